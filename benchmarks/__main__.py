@@ -29,6 +29,7 @@ from .meshes import meshes
 from .pictures import pictures
 from .povray import compare_with_povray, has_povray
 from .rays import RULES, WIDTH, Row, machine, measure, published
+from .repair import repair
 from .scenes import others, polygons
 from .versions import beside
 from .winding import throughput
@@ -36,8 +37,8 @@ from .winding import throughput
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 SECTIONS = (
     "rays", "convergence", "winding", "agreement", "versions", "inclusion", "laplacian", "hart",
-    "povray", "antialiasing", "baselines", "formulas", "meshes", "distances", "pictures", "live",
-    "cluster",
+    "povray", "antialiasing", "baselines", "formulas", "meshes", "repair", "distances", "pictures",
+    "live", "cluster",
 )  # fmt: skip
 
 
@@ -48,7 +49,9 @@ def main() -> None:
     parser.add_argument("--no-convergence", action="store_true", help="skip that section")
     parser.add_argument("--only", choices=SECTIONS, help="rewrite one section of the page")
     parser.add_argument("--bunny", type=Path, help="a surface file, for the winding numbers")
-    parser.add_argument("--meshes", type=Path, help="a folder of surface files, for agreement")
+    parser.add_argument(
+        "--meshes", type=Path, help="a folder of surface files, for agreement and repair"
+    )
     parser.add_argument("--before", type=Path, help="a checkout of an earlier version, to compare")
     arguments = parser.parse_args()
     names = [arguments.only] if arguments.only else list(SECTIONS)
@@ -90,6 +93,7 @@ def main() -> None:
         "live": live,
         "meshes": meshes,
         "pictures": pictures,
+        "repair": lambda: repair(arguments.meshes),
         "povray": compare_with_povray,
         "winding": lambda: _winding(arguments.bunny, arguments.out.with_name("growth.png")),
     }

@@ -35,7 +35,8 @@ def ball(directions: Any = AXES, radius: float = 0.5, subdivisions: int = 3) -> 
 
 def check(given: trimesh.Trimesh, euler: int = 2) -> trimesh.Trimesh:
     """Repairs a mesh and judges the result by other means than `repair` does."""
-    made = hk.repair(given)
+    made = hk.repair(given, keep="all")
+    assert made.metadata["harnack"]["stage"] == "kept"
     n, m = len(given.vertices), len(given.faces)
     assert made.vertices[:n].tobytes() == given.vertices.tobytes()
     assert made.faces[:m].tobytes() == given.faces.tobytes()
@@ -133,7 +134,7 @@ def test_patches_that_meet_the_mesh_are_refused() -> None:
         process=False,
     )
     with pytest.raises(hk.MeshingError, match=r"meet \d+ triangles of the mesh"):
-        hk.repair(together, spacing=0.08)
+        hk.repair(together, spacing=0.08, keep="all")
 
 
 def doubled() -> trimesh.Trimesh:
@@ -178,9 +179,56 @@ def not_a_number() -> trimesh.Trimesh:
         (not_a_number, "finite"),
     ],
 )
-def test_meshes_that_are_refused(make: Any, message: str) -> None:
+def test_meshes_of_which_not_all_can_be_kept(make: Any, message: str) -> None:
     with pytest.raises(MeshError, match=message):
-        hk.repair(make())
+        hk.repair(make(), keep="all")
+
+
+@pytest.mark.few(2)
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (soup, "at the same place"),
+        (doubled, "more than two faces"),
+        (one_reversed, "do not agree which side is outside"),
+        (flat, "zero area"),
+    ],
+)
+def test_what_cannot_be_kept_is_made_anew(make: Any, message: str) -> None:
+    made = hk.repair(make(), spacing=0.15, tolerance=1e-2)
+    facts = made.metadata["harnack"]
+    assert facts["stage"] == "anew"
+    assert facts["kept"] == 0
+    assert message in facts["why"]
+    assert made.is_watertight
+    assert made.is_winding_consistent
+    assert not len(intersecting_pairs(np.asarray(made.vertices), np.asarray(made.faces)))
+    assert made.volume == pytest.approx(4.0, abs=0.2)
+
+
+def test_numbers_that_are_none_are_refused_anyway() -> None:
+    with pytest.raises(MeshError, match="finite"):
+        hk.repair(not_a_number())
+    with pytest.raises(hk.MeshingError, match="empty"):
+        hk.repair(inside_out())
+
+
+def inside_out() -> trimesh.Trimesh:
+    vertices, faces = icosphere(1)
+    return trimesh.Trimesh(vertices, np.concatenate([faces[:, ::-1], faces[:1]]), process=False)
+
+
+def test_loose_parts_are_kept_or_dropped() -> None:
+    vertices, faces = icosphere(2)
+    both = trimesh.Trimesh(
+        np.concatenate([vertices, 0.3 * vertices + 2]), np.concatenate([faces, faces + 162]),
+        process=False,
+    )  # fmt: skip
+    made = hk.repair(both, keep="none", spacing=0.2, tolerance=1e-2)
+    assert made.body_count == 2
+    one = hk.repair(both, keep="none", largest=True, spacing=0.2, tolerance=1e-2)
+    assert one.body_count == 1
+    assert one.volume > 3.5
 
 
 def test_settings_that_are_refused() -> None:
@@ -188,6 +236,8 @@ def test_settings_that_are_refused() -> None:
         hk.repair(np.zeros((3, 3)))  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="tolerance"):
         hk.repair(ball(), tolerance=0)
+    with pytest.raises(ValueError, match='keep is None, "all" or "none"'):
+        hk.repair(ball(), keep="some")  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="spacing"):
         hk.repair(ball(), spacing=float("nan"))
 

@@ -389,9 +389,10 @@ def _add_mesh(commands: Any) -> None:
 
 def _add_repair(commands: Any) -> None:
     one = commands.add_parser(
-        "repair", help="close the holes of a mesh",
-        description="Write a mesh with patches over its holes. The triangles that there are stay "
-        "as they are.",
+        "repair", help="close a damaged mesh",
+        description="Write a mesh with patches over its holes; the triangles that there are stay "
+        "as they are. Where that cannot be done, as for loose or crossing triangles, all is made "
+        "anew by the sign of the winding number less 1/2, and closed whatever the mesh is.",
     )  # fmt: skip
     one.add_argument("mesh", metavar="FILE", help="a mesh: .obj, .ply, .stl, .off, .glb or .gltf")
     one.add_argument(
@@ -399,7 +400,16 @@ def _add_repair(commands: Any) -> None:
     )
     one.add_argument(
         "--tolerance", type=_positive, metavar="PART",
-        help="how far patches may be from the surface, as a part of their size (0.001)",
+        help="how far new triangles may be from the surface, as a part of their size (0.001)",
+    )  # fmt: skip
+    one.add_argument(
+        "--keep", choices=("all", "none"),
+        help="all: fail if the triangles cannot all be kept; none: make all anew (whichever can be "
+        "done)",
+    )  # fmt: skip
+    one.add_argument(
+        "--largest", action="store_true", default=None,
+        help="of what is made anew keep the largest part alone",
     )  # fmt: skip
     one.add_argument(
         "--spacing", type=_positive, metavar="LENGTH", help="of cells before anything is refined"

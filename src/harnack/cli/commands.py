@@ -424,7 +424,7 @@ def _meshed(options: Any, source: Path) -> tuple[Field, dict[str, Any]]:
 
 
 def _repair(options: Any) -> int:
-    """A mesh with patches over its holes."""
+    """A closed mesh of a damaged one."""
     import trimesh  # here: half a second that few need
 
     source = Path(options.mesh)
@@ -433,7 +433,8 @@ def _repair(options: Any) -> int:
     if not isinstance(found, Mesh):
         raise ValueError(f"{source} holds no mesh to repair")
     _say(f"{source}: {in_options(found.said)}")
-    settings = {"tolerance": options.tolerance, "spacing": options.spacing}
+    names = ("tolerance", "spacing", "keep", "largest")
+    settings = {name: getattr(options, name) for name in names}
     chosen = {name: value for name, value in settings.items() if value is not None}
     # Files such as .stl list the corners of each face anew.
     kept, faces = np.unique(weld_vertices(found.vertices)[found.faces], return_inverse=True)
@@ -442,11 +443,22 @@ def _repair(options: Any) -> int:
         made = repair(given, progress=None if options.quiet else status.update, **chosen)
     write_mesh(made, target)
     facts = made.metadata["harnack"]
-    holes = f"{facts['holes']:,} hole" + ("" if facts["holes"] == 1 else "s")
-    added = f"{facts['patches']:,} triangles added to {len(faces):,}"
-    _say(f"{holes}, {added}, Euler characteristic {facts['euler_characteristic']}")
+    _say(f"{_repaired(facts, len(faces), len(made.faces))}, Euler characteristic "
+         f"{facts['euler_characteristic']}")  # fmt: skip
     _say(f"wrote {target}")
     return 0
+
+
+def _repaired(facts: dict[str, Any], given: int, made: int) -> str:
+    """What `repair` kept and what it added, or why it kept nothing."""
+    if facts["stage"] == "kept":
+        holes = f"{facts['holes']:,} hole" + ("" if facts["holes"] == 1 else "s")
+        return f"{holes}, {facts['patches']:,} triangles added to {given:,}, which are all kept"
+    why = "" if facts["why"] is None else f" since {facts['why']}"
+    return (
+        f"made anew: {made:,} triangles in place of {given:,}{why}; {facts['far']:,} vertices and "
+        f"centers are beyond the tolerance, all are within {facts['within']:.2g}"
+    )
 
 
 def _gallery(options: Any) -> int:

@@ -33,6 +33,7 @@ __all__ = [
     "check_manifold",
     "check_near_level",
     "euler_characteristic",
+    "far_from_level",
     "intersecting_faces",
     "sides_of_lines",
     "sides_of_planes",
@@ -363,6 +364,25 @@ def check_near_level(
     Raises:
         LocalError: with the points that are not.
     """
+    far, count = far_from_level(function, vertices, faces, tolerance, volume)
+    if len(far):
+        raise LocalError(
+            f"{len(far):,} of {count:,} vertices and centers of triangles are farther than "
+            f"the tolerance, {tolerance:.3g}, from the level, such as {_point(far[0])}: "
+            "choose a smaller `spacing` or a larger `tolerance`",
+            far,
+        )
+
+
+def far_from_level(
+    function: LevelFunction,
+    vertices: FloatArray,
+    faces: IntArray,
+    tolerance: float,
+    volume: Volume | None,
+) -> tuple[FloatArray, int]:
+    """Those vertices and centers of faces (k, 3) that are not within `tolerance` of the level, as
+    `check_near_level` decides it; and how many were looked at."""
     corner = vertices[faces]
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     longest = np.stack([lengths(corner[:, k] - corner[:, k - 1]) for k in range(3)]).max(axis=0)
@@ -379,17 +399,11 @@ def check_near_level(
     far = np.flatnonzero(~(function.at(points).distance <= tolerance))
     for axis in (None, *np.eye(3)):
         if not len(far):
-            return
+            break
         step = tolerance * (ways[far] if axis is None else axis)
         one, other = (_is_positive(function, points[far] + s * step, volume) for s in (1, -1))
         far = far[one == other]
-    if len(far):
-        raise LocalError(
-            f"{len(far):,} of {len(points):,} vertices and centers of triangles are farther than "
-            f"the tolerance, {tolerance:.3g}, from the level, such as {_point(points[far][0])}: "
-            "choose a smaller `spacing` or a larger `tolerance`",
-            points[far],
-        )
+    return points[far], len(points)
 
 
 def _is_positive(

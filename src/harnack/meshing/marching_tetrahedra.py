@@ -15,8 +15,9 @@ Tetrahedra between points are Delaunay's, by Qhull (`delaunay`).
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any, TypeAlias, cast
 
 import numpy as np
 
@@ -27,7 +28,15 @@ from harnack.meshing.edges import Edges, IntArray, dots, edge_keys, lengths
 from harnack.meshing.points import PointSet
 from harnack.meshing.samples import LevelFunction
 
-__all__ = ["Crossings", "Tetrahedra", "crossings_of", "delaunay", "is_cut", "triangles_of"]
+__all__ = [
+    "Crossings",
+    "Roots",
+    "Tetrahedra",
+    "crossings_of",
+    "delaunay",
+    "is_cut",
+    "triangles_of",
+]
 
 _PAIRS = tuple(itertools.combinations(range(4), 2))
 
@@ -150,11 +159,21 @@ def _integrated(
     return wrapped + period * turns
 
 
+Roots: TypeAlias = Callable[[FloatArray, FloatArray], FloatArray]
+"""From the ends (k, 3) of edges, below the level and above it, to where they meet it (k, 3)."""
+
+
 def triangles_of(
-    function: LevelFunction, points: PointSet, tets: Tetrahedra, crossings: Crossings
+    function: LevelFunction,
+    points: PointSet,
+    tets: Tetrahedra,
+    crossings: Crossings,
+    roots_of: Roots | None = None,
 ) -> tuple[FloatArray, IntArray]:
     """Vertices (n, 3) and faces (m, 3), counter-clockwise as seen from where the function is
     greater. The first vertices are `points`, whether they are in use or not.
+
+    roots_of: where edges meet the level of a real-valued function; None for a search along them.
 
     Raises:
         MeshingError: crossings that do not agree around a face, or two levels between corners.
@@ -171,7 +190,16 @@ def triangles_of(
             _mean(points.points, tets.corners[double]),
         )
     cut = np.flatnonzero(~on.all(axis=1) & (most > least))
-    roots, place = _roots(function, points, tets, crossings, cut)
+    edges = np.unique(tets.edges[cut])
+    edges = edges[crossings.count[edges] != 0]
+    if roots_of is None:
+        roots = _roots(function, points, tets, crossings, edges)
+    else:
+        upwards = (crossings.count[edges] > 0)[:, None]
+        ends = np.where(upwards, tets.ends[edges], tets.ends[edges, ::-1])
+        roots = roots_of(points.points[ends[:, 0]], points.points[ends[:, 1]])
+    place = np.full(len(tets.ends), -1, np.int64)
+    place[edges] = len(points.points) + np.arange(len(edges))
     vertices = np.concatenate([points.points, roots])
     parts: list[tuple[IntArray, FloatArray]] = []
     above = (side > least[:, None]) & ~on
@@ -256,12 +284,9 @@ def _roots(
     points: PointSet,
     tets: Tetrahedra,
     crossings: Crossings,
-    cut: IntArray,
-) -> tuple[FloatArray, IntArray]:
-    """Where edges of some tetrahedra meet the level (r, 3), and for each edge the index of that
-    vertex, after those of the points; by Chandrupatla's method along the edge."""
-    edges = np.unique(tets.edges[cut])
-    edges = edges[crossings.count[edges] != 0]
+    edges: IntArray,
+) -> FloatArray:
+    """Where some edges meet the level (r, 3), by Chandrupatla's method along the edge."""
     a, b = tets.ends[edges].T
     p, way = points.points[a], points.points[b] - points.points[a]
     value, change = points.samples.value[a], crossings.change[edges]
@@ -294,10 +319,8 @@ def _roots(
             f"{int((~result.success).sum())} crossings of edges were not found: the function may "
             "not be continuous there; choose another level"
         )
-    place = np.full(len(tets.ends), -1, np.int64)
-    place[edges] = len(points.points) + np.arange(len(edges))
     share = np.array(result.x, np.float64)
-    return p + share[:, None] * way, place
+    return p + share[:, None] * way
 
 
 def _faces_on_the_level(

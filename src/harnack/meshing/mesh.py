@@ -13,6 +13,7 @@ from harnack.fields.field import check_is_field
 from harnack.fields.solid_angles.solid_angle import SolidAngle
 from harnack.geometry import Box, Intersection, Volume
 from harnack.geometry.volume import check_volume
+from harnack.meshing.by_signs import signed_surface
 from harnack.meshing.checks import (
     MeshingError,
     TooLargeError,
@@ -22,11 +23,13 @@ from harnack.meshing.checks import (
     check_near_level,
 )
 from harnack.meshing.clipping import cut_by, largest_body, largest_part
+from harnack.meshing.closed_mesh import box_manifold, manifold_of, surface_of, volume_manifold
 from harnack.meshing.finishing import check_options, finished, normals_of, simplified, thickened
 from harnack.meshing.lattice import Lattice
 from harnack.meshing.lattice_surface import Surface, open_surface
 from harnack.meshing.samples import CELLS_PER_WAVE, MOST_FACES, LevelFunction
-from harnack.meshing.solids import AngleMesher, mesh_solid, region_of
+from harnack.meshing.sign_function import SignFunction, is_meshed_by_signs
+from harnack.meshing.solids import AngleMesher, ends_of_solid, mesh_solid, region_of
 from harnack.meshing.spanned import spanned_surface
 from harnack.tracer import LevelSet
 
@@ -42,6 +45,7 @@ __all__ = ["mesh"]
 # Cells across the level set, unless a spacing is given; curves have their own length besides.
 _ACROSS = 24
 _MOST_ATTEMPTS = 4
+_ACROSS_BY_SIGNS, _ATTEMPTS_BY_SIGNS = 48, 2
 # Room around what has an extent, and around a curve whose surface has none, as a part of the size.
 _MARGIN = 0.01
 _ROOM = 0.05
@@ -70,15 +74,22 @@ def mesh(
     onto the surface until middles of edges and centers of triangles are within the tolerance.
     Solids are put together from the meshes of smooth levels by manifold3d, and so cut by the clip.
 
-    field: a `SolidAngle` of polygons, or a real-valued field that is continuous; or a `LevelSet` of
-        one level or a solid, whose level, clip, section, solid and largest are used unless others
-        are given here. Its tolerance and its other settings are those of rays, and not used.
+    Fields that are sums over meshes, points and blobs (`WindingNumber`, `DipolePotential`,
+    `ScreenedWindingNumber`, `Morph`, `HRBF`, `Blobs`) are meshed by the signs of their values alone
+    (`meshing.by_signs`), which gives a closed surface whatever the mesh or the cloud is. Vertices
+    lie where edges of the cells meet the level, so on the very triangles of a sound mesh; parts
+    that are nearer to each other than a cell may be joined, or missed.
+
+    field: a `SolidAngle` of polygons, a real-valued field that is continuous, or one of those; or a
+        `LevelSet` of one level or a solid, whose level, clip, section, solid and largest are used
+        unless others are given here. Its tolerance and other settings of rays are not used.
     level: None for the field's default.
     tolerance: how far triangles may be from the surface, as a part of the size of the level set's
         box (its longest side), sampled and not proved.
     spacing: of cells before anything is refined, in the field's unit; None chooses a 24th of the
-        longest side, and of waves (`Field.wavelength`) a fifth of theirs at the most. Sheets that
-        are nearer to each other are told apart where that is noticed; else a MeshingError says so.
+        longest side (by signs a 48th), and of waves (`Field.wavelength`) a fifth of theirs at the
+        most. Sheets that are nearer to each other are told apart where that is noticed; else a
+        MeshingError says so.
     clip: a volume, needed where the level set has no extent. The surface ends at its boundary; a
         solid is closed there. None for the field's domain.
     section: another one, such as a `HalfSpace`, besides the clip or the domain.
@@ -99,7 +110,9 @@ def mesh(
     All that is returned has been checked: every edge has two faces, or one at the boundary, no two
     triangles pass through each other, vertices and centers of triangles are within the tolerance of
     the level by samples of the field, and inside the clip (of a thick part, the surface that it is
-    made of). Else a MeshingError is raised.
+    made of). Else a MeshingError is raised. By signs all is checked but the last: if one in a
+    hundred vertices and centers is beyond the tolerance, smaller cells are tried, and how many are
+    at last is said (`far`, below).
 
     Returns:
         A trimesh.Trimesh; if it is closed, `export` writes closed files, in single precision, or
@@ -117,12 +130,17 @@ def mesh(
             have the topology of the level set (`meshing.isotopy`), of all and of those farther than
             1.5 times the spacing from the curve;
         turned: triangles of an angle, smaller than the tolerance, that are turned over.
+        Of meshes by signs, made_by is "signs", and
+        far, within: how many vertices and centers of triangles are beyond the tolerance, and a
+            distance within which all are, sampled up to a factor of 2;
+        undecided: at how many points of the lattice the error of f leaves its sign open;
+        flat: how many triangles were not fitted to creases, as they would pass through others.
 
         Solids and thick surfaces have more: see `docs/printing.md`.
 
     Raises:
         MeshingError: a ValueError, if it could not be done; the message says why.
-        TypeError: a field that jumps or has parts; a clip that is no volume.
+        TypeError: a field that has parts; a clip that is no volume.
         ValueError: options out of range, or that contradict each other; a `LevelSet` of several
             levels.
     """
@@ -146,7 +164,32 @@ def mesh(
     facts: dict[str, Any]
     volume = _volume(field, clip, section)
     region = None
-    if solid:
+    if is_meshed_by_signs(field):
+        if thickness is not None and field.has_sheets:
+            raise TypeError(
+                f"{type(field).__name__} jumps, and its surface has no normals to thicken it "
+                "along: mesh it, and move the mesh's vertices instead"
+            )
+        if solid:
+            ends = ends_of_solid(field, solid, level)
+        else:
+            level = field.default_level if level is None else float(level)
+            field.check_levels((level,))
+            ends = level, math.inf
+        made, size, facts = _signed(
+            field, ends, volume, tolerance, spacing, max_triangles, bool(solid), report
+        )
+        if solid:
+            facts["solid"] = solid
+        elif largest:
+            made = largest_part(made)
+        if thickness is not None:
+            function = SignFunction(field, ends[0])
+            made, more = thickened(
+                made, normals_of(function, made), float(thickness), 0.5 * tolerance * size
+            )
+            facts |= more
+    elif solid:
         region = LevelFunction(*region_of(field, solid, level), most_faces=max_triangles)
         made, size, facts = _solid(region, volume, tolerance, spacing, seed, report)
         facts["solid"] = solid
@@ -182,6 +225,56 @@ def mesh(
     return finished(made, facts, is_closed)
 
 
+def _signed(
+    field: Field,
+    ends: tuple[float, float],
+    volume: Volume | None,
+    tolerance: float,
+    spacing: float | None,
+    most_faces: int,
+    is_solid: bool,
+    report: Callable[[str], None],
+) -> tuple[Surface, float, dict[str, Any]]:
+    """The closed surface of the points where low <= f <= high by the signs of f, or the surface of
+    level low; its size, and what is known of it."""
+    levels = tuple(one for one in ends if math.isfinite(one))
+    box = _box(field, levels, volume)
+    size = float((box.upper - box.lower).max())
+    cells = size / _ACROSS_BY_SIGNS if spacing is None else float(spacing)
+    attempts = _ATTEMPTS_BY_SIGNS if spacing is None else 1
+    # Where nothing ends at the box, its cells should not lie along what is symmetrical.
+    room = np.zeros(3) if box.has_walls else size * np.array([0.0037, 0.0053, 0.0029])
+    filled = box.lower - room, box.upper + 0.5 * room
+
+    def surface(level: float, side: float, closed: bool) -> tuple[Surface, dict[str, Any]]:
+        function = SignFunction.of(field, level, filled, cells, side=side, most_faces=most_faces)
+        made, facts = signed_surface(
+            function, filled, cells, tolerance * size, attempts, report, closed=closed
+        )
+        return made, {"level": level, **facts}
+
+    if not is_solid:
+        made, facts = surface(levels[0], 1.0, False)
+        if volume is not None and not (isinstance(volume, Box) and box.has_walls):
+            made = cut_by(made, volume)
+    elif volume is None and ends[1] == math.inf:
+        made, facts = surface(levels[0], -1.0, False)
+    else:
+        whole, facts = box_manifold(box.lower, box.upper), {}
+        if math.isfinite(ends[0]):
+            made, facts = surface(ends[0], -1.0, True)
+            whole = manifold_of(made)
+        if math.isfinite(ends[1]):
+            made, facts = surface(ends[1], -1.0, True)
+            whole = whole - manifold_of(made)
+        cut = volume or Box(tuple(box.lower.tolist()), tuple(box.upper.tolist()))
+        whole ^= volume_manifold(cut, box.lower, box.upper, 0.5 * tolerance * size)
+        made = surface_of(whole)
+    if not len(made.faces):
+        raise MeshingError("the level set is empty: it lies outside of the clip")
+    return made, size, facts
+
+
 def _level_and_solid(
     surface: LevelSet, level: float | None, solid: tuple[float, float] | bool | None
 ) -> tuple[float | None, tuple[float, float] | bool | None]:
@@ -211,7 +304,7 @@ def _check_level(
 
 def _checked(field: Field) -> Field:
     check_is_field(field)
-    if field.has_parts or field.has_sheets:
+    if field.has_parts or (field.has_sheets and not is_meshed_by_signs(field)):
         raise TypeError(
             f"{type(field).__name__} is not one continuous function: mesh its parts, or the "
             "solid angle of its boundary"
@@ -256,7 +349,7 @@ def _solid(
     def angle_mesher(error: float, cells: float) -> AngleMesher:
         def mesh_angle(angle: SolidAngle, value: float) -> Surface:
             angle = cast("SolidAngle", _checked(angle))
-            box = _box(angle, value, None)
+            box = _box(angle, (value,), None)
             function = LevelFunction(angle, value, most_faces=most_faces)
             made, facts = _spanned(function, box, error, cells, 1, seed, report)
             evaluations[0] += facts["evaluations"]
@@ -293,7 +386,7 @@ def _surface(
     """A level set, its size, and what is known of it."""
     field, level = function.field, function.level
     field.check_levels((level,))
-    box = _box(field, level, volume)
+    box = _box(field, (level,), volume)
     size = float((box.upper - box.lower).max())
     cells = size / _ACROSS if spacing is None else float(spacing)
     if spacing is None and field.wavelength is not None:
@@ -380,13 +473,13 @@ class _Filled:
     has_walls: bool
 
 
-def _box(field: Field, level: float, volume: Volume | None) -> _Filled:
-    """The box to be filled: around the level set, if it has an extent, and the volume.
+def _box(field: Field, levels: tuple[float, ...], volume: Volume | None) -> _Filled:
+    """The box to be filled: around the level sets, if it has an extent, and the volume.
 
     Raises:
         MeshingError: neither has bounds, or they have nothing in common.
     """
-    extent = field.extent((level,))
+    extent, level = field.extent(levels), levels[0]
     if volume is None and extent is None and isinstance(field, SolidAngle):
         raise MeshingError(
             f"level {level:g} is a multiple of 4 pi: the surface of a curve has no end there; "

@@ -19,7 +19,7 @@ from harnack.meshing.points import newton
 from harnack.meshing.relaxation import flipped, relaxed, without_slivers
 from harnack.meshing.samples import LevelFunction, Samples
 
-__all__ = ["far_places", "improved", "refined", "smoothed", "smoothed_within"]
+__all__ = ["far_places", "improved", "refined", "smoothed", "smoothed_within", "split_faces"]
 
 Walls = tuple[FloatArray, FloatArray] | None
 # Across a crease normals turn by at least this angle, and by this part of it between two points.
@@ -85,7 +85,7 @@ def refined(
         )
         a, b, c = faces[cut_off].T
         fans = [np.stack([*ends, inner], axis=1) for ends in ((a, b), (b, c), (c, a))]
-        whole = _split(vertices, faces[~cut_off], place[far.edges[~cut_off]])
+        whole = split_faces(vertices, faces[~cut_off], place[far.edges[~cut_off]])
         faces = np.concatenate([whole, *fans])
     if function.field.has_detail:
         vertices = _settled(function, vertices, faces, tolerance, walls)
@@ -267,7 +267,7 @@ def _edges(faces: IntArray) -> tuple[IntArray, IntArray, BoolArray]:
     return edges.ends, edges.index.reshape(3, -1).T, edges.uses == 1
 
 
-def _split(vertices: FloatArray, faces: IntArray, middle: IntArray) -> IntArray:
+def split_faces(vertices: FloatArray, faces: IntArray, middle: IntArray) -> IntArray:
     """Faces cut at the middles (m, 3) of their edges, -1 for those that are not cut."""
     cut = middle >= 0
     number = cut.sum(axis=1)

@@ -11,7 +11,7 @@ import math
 from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from harnack.fields.solid_angles.solid_angle import SolidAngle
 from harnack.fields.solid_angles.winding_number import WindingNumber
 from harnack.geometry import MeshError, validate_mesh
 from harnack.geometry.chains import singular_loops, weld_vertices
+from harnack.geometry.meshes import without_zero_area_faces
 from harnack.meshing.checks import (
     LocalError,
     MeshingError,
@@ -30,6 +31,7 @@ from harnack.meshing.checks import (
 )
 from harnack.meshing.edges import Edges, IntArray, directed_edges
 from harnack.meshing.marching_tetrahedra import crossings_of, delaunay, triangles_of
+from harnack.meshing.mesh import mesh as mesh_of
 from harnack.meshing.points import Boundary, Places, box_cells, place_points
 from harnack.meshing.refinement import far_places, improved, refined, smoothed
 from harnack.meshing.samples import LevelFunction
@@ -45,6 +47,9 @@ _LEVEL = 2 * math.pi
 # Cells across the holes at first, and how often they are made smaller where that fails.
 _ACROSS = 24
 _ATTEMPTS = 6
+# How often if all may be made anew instead; and cells across the mesh then.
+_FEW_ATTEMPTS = 3
+_ACROSS_ANEW = 48
 # How often edges of holes that are too near to others are halved for the tetrahedra.
 _MOST_CUTS = 12
 # How often patches that meet the mesh are made again, of smaller cells.
@@ -53,57 +58,124 @@ _MOST_MET = 1
 _NEAR = 1e-6
 
 
+Keep = Literal["all", "none"]
+
+
 def repair(
     mesh: trimesh.Trimesh,
     *,
+    keep: Keep | None = None,
+    largest: bool = False,
     tolerance: float = 1e-3,
     spacing: float | None = None,
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
 ) -> trimesh.Trimesh:
-    """The mesh with patches over its holes, where its winding number is 1/2 modulo 1.
+    """A closed mesh of a damaged one: with patches over its holes, or made anew.
 
-    If that cannot be meshed, for which holes at one corner are the usual reason, holes of three
-    edges get their triangle, where it passes through no other, and patches are those of the mesh
-    with them.
+    Patches are where the winding number w of the mesh is 1/2 modulo 1, and the triangles that are
+    there stay. If that cannot be meshed, for which holes at one corner are the usual reason, holes
+    of three edges get their triangle, where it passes through no other, and patches are those of
+    the mesh with them. Where that fails too, or the mesh is none with two sides (edges of more than
+    two faces, faces turned over, loose triangles), the surface w = 1/2 is made anew by the signs of
+    w - 1/2 in cells (`meshing.by_signs`): closed whatever the mesh is.
 
-    mesh: anything with `vertices` (n, 3) and `faces` (m, 3): every edge has one or two faces, which
-        agree on its two sides.
-    tolerance: how far triangles of the patches may be from the surface, as a part of the size of
-        the box around all holes, sampled and not proved; but for triangles between three edges of
-        holes, which stay as they are.
+    mesh: anything with `vertices` (n, 3) and `faces` (m, 3); faces without an area are left out.
+    keep: None keeps all triangles if possible, and else makes all anew; "all" raises an error where
+        that is not possible; "none" makes all anew.
+    largest: of what is made anew keep the part of the largest volume alone, with its cavities.
+    tolerance: how far triangles may be from the surface, sampled and not proved, as a part of the
+        size of the box around all holes, or of the mesh if all is made anew; but for triangles
+        between three edges of holes, which stay as they are.
     spacing: of cells before anything is refined, in the mesh's unit; None chooses.
     seed: of the small random moves that keep points in general position.
     progress: told what is being done.
 
     Returns:
-        A trimesh.Trimesh whose first vertices and faces are those given, bit by bit and in their
-        order; vertices inside of patches and their faces follow. Every edge has two faces, which
-        agree, and no patch meets another triangle but at the edges and corners that they share.
-        `metadata["harnack"]` has holes (loops of edges that were open), patches (triangles added),
-        missing (how many of these are the triangles of holes of three edges), refined (whether
-        they are within the tolerance: they stay as the cells cut them if finer ones would pass
-        through each other, however small cells are made there), spacing, evaluations and the Euler
-        characteristic. A closed mesh gets nothing added.
+        A closed trimesh.Trimesh: every edge has two faces, which agree. `metadata["harnack"]` has
+        stage: "kept" or "anew"; and why (None, or what the other stage failed with).
+
+        If all was kept, the first vertices and faces are those given, bit by bit and in their
+        order; vertices inside of patches and their faces follow, and no patch meets another
+        triangle but at the edges and corners that they share. Then there are also holes (loops of
+        edges that were open), patches (triangles added), missing (how many of these are the
+        triangles of holes of three edges), refined (whether they are within the tolerance: they
+        stay as the cells cut them if finer ones would pass through each other, however small cells
+        are made there), spacing, evaluations and the Euler characteristic. A closed mesh gets
+        nothing added.
+
+        If all was made anew, no triangles pass through each other, and there is what `mesh` says of
+        meshes by signs, such as far and within; kept is 0.
 
     Raises:
-        MeshError: a ValueError, for a mesh that is not as said above; the message says where.
-        MeshingError: a ValueError, if the patches could not be made, or meet the mesh or each
-            other.
+        MeshError: a ValueError, for a mesh that has no triangles, or numbers that are none; with
+            keep="all" also for one that is not as said above.
+        MeshingError: a ValueError, with keep="all", if the patches could not be made, or meet the
+            mesh or each other; if the surface w = 1/2 is empty, as for faces turned inwards, or
+            takes too many cells.
     """
     report = progress or _silent
+    if keep is not None and keep not in ("all", "none"):
+        raise ValueError(f'keep is None, "all" or "none", not {keep!r}')
     if not 0 < tolerance < 0.5:
         raise ValueError(
             f"tolerance is a part of the size: it must lie in (0, 0.5), not {tolerance}"
         )
     if spacing is not None and not 0 < spacing < math.inf:
         raise ValueError(f"spacing must be a positive length, not {spacing!r}")
+    if keep == "none":
+        return _anew(mesh, None, tolerance, spacing, largest, report)
+    try:
+        attempts = _ATTEMPTS if keep == "all" else _FEW_ATTEMPTS
+        return _kept(mesh, tolerance, spacing, seed, attempts, report)
+    except (MeshError, MeshingError) as error:
+        if keep == "all":
+            raise
+        report(f"{error}; so all is made anew")
+        return _anew(mesh, str(error), tolerance, spacing, largest, report)
+
+
+def _anew(
+    mesh: Any,
+    why: str | None,
+    tolerance: float,
+    spacing: float | None,
+    largest: bool,
+    report: Callable[[str], None],
+) -> trimesh.Trimesh:
+    """The surface on which the winding number is 1/2, closed whatever the mesh is."""
+    _check_is_mesh(mesh)
+    corners = without_zero_area_faces(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    field = WindingNumber(*corners)
+    if spacing is None:
+        spacing = float(np.ptp(corners[0], axis=0).max()) / _ACROSS_ANEW
+    made = mesh_of(
+        field, solid=(0.5, math.inf), tolerance=tolerance, spacing=spacing, largest=largest,
+        progress=report,
+    )  # fmt: skip
+    made.metadata["harnack"] |= {"stage": "anew", "kept": 0, "why": why}
+    return made
+
+
+def _kept(
+    mesh: Any,
+    tolerance: float,
+    spacing: float | None,
+    seed: int,
+    attempts: int,
+    report: Callable[[str], None],
+) -> trimesh.Trimesh:
+    """The mesh with patches; all its triangles stay.
+
+    Raises:
+        MeshError, MeshingError: as `repair`.
+    """
     vertices, faces = _checked(mesh)
     edges = _open_edges(faces)
     if not len(edges):
         nothing = _Patches(vertices[:0], faces[:0], True, 0.0, 0)
         return _joined(vertices, faces, nothing, len(faces))
-    asked = _Asked(len(faces), tolerance, spacing, seed, report)
+    asked = _Asked(len(faces), tolerance, spacing, seed, attempts, report)
     try:
         return _repaired(vertices, faces, edges, asked)
     except MeshingError as error:
@@ -123,12 +195,14 @@ def repair(
 
 @dataclass(frozen=True)
 class _Asked:
-    """The arguments of `repair`. given: how many faces there were."""
+    """The arguments of `repair`. given: how many faces there were. attempts: how many sizes of
+    cells are tried."""
 
     given: int
     tolerance: float
     spacing: float | None
     seed: int
+    attempts: int
     report: Callable[[str], None]
 
 
@@ -150,8 +224,8 @@ def _repaired(
     report, tolerance = asked.report, asked.tolerance * size
     finer: tuple[Places, ...] = ()
     times_met, seed = 0, asked.seed
-    for attempt in range(_ATTEMPTS):
-        last = attempt == _ATTEMPTS - 1
+    for attempt in range(asked.attempts):
+        last = attempt == asked.attempts - 1
         report(f"cells of {cell:.3g}" + ", smaller in places" * bool(finer))
         try:
             patches = _patches(
@@ -205,13 +279,17 @@ def _silent(text: str) -> None:
     """Reports nothing."""
 
 
-def _checked(mesh: Any) -> tuple[FloatArray, IntArray]:
-    """Vertices and faces of a mesh that can be repaired."""
+def _check_is_mesh(mesh: Any) -> None:
     if not hasattr(mesh, "vertices") or not hasattr(mesh, "faces"):
         raise TypeError(
             f"repair takes a mesh with vertices and faces, such as a trimesh.Trimesh, not "
             f"{type(mesh).__name__}"
         )
+
+
+def _checked(mesh: Any) -> tuple[FloatArray, IntArray]:
+    """Vertices and faces of a mesh that can be repaired."""
+    _check_is_mesh(mesh)
     vertices, faces = validate_mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces))
     used = np.unique(faces)
     welded = weld_vertices(vertices[used])
@@ -448,6 +526,9 @@ def _joined(
         np.concatenate([vertices, patches.vertices]), together, process=False, validate=False
     )
     result.metadata["harnack"] = {
+        "stage": "kept",
+        "kept": given,
+        "why": None,
         "holes": len(singular_loops(edges, np.ones(len(edges), np.int64))) if len(edges) else 0,
         "patches": len(together) - given,
         "missing": len(faces) - given,

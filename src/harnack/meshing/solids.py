@@ -48,7 +48,15 @@ from harnack.meshing.thread_mesh import thread_manifold
 if TYPE_CHECKING:
     from manifold3d import Manifold
 
-__all__ = ["AngleMesher", "RegionMesher", "SolidMesh", "is_smooth", "mesh_solid", "region_of"]
+__all__ = [
+    "AngleMesher",
+    "RegionMesher",
+    "SolidMesh",
+    "ends_of_solid",
+    "is_smooth",
+    "mesh_solid",
+    "region_of",
+]
 
 # Cells of offsets of meshes, in tolerances; and the error of roots on their edges.
 _CELLS_OF_OFFSET, _ROOT_ERROR = 5.0, 1e-3
@@ -361,14 +369,30 @@ def region_of(field: Field, solid: Any, level: float | None) -> tuple[Solid, flo
         ValueError: it is none; levels that no solid has.
         TypeError: neither.
     """
-    if solid is True:
-        if not isinstance(field, Solid):
-            raise ValueError(
-                f"solid=True is for solids, and a {type(field).__name__} has two sides: give "
-                "solid=(low, high), the values inside, such as solid=(-math.inf, 0.0)"
-            )
+    if solid is True and isinstance(field, Solid):
         level = field.default_level if level is None else float(level)
         return field, level
+    low, high = ends_of_solid(field, solid, level)
+    if low == -math.inf:
+        return solid_of(field, below=high), 0.0
+    if high == math.inf:
+        return solid_of(field, above=low), 0.0
+    if field.period is not None:
+        return solid_of(field, around=(0.5 * (low + high), 0.5 * (high - low))), 0.0
+    return solid_of(field, between=(low, high)), 0.0
+
+
+def ends_of_solid(field: Field, solid: Any, level: float | None) -> tuple[float, float]:
+    """The values (low, high) between which a solid is, given as such.
+
+    Raises:
+        ValueError, TypeError: as `region_of`.
+    """
+    if solid is True:
+        raise ValueError(
+            f"solid=True is for solids, and a {type(field).__name__} has two sides: give "
+            "solid=(low, high), the values inside, such as solid=(-math.inf, 0.0)"
+        )
     if level is not None:
         raise ValueError("give either level or solid: the ends of a solid are its levels")
     try:
@@ -378,13 +402,7 @@ def region_of(field: Field, solid: Any, level: float | None) -> tuple[Solid, flo
     if not low < high or not (math.isfinite(low) or math.isfinite(high)):
         raise ValueError(f"solid must be (low, high) with low < high, one finite, not {solid}")
     field.check_levels(tuple(one for one in (low, high) if math.isfinite(one)))
-    if low == -math.inf:
-        return solid_of(field, below=high), 0.0
-    if high == math.inf:
-        return solid_of(field, above=low), 0.0
-    if field.period is not None:
-        return solid_of(field, around=(0.5 * (low + high), 0.5 * (high - low))), 0.0
-    return solid_of(field, between=(low, high)), 0.0
+    return low, high
 
 
 def mesh_solid(

@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from harnack.geometry import Volume
     from harnack.tree.cells import OccupiedCells
 
-__all__ = ["winding_box", "winding_cells", "winding_extent"]
+__all__ = ["WindingModuloOne", "winding_box", "winding_cells", "winding_extent"]
 
 # The most cells that are tested in one round for an extent, and how often the box is halved.
 _MOST_CELLS = 20_000
@@ -68,7 +68,7 @@ class WindingField(Protocol):
         ...
 
 
-class _WindingModuloOne(Field):
+class WindingModuloOne(Field):
     """A winding number modulo 1: continuous off the singular edges, also across sheets.
 
     winding: the field. The promises of its samples are about its lift, with all jumps taken out;
@@ -94,7 +94,7 @@ def winding_cells(
     winding: WindingField, extent: Volume, levels: tuple[float, ...]
 ) -> OccupiedCells:
     """Cells over an extent, empty where w modulo 1 is proved to stay off the levels."""
-    return occupied_cells(_WindingModuloOne(winding), levels, extent, _ACROSS)
+    return occupied_cells(WindingModuloOne(winding), levels, extent, _ACROSS)
 
 
 def winding_extent(
@@ -114,7 +114,7 @@ def winding_extent(
     corners = mesh.vertices[mesh.faces].reshape(-1, 3)
     lower, upper = box.bounds()
     return tight_extent(
-        _WindingModuloOne(winding), levels, lower, upper, _MOST_CELLS, _FINEST, corners
+        WindingModuloOne(winding), levels, lower, upper, _MOST_CELLS, _FINEST, corners
     )
 
 

@@ -1,0 +1,255 @@
+"""Functions of which only the signs count: values at points, and where segments meet the level.
+
+What is real-valued has a sign at every point, whether or not it is continuous: winding numbers
+jump at triangles and are known up to an error, potentials of dipoles are infinite at points, and
+Newton's method is at a loss with both. Here a segment whose ends have different signs is halved, by
+values alone, and what is left of it is intersected with the sheets of the field, such as triangles.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import numpy as np
+
+from harnack.backend import BoolArray, FloatArray, choose_backend
+from harnack.enclosures import TargetLevels
+from harnack.fields.batch import BatchedField
+from harnack.fields.blobs.blobs import Blobs
+from harnack.fields.blobs.hrbf import HRBF
+from harnack.fields.clearance import distance_below
+from harnack.fields.points import in_batches
+from harnack.fields.sheets import NO_SHEET, Crossing
+from harnack.fields.solid_angles.winding_number import WindingModuloOne, WindingNumber
+from harnack.meshing.edges import dots, lengths
+from harnack.meshing.samples import LevelFunction, Samples
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Precision, Real, Vec3
+    from harnack.fields import Field
+
+__all__ = ["SignFunction", "is_meshed_by_signs"]
+
+# How often a segment is halved before it is intersected with sheets; and how often a smooth
+# function is evaluated along it, in turn where the secant meets the level and in the middle.
+_HALVINGS, _STEPS = 4, 8
+# A part of what is left of a segment that is looked at beyond both of its ends.
+_BEYOND = 1e-6
+# Single precision is used where it tells this many points apart along a cell.
+_STEPS_IN_CELL = 1000
+
+
+def is_meshed_by_signs(field: Field) -> bool:
+    """Whether a field is meshed by its signs: sums over meshes, points and blobs, whose values cost
+    little and whose promises reach no farther than to the next point."""
+    return isinstance(field, BatchedField | Blobs | HRBF)
+
+
+@dataclass
+class SignFunction(LevelFunction):
+    """side (f - level), of a real-valued field, by its values at points.
+
+    side: 1, or -1 for a function that is negative where f is above the level.
+    precision: of values. Crossings of sheets are found in double precision.
+    """
+
+    side: float = dataclasses.field(default=1.0, kw_only=True)
+    precision: Precision = dataclasses.field(default="double", kw_only=True)
+
+    def __post_init__(self) -> None:
+        self._clearances: list[Callable[[FloatArray], FloatArray]] = []
+
+    @classmethod
+    def of(
+        cls,
+        field: Field,
+        level: float,
+        box: tuple[FloatArray, FloatArray],
+        spacing: float,
+        *,
+        side: float = 1.0,
+        most_faces: int,
+    ) -> SignFunction:
+        """In single precision where that tells points of a cell in the box apart."""
+        far = float(np.abs(box).max())
+        is_near = far * 2.0**-24 * _STEPS_IN_CELL < spacing
+        precision: Precision = "single" if is_near else "double"
+        return cls(field, level, side=side, precision=precision, most_faces=most_faces)
+
+    def wrapped(self, value: FloatArray) -> FloatArray:
+        return self.side * (np.asarray(value, np.float64) - self.level)
+
+    def values(self, points: FloatArray) -> FloatArray:
+        self.evaluations += len(points)
+        return self.wrapped(self.field.value(points, precision=self.precision))
+
+    def at(self, points: FloatArray) -> Samples:
+        """The function at points (n, 3). Of a field with sheets the gradient is given as 0, since
+        it does not say how far the level is."""
+        none = np.zeros(len(points))
+        if self.field.has_sheets:
+            return Samples(self.values(points), np.zeros((len(points), 3)), none)
+        self.evaluations += len(points)
+        if isinstance(self.field, BatchedField):
+            value, gradient = self.field.value_and_gradient(points, precision=self.precision)
+        else:
+            backend = choose_backend(self.precision)
+            prepared = self.field.prepare(backend)
+
+            def both(p: Vec3) -> tuple[Real, Vec3]:
+                sample = prepared.evaluate(p)
+                return sample.value, sample.gradient
+
+            value, gradient = in_batches(backend, both, points)
+        return Samples(self.wrapped(value), self.side * np.asarray(gradient, np.float64), none)
+
+    def undecided(self, points: FloatArray, value: FloatArray) -> int:
+        """At how many of some points, with the function's values, its error leaves the sign
+        open."""
+        if not isinstance(self.field, BatchedField):
+            return 0
+        scale = float(np.median(np.abs(value))) if len(value) else 0.0
+        near = np.abs(value) < 1e-2 * scale
+        if not near.any():
+            return 0
+        error = self.field.error_bound(points[near], precision=self.precision)
+        return int((np.abs(value[near]) <= error).sum())
+
+    def clearance(self, points: FloatArray) -> FloatArray:
+        """(n,) no point of the level set is nearer: see `distance_below`. Of a winding number
+        modulo 1, which has no jumps and needs coarse samples alone, and from its triangles."""
+        self.evaluations += len(points)
+        if not self._clearances:
+            self._clearances = _clearances(self.field, self.level, self.precision)
+        found = [one(points) for one in self._clearances]
+        return np.min(found, axis=0)
+
+    def crossings(self, low: FloatArray, high: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Where segments between points (n, 3), at which the function is not positive and positive,
+        meet the level: points (n, 3), and unit normals there towards where the function grows.
+
+        They lie on sheets where the function changes its sign by a jump, to rounding.
+        """
+        if not len(low):
+            return low.copy(), low.copy()
+        way = high - low
+        t = np.zeros(len(low))
+        normal, is_on_sheet = np.zeros_like(low), np.zeros(len(low), np.bool_)
+        if self.field.has_sheets:
+            first, last = self._halved(low, way)
+            t, normal, is_on_sheet = self._on_sheets(low, way, first, last)
+            rows = np.flatnonzero(~is_on_sheet)
+            t[rows] = self._roots(low[rows], way[rows], first[rows], last[rows], 2)
+        else:
+            t = self._roots(low, way, t, t + 1, _STEPS)
+        x = low + t[:, None] * way
+        smooth = np.flatnonzero(~is_on_sheet)
+        normal[smooth] = self._slopes(x[smooth], way[smooth])
+        down = is_on_sheet & (dots(normal, way) < 0)
+        normal[down] *= -1
+        return x, normal / np.maximum(lengths(normal), 1e-300)[:, None]
+
+    def _slopes(self, x: FloatArray, way: FloatArray) -> FloatArray:
+        """(n, 3) gradients at points; where there is none, the way that leads up."""
+        if not len(x):
+            return x
+        self.evaluations += len(x)
+        given = self.field.gradient(x, precision=self.precision)
+        slope = self.side * np.asarray(given, np.float64)
+        flat = ~np.isfinite(slope).all(axis=1) | ~slope.any(axis=1)
+        slope[flat] = way[flat]
+        return slope
+
+    def _halved(self, start: FloatArray, way: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Ends (n,) of parts of segments, in which the function changes its sign as well."""
+        first, last = np.zeros(len(start)), np.ones(len(start))
+        for _ in range(_HALVINGS):
+            t = 0.5 * (first + last)
+            above = self.values(start + t[:, None] * way) > 0
+            first, last = np.where(above, first, t), np.where(above, t, last)
+        return first, last
+
+    def _roots(
+        self, start: FloatArray, way: FloatArray, first: FloatArray, last: FloatArray, steps: int
+    ) -> FloatArray:
+        """(n,) where the function is 0 between two places of a segment: by turns the secant and the
+        middle are tried, so that what is left is at most half as long with every second step."""
+        if not len(start):
+            return first
+        low, high = (self.values(start + t[:, None] * way) for t in (first, last))
+        for k in range(steps):
+            t = 0.5 * (first + last) if k % 2 else _secant(first, last, low, high)
+            value = self.values(start + t[:, None] * way)
+            above = value > 0
+            first, last = np.where(above, first, t), np.where(above, t, last)
+            low, high = np.where(above, low, value), np.where(above, value, high)
+        return _secant(first, last, low, high)
+
+    def _on_sheets(
+        self, start: FloatArray, way: FloatArray, first: FloatArray, last: FloatArray
+    ) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Where segments first cross a sheet between two places of them (n,), the sheet's normals
+        (n, 3), and whether there is one."""
+        backend = choose_backend("double")
+        field = self.field.prepare(backend)
+        length = lengths(way)
+        ray = way / np.maximum(length, 1e-300)[:, None]
+        room = _BEYOND * (last - first)
+        origin = start + (first - room)[:, None] * way
+        reach = (last - first + 2 * room) * length
+
+        def crossed(o: Vec3, d: Vec3, limit: Vec3) -> tuple[Real, Vec3]:
+            none = backend.Array3f(0)
+            after = Crossing(backend.Float(0), backend.UInt32(NO_SHEET), backend.Float(0), none)
+            found = field.next_crossing(o, d, after, limit.x, backend.Bool(True))
+            return found.t, found.normal
+
+        t, normal = in_batches(backend, crossed, origin, ray, np.column_stack([reach] * 3))
+        is_crossed = np.isfinite(t) & (t <= reach)
+        along = first - room + np.where(is_crossed, t, 0.0) / np.maximum(length, 1e-300)
+        normal = np.where(is_crossed[:, None], normal, 0.0)
+        return along, normal, is_crossed
+
+
+def _secant(first: FloatArray, last: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
+    """Where lines through two values of different signs meet 0; in the middle where values are no
+    numbers."""
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        share = low / (low - high)
+    share = np.where(np.isfinite(share), np.clip(share, 0.0, 1.0), 0.5)
+    return first + share * (last - first)
+
+
+def _clearances(
+    field: Field, level: float, precision: Precision
+) -> list[Callable[[FloatArray], FloatArray]]:
+    """Functions from points (n, 3) to lengths (n,); the least of them is proved."""
+    backend = choose_backend(precision)
+
+    def bound(smooth: Field) -> Callable[[FloatArray], FloatArray]:
+        prepared = smooth.prepare(backend)
+        levels = TargetLevels((dr.opaque(backend.Float, level),), smooth.period)
+
+        def kernel(p: Vec3) -> tuple[Real]:
+            return (distance_below(backend, prepared, levels, p, prepared.evaluate(p)),)
+
+        return lambda points: _numbers(backend, kernel, points)
+
+    if not isinstance(field, WindingNumber):
+        return [bound(field)]
+    sheets = field.prepare(backend)
+
+    def distance(p: Vec3) -> tuple[Real]:
+        return (sheets.distance_to_sheets(p),)
+
+    return [bound(WindingModuloOne(field)), lambda points: _numbers(backend, distance, points)]
+
+
+def _numbers(
+    backend: Backend, kernel: Callable[[Vec3], tuple[Any, ...]], points: FloatArray
+) -> FloatArray:
+    return np.asarray(in_batches(backend, kernel, points, at_once=1 << 18)[0], np.float64)
