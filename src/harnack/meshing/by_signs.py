@@ -47,6 +47,9 @@ __all__ = ["SignSurface", "sign_surface", "signed_surface"]
 _FROM_ENDS = 1e-4
 # How often edges are cut; and how often triangles that pass through others are made flat again.
 _ROUNDS, _MOST_REPAIRS = 2, 12
+# A round that would cut more than this part of the edges that the last one cut, or of the faces, is
+# not made: the surface is rough at every scale.
+_ENDS = 0.5
 # Neighbors lie on each other if the cosine between their normals is less than this.
 _FOLDED = -0.99999
 # Slivers and flat places are left out within this part of the tolerance, and this one of a cell.
@@ -174,11 +177,13 @@ def sign_surface(
     report(f"{len(first.faces):,} triangles, {len(faces):,} without slivers")
     flat = x
     bent = np.zeros(len(x), np.bool_)
+    before = len(faces)
     for round_number in range(_ROUNDS):
         report(f"refining, round {round_number + 1}: {len(faces):,} triangles")
         cut = _Cut.of(function, x, normals, bent, faces, tolerance)
-        if not len(cut.points):
+        if not len(cut.points) or len(cut.points) > _ENDS * before:
             break
+        before = len(cut.points)
         check_count(len(faces) + 2 * len(cut.points), function.most_faces)
         one, other = (flat[cut.ends[:, k]] for k in (0, 1))
         feet = one + cut.share[:, None] * (other - one)

@@ -49,6 +49,8 @@ _ACROSS = 24
 _ATTEMPTS = 6
 # How often if all may be made anew instead; and cells across the mesh then.
 _FEW_ATTEMPTS = 3
+# Meshes with more open edges than that, or than this part of their faces, are made anew at once.
+_MOST_OPEN, _MOST_OPEN_PART = 4000, 0.5
 _ACROSS_ANEW = 48
 # How often edges of holes that are too near to others are halved for the tetrahedra.
 _MOST_CUTS = 12
@@ -175,6 +177,11 @@ def _kept(
     if not len(edges):
         nothing = _Patches(vertices[:0], faces[:0], True, 0.0, 0)
         return _joined(vertices, faces, nothing, len(faces))
+    if attempts < _ATTEMPTS and len(edges) > min(_MOST_OPEN, _MOST_OPEN_PART * len(faces)):
+        raise MeshError(
+            f"{len(edges):,} edges of {len(faces):,} faces are open, too many for patches that all "
+            'end there, unless keep="all" asks for them'
+        )
     asked = _Asked(len(faces), tolerance, spacing, seed, attempts, report)
     try:
         return _repaired(vertices, faces, edges, asked)
