@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from harnack.backend.numbers import refuses_derivatives
 from harnack.cluster.lazy import is_lazy
 from harnack.cluster.packing import load_module
 from harnack.cluster.workers import as_client
@@ -18,6 +19,7 @@ from harnack.progress import Advance, progress_bar
 _MARK = "harnack"
 
 
+@refuses_derivatives
 def to_zarr(
     array: Any,
     path: str | os.PathLike[str],
