@@ -217,12 +217,17 @@ class Seen:
     def from_numbers(cls, mi: Any, numbers: Mapping[str, npt.NDArray[Any]]) -> Seen:
         """From what `numbers` gave, here or in another process."""
         empty = vars(cls.nothing(mi, 0))
-        return cls(**{name: _of_numbers(type(kind), numbers[name]) for name, kind in empty.items()})
+        return cls(
+            **{name: _of_numbers(mi, type(kind), numbers[name]) for name, kind in empty.items()}
+        )
 
 
-def _of_numbers(kind: Any, numbers: npt.NDArray[Any]) -> Any:
-    """A Dr.Jit array of a type, from numbers (n,) or (n, 3)."""
-    return kind(np.ascontiguousarray(numbers.T))
+def _of_numbers(mi: Any, kind: Any, numbers: npt.NDArray[Any]) -> Any:
+    """A Dr.Jit array of a type, from numbers (n,) or (n, 3). Kernels depend on the alignment."""
+    if dr.is_mask_v(kind):
+        return kind(np.ascontiguousarray(numbers))
+    columns = numbers.reshape(len(numbers), -1).T
+    return kind(*(aligned(mitsuba_backend(mi), one) for one in columns))
 
 
 class Shading:
@@ -378,11 +383,13 @@ def _nearest_sky(mi: Any, seen: Seen, row: Any, position: FloatArray, sky: Float
     sample's pixel among those that were chosen."""
     nearest, found = mi.Float(dr.inf), mi.Float(1)
     for k in range(position.shape[1]):
-        there = dr.gather(mi.Vector3f, _of_numbers(mi.Vector3f, position[:, k]), row)
+        there = dr.gather(mi.Vector3f, _of_numbers(mi, mi.Vector3f, position[:, k]), row)
         away = dr.norm(there - seen.position)
         nearer = away < nearest  # not where NaN: nothing is there
         nearest = dr.select(nearer, away, nearest)
-        found = dr.select(nearer, dr.gather(mi.Float, _of_numbers(mi.Float, sky[:, k]), row), found)
+        found = dr.select(
+            nearer, dr.gather(mi.Float, _of_numbers(mi, mi.Float, sky[:, k]), row), found
+        )
     return found
 
 
