@@ -165,7 +165,7 @@ def visible_sky(mi: Any, position: Any, normal: Any, width: Any, size: tuple[int
 
 
 # Rays of one band.
-RAYS_A_BAND = 2**17
+_RAYS_A_BAND = 2**17
 # Where in its pixel the first ray goes through.
 _MIDDLE = 0.5
 # The share of the time that is spent on the first rays, as the progress bar guesses.
@@ -405,7 +405,7 @@ def shaded(
     mi, order, size = shading.mi, shading.order, shading.size
     count = len(order)
     seen = Seen.nothing(mi, count)
-    parts = hands.cut(count, RAYS_A_BAND)
+    parts = hands.cut(count, _RAYS_A_BAND)
     for (start, stop), part in zip(parts, hands.each("look", parts), strict=True):
         dr.scatter(seen, part, uploaded(mi, order[start:stop]))
         dr.eval(seen)
@@ -419,7 +419,7 @@ def shaded(
     again |= to_numpy(seen.marked)
     edges = order[again[order]] if shading.refines else order[:0]
     pixels = image.reshape(-1, 4)
-    at_once = max(1, RAYS_A_BAND // max(1, len(shading.offsets)))
+    at_once = max(1, _RAYS_A_BAND // max(1, len(shading.offsets)))
     chosen = [edges[start:stop] for start, stop in hands.cut(len(edges), at_once)]
     around = ((one, *shading.around(one, seen.position, sky)) for one in chosen)
     for one, (color, gone) in zip(chosen, hands.each("refine", list(around)), strict=True):
