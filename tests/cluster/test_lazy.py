@@ -95,10 +95,11 @@ def refused(points: Any, directions: Any) -> list[tuple[Callable[[], Any], str]]
         (lambda: POLYGON.value(points[points[:, 0] > 0]), "compute_chunk_sizes"),
         (lambda: hk.trace(POLYGON, points, directions[:7]), "directions has 7 entries"),
         (lambda: hk.trace(POLYGON, points, directions, level=da.ones(2)), "level cannot be a Dask"),
+        (lambda: POLYGON.value(da.zeros(())), r"points must have shape .*, not \(\)"),
     ]
 
 
-@pytest.mark.parametrize("which", range(7))
+@pytest.mark.parametrize("which", range(8))
 def test_wrong_arrays_are_refused_by_name(which: int, points: Any, directions: Any) -> None:
     call, message = refused(points, directions)[which]
     with pytest.raises((TypeError, ValueError), match=message):
@@ -141,6 +142,14 @@ def test_zeros_are_written_too(points: Any, tmp_path: Path) -> None:
     """Zarr leaves out chunks of zeros unless told not to; they would be computed again."""
     hk.to_zarr(da.zeros(40, chunks=10), tmp_path / "z.zarr", progress=False)
     assert len(list((tmp_path / "z.zarr" / "c").iterdir())) == 4
+
+
+@zarr_only
+def test_blocks_without_rows_need_no_chunk(tmp_path: Path) -> None:
+    for k, lengths in enumerate([(0,), (20, 0)]):
+        points = da.from_array(POINTS[: sum(lengths)], chunks=(lengths, 3))
+        found = hk.to_zarr(POLYGON.value(points), tmp_path / f"{k}.zarr", progress=False)
+        np.testing.assert_array_equal(found[:], POLYGON.value(POINTS[: sum(lengths)]))
 
 
 @zarr_only

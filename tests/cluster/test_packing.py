@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+import importlib
+import os
 import pickle
+import subprocess
+import sys
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -94,3 +100,94 @@ def test_moved_clouds_take_their_tree_with_them() -> None:
 
 def test_curves_are_small() -> None:
     assert len(Packed.of(hk.SolidAngle(shapes.wavy_polygon(24)), "test").data) < 3000
+
+
+PROGRAM = """
+import harnack as hk
+from harnack.cluster.packing import name_of
+
+class Doubled(hk.Sphere):
+    names = frozenset(["one", "two", "three"])
+
+    def value(self, *points, **settings):
+        return 2 * super().value(*points, **settings)
+
+    def another(self):
+        return Doubled(3.0)
+
+factor = 3.0
+def helper(x):
+    return factor * x if x in {"a", "b", "c"} else helper(x)
+print(name_of([Doubled(1.0), lambda x: helper(x), {"a", "b", "c"}], "test"))
+"""
+
+
+def test_programs_find_what_they_did_when_they_are_started_again(tmp_path: Path) -> None:
+    """Also with a comment more, which moves all lines. Another program finds nothing of it."""
+    said: list[str] = []
+    for k, text in enumerate((PROGRAM, "# more\n" + PROGRAM, PROGRAM.replace("2 *", "4 *"))):
+        (tmp_path / "program.py").write_text(text)
+        given = [sys.executable, str(tmp_path / "program.py")]
+        env = {**os.environ, "PYTHONHASHSEED": str(k)}
+        said.append(subprocess.run(given, env=env, capture_output=True, check=True).stdout.decode())
+    assert said[0] == said[1] != said[2]
+
+
+def test_modules_of_users_are_sent_as_they_are_here(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A worker may not have them, or as they were before they were changed. What they use may have
+    a lock."""
+    text = """from functools import cached_property
+import harnack as hk
+class Mine(hk.Sphere):
+    @cached_property
+    def factor(self):
+        return 2.0
+    def value(self, *points, **settings):
+        return self.factor * super().value(*points, **settings)
+"""
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    names: list[str] = []
+    for factor in (2.0, 30.0):
+        (tmp_path / "of_a_user.py").write_text(text.replace("2.0", str(factor)))
+        packed = Packed.of(importlib.import_module("of_a_user").Mine(1.0), "test")
+        names.append(packed.name)
+        del sys.modules["of_a_user"]
+        (tmp_path / "of_a_user.py").unlink()
+        importlib.invalidate_caches()
+        there = packed.open()
+        assert there.value(np.zeros((1, 3))) == -factor
+        assert there.factor is there.factor
+    assert names[0] != names[1]
+
+
+def test_files_count_by_what_is_in_them(tmp_path: Path) -> None:
+    file = tmp_path / "wood.png"
+    file.write_bytes(b"brown")
+    for described in ({"type": "bitmap", "filename": str(file)}, [file]):
+        file.write_bytes(b"brown")
+        packed = Packed.of(described, "test")
+        assert packed.open() == described
+        file.write_bytes(b"green")
+        changed = Packed.of(described, "test")
+        assert changed.name != packed.name
+        missing = Packed.of(described, "test again")
+        file.unlink()
+        with pytest.raises(ValueError, match=r"wood.png is not here"):
+            replace(missing, name="0" * 32).open()
+
+
+def test_other_versions_open_nothing() -> None:
+    with pytest.raises(RuntimeError, match=r"sent by harnack 0\.0, and here is harnack .*drjit"):
+        replace(Packed.of(3, "test"), made_by="harnack 0.0").open()
+
+
+def test_what_users_do_not_compare_is_sent() -> None:
+    @dataclass(frozen=True)
+    class Named:
+        radius: float = field(default=1.0, compare=False)
+
+    assert Packed.of(Named(2.0), "test").open().radius == 2
+    assert name_of(Named(2.0), "test") != name_of(Named(3.0), "test")

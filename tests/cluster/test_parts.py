@@ -268,3 +268,19 @@ def test_other_processors_are_told_of(client: Any, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr("harnack.cluster.workers.fingerprint", lambda: "another")
     with pytest.warns(UserWarning, match="round differently"), crew(client):
         pass
+
+
+def test_workers_that_came_late_are_told_of(client: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("harnack.cluster.parts.worker_threads", lambda _: {})
+    monkeypatch.setattr("harnack.cluster.parts.fingerprint", lambda: "another")
+    with pytest.warns(UserWarning, match=r"processors of tcp://.* round differently"):
+        list(Crew(client).each(Squares(), "square", [(2,)]))
+
+
+def test_a_lost_scheduler_is_told(client: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    def lost() -> None:
+        raise OSError("Connection reset by peer")
+
+    monkeypatch.setattr(client, "nthreads", lost)
+    with pytest.raises(RuntimeError, match="the scheduler was lost"):
+        list(Crew(client).each(Squares(), "square", [(2,)]))

@@ -89,6 +89,8 @@ def _alike(array: Any, lazy: dict[str, Any], others: Mapping[str, Any]) -> dict[
         ValueError: their lengths differ or are not known.
     """
     first, main = next(iter(lazy.items()))
+    if main.ndim == 0:
+        raise ValueError(f"{first} must have shape (n, 3) or (n,), not ()")
     if any(np.isnan(one) for one in main.chunks[0]):
         raise ValueError(
             f"{first}: the lengths of its blocks are not known; call its method "

@@ -14,7 +14,7 @@ import warnings
 import zipfile
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,14 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.cluster.packing import Packed, load_module, name_of
-from harnack.cluster.workers import alone, as_client, worker_threads
+from harnack.cluster.workers import (
+    SCHEDULER_LOST,
+    alone,
+    as_client,
+    fingerprint,
+    warn_of_rounding,
+    worker_threads,
+)
 from harnack.files.file_format import check_writable, write_atomically
 
 Arrays = dict[str, npt.NDArray[Any]]
@@ -184,6 +191,7 @@ class _There:
         self.scheduler_lost = load_module("distributed.client", "client").FuturesCancelledError
         self.done = distributed.as_completed(loop=client.loop)
         self.names: dict[Any, str] = {}
+        self.looked_at = set(worker_threads(client))
         # As a task and not as data in a worker's memory, which would be lost with that worker.
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="Sending large graph")
@@ -204,18 +212,20 @@ class _There:
         self._wait()
         future = next(self.done)
         try:
-            arrays: Arrays = future.result()
+            arrays, worker, rounding = future.result()
         except self.worker_lost as error:
             raise RuntimeError(
                 f"several workers were lost while they did one part ({error}): it may need more "
                 "memory than they have. Cut the task into more parts (tiles=), or give them more"
             ) from None
         except (asyncio.CancelledError, self.scheduler_lost):
-            raise RuntimeError(
-                "the scheduler was lost, or somebody cancelled what this task waits for"
-            ) from None
+            raise RuntimeError(SCHEDULER_LOST) from None
         name = self.names.pop(future)
         future.release()
+        if worker not in self.looked_at:
+            self.looked_at.add(worker)
+            if rounding != fingerprint():
+                warn_of_rounding([worker])
         return name, arrays
 
     def _wait(self) -> None:
@@ -239,8 +249,12 @@ class _There:
     def end(self) -> list[tuple[str, Arrays]]:
         """Forget what is not done; what is done and nobody asked for."""
         ready = [one for one in self.names if one.status == "finished"]
-        self.client.cancel([one for one in self.names if one.status != "finished"])
-        found = [(self.names[one], one.result(timeout=_ALONE)) for one in ready]
+        found: list[tuple[str, Arrays]] = []
+        # Without a scheduler there is nobody to ask; what is raised already says so.
+        with suppress(OSError, TimeoutError, asyncio.CancelledError, self.scheduler_lost):
+            self.client.cancel([one for one in self.names if one.status != "finished"])
+            for one in ready:
+                found.append((self.names[one], one.result(timeout=_ALONE)[0]))
         self.names.clear()
         self.packed.release()
         return found
@@ -297,8 +311,8 @@ def _same(packed: Packed) -> Packed:
     return packed
 
 
-def _done(packed: Packed, step: str, part: tuple[Any, ...]) -> Arrays:
-    """A part, done by this worker."""
-    with alone():
+def _done(packed: Packed, step: str, part: tuple[Any, ...]) -> tuple[Arrays, str, str]:
+    """A part, done by this worker; the worker's address, and its `fingerprint`."""
+    with alone() as address:
         do: Step = getattr(packed.open(), step)
-        return do(*part)
+        return do(*part), address, fingerprint()

@@ -7,7 +7,7 @@ import hashlib
 import importlib.metadata
 import sys
 import warnings
-from collections.abc import Generator
+from collections.abc import Generator, Iterable
 from contextlib import contextmanager, suppress
 from typing import Any
 
@@ -15,12 +15,11 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import choose_backend, to_numpy
-from harnack.cluster.packing import load_module
+from harnack.cluster.packing import load_module, packages
 
 # How long to wait for a scheduler.
 _PATIENCE = "10s"
-# Bits of kernels and of pictures depend on these.
-_PACKAGES = ("drjit", "mitsuba", "numpy")
+SCHEDULER_LOST = "the scheduler was lost, or somebody cancelled what this task waits for"
 _INSTALL = "install the same there as here, such as by pip install 'harnack[cluster]=={version}'"
 
 
@@ -29,7 +28,7 @@ def connected(client: Any) -> Generator[Any]:
     """A Dask client, given as one or by the address of a scheduler, all of whose workers can work.
     What was opened here is closed when the block ends.
 
-    Workers that come later are looked at when they get their first task.
+    Workers that come later are looked at when they get a task: by `alone` and `Packed.open`.
 
     Raises:
         ModuleNotFoundError: Dask is not installed.
@@ -72,9 +71,9 @@ def as_client(client: Any) -> Generator[Any]:
 
 
 @contextmanager
-def alone() -> Generator[None]:
+def alone() -> Generator[str]:
     """Lets one task at a time compute in this process, as Dr.Jit itself uses all threads that a
-    worker has.
+    worker has. Yields the address of the worker that this is, "" for none.
 
     Raises:
         RuntimeError: it is a worker that cannot work.
@@ -91,12 +90,19 @@ def alone() -> Generator[None]:
     if worker is not None:
         take_threads(worker.nanny is not None, worker.state.nthreads)
     with load_module("dask.utils", "client").SerializableLock("harnack"):
-        yield
+        yield "" if worker is None else worker.address
 
 
 def worker_threads(client: Any) -> dict[str, int]:
-    """The threads of each worker, by its address."""
-    found: dict[str, int] = client.nthreads()
+    """The threads of each worker, by its address.
+
+    Raises:
+        RuntimeError: the scheduler is gone.
+    """
+    try:
+        found: dict[str, int] = client.nthreads()
+    except OSError:
+        raise RuntimeError(SCHEDULER_LOST) from None
     return found
 
 
@@ -122,11 +128,16 @@ def _check_workers(client: Any) -> None:
             )
     strange = [address for address, state in states.items() if state[1] != fingerprint()]
     if strange:
-        warnings.warn(
-            f"the processors of {', '.join(sorted(strange))} round differently from this one: "
-            "results are right, but not the same bit for bit as without them",
-            stacklevel=3,
-        )
+        warn_of_rounding(strange)
+
+
+def warn_of_rounding(workers: Iterable[str]) -> None:
+    """Say that the processors of workers, given by their addresses, round differently."""
+    warnings.warn(
+        f"the processors of {', '.join(sorted(workers))} round differently from this one: "
+        "results are right, but not the same bit for bit as without them",
+        stacklevel=4,
+    )
 
 
 def _state(dask_worker: Any = None) -> tuple[str, str]:
@@ -147,17 +158,17 @@ def take_threads(has_nanny: bool, threads: int) -> None:
         dr.set_thread_count(threads)
 
 
-def packages() -> str:
-    """Versions of the packages on which the bits of results depend."""
-    return ", ".join(f"{name} {importlib.metadata.version(name)}" for name in _PACKAGES)
-
-
 def fingerprint() -> str:
     """What this machine makes of some numbers, the same where kernels give the same bits."""
-    backend = choose_backend()
-    x = dr.linspace(backend.Float, 0.01, 40, 4096)
+    name = choose_backend().name
+    return f"{name} {_rounding(name)}"
+
+
+@functools.cache
+def _rounding(_name: str) -> str:
+    x = dr.linspace(choose_backend().Float, 0.01, 40, 4096)
     s, c = dr.sincos(x)
     results = (dr.rcp(x), dr.rsqrt(x), s, c, dr.exp(-x), dr.log(x), dr.fma(s, c, x), dr.sqrt(x),
                dr.atan2(s, x), x / c)  # fmt: skip
     numbers = np.concatenate([to_numpy(one) for one in results])
-    return f"{backend.name} {hashlib.blake2b(numbers.tobytes(), digest_size=8).hexdigest()}"
+    return hashlib.blake2b(numbers.tobytes(), digest_size=8).hexdigest()

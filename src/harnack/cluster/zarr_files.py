@@ -55,7 +55,10 @@ def to_zarr(
     target = Path(path).resolve()
     file = _zarr_file(zarr, array, target)
     missing = [
-        index for index in np.ndindex(*array.numblocks) if not _chunk(file, target, index).exists()
+        index
+        for index in np.ndindex(*array.numblocks)
+        if all(one.stop > one.start for one in _places(array, index))
+        and not _chunk(file, target, index).exists()
     ]
     blocks = array.to_delayed()
     write = dask.delayed(_write, pure=False)
