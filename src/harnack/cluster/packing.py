@@ -284,11 +284,11 @@ def _naming(base: Any) -> Callable[..., Any]:
                 return kind.__name__, sorted(name_of(one, self.what) for one in members)
             if not isinstance(obj, str | os.PathLike):
                 return None
-            path = os.fspath(cast("str | os.PathLike[str]", obj))
+            path = os.fsdecode(cast("str | os.PathLike[str]", obj))
             suffix = os.path.splitext(path)[1]
             if not suffix or suffix in _CODE or (contents := _contents(path)) is None:
                 return None
-            self.files[str(path)] = contents
+            self.files[path] = contents
             return f"file {contents}"
 
         def reducer_override(self, obj: Any) -> Any:
