@@ -32,18 +32,34 @@ def test_rounding_of_a_product_grows_with_its_factors() -> None:
     assert error > 20 * UNIT * (16 + np.sqrt(count))
 
 
-def test_rounding_of_a_sum_is_counted_term_by_term() -> None:
-    """Terms that are lost in a sum of 1; what cancels later is counted; adding 0 is exact."""
+def test_terms_that_are_lost_in_a_sum_are_found_again() -> None:
+    """Each is less than a rounding of the sum, so that the total alone would stay where it was."""
     backend = choose_backend("single")
     sums = FieldSums.zero(backend, dr.inf, 0).plus(Terms(backend.Float(1)), True)
-    first = float(sums.rounding[0])
     for _ in range(200):
         sums = sums.plus(Terms(backend.Float(0.99 * UNIT)), True)
         sums = sums.plus(Terms(backend.Float(0)), True).plus(Terms(backend.Float(5)), False)
-    lost = 200 * 0.99 * UNIT - float(sums.value[0] - 1)
-    assert 0.3 * (float(sums.rounding[0]) - first) < lost <= float(sums.rounding[0])
+    bound = float(sums.rounding[0]) + UNIT
+    assert abs(float(sums.value[0]) - (1 + 200 * 0.99 * UNIT)) <= 2 * UNIT
+    assert abs(float(sums.total[0]) - (1 + 200 * 0.99 * UNIT)) > 2 * bound
     back = sums.plus(Terms(backend.Float(-1)), True)
-    assert float(back.rounding[0]) >= float(sums.rounding[0])
+    assert abs(float(back.value[0]) / (200 * 0.99 * UNIT) - 1) < 1e-5
+
+
+def test_the_value_of_a_long_sum_is_within_its_bound() -> None:
+    """3,000 terms of both signs and of all sizes, on 300 lanes."""
+    backend, rng = choose_backend("single"), np.random.default_rng(1)
+    terms = rng.normal(size=(3000, 300)) * 10.0 ** rng.uniform(-6, 1, (3000, 300))
+    terms = terms.astype(np.float32)
+    sums = FieldSums.zero(backend, dr.inf, 0)
+    for k, row in enumerate(terms):
+        sums = sums.plus(Terms(backend.Float(row)), True)
+        if k % 20 == 0:
+            dr.eval(sums.total, sums.lost, sums.rounding)
+    exact = terms.astype(float).sum(axis=0)
+    bound = sums.rounding.numpy() + UNIT * np.abs(exact)
+    assert (np.abs(sums.value.numpy() - exact) <= bound).all()
+    assert (np.abs(sums.total.numpy() - exact) > UNIT * np.abs(exact)).mean() > 0.9
 
 
 def test_error_of_a_curve_covers_single_precision() -> None:

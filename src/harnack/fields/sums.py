@@ -54,8 +54,8 @@ def remainder_factor(q: float) -> float:
 
 def last_roundings(backend: Backend, size: float = 1.0) -> Real:
     """A bound of what rounds a sum after its last term: 16 roundings of numbers of this size. What
-    the terms and their addition lose is counted term by term (`FieldSums.plus`). A kernel
-    parameter."""
+    the terms lose is counted term by term, and so is what is left of what their addition loses
+    (`FieldSums.plus`). A kernel parameter."""
     return dr.opaque(backend.Float, backend.epsilon * 16 * size)
 
 
@@ -84,7 +84,8 @@ class Terms:
 class FieldSums:
     """Sums of terms of f at points x, and of what bounds them near x.
 
-    value, gradient, hessian: of f, None where they were not asked for.
+    total, gradient, hessian: of f and its derivatives, None where they were not asked for. `value`
+        is better than the total.
     truncation, slope_truncation, second_truncation: bounds of the truncation of value, gradient and
         second derivatives along lines; the last is None without a Hessian.
     rounding: bound of the rounding of the value.
@@ -92,9 +93,10 @@ class FieldSums:
         of the distance to the nearest far node's center if that is less.
     s4, s5: sums of a/rho^4 and a/rho^5 over dipoles of area a at distance rho and, with A + K/r^2
         of `multipole.bend_columns` for a, over far nodes at r. For edges see `LiftedEdge.bounds`.
+    lost: what the additions to the total have lost: see `plus`.
     """
 
-    value: Real
+    total: Real
     gradient: Vec3
     hessian: SymmetricSum | None
     truncation: Real
@@ -104,6 +106,12 @@ class FieldSums:
     free_distance: Real
     s4: Real
     s5: Real
+    lost: Real
+
+    @property
+    def value(self) -> Real:
+        """f, with what the additions have lost."""
+        return self.total + self.lost
 
     @classmethod
     def zero(cls, backend: Backend, free_distance: Real, derivatives: int) -> FieldSums:
@@ -113,21 +121,22 @@ class FieldSums:
         gradient = backend.Array3f(0) if derivatives >= 1 else None
         hessian = SymmetricSum.zero(real) if derivatives == 2 else None
         second = None if hessian is None else zero
-        bounds = zero, zero, second, zero, real(free_distance), zero, zero
+        bounds = zero, zero, second, zero, real(free_distance), zero, zero, zero
         return cls(zero, gradient, hessian, *bounds)
 
     @classmethod
     def of(cls, parts: tuple[Any, ...]) -> FieldSums:
         """The sums with these `parts`."""
-        value, gradient, hessian, *bounds = parts
-        return cls(value, gradient, None if hessian is None else SymmetricSum(*hessian), *bounds)
+        total, gradient, hessian, *bounds = parts
+        return cls(total, gradient, None if hessian is None else SymmetricSum(*hessian), *bounds)
 
     def parts(self) -> tuple[Any, ...]:
         """The attributes in the order of the constructor, for the state of a loop. (Sums that were
         not asked for are None: Dr.Jit records a loop twice if a state in it never changes.)"""
         hessian = None if self.hessian is None else self.hessian.parts()
         bounds = self.truncation, self.slope_truncation, self.second_truncation, self.rounding
-        return self.value, self.gradient, hessian, *bounds, self.free_distance, self.s4, self.s5
+        ends = self.free_distance, self.s4, self.s5, self.lost
+        return self.total, self.gradient, hessian, *bounds, *ends
 
     def where(self, mask: Mask, other: FieldSums) -> FieldSums:
         """The other sums where the mask holds, these elsewhere. Without Hessians."""
@@ -142,11 +151,13 @@ class FieldSums:
     def plus(self, terms: Terms, active: Mask) -> FieldSums:
         """The sums with terms added where active; what they do not have is 0.
 
-        Rounding of the value. fl(s + t) is off by at most u |fl(s + t)|, u half the distance from 1
-        to the next number, so that a sum made term by term is off by at most u times the sum of the
-        absolute values of its partial sums (Higham 2002, Section 4.2), in whatever order a tree is
-        walked. Twice that is added up, because the bound itself is rounded: it loses less than half
-        as long as there are fewer than 2^23 terms. Adding 0 is exact.
+        Rounding of the value. Errors of n additions add up like n, if they are all of one sign, as
+        where small terms are lost in a large sum. But what s = fl(a + b) loses is a number of the
+        same precision, and found exactly (Knuth's TwoSum; Higham 2002, Section 4.3): with c = s - a
+        it is (a - (s - c)) + (b - c). It is at most u |s|, u half the distance from 1 to the next
+        number. These numbers are summed in turn, and that sum is off by at most n u times the sum
+        of their absolute values, hence by n u^2 times the sum of all |s|. Up to n = 2^20 terms n u
+        is at most 1/16, and twice that covers the rounding of the bound itself.
         """
         gradient, hessian = self.gradient, self.hessian
         if gradient is not None and terms.gradient is not None:
@@ -154,14 +165,15 @@ class FieldSums:
         if hessian is not None and terms.hessian is not None:
             pairs = zip(hessian.parts(), terms.hessian.parts(), strict=True)
             hessian = SymmetricSum(*(old + dr.select(active, new, 0) for old, new in pairs))
-        value, rounding = self.value, self.rounding
+        total, lost, rounding = self.total, self.lost, self.rounding
         if terms.value is not None:
             term = dr.select(active, terms.value, 0)
-            value = value + term
-            lost = 2 * float(dr.epsilon(value)) * dr.abs(value)
-            rounding = rounding + dr.select(term != 0, lost, 0)
-        new = {"value": value, "gradient": gradient, "hessian": hessian, "rounding": rounding}
-        return dataclasses.replace(self, **new)
+            total = self.total + term
+            grown = total - self.total
+            lost = lost + ((self.total - (total - grown)) + (term - grown))
+            rounding = dr.fma(float(dr.epsilon(total)) / 8, dr.abs(total), rounding)
+        new = {"total": total, "lost": lost, "rounding": rounding}
+        return dataclasses.replace(self, gradient=gradient, hessian=hessian, **new)
 
     def with_far_node(
         self, terms: Terms, far: Mask, inverse: Real, size: Real, left_out: tuple[Real, Real, Real],

@@ -477,7 +477,7 @@ class LiftedTrails:
         sums = FieldSums.zero(backend, dr.inf, 1)
         return dataclasses.replace(
             sums,
-            value=LiftedProduct(*product).angle(),
+            total=LiftedProduct(*product).angle(),
             gradient=g,
             rounding=rounding,
             free_distance=dr.sqrt(least),

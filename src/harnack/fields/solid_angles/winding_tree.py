@@ -24,7 +24,7 @@ from harnack.fields.clearance import epsilon_at
 from harnack.fields.solid_angles.edge_lift import LiftedEdge, LiftedProduct, LiftedSums
 from harnack.fields.solid_angles.edge_trails import Line, known_along, with_edge_rates
 from harnack.fields.solid_angles.far_clusters import Treecode
-from harnack.fields.sums import FieldSums, Terms, last_roundings
+from harnack.fields.sums import FieldSums, last_roundings
 from harnack.tree.triangles import (
     EDGES,
     INDEX,
@@ -146,8 +146,10 @@ class TreeWinding:
             row: list[Real], active: Mask, sums: FieldSums, own: tuple[Any, ...]
         ) -> tuple[FieldSums, tuple[Any, ...]]:
             t, turn = crossing(row, frame)
-            crossed = Terms(4 * math.pi * turn)
-            lifted = LiftedSums(sums.plus(crossed, active & is_ahead(row, t)), LiftedProduct(*own))
+            # A crossing is a full turn of the product, which counts them without rounding.
+            re, im, turns = own
+            turns = turns + dr.select(active & is_ahead(row, t), turn, 0)
+            lifted = LiftedSums(sums, LiftedProduct(re, im, turns))
             for near in edges_of(row, x, frame):
                 lifted = lifted.plus(near.edge, unit, active & near.is_open(reach))
             return lifted.sums, lifted.product.parts()
