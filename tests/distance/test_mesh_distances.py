@@ -17,27 +17,12 @@ from harnack.geometry import mesh_shapes
 from harnack.tree.nearest import NearestPoint
 from harnack.tree.triangles import triangle_records
 from tests.oracles.direct_sums import winding_sum
+from tests.oracles.mesh_distance import distances_to_triangles
 
 PRECISIONS = ("double", "single")
 
 
 # --- oracles: NumPy in float64, no trees, no rays ----------------------------------------------
-
-
-def distances_to_triangles(x: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """(n, m) from points (n, 3) to triangles (m, 3, 3), one by one."""
-    p, q, r = np.moveaxis(corners, 1, 0)
-    normal = np.cross(q - p, r - p)
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    inside = np.ones((len(x), len(corners)), bool)
-    best = np.full((len(x), len(corners)), np.inf)
-    for a, b in ((p, q), (q, r), (r, p)):
-        edge, away = b - a, x[:, None] - a
-        share = np.clip((away * edge).sum(axis=2) / (edge * edge).sum(axis=1), 0, 1)
-        best = np.minimum(best, np.linalg.norm(away - share[..., None] * edge, axis=2))
-        inside &= (np.cross(edge, away) * normal).sum(axis=2) >= 0
-    height = np.abs(((x[:, None] - p) * normal).sum(axis=2))
-    return np.where(inside, height, best)
 
 
 def distance_to_closed_mesh(

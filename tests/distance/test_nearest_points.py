@@ -17,11 +17,8 @@ from harnack.distance.surface_cells import remainder
 from harnack.fields.look import Sample
 from harnack.geometry import mesh_shapes, shapes
 from tests.distance.test_distance import CURVED, Bare, surface_points, true_distance, unit
-from tests.distance.test_mesh_distances import (
-    beside_faces,
-    distance_to_closed_mesh,
-    distances_to_triangles,
-)
+from tests.distance.test_mesh_distances import beside_faces, distance_to_closed_mesh
+from tests.oracles.mesh_distance import distances_to_triangles
 
 PRECISIONS = ("double", "single")
 

@@ -14,12 +14,13 @@ def signed_distance(x: Any, vertices: Any, faces: Any) -> Any:
     corners = np.asarray(vertices, float)[np.asarray(faces)]
     points = np.asarray(x, float).reshape(-1, 3)
     parts = np.array_split(points, max(1, len(points) * len(corners) // _AT_ONCE))
-    found = [_distance(part, corners) * np.where(_winding(part, corners) > 0.5, -1, 1)
-             for part in parts]  # fmt: skip
+    found = [distances_to_triangles(part, corners).min(axis=1)
+             * np.where(_winding(part, corners) > 0.5, -1, 1) for part in parts]  # fmt: skip
     return np.concatenate(found).reshape(np.shape(x)[:-1])
 
 
-def _distance(x: Any, corners: Any) -> Any:
+def distances_to_triangles(x: Any, corners: Any) -> Any:
+    """(n, m) from points (n, 3) to triangles (m, 3, 3), one by one."""
     p, q, r = np.moveaxis(corners, 1, 0)
     normal = np.cross(q - p, r - p)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -31,7 +32,7 @@ def _distance(x: Any, corners: Any) -> Any:
         best = np.minimum(best, np.linalg.norm(away - share[..., None] * edge, axis=2))
         inside &= (np.cross(edge, away) * normal).sum(axis=2) >= 0
     height = np.abs(((x[:, None] - p) * normal).sum(axis=2))
-    return np.where(inside, height, best).min(axis=1)
+    return np.where(inside, height, best)
 
 
 def _winding(x: Any, corners: Any) -> Any:

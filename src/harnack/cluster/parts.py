@@ -26,7 +26,7 @@ from harnack.cluster.packing import Packed, load_module, name_of
 from harnack.cluster.workers import (
     SCHEDULER_LOST,
     alone,
-    as_client,
+    connected,
     fingerprint,
     warn_of_rounding,
     worker_threads,
@@ -150,13 +150,13 @@ def crew(client: Any = None, checkpoint: Any = None, tiles: int | None = None) -
     """A crew, from the arguments of those who have something done.
 
     Raises:
-        ModuleNotFoundError, TypeError, OSError, RuntimeError: as `as_client` and `Folder.at`.
+        ModuleNotFoundError, TypeError, OSError, RuntimeError: as `connected` and `Folder.at`.
     """
     folder = None
     if checkpoint is not None:
         load_module("cloudpickle", "checkpoint")
         folder = Folder.at(checkpoint)
-    with as_client(client) as one:
+    with connected(client) as one:
         yield Crew(one, folder, tiles)
 
 

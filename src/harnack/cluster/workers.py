@@ -25,8 +25,8 @@ _INSTALL = "install the same there as here, such as by pip install 'harnack[clus
 
 @contextmanager
 def connected(client: Any) -> Generator[Any]:
-    """A Dask client, given as one or by the address of a scheduler, all of whose workers can work.
-    What was opened here is closed when the block ends.
+    """A Dask client, given as one or by the address of a scheduler, all of whose workers can work;
+    None for None. What was opened here is closed when the block ends.
 
     Workers that come later are looked at when they get a task: by `alone` and `Packed.open`.
 
@@ -37,6 +37,9 @@ def connected(client: Any) -> Generator[Any]:
         RuntimeError: a worker has no harnack, another version of it, or no LLVM that Dr.Jit can
             work with. The message names it.
     """
+    if client is None:
+        yield None
+        return
     distributed = load_module("distributed", "client")
     opened = None
     if isinstance(client, str):
@@ -58,16 +61,6 @@ def connected(client: Any) -> Generator[Any]:
     finally:
         if opened is not None:
             opened.close()
-
-
-@contextmanager
-def as_client(client: Any) -> Generator[Any]:
-    """What `connected` yields; None for None."""
-    if client is None:
-        yield None
-        return
-    with connected(client) as one:
-        yield one
 
 
 @contextmanager

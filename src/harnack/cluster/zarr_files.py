@@ -12,7 +12,7 @@ import numpy as np
 from harnack.backend.numbers import refuses_derivatives
 from harnack.cluster.lazy import is_lazy
 from harnack.cluster.packing import load_module
-from harnack.cluster.workers import as_client
+from harnack.cluster.workers import connected
 from harnack.progress import Advance, progress_bar
 
 # The attribute of a Zarr array that says what it holds.
@@ -64,7 +64,7 @@ def to_zarr(
     write = dask.delayed(_write, pure=False)
     tasks = [write(str(target), _places(array, index), blocks[index]) for index in missing]
     part = 1 / max(1, array.npartitions)
-    with progress_bar("writing", progress) as advance, as_client(client) as one:
+    with progress_bar("writing", progress) as advance, connected(client) as one:
         advance(1 - part * len(missing))
         for _ in _computed(one, tasks):
             advance(part)

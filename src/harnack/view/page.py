@@ -97,16 +97,12 @@ def page(
     check_title(title)
     if not target.lower().endswith((".html", ".htm")):
         raise ValueError(f"{target}: a page is written as .html")
-    live = Live.of(what, settings)
+    job = _PageJob(what, settings, register().variant())
     with progress_bar("page", progress) as advance:
-        places = _places(live)
-        job = _PageJob(what, settings, _choices(_framed(places)), register().variant())
-        if client is None and checkpoint is None:
-            vars(job)["live"] = live.framed(job.framed)
         live = job.live
         scene = live.scene(title or live.subject.name)
         with crew(client, checkpoint) as workers:
-            scene["frames"] = _frames(job, places, workers, advance)
+            scene["frames"] = _frames(job, workers, advance)
     text = document(scene, still_of(live)).encode()
     with write_atomically(target) as partial:
         partial.write_bytes(text)
@@ -182,19 +178,27 @@ def _frame(live: Live, values: Mapping[str, float]) -> Plain:
 
 @dataclass(frozen=True)
 class _PageJob:
-    """What the states of a page are made of: as `page` was given it, the choices of places that are
-    framed, and Mitsuba's variant."""
+    """What the states of a page are made of: as `page` was given it, and Mitsuba's variant."""
 
     what: Any
     settings: Mapping[str, Any]
-    framed: list[dict[str, float]]
     variant: str
 
     @functools.cached_property
-    def live(self) -> Live:
+    def given(self) -> Live:
         """What moves."""
         take_variant(self.variant)
-        return Live.of(self.what, dict(self.settings)).framed(self.framed)
+        return Live.of(self.what, dict(self.settings))
+
+    @functools.cached_property
+    def places(self) -> dict[str, list[float]]:
+        """The places of the sliders that the page holds."""
+        return _places(self.given)
+
+    @functools.cached_property
+    def live(self) -> Live:
+        """What moves, framed over these places."""
+        return self.given.framed(_choices(_framed(self.places)))
 
     @functools.cached_property
     def digest(self) -> str:
@@ -218,14 +222,14 @@ class _PageJob:
         return {"text": np.frombuffer(text, np.uint8)}
 
 
-def _frames(job: _PageJob, places: Mapping[str, list[float]], workers: Crew, advance: Any) -> Plain:
+def _frames(job: _PageJob, workers: Crew, advance: Any) -> Plain:
     """The places of the sliders, and what is drawn at each choice of them."""
     frames: list[Plain] = []
-    parts = [(values, job.digest) for values in _choices(places)]
+    parts = [(values, job.digest) for values in _choices(job.places)]
     for found in workers.each(job, "state", parts):
         frames.append(json.loads(found["text"].tobytes()))
         advance(1 / len(parts))
-    return {"places": places, "frames": frames}
+    return {"places": job.places, "frames": frames}
 
 
 def script(*names: str) -> str:
