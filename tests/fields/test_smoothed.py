@@ -121,5 +121,5 @@ def test_smoothing_that_cannot_be(smoothing: float, message: str) -> None:
 def test_normals_that_cancel_each_other_have_no_level() -> None:
     points = np.repeat(noisy_sphere(300, 0.0)[0], 2, axis=0)
     normals = points * np.tile([1.0, -1.0], 300)[:, None]
-    with pytest.raises(CloudError, match="normals cancel each other"):
+    with pytest.raises(CloudError, match="normals cancel each other, or the points lie"):
         hk.DipolePotential(points, normals, smoothing=0.1)

@@ -37,6 +37,8 @@ __all__ = ["CloudError", "estimate_areas", "estimate_normals", "validate_cloud"]
 MAX_POINTS = 100_000_000
 # Points per step: the temporary arrays of one step then stay in the cache of one core.
 _CHUNK = 4096
+# A cell is at most so many times as wide as those of its neighbors may be.
+_LONELY = 3.0
 _REMOVE = "its components must be finite; remove the point"
 
 
@@ -136,6 +138,9 @@ def estimate_areas(
     cell may reach out without end: where all neighbors lie on one side (of a line through the
     point), their mirror images bound the cell too, so that it reaches out as far as in.
 
+    Outliers: a cell ends at three times the median of such radii of its neighbors as well, so that
+    a point far from the others stands for no more than they do.
+
     neighbors: how many; more cost time, fewer cut large cells of uneven samples.
 
     Raises:
@@ -148,13 +153,18 @@ def estimate_areas(
     positions, where = np.unique(welded, return_inverse=True)
     sharing = np.bincount(where)[where]
     tree = point_tree(x[positions])
-    areas = np.empty(len(x))
+    radii, areas = np.empty(len(positions)), np.empty(len(x))
+
+    def reach(part: slice) -> None:
+        radii[part] = 0.5 * nearest_others(tree, tree.data[part], neighbors)[1][:, -1]
 
     def estimate(part: slice) -> None:
         nearest, distance = nearest_others(tree, x[part], neighbors)
         offsets = tree.data[nearest] - x[part, None]
-        areas[part] = _cell_areas(offsets, n[part], 0.5 * distance[:, -1])
+        most = _LONELY * np.median(radii[nearest], axis=1)
+        areas[part] = _cell_areas(offsets, n[part], np.minimum(0.5 * distance[:, -1], most))
 
+    in_parts(reach, len(positions))
     in_parts(estimate, len(x))
     return areas / sharing
 

@@ -24,7 +24,9 @@ from harnack.fields.blobs.hrbf import HRBF
 from harnack.fields.clearance import distance_below
 from harnack.fields.points import in_batches
 from harnack.fields.sheets import NO_SHEET, Crossing
+from harnack.fields.solid_angles.dipole import DipolePotential
 from harnack.fields.solid_angles.winding_number import WindingModuloOne, WindingNumber
+from harnack.meshing.checks import MeshingError
 from harnack.meshing.edges import dots, lengths
 from harnack.meshing.samples import LevelFunction, Samples
 
@@ -41,6 +43,8 @@ _HALVINGS, _STEPS = 4, 8
 _BEYOND = 1e-6
 # Single precision is used where it tells this many points apart along a cell.
 _STEPS_IN_CELL = 1000
+# Points of a cloud at which its value is looked at, and the part of the level that it must have.
+_MOST_PROBES, _LEAST_PART = 2000, 0.1
 
 
 def is_meshed_by_signs(field: Field) -> bool:
@@ -74,7 +78,13 @@ class SignFunction(LevelFunction):
         side: float = 1.0,
         most_faces: int,
     ) -> SignFunction:
-        """In single precision where that tells points of a cell in the box apart."""
+        """In single precision where that tells points of a cell in the box apart.
+
+        Raises:
+            MeshingError: a cloud whose normals do not face outwards, or that encloses nothing.
+        """
+        if isinstance(field, DipolePotential):
+            _check_encloses(field, level)
         far = float(np.abs(box).max())
         is_near = far * 2.0**-24 * _STEPS_IN_CELL < spacing
         precision: Precision = "single" if is_near else "double"
@@ -213,6 +223,28 @@ class SignFunction(LevelFunction):
         along = first - room + np.where(is_crossed, t, 0.0) / np.maximum(length, 1e-300)
         normal = np.where(is_crossed[:, None], normal, 0.0)
         return along, normal, is_crossed
+
+
+def _check_encloses(field: DipolePotential, level: float) -> None:
+    """Raise unless the points lie about where f is half the level of a closed surface: without its
+    own term f is 2 pi at a point of one, and -2 pi where its normals face inwards.
+
+    Where areas are given, points need not stand for a surface.
+    """
+    if field.smoothing or not field.estimated[1] or not level > 0:
+        return
+    step = -(-len(field.points) // _MOST_PROBES)
+    value = float(np.median(field.value(field.points[::step])))
+    if not value > _LEAST_PART * level:
+        fault = (
+            "normals face inwards: turn them around, or mesh level=-2 pi"
+            if value < -_LEAST_PART * level
+            else "normals cancel each other, or the points lie in a plane"
+        )
+        raise MeshingError(
+            f"the points of this {type(field).__name__} enclose nothing: its value at them, each "
+            f"without its own term, is {value:.2g} in the median where 2 pi is right; {fault}"
+        )
 
 
 def _secant(first: FloatArray, last: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:

@@ -233,8 +233,8 @@ class DipolePotential(DetailedField["_DipoleBuffers"], BatchedField):
         level = float(np.median(self.value(self.points[::step], precision="double")))
         if abs(level) < _LEAST_LEVEL:
             raise CloudError(
-                f"normals cancel each other: the smoothed sum is {level:.2g} at the points, where "
-                "it should be about 2 pi; turn them all outwards"
+                f"the smoothed sum is {level:.2g} at the points, where it should be about 2 pi: "
+                "normals cancel each other, or the points lie in a plane and enclose nothing"
             )
         return level
 
