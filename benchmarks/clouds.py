@@ -52,7 +52,8 @@ def clouds(folder: Path | None) -> str:
         "## Meshes of point clouds\n",
         f"Points chosen by chance on meshes, with Gaussian noise of {_NOISE:.1%} of the diagonal "
         "along each axis, and the normals of the mesh or none (then each program estimates them). "
-        "harnack smooths over twice the noise (`smoothing=`), and is else as it comes; Poisson "
+        "harnack smooths over 1.4 sqrt(noise * spacing), the spacing being the root of the area "
+        "over the number of points (`smoothing=`), and is else as it comes; Poisson "
         f"reconstruction has depth {_DEPTH}, the default of both, and is then simplified to "
         "harnack's number of triangles (by Open3D, not timed). Each entry: seconds of CPU time, "
         "Hausdorff's distance from the mesh and the mean distance, both in % of the diagonal, from "
@@ -107,7 +108,8 @@ def _cloud(whole: Arrays, count: int) -> tuple[FloatArray, FloatArray, float]:
     points, faces = trimesh.sample.sample_surface(mesh, count, seed=0)
     noise = _NOISE * _diagonal(whole)
     moved = points + np.random.default_rng(0).normal(0, noise, points.shape)
-    return np.asarray(moved), np.array(mesh.face_normals[faces]), 2 * noise
+    length = 1.4 * math.sqrt(noise * math.sqrt(mesh.area / count))
+    return np.asarray(moved), np.array(mesh.face_normals[faces]), length
 
 
 def _diagonal(whole: Arrays) -> float:

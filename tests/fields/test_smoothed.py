@@ -109,7 +109,7 @@ def test_moved_points_stay_smoothed() -> None:
         (math.inf, "smoothing"),
         ("much", "smoothing"),
         (5.0, r"about 4 across: give one between 2e-05 and 2,"),
-        (1e-9, "such as twice the noise"),
+        (1e-9, "such as the length of the noise"),
     ],
 )
 def test_smoothing_that_cannot_be(smoothing: float, message: str) -> None:

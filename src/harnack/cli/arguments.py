@@ -224,8 +224,8 @@ def _add_file(one: Any) -> Any:
     _add_choice(file, "--normals", ("estimate",), "estimate the normals of a point cloud")
     file.add_argument(
         "--smoothing", type=_positive, metavar="LENGTH",
-        help="even out the noise of a point cloud over such lengths, in its own unit; about twice "
-        "the noise is good",
+        help="even out the noise of a point cloud over such lengths, in its own unit: about "
+        "1.4 sqrt(noise * distance between points)",
     )  # fmt: skip
     return file
 

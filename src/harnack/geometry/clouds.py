@@ -287,7 +287,7 @@ _LINE = 1e-9
 # neighbors in a layer this flat, one standard deviation to the other; else the largest among a
 # half, a quarter, ... of the points, down to so many. If none is as flat, it is the flattest, where
 # it is flatter by this factor than smaller ones.
-_COUNTS, _FLAT, _PROBES, _FEWEST, _FLATTER = (16, 32, 64), 0.25, 1000, 1000, 0.9
+_COUNTS, _FLAT, _PROBES, _FEWEST, _FLATTER = (16, 32, 64), 0.45, 1000, 1000, 0.9
 # A point is turned as so many of the nearest points that have a direction.
 _NEAREST = 8
 # Where to look for extreme points: towards the faces, edges and corners of a cube.

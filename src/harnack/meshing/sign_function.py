@@ -234,7 +234,7 @@ def _check_encloses(field: DipolePotential, level: float) -> None:
     if field.smoothing or not field.estimated[1] or not level > 0:
         return
     step = -(-len(field.points) // _MOST_PROBES)
-    value = float(np.median(field.value(field.points[::step])))
+    value = float(np.median(field.value(field.points[::step], precision="double")))
     if not value > _LEAST_PART * level:
         fault = (
             "normals face inwards: turn them around, or mesh level=-2 pi"

@@ -164,8 +164,9 @@ class DipolePotential(DetailedField["_DipoleBuffers"], BatchedField):
     is the sum above blurred: averaged about x with the weight 15 h^4/(8 pi (rho^2 + h^2)^(7/2)),
     whose standard deviation along each axis is h/sqrt(2). It is finite everywhere, and its surface
     passes through no point, but on both sides of them: `default_level` is the median of f at the
-    points. Details smaller than h are lost, edges become round, thin parts thinner than h may
-    vanish. Twice the standard deviation of the noise was best where that was measured.
+    points. Details smaller than h are lost, edges become round, parts thinner than h may
+    vanish. Where that was measured h = 1.4 sqrt(noise * spacing) was good, with the standard
+    deviation of the noise along an axis and the distance between neighboring points.
 
     points: (n, 3).
     normals: (n, 3), outward, of any length; or "estimate", from neighbors, oriented along a
@@ -227,7 +228,8 @@ class DipolePotential(DetailedField["_DipoleBuffers"], BatchedField):
             raise ValueError(
                 f"smoothing={self.smoothing:g} is a length in the unit of the points, whose cloud "
                 f"is about {2 * self._size:.2g} across: give one between "
-                f"{_LEAST_SMOOTHING * self._size:.2g} and {self._size:.2g}, such as twice the noise"
+                f"{_LEAST_SMOOTHING * self._size:.2g} and {self._size:.2g}, such as the length of "
+                "the noise"
             )
         step = -(-len(self.points) // _PROBES)
         level = float(np.median(self.value(self.points[::step], precision="double")))
