@@ -39,6 +39,8 @@ __all__ = ["SignFunction", "is_meshed_by_signs"]
 # How often a segment is halved before it is intersected with sheets; and how often a smooth
 # function is evaluated along it, in turn where the secant meets the level and in the middle.
 _HALVINGS, _STEPS = 4, 8
+# Values that are so small, as a part of those at the ends, need no further steps.
+_NEAR_ROOT = 1e-3
 # A part of what is left of a segment that is looked at beyond both of its ends.
 _BEYOND = 1e-6
 # Single precision is used where it tells this many points apart along a cell.
@@ -187,16 +189,25 @@ class SignFunction(LevelFunction):
         self, start: FloatArray, way: FloatArray, first: FloatArray, last: FloatArray, steps: int
     ) -> FloatArray:
         """(n,) where the function is 0 between two places of a segment: by turns the secant and the
-        middle are tried, so that what is left is at most half as long with every second step."""
+        middle are tried, so that what is left is at most half as long with every second step; until
+        values are small beside those at the ends, so that one more secant is as good as exact."""
         if not len(start):
             return first
+        first, last = first.copy(), last.copy()
         low, high = (self.values(start + t[:, None] * way) for t in (first, last))
+        enough = _NEAR_ROOT * np.minimum(np.abs(low), np.abs(high))
+        rows = np.arange(len(start))
         for k in range(steps):
-            t = 0.5 * (first + last) if k % 2 else _secant(first, last, low, high)
-            value = self.values(start + t[:, None] * way)
+            ends = first[rows], last[rows]
+            t = 0.5 * sum(ends) if k % 2 else _secant(*ends, low[rows], high[rows])
+            value = self.values(start[rows] + t[:, None] * way[rows])
             above = value > 0
-            first, last = np.where(above, first, t), np.where(above, t, last)
-            low, high = np.where(above, low, value), np.where(above, value, high)
+            first[rows], last[rows] = np.where(above, ends[0], t), np.where(above, t, ends[1])
+            low[rows] = np.where(above, low[rows], value)
+            high[rows] = np.where(above, value, high[rows])
+            rows = rows[~(np.abs(value) <= enough[rows])]
+            if not len(rows):
+                break
         return _secant(first, last, low, high)
 
     def _on_sheets(
