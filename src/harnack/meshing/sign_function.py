@@ -199,7 +199,7 @@ class SignFunction(LevelFunction):
         rows = np.arange(len(start))
         for k in range(steps):
             ends = first[rows], last[rows]
-            t = 0.5 * sum(ends) if k % 2 else _secant(*ends, low[rows], high[rows])
+            t = 0.5 * (ends[0] + ends[1]) if k % 2 else _secant(*ends, low[rows], high[rows])
             value = self.values(start[rows] + t[:, None] * way[rows])
             above = value > 0
             first[rows], last[rows] = np.where(above, ends[0], t), np.where(above, t, ends[1])
