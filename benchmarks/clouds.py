@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import importlib.metadata
+import itertools
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -62,25 +63,31 @@ def clouds(folder: Path | None) -> str:
         f"| mesh | points | normals | triangles | {names} |",
         "|---|---:|---|---:|" + "---|" * len(programs),
     ]
-    for name, whole in _meshes(folder).items():
-        for count in _COUNTS:
-            for given in (True, False):
-                points, normals, length = _cloud(whole, count)
-                rows: dict[str, _Row | None] = {}
-                most = 0
-                for program, make in programs.items():
-                    slow = program.startswith(_SLOW) and count > _COUNTS[0] and name != _OF_SLOW
-                    if not slow:
-                        made = _measured(make, points, normals if given else None, length, most)
-                        rows[program] = _compared(*made, whole)
-                        most = most or len(made[1][1])
-                entries = (_entry(rows.get(program)) for program in programs)
-                lines.append(
-                    f"| {name} | {count:,} | {'given' if given else 'none'} | {most:,} "
-                    f"| {' | '.join(entries)} |"
-                )
-                print(lines[-1], flush=True)
+    try:
+        for line in _lines(programs, folder):
+            print(line, flush=True)
+            lines.append(line)
+    except KeyboardInterrupt:
+        lines.append("\nInterrupted: the other rows were not measured.")
     return "\n".join(lines) + "\n"
+
+
+def _lines(programs: dict[str, Make], folder: Path | None) -> Iterator[str]:
+    """The rows of the table, each when it is measured."""
+    for name, whole in _meshes(folder).items():
+        for count, given in itertools.product(_COUNTS, (True, False)):
+            points, normals, length = _cloud(whole, count)
+            rows: dict[str, _Row] = {}
+            most = 0
+            for program, make in programs.items():
+                if program.startswith(_SLOW) and count > _COUNTS[0] and name != _OF_SLOW:
+                    continue
+                made = _measured(make, points, normals if given else None, length, most)
+                rows[program] = _compared(*made, whole)
+                most = most or len(made[1][1])
+            entries = " | ".join(_entry(rows.get(program)) for program in programs)
+            said = "given" if given else "none"
+            yield f"| {name} | {count:,} | {said} | {most:,} | {entries} |"
 
 
 def _entry(row: _Row | None) -> str:
