@@ -165,7 +165,7 @@ class DipolePotential(DetailedField["_DipoleBuffers"], BatchedField):
     whose standard deviation along each axis is h/sqrt(2). It is finite everywhere, and its surface
     passes through no point, but on both sides of them: `default_level` is the median of f at the
     points. Details smaller than h are lost, edges become round, parts thinner than h may
-    vanish. Where that was measured h = 1.4 sqrt(noise * spacing) was good, with the standard
+    vanish. h = 1.4 sqrt(noise * spacing) was good on two meshes, with the standard
     deviation of the noise along an axis and the distance between neighboring points.
 
     points: (n, 3).
