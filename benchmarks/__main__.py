@@ -16,6 +16,7 @@ import harnack as hk
 from .agreement import agreement
 from .antialiasing import antialiasing
 from .baselines import baselines
+from .clouds import clouds
 from .cluster import cluster
 from .convergence import plot
 from .distances import distances
@@ -37,8 +38,8 @@ from .winding import throughput
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 SECTIONS = (
     "rays", "convergence", "winding", "agreement", "versions", "inclusion", "laplacian", "hart",
-    "povray", "antialiasing", "baselines", "formulas", "meshes", "repair", "distances", "pictures",
-    "live", "cluster",
+    "povray", "antialiasing", "baselines", "formulas", "meshes", "repair", "clouds", "distances",
+    "pictures", "live", "cluster",
 )  # fmt: skip
 
 
@@ -50,7 +51,7 @@ def main() -> None:
     parser.add_argument("--only", choices=SECTIONS, help="rewrite one section of the page")
     parser.add_argument("--bunny", type=Path, help="a surface file, for the winding numbers")
     parser.add_argument(
-        "--meshes", type=Path, help="a folder of surface files, for agreement and repair"
+        "--meshes", type=Path, help="a folder of surface files, for agreement, repair and clouds"
     )
     parser.add_argument("--before", type=Path, help="a checkout of an earlier version, to compare")
     arguments = parser.parse_args()
@@ -87,6 +88,7 @@ def main() -> None:
         "hart": hart,
         "antialiasing": antialiasing,
         "baselines": baselines,
+        "clouds": lambda: clouds(arguments.meshes),
         "cluster": cluster,
         "distances": distances,
         "formulas": formulas,

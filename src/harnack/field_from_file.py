@@ -60,6 +60,7 @@ def open_surface(
     as_: ReadAs | None = None,
     boundary: bool = False,
     normals: Literal["estimate"] | None = None,
+    smoothing: float | None = None,
     up: Axis | None = None,
 ) -> OpenedSurface:
     """The field of a surface file: of a mesh a `WindingNumber`, of a cloud with normals a
@@ -68,7 +69,8 @@ def open_surface(
 
     as_: "winding", "dipole", "loops" or "polygons" instead of what `read_surface` decides.
     boundary: the curves that bound the faces. normals: "estimate" finds those of a point cloud,
-    and replaces those of the file. up: the file's axis that turns to z, by default y for glTF,
+    and replaces those of the file. smoothing: for clouds with noise, a length in the file's unit,
+    as for `DipolePotential`. up: the file's axis that turns to z, by default y for glTF,
     whose standard says so, and for meshes and clouds of .obj files, most of which have it so;
     else z.
 
@@ -90,9 +92,13 @@ def open_surface(
             f'{surface.said}; leave out normals="estimate", or take its points with as_="dipole"'
         )
     is_curve = isinstance(surface, ClosedCurves)
+    if smoothing is not None and not isinstance(surface, Cloud):
+        raise ValueError(
+            f"{path}: smoothing is for point clouds, and this is something else: {surface.said}"
+        )
     axis, why = (up, "as asked") if up is not None else _usual_up(path, is_curve=is_curve)
     try:
-        field = _field(surface, normals, upright(axis))
+        field = _field(surface, normals, smoothing or 0.0, upright(axis))
     except ValueError as error:
         raise FileFormatError(f"{path}: {error}") from error
     show, material = ("color", "two-tone") if is_curve else ("shaded", "eggshell")
@@ -118,7 +124,7 @@ def _read(path: Path, as_: ReadAs | None, boundary: bool) -> Surface:
     return read_surface(path, "loops" if boundary else as_)
 
 
-def _field(surface: Surface, normals: str | None, rotation: FloatArray) -> Field:
+def _field(surface: Surface, normals: str | None, smoothing: float, rotation: FloatArray) -> Field:
     if isinstance(surface, Mesh):
         return WindingNumber(surface.vertices @ rotation.T, surface.faces)
     if isinstance(surface, ClosedCurves):
@@ -132,10 +138,11 @@ def _field(surface: Surface, normals: str | None, rotation: FloatArray) -> Field
         return Molecule(replace(surface, positions=surface.positions @ rotation.T))
     points = surface.points @ rotation.T
     if normals == "estimate":
-        return DipolePotential(points, normals, surface.areas)
+        return DipolePotential(points, normals, surface.areas, smoothing=smoothing)
     if surface.normals is None:
         raise ValueError(
             f"{surface.said}. Its normals are missing, which say where outside is: add them to "
             'the file, or let them be estimated with normals="estimate"'
         )
-    return DipolePotential(points, surface.normals @ rotation.T, surface.areas)
+    given = surface.normals @ rotation.T
+    return DipolePotential(points, given, surface.areas, smoothing=smoothing)

@@ -153,6 +153,9 @@ _SPHERE = (_POINTS, _POINTS)
 FIELDS = {
     # Accurate enough that clusters of points are never taken as a whole: no truncation.
     "dipoles": hk.DipolePotential(*_SPHERE, np.full(60, 4 * math.pi / 60), accuracy=100.0),
+    "smoothed": hk.DipolePotential(
+        *_SPHERE, np.full(60, 4 * math.pi / 60), smoothing=0.2, accuracy=100.0
+    ),
     "screened": hk.ScreenedWindingNumber(
         *_SPHERE, np.full(60, 4 * math.pi / 60), length=0.7, method="sum"
     ),
@@ -178,7 +181,7 @@ PROMISES_OF: dict[str, tuple[Promise, ...]] = {
     **dict.fromkeys(
         ("hyperspherical 4,2,1", "hyperspherical 6,6,5, in a ball", "plane"), (_STEEP, _BENT)
     ),
-    **dict.fromkeys(("lobes 3,2", "lobes 2,1, positive", "Fourier series"), (_BENT,)),
+    **dict.fromkeys(("lobes 3,2", "lobes 2,1, positive", "Fourier series", "smoothed"), (_BENT,)),
     **dict.fromkeys(SOURCED, (BoundedLaplacian(1.0, -1.0, 1.0, -1.0, 1.0),)),
     "screened": (_PLANE_BALL, _BENT),
 }
@@ -214,6 +217,7 @@ _CLOUD = (lambda x: (x, x, np.full(len(x), 4 * math.pi / len(x))))(icosphere(3)[
 APPROXIMATE: dict[str, Field] = {
     "dipoles, accuracy 2": hk.DipolePotential(*_CLOUD, accuracy=2.0),
     "dipoles, accuracy 4": hk.DipolePotential(*_CLOUD, accuracy=4.0),
+    "smoothed by tree": hk.DipolePotential(*_CLOUD, smoothing=0.1, accuracy=2.0),
     "screened by tree": hk.ScreenedWindingNumber(*_CLOUD, length=0.7, method="tree"),
     "mesh by tree, accuracy 2": hk.WindingNumber(*_DAMAGED, method="tree", accuracy=2.0),
     "mesh by tree, accuracy 4": hk.WindingNumber(*_DAMAGED, method="tree", accuracy=4.0),

@@ -294,7 +294,7 @@ def test_signs_are_carried_along_any_tree():
     x, _ = icosphere(2)
     parent = np.maximum(np.arange(len(x)) - 1, 0)
     normals = x * np.where(rng().random(len(x)) < 0.5, -1.0, 1.0)[:, None]
-    sign = clouds._carried_signs(x, normals, parent)
+    sign = clouds._carried_signs(clouds._Planes(x, normals, parent[:, None]), parent)
     for k in range(1, len(x)):
         edge = x[k] - x[k - 1]
         edge /= np.linalg.norm(edge)

@@ -222,6 +222,11 @@ def _add_file(one: Any) -> Any:
         "--boundary", action="store_true", help="take the boundary of a file's faces as the curves"
     )
     _add_choice(file, "--normals", ("estimate",), "estimate the normals of a point cloud")
+    file.add_argument(
+        "--smoothing", type=_positive, metavar="LENGTH",
+        help="even out the noise of a point cloud over such lengths, in its own unit: about "
+        "1.4 sqrt(noise * distance between points)",
+    )  # fmt: skip
     return file
 
 

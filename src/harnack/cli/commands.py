@@ -303,6 +303,7 @@ def _camera(options: Any) -> Camera:
 def _refuse_file_options(options: Any) -> None:
     given = {
         "--as": options.as_, "--boundary": options.boundary, "--normals": options.normals,
+        "--smoothing": options.smoothing,
     }  # fmt: skip
     for name, value in given.items():
         if value:
@@ -312,8 +313,9 @@ def _refuse_file_options(options: Any) -> None:
 def _of_file(source: Path, options: Any, settings: dict[str, Any]) -> _Drawn:
     up = settings.pop("up", None)
     opened = open_surface(
-        source, as_=options.as_, boundary=options.boundary, normals=options.normals, up=up
-    )
+        source, as_=options.as_, boundary=options.boundary, normals=options.normals,
+        smoothing=options.smoothing, up=up,
+    )  # fmt: skip
     facts = ", ".join(f"{key}: {value}" for key, value in opened.field.describe().items())
     _say(f"{source}: {in_options(opened.said)}")
     _say(f"{type(opened.field).__name__}: {facts}")
@@ -321,7 +323,10 @@ def _of_file(source: Path, options: Any, settings: dict[str, Any]) -> _Drawn:
         settings["show"] = opened.show
         _say(f"drawn {opened.show}; --show color follows light paths, in minutes")
     usual = {"level": options.level, "material": opened.material}
-    asked = {"as": options.as_, "boundary": options.boundary, "normals": options.normals, "up": up}
+    asked = {
+        "as": options.as_, "boundary": options.boundary, "normals": options.normals,
+        "smoothing": options.smoothing, "up": up,
+    }  # fmt: skip
     origin = {"file": str(source.resolve()), **{k: v for k, v in asked.items() if v}}
     return opened.field, {**usual, **settings}, [(opened.field, origin)]
 
@@ -398,7 +403,7 @@ def _meshed(options: Any, source: Path) -> tuple[Field, dict[str, Any]]:
     if options.scene not in SCENES and not _is_saved(source):
         opened = open_surface(
             source, as_=options.as_, boundary=options.boundary, normals=options.normals,
-            up=options.up,
+            smoothing=options.smoothing, up=options.up,
         )  # fmt: skip
         _say(f"{source}: {in_options(opened.said)}")
         return opened.field, {}

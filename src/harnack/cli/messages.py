@@ -80,7 +80,8 @@ def warnings_noted() -> Generator[None]:
 _WRITTEN_OTHERWISE = ("backdrop", "camera", "isolines", "max_depth", "progress", "value_range")
 OPTIONS = (
     *(name for name in SETTINGS if name not in _WRITTEN_OTHERWISE), "as_", "bound", "confirm",
-    "keep", "largest", "level", "max_triangles", "normals", "simplify", "spacing", "tolerance",
+    "keep", "largest", "level", "max_triangles", "normals", "simplify", "smoothing", "spacing",
+    "tolerance",
 )  # fmt: skip
 _PARAMETER = re.compile(r'parameters=\{"(\w+)": 1\.0\}')
 # One of them with a value, as messages write it, that is not inside of a call.

@@ -11,6 +11,7 @@ import itertools
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -36,6 +37,8 @@ __all__ = ["CloudError", "estimate_areas", "estimate_normals", "validate_cloud"]
 MAX_POINTS = 100_000_000
 # Points per step: the temporary arrays of one step then stay in the cache of one core.
 _CHUNK = 4096
+# A cell is at most so many times as wide as those of its neighbors may be.
+_LONELY = 3.0
 _REMOVE = "its components must be finite; remove the point"
 
 
@@ -135,6 +138,9 @@ def estimate_areas(
     cell may reach out without end: where all neighbors lie on one side (of a line through the
     point), their mirror images bound the cell too, so that it reaches out as far as in.
 
+    Outliers: a cell ends at three times the median of such radii of its neighbors as well, so that
+    a point far from the others stands for no more than they do.
+
     neighbors: how many; more cost time, fewer cut large cells of uneven samples.
 
     Raises:
@@ -147,13 +153,18 @@ def estimate_areas(
     positions, where = np.unique(welded, return_inverse=True)
     sharing = np.bincount(where)[where]
     tree = point_tree(x[positions])
-    areas = np.empty(len(x))
+    radii, areas = np.empty(len(positions)), np.empty(len(x))
+
+    def reach(part: slice) -> None:
+        radii[part] = 0.5 * nearest_others(tree, tree.data[part], neighbors)[1][:, -1]
 
     def estimate(part: slice) -> None:
         nearest, distance = nearest_others(tree, x[part], neighbors)
         offsets = tree.data[nearest] - x[part, None]
-        areas[part] = _cell_areas(offsets, n[part], 0.5 * distance[:, -1])
+        most = _LONELY * np.median(radii[nearest], axis=1)
+        areas[part] = _cell_areas(offsets, n[part], np.minimum(0.5 * distance[:, -1], most))
 
+    in_parts(reach, len(positions))
     in_parts(estimate, len(x))
     return areas / sharing
 
@@ -272,20 +283,32 @@ Indices = npt.NDArray[np.int64] | npt.NDArray[np.int32]
 
 # Of the variances of a neighborhood, the second over the first: below it lies on a line.
 _LINE = 1e-9
+# Without `neighbors`, the first of these counts is taken with which half of some points see their
+# neighbors in a layer this flat, one standard deviation to the other; else the largest among a
+# half, a quarter, ... of the points, down to so many. If none is as flat, it is the flattest, where
+# it is flatter by this factor than smaller ones.
+_COUNTS, _FLAT, _PROBES, _FEWEST, _FLATTER = (16, 32, 64), 0.45, 1000, 1000, 0.9
+# A point is turned as so many of the nearest points that have a direction.
+_NEAREST = 8
 # Where to look for extreme points: towards the faces, edges and corners of a cube.
 _DIRECTIONS = np.array([d for d in itertools.product((-1.0, 0.0, 1.0), repeat=3) if any(d)])
 
 
 @renamed(neighbours="neighbors")
-def estimate_normals(points: npt.ArrayLike, neighbors: int = 16) -> FloatArray:
+def estimate_normals(points: npt.ArrayLike, neighbors: int | None = None) -> FloatArray:
     """Unit normals (n, 3), outward, of points (n, 3) that sample a surface.
 
     Hoppe et al. 1992. The line of a normal is that in which a point and its nearest neighbors
     vary least. Its direction is carried from point to point along the tree that spans the graph of
     neighbors and in which normals agree best, mirrored as Xie et al. 2003 propose, which carries
-    it around edges and thin walls. What then remains is one sign for each connected piece of the
-    graph: the one with which the piece's extreme points in 26 directions face outward, added up.
-    That sign is right for a closed surface, however unevenly sampled.
+    it around edges and thin walls; between points moved onto the planes of their neighbors, as
+    noise would mirror normals otherwise. What then remains is one sign for each connected piece of
+    the graph: the one with which the piece's extreme points in 26 directions face outward, added
+    up. That sign is right for a closed surface, however unevenly sampled.
+
+    neighbors: how many; None for 16, and where there is noise, so many that planes through them
+        are known to some degrees: up to 64 and, where that is not enough, 64 among a part of the
+        points, chosen by chance (with a seed), which are then as far apart as the noise asks for.
 
     So each piece faces outward by itself: the inner wall of a hollow body does not face its cavity,
     and how an open surface faces is a convention (a flat one: to the positive side of the axis
@@ -299,23 +322,79 @@ def estimate_normals(points: npt.ArrayLike, neighbors: int = 16) -> FloatArray:
             line, which have no plane; fewer than 3 neighbors.
     """
     x = checked_points(points)
-    check_neighbors(neighbors)
+    if neighbors is not None:
+        check_neighbors(neighbors)
     positions, where = np.unique(weld_vertices(x), return_inverse=True)
     x = x[positions]
     if len(x) < 4:
         raise CloudError(f"{len(x)} different points do not show a surface: give at least 4")
-    normals, nearest = _planes(x, neighbors)
-    piece, parent = _spanning_forest(x, normals, nearest)
-    sign = _carried_signs(x, normals, parent)
-    normals *= sign[:, None]
-    normals *= _outward_signs(x, normals, piece)[piece, None]
+    some = np.arange(len(x))
+    if neighbors is None:
+        neighbors, some = _neighborhoods(x)
+    tree = point_tree(x[some])
+    planes = _planes(x[some], tree, neighbors)
+    piece, parent = _spanning_forest(planes)
+    sign = _carried_signs(planes, parent)
+    normals = planes.normals * sign[:, None]
+    normals *= _outward_signs(x[some], normals, piece)[piece, None]
+    if len(some) < len(x):
+        normals = _carried_to(x, tree, normals, neighbors)
     return normals[where]
 
 
-def _planes(x: FloatArray, neighbors: int) -> tuple[FloatArray, npt.NDArray[np.int32]]:
-    """Normals (n, 3) of any sign, and the indices of the neighbors (n, k)."""
-    tree = point_tree(x)
+def _neighborhoods(x: FloatArray) -> tuple[int, IntArray]:
+    """How many neighbors show planes, and the points (k,) among which to look for them."""
+    rng = np.random.default_rng(0)
+    probes = x[rng.choice(len(x), min(len(x), _PROBES), replace=False)]
+    some = np.arange(len(x))
+    best, found = np.inf, (_COUNTS[0], some)
+    counts = _COUNTS
+    while True:
+        tree = point_tree(x[some])
+        for count in counts:
+            index, _ = nearest_others(tree, probes, count)
+            spread = tree.data[index]
+            spread = spread - spread.mean(axis=1, keepdims=True)
+            widths = np.linalg.eigvalsh(np.einsum("mki,mkj->mij", spread, spread))
+            flatness = np.median(np.sqrt(np.abs(widths[:, 0]) / np.maximum(widths[:, 1], 1e-300)))
+            if flatness < _FLATTER * best:
+                best, found = float(flatness), (count, some)
+            if best < _FLAT:
+                return found
+        if len(some) < _FEWEST:
+            return found
+        some, counts = np.sort(rng.choice(some, len(some) // 2, replace=False)), _COUNTS[-1:]
+
+
+def _carried_to(x: FloatArray, tree: Any, given: FloatArray, neighbors: int) -> FloatArray:
+    """Normals of points (n, 3) by the nearest of some that have one, turned as these are."""
     normals = np.empty_like(x)
+
+    def fit(part: slice) -> None:
+        _, index = tree.query(x[part], k=min(neighbors, tree.n))
+        spread = tree.data[index] - tree.data[index].mean(axis=1, keepdims=True)
+        _, axes = np.linalg.eigh(np.einsum("mki,mkj->mij", spread, spread))
+        line = axes[:, :, 0]
+        along = np.einsum("mki,mi->mk", given[index[:, :_NEAREST]], line)
+        normals[part] = line * np.where(along.sum(axis=1) < 0, -1.0, 1.0)[:, None]
+
+    in_parts(fit, len(x))
+    return normals
+
+
+@dataclass(frozen=True)
+class _Planes:
+    """Points (n, 3), moved onto the planes of their neighbors; normals (n, 3) of any sign, and the
+    indices of the neighbors (n, k)."""
+
+    points: FloatArray
+    normals: FloatArray
+    nearest: npt.NDArray[np.int32]
+
+
+def _planes(x: FloatArray, tree: Any, neighbors: int) -> _Planes:
+    """tree: of these points."""
+    normals, points = np.empty_like(x), np.empty_like(x)
     nearest = np.empty((len(x), min(neighbors, len(x) - 1)), dtype=np.int32)
     on_line = np.zeros(len(x), dtype=bool)
 
@@ -324,9 +403,12 @@ def _planes(x: FloatArray, neighbors: int) -> tuple[FloatArray, npt.NDArray[np.i
         nearest[part] = index
         offsets = (x[index] - x[part, None]) / distance[:, -1, None, None]
         offsets = np.concatenate([offsets, np.zeros_like(offsets[:, :1])], axis=1)
-        offsets -= offsets.mean(axis=1, keepdims=True)
+        middle = offsets.mean(axis=1, keepdims=True)
+        offsets -= middle
         variances, axes = np.linalg.eigh(np.einsum("mki,mkj->mij", offsets, offsets))
         normals[part] = axes[:, :, 0]
+        height = np.einsum("mi,mi->m", middle[:, 0], axes[:, :, 0]) * distance[:, -1]
+        points[part] = x[part] + height[:, None] * axes[:, :, 0]
         on_line[part] = variances[:, 1] <= _LINE * variances[:, 2]
 
     in_parts(fit, len(x))
@@ -337,15 +419,16 @@ def _planes(x: FloatArray, neighbors: int) -> tuple[FloatArray, npt.NDArray[np.i
             f"first of {vector_text(x[first])}: they show no surface; ask for more neighbors, or "
             "give normals"
         )
-    return normals, nearest
+    return _Planes(points, normals, nearest)
 
 
-def _agreement(x: FloatArray, normals: FloatArray, i: Indices, j: Indices) -> FloatArray:
+def _agreement(planes: _Planes, i: Indices, j: Indices) -> FloatArray:
     """The product of each normal i with normal j mirrored in the plane that bisects i and j: (m,).
 
     On a circle, across an edge between two planes and across a thin wall it is 1 if both face
     outward (Xie et al. 2003).
     """
+    x, normals = planes.points, planes.normals
     edge = x[j] - x[i]
     length = np.linalg.norm(edge, axis=1, keepdims=True)
     edge /= np.where(length > 0.0, length, 1.0)
@@ -354,19 +437,18 @@ def _agreement(x: FloatArray, normals: FloatArray, i: Indices, j: Indices) -> Fl
     return np.einsum("ij,ij->i", a, b) - 2.0 * along
 
 
-def _spanning_forest(
-    x: FloatArray, normals: FloatArray, nearest: npt.NDArray[np.int32]
-) -> tuple[IntArray, IntArray]:
+def _spanning_forest(planes: _Planes) -> tuple[IntArray, IntArray]:
     """For each point its piece (n,), from 0, and its parent (n,); a root is its own parent."""
     import scipy.sparse  # here: half a second that few need
 
     sparse: Any = scipy.sparse
+    nearest = planes.nearest
     n, k = nearest.shape
     weight = np.empty((n, k))
 
     def weigh(part: slice) -> None:
         start = np.repeat(np.arange(part.start, part.stop, dtype=np.int64), k)
-        agreement = np.abs(_agreement(x, normals, start, nearest[part].ravel()))
+        agreement = np.abs(_agreement(planes, start, nearest[part].ravel()))
         # An edge of weight 0 would be no edge.
         weight[part] = np.maximum(1.0 - agreement, 0.0).reshape(-1, k) + 1e-9
 
@@ -386,12 +468,12 @@ def _spanning_forest(
     return np.asarray(piece, dtype=np.int64), parent
 
 
-def _carried_signs(x: FloatArray, normals: FloatArray, parent: IntArray) -> FloatArray:
+def _carried_signs(planes: _Planes, parent: IntArray) -> FloatArray:
     """The sign (n,) of each normal with which it agrees with its root, along the way to it.
 
     Pointer doubling: after step i, `parent` is the ancestor 2^i levels up, or the root.
     """
-    agreement = _agreement(x, normals, np.arange(len(x)), parent)
+    agreement = _agreement(planes, np.arange(len(parent)), parent)
     sign = np.where(agreement < 0.0, -1.0, 1.0)
     while True:
         above = parent[parent]

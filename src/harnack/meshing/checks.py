@@ -121,6 +121,8 @@ def _exact_turns(points: Any) -> Any:
 
 _EDGES = ((0, 1), (1, 2), (2, 0))
 _PAIRS_AT_ONCE = 1 << 18
+# So many triangles of a size are compared with each other at once.
+_MOST_AT_ONCE = 1 << 19
 
 
 def turned_faces(function: LevelFunction, vertices: FloatArray, faces: IntArray) -> IntArray:
@@ -152,6 +154,7 @@ def intersecting_faces(
     near = _near_pairs(vertices[faces], among)
     for start in range(0, len(near), _PAIRS_AT_ONCE):
         pairs = near[start : start + _PAIRS_AT_ONCE]
+        pairs = pairs[~_are_apart(vertices, faces, pairs)]
         one, other = faces[pairs[:, 0]], faces[pairs[:, 1]]
         heights = [_heights(vertices, *two) for two in ((one, other), (other, one))]
         meet = np.zeros(len(pairs), np.bool_)
@@ -187,20 +190,57 @@ def _near_pairs(corner: FloatArray, among: BoolArray | None) -> IntArray:
     groups = [np.flatnonzero(near & (octave == one)) for one in np.unique(octave[near])]
     trees = [searching.cKDTree(center[rows]) for rows in groups]
     found: list[IntArray] = []
+
+    def add(one: IntArray, other: IntArray) -> None:
+        keep = (lower[one] <= upper[other]).all(axis=1)
+        keep &= (lower[other] <= upper[one]).all(axis=1)
+        found.append(np.column_stack([one[keep], other[keep]]))
+
     for i, j in itertools.product(range(len(groups)), repeat=2):
         reach = float(radius[groups[i]].max() + radius[groups[j]].max())
-        step = max(1, _PAIRS_AT_ONCE // 64)
         first = groups[i][chosen[groups[i]]]
+        if i == j and len(first) == len(groups[i]) <= _MOST_AT_ONCE:
+            table = trees[i].query_pairs(reach, output_type="ndarray")
+            add(*groups[i][table.T])
+            continue
+        step = max(1, _PAIRS_AT_ONCE // 64)
         for start in range(0, len(first), step):
             rows = first[start : start + step]
             some = searching.cKDTree(center[rows])
             table = some.sparse_distance_matrix(trees[j], reach, output_type="ndarray")
             one, other = rows[table["i"]], groups[j][table["j"]]
-            keep = (lower[one] <= upper[other]).all(axis=1)
-            keep &= (lower[other] <= upper[one]).all(axis=1)
-            keep &= (one < other) | ~chosen[other]  # two that are chosen meet once
-            found.append(np.column_stack([one[keep], other[keep]]))
+            once = (one < other) | ~chosen[other]  # two that are chosen meet once
+            add(one[once], other[once])
     return np.concatenate(found).astype(np.int64)
+
+
+def _are_apart(vertices: FloatArray, faces: IntArray, pairs: IntArray) -> BoolArray:
+    """(k,) whether the plane of one of two faces has all corners of the other that they do not
+    share on one side: then they have nothing in common but these. False where rounding leaves it
+    open.
+
+    Heights are sums of three products of differences of coordinates and their products: seven
+    roundings of their magnitudes (twice as many are allowed), and underflow.
+    """
+    apart = np.zeros(len(pairs), np.bool_)
+    for first, second in (pairs.T, pairs.T[::-1]):
+        rows = np.flatnonzero(~apart)
+        plane, of = faces[first[rows]], faces[second[rows]]
+        a = vertices[plane[:, 0]]
+        u, v = vertices[plane[:, 1]] - a, vertices[plane[:, 2]] - a
+        normal = np.cross(u, v)
+        most = 16 * 2.0**-52 * (lengths(u) * lengths(v))
+        above, below = np.ones(len(rows), np.bool_), np.ones(len(rows), np.bool_)
+        for k in range(3):
+            way = vertices[of[:, k]] - a
+            height, error = dots(normal, way), most * lengths(way) + 1e-290
+            shared = (of[:, k, None] == plane).any(axis=1)
+            above &= shared | (height > error)
+            below &= shared | (height < -error)
+        # A face that shares all its corners is the same one.
+        several = (of[:, :, None] != plane[:, None]).all(axis=2).any(axis=1)
+        apart[rows] = (above | below) & several
+    return apart
 
 
 def _heights(vertices: FloatArray, plane: IntArray, of: IntArray) -> SignArray:

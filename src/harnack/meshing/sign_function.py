@@ -24,7 +24,9 @@ from harnack.fields.blobs.hrbf import HRBF
 from harnack.fields.clearance import distance_below
 from harnack.fields.points import in_batches
 from harnack.fields.sheets import NO_SHEET, Crossing
+from harnack.fields.solid_angles.dipole import DipolePotential
 from harnack.fields.solid_angles.winding_number import WindingModuloOne, WindingNumber
+from harnack.meshing.checks import MeshingError
 from harnack.meshing.edges import dots, lengths
 from harnack.meshing.samples import LevelFunction, Samples
 
@@ -37,10 +39,14 @@ __all__ = ["SignFunction", "is_meshed_by_signs"]
 # How often a segment is halved before it is intersected with sheets; and how often a smooth
 # function is evaluated along it, in turn where the secant meets the level and in the middle.
 _HALVINGS, _STEPS = 4, 8
+# Values that are so small, as a part of those at the ends, need no further steps.
+_NEAR_ROOT = 1e-3
 # A part of what is left of a segment that is looked at beyond both of its ends.
 _BEYOND = 1e-6
 # Single precision is used where it tells this many points apart along a cell.
 _STEPS_IN_CELL = 1000
+# Points of a cloud at which its value is looked at, and the part of the level that it must have.
+_MOST_PROBES, _LEAST_PART = 2000, 0.1
 
 
 def is_meshed_by_signs(field: Field) -> bool:
@@ -74,7 +80,13 @@ class SignFunction(LevelFunction):
         side: float = 1.0,
         most_faces: int,
     ) -> SignFunction:
-        """In single precision where that tells points of a cell in the box apart."""
+        """In single precision where that tells points of a cell in the box apart.
+
+        Raises:
+            MeshingError: a cloud whose normals do not face outwards, or that encloses nothing.
+        """
+        if isinstance(field, DipolePotential):
+            _check_encloses(field, level)
         far = float(np.abs(box).max())
         is_near = far * 2.0**-24 * _STEPS_IN_CELL < spacing
         precision: Precision = "single" if is_near else "double"
@@ -177,16 +189,25 @@ class SignFunction(LevelFunction):
         self, start: FloatArray, way: FloatArray, first: FloatArray, last: FloatArray, steps: int
     ) -> FloatArray:
         """(n,) where the function is 0 between two places of a segment: by turns the secant and the
-        middle are tried, so that what is left is at most half as long with every second step."""
+        middle are tried, so that what is left is at most half as long with every second step; until
+        values are small beside those at the ends, so that one more secant is as good as exact."""
         if not len(start):
             return first
+        first, last = first.copy(), last.copy()
         low, high = (self.values(start + t[:, None] * way) for t in (first, last))
+        enough = _NEAR_ROOT * np.minimum(np.abs(low), np.abs(high))
+        rows = np.arange(len(start))
         for k in range(steps):
-            t = 0.5 * (first + last) if k % 2 else _secant(first, last, low, high)
-            value = self.values(start + t[:, None] * way)
+            ends = first[rows], last[rows]
+            t = 0.5 * (ends[0] + ends[1]) if k % 2 else _secant(*ends, low[rows], high[rows])
+            value = self.values(start[rows] + t[:, None] * way[rows])
             above = value > 0
-            first, last = np.where(above, first, t), np.where(above, t, last)
-            low, high = np.where(above, low, value), np.where(above, value, high)
+            first[rows], last[rows] = np.where(above, ends[0], t), np.where(above, t, ends[1])
+            low[rows] = np.where(above, low[rows], value)
+            high[rows] = np.where(above, value, high[rows])
+            rows = rows[~(np.abs(value) <= enough[rows])]
+            if not len(rows):
+                break
         return _secant(first, last, low, high)
 
     def _on_sheets(
@@ -213,6 +234,28 @@ class SignFunction(LevelFunction):
         along = first - room + np.where(is_crossed, t, 0.0) / np.maximum(length, 1e-300)
         normal = np.where(is_crossed[:, None], normal, 0.0)
         return along, normal, is_crossed
+
+
+def _check_encloses(field: DipolePotential, level: float) -> None:
+    """Raise unless the points lie about where f is half the level of a closed surface: without its
+    own term f is 2 pi at a point of one, and -2 pi where its normals face inwards.
+
+    Where areas are given, points need not stand for a surface.
+    """
+    if field.smoothing or not field.estimated[1] or not level > 0:
+        return
+    step = -(-len(field.points) // _MOST_PROBES)
+    value = float(np.median(field.value(field.points[::step], precision="double")))
+    if not value > _LEAST_PART * level:
+        fault = (
+            "normals face inwards: turn them around, or mesh level=-2 pi"
+            if value < -_LEAST_PART * level
+            else "normals cancel each other, or the points lie in a plane"
+        )
+        raise MeshingError(
+            f"the points of this {type(field).__name__} enclose nothing: its value at them, each "
+            f"without its own term, is {value:.2g} in the median where 2 pi is right; {fault}"
+        )
 
 
 def _secant(first: FloatArray, last: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:

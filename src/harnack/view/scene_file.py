@@ -11,9 +11,9 @@ A scene file is JSON of version 1. Nothing in it is ever run, and what is not kn
 
 A field is one of {"curves": loops of points}, {"formula": text, "parameters": numbers by name},
 {"scene": a name of the gallery, "number": which of its surfaces}, {"file": a surface file, "as":
-..., "boundary": ..., "normals": ..., "up": ...}, or the name of a class and its arguments, as
-{"Sphere": {"radius": 2}}. Beside it stand the settings of `level_set`, under "settings" those of
-`render`, by the names that they have in Python.
+..., "boundary": ..., "normals": ..., "smoothing": ..., "up": ...}, or the name of a class and its
+arguments, as {"Sphere": {"radius": 2}}. Beside it stand the settings of `level_set`, under
+"settings" those of `render`, by the names that they have in Python.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ _MORE: tuple[type[Field], ...] = (
 )  # fmt: skip
 # What Python says of arguments that are something else.
 _WRONG = (ValueError, TypeError, ArithmeticError, AttributeError, LookupError, NotImplementedError)
-_FILE_OPTIONS = ("as", "boundary", "normals", "up")
+_FILE_OPTIONS = ("as", "boundary", "normals", "smoothing", "up")
 
 Plain = dict[str, Any]
 Origins = Sequence[tuple[Field, Plain]]

@@ -1,0 +1,219 @@
+"""Meshes of point clouds by harnack, Open3D's Poisson and Kazhdan's: time, closed, distances."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import itertools
+import math
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import trimesh
+
+import harnack as hk
+from harnack.backend import choose_backend, to_numpy, to_vector3
+from harnack.distance.mesh_surface import MeshSurface
+from harnack.field_from_file import read_surface
+from harnack.geometry.mesh_shapes import bumpy_sphere, torus_mesh
+
+FloatArray = npt.NDArray[np.float64]
+Arrays = tuple[FloatArray, npt.NDArray[np.int64]]
+# From points and normals, or None, and the smoothing length: vertices and faces.
+Make = Callable[[FloatArray, "FloatArray | None", float], tuple[Any, Any]]
+
+_COUNTS, _NOISE = (20_000, 200_000), 0.005
+# The depth of the octree of Poisson reconstruction: the default of both programs.
+_DEPTH, _SAMPLES = 8, 100_000
+_NAMES = ("spot", "stanford-bunny", "fandisk")
+# With many points Kazhdan's is asked for this mesh only: it takes minutes.
+_SLOW, _OF_SLOW = "PoissonRecon", "spot"
+
+
+@dataclass(frozen=True)
+class _Row:
+    """What a program made. distance, mean: Hausdorff's and the mean one, parts of the diagonal."""
+
+    seconds: float
+    faces: int
+    is_closed: bool
+    distance: float
+    mean: float
+
+
+def clouds(folder: Path | None) -> str:
+    """Measure, and return the section of the page. folder: of the meshes; None for made ones."""
+    programs: dict[str, Make] = {"harnack": _ours, **_peers()}
+    names = " | ".join(programs)
+    lines = [
+        "## Meshes of point clouds\n",
+        f"Points chosen by chance on meshes, with Gaussian noise of {_NOISE:.1%} of the diagonal "
+        "along each axis, and the normals of the mesh or none (then each program estimates them). "
+        "harnack smooths over 1.4 sqrt(noise * spacing), the spacing being the root of the area "
+        "over the number of points (`smoothing=`: it is told the noise, and the factor was chosen "
+        "on spot and fandisk), and is else as it comes; Poisson "
+        f"reconstruction has depth {_DEPTH}, the default of both, and is then simplified to "
+        "harnack's number of triangles (by Open3D, not timed). Each entry: seconds of CPU time, "
+        "Hausdorff's distance from the mesh and the mean distance, both in % of the diagonal, from "
+        f"{_SAMPLES:,} points on each to the triangles of the other; 'open' where the mesh is not "
+        "closed (trimesh).\n",
+        f"| mesh | points | normals | triangles | {names} |",
+        "|---|---:|---|---:|" + "---|" * len(programs),
+    ]
+    try:
+        for line in _lines(programs, folder):
+            print(line, flush=True)
+            lines.append(line)
+    except KeyboardInterrupt:
+        lines.append("\nInterrupted: the other rows were not measured.")
+    return "\n".join(lines) + "\n"
+
+
+def _lines(programs: dict[str, Make], folder: Path | None) -> Iterator[str]:
+    """The rows of the table, each when it is measured."""
+    for name, whole in _meshes(folder).items():
+        for count, given in itertools.product(_COUNTS, (True, False)):
+            points, normals, length = _cloud(whole, count)
+            rows: dict[str, _Row] = {}
+            most = 0
+            for program, make in programs.items():
+                if program.startswith(_SLOW) and count > _COUNTS[0] and name != _OF_SLOW:
+                    continue
+                made = _measured(make, points, normals if given else None, length, most)
+                rows[program] = _compared(*made, whole)
+                most = most or len(made[1][1])
+            entries = " | ".join(_entry(rows.get(program)) for program in programs)
+            said = "given" if given else "none"
+            yield f"| {name} | {count:,} | {said} | {most:,} | {entries} |"
+
+
+def _entry(row: _Row | None) -> str:
+    if row is None:
+        return ""
+    if not row.faces:
+        return f"{row.seconds:.1f} s, failed"
+    closed = "" if row.is_closed else ", open"
+    return f"{row.seconds:.1f} s, {100 * row.distance:.2f}, {100 * row.mean:.3f}{closed}"
+
+
+def _meshes(folder: Path | None) -> dict[str, Arrays]:
+    found: dict[str, Arrays] = {}
+    for name in _NAMES if folder else ():
+        mesh: Any = read_surface(Path(folder or "") / f"{name}.obj", "winding")
+        joined = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+        joined.merge_vertices(merge_tex=True, merge_norm=True)
+        found[name] = np.array(joined.vertices), np.array(joined.faces)
+    return {**found, "torus": torus_mesh(1.0, 0.4, 192, 96), "bumpy sphere": bumpy_sphere(5)}
+
+
+def _cloud(whole: Arrays, count: int) -> tuple[FloatArray, FloatArray, float]:
+    """Points with noise, normals, and the length over which to smooth."""
+    mesh = trimesh.Trimesh(*whole, process=False)
+    points, faces = trimesh.sample.sample_surface(mesh, count, seed=0)
+    noise = _NOISE * _diagonal(whole)
+    moved = points + np.random.default_rng(0).normal(0, noise, points.shape)
+    length = 1.4 * math.sqrt(noise * math.sqrt(mesh.area / count))
+    return np.asarray(moved), np.array(mesh.face_normals[faces]), length
+
+
+def _diagonal(whole: Arrays) -> float:
+    return float(np.linalg.norm(np.ptp(whole[0], axis=0)))
+
+
+def _ours(points: FloatArray, normals: FloatArray | None, length: float) -> tuple[Any, Any]:
+    given = "estimate" if normals is None else normals
+    made = hk.mesh(hk.DipolePotential(points, given, smoothing=length))
+    return made.vertices, made.faces
+
+
+def _peers() -> dict[str, Make]:
+    """Other programs that are installed."""
+    found: dict[str, Make] = {}
+    try:
+        import open3d
+    except ImportError:
+        return found
+
+    def poisson(points: FloatArray, normals: FloatArray | None, length: float) -> tuple[Any, Any]:
+        del length
+        cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
+        if normals is None:
+            cloud.estimate_normals()
+            cloud.orient_normals_consistent_tangent_plane(16)
+        else:
+            cloud.normals = open3d.utility.Vector3dVector(normals)
+        make = open3d.geometry.TriangleMesh.create_from_point_cloud_poisson
+        mesh, _ = make(cloud, depth=_DEPTH, n_threads=1)
+        return np.asarray(mesh.vertices), np.asarray(mesh.triangles)
+
+    found[f"Open3D {open3d.__version__}"] = poisson
+    try:
+        import pymeshlab
+    except ImportError:
+        return found
+
+    def recon(points: FloatArray, normals: FloatArray | None, length: float) -> tuple[Any, Any]:
+        del length
+        meshes = pymeshlab.MeshSet()
+        if normals is None:
+            meshes.add_mesh(pymeshlab.Mesh(points))
+            meshes.apply_filter("compute_normal_for_point_clouds", k=16)
+        else:
+            meshes.add_mesh(pymeshlab.Mesh(points, v_normals_matrix=normals))
+        name = "generate_surface_reconstruction_screened_poisson"
+        meshes.apply_filter(name, depth=_DEPTH, threads=1)
+        mesh = meshes.current_mesh()
+        return mesh.vertex_matrix(), mesh.face_matrix()
+
+    version = importlib.metadata.version("pymeshlab")
+    found[f"{_SLOW} (pymeshlab {version})"] = recon
+    return found
+
+
+def _measured(
+    make: Make, points: FloatArray, normals: FloatArray | None, length: float, most: int
+) -> tuple[float, Arrays]:
+    """Seconds, and a mesh of at most so many triangles; 0 for as many as there are."""
+    start = time.process_time()
+    try:
+        vertices, faces = make(points, normals, length)
+    except Exception as error:
+        print(f"{type(error).__name__}: {error}", flush=True)
+        vertices, faces = np.zeros((0, 3)), np.zeros((0, 3), np.int64)
+    seconds = time.process_time() - start
+    if most and len(faces) > most:
+        import open3d
+
+        mesh = open3d.geometry.TriangleMesh(
+            open3d.utility.Vector3dVector(vertices), open3d.utility.Vector3iVector(faces)
+        ).simplify_quadric_decimation(most)
+        vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.triangles)
+    return seconds, (np.array(vertices, np.float64), np.array(faces, np.int64))
+
+
+def _compared(seconds: float, made: Arrays, whole: Arrays) -> _Row:
+    if not len(made[1]):
+        return _Row(seconds, 0, False, math.nan, math.nan)
+    mesh = trimesh.Trimesh(*made, process=False)
+    away = [_away(made, whole, 1), _away(whole, made, 2)]
+    size = _diagonal(whole)
+    far, mean = max(float(one.max()) for one in away), float(np.mean(away))
+    closed = bool(mesh.is_watertight and mesh.is_winding_consistent)
+    return _Row(seconds, len(made[1]), closed, far / size, mean / size)
+
+
+def _away(made: Arrays, other: Arrays, seed: int) -> FloatArray:
+    """Distances of points chosen by chance on a mesh from the triangles of another."""
+    mesh = trimesh.Trimesh(*made, process=False)
+    points = np.asarray(trimesh.sample.sample_surface(mesh, _SAMPLES, seed=seed)[0])
+    vertices, faces = other
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    center, size = 0.5 * (low + high), float((high - low).max())
+    backend = choose_backend("double")
+    surface = MeshSurface((vertices[faces] - center) / size, center, size, True)
+    way = surface.upload(backend)(to_vector3(backend, points))
+    return np.linalg.norm(to_numpy(way), axis=1)

@@ -1,0 +1,118 @@
+"""Smoothed dipoles: sums over points of clouds with noise, without their singularities.
+
+`SmoothedKernel` is the kernel, with the proof of its bounds, `SmoothedSum` the sum by a tree.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import drjit as dr
+
+from harnack.backend.elementary import fmax, fmin
+from harnack.fields.batch import Values
+from harnack.fields.clearance import epsilon_at
+from harnack.fields.field import Sample
+from harnack.fields.solid_angles.radial_kernel import Radial, RadialKernel
+from harnack.fields.solid_angles.radial_tree import ClusteredDipoles, TreeSum, clusters
+from harnack.fields.sums import SLOPE_ROUNDINGS, SUM_ROUNDING
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, FloatArray, Real, Vec3
+    from harnack.tree import Hierarchy
+
+# Bounds of the kernel hold from this part of a distance on: promises reach `_REACHES` = 0.45 of it.
+_FROM = 0.55
+
+
+class SmoothedKernel(RadialKernel):
+    """1/D + h^2/(2 D^3) on a backend, D = sqrt(rho^2 + h^2); h: the smoothing length.
+
+    Kernel. The first two terms of 1/rho = (D^2 - h^2)^(-1/2) in powers of h^2. With psi_0 = K and
+    psi_(k+1) = -psi_k'/rho
+
+        psi_k = (2k-1)!! (1 + (2k+1) q/2)/D^(2k+1),   q = h^2/D^2,
+
+    sums of positive terms; a dipole m at y = x + z gives -m.grad_y K = m.z (rho^2 + 5 h^2/2)/D^5.
+    Since Laplacian D^p = p D^(p-2) (p + 1 - (p-2) q) in three dimensions, -Laplacian K/(4 pi) =
+    15 h^4/(8 pi D^7): positive, with integral 1 and second moment 3 h^2/2. So a sum over dipoles
+    is that of plain ones averaged with this weight. (1/D alone has the weight 3 h^2/(4 pi D^5),
+    whose second moment is infinite: at equal noise its surfaces were farther off.)
+
+    Bound. |d^m K[u_1, ..., u_m]| <= m! Q_m/D^(m+1), Q_m = 1 + q (m+1)(m+2)/4, for unit vectors.
+    Proof. Equal vectors u are the worst (Banach 1938). D is the length of Z = (z, h), and along a
+    line in direction u at an angle phi from Z 1/|Z + t u|^(2 l) is the generating function of
+    Gegenbauer's polynomials: its m-th derivative is m! C_m^l(-cos phi)/D^(m + 2 l), at most m!
+    C_m^l(1)/D^(m + 2 l). That is m!/D^(m+1) for l = 1/2, and m! (m+1)(m+2)/(2 D^(m+3)) for l = 3/2.
+    As D >= h always, q <= 1. Bounds that are asked for at a distance hold from 0.55 of it on, so
+    that promises, which reach 0.45 of it, need no more (`growth`).
+    """
+
+    def __init__(self, backend: Backend, height: float) -> None:
+        self.height_square = dr.opaque(backend.Float, height * height)
+
+    def at(self, distance: Real, inverse: Real, last: int) -> Radial:
+        del distance
+        half = 0.5 * self.height_square * inverse * inverse
+        thetas: list[Real] = []
+        factor = 1.0
+        for k in range(last + 1):
+            thetas.append(dr.fma((2 * k + 1) * factor, half, factor))
+            factor *= 2 * k + 1
+        return Radial(inverse, thetas)
+
+    def bounds(self, distance: Real, last: int) -> list[Real]:
+        share = dr.sqrt(self.height_square) / (_FROM * fmax(distance, 1e-30))
+        q = fmin(share * share, 1)
+        return [dr.fma(0.25 * (m + 1) * (m + 2), q, 1) for m in range(2, last + 1)]
+
+    def growth(self, r: Real) -> Real:
+        del r
+        return 1.0
+
+    def accepting_distance(self, radius: FloatArray, accuracy: float) -> FloatArray:
+        return accuracy * radius + 1e-5
+
+
+@dataclass(frozen=True)
+class SmoothedSum:
+    """sum_i m_i.z_i (rho_i^2 + 5 h^2/2)/(rho_i^2 + h^2)^(5/2), z_i = y_i - x, rho_i = |z_i|."""
+
+    dipoles: TreeSum
+
+    @classmethod
+    def of(
+        cls, backend: Backend, tree: Hierarchy, rows: FloatArray, height: float, accuracy: float
+    ) -> SmoothedSum:
+        """rows: (n, 8) of `dipole_rows`. tree: `hierarchy_of` their points, or of the same points
+        at earlier positions. height: the smoothing length, in the units of the dipoles."""
+        clustered = ClusteredDipoles(rows, tree, clusters(tree, rows))
+        return cls(TreeSum(backend, clustered, SmoothedKernel(backend, height), accuracy))
+
+    @property
+    def coarsest(self) -> float:
+        """The detail of coarse evaluations (`Field.coarsest_detail`): there are none."""
+        return 1.0
+
+    def at(self, x: Vec3, derivatives: int, closer: Real) -> Values:
+        """Value and the derivatives asked for at x; closer: the detail, at least 1."""
+        sums = self.dipoles.sums(x, closer, derivatives).sums
+        rounding = 8 * self.dipoles.backend.epsilon * dr.abs(sums.value)
+        return sums.values(1.0, epsilon_at(x), rounding)
+
+    def sample(self, x: Vec3, detail: Real) -> Sample:
+        """Value, gradient and promises at x."""
+        radial = self.dipoles.sums(x, detail, 1)
+        sums = radial.sums
+        slope_error = dr.fma(SLOPE_ROUNDINGS * epsilon_at(x), sums.s4, sums.slope_truncation)
+        epsilon = self.dipoles.backend.epsilon
+        nearest = fmax(sums.free_distance * (1 - SUM_ROUNDING) - 8 * epsilon, 0)
+        return Sample(
+            sums.value,
+            sums.gradient,
+            radial.curvatures(lambda r: 1.0, nearest, 1.0),
+            sums.truncation + sums.rounding + 8 * epsilon * dr.abs(sums.value),
+            slope_error,
+            truncation=sums.truncation,
+        )
