@@ -147,8 +147,9 @@ def _dipole(row: list[Real], x: Vec3, derivatives: int) -> tuple[Real, Terms]:
 
 _VALUES, _TRACED = 2.0, 4.0
 # The least smoothing length, as a part of half the size of the cloud; the most points at which its
-# level is looked for, and the least level that is one.
-_LEAST_SMOOTHING, _PROBES, _LEAST_LEVEL = 1e-5, 10_000, 1e-3
+# level is looked for; the least level that is one, as a part of 2 pi if areas are estimated.
+_LEAST_SMOOTHING, _PROBES = 1e-5, 10_000
+_LEAST_PART, _LEAST_LEVEL = 0.1, 1e-3
 
 
 class DipolePotential(DetailedField["_DipoleBuffers"], BatchedField):
@@ -233,10 +234,13 @@ class DipolePotential(DetailedField["_DipoleBuffers"], BatchedField):
             )
         step = -(-len(self.points) // _PROBES)
         level = float(np.median(self.value(self.points[::step], precision="double")))
-        if abs(level) < _LEAST_LEVEL:
+        # Areas that are given may stand for other things than a surface.
+        least = _LEAST_PART * 2 * math.pi if self.estimated[1] else _LEAST_LEVEL
+        if not abs(level) >= least:
             raise CloudError(
                 f"the smoothed sum is {level:.2g} at the points, where it should be about 2 pi: "
-                "normals cancel each other, or the points lie in a plane and enclose nothing"
+                "normals cancel each other, or the points lie in a plane or on a line and enclose "
+                "nothing, or what they enclose is thinner than the smoothing"
             )
         return level
 
