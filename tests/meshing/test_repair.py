@@ -13,10 +13,10 @@ import harnack as hk
 from harnack.cli import main
 from harnack.geometry import MeshError
 from harnack.geometry.mesh_shapes import icosphere, remove_faces, torus_mesh
-from harnack.meshing.repair import (  # pyright: ignore[reportPrivateUsage]
-    _collapsed,
-    _missing_triangles,
-    _open_edges,
+from harnack.meshing.harmonic_patches import (
+    _collapsed,  # pyright: ignore[reportPrivateUsage]
+    missing_triangles,
+    open_edges,
 )
 from tests.oracles.mesh_files import read_closed
 from tests.oracles.triangle_pairs import intersecting_pairs
@@ -35,7 +35,7 @@ def ball(directions: Any = AXES, radius: float = 0.5, subdivisions: int = 3) -> 
 
 def check(given: trimesh.Trimesh, euler: int = 2) -> trimesh.Trimesh:
     """Repairs a mesh and judges the result by other means than `repair` does."""
-    made = hk.repair(given, keep="all")
+    made = hk.repair(given, keep="all", patches="harmonic")
     assert made.metadata["harnack"]["stage"] == "kept"
     n, m = len(given.vertices), len(given.faces)
     assert made.vertices[:n].tobytes() == given.vertices.tobytes()
@@ -290,7 +290,7 @@ def test_points_are_moved_in_another_way_where_a_change_is_not_known() -> None:
     assert made.euler_number == 2
 
 
-def test_missing_triangles_are_those_that_stand_in_no_other() -> None:
+def testmissing_triangles_are_those_that_stand_in_no_other() -> None:
     whole = trimesh.Trimesh(*icosphere(2), process=False)
     faces = np.asarray(whole.faces)[2:]
     lost = {tuple(sorted(face)) for face in np.asarray(whole.faces)[:2].tolist()}
@@ -313,4 +313,4 @@ def test_a_lone_triangle_is_not_covered_by_itself() -> None:
 
 
 def missing(vertices: Any, faces: Any) -> Any:
-    return _missing_triangles(np.asarray(vertices), faces, _open_edges(faces))
+    return missing_triangles(np.asarray(vertices), faces, open_edges(faces))

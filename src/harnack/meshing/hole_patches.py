@@ -63,7 +63,7 @@ class Filled:
 
 
 def filled(
-    vertices: FloatArray, faces: IntArray, loops: list[IntArray], winding: Winding | None
+    vertices: FloatArray, faces: IntArray, loops: list[IntArray], winding: Winding
 ) -> Filled:
     """Patches over loops of open edges, as `hole_loops` gives them, that pass these checks: no
     triangle of one meets another triangle or is without an area, and the winding number of what is
@@ -72,10 +72,11 @@ def filled(
 
     What fails is tried once more with the least area in place of the least bending.
 
-    winding: the winding number of the mesh at points; None checks all but that.
+    winding: the winding number of the mesh at points.
     """
-    x, together, left = vertices, faces, loops
-    reasons: dict[int, str] = {}
+    x, together = vertices, faces
+    left: list[IntArray] = loops
+    reasons = dict[int, str]()
     for is_flat in (False, True):
         if not left:
             break
@@ -103,20 +104,18 @@ def _failures(
     new: IntArray,
     owner: IntArray,
     given: int,
-    winding: Winding | None,
+    winding: Winding,
 ) -> dict[int, str]:
     """By loop, what is wrong with its patch. new: faces of patches, and owner: of which loop."""
     found: dict[int, str] = {}
     if not len(new):
         return found
-    if winding is not None:
-        points = np.concatenate([x[new].mean(axis=1), x[given:]])
-        loop_of = np.zeros(len(x), np.int64)
-        loop_of[new] = owner[:, None]
-        loops = np.concatenate([owner, loop_of[given:]])
-        w = winding(points)
-        far = ~(np.abs(w - np.floor(w) - 0.5) <= _FROM_HALF)
-        found |= dict.fromkeys(loops[far].tolist(), "not where the winding number is near 1/2")
+    loop_of = np.zeros(len(x), np.int64)
+    loop_of[new] = owner[:, None]
+    loops = np.concatenate([owner, loop_of[given:]])
+    w = winding(np.concatenate([x[new].mean(axis=1), x[given:]]))
+    far = ~(np.abs(w - np.floor(w) - 0.5) <= _FROM_HALF)
+    found |= dict.fromkeys(loops[far].tolist(), "not where the winding number is near 1/2")
     together = np.concatenate([faces, new])
     is_new = np.arange(len(together)) >= len(faces)
     met = intersecting_faces(x, together, is_new)
@@ -174,12 +173,13 @@ def _across_gaps(
     """For each edge that comes from a start to v, the end to which its loop goes on: the next one
     counter-clockwise, since faces are to the left of their edges and holes to the right."""
     axis = np.eye(3)[np.abs(normal).argmin()]
-    one = np.cross(normal, axis)
-    other = np.cross(normal, one)
+    unit = normal / max(float(np.linalg.norm(normal)), 1e-300)
+    one = np.cross(unit, axis)
+    other = np.cross(unit, one)
 
     def angle(k: int) -> float:
         way = x[k] - x[v]
-        return float(np.arctan2(way @ other * np.linalg.norm(one), way @ one * np.linalg.norm(other)))
+        return float(np.arctan2(way @ other, way @ one))
 
     free, found = {c: angle(c) for c in ends}, list[int]()
     for a in starts:
@@ -231,7 +231,8 @@ def _beside(faces: IntArray, rims: IntArray, count: int) -> dict[tuple[int, int]
     directed = directed_edges(faces)
     near = is_rim[directed].all(axis=1)
     third = np.roll(faces, 1, axis=1).T.ravel()[near].tolist()
-    return dict(zip(map(tuple, directed[near].tolist()), third, strict=True))
+    ends = directed[near].tolist()
+    return {(a, b): c for (a, b), c in zip(ends, third, strict=True)}
 
 
 def _barred(polygon: IntArray, taken: set[tuple[int, int]]) -> BoolArray:
@@ -497,10 +498,10 @@ def _owners(new: IntArray, loops: list[IntArray], count: int) -> IntArray:
     keys = edge_keys(edges.ends, count)
     face_at = np.empty(len(keys), np.int64)
     face_at[edges.index] = np.arange(3 * len(new)) % len(new)
-    for k, loop in enumerate(loops):
-        place = np.searchsorted(keys, edge_keys(loop[None, :2], count)[0])
-        if place < len(keys) and keys[place] == edge_keys(loop[None, :2], count)[0]:
-            loop_at[part[face_at[place]]] = k
+    firsts = edge_keys(np.array([loop[:2] for loop in loops]), count)
+    places = np.minimum(np.searchsorted(keys, firsts), len(keys) - 1)
+    found = np.flatnonzero(keys[places] == firsts)
+    loop_at[part[face_at[places[found]]]] = found
     return loop_at[part]
 
 

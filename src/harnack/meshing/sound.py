@@ -42,14 +42,14 @@ class Mended:
 
     kept: of the first faces, which of the given ones they are, in order. turned: which of these
         run the other way round.
-    counts: how many of the given triangles were left out, by reason; and how many holes were
-        filled.
+    left_out: how many of the given triangles were, by reason. holes: how many were filled.
     """
 
     surface: Surface
     kept: IntArray
     turned: IntArray
-    counts: dict[str, int]
+    left_out: dict[str, int]
+    holes: int
 
 
 def mended(vertices: FloatArray, faces: IntArray, report: Callable[[str], None]) -> Mended:
@@ -60,7 +60,7 @@ def mended(vertices: FloatArray, faces: IntArray, report: Callable[[str], None])
     """
     report("looking for triangles that are sound")
     state = _State.of(vertices, faces)
-    holes = 0
+    holes, why, most = 0, "", _MOST_LEFT_OUT * len(state.faces)
     for ring in range(_MOST_RINGS):
         state = state.without_branches()
         edges = boundary_edges(state.faces)
@@ -68,21 +68,21 @@ def mended(vertices: FloatArray, faces: IntArray, report: Callable[[str], None])
             raise MeshingError(f"{len(edges):,} edges of {len(state.faces):,} triangles are open")
         loops = hole_loops(state.vertices, state.faces, edges)
         report(f"{len(loops):,} holes" + f", {ring} rings wider in places" * (ring > 0))
-        holes += len(loops)
         state, left, why = state.filled(loops)
+        holes += len(loops) - len(left)
         bad = np.concatenate([singular_vertices(state.faces), *left])
         if not len(bad):
-            return state.result(faces, holes)
+            return state.result(holes)
         state = state.without_ring(bad)
-        if (state.origin >= 0).sum() < _MOST_LEFT_OUT * len(faces):
+        if (state.origin >= 0).sum() < most:
             raise MeshingError(f"half of the triangles would be left out: {why}")
-    raise MeshingError(f"{len(left):,} holes cannot be filled: {why}")
+    raise MeshingError(f"holes cannot be filled, even {_MOST_RINGS} rings wider: {why}")
 
 
 @dataclass(frozen=True)
 class _State:
-    """Vertices, those given first; faces; of each face which of the given ones it is, or -1; and
-    whether it runs the other way."""
+    """Vertices, those given first; faces; of each face which of the given ones it is, or -1, and
+    whether it runs the other way. counts: of the given ones that were left out, by reason."""
 
     vertices: FloatArray
     faces: IntArray
@@ -98,7 +98,8 @@ class _State:
         corner = vertices[joined]
         area = lengths(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]))
         rows = every[area > 0]
-        counts = {"flat": len(faces) - len(rows)}
+        reasons = ("flat", "doubled", "crossing", "branching", "one-sided", "around")
+        counts = dict.fromkeys(reasons, 0) | {"flat": len(faces) - len(rows)}
         _, first = np.unique(np.sort(joined[rows], axis=1), axis=0, return_index=True)
         counts["doubled"] = len(rows) - len(first)
         rows = rows[np.sort(first)]
@@ -110,7 +111,7 @@ class _State:
     def chosen(self, rows: BoolArray, reason: str) -> _State:
         """Without some faces, of which those given are counted."""
         lost = int((~rows & (self.origin >= 0)).sum())
-        counts = self.counts | {reason: self.counts.get(reason, 0) + lost}
+        counts = self.counts | {reason: self.counts[reason] + lost}
         return _State(
             self.vertices, self.faces[rows], self.origin[rows], self.is_turned[rows], counts
         )
@@ -119,7 +120,7 @@ class _State:
         """Without faces at edges of more than two; and oriented, without those at edges where that
         is not possible."""
         edges = Edges.of(directed_edges(self.faces))
-        many = (edges.uses > 2)[edges.index].reshape(3, -1).any(axis=0)
+        many = np.asarray((edges.uses > 2)[edges.index].reshape(3, -1).any(axis=0))
         state = self.chosen(~many, "branching")
         turned = _against_neighbors(state.vertices, state.faces)
         oriented = np.where(turned[:, None], state.faces[:, ::-1], state.faces)
@@ -131,7 +132,7 @@ class _State:
         state = _State(
             state.vertices, oriented, state.origin, state.is_turned ^ turned, state.counts
         )
-        return state.chosen(~bad, "one-sided")
+        return state.chosen(~np.asarray(bad), "one-sided")
 
     def filled(self, loops: list[IntArray]) -> tuple[_State, list[IntArray], str]:
         """With patches where they pass the checks; the loops left, and why they are."""
@@ -155,26 +156,19 @@ class _State:
         """Without the faces at some vertices."""
         is_bad = np.zeros(len(self.vertices), np.bool_)
         is_bad[places] = True
-        return self.chosen(~is_bad[self.faces].any(axis=1), "around")
+        return self.chosen(~np.asarray(is_bad[self.faces].any(axis=1)), "around")
 
-    def result(self, given: IntArray, holes: int) -> Mended:
+    def result(self, holes: int) -> Mended:
         """The surface, with what was given first."""
-        order = np.lexsort((np.arange(len(self.faces)), self.origin < 0))
-        faces, origin = self.faces[order], self.origin[order]
-        turned = self.is_turned[order]
+        last = len(self.vertices) + len(self.origin)  # behind all that were given
+        order = np.argsort(np.where(self.origin < 0, last, self.origin), kind="stable")
+        faces, kept = self.faces[order], self.origin[order]
         check_manifold(faces)
-        outwards = turned_outwards(Surface(self.vertices, faces))
-        faces = np.where(outwards[:, None], faces[:, ::-1], faces)
-        turned ^= outwards
-        count = int((origin >= 0).sum())
-        # Corners in the order in which they were given.
-        kept = origin[:count]
-        order = np.argsort(kept)
-        kept, turned = kept[order], turned[:count][order]
-        first = faces[:count][order]
-        del given
-        surface = Surface.of(self.vertices, np.concatenate([first, faces[count:]]))
-        return Mended(surface, kept, kept[turned], self.counts | {"holes": holes})
+        inwards = turned_outwards(Surface(self.vertices, faces))
+        faces = np.where(inwards[:, None], faces[:, ::-1], faces)
+        kept, turned = kept[kept >= 0], (self.is_turned[order] ^ inwards)[kept >= 0]
+        surface = Surface.of(self.vertices, faces)
+        return Mended(surface, kept, kept[turned], self.counts, holes)
 
 
 def _against_neighbors(x: FloatArray, faces: IntArray) -> BoolArray:
