@@ -465,8 +465,8 @@ def _repaired(facts: dict[str, Any], given: int, made: int) -> str:
         return f"{added} to {given:,}, which are all kept; {parts}"
     out = ", ".join(f"{count:,} {what}" for what, count in facts["left_out"].items() if count)
     return (
-        f"kept what is sound{why}: {facts['kept']:,} triangles of {given:,}, {facts['turned']:,} of "
-        f"them turned over; left out {out or 'none'}; {added}; {parts}"
+        f"kept what is sound{why}: {facts['kept']:,} triangles of {given:,}, {facts['turned']:,} "
+        f"of them turned over; left out {out or 'none'}; {added}; {parts}"
     )
 
 
