@@ -11,6 +11,7 @@ import trimesh
 
 import harnack as hk
 from harnack.geometry.mesh_shapes import flip_faces, icosphere, remove_faces
+from harnack.meshing import by_signs
 from harnack.meshing.by_signs import sign_surface
 from harnack.meshing.lattice import Lattice
 from harnack.meshing.sign_function import SignFunction
@@ -28,6 +29,15 @@ def soup(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     return loose, np.arange(len(loose)).reshape(-1, 3)
 
 
+def sphere_points(n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points of the unit sphere on a spiral, and normals there."""
+    k = np.arange(n) + 0.5
+    height, turn = 1 - 2 * k / n, math.pi * (1 + math.sqrt(5)) * k
+    ring = np.sqrt(1 - height**2)
+    points = np.column_stack([ring * np.cos(turn), ring * np.sin(turn), height])
+    return points, points
+
+
 def check(made: trimesh.Trimesh) -> dict[str, Any]:
     """Closed and without crossings, by other means than `mesh`."""
     assert made.is_watertight
@@ -38,11 +48,28 @@ def check(made: trimesh.Trimesh) -> dict[str, Any]:
 
 
 def test_a_soup_is_closed() -> None:
-    made = hk.mesh(hk.WindingNumber(*soup()), tolerance=4e-3, spacing=0.1)
+    with pytest.warns(UserWarning, match="are farther from the level of this WindingNumber"):
+        made = hk.mesh(hk.WindingNumber(*soup()), tolerance=4e-3, spacing=0.1)
     facts = check(made)
     assert facts["made_by"] == "signs"
     assert made.volume == pytest.approx(1.0, abs=0.03)
     assert math.isfinite(facts["within"])
+
+
+def test_both_ends_of_a_solid_are_told_of() -> None:
+    ball = hk.DipolePotential(*sphere_points(1000))
+    ends = {end: hk.mesh(ball, solid=end, tolerance=4e-3, spacing=0.12).metadata["harnack"]
+            for end in ((5.0, math.inf), (-math.inf, 8.0), (5.0, 8.0))}  # fmt: skip
+    low, high, both = ends.values()
+    for key in ("evaluations", "looked_at", "far", "undecided"):
+        assert both[key] == pytest.approx(low[key] + high[key], rel=0.2, abs=20), key
+    assert both["within"] == max(low["within"], high["within"])
+
+
+def test_what_is_nowhere_near_the_level_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(by_signs, "far_from_level", lambda *_: (np.zeros((1, 3)), 1000))
+    with pytest.raises(hk.MeshingError, match="farther than several cells"):
+        hk.mesh(hk.WindingNumber(*icosphere(1)), spacing=0.2)
 
 
 def test_vertices_lie_on_triangles_and_creases_are_sharp() -> None:
@@ -69,10 +96,7 @@ def test_units_and_places(scale: float, shift: float) -> None:
 
 
 def test_a_cloud_is_closed_and_near() -> None:
-    k = np.arange(1000) + 0.5
-    height, turn = 1 - k / 500, math.pi * (1 + math.sqrt(5)) * k
-    ring = np.sqrt(1 - height**2)
-    points = np.column_stack([ring * np.cos(turn), ring * np.sin(turn), height])
+    points, _ = sphere_points(1000)
     made = hk.mesh(hk.DipolePotential(points, points), tolerance=4e-3, spacing=0.12)
     check(made)
     assert np.abs(np.linalg.norm(made.vertices, axis=1) - 1).max() < 0.02

@@ -25,9 +25,7 @@ from harnack.backend import BoolArray, FloatArray
 from harnack.meshing.checks import (
     LocalError,
     MeshingError,
-    check_apart,
     check_count,
-    check_manifold,
     far_from_level,
     intersecting_faces,
 )
@@ -41,7 +39,7 @@ from harnack.meshing.refinement import split_faces
 from harnack.meshing.samples import Samples
 from harnack.meshing.sign_function import SignFunction
 
-__all__ = ["SignSurface", "sign_surface", "signed_surface"]
+__all__ = ["MOST_FAR", "SignSurface", "sign_surface", "signed_surface"]
 
 # Vertices keep this part of an edge from its ends, so that all triangles have an area.
 _FROM_ENDS = 1e-4
@@ -67,7 +65,9 @@ _BEFORE, _BEHIND, _BESIDE = 0.3, 1.3, 1.0
 # the determinant of their normals is larger than the last.
 _PARALLEL, _INDEPENDENT = 1e-4, 0.1
 # So large a part of vertices and centers may be beyond the tolerance before cells are made smaller.
-_MOST_FAR, _SMALLER = 0.01, 0.6
+MOST_FAR, _SMALLER = 0.01, 0.6
+# What is farther from the level than this many cells is nowhere near.
+_NOWHERE = 4.0
 # What has more triangles is not made again.
 _MOST_REMADE = 100_000
 # Points at which the function is no number are moved by this part of a cell.
@@ -108,16 +108,13 @@ def signed_surface(
         layers = 2 if closed else 0
         lattice = Lattice.filling(*box, spacing, layers=layers)
         made = sign_surface(function, lattice, 0.8 * tolerance, report, closed=closed)
-        x, faces = made.surface.vertices, made.surface.faces
         report("measuring distances to the level")
         far, count, within = _distances(function, made.surface, tolerance, lattice, closed)
         attempts -= 1
-        if attempts <= 0 or far <= _MOST_FAR * count or len(faces) > _MOST_REMADE:
+        if attempts <= 0 or far <= MOST_FAR * count or len(made.surface.faces) > _MOST_REMADE:
             break
         report(f"{far:,} of {count:,} vertices and centers are beyond the tolerance")
         spacing *= _SMALLER
-    check_manifold(faces)
-    check_apart(x, faces)
     facts = {
         "made_by": "signs",
         "spacing": spacing,
@@ -127,6 +124,7 @@ def signed_surface(
         "undecided": made.undecided,
         "flat": made.flat,
         "far": far,
+        "looked_at": count,
         "within": within,
     }
     return made.surface, facts
@@ -146,7 +144,7 @@ def _distances(
         x, faces = surface.vertices, surface.faces
     far, count = far_from_level(function, x, faces, tolerance, None)
     within, left = tolerance, far
-    while len(left) and within < float(lattice.size.max()):
+    while len(left) and within < _NOWHERE * float(lattice.size.max()):
         within *= 2
         alone = np.zeros((0, 3), np.int64)
         left, _ = far_from_level(function, left, alone, within, None)

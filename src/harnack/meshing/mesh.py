@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from harnack.fields.field import check_is_field
 from harnack.fields.solid_angles.solid_angle import SolidAngle
 from harnack.geometry import Box, Intersection, Volume
 from harnack.geometry.volume import check_volume
-from harnack.meshing.by_signs import signed_surface
+from harnack.meshing.by_signs import MOST_FAR, signed_surface
 from harnack.meshing.checks import (
     MeshingError,
     TooLargeError,
@@ -110,9 +111,10 @@ def mesh(
     All that is returned has been checked: every edge has two faces, or one at the boundary, no two
     triangles pass through each other, vertices and centers of triangles are within the tolerance of
     the level by samples of the field, and inside the clip (of a thick part, the surface that it is
-    made of). Else a MeshingError is raised. By signs all is checked but the last: if one in a
-    hundred vertices and centers is beyond the tolerance, smaller cells are tried, and how many are
-    at last is said (`far`, below).
+    made of). Else a MeshingError is raised. By signs all is checked but the last: if more than one
+    in a hundred vertices and centers are beyond the tolerance, smaller cells are tried; if that is
+    not enough, a warning says how many there are and how far they are; and a MeshingError if some
+    are farther than a few cells.
 
     Returns:
         A trimesh.Trimesh; if it is closed, `export` writes closed files, in single precision, or
@@ -131,8 +133,8 @@ def mesh(
             1.5 times the spacing from the curve;
         turned: triangles of an angle, smaller than the tolerance, that are turned over.
         Of meshes by signs, made_by is "signs", and
-        far, within: how many vertices and centers of triangles are beyond the tolerance, and a
-            distance within which all are, sampled up to a factor of 2;
+        far, looked_at, within: how many vertices and centers of triangles are beyond the tolerance,
+            of how many, and a distance within which all are, sampled up to a factor of 2;
         undecided: at how many points of the lattice the error of f leaves its sign open;
         flat: how many triangles were not fitted to creases, as they would pass through others.
 
@@ -144,7 +146,6 @@ def mesh(
         ValueError: options out of range, or that contradict each other; a `LevelSet` of several
             levels.
     """
-    report = progress or _silent
     if isinstance(field, LevelSet):
         level, solid = _level_and_solid(field, level, solid)
         clip = field.clip if clip is None else clip
@@ -161,118 +162,179 @@ def mesh(
     is_closed = bool(solid) or thickness is not None
     if simplify and not is_closed:
         raise ValueError("simplify is for closed meshes: give solid or thickness as well")
-    facts: dict[str, Any]
+    report = progress or _silent
     volume = _volume(field, clip, section)
-    region = None
+    asked = _Asked(volume, tolerance, spacing, seed, max_triangles, report)
     if is_meshed_by_signs(field):
-        if thickness is not None and field.has_sheets:
-            raise TypeError(
-                f"{type(field).__name__} jumps, and its surface has no normals to thicken it "
-                "along: mesh it, and move the mesh's vertices instead"
-            )
-        if solid:
-            ends = ends_of_solid(field, solid, level)
-        else:
-            level = field.default_level if level is None else float(level)
-            field.check_levels((level,))
-            ends = level, math.inf
-        made, size, facts = _signed(
-            field, ends, volume, tolerance, spacing, max_triangles, bool(solid), report
-        )
-        if solid:
-            facts["solid"] = solid
-        elif largest:
-            made = largest_part(made)
-        if thickness is not None:
-            function = SignFunction(field, ends[0])
-            made, more = thickened(
-                made, normals_of(function, made), float(thickness), 0.5 * tolerance * size
-            )
-            facts |= more
+        made = _by_signs(field, level, solid, thickness is not None, asked)
     elif solid:
-        region = LevelFunction(*region_of(field, solid, level), most_faces=max_triangles)
-        made, size, facts = _solid(region, volume, tolerance, spacing, seed, report)
+        made = _solid(field, level, solid, asked)
+    else:
+        made = _surface(field, level, asked)
+    surface, facts = made.surface, dict(made.facts)
+    if solid:
         facts["solid"] = solid
     else:
-        level = field.default_level if level is None else float(level)
-        function = LevelFunction(field, level, most_faces=max_triangles)
-        made, size, facts = _surface(function, volume, tolerance, spacing, seed, report)
-        if largest:
-            made = largest_part(made)
-        _check_level(function, made, tolerance * size, volume)
-        if thickness is not None:
-            report("thickening")
-            made, more = thickened(
-                made, normals_of(function, made), float(thickness), 0.5 * tolerance * size
-            )
-            facts |= more
+        surface = largest_part(surface) if largest else surface
+        made.check_level(surface)
+    if thickness is not None:
+        report("thickening")
+        normals = normals_of(made.function, surface)
+        surface, more = thickened(surface, normals, float(thickness), 0.5 * tolerance * made.size)
+        facts |= more
     if largest and is_closed:
-        made = largest_body(made)
+        surface = largest_body(surface)
 
     def check(one: Surface) -> None:
-        if region is not None:
-            _check_level(region, one, tolerance * size, volume)
+        if solid:
+            made.check_level(one)
         check_manifold(one.faces)
         check_apart(one.vertices, one.faces)
 
-    if region is None:  # else it was checked when it was made
+    if not made.is_checked:
         report("checking")
-        check(made)
+        check(surface)
     if simplify:
         report("simplifying")
-        made, more = simplified(made, tolerance * size, check)
+        surface, more = simplified(surface, tolerance * made.size, check)
         facts |= more
-    return finished(made, facts, is_closed)
+    return finished(surface, facts, is_closed)
 
 
-def _signed(
+@dataclass(frozen=True)
+class _Asked:
+    """Arguments of `mesh`; volume: what the level set is cut by."""
+
+    volume: Volume | None
+    tolerance: float
+    spacing: float | None
+    seed: int
+    most_faces: int
+    report: Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class _Made:
+    """A surface, its size, what is known of it, and the function that it is a level set of.
+
+    check_level: raises a MeshingError unless a surface is within the tolerance of the level.
+    is_checked: whether that has been done, and the surface is known to be a manifold that does not
+        pass through itself.
+    """
+
+    surface: Surface
+    size: float
+    facts: dict[str, Any]
+    function: LevelFunction
+    check_level: Callable[[Surface], None]
+    is_checked: bool
+
+
+def _by_signs(
     field: Field,
-    ends: tuple[float, float],
-    volume: Volume | None,
-    tolerance: float,
-    spacing: float | None,
-    most_faces: int,
-    is_solid: bool,
-    report: Callable[[str], None],
-) -> tuple[Surface, float, dict[str, Any]]:
-    """The closed surface of the points where low <= f <= high by the signs of f, or the surface of
-    level low; its size, and what is known of it."""
+    level: float | None,
+    solid: tuple[float, float] | bool | None,
+    is_thick: bool,
+    asked: _Asked,
+) -> _Made:
+    """A level set by the signs of f, or the closed surface of a solid.
+
+    Raises:
+        MeshingError: as `signed_surface`; if it is empty, or not near the level at all.
+    """
+    if is_thick and field.has_sheets:
+        raise TypeError(
+            f"{type(field).__name__} jumps, and its surface has no normals to thicken it "
+            "along: mesh it, and move the mesh's vertices instead"
+        )
+    if solid:
+        ends = ends_of_solid(field, solid, level)
+    else:
+        level = field.default_level if level is None else float(level)
+        field.check_levels((level,))
+        ends = level, math.inf
     levels = tuple(one for one in ends if math.isfinite(one))
-    box = _box(field, levels, volume)
+    volume, box = asked.volume, _box(field, levels, asked.volume)
     size = float((box.upper - box.lower).max())
-    cells = size / _ACROSS_BY_SIGNS if spacing is None else float(spacing)
-    attempts = _ATTEMPTS_BY_SIGNS if spacing is None else 1
+    cells = size / _ACROSS_BY_SIGNS if asked.spacing is None else float(asked.spacing)
+    attempts = _ATTEMPTS_BY_SIGNS if asked.spacing is None else 1
     # Where nothing ends at the box, its cells should not lie along what is symmetrical.
     room = np.zeros(3) if box.has_walls else size * np.array([0.0037, 0.0053, 0.0029])
     filled = box.lower - room, box.upper + 0.5 * room
+    facts: list[dict[str, Any]] = []
 
-    def surface(level: float, side: float, closed: bool) -> tuple[Surface, dict[str, Any]]:
-        function = SignFunction.of(field, level, filled, cells, side=side, most_faces=most_faces)
-        made, facts = signed_surface(
-            function, filled, cells, tolerance * size, attempts, report, closed=closed
+    def function(one: float, side: float) -> SignFunction:
+        return SignFunction.of(field, one, filled, cells, side=side, most_faces=asked.most_faces)
+
+    def signed(one: float, side: float, closed: bool) -> Surface:
+        made, more = signed_surface(
+            function(one, side),
+            filled,
+            cells,
+            asked.tolerance * size,
+            attempts,
+            asked.report,
+            closed=closed,
         )
-        return made, {"level": level, **facts}
+        facts.append(more)
+        return made
 
-    if not is_solid:
-        made, facts = surface(levels[0], 1.0, False)
+    if not solid:
+        made = signed(levels[0], 1.0, False)
         if volume is not None and not (isinstance(volume, Box) and box.has_walls):
             made = cut_by(made, volume)
     elif volume is None and ends[1] == math.inf:
-        made, facts = surface(levels[0], -1.0, False)
+        made = signed(levels[0], -1.0, False)
     else:
-        whole, facts = box_manifold(box.lower, box.upper), {}
+        whole = box_manifold(box.lower, box.upper)
         if math.isfinite(ends[0]):
-            made, facts = surface(ends[0], -1.0, True)
-            whole = manifold_of(made)
+            whole = manifold_of(signed(ends[0], -1.0, True))
         if math.isfinite(ends[1]):
-            made, facts = surface(ends[1], -1.0, True)
-            whole = whole - manifold_of(made)
+            whole = whole - manifold_of(signed(ends[1], -1.0, True))
         cut = volume or Box(tuple(box.lower.tolist()), tuple(box.upper.tolist()))
-        whole ^= volume_manifold(cut, box.lower, box.upper, 0.5 * tolerance * size)
+        whole ^= volume_manifold(cut, box.lower, box.upper, 0.5 * asked.tolerance * size)
         made = surface_of(whole)
     if not len(made.faces):
         raise MeshingError("the level set is empty: it lies outside of the clip")
-    return made, size, facts
+    known = {"level": levels[0], **_of_both(facts)}
+    _judge_signs(field, known, asked.tolerance * size)
+    return _Made(made, size, known, function(levels[0], 1.0), _nothing, False)
+
+
+def _of_both(facts: list[dict[str, Any]]) -> dict[str, Any]:
+    """What is known of the surfaces at both ends of a solid."""
+    sums = ("evaluations", "undecided", "flat", "far", "looked_at")
+    larger = {key: max(one[key] for one in facts) for key in ("spacing", "within")}
+    return {**facts[0], **larger, **{key: sum(one[key] for one in facts) for key in sums}}
+
+
+def _judge_signs(field: Field, facts: dict[str, Any], tolerance: float) -> None:
+    """Warns where more than a few vertices and centers of triangles are beyond the tolerance.
+
+    Raises:
+        MeshingError: some of them are nowhere near the level.
+    """
+    far, count, within = facts["far"], facts["looked_at"], facts["within"]
+    kind = type(field).__name__
+    if not math.isfinite(within):
+        raise MeshingError(
+            f"some of {far:,} vertices and centers of triangles are farther than several cells "
+            f"from where the sign of {kind} changes: its values are not what it promises there; "
+            "choose a smaller `spacing`, or a `clip` without these places"
+        )
+    if far > MOST_FAR * count:
+        warnings.warn(
+            f"{far:,} of {count:,} vertices and centers of triangles are farther from the level of "
+            f"this {kind} than the tolerance, which is {tolerance:.3g}; all are within "
+            f"{within:.3g}. The level is rough there, or has parts that are nearer to each other "
+            f"than its cells of {facts['spacing']:.3g} are wide: choose a smaller `spacing`, or a "
+            "larger `tolerance`",
+            stacklevel=4,
+        )
+
+
+def _nothing(surface: Surface) -> None:
+    """Accepts every surface: by signs distances were measured when it was made."""
 
 
 def _level_and_solid(
@@ -335,72 +397,83 @@ def _volume(field: Field, clip: Volume | None, section: Volume | None) -> Volume
 
 
 def _solid(
-    region: LevelFunction,
-    volume: Volume | None,
-    tolerance: float,
-    spacing: float | None,
-    seed: int,
-    report: Callable[[str], None],
-) -> tuple[Surface, float, dict[str, Any]]:
-    """The closed surface of a solid, its size, and what is known of it."""
-    solid, at, most_faces = cast("Solid", region.field), region.level, region.most_faces
+    field: Field,
+    level: float | None,
+    solid: tuple[float, float] | Literal[True],
+    asked: _Asked,
+) -> _Made:
+    """The closed surface of a solid that is put together from smooth levels."""
+    region = LevelFunction(*region_of(field, solid, level), most_faces=asked.most_faces)
     evaluations = [0]
 
     def angle_mesher(error: float, cells: float) -> AngleMesher:
         def mesh_angle(angle: SolidAngle, value: float) -> Surface:
             angle = cast("SolidAngle", _checked(angle))
             box = _box(angle, (value,), None)
-            function = LevelFunction(angle, value, most_faces=most_faces)
-            made, facts = _spanned(function, box, error, cells, 1, seed, report)
+            function = LevelFunction(angle, value, most_faces=asked.most_faces)
+            made, facts = _spanned(function, box, error, cells, 1, asked.seed, asked.report)
             evaluations[0] += facts["evaluations"]
             return made
 
         return mesh_angle
 
+    def check_level(made: Surface, size: float) -> None:
+        _check_level(region, made, asked.tolerance * size, asked.volume)
+
     def check(made: Surface, size: float) -> None:
-        report("checking")
-        _check_level(region, made, tolerance * size, volume)
+        asked.report("checking")
+        check_level(made, size)
         check_manifold(made.faces, made.vertices)
         check_apart(made.vertices, made.faces)
 
     made = mesh_solid(
-        solid, at, volume, tolerance, spacing, angle_mesher, most_faces, check, report
+        cast("Solid", region.field),
+        region.level,
+        asked.volume,
+        asked.tolerance,
+        asked.spacing,
+        angle_mesher,
+        asked.most_faces,
+        check,
+        asked.report,
     )
     facts = {
-        "level": at,
+        "level": region.level,
         "spacing": made.spacing,
         "evaluations": made.evaluations + evaluations[0],
         "level_sets": made.levels,
     }
-    return made.surface, made.size, facts
+    return _Made(
+        made.surface, made.size, facts, region, lambda one: check_level(one, made.size), True
+    )
 
 
-def _surface(
-    function: LevelFunction,
-    volume: Volume | None,
-    tolerance: float,
-    spacing: float | None,
-    seed: int,
-    report: Callable[[str], None],
-) -> tuple[Surface, float, dict[str, Any]]:
-    """A level set, its size, and what is known of it."""
-    field, level = function.field, function.level
+def _surface(field: Field, level: float | None, asked: _Asked) -> _Made:
+    """A level set of a function that is smooth nearly everywhere, or of an angle."""
+    level = field.default_level if level is None else float(level)
+    function = LevelFunction(field, level, most_faces=asked.most_faces)
     field.check_levels((level,))
+    volume, report = asked.volume, asked.report
     box = _box(field, (level,), volume)
     size = float((box.upper - box.lower).max())
-    cells = size / _ACROSS if spacing is None else float(spacing)
-    if spacing is None and field.wavelength is not None:
+    error = 0.5 * asked.tolerance * size
+    cells = size / _ACROSS if asked.spacing is None else float(asked.spacing)
+    if asked.spacing is None and field.wavelength is not None:
         cells = min(cells, field.wavelength / CELLS_PER_WAVE)
-    attempts = 1 if spacing is not None else _MOST_ATTEMPTS
+    attempts = 1 if asked.spacing is not None else _MOST_ATTEMPTS
     if isinstance(field, SolidAngle):
-        made, facts = _spanned(function, box, 0.5 * tolerance * size, cells, attempts, seed, report)
+        made, facts = _spanned(function, box, error, cells, attempts, asked.seed, report)
     else:
-        made, facts = _filling(function, box, 0.5 * tolerance * size, cells, attempts, report)
+        made, facts = _filling(function, box, error, cells, attempts, report)
     if volume is not None and not (isinstance(volume, Box) and box.has_walls):
         made = cut_by(made, volume)
         if not len(made.faces):
             raise MeshingError("the level set is empty: it lies outside of the clip")
-    return made, size, {"level": level, **facts}
+
+    def check_level(one: Surface) -> None:
+        _check_level(function, one, asked.tolerance * size, volume)
+
+    return _Made(made, size, {"level": level, **facts}, function, check_level, False)
 
 
 def _filling(
