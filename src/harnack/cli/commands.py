@@ -463,9 +463,13 @@ def _repaired(facts: dict[str, Any], given: int, made: int) -> str:
     added = f"{_counted(facts['holes'], 'hole')}, {facts['patches']:,} triangles added"
     if facts["stage"] == "kept":
         return f"{added} to {given:,}, which are all kept; {parts}"
+    start, kept = f"kept what is sound{why}", facts["kept"]
+    if facts["stage"] == "joined":
+        kept = facts["joined"]
+        start = f"corners joined that moved up to {facts['moved']:.2g}{why}"
     out = ", ".join(f"{count:,} {what}" for what, count in facts["left_out"].items() if count)
     return (
-        f"kept what is sound{why}: {facts['kept']:,} triangles of {given:,}, {facts['turned']:,} "
+        f"{start}: {kept:,} triangles of {given:,}, {facts['turned']:,} "
         f"of them turned over; left out {out or 'none'}; {added}; {parts}"
     )
 

@@ -30,7 +30,7 @@ from harnack.meshing.harmonic_patches import Asked, HarmonicPatches, harmonic_pa
 from harnack.meshing.hole_patches import filled, hole_loops
 from harnack.meshing.lattice_surface import Surface
 from harnack.meshing.mesh import mesh as mesh_of
-from harnack.meshing.sound import mended
+from harnack.meshing.sound import joined, mended
 
 if TYPE_CHECKING:
     import trimesh
@@ -62,17 +62,19 @@ def repair(
 ) -> trimesh.Trimesh:
     """A closed mesh of a damaged one: with patches over its holes, or made anew.
 
-    Three stages are tried in turn:
+    Four stages are tried in turn:
 
     - kept: all triangles stay, and holes get patches;
     - sound: triangles that are there twice, have no area or pass through others are left out, those
       turned over against their neighbors are turned back, and holes get patches; where one cannot
       be filled, the triangles around it are left out as well, ring by ring;
+    - joined: corners of loose triangles that lie near each other, as in a mesh full of cracks, are
+      moved to their mean, and the rest is done as before;
     - anew: the surface on which the winding number w of the mesh is 1/2 is made by the signs of
       w - 1/2 in cells (`meshing.by_signs`), closed whatever the mesh is.
 
     mesh: anything with `vertices` (n, 3) and `faces` (m, 3).
-    keep: "all" does the first stage or raises an error, "sound" the second one, "none" the third;
+    keep: "all" does the first stage or raises an error, "sound" the second one, "none" the last;
         None does the first that succeeds.
     patches: "smooth" ones continue the surface around each hole, with its tangents, and bend least.
         They are made hole by hole, and used where w is within 0.36 of 1/2 modulo 1 on them; the
@@ -89,8 +91,8 @@ def repair(
 
     Returns:
         A closed trimesh.Trimesh: every edge has two faces, which agree. `metadata["harnack"]` has
-        stage: "kept", "sound" or "anew"; why: what the stages before failed with, or None; kept:
-        how many of the given triangles are there; parts: of each connected part, largest first, a
+        stage: "kept", "sound", "joined" or "anew"; why: what those before failed with, or None;
+        kept: how many of the given triangles are there; parts: of each part, largest first, a
         dictionary of its faces, volume and center; dropped: how many parts of these were left out
         for `largest`; and the Euler characteristic.
 
@@ -112,6 +114,9 @@ def repair(
         holes that could not be filled. Vertices at one place are joined. No triangles pass through
         each other, and no part is inside out.
 
+        If corners were joined: the same, and joined (how many of the given triangles are there,
+        with moved corners) and moved (how far the farthest corner went, a length); kept is 0.
+
         If all was made anew, no triangles pass through each other, and there is what `mesh` says of
         meshes by signs, such as far and within; kept is 0.
 
@@ -125,7 +130,7 @@ def repair(
     """
     asked = _checked_settings(keep, patches, tolerance, spacing, seed, progress or _silent)
     _check_is_mesh(mesh)
-    stages = {"all": _kept, "sound": _sound, "none": _anew}
+    stages = {"all": _kept, "sound": _sound, "joined": _joined, "none": _anew}
     names = list(stages) if keep is None else [keep]
     reasons: list[str] = []
     for name in names:
@@ -216,12 +221,21 @@ def _anew(mesh: Any, asked: _Asked) -> tuple[Surface, dict[str, Any]]:
     spacing = asked.spacing
     if spacing is None:
         spacing = float(np.ptp(corners[0], axis=0).max()) / _ACROSS_ANEW
-    made = mesh_of(
+    try:
+        made = _by_signs(field, spacing, asked)
+    except MeshingError:
+        if asked.spacing is not None:
+            raise
+        made = _by_signs(field, 0.6 * spacing, asked)
+    facts = made.metadata["harnack"] | {"stage": "anew", "kept": 0}
+    return Surface(np.asarray(made.vertices), np.asarray(made.faces, np.int64)), facts
+
+
+def _by_signs(field: WindingNumber, spacing: float, asked: _Asked) -> trimesh.Trimesh:
+    return mesh_of(
         field, solid=(0.5, math.inf), tolerance=asked.tolerance, spacing=spacing,
         progress=asked.report,
     )  # fmt: skip
-    facts = made.metadata["harnack"] | {"stage": "anew", "kept": 0}
-    return Surface(np.asarray(made.vertices), np.asarray(made.faces, np.int64)), facts
 
 
 # What is sound kept.
@@ -244,6 +258,32 @@ def _sound(mesh: Any, asked: _Asked) -> tuple[Surface, dict[str, Any]]:
         "left_out": made.left_out | left_out,
         "holes": made.holes,
         "patches": len(made.surface.faces) - len(made.kept),
+        "harmonic": 0,
+    }
+
+
+# Loose triangles joined.
+
+
+def _joined(mesh: Any, asked: _Asked) -> tuple[Surface, dict[str, Any]]:
+    """Triangles with near corners joined, with patches; none is kept bit by bit.
+
+    Raises:
+        MeshError, MeshingError: as `repair`.
+    """
+    corners = without_zero_area_faces(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    vertices, faces, moved = joined(*corners)
+    made = mended(vertices, faces, asked.report)
+    count = len(made.kept)
+    return made.surface, {
+        "stage": "joined",
+        "kept": 0,
+        "joined": count,
+        "moved": moved,
+        "turned": len(made.turned),
+        "left_out": made.left_out | {"flat": len(np.asarray(mesh.faces)) - len(faces)},
+        "holes": made.holes,
+        "patches": len(made.surface.faces) - count,
         "harmonic": 0,
     }
 
