@@ -345,6 +345,21 @@ def test_the_command_line_names_its_options_and_not_arguments_of_python() -> Non
     assert said == "give --box X,Y,Z,X,Y,Z or --ball X,Y,Z,RADIUS"
 
 
+def test_warnings_are_notes_without_places_in_files(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=(300, 3))
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    cloud = tmp_path / "rough.xyz"
+    np.savetxt(cloud, np.column_stack([x + rng.normal(0, 0.03, x.shape), x]))
+    command = ["mesh", str(cloud), "--spacing", "0.2", "-o", str(tmp_path / "a.stl"), "--quiet"]
+    assert main([*command, "--tolerance", "1e-4"]) == 0
+    notes = capsys.readouterr().err.splitlines()
+    assert len(notes) == 1
+    assert re.match(r"note: [\d,]+ of [\d,]+ vertices and centers .* than the tolerance", notes[0])
+
+
 @pytest.mark.parametrize(
     ("level", "text"),
     [(2 * math.pi, "2pi"), (math.pi, "pi"), (-math.pi / 2, "-0.5pi"), (0.5, "0.5"), (0.0, "0")],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import math
 from pathlib import Path
 from types import ModuleType
 
@@ -51,6 +52,19 @@ def test_a_gyroid_part_fills_what_its_walls_do(tmp_path: Path) -> None:
         0.23, abs=0.01
     )
     read_closed(tmp_path / "gyroid_part.stl")
+
+
+@pytest.mark.slow
+def test_parts_to_print_are_closed_and_of_the_volume_that_their_formulas_say(
+    tmp_path: Path,
+) -> None:
+    module = example("printed_parts")
+    volumes = module.main(tmp_path, SMALL, 2e-3, ("nut", "plate"))
+    for name in volumes:
+        read_closed(tmp_path / f"{name}.stl")
+    # A hexagon less a hole, whose thread is between its minor and its major diameter.
+    hexagon, hole = 6.5 * 0.5 * math.sqrt(3) * 13**2, 6.5 * 0.25 * math.pi
+    assert hexagon - hole * 8.3**2 < volumes["nut"] < hexagon - hole * 6.6**2
 
 
 @pytest.mark.slow

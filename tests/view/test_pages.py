@@ -129,9 +129,9 @@ def test_a_page_holds_fewer_places_where_they_are_large(
     monkeypatch.setattr(page_module, "_MANY_BYTES", 1e6)
     assert main([*command, "a=1:2"]) == 0
     assert len(scene_of(Path(path))["frames"]["frames"]) == 9
-    said = capsys.readouterr().out.splitlines()
-    assert "at 9 places of the sliders: give them larger steps, as in --slider" in said[0]
-    assert re.search(r"wrote .*a\.html \(\d\.\d MB\)", said[-1])
+    said = capsys.readouterr()
+    assert "at 9 places of the sliders: give them larger steps, as in --slider" in said.err
+    assert re.search(r"wrote .*a\.html \(\d\.\d MB\)", said.out)
     assert main([*command, "a=1:2:1"]) == 0
     assert len(scene_of(Path(path))["frames"]["frames"]) == 2
     assert "step" not in capsys.readouterr().out

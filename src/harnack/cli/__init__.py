@@ -7,14 +7,14 @@ from collections.abc import Sequence
 
 from harnack.cli.arguments import parse, parse_level, parse_size
 from harnack.cli.commands import COMMANDS
-from harnack.cli.messages import error_line, interrupts_noticed
+from harnack.cli.messages import error_line, interrupts_noticed, warnings_noted
 
 __all__ = ["main", "parse_level", "parse_size"]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; 0 on success, 1 for what went wrong, 2 for wrong usage, 130 for Ctrl-C."""
-    with interrupts_noticed() as interrupts:
+    with interrupts_noticed() as interrupts, warnings_noted():
         try:
             options = parse(arguments)
             return COMMANDS[options.command](options)

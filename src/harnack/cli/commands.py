@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 import math
-import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -97,11 +96,7 @@ def _page(options: Any) -> int:
         raise ValueError("-o is empty: name the page to write, such as a.html")
     target = options.output or f"{source.stem or 'surface'}.html"
     what, settings, _ = _live(options, source)
-    with warnings.catch_warnings(record=True) as noted:
-        warnings.simplefilter("always", UserWarning)
-        page(what, target, **settings, **_divided(options))
-    for one in noted:
-        _say(f"note: {in_options(str(one.message))}")
+    page(what, target, **settings, **_divided(options))
     _say(f"wrote {target} ({Path(target).stat().st_size / 1e6:.1f} MB)")
     return 0
 

@@ -7,12 +7,15 @@ from __future__ import annotations
 
 import re
 import signal
+import sys
 import threading
 import time
+import warnings
 from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from types import FrameType
+from typing import Any
 
 from harnack.rendering import UnboundedSurfaceError
 from harnack.rendering.arguments import SETTINGS
@@ -55,6 +58,23 @@ def interrupts_noticed() -> Generator[Interrupts]:
 
 
 # Messages.
+
+
+@contextmanager
+def warnings_noted() -> Generator[None]:
+    """What is warned of within the block is printed on a line, in the words of the command line."""
+    with warnings.catch_warnings():
+        shown = warnings.showwarning
+
+        def note(message: Any, category: type[Warning], *place: Any, **more: Any) -> None:
+            if issubclass(category, UserWarning | RuntimeWarning):
+                print(f"note: {in_options(str(message))}", file=sys.stderr)
+            else:
+                shown(message, category, *place, **more)
+
+        warnings.showwarning = note
+        yield
+
 
 # Arguments of Python that are options of the command line.
 _WRITTEN_OTHERWISE = ("backdrop", "camera", "isolines", "max_depth", "progress", "value_range")
