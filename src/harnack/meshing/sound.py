@@ -86,10 +86,12 @@ def joined(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray,
     the fewest edges open; faces; and how far the farthest corner went.
 
     Raises:
-        MeshingError: most edges stay open.
+        MeshingError: triangles are not loose, or most edges stay open.
     """
     places, index = np.unique(vertices[faces].reshape(-1, 3), axis=0, return_inverse=True)
     corners = np.asarray(index, np.int64).reshape(-1, 3)
+    if len(boundary_edges(corners)) <= _MOST_OPEN * len(faces):
+        raise MeshingError("its triangles are not loose")
     at = places[corners]
     usual = float(np.median(lengths((at - np.roll(at, 1, axis=1)).reshape(-1, 3))))
     found: list[tuple[int, FloatArray, IntArray, float]] = []
