@@ -13,11 +13,14 @@ import harnack as hk
 from harnack.cli import main
 from harnack.geometry import MeshError
 from harnack.geometry.mesh_shapes import icosphere, remove_faces, torus_mesh
-from harnack.meshing.repair import (  # pyright: ignore[reportPrivateUsage]
-    _collapsed,
-    _missing_triangles,
-    _open_edges,
+from harnack.meshing.harmonic_patches import (
+    Asked,
+    _collapsed,  # pyright: ignore[reportPrivateUsage]
+    harmonic_patches,
+    missing_triangles,
+    open_edges,
 )
+from harnack.meshing.hole_patches import hole_loops
 from tests.oracles.mesh_files import read_closed
 from tests.oracles.triangle_pairs import intersecting_pairs
 
@@ -35,7 +38,7 @@ def ball(directions: Any = AXES, radius: float = 0.5, subdivisions: int = 3) -> 
 
 def check(given: trimesh.Trimesh, euler: int = 2) -> trimesh.Trimesh:
     """Repairs a mesh and judges the result by other means than `repair` does."""
-    made = hk.repair(given, keep="all")
+    made = hk.repair(given, keep="all", patches="harmonic")
     assert made.metadata["harnack"]["stage"] == "kept"
     n, m = len(given.vertices), len(given.faces)
     assert made.vertices[:n].tobytes() == given.vertices.tobytes()
@@ -98,8 +101,15 @@ def test_many_random_holes(seed: int) -> None:
 @pytest.mark.few(1)
 @pytest.mark.parametrize(("scale", "shift"), [(1e-5, 0.0), (1.0, 300.0), (2e4, -1e5)])
 def test_units_and_places(scale: float, shift: float) -> None:
-    given = ball(AXES[:1], subdivisions=2)
-    check(trimesh.Trimesh(given.vertices * scale + shift, given.faces, process=False))
+    small = ball(AXES[:1], subdivisions=2)
+    given = trimesh.Trimesh(small.vertices * scale + shift, small.faces, process=False)
+    check(given)
+    made = hk.repair(given)
+    assert made.metadata["harnack"]["harmonic"] == 0
+    one = hk.repair(small)
+    assert np.asarray(made.vertices) == pytest.approx(
+        np.asarray(one.vertices) * scale + shift, abs=1e-6 * scale + 1e-12 * abs(shift)
+    )
 
 
 @pytest.mark.slow
@@ -134,7 +144,7 @@ def test_patches_that_meet_the_mesh_are_refused() -> None:
         process=False,
     )
     with pytest.raises(hk.MeshingError, match=r"meet \d+ triangles of the mesh"):
-        hk.repair(together, spacing=0.08, keep="all")
+        hk.repair(together, spacing=0.08, keep="all", patches="harmonic")
 
 
 def doubled() -> trimesh.Trimesh:
@@ -184,38 +194,207 @@ def test_meshes_of_which_not_all_can_be_kept(make: Any, message: str) -> None:
         hk.repair(make(), keep="all")
 
 
-@pytest.mark.few(2)
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (soup, "at the same place"),
-        (doubled, "more than two faces"),
-        (one_reversed, "do not agree which side is outside"),
-        (flat, "zero area"),
-    ],
-)
-def test_what_cannot_be_kept_is_made_anew(make: Any, message: str) -> None:
-    made = hk.repair(make(), spacing=0.15, tolerance=1e-2)
-    facts = made.metadata["harnack"]
-    assert facts["stage"] == "anew"
-    assert facts["kept"] == 0
-    assert message in facts["why"]
+def crossing() -> trimesh.Trimesh:
+    """A ball without holes, with a triangle that stands in it and half outside."""
+    vertices, faces = icosphere(3)
+    spike = np.array([[0.0, 0.3, 0.2], [0.1, 1.3, 0.2], [0.1, 1.3, 0.3]])
+    more = np.concatenate([faces, [[len(vertices), len(vertices) + 1, len(vertices) + 2]]])
+    return trimesh.Trimesh(np.concatenate([vertices, spike]), more, process=False)
+
+
+def corners(mesh: trimesh.Trimesh) -> set[bytes]:
+    """Triangles by the bits of their corners, which run from the least one."""
+    found: set[bytes] = set()
+    for triangle in np.asarray(mesh.vertices)[np.asarray(mesh.faces)]:
+        first = min(range(3), key=lambda k, t=triangle: tuple(t[k]))
+        found.add(np.roll(triangle, -first, axis=0).tobytes())
+    return found
+
+
+def check_closed(made: trimesh.Trimesh) -> None:
     assert made.is_watertight
     assert made.is_winding_consistent
+    assert made.volume > 0
     assert not len(intersecting_pairs(np.asarray(made.vertices), np.asarray(made.faces)))
-    assert made.volume == pytest.approx(4.0, abs=0.2)
+
+
+@pytest.mark.parametrize(
+    ("make", "message", "reason", "turned"),
+    [
+        (doubled, "more than two faces", "branching", 0),
+        (one_reversed, "do not agree which side is outside", None, 1),
+        (soup, "at the same place", None, 0),
+        (flat, "zero area", "flat", 0),
+        (crossing, "pass through others", "crossing", 0),
+    ],
+)
+def test_what_is_sound_is_kept(make: Any, message: str, reason: str | None, turned: int) -> None:
+    given = make()
+    made = hk.repair(given)
+    facts = made.metadata["harnack"]
+    assert facts["stage"] == "sound"
+    assert message in facts["why"]
+    check_closed(made)
+    # But for what was left out all is there, first and in its order.
+    count = sum(facts["left_out"].values())
+    assert facts["kept"] == len(given.faces) - count
+    assert count < 30
+    assert (count > 0) == (reason is not None)
+    assert reason is None or facts["left_out"][reason] > 0
+    assert len(made.faces) == facts["kept"] + facts["patches"]
+    first = np.asarray(made.vertices)[np.asarray(made.faces)[: facts["kept"]]].reshape(-1, 9)
+    rows = given.vertices[given.faces].reshape(-1, 9)
+    place = {row.tobytes(): k for k, row in enumerate(rows)}
+    order = [place[row.tobytes()] for row in first if row.tobytes() in place]
+    assert order == sorted(order)
+    assert len(order) == facts["kept"] - turned
+    assert facts["turned"] == turned
+    assert 3.9 < made.volume < 4.25
+
+
+def test_flipped_and_doubled_faces_are_all_told() -> None:
+    """A tenth of the faces of a closed ball turned over, and a tenth there twice."""
+    vertices, faces = icosphere(3)
+    some = np.random.default_rng(3).choice(len(faces), 256, replace=False)
+    broken = faces.copy()
+    broken[some[:128]] = broken[some[:128], ::-1]
+    broken = np.concatenate([broken, faces[some[128:]]])
+    made = hk.repair(trimesh.Trimesh(vertices, broken, process=False), keep="sound")
+    facts = made.metadata["harnack"]
+    assert (facts["turned"], facts["patches"], facts["left_out"]["doubled"]) == (128, 0, 128)
+    assert corners(made) == corners(trimesh.Trimesh(vertices, faces, process=False))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(4))
+def test_noise_of_the_size_of_triangles(seed: int) -> None:
+    """Crossing triangles are left out with what is around them, or all is made anew; no more than
+    that is promised, and it is closed."""
+    vertices, faces = icosphere(3)
+    rng = np.random.default_rng(seed)
+    noisy = vertices + rng.normal(0, 0.04 + 0.01 * seed, vertices.shape)
+    given = trimesh.Trimesh(noisy, faces[rng.random(len(faces)) > 0.05], process=False)
+    made = hk.repair(given, spacing=0.1, tolerance=1e-2)
+    check_closed(made)
+    assert made.metadata["harnack"]["stage"] != "kept"
+    assert made.volume == pytest.approx(4.1, abs=0.5)
+
+
+def loose(noise: float) -> trimesh.Trimesh:
+    """All triangles of a ball with three holes, each moved at random by a length."""
+    given = ball()
+    corner = given.vertices[given.faces]
+    shaken = corner + np.random.default_rng(0).normal(0, noise, (len(corner), 1, 3))
+    every = np.arange(3 * len(corner)).reshape(-1, 3)
+    return trimesh.Trimesh(shaken.reshape(-1, 3), every, process=False)
+
+
+def test_corners_of_cracks_are_joined() -> None:
+    given = loose(2e-3)
+    with pytest.raises(hk.MeshingError, match="open"):
+        hk.repair(given, keep="sound")
+    made = hk.repair(given)
+    facts = made.metadata["harnack"]
+    assert (facts["stage"], facts["kept"], facts["joined"]) == ("joined", 0, len(given.faces))
+    assert facts["holes"] == 3
+    check_closed(made)
+    # Corners went nowhere but to means near by.
+    x = np.asarray(made.vertices)[np.asarray(made.faces)[: facts["joined"]]]
+    moved = np.linalg.norm(x - given.vertices[given.faces], axis=2)
+    assert 0 < moved.max() == pytest.approx(facts["moved"])
+    assert facts["moved"] < 0.01
+    assert np.abs(np.linalg.norm(made.vertices, axis=1) - 1).max() < 0.015
+
+
+def test_what_cannot_be_joined_is_made_anew() -> None:
+    """Triangles that are moved by more than half of their size."""
+    given = loose(0.05)
+    made = hk.repair(given, spacing=0.15, tolerance=1e-2)
+    facts = made.metadata["harnack"]
+    assert (facts["stage"], facts["kept"]) == ("anew", 0)
+    assert "are loose" in facts["why"]
+    check_closed(made)
+    assert made.volume == pytest.approx(4.0, abs=0.3)
+
+
+def test_smooth_patches_continue_the_surface() -> None:
+    """On a ball they stay near the sphere, where harmonic ones have dents; and all is kept."""
+    given = ball()
+    made = hk.repair(given, keep="all")
+    facts = made.metadata["harnack"]
+    assert (facts["stage"], facts["holes"], facts["harmonic"]) == ("kept", 3, 0)
+    n, m = len(given.vertices), len(given.faces)
+    assert made.vertices[:n].tobytes() == given.vertices.tobytes()
+    assert made.faces[:m].tobytes() == given.faces.tobytes()
+    check_closed(made)
+    radius = np.linalg.norm(made.vertices[n:], axis=1)
+    assert len(radius) > 20
+    assert np.abs(radius - 1).max() < 0.01  # the cap is 0.12 high
+    w = hk.WindingNumber(given.vertices, given.faces).value(made.vertices[n:], precision="double")
+    assert np.abs(w - 0.5).max() <= 0.36
+
+
+@pytest.mark.slow
+def test_rims_of_one_gap_are_joined() -> None:
+    """Two halves of a ball with a gap between them: smooth patches would close each."""
+    vertices, faces = icosphere(3)
+    middle = vertices[faces].mean(axis=1)[:, 2]
+    given = trimesh.Trimesh(vertices, faces[np.abs(middle) > 0.1], process=False)
+    made = hk.repair(given, keep="all")
+    facts = made.metadata["harnack"]
+    assert facts["harmonic"] == facts["patches"] > 0
+    assert facts["holes"] == 2
+    assert len(facts["parts"]) == 1
+    check_closed(made)
+
+
+def test_holes_that_share_a_corner_are_told_apart() -> None:
+    """Two opposite faces at a vertex of six are lost: two holes of three edges."""
+    vertices, faces = icosphere(2)
+    center = next(v for v in range(len(vertices)) if (faces == v).sum() == 6)
+    around = np.flatnonzero((faces == center).any(axis=1))
+    one = around[0]
+    other = next(k for k in around if len(set(faces[k]) & set(faces[one])) == 1)
+    rest = np.delete(faces, [one, other], axis=0)
+    loops = hole_loops(vertices, rest, open_edges(rest))
+    assert sorted(map(len, loops)) == [3, 3]
+    lost = {tuple(sorted(faces[k].tolist())) for k in (one, other)}
+    assert {tuple(sorted(loop.tolist())) for loop in loops} == lost
 
 
 def test_numbers_that_are_none_are_refused_anyway() -> None:
     with pytest.raises(MeshError, match="finite"):
         hk.repair(not_a_number())
     with pytest.raises(hk.MeshingError, match="empty"):
-        hk.repair(inside_out())
+        hk.repair(inside_out(), keep="none")
 
 
 def inside_out() -> trimesh.Trimesh:
     vertices, faces = icosphere(1)
-    return trimesh.Trimesh(vertices, np.concatenate([faces[:, ::-1], faces[:1]]), process=False)
+    return trimesh.Trimesh(vertices, faces[:, ::-1], process=False)
+
+
+def test_what_is_inside_out_is_turned() -> None:
+    made = hk.repair(inside_out())
+    facts = made.metadata["harnack"]
+    assert facts["stage"] == "sound"
+    assert "inside out" in facts["why"]
+    assert facts["turned"] == len(made.faces) == 80
+    assert made.volume > 3.5
+
+
+def test_a_cavity_is_not_turned() -> None:
+    vertices, faces = icosphere(2)
+    shells = trimesh.Trimesh(
+        np.concatenate([vertices, 0.5 * vertices]), np.concatenate([faces, faces[:, ::-1] + 162]),
+        process=False,
+    )  # fmt: skip
+    made = hk.repair(shells)
+    facts = made.metadata["harnack"]
+    assert facts["stage"] == "kept"
+    outer, inner = facts["parts"]
+    assert outer["volume"] == pytest.approx(-8 * inner["volume"])
+    assert made.volume == pytest.approx(outer["volume"] + inner["volume"])
 
 
 def test_loose_parts_are_kept_or_dropped() -> None:
@@ -229,6 +408,25 @@ def test_loose_parts_are_kept_or_dropped() -> None:
     one = hk.repair(both, keep="none", largest=True, spacing=0.2, tolerance=1e-2)
     assert one.body_count == 1
     assert one.volume > 3.5
+    assert one.metadata["harnack"]["dropped"] == 1
+
+
+@pytest.mark.parametrize("keep", ["all", "sound"])
+def test_loose_parts_that_are_kept_are_listed(keep: Any) -> None:
+    vertices, faces = icosphere(2)
+    both = trimesh.Trimesh(
+        np.concatenate([0.3 * vertices + 2, vertices]), np.concatenate([faces[3:], faces + 162]),
+        process=False,
+    )  # fmt: skip
+    for largest in (False, True):
+        made = hk.repair(both, keep=keep, largest=largest)
+        large, small = made.metadata["harnack"]["parts"]
+        assert large["volume"] == pytest.approx(small["volume"] / 0.3**3, rel=0.02)
+        assert small["center"] == pytest.approx([2, 2, 2], abs=0.01)
+        assert (large["faces"], small["faces"]) == (320, 320)
+        assert made.metadata["harnack"]["dropped"] == largest
+        assert made.body_count == 2 - largest
+    assert corners(made) == corners(trimesh.Trimesh(vertices, faces, process=False))
 
 
 def test_settings_that_are_refused() -> None:
@@ -236,8 +434,10 @@ def test_settings_that_are_refused() -> None:
         hk.repair(np.zeros((3, 3)))  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="tolerance"):
         hk.repair(ball(), tolerance=0)
-    with pytest.raises(ValueError, match='keep is None, "all" or "none"'):
+    with pytest.raises(ValueError, match='keep is None, "all", "sound" or "none"'):
         hk.repair(ball(), keep="some")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match='patches are "smooth" or "harmonic"'):
+        hk.repair(ball(), patches="flat")  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="spacing"):
         hk.repair(ball(), spacing=float("nan"))
 
@@ -255,6 +455,12 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     ball(AXES[:1], subdivisions=2).export(source)
     assert main(["repair", str(source), "-o", str(target), "--quiet"]) == 0
     assert "1 hole," in capsys.readouterr().out
+    again = ["repair", str(source), "-o", str(target), "--quiet", "--keep", "sound"]
+    assert main([*again, "--patches", "smooth"]) == 0
+    said = capsys.readouterr().out
+    assert "kept what is sound: " in said
+    assert "left out none; 1 hole," in said
+    assert "; 1 part" in said
     read_closed(target)
     assert sorted(tmp_path.iterdir()) == [source, target]
     assert main(["repair", str(source), "-o", str(tmp_path / "a.txt")]) == 1
@@ -267,6 +473,7 @@ def test_meshes_that_lack_single_triangles_get_them_back() -> None:
     rest = remove_faces(faces, 0.1, seed=1)
     given = trimesh.Trimesh(vertices, rest, process=False)
     made = hk.repair(given)
+    assert made.metadata["harnack"]["stage"] == "kept"
     assert made.faces[: len(rest)].tobytes() == given.faces.tobytes()
     assert made.is_watertight
     assert made.is_winding_consistent
@@ -275,8 +482,21 @@ def test_meshes_that_lack_single_triangles_get_them_back() -> None:
     assert not len(intersecting_pairs(np.asarray(made.vertices), np.asarray(made.faces)))
     facts = made.metadata["harnack"]
     assert facts["patches"] == len(made.faces) - len(rest)
-    assert facts["missing"] > 50
-    assert facts["refined"]
+    assert facts["harmonic"] == 0
+    lost = corners(trimesh.Trimesh(vertices, faces, process=False)) - corners(given)
+    assert len(lost & corners(made)) > 0.8 * len(lost)
+
+
+@pytest.mark.slow
+def test_harmonic_patches_get_the_triangles_of_holes_of_three_edges() -> None:
+    vertices, faces = torus_mesh(1.0, 0.35, 24, 24)
+    given = trimesh.Trimesh(vertices, remove_faces(faces, 0.1, seed=1), process=False)
+    edges = open_edges(np.asarray(given.faces, np.int64))
+    how = Asked(1e-3, None, 0, 3, lambda _: None)
+    made = harmonic_patches(vertices, np.asarray(given.faces, np.int64), edges, how)
+    assert made.missing > 50
+    assert made.is_fine
+    assert (made.faces[: made.missing] < len(vertices)).all()
 
 
 @pytest.mark.slow
@@ -290,7 +510,7 @@ def test_points_are_moved_in_another_way_where_a_change_is_not_known() -> None:
     assert made.euler_number == 2
 
 
-def test_missing_triangles_are_those_that_stand_in_no_other() -> None:
+def testmissing_triangles_are_those_that_stand_in_no_other() -> None:
     whole = trimesh.Trimesh(*icosphere(2), process=False)
     faces = np.asarray(whole.faces)[2:]
     lost = {tuple(sorted(face)) for face in np.asarray(whole.faces)[:2].tolist()}
@@ -313,4 +533,4 @@ def test_a_lone_triangle_is_not_covered_by_itself() -> None:
 
 
 def missing(vertices: Any, faces: Any) -> Any:
-    return _missing_triangles(np.asarray(vertices), faces, _open_edges(faces))
+    return missing_triangles(np.asarray(vertices), faces, open_edges(faces))

@@ -396,8 +396,9 @@ def _add_repair(commands: Any) -> None:
     one = commands.add_parser(
         "repair", help="close a damaged mesh",
         description="Write a mesh with patches over its holes; the triangles that there are stay "
-        "as they are. Where that cannot be done, as for loose or crossing triangles, all is made "
-        "anew by the sign of the winding number less 1/2, and closed whatever the mesh is.",
+        "as they are. Where that cannot be done, those that are sound stay, and others (crossing, "
+        "doubled) are left out or turned over. Where that fails too, as for loose triangles, all "
+        "is made anew by the sign of the winding number less 1/2, and closed whatever the mesh is.",
     )  # fmt: skip
     one.add_argument("mesh", metavar="FILE", help="a mesh: .obj, .ply, .stl, .off, .glb or .gltf")
     one.add_argument(
@@ -408,14 +409,18 @@ def _add_repair(commands: Any) -> None:
         help="how far new triangles may be from the surface, as a part of their size (0.001)",
     )  # fmt: skip
     one.add_argument(
-        "--keep", choices=("all", "none"),
-        help="all: fail if the triangles cannot all be kept; none: make all anew (whichever can be "
-        "done)",
+        "--keep", choices=("all", "sound", "none"),
+        help="all: fail if the triangles cannot all be kept; sound: keep those that are sound; "
+        "none: make all anew (the first that can be done)",
     )  # fmt: skip
     one.add_argument(
-        "--largest", action="store_true", default=None,
-        help="of what is made anew keep the largest part alone",
+        "--patches", choices=("smooth", "harmonic"),
+        help="smooth: continue the surface around holes; harmonic: where the winding number is "
+        "1/2 (smooth, and harmonic where those do not fit)",
     )  # fmt: skip
+    one.add_argument(
+        "--largest", action="store_true", default=None, help="keep the largest part alone"
+    )
     one.add_argument(
         "--spacing", type=_positive, metavar="LENGTH", help="of cells before anything is refined"
     )

@@ -433,7 +433,7 @@ def _repair(options: Any) -> int:
     if not isinstance(found, Mesh):
         raise ValueError(f"{source} holds no mesh to repair")
     _say(f"{source}: {in_options(found.said)}")
-    names = ("tolerance", "spacing", "keep", "largest")
+    names = ("tolerance", "spacing", "keep", "patches", "largest")
     settings = {name: getattr(options, name) for name in names}
     chosen = {name: value for name, value in settings.items() if value is not None}
     # Files such as .stl list the corners of each face anew.
@@ -450,15 +450,32 @@ def _repair(options: Any) -> int:
 
 
 def _repaired(facts: dict[str, Any], given: int, made: int) -> str:
-    """What `repair` kept and what it added, or why it kept nothing."""
-    if facts["stage"] == "kept":
-        holes = f"{facts['holes']:,} hole" + ("" if facts["holes"] == 1 else "s")
-        return f"{holes}, {facts['patches']:,} triangles added to {given:,}, which are all kept"
+    """What `repair` kept, changed and added; and why not more was kept."""
+    parts = _counted(len(facts["parts"]), "part")
+    if facts["dropped"]:
+        parts += f", of which {facts['dropped']:,} dropped"
     why = "" if facts["why"] is None else f" since {facts['why']}"
+    if facts["stage"] == "anew":
+        return (
+            f"made anew: {made:,} triangles in place of {given:,}{why}; {facts['far']:,} vertices "
+            f"and centers are beyond the tolerance, all are within {facts['within']:.2g}; {parts}"
+        )
+    added = f"{_counted(facts['holes'], 'hole')}, {facts['patches']:,} triangles added"
+    if facts["stage"] == "kept":
+        return f"{added} to {given:,}, which are all kept; {parts}"
+    start, kept = f"kept what is sound{why}", facts["kept"]
+    if facts["stage"] == "joined":
+        kept = facts["joined"]
+        start = f"corners joined that moved up to {facts['moved']:.2g}{why}"
+    out = ", ".join(f"{count:,} {what}" for what, count in facts["left_out"].items() if count)
     return (
-        f"made anew: {made:,} triangles in place of {given:,}{why}; {facts['far']:,} vertices and "
-        f"centers are beyond the tolerance, all are within {facts['within']:.2g}"
+        f"{start}: {kept:,} triangles of {given:,}, {facts['turned']:,} "
+        f"of them turned over; left out {out or 'none'}; {added}; {parts}"
     )
+
+
+def _counted(count: int, what: str) -> str:
+    return f"{count:,} {what}" + ("" if count == 1 else "s")
 
 
 def _gallery(options: Any) -> int:

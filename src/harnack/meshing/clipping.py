@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
+import numpy.typing as npt
 
 from harnack.backend import FloatArray
 from harnack.geometry import Ball, Box, ConvexHull, HalfSpace, Intersection, Volume
@@ -17,7 +18,7 @@ from harnack.meshing.checks import MeshingError
 from harnack.meshing.edges import IntArray, boundary_edges, dots, edge_keys, lengths
 from harnack.meshing.lattice_surface import Surface
 
-__all__ = ["cut_by", "largest_body", "largest_part"]
+__all__ = ["cut_by", "largest_body", "largest_part", "parts_of", "turned_outwards"]
 
 
 def largest_part(surface: Surface) -> Surface:
@@ -58,6 +59,41 @@ def largest_body(surface: Surface) -> Surface:
         bodies[found] += volumes[cavity]
     kept = outer[bodies[outer].argmax()] if len(outer) else -1
     return Surface.of(surface.vertices, surface.faces[owner[shell] == kept])
+
+
+def parts_of(surface: Surface) -> list[dict[str, Any]]:
+    """Of each connected part of a closed surface, largest first, faces: their number; volume: what
+    it holds, negative for a cavity; center: of the box around it."""
+    _, shell = np.unique(_parts(surface), return_inverse=True)
+    volumes, found = _volumes(surface, shell), list[dict[str, Any]]()
+    corner = surface.vertices[surface.faces]
+    for k in np.argsort(-np.abs(volumes), kind="stable"):
+        own = corner[shell == k].reshape(-1, 3)
+        center = 0.5 * (own.min(axis=0) + own.max(axis=0))
+        found.append(
+            {"faces": len(own) // 3, "volume": float(volumes[k]), "center": center.tolist()}
+        )
+    return found
+
+
+def turned_outwards(surface: Surface) -> npt.NDArray[np.bool_]:
+    """(m,) which faces of a closed surface to turn over for no part to be inside out: those of
+    parts of negative volume that lie in no other, and so are no cavities."""
+    _, shell = np.unique(_parts(surface), return_inverse=True)
+    volumes, corner = _volumes(surface, shell), surface.vertices[surface.faces]
+    inwards: list[int] = []
+    for k in np.flatnonzero(volumes < 0):
+        point = corner[np.flatnonzero(shell == k)[0]].mean(axis=0)
+        if abs(_winding(corner[shell != k], point)) < 0.5:
+            inwards.append(int(k))
+    return np.isin(shell, inwards)
+
+
+def _volumes(surface: Surface, shell: IntArray) -> FloatArray:
+    """What the parts, by number of each face, hold."""
+    center = surface.vertices.mean(axis=0)
+    corner = surface.vertices[surface.faces][:, 0] - center
+    return np.bincount(shell, dots(_crosses(surface), corner)) / 6
 
 
 def _parts(surface: Surface) -> IntArray:

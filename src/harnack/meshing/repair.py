@@ -1,40 +1,36 @@
-"""Repair of triangle meshes: patches over holes; the triangles that are there stay as they are.
+"""Repair of triangle meshes: a closed mesh of a damaged one, in which what was sound stays.
 
-The 1/2 level of the winding number w modulo 1 is the 2 pi level of the solid angle of the boundary
-edges (`geometry.chains`), a smooth surface that ends at them. It is meshed with these very edges in
-it, and joined to the mesh by index.
+It goes by stages: all triangles are kept, and holes get patches; or those that are sound are; or
+the surface on which the winding number is 1/2 is made anew.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from harnack.fields.solid_angles.solid_angle import SolidAngle
 from harnack.fields.solid_angles.winding_number import WindingNumber
 from harnack.geometry import MeshError, validate_mesh
-from harnack.geometry.chains import singular_loops, weld_vertices
+from harnack.geometry.chains import weld_vertices
 from harnack.geometry.meshes import without_zero_area_faces
 from harnack.meshing.checks import (
-    LocalError,
     MeshingError,
-    TooLargeError,
-    check_manifold,
     euler_characteristic,
     intersecting_faces,
     singular_vertices,
 )
-from harnack.meshing.edges import Edges, IntArray, directed_edges
-from harnack.meshing.marching_tetrahedra import crossings_of, delaunay, triangles_of
+from harnack.meshing.clipping import largest_body, parts_of, turned_outwards
+from harnack.meshing.edges import IntArray
+from harnack.meshing.harmonic_patches import Asked, HarmonicPatches, harmonic_patches, open_edges
+from harnack.meshing.hole_patches import filled, hole_loops
+from harnack.meshing.lattice_surface import Surface
 from harnack.meshing.mesh import mesh as mesh_of
-from harnack.meshing.points import Boundary, Places, box_cells, place_points
-from harnack.meshing.refinement import far_places, improved, refined, smoothed
-from harnack.meshing.samples import LevelFunction
+from harnack.meshing.sound import joined, mended
 
 if TYPE_CHECKING:
     import trimesh
@@ -43,30 +39,21 @@ if TYPE_CHECKING:
 
 __all__ = ["repair"]
 
-_LEVEL = 2 * math.pi
-# Cells across the holes at first, and how often they are made smaller where that fails.
-_ACROSS = 24
-_ATTEMPTS = 6
-# How often if all may be made anew instead; and cells across the mesh then.
-_FEW_ATTEMPTS = 3
-# Meshes with more open edges than that, or than this part of their faces, are made anew at once.
-_MOST_OPEN, _MOST_OPEN_PART = 4000, 0.5
+# How many sizes of cells are tried for patches on which w is 1/2, if all triangles have to stay;
+# and if they need not, where there are no more open edges than that.
+_ATTEMPTS, _FEW_ATTEMPTS, _FEW_EDGES = 6, 1, 1000
+# Cells across the mesh if all is made anew.
 _ACROSS_ANEW = 48
-# How often edges of holes that are too near to others are halved for the tetrahedra.
-_MOST_CUTS = 12
-# How often patches that meet the mesh are made again, of smaller cells.
-_MOST_MET = 1
-# How far w may be from 1/2, modulo 1, at vertices of patches.
-_NEAR = 1e-6
 
-
-Keep = Literal["all", "none"]
+Keep = Literal["all", "sound", "none"]
+Patches = Literal["smooth", "harmonic"]
 
 
 def repair(
     mesh: trimesh.Trimesh,
     *,
     keep: Keep | None = None,
+    patches: Patches = "smooth",
     largest: bool = False,
     tolerance: float = 1e-3,
     spacing: float | None = None,
@@ -75,211 +62,141 @@ def repair(
 ) -> trimesh.Trimesh:
     """A closed mesh of a damaged one: with patches over its holes, or made anew.
 
-    Patches are where the winding number w of the mesh is 1/2 modulo 1, and the triangles that are
-    there stay. If that cannot be meshed, for which holes at one corner are the usual reason, holes
-    of three edges get their triangle, where it passes through no other, and patches are those of
-    the mesh with them. Where that fails too, or the mesh is none with two sides (edges of more than
-    two faces, faces turned over, loose triangles), the surface w = 1/2 is made anew by the signs of
-    w - 1/2 in cells (`meshing.by_signs`): closed whatever the mesh is.
+    Four stages are tried in turn:
 
-    mesh: anything with `vertices` (n, 3) and `faces` (m, 3); faces without an area are left out.
-    keep: None keeps all triangles if possible, and else makes all anew; "all" raises an error where
-        that is not possible; "none" makes all anew.
-    largest: of what is made anew keep the part of the largest volume alone, with its cavities.
-    tolerance: how far triangles may be from the surface, sampled and not proved, as a part of the
-        size of the box around all holes, or of the mesh if all is made anew; but for triangles
-        between three edges of holes, which stay as they are.
+    - kept: all triangles stay, and holes get patches;
+    - sound: triangles that are there twice, have no area or pass through others are left out, those
+      turned over against their neighbors are turned back, and holes get patches; where one cannot
+      be filled, the triangles around it are left out as well, ring by ring;
+    - joined: corners of loose triangles that lie near each other, as in a mesh full of cracks, are
+      moved to their mean, and the rest is done as before;
+    - anew: the surface on which the winding number w of the mesh is 1/2 is made by the signs of
+      w - 1/2 in cells (`meshing.by_signs`), closed whatever the mesh is.
+
+    mesh: anything with `vertices` (n, 3) and `faces` (m, 3).
+    keep: "all" does the first stage or raises an error, "sound" the second one, "none" the last;
+        None does the first that succeeds.
+    patches: "smooth" ones continue the surface around each hole, with its tangents, and bend least.
+        They are made hole by hole, and used where w is within 0.36 of 1/2 modulo 1 on them; the
+        rest is done by "harmonic" ones, on which w is 1/2 modulo 1: they join the rims of a gap
+        between two parts, and have a dent where the surface was round. Only of these is it proved
+        what they are.
+    largest: keep the body of the largest volume alone, with its cavities.
+    tolerance: how far harmonic patches may be from the surface w = 1/2, as a part of the size of
+        the box around all holes, and triangles made anew, as a part of the mesh's; sampled and not
+        proved.
     spacing: of cells before anything is refined, in the mesh's unit; None chooses.
     seed: of the small random moves that keep points in general position.
     progress: told what is being done.
 
     Returns:
         A closed trimesh.Trimesh: every edge has two faces, which agree. `metadata["harnack"]` has
-        stage: "kept" or "anew"; and why (None, or what the other stage failed with).
+        stage: "kept", "sound", "joined" or "anew"; why: what those before failed with, or None;
+        kept: how many of the given triangles are there; parts: of each part, largest first, a
+        dictionary of its faces, volume and center; dropped: how many parts of these were left out
+        for `largest`; and the Euler characteristic.
 
-        If all was kept, the first vertices and faces are those given, bit by bit and in their
-        order; vertices inside of patches and their faces follow, and no patch meets another
-        triangle but at the edges and corners that they share. Then there are also holes (loops of
-        edges that were open), patches (triangles added), missing (how many of these are the
-        triangles of holes of three edges), refined (whether they are within the tolerance: they
-        stay as the cells cut them if finer ones would pass through each other, however small cells
-        are made there), spacing, evaluations and the Euler characteristic. A closed mesh gets
-        nothing added.
+        Unless all was made anew there are also holes (loops of edges that were open), patches
+        (triangles added) and harmonic (how many of these are harmonic). Vertices and faces that
+        were given come first, bit by bit and in their order: all of them if all was kept and
+        nothing dropped, else those that are in use. Patches meet no other triangle but at the edges
+        and corners that they share, decided exactly.
+
+        If all was kept: missing (how many patches are the triangles of holes of three edges),
+        refined (whether harmonic patches are within the tolerance: they stay as the cells cut them
+        if finer ones would pass through each other), spacing and evaluations of these. A closed
+        mesh gets nothing added; unless keep is "all", it is only returned if no triangles pass
+        through each other.
+
+        If what was sound was kept: turned (how many triangles were turned over) and left_out, a
+        dictionary: how many were "flat" (without an area), "doubled", "crossing", "branching" (at
+        edges of more than two), "one-sided" (at edges where no two sides can be told) or "around"
+        holes that could not be filled. Vertices at one place are joined. No triangles pass through
+        each other, and no part is inside out.
+
+        If corners were joined: the same, and joined (how many of the given triangles are there,
+        with moved corners) and moved (how far the farthest corner went, a length); kept is 0.
 
         If all was made anew, no triangles pass through each other, and there is what `mesh` says of
         meshes by signs, such as far and within; kept is 0.
 
     Raises:
         MeshError: a ValueError, for a mesh that has no triangles, or numbers that are none; with
-            keep="all" also for one that is not as said above.
-        MeshingError: a ValueError, with keep="all", if the patches could not be made, or meet the
-            mesh or each other; if the surface w = 1/2 is empty, as for faces turned inwards, or
-            takes too many cells.
+            keep="all" also for edges of more than two faces, faces that disagree on their sides,
+            faces without an area and vertices at one place.
+        MeshingError: a ValueError, with keep="all" or "sound", if patches could not be made, or
+            meet the mesh or each other; else if the surface w = 1/2 is empty or takes too many
+            cells.
     """
-    report = progress or _silent
-    if keep is not None and keep not in ("all", "none"):
-        raise ValueError(f'keep is None, "all" or "none", not {keep!r}')
+    asked = _checked_settings(keep, patches, tolerance, spacing, seed, progress or _silent)
+    _check_is_mesh(mesh)
+    stages = {"all": _kept, "sound": _sound, "joined": _joined, "none": _anew}
+    names = list(stages) if keep is None else [keep]
+    reasons: list[str] = []
+    for name in names:
+        try:
+            surface, facts = stages[name](mesh, asked)
+        except (MeshError, MeshingError) as error:
+            if name == names[-1]:
+                raise
+            reasons.append(str(error))
+            asked.report(f"{error}; so not all is kept")
+            continue
+        facts |= {"why": "; ".join(reasons) or None}
+        return _result(surface, facts, largest)
+    raise AssertionError("unreachable: the last stage returns or raises")
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """The arguments of `repair`."""
+
+    keep: Keep | None
+    patches: Patches
+    tolerance: float
+    spacing: float | None
+    seed: int
+    report: Callable[[str], None]
+
+
+def _checked_settings(
+    keep: Keep | None,
+    patches: Patches,
+    tolerance: float,
+    spacing: float | None,
+    seed: int,
+    report: Callable[[str], None],
+) -> _Asked:
+    if keep is not None and keep not in ("all", "sound", "none"):
+        raise ValueError(f'keep is None, "all", "sound" or "none", not {keep!r}')
+    if patches not in ("smooth", "harmonic"):
+        raise ValueError(f'patches are "smooth" or "harmonic", not {patches!r}')
     if not 0 < tolerance < 0.5:
         raise ValueError(
             f"tolerance is a part of the size: it must lie in (0, 0.5), not {tolerance}"
         )
     if spacing is not None and not 0 < spacing < math.inf:
         raise ValueError(f"spacing must be a positive length, not {spacing!r}")
-    if keep == "none":
-        return _anew(mesh, None, tolerance, spacing, largest, report)
-    try:
-        attempts = _ATTEMPTS if keep == "all" else _FEW_ATTEMPTS
-        return _kept(mesh, tolerance, spacing, seed, attempts, report)
-    except (MeshError, MeshingError) as error:
-        if keep == "all":
-            raise
-        report(f"{error}; so all is made anew")
-        return _anew(mesh, str(error), tolerance, spacing, largest, report)
+    return _Asked(keep, patches, tolerance, spacing, seed, report)
 
 
-def _anew(
-    mesh: Any,
-    why: str | None,
-    tolerance: float,
-    spacing: float | None,
-    largest: bool,
-    report: Callable[[str], None],
-) -> trimesh.Trimesh:
-    """The surface on which the winding number is 1/2, closed whatever the mesh is."""
-    _check_is_mesh(mesh)
-    corners = without_zero_area_faces(np.asarray(mesh.vertices), np.asarray(mesh.faces))
-    field = WindingNumber(*corners)
-    if spacing is None:
-        spacing = float(np.ptp(corners[0], axis=0).max()) / _ACROSS_ANEW
-    made = mesh_of(
-        field, solid=(0.5, math.inf), tolerance=tolerance, spacing=spacing, largest=largest,
-        progress=report,
-    )  # fmt: skip
-    made.metadata["harnack"] |= {"stage": "anew", "kept": 0, "why": why}
+def _result(surface: Surface, facts: dict[str, Any], largest: bool) -> trimesh.Trimesh:
+    """The mesh, with what is known of it and of its parts."""
+    from harnack.meshing.closed_mesh import ClosedMesh
+
+    parts = parts_of(surface)
+    dropped = 0
+    if largest and len(parts) > 1:
+        surface = largest_body(surface)
+        dropped = len(parts) - len(parts_of(surface))
+    made = ClosedMesh(surface.vertices, surface.faces, process=False, validate=False)
+    made.metadata["harnack"] = {
+        **facts,
+        "parts": parts,
+        "dropped": dropped,
+        "euler_characteristic": euler_characteristic(surface.faces),
+    }
     return made
-
-
-def _kept(
-    mesh: Any,
-    tolerance: float,
-    spacing: float | None,
-    seed: int,
-    attempts: int,
-    report: Callable[[str], None],
-) -> trimesh.Trimesh:
-    """The mesh with patches; all its triangles stay.
-
-    Raises:
-        MeshError, MeshingError: as `repair`.
-    """
-    vertices, faces = _checked(mesh)
-    edges = _open_edges(faces)
-    if not len(edges):
-        nothing = _Patches(vertices[:0], faces[:0], True, 0.0, 0)
-        return _joined(vertices, faces, nothing, len(faces))
-    if attempts < _ATTEMPTS and len(edges) > min(_MOST_OPEN, _MOST_OPEN_PART * len(faces)):
-        raise MeshError(
-            f"{len(edges):,} edges of {len(faces):,} faces are open, too many for patches that all "
-            'end there, unless keep="all" asks for them'
-        )
-    asked = _Asked(len(faces), tolerance, spacing, seed, attempts, report)
-    try:
-        return _repaired(vertices, faces, edges, asked)
-    except MeshingError as error:
-        missing = _missing_triangles(vertices, faces, edges)
-        if not len(missing):
-            raise
-        first = error
-    report(f"once more, with triangles in {len(missing):,} holes of three edges")
-    together = np.concatenate([faces, missing])
-    try:
-        return _repaired(vertices, together, _open_edges(together), asked)
-    except MeshingError as error:
-        raise MeshingError(
-            f"{first}; and with triangles in {len(missing):,} holes of three edges: {error}"
-        ) from error
-
-
-@dataclass(frozen=True)
-class _Asked:
-    """The arguments of `repair`. given: how many faces there were. attempts: how many sizes of
-    cells are tried."""
-
-    given: int
-    tolerance: float
-    spacing: float | None
-    seed: int
-    attempts: int
-    report: Callable[[str], None]
-
-
-def _repaired(
-    vertices: FloatArray, faces: IntArray, edges: IntArray, asked: _Asked
-) -> trimesh.Trimesh:
-    """The mesh with patches that end at its open edges; cells are made smaller where checks fail.
-
-    Raises:
-        MeshingError: as `repair`.
-    """
-    if not len(edges):
-        nothing = _Patches(vertices[:0], faces[:0], True, 0.0, 0)
-        return _joined(vertices, faces, nothing, asked.given)
-    loops = singular_loops(edges, np.ones(len(edges), np.int64))
-    function = LevelFunction(SolidAngle([vertices[loop] for loop in loops]), _LEVEL)
-    size = float(np.ptp(vertices[np.unique(edges)], axis=0).max())
-    cell = size / _ACROSS if asked.spacing is None else float(asked.spacing)
-    report, tolerance = asked.report, asked.tolerance * size
-    finer: tuple[Places, ...] = ()
-    times_met, seed = 0, asked.seed
-    for attempt in range(asked.attempts):
-        last = attempt == asked.attempts - 1
-        report(f"cells of {cell:.3g}" + ", smaller in places" * bool(finer))
-        try:
-            patches = _patches(
-                function, vertices, edges, cell, finer, tolerance, seed, last, report
-            )
-            result = _joined(vertices, faces, patches, asked.given)
-            _check(vertices, faces, result, report)
-        except LocalError as error:
-            times_met += isinstance(error, _MetError)
-            if last or times_met > _MOST_MET:
-                place = ", ".join(f"{c:.4g}" for c in error.places[0])
-                raise MeshingError(
-                    f"{error} (cells were {cell:.3g} wide, and smaller in {len(error.places)} "
-                    f"places, such as near ({place}))"
-                ) from None
-            report(f"{error} ({len(error.places)} places)")
-            finer = (*finer, Places(error.places, 2 * cell * 0.5 ** len(finer)))
-        except TooLargeError:
-            raise
-        except MeshingError as error:  # a point lies where the function is too inaccurate
-            if last:
-                raise
-            report(f"{error}; once more, with points moved at random in another way")
-            seed += 1
-        else:
-            return result
-    raise AssertionError("unreachable: the last attempt returns or raises")
-
-
-class _MetError(LocalError):
-    """Patches intersect the mesh."""
-
-
-@dataclass(frozen=True)
-class _Patches:
-    """What is added.
-
-    vertices: (k, 3).
-    faces: (p, 3); indices below the number of given vertices are of these.
-    is_fine: whether they were refined to the tolerance.
-    """
-
-    vertices: FloatArray
-    faces: IntArray
-    is_fine: bool
-    spacing: float
-    evaluations: int
 
 
 def _silent(text: str) -> None:
@@ -294,9 +211,109 @@ def _check_is_mesh(mesh: Any) -> None:
         )
 
 
+# All made anew.
+
+
+def _anew(mesh: Any, asked: _Asked) -> tuple[Surface, dict[str, Any]]:
+    """The surface on which the winding number is 1/2, closed whatever the mesh is."""
+    corners = without_zero_area_faces(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    field = WindingNumber(*corners)
+    spacing = asked.spacing
+    if spacing is None:
+        spacing = float(np.ptp(corners[0], axis=0).max()) / _ACROSS_ANEW
+    try:
+        made = _by_signs(field, spacing, asked)
+    except MeshingError:
+        if asked.spacing is not None:
+            raise
+        made = _by_signs(field, 0.6 * spacing, asked)
+    facts = made.metadata["harnack"] | {"stage": "anew", "kept": 0}
+    return Surface(np.asarray(made.vertices), np.asarray(made.faces, np.int64)), facts
+
+
+def _by_signs(field: WindingNumber, spacing: float, asked: _Asked) -> trimesh.Trimesh:
+    return mesh_of(
+        field, solid=(0.5, math.inf), tolerance=asked.tolerance, spacing=spacing,
+        progress=asked.report,
+    )  # fmt: skip
+
+
+# What is sound kept.
+
+
+def _sound(mesh: Any, asked: _Asked) -> tuple[Surface, dict[str, Any]]:
+    """The triangles that are sound, with patches.
+
+    Raises:
+        MeshError, MeshingError: as `repair`.
+    """
+    vertices, faces = without_zero_area_faces(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    made = mended(vertices, faces, asked.report)
+    flat = len(np.asarray(mesh.faces)) - len(faces)
+    left_out = {"flat": made.left_out["flat"] + flat}
+    return made.surface, {
+        "stage": "sound",
+        "kept": len(made.kept),
+        "turned": len(made.turned),
+        "left_out": made.left_out | left_out,
+        "holes": made.holes,
+        "patches": len(made.surface.faces) - len(made.kept),
+        "harmonic": 0,
+    }
+
+
+# Loose triangles joined.
+
+
+def _joined(mesh: Any, asked: _Asked) -> tuple[Surface, dict[str, Any]]:
+    """Triangles with near corners joined, with patches; none is kept bit by bit.
+
+    Raises:
+        MeshError, MeshingError: as `repair`.
+    """
+    corners = without_zero_area_faces(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    vertices, faces, moved = joined(*corners)
+    made = mended(vertices, faces, asked.report)
+    count = len(made.kept)
+    return made.surface, {
+        "stage": "joined",
+        "kept": 0,
+        "joined": count,
+        "moved": moved,
+        "turned": len(made.turned),
+        "left_out": made.left_out | {"flat": len(np.asarray(mesh.faces)) - len(faces)},
+        "holes": made.holes,
+        "patches": len(made.surface.faces) - count,
+        "harmonic": 0,
+    }
+
+
+# All kept.
+
+
+def _kept(mesh: Any, asked: _Asked) -> tuple[Surface, dict[str, Any]]:
+    """The mesh with patches; all its triangles stay.
+
+    Raises:
+        MeshError, MeshingError: as `repair`.
+    """
+    vertices, faces = _checked(mesh)
+    edges = open_edges(faces)
+    if asked.keep is None and len(crossing := intersecting_faces(vertices, faces)):
+        raise MeshError(f"{len(crossing):,} triangles of the mesh pass through others")
+    loops = hole_loops(vertices, faces, edges)
+    if asked.patches == "smooth":
+        try:
+            return _kept_with(vertices, faces, loops, asked)
+        except MeshingError as error:
+            if asked.keep is None:
+                raise
+            asked.report(f"{error}; once more, with harmonic patches alone")
+    return _kept_with(vertices, faces, loops, dataclasses.replace(asked, patches="harmonic"))
+
+
 def _checked(mesh: Any) -> tuple[FloatArray, IntArray]:
-    """Vertices and faces of a mesh that can be repaired."""
-    _check_is_mesh(mesh)
+    """Vertices and faces of a mesh all of which can be kept."""
     vertices, faces = validate_mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces))
     used = np.unique(faces)
     welded = weld_vertices(vertices[used])
@@ -310,277 +327,53 @@ def _checked(mesh: Any) -> tuple[FloatArray, IntArray]:
     return vertices, faces
 
 
-def _open_edges(faces: IntArray) -> IntArray:
-    """(k, 2): edges of one face, in its direction.
+def _kept_with(
+    vertices: FloatArray, faces: IntArray, loops: list[IntArray], asked: _Asked
+) -> tuple[Surface, dict[str, Any]]:
+    """The mesh with patches over its holes: smooth ones if asked for, and harmonic ones.
 
     Raises:
-        MeshError: an edge of more than two faces, or of two that have it in the same direction.
+        MeshingError: as `repair`.
     """
-    pairs = directed_edges(faces)
-    edges = Edges.of(pairs)
-    index, uses = edges.index, edges.uses
-    several = np.flatnonzero(uses > 2)
-    if len(several):
-        a, b = edges.ends[several[0]].tolist()
-        raise MeshError(
-            f"{len(several):,} edges have more than two faces, the first of them between vertices "
-            f"{a} and {b}: such a mesh has no two sides there; remove faces, or draw it with "
-            "WindingNumber, which needs no repair"
-        )
-    sign = np.bincount(index, np.where(pairs[:, 0] < pairs[:, 1], 1, -1), minlength=len(uses))
-    turned = np.flatnonzero((uses == 2) & (sign != 0))
-    if len(turned):
-        a, b = edges.ends[turned[0]].tolist()
-        raise MeshError(
-            f"the faces at {len(turned):,} edges do not agree which side is outside, the first of "
-            f"them between vertices {a} and {b}: reverse some faces, for instance by "
-            "trimesh.repair.fix_winding(mesh)"
-        )
-    return pairs[uses[index] == 1]
-
-
-def _missing_triangles(vertices: FloatArray, faces: IntArray, edges: IntArray) -> IntArray:
-    """The triangles (k, 3) that holes of three edges lack, where these pass through no others.
-
-    edges: (n, 2) open ones, as the faces run them.
-    """
-    leads: dict[int, set[int]] = defaultdict(set)
-    for a, b in edges.tolist():
-        leads[a].add(b)
-    there = {tuple(sorted(face)) for face in faces.tolist()}
-    found: list[tuple[int, int, int]] = []
-    for a, b in edges.tolist():
-        for c in leads[b]:
-            if a in leads[c] and tuple(sorted((a, b, c))) not in there and b in leads[a]:
-                found.append((a, c, b))
-                for one, other in ((a, b), (b, c), (c, a)):
-                    leads[one].discard(other)
-                break
-    made = np.array(found, np.int64).reshape(-1, 3)
-    corners = vertices[made]
-    made = made[np.linalg.norm(_normals(corners), axis=1) > 0]
-    together = np.concatenate([faces, made])
-    is_made = np.arange(len(together)) >= len(faces)
-    met = np.setdiff1d(intersecting_faces(vertices, together, is_made), np.arange(len(faces)))
-    return np.delete(made, met - len(faces), axis=0)
-
-
-def _patches(
-    function: LevelFunction,
-    vertices: FloatArray,
-    edges: IntArray,
-    spacing: float,
-    finer: tuple[Places, ...],
-    tolerance: float,
-    seed: int,
-    last: bool,
-    report: Callable[[str], None],
-) -> _Patches:
-    """The level set, ending at the edges (k, 2) of the mesh.
-
-    last: whether patches that cannot be refined will do.
-
-    Raises:
-        MeshingError: as `mesh`; or Delaunay's tetrahedra lack an edge.
-    """
-    rim, place = np.unique(edges, return_inverse=True)
-    boundary = Boundary(vertices[rim], place.reshape(-1, 2))
-    hull: Any = function.field.extent((_LEVEL,))
-    lower, upper = (np.array(end, np.float64) for end in hull.bounds())
-    root = box_cells(lower - 0.5 * spacing, upper + 0.5 * spacing, spacing, exact=False)
-    cut, middles = boundary, np.zeros((0, 2), np.int64)
-    points = place_points(function, root, cut, None, seed, finer)
-    tets = delaunay(points.points)
-    for _ in range(_MOST_CUTS):
-        lacks = ~tets.has_edges(cut.edges)
-        if not lacks.any():
-            break
-        middles = np.concatenate([middles, cut.edges[lacks]])
-        cut = cut.split(lacks)
-        points = place_points(function, root, cut, None, seed, finer)
-        tets = delaunay(points.points)
-    lacks = ~tets.has_edges(cut.edges)
-    if lacks.any():
-        raise LocalError(
-            f"{int(lacks.sum())} boundary edges of the mesh are too near to others for a patch "
-            "that ends at them: subdivide the mesh there, or choose a smaller `spacing`",
-            cut.points[cut.edges[lacks]].mean(axis=1),
-        )
-    report(f"{len(points.points):,} points, {len(tets.corners):,} tetrahedra")
-    x, faces = triangles_of(function, points, tets, crossings_of(function, points, tets))
-    for k, ends in reversed(list(enumerate(middles.tolist(), start=len(rim)))):
-        faces = _collapsed(x, faces, k, ends)
-    if not len(faces):
-        raise LocalError("no patch was found: choose a smaller `spacing`", boundary.points)
-    _check_boundary(x, faces, boundary)
-    is_fine = True
-    try:
-        x, faces = _finished(function, x, faces, tolerance, report)
-    except LocalError:
-        if not last or len(intersecting_faces(x, faces)):
-            raise
-        is_fine = False
-    # Faces of level sets are seen from where w is greater, those of meshes from outside.
-    faces = faces[:, ::-1]
-    kept = np.unique(faces)
-    inner = kept[kept >= len(rim)]
-    index = np.full(len(x), -1, np.int64)
-    index[: len(rim)] = rim
-    index[inner] = len(vertices) + np.arange(len(inner))
-    return _Patches(x[inner], index[faces], is_fine, spacing, function.evaluations)
-
-
-def _finished(
-    function: LevelFunction,
-    x: FloatArray,
-    faces: IntArray,
-    tolerance: float,
-    report: Callable[[str], None],
-) -> tuple[FloatArray, IntArray]:
-    """Vertices and faces of patches refined to the tolerance: smoothed and improved, or only
-    smoothed, or as they are, whichever first does not pass through itself.
-
-    Raises:
-        MeshingError: all do, as small triangles turn over each other beside sharp corners of holes.
-    """
-    bad = x[:0]
-    for way in ("improving", "smoothing", "refining alone"):
-        report(way)
-        finer, split = (x if way == "refining alone" else smoothed(function, x, faces, None)), faces
-        finer, split = refined(function, finer, split, 0.5 * tolerance, None, report)
-        far = far_places(function, finer, split, 0.5 * tolerance)
-        if len(far):  # the patch takes another way than the surface, or connects two of its sheets
-            raise LocalError(
-                f"{len(far):,} triangles of patches do not come near the surface, however they are "
-                "cut: subdivide the mesh there, or choose a smaller `spacing`",
-                far,
-            )
-        if way == "improving":
-            finer, split = improved(function, finer, split, 0.5 * tolerance, None, report)
-        elif way == "smoothing":
-            finer = smoothed(function, finer, split, None)
-        met = finer[split[intersecting_faces(finer, split)]].mean(axis=1)
-        bad = np.concatenate([met, finer[_new_singular(faces, split)]])
-        if not len(bad):
-            return finer, split
-    raise LocalError("the patches meet each other: choose a smaller `spacing`", bad)
-
-
-def _new_singular(before: IntArray, after: IntArray) -> IntArray:
-    """Vertices at which faces are not a manifold any more; holes may touch in others."""
-    return np.setdiff1d(singular_vertices(after), singular_vertices(before))
-
-
-def _collapsed(x: FloatArray, faces: IntArray, middle: int, ends: list[int]) -> IntArray:
-    """The faces with a vertex in the middle of a boundary edge moved to one of its ends: that with
-    which fewer faces meet or, if they are as many, the faces around it are turned less.
-
-    Raises:
-        MeshingError: both ends would join more than the two faces at the edge.
-    """
-    around = (faces == middle).any(axis=1)
-    star, rest = faces[around], faces[~around]
-    found: list[tuple[int, float, IntArray]] = []
-    for end in ends:
-        joined = (faces == end).any(axis=1)
-        if len(np.intersect1d(star, faces[joined])) != 3:  # these two, and the face's third corner
-            continue
-        moved = np.where(star == middle, end, star)
-        kept = ~(star == end).any(axis=1)
-        one, other = _normals(x[star[kept]]), _normals(x[moved[kept]])
-        turned = float((one * other).sum(axis=1).min(initial=1.0))
-        made = np.concatenate([rest, moved[kept]])
-        is_moved = np.arange(len(made)) >= len(rest)
-        found.append((len(intersecting_faces(x, made, is_moved)), -turned, made))
-    if not found:
-        raise LocalError(
-            "boundary edges of the mesh are too near to others for patches that end at them: "
-            "subdivide the mesh there, or choose a smaller `spacing`",
-            x[[middle]],
-        )
-    return min(found, key=lambda one: one[:2])[2]
-
-
-def _normals(corners: FloatArray) -> FloatArray:
-    """Unit normals of triangles (m, 3, 3), 0 of those without an area."""
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
-
-
-def _check_boundary(x: FloatArray, faces: IntArray, boundary: Boundary) -> None:
-    """Raise unless patches end at the boundary, and run each of its edges as the mesh does: they
-    are reversed afterwards."""
-    directed = {(int(a), int(b)) for a, b in directed_edges(faces)}
-    rim = {(a, b) for a, b in directed if (b, a) not in directed}
-    wrong = rim ^ {(int(a), int(b)) for a, b in boundary.edges}
-    if wrong:
-        raise LocalError(
-            "the patches do not end at the edges of the holes: cells are too large for them; "
-            "choose a smaller `spacing`",
-            x[np.array(sorted(wrong))].mean(axis=1),
-        )
-
-
-def _joined(
-    vertices: FloatArray, faces: IntArray, patches: _Patches, given: int
-) -> trimesh.Trimesh:
-    """The mesh and its patches. given: how many of the faces were there before."""
-    from harnack.meshing.closed_mesh import ClosedMesh
-
-    edges = _open_edges(faces[:given])
-    together = np.concatenate([faces, patches.faces])
-    result = ClosedMesh(
-        np.concatenate([vertices, patches.vertices]), together, process=False, validate=False
-    )
-    result.metadata["harnack"] = {
+    x, together, left = vertices, faces, loops
+    if loops and asked.patches == "smooth":
+        asked.report(f"filling {len(loops):,} holes")
+        field = WindingNumber(vertices, faces)
+        made = filled(vertices, faces, loops, lambda p: field.value(p, precision="double"))
+        x, together = np.concatenate([x, made.vertices]), np.concatenate([faces, made.faces])
+        left = made.left
+        asked.report(f"{len(left):,} holes are left" + f": {made.why}" * bool(left))
+    rest = HarmonicPatches(vertices[:0], faces[:0], True, 0.0, 0)
+    if left:
+        edges = open_edges(together)
+        if asked.keep is None and len(edges) > _FEW_EDGES:
+            raise MeshingError(f"{len(left):,} holes of {len(edges):,} edges have no smooth patch")
+        attempts = _ATTEMPTS if asked.keep == "all" else _FEW_ATTEMPTS
+        how = Asked(asked.tolerance, asked.spacing, asked.seed, attempts, asked.report)
+        rest = harmonic_patches(x, together, edges, how)
+        x, together = np.concatenate([x, rest.vertices]), np.concatenate([together, rest.faces])
+    surface = Surface(x, together)
+    if loops or asked.keep is None:
+        _check_touching(together)
+    if asked.keep is None and turned_outwards(surface).any():
+        raise MeshError("a part of the mesh is inside out")
+    return surface, {
         "stage": "kept",
-        "kept": given,
-        "why": None,
-        "holes": len(singular_loops(edges, np.ones(len(edges), np.int64))) if len(edges) else 0,
-        "patches": len(together) - given,
-        "missing": len(faces) - given,
-        "refined": patches.is_fine,
-        "spacing": patches.spacing,
-        "evaluations": patches.evaluations,
-        "euler_characteristic": euler_characteristic(together),
+        "kept": len(faces),
+        "holes": len(loops),
+        "patches": len(together) - len(faces),
+        "harmonic": len(rest.faces),
+        "missing": rest.missing,
+        "refined": rest.is_fine,
+        "spacing": rest.spacing,
+        "evaluations": rest.evaluations,
     }
-    return result
 
 
-def _check(
-    vertices: FloatArray, faces: IntArray, result: Any, report: Callable[[str], None]
-) -> None:
-    """Raise unless the result is what `repair` promises.
-
-    Raises:
-        MeshingError: it is not.
-    """
-    report("checking the patches")
-    x = np.asarray(result.vertices, np.float64)
-    together = np.asarray(result.faces, np.int64)
-    try:
-        check_manifold(together)
-    except MeshingError as error:
-        raise LocalError(str(error), x[singular_vertices(together)]) from None
-    added = x[len(vertices) :]
-    w = WindingNumber(vertices, faces).value(added, precision="double")
-    off = np.abs(w - np.floor(w) - 0.5)
-    if not (off <= _NEAR).all():
-        raise LocalError(
-            f"the winding number is off 1/2 by {off.max():.2g} at a vertex of the patches: choose "
-            "a smaller `spacing`",
-            added[off > _NEAR],
+def _check_touching(faces: IntArray) -> None:
+    """Raise unless the faces around each vertex are joined by edges."""
+    if len(places := singular_vertices(faces)):
+        raise MeshingError(
+            f"faces touch in {len(places):,} vertices alone, such as vertex {places[0]}: such a "
+            "mesh has no two sides there"
         )
-    is_patch = np.arange(len(together)) >= len(faces)
-    met = intersecting_faces(x, together, is_patch)
-    if not len(met):
-        return
-    places = x[together[met[is_patch[met]]]].mean(axis=1)
-    if is_patch[met].all():
-        raise LocalError("the patches meet each other: choose a smaller `spacing`", places)
-    raise _MetError(
-        f"the patches meet {int((~is_patch[met]).sum()):,} triangles of the mesh, where the "
-        "winding number jumps: the hole cannot be closed by its 1/2 level alone; remove the "
-        "triangles that stand in it, or draw the mesh with WindingNumber, which needs no repair",
-        places,
-    )

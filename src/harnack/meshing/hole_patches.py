@@ -1,0 +1,511 @@
+"""Smooth patches over the holes of a mesh, each bounded by one loop of open edges.
+
+A patch begins as the triangulation of its loop that has the least area (Barequet and Sharir 1995)
+or, for small loops, that turns least against the faces around it (Liepa, Filling Holes in Meshes,
+2003). Edges are cut and flipped until triangles are as large as those around the hole. Then the
+patch is made to bend as little as it can: the sum of squared Laplacians of positions is least, over
+the new vertices and those of the loop, while all vertices that were there stay (Botsch and
+Kobbelt 2004). So it continues the surface around it, tangents included.
+
+Nothing is proved of such patches. Those are handed back that pass the checks of `filled`.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, cast
+
+import numpy as np
+
+from harnack.backend import BoolArray, FloatArray
+from harnack.meshing.checks import intersecting_faces
+from harnack.meshing.edges import Edges, IntArray, directed_edges, dots, edge_keys, lengths
+from harnack.meshing.refinement import split_faces
+
+__all__ = ["Filled", "filled", "hole_loops"]
+
+# Loops of more edges are not filled: the time grows with the cube of their number.
+_MOST_IN_LOOP = 600
+# Up to so many edges angles count, beyond it areas alone.
+_MOST_BY_ANGLES = 10
+# Edges are cut that are longer than this many times what is usual around the hole; so often.
+_LONG, _ROUNDS = 1.4, 10
+_MOST_CUT = 200_000
+# Edges of two triangles are flipped if the cotangents of the angles opposite have a sum below this.
+_FLIP = -1e-3
+_MOST_FLIPS = 12
+# Cotangents are kept between these, so that every matrix is definite.
+_LEAST_COTANGENT, _MOST_COTANGENT = 0.02, 20.0
+# How often the patch is made to bend little, by the cotangents of what it was before.
+_FAIRINGS = 2
+# On a patch the winding number of what is there may differ from 1/2 modulo 1 by so much.
+_FROM_HALF = 0.36
+
+Winding = Callable[[FloatArray], FloatArray]
+
+
+@dataclass(frozen=True)
+class Filled:
+    """What was added to a mesh.
+
+    vertices: (k, 3) new ones.
+    faces: (p, 3) of patches; indices below the number of given vertices are of these.
+    left: loops that have no patch, each an array of vertices.
+    why: what patches of these failed with, in words.
+    """
+
+    vertices: FloatArray
+    faces: IntArray
+    left: list[IntArray]
+    why: str
+
+
+def filled(
+    vertices: FloatArray, faces: IntArray, loops: list[IntArray], winding: Winding
+) -> Filled:
+    """Patches over loops of open edges, as `hole_loops` gives them, that pass these checks: no
+    triangle of one meets another triangle or is without an area, and the winding number of what is
+    there is near 1/2 modulo 1 at its vertices and centers. It is far from that where a hole is no
+    hole of its own: where two rims belong to one gap, or a part stands in it.
+
+    What fails is tried once more with the least area in place of the least bending.
+
+    winding: the winding number of the mesh at points.
+    """
+    x, together = vertices, faces
+    left: list[IntArray] = loops
+    reasons = dict[int, str]()
+    for is_flat in (False, True):
+        if not left:
+            break
+        made, new, owner, reasons = _patches(x, together, left, is_flat)
+        reasons |= _failures(made, together, new, owner, len(x), winding)
+        good = ~np.isin(owner, list(reasons))
+        x, together = _used(made, np.concatenate([together, new[good]]), len(x))
+        left = [left[k] for k in sorted(reasons)]
+    counts = Counter(reasons.values())
+    why = ", ".join(f"{count:,} {what}" for what, count in counts.items())
+    return Filled(x[len(vertices) :], together[len(faces) :], left, why)
+
+
+def _used(x: FloatArray, faces: IntArray, given: int) -> tuple[FloatArray, IntArray]:
+    """Vertices and faces without those vertices that no face has, but for the given ones."""
+    used = np.zeros(len(x), np.bool_)
+    used[:given] = True
+    used[faces] = True
+    return x[used], (np.cumsum(used) - 1)[faces]
+
+
+def _failures(
+    x: FloatArray,
+    faces: IntArray,
+    new: IntArray,
+    owner: IntArray,
+    given: int,
+    winding: Winding,
+) -> dict[int, str]:
+    """By loop, what is wrong with its patch. new: faces of patches, and owner: of which loop."""
+    found: dict[int, str] = {}
+    if not len(new):
+        return found
+    loop_of = np.zeros(len(x), np.int64)
+    loop_of[new] = owner[:, None]
+    loops = np.concatenate([owner, loop_of[given:]])
+    w = winding(np.concatenate([x[new].mean(axis=1), x[given:]]))
+    far = ~(np.abs(w - np.floor(w) - 0.5) <= _FROM_HALF)
+    found |= dict.fromkeys(loops[far].tolist(), "not where the winding number is near 1/2")
+    together = np.concatenate([faces, new])
+    is_new = np.arange(len(together)) >= len(faces)
+    met = intersecting_faces(x, together, is_new)
+    found |= dict.fromkeys(
+        owner[met[is_new[met]] - len(faces)].tolist(), "passing through other triangles"
+    )
+    flat = lengths(_crosses(x, new)) == 0
+    return found | dict.fromkeys(owner[flat].tolist(), "with triangles without an area")
+
+
+# Loops.
+
+
+def hole_loops(vertices: FloatArray, faces: IntArray, edges: IntArray) -> list[IntArray]:
+    """The loops of open edges (k, 2), which run as their faces do, each without a vertex twice.
+
+    Where several holes meet at a vertex, a loop goes on with the edge that bounds the same gap
+    between faces, as seen along the normal there.
+    """
+    leaving: defaultdict[int, list[int]] = defaultdict(list)
+    arriving: defaultdict[int, list[int]] = defaultdict(list)
+    for a, b in edges.tolist():
+        leaving[a].append(b)
+        arriving[b].append(a)
+    normals = np.zeros_like(vertices)
+    for k in range(3):
+        np.add.at(normals, faces[:, k], _crosses(vertices, faces))
+    following: dict[tuple[int, int], int] = {}
+    for v, starts in arriving.items():
+        ends = leaving[v]
+        if len(ends) > 1:
+            ends = _across_gaps(vertices, v, normals[v], starts, ends)
+        following |= {(a, v): c for a, c in zip(starts, ends, strict=True)}
+    loops: list[IntArray] = []
+    while following:
+        (a, b), _ = next(iter(following.items()))
+        path, place = [a], {a: 0}
+        while (a, b) in following:
+            a, b = b, following.pop((a, b))
+            if a in place:  # a loop is complete; what led to it goes on
+                first = place[a]
+                loops.append(np.array(path[first:]))
+                for one in path[first + 1 :]:
+                    del place[one]
+                del path[first + 1 :]
+            else:
+                place[a] = len(path)
+                path.append(a)
+    return loops
+
+
+def _across_gaps(
+    x: FloatArray, v: int, normal: FloatArray, starts: list[int], ends: list[int]
+) -> list[int]:
+    """For each edge that comes from a start to v, the end to which its loop goes on: the next one
+    counter-clockwise, since faces are to the left of their edges and holes to the right."""
+    axis = np.eye(3)[np.abs(normal).argmin()]
+    unit = normal / max(float(np.linalg.norm(normal)), 1e-300)
+    one = np.cross(unit, axis)
+    other = np.cross(unit, one)
+
+    def angle(k: int) -> float:
+        way = x[k] - x[v]
+        return float(np.arctan2(way @ other, way @ one))
+
+    free, found = {c: angle(c) for c in ends}, list[int]()
+    for a in starts:
+        from_here = angle(a)
+        nearest = min(free, key=lambda c: (free[c] - from_here) % (2 * np.pi))
+        del free[nearest]
+        found.append(nearest)
+    return found
+
+
+# Triangulations of loops.
+
+
+def _patches(
+    vertices: FloatArray, faces: IntArray, loops: list[IntArray], is_flat: bool
+) -> tuple[FloatArray, IntArray, IntArray, dict[int, str]]:
+    """All vertices with those of patches behind; faces of patches; of which loop each is; and loops
+    without a patch, with the reason."""
+    third = _beside(faces, np.unique(np.concatenate(loops)), len(vertices))
+    taken = {(min(edge), max(edge)) for edge in third}
+    there = np.array(sorted(taken), np.int64).reshape(-1, 2)
+    found, failed = list[IntArray](), dict[int, str]()
+    for k, loop in enumerate(loops):
+        if len(loop) > _MOST_IN_LOOP:
+            failed[k] = f"of more than {_MOST_IN_LOOP} edges"
+            continue
+        polygon = loop[::-1].copy()
+        plan = _least_turning if 3 < len(polygon) <= _MOST_BY_ANGLES else _least_area
+        made = plan(vertices, polygon, third, taken)
+        if made is None:
+            failed[k] = "between edges that are joined already"
+            continue
+        taken |= {(min(e), max(e)) for e in directed_edges(made).tolist()}
+        found.append(made)
+    if not found:
+        return vertices, faces[:0], np.zeros(0, np.int64), failed
+    x, new = _finer(vertices, faces, np.concatenate(found), there)
+    if not is_flat and len(x) > len(vertices):
+        for _ in range(_FAIRINGS):
+            x = _fair(x, faces, new, len(vertices))
+            new = _flipped(x, new, there)
+    return x, new, _owners(new, loops, len(x)), failed
+
+
+def _beside(faces: IntArray, rims: IntArray, count: int) -> dict[tuple[int, int], int]:
+    """The third corners of faces, by their directed edges between some vertices."""
+    is_rim = np.zeros(count, np.bool_)
+    is_rim[rims] = True
+    directed = directed_edges(faces)
+    near = is_rim[directed].all(axis=1)
+    third = np.roll(faces, 1, axis=1).T.ravel()[near].tolist()
+    ends = directed[near].tolist()
+    return {(a, b): c for (a, b), c in zip(ends, third, strict=True)}
+
+
+def _barred(polygon: IntArray, taken: set[tuple[int, int]]) -> BoolArray:
+    """(n, n) which diagonals of a polygon are edges already."""
+    n = len(polygon)
+    barred = np.zeros((n, n), np.bool_)
+    place = {v: k for k, v in enumerate(polygon.tolist())}
+    for a, b in taken if n * n > len(taken) else _pairs(polygon, taken):
+        if a in place and b in place:
+            barred[place[a], place[b]] = barred[place[b], place[a]] = True
+    k = np.arange(n)
+    barred[k, (k + 1) % n] = barred[(k + 1) % n, k] = False
+    return barred
+
+
+def _pairs(polygon: IntArray, taken: set[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Those pairs of a polygon's vertices that are edges already."""
+    ordered = sorted(polygon.tolist())
+    return [(a, b) for i, a in enumerate(ordered) for b in ordered[i + 1 :] if (a, b) in taken]
+
+
+def _least_area(
+    x: FloatArray,
+    polygon: IntArray,
+    third: dict[tuple[int, int], int],
+    taken: set[tuple[int, int]],
+) -> IntArray | None:
+    """Triangles (n - 2, 3) of least area between the corners of a polygon; None if edges that are
+    there already leave none."""
+    n, corner = len(polygon), x[polygon]
+    if n == 3:
+        return polygon[None]
+    cost = np.where(_barred(polygon, taken), np.inf, 0.0)
+    middle = np.zeros((n, n), np.int64)
+    for d in range(2, n):
+        i = np.arange(n - d)[:, None]
+        m = i + np.arange(1, d)
+        area = 0.5 * lengths(
+            np.cross(corner[m] - corner[i], corner[i + d] - corner[i]).reshape(-1, 3)
+        ).reshape(m.shape)
+        total = cost[i, m] + cost[m, i + d] + area
+        best = total.argmin(axis=1)
+        rows = np.arange(n - d)
+        cost[rows, rows + d] += total[rows, best]
+        middle[rows, rows + d] = m[rows, best]
+    if not np.isfinite(cost[0, n - 1]):
+        return None
+    return polygon[_traced(middle, n)]
+
+
+def _traced(middle: IntArray, n: int) -> IntArray:
+    """The triangles of a plan: middle[i, k] is the third corner of that at the diagonal from i to
+    k, on the side of the corners between them."""
+    found, todo = list[tuple[int, int, int]](), [(0, n - 1)]
+    while todo:
+        i, k = todo.pop()
+        if k - i > 1:
+            m = int(middle[i, k])
+            found.append((i, m, k))
+            todo += [(i, m), (m, k)]
+    return np.array(found, np.int64)
+
+
+def _least_turning(
+    x: FloatArray,
+    polygon: IntArray,
+    third: dict[tuple[int, int], int],
+    taken: set[tuple[int, int]],
+) -> IntArray | None:
+    """Triangles of a small polygon whose largest angle with neighbors, those around the polygon
+    among them, is least; of the same angles those of least area (Liepa 2003)."""
+    n, corner = len(polygon), x[polygon]
+    barred = _barred(polygon, taken)
+
+    def normal(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
+        cross = np.cross(b - a, c - a)
+        return cross / max(float(np.linalg.norm(cross)), 1e-300)
+
+    beside: dict[tuple[int, int], FloatArray] = {}
+    for k in range(n):
+        a, b = int(polygon[k]), int(polygon[(k + 1) % n])
+        if (b, a) in third:
+            beside[k, (k + 1) % n] = normal(x[b], x[a], x[third[b, a]])
+    cost = {(k, k + 1): (-1.0, 0.0) for k in range(n - 1)}
+    middle = np.zeros((n, n), np.int64)
+    for d in range(2, n):
+        for i in range(n - d):
+            k, best = i + d, (np.inf, np.inf)
+            for m in range(i + 1, k):
+                one, other = cost[i, m], cost[m, k]
+                own = normal(corner[i], corner[m], corner[k])
+                sides = [beside[e] for e in ((i, m), (m, k)) if e in beside]
+                if d == n - 1 and (k, i) in beside:
+                    sides.append(beside[k, i])
+                turn = max([-float(own @ side) for side in sides], default=-1.0)
+                area = float(np.linalg.norm(np.cross(corner[m] - corner[i], corner[k] - corner[i])))
+                total = max(turn, one[0], other[0]), area + one[1] + other[1]
+                if total < best:
+                    best, middle[i, k] = total, m
+                    beside[i, k] = own
+            cost[i, k] = (np.inf, np.inf) if barred[i, k] and d < n - 1 else best
+    if not np.isfinite(cost[0, n - 1][1]):
+        return None
+    return polygon[_traced(middle, n)]
+
+
+# Finer triangles.
+
+
+def _finer(
+    vertices: FloatArray, faces: IntArray, new: IntArray, taken: IntArray
+) -> tuple[FloatArray, IntArray]:
+    """Patches of triangles about as large as those around them, with the least area; new vertices
+    lie behind those given.
+
+    taken: (t, 2) edges that are there already.
+    """
+    given = len(vertices)
+    x = np.column_stack([vertices, _usual_lengths(vertices, faces, np.unique(new))])
+    for _ in range(_ROUNDS):
+        new = _flipped(x[:, :3], new, taken)
+        edges = Edges.of(directed_edges(new))
+        ends = x[edges.ends]
+        long = lengths(ends[:, 0, :3] - ends[:, 1, :3]) > _LONG * ends[:, :, 3].mean(axis=1)
+        rows = np.flatnonzero(long & (edges.uses == 2))
+        if not len(rows) or len(new) > _MOST_CUT:
+            break
+        place = np.full(len(edges.ends), -1, np.int64)
+        place[rows] = len(x) + np.arange(len(rows))
+        x = np.concatenate([x, ends[rows].mean(axis=1)])
+        new = split_faces(x[:, :3], new, place[edges.index].reshape(3, -1).T)
+        x = _relaxed(x, new, given)
+    return x[:, :3], _flipped(x[:, :3], new, taken)
+
+
+def _usual_lengths(x: FloatArray, faces: IntArray, rims: IntArray) -> FloatArray:
+    """(n,) the mean length of a vertex's edges; 0 but at some vertices."""
+    is_rim = np.zeros(len(x), np.bool_)
+    is_rim[rims] = True
+    edges = Edges.of(directed_edges(faces[is_rim[faces].any(axis=1)])).ends
+    long = lengths(x[edges[:, 0]] - x[edges[:, 1]])
+    total, count = (
+        np.bincount(edges.ravel(), np.repeat(one, 2), minlength=len(x))
+        for one in (long, np.ones(len(long)))
+    )
+    return np.where(is_rim, total / np.maximum(count, 1), 0.0)
+
+
+def _relaxed(x: FloatArray, new: IntArray, given: int) -> FloatArray:
+    """Rows of new vertices, in the middle of their neighbors' rows."""
+    ends = Edges.of(directed_edges(new)).ends
+    weights = _symmetric(ends, np.ones(len(ends)), len(x))
+    return _least_change(weights[given:], x, given)
+
+
+def _least_change(rows: Any, x: FloatArray, given: int) -> FloatArray:
+    """Rows from `given` on such that a linear map of all is nearest to 0."""
+    import scipy.sparse.linalg as linalg  # here: half a second that few need
+
+    solver = cast("Any", linalg)
+    inner, fixed = rows[:, given:], rows[:, :given]
+    after = x.copy()
+    right = inner.T @ (fixed @ x[:given])
+    after[given:] = -solver.splu((inner.T @ inner).tocsc()).solve(np.asarray(right))
+    return after
+
+
+def _symmetric(ends: IntArray, weight: FloatArray, count: int) -> Any:
+    """The Laplacian of a graph with these edges (k, 2), as a sparse matrix."""
+    import scipy.sparse  # here: half a second that few need
+
+    sparse = cast("Any", scipy.sparse)
+    a, b = ends.T
+    total = np.bincount(ends.ravel(), np.repeat(weight, 2), minlength=count)
+    every = np.arange(count)
+    return sparse.coo_matrix(
+        (
+            np.concatenate([-weight, -weight, total]),
+            (np.concatenate([a, b, every]), np.concatenate([b, a, every])),
+        ),
+        shape=(count, count),
+    ).tocsr()
+
+
+def _fair(x: FloatArray, faces: IntArray, new: IntArray, given: int) -> FloatArray:
+    """New vertices where the patches bend least, together with the faces around them."""
+    is_rim = np.zeros(len(x), np.bool_)
+    is_rim[new] = True
+    around = np.concatenate([faces[is_rim[faces].any(axis=1)], new])
+    edges = Edges.of(directed_edges(around))
+    corner = x[around]
+    weight = np.zeros(len(edges.ends))
+    area = np.zeros(len(x))
+    double = np.maximum(lengths(_crosses(x, around)), 1e-300)
+    for k in range(3):  # the edge from corner k to the next is opposite to the one after
+        one, other = (corner[:, j] - corner[:, k - 1] for j in (k, (k + 1) % 3))
+        cotangent = np.clip(dots(one, other) / double, -_MOST_COTANGENT, _MOST_COTANGENT)
+        m = len(around)
+        np.add.at(weight, edges.index[k * m : (k + 1) * m], 0.5 * cotangent)
+        np.add.at(area, around[:, k], double / 6)
+    weight = np.maximum(weight, _LEAST_COTANGENT)
+    # Beside holes that stay open only new vertices count.
+    is_rim[edges.ends[edges.uses != 2]] = False
+    rows = np.flatnonzero(is_rim & (area > 0))
+    laplacian = _symmetric(edges.ends, weight, len(x))[rows]
+    scale = 1 / np.sqrt(np.maximum(area[rows], 1e-300))
+    return _least_change(laplacian.multiply(scale[:, None]).tocsr(), x, given)
+
+
+def _flipped(x: FloatArray, new: IntArray, taken: IntArray) -> IntArray:
+    """Triangles with edges flipped so that angles opposite to them are small (Delaunay's
+    criterion), where the new edge is none already and nothing turns over."""
+    new = new.copy()
+    there = edge_keys(taken, len(x))
+    for _ in range(_MOST_FLIPS):
+        edges = Edges.of(directed_edges(new))
+        order = np.argsort(edges.index, kind="stable")
+        half = order[(edges.uses == 2)[edges.index[order]]].reshape(-1, 2)
+        f, g = half.T % len(new)
+        k, j = half.T // len(new)
+        a, b, c, d = new[f, k], new[f, (k + 1) % 3], new[f, (k + 2) % 3], new[g, (j + 2) % 3]
+        key = edge_keys(np.column_stack([c, d]), len(x))
+        gain = _cotangents(x[a], x[b], x[c]) + _cotangents(x[a], x[b], x[d])
+        good = (gain < _FLIP) & (c != d)
+        good &= ~np.isin(key, there) & ~np.isin(key, edge_keys(edges.ends, len(x)))
+        before = _crosses(x, new)
+        mean = before[f] + before[g]
+        for triangle in ((a, d, c), (d, b, c)):
+            good &= dots(_crosses(x, np.column_stack(triangle)), mean) > 0
+        rows = np.flatnonzero(good)
+        rows = rows[np.argsort(gain[rows])]
+        rows = rows[np.sort(np.unique(key[rows], return_index=True)[1])]
+        best = np.full(len(new), len(rows))
+        for one in (f, g):
+            np.minimum.at(best, one[rows], np.arange(len(rows)))
+        rank = np.arange(len(rows))
+        rows = rows[(best[f[rows]] == rank) & (best[g[rows]] == rank)]
+        if not len(rows):
+            break
+        a, b, c, d = a[rows], b[rows], c[rows], d[rows]
+        new[f[rows]], new[g[rows]] = np.column_stack([a, d, c]), np.column_stack([d, b, c])
+    return new
+
+
+def _cotangents(a: FloatArray, b: FloatArray, apex: FloatArray) -> FloatArray:
+    """(k,) of the angles at `apex` between points."""
+    one, other = a - apex, b - apex
+    return dots(one, other) / np.maximum(lengths(np.cross(one, other)), 1e-300)
+
+
+def _owners(new: IntArray, loops: list[IntArray], count: int) -> IntArray:
+    """(p,) of which loop each face of patches is: those joined by edges to a face at the loop."""
+    import scipy.sparse  # here: half a second that few need
+    import scipy.sparse.csgraph as csgraph_module
+
+    sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
+    edges = Edges.of(directed_edges(new))
+    order = np.argsort(edges.index, kind="stable")
+    one, other = order[(edges.uses == 2)[edges.index[order]]].reshape(-1, 2).T % len(new)
+    joined = sparse.coo_matrix((np.ones(len(one)), (one, other)), shape=(len(new), len(new)))
+    part = np.asarray(csgraph.connected_components(joined, directed=False)[1])
+    loop_at = np.full(int(part.max()) + 1, -1, np.int64)
+    keys = edge_keys(edges.ends, count)
+    face_at = np.empty(len(keys), np.int64)
+    face_at[edges.index] = np.arange(3 * len(new)) % len(new)
+    firsts = edge_keys(np.array([loop[:2] for loop in loops]), count)
+    places = np.minimum(np.searchsorted(keys, firsts), len(keys) - 1)
+    found = np.flatnonzero(keys[places] == firsts)
+    loop_at[part[face_at[places[found]]]] = found
+    return loop_at[part]
+
+
+def _crosses(x: FloatArray, faces: IntArray) -> FloatArray:
+    """(m, 3) normals of faces, twice as long as their areas."""
+    corner = x[faces]
+    return np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
