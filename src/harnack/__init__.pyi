@@ -92,7 +92,16 @@ from .fields.solids.thread import Thread, thread
 from .fields.solids.tube import Tube, Tubes
 from .files import outline
 from .geometry import Ball, Box, Circle, ConvexHull, HalfSpace, Intersection
-from .meshing import MeshingError, mesh, repair
+from .meshing import (
+    MeshingError,
+    PrintCheck,
+    PrintProblem,
+    Thickness,
+    check_print,
+    mesh,
+    repair,
+    thickness,
+)
 from .rendering import Camera, Isolines, animate, render
 from .tracer import AllHits, Hits, LevelSet, Status, Tolerance, level_set, trace
 from .view import SavedScene, SceneFileError, Slider, View, page, read_scene, view, write_scene
@@ -154,6 +163,8 @@ __all__ = [
     "Plane",
     "PlaneWave",
     "PolygonMesh",
+    "PrintCheck",
+    "PrintProblem",
     "Product",
     "Revolved",
     "RiemannSurface",
@@ -175,6 +186,7 @@ __all__ = [
     "Superellipsoid",
     "Supertorus",
     "Taylor",
+    "Thickness",
     "Thread",
     "Tolerance",
     "Torus",
@@ -191,6 +203,7 @@ __all__ = [
     "atan",
     "atan2",
     "backend",
+    "check_print",
     "closest_points",
     "cos",
     "cosh",
@@ -228,6 +241,7 @@ __all__ = [
     "tan",
     "tanh",
     "testing",
+    "thickness",
     "thread",
     "to_zarr",
     "trace",

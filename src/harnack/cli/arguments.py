@@ -79,6 +79,7 @@ def parsers() -> tuple[_Parser, dict[str, _Parser]]:
     _add_live(commands)
     _add_mesh(commands)
     _add_repair(commands)
+    _add_check(commands)
     many = commands.add_parser("gallery", help="draw or list the named scenes")
     many.add_argument("names", nargs="*", metavar="NAME", help="scenes to draw (all)")
     many.add_argument("--list", action="store_true", help="list them and draw nothing")
@@ -390,6 +391,28 @@ def _add_mesh(commands: Any) -> None:
     )  # fmt: skip
     _add_up(_add_file(one))
     one.add_argument("--quiet", action="store_true", help="do not say what is being done")
+
+
+def _add_check(commands: Any) -> None:
+    one = commands.add_parser(
+        "check", help="say what a slicer would complain of",
+        description="Say what is wrong with a mesh for printing, and where: open edges, edges of "
+        "many faces, sides that disagree, crossing triangles, loose and tiny parts, cavities, thin "
+        "walls. The exit code is 1 if something is wrong.",
+    )  # fmt: skip
+    one.add_argument("mesh", metavar="FILE", help="a mesh: .stl, .obj, .ply, .off, .glb or .gltf")
+    one.add_argument(
+        "--wall", type=_positive, metavar="LENGTH", help="the least thickness that is fine"
+    )
+    one.add_argument(
+        "--bed", type=_positive, nargs=3, metavar=("X", "Y", "Z"), help="what it has to fit on"
+    )
+    one.add_argument("--json", action="store_true", help="all of it as JSON")
+    one.add_argument(
+        "--colors", metavar="FILE",
+        help="write the mesh with its thickness as colors, .ply or .glb (needs --wall): red below "
+        "the wall, gray from three times that on",
+    )  # fmt: skip
 
 
 def _add_repair(commands: Any) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import json
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -19,11 +20,12 @@ from harnack.cli.messages import in_options, printable
 from harnack.field_from_file import open_surface
 from harnack.fields import Field
 from harnack.fields.expressions import expression, looks_like_formula
+from harnack.files.file_format import write_atomically
 from harnack.files.surfaces import SURFACE_FILES, Mesh, read_surface
 from harnack.gallery import SCENES, Scene
 from harnack.geometry import Ball, Box, HalfSpace
 from harnack.geometry.chains import weld_vertices
-from harnack.meshing import mesh, repair
+from harnack.meshing import check_print, mesh, repair, thickness
 from harnack.names import did_you_mean
 from harnack.rendering import Camera, Isolines, animate, render
 from harnack.rendering.arguments import OF_STUDIO, SETTINGS
@@ -478,6 +480,34 @@ def _counted(count: int, what: str) -> str:
     return f"{count:,} {what}" + ("" if count == 1 else "s")
 
 
+def _check(options: Any) -> int:
+    """What is wrong with a mesh for printing: 0 if nothing is."""
+    if options.colors is not None:
+        if options.wall is None:
+            raise ValueError("--colors needs --wall: the thickness below which they are red")
+        if check_mesh_path(options.colors).suffix.lower() not in (".ply", ".glb"):
+            raise ValueError(f"--colors {options.colors}: only .ply and .glb hold colors")
+    found = check_print(options.mesh, wall=options.wall, bed=options.bed)
+    if options.json:
+        print(json.dumps(found.as_dict()))
+    else:
+        size = " x ".join(f"{one:.4g}" for one in found.size)
+        volume = "not closed" if found.volume is None else f"volume {found.volume:.4g}"
+        _say(f"{options.mesh}: {found.triangles:,} triangles, {size}, {volume}")
+        for one in found.problems:
+            _say(f"{'wrong' if one.is_fatal else 'note'}: {one.kind}: {one.message}")
+        if found.is_fine:
+            _say("nothing is wrong")
+    if options.colors is not None:
+        thin = thickness(options.mesh)
+        with write_atomically(Path(options.colors)) as partial:
+            kind = Path(options.colors).suffix.lower()[1:]
+            cast("Any", thin.colored(options.wall, 3 * options.wall)).export(partial, kind)
+        if not options.json:
+            _say(f"wrote {options.colors}")
+    return 0 if found.is_fine else 1
+
+
 def _gallery(options: Any) -> int:
     console = Console()
     if options.list:
@@ -535,6 +565,7 @@ COMMANDS: Mapping[str, Callable[[Any], int]] = MappingProxyType(
         "view": _view,
         "mesh": _mesh,
         "repair": _repair,
+        "check": _check,
         "gallery": _gallery,
         "doctor": _doctor,
     }

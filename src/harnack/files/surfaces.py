@@ -37,7 +37,7 @@ from harnack.geometry.chains import (
 )
 from harnack.geometry.clouds import CloudError, checked_normals, checked_points
 from harnack.geometry.curves import CurveError, validate_loops
-from harnack.geometry.meshes import MeshError, without_zero_area_faces
+from harnack.geometry.meshes import MeshError, without_zero_area_faces, zero_area_faces
 from harnack.geometry.polygons import triangulate
 from harnack.names import did_you_mean
 
@@ -176,11 +176,13 @@ SURFACE_FILES = (*_READERS, ".loops", ".blobs", *MOLECULE_FILES)
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Triangles from a file, as `validate_mesh` returns them. said: what was found, and why."""
+    """Triangles from a file, as `validate_mesh` returns them. said: what was found, and why. flat:
+    (k, 3) faces of zero area, left out of `faces`, which may close gaps without a width."""
 
     vertices: FloatArray
     faces: IntArray
     said: str
+    flat: IntArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -337,6 +339,7 @@ def _are_curves(contents: Contents) -> bool:
 def _mesh(contents: Contents) -> Mesh:
     found = triangulate(contents.vertices, contents.faces.corners, contents.faces.sizes)
     vertices, faces = without_zero_area_faces(contents.vertices, found)
+    flat = found[zero_area_faces(vertices, found)]
     net = net_faces(weld_vertices(vertices)[faces])
     if not len(net.faces):
         raise MeshError(f"its {len(faces):,} faces cancel each other: there is no surface")
@@ -357,7 +360,7 @@ def _mesh(contents: Contents) -> Mesh:
         said += f"; {len(faces) - len(net.faces):,} are added to or canceled by others"
     if len(contents.polylines):
         said += "; polylines not used"
-    return Mesh(vertices, faces, said)
+    return Mesh(vertices, faces, said, flat)
 
 
 def _centers(mesh: Mesh) -> Cloud:

@@ -2,6 +2,17 @@
 
 from harnack.meshing.checks import MeshingError
 from harnack.meshing.mesh import mesh
+from harnack.meshing.print_checks import PrintCheck, PrintProblem, check_print
 from harnack.meshing.repair import repair
+from harnack.meshing.thickness import Thickness, thickness
 
-__all__ = ["MeshingError", "mesh", "repair"]
+__all__ = [
+    "MeshingError",
+    "PrintCheck",
+    "PrintProblem",
+    "Thickness",
+    "check_print",
+    "mesh",
+    "repair",
+    "thickness",
+]

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from harnack.geometry import Volume
 
 __all__ = [
+    "CrossingError",
     "LocalError",
     "MeshingError",
     "SignArray",
@@ -297,6 +298,10 @@ class LocalError(MeshingError):
         self.places = places
 
 
+class CrossingError(LocalError):
+    """Triangles that pass through each other."""
+
+
 class TooLargeError(MeshingError):
     """A mesh that would be so large that it was not begun."""
 
@@ -351,14 +356,14 @@ def check_apart(vertices: FloatArray, faces: IntArray) -> None:
     decided exactly.
 
     Raises:
-        MeshingError: so; a LocalError with the centers of these faces.
+        MeshingError: so; a CrossingError with the centers of these faces.
     """
     if not np.isfinite(vertices).all():
         raise MeshingError("vertices of the mesh are no numbers: choose another level or `clip`")
     crossing = intersecting_faces(vertices, faces)
     if len(crossing):
         places = vertices[faces[crossing]].mean(axis=1)
-        raise LocalError(
+        raise CrossingError(
             f"{len(crossing):,} of {len(faces):,} triangles pass through each other, such as near "
             f"{_point(places[0])}: choose a smaller `spacing` or a larger `tolerance`",
             places,

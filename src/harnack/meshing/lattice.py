@@ -15,6 +15,7 @@ and the tetrahedron behind such a face belongs to a face of the chosen cell as w
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 
@@ -111,6 +112,57 @@ class Lattice:
             raise too_large(expected, most)
         index = np.rint((leaves.corners - self.lower) / self.size).astype(np.int64)
         return index[(index < self.counts).all(axis=1)]
+
+    def cells_that_matter(
+        self, clearance: Clearance, elsewhere: Clearance, values: Clearance, most_faces: int
+    ) -> tuple[IntArray, BoolArray]:
+        """(n, 3) indices of the cells that may hold the level set or are negative beside cells that
+        do not matter, and of all cells of the lattice which do (counts).
+
+        elsewhere: of points (k, 3), how far around them nothing matters, by proof. values: of the
+            function. What does not matter counts as positive: all points of such cells do. As in
+            the module's proof, tetrahedra at the chosen cells then have all faces between points
+            of two signs: a cell that is not chosen has a center of the sign of its corners that
+            matter, and if one of them does not, all of them are positive.
+
+        Raises:
+            MeshingError: there are too many.
+        """
+        matter = self.cells_not_empty(elsewhere, most_faces)
+        does = np.zeros(tuple(self.counts.tolist()), np.bool_)
+        does[tuple(matter.T)] = True
+        centers = self.points(2 * matter + 1)
+        half_diagonal = 0.5 * float(np.linalg.norm(self.size))
+        chosen = clearance(centers) <= half_diagonal * (1 + 1e-9)
+        rim = np.flatnonzero(~chosen & ~self.deep(does)[tuple(matter.T)])
+        chosen[rim[values(centers[rim]) <= 0]] = True
+        if int(chosen.sum()) > min(MOST_CELLS, most_faces):
+            raise too_large(float(chosen.sum()), min(MOST_CELLS, most_faces))
+        return matter[chosen], does
+
+    def deep(self, cells: BoolArray) -> BoolArray:
+        """Those of some cells (counts) of which all neighbors in the lattice belong to them."""
+        around = np.pad(cells, 1, constant_values=True)
+        inner = cells.copy()
+        for shift in itertools.product((0, 1, 2), repeat=3):
+            inner &= around[tuple(slice(i, i + n) for i, n in zip(shift, cells.shape, strict=True))]
+        return inner
+
+    def cells_of(self, points: FloatArray) -> IntArray:
+        """(n, 3) indices of the cells that points lie in, or that are nearest to them."""
+        index = np.floor((points - self.lower) / self.size).astype(np.int64)
+        return np.clip(index, 0, self.counts - 1)
+
+    def beside(self, coordinates: IntArray, cells: BoolArray) -> BoolArray:
+        """(n,) whether points, by coordinates, are corners or centers of some of the cells
+        (counts)."""
+        padded = np.pad(cells, 1)
+        found = np.zeros(len(coordinates), np.bool_)
+        for ways in itertools.product((-1, 0), repeat=3):
+            # Of an odd coordinate both are the same cell.
+            index = (coordinates + ways) // 2 + 1
+            found |= padded[tuple(index.T)]
+        return found
 
     def outer_cells(self) -> IntArray:
         """(n, 3) indices of the cells at the box."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -20,10 +20,19 @@ from harnack.meshing.checks import MeshingError, TooLargeError, singular_vertice
 from harnack.meshing.edges import IntArray, lengths
 from harnack.meshing.isotopy import Isotopy, isotopy_of
 from harnack.meshing.lattice import Lattice, distinct_rows
-from harnack.meshing.marching_tetrahedra import Tetrahedra, crossings_of, is_cut, triangles_of
+from harnack.meshing.marching_tetrahedra import (
+    BEYOND,
+    Tetrahedra,
+    crossings_of,
+    is_cut,
+    triangles_of,
+)
 from harnack.meshing.points import Boundary, PointSet, newton
 from harnack.meshing.refinement import refined, smoothed, smoothed_within
 from harnack.meshing.samples import LevelFunction, Samples
+
+if TYPE_CHECKING:
+    from harnack.tree.cells import Clearance
 
 __all__ = [
     "MissedError",
@@ -57,6 +66,7 @@ def check_nothing_missed(
     surface: tuple[FloatArray, IntArray],
     size: float,
     box: tuple[FloatArray, FloatArray],
+    elsewhere: Clearance | None = None,
 ) -> None:
     """Raise if the level set has parts, two cells long or longer, away from its triangles: thin
     walls, knife edges, islands.
@@ -66,7 +76,8 @@ def check_nothing_missed(
     points are a dense sample, and no proof. Islands smaller than a cell may be missed.
 
     samples: at points (n, 3) of the lattice. is_beside: (n,) those of tetrahedra that are cut.
-    surface: vertices and faces. size: of a cell. box: where the level set counts.
+    surface: vertices and faces. size: of a cell. box: where the level set counts; elsewhere: and
+        how far around points it does not.
 
     Raises:
         MissedError: with one of the places.
@@ -89,6 +100,8 @@ def check_nothing_missed(
     if len(faces) and len(x):
         around = np.concatenate([vertices[np.unique(faces)], vertices[faces].mean(axis=1)])
         x = x[searching.cKDTree(around).query(x)[0] > _APART * size]
+    if elsewhere is not None and len(x):
+        x = x[elsewhere(x) <= 0]
     part = _longest_part(x, _TOGETHER * size)
     if len(part) and np.ptp(part, axis=0).max() >= _LONG * size:
         a, b, c = part[0]
@@ -159,6 +172,8 @@ def check_size(
 
 # Points this near to the level, in parts of the length of a cell, are moved onto it.
 _SNAPPED = 0.25
+# So many cells around what matters are made as if they did.
+_BORDER = 2.0
 _MOST_ROUNDS = 20
 
 
@@ -222,6 +237,7 @@ def closed_surface(
     report: Callable[[str], None],
     *,
     as_cut: bool = False,
+    elsewhere: Clearance | None = None,
 ) -> Surface:
     """The boundary of the points of a lattice's box where the function is negative.
 
@@ -233,12 +249,23 @@ def closed_surface(
     as_cut: leave the triangles as the cells cut them, which never pass through each other, and
         leave out what lies between points of the lattice: for functions with creases everywhere, as
         distances from meshes have, and cells of about the tolerance.
+    elsewhere: of points (k, 3), how far around them nothing matters; there, but for a few cells at
+        its border, the function counts as positive, and the surface is closed by coarse triangles.
 
     Raises:
         MeshingError: too many cells.
     """
-    cells = lattice.cells_not_empty(function.clearance, function.most_faces)
+    most, does_matter = function.most_faces, None
+    if elsewhere is None:
+        cells = lattice.cells_not_empty(function.clearance, most)
+    else:
+        far = _less_cells(elsewhere, _BORDER * float(lattice.size.max()))
+        cells, does_matter = lattice.cells_that_matter(
+            function.clearance, far, function.values, most
+        )
     outer = lattice.outer_cells()
+    if does_matter is not None:
+        outer = outer[does_matter[tuple(outer.T)]]
     outer = outer[function.values(lattice.points(2 * outer + 1)) <= 0]
     coordinates, corners = lattice.tetrahedra(distinct_rows(np.concatenate([cells, outer])))
     points = lattice.points(coordinates)
@@ -246,16 +273,23 @@ def closed_surface(
     is_wall = lattice.is_outer(coordinates)
     is_fixed = is_wall | ((coordinates == 1) | (coordinates == 2 * lattice.counts - 1)).any(axis=1)
     samples = _sampled(function, points)
-    first = _marched(function, points, samples, corners, is_fixed, is_wall, lattice, None)
+    is_beyond = np.zeros(len(points), np.bool_)
+    if does_matter is not None:
+        is_beyond = lattice.beside(coordinates, ~does_matter) & ~is_wall
+        samples = _beyond(samples, is_beyond)
+    first = _marched(
+        function, points, samples, corners, is_fixed | is_beyond, is_wall, lattice, None
+    )
     vertices, faces = first.vertices, first.faces
-    is_on_wall = np.zeros(len(vertices), np.bool_)
-    is_on_wall[: len(points)] = is_wall
-    is_cap = is_on_wall[faces].any(axis=1)
+    is_coarse = first.is_beside(is_wall | is_beyond)
+    is_cap = is_coarse[faces].any(axis=1)
     rest, caps = faces[~is_cap], [faces[is_cap], _wall_faces(points, samples, corners, is_wall)]
     inner = lattice.lower + 2 * lattice.size, lattice.upper - 2 * lattice.size
     if as_cut:
         return Surface.of(vertices, np.concatenate([rest, *caps]))
-    _check_nothing_missed(function, points, samples, corners, first, faces, lattice, inner)
+    _check_nothing_missed(
+        function, points, samples, corners, first, faces, lattice, inner, elsewhere
+    )
     # What ends at the outermost cells is moved and cut, its ends are not.
     if len(rest):
         check_size(function, vertices, rest, tolerance)
@@ -265,6 +299,7 @@ def closed_surface(
             function.level,
             function,
             lattice,
+            does_matter,
             most_faces=function.most_faces,
             uploads=function.uploads,
         )
@@ -272,6 +307,17 @@ def closed_surface(
         vertices = smoothed_within(inside, vertices, rest, None, tolerance)
     faces = np.concatenate([rest, *caps])
     return Surface.of(vertices, faces) if len(faces) else Surface(np.zeros((0, 3)), faces)
+
+
+def _less_cells(elsewhere: Clearance, length: float) -> Clearance:
+    return lambda points: elsewhere(points) - length
+
+
+def _beyond(samples: Samples, rows: BoolArray) -> Samples:
+    """With points that do not matter far on the positive side."""
+    value, gradient = samples.value.copy(), samples.gradient.copy()
+    value[rows], gradient[rows] = 10 * BEYOND, 1.0
+    return Samples(value, gradient, samples.reach)
 
 
 def _check_nothing_missed(
@@ -283,6 +329,7 @@ def _check_nothing_missed(
     faces: IntArray,
     lattice: Lattice,
     box: tuple[FloatArray, FloatArray],
+    elsewhere: Clearance | None = None,
 ) -> None:
     # Tetrahedra with corners on both sides; those with corners on the level may have no face.
     side = np.where(first.points.is_on, 0.0, np.sign(first.points.samples.value))[corners]
@@ -290,12 +337,13 @@ def _check_nothing_missed(
     is_beside[corners[(side.min(axis=1) < 0) & (side.max(axis=1) > 0)]] = True
     surface = first.vertices, faces
     size = float(lattice.size.max())
-    check_nothing_missed(function, points, samples, is_beside, surface, size, box)
+    check_nothing_missed(function, points, samples, is_beside, surface, size, box, elsewhere)
 
 
 @dataclass
 class _Inside(LevelFunction):
-    """A function that is on the level wherever it is within one and a half cells of the box.
+    """A function that is on the level wherever it is within one and a half cells of the box, or in
+    or beside cells that do not matter (counts).
 
     So nothing is cut there. Triangles that end in the outermost cells would be cut again and again:
     the edge they end with stays as it is, and their centers are no deeper than that.
@@ -303,6 +351,11 @@ class _Inside(LevelFunction):
 
     function: LevelFunction
     lattice: Lattice
+    does_matter: BoolArray | None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._is_deep = None if self.does_matter is None else self.lattice.deep(self.does_matter)
 
     def at(self, points: FloatArray) -> Samples:
         samples = self.function.at(points)
@@ -311,6 +364,8 @@ class _Inside(LevelFunction):
         is_inside = np.ones(len(points), np.bool_)
         for x, low, high in zip(points.T, lower, upper, strict=True):
             is_inside &= (x >= low) & (x <= high)
+        if self._is_deep is not None:
+            is_inside &= self._is_deep[tuple(self.lattice.cells_of(points).T)]
         return dataclasses.replace(samples, value=np.where(is_inside, samples.value, 0.0))
 
 
@@ -346,12 +401,18 @@ def _sampled(function: LevelFunction, points: FloatArray) -> Samples:
 @dataclass(frozen=True)
 class _First:
     """Vertices and faces before they are refined, the points of the tetrahedra, those near the
-    level moved onto it, and which tetrahedra (m,) hold points of the faces."""
+    level moved onto it, and which tetrahedra (m,) hold points of the faces; crossed: (k, 2) points
+    at the ends of the edges on which the other vertices lie."""
 
     vertices: FloatArray
     faces: IntArray
     points: PointSet
     is_cut: BoolArray
+    crossed: IntArray
+
+    def is_beside(self, chosen: BoolArray) -> BoolArray:
+        """Whether each vertex is one of the chosen points, or on an edge that ends there."""
+        return np.concatenate([chosen, chosen[self.crossed].any(axis=1)])
 
 
 def _marched(
@@ -371,25 +432,41 @@ def _marched(
     at_rest, original = points, samples
     points, samples, is_on = _snapped(function, points, samples, is_fixed, lattice, walls)
     is_on |= is_wall
-    wrong = np.zeros(0, np.int64)
+    wrong, beside, is_asked = np.zeros(0, np.int64), corners, np.ones(len(points), np.bool_)
     for _ in range(_MOST_ROUNDS):
-        rows, tets = _cut_tetrahedra(points, samples.value, is_on, corners)
+        # Where vertices lie on edges does not matter for what touches.
+        _, tets = _cut_tetrahedra(points, samples.value, is_on, beside)
         some = PointSet(points, is_on, samples)
         crossings = crossings_of(function, some, tets)
-        vertices, faces = triangles_of(function, some, tets, crossings)
+        _, faces = triangles_of(function, some, tets, crossings, _middles)
         wrong = singular_vertices(faces)
         wrong = wrong[wrong < len(points)]
-        wrong = wrong[~is_wall[wrong]]
+        wrong = wrong[(is_asked & ~is_wall)[wrong]]
         if not len(wrong):
-            cut: BoolArray = np.asarray(is_on[corners].any(axis=1))
-            cut[rows] |= is_cut(some, tets, crossings)
-            return _First(vertices, faces, some, cut)
+            break
         points, is_on = points.copy(), is_on.copy()
         points[wrong], is_on[wrong] = at_rest[wrong], False
         samples = samples.replaced(wrong, original.some(wrong))
-    raise MeshingError(
-        f"sheets of the level set touch at {len(wrong)} places: choose a smaller `spacing`"
-    )
+        # Only points beside these may touch anew: with all of their tetrahedra.
+        near, is_asked = np.zeros(len(points), np.bool_), np.zeros(len(points), np.bool_)
+        near[wrong] = True
+        is_asked[corners[near[corners].any(axis=1)]] = True
+        beside = corners[is_asked[corners].any(axis=1)]
+    else:
+        raise MeshingError(
+            f"sheets of the level set touch at {len(wrong)} places: choose a smaller `spacing`"
+        )
+    rows, tets = _cut_tetrahedra(points, samples.value, is_on, corners)
+    some = PointSet(points, is_on, samples)
+    crossings = crossings_of(function, some, tets)
+    vertices, faces = triangles_of(function, some, tets, crossings)
+    cut: BoolArray = np.asarray(is_on[corners].any(axis=1))
+    cut[rows] |= is_cut(some, tets, crossings)
+    return _First(vertices, faces, some, cut, tets.ends[np.flatnonzero(crossings.count)])
+
+
+def _middles(low: FloatArray, high: FloatArray) -> FloatArray:
+    return 0.5 * (low + high)
 
 
 def _snapped(

@@ -29,6 +29,7 @@ from harnack.meshing.points import PointSet
 from harnack.meshing.samples import LevelFunction
 
 __all__ = [
+    "BEYOND",
     "Crossings",
     "Roots",
     "Tetrahedra",
@@ -39,6 +40,11 @@ __all__ = [
 ]
 
 _PAIRS = tuple(itertools.combinations(range(4), 2))
+# Values this large are none: where the other end has one, the edge is crossed in its middle.
+BEYOND = 1e299
+# Of places where edges meet the level, as a part of the edge; and what secants leave at its ends,
+# so that triangles have an area.
+_ROOT_ERROR, _FROM_ENDS = 1e-10, 1e-4
 
 
 @dataclass(frozen=True)
@@ -171,7 +177,8 @@ def triangles_of(
     roots_of: Roots | None = None,
 ) -> tuple[FloatArray, IntArray]:
     """Vertices (n, 3) and faces (m, 3), counter-clockwise as seen from where the function is
-    greater. The first vertices are `points`, whether they are in use or not.
+    greater. The first vertices are `points`, whether they are in use or not; then comes one for
+    each edge that is crossed, in their order.
 
     roots_of: where edges meet the level of a real-valued function; None for a search along them.
 
@@ -190,8 +197,7 @@ def triangles_of(
             _mean(points.points, tets.corners[double]),
         )
     cut = np.flatnonzero(~on.all(axis=1) & (most > least))
-    edges = np.unique(tets.edges[cut])
-    edges = edges[crossings.count[edges] != 0]
+    edges = np.flatnonzero(crossings.count)
     if roots_of is None:
         roots = _roots(function, points, tets, crossings, edges)
     else:
@@ -305,13 +311,52 @@ def _roots(
             return found
         return found + function.period * np.rint((start + 0.5 * rise - found) / function.period)
 
+    if function.secants:
+        return p + _secants(function, p, way, value, value + change)[:, None] * way
+    known = np.flatnonzero(np.maximum(np.abs(value), np.abs(value + change)) < BEYOND)
+    share = np.full(len(a), 0.5)
+    share[known] = _searched(function, p[known], way[known], value[known], change[known], lifted)
+    return p + share[:, None] * way
+
+
+def _secants(
+    function: LevelFunction, p: FloatArray, way: FloatArray, low: FloatArray, high: FloatArray
+) -> FloatArray:
+    """(r,) places along edges by a few secants, given the values at both ends; the end that stays
+    counts half from the second time on (the Illinois method)."""
+    first, last = np.zeros(len(p)), np.ones(len(p))
+    up = high > low
+    low, high = np.where(up, low, -low), np.where(up, high, -high)
+    stayed = np.zeros(len(p), np.int64)
+    share = low / (low - high)
+    for _ in range(function.secants):
+        value = function.values(p + share[:, None] * way)
+        value = np.where(up, value, -value)
+        above = value > 0
+        stayed = np.where(above, np.maximum(stayed, 0) + 1, np.minimum(stayed, 0) - 1)
+        low = np.where(above, np.where(stayed > 1, 0.5 * low, low), value)
+        high = np.where(above, value, np.where(stayed < -1, 0.5 * high, high))
+        first, last = np.where(above, first, share), np.where(above, share, last)
+        share = first + (last - first) * low / np.minimum(low - high, -1e-300)
+    return np.clip(share, _FROM_ENDS, 1 - _FROM_ENDS)
+
+
+def _searched(
+    function: LevelFunction,
+    p: FloatArray,
+    way: FloatArray,
+    value: FloatArray,
+    change: FloatArray,
+    lifted: Callable[..., FloatArray],
+) -> FloatArray:
+    """(r,) places along edges by Chandrupatla's method."""
     import scipy.optimize.elementwise as elementwise  # here: half a second that few need
 
     search = cast("Any", elementwise).find_root
     arguments = (*p.T, *way.T, value, change)
     result = search(
-        lifted, (np.zeros(len(a)), np.ones(len(a))), args=arguments,
-        tolerances={"xatol": function.root_error, "fatol": 0.0, "xrtol": 0.0, "frtol": 0.0},
+        lifted, (np.zeros(len(p)), np.ones(len(p))), args=arguments,
+        tolerances={"xatol": _ROOT_ERROR, "fatol": 0.0, "xrtol": 0.0, "frtol": 0.0},
         maxiter=60,
     )  # fmt: skip
     if not bool(np.all(result.success)):
@@ -319,8 +364,7 @@ def _roots(
             f"{int((~result.success).sum())} crossings of edges were not found: the function may "
             "not be continuous there; choose another level"
         )
-    share = np.array(result.x, np.float64)
-    return p + share[:, None] * way
+    return np.array(result.x, np.float64)
 
 
 def _faces_on_the_level(

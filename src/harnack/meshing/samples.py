@@ -80,14 +80,15 @@ class LevelFunction:
 
     most_faces: no more triangles may be made of it.
     evaluations: of f so far, in points. uploads: of fields, which functions share.
-    root_error: of places where edges of cells meet the level, as a part of the edge.
+    secants: how many find where an edge of a cell meets the level, of functions that are nearly
+        linear along edges, as distances are; 0 for a search.
     """
 
     field: Field
     level: float
     most_faces: int = dataclasses.field(default=MOST_FACES, kw_only=True)
     uploads: Uploads = dataclasses.field(default_factory=Uploads, kw_only=True)
-    root_error: float = dataclasses.field(default=1e-10, kw_only=True)
+    secants: int = dataclasses.field(default=0, kw_only=True)
     evaluations: int = dataclasses.field(default=0, init=False)
 
     def __post_init__(self) -> None:

@@ -14,7 +14,7 @@ import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import numpy as np
 
@@ -30,7 +30,7 @@ from harnack.fields.solids.region import solid as solid_of
 from harnack.fields.solids.swept import Extruded, Revolved
 from harnack.fields.solids.thread import Thread
 from harnack.geometry import Ball, Box, Intersection, Volume
-from harnack.meshing.checks import LocalError, MeshingError, intersecting_faces
+from harnack.meshing.checks import CrossingError, LocalError, MeshingError, intersecting_faces
 from harnack.meshing.closed_mesh import (
     box_manifold,
     extruded_manifold,
@@ -48,6 +48,8 @@ from harnack.meshing.thread_mesh import thread_manifold
 if TYPE_CHECKING:
     from manifold3d import Manifold
 
+    from harnack.tree.cells import Clearance
+
 __all__ = [
     "AngleMesher",
     "RegionMesher",
@@ -58,13 +60,30 @@ __all__ = [
     "region_of",
 ]
 
-# Cells of offsets of meshes, in tolerances; and the error of roots on their edges.
-_CELLS_OF_OFFSET, _ROOT_ERROR = 5.0, 1e-3
+# Cells of offsets of meshes, in tolerances; and how many secants find roots on their edges.
+_CELLS_OF_OFFSET, _SECANTS = 6.0, 2
+# Where other parts leave nothing is looked for in lattices of more cells than this.
+_MANY_CELLS = 100_000
 # How far joining their triangles may move them, in tolerances: the first that does no harm.
 _JOINED_WITHIN = (0.5, 0.25, 0.1)
 
 # Meshes the level set of an angle, which ends at its curve: field, level -> vertices and faces.
 AngleMesher = Callable[[SolidAngle, float], Surface]
+
+
+Others: TypeAlias = tuple[tuple[Solid, float], ...]
+"""Solids and their levels: what is meshed is intersected with all of them, so that it need not be
+made where one of them is proved to have nothing.
+
+Proof that parts of a tree of unions, intersections and complements may be left out there. Inside
+of a complement, only parts that are not one are taken, of the intersection that the complement is
+itself a part of; elsewhere those of all intersections above. First let nothing be left out within
+complements. Then all that is made of a tree is a part of the truth, since unions and intersections
+grow with their parts. If something is left out at a point, some part of an intersection above has
+nothing there in truth, so neither has what is made of it, nor the intersection: which is the truth.
+Now let something be left out within complements. At such a point a part of the intersection that
+the complement is in, without complements within, has nothing there, and as before what is made of
+it is a part of the truth: again the intersection is the truth."""
 
 
 @dataclass
@@ -77,6 +96,7 @@ class RegionMesher:
     evaluations, levels, finest: of fields, in points, how many level sets were meshed so far, and
         the smallest spacing of these.
     uploads: of the fields that were meshed so far.
+    others: parts that everything meshed next is intersected with (see `Others`).
     """
 
     lower: FloatArray
@@ -91,6 +111,7 @@ class RegionMesher:
     levels: int = 0
     finest: float = math.inf
     uploads: Uploads = dataclasses.field(default_factory=Uploads)
+    others: Others = ()
 
     def below(self, solid: Solid, level: float) -> Manifold:
         """The points of the box where a solid's function is at most `level`; what there is outside
@@ -102,7 +123,7 @@ class RegionMesher:
         from manifold3d import Manifold, OpType
 
         if isinstance(solid, Combined):
-            parts = [self.below(one, level) for one in solid.parts]
+            parts = [self._part(solid, k, level) for k in range(len(solid.parts))]
             how = OpType.Add if solid.is_union else OpType.Intersect
             return Manifold.batch_boolean(parts, how)
         if isinstance(solid, Complement):  # -f <= c where f >= -c
@@ -134,6 +155,38 @@ class RegionMesher:
             return self._space().trim_by_plane((-x, -y, -z), -(solid.distance + level))
         return manifold_of(self.smooth(solid, level)[0])
 
+    def _part(self, solid: Combined, number: int, level: float) -> Manifold:
+        """One part of a union or an intersection, made where the others of an intersection may
+        leave something of it (`Others`)."""
+        kept, part = self.others, solid.parts[number]
+        if not solid.is_union:
+            beside = [one for one in solid.parts if one is not part]
+            if isinstance(part, Complement):
+                self.others = tuple((one, level) for one in beside if _is_exact(one))
+            else:
+                self.others = (*kept, *((one, level) for one in beside))
+        try:
+            return self.below(part, level)
+        finally:
+            self.others = kept
+
+    def _elsewhere(self, lattice: Lattice) -> Clearance | None:
+        """How far around points the other parts leave nothing, by proof; None if nothing is to be
+        gained by it."""
+        if not self.others or math.prod(lattice.counts.tolist()) < _MANY_CELLS:
+            return None
+        functions = [self._function(one, level) for one, level in self.others]
+
+        def clearance(points: FloatArray) -> FloatArray:
+            found = np.zeros(len(points))
+            for one in functions:
+                rows = np.flatnonzero(found == 0)
+                outside = rows[one.values(points[rows]) > 0]
+                found[outside] = one.clearance(points[outside])
+            return found
+
+        return clearance
+
     def smooth(self, field: Field, level: float) -> tuple[Surface, bool]:
         """The boundary of {f <= level} as one level set, and whether it is all of it: if not, it is
         closed outside of the box in a way that has no meaning."""
@@ -154,7 +207,9 @@ class RegionMesher:
         function = self._function(_entire(field), level)
         self.report(f"level {level:g} of {type(field).__name__} in cells of {spacing:.3g}")
         lattice = Lattice.filling(lower, upper, spacing, layers=2)
-        made = closed_surface(function, lattice, self.tolerance, self.report)
+        made = closed_surface(
+            function, lattice, self.tolerance, self.report, elsewhere=self._elsewhere(lattice)
+        )
         self.evaluations += function.evaluations
         self.levels += 1
         return made, is_whole
@@ -234,7 +289,7 @@ class RegionMesher:
             return manifold_of(Surface(np.zeros((0, 3)), np.zeros((0, 3), np.int64)))
         cells = min(self.spacing, _CELLS_OF_OFFSET * self.tolerance)
         self.finest = min(self.finest, cells)
-        function = dataclasses.replace(self._function(solid, level), root_error=_ROOT_ERROR)
+        function = dataclasses.replace(self._function(solid, level), secants=_SECANTS)
         self.report(f"level {level:g} of a mesh in cells of {cells:.3g}")
         lattice = Lattice.filling(lower - cells, upper + cells, cells, layers=2)
         made = manifold_of(
@@ -258,13 +313,22 @@ class RegionMesher:
         local = dataclasses.replace(
             self, lower=own.min(axis=0), upper=own.max(axis=0), tolerance=self.tolerance / scale,
             spacing=self.spacing / scale, evaluations=0, levels=0,
-            finest=math.inf,
+            finest=math.inf, others=(),
         )  # fmt: skip
         made = local.below(solid.inner, level / solid.map.factor)
         self.evaluations += local.evaluations
         self.levels += local.levels
         self.finest = min(self.finest, local.finest * scale)
         return made.transform(np.column_stack([matrix, offset]))
+
+
+def _is_exact(solid: Solid) -> bool:
+    """Whether there is no complement within a solid, as it is meshed."""
+    if isinstance(solid, Combined):
+        return all(_is_exact(one) for one in solid.parts)
+    if isinstance(solid, AffineImage | Offset):
+        return _is_exact(solid.inner)
+    return not isinstance(solid, Complement | Near)
 
 
 def is_smooth(solid: Solid) -> bool:
@@ -346,6 +410,9 @@ _ACROSS = 24
 # How many sizes of cells are tried, and what each is of the one before.
 _MOST_ATTEMPTS = 3
 _SMALLER = 0.6
+# Where parts were cut by each other, slivers may pass through their neighbors by rounding: what may
+# be moved to leave them out, in tolerances, in the order in which it is tried.
+_SLIVERS_WITHIN = (1e-2, 1e-4, 0.0)
 # Room around what has an extent, as a part of its size.
 _MARGIN = 0.01
 
@@ -439,10 +506,7 @@ def mesh_solid(
             uploads=uploads,
         )  # fmt: skip
         try:
-            made = _put_together(mesher, solid, level, volume)
-            if not len(made.faces):
-                raise MeshingError("the solid is empty: no point of the box is inside")
-            check(made, size)
+            made = _checked(_put_together(mesher, solid, level, volume), error, size, check)
             break
         except (MissedError, LocalError) as wrong:
             attempts -= 1
@@ -456,9 +520,47 @@ def mesh_solid(
     return SolidMesh(made, min(cells, mesher.finest), mesher.evaluations, mesher.levels, size)
 
 
+def _checked(
+    parts: Surface | _Joined,
+    tolerance: float,
+    size: float,
+    check: Callable[[Surface, float], None],
+) -> Surface:
+    """The surface that passes the check; of parts put together without slivers.
+
+    Raises:
+        MeshingError: it is empty; as the check does.
+    """
+    raised: CrossingError | None = None
+    for share in _SLIVERS_WITHIN if isinstance(parts, _Joined) else (0.0,):
+        one = parts.without_slivers(share * tolerance) if isinstance(parts, _Joined) else parts
+        if not len(one.faces):
+            raise MeshingError("the solid is empty: no point of the box is inside")
+        try:
+            check(one, size)
+        except CrossingError as error:
+            raised = error
+        else:
+            return one
+    raise cast("CrossingError", raised)
+
+
+@dataclass(frozen=True)
+class _Joined:
+    """Parts put together, in a volume."""
+
+    whole: Manifold
+    volume: Volume
+
+    def without_slivers(self, length: float) -> Surface:
+        """The surface, short edges and slivers left out within a length."""
+        made = self.whole.simplify(length) if length > 0 else self.whole
+        return _on_box(surface_of(made), self.volume)
+
+
 def _put_together(
     mesher: RegionMesher, solid: Solid, level: float, volume: Volume | None
-) -> Surface:
+) -> Surface | _Joined:
     """The boundary of the solid in the volume."""
     if volume is None and is_smooth(solid):
         return mesher.smooth(solid, level)[0]
@@ -468,7 +570,7 @@ def _put_together(
     if volume is None:
         volume = Box(_point(lower), _point(upper))
     cut = volume_manifold(volume, lower, upper, mesher.tolerance)
-    return _on_box(surface_of(whole ^ cut), volume)
+    return _Joined(whole ^ cut, volume)
 
 
 def _bounds(solid: Solid, level: float, volume: Volume | None) -> tuple[FloatArray, FloatArray]:

@@ -71,7 +71,8 @@ def solid_of_mesh(given: Any) -> MeshSolid:
         surface = read_surface(cast("Any", given), "winding")
         if not isinstance(surface, Mesh):
             raise MeshError(f"{given}: it holds no faces, so it bounds no solid")
-        return MeshSolid(surface.vertices, surface.faces)
+        faces = np.concatenate([surface.faces, surface.flat])
+        return MeshSolid(surface.vertices, faces)
     mesh: Any = given
     if hasattr(mesh, "vertices") and hasattr(mesh, "faces"):
         return MeshSolid(mesh.vertices, mesh.faces)

@@ -1,0 +1,302 @@
+"""What a slicer would complain of in a mesh, and where."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, cast
+
+import numpy as np
+
+from harnack.backend import FloatArray
+from harnack.fields.solids.mesh_solid import MeshSolid
+from harnack.files.surfaces import Mesh, read_surface
+from harnack.geometry import MeshError, validate_mesh, zero_area_faces
+from harnack.geometry.chains import weld_vertices
+from harnack.meshing.checks import intersecting_faces, singular_vertices
+from harnack.meshing.edges import Edges, IntArray, directed_edges
+from harnack.meshing.thickness import check_length, thickness
+
+__all__ = ["PrintCheck", "PrintProblem", "check_print"]
+
+# A part is tiny if it is no longer than this part of the whole.
+_TINY = 0.01
+# Sizes in millimeters beyond which another unit is likely.
+_SMALLEST, _LARGEST = 1.0, 2000.0
+_INCH = 25.4
+
+
+@dataclass(frozen=True, eq=False)
+class PrintProblem:
+    """kind: its name, such as "open edges". count: how many there are. where: (k, 3) places of
+    some or all. message: all of it in a sentence. is_fatal: whether it is wrong, and no hint."""
+
+    kind: str
+    count: int
+    where: FloatArray
+    message: str
+    is_fatal: bool = True
+
+
+@dataclass(frozen=True)
+class PrintCheck:
+    """problems: what was found, the worst first. size: (x, y, z). volume: None if the mesh is not
+    closed. triangles: how many there are. parts: that do not touch each other."""
+
+    problems: tuple[PrintProblem, ...]
+    size: tuple[float, float, float]
+    volume: float | None
+    triangles: int
+    parts: int
+
+    @property
+    def is_fine(self) -> bool:
+        """Whether nothing is wrong; hints may be left."""
+        return not _is_wrong(self.problems)
+
+    def as_dict(self, most_places: int = 10) -> dict[str, Any]:
+        """Of plain numbers and texts, as JSON holds them."""
+        return {
+            "fine": self.is_fine,
+            "size": list(self.size),
+            "volume": self.volume,
+            "triangles": self.triangles,
+            "parts": self.parts,
+            "problems": [
+                {
+                    "kind": one.kind,
+                    "count": one.count,
+                    "fatal": one.is_fatal,
+                    "message": one.message,
+                    "where": one.where[:most_places].tolist(),
+                }
+                for one in self.problems
+            ],
+        }
+
+
+def check_print(part: Any, *, wall: float | None = None, bed: Any = None) -> PrintCheck:
+    """What a slicer would complain of in a mesh, and where.
+
+    Wrong are: open edges, edges of more than two faces, neighbors that do not agree on their two
+    sides, parts that are inside out, vertices where sheets touch, triangles that pass through each
+    other or lie on each other (decided exactly), faces that are there twice; walls thinner than
+    asked; what does not fit on the bed. Hints are: faces without an area, several parts, tiny ones,
+    cavities without a way out (for powder and resin), and a size that looks like inches or meters.
+
+    part: a trimesh.Trimesh, (vertices, faces), or the name of a file. Vertices at the same place
+        are one.
+    wall: the least thickness that is fine, a length (see `thickness`); None to leave it out.
+    bed: (x, y, z), the size that fits, turned by right angles about z; None to leave it out.
+
+    Raises:
+        MeshError: no mesh. FileFormatError: a file that cannot be read. ValueError: a wall or a bed
+            that is no length.
+    """
+    if wall is not None:
+        wall = check_length(wall, "wall")
+    sides = None if bed is None else [check_length(one, "bed") for one in bed]
+    if sides is not None and len(sides) != 3:
+        raise ValueError(f"bed must be (x, y, z), three lengths, not {bed!r}")
+    x, faces = _mesh_of(part)
+    found = _topology(x, faces)
+    is_closed = not _is_wrong(found)
+    pieces = _parts(faces)
+    volumes = _volumes(x, faces, pieces)
+    found += _of_parts(x, faces, pieces, volumes, is_closed)
+    found += _crossings(x, faces)
+    if wall is not None:
+        found.append(_thin(x, faces, wall, not _is_wrong(found)))
+    low, high = x[faces].min(axis=(0, 1)), x[faces].max(axis=(0, 1))
+    size = cast("tuple[float, float, float]", tuple((high - low).tolist()))
+    found += _of_size(size, sides)
+    kept = sorted((one for one in found if one.count), key=lambda one: not one.is_fatal)
+    volume = float(volumes.sum()) if is_closed else None
+    return PrintCheck(tuple(kept), size, volume, len(faces), len(volumes))
+
+
+def _is_wrong(problems: Sequence[PrintProblem]) -> bool:
+    return any(one.is_fatal and one.count for one in problems)
+
+
+def _mesh_of(part: Any) -> tuple[FloatArray, IntArray]:
+    """Vertices, those at one place joined, and faces, with those of zero area."""
+    if isinstance(part, str | os.PathLike):
+        read = read_surface(cast("Any", part), "winding")
+        if not isinstance(read, Mesh):
+            raise MeshError(f"{part}: it holds no faces, so there is nothing to print")
+        x, faces = read.vertices, np.concatenate([read.faces, read.flat])
+    else:
+        pair = (part.vertices, part.faces) if hasattr(part, "faces") else part
+        try:
+            vertices, given = pair
+        except (TypeError, ValueError):
+            raise TypeError(
+                "a mesh is a trimesh.Trimesh, a pair (vertices, faces), or the path of a file, not "
+                f"of type {type(part).__name__}"
+            ) from None
+        x, faces = validate_mesh(vertices, given, flat=True)
+    return x, weld_vertices(x)[faces]
+
+
+def _problem(kind: str, where: FloatArray, text: str, *, is_fatal: bool = True) -> PrintProblem:
+    """text: with {} for the number."""
+    near = "" if not len(where) else f", such as at {_point(where[0])}"
+    return PrintProblem(kind, len(where), where, text.format(f"{len(where):,}") + near, is_fatal)
+
+
+def _point(x: FloatArray) -> str:
+    return "(" + ", ".join(f"{c:.4g}" for c in x) + ")"
+
+
+def _topology(x: FloatArray, faces: IntArray) -> list[PrintProblem]:
+    """Edges, sides, duplicates and faces without an area."""
+    flat = zero_area_faces(x, faces)
+    vanished = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
+    kept = faces[~vanished]
+    pairs = directed_edges(kept)
+    edges = Edges.of(pairs)
+    middle = x[edges.ends].mean(axis=1)
+    ways = np.bincount(
+        edges.index, np.where(pairs[:, 0] < pairs[:, 1], 1, -1), minlength=len(edges.uses)
+    )
+    _, first, uses = np.unique(np.sort(kept, axis=1), axis=0, return_index=True, return_counts=True)
+    touching = singular_vertices(kept)
+    many = np.unique(edges.ends[edges.uses > 2])
+    return [
+        _problem("open edges", middle[edges.uses == 1], "{} edges have one face alone"),
+        _problem(
+            "edges of many faces", middle[edges.uses > 2], "{} edges have more than two faces"
+        ),
+        _problem(
+            "sides that disagree",
+            middle[(edges.uses == 2) & (ways != 0)],
+            "at {} edges neighboring faces do not agree on what is inside",
+        ),
+        _problem(
+            "duplicate faces", x[kept[first[uses > 1]]].mean(axis=1), "{} faces are there twice"
+        ),
+        _problem(
+            "touching vertices",
+            x[np.setdiff1d(touching, many)],
+            "at {} vertices parts touch in a point",
+        ),
+        _problem(
+            "faces without area",
+            x[faces[flat]].mean(axis=1),
+            "{} faces have no area",
+            is_fatal=False,
+        ),
+    ]
+
+
+def _parts(faces: IntArray) -> IntArray:
+    """(m,) which part each face belongs to, of those joined by vertices."""
+    import scipy.sparse  # here: half a second that few need
+    import scipy.sparse.csgraph as csgraph_module
+
+    sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
+    n = int(faces.max()) + 1
+    pairs = directed_edges(faces)
+    graph = sparse.coo_matrix((np.ones(len(pairs)), tuple(pairs.T)), shape=(n, n))
+    _, label = csgraph.connected_components(graph, directed=False)
+    return np.unique(label[faces[:, 0]], return_inverse=True)[1]
+
+
+def _volumes(x: FloatArray, faces: IntArray, pieces: IntArray) -> FloatArray:
+    """(k,) signed volumes of parts."""
+    corner = x[faces] - x[faces].mean(axis=(0, 1))
+    found: FloatArray = np.bincount(pieces, np.linalg.det(corner) / 6).astype(np.float64)
+    return found
+
+
+def _of_parts(
+    x: FloatArray, faces: IntArray, pieces: IntArray, volumes: FloatArray, is_closed: bool
+) -> list[PrintProblem]:
+    """Inside out, cavities, loose and tiny parts."""
+    count = len(volumes)
+    low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
+    for k in range(3):
+        np.minimum.at(low, pieces, x[faces[:, k]])
+        np.maximum.at(high, pieces, x[faces[:, k]])
+    middle, length = 0.5 * (low + high), (high - low).max(axis=1)
+    is_hollow = np.zeros(count, np.bool_)
+    for k in np.flatnonzero(volumes < 0) if is_closed else ():
+        point = x[faces[np.argmax(pieces == k), 0]]
+        around = [j for j in np.flatnonzero(volumes > 0) if _winds(point, x, faces[pieces == j])]
+        is_hollow[k] = bool(around)
+    inside_out = (volumes < 0) & ~is_hollow if is_closed else np.zeros(count, np.bool_)
+    is_tiny = (length < _TINY * length.max()) & ~is_hollow
+    loose = middle[~is_hollow]
+    return [
+        _problem(
+            "inside out", middle[inside_out], "{} parts are inside out: their faces look inward"
+        ),
+        _problem(
+            "cavities",
+            middle[is_hollow],
+            "{} cavities have no way out, for powder or resin",
+            is_fatal=False,
+        ),
+        _problem("tiny parts", middle[is_tiny], "{} parts are tiny", is_fatal=False),
+        _problem(
+            "loose parts",
+            loose if len(loose) > 1 else loose[:0],
+            "there are {} parts that do not touch",
+            is_fatal=False,
+        ),
+    ]
+
+
+def _winds(point: FloatArray, x: FloatArray, faces: IntArray) -> bool:
+    """Whether closed faces wind around a point: by the sum of their solid angles (van Oosterom and
+    Strackee 1983)."""
+    a, b, c = (x[faces[:, k]] - point for k in range(3))
+    na, nb, nc = (np.linalg.norm(one, axis=1) for one in (a, b, c))
+    top = (a * np.cross(b, c)).sum(axis=1)
+    bottom = na * nb * nc + (a * b).sum(axis=1) * nc + (b * c).sum(axis=1) * na
+    bottom += (c * a).sum(axis=1) * nb
+    return bool(abs(2 * np.arctan2(top, bottom).sum()) > 2 * np.pi)
+
+
+def _crossings(x: FloatArray, faces: IntArray) -> list[PrintProblem]:
+    kept = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
+    kept = np.unique(np.sort(kept, axis=1), axis=0)  # duplicates have been counted
+    crossing = intersecting_faces(x, kept)
+    places = x[kept[crossing]].mean(axis=1)
+    return [_problem("crossing faces", places, "{} triangles pass through or lie on others")]
+
+
+def _thin(x: FloatArray, faces: IntArray, wall: float, is_solid: bool) -> PrintProblem:
+    if not is_solid:
+        return PrintProblem(
+            "thin walls", 1, np.zeros((0, 3)),
+            "how thick walls are is not known before the rest is mended",
+        )  # fmt: skip
+    found = thickness(MeshSolid(x, faces))
+    places = found.where(wall)
+    least = f"; the thinnest is {found.thinnest:.3g}"
+    text = f"at {{}} triangles the part is thinner than {wall:g}{least}"
+    return _problem("thin walls", places, text)
+
+
+def _of_size(size: tuple[float, float, float], bed: list[float] | None) -> list[PrintProblem]:
+    longest, nowhere = max(size), np.zeros((0, 3))
+    text = " x ".join(f"{one:.4g}" for one in size)
+    found: list[PrintProblem] = []
+    if longest < _SMALLEST or longest > _LARGEST:
+        why = f"it is {text} mm, if files are in millimeters"
+        if longest < _SMALLEST:
+            why += f"; in meters {longest * 1000:.4g}, in inches {longest * _INCH:.4g} mm long"
+        found.append(PrintProblem("unit", 1, nowhere, why, is_fatal=False))
+    elif longest < 10 * _SMALLEST:
+        why = f"it is {text} mm; if that is meant in inches, scale it by 25.4"
+        found.append(PrintProblem("unit", 1, nowhere, why, is_fatal=False))
+    if bed is not None:
+        x, y, z = size
+        fits = z <= bed[2] and ((x <= bed[0] and y <= bed[1]) or (y <= bed[0] and x <= bed[1]))
+        if not fits:
+            space = " x ".join(f"{one:g}" for one in bed)
+            found.append(PrintProblem("bed", 1, nowhere, f"{text} does not fit on {space}"))
+    return found

@@ -1,0 +1,156 @@
+"""Thickness of closed meshes: how much material is behind each face."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from harnack.backend import BoolArray, FloatArray, choose_backend, to_numpy, to_vector3
+from harnack.backend.numbers import real
+from harnack.fields import Solid
+from harnack.fields.solids.mesh_solid import MeshSolid, solid_of_mesh
+from harnack.meshing.edges import IntArray, dots, lengths
+from harnack.meshing.mesh import mesh
+from harnack.tracer import trace
+
+if TYPE_CHECKING:
+    import trimesh
+
+__all__ = ["Thickness", "thickness"]
+
+# Rays start this far below a face, in parts of the mesh's size.
+_BELOW = 1e-6
+# Balls shrink so often at most, and no more once they are this near to what they touch.
+_MOST_ROUNDS, _TOUCHING = 30, 1e-6
+# Two places are opposite if the cosine between their normals is below this: walls beside an edge of
+# a part, at up to 120 degrees, are no thin places.
+_OPPOSITE = -0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Thickness:
+    """What `thickness` found.
+
+    vertices: (n, 3) and faces: (m, 3), of the mesh.
+    values: (m,) thickness at the centers of faces, a length; nan for faces without an area.
+    """
+
+    vertices: FloatArray
+    faces: IntArray
+    values: FloatArray
+
+    @property
+    def thinnest(self) -> float:
+        """The least of the values."""
+        return float(np.nanmin(self.values))
+
+    def where(self, less_than: float) -> FloatArray:
+        """Centers (k, 3) of the faces at which the part is thinner, the thinnest first."""
+        rows = np.flatnonzero(self.is_thinner(less_than))
+        rows = rows[np.argsort(self.values[rows])]
+        return self.vertices[self.faces[rows]].mean(axis=1)
+
+    def is_thinner(self, than: float) -> BoolArray:
+        """(m,) faces at which the part is thinner."""
+        return np.asarray(np.nan_to_num(self.values, nan=np.inf) < than)
+
+    def colored(self, low: float, high: float) -> trimesh.Trimesh:
+        """The mesh with colors of faces: red up to `low`, through yellow, to gray from `high` on.
+        PLY and GLB files hold them."""
+        import trimesh  # here: half a second that few need
+
+        share = np.clip((self.values - low) / max(high - low, 1e-300), 0.0, 1.0)
+        share = np.nan_to_num(share, nan=1.0)
+        stops = np.array([[200, 30, 30], [240, 200, 60], [190, 190, 190]], np.float64)
+        colors = np.full((len(share), 4), 255, np.uint8)
+        for k in range(3):
+            colors[:, k] = np.rint(np.interp(share, (0.0, 0.5, 1.0), stops[:, k]))
+        return trimesh.Trimesh(
+            self.vertices, self.faces, face_colors=colors, process=False, validate=False
+        )
+
+
+def thickness(part: Any, **options: Any) -> Thickness:
+    """How thick a part is behind each of its faces.
+
+    At the center of a face a ray goes into the part, along the normal, and ends at the other side:
+    at a distance t. Then the ball that touches the center, t wide, shrinks until it holds no place
+    of the surface that faces the center (normals more than 120 degrees apart): to the ball that
+    touches the nearest such place as well, again and again (Ma, Bae and Choi 2012, 3D medial axis
+    point approximation using nearest neighbors and the normal field). Its diameter is the
+    thickness. Where walls are parallel it is their distance, and it is never more than the length
+    of the ray. Places beside the edges of a part, where the nearest wall is no opposite one, are
+    not thin by that: there the ball shrinks no further, so that the value is an upper bound.
+
+    Error: rays and nearest points are exact on the triangles, in double precision, to 1e-6 of the
+    mesh's size. Between centers nothing is looked at; make large faces smaller for that
+    (`mesh.subdivide_to_size`).
+
+    part: a closed mesh (a trimesh.Trimesh, (vertices, faces), or a file's name), or a solid, of
+        which a mesh is made.
+    options: of `mesh`, for a solid.
+
+    Raises:
+        MeshError: a mesh that bounds no solid. MeshingError: a solid that cannot be meshed.
+    """
+    if isinstance(part, Solid) and not isinstance(part, MeshSolid):
+        part = mesh(part, **options)
+    elif options:
+        raise TypeError(f"{next(iter(options))} is for solids: a mesh is taken as it is")
+    solid = part if isinstance(part, MeshSolid) else solid_of_mesh(part)
+    x, faces = np.asarray(solid.vertices), np.asarray(solid.faces)
+    corner = x[faces]
+    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    length = lengths(normal)
+    rows = np.flatnonzero(length > 0)
+    values = np.full(len(faces), np.nan)
+    values[rows] = _behind(solid, corner[rows].mean(axis=1), normal[rows] / length[rows, None])
+    return Thickness(x, faces, values)
+
+
+def _behind(solid: MeshSolid, start: FloatArray, normal: FloatArray) -> FloatArray:
+    """(k,) thickness at points of the surface with normals (k, 3)."""
+    size = solid.surface.size
+    below = _BELOW * size
+    hits: Any = trace(
+        solid, start - below * normal, -normal, t_min=below, tolerance=1e-6, precision="double"
+    )
+    t = np.asarray(hits.t, np.float64) + below
+    width = np.where(np.isfinite(t), t, 2 * size)
+    moving = np.arange(len(width))
+    for _ in range(_MOST_ROUNDS):
+        if not len(moving):
+            break
+        p, n, r = start[moving], normal[moving], 0.5 * width[moving]
+        center = p - r[:, None] * n
+        distance, foot, towards = _nearest(solid, center)
+        # The ball is free, or touches what does not face the center.
+        inside = distance < r * (1 - _TOUCHING)
+        shrinks = inside & (dots(towards, n) < _OPPOSITE)
+        away = p - foot
+        along = dots(away, n)
+        shrinks &= along > 0
+        smaller = dots(away, away)[shrinks] / (2 * along[shrinks])
+        width[moving[shrinks]] = np.minimum(width[moving[shrinks]], 2 * smaller)
+        moving = moving[shrinks]
+    return width
+
+
+def _nearest(solid: MeshSolid, points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Distances (k,) to the surface from points within, the nearest points (k, 3), and the
+    directions towards them (k, 3)."""
+    backend = choose_backend("double")
+    sample = solid.prepare(backend).evaluate(to_vector3(backend, points))
+    value, gradient = to_numpy(sample.value), to_numpy(sample.gradient)
+    distance = np.abs(value)
+    return distance, points - value[:, None] * gradient, gradient
+
+
+def check_length(value: Any, name: str) -> float:
+    """A positive length; raises ValueError or TypeError."""
+    length = real(value, name)
+    if not 0 < length < np.inf:
+        raise ValueError(f"{name} must be a positive length, not {value!r}")
+    return length

@@ -1,0 +1,158 @@
+"""What `check_print` and `thickness` say of meshes whose faults and walls are known."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+
+import harnack as hk
+from harnack.cli import main
+from harnack.files.file_format import FileFormatError
+from harnack.geometry import mesh_shapes
+
+PLATE = trimesh.creation.box((20.0, 10.0, 2.0))
+FINE_PLATE = PLATE.subdivide().subdivide()
+
+
+def kinds(part: Any, **options: Any) -> dict[str, int]:
+    return {one.kind: one.count for one in hk.check_print(part, **options).problems}
+
+
+def test_a_plate_is_fine() -> None:
+    found = hk.check_print(PLATE, wall=1.9, bed=(10.0, 20.0, 2.0))
+    assert found.is_fine
+    assert found.problems == ()
+    assert found.volume == pytest.approx(400.0)
+    assert found.size == (20.0, 10.0, 2.0)
+
+
+def test_faults_are_named_and_placed() -> None:
+    x, faces = np.array(PLATE.vertices), np.array(PLATE.faces)
+    assert kinds((x, faces[1:])) == {"open edges": 3}
+    turned = faces.copy()
+    turned[0] = turned[0][::-1]
+    assert kinds((x, turned)) == {"sides that disagree": 3}
+    assert kinds((x, faces[:, ::-1])) == {"inside out": 1}
+    twice = kinds((x, np.concatenate([faces, faces[:1]])))
+    assert twice == {"edges of many faces": 3, "duplicate faces": 1}
+    opened = hk.check_print((x, faces[1:])).problems[0]
+    ends = x[faces[0]]
+    middles = 0.5 * (ends + np.roll(ends, 1, axis=0))
+    assert {*map(tuple, opened.where)} == {*map(tuple, middles)}
+
+
+def test_parts_that_cross_are_found() -> None:
+    other = PLATE.copy()
+    other.apply_translation((10.0, 3.0, 0.7))
+    both = trimesh.util.concatenate([PLATE, other])
+    found = kinds(both)
+    assert found["crossing faces"] >= 4
+    assert found["loose parts"] == 2
+    far = PLATE.copy()
+    far.apply_translation((50.0, 0.0, 0.0))
+    apart = hk.check_print(trimesh.util.concatenate([PLATE, far]))
+    assert apart.is_fine  # a hint alone
+    assert [one.kind for one in apart.problems] == ["loose parts"]
+
+
+def test_cavities_and_tiny_parts() -> None:
+    inner = PLATE.copy()
+    inner.apply_scale(0.5)
+    inner.invert()
+    hollow = trimesh.util.concatenate([PLATE, inner])
+    assert kinds(hollow) == {"cavities": 1}
+    assert hk.check_print(hollow).volume == pytest.approx(400 * (1 - 0.125))
+    crumb = trimesh.creation.icosphere(1, 0.05)
+    crumb.apply_translation((30.0, 0.0, 0.0))
+    assert kinds(trimesh.util.concatenate([PLATE, crumb])) == {"tiny parts": 1, "loose parts": 2}
+
+
+def test_thin_walls_beds_and_units() -> None:
+    assert kinds(FINE_PLATE, wall=2.1)["thin walls"] == 2 * len(FINE_PLATE.faces) // 6
+    assert kinds(PLATE, bed=(19.0, 30.0, 5.0)) == {}
+    assert kinds(PLATE, bed=(19.0, 19.0, 5.0)) == {"bed": 1}
+    small = PLATE.copy()
+    small.apply_scale(1 / 25.4)
+    assert kinds(small) == {"unit": 1}
+    with pytest.raises(ValueError, match="wall must be a positive length"):
+        hk.check_print(PLATE, wall=-1.0)
+
+
+def test_thickness_is_that_of_plates_balls_and_wedges() -> None:
+    plate = hk.thickness(FINE_PLATE)
+    assert np.unique(plate.values.round(5)).tolist() == [2.0, 10.0, 20.0]
+    assert plate.thinnest == pytest.approx(2.0, abs=1e-5)
+    assert (np.abs(plate.where(3.0)[:, 2]) == 1.0).all()
+    # The widest ball within an inscribed polyhedron of the unit sphere.
+    ball = hk.thickness(mesh_shapes.icosphere(3))
+    assert 1.98 < ball.thinnest <= ball.values.max() < 2.0
+    # A wedge of half-angle a: the ball that touches one side at a distance s from the edge touches
+    # the other as well if its radius is s tan a.
+    half = np.array([[0, 0, -1.0], [0, 0, 1], [10, 0, -1], [10, 0, 1], [0, 1, -1], [0, 1, 1]])
+    wedge = trimesh.convex.convex_hull(half)
+    for _ in range(4):
+        wedge = wedge.subdivide()
+    found = hk.thickness(wedge)
+    center = wedge.triangles_center
+    side = (wedge.face_normals[:, 1] < -0.9) & (center[:, 0] > 3)
+    side &= np.abs(center[:, 2]) < 0.6  # beside the ends the ray's length is given
+    expected = 2 * (10 - center[side, 0]) * np.tan(0.5 * np.arctan(0.1))
+    assert found.values[side] == pytest.approx(expected, abs=1e-4)
+
+
+def test_thickness_of_a_solid_is_that_of_its_mesh() -> None:
+    shell = hk.Sphere(1.0) - hk.Sphere(0.8)
+    found = hk.thickness(shell, tolerance=4e-3)
+    assert found.values.min() > 0.2 - 0.02
+    colored = found.colored(0.1, 0.3)
+    assert len(colored.visual.face_colors) == len(found.values)
+    with pytest.raises(TypeError, match="tolerance is for solids"):
+        hk.thickness(PLATE, tolerance=1e-3)
+
+
+def test_the_command_says_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    name = str(tmp_path / "plate.stl")
+    PLATE.export(name)
+    assert main(["check", name]) == 0
+    assert "nothing is wrong" in capsys.readouterr().out
+    colors = str(tmp_path / "thin.ply")
+    assert main(["check", name, "--wall", "2.5", "--colors", colors]) == 1
+    assert "wrong: thin walls" in capsys.readouterr().out
+    assert len(trimesh.load(colors).faces) == len(PLATE.faces)
+    assert main(["check", name, "--json", "--bed", "5", "5", "5"]) == 1
+    found = json.loads(capsys.readouterr().out)
+    assert [one["kind"] for one in found["problems"]] == ["bed"]
+    assert main(["check", name, "--colors", colors]) == 1
+    assert "--wall" in capsys.readouterr().err
+
+
+def test_hostile_files_are_refused(tmp_path: Path) -> None:
+    for name, data in (
+        ("a.stl", b""),
+        ("b.stl", b"\0" * 83),
+        ("c.ply", b"ply\n"),
+        ("d.xyz", b"1 2 3"),
+    ):
+        path = tmp_path / name
+        path.write_bytes(data)
+        with pytest.raises((FileFormatError, hk.geometry.MeshError)):
+            hk.check_print(path)
+
+
+def test_faces_without_area_that_close_a_file_are_kept(tmp_path: Path) -> None:
+    # A vertex in the middle of an edge of one neighbor alone, and a face without width between.
+    x = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0.5, 0, 0]], float)
+    faces = np.array([[0, 2, 1], [0, 4, 3], [4, 1, 3], [1, 2, 3], [0, 3, 2], [0, 1, 4]])
+    assert trimesh.Trimesh(x, faces, process=False).is_watertight
+    path = tmp_path / "flat.stl"
+    trimesh.Trimesh(x, faces, process=False).export(path)
+    assert hk.solid(path).value([[0.2, 0.2, 0.2]])[0] < 0
+    found = hk.check_print(path)
+    assert found.is_fine
+    assert found.volume == pytest.approx(1 / 6)
+    assert [one.kind for one in found.problems] == ["faces without area", "unit"]
