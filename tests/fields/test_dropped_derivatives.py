@@ -113,7 +113,8 @@ WITH_DERIVATIVES = {
 # Functions of any numbers, of solids, and of scenes and files, whose results carry nothing.
 OTHERS = {
     "atan2", "maximum", "minimum", "norm", "union", "intersection", "animate", "render", "page",
-    "mesh", "read_scene", "repair", "view", "wrap_for_jax", "write_scene",
+    "check_print", "mesh", "read_scene", "repair", "thickness", "view", "wrap_for_jax",
+    "write_scene",
 }  # fmt: skip
 FUNCTIONS = {
     name: getattr(hk, name)
@@ -173,7 +174,8 @@ PARTS: dict[str, tuple[dict[str, Any], Callable[[Any], Any]]] = {
 }
 # Records of settings, results and pictures, and proofs.
 NO_PARTS = {"AllHits", "Camera", "Curvatures", "DistanceBounds", "Hits", "Isolines", "LevelSet",
-            "Sample", "SavedScene", "Slider", "Tolerance", "View"}  # fmt: skip
+            "PrintCheck", "PrintProblem", "Sample", "SavedScene", "Slider", "Thickness",
+            "Tolerance", "View"}  # fmt: skip
 
 
 def test_the_list_of_records_is_whole() -> None:

@@ -107,8 +107,12 @@ def test_what_encloses_nothing_is_refused(
 
 
 def test_smoothed_points_of_a_plane_are_refused() -> None:
-    with pytest.raises(CloudError, match="the points lie in a plane and enclose nothing"):
+    with pytest.raises(CloudError, match="or the points lie in a plane or on a line"):
         hk.DipolePotential(_FLAT, _UP, smoothing=0.1)
+    rng = np.random.default_rng(0)
+    line, normals = np.linspace(0, 1, 200)[:, None] * (1.0, 2.0, 3.0), rng.normal(size=(200, 3))
+    with pytest.raises(CloudError, match="or the points lie in a plane or on a line"):
+        hk.DipolePotential(line, normals, smoothing=0.05)
 
 
 def test_normals_turned_inwards_do_not_matter_to_what_is_smoothed() -> None:

@@ -52,7 +52,7 @@ def test_revolved_outlines_keep_their_rings() -> None:
     assert mesh.is_watertight
     r = np.linalg.norm(mesh.vertices[:, :2], axis=1)
     found = np.unique(np.round(np.column_stack([r, mesh.vertices[:, 2]]), 9), axis=0)
-    assert np.allclose(found, sorted(CUP))
+    assert np.allclose(found, [one for one in sorted(CUP) if one[0] > 0])
     p, q = np.array(CUP), np.roll(CUP, -1, axis=0)
     turned = np.pi / 3 * ((p[:, 0] * q[:, 1] - q[:, 0] * p[:, 1]) * (p[:, 0] + q[:, 0])).sum()
     assert mesh.volume == pytest.approx(turned, rel=5e-3)
