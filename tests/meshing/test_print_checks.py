@@ -197,3 +197,17 @@ def test_foils_are_thin(height: float) -> None:
 def test_beds_that_are_none_are_refused(bed: Any) -> None:
     with pytest.raises(ValueError, match="bed must be"):
         hk.check_print(PLATE, bed=bed)
+
+
+def test_what_overlaps_can_be_united_and_that_is_said() -> None:
+    ball = trimesh.creation.icosphere(1)
+    two = trimesh.util.concatenate([ball, ball.copy().apply_translation((0.7, 0.1, 0.05))])
+    [found] = hk.check_print(two, wall=0.1).problems[:1]
+    assert found.kind == "crossing faces"
+    assert "hk.mesh(hk.solid(part))" in found.message
+    assert "walls not measured" in kinds(two, wall=0.1)  # and not: thin
+    united = hk.mesh(hk.solid(two))
+    assert "crossing faces" not in kinds(united)
+    other = ball.copy().apply_translation((0.7, 0.1, 0.05))
+    expected = trimesh.boolean.union([ball, other], engine="manifold").volume
+    assert united.volume == pytest.approx(expected, rel=1e-6)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -105,7 +106,7 @@ def check_print(part: Any, *, wall: float | None = None, bed: Any = None) -> Pri
     is_closed = not _is_wrong(found)
     pieces = _parts(faces)
     volumes = _volumes(x, faces, pieces)
-    crossings = _crossings(x, faces)
+    crossings = _crossings(x, faces, is_closed)
     is_clear = is_closed and not crossings.count
     found += [*_of_parts(x, faces, pieces, volumes, is_closed, is_clear), crossings]
     if wall is not None:
@@ -278,20 +279,21 @@ def _turns(point: FloatArray, x: FloatArray, faces: IntArray) -> int:
     return round(float(np.arctan2(top, bottom).sum()) / (2 * np.pi))
 
 
-def _crossings(x: FloatArray, faces: IntArray) -> PrintProblem:
+def _crossings(x: FloatArray, faces: IntArray, is_closed: bool) -> PrintProblem:
     kept = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
     kept = np.unique(np.sort(kept, axis=1), axis=0)  # duplicates have been counted
     crossing = intersecting_faces(x, kept)
     places = x[kept[crossing]].mean(axis=1)
-    return _problem("crossing faces", places, "{} triangles pass through or lie on others")
+    found = _problem("crossing faces", places, "{} triangles pass through or lie on others")
+    advice = "; hk.mesh(hk.solid(part)) makes one of parts that overlap" if is_closed else ""
+    return dataclasses.replace(found, message=found.message + advice)
 
 
 def _thin(x: FloatArray, faces: IntArray, wall: float, is_solid: bool) -> PrintProblem:
     if not is_solid:
-        return PrintProblem(
-            "thin walls", 1, np.zeros((0, 3)),
-            "how thick walls are is not known before the rest is mended",
-        )  # fmt: skip
+        # Another name than that of walls that were found thin.
+        why = "how thick walls are is not known before the rest is mended"
+        return PrintProblem("walls not measured", 1, np.zeros((0, 3)), why)
     found = thickness(MeshSolid(x, faces))
     places = found.where(wall)
     least = f"; the thinnest is {found.thinnest:.3g}"
