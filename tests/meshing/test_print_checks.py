@@ -211,3 +211,13 @@ def test_what_overlaps_can_be_united_and_that_is_said() -> None:
     other = ball.copy().apply_translation((0.7, 0.1, 0.05))
     expected = trimesh.boolean.union([ball, other], engine="manifold").volume
     assert united.volume == pytest.approx(expected, rel=1e-6)
+
+
+def test_parts_that_touch_inside_a_face_are_not_said_to_be_apart() -> None:
+    box = trimesh.creation.box((20.0, 20.0, 20.0))
+    point = [(3, 1, 10), (5, 1, 15), (1, 5, 15), (-3, -3, 15)]
+    faces = [(0, 2, 1), (0, 3, 2), (0, 1, 3), (1, 2, 3)]
+    found = hk.check_print(trimesh.util.concatenate([box, trimesh.Trimesh(point, faces)]))
+    [loose] = [one for one in found.problems if one.kind == "loose parts"]
+    assert "joined by vertices" in loose.message
+    assert "do not touch" not in loose.message

@@ -262,7 +262,7 @@ def _of_parts(
         _problem(
             "loose parts",
             loose if len(loose) > 1 else loose[:0],
-            "there are {} parts that do not touch",
+            "there are {} parts that are not joined by vertices",
             is_fatal=False,
         ),
     ]
