@@ -156,3 +156,68 @@ def test_faces_without_area_that_close_a_file_are_kept(tmp_path: Path) -> None:
     assert found.is_fine
     assert found.volume == pytest.approx(1 / 6)
     assert [one.kind for one in found.problems] == ["faces without area", "unit"]
+
+
+def test_parts_in_the_material_of_others_are_wrong() -> None:
+    # Their volume counts twice; slicers print them, or a cavity in their place.
+    ball = trimesh.creation.icosphere(1, radius=10.0)
+    x, f, n = ball.vertices, ball.faces, len(ball.vertices)
+
+    def nested(*sides: int) -> dict[str, int]:
+        """Balls in balls, the largest first; -1: turned inwards."""
+        vertices = [x * (1 - 0.25 * k) for k in range(len(sides))]
+        faces = [f[:, ::side] + k * n for k, side in enumerate(sides)]
+        return kinds((np.concatenate(vertices), np.concatenate(faces)))
+
+    assert nested(1, 1) == {"nested parts": 1, "loose parts": 2}
+    assert nested(1, -1, 1) == {"cavities": 1, "loose parts": 2}
+    assert nested(1, -1, -1) == {"inside out": 1, "cavities": 1, "loose parts": 2}
+    moved = trimesh.util.concatenate([ball, ball.copy().apply_translation((5.0, 1.0, 2.0))])
+    assert "nested parts" not in kinds(moved)  # they cross, which is said
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1e-3, 0.04, 1e5])
+def test_thickness_knows_no_unit(scale: float) -> None:
+    # Rays ended at once where a mesh was less than 1 long, and it was said to be thin all over.
+    plate = (FINE_PLATE.vertices * scale, FINE_PLATE.faces)
+    found = hk.thickness(plate)
+    assert found.thinnest == pytest.approx(2.0 * scale, rel=1e-5)
+    assert np.median(found.values) > 2.5 * scale
+
+
+@pytest.mark.parametrize("height", [1e-5, 1e-6, 1e-9])
+def test_foils_are_thin(height: float) -> None:
+    # Rays that began beyond the other side ran into the open: 0.0067 and 32 were found.
+    foil = trimesh.creation.box((20.0, 10.0, height))
+    is_flat = np.abs(foil.face_normals[:, 2]) > 0.5
+    assert hk.thickness(foil).values[is_flat].max() < 3.3e-5
+
+
+@pytest.mark.parametrize("bed", [220, (220, 220), (220, 220, 0), "abc"])
+def test_beds_that_are_none_are_refused(bed: Any) -> None:
+    with pytest.raises(ValueError, match="bed must be"):
+        hk.check_print(PLATE, bed=bed)
+
+
+def test_what_overlaps_can_be_united_and_that_is_said() -> None:
+    ball = trimesh.creation.icosphere(1)
+    two = trimesh.util.concatenate([ball, ball.copy().apply_translation((0.7, 0.1, 0.05))])
+    [found] = hk.check_print(two, wall=0.1).problems[:1]
+    assert found.kind == "crossing faces"
+    assert "hk.mesh(hk.solid(part))" in found.message
+    assert "walls not measured" in kinds(two, wall=0.1)  # and not: thin
+    united = hk.mesh(hk.solid(two))
+    assert "crossing faces" not in kinds(united)
+    other = ball.copy().apply_translation((0.7, 0.1, 0.05))
+    expected = trimesh.boolean.union([ball, other], engine="manifold").volume
+    assert united.volume == pytest.approx(expected, rel=1e-6)
+
+
+def test_parts_that_touch_inside_a_face_are_not_said_to_be_apart() -> None:
+    box = trimesh.creation.box((20.0, 20.0, 20.0))
+    point = [(3, 1, 10), (5, 1, 15), (1, 5, 15), (-3, -3, 15)]
+    faces = [(0, 2, 1), (0, 3, 2), (0, 1, 3), (1, 2, 3)]
+    found = hk.check_print(trimesh.util.concatenate([box, trimesh.Trimesh(point, faces)]))
+    [loose] = [one for one in found.problems if one.kind == "loose parts"]
+    assert "joined by vertices" in loose.message
+    assert "do not touch" not in loose.message

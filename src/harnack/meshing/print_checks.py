@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -80,10 +81,11 @@ def check_print(part: Any, *, wall: float | None = None, bed: Any = None) -> Pri
     """What a slicer would complain of in a mesh, and where.
 
     Wrong are: open edges, edges of more than two faces, neighbors that do not agree on their two
-    sides, parts that are inside out, vertices where sheets touch, triangles that pass through each
-    other or lie on each other (decided exactly), faces that are there twice; walls thinner than
-    asked; what does not fit on the bed. Hints are: faces without an area, several parts, tiny ones,
-    cavities without a way out (for powder and resin), and a size that looks like inches or meters.
+    sides, parts that are inside out or in the material of others, vertices where sheets touch,
+    triangles that pass through each other or lie on each other (decided exactly), faces that are
+    there twice; walls thinner than asked; what does not fit on the bed. Hints are: faces without an
+    area, several parts, tiny ones, cavities without a way out (for powder and resin), and a size
+    that looks like inches or meters.
 
     part: a trimesh.Trimesh, (vertices, faces), or the name of a file. Vertices at the same place
         are one.
@@ -96,16 +98,17 @@ def check_print(part: Any, *, wall: float | None = None, bed: Any = None) -> Pri
     """
     if wall is not None:
         wall = check_length(wall, "wall")
-    sides = None if bed is None else [check_length(one, "bed") for one in bed]
-    if sides is not None and len(sides) != 3:
+    if bed is not None and np.shape(bed) != (3,):
         raise ValueError(f"bed must be (x, y, z), three lengths, not {bed!r}")
+    sides = None if bed is None else [check_length(one, "bed") for one in bed]
     x, faces = _mesh_of(part)
     found = _topology(x, faces)
     is_closed = not _is_wrong(found)
     pieces = _parts(faces)
     volumes = _volumes(x, faces, pieces)
-    found += _of_parts(x, faces, pieces, volumes, is_closed)
-    found += _crossings(x, faces)
+    crossings = _crossings(x, faces, is_closed)
+    is_clear = is_closed and not crossings.count
+    found += [*_of_parts(x, faces, pieces, volumes, is_closed, is_clear), crossings]
     if wall is not None:
         found.append(_thin(x, faces, wall, not _is_wrong(found)))
     low, high = x[faces].min(axis=(0, 1)), x[faces].max(axis=(0, 1))
@@ -212,26 +215,42 @@ def _volumes(x: FloatArray, faces: IntArray, pieces: IntArray) -> FloatArray:
 
 
 def _of_parts(
-    x: FloatArray, faces: IntArray, pieces: IntArray, volumes: FloatArray, is_closed: bool
+    x: FloatArray,
+    faces: IntArray,
+    pieces: IntArray,
+    volumes: FloatArray,
+    is_closed: bool,
+    is_clear: bool,
 ) -> list[PrintProblem]:
-    """Inside out, cavities, loose and tiny parts."""
+    """Inside out, inside others, cavities, loose and tiny parts. is_clear: closed, and no faces
+    pass through each other, so that a part is inside another as a whole or not at all."""
     count = len(volumes)
     low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
     for k in range(3):
         np.minimum.at(low, pieces, x[faces[:, k]])
         np.maximum.at(high, pieces, x[faces[:, k]])
     middle, length = 0.5 * (low + high), (high - low).max(axis=1)
-    is_hollow = np.zeros(count, np.bool_)
-    for k in np.flatnonzero(volumes < 0) if is_closed else ():
-        point = x[faces[np.argmax(pieces == k), 0]]
-        around = [j for j in np.flatnonzero(volumes > 0) if _winds(point, x, faces[pieces == j])]
-        is_hollow[k] = bool(around)
+    depth = np.zeros(count, np.int64)  # how often the other parts wind around each
+    first = np.unique(pieces, return_index=True)[1]
+    for k in range(count) if is_closed and count > 1 else ():
+        point = x[faces[first[k]]].mean(axis=0)
+        near = ((low < point) & (point < high)).all(axis=1)
+        near[k] = False
+        depth[k] = sum(_turns(point, x, faces[pieces == j]) for j in np.flatnonzero(near))
+    is_hollow = (volumes < 0) & (depth > 0)
+    is_nested = (volumes > 0) & (depth > 0) & is_clear
     inside_out = (volumes < 0) & ~is_hollow if is_closed else np.zeros(count, np.bool_)
     is_tiny = (length < _TINY * length.max()) & ~is_hollow
     loose = middle[~is_hollow]
     return [
         _problem(
             "inside out", middle[inside_out], "{} parts are inside out: their faces look inward"
+        ),
+        _problem(
+            "nested parts",
+            middle[is_nested],
+            "{} parts are inside the material of others: their volume counts twice, and slicers "
+            "may take them for cavities",
         ),
         _problem(
             "cavities",
@@ -243,37 +262,38 @@ def _of_parts(
         _problem(
             "loose parts",
             loose if len(loose) > 1 else loose[:0],
-            "there are {} parts that do not touch",
+            "there are {} parts that are not joined by vertices",
             is_fatal=False,
         ),
     ]
 
 
-def _winds(point: FloatArray, x: FloatArray, faces: IntArray) -> bool:
-    """Whether closed faces wind around a point: by the sum of their solid angles (van Oosterom and
-    Strackee 1983)."""
+def _turns(point: FloatArray, x: FloatArray, faces: IntArray) -> int:
+    """How often closed faces wind around a point: by the sum of their solid angles (van Oosterom
+    and Strackee 1983)."""
     a, b, c = (x[faces[:, k]] - point for k in range(3))
     na, nb, nc = (np.linalg.norm(one, axis=1) for one in (a, b, c))
     top = (a * np.cross(b, c)).sum(axis=1)
     bottom = na * nb * nc + (a * b).sum(axis=1) * nc + (b * c).sum(axis=1) * na
     bottom += (c * a).sum(axis=1) * nb
-    return bool(abs(2 * np.arctan2(top, bottom).sum()) > 2 * np.pi)
+    return round(float(np.arctan2(top, bottom).sum()) / (2 * np.pi))
 
 
-def _crossings(x: FloatArray, faces: IntArray) -> list[PrintProblem]:
+def _crossings(x: FloatArray, faces: IntArray, is_closed: bool) -> PrintProblem:
     kept = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
     kept = np.unique(np.sort(kept, axis=1), axis=0)  # duplicates have been counted
     crossing = intersecting_faces(x, kept)
     places = x[kept[crossing]].mean(axis=1)
-    return [_problem("crossing faces", places, "{} triangles pass through or lie on others")]
+    found = _problem("crossing faces", places, "{} triangles pass through or lie on others")
+    advice = "; hk.mesh(hk.solid(part)) makes one of parts that overlap" if is_closed else ""
+    return dataclasses.replace(found, message=found.message + advice)
 
 
 def _thin(x: FloatArray, faces: IntArray, wall: float, is_solid: bool) -> PrintProblem:
     if not is_solid:
-        return PrintProblem(
-            "thin walls", 1, np.zeros((0, 3)),
-            "how thick walls are is not known before the rest is mended",
-        )  # fmt: skip
+        # Another name than that of walls that were found thin.
+        why = "how thick walls are is not known before the rest is mended"
+        return PrintProblem("walls not measured", 1, np.zeros((0, 3)), why)
     found = thickness(MeshSolid(x, faces))
     places = found.where(wall)
     least = f"; the thinnest is {found.thinnest:.3g}"

@@ -114,11 +114,15 @@ def _behind(solid: MeshSolid, start: FloatArray, normal: FloatArray) -> FloatArr
     """(k,) thickness at points of the surface with normals (k, 3)."""
     size = solid.surface.size
     below = _BELOW * size
+    # Not a fixed tolerance: rays into a small mesh would end where they start.
     hits: Any = trace(
-        solid, start - below * normal, -normal, t_min=below, tolerance=1e-6, precision="double"
-    )
+        solid, start - below * normal, -normal,
+        t_min=below, tolerance=0.1 * below, precision="double",
+    )  # fmt: skip
     t = np.asarray(hits.t, np.float64) + below
     width = np.where(np.isfinite(t), t, 2 * size)
+    # Where that is beyond the other side already, the part is no thicker than what was skipped.
+    width[~_is_within(solid, start - 2 * below * normal)] = 2 * below
     moving = np.arange(len(width))
     for _ in range(_MOST_ROUNDS):
         if not len(moving):
@@ -136,6 +140,12 @@ def _behind(solid: MeshSolid, start: FloatArray, normal: FloatArray) -> FloatArr
         width[moving[shrinks]] = np.minimum(width[moving[shrinks]], 2 * smaller)
         moving = moving[shrinks]
     return width
+
+
+def _is_within(solid: MeshSolid, points: FloatArray) -> BoolArray:
+    backend = choose_backend("double")
+    value = solid.prepare(backend).evaluate(to_vector3(backend, points)).value
+    return np.asarray(to_numpy(value) < 0)
 
 
 def _nearest(solid: MeshSolid, points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
