@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from harnack.backend import BoolArray, FloatArray
 from harnack.meshing.edges import Edges, IntArray, boundary_edges, directed_edges, dots, lengths
+from harnack.meshing.near_faces import near_pairs
 from harnack.meshing.samples import LevelFunction
 
 if TYPE_CHECKING:
@@ -122,6 +123,8 @@ def _exact_turns(points: Any) -> Any:
 
 _EDGES = ((0, 1), (1, 2), (2, 0))
 _PAIRS_AT_ONCE = 1 << 18
+# Of more triangles than this, a kernel that takes a quarter of a second to record finds the pairs.
+_MANY = 50_000
 # So many triangles of a size are compared with each other at once.
 _MOST_AT_ONCE = 1 << 19
 
@@ -152,7 +155,11 @@ def intersecting_faces(
     among: (m,) mask; pairs of which neither is chosen are not looked at.
     """
     found: list[IntArray] = []
-    near = _near_pairs(vertices[faces], among)
+    many = len(faces) if among is None else int(among.sum())
+    if many > _MANY:
+        near = near_pairs(vertices, faces, among)
+    else:
+        near = _near_pairs(vertices[faces], among)
     for start in range(0, len(near), _PAIRS_AT_ONCE):
         pairs = near[start : start + _PAIRS_AT_ONCE]
         pairs = pairs[~_are_apart(vertices, faces, pairs)]

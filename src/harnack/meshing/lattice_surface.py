@@ -8,7 +8,6 @@ tetrahedron is cut by one triangle or quadrilateral, and signs at its corners al
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
@@ -294,17 +293,9 @@ def closed_surface(
     if len(rest):
         check_size(function, vertices, rest, tolerance)
         vertices = smoothed(function, vertices, rest, None)
-        inside = _Inside(
-            function.field,
-            function.level,
-            function,
-            lattice,
-            does_matter,
-            most_faces=function.most_faces,
-            uploads=function.uploads,
-        )
-        vertices, rest = refined(inside, vertices, rest, tolerance, None, report)
-        vertices = smoothed_within(inside, vertices, rest, None, tolerance)
+        counts = _inside(lattice, does_matter)
+        vertices, rest = refined(function, vertices, rest, tolerance, None, report, counts)
+        vertices = smoothed_within(function, vertices, rest, None, tolerance, counts)
     faces = np.concatenate([rest, *caps])
     return Surface.of(vertices, faces) if len(faces) else Surface(np.zeros((0, 3)), faces)
 
@@ -340,33 +331,25 @@ def _check_nothing_missed(
     check_nothing_missed(function, points, samples, is_beside, surface, size, box, elsewhere)
 
 
-@dataclass
-class _Inside(LevelFunction):
-    """A function that is on the level wherever it is within one and a half cells of the box, or in
-    or beside cells that do not matter (counts).
+def _inside(lattice: Lattice, does_matter: BoolArray | None) -> Callable[[FloatArray], BoolArray]:
+    """Which points are farther than one and a half cells from the box, and neither in nor beside
+    cells that do not matter (counts).
 
-    So nothing is cut there. Triangles that end in the outermost cells would be cut again and again:
-    the edge they end with stays as it is, and their centers are no deeper than that.
+    Triangles that end in the outermost cells would be cut again and again: the edge they end with
+    stays as it is, and their centers are no deeper than that.
     """
+    lower, upper = lattice.lower + 1.5 * lattice.size, lattice.upper - 1.5 * lattice.size
+    deep = None if does_matter is None else lattice.deep(does_matter)
 
-    function: LevelFunction
-    lattice: Lattice
-    does_matter: BoolArray | None
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._is_deep = None if self.does_matter is None else self.lattice.deep(self.does_matter)
-
-    def at(self, points: FloatArray) -> Samples:
-        samples = self.function.at(points)
-        lower = self.lattice.lower + 1.5 * self.lattice.size
-        upper = self.lattice.upper - 1.5 * self.lattice.size
-        is_inside = np.ones(len(points), np.bool_)
+    def counts(points: FloatArray) -> BoolArray:
+        found = np.ones(len(points), np.bool_)
         for x, low, high in zip(points.T, lower, upper, strict=True):
-            is_inside &= (x >= low) & (x <= high)
-        if self._is_deep is not None:
-            is_inside &= self._is_deep[tuple(self.lattice.cells_of(points).T)]
-        return dataclasses.replace(samples, value=np.where(is_inside, samples.value, 0.0))
+            found &= (x >= low) & (x <= high)
+        if deep is not None:
+            found &= deep[tuple(lattice.cells_of(points).T)]
+        return found
+
+    return counts
 
 
 def _wall_faces(
