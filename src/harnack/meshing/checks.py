@@ -306,7 +306,11 @@ class LocalError(MeshingError):
 
 
 class CrossingError(LocalError):
-    """Triangles that pass through each other."""
+    """Triangles that pass through each other, by index; places: their centers."""
+
+    def __init__(self, message: str, places: FloatArray, faces: IntArray) -> None:
+        super().__init__(message, places)
+        self.faces = faces
 
 
 class TooLargeError(MeshingError):
@@ -363,7 +367,7 @@ def check_apart(vertices: FloatArray, faces: IntArray) -> None:
     decided exactly.
 
     Raises:
-        MeshingError: so; a CrossingError with the centers of these faces.
+        MeshingError: so; a CrossingError with these faces.
     """
     if not np.isfinite(vertices).all():
         raise MeshingError("vertices of the mesh are no numbers: choose another level or `clip`")
@@ -374,6 +378,7 @@ def check_apart(vertices: FloatArray, faces: IntArray) -> None:
             f"{len(crossing):,} of {len(faces):,} triangles pass through each other, such as near "
             f"{_point(places[0])}: choose a smaller `spacing` or a larger `tolerance`",
             places,
+            crossing,
         )
 
 

@@ -39,6 +39,7 @@ __all__ = [
     "check_nothing_missed",
     "check_size",
     "closed_surface",
+    "cut_where_far",
     "open_surface",
 ]
 
@@ -298,6 +299,31 @@ def closed_surface(
         vertices = smoothed_within(function, vertices, rest, None, tolerance, counts)
     faces = np.concatenate([rest, *caps])
     return Surface.of(vertices, faces) if len(faces) else Surface(np.zeros((0, 3)), faces)
+
+
+def cut_where_far(
+    function: LevelFunction, surface: Surface, farthest: float, times: int
+) -> Surface:
+    """Faces whose center is farther than that from the level, as across a crease, cut into three at
+    a point on it; so are the new ones, a few times. All edges stay."""
+    vertices, faces = surface.vertices, surface.faces
+    asked = np.arange(len(faces))
+    for _ in range(times):
+        corner = vertices[faces[asked]]
+        center = corner.mean(axis=1)
+        samples = function.at(center)
+        far = np.flatnonzero(samples.distance > farthest)
+        if not len(far):
+            break
+        span = 0.5 * lengths(corner[far, 1] - corner[far, 0])
+        moved = newton(function, center[far], samples.some(far), span, None)
+        rows, inner = asked[far], len(vertices) + np.arange(len(far))
+        a, b, c = faces[rows].T
+        vertices = np.concatenate([vertices, moved])
+        fans = [np.stack([*ends, inner], axis=1) for ends in ((a, b), (b, c), (c, a))]
+        faces = np.concatenate([np.delete(faces, rows, axis=0), *fans])
+        asked = np.arange(len(faces) - 3 * len(rows), len(faces))
+    return Surface(vertices, faces)
 
 
 def _less_cells(elsewhere: Clearance, length: float) -> Clearance:

@@ -16,11 +16,11 @@ from typing import Any, cast
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
-from harnack.meshing.checks import intersecting_faces
+from harnack.meshing.checks import CrossingError, check_apart, intersecting_faces
 from harnack.meshing.edges import IntArray, directed_edges, distinct, dots, edge_keys, lengths
 from harnack.meshing.lattice_surface import Surface
 
-__all__ = ["uncrossed"]
+__all__ = ["made_apart", "uncrossed"]
 
 # More crossing triangles than this, or in a larger neighborhood, are no slivers.
 _MOST, _MOST_AROUND = 400, 5_000
@@ -28,6 +28,23 @@ _MOST, _MOST_AROUND = 400, 5_000
 _MOST_CHANGES, _MOST_TRIED = 40, 80
 # New triangles of this part of the area that they are to cover may look backwards.
 _NOTHING = 1e-4
+
+
+def made_apart(surface: Surface, length: float) -> Surface:
+    """A closed surface, mended where its triangles pass through each other (`uncrossed`), so that
+    none do.
+
+    Raises:
+        MeshingError: vertices that are not finite; a CrossingError where that is not enough.
+    """
+    try:
+        check_apart(surface.vertices, surface.faces)
+    except CrossingError as error:
+        mended, left = uncrossed(surface, error.faces, length)
+        if left:
+            raise
+        return mended
+    return surface
 
 
 def uncrossed(surface: Surface, crossing: IntArray, length: float) -> tuple[Surface, int]:
