@@ -18,7 +18,7 @@ from harnack.meshing.checks import (
     check_manifold,
     intersecting_faces,
 )
-from harnack.meshing.edges import IntArray
+from harnack.meshing.edges import IntArray, numbered
 from harnack.meshing.lattice_surface import Surface
 
 if TYPE_CHECKING:
@@ -332,9 +332,15 @@ def _simpler(given: Surface, step: float) -> trimesh.Trimesh | None:
 def _contracted(surface: Surface, step: float) -> tuple[FloatArray, IntArray, BoolArray]:
     """Vertices on the grid, faces between the first of those that are one point, and which faces
     are left."""
-    x = np.round(surface.vertices / step) * step
-    _, first, place = np.unique(x, axis=0, return_index=True, return_inverse=True)
-    faces = first[place.reshape(-1)][surface.faces]
+    grid = np.round(surface.vertices / step)
+    x = grid * step
+    # Points that are one, by their coordinates one after the other.
+    place = np.zeros(len(x), np.int64)
+    for one in (grid - grid.min(axis=0)).astype(np.int64).T:
+        _, place, _ = numbered(place * (int(one.max()) + 1) + one)
+    first = np.empty(len(x), np.int64)
+    first[place[::-1]] = np.arange(len(x))[::-1]
+    faces = first[place][surface.faces]
     return x, faces, (faces != np.roll(faces, 1, axis=1)).all(axis=1)
 
 

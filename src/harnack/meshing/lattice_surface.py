@@ -16,7 +16,7 @@ import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
 from harnack.meshing.checks import MeshingError, TooLargeError, singular_vertices
-from harnack.meshing.edges import IntArray, lengths
+from harnack.meshing.edges import IntArray, lengths, numbered
 from harnack.meshing.isotopy import Isotopy, isotopy_of
 from harnack.meshing.lattice import Lattice, distinct_rows
 from harnack.meshing.marching_tetrahedra import (
@@ -174,6 +174,8 @@ def check_size(
 _SNAPPED = 0.25
 # So many cells around what matters are made as if they did.
 _BORDER = 2.0
+# So many cells along an edge of a block.
+_BLOCK = 8
 _MOST_ROUNDS = 20
 
 
@@ -266,7 +268,7 @@ def closed_surface(
     outer = lattice.outer_cells()
     if does_matter is not None:
         outer = outer[does_matter[tuple(outer.T)]]
-    outer = outer[function.values(lattice.points(2 * outer + 1)) <= 0]
+    outer = outer[_are_negative(function, lattice, outer)]
     coordinates, corners = lattice.tetrahedra(distinct_rows(np.concatenate([cells, outer])))
     points = lattice.points(coordinates)
     report(f"{len(points):,} points, {len(corners):,} tetrahedra")
@@ -324,6 +326,23 @@ def cut_where_far(
         faces = np.concatenate([np.delete(faces, rows, axis=0), *fans])
         asked = np.arange(len(faces) - 3 * len(rows), len(faces))
     return Surface(vertices, faces)
+
+
+def _are_negative(function: LevelFunction, lattice: Lattice, cells: IntArray) -> BoolArray:
+    """(k,) whether the centers of cells (k, 3) are negative: as those of blocks of cells, where it
+    is proved that the level is not in the block."""
+    shape = lattice.counts // _BLOCK + 1
+    x, y, z = (cells // _BLOCK).T
+    keys, index, _ = numbered((x * shape[1] + y) * shape[2] + z)
+    rest, z = np.divmod(keys, shape[2])
+    blocks = np.stack([*np.divmod(rest, shape[1]), z], axis=1)
+    centers = lattice.points(_BLOCK * (2 * blocks + 1))
+    half_diagonal = 0.5 * _BLOCK * float(np.linalg.norm(lattice.size))
+    is_sure = function.clearance(centers) > half_diagonal * (1 + 1e-9)
+    negative = (function.values(centers) <= 0)[index]
+    open_rows = np.flatnonzero(~is_sure[index])
+    negative[open_rows] = function.values(lattice.points(2 * cells[open_rows] + 1)) <= 0
+    return negative
 
 
 def _less_cells(elsewhere: Clearance, length: float) -> Clearance:
