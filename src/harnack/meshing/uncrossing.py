@@ -54,7 +54,7 @@ def uncrossed(surface: Surface, crossing: IntArray, length: float) -> tuple[Surf
     crossing: all faces that do (`intersecting_faces`).
     length: how far the surface may be moved by one change; vertices stay where they are, or go.
     """
-    if not 0 < len(crossing) <= _MOST:
+    if not 0 < len(crossing) <= _MOST or length <= 0:
         return surface, len(crossing)
     vertices, faces = surface.vertices, surface.faces
     is_gone, made, left = np.zeros(len(faces), np.bool_), [faces[:0]], 0
