@@ -380,19 +380,20 @@ def smoothed_within(
 
     where: middles and centers count."""
     after = smoothed(function, vertices, faces, walls)
+    rows = np.arange(len(faces))
     for _ in range(8):
-        far = _Far.of(function, after, faces, tolerance, walls, where)
-        off = far.is_beyond[far.edges].any(axis=1) | far.is_off
+        far = _Far.of(function, after, faces[rows], tolerance, walls, where)
+        off = np.zeros(len(faces), np.bool_)
+        off[rows] = far.is_beyond[far.edges].any(axis=1) | far.is_off
         back = np.zeros(len(vertices), np.bool_)
         for _ in range(2):  # with neighbors, so that this ends soon
             back[faces[off]] = True
             off = back[faces].any(axis=1)
-        back = np.flatnonzero(back)
-        back = back[(after[back] != vertices[back]).any(axis=1)]
-        if not len(back):
+        back &= (after != vertices).any(axis=1)
+        if not back.any():
             return after
-        after = after.copy()
-        after[back] = vertices[back]
+        after = np.where(back[:, None], vertices, after)
+        rows = np.flatnonzero(back[faces].any(axis=1))  # others are as they were
     return vertices
 
 
