@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 import numpy as np
@@ -151,26 +151,25 @@ def _are_apart(a: Corners, b: Corners, shared: list[list[Mask]], active: Mask) -
     """
     in_a = [shared[i][0] | shared[i][1] | shared[i][2] for i in range(3)]
     in_b = [shared[0][k] | shared[1][k] | shared[2][k] for k in range(3)]
-    kind = type(a[0].x)
-    count = sum((dr.select(one, kind(1), kind(0)) for one in in_a), kind(0))
+    real = cast("Any", type(a[0].x))
+    count: Real = sum((dr.select(one, real(1), real(0)) for one in in_a), real(0))
     of_b, of_a = _sides(a, b), _sides(b, a)
     by_plane = _on_one_side(of_b, in_b) | _on_one_side(of_a, in_a)
     by_plane &= count < 2.5
 
-    def closer(*_: Any) -> Mask:
-        of_b, of_a = _sides(a, b), _sides(b, a)
-        passes = _passes(a, b, of_b, in_b) | _passes(b, a, of_a, in_a)
-        turned_a, turned_b = _turned(a, in_a, count), _turned(b, in_b, count)
-        return ((count < 1.5) & ~passes) | _beside(turned_a, turned_b, count)
+    def by_edges_or_line(*numbers: Any) -> Mask:
+        one, other = cast("tuple[Corners, Corners]", (numbers[:3], numbers[3:6]))
+        in_one, in_other, common = list(numbers[6:9]), list(numbers[9:12]), numbers[12]
+        passes = _passes(one, other, _sides(one, other), in_other)
+        passes |= _passes(other, one, _sides(other, one), in_one)
+        turned = _turned(one, in_one, common), _turned(other, in_other, common)
+        return ((common < 1.5) & ~passes) | _beside(*turned, common)
 
-    flat = [*a, *b, *in_a, *in_b, count]
+    def is_open(*numbers: Any) -> Mask:
+        return numbers[12] < 0
 
-    def wrapped(*_: Any):
-        nonlocal a, b, in_a, in_b, count
-        a, b, in_a, in_b, count = _[:3], _[3:6], _[6:9], _[9:12], _[12]
-        return closer()
-
-    return by_plane | dr.if_stmt(tuple(flat), active & ~by_plane, wrapped, lambda *_: kind(0) != 0)
+    numbers = (*a, *b, *in_a, *in_b, count)
+    return by_plane | dr.if_stmt(numbers, active & ~by_plane, by_edges_or_line, is_open)
 
 
 def _sides(plane: Corners, of: Corners) -> list[tuple[Mask, Mask]]:

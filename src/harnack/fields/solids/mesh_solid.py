@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import copy
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -201,7 +201,7 @@ _KEPT: ContextVar[dict[tuple[int, ...], tuple[Vec3, Sample]] | None] = ContextVa
 
 
 @contextmanager
-def shared_samples() -> Iterator[None]:
+def shared_samples() -> Generator[None]:
     """Samples of a mesh at the same points are recorded once: parts of a solid that are made of the
     same mesh, such as its shell and a lattice in it, look for the nearest triangle once.
 
