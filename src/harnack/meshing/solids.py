@@ -424,7 +424,7 @@ _MOST_ATTEMPTS = 3
 _SMALLER = 0.6
 # Where parts were cut by each other, slivers may pass through their neighbors by rounding: what may
 # be moved to leave them out, in tolerances, in the order in which it is tried.
-_SLIVERS_WITHIN = (1e-4, 1e-2, 0.0)
+_SLIVERS_WITHIN = (1e-3, 1e-4, 0.0)
 # Room around what has an extent, as a part of its size.
 _MARGIN = 0.01
 
