@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from harnack.backend import BoolArray, FloatArray
 from harnack.meshing.edges import Edges, IntArray, boundary_edges, directed_edges, dots, lengths
+from harnack.meshing.near_faces import near_pairs
 from harnack.meshing.samples import LevelFunction
 
 if TYPE_CHECKING:
@@ -122,6 +123,8 @@ def _exact_turns(points: Any) -> Any:
 
 _EDGES = ((0, 1), (1, 2), (2, 0))
 _PAIRS_AT_ONCE = 1 << 18
+# Of more triangles than this, a kernel that takes a quarter of a second to record finds the pairs.
+_MANY = 50_000
 # So many triangles of a size are compared with each other at once.
 _MOST_AT_ONCE = 1 << 19
 
@@ -152,7 +155,11 @@ def intersecting_faces(
     among: (m,) mask; pairs of which neither is chosen are not looked at.
     """
     found: list[IntArray] = []
-    near = _near_pairs(vertices[faces], among)
+    many = len(faces) if among is None else int(among.sum())
+    if many > _MANY:
+        near = near_pairs(vertices, faces, among)
+    else:
+        near = _near_pairs(vertices[faces], among)
     for start in range(0, len(near), _PAIRS_AT_ONCE):
         pairs = near[start : start + _PAIRS_AT_ONCE]
         pairs = pairs[~_are_apart(vertices, faces, pairs)]
@@ -299,7 +306,11 @@ class LocalError(MeshingError):
 
 
 class CrossingError(LocalError):
-    """Triangles that pass through each other."""
+    """Triangles that pass through each other, by index; places: their centers."""
+
+    def __init__(self, message: str, places: FloatArray, faces: IntArray) -> None:
+        super().__init__(message, places)
+        self.faces = faces
 
 
 class TooLargeError(MeshingError):
@@ -356,7 +367,7 @@ def check_apart(vertices: FloatArray, faces: IntArray) -> None:
     decided exactly.
 
     Raises:
-        MeshingError: so; a CrossingError with the centers of these faces.
+        MeshingError: so; a CrossingError with these faces.
     """
     if not np.isfinite(vertices).all():
         raise MeshingError("vertices of the mesh are no numbers: choose another level or `clip`")
@@ -367,6 +378,7 @@ def check_apart(vertices: FloatArray, faces: IntArray) -> None:
             f"{len(crossing):,} of {len(faces):,} triangles pass through each other, such as near "
             f"{_point(places[0])}: choose a smaller `spacing` or a larger `tolerance`",
             places,
+            crossing,
         )
 
 

@@ -12,14 +12,15 @@ from harnack.backend import BoolArray, FloatArray
 from harnack.geometry import Ball, Box, ConvexHull, HalfSpace, Intersection
 from harnack.geometry.outlines import Outline, for_clipper
 from harnack.meshing.checks import (
+    CrossingError,
     LocalError,
     MeshingError,
-    check_apart,
     check_manifold,
     intersecting_faces,
 )
-from harnack.meshing.edges import IntArray
+from harnack.meshing.edges import IntArray, numbered
 from harnack.meshing.lattice_surface import Surface
+from harnack.meshing.uncrossing import made_apart
 
 if TYPE_CHECKING:
     from manifold3d import CrossSection, Manifold
@@ -229,6 +230,8 @@ _LARGEST = 2.0**36
 _MOST_COARSE = 1e4
 # Where the snapped mesh does not pass its checks, it is simplified within these numbers of steps.
 _SIMPLER = (4, 32)
+# And mended, where triangles cross, within this number.
+_MENDED = 32
 
 
 class ClosedMesh(trimesh.Trimesh):
@@ -292,28 +295,31 @@ def _step(x: FloatArray) -> float:
 
 
 def _snapped(mesh: trimesh.Trimesh, step: float) -> trimesh.Trimesh:
-    """The mesh with vertices on the grid; where that does not pass its checks, simplified."""
+    """The mesh with vertices on the grid; where that does not pass its checks, mended there or
+    simplified."""
     given = Surface(np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64))
     x, faces, kept = _contracted(given, step)
+    is_plain = not cast("Any", mesh.visual).defined
     try:
-        _check(x, faces[kept], given)
+        mended = _mended(Surface(x, faces[kept]), given, _MENDED * step if is_plain else 0.0)
     except LocalError as error:
-        simpler = None if cast("Any", mesh.visual).defined else _simpler(given, step)
-        if simpler is None:
+        mended = _simpler(given, step) if is_plain else None
+        if mended is None:
             x, y, z = error.places[0]
             raise MeshingError(
                 f"in a file, where points are {step:.2g} from each other at the least, parts touch "
                 f"or pass through each other, such as near ({x:.4g}, {y:.4g}, {z:.4g}): move them "
                 "apart or make them overlap, or choose another `tolerance`"
             ) from error
-        return simpler
+    if mended is not None:
+        return trimesh.Trimesh(mended.vertices, mended.faces, process=False, validate=False)
     mesh.vertices, mesh.faces = x, faces
     mesh.update_faces(kept)
     mesh.remove_unreferenced_vertices()
     return mesh
 
 
-def _simpler(given: Surface, step: float) -> trimesh.Trimesh | None:
+def _simpler(given: Surface, step: float) -> Surface | None:
     """Without slivers, simplified by manifold3d; None if that does not help either."""
     for steps in _SIMPLER:
         simpler = surface_of(manifold_of(given).simplify(steps * step))
@@ -322,28 +328,42 @@ def _simpler(given: Surface, step: float) -> trimesh.Trimesh | None:
             return None
         made = Surface.of(x, faces[kept])
         try:
-            _check(made.vertices, made.faces, given)
+            return _mended(made, given, _MENDED * step) or made
         except LocalError:
             continue
-        return trimesh.Trimesh(made.vertices, made.faces, process=False, validate=False)
     return None
 
 
 def _contracted(surface: Surface, step: float) -> tuple[FloatArray, IntArray, BoolArray]:
     """Vertices on the grid, faces between the first of those that are one point, and which faces
     are left."""
-    x = np.round(surface.vertices / step) * step
-    _, first, place = np.unique(x, axis=0, return_index=True, return_inverse=True)
-    faces = first[place.reshape(-1)][surface.faces]
+    grid = np.round(surface.vertices / step)
+    x = grid * step
+    # Points that are one, by their coordinates one after the other.
+    place = np.zeros(len(x), np.int64)
+    for one in (grid - grid.min(axis=0)).astype(np.int64).T:
+        _, place, _ = numbered(place * (int(one.max()) + 1) + one)
+    first = np.empty(len(x), np.int64)
+    first[place[::-1]] = np.arange(len(x))[::-1]
+    faces = first[place][surface.faces]
     return x, faces, (faces != np.roll(faces, 1, axis=1)).all(axis=1)
 
 
-def _check(x: FloatArray, faces: IntArray, given: Surface) -> None:
-    """Raise a LocalError where faces are not closed, or pass through each other while those that
-    were given, such as the triangles of a mesh that was repaired, do not."""
-    check_manifold(faces, x)
+def _mended(made: Surface, given: Surface, length: float) -> Surface | None:
+    """A surface mended where triangles cross, moved by no more than a length; None if none do, or
+    if that does not help and those that were given, such as of a mesh that was repaired, do too.
+
+    Raises:
+        LocalError: it is not closed, or triangles cross.
+    """
+    check_manifold(made.faces, made.vertices)
     try:
-        check_apart(x, faces)
-    except LocalError:
+        apart = made_apart(made, length)
+    except CrossingError:
         if not len(intersecting_faces(given.vertices, given.faces)):
             raise
+        return None
+    if apart is made:
+        return None
+    check_manifold(apart.faces, apart.vertices)
+    return apart

@@ -21,6 +21,7 @@ __all__ = [
     "dots",
     "edge_keys",
     "lengths",
+    "numbered",
 ]
 
 
@@ -50,7 +51,7 @@ class Edges:
     def of(cls, pairs: IntArray) -> Edges:
         """The edges that pairs (n, 2) of points are, in either order."""
         count = int(pairs.max(initial=-1)) + 1
-        keys, index, uses = _numbered(edge_keys(pairs, count))
+        keys, index, uses = numbered(edge_keys(pairs, count))
         return cls(np.stack(np.divmod(keys, max(count, 1)), axis=1), index, uses)
 
 
@@ -79,7 +80,7 @@ def distinct(keys: IntArray) -> IntArray:
     return keys[np.flatnonzero(np.diff(keys, prepend=keys[:1] - 1))]
 
 
-def _numbered(keys: IntArray) -> tuple[IntArray, IntArray, IntArray]:
+def numbered(keys: IntArray) -> tuple[IntArray, IntArray, IntArray]:
     """Numbers (n,) that are not negative, each once and in order (k,), for each given one its place
     among them (n,), and how often each was given (k,): `np.unique`, at a third of its time."""
     bits = len(keys).bit_length()

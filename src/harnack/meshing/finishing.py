@@ -24,6 +24,7 @@ from harnack.meshing.edges import (
 )
 from harnack.meshing.lattice_surface import Surface
 from harnack.meshing.samples import LevelFunction
+from harnack.meshing.uncrossing import made_apart
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -160,8 +161,8 @@ def _hulls(surface: Surface, radius: float, tolerance: float, why: str) -> Surfa
 
 # The cosine of the angle between normals from which on an edge is a crease.
 _CREASE = math.cos(math.radians(30))
-# What simplification may move a surface by, as parts of the tolerance.
-_SIMPLER = (0.4, 0.2, 0.1)
+# What simplification may move a surface by, and mending it then, as parts of the tolerance.
+_SIMPLER, _MENDED = (0.4, 0.2, 0.1), 0.05
 
 
 def check_options(tolerance: Any, spacing: Any, thickness: Any, seed: Any, most: Any) -> None:
@@ -205,8 +206,11 @@ def simplified(
     """A closed surface with fewer triangles, or as it is where that cannot be.
 
     manifold3d's simplification: vertices are a part of those before. It moves the surface by less
-    than a part of the tolerance, half of which is for all else, and what does not pass the check is
-    done with a smaller part.
+    than a part of the tolerance, half of which is for all else. Where triangles then pass through
+    each other they are mended; what cannot be, or does not pass the check, is done with a smaller
+    part.
+
+    check: of a surface of which no triangles pass through each other.
     """
     facts = {"triangles_before_simplification": len(surface.faces)}
     solid = manifold_of(surface)
@@ -215,6 +219,7 @@ def simplified(
         if not 0 < len(made.faces) < len(surface.faces):
             continue
         try:
+            made = made_apart(made, _MENDED * tolerance)
             check(made)
         except MeshingError:
             continue

@@ -8,7 +8,6 @@ tetrahedron is cut by one triangle or quadrilateral, and signs at its corners al
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
@@ -17,7 +16,7 @@ import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
 from harnack.meshing.checks import MeshingError, TooLargeError, singular_vertices
-from harnack.meshing.edges import IntArray, lengths
+from harnack.meshing.edges import IntArray, lengths, numbered
 from harnack.meshing.isotopy import Isotopy, isotopy_of
 from harnack.meshing.lattice import Lattice, distinct_rows
 from harnack.meshing.marching_tetrahedra import (
@@ -40,6 +39,7 @@ __all__ = [
     "check_nothing_missed",
     "check_size",
     "closed_surface",
+    "cut_where_far",
     "open_surface",
 ]
 
@@ -174,6 +174,8 @@ def check_size(
 _SNAPPED = 0.25
 # So many cells around what matters are made as if they did.
 _BORDER = 2.0
+# So many cells along an edge of a block.
+_BLOCK = 8
 _MOST_ROUNDS = 20
 
 
@@ -266,7 +268,7 @@ def closed_surface(
     outer = lattice.outer_cells()
     if does_matter is not None:
         outer = outer[does_matter[tuple(outer.T)]]
-    outer = outer[function.values(lattice.points(2 * outer + 1)) <= 0]
+    outer = outer[_are_negative(function, lattice, outer)]
     coordinates, corners = lattice.tetrahedra(distinct_rows(np.concatenate([cells, outer])))
     points = lattice.points(coordinates)
     report(f"{len(points):,} points, {len(corners):,} tetrahedra")
@@ -294,19 +296,53 @@ def closed_surface(
     if len(rest):
         check_size(function, vertices, rest, tolerance)
         vertices = smoothed(function, vertices, rest, None)
-        inside = _Inside(
-            function.field,
-            function.level,
-            function,
-            lattice,
-            does_matter,
-            most_faces=function.most_faces,
-            uploads=function.uploads,
-        )
-        vertices, rest = refined(inside, vertices, rest, tolerance, None, report)
-        vertices = smoothed_within(inside, vertices, rest, None, tolerance)
+        counts = _inside(lattice, does_matter)
+        vertices, rest = refined(function, vertices, rest, tolerance, None, report, counts)
+        vertices = smoothed_within(function, vertices, rest, None, tolerance, counts)
     faces = np.concatenate([rest, *caps])
     return Surface.of(vertices, faces) if len(faces) else Surface(np.zeros((0, 3)), faces)
+
+
+def cut_where_far(
+    function: LevelFunction, surface: Surface, farthest: float, times: int
+) -> Surface:
+    """Faces whose center is farther than that from the level, as across a crease, cut into three at
+    a point on it; so are the new ones, a few times. All edges stay."""
+    vertices, faces = surface.vertices, surface.faces
+    asked = np.arange(len(faces))
+    for _ in range(times):
+        corner = vertices[faces[asked]]
+        center = corner.mean(axis=1)
+        samples = function.at(center)
+        far = np.flatnonzero(samples.distance > farthest)
+        if not len(far):
+            break
+        span = 0.5 * lengths(corner[far, 1] - corner[far, 0])
+        moved = newton(function, center[far], samples.some(far), span, None)
+        rows, inner = asked[far], len(vertices) + np.arange(len(far))
+        a, b, c = faces[rows].T
+        vertices = np.concatenate([vertices, moved])
+        fans = [np.stack([*ends, inner], axis=1) for ends in ((a, b), (b, c), (c, a))]
+        faces = np.concatenate([np.delete(faces, rows, axis=0), *fans])
+        asked = np.arange(len(faces) - 3 * len(rows), len(faces))
+    return Surface(vertices, faces)
+
+
+def _are_negative(function: LevelFunction, lattice: Lattice, cells: IntArray) -> BoolArray:
+    """(k,) whether the centers of cells (k, 3) are negative: as those of blocks of cells, where it
+    is proved that the level is not in the block."""
+    shape = lattice.counts // _BLOCK + 1
+    x, y, z = (cells // _BLOCK).T
+    keys, index, _ = numbered((x * shape[1] + y) * shape[2] + z)
+    rest, z = np.divmod(keys, shape[2])
+    blocks = np.stack([*np.divmod(rest, shape[1]), z], axis=1)
+    centers = lattice.points(_BLOCK * (2 * blocks + 1))
+    half_diagonal = 0.5 * _BLOCK * float(np.linalg.norm(lattice.size))
+    is_sure = function.clearance(centers) > half_diagonal * (1 + 1e-9)
+    negative = (function.values(centers) <= 0)[index]
+    open_rows = np.flatnonzero(~is_sure[index])
+    negative[open_rows] = function.values(lattice.points(2 * cells[open_rows] + 1)) <= 0
+    return negative
 
 
 def _less_cells(elsewhere: Clearance, length: float) -> Clearance:
@@ -340,33 +376,25 @@ def _check_nothing_missed(
     check_nothing_missed(function, points, samples, is_beside, surface, size, box, elsewhere)
 
 
-@dataclass
-class _Inside(LevelFunction):
-    """A function that is on the level wherever it is within one and a half cells of the box, or in
-    or beside cells that do not matter (counts).
+def _inside(lattice: Lattice, does_matter: BoolArray | None) -> Callable[[FloatArray], BoolArray]:
+    """Which points are farther than one and a half cells from the box, and neither in nor beside
+    cells that do not matter (counts).
 
-    So nothing is cut there. Triangles that end in the outermost cells would be cut again and again:
-    the edge they end with stays as it is, and their centers are no deeper than that.
+    Triangles that end in the outermost cells would be cut again and again: the edge they end with
+    stays as it is, and their centers are no deeper than that.
     """
+    lower, upper = lattice.lower + 1.5 * lattice.size, lattice.upper - 1.5 * lattice.size
+    deep = None if does_matter is None else lattice.deep(does_matter)
 
-    function: LevelFunction
-    lattice: Lattice
-    does_matter: BoolArray | None
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._is_deep = None if self.does_matter is None else self.lattice.deep(self.does_matter)
-
-    def at(self, points: FloatArray) -> Samples:
-        samples = self.function.at(points)
-        lower = self.lattice.lower + 1.5 * self.lattice.size
-        upper = self.lattice.upper - 1.5 * self.lattice.size
-        is_inside = np.ones(len(points), np.bool_)
+    def counts(points: FloatArray) -> BoolArray:
+        found = np.ones(len(points), np.bool_)
         for x, low, high in zip(points.T, lower, upper, strict=True):
-            is_inside &= (x >= low) & (x <= high)
-        if self._is_deep is not None:
-            is_inside &= self._is_deep[tuple(self.lattice.cells_of(points).T)]
-        return dataclasses.replace(samples, value=np.where(is_inside, samples.value, 0.0))
+            found &= (x >= low) & (x <= high)
+        if deep is not None:
+            found &= deep[tuple(lattice.cells_of(points).T)]
+        return found
+
+    return counts
 
 
 def _wall_faces(

@@ -189,11 +189,11 @@ def mesh(
         if solid:
             made.check_level(one)
         check_manifold(one.faces)
-        check_apart(one.vertices, one.faces)
 
     if not made.is_checked:
         report("checking")
         check(surface)
+        check_apart(surface.vertices, surface.faces)
     if simplify:
         report("simplifying")
         surface, more = simplified(surface, tolerance * made.size, check)
@@ -424,7 +424,6 @@ def _solid(
         asked.report("checking")
         check_level(made, size)
         check_manifold(made.faces, made.vertices)
-        check_apart(made.vertices, made.faces)
 
     made = mesh_solid(
         cast("Solid", region.field),

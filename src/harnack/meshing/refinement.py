@@ -22,6 +22,8 @@ from harnack.meshing.samples import LevelFunction, Samples
 __all__ = ["far_places", "improved", "refined", "smoothed", "smoothed_within", "split_faces"]
 
 Walls = tuple[FloatArray, FloatArray] | None
+# Which points (k, 3) count; None for all.
+Where = Callable[[FloatArray], BoolArray] | None
 # Across a crease normals turn by at least this angle, and by this part of it between two points.
 _BENT, _AT_ONCE = math.radians(20), 0.75
 # A vertex this near, in parts of the tolerance, counts as on the surface.
@@ -49,10 +51,14 @@ def refined(
     tolerance: float,
     walls: Walls,
     report: Callable[[str], None],
+    where: Where = None,
 ) -> tuple[FloatArray, IntArray]:
     """Cut edges at their middles, and move these onto the surface, until the middles of all edges
     but those of the boundary, and the centers of all faces, are within `tolerance` of it; or until
     that is seen not to succeed, which the caller has to check (`check_near_level`).
+
+    where: middles and centers count. What is cut beside these places is moved onto the surface as
+        well: else its edges, which end off the surface, would be cut again and again.
 
     Raises:
         TooLargeError: it takes more triangles than the function allows.
@@ -60,7 +66,7 @@ def refined(
     least, before = math.inf, 0
     for round_number in range(_MOST_ROUNDS):
         report(f"refining, round {round_number + 1}: {len(faces):,} triangles")
-        far = _Far.of(function, vertices, faces, tolerance, walls)
+        far = _Far.of(function, vertices, faces, tolerance, walls, where)
         marked = far.marked
         if not marked.any() and not far.cuts_off.any():
             break
@@ -199,7 +205,7 @@ def far_places(
     function: LevelFunction, vertices: FloatArray, faces: IntArray, tolerance: float
 ) -> FloatArray:
     """Middles (k, 3) of the edges that `refined` would still cut."""
-    far = _Far.of(function, vertices, faces, tolerance, None)
+    far = _Far.of(function, vertices, faces, tolerance, None, None)
     return far.middle[far.marked]
 
 
@@ -209,7 +215,8 @@ class _Far:
 
     edges: (m, 3) of the faces. ends: (k, 2) vertices, middle: (k, 3), span: (k,) and marked: (k,)
         of edges.
-    samples: at the middles. cuts_off: (m,) faces whose center alone is beyond, at a corner.
+    samples: at the middles; is_beyond: (k,) those that count and are beyond the tolerance.
+    is_off: (m,) faces of whose centers that holds. cuts_off: (m,) of these at a corner alone.
     """
 
     edges: IntArray
@@ -217,6 +224,8 @@ class _Far:
     middle: FloatArray
     span: FloatArray
     samples: Samples
+    is_beyond: BoolArray
+    is_off: BoolArray
     marked: BoolArray
     cuts_off: BoolArray
 
@@ -228,6 +237,7 @@ class _Far:
         faces: IntArray,
         tolerance: float,
         walls: Walls,
+        where: Where,
     ) -> _Far:
         """Those whose middle, or the center of a face beside them, is beyond the tolerance."""
         ends, edges, is_boundary = _edges(faces)
@@ -235,10 +245,15 @@ class _Far:
             is_boundary = np.zeros_like(is_boundary)
         middle = 0.5 * (vertices[ends[:, 0]] + vertices[ends[:, 1]])
         span = lengths(vertices[ends[:, 0]] - vertices[ends[:, 1]])
+        center = vertices[faces].mean(axis=1)
         samples = function.at(middle)
-        marked = samples.distance > tolerance
-        off = function.at(vertices[faces].mean(axis=1)).distance > tolerance
-        off &= span[edges].max(axis=1) > _SHORTEST * tolerance
+        is_beyond = samples.distance > tolerance
+        is_off = function.at(center).distance > tolerance
+        if where is not None:
+            is_beyond &= where(middle)
+            is_off &= where(center)
+        marked = is_beyond.copy()
+        off = is_off & (span[edges].max(axis=1) > _SHORTEST * tolerance)
         cuts_off = np.zeros(len(faces), np.bool_)
         lone = np.flatnonzero(off & ~marked[edges].any(axis=1))
         if function.field.has_creases:
@@ -249,7 +264,7 @@ class _Far:
         worst = edges[np.arange(len(faces)), free.argmax(axis=1)]
         marked[worst[off]] = True
         marked &= ~is_boundary & (span > _SHORTEST * tolerance)
-        return cls(edges, ends, middle, span, samples, marked, cuts_off)
+        return cls(edges, ends, middle, span, samples, is_beyond, is_off, marked, cuts_off)
 
 
 def _turns(function: LevelFunction, corner: FloatArray) -> BoolArray:
@@ -358,24 +373,27 @@ def smoothed_within(
     faces: IntArray,
     walls: Walls,
     tolerance: float,
+    where: Where = None,
 ) -> FloatArray:
     """As `smoothed`, but for vertices of faces whose middles of edges or center would get farther
-    from the surface than `tolerance` by that, as beside a crease."""
+    from the surface than `tolerance` by that, as beside a crease.
+
+    where: middles and centers count."""
     after = smoothed(function, vertices, faces, walls)
+    rows = np.arange(len(faces))
     for _ in range(8):
-        far = _Far.of(function, after, faces, tolerance, walls)
-        off = (far.samples.distance > tolerance)[far.edges].any(axis=1)
-        off |= function.at(after[faces].mean(axis=1)).distance > tolerance
+        far = _Far.of(function, after, faces[rows], tolerance, walls, where)
+        off = np.zeros(len(faces), np.bool_)
+        off[rows] = far.is_beyond[far.edges].any(axis=1) | far.is_off
         back = np.zeros(len(vertices), np.bool_)
         for _ in range(2):  # with neighbors, so that this ends soon
             back[faces[off]] = True
             off = back[faces].any(axis=1)
-        back = np.flatnonzero(back)
-        back = back[(after[back] != vertices[back]).any(axis=1)]
-        if not len(back):
+        back &= (after != vertices).any(axis=1)
+        if not back.any():
             return after
-        after = after.copy()
-        after[back] = vertices[back]
+        after = np.where(back[:, None], vertices, after)
+        rows = np.flatnonzero(back[faces].any(axis=1))  # others are as they were
     return vertices
 
 

@@ -15,6 +15,7 @@ from harnack.backend.elementary import length
 from harnack.enclosures import Gaps, Slopes, TargetLevels, choose_proofs, longest_step
 from harnack.fields.clearance import distance_below
 from harnack.fields.points import in_batches
+from harnack.fields.solids.mesh_solid import shared_samples
 from harnack.meshing.edges import lengths
 
 if TYPE_CHECKING:
@@ -117,8 +118,12 @@ class LevelFunction:
 
     def values(self, points: FloatArray) -> FloatArray:
         """(n,) f - level alone."""
-        (value,) = self._in_batches(points, lambda p: (self._prepared.evaluate(p).value,))
-        return self.wrapped(value)
+
+        def value(p: Vec3) -> tuple[Real]:
+            with shared_samples():
+                return (self._prepared.evaluate(p).value,)
+
+        return self.wrapped(self._in_batches(points, value)[0])
 
     def slopes(self, points: FloatArray, radius: FloatArray) -> tuple[Samples, FloatArray]:
         """The function at points (n, 3), its reach left out, and by how much at most its gradient
@@ -145,7 +150,8 @@ class LevelFunction:
         return self._in_batches(points, bound)[0]
 
     def _evaluated(self, p: Vec3) -> tuple[Real, Vec3, Real]:
-        sample = self._prepared.evaluate(p)
+        with shared_samples():
+            sample = self._prepared.evaluate(p)
         if self.period is None:
             return sample.value, sample.gradient, self._backend.Float(0)
         steepest = length(sample.gradient) + sample.gradient_error

@@ -30,7 +30,7 @@ from harnack.fields.solids.region import solid as solid_of
 from harnack.fields.solids.swept import Extruded, Revolved
 from harnack.fields.solids.thread import Thread
 from harnack.geometry import Ball, Box, Intersection, Volume
-from harnack.meshing.checks import CrossingError, LocalError, MeshingError, intersecting_faces
+from harnack.meshing.checks import CrossingError, LocalError, MeshingError
 from harnack.meshing.closed_mesh import (
     box_manifold,
     extruded_manifold,
@@ -41,9 +41,15 @@ from harnack.meshing.closed_mesh import (
     volume_manifold,
 )
 from harnack.meshing.lattice import Lattice
-from harnack.meshing.lattice_surface import MissedError, Surface, closed_surface
+from harnack.meshing.lattice_surface import (
+    MissedError,
+    Surface,
+    closed_surface,
+    cut_where_far,
+)
 from harnack.meshing.samples import CELLS_PER_WAVE, LevelFunction, Samples, Uploads
 from harnack.meshing.thread_mesh import thread_manifold
+from harnack.meshing.uncrossing import made_apart
 
 if TYPE_CHECKING:
     from manifold3d import Manifold
@@ -64,8 +70,11 @@ __all__ = [
 _CELLS_OF_OFFSET, _SECANTS = 6.0, 2
 # Where other parts leave nothing is looked for in lattices of more cells than this.
 _MANY_CELLS = 100_000
-# How far joining their triangles may move them, in tolerances: the first that does no harm.
-_JOINED_WITHIN = (0.5, 0.25, 0.1)
+# How far joining their triangles may move them, in tolerances: the first that does no harm; and how
+# far mending may, which is tried with the least.
+_JOINED_WITHIN, _MENDED_WITHIN = (0.5, 0.25, 0.1), 0.5
+# Triangles of them are cut in three where their centers are farther off, in tolerances; so often.
+_FAR_OFF, _TIMES_CUT = 1.8, 2
 
 # Meshes the level set of an angle, which ends at its curve: field, level -> vertices and faces.
 AngleMesher = Callable[[SolidAngle, float], Surface]
@@ -279,10 +288,10 @@ class RegionMesher:
 
         Offsets of meshes have creases wherever the mesh has, too many for cells to be refined
         beside them. So cells are small at once, and of f, a distance, roots are linear along their
-        edges but at creases. Then triangles that are nearly in a plane are joined, unless they pass
-        through each other by that. Parts thinner than a cell, such as the tip of a knife edge, may
-        be left out: points of them are less than a cell from the
-        level.
+        edges but at creases. Then triangles that are nearly in a plane are joined, those that lie
+        across a crease are cut, and those that pass through each other are mended. Parts thinner
+        than a cell, such as the tip of a knife edge, may be left out: points of them are less than
+        a cell from the level.
         """
         lower, upper = (np.array(end) for end in _finite_hull(solid, level))
         if not (lower < upper).all():
@@ -292,16 +301,19 @@ class RegionMesher:
         function = dataclasses.replace(self._function(solid, level), secants=_SECANTS)
         self.report(f"level {level:g} of a mesh in cells of {cells:.3g}")
         lattice = Lattice.filling(lower - cells, upper + cells, cells, layers=2)
-        made = manifold_of(
-            closed_surface(function, lattice, self.tolerance, self.report, as_cut=True)
-        )
-        self.evaluations += function.evaluations
+        made = closed_surface(function, lattice, self.tolerance, self.report, as_cut=True)
+        whole = manifold_of(made)
         self.levels += 1
         for share in _JOINED_WITHIN:
-            simpler = surface_of(made.simplify(share * self.tolerance))
-            if not len(intersecting_faces(simpler.vertices, simpler.faces)):
-                return manifold_of(simpler)
-        return made
+            joined = surface_of(whole.simplify(share * self.tolerance))
+            joined = cut_where_far(function, joined, _FAR_OFF * self.tolerance, _TIMES_CUT)
+            try:
+                made = made_apart(joined, _MENDED_WITHIN * self.tolerance)
+            except CrossingError:
+                continue
+            break
+        self.evaluations += function.evaluations
+        return manifold_of(made)
 
     def _image(self, solid: AffineImage, level: float) -> Manifold:
         """Of a solid under an affine map: the image of its mesh."""
@@ -412,7 +424,7 @@ _MOST_ATTEMPTS = 3
 _SMALLER = 0.6
 # Where parts were cut by each other, slivers may pass through their neighbors by rounding: what may
 # be moved to leave them out, in tolerances, in the order in which it is tried.
-_SLIVERS_WITHIN = (1e-2, 1e-4, 0.0)
+_SLIVERS_WITHIN = (1e-3, 1e-4, 0.0)
 # Room around what has an extent, as a part of its size.
 _MARGIN = 0.01
 
@@ -487,8 +499,9 @@ def mesh_solid(
 
     volume: None for all of space. tolerance: a part of the size. most_faces: of a level set.
     angle_mesher: given a tolerance and a spacing, both lengths, how to mesh level sets of angles.
-    check: of the surface, given the size; where it fails in known places, smaller cells are tried,
-        and half the tolerance: beside a thin part triangles within it may be anywhere.
+    check: of the surface, of which no triangles pass through each other, given the size; where it
+        fails in known places, smaller cells are tried, and half the tolerance: beside a thin part
+        triangles within it may be anywhere.
 
     Raises:
         MeshingError: it has no bounds; it is empty; a part cannot be meshed.
@@ -506,7 +519,8 @@ def mesh_solid(
             uploads=uploads,
         )  # fmt: skip
         try:
-            made = _checked(_put_together(mesher, solid, level, volume), error, size, check)
+            made = _apart(_put_together(mesher, solid, level, volume), error)
+            check(made, size)
             break
         except (MissedError, LocalError) as wrong:
             attempts -= 1
@@ -520,16 +534,12 @@ def mesh_solid(
     return SolidMesh(made, min(cells, mesher.finest), mesher.evaluations, mesher.levels, size)
 
 
-def _checked(
-    parts: Surface | _Joined,
-    tolerance: float,
-    size: float,
-    check: Callable[[Surface, float], None],
-) -> Surface:
-    """The surface that passes the check; of parts put together without slivers.
+def _apart(parts: Surface | _Joined, tolerance: float) -> Surface:
+    """The surface, of which no triangles pass through each other; of parts put together mended, or
+    without slivers.
 
     Raises:
-        MeshingError: it is empty; as the check does.
+        MeshingError: it is empty; a CrossingError where that does not help.
     """
     raised: CrossingError | None = None
     for share in _SLIVERS_WITHIN if isinstance(parts, _Joined) else (0.0,):
@@ -537,11 +547,9 @@ def _checked(
         if not len(one.faces):
             raise MeshingError("the solid is empty: no point of the box is inside")
         try:
-            check(one, size)
+            return made_apart(one, _MENDED_WITHIN * tolerance)
         except CrossingError as error:
             raised = error
-        else:
-            return one
     raise cast("CrossingError", raised)
 
 

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import copy
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -172,7 +174,13 @@ class MeshSolid(Solid):
         return made
 
     def evaluate(self, p: Vec3) -> Sample:
-        return _on(self, p).sample(p)
+        buffers, kept = _on(self, p), _KEPT.get()
+        if kept is None or dr.flag(dr.JitFlag.SymbolicScope):
+            return buffers.sample(p)
+        key = id(buffers), p.x.index, p.y.index, p.z.index
+        if key not in kept:
+            kept[key] = p, buffers.sample(p)  # with p, so that its indices name nothing else
+        return kept[key][1]
 
     def look(self, path: Ray, t: Real, ahead: Real, back: Real) -> Look:
         del ahead, back
@@ -185,6 +193,25 @@ class MeshSolid(Solid):
         if not is_jet(x, type(self).__name__):
             return self.differentiable_value(backend_of(x).Array3f(x, y, z))
         return jet_of_signed_distance(self, x, y, z)
+
+
+_KEPT: ContextVar[dict[tuple[int, ...], tuple[Vec3, Sample]] | None] = ContextVar(
+    "kept samples", default=None
+)
+
+
+@contextmanager
+def shared_samples() -> Generator[None]:
+    """Samples of a mesh at the same points are recorded once: parts of a solid that are made of the
+    same mesh, such as its shell and a lattice in it, look for the nearest triangle once.
+
+    Not while loops are recorded, whose numbers are known within them alone.
+    """
+    token = _KEPT.set({})
+    try:
+        yield
+    finally:
+        _KEPT.reset(token)
 
 
 def _on(solid: Any, like: Any) -> _Buffers:

@@ -1,0 +1,282 @@
+"""Pairs of triangles that may meet: all others are proved apart, in floating point.
+
+Each triangle walks a tree of boxes. Of the few whose boxes overlap with its own, nearly all are
+apart by a sign that rounding cannot change; what is left is for exact arithmetic
+(`checks.intersecting_faces`).
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, cast
+
+import drjit as dr
+import numpy as np
+
+from harnack.backend import BoolArray, FloatArray, choose_backend, to_numpy
+from harnack.meshing.edges import IntArray
+from harnack.tree.hierarchy import (
+    NO_PRIMITIVE,
+    Node,
+    PackedTree,
+    State,
+    build_hierarchy,
+    for_each,
+    pack,
+    walk,
+)
+from harnack.tree.triangles import box_levels
+
+if TYPE_CHECKING:
+    from harnack.backend import Mask, Real, Vec3
+
+    Corners = tuple[Vec3, Vec3, Vec3]
+
+__all__ = ["near_pairs"]
+
+# Columns of a record behind the corners: the three vertices' numbers, and the face's.
+_VERTICES, _NUMBER, _CHOSEN = 9, 12, 13
+_LEAF_SIZE = 4
+_AT_ONCE = 1 << 20
+# Rounding of a product of three vectors and of two, of differences of coordinates, over the product
+# of their lengths: at most seven roundings of up to six terms, which are 1.16 times that product
+# together, and four of three terms, which are as much as it. So that is a third of what is allowed.
+_ROUNDING = 16 * 2.0**-52
+# What underflow may add, for coordinates of order one.
+_UNDERFLOW = 1e-290
+
+
+def near_pairs(vertices: FloatArray, faces: IntArray, among: BoolArray | None) -> IntArray:
+    """Pairs (k, 2) of faces (m, 3) that may have more in common than the vertices that they share,
+    each once; all others are proved not to (`_are_apart`).
+
+    vertices: (n, 3), finite.
+    among: (m,) mask; pairs of which neither is chosen are left out.
+    """
+    chosen = np.ones(len(faces), np.bool_) if among is None else among
+    rows = np.flatnonzero(chosen)
+    found = [np.zeros((0, 2), np.int64)]
+    if not len(rows):
+        return found[0]
+    largest = float(np.abs(vertices).max(initial=0.0))
+    # A power of two, so that nothing is rounded.
+    corners = (np.ldexp(vertices, -int(np.frexp(largest)[1])) if largest else vertices)[faces]
+    search = _Search.of(corners, faces, chosen)
+    rows = search.order[chosen[search.order]]
+    for start in range(0, len(rows), _AT_ONCE):
+        some = rows[start : start + _AT_ONCE]
+        counts, _ = search.partners(some, np.zeros(len(some)))
+        each = np.repeat(some, counts)
+        if len(each):
+            # 1, 2, ... for each face
+            place = np.arange(len(each)) - np.repeat(np.cumsum(counts) - counts, counts) + 1
+            found.append(np.column_stack([each, search.partners(each, place)[1]]))
+    return np.concatenate(found)
+
+
+@dataclass(frozen=True)
+class _Search:
+    """Faces in a tree. records: (m, 14); order: their indices leaf by leaf."""
+
+    tree: PackedTree
+    records: FloatArray
+    order: IntArray
+
+    @classmethod
+    def of(cls, corners: FloatArray, faces: IntArray, chosen: BoolArray) -> _Search:
+        lower, upper = corners.min(axis=1), corners.max(axis=1)
+        hierarchy = build_hierarchy(0.5 * (lower + upper), leaf_size=_LEAF_SIZE)
+        records = np.column_stack(
+            [corners.reshape(-1, 9), faces, np.arange(len(faces)), chosen]
+        ).astype(np.float64)
+        placed = hierarchy.gather(records)
+        placed[hierarchy.slots == NO_PRIMITIVE, _NUMBER] = -1.0
+        levels = box_levels(hierarchy, lower, upper)
+        order = hierarchy.slots[hierarchy.slots != NO_PRIMITIVE]
+        return cls(pack(choose_backend("double"), hierarchy, levels, placed), records, order)
+
+    def partners(self, rows: IntArray, place: Any) -> tuple[IntArray, IntArray]:
+        """Of some faces how many others may meet them, and which comes at a place (from 1 on) of
+        these, in the order of the tree."""
+        backend = self.tree.backend
+        real, vector = backend.Float, backend.Array3f
+        columns = [real(np.ascontiguousarray(one)) for one in self.records[rows].T]
+        one = (vector(*columns[:3]), vector(*columns[3:6]), vector(*columns[6:9]))
+        names, own = columns[_VERTICES:_NUMBER], columns[_NUMBER]
+        wanted = real(np.asarray(place, np.float64))
+        low = dr.minimum(dr.minimum(one[0], one[1]), one[2])
+        high = dr.maximum(dr.maximum(one[0], one[1]), one[2])
+
+        def visit(node: Node, state: State) -> tuple[Mask, State]:
+            down, up = vector(*node.head[:3]), vector(*node.head[3:6])
+            near = dr.all((down <= high) & (up >= low))
+            return near, for_each(node, near & node.is_leaf, compare, state)
+
+        def compare(row: list[Real], active: Mask, state: State) -> State:
+            other = (vector(*row[:3]), vector(*row[3:6]), vector(*row[6:9]))
+            number = row[_NUMBER]
+            # Two that are chosen meet once.
+            asked = active & ((number > own) | ((row[_CHOSEN] == 0) & (number >= 0)))
+            for k in range(3):
+                three = (other[0][k], other[1][k], other[2][k])
+                asked &= dr.minimum(dr.minimum(three[0], three[1]), three[2]) <= high[k]
+                asked &= dr.maximum(dr.maximum(three[0], three[1]), three[2]) >= low[k]
+            shared = [
+                [name == another for another in row[_VERTICES:_NUMBER]] for name in names
+            ]  # fmt: skip
+            apart = _are_apart(one, other, shared, asked)
+            count, found = state
+            met = asked & ~apart
+            count = dr.select(met, count + 1, count)
+            return count, dr.select(met & (count == wanted), number, found)
+
+        counts, found = walk(self.tree, visit, (real(0), real(-1)))
+        return to_numpy(counts).astype(np.int64), to_numpy(found).astype(np.int64)
+
+
+def _are_apart(a: Corners, b: Corners, shared: list[list[Mask]], active: Mask) -> Mask:
+    """Whether two triangles have nothing in common but the corners they share, proved.
+
+    shared: whether corner i of a is corner k of b.
+
+    - *A plane*: all corners of one that are not shared lie strictly on one side of the other's
+      plane (`_sides`). Points of the one on that plane then are combinations of shared corners.
+    - *Edges*, where at most one corner is shared: triangles in different planes meet in a segment
+      on the line of both planes, whose ends lie on edges that pass through the other triangle.
+      None does: each edge without a shared corner has its ends strictly on one side of the other's
+      plane, or passes two of its edges on different sides (`_passes`). In one plane all these
+      signs are 0, and nothing is proved.
+    - *A line*, for triangles in one plane: `_beside`.
+    """
+    in_a = [shared[i][0] | shared[i][1] | shared[i][2] for i in range(3)]
+    in_b = [shared[0][k] | shared[1][k] | shared[2][k] for k in range(3)]
+    real = cast("Any", type(a[0].x))
+    count: Real = sum((dr.select(one, real(1), real(0)) for one in in_a), real(0))
+    of_b, of_a = _sides(a, b), _sides(b, a)
+    by_plane = _on_one_side(of_b, in_b) | _on_one_side(of_a, in_a)
+    by_plane &= count < 2.5
+
+    def by_edges_or_line(*numbers: Any) -> Mask:
+        one, other = cast("tuple[Corners, Corners]", (numbers[:3], numbers[3:6]))
+        in_one, in_other, common = list(numbers[6:9]), list(numbers[9:12]), numbers[12]
+        passes = _passes(one, other, _sides(one, other), in_other)
+        passes |= _passes(other, one, _sides(other, one), in_one)
+        turned = _turned(one, in_one, common), _turned(other, in_other, common)
+        return ((common < 1.5) & ~passes) | _beside(*turned, common)
+
+    def is_open(*numbers: Any) -> Mask:
+        return numbers[12] < 0
+
+    numbers = (*a, *b, *in_a, *in_b, count)
+    return by_plane | dr.if_stmt(numbers, active & ~by_plane, by_edges_or_line, is_open)
+
+
+def _sides(plane: Corners, of: Corners) -> list[tuple[Mask, Mask]]:
+    """Of each corner of a triangle, whether it is strictly above another's plane, and strictly
+    below it; neither where rounding leaves it open."""
+    u, v = plane[1] - plane[0], plane[2] - plane[0]
+    normal = dr.cross(u, v)
+    most = _ROUNDING * dr.norm(u) * dr.norm(v)
+    found: list[tuple[Mask, Mask]] = []
+    for corner in of:
+        way = corner - plane[0]
+        height, error = dr.dot(normal, way), most * dr.norm(way) + _UNDERFLOW
+        found.append((height > error, height < -error))
+    return found
+
+
+def _on_one_side(sides: list[tuple[Mask, Mask]], shared: list[Mask]) -> Mask:
+    above, below = (
+        (sides[0][k] | shared[0]) & (sides[1][k] | shared[1]) & (sides[2][k] | shared[2])
+        for k in range(2)
+    )
+    return above | below
+
+
+def _passes(
+    through: Corners, of: Corners, sides: list[tuple[Mask, Mask]], shared: list[Mask]
+) -> Mask:
+    """Whether an edge of a triangle without shared corners may pass through another: unless both
+    ends are strictly on one side of its plane, or the line of the edge has two edges of it on
+    different sides of itself."""
+    found = False
+    for i, j in ((0, 1), (1, 2), (2, 0)):
+        stays = (sides[i][0] & sides[j][0]) | (sides[i][1] & sides[j][1]) | shared[i] | shared[j]
+        way = of[j] - of[i]
+        to = [corner - of[i] for corner in through]
+        length, lengths = dr.norm(way), [dr.norm(one) for one in to]
+        left, right = False, False
+        for k, m in ((0, 1), (1, 2), (2, 0)):
+            value = dr.dot(way, dr.cross(to[k], to[m]))
+            error = _ROUNDING * length * lengths[k] * lengths[m] + _UNDERFLOW
+            left, right = left | (value > error), right | (value < -error)
+        found = found | ~(stays | (left & right))
+    return found
+
+
+def _turned(of: Corners, shared: list[Mask], count: Real) -> Corners:
+    """The corners in another order: what is shared first."""
+    once = count < 1.5
+    # One that is shared comes first; of two, the one that is not shared comes last.
+    from_second = dr.select(once, shared[1], ~shared[0])
+    from_third = dr.select(once, shared[2], ~shared[1])
+    none = count < 0.5
+    from_second, from_third = from_second & ~none, from_third & ~none
+    return tuple(
+        dr.select(from_second, of[(k + 1) % 3], dr.select(from_third, of[(k + 2) % 3], of[k]))
+        for k in range(3)
+    )  # type: ignore[return-value]
+
+
+def _beside(a: Corners, b: Corners, count: Real) -> Mask:
+    """Whether a plane through an edge, at right angles to its triangle, has the triangles on its
+    two sides; shared corners come first.
+
+    m is any vector, and m' = m - (m.e/|e|^2) e, for an edge e, exactly: so m'.e = 0, and m'.x is
+    m.x up to |m.e| |x|/|e|, which is rounding if m was made at right angles to e.
+    - No shared corner: m.x is less on one triangle than on the other (separating axes).
+    - One, the origin: m' < 0 or = 0 on e, < 0 at the other corner of e's triangle and > 0 at both
+      corners of the other. Points of both have m' = 0, so of the latter only the origin. Or m < 0
+      at both corners of one and m > 0 at those of the other: m along the difference of the
+      directions of their middles.
+    - Two: e is between them, m' < 0 at the last corner of one, and > 0 at that of the other. Points
+      of both have m' = 0: they lie on e.
+    """
+    none, once = count < 0.5, (count > 0.5) & (count < 1.5)
+    twice = (count > 1.5) & (count < 2.5)
+    found = False
+    for one, other in ((a, b), (b, a)):
+        for i, j, k in ((0, 1, 2), (0, 2, 1), (1, 2, 0)):
+            origin = one[i]
+            e, x = one[j] - origin, one[k] - origin
+            m = dr.fma(e, dr.dot(x, e) / dr.squared_norm(e), -x)
+            size, length = dr.norm(m), dr.norm(e)
+            off = 1.01 * (dr.abs(dr.dot(m, e)) + _ROUNDING * size * length) / length
+            slack = _ROUNDING * size + off
+
+            def past(to: Vec3, m: Vec3 = m, slack: Real = slack) -> tuple[Mask, Mask]:
+                value, error = dr.dot(m, to), slack * dr.norm(to) + _UNDERFLOW
+                return value > error, value < -error
+
+            behind = past(x)[1]
+            beyond = [past(corner - origin)[0] for corner in other]
+            if i == 0:
+                found = found | (once & behind & beyond[1] & beyond[2])
+            if (i, j) == (0, 1):
+                found = found | (twice & behind & beyond[2])
+            # Without a shared corner the edge itself is behind as well: m'.e = 0.
+            found = found | (none & behind & beyond[0] & beyond[1] & beyond[2])
+    return found | (once & _opposite(a, b))
+
+
+def _opposite(a: Corners, b: Corners) -> Mask:
+    """Whether a plane through the first corner, which is that of both, has the others of a and
+    those of b on different sides, at right angles to the difference of their mean directions."""
+    ways = [one[k] - one[0] for one, k in itertools.product((a, b), (1, 2))]
+    mean = [dr.normalize(ways[k]) + dr.normalize(ways[k + 1]) for k in (0, 2)]
+    m = dr.normalize(mean[1]) - dr.normalize(mean[0])
+    slack = _ROUNDING * dr.norm(m)
+    values = [(dr.dot(m, way), slack * dr.norm(way) + _UNDERFLOW) for way in ways]
+    (p, one), (q, two), (r, three), (s, four) = values
+    return (p < -one) & (q < -two) & (r > three) & (s > four)
