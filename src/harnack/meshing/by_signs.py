@@ -176,6 +176,7 @@ def sign_surface(
         first, min(_SLIVERS * tolerance, _SMALL * float(lattice.size.min()))
     )
     report(f"{len(first.faces):,} triangles, {len(faces):,} without slivers")
+    check_count(len(faces), function.most_faces)
     flat = x
     bent = np.zeros(len(x), np.bool_)
     before = len(faces)

@@ -1,11 +1,14 @@
 """Smooth patches over the holes of a mesh, each bounded by one loop of open edges.
 
-A patch begins as the triangulation of its loop that has the least area (Barequet and Sharir 1995)
-or, for small loops, that turns least against the faces around it (Liepa, Filling Holes in Meshes,
-2003). Edges are cut and flipped until triangles are as large as those around the hole. Then the
-patch is made to bend as little as it can: the sum of squared Laplacians of positions is least, over
-the new vertices and those of the loop, while all vertices that were there stay (Botsch and
-Kobbelt 2004). So it continues the surface around it, tangents included.
+A patch begins as the triangulation of its loop that turns least against the faces around it (Liepa,
+Filling Holes in Meshes, 2003) or, for long loops, that has the least area (Barequet and Sharir
+1995), which may cut through a tube where the other goes around it. Edges are cut and flipped until
+triangles are as large as those around the hole. Then the patch is made to bend as little as it can:
+the sum of squared Laplacians of positions is least, over the new vertices and those of the loop,
+while all vertices that were there stay (Botsch and Kobbelt 2004). So it continues the surface
+around it, tangents included. Laplacians are those of the patch before; repeated, with edges cut
+that have become long, this ends at surfaces whose mean curvature is harmonic, such as spheres and
+cylinders.
 
 Nothing is proved of such patches. Those are handed back that pass the checks of `filled`.
 """
@@ -28,8 +31,10 @@ __all__ = ["Filled", "filled", "hole_loops"]
 
 # Loops of more edges are not filled: the time grows with the cube of their number.
 _MOST_IN_LOOP = 600
-# Up to so many edges angles count, beyond it areas alone.
-_MOST_BY_ANGLES = 10
+# Up to so many edges angles count, beyond it areas alone; up to so many they always do.
+_MOST_BY_ANGLES, _ALWAYS_BY_ANGLES = 150, 10
+# Largest angles count as the same if their cosines differ by less than this.
+_SAME_TURN = 1e-9
 # Edges are cut that are longer than this many times what is usual around the hole; so often.
 _LONG, _ROUNDS = 1.4, 10
 _MOST_CUT = 200_000
@@ -38,8 +43,9 @@ _FLIP = -1e-3
 _MOST_FLIPS = 12
 # Cotangents are kept between these, so that every matrix is definite.
 _LEAST_COTANGENT, _MOST_COTANGENT = 0.02, 20.0
-# How often the patch is made to bend little, by the cotangents of what it was before.
-_FAIRINGS = 2
+# What is tried in turn: whether loops are triangulated by angles, and how often the patch is made
+# to bend little, by the cotangents of what it was before.
+_TRIES = ((True, 6), (False, 2), (True, 0), (False, 0))
 # On a patch the winding number of what is there may differ from 1/2 modulo 1 by so much.
 _FROM_HALF = 0.36
 
@@ -70,17 +76,18 @@ def filled(
     there is near 1/2 modulo 1 at its vertices and centers. It is far from that where a hole is no
     hole of its own: where two rims belong to one gap, or a part stands in it.
 
-    What fails is tried once more with the least area in place of the least bending.
+    What fails is tried once more from the triangulation of least area, then without making it bend
+    little.
 
     winding: the winding number of the mesh at points.
     """
     x, together = vertices, faces
     left: list[IntArray] = loops
     reasons = dict[int, str]()
-    for is_flat in (False, True):
+    for by_angles, fairings in _TRIES:
         if not left:
             break
-        made, new, owner, reasons = _patches(x, together, left, is_flat)
+        made, new, owner, reasons = _patches(x, together, left, by_angles, fairings)
         reasons |= _failures(made, together, new, owner, len(x), winding)
         good = ~np.isin(owner, list(reasons))
         x, together = _used(made, np.concatenate([together, new[good]]), len(x))
@@ -194,7 +201,11 @@ def _across_gaps(
 
 
 def _patches(
-    vertices: FloatArray, faces: IntArray, loops: list[IntArray], is_flat: bool
+    vertices: FloatArray,
+    faces: IntArray,
+    loops: list[IntArray],
+    by_angles: bool,
+    fairings: int,
 ) -> tuple[FloatArray, IntArray, IntArray, dict[int, str]]:
     """All vertices with those of patches behind; faces of patches; of which loop each is; and loops
     without a patch, with the reason."""
@@ -207,7 +218,8 @@ def _patches(
             failed[k] = f"of more than {_MOST_IN_LOOP} edges"
             continue
         polygon = loop[::-1].copy()
-        plan = _least_turning if 3 < len(polygon) <= _MOST_BY_ANGLES else _least_area
+        most = _MOST_BY_ANGLES if by_angles else _ALWAYS_BY_ANGLES
+        plan = _least_turning if len(polygon) <= most else _least_area
         made = plan(vertices, polygon, third, taken)
         if made is None:
             failed[k] = "between edges that are joined already"
@@ -216,12 +228,14 @@ def _patches(
         found.append(made)
     if not found:
         return vertices, faces[:0], np.zeros(0, np.int64), failed
-    x, new = _finer(vertices, faces, np.concatenate(found), there)
-    if not is_flat and len(x) > len(vertices):
-        for _ in range(_FAIRINGS):
-            x = _fair(x, faces, new, len(vertices))
-            new = _flipped(x, new, there)
-    return x, new, _owners(new, loops, len(x)), failed
+    sized, new = _finer(vertices, faces, np.concatenate(found), there)
+    for left in range(fairings if len(sized) > len(vertices) else 0, 0, -1):
+        sized[:, :3] = _fair(sized[:, :3], faces, new, len(vertices))
+        new = _flipped(sized[:, :3], new, there)
+        if left > 2:
+            sized, new = _cut(sized, new)
+            new = _flipped(sized[:, :3], new, there)
+    return sized[:, :3], new, _owners(new, loops, len(sized)), failed
 
 
 def _beside(faces: IntArray, rims: IntArray, count: int) -> dict[tuple[int, int], int]:
@@ -302,41 +316,48 @@ def _least_turning(
     third: dict[tuple[int, int], int],
     taken: set[tuple[int, int]],
 ) -> IntArray | None:
-    """Triangles of a small polygon whose largest angle with neighbors, those around the polygon
-    among them, is least; of the same angles those of least area (Liepa 2003)."""
+    """Triangles of a polygon whose largest angle with neighbors, those around the polygon among
+    them, is least; of the same angles those of least area (Liepa 2003)."""
     n, corner = len(polygon), x[polygon]
+    if n == 3:
+        return polygon[None]
     barred = _barred(polygon, taken)
-
-    def normal(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
-        cross = np.cross(b - a, c - a)
-        return cross / max(float(np.linalg.norm(cross)), 1e-300)
-
-    beside: dict[tuple[int, int], FloatArray] = {}
+    beside = np.zeros((n, n, 3))  # 0: there is none, or not yet
     for k in range(n):
         a, b = int(polygon[k]), int(polygon[(k + 1) % n])
         if (b, a) in third:
-            beside[k, (k + 1) % n] = normal(x[b], x[a], x[third[b, a]])
-    cost = {(k, k + 1): (-1.0, 0.0) for k in range(n - 1)}
+            face = np.array([[b, a, third[b, a]]])
+            beside[k, (k + 1) % n] = _unit(_crosses(x, face))[0]
+    turn, area = np.full((n, n), -1.0), np.zeros((n, n))
     middle = np.zeros((n, n), np.int64)
     for d in range(2, n):
-        for i in range(n - d):
-            k, best = i + d, (np.inf, np.inf)
-            for m in range(i + 1, k):
-                one, other = cost[i, m], cost[m, k]
-                own = normal(corner[i], corner[m], corner[k])
-                sides = [beside[e] for e in ((i, m), (m, k)) if e in beside]
-                if d == n - 1 and (k, i) in beside:
-                    sides.append(beside[k, i])
-                turn = max([-float(own @ side) for side in sides], default=-1.0)
-                area = float(np.linalg.norm(np.cross(corner[m] - corner[i], corner[k] - corner[i])))
-                total = max(turn, one[0], other[0]), area + one[1] + other[1]
-                if total < best:
-                    best, middle[i, k] = total, m
-                    beside[i, k] = own
-            cost[i, k] = (np.inf, np.inf) if barred[i, k] and d < n - 1 else best
-    if not np.isfinite(cost[0, n - 1][1]):
+        i = np.arange(n - d)[:, None]
+        m, k = i + np.arange(1, d), i + d
+        cross = np.cross(corner[m] - corner[i], corner[k] - corner[i])
+        own = _unit(cross)
+        sides = [beside[i, m], beside[m, k]]
+        if d == n - 1:
+            sides.append(np.broadcast_to(beside[k, i], own.shape))
+        turns = [-np.einsum("imk,imk->im", own, side) for side in sides]
+        turns = [np.where(side.any(axis=2), t, -1.0) for side, t in zip(sides, turns, strict=True)]
+        worst = np.maximum.reduce([*turns, turn[i, m], turn[m, k]])
+        size = area[i, m] + area[m, k] + np.sqrt((cross**2).sum(axis=2))
+        least = worst.min(axis=1, keepdims=True)
+        best = np.where(worst <= least + _SAME_TURN, size, np.inf).argmin(axis=1)
+        rows = np.arange(n - d)
+        bar = barred[rows, rows + d] if d < n - 1 else np.zeros(1, np.bool_)
+        turn[rows, rows + d] = np.where(bar, np.inf, worst[rows, best])
+        area[rows, rows + d] = size[rows, best]
+        middle[rows, rows + d] = m[rows, best]
+        beside[rows, rows + d] = own[rows, best]
+    if not np.isfinite(turn[0, n - 1]):
         return None
     return polygon[_traced(middle, n)]
+
+
+def _unit(vectors: FloatArray) -> FloatArray:
+    """(..., 3) of length 1, or 0."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-300)
 
 
 # Finer triangles.
@@ -345,27 +366,34 @@ def _least_turning(
 def _finer(
     vertices: FloatArray, faces: IntArray, new: IntArray, taken: IntArray
 ) -> tuple[FloatArray, IntArray]:
-    """Patches of triangles about as large as those around them, with the least area; new vertices
-    lie behind those given.
+    """Patches of triangles about as large as those around them, with the least area; all vertices
+    (n, 4), new ones behind those given, and with each the usual length of edges there.
 
     taken: (t, 2) edges that are there already.
     """
     given = len(vertices)
     x = np.column_stack([vertices, _usual_lengths(vertices, faces, np.unique(new))])
     for _ in range(_ROUNDS):
-        new = _flipped(x[:, :3], new, taken)
-        edges = Edges.of(directed_edges(new))
-        ends = x[edges.ends]
-        long = lengths(ends[:, 0, :3] - ends[:, 1, :3]) > _LONG * ends[:, :, 3].mean(axis=1)
-        rows = np.flatnonzero(long & (edges.uses == 2))
-        if not len(rows) or len(new) > _MOST_CUT:
+        new, count = _flipped(x[:, :3], new, taken), len(x)
+        x, new = _cut(x, new)
+        if len(x) == count:
             break
-        place = np.full(len(edges.ends), -1, np.int64)
-        place[rows] = len(x) + np.arange(len(rows))
-        x = np.concatenate([x, ends[rows].mean(axis=1)])
-        new = split_faces(x[:, :3], new, place[edges.index].reshape(3, -1).T)
         x = _relaxed(x, new, given)
-    return x[:, :3], _flipped(x[:, :3], new, taken)
+    return x, _flipped(x[:, :3], new, taken)
+
+
+def _cut(x: FloatArray, new: IntArray) -> tuple[FloatArray, IntArray]:
+    """Vertices (n, 4) and triangles with edges cut in the middle that are too long."""
+    edges = Edges.of(directed_edges(new))
+    ends = x[edges.ends]
+    long = lengths(ends[:, 0, :3] - ends[:, 1, :3]) > _LONG * ends[:, :, 3].mean(axis=1)
+    rows = np.flatnonzero(long & (edges.uses == 2))
+    if not len(rows) or len(new) > _MOST_CUT:
+        return x, new
+    place = np.full(len(edges.ends), -1, np.int64)
+    place[rows] = len(x) + np.arange(len(rows))
+    x = np.concatenate([x, ends[rows].mean(axis=1)])
+    return x, split_faces(x[:, :3], new, place[edges.index].reshape(3, -1).T)
 
 
 def _usual_lengths(x: FloatArray, faces: IntArray, rims: IntArray) -> FloatArray:

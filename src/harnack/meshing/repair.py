@@ -20,6 +20,7 @@ from harnack.geometry.chains import weld_vertices
 from harnack.geometry.meshes import without_zero_area_faces
 from harnack.meshing.checks import (
     MeshingError,
+    TooLargeError,
     euler_characteristic,
     intersecting_faces,
     singular_vertices,
@@ -42,8 +43,10 @@ __all__ = ["repair"]
 # How many sizes of cells are tried for patches on which w is 1/2, if all triangles have to stay;
 # and if they need not, where there are no more open edges than that.
 _ATTEMPTS, _FEW_ATTEMPTS, _FEW_EDGES = 6, 1, 1000
-# Cells across the mesh if all is made anew.
+# Cells across the mesh if all is made anew; larger ones by this factor, up to so many times, where
+# the surface is rough and has more triangles than that.
 _ACROSS_ANEW = 48
+_MOST_ANEW, _LARGER, _MOST_LARGER = 80_000, 1.4, 3
 
 Keep = Literal["all", "sound", "none"]
 Patches = Literal["smooth", "harmonic"]
@@ -218,23 +221,35 @@ def _anew(mesh: Any, asked: _Asked) -> tuple[Surface, dict[str, Any]]:
     """The surface on which the winding number is 1/2, closed whatever the mesh is."""
     corners = without_zero_area_faces(np.asarray(mesh.vertices), np.asarray(mesh.faces))
     field = WindingNumber(*corners)
-    spacing = asked.spacing
-    if spacing is None:
+    if asked.spacing is not None:
+        made = _by_signs(field, asked.spacing, asked)
+    else:
         spacing = float(np.ptp(corners[0], axis=0).max()) / _ACROSS_ANEW
-    try:
-        made = _by_signs(field, spacing, asked)
-    except MeshingError:
-        if asked.spacing is not None:
-            raise
-        made = _by_signs(field, 0.6 * spacing, asked)
+        try:
+            made = _of_bounded_size(field, spacing, asked)
+        except MeshingError:
+            made = _by_signs(field, 0.6 * spacing, asked)
     facts = made.metadata["harnack"] | {"stage": "anew", "kept": 0}
     return Surface(np.asarray(made.vertices), np.asarray(made.faces, np.int64)), facts
 
 
-def _by_signs(field: WindingNumber, spacing: float, asked: _Asked) -> trimesh.Trimesh:
+def _of_bounded_size(field: WindingNumber, spacing: float, asked: _Asked) -> trimesh.Trimesh:
+    """Of larger cells where there would be too many triangles, as of noisy meshes: the time of
+    checks grows with their number."""
+    for k in range(_MOST_LARGER):
+        try:
+            return _by_signs(field, spacing * _LARGER**k, asked, _MOST_ANEW)
+        except TooLargeError as error:
+            asked.report(f"{error}; so of larger cells")
+    return _by_signs(field, spacing * _LARGER**_MOST_LARGER, asked)
+
+
+def _by_signs(
+    field: WindingNumber, spacing: float, asked: _Asked, most: int = 2_000_000
+) -> trimesh.Trimesh:
     return mesh_of(
         field, solid=(0.5, math.inf), tolerance=asked.tolerance, spacing=spacing,
-        progress=asked.report,
+        max_triangles=most, progress=asked.report,
     )  # fmt: skip
 
 
