@@ -569,3 +569,24 @@ def test_a_lone_triangle_is_not_covered_by_itself() -> None:
 
 def missing(vertices: Any, faces: Any) -> Any:
     return missing_triangles(np.asarray(vertices), faces, open_edges(faces))
+
+
+def test_bodies_that_overlap_are_united_exactly() -> None:
+    """They were made anew, which took long and moved the surface."""
+    ball = trimesh.creation.icosphere(2)
+    other = trimesh.Trimesh(np.add(ball.vertices, (0.7, 0.3, 0.2)), ball.faces)
+    made = hk.repair(trimesh.util.concatenate([ball, other]))
+    assert made.metadata["harnack"]["stage"] == "united"
+    assert made.is_watertight
+    assert not len(intersecting_pairs(np.asarray(made.vertices), np.asarray(made.faces)))
+    expected = trimesh.boolean.union([ball, other]).volume
+    assert made.volume == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize("keep", [None, "all", "none"])
+def test_what_lies_in_a_plane_is_refused_at_once(keep: Any) -> None:
+    """It took a minute, and then the level set was said to be empty."""
+    turn = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
+    x = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]]) @ turn + 5.0
+    with pytest.raises(MeshError, match="lie in a plane"):
+        hk.repair(trimesh.Trimesh(x, [[0, 1, 2], [1, 3, 2]], process=False), keep=keep)

@@ -462,6 +462,8 @@ def _repaired(facts: dict[str, Any], given: int, made: int) -> str:
             f"made anew: {made:,} triangles in place of {given:,}{why}; {facts['far']:,} vertices "
             f"and centers are beyond the tolerance, all are within {facts['within']:.2g}; {parts}"
         )
+    if facts["stage"] == "united":
+        return f"bodies united: {made:,} triangles around them, of {given:,}{why}; {parts}"
     added = f"{_counted(facts['holes'], 'hole')}, {facts['patches']:,} triangles added"
     if facts["stage"] == "kept":
         return f"{added} to {given:,}, which are all kept; {parts}"

@@ -1,7 +1,8 @@
 """Repair of triangle meshes: a closed mesh of a damaged one, in which what was sound stays.
 
-It goes by stages: all triangles are kept, and holes get patches; or those that are sound are; or
-the surface on which the winding number is 1/2 is made anew.
+It goes by stages: all triangles are kept, and holes get patches; or bodies that overlap are united;
+or the triangles that are sound are kept; or the surface on which the winding number is 1/2 is made
+anew.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from harnack.fields.solid_angles.winding_number import WindingNumber
+from harnack.fields.solids.mesh_solid import MeshSolid
 from harnack.geometry import MeshError, validate_mesh
 from harnack.geometry.chains import weld_vertices
 from harnack.geometry.meshes import without_zero_area_faces
@@ -48,6 +50,9 @@ _ATTEMPTS, _FEW_ATTEMPTS, _FEW_EDGES = 6, 1, 1000
 _ACROSS_ANEW = 48
 _MOST_ANEW, _LARGER, _MOST_LARGER = 80_000, 1.4, 3
 
+# Points lie in a plane if the least of their singular values is this part of the largest.
+_FLAT = 1e-9
+
 Keep = Literal["all", "sound", "none"]
 Patches = Literal["smooth", "harmonic"]
 
@@ -65,9 +70,11 @@ def repair(
 ) -> trimesh.Trimesh:
     """A closed mesh of a damaged one: with patches over its holes, or made anew.
 
-    Four stages are tried in turn:
+    Five stages are tried in turn:
 
     - kept: all triangles stay, and holes get patches;
+    - united: a closed mesh that crosses itself, such as bodies that overlap, is cut where it does,
+      exactly, and what is inside is left out (`hk.solid`);
     - sound: triangles that are there twice, have no area or pass through others are left out, those
       turned over against their neighbors are turned back, and holes get patches; where one cannot
       be filled, the triangles around it are left out as well, ring by ring;
@@ -78,7 +85,7 @@ def repair(
 
     mesh: anything with `vertices` (n, 3) and `faces` (m, 3).
     keep: "all" does the first stage or raises an error, "sound" the second one, "none" the last;
-        None does the first that succeeds.
+        None does the first that succeeds of all.
     patches: "smooth" ones continue the surface around each hole, with its tangents, and bend least.
         They are made hole by hole, and used where w is within 0.36 of 1/2 modulo 1 on them; the
         rest is done by "harmonic" ones, on which w is 1/2 modulo 1: they join the rims of a gap
@@ -94,8 +101,8 @@ def repair(
 
     Returns:
         A closed trimesh.Trimesh: every edge has two faces, which agree. `metadata["harnack"]` has
-        stage: "kept", "sound", "joined" or "anew"; why: what those before failed with, or None;
-        kept: how many of the given triangles are there; parts: of each part, largest first, a
+        stage: "kept", "united", "sound", "joined" or "anew"; why: what those before failed with, or
+        None; kept: how many of the given triangles are there; parts: of each part, largest first, a
         dictionary of its faces, volume and center; dropped: how many parts of these were left out
         for `largest`; and the Euler characteristic.
 
@@ -110,6 +117,9 @@ def repair(
         if finer ones would pass through each other), spacing and evaluations of these. A closed
         mesh gets nothing added; unless keep is "all", it is only returned if no triangles pass
         through each other.
+
+        If it was united, kept is 0: triangles that were not cut lie where they were, but may be
+        divided otherwise.
 
         If what was sound was kept: turned (how many triangles were turned over) and left_out, a
         dictionary: how many were "flat" (without an area), "doubled", "crossing", "branching" (at
@@ -133,7 +143,10 @@ def repair(
     """
     asked = _checked_settings(keep, patches, tolerance, spacing, seed, progress or _silent)
     _check_is_mesh(mesh)
-    stages = {"all": _kept, "sound": _sound, "joined": _joined, "none": _anew}
+    _check_encloses(mesh)
+    stages = {
+        "all": _kept, "united": _united, "sound": _sound, "joined": _joined, "none": _anew,
+    }  # fmt: skip
     names = list(stages) if keep is None else [keep]
     reasons: list[str] = []
     for name in names:
@@ -212,6 +225,40 @@ def _check_is_mesh(mesh: Any) -> None:
             f"repair takes a mesh with vertices and faces, such as a trimesh.Trimesh, not "
             f"{type(mesh).__name__}"
         )
+
+
+def _check_encloses(mesh: Any) -> None:
+    """Raise if all faces lie in a plane.
+
+    Raises:
+        MeshError: so; or as `validate_mesh`.
+    """
+    vertices, faces = validate_mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces), flat=True)
+    x = vertices[np.unique(faces)]
+    x = x - x.mean(axis=0)
+    largest, *_, least = np.linalg.svd(x / np.abs(x).max(), compute_uv=False)
+    if least <= _FLAT * largest:
+        raise MeshError(
+            "all faces of the mesh lie in a plane, or nearly so: they enclose nothing that could "
+            "be closed; give it a thickness first, or mesh its boundary with `thickness`"
+        )
+
+
+# Bodies united.
+
+
+def _united(mesh: Any, asked: _Asked) -> tuple[Surface, dict[str, Any]]:
+    """The boundary of the solid that a closed mesh bounds which passes through itself.
+
+    Raises:
+        MeshError, MeshingError: as `repair`.
+    """
+    vertices, faces = _checked(mesh)
+    if len(open_edges(faces)):
+        raise MeshError("the mesh is not closed")
+    made = mesh_of(MeshSolid(vertices, faces), progress=asked.report)
+    surface = Surface(np.asarray(made.vertices), np.asarray(made.faces, np.int64))
+    return surface, {"stage": "united", "kept": 0}
 
 
 # All made anew.
