@@ -583,6 +583,17 @@ def test_bodies_that_overlap_are_united_exactly() -> None:
     assert made.volume == pytest.approx(expected, rel=1e-9)
 
 
+def test_what_is_inside_the_material_of_another_part_is_left_out() -> None:
+    ball = trimesh.creation.icosphere(2)
+    inner = trimesh.Trimesh(0.5 * ball.vertices, ball.faces)
+    made = hk.repair(trimesh.util.concatenate([ball, inner]))
+    assert made.volume == pytest.approx(ball.volume)
+    inner.invert()
+    hollow = hk.repair(trimesh.util.concatenate([ball, inner]))
+    assert hollow.metadata["harnack"]["stage"] == "kept"
+    assert hollow.volume == pytest.approx(0.875 * ball.volume)
+
+
 @pytest.mark.parametrize("keep", [None, "all", "none"])
 def test_what_lies_in_a_plane_is_refused_at_once(keep: Any) -> None:
     """It took a minute, and then the level set was said to be empty."""

@@ -18,7 +18,7 @@ from harnack.meshing.checks import MeshingError
 from harnack.meshing.edges import IntArray, boundary_edges, dots, edge_keys, lengths
 from harnack.meshing.lattice_surface import Surface
 
-__all__ = ["cut_by", "largest_body", "largest_part", "parts_of", "turned_outwards"]
+__all__ = ["Shells", "cut_by", "largest_body", "largest_part", "parts_of", "turned_outwards"]
 
 
 def largest_part(surface: Surface) -> Surface:
@@ -41,59 +41,82 @@ def largest_body(surface: Surface) -> Surface:
     Raises:
         MeshingError: a cavity that lies in no shell.
     """
-    part = _parts(surface)
-    names, shell = np.unique(part, return_inverse=True)
-    cross, corner = _crosses(surface), surface.vertices[surface.faces]
-    center = surface.vertices.mean(axis=0)
-    volumes = np.bincount(shell, dots(cross, corner[:, 0] - center)) / 6
-    bodies = volumes.copy()
-    owner = np.arange(len(names))
-    outer = np.flatnonzero(volumes > 0)
-    outer = outer[np.argsort(volumes[outer])]
-    for cavity in np.flatnonzero(volumes <= 0):
-        point = corner[np.flatnonzero(shell == cavity)[0]].mean(axis=0)
-        holds = (one for one in outer if _winding(corner[shell == one], point) > 0.5)
+    shells = Shells.of(surface)
+    bodies = shells.volumes.copy()
+    owner = np.arange(len(bodies))
+    outer = np.flatnonzero(shells.volumes > 0)
+    outer = outer[np.argsort(shells.volumes[outer])]
+    for cavity in np.flatnonzero(shells.volumes <= 0):
+        holds = (one for one in outer if shells.turns(one, cavity) > 0.5)
         if (found := next(holds, None)) is None:
             raise MeshingError("a part of the mesh is inside out: choose a smaller `spacing`")
         owner[cavity] = found
-        bodies[found] += volumes[cavity]
+        bodies[found] += shells.volumes[cavity]
     kept = outer[bodies[outer].argmax()] if len(outer) else -1
-    return Surface.of(surface.vertices, surface.faces[owner[shell] == kept])
+    return Surface.of(surface.vertices, surface.faces[owner[shells.number] == kept])
 
 
 def parts_of(surface: Surface) -> list[dict[str, Any]]:
     """Of each connected part of a closed surface, largest first, faces: their number; volume: what
     it holds, negative for a cavity; center: of the box around it."""
-    _, shell = np.unique(_parts(surface), return_inverse=True)
-    volumes, found = _volumes(surface, shell), list[dict[str, Any]]()
-    corner = surface.vertices[surface.faces]
-    for k in np.argsort(-np.abs(volumes), kind="stable"):
-        own = corner[shell == k].reshape(-1, 3)
-        center = 0.5 * (own.min(axis=0) + own.max(axis=0))
-        found.append(
-            {"faces": len(own) // 3, "volume": float(volumes[k]), "center": center.tolist()}
-        )
+    shells, found = Shells.of(surface), list[dict[str, Any]]()
+    counts = np.bincount(shells.number)
+    for k in np.argsort(-np.abs(shells.volumes), kind="stable"):
+        center = 0.5 * (shells.lower[k] + shells.upper[k])
+        volume = float(shells.volumes[k])
+        found.append({"faces": int(counts[k]), "volume": volume, "center": center.tolist()})
     return found
 
 
 def turned_outwards(surface: Surface) -> npt.NDArray[np.bool_]:
     """(m,) which faces of a closed surface to turn over for no part to be inside out: those of
     parts of negative volume that lie in no other, and so are no cavities."""
-    _, shell = np.unique(_parts(surface), return_inverse=True)
-    volumes, corner = _volumes(surface, shell), surface.vertices[surface.faces]
-    inwards: list[int] = []
-    for k in np.flatnonzero(volumes < 0):
-        point = corner[np.flatnonzero(shell == k)[0]].mean(axis=0)
-        if abs(_winding(corner[shell != k], point)) < 0.5:
-            inwards.append(int(k))
-    return np.isin(shell, inwards)
+    shells = Shells.of(surface)
+    inwards = (shells.volumes < 0) & (shells.depths() == 0)
+    return inwards[shells.number]
 
 
-def _volumes(surface: Surface, shell: IntArray) -> FloatArray:
-    """What the parts, by number of each face, hold."""
-    center = surface.vertices.mean(axis=0)
-    corner = surface.vertices[surface.faces][:, 0] - center
-    return np.bincount(shell, dots(_crosses(surface), corner)) / 6
+@dataclass(frozen=True)
+class Shells:
+    """The connected parts of a closed surface.
+
+    number: (m,) of the part that each face belongs to. volumes: (k,) what parts hold, negative of
+        those turned inwards. lower, upper: (k, 3) their boxes. corners: (m, 3, 3) of the faces.
+    """
+
+    number: IntArray
+    volumes: FloatArray
+    lower: FloatArray
+    upper: FloatArray
+    corners: FloatArray
+
+    @classmethod
+    def of(cls, surface: Surface) -> Shells:
+        number = np.unique(_parts(surface), return_inverse=True)[1]
+        corners = surface.vertices[surface.faces]
+        away = corners[:, 0] - surface.vertices[surface.faces].mean(axis=(0, 1))
+        volumes = np.bincount(number, dots(_crosses(surface), away)) / 6
+        lower, upper = np.full((len(volumes), 3), np.inf), np.full((len(volumes), 3), -np.inf)
+        np.minimum.at(lower, number, corners.min(axis=1))
+        np.maximum.at(upper, number, corners.max(axis=1))
+        return cls(number, volumes, lower, upper, corners)
+
+    def turns(self, around: Any, part: Any) -> float:
+        """How often a part winds around another one, at a point of it."""
+        point = self.corners[np.argmax(self.number == part)].mean(axis=0)
+        return _winding(self.corners[self.number == around], point)
+
+    def depths(self) -> IntArray:
+        """(k,) how often all other parts wind around each, at a point of it: more than 0 where it
+        is in their material, if no two meet."""
+        depth = np.zeros(len(self.volumes), np.int64)
+        for k in range(len(depth)) if len(depth) > 1 else ():
+            point = self.corners[np.argmax(self.number == k)].mean(axis=0)
+            around = ((self.lower < point) & (point < self.upper)).all(axis=1)
+            around[k] = False
+            near = np.flatnonzero(around)
+            depth[k] = round(sum(self.turns(j, k) for j in near))
+        return depth
 
 
 def _parts(surface: Surface) -> IntArray:

@@ -16,7 +16,9 @@ from harnack.files.surfaces import Mesh, read_surface
 from harnack.geometry import MeshError, validate_mesh, zero_area_faces
 from harnack.geometry.chains import weld_vertices
 from harnack.meshing.checks import intersecting_faces, singular_vertices
+from harnack.meshing.clipping import Shells
 from harnack.meshing.edges import Edges, IntArray, directed_edges
+from harnack.meshing.lattice_surface import Surface
 from harnack.meshing.thickness import check_length, thickness
 
 __all__ = ["PrintCheck", "PrintProblem", "check_print"]
@@ -104,19 +106,18 @@ def check_print(part: Any, *, wall: float | None = None, bed: Any = None) -> Pri
     x, faces = _mesh_of(part)
     found = _topology(x, faces)
     is_closed = not _is_wrong(found)
-    pieces = _parts(faces)
-    volumes = _volumes(x, faces, pieces)
+    shells = Shells.of(Surface(x, faces))
     crossings = _crossings(x, faces, is_closed)
     is_clear = is_closed and not crossings.count
-    found += [*_of_parts(x, faces, pieces, volumes, is_closed, is_clear), crossings]
+    found += [*_of_parts(shells, is_closed, is_clear), crossings]
     if wall is not None:
         found.append(_thin(x, faces, wall, not _is_wrong(found)))
     low, high = x[faces].min(axis=(0, 1)), x[faces].max(axis=(0, 1))
     size = cast("tuple[float, float, float]", tuple((high - low).tolist()))
     found += _of_size(size, sides)
     kept = sorted((one for one in found if one.count), key=lambda one: not one.is_fatal)
-    volume = float(volumes.sum()) if is_closed else None
-    return PrintCheck(tuple(kept), size, volume, len(faces), len(volumes))
+    volume = float(shells.volumes.sum()) if is_closed else None
+    return PrintCheck(tuple(kept), size, volume, len(faces), len(shells.volumes))
 
 
 def _is_wrong(problems: Sequence[PrintProblem]) -> bool:
@@ -194,52 +195,16 @@ def _topology(x: FloatArray, faces: IntArray) -> list[PrintProblem]:
     ]
 
 
-def _parts(faces: IntArray) -> IntArray:
-    """(m,) which part each face belongs to, of those joined by vertices."""
-    import scipy.sparse  # here: half a second that few need
-    import scipy.sparse.csgraph as csgraph_module
-
-    sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
-    n = int(faces.max()) + 1
-    pairs = directed_edges(faces)
-    graph = sparse.coo_matrix((np.ones(len(pairs)), tuple(pairs.T)), shape=(n, n))
-    _, label = csgraph.connected_components(graph, directed=False)
-    return np.unique(label[faces[:, 0]], return_inverse=True)[1]
-
-
-def _volumes(x: FloatArray, faces: IntArray, pieces: IntArray) -> FloatArray:
-    """(k,) signed volumes of parts."""
-    corner = x[faces] - x[faces].mean(axis=(0, 1))
-    found: FloatArray = np.bincount(pieces, np.linalg.det(corner) / 6).astype(np.float64)
-    return found
-
-
-def _of_parts(
-    x: FloatArray,
-    faces: IntArray,
-    pieces: IntArray,
-    volumes: FloatArray,
-    is_closed: bool,
-    is_clear: bool,
-) -> list[PrintProblem]:
+def _of_parts(shells: Shells, is_closed: bool, is_clear: bool) -> list[PrintProblem]:
     """Inside out, inside others, cavities, loose and tiny parts. is_clear: closed, and no faces
     pass through each other, so that a part is inside another as a whole or not at all."""
-    count = len(volumes)
-    low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
-    for k in range(3):
-        np.minimum.at(low, pieces, x[faces[:, k]])
-        np.maximum.at(high, pieces, x[faces[:, k]])
-    middle, length = 0.5 * (low + high), (high - low).max(axis=1)
-    depth = np.zeros(count, np.int64)  # how often the other parts wind around each
-    first = np.unique(pieces, return_index=True)[1]
-    for k in range(count) if is_closed and count > 1 else ():
-        point = x[faces[first[k]]].mean(axis=0)
-        near = ((low < point) & (point < high)).all(axis=1)
-        near[k] = False
-        depth[k] = sum(_turns(point, x, faces[pieces == j]) for j in np.flatnonzero(near))
+    volumes, none = shells.volumes, np.zeros(len(shells.volumes), np.bool_)
+    middle = 0.5 * (shells.lower + shells.upper)
+    length = (shells.upper - shells.lower).max(axis=1)
+    depth = shells.depths() if is_closed else np.zeros(len(volumes), np.int64)
     is_hollow = (volumes < 0) & (depth > 0)
     is_nested = (volumes > 0) & (depth > 0) & is_clear
-    inside_out = (volumes < 0) & ~is_hollow if is_closed else np.zeros(count, np.bool_)
+    inside_out = (volumes < 0) & ~is_hollow if is_closed else none
     is_tiny = (length < _TINY * length.max()) & ~is_hollow
     loose = middle[~is_hollow]
     return [
@@ -266,17 +231,6 @@ def _of_parts(
             is_fatal=False,
         ),
     ]
-
-
-def _turns(point: FloatArray, x: FloatArray, faces: IntArray) -> int:
-    """How often closed faces wind around a point: by the sum of their solid angles (van Oosterom
-    and Strackee 1983)."""
-    a, b, c = (x[faces[:, k]] - point for k in range(3))
-    na, nb, nc = (np.linalg.norm(one, axis=1) for one in (a, b, c))
-    top = (a * np.cross(b, c)).sum(axis=1)
-    bottom = na * nb * nc + (a * b).sum(axis=1) * nc + (b * c).sum(axis=1) * na
-    bottom += (c * a).sum(axis=1) * nb
-    return round(float(np.arctan2(top, bottom).sum()) / (2 * np.pi))
 
 
 def _crossings(x: FloatArray, faces: IntArray, is_closed: bool) -> PrintProblem:

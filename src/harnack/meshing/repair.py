@@ -27,7 +27,7 @@ from harnack.meshing.checks import (
     intersecting_faces,
     singular_vertices,
 )
-from harnack.meshing.clipping import largest_body, parts_of, turned_outwards
+from harnack.meshing.clipping import Shells, largest_body, parts_of
 from harnack.meshing.edges import IntArray
 from harnack.meshing.harmonic_patches import Asked, HarmonicPatches, harmonic_patches, open_edges
 from harnack.meshing.hole_patches import filled, hole_loops
@@ -417,8 +417,8 @@ def _kept_with(
     surface = Surface(x, together)
     if loops or asked.keep is None:
         _check_touching(together)
-    if asked.keep is None and turned_outwards(surface).any():
-        raise MeshError("a part of the mesh is inside out")
+    if asked.keep is None:
+        _check_sides(surface)
     return surface, {
         "stage": "kept",
         "kept": len(faces),
@@ -430,6 +430,16 @@ def _kept_with(
         "spacing": rest.spacing,
         "evaluations": rest.evaluations,
     }
+
+
+def _check_sides(surface: Surface) -> None:
+    """Raise if a part is inside out, or inside the material of another one."""
+    shells = Shells.of(surface)
+    depths = shells.depths()
+    if ((shells.volumes < 0) & (depths == 0)).any():
+        raise MeshError("a part of the mesh is inside out")
+    if ((shells.volumes > 0) & (depths > 0)).any():
+        raise MeshError("a part of the mesh is inside the material of another one")
 
 
 def _check_touching(faces: IntArray) -> None:
