@@ -93,6 +93,7 @@ def test_the_tail_of_a_dipole_is_bounded_and_attained(q: float) -> None:
 
 def test_rounding_of_expansions_is_below_what_is_counted() -> None:
     """`far_sums._Expanded.of`: the sums of absolute values, all coordinates as large as can be."""
+    q = 1 / near_far._NEAR
     ones = [_Sizes(np.array(1.0))] * 3
     for largest in (1, 2, 3, 4):
         seen = irregular(*ones, _Sizes(np.array(1.0)), DEGREE + largest)
@@ -102,10 +103,10 @@ def test_rounding_of_expansions_is_below_what_is_counted() -> None:
             size = _Sizes(np.array(1 / math.sqrt(math.factorial(l + m) * math.factorial(l - m))))
             moments[l, m] = size, size
         found = of_cluster(moments, seen, DEGREE)
-        powers = [one.number * 0.4**j for (j, _, _), one in zip(parts(DEGREE), found, strict=True)]
+        powers = [one.number * q**j for (j, _, _), one in zip(parts(DEGREE), found, strict=True)]
         harmonics = rounding_tables(DEGREE, 1 / math.sqrt(3))
         roundings = 0.51 * (9 * DEGREE + 2 * COEFFICIENTS)
-        assert (powers @ harmonics / roundings).max() < 2**16
+        assert (powers @ harmonics / roundings).max() < 2**22
 
 
 def sampled(field: hk.DipolePotential, x: np.ndarray, precision: Precision) -> Any:
@@ -138,7 +139,7 @@ def test_errors_are_bounded(n: int, count: int, precision: Precision) -> None:
     off = np.abs(found - value) - point * np.linalg.norm(gradient, axis=1) - 1e-6 * np.abs(value)
     assert (off <= error).all()
     known = slope_error < np.linalg.norm(slope, axis=1)
-    assert known.mean() > 0.99
+    assert known.mean() > 0.9  # far from the surface the gradient vanishes
     rounding = 1e-5 * np.linalg.norm(gradient, axis=1)
     steep = np.linalg.norm(slope - gradient, axis=1) - rounding
     assert (steep <= slope_error)[known].all()
@@ -172,18 +173,20 @@ def compare(some: Cloud, o: np.ndarray, d: np.ndarray, **settings: Any) -> None:
     plain = hk.trace(hk.DipolePotential(*some), o, d, **settings)
     hits = hk.trace(with_cells, o, d, **settings)
     assert not (hits.status == hk.Status.OUT_OF_STEPS).any()
+    assert (plain.hit != hits.hit).mean() < 2e-3
+    # Where one hits before the other, the level is within its tolerance there; with what single
+    # precision does to positions.
+    near = 1.3e-4 + 1e-6 * np.abs(o).max()
     value_at = dipole_sum(some[0], some[1] * some[2][:, None])
-    differ = plain.hit != hits.hit
-    assert differ.mean() < 2e-3
     for one, other in ((plain, hits), (hits, plain)):
-        # Where one hits before the other, the level is within its tolerance there.
-        early = one.hit & (one.t < other.t - 1e-3)
-        x = o[early] + one.t[early, None] * d[early]
-        value, gradient = value_at(x)
-        steepness = np.linalg.norm(gradient, axis=1)
-        far = np.linalg.norm(x[:, None] - some[0][None], axis=2).min(axis=1) > 1e-5
-        assert (np.abs(value - 2 * math.pi) <= 1.3e-4 * steepness + 1e-4)[far].all()
-        assert early.mean() < 0.02
+        early = np.flatnonzero(one.hit & (one.t < other.t - 10 * near))
+        assert len(early) < 0.02 * len(o)
+        if len(early):
+            x = o[early] + one.t[early, None] * d[early]
+            value, gradient = value_at(x)
+            far = np.linalg.norm(x[:, None] - some[0][None], axis=2).min(axis=1) > near
+            off = np.abs(value - 2 * math.pi)
+            assert (off <= near * np.linalg.norm(gradient, axis=1) + 1e-4)[far].all()
 
 
 @pytest.mark.parametrize("precision", ["single", "double"])
@@ -222,19 +225,22 @@ def test_memory_is_bounded_and_stated() -> None:
     x = places(some, 2000, 5)
     value, gradient = dipole_sum(some[0], some[1] * some[2][:, None])(x)
     sizes: list[int] = []
-    for megabytes in (True, 2.0, 0.1, 1e-6):
+    for megabytes in (True, 4.0, 2.0, 0.01):
         field = hk.DipolePotential(*some, cells=megabytes)
         prepared = field.prepare(choose_backend("single"))
         assert prepared._device is not None
-        cells = prepared._device.tree.cells
-        assert cells is not None
-        sizes.append(cells.size)
-        assert cells.size <= max(1e6 * (256 if megabytes is True else megabytes), 15_000)
-        assert prepared.describe()["cells"] == f"{cells.count} of {cells.size / 1e6:.1f} MB"
+        cells, said = prepared._device.tree.cells, prepared.describe()["cells"]
+        if cells is None:
+            sizes.append(0)
+            assert said == "none, as they need more memory"
+        else:
+            sizes.append(cells.size)
+            assert cells.size <= 1e6 * (256 if megabytes is True else megabytes)
+            assert said == f"{cells.count} of {cells.size / 1e6:.1f} MB"
         found, _, error, _ = sampled(field, x, "single")
         rounding = 1e-6 * (np.abs(value) + np.linalg.norm(gradient, axis=1))
         assert (np.abs(found - value) <= error + rounding).all()
-    assert sizes == sorted(sizes, reverse=True)
+    assert sizes[0] > sizes[1] > sizes[2] > sizes[3] == 0
     assert "cells" not in hk.DipolePotential(*some).describe()
 
 

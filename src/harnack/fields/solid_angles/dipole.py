@@ -200,10 +200,11 @@ class DipolePotential(DetailedField["_DipoleBuffers"], BatchedField):
         default 2 for values at points and 4 for tracing, which takes more where the tolerance asks
         for it. At least 1.5.
     cells: for many rays through many points. True builds cells in which the near points count one
-        by one and all others as one polynomial, so that an evaluation for tracing costs a tenth;
-        the memory for them may be given in megabytes, True for 256. Building takes as long as
-        tracing some 100,000 rays without them, for each precision and at the first trace.
-        Whatever is given, all bounds are proved: with less memory, cells are larger and slower.
+        by one and all others as one polynomial, so that an evaluation for tracing costs a tenth.
+        They take some 2 kB a point, or the megabytes that are given (True: 256) with larger and
+        slower cells; where these would be too large, none are built, and `describe` of a prepared
+        field says so. Building takes as long as tracing 100,000 to a million rays without cells,
+        for each precision, at the first trace. All bounds are proved, whatever is given.
 
     `moved` gives the field of points that have moved.
 
@@ -324,9 +325,13 @@ class DipolePotential(DetailedField["_DipoleBuffers"], BatchedField):
         return {"points": len(self.points), **named, **self._cells_built()}
 
     def _cells_built(self) -> dict[str, Any]:
-        """For `describe`: the number and memory of cells that were built."""
-        found = None if self._device is None else self._device.tree.cells
-        return {} if found is None else {"cells": f"{found.count} of {found.size / 1e6:.1f} MB"}
+        """For `describe`: the number and memory of cells."""
+        if self._device is None or not self.cells:
+            return {}
+        found = self._device.tree.cells
+        if found is None:
+            return {"cells": "none, as they need more memory"}
+        return {"cells": f"{found.count} of {found.size / 1e6:.1f} MB"}
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,7 @@ DEGREE, _POLES = 6, 4
 COEFFICIENTS = (DEGREE + 1) ** 2
 _SPREAD = 4.5
 # See `_Expanded.of`.
-_ROUNDING = 2.0**-27
+_ROUNDING = 2.0**-21
 # Moments of a node, in order.
 _MOMENTS = tuple(key for key in parts(_POLES) if key[0])
 # Sums of many positive numbers in double precision, as bounds.
@@ -219,8 +219,9 @@ class FarSums:
         dr.eval(*found)
         n = dr.width(lists.count)
         columns = [np.broadcast_to(to_numpy(one), n) for one in found]
-        bounds = (one * _ROUNDED_UP for one in columns[COEFFICIENTS:-1])
-        return cls(np.stack(columns[:COEFFICIENTS], axis=1), *bounds, columns[-1] / _ROUNDED_UP)
+        coefficients = np.stack(columns[:COEFFICIENTS], axis=1)
+        error, slope, fourth = (one * _ROUNDED_UP for one in columns[COEFFICIENTS:-1])
+        return cls(coefficients, error, slope, fourth, columns[-1] / _ROUNDED_UP)
 
 
 def _fourth(number: Any) -> Any:
@@ -253,8 +254,8 @@ class _Expanded:
 
         Rounding, in double precision: each product of a coefficient passes through fewer than 2^10
         roundings, its shifts to smaller cells included, and the sum of the absolute values of all
-        products, with those of the harmonics of the ball, is below 2^16 norms[l-1]/r^(l+1) (tests
-        compute it). So value, and gradient times the radius, are off by at most 2^-27 of that.
+        products, with those of the harmonics of the ball, is below 2^22 norms[l-1]/r^(l+1) (tests
+        compute it). So value, and gradient times the radius, are off by at most 2^-21 of that.
         """
         inverse = dr.rsqrt(dr.squared_norm(r))
         seen = irregular(r.x, r.y, r.z, inverse, DEGREE + len(norms))

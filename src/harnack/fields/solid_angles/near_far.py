@@ -51,9 +51,9 @@ if TYPE_CHECKING:
 _NEAR, _SHARED = 3.0, 4.5
 # Nodes of the tree are left to the cells in a cell if they are no larger than its ball.
 _SMALL = 1.0
-# Cells are split that have more near dipoles, by experiment; where memory is short, so many times
-# more, again and again.
-_MOST_NEAR, _COARSER = 64, 2
+# Cells are split that have more near dipoles, by experiment; where memory is short, twice as many,
+# again and again, up to a number with which the tree is faster.
+_MOST_NEAR, _TOO_MANY = 64, 512
 # Balls are larger than the balls around cells by this factor, for the rounding of positions, and
 # cells of the finest level are 2^-_DEEPEST as wide as the cube: rounding moves a point by less
 # than 2^-20 of it in single precision, and the balls reach 2^-19 of it beyond the finest cells.
@@ -165,8 +165,9 @@ class _Level:
 def build_cells(
     backend: Backend, tree: Hierarchy, levels: list[NodeMoments], rows: FloatArray,
     dipoles: Records, half: float, most_bytes: int,
-) -> NearFarCells:  # fmt: skip
-    """Cells of a cube [-h, h]^3, h at least `half`, of at most so many bytes.
+) -> NearFarCells | None:  # fmt: skip
+    """Cells of a cube [-h, h]^3, h at least `half`, of at most so many bytes; None where those
+    would be too large to be of use.
 
     levels, rows: the moments of the tree, and its dipoles in their slots. dipoles: the latter on
         the backend. Where cells would take more bytes, they are larger and have more near dipoles.
@@ -179,6 +180,8 @@ def build_cells(
     """
     packed = source_tree(tree, levels, rows)
     octree = _fitting(packed, half, backend, most_bytes)
+    if octree is None:
+        return None
     double, shifts = packed.backend, shift_matrices(DEGREE, 0.5 / (math.sqrt(3) * _MARGIN))
     lists, shared = Lists.of_root(double), FarSums.none(1)
     nodes, tables, near = [np.zeros(0, np.int64)], [np.zeros((0, 0))], [np.zeros(0, np.uint32)]
@@ -261,25 +264,29 @@ def _table(
     return np.column_stack([*head, sums.coefficients])
 
 
-def _fitting(packed: PackedTree, half: float, backend: Backend, most_bytes: int) -> list[_Level]:
-    """The octree, with as few near dipoles in a cell as memory allows."""
+def _fitting(
+    packed: PackedTree, half: float, backend: Backend, most_bytes: int
+) -> list[_Level] | None:
+    """The octree, with as few near dipoles in a cell as memory allows; None where it takes too
+    many: lists of near dipoles take nearly as much memory, whatever the size of the cells."""
 
     def is_too_large(levels: list[_Level]) -> bool:
         return _bytes(backend, levels) > most_bytes
 
     most_near = _MOST_NEAR
-    while True:
+    while most_near <= _TOO_MANY:
         octree = _octree(packed, half, most_near, is_too_large)
         if octree is not None:
             return octree
-        most_near *= _COARSER
+        most_near *= 2
+    return None
 
 
 def _octree(
     packed: PackedTree, half: float, most_near: int, too_large: Callable[[list[_Level]], bool]
 ) -> list[_Level] | None:
     """The cells of a cube, level by level, split where more dipoles are near; None where they are
-    too large. A single cell never is."""
+    too large."""
     backend = packed.backend
     index, root = backend.UInt32, Lists.of_root(backend)
     levels: list[_Level] = []
@@ -288,14 +295,14 @@ def _octree(
         side = half / 2 ** len(levels)
         radius = math.sqrt(3) * side * _MARGIN
         lists = root.some(backend, np.zeros(len(centers), np.int64))
-        is_last = len(levels) == _DEEPEST or most_near > _ANY // _COARSER
+        is_last = len(levels) == _DEEPEST
         most = dr.opaque(index, _ANY if is_last else most_near)
         near = dr.opaque(backend.Float, _NEAR * radius)
         given = packed, lists, _vectors(backend, centers), near, most, None
         count = to_numpy(dipoles_of(*given, far=False)).astype(np.int64)
         is_leaf = np.broadcast_to(count <= most_near, len(centers)) | is_last
         levels.append(_Level(centers, radius, is_leaf, count))
-        if len(levels) > 1 and too_large(levels):
+        if too_large(levels):
             return None
         centers = (centers[~is_leaf][:, None] + 0.5 * side * _OCTANTS).reshape(-1, 3)
     return levels
