@@ -1,0 +1,277 @@
+"""What far dipoles add to balls: local expansions, and bounds of what these leave out.
+
+- `source_tree`: a tree of dipoles in double precision, with all that expansions need.
+- `nodes_of`, `dipoles_of`: walks that split the dipoles of a ball into far nodes, far dipoles, near
+  dipoles, and what is left to smaller balls.
+- `FarSums`: the sums over far nodes and far dipoles.
+
+A node of radius R is far from a ball of radius rho if their centers are farther apart than k rho +
+`_SPREAD` R, a dipole if it is farther from the ball's center than k rho, for a factor k > 1: then
+its dipoles are all farther from the center than k rho.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import numpy as np
+
+from harnack.backend import BoolArray, FloatArray, choose_backend, to_numpy
+from harnack.backend.elementary import fmin
+from harnack.fields.solid_angles.local_expansion import irregular, of_cluster, parts, tail_factors
+from harnack.fields.solid_angles.multipole import NodeMoments, sup_norm, truncation
+from harnack.tree import Node, PackedTree, pack
+from harnack.tree.lists import Lists, Put, each_entry, walk_lists
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Mask, Real, Vec3
+    from harnack.tree import Hierarchy
+
+# Harmonics have degree l.
+# ruff: noqa: E741
+
+# The degree of local expansions, and the largest of the multipoles that they are made of.
+DEGREE, _POLES = 6, 4
+COEFFICIENTS = (DEGREE + 1) ** 2
+_SPREAD = 4.5
+# See `_Expanded.of`.
+_ROUNDING = 2.0**-21
+# Moments of a node, in order.
+_MOMENTS = tuple(key for key in parts(_POLES) if key[0])
+# Sums of many positive numbers in double precision, as bounds.
+_ROUNDED_UP = 1 + 1e-9
+
+
+def source_tree(tree: Hierarchy, levels: list[NodeMoments], rows: FloatArray) -> PackedTree:
+    """Nodes: center, `_SPREAD` times the radius, radius, area | moments up to `_POLES`, (E, G) of
+    `multipole.truncation`, and the sup norms of the moments. rows: `far_clusters.in_slots`."""
+    numbers: list[FloatArray] = []
+    for level in levels:
+        reach = _SPREAD * level.radius
+        left_out, slope, _ = truncation(level, reach, _POLES - 1)
+        moments = [
+            level.moments[l, m].imag if part else level.moments[l, m].real
+            for l, m, part in _MOMENTS
+        ]
+        norms = [sup_norm(level.moments, l) for l in range(1, _POLES + 1)]
+        head = [level.center, reach, level.radius, level.area]
+        numbers.append(np.column_stack([*head, *moments, left_out, slope, *norms]))
+    return pack(choose_backend("double"), tree, numbers, rows)
+
+
+def nodes_of(
+    tree: PackedTree, lists: Lists, c: Vec3, inner: Real, smallest: Real, put: Put | None, *,
+    far: bool,
+) -> Any:  # fmt: skip
+    """The number of nodes in listed subtrees that are far from c, or of those that are left; for
+    `make_lists`. Nodes that are not far are left if their radius is at most `smallest` or they are
+    leaves, and are replaced by their children otherwise.
+
+    Each dipole of the listed subtrees is in just one node that is far or left.
+    """
+    index, vector = tree.backend.UInt32, tree.backend.Array3f
+
+    def visit(node: Node, state: tuple[Any, ...]) -> tuple[Mask, tuple[Any, ...]]:
+        is_far = dr.squared_norm(c - vector(*node.head[:3])) > dr.square(inner + node.head[3])
+        is_left = ~is_far & ((node.head[4] <= smallest) | node.is_leaf)
+        chosen = is_far if far else is_left
+        if put is not None:
+            put(state[0], node.index, chosen)
+        return ~(is_far | is_left), (state[0] + dr.select(chosen, index(1), index(0)),)
+
+    return walk_lists(tree, lists, visit, (index(0),))[0]
+
+
+def dipoles_of(
+    tree: PackedTree, lists: Lists, c: Vec3, inner: Real, most: Any, put: Put | None, *, far: bool
+) -> Any:
+    """The number of dipoles in listed subtrees that are near c, or of those that are neither near
+    nor in a far node; for `make_lists`. Once it is more than `most`, not all may be counted."""
+    index, vector = tree.backend.UInt32, tree.backend.Array3f
+
+    def visit(node: Node, state: tuple[Any, ...]) -> tuple[Mask, tuple[Any, ...]]:
+        # A node that is not far may have near dipoles only if its ball comes near.
+        reach = node.head[3] if far else node.head[4] * (1 + 1e-9) + 1e-12
+        square = dr.squared_norm(c - vector(*node.head[:3]))
+        down = (square <= dr.square(inner + reach)) & (state[0] <= most)
+
+        def more(slot: Any, *_: Any) -> Mask:
+            return down & node.is_leaf & (slot < tree.leaf_size)
+
+        def step(slot: Any, count: Any) -> tuple[Any, ...]:
+            row = tree.primitive(node.leaf, slot, down)
+            is_far = dr.squared_norm(c - vector(*row[:3])) > dr.square(inner)
+            chosen = (is_far if far else ~is_far) & (row[6] > 0) & down
+            if put is not None:
+                put(count, node.leaf * tree.leaf_size + slot, chosen)
+            return slot + 1, count + dr.select(chosen, index(1), index(0))
+
+        return down, (dr.while_loop((index(0), state[0]), more, step, label="dipoles")[1],)
+
+    return walk_lists(tree, lists, visit, (index(0),))[0]
+
+
+@dataclass(frozen=True)
+class FarSums:
+    """Sums over far dipoles of n balls.
+
+    coefficients: (n, COEFFICIENTS) of the local expansion (`local_expansion.parts`).
+    error, slope: (n,) bounds of what it leaves out of value and gradient, anywhere in the ball.
+    fourth: (n,) bounds of the sums of area/D^4, D the distance of a dipole from the center.
+    least: (n,) a distance from the center within which there are none of these dipoles.
+    """
+
+    coefficients: FloatArray
+    error: FloatArray
+    slope: FloatArray
+    fourth: FloatArray
+    least: FloatArray
+
+    @classmethod
+    def none(cls, n: int) -> FarSums:
+        """Sums over no dipoles."""
+        zero = np.zeros(n)
+        return cls(np.zeros((n, COEFFICIENTS)), zero, zero, zero, np.full(n, np.inf))
+
+    def plus(self, other: FarSums) -> FarSums:
+        """The sums over the dipoles of both."""
+        return FarSums(
+            self.coefficients + other.coefficients,
+            (self.error + other.error) * _ROUNDED_UP,
+            (self.slope + other.slope) * _ROUNDED_UP,
+            (self.fourth + other.fourth) * _ROUNDED_UP,
+            np.minimum(self.least, other.least),
+        )
+
+    def some(self, which: BoolArray) -> FarSums:
+        """Those chosen by a mask."""
+        return FarSums(*(one[which] for one in vars(self).values()))
+
+    def of_octants(self, shifts: FloatArray, radius: float) -> FarSums:
+        """The same dipoles seen from the eight octants of cells with balls of this radius, octant
+        by octant of each cell.
+
+        Proof. The ball of an octant lies in that of the cell, so that error and slope are bounds
+        there as well. Its center is half a radius away, or less by the margin, so that distances
+        shrink by at most that, and 1/D^4 grows by at most (1 - radius/(2 least))^-4, D >= least.
+        """
+        shifted = np.einsum("oab,kb->koa", shifts, self.coefficients)
+        share = 0.5 * radius / self.least  # 0 where there are no dipoles
+        bounds = self.error, self.slope, self.fourth / (1 - share) ** 4, self.least - 0.5 * radius
+        others = (np.repeat(one, 8) for one in bounds)
+        return FarSums(shifted.reshape(-1, COEFFICIENTS), *others)
+
+    @classmethod
+    def over_nodes(cls, tree: PackedTree, lists: Lists, c: Vec3, radius: Real) -> FarSums:
+        """Sums over listed far nodes, for balls around c."""
+
+        def term(i: Any, active: Mask) -> list[Any]:
+            head, payload = tree.heads.row(i, active), tree.payload(i, active)
+            numbers = dict(zip(_MOMENTS, payload, strict=False))
+            left_out, slope_left_out, *norms = payload[len(_MOMENTS) :]
+            found = _Expanded.of(
+                c - tree.backend.Array3f(*head[:3]), _pairs(numbers), norms, radius
+            )
+            distance = dr.rcp(found.inverse)
+            near = dr.rcp(distance - radius)
+            power = near
+            for _ in range(_POLES + 1):
+                power = power * near
+            error = found.error + left_out * power
+            slope = found.slope + slope_left_out * power * near
+            least = distance - head[4]
+            return [*found.coefficients, error, slope, head[5] * _fourth(dr.rcp(least)), least]
+
+        return cls._accumulated(tree.backend, lists, term)
+
+    @classmethod
+    def over_dipoles(cls, tree: PackedTree, lists: Lists, c: Vec3, radius: Real) -> FarSums:
+        """Sums over listed far dipoles, for balls around c."""
+
+        def term(i: Any, active: Mask) -> list[Any]:
+            row = tree.primitives.row(i, active)
+            moments = {(1, 0): (row[5], 0.0), (1, 1): (0.5 * row[3], 0.5 * row[4])}
+            found = _Expanded.of(c - tree.backend.Array3f(*row[:3]), moments, [row[6]], radius)
+            rest = row[6] * _fourth(found.inverse), dr.rcp(found.inverse)
+            return [*found.coefficients, found.error, found.slope, *rest]
+
+        return cls._accumulated(tree.backend, lists, term)
+
+    @classmethod
+    def _accumulated(
+        cls, backend: Backend, lists: Lists, term: Callable[[Any, Mask], list[Any]]
+    ) -> FarSums:
+        """term: from an entry of a list, all numbers, the last of which is a minimum."""
+        zero = backend.Float(0)
+
+        def add(i: Any, active: Mask, state: tuple[Any, ...]) -> tuple[Any, ...]:
+            *sums, least = state
+            *added, nearest = term(i, active)
+            pairs = zip(sums, added, strict=True)
+            new = [old + dr.select(active, one, 0) for old, one in pairs]
+            return *new, dr.select(active, fmin(least, nearest), least)
+
+        start = (*([zero] * (COEFFICIENTS + 3)), zero + dr.inf)
+        found = each_entry(backend, lists, add, start)
+        dr.eval(*found)
+        n = dr.width(lists.count)
+        columns = [np.broadcast_to(to_numpy(one), n) for one in found]
+        coefficients = np.stack(columns[:COEFFICIENTS], axis=1)
+        error, slope, fourth = (one * _ROUNDED_UP for one in columns[COEFFICIENTS:-1])
+        return cls(coefficients, error, slope, fourth, columns[-1] / _ROUNDED_UP)
+
+
+def _fourth(number: Any) -> Any:
+    square = number * number
+    return square * square
+
+
+def _pairs(numbers: dict[Any, Any]) -> dict[tuple[int, int], tuple[Any, Any]]:
+    return {
+        (l, m): (numbers[l, m, 0], numbers.get((l, m, 1), 0.0))
+        for l, m, part in numbers
+        if not part
+    }
+
+
+@dataclass(frozen=True)
+class _Expanded:
+    """The local expansion of multipole terms: coefficients times powers of the ball's radius,
+    bounds of what it leaves out of value and gradient in the ball, and one over the distance."""
+
+    coefficients: list[Any]
+    error: Any
+    slope: Any
+    inverse: Any
+
+    @classmethod
+    def of(cls, r: Vec3, moments: Any, norms: list[Any], radius: Real) -> _Expanded:
+        """r: from the multipoles to the ball's center. norms: of the terms l = 1, 2, ...: term l is
+        at most norms[l-1]/r^(l+1). The bounds are those of `tail_factors`, whose c grows with l.
+
+        Rounding, in double precision: each product of a coefficient passes through fewer than 2^10
+        roundings, its shifts to smaller cells included, and the sum of the absolute values of all
+        products, with those of the harmonics of the ball, is below 2^22 norms[l-1]/r^(l+1) (tests
+        compute it). So value, and gradient times the radius, are off by at most 2^-21 of that.
+        """
+        inverse = dr.rsqrt(dr.squared_norm(r))
+        seen = irregular(r.x, r.y, r.z, inverse, DEGREE + len(norms))
+        powers, q = [1.0], radius * inverse
+        total, largest, u, power = 0.0, 0.0, inverse, q
+        for _ in range(DEGREE):
+            powers.append(powers[-1] * radius)
+            power = power * q
+        found = zip(parts(DEGREE), of_cluster(moments, seen, DEGREE), strict=True)
+        coefficients = [one * powers[j] for (j, _, _), one in found]
+        ratio = 1.0
+        for l, norm in enumerate(norms, start=1):
+            u = u * inverse
+            factor, ratio = tail_factors(DEGREE, l)
+            total, largest = total + factor * norm * u, largest + norm * u
+        steeper = ratio * (DEGREE + 2) / (DEGREE + 1)
+        error = total * power / (1 - ratio * q) + _ROUNDING * largest
+        slope = (DEGREE + 1) * total * power / (1 - steeper * q) + _ROUNDING * largest
+        return cls(coefficients, error, slope / radius, inverse)

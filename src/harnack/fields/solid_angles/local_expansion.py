@@ -1,0 +1,204 @@
+"""Local expansions: the field of dipoles outside of a ball as a harmonic polynomial in the ball.
+
+With the harmonics of `multipole` and coefficients L_jk about the center c of a ball of radius rho,
+every f that is harmonic there is
+
+    f(c + u) = sum_{j>=0} sum_k conj(R_jk(u)) L_jk,      L_j,-k = (-1)^k conj L_jk.
+
+- `of_cluster`: L_jk of dipoles given by their moments about a point outside of the ball.
+- `shift_matrices`: L_jk about the centers of the eight octants of a cell.
+- `value_and_gradient`: the polynomial, of coefficients that a record holds.
+- `tail_factors`: a bound of the terms of higher degree; `rounding_tables`: of all rounding.
+
+Coefficients are stored as real and imaginary parts for k >= 0 in the order of `parts`, times rho^j,
+so that u is taken in units of rho.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from harnack.backend import FloatArray
+from harnack.fields.solid_angles.multipole import Pairs, regular
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+# Harmonics have degree l.
+# ruff: noqa: E741
+
+
+def parts(degree: int) -> list[tuple[int, int, int]]:
+    """(j, k, 0 for the real or 1 for the imaginary part) of the (degree + 1)^2 coefficients."""
+    return [
+        (j, k, part)
+        for j in range(degree + 1)
+        for k in range(j + 1)
+        for part in range(2 if k else 1)
+    ]
+
+
+def irregular(x: Any, y: Any, z: Any, inverse: Any, degree: int) -> Pairs:
+    """I_lm at (x, y, z) for l <= degree and 0 <= m <= l; inverse: one over the length.
+
+    By definition I_lm = (l+m)! (l-m)! R_lm / r^(2l+1), and R_lm(v / r^2) = R_lm(v) / r^(2l).
+    """
+    square = inverse * inverse
+    out: Pairs = {}
+    for (l, m), (re, im) in regular(x * square, y * square, z * square, degree).items():
+        scale = float(math.factorial(l + m) * math.factorial(l - m)) * inverse
+        out[l, m] = scale * re, scale * im if m else 0.0
+    return out
+
+
+def _signed(values: Pairs, l: int, m: int) -> tuple[Any, Any]:
+    """The entry (l, m) for either sign of m: (-1)^m times the conjugate of (l, -m)."""
+    re, im = values[l, abs(m)]
+    if m >= 0:
+        return re, im
+    return (re, -im) if m % 2 == 0 else (-re, im)
+
+
+def of_cluster(moments: Pairs, seen: Pairs, degree: int) -> list[Any]:
+    """L_jk, in the order of `parts`, of dipoles with these moments about a point y.
+
+    seen: I_lm (`irregular`) at c - y, of degree `degree` and the largest of the moments together.
+
+    Proof. f(x) = -sum conj(M_lm) I_lm(x - y). The addition theorem of R, applied to both arguments
+    of 1/|r + u - y| = sum conj(R_lm(y)) I_lm(r + u) = sum conj(R_lm(y - u)) I_lm(r), gives
+    I_lm(r + u) = sum_jk conj(R_jk(-u)) I_(l+j),(m+k)(r), as the R_lm are linearly independent, and
+    R_jk(-u) = (-1)^j R_jk(u). So L_jk = -(-1)^j sum_lm conj(M_lm) I_(l+j),(m+k)(c - y).
+    """
+    out: list[Any] = []
+    largest = max(l for l, _ in moments)
+    for j in range(degree + 1):
+        for k in range(j + 1):
+            re, im = 0.0, 0.0
+            for l in range(1, largest + 1):
+                for m in range(-l, l + 1):
+                    a, b = _signed(moments, l, m)
+                    u, v = _signed(seen, l + j, m + k)
+                    re = re + (a * u + b * v)
+                    if k:
+                        im = im + (a * v - b * u)
+            sign = -1.0 if j % 2 == 0 else 1.0
+            out += [sign * re, sign * im] if k else [sign * re]
+    return out
+
+
+def shift_matrices(degree: int, offset: float) -> FloatArray:
+    """(8, n, n) matrices T, one for each octant of a cube in the order of its corners, z fastest:
+    T @ L are the coefficients about the octant's center, in units of its own radius, which is half
+    that of the cube.
+
+    offset: of an octant's center along each axis, in units of the cube's radius.
+
+    R_jk(s + v) = sum R_ab(v) R_(j-a),(k-b)(s), so that L'_ab = sum_jk L_jk conj(R_(j-a),(k-b)(s)):
+    exact, as all are polynomials.
+    """
+    order = parts(degree)
+    place = {key: i for i, key in enumerate(order)}
+    out = np.zeros((8, len(order), len(order)))
+    for octant, corner in enumerate(itertools.product((-offset, offset), repeat=3)):
+        x, y, z = corner
+        shifted = regular(x, y, z, degree)
+        for (j, k, part), column in place.items():
+            for sign in (1, -1) if k else (1,):  # L_j,-k = (-1)^k conj L_jk counts too
+                given = 1j if part else 1.0
+                if sign < 0:
+                    given = (-1) ** k * np.conj(given)
+                for a, b in {(a, b) for a, b, _ in order if a <= j}:
+                    if abs(sign * k - b) > j - a:
+                        continue
+                    u, v = _signed(shifted, j - a, sign * k - b)
+                    term = given * (u - 1j * v) * 0.5**a
+                    out[octant, place[a, b, 0], column] += term.real
+                    if b:
+                        out[octant, place[a, b, 1], column] += term.imag
+    return out
+
+
+def value_and_gradient(coefficients: Sequence[Any], y: Sequence[Any], degree: int) -> list[Any]:
+    """The polynomial and its three derivatives at y, all in units of the radius.
+
+    With A_jk = w_k conj L_jk, w_0 = 1 and w_k = 2 otherwise, f = Re sum A_jk R_jk over k >= 0.
+    By the derivatives of R_jk (`multipole`), and as R_j,-1 = -conj R_j1, each derivative is
+    Re sum B_jk R_jk, with B^z_jk = A_j+1,k and, up to factors 2 where k + 1 or k - 1 is 0,
+    B^x_jk = (A_j+1,k+1 - A_j+1,k-1)/2, B^y_jk = i (A_j+1,k+1 + A_j+1,k-1)/2.
+    """
+    r, a = regular(y[0], y[1], y[2], degree), dict(zip(parts(degree), coefficients, strict=True))
+    total: list[Any] = [0.0] * 4
+    for j, k in sorted(r):
+        re, im = r[j, k]
+        real, imag = a[j, k, 0], a.get((j, k, 1), 0.0)
+        weight = 2.0 if k else 1.0
+        total[0] = total[0] + weight * (real * re + (imag * im if k else 0.0))
+        if j == degree:
+            continue
+        up, down = a[j + 1, k + 1, 0], a.get((j + 1, k - 1, 0), 0.0)
+        iup, idown = a[j + 1, k + 1, 1], a.get((j + 1, k - 1, 1), 0.0)
+        zr, zi = a[j + 1, k, 0], a.get((j + 1, k, 1), 0.0)
+        x, xi = (up, iup) if k == 0 else (up - down, iup - idown)
+        v, vi = (up, iup) if k == 0 else (up + down, iup + idown)
+        total[1] = total[1] + (x * re + (xi * im if k else 0.0))
+        total[2] = total[2] + (vi * re if k == 0 else vi * re - v * im)
+        total[3] = total[3] + weight * (zr * re + (zi * im if k else 0.0))
+    return total
+
+
+class _Sizes:
+    """Absolute values: differences are sums."""
+
+    def __init__(self, number: Any) -> None:
+        self.number = number
+
+    def __add__(self, other: Any) -> _Sizes:
+        return _Sizes(self.number + np.abs(other.number if isinstance(other, _Sizes) else other))
+
+    def __mul__(self, other: Any) -> _Sizes:
+        return _Sizes(self.number * np.abs(other.number if isinstance(other, _Sizes) else other))
+
+    def __neg__(self) -> _Sizes:
+        return self
+
+    __radd__ = __sub__ = __rsub__ = __add__
+    __rmul__ = __mul__
+
+
+def rounding_tables(degree: int, largest: float) -> FloatArray:
+    """(n, 4) numbers whose products with |L_jk|, summed up, and with the backend's epsilon bound
+    the rounding of `value_and_gradient` for coordinates up to `largest`.
+
+    Proof. Value and derivatives are sums of products of coefficients, coordinates and constants,
+    each of which passes through at most n = 9 degree + 2 (degree + 1)^2 roundings: 6 a degree in
+    the recurrence of R_jk, 3 a degree of the coordinates, and those of the sums. So they are off by
+    at most 1.01 n u times the sum of the absolute values of the products (u = epsilon/2), which is
+    the same expression with all signs positive, at the largest coordinates.
+    """
+    count = (degree + 1) ** 2
+    one = _Sizes(np.full(count, largest))
+    rows = [_Sizes(row) for row in np.eye(count)]
+    sums = value_and_gradient(rows, (one, one, one), degree)
+    roundings = 0.51 * (9 * degree + 2 * count)
+    return roundings * np.stack([part.number for part in sums], axis=1)
+
+
+def tail_factors(degree: int, l: int) -> tuple[float, float]:
+    """(b, c): on the ball of radius rho, the terms of degree above p of the local expansion of the
+    multipole term of degree l at distance D, which is at most B/r^(l+1), are with q = rho/D at most
+
+        B/D^(l+1) b q^(p+1)/(1 - c q),   b = C(l+p+1, p+1), c = (l+p+2)/(p+2).
+
+    Their gradient is at most (p+1)/rho times that, with (l+p+2)/(p+1) for c.
+
+    Proof. The derivative of order j along a line is at most (l+j)!/l! B/D^(l+1+j) at c
+    (`multipole.truncation`), so that the term of degree j is at most C(l+j, j) q^j B/D^(l+1). From
+    j = p+1 on, each of these is at most c q times the one before. By Bernstein and Szego's
+    inequality a harmonic polynomial of degree j has a gradient of at most j/rho times its
+    largest value on the sphere; and j C(l+j, j) grows by (l+j+1)/j at most.
+    """
+    return float(math.comb(l + degree + 1, degree + 1)), (l + degree + 2) / (degree + 2)

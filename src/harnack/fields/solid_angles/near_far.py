@@ -1,0 +1,322 @@
+"""Cells in which a sum over dipoles is a few near dipoles and one polynomial for all others.
+
+A cube around the dipoles is an octree of cells. In each cell that is not split, the dipoles that
+are within `_NEAR` times the radius of its ball from its center are listed, and all the rest are one
+harmonic polynomial (`local_expansion`), so that a sample costs what is near, whatever the number of
+dipoles.
+
+- `NearFarCells`: the cells on a backend. `build_cells` makes them, a level at a time, from the
+  moments of the tree; what cells share with others is gathered once, for their parent.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import numpy as np
+
+from harnack.backend import BoolArray, FloatArray, to_numpy
+from harnack.backend.arrays import aligned, aligned_integers
+from harnack.backend.records import Records
+from harnack.fields.solid_angles.far_sums import (
+    COEFFICIENTS,
+    DEGREE,
+    FarSums,
+    dipoles_of,
+    nodes_of,
+    source_tree,
+)
+from harnack.fields.solid_angles.local_expansion import (
+    rounding_tables,
+    shift_matrices,
+    value_and_gradient,
+)
+from harnack.fields.sums import SUM_ROUNDING, FieldSums
+from harnack.tree.lists import Lists, make_lists
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from harnack.backend import Backend, IntArray, Mask, Real, Vec3
+    from harnack.fields.solid_angles.far_clusters import AddPrimitive
+    from harnack.fields.solid_angles.multipole import NodeMoments
+    from harnack.tree import Hierarchy, PackedTree
+
+# Factors k of `far_sums`, by experiment: for a cell's own dipoles, and for those that it gathers
+# for all cells in it. The second is larger, as each level of cells adds to the truncation.
+_NEAR, _SHARED = 3.0, 4.5
+# Nodes of the tree are left to the cells in a cell if they are no larger than its ball.
+_SMALL = 1.0
+# Cells are split that have more near dipoles, by experiment; where memory is short, twice as many,
+# again and again, up to a number with which the tree is faster.
+_MOST_NEAR, _TOO_MANY = 64, 512
+# Balls are larger than the balls around cells by this factor, for the rounding of positions, and
+# cells of the finest level are 2^-_DEEPEST as wide as the cube: rounding moves a point by less
+# than 2^-20 of it in single precision, and the balls reach 2^-19 of it beyond the finest cells.
+_MARGIN, _DEEPEST = 1.004, 10
+_OCTANTS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+# Numbers of a record before the coefficients, and the base in which the first index is stored:
+# single precision holds no integers above 2^24.
+_HEAD, _BASE = 12, 4096
+_ANY = 2**31 - 1
+
+
+@dataclass(frozen=True)
+class NearFarCells:
+    """Cells on a backend.
+
+    low: the lower corner of the cube. scale: 2^_DEEPEST over its side.
+    nodes: for each node of the octree the number of the first of its eight children, z fastest; or
+        for a cell that is not split, -1 minus the number of its record.
+    records: center and one over the radius; bounds of truncation of value and gradient and of the
+        rounding of the value; `FarSums.fourth` and `least`; first index (two numbers) and number of
+        near dipoles | coefficients.
+    near: the near dipoles, as rows of `dipoles`.
+    dipoles: records of all dipoles, as `far_clusters.in_slots` has them.
+    count, size: the number of cells, and their bytes.
+    """
+
+    backend: Backend
+    low: Vec3
+    scale: Real
+    nodes: Any
+    records: Records
+    near: Any
+    dipoles: Records
+    count: int
+    size: int
+
+    def cell(self, x: Vec3) -> tuple[Any, Mask]:
+        """The record of the cell in which x lies, and whether x lies in the cube."""
+        index, integer = self.backend.UInt32, self.backend.Int32
+        place = (x - self.low) * self.scale
+        inside = dr.all((place >= 0) & (place < float(2**_DEEPEST)))
+        ix, iy, iz = (index(dr.select(inside, place[k], 0)) for k in range(3))
+
+        def more(node: Any, *_: Any) -> Mask:
+            return node >= 0
+
+        def step(node: Any, bit: Any) -> tuple[Any, Any]:
+            octant = ((ix >> bit) & 1) * 4 + ((iy >> bit) & 1) * 2 + ((iz >> bit) & 1)
+            return dr.gather(integer, self.nodes, index(node) + octant), bit - 1
+
+        root = dr.gather(integer, self.nodes, 0 * ix)
+        node, _ = dr.while_loop((root, index(_DEEPEST - 1) + 0 * ix), more, step, label="cell")
+        return index(-1 - node), inside
+
+    def sums(
+        self, x: Vec3, active: Mask, add: AddPrimitive, own: tuple[Any, ...]
+    ) -> tuple[FieldSums, tuple[Any, ...], Mask]:
+        """The sums over all dipoles at x, with gradients, a state of the caller's own, and the mask
+        of points for which they hold: those that are active and lie in the cube.
+
+        add: as for `Treecode.sums`, for near dipoles.
+
+        Proof of the bounds on far dipoles, D >= least from the center, at a point a from it: the
+        distance to x is at least D - a >= D (1 - a/least), so that the sum of area/distance^4 is at
+        most `fourth` (1 - a/least)^-4, and that of area/distance^5 at most that over least - a.
+        """
+        vector, index = self.backend.Array3f, self.backend.UInt32
+        number, inside = self.cell(x)
+        active = active & inside
+        row = self.records.row(number, active)
+        u, inverse = x - vector(*row[:3]), row[3]
+        y = u * inverse
+        value, *slopes = value_and_gradient(row[_HEAD : _HEAD + COEFFICIENTS], [*y], DEGREE)
+        error, slope_error, rounding, fourth, least, low, high, count = row[4:_HEAD]
+        free = least - dr.norm(u) * (1 + SUM_ROUNDING)
+        s4 = fourth * dr.square(dr.square(least / free))
+        zero = self.backend.Float(0)
+        far = FieldSums(
+            value, inverse * vector(*slopes), None, error, slope_error, None, rounding, free, s4,
+            s4 / free, zero,
+        )  # fmt: skip
+        first, count = index(low) + index(high) * _BASE, dr.select(active, index(count), 0)
+
+        def more(i: Any, *_: Any) -> Mask:
+            return i < count
+
+        def step(i: Any, sums: Any, own: Any) -> tuple[Any, ...]:
+            go = i < count
+            dipole = self.dipoles.row(dr.gather(index, self.near, first + i, go), go)
+            new, own = add(dipole, go, FieldSums.of(sums), own)
+            return i + 1, new.parts(), own
+
+        start = (index(0), far.parts(), own)
+        _, sums, own = dr.while_loop(start, more, step, label="near dipoles")
+        return FieldSums.of(sums), own, active
+
+
+@dataclass(frozen=True)
+class _Level:
+    """The cells of one size: centers (n, 3), the radius of their balls, which are not split, and
+    the number of near dipoles of those."""
+
+    centers: FloatArray
+    radius: float
+    is_leaf: BoolArray
+    near: IntArray
+
+
+def build_cells(
+    backend: Backend, tree: Hierarchy, levels: list[NodeMoments], rows: FloatArray,
+    dipoles: Records, half: float, most_bytes: int,
+) -> NearFarCells | None:  # fmt: skip
+    """Cells of a cube [-h, h]^3, h at least `half`, of at most so many bytes; None where those
+    would be too large to be of use.
+
+    levels, rows: the moments of the tree, and its dipoles in their slots. dipoles: the latter on
+        the backend. Where cells would take more bytes, they are larger and have more near dipoles.
+
+    Proof that each dipole counts once in each cell that is not split. The root of the octree begins
+    with a list of one node, the root of the tree. From each node of a cell's list the dipoles go to
+    far nodes, which the cell adds to its expansion, or to nodes that are left (`nodes_of`), which
+    are the list of each of its octants. A cell that is not split takes apart what is left: into far
+    nodes, far dipoles of other nodes, and near dipoles (`dipoles_of`).
+    """
+    packed = source_tree(tree, levels, rows)
+    octree = _fitting(packed, half, backend, most_bytes)
+    if octree is None:
+        return None
+    double, shifts = packed.backend, shift_matrices(DEGREE, 0.5 / (math.sqrt(3) * _MARGIN))
+    lists, shared = Lists.of_root(double), FarSums.none(1)
+    nodes, tables, near = [np.zeros(0, np.int64)], [np.zeros((0, 0))], [np.zeros(0, np.uint32)]
+    numbered, count, total = 1, 0, 0
+    for level in octree:
+        c, radius = _vectors(double, level.centers), dr.opaque(double.Float, level.radius)
+        found, lists = _shared(packed, lists, c, radius)
+        shared = shared.plus(found)
+        leaves, split = np.flatnonzero(level.is_leaf), np.flatnonzero(~level.is_leaf)
+        if len(leaves):
+            own = lists.some(double, leaves)
+            sums, close = _own(packed, own, _vectors(double, level.centers[leaves]), radius)
+            sums = sums.plus(shared.some(level.is_leaf))
+            lengths = to_numpy(close.count).astype(np.int64)
+            first = total + np.cumsum(lengths) - lengths
+            placed = level.centers[leaves], level.radius
+            tables.append(_table(backend, *placed, sums, first, lengths))
+            near.append(to_numpy(close.entries)[: int(lengths.sum())])
+            total += int(lengths.sum())
+        number = np.empty(len(level.is_leaf), np.int64)
+        number[leaves] = -1 - (count + np.arange(len(leaves)))
+        number[split] = numbered + 8 * np.arange(len(split))
+        nodes.append(number)
+        count, numbered = count + len(leaves), numbered + 8 * len(split)
+        shared = shared.some(~level.is_leaf).of_octants(shifts, level.radius)
+        lists = lists.some(double, np.repeat(split, 8))
+    table, entries = np.concatenate(tables[1:]), np.concatenate(near)
+    low = (dr.opaque(backend.Float, -half) for _ in range(3))
+    return NearFarCells(
+        backend, backend.Array3f(*low), dr.opaque(backend.Float, 2**_DEEPEST / (2 * half)),
+        backend.Int32(np.concatenate(nodes).astype(np.int32)), Records.upload(backend, table),
+        aligned_integers(backend, entries if len(entries) else np.zeros(1, np.uint32)), dipoles,
+        count, _bytes(backend, octree),
+    )  # fmt: skip
+
+
+def _shared(packed: PackedTree, lists: Lists, c: Vec3, radius: Real) -> tuple[FarSums, Lists]:
+    """What cells add for all cells in them, and what is left to these."""
+    backend, inner, smallest = packed.backend, _SHARED * radius, _SMALL * radius
+    far, left = (
+        make_lists(
+            backend,
+            lambda put, far=far: nodes_of(packed, lists, c, inner, smallest, put, far=far),
+        )
+        for far in (True, False)
+    )
+    return FarSums.over_nodes(packed, far, c, radius), left
+
+
+def _own(packed: PackedTree, lists: Lists, c: Vec3, radius: Real) -> tuple[FarSums, Lists]:
+    """What cells that are not split add for themselves, and their near dipoles."""
+    backend, inner = packed.backend, _NEAR * radius
+    nothing, most = dr.opaque(backend.Float, -1.0), dr.opaque(backend.UInt32, _ANY)
+    nodes = make_lists(
+        backend, lambda put: nodes_of(packed, lists, c, inner, nothing, put, far=True)
+    )
+    far, close = (
+        make_lists(
+            backend, lambda put, far=far: dipoles_of(packed, lists, c, inner, most, put, far=far)
+        )
+        for far in (True, False)
+    )
+    sums = FarSums.over_nodes(packed, nodes, c, radius)
+    return sums.plus(FarSums.over_dipoles(packed, far, c, radius)), close
+
+
+def _table(
+    backend: Backend, centers: FloatArray, radius: float, sums: FarSums, first: IntArray,
+    lengths: IntArray,
+) -> FloatArray:  # fmt: skip
+    """Records of cells. Rounding is that of `rounding_tables`, for coordinates within a cell and
+    what rounding of positions adds; that of the gradient, over the radius, counts as truncation."""
+    tables = rounding_tables(DEGREE, _MARGIN / math.sqrt(3))
+    rounding = backend.epsilon * np.abs(sums.coefficients) @ tables
+    slope = sums.slope + rounding[:, 1:].sum(axis=1) / radius
+    up, inverse = 1 + SUM_ROUNDING, np.full(len(first), 1 / radius)
+    least = np.minimum(sums.least, 1e3) / up
+    bounds = [sums.error * up, slope * up, rounding[:, 0], sums.fourth * up, least]
+    head = [centers, inverse, *bounds, first % _BASE, first // _BASE, lengths]
+    return np.column_stack([*head, sums.coefficients])
+
+
+def _fitting(
+    packed: PackedTree, half: float, backend: Backend, most_bytes: int
+) -> list[_Level] | None:
+    """The octree, with as few near dipoles in a cell as memory allows; None where it takes too
+    many: lists of near dipoles take nearly as much memory, whatever the size of the cells."""
+
+    def is_too_large(levels: list[_Level]) -> bool:
+        return _bytes(backend, levels) > most_bytes
+
+    most_near = _MOST_NEAR
+    while most_near <= _TOO_MANY:
+        octree = _octree(packed, half, most_near, is_too_large)
+        if octree is not None:
+            return octree
+        most_near *= 2
+    return None
+
+
+def _octree(
+    packed: PackedTree, half: float, most_near: int, too_large: Callable[[list[_Level]], bool]
+) -> list[_Level] | None:
+    """The cells of a cube, level by level, split where more dipoles are near; None where they are
+    too large."""
+    backend = packed.backend
+    index, root = backend.UInt32, Lists.of_root(backend)
+    levels: list[_Level] = []
+    centers = np.zeros((1, 3))
+    while len(centers):
+        side = half / 2 ** len(levels)
+        radius = math.sqrt(3) * side * _MARGIN
+        lists = root.some(backend, np.zeros(len(centers), np.int64))
+        is_last = len(levels) == _DEEPEST
+        most = dr.opaque(index, _ANY if is_last else most_near)
+        near = dr.opaque(backend.Float, _NEAR * radius)
+        given = packed, lists, _vectors(backend, centers), near, most, None
+        count = to_numpy(dipoles_of(*given, far=False)).astype(np.int64)
+        is_leaf = np.broadcast_to(count <= most_near, len(centers)) | is_last
+        levels.append(_Level(centers, radius, is_leaf, count))
+        if too_large(levels):
+            return None
+        centers = (centers[~is_leaf][:, None] + 0.5 * side * _OCTANTS).reshape(-1, 3)
+    return levels
+
+
+def _bytes(backend: Backend, levels: list[_Level]) -> int:
+    """Bytes of cells: records, lists of near dipoles, and nodes."""
+    leaves, near = sum(int(one.is_leaf.sum()) for one in levels), 0
+    for one in levels:
+        near += int(one.near[one.is_leaf].sum())
+    nodes = sum(len(one.is_leaf) for one in levels)
+    packets = -(-(_HEAD + COEFFICIENTS) // 8)
+    return 8 * packets * np.dtype(backend.dtype).itemsize * leaves + 4 * (near + nodes)
+
+
+def _vectors(backend: Backend, points: FloatArray) -> Vec3:
+    return backend.Array3f(*(aligned(backend, np.ascontiguousarray(one)) for one in points.T))

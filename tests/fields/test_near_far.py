@@ -1,0 +1,266 @@
+"""Cells of near dipoles and one polynomial: its formulas, its bounds, and rays through cells."""
+
+# Harmonics have degree l.
+# ruff: noqa: E741
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import Any
+
+import drjit as dr
+import numpy as np
+import pytest
+
+import harnack as hk
+from harnack.backend import Precision, choose_backend, to_numpy, to_vector3
+from harnack.fields.solid_angles import near_far
+from harnack.fields.solid_angles.far_sums import COEFFICIENTS, DEGREE
+from harnack.fields.solid_angles.local_expansion import (
+    _Sizes,  # pyright: ignore[reportPrivateUsage]
+    irregular,
+    of_cluster,
+    parts,
+    rounding_tables,
+    shift_matrices,
+    tail_factors,
+    value_and_gradient,
+)
+from harnack.fields.solid_angles.multipole import of_dipole, regular
+from tests.oracles.direct_sums import dipole_sum
+from tests.tracer.test_cloud_hits import Cloud, cloud, rays, unit
+
+
+def moments_of(d: np.ndarray, n: np.ndarray, largest: int) -> Any:
+    total: Any = {}
+    for at, normal in zip(d, n, strict=True):
+        for key, (re, im) in of_dipole(regular(*at, 4), *normal).items():
+            if key[0] <= largest:
+                old = total.get(key, (0.0, 0.0))
+                total[key] = old[0] + re, old[1] + im
+    return total
+
+
+def expanded(r: np.ndarray, moments: Any, degree: int) -> np.ndarray:
+    largest = max(key[0] for key in moments)
+    seen = irregular(*r, 1 / np.linalg.norm(r), degree + largest)
+    return np.array(of_cluster(moments, seen, degree))
+
+
+def test_expansions_are_the_sum_over_dipoles() -> None:
+    rng = np.random.default_rng(0)
+    d, n, r = 0.1 * rng.normal(size=(7, 3)), rng.normal(size=(7, 3)), np.array([2.0, 1.5, -2.2])
+    found = expanded(r, moments_of(d, n, 5), 10)
+    u = 0.2 * unit(rng.normal(size=(50, 3)))
+    value, gradient = dipole_sum(d, n)(r + u)
+    for k, at in enumerate(u):
+        f, *g = value_and_gradient(found, at, 10)
+        np.testing.assert_allclose([f, *g], [value[k], *gradient[k]], atol=2e-5)
+
+
+def test_shifts_are_exact() -> None:
+    rng = np.random.default_rng(1)
+    given, u = rng.normal(size=COEFFICIENTS), rng.uniform(-0.5, 0.5, 3)
+    before = np.array(value_and_gradient(given, u, DEGREE))
+    corners = itertools.product((-0.28, 0.28), repeat=3)
+    for matrix, corner in zip(shift_matrices(DEGREE, 0.28), corners, strict=True):
+        after = value_and_gradient(matrix @ given, 2 * (u - corner), DEGREE)
+        np.testing.assert_allclose(after, before * [1, 0.5, 0.5, 0.5], atol=1e-12)
+
+
+@pytest.mark.parametrize("q", [0.1, 0.25, 1 / 3, 0.4])
+def test_the_tail_of_a_dipole_is_bounded_and_attained(q: float) -> None:
+    """By one that points to the center of the ball, at the point of the ball nearest to it."""
+    at, normal = np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]])
+    r = np.array([0.0, 0.0, 1.0])
+    found = expanded(r, moments_of(at, normal, 1), DEGREE)
+    factor, ratio = tail_factors(DEGREE, 1)
+    error = factor * q ** (DEGREE + 1) / (1 - ratio * q)
+    steeper = ratio * (DEGREE + 2) / (DEGREE + 1)
+    slope = (DEGREE + 1) * factor * q**DEGREE / (1 - steeper * q)
+    rng = np.random.default_rng(2)
+    u = q * np.concatenate([[[0, 0, -1.0]], unit(rng.normal(size=(300, 3)))])
+    value, gradient = dipole_sum(at, normal)(r + u)
+    off = np.array([value_and_gradient(found, one, DEGREE) for one in u])
+    used = np.abs(off[:, 0] - value) / error
+    steep = np.linalg.norm(off[:, 1:] - gradient, axis=1) / slope
+    assert used.max() <= 1 + 1e-6
+    assert steep.max() <= 1 + 1e-6
+    assert used[0] > 0.95
+    assert steep[0] > 0.9
+
+
+def test_rounding_of_expansions_is_below_what_is_counted() -> None:
+    """`far_sums._Expanded.of`: the sums of absolute values, all coordinates as large as can be."""
+    q = 1 / near_far._NEAR
+    ones = [_Sizes(np.array(1.0))] * 3
+    for largest in (1, 2, 3, 4):
+        seen = irregular(*ones, _Sizes(np.array(1.0)), DEGREE + largest)
+        keys = [(largest, m) for m in range(largest + 1)]
+        moments: Any = {(l, m): (0.0, 0.0) for l in range(1, largest) for m in range(l + 1)}
+        for l, m in keys:
+            size = _Sizes(np.array(1 / math.sqrt(math.factorial(l + m) * math.factorial(l - m))))
+            moments[l, m] = size, size
+        found = of_cluster(moments, seen, DEGREE)
+        powers = [one.number * q**j for (j, _, _), one in zip(parts(DEGREE), found, strict=True)]
+        harmonics = rounding_tables(DEGREE, 1 / math.sqrt(3))
+        roundings = 0.51 * (9 * DEGREE + 2 * COEFFICIENTS)
+        assert (powers @ harmonics / roundings).max() < 2**22
+
+
+def sampled(field: hk.DipolePotential, x: np.ndarray, precision: Precision) -> Any:
+    backend = choose_backend(precision)
+    sample = field.prepare(backend).evaluate(to_vector3(backend, x))
+    dr.eval(sample.value, sample.gradient, sample.error, sample.gradient_error)
+    numbers = sample.value, sample.gradient, sample.error, sample.gradient_error
+    return tuple(to_numpy(one).astype(np.float64) for one in numbers)
+
+
+def places(some: Cloud, n: int, seed: int) -> np.ndarray:
+    """Everywhere, and near the points at all distances; numbers of single precision."""
+    rng = np.random.default_rng(seed)
+    near = some[0][rng.integers(len(some[0]), size=n)]
+    x = near + 10 ** rng.uniform(-4, 0.3, (n, 1)) * unit(rng.normal(size=(n, 3)))
+    return x.astype(np.float32).astype(np.float64)
+
+
+@pytest.mark.parametrize("precision", ["single", "double"])
+@pytest.mark.parametrize(
+    ("n", "count"), [(300, 20_000), pytest.param(5000, 500_000, marks=pytest.mark.slow)]
+)
+def test_errors_are_bounded(n: int, count: int, precision: Precision) -> None:
+    some = cloud(n)
+    x = places(some, count, 3)
+    value, gradient = dipole_sum(some[0], some[1] * some[2][:, None])(x)
+    found, slope, error, slope_error = sampled(hk.DipolePotential(*some, cells=True), x, precision)
+    # The bounds leave out the rounding of the point itself.
+    point = 4 * choose_backend(precision).epsilon * np.abs(x).max(axis=1)
+    off = np.abs(found - value) - point * np.linalg.norm(gradient, axis=1) - 1e-6 * np.abs(value)
+    assert (off <= error).all()
+    known = slope_error < np.linalg.norm(slope, axis=1)
+    assert known.mean() > 0.9  # far from the surface the gradient vanishes
+    rounding = 1e-5 * np.linalg.norm(gradient, axis=1)
+    steep = np.linalg.norm(slope - gradient, axis=1) - rounding
+    assert (steep <= slope_error)[known].all()
+
+
+def test_errors_are_attained(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Half the error would be too little, at corners of cells towards a dipole that just misses
+    being near: with a dipole alone and in double precision, so that all error is truncation."""
+    monkeypatch.setattr(near_far, "_MOST_NEAR", 0)
+    point, normal = np.full((1, 3), 0.3), unit(np.ones((1, 3)))
+    field = hk.DipolePotential(point, normal, [1.0], cells=True)
+    prepared = field.prepare(choose_backend("double"))
+    assert prepared._device is not None
+    on = prepared._device
+    cells = on.tree.cells
+    assert cells is not None
+    table = to_numpy(cells.records.buffer).reshape(cells.count, -1)
+    corners = np.array(list(itertools.product((-1.0, 1.0), repeat=3))) / math.sqrt(3) / 1.0041
+    x = (table[:, None, :3] + corners / table[:, None, 3:4]).reshape(-1, 3)
+    x = field.points.mean(axis=0) + field._size * x
+    value, _ = dipole_sum(point, normal)(x)
+    found, _, error, _ = sampled(field, x, "double")
+    used = np.abs(found - value) / error
+    assert used.max() <= 1
+    assert used.max() > 0.5
+
+
+def compare(some: Cloud, o: np.ndarray, d: np.ndarray, **settings: Any) -> None:
+    """Rays with cells end as those without, but for grazes within the tolerance."""
+    with_cells = hk.DipolePotential(*some, cells=True)
+    plain = hk.trace(hk.DipolePotential(*some), o, d, **settings)
+    hits = hk.trace(with_cells, o, d, **settings)
+    assert not (hits.status == hk.Status.OUT_OF_STEPS).any()
+    assert (plain.hit != hits.hit).mean() < 2e-3
+    # Where one hits before the other, the level is within its tolerance there; with what single
+    # precision does to positions.
+    near = 1.3e-4 + 1e-6 * np.abs(o).max()
+    value_at = dipole_sum(some[0], some[1] * some[2][:, None])
+    for one, other in ((plain, hits), (hits, plain)):
+        early = np.flatnonzero(one.hit & (one.t < other.t - 10 * near))
+        assert len(early) < 0.02 * len(o)
+        if len(early):
+            x = o[early] + one.t[early, None] * d[early]
+            value, gradient = value_at(x)
+            far = np.linalg.norm(x[:, None] - some[0][None], axis=2).min(axis=1) > near
+            off = np.abs(value - 2 * math.pi)
+            assert (off <= near * np.linalg.norm(gradient, axis=1) + 1e-4)[far].all()
+
+
+@pytest.mark.parametrize("precision", ["single", "double"])
+@pytest.mark.parametrize(
+    ("n", "count"), [(400, 2000), pytest.param(5000, 20_000, marks=pytest.mark.slow)]
+)
+def test_rays_end_as_without_cells(n: int, count: int, precision: Precision) -> None:
+    some = cloud(n)
+    compare(some, *rays(some[0], count), precision=precision, t_max=6.0)
+
+
+@pytest.mark.parametrize("shift", [0.0, 1024.0])
+def test_rays_along_faces_and_through_corners_of_cells(shift: float) -> None:
+    """Also far from the origin."""
+    points, normals, areas = cloud(400)
+    points = (points + shift).astype(np.float32).astype(np.float64)
+    field = hk.DipolePotential(points, normals, areas, cells=True)
+    on = field.prepare(choose_backend("single"))._device
+    assert on is not None
+    cells = on.tree.cells
+    assert cells is not None
+    table = to_numpy(cells.records.buffer).reshape(cells.count, -1).astype(np.float64)
+    rng = np.random.default_rng(4)
+    chosen = table[rng.integers(cells.count, size=1000)]
+    corner = (
+        chosen[:, :3] + rng.choice([-1, 1], (1000, 3)) / (1.004 * math.sqrt(3)) / chosen[:, 3:4]
+    )
+    corner = field._center + field._size * corner
+    d = np.eye(3)[rng.integers(3, size=1000)]
+    d[500:] = unit(rng.choice([-1.0, 1.0], (500, 3)))
+    compare((points, normals, areas), corner - 3 * d, d, t_max=6.0)
+
+
+def test_memory_is_bounded_and_stated() -> None:
+    some = cloud(3000)
+    x = places(some, 2000, 5)
+    value, gradient = dipole_sum(some[0], some[1] * some[2][:, None])(x)
+    sizes: list[int] = []
+    for megabytes in (True, 4.0, 2.0, 0.01):
+        field = hk.DipolePotential(*some, cells=megabytes)
+        prepared = field.prepare(choose_backend("single"))
+        assert prepared._device is not None
+        cells, said = prepared._device.tree.cells, prepared.describe()["cells"]
+        if cells is None:
+            sizes.append(0)
+            assert said == "none, as they need more memory"
+        else:
+            sizes.append(cells.size)
+            assert cells.size <= 1e6 * (256 if megabytes is True else megabytes)
+            assert said == f"{cells.count} of {cells.size / 1e6:.1f} MB"
+        found, _, error, _ = sampled(field, x, "single")
+        rounding = 1e-6 * (np.abs(value) + np.linalg.norm(gradient, axis=1))
+        assert (np.abs(found - value) <= error + rounding).all()
+    assert sizes[0] > sizes[1] > sizes[2] > sizes[3] == 0
+    assert "cells" not in hk.DipolePotential(*some).describe()
+
+
+@pytest.mark.parametrize("cells", [-1.0, math.inf, math.nan])
+def test_cells_is_a_number_of_megabytes(cells: float) -> None:
+    with pytest.raises(ValueError, match="megabytes"):
+        hk.DipolePotential(*cloud(100), cells=cells)
+
+
+def test_moved_points_keep_cells() -> None:
+    some = cloud(200)
+    moved = hk.DipolePotential(*some, cells=8).moved(1.5 * some[0], some[1], 2.25 * some[2])
+    assert moved.cells == 8
+    x = places(some, 500, 6)
+    value, _ = dipole_sum(1.5 * some[0], some[1] * 2.25 * some[2][:, None])(x)
+    found, _, error, _ = sampled(moved, x, "double")
+    assert (np.abs(found - value) <= error + 1e-9 * np.abs(value)).all()
+
+
+def test_smoothed_sums_have_no_cells() -> None:
+    points, _ = icosphere(1)
+    with pytest.raises(ValueError, match="cells are of sums without smoothing"):
+        hk.DipolePotential(points, points, smoothing=0.1, cells=True)
