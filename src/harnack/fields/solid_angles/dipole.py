@@ -389,7 +389,8 @@ class DipolePotential(DetailedField["_DipoleBuffers"], BatchedField):
         """For `describe`: the number and memory of cells."""
         if self._device is None or not self.cells:
             return {}
-        found = self._device.tree.cells
+        tree = self._device.tree
+        found = tree.cells if isinstance(tree, DipoleTree) else None
         if found is None:
             return {"cells": "none, as they need more memory"}
         return {"cells": f"{found.count} of {found.size / 1e6:.1f} MB"}
