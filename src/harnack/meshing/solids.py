@@ -30,7 +30,7 @@ from harnack.fields.solids.region import solid as solid_of
 from harnack.fields.solids.swept import Extruded, Revolved
 from harnack.fields.solids.thread import Thread
 from harnack.geometry import Ball, Box, Intersection, Volume
-from harnack.meshing.checks import CrossingError, LocalError, MeshingError
+from harnack.meshing.checks import CrossingError, LocalError, MeshingError, TooLargeError
 from harnack.meshing.closed_mesh import (
     box_manifold,
     extruded_manifold,
@@ -512,7 +512,7 @@ def mesh_solid(
     error = 0.5 * tolerance * size
     attempts = _MOST_ATTEMPTS if spacing is None else 1
     per_wave = CELLS_PER_WAVE if spacing is None else None
-    uploads = Uploads()
+    uploads, first = Uploads(), None
     while True:
         mesher = RegionMesher(
             lower, upper, error, cells, per_wave, angle_mesher(error, cells), most_faces, report,
@@ -522,8 +522,12 @@ def mesh_solid(
             made = _apart(_put_together(mesher, solid, level, volume), error)
             check(made, size)
             break
+        except TooLargeError as large:
+            if first is None:
+                raise
+            raise first from large  # what smaller cells were for is what went wrong
         except (MissedError, LocalError) as wrong:
-            attempts -= 1
+            attempts, first = attempts - 1, first or wrong
             if not attempts:
                 raise
             cells *= _SMALLER
