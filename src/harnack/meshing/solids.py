@@ -425,9 +425,6 @@ _SMALLER = 0.6
 # Where parts were cut by each other, slivers may pass through their neighbors by rounding: what may
 # be moved to leave them out, in tolerances, in the order in which it is tried.
 _SLIVERS_WITHIN = (1e-3, 1e-4, 0.0)
-# So few triangles pass through others by chance, by the rounding of places where parts are cut.
-# Parts that are made a little otherwise are cut elsewhere.
-_CHANCE = 30
 # Room around what has an extent, as a part of its size.
 _MARGIN = 0.01
 
@@ -530,11 +527,6 @@ def mesh_solid(
                 raise
             raise first from large  # what smaller cells were for is what went wrong
         except (MissedError, LocalError) as wrong:
-            by_chance = isinstance(wrong, CrossingError) and len(wrong.places) <= _CHANCE
-            if by_chance and first is None and spacing is None:
-                first, cells, error = wrong, 0.97 * cells, 0.95 * error
-                report(f"{wrong}; once more, cut in other places")
-                continue
             attempts, first = attempts - 1, first or wrong
             if not attempts:
                 raise
