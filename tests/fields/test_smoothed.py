@@ -34,7 +34,7 @@ def smoothed_sum(field: hk.DipolePotential, x: np.ndarray) -> np.ndarray:
 def test_bounds_of_derivatives_hold_and_are_attained(m: int) -> None:
     """Along lines, by Taylor's coefficients on a circle in the complex plane."""
     kernel = SmoothedKernel(DOUBLE, 1.0)
-    rho, cosine = np.geomspace(1e-3, 50, 60)[:, None, None], np.linspace(-1, 1, 41)[:, None]
+    rho, cosine = np.geomspace(1e-3, 5000, 60)[:, None, None], np.linspace(-1, 1, 41)[:, None]
     d = np.sqrt(rho**2 + 1)
     turn = np.exp(2j * np.pi * np.arange(64) / 64)
     t = 0.3 * d * turn
@@ -45,7 +45,7 @@ def test_bounds_of_derivatives_hold_and_are_attained(m: int) -> None:
     bound = to_numpy(kernel.bounds(to_float(DOUBLE, distance), m)[m - 2])
     largest = coefficient.max(axis=1) * distance ** (m + 1)
     assert (largest <= bound * (1 + 1e-9)).all()
-    assert largest[-1] == pytest.approx(1.0, rel=0.02)  # far off as a plain dipole's
+    assert largest[-1] >= bound[-1] * (1 - 1e-4)  # far off, where it is that of plain dipoles
 
 
 def test_values_are_the_sum_within_their_errors() -> None:
