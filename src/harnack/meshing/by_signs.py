@@ -30,7 +30,15 @@ from harnack.meshing.checks import (
     intersecting_faces,
 )
 from harnack.meshing.closed_mesh import manifold_of, surface_of
-from harnack.meshing.edges import Edges, IntArray, boundary_edges, directed_edges, dots, lengths
+from harnack.meshing.edges import (
+    Edges,
+    IntArray,
+    boundary_edges,
+    crosses,
+    directed_edges,
+    dots,
+    lengths,
+)
 from harnack.meshing.lattice import Lattice, distinct_rows
 from harnack.meshing.lattice_surface import Surface
 from harnack.meshing.marching_tetrahedra import Tetrahedra, crossings_of, triangles_of
@@ -482,11 +490,11 @@ def _untangled(x: FloatArray, flat: FloatArray, faces: IntArray) -> tuple[FloatA
     """
     x = x.copy()
     total = 0
-    upright = _crosses(flat, faces)
+    upright = crosses(flat[faces])
     for _ in range(_MOST_REPAIRS):
         moved = (x != flat).any(axis=1)
         turned = moved[faces].any(axis=1)
-        turned[turned] = dots(_crosses(x, faces[turned]), upright[turned]) <= 0
+        turned[turned] = dots(crosses(x[faces[turned]]), upright[turned]) <= 0
         if not turned.any():
             break
         x[faces[turned]] = flat[faces[turned]]
@@ -512,7 +520,7 @@ def _untangled(x: FloatArray, flat: FloatArray, faces: IntArray) -> tuple[FloatA
 
 def _folded(x: FloatArray, faces: IntArray, among: BoolArray) -> IntArray:
     """Faces, by index, that lie on a neighbor but for rounding, of which one is chosen."""
-    normal = _crosses(x, faces)
+    normal = crosses(x[faces])
     normal /= np.maximum(lengths(normal), 1e-300)[:, None]
     edges = Edges.of(directed_edges(faces))
     order = np.argsort(edges.index, kind="stable")
@@ -520,9 +528,3 @@ def _folded(x: FloatArray, faces: IntArray, among: BoolArray) -> IntArray:
     one, other = pairs.T
     on_other = (dots(normal[one], normal[other]) < _FOLDED) & (among[one] | among[other])
     return np.unique(pairs[on_other])
-
-
-def _crosses(x: FloatArray, faces: IntArray) -> FloatArray:
-    """(m, 3) normals of faces, twice as long as their areas."""
-    corner = x[faces]
-    return np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])

@@ -16,8 +16,16 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import BoolArray, FloatArray
-from harnack.meshing.edges import Edges, IntArray, boundary_edges, directed_edges, dots, lengths
-from harnack.meshing.near_faces import near_pairs
+from harnack.meshing.edges import (
+    Edges,
+    IntArray,
+    boundary_edges,
+    crosses,
+    directed_edges,
+    dots,
+    lengths,
+)
+from harnack.meshing.near_faces import ROUNDING, near_pairs
 from harnack.meshing.samples import LevelFunction
 
 if TYPE_CHECKING:
@@ -133,7 +141,7 @@ def turned_faces(function: LevelFunction, vertices: FloatArray, faces: IntArray)
     """Indices of faces whose normal does not point to where the function grows, judged at their
     center."""
     corner = vertices[faces]
-    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    normal = crosses(corner)
     slope = function.at(corner.mean(axis=1)).gradient
     return np.flatnonzero(dots(normal, slope) <= 0)
 
@@ -156,13 +164,12 @@ def intersecting_faces(
     """
     found: list[IntArray] = []
     many = len(faces) if among is None else int(among.sum())
-    if many > _MANY:
-        near = near_pairs(vertices, faces, among)
-    else:
-        near = _near_pairs(vertices[faces], among)
+    by_kernel = many > _MANY
+    near = near_pairs(vertices, faces, among) if by_kernel else _near_pairs(vertices[faces], among)
     for start in range(0, len(near), _PAIRS_AT_ONCE):
         pairs = near[start : start + _PAIRS_AT_ONCE]
-        pairs = pairs[~_are_apart(vertices, faces, pairs)]
+        if not by_kernel:
+            pairs = pairs[~_are_apart(vertices, faces, pairs)]
         one, other = faces[pairs[:, 0]], faces[pairs[:, 1]]
         heights = [_heights(vertices, *two) for two in ((one, other), (other, one))]
         meet = np.zeros(len(pairs), np.bool_)
@@ -227,8 +234,7 @@ def _are_apart(vertices: FloatArray, faces: IntArray, pairs: IntArray) -> BoolAr
     share on one side: then they have nothing in common but these. False where rounding leaves it
     open.
 
-    Heights are sums of three products of differences of coordinates and their products: seven
-    roundings of their magnitudes (twice as many are allowed), and underflow.
+    See `near_faces.ROUNDING` for the error of heights.
     """
     apart = np.zeros(len(pairs), np.bool_)
     for first, second in (pairs.T, pairs.T[::-1]):
@@ -237,11 +243,11 @@ def _are_apart(vertices: FloatArray, faces: IntArray, pairs: IntArray) -> BoolAr
         a = vertices[plane[:, 0]]
         u, v = vertices[plane[:, 1]] - a, vertices[plane[:, 2]] - a
         normal = np.cross(u, v)
-        most = 16 * 2.0**-52 * (lengths(u) * lengths(v))
+        most = ROUNDING * (lengths(u) * lengths(v))
         above, below = np.ones(len(rows), np.bool_), np.ones(len(rows), np.bool_)
         for k in range(3):
             way = vertices[of[:, k]] - a
-            height, error = dots(normal, way), most * lengths(way) + 1e-290
+            height, error = dots(normal, way), most * lengths(way) + _UNDERFLOW
             shared = (of[:, k, None] == plane).any(axis=1)
             above &= shared | (height > error)
             below &= shared | (height < -error)
@@ -278,7 +284,7 @@ def _cross(vertices: FloatArray, through: IntArray, of: IntArray, heights: SignA
 def _overlap(one: FloatArray, other: FloatArray) -> BoolArray:
     """(k,) whether triangles (k, 3, 3) in one plane have an area in common; seen along the axis in
     which they are thinnest."""
-    normal = np.abs(np.cross(one[:, 1] - one[:, 0], one[:, 2] - one[:, 0]))
+    normal = np.abs(crosses(one))
     axes = np.array([[1, 2], [2, 0], [0, 1]])[normal.argmax(axis=1)]
     flat = [np.take_along_axis(t, axes[:, None].repeat(3, axis=1), axis=2) for t in (one, other)]
     found = np.ones(len(one), np.bool_)
@@ -441,7 +447,7 @@ def far_from_level(
     """Those vertices and centers of faces (k, 3) that are not within `tolerance` of the level, as
     `check_near_level` decides it; and how many were looked at."""
     corner = vertices[faces]
-    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    normal = crosses(corner)
     longest = np.stack([lengths(corner[:, k] - corner[:, k - 1]) for k in range(3)]).max(axis=0)
     large = longest > 0.5 * tolerance
     is_checked = np.ones(len(vertices), np.bool_)

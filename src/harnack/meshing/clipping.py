@@ -15,7 +15,7 @@ import numpy.typing as npt
 from harnack.backend import FloatArray
 from harnack.geometry import Ball, Box, ConvexHull, HalfSpace, Intersection, Volume
 from harnack.meshing.checks import MeshingError
-from harnack.meshing.edges import IntArray, boundary_edges, dots, edge_keys, lengths
+from harnack.meshing.edges import IntArray, boundary_edges, crosses, dots, edge_keys, lengths
 from harnack.meshing.lattice_surface import Surface
 
 __all__ = ["Shells", "cut_by", "largest_body", "largest_part", "parts_of", "turned_outwards"]
@@ -24,7 +24,7 @@ __all__ = ["Shells", "cut_by", "largest_body", "largest_part", "parts_of", "turn
 def largest_part(surface: Surface) -> Surface:
     """The connected part with the largest area."""
     part = _parts(surface)
-    areas = np.bincount(part, np.linalg.norm(_crosses(surface), axis=1))
+    areas = np.bincount(part, np.linalg.norm(crosses(surface.vertices[surface.faces]), axis=1))
     return Surface.of(surface.vertices, surface.faces[part == areas.argmax()])
 
 
@@ -95,7 +95,7 @@ class Shells:
         number = np.unique(_parts(surface), return_inverse=True)[1]
         corners = surface.vertices[surface.faces]
         away = corners[:, 0] - surface.vertices[surface.faces].mean(axis=(0, 1))
-        volumes = np.bincount(number, dots(_crosses(surface), away)) / 6
+        volumes = np.bincount(number, dots(crosses(surface.vertices[surface.faces]), away)) / 6
         lower, upper = np.full((len(volumes), 3), np.inf), np.full((len(volumes), 3), -np.inf)
         np.minimum.at(lower, number, corners.min(axis=1))
         np.maximum.at(upper, number, corners.max(axis=1))
@@ -129,12 +129,6 @@ def _parts(surface: Surface) -> IntArray:
     rows, columns = np.concatenate([faces[:, :2], faces[:, 1:]]).T
     joined = sparse.coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(n, n))
     return np.asarray(csgraph.connected_components(joined, directed=False)[1])[faces[:, 0]]
-
-
-def _crosses(surface: Surface) -> FloatArray:
-    """(m, 3) normals of faces, twice as long as their areas."""
-    corner = surface.vertices[surface.faces]
-    return np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
 
 
 def _winding(corner: FloatArray, point: FloatArray) -> float:
@@ -212,7 +206,7 @@ def _snapped(surface: Surface, side: _Side) -> tuple[FloatArray, FloatArray]:
     x, faces = surface.vertices, surface.faces
     corner = x[faces]
     edges = np.linalg.norm(corner - np.roll(corner, 1, axis=1), axis=2).min(axis=1)
-    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    normal = crosses(corner)
     shortest, mean = np.full(len(x), np.inf), np.zeros_like(x)
     for k in range(3):
         np.minimum.at(shortest, faces[:, k], edges)

@@ -1,4 +1,5 @@
-"""Edges of triangles and tetrahedra, each once, by integer keys; products and lengths of rows.
+"""Edges of triangles and tetrahedra, each once, by integer keys; products and lengths of rows,
+and normals of triangles.
 
 `dots` and `lengths` are here as numpy's own sums along an axis of three are slow.
 """
@@ -16,6 +17,7 @@ __all__ = [
     "Edges",
     "IntArray",
     "boundary_edges",
+    "crosses",
     "directed_edges",
     "distinct",
     "dots",
@@ -28,6 +30,12 @@ __all__ = [
 def dots(a: FloatArray, b: FloatArray) -> FloatArray:
     """(n,) of rows (n, 3), in a third of the time of (a * b).sum(axis=1)."""
     return np.einsum("ij,ij->i", a, b)
+
+
+def crosses(corners: FloatArray) -> FloatArray:
+    """(m, 3) normals of triangles (m, 3, 3) by the right-hand rule, twice as long as their
+    areas."""
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 
 def lengths(vectors: FloatArray) -> FloatArray:

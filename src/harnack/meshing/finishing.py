@@ -16,6 +16,7 @@ from harnack.meshing.edges import (
     Edges,
     IntArray,
     boundary_edges,
+    crosses,
     directed_edges,
     distinct,
     dots,
@@ -61,7 +62,7 @@ def thickened(
     Raises:
         MeshingError: the part is far thicker than triangles are large, of which there are too many.
     """
-    area = 0.5 * float(np.linalg.norm(_crosses(surface.vertices, surface.faces), axis=1).sum())
+    area = 0.5 * float(np.linalg.norm(crosses(surface.vertices[surface.faces]), axis=1).sum())
     facts: dict[str, Any] = {"thickness": thickness, "area": area}
     why = _beyond_reach(surface, normals, thickness)
     if why is None:
@@ -73,11 +74,6 @@ def thickened(
     return _hulls(surface, 0.5 * thickness, tolerance, why), {
         **facts, "thickened_by": "hulls of balls", "why": why
     }  # fmt: skip
-
-
-def _crosses(vertices: FloatArray, faces: Any) -> FloatArray:
-    corner = vertices[faces]
-    return np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
 
 
 def _offset(surface: Surface, normals: FloatArray, thickness: float) -> Surface:
@@ -94,7 +90,7 @@ def _offset(surface: Surface, normals: FloatArray, thickness: float) -> Surface:
 def _slants(surface: Surface, normals: FloatArray) -> FloatArray:
     """(n,) cosines between normals at vertices and those of the faces there, means by area:
     vertices are moved farther by that, so that faces are moved by the thickness."""
-    cross = _crosses(surface.vertices, surface.faces)
+    cross = crosses(surface.vertices[surface.faces])
     total, area = np.zeros(len(normals)), np.zeros(len(normals))
     size = np.linalg.norm(cross, axis=1)
     for k in range(3):
@@ -110,7 +106,7 @@ def _beyond_reach(surface: Surface, normals: FloatArray, thickness: float) -> st
 
     searching: Any = scipy.spatial
     half = 0.5 * thickness
-    flat = _crosses(surface.vertices, surface.faces)
+    flat = crosses(surface.vertices[surface.faces])
     areas = np.linalg.norm(flat, axis=1)
     tree = searching.cKDTree(surface.vertices)
     own = np.arange(len(surface.vertices))
@@ -118,7 +114,7 @@ def _beyond_reach(surface: Surface, normals: FloatArray, thickness: float) -> st
     neighbors = distinct(edge_keys(directed_edges(surface.faces), len(own)))
     for sign in (1, -1):
         side = surface.vertices + sign * half * normals
-        turned = (_crosses(side, surface.faces) * flat).sum(axis=1) <= 0
+        turned = (crosses(side[surface.faces]) * flat).sum(axis=1) <= 0
         if areas[turned].sum() > _TURNED * areas.sum():  # less are slivers
             return f"{turned.sum()} triangles turn over: the surface bends more than 1/{half:.3g}"
         # Nearer than the vertex that a point was moved from are at most its neighbors.
@@ -184,7 +180,7 @@ def normals_of(function: LevelFunction, surface: Surface) -> FloatArray:
     """Unit normals (n, 3) at vertices: along the gradient of the field, and where it has none, as
     at the curve that a surface ends on, the mean of the faces there by area."""
     corner = surface.vertices[surface.faces]
-    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    normal = crosses(corner)
     mean = np.zeros_like(surface.vertices)
     for k in range(3):
         np.add.at(mean, surface.faces[:, k], normal)
@@ -270,5 +266,5 @@ def _creases(surface: Surface) -> int:
 def _unit_normals(vertices: FloatArray, faces: IntArray) -> FloatArray:
     """(m, 3) of faces; 0 for those without an area."""
     corner = vertices[faces]
-    cross = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    cross = crosses(corner)
     return cross / np.maximum(lengths(cross), 1e-300)[:, None]

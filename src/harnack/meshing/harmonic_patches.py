@@ -28,7 +28,7 @@ from harnack.meshing.checks import (
     intersecting_faces,
     singular_vertices,
 )
-from harnack.meshing.edges import Edges, IntArray, directed_edges
+from harnack.meshing.edges import Edges, IntArray, crosses, directed_edges
 from harnack.meshing.marching_tetrahedra import crossings_of, delaunay, triangles_of
 from harnack.meshing.points import Boundary, Places, box_cells, place_points
 from harnack.meshing.refinement import far_places, improved, refined, smoothed
@@ -356,7 +356,7 @@ def _collapsed(x: FloatArray, faces: IntArray, middle: int, ends: list[int]) -> 
 
 def _normals(corners: FloatArray) -> FloatArray:
     """Unit normals of triangles (m, 3, 3), 0 of those without an area."""
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal = crosses(corners)
     return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
 
 

@@ -24,7 +24,7 @@ import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
 from harnack.meshing.checks import intersecting_faces
-from harnack.meshing.edges import Edges, IntArray, directed_edges, dots, edge_keys, lengths
+from harnack.meshing.edges import Edges, IntArray, crosses, directed_edges, dots, edge_keys, lengths
 from harnack.meshing.refinement import split_faces
 
 __all__ = ["Filled", "filled", "hole_loops"]
@@ -129,7 +129,7 @@ def _failures(
     found |= dict.fromkeys(
         owner[met[is_new[met]] - len(faces)].tolist(), "passing through other triangles"
     )
-    flat = lengths(_crosses(x, new)) == 0
+    flat = lengths(crosses(x[new])) == 0
     return found | dict.fromkeys(owner[flat].tolist(), "with triangles without an area")
 
 
@@ -149,7 +149,7 @@ def hole_loops(vertices: FloatArray, faces: IntArray, edges: IntArray) -> list[I
         arriving[b].append(a)
     normals = np.zeros_like(vertices)
     for k in range(3):
-        np.add.at(normals, faces[:, k], _crosses(vertices, faces))
+        np.add.at(normals, faces[:, k], crosses(vertices[faces]))
     following: dict[tuple[int, int], int] = {}
     for v, starts in arriving.items():
         ends = leaving[v]
@@ -327,7 +327,7 @@ def _least_turning(
         a, b = int(polygon[k]), int(polygon[(k + 1) % n])
         if (b, a) in third:
             face = np.array([[b, a, third[b, a]]])
-            beside[k, (k + 1) % n] = _unit(_crosses(x, face))[0]
+            beside[k, (k + 1) % n] = _unit(crosses(x[face]))[0]
     turn, area = np.full((n, n), -1.0), np.zeros((n, n))
     middle = np.zeros((n, n), np.int64)
     for d in range(2, n):
@@ -454,7 +454,7 @@ def _fair(x: FloatArray, faces: IntArray, new: IntArray, given: int) -> FloatArr
     corner = x[around]
     weight = np.zeros(len(edges.ends))
     area = np.zeros(len(x))
-    double = np.maximum(lengths(_crosses(x, around)), 1e-300)
+    double = np.maximum(lengths(crosses(x[around])), 1e-300)
     for k in range(3):  # the edge from corner k to the next is opposite to the one after
         one, other = (corner[:, j] - corner[:, k - 1] for j in (k, (k + 1) % 3))
         cotangent = np.clip(dots(one, other) / double, -_MOST_COTANGENT, _MOST_COTANGENT)
@@ -486,10 +486,10 @@ def _flipped(x: FloatArray, new: IntArray, taken: IntArray) -> IntArray:
         gain = _cotangents(x[a], x[b], x[c]) + _cotangents(x[a], x[b], x[d])
         good = (gain < _FLIP) & (c != d)
         good &= ~np.isin(key, there) & ~np.isin(key, edge_keys(edges.ends, len(x)))
-        before = _crosses(x, new)
+        before = crosses(x[new])
         mean = before[f] + before[g]
         for triangle in ((a, d, c), (d, b, c)):
-            good &= dots(_crosses(x, np.column_stack(triangle)), mean) > 0
+            good &= dots(crosses(x[np.column_stack(triangle)]), mean) > 0
         rows = np.flatnonzero(good)
         rows = rows[np.argsort(gain[rows])]
         rows = rows[np.sort(np.unique(key[rows], return_index=True)[1])]
@@ -531,9 +531,3 @@ def _owners(new: IntArray, loops: list[IntArray], count: int) -> IntArray:
     found = np.flatnonzero(keys[places] == firsts)
     loop_at[part[face_at[places[found]]]] = found
     return loop_at[part]
-
-
-def _crosses(x: FloatArray, faces: IntArray) -> FloatArray:
-    """(m, 3) normals of faces, twice as long as their areas."""
-    corner = x[faces]
-    return np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])

@@ -24,7 +24,7 @@ import numpy as np
 from harnack.backend import BoolArray, FloatArray
 from harnack.fields import Field
 from harnack.meshing.checks import LocalError, MeshingError
-from harnack.meshing.edges import Edges, IntArray, dots, edge_keys, lengths
+from harnack.meshing.edges import Edges, IntArray, crosses, dots, edge_keys, lengths
 from harnack.meshing.points import PointSet
 from harnack.meshing.samples import LevelFunction
 
@@ -232,7 +232,7 @@ def triangles_of(
     parts.append(_faces_on_the_level(function, points, tets))
     faces, rise = (np.concatenate(column) for column in zip(*parts, strict=True))
     corner = vertices[faces]
-    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    normal = crosses(corner)
     turned = dots(normal, rise) < 0
     faces[turned] = faces[turned][:, ::-1]
     return vertices, faces

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
     Corners = tuple[Vec3, Vec3, Vec3]
 
-__all__ = ["near_pairs"]
+__all__ = ["ROUNDING", "near_pairs"]
 
 # Columns of a record behind the corners: the three vertices' numbers, and the face's.
 _VERTICES, _NUMBER, _CHOSEN = 9, 12, 13
@@ -42,7 +42,7 @@ _AT_ONCE = 1 << 20
 # Rounding of a product of three vectors and of two, of differences of coordinates, over the product
 # of their lengths: at most seven roundings of up to six terms, which are 1.16 times that product
 # together, and four of three terms, which are as much as it. So that is a third of what is allowed.
-_ROUNDING = 16 * 2.0**-52
+ROUNDING = 16 * 2.0**-52
 # What underflow may add, for coordinates of order one.
 _UNDERFLOW = 1e-290
 
@@ -177,7 +177,7 @@ def _sides(plane: Corners, of: Corners) -> list[tuple[Mask, Mask]]:
     below it; neither where rounding leaves it open."""
     u, v = plane[1] - plane[0], plane[2] - plane[0]
     normal = dr.cross(u, v)
-    most = _ROUNDING * dr.norm(u) * dr.norm(v)
+    most = ROUNDING * dr.norm(u) * dr.norm(v)
     found: list[tuple[Mask, Mask]] = []
     for corner in of:
         way = corner - plane[0]
@@ -209,7 +209,7 @@ def _passes(
         left, right = False, False
         for k, m in ((0, 1), (1, 2), (2, 0)):
             value = dr.dot(way, dr.cross(to[k], to[m]))
-            error = _ROUNDING * length * lengths[k] * lengths[m] + _UNDERFLOW
+            error = ROUNDING * length * lengths[k] * lengths[m] + _UNDERFLOW
             left, right = left | (value > error), right | (value < -error)
         found = found | ~(stays | (left & right))
     return found
@@ -252,8 +252,8 @@ def _beside(a: Corners, b: Corners, count: Real) -> Mask:
             e, x = one[j] - origin, one[k] - origin
             m = dr.fma(e, dr.dot(x, e) / dr.squared_norm(e), -x)
             size, length = dr.norm(m), dr.norm(e)
-            off = 1.01 * (dr.abs(dr.dot(m, e)) + _ROUNDING * size * length) / length
-            slack = _ROUNDING * size + off
+            off = 1.01 * (dr.abs(dr.dot(m, e)) + ROUNDING * size * length) / length
+            slack = ROUNDING * size + off
 
             def past(to: Vec3, m: Vec3 = m, slack: Real = slack) -> tuple[Mask, Mask]:
                 value, error = dr.dot(m, to), slack * dr.norm(to) + _UNDERFLOW
@@ -276,7 +276,7 @@ def _opposite(a: Corners, b: Corners) -> Mask:
     ways = [one[k] - one[0] for one, k in itertools.product((a, b), (1, 2))]
     mean = [dr.normalize(ways[k]) + dr.normalize(ways[k + 1]) for k in (0, 2)]
     m = dr.normalize(mean[1]) - dr.normalize(mean[0])
-    slack = _ROUNDING * dr.norm(m)
+    slack = ROUNDING * dr.norm(m)
     values = [(dr.dot(m, way), slack * dr.norm(way) + _UNDERFLOW) for way in ways]
     (p, one), (q, two), (r, three), (s, four) = values
     return (p < -one) & (q < -two) & (r > three) & (s > four)

@@ -14,7 +14,15 @@ import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
 from harnack.meshing.checks import check_count
-from harnack.meshing.edges import Edges, IntArray, boundary_edges, directed_edges, dots, lengths
+from harnack.meshing.edges import (
+    Edges,
+    IntArray,
+    boundary_edges,
+    crosses,
+    directed_edges,
+    dots,
+    lengths,
+)
 from harnack.meshing.points import newton
 from harnack.meshing.relaxation import flipped, relaxed, without_slivers
 from harnack.meshing.samples import LevelFunction, Samples
@@ -401,9 +409,9 @@ def _unfolded(before: FloatArray, after: FloatArray, faces: IntArray) -> FloatAr
     """`after`, but for vertices of faces that have turned over, which stay as before."""
     for _ in range(8):
         corner = after[faces]
-        normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+        normal = crosses(corner)
         old = before[faces]
-        was = np.cross(old[:, 1] - old[:, 0], old[:, 2] - old[:, 0])
+        was = crosses(old)
         turned = dots(normal, was) <= 0.3 * lengths(normal) * lengths(was)
         if not turned.any():
             return after

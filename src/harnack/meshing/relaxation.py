@@ -23,6 +23,7 @@ from harnack.backend import BoolArray, FloatArray
 from harnack.meshing.edges import (
     IntArray,
     boundary_edges,
+    crosses,
     directed_edges,
     distinct,
     dots,
@@ -196,7 +197,7 @@ def _is_good(
     function: LevelFunction, vertices: FloatArray, new: IntArray, tolerance: float
 ) -> bool:
     corner = vertices[new]
-    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    normal = crosses(corner)
     samples = function.at(corner.mean(axis=1))
     size = lengths(normal) * lengths(samples.gradient)
     facing = dots(normal, samples.gradient) > _STILL_FACING * size
@@ -356,7 +357,7 @@ def _moves_stay_near(
     corner = vertices[stars.corners[pairs]]
     corner[:, 0] = there[stars.owner[pairs]]
     samples = function.at(corner.mean(axis=1))
-    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    normal = crosses(corner)
     size = lengths(normal) * lengths(samples.gradient)
     good = dots(normal, samples.gradient) > _FACING * size
     good &= samples.distance <= tolerance

@@ -24,7 +24,7 @@ from harnack.meshing.checks import (
     singular_vertices,
 )
 from harnack.meshing.clipping import turned_outwards
-from harnack.meshing.edges import Edges, IntArray, boundary_edges, directed_edges, lengths
+from harnack.meshing.edges import Edges, IntArray, boundary_edges, crosses, directed_edges, lengths
 from harnack.meshing.hole_patches import filled, hole_loops
 from harnack.meshing.lattice_surface import Surface
 
@@ -144,7 +144,7 @@ class _State:
         joined = weld_vertices(vertices)[faces]
         every = np.arange(len(faces))
         corner = vertices[joined]
-        area = lengths(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]))
+        area = lengths(crosses(corner))
         rows = every[area > 0]
         reasons = ("flat", "doubled", "crossing", "branching", "one-sided", "around")
         counts = dict.fromkeys(reasons, 0) | {"flat": len(faces) - len(rows)}
@@ -238,6 +238,6 @@ def _against_neighbors(x: FloatArray, faces: IntArray) -> BoolArray:
     joined = sparse.coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(2 * m, 2 * m))
     part = np.asarray(csgraph.connected_components(joined, directed=False)[1])
     corner = x[faces]
-    area = lengths(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]))
+    area = lengths(crosses(corner))
     as_is = np.bincount(part[:m], area, minlength=int(part.max(initial=-1)) + 1)
     return as_is[part[:m]] < as_is[part[m:]]

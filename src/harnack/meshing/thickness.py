@@ -11,7 +11,7 @@ from harnack.backend import BoolArray, FloatArray, choose_backend, to_numpy, to_
 from harnack.backend.numbers import real
 from harnack.fields import Solid
 from harnack.fields.solids.mesh_solid import MeshSolid, solid_of_mesh
-from harnack.meshing.edges import IntArray, dots, lengths
+from harnack.meshing.edges import IntArray, crosses, dots, lengths
 from harnack.meshing.mesh import mesh
 from harnack.tracer import trace
 
@@ -102,7 +102,7 @@ def thickness(part: Any, **options: Any) -> Thickness:
     solid = part if isinstance(part, MeshSolid) else solid_of_mesh(part)
     x, faces = np.asarray(solid.vertices), np.asarray(solid.faces)
     corner = x[faces]
-    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    normal = crosses(corner)
     length = lengths(normal)
     rows = np.flatnonzero(length > 0)
     values = np.full(len(faces), np.nan)

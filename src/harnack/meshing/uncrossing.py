@@ -17,7 +17,15 @@ import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
 from harnack.meshing.checks import CrossingError, check_apart, intersecting_faces
-from harnack.meshing.edges import IntArray, directed_edges, distinct, dots, edge_keys, lengths
+from harnack.meshing.edges import (
+    IntArray,
+    crosses,
+    directed_edges,
+    distinct,
+    dots,
+    edge_keys,
+    lengths,
+)
 from harnack.meshing.lattice_surface import Surface
 
 __all__ = ["made_apart", "uncrossed"]
@@ -226,14 +234,10 @@ def _changes(
 def _looks_onward(patch: _Patch, gone: IntArray, new: IntArray) -> bool:
     """Whether no new face, but for slivers, looks backwards from where the old ones look in the
     mean."""
-    old, made = _crosses(patch.vertices[patch.faces[gone]]), _crosses(patch.vertices[new])
+    old, made = crosses(patch.vertices[patch.faces[gone]]), crosses(patch.vertices[new])
     mean = old.sum(axis=0)
     most = float(lengths(old).sum())
     return bool(((made @ mean > 0) | (lengths(made) <= _NOTHING * most)).all())
-
-
-def _crosses(corner: FloatArray) -> FloatArray:
-    return np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
 
 
 def _distance(point: FloatArray, corner: FloatArray) -> float:
@@ -245,7 +249,7 @@ def _distance(point: FloatArray, corner: FloatArray) -> float:
         share = dots(point - start, way) / np.maximum(dots(way, way), 1e-300)
         foot = start + np.clip(share, 0, 1)[:, None] * way
         least = min(least, float(lengths(point - foot).min(initial=np.inf)))
-    normal = _crosses(corner)
+    normal = crosses(corner)
     size = np.maximum(lengths(normal), 1e-300)
     height = dots(point - corner[:, 0], normal) / size
     foot = point - (height / size)[:, None] * normal
