@@ -79,7 +79,7 @@ def test_thin_walls_beds_and_units() -> None:
     small = PLATE.copy()
     small.apply_scale(1 / 25.4)
     assert kinds(small) == {"unit": 1}
-    with pytest.raises(ValueError, match="wall must be a positive length"):
+    with pytest.raises(ValueError, match="wall must be positive and finite"):
         hk.check_print(PLATE, wall=-1.0)
 
 

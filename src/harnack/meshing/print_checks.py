@@ -11,6 +11,7 @@ from typing import Any, cast
 import numpy as np
 
 from harnack.backend import FloatArray
+from harnack.backend.numbers import positive
 from harnack.fields.solids.mesh_solid import MeshSolid
 from harnack.files.surfaces import Mesh, read_surface
 from harnack.geometry import MeshError, validate_mesh, zero_area_faces
@@ -19,7 +20,7 @@ from harnack.meshing.checks import intersecting_faces, singular_vertices
 from harnack.meshing.clipping import Shells
 from harnack.meshing.edges import Edges, IntArray, directed_edges
 from harnack.meshing.lattice_surface import Surface
-from harnack.meshing.thickness import check_length, thickness
+from harnack.meshing.thickness import thickness
 
 __all__ = ["PrintCheck", "PrintProblem", "check_print"]
 
@@ -99,10 +100,10 @@ def check_print(part: Any, *, wall: float | None = None, bed: Any = None) -> Pri
             that is no length.
     """
     if wall is not None:
-        wall = check_length(wall, "wall")
+        wall = positive(wall, "wall")
     if bed is not None and np.shape(bed) != (3,):
         raise ValueError(f"bed must be (x, y, z), three lengths, not {bed!r}")
-    sides = None if bed is None else [check_length(one, "bed") for one in bed]
+    sides = None if bed is None else [positive(one, "bed") for one in bed]
     x, faces = _mesh_of(part)
     found = _topology(x, faces)
     is_closed = not _is_wrong(found)

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from harnack.backend.numbers import positive
 from harnack.fields.solid_angles.winding_number import WindingNumber
 from harnack.fields.solids.mesh_solid import MeshSolid
 from harnack.geometry import MeshError, validate_mesh
@@ -191,8 +192,8 @@ def _checked_settings(
         raise ValueError(
             f"tolerance is a part of the size: it must lie in (0, 0.5), not {tolerance}"
         )
-    if spacing is not None and not 0 < spacing < math.inf:
-        raise ValueError(f"spacing must be a positive length, not {spacing!r}")
+    if spacing is not None:
+        spacing = positive(spacing, "spacing")
     return _Asked(keep, patches, tolerance, spacing, seed, report)
 
 

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray, choose_backend, to_numpy, to_vector3
-from harnack.backend.numbers import real
 from harnack.fields import Solid
 from harnack.fields.solids.mesh_solid import MeshSolid, solid_of_mesh
 from harnack.meshing.edges import IntArray, crosses, dots, lengths
@@ -156,11 +155,3 @@ def _nearest(solid: MeshSolid, points: FloatArray) -> tuple[FloatArray, FloatArr
     value, gradient = to_numpy(sample.value), to_numpy(sample.gradient)
     distance = np.abs(value)
     return distance, points - value[:, None] * gradient, gradient
-
-
-def check_length(value: Any, name: str) -> float:
-    """A positive length; raises ValueError or TypeError."""
-    length = real(value, name)
-    if not 0 < length < np.inf:
-        raise ValueError(f"{name} must be a positive length, not {value!r}")
-    return length
