@@ -26,7 +26,8 @@ def kinds(part: Any, **options: Any) -> dict[str, int]:
 def test_a_plate_is_fine() -> None:
     found = hk.check_print(PLATE, wall=1.9, bed=(10.0, 20.0, 2.0))
     assert found.is_fine
-    assert found.problems == ()
+    assert [one.kind for one in found.problems] == ["walls measured coarsely"]
+    assert hk.check_print(PLATE, bed=(10.0, 20.0, 2.0)).problems == ()
     assert found.volume == pytest.approx(400.0)
     assert found.size == (20.0, 10.0, 2.0)
 
@@ -221,3 +222,13 @@ def test_parts_that_touch_inside_a_face_are_not_said_to_be_apart() -> None:
     [loose] = [one for one in found.problems if one.kind == "loose parts"]
     assert "joined by vertices" in loose.message
     assert "do not touch" not in loose.message
+
+
+def test_large_faces_are_told_of_where_walls_are_measured() -> None:
+    """A pit beside the center of a face was not seen, and nothing said so."""
+    box = trimesh.creation.box((20.0, 10.0, 5.0))
+    found = {one.kind: one for one in hk.check_print(box, wall=1.0).problems}
+    assert found["walls measured coarsely"].count == 12
+    assert not found["walls measured coarsely"].is_fatal
+    fine = box.subdivide_to_size(4.0)
+    assert not hk.check_print(fine, wall=1.0).problems

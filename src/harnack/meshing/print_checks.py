@@ -18,7 +18,7 @@ from harnack.geometry import MeshError, validate_mesh, zero_area_faces
 from harnack.geometry.chains import weld_vertices
 from harnack.meshing.checks import intersecting_faces, singular_vertices
 from harnack.meshing.clipping import Shells
-from harnack.meshing.edges import Edges, IntArray, directed_edges
+from harnack.meshing.edges import Edges, IntArray, directed_edges, lengths
 from harnack.meshing.lattice_surface import Surface
 from harnack.meshing.thickness import thickness
 
@@ -29,6 +29,8 @@ _TINY = 0.01
 # Sizes in millimeters beyond which another unit is likely.
 _SMALLEST, _LARGEST = 1.0, 2000.0
 _INCH = 25.4
+# Faces longer than so many walls may hide thin places beside their centers.
+_COARSE = 5.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +90,8 @@ def check_print(part: Any, *, wall: float | None = None, bed: Any = None) -> Pri
     triangles that pass through each other or lie on each other (decided exactly), faces that are
     there twice; walls thinner than asked; what does not fit on the bed. Hints are: faces without an
     area, several parts, tiny ones, cavities without a way out (for powder and resin), and a size
-    that looks like inches or meters.
+    that looks like inches or meters, and, of walls, faces so large that a thin place beside their
+    centers may be missed.
 
     part: a trimesh.Trimesh, (vertices, faces), or the name of a file. Vertices at the same place
         are one.
@@ -112,7 +115,7 @@ def check_print(part: Any, *, wall: float | None = None, bed: Any = None) -> Pri
     is_clear = is_closed and not crossings.count
     found += [*_of_parts(shells, is_closed, is_clear), crossings]
     if wall is not None:
-        found.append(_thin(x, faces, wall, not _is_wrong(found)))
+        found += [_thin(x, faces, wall, not _is_wrong(found)), _coarse(x, faces, wall)]
     low, high = x[faces].min(axis=(0, 1)), x[faces].max(axis=(0, 1))
     size = cast("tuple[float, float, float]", tuple((high - low).tolist()))
     found += _of_size(size, sides)
@@ -254,6 +257,15 @@ def _thin(x: FloatArray, faces: IntArray, wall: float, is_solid: bool) -> PrintP
     least = f"; the thinnest is {found.thinnest:.3g}"
     text = f"at {{}} triangles the part is thinner than {wall:g}{least}"
     return _problem("thin walls", places, text)
+
+
+def _coarse(x: FloatArray, faces: IntArray, wall: float) -> PrintProblem:
+    """Faces beside whose centers thin places may be that nobody looked at."""
+    corner = x[faces]
+    longest = np.stack([lengths(corner[:, k] - corner[:, k - 1]) for k in range(3)]).max(axis=0)
+    places = corner[longest > _COARSE * wall].mean(axis=1)
+    text = f"{{}} triangles are longer than {_COARSE:g} walls, and thickness is measured at centers"
+    return _problem("walls measured coarsely", places, text, is_fatal=False)
 
 
 def _of_size(size: tuple[float, float, float], bed: list[float] | None) -> list[PrintProblem]:
