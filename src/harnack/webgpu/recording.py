@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
+import gc
 import io
 import threading
 from collections.abc import Callable, Generator, Iterator, Mapping
@@ -83,6 +84,7 @@ def _is_constant(array: Any) -> bool:
 def _evaluated(arrays: list[Any]) -> str:
     """Evaluates arrays, and gives the text of the kernel."""
     with (
+        _no_garbage_collected(),
         dr.scoped_set_flag(dr.JitFlag.KernelHistory, True),
         dr.scoped_set_flag(dr.JitFlag.PrintIR, True),
         contextlib.redirect_stdout(io.StringIO()),  # the flag also has it printed
@@ -93,6 +95,22 @@ def _evaluated(arrays: list[Any]) -> str:
     if len(kernels) != 1:
         raise RuntimeError(f"this computation is {len(kernels)} kernels, and not one")
     return kernels[0]["ir"].getvalue()
+
+
+@contextlib.contextmanager
+def _no_garbage_collected() -> Generator[None]:
+    """While it lasts, no thread collects garbage.
+
+    To print a kernel, Dr.Jit waits for Python's lock while it holds its own. A thread that collects
+    garbage holds Python's lock, and would wait for Dr.Jit's to free an array, for ever.
+    """
+    was_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_enabled:
+            gc.enable()
 
 
 class _Naming:

@@ -1,0 +1,50 @@
+"""Kernels are recorded beside other threads."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+# In a process of its own, since the lock that it is about stops all threads.
+_SCRIPT = """
+import faulthandler, gc, sys, threading
+import drjit as dr
+from harnack.backend import choose_backend
+from harnack.webgpu.recording import record
+
+faulthandler.dump_traceback_later(50, exit=True)
+real = choose_backend("single").Float
+
+
+class Cycle:
+    pass
+
+
+def cycle():
+    one = Cycle()
+    one.own, one.array = one, real([1.0, 2.0])
+    return one
+
+
+def recorded():
+    for k in range(60):
+        record(lambda x, k=k: {"y": dr.sin(x) * (k + 1.0)}, {"x": real([1.0, 2.0, 3.0])}, ())
+
+
+waste = [cycle() for _ in range(50_000)]
+thread = threading.Thread(target=recorded)
+gc.set_threshold(20)
+sys.setswitchinterval(1e-5)
+thread.start()
+while thread.is_alive() and waste:
+    waste.pop()
+    [[] for _ in range(300)]
+thread.join()
+assert gc.isenabled()
+"""
+
+
+def test_arrays_freed_as_garbage_of_other_threads_stop_no_recording() -> None:
+    """One thread waited for Dr.Jit's lock with Python's, the other for Python's with Dr.Jit's."""
+    ended = subprocess.run([sys.executable, "-c", _SCRIPT], capture_output=True, text=True)
+    assert ended.returncode == 0, ended.stderr
