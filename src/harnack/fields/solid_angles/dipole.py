@@ -219,7 +219,7 @@ class DipolePotential(DetailedField["_DipoleBuffers"], BatchedField):
         for it. At least 1.5.
     cells: for many rays through many points. True builds cells in which the near points count one
         by one and all others as one polynomial, so that an evaluation for tracing costs a tenth.
-        They take some 2 kB a point, or the megabytes that are given (True: 256) with larger and
+        They take some 1 kB a point, or the megabytes that are given (True: 256) with larger and
         slower cells; where these would be too large, none are built, and `describe` of a prepared
         field says so. Building takes as long as tracing 100,000 to a million rays without cells,
         for each precision, at the first trace. All bounds are proved, whatever is given.
@@ -350,9 +350,10 @@ class DipolePotential(DetailedField["_DipoleBuffers"], BatchedField):
         return _DipoleBuffers(*placed(backend, self._center, self._size), tree)
 
     def _half(self, unit: FloatArray) -> float:
-        """Half the side of the cube of cells, which holds the default level (`extent`)."""
+        """Half the side of the cube of cells, which holds the `extent` of the default level: rays
+        begin at the faces of that."""
         reach = math.sqrt(float(self.areas.sum()) / self.default_level) / self._size
-        return float(np.abs(unit).max()) + reach
+        return 1.001 * (float(np.abs(unit).max()) + reach)
 
     def prepare(self, backend: Backend) -> Self:
         prepared = super().prepare(backend)

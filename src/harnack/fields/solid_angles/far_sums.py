@@ -36,9 +36,9 @@ if TYPE_CHECKING:
 # The degree of local expansions, and the largest of the multipoles that they are made of.
 DEGREE, _POLES = 6, 4
 COEFFICIENTS = (DEGREE + 1) ** 2
-_SPREAD = 4.5
+_SPREAD = 6.0
 # See `_Expanded.of`.
-_ROUNDING = 2.0**-21
+_ROUNDING = 2.0**-20
 # Moments of a node, in order.
 _MOMENTS = tuple(key for key in parts(_POLES) if key[0])
 # Sums of many positive numbers in double precision, as bounds.
@@ -120,6 +120,8 @@ class FarSums:
 
     coefficients: (n, COEFFICIENTS) of the local expansion (`local_expansion.parts`).
     error, slope: (n,) bounds of what it leaves out of value and gradient, anywhere in the ball.
+    tail, tail_slope: (n,) of what it leaves out besides: at a distance a from the center at most
+        q^(p+1) and q^p times these, with q = a/radius and p = `DEGREE`.
     fourth: (n,) bounds of the sums of area/D^4, D the distance of a dipole from the center.
     least: (n,) a distance from the center within which there are none of these dipoles.
     """
@@ -127,6 +129,8 @@ class FarSums:
     coefficients: FloatArray
     error: FloatArray
     slope: FloatArray
+    tail: FloatArray
+    tail_slope: FloatArray
     fourth: FloatArray
     least: FloatArray
 
@@ -134,17 +138,14 @@ class FarSums:
     def none(cls, n: int) -> FarSums:
         """Sums over no dipoles."""
         zero = np.zeros(n)
-        return cls(np.zeros((n, COEFFICIENTS)), zero, zero, zero, np.full(n, np.inf))
+        return cls(np.zeros((n, COEFFICIENTS)), *(5 * [zero]), least=np.full(n, np.inf))
 
     def plus(self, other: FarSums) -> FarSums:
         """The sums over the dipoles of both."""
-        return FarSums(
-            self.coefficients + other.coefficients,
-            (self.error + other.error) * _ROUNDED_UP,
-            (self.slope + other.slope) * _ROUNDED_UP,
-            (self.fourth + other.fourth) * _ROUNDED_UP,
-            np.minimum(self.least, other.least),
-        )
+        bounds = "error", "slope", "tail", "tail_slope", "fourth"
+        sums = (_ROUNDED_UP * (getattr(self, one) + getattr(other, one)) for one in bounds)
+        least = np.minimum(self.least, other.least)
+        return FarSums(self.coefficients + other.coefficients, *sums, least=least)
 
     def some(self, which: BoolArray) -> FarSums:
         """Those chosen by a mask."""
@@ -154,13 +155,16 @@ class FarSums:
         """The same dipoles seen from the eight octants of cells with balls of this radius, octant
         by octant of each cell.
 
-        Proof. The ball of an octant lies in that of the cell, so that error and slope are bounds
-        there as well. Its center is half a radius away, or less by the margin, so that distances
+        Proof. The ball of an octant lies in that of the cell, so that bounds of errors are bounds
+        there as well, but what a polynomial leaves out is not small about an octant's center. This
+        center is half a radius away, or less by the margin, so that distances
         shrink by at most that, and 1/D^4 grows by at most (1 - radius/(2 least))^-4, D >= least.
         """
         shifted = np.einsum("oab,kb->koa", shifts, self.coefficients)
         share = 0.5 * radius / self.least  # 0 where there are no dipoles
-        bounds = self.error, self.slope, self.fourth / (1 - share) ** 4, self.least - 0.5 * radius
+        error, slope = self.error + self.tail, self.slope + self.tail_slope
+        far = self.fourth / (1 - share) ** 4, self.least - 0.5 * radius
+        bounds = _ROUNDED_UP * error, _ROUNDED_UP * slope, 0 * error, 0 * slope, *far
         others = (np.repeat(one, 8) for one in bounds)
         return FarSums(shifted.reshape(-1, COEFFICIENTS), *others)
 
@@ -180,10 +184,11 @@ class FarSums:
             power = near
             for _ in range(_POLES + 1):
                 power = power * near
-            error = found.error + left_out * power
-            slope = found.slope + slope_left_out * power * near
+            error = found.rounding + left_out * power
+            slope = found.rounding / radius + slope_left_out * power * near
             least = distance - head[4]
-            return [*found.coefficients, error, slope, head[5] * _fourth(dr.rcp(least)), least]
+            rest = found.tail, found.tail_slope, head[5] * _fourth(dr.rcp(least)), least
+            return [*found.coefficients, error, slope, *rest]
 
         return cls._accumulated(tree.backend, lists, term)
 
@@ -195,8 +200,9 @@ class FarSums:
             row = tree.primitives.row(i, active)
             moments = {(1, 0): (row[5], 0.0), (1, 1): (0.5 * row[3], 0.5 * row[4])}
             found = _Expanded.of(c - tree.backend.Array3f(*row[:3]), moments, [row[6]], radius)
+            bounds = found.rounding, found.rounding / radius, found.tail, found.tail_slope
             rest = row[6] * _fourth(found.inverse), dr.rcp(found.inverse)
-            return [*found.coefficients, found.error, found.slope, *rest]
+            return [*found.coefficients, *bounds, *rest]
 
         return cls._accumulated(tree.backend, lists, term)
 
@@ -214,14 +220,14 @@ class FarSums:
             new = [old + dr.select(active, one, 0) for old, one in pairs]
             return *new, dr.select(active, fmin(least, nearest), least)
 
-        start = (*([zero] * (COEFFICIENTS + 3)), zero + dr.inf)
+        start = (*([zero] * (COEFFICIENTS + 5)), zero + dr.inf)
         found = each_entry(backend, lists, add, start)
         dr.eval(*found)
         n = dr.width(lists.count)
         columns = [np.broadcast_to(to_numpy(one), n) for one in found]
         coefficients = np.stack(columns[:COEFFICIENTS], axis=1)
-        error, slope, fourth = (one * _ROUNDED_UP for one in columns[COEFFICIENTS:-1])
-        return cls(coefficients, error, slope, fourth, columns[-1] / _ROUNDED_UP)
+        bounds = (one * _ROUNDED_UP for one in columns[COEFFICIENTS:-1])
+        return cls(coefficients, *bounds, least=columns[-1] / _ROUNDED_UP)
 
 
 def _fourth(number: Any) -> Any:
@@ -240,22 +246,26 @@ def _pairs(numbers: dict[Any, Any]) -> dict[tuple[int, int], tuple[Any, Any]]:
 @dataclass(frozen=True)
 class _Expanded:
     """The local expansion of multipole terms: coefficients times powers of the ball's radius,
-    bounds of what it leaves out of value and gradient in the ball, and one over the distance."""
+    bounds of what it leaves out of value and gradient on the ball's sphere, of the rounding of the
+    value, and one over the distance."""
 
     coefficients: list[Any]
-    error: Any
-    slope: Any
+    tail: Any
+    tail_slope: Any
+    rounding: Any
     inverse: Any
 
     @classmethod
     def of(cls, r: Vec3, moments: Any, norms: list[Any], radius: Real) -> _Expanded:
         """r: from the multipoles to the ball's center. norms: of the terms l = 1, 2, ...: term l is
-        at most norms[l-1]/r^(l+1). The bounds are those of `tail_factors`, whose c grows with l.
+        at most norms[l-1]/r^(l+1). The bounds are those of `tail_factors`, whose c grows with l:
+        they bound all terms of degree j > p, so that at q times the radius, q <= 1, q^(p+1) times
+        as much, and q^p times as much for the gradient, is left out.
 
         Rounding, in double precision: each product of a coefficient passes through fewer than 2^10
         roundings, its shifts to smaller cells included, and the sum of the absolute values of all
-        products, with those of the harmonics of the ball, is below 2^22 norms[l-1]/r^(l+1) (tests
-        compute it). So value, and gradient times the radius, are off by at most 2^-21 of that.
+        products, with those of the harmonics of the ball, is below 2^23 norms[l-1]/r^(l+1) (tests
+        compute it). So value, and gradient times the radius, are off by at most 2^-20 of that.
         """
         inverse = dr.rsqrt(dr.squared_norm(r))
         seen = irregular(r.x, r.y, r.z, inverse, DEGREE + len(norms))
@@ -272,6 +282,6 @@ class _Expanded:
             factor, ratio = tail_factors(DEGREE, l)
             total, largest = total + factor * norm * u, largest + norm * u
         steeper = ratio * (DEGREE + 2) / (DEGREE + 1)
-        error = total * power / (1 - ratio * q) + _ROUNDING * largest
-        slope = (DEGREE + 1) * total * power / (1 - steeper * q) + _ROUNDING * largest
-        return cls(coefficients, error, slope / radius, inverse)
+        tail = total * power / (1 - ratio * q)
+        slope = (DEGREE + 1) * total * power / (1 - steeper * q)
+        return cls(coefficients, tail, slope / radius, _ROUNDING * largest, inverse)

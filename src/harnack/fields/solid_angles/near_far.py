@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 
 # Factors k of `far_sums`, by experiment: for a cell's own dipoles, and for those that it gathers
 # for all cells in it. The second is larger, as each level of cells adds to the truncation.
-_NEAR, _SHARED = 3.0, 4.5
+_NEAR, _SHARED = 2.5, 4.5
 # Nodes of the tree are left to the cells in a cell if they are no larger than its ball.
 _SMALL = 1.0
 # Cells are split that have more near dipoles, by experiment; where memory is short, twice as many,
@@ -61,7 +61,7 @@ _MARGIN, _DEEPEST = 1.004, 10
 _OCTANTS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 # Numbers of a record before the coefficients, and the base in which the first index is stored:
 # single precision holds no integers above 2^24.
-_HEAD, _BASE = 12, 4096
+_HEAD, _BASE = 14, 4096
 _ANY = 2**31 - 1
 
 
@@ -72,9 +72,10 @@ class NearFarCells:
     low: the lower corner of the cube. scale: 2^_DEEPEST over its side.
     nodes: for each node of the octree the number of the first of its eight children, z fastest; or
         for a cell that is not split, -1 minus the number of its record.
-    records: center and one over the radius; bounds of truncation of value and gradient and of the
-        rounding of the value; `FarSums.fourth` and `least`; first index (two numbers) and number of
-        near dipoles | coefficients.
+    records: center and one over the radius; bounds of truncation of value and gradient, everywhere
+        and in powers of the distance (`FarSums`), and of the rounding of the value;
+        `FarSums.fourth` and `least`; first index (two numbers) and number of near dipoles |
+        coefficients.
     near: the near dipoles, as rows of `dipoles`.
     dipoles: records of all dipoles, as `far_clusters.in_slots` has them.
     count, size: the number of cells, and their bytes.
@@ -127,8 +128,12 @@ class NearFarCells:
         u, inverse = x - vector(*row[:3]), row[3]
         y = u * inverse
         value, *slopes = value_and_gradient(row[_HEAD : _HEAD + COEFFICIENTS], [*y], DEGREE)
-        error, slope_error, rounding, fourth, least, low, high, count = row[4:_HEAD]
-        free = least - dr.norm(u) * (1 + SUM_ROUNDING)
+        error, slope_error, tail, tail_slope, rounding, fourth, least, low, high, count = row[
+            4:_HEAD
+        ]
+        away = dr.norm(u) * (1 + SUM_ROUNDING)
+        error, slope_error = _with_tail(away * inverse, error, slope_error, tail, tail_slope)
+        free = least - away
         s4 = fourth * dr.square(dr.square(least / free))
         zero = self.backend.Float(0)
         far = FieldSums(
@@ -149,6 +154,17 @@ class NearFarCells:
         start = (index(0), far.parts(), own)
         _, sums, own = dr.while_loop(start, more, step, label="near dipoles")
         return FieldSums.of(sums), own, active
+
+
+def _with_tail(
+    q: Real, error: Real, slope: Real, tail: Real, tail_slope: Real
+) -> tuple[Real, Real]:
+    """Bounds of truncation of value and gradient at q times the radius: see `FarSums`."""
+    power = 1.0 + 0 * q
+    for _ in range(DEGREE):
+        power = power * q
+    up = 1 + SUM_ROUNDING
+    return dr.fma(tail * up, power * q, error), dr.fma(tail_slope * up, power, slope)
 
 
 @dataclass(frozen=True)
@@ -259,8 +275,9 @@ def _table(
     slope = sums.slope + rounding[:, 1:].sum(axis=1) / radius
     up, inverse = 1 + SUM_ROUNDING, np.full(len(first), 1 / radius)
     least = np.minimum(sums.least, 1e3) / up
-    bounds = [sums.error * up, slope * up, rounding[:, 0], sums.fourth * up, least]
-    head = [centers, inverse, *bounds, first % _BASE, first // _BASE, lengths]
+    bounds = (sums.error, slope, sums.tail, sums.tail_slope, rounding[:, 0], sums.fourth)
+    numbered = first % _BASE, first // _BASE, lengths
+    head = [centers, inverse, *(one * up for one in bounds), least, *numbered]
     return np.column_stack([*head, sums.coefficients])
 
 
