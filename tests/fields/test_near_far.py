@@ -15,7 +15,7 @@ import pytest
 
 import harnack as hk
 from harnack.backend import Precision, choose_backend, to_numpy, to_vector3
-from harnack.fields.solid_angles import near_far
+from harnack.fields.solid_angles import dipole, near_far
 from harnack.fields.solid_angles.far_sums import COEFFICIENTS, DEGREE
 from harnack.fields.solid_angles.local_expansion import (
     _Sizes,  # pyright: ignore[reportPrivateUsage]
@@ -244,13 +244,56 @@ def test_memory_is_bounded_and_stated() -> None:
         rounding = 1e-6 * (np.abs(value) + np.linalg.norm(gradient, axis=1))
         assert (np.abs(found - value) <= error + rounding).all()
     assert sizes[0] > sizes[1] > sizes[2] > sizes[3] == 0
-    assert "cells" not in hk.DipolePotential(*some).describe()
+    assert "cells" not in hk.DipolePotential(*some, cells=False).describe()
+    assert hk.DipolePotential(*some).describe()["cells"] == "from 100,000 rays on"
 
 
 @pytest.mark.parametrize("cells", [-1.0, math.inf, math.nan])
 def test_cells_is_a_number_of_megabytes(cells: float) -> None:
     with pytest.raises(ValueError, match="megabytes"):
         hk.DipolePotential(*cloud(100), cells=cells)
+
+
+def test_many_rays_get_cells_by_themselves(monkeypatch: pytest.MonkeyPatch) -> None:
+    some = cloud(300)
+    field = hk.DipolePotential(*some)
+    assert field.for_rays(99_999) is field
+    with_cells = field.for_rays(100_000)
+    assert with_cells.cells is True
+    assert field.for_rays(10**8) is with_cells
+    assert field.cells is None
+    for given in (False, 3.0):
+        refused = hk.DipolePotential(*some, cells=given)
+        assert refused.for_rays(10**8) is refused
+    smooth = hk.DipolePotential(*some, smoothing=0.05)
+    assert smooth.for_rays(10**8) is smooth
+    # Of points that were put in the place of others, others are made.
+    field.points = 1.5 * field.points
+    other = field.for_rays(10**8)
+    assert other is not with_cells
+    assert other.points is field.points
+    # Tracing asks for them.
+    monkeypatch.setattr(dipole, "_LEAST_RAYS", 1000)
+    monkeypatch.setattr(dipole, "_PAYS", 1)
+    made: list[int] = []
+    build = dipole.build_cells
+
+    def counted(*given: Any) -> Any:
+        made.append(1)
+        return build(*given)
+
+    monkeypatch.setattr(dipole, "build_cells", counted)
+    field = hk.DipolePotential(*some)
+    few, many = rays(some[0], 999), rays(some[0], 1000)
+    hk.trace(field, *few)
+    assert not made
+    hits = hk.trace(field, *many)
+    hk.trace(field, *many)
+    assert len(made) == 1
+    plain = hk.trace(hk.DipolePotential(*some, cells=False), *many)
+    assert (plain.hit != hits.hit).mean() < 2e-3
+    hk.render(field, size=(32, 32), show="shaded", progress=False)
+    assert len(made) == 1
 
 
 def test_moved_points_keep_cells() -> None:

@@ -166,6 +166,13 @@ class Field(Sheets, Parts, Detail, Boundary, abc.ABC):
         del levels
         return None
 
+    def for_rays(self, count: int) -> Field:
+        """This field, to be traced by so many rays: a field may take longer to prepare where that
+        pays for them. The same object for the same count, so that nothing is prepared twice. The
+        default is the field itself."""
+        del count
+        return self
+
     def slope_change(self, p: Vec3, radius: Real) -> Real:
         """A proved bound of |grad f(y) - grad f(p)| for all y with |y - p| <= radius; infinite, the
         default, where none is known. Proofs that a mesh has the surface's topology use it."""

@@ -20,7 +20,7 @@ from harnack.rendering.mitsuba import load_dictionary, load_scene_file, take_var
 from harnack.rendering.placement import Placement
 from harnack.rendering.plugins import register, stand_in
 from harnack.rendering.shaded import Seen, Shading
-from harnack.rendering.stage import Studio, studio
+from harnack.rendering.stage import STUDIO_SPP, Studio, studio
 from harnack.rendering.studio_scene import studio_objects
 from harnack.rendering.views import VIEWS, View, Viewer
 from harnack.tracer import LevelSet
@@ -30,6 +30,8 @@ EDGE_SPP = 9
 # memory, and enough for all threads.
 _PATHS_A_BAND = 2**18
 _SIZE = (800, 600)
+# Rays of a path, shadow rays included, about.
+_RAYS_A_PATH = 3
 
 
 @dataclass(frozen=True)
@@ -58,15 +60,19 @@ class PictureJob:
         """The studio in which surfaces are drawn; None for a Mitsuba scene."""
         if not isinstance(self.what, Field | LevelSet | list | tuple):
             return None
-        asked = self.asked
-        check_memory(asked.show, *(asked.size or _SIZE))
+        asked, size = self.asked, self.asked.size or _SIZE
+        check_memory(asked.show, *size)
         on_stage = studio_objects(
             self.what, asked.material, self.settings, boundary=asked.boundary,
             boundary_material=asked.boundary_material, cut=asked.cut_material,
             isolines=asked.isolines, thickness=asked.thickness,
         )  # fmt: skip
+        rays = size[0] * size[1]
+        if asked.show not in (*VIEWS, "shaded"):
+            rays *= _RAYS_A_PATH * (asked.spp or STUDIO_SPP)
+        on_stage = [replace(one, surface=one.surface.for_rays(rays)) for one in on_stage]
         return studio(
-            self.mi, on_stage, size=asked.size or _SIZE, camera=asked.camera,
+            self.mi, on_stage, size=size, camera=asked.camera,
             backdrop=asked.backdrop, up="z" if asked.up is None else asked.up,
             bare=asked.show in VIEWS, traced_light=asked.show == "color",
         )  # fmt: skip

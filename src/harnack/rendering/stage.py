@@ -170,6 +170,8 @@ def material_of(wanted: Any) -> Material:
         ) from None
 
 
+# Samples a pixel, if not said otherwise.
+STUDIO_SPP = 64
 # Tolerances of fitted surfaces, on the stage. Surfaces of many parts have edges inside the picture,
 # where two parts meet: hits within the tolerance of such an edge have the normal of neither.
 _TOLERANCE, _OF_PARTS = 1e-4, 1e-5
@@ -308,5 +310,5 @@ def _sensor(mi: Any, pose: Pose, size: tuple[int, int]) -> dict[str, Any]:
             "pixel_format": "luminance" if mi.is_monochromatic else "rgb",
             "component_format": "float32",
         },
-        "sampler": {"type": "multijitter", "sample_count": 64},
+        "sampler": {"type": "multijitter", "sample_count": STUDIO_SPP},
     }

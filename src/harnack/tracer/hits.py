@@ -299,7 +299,8 @@ def _trace(
     *,
     differentiable: bool,
 ) -> Hits:
-    prepared = surface.prepare(backend, many=dr.width(o, d) >= _MANY)
+    count = dr.width(o, d)
+    prepared = surface.for_rays(count).prepare(backend, many=count >= _MANY)
     with dr.suspend_grad():
         end, hits = _ends(prepared, *(dr.detach(one) for one in (o, d, near, far)))
     if differentiable and wants_derivatives(prepared, o, d):

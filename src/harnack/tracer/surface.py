@@ -157,6 +157,10 @@ class LevelSet:
         None for all of space."""
         return _common([self.field.domain, self.extent, self.clip, self.section])
 
+    def for_rays(self, count: int) -> LevelSet:
+        """The same surface, to be traced by so many rays (`Field.for_rays`)."""
+        return replace(self, field=self.field.for_rays(count))
+
     def field_on(self, backend: Backend) -> Field:
         """The field on a backend, one for uses with and one for uses without derivatives."""
         is_followed = any(dr.grad_enabled(one) for one in self.field.parameters())

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import functools
 import math
@@ -17,6 +18,7 @@ import numpy as np
 from harnack.backend import backend_of
 from harnack.backend.elementary import fmax
 from harnack.backend.numbers import positive
+from harnack.cluster.packing import Remembered
 from harnack.fields.batch import BatchedField, SymmetricSum, Values
 from harnack.fields.clearance import DetailedField, UnitCoordinates, epsilon_at, placed, single
 from harnack.fields.field import Sample, lengthened
@@ -44,6 +46,9 @@ if TYPE_CHECKING:
 _BEYOND_CELLS = 1.0
 # Megabytes that cells may take by default.
 _MEGABYTES = 256.0
+# Cells are built by themselves from so many rays a point, and so many rays, on, and up to so many
+# points. To build them takes as long as to trace about 10 rays a point without them.
+_PAYS, _LEAST_RAYS, _MOST_POINTS = 25, 100_000, 200_000
 # A point counts as near if the squared distance is less than this fraction of its area.
 _BESIDE = 0.04
 
@@ -217,8 +222,10 @@ class DipolePotential(DetailedField["_DipoleBuffers"], BatchedField):
     accuracy: a cluster of points is taken as a whole beyond `accuracy` times its radius; by
         default 2 for values at points and 4 for tracing, which takes more where the tolerance asks
         for it. At least 1.5.
-    cells: for many rays through many points. True builds cells in which the near points count one
-        by one and all others as one polynomial, so that an evaluation for tracing costs a tenth.
+    cells: for many rays through many points: cells in which the near points count one by one and
+        all others as one polynomial, so that an evaluation for tracing costs a tenth. None builds
+        them where they pay (`for_rays`), for pictures of small clouds and for path tracing; True
+        always, False never.
         They take some 1 kB a point, or the megabytes that are given (True: 256) with larger and
         slower cells; where these would be too large, none are built, and `describe` of a prepared
         field says so. Building takes as long as tracing 100,000 to a million rays without cells,
@@ -241,7 +248,7 @@ class DipolePotential(DetailedField["_DipoleBuffers"], BatchedField):
         *,
         smoothing: float = 0.0,
         accuracy: float | None = None,
-        cells: bool | float = False,
+        cells: bool | float | None = None,
     ) -> None:
         super().__init__()
         if normals is None:
@@ -261,14 +268,17 @@ class DipolePotential(DetailedField["_DipoleBuffers"], BatchedField):
         if areas is None:
             self.areas = estimate_areas(self.points, self.normals)
         self.accuracy = accuracy
-        if not 0 <= cells < math.inf:
-            raise ValueError(f"cells must be True, False or a number of megabytes, not {cells}")
+        if cells is not None and not 0 <= cells < math.inf:
+            raise ValueError(
+                f"cells must be True, False, a number of megabytes or None, not {cells}"
+            )
         self.cells = cells
         self._box = low, high = self.points.min(axis=0), self.points.max(axis=0)
         self._center = single(0.5 * (low + high))
         extent = max(0.5 * float((high - low).max()), math.sqrt(float(self.areas.sum())) / 4)
         self._size = 2.0 ** math.ceil(math.log2(extent))
         self._given_hierarchy: Hierarchy | None = None
+        self._with_cells: Remembered[tuple[int, ...], Self] = Remembered()
         self.smoothing = 0.0 if smoothing == 0 else positive(smoothing, "smoothing")
         if self.smoothing and self.cells:
             raise ValueError("cells are of sums without smoothing: give one of the two")
@@ -342,7 +352,7 @@ class DipolePotential(DetailedField["_DipoleBuffers"], BatchedField):
             height, rows = self.smoothing / self._size, dipole_rows(unit, moments)
             tree = SmoothedSum.of(backend, self._hierarchy, rows, height, accuracy)
         else:
-            megabytes = _MEGABYTES if self.cells is True else float(self.cells)
+            megabytes = _MEGABYTES if self.cells is True else float(self.cells or 0)
             most_bytes = int(1e6 * megabytes) if traced else 0
             tree = DipoleTree.of(
                 backend, self._hierarchy, unit, moments, accuracy, most_bytes, self._half(unit)
@@ -354,6 +364,22 @@ class DipolePotential(DetailedField["_DipoleBuffers"], BatchedField):
         begin at the faces of that."""
         reach = math.sqrt(float(self.areas.sum()) / self.default_level) / self._size
         return 1.001 * (float(np.abs(unit).max()) + reach)
+
+    def for_rays(self, count: int) -> Self:
+        """With cells, if none were asked for and none refused, from `_PAYS` rays a point on."""
+        if self.cells is not None or not self._least_rays() <= count:
+            return self
+        key = id(self.points), id(self.normals), id(self.areas)  # of arrays that the copy holds
+        if key not in self._with_cells:
+            other = copy.copy(self)
+            other.cells, other._device, other._with_cells = True, None, Remembered()
+            self._with_cells[key] = other
+        return self._with_cells[key]
+
+    def _least_rays(self) -> float:
+        """The number of rays from which on cells pay."""
+        few = len(self.points) <= _MOST_POINTS and not self.smoothing
+        return max(_LEAST_RAYS, _PAYS * len(self.points)) if few else math.inf
 
     def prepare(self, backend: Backend) -> Self:
         prepared = super().prepare(backend)
@@ -387,7 +413,9 @@ class DipolePotential(DetailedField["_DipoleBuffers"], BatchedField):
         return about
 
     def _cells_built(self) -> dict[str, Any]:
-        """For `describe`: the number and memory of cells."""
+        """For `describe`: the number and memory of cells, or from how many rays there are any."""
+        if self.cells is None and self._least_rays() < math.inf:
+            return {"cells": f"from {self._least_rays():,.0f} rays on"}
         if self._device is None or not self.cells:
             return {}
         tree = self._device.tree
