@@ -19,6 +19,7 @@ from .baselines import baselines
 from .clouds import clouds
 from .cluster import cluster
 from .convergence import plot
+from .curve_cells import curve_cells
 from .distances import distances
 from .formulas import formulas
 from .growth import growth
@@ -39,7 +40,7 @@ DOCS = Path(__file__).resolve().parent.parent / "docs"
 SECTIONS = (
     "rays", "convergence", "winding", "agreement", "versions", "inclusion", "laplacian", "hart",
     "povray", "antialiasing", "baselines", "formulas", "meshes", "repair", "clouds", "distances",
-    "pictures", "live", "cluster",
+    "pictures", "live", "cluster", "curves",
 )  # fmt: skip
 
 
@@ -90,6 +91,7 @@ def main() -> None:
         "baselines": baselines,
         "clouds": lambda: clouds(arguments.meshes),
         "cluster": cluster,
+        "curves": curve_cells,
         "distances": distances,
         "formulas": formulas,
         "live": live,

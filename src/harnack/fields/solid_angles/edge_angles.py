@@ -167,14 +167,19 @@ def slope_change(cubes: Real, fourths: Real, distance: Real, radius: Real) -> Re
 
 
 def swept_ball(
-    value: Real, gradient: Vec3, squares: Real, bends: tuple[Curvature, ...]
+    value: Real,
+    gradient: Vec3,
+    squares: Real,
+    bends: tuple[Curvature, ...],
+    slope_error: Real = 0.0,
 ) -> HarmonicBall:
     """The range of the lift on the ball of one of the promises, which themselves prove longer
     steps.
 
     squares: the integral of |dp|/|D|^2, to which the rounding of the gradient is proportional.
+    slope_error: a bound of other errors of the gradient.
     """
     bend = bends[1]
-    slope = dr.norm(gradient) + SUM_ROUNDING * squares
+    slope = dr.norm(gradient) + SUM_ROUNDING * squares + slope_error
     moved = (1 + SUM_ROUNDING) * bend.radius * dr.fma(0.5 * bend.radius, bend.constant, slope)
     return HarmonicBall(bend.radius, value - moved, value + moved)

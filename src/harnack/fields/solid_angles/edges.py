@@ -283,8 +283,8 @@ class EdgeSums:
     fourths: Real
 
 
-def sum_over_edges(edges: LoopEdges, x: Vec3) -> EdgeSums:
-    """All sums at x in one loop.
+def sum_over_edges(edges: LoopEdges, x: Vec3, active: Mask = True) -> EdgeSums:
+    """All sums at x in one loop, on lanes that are active.
 
     It is the only loop that costs anything in a trace of a curve, so it is written for throughput:
     eight edges a trip, vertices fetched in aligned packets of eight floats, one square root, one
@@ -338,7 +338,7 @@ def sum_over_edges(edges: LoopEdges, x: Vec3) -> EdgeSums:
         return zr, zi, g, d2, squares, cubes, fourths
 
     start = (real(1), real(0), type(x)(0), real(dr.inf), real(0), real(0), real(0))
-    zr, zi, g, d2, squares, cubes, fourths = edges.records.for_each(add, start, "edges")
+    zr, zi, g, d2, squares, cubes, fourths = edges.records.for_each(add, start, "edges", active)
     angle = 2 * dr.atan2(zi, zr)
     # The weights are half of those in the gradient.
     return EdgeSums(angle, 2 * g, dr.sqrt(d2), 4 * squares, 2 * cubes, 2 * fourths)

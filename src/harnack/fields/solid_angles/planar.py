@@ -56,20 +56,23 @@ class PlanarRegion:
     normal: FloatArray
     offset: float
 
-    def window(self, angle: Real, height: Real, distance: Real, slack: Real) -> HarmonicBall:
+    def window(
+        self, angle: Real, height: Real, distance: Real, slack: Real, error: Real = 0.0
+    ) -> HarmonicBall:
         """A ball and a range of the lift on it: see the module.
 
         angle: f modulo 4 pi.
         height: over the plane, along its normal, off by at most `slack`.
         distance: to the curves, or less.
         slack: a length that bounds the rounding of positions.
+        error: of the angle, beyond rounding.
         """
         turn = 2 * math.pi
         f = angle - 2 * turn * dr.round(angle / (2 * turn))
         above = dr.abs(height) + slack
         share = above / distance
         # Near the curve the rounding of positions moves f by up to about 2 slack/distance.
-        doubt = 1e-3 + 16 * slack / distance
+        doubt = 1e-3 + 16 * slack / distance + error
         is_inside = dr.abs(f) > turn * fmax(share, 0.5) + doubt
         is_outside = dr.abs(f) < turn * fmin(1 - share, 0.5) - doubt
         free = fmax(dr.abs(height) - slack, 0)

@@ -1,0 +1,235 @@
+"""Cells in which the solid angle of a curve is that of a few near edges and one polynomial.
+
+A cube around the curve is an octree of cells. In each cell that is not split, the edges within
+three radii of its ball from its center are in runs that one more vertex closes to loops
+(`near_runs`), and the solid angle of all that is left is one harmonic polynomial (`far_edges`). So
+a sample costs what is near, whatever the number of edges. `curve_octree` makes the cells.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+
+from harnack.backend.elementary import fmin
+from harnack.fields.solid_angles.edge_trails import with_edge_rates
+from harnack.fields.solid_angles.edges import Edge, EdgeSums, inner_product, spinor
+from harnack.fields.solid_angles.far_edges import COEFFICIENTS, DEGREE
+from harnack.fields.solid_angles.local_expansion import value_and_gradient
+from harnack.fields.sums import SUM_ROUNDING
+from harnack.tree.nearest import squared_distance_to_segment
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Mask, Real, Vec3
+    from harnack.backend.records import Records
+    from harnack.fields.solid_angles.edge_trails import Line
+
+# Cells of the finest level are 2^-DEEPEST as wide as the cube; those of a grid that is looked up at
+# once 2^-TOP.
+DEEPEST, TOP = 10, 5
+# The balls of cells are larger than the balls around them by this factor, for rounding: it moves a
+# point by less than 2^-20 of the cube's side in single precision, and the balls of the finest cells
+# reach 2^-19 of it beyond these.
+MARGIN = 1.004
+# Numbers of a record before the coefficients, and vertices in a record of near edges.
+HEAD, VERTICES = 15, 2
+# Lengths up to this part of the distance to far edges are used along lines.
+_ALONG = 0.5
+
+
+@dataclass(frozen=True)
+class CellSums:
+    """Sums over all edges at x, in a cell.
+
+    sums: those of `edges.sum_over_edges`; integrals and the distance are bounds.
+    error, slope_error: bounds of what the polynomial leaves out of value and gradient.
+    rounding: a bound of the rounding of the value, to which `edges.near_rounding` is to be added.
+    rest: the gradient of the polynomial. cubes, free: of far edges, an upper bound of the integral
+        of |dp|/D^3, and a lower bound of the distance.
+    first, count: of the records of near edges.
+    """
+
+    sums: EdgeSums
+    error: Real
+    slope_error: Real
+    rounding: Real
+    rest: Vec3
+    cubes: Real
+    free: Real
+    first: Any
+    count: Any
+
+
+@dataclass(frozen=True)
+class CurveCells:
+    """Cells on a backend.
+
+    low: the lower corner of the cube. scale: 2^DEEPEST over its side.
+    top: for each cube of a grid of 2^TOP along each side, z fastest, a node of the octree: the
+        number of the first of its eight children, z fastest; or for a cell that is not split, or is
+        in one that is not, -1 minus the number of its record.
+    nodes: likewise for each node of the octree.
+    records: center and one over the radius; bounds of what the polynomial leaves out of value and
+        gradient, and of the rounding of the value; of the edges that are not near a lower bound
+        of the distance from the center; the factor of `EdgeSums.squares`; of the same edges an
+        upper bound of the integral of |dp|/D^3, D the distance from the center, and its gradient;
+        first record and number of records of near edges | coefficients.
+    near: records of two vertices each: place, and for the edge that leads there one over the square
+        of its length, negative for edges that close a run, 0 where there is no edge.
+    count, size: the number of cells, and their bytes.
+    """
+
+    backend: Backend
+    low: Vec3
+    scale: Real
+    top: Any
+    nodes: Any
+    records: Records
+    near: Records
+    count: int
+    size: int
+
+    def cell(self, x: Vec3) -> tuple[Any, Mask]:
+        """The record of the cell in which x lies, and whether x lies in the cube."""
+        index, integer = self.backend.UInt32, self.backend.Int32
+        place = (x - self.low) * self.scale
+        inside = dr.all((place >= 0) & (place < float(2**DEEPEST)))
+        ix, iy, iz = (index(dr.select(inside, place[k], 0)) for k in range(3))
+        down = DEEPEST - TOP
+        first = (((ix >> down) << TOP | (iy >> down)) << TOP) | (iz >> down)
+
+        def more(node: Any, *_: Any) -> Mask:
+            return node >= 0
+
+        def step(node: Any, bit: Any) -> tuple[Any, Any]:
+            octant = ((ix >> bit) & 1) * 4 + ((iy >> bit) & 1) * 2 + ((iz >> bit) & 1)
+            return dr.gather(integer, self.nodes, index(node) + octant), bit - 1
+
+        node = dr.gather(integer, self.top, first)
+        node, _ = dr.while_loop((node, index(down - 1) + 0 * ix), more, step, label="cell")
+        return index(-1 - node), inside
+
+    def sums(self, x: Vec3, active: Mask) -> tuple[CellSums, Mask]:
+        """The sums over all edges at x, and the mask of points for which they hold: those that are
+        active and lie in the cube.
+
+        Proof of the bound of I3, the integral of |dp|/D^3, of far edges at a point u from the
+        center, by I3 and its gradient there. With s the cosine of the angle between u and p - c and
+        q = |u|/D, the term of p is D^-3 (1 - 2 q s + q^2)^(-3/2) = D^-3 sum of C_j(s) q^j with
+        Gegenbauer's polynomials, which are largest at s = 1. The first two terms are the value and
+        the gradient at the center; the others are at most (1-q)^-3 - 1 - 3q = q^2 psi(q), with
+        psi = (6 - 8q + 3q^2)/(1-q)^3, which grows with q.
+        """
+        vector, index = self.backend.Array3f, self.backend.UInt32
+        number, inside = self.cell(x)
+        active = active & inside
+        row = self.records.row(number, active)
+        inverse, error, slope_error, rounding, least, factor, cubes = row[3:10]
+        u = x - vector(*row[:3])
+        constant, *others = row[HEAD : HEAD + COEFFICIENTS]
+        polynomial = [self.backend.Float(0), *others]
+        value, *slopes = value_and_gradient(polynomial, [*(u * inverse)], DEGREE)
+        rest = inverse * vector(*slopes)
+        first, count = index(row[13]), dr.select(active, index(row[14]), 0)
+        near = self._near(x, first, count)
+        away = dr.norm(u) * (1 + SUM_ROUNDING)
+        q, free = away / least, least - away
+        share = least / free
+        psi = dr.fma(q, dr.fma(3, q, -8), 6) * share * share * share
+        far = dr.fma(cubes, dr.fma(dr.square(q), psi, 1), dr.dot(u, vector(*row[10:13])))
+        sums = EdgeSums(
+            near.angle + (constant + value),
+            near.gradient + rest,
+            fmin(near.distance, free),
+            near.squares * factor,
+            near.cubes + far,
+            near.fourths + far / free,
+        )
+        return CellSums(sums, error, slope_error, rounding, rest, far, free, first, count), active
+
+    def rates_along(
+        self, found: CellSums, line: Line, lengths: tuple[Real, ...], active: Mask
+    ) -> tuple[Real, ...]:
+        """As `edge_trails.rates_along`, at the points of these sums.
+
+        Proof. f changes along a line by the sum of what the fields of all edges add up to along it.
+        For near edges that is bounded by `with_edge_rates`. The field H of all others at x is the
+        gradient of the polynomial, up to `slope_error`, with the fields of closing edges, which are
+        in the near loops. Along v it adds to f at x + sv at most |s||H . v| + s^2/2 K for |s| <= r,
+        with r half the distance d of far edges, and K the constant of `edge_angles.bends` for
+        q = 1/2, which is 3/2 (I3 + d I4), at most 3 I3.
+        """
+        vector, x = self.backend.Array3f, line.x
+        count = dr.select(active, found.count, 0)
+
+        def more(i: Any, *_: Any) -> Mask:
+            return i < count
+
+        def body(i: Any, p: Vec3, rest: Vec3, *rates: Real) -> tuple[Any, ...]:
+            row = self.near.row(found.first + i, i < count)
+            for k in range(VERTICES):
+                q, inverse = vector(*row[4 * k : 4 * k + 3]), row[4 * k + 3]
+                edge = Edge.between(p, q, dr.select(inverse > 0, inverse, 1), x)
+                grown = with_edge_rates(line, edge, lengths, rates)
+                pairs = zip(grown, rates, strict=True)
+                rates = tuple(dr.select(inverse > 0, new, old) for new, old in pairs)
+                w, c = edge.field()
+                rest = rest + dr.select(inverse < 0, w * c, 0)
+                p = q
+            return i + 1, p, rest, *rates
+
+        start = (self.backend.UInt32(0), vector(0), found.rest)
+        start = (*start, *(self.backend.Float(0) for _ in lengths))
+        _, _, rest, *rates = dr.while_loop(start, more, body, label="near edges along")
+        slope = dr.abs(dr.dot(rest, line.v)) + found.slope_error
+        slope = slope + SUM_ROUNDING * found.sums.squares
+        bend = (1 + SUM_ROUNDING) * 1.5 * found.cubes  # K/2
+        reach = _ALONG * found.free
+        return tuple(
+            dr.select(active & (length <= reach), rate + dr.fma(length, bend, slope), dr.inf)
+            for rate, length in zip(rates, lengths, strict=True)
+        )
+
+    def _near(self, x: Vec3, first: Any, count: Any) -> EdgeSums:
+        """As `sum_over_edges`, over the near loops. Edges that close runs do not count for the
+        distance, for cubes and for fourths, which are of the curve."""
+        real, index, vector = self.backend.Float, self.backend.UInt32, self.backend.Array3f
+
+        def more(i: Any, *_: Any) -> Mask:
+            return i < count
+
+        def body(i: Any, *state: Any) -> tuple[Any, ...]:
+            zr, zi, g, d2, squares, cubes, fourths, p, a, la, sa, *ca = state
+            row = self.near.row(first + i, i < count)
+            for k in range(VERTICES):
+                q, inverse = vector(*row[4 * k : 4 * k + 3]), row[4 * k + 3]
+                b = q - x
+                lb, sb, cb = spinor(b)
+                re, im = inner_product((ca[0], ca[1], ca[2], ca[3]), cb)
+                e, is_edge, counts = q - p, inverse != 0, inverse > 0
+                weight = (la + lb) * (sa * sb) / (la * lb * dr.fma(re, re, im * im))
+                weight = dr.select(is_edge, weight, 0)
+                re, im = dr.select(is_edge, re, 1), dr.select(is_edge, im, 0)
+                zr, zi = dr.fma(zr, re, -(zi * im)), dr.fma(zr, im, zi * re)
+                g = dr.fma(vector(weight), dr.cross(a, e), g)
+                size = dr.select(is_edge, dr.abs(inverse), 1)
+                square = squared_distance_to_segment(a, e, size)
+                share, near = weight * dr.rsqrt(size), dr.rsqrt(square)
+                squares = squares + dr.select(is_edge, share * square * near, 0)
+                d2 = dr.select(counts, fmin(square, d2), d2)
+                cubes = cubes + dr.select(counts, share, 0)
+                fourths = fourths + dr.select(counts, share * near, 0)
+                p, a, la, sa, ca = q, b, lb, sb, cb
+            scale = dr.rcp(dr.abs(zr) + dr.abs(zi))
+            zr, zi = zr * scale, zi * scale
+            return i + 1, zr, zi, g, d2, squares, cubes, fourths, p, a, la, sa, *ca
+
+        one, zero = real(1), real(0)
+        start = (one, zero, vector(0), real(dr.inf), zero, zero, zero, vector(0), vector(1), one,
+                 one, one, zero, zero, zero)  # fmt: skip
+        found = dr.while_loop((index(0), *start), more, body, label="near edges")[1:8]
+        zr, zi, g, d2, squares, cubes, fourths = found
+        angle = 2 * dr.atan2(zi, zr)
+        return EdgeSums(angle, 2 * g, dr.sqrt(d2), 4 * squares, 2 * cubes, 2 * fourths)

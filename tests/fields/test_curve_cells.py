@@ -1,0 +1,443 @@
+"""Cells of near edges and one polynomial: its formulas, its bounds, and rays through cells."""
+
+# Harmonics have degree j.
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import Any
+
+import drjit as dr
+import numpy as np
+import pytest
+
+import harnack as hk
+from harnack.backend import Precision, choose_backend, to_numpy, to_vector3
+from harnack.backend.records import Records
+from harnack.fields.solid_angles import curve_octree
+from harnack.fields.solid_angles.far_edges import (
+    _OF_TERMS,  # pyright: ignore[reportPrivateUsage]
+    COEFFICIENTS,
+    DEGREE,
+    FarEdges,
+    _turned,  # pyright: ignore[reportPrivateUsage]
+)
+from harnack.fields.solid_angles.local_expansion import (
+    _Sizes,  # pyright: ignore[reportPrivateUsage]
+    irregular,
+    parts,
+    rounding_tables,
+    shift_matrices,
+    value_and_gradient,
+)
+from harnack.fields.solid_angles.near_runs import Edges, Runs, VertexTable, left_over
+from harnack.geometry import shapes
+from tests.oracles.direct_sums import winding_sum
+
+PERIOD = 4 * math.pi
+RNG = np.random.default_rng(7)
+
+
+def unit(v: np.ndarray) -> np.ndarray:
+    return v / np.linalg.norm(v, axis=-1, keepdims=True)
+
+
+def wavy(n: int) -> np.ndarray:
+    t = 2 * np.pi * np.arange(n) / n
+    return np.stack([np.cos(t), np.sin(t), 0.45 * np.cos(3 * t)], axis=1)
+
+
+def collinear() -> np.ndarray:
+    """A long rod, its long sides cut into very different edges."""
+    t = np.array([0, 1e-3, 0.01, 0.3, 0.31, 0.7, 1.0])
+    there = np.stack([2 * t - 1, 0 * t, 0 * t], axis=1)
+    back = np.stack([1 - 2 * t, 0 * t + 0.05, 0.02 + 0 * t], axis=1)
+    return np.concatenate([there, back])
+
+
+CURVES: dict[str, Any] = {
+    "wavy": wavy(96),
+    "trefoil": shapes.torus_knot(2, 3, 120),
+    "coil": shapes.coil(5, 160, height=0.4),
+    "link": shapes.hopf_link(40),
+    "rings": shapes.borromean_rings(30),
+    "random": shapes.random_closed_curve(RNG, 60),
+    "spiky": shapes.spiky_polygon(RNG, 33),
+    "twice": [wavy(50), wavy(50)],
+    "twice in one": np.concatenate([wavy(30), wavy(30)]),
+    "rod": collinear(),
+    "triangle": np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0.4]]),
+    "flat": shapes.regular_polygon(40),
+    "holes": shapes.square_with_holes(24),
+    "there and back": np.array(
+        [[0, 0, 0], [1, 0, 0], [1, 1, 0.2], [2, 1, 0], [1, 1, 0.2], [0, 1, 0]]
+    ),
+}
+SOME = ("wavy", "trefoil", "coil", "twice", "rod", "holes")
+
+
+def loops_of(curve: Any) -> list[np.ndarray]:
+    return [
+        np.asarray(one, dtype=np.float64) for one in (curve if isinstance(curve, list) else [curve])
+    ]
+
+
+def angle_of(curve: Any) -> Any:
+    """The solid angle by fans of triangles, modulo 4 pi."""
+    fans: list[np.ndarray] = []
+    for loop in loops_of(curve):
+        apex = np.broadcast_to(loop.mean(axis=0) + 0.123, loop.shape)
+        fans.append(np.stack([apex, loop, np.roll(loop, -1, axis=0)], axis=1))
+    of_fans = winding_sum(np.concatenate(fans))
+    return lambda x: PERIOD * of_fans(x)
+
+
+def wrapped(difference: np.ndarray) -> np.ndarray:
+    return difference - PERIOD * np.round(difference / PERIOD)
+
+
+def expanded(points: np.ndarray, start: list[int], end: list[int], radius: float) -> FarEdges:
+    backend = choose_backend("double")
+    rows = Records.upload(backend, np.column_stack([points, np.zeros((len(points), 5))]))
+    edges = Edges(np.array(start), np.array(end), np.zeros(len(start), np.int64))
+    return FarEdges.of(rows, edges, backend.Array3f(0.0), dr.opaque(backend.Float, radius), 1)
+
+
+@pytest.mark.parametrize("q", [0.1, 1 / 3, 0.5])
+def test_far_loops_are_polynomials(q: float) -> None:
+    """In value and gradient, for edges short and long."""
+    rng = np.random.default_rng(1)
+    for n in (3, 7, 40):
+        loop = unit(np.cumsum(rng.normal(size=(n, 3)), axis=0) + 4 * rng.normal(size=3))
+        backend = choose_backend("double")
+        curve = hk.SolidAngle(loop).prepare(backend)
+        nearest = curve.closest_on_boundary(backend.Array3f(0.0))
+        radius = q * float(to_numpy(dr.norm(nearest))[0])
+        found = expanded(loop, [*range(n)], [*range(1, n), 0], radius)
+        u = unit(rng.normal(size=(500, 3)))
+        f, *g = value_and_gradient(found.coefficients[0], [*u.T], DEGREE)
+        off = np.abs(wrapped(f - angle_of(loop)(radius * u)))
+        true = hk.SolidAngle(loop).gradient(radius * u, precision="double")
+        steep = np.linalg.norm(np.stack(g, axis=1) / radius - true, axis=1)
+        assert off.max() <= found.error[0] + 1e-12
+        assert steep.max() <= found.slope[0] + 1e-10
+
+
+def of_one_edge(a: np.ndarray, e: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """g of `far_edges` at points u, for a short edge."""
+    s, w = np.polynomial.legendre.leggauss(40)
+    s, w = 0.5 * (s + 1), 0.5 * w
+    d = a + 0.5 * e
+    reach = np.linalg.norm(d - s[:, None, None] * u, axis=2)
+    return (u @ np.cross(d, e)) * (w[:, None] / reach**3).sum(axis=0)
+
+
+@pytest.mark.parametrize("q", [0.1, 0.25, 1 / 3])
+def test_the_tail_is_attained(q: float) -> None:
+    """Half of it would be too little, for an edge across the direction to it."""
+    a, e = np.array([0, 0, 1.0]), np.array([1e-6, 0, 0])
+    found = expanded(np.stack([a, a + e]), [0], [1], q)
+    angle, turn = np.meshgrid(np.linspace(0, np.pi, 200), np.linspace(0, np.pi, 41))
+    u = np.stack([np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), np.cos(angle)], -1)
+    u = u.reshape(-1, 3)
+    f, *_ = value_and_gradient([0.0, *found.coefficients[0, 1:]], [*u.T], DEGREE)
+    used = np.abs(f - of_one_edge(a, e, q * u)).max() / (found.error[0] - 2.0**-36)
+    assert 0.5 < used <= 1
+
+
+def test_rounding_of_polynomials_is_below_what_is_counted() -> None:
+    """`_Piece.sums`: the sums of absolute values, all coordinates as large as can be."""
+    one, q = _Sizes(np.array(1.0)), 0.5
+
+    class Ones:
+        x = y = z = one
+
+    phi = {key: list(pair) for key, pair in irregular(one, one, one, one, DEGREE).items()}
+    phi = {key: [part if isinstance(part, _Sizes) else _Sizes(np.array(part)) for part in pair]
+           for key, pair in phi.items()}  # fmt: skip
+    sizes = [float(part.number) for part in _turned(phi, Ones(), q)]  # pyright: ignore[reportArgumentType]
+    roundings = 0.51 * (9 * DEGREE + 2 * COEFFICIENTS)
+    harmonics = rounding_tables(DEGREE, 1.0) / roundings
+    assert (np.array(sizes) @ harmonics[1:]).max() < 2**14
+    assert _OF_TERMS >= 2.0**-53 * 2**9 * 2**14
+
+
+def test_polynomials_move_with_cells() -> None:
+    rng = np.random.default_rng(2)
+    given = FarEdges(rng.normal(size=(1, COEFFICIENTS)), np.ones(1), np.ones(1))
+    shifts = shift_matrices(DEGREE, 0.28)
+    found = given.of_children(np.array([True]), shifts, 1.0)
+    u = 0.3 * rng.normal(size=3)
+    before = value_and_gradient(given.coefficients[0], u, DEGREE)[0]
+    for k, corner in enumerate(itertools.product((-0.28, 0.28), repeat=3)):
+        after = value_and_gradient(found.coefficients[k], 2 * (u - corner), DEGREE)[0]
+        assert abs(after - before) < 1e-12
+    assert (found.error >= 1).all()
+    assert (found.error < 1 + 1e-10).all()
+    assert len(parts(DEGREE)) == COEFFICIENTS
+
+
+@pytest.mark.parametrize("name", CURVES)
+def test_what_is_left_over_is_a_cycle_far_away(name: str) -> None:
+    """Runs hold the near edges, closed runs and what is left over enter each vertex as often as
+    they leave it, and what is left over is no nearer than closing edges may be."""
+    rng = np.random.default_rng(3)
+    loops = [loop - loop.mean() for loop in loops_of(CURVES[name])]
+    table = VertexTable.of(tuple(loops))
+    before = Runs.of_loops(table)
+    centers = np.array([np.concatenate(loops)[rng.integers(3)] + 0.1 * rng.normal(size=3)])
+    for radius in (0.5, 0.25, 0.1, 0.03):
+        run, place = before.edges()
+        p, q = table.points[place], table.points[place + 1]
+        distance = to_segments(centers[0], p, q)
+        after, kept = before.narrowed(distance <= radius)
+        after = after.closed(table, centers, np.array([radius]), np.dtype(np.float64))
+        assert kept[distance <= radius].all()
+        left = left_over(before, kept, after, len(table.points))
+        points = np.concatenate([table.points, before.apex, after.apex])
+        degree: dict[bytes, int] = {}
+        for at, sign in ((left.start, 1), (left.end, -1)):
+            for vertex in points[at]:
+                degree[vertex.tobytes()] = degree.get(vertex.tobytes(), 0) + sign
+        assert not any(degree.values())
+        if len(left.start):
+            nearest = to_segments(centers[0], points[left.start], points[left.end])
+            assert nearest.min() >= 0.92 * radius
+        assert len(run) == before.count.sum()
+        before = after
+
+
+def to_segments(x: np.ndarray, p: np.ndarray, q: np.ndarray) -> np.ndarray:
+    e = q - p
+    share = ((x - p) * e).sum(axis=1) / np.maximum((e * e).sum(axis=1), 1e-300)
+    return np.linalg.norm(p + np.clip(share, 0, 1)[:, None] * e - x, axis=1)
+
+
+def places(curve: Any, n: int, seed: int) -> np.ndarray:
+    """Everywhere, and near the curve at all distances; numbers of single precision."""
+    rng = np.random.default_rng(seed)
+    loops = loops_of(curve)
+    vertices = np.concatenate(loops)
+    following = np.concatenate([np.roll(loop, -1, axis=0) for loop in loops])
+    k, t = rng.integers(len(vertices), size=n), rng.random((n, 1))
+    size = np.ptp(vertices, axis=0).max()
+    x = (1 - t) * vertices[k] + t * following[k]
+    x = x + size * 10 ** rng.uniform(-4, 0.2, (n, 1)) * unit(rng.normal(size=(n, 3)))
+    return x.astype(np.float32).astype(np.float64)
+
+
+def sampled(field: hk.SolidAngle, x: np.ndarray, precision: Precision) -> Any:
+    backend = choose_backend(precision)
+    sample = field.prepare(backend).evaluate(to_vector3(backend, x))
+    numbers = sample.value, sample.gradient, sample.error, sample.gradient_error, sample.truncation
+    numbers = tuple(backend.Float(one) if isinstance(one, float) else one for one in numbers)
+    dr.eval(*numbers)
+    return tuple(to_numpy(one).astype(np.float64) for one in numbers)
+
+
+@pytest.mark.parametrize("precision", ["single", "double"])
+@pytest.mark.parametrize("name", CURVES)
+def test_errors_are_bounded(name: str, precision: Precision) -> None:
+    curve = [loop.astype(np.float32) for loop in loops_of(CURVES[name])]
+    x = places(curve, 20_000, 4)
+    field = hk.SolidAngle(curve, cells=True)
+    found, slope, error, slope_error, truncation = sampled(field, x, precision)
+    assert (truncation <= error).all()
+    gradient = hk.SolidAngle(curve).gradient(x, precision="double")
+    steep = np.linalg.norm(gradient, axis=1)
+    # The bounds leave out the rounding of the point itself.
+    point = 8 * choose_backend(precision).epsilon * (1 + np.abs(x).max(axis=1))
+    off = np.abs(wrapped(found - angle_of(curve)(x))) - point * steep
+    assert (off <= error + 1e-9).all()
+    off = np.linalg.norm(slope - gradient, axis=1)
+    distance = np.full(len(x), np.inf)
+    for loop in curve:
+        for p, q in zip(loop, np.roll(loop, -1, axis=0), strict=True):
+            e, a = (q - p).astype(float), x - p
+            share = np.clip((a @ e) / max(e @ e, 1e-300), 0, 1)
+            distance = np.minimum(distance, np.linalg.norm(a - share[:, None] * e, axis=1))
+    rounding = (1e-5 if precision == "single" else 1e-12) + 8 * point / distance
+    clear = distance > 100 * point
+    scale = np.linalg.norm(gradient, axis=1) + 1 / distance
+    assert (off <= slope_error + rounding * scale)[clear].all()
+
+
+def table_of(field: hk.SolidAngle, precision: Precision = "single") -> tuple[Any, np.ndarray]:
+    """The cells of a prepared field, and the numbers of their records."""
+    on = field.prepare(choose_backend(precision))._device
+    assert on is not None
+    assert on.cells is not None
+    cells = on.cells
+    return cells, to_numpy(cells.records.buffer).reshape(cells.count, -1).astype(np.float64)
+
+
+def test_samples_cost_what_is_near() -> None:
+    """Sixteen times as many edges are a few more near ones in each cell."""
+    mean: list[float] = []
+    for n in (64, 1024):
+        cells, table = table_of(hk.SolidAngle(wavy(n), cells=True))
+        assert cells.size < 12e6
+        mean.append(table[:, 14].mean())
+    assert mean[0] < mean[1] < 4
+
+
+def compare(curve: Any, o: np.ndarray, d: np.ndarray, **settings: Any) -> None:
+    """Rays with cells end as those without, but for grazes within the tolerance."""
+    hits = hk.trace(hk.SolidAngle(curve, cells=True), o, d, **settings)
+    plain = hk.trace(hk.SolidAngle(curve), o, d, **settings)
+    assert not (hits.status == hk.Status.OUT_OF_STEPS).any()
+    assert (plain.hit != hits.hit).mean() < 2e-3
+    value, exact = angle_of(curve), hk.SolidAngle(curve)
+    near = 1.3e-4 + 1e-6 * np.abs(o).max()
+    for one, other in ((plain, hits), (hits, plain)):
+        early = np.flatnonzero(one.hit & ~(other.t < one.t + 10 * near))
+        assert len(early) < 0.02 * len(o)
+        if len(early):
+            x = o[early] + one.t[early, None] * d[early]
+            steep = np.linalg.norm(exact.gradient(x, precision="double"), axis=1)
+            off = np.abs(wrapped(value(x) - 2 * math.pi))
+            clear = steep < 0.1 / near
+            assert (off <= 2 * near * steep + 1e-4)[clear].all()
+
+
+def rays(curve: Any, n: int, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    """From outside and inside; anywhere, and closely past the curve, also along its edges."""
+    rng = np.random.default_rng(seed)
+    vertices = np.concatenate(loops_of(curve))
+    center, size = vertices.mean(axis=0), np.ptp(vertices, axis=0).max()
+    o = center + 1.2 * size * unit(rng.normal(size=(n, 3)))
+    o[: n // 4] = center + 0.4 * size * rng.uniform(-1, 1, (n // 4, 3))
+    target = center + 0.6 * size * rng.uniform(-1, 1, (n, 3))
+    target[n // 2 :] = places(curve, n - n // 2, seed)
+    d = unit(target - o)
+    along = n // 8
+    first = loops_of(curve)[0]
+    k = rng.integers(len(first), size=along)
+    e = np.roll(first, -1, axis=0)[k] - first[k]
+    keep = np.linalg.norm(e, axis=1) > 0
+    o[-along:][keep] = (first[k] - 2 * e + 1e-4 * size * rng.normal(size=e.shape))[keep]
+    d[-along:][keep] = unit(e[keep])
+    return o.astype(np.float32).astype(np.float64), d
+
+
+@pytest.mark.parametrize("precision", ["single", "double"])
+@pytest.mark.parametrize("name", SOME)
+def test_rays_end_as_without_cells(name: str, precision: Precision) -> None:
+    compare(CURVES[name], *rays(CURVES[name], 4000), precision=precision)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [*CURVES, "fine"])
+def test_many_rays_end_as_without_cells(name: str) -> None:
+    curve = CURVES.get(name, wavy(1024))
+    compare(curve, *rays(curve, 100_000, 5))
+    compare(curve, *rays(curve, 20_000, 6), precision="double", tolerance=1e-7)
+
+
+@pytest.mark.parametrize("shift", [0.0, 1024.0])
+def test_rays_along_faces_and_through_corners_of_cells(shift: float) -> None:
+    """Also far from the origin."""
+    curve = (wavy(96) + shift).astype(np.float32).astype(np.float64)
+    field = hk.SolidAngle(curve, cells=True)
+    cells, table = table_of(field)
+    rng = np.random.default_rng(4)
+    chosen = table[rng.integers(cells.count, size=2000)]
+    away = rng.choice([-1, 1], (2000, 3)) / (1.004 * math.sqrt(3)) / chosen[:, 3:4]
+    corner = field._center + field._size * (chosen[:, :3] + away)
+    d = np.eye(3)[rng.integers(3, size=2000)]
+    d[1000:] = unit(rng.choice([-1.0, 1.0], (1000, 3)))
+    compare(curve, corner - 3 * d, d)
+
+
+def test_levels_and_tolerances_that_cells_do_not_reach() -> None:
+    """Other levels lie outside of the cube in part; small tolerances need all edges."""
+    o, d = rays(CURVES["trefoil"], 2000)
+    for settings in ({"level": 1.0}, {"tolerance": 1e-6}):
+        plain = hk.trace(hk.SolidAngle(CURVES["trefoil"]), o, d, **settings)
+        hits = hk.trace(hk.SolidAngle(CURVES["trefoil"], cells=True), o, d, **settings)
+        both = plain.hit & hits.hit
+        assert (plain.hit != hits.hit).mean() < 2e-3
+        assert np.quantile(np.abs(plain.t[both] - hits.t[both]), 0.9) < 2e-4
+
+
+def test_values_and_derivatives_are_those_of_all_edges() -> None:
+    curve, x = CURVES["trefoil"], places(CURVES["trefoil"], 300, 5)
+    plain, field = hk.SolidAngle(curve), hk.SolidAngle(curve, cells=True)
+    field.prepare(choose_backend("single"))
+    np.testing.assert_array_equal(field.value(x), plain.value(x))
+    np.testing.assert_array_equal(field.gradient(x), plain.gradient(x))
+    np.testing.assert_array_equal(field.hessian(x), plain.hessian(x))
+    o, d = rays(curve, 400)
+    backend = choose_backend("double")
+    level = backend.Float(2.0)
+    dr.enable_grad(level)
+    given = to_vector3(backend, o), to_vector3(backend, d)
+    t = hk.trace(field, *given, level=level, tolerance=1e-8).t
+    dr.forward(level)
+    found = to_numpy(dr.grad(t))
+    hits = hk.trace(plain, o, d, level=2.0, precision="double", tolerance=1e-8)
+    x = o[hits.hit] + hits.t[hits.hit, None] * d[hits.hit]
+    slope = (plain.gradient(x, precision="double") * d[hits.hit]).sum(axis=1)
+    steady = np.abs(slope) > 0.5
+    np.testing.assert_allclose(found[hits.hit][steady] * slope[steady], 1.0, atol=0.01)
+
+
+def test_circles_beside_cells() -> None:
+    loops = [wavy(64), hk.Circle(0.4, normal=(0, 0, -1))]
+    o, d = rays(wavy(64), 2000)
+    plain, hits = (hk.trace(hk.SolidAngle(loops, cells=some), o, d) for some in (False, True))
+    assert (plain.hit != hits.hit).mean() < 2e-3
+    both = plain.hit & hits.hit
+    assert np.quantile(np.abs(plain.t[both] - hits.t[both]), 0.98) < 1e-3
+
+
+def test_memory_is_bounded_and_stated() -> None:
+    curve = wavy(400)
+    x = places(curve, 2000, 5)
+    truth = angle_of(curve)(x)
+    sizes: list[int] = []
+    for megabytes in (True, 3.0, 1.0, 0.01):
+        field = hk.SolidAngle(curve, cells=megabytes)
+        prepared = field.prepare(choose_backend("double"))
+        assert prepared._device is not None
+        cells, said = prepared._device.cells, prepared.describe()["cells"]
+        if cells is None:
+            sizes.append(0)
+            assert said == "none, as they need more memory"
+        else:
+            sizes.append(cells.size)
+            assert cells.size <= 1e6 * (256 if megabytes is True else megabytes)
+            assert said == f"{cells.count} of {cells.size / 1e6:.1f} MB"
+        found, _, error, *_ = sampled(field, x, "double")
+        assert (np.abs(wrapped(found - truth)) <= error + 1e-9).all()
+    assert sizes[0] > sizes[1] > sizes[2] > sizes[3] == 0
+    assert "cells" not in hk.SolidAngle(curve).describe()
+
+
+@pytest.mark.parametrize("cells", [-1.0, math.inf, math.nan])
+def test_cells_is_a_number_of_megabytes(cells: float) -> None:
+    with pytest.raises(ValueError, match="megabytes"):
+        hk.SolidAngle(wavy(20), cells=cells)
+
+
+def test_vertices_that_may_move_have_no_cells() -> None:
+    loop = to_vector3(choose_backend("single"), wavy(20))
+    with pytest.raises(ValueError, match="cells are of curves that stay as they are"):
+        hk.SolidAngle(loop, cells=True)
+
+
+def test_errors_are_attained_in_cells(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An eighth of the error would be too little in some cell: all its edges add up in size, and
+    what they leave out only in part."""
+    monkeypatch.setattr(curve_octree, "_FINE", 1e-3)
+    curve = wavy(200)
+    field = hk.SolidAngle(curve, cells=True)
+    _, table = table_of(field, "double")
+    corners = np.array(list(itertools.product((-1.0, 1.0), repeat=3))) / math.sqrt(3) / 1.0041
+    x = (table[:, None, :3] + corners / table[:, None, 3:4]).reshape(-1, 3)
+    x = field._center + field._size * x
+    found, _, _, _, truncation = sampled(field, x, "double")
+    some = truncation > 1e-6
+    used = np.abs(wrapped(found - angle_of(curve)(x)))[some] / truncation[some]
+    assert 0.125 < used.max() <= 1
