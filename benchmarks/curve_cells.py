@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import resource
 from collections.abc import Callable
 from typing import Any
@@ -51,7 +52,8 @@ def _row(n: int) -> str:
     for o, d in (_camera(), _chords(), _bounces(plain)):
         rays = to_vector3(backend, o), to_vector3(backend, d)
         for one in (plain, field):
-            best = min(_seconds(lambda one=one: _trace(one, rays)) for _ in range(_REPEATS))
+            work = functools.partial(_trace, one, rays)
+            best = min(_seconds(work) for _ in range(_REPEATS))
             entries.append(f"{best / len(o) * 1e9:,.0f}")
     size = field.prepare(backend)._device.cells.size  # type: ignore[union-attr]
     return f"| {n:,} | " + " | ".join(entries) + f" | {built:.2f} s | {size / 1e6:.1f} |"

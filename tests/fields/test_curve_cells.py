@@ -282,6 +282,44 @@ def test_samples_cost_what_is_near() -> None:
     assert mean[0] < mean[1] < 4
 
 
+@pytest.mark.parametrize("name", ["wavy", "trefoil", "link", "rod"])
+def test_promises_hold(name: str) -> None:
+    """Second derivatives near points, and rates along lines that run along edges."""
+    curve, n = CURVES[name], 4000
+    o, d = rays(curve, n, 8)
+    rng = np.random.default_rng(9)
+    x = np.concatenate([places(curve, n // 2, 8), o[n // 2 :] + 0.3 * d[n // 2 :]])
+    x = x.astype(np.float32).astype(np.float64)
+    backend = choose_backend("double")
+    field = hk.SolidAngle(curve, cells=True).prepare(backend)
+    p, v = to_vector3(backend, x), to_vector3(backend, d)
+    sample = field._sample(p, v)
+    known = [(one.radius, one.constant) for one in (*sample.known, *sample.along)]
+    dr.eval(sample.value, sample.gradient, known)
+    value, gradient = to_numpy(sample.value), to_numpy(sample.gradient)
+    exact = hk.SolidAngle(curve)
+    bends, found = len(sample.known), 0
+    for k, (radius, constant) in enumerate(known):
+        radius = np.minimum(to_numpy(radius + 0 * p.x), 1e3)
+        constant = to_numpy(constant + 0 * p.x)
+        way = unit(rng.normal(size=(n, 3))) if k < bends else d
+        for share in (0.1, 0.5, 0.99):
+            t = share * radius
+            y = x + t[:, None] * way
+            move = wrapped(exact.value(y, precision="double") - exact.value(x, precision="double"))
+            slope = (exact.gradient(x, precision="double") * way).sum(axis=1)
+            most = 0.5 * constant * t * t if k < bends else constant * t
+            off = np.abs(move - slope * t) if k < bends else np.abs(move)
+            if k >= bends:  # a change of more than a half period is not seen by values
+                off = np.where(most < 0.5 * PERIOD, off, 0)
+            off = np.minimum(off, np.abs(off - PERIOD))
+            assert (off <= most + 1e-6 * (1 + np.abs(slope) * t)).all()
+            found += int((np.isfinite(most) & (most < PERIOD)).sum())
+    assert np.isfinite(value).all()
+    assert gradient.shape == (n, 3)
+    assert found > n
+
+
 def compare(curve: Any, o: np.ndarray, d: np.ndarray, **settings: Any) -> None:
     """Rays with cells end as those without, but for grazes within the tolerance."""
     hits = hk.trace(hk.SolidAngle(curve, cells=True), o, d, **settings)
