@@ -191,10 +191,10 @@ def test_what_is_left_over_is_a_cycle_far_away(name: str) -> None:
         run, place = before.edges()
         p, q = table.points[place], table.points[place + 1]
         distance = to_segments(centers[0], p, q)
-        after, kept = before.narrowed(distance <= radius)
+        after, kept = before.narrowed(run, distance <= radius)
         after = after.closed(table, centers, np.array([radius]), np.dtype(np.float64))
         assert kept[distance <= radius].all()
-        left = left_over(before, kept, after, len(table.points))
+        left = left_over(before, (run, place), kept, after, len(table.points))
         points = np.concatenate([table.points, before.apex, after.apex])
         degree: dict[bytes, int] = {}
         for at, sign in ((left.start, 1), (left.end, -1)):

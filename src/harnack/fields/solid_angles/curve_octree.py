@@ -144,9 +144,9 @@ class _Octree:
         around = _Around.of(self.edges, centers, radius)
         is_leaf = (count <= self.most_near) & (around.tail <= self.fine * around.total) | is_last
         inner = np.where(is_leaf, _NEAR, _SHARED) * radius
-        chosen, kept = runs.narrowed(distance <= inner[cell])
+        chosen, kept = runs.narrowed(run, distance <= inner[cell])
         chosen = chosen.closed(self.vertices, centers, inner, np.dtype(self.backend.dtype))
-        left = left_over(runs, kept, chosen, len(self.vertices.points))
+        left = left_over(runs, (run, place), kept, chosen, len(self.vertices.points))
         points = np.concatenate([self.vertices.points, runs.apex, chosen.apex])
         rows = Records.upload(double, np.column_stack([points, np.zeros((len(points), 5))]))
         far = far.plus(

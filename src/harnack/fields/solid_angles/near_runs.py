@@ -102,12 +102,12 @@ class Runs:
         begin = np.cumsum(self.count) - self.count
         return run, np.arange(len(run)) - begin[run] + self.first[run]
 
-    def narrowed(self, is_near: BoolArray) -> tuple[Runs, BoolArray]:
+    def narrowed(self, run: IntArray, is_near: BoolArray) -> tuple[Runs, BoolArray]:
         """The runs of near edges, and for each edge whether it is in one of them.
 
-        is_near: (k,) for each of `edges`. Apexes are to be chosen (`closed`).
+        run, is_near: (k,) for each of `edges`, its run, and whether it is near. Apexes are to be
+            chosen (`closed`).
         """
-        run, _ = self.edges()
         begin = np.cumsum(self.count) - self.count
         near = np.flatnonzero(is_near)
         owner = run[near]
@@ -167,15 +167,13 @@ class Runs:
         apex = apex.astype(number).astype(np.float64)
         return Runs(self.cell, self.first, self.count, self.is_whole, apex)
 
-    def closing(self, apexes: int) -> Edges:
-        """The closing edges of runs; apexes: the row of the first apex in the table of points."""
+    def closing(self, apexes: int) -> tuple[Edges, Edges]:
+        """The edges from the ends of runs to apexes, and those from apexes to their beginnings;
+        apexes: the row of the first apex in the table of points."""
         rows = np.flatnonzero(~self.is_whole)
         first, last = self.first[rows], self.first[rows] + self.count[rows]
         cell = self.cell[rows]
-        return Edges(
-            np.concatenate([last, apexes + rows]), np.concatenate([apexes + rows, first]),
-            np.concatenate([cell, cell]),
-        )  # fmt: skip
+        return Edges(last, apexes + rows, cell), Edges(apexes + rows, first, cell)
 
 
 def _unit(vectors: FloatArray) -> FloatArray:
@@ -183,19 +181,37 @@ def _unit(vectors: FloatArray) -> FloatArray:
     return vectors / np.maximum(length, 1e-300)
 
 
-def left_over(before: Runs, kept: BoolArray, after: Runs, vertices: int) -> Edges:
+def left_over(
+    before: Runs, edges: tuple[IntArray, IntArray], kept: BoolArray, after: Runs, vertices: int
+) -> Edges:
     """What is left of the closed runs before if the closed runs after are taken out, in the order
     of cells.
 
-    kept: for each edge before, whether it is in a run after. The rows of points are the vertices,
-    so many, the apexes before, and the apexes after.
+    edges: of the runs before (`Runs.edges`). kept: for each of them, whether it is in a run after.
+    The rows of points are the vertices, so many, the apexes before, and the apexes after.
     """
-    run, place = before.edges()
-    left = ~kept
-    edges = Edges(place[left], place[left] + 1, before.cell[run[left]])
-    outer, inner = before.closing(vertices), after.closing(vertices + len(before.cell))
-    start = np.concatenate([edges.start, outer.start, inner.end])
-    end = np.concatenate([edges.end, outer.end, inner.start])
-    cell = np.concatenate([edges.cell, outer.cell, inner.cell])
-    order = np.argsort(cell, kind="stable")
-    return Edges(start[order], end[order], cell[order])
+    left = np.flatnonzero(~kept)
+    run, place = (one[left] for one in edges)
+    inner = after.closing(vertices + len(before.cell))
+    return _merged(
+        [
+            Edges(place, place + 1, before.cell[run]),
+            *before.closing(vertices),
+            *(Edges(one.end, one.start, one.cell) for one in inner),
+        ]
+    )
+
+
+def _merged(groups: list[Edges]) -> Edges:
+    """All edges in the order of cells; those of each group are in that order."""
+    cells = 1 + max((int(one.cell[-1]) for one in groups if len(one.cell)), default=0)
+    counts = [np.bincount(one.cell, minlength=cells) for one in groups]
+    total = np.sum(counts, axis=0)
+    at = np.cumsum(total) - total
+    start, end, cell = np.empty((3, int(total.sum())), np.int64)
+    for one, count in zip(groups, counts, strict=True):
+        rank = np.arange(len(one.cell)) - np.repeat(np.cumsum(count) - count, count)
+        place = np.repeat(at, count) + rank
+        start[place], end[place], cell[place] = one.start, one.end, one.cell
+        at = at + count
+    return Edges(start, end, cell)
