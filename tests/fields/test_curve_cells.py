@@ -450,7 +450,30 @@ def test_memory_is_bounded_and_stated() -> None:
         found, _, error, *_ = sampled(field, x, "double")
         assert (np.abs(wrapped(found - truth)) <= error + 1e-9).all()
     assert sizes[0] > sizes[1] > sizes[2] > sizes[3] == 0
-    assert "cells" not in hk.SolidAngle(curve).describe()
+    assert "cells" not in hk.SolidAngle(curve, cells=False).describe()
+    assert hk.SolidAngle(curve).describe()["cells"] == "from 625,000 rays on"
+
+
+def test_many_rays_get_cells_by_themselves() -> None:
+    curve = wavy(1000)
+    field = hk.SolidAngle(curve)
+    assert field.for_rays(249_999) is field
+    with_cells = field.for_rays(250_000)
+    assert with_cells.cells is True
+    assert field.for_rays(10**8) is with_cells
+    assert field.cells is None
+    vector = choose_backend("single").Array3f
+    for one in (
+        hk.SolidAngle(wavy(47)),
+        hk.SolidAngle(curve, cells=False),
+        hk.SolidAngle(curve, certificate="paper"),
+        hk.SolidAngle(vector(*curve.T)),
+        hk.SolidAngle(hk.Circle(1.0, (0, 0, 0), (0, 0, 1))),
+    ):
+        assert one.for_rays(10**9) is one
+    x = places(curve, 500, 6)
+    found, _, error, *_ = sampled(with_cells, x, "double")
+    assert (np.abs(wrapped(found - angle_of(curve)(x))) <= error + 1e-9).all()
 
 
 @pytest.mark.parametrize("cells", [-1.0, math.inf, math.nan])

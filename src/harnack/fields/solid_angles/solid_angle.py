@@ -56,6 +56,7 @@ from harnack.names import did_you_mean
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from typing import Self
 
     import numpy.typing as npt
 
@@ -72,6 +73,9 @@ _NARROW = 1e-9 * _PERIOD
 _MOST_PAIRS = 3_000_000
 # Sides of the polygons that stand for circles where a boundary is drawn.
 _SIDES = 256
+# Cells are built by themselves from so many rays times edges on, which take five times as long as
+# to build the cells, and for no fewer edges.
+_PAYS, _LEAST_EDGES = 2.5e8, 48
 # Megabytes that cells may take by default; and the most planes of the extent of a curve in convex
 # position with cells, by experiment: with hundreds, clipping rays takes longer than the march.
 _MEGABYTES, _PLANES = 256.0, 48
@@ -108,14 +112,15 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
     - "paper" assumes that range for any curve and promises nothing else, as the paper does. It is
       false for coils and links and exists for comparisons: hits can be missed.
 
-    cells: for many rays and curves of many vertices. True builds cells in which the near edges
-    count one by one and all others as one polynomial, with a proved remainder, so that an
-    evaluation for tracing costs about the same whatever the number of edges; where the remainder
-    decides, all edges are summed up. They take some 2 to 10 MB, at most the megabytes that are
-    given (True: 256); where these would be too small, none are built, and `describe` of a prepared
-    field says so. Building takes as long as tracing some 200,000 to 600,000 camera rays without
-    cells, for each precision, at the first trace. Circles have no cells, and cost what they cost.
-    Values and derivatives at points are those of all edges.
+    cells: for many rays and curves of many vertices: cells in which the near edges count one by one
+    and all others as one polynomial, with a proved remainder, so that an evaluation for tracing
+    costs about the same whatever the number of edges; where the remainder decides, all edges are
+    summed up. None builds them where they pay (`for_rays`), True always, False never. They take
+    some 2 to 10 MB, at most the megabytes that are given (True: 256); where these would be too
+    small, none are built, and `describe` of a prepared field says so. Building takes as long as
+    tracing some 200,000 to 600,000 camera rays without cells, for each precision, at the first
+    trace. Circles have no cells, and cost what they cost. Values and derivatives at points are
+    those of all edges.
 
     Raises CurveError for loops that are not closed curves, ValueError for "convex" where the
     hypothesis fails, and for cells if a loop is a Dr.Jit array, as its vertices may move.
@@ -130,7 +135,7 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
         loops: Any,
         *,
         certificate: CertificateName = "auto",
-        cells: bool | float = False,
+        cells: bool | float | None = None,
     ) -> None:
         super().__init__()
         self.loops: Loops
@@ -152,8 +157,10 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
         self._center = 0.5 * (points.min(axis=0) + points.max(axis=0))
         self._size = float(np.linalg.norm(points - self._center, axis=1).max())
         self._extents: Remembered[tuple[float, ...], Volume | None] = Remembered()
-        if not 0 <= cells < math.inf:
-            raise ValueError(f"cells must be True, False or a number of megabytes, not {cells}")
+        if cells is not None and not 0 <= cells < math.inf:
+            raise ValueError(
+                f"cells must be True, False, a number of megabytes or None, not {cells}"
+            )
         if cells and self._movable:
             raise ValueError(
                 "cells are of curves that stay as they are, and a loop is a Dr.Jit array: give "
@@ -162,6 +169,7 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
         self.cells = cells
         self.has_detail = bool(cells) and bool(self._net)
         self._detail: Real = 1.0
+        self._with_cells: Remembered[int, Self] = Remembered()
 
     @property
     def _is_empty(self) -> bool:
@@ -235,7 +243,7 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
         value_rounding = 16 * backend.epsilon if edges is None else edges.rounding(records)
         cells = None
         if self.has_detail and traced:
-            megabytes = _MEGABYTES if self.cells is True else float(self.cells)
+            megabytes = _MEGABYTES if self.cells is True else float(self.cells or 0)
             low, high = self._box(center)
             cells = build_curve_cells(backend, unit, low, high, int(1e6 * megabytes))
         return _CurveBuffers(
@@ -503,6 +511,24 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
         vertices = sum(map(len, self._net)) + 3 * len(self._net_circles)
         return tight_extent(proved, levels, lower, upper, max(8, _MOST_PAIRS // vertices))
 
+    def for_rays(self, count: int) -> Self:
+        """With cells, if none were asked for and none refused, where rays and edges are many."""
+        if self.cells is not None or not self._least_rays() <= count:
+            return self
+        key = id(self.loops)  # which the copy holds
+        if key not in self._with_cells:
+            other = copy.copy(self)
+            other.cells, other.has_detail, other._device = True, True, None
+            other._extents, other._with_cells = Remembered(), Remembered()
+            self._with_cells[key] = other
+        return self._with_cells[key]
+
+    def _least_rays(self) -> float:
+        """The number of rays from which on cells pay."""
+        edges = sum(map(len, self._net))
+        is_fixed = not self._movable and self._asked != "paper"
+        return _PAYS / edges if is_fixed and edges >= _LEAST_EDGES else math.inf
+
     def describe(self) -> dict[str, Any]:
         return {
             "loops": len(self.loops) + len(self.circles),
@@ -515,7 +541,9 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
         }
 
     def _cells_built(self) -> dict[str, Any]:
-        """For `describe`: the number and memory of cells."""
+        """For `describe`: the number and memory of cells, or from how many rays there are any."""
+        if self.cells is None and self._least_rays() < math.inf:
+            return {"cells": f"from {math.ceil(self._least_rays()):,} rays on"}
         if self._device is None or not self.has_detail:
             return {}
         if (found := self._device.cells) is None:
