@@ -42,7 +42,7 @@ def curve_cells() -> str:
 
 
 def _row(n: int) -> str:
-    plain, built = hk.SolidAngle(shapes.wavy_polygon(n)), 0.0
+    plain, built = hk.SolidAngle(shapes.wavy_polygon(n), cells=False), 0.0
     backend = choose_backend("single")
     for _ in range(2):  # the first time compiles kernels
         field = hk.SolidAngle(shapes.wavy_polygon(n), cells=True)
