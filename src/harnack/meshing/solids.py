@@ -40,6 +40,7 @@ from harnack.meshing.closed_mesh import (
     surface_of,
     volume_manifold,
 )
+from harnack.meshing.common_parts import common_parts_taken_out
 from harnack.meshing.lattice import Lattice
 from harnack.meshing.lattice_surface import (
     MissedError,
@@ -132,6 +133,9 @@ class RegionMesher:
         from manifold3d import Manifold, OpType
 
         if isinstance(solid, Combined):
+            apart = common_parts_taken_out(solid, level) if solid.is_union else None
+            if apart is not None:
+                return self.below(apart, 0.0)
             parts = [self._part(solid, k, level) for k in range(len(solid.parts))]
             how = OpType.Add if solid.is_union else OpType.Intersect
             return Manifold.batch_boolean(parts, how)
