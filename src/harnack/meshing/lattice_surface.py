@@ -16,14 +16,13 @@ import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
 from harnack.meshing.checks import MeshingError, TooLargeError, singular_vertices
-from harnack.meshing.edges import IntArray, lengths, numbered
+from harnack.meshing.edges import IntArray, distinct, lengths, numbered
 from harnack.meshing.isotopy import Isotopy, isotopy_of
 from harnack.meshing.lattice import Lattice, distinct_rows
 from harnack.meshing.marching_tetrahedra import (
     BEYOND,
     Tetrahedra,
     crossings_of,
-    is_cut,
     triangles_of,
 )
 from harnack.meshing.points import Boundary, PointSet, newton
@@ -225,7 +224,8 @@ def open_surface(
     check_size(function, vertices, faces, tolerance)
     none = Boundary(np.zeros((0, 3)), np.zeros((0, 2), np.int64))
     size = float(lattice.size.max())
-    isotopy = isotopy_of(function, first.points, corners, first.is_cut, faces, none, size, walls)
+    cut = first.is_cut(corners)
+    isotopy = isotopy_of(function, first.points, corners, cut, faces, none, size, walls)
     vertices = smoothed(function, vertices, faces, walls)
     vertices, faces = refined(function, vertices, faces, tolerance, walls, report)
     vertices = smoothed_within(function, vertices, faces, walls, tolerance)
@@ -428,19 +428,27 @@ def _sampled(function: LevelFunction, points: FloatArray) -> Samples:
 
 @dataclass(frozen=True)
 class _First:
-    """Vertices and faces before they are refined, the points of the tetrahedra, those near the
-    level moved onto it, and which tetrahedra (m,) hold points of the faces; crossed: (k, 2) points
-    at the ends of the edges on which the other vertices lie."""
+    """Vertices and faces before they are refined, and the points of the tetrahedra, those near the
+    level moved onto it; rows: (k,) the tetrahedra that the level may pass through between points,
+    and crossed: (k,) whether it does; ends: (j, 2) points at the ends of the edges on which the
+    other vertices lie."""
 
     vertices: FloatArray
     faces: IntArray
     points: PointSet
-    is_cut: BoolArray
-    crossed: IntArray
+    rows: IntArray
+    crossed: BoolArray
+    ends: IntArray
+
+    def is_cut(self, corners: IntArray) -> BoolArray:
+        """(m,) which of all tetrahedra, by their corners (m, 4), hold points of the faces."""
+        cut: BoolArray = np.asarray(self.points.is_on[corners].any(axis=1))
+        cut[self.rows] |= self.crossed
+        return cut
 
     def is_beside(self, chosen: BoolArray) -> BoolArray:
         """Whether each vertex is one of the chosen points, or on an edge that ends there."""
-        return np.concatenate([chosen, chosen[self.crossed].any(axis=1)])
+        return np.concatenate([chosen, chosen[self.ends].any(axis=1)])
 
 
 def _marched(
@@ -460,12 +468,14 @@ def _marched(
     at_rest, original = points, samples
     points, samples, is_on = _snapped(function, points, samples, is_fixed, lattice, walls)
     is_on |= is_wall
-    wrong, beside, is_asked = np.zeros(0, np.int64), corners, np.ones(len(points), np.bool_)
+    wrong, is_asked = np.zeros(0, np.int64), np.ones(len(points), np.bool_)
+    asked, found = np.arange(len(corners)), np.zeros(0, np.int64)
     for _ in range(_MOST_ROUNDS):
-        # Where vertices lie on edges does not matter for what touches.
-        _, tets = _cut_tetrahedra(points, samples.value, is_on, beside)
-        some = PointSet(points, is_on, samples)
+        rows = asked[_may_be_cut(samples.value, is_on, corners[asked])]
+        found = np.concatenate([found, rows])
+        some, tets = PointSet(points, is_on, samples), Tetrahedra.of(points, corners[rows])
         crossings = crossings_of(function, some, tets)
+        # Where vertices lie on edges does not matter for what touches.
         _, faces = triangles_of(function, some, tets, crossings, _middles)
         wrong = singular_vertices(faces)
         wrong = wrong[wrong < len(points)]
@@ -479,18 +489,20 @@ def _marched(
         near, is_asked = np.zeros(len(points), np.bool_), np.zeros(len(points), np.bool_)
         near[wrong] = True
         is_asked[corners[near[corners].any(axis=1)]] = True
-        beside = corners[is_asked[corners].any(axis=1)]
+        asked = np.flatnonzero(is_asked[corners].any(axis=1))
     else:
         raise MeshingError(
             f"sheets of the level set touch at {len(wrong)} places: choose a smaller `spacing`"
         )
-    rows, tets = _cut_tetrahedra(points, samples.value, is_on, corners)
-    some = PointSet(points, is_on, samples)
+    # Others have the same points as before.
+    rows = distinct(found)
+    rows = rows[_may_be_cut(samples.value, is_on, corners[rows])]
+    some, tets = PointSet(points, is_on, samples), Tetrahedra.of(points, corners[rows])
     crossings = crossings_of(function, some, tets)
     vertices, faces = triangles_of(function, some, tets, crossings)
-    cut: BoolArray = np.asarray(is_on[corners].any(axis=1))
-    cut[rows] |= is_cut(some, tets, crossings)
-    return _First(vertices, faces, some, cut, tets.ends[np.flatnonzero(crossings.count)])
+    crossed: BoolArray = np.asarray((crossings.count[tets.edges] != 0).any(axis=1))
+    ends = tets.ends[np.flatnonzero(crossings.count)]
+    return _First(vertices, faces, some, rows, crossed, ends)
 
 
 def _middles(low: FloatArray, high: FloatArray) -> FloatArray:
@@ -522,12 +534,9 @@ def _snapped(
     return points, samples.replaced(rows, there.some(good)), is_on
 
 
-def _cut_tetrahedra(
-    points: FloatArray, value: FloatArray, is_on: BoolArray, corners: IntArray
-) -> tuple[IntArray, Tetrahedra]:
-    """Those tetrahedra that the level may cut, by their rows, with their edges numbered."""
+def _may_be_cut(value: FloatArray, is_on: BoolArray, corners: IntArray) -> BoolArray:
+    """(m,) whether the level may pass through tetrahedra (m, 4)."""
     on = is_on[corners]
-    up = (value[corners] > 0) & ~on
+    up = (value > 0)[corners] & ~on
     down = ~up & ~on
-    rows = np.flatnonzero((up.any(axis=1) & down.any(axis=1)) | (on.sum(axis=1) >= 3))
-    return rows, Tetrahedra.of(points, corners[rows])
+    return (up.any(axis=1) & down.any(axis=1)) | (on.sum(axis=1) >= 3)

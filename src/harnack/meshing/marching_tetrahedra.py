@@ -388,20 +388,19 @@ def _faces_on_the_level(
     if not len(face):
         return np.zeros((0, 3), np.int64), np.zeros((0, 3))
     middle = _mean(points.points, face)
-    sides = [_beside(points, tets, row) for row in (one, other)]
-    value = [function.values(side) for side in sides]
+    (before, low), (behind, high) = (_beside(function, points, tets, row) for row in (one, other))
     if function.period is None:
-        count = (value[1] > 0).astype(np.int64) - (value[0] > 0)
+        count = (high > 0).astype(np.int64) - (low > 0)
     else:
         period = function.period
         there = function.values(middle)
         change = sum(
             sign * _integrated(function.field, side, middle, _wrap(there - start, period), period)
-            for sign, side, start in zip((1, -1), sides, value, strict=True)
+            for sign, side, start in ((1, before, low), (-1, behind, high))
         )
-        level = [np.remainder(one_value, period) for one_value in value]
-        count = np.round((level[0] + change - level[1]) / period).astype(np.int64)
-    rise = (sides[1] - sides[0]) * np.sign(count)[:, None]
+        rest = np.remainder(low, period) + change - np.remainder(high, period)
+        count = np.round(rest / period).astype(np.int64)
+    rise = (behind - before) * np.sign(count)[:, None]
     return face[count != 0], rise[count != 0]
 
 
@@ -409,9 +408,14 @@ def _wrap(change: FloatArray, period: float) -> FloatArray:
     return change - period * np.round(change / period)
 
 
-def _beside(points: PointSet, tets: Tetrahedra, rows: IntArray) -> FloatArray:
+def _beside(
+    function: LevelFunction, points: PointSet, tets: Tetrahedra, rows: IntArray
+) -> tuple[FloatArray, FloatArray]:
+    """Points (n, 3) on one side of faces, and the function there."""
     corners = tets.corners[rows[:, 3]]
     apex = corners[np.arange(len(rows)), rows[:, 4]]
-    center = points.points[corners].mean(axis=1)
-    is_on: BoolArray = points.is_on[apex]
-    return np.where(is_on[:, None], center, points.points[apex])
+    place, value = points.points[apex], points.samples.value[apex]
+    is_on = np.flatnonzero(points.is_on[apex])
+    place[is_on] = points.points[corners[is_on]].mean(axis=1)
+    value[is_on] = function.values(place[is_on])
+    return place, value

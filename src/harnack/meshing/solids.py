@@ -130,15 +130,13 @@ class RegionMesher:
         Raises:
             MeshingError: a part cannot be meshed.
         """
-        from manifold3d import Manifold, OpType
+        from manifold3d import Manifold
 
         if isinstance(solid, Combined):
             apart = common_parts_taken_out(solid, level) if solid.is_union else None
             if apart is not None:
                 return self.below(apart, 0.0)
-            parts = [self._part(solid, k, level) for k in range(len(solid.parts))]
-            how = OpType.Add if solid.is_union else OpType.Intersect
-            return Manifold.batch_boolean(parts, how)
+            return self._joined(solid, level)
         if isinstance(solid, Complement):  # -f <= c where f >= -c
             return self._space() - self.below(solid.inner, -level)
         if isinstance(solid, Offset):
@@ -168,14 +166,30 @@ class RegionMesher:
             return self._space().trim_by_plane((-x, -y, -z), -(solid.distance + level))
         return manifold_of(self.smooth(solid, level)[0])
 
+    def _joined(self, solid: Combined, level: float) -> Manifold:
+        """A union; or an intersection, from which complements are cut away."""
+        from manifold3d import Manifold, OpType
+
+        numbers = range(len(solid.parts))
+        if solid.is_union:
+            return Manifold.batch_boolean(
+                [self._part(solid, k, level) for k in numbers], OpType.Add
+            )
+        cut = [k for k in numbers if isinstance(solid.parts[k], Complement)]
+        kept = [self._part(solid, k, level) for k in numbers if k not in cut]
+        whole = Manifold.batch_boolean(kept, OpType.Intersect) if kept else self._space()
+        away = [self._part(solid, k, level) for k in cut]
+        return Manifold.batch_boolean([whole, *away], OpType.Subtract)
+
     def _part(self, solid: Combined, number: int, level: float) -> Manifold:
         """One part of a union or an intersection, made where the others of an intersection may
-        leave something of it (`Others`)."""
+        leave something of it (`Others`); of a complement in an intersection what is cut away."""
         kept, part = self.others, solid.parts[number]
         if not solid.is_union:
             beside = [one for one in solid.parts if one is not part]
             if isinstance(part, Complement):
                 self.others = tuple((one, level) for one in beside if _is_exact(one))
+                part, level = part.inner, -level
             else:
                 self.others = (*kept, *((one, level) for one in beside))
         try:
