@@ -100,7 +100,8 @@ it is a part of the truth: again the intersection is the truth."""
 class RegionMesher:
     """Meshes solids in a box from `lower` to `upper`, (3,) each.
 
-    tolerance: a length, of the middles of edges and faces. spacing: of cells, at most.
+    tolerance: a length, of the middles of edges and faces; smooth_tolerance: of those of level sets
+        that are smooth. spacing: of cells, at most.
     per_wave: cells along a wave (`Field.wavelength`) at the least; None for as many as there are.
     mesh_angle: meshes level sets of angles, which end at a curve. most_faces: of each level set.
     evaluations, levels, finest: of fields, in points, how many level sets were meshed so far, and
@@ -112,6 +113,7 @@ class RegionMesher:
     lower: FloatArray
     upper: FloatArray
     tolerance: float
+    smooth_tolerance: float
     spacing: float
     per_wave: float | None
     mesh_angle: AngleMesher
@@ -235,7 +237,11 @@ class RegionMesher:
         self.report(f"level {level:g} of {type(field).__name__} in cells of {spacing:.3g}")
         lattice = Lattice.filling(lower, upper, spacing, layers=2)
         made = closed_surface(
-            function, lattice, self.tolerance, self.report, elsewhere=self._elsewhere(lattice)
+            function,
+            lattice,
+            self.smooth_tolerance,
+            self.report,
+            elsewhere=self._elsewhere(lattice),
         )
         self.evaluations += function.evaluations
         self.levels += 1
@@ -283,10 +289,10 @@ class RegionMesher:
         near = samples.distance <= np.median(samples.distance)
         steep = float(np.median(np.linalg.norm(samples.gradient[near], axis=1)))
         self.evaluations += len(points)
-        if high - low < 2 * self.tolerance * steep:
+        if high - low < 2 * self.smooth_tolerance * steep:
             raise MeshingError(
-                f"the wall is about {(high - low) / steep:.2g} thick, and its sides are made "
-                f"within {self.tolerance:.2g}: choose a smaller `tolerance`, or a thicker wall"
+                f"the wall is about {(high - low) / steep:.2g} thick, and its sides are made within "
+                f"{self.smooth_tolerance:.2g}: choose a smaller `tolerance`, or a thicker wall"
             )
 
     def _lens(self, field: SolidAngle, low: float, high: float) -> Surface:
@@ -342,8 +348,8 @@ class RegionMesher:
         scale = float(np.linalg.norm(matrix, 2))
         local = dataclasses.replace(
             self, lower=own.min(axis=0), upper=own.max(axis=0), tolerance=self.tolerance / scale,
-            spacing=self.spacing / scale, evaluations=0, levels=0,
-            finest=math.inf, others=(),
+            smooth_tolerance=self.smooth_tolerance / scale, spacing=self.spacing / scale,
+            evaluations=0, levels=0, finest=math.inf, others=(),
         )  # fmt: skip
         made = local.below(solid.inner, level / solid.map.factor)
         self.evaluations += local.evaluations
@@ -507,6 +513,7 @@ def mesh_solid(
     level: float,
     volume: Volume | None,
     tolerance: float,
+    part: float,
     spacing: float | None,
     angle_mesher: Callable[[float, float], AngleMesher],
     most_faces: int,
@@ -515,7 +522,8 @@ def mesh_solid(
 ) -> SolidMesh:
     """The boundary of the points of a volume where a solid's function is at most `level`.
 
-    volume: None for all of space. tolerance: a part of the size. most_faces: of a level set.
+    volume: None for all of space. tolerance: a part of the size; part: of the tolerance, what
+        smooth level sets take up. most_faces: of a level set.
     angle_mesher: given a tolerance and a spacing, both lengths, how to mesh level sets of angles.
     check: of the surface, of which no triangles pass through each other, given the size; where it
         fails in known places, smaller cells are tried, and half the tolerance: beside a thin part
@@ -533,8 +541,8 @@ def mesh_solid(
     uploads, first = Uploads(), None
     while True:
         mesher = RegionMesher(
-            lower, upper, error, cells, per_wave, angle_mesher(error, cells), most_faces, report,
-            uploads=uploads,
+            lower, upper, error, 2 * part * error, cells, per_wave, angle_mesher(error, cells),
+            most_faces, report, uploads=uploads,
         )  # fmt: skip
         try:
             made = _apart(_put_together(mesher, solid, level, volume), error)
