@@ -291,8 +291,9 @@ class RegionMesher:
         self.evaluations += len(points)
         if high - low < 2 * self.smooth_tolerance * steep:
             raise MeshingError(
-                f"the wall is about {(high - low) / steep:.2g} thick, and its sides are made within "
-                f"{self.smooth_tolerance:.2g}: choose a smaller `tolerance`, or a thicker wall"
+                f"the wall is about {(high - low) / steep:.2g} thick, and its sides are made "
+                f"within {self.smooth_tolerance:.2g}: choose a smaller `tolerance`, or make the "
+                "wall thicker"
             )
 
     def _lens(self, field: SolidAngle, low: float, high: float) -> Surface:
