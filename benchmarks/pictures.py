@@ -31,7 +31,9 @@ def pictures() -> str:
     material = material_of("two-tone")
 
     def staged(fields: list[hk.Field]) -> Any:
-        objects = [StudioObject(hk.level_set(one), material, fitted=True) for one in fields]
+        rays = 3 * _SIZE[0] * _SIZE[1] * _SPP  # as `render` counts them
+        surfaces = (hk.level_set(one).for_rays(rays) for one in fields)
+        objects = [StudioObject(one, material, fitted=True) for one in surfaces]
         return studio(mi, objects, size=_SIZE, camera=Camera())
 
     one, three = staged([_field()]), staged([_field(x) for x in (-2.2, 0.0, 2.2)])
