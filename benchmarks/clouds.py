@@ -126,7 +126,7 @@ def _diagonal(whole: Arrays) -> float:
 
 def _ours(points: FloatArray, normals: FloatArray | None, length: float) -> tuple[Any, Any]:
     given = "estimate" if normals is None else normals
-    made = hk.mesh(hk.DipolePotential(points, given, smoothing=length))
+    made = hk.mesh(hk.DipolePotential(points, given, smoothing="auto"))
     return made.vertices, made.faces
 
 

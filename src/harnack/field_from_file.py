@@ -60,7 +60,7 @@ def open_surface(
     as_: ReadAs | None = None,
     boundary: bool = False,
     normals: Literal["estimate"] | None = None,
-    smoothing: float | None = None,
+    smoothing: float | Literal["auto"] | None = None,
     up: Axis | None = None,
 ) -> OpenedSurface:
     """The field of a surface file: of a mesh a `WindingNumber`, of a cloud with normals a
@@ -69,8 +69,8 @@ def open_surface(
 
     as_: "winding", "dipole", "loops" or "polygons" instead of what `read_surface` decides.
     boundary: the curves that bound the faces. normals: "estimate" finds those of a point cloud,
-    and replaces those of the file. smoothing: for clouds with noise, a length in the file's unit,
-    as for `DipolePotential`. up: the file's axis that turns to z, by default y for glTF,
+    and replaces those of the file. smoothing: for clouds with noise, a length in the file's unit
+    or "auto", as for `DipolePotential`. up: the file's axis that turns to z, by default y for glTF,
     whose standard says so, and for meshes and clouds of .obj files, most of which have it so;
     else z.
 
@@ -124,7 +124,12 @@ def _read(path: Path, as_: ReadAs | None, boundary: bool) -> Surface:
     return read_surface(path, "loops" if boundary else as_)
 
 
-def _field(surface: Surface, normals: str | None, smoothing: float, rotation: FloatArray) -> Field:
+def _field(
+    surface: Surface,
+    normals: str | None,
+    smoothing: float | Literal["auto"],
+    rotation: FloatArray,
+) -> Field:
     if isinstance(surface, Mesh):
         return WindingNumber(surface.vertices @ rotation.T, surface.faces)
     if isinstance(surface, ClosedCurves):

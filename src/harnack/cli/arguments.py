@@ -224,9 +224,9 @@ def _add_file(one: Any) -> Any:
     )
     _add_choice(file, "--normals", ("estimate",), "estimate the normals of a point cloud")
     file.add_argument(
-        "--smoothing", type=_positive, metavar="LENGTH",
-        help="even out the noise of a point cloud over such lengths, in its own unit: about "
-        "1.4 sqrt(noise * distance between points)",
+        "--smoothing", type=_smoothing, metavar="LENGTH",
+        help="even out the noise of a point cloud over such lengths, in its own unit, or auto: "
+        "by the noise that is found, with points moved and far ones left out",
     )  # fmt: skip
     return file
 
@@ -507,6 +507,10 @@ def _positive(text: str) -> float:
     if not 0 < number < math.inf:
         raise argparse.ArgumentTypeError(f"{_shown(text)} must be a positive number")
     return number
+
+
+def _smoothing(text: str) -> float | str:
+    return text if text == "auto" else _positive(text)
 
 
 def _port(text: str) -> int:

@@ -312,15 +312,19 @@ def _refuse_file_options(options: Any) -> None:
             raise ValueError(f"{name} is for surface files ({', '.join(SURFACE_FILES)}) only")
 
 
+def _described(field: Field) -> str:
+    facts = ", ".join(f"{key}: {value}" for key, value in field.describe().items())
+    return f"{type(field).__name__}: {facts}"
+
+
 def _of_file(source: Path, options: Any, settings: dict[str, Any]) -> _Drawn:
     up = settings.pop("up", None)
     opened = open_surface(
         source, as_=options.as_, boundary=options.boundary, normals=options.normals,
         smoothing=options.smoothing, up=up,
     )  # fmt: skip
-    facts = ", ".join(f"{key}: {value}" for key, value in opened.field.describe().items())
     _say(f"{source}: {in_options(opened.said)}")
-    _say(f"{type(opened.field).__name__}: {facts}")
+    _say(_described(opened.field))
     if options.show is None and opened.show != "color":
         settings["show"] = opened.show
         _say(f"drawn {opened.show}; --show color follows light paths, in minutes")
@@ -408,6 +412,8 @@ def _meshed(options: Any, source: Path) -> tuple[Field, dict[str, Any]]:
             smoothing=options.smoothing, up=options.up,
         )  # fmt: skip
         _say(f"{source}: {in_options(opened.said)}")
+        if options.smoothing == "auto":
+            _say(_described(opened.field))
         return opened.field, {}
     is_saved = _is_saved(source)
     scene = read_scene(source) if is_saved else None

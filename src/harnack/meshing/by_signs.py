@@ -47,7 +47,7 @@ from harnack.meshing.refinement import split_faces
 from harnack.meshing.samples import Samples
 from harnack.meshing.sign_function import SignFunction
 
-__all__ = ["MOST_FAR", "SignSurface", "sign_surface", "signed_surface"]
+__all__ = ["MOST_FAR", "SMALLER", "SignSurface", "sign_surface", "signed_surface"]
 
 # Vertices keep this part of an edge from its ends, so that all triangles have an area.
 _FROM_ENDS = 1e-4
@@ -73,7 +73,7 @@ _BEFORE, _BEHIND, _BESIDE = 0.3, 1.3, 1.0
 # the determinant of their normals is larger than the last.
 _PARALLEL, _INDEPENDENT = 1e-4, 0.1
 # So large a part of vertices and centers may be beyond the tolerance before cells are made smaller.
-MOST_FAR, _SMALLER = 0.01, 0.6
+MOST_FAR, SMALLER = 0.01, 0.6
 # What is farther from the level than this many cells is nowhere near.
 _NOWHERE = 4.0
 # At the corners and centers of so many triangles distances are measured.
@@ -124,7 +124,7 @@ def signed_surface(
         if attempts <= 0 or far <= MOST_FAR * count or len(made.surface.faces) > _MOST_REMADE:
             break
         report(f"{far:,} of {count:,} vertices and centers are beyond the tolerance")
-        spacing *= _SMALLER
+        spacing *= SMALLER
     facts = {
         "made_by": "signs",
         "spacing": spacing,

@@ -11,10 +11,11 @@ import numpy as np
 
 from harnack.fields import Field, Solid
 from harnack.fields.field import check_is_field
+from harnack.fields.solid_angles.dipole import DipolePotential
 from harnack.fields.solid_angles.solid_angle import SolidAngle
 from harnack.geometry import Box, Intersection, Volume
 from harnack.geometry.volume import check_volume
-from harnack.meshing.by_signs import MOST_FAR, signed_surface
+from harnack.meshing.by_signs import MOST_FAR, SMALLER, signed_surface
 from harnack.meshing.checks import (
     MeshingError,
     TooLargeError,
@@ -29,7 +30,7 @@ from harnack.meshing.finishing import check_options, finished, normals_of, simpl
 from harnack.meshing.lattice import Lattice
 from harnack.meshing.lattice_surface import Surface, open_surface
 from harnack.meshing.samples import CELLS_PER_WAVE, MOST_FACES, LevelFunction
-from harnack.meshing.sign_function import SignFunction, is_meshed_by_signs
+from harnack.meshing.sign_function import SignFunction, has_details, is_meshed_by_signs
 from harnack.meshing.solids import AngleMesher, ends_of_solid, mesh_solid, region_of
 from harnack.meshing.spanned import spanned_surface
 from harnack.tracer import LevelSet
@@ -139,7 +140,9 @@ def mesh(
         far, looked_at, within: how many vertices and centers of triangles are beyond the tolerance,
             of how many, and a distance within which all are, sampled up to a factor of 2;
         undecided: at how many points of the lattice the error of f leaves its sign open;
-        flat: how many triangles were not fitted to creases, as they would pass through others.
+        flat: how many triangles were not fitted to creases, as they would pass through others;
+        cloud: of a `DipolePotential`, what it says of itself (`describe`), such as how many points
+            it has, what was estimated, and the smoothing and noise that were chosen and found.
 
         Solids and thick surfaces have more: see `docs/printing.md`.
 
@@ -262,8 +265,11 @@ def _by_signs(
     levels = tuple(one for one in ends if math.isfinite(one))
     volume, box = asked.volume, _box(field, levels, asked.volume)
     size = float((box.upper - box.lower).max())
-    cells = size / _ACROSS_BY_SIGNS if asked.spacing is None else float(asked.spacing)
-    attempts = _ATTEMPTS_BY_SIGNS if asked.spacing is None else 1
+    cells, attempts = size / _ACROSS_BY_SIGNS, _ATTEMPTS_BY_SIGNS
+    if asked.spacing is not None:
+        cells, attempts = float(asked.spacing), 1
+    elif has_details(field, cells):  # at once what would be tried next
+        cells, attempts = SMALLER * cells, attempts - 1
     # Where nothing ends at the box, its cells should not lie along what is symmetrical.
     room = np.zeros(3) if box.has_walls else size * np.array([0.0037, 0.0053, 0.0029])
     filled = box.lower - room, box.upper + 0.5 * room
@@ -303,6 +309,8 @@ def _by_signs(
     if not len(made.faces):
         raise MeshingError("the level set is empty: it lies outside of the clip")
     known = {"level": levels[0], **_of_both(facts)}
+    if isinstance(field, DipolePotential):
+        known["cloud"] = field.describe()
     _judge_signs(field, known, asked.tolerance * size)
     return _Made(made, size, known, function(levels[0], 1.0), _nothing, False)
 

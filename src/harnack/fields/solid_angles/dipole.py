@@ -29,6 +29,7 @@ from harnack.fields.solid_angles.far_clusters import (
     hierarchy_of,
     in_slots,
 )
+from harnack.fields.solid_angles.fitted_cloud import FittedCloud
 from harnack.fields.solid_angles.multipole import all_levels
 from harnack.fields.solid_angles.near_far import NearFarCells, build_cells
 from harnack.fields.solid_angles.smoothed import SmoothedSum
@@ -214,6 +215,14 @@ class DipolePotential(DetailedField["_DipoleBuffers"], BatchedField):
     vanish. h = 1.4 sqrt(noise * spacing) was good on two meshes, with the standard
     deviation of the noise along an axis and the distance between neighboring points.
 
+    smoothing="auto": for points with noise that is not known. The sum is then not that of the
+    points given: those far from all others are left out, with a warning; the others are moved along
+    their normals to where their neighbors say that the surface is (`geometry.denoising`), a part of
+    them if noise is larger than the spacing; and their sum is smoothed over their spacing, or less.
+    Normals that are estimated are corrected by the sum and by the moved points. `points`,
+    `normals`, `areas` and `smoothing` are those of the sum, and `describe` has the noise that was
+    found, and how many points were given and left out.
+
     points: (n, 3).
     normals: (n, 3), outward, of any length; or "estimate", from neighbors, oriented along a
         spanning tree (`geometry.estimate_normals`).
@@ -246,7 +255,7 @@ class DipolePotential(DetailedField["_DipoleBuffers"], BatchedField):
         normals: Any | Literal["estimate"] = None,
         areas: Any = None,
         *,
-        smoothing: float = 0.0,
+        smoothing: float | Literal["auto"] = 0.0,
         accuracy: float | None = None,
         cells: bool | float | None = None,
     ) -> None:
@@ -259,9 +268,12 @@ class DipolePotential(DetailedField["_DipoleBuffers"], BatchedField):
         if accuracy is not None and not 1.5 <= accuracy <= 100:
             raise ValueError(f"accuracy must lie between 1.5 and 100, not {accuracy}")
         self.estimated = [isinstance(normals, str), areas is None]
+        if isinstance(normals, str) and normals != "estimate":
+            raise CloudError(f'normals must be (n, 3) or "estimate", not {normals!r}')
+        self.fitted: dict[str, Any] = {}
+        if isinstance(smoothing, str):
+            points, normals, smoothing = self._fitted(points, normals, areas, smoothing)
         if isinstance(normals, str):
-            if normals != "estimate":
-                raise CloudError(f'normals must be (n, 3) or "estimate", not {normals!r}')
             normals = estimate_normals(points)
         some = np.ones(len(points)) if areas is None else areas
         self.points, self.normals, self.areas = validate_cloud(points, normals, some)
@@ -284,6 +296,27 @@ class DipolePotential(DetailedField["_DipoleBuffers"], BatchedField):
             raise ValueError("cells are of sums without smoothing: give one of the two")
         if self.smoothing:
             self.default_level = self._level_at_points()
+
+    def _fitted(
+        self, points: Any, normals: Any, areas: Any, smoothing: str
+    ) -> tuple[FloatArray, FloatArray, float]:
+        """Points, normals and the length of `smoothing="auto"`; `fitted` says what was found."""
+        if smoothing != "auto":
+            raise ValueError(f'smoothing must be a length or "auto", not {smoothing!r}')
+        if areas is not None:
+            raise CloudError(
+                'with smoothing="auto" points are moved, and their areas are estimated: leave out '
+                "the areas, or give a length"
+            )
+
+        def gradients(x: FloatArray, n: FloatArray, areas: FloatArray, length: float) -> FloatArray:
+            field = DipolePotential(x, n, areas, smoothing=length)
+            return np.asarray(field.gradient(x, precision="single"), np.float64)
+
+        given = None if isinstance(normals, str) else normals
+        found = FittedCloud.of(points, given, gradients)
+        self.fitted = found.facts
+        return found.points, found.normals, found.smoothing
 
     def _level_at_points(self) -> float:
         """The median of the smoothed sum at (some of) the points."""
@@ -407,7 +440,7 @@ class DipolePotential(DetailedField["_DipoleBuffers"], BatchedField):
     def describe(self) -> dict[str, Any]:
         said = ("estimated" if one else "given" for one in self.estimated)
         named = dict(zip(("normals", "areas"), said, strict=True))
-        about = {"points": len(self.points), **named, **self._cells_built()}
+        about = {"points": len(self.points), **named, **self.fitted, **self._cells_built()}
         if self.smoothing:
             about |= {"smoothing": self.smoothing, "level": self.default_level}
         return about

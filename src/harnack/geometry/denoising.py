@@ -1,0 +1,266 @@
+"""Clouds with noise: how much of it there is, and points moved to where the surface is.
+
+A point of a cloud with noise lies off the surface by some distance, with a standard deviation that
+`noise_of` estimates. `Denoising` moves points along their normals to where their neighbors say that
+the surface is, so that sums over them need less smoothing, and edges stay sharper.
+
+A neighbor j, at p_j with the normal n_j, says that the surface at x is
+
+    t_j = (n + n_j)/2 . (p_j - x)
+
+farther along the normal n of x. On a sphere, and to second order on every surface, t_j is 0 at a
+point of the surface, however far the neighbor is: the plane of j lies as far outside of the surface
+as j itself is inside of the plane of x. So the mean of t_j does not shrink what is curved, as the
+mean of the positions would. Neighbors count by distance and by the angle between n and n_j, so that
+what lies around an edge or on the other side of a wall does not count.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from harnack.backend.numbers import FloatArray, IntArray
+from harnack.geometry.clouds import Indices, in_parts, nearest_others, point_tree
+
+__all__ = ["Denoising", "Noise", "lonely_points", "noise_of"]
+
+# A point is alone if its fourth neighbor is so many times as far as those of its neighbors are.
+_ALONE, _COMPANY = 6.0, 4
+# Noise is measured at so many points, among the first of these counts of neighbors that reaches so
+# many standard deviations; neighbors whose normals turn by more than 60 degrees do not count.
+_PROBES, _COUNTS, _REACH, _LIKE = 1000, (16, 64, 256, 1024), 4.5, 0.5
+# The standard deviation of a normal distribution over the median of absolute values.
+_OVER_MEDIAN = 1.4826
+# So many neighbors are used, times noise over spacing, but at least and at most these: half of them
+# within 3.1 sqrt(noise * spacing), by experiment as a compromise of noise and detail.
+_NEIGHBORS, _FEWEST, _MOST = 62.0, 16, 256
+# Of a cloud in which noise is larger than this times the spacing, a part of the points is moved,
+# with a spacing that is so large; but not less than the last part.
+_COARSEST, _LEAST_PART = 0.8, 0.1
+# Weights of neighbors fall to exp(-3) at the last of them, and to 1/e where normals differ by this
+# chord, given and estimated.
+_FALL, _CHORD, _CHORD_OF_ESTIMATES = 3.0, 0.8, 0.5
+# Normals are estimated anew from moved points so often, each from this many of them. Where only
+# some points are moved, they are moved at first by so many of each other.
+_ROUNDS, _OF_PLANE, _AT_FIRST = 2, 24, 32
+# Of neighbors that face the other way, half of the sum of weights is less than this.
+_AGREED = 0.25
+
+
+@dataclass(frozen=True)
+class Noise:
+    """deviation: the standard deviation of the points from the surface, along its normal; spacing:
+    the root of the area that a point stands for, in the median."""
+
+    deviation: float
+    spacing: float
+
+    @property
+    def neighbors(self) -> int:
+        """How many neighbors show where the surface is."""
+        count = round(_NEIGHBORS * self.deviation / self.spacing)
+        return min(max(count, _FEWEST), _MOST)
+
+    def part(self) -> float:
+        """The part of the points that is worth to be kept, at most 1."""
+        share = _COARSEST * self.spacing / max(self.deviation, 1e-300)
+        return min(max(share, _LEAST_PART), 1.0)
+
+
+def lonely_points(points: FloatArray, tree: Any) -> IntArray:
+    """The indices of points far from all others: the fourth neighbor of each is more than six times
+    as far as those of its neighbors, and of all points, are in the median. tree: of these."""
+    count = min(_COMPANY, len(points) - 1)
+    nearest = np.empty((len(points), count), np.int64)
+    reach = np.empty(len(points))
+
+    def find(part: slice) -> None:
+        distance, index = tree.query(points[part], k=count + 1)
+        nearest[part], reach[part] = index[:, 1:], distance[:, -1]
+
+    in_parts(find, len(points))
+    usual = np.maximum(np.median(reach[nearest], axis=1), np.median(reach))
+    return np.flatnonzero(reach > _ALONE * usual)
+
+
+def noise_of(points: FloatArray, normals: FloatArray | None, tree: Any) -> Noise:
+    """The noise of a cloud, by how far some points lie from where their neighbors say that the
+    surface is; without normals, by how far neighbors lie from their plane: then what is curved
+    counts as noise. tree: of these points."""
+    rng = np.random.default_rng(0)
+    probes = np.sort(rng.choice(len(points), min(len(points), _PROBES), replace=False))
+    noise = Noise(0.0, 1.0)
+    for count in _COUNTS:
+        index, distance = nearest_others(tree, points[probes], count)
+        offsets = points[index] - points[probes, None]
+        if normals is None:
+            deviation = float(np.median(_deviations_from_planes(offsets)))
+        else:
+            away = np.abs(_away_by_normals(offsets, normals[probes], normals[index]))
+            deviation = _OVER_MEDIAN * float(np.median(away)) / math.sqrt(1 + 1 / count)
+        reach = float(np.median(distance[:, -1]))
+        noise = Noise(deviation, reach * math.sqrt(math.pi / index.shape[1]))
+        if reach >= _REACH * deviation or index.shape[1] < count:
+            break
+    return noise
+
+
+def _deviations_from_planes(offsets: FloatArray) -> FloatArray:
+    """Standard deviations (m,) of neighbors, at these offsets (m, k, 3), from their planes."""
+    spread = offsets - offsets.mean(axis=1, keepdims=True)
+    variances = np.linalg.eigvalsh(np.matmul(spread.transpose(0, 2, 1), spread))
+    freedoms = max(offsets.shape[1] - 3, 1)
+    return np.sqrt(np.maximum(variances[:, 0], 0.0) / freedoms)
+
+
+def _least_axes(offsets: FloatArray, weights: FloatArray | None) -> FloatArray:
+    """(m, 3) the directions in which offsets (m, k, 3), weighted (m, k), vary least."""
+    weighted = offsets if weights is None else offsets * weights[:, :, None]
+    _, axes = np.linalg.eigh(np.matmul(weighted.transpose(0, 2, 1), offsets))
+    return axes[:, :, 0]
+
+
+def _away_by_normals(offsets: FloatArray, own: FloatArray, theirs: FloatArray) -> FloatArray:
+    """The mean (m,) of t_j over neighbors with a normal like one's own."""
+    like = np.einsum("mi,mki->mk", own, theirs) > _LIKE
+    said = np.einsum("mki,mki->mk", 0.5 * (own[:, None] + theirs), offsets)
+    return (said * like).sum(axis=1) / np.maximum(like.sum(axis=1), 1)
+
+
+class Denoising:
+    """Points of a cloud, of which some are moved onto the surface by all.
+
+    points: (n, 3), and `tree` of them. noise: theirs.
+    chosen: (m,) indices of the points to be moved; all, unless there is so much noise that a part
+        is as good.
+    """
+
+    def __init__(self, points: FloatArray, noise: Noise, tree: Any | None = None) -> None:
+        self.points, self.noise = points, noise
+        self.tree = point_tree(points) if tree is None else tree
+        self.chosen = np.arange(len(points))
+        if (part := noise.part()) < 1:
+            some = np.random.default_rng(0).choice(
+                len(points), max(4, round(part * len(points))), replace=False
+            )
+            # In the order of the tree, so that neighbors of neighbors are looked up together.
+            place = np.empty(len(points), np.int64)
+            place[self.tree.indices] = self.chosen
+            self.chosen = some[np.argsort(place[some])]
+
+    @property
+    def spacing(self) -> float:
+        """The spacing of the chosen points."""
+        return self.noise.spacing * math.sqrt(len(self.points) / len(self.chosen))
+
+    def moved(self, normals: FloatArray) -> FloatArray:
+        """The chosen points (m, 3), moved along the normals (n, 3) of all points, which are known
+        and stay."""
+        some, own = self.points[self.chosen], normals[self.chosen]
+        if len(some) < len(self.points):
+            some = _moved(
+                some, own, _neighbors(point_tree(some), some, _AT_FIRST), some, own, _CHORD
+            )
+        near = _neighbors(self.tree, some, self.noise.neighbors)
+        return _moved(some, own, near, self.points, normals, _CHORD)
+
+    def moved_and_turned(self, normals: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The chosen points (m, 3), moved, and their normals (m, 3), improved in turn with the
+        points. normals: (m, 3) of these, as they are estimated."""
+        start, chord = self.points[self.chosen], _CHORD_OF_ESTIMATES
+        if len(start) == len(self.points):
+            nearest = self.chosen
+            beside = _neighbors(self.tree, start, _OF_PLANE)
+        else:
+            tree = point_tree(start)
+            nearest = _neighbors(tree, self.points, 1)[:, 0]
+            beside = _neighbors(tree, start, _AT_FIRST)
+            start = _moved(start, normals, beside, start, normals, chord)
+        near = _neighbors(self.tree, start, self.noise.neighbors)
+        moved = _moved(start, normals, near, self.points, normals[nearest], chord)
+        for _ in range(_ROUNDS):
+            normals = _turned(moved, normals, beside, chord)
+            moved = _moved(start, normals, near, self.points, normals[nearest], chord)
+        return moved, normals
+
+
+def _neighbors(tree: Any, points: FloatArray, count: int) -> Indices:
+    """(m, k) the indices of the points of a tree that are nearest to points (m, 3), these included
+    where they are among them."""
+    count = min(count, tree.n)
+    index = np.empty((len(points), count), np.int32)
+
+    def find(part: slice) -> None:
+        index[part] = tree.query(points[part], k=count)[1].reshape(-1, count)
+
+    in_parts(find, len(points))
+    return index
+
+
+def _moved(
+    start: FloatArray,
+    own: FloatArray,
+    near: Indices,
+    points: FloatArray,
+    normals: FloatArray,
+    chord: float,
+) -> FloatArray:
+    """Points (m, 3), moved along their `own` normals (m, 3) to where the mean of t_j is 0.
+
+    near: (m, k) their neighbors among points (n, 3) with normals (n, 3), which count by their
+        distance along the plane of the point: else those on its side of the surface would hold it
+        there.
+    """
+    moved = np.empty_like(start)
+
+    def move(part: slice) -> None:
+        n, index = own[part], near[part]
+        theirs, offsets = normals[index], points[index] - start[part, None]
+        height = np.einsum("mi,mki->mk", n, offsets)
+        square = np.maximum(_squares(offsets) - height * height, 0.0)
+        cosine = np.einsum("mi,mki->mk", n, theirs)
+        weight = _weights(square, cosine, chord)
+        # n_j . (p_j - x) and n . (p_j - x); both are linear where x moves along n.
+        said = 0.5 * (np.einsum("mki,mki->mk", theirs, offsets) + height)
+        slope = 0.5 * (weight * (cosine + 1)).sum(axis=1)
+        # What all neighbors contradict stays.
+        along = np.where(slope > _AGREED, (weight * said).sum(axis=1), 0.0)
+        moved[part] = start[part] + (along / np.maximum(slope, _AGREED))[:, None] * n
+
+    in_parts(move, len(start))
+    return moved
+
+
+def _turned(points: FloatArray, normals: FloatArray, near: Indices, chord: float) -> FloatArray:
+    """Normals (m, 3) of points (m, 3), by the planes of those neighbors (m, k) that have such
+    normals."""
+    turned = np.empty_like(normals)
+
+    def turn(part: slice) -> None:
+        index = near[part]
+        offsets = points[index] - points[part, None]
+        cosine = np.einsum("mi,mki->mk", normals[part], normals[index])
+        weight = _weights(_squares(offsets), cosine, chord)
+        offsets -= np.einsum("mk,mki->mi", weight, offsets)[:, None]
+        line = _least_axes(offsets, weight)
+        back = np.einsum("mi,mi->m", line, normals[part]) < 0
+        turned[part] = np.where(back[:, None], -line, line)
+
+    in_parts(turn, len(points))
+    return turned
+
+
+def _squares(offsets: FloatArray) -> FloatArray:
+    return np.einsum("mki,mki->mk", offsets, offsets)
+
+
+def _weights(square: FloatArray, cosine: FloatArray, chord: float) -> FloatArray:
+    """(m, k) weights of neighbors, whose sum is 1, by squared distances and by cosines between
+    normals."""
+    far = np.maximum(square.max(axis=1, keepdims=True), 1e-300)
+    weight = np.exp(-_FALL * square / far - (2 - 2 * cosine) / chord**2)
+    return weight / weight.sum(axis=1, keepdims=True)
