@@ -39,6 +39,8 @@ MAX_POINTS = 100_000_000
 _CHUNK = 4096
 # A cell is at most so many times as wide as those of its neighbors may be.
 _LONELY = 3.0
+# The neighbors of so many points are kept in memory: 300 MB.
+_MOST_KEPT = 1_000_000
 _REMOVE = "its components must be finite; remove the point"
 
 
@@ -154,12 +156,19 @@ def estimate_areas(
     sharing = np.bincount(where)[where]
     tree = point_tree(x[positions])
     radii, areas = np.empty(len(positions)), np.empty(len(x))
+    # What was found for the radii is kept where points are few and all different.
+    keeps = len(positions) == len(x) <= _MOST_KEPT
+    kept: dict[int, tuple[IntArray, FloatArray]] = {}
 
     def reach(part: slice) -> None:
-        radii[part] = 0.5 * nearest_others(tree, tree.data[part], neighbors)[1][:, -1]
+        found = nearest_others(tree, tree.data[part], neighbors)
+        radii[part] = 0.5 * found[1][:, -1]
+        if keeps:
+            kept[part.start] = found
 
     def estimate(part: slice) -> None:
-        nearest, distance = nearest_others(tree, x[part], neighbors)
+        found = kept[part.start] if keeps else nearest_others(tree, x[part], neighbors)
+        nearest, distance = found
         offsets = tree.data[nearest] - x[part, None]
         most = _LONELY * np.median(radii[nearest], axis=1)
         areas[part] = _cell_areas(offsets, n[part], np.minimum(0.5 * distance[:, -1], most))

@@ -43,7 +43,7 @@ _NEIGHBORS, _FEWEST, _MOST = 62.0, 16, 256
 _COARSEST, _LEAST_PART = 0.8, 0.1
 # Weights of neighbors fall to exp(-3) at the last of them, and to 1/e where normals differ by this
 # chord, given and estimated.
-_FALL, _CHORD, _CHORD_OF_ESTIMATES = 3.0, 0.8, 0.5
+_FALL, _CHORD, _CHORD_OF_ESTIMATES = 3.0, 0.8, 0.4
 # Normals are estimated anew from moved points so often, each from this many of them. Where only
 # some points are moved, they are moved at first by so many of each other.
 _ROUNDS, _OF_PLANE, _AT_FIRST = 2, 24, 32

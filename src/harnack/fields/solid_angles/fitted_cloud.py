@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 _TURNS, _OVER = 2, 3.0
 # The smoothing length in spacings of the points that were moved; with little noise it is this times
 # the root of noise over spacing, and if that is below the last number, there is none.
-_SMOOTHING, _OF_ROOT, _NO_NOISE = 1.0, 1.4, 0.1
+_SMOOTHING, _OF_ROOT, _NO_NOISE = 0.9, 1.4, 0.1
 # The fewest points among which a surface, and what is far from it, can be seen.
 _FEWEST = 32
 
