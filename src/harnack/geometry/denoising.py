@@ -33,8 +33,6 @@ _ALONE, _COMPANY = 6.0, 4
 # Noise is measured at so many points, among the first of these counts of neighbors that reaches so
 # many standard deviations; neighbors whose normals turn by more than 60 degrees do not count.
 _PROBES, _COUNTS, _REACH, _LIKE = 1000, (16, 64, 256, 1024), 4.5, 0.5
-# The standard deviation of a normal distribution over the median of absolute values.
-_OVER_MEDIAN = 1.4826
 # So many neighbors are used, times noise over spacing, but at least and at most these: half of them
 # within 3.1 sqrt(noise * spacing), by experiment as a compromise of noise and detail.
 _NEIGHBORS, _FEWEST, _MOST = 62.0, 16, 256
@@ -88,9 +86,10 @@ def lonely_points(points: FloatArray, tree: Any) -> IntArray:
 
 
 def noise_of(points: FloatArray, normals: FloatArray | None, tree: Any) -> Noise:
-    """The noise of a cloud, by how far some points lie from where their neighbors say that the
-    surface is; without normals, by how far neighbors lie from their plane: then what is curved
-    counts as noise. tree: of these points."""
+    """The noise of a cloud, by how different the distances from the surface are that the neighbors
+    of some points say. Without normals, by how far neighbors lie from their plane: then what is
+    curved counts as noise. Among too few neighbors, which reach no farther than the noise, there is
+    no surface to be seen. tree: of these points."""
     rng = np.random.default_rng(0)
     probes = np.sort(rng.choice(len(points), min(len(points), _PROBES), replace=False))
     noise = Noise(0.0, 1.0)
@@ -100,8 +99,8 @@ def noise_of(points: FloatArray, normals: FloatArray | None, tree: Any) -> Noise
         if normals is None:
             deviation = float(np.median(_deviations_from_planes(offsets)))
         else:
-            away = np.abs(_away_by_normals(offsets, normals[probes], normals[index]))
-            deviation = _OVER_MEDIAN * float(np.median(away)) / math.sqrt(1 + 1 / count)
+            deviations = _deviations_by_normals(offsets, normals[probes], normals[index])
+            deviation = float(np.median(deviations))
         reach = float(np.median(distance[:, -1]))
         noise = Noise(deviation, reach * math.sqrt(math.pi / index.shape[1]))
         if reach >= _REACH * deviation or index.shape[1] < count:
@@ -124,11 +123,13 @@ def _least_axes(offsets: FloatArray, weights: FloatArray | None) -> FloatArray:
     return axes[:, :, 0]
 
 
-def _away_by_normals(offsets: FloatArray, own: FloatArray, theirs: FloatArray) -> FloatArray:
-    """The mean (m,) of t_j over neighbors with a normal like one's own."""
+def _deviations_by_normals(offsets: FloatArray, own: FloatArray, theirs: FloatArray) -> FloatArray:
+    """Standard deviations (m,) of t_j among neighbors with a normal like one's own."""
     like = np.einsum("mi,mki->mk", own, theirs) > _LIKE
     said = np.einsum("mki,mki->mk", 0.5 * (own[:, None] + theirs), offsets)
-    return (said * like).sum(axis=1) / np.maximum(like.sum(axis=1), 1)
+    count = np.maximum(like.sum(axis=1), 2)
+    mean = (said * like).sum(axis=1) / count
+    return np.sqrt(((said - mean[:, None]) ** 2 * like).sum(axis=1) / (count - 1))
 
 
 class Denoising:
