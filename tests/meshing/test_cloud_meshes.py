@@ -77,6 +77,12 @@ def test_hostile_clouds_have_the_right_surface(kind: str, smoothing: float) -> N
     check_ball(made, 0.15 if kind == "uneven" else 0.03, shift)
 
 
+def test_one_point_too_far_away_is_named() -> None:
+    x = np.concatenate([sphere(500)[0], [[400.0, 0, 0]]])
+    with pytest.raises(hk.MeshingError, match=r"1 of 501 points are far .* \(400, 0, 0\)"):
+        hk.mesh(hk.DipolePotential(x, x, smoothing=0.1))
+
+
 def test_two_parts_are_both_turned_outwards() -> None:
     x = sphere(1500)[0]
     field = hk.DipolePotential(

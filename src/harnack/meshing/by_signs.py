@@ -23,6 +23,7 @@ import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
 from harnack.meshing.checks import (
+    EmptyError,
     LocalError,
     MeshingError,
     check_count,
@@ -239,7 +240,7 @@ def _marched(
     places = np.zeros((0, 3))
     for _ in range(_MOST_ADDED):
         if not len(cells):
-            raise MeshingError("the level set is empty: no cell of the box holds the level")
+            raise EmptyError("the level set is empty: no cell of the box holds the level")
         coordinates, corners = lattice.tetrahedra(cells)
         points = lattice.points(coordinates)
         report(f"{len(points):,} points, {len(corners):,} tetrahedra")
@@ -259,7 +260,7 @@ def _marched(
 
         x, faces = _triangles(function, points, value, corners, roots)
         if not len(faces):
-            raise MeshingError("the level set is empty: no cell of the box holds the level")
+            raise EmptyError("the level set is empty: no cell of the box holds the level")
         ends = boundary_edges(faces)
         middle = x[ends].mean(axis=1)
         slack = 1e-9 * lattice.size

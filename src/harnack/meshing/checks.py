@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "CrossingError",
+    "EmptyError",
     "LocalError",
     "MeshingError",
     "SignArray",
@@ -301,6 +302,10 @@ def _overlap(one: FloatArray, other: FloatArray) -> BoolArray:
 
 class MeshingError(ValueError):
     """A level set that could not be meshed; the message says why and what to do."""
+
+
+class EmptyError(MeshingError):
+    """No cell holds the level."""
 
 
 class LocalError(MeshingError):

@@ -17,6 +17,7 @@ from harnack.geometry import Box, Intersection, Volume
 from harnack.geometry.volume import check_volume
 from harnack.meshing.by_signs import MOST_FAR, SMALLER, signed_surface
 from harnack.meshing.checks import (
+    EmptyError,
     MeshingError,
     TooLargeError,
     check_apart,
@@ -30,7 +31,12 @@ from harnack.meshing.finishing import check_options, finished, normals_of, simpl
 from harnack.meshing.lattice import Lattice
 from harnack.meshing.lattice_surface import Surface, open_surface
 from harnack.meshing.samples import CELLS_PER_WAVE, MOST_FACES, LevelFunction
-from harnack.meshing.sign_function import SignFunction, has_details, is_meshed_by_signs
+from harnack.meshing.sign_function import (
+    SignFunction,
+    has_details,
+    is_meshed_by_signs,
+    why_empty,
+)
 from harnack.meshing.solids import AngleMesher, ends_of_solid, mesh_solid, region_of
 from harnack.meshing.spanned import spanned_surface
 from harnack.tracer import LevelSet
@@ -279,15 +285,18 @@ def _by_signs(
         return SignFunction.of(field, one, filled, cells, side=side, most_faces=asked.most_faces)
 
     def signed(one: float, side: float, closed: bool) -> Surface:
-        made, more = signed_surface(
-            function(one, side),
-            filled,
-            cells,
-            asked.tolerance * size,
-            attempts,
-            asked.report,
-            closed=closed,
-        )
+        try:
+            made, more = signed_surface(
+                function(one, side),
+                filled,
+                cells,
+                asked.tolerance * size,
+                attempts,
+                asked.report,
+                closed=closed,
+            )
+        except EmptyError as error:
+            raise EmptyError(f"{error}{why_empty(field)}") from error
         facts.append(more)
         return made
 

@@ -17,6 +17,7 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray, choose_backend
+from harnack.backend.numbers import vector_text
 from harnack.enclosures import TargetLevels
 from harnack.fields.batch import BatchedField
 from harnack.fields.blobs.blobs import Blobs
@@ -26,6 +27,8 @@ from harnack.fields.points import in_batches
 from harnack.fields.sheets import NO_SHEET, Crossing
 from harnack.fields.solid_angles.dipole import DipolePotential
 from harnack.fields.solid_angles.winding_number import WindingModuloOne, WindingNumber
+from harnack.geometry.clouds import point_tree
+from harnack.geometry.denoising import lonely_points
 from harnack.meshing.checks import MeshingError
 from harnack.meshing.edges import dots, lengths
 from harnack.meshing.samples import LevelFunction, Samples
@@ -34,7 +37,7 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, Precision, Real, Vec3
     from harnack.fields import Field
 
-__all__ = ["SignFunction", "has_details", "is_meshed_by_signs"]
+__all__ = ["SignFunction", "has_details", "is_meshed_by_signs", "why_empty"]
 
 # How often a segment is halved before it is intersected with sheets; and how often a smooth
 # function is evaluated along it, in turn where the secant meets the level and in the middle.
@@ -62,6 +65,20 @@ def has_details(field: Field, spacing: float) -> bool:
     """Whether the surface of a cloud with noise is likely to have details that cells of this size
     do not show."""
     return isinstance(field, DipolePotential) and 0 < field.smoothing < _DETAILS * spacing
+
+
+def why_empty(field: Field) -> str:
+    """What is known of why there is no surface among cells, to be added to an error."""
+    if not isinstance(field, DipolePotential) or len(field.points) < 2:
+        return ""
+    alone = lonely_points(field.points, point_tree(field.points))
+    if not len(alone):
+        return ""
+    return (
+        f"; {len(alone):,} of {len(field.points):,} points are far from all others, such as "
+        f"{vector_text(field.points[alone[0]])}, and make cells too large: leave them out, as "
+        'smoothing="auto" does, or give a `spacing`'
+    )
 
 
 @dataclass

@@ -1,0 +1,92 @@
+"""Noise of clouds: how much is found, and points moved onto the surface."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from harnack.geometry.clouds import point_tree
+from harnack.geometry.denoising import Denoising, Noise, lonely_points, noise_of
+
+
+def sphere(count: int, noise: float = 0.0, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    normals = rng.normal(size=(count, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return normals + rng.normal(0, noise, (count, 3)), normals
+
+
+def cube(count: int, noise: float) -> tuple[np.ndarray, np.ndarray]:
+    """Of points on [-1, 1]^3, and normals of its faces."""
+    rng = np.random.default_rng(0)
+    axis, side = rng.integers(0, 3, count), rng.choice([-1.0, 1.0], count)
+    points, normals = rng.uniform(-1, 1, (count, 3)), np.zeros((count, 3))
+    rows = np.arange(count)
+    points[rows, axis] = normals[rows, axis] = side
+    return points + rng.normal(0, noise, points.shape), normals
+
+
+@pytest.mark.parametrize(
+    ("count", "noise", "off"), [(4000, 0.05, 0.15), (4000, 0.01, 0.15), (40_000, 0.06, 0.25)]
+)
+@pytest.mark.parametrize("is_given", [True, False])
+def test_noise_and_spacing_are_found(count: int, noise: float, off: float, is_given: bool) -> None:
+    points, normals = sphere(count, noise)
+    found = noise_of(points, normals if is_given else None, point_tree(points))
+    assert found.deviation == pytest.approx(noise, rel=off)
+    assert found.spacing == pytest.approx(np.sqrt(4 * np.pi / count), rel=0.2)
+
+
+def test_without_noise_next_to_none_is_found() -> None:
+    points, normals = sphere(4000)
+    tree = point_tree(points)
+    spacing = np.sqrt(4 * np.pi / 4000)
+    assert noise_of(points, normals, tree).deviation < 1e-12
+    assert noise_of(points, None, tree).deviation < 0.05 * spacing
+
+
+def test_points_of_a_sphere_stay_where_they_are() -> None:
+    """As neighbors say exactly that they are on it, however far these are."""
+    points, normals = sphere(500)
+    moved = Denoising(points, Noise(0.1, 0.16)).moved(normals)
+    assert np.abs(moved - points).max() < 1e-12
+
+
+@pytest.mark.parametrize(("count", "noise", "left"), [(4000, 0.04, 0.3), (40_000, 0.06, 0.15)])
+def test_noise_is_taken_away_and_nothing_shrinks(count: int, noise: float, left: float) -> None:
+    points, normals = sphere(count, noise)
+    cloud = Denoising(points, Noise(noise, float(np.sqrt(4 * np.pi / count))))
+    assert (len(cloud.chosen) < count) == (count == 40_000)
+    off = np.linalg.norm(cloud.moved(normals), axis=1) - 1
+    assert np.sqrt((off**2).mean()) < left * noise
+    # Noise along the sphere moves points out by noise^2.
+    assert abs(off.mean()) < 2 * noise**2
+
+
+def test_points_beside_edges_stay_on_their_faces() -> None:
+    points, normals = cube(6000, 0.03)
+    moved = Denoising(points, Noise(0.03, 0.063)).moved(normals)
+    height = np.einsum("ij,ij->i", moved, normals) - 1
+    beside = (np.abs(moved) > 0.9).sum(axis=1) > 1
+    assert beside.sum() > 500
+    for off in (height[beside], height[~beside]):
+        assert abs(off.mean()) < 0.15 * 0.03
+        assert off.std() < 0.4 * 0.03
+
+
+def test_estimated_normals_get_better_at_edges() -> None:
+    points, normals = cube(6000, 0.03)
+    tree = point_tree(points)
+    rounded = normals[tree.query(points, k=32)[1]].mean(axis=1)
+    rounded /= np.linalg.norm(rounded, axis=1, keepdims=True)
+    _, turned = Denoising(points, Noise(0.03, 0.063), tree).moved_and_turned(rounded)
+    before, after = (np.einsum("ij,ij->i", one, normals) for one in (rounded, turned))
+    assert (after < 0.9).mean() < 0.6 * (before < 0.9).mean()
+
+
+def test_points_far_from_all_others_are_found() -> None:
+    points, _ = sphere(2000, 0.03)
+    dense, _ = sphere(8000, seed=1)
+    some = np.array([[3.0, 0, 0], [3.01, 0, 0], [0, 0, 0], [-40, 9, 5]])
+    x = np.concatenate([points, dense[dense[:, 2] > 0], some])
+    assert lonely_points(x, point_tree(x)).tolist() == list(range(len(x) - 4, len(x)))
