@@ -38,7 +38,7 @@ _PROBES, _COUNTS, _REACH, _LIKE = 1000, (16, 64, 256, 1024), 4.5, 0.5
 _NEIGHBORS, _FEWEST, _MOST = 62.0, 16, 256
 # Of a cloud in which noise is larger than this times the spacing, a part of the points is moved,
 # with a spacing that is so large; but not less than the last part.
-_COARSEST, _LEAST_PART = 0.8, 0.1
+_COARSEST, _LEAST_PART = 1.2, 0.1
 # Weights of neighbors fall to exp(-3) at the last of them, and to 1/e where normals differ by this
 # chord, given and estimated.
 _FALL, _CHORD, _CHORD_OF_ESTIMATES = 3.0, 0.8, 0.4
