@@ -36,8 +36,8 @@ _PROBES, _COUNTS, _REACH, _LIKE = 1000, (16, 64, 256, 1024), 4.5, 0.5
 # So many neighbors are used, times noise over spacing, but at least and at most these: half of them
 # within 3.1 sqrt(noise * spacing), by experiment as a compromise of noise and detail.
 _NEIGHBORS, _FEWEST, _MOST = 62.0, 16, 256
-# Of a cloud in which noise is larger than this times the spacing, a part of the points is moved,
-# with a spacing that is so large; but not less than the last part.
+# Of a cloud in which noise is larger than so many spacings, a part of the points is moved: that
+# many spacings over the noise, but not less than the last number.
 _COARSEST, _LEAST_PART = 1.2, 0.1
 # Weights of neighbors fall to exp(-3) at the last of them, and to 1/e where normals differ by this
 # chord, given and estimated.
