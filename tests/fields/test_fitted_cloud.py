@@ -64,7 +64,12 @@ def test_normals_that_are_turned_wrongly_are_turned_back(monkeypatch: pytest.Mon
     """Also those of a whole region, which agree with each other."""
     points, normals = sphere(4000, 0.02)
     wrong = np.where((points[:, 2] > 0.95)[:, None], -normals, normals)
-    monkeypatch.setattr(fitted_cloud, "estimate_normals", lambda _: wrong)
+
+    def estimated(points: np.ndarray) -> np.ndarray:
+        del points
+        return wrong
+
+    monkeypatch.setattr(fitted_cloud, "estimate_normals", estimated)
     field = hk.DipolePotential(points, "estimate", smoothing="auto")
     assert (np.einsum("ij,ij->i", field.normals, normals) > 0.7).all()
 
