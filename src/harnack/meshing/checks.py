@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 __all__ = [
     "CrossingError",
     "EmptyError",
+    "HopelessError",
     "LocalError",
     "MeshingError",
     "SignArray",
@@ -46,6 +47,7 @@ __all__ = [
     "euler_characteristic",
     "far_from_level",
     "intersecting_faces",
+    "may_help_again",
     "sides_of_lines",
     "sides_of_planes",
     "singular_vertices",
@@ -324,8 +326,24 @@ class CrossingError(LocalError):
         self.faces = faces
 
 
-class TooLargeError(MeshingError):
+class HopelessError(MeshingError):
+    """What smaller cells do not help against."""
+
+
+class TooLargeError(HopelessError):
     """A mesh that would be so large that it was not begun."""
+
+
+# So many places may be wrong in smaller cells, or this part of those before.
+_FEW_PLACES, _FEWER = 20, 0.5
+
+
+def may_help_again(now: MeshingError, before: MeshingError | None) -> bool:
+    """Whether cells that are smaller still may help, after two sizes of them failed: not if nearly
+    as many places are wrong, as along a pole or where sheets cross, where cells of no size do."""
+    if not isinstance(now, LocalError) or not isinstance(before, LocalError):
+        return not isinstance(now, HopelessError)
+    return len(now.places) <= max(_FEW_PLACES, _FEWER * len(before.places))
 
 
 def euler_characteristic(faces: IntArray) -> int:
@@ -423,11 +441,11 @@ def check_near_level(
     the function.
 
     A point is within it if the gradient says so, |f|/|grad f| <= tolerance; or if f changes its
-    sign between two points at that distance from it, along the normal of the face or along an axis,
-    for then a continuous f has its level between them. A solid is cut at the volume's boundary: to
-    be outside of the volume counts as a positive sign. Boundary vertices of an angle's level set
-    are on its curve, where it has no value, and are left out; and triangles smaller than half of
-    the tolerance are as near as their corners.
+    sign between two points at that distance from it or nearer, along the normal of the face or
+    along an axis, for then a continuous f has its level between them. A solid is cut at the
+    volume's boundary: to be outside of the volume counts as a positive sign. Boundary vertices of
+    an angle's level set are on its curve, where it has no value, and are left out; and triangles
+    smaller than half of the tolerance are as near as their corners.
 
     Raises:
         LocalError: with the points that are not.
@@ -465,10 +483,11 @@ def far_from_level(
     ways = np.concatenate([mean[is_checked], normal[large]])
     ways /= np.maximum(lengths(ways), 1e-300)[:, None]
     far = np.flatnonzero(~(function.at(points).distance <= tolerance))
-    for axis in (None, *np.eye(3)):
+    # Nearer ones as well: behind a cap there may be little of a solid.
+    for share, axis in itertools.product((1.0, 0.25, 0.0625), (None, *np.eye(3))):
         if not len(far):
             break
-        step = tolerance * (ways[far] if axis is None else axis)
+        step = share * tolerance * (ways[far] if axis is None else axis)
         one, other = (_is_positive(function, points[far] + s * step, volume) for s in (1, -1))
         far = far[one == other]
     return points[far], len(points)

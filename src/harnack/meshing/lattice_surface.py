@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
-from harnack.meshing.checks import MeshingError, TooLargeError, singular_vertices
+from harnack.meshing.checks import HopelessError, MeshingError, TooLargeError, singular_vertices
 from harnack.meshing.edges import IntArray, distinct, lengths, numbered
 from harnack.meshing.isotopy import Isotopy, isotopy_of
 from harnack.meshing.lattice import Lattice, distinct_rows
@@ -51,6 +51,8 @@ _NEAR, _FOUND, _APART, _DEEP = 1.0, 1.5, 0.75, 0.5
 _TOGETHER, _LONG = 1.0, 2.0
 # How near to the level, in cells, a point has to come by Newton's method.
 _ON = 1e-3
+# A function that is its level at a larger part of so many points has no surface there.
+_MOST_FLAT, _MOST_PROBES = 0.75, 2000
 
 
 class MissedError(MeshingError):
@@ -207,7 +209,8 @@ def open_surface(
     tolerance: of the middles of edges and faces, a length.
 
     Raises:
-        MeshingError: no cell is cut, or there are too many.
+        MeshingError: no cell is cut, or there are too many; a HopelessError where the function is
+            not finite, or its level is a volume.
     """
     walls = lattice.lower, lattice.upper
     cells = lattice.cells_not_empty(function.clearance, function.most_faces)
@@ -419,11 +422,28 @@ def _sampled(function: LevelFunction, points: FloatArray) -> Samples:
     bad = ~np.isfinite(samples.value)
     if bad.any():
         x, y, z = points[bad][0]
-        raise MeshingError(
+        raise HopelessError(
             f"{type(function.field).__name__} has no finite value at {bad.sum():,} points, such "
             f"as ({x:.4g}, {y:.4g}, {z:.4g}): choose a `clip` where it has"
         )
+    _check_is_no_volume(function, points, samples)
     return samples
+
+
+def _check_is_no_volume(function: LevelFunction, points: FloatArray, samples: Samples) -> None:
+    """Raise if the function is its level nearly everywhere, up to rounding: such as x - x, of which
+    no cells are proved empty, however small they are."""
+    flat = np.flatnonzero((samples.value == 0) | ~samples.gradient.any(axis=1))
+    if len(flat) <= _MOST_FLAT * len(points):
+        return
+    some = points[:: -(-len(points) // _MOST_PROBES)]
+    share = float(function.undecided(some).mean())
+    if share > _MOST_FLAT:
+        raise HopelessError(
+            f"{type(function.field).__name__} is {function.level:g}, up to rounding, at "
+            f"{share:.0%} of the points looked at: its level there is a volume and no surface; "
+            "choose another level"
+        )
 
 
 @dataclass(frozen=True)

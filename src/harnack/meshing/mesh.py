@@ -19,11 +19,11 @@ from harnack.meshing.by_signs import MOST_FAR, SMALLER, signed_surface
 from harnack.meshing.checks import (
     EmptyError,
     MeshingError,
-    TooLargeError,
     check_apart,
     check_inside,
     check_manifold,
     check_near_level,
+    may_help_again,
 )
 from harnack.meshing.clipping import cut_by, largest_body, largest_part
 from harnack.meshing.closed_mesh import box_manifold, manifold_of, surface_of, volume_manifold
@@ -508,22 +508,22 @@ def _filling(
     report: Callable[[str], None],
 ) -> tuple[Surface, dict[str, Any]]:
     """The level set of a real-valued field in a box, in cells of a lattice."""
+    before: MeshingError | None = None
     while True:
         report(f"cells of {spacing:.3g}")
         try:
             lattice = Lattice.filling(box.lower, box.upper, spacing)
             made, isotopy = open_surface(function, lattice, tolerance, report)
-            check_manifold(made.faces)
+            check_manifold(made.faces, made.vertices)
             check_near_level(function, made.vertices, made.faces, 2 * tolerance, None)
             check_apart(made.vertices, made.faces)
             break
-        except TooLargeError:
-            raise
-        except MeshingError:
+        except MeshingError as wrong:
             attempts -= 1
-            if not attempts:
+            if not attempts or not may_help_again(wrong, before):
                 raise
-            spacing *= 0.6
+            before, spacing = wrong, 0.6 * spacing
+            report(f"{wrong}; so smaller cells")
     facts = {
         "spacing": spacing,
         "evaluations": function.evaluations,

@@ -273,14 +273,18 @@ def newton(
 ) -> FloatArray:
     """Points (n, 3) after steps of Newton's method along the gradient towards the level, each no
     longer than `longest` (n,). On walls they stay on them. Points are left alone after a step that
-    was so short that the next one, of its square, would be lost in rounding."""
+    was so short that the next one, of its square, would be lost in rounding; and where there is no
+    finite step, as beside a pole."""
     x, rows = points.copy(), np.arange(len(points))
     for k in range(steps):
         here = x[rows]
         g = samples.gradient if walls is None else samples.gradient * _off_walls(here, walls)
         square = dots(g, g)
-        move = -(samples.value / np.maximum(square, 1e-300))[:, None] * g
-        length = lengths(move)
+        with np.errstate(invalid="ignore", over="ignore"):
+            move = -(samples.value / np.maximum(square, 1e-300))[:, None] * g
+            length = lengths(move)
+        lost = ~np.isfinite(length)
+        move[lost], length[lost] = 0.0, 0.0
         there = here + move * np.minimum(1, longest[rows] / np.maximum(length, 1e-300))[:, None]
         x[rows] = there if walls is None else np.clip(there, *walls)
         rows = rows[length > _CONVERGED * longest[rows]]

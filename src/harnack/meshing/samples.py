@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 import numpy as np
 
-from harnack.backend import FloatArray, choose_backend
+from harnack.backend import BoolArray, FloatArray, choose_backend
 from harnack.backend.elementary import length
 from harnack.enclosures import Gaps, Slopes, TargetLevels, choose_proofs, longest_step
 from harnack.fields.clearance import distance_below
@@ -124,6 +124,16 @@ class LevelFunction:
                 return (self._prepared.evaluate(p).value,)
 
         return self.wrapped(self._in_batches(points, value)[0])
+
+    def undecided(self, points: FloatArray) -> BoolArray:
+        """(n,) where f is the level up to its error: rounding, and what a sum leaves out."""
+
+        def both(p: Vec3) -> tuple[Real, Real]:
+            sample = self._prepared.evaluate(p)
+            return sample.value, self._backend.Float(sample.error)
+
+        value, error = self._in_batches(points, both)
+        return np.abs(self.wrapped(value)) <= error
 
     def slopes(self, points: FloatArray, radius: FloatArray) -> tuple[Samples, FloatArray]:
         """The function at points (n, 3), its reach left out, and by how much at most its gradient

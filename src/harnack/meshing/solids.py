@@ -30,7 +30,13 @@ from harnack.fields.solids.region import solid as solid_of
 from harnack.fields.solids.swept import Extruded, Revolved
 from harnack.fields.solids.thread import Thread
 from harnack.geometry import Ball, Box, Intersection, Volume
-from harnack.meshing.checks import CrossingError, LocalError, MeshingError, TooLargeError
+from harnack.meshing.checks import (
+    CrossingError,
+    LocalError,
+    MeshingError,
+    TooLargeError,
+    may_help_again,
+)
 from harnack.meshing.closed_mesh import (
     box_manifold,
     extruded_manifold,
@@ -539,7 +545,9 @@ def mesh_solid(
     error = 0.5 * tolerance * size
     attempts = _MOST_ATTEMPTS if spacing is None else 1
     per_wave = CELLS_PER_WAVE if spacing is None else None
-    uploads, first = Uploads(), None
+    uploads = Uploads()
+    first: MeshingError | None = None
+    before: MeshingError | None = None
     while True:
         mesher = RegionMesher(
             lower, upper, error, 2 * part * error, cells, per_wave, angle_mesher(error, cells),
@@ -555,8 +563,9 @@ def mesh_solid(
             raise first from large  # what smaller cells were for is what went wrong
         except (MissedError, LocalError) as wrong:
             attempts, first = attempts - 1, first or wrong
-            if not attempts:
+            if not attempts or not may_help_again(wrong, before):
                 raise
+            before = wrong
             cells *= _SMALLER
             per_wave = CELLS_PER_WAVE * size / (_ACROSS * cells)
             if isinstance(wrong, LocalError):
