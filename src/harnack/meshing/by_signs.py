@@ -89,12 +89,14 @@ _MOST_ADDED = 20
 @dataclass(frozen=True)
 class SignSurface:
     """A surface; of the points of the lattice how many there are, and at how many the error of the
-    function leaves the sign open; flat: how many triangles were made flat again."""
+    function leaves the sign open; flat: how many triangles were made flat again; is_apart: whether
+    it was checked, exactly, that no triangles pass through each other."""
 
     surface: Surface
     points: int
     undecided: int
     flat: int
+    is_apart: bool
 
 
 def signed_surface(
@@ -106,7 +108,7 @@ def signed_surface(
     report: Callable[[str], None],
     *,
     closed: bool = False,
-) -> tuple[Surface, dict[str, Any]]:
+) -> tuple[SignSurface, dict[str, Any]]:
     """`sign_surface` in cells of a box, and facts about it. Where more than a few vertices and
     centers of triangles are beyond the tolerance, a length, it is made once more of smaller cells;
     how many are at last, and within what distance all are, is among the facts.
@@ -138,7 +140,7 @@ def signed_surface(
         "looked_at": count,
         "within": within,
     }
-    return made.surface, facts
+    return made, facts
 
 
 def _distances(
@@ -181,7 +183,7 @@ def sign_surface(
         MeshingError: there is none, too many cells, or values that are no numbers.
     """
     first = _marched(function, lattice, closed, report)
-    x, faces, normals = _without_slivers(
+    x, faces, normals, is_apart = _without_slivers(
         first, min(_SLIVERS * tolerance, _SMALL * float(lattice.size.min()))
     )
     report(f"{len(first.faces):,} triangles, {len(faces):,} without slivers")
@@ -208,7 +210,8 @@ def sign_surface(
         x, count = _untangled(x, flat, faces)
     except LocalError:  # as the tetrahedra cut it
         x, faces, count = first.vertices, first.faces, len(first.faces)
-    return SignSurface(Surface(x, faces), first.points, first.undecided, count)
+        is_apart = False
+    return SignSurface(Surface(x, faces), first.points, first.undecided, count, is_apart)
 
 
 @dataclass(frozen=True)
@@ -281,23 +284,24 @@ def _marched(
 
 def _without_slivers(
     marched: _Marched, tolerance: float
-) -> tuple[FloatArray, IntArray, FloatArray]:
+) -> tuple[FloatArray, IntArray, FloatArray, bool]:
     """Vertices, faces and normals with short edges contracted, and vertices left out where faces
     around them lie in a plane, within a tolerance (manifold3d); all as they were if the surface is
-    open, or triangles then pass through each other."""
+    open, or triangles then pass through each other. And whether that was checked and none do: they
+    do not as the tetrahedra cut them, but for rounding."""
     import scipy.spatial  # here: half a second that few need
 
     searching: Any = scipy.spatial
     x, faces = marched.vertices, marched.faces
     if len(boundary_edges(faces)):
-        return x, faces, marched.normals
+        return x, faces, marched.normals, False
     simpler = surface_of(manifold_of(Surface(x, faces)).simplify(tolerance))
     away, place = searching.cKDTree(x).query(simpler.vertices)
     if not len(simpler.faces) or away.any():
-        return x, faces, marched.normals
+        return x, faces, marched.normals, False
     if len(intersecting_faces(simpler.vertices, simpler.faces)):
-        return x, faces, marched.normals
-    return simpler.vertices, simpler.faces, marched.normals[place]
+        return x, faces, marched.normals, False
+    return simpler.vertices, simpler.faces, marched.normals[place], True
 
 
 def _values(function: SignFunction, points: FloatArray, size: FloatArray) -> FloatArray:
@@ -482,7 +486,8 @@ def _corners(
 
 def _untangled(x: FloatArray, flat: FloatArray, faces: IntArray) -> tuple[FloatArray, int]:
     """Vertices moved back to where they were made, within the triangles of the tetrahedra, of faces
-    that turn over or pass through others; and how many faces did.
+    that turn over or pass through others; and how many faces did. Faces none of whose vertices were
+    moved are not compared with each other.
 
     flat: (n, 3) these places.
 

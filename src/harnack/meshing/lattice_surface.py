@@ -437,7 +437,7 @@ def _check_is_no_volume(function: LevelFunction, points: FloatArray, samples: Sa
     if len(flat) <= _MOST_FLAT * len(points):
         return
     some = points[:: -(-len(points) // _MOST_PROBES)]
-    share = float(function.undecided(some).mean())
+    share = float(function.is_on_level(some).mean())
     if share > _MOST_FLAT:
         raise HopelessError(
             f"{type(function.field).__name__} is {function.level:g}, up to rounding, at "

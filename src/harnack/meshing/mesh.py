@@ -284,7 +284,10 @@ def _by_signs(
     def function(one: float, side: float) -> SignFunction:
         return SignFunction.of(field, one, filled, cells, side=side, most_faces=asked.most_faces)
 
+    is_apart = False
+
     def signed(one: float, side: float, closed: bool) -> Surface:
+        nonlocal is_apart
         try:
             made, more = signed_surface(
                 function(one, side),
@@ -298,12 +301,13 @@ def _by_signs(
         except EmptyError as error:
             raise EmptyError(f"{error}{why_empty(field)}") from error
         facts.append(more)
-        return made
+        is_apart = made.is_apart
+        return made.surface
 
     if not solid:
         made = signed(levels[0], 1.0, False)
         if volume is not None and not (isinstance(volume, Box) and box.has_walls):
-            made = cut_by(made, volume)
+            made, is_apart = cut_by(made, volume), False
     elif volume is None and ends[1] == math.inf:
         made = signed(levels[0], -1.0, False)
     else:
@@ -314,14 +318,16 @@ def _by_signs(
             whole = whole - manifold_of(signed(ends[1], -1.0, True))
         cut = volume or Box(tuple(box.lower.tolist()), tuple(box.upper.tolist()))
         whole ^= volume_manifold(cut, box.lower, box.upper, 0.5 * asked.tolerance * size)
-        made = surface_of(whole)
+        made, is_apart = surface_of(whole), False
     if not len(made.faces):
         raise MeshingError("the level set is empty: it lies outside of the clip")
+    if is_apart:
+        check_manifold(made.faces)
     known = {"level": levels[0], **_of_both(facts)}
     if isinstance(field, DipolePotential):
         known["cloud"] = field.describe()
     _judge_signs(field, known, asked.tolerance * size)
-    return _Made(made, size, known, function(levels[0], 1.0), _nothing, False)
+    return _Made(made, size, known, function(levels[0], 1.0), _nothing, is_apart)
 
 
 def _of_both(facts: list[dict[str, Any]]) -> dict[str, Any]:

@@ -125,7 +125,7 @@ class LevelFunction:
 
         return self.wrapped(self._in_batches(points, value)[0])
 
-    def undecided(self, points: FloatArray) -> BoolArray:
+    def is_on_level(self, points: FloatArray) -> BoolArray:
         """(n,) where f is the level up to its error: rounding, and what a sum leaves out."""
 
         def both(p: Vec3) -> tuple[Real, Real]:
