@@ -51,6 +51,9 @@ _NEAR, _FOUND, _APART, _DEEP = 1.0, 1.5, 0.75, 0.5
 _TOGETHER, _LONG = 1.0, 2.0
 # How near to the level, in cells, a point has to come by Newton's method.
 _ON = 1e-3
+# So large a part of vertices may be farther from the level than that many cells: where signs change
+# by a jump.
+_MOST_JUMPS, _FAR = 0.1, 0.1
 # A function that is its level at a larger part of so many points has no surface there.
 _MOST_FLAT, _MOST_PROBES = 0.75, 2000
 
@@ -224,6 +227,7 @@ def open_surface(
     _check_nothing_missed(function, points, samples, corners, first, faces, lattice, walls)
     if not len(faces):
         raise MeshingError("the level set is empty: no cell of the box holds the level")
+    _check_is_continuous(function, vertices, faces, lattice)
     check_size(function, vertices, faces, tolerance)
     none = Boundary(np.zeros((0, 3)), np.zeros((0, 2), np.int64))
     size = float(lattice.size.max())
@@ -297,6 +301,7 @@ def closed_surface(
     )
     # What ends at the outermost cells is moved and cut, its ends are not.
     if len(rest):
+        _check_is_continuous(function, vertices, rest, lattice)
         check_size(function, vertices, rest, tolerance)
         vertices = smoothed(function, vertices, rest, None)
         counts = _inside(lattice, does_matter)
@@ -428,6 +433,23 @@ def _sampled(function: LevelFunction, points: FloatArray) -> Samples:
         )
     _check_is_no_volume(function, points, samples)
     return samples
+
+
+def _check_is_continuous(
+    function: LevelFunction, vertices: FloatArray, faces: IntArray, lattice: Lattice
+) -> None:
+    """Raise if at many vertices the sign of the function changes and the level is not near: it
+    jumps there, and refinement would never come to an end."""
+    x = vertices[np.unique(faces)]
+    is_far = function.at(x).distance > _FAR * float(lattice.size.max())
+    if is_far.sum() > _MOST_JUMPS * len(x):
+        a, b, c = x[is_far][0]
+        raise HopelessError(
+            f"{type(function.field).__name__} changes its sign without coming to its level at "
+            f"{is_far.sum():,} of {len(x):,} places, such as ({a:.4g}, {b:.4g}, {c:.4g}): it jumps "
+            "there, as at the cut of atan2 or a pole; choose a `clip` without it, or another formula, "
+            "such as the sine of an angle"
+        )
 
 
 def _check_is_no_volume(function: LevelFunction, points: FloatArray, samples: Samples) -> None:
