@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from harnack.files.file_format import check_writable, write_atomically
+from harnack.files.three_mf import FOR_3MF
 
 if TYPE_CHECKING:
     import trimesh
@@ -16,9 +17,6 @@ __all__ = ["MESH_FILES", "check_mesh_path", "write_mesh"]
 
 MESH_FILES = (".stl", ".ply", ".obj", ".glb", ".3mf")
 """What meshes are written to."""
-
-# What trimesh needs for 3MF.
-_FOR_3MF = ("lxml", "networkx")
 
 
 def check_mesh_path(path: str | os.PathLike[str]) -> Path:
@@ -33,7 +31,7 @@ def check_mesh_path(path: str | os.PathLike[str]) -> Path:
     if target.suffix.lower() not in MESH_FILES:
         raise ValueError(f"{target} has no extension of a mesh: name it {', '.join(MESH_FILES)}")
     if target.suffix.lower() == ".3mf":
-        missing = [name for name in _FOR_3MF if importlib.util.find_spec(name) is None]
+        missing = [name for name in FOR_3MF if importlib.util.find_spec(name) is None]
         if missing:
             raise ImportError(
                 f"{target}: 3MF needs {' and '.join(missing)}: pip install 'harnack[3mf]', or name "

@@ -25,6 +25,7 @@ from harnack.files.text_formats import (
     read_stl,
     read_xyz,
 )
+from harnack.files.three_mf import read_3mf
 from harnack.geometry.chains import (
     Edge,
     OpenChainError,
@@ -168,7 +169,7 @@ _READ_AS = ("winding", "dipole", "loops", "polygons")
 
 _READERS: dict[str, Callable[[Path, bytes], Contents]] = {
     ".obj": read_obj, ".ply": read_ply, ".stl": read_stl, ".off": read_off,
-    ".glb": read_gltf, ".gltf": read_gltf, ".xyz": read_xyz,
+    ".glb": read_gltf, ".gltf": read_gltf, ".3mf": read_3mf, ".xyz": read_xyz,
 }  # fmt: skip
 _LOOP_FILES = (".obj", ".ply", ".loops")
 SURFACE_FILES = (*_READERS, ".loops", ".blobs", *MOLECULE_FILES)
@@ -222,8 +223,8 @@ Surface: TypeAlias = Mesh | Cloud | ClosedCurves | PolygonSurface | Metaballs | 
 
 
 def read_surface(path: str | os.PathLike[str], as_: ReadAs | None = None) -> Surface:
-    """What a surface file describes: .obj, .ply, .stl, .off, .glb, .gltf, .xyz, .loops, .blobs,
-    or a molecule's, .pdb, .ent, .cif, .mmcif.
+    """What a surface file describes: .obj, .ply, .stl, .off, .glb, .gltf, .3mf, .xyz, .loops,
+    .blobs, or a molecule's, .pdb, .ent, .cif, .mmcif.
 
     Faces make a mesh, except polygons of an .obj or .ply file of which some have more than four
     corners and none share an edge: these are curves, as are polylines without faces. Points alone

@@ -447,8 +447,8 @@ def _check_is_continuous(
         raise HopelessError(
             f"{type(function.field).__name__} changes its sign without coming to its level at "
             f"{is_far.sum():,} of {len(x):,} places, such as ({a:.4g}, {b:.4g}, {c:.4g}): it jumps "
-            "there, as at the cut of atan2 or a pole; choose a `clip` without it, or another formula, "
-            "such as the sine of an angle"
+            "there, as at the cut of atan2 or a pole; choose a `clip` without it, or write it "
+            "otherwise, such as with the sine of an angle"
         )
 
 

@@ -1,0 +1,92 @@
+"""Reading .3mf files, which slicers write, through trimesh: triangles in millimeters."""
+
+from __future__ import annotations
+
+import importlib.util
+import warnings
+import zipfile
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from harnack.files.file_format import (
+    MAX_BYTES,
+    Contents,
+    FileFormatError,
+    Place,
+    Places,
+    check_finite,
+    check_indices,
+    triangle_list,
+)
+
+__all__ = ["FOR_3MF", "read_3mf"]
+
+FOR_3MF = ("lxml", "networkx")
+"""What trimesh needs for 3MF."""
+
+# Millimeters in the units of the format, in the singular that it has and trimesh's plural.
+_UNITS = {
+    "micron": 1e-3, "millimeter": 1.0, "centimeter": 10.0, "inch": 25.4, "foot": 304.8,
+    "meter": 1000.0,
+}  # fmt: skip
+
+
+def read_3mf(path: Path, data: bytes) -> Contents:
+    """All triangles of the parts that a file would have printed, where it puts them, in
+    millimeters. Colors and settings are ignored.
+
+    Raises:
+        FileFormatError: no archive, too large when it is unpacked, malformed, without triangles; or
+            packages are missing.
+    """
+    import trimesh  # here, since it takes half a second
+
+    place = Place(path)
+    missing = [name for name in FOR_3MF if importlib.util.find_spec(name) is None]
+    if missing:
+        raise place.error(f"3MF needs {' and '.join(missing)}: pip install 'harnack[3mf]'")
+    try:
+        with zipfile.ZipFile(BytesIO(data)) as archive:
+            size = sum(one.file_size for one in archive.infolist())
+    except zipfile.BadZipFile:
+        raise place.error("this is no .3mf file: it is no zip archive") from None
+    if size > MAX_BYTES:
+        raise place.error(f"it has {size:,} bytes when unpacked: at most {MAX_BYTES:,} are read")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            scene: Any = trimesh.load(BytesIO(data), file_type="3mf", force="scene", process=False)
+            return _contents(place, scene)
+    except FileFormatError:
+        raise
+    except Exception as error:  # whatever trimesh stumbles over
+        reason = str(error).strip().splitlines()[:1] or [type(error).__name__]
+        raise place.error(f"it is no sound 3MF file ({reason[0][:120]})") from None
+
+
+def _contents(place: Place, scene: Any) -> Contents:
+    """The triangles of a scene's nodes."""
+    unit = str(scene.units or "millimeter").lower().removesuffix("s")
+    if unit not in _UNITS:
+        raise place.error(f"its unit, {unit[:40]!r}, is none of {', '.join(_UNITS)}")
+    vertices, faces, count = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], 0
+    for node in scene.graph.nodes_geometry:
+        matrix, name = scene.graph[node]
+        part = scene.geometry[name]
+        corners = np.asarray(part.faces, np.int64)
+        own = triangle_list(place.path, corners)
+        check_indices(own, len(part.vertices))
+        x = np.asarray(part.vertices, np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
+        if np.linalg.det(matrix[:3, :3]) < 0:  # a mirror image
+            corners = corners[:, ::-1]
+        vertices.append(_UNITS[unit] * x)
+        faces.append(corners + count)
+        count += len(x)
+    x, triangles = np.concatenate(vertices), np.concatenate(faces)
+    check_finite(x, Places(place.path, "vertex", range(len(x))))
+    if not len(triangles):
+        raise place.error("it holds no triangles")
+    return Contents(place.path, x, faces=triangle_list(place.path, triangles))
