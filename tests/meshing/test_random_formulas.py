@@ -356,7 +356,38 @@ def judge(seed: int) -> str:
     return why or "made"
 
 
+REFUSED = {
+    "x - x": "volume and no surface",
+    "sin(x + y)^2 + cos(x + y)^2 - 1": "volume and no surface",
+    "atan2(y, x) - 3*z": "jumps",
+    "max((x^2 + y^2 + z^2 + 0.34)^2 - 1.6*(x^2 + y^2), atan2(y, x) - 3*z)": "jumps",
+    "sqrt(x) - y": "no finite value",
+}
+
+
+@pytest.mark.parametrize("text", REFUSED)
+def test_what_has_no_surface_is_refused_in_seconds(text: str) -> None:
+    """Each of the first four took minutes, or 16 GB."""
+    box = hk.Box((-1, -1, -1), (1, 1, 1))
+    begun = time.process_time()
+    with pytest.raises(hk.MeshingError, match=REFUSED[text]):
+        hk.mesh(hk.expression(text), clip=box, tolerance=TOLERANCE)
+    assert time.process_time() - begun < SECONDS
+
+
+def test_caps_over_little_of_a_solid_are_as_near_as_they_are() -> None:
+    """Of waves cut by the box where they are thinner than the tolerance: 13 centers of caps were
+    taken for far ones, whatever the cells, in 32 s."""
+    assert judge(47) == "made"
+
+
+# Those that were wrong, took longest or ended in another error, and one of each kind.
+SEEDS = (0, 1, 4, 7, 9, 10, 20, 21, 24, 34, 37, 40, 50, 55, 59, 66, 67, 69, 72)
+
+
 @pytest.mark.slow
-def test_random_formulas_and_blobs_are_right_or_refused() -> None:
-    """Of 300 seeds, all of which were tried, some."""
-    assert [judge(seed) for seed in range(12)].count("made") >= 6
+@pytest.mark.parametrize("seed", SEEDS)
+def test_random_formulas_and_blobs_are_right_or_refused(seed: int) -> None:
+    if seed == 21:
+        pytest.xfail("a product with a pole: triangles cross there, found out in 19 s")
+    judge(seed)

@@ -18,7 +18,18 @@ from harnack.meshing.checks import MeshingError
 from harnack.meshing.edges import IntArray, boundary_edges, crosses, dots, edge_keys, lengths
 from harnack.meshing.lattice_surface import Surface
 
-__all__ = ["Shells", "cut_by", "largest_body", "largest_part", "parts_of", "turned_outwards"]
+__all__ = [
+    "Shells",
+    "cut_by",
+    "largest_body",
+    "largest_part",
+    "parts_of",
+    "turned_outwards",
+    "without_films",
+]
+
+# Parts no thicker than this part of their coordinates are made of rounding.
+_FILM = 1e-11
 
 
 def largest_part(surface: Surface) -> Surface:
@@ -54,6 +65,30 @@ def largest_body(surface: Surface) -> Surface:
         bodies[found] += shells.volumes[cavity]
     kept = outer[bodies[outer].argmax()] if len(outer) else -1
     return Surface.of(surface.vertices, surface.faces[owner[shells.number] == kept])
+
+
+def without_films(surface: Surface) -> Surface:
+    """A closed surface without the connected parts that are nothing but rounding: what is left of
+    two parts that cancel each other, such as a solid less itself."""
+    x, faces = surface.vertices, surface.faces
+    if not len(faces):
+        return surface
+    part = _parts(surface)
+    count = np.bincount(part)
+    corner = x[faces]
+    middle = (
+        np.stack([np.bincount(part, c) for c in corner.mean(axis=1).T], axis=1) / count[:, None]
+    )
+    corner = corner - middle[part][:, None]
+    normal = crosses(corner)
+    # Six times the volume and twice the area.
+    volume = np.abs(np.bincount(part, (corner[:, 0] * normal).sum(axis=1)))
+    area = np.bincount(part, np.linalg.norm(normal, axis=1))
+    is_film = 2 * volume <= 3 * _FILM * float(np.abs(x).max()) * area
+    if not is_film.any():
+        return surface
+    kept = faces[~is_film[part]]
+    return Surface.of(x, kept) if len(kept) else Surface(x[:0], kept)
 
 
 def parts_of(surface: Surface) -> list[dict[str, Any]]:

@@ -8,6 +8,7 @@ tetrahedron is cut by one triangle or quadrilateral, and signs at its corners al
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
@@ -53,7 +54,7 @@ _TOGETHER, _LONG = 1.0, 2.0
 _ON = 1e-3
 # So large a part of vertices may be farther from the level than that many cells: where signs change
 # by a jump.
-_MOST_JUMPS, _FAR = 0.1, 0.1
+_MOST_JUMPS, _FAR = 0.04, 0.1
 # A function that is its level at a larger part of so many points has no surface there.
 _MOST_FLAT, _MOST_PROBES = 0.75, 2000
 
@@ -221,7 +222,7 @@ def open_surface(
     points = lattice.points(coordinates)
     report(f"{len(points):,} points, {len(corners):,} tetrahedra")
     nowhere = np.zeros(len(points), np.bool_)
-    samples = _sampled(function, points)
+    samples = _sampled(function, points, lattice)
     first = _marched(function, points, samples, corners, nowhere, nowhere, lattice, walls)
     vertices, faces = first.vertices, first.faces
     _check_nothing_missed(function, points, samples, corners, first, faces, lattice, walls)
@@ -281,7 +282,7 @@ def closed_surface(
     report(f"{len(points):,} points, {len(corners):,} tetrahedra")
     is_wall = lattice.is_outer(coordinates)
     is_fixed = is_wall | ((coordinates == 1) | (coordinates == 2 * lattice.counts - 1)).any(axis=1)
-    samples = _sampled(function, points)
+    samples = _sampled(function, points, lattice)
     is_beyond = np.zeros(len(points), np.bool_)
     if does_matter is not None:
         is_beyond = lattice.beside(coordinates, ~does_matter) & ~is_wall
@@ -421,8 +422,9 @@ def _wall_faces(
     return face
 
 
-def _sampled(function: LevelFunction, points: FloatArray) -> Samples:
-    """The function at points; raises MeshingError where it is not finite."""
+def _sampled(function: LevelFunction, points: FloatArray, lattice: Lattice) -> Samples:
+    """The function at points of a lattice; raises HopelessError where it is not finite, or is its
+    level nearly everywhere."""
     samples = function.at(points)
     bad = ~np.isfinite(samples.value)
     if bad.any():
@@ -431,7 +433,7 @@ def _sampled(function: LevelFunction, points: FloatArray) -> Samples:
             f"{type(function.field).__name__} has no finite value at {bad.sum():,} points, such "
             f"as ({x:.4g}, {y:.4g}, {z:.4g}): choose a `clip` where it has"
         )
-    _check_is_no_volume(function, points, samples)
+    _check_is_no_volume(function, points, lattice)
     return samples
 
 
@@ -452,11 +454,10 @@ def _check_is_continuous(
         )
 
 
-def _check_is_no_volume(function: LevelFunction, points: FloatArray, samples: Samples) -> None:
+def _check_is_no_volume(function: LevelFunction, points: FloatArray, lattice: Lattice) -> None:
     """Raise if the function is its level nearly everywhere, up to rounding: such as x - x, of which
     no cells are proved empty, however small they are."""
-    flat = np.flatnonzero((samples.value == 0) | ~samples.gradient.any(axis=1))
-    if len(flat) <= _MOST_FLAT * len(points):
+    if len(points) <= _MOST_FLAT * 2 * math.prod(lattice.counts.tolist()):
         return
     some = points[:: -(-len(points) // _MOST_PROBES)]
     share = float(function.is_on_level(some).mean())

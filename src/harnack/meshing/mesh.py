@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     import trimesh
+    from manifold3d import Manifold
 
     from harnack.backend import FloatArray
 
@@ -316,6 +317,8 @@ def _by_signs(
             whole = manifold_of(signed(ends[0], -1.0, True))
         if math.isfinite(ends[1]):
             whole = whole - manifold_of(signed(ends[1], -1.0, True))
+        if field.has_sheets and len(levels) == 2:
+            _check_has_thickness(field, whole, ends, asked.tolerance * size)
         cut = volume or Box(tuple(box.lower.tolist()), tuple(box.upper.tolist()))
         whole ^= volume_manifold(cut, box.lower, box.upper, 0.5 * asked.tolerance * size)
         made, is_apart = surface_of(whole), False
@@ -328,6 +331,19 @@ def _by_signs(
         known["cloud"] = field.describe()
     _judge_signs(field, known, asked.tolerance * size)
     return _Made(made, size, known, function(levels[0], 1.0), _nothing, is_apart)
+
+
+def _check_has_thickness(
+    field: Field, whole: Manifold, ends: tuple[float, float], tolerance: float
+) -> None:
+    """Raise if both levels are the same triangles, where the field jumps across them."""
+    if 2 * abs(whole.volume()) < tolerance * whole.surface_area():
+        low, high = (f"{one:g}" for one in ends)
+        raise MeshingError(
+            f"the part between the levels {low} and {high} of this {type(field).__name__} has no "
+            f"thickness: it jumps across both at its triangles; for what is inside give "
+            f"solid=(0.5, math.inf)"
+        )
 
 
 def _of_both(facts: list[dict[str, Any]]) -> dict[str, Any]:

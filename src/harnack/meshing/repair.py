@@ -34,7 +34,7 @@ from harnack.meshing.harmonic_patches import Asked, HarmonicPatches, harmonic_pa
 from harnack.meshing.hole_patches import filled, hole_loops
 from harnack.meshing.lattice_surface import Surface
 from harnack.meshing.mesh import mesh as mesh_of
-from harnack.meshing.sound import joined, mended
+from harnack.meshing.sound import is_one_sided, joined, mended
 
 if TYPE_CHECKING:
     import trimesh
@@ -204,8 +204,9 @@ def _result(surface: Surface, facts: dict[str, Any], largest: bool) -> trimesh.T
     parts = parts_of(surface)
     dropped = 0
     if largest and len(parts) > 1:
-        surface = largest_body(surface)
+        whole, surface = surface, largest_body(surface)
         dropped = len(parts) - len(parts_of(surface))
+        facts = facts | {"kept": _count_of(surface, whole, facts["kept"])}
     made = ClosedMesh(surface.vertices, surface.faces, process=False, validate=False)
     made.metadata["harnack"] = {
         **facts,
@@ -214,6 +215,13 @@ def _result(surface: Surface, facts: dict[str, Any], largest: bool) -> trimesh.T
         "euler_characteristic": euler_characteristic(surface.faces),
     }
     return made
+
+
+def _count_of(surface: Surface, whole: Surface, first: int) -> int:
+    """How many of the first faces of a whole are in a surface that is a part of it."""
+    corners = [one.vertices[one.faces].reshape(-1, 9) for one in (surface, whole)]
+    there = {row.tobytes() for row in corners[0]}
+    return sum(row.tobytes() in there for row in corners[1][:first])
 
 
 def _silent(text: str) -> None:
@@ -229,7 +237,7 @@ def _check_is_mesh(mesh: Any) -> None:
 
 
 def _check_encloses(mesh: Any) -> None:
-    """Raise if all faces lie in a plane.
+    """Raise if all faces lie in a plane, or form a strip of one side only.
 
     Raises:
         MeshError: so; or as `validate_mesh`.
@@ -242,6 +250,11 @@ def _check_encloses(mesh: Any) -> None:
         raise MeshError(
             "all faces of the mesh lie in a plane, or nearly so: they enclose nothing that could "
             "be closed; give it a thickness first, or mesh its boundary with `thickness`"
+        )
+    if is_one_sided(weld_vertices(vertices)[faces]):
+        raise MeshError(
+            "the mesh has one side only, as a Moebius strip has: nothing is inside of it that "
+            "could be closed; give it a thickness first, in the program that made it"
         )
 
 
@@ -415,7 +428,7 @@ def _kept_with(
         how = Asked(asked.tolerance, asked.spacing, asked.seed, attempts, asked.report)
         rest = harmonic_patches(x, together, edges, how)
         x, together = np.concatenate([x, rest.vertices]), np.concatenate([together, rest.faces])
-    surface = Surface(x, together)
+    surface = Surface.of(x, together)
     if loops or asked.keep is None:
         _check_touching(together)
     if asked.keep is None:

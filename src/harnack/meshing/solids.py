@@ -37,6 +37,7 @@ from harnack.meshing.checks import (
     TooLargeError,
     may_help_again,
 )
+from harnack.meshing.clipping import without_films
 from harnack.meshing.closed_mesh import (
     box_manifold,
     extruded_manifold,
@@ -601,9 +602,10 @@ class _Joined:
     volume: Volume
 
     def without_slivers(self, length: float) -> Surface:
-        """The surface, short edges and slivers left out within a length."""
+        """The surface, short edges and slivers left out within a length, and bodies that are
+        nothing but rounding."""
         made = self.whole.simplify(length) if length > 0 else self.whole
-        return _on_box(surface_of(made), self.volume)
+        return _on_box(without_films(surface_of(made)), self.volume)
 
 
 def _put_together(

@@ -28,7 +28,7 @@ from harnack.meshing.edges import Edges, IntArray, boundary_edges, crosses, dire
 from harnack.meshing.hole_patches import filled, hole_loops
 from harnack.meshing.lattice_surface import Surface
 
-__all__ = ["Mended", "joined", "mended"]
+__all__ = ["Mended", "is_one_sided", "joined", "mended"]
 
 # How often the rings around holes are left out; and what part of all triangles may be.
 _MOST_RINGS, _MOST_LEFT_OUT = 6, 0.5
@@ -167,9 +167,10 @@ class _State:
     def without_branches(self) -> _State:
         """Without faces at edges of more than two; and oriented, without those at edges where that
         is not possible."""
-        edges = Edges.of(directed_edges(self.faces))
+        state = self.without_fins()
+        edges = Edges.of(directed_edges(state.faces))
         many = np.asarray((edges.uses > 2)[edges.index].reshape(3, -1).any(axis=0))
-        state = self.chosen(~many, "branching")
+        state = state.chosen(~many, "branching")
         turned = _against_neighbors(state.vertices, state.faces)
         oriented = np.where(turned[:, None], state.faces[:, ::-1], state.faces)
         pairs = directed_edges(oriented)
@@ -181,6 +182,28 @@ class _State:
             state.vertices, oriented, state.origin, state.is_turned ^ turned, state.counts
         )
         return state.chosen(~np.asarray(bad), "one-sided")
+
+    def without_fins(self) -> _State:
+        """Without sheets that hang on a surface: of the pieces between edges of more than two faces
+        those that end in the open, the smallest first, as long as there are such edges. The largest
+        piece stays."""
+        state = self
+        while True:
+            edges = Edges.of(directed_edges(state.faces))
+            if not (edges.uses > 2).any():
+                return state
+            piece = _pieces(edges, len(state.faces))
+            uses = edges.uses[edges.index].reshape(3, -1)
+            count = int(piece.max()) + 1
+            branches, ends = (
+                np.bincount(piece, has.any(axis=0), minlength=count) > 0
+                for has in (uses > 2, uses == 1)
+            )
+            area = np.bincount(piece, lengths(crosses(state.vertices[state.faces])))
+            fins = np.flatnonzero(branches & ends & (area < area.max()))
+            if not len(fins):
+                return state
+            state = state.chosen(piece != fins[area[fins].argmin()], "branching")
 
     def filled(self, loops: list[IntArray]) -> tuple[_State, list[IntArray], str]:
         """With patches where they pass the checks; the loops left, and why they are."""
@@ -219,9 +242,42 @@ class _State:
         return Mended(surface, kept, kept[turned], self.counts, holes)
 
 
+def _pieces(edges: Edges, count: int) -> IntArray:
+    """(m,) which of the pieces that edges of two faces hold together each of `count` faces belongs
+    to. edges: those of `directed_edges`."""
+    import scipy.sparse  # here: half a second that few need
+    import scipy.sparse.csgraph as csgraph_module
+
+    sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
+    order = np.argsort(edges.index, kind="stable")
+    one, other = (order[(edges.uses == 2)[edges.index[order]]].reshape(-1, 2) % count).T
+    joined = sparse.coo_matrix((np.ones(len(one)), (one, other)), shape=(count, count))
+    return np.asarray(csgraph.connected_components(joined, directed=False)[1], np.int64)
+
+
+def is_one_sided(faces: IntArray) -> bool:
+    """Whether a mesh ends in the open and no part of it, of those that edges of two faces hold
+    together, has two sides: as a Moebius strip."""
+    if not len(boundary_edges(faces)):
+        return False
+    part = _sided_parts(faces)
+    return bool((part[: len(faces)] == part[len(faces) :]).all())
+
+
 def _against_neighbors(x: FloatArray, faces: IntArray) -> BoolArray:
     """(m,) which faces are to be turned over for all that share an edge of two to agree: of each
     part those with the smaller area. Parts of one side only are left as they are."""
+    m, part = len(faces), _sided_parts(faces)
+    corner = x[faces]
+    area = lengths(crosses(corner))
+    as_is = np.bincount(part[:m], area, minlength=int(part.max(initial=-1)) + 1)
+    return as_is[part[:m]] < as_is[part[m:]]
+
+
+def _sided_parts(faces: IntArray) -> IntArray:
+    """(2m,) the parts that sides of faces belong to, first of all as they are and then of all
+    turned over: sides of neighbors that agree are joined. A part of one side only is joined to
+    itself turned over."""
     import scipy.sparse  # here: half a second that few need
     import scipy.sparse.csgraph as csgraph_module
 
@@ -236,8 +292,4 @@ def _against_neighbors(x: FloatArray, faces: IntArray) -> BoolArray:
     rows = np.concatenate([one, one + m])
     columns = np.concatenate([other + m * same, other + m * (1 - same)])
     joined = sparse.coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(2 * m, 2 * m))
-    part = np.asarray(csgraph.connected_components(joined, directed=False)[1])
-    corner = x[faces]
-    area = lengths(crosses(corner))
-    as_is = np.bincount(part[:m], area, minlength=int(part.max(initial=-1)) + 1)
-    return as_is[part[:m]] < as_is[part[m:]]
+    return np.asarray(csgraph.connected_components(joined, directed=False)[1], np.int64)

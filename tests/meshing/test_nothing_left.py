@@ -1,0 +1,96 @@
+"""Solids of which nothing is left, meshes without an inside, and sheets that hang on a surface."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import trimesh
+
+import harnack as hk
+from harnack.meshing.clipping import without_films
+from harnack.meshing.lattice_surface import Surface
+
+BALL = trimesh.creation.icosphere(2)
+
+
+@pytest.mark.parametrize("solid", [hk.solid(BALL), hk.Sphere(1.0)])
+def test_a_solid_less_itself_is_empty(solid: hk.Solid) -> None:
+    with pytest.raises(hk.MeshingError, match="empty"):
+        hk.mesh(solid - solid, tolerance=2e-2)
+
+
+def test_films_are_left_out_and_cavities_stay() -> None:
+    outer = trimesh.creation.box((3.0, 3.0, 3.0))
+    inner = trimesh.creation.box((2.0, 2.0, 2.0))
+    film = trimesh.creation.box((1.0, 1.0, 1e-14))
+    film.apply_translation((4.0, 0.0, 0.0))
+    parts = [outer.faces, inner.faces[:, ::-1] + 8, film.faces + 16]
+    x = np.concatenate([outer.vertices, inner.vertices, film.vertices])
+    made = without_films(Surface(x, np.concatenate(parts)))
+    assert np.array_equal(made.faces, np.concatenate(parts[:2]))
+    assert len(made.vertices) == 16
+
+
+def test_between_two_levels_that_are_the_same_triangles_is_nothing() -> None:
+    cube = trimesh.creation.box((1.0, 1.0, 1.0))
+    field = hk.WindingNumber(cube.vertices, cube.faces)
+    with pytest.raises(hk.MeshingError, match="no thickness"):
+        hk.mesh(field, solid=(0.25, 0.75), tolerance=1e-2)
+
+
+def strip(turns: int) -> trimesh.Trimesh:
+    """A closed strip, turned by so many half turns."""
+    n = 30
+    angle = 2 * np.pi * np.arange(n) / n
+    bend = 0.5 * turns * angle
+    ends = []
+    for s in (-0.3, 0.3):
+        r = 1 + s * np.cos(bend)
+        ends.append(np.column_stack([r * np.cos(angle), r * np.sin(angle), s * np.sin(bend)]))
+    x = np.stack(ends, axis=1).reshape(-1, 3)
+    faces: list[list[int]] = []
+    for k in range(n):
+        a, b, c, d = 2 * k, 2 * k + 1, 2 * k + 2, 2 * k + 3
+        if k == n - 1:
+            c, d = (1, 0) if turns % 2 else (0, 1)
+        faces += [[a, c, b], [b, c, d]]
+    return trimesh.Trimesh(x, faces, process=False)
+
+
+def test_a_strip_of_one_side_has_no_inside() -> None:
+    with pytest.raises(hk.geometry.MeshError, match="one side only"):
+        hk.repair(strip(1))
+
+
+def test_fins_cost_no_sound_triangle() -> None:
+    """A triangle, and a sheet of several, that hang on edges of a closed mesh."""
+    x, faces = np.asarray(BALL.vertices), np.asarray(BALL.faces)
+    a, b = faces[0, :2]
+    c, d = faces[100, :2]
+    n = len(x)
+    tips = np.array([1.5 * x[a], 1.5 * x[c], 1.5 * x[d]])
+    fins = [[a, b, n], [c, d, n + 1], [d, n + 2, n + 1]]
+    given = trimesh.Trimesh(np.concatenate([x, tips]), np.concatenate([faces, fins]), process=False)
+    made = hk.repair(given)
+    facts = made.metadata["harnack"]
+    assert (facts["stage"], facts["kept"], facts["patches"]) == ("sound", len(faces), 0)
+    assert facts["left_out"]["branching"] == len(fins)
+    assert math.isclose(made.volume, BALL.volume)
+    assert len(made.vertices) == n
+
+
+def test_vertices_of_no_face_are_left_out_where_all_is_kept() -> None:
+    x = np.concatenate([[[9.0, 9.0, 9.0]], BALL.vertices])
+    made = hk.repair(trimesh.Trimesh(x, BALL.faces[:-1] + 1, process=False))
+    assert made.metadata["harnack"]["stage"] == "kept"
+    assert np.abs(made.vertices).max() < 2
+
+
+def test_what_is_kept_counts_what_is_left_of_the_largest_body() -> None:
+    two = trimesh.util.concatenate(
+        [BALL, BALL.copy().apply_scale(0.5).apply_translation((3, 0, 0))]
+    )
+    made = hk.repair(two, largest=True)
+    assert made.metadata["harnack"]["kept"] == len(made.faces) == len(BALL.faces)
