@@ -15,8 +15,8 @@ from harnack.meshing.lattice_surface import Surface
 BALL = trimesh.creation.icosphere(2)
 
 
-@pytest.mark.parametrize("solid", [hk.solid(BALL), hk.Sphere(1.0)])
-def test_a_solid_less_itself_is_empty(solid: hk.Solid) -> None:
+def test_a_solid_less_itself_is_empty() -> None:
+    solid = hk.solid(BALL)
     with pytest.raises(hk.MeshingError, match="empty"):
         hk.mesh(solid - solid, tolerance=2e-2)
 
@@ -33,6 +33,7 @@ def test_films_are_left_out_and_cavities_stay() -> None:
     assert len(made.vertices) == 16
 
 
+@pytest.mark.slow
 def test_between_two_levels_that_are_the_same_triangles_is_nothing() -> None:
     cube = trimesh.creation.box((1.0, 1.0, 1.0))
     field = hk.WindingNumber(cube.vertices, cube.faces)
