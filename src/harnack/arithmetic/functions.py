@@ -113,7 +113,13 @@ def _sqrt(x: Interval) -> Ranges:
     low = fmax(x.low, 0)
     high = low if x.low is x.high else x.high
     root = _rising(dr.sqrt, Interval(low, high))
-    root = Interval(fmax(root.low, 0), root.high)
+    # Ends that rounding took below 0 count as 0; where both are below, there is no root.
+    is_none = x.high < 0
+    like = root.low
+    root = Interval(
+        select(is_none, dr.nan, fmax(root.low, 0), like),
+        select(is_none, dr.nan, root.high, like),
+    )
     slope = _half(_positive_reciprocal(root))
     second = -_half(slope * _positive_reciprocal(Interval(low, high)))
     return _where(x.low >= 0, (root, slope, second))
