@@ -54,8 +54,8 @@ __all__ = ["mesh"]
 # Cells across the level set, unless a spacing is given; curves have their own length besides.
 _ACROSS = 24
 _MOST_ATTEMPTS = 4
-# How much of the tolerance smooth level sets of solids take up, if the mesh is to be simplified and
-# if it is not: triangles that are cut have centers where none were.
+# How much of the tolerance smooth level sets of solids take up of which others cut a part, if the
+# mesh is to be simplified and if it is not: triangles that are cut have centers where none were.
 _BEFORE_SIMPLIFYING, _WITHOUT = 0.5, 0.75
 _ACROSS_BY_SIGNS, _ATTEMPTS_BY_SIGNS = 48, 2
 # Room around what has an extent, and around a curve whose surface has none, as a part of the size.

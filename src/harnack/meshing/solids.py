@@ -108,7 +108,7 @@ class RegionMesher:
     """Meshes solids in a box from `lower` to `upper`, (3,) each.
 
     tolerance: a length, of the middles of edges and faces; smooth_tolerance: of those of level sets
-        that are smooth. spacing: of cells, at most.
+        that are smooth and of which others cut a part. spacing: of cells, at most.
     per_wave: cells along a wave (`Field.wavelength`) at the least; None for as many as there are.
     mesh_angle: meshes level sets of angles, which end at a curve. most_faces: of each level set.
     evaluations, levels, finest: of fields, in points, how many level sets were meshed so far, and
@@ -131,6 +131,11 @@ class RegionMesher:
     finest: float = math.inf
     uploads: Uploads = dataclasses.field(default_factory=Uploads)
     others: Others = ()
+
+    @property
+    def _for_smooth(self) -> float:
+        """The tolerance of a level set that is smooth."""
+        return self.smooth_tolerance if self.others else self.tolerance
 
     def below(self, solid: Solid, level: float) -> Manifold:
         """The points of the box where a solid's function is at most `level`; what there is outside
@@ -246,7 +251,7 @@ class RegionMesher:
         made = closed_surface(
             function,
             lattice,
-            self.smooth_tolerance,
+            self._for_smooth,
             self.report,
             elsewhere=self._elsewhere(lattice),
         )
@@ -296,10 +301,10 @@ class RegionMesher:
         near = samples.distance <= np.median(samples.distance)
         steep = float(np.median(np.linalg.norm(samples.gradient[near], axis=1)))
         self.evaluations += len(points)
-        if high - low < 2 * self.smooth_tolerance * steep:
+        if high - low < 2 * self._for_smooth * steep:
             raise MeshingError(
                 f"the wall is about {(high - low) / steep:.2g} thick, and its sides are made "
-                f"within {self.smooth_tolerance:.2g}: choose a smaller `tolerance`, or make the "
+                f"within {self._for_smooth:.2g}: choose a smaller `tolerance`, or make the "
                 "wall thicker"
             )
 
@@ -531,7 +536,7 @@ def mesh_solid(
     """The boundary of the points of a volume where a solid's function is at most `level`.
 
     volume: None for all of space. tolerance: a part of the size; part: of the tolerance, what
-        smooth level sets take up. most_faces: of a level set.
+        smooth level sets take up of which others cut a part. most_faces: of a level set.
     angle_mesher: given a tolerance and a spacing, both lengths, how to mesh level sets of angles.
     check: of the surface, of which no triangles pass through each other, given the size; where it
         fails in known places, smaller cells are tried, and half the tolerance: beside a thin part
