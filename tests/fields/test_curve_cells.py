@@ -476,6 +476,19 @@ def test_many_rays_get_cells_by_themselves() -> None:
     assert (np.abs(wrapped(found - angle_of(curve)(x))) <= error + 1e-9).all()
 
 
+def test_loops_of_a_field_cannot_be_replaced() -> None:
+    """Neither as a whole nor in place: what was computed from them would stay, and be traced."""
+    given = wavy(50)
+    field = hk.SolidAngle(given)
+    with pytest.raises(AttributeError, match="loops"):
+        field.loops = (2 * given,)  # pyright: ignore[reportAttributeAccessIssue]
+    with pytest.raises(ValueError, match="read-only"):
+        field.loops[0][:] *= 2
+    given *= 2  # the caller's own
+    assert field.loops[0].max() < 1.01
+    assert field.for_rays(10**8).loops is field.loops
+
+
 @pytest.mark.parametrize("cells", [-1.0, math.inf, math.nan])
 def test_cells_is_a_number_of_megabytes(cells: float) -> None:
     with pytest.raises(ValueError, match="megabytes"):

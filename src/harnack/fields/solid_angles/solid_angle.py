@@ -138,10 +138,10 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
         cells: bool | float | None = None,
     ) -> None:
         super().__init__()
-        self.loops: Loops
         self.circles: tuple[Circle, ...]
         curves, self._movable = _movable_loops(loops)
-        self.loops, self.circles = validate_curves(curves)
+        found, self.circles = validate_curves(curves)
+        self._loops: Loops = tuple(_read_only(loop) for loop in found)
         self._net: Loops = net_loops(self.loops) if self.loops else ()
         self._net_circles = net_circles(self.circles)
         is_circle = not self._net and len(self._net_circles) == 1
@@ -169,7 +169,13 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
         self.cells = cells
         self.has_detail = bool(cells) and bool(self._net)
         self._detail: Real = 1.0
-        self._with_cells: Remembered[int, Self] = Remembered()
+        self._with_cells: Remembered[bool, Self] = Remembered()
+
+    @property
+    def loops(self) -> Loops:
+        """The loops of vertices as given. They stay as they are, as all else is computed from them
+        once: another curve is another field."""
+        return self._loops
 
     @property
     def _is_empty(self) -> bool:
@@ -515,13 +521,12 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
         """With cells, if none were asked for and none refused, where rays and edges are many."""
         if self.cells is not None or not self._least_rays() <= count:
             return self
-        key = id(self.loops)  # which the copy holds
-        if key not in self._with_cells:
+        if True not in self._with_cells:
             other = copy.copy(self)
             other.cells, other.has_detail, other._device = True, True, None
             other._extents, other._with_cells = Remembered(), Remembered()
-            self._with_cells[key] = other
-        return self._with_cells[key]
+            self._with_cells[True] = other
+        return self._with_cells[True]
 
     def _least_rays(self) -> float:
         """The number of rays from which on cells pay."""
@@ -696,6 +701,13 @@ def _along_curves(
         return tuple(sum(several) for several in zip(*found, strict=True))
 
     return known_along(line, sums.gradient, sums.distance, rates)
+
+
+def _read_only(loop: FloatArray) -> FloatArray:
+    """A view of a loop that cannot be written to."""
+    view = loop.view()
+    view.flags.writeable = False
+    return view
 
 
 def _movable_loops(loops: Any) -> tuple[Any, tuple[Any, ...]]:
