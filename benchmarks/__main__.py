@@ -24,6 +24,7 @@ from .distances import distances
 from .formulas import formulas
 from .growth import growth
 from .hart import hart
+from .hollow import hollow
 from .inclusion import inclusion
 from .laplacian import laplacian
 from .live import live
@@ -40,7 +41,7 @@ DOCS = Path(__file__).resolve().parent.parent / "docs"
 SECTIONS = (
     "rays", "convergence", "winding", "agreement", "versions", "inclusion", "laplacian", "hart",
     "povray", "antialiasing", "baselines", "formulas", "meshes", "repair", "clouds", "distances",
-    "pictures", "live", "cluster", "curves",
+    "pictures", "live", "cluster", "curves", "hollow",
 )  # fmt: skip
 
 
@@ -52,7 +53,9 @@ def main() -> None:
     parser.add_argument("--only", choices=SECTIONS, help="rewrite one section of the page")
     parser.add_argument("--bunny", type=Path, help="a surface file, for the winding numbers")
     parser.add_argument(
-        "--meshes", type=Path, help="a folder of surface files, for agreement, repair and clouds"
+        "--meshes",
+        type=Path,
+        help="a folder of surface files, for agreement, repair, clouds and hollow",
     )
     parser.add_argument("--before", type=Path, help="a checkout of an earlier version, to compare")
     arguments = parser.parse_args()
@@ -60,9 +63,10 @@ def main() -> None:
     if arguments.no_convergence and "convergence" in names:
         names.remove("convergence")
     if arguments.meshes is None:
-        if arguments.only == "agreement":
-            parser.error("agreement needs a folder of surface files: --meshes FOLDER")
-        names = [name for name in names if name != "agreement"]
+        of_files = ("agreement", "hollow")
+        if arguments.only in of_files:
+            parser.error(f"{arguments.only} needs a folder of surface files: --meshes FOLDER")
+        names = [name for name in names if name not in of_files]
     if arguments.before is None:
         if arguments.only == "versions":
             parser.error("versions needs a checkout of an earlier version: --before FOLDER")
@@ -84,6 +88,7 @@ def main() -> None:
         "convergence": lambda: _convergence(arguments.out.with_name("convergence.png")),
         "agreement": lambda: agreement(arguments.meshes),
         "versions": lambda: beside(arguments.before),
+        "hollow": lambda: hollow(arguments.meshes),
         "inclusion": inclusion,
         "laplacian": laplacian,
         "hart": hart,

@@ -333,12 +333,13 @@ def _measured(close: Close, given: Arrays, whole: Arrays) -> _Row:
     if not len(faces):
         return _Row(seconds, False, math.inf, "empty")
     mesh = trimesh.Trimesh(vertices, faces, process=False)
-    is_closed = bool(mesh.is_watertight and mesh.is_winding_consistent) and _is_solid(mesh)
+    is_closed = bool(mesh.is_watertight and mesh.is_winding_consistent) and is_solid(mesh)
     is_closed = is_closed and not len(intersecting_faces(vertices, faces))
     return _Row(seconds, is_closed, _hausdorff((vertices, faces), whole), stage)
 
 
-def _is_solid(mesh: trimesh.Trimesh) -> bool:
+def is_solid(mesh: trimesh.Trimesh) -> bool:
+    """Whether manifold3d takes it."""
     from manifold3d import Error, Manifold, Mesh64
 
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces).astype(np.uint64)

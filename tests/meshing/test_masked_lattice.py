@@ -12,7 +12,7 @@ from harnack.meshing import solids
 from harnack.meshing.checks import check_apart, check_manifold
 from harnack.meshing.edges import boundary_edges
 from harnack.meshing.lattice import Lattice
-from harnack.meshing.lattice_surface import closed_surface
+from harnack.meshing.lattice_surface import Elsewhere, closed_surface
 from harnack.meshing.samples import LevelFunction
 
 FOUR = Lattice.filling(np.zeros(3), np.full(3, 4.0), 1.0)
@@ -34,7 +34,8 @@ def beyond_two(points: np.ndarray) -> np.ndarray:
 def test_cells_at_the_level_are_chosen_where_they_matter_and_negative_ones_at_the_end() -> None:
     """Of 4 x 4 x 4 cells those of y > 3 are proved not to matter: their centers are 1.5 away from
     what does, and their corners 0.87 from their centers."""
-    chosen, does = FOUR.cells_that_matter(distance_to_plane, beyond_two, side_of_plane, 1000)
+    matter = FOUR.cells_not_empty(beyond_two, 1000)
+    chosen, does = FOUR.cells_that_matter(distance_to_plane, matter, side_of_plane, 1000)
     assert does[:, :3].all()
     assert not does[:, 3].any()
     expected = {(x, y, z) for x in (1, 2) for y in range(3) for z in range(4)}
@@ -43,9 +44,8 @@ def test_cells_at_the_level_are_chosen_where_they_matter_and_negative_ones_at_th
 
 
 def test_all_cells_matter_where_nothing_is_elsewhere() -> None:
-    chosen, does = FOUR.cells_that_matter(
-        distance_to_plane, lambda p: np.zeros(len(p)), side_of_plane, 1000
-    )
+    matter = FOUR.cells_not_empty(lambda p: np.zeros(len(p)), 1000)
+    chosen, does = FOUR.cells_that_matter(distance_to_plane, matter, side_of_plane, 1000)
     assert does.all()
     assert sorted(map(tuple, chosen.tolist())) == sorted(
         map(tuple, FOUR.cells_not_empty(distance_to_plane, 1000).tolist())
@@ -71,12 +71,12 @@ def test_a_surface_is_closed_where_nothing_matters_and_as_it_was_elsewhere() -> 
     """A ball, of which only the lower half is asked for."""
     lattice = Lattice.filling(np.full(3, -1.3), np.full(3, 1.3), 0.1, layers=2)
 
-    def made(elsewhere: object) -> tuple[np.ndarray, np.ndarray]:
+    def made(elsewhere: Elsewhere | None) -> tuple[np.ndarray, np.ndarray]:
         function = LevelFunction(hk.Sphere(1.0), 0.0)
-        one = closed_surface(function, lattice, 5e-3, lambda _: None, elsewhere=elsewhere)  # type: ignore[arg-type]
+        one = closed_surface(function, lattice, 5e-3, lambda _: None, elsewhere=elsewhere)
         return one.vertices, one.faces
 
-    vertices, faces = made(lambda p: np.maximum(p[:, 2], 0.0))
+    vertices, faces = made(Elsewhere(lambda p: np.maximum(p[:, 2], 0.0)))
     assert not len(boundary_edges(faces))
     check_manifold(faces, vertices)
     check_apart(vertices, faces)
@@ -106,3 +106,19 @@ def test_parts_made_where_they_matter_are_the_same(
         monkeypatch.setattr(solids, "_MANY_CELLS", most)
         volumes.append(float(hk.mesh(PARTS[name], tolerance=5e-3).volume))
     assert volumes[0] == pytest.approx(volumes[1], rel=2e-3)
+
+
+def test_both_sides_of_a_wall_ask_once_where_the_other_parts_are(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked: list[int] = []
+    whole = Elsewhere.cells_beside
+
+    def counted(self: Elsewhere, lattice: Lattice, most: int) -> np.ndarray:
+        asked.append(len(self.found))
+        return whole(self, lattice, most)
+
+    monkeypatch.setattr(Elsewhere, "cells_beside", counted)
+    monkeypatch.setattr(solids, "_MANY_CELLS", 0)
+    hk.mesh(BALL & WALLS, tolerance=1e-2)
+    assert asked == [0, 1]

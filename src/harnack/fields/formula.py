@@ -12,7 +12,9 @@ import copy
 import dataclasses
 import itertools
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
@@ -45,6 +47,21 @@ _TIE = 1024.0
 _LONG = 10.0
 
 
+# Whether samples are asked for without promises that are weaker than others.
+_WITHOUT_WEAKER: ContextVar[bool] = ContextVar("without_weaker", default=False)
+
+
+@contextmanager
+def without_weaker() -> Generator[None]:
+    """Samples of formulas have no weaker promises, which take several times as long to record as
+    value and gradient: for callers that use these alone."""
+    token = _WITHOUT_WEAKER.set(True)
+    try:
+        yield
+    finally:
+        _WITHOUT_WEAKER.reset(token)
+
+
 class Formula(Field):
     """A field given by `formula`.
 
@@ -66,6 +83,8 @@ class Formula(Field):
 
     def evaluate(self, p: Vec3) -> Sample:
         sample = self._one_sided(p, self.sample_alone(p))
+        if _WITHOUT_WEAKER.get():
+            return sample
         return dataclasses.replace(sample, weaker=self._lipschitz_near(p, sample))
 
     def _one_sided(self, p: Vec3, sample: Sample) -> Sample:

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 __all__ = [
     "CrossingError",
     "EmptyError",
+    "FarError",
     "HopelessError",
     "LocalError",
     "MeshingError",
@@ -318,6 +319,10 @@ class LocalError(MeshingError):
         self.places = places
 
 
+class FarError(LocalError):
+    """Vertices and centers of faces that are too far from the level: the places."""
+
+
 class CrossingError(LocalError):
     """Triangles that pass through each other, by index; places: their centers."""
 
@@ -448,11 +453,11 @@ def check_near_level(
     smaller than half of the tolerance are as near as their corners.
 
     Raises:
-        LocalError: with the points that are not.
+        FarError: with the points that are not.
     """
     far, count = far_from_level(function, vertices, faces, tolerance, volume)
     if len(far):
-        raise LocalError(
+        raise FarError(
             f"{len(far):,} of {count:,} vertices and centers of triangles are farther than "
             f"the tolerance, {tolerance:.3g}, from the level, such as {_point(far[0])}: "
             "choose a smaller `spacing` or a larger `tolerance`",

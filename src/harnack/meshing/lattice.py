@@ -114,12 +114,12 @@ class Lattice:
         return index[(index < self.counts).all(axis=1)]
 
     def cells_that_matter(
-        self, clearance: Clearance, elsewhere: Clearance, values: Clearance, most_faces: int
+        self, clearance: Clearance, matter: IntArray, values: Clearance, most_faces: int
     ) -> tuple[IntArray, BoolArray]:
         """(n, 3) indices of the cells that may hold the level set or are negative beside cells that
         do not matter, and of all cells of the lattice which do (counts).
 
-        elsewhere: of points (k, 3), how far around them nothing matters, by proof. values: of the
+        matter: (k, 3) indices of the cells that may matter (`cells_not_empty`). values: of the
             function. What does not matter counts as positive: all points of such cells do. As in
             the module's proof, tetrahedra at the chosen cells then have all faces between points
             of two signs: a cell that is not chosen has a center of the sign of its corners that
@@ -128,7 +128,6 @@ class Lattice:
         Raises:
             MeshingError: there are too many.
         """
-        matter = self.cells_not_empty(elsewhere, most_faces)
         does = np.zeros(tuple(self.counts.tolist()), np.bool_)
         does[tuple(matter.T)] = True
         centers = self.points(2 * matter + 1)

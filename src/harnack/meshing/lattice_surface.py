@@ -8,6 +8,7 @@ tetrahedron is cut by one triangle or quadrilateral, and signs at its corners al
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from harnack.tree.cells import Clearance
 
 __all__ = [
+    "Elsewhere",
     "MissedError",
     "Surface",
     "check_nothing_missed",
@@ -204,6 +206,31 @@ class Surface:
         return Surface(self.vertices, self.faces[:, ::-1])
 
 
+@dataclass(frozen=True)
+class Elsewhere:
+    """Where nothing matters, of one or several surfaces: how far around points (k, 3) nothing does.
+
+    found: the cells of lattices that are not proved to be there, each looked for once.
+    """
+
+    clearance: Clearance
+    found: dict[tuple[float, ...], IntArray] = dataclasses.field(default_factory=dict)
+
+    def cells_beside(self, lattice: Lattice, most: int) -> IntArray:
+        """(n, 3) indices of the cells that are not there, and of some around them.
+
+        Raises:
+            MeshingError: there are more than `most` triangles would take.
+        """
+        key = (*lattice.lower.tolist(), *lattice.size.tolist(), *lattice.counts.tolist(), most)
+        if key not in self.found:
+            border = _BORDER * float(lattice.size.max())
+            self.found[key] = lattice.cells_not_empty(
+                lambda points: self.clearance(points) - border, most
+            )
+        return self.found[key]
+
+
 def open_surface(
     function: LevelFunction, lattice: Lattice, tolerance: float, report: Callable[[str], None]
 ) -> tuple[Surface, Isotopy]:
@@ -247,7 +274,7 @@ def closed_surface(
     report: Callable[[str], None],
     *,
     as_cut: bool = False,
-    elsewhere: Clearance | None = None,
+    elsewhere: Elsewhere | None = None,
 ) -> Surface:
     """The boundary of the points of a lattice's box where the function is negative.
 
@@ -259,8 +286,8 @@ def closed_surface(
     as_cut: leave the triangles as the cells cut them, which never pass through each other, and
         leave out what lies between points of the lattice: for functions with creases everywhere, as
         distances from meshes have, and cells of about the tolerance.
-    elsewhere: of points (k, 3), how far around them nothing matters; there, but for a few cells at
-        its border, the function counts as positive, and the surface is closed by coarse triangles.
+    elsewhere: where nothing matters: there, but for a few cells at the border, the function counts
+        as positive, and the surface is closed by coarse triangles.
 
     Raises:
         MeshingError: too many cells.
@@ -269,9 +296,8 @@ def closed_surface(
     if elsewhere is None:
         cells = lattice.cells_not_empty(function.clearance, most)
     else:
-        far = _less_cells(elsewhere, _BORDER * float(lattice.size.max()))
         cells, does_matter = lattice.cells_that_matter(
-            function.clearance, far, function.values, most
+            function.clearance, elsewhere.cells_beside(lattice, most), function.values, most
         )
     outer = lattice.outer_cells()
     if does_matter is not None:
@@ -298,8 +324,9 @@ def closed_surface(
     if as_cut:
         return Surface.of(vertices, np.concatenate([rest, *caps]))
     _check_nothing_missed(
-        function, points, samples, corners, first, faces, lattice, inner, elsewhere
-    )
+        function, points, samples, corners, first, faces, lattice, inner,
+        None if elsewhere is None else elsewhere.clearance,
+    )  # fmt: skip
     # What ends at the outermost cells is moved and cut, its ends are not.
     if len(rest):
         _check_is_continuous(function, vertices, rest, lattice)
@@ -352,10 +379,6 @@ def _are_negative(function: LevelFunction, lattice: Lattice, cells: IntArray) ->
     open_rows = np.flatnonzero(~is_sure[index])
     negative[open_rows] = function.values(lattice.points(2 * cells[open_rows] + 1)) <= 0
     return negative
-
-
-def _less_cells(elsewhere: Clearance, length: float) -> Clearance:
-    return lambda points: elsewhere(points) - length
 
 
 def _beyond(samples: Samples, rows: BoolArray) -> Samples:

@@ -466,9 +466,8 @@ def _solid(
         _check_level(region, made, asked.tolerance * size, asked.volume)
 
     def check(made: Surface, size: float) -> None:
-        asked.report("checking")
-        check_level(made, size)
         check_manifold(made.faces, made.vertices)
+        check_level(made, size)
 
     made = mesh_solid(
         cast("Solid", region.field),

@@ -14,6 +14,7 @@ from harnack.backend import BoolArray, FloatArray, choose_backend
 from harnack.backend.elementary import length
 from harnack.enclosures import Gaps, Slopes, TargetLevels, choose_proofs, longest_step
 from harnack.fields.clearance import distance_below
+from harnack.fields.formula import without_weaker
 from harnack.fields.points import in_batches
 from harnack.fields.solids.mesh_solid import shared_samples
 from harnack.meshing.edges import lengths
@@ -120,7 +121,7 @@ class LevelFunction:
         """(n,) f - level alone."""
 
         def value(p: Vec3) -> tuple[Real]:
-            with shared_samples():
+            with shared_samples(), without_weaker():
                 return (self._prepared.evaluate(p).value,)
 
         return self.wrapped(self._in_batches(points, value)[0])
@@ -160,10 +161,12 @@ class LevelFunction:
         return self._in_batches(points, bound)[0]
 
     def _evaluated(self, p: Vec3) -> tuple[Real, Vec3, Real]:
+        if self.period is None:
+            with shared_samples(), without_weaker():
+                sample = self._prepared.evaluate(p)
+            return sample.value, sample.gradient, self._backend.Float(0)
         with shared_samples():
             sample = self._prepared.evaluate(p)
-        if self.period is None:
-            return sample.value, sample.gradient, self._backend.Float(0)
         steepest = length(sample.gradient) + sample.gradient_error
         slopes = Slopes(-steepest, steepest)
         enclosures = _PROOFS.enclose(

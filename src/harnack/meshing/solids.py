@@ -32,6 +32,7 @@ from harnack.fields.solids.thread import Thread
 from harnack.geometry import Ball, Box, Intersection, Volume
 from harnack.meshing.checks import (
     CrossingError,
+    FarError,
     LocalError,
     MeshingError,
     TooLargeError,
@@ -50,19 +51,19 @@ from harnack.meshing.closed_mesh import (
 from harnack.meshing.common_parts import common_parts_taken_out
 from harnack.meshing.lattice import Lattice
 from harnack.meshing.lattice_surface import (
+    Elsewhere,
     MissedError,
     Surface,
     closed_surface,
     cut_where_far,
 )
+from harnack.meshing.nearing import brought_near
 from harnack.meshing.samples import CELLS_PER_WAVE, LevelFunction, Samples, Uploads
 from harnack.meshing.thread_mesh import thread_manifold
 from harnack.meshing.uncrossing import made_apart
 
 if TYPE_CHECKING:
     from manifold3d import Manifold
-
-    from harnack.tree.cells import Clearance
 
 __all__ = [
     "AngleMesher",
@@ -115,6 +116,7 @@ class RegionMesher:
         the smallest spacing of these.
     uploads: of the fields that were meshed so far.
     others: parts that everything meshed next is intersected with (see `Others`).
+    last_elsewhere: where others left nothing, when that was asked for last.
     """
 
     lower: FloatArray
@@ -131,6 +133,7 @@ class RegionMesher:
     finest: float = math.inf
     uploads: Uploads = dataclasses.field(default_factory=Uploads)
     others: Others = ()
+    last_elsewhere: tuple[Others, Elsewhere] | None = None
 
     @property
     def _for_smooth(self) -> float:
@@ -211,12 +214,14 @@ class RegionMesher:
         finally:
             self.others = kept
 
-    def _elsewhere(self, lattice: Lattice) -> Clearance | None:
+    def _elsewhere(self, lattice: Lattice) -> Elsewhere | None:
         """How far around points the other parts leave nothing, by proof; None if nothing is to be
-        gained by it."""
+        gained by it. The two sides of a wall have the same."""
         if not self.others or math.prod(lattice.counts.tolist()) < _MANY_CELLS:
             return None
-        functions = [self._function(one, level) for one, level in self.others]
+        if self.last_elsewhere is not None and self.last_elsewhere[0] is self.others:
+            return self.last_elsewhere[1]
+        functions = [self.function(one, level) for one, level in self.others]
 
         def clearance(points: FloatArray) -> FloatArray:
             found = np.zeros(len(points))
@@ -226,7 +231,9 @@ class RegionMesher:
                 found[outside] = one.clearance(points[outside])
             return found
 
-        return clearance
+        made = Elsewhere(clearance)
+        self.last_elsewhere = self.others, made
+        return made
 
     def smooth(self, field: Field, level: float) -> tuple[Surface, bool]:
         """The boundary of {f <= level} as one level set, and whether it is all of it: if not, it is
@@ -245,7 +252,7 @@ class RegionMesher:
         if self.per_wave is not None and field.wavelength is not None:
             spacing = min(spacing, field.wavelength / self.per_wave)
         self.finest = min(self.finest, spacing)
-        function = self._function(_entire(field), level)
+        function = self.function(_entire(field), level)
         self.report(f"level {level:g} of {type(field).__name__} in cells of {spacing:.3g}")
         lattice = Lattice.filling(lower, upper, spacing, layers=2)
         made = closed_surface(
@@ -259,7 +266,8 @@ class RegionMesher:
         self.levels += 1
         return made, is_whole
 
-    def _function(self, field: Field, level: float) -> LevelFunction:
+    def function(self, field: Field, level: float) -> LevelFunction:
+        """f - level, continued beyond the field's domain."""
         return _WithinDomain(field, level, most_faces=self.most_faces, uploads=self.uploads)
 
     def _space(self) -> Manifold:
@@ -296,7 +304,7 @@ class RegionMesher:
         )
         points = lattice.points(2 * np.argwhere(np.ones(lattice.counts)) + 1)
         middle = 0.5 * (low + high)
-        samples = self._function(field, middle).at(points)
+        samples = self.function(field, middle).at(points)
         # Where the wall may be near.
         near = samples.distance <= np.median(samples.distance)
         steep = float(np.median(np.linalg.norm(samples.gradient[near], axis=1)))
@@ -335,7 +343,7 @@ class RegionMesher:
             return manifold_of(Surface(np.zeros((0, 3)), np.zeros((0, 3), np.int64)))
         cells = min(self.spacing, _CELLS_OF_OFFSET * self.tolerance)
         self.finest = min(self.finest, cells)
-        function = dataclasses.replace(self._function(solid, level), secants=_SECANTS)
+        function = dataclasses.replace(self.function(solid, level), secants=_SECANTS)
         self.report(f"level {level:g} of a mesh in cells of {cells:.3g}")
         lattice = Lattice.filling(lower - cells, upper + cells, cells, layers=2)
         made = closed_surface(function, lattice, self.tolerance, self.report, as_cut=True)
@@ -538,9 +546,10 @@ def mesh_solid(
     volume: None for all of space. tolerance: a part of the size; part: of the tolerance, what
         smooth level sets take up of which others cut a part. most_faces: of a level set.
     angle_mesher: given a tolerance and a spacing, both lengths, how to mesh level sets of angles.
-    check: of the surface, of which no triangles pass through each other, given the size; where it
-        fails in known places, smaller cells are tried, and half the tolerance: beside a thin part
-        triangles within it may be anywhere.
+    check: of the surface, of which no triangles pass through each other, given the size, that it is
+        near the level last. Where it is not, in a few places, these are mended (`brought_near`);
+        where another check fails in known places, or that is not enough, smaller cells are tried,
+        and half the tolerance: beside a thin part triangles within it may be anywhere.
 
     Raises:
         MeshingError: it has no bounds; it is empty; a part cannot be meshed.
@@ -561,7 +570,8 @@ def mesh_solid(
         )  # fmt: skip
         try:
             made = _apart(_put_together(mesher, solid, level, volume), error)
-            check(made, size)
+            report("checking")
+            made = _checked(mesher, solid, level, made, size, check)
             break
         except TooLargeError as large:
             if first is None:
@@ -578,6 +588,32 @@ def mesh_solid(
                 error *= 0.5
             report(f"{wrong}; so cells of {cells:.3g}")
     return SolidMesh(made, min(cells, mesher.finest), mesher.evaluations, mesher.levels, size)
+
+
+def _checked(
+    mesher: RegionMesher,
+    solid: Solid,
+    level: float,
+    made: Surface,
+    size: float,
+    check: Callable[[Surface, float], None],
+) -> Surface:
+    """The surface, checked; brought nearer to the level in a few places, if need be.
+
+    Raises:
+        MeshingError: it fails the check.
+    """
+    try:
+        check(made, size)
+    except FarError as far:
+        mended = brought_near(
+            mesher.function(solid, level), made, far.places, 2 * mesher.tolerance,
+            lambda one: check(one, size),
+        )  # fmt: skip
+        if mended is None:
+            raise
+        return mended
+    return made
 
 
 def _apart(parts: Surface | _Joined, tolerance: float) -> Surface:
