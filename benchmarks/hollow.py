@@ -64,7 +64,7 @@ def hollow(folder: Path) -> str:
     ]
     paths = [path for name in _NAMES if (path := folder / f"{name}.obj").exists()]
     with get_context("spawn").Pool(_AT_ONCE, maxtasksperchild=1) as pool:
-        for path, row in zip(paths, pool.map(_measured, paths, chunksize=1), strict=True):
+        for path, row in zip(paths, pool.imap(_measured, paths), strict=True):
             if isinstance(row, str):
                 lines.append(f"| {path.stem} | | | | refused: {row} | | | |")
                 continue

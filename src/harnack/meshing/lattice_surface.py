@@ -214,7 +214,9 @@ class Elsewhere:
     """
 
     clearance: Clearance
-    found: dict[tuple[float, ...], IntArray] = dataclasses.field(default_factory=dict)
+    found: dict[tuple[float, ...], IntArray] = dataclasses.field(
+        default_factory=dict[tuple[float, ...], IntArray]
+    )
 
     def cells_beside(self, lattice: Lattice, most: int) -> IntArray:
         """(n, 3) indices of the cells that are not there, and of some around them.
