@@ -451,14 +451,15 @@ def test_memory_is_bounded_and_stated() -> None:
         assert (np.abs(wrapped(found - truth)) <= error + 1e-9).all()
     assert sizes[0] > sizes[1] > sizes[2] > sizes[3] == 0
     assert "cells" not in hk.SolidAngle(curve, cells=False).describe()
-    assert hk.SolidAngle(curve).describe()["cells"] == "from 625,000 rays on"
+    assert hk.SolidAngle(curve).describe()["cells"] == "from 1,000,000 rays on"
 
 
 def test_many_rays_get_cells_by_themselves() -> None:
+    assert hk.SolidAngle(wavy(100)).describe()["cells"] == "from 2,500,000 rays on"
     curve = wavy(1000)
     field = hk.SolidAngle(curve)
-    assert field.for_rays(249_999) is field
-    with_cells = field.for_rays(250_000)
+    assert field.for_rays(999_999) is field
+    with_cells = field.for_rays(1_000_000)
     assert with_cells.cells is True
     assert field.for_rays(10**8) is with_cells
     assert field.cells is None

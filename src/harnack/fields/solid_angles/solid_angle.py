@@ -73,9 +73,10 @@ _NARROW = 1e-9 * _PERIOD
 _MOST_PAIRS = 3_000_000
 # Sides of the polygons that stand for circles where a boundary is drawn.
 _SIDES = 256
-# Cells are built by themselves from so many rays times edges on, which take five times as long as
-# to build the cells, and for no fewer edges.
-_PAYS, _LEAST_EDGES = 2.5e8, 48
+# Cells are built by themselves from so many rays times edges on, for no fewer rays and edges. To
+# trace those takes five times as long as to build the cells of a knot; those of a tangle of a
+# thousand edges take ten times as long as a knot's.
+_PAYS, _LEAST_RAYS, _LEAST_EDGES = 2.5e8, 1e6, 48
 # Megabytes that cells may take by default; and the most planes of the extent of a curve in convex
 # position with cells, by experiment: with hundreds, clipping rays takes longer than the march.
 _MEGABYTES, _PLANES = 256.0, 48
@@ -319,22 +320,22 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
         rounding = on.rounding
         distance = sums.distance * (1 - SUM_ROUNDING) - rounding
         known = bends(sums.cubes, sums.fourths, distance)
+        rounded = left_out.rounding + near_rounding(epsilon, x, sums.squares)
         if self.certificate == "edges":
             ball = swept_ball(sums.angle, sums.gradient, sums.squares, known, left_out.slope)
         elif self.certificate == "planar":
             ball = self._planar_ball(on, x, sums, distance, left_out.value)
         else:
-            ball = _in_range(sums.angle, distance, left_out.value)
+            ball = _in_range(sums.angle, distance, left_out.value + rounded)
         # At the curve itself, up to rounding, f has all values (`uncanceled_edges`) and no
         # gradient: give one so steep that the point counts as close to any level. Anywhere else NaN
         # stays NaN, and the tracer accepts no such point.
         met = sums.distance <= 2 * rounding
         steep = on.backend.Array3f(0, 0, 4 * _PERIOD / rounding)
         gradient = dr.select(met, steep, sums.gradient)
-        error, gradient_error = left_out.rounding, left_out.slope
+        gradient_error = left_out.slope
         truncation = dr.select(met, 0, left_out.value)
-        error = error + truncation
-        error = error + dr.select(met, 0, near_rounding(epsilon, x, sums.squares))
+        error = truncation + dr.select(met, left_out.rounding, rounded)
         if sums.circles is not None:
             own = sums.circles
             # Measured: 15 units in the last place of a circle's angle and 60 of its gradient (near
@@ -532,7 +533,8 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
         """The number of rays from which on cells pay."""
         edges = sum(map(len, self._net))
         is_fixed = not self._movable and self._asked != "paper"
-        return _PAYS / edges if is_fixed and edges >= _LEAST_EDGES else math.inf
+        few = not is_fixed or edges < _LEAST_EDGES
+        return math.inf if few else max(_LEAST_RAYS, _PAYS / edges)
 
     def describe(self) -> dict[str, Any]:
         return {
@@ -674,12 +676,12 @@ def _in_range(angle: Real, distance: Real, error: Real) -> HarmonicBall:
     """The ball for curves in convex position, whose lift stays in (-6 pi, 6 pi) if its value at the
     center is the principal one, in (-2 pi, 2 pi).
 
-    angle: the value, which need not be that one. error: of the angle, beyond rounding: where it
-    leaves two values possible, the range holds those of both.
+    angle: the value, which need not be that one. error: of the angle: where it leaves two values
+    possible, the range holds those of both.
     """
     principal = angle - _PERIOD * dr.round(angle / _PERIOD)
     moved = angle - principal
-    wraps = dr.select((error > 0) & (dr.abs(principal) > 0.5 * _PERIOD - error), _PERIOD, 0)
+    wraps = dr.select(dr.abs(principal) > 0.5 * _PERIOD - error, _PERIOD, 0)
     lower, upper = dr.select(principal < 0, wraps, 0), dr.select(principal > 0, wraps, 0)
     return HarmonicBall(distance, moved - 1.5 * _PERIOD - lower, moved + 1.5 * _PERIOD + upper)
 
