@@ -359,6 +359,7 @@ def judge(seed: int) -> str:
 REFUSED = {
     "sqrt(x) - y": "no finite value",
     "x - x": "volume and no surface",
+    "max(x, 0)": "volume and no surface",
     "sin(x + y)^2 + cos(x + y)^2 - 1": "volume and no surface",
     "atan2(y, x) - 3*z": "jumps",
     "max((x^2 + y^2 + z^2 + 0.34)^2 - 1.6*(x^2 + y^2), atan2(y, x) - 3*z)": "jumps",
@@ -383,7 +384,7 @@ def test_caps_over_little_of_a_solid_are_as_near_as_they_are() -> None:
 
 
 # Those that were wrong, took longest or ended in another error, and one of each kind.
-SEEDS = (0, 1, 4, 7, 9, 10, 20, 21, 24, 34, 37, 40, 50, 55, 59, 66, 67, 69, 72)
+SEEDS = (0, 1, 4, 7, 9, 10, 20, 21, 24, 34, 37, 40, 50, 55, 59, 66, 67, 69, 70, 72)
 
 
 @pytest.mark.slow

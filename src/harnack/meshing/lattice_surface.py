@@ -59,6 +59,8 @@ _ON = 1e-3
 _MOST_JUMPS, _FAR = 0.04, 0.1
 # A function that is its level at a larger part of so many points has no surface there.
 _MOST_FLAT, _MOST_PROBES = 0.75, 2000
+# How far around a point, in cells, the function has to be its level for that to be a volume.
+_FLAT_AROUND = 0.25
 
 
 class MissedError(MeshingError):
@@ -87,7 +89,7 @@ def check_nothing_missed(
         how far around points it does not.
 
     Raises:
-        MissedError: with one of the places.
+        MissedError: with one of the places. HopelessError: the function is its level in a volume.
     """
     import scipy.spatial  # here: half a second that few need
 
@@ -111,12 +113,29 @@ def check_nothing_missed(
         x = x[elsewhere(x) <= 0]
     part = _longest_part(x, _TOGETHER * size)
     if len(part) and np.ptp(part, axis=0).max() >= _LONG * size:
+        _check_is_no_volume_there(function, part, _FLAT_AROUND * size)
         a, b, c = part[0]
         raise MissedError(
             f"cells of {size:.3g} miss parts of the level set, such as that at ({a:.4g}, {b:.4g}, "
             f"{c:.4g}), which are thinner or smaller: choose a smaller `spacing`, or for a wall or "
             "an edge make the solid of smooth parts, such as hk.solid(f, between=(low, high)) or "
             "hk.solid(f, below=0) & hk.solid(g, below=0)"
+        )
+
+
+def _check_is_no_volume_there(function: LevelFunction, part: FloatArray, reach: float) -> None:
+    """Raise if the function is its level, up to rounding, at most of some points (n, 3) and on all
+    sides of them: such as max(x, 0), of which no cells are small enough."""
+    some = part[:: -(-len(part) // _MOST_PROBES)]
+    ways = reach * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
+    around = (some[:, None] + ways).reshape(-1, 3)
+    is_flat = function.is_on_level(around).reshape(len(some), -1).all(axis=1)
+    if is_flat.mean() > 0.5:
+        a, b, c = some[is_flat][0]
+        raise HopelessError(
+            f"{type(function.field).__name__} is {function.level:g}, up to rounding, at and around "
+            f"points such as ({a:.4g}, {b:.4g}, {c:.4g}): its level there is a volume and no "
+            "surface; choose another level"
         )
 
 

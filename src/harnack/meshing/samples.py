@@ -130,7 +130,8 @@ class LevelFunction:
         """(n,) where f is the level up to its error: rounding, and what a sum leaves out."""
 
         def both(p: Vec3) -> tuple[Real, Real]:
-            sample = self._prepared.evaluate(p)
+            with without_weaker():
+                sample = self._prepared.evaluate(p)
             return sample.value, self._backend.Float(sample.error)
 
         value, error = self._in_batches(points, both)

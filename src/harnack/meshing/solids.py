@@ -621,7 +621,8 @@ def _apart(parts: Surface | _Joined, tolerance: float) -> Surface:
     without slivers.
 
     Raises:
-        MeshingError: it is empty; a CrossingError where that does not help.
+        MeshingError: it is empty; a CrossingError where that does not help, or hardly any fewer
+            triangles cross where less is left out.
     """
     raised: CrossingError | None = None
     for share in _SLIVERS_WITHIN if isinstance(parts, _Joined) else (0.0,):
@@ -631,6 +632,8 @@ def _apart(parts: Surface | _Joined, tolerance: float) -> Surface:
         try:
             return made_apart(one, _MENDED_WITHIN * tolerance)
         except CrossingError as error:
+            if not may_help_again(error, raised):
+                raise
             raised = error
     raise cast("CrossingError", raised)
 
