@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 
 import numpy as np
 import pytest
@@ -123,3 +124,16 @@ def test_normals_that_cancel_each_other_have_no_level() -> None:
     normals = points * np.tile([1.0, -1.0], 300)[:, None]
     with pytest.raises(CloudError, match="normals cancel each other, or the points lie"):
         hk.DipolePotential(points, normals, smoothing=0.1)
+
+
+def test_smoothing_that_makes_a_blob_is_told_of() -> None:
+    """Of a flat ellipsoid: smoothing as long as a cloud is wide was silent."""
+    points, _ = hk.geometry.mesh_shapes.icosphere(3)
+    normals = points / (2.0, 1.0, 0.2)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    cloud = points * (2.0, 1.0, 0.2)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        hk.DipolePotential(cloud, normals, smoothing=0.05)
+    with pytest.warns(UserWarning, match="may be too long"):
+        hk.DipolePotential(cloud, normals, smoothing=1.0)

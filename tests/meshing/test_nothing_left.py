@@ -63,6 +63,10 @@ def strip(turns: int) -> trimesh.Trimesh:
 def test_a_strip_of_one_side_has_no_inside() -> None:
     with pytest.raises(hk.geometry.MeshError, match="one side only"):
         hk.repair(strip(1))
+    with pytest.raises(hk.geometry.MeshError, match="one side only"):
+        hk.solid(strip(1))
+    with pytest.raises(hk.geometry.MeshError, match=r"not closed.*repair"):
+        hk.solid(strip(2))
 
 
 def test_fins_cost_no_sound_triangle() -> None:

@@ -42,6 +42,7 @@ def test_faults_are_named_and_placed() -> None:
     twice = kinds((x, np.concatenate([faces, faces[:1]])))
     assert twice == {"edges of many faces": 3, "duplicate faces": 1}
     opened = hk.check_print((x, faces[1:])).problems[0]
+    assert opened.message.startswith("3 edges have one face alone, such as at (")
     ends = x[faces[0]]
     middles = 0.5 * (ends + np.roll(ends, 1, axis=0))
     assert {*map(tuple, opened.where)} == {*map(tuple, middles)}
@@ -67,6 +68,7 @@ def test_cavities_and_tiny_parts() -> None:
     inner.invert()
     hollow = trimesh.util.concatenate([PLATE, inner])
     assert kinds(hollow) == {"cavities": 1}
+    assert "1 cavity has no way out" in hk.check_print(hollow).problems[0].message
     assert hk.check_print(hollow).volume == pytest.approx(400 * (1 - 0.125))
     crumb = trimesh.creation.icosphere(1, 0.05)
     crumb.apply_translation((30.0, 0.0, 0.0))

@@ -313,7 +313,10 @@ def _refuse_file_options(options: Any) -> None:
 
 
 def _described(field: Field) -> str:
-    facts = ", ".join(f"{key}: {value}" for key, value in field.describe().items())
+    facts = ", ".join(
+        f"{key}: {f'{value:.6g}' if isinstance(value, float) else value}"
+        for key, value in field.describe().items()
+    )
     return f"{type(field).__name__}: {facts}"
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, cast
@@ -31,6 +32,8 @@ _SMALLEST, _LARGEST = 1.0, 2000.0
 _INCH = 25.4
 # Faces longer than so many walls may hide thin places beside their centers.
 _COARSE = 5.0
+# Words for one and for several, in messages.
+_WORDS = re.compile(r"\{([^{}|]*)\|([^{}|]*)\}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,9 +152,11 @@ def _mesh_of(part: Any) -> tuple[FloatArray, IntArray]:
 
 
 def _problem(kind: str, where: FloatArray, text: str, *, is_fatal: bool = True) -> PrintProblem:
-    """text: with {} for the number."""
-    near = "" if not len(where) else f", such as at {_point(where[0])}"
-    return PrintProblem(kind, len(where), where, text.format(f"{len(where):,}") + near, is_fatal)
+    """text: with {} for the number, and the words for one and for several as {one|several}."""
+    count = len(where)
+    near = "" if not count else f", {'' if count == 1 else 'such as '}at {_point(where[0])}"
+    text = _WORDS.sub(lambda pair: pair[1 if count == 1 else 2], text)
+    return PrintProblem(kind, count, where, text.format(f"{count:,}") + near, is_fatal)
 
 
 def _point(x: FloatArray) -> str:
@@ -173,27 +178,31 @@ def _topology(x: FloatArray, faces: IntArray) -> list[PrintProblem]:
     touching = singular_vertices(kept)
     many = np.unique(edges.ends[edges.uses > 2])
     return [
-        _problem("open edges", middle[edges.uses == 1], "{} edges have one face alone"),
+        _problem("open edges", middle[edges.uses == 1], "{} {edge has|edges have} one face alone"),
         _problem(
-            "edges of many faces", middle[edges.uses > 2], "{} edges have more than two faces"
+            "edges of many faces",
+            middle[edges.uses > 2],
+            "{} {edge has|edges have} more than two faces",
         ),
         _problem(
             "sides that disagree",
             middle[(edges.uses == 2) & (ways != 0)],
-            "at {} edges neighboring faces do not agree on what is inside",
+            "at {} {edge|edges} neighboring faces do not agree on what is inside",
         ),
         _problem(
-            "duplicate faces", x[kept[first[uses > 1]]].mean(axis=1), "{} faces are there twice"
+            "duplicate faces",
+            x[kept[first[uses > 1]]].mean(axis=1),
+            "{} {face is|faces are} there twice",
         ),
         _problem(
             "touching vertices",
             x[np.setdiff1d(touching, many)],
-            "at {} vertices parts touch in a point",
+            "at {} {vertex|vertices} parts touch in a point",
         ),
         _problem(
             "faces without area",
             x[faces[flat]].mean(axis=1),
-            "{} faces have no area",
+            "{} {face has|faces have} no area",
             is_fatal=False,
         ),
     ]
@@ -213,21 +222,21 @@ def _of_parts(shells: Shells, is_closed: bool, is_clear: bool) -> list[PrintProb
     loose = middle[~is_hollow]
     return [
         _problem(
-            "inside out", middle[inside_out], "{} parts are inside out: their faces look inward"
+            "inside out", middle[inside_out], "{} {part is|parts are} inside out: faces look inward"
         ),
         _problem(
             "nested parts",
             middle[is_nested],
-            "{} parts are inside the material of others: their volume counts twice, and slicers "
-            "may take them for cavities",
+            "{} {part is|parts are} inside the material of others: what is inside counts twice, "
+            "and slicers may take it for a cavity",
         ),
         _problem(
             "cavities",
             middle[is_hollow],
-            "{} cavities have no way out, for powder or resin",
+            "{} {cavity has|cavities have} no way out, for powder or resin",
             is_fatal=False,
         ),
-        _problem("tiny parts", middle[is_tiny], "{} parts are tiny", is_fatal=False),
+        _problem("tiny parts", middle[is_tiny], "{} {part is|parts are} tiny", is_fatal=False),
         _problem(
             "loose parts",
             loose if len(loose) > 1 else loose[:0],
@@ -242,7 +251,11 @@ def _crossings(x: FloatArray, faces: IntArray, is_closed: bool) -> PrintProblem:
     kept = np.unique(np.sort(kept, axis=1), axis=0)  # duplicates have been counted
     crossing = intersecting_faces(x, kept)
     places = x[kept[crossing]].mean(axis=1)
-    found = _problem("crossing faces", places, "{} triangles pass through or lie on others")
+    found = _problem(
+        "crossing faces",
+        places,
+        "{} {triangle passes through or lies|triangles pass through or lie} on others",
+    )
     advice = "; hk.mesh(hk.solid(part)) makes one of parts that overlap" if is_closed else ""
     return dataclasses.replace(found, message=found.message + advice)
 
@@ -255,7 +268,7 @@ def _thin(x: FloatArray, faces: IntArray, wall: float, is_solid: bool) -> PrintP
     found = thickness(MeshSolid(x, faces))
     places = found.where(wall)
     least = f"; the thinnest is {found.thinnest:.3g}"
-    text = f"at {{}} triangles the part is thinner than {wall:g}{least}"
+    text = f"at {{}} {{triangle|triangles}} the part is thinner than {wall:g}{least}"
     return _problem("thin walls", places, text)
 
 
@@ -264,7 +277,8 @@ def _coarse(x: FloatArray, faces: IntArray, wall: float) -> PrintProblem:
     corner = x[faces]
     longest = np.stack([lengths(corner[:, k] - corner[:, k - 1]) for k in range(3)]).max(axis=0)
     places = corner[longest > _COARSE * wall].mean(axis=1)
-    text = f"{{}} triangles are longer than {_COARSE:g} walls, and thickness is measured at centers"
+    text = f"{{}} {{triangle is|triangles are}} longer than {_COARSE:g} walls, and thickness is "
+    text += "measured at centers"
     return _problem("walls measured coarsely", places, text, is_fatal=False)
 
 

@@ -21,6 +21,7 @@ from harnack.fields.solids.mesh_solid import MeshSolid
 from harnack.geometry import MeshError, validate_mesh
 from harnack.geometry.chains import weld_vertices
 from harnack.geometry.meshes import without_zero_area_faces
+from harnack.geometry.sides import is_one_sided
 from harnack.meshing.checks import (
     MeshingError,
     TooLargeError,
@@ -34,7 +35,7 @@ from harnack.meshing.harmonic_patches import Asked, HarmonicPatches, harmonic_pa
 from harnack.meshing.hole_patches import filled, hole_loops
 from harnack.meshing.lattice_surface import Surface
 from harnack.meshing.mesh import mesh as mesh_of
-from harnack.meshing.sound import is_one_sided, joined, mended
+from harnack.meshing.sound import joined, mended
 
 if TYPE_CHECKING:
     import trimesh
@@ -159,7 +160,7 @@ def repair(
             reasons.append(str(error))
             asked.report(f"{error}; so not all is kept")
             continue
-        facts |= {"why": "; ".join(reasons) or None}
+        facts |= {"why": "; ".join(dict.fromkeys(reasons)) or None}  # each reason once
         return _result(surface, facts, largest)
     raise AssertionError("unreachable: the last stage returns or raises")
 

@@ -17,6 +17,7 @@ import numpy as np
 from harnack.backend import BoolArray, FloatArray
 from harnack.fields.solid_angles.winding_number import WindingNumber
 from harnack.geometry.chains import weld_vertices
+from harnack.geometry.sides import sided_parts
 from harnack.meshing.checks import (
     MeshingError,
     check_manifold,
@@ -28,7 +29,7 @@ from harnack.meshing.edges import Edges, IntArray, boundary_edges, crosses, dire
 from harnack.meshing.hole_patches import filled, hole_loops
 from harnack.meshing.lattice_surface import Surface
 
-__all__ = ["Mended", "is_one_sided", "joined", "mended"]
+__all__ = ["Mended", "joined", "mended"]
 
 # How often the rings around holes are left out; and what part of all triangles may be.
 _MOST_RINGS, _MOST_LEFT_OUT = 6, 0.5
@@ -255,41 +256,11 @@ def _pieces(edges: Edges, count: int) -> IntArray:
     return np.asarray(csgraph.connected_components(joined, directed=False)[1], np.int64)
 
 
-def is_one_sided(faces: IntArray) -> bool:
-    """Whether a mesh ends in the open and no part of it, of those that edges of two faces hold
-    together, has two sides: as a Moebius strip."""
-    if not len(boundary_edges(faces)):
-        return False
-    part = _sided_parts(faces)
-    return bool((part[: len(faces)] == part[len(faces) :]).all())
-
-
 def _against_neighbors(x: FloatArray, faces: IntArray) -> BoolArray:
     """(m,) which faces are to be turned over for all that share an edge of two to agree: of each
     part those with the smaller area. Parts of one side only are left as they are."""
-    m, part = len(faces), _sided_parts(faces)
+    m, part = len(faces), sided_parts(faces)
     corner = x[faces]
     area = lengths(crosses(corner))
     as_is = np.bincount(part[:m], area, minlength=int(part.max(initial=-1)) + 1)
     return as_is[part[:m]] < as_is[part[m:]]
-
-
-def _sided_parts(faces: IntArray) -> IntArray:
-    """(2m,) the parts that sides of faces belong to, first of all as they are and then of all
-    turned over: sides of neighbors that agree are joined. A part of one side only is joined to
-    itself turned over."""
-    import scipy.sparse  # here: half a second that few need
-    import scipy.sparse.csgraph as csgraph_module
-
-    sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
-    m, pairs = len(faces), directed_edges(faces)
-    edges = Edges.of(pairs)
-    order = np.argsort(edges.index, kind="stable")
-    one, other = order[(edges.uses == 2)[edges.index[order]]].reshape(-1, 2).T
-    same = ((pairs[one] == pairs[other]).all(axis=1)).astype(np.int64)
-    one, other = one % m, other % m
-    # Each face as it is and turned over (m more); neighbors that agree are joined.
-    rows = np.concatenate([one, one + m])
-    columns = np.concatenate([other + m * same, other + m * (1 - same)])
-    joined = sparse.coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(2 * m, 2 * m))
-    return np.asarray(csgraph.connected_components(joined, directed=False)[1], np.int64)

@@ -40,6 +40,9 @@ class Thickness:
     faces: IntArray
     values: FloatArray
 
+    def __repr__(self) -> str:
+        return f"Thickness({len(self.faces):,} faces, thinnest {self.thinnest:.4g})"
+
     @property
     def thinnest(self) -> float:
         """The least of the values."""

@@ -9,6 +9,7 @@ import copy
 import dataclasses
 import functools
 import math
+import warnings
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 
@@ -196,6 +197,8 @@ _VALUES, _TRACED = 2.0, 4.0
 # level is looked for; the least level that is one, as a part of 2 pi if areas are estimated.
 _LEAST_SMOOTHING, _PROBES = 1e-5, 10_000
 _LEAST_PART, _LEAST_LEVEL = 0.1, 1e-3
+# A tenth of the points may be off a smoothed surface by this part of the cloud's longest side.
+_FAR = 0.04
 
 
 class DipolePotential(DetailedField["_DipoleBuffers"], BatchedField):
@@ -327,8 +330,9 @@ class DipolePotential(DetailedField["_DipoleBuffers"], BatchedField):
                 f"{_LEAST_SMOOTHING * self._size:.2g} and {self._size:.2g}, such as the length of "
                 "the noise"
             )
-        step = -(-len(self.points) // _PROBES)
-        level = float(np.median(self.value(self.points[::step], precision="double")))
+        some = self.points[:: -(-len(self.points) // _PROBES)]
+        values = np.asarray(self.value(some, precision="double"))
+        level = float(np.median(values))
         # Areas that are given may stand for other things than a surface.
         least = _LEAST_PART * 2 * math.pi if self.estimated[1] else _LEAST_LEVEL
         if not abs(level) >= least:
@@ -337,7 +341,23 @@ class DipolePotential(DetailedField["_DipoleBuffers"], BatchedField):
                 "normals cancel each other, or the points lie in a plane or on a line and enclose "
                 "nothing, or what they enclose is thinner than the smoothing"
             )
+        if not self.fitted and self.estimated[1]:
+            self._warn_if_far(some, values - level)
         return level
+
+    def _warn_if_far(self, points: FloatArray, values: FloatArray) -> None:
+        """Warn if the smoothed surface leaves a tenth of the points, with values above the level,
+        far away, by their slopes."""
+        steep = np.linalg.norm(self.gradient(points, precision="double"), axis=1)
+        far = float(np.quantile(np.abs(values) / np.maximum(steep, 1e-300), 0.9))
+        longest = float((self._box[1] - self._box[0]).max())
+        if far > _FAR * longest:
+            warnings.warn(
+                f"smoothing={self.smoothing:g} may be too long: a tenth of the points are farther "
+                f"than {far:.2g} from the smoothed surface, and the cloud is {longest:.3g} long. "
+                'Noise wants 1.4 sqrt(noise * spacing), or smoothing="auto"',
+                stacklevel=4,
+            )
 
     def moved(
         self, points: Any, normals: Any | Literal["estimate"] = None, areas: Any = None

@@ -33,6 +33,7 @@ from harnack.fields.solids.solid import Solid, box_around, set_checked
 from harnack.files.surfaces import SURFACE_FILES, Mesh, read_surface
 from harnack.geometry import MeshError, validate_mesh, zero_area_faces
 from harnack.geometry.chains import net_faces, singular_edges, weld_vertices
+from harnack.geometry.sides import is_one_sided
 from harnack.tree import build_hierarchy
 from harnack.tree.nearest import NearestTriangle, nearest_triangle, square_to_some_vertex
 from harnack.tree.pieces import pieces_of_faces, windings_beside
@@ -527,6 +528,11 @@ def _check_closed(vertices: FloatArray, faces: IntArray, weights: IntArray) -> N
     where = edges[is_open] if is_open.any() else edges
     first = " and ".join(vector_text(one) for one in vertices[where[0]])
     if is_open.any():
+        if is_one_sided(faces):
+            raise MeshError(
+                "the mesh has one side only, as a Moebius strip has, so that nothing is inside of "
+                "it: give it a thickness first, in the program that made it"
+            )
         raise MeshError(
             f"the mesh is not closed: {int(is_open.sum()):,} edges have one face alone, such as "
             f"that between {first}; harnack.repair(mesh) closes holes. Welding vertices that are "
