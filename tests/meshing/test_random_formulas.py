@@ -384,7 +384,7 @@ def test_caps_over_little_of_a_solid_are_as_near_as_they_are() -> None:
 
 
 # Those that were wrong, took longest or ended in another error, and one of each kind.
-SEEDS = (0, 1, 4, 7, 9, 10, 20, 21, 24, 34, 37, 40, 50, 55, 59, 66, 67, 69, 70, 72)
+SEEDS = (0, 1, 4, 7, 9, 10, 20, 21, 24, 34, 37, 40, 50, 55, 59, 66, 67, 69, 72)
 
 
 @pytest.mark.slow
