@@ -54,9 +54,6 @@ __all__ = ["mesh"]
 # Cells across the level set, unless a spacing is given; curves have their own length besides.
 _ACROSS = 24
 _MOST_ATTEMPTS = 4
-# How much of the tolerance smooth level sets of solids take up of which others cut a part, if the
-# mesh is to be simplified and if it is not: triangles that are cut have centers where none were.
-_BEFORE_SIMPLIFYING, _WITHOUT = 0.5, 0.75
 _ACROSS_BY_SIGNS, _ATTEMPTS_BY_SIGNS = 48, 2
 # Room around what has an extent, and around a curve whose surface has none, as a part of the size.
 _MARGIN = 0.01
@@ -177,8 +174,7 @@ def mesh(
         raise ValueError("simplify is for closed meshes: give solid or thickness as well")
     report = progress or _silent
     volume = _volume(field, clip, section)
-    part = _BEFORE_SIMPLIFYING if simplify else _WITHOUT
-    asked = _Asked(volume, tolerance, part, spacing, seed, max_triangles, report)
+    asked = _Asked(volume, tolerance, spacing, seed, max_triangles, report)
     if is_meshed_by_signs(field):
         made = _by_signs(field, level, solid, thickness is not None, asked)
     elif solid:
@@ -217,12 +213,10 @@ def mesh(
 
 @dataclass(frozen=True)
 class _Asked:
-    """Arguments of `mesh`; volume: what the level set is cut by; part: of the tolerance, what
-    smooth level sets of solids take up."""
+    """Arguments of `mesh`; volume: what the level set is cut by."""
 
     volume: Volume | None
     tolerance: float
-    part: float
     spacing: float | None
     seed: int
     most_faces: int
@@ -474,7 +468,6 @@ def _solid(
         region.level,
         asked.volume,
         asked.tolerance,
-        asked.part,
         asked.spacing,
         angle_mesher,
         asked.most_faces,

@@ -108,8 +108,7 @@ it is a part of the truth: again the intersection is the truth."""
 class RegionMesher:
     """Meshes solids in a box from `lower` to `upper`, (3,) each.
 
-    tolerance: a length, of the middles of edges and faces; smooth_tolerance: of those of level sets
-        that are smooth and of which others cut a part. spacing: of cells, at most.
+    tolerance: a length, of the middles of edges and faces. spacing: of cells, at most.
     per_wave: cells along a wave (`Field.wavelength`) at the least; None for as many as there are.
     mesh_angle: meshes level sets of angles, which end at a curve. most_faces: of each level set.
     evaluations, levels, finest: of fields, in points, how many level sets were meshed so far, and
@@ -122,7 +121,6 @@ class RegionMesher:
     lower: FloatArray
     upper: FloatArray
     tolerance: float
-    smooth_tolerance: float
     spacing: float
     per_wave: float | None
     mesh_angle: AngleMesher
@@ -134,11 +132,6 @@ class RegionMesher:
     uploads: Uploads = dataclasses.field(default_factory=Uploads)
     others: Others = ()
     last_elsewhere: tuple[Others, Elsewhere] | None = None
-
-    @property
-    def _for_smooth(self) -> float:
-        """The tolerance of a level set that is smooth."""
-        return self.smooth_tolerance if self.others else self.tolerance
 
     def below(self, solid: Solid, level: float) -> Manifold:
         """The points of the box where a solid's function is at most `level`; what there is outside
@@ -258,7 +251,7 @@ class RegionMesher:
         made = closed_surface(
             function,
             lattice,
-            self._for_smooth,
+            self.tolerance,
             self.report,
             elsewhere=self._elsewhere(lattice),
         )
@@ -309,10 +302,10 @@ class RegionMesher:
         near = samples.distance <= np.median(samples.distance)
         steep = float(np.median(np.linalg.norm(samples.gradient[near], axis=1)))
         self.evaluations += len(points)
-        if high - low < 2 * self._for_smooth * steep:
+        if high - low < 2 * self.tolerance * steep:
             raise MeshingError(
                 f"the wall is about {(high - low) / steep:.2g} thick, and its sides are made "
-                f"within {self._for_smooth:.2g}: choose a smaller `tolerance`, or make the "
+                f"within {self.tolerance:.2g}: choose a smaller `tolerance`, or make the "
                 "wall thicker"
             )
 
@@ -369,8 +362,7 @@ class RegionMesher:
         scale = float(np.linalg.norm(matrix, 2))
         local = dataclasses.replace(
             self, lower=own.min(axis=0), upper=own.max(axis=0), tolerance=self.tolerance / scale,
-            smooth_tolerance=self.smooth_tolerance / scale, spacing=self.spacing / scale,
-            evaluations=0, levels=0, finest=math.inf, others=(),
+            spacing=self.spacing / scale, evaluations=0, levels=0, finest=math.inf, others=(),
         )  # fmt: skip
         made = local.below(solid.inner, level / solid.map.factor)
         self.evaluations += local.evaluations
@@ -534,7 +526,6 @@ def mesh_solid(
     level: float,
     volume: Volume | None,
     tolerance: float,
-    part: float,
     spacing: float | None,
     angle_mesher: Callable[[float, float], AngleMesher],
     most_faces: int,
@@ -543,8 +534,7 @@ def mesh_solid(
 ) -> SolidMesh:
     """The boundary of the points of a volume where a solid's function is at most `level`.
 
-    volume: None for all of space. tolerance: a part of the size; part: of the tolerance, what
-        smooth level sets take up of which others cut a part. most_faces: of a level set.
+    volume: None for all of space. tolerance: a part of the size. most_faces: of a level set.
     angle_mesher: given a tolerance and a spacing, both lengths, how to mesh level sets of angles.
     check: of the surface, of which no triangles pass through each other, given the size, that it is
         near the level last. Where it is not, in a few places, these are mended (`brought_near`);
@@ -565,7 +555,7 @@ def mesh_solid(
     before: MeshingError | None = None
     while True:
         mesher = RegionMesher(
-            lower, upper, error, 2 * part * error, cells, per_wave, angle_mesher(error, cells),
+            lower, upper, error, cells, per_wave, angle_mesher(error, cells),
             most_faces, report, uploads=uploads,
         )  # fmt: skip
         try:
