@@ -25,14 +25,8 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.backend.records import Records
     from harnack.fields.solid_angles.edge_trails import Line
+    from harnack.tree.cell_lookup import CellLookup
 
-# Cells of the finest level are 2^-DEEPEST as wide as the cube; those of a grid that is looked up at
-# once 2^-TOP.
-DEEPEST, TOP = 10, 5
-# The balls of cells are larger than the balls around them by this factor, for rounding: it moves a
-# point by less than 2^-20 of the cube's side in single precision, and the balls of the finest cells
-# reach 2^-19 of it beyond these.
-MARGIN = 1.004
 # Numbers of a record before the coefficients, and vertices in a record of near edges.
 HEAD, VERTICES = 15, 2
 # Lengths up to this part of the distance to far edges are used along lines.
@@ -66,11 +60,7 @@ class CellSums:
 class CurveCells:
     """Cells on a backend.
 
-    low: the lower corner of the cube. scale: 2^DEEPEST over its side.
-    top: for each cube of a grid of 2^TOP along each side, z fastest, a node of the octree: the
-        number of the first of its eight children, z fastest; or for a cell that is not split, or is
-        in one that is not, -1 minus the number of its record.
-    nodes: likewise for each node of the octree.
+    lookup: of cells, which are its leaves.
     records: center and one over the radius; bounds of what the polynomial leaves out of value and
         gradient, and of the rounding of the value; of the edges that are not near a lower bound
         of the distance from the center; the factor of `EdgeSums.squares`; of the same edges an
@@ -82,34 +72,11 @@ class CurveCells:
     """
 
     backend: Backend
-    low: Vec3
-    scale: Real
-    top: Any
-    nodes: Any
+    lookup: CellLookup
     records: Records
     near: Records
     count: int
     size: int
-
-    def cell(self, x: Vec3) -> tuple[Any, Mask]:
-        """The record of the cell in which x lies, and whether x lies in the cube."""
-        index, integer = self.backend.UInt32, self.backend.Int32
-        place = (x - self.low) * self.scale
-        inside = dr.all((place >= 0) & (place < float(2**DEEPEST)))
-        ix, iy, iz = (index(dr.select(inside, place[k], 0)) for k in range(3))
-        down = DEEPEST - TOP
-        first = (((ix >> down) << TOP | (iy >> down)) << TOP) | (iz >> down)
-
-        def more(node: Any, *_: Any) -> Mask:
-            return node >= 0
-
-        def step(node: Any, bit: Any) -> tuple[Any, Any]:
-            octant = ((ix >> bit) & 1) * 4 + ((iy >> bit) & 1) * 2 + ((iz >> bit) & 1)
-            return dr.gather(integer, self.nodes, index(node) + octant), bit - 1
-
-        node = dr.gather(integer, self.top, first)
-        node, _ = dr.while_loop((node, index(down - 1) + 0 * ix), more, step, label="cell")
-        return index(-1 - node), inside
 
     def sums(self, x: Vec3, active: Mask) -> tuple[CellSums, Mask]:
         """The sums over all edges at x, and the mask of points for which they hold: those that are
@@ -123,7 +90,7 @@ class CurveCells:
         psi = (6 - 8q + 3q^2)/(1-q)^3, which grows with q.
         """
         vector, index = self.backend.Array3f, self.backend.UInt32
-        number, inside = self.cell(x)
+        number, inside = self.lookup.leaf(x)
         active = active & inside
         row = self.records.row(number, active)
         inverse, error, slope_error, rounding, least, factor, cubes = row[3:10]

@@ -9,7 +9,6 @@ of what is far, all edges are summed up at each center.
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -17,22 +16,16 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 import numpy as np
 
-from harnack.backend import BoolArray, FloatArray, IntArray, choose_backend, to_numpy
-from harnack.backend.arrays import aligned, aligned_integers
+from harnack.backend import BoolArray, FloatArray, IntArray, choose_backend, to_numpy, to_vector3
+from harnack.backend.arrays import aligned_integers
 from harnack.backend.elementary import fmax, fmin
 from harnack.backend.records import Records
-from harnack.fields.solid_angles.curve_cells import (
-    DEEPEST,
-    HEAD,
-    MARGIN,
-    TOP,
-    VERTICES,
-    CurveCells,
-)
+from harnack.fields.solid_angles.curve_cells import HEAD, VERTICES, CurveCells
 from harnack.fields.solid_angles.edges import Edge, LoopEdges, inverse_squares
 from harnack.fields.solid_angles.far_edges import COEFFICIENTS, DEGREE, FarEdges
 from harnack.fields.solid_angles.local_expansion import rounding_tables, shift_matrices
 from harnack.fields.solid_angles.near_runs import Runs, VertexTable, left_over
+from harnack.tree.cell_lookup import DEEPEST, MARGIN, OCTANTS, CellLookup, numbered_nodes
 from harnack.tree.nearest import squared_distance_to_segment
 
 if TYPE_CHECKING:
@@ -55,7 +48,6 @@ _STEP = 2.0**-8
 _SLACK = 1e-3
 # The most records of near edges, whose numbers single precision holds.
 _MOST_RECORDS = 2**24
-_OCTANTS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 
 
 def build_curve_cells(
@@ -90,7 +82,7 @@ def build_curve_cells(
 class _Octree:
     """Cells while they are made. most_near, fine: see `_MOST_NEAR`.
 
-    nodes: of each level, as those of `CurveCells`. tables, near: records, likewise.
+    nodes: of each level, for `CellLookup.of`. tables, near: records of `CurveCells`.
     leaves, packets: the number of cells that are not split, and of records of near edges.
     """
 
@@ -111,24 +103,20 @@ class _Octree:
         """Make all cells, level by level; False as soon as they take too many bytes."""
         shifts = shift_matrices(DEGREE, 0.5 / (math.sqrt(3) * MARGIN))
         centers, runs, far = self.middle[None], Runs.of_loops(self.vertices), FarEdges.none(1)
-        numbered = 0
+        splits = 0
         for level in range(DEEPEST + 1):
             side = self.half / 2**level
             radius = math.sqrt(3) * side * MARGIN
             is_leaf, runs, far = self._level(centers, radius, runs, far, is_last=level == DEEPEST)
-            count = int(is_leaf.sum())
             split = np.flatnonzero(~is_leaf)
-            number = np.empty(len(centers), np.int64)
-            number[is_leaf] = -1 - (self.leaves - count + np.arange(count))
-            number[split] = numbered + 8 * np.arange(len(split))
-            self.nodes.append(number)
-            numbered += 8 * len(split)
+            self.nodes.append(numbered_nodes(is_leaf, self.leaves - int(is_leaf.sum()), splits))
+            splits += len(split)
             if self.size > most_bytes or self.packets >= _MOST_RECORDS:
                 return False
             if not len(split):
                 break
             runs, far = runs.of_children(~is_leaf), far.of_children(~is_leaf, shifts, radius)
-            centers = (centers[split][:, None] + 0.5 * side * _OCTANTS).reshape(-1, 3)
+            centers = (centers[split][:, None] + 0.5 * side * OCTANTS).reshape(-1, 3)
         return True
 
     def _level(
@@ -150,7 +138,7 @@ class _Octree:
         points = np.concatenate([self.vertices.points, runs.apex, chosen.apex])
         rows = Records.upload(double, np.column_stack([points, np.zeros((len(points), 5))]))
         far = far.plus(
-            FarEdges.of(rows, left, _vectors(double, centers), dr.opaque(double.Float, radius), n)
+            FarEdges.of(rows, left, to_vector3(double, centers), dr.opaque(double.Float, radius), n)
         )
         if is_leaf.any():
             table, first, packets = near_records(self.vertices, chosen, is_leaf)
@@ -168,24 +156,17 @@ class _Octree:
         """Bytes of records, near edges, nodes, and the grid on top."""
         number = np.dtype(self.backend.dtype).itemsize
         record = 8 * -(-(HEAD + COEFFICIENTS) // 8)
-        nodes = sum(len(one) for one in self.nodes) + 8**TOP
-        return number * (record * self.leaves + 4 * VERTICES * self.packets) + 4 * nodes
+        lookup = CellLookup.size(sum(len(one) for one in self.nodes))
+        return number * (record * self.leaves + 4 * VERTICES * self.packets) + lookup
 
     def cells(self) -> CurveCells:
         """The cells on the backend."""
         backend = self.backend
-        root, *below = self.nodes
-        nodes = np.concatenate([*below, np.zeros(8, np.int64)])  # room for any octant
+        lookup = CellLookup.of(backend, self.middle - self.half, 2 * self.half, self.nodes)
         near = np.concatenate([*self.near, np.zeros((1, 4 * VERTICES))])
-        corner = (dr.opaque(backend.Float, float(one)) for one in self.middle - self.half)
-        return CurveCells(
-            backend, backend.Array3f(*corner),
-            dr.opaque(backend.Float, 2**DEEPEST / (2 * self.half)),
-            backend.Int32(_top(int(root[0]), nodes).astype(np.int32)),
-            backend.Int32(nodes.astype(np.int32)),
-            Records.upload(backend, np.concatenate(self.tables)), Records.upload(backend, near),
-            self.leaves, self.size,
-        )  # fmt: skip
+        records = Records.upload(backend, np.concatenate(self.tables))
+        near_edges = Records.upload(backend, near)
+        return CurveCells(backend, lookup, records, near_edges, self.leaves, self.size)
 
 
 @dataclass(frozen=True)
@@ -206,7 +187,7 @@ class _Around:
     @classmethod
     def of(cls, edges: LoopEdges, centers: FloatArray, radius: float) -> _Around:
         """The sums over edges that are not near; some near edges may count as well."""
-        backend, c = edges.backend, _vectors(edges.backend, centers)
+        backend, c = edges.backend, to_vector3(edges.backend, centers)
         rho = dr.opaque(backend.Float, radius)
         inner = dr.opaque(backend.Float, _NEAR * radius * (1 - _SLACK))
 
@@ -248,7 +229,7 @@ def _distances(
     if not len(cell):
         return np.zeros(0)
     vector = backend.Array3f
-    points, middles = _vectors(backend, vertices.points), _vectors(backend, centers)
+    points, middles = to_vector3(backend, vertices.points), to_vector3(backend, centers)
     at = aligned_integers(backend, place)
     c = dr.gather(vector, middles, aligned_integers(backend, cell))
     p, q = dr.gather(vector, points, at), dr.gather(vector, points, at + 1)
@@ -324,18 +305,3 @@ def _table(
     inverse, least = np.full(len(first), 1 / radius), np.minimum(around.least, 1e3)
     bounds = [far.error * up, slope * up, value * up, least, factor, around.cubes]
     return np.column_stack([centers, inverse, *bounds, around.slope, first, count, coefficients])
-
-
-def _top(root: int, nodes: IntArray) -> IntArray:
-    """`CurveCells.top`."""
-    grid = np.full((1, 1, 1), root, np.int64)
-    for _ in range(TOP):
-        x, y, z = np.indices([2 * side for side in grid.shape])
-        node = grid[x >> 1, y >> 1, z >> 1]
-        octant = (x & 1) * 4 + (y & 1) * 2 + (z & 1)
-        grid = np.where(node >= 0, nodes[np.maximum(node, 0) + octant], node)
-    return grid.ravel()
-
-
-def _vectors(backend: Backend, points: FloatArray) -> Vec3:
-    return backend.Array3f(*(aligned(backend, np.ascontiguousarray(one)) for one in points.T))

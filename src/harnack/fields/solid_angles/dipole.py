@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import functools
 import math
@@ -19,10 +18,10 @@ import numpy as np
 from harnack.backend import backend_of
 from harnack.backend.elementary import fmax
 from harnack.backend.numbers import positive
-from harnack.cluster.packing import Remembered
 from harnack.fields.batch import BatchedField, SymmetricSum, Values
 from harnack.fields.clearance import DetailedField, UnitCoordinates, epsilon_at, placed, single
 from harnack.fields.field import Sample, lengthened
+from harnack.fields.solid_angles.cell_choice import HasCells
 from harnack.fields.solid_angles.far_clusters import (
     AddPrimitive,
     Treecode,
@@ -46,8 +45,6 @@ if TYPE_CHECKING:
 
 # Where there are cells, the detail of the tree that detail 1 stands for, by experiment.
 _BEYOND_CELLS = 1.0
-# Megabytes that cells may take by default.
-_MEGABYTES = 256.0
 # Cells are built by themselves from so many rays a point, and so many rays, on, and up to so many
 # points. To build them takes as long as to trace about 10 rays a point without them.
 _PAYS, _LEAST_RAYS, _MOST_POINTS = 25, 100_000, 200_000
@@ -201,7 +198,7 @@ _LEAST_PART, _LEAST_LEVEL = 0.1, 1e-3
 _FAR = 0.04
 
 
-class DipolePotential(DetailedField["_DipoleBuffers"], BatchedField):
+class DipolePotential(HasCells, DetailedField["_DipoleBuffers"], BatchedField):
     """f(x) = sum a_i n_i.(p_i - x)/|p_i - x|^3 of oriented points (paper, Eq. 12).
 
     With a_i the areas that the points stand for, f is about 4 pi inside and 0 outside: the
@@ -283,17 +280,12 @@ class DipolePotential(DetailedField["_DipoleBuffers"], BatchedField):
         if areas is None:
             self.areas = estimate_areas(self.points, self.normals)
         self.accuracy = accuracy
-        if cells is not None and not 0 <= cells < math.inf:
-            raise ValueError(
-                f"cells must be True, False, a number of megabytes or None, not {cells}"
-            )
-        self.cells = cells
+        self.set_cells(cells)
         self._box = low, high = self.points.min(axis=0), self.points.max(axis=0)
         self._center = single(0.5 * (low + high))
         extent = max(0.5 * float((high - low).max()), math.sqrt(float(self.areas.sum())) / 4)
         self._size = 2.0 ** math.ceil(math.log2(extent))
         self._given_hierarchy: Hierarchy | None = None
-        self._with_cells: Remembered[tuple[int, ...], Self] = Remembered()
         self.smoothing = 0.0 if smoothing == 0 else positive(smoothing, "smoothing")
         if self.smoothing and self.cells:
             raise ValueError("cells are of sums without smoothing: give one of the two")
@@ -405,8 +397,7 @@ class DipolePotential(DetailedField["_DipoleBuffers"], BatchedField):
             height, rows = self.smoothing / self._size, dipole_rows(unit, moments)
             tree = SmoothedSum.of(backend, self._hierarchy, rows, height, accuracy)
         else:
-            megabytes = _MEGABYTES if self.cells is True else float(self.cells or 0)
-            most_bytes = int(1e6 * megabytes) if traced else 0
+            most_bytes = self.most_bytes() if traced else 0
             tree = DipoleTree.of(
                 backend, self._hierarchy, unit, moments, accuracy, most_bytes, self._half(unit)
             )
@@ -418,19 +409,10 @@ class DipolePotential(DetailedField["_DipoleBuffers"], BatchedField):
         reach = math.sqrt(float(self.areas.sum()) / self.default_level) / self._size
         return 1.001 * (float(np.abs(unit).max()) + reach)
 
-    def for_rays(self, count: int) -> Self:
-        """With cells, if none were asked for and none refused, from `_PAYS` rays a point on."""
-        if self.cells is not None or not self._least_rays() <= count:
-            return self
-        key = id(self.points), id(self.normals), id(self.areas)  # of arrays that the copy holds
-        if key not in self._with_cells:
-            other = copy.copy(self)
-            other.cells, other._device, other._with_cells = True, None, Remembered()
-            self._with_cells[key] = other
-        return self._with_cells[key]
+    def made_of(self) -> tuple[Any, ...]:
+        return self.points, self.normals, self.areas
 
-    def _least_rays(self) -> float:
-        """The number of rays from which on cells pay."""
+    def least_rays(self) -> float:
         few = len(self.points) <= _MOST_POINTS and not self.smoothing
         return max(_LEAST_RAYS, _PAYS * len(self.points)) if few else math.inf
 
@@ -460,22 +442,12 @@ class DipolePotential(DetailedField["_DipoleBuffers"], BatchedField):
     def describe(self) -> dict[str, Any]:
         said = ("estimated" if one else "given" for one in self.estimated)
         named = dict(zip(("normals", "areas"), said, strict=True))
-        about = {"points": len(self.points), **named, **self.fitted, **self._cells_built()}
+        tree = None if self._device is None else self._device.tree
+        cells = self.said_of_cells(tree.cells if isinstance(tree, DipoleTree) else None)
+        about = {"points": len(self.points), **named, **self.fitted, **cells}
         if self.smoothing:
             about |= {"smoothing": self.smoothing, "level": self.default_level}
         return about
-
-    def _cells_built(self) -> dict[str, Any]:
-        """For `describe`: the number and memory of cells, or from how many rays there are any."""
-        if self.cells is None and self._least_rays() < math.inf:
-            return {"cells": f"from {self._least_rays():,.0f} rays on"}
-        if self._device is None or not self.cells:
-            return {}
-        tree = self._device.tree
-        found = tree.cells if isinstance(tree, DipoleTree) else None
-        if found is None:
-            return {"cells": "none, as they need more memory"}
-        return {"cells": f"{found.count} of {found.size / 1e6:.1f} MB"}
 
 
 @dataclass(frozen=True)

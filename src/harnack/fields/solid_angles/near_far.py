@@ -11,7 +11,6 @@ dipoles.
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -19,8 +18,8 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 import numpy as np
 
-from harnack.backend import BoolArray, FloatArray, to_numpy
-from harnack.backend.arrays import aligned, aligned_integers
+from harnack.backend import BoolArray, FloatArray, to_numpy, to_vector3
+from harnack.backend.arrays import aligned_integers
 from harnack.backend.records import Records
 from harnack.fields.solid_angles.far_sums import (
     COEFFICIENTS,
@@ -36,6 +35,7 @@ from harnack.fields.solid_angles.local_expansion import (
     value_and_gradient,
 )
 from harnack.fields.sums import SUM_ROUNDING, FieldSums
+from harnack.tree.cell_lookup import DEEPEST, MARGIN, OCTANTS, CellLookup, numbered_nodes
 from harnack.tree.lists import Lists, make_lists
 
 if TYPE_CHECKING:
@@ -54,11 +54,6 @@ _SMALL = 1.0
 # Cells are split that have more near dipoles, by experiment; where memory is short, twice as many,
 # again and again, up to a number with which the tree is faster.
 _MOST_NEAR, _TOO_MANY = 64, 512
-# Balls are larger than the balls around cells by this factor, for the rounding of positions, and
-# cells of the finest level are 2^-_DEEPEST as wide as the cube: rounding moves a point by less
-# than 2^-20 of it in single precision, and the balls reach 2^-19 of it beyond the finest cells.
-_MARGIN, _DEEPEST = 1.004, 10
-_OCTANTS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 # Numbers of a record before the coefficients, and the base in which the first index is stored:
 # single precision holds no integers above 2^24.
 _HEAD, _BASE = 14, 4096
@@ -69,9 +64,7 @@ _ANY = 2**31 - 1
 class NearFarCells:
     """Cells on a backend.
 
-    low: the lower corner of the cube. scale: 2^_DEEPEST over its side.
-    nodes: for each node of the octree the number of the first of its eight children, z fastest; or
-        for a cell that is not split, -1 minus the number of its record.
+    lookup: of cells, which are its leaves.
     records: center and one over the radius; bounds of truncation of value and gradient, everywhere
         and in powers of the distance (`FarSums`), and of the rounding of the value;
         `FarSums.fourth` and `least`; first index (two numbers) and number of near dipoles |
@@ -82,32 +75,12 @@ class NearFarCells:
     """
 
     backend: Backend
-    low: Vec3
-    scale: Real
-    nodes: Any
+    lookup: CellLookup
     records: Records
     near: Any
     dipoles: Records
     count: int
     size: int
-
-    def cell(self, x: Vec3) -> tuple[Any, Mask]:
-        """The record of the cell in which x lies, and whether x lies in the cube."""
-        index, integer = self.backend.UInt32, self.backend.Int32
-        place = (x - self.low) * self.scale
-        inside = dr.all((place >= 0) & (place < float(2**_DEEPEST)))
-        ix, iy, iz = (index(dr.select(inside, place[k], 0)) for k in range(3))
-
-        def more(node: Any, *_: Any) -> Mask:
-            return node >= 0
-
-        def step(node: Any, bit: Any) -> tuple[Any, Any]:
-            octant = ((ix >> bit) & 1) * 4 + ((iy >> bit) & 1) * 2 + ((iz >> bit) & 1)
-            return dr.gather(integer, self.nodes, index(node) + octant), bit - 1
-
-        root = dr.gather(integer, self.nodes, 0 * ix)
-        node, _ = dr.while_loop((root, index(_DEEPEST - 1) + 0 * ix), more, step, label="cell")
-        return index(-1 - node), inside
 
     def sums(
         self, x: Vec3, active: Mask, add: AddPrimitive, own: tuple[Any, ...]
@@ -122,7 +95,7 @@ class NearFarCells:
         most `fourth` (1 - a/least)^-4, and that of area/distance^5 at most that over least - a.
         """
         vector, index = self.backend.Array3f, self.backend.UInt32
-        number, inside = self.cell(x)
+        number, inside = self.lookup.leaf(x)
         active = active & inside
         row = self.records.row(number, active)
         u, inverse = x - vector(*row[:3]), row[3]
@@ -198,18 +171,19 @@ def build_cells(
     octree = _fitting(packed, half, backend, most_bytes)
     if octree is None:
         return None
-    double, shifts = packed.backend, shift_matrices(DEGREE, 0.5 / (math.sqrt(3) * _MARGIN))
+    double, shifts = packed.backend, shift_matrices(DEGREE, 0.5 / (math.sqrt(3) * MARGIN))
     lists, shared = Lists.of_root(double), FarSums.none(1)
-    nodes, tables, near = [np.zeros(0, np.int64)], [np.zeros((0, 0))], [np.zeros(0, np.uint32)]
-    numbered, count, total = 1, 0, 0
+    nodes: list[IntArray] = []
+    tables, near = [np.zeros((0, 0))], [np.zeros(0, np.uint32)]
+    splits, count, total = 0, 0, 0
     for level in octree:
-        c, radius = _vectors(double, level.centers), dr.opaque(double.Float, level.radius)
+        c, radius = to_vector3(double, level.centers), dr.opaque(double.Float, level.radius)
         found, lists = _shared(packed, lists, c, radius)
         shared = shared.plus(found)
         leaves, split = np.flatnonzero(level.is_leaf), np.flatnonzero(~level.is_leaf)
         if len(leaves):
             own = lists.some(double, leaves)
-            sums, close = _own(packed, own, _vectors(double, level.centers[leaves]), radius)
+            sums, close = _own(packed, own, to_vector3(double, level.centers[leaves]), radius)
             sums = sums.plus(shared.some(level.is_leaf))
             lengths = to_numpy(close.count).astype(np.int64)
             first = total + np.cumsum(lengths) - lengths
@@ -217,18 +191,14 @@ def build_cells(
             tables.append(_table(backend, *placed, sums, first, lengths))
             near.append(to_numpy(close.entries)[: int(lengths.sum())])
             total += int(lengths.sum())
-        number = np.empty(len(level.is_leaf), np.int64)
-        number[leaves] = -1 - (count + np.arange(len(leaves)))
-        number[split] = numbered + 8 * np.arange(len(split))
-        nodes.append(number)
-        count, numbered = count + len(leaves), numbered + 8 * len(split)
+        nodes.append(numbered_nodes(level.is_leaf, count, splits))
+        count, splits = count + len(leaves), splits + len(split)
         shared = shared.some(~level.is_leaf).of_octants(shifts, level.radius)
         lists = lists.some(double, np.repeat(split, 8))
     table, entries = np.concatenate(tables[1:]), np.concatenate(near)
-    low = (dr.opaque(backend.Float, -half) for _ in range(3))
     return NearFarCells(
-        backend, backend.Array3f(*low), dr.opaque(backend.Float, 2**_DEEPEST / (2 * half)),
-        backend.Int32(np.concatenate(nodes).astype(np.int32)), Records.upload(backend, table),
+        backend, CellLookup.of(backend, np.full(3, -half), 2 * half, nodes),
+        Records.upload(backend, table),
         aligned_integers(backend, entries if len(entries) else np.zeros(1, np.uint32)), dipoles,
         count, _bytes(backend, octree),
     )  # fmt: skip
@@ -270,7 +240,7 @@ def _table(
 ) -> FloatArray:  # fmt: skip
     """Records of cells. Rounding is that of `rounding_tables`, for coordinates within a cell and
     what rounding of positions adds; that of the gradient, over the radius, counts as truncation."""
-    tables = rounding_tables(DEGREE, _MARGIN / math.sqrt(3))
+    tables = rounding_tables(DEGREE, MARGIN / math.sqrt(3))
     rounding = backend.epsilon * np.abs(sums.coefficients) @ tables
     slope = sums.slope + rounding[:, 1:].sum(axis=1) / radius
     up, inverse = 1 + SUM_ROUNDING, np.full(len(first), 1 / radius)
@@ -310,18 +280,18 @@ def _octree(
     centers = np.zeros((1, 3))
     while len(centers):
         side = half / 2 ** len(levels)
-        radius = math.sqrt(3) * side * _MARGIN
+        radius = math.sqrt(3) * side * MARGIN
         lists = root.some(backend, np.zeros(len(centers), np.int64))
-        is_last = len(levels) == _DEEPEST
+        is_last = len(levels) == DEEPEST
         most = dr.opaque(index, _ANY if is_last else most_near)
         near = dr.opaque(backend.Float, _NEAR * radius)
-        given = packed, lists, _vectors(backend, centers), near, most, None
+        given = packed, lists, to_vector3(backend, centers), near, most, None
         count = to_numpy(dipoles_of(*given, far=False)).astype(np.int64)
         is_leaf = np.broadcast_to(count <= most_near, len(centers)) | is_last
         levels.append(_Level(centers, radius, is_leaf, count))
         if too_large(levels):
             return None
-        centers = (centers[~is_leaf][:, None] + 0.5 * side * _OCTANTS).reshape(-1, 3)
+        centers = (centers[~is_leaf][:, None] + 0.5 * side * OCTANTS).reshape(-1, 3)
     return levels
 
 
@@ -331,9 +301,5 @@ def _bytes(backend: Backend, levels: list[_Level]) -> int:
     for one in levels:
         near += int(one.near[one.is_leaf].sum())
     nodes = sum(len(one.is_leaf) for one in levels)
-    packets = -(-(_HEAD + COEFFICIENTS) // 8)
-    return 8 * packets * np.dtype(backend.dtype).itemsize * leaves + 4 * (near + nodes)
-
-
-def _vectors(backend: Backend, points: FloatArray) -> Vec3:
-    return backend.Array3f(*(aligned(backend, np.ascontiguousarray(one)) for one in points.T))
+    record = 8 * -(-(_HEAD + COEFFICIENTS) // 8) * np.dtype(backend.dtype).itemsize
+    return record * leaves + 4 * near + CellLookup.size(nodes)

@@ -27,6 +27,7 @@ from harnack.fields.clearance import (
 from harnack.fields.field import Look, Path, Sample, lengthened
 from harnack.fields.points import in_batches
 from harnack.fields.sheets import NO_TRUNCATION
+from harnack.fields.solid_angles.cell_choice import HasCells
 from harnack.fields.solid_angles.circle_sums import Circles, CircleSums
 from harnack.fields.solid_angles.curve_cells import CellSums, CurveCells
 from harnack.fields.solid_angles.curve_octree import build_curve_cells
@@ -77,12 +78,12 @@ _SIDES = 256
 # trace those takes five times as long as to build the cells of a knot; those of a tangle of a
 # thousand edges take ten times as long as a knot's.
 _PAYS, _LEAST_RAYS, _LEAST_EDGES = 2.5e8, 1e6, 48
-# Megabytes that cells may take by default; and the most planes of the extent of a curve in convex
-# position with cells, by experiment: with hundreds, clipping rays takes longer than the march.
-_MEGABYTES, _PLANES = 256.0, 48
+# The most planes of the extent of a curve in convex position with cells, by experiment: with
+# hundreds, clipping rays takes longer than the march.
+_PLANES = 48
 
 
-class SolidAngle(UploadedField["_CurveBuffers"]):
+class SolidAngle(HasCells, UploadedField["_CurveBuffers"]):
     """The signed solid angle of closed curves, in steradians, with period 4 pi (paper, Eq. 10).
 
     loops: one (n, 3) array-like of vertices, n >= 3, a `Circle`, or a list of these. Every loop is
@@ -158,19 +159,14 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
         self._center = 0.5 * (points.min(axis=0) + points.max(axis=0))
         self._size = float(np.linalg.norm(points - self._center, axis=1).max())
         self._extents: Remembered[tuple[float, ...], Volume | None] = Remembered()
-        if cells is not None and not 0 <= cells < math.inf:
-            raise ValueError(
-                f"cells must be True, False, a number of megabytes or None, not {cells}"
-            )
+        self.set_cells(cells)
         if cells and self._movable:
             raise ValueError(
                 "cells are of curves that stay as they are, and a loop is a Dr.Jit array: give "
                 "NumPy arrays, or no cells"
             )
-        self.cells = cells
         self.has_detail = bool(cells) and bool(self._net)
         self._detail: Real = 1.0
-        self._with_cells: Remembered[bool, Self] = Remembered()
 
     @property
     def loops(self) -> Loops:
@@ -250,9 +246,8 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
         value_rounding = 16 * backend.epsilon if edges is None else edges.rounding(records)
         cells = None
         if self.has_detail and traced:
-            megabytes = _MEGABYTES if self.cells is True else float(self.cells or 0)
             low, high = self._box(center)
-            cells = build_curve_cells(backend, unit, low, high, int(1e6 * megabytes))
+            cells = build_curve_cells(backend, unit, low, high, self.most_bytes())
         return _CurveBuffers(
             *placed(backend, center, self._size),
             edges,
@@ -518,19 +513,12 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
         vertices = sum(map(len, self._net)) + 3 * len(self._net_circles)
         return tight_extent(proved, levels, lower, upper, max(8, _MOST_PAIRS // vertices))
 
-    def for_rays(self, count: int) -> Self:
-        """With cells, if none were asked for and none refused, where rays and edges are many."""
-        if self.cells is not None or not self._least_rays() <= count:
-            return self
-        if True not in self._with_cells:
-            other = copy.copy(self)
-            other.cells, other.has_detail, other._device = True, True, None
-            other._extents, other._with_cells = Remembered(), Remembered()
-            self._with_cells[True] = other
-        return self._with_cells[True]
+    def having_cells(self) -> Self:
+        other = super().having_cells()
+        other.has_detail, other._extents = True, Remembered()
+        return other
 
-    def _least_rays(self) -> float:
-        """The number of rays from which on cells pay."""
+    def least_rays(self) -> float:
         edges = sum(map(len, self._net))
         is_fixed = not self._movable and self._asked != "paper"
         few = not is_fixed or edges < _LEAST_EDGES
@@ -544,18 +532,8 @@ class SolidAngle(UploadedField["_CurveBuffers"]):
             "canceled edges": sum(map(len, self.loops)) - sum(map(len, self._net)),
             "convex position": self.convex_position,
             "certificate": self.certificate,
-            **self._cells_built(),
+            **self.said_of_cells(None if self._device is None else self._device.cells),
         }
-
-    def _cells_built(self) -> dict[str, Any]:
-        """For `describe`: the number and memory of cells, or from how many rays there are any."""
-        if self.cells is None and self._least_rays() < math.inf:
-            return {"cells": f"from {math.ceil(self._least_rays()):,} rays on"}
-        if self._device is None or not self.has_detail:
-            return {}
-        if (found := self._device.cells) is None:
-            return {"cells": "none, as they need more memory"}
-        return {"cells": f"{found.count} of {found.size / 1e6:.1f} MB"}
 
 
 @dataclass(frozen=True)
