@@ -15,6 +15,7 @@ import pytest
 
 import harnack as hk
 from harnack.meshing.checks import intersecting_faces
+from tests.oracles.direct_sums import winding_sum
 
 Function = Callable[[Any], Any]
 TOLERANCE = 1e-2
@@ -279,19 +280,6 @@ def changes_near(
     return ((low <= 0) & (high >= 0)) | (flat if by_slope else False)
 
 
-def winds(corner: Any, points: Any) -> Any:
-    """Winding numbers of triangles (m, 3, 3) around points: van Oosterom and Strackee 1983."""
-    found: list[float] = []
-    for point in points:
-        a, b, c = (corner[:, k] - point for k in range(3))
-        na, nb, nc = (np.linalg.norm(one, axis=1) for one in (a, b, c))
-        top = (a * np.cross(b, c)).sum(axis=1)
-        bottom = na * nb * nc + (a * b).sum(axis=1) * nc
-        bottom += (b * c).sum(axis=1) * na + (c * a).sum(axis=1) * nb
-        found.append(float(np.arctan2(top, bottom).sum() / (2 * np.pi)))
-    return np.array(found)
-
-
 def faults(case: Case, made: Any, seed: int) -> list[str]:
     """What is wrong with a mesh, by the oracle."""
     rng = np.random.default_rng(seed)
@@ -326,7 +314,7 @@ def faults(case: Case, made: Any, seed: int) -> list[str]:
     points += (0.5 * (x.min(axis=0) + x.max(axis=0))) if case.clip is everywhere else 0
     if case.is_closed:
         clear = ~changes_near(solid, points, 0.05 * size, rng, by_slope=False)
-        is_in = winds(corner, points[clear])
+        is_in = winding_sum(corner)(points[clear])
         value = solid(points[clear])
         wrong = np.abs(is_in - (value < 0)) > 1e-3
         if wrong.any():

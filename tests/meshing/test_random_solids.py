@@ -12,6 +12,7 @@ import pytest
 import trimesh
 
 import harnack as hk
+from tests.oracles.direct_sums import winding_sum
 
 Function = Callable[[Any], Any]
 TOLERANCE = 8e-3
@@ -68,19 +69,6 @@ def random_solid(rng: np.random.Generator) -> tuple[hk.Solid, Function]:
     return whole, inside
 
 
-def winds(corner: Any, points: Any) -> Any:
-    """Whether triangles (m, 3, 3) wind around points: van Oosterom and Strackee 1983."""
-    found: list[bool] = []
-    for point in points:
-        a, b, c = (corner[:, k] - point for k in range(3))
-        na, nb, nc = (np.linalg.norm(one, axis=1) for one in (a, b, c))
-        top = (a * np.cross(b, c)).sum(axis=1)
-        bottom = na * nb * nc + (a * b).sum(axis=1) * nc
-        bottom += (b * c).sum(axis=1) * na + (c * a).sum(axis=1) * nb
-        found.append(bool(np.arctan2(top, bottom).sum() > np.pi))
-    return np.array(found, bool)
-
-
 def judge(seed: int) -> str:
     """ "made" or the reason for a refusal; raises AssertionError for a wrong mesh."""
     rng = np.random.default_rng(seed)
@@ -112,7 +100,7 @@ def judge(seed: int) -> str:
     points = rng.uniform(*made.bounds, (100, 3))
     value = inside(points)
     clear = np.abs(value) > step
-    assert (winds(corner, points[clear]) == (value[clear] < 0)).all(), f"seed {seed}"
+    assert ((winding_sum(corner)(points[clear]) > 0.5) == (value[clear] < 0)).all(), f"seed {seed}"
     return "made"
 
 

@@ -51,6 +51,26 @@ def test_fields_come_back_as_they_were(name: str) -> None:
     assert text_of(saved.surfaces, saved.settings) == text
 
 
+def test_how_curves_are_traced_comes_back() -> None:
+    """A curve of certificate "paper" came back as one that is proved."""
+    loops = CURVE.loops
+    for how in ({"certificate": "paper"}, {"cells": True}, {"cells": False}, {}):
+        text = text_of(hk.SolidAngle(loops, **how), {})
+        about = json.loads(text)["surfaces"][0]["field"]
+        assert {name: about[name] for name in about if name != "curves"} == how
+        (field,) = scene_of(text).surfaces
+        assert isinstance(field, hk.SolidAngle)
+        assert field.asked_certificate == how.get("certificate", "auto")
+        assert field.cells is how.get("cells")
+    with pytest.raises(ValueError, match="true or false, not 3"):
+        text_of(hk.SolidAngle(loops, cells=3.0), {})
+    for wrong, said in (({"cells": 9e9}, "true or false"), ({"certificate": "x"}, "certificate")):
+        given = json.loads(text_of(CURVE, {}))
+        given["surfaces"][0]["field"] |= wrong
+        with pytest.raises(ValueError, match=said):
+            scene_of(json.dumps(given))
+
+
 def test_every_scene_of_the_gallery_comes_back() -> None:
     for name, scene in SCENES.items():
         surfaces = scene.surfaces()
@@ -205,7 +225,7 @@ WRONG_FIELDS = {
     '{"Gyroid": {"cell": 1e308}}': "Gyroid",
     '{"scene": []}': "no scene is named",
     '{"curves": [[1, 2]]}': "surfaces",
-    '{"curves": [], "level": 1}': "nothing",
+    '{"curves": [], "level": 1}': "part of curves",
     '{"Sphere": {}}, "levle": 1': 'mean "level"',
     '{"Sphere": {}}, "level": "x"': "level",
 }

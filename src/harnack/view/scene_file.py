@@ -9,7 +9,8 @@ A scene file is JSON of version 1. Nothing in it is ever run, and what is not kn
       "sliders": {"level": {"low": 1, "high": 12, "start": 6.28}}
     }
 
-A field is one of {"curves": loops of points}, {"formula": text, "parameters": numbers by name},
+A field is one of {"curves": loops of points, "certificate": ..., "cells": true or false},
+{"formula": text, "parameters": numbers by name},
 {"scene": a name of the gallery, "number": which of its surfaces}, {"file": a surface file, "as":
 ..., "boundary": ..., "normals": ..., "smoothing": ..., "up": ...}, or the name of a class and its
 arguments, as {"Sphere": {"radius": 2}}. Beside it stand the settings of `level_set`, under
@@ -265,7 +266,11 @@ def _field_text(one: Field, origins: Origins) -> Plain:
         made |= {k: _plain(v) for k, v in extra.items() if v != usual[k].default}
         return {name: value for name, value in made.items() if value != {}}
     if type(one) is SolidAngle and not one.circles:
-        return {"curves": [np.asarray(loop).tolist() for loop in one.loops]}
+        how = {"certificate": one.asked_certificate, "cells": one.cells}
+        usual = inspect.signature(SolidAngle).parameters
+        own = {name: value for name, value in how.items() if value != usual[name].default}
+        _check_cells(own)
+        return {"curves": [np.asarray(loop).tolist() for loop in one.loops], **own}
     if type(one).__name__ not in _kinds():
         raise SceneFileError(
             f"a {type(one).__name__} that was made in Python cannot be written into a scene file, "
@@ -274,6 +279,12 @@ def _field_text(one: Field, origins: Origins) -> Plain:
     made = _object_text(one)
     _check_return(one, _field_of(made, "field", None))
     return made
+
+
+def _check_cells(how: Mapping[str, Any]) -> None:
+    """Raise for megabytes: how much memory is used is not up to a file."""
+    if not isinstance(how.get("cells", True), bool):
+        raise SceneFileError(f"cells of a scene are true or false, not {how['cells']!r:.60}")
 
 
 def _check_return(one: Field, other: Field) -> None:
@@ -505,9 +516,12 @@ def _origin_of(
 def _field_of(given: Any, where: str, find: Callable[[str], Path] | None) -> Field:
     about = _object(given, where)
     if "curves" in about:
-        if len(about) > 1:
-            raise SceneFileError(f"{where}: beside curves there is nothing")
-        return SolidAngle(about["curves"])
+        for name in about:
+            _check_name(name, ("curves", "certificate", "cells"), "part of curves")
+        how = {name: value for name, value in about.items() if name != "curves"}
+        check_types(SolidAngle, how)
+        _check_cells(how)
+        return SolidAngle(about["curves"], **how)
     if "formula" in about:
         known = ("formula", "parameters", "domain", "level", "is_convex")
         for name in about:

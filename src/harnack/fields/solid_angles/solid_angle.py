@@ -153,7 +153,7 @@ class SolidAngle(HasCells, UploadedField["_CurveBuffers"]):
         self._region: PlanarRegion | None = None
         if not self._is_empty:
             self._region = planar_region(self._net, self._net_circles)
-        self._asked: CertificateName = certificate
+        self.asked_certificate: CertificateName = certificate
         self.certificate = self._choose(certificate)
         points = self._points_around()
         self._center = 0.5 * (points.min(axis=0) + points.max(axis=0))
@@ -270,7 +270,7 @@ class SolidAngle(HasCells, UploadedField["_CurveBuffers"]):
         """The same field without cells."""
         if not self.has_detail:
             return self
-        return SolidAngle([*self.loops, *self.circles], certificate=self._asked)
+        return SolidAngle([*self.loops, *self.circles], certificate=self.asked_certificate)
 
     def _on(self, p: Vec3) -> _CurveBuffers:
         """The data; without cells if `prepare` was not called."""
@@ -300,7 +300,7 @@ class SolidAngle(HasCells, UploadedField["_CurveBuffers"]):
         """The look with promises along the ray, which prove long steps where it runs along an
         edge."""
         del ahead, back
-        knows_lines = not self._is_empty and self._asked != "paper"
+        knows_lines = not self._is_empty and self.asked_certificate != "paper"
         direction = path.direction if knows_lines else None
         return path.look(self._sample(path.point(t), direction))
 
@@ -343,7 +343,7 @@ class SolidAngle(HasCells, UploadedField["_CurveBuffers"]):
         gradient_error = dr.select(met, 0, gradient_error)
         error = dr.select(met, 8 * _PERIOD, error)  # the steep gradient times 2 rounding
         along = _along_curves(on, x, sums, left_out, direction)
-        if self._asked == "paper":
+        if self.asked_certificate == "paper":
             known = (ball,)
         value = dr.select(met, 0, sums.angle)
         sample = Sample(
@@ -509,7 +509,7 @@ class SolidAngle(HasCells, UploadedField["_CurveBuffers"]):
         reach = 1.0001 * length / math.sqrt(nearest * (_PERIOD - nearest))
         lower, upper = points.min(axis=0) - reach, points.max(axis=0) + reach
         loops = [*self._net, *self._net_circles]
-        proved = self._without_cells if self._asked != "paper" else SolidAngle(loops)
+        proved = self._without_cells if self.asked_certificate != "paper" else SolidAngle(loops)
         vertices = sum(map(len, self._net)) + 3 * len(self._net_circles)
         return tight_extent(proved, levels, lower, upper, max(8, _MOST_PAIRS // vertices))
 
@@ -520,7 +520,7 @@ class SolidAngle(HasCells, UploadedField["_CurveBuffers"]):
 
     def least_rays(self) -> float:
         edges = sum(map(len, self._net))
-        is_fixed = not self._movable and self._asked != "paper"
+        is_fixed = not self._movable and self.asked_certificate != "paper"
         few = not is_fixed or edges < _LEAST_EDGES
         return math.inf if few else max(_LEAST_RAYS, _PAYS / edges)
 
