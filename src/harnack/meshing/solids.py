@@ -36,6 +36,7 @@ from harnack.meshing.checks import (
     LocalError,
     MeshingError,
     TooLargeError,
+    check_manifold,
     may_help_again,
 )
 from harnack.meshing.clipping import without_films
@@ -602,6 +603,7 @@ def _checked(
         )  # fmt: skip
         if mended is None:
             raise
+        check_manifold(mended.faces, mended.vertices)  # all of it: `check` saw what is new
         return mended
     return made
 
