@@ -156,6 +156,9 @@ _SPHERE = (_POINTS, _POINTS)
 FIELDS = {
     # Accurate enough that clusters of points are never taken as a whole: no truncation.
     "dipoles": hk.DipolePotential(*_SPHERE, np.full(60, 4 * math.pi / 60), accuracy=100.0),
+    "dipoles in cells": hk.DipolePotential(
+        *_SPHERE, np.full(60, 4 * math.pi / 60), accuracy=100.0, cells=True
+    ),
     "smoothed": hk.DipolePotential(
         *_SPHERE, np.full(60, 4 * math.pi / 60), smoothing=0.2, accuracy=100.0
     ),
@@ -174,7 +177,9 @@ SOME = ("coil", "Y 5,3", "charges", "matter")
 _BALL, _PLANE_BALL = HarmonicBall(1.0, -1.0, 1.0), HarmonicBall(1.0, -1.0, 1.0, 2)
 _STEEP, _BENT = Lipschitz(1.0), Curvature(1.0)
 PROMISES_OF: dict[str, tuple[Promise, ...]] = {
-    **dict.fromkeys(("dipoles", "Y 2,0", "polynomial off center", *CURVES), (_BALL, _BENT)),
+    **dict.fromkeys(
+        ("dipoles", "dipoles in cells", "Y 2,0", "polynomial off center", *CURVES), (_BALL, _BENT)
+    ),
     **dict.fromkeys(("Y 5,3", "Y 12,-7, large", "Eq. 8"), (_BALL, _STEEP, _BENT)),
     **dict.fromkeys(
         ("gyroid", "gyroid, small", "P", "D", "Fig. 21", "plane waves"),

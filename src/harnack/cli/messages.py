@@ -101,6 +101,7 @@ _PHRASES = {
     "solid=(-math.inf, level)": "--solid :LEVEL",
     "solid=(-math.inf, 0.0)": "--solid :0",
     "solid=(low, high)": "--solid LOW:HIGH",
+    "solid=(0.5, math.inf)": "--solid 0.5:",
     'backdrop="white"': "--backdrop white",
     "up= ": "--up ",
     "max_triangles": "--max-triangles",

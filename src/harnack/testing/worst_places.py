@@ -111,10 +111,15 @@ class FieldValues:
         )
 
 
-def look_at(field: Field, points: FloatArray, precision: Precision = "double") -> FieldValues:
-    """The field at points (n, 3), all numbers of its promises as float64 arrays (n,)."""
+def look_at(
+    field: Field, points: FloatArray, precision: Precision = "double", *, closely: bool = False
+) -> FieldValues:
+    """The field at points (n, 3), all numbers of its promises as float64 arrays (n,).
+
+    closely: without truncation.
+    """
     n = len(points)
-    sample = _sample(field, points, precision)
+    sample = _sample(field, points, precision, closely)
     numbers_known = [list(vars(one).values()) for one in sample.promises]
     # At once, or each would be computed by a kernel of its own.
     dr.eval(sample.value, sample.gradient, sample.error, sample.gradient_error, numbers_known)
@@ -218,9 +223,11 @@ def random_directions(rng: np.random.Generator, n: int) -> FloatArray:
     return directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
-def _sample(field: Field, points: FloatArray, precision: Precision) -> Sample:
+def _sample(field: Field, points: FloatArray, precision: Precision, closely: bool) -> Sample:
     backend = choose_backend(precision)
-    return field.prepare(backend).evaluate(to_vector3(backend, points, "points"))
+    prepared = field.prepare(backend)
+    seen = prepared.without_truncation(backend) if closely else prepared
+    return seen.evaluate(to_vector3(backend, points, "points"))
 
 
 def _spread(value: object, n: int) -> FloatArray:
