@@ -177,7 +177,7 @@ def _at_once(lines: Lines, columns: Sequence[int] | None = None) -> FloatArray |
 
     columns: which to read. None: all, if there are as many in each line.
     """
-    if not len(lines) or any(b"_" in line for line in lines.text):
+    if not len(lines) or b"_" in b"\n".join(lines.text):
         return None
     try:
         with warnings.catch_warnings():

@@ -1,0 +1,171 @@
+"""Areas of the cells of points in their tangent planes, each cut by what neighbors leave it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import numpy as np
+import numpy.typing as npt
+
+from harnack.backend import BoolArray, FloatArray, choose_backend, to_numpy
+from harnack.backend.arrays import aligned, aligned_integers, upload_vectors
+from harnack.backend.elementary import across_rows, fmax, fmin
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Mask, Real
+
+__all__ = ["TangentCells"]
+
+# Lines that are cut at once by each of the others.
+_AT_ONCE = 4
+# Sines below which lines are parallel, and distances below which these are equal.
+_PARALLEL = 1e-12
+
+
+@dataclass(frozen=True)
+class _Line:
+    """The line n . y = h that crosses the unit disc, n = (x, y) of length 1; one that does not is
+    (0, 0), 1. q: n times the distance of the neighbor, seen in the plane, whatever the line."""
+
+    x: Real
+    y: Real
+    h: Real
+    q: tuple[Real, Real]
+
+
+@dataclass(frozen=True)
+class TangentCells:
+    """Positions that may be neighbors, on a backend: each coordinate (n,)."""
+
+    backend: Backend
+    positions: tuple[Real, ...]
+
+    @classmethod
+    def of(cls, positions: FloatArray) -> TangentCells:
+        """positions: (n, 3)."""
+        backend = choose_backend("double")
+        columns = np.asarray(positions, np.float64).T
+        return cls(backend, tuple(aligned(backend, one) for one in columns))
+
+    def areas(
+        self, points: FloatArray, normals: FloatArray, nearest: npt.NDArray[Any], radii: FloatArray
+    ) -> FloatArray:
+        """(m,): of { y : |y| <= R, y nearer to the point than to each neighbor } in the plane
+        through each of the points (m, 3) across its normal.
+
+        nearest: (m, k) the neighbors, as positions. radii: (m,). Where all neighbors lie on one
+        side of a line through the point, their mirror images count too.
+        """
+        areas, rim = self._cut(points, normals, nearest, radii, mirrored=False)
+        if rim.any():
+            some = points[rim], normals[rim], nearest[rim], radii[rim]
+            areas[rim], _ = self._cut(*some, mirrored=True)
+        return areas * radii * radii
+
+    def _cut(
+        self, points: FloatArray, normals: FloatArray, nearest: npt.NDArray[Any],
+        radii: FloatArray, *, mirrored: bool,
+    ) -> tuple[FloatArray, BoolArray]:  # fmt: skip
+        """Areas in units of the radii squared, and where all neighbors lie on one side.
+
+        On line j, at distance h_j from the center, the others and the circle leave an interval of
+        the position s along it. The region is star shaped, so its area is the sum of the triangles
+        between these intervals and the center, and of circular sectors in the directions that
+        remain. All neighbors lie on one side if none is to the left of one of them.
+        """
+        backend, index = self.backend, self.backend.UInt32
+        u, v = (upload_vectors(backend, axis) for axis in across_rows(normals))
+        center, scale = upload_vectors(backend, points), aligned(backend, 1 / radii)
+        count = nearest.shape[1]
+        table = aligned_integers(backend, np.ascontiguousarray(nearest.T).ravel())
+        lane, width = dr.arange(index, len(points)), dr.opaque(index, len(points))
+        lines = dr.opaque(index, count * (2 if mirrored else 1))
+        rows = dr.opaque(index, count)
+
+        def line(i: Any, active: Mask) -> _Line:
+            row = dr.select(i < rows, i, i - rows)
+            one = dr.gather(index, table, row * width + lane, active)
+            there = [dr.gather(backend.Float, part, one, active) for part in self.positions]
+            offset = (backend.Array3f(*there) - center) * scale
+            sign = dr.select(i < rows, backend.Float(1), backend.Float(-1))
+            # The plane that bisects the offset d meets the tangent plane in q . y = |d|^2/2.
+            q = sign * dr.dot(offset, u), sign * dr.dot(offset, v)
+            return _crossing(backend, q, 0.5 * dr.squared_norm(offset))
+
+        def others(j: Any, *state: Any) -> tuple[Any, ...]:
+            numbers = [j + t for t in range(_AT_ONCE)]
+            own = [line(number, number < lines) for number in numbers]
+            area, turned, is_rim = state
+            for number, one, found in zip(
+                numbers, own, _cut_by_all(backend, numbers, own, line, lines), strict=True
+            ):
+                low, high, has_left = found
+                used, there = low < high, number < lines
+                low, high = dr.select(used, low, 0), dr.select(used, high, 0)
+                area = area + dr.select(there, 0.5 * one.h * (high - low), 0)
+                turn = dr.atan2(high, one.h) - dr.atan2(low, one.h)
+                turned = turned + dr.select(there, turn, 0)
+                is_rim = is_rim | (there & ~has_left & ((one.q[0] != 0) | (one.q[1] != 0)))
+            return j + _AT_ONCE, area, turned, is_rim
+
+        zero = backend.Float(0) + 0 * scale
+        start = index(0) + 0 * lane, zero, zero, zero > 1
+        more = _below(lines)
+        _, area, turned, is_rim = dr.while_loop(start, more, others, label="lines")
+        whole = area + 0.5 * fmax(2 * math.pi - turned, 0)
+        dr.eval(whole, is_rim)
+        return to_numpy(whole), to_numpy(is_rim)
+
+
+def _below(count: Any) -> Callable[..., Mask]:
+    """Whether a loop's first number is below the count."""
+
+    def more(i: Any, *_: Any) -> Mask:
+        return i < count
+
+    return more
+
+
+def _crossing(backend: Backend, q: tuple[Real, Real], b: Real) -> _Line:
+    """The line q . y = b in the unit disc."""
+    length = dr.sqrt(dr.square(q[0]) + dr.square(q[1]))
+    crosses = length > b
+    inverse = dr.select(crosses, dr.rcp(length), 0)
+    return _Line(q[0] * inverse, q[1] * inverse, dr.select(crosses, b * inverse, 1), q)
+
+
+def _cut_by_all(
+    backend: Backend, numbers: list[Any], own: list[_Line], line: Any, lines: Any
+) -> list[tuple[Real, Real, Mask]]:
+    """Of some lines the intervals that all others leave, and whether a neighbor is to the left."""
+    start: list[Any] = []
+    for one in own:
+        half_chord = dr.sqrt(fmax(1 - dr.square(one.h), 0))
+        start += [-half_chord, half_chord, half_chord > dr.inf]
+
+    def cut(i: Any, *state: Any) -> tuple[Any, ...]:
+        other, new = line(i, i < lines), list[Any]()
+        for t, (number, one) in enumerate(zip(numbers, own, strict=True)):
+            low, high, has_left = state[3 * t : 3 * t + 3]
+            # How fast this line nears the other, going along it.
+            slope = other.y * one.x - other.x * one.y
+            room = other.h - one.h * (other.x * one.x + other.y * one.y)
+            is_parallel = dr.abs(slope) < _PARALLEL
+            bound = room / dr.select(is_parallel, 1, slope)
+            low = dr.select(slope < -_PARALLEL, fmax(low, bound), low)
+            high = dr.select(slope > _PARALLEL, fmin(high, bound), high)
+            # Of equal lines the first counts.
+            hidden = is_parallel & (room < dr.select(number > i, _PARALLEL, -_PARALLEL))
+            high = dr.select(hidden, -dr.inf, high)
+            has_left = has_left | (one.q[0] * other.q[1] - one.q[1] * other.q[0] > 0)
+            new += [low, high, has_left]
+        return i + 1, *new
+
+    zero = backend.UInt32(0) + 0 * numbers[0]
+    found: tuple[Any, ...] = dr.while_loop((zero, *start), _below(lines), cut, label="other lines")
+    found = found[1:]
+    return [(found[k], found[k + 1], found[k + 2]) for k in range(0, len(found), 3)]
