@@ -28,6 +28,7 @@ from harnack.fields.solid_angles.local_expansion import (
     value_and_gradient,
 )
 from harnack.fields.solid_angles.multipole import of_dipole, regular
+from harnack.geometry import shapes
 from tests.oracles.direct_sums import dipole_sum
 from tests.tracer.test_cloud_hits import Cloud, cloud, rays, unit
 
@@ -269,6 +270,28 @@ def test_memory_is_bounded_and_stated() -> None:
     assert sizes[0] > sizes[1] > sizes[2] > sizes[3] == 0
     assert "cells" not in hk.DipolePotential(*some, cells=False).describe()
     assert hk.DipolePotential(*some).describe()["cells"] == "from 100,000 rays on"
+
+
+def test_solids_tell_their_parts_how_many_rays_there_will_be() -> None:
+    """Parts of solids had no cells, however many rays there were."""
+    points, normals, areas = cloud(300)
+    curve = hk.SolidAngle(shapes.torus_knot(2, 3, 60))
+    knot = hk.solid(curve, around=(2 * math.pi, 0.4))
+    inside = hk.solid(hk.DipolePotential(points, normals, areas), above=2 * math.pi)
+    solid = (inside.scaled(2.0) - knot.moved((1.0, 0, 0))).grown(0.01)
+    assert solid.for_rays(1000) is solid
+    assert not knot.has_detail
+    many = solid.for_rays(10**8)
+    assert many.for_rays(10) is many
+    assert solid.for_rays(10**8) is many
+    assert knot.for_rays(10**8).has_detail
+    o = np.random.default_rng(3).normal(size=(2000, 3)) * 0.2 + [0.0, 0.0, 6.0]
+    d = np.random.default_rng(4).uniform(-2, 2, (2000, 3)) - o
+    hits, same = (hk.trace(one, o, d) for one in (solid, many))
+    assert (np.asarray(hits.hit) == np.asarray(same.hit)).mean() > 0.998
+    both = np.asarray(hits.hit & same.hit)
+    apart = np.abs(np.asarray(hits.t)[both] - np.asarray(same.t)[both])
+    assert np.quantile(apart, 0.99) < 1e-3
 
 
 @pytest.mark.parametrize("cells", [-1.0, math.inf, math.nan])

@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import abc
 import copy
+import dataclasses
 import functools
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from harnack.backend.numbers import positive, refuses_derivatives
+from harnack.cluster.packing import Remembered
 from harnack.fields.field import Field
 from harnack.fields.formula import Formula
 from harnack.geometry import Ball, Box, Volume
@@ -222,6 +224,11 @@ class Solid(Field):
 
         return self._mapped(Affine.rotation(degrees, axis))
 
+    @functools.cached_property
+    def _made(self) -> Remembered[tuple[int, ...], Solid]:
+        """The same combination of other parts, by these parts, which it holds (`for_rays`)."""
+        return Remembered()
+
     @refuses_derivatives
     def scaled(self, factors: float | Sequence[float]) -> Solid:
         """The solid, scaled about the origin, by one factor or by one for each axis.
@@ -285,6 +292,15 @@ class Derived(Solid):
         other = copy.copy(self)
         object.__setattr__(other, "inner", inner)
         return other
+
+    def for_rays(self, count: int) -> Field:
+        """Of the inner field as it is for so many rays."""
+        inner = self.inner.for_rays(count)
+        if inner is self.inner:
+            return self
+        if (id(inner),) not in self._made:
+            self._made[id(inner),] = dataclasses.replace(cast("Any", self), inner=inner)
+        return self._made[id(inner),]
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
         """Those of the inner field, which has the same derivatives up to their sign."""
