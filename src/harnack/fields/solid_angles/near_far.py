@@ -162,10 +162,11 @@ def build_cells(
         the backend. Where cells would take more bytes, they are larger and have more near dipoles.
 
     Proof that each dipole counts once in each cell that is not split. The root of the octree begins
-    with a list of one node, the root of the tree. From each node of a cell's list the dipoles go to
-    far nodes, which the cell adds to its expansion, or to nodes that are left (`nodes_of`), which
-    are the list of each of its octants. A cell that is not split takes apart what is left: into far
-    nodes, far dipoles of other nodes, and near dipoles (`dipoles_of`).
+    with a list of one node, the root of the tree. In a cell that is split the dipoles of each node
+    of its list go to far nodes, which are added to the expansion of all cells in it, or to nodes
+    that are left (`nodes_of`), which are the list of each of its octants. A cell that is not split
+    takes its list apart: into far nodes, far dipoles of other nodes, and near dipoles
+    (`dipoles_of`).
     """
     packed = source_tree(tree, levels, rows)
     octree = _fitting(packed, half, backend, most_bytes)
@@ -177,10 +178,8 @@ def build_cells(
     tables, near = [np.zeros((0, 0))], [np.zeros(0, np.uint32)]
     splits, count, total = 0, 0, 0
     for level in octree:
-        c, radius = to_vector3(double, level.centers), dr.opaque(double.Float, level.radius)
-        found, lists = _shared(packed, lists, c, radius)
-        shared = shared.plus(found)
         leaves, split = np.flatnonzero(level.is_leaf), np.flatnonzero(~level.is_leaf)
+        radius = dr.opaque(double.Float, level.radius)
         if len(leaves):
             own = lists.some(double, leaves)
             sums, close = _own(packed, own, to_vector3(double, level.centers[leaves]), radius)
@@ -193,8 +192,11 @@ def build_cells(
             total += int(lengths.sum())
         nodes.append(numbered_nodes(level.is_leaf, count, splits))
         count, splits = count + len(leaves), splits + len(split)
-        shared = shared.some(~level.is_leaf).of_octants(shifts, level.radius)
-        lists = lists.some(double, np.repeat(split, 8))
+        if len(split):
+            lists, centers = lists.some(double, split), level.centers[split]
+            found, lists = _shared(packed, lists, to_vector3(double, centers), radius)
+            shared = shared.some(~level.is_leaf).plus(found).of_octants(shifts, level.radius)
+            lists = lists.some(double, np.repeat(np.arange(len(split)), 8))
     table, entries = np.concatenate(tables[1:]), np.concatenate(near)
     return NearFarCells(
         backend, CellLookup.of(backend, np.full(3, -half), 2 * half, nodes),
@@ -205,7 +207,7 @@ def build_cells(
 
 
 def _shared(packed: PackedTree, lists: Lists, c: Vec3, radius: Real) -> tuple[FarSums, Lists]:
-    """What cells add for all cells in them, and what is left to these."""
+    """What cells that are split add for all cells in them, and what is left to these."""
     backend, inner, smallest = packed.backend, _SHARED * radius, _SMALL * radius
     far, left = (
         make_lists(
