@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 
 # Factors k of `far_sums`, by experiment: for a cell's own dipoles, and for those that it gathers
 # for all cells in it. The second is larger, as each level of cells adds to the truncation.
-_NEAR, _SHARED = 2.5, 4.5
+_NEAR, _SHARED = 2.5, 3.5
 # Nodes of the tree are left to the cells in a cell if they are no larger than its ball.
 _SMALL = 1.0
 # Cells are split that have more near dipoles, by experiment; where memory is short, twice as many,
@@ -224,7 +224,8 @@ def _own(packed: PackedTree, lists: Lists, c: Vec3, radius: Real) -> tuple[FarSu
     backend, inner = packed.backend, _NEAR * radius
     nothing, most = dr.opaque(backend.Float, -1.0), dr.opaque(backend.UInt32, _ANY)
     nodes = make_lists(
-        backend, lambda put: nodes_of(packed, lists, c, inner, nothing, put, far=True)
+        backend,
+        lambda put: nodes_of(packed, lists, c, inner, nothing, put, far=True, leaves=False),
     )
     far, close = (
         make_lists(
