@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from harnack.geometry.mesh_shapes import icosphere
-from harnack.meshing import checks
+from harnack.meshing import checks, near_faces
 from harnack.meshing.checks import intersecting_faces
 from harnack.meshing.near_faces import near_pairs
 from tests.oracles.triangle_pairs import intersecting_pairs
@@ -65,6 +65,19 @@ def test_the_same_faces_are_found_as_with_all_pairs_of_boxes(
     by_tree = [intersecting_faces(vertices, faces, among).tolist() for among in (None, some)]
     assert by_tree == by_boxes
     assert by_tree[0]
+
+
+def test_pairs_for_which_there_is_no_room_are_found_in_parts(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    vertices, faces = noisy()
+    expected = near_pairs(vertices, faces, None)
+    lower, upper = vertices[faces].min(axis=1), vertices[faces].max(axis=1)
+    overlap = ((lower[:, None] <= upper) & (lower <= upper[:, None])).all(axis=2)
+    assert (overlap.sum() - len(faces)) / 2 > len(faces)  # more than there is room for
+    monkeypatch.setattr(near_faces, "_PAIRS_AT_ONCE", 1)
+    found = near_pairs(vertices, faces, None)
+    assert sorted(found.tolist()) == sorted(expected.tolist())
 
 
 @pytest.mark.parametrize("make", [noisy, coplanar, around_few_points])

@@ -1,8 +1,9 @@
 """Pairs of triangles that may meet: all others are proved apart, in floating point.
 
-Each triangle walks a tree of boxes. Of the few whose boxes overlap with its own, nearly all are
-apart by a sign that rounding cannot change; what is left is for exact arithmetic
-(`checks.intersecting_faces`).
+Each triangle walks a tree of boxes, and the pairs whose boxes overlap are listed: about eight for
+each triangle. They are then tested side by side, since tests within the walk would wait for each
+other. Nearly all are apart by a sign that rounding cannot change; what is left is for exact
+arithmetic (`checks.intersecting_faces`).
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray, choose_backend, to_numpy
+from harnack.backend.records import Records
 from harnack.meshing.edges import IntArray
 from harnack.tree.hierarchy import (
     NO_PRIMITIVE,
@@ -35,10 +37,11 @@ if TYPE_CHECKING:
 
 __all__ = ["ROUNDING", "near_pairs"]
 
-# Columns of a record behind the corners: the three vertices' numbers, and the face's.
-_VERTICES, _NUMBER, _CHOSEN = 9, 12, 13
-_LEAF_SIZE = 4
-_AT_ONCE = 1 << 20
+# Columns of a record behind the box: the face's number, and whether it is chosen.
+_NUMBER, _CHOSEN = 6, 7
+_LEAF_SIZE = 8
+# Triangles that walk the tree at once, and pairs that there is room for then, at the least.
+_ROWS_AT_ONCE, _PAIRS_AT_ONCE = 1 << 17, 1 << 22
 # Rounding of a product of three vectors and of two, of differences of coordinates, over the product
 # of their lengths: at most seven roundings of up to six terms, which are 1.16 times that product
 # together, and four of three terms, which are as much as it. So that is a third of what is allowed.
@@ -55,87 +58,112 @@ def near_pairs(vertices: FloatArray, faces: IntArray, among: BoolArray | None) -
     among: (m,) mask; pairs of which neither is chosen are left out.
     """
     chosen = np.ones(len(faces), np.bool_) if among is None else among
-    rows = np.flatnonzero(chosen)
     found = [np.zeros((0, 2), np.int64)]
-    if not len(rows):
+    if not chosen.any():
         return found[0]
     largest = float(np.abs(vertices).max(initial=0.0))
     # A power of two, so that nothing is rounded.
-    corners = (np.ldexp(vertices, -int(np.frexp(largest)[1])) if largest else vertices)[faces]
-    search = _Search.of(corners, faces, chosen)
-    rows = search.order[chosen[search.order]]
-    for start in range(0, len(rows), _AT_ONCE):
-        some = rows[start : start + _AT_ONCE]
-        counts, _ = search.partners(some, np.zeros(len(some)))
-        each = np.repeat(some, counts)
-        if len(each):
-            # 1, 2, ... for each face
-            place = np.arange(len(each)) - np.repeat(np.cumsum(counts) - counts, counts) + 1
-            found.append(np.column_stack([each, search.partners(each, place)[1]]))
+    unit = np.ldexp(vertices, -int(np.frexp(largest)[1])) if largest else vertices
+    boxes, pairs = _Boxes.of(unit[faces], chosen), _Pairs.of(unit, faces)
+    rows = boxes.order[chosen[boxes.order]]
+    room = max(_PAIRS_AT_ONCE, len(faces))
+    left = [rows[start : start + _ROWS_AT_ONCE] for start in range(0, len(rows), _ROWS_AT_ONCE)]
+    while left:
+        some = left.pop()
+        listed = boxes.overlapping(some, room)
+        if listed is None:  # a single triangle always has room
+            left += np.array_split(some, 2)
+            continue
+        found.append(pairs.not_apart(*listed))
     return np.concatenate(found)
 
 
 @dataclass(frozen=True)
-class _Search:
-    """Faces in a tree. records: (m, 14); order: their indices leaf by leaf."""
+class _Boxes:
+    """Boxes of faces in a tree. records: (m, 8); order: their indices leaf by leaf."""
 
     tree: PackedTree
     records: FloatArray
     order: IntArray
 
     @classmethod
-    def of(cls, corners: FloatArray, faces: IntArray, chosen: BoolArray) -> _Search:
-        lower, upper = corners.min(axis=1), corners.max(axis=1)
+    def of(cls, corners: FloatArray, chosen: BoolArray) -> _Boxes:
+        a, b, c = (corners[:, k] for k in range(3))
+        lower, upper = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
         hierarchy = build_hierarchy(0.5 * (lower + upper), leaf_size=_LEAF_SIZE)
-        records = np.column_stack(
-            [corners.reshape(-1, 9), faces, np.arange(len(faces)), chosen]
-        ).astype(np.float64)
+        records = np.column_stack([lower, upper, np.arange(len(corners)), chosen])
         placed = hierarchy.gather(records)
         placed[hierarchy.slots == NO_PRIMITIVE, _NUMBER] = -1.0
         levels = box_levels(hierarchy, lower, upper)
         order = hierarchy.slots[hierarchy.slots != NO_PRIMITIVE]
         return cls(pack(choose_backend("double"), hierarchy, levels, placed), records, order)
 
-    def partners(self, rows: IntArray, place: Any) -> tuple[IntArray, IntArray]:
-        """Of some faces how many others may meet them, and which comes at a place (from 1 on) of
-        these, in the order of the tree."""
+    def overlapping(self, rows: IntArray, room: int) -> tuple[Any, Any] | None:
+        """Pairs of some faces, and of others, whose boxes overlap, in no order; None if there are
+        more than `room`."""
         backend = self.tree.backend
-        real, vector = backend.Float, backend.Array3f
+        real, vector, whole = backend.Float, backend.Array3f, backend.UInt32
         columns = [real(np.ascontiguousarray(one)) for one in self.records[rows].T]
-        one = (vector(*columns[:3]), vector(*columns[3:6]), vector(*columns[6:9]))
-        names, own = columns[_VERTICES:_NUMBER], columns[_NUMBER]
-        wanted = real(np.asarray(place, np.float64))
-        low = dr.minimum(dr.minimum(one[0], one[1]), one[2])
-        high = dr.maximum(dr.maximum(one[0], one[1]), one[2])
+        low, high, own = vector(*columns[:3]), vector(*columns[3:6]), columns[_NUMBER]
+        number, most = dr.zeros(whole, 1), dr.opaque(whole, room)
+        one, other = dr.zeros(whole, room), dr.zeros(whole, room)
+
+        def overlap(row: Any) -> Mask:
+            return dr.all((vector(*row[:3]) <= high) & (vector(*row[3:6]) >= low))
 
         def visit(node: Node, state: State) -> tuple[Mask, State]:
-            down, up = vector(*node.head[:3]), vector(*node.head[3:6])
-            near = dr.all((down <= high) & (up >= low))
-            return near, for_each(node, near & node.is_leaf, compare, state)
+            near = overlap(node.head)
+            return near, for_each(node, near & node.is_leaf, put, state)
 
-        def compare(row: list[Real], active: Mask, state: State) -> State:
-            other = (vector(*row[:3]), vector(*row[3:6]), vector(*row[6:9]))
-            number = row[_NUMBER]
+        def put(row: list[Real], active: Mask, state: State) -> State:
+            with_number = row[_NUMBER]
             # Two that are chosen meet once.
-            asked = active & ((number > own) | ((row[_CHOSEN] == 0) & (number >= 0)))
-            for k in range(3):
-                three = (other[0][k], other[1][k], other[2][k])
-                asked &= dr.minimum(dr.minimum(three[0], three[1]), three[2]) <= high[k]
-                asked &= dr.maximum(dr.maximum(three[0], three[1]), three[2]) >= low[k]
-            shared = [
-                [name == another for another in row[_VERTICES:_NUMBER]] for name in names
-            ]  # fmt: skip
-            apart = _are_apart(one, other, shared, asked)
-            count, found = state
-            met = asked & ~apart
-            count = dr.select(met, count + 1, count)
-            return count, dr.select(met & (count == wanted), number, found)
+            once = (with_number > own) | ((row[_CHOSEN] == 0) & (with_number >= 0))
+            met = active & once & overlap(row)
+            place = dr.scatter_inc(number, whole(0), met)
+            has_room = met & (place < most)
+            dr.scatter(one, whole(own), place, has_room)
+            dr.scatter(other, whole(with_number), place, has_room)
+            return state
 
-        counts, found = walk(self.tree, visit, (real(0), real(-1)))
-        return to_numpy(counts).astype(np.int64), to_numpy(found).astype(np.int64)
+        walk(self.tree, visit, (real(0),))
+        dr.eval(number, one, other)
+        count = int(to_numpy(number)[0])
+        if count > room:
+            return None
+        listed = dr.arange(whole, count)
+        return dr.gather(whole, one, listed), dr.gather(whole, other, listed)
 
 
-def _are_apart(a: Corners, b: Corners, shared: list[list[Mask]], active: Mask) -> Mask:
+@dataclass(frozen=True)
+class _Pairs:
+    """Tests of pairs of faces. points: of vertices. corners: of the faces, three columns."""
+
+    points: Records
+    corners: tuple[Any, Any, Any]
+
+    @classmethod
+    def of(cls, vertices: FloatArray, faces: IntArray) -> _Pairs:
+        backend = choose_backend("double")
+        a, b, c = (backend.UInt32(np.ascontiguousarray(one, np.uint32)) for one in faces.T)
+        return cls(Records.upload(backend, vertices), (a, b, c))
+
+    def not_apart(self, one: Any, other: Any) -> IntArray:
+        """Those pairs (k, 2) that are not proved apart, in order."""
+        backend = self.points.backend
+        names = [[dr.gather(backend.UInt32, k, i) for k in self.corners] for i in (one, other)]
+        triangles = [
+            tuple(backend.Array3f(*self.points.row(name)[:3]) for name in three) for three in names
+        ]
+        shared = [[name == another for another in names[1]] for name in names[0]]
+        a, b = cast("tuple[Corners, Corners]", triangles)
+        rows = dr.compress(~_are_apart(a, b, shared))
+        pairs = [to_numpy(dr.gather(backend.UInt32, i, rows)) for i in (one, other)]
+        found = np.stack(pairs, axis=1).astype(np.int64)
+        return found[np.lexsort(found.T[::-1])]
+
+
+def _are_apart(a: Corners, b: Corners, shared: list[list[Mask]]) -> Mask:
     """Whether two triangles have nothing in common but the corners they share, proved.
 
     shared: whether corner i of a is corner k of b.
@@ -169,7 +197,7 @@ def _are_apart(a: Corners, b: Corners, shared: list[list[Mask]], active: Mask) -
         return numbers[12] < 0
 
     numbers = (*a, *b, *in_a, *in_b, count)
-    return by_plane | dr.if_stmt(numbers, active & ~by_plane, by_edges_or_line, is_open)
+    return by_plane | dr.if_stmt(numbers, ~by_plane, by_edges_or_line, is_open)
 
 
 def _sides(plane: Corners, of: Corners) -> list[tuple[Mask, Mask]]:
