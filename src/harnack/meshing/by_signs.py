@@ -528,9 +528,7 @@ def _folded(x: FloatArray, faces: IntArray, among: BoolArray) -> IntArray:
     """Faces, by index, that lie on a neighbor but for rounding, of which one is chosen."""
     normal = crosses(x[faces])
     normal /= np.maximum(lengths(normal), 1e-300)[:, None]
-    edges = Edges.of(directed_edges(faces))
-    order = np.argsort(edges.index, kind="stable")
-    pairs = order[(edges.uses == 2)[edges.index[order]]].reshape(-1, 2) % len(faces)
+    pairs = Edges.of(directed_edges(faces)).twice() % len(faces)
     one, other = pairs.T
     on_other = (dots(normal[one], normal[other]) < _FOLDED) & (among[one] | among[other])
     return np.unique(pairs[on_other])

@@ -135,8 +135,8 @@ def _exact_turns(points: Any) -> Any:
 
 _EDGES = ((0, 1), (1, 2), (2, 0))
 _PAIRS_AT_ONCE = 1 << 18
-# Of more triangles than this, a kernel that takes a quarter of a second to record finds the pairs.
-_MANY = 50_000
+# Of more triangles than this a kernel finds the pairs, which takes 0.05 s to record.
+_MANY = 5_000
 # So many triangles of a size are compared with each other at once.
 _MOST_AT_ONCE = 1 << 19
 
@@ -306,6 +306,11 @@ def _overlap(one: FloatArray, other: FloatArray) -> BoolArray:
 class MeshingError(ValueError):
     """A level set that could not be meshed; the message says why and what to do."""
 
+    def is_mended_by(self, smaller: float) -> bool:
+        """Whether cells may help that are `smaller` times as large as those that failed."""
+        del smaller
+        return True
+
 
 class EmptyError(MeshingError):
     """No cell holds the level."""
@@ -334,6 +339,10 @@ class CrossingError(LocalError):
 class HopelessError(MeshingError):
     """What smaller cells do not help against."""
 
+    def is_mended_by(self, smaller: float) -> bool:
+        del smaller
+        return False
+
 
 class TooLargeError(HopelessError):
     """A mesh that would be so large that it was not begun."""
@@ -343,18 +352,24 @@ class TooLargeError(HopelessError):
 _FEW_PLACES, _FEWER = 20, 0.5
 
 
-def may_help_again(now: MeshingError, before: MeshingError | None) -> bool:
-    """Whether cells that are smaller still may help, after two sizes of them failed: not if nearly
-    as many places are wrong, as along a pole or where sheets cross, where cells of no size do."""
+def may_help_again(now: MeshingError, before: MeshingError | None, smallest: float = 1.0) -> bool:
+    """Whether smaller cells may help, after one or two sizes of them failed: not if nearly as many
+    places are wrong, as along a pole or where sheets cross, where cells of no size do.
+
+    smallest: how large cells may become, in those that failed now.
+    """
+    if not now.is_mended_by(smallest):
+        return False
     if not isinstance(now, LocalError) or not isinstance(before, LocalError):
-        return not isinstance(now, HopelessError)
+        return True
     return len(now.places) <= max(_FEW_PLACES, _FEWER * len(before.places))
 
 
-def euler_characteristic(faces: IntArray) -> int:
-    """Vertices in use, less edges, and faces."""
+def euler_characteristic(faces: IntArray, edges: Edges | None = None) -> int:
+    """Vertices in use, less edges, and faces. edges: those of `directed_edges`, if known."""
     vertices = int(np.count_nonzero(np.bincount(faces.ravel())))
-    return vertices - len(Edges.of(directed_edges(faces)).ends) + len(faces)
+    edges = edges or Edges.of(directed_edges(faces))
+    return vertices - len(edges.ends) + len(faces)
 
 
 def check_manifold(faces: IntArray, vertices: FloatArray | None = None) -> None:
@@ -388,7 +403,7 @@ def check_manifold(faces: IntArray, vertices: FloatArray | None = None) -> None:
             "this level set; choose a smaller `spacing`",
             np.unique(pairs[((uses == 2) & (ways != 0))[index]]),
         )
-    if _fans(faces, index, uses)[0] > np.count_nonzero(np.bincount(faces.ravel())):
+    if _fans(faces, edges)[0] > np.count_nonzero(np.bincount(faces.ravel())):
         fail(
             "sheets of the mesh touch in a point: cells are too large for this level set; choose a "
             "smaller `spacing`, or another level",
@@ -515,16 +530,17 @@ def singular_vertices(faces: IntArray) -> IntArray:
     pairs, count = directed_edges(faces), int(faces.max(initial=-1)) + 1
     edges = Edges.of(pairs)
     many = np.unique(pairs[edges.uses[edges.index] > 2])
-    _, fan = _fans(faces, edges.index, edges.uses)
+    _, fan = _fans(faces, edges)
     # Each fan once, at its vertex.
-    _, first = np.unique(fan, return_index=True)
-    fans = np.bincount(faces.ravel()[first], minlength=count)
+    vertex = np.empty(int(fan.max(initial=-1)) + 1, np.int64)
+    vertex[fan] = faces.ravel()
+    fans = np.bincount(vertex, minlength=count)
     return np.union1d(many, np.flatnonzero(fans > 1))
 
 
-def _fans(faces: IntArray, edge: IntArray, uses: IntArray) -> tuple[int, IntArray]:
+def _fans(faces: IntArray, edges: Edges) -> tuple[int, IntArray]:
     """How many fans of faces, joined by edges, all vertices have together, and of each corner of
-    the faces (3m,) the fan that it belongs to."""
+    the faces (3m,) the fan that it belongs to. edges: those of `directed_edges`."""
     import scipy.sparse  # here: half a second that few need
     import scipy.sparse.csgraph as csgraph_module
 
@@ -534,9 +550,7 @@ def _fans(faces: IntArray, edge: IntArray, uses: IntArray) -> tuple[int, IntArra
     # Corners at both ends of the edge k of a face, in the order of `directed_edges`.
     first = np.concatenate([corner[:, 0], corner[:, 1], corner[:, 2]])
     second = np.concatenate([corner[:, 1], corner[:, 2], corner[:, 0]])
-    order = np.argsort(edge, kind="stable")
-    pairs = order[np.isin(edge[order], np.flatnonzero(uses == 2))].reshape(-1, 2)
-    one, other = pairs[:, 0], pairs[:, 1]  # run in opposite directions
+    one, other = edges.twice().T  # run in opposite directions
     rows = np.concatenate([first[one], second[one]])
     columns = np.concatenate([second[other], first[other]])
     joined = sparse.coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(3 * m, 3 * m))

@@ -342,7 +342,7 @@ def _contracted(surface: Surface, step: float) -> tuple[FloatArray, IntArray, Bo
     # Points that are one, by their coordinates one after the other.
     place = np.zeros(len(x), np.int64)
     for one in (grid - grid.min(axis=0)).astype(np.int64).T:
-        _, place, _ = numbered(place * (int(one.max()) + 1) + one)
+        _, place, _, _ = numbered(place * (int(one.max()) + 1) + one)
     first = np.empty(len(x), np.int64)
     first[place[::-1]] = np.arange(len(x))[::-1]
     faces = first[place][surface.faces]

@@ -49,18 +49,23 @@ IntArray = npt.NDArray[np.int64]
 @dataclass(frozen=True)
 class Edges:
     """ends: (k, 2) of all edges, the lower index first, in order. index: (n,) which edge each of
-    the pairs given is. uses: (k,) how many of them each is."""
+    the pairs given is. uses: (k,) how many of them each is. order: (n,) the pairs, edge by edge."""
 
     ends: IntArray
     index: IntArray
     uses: IntArray
+    order: IntArray
 
     @classmethod
     def of(cls, pairs: IntArray) -> Edges:
         """The edges that pairs (n, 2) of points are, in either order."""
         count = int(pairs.max(initial=-1)) + 1
-        keys, index, uses = numbered(edge_keys(pairs, count))
-        return cls(np.stack(np.divmod(keys, max(count, 1)), axis=1), index, uses)
+        keys, index, uses, order = numbered(edge_keys(pairs, count))
+        return cls(np.stack(np.divmod(keys, max(count, 1)), axis=1), index, uses, order)
+
+    def twice(self) -> IntArray:
+        """(j, 2) the two of the pairs given that each edge is that is exactly two of them."""
+        return self.order[np.repeat(self.uses == 2, self.uses)].reshape(-1, 2)
 
 
 def edge_keys(pairs: IntArray, count: int) -> IntArray:
@@ -88,9 +93,10 @@ def distinct(keys: IntArray) -> IntArray:
     return keys[np.flatnonzero(np.diff(keys, prepend=keys[:1] - 1))]
 
 
-def numbered(keys: IntArray) -> tuple[IntArray, IntArray, IntArray]:
+def numbered(keys: IntArray) -> tuple[IntArray, IntArray, IntArray, IntArray]:
     """Numbers (n,) that are not negative, each once and in order (k,), for each given one its place
-    among them (n,), and how often each was given (k,): `np.unique`, at a third of its time."""
+    among them (n,), how often each was given (k,), and the order of those given (n,): `np.unique`,
+    at a third of its time."""
     bits = len(keys).bit_length()
     if int(keys.max(initial=0)) >> (62 - bits):
         order = np.argsort(keys, kind="stable")
@@ -103,4 +109,4 @@ def numbered(keys: IntArray) -> tuple[IntArray, IntArray, IntArray]:
     index = np.empty(len(keys), np.int64)
     index[order] = np.cumsum(is_first) - 1
     start = np.flatnonzero(is_first)
-    return ordered[start], index, np.diff(start, append=len(keys))
+    return ordered[start], index, np.diff(start, append=len(keys)), order

@@ -233,7 +233,9 @@ def finished(surface: Surface, facts: dict[str, Any], is_closed: bool) -> trimes
     from harnack.meshing.closed_mesh import ClosedMesh
 
     made = ClosedMesh(surface.vertices, surface.faces, process=False, validate=False)
-    boundary = boundary_edges(surface.faces)
+    pairs = directed_edges(surface.faces)
+    edges = Edges.of(pairs)
+    boundary = pairs[edges.uses[edges.index] == 1]
     if is_closed:
         volume = float(made.volume)
         if len(boundary) or not volume > 0:
@@ -247,19 +249,17 @@ def finished(surface: Surface, facts: dict[str, Any], is_closed: bool) -> trimes
         "proved": 0,
         "integrated": 0,
         **facts,
-        "euler_characteristic": euler_characteristic(surface.faces),
+        "euler_characteristic": euler_characteristic(surface.faces, edges),
         "boundary": boundary,
-        "creases": _creases(surface),
+        "creases": _creases(surface, edges),
     }
     return made
 
 
-def _creases(surface: Surface) -> int:
+def _creases(surface: Surface, edges: Edges) -> int:
     """How many edges two faces meet at whose normals are more than 30 degrees apart."""
     normals = _unit_normals(surface.vertices, surface.faces)
-    edges = Edges.of(directed_edges(surface.faces))
-    order = np.argsort(edges.index, kind="stable")
-    pairs = order[(edges.uses == 2)[edges.index[order]]].reshape(-1, 2) % len(surface.faces)
+    pairs = edges.twice() % len(surface.faces)
     return int((dots(normals[pairs[:, 0]], normals[pairs[:, 1]]) < _CREASE).sum())
 
 

@@ -477,8 +477,7 @@ def _flipped(x: FloatArray, new: IntArray, taken: IntArray) -> IntArray:
     there = edge_keys(taken, len(x))
     for _ in range(_MOST_FLIPS):
         edges = Edges.of(directed_edges(new))
-        order = np.argsort(edges.index, kind="stable")
-        half = order[(edges.uses == 2)[edges.index[order]]].reshape(-1, 2)
+        half = edges.twice()
         f, g = half.T % len(new)
         k, j = half.T // len(new)
         a, b, c, d = new[f, k], new[f, (k + 1) % 3], new[f, (k + 2) % 3], new[g, (j + 2) % 3]
@@ -518,8 +517,7 @@ def _owners(new: IntArray, loops: list[IntArray], count: int) -> IntArray:
 
     sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
     edges = Edges.of(directed_edges(new))
-    order = np.argsort(edges.index, kind="stable")
-    one, other = order[(edges.uses == 2)[edges.index[order]]].reshape(-1, 2).T % len(new)
+    one, other = edges.twice().T % len(new)
     joined = sparse.coo_matrix((np.ones(len(one)), (one, other)), shape=(len(new), len(new)))
     part = np.asarray(csgraph.connected_components(joined, directed=False)[1])
     loop_at = np.full(int(part.max()) + 1, -1, np.int64)

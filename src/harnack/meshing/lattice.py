@@ -179,32 +179,33 @@ class Lattice:
         """Tetrahedra at all faces of cells (k, 3): their points (n, 3) by coordinates, and for each
         the indices of four of them (m, 4)."""
         shape = 2 * self.counts + 1
-        found: list[IntArray] = []
+        found: list[list[IntArray]] = []  # of each face both centers, and its corners in turn
         for axis in range(3):
             lower = 2 * cells
             lower[:, axis] += 2
             face = np.concatenate([2 * cells, lower])
             face = _key_rows(distinct(_keys(face, shape)), shape)
             others = [k for k in range(3) if k != axis]
-            ends: list[IntArray] = []
+            six: list[IntArray] = []
             for way in (-1, 1):
                 center = face + 1
                 center[:, axis] = np.clip(face[:, axis] + way, 0, shape[axis] - 1)
-                ends.append(_keys(center, shape))
-            ring: list[IntArray] = []
+                six.append(_keys(center, shape))
             for i, j in ((0, 0), (2, 0), (2, 2), (0, 2)):
                 corner = face.copy()
                 corner[:, others] += [i, j]
-                ring.append(_keys(corner, shape))
-            for k in range(4):
-                found.append(np.stack([*ends, ring[k], ring[(k + 1) % 4]], axis=1))
-        keys = np.concatenate(found)
-        used = distinct(keys.ravel())
+                six.append(_keys(corner, shape))
+            found.append(six)
+        keys = [np.concatenate(column) for column in zip(*found, strict=True)]
+        used = distinct(np.concatenate(keys))
         if math.prod(shape.tolist()) < _MOST_LISTED:
             place = np.zeros(math.prod(shape.tolist()), np.int64)
             place[used] = np.arange(len(used))
-            return _key_rows(used, shape), place[keys]
-        return _key_rows(used, shape), np.searchsorted(used, keys)
+            one, other, *ring = (place[column] for column in keys)
+        else:
+            one, other, *ring = (np.searchsorted(used, column) for column in keys)
+        fours = [np.stack([one, other, ring[k - 1], ring[k]], axis=1) for k in range(4)]
+        return _key_rows(used, shape), np.concatenate(fours)
 
 
 def distinct_rows(rows: IntArray) -> IntArray:

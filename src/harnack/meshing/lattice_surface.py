@@ -9,6 +9,7 @@ tetrahedron is cut by one triangle or quadrilateral, and signs at its corners al
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -52,6 +53,8 @@ __all__ = [
 _NEAR, _FOUND, _APART, _DEEP = 1.0, 1.5, 0.75, 0.5
 # Points nearer than the first belong together; parts at least as long as the second are missed.
 _TOGETHER, _LONG = 1.0, 2.0
+# Parts thinner than this many cells are missed nearly everywhere; and the thinnest measured.
+_THIN, _LEAST = 0.25, 2.0**-7
 # How near to the level, in cells, a point has to come by Newton's method.
 _ON = 1e-3
 # So large a part of vertices may be farther from the level than that many cells: where signs change
@@ -64,7 +67,26 @@ _FLAT_AROUND = 0.25
 
 
 class MissedError(MeshingError):
-    """A level set of which some parts lie between the points of a lattice."""
+    """A level set of which some parts lie between the points of a lattice.
+
+    places: (k, 3) of the longest one, on the level; thickness: (k,) of the part there, a multiple
+        of `_LEAST` cells: 0 where it is thinner, inf where it is thicker than a cell.
+    size: of cells.
+    """
+
+    def __init__(
+        self, message: str, places: FloatArray, thickness: FloatArray, size: float
+    ) -> None:
+        super().__init__(message)
+        self.places, self.thickness, self.size = places, thickness, size
+
+    def is_mended_by(self, smaller: float) -> bool:
+        """Not if these cells would miss a part of it as well, two of them long and far thinner than
+        one: as beside a cusp or a cone's tip, which cells of no size show."""
+        thin = self.places[self.thickness < _THIN * smaller * self.size]
+        part = _longest_part(thin, _TOGETHER * self.size)
+        reach = float(np.ptp(part, axis=0).max()) if len(part) else 0.0
+        return reach < _LONG * smaller * self.size
 
 
 def check_nothing_missed(
@@ -119,8 +141,29 @@ def check_nothing_missed(
             f"cells of {size:.3g} miss parts of the level set, such as that at ({a:.4g}, {b:.4g}, "
             f"{c:.4g}), which are thinner or smaller: choose a smaller `spacing`, or for a wall or "
             "an edge make the solid of smooth parts, such as hk.solid(f, between=(low, high)) or "
-            "hk.solid(f, below=0) & hk.solid(g, below=0)"
+            "hk.solid(f, below=0) & hk.solid(g, below=0)",
+            part,
+            _thickness(function, part, size),
+            size,
         )
+
+
+def _thickness(function: LevelFunction, x: FloatArray, size: float) -> FloatArray:
+    """(k,) how far points (k, 3) on the level are from where the sign changes again along the
+    slope, up to `size`: 0 where it does not change at the point itself, inf where not again."""
+    slope = function.at(x).gradient
+    way = slope / np.maximum(lengths(slope), 1e-300)[:, None]
+    far = size * 2.0 ** np.arange(round(math.log2(_LEAST)), 1)
+    sides: list[BoolArray] = []
+    least = np.full(len(x), np.inf)
+    for sign in (1.0, -1.0):
+        there = x[:, None] + sign * far[:, None] * way[:, None]
+        is_above = function.values(there.reshape(-1, 3)).reshape(len(x), len(far)) > 0
+        changed = is_above != is_above[:, :1]
+        first = far[changed.argmax(axis=1)]
+        least = np.minimum(least, np.where(changed.any(axis=1), first, np.inf))
+        sides.append(is_above[:, 0])
+    return np.where(sides[0] == sides[1], 0.0, least)
 
 
 def _check_is_no_volume_there(function: LevelFunction, part: FloatArray, reach: float) -> None:
@@ -390,7 +433,7 @@ def _are_negative(function: LevelFunction, lattice: Lattice, cells: IntArray) ->
     is proved that the level is not in the block."""
     shape = lattice.counts // _BLOCK + 1
     x, y, z = (cells // _BLOCK).T
-    keys, index, _ = numbered((x * shape[1] + y) * shape[2] + z)
+    keys, index, _, _ = numbered((x * shape[1] + y) * shape[2] + z)
     rest, z = np.divmod(keys, shape[2])
     blocks = np.stack([*np.divmod(rest, shape[1]), z], axis=1)
     centers = lattice.points(_BLOCK * (2 * blocks + 1))
@@ -529,7 +572,7 @@ class _First:
 
     def is_cut(self, corners: IntArray) -> BoolArray:
         """(m,) which of all tetrahedra, by their corners (m, 4), hold points of the faces."""
-        cut: BoolArray = np.asarray(self.points.is_on[corners].any(axis=1))
+        cut = _have_any(self.points.is_on, corners)
         cut[self.rows] |= self.crossed
         return cut
 
@@ -556,10 +599,8 @@ def _marched(
     points, samples, is_on = _snapped(function, points, samples, is_fixed, lattice, walls)
     is_on |= is_wall
     wrong, is_asked = np.zeros(0, np.int64), np.ones(len(points), np.bool_)
-    asked, found = np.arange(len(corners)), np.zeros(0, np.int64)
+    rows = found = np.flatnonzero(_may_be_cut(samples.value, is_on, corners))
     for _ in range(_MOST_ROUNDS):
-        rows = asked[_may_be_cut(samples.value, is_on, corners[asked])]
-        found = np.concatenate([found, rows])
         some, tets = PointSet(points, is_on, samples), Tetrahedra.of(points, corners[rows])
         crossings = crossings_of(function, some, tets)
         # Where vertices lie on edges does not matter for what touches.
@@ -575,8 +616,10 @@ def _marched(
         # Only points beside these may touch anew: with all of their tetrahedra.
         near, is_asked = np.zeros(len(points), np.bool_), np.zeros(len(points), np.bool_)
         near[wrong] = True
-        is_asked[corners[near[corners].any(axis=1)]] = True
-        asked = np.flatnonzero(is_asked[corners].any(axis=1))
+        is_asked[corners[_have_any(near, corners)]] = True
+        asked = np.flatnonzero(_have_any(is_asked, corners))
+        rows = asked[_may_be_cut(samples.value, is_on, corners[asked])]
+        found = np.concatenate([found, rows])
     else:
         raise MeshingError(
             f"sheets of the level set touch at {len(wrong)} places: choose a smaller `spacing`"
@@ -621,9 +664,27 @@ def _snapped(
     return points, samples.replaced(rows, there.some(good)), is_on
 
 
+def _have_any(chosen: BoolArray, corners: IntArray) -> BoolArray:
+    """(m,) which tetrahedra (m, 4) have some of the chosen points."""
+    found = np.zeros(len(corners), np.bool_)
+    for column in corners.T:  # four times as fast as chosen[corners].any(axis=1)
+        found |= chosen[column]
+    return found
+
+
+# Of a point above the level, below it, and on it: sums of four tell how many there are of each.
+_ABOVE, _BELOW, _ON_LEVEL = 1, 5, 25
+
+
 def _may_be_cut(value: FloatArray, is_on: BoolArray, corners: IntArray) -> BoolArray:
     """(m,) whether the level may pass through tetrahedra (m, 4)."""
-    on = is_on[corners]
-    up = (value > 0)[corners] & ~on
-    down = ~up & ~on
-    return (up.any(axis=1) & down.any(axis=1)) | (on.sum(axis=1) >= 3)
+    kind = np.where(is_on, _ON_LEVEL, np.where(value > 0, _ABOVE, _BELOW)).astype(np.uint8)
+    sums = np.zeros(len(corners), np.uint8)
+    for column in corners.T:
+        sums += kind[column]
+    cut = np.zeros(4 * _ON_LEVEL + 1, np.bool_)
+    for above, below in itertools.product(range(5), repeat=2):
+        on = 4 - above - below
+        if on >= 0:
+            cut[above * _ABOVE + below * _BELOW + on * _ON_LEVEL] = (above and below) or on >= 3
+    return cut[sums]

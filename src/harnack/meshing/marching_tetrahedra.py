@@ -231,9 +231,7 @@ def triangles_of(
             parts.append((np.stack([*on_level, *crossed], axis=1), rise))
     parts.append(_faces_on_the_level(function, points, tets))
     faces, rise = (np.concatenate(column) for column in zip(*parts, strict=True))
-    corner = vertices[faces]
-    normal = crosses(corner)
-    turned = dots(normal, rise) < 0
+    turned = dots(crosses(vertices[faces]), rise) < 0
     faces[turned] = faces[turned][:, ::-1]
     return vertices, faces
 

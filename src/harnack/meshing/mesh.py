@@ -534,9 +534,9 @@ def _filling(
             break
         except MeshingError as wrong:
             attempts -= 1
-            if not attempts or not may_help_again(wrong, before):
+            if not attempts or not may_help_again(wrong, before, SMALLER**attempts):
                 raise
-            before, spacing = wrong, 0.6 * spacing
+            before, spacing = wrong, SMALLER * spacing
             report(f"{wrong}; so smaller cells")
     facts = {
         "spacing": spacing,

@@ -91,7 +91,8 @@ class _Boxes:
         a, b, c = (corners[:, k] for k in range(3))
         lower, upper = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
         hierarchy = build_hierarchy(0.5 * (lower + upper), leaf_size=_LEAF_SIZE)
-        records = np.column_stack([lower, upper, np.arange(len(corners)), chosen])
+        numbers = np.column_stack([np.arange(len(corners)), chosen]).astype(np.float64)
+        records = np.concatenate([lower, upper, numbers], axis=1)
         placed = hierarchy.gather(records)
         placed[hierarchy.slots == NO_PRIMITIVE, _NUMBER] = -1.0
         levels = box_levels(hierarchy, lower, upper)

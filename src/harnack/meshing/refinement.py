@@ -46,9 +46,9 @@ _BEYOND, _INDEPENDENT = 1.25, 0.1
 # Edges shorter than this part of the tolerance are never cut.
 _SHORTEST = 0.5
 _MOST_ROUNDS = 12
-# The number of edges to be cut grows at first, and then falls. If it grows to this many times the
-# least before, refinement will not end: the surface bends within any triangle, as around each
-# dipole of a cloud.
+# The number of edges and centers to be cut grows at first, and then falls. If it grows to this many
+# times the least before, refinement will not end: the surface bends within any triangle, as around
+# each dipole of a cloud.
 _RUNS_AWAY = 3
 
 
@@ -76,14 +76,14 @@ def refined(
         report(f"refining, round {round_number + 1}: {len(faces):,} triangles")
         far = _Far.of(function, vertices, faces, tolerance, walls, where)
         marked = far.marked
-        if not marked.any() and not far.cuts_off.any():
+        count = int(marked.sum()) + int(far.cuts_off.sum())
+        if not count:
             break
-        count = int(marked.sum())
         if count > _RUNS_AWAY * least:
             break
         least = min(least, count) if count < before else least
         before = count
-        # Every edge that is cut makes one more triangle on each side.
+        # Every edge that is cut makes one more triangle on each side, and so does every center.
         check_count(len(faces) + 2 * count, function.most_faces)
         samples, reach = far.samples.some(marked), 0.5 * far.span[marked]
         moved = newton(function, far.middle[marked], samples, reach, walls)

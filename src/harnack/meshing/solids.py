@@ -147,7 +147,7 @@ class RegionMesher:
             apart = common_parts_taken_out(solid, level) if solid.is_union else None
             if apart is not None:
                 return self.below(apart, 0.0)
-            return self._joined(solid, level)
+            return self._joined(_flat(solid), level)
         if isinstance(solid, Complement):  # -f <= c where f >= -c
             return self._space() - self.below(solid.inner, -level)
         if isinstance(solid, Offset):
@@ -372,6 +372,18 @@ class RegionMesher:
         return made.transform(np.column_stack([matrix, offset]))
 
 
+def _flat(solid: Combined) -> Combined:
+    """With the parts of unions in a union, or of intersections in an intersection, as its own: all
+    that is cut away from a part is cut away at once."""
+    parts: list[Solid] = []
+    for one in solid.parts:
+        if isinstance(one, Combined) and one.is_union == solid.is_union:
+            parts += _flat(one).parts
+        else:
+            parts.append(one)
+    return dataclasses.replace(solid, parts=tuple(parts))
+
+
 def _is_exact(solid: Solid) -> bool:
     """Whether there is no complement within a solid, as it is meshed."""
     if isinstance(solid, Combined):
@@ -570,7 +582,7 @@ def mesh_solid(
             raise first from large  # what smaller cells were for is what went wrong
         except (MissedError, LocalError) as wrong:
             attempts, first = attempts - 1, first or wrong
-            if not attempts or not may_help_again(wrong, before):
+            if not attempts or not may_help_again(wrong, before, _SMALLER**attempts):
                 raise
             before = wrong
             cells *= _SMALLER
@@ -655,6 +667,9 @@ def _put_together(
     mesher.report("putting the parts together")
     if volume is None:
         volume = Box(_point(lower), _point(upper))
+        ends = np.array(whole.bounding_box(), np.float64)
+        if (ends[:3] > lower).all() and (ends[3:] < upper).all():
+            return _Joined(whole, volume)
     cut = volume_manifold(volume, lower, upper, mesher.tolerance)
     return _Joined(whole ^ cut, volume)
 

@@ -250,8 +250,7 @@ def _pieces(edges: Edges, count: int) -> IntArray:
     import scipy.sparse.csgraph as csgraph_module
 
     sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
-    order = np.argsort(edges.index, kind="stable")
-    one, other = (order[(edges.uses == 2)[edges.index[order]]].reshape(-1, 2) % count).T
+    one, other = edges.twice().T % count
     joined = sparse.coo_matrix((np.ones(len(one)), (one, other)), shape=(count, count))
     return np.asarray(csgraph.connected_components(joined, directed=False)[1], np.int64)
 

@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.geometry import Volume
 
-_LEAF_SIZE = 8
+_LEAF_SIZE = 4
 # Of a signed distance the gradient is a unit vector wherever it exists.
 _STEEP = 0.99
 # How far rounding may move a distance, in epsilons of coordinates and of the mesh's size, by
