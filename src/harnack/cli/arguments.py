@@ -28,6 +28,7 @@ from harnack.view.sliders import Slider
 
 # Of what was typed, this much is repeated in messages.
 _SHOWN = 60
+_MESH_FILE = "a mesh: .stl, .obj, .ply, .off, .glb, .gltf or .3mf"
 
 
 class _Parser(argparse.ArgumentParser):
@@ -400,7 +401,7 @@ def _add_check(commands: Any) -> None:
         "many faces, sides that disagree, crossing triangles, loose and tiny parts, cavities, thin "
         "walls. The exit code is 1 if something is wrong.",
     )  # fmt: skip
-    one.add_argument("mesh", metavar="FILE", help="a mesh: .stl, .obj, .ply, .off, .glb or .gltf")
+    one.add_argument("mesh", metavar="FILE", help=_MESH_FILE)
     one.add_argument(
         "--wall", type=_positive, metavar="LENGTH", help="the least thickness that is fine"
     )
@@ -423,7 +424,7 @@ def _add_repair(commands: Any) -> None:
         "doubled) are left out or turned over. Where that fails too, as for loose triangles, all "
         "is made anew by the sign of the winding number less 1/2, and closed whatever the mesh is.",
     )  # fmt: skip
-    one.add_argument("mesh", metavar="FILE", help="a mesh: .obj, .ply, .stl, .off, .glb or .gltf")
+    one.add_argument("mesh", metavar="FILE", help=_MESH_FILE)
     one.add_argument(
         "-o", "--output", metavar="FILE", help=f"{', '.join(MESH_FILES)} (FILE-repaired.ply)"
     )

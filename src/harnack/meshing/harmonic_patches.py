@@ -177,8 +177,8 @@ def open_edges(faces: IntArray) -> IntArray:
         a, b = edges.ends[several[0]].tolist()
         raise MeshError(
             f"{len(several):,} edges have more than two faces, the first of them between vertices "
-            f"{a} and {b}: such a mesh has no two sides there; remove faces, or draw it with "
-            "WindingNumber, which needs no repair"
+            f"{a} and {b}: such a mesh has no two sides there, and where all faces are kept none "
+            "are left out"
         )
     sign = np.bincount(index, np.where(pairs[:, 0] < pairs[:, 1], 1, -1), minlength=len(uses))
     turned = np.flatnonzero((uses == 2) & (sign != 0))
@@ -186,8 +186,7 @@ def open_edges(faces: IntArray) -> IntArray:
         a, b = edges.ends[turned[0]].tolist()
         raise MeshError(
             f"the faces at {len(turned):,} edges do not agree which side is outside, the first of "
-            f"them between vertices {a} and {b}: reverse some faces, for instance by "
-            "trimesh.repair.fix_winding(mesh)"
+            f"them between vertices {a} and {b}, and where all faces are kept none are turned over"
         )
     return pairs[uses[index] == 1]
 

@@ -135,7 +135,7 @@ def check_nothing_missed(
         x = x[elsewhere(x) <= 0]
     part = _longest_part(x, _TOGETHER * size)
     if len(part) and np.ptp(part, axis=0).max() >= _LONG * size:
-        _check_is_no_volume_there(function, part, _FLAT_AROUND * size)
+        _check_off_level_around(function, part, _FLAT_AROUND * size)
         a, b, c = part[0]
         raise MissedError(
             f"cells of {size:.3g} miss parts of the level set, such as that at ({a:.4g}, {b:.4g}, "
@@ -166,7 +166,7 @@ def _thickness(function: LevelFunction, x: FloatArray, size: float) -> FloatArra
     return np.where(sides[0] == sides[1], 0.0, least)
 
 
-def _check_is_no_volume_there(function: LevelFunction, part: FloatArray, reach: float) -> None:
+def _check_off_level_around(function: LevelFunction, part: FloatArray, reach: float) -> None:
     """Raise if the function is its level, up to rounding, at most of some points (n, 3) and on all
     sides of them: such as max(x, 0), of which no cells are small enough."""
     some = part[:: -(-len(part) // _MOST_PROBES)]
@@ -520,7 +520,7 @@ def _sampled(function: LevelFunction, points: FloatArray, lattice: Lattice) -> S
             f"{type(function.field).__name__} has no finite value at {bad.sum():,} points, such "
             f"as ({x:.4g}, {y:.4g}, {z:.4g}): choose a `clip` where it has"
         )
-    _check_is_no_volume(function, points, lattice)
+    _check_off_level_at_most_points(function, points, lattice)
     return samples
 
 
@@ -541,7 +541,9 @@ def _check_is_continuous(
         )
 
 
-def _check_is_no_volume(function: LevelFunction, points: FloatArray, lattice: Lattice) -> None:
+def _check_off_level_at_most_points(
+    function: LevelFunction, points: FloatArray, lattice: Lattice
+) -> None:
     """Raise if the function is its level nearly everywhere, up to rounding: such as x - x, of which
     no cells are proved empty, however small they are."""
     if len(points) <= _MOST_FLAT * 2 * math.prod(lattice.counts.tolist()):
