@@ -44,6 +44,23 @@ def test_nothing_is_changed_where_there_is_nothing_in_common() -> None:
     assert common_parts_taken_out(other_level, 0.0) is None
 
 
+@pytest.mark.parametrize("hole", [ROD, NEAR, BALL & NEAR])
+def test_what_is_added_and_cut_away_again_is_not_made(hole: hk.Solid) -> None:
+    """Triangles of the rod passed through others, which was refused, or left a crumb."""
+    shell = BALL.shell(0.2)
+    made = hk.mesh((shell | hole) - hole, tolerance=5e-3)  # of the rod, which is longer
+    expected = hk.mesh(shell - hole, tolerance=1e-2)
+    facts = [one.metadata["harnack"] for one in (made, expected)]
+    assert facts[0]["euler_characteristic"] == facts[1]["euler_characteristic"]
+    assert made.body_count == expected.body_count
+    assert made.volume == pytest.approx(expected.volume, rel=2e-2)
+
+
+def test_of_what_is_cut_away_whole_nothing_is_left() -> None:
+    with pytest.raises(hk.MeshingError, match="empty"):
+        hk.mesh((ROD | NEAR) - ROD - NEAR, tolerance=1e-2)
+
+
 def test_of_a_hollow_part_the_hollow_is_cut_away() -> None:
     """So that no space around it is made, and the lattice only where the hollow is."""
     hollow = BALL.shell(0.2) | (BALL & CUBE)

@@ -17,7 +17,7 @@ from harnack.fields.solids.affine import AffineImage
 from harnack.fields.solids.combined import Combined, Complement, Offset
 from harnack.fields.solids.region import Near, Region
 
-__all__ = ["common_parts_taken_out"]
+__all__ = ["common_parts_taken_out", "flat", "without_cut_parts"]
 
 Factor: TypeAlias = tuple[Solid, float]
 """A solid's function and a level: the points where it is at most that."""
@@ -39,6 +39,36 @@ def common_parts_taken_out(union: Combined, level: float) -> Solid | None:
         common.append(_union([_intersection(rest) for rest in rests]))
     made = Combined(tuple(common), is_union=False)
     return _union([made, *others]) if others else made
+
+
+def flat(solid: Combined) -> Combined:
+    """With the parts of unions in a union, or of intersections in an intersection, as its own: all
+    that is cut away from a part is cut away at once."""
+    parts: list[Solid] = []
+    for one in solid.parts:
+        if isinstance(one, Combined) and one.is_union == solid.is_union:
+            parts += flat(one).parts
+        else:
+            parts.append(one)
+    return Combined(tuple(parts), solid.is_union)
+
+
+def without_cut_parts(solid: Combined, level: float) -> Combined | None:
+    """(A | C) less C as A less C, of an intersection's own parts: C has nothing but its boundary in
+    common with its complement. None if nothing is left; a union as it is."""
+    if solid.is_union:
+        return solid
+    cut = {_key(one.inner, -level) for one in solid.parts if isinstance(one, Complement)}
+    parts: list[Solid] = []
+    for one in solid.parts:
+        if isinstance(one, Combined) and one.is_union:
+            kept = [part for part in flat(one).parts if _key(part, level) not in cut]
+            if not kept:
+                return None
+            if len(kept) < len(flat(one).parts):
+                one = kept[0] if len(kept) == 1 else Combined(tuple(kept), is_union=True)
+        parts.append(one)
+    return Combined(tuple(parts), is_union=False)
 
 
 def _factors(solid: Solid, level: float) -> list[Factor]:

@@ -49,7 +49,7 @@ from harnack.meshing.closed_mesh import (
     surface_of,
     volume_manifold,
 )
-from harnack.meshing.common_parts import common_parts_taken_out
+from harnack.meshing.common_parts import common_parts_taken_out, flat, without_cut_parts
 from harnack.meshing.lattice import Lattice
 from harnack.meshing.lattice_surface import (
     Elsewhere,
@@ -147,7 +147,8 @@ class RegionMesher:
             apart = common_parts_taken_out(solid, level) if solid.is_union else None
             if apart is not None:
                 return self.below(apart, 0.0)
-            return self._joined(_flat(solid), level)
+            kept = without_cut_parts(flat(solid), level)
+            return Manifold() if kept is None else self._joined(kept, level)
         if isinstance(solid, Complement):  # -f <= c where f >= -c
             return self._space() - self.below(solid.inner, -level)
         if isinstance(solid, Offset):
@@ -370,18 +371,6 @@ class RegionMesher:
         self.levels += local.levels
         self.finest = min(self.finest, local.finest * scale)
         return made.transform(np.column_stack([matrix, offset]))
-
-
-def _flat(solid: Combined) -> Combined:
-    """With the parts of unions in a union, or of intersections in an intersection, as its own: all
-    that is cut away from a part is cut away at once."""
-    parts: list[Solid] = []
-    for one in solid.parts:
-        if isinstance(one, Combined) and one.is_union == solid.is_union:
-            parts += _flat(one).parts
-        else:
-            parts.append(one)
-    return dataclasses.replace(solid, parts=tuple(parts))
 
 
 def _is_exact(solid: Solid) -> bool:
