@@ -387,8 +387,8 @@ def test_rays_end_as_without_cells(name: str, precision: Precision) -> None:
 @pytest.mark.parametrize("name", [*CURVES, "fine"])
 def test_many_rays_end_as_without_cells(name: str) -> None:
     curve = CURVES.get(name, wavy(1024))
-    compare(curve, *rays(curve, 100_000, 5))
-    compare(curve, *rays(curve, 20_000, 6), precision="double", tolerance=1e-7)
+    compare(curve, *rays(curve, 40_000, 5))
+    compare(curve, *rays(curve, 8_000, 6), precision="double", tolerance=1e-7)
 
 
 @pytest.mark.parametrize("shift", [0.0, 1024.0])

@@ -450,7 +450,7 @@ def test_auto_takes_the_exact_method_for_few_edges() -> None:
 def test_thousands_of_points() -> None:
     """80,000 faces with a tenth of them removed: every value within its bound."""
     vertices, faces = damaged_sphere(6)
-    x = places((vertices, faces), 30_000, closest=2e-3)
+    x = places((vertices, faces), 10_000, closest=2e-3)
     exact = WindingNumber(vertices, faces, method="exact")
     some = np.random.default_rng(0).permutation(len(x))[:2000]
     expected = exact.value(x, precision="double")
@@ -564,7 +564,7 @@ def test_first_hits(method: Any) -> None:
 @pytest.mark.parametrize("seed", [2, 5])
 def test_many_first_hits(kind: str, seed: int, method: Any) -> None:
     precision = "double" if seed == 5 else "single"
-    check_first_hits(damaged(kind, seed), method, 2000, seed, precision)
+    check_first_hits(damaged(kind, seed), method, 1000, seed, precision)
 
 
 @pytest.mark.few(1)
