@@ -181,20 +181,29 @@ class CellTree:
                 taken &= dr.squared_norm(cell.foot - one) >= dr.square(times * cell.apart)
             return lower, dr.select(taken, near, nearest), dr.select(taken, cell.foot, foot)
 
+        def is_open(low: Vec3, high: Vec3) -> Mask:
+            y = best.foot
+            corner = vector(*(fmax(high[k] - y[k], y[k] - low[k]) for k in range(3)))
+            return dr.squared_norm(corner) >= best.free * best.free
+
         limit = backend.Float(best.distance)
         start = limit, backend.Float(dr.inf), vector(FAR)
-        lower, _, foot = self._walk(x, each, start, lambda state: limit * limit)
+        lower, _, foot = self._walk(x, each, start, lambda state: limit * limit, is_open)
         dr.eval(lower, foot, marks)
         return lower, foot
 
-    def _walk(self, x: Vec3, each: Any, start: State, limit: Callable[[State], Real]) -> State:
-        """limit: the squared distance, given the state, beyond which boxes are left out."""
+    def _walk(
+        self, x: Vec3, each: Any, start: State, limit: Callable[[State], Real],
+        is_open: Callable[[Vec3, Vec3], Mask] = lambda low, high: low.x <= high.x,
+    ) -> State:  # fmt: skip
+        """limit: the squared distance, given the state, beyond which boxes are left out, and so are
+        those that are not `is_open`."""
         vector = self.tree.backend.Array3f
 
         def visit(node: Node, state: State) -> tuple[Mask, State]:
             low, high = vector(*node.head[:3]), vector(*node.head[3:6])
             away = dr.select(x < low, low - x, dr.select(x > high, x - high, 0))
-            close = dr.squared_norm(away) < limit(state)
+            close = (dr.squared_norm(away) < limit(state)) & is_open(low, high)
             return close, for_each(node, close & node.is_leaf, each, state)
 
         return walk(self.tree, visit, start)

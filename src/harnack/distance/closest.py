@@ -13,11 +13,12 @@ import numpy as np
 from harnack.backend import BoolArray, FloatArray, choose_backend, to_numpy
 from harnack.backend.arrays import finite_vectors, upload_vectors
 from harnack.backend.elementary import fmax, length
+from harnack.distance.free_ball import free_radius
 from harnack.distance.mesh_surface import MeshSurface
 from harnack.distance.on_sheets import SheetSearch, close_in
 from harnack.distance.projection import Descent
 from harnack.distance.search import Known, Tolerance, search
-from harnack.distance.surface_cells import RimDescent, remainder
+from harnack.distance.surface_cells import RimDescent
 from harnack.distance.tangent import first_order, in_batches
 from harnack.fields.clearance import distance_below
 from harnack.fields.points import morton_order
@@ -36,8 +37,6 @@ _ROUNDING = 64.0
 _TOLERANCE = 1e-6
 # Cells along an axis that points are sorted by, as a power of two.
 _BITS = 10
-# Radii about a foot in which it may be proved the nearest, in distances from it: powers of two.
-_FREE = range(8, -12, -1)
 # The surface may leave its boundary at this cosine away from a point and yet come nearer to it.
 _AWAY = 0.2
 # Descents that Newton's method alone does not end.
@@ -265,30 +264,18 @@ class _Points:
         """By Newton's method: feet or NaN, radii about them, and `_UNFINISHED` where that does not
         say whether there is one nearby, else 0."""
         y, found, singular = self._descent.directly(p, start)
-        free = dr.select(found, self._free(y, length(p - y)), 0)
+        free = dr.select(found, self._free(p, y), 0)
         unfinished = ~found & ~singular
         return dr.select(found, y, dr.nan), free, dr.select(unfinished, _UNFINISHED, 0 * free)
 
     def _descend(self, p: Vec3, start: Vec3) -> tuple[Vec3, Real]:
         y, found, on_level = self._descent.closest(p, start)
-        return dr.select(on_level, y, dr.nan), dr.select(found, self._free(y, length(p - y)), 0)
+        return dr.select(on_level, y, dr.nan), dr.select(found, self._free(p, y), 0)
 
-    def _free(self, y: Vec3, d: Real) -> Real:
-        """A radius about y, at the distance d from x at right angles to the surface, in which no
-        point of the surface is nearer to x.
-
-        Proof. Let |f(y + w) - f(y) - g . w| <= C |w|^2 for |w| <= r (`remainder` falls at least as
-        the square), n = g/|g| and x = y +- d n. Points y + w of the surface have |n . w| <=
-        C |w|^2/|g|, so |x - y - w|^2 >= d^2 - 2 d |n . w| + |w|^2 >= d^2 if 2 d C <= |g|.
-        """
-        sample = self._field.evaluate(y)
-        exact = dataclasses.replace(sample, error=0.0, gradient_error=0.0)
-        steep, best = length(sample.gradient), self.backend.Float(0)
-        for power in _FREE:
-            r = fmax(d, 1e-12) * 2.0**power
-            holds = 2 * d * remainder(exact, r) <= steep * r * r
-            best = dr.select((best == 0) & holds, r, best)
-        return best
+    def _free(self, x: Vec3, y: Vec3) -> Real:
+        return free_radius(
+            self.backend, self._field, x, y, has_hessian=self._descent.has_hessian
+        )
 
     def refined(self, points: FloatArray, feet: FloatArray) -> FloatArray:
         """The feet (n, 3) moved onto the level of the field without what clusters leave out: by

@@ -197,12 +197,13 @@ _CLOSE = 1e-7
 _DIAGONALS = ((1.0, 1.0, 1.0), (1.0, 1.0, -1.0), (1.0, -1.0, 1.0), (-1.0, 1.0, 1.0))
 
 
-def remainder(sample: Sample, radius: Real) -> Real:
-    """A bound of |f(y) - value - gradient . (y - p)| for |y - p| <= radius; infinite where the
-    field promises none. It falls at least as the square of the radius."""
+def remainder(sample: Sample, radius: Real, degree: int = 1) -> Real:
+    """A bound of what Taylor's polynomial of degree 1 or 2 leaves out of f(y) for |y - p| <=
+    radius; infinite where the field promises none. It falls at least as the power degree + 1 of the
+    radius."""
     best: Real = dr.inf
     for known in sample.promises:
-        best = fmin(best, known.remainder(sample.value, radius))
+        best = fmin(best, known.remainder(sample.value, radius, degree))
     return best + sample.error + sample.gradient_error * radius
 
 

@@ -60,10 +60,11 @@ class Promise(abc.ABC):
         """Lower and upper bound of f(y) - f(p), for y at that length, less than the radius, from p
         along a direction with these slopes; value: f(p). For NumPy and Dr.Jit arrays alike."""
 
-    def remainder(self, value: Real, length: Real) -> Real:
-        """A bound of |f(y) - f(p) - grad f(p) . (y - p)| for |y - p| <= length, which decreases at
-        least as the square of the length; infinite where none follows."""
-        del value, length
+    def remainder(self, value: Real, length: Real, degree: int = 1) -> Real:
+        """A bound of what Taylor's polynomial of a degree (1 or 2) about p leaves out of f(y), for
+        |y - p| <= length, which decreases at least as the power degree + 1 of the length; infinite
+        where none follows."""
+        del value, length, degree
         return dr.inf
 
     def lipschitz(self, value: Real) -> Lipschitz | None:
@@ -154,20 +155,24 @@ class HarmonicBall(Promise):
     def movement(self, value: Any, slopes: Slopes, length: Any) -> tuple[Any, Any]:
         return self.lower - value, self.upper - value
 
-    def remainder(self, value: Real, length: Real) -> Real:
+    def remainder(self, value: Real, length: Real, degree: int = 1) -> Real:
         """Proof for a harmonic f >= c on a ball of radius R in n dimensions: f - c is the integral
         of Poisson's kernel P(q, s) = sum over l of the zonal harmonics, all largest at s = 1, with
         a measure of mass f(p) - c; those of degree 0 and 1 are the value and the gradient. The rest
         is between -(P - 1 - n q) and P - 1 - n q at s = 1, P = (1 + q)/(1 - q)^(n - 1), times
-        f(p) - c. The same holds for C - f, and the smaller of the two bounds is returned.
+        f(p) - c. The same holds for C - f, and the smaller of the two bounds is returned. For
+        degree 2 that harmonic is left out, too: at s = 1 it is 2, 5 and 9 times q^2.
         """
         mass = fmin(value - self.lower, self.upper - value)
         q = length / self.radius
         rest = {
-            2: 2 * q * q / (1 - q),
-            3: q * q * (5 - 3 * q) / dr.square(1 - q),
-            4: q * q * (9 - q * (11 - 4 * q)) / (dr.square(1 - q) * (1 - q)),
-        }[self.dimension]
+            (2, 1): 2 * q * q / (1 - q),
+            (3, 1): q * q * (5 - 3 * q) / dr.square(1 - q),
+            (4, 1): q * q * (9 - q * (11 - 4 * q)) / (dr.square(1 - q) * (1 - q)),
+            (2, 2): 2 * q * q * q / (1 - q),
+            (3, 2): q * q * q * (7 - 5 * q) / dr.square(1 - q),
+            (4, 2): q * q * q * (16 - q * (23 - 9 * q)) / (dr.square(1 - q) * (1 - q)),
+        }[self.dimension, degree]
         return dr.select((q < 1) & (mass < dr.inf), mass * rest, dr.inf)
 
     def lipschitz(self, value: Real) -> Lipschitz | None:
@@ -287,13 +292,15 @@ class Lipschitz(Promise):
 class Curvature(Promise):
     """|f(y) - f(p) - grad f(p).(y-p)| <= constant |y-p|^2/2 for every y with |y-p| < radius.
 
-    For a field with a domain: for every such y in it.
+    For a field with a domain: for every such y in it. There too, what Taylor's polynomial of second
+    degree leaves out is at most change |y-p|^3/6, if that is known.
     """
 
     constant: Real
     radius: Real = float("inf")
+    change: Real = float("inf")
 
-    units = (("constant", 1, -2), ("radius", 0, 1))
+    units = (("constant", 1, -2), ("radius", 0, 1), ("change", 1, -3))
 
     def movement(self, value: Any, slopes: Slopes, length: Any) -> tuple[Any, Any]:
         bend = 0.5 * self.constant * length * length
@@ -304,8 +311,11 @@ class Curvature(Promise):
         del value
         return (self.constant, self.radius) if _is_open(self.radius) else None
 
-    def remainder(self, value: Real, length: Real) -> Real:
-        return dr.select(length < self.radius, 0.5 * self.constant * length * length, dr.inf)
+    def remainder(self, value: Real, length: Real, degree: int = 1) -> Real:
+        if degree == 2 and _is_open(self.change):
+            return dr.inf
+        rest = 0.5 * self.constant if degree == 1 else self.change * length / 6
+        return dr.select(length < self.radius, rest * length * length, dr.inf)
 
 
 def _is_open(end: Any) -> bool:

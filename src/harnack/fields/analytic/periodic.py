@@ -232,7 +232,8 @@ class EigenfunctionSum(Field):
         reach = 0.9 * self.steepness / self.curvature  # the best by experiment, gyroid and P
         local = (slope + 0.5 * self.curvature * reach) * (1 + _ROUNDING)
         lipschitz = Lipschitz(fmin(local, self.steepness * (1 + _ROUNDING)), reach)
-        known = (Curvature(self.curvature * (1 + _ROUNDING + _SLOPE_SHARE)),)
+        change = self.waves.largest_change * (1 + _ROUNDING)
+        known = (Curvature(self.curvature * (1 + _ROUNDING + _SLOPE_SHARE), change=change),)
         weaker = (self._extension.ball(value, slope), lipschitz)
         error += slope_error * (slope_error * (0.5 / (_SLOPE_SHARE * self.curvature)))
         error += fmax(slope_error * self._extension.radius - self._slack * epsilon, 0)

@@ -1,0 +1,67 @@
+"""The ball about a closest point of a level set that is proved to hold no nearer one."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING
+
+import drjit as dr
+
+from harnack.backend.elementary import fmax, fmin, length
+from harnack.distance.surface_cells import remainder
+from harnack.distance.tangent import Eigen, TangentPlane, apply
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Real, Vec3
+    from harnack.fields.field import Field
+
+__all__ = ["free_radius"]
+
+# Radii that are tried, in distances of the foot: powers of two.
+_POWERS = range(8, -12, -1)
+_LEAST = 1 / 64
+"""What has to be left of 1 in the proof: it covers the rounding of second derivatives, and that
+x - y is at right angles to the surface up to the square root of epsilon only."""
+
+
+def free_radius(backend: Backend, field: Field, x: Vec3, y: Vec3, *, has_hessian: bool) -> Real:
+    """A radius about y, the foot of x at right angles to the surface, in which no point of the
+    surface is nearer to x; 0 where none is proved.
+
+    Proof. Let y + w be a point of the surface, |w| <= r, n = grad f/|g| and x = y + d n, where f
+    is taken with the other sign if x is on the other side. With |f(y + w) - f(y) - g . w| <=
+    R1 |w|^2/r^2 (`remainder` falls at least as the square), |n . w| <= c |w|^2, c = R1/(|g| r^2).
+    So |x - y - w|^2 = d^2 - 2 d n . w + |w|^2 >= d^2 + |w|^2 (1 - 2 d c).
+
+    With second derivatives H: -n . w |g| is w.Hw/2 and a rest of at most R2 |w|^3/r^3. Let t be
+    the part of w along the tangent plane, k the least of the eigenvalues of H in that plane and 0,
+    a = |Hn - (n.Hn) n|, b = |n.Hn|. As |n . w| <= c r |w|,
+
+        w.Hw >= k |t|^2 - 2 |n . w| |t| a - (n . w)^2 b >= |w|^2 (k - 2 c r a - c^2 r^2 b),
+
+    so that in the inequality above 1 - 2 d c may be replaced by
+    1 + d/|g| (k - 2 c r a - c^2 r^2 b - 2 R2/r^2). Here c also is at most (|H|/2 + R2/r^2)/|g|.
+    """
+    sample = field.evaluate(y)
+    exact = dataclasses.replace(sample, error=0.0, gradient_error=0.0)
+    steep, d = length(sample.gradient), length(x - y)
+    best = backend.Float(0)
+    if has_hessian:
+        plane, rows = TangentPlane.of(sample.gradient), field.hessian(y)
+        uu, vv, uv = plane.restricted(rows)
+        eigen = Eigen.of(uu, vv, uv)
+        towards = dr.dot(x - y, plane.n) > 0
+        k = fmin(dr.select(towards, eigen.least, -eigen.most), 0)
+        bent = apply(rows, plane.n)
+        a, b = length(dr.cross(bent, plane.n)), dr.abs(dr.dot(bent, plane.n))
+        half_norm = 0.5 * dr.sqrt(sum(dr.squared_norm(row) for row in rows))
+    for power in _POWERS:
+        r = fmax(d, 1e-12) * 2.0**power
+        first = remainder(exact, r) / (r * r)
+        left = 1 - 2 * d * first / steep
+        if has_hessian:
+            second = remainder(exact, r, 2) / (r * r)
+            c = fmin(first, half_norm + second) * r / steep
+            left = fmax(left, 1 + d / steep * (k - c * (2 * a + c * b) - 2 * second))
+        best = dr.select((best == 0) & (left >= _LEAST), r, best)
+    return best
