@@ -12,8 +12,7 @@ import numpy as np
 
 from harnack.backend import BoolArray, FloatArray, choose_backend, to_numpy
 from harnack.backend.arrays import finite_vectors, upload_vectors
-from harnack.backend.elementary import fmax, length
-from harnack.distance.free_ball import free_radius
+from harnack.backend.elementary import largest_coordinate, length
 from harnack.distance.mesh_surface import MeshSurface
 from harnack.distance.on_sheets import SheetSearch, close_in
 from harnack.distance.projection import Descent
@@ -39,8 +38,8 @@ _TOLERANCE = 1e-6
 _BITS = 10
 # The surface may leave its boundary at this cosine away from a point and yet come nearer to it.
 _AWAY = 0.2
-# Descents that Newton's method alone does not end.
-_UNFINISHED = 1.0
+# Times that Newton's method is begun before a slower descent.
+_ATTEMPTS = 2
 # Sheets that are examined for each point before cells are.
 _SHEETS = 16
 
@@ -207,7 +206,9 @@ class _Points:
         inside = domain.contains_points(np.nan_to_num(feet))
         return np.where(inside[:, None], feet, np.nan)
 
-    def polish(self, points: FloatArray, start: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def polish(
+        self, points: FloatArray, start: FloatArray, limit: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
         """`search.Descents`: by descent, or with sheets by rays."""
         if self.surface.field.has_sheets:
 
@@ -218,18 +219,23 @@ class _Points:
                 len(points)
             )
         feet, free = np.full_like(points, np.nan), np.zeros(len(points))
-        state = np.full(len(points), _UNFINISHED)
         rows = np.flatnonzero((start != points).any(axis=1))  # else it would be far
-        feet[rows], free[rows], state[rows] = in_batches(
-            self.backend, self._directly, points[rows], start[rows]
-        )
-        rows = np.flatnonzero(state == _UNFINISHED)
+        y, far = start[rows], np.zeros(len(points), np.bool_)
+        for _ in range(_ATTEMPTS):
+            if not len(rows):
+                break
+            limits = np.tile(limit[rows, None], 3)
+            feet[rows], there, free[rows], goes_on, is_far = in_batches(
+                self.backend, self._directly, points[rows], y, limits
+            )
+            far[rows] = is_far > 0
+            rows, y = rows[goes_on > 0], there[goes_on > 0]
         if len(rows):
             feet[rows], free[rows] = in_batches(
                 self.backend, self._descend, points[rows], start[rows]
             )
         feet = self._within(feet)
-        left, rim = np.flatnonzero(np.isnan(feet[:, 0])), self._rim
+        left, rim = np.flatnonzero(np.isnan(feet[:, 0]) & ~far), self._rim
         if rim is not None and len(left):  # out of the domain
 
             def along(p: Vec3, y: Vec3) -> tuple[Vec3]:
@@ -252,6 +258,8 @@ class _Points:
 
         feet, free = np.full_like(points, np.nan), np.zeros(len(points))
         lengths = np.tile(aside[:, None], 3)
+        if not len(points):
+            return feet, free
         (start,) = in_batches(self.backend, beside, points, boundary, lengths)
         rows = np.flatnonzero(~np.isnan(start[:, 0]))
         if len(rows):
@@ -260,22 +268,26 @@ class _Points:
             )
         return self._within(feet), free
 
-    def _directly(self, p: Vec3, start: Vec3) -> tuple[Vec3, Real, Real]:
-        """By Newton's method: feet or NaN, radii about them, and `_UNFINISHED` where that does not
-        say whether there is one nearby, else 0."""
-        y, found, singular = self._descent.directly(p, start)
-        free = dr.select(found, self._free(p, y), 0)
-        unfinished = ~found & ~singular
-        return dr.select(found, y, dr.nan), free, dr.select(unfinished, _UNFINISHED, 0 * free)
+    def _directly(
+        self, p: Vec3, start: Vec3, limit: Vec3
+    ) -> tuple[Vec3, Vec3, Real, Real, Real]:
+        """By Newton's method: feet, NaN where there is none; where the search goes on; radii about
+        feet; and 1 or 0: whether it does go on, and whether it ends farther than `limit` away."""
+        y, first, is_lost, is_far = self._descent.directly(p, start, limit.x)
+        foot, found, free = self._descent.end(p, y)
+        most = (length(p - start) + 2 * first) * (1 + 64 * self.backend.epsilon)
+        most = dr.fma(64 * self.backend.epsilon, largest_coordinate(y), most)
+        is_lost |= is_far
+        is_foot = found & ~is_lost & (length(p - foot) <= most)
+        one, zero = self.backend.Float(1), self.backend.Float(0)
+        goes_on = dr.select(found | is_lost, zero, one)
+        return (
+            dr.select(is_foot, foot, dr.nan), y, free, goes_on, dr.select(is_far, one, zero)
+        )  # fmt: skip
 
     def _descend(self, p: Vec3, start: Vec3) -> tuple[Vec3, Real]:
         y, found, on_level = self._descent.closest(p, start)
-        return dr.select(on_level, y, dr.nan), dr.select(found, self._free(p, y), 0)
-
-    def _free(self, x: Vec3, y: Vec3) -> Real:
-        return free_radius(
-            self.backend, self._field, x, y, has_hessian=self._descent.has_hessian
-        )
+        return dr.select(on_level, y, dr.nan), dr.select(found, self._descent.end(p, y)[2], 0)
 
     def refined(self, points: FloatArray, feet: FloatArray) -> FloatArray:
         """The feet (n, 3) moved onto the level of the field without what clusters leave out: by
@@ -286,8 +298,9 @@ class _Points:
             return feet
 
         def directly(p: Vec3, start: Vec3) -> tuple[Vec3]:
-            y, found, _ = exact.directly(p, start)
-            return (dr.select(found, y, dr.nan),)
+            y, _, is_lost, _ = exact.directly(p, start, self.backend.Float(dr.inf))
+            foot, found, _ = exact.end(p, y)
+            return (dr.select(found & ~is_lost, foot, dr.nan),)
 
         def to_level(start: Vec3) -> tuple[Vec3]:
             y = exact.onto_level(start)

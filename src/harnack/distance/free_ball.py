@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import drjit as dr
 
@@ -12,8 +11,10 @@ from harnack.distance.surface_cells import remainder
 from harnack.distance.tangent import Eigen, TangentPlane, apply
 
 if TYPE_CHECKING:
-    from harnack.backend import Backend, Real, Vec3
-    from harnack.fields.field import Field
+    from harnack.backend import Real, Vec3
+    from harnack.fields.field import Sample
+
+    Rows: TypeAlias = tuple[Vec3, Vec3, Vec3]
 
 __all__ = ["free_radius"]
 
@@ -24,9 +25,11 @@ _LEAST = 1 / 64
 x - y is at right angles to the surface up to the square root of epsilon only."""
 
 
-def free_radius(backend: Backend, field: Field, x: Vec3, y: Vec3, *, has_hessian: bool) -> Real:
+def free_radius(sample: Sample, rows: Rows | None, x: Vec3, y: Vec3) -> Real:
     """A radius about y, the foot of x at right angles to the surface, in which no point of the
     surface is nearer to x; 0 where none is proved.
+
+    sample: f at y, rounding left out. rows: of its Hessian there, if it is known.
 
     Proof. Let y + w be a point of the surface, |w| <= r, n = grad f/|g| and x = y + d n, where f
     is taken with the other sign if x is on the other side. With |f(y + w) - f(y) - g . w| <=
@@ -42,12 +45,10 @@ def free_radius(backend: Backend, field: Field, x: Vec3, y: Vec3, *, has_hessian
     so that in the inequality above 1 - 2 d c may be replaced by
     1 + d/|g| (k - 2 c r a - c^2 r^2 b - 2 R2/r^2). Here c also is at most (|H|/2 + R2/r^2)/|g|.
     """
-    sample = field.evaluate(y)
-    exact = dataclasses.replace(sample, error=0.0, gradient_error=0.0)
     steep, d = length(sample.gradient), length(x - y)
-    best = backend.Float(0)
-    if has_hessian:
-        plane, rows = TangentPlane.of(sample.gradient), field.hessian(y)
+    best = 0 * d
+    if rows is not None:
+        plane = TangentPlane.of(sample.gradient)
         uu, vv, uv = plane.restricted(rows)
         eigen = Eigen.of(uu, vv, uv)
         towards = dr.dot(x - y, plane.n) > 0
@@ -57,10 +58,10 @@ def free_radius(backend: Backend, field: Field, x: Vec3, y: Vec3, *, has_hessian
         half_norm = 0.5 * dr.sqrt(sum(dr.squared_norm(row) for row in rows))
     for power in _POWERS:
         r = fmax(d, 1e-12) * 2.0**power
-        first = remainder(exact, r) / (r * r)
+        first = remainder(sample, r) / (r * r)
         left = 1 - 2 * d * first / steep
-        if has_hessian:
-            second = remainder(exact, r, 2) / (r * r)
+        if rows is not None:
+            second = remainder(sample, r, 2) / (r * r)
             c = fmin(first, half_norm + second) * r / steep
             left = fmax(left, 1 + d / steep * (k - c * (2 * a + c * b) - 2 * second))
         best = dr.select((best == 0) & (left >= _LEAST), r, best)

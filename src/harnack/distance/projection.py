@@ -7,6 +7,7 @@ part of the surface may be nearer still, so the distance is an upper bound of th
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -14,16 +15,20 @@ import drjit as dr
 
 from harnack.backend import elementary as lengths
 from harnack.backend.elementary import clamp, fmax, fmin
+from harnack.distance.free_ball import free_radius
+from harnack.distance.surface_cells import remainder
 from harnack.distance.tangent import Eigen, TangentPlane
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.enclosures import TargetLevels
-    from harnack.fields.field import Field
+    from harnack.distance.free_ball import Rows
+    from harnack.fields.field import Field, Sample
 
 __all__ = ["Descent"]
 
 _STEPS_DIRECT = 10
+_NEAR = 1e-9  # of the distance: the last step is expected to be shorter
 _STEPS_TO_LEVEL = 60
 _STEPS_ALONG = 60
 _LEAST_SHARE = 1e-7  # of a step: shorter ones are given up
@@ -78,46 +83,70 @@ class Descent:
             return cls(backend, field, levels, False)
         return cls(backend, field, levels, True)
 
-    def directly(self, x: Vec3, start: Vec3) -> tuple[Vec3, Mask, Mask]:
-        """The closest point y to x that Newton's method for f(y) = level and (x - y) parallel to
-        grad f(y) leads to from a point of the surface nearby; whether it is one, by the criterion
-        of `closest`, no farther than `start` but for twice what that is off the level; and whether
-        the search goes on to where f is singular.
+    def directly(self, x: Vec3, start: Vec3, limit: Real) -> tuple[Vec3, Real, Mask, Mask]:
+        """A place from which Newton's method for f(y) = level and (x - y) parallel to grad f(y),
+        begun at a point of the surface nearby, ends with one more step (`end`); how far `start` is
+        off the level; and whether the search was given up, as it goes on to where f is singular, or
+        to a point that is farther from x than `limit`.
 
         Each step is that of `closest` along the surface, which follows its curvature, and one to
-        the level, both from derivatives at one place: errors are squared by each of both.
+        the level, both from derivatives at one place: errors are squared by each of both. So the
+        step after the next is about its length times the square of its ratio to the last one.
+        Where steps become shorter the end is within twice the next.
         """
         real, vector, count = self.backend.Float, self.backend.Array3f, self.backend.UInt32
         x, mask = vector(x), self.backend.Bool
 
         def body(
-            y: Vec3, first: Real, found: Mask, singular: Mask, k: Any, active: Mask
+            y: Vec3, first: Real, last: Real, is_lost: Mask, is_far: Mask, k: Any, active: Mask
         ) -> tuple[Any, ...]:
             above, here = self._evaluate(y)
-            gradient_norm = lengths.length(here.gradient)
-            move, settled = self._step_along(x, here, real(1))
-            off = -above / gradient_norm
+            move, _ = self._step_along(x, here, real(1))
+            off = -above / lengths.length(here.gradient)
             first = dr.select(k == 0, dr.abs(off), first)
-            off = clamp(off, -here.reach, here.reach)
-            move = dr.fma(vector(off / gradient_norm), here.gradient, move)
-            length = dr.norm(move)
+            move = dr.fma(vector(off), here.gradient / lengths.length(here.gradient), move)
+            length, distance = dr.norm(move), dr.norm(x - y)
             longest = 0.5 * here.reach
-            too_long = length > longest
-            there = dr.fma(vector(dr.select(too_long, longest / length, 1)), move, y)
-            done = settled & self._is_close(above, here)
-            found |= active & done
-            singular = dr.select(active, too_long, singular)
-            active &= ~done & dr.isfinite(length) & (k + 1 < _STEPS_DIRECT)
-            return dr.select(active, there, y), first, found, singular, k + 1, active
+            is_lost = dr.select(active, length > longest, is_lost)
+            shrinks = (k > 0) & (length < 0.5 * last)
+            is_far = dr.select(active, shrinks & (distance - 2 * length > limit), is_far)
+            after = length * dr.square(length / last)
+            is_near = shrinks & ~is_lost & (after <= dr.fma(_NEAR, distance, here.noise))
+            active &= ~is_far & dr.isfinite(length)
+            y = dr.select(active, y + dr.select(is_lost, longest / length, 1) * move, y)
+            active &= ~is_near & (k + 1 < _STEPS_DIRECT)
+            return y, first, length, is_lost, is_far, k + 1, active
 
         def more(*state: Any) -> Mask:
             return state[-1]
 
-        state = vector(start), real(0), mask(False), mask(False), count(0), mask(True)
-        y, first, found, singular, _, _ = dr.while_loop(state, more, body, label="Newton's method")
-        limit = (dr.norm(x - start) + 2 * first) * (1 + 64 * self.backend.epsilon)
-        limit = dr.fma(64 * self.backend.epsilon, lengths.largest_coordinate(y), limit)
-        return y, found & (dr.norm(x - y) <= limit), singular & ~found
+        never = mask(False)
+        state = vector(start), real(0), real(dr.inf), never, mask(False), count(0), mask(True)
+        found = dr.while_loop(state, more, body, label="Newton's method")
+        y, first, _, is_lost, is_far, _, _ = found
+        return y, first, is_lost, is_far
+
+    def end(self, x: Vec3, y: Vec3) -> tuple[Vec3, Mask, Real]:
+        """The last step from y onto the level; whether that leads to a closest point to x, by the
+        criterion of `closest`; and a radius about it in which no point of the surface is nearer.
+
+        Proof that the step, of length s along grad f, ends on the level: by Newton's formula f is
+        off the level there by at most what Taylor's polynomial of first degree leaves out within s.
+        It turns normals by about s times the curvature, less than slant may be in any case.
+        """
+        sample = self.field.evaluate(y)
+        above, here = self._place(y, sample)
+        rows = self.field.hessian(y) if self.has_hessian else None
+        _, settled = self._step_along(x, here, self.backend.Float(1), rows)
+        steep = lengths.length(here.gradient)
+        off = -above / steep
+        exact = dataclasses.replace(sample, error=0.0, gradient_error=0.0)
+        lands = remainder(exact, dr.abs(off)) <= steep * here.noise
+        lands &= dr.abs(off) <= self.backend.epsilon**0.5 * dr.norm(x - y) + here.noise
+        found = settled & (self._is_close(above, here) | (self._is_known(here) & lands))
+        foot = dr.fma(self.backend.Array3f(off / steep), here.gradient, y)
+        free = free_radius(exact, rows, x, y)
+        return foot, found, dr.select(found, free, 0)
 
     def closest(self, x: Vec3, start: Vec3) -> tuple[Vec3, Mask, Mask]:
         """The closest point y to x that is found from `start`, whether it is one (see above), and
@@ -183,7 +212,10 @@ class Descent:
 
     def _evaluate(self, y: Vec3) -> tuple[Real, _Place]:
         """f - level at y, and the place."""
-        sample, real = self.field.evaluate(y), self.backend.Float
+        return self._place(y, self.field.evaluate(y))
+
+    def _place(self, y: Vec3, sample: Sample) -> tuple[Real, _Place]:
+        real = self.backend.Float
         size = lengths.largest_coordinate(y)
         epsilon, gradient_norm = self.backend.epsilon, lengths.length(sample.gradient)
         total_error = dr.fma(8 * epsilon, dr.abs(sample.value), sample.error)
@@ -201,9 +233,14 @@ class Descent:
     @staticmethod
     def _is_close(above: Real, place: _Place) -> Mask:
         """Whether a place is on the level, to rounding; False where rounding leaves that open."""
-        size = lengths.largest_coordinate(place.y)
-        known = place.noise <= _CLEAR * fmax(size, place.reach)
+        known = Descent._is_known(place)
         return known & (dr.abs(above) <= 2 * lengths.length(place.gradient) * place.noise)
+
+    @staticmethod
+    def _is_known(place: _Place) -> Mask:
+        """Whether rounding tells anything of the level."""
+        size = lengths.largest_coordinate(place.y)
+        return place.noise <= _CLEAR * fmax(size, place.reach)
 
     def _to_level(self, start: Vec3, active: Mask) -> tuple[_Place, Mask]:
         """From `start` to the nearest level by Newton's method along the gradient.
@@ -239,12 +276,20 @@ class Descent:
         _, *place, _, close, _, _ = dr.while_loop(state, more, body, label="to the level")
         return _Place(*place), close
 
-    def _step_along(self, x: Vec3, here: _Place, share: Real) -> tuple[Vec3, Mask]:
-        """The step along the surface, and whether y already is a local minimum of the distance."""
+    def _step_along(
+        self, x: Vec3, here: _Place, share: Real, rows: Rows | None = None
+    ) -> tuple[Vec3, Mask]:
+        """The step along the surface, and whether y already is a local minimum of the distance.
+
+        rows: of the Hessian, where they are known.
+        """
         plane = TangentPlane.of(here.gradient)
         r = x - here.y
         distance = dr.norm(r)
-        uu, vv, uv = self._second_derivatives(here.y, plane, fmin(here.reach, distance))
+        if rows is not None:
+            uu, vv, uv = plane.restricted(rows)
+        else:
+            uu, vv, uv = self._second_derivatives(here.y, plane, fmin(here.reach, distance))
         lift = dr.dot(r, plane.n) / plane.gradient_norm
         eigen = Eigen.of(dr.fma(lift, uu, 1), dr.fma(lift, vv, 1), lift * uv)  # of B
         tu, tv = dr.dot(r, plane.u), dr.dot(r, plane.v)

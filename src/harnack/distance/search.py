@@ -25,6 +25,8 @@ _EACH, _FEWEST, _FEWEST_ON_SHEETS = 0.25, 10_000, 1500
 # Cells at most, and which share of that where evaluations are as expensive as sums of many terms.
 _MOST, _MOST_TO_PROVE, _MOST_ON_SHEETS, _EXPENSIVE = 60_000, 150_000, 20_000, 0.25
 _FINEST = 40
+# Cells along an edge of the cube to begin with.
+_ACROSS = 8
 # Feet of other parts of the surface that are tried, from the same cells.
 _CHALLENGES = 4
 # In tolerances: how far to the side of its boundary the surface is looked for.
@@ -53,8 +55,10 @@ class Descents(Protocol):
     """Ways to nearer points of the surface from points x (n, 3). They return feet, NaN where none
     was found, and radii about these within which none is nearer."""
 
-    def polish(self, points: FloatArray, start: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """From places (n, 3) near the surface."""
+    def polish(
+        self, points: FloatArray, start: FloatArray, limit: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """From places (n, 3) near the surface; feet farther than `limit` (n,) need not be found."""
         ...
 
     def leave_boundary(
@@ -182,22 +186,25 @@ def _split(
 ) -> SurfaceCells:
     """Cells of the root, split until there are enough: in each round the larger half of those where
     the surface may be in several pieces, and the others by how much it may bend."""
-    cells = proofs.not_empty(root.center[None], np.array([root.half]))
+    half = root.half / _ACROSS
+    steps = (2 * np.indices((_ACROSS,) * 3).reshape(3, -1).T + 1 - _ACROSS) * half
+    cells = proofs.not_empty(root.center + steps, np.full(len(steps), half))
     for _ in range(_FINEST):
         if not 0 < len(cells) < enough:
             break
         size = np.where(cells.is_one_piece, 0.25 * cells.thickness, cells.half)
-        cells = _halved(proofs, cells, size >= np.median(size))
+        which = size >= np.median(size)
+        parts = _parts(proofs, cells, which)
+        cells = SurfaceCells.joined([cells.some(~which), parts])
         progress(f"distances: {len(cells):,} cells")
-    return cells
+    return proofs.with_feet(cells)
 
 
-def _halved(proofs: CellProofs, cells: SurfaceCells, which: BoolArray) -> SurfaceCells:
-    """The cells, those of a mask (n,) cut in eight."""
+def _parts(proofs: CellProofs, cells: SurfaceCells, which: BoolArray) -> SurfaceCells:
+    """What is left of the cells of a mask (n,), each cut in eight."""
     half = 0.5 * cells.half[which]
     center = cells.center[which, None] + half[:, None, None] * _CORNERS
-    parts = proofs.not_empty(center.reshape(-1, 3), np.repeat(half, 8))
-    return SurfaceCells.joined([cells.some(~which), parts])
+    return proofs.not_empty(center.reshape(-1, 3), np.repeat(half, 8))
 
 
 class _Search:
@@ -249,7 +256,8 @@ class _Search:
             count = int(marks.sum())
             if not count or not len(rows) or len(self.cells) + 4 * count > self.most:
                 break
-            self.cells = _halved(self.proofs, self.cells, marks)
+            parts = self.proofs.with_feet(_parts(self.proofs, self.cells, marks))
+            self.cells = SurfaceCells.joined([self.cells.some(~marks), parts])
             progress(f"distances: {len(self.cells):,} cells for {len(rows):,} points")
             tree = CellTree.of(self.backend, self.cells)
 
@@ -322,10 +330,12 @@ class _Search:
 
     def _descend(self, rows: IntArray, start: FloatArray) -> None:
         """Descend from places (k, 3), points of the surface or the points themselves."""
+        if not len(rows):
+            return
         x = self.points[rows]
         on_surface = (start != x).any(axis=1, keepdims=True)
         self._take(rows, np.where(on_surface, start, np.nan), np.zeros(len(rows)))
-        self._take(rows, *self.descents.polish(x, start))
+        self._take(rows, *self.descents.polish(x, start, self._distance(rows)))
 
     def _take(self, rows: IntArray, feet: FloatArray, free: FloatArray) -> None:
         """Take points of the surface (k, 3) or NaN, and their radii, where they are nearer."""

@@ -6,6 +6,7 @@ searches for the closest.
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -229,35 +230,41 @@ class CellProofs:
 
     def not_empty(self, center: FloatArray, half: FloatArray) -> SurfaceCells:
         """Of cubes (n, 3), half the length of an edge (n,), those that are not proved empty, with
-        what is known of them."""
-        radius = _WITHIN * half
-        inside, start = np.ones(len(center), np.bool_), center
-        away: FloatArray = np.zeros(len(center))
-        if self._volume is not None:
+        the slabs that the surface lies in."""
+        inside = np.ones(len(center), np.bool_)
+        if self._volume is not None and len(center):
             inside = self._volume.contains_points(center)
-            away, start = self._at(self._pulled_inside, center)
-            some = inside | (away <= radius)
-            center, half, radius = center[some], half[some], radius[some]
-            inside, start, away = inside[some], start[some], away[some]
+            (away,) = self._at(self._away, center)
+            some = inside | (away <= _WITHIN * half)
+            center, half, inside = center[some], half[some], inside[some]
         cells = SurfaceCells.unknown(center, half)
+        if not inside.any():
+            return cells
         # Nothing is promised about places outside the domain.
         empty, cells.normal[inside], cells.offset[inside], cells.thickness[inside] = self._at(
-            self._slab, center[inside], radius[inside]
+            self._slab, center[inside], _WITHIN * half[inside]
         )
         not_empty = np.ones(len(cells), np.bool_)
         not_empty[inside] = empty == 0
-        cells, start, radius = cells.some(not_empty), start[not_empty], radius[not_empty]
-        cells.foot[:], cells.normal[:], cells.spread[:] = self._at(
-            self._disk, start, radius, cells.normal
+        return cells.some(not_empty)
+
+    def with_feet(self, cells: SurfaceCells) -> SurfaceCells:
+        """The cells with points of the surface and of the rim."""
+        if not len(cells):
+            return cells
+        radius, start = _WITHIN * cells.half, cells.center
+        if self._volume is not None:
+            away, start = self._at(self._pulled_inside, cells.center)
+        foot, normal, spread = self._at(self._disk, start, radius, cells.normal)
+        self._outside(foot)
+        rim, rim_curvature = cells.rim.copy(), cells.rim_curvature.copy()
+        if self._rim is not None:
+            cut = np.flatnonzero(np.abs(away) <= radius)
+            rim[cut], rim_curvature[cut] = self._at(self._on_rim, start[cut], radius[cut])
+            self._outside(rim)
+        return dataclasses.replace(
+            cells, foot=foot, normal=normal, spread=spread, rim=rim, rim_curvature=rim_curvature
         )
-        self._outside(cells.foot)
-        if self._rim is not None and len(cells):
-            cut = np.flatnonzero(np.abs(away[not_empty]) <= radius)
-            cells.rim[cut], cells.rim_curvature[cut] = self._at(
-                self._on_rim, start[cut], radius[cut]
-            )
-            self._outside(cells.rim)
-        return cells
 
     def _at(
         self, compute: Callable[..., tuple[Any, ...]], points: FloatArray, *others: FloatArray
@@ -270,6 +277,9 @@ class CellProofs:
         """Put feet (n, 3) that lie outside the domain far away."""
         if self._volume is not None and len(feet):
             feet[~self._volume.contains_points(np.where(feet < FAR, feet, 0))] = FAR
+
+    def _away(self, p: Vec3) -> tuple[Real]:
+        return (self._volume.signed_distance(p),)
 
     def _pulled_inside(self, p: Vec3) -> tuple[Real, Vec3]:
         """How far p is from the domain, at least, and p or a place near it on the boundary."""
