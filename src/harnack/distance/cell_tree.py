@@ -47,6 +47,7 @@ class SurfaceCells:
         . (y - center) - offset| <= thickness, which is FAR where nothing is known. The normal is
         zero where no plane is known that is nearly the surface.
     spread: (n,) within this radius about its foot the surface is nearly that plane.
+    curvature: (n,) how much it is curved there, at most; FAR where that is not known.
     rim: (n, 3) a point of the rim, the curve at which a domain cuts the surface, or FAR.
     rim_curvature: (n,) of the rim there.
     """
@@ -58,6 +59,7 @@ class SurfaceCells:
     offset: FloatArray
     thickness: FloatArray
     spread: FloatArray
+    curvature: FloatArray
     rim: FloatArray
     rim_curvature: FloatArray
 
@@ -67,8 +69,8 @@ class SurfaceCells:
         n = len(half)
         far, zero = np.full((n, 3), FAR), np.zeros(n)
         return cls(
-            center, half, far, np.zeros((n, 3)), zero, np.full(n, FAR), zero.copy(), far.copy(),
-            zero.copy(),
+            center, half, far, np.zeros((n, 3)), zero, np.full(n, FAR), zero.copy(),
+            np.full(n, FAR), far.copy(), zero.copy(),
         )  # fmt: skip
 
     def __len__(self) -> int:
@@ -118,7 +120,8 @@ class CellTree:
         n, both = len(cells), np.concatenate([np.arange(len(cells)), cut])
         is_plain = cells.is_one_piece & (cells.rim[:, 0] == FAR)
         apart = np.where(is_plain, _APART, _APART_ELSEWHERE) * cells.half
-        doubt = np.where(cells.is_one_piece, cells.thickness, 0.0)
+        bulge = 0.15 * cells.curvature * np.square(cells.spread)
+        doubt = np.where(cells.is_one_piece, np.minimum(cells.thickness, bulge), 0.0)
         records = np.column_stack([
             cells.center, cells.half, cells.foot, cells.thickness, cells.normal, cells.offset,
             np.arange(n, dtype=np.float64), cells.spread, doubt, apart,

@@ -219,8 +219,17 @@ class _Points:
                 len(points)
             )
         feet, free = np.full_like(points, np.nan), np.zeros(len(points))
-        rows = np.flatnonzero((start != points).any(axis=1))  # else it would be far
-        y, far = start[rows], np.zeros(len(points), np.bool_)
+        is_far_off = (start == points).all(axis=1)
+        if is_far_off.any():
+
+            def to_level(p: Vec3) -> tuple[Vec3]:
+                y = self._descent.onto_level(p)
+                return (dr.select(dr.isnan(y.x), p, y),)
+
+            start = start.copy()
+            (start[is_far_off],) = in_batches(self.backend, to_level, points[is_far_off])
+        rows = np.arange(len(points))
+        y, far = start, np.zeros(len(points), np.bool_)
         for _ in range(_ATTEMPTS):
             if not len(rows):
                 break

@@ -17,7 +17,7 @@ from harnack.backend import elementary as lengths
 from harnack.backend.elementary import clamp, fmax, fmin
 from harnack.distance.free_ball import free_radius
 from harnack.distance.surface_cells import remainder
-from harnack.distance.tangent import Eigen, TangentPlane
+from harnack.distance.tangent import Eigen, TangentPlane, has_hessian
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
@@ -77,11 +77,7 @@ class Descent:
 
     @classmethod
     def of(cls, backend: Backend, field: Field, levels: TargetLevels) -> Descent:
-        try:
-            field.hessian(backend.Array3f(0))
-        except NotImplementedError:
-            return cls(backend, field, levels, False)
-        return cls(backend, field, levels, True)
+        return cls(backend, field, levels, has_hessian(backend, field))
 
     def directly(self, x: Vec3, start: Vec3, limit: Real) -> tuple[Vec3, Real, Mask, Mask]:
         """A place from which Newton's method for f(y) = level and (x - y) parallel to grad f(y),

@@ -16,7 +16,7 @@ import numpy as np
 from harnack.backend import FloatArray, choose_backend
 from harnack.backend.elementary import clamp, fmax, fmin, largest_coordinate, length
 from harnack.distance.cell_tree import FAR, SurfaceCells
-from harnack.distance.tangent import in_batches
+from harnack.distance.tangent import TangentPlane, has_hessian, in_batches
 from harnack.fields.clearance import distance_below
 from harnack.tracer import Status
 
@@ -219,6 +219,7 @@ class CellProofs:
         self._prepared = self.surface.prepare(self._backend)
         self._levels = self._prepared.levels
         self._volume = _domain(self.surface)
+        self._has_hessian = has_hessian(self._backend, self._field)
         self._rim = None
         if self._volume is not None and not self.surface.field.has_sheets:
             volume = self._volume.prepare(self._backend)
@@ -255,7 +256,7 @@ class CellProofs:
         radius, start = _WITHIN * cells.half, cells.center
         if self._volume is not None:
             away, start = self._at(self._pulled_inside, cells.center)
-        foot, normal, spread = self._at(self._disk, start, radius, cells.normal)
+        foot, normal, spread, curvature = self._at(self._disk, start, radius, cells.normal)
         self._outside(foot)
         rim, rim_curvature = cells.rim.copy(), cells.rim_curvature.copy()
         if self._rim is not None:
@@ -263,8 +264,9 @@ class CellProofs:
             rim[cut], rim_curvature[cut] = self._at(self._on_rim, start[cut], radius[cut])
             self._outside(rim)
         return dataclasses.replace(
-            cells, foot=foot, normal=normal, spread=spread, rim=rim, rim_curvature=rim_curvature
-        )
+            cells, foot=foot, normal=normal, spread=spread, curvature=curvature, rim=rim,
+            rim_curvature=rim_curvature,
+        )  # fmt: skip
 
     def _at(
         self, compute: Callable[..., tuple[Any, ...]], points: FloatArray, *others: FloatArray
@@ -309,22 +311,27 @@ class CellProofs:
         empty = (free > radius) | (known & (dr.abs(offset) > radius + thickness))
         return dr.select(empty, real(1), 0), normal, offset, thickness
 
-    def _disk(self, p: Vec3, radii: Vec3, normal: Vec3) -> tuple[Vec3, Vec3, Real]:
-        """A foot near p, the normal of a plane that is nearly the surface there, and how far about
-        the foot: up to the curve that the surface ends in."""
-        radius = radii.x
+    def _disk(self, p: Vec3, radii: Vec3, normal: Vec3) -> tuple[Vec3, Vec3, Real, Real]:
+        """A foot near p, the normal of a plane that is nearly the surface there, how far about the
+        foot: as far as the cell, up to the curve that the surface ends in; and its curvature."""
+        radius, unknown = radii.x, self._backend.Float(FAR)
         if self.surface.field.has_sheets:
-            return self._hit(p, radius), normal, self._backend.Float(0)
+            return self._hit(p, radius), normal, self._backend.Float(0), unknown
         foot = self._foot(p, radius)
         found = foot.x < 0.5 * FAR
         at = dr.select(found, foot, p)
         gradient = self._field.evaluate(at).gradient
         n = gradient / length(gradient)
         is_plane = found & ~(dr.squared_norm(normal) > 0) & dr.isfinite(dr.squared_norm(n))
-        spread, boundary = 2 * radius, self._field.closest_on_boundary(at)
+        spread, boundary = radius + length(at - p), self._field.closest_on_boundary(at)
         if boundary is not None:
             spread = fmin(spread, length(boundary - at))
-        return foot, dr.select(is_plane, n, normal), dr.select(found, spread, 0)
+        curvature = unknown
+        if self._has_hessian:
+            uu, vv, uv = TangentPlane.of(gradient).restricted(self._field.hessian(at))
+            bent = dr.sqrt(dr.fma(uu, uu, dr.fma(vv, vv, 2 * uv * uv))) / length(gradient)
+            curvature = dr.select(bent < FAR, bent, unknown)
+        return foot, dr.select(is_plane, n, normal), dr.select(found, spread, 0), curvature
 
     def _on_rim(self, p: Vec3, radii: Vec3) -> tuple[Vec3, Real]:
         """A point of the rim near p, and the rim's curvature."""

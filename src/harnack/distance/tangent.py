@@ -16,8 +16,17 @@ from harnack.fields import points as field_points
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
+    from harnack.fields.field import Field
 
-__all__ = ["Eigen", "TangentPlane", "apply", "first_order", "in_batches", "second_order"]
+__all__ = [
+    "Eigen",
+    "TangentPlane",
+    "apply",
+    "first_order",
+    "has_hessian",
+    "in_batches",
+    "second_order",
+]
 
 
 @dataclass(frozen=True)
@@ -74,6 +83,15 @@ class Eigen:
             dr.fma(self.cosine, most, -self.sine * least),
             dr.fma(self.sine, most, self.cosine * least),
         )
+
+
+def has_hessian(backend: Backend, field: Field) -> bool:
+    """Whether a prepared field knows its second derivatives."""
+    try:
+        field.hessian(backend.Array3f(0))
+    except NotImplementedError:
+        return False
+    return True
 
 
 def apply(rows: tuple[Vec3, Vec3, Vec3], vector: Vec3) -> Vec3:
