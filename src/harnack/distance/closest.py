@@ -38,6 +38,8 @@ _TOLERANCE = 1e-6
 _BITS = 10
 # The surface may leave its boundary at this cosine away from a point and yet come nearer to it.
 _AWAY = 0.2
+# About the boundary the surface may be as far along a circle, in radii.
+_LONGEST_ARC = 2.5
 # Times that Newton's method is begun before a slower descent.
 _ATTEMPTS = 2
 # Sheets that are examined for each point before cells are.
@@ -259,6 +261,11 @@ class _Points:
     ) -> tuple[FloatArray, FloatArray]:
         """`search.Descents`."""
 
+        def level_away(p: Vec3, b: Vec3, length_: Vec3) -> tuple[Real]:
+            way = p - b
+            sample = self._field.evaluate(b + length_.x / length(way) * way)
+            return (first_order(self.levels.to_nearest(sample.value), sample.gradient),)
+
         def beside(p: Vec3, b: Vec3, length_: Vec3) -> tuple[Vec3]:
             way = p - b
             y = self._descent.onto_level(b + length_.x / length(way) * way)
@@ -269,12 +276,17 @@ class _Points:
         lengths = np.tile(aside[:, None], 3)
         if not len(points):
             return feet, free
-        (start,) = in_batches(self.backend, beside, points, boundary, lengths)
-        rows = np.flatnonzero(~np.isnan(start[:, 0]))
+        # Beside an edge f is the angle about it: to first order the level is as far away as the arc.
+        (away,) = in_batches(self.backend, level_away, points, boundary, lengths)
+        rows = np.flatnonzero(~(np.abs(away) > _LONGEST_ARC * aside))
+        start = points[rows]
         if len(rows):
-            feet[rows], free[rows] = in_batches(
-                self.backend, self._descend, points[rows], start[rows]
+            (start,) = in_batches(
+                self.backend, beside, points[rows], boundary[rows], lengths[rows]
             )
+        rows, start = rows[~np.isnan(start[:, 0])], start[~np.isnan(start[:, 0])]
+        if len(rows):
+            feet[rows], free[rows] = in_batches(self.backend, self._descend, points[rows], start)
         return self._within(feet), free
 
     def _directly(

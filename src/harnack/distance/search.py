@@ -21,10 +21,12 @@ __all__ = ["Descents", "Found", "Known", "Tolerance", "search"]
 
 # The number of cells before points are looked up in them: for each point, at least, and for fields
 # with sheets, which are searched in turn as well.
-_EACH, _FEWEST, _FEWEST_ON_SHEETS = 0.25, 10_000, 1500
+_EACH, _FEWEST, _FEWEST_ON_SHEETS = 0.05, 10_000, 1500
 # Cells at most, and which share of that where evaluations are as expensive as sums of many terms.
 _MOST, _MOST_TO_PROVE, _MOST_ON_SHEETS, _EXPENSIVE = 60_000, 150_000, 20_000, 0.25
 _FINEST = 40
+# Cells, at least, in which the search for a point begins.
+_COARSE = 300
 # Cells along an edge of the cube to begin with.
 _ACROSS = 8
 # Feet of other parts of the surface that are tried, from the same cells.
@@ -161,13 +163,13 @@ def _in_parts(
     enough = min(max(_FEWEST, int(_EACH * len(points))), _MOST, most)
     if surface.field.has_sheets:
         enough = _FEWEST_ON_SHEETS
-    cells = _split(proofs, root, enough, progress)
+    coarse, cells = _split(proofs, root, enough, progress)
     parts: list[Found] = []
     for first in range(0, max(len(points), 1), _AT_ONCE):
         rows = slice(first, first + _AT_ONCE)
         at_most = most if tolerance.is_proved else 0
         job = _Search(
-            proofs, cells, points[rows], known.some(rows), descents, tolerance.length, at_most
+            proofs, coarse, cells, points[rows], known.some(rows), descents, tolerance.length, at_most
         )
         parts.append(job.run(progress))
     return Found(*(np.concatenate([getattr(p, k) for p in parts]) for k in ("feet", "lower")))
@@ -183,21 +185,25 @@ def _most(surface: LevelSet, points: int, is_proved: bool) -> int:
 
 def _split(
     proofs: CellProofs, root: _Cube, enough: int, progress: Callable[[str], None]
-) -> SurfaceCells:
+) -> tuple[SurfaceCells, SurfaceCells]:
     """Cells of the root, split until there are enough: in each round the larger half of those where
-    the surface may be in several pieces, and the others by how much it may bend."""
+    the surface may be in several pieces, and the others by how much it may bend. Before these, the
+    few cells that they are parts of."""
     half = root.half / _ACROSS
     steps = (2 * np.indices((_ACROSS,) * 3).reshape(3, -1).T + 1 - _ACROSS) * half
     cells = proofs.not_empty(root.center + steps, np.full(len(steps), half))
+    coarse = cells
     for _ in range(_FINEST):
         if not 0 < len(cells) < enough:
             break
+        if len(coarse) < _COARSE:
+            coarse = cells
         size = np.where(cells.is_one_piece, 0.25 * cells.thickness, cells.half)
         which = size >= np.median(size)
         parts = _parts(proofs, cells, which)
         cells = SurfaceCells.joined([cells.some(~which), parts])
         progress(f"distances: {len(cells):,} cells")
-    return proofs.with_feet(cells)
+    return proofs.with_feet(coarse), proofs.with_feet(cells)
 
 
 def _parts(proofs: CellProofs, cells: SurfaceCells, which: BoolArray) -> SurfaceCells:
@@ -208,16 +214,18 @@ def _parts(proofs: CellProofs, cells: SurfaceCells, which: BoolArray) -> Surface
 
 
 class _Search:
-    """The search for some points, from cells that hold all of the surface.
+    """The search for some points, from cells that hold all of the surface, and first from coarse
+    ones.
 
     feet: (n, 3) the nearest points so far, or NaN. free: (n,) within these radii about them none is
     nearer. lower: (n,) proved bounds of distances. most: cells are split while they are not more.
     """
 
     def __init__(
-        self, proofs: CellProofs, cells: SurfaceCells, points: FloatArray, known: Known,
-        descents: Descents, tolerance: float, most: int,
+        self, proofs: CellProofs, coarse: SurfaceCells, cells: SurfaceCells, points: FloatArray,
+        known: Known, descents: Descents, tolerance: float, most: int,
     ) -> None:  # fmt: skip
+        self.coarse = coarse
         self.proofs, self.cells, self.points, self.descents = proofs, cells, points, descents
         self.backend = choose_backend("double")
         self.known, self.feet, self.free = known, known.feet.copy(), np.zeros(len(points))
@@ -242,11 +250,11 @@ class _Search:
         return Found(self.feet, self.lower)
 
     def _search_cells(self, has_sheets: bool, progress: Callable[[str], None]) -> None:
-        """Descend first from the foot of the cell where the surface seems nearest, then from those
+        """Descend first from the foot of the coarse cell where the surface seems nearest, then from those
         of other parts that may be nearer. If some may still be, and there are not too many cells,
         those cells are split, and so on."""
         tree = CellTree.of(self.backend, self.cells)
-        tried = self._first(tree)
+        tried = self._first(CellTree.of(self.backend, self.coarse))
         if not has_sheets:
             self._leave_boundary()
         rows = np.arange(len(self.points))
