@@ -260,6 +260,8 @@ class _Search:
         rows = np.arange(len(self.points))
         for _ in range(_FINEST):
             marks = self._challenge(tree, rows, tried[rows])
+            if marks is None:
+                break
             rows = np.flatnonzero(self._is_open())
             count = int(marks.sum())
             if not count or not len(rows) or len(self.cells) + 4 * count > self.most:
@@ -290,14 +292,14 @@ class _Search:
         self._descend(rows, start[rows])
         return start
 
-    def _challenge(self, tree: CellTree, rows: IntArray, first: FloatArray) -> BoolArray:
+    def _challenge(self, tree: CellTree, rows: IntArray, first: FloatArray) -> BoolArray | None:
         """Descend from the feet of other parts of the surface that may be nearer, one after the
         other.
 
         first: (k, 3) feet that were tried. Returns which cells may hold points that are nearer than
-        the best, of these points.
+        the best, of these points; None if no cells are to be split.
         """
-        marks = dr.zeros(self.backend.Bool, len(self.cells))
+        marks = dr.zeros(self.backend.Bool, len(self.cells)) if self.most else None
         second = np.full_like(first, FAR)
         for _ in range(_CHALLENGES):
             if not len(rows):
@@ -306,7 +308,7 @@ class _Search:
             some = start[:, 0] < 0.5 * FAR
             rows, first, second = rows[some], second[some], start[some]
             self._descend(rows, start[some])
-        return to_numpy(marks)
+        return None if marks is None else to_numpy(marks)
 
     def _nearer(
         self, tree: CellTree, rows: IntArray, others: tuple[FloatArray, ...], marks: Any
