@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 __all__ = ["Descent"]
 
 _STEPS_DIRECT = 10
-_NEAR = 1e-9  # of the distance: the last step is expected to be shorter
+_NEAR = 1e-11  # of the distance: the last step is expected to be shorter
 _STEPS_TO_LEVEL = 60
 _STEPS_ALONG = 60
 _LEAST_SHARE = 1e-7  # of a step: shorter ones are given up
