@@ -158,20 +158,20 @@ class CellTree:
 
     def nearer(
         self, x: Vec3, best: Best, others: tuple[Vec3, ...], tolerance: Real, marks: Any
-    ) -> tuple[Real, Vec3]:
+    ) -> tuple[Real, Vec3, Vec3]:
         """What cells say about points of the surface that are nearer to x than the best.
 
         Returns a length that the surface is no nearer than, at most the distance of the best; and
-        the foot (else FAR) of the cell where it seems to come nearest, of those in which it may be
-        nearer than the best by more than `tolerance`. Feet that are not apart from the best and
-        from `others` (`_APART`) are left out. In `marks`, if given, a Bool is set for each of those
-        cells, wherever their feet are.
+        the feet (else FAR) of the two cells where it seems to come nearest, of those in which it
+        may be nearer than the best by more than `tolerance`. Feet that are not apart from the best,
+        from `others` and from one another (`_APART`) are left out. In `marks`, if given, a Bool is
+        set for each of those cells, wherever their feet are.
         """
         backend = self.tree.backend
         vector, index = backend.Array3f, backend.UInt32
 
         def each(row: list[Real], active: Mask, state: State) -> State:
-            lower, nearest, foot = state
+            lower, nearest, foot, second, second_foot = state
             cell = _Record.of(vector, row)
             counts = active & ~cell.is_within(best.foot, best.free)
             here = cell.lower(x)
@@ -181,10 +181,18 @@ class CellTree:
                 dr.scatter(marks, backend.Bool(True), number, wanted & cell.is_cell)
             lower = dr.select(counts & cell.is_cell, fmin(lower, here), lower)
             near = cell.estimate(x)
-            taken = wanted & (near < nearest) & (near < best.distance + cell.doubt)
-            for one, times in ((best.foot, best.apart), *((other, 1.0) for other in others)):
-                taken &= dr.squared_norm(cell.foot - one) >= dr.square(times * cell.apart)
-            return lower, dr.select(taken, near, nearest), dr.select(taken, cell.foot, foot)
+            taken = wanted & (near < second) & (near < best.distance + cell.doubt)
+            taken &= cell.is_apart(best.foot, best.apart)
+            for other in others:
+                taken &= cell.is_apart(other, 1.0)
+            is_first, apart = near < nearest, cell.is_apart(foot, 1.0)
+            # What was first becomes second, unless this is the same place.
+            moves, is_second = taken & is_first & apart, taken & ~is_first & apart
+            second = dr.select(moves, nearest, dr.select(is_second, near, second))
+            second_foot = dr.select(moves, foot, dr.select(is_second, cell.foot, second_foot))
+            nearest = dr.select(taken & is_first, near, nearest)
+            foot = dr.select(taken & is_first, cell.foot, foot)
+            return lower, nearest, foot, second, second_foot
 
         def is_open(low: Vec3, high: Vec3) -> Mask:
             y = best.foot
@@ -192,12 +200,10 @@ class CellTree:
             return dr.squared_norm(corner) >= best.free * best.free
 
         limit = backend.Float(best.distance)
-        start = limit, backend.Float(dr.inf), vector(FAR)
-        lower, _, foot = self._walk(x, each, start, lambda state: limit * limit, is_open)
-        dr.eval(lower, foot)
-        if marks is not None:
-            dr.eval(marks)
-        return lower, foot
+        start = limit, backend.Float(dr.inf), vector(FAR), backend.Float(dr.inf), vector(FAR)
+        found = self._walk(x, each, start, lambda state: limit * limit, is_open)
+        lower, _, foot, _, second_foot = found
+        return lower, foot, second_foot
 
     def _walk(
         self, x: Vec3, each: Any, start: State, limit: Callable[[State], Real],
@@ -271,6 +277,10 @@ class _Record:
         square = dr.squared_norm(away) - height * height - self.spread * self.spread
         near = dr.sqrt(dr.fma(height, height, fmax(square, 0)))
         return dr.select(self.foot.x < 0.5 * FAR, fmax(near, self.lower(x)), dr.inf)
+
+    def is_apart(self, y: Vec3, times: Real) -> Mask:
+        """Whether the foot is apart from y (`_APART`), so many times as far as it has to be."""
+        return dr.squared_norm(self.foot - y) >= dr.square(times * self.apart)
 
     def is_within(self, y: Vec3, radius: Real) -> Mask:
         """Whether the whole cell is within a radius of y."""

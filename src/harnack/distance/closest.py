@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 import numpy as np
@@ -23,9 +23,10 @@ from harnack.fields.clearance import distance_below
 from harnack.fields.points import morton_order
 
 if TYPE_CHECKING:
-    from harnack.backend import Backend, Real, Vec3
+    from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.enclosures import TargetLevels
     from harnack.fields.field import Field
+    from harnack.geometry import Volume
     from harnack.tracer import LevelSet
 
 __all__ = ["Closest", "find_closest"]
@@ -40,8 +41,6 @@ _BITS = 10
 _AWAY = 0.2
 # About the boundary the surface may be as far along a circle, in radii.
 _LONGEST_ARC = 2.5
-# Times that Newton's method is begun before a slower descent.
-_ATTEMPTS = 2
 # Sheets that are examined for each point before cells are.
 _SHEETS = 16
 
@@ -154,9 +153,9 @@ class _Points:
         exact = field.without_truncation(backend)
         set_(self, "_descent", Descent.of(backend, field, self.levels))
         set_(self, "_exact", Descent.of(backend, exact, self.levels) if field.has_detail else None)
-        domain = field.domain
-        rim = domain and RimDescent(backend, field, self.levels, domain.prepare(backend))
-        set_(self, "_rim", rim)
+        domain = field.domain and field.domain.prepare(backend)
+        set_(self, "_domain", domain)
+        set_(self, "_rim", domain and RimDescent(backend, field, self.levels, domain))
         # Rays are compared by differences of angles, for which single precision is too short.
         double = choose_backend("double")
         set_(self, "_prepared", self.surface.prepare(double) if field.has_sheets else None)
@@ -164,6 +163,7 @@ class _Points:
     _field: Field = dataclasses.field(init=False)
     _descent: Descent = dataclasses.field(init=False)
     _exact: Descent | None = dataclasses.field(init=False)
+    _domain: Volume | None = dataclasses.field(init=False)
     _rim: RimDescent | None = dataclasses.field(init=False)
     _prepared: Any = dataclasses.field(init=False)
 
@@ -220,7 +220,6 @@ class _Points:
             return in_batches(self._prepared.backend, close, points, start)[0], np.zeros(
                 len(points)
             )
-        feet, free = np.full_like(points, np.nan), np.zeros(len(points))
         is_far_off = (start == points).all(axis=1)
         if is_far_off.any():
 
@@ -230,23 +229,15 @@ class _Points:
 
             start = start.copy()
             (start[is_far_off],) = in_batches(self.backend, to_level, points[is_far_off])
-        rows = np.arange(len(points))
-        y, far = start, np.zeros(len(points), np.bool_)
-        for _ in range(_ATTEMPTS):
-            if not len(rows):
-                break
-            limits = np.tile(limit[rows, None], 3)
-            feet[rows], there, free[rows], goes_on, is_far = in_batches(
-                self.backend, self._directly, points[rows], y, limits
-            )
-            far[rows] = is_far > 0
-            rows, y = rows[goes_on > 0], there[goes_on > 0]
+        limits = np.tile(limit[:, None], 3)
+        feet, y, free, goes_on, is_far = in_batches(
+            self.backend, self._directly, points, start, limits
+        )
+        rows = np.flatnonzero(goes_on)
         if len(rows):
-            feet[rows], free[rows] = in_batches(
-                self.backend, self._descend, points[rows], start[rows]
-            )
+            feet[rows], free[rows] = in_batches(self.backend, self._descend, points[rows], y[rows])
         feet = self._within(feet)
-        left, rim = np.flatnonzero(np.isnan(feet[:, 0]) & ~far), self._rim
+        left, rim = np.flatnonzero(np.isnan(feet[:, 0]) & (is_far == 0)), self._rim
         if rim is not None and len(left):  # out of the domain
 
             def along(p: Vec3, y: Vec3) -> tuple[Vec3]:
@@ -276,35 +267,42 @@ class _Points:
         lengths = np.tile(aside[:, None], 3)
         if not len(points):
             return feet, free
-        # Beside an edge f is the angle about it: to first order the level is as far away as the arc.
+        # Beside an edge f is the angle about it: to first order the level is as far as the arc.
         (away,) = in_batches(self.backend, level_away, points, boundary, lengths)
         rows = np.flatnonzero(~(np.abs(away) > _LONGEST_ARC * aside))
         start = points[rows]
         if len(rows):
-            (start,) = in_batches(
-                self.backend, beside, points[rows], boundary[rows], lengths[rows]
-            )
+            (start,) = in_batches(self.backend, beside, points[rows], boundary[rows], lengths[rows])
         rows, start = rows[~np.isnan(start[:, 0])], start[~np.isnan(start[:, 0])]
         if len(rows):
             feet[rows], free[rows] = in_batches(self.backend, self._descend, points[rows], start)
         return self._within(feet), free
 
-    def _directly(
-        self, p: Vec3, start: Vec3, limit: Vec3
-    ) -> tuple[Vec3, Vec3, Real, Real, Real]:
+    def directly(self, x: Vec3, start: Vec3, limit: Real) -> tuple[Vec3, Real, Mask]:
+        """`search.Descents`."""
+        p, vector = self.backend.Array3f(x), cast("Any", type(x))
+        foot, _, free, goes_on, _ = self._newton(p, self.backend.Array3f(start), limit)
+        if self._domain is not None:
+            slack = _ROUNDING * self.backend.epsilon * largest_coordinate(foot)
+            goes_on |= ~(self._domain.signed_distance(foot) < -slack)
+        return vector(foot), type(x.x)(free), goes_on
+
+    def _newton(self, p: Vec3, start: Vec3, limit: Real) -> tuple[Vec3, Vec3, Real, Mask, Mask]:
         """By Newton's method: feet, NaN where there is none; where the search goes on; radii about
-        feet; and 1 or 0: whether it does go on, and whether it ends farther than `limit` away."""
-        y, first, is_lost, is_far = self._descent.directly(p, start, limit.x)
+        feet; whether it does go on, and whether it ends farther than `limit` away."""
+        y, first, is_lost, is_far = self._descent.directly(p, start, self.backend.Float(limit))
         foot, found, free = self._descent.end(p, y)
         most = (length(p - start) + 2 * first) * (1 + 64 * self.backend.epsilon)
         most = dr.fma(64 * self.backend.epsilon, largest_coordinate(y), most)
         is_lost |= is_far
         is_foot = found & ~is_lost & (length(p - foot) <= most)
+        return dr.select(is_foot, foot, dr.nan), y, free, ~(found | is_lost), is_far
+
+    def _directly(self, p: Vec3, start: Vec3, limit: Vec3) -> tuple[Vec3, Vec3, Real, Real, Real]:
+        """`_newton` with numbers for masks."""
         one, zero = self.backend.Float(1), self.backend.Float(0)
-        goes_on = dr.select(found | is_lost, zero, one)
-        return (
-            dr.select(is_foot, foot, dr.nan), y, free, goes_on, dr.select(is_far, one, zero)
-        )  # fmt: skip
+        *found, goes_on, is_far = self._newton(p, start, limit.x)
+        return *found, dr.select(goes_on, one, zero), dr.select(is_far, one, zero)
 
     def _descend(self, p: Vec3, start: Vec3) -> tuple[Vec3, Real]:
         y, found, on_level = self._descent.closest(p, start)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias
 
 import drjit as dr
@@ -46,23 +47,40 @@ def free_radius(sample: Sample, rows: Rows | None, x: Vec3, y: Vec3) -> Real:
     1 + d/|g| (k - 2 c r a - c^2 r^2 b - 2 R2/r^2). Here c also is at most (|H|/2 + R2/r^2)/|g|.
     """
     steep, d = length(sample.gradient), length(x - y)
+    curved = None if rows is None else _Curved.of(sample, rows, x - y)
     best = 0 * d
-    if rows is not None:
-        plane = TangentPlane.of(sample.gradient)
-        uu, vv, uv = plane.restricted(rows)
-        eigen = Eigen.of(uu, vv, uv)
-        towards = dr.dot(x - y, plane.n) > 0
-        k = fmin(dr.select(towards, eigen.least, -eigen.most), 0)
-        bent = apply(rows, plane.n)
-        a, b = length(dr.cross(bent, plane.n)), dr.abs(dr.dot(bent, plane.n))
-        half_norm = 0.5 * dr.sqrt(sum(dr.squared_norm(row) for row in rows))
     for power in _POWERS:
         r = fmax(d, 1e-12) * 2.0**power
         first = remainder(sample, r) / (r * r)
         left = 1 - 2 * d * first / steep
-        if rows is not None:
+        if curved is not None:
             second = remainder(sample, r, 2) / (r * r)
-            c = fmin(first, half_norm + second) * r / steep
-            left = fmax(left, 1 + d / steep * (k - c * (2 * a + c * b) - 2 * second))
+            c = fmin(first, curved.half_norm + second) * r / steep
+            lift = curved.least - c * (2 * curved.across + c * curved.along)
+            left = fmax(left, 1 + d / steep * (lift - 2 * second))
         best = dr.select((best == 0) & (left >= _LEAST), r, best)
     return best
+
+
+@dataclass(frozen=True)
+class _Curved:
+    """Of the Hessian H of f, taken with the sign for which x - y is along its gradient: the least
+    eigenvalue in the tangent plane, if it is negative; |Hn - (n.Hn) n|; |n.Hn|; and at least half
+    the norm."""
+
+    least: Real
+    across: Real
+    along: Real
+    half_norm: Real
+
+    @classmethod
+    def of(cls, sample: Sample, rows: Rows, way: Vec3) -> _Curved:
+        plane = TangentPlane.of(sample.gradient)
+        eigen = Eigen.of(*plane.restricted(rows))
+        least = dr.select(dr.dot(way, plane.n) > 0, eigen.least, -eigen.most)
+        bent = apply(rows, plane.n)
+        squares = dr.squared_norm(rows[0]) + dr.squared_norm(rows[1]) + dr.squared_norm(rows[2])
+        return cls(
+            fmin(least, 0), length(dr.cross(bent, plane.n)), dr.abs(dr.dot(bent, plane.n)),
+            0.5 * dr.sqrt(squares),
+        )  # fmt: skip

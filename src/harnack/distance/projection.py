@@ -21,8 +21,8 @@ from harnack.distance.tangent import Eigen, TangentPlane, has_hessian
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
-    from harnack.enclosures import TargetLevels
     from harnack.distance.free_ball import Rows
+    from harnack.enclosures import TargetLevels
     from harnack.fields.field import Field, Sample
 
 __all__ = ["Descent"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -11,17 +11,20 @@ import numpy as np
 
 from harnack.backend import BoolArray, FloatArray, IntArray, choose_backend, to_numpy
 from harnack.backend.arrays import aligned, upload_vectors
+from harnack.backend.elementary import length
 from harnack.distance.cell_tree import FAR, Best, CellTree, SurfaceCells
 from harnack.distance.surface_cells import CellProofs
+from harnack.distance.tangent import in_batches
 
 if TYPE_CHECKING:
+    from harnack.backend import Mask, Real, Vec3
     from harnack.tracer import LevelSet
 
 __all__ = ["Descents", "Found", "Known", "Tolerance", "search"]
 
 # The number of cells before points are looked up in them: for each point, at least, and for fields
 # with sheets, which are searched in turn as well.
-_EACH, _FEWEST, _FEWEST_ON_SHEETS = 0.05, 10_000, 1500
+_EACH, _EACH_TO_PROVE, _FEWEST, _FEWEST_ON_SHEETS = 0.16, 0.25, 10_000, 1500
 # Cells at most, and which share of that where evaluations are as expensive as sums of many terms.
 _MOST, _MOST_TO_PROVE, _MOST_ON_SHEETS, _EXPENSIVE = 60_000, 150_000, 20_000, 0.25
 _FINEST = 40
@@ -29,7 +32,7 @@ _FINEST = 40
 _COARSE = 300
 # Cells along an edge of the cube to begin with.
 _ACROSS = 8
-# Feet of other parts of the surface that are tried, from the same cells.
+# Times that feet of other parts of the surface are tried, from the same cells.
 _CHALLENGES = 4
 # In tolerances: how far to the side of its boundary the surface is looked for.
 _ASIDE = 100.0
@@ -56,6 +59,11 @@ class Found:
 class Descents(Protocol):
     """Ways to nearer points of the surface from points x (n, 3). They return feet, NaN where none
     was found, and radii about these within which none is nearer."""
+
+    def directly(self, x: Vec3, start: Vec3, limit: Real) -> tuple[Vec3, Real, Mask]:
+        """From places near the surface, in a kernel: feet, radii, and where `polish` is to be
+        asked."""
+        ...
 
     def polish(
         self, points: FloatArray, start: FloatArray, limit: FloatArray
@@ -160,16 +168,27 @@ def _in_parts(
     """The nearest points in a cube, for some of the points at a time."""
     proofs = CellProofs(surface)
     most = _most(surface, len(points), tolerance.is_proved)
-    enough = min(max(_FEWEST, int(_EACH * len(points))), _MOST, most)
+    each = _EACH_TO_PROVE if tolerance.is_proved else _EACH
+    enough = min(max(_FEWEST, int(each * len(points))), _MOST, most)
     if surface.field.has_sheets:
         enough = _FEWEST_ON_SHEETS
     coarse, cells = _split(proofs, root, enough, progress)
+    backend, trees = choose_backend("double"), None
+    if len(cells):
+        trees = CellTree.of(backend, coarse), CellTree.of(backend, cells)
     parts: list[Found] = []
     for first in range(0, max(len(points), 1), _AT_ONCE):
         rows = slice(first, first + _AT_ONCE)
         at_most = most if tolerance.is_proved else 0
         job = _Search(
-            proofs, coarse, cells, points[rows], known.some(rows), descents, tolerance.length, at_most
+            proofs,
+            cells,
+            trees,
+            points[rows],
+            known.some(rows),
+            descents,
+            tolerance.length,
+            at_most,
         )
         parts.append(job.run(progress))
     return Found(*(np.concatenate([getattr(p, k) for p in parts]) for k in ("feet", "lower")))
@@ -217,15 +236,16 @@ class _Search:
     """The search for some points, from cells that hold all of the surface, and first from coarse
     ones.
 
+    trees: of the coarse cells and of `cells`; None if there are none.
     feet: (n, 3) the nearest points so far, or NaN. free: (n,) within these radii about them none is
     nearer. lower: (n,) proved bounds of distances. most: cells are split while they are not more.
     """
 
     def __init__(
-        self, proofs: CellProofs, coarse: SurfaceCells, cells: SurfaceCells, points: FloatArray,
-        known: Known, descents: Descents, tolerance: float, most: int,
+        self, proofs: CellProofs, cells: SurfaceCells, trees: tuple[CellTree, CellTree] | None,
+        points: FloatArray, known: Known, descents: Descents, tolerance: float, most: int,
     ) -> None:  # fmt: skip
-        self.coarse = coarse
+        self.trees = trees
         self.proofs, self.cells, self.points, self.descents = proofs, cells, points, descents
         self.backend = choose_backend("double")
         self.known, self.feet, self.free = known, known.feet.copy(), np.zeros(len(points))
@@ -237,8 +257,8 @@ class _Search:
         if not len(self.points):
             return Found(self.feet, self.lower)
         has_sheets = self.proofs.surface.field.has_sheets
-        if len(self.cells):
-            self._search_cells(has_sheets, progress)
+        if self.trees is not None:
+            self._search_cells(*self.trees, has_sheets, progress)
         else:
             self.lower[:] = np.inf
         if not has_sheets:
@@ -249,27 +269,73 @@ class _Search:
             self._descend(rows, self.points[rows])
         return Found(self.feet, self.lower)
 
-    def _search_cells(self, has_sheets: bool, progress: Callable[[str], None]) -> None:
-        """Descend first from the foot of the coarse cell where the surface seems nearest, then from those
-        of other parts that may be nearer. If some may still be, and there are not too many cells,
-        those cells are split, and so on."""
-        tree = CellTree.of(self.backend, self.cells)
-        tried = self._first(CellTree.of(self.backend, self.coarse))
-        if not has_sheets:
-            self._leave_boundary()
-        rows = np.arange(len(self.points))
+    def _search_cells(
+        self, coarse: CellTree, tree: CellTree, has_sheets: bool, progress: Callable[[str], None]
+    ) -> None:
+        """Descend first from the foot of the coarse cell where the surface seems nearest, then from
+        those of other parts that may be nearer. If some may still be, and there are not too many
+        cells, those cells are split, and so on."""
+        marks = dr.zeros(self.backend.Bool, len(self.cells)) if self.most else None
+        if has_sheets:
+            tried = self._first(tree)
+            rows = np.arange(len(self.points))
+        else:
+            rows, tried = self._begin(coarse, tree, marks)
+            rows = np.union1d(rows, self._leave_boundary())
         for _ in range(_FINEST):
-            marks = self._challenge(tree, rows, tried[rows])
+            self._challenge(tree, rows, [tried[rows]], marks)
             if marks is None:
                 break
             rows = np.flatnonzero(self._is_open())
-            count = int(marks.sum())
+            split = to_numpy(marks)
+            count = int(split.sum())
             if not count or not len(rows) or len(self.cells) + 4 * count > self.most:
                 break
-            parts = self.proofs.with_feet(_parts(self.proofs, self.cells, marks))
-            self.cells = SurfaceCells.joined([self.cells.some(~marks), parts])
+            parts = self.proofs.with_feet(_parts(self.proofs, self.cells, split))
+            self.cells = SurfaceCells.joined([self.cells.some(~split), parts])
             progress(f"distances: {len(self.cells):,} cells for {len(rows):,} points")
-            tree = CellTree.of(self.backend, self.cells)
+            tree, tried = CellTree.of(self.backend, self.cells), self.feet
+            marks = dr.zeros(self.backend.Bool, len(self.cells))
+
+    def _begin(self, coarse: CellTree, tree: CellTree, marks: Any) -> tuple[IntArray, FloatArray]:
+        """`_first`, and a first `_challenge`: in one kernel, where Newton's method ends.
+
+        Returns the rows at which there is more to try, and the feet that were tried (n, 3).
+        """
+        backend = self.backend
+        tolerance = dr.opaque(backend.Float, self.tolerance)
+
+        def compute(x: Vec3, known: Vec3) -> tuple[Real | Vec3, ...]:
+            real, none = backend.Float, backend.Array3f(FAR)
+            limit = length(known - x)
+            limit = dr.select(dr.isfinite(limit), limit, FAR)
+            start = coarse.nearest(x, limit)
+            y, free, unknown = self.descents.directly(x, start, limit)
+            begins, away = start.x < 0.5 * FAR, length(y - x)
+            unknown &= begins
+            is_nearer = begins & ~unknown & (away < limit)
+            foot = dr.select(is_nearer, y, dr.select(limit < 0.5 * FAR, known, none))
+            distance = dr.select(is_nearer, away, limit)
+            best = Best(
+                foot, dr.select(unknown, 0, distance), dr.select(is_nearer, free, 0),
+                dr.select(is_nearer, 1, real(_APART_FROM_BOUNDARY)),
+            )  # fmt: skip
+            lower, *others = tree.nearer(x, best, (start,), tolerance, marks)
+            foot = dr.select(distance < 0.5 * FAR, foot, dr.nan)
+            return foot, best.free, lower, start, *others, dr.select(unknown, real(1), 0)
+
+        self.feet, self.free, lower, start, *others, unknown = in_batches(
+            backend, compute, self.points, self.known.feet
+        )
+        self.lower = self._rounded(lower, self.points)
+        rows = np.flatnonzero(unknown)
+        self._descend(rows, start[rows])
+        return np.union1d(rows, self._try(np.arange(len(start)), others)), start
+
+    @staticmethod
+    def _rounded(lower: FloatArray, points: FloatArray) -> FloatArray:
+        """Lower bounds (n,), less what rounding may have done to them."""
+        return lower * (1 - 1e-12) - 1e-15 * np.abs(points).max(axis=1)
 
     def _is_open(self) -> BoolArray:
         """Whether it is not proved that no point is nearer than the best."""
@@ -292,27 +358,35 @@ class _Search:
         self._descend(rows, start[rows])
         return start
 
-    def _challenge(self, tree: CellTree, rows: IntArray, first: FloatArray) -> BoolArray | None:
-        """Descend from the feet of other parts of the surface that may be nearer, one after the
-        other.
+    def _challenge(
+        self, tree: CellTree, rows: IntArray, tried: Sequence[FloatArray], marks: Any
+    ) -> None:
+        """Descend from the feet of other parts of the surface that may be nearer, and from further
+        ones where that led nearer; with sheets, of which cells know no planes, wherever there are.
 
-        first: (k, 3) feet that were tried. Returns which cells may hold points that are nearer than
-        the best, of these points; None if no cells are to be split.
+        tried: feet (k, 3) that need not be tried. marks: `CellTree.nearer`.
         """
-        marks = dr.zeros(self.backend.Bool, len(self.cells)) if self.most else None
-        second = np.full_like(first, FAR)
         for _ in range(_CHALLENGES):
             if not len(rows):
                 break
-            start = self._nearer(tree, rows, (first, second), marks)
+            starts = self._nearer(tree, rows, tried, marks)
+            nearer = self._try(rows, starts)
+            some = np.isin(rows, nearer)
+            if self.proofs.surface.field.has_sheets:
+                some |= starts[0][:, 0] < 0.5 * FAR
+            rows, tried = rows[some], [start[some] for start in starts]
+
+    def _try(self, rows: IntArray, starts: Sequence[FloatArray]) -> IntArray:
+        """Descend from feet (k, 3), FAR for none; returns the rows where that led nearer."""
+        before = self._distance(rows)
+        for start in starts:
             some = start[:, 0] < 0.5 * FAR
-            rows, first, second = rows[some], second[some], start[some]
-            self._descend(rows, start[some])
-        return None if marks is None else to_numpy(marks)
+            self._descend(rows[some], start[some])
+        return rows[self._distance(rows) < before]
 
     def _nearer(
-        self, tree: CellTree, rows: IntArray, others: tuple[FloatArray, ...], marks: Any
-    ) -> FloatArray:
+        self, tree: CellTree, rows: IntArray, tried: Sequence[FloatArray], marks: Any
+    ) -> list[FloatArray]:
         """`CellTree.nearer` for some points; raises their lower bounds."""
         backend, feet = self.backend, self.feet[rows]
         best = Best(
@@ -321,22 +395,24 @@ class _Search:
             aligned(backend, np.where(self._is_boundary(rows), _APART_FROM_BOUNDARY, 1.0)),
         )  # fmt: skip
         x = upload_vectors(backend, self.points[rows])
-        tried = tuple(upload_vectors(backend, one) for one in others)
+        tried_already = tuple(upload_vectors(backend, one) for one in tried)
         tolerance = dr.opaque(backend.Float, self.tolerance)
-        lower, foot = tree.nearer(x, best, tried, tolerance, marks)
-        size = np.abs(self.points[rows]).max(axis=1)
-        proved = to_numpy(lower) * (1 - 1e-12) - 1e-15 * size
+        lower, *others = tree.nearer(x, best, tried_already, tolerance, marks)
+        dr.eval(lower, *others)
+        proved = self._rounded(to_numpy(lower), self.points[rows])
         self.lower[rows] = np.maximum(proved, self.lower[rows])
-        return to_numpy(foot)
+        return [to_numpy(one) for one in others]
 
-    def _leave_boundary(self) -> None:
-        """Descend from the boundary of the surface, where the best point is on it."""
+    def _leave_boundary(self) -> IntArray:
+        """Descend from the boundary of the surface, where the best point is on it; returns the rows
+        where that led nearer."""
         rows = np.flatnonzero(self._is_boundary(slice(None)))
         distance = self._distance(rows)
         rows, distance = rows[distance > 0], distance[distance > 0]
         aside = np.minimum(0.25 * distance, _ASIDE * self.tolerance)
         x = self.points[rows]
         self._take(rows, *self.descents.leave_boundary(x, self.feet[rows], aside))
+        return rows[self._distance(rows) < distance]
 
     def _descend(self, rows: IntArray, start: FloatArray) -> None:
         """Descend from places (k, 3), points of the surface or the points themselves."""

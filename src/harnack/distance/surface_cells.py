@@ -254,6 +254,7 @@ class CellProofs:
         if not len(cells):
             return cells
         radius, start = _WITHIN * cells.half, cells.center
+        away = np.full(len(cells), np.inf)
         if self._volume is not None:
             away, start = self._at(self._pulled_inside, cells.center)
         foot, normal, spread, curvature = self._at(self._disk, start, radius, cells.normal)
