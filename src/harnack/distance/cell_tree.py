@@ -29,6 +29,8 @@ FAR = 1e150
 """Coordinates of missing feet, and the thickness of slabs that bound nothing."""
 # Visits of nodes take a tenth of what visits of cells do.
 _LEAF_SIZE = 1
+# Feet of other parts of the surface that one walk finds.
+_LISTED = 4
 # Feet closer to one another than this many half cells lead to the same place: where the surface in
 # a cell is in one piece and does not end, and elsewhere.
 _APART, _APART_ELSEWHERE = 4.0, 3.0
@@ -158,11 +160,11 @@ class CellTree:
 
     def nearer(
         self, x: Vec3, best: Best, others: tuple[Vec3, ...], tolerance: Real, marks: Any
-    ) -> tuple[Real, Vec3, Vec3]:
+    ) -> tuple[Real, list[Vec3]]:
         """What cells say about points of the surface that are nearer to x than the best.
 
         Returns a length that the surface is no nearer than, at most the distance of the best; and
-        the feet (else FAR) of the two cells where it seems to come nearest, of those in which it
+        the feet (else FAR) of the few cells where it seems to come nearest, of those in which it
         may be nearer than the best by more than `tolerance`. Feet that are not apart from the best,
         from `others` and from one another (`_APART`) are left out. In `marks`, if given, a Bool is
         set for each of those cells, wherever their feet are.
@@ -171,7 +173,7 @@ class CellTree:
         vector, index = backend.Array3f, backend.UInt32
 
         def each(row: list[Real], active: Mask, state: State) -> State:
-            lower, nearest, foot, second, second_foot = state
+            lower, *listed = state
             cell = _Record.of(vector, row)
             counts = active & ~cell.is_within(best.foot, best.free)
             here = cell.lower(x)
@@ -181,18 +183,21 @@ class CellTree:
                 dr.scatter(marks, backend.Bool(True), number, wanted & cell.is_cell)
             lower = dr.select(counts & cell.is_cell, fmin(lower, here), lower)
             near = cell.estimate(x)
-            taken = wanted & (near < second) & (near < best.distance + cell.doubt)
+            taken = wanted & (near < best.distance + cell.doubt)
             taken &= cell.is_apart(best.foot, best.apart)
             for other in others:
                 taken &= cell.is_apart(other, 1.0)
-            is_first, apart = near < nearest, cell.is_apart(foot, 1.0)
-            # What was first becomes second, unless this is the same place.
-            moves, is_second = taken & is_first & apart, taken & ~is_first & apart
-            second = dr.select(moves, nearest, dr.select(is_second, near, second))
-            second_foot = dr.select(moves, foot, dr.select(is_second, cell.foot, second_foot))
-            nearest = dr.select(taken & is_first, near, nearest)
-            foot = dr.select(taken & is_first, cell.foot, foot)
-            return lower, nearest, foot, second, second_foot
+            # The list is sorted: what is nearer takes a place, and what was there goes on to the
+            # next, unless both lead to the same place.
+            near, foot = dr.select(taken, near, dr.inf), cell.foot
+            for k in range(0, len(listed), 2):
+                there, y = listed[k], listed[k + 1]
+                is_nearer, is_apart = near < there, cell.is_apart(y, 1.0)
+                listed[k] = dr.select(is_nearer, near, there)
+                listed[k + 1] = dr.select(is_nearer, foot, y)
+                near = dr.select(is_apart, dr.select(is_nearer, there, near), dr.inf)
+                foot = dr.select(is_nearer, y, foot)
+            return lower, *listed
 
         def is_open(low: Vec3, high: Vec3) -> Mask:
             y = best.foot
@@ -200,10 +205,10 @@ class CellTree:
             return dr.squared_norm(corner) >= best.free * best.free
 
         limit = backend.Float(best.distance)
-        start = limit, backend.Float(dr.inf), vector(FAR), backend.Float(dr.inf), vector(FAR)
-        found = self._walk(x, each, start, lambda state: limit * limit, is_open)
-        lower, _, foot, _, second_foot = found
-        return lower, foot, second_foot
+        empty = (one for _ in range(_LISTED) for one in (backend.Float(dr.inf), vector(FAR)))
+        start = limit, *empty
+        lower, *listed = self._walk(x, each, start, lambda state: limit * limit, is_open)
+        return lower, listed[1::2]
 
     def _walk(
         self, x: Vec3, each: Any, start: State, limit: Callable[[State], Real],

@@ -320,7 +320,7 @@ class _Search:
                 foot, dr.select(unknown, 0, distance), dr.select(is_nearer, free, 0),
                 dr.select(is_nearer, 1, real(_APART_FROM_BOUNDARY)),
             )  # fmt: skip
-            lower, *others = tree.nearer(x, best, (start,), tolerance, marks)
+            lower, others = tree.nearer(x, best, (start,), tolerance, marks)
             foot = dr.select(distance < 0.5 * FAR, foot, dr.nan)
             return foot, best.free, lower, start, *others, dr.select(unknown, real(1), 0)
 
@@ -379,9 +379,8 @@ class _Search:
     def _try(self, rows: IntArray, starts: Sequence[FloatArray]) -> IntArray:
         """Descend from feet (k, 3), FAR for none; returns the rows where that led nearer."""
         before = self._distance(rows)
-        for start in starts:
-            some = start[:, 0] < 0.5 * FAR
-            self._descend(rows[some], start[some])
+        number, some = np.nonzero([start[:, 0] < 0.5 * FAR for start in starts])
+        self._descend(rows[some], np.stack(starts)[number, some])
         return rows[self._distance(rows) < before]
 
     def _nearer(
@@ -397,7 +396,7 @@ class _Search:
         x = upload_vectors(backend, self.points[rows])
         tried_already = tuple(upload_vectors(backend, one) for one in tried)
         tolerance = dr.opaque(backend.Float, self.tolerance)
-        lower, *others = tree.nearer(x, best, tried_already, tolerance, marks)
+        lower, others = tree.nearer(x, best, tried_already, tolerance, marks)
         dr.eval(lower, *others)
         proved = self._rounded(to_numpy(lower), self.points[rows])
         self.lower[rows] = np.maximum(proved, self.lower[rows])
@@ -424,6 +423,9 @@ class _Search:
         self._take(rows, *self.descents.polish(x, start, self._distance(rows)))
 
     def _take(self, rows: IntArray, feet: FloatArray, free: FloatArray) -> None:
-        """Take points of the surface (k, 3) or NaN, and their radii, where they are nearer."""
-        nearer = np.linalg.norm(self.points[rows] - feet, axis=1) < self._distance(rows)
+        """Take points of the surface (k, 3) or NaN, and their radii, where they are nearer; rows
+        may come several times."""
+        away = np.linalg.norm(self.points[rows] - feet, axis=1)
+        nearer = np.flatnonzero(away < self._distance(rows))
+        nearer = nearer[np.argsort(-away[nearer])]  # the last one stays
         self.feet[rows[nearer]], self.free[rows[nearer]] = feet[nearer], free[nearer]
