@@ -379,6 +379,8 @@ def test_what_is_not_a_number_proves_no_step(kind: type[Promise], precision: str
     right, gap, nan = plain(kind, real), real(0.1), real(math.nan)
     wrong = [(right, Gaps(nan, gap)), (right, Gaps(gap, nan))]
     for name, *_ in kind.units:
+        if name == "change":  # of third derivatives, which no step asks for
+            continue
         numbers = [nan] if name in itertools.chain(*kind.ends) else [nan, real(-1)]
         wrong += [(dataclasses.replace(right, **{name: one}), Gaps(gap, gap)) for one in numbers]
     tried = [bound for bound in BOUNDS if Case(right, gap, gap).accepts(bound)]
