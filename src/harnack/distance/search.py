@@ -276,9 +276,10 @@ class _Search:
         those of other parts that may be nearer. If some may still be, and there are not too many
         cells, those cells are split, and so on."""
         marks = dr.zeros(self.backend.Bool, len(self.cells)) if self.most else None
-        if has_sheets:
-            tried = self._first(tree)
-            rows = np.arange(len(self.points))
+        if has_sheets or self._is_expensive:
+            tried, rows = self._first(tree), np.arange(len(self.points))
+            if not has_sheets:
+                self._leave_boundary()
         else:
             rows, tried = self._begin(coarse, tree, marks)
             rows = np.union1d(rows, self._leave_boundary())
@@ -337,6 +338,11 @@ class _Search:
         """Lower bounds (n,), less what rounding may have done to them."""
         return lower * (1 - 1e-12) - 1e-15 * np.abs(points).max(axis=1)
 
+    @property
+    def _is_expensive(self) -> bool:
+        """Whether evaluations take longer than walks: then fine cells tell where to begin."""
+        return self.proofs.surface.field.has_detail
+
     def _is_open(self) -> BoolArray:
         """Whether it is not proved that no point is nearer than the best."""
         return self.lower < self._distance(slice(None)) - self.tolerance
@@ -362,7 +368,8 @@ class _Search:
         self, tree: CellTree, rows: IntArray, tried: Sequence[FloatArray], marks: Any
     ) -> None:
         """Descend from the feet of other parts of the surface that may be nearer, and from further
-        ones where that led nearer; with sheets, of which cells know no planes, wherever there are.
+        ones where that led nearer; with sheets, of which cells know no planes, wherever there are,
+        and where evaluations are expensive one by one.
 
         tried: feet (k, 3) that need not be tried. marks: `CellTree.nearer`.
         """
@@ -370,11 +377,13 @@ class _Search:
             if not len(rows):
                 break
             starts = self._nearer(tree, rows, tried, marks)
+            if self._is_expensive:
+                starts = starts[:1]
             nearer = self._try(rows, starts)
             some = np.isin(rows, nearer)
-            if self.proofs.surface.field.has_sheets:
+            if self._is_expensive or self.proofs.surface.field.has_sheets:
                 some |= starts[0][:, 0] < 0.5 * FAR
-            rows, tried = rows[some], [start[some] for start in starts]
+            rows, tried = rows[some], [one[some] for one in (*tried[-1:], *starts)]
 
     def _try(self, rows: IntArray, starts: Sequence[FloatArray]) -> IntArray:
         """Descend from feet (k, 3), FAR for none; returns the rows where that led nearer."""
