@@ -436,7 +436,7 @@ class DipolePotential(HasCells, DetailedField["_DipoleBuffers"], BatchedField):
         """A box around the points: at distance rho from all of them |f| <= (sum of areas)/rho^2,
         smoothed or not, as 1 + 5 q/2 <= (1 + q)^(5/2)."""
         reach = 1.0001 * math.sqrt(float(self.areas.sum()) / min(abs(level) for level in levels))
-        low, high = self._box
+        low, high = self.points.min(axis=0), self.points.max(axis=0)  # they may be replaced
         return Box(low - reach, high + reach)
 
     def describe(self) -> dict[str, Any]:
