@@ -318,6 +318,12 @@ def test_many_rays_get_cells_by_themselves(monkeypatch: pytest.MonkeyPatch) -> N
     other = field.for_rays(10**8)
     assert other is not with_cells
     assert other.points is field.points
+    # Their extent too: rays to where the points are now were proved misses.
+    field.points = some[0] + np.array([10.0, 0.0, 0.0])
+    for one in (field, field.for_rays(10**8)):
+        volume = one.extent((2 * math.pi,))
+        assert volume is not None
+        assert volume.contains_points(field.points).all()
     # Tracing asks for them.
     monkeypatch.setattr(dipole, "_LEAST_RAYS", 1000)
     monkeypatch.setattr(dipole, "_PAYS", 1)

@@ -128,7 +128,10 @@ def find_crossings(
         more = found & (crossings < k)
         status = dr.select(more, count(int(Status.MISS)), after.status)
         if now.sheets is None:
-            more &= after.proved_to + after.proved_step < end
+            undecided = after.proved_to + after.proved_step < end
+            if march.hysteresis is not None:
+                undecided |= march.hysteresis.samples_end(contact, end) & (after.proved_to < end)
+            more &= undecided
         else:
             more |= after.active
         return there.with_march(dataclasses.replace(after, status=status, active=more), crossings)
@@ -139,7 +142,7 @@ def find_crossings(
     walk = while_active(begun, one, "harnack crossings")
     last = walk.now
     ray, none = dr.arange(count, n * k) // k, real(0)
-    roots = Contact(side, backend.Bool(False), t, gradient, none, before, behind)
+    roots = Contact(side, backend.Bool(False), t, gradient, none, before, behind, none)
     origins, directions = gather_vectors(backend, o, ray), gather_vectors(backend, d, ray)
     t, gradient, looks = prepared.settled(origins, directions, roots, dr.isfinite(t))
     evaluations = last.evaluations + dr.block_reduce(dr.ReduceOp.Add, looks, k)

@@ -152,6 +152,9 @@ _PASSED = 0.5
 AIM = 0.75
 # In contact, truncation is judged by this fraction of the tolerance.
 CLOSER = 0.5
+# A ray in contact takes shorter steps where its band becomes smaller than this fraction, but none
+# shorter than so many tolerances.
+_MUCH_SMALLER, _SHORT = 0.25, 4.0
 # Rounds of the search for the root of a cubic.
 _ROUNDS = 4
 
@@ -170,6 +173,7 @@ class Contact:
     excess: by how much f at the root may be farther from the level than the tolerance allows, where
         rounding leaves f less certain than that: the root lies between the two samples.
     before, behind: the places of the two samples, or the root itself.
+    band: that of the last sample.
     """
 
     side: Real
@@ -179,12 +183,13 @@ class Contact:
     excess: Real
     before: Real
     behind: Real
+    band: Real
 
     @classmethod
     def none(cls, backend: Backend) -> Contact:
         """Before the first sample."""
         zero = backend.Float(0)
-        return cls(zero, backend.Bool(False), zero, backend.Array3f(0), zero, zero, zero)
+        return cls(zero, backend.Bool(False), zero, backend.Array3f(0), zero, zero, zero, zero)
 
 
 @dataclass(frozen=True)
@@ -291,6 +296,19 @@ class Hysteresis:
         """The tolerance in value around a level: `within`, or more where rounding asks for it."""
         return fmin(fmax(within, _ROUNDINGS * rounding), _OF_SPACING * self.spacing)
 
+    def may_reach(self, now: Contact, band: Real, step: Real, tolerance: Real) -> Mask:
+        """Whether the band of the last sample may count for a step to a point with this band.
+
+        tolerance: a length, at that point.
+        """
+        holds = now.band * _MUCH_SMALLER <= band
+        return ~now.is_touching | holds | (step <= _SHORT * tolerance)
+
+    def samples_end(self, now: Contact, end: Real) -> Mask:
+        """Whether a ray that is proved free to its end has to sample it: in contact it is proved
+        free of levels that lie a band beyond."""
+        return now.is_touching & (self.is_free_after | (end < dr.inf))
+
     def gaps(
         self, contact: Contact, value: Real, gaps: Gaps, band: Real, part: float = 1.0
     ) -> Gaps:
@@ -344,6 +362,7 @@ class Hysteresis:
             excess,
             before,
             behind,
+            dr.select(active, seen.band, now.band),
         ), crosses
 
     def jump(
@@ -374,6 +393,7 @@ class Hysteresis:
             dr.select(at_sheet, 0, now.excess),
             dr.select(at_sheet, seen.t, now.before),
             dr.select(at_sheet, seen.t, now.behind),
+            dr.select(active, seen.band, now.band),
         ), crosses
 
     def _side(self, now: Contact, seen: Accepted, x: Real) -> Real:

@@ -58,6 +58,8 @@ _WIDENING = 0.1
 _CLOSER = 1.25, 16.0
 # Truncation falls like this power of detail; beyond the largest detail there is none.
 _POWER, _MOST_DETAIL = 3.2, 1e6
+# In contact, a step that leads to where the band is much smaller is tried again so much shorter.
+_SHORTER = 0.125
 
 
 @dataclass(frozen=True)
@@ -254,6 +256,13 @@ class March:
         if self.hysteresis is not None and now.contact is not None:
             seen = self._in_contact(seen, self.hysteresis, now.contact)
         accepted, detail, too_coarse = self._accept(field, seen, now, ahead)
+        proved_step, retry = now.proved_step, now.proved_step
+        if self.hysteresis is not None and now.contact is not None:
+            tolerance = dr.fma(seen.t, self.tolerance.per_length, self.tolerance.distance)
+            reaches = self.hysteresis.may_reach(now.contact, seen.band, now.trial_step, tolerance)
+            shorter = fmin(now.proved_step, _SHORTER * now.trial_step)
+            proved_step = retry = dr.select(reaches | too_coarse, now.proved_step, shorter)
+            accepted &= reaches
 
         # Is it a hit, a sheet, or a crossing?
         hit, gaps_ahead, sheet = accepted & seen.is_near, seen.gaps, None
@@ -277,7 +286,8 @@ class March:
         if self.occupied is not None:
             forward, trial = self._jump(self.occupied, path, end, seen, accepted, forward, trial)
         look_ahead = self._look_ahead(now, seen, end, proved, contact, hit)
-        free = self._is_free(now, seen, end, accepted, forward, contact)
+        proved_step = dr.select(accepted, forward, proved_step)
+        free = self._is_free(now, seen, end, accepted, proved_step, contact)
         if sheet is not None:
             free = dr.select(sheet.has_crossing, sheet.at_crossing, free)
         evaluations = now.evaluations + 1
@@ -286,11 +296,11 @@ class March:
         if sheet is not None:
             status, gradient = sheet.mark(status, gradient)
         proved_to = dr.select(accepted, seen.t, now.proved_to)
-        step = dr.select(accepted, trial, dr.select(too_coarse, now.trial_step, now.proved_step))
+        step = dr.select(accepted, trial, dr.select(too_coarse, now.trial_step, retry))
         return MarchState(
             proved_to=proved_to,
             trial_step=fmin(step, end - proved_to),
-            proved_step=dr.select(accepted, forward, now.proved_step),
+            proved_step=proved_step,
             look_ahead=dr.select(accepted, look_ahead, now.look_ahead),
             value=dr.select(accepted, value, now.value),
             gradient=gradient,
@@ -470,17 +480,15 @@ class March:
         seen: _Seen,
         end: Real,
         accepted: Mask,
-        forward: Real,
+        proved_step: Real,
         contact: Contact | None,
     ) -> Mask:
         """Whether rays are proved free to their end."""
         farthest = float(dr.largest(self.backend.Float)) ** _FARTHEST
         proved_to = dr.select(accepted, seen.t, now.proved_to)
-        proved_step = dr.select(accepted, forward, now.proved_step)
         free = proved_to + proved_step >= dr.select(end == dr.inf, farthest, end)
-        if self.hysteresis is not None and contact is not None:  # sample the end: contact may cease
-            undecided = contact.is_touching & self.hysteresis.is_free_after
-            free &= ~(accepted & undecided & (seen.t < end))
+        if self.hysteresis is not None and contact is not None:
+            free &= ~(accepted & self.hysteresis.samples_end(contact, end) & (seen.t < end))
         return free
 
     def _is_near(

@@ -134,8 +134,8 @@ class SheetTracer:
         # The last step may already have proved the rest of the ray.
         goes_on = now.proved_to + now.proved_step < stop
         if now.contact is not None and self.march.hysteresis is not None:
-            undecided = now.contact.is_touching & self.march.hysteresis.is_free_after
-            goes_on |= undecided & (now.proved_to < stop)
+            samples_end = self.march.hysteresis.samples_end(now.contact, stop)
+            goes_on |= samples_end & (now.proved_to < stop)
         active = now.active & (stops | goes_on)
         step = fmin(self.march.overstep * now.proved_step, stop - now.proved_to)
         now = dataclasses.replace(now, trial_step=step, active=active)
