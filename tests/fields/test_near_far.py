@@ -29,6 +29,7 @@ from harnack.fields.solid_angles.local_expansion import (
 )
 from harnack.fields.solid_angles.multipole import of_dipole, regular
 from harnack.geometry import shapes
+from harnack.testing import check_field
 from tests.oracles.direct_sums import dipole_sum
 from tests.tracer.test_cloud_hits import Cloud, cloud, rays, unit
 
@@ -362,3 +363,9 @@ def test_smoothed_sums_have_no_cells() -> None:
     points, normals = np.eye(3), np.eye(3)
     with pytest.raises(ValueError, match="cells are of sums without smoothing"):
         hk.DipolePotential(points, normals, smoothing=0.1, cells=True)
+
+
+@pytest.mark.parametrize("cells", [False, True])
+def test_a_cloud_as_it_comes_keeps_its_contract(cells: bool) -> None:
+    """Values at points leave out more than samples do: `check_field` took that for an error."""
+    check_field(hk.DipolePotential(*cloud(1000), cells=cells), rng=0, count=40, directions=2)
