@@ -28,8 +28,11 @@ _PARALLEL = 1e-12
 
 @dataclass(frozen=True)
 class _Line:
-    """The line n . y = h that crosses the unit disc, n = (x, y) of length 1; one that does not is
-    (0, 0), 1. q: n times the distance of the neighbor, seen in the plane, whatever the line."""
+    """The line n . y = h that bounds a cell towards a neighbor, in units of the cell's radius.
+
+    x, y: n, of length 1; 0 if the line misses the unit disc. h: 1 if it does.
+    q: from the point to the neighbor, projected to the tangent plane.
+    """
 
     x: Real
     y: Real

@@ -152,8 +152,8 @@ _PASSED = 0.5
 AIM = 0.75
 # In contact, truncation is judged by this fraction of the tolerance.
 CLOSER = 0.5
-# A ray in contact takes shorter steps where its band becomes smaller than this fraction, but none
-# shorter than so many tolerances.
+# In contact, a step must not lead to where the band is less than this fraction of what it was,
+# unless it is at most so many tolerances long.
 _MUCH_SMALLER, _SHORT = 0.25, 4.0
 # Rounds of the search for the root of a cubic.
 _ROUNDS = 4
@@ -236,7 +236,10 @@ class Hysteresis:
        contact on the side of larger values, the ray is proved free of `level - band`, the band
        being that of the last sample, as a ray is proved free of a level before contact
        (`March.advance`). So f > level - W as long as no crossing was noticed. Before the contact,
-       f was proved not to take the level at all.
+       f was proved not to take the level at all. Beside a pole the band is as large as f is steep,
+       and may be larger than f gets anywhere behind it. So the band of a sample counts up to the
+       next sample only if the band there is not much smaller (`_MUCH_SMALLER`), or if the two are at
+       most `_SHORT` tolerances apart (`may_reach`): a step that fails this is made shorter.
     2. *Nothing is counted twice.* A crossing is noticed at a point where f is proved to be on the
        other side of the level, `band/2` being more than its error; the next one only where it is
        proved to be on the first side again. So crossings of a level alternate, and between two that

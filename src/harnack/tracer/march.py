@@ -256,12 +256,12 @@ class March:
         if self.hysteresis is not None and now.contact is not None:
             seen = self._in_contact(seen, self.hysteresis, now.contact)
         accepted, detail, too_coarse = self._accept(field, seen, now, ahead)
-        proved_step, retry = now.proved_step, now.proved_step
+        fallback = now.proved_step
         if self.hysteresis is not None and now.contact is not None:
             tolerance = dr.fma(seen.t, self.tolerance.per_length, self.tolerance.distance)
             reaches = self.hysteresis.may_reach(now.contact, seen.band, now.trial_step, tolerance)
             shorter = fmin(now.proved_step, _SHORTER * now.trial_step)
-            proved_step = retry = dr.select(reaches | too_coarse, now.proved_step, shorter)
+            fallback = dr.select(reaches | too_coarse, now.proved_step, shorter)
             accepted &= reaches
 
         # Is it a hit, a sheet, or a crossing?
@@ -286,7 +286,7 @@ class March:
         if self.occupied is not None:
             forward, trial = self._jump(self.occupied, path, end, seen, accepted, forward, trial)
         look_ahead = self._look_ahead(now, seen, end, proved, contact, hit)
-        proved_step = dr.select(accepted, forward, proved_step)
+        proved_step = dr.select(accepted, forward, fallback)
         free = self._is_free(now, seen, end, accepted, proved_step, contact)
         if sheet is not None:
             free = dr.select(sheet.has_crossing, sheet.at_crossing, free)
@@ -296,7 +296,7 @@ class March:
         if sheet is not None:
             status, gradient = sheet.mark(status, gradient)
         proved_to = dr.select(accepted, seen.t, now.proved_to)
-        step = dr.select(accepted, trial, dr.select(too_coarse, now.trial_step, retry))
+        step = dr.select(accepted, trial, dr.select(too_coarse, now.trial_step, fallback))
         return MarchState(
             proved_to=proved_to,
             trial_step=fmin(step, end - proved_to),

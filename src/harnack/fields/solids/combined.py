@@ -104,13 +104,10 @@ class Combined(Solid):
         return self._of([one.at_detail(detail) for one in self.parts])
 
     def for_rays(self, count: int) -> Field:
-        parts: list[Any] = [one.for_rays(count) for one in self.parts]
-        key = tuple(map(id, parts))
-        if key == tuple(map(id, self.parts)):
-            return self
-        if key not in self._made:
-            self._made[key] = Combined(tuple(parts), self.is_union)
-        return self._made[key]
+        def make(parts: list[Any]) -> Solid:
+            return Combined(tuple(parts), self.is_union)
+
+        return self._for_rays(self.parts, count, make)
 
     def _of(self, parts: list[Field]) -> Solid:
         """The same combination of other parts, which need not be solids."""

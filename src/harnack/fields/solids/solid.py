@@ -226,8 +226,20 @@ class Solid(Field):
 
     @functools.cached_property
     def _made(self) -> Remembered[tuple[int, ...], Solid]:
-        """The same combination of other parts, by these parts, which it holds (`for_rays`)."""
         return Remembered()
+
+    def _for_rays(
+        self, parts: Sequence[Field], count: int, make: Callable[[list[Field]], Solid]
+    ) -> Field:
+        """This solid, or the same one made of its parts as they are for so many rays: once, so that
+        nothing is prepared twice. `Field.for_rays` of solids that have parts."""
+        others = [one.for_rays(count) for one in parts]
+        key = tuple(map(id, others))  # of objects that the solid holds
+        if key == tuple(map(id, parts)):
+            return self
+        if key not in self._made:
+            self._made[key] = make(others)
+        return self._made[key]
 
     @refuses_derivatives
     def scaled(self, factors: float | Sequence[float]) -> Solid:
@@ -294,13 +306,10 @@ class Derived(Solid):
         return other
 
     def for_rays(self, count: int) -> Field:
-        """Of the inner field as it is for so many rays."""
-        inner = self.inner.for_rays(count)
-        if inner is self.inner:
-            return self
-        if (id(inner),) not in self._made:
-            self._made[id(inner),] = dataclasses.replace(cast("Any", self), inner=inner)
-        return self._made[id(inner),]
+        def make(parts: list[Field]) -> Solid:
+            return dataclasses.replace(cast("Any", self), inner=parts[0])
+
+        return self._for_rays([self.inner], count, make)
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
         """Those of the inner field, which has the same derivatives up to their sign."""
