@@ -238,7 +238,7 @@ class Hysteresis:
        (`March.advance`). So f > level - W as long as no crossing was noticed. Before the contact,
        f was proved not to take the level at all. Beside a pole the band is as large as f is steep,
        and may be larger than f gets anywhere behind it. So the band of a sample counts up to the
-       next sample only if the band there is not much smaller (`_MUCH_SMALLER`), or if the two are at
+       next sample only if the band there is not much smaller (`_MUCH_SMALLER`), or if both are at
        most `_SHORT` tolerances apart (`may_reach`): a step that fails this is made shorter.
     2. *Nothing is counted twice.* A crossing is noticed at a point where f is proved to be on the
        other side of the level, `band/2` being more than its error; the next one only where it is
