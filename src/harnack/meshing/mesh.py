@@ -33,7 +33,7 @@ from harnack.meshing.lattice_surface import Surface, open_surface
 from harnack.meshing.samples import CELLS_PER_WAVE, MOST_FACES, LevelFunction
 from harnack.meshing.sign_function import (
     SignFunction,
-    has_details,
+    cells_for_details,
     is_meshed_by_signs,
     why_empty,
 )
@@ -269,8 +269,10 @@ def _by_signs(
     cells, attempts = size / _ACROSS_BY_SIGNS, _ATTEMPTS_BY_SIGNS
     if asked.spacing is not None:
         cells, attempts = float(asked.spacing), 1
-    elif has_details(field, cells):  # at once what would be tried next
-        cells, attempts = SMALLER * cells, attempts - 1
+    else:
+        detailed = cells_for_details(field, cells, SMALLER, SMALLER**2)
+        if detailed < cells:  # at once what would be tried next
+            cells, attempts = detailed, attempts - 1
     # Where nothing ends at the box, its cells should not lie along what is symmetrical.
     room = np.zeros(3) if box.has_walls else size * np.array([0.0037, 0.0053, 0.0029])
     filled = box.lower - room, box.upper + 0.5 * room

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, Precision, Real, Vec3
     from harnack.fields import Field
 
-__all__ = ["SignFunction", "has_details", "is_meshed_by_signs", "why_empty"]
+__all__ = ["SignFunction", "cells_for_details", "is_meshed_by_signs", "why_empty"]
 
 # How often a segment is halved before it is intersected with sheets; and how often a smooth
 # function is evaluated along it, in turn where the secant meets the level and in the middle.
@@ -49,8 +49,10 @@ _BEYOND = 1e-6
 # Single precision is used where it tells this many points apart along a cell.
 _STEPS_IN_CELL = 1000
 # Surfaces smoothed over a smaller part of a cell than this have details that it does not show: of
-# five meshes, cells up to 2.8 smoothing lengths were enough, and those above 3.9 were not.
-_DETAILS = 0.3
+# five meshes, cells up to 2.8 smoothing lengths were enough, and those above 3.9 were not. Cells of
+# so many smoothing lengths show them, but for noise: by experiment cells of 7 lose thin edges, and
+# those below 4 show bubbles around single points.
+_DETAILS, _SHOWN = 0.3, 4.8
 # Points of a cloud at which its value is looked at, and the part of the level that it must have.
 _MOST_PROBES, _LEAST_PART = 2000, 0.1
 
@@ -61,10 +63,12 @@ def is_meshed_by_signs(field: Field) -> bool:
     return isinstance(field, BatchedField | Blobs | HRBF)
 
 
-def has_details(field: Field, spacing: float) -> bool:
-    """Whether the surface of a cloud with noise is likely to have details that cells of this size
-    do not show."""
-    return isinstance(field, DipolePotential) and 0 < field.smoothing < _DETAILS * spacing
+def cells_for_details(field: Field, spacing: float, most: float, least: float) -> float:
+    """The size of cells: `spacing`, or where the surface of a cloud with noise is likely to have
+    details that these do not show, smaller by factors between `least` and `most`."""
+    if not isinstance(field, DipolePotential) or not 0 < field.smoothing < _DETAILS * spacing:
+        return spacing
+    return min(max(_SHOWN * field.smoothing, least * spacing), most * spacing)
 
 
 def why_empty(field: Field) -> str:
