@@ -59,10 +59,9 @@ def clouds(folder: Path | None) -> str:
         "harnack's number of triangles (by Open3D, not timed). Each entry: seconds of CPU time, "
         "Hausdorff's distance from the mesh and the mean distance, both in % of the diagonal, from "
         f"{_SAMPLES:,} points on each to the triangles of the other, the largest one with as many "
-        f"points twice again on the triangles of the {_FARTHEST} farthest; 'open' where the mesh is "
-        "not closed (trimesh). "
-        "The bunny has holes, which all programs span: its largest distance is that of the middle "
-        "of the largest hole from its rim.\n",
+        f"points twice again on the triangles of the {_FARTHEST} farthest; 'open' where the mesh "
+        "is not closed (trimesh). The bunny has holes, which all programs span: its largest "
+        "distance is that of the middle of the largest hole from its rim.\n",
         f"| mesh | points | normals | triangles | {names} |",
         "|---|---:|---|---:|" + "---|" * len(programs),
     ]
