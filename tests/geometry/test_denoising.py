@@ -79,9 +79,23 @@ def test_estimated_normals_get_better_at_edges() -> None:
     tree = point_tree(points)
     rounded = normals[tree.query(points, k=32)[1]].mean(axis=1)
     rounded /= np.linalg.norm(rounded, axis=1, keepdims=True)
-    _, turned = Denoising(points, Noise(0.03, 0.063), tree).moved_and_turned(rounded)
-    before, after = (np.einsum("ij,ij->i", one, normals) for one in (rounded, turned))
+    moved, turned = Denoising(points, Noise(0.03, 0.063), tree).moved_and_turned(rounded)
+    assert len(moved) > 0.99 * len(points)
+    before = np.einsum("ij,ij->i", rounded, normals)
+    after = np.einsum("ij,ij->i", turned, normals[tree.query(moved)[1]])
     assert (after < 0.9).mean() < 0.6 * (before < 0.9).mean()
+
+
+def test_points_in_the_middle_of_thin_parts_are_left_out() -> None:
+    """Two walls, and points between them with normals that no neighbor has."""
+    rng = np.random.default_rng(2)
+    walls = np.column_stack([rng.uniform(-1, 1, (6000, 2)), rng.choice([-0.2, 0.2], 6000)])
+    points = walls + rng.normal(0, 0.01, walls.shape)
+    normals = np.column_stack([np.zeros((6000, 2)), np.sign(walls[:, 2])])
+    points[:5], normals[:5] = [[x, 0, 0] for x in (-0.8, -0.4, 0, 0.4, 0.8)], (1, 0, 0)
+    moved, turned = Denoising(points, Noise(0.03, 0.052)).moved_and_turned(normals)
+    assert len(moved) == len(turned) == 5995
+    assert (np.abs(moved[:, 2]) > 0.1).all()
 
 
 def test_points_far_from_all_others_are_found() -> None:

@@ -78,8 +78,8 @@ def test_hostile_clouds_have_the_right_surface(kind: str, smoothing: float) -> N
 
 
 def test_one_point_too_far_away_is_named() -> None:
-    x = np.concatenate([sphere(500)[0], [[400.0, 0, 0]]])
-    with pytest.raises(hk.MeshingError, match=r"1 of 501 points are far .* \(400, 0, 0\)"):
+    x = np.concatenate([sphere(500)[0], [[4000.0, 0, 0]]])
+    with pytest.raises(hk.MeshingError, match=r"1 of 501 points are far .* \(4000, 0, 0\)"):
         hk.mesh(hk.DipolePotential(x, x, smoothing=0.1))
 
 

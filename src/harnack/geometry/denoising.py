@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from harnack.backend.numbers import FloatArray, IntArray
+from harnack.backend.numbers import BoolArray, FloatArray, IntArray
 from harnack.geometry.clouds import Indices, in_parts, nearest_others, point_tree
 
 __all__ = ["Denoising", "Noise", "lonely_points", "noise_of"]
@@ -44,9 +44,12 @@ _COARSEST, _LEAST_PART = 1.2, 0.1
 _FALL, _CHORD, _CHORD_OF_ESTIMATES = 3.0, 0.8, 0.4
 # Normals are estimated anew from moved points so often, each from this many of them. Where only
 # some points are moved, they are moved at first by so many of each other.
-_ROUNDS, _OF_PLANE, _AT_FIRST = 2, 24, 32
+_ROUNDS, _OF_PLANE, _AT_FIRST = 2, 32, 32
 # Of neighbors that face the other way, half of the sum of weights is less than this.
 _AGREED = 0.25
+# A point whose estimated normal so small a part of its neighbors has, by weight, is nowhere on the
+# surface: such points lie in the middle of thin parts. At edges and corners more of them have it.
+_ALIKE = 0.1
 
 
 @dataclass(frozen=True)
@@ -170,8 +173,11 @@ class Denoising:
         return _moved(some, own, near, self.points, normals, _CHORD)
 
     def moved_and_turned(self, normals: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The chosen points (m, 3), moved, and their normals (m, 3), improved in turn with the
-        points. normals: (m, 3) of these, as they are estimated."""
+        """The chosen points, moved, and their normals, improved in turn with the points: (k, 3)
+        each, k <= m, without points whose normals hardly any neighbor has.
+
+        normals: (m, 3) of these, as they are estimated.
+        """
         start, chord = self.points[self.chosen], _CHORD_OF_ESTIMATES
         if len(start) == len(self.points):
             nearest = self.chosen
@@ -186,7 +192,9 @@ class Denoising:
         for _ in range(_ROUNDS):
             normals = _turned(moved, normals, beside, chord)
             moved = _moved(start, normals, near, self.points, normals[nearest], chord)
-        return moved, normals
+        own = near == self.chosen[:, None]
+        kept = _alike(start, normals, near, own, self.points, normals[nearest], chord) >= _ALIKE
+        return moved[kept], normals[kept]
 
 
 def _neighbors(tree: Any, points: FloatArray, count: int) -> Indices:
@@ -222,9 +230,8 @@ def _moved(
         n, index = own[part], near[part]
         theirs, offsets = normals[index], points[index] - start[part, None]
         height = np.einsum("mi,mki->mk", n, offsets)
-        square = np.maximum(_squares(offsets) - height * height, 0.0)
         cosine = np.einsum("mi,mki->mk", n, theirs)
-        weight = _weights(square, cosine, chord)
+        weight = _weights(_across(offsets, height), cosine, chord)
         # n_j . (p_j - x) and n . (p_j - x); both are linear where x moves along n.
         said = 0.5 * (np.einsum("mki,mki->mk", theirs, offsets) + height)
         slope = 0.5 * (weight * (cosine + 1)).sum(axis=1)
@@ -234,6 +241,34 @@ def _moved(
 
     in_parts(move, len(start))
     return moved
+
+
+def _alike(
+    start: FloatArray,
+    own: FloatArray,
+    near: Indices,
+    is_own: BoolArray,
+    points: FloatArray,
+    normals: FloatArray,
+    chord: float,
+) -> FloatArray:
+    """(m,) the part of the neighbors of points that have a normal like theirs, by weight.
+
+    is_own: (m, k) which of them are the points themselves, and do not count. The others: as for
+        `_moved`.
+    """
+    alike = np.empty(len(start))
+
+    def add(part: slice) -> None:
+        n, index = own[part], near[part]
+        offsets = points[index] - start[part, None]
+        height = np.einsum("mi,mki->mk", n, offsets)
+        near_by = np.exp(-_FALL * _relative(_across(offsets, height))) * ~is_own[part]
+        cosine = np.einsum("mi,mki->mk", n, normals[index])
+        alike[part] = (near_by * _likeness(cosine, chord)).sum(axis=1) / near_by.sum(axis=1)
+
+    in_parts(add, len(start))
+    return alike
 
 
 def _turned(points: FloatArray, normals: FloatArray, near: Indices, chord: float) -> FloatArray:
@@ -259,9 +294,22 @@ def _squares(offsets: FloatArray) -> FloatArray:
     return np.einsum("mki,mki->mk", offsets, offsets)
 
 
+def _across(offsets: FloatArray, height: FloatArray) -> FloatArray:
+    """(m, k) squared lengths of offsets (m, k, 3) along planes, from their heights (m, k)."""
+    return np.maximum(_squares(offsets) - height * height, 0.0)
+
+
+def _relative(square: FloatArray) -> FloatArray:
+    """(m, k) squared distances as parts of the largest in each row."""
+    return square / np.maximum(square.max(axis=1, keepdims=True), 1e-300)
+
+
+def _likeness(cosine: FloatArray, chord: float) -> FloatArray:
+    return np.exp(-(2 - 2 * cosine) / chord**2)
+
+
 def _weights(square: FloatArray, cosine: FloatArray, chord: float) -> FloatArray:
     """(m, k) weights of neighbors, whose sum is 1, by squared distances and by cosines between
     normals."""
-    far = np.maximum(square.max(axis=1, keepdims=True), 1e-300)
-    weight = np.exp(-_FALL * square / far - (2 - 2 * cosine) / chord**2)
+    weight = np.exp(-_FALL * _relative(square)) * _likeness(cosine, chord)
     return weight / weight.sum(axis=1, keepdims=True)
