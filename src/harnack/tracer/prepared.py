@@ -275,9 +275,13 @@ class PreparedLevelSet:
         if occupied is not None:
             holds = backend.Bool(active) & (start < end)
             start, end = dr.select(holds, start, 0), dr.select(holds, end, 0)
-            if not self.field.has_sheets:  # else a sheet at the very start would be skipped
-                start = occupied.free_until(path.origin, path.direction, start, end)
+            free_to = occupied.free_until(path.origin, path.direction, start, end)
+            if not self.field.has_sheets:
+                start = free_to
         state = MarchState.at(backend, start, end, active, has_detail=has_detail, crosses=crosses)
+        if occupied is not None and self.field.has_sheets and not self.is_part:
+            # Sheets in empty cells are still compared with the level.
+            state = replace(state, proved_step=free_to - start)
         if occupied is not None and self.is_part:
             # Where rounding leaves it open in which cell a point is, nothing can be proved.
             lost = state.active & ~self.resolves(path.origin, end)
