@@ -24,7 +24,7 @@ from harnack.backend.elementary import fmax, fmin
 if TYPE_CHECKING:
     from typing import Self
 
-    from harnack.backend import Real
+    from harnack.backend import Mask, Real
     from harnack.enclosures.enclosure import Slopes
 
 # For a harmonic f on a ball of radius 1 with upper - lower = 1: the largest |f''| at the center, in
@@ -127,6 +127,15 @@ class Promise(abc.ABC):
     def each(self, change: Callable[[Any, int, int], Any]) -> Self:
         """The promise with other numbers; change: from a number and the powers of its unit."""
         numbers = {name: change(getattr(self, name), *powers) for name, *powers in self.units}
+        return dataclasses.replace(self, **numbers)
+
+    def where(self, mask: Mask, other: Self) -> Self:
+        """The other promise, of the same kind, where the mask holds, this one elsewhere."""
+        numbers: dict[str, Any] = {}
+        for name, *_ in self.units:
+            one, own = getattr(other, name), getattr(self, name)
+            is_same = isinstance(one, float) and isinstance(own, float) and one == own
+            numbers[name] = own if is_same else dr.select(mask, one, own)
         return dataclasses.replace(self, **numbers)
 
 

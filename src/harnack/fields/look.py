@@ -17,7 +17,7 @@ from harnack.enclosures import Enclosure, Lipschitz, Promise, Proofs, Slopes
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from harnack.backend import Real, Vec3
+    from harnack.backend import Mask, Real, Vec3
 
 
 @dataclass(frozen=True)
@@ -39,6 +39,7 @@ class Sample:
     weaker: promises that are as true as `known`, but proved shorter steps wherever that was
         measured. Only a bound that is asked for by name uses them.
     along: more promises, which hold only for points of the path of a `Field.look`.
+    is_modulo: where f is known but for a whole number (`Sheets.is_modulo`); None for nowhere.
     """
 
     value: Real
@@ -50,6 +51,7 @@ class Sample:
     truncation: Real = 0.0
     weaker: tuple[Promise, ...] = ()
     along: tuple[Lipschitz, ...] = ()
+    is_modulo: Mask | None = None
 
     @property
     def promises(self) -> tuple[Promise, ...]:
@@ -60,6 +62,19 @@ class Sample:
         """The sample with each promise changed, and with other attributes replaced."""
         known, weaker = (tuple(map(change, group)) for group in (self.known, self.weaker))
         return dataclasses.replace(self, known=known, weaker=weaker, **numbers)
+
+    def where(self, mask: Mask, other: Sample) -> Sample:
+        """The other sample, with promises of the same kinds, where the mask holds, this one
+        elsewhere. Without normals."""
+        names = "value", "gradient", "error", "gradient_error", "truncation"
+        numbers = {k: dr.select(mask, getattr(other, k), getattr(self, k)) for k in names}
+        groups = {
+            k: tuple(
+                a.where(mask, b) for a, b in zip(getattr(self, k), getattr(other, k), strict=True)
+            )
+            for k in ("known", "weaker", "along")
+        }
+        return dataclasses.replace(self, normal=None, **numbers, **groups)
 
 
 _R = TypeVar("_R", bound=Sample | Promise)

@@ -96,6 +96,13 @@ class Sheets:
     """Whether f jumps across sheets. Then `next_crossing` and `between` are needed, and the
     promises of `evaluate` are about f with the jumps taken out."""
 
+    @property
+    def is_modulo(self) -> bool:
+        """Whether samples of `between` at details below 1 may know f but for a whole number, where
+        they say so (`Sample.is_modulo`). All jumps are whole numbers then, and outside of the
+        `extent` of levels no ray meets one of them, modulo 1, on the way to where f is 0."""
+        return False
+
     def next_crossing(
         self, o: Vec3, d: Vec3, after: Crossing, t_max: Real, active: Mask
     ) -> Crossing:

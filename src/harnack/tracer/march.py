@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from harnack.enclosures import Gaps, TargetLevels
     from harnack.fields.field import Field
     from harnack.fields.look import Look, Path
+    from harnack.tracer.whole_numbers import WholeNumbers
     from harnack.tree.cells import UniformGrid
 
 # A coarse sample is repeated at higher detail where a level is closer in value than this many times
@@ -138,6 +139,7 @@ class _Seen:
         it lies.
     excess: as that of `MarchState`.
     is_smooth: whether value and slope predict f.
+    passes, is_doubtful: see `WholeNumbers.gaps`; None for fields that know their values.
     """
 
     t: Real
@@ -154,11 +156,18 @@ class _Seen:
     may_pass: Mask
     excess: Real
     is_smooth: bool
+    passes: Mask | None = None
+    is_doubtful: Mask | None = None
 
     @property
     def value(self) -> Real:
         """f at the points."""
         return self.look.sample.value
+
+    def rungs_or(self, behind: Gaps) -> Gaps:
+        """The gaps to rungs, which a sheet does not change; behind it where these are passed."""
+        down = dr.select(self.passes, behind.down, self.gaps.down)
+        return replace(self.gaps, down=down, up=dr.select(self.passes, behind.up, self.gaps.up))
 
 
 @dataclass(frozen=True)
@@ -173,6 +182,8 @@ class March:
         not even behind a sheet.
     last: where these rays end.
     is_part: whether there may be levels outside of these cells, which do not count.
+    whole_numbers: for fields whose coarse samples know f but for a whole number, how rays find it;
+        None for no such samples.
     """
 
     backend: Backend
@@ -185,6 +196,7 @@ class March:
     occupied: UniformGrid | None = None
     last: Real = 0.0
     is_part: bool = False
+    whole_numbers: WholeNumbers | None = None
 
     def advance(
         self,
@@ -270,7 +282,7 @@ class March:
             sheet = compare_with_sheet(
                 ahead, accepted & seen.at_end, seen.value, seen.total_error, self.levels
             )
-            gaps_ahead = sheet.gaps
+            gaps_ahead = sheet.gaps if seen.passes is None else seen.rungs_or(sheet.gaps)
         aims, contact, value = gaps_ahead, now.contact, seen.value
         if self.hysteresis is not None and now.contact is not None:
             contact, hit, sheet, value = self._cross(
@@ -278,6 +290,8 @@ class March:
             )
             after = contact, value, self.levels.gaps(value), seen.band
             gaps_ahead, aims = self.hysteresis.gaps(*after), self.hysteresis.gaps(*after, AIM)
+        elif sheet is not None and ahead is not None:
+            value = value + dr.select(sheet.at_crossing & ~sheet.is_hit, ahead.jump, 0)
 
         # How far to go from there.
         proved = self._proved(seen, gaps_ahead)
@@ -320,13 +334,24 @@ class March:
         t = now.proved_to + now.trial_step
         if ahead is not None or now.contact is not None:  # the end exactly
             t = dr.select(now.trial_step >= end - now.proved_to, end, t)
-        seen = field.at_detail(now.detail) if _has_detail(field, now) else field
+        seen, whole, is_modulo = field, self.whole_numbers, None
+        if now.detail is not None and field.has_detail:
+            knows = field.is_modulo and whole is None
+            seen = field.at_detail(fmax(now.detail, 1) if knows else now.detail)
         unproved, size = now.trial_step - now.proved_step, largest_coordinate(path.origin) + t
         look = seen.look(path, t, fmin(now.look_ahead, end - t), fmax(unproved, real(0)))
+        passes, is_doubtful = None, None
+        if whole is not None and look.sample.is_modulo is not None:
+            is_modulo = look.sample.is_modulo
+            look = whole.continued(look, now.value, now.trial_step)
         sample, gradient_norm = look.sample, length(look.sample.gradient)
         gaps = self.levels.gaps(sample.value)
+        gap = gaps.smaller
+        if whole is not None and is_modulo is not None:
+            gaps, passes, is_doubtful = whole.gaps(sample, is_modulo)
         if self.cover is not None:
             gaps = gaps.less(self.cover * t * gradient_norm)
+            gap = gaps.smaller
         total_error = value_error(sample, gradient_norm, size)
         steepness = fmax(gradient_norm - sample.gradient_error, real(0))
         if look.slope_error is not None:  # the gradient is at least as long as its projection
@@ -339,9 +364,7 @@ class March:
             within = self.hysteresis.within(within)
         # Where not even the gradient is known, no hit is due to rounding.
         rounding = dr.select(knows_gradient, total_error - sample.truncation, 0)
-        is_near = self._is_near(
-            gaps.smaller, within, total_error, rounding, look, gradient_norm, size, end
-        )
+        is_near = self._is_near(gap, within, total_error, rounding, look, gradient_norm, size, end)
         return _Seen(
             t=t,
             at_end=t == end,
@@ -355,8 +378,10 @@ class March:
             band=within,
             is_near=is_near,
             may_pass=is_near,
-            excess=fmax(gaps.smaller + total_error - within, real(0)),
+            excess=fmax(gap + total_error - within, real(0)),
             is_smooth=ahead is None and not field.has_detail,
+            passes=passes,
+            is_doubtful=is_doubtful,
         )
 
     def _in_contact(self, seen: _Seen, hysteresis: Hysteresis, contact: Contact) -> _Seen:
@@ -387,6 +412,9 @@ class March:
         at = fmax(now.detail, coarsest)
         finer, too_coarse = _finer(at, deciding, seen.total_error, truncation, seen.within)
         coarser = _coarser(at, seen.gaps.smaller, truncation, coarsest)
+        if seen.passes is not None and seen.is_doubtful is not None:
+            too_coarse |= seen.is_doubtful & accepted  # others go back in any case
+            coarser = dr.select(seen.passes, at, coarser)
         accepted &= ~too_coarse & is_known
         detail = dr.select(too_coarse, finer, dr.select(accepted, coarser, now.detail))
         return accepted, detail, too_coarse
@@ -569,10 +597,6 @@ class March:
             behind = self.levels.gaps(value + ahead.jump).smaller
             gap = dr.select(at_end & (ahead.sheet != NO_SHEET), fmin(gap, behind), gap)
         return gap
-
-
-def _has_detail(field: Field, now: MarchState) -> bool:
-    return field.has_detail and now.detail is not None
 
 
 def _finer(

@@ -20,6 +20,7 @@ from harnack.fields.sheets import NO_PART, NO_SHEET
 from harnack.tracer.contact import Contact, Hysteresis, PreparedTolerance, Status, settled
 from harnack.tracer.march import March, MarchState
 from harnack.tracer.walks import PartTracer, SheetTracer
+from harnack.tracer.whole_numbers import WholeNumbers
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
@@ -174,6 +175,8 @@ class PreparedLevelSet:
         open; None for none.
     queued: whether rays are traced at once, by few lanes that share a queue. Then its methods
         cannot be called while a kernel is being recorded.
+    around: for a field whose coarse samples know f but for a whole number, the volume outside of
+        which that number is the one of f = 0; None for no such samples.
     """
 
     backend: Backend
@@ -190,6 +193,7 @@ class PreparedLevelSet:
     is_part: bool = False
     section: Volume | None = None
     queued: bool = False
+    around: Volume | None = None
 
     def sample(self, p: Vec3) -> Sample:
         """The field at p."""
@@ -271,7 +275,7 @@ class PreparedLevelSet:
         hysteresis = None
         if crosses:
             start, end, hysteresis = self._around(path, real(t_min), real(t_max), start, end)
-        occupied = None if crosses else self.occupied
+        occupied, free_to = None if crosses else self.occupied, start
         if occupied is not None:
             holds = backend.Bool(active) & (start < end)
             start, end = dr.select(holds, start, 0), dr.select(holds, end, 0)
@@ -288,6 +292,12 @@ class PreparedLevelSet:
             out = backend.UInt32(int(Status.OUT_OF_STEPS))
             status = dr.select(lost, out, state.status)
             state = replace(state, active=state.active & ~lost, status=status)
+        whole_numbers = None
+        if self.around is not None and not crosses:
+            whole_numbers = WholeNumbers(self.levels)
+            entry, _ = self.around.clip(path.origin, path.direction, t_min, t_max)
+            outside = (entry > t_min) & (start <= entry)
+            state = replace(state, detail=dr.select(outside, real(0), real(1)))
         march = March(
             backend,
             self.levels,
@@ -298,6 +308,7 @@ class PreparedLevelSet:
             occupied=occupied,
             last=end,
             is_part=self.is_part,
+            whole_numbers=whole_numbers,
         )
         return march, path, real(start), real(end), state
 

@@ -31,6 +31,10 @@ if TYPE_CHECKING:
 
 _T = TypeVar("_T")
 
+# Levels nearer than this to a whole number are traced by samples that know f itself: far away a
+# winding number comes as near to such a level as one likes.
+_WHOLE = 1e-3
+
 _FIRST_HITS = (
     "largest=... works for first hits alone: it cannot be combined with all_hits, confirm or "
     'antialias="cones"'
@@ -195,9 +199,12 @@ class LevelSet:
         occupied = self._occupied() if self.largest or (many and not crosses) else None
         if crosses or self.confirm:
             region = _common([self.field.domain, self.clip, self.section])
+        field, around = self.field_on(backend), None
+        if field.is_modulo and all(abs(math.remainder(one, 1)) > _WHOLE for one in self.numbers):
+            around = None if self.extent is None else self.extent.prepare(backend)
         return PreparedLevelSet(
             backend,
-            self.field_on(backend),
+            field,
             self.levels_on(backend),
             None if volume is None else volume.prepare(backend),
             self.bound,
@@ -209,6 +216,7 @@ class LevelSet:
             None if occupied is None else occupied.upload(backend),
             is_part=self.largest > 0,
             section=None if self.section is None else self.section.prepare(backend),
+            around=around,
         )
 
 

@@ -52,12 +52,13 @@ _MOST_RECORDS = 2**24
 
 def build_curve_cells(
     backend: Backend, loops: tuple[FloatArray, ...], low: FloatArray, high: FloatArray,
-    most_bytes: int,
+    most_bytes: int, near: float = 1.0,
 ) -> CurveCells | None:  # fmt: skip
     """Cells of a cube around the box from low (3,) to high (3,), of at most so many bytes; None
     where they would take more even if they were larger and had more near edges.
 
     loops: (n, 3) each, of a size of about one.
+    near: cells may have so many times as many near edges as usual, and leave out as much more.
 
     Proof. The cell of the cube begins with all loops as near runs and nothing else. Each cell keeps
     those edges of the runs of the cell around it that are near, closed again; the cycle of what is
@@ -70,6 +71,7 @@ def build_curve_cells(
     half = (math.ceil(half / _STEP) + 1) * _STEP
     edges = LoopEdges.upload(backend, loops)
     most_near, fine = max(_FEWEST, _MOST_NEAR * sum(map(len, loops)) ** (1 / 3)), _FINE
+    most_near, fine = near * most_near, near * fine
     for _ in range(_ATTEMPTS):
         octree = _Octree(backend, VertexTable.of(loops), edges, middle, half, most_near, fine)
         if octree.grow(most_bytes):

@@ -408,32 +408,36 @@ class ExactWinding:
         return self.rays.turns_ahead(frame, t, active)
 
     def on_stretch(
-        self, frame: Frame, x: Vec3, behind: Crossing, turns: Real, detail: Real
-    ) -> Sample:
-        """w continued along a ray interval, with the promises of `FieldSums.sample`."""
+        self, frame: Frame, x: Vec3, behind: Crossing, turns: Real, detail: Real,
+        active: Mask = True,
+    ) -> Sample:  # fmt: skip
+        """w continued along a ray interval, where active, with the promises of
+        `FieldSums.sample`."""
         del behind
         if self.edges is None:
             nothing = self.backend.Array3f(0)
             return Sample(self.backend.Float(turns), nothing, (Lipschitz(0.0),), 0.0)
         if self.chains is None:
             raise RuntimeError("uploaded for points and not for rays")
-        found = self._near(self.chains, frame, x, detail)
+        found = self._near(self.chains, frame, x, detail, active)
         found = found.plus(Terms(4 * math.pi * turns), True)
         unit = fmax(epsilon_at(frame.o), epsilon_at(x))
         line, chains = Line(x, frame.d, 8 * unit), self.chains
 
-        def rates(lengths: tuple[Real, ...], active: Mask) -> tuple[Real, ...]:
-            return chains.rates(frame, line, lengths, active)
+        def rates(lengths: tuple[Real, ...], wanted: Mask) -> tuple[Real, ...]:
+            return chains.rates(frame, line, lengths, wanted & active)
 
         known = known_along(line, found.gradient, found.free_distance, rates)
         return found.sample(_SHARE, unit, self.rounding, along=known)
 
-    def _near(self, chains: EdgeChains, frame: Frame, x: Vec3, detail: Real) -> FieldSums:
+    def _near(
+        self, chains: EdgeChains, frame: Frame, x: Vec3, detail: Real, active: Mask
+    ) -> FieldSums:
         """The sum over boundary edges: below detail 1 by chains, else over all edges if they are
         few, as at detail 1 the tree of chains is visited down to its leaves nearly everywhere."""
         if self.all_edges is None:
-            return chains.near(frame, x, detail)
+            return chains.near(frame, x, detail, active)
         is_close = self.backend.Float(detail) >= 1
-        close = self.all_edges.near(frame, x, is_close)
-        coarse = chains.near(frame, x, detail, ~is_close)
+        close = self.all_edges.near(frame, x, is_close & active)
+        coarse = chains.near(frame, x, detail, ~is_close & active)
         return coarse.where(is_close, close)

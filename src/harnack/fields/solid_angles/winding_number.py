@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import FloatArray, IntArray, backend_of
+from harnack.backend.elementary import fmax
 from harnack.cluster.packing import Remembered
 from harnack.fields.batch import BatchedField, Values
 from harnack.fields.clearance import (
@@ -32,6 +33,8 @@ from harnack.fields.clearance import (
 )
 from harnack.fields.field import Field, Sample, lengthened
 from harnack.fields.sheets import NO_SHEET, Crossing, NearestSheet
+from harnack.fields.solid_angles.boundary_cells import BoundaryCells
+from harnack.fields.solid_angles.cell_choice import HasCells
 from harnack.fields.solid_angles.winding_exact import ExactWinding
 from harnack.fields.solid_angles.winding_mesh import WindingMesh
 from harnack.fields.solid_angles.winding_tree import TreeWinding
@@ -147,13 +150,15 @@ MethodName = Literal["auto", "exact", "tree"]
 _MOST_EDGES = 2048
 # With fewer edges samples cost so little that no cells are made for them.
 _FEW_EDGES = 64
+# Cells are built from so many rays an edge on, and for no fewer rays.
+_PAYS, _LEAST_RAYS = 100.0, 1e5
 # The accuracy of values at points, and of traces, by experiment.
 _VALUES, _TRACED = 2.0, 4.0
 # A point within so many roundings of a coordinate of a triangle may be on either side of it.
 _ON_TRIANGLE = 8.0
 
 
-class WindingNumber(UploadedField["_MeshBuffers"], BatchedField):
+class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
     """w of a triangle mesh: how often it winds around a point (Jacobson et al. 2013).
 
     For a closed mesh 1 inside and 0 outside; for a mesh with holes, cracks, duplicated or flipped
@@ -170,6 +175,11 @@ class WindingNumber(UploadedField["_MeshBuffers"], BatchedField):
         radius; more is slower and sharper. At least 1.5; by default 2 for values at points and 4
         for tracing, which uses more detail where the tolerance asks for it.
     order: of the multipoles of the tree: 0 (dipoles), 1 or 2 (octupoles).
+    cells: for many rays: cells in which w, but for a whole number, is the solid angle of a few
+        near edges and one polynomial for all others, with a proved remainder (`boundary_cells`), so
+        that a sample costs the same however many edges there are. None builds them where they pay
+        (`for_rays`), True always, False never; at most the megabytes that are given (True: 256).
+        Values and derivatives at points are those of `method`.
 
     Hits on triangles have `Hits.sheet`; `faces_of_sheets` gives the face of each. `moved` gives the
     field for the same faces when vertices have moved.
@@ -189,6 +199,7 @@ class WindingNumber(UploadedField["_MeshBuffers"], BatchedField):
         method: MethodName = "auto",
         accuracy: float | None = None,
         order: int = 2,
+        cells: bool | float | None = None,
     ) -> None:
         super().__init__()
         if method not in ("auto", "exact", "tree"):
@@ -204,6 +215,7 @@ class WindingNumber(UploadedField["_MeshBuffers"], BatchedField):
             ("exact" if few else "tree") if method == "auto" else method
         )
         self.accuracy, self.order = accuracy, order
+        self.set_cells(cells)
         self._extents: Remembered[tuple[float, ...], Volume | None] = Remembered()
         self._occupied: Remembered[tuple[float, ...], OccupiedCells] = Remembered()
 
@@ -221,6 +233,7 @@ class WindingNumber(UploadedField["_MeshBuffers"], BatchedField):
         field.mesh = self.mesh.moved(vertices)
         field._batches, field._device = Remembered(), None
         field._extents, field._occupied = Remembered(), Remembered()
+        field.set_cells(self.cells)
         return field
 
     @property
@@ -251,7 +264,27 @@ class WindingNumber(UploadedField["_MeshBuffers"], BatchedField):
             winding = ExactWinding.of(backend, mesh, rays, traced)
         else:
             winding = TreeWinding.of(backend, mesh, accuracy, self.order)
-        return _MeshBuffers(*placed(backend, mesh.center, mesh.size), winding, rays)
+        cells = None
+        if traced and self.cells and len(mesh.singular):
+            extent = self.extent((self.default_level,))
+            assert extent is not None
+            cells = BoundaryCells.build(backend, mesh, *extent.bounds(), self.most_bytes())
+        return _MeshBuffers(*placed(backend, mesh.center, mesh.size), winding, rays, cells)
+
+    def _without_cells(self) -> WindingNumber:
+        """The same field without cells."""
+        other = copy.copy(self)
+        other.set_cells(False)
+        other._device = None
+        return other
+
+    @property
+    def is_modulo(self) -> bool:
+        return self._device is not None and self._device.cells is not None
+
+    def least_rays(self) -> float:
+        edges = len(self.mesh.singular)
+        return max(_LEAST_RAYS, _PAYS * edges) if edges >= _FEW_EDGES else math.inf
 
     def occupied(self, levels: tuple[float, ...]) -> OccupiedCells | None:
         """Cells by `winding_cells`, for the exact method if edges are not few."""
@@ -261,7 +294,7 @@ class WindingNumber(UploadedField["_MeshBuffers"], BatchedField):
         if extent is None:
             return None
         if levels not in self._occupied:
-            self._occupied[levels] = winding_cells(self, extent, levels)
+            self._occupied[levels] = winding_cells(self._without_cells(), extent, levels)
         return self._occupied[levels]
 
     def evaluate(self, p: Vec3) -> Sample:
@@ -327,7 +360,7 @@ class WindingNumber(UploadedField["_MeshBuffers"], BatchedField):
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
         """All triangles, and cells around them that are not proved empty (`winding_extent`)."""
         if levels not in self._extents:
-            self._extents[levels] = winding_extent(self, self.mesh, levels)
+            self._extents[levels] = winding_extent(self._without_cells(), self.mesh, levels)
         return self._extents[levels]
 
     def describe(self) -> dict[str, Any]:
@@ -336,6 +369,7 @@ class WindingNumber(UploadedField["_MeshBuffers"], BatchedField):
             "triangles": len(mesh.triangles),
             "singular edges": len(mesh.singular),
             "method": self.method,
+            **self.said_of_cells(None if self._device is None else self._device.cells),
         }
 
 
@@ -345,6 +379,7 @@ class _MeshBuffers(UnitCoordinates):
 
     winding: ExactWinding | TreeWinding
     rays: TriangleRays
+    cells: BoundaryCells | None = None
 
 
 def _at_start(on: _MeshBuffers, frame: Frame, turns: Real, detail: float) -> Sample:
@@ -360,17 +395,26 @@ class _Stretch(Field):
     def __init__(
         self, on: _MeshBuffers, frame: Frame, behind: Crossing, offset: Real, detail: Real = 1.0
     ) -> None:
-        self.has_detail = on.winding.has_detail
+        self.has_detail = on.winding.has_detail or on.cells is not None
         self.coarsest_detail = on.winding.coarsest_detail
         self._on, self._frame, self._detail = on, frame, on.backend.Float(detail)
         self._behind, self._offset = behind, offset
+
+    @property
+    def is_modulo(self) -> bool:
+        return self._on.cells is not None
 
     def at_detail(self, detail: Real) -> Field:
         return _Stretch(self._on, self._frame, self._behind, self._offset, detail)
 
     def evaluate(self, p: Vec3) -> Sample:
-        on = self._on
-        sample = on.winding.on_stretch(
-            self._frame, on.unit(p), self._behind, self._offset, self._detail
-        )
+        on, frame = self._on, self._frame
+        x, detail = on.unit(p), self._detail
+        if on.cells is None:
+            sample = on.winding.on_stretch(frame, x, self._behind, self._offset, detail)
+            return lengthened(sample, on.size)
+        unit = fmax(epsilon_at(frame.o), epsilon_at(x))
+        in_cells, inside = on.cells.sample(x, frame.d, unit, detail < 1)
+        sample = on.winding.on_stretch(frame, x, self._behind, self._offset, detail, ~inside)
+        sample = dataclasses.replace(sample.where(inside, in_cells), is_modulo=inside)
         return lengthened(sample, on.size)

@@ -133,7 +133,7 @@ class TreeWinding:
 
     def _sums(
         self, frame: Frame | Upwards, x: Vec3, detail: Real, unit: Real, is_ahead: IsAhead,
-        derivatives: int,
+        derivatives: int, where: Mask = True,
     ) -> FieldSums:  # fmt: skip
         """4 pi w: far clusters, the crossings of near triangles that are ahead of x on rays of the
         frame, and the open edges of near triangles (`NearEdge.is_open`).
@@ -155,7 +155,7 @@ class TreeWinding:
             return lifted.sums, lifted.product.parts()
 
         one = LiftedProduct.one(self.backend.Float).parts()
-        sums, product = self.clusters.sums(x, detail, add, one, derivatives=derivatives)
+        sums, product = self.clusters.sums(x, detail, add, one, where, derivatives=derivatives)
         return LiftedSums(sums, LiftedProduct(*product)).whole()
 
     def start(self, frame: Frame, t: Real, active: Mask) -> Real:
@@ -164,9 +164,10 @@ class TreeWinding:
         return self.backend.Float(0)
 
     def on_stretch(
-        self, frame: Frame, x: Vec3, behind: Crossing, turns: Real, detail: Real
-    ) -> Sample:
-        """w on a ray interval, with promises.
+        self, frame: Frame, x: Vec3, behind: Crossing, turns: Real, detail: Real,
+        active: Mask = True,
+    ) -> Sample:  # fmt: skip
+        """w on a ray interval, where active, with promises.
 
         Near triangles add their crossings ahead of x along the ray, and their open edges
         (`NearEdge.is_open`). Crossings that the tracer has passed up to the start of the interval
@@ -184,16 +185,18 @@ class TreeWinding:
             number = index(fmax(row[INDEX], self.backend.Float(0)))
             return ~((t < behind.t) | ((t == behind.t) & (number <= behind.sheet)))
 
-        found = self._sums(frame, x, detail, unit, is_ahead, 1)
+        found = self._sums(frame, x, detail, unit, is_ahead, 1, active)
         line = Line(x, frame.d, 8 * unit)
-        known = known_along(line, found.gradient, found.free_distance, self._rates(line))
+        known = known_along(line, found.gradient, found.free_distance, self._rates(line, active))
         return found.sample(_SHARE, unit, self.rounding, along=known)
 
-    def _rates(self, line: Line) -> Rates:
+    def _rates(self, line: Line, where: Mask) -> Rates:
         """The rates of `edge_trails.rates_along` for 4 pi w on a line."""
         reach = self.clusters.rough
 
         def rates(lengths: tuple[Real, ...], active: Mask) -> tuple[Real, ...]:
+            active = active & where
+
             def add(
                 row: list[Real], active: Mask, sums: FieldSums, own: tuple[Any, ...]
             ) -> tuple[FieldSums, tuple[Any, ...]]:

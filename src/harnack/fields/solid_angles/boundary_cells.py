@@ -1,0 +1,103 @@
+"""Winding numbers modulo 1, by cells of the boundary.
+
+Modulo 1 the winding number of a mesh is the solid angle of its singular edges over 4 pi, which are
+closed curves. In cells (`curve_cells`) that costs about the same however many of them there are,
+and no ray has to be followed. What is left open is a whole number: between two sheets w does not
+pass a level, modulo 1, unless a ray meets it, so the march knows that number from one sample to the
+next (`tracer.whole_numbers`).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import drjit as dr
+import numpy as np
+
+from harnack.fields.look import Sample
+from harnack.fields.solid_angles.curve_cells import CurveCells
+from harnack.fields.solid_angles.curve_octree import build_curve_cells
+from harnack.fields.solid_angles.edge_angles import bends, swept_ball
+from harnack.fields.solid_angles.edge_trails import Line, closed_trails, known_along
+from harnack.fields.solid_angles.edges import near_rounding
+from harnack.fields.sums import SLOPE_ROUNDINGS, SUM_ROUNDING
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, FloatArray, Mask, Real, Vec3
+    from harnack.fields.solid_angles.winding_mesh import WindingMesh
+
+__all__ = ["BoundaryCells"]
+
+_SHARE = 1 / (4 * math.pi)
+# The boundary of a broken mesh is many small loops, for which cells with more near edges are built
+# in less time: this many times as many as in those of one curve.
+_NEAR = 4.0
+# Roundings of a coordinate: of a point, and within which of an edge nothing is known.
+_PLACE, _MET = 8.0, 16.0
+
+
+@dataclass(frozen=True)
+class BoundaryCells:
+    """Cells of the singular edges of a mesh on a backend, in its unit coordinates."""
+
+    cells: CurveCells
+
+    @classmethod
+    def build(
+        cls, backend: Backend, mesh: WindingMesh, low: FloatArray, high: FloatArray, most_bytes: int
+    ) -> BoundaryCells | None:
+        """Cells of a cube around the mesh and the box from low (3,) to high (3,), of at most so
+        many bytes; None where that is too little."""
+        trails = closed_trails(mesh.singular)
+        loops = tuple(mesh.unit_vertices[trail[:-1]] for trail in trails)
+        ends = (np.array(end) for end in (low, high))
+        points = np.concatenate(
+            [*loops, *(((end - mesh.center) / mesh.size)[None] for end in ends)]
+        )
+        cells = build_curve_cells(
+            backend, loops, points.min(axis=0), points.max(axis=0), most_bytes, near=_NEAR
+        )
+        return None if cells is None else cls(cells)
+
+    @property
+    def count(self) -> int:
+        """The number of cells."""
+        return self.cells.count
+
+    @property
+    def size(self) -> int:
+        """Their bytes."""
+        return self.cells.size
+
+    def sample(self, x: Vec3, direction: Vec3, unit: Real, active: Mask) -> tuple[Sample, Mask]:
+        """w at x but for a whole number, with promises of its lift, those along a unit direction
+        among them; and the points for which they hold: those that are active, in a cell and not at
+        an edge. See `SolidAngle` for the promises.
+
+        unit: the rounding of a coordinate.
+        """
+        backend = self.cells.backend
+        found, inside = self.cells.sums(x, active)
+        sums, rounding = found.sums, _PLACE * unit
+        known = bends(sums.cubes, sums.fourths, sums.distance * (1 - SUM_ROUNDING) - rounding)
+        ball = swept_ball(sums.angle, sums.gradient, sums.squares, known, found.slope_error)
+        rounded = found.rounding + near_rounding(backend.epsilon, x, sums.squares)
+        line = Line(x, direction, rounding)
+
+        def rates(lengths: tuple[Real, ...], wanted: Mask) -> tuple[Real, ...]:
+            return self.cells.rates_along(found, line, lengths, wanted & inside)
+
+        along = known_along(line, sums.gradient, sums.distance, rates)
+        sample = Sample(
+            _SHARE * sums.angle,
+            _SHARE * sums.gradient,
+            tuple(one.scaled(_SHARE) for one in known),
+            _SHARE * (found.error + rounded),
+            _SHARE * dr.fma(SLOPE_ROUNDINGS / 3 * unit, sums.cubes, found.slope_error),
+            truncation=_SHARE * found.error,
+            weaker=(ball.scaled(_SHARE),),
+            along=tuple(one.scaled(_SHARE) for one in along),
+        )
+        return sample, inside & (sums.distance > _MET * unit)
