@@ -63,6 +63,10 @@ class Sample:
         known, weaker = (tuple(map(change, group)) for group in (self.known, self.weaker))
         return dataclasses.replace(self, known=known, weaker=weaker, **numbers)
 
+    def shifted(self, offset: Real) -> Sample:
+        """The sample of f + offset, a number that adds no error."""
+        return self.with_promises(lambda one: one.shifted(offset), value=self.value + offset)
+
     def where(self, mask: Mask, other: Sample) -> Sample:
         """The other sample, with promises of the same kinds, where the mask holds, this one
         elsewhere. Without normals."""

@@ -131,8 +131,10 @@ def _described(prepared: PreparedLevelSet, ended: _Ended) -> SurfaceHit:
         step, side = dr.zeros(type(step)), trace.side
     t = dr.maximum(dr.select(met, trace.t, 0) + step, 0)
     p = dr.fma(vector(t), d, o)
-    sheets = prepared.field.has_sheets
-    sample = _sample_where(prepared, p, d, smooth) if sheets else prepared.sample(p)
+    if prepared.field.has_sheets:
+        sample = _sample_where(prepared, p, trace.value, d, smooth)
+    else:
+        sample = prepared.sample(p)
     length = norm(sample.gradient)
     normal = dr.select(length > 0, sample.gradient / length, -d)
     shading = normal if sample.normal is None else sample.normal
@@ -159,10 +161,12 @@ def _described(prepared: PreparedLevelSet, ended: _Ended) -> SurfaceHit:
     return dr.select(trace.on_sheet, _on_sheet(prepared, o, d, trace, hit), hit)
 
 
-def _sample_where(prepared: PreparedLevelSet, p: Vec3, d: Vec3, active: Mask) -> Sample:
+def _sample_where(
+    prepared: PreparedLevelSet, p: Vec3, value: Real, d: Vec3, active: Mask
+) -> Sample:
     """Value, error, gradient and normal at p where active, zeros elsewhere, and no promises.
 
-    d: of the ray; a point with a zero gradient has the normal -d.
+    value: f near p. d: of the ray; a point with a zero gradient has the normal -d.
 
     A loop of at most one iteration, skipped where no lane is active: a sample of a broken mesh
     costs more than a ray that hits a triangle or nothing, and most rays do.
@@ -170,7 +174,7 @@ def _sample_where(prepared: PreparedLevelSet, p: Vec3, d: Vec3, active: Mask) ->
     real, vector = prepared.backend.Float, prepared.backend.Array3f
 
     def once(trip: Any, *_: Any) -> tuple[Any, ...]:
-        sample = prepared.sample(p)
+        sample = prepared.sample_near(p, value)
         length = norm(sample.gradient)
         normal = dr.select(length > 0, sample.gradient / length, -d)
         shading = vector(normal if sample.normal is None else sample.normal)

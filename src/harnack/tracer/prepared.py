@@ -199,6 +199,13 @@ class PreparedLevelSet:
         """The field at p."""
         return self.field.evaluate(p)
 
+    def sample_near(self, p: Vec3, value: Real) -> Sample:
+        """The field at p, where f is known to differ from a value by less than a half."""
+        if self.around is None:
+            return self.sample(p)
+        sample = self.field.evaluate_modulo_one(p)
+        return sample.shifted(dr.round(value - sample.value))
+
     def of_hit(self, hit: MarchResult) -> PreparedLevelSet:
         """The level set that was hit: for a field with parts that of the part, else this one."""
         if hit.part is None:

@@ -56,8 +56,7 @@ class WholeNumbers:
         is_near = any_covers(look.back, Gaps(change, change), step) & (sample.error < _CHANGE)
         value = dr.select(is_near, nearest, between)
         shift = dr.select(sample.is_modulo, value - sample.value, 0)
-        sample = sample.with_promises(lambda one: one.shifted(shift), value=sample.value + shift)
-        return replace(look, sample=sample)
+        return replace(look, sample=sample.shifted(shift))
 
     def gaps(self, sample: Sample, is_modulo: Mask) -> tuple[Gaps, Mask, Mask]:
         """The gaps from f to the rungs on both sides, or where one that is no level is near, to the

@@ -26,14 +26,16 @@ from harnack.fields.sums import SLOPE_ROUNDINGS, SUM_ROUNDING
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, Mask, Real, Vec3
+    from harnack.enclosures import Lipschitz
     from harnack.fields.solid_angles.winding_mesh import WindingMesh
 
 __all__ = ["BoundaryCells"]
 
 _SHARE = 1 / (4 * math.pi)
-# The boundary of a broken mesh is many small loops, for which cells with more near edges are built
-# in less time: this many times as many as in those of one curve.
-_NEAR = 4.0
+# The boundary of a broken mesh is many small loops, and its cells must be built soon: they have so
+# many times as many near edges as those of one curve, and split ones share what is beyond so many
+# radii.
+_NEAR, _SHARED = 4.0, 3.5
 # Roundings of a coordinate: of a point, and within which of an edge nothing is known.
 _PLACE, _MET = 8.0, 16.0
 
@@ -57,7 +59,13 @@ class BoundaryCells:
             [*loops, *(((end - mesh.center) / mesh.size)[None] for end in ends)]
         )
         cells = build_curve_cells(
-            backend, loops, points.min(axis=0), points.max(axis=0), most_bytes, near=_NEAR
+            backend,
+            loops,
+            points.min(axis=0),
+            points.max(axis=0),
+            most_bytes,
+            near=_NEAR,
+            shared=_SHARED,
         )
         return None if cells is None else cls(cells)
 
@@ -84,12 +92,14 @@ class BoundaryCells:
         known = bends(sums.cubes, sums.fourths, sums.distance * (1 - SUM_ROUNDING) - rounding)
         ball = swept_ball(sums.angle, sums.gradient, sums.squares, known, found.slope_error)
         rounded = found.rounding + near_rounding(backend.epsilon, x, sums.squares)
-        line = Line(x, direction, rounding)
+        along: tuple[Lipschitz, ...] = ()
+        if direction is not None:
+            line = Line(x, direction, rounding)
 
-        def rates(lengths: tuple[Real, ...], wanted: Mask) -> tuple[Real, ...]:
-            return self.cells.rates_along(found, line, lengths, wanted & inside)
+            def rates(lengths: tuple[Real, ...], wanted: Mask) -> tuple[Real, ...]:
+                return self.cells.rates_along(found, line, lengths, wanted & inside)
 
-        along = known_along(line, sums.gradient, sums.distance, rates)
+            along = known_along(line, sums.gradient, sums.distance, rates)
         sample = Sample(
             _SHARE * sums.angle,
             _SHARE * sums.gradient,

@@ -52,13 +52,14 @@ _MOST_RECORDS = 2**24
 
 def build_curve_cells(
     backend: Backend, loops: tuple[FloatArray, ...], low: FloatArray, high: FloatArray,
-    most_bytes: int, near: float = 1.0,
+    most_bytes: int, near: float = 1.0, shared: float = _SHARED,
 ) -> CurveCells | None:  # fmt: skip
     """Cells of a cube around the box from low (3,) to high (3,), of at most so many bytes; None
     where they would take more even if they were larger and had more near edges.
 
     loops: (n, 3) each, of a size of about one.
     near: cells may have so many times as many near edges as usual, and leave out as much more.
+    shared: of split cells, edges beyond so many radii of the ball count for all cells in them.
 
     Proof. The cell of the cube begins with all loops as near runs and nothing else. Each cell keeps
     those edges of the runs of the cell around it that are near, closed again; the cycle of what is
@@ -73,7 +74,9 @@ def build_curve_cells(
     most_near, fine = max(_FEWEST, _MOST_NEAR * sum(map(len, loops)) ** (1 / 3)), _FINE
     most_near, fine = near * most_near, near * fine
     for _ in range(_ATTEMPTS):
-        octree = _Octree(backend, VertexTable.of(loops), edges, middle, half, most_near, fine)
+        octree = _Octree(
+            backend, VertexTable.of(loops), edges, middle, half, most_near, fine, shared
+        )
         if octree.grow(most_bytes):
             return octree.cells()
         most_near, fine = 2 * most_near, 4 * fine
@@ -82,7 +85,7 @@ def build_curve_cells(
 
 @dataclass
 class _Octree:
-    """Cells while they are made. most_near, fine: see `_MOST_NEAR`.
+    """Cells while they are made. most_near, fine, shared: see `_MOST_NEAR` and `_SHARED`.
 
     nodes: of each level, for `CellLookup.of`. tables, near: records of `CurveCells`.
     leaves, packets: the number of cells that are not split, and of records of near edges.
@@ -95,6 +98,7 @@ class _Octree:
     half: float
     most_near: float
     fine: float
+    shared: float
     nodes: list[IntArray] = field(default_factory=list[IntArray])
     tables: list[FloatArray] = field(default_factory=list[FloatArray])
     near: list[FloatArray] = field(default_factory=list[FloatArray])
@@ -133,7 +137,7 @@ class _Octree:
         count = np.bincount(cell, distance <= _NEAR * radius, n)
         around = _Around.of(self.edges, centers, radius)
         is_leaf = (count <= self.most_near) & (around.tail <= self.fine * around.total) | is_last
-        inner = np.where(is_leaf, _NEAR, _SHARED) * radius
+        inner = np.where(is_leaf, _NEAR, self.shared) * radius
         chosen, kept = runs.narrowed(run, distance <= inner[cell])
         chosen = chosen.closed(self.vertices, centers, inner, np.dtype(self.backend.dtype))
         left = left_over(runs, (run, place), kept, chosen, len(self.vertices.points))

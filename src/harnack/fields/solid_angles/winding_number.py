@@ -294,7 +294,7 @@ class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
         if extent is None:
             return None
         if levels not in self._occupied:
-            self._occupied[levels] = winding_cells(self._without_cells(), extent, levels)
+            self._occupied[levels] = winding_cells(self, extent, levels)
         return self._occupied[levels]
 
     def evaluate(self, p: Vec3) -> Sample:
@@ -305,7 +305,11 @@ class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
     def evaluate_modulo_one(self, p: Vec3) -> Sample:
         """w less a whole number, which differs from point to point; the coarsest sample."""
         on, frame = self._upward(p)
-        return _at_start(on, frame, on.backend.Float(0), 0.0)
+        if on.cells is None:
+            return _at_start(on, frame, on.backend.Float(0), 0.0)
+        in_cells, inside = on.cells.sample(frame.o, None, epsilon_at(frame.o), True)
+        other = _at_start(on, frame, on.backend.Float(0), 0.0, ~inside)
+        return other.where(inside, lengthened(in_cells, on.size))
 
     def _upward(self, p: Vec3) -> tuple[_MeshBuffers, Frame]:
         """The data, and rays from p, on which all triangles lie ahead."""
@@ -382,10 +386,14 @@ class _MeshBuffers(UnitCoordinates):
     cells: BoundaryCells | None = None
 
 
-def _at_start(on: _MeshBuffers, frame: Frame, turns: Real, detail: float) -> Sample:
-    """The sample where rays begin; turns: the sum of the signs of all crossings ahead."""
+def _at_start(
+    on: _MeshBuffers, frame: Frame, turns: Real, detail: float, active: Mask = True
+) -> Sample:
+    """The sample where rays begin, where active; turns: the sum of the signs of all crossings
+    ahead."""
     nowhere = Crossing(0.0, on.backend.UInt32(NO_SHEET), 0.0, on.backend.Array3f(0, 0, 1))
-    sample = on.winding.on_stretch(frame, frame.o, nowhere, turns, on.backend.Float(detail))
+    detail = on.backend.Float(detail)
+    sample = on.winding.on_stretch(frame, frame.o, nowhere, turns, detail, active)
     return lengthened(dataclasses.replace(sample, along=()), on.size)
 
 
