@@ -402,12 +402,9 @@ _RUNS = 3, 4
 class LiftedTrails:
     """Closed trails of edges on a backend, as records of `run` consecutive edges.
 
-    For `edge_lift`'s sum along rays, edge by edge, with decisions made by the same bits. At points
-    close to the curve a sum over a tree of chains (`EdgeChains`) visits most of its leaves, in
-    neighboring lanes along different paths, so that up to some thousands of edges a plain loop over
-    all of them is faster, and exact. The part of a factor that belongs to a vertex is computed once
-    and not for each of its edges, and roots and divisions, which cost most, are shared by edges
-    where a bound allows it.
+    For `edge_lift`'s sum along rays, edge by edge, with decisions made by the same bits. The part
+    of a factor that belongs to a vertex is computed once and not for each of its edges, and roots
+    and divisions, which cost most, are shared by edges where a bound allows it.
 
     A record holds run + 1 vertices, run numbers 1/length^2, and run lengths: negative where the
     edge runs from a higher to a lower index, 0 where there is no edge.

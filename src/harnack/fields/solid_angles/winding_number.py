@@ -150,8 +150,8 @@ MethodName = Literal["auto", "exact", "tree"]
 _MOST_EDGES = 2048
 # With fewer edges samples cost so little that no cells are made for them.
 _FEW_EDGES = 64
-# Cells are built from so many rays an edge on, and for no fewer rays.
-_PAYS, _LEAST_RAYS = 100.0, 1e5
+# Cells are built from so many rays an edge on, for no fewer rays and for no more edges.
+_PAYS, _LEAST_RAYS, _MOST_IN_CELLS = 3.0, 5e3, 100_000
 # The accuracy of values at points, and of traces, by experiment.
 _VALUES, _TRACED = 2.0, 4.0
 # A point within so many roundings of a coordinate of a triangle may be on either side of it.
@@ -168,9 +168,8 @@ class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
 
     vertices: (n, 3).
     faces: (m, 3) indices into them.
-    method: "exact" (`edge_lift`: no truncation, cost by boundary edges; along rays `EdgeChains`,
-        no more truncation than rounding), "tree" (`winding_tree`), or "auto": exact up to 2048
-        boundary edges.
+    method: "exact" (`edge_lift`: no truncation, cost by boundary edges), "tree" (`winding_tree`),
+        or "auto": exact up to 2048 boundary edges.
     accuracy: for the tree, a cluster of triangles is taken as a whole beyond `accuracy` times its
         radius; more is slower and sharper. At least 1.5; by default 2 for values at points and 4
         for tracing, which uses more detail where the tolerance asks for it.
@@ -284,11 +283,14 @@ class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
 
     def least_rays(self) -> float:
         edges = len(self.mesh.singular)
-        return max(_LEAST_RAYS, _PAYS * edges) if edges >= _FEW_EDGES else math.inf
+        pays = _FEW_EDGES <= edges <= _MOST_IN_CELLS
+        return max(_LEAST_RAYS, _PAYS * edges) if pays else math.inf
 
     def occupied(self, levels: tuple[float, ...]) -> OccupiedCells | None:
-        """Cells by `winding_cells`, for the exact method if edges are not few."""
-        if self.method != "exact" or len(self.mesh.singular) < _FEW_EDGES:
+        """Cells by `winding_cells`, if edges are not few, for the exact method or by the cells of
+        the boundary."""
+        few = len(self.mesh.singular) < _FEW_EDGES
+        if few or (self.method != "exact" and not self.cells):
             return None
         extent = self.extent(levels)
         if extent is None:
