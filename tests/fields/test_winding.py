@@ -514,10 +514,12 @@ def rays(mesh: Mesh, n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     return mesh_rays(*mesh, n, seed, -1.2, 1.2)
 
 
-def check_first_hits(mesh: Mesh, method: Any, n: int, seed: int, precision: Any) -> None:
+def check_first_hits(
+    mesh: Mesh, method: Any, n: int, seed: int, precision: Any, *, cells: bool = False
+) -> None:
     vertices, faces = mesh
     o, d = rays(mesh, n, seed)
-    field = WindingNumber(vertices, faces, method=method)
+    field = WindingNumber(vertices, faces, method=method, cells=cells)
     exact = summed_on_device(vertices[faces])
     far = 5.0
     truth = first_side_changes(exact, o, d, 0.0, far, level=0.5, samples=384)

@@ -1,0 +1,240 @@
+"""Winding numbers by cells of the boundary: samples modulo one, and the whole numbers of rays."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import drjit as dr
+import numpy as np
+import pytest
+
+import harnack as hk
+from harnack.backend import choose_backend, to_numpy, to_vector3
+from harnack.enclosures import Lipschitz, TargetLevels, choose_proofs
+from harnack.fields import Sample
+from harnack.fields.look import Path
+from harnack.geometry.mesh_shapes import bumpy_sphere, icosphere, remove_faces
+from harnack.tracer.whole_numbers import WholeNumbers
+from tests.fields.test_winding import (
+    KINDS,
+    METHODS,
+    Mesh,
+    check_first_hits,
+    damaged,
+    direct_sum,
+    places,
+    rays,
+    unit,
+)
+from tests.oracles.jump_oracle import first_side_changes
+
+PRECISIONS = ["single", "double"]
+
+
+def with_cells(mesh: Mesh, cells: Any = True, **settings: Any) -> hk.WindingNumber:
+    return hk.WindingNumber(*mesh, cells=cells, **settings)
+
+
+def modulo_one(numbers: np.ndarray) -> np.ndarray:
+    return (numbers + 0.5) % 1 - 0.5
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("kind", ["holes", "soup"])
+def test_samples_in_cells_are_within_their_errors(kind: str, precision: Any) -> None:
+    mesh = damaged(kind, 1)
+    field = with_cells(mesh, method="exact").prepare(choose_backend(precision))
+    backend = choose_backend(precision)
+    x = places(mesh, 4000, 1e-4)
+    sample = field.evaluate_modulo_one(to_vector3(backend, x))
+    off = modulo_one(to_numpy(sample.value) - direct_sum(mesh[0][mesh[1]], x))
+    gradient = hk.WindingNumber(*mesh, method="exact").gradient(x, precision="double")
+    steep = np.linalg.norm(gradient, axis=1)
+    place = 4 * backend.epsilon * np.abs(x).max(axis=1) * steep
+    error = to_numpy(sample.error).astype(np.float64)
+    assert (np.abs(off) <= error + place + 1e-12).all()
+    assert np.median(error) < 2e-3
+    turned = np.linalg.norm(to_numpy(sample.gradient) - gradient, axis=1)
+    bent = to_numpy(sample.known[0].constant) * 4 * backend.epsilon
+    assert (turned <= to_numpy(sample.gradient_error) + bent + 1e-4 * steep).all()
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("kind", ["holes", "all of it"])
+def test_first_hits(kind: str, precision: Any) -> None:
+    check_first_hits(damaged(kind, 3), "exact", 400, 3, precision, cells=True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("seed", [2, 5])
+def test_many_first_hits(kind: str, seed: int, method: Any) -> None:
+    precision = "double" if seed == 5 else "single"
+    check_first_hits(damaged(kind, seed), method, 1000, seed, precision, cells=True)
+
+
+def compare(mesh: Mesh, o: np.ndarray, d: np.ndarray, **settings: Any) -> hk.Hits:
+    """Rays end as without cells, but for grazes within the tolerance."""
+    hits = hk.trace(with_cells(mesh), o, d, **settings)
+    plain = hk.trace(with_cells(mesh, False), o, d, **settings)
+    assert not (hits.status == hk.Status.OUT_OF_STEPS).any()
+    assert (plain.hit != hits.hit).mean() <= 2e-3
+    both = plain.hit & hits.hit
+    apart = np.abs(plain.t[both] - hits.t[both])
+    assert (apart > 2e-3 * (1 + np.abs(o).max() / 100)).mean() <= 5e-3
+    assert (plain.sheet[both] != hits.sheet[both]).mean() <= 5e-3
+    return hits
+
+
+@pytest.mark.parametrize("level", [1.5, -0.5, 0.3, 1.0, (0.5, 1.4)])
+def test_other_levels_of_overlapping_parts(level: Any) -> None:
+    """Where w goes from -1 to 3: a copy inside, one turned around, one twice."""
+    vertices, faces = bumpy_sphere(2)
+    faces = remove_faces(faces, 0.1, 0)
+    shifts = ((1.0, 0.0, 1), (0.6, 0.2, 1), (0.7, 0.9, -1), (0.5, -0.6, 1), (0.5, -0.6, 1))
+    copies = [size * vertices + np.array([shift, 0, 0]) for size, shift, _ in shifts]
+    turns = [faces[:, ::way] for *_, way in shifts]
+    table = [turn + k * len(vertices) for k, turn in enumerate(turns)]
+    mesh = np.concatenate(copies), np.concatenate(table)
+    hits = compare(mesh, *rays(mesh, 1500, 4), level=level)
+    assert hits.hit.mean() > 0.05
+
+
+def test_rays_from_inside_and_far_away_and_of_a_clip() -> None:
+    mesh = damaged("holes", 1)
+    rng = np.random.default_rng(1)
+    o, d = rng.uniform(-0.6, 0.6, (1500, 3)), unit(rng.normal(size=(1500, 3)))
+    compare(mesh, o, d)
+    compare(mesh, o, d, t_min=0.3, t_max=0.9)
+    far = o - 1e3 * d
+    compare(mesh, far, d, precision="double")
+    clip = hk.Ball((0.3, 0.1, 0.0), 0.7)
+    fields = with_cells(mesh), with_cells(mesh, False)
+    one, other = (hk.trace(hk.level_set(field, clip=clip), far, d) for field in fields)
+    assert (one.hit != other.hit).mean() <= 2e-3
+    assert one.hit.sum() > 100
+
+
+def test_many_rays_end_as_without_cells() -> None:
+    """So many that a grid of empty cells is made, by cells and without."""
+    mesh = damaged("holes", 1)
+    hits = compare(mesh, *rays(mesh, 6000, 9))
+    assert hits.evaluations.mean() < 4
+
+
+def test_a_rung_within_the_tolerance_is_no_hit() -> None:
+    """Beside the cracks of a soup w is so steep that the tolerance holds more than its way to the
+    next level, modulo one: rays hit where w was -1/2."""
+    rng = np.random.default_rng(0)
+    vertices, faces = bumpy_sphere(2)
+    corners = vertices[faces[:150]]
+    corners = corners + 2e-3 * rng.normal(size=corners.shape)
+    mesh = corners.reshape(-1, 3), np.arange(450).reshape(-1, 3)
+    middle = corners.reshape(-1, 3).mean(axis=0)
+    o = middle + 1.5 * unit(rng.normal(size=(4000, 3)))
+    d = unit(middle + 0.4 * rng.normal(size=(4000, 3)) - o)
+    hits = hk.trace(with_cells(mesh), o, d, precision="double", tolerance=1e-4)
+    smooth = hits.hit & (hits.sheet < 0)
+    x = hits.position[smooth]
+    gradient = hk.WindingNumber(*mesh, method="exact").gradient(x, precision="double")
+    off = np.abs(direct_sum(corners, x) - 0.5)
+    assert smooth.sum() > 50
+    assert (off <= 1.01e-4 * np.linalg.norm(gradient, axis=1) + 1e-9).all()
+    truth = first_side_changes(
+        lambda p: direct_sum(corners, p), o[:400], d[:400], 0.0, 4.0, level=0.5, samples=256
+    )
+    late = hits.t[:400] > truth + 1e-3
+    assert not late.any()
+
+
+def test_crossings_are_those_without_cells() -> None:
+    mesh = damaged("holes", 1)
+    o, d = rays(mesh, 300, 2)
+    for settings in ({"all_hits": 6}, {"confirm": True}):
+        one, other = (
+            hk.trace(with_cells(mesh, cells), o, d, **settings) for cells in (True, False)
+        )
+        assert (one.t != other.t).mean() < 0.02 or np.array_equal(one.t, other.t, equal_nan=True)
+
+
+def test_moved_meshes_have_cells_of_their_own() -> None:
+    vertices, faces = damaged("holes", 1)
+    o, d = rays((vertices, faces), 500, 3)
+    field = with_cells((vertices, faces))
+    hk.trace(field, o, d)
+    moved = field.moved(1.3 * vertices + 0.2)
+    hits = hk.trace(moved, o, d)
+    fresh = hk.trace(with_cells((1.3 * vertices + 0.2, faces)), o, d)
+    np.testing.assert_array_equal(hits.t, fresh.t)
+
+
+def test_when_there_are_cells() -> None:
+    mesh = damaged("holes", 1)
+    field = hk.WindingNumber(*mesh)
+    edges = field.describe()["singular edges"]
+    assert edges > 64
+    assert field.describe()["cells"] == "from 5,000 rays on"
+    assert field.for_rays(100) is field
+    assert field.for_rays(10**6).cells is True
+    assert field.for_rays(10**6) is field.for_rays(2 * 10**6)
+    prepared = field.for_rays(10**6).prepare(choose_backend("single"))
+    assert prepared.describe()["cells"].endswith("MB")
+    assert prepared.is_modulo
+    short = with_cells(mesh, 0.01).prepare(choose_backend("single"))
+    assert short.describe()["cells"] == "none, as they need more memory"
+    assert not short.is_modulo
+    assert hk.WindingNumber(*icosphere(1)).for_rays(10**9).cells is None
+    assert with_cells(mesh, False).for_rays(10**9).cells is False
+    with pytest.raises(ValueError, match="megabytes"):
+        with_cells(mesh, -1.0)
+
+
+@pytest.mark.parametrize(
+    ("value", "before", "step", "expected"),
+    [
+        (0.45, 0.4, 0.1, 0.45),
+        (-0.55, 0.4, 0.1, 0.45),
+        # Proved to change little: past a rung by as much as the error.
+        (-0.499, 0.45, 0.1, 0.501),
+        # Nothing is proved of the change: between the rungs of the value before.
+        (-0.499, 0.45, 9.0, -0.499),
+        (2.2, 0.4, 9.0, 0.2),
+        (2.2, 1.4, 9.0, 1.2),
+        (0.2, -1.4, 9.0, -0.8),
+    ],
+)
+def test_whole_numbers(value: float, before: float, step: float, expected: float) -> None:
+    backend = choose_backend("double")
+    real, vector = backend.Float, backend.Array3f
+    known = (Lipschitz(real(1.0), real(0.2)),)
+    sample = Sample(real(value), vector(0.5, 0, 0), known, real(1e-6), is_modulo=backend.Bool(True))
+    path = Path(vector(0), vector(1, 0, 0), choose_proofs(None))
+    numbers = WholeNumbers(TargetLevels((0.5,)))
+    look = numbers.continued(path.look(sample), real(before), real(step))
+    assert look.sample.value[0] == pytest.approx(expected, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "knows", "up", "passes", "is_doubtful"),
+    [
+        (0.45, 0.0, False, 0.05, False, False),
+        (-0.2, 0.0, False, 0.7, False, False),
+        (-0.45, 0.0, False, 0.95, False, True),
+        (-0.45, 0.0, True, 0.95, True, False),
+        (-0.3, 0.15, False, 0.8, False, True),
+        (1.45, 0.0, True, math.inf, True, False),
+        (0.55, 0.0, True, 0.95, False, False),
+    ],
+)
+def test_gaps_to_rungs(
+    value: float, error: float, knows: bool, up: float, passes: bool, is_doubtful: bool
+) -> None:
+    backend = choose_backend("double")
+    real = backend.Float
+    sample = Sample(real(value), backend.Array3f(1, 0, 0), (), real(error))
+    gaps, *said = WholeNumbers(TargetLevels((0.5,))).gaps(sample, backend.Bool(not knows))
+    assert gaps.up[0] == pytest.approx(up)
+    assert [bool(one[0]) for one in said] == [passes, is_doubtful]
+    assert not dr.any(said[0] & said[1])
