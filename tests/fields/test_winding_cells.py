@@ -212,7 +212,8 @@ def test_whole_numbers(value: float, before: float, step: float, expected: float
     sample = Sample(real(value), vector(0.5, 0, 0), known, real(1e-6), is_modulo=backend.Bool(True))
     path = Path(vector(0), vector(1, 0, 0), choose_proofs(None))
     numbers = WholeNumbers(TargetLevels((0.5,)))
-    look = numbers.continued(path.look(sample), real(before), real(step))
+    look, is_sure = numbers.continued(path.look(sample), real(before), real(step), real(1e-6))
+    assert bool(is_sure[0]) == (step < 1)
     assert look.sample.value[0] == pytest.approx(expected, abs=1e-12)
 
 
@@ -223,7 +224,10 @@ def test_whole_numbers(value: float, before: float, step: float, expected: float
         (-0.2, 0.0, False, 0.7, False, False),
         (-0.45, 0.0, False, 0.95, False, True),
         (-0.45, 0.0, True, 0.95, True, False),
-        (-0.3, 0.15, False, 0.8, False, True),
+        (-0.3, 0.11, False, 0.8, False, True),
+        (0.1, 0.2, False, 0.4, False, True),
+        (0.1, 0.2, True, 0.4, True, False),
+        (0.45, 0.03, False, 0.05, False, True),
         (1.45, 0.0, True, math.inf, True, False),
         (0.55, 0.0, True, 0.95, False, False),
     ],
@@ -233,8 +237,68 @@ def test_gaps_to_rungs(
 ) -> None:
     backend = choose_backend("double")
     real = backend.Float
-    sample = Sample(real(value), backend.Array3f(1, 0, 0), (), real(error))
-    gaps, *said = WholeNumbers(TargetLevels((0.5,))).gaps(sample, backend.Bool(not knows))
+    sample = Sample(real(value), backend.Array3f(1, 0, 0), ())
+    asked = backend.Bool(not knows), backend.Bool(False), real(error)
+    gaps, *said = WholeNumbers(TargetLevels((0.5,))).gaps(sample, *asked)
     assert gaps.up[0] == pytest.approx(up)
     assert [bool(one[0]) for one in said] == [passes, is_doubtful]
     assert not dr.any(said[0] & said[1])
+
+
+_TRIANGLE = np.array([[-1.0, -1, 0], [1, -1, 0], [0, 1, 0]])
+_SMALL = np.array([[-0.3, -0.3, 0.3], [0.3, -0.3, 0.3], [0, 0.3, 0.3]])
+
+
+def _ends(
+    corners: list[Any], level: float, origins: Any, directions: Any, **settings: Any
+) -> list[hk.Hits]:
+    """Ends of rays with cells, and without."""
+    mesh = np.concatenate(corners), np.arange(3 * len(corners)).reshape(-1, 3)
+    fields = (with_cells(mesh, one, method="tree") for one in (True, False))
+    return [hk.trace(one, origins, directions, level=level, **settings) for one in fields]
+
+
+def test_a_ray_that_enters_beyond_a_rung_next_to_zero_knows_the_number() -> None:
+    # Where it enters, w is about -0.2, between the rungs -1.1 and -0.1 of the level 0.9.
+    cells, plain = _ends([_TRIANGLE, _SMALL], 0.9, [(-0.387, -0.093, 5.0)], [(0.0, 0, -1)])
+    assert plain.status[0] == hk.Status.MISS
+    assert cells.status[0] == plain.status[0]
+
+
+def test_the_first_sample_of_a_ray_is_not_the_value_nearest_to_zero() -> None:
+    # Where it enters, w is about -0.6, between the rungs -0.7 and 0.3.
+    ray = [(-0.087, -0.093, 5.0)], [(0.0, 0, -1)]
+    cells, plain = _ends([_TRIANGLE] * 3 + [_SMALL], 0.3, *ray, tolerance=1e-3)
+    assert plain.sheet[0] == 0
+    assert cells.sheet[0] == plain.sheet[0]
+    assert abs(cells.t[0] - plain.t[0]) < 1e-3
+    assert abs(cells.value[0] - plain.value[0]) < 1e-3
+
+
+def test_behind_a_rung_passed_off_the_cells_the_next_sample_knows_the_number() -> None:
+    x, y = (-10000.8193359375, -9999.1806640625), (-10001.2041015625, -9998.7958984375)
+    z = -9999.703125
+    big = np.array([[x[0], y[0], z], [x[1], y[0], z], [x[1], y[1], z], [x[0], y[1], z]])
+    u, v = (-10000.6787109375, -10000.0234375), (-10000.4814453125, -9999.5185546875)
+    z = -10001.5859375
+    small = np.array([[u[0], v[0], z], [u[1], v[0], z], [u[1], v[1], z], [u[0], v[1], z]])
+    corners = [big[[0, 1, 2]], big[[0, 2, 3]]] * 3 + [small[[2, 1, 0]], small[[3, 2, 0]]]
+    origin = (-10000.1025390625, -10001.2021484375, -10004.2509765625)
+    ray = [origin], [(-0.029849009588360786, 0.31229814887046814, 0.9495151042938232)]
+    cells, plain = _ends(corners, 0.9, *ray, tolerance=1e-3, t_min=1.2875842, t_max=4.0504760)
+    assert plain.status[0] == hk.Status.MISS
+    assert cells.status[0] == plain.status[0]
+
+
+def test_a_ray_far_from_the_origin_does_not_run_out_of_steps() -> None:
+    corners = np.array(
+        [
+            [-10000.734375, 9998.6572265625, -10000.0908203125],
+            [-9999.6953125, 10000.630859375, -9999.73828125],
+            [-10000.73046875, 9999.498046875, -9999.8203125],
+        ]
+    )
+    ray = [(-10002.29296875, 9995.697265625, -10000.619140625)], [(0.460142, 0.874011, 0.156120)]
+    cells, plain = _ends([corners], 0.9, *ray, tolerance=1e-3)
+    assert plain.status[0] == hk.Status.HIT
+    assert cells.status[0] == plain.status[0]

@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, IntArray, Mask, Real, Vec3
-    from harnack.fields.field import Field
-    from harnack.fields.look import Sample
+    from harnack.fields.field import Field, Sample
 
 NO_SHEET = 0xFFFFFFFF
 """The index of no sheet, larger than that of any."""

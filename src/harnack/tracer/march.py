@@ -340,19 +340,20 @@ class March:
             seen = field.at_detail(fmax(now.detail, 1) if knows else now.detail)
         unproved, size = now.trial_step - now.proved_step, largest_coordinate(path.origin) + t
         look = seen.look(path, t, fmin(now.look_ahead, end - t), fmax(unproved, real(0)))
-        passes, is_doubtful = None, None
+        passes, is_doubtful, is_sure = None, None, None
+        gradient_norm = length(look.sample.gradient)
         if whole is not None and look.sample.is_modulo is not None:
             is_modulo = look.sample.is_modulo
-            look = whole.continued(look, now.value, now.trial_step)
-        sample, gradient_norm = look.sample, length(look.sample.gradient)
+            error = value_error(look.sample, gradient_norm, size)
+            look, is_sure = whole.continued(look, now.value, now.trial_step, error)
+        sample = look.sample
         gaps = self.levels.gaps(sample.value)
-        gap = gaps.smaller
-        if whole is not None and is_modulo is not None:
-            gaps, passes, is_doubtful = whole.gaps(sample, is_modulo)
+        gap, total_error = gaps.smaller, value_error(sample, gradient_norm, size)
+        if whole is not None and is_modulo is not None and is_sure is not None:
+            gaps, passes, is_doubtful = whole.gaps(sample, is_modulo, is_sure, total_error)
         if self.cover is not None:
             gaps = gaps.less(self.cover * t * gradient_norm)
             gap = gaps.smaller
-        total_error = value_error(sample, gradient_norm, size)
         steepness = fmax(gradient_norm - sample.gradient_error, real(0))
         if look.slope_error is not None:  # the gradient is at least as long as its projection
             steepness = fmax(dr.abs(look.slope) - look.slope_error, steepness)
@@ -414,7 +415,7 @@ class March:
         coarser = _coarser(at, seen.gaps.smaller, truncation, coarsest)
         if seen.passes is not None and seen.is_doubtful is not None:
             too_coarse |= seen.is_doubtful & accepted  # others go back in any case
-            coarser = dr.select(seen.passes, at, coarser)
+            coarser = dr.select(seen.passes, fmax(at, 1), coarser)  # the next knows it too
         accepted &= ~too_coarse & is_known
         detail = dr.select(too_coarse, finer, dr.select(accepted, coarser, now.detail))
         return accepted, detail, too_coarse

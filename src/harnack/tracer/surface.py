@@ -201,7 +201,8 @@ class LevelSet:
             region = _common([self.field.domain, self.clip, self.section])
         field, around = self.field_on(backend), None
         if field.is_modulo and all(abs(math.remainder(one, 1)) > _WHOLE for one in self.numbers):
-            around = None if self.extent is None else self.extent.prepare(backend)
+            extent = self.field.extent(_with_rungs_at_zero(self.numbers))
+            around = None if extent is None else extent.prepare(backend)
         return PreparedLevelSet(
             backend,
             field,
@@ -273,6 +274,13 @@ def level_set(
         field, asked, clip, tolerance, max_steps, choose_proofs(bound), overstep, solid, confirm,
         section, largest,
     )  # fmt: skip
+
+
+def _with_rungs_at_zero(levels: tuple[float, ...]) -> tuple[float, ...]:
+    """The levels, and for those farther from 0 than a half the nearest ones of the same ladder,
+    which |f| reaches sooner."""
+    rungs = dict.fromkeys(math.remainder(level, 1) for level in levels if abs(level) > 0.5)
+    return levels + tuple(rung for rung in rungs if rung not in levels)
 
 
 def _common(parts: Sequence[Volume | None]) -> Volume | None:
