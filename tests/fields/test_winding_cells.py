@@ -18,7 +18,6 @@ from harnack.geometry.mesh_shapes import bumpy_sphere, icosphere, remove_faces
 from harnack.tracer.whole_numbers import WholeNumbers
 from tests.fields.test_winding import (
     KINDS,
-    METHODS,
     Mesh,
     check_first_hits,
     damaged,
@@ -67,11 +66,11 @@ def test_first_hits(kind: str, precision: Any) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("seed", [2, 5])
-def test_many_first_hits(kind: str, seed: int, method: Any) -> None:
-    precision = "double" if seed == 5 else "single"
+@pytest.mark.parametrize(
+    ("method", "precision", "seed"), [("exact", "single", 2), ("tree", "double", 5)]
+)
+def test_many_first_hits(kind: str, method: Any, precision: Any, seed: int) -> None:
     check_first_hits(damaged(kind, seed), method, 1000, seed, precision, cells=True)
 
 
