@@ -91,6 +91,7 @@ def test_extents_hold_the_level_set_and_the_triangles() -> None:
 @pytest.mark.slow
 def test_hits_are_those_without_cells() -> None:
     field = broken()
+    field.set_cells(False)
     rng = np.random.default_rng(3)
     o = 4 * unit(rng.normal(size=(5000, 3)))
     d = unit(rng.uniform(-1, 1, (5000, 3)) * [1.0, 0.6, 1.4] - o)
