@@ -304,7 +304,7 @@ class PreparedLevelSet:
             whole_numbers = WholeNumbers(self.levels)
             entry, _ = self.around.clip(path.origin, path.direction, t_min, t_max)
             outside = (entry > t_min) & (start <= entry)
-            state = replace(state, detail=dr.select(outside, real(0), real(1)))
+            state = replace(state, detail=dr.select(outside, 0, real(self.field.coarsest_detail)))
         march = March(
             backend,
             self.levels,

@@ -240,6 +240,11 @@ class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
         """The face, as given, of each sheet."""
         return self.mesh.source
 
+    def prepare(self, backend: Backend) -> Self:
+        prepared = super().prepare(backend)
+        prepared.coarsest_detail = prepared._prepared().winding.coarsest_detail
+        return prepared
+
     def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> Values:
         on = self._batch(backend_of(x))
         winding, x = on.winding, on.unit(x)
@@ -424,7 +429,8 @@ class _Stretch(Field):
             sample = on.winding.on_stretch(frame, x, self._behind, self._offset, detail)
             return lengthened(sample, on.size)
         unit = fmax(epsilon_at(frame.o), epsilon_at(x))
-        in_cells, inside = on.cells.sample(x, frame.d, unit, detail < 1)
+        # Cells are coarser than the coarsest samples that know the number.
+        in_cells, inside = on.cells.sample(x, frame.d, unit, detail < self.coarsest_detail)
         sample = on.winding.on_stretch(frame, x, self._behind, self._offset, detail, ~inside)
         sample = dataclasses.replace(sample.where(inside, in_cells), is_modulo=inside)
         return lengthened(sample, on.size)
