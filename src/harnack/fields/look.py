@@ -72,12 +72,10 @@ class Sample:
         elsewhere. Without normals."""
         names = "value", "gradient", "error", "gradient_error", "truncation"
         numbers = {k: dr.select(mask, getattr(other, k), getattr(self, k)) for k in names}
-        groups = {
-            k: tuple(
-                a.where(mask, b) for a, b in zip(getattr(self, k), getattr(other, k), strict=True)
-            )
-            for k in ("known", "weaker", "along")
-        }
+        groups: dict[str, Any] = {}
+        for k in ("known", "weaker", "along"):
+            pairs = zip(getattr(self, k), getattr(other, k), strict=True)
+            groups[k] = tuple(own.where(mask, one) for own, one in pairs)
         return dataclasses.replace(self, normal=None, **numbers, **groups)
 
 

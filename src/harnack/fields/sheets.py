@@ -98,9 +98,10 @@ class Sheets:
 
     @property
     def is_modulo(self) -> bool:
-        """Whether samples of `between` at details below 1 may know f but for a whole number, where
-        they say so (`Sample.is_modulo`). All jumps are whole numbers then, and outside of the
-        `extent` of levels no ray meets one of them, modulo 1, on the way to where f is 0."""
+        """Whether samples of `between` at details below `coarsest_detail` may know f but for a
+        whole number, where they say so (`Sample.is_modulo`). All jumps are whole numbers then.
+        Outside of the `extent` of some levels, which hold for each of them the one nearest to 0
+        modulo 1, f lies between the same two of these levels, modulo 1, as 0 does."""
         return False
 
     def evaluate_modulo_one(self, p: Vec3) -> Sample:

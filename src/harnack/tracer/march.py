@@ -71,7 +71,7 @@ class MarchState:
     proved_step: a length from there that is proved free too.
     trial_step: from there to the next trial point.
     look_ahead: how far enclosures are asked to reach next.
-    value, gradient: f at `proved_to`.
+    value, gradient: f at `proved_to`; the value is that behind the sheet if one was passed there.
     excess: by how much f there may be farther from a level than the tolerance allows.
     evaluations: of f, so far.
     detail: of the next sample (`Field.at_detail`); None for fields without a choice of detail
@@ -246,8 +246,8 @@ class March:
 
         ahead: for a field with sheets, the crossing at `end`, on lanes where there is one. Those
         lanes sample that point as well. Accepted there, they hit the sheet or have passed it: a
-        miss, with the step that the value behind the sheet allows from there. With `hysteresis`
-        `value` is then that behind the sheet.
+        miss, with the step that the value behind the sheet allows from there. `value` is then that
+        behind the sheet; without `hysteresis` not where the sheet was hit.
         """
 
         def body(now: MarchState) -> MarchState:

@@ -79,10 +79,12 @@ class BoundaryCells:
         """Their bytes."""
         return self.cells.size
 
-    def sample(self, x: Vec3, direction: Vec3, unit: Real, active: Mask) -> tuple[Sample, Mask]:
+    def sample(
+        self, x: Vec3, direction: Vec3 | None, unit: Real, active: Mask
+    ) -> tuple[Sample, Mask]:
         """w at x but for a whole number, with promises of its lift, those along a unit direction
-        among them; and the points for which they hold: those that are active, in a cell and not at
-        an edge. See `SolidAngle` for the promises.
+        among them if one is given; and the points for which they hold: those that are active, in a
+        cell and not at an edge. See `SolidAngle` for the promises.
 
         unit: the rounding of a coordinate.
         """

@@ -19,10 +19,7 @@ from harnack.enclosures import Lipschitz
 from harnack.fields.batch import SymmetricSum, Values
 from harnack.fields.clearance import epsilon_at
 from harnack.fields.field import Sample
-from harnack.fields.solid_angles.edge_lift import (
-    LiftedEdges,
-    lifted_sums,
-)
+from harnack.fields.solid_angles.edge_lift import LiftedEdges, lifted_sums
 from harnack.fields.solid_angles.edge_trails import (
     EdgeTrails,
     LiftedTrails,
