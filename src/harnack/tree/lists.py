@@ -39,6 +39,12 @@ class Lists:
         index = backend.UInt32
         return cls(index(0), index(1), index(0))
 
+    @classmethod
+    def none(cls, backend: Backend) -> Lists:
+        """One list, which is empty."""
+        index = backend.UInt32
+        return cls(index(0), index(0), index(0))
+
     def some(self, backend: Backend, lanes: IntArray) -> Lists:
         """The lists of these lanes; a lane may occur several times."""
         index = backend.UInt32

@@ -1,9 +1,8 @@
 """What far dipoles add to balls: local expansions, and bounds of what these leave out.
 
 - `source_tree`: a tree of dipoles in double precision, with all that expansions need.
-- `nodes_of`, `dipoles_of`: walks that split the dipoles of a ball into far nodes, far dipoles, near
-  dipoles, and what is left to smaller balls.
-- `FarSums`: the sums over far nodes and far dipoles.
+- `FarSums`: sums over far nodes and far dipoles.
+- `Sources`: the dipoles of balls, parted into such sums and what is left to smaller balls.
 
 A node of radius R is far from a ball of radius rho if their centers are farther apart than k rho +
 `_SPREAD` R, a dipole if it is farther from the ball's center than k rho, for a factor k > 1: then
@@ -19,12 +18,12 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 import numpy as np
 
-from harnack.backend import BoolArray, FloatArray, choose_backend, to_numpy
+from harnack.backend import BoolArray, FloatArray, IntArray, choose_backend, to_numpy
 from harnack.backend.elementary import fmin
 from harnack.fields.solid_angles.local_expansion import irregular, of_cluster, parts, tail_factors
 from harnack.fields.solid_angles.multipole import NodeMoments, sup_norm, truncation
 from harnack.tree import Node, PackedTree, pack
-from harnack.tree.lists import Lists, Put, each_entry, walk_lists
+from harnack.tree.lists import Lists, Put, each_entry, make_lists, walk_lists
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
@@ -36,7 +35,7 @@ if TYPE_CHECKING:
 # The degree of local expansions, and the largest of the multipoles that they are made of.
 DEGREE, _POLES = 6, 4
 COEFFICIENTS = (DEGREE + 1) ** 2
-_SPREAD = 6.0
+_SPREAD = 4.0
 # See `_Expanded.of`.
 _ROUNDING = 2.0**-20
 # Moments of a node, in order.
@@ -60,67 +59,6 @@ def source_tree(tree: Hierarchy, levels: list[NodeMoments], rows: FloatArray) ->
         head = [level.center, reach, level.radius, level.area]
         numbers.append(np.column_stack([*head, *moments, left_out, slope, *norms]))
     return pack(choose_backend("double"), tree, numbers, rows)
-
-
-def nodes_of(
-    tree: PackedTree, lists: Lists, c: Vec3, inner: Real, smallest: Real, put: Put | None, *,
-    far: bool, leaves: bool = True,
-) -> Any:  # fmt: skip
-    """The number of nodes in listed subtrees that are far from c, or of those that are left; for
-    `make_lists`. Nodes that are not far are left if their radius is at most `smallest` or they are
-    leaves, and are replaced by their children otherwise.
-
-    leaves: whether leaves may be far; where they may not, `dipoles_of` takes them apart.
-
-    Each dipole of the listed subtrees is in just one node that is far or left.
-    """
-    index, vector = tree.backend.UInt32, tree.backend.Array3f
-
-    def visit(node: Node, state: tuple[Any, ...]) -> tuple[Mask, tuple[Any, ...]]:
-        is_far = dr.squared_norm(c - vector(*node.head[:3])) > dr.square(inner + node.head[3])
-        if not leaves:
-            is_far &= ~node.is_leaf
-        is_left = ~is_far & ((node.head[4] <= smallest) | node.is_leaf)
-        chosen = is_far if far else is_left
-        if put is not None:
-            put(state[0], node.index, chosen)
-        return ~(is_far | is_left), (state[0] + dr.select(chosen, index(1), index(0)),)
-
-    return walk_lists(tree, lists, visit, (index(0),))[0]
-
-
-def dipoles_of(
-    tree: PackedTree, lists: Lists, c: Vec3, inner: Real, most: Any, put: Put | None, *, far: bool
-) -> Any:
-    """The number of dipoles in listed subtrees that are near c, or of those that are neither near
-    nor in a far node above the leaves; for `make_lists`. Once it is more than `most`, not all may
-    be counted. To add the dipoles of a leaf one by one takes less time than to add their moments.
-    """
-    index, vector = tree.backend.UInt32, tree.backend.Array3f
-
-    def visit(node: Node, state: tuple[Any, ...]) -> tuple[Mask, tuple[Any, ...]]:
-        # A node that is not far may have near dipoles only if its ball comes near.
-        reach = node.head[3] if far else node.head[4] * (1 + 1e-9) + 1e-12
-        square = dr.squared_norm(c - vector(*node.head[:3]))
-        down = square <= dr.square(inner + reach)
-        if far:
-            down |= node.is_leaf
-        down &= state[0] <= most
-
-        def more(slot: Any, *_: Any) -> Mask:
-            return down & node.is_leaf & (slot < tree.leaf_size)
-
-        def step(slot: Any, count: Any) -> tuple[Any, ...]:
-            row = tree.primitive(node.leaf, slot, down)
-            is_far = dr.squared_norm(c - vector(*row[:3])) > dr.square(inner)
-            chosen = (is_far if far else ~is_far) & (row[6] > 0) & down
-            if put is not None:
-                put(count, node.leaf * tree.leaf_size + slot, chosen)
-            return slot + 1, count + dr.select(chosen, index(1), index(0))
-
-        return down, (dr.while_loop((index(0), state[0]), more, step, label="dipoles")[1],)
-
-    return walk_lists(tree, lists, visit, (index(0),))[0]
 
 
 @dataclass(frozen=True)
@@ -294,3 +232,111 @@ class _Expanded:
         tail = total * power / (1 - ratio * q)
         slope = (DEGREE + 1) * total * power / (1 - steeper * q)
         return cls(coefficients, tail, slope / radius, _ROUNDING * largest, inverse)
+
+
+@dataclass(frozen=True)
+class Sources:
+    """Dipoles that balls have still to take into account: those of the nodes of one list for each
+    ball, and those of another list, rows of the tree's primitives."""
+
+    nodes: Lists
+    dipoles: Lists
+
+    @classmethod
+    def of_root(cls, backend: Backend) -> Sources:
+        """All dipoles of a tree, for one ball."""
+        return cls(Lists.of_root(backend), Lists.none(backend))
+
+    def some(self, backend: Backend, lanes: IntArray) -> Sources:
+        """Those of these balls; a ball may occur several times."""
+        return Sources(self.nodes.some(backend, lanes), self.dipoles.some(backend, lanes))
+
+    def parted(
+        self, tree: PackedTree, c: Vec3, radius: Real, factor: float, smallest: Real
+    ) -> tuple[FarSums, Sources]:
+        """Sums over what is farther than `factor` radii from the centers c of balls, and the rest.
+
+        smallest: inner nodes up to this radius stay nodes where they are not far. Others are
+            replaced by their children, and leaves by their dipoles, each of which is far or near.
+
+        Each dipole is in just one far node, or is itself far, or is in the rest.
+        """
+        backend, inner = tree.backend, factor * radius
+        far, left = (
+            make_lists(
+                backend,
+                lambda put, far=far: _nodes(tree, self.nodes, c, inner, smallest, put, far=far),
+            )
+            for far in (True, False)
+        )
+        far_dipoles, near = (
+            make_lists(
+                backend,
+                lambda put, far=far: self.dipoles_of(tree, c, inner, smallest, put, far=far),
+            )
+            for far in (True, False)
+        )
+        sums = FarSums.over_nodes(tree, far, c, radius)
+        return sums.plus(FarSums.over_dipoles(tree, far_dipoles, c, radius)), Sources(left, near)
+
+    def dipoles_of(
+        self, tree: PackedTree, c: Vec3, inner: Real, smallest: Real, put: Put | None, *, far: bool,
+        most: Any = None,
+    ) -> Any:  # fmt: skip
+        """The number of dipoles, of the second list and of leaves that are not far, that are
+        farther from c than `inner`, or of the others; for `make_lists`. Once it is more than
+        `most`, not all may be counted."""
+        index, vector = tree.backend.UInt32, tree.backend.Array3f
+
+        def is_chosen(row: list[Real], active: Mask) -> Mask:
+            is_far = dr.squared_norm(c - vector(*row[:3])) > dr.square(inner)
+            return (is_far if far else ~is_far) & (row[6] > 0) & active
+
+        def visit(node: Node, state: tuple[Any, ...]) -> tuple[Mask, tuple[Any, ...]]:
+            square = dr.squared_norm(c - vector(*node.head[:3]))
+            down = square <= dr.square(inner + node.head[3])
+            if not far:  # only nodes whose ball comes near have near dipoles
+                down &= square <= dr.square(inner + node.head[4] * (1 + 1e-9) + 1e-12)
+            down &= node.is_leaf | (node.head[4] > smallest)
+            if most is not None:
+                down &= state[0] <= most
+
+            def more(slot: Any, *_: Any) -> Mask:
+                return down & node.is_leaf & (slot < tree.leaf_size)
+
+            def step(slot: Any, count: Any) -> tuple[Any, ...]:
+                chosen = is_chosen(tree.primitive(node.leaf, slot, down), down)
+                if put is not None:
+                    put(count, node.leaf * tree.leaf_size + slot, chosen)
+                return slot + 1, count + dr.select(chosen, index(1), index(0))
+
+            return down, (dr.while_loop((index(0), state[0]), more, step, label="dipoles")[1],)
+
+        def listed(i: Any, active: Mask, state: tuple[Any, ...]) -> tuple[Any, ...]:
+            chosen = is_chosen(tree.primitives.row(i, active), active)
+            if put is not None:
+                put(state[0], i, chosen)
+            return (state[0] + dr.select(chosen, index(1), index(0)),)
+
+        found = walk_lists(tree, self.nodes, visit, (index(0),))
+        return each_entry(tree.backend, self.dipoles, listed, found)[0]
+
+
+def _nodes(
+    tree: PackedTree, lists: Lists, c: Vec3, inner: Real, smallest: Real, put: Put | None, *,
+    far: bool,
+) -> Any:  # fmt: skip
+    """The number of nodes in listed subtrees that are far from c, or of the inner ones that are
+    left: not far, with a radius of at most `smallest`; for `make_lists`. Others are replaced by
+    their children; leaves that are not far are in neither."""
+    index, vector = tree.backend.UInt32, tree.backend.Array3f
+
+    def visit(node: Node, state: tuple[Any, ...]) -> tuple[Mask, tuple[Any, ...]]:
+        is_far = dr.squared_norm(c - vector(*node.head[:3])) > dr.square(inner + node.head[3])
+        is_left = ~is_far & ~node.is_leaf & (node.head[4] <= smallest)
+        chosen = is_far if far else is_left
+        if put is not None:
+            put(state[0], node.index, chosen)
+        return ~(is_far | is_left), (state[0] + dr.select(chosen, index(1), index(0)),)
+
+    return walk_lists(tree, lists, visit, (index(0),))[0]

@@ -25,8 +25,7 @@ from harnack.fields.solid_angles.far_sums import (
     COEFFICIENTS,
     DEGREE,
     FarSums,
-    dipoles_of,
-    nodes_of,
+    Sources,
     source_tree,
 )
 from harnack.fields.solid_angles.local_expansion import (
@@ -36,7 +35,6 @@ from harnack.fields.solid_angles.local_expansion import (
 )
 from harnack.fields.sums import SUM_ROUNDING, FieldSums
 from harnack.tree.cell_lookup import DEEPEST, MARGIN, OCTANTS, CellLookup, numbered_nodes
-from harnack.tree.lists import Lists, make_lists
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -48,9 +46,9 @@ if TYPE_CHECKING:
 
 # Factors k of `far_sums`, by experiment: for a cell's own dipoles, and for those that it gathers
 # for all cells in it. The second is larger, as each level of cells adds to the truncation.
-_NEAR, _SHARED = 2.5, 3.5
-# Nodes of the tree are left to the cells in a cell if they are no larger than its ball.
-_SMALL = 1.0
+_NEAR, _SHARED = 2.5, 4.0
+# Nodes of the tree are left to the cells in a cell up to this share of the radius of its ball.
+_SMALL = 0.35
 # Cells are split that have more near dipoles, by experiment; where memory is short, twice as many,
 # again and again, up to a number with which the tree is faster.
 _MOST_NEAR, _TOO_MANY = 64, 512
@@ -162,41 +160,39 @@ def build_cells(
         the backend. Where cells would take more bytes, they are larger and have more near dipoles.
 
     Proof that each dipole counts once in each cell that is not split. The root of the octree begins
-    with a list of one node, the root of the tree. In a cell that is split the dipoles of each node
-    of its list go to far nodes, which are added to the expansion of all cells in it, or to nodes
-    that are left (`nodes_of`), which are the list of each of its octants. A cell that is not split
-    takes its list apart: into far nodes, far dipoles of other nodes, and near dipoles
-    (`dipoles_of`).
+    with the root of the tree. A cell that is split adds what is far from it to the expansions of
+    all cells in it, and leaves the rest, nodes and dipoles, to each of its octants
+    (`Sources.parted`). In a cell that is not split nothing but near dipoles is left.
     """
     packed = source_tree(tree, levels, rows)
     octree = _fitting(packed, half, backend, most_bytes)
     if octree is None:
         return None
     double, shifts = packed.backend, shift_matrices(DEGREE, 0.5 / (math.sqrt(3) * MARGIN))
-    lists, shared = Lists.of_root(double), FarSums.none(1)
+    sources, shared = Sources.of_root(double), FarSums.none(1)
     nodes: list[IntArray] = []
     tables, near = [np.zeros((0, 0))], [np.zeros(0, np.uint32)]
     splits, count, total = 0, 0, 0
     for level in octree:
         leaves, split = np.flatnonzero(level.is_leaf), np.flatnonzero(~level.is_leaf)
-        radius = dr.opaque(double.Float, level.radius)
+        radius, none_stay = (dr.opaque(double.Float, one) for one in (level.radius, -1.0))
         if len(leaves):
-            own = lists.some(double, leaves)
-            sums, close = _own(packed, own, to_vector3(double, level.centers[leaves]), radius)
+            own, c = sources.some(double, leaves), to_vector3(double, level.centers[leaves])
+            sums, close = own.parted(packed, c, radius, _NEAR, none_stay)
             sums = sums.plus(shared.some(level.is_leaf))
-            lengths = to_numpy(close.count).astype(np.int64)
+            lengths = to_numpy(close.dipoles.count).astype(np.int64)
             first = total + np.cumsum(lengths) - lengths
             placed = level.centers[leaves], level.radius
             tables.append(_table(backend, *placed, sums, first, lengths))
-            near.append(to_numpy(close.entries)[: int(lengths.sum())])
+            near.append(to_numpy(close.dipoles.entries)[: int(lengths.sum())])
             total += int(lengths.sum())
         nodes.append(numbered_nodes(level.is_leaf, count, splits))
         count, splits = count + len(leaves), splits + len(split)
         if len(split):
-            lists, centers = lists.some(double, split), level.centers[split]
-            found, lists = _shared(packed, lists, to_vector3(double, centers), radius)
+            ours, c = sources.some(double, split), to_vector3(double, level.centers[split])
+            found, left = ours.parted(packed, c, radius, _SHARED, _SMALL * radius)
             shared = shared.some(~level.is_leaf).plus(found).of_octants(shifts, level.radius)
-            lists = lists.some(double, np.repeat(np.arange(len(split)), 8))
+            sources = left.some(double, np.repeat(np.arange(len(split)), 8))
     table, entries = np.concatenate(tables[1:]), np.concatenate(near)
     return NearFarCells(
         backend, CellLookup.of(backend, np.full(3, -half), 2 * half, nodes),
@@ -204,37 +200,6 @@ def build_cells(
         aligned_integers(backend, entries if len(entries) else np.zeros(1, np.uint32)), dipoles,
         count, _bytes(backend, octree),
     )  # fmt: skip
-
-
-def _shared(packed: PackedTree, lists: Lists, c: Vec3, radius: Real) -> tuple[FarSums, Lists]:
-    """What cells that are split add for all cells in them, and what is left to these."""
-    backend, inner, smallest = packed.backend, _SHARED * radius, _SMALL * radius
-    far, left = (
-        make_lists(
-            backend,
-            lambda put, far=far: nodes_of(packed, lists, c, inner, smallest, put, far=far),
-        )
-        for far in (True, False)
-    )
-    return FarSums.over_nodes(packed, far, c, radius), left
-
-
-def _own(packed: PackedTree, lists: Lists, c: Vec3, radius: Real) -> tuple[FarSums, Lists]:
-    """What cells that are not split add for themselves, and their near dipoles."""
-    backend, inner = packed.backend, _NEAR * radius
-    nothing, most = dr.opaque(backend.Float, -1.0), dr.opaque(backend.UInt32, _ANY)
-    nodes = make_lists(
-        backend,
-        lambda put: nodes_of(packed, lists, c, inner, nothing, put, far=True, leaves=False),
-    )
-    far, close = (
-        make_lists(
-            backend, lambda put, far=far: dipoles_of(packed, lists, c, inner, most, put, far=far)
-        )
-        for far in (True, False)
-    )
-    sums = FarSums.over_nodes(packed, nodes, c, radius)
-    return sums.plus(FarSums.over_dipoles(packed, far, c, radius)), close
 
 
 def _table(
@@ -278,18 +243,18 @@ def _octree(
     """The cells of a cube, level by level, split where more dipoles are near; None where they are
     too large."""
     backend = packed.backend
-    index, root = backend.UInt32, Lists.of_root(backend)
+    root = Sources.of_root(backend)
     levels: list[_Level] = []
     centers = np.zeros((1, 3))
     while len(centers):
         side = half / 2 ** len(levels)
         radius = math.sqrt(3) * side * MARGIN
-        lists = root.some(backend, np.zeros(len(centers), np.int64))
         is_last = len(levels) == DEEPEST
-        most = dr.opaque(index, _ANY if is_last else most_near)
-        near = dr.opaque(backend.Float, _NEAR * radius)
-        given = packed, lists, to_vector3(backend, centers), near, most, None
-        count = to_numpy(dipoles_of(*given, far=False)).astype(np.int64)
+        most = dr.opaque(backend.UInt32, _ANY if is_last else most_near)
+        near, none_stay = dr.opaque(backend.Float, _NEAR * radius), dr.opaque(backend.Float, -1.0)
+        ours, c = root.some(backend, np.zeros(len(centers), np.int64)), to_vector3(backend, centers)
+        found = ours.dipoles_of(packed, c, near, none_stay, None, far=False, most=most)
+        count = to_numpy(found).astype(np.int64)
         is_leaf = np.broadcast_to(count <= most_near, len(centers)) | is_last
         levels.append(_Level(centers, radius, is_leaf, count))
         if too_large(levels):
