@@ -12,7 +12,7 @@ import trimesh
 
 import harnack as hk
 from harnack.geometry import shapes
-from harnack.geometry.mesh_shapes import icosphere
+from harnack.geometry.mesh_shapes import icosphere, torus_mesh
 from harnack.meshing.checks import LocalError
 from harnack.rendering import studio_scene
 from harnack.view import scene
@@ -386,3 +386,22 @@ def test_the_floor_hides_nothing_that_moves_below_it() -> None:
         parts.append((np.ptp(drawn[..., :3].astype(int), axis=2) > 40).mean())
     assert parts[0] > 0.01
     assert parts[1] == pytest.approx(parts[0], rel=0.3)
+
+
+def test_many_pictures_are_painted_with_cells() -> None:
+    """Of a broken mesh, from the second on: and they show the same."""
+    vertices, faces = torus_mesh(1.0, 0.4, 24, 12)
+    broken = np.delete(faces, slice(None, None, 9), axis=0)
+    session = Session(Live.of(hk.WindingNumber(vertices, broken), {}))
+    plain = Session(Live.of(hk.WindingNumber(vertices, broken, cells=False), {}))
+    asked = {"kind": "draw", "size": (64, 48), "eye": EYE}
+    for has_cells in (False, True, True):
+        pictures = [one.answer(asked).pixels[..., :3].astype(int) for one in (session, plain)]
+        state = session._painted
+        assert state is not None
+        assert (state.drawn[0].surface.field.cells is True) == has_cells
+        assert (np.abs(pictures[0] - pictures[1]).max(axis=2) > 8).mean() < 5e-3
+    assert np.ptp(pictures[0], axis=(0, 1)).max() > 50
+    # Other controls begin anew.
+    session.answer({**asked, "settings": {"material": "gold"}})
+    assert session._painted is not state

@@ -9,7 +9,7 @@ import base64
 import json
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -41,6 +41,7 @@ from harnack.view.sliders import ends_of
 if TYPE_CHECKING:
     from harnack.backend import FloatArray
     from harnack.geometry import Volume
+    from harnack.rendering.stage import StudioObject
     from harnack.view.painter import Painting
     from harnack.view.scene import Plain
 
@@ -68,6 +69,17 @@ class QuestionError(ValueError):
 
 class Cancelled(Exception):
     """Work was stopped, because nobody waits for its answer any more."""
+
+
+@dataclass
+class _PaintedState:
+    """What is painted: what it was made of, its surfaces, the same prepared, and how many rays were
+    traced."""
+
+    key: Any
+    drawn: list[StudioObject]
+    made: list[Painted] = field(default_factory=list[Painted])
+    rays: int = 0
 
 
 class Client:
@@ -137,7 +149,7 @@ class Session:
     def __init__(self, live: Live) -> None:
         self.live = live
         self._painter = Painter()
-        self._painted: tuple[Any, list[Painted]] = (None, [])
+        self._painted: _PaintedState | None = None
 
     def answer(
         self, question: Mapping[str, Any], report: Progress = _ignore_progress
@@ -269,19 +281,25 @@ class Session:
             raise QuestionError("eye: pixel must be a positive number")
         seen = Eye(origin, right, up, forward, pixel)
         return self._painter.paint(
-            self._surfaces(controls), seen, size, show=show, ground=ground,
+            self._surfaces(controls, size[0] * size[1]), seen, size, show=show, ground=ground,
             is_idle=question.get("is_idle") is True,
         )  # fmt: skip
 
-    def _surfaces(self, controls: Controls) -> list[Painted]:
-        """The surfaces, prepared once as long as only the camera moves."""
+    def _surfaces(self, controls: Controls, rays: int) -> list[Painted]:
+        """The surfaces, prepared once as long as only the camera moves, and once more where all
+        rays so far pay for cells."""
         loops = None if controls.loops is None else [one.tobytes() for one in controls.loops]
         key = controls.values, loops, controls.cut, controls.settings
-        if self._painted[0] != key:
-            drawn = self.live.drawn(controls)
-            made = [Painted(self.live.placed(one), paints_of(one)) for one in drawn]
-            self._painted = key, made
-        return self._painted[1]
+        state = self._painted
+        if state is None or state.key != key:
+            state = self._painted = _PaintedState(key, self.live.drawn(controls))
+        state.rays += rays
+        drawn = [replace(one, surface=one.surface.for_rays(state.rays)) for one in state.drawn]
+        pairs = zip(drawn, state.drawn, strict=True)
+        if not state.made or any(a.surface.field is not b.surface.field for a, b in pairs):
+            state.drawn = drawn
+            state.made = [Painted(self.live.placed(one), paints_of(one)) for one in drawn]
+        return state.made
 
     def _picture(self, question: Mapping[str, Any], controls: Controls, report: Progress) -> Plain:
         """A picture of what is seen, as base64 of a PNG file."""
@@ -320,7 +338,7 @@ class Session:
         settings = {**live_settings(saved.settings), **saved.sliders}
         live = Live.of([*saved.surfaces], settings, edits=True, origins=saved.origins)
         self.live = live.framed(ends_of(live.subject.sliders))
-        self._painter, self._painted = Painter(), (None, [])
+        self._painter, self._painted = Painter(), None
         return self.live.scene(self.live.subject.name)
 
 
