@@ -41,6 +41,11 @@ def _cloud(n: int) -> hk.DipolePotential:
     return hk.DipolePotential(p, p, np.full(n, 4 * np.pi / n))
 
 
+def _with_holes() -> hk.WindingNumber:
+    vertices, faces = mesh_shapes.bumpy_sphere(4)
+    return hk.WindingNumber(vertices, mesh_shapes.remove_faces(faces, 0.1, 0))
+
+
 def distances(n: int = POINTS) -> str:
     """The section's text."""
     fields: dict[str, tuple[hk.Field, int]] = {
@@ -49,6 +54,7 @@ def distances(n: int = POINTS) -> str:
         "trefoil, 60 edges": (hk.SolidAngle(shapes.torus_knot(2, 3, 60)), n // 10),
         "gyroid": (hk.Gyroid(), n // 10),
         "cloud of 2,000 points": (_cloud(2000), n // 50),
+        "mesh of 5,120 faces, a tenth lost": (_with_holes(), n // 10),
     }
     rows = [
         "| surface | points | us a point | gap, median | gap, 90 % |", "|---|---|---|---|---|"

@@ -10,9 +10,11 @@ from typing import Any
 import drjit as dr
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
+from harnack.distance import closest
 from harnack.geometry import mesh_shapes
 from harnack.tree.nearest import NearestPoint
 from harnack.tree.triangles import triangle_records
@@ -254,6 +256,63 @@ def test_messy_meshes(seed: int) -> None:
     assert (found >= upper - 0.03).all()
     assert (found > upper * 1.01).mean() <= 0.018
     assert (found <= upper * 3).all()
+
+
+@pytest.mark.parametrize(
+    ("seed", "precision", "method"),
+    [(0, "double", "auto"), pytest.param(1, "single", "tree", marks=pytest.mark.slow)],
+)
+def test_meshes_with_holes(
+    seed: int, precision: Any, method: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The surface is triangles and what spans the holes, off which nothing is nearer. A tenth of
+    the answers were too long, by up to a tenth, and took rays, a hundred times as long."""
+    vertices, faces = mesh_shapes.torus_mesh(1.0, 0.42, 20, 10)
+    faces = faces[np.random.default_rng(seed).uniform(size=len(faces)) > 0.1]
+    field = hk.WindingNumber(vertices, mesh_shapes.flip_faces(faces, 0.05, seed), method=method)
+    rng = np.random.default_rng(seed + 10)
+    x = np.concatenate([
+        rng.uniform(vertices.min(axis=0) - 0.4, vertices.max(axis=0) + 0.4, (300, 3)),
+        beside_faces(vertices, faces, 300, 10 ** rng.uniform(-8, -0.5, 300), seed),
+    ])  # fmt: skip
+    x = x.astype(np.float32).astype(np.float64)
+    searched: list[Any] = []
+    search = closest.search
+
+    def counted(surface: Any, *given: Any) -> Any:
+        searched.append(surface.field.has_sheets)
+        return search(surface, *given)
+
+    monkeypatch.setattr(closest, "search", counted)
+    found = hk.distance_bounds(field, x, precision=precision)
+    assert searched == [False]
+    upper = cKDTree(points_of_surface(field, vertices, faces, 100_000)).query(x)[0]
+    rounding = 1e-5 if precision == "single" else 1e-9
+    assert (found.lower <= upper + rounding).all()
+    assert (found.upper <= 1.002 * upper + rounding).all()
+    # Feet lie on the surface: w is on both sides of the level about them, or takes it.
+    about = found.feet[:, None] + 3 * rounding * rng.normal(size=(60, 3))
+    w = field.value(about.reshape(-1, 3), precision="double").reshape(-1, 60)
+    assert (w.min(axis=1) < 0.5 + 1e-3).all()
+    assert (w.max(axis=1) > 0.5 - 1e-3).all()
+
+
+def test_levels_that_others_are_modulo_one() -> None:
+    """What spans a hole has the level of w, and not one that differs by a whole number: a second
+    sphere, twice, inside out and open, has the level -1/2 there."""
+    ball, faces = mesh_shapes.icosphere(2)
+    inner = 0.4 * ball + [0.1, 0, 0]
+    kept = faces[inner[faces].mean(axis=1)[:, 2] < 0.1]
+    vertices = np.concatenate([ball, inner])
+    outer = faces[ball[faces].mean(axis=1)[:, 2] < 0.9]
+    all_faces = np.concatenate([outer, kept[:, ::-1] + len(ball), kept[:, ::-1] + len(ball)])
+    field = hk.WindingNumber(vertices, all_faces)
+    x = np.random.default_rng(0).uniform(-0.5, 0.5, (300, 3))
+    found = hk.distance_bounds(field, x)
+    upper = cKDTree(points_of_surface(field, vertices, all_faces, 100_000)).query(x)[0]
+    assert (found.lower <= upper + 1e-9).all()
+    assert (found.upper >= upper - 0.03).all()
+    assert (found.upper > 1.01 * upper).mean() <= 0.01
 
 
 # --- the nearest triangle ----------------------------------------------------------------------

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
@@ -16,11 +16,12 @@ from harnack.backend.elementary import largest_coordinate, length
 from harnack.distance.mesh_surface import MeshSurface
 from harnack.distance.on_sheets import SheetSearch, close_in
 from harnack.distance.projection import Descent
-from harnack.distance.search import Known, Tolerance, search
+from harnack.distance.search import Found, Known, Tolerance, search
 from harnack.distance.surface_cells import RimDescent
 from harnack.distance.tangent import first_order, in_batches
 from harnack.fields.clearance import distance_below
 from harnack.fields.points import morton_order
+from harnack.fields.sheets import NO_SHEET
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
@@ -41,6 +42,14 @@ _BITS = 10
 _AWAY = 0.2
 # About the boundary the surface may be as far along a circle, in radii.
 _LONGEST_ARC = 2.5
+# Of feet of a field without jumps, which knows f but for a whole number: so near to a level f is.
+_SAME_LEVEL = 0.25
+# Where f is compared on both sides of a triangle: so far from the point towards the middle, in
+# parts of the way to it, and so far on either side, in sizes of the surface. By how much f has to
+# be on different sides of a level.
+_WITHIN_FACE, _BESIDE_FACE, _SURE = 1e-8, 1e-10, 1e-3
+# Samples of a smooth part for each point, about.
+_LOOKS = 10
 # Sheets that are examined for each point before cells are.
 _SHEETS = 16
 
@@ -97,7 +106,12 @@ def _in_order(
     if surface.field.has_sheets:
         start = job.on_sheets(x, start)
     tolerance = Tolerance(_TOLERANCE * _size(surface, x), is_proved)
-    found = search(surface, x, Known(start, near), job, tolerance, progress)
+    many = surface.field.for_rays(_LOOKS * len(x))
+    smooth = many.smooth_part() if surface.cut is None else None
+    if smooth is None:
+        found = search(surface, x, Known(start, near), job, tolerance, progress)
+    else:
+        found = _besides_sheets(job, smooth, x, Known(start, near), tolerance, progress)
     found.feet = job.refined(x, found.feet)
     distance = _length(x - found.feet)
     # A foot nearer than the proof allows: either it is off the surface by rounding, or a promise of
@@ -111,6 +125,45 @@ def _in_order(
     distance = np.where(refused, np.nan, distance)
     lower = np.fmin(np.maximum(lower, found.lower), distance)
     return Closest(x, feet, distance, above, lower, refused)
+
+
+def _besides_sheets(
+    job: _Points, smooth: Field, points: FloatArray, known: Known, tolerance: Tolerance,
+    progress: Callable[[str], None],
+) -> Found:  # fmt: skip
+    """What is found of a surface with sheets: on its smooth part, or what is known on sheets.
+
+    smooth: `Sheets.smooth_part` of the surface's field. known: feet on sheets.
+
+    Proof of the lower bounds: the surface lies on level sets of `smooth` and on sheets, and is no
+    nearer than the nearest of either. Feet on the former are of the surface where f has the level
+    too. Where f has not, and where a sheet is nearer than all feet, which may be of the surface
+    elsewhere than at its nearest point, rays look further.
+    """
+    backend, surface = job.backend, job.surface
+    alone = replace(surface, field=smooth).in_one_call(begins=True)
+    parts = _Points(backend, alone, alone.levels_on(backend))
+    near = parts.look(points)[-1]
+    found = search(
+        alone, points, Known(known.feet, near, on_boundary=False), parts, tolerance, progress
+    )
+    sheets = job.to_sheets(points)
+    rounding = _ROUNDING * backend.epsilon * (np.abs(points).max(axis=1, initial=0.0) + sheets)
+    lower = np.maximum(np.minimum(found.lower, sheets - rounding), 0)
+    away, feet = _length(points - known.feet), known.feet.copy()
+    rows = np.flatnonzero(_length(points - found.feet) < np.nan_to_num(away, nan=np.inf) - rounding)
+    there = parts.refined(points[rows], found.feet[rows])
+    value = np.asarray(surface.field.value(there, precision="double"))
+    is_level = np.abs(value[:, None] - surface.numbers).min(axis=1) < _SAME_LEVEL
+    feet[rows[is_level]] = there[is_level]
+    is_known = _length(points - feet) <= sheets + rounding + tolerance.length
+    is_known[rows[~is_level]] = False
+    again = np.flatnonzero(~is_known)
+    if len(again):
+        rest = Known(feet[again], known.near[again])
+        others = search(surface, points[again], rest, job, tolerance, progress)
+        feet[again], lower[again] = others.feet, np.maximum(lower[again], others.lower)
+    return Found(feet, lower)
 
 
 def _closest_on_mesh(
@@ -190,6 +243,48 @@ class _Points:
 
     def on_sheets(self, points: FloatArray, start: FloatArray) -> FloatArray:
         """The places (n, 3), or points of the surface on sheets where these are nearer."""
+        away, start = _length(points - start), start.copy()
+        rows = np.flatnonzero(~(away <= self.to_sheets(points) * (1 + 1e-12)))
+        start[rows] = self._on_nearest_face(points[rows])
+        rows = rows[np.isnan(start[rows, 0])]
+        if len(rows):
+            start[rows] = self._on_sheets(points[rows], start[rows])
+        return start
+
+    def _on_nearest_face(self, points: FloatArray) -> FloatArray:
+        """The nearest points (n, 3) of triangles that are the sheets, where the level lies between
+        the values of f on both sides right beside them; NaN elsewhere."""
+        mesh, prepared = self.surface.field.mesh_of_sheets(), self._prepared
+        feet = np.full_like(points, np.nan)
+        if mesh is None or not len(points):
+            return feet
+        real, index = prepared.backend.Float, prepared.backend.UInt32
+
+        def nearest(p: Vec3) -> tuple[Vec3, Any, Vec3]:
+            none, always = (real(-1), index(NO_SHEET)), prepared.backend.Bool(True)
+            found = prepared.field.nearest_sheet(p, none, real(dr.inf), always)
+            return p + found.offset, found.sheet, found.normal
+
+        y, sheet, normal = in_batches(prepared.backend, nearest, points)
+        corners = mesh[0][mesh[1][sheet.astype(np.int64)]]
+        y_within = y + _WITHIN_FACE * (corners.mean(axis=1) - y)
+        way = _BESIDE_FACE * _size(self.surface, points) * normal
+        sides = [self.surface.field.value(y_within + k * way, precision="double") for k in (1, -1)]
+        low, high = np.minimum(*sides) + _SURE, np.maximum(*sides) - _SURE
+        on = np.any([(low < one) & (one < high) for one in self.surface.numbers], axis=0)
+        feet[on] = y[on]
+        return feet
+
+    def to_sheets(self, points: FloatArray) -> FloatArray:
+        """The distances (n,) to sheets, of the surface or not."""
+        prepared = self._prepared
+
+        def compute(p: Vec3) -> tuple[Real]:
+            return (prepared.field.distance_to_sheets(p),)
+
+        return in_batches(prepared.backend, compute, points)[0]
+
+    def _on_sheets(self, points: FloatArray, start: FloatArray) -> FloatArray:
         x = np.concatenate([points, np.nan_to_num(start)])
         search = SheetSearch(self._prepared, max(float(np.abs(x).max(initial=0)), 1e-30), _SHEETS)
 

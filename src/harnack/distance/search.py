@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Protocol
 
 import drjit as dr
@@ -84,14 +84,16 @@ class Known:
     """What is known of the surface from the points alone.
 
     feet: (n, 3) points of the surface, or NaN. near: (n,) what the distance is to first order.
+    on_boundary: whether the feet lie on the curve that the surface ends in.
     """
 
     feet: FloatArray
     near: FloatArray
+    on_boundary: bool = True
 
     def some(self, rows: IntArray | slice) -> Known:
         """Of some points."""
-        return Known(self.feet[rows], self.near[rows])
+        return replace(self, feet=self.feet[rows], near=self.near[rows])
 
 
 @dataclass(frozen=True)
@@ -143,7 +145,7 @@ def search(
         away = np.linalg.norm(x - feet[rows], axis=1)
         half = max(4 * half, 1.0 + 4 * root.half, 1.1 * float(np.nanmax(away, initial=0.0)))
         root = _Cube(root.center, root.half + half)
-        so_far = Known(feet[rows], known.near[rows])
+        so_far = replace(known.some(rows), feet=feet[rows])
         found = _in_parts(surface, root, x, so_far, descents, tolerance, progress)
         # Beyond the cube there may be more.
         to_walls = root.half - np.abs(x - root.center).max(axis=1)
@@ -353,8 +355,8 @@ class _Search:
         return np.where(np.isnan(away), FAR, away)
 
     def _is_boundary(self, rows: IntArray | slice) -> BoolArray:
-        """Whether the best is what was known."""
-        return (self.feet[rows] == self.known.feet[rows]).all(axis=1)
+        """Whether the best is what was known on the boundary."""
+        return self.known.on_boundary & (self.feet[rows] == self.known.feet[rows]).all(axis=1)
 
     def _first(self, tree: CellTree) -> FloatArray:
         """Descend from the feet that seem nearest, which are returned (n, 3)."""

@@ -104,6 +104,11 @@ class Sheets:
         modulo 1, f lies between the same two of these levels, modulo 1, as 0 does."""
         return False
 
+    def smooth_part(self) -> Field | None:
+        """A field without sheets whose level sets hold all points of this one's that lie on no
+        sheet; None where none is known. Distances use it."""
+        return None
+
     def evaluate_modulo_one(self, p: Vec3) -> Sample:
         """f at p but for a whole number, if it `is_modulo`: for less work than `evaluate` takes."""
         return cast("Field", self).evaluate(p)
