@@ -20,13 +20,14 @@ from harnack.distance.search import Found, Known, Tolerance, search
 from harnack.distance.surface_cells import RimDescent
 from harnack.distance.tangent import first_order, in_batches
 from harnack.fields.clearance import distance_below
+from harnack.fields.field import Field
 from harnack.fields.points import morton_order
 from harnack.fields.sheets import NO_SHEET
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.enclosures import TargetLevels
-    from harnack.fields.field import Field
+    from harnack.fields.look import Sample
     from harnack.geometry import Volume
     from harnack.tracer import LevelSet
 
@@ -48,6 +49,8 @@ _SAME_LEVEL = 0.25
 # parts of the way to it, and so far on either side, in sizes of the surface. By how much f has to
 # be on different sides of a level.
 _WITHIN_FACE, _BESIDE_FACE, _SURE = 1e-8, 1e-10, 1e-3
+# How often what clusters leave out is computed for a foot.
+_CORRECTIONS = 2
 # Samples of a smooth part for each point, about.
 _LOOKS = 10
 # Sheets that are examined for each point before cells are.
@@ -411,22 +414,52 @@ class _Points:
         if exact is None or not len(rows):
             return feet
 
-        def directly(p: Vec3, start: Vec3) -> tuple[Vec3]:
-            y, _, is_lost, _ = exact.directly(p, start, self.backend.Float(dr.inf))
-            foot, found, _ = exact.end(p, y)
-            return (dr.select(found & ~is_lost, foot, dr.nan),)
-
         def to_level(start: Vec3) -> tuple[Vec3]:
             y = exact.onto_level(start)
             return (dr.select(dr.isfinite(dr.squared_norm(y)), y, start),)
 
         feet = feet.copy()
-        (there,) = in_batches(self.backend, directly, points[rows], feet[rows])
+        there = self._corrected(exact, points[rows], feet[rows])
         left = np.flatnonzero(np.isnan(there[:, 0]))
         if len(left):
             (there[left],) = in_batches(self.backend, to_level, feet[rows[left]])
         inside = ~np.isnan(self._within(there)[:, 0])
         feet[rows[inside]] = there[inside]
+        return feet
+
+    def _corrected(self, exact: Descent, points: FloatArray, feet: FloatArray) -> FloatArray:
+        """The feet (n, 3) on the level of the exact field, NaN where they are not found.
+
+        What clusters leave out hardly changes on the way, and costs as much as all of the field: so
+        it is computed at the foot, with its gradient, and Newton's method is that of the field with
+        clusters and this correction. Twice, as the foot moves by what is left out at first. Feet
+        count that are on the level of the exact field, to rounding.
+        """
+        rough = self._descent
+
+        def left_out(y: Vec3) -> tuple[Vec3, Vec3]:
+            one, other = exact.field.evaluate(y), rough.field.evaluate(y)
+            vector = self.backend.Array3f
+            return vector(one.value - other.value), vector(one.gradient) - vector(other.gradient)
+
+        def newton(p: Vec3, y: Vec3, value: Vec3, slope: Vec3) -> tuple[Vec3]:
+            field = _Corrected(rough.field, y, value.x, slope)
+            descent = replace(rough, field=field)
+            end, _, is_lost, _ = descent.directly(p, y, self.backend.Float(dr.inf))
+            foot, found, _ = descent.end(p, end)
+            return (dr.select(found & ~is_lost, foot, dr.nan),)
+
+        def on_level(p: Vec3, y: Vec3) -> tuple[Vec3]:
+            return (exact.last_step(p, y),)
+
+        feet, rows = feet.copy(), np.arange(len(feet))
+        for _ in range(_CORRECTIONS):
+            if len(rows):
+                given = points[rows], feet[rows], *in_batches(self.backend, left_out, feet[rows])
+                (feet[rows],) = in_batches(self.backend, newton, *given)
+                rows = rows[~np.isnan(feet[rows, 0])]
+        if len(rows):
+            (feet[rows],) = in_batches(self.backend, on_level, points[rows], feet[rows])
         return feet
 
     def noise(self, feet: FloatArray) -> FloatArray:
@@ -438,6 +471,25 @@ class _Points:
             return (self._descent.noise(y),)
 
         return in_batches(self.backend, compute, feet)[0]
+
+
+class _Corrected(Field):
+    """A field plus a linear function of the way from a point, other ones in each lane; its error is
+    what rounding does."""
+
+    def __init__(self, field: Field, at: Vec3, value: Real, slope: Vec3) -> None:
+        self._field, self._at, self._value, self._slope = field, at, value, slope
+
+    def evaluate(self, p: Vec3) -> Sample:
+        sample = self._field.evaluate(p)
+        shifted = sample.shifted(dr.dot(self._slope, p - self._at) + self._value)
+        return replace(
+            shifted, gradient=sample.gradient + self._slope, error=sample.error - sample.truncation,
+            truncation=0.0,
+        )  # fmt: skip
+
+    def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
+        return self._field.hessian(p)
 
 
 def _length(vectors: FloatArray) -> FloatArray:

@@ -207,6 +207,16 @@ class Descent:
         """How far rounding and approximation may have moved the level at y, as a length."""
         return self._evaluate(y)[1].noise
 
+    def last_step(self, x: Vec3, y: Vec3) -> Vec3:
+        """y moved onto the level, where it is closest to x but for so short a step as in `end`; NaN
+        elsewhere."""
+        above, here = self._evaluate(y)
+        steep = lengths.length(here.gradient)
+        off = -above / steep
+        lands = dr.abs(off) <= self.backend.epsilon**0.5 * dr.norm(x - y) + here.noise
+        foot = dr.fma(self.backend.Array3f(off / steep), here.gradient, y)
+        return dr.select(lands & self._is_known(here), foot, dr.nan)
+
     def _evaluate(self, y: Vec3) -> tuple[Real, _Place]:
         """f - level at y, and the place."""
         return self._place(y, self.field.evaluate(y))
