@@ -18,6 +18,7 @@ from harnack.fields.look import Sample
 from harnack.geometry import mesh_shapes, shapes
 from tests.distance.test_distance import CURVED, Bare, surface_points, true_distance, unit
 from tests.distance.test_mesh_distances import beside_faces, distance_to_closed_mesh
+from tests.oracles.direct_sums import dipole_sum
 from tests.oracles.mesh_distance import distances_to_triangles
 
 PRECISIONS = ("double", "single")
@@ -379,3 +380,24 @@ def test_no_dense_sample_is_nearer_in_many_points(name: str, where: str) -> None
     assert (found.lower <= nearest + 1e-12 * size).all()
     assert (found.upper > nearest + 1e-6 * size).sum() <= 2
     assert (found.upper <= nearest + 1e-4 * size).all()
+
+
+@pytest.mark.parametrize("cells", [None, True])
+def test_feet_on_clouds_are_on_the_exact_surface(cells: Any) -> None:
+    """They come from sums with clusters, which leave out 1e-4 of the size here, and are moved by
+    what these leave out; x is straight above them."""
+    rng = np.random.default_rng(3)
+    n = rng.normal(size=(2000, 3))
+    n /= np.linalg.norm(n, axis=1, keepdims=True)
+    points = n * (1 + 0.1 * n[:, :1] ** 2)
+    field = hk.DipolePotential(points, n, cells=cells)
+    x = 1.7 * rng.normal(size=(400, 3))
+    found = hk.distance_bounds(field, x)
+    total = dipole_sum(points, n * field.areas[:, None])
+    value, gradient = total(found.feet)
+    steep = np.linalg.norm(gradient, axis=1)
+    off = np.abs(value - 2 * np.pi) / steep
+    assert off.max() < 1e-12
+    away = (x - found.feet) / found.upper[:, None]
+    slant = np.linalg.norm(np.cross(away, gradient / steep[:, None]), axis=1)
+    assert np.quantile(slant, 0.95) < 1e-8

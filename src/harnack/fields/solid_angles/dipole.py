@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 _BEYOND_CELLS = 1.0
 # Cells are built by themselves from so many rays a point, and so many rays, on, and up to so many
 # points. To build them takes as long as to trace about 6 rays a point without them.
-_PAYS, _LEAST_RAYS, _MOST_POINTS = 15, 100_000, 200_000
+_PAYS, _LEAST_RAYS, _MOST_POINTS = 7, 100_000, 200_000
 # A point counts as near if the squared distance is less than this fraction of its area.
 _BESIDE = 0.04
 
