@@ -315,6 +315,60 @@ def test_levels_that_others_are_modulo_one() -> None:
     assert (found.upper > 1.01 * upper).mean() <= 0.01
 
 
+@pytest.mark.slow
+def test_feet_are_where_the_level_comes() -> None:
+    """By a singular edge w is steep, and the level seemed near: the foot (0.10, 0.3, -0.3) lay on
+    the patch, where w is at least 3/2."""
+    vertices, faces = mesh_shapes.icosphere(2)
+    u = np.linspace(-0.3, 0.3, 5)
+    patch = np.array([[a, b, -0.3] for a in u for b in u])
+    quads = [(5 * i + j, 5 * i + j + 5, 5 * i + j + 6, 5 * i + j + 1)
+             for i in range(4) for j in range(4)]  # fmt: skip
+    flat = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
+    n = len(vertices)
+    field = hk.WindingNumber(
+        np.concatenate([vertices, 1.3 * vertices, patch]),
+        np.concatenate([faces, faces + n, flat + 2 * n]),
+    )
+    x = np.array([[0.10139405, 0.49233492, -0.13777074], [0.1, 0.2, -0.14], [-0.4, 0.1, -0.2]])
+    found = hk.distance_bounds(field, x)
+    exact = distances_to_triangles(x, 1.3 * vertices[faces]).min(axis=1)
+    assert np.allclose(found.upper, exact, rtol=1e-9)
+    assert (found.lower <= exact).all()
+
+
+@pytest.mark.parametrize("level", [0.7, 1.5, -0.7])
+def test_one_triangle_has_no_level_beyond_a_half(level: float) -> None:
+    field = hk.WindingNumber([(0, 0, 0), (1, 0, 0), (0, 1, 0)], [(0, 1, 2)])
+    with pytest.warns(RuntimeWarning, match="no closest point was found for 2 of 2"):
+        found = hk.distance_bounds(field, [[0.3, 0.3, 0.5], [0.0, 0.0, 0.0]], level=level)
+    assert np.isnan(found.feet).all()
+
+
+@pytest.mark.slow
+def test_a_vertex_of_a_soup_that_the_level_does_not_reach() -> None:
+    """A ray that began there hit a triangle at once: w is at most 1/8 about the first one."""
+    corners = np.random.default_rng(0).normal(size=(180, 3))
+    field = hk.WindingNumber(corners, np.arange(180).reshape(-1, 3))
+    x = corners[np.abs(corners - [-0.7410805, -0.2374157, 0.7391781]).sum(axis=1).argsort()[:1]]
+    found = hk.distance_bounds(field, x)
+    assert 0.19 < found.upper[0] < 0.25
+    about = 1e-6 * np.random.default_rng(1).normal(size=(2000, 3))
+    largest = [field.value(one + about, precision="double").max() for one in (x, found.feet)]
+    assert largest[0] < 0.2
+    assert largest[1] > 0.5
+
+
+def test_points_on_edges_of_flat_wedges() -> None:
+    """On both sides of a face, as it was first done, was on the same side of the one beside it."""
+    ball, faces = mesh_shapes.icosphere(2)
+    vertices = ball @ np.array([[30.0, 5.0, 2.0], [0.0, 0.4, 9.0], [1.0, 0.0, 25.0]])
+    edges = vertices[faces[:, :2]].mean(axis=1)
+    field = hk.WindingNumber(vertices, mesh_shapes.remove_faces(faces, 0.05, 0))
+    found = np.abs(hk.signed_distance(field, edges))
+    assert (found < 1e-9).mean() > 0.97
+
+
 # --- the nearest triangle ----------------------------------------------------------------------
 
 

@@ -48,7 +48,7 @@ _SAME_LEVEL = 0.25
 # Where f is compared on both sides of a triangle: so far from the point towards the middle, in
 # parts of the way to it, and so far on either side, in sizes of the surface. By how much f has to
 # be on different sides of a level.
-_WITHIN_FACE, _BESIDE_FACE, _SURE = 1e-8, 1e-10, 1e-3
+_WITHIN_FACE, _BESIDE_FACE, _SURE = 1e-7, 1e-12, 1e-3
 # How often what clusters leave out is computed for a foot.
 _CORRECTIONS = 2
 # Samples of a smooth part for each point, about.

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from harnack.fields.field import Field
     from harnack.tracer.prepared import MarchResult, PreparedLevelSet
 
-__all__ = ["SheetSearch", "close_in", "takes_level"]
+__all__ = ["SheetSearch", "close_in", "is_on_surface", "takes_level"]
 
 # Half the length of a ray through a point of a sheet, in epsilons of coordinates.
 _SHORT = 32.0
@@ -370,7 +370,7 @@ def close_in(surface: PreparedLevelSet, x: Vec3, foot: Vec3) -> Vec3:
         hit = usable & (seen.status == int(Status.HIT))
         nearer = hit & (seen.t < t * (1 - 8 * backend.epsilon))
         there = dr.fma(vector(seen.t), way, x)
-        nearer &= _is_on_surface(surface, there, seen, nearer)
+        nearer &= is_on_surface(surface, there, seen, nearer)
         normal = dr.normalize(seen.gradient)
         touches = hit & dr.isfinite(dr.squared_norm(normal))
         touching = _TouchingPlane(normal, dr.dot(normal, way) * seen.t)
@@ -396,12 +396,12 @@ def close_in(surface: PreparedLevelSet, x: Vec3, foot: Vec3) -> Vec3:
     return dr.while_loop(start, more, body, label="closing in")[2]
 
 
-def _is_on_surface(surface: PreparedLevelSet, y: Vec3, hit: MarchResult, active: Mask) -> Mask:
-    """Whether hits y are on a sheet, or f takes the level about them: beside the edge of a sheet,
-    where its gradient has no bound, rays are within the tolerance of any level to first order."""
-    is_smooth = active & (hit.sheet == NO_SHEET)
+def is_on_surface(surface: PreparedLevelSet, y: Vec3, hit: MarchResult, active: Mask) -> Mask:
+    """Whether f takes the level about hits y: beside the edge of a sheet, where its gradient has no
+    bound, rays are within the tolerance of any level to first order, and a ray that begins there
+    may hit the sheet at once, whatever f is."""
     radius = _ABOUT * surface.backend.epsilon * fmax(largest_coordinate(y), hit.t)
-    return ~is_smooth | takes_level(surface, y, radius, is_smooth)
+    return takes_level(surface, y, radius, active)
 
 
 def _tilted(d: Vec3, step: Real, angle: Real) -> Vec3:

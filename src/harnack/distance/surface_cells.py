@@ -16,6 +16,7 @@ import numpy as np
 from harnack.backend import FloatArray, choose_backend
 from harnack.backend.elementary import clamp, fmax, fmin, largest_coordinate, length
 from harnack.distance.cell_tree import FAR, SurfaceCells
+from harnack.distance.on_sheets import is_on_surface
 from harnack.distance.tangent import TangentPlane, has_hessian, in_batches
 from harnack.fields.clearance import distance_below
 from harnack.tracer import Status
@@ -379,6 +380,7 @@ class CellProofs:
             y = dr.fma(vector(seen.t), d, o)
             square = dr.squared_norm(y - p)
             nearer = hit & (square < best)
+            nearer &= is_on_surface(self._prepared, y, seen, nearer)
             return dr.select(nearer, y, foot), dr.select(nearer, square, best), k + 1
 
         def more(foot: Vec3, best: Real, k: Any) -> Mask:
