@@ -393,11 +393,31 @@ def test_feet_on_clouds_are_on_the_exact_surface(cells: Any) -> None:
     field = hk.DipolePotential(points, n, cells=cells)
     x = 1.7 * rng.normal(size=(400, 3))
     found = hk.distance_bounds(field, x)
+    at_points = cKDTree(points).query(found.feet)[0] == 0
+    assert at_points.mean() < 0.5
     total = dipole_sum(points, n * field.areas[:, None])
-    value, gradient = total(found.feet)
+    x, feet, upper = x[~at_points], found.feet[~at_points], found.upper[~at_points]
+    value, gradient = total(feet)
     steep = np.linalg.norm(gradient, axis=1)
     off = np.abs(value - 2 * np.pi) / steep
     assert off.max() < 1e-12
-    away = (x - found.feet) / found.upper[:, None]
+    away = (x - feet) / upper[:, None]
     slant = np.linalg.norm(np.cross(away, gradient / steep[:, None]), axis=1)
     assert np.quantile(slant, 0.95) < 1e-8
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_beside_a_point_of_a_cloud(precision: Any) -> None:
+    """All levels come to it: distances were up to five thousand times as long."""
+    rng = np.random.default_rng(0)
+    points, d = (unit(rng.normal(size=(n, 3))) for n in (50, 400))
+    field = hk.DipolePotential(points, points)
+    which = np.arange(400) % 50
+    for u in (1e-3, 1e-5):
+        x = points[which] + u * d
+        found = hk.distance_bounds(field, x, precision=precision)
+        away = np.linalg.norm(x.astype(np.float32) - points[which], axis=1)
+        assert (found.upper <= np.maximum(u, away) * (1 + 1e-6) + 1e-12).all()
+        assert (found.lower <= found.upper).all()
+    # A smoothed sum has no such points, and a cut leaves out those outside.
+    assert not len(hk.DipolePotential(points, points, smoothing=0.2).singular_points)

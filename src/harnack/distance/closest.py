@@ -115,7 +115,7 @@ def _in_order(
         found = search(surface, x, Known(start, near), job, tolerance, progress)
     else:
         found = _besides_sheets(job, smooth, x, Known(start, near), tolerance, progress)
-    found.feet = job.refined(x, found.feet)
+    found.feet = _or_singular(surface, x, job.refined(x, found.feet))
     distance = _length(x - found.feet)
     # A foot nearer than the proof allows: either it is off the surface by rounding, or a promise of
     # the field does not hold.
@@ -167,6 +167,22 @@ def _besides_sheets(
         others = search(surface, points[again], rest, job, tolerance, progress)
         feet[again], lower[again] = others.feet, np.maximum(lower[again], others.lower)
     return Found(feet, lower)
+
+
+def _or_singular(surface: LevelSet, points: FloatArray, feet: FloatArray) -> FloatArray:
+    """The feet (n, 3), or the nearest singular points where these are nearer: beside those the
+    surface is a tiny loop that descents do not see."""
+    singular = surface.field.singular_points
+    if surface.cut is not None and len(singular):
+        singular = singular[surface.cut.contains_points(singular)]
+    if not len(singular) or not len(points):
+        return feet
+    import scipy.spatial  # here: half a second that few need
+
+    searching: Any = scipy.spatial
+    away, row = searching.cKDTree(singular).query(points)
+    nearer = ~(_length(points - feet) <= away)
+    return np.where(nearer[:, None], singular[row], feet)
 
 
 def _closest_on_mesh(

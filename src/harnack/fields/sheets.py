@@ -12,6 +12,8 @@ import copy
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
+import numpy as np
+
 if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, IntArray, Mask, Real, Vec3
     from harnack.fields.field import Field, Sample
@@ -239,6 +241,12 @@ class Boundary:
         """
         del p
         return None
+
+    @property
+    def singular_points(self) -> FloatArray:
+        """Points (n, 3) that all level sets come arbitrarily near to, such as the dipoles of a
+        cloud. Distances use them."""
+        return np.zeros((0, 3))
 
     def change_along(self, p: FloatArray, q: FloatArray) -> FloatArray | None:
         """The change (n,) of an angle-valued f, followed continuously along straight segments from

@@ -439,6 +439,10 @@ class DipolePotential(HasCells, DetailedField["_DipoleBuffers"], BatchedField):
         low, high = self.points.min(axis=0), self.points.max(axis=0)  # they may be replaced
         return Box(low - reach, high + reach)
 
+    @property
+    def singular_points(self) -> FloatArray:
+        return np.zeros((0, 3)) if self.smoothing else self.points[self.areas > 0]
+
     def describe(self) -> dict[str, Any]:
         said = ("estimated" if one else "given" for one in self.estimated)
         named = dict(zip(("normals", "areas"), said, strict=True))
