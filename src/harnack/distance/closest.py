@@ -448,8 +448,8 @@ class _Points:
 
         What clusters leave out hardly changes on the way, and costs as much as all of the field: so
         it is computed at the foot, with its gradient, and Newton's method is that of the field with
-        clusters and this correction. Twice, as the foot moves by what is left out at first. Feet
-        count that are on the level of the exact field, to rounding.
+        clusters and this correction. Twice, as the foot moves by what is left out at first. What
+        remains is a short step to the level of the exact field.
         """
         rough = self._descent
 

@@ -139,9 +139,9 @@ class Descent:
         off = -above / steep
         exact = dataclasses.replace(sample, error=0.0, gradient_error=0.0)
         lands = remainder(exact, dr.abs(off)) <= steep * here.noise
-        lands &= dr.abs(off) <= self.backend.epsilon**0.5 * dr.norm(x - y) + here.noise
+        foot, is_short = self._step_to_level(x, above, here)
+        lands &= is_short
         found = settled & (self._is_close(above, here) | (self._is_known(here) & lands))
-        foot = dr.fma(self.backend.Array3f(off / steep), here.gradient, y)
         free = free_radius(exact, rows, x, y)
         return foot, found, dr.select(found, free, 0)
 
@@ -211,11 +211,17 @@ class Descent:
         """y moved onto the level, where it is closest to x but for so short a step as in `end`; NaN
         elsewhere."""
         above, here = self._evaluate(y)
+        foot, is_short = self._step_to_level(x, above, here)
+        return dr.select(is_short & self._is_known(here), foot, dr.nan)
+
+    def _step_to_level(self, x: Vec3, above: Real, here: _Place) -> tuple[Vec3, Mask]:
+        """Where Newton's step along the gradient leads, and whether it is so short that the point
+        stays the closest to x, to rounding."""
         steep = lengths.length(here.gradient)
         off = -above / steep
-        lands = dr.abs(off) <= self.backend.epsilon**0.5 * dr.norm(x - y) + here.noise
-        foot = dr.fma(self.backend.Array3f(off / steep), here.gradient, y)
-        return dr.select(lands & self._is_known(here), foot, dr.nan)
+        foot = dr.fma(self.backend.Array3f(off / steep), here.gradient, here.y)
+        limit = self.backend.epsilon**0.5 * dr.norm(x - here.y) + here.noise
+        return foot, dr.abs(off) <= limit
 
     def _evaluate(self, y: Vec3) -> tuple[Real, _Place]:
         """f - level at y, and the place."""
