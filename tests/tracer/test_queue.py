@@ -15,6 +15,7 @@ from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.backend.arrays import aligned
 from harnack.backend.loops import on_some, while_queued
 from harnack.geometry.mesh_shapes import icosphere
+from harnack.tracer.hits import _are_scattered
 
 
 def cut_sphere() -> hk.LevelSet:
@@ -33,9 +34,15 @@ def parts() -> hk.LevelSet:
     return SCENES["exoskeleton"].surfaces()[0]
 
 
+def fourier_series() -> hk.LevelSet:
+    waves = np.random.default_rng(1).normal(size=(3, 3, 3))
+    return hk.level_set(hk.FourierSeries(waves, ((-1, -1, -1), (1, 1, 1))))
+
+
 CASES: dict[str, Callable[[], hk.LevelSet]] = {
     "curve": saddle,
-    "domain": lambda: hk.level_set(hk.Gyroid(1.0, domain=hk.Ball(radius=1.0))),
+    "domain": fourier_series,
+    "combined": lambda: hk.level_set(hk.Torus(1.0, 0.4) & hk.Cuboid((1.0, 1.5, 1.5))),
     "sheets": cut_sphere,
     "parts": parts,
     "confirmed": lambda: hk.level_set(hk.Gyroid(1.0, domain=hk.Ball(radius=1.0)), confirm=True),
@@ -78,6 +85,46 @@ def test_a_queue_changes_no_bit(name: str, precision: Any) -> None:
     for a, b in zip(one_by_one, queued, strict=True):
         # What a ray that missed saw last is of no meaning, but no other lane may write it.
         np.testing.assert_array_equal(a[active], b[active])
+
+
+def eye_rays(n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rays of a camera, row by row."""
+    y, x = np.divmod(np.arange(n * n), n)
+    d = np.column_stack([x / n - 0.5, y / n - 0.5, np.full(n * n, -1.5)])
+    return np.array([[0, 0, 3.0]]), d / np.linalg.norm(d, axis=1)[:, None]
+
+
+def parallel_rays(n: int) -> tuple[np.ndarray, np.ndarray]:
+    """From the points of a grid, row by row."""
+    y, x = np.divmod(np.arange(n * n), n)
+    return np.column_stack([x / n, y / n, np.full(n * n, 2.0)]), np.array([[0, 0, -1.0]])
+
+
+@pytest.mark.parametrize("rays", [eye_rays, parallel_rays])
+def test_rays_are_scattered_where_neighbors_differ(rays: Any) -> None:
+    backend = choose_backend("single")
+    o, d = rays(80)
+    order = np.random.default_rng(0).permutation(6400)
+    shuffled = [one[order] if len(one) > 1 else one for one in (o, d)]
+
+    def scattered(o: np.ndarray, d: np.ndarray) -> bool:
+        return _are_scattered(backend, to_vector3(backend, o), to_vector3(backend, d))
+
+    assert scattered(*shuffled) == (dr.backend_v(backend.Float) == dr.JitBackend.LLVM)
+    assert not scattered(o, d)
+    assert not scattered(*(one[:200] for one in shuffled)), "too few to share lanes"
+    still = np.repeat([[0.3, 0.2, 2.0]], 6400, axis=0)
+    assert not scattered(still, np.repeat([[0, 0, -1.0]], 6400, axis=0))
+
+
+def test_scattered_rays_end_as_others() -> None:
+    surface = saddle()
+    o, d = eye_rays(80)
+    order = np.random.default_rng(0).permutation(6400)
+    hits, others = hk.trace(surface, o, d), hk.trace(surface, o, d[order])
+    assert hits.hit.sum() > 1000
+    for name in ("t", "position", "normal", "evaluations", "status"):
+        np.testing.assert_array_equal(getattr(hits, name)[order], getattr(others, name))
 
 
 @dataclass(frozen=True)

@@ -51,6 +51,23 @@ def while_active(state: State, body: Callable[[State], State], label: str) -> St
     return record_of(state, iter(leaves))
 
 
+def changed_where(
+    active: Mask, change: Callable[[tuple[Any, ...]], tuple[Any, ...]], state: tuple[Any, ...],
+    label: str,
+) -> tuple[Any, ...]:  # fmt: skip
+    """The state, changed where active: by a loop of at most one trip, so that packets without such
+    lanes skip what it costs."""
+    index = dr.uint32_array_t(active)
+
+    def step(trip: Any, *state: Any) -> tuple[Any, ...]:
+        return trip + 1, *change(state)
+
+    def is_first(trip: Any, *_: Any) -> Mask:
+        return active & (trip < 1)
+
+    return dr.while_loop((index(0), *state), is_first, step, label=label)[1:]
+
+
 def leaves_of(record: Any) -> Iterator[Any]:
     """The arrays of a record of arrays and records, in order; None is left out."""
     for value in _entries(record):

@@ -6,6 +6,7 @@ have a *foot*: a known point of the surface.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
@@ -15,6 +16,7 @@ import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
 from harnack.backend.elementary import fmax, fmin
+from harnack.backend.loops import changed_where
 from harnack.tree import PackedTree, build_hierarchy, for_each, pack, walk
 from harnack.tree.nearest import square_to_some_point
 from harnack.tree.triangles import box_levels
@@ -187,9 +189,14 @@ class CellTree:
             taken &= cell.is_apart(best.foot, best.apart)
             for other in others:
                 taken &= cell.is_apart(other, 1.0)
+            near = dr.select(taken, near, dr.inf)
+            add = functools.partial(listed_with, cell, near)
+            return lower, *changed_where(taken, add, (*listed,), "listed cells")
+
+        def listed_with(cell: _Record, near: Real, state: State) -> State:
             # The list is sorted: what is nearer takes a place, and what was there goes on to the
             # next, unless both lead to the same place.
-            near, foot = dr.select(taken, near, dr.inf), cell.foot
+            listed, foot = [*state], cell.foot
             for k in range(0, len(listed), 2):
                 there, y = listed[k], listed[k + 1]
                 is_nearer, is_apart = near < there, cell.is_apart(y, 1.0)
@@ -197,7 +204,7 @@ class CellTree:
                 listed[k + 1] = dr.select(is_nearer, foot, y)
                 near = dr.select(is_apart, dr.select(is_nearer, there, near), dr.inf)
                 foot = dr.select(is_nearer, y, foot)
-            return lower, *listed
+            return tuple(listed)
 
         def is_open(low: Vec3, high: Vec3) -> Mask:
             y = best.foot

@@ -84,6 +84,10 @@ class Field(Sheets, Parts, Detail, Boundary, abc.ABC):
     """The shortest wavelength of f that matters, where it is known: code that samples f in cells
     makes them smaller than this."""
 
+    is_cheap: bool = False
+    """Whether a sample takes so little time that a lane needs longer to fetch another ray from a
+    queue (`tracer.prepared.trace_queued`), by experiment."""
+
     has_creases: bool = False
     """Whether the gradient jumps somewhere, as it does where the surfaces of a union meet."""
 

@@ -71,6 +71,7 @@ class Formula(Field):
     """
 
     is_convex: bool = False
+    is_cheap = True
     has_creases = True  # it may use abs, maximum and minimum
     overstep = 1.0  # proved steps are long already; trying longer ones takes more samples
     lipschitz: Real | None = None

@@ -14,7 +14,7 @@ import drjit as dr
 
 from harnack.backend import Mask, Real, Vec3
 from harnack.backend.elementary import length as norm
-from harnack.backend.loops import on_some
+from harnack.backend.loops import changed_where, on_some
 from harnack.fields.look import Sample
 from harnack.tracer import Status
 
@@ -168,23 +168,20 @@ def _sample_where(
 
     value: f near p. d: of the ray; a point with a zero gradient has the normal -d.
 
-    A loop of at most one iteration, skipped where no lane is active: a sample of a broken mesh
-    costs more than a ray that hits a triangle or nothing, and most rays do.
+    Skipped where no lane is active: a sample of a broken mesh costs more than a ray that hits a
+    triangle or nothing, and most rays do.
     """
     real, vector = prepared.backend.Float, prepared.backend.Array3f
 
-    def once(trip: Any, *_: Any) -> tuple[Any, ...]:
+    def sampled(_: tuple[Any, ...]) -> tuple[Any, ...]:
         sample = prepared.sample_near(p, value)
         length = norm(sample.gradient)
         normal = dr.select(length > 0, sample.gradient / length, -d)
         shading = vector(normal if sample.normal is None else sample.normal)
-        return trip + 1, real(sample.value), real(sample.error), vector(sample.gradient), shading
+        return real(sample.value), real(sample.error), vector(sample.gradient), shading
 
-    def is_first(trip: Any, *_: Any) -> Mask:
-        return active & (trip < 1)
-
-    start = prepared.backend.UInt32(0), real(0), real(0), vector(0), vector(0)
-    _, value, error, gradient, normal = dr.while_loop(start, is_first, once, label="at hits")
+    start = real(0), real(0), vector(0), vector(0)
+    value, error, gradient, normal = changed_where(active, sampled, start, "at hits")
     return Sample(value, gradient, (), error, normal=normal)
 
 

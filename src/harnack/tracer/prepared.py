@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeVar
 
 import drjit as dr
 
@@ -97,11 +97,18 @@ class _Ray:
         return self.walk.active
 
 
+Ends = TypeVar("Ends")
+
+
 def trace_queued(
-    tracer_of: TracerOf, path: Path, start: Real, end: Real, state: MarchState
-) -> tuple[MarchState, Any]:
-    """What `RayTracer.run` finds, evaluated, by few lanes: one that has followed a ray to its end
-    fetches the next.
+    tracer_of: TracerOf, path: Path, start: Real, end: Real, state: MarchState,
+    wanted: Callable[[MarchState, Any], Ends],
+) -> Ends:  # fmt: skip
+    """What is wanted of what `RayTracer.run` finds, evaluated, by few lanes: one that has followed
+    a ray to its end fetches the next.
+
+    wanted: a record of some arrays of the end state and the index. Each is written by itself, which
+        takes a good part of the time of a step.
 
     Rays differ in length, and a packet of a processor waits for its longest. Bounces of light paths
     go in all directions: there the longest ray of a packet took three to six times as many samples
@@ -117,8 +124,9 @@ def trace_queued(
 
     begun = tracer_of(path, start, end).begin(state)
     rays = _Ray(path.origin, path.direction, start, end, begun)
-    walk = while_queued(rays, one, lambda ray: ray.walk, "harnack queue")
-    return tracer(rays).end_of(walk)
+    return while_queued(
+        rays, one, lambda ray: wanted(*tracer(ray).end_of(ray.walk)), "harnack queue"
+    )
 
 
 # Rays that look for crossings begin before the proved extent of the surface and end behind it, so
@@ -162,6 +170,39 @@ class MarchResult:
 
 
 @dataclass(frozen=True)
+class _Ends:
+    """What `MarchResult` is made of: some of a `MarchState`, and the index of the sheet or part."""
+
+    proved_to: Real
+    value: Real
+    gradient: Vec3
+    excess: Real
+    evaluations: Any
+    status: Any
+    contact: Contact | None
+    sheet: Any
+
+    @classmethod
+    def of(cls, end: MarchState, sheet: Any) -> _Ends:
+        """Those of an end state."""
+        names = (field.name for field in dataclasses.fields(cls) if field.name != "sheet")
+        return cls(**{name: getattr(end, name) for name in names}, sheet=sheet)
+
+
+@dataclass(frozen=True)
+class _Status:
+    """How rays ended, alone."""
+
+    status: Any
+
+    @classmethod
+    def of(cls, end: MarchState, sheet: Any) -> _Status:
+        """That of an end state."""
+        del sheet
+        return cls(end.status)
+
+
+@dataclass(frozen=True)
 class PreparedLevelSet:
     """A level set on a backend. Its methods can be called while a kernel is being recorded.
 
@@ -173,8 +214,8 @@ class PreparedLevelSet:
         which do not count.
     section: the volume, one of those that `volume` is the intersection of, that cuts the surface
         open; None for none.
-    queued: whether rays are traced at once, by few lanes that share a queue. Then its methods
-        cannot be called while a kernel is being recorded.
+    queued: whether rays are traced at once, and where a sample is not cheap by few lanes that share
+        a queue. Then its methods cannot be called while a kernel is being recorded.
     around: for a field whose coarse samples know f but for a whole number, the volume outside of
         which that number is the one of f = 0; None for no such samples.
     """
@@ -234,15 +275,15 @@ class PreparedLevelSet:
     def occluded(self, o: Vec3, d: Vec3, t_min: Real, t_max: Real, active: Mask = True) -> Mask:
         """Whether the surface lies between t_min and t_max. Out of steps counts as occluded:
         what is not proved free must not let light through."""
-        end, _ = self._march(o, d, t_min, t_max, active, any_hit=True)
+        end = self._march(o, d, t_min, t_max, active, _Status.of, any_hit=True)
         return end.status != int(Status.MISS)
 
     def first_hit(
         self, o: Vec3, d: Vec3, t_min: Real, t_max: Real, active: Mask = True
     ) -> MarchResult:
         """The first hit of rays o + t d, |d| = 1, for t_min <= t <= t_max. Inactive rays miss."""
-        end, sheet = self._march(o, d, t_min, t_max, active)
-        t, gradient, excess, side = end.proved_to, end.gradient, end.excess, None
+        end = self._march(o, d, t_min, t_max, active, _Ends.of)
+        sheet, t, gradient, excess, side = end.sheet, end.proved_to, end.gradient, end.excess, None
         contact, evaluations = end.contact, end.evaluations
         if contact is not None:
             crossed = end.status == int(Status.HIT)
@@ -358,10 +399,11 @@ class PreparedLevelSet:
         t_min: Real,
         t_max: Real,
         active: Mask,
+        wanted: Callable[[MarchState, Any], Ends],
         *,
         any_hit: bool = False,
-    ) -> tuple[MarchState, Any]:
-        """The end state of rays, and the index of the sheet or the part that each hit.
+    ) -> Ends:
+        """What is wanted of the end state of rays and the index of the sheet or part that each hit.
 
         any_hit: whether any hit will do if it is found with less work than the first.
         """
@@ -377,6 +419,6 @@ class PreparedLevelSet:
                 return PartTracer(here, self.field, path, start, end, any_hit)
             return PlainTracer(here, self.field, path, end)
 
-        if self.queued and march.hysteresis is None:
-            return trace_queued(tracer, path, start, end, state)
-        return tracer(path, start, end).run(state)
+        if self.queued and march.hysteresis is None and not self.field.is_cheap:
+            return trace_queued(tracer, path, start, end, state, wanted)
+        return wanted(*tracer(path, start, end).run(state))

@@ -124,6 +124,7 @@ class HypersphericalHarmonic(Field):
         TypeError: l, j or m is no whole number.
     """
 
+    is_cheap = True
     overstep = 1.6
     is_entire = True
 

@@ -192,6 +192,7 @@ class EigenfunctionSum(Field):
     """
 
     is_entire = True
+    is_cheap = True
 
     def __init__(self, terms: Iterable[Term], *, domain: Volume | None = None) -> None:
         self.terms = checked_terms(terms)

@@ -78,6 +78,7 @@ class Blobs(Formula):
     Raises BlobError (a ValueError) for numbers that are no blobs.
     """
 
+    is_cheap = False
     default_level: float = 1.0
     period: ClassVar[float | None] = None
 

@@ -49,6 +49,7 @@ class HRBF(Formula):
     Raises ValueError for what are no points with normals, or points that are given twice.
     """
 
+    is_cheap = False
     period: ClassVar[float | None] = None
     default_level: float = 0.0
 

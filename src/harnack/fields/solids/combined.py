@@ -390,6 +390,8 @@ class Blend(Shape):
     where both functions are at most the radius: within the union of the solids grown by the radius.
     """
 
+    is_cheap = False
+
     parts: tuple[Solid, Solid]
     radius: Any
     power: Any

@@ -288,7 +288,8 @@ class Derived(Solid):
 
     def _take_over(self, *names: str) -> None:
         """Copy the inner field's settings for the tracer, and these attributes."""
-        for name in ("has_detail", "coarsest_detail", "overstep", "wavelength", *names):
+        settings = "has_detail", "coarsest_detail", "overstep", "wavelength", "is_cheap"
+        for name in (*settings, *names):
             object.__setattr__(self, name, getattr(self.inner, name))
 
     def leaves(self, change: Callable[[Solid], Solid]) -> Solid:
