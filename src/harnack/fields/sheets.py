@@ -9,6 +9,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
@@ -114,6 +115,12 @@ class Sheets:
     def evaluate_modulo_one(self, p: Vec3) -> Sample:
         """f at p but for a whole number, if it `is_modulo`: for less work than `evaluate` takes."""
         return cast("Field", self).evaluate(p)
+
+    def value_where_known(self, p: Vec3, active: Mask) -> Real:
+        """f at p, where active, if it `is_modulo` and less work than `evaluate` takes tells it; NaN
+        elsewhere, and where p may lie on a sheet."""
+        del active
+        return 0 * p.x + math.nan
 
     def next_crossing(
         self, o: Vec3, d: Vec3, after: Crossing, t_max: Real, active: Mask

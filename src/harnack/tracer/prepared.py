@@ -345,7 +345,12 @@ class PreparedLevelSet:
             whole_numbers = WholeNumbers(self.levels)
             entry, _ = self.around.clip(path.origin, path.direction, t_min, t_max)
             outside = (entry > t_min) & (start <= entry)
-            state = replace(state, detail=dr.select(outside, 0, real(self.field.coarsest_detail)))
+            begins = state.active & ~outside
+            value = self.field.value_where_known(path.point(start), begins)
+            knows = outside | dr.isfinite(value)
+            detail = dr.select(knows, 0, real(self.field.coarsest_detail))
+            value = dr.select(dr.isfinite(value), value, 0)
+            state = replace(state, detail=detail, value=real(value))
         march = March(
             backend,
             self.levels,

@@ -372,7 +372,7 @@ def squared_distance_to_segment(a: Vec3, e: Vec3, inverse: Real) -> Real:
     return dr.squared_norm(_on_segment(a, e, inverse))
 
 
-def jumps_within(rays: TriangleRays, x: Vec3, distance: Real) -> Real:
+def jumps_within(rays: TriangleRays, x: Vec3, distance: Real, active: Mask = True) -> Real:
     """The sum of the sizes of the winding number's jumps across triangles within a distance of
     x."""
     real, vector = rays.tree.backend.Float, rays.tree.backend.Array3f
@@ -387,4 +387,4 @@ def jumps_within(rays: TriangleRays, x: Vec3, distance: Real) -> Real:
         within = active & (row[INDEX] >= 0) & (NearestPoint.of(row, x).square <= reach)
         return (state[0] + dr.select(within, dr.abs(row[PARITY]), 0),)
 
-    return walk(rays.tree, visit, (real(0),))[0]
+    return walk(rays.tree, visit, (real(0),), active)[0]

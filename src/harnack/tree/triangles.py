@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 PARITY, INDEX, EDGES = 9, 10, 11
 # A ray that is so many roundings of a coordinate from an edge counts as passing through the edge.
 _CLOSE = 4.0
+# A crossing so many roundings of a coordinate from the end of a line may be on either side of it.
+_UNSURE = 64.0
 # Triangles are numbered in floats; single precision holds no larger integers without gaps.
 MOST_TRIANGLES = 2**24
 NO_TRIANGLE = 0xFFFFFFFF
@@ -237,6 +239,34 @@ class TriangleRays:
             return (state[0] + dr.select(active & (t > t_min), turn, 0),)
 
         return walk(self.tree, visit, (real(0),), active)[0]
+
+    def turns_between(self, frame: Frame, end: Real, unit: Real, active: Mask) -> tuple[Real, Mask]:
+        """The sum of the signs of all crossings with 0 < t < end, and where that is sure.
+
+        unit: the rounding of a coordinate.
+
+        A computed t belongs to a point of the triangle within a few units of the ray, so that it is
+        off by that over the cosine between ray and normal. Where this leaves it open whether t is
+        between the ends, nothing is sure.
+        """
+        real, inside = self.tree.backend.Float, self._boxes(frame)
+
+        def visit(node: Node, state: State) -> tuple[Mask, State]:
+            open_ = inside(node, real(0), real(end))
+            return open_, for_each(node, open_ & node.is_leaf, add, state)
+
+        def add(row: list[Real], active: Mask, state: State) -> State:
+            turns, sure = state
+            t, turn = crossing(row, frame)
+            normal = normal_of(row, self.tree.backend.Array3f)
+            steep, off = dr.abs(dr.dot(normal, frame.d)), _UNSURE * unit * dr.norm(normal)
+            clear = (dr.abs(t) * steep > off) & (dr.abs(t - end) * steep > off)
+            between = active & (t > 0) & (t < end)
+            return turns + dr.select(between, turn, 0), sure & (clear | (turn == 0) | ~active)
+
+        start = real(0), self.tree.backend.Bool(active)
+        turns, sure = walk(self.tree, visit, start, active)
+        return turns, sure
 
     def turns_along(self, x: Vec3, way: Real, active: Mask = True) -> Real:
         """The sum of the signs of all crossings of rays from x up (way 1) or down (-1) the z axis.

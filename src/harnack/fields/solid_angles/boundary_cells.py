@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import drjit as dr
 import numpy as np
 
+from harnack.backend import to_numpy, to_vector3
 from harnack.fields.look import Sample
 from harnack.fields.solid_angles.curve_cells import CurveCells
 from harnack.fields.solid_angles.curve_octree import build_curve_cells
@@ -23,11 +24,16 @@ from harnack.fields.solid_angles.edge_angles import bends, swept_ball
 from harnack.fields.solid_angles.edge_trails import Line, closed_trails, known_along
 from harnack.fields.solid_angles.edges import near_rounding
 from harnack.fields.sums import SLOPE_ROUNDINGS, SUM_ROUNDING
+from harnack.tree.nearest import distance_to_triangles, jumps_within
+from harnack.tree.triangles import Frame
 
 if TYPE_CHECKING:
-    from harnack.backend import Backend, FloatArray, Mask, Real, Vec3
+    from collections.abc import Callable
+
+    from harnack.backend import FloatArray, Mask, Real, Vec3
     from harnack.enclosures import Lipschitz
     from harnack.fields.solid_angles.winding_mesh import WindingMesh
+    from harnack.tree.triangles import TriangleRays
 
 __all__ = ["BoundaryCells"]
 
@@ -38,20 +44,33 @@ _SHARE = 1 / (4 * math.pi)
 _NEAR, _SHARED = 4.0, 3.5
 # Roundings of a coordinate: of a point, and within which of an edge nothing is known.
 _PLACE, _MET = 8.0, 16.0
+# In roundings: points are that far off triangles where w is known from a cell's center, and so are
+# the centers. By how much w may then be off.
+_OFF, _SURE = 64.0, 0.125
 
 
 @dataclass(frozen=True)
 class BoundaryCells:
-    """Cells of the singular edges of a mesh on a backend, in its unit coordinates."""
+    """Cells of the singular edges of a mesh on a backend, in its unit coordinates.
+
+    rays: the triangles. at_centers: w at the center of each cell; NaN where a triangle is near.
+    """
 
     cells: CurveCells
+    rays: TriangleRays
+    at_centers: Real
 
     @classmethod
     def build(
-        cls, backend: Backend, mesh: WindingMesh, low: FloatArray, high: FloatArray, most_bytes: int
-    ) -> BoundaryCells | None:
+        cls, rays: TriangleRays, mesh: WindingMesh, low: FloatArray, high: FloatArray,
+        most_bytes: int, value: Callable[[FloatArray], FloatArray],
+    ) -> BoundaryCells | None:  # fmt: skip
         """Cells of a cube around the mesh and the box from low (3,) to high (3,), of at most so
-        many bytes; None where that is too little."""
+        many bytes; None where that is too little.
+
+        value: w at points (n, 3).
+        """
+        backend = rays.tree.backend
         trails = closed_trails(mesh.singular)
         loops = tuple(mesh.unit_vertices[trail[:-1]] for trail in trails)
         ends = (np.array(end) for end in (low, high))
@@ -67,7 +86,13 @@ class BoundaryCells:
             near=_NEAR,
             shared=_SHARED,
         )
-        return None if cells is None else cls(cells)
+        if cells is None:
+            return None
+        centers = cells.centers()
+        near = distance_to_triangles(rays, to_vector3(backend, centers))
+        w = value(centers * mesh.size + mesh.center)
+        w[to_numpy(near) < _OFF * backend.epsilon] = np.nan
+        return cls(cells, rays, backend.Float(w.astype(backend.dtype)))
 
     @property
     def count(self) -> int:
@@ -78,6 +103,37 @@ class BoundaryCells:
     def size(self) -> int:
         """Their bytes."""
         return self.cells.size
+
+    def value_where_known(self, x: Vec3, unit: Real, active: Mask) -> Real:
+        """w at x where active; NaN where it is not known.
+
+        unit: the rounding of a coordinate.
+
+        Proof. On the line from the cell's center c to x, w changes by that of the solid angle of
+        the boundary over 4 pi, and where the line crosses a triangle along its normal, by -1
+        (`edge_lift`). So w is known at x with the errors of w(c) and of the cell; it is the number
+        nearest to that of those that are what the cell knows modulo 1, as all errors together are
+        below a quarter. On a triangle nothing is known, nor where `turns_between` or
+        `change_from_center` are not sure.
+        """
+        backend, real = self.cells.backend, self.cells.backend.Float
+        found, inside = self.cells.sums(x, active)
+        way = x - found.center
+        end = dr.norm(way)
+        inside &= end > _OFF * unit
+        d = dr.select(inside, way / end, backend.Array3f(0, 0, 1))
+        frame = Frame.along(backend, found.center, d)
+        change, sure = self.cells.change_from_center(found, frame, x, unit, inside)
+        turns, clear = self.rays.turns_between(frame, end, unit, inside)
+        on_triangle = jumps_within(self.rays, x, _OFF * unit, inside)
+        estimate = dr.gather(real, self.at_centers, found.cell, inside) - turns + _SHARE * change
+        value = _SHARE * found.sums.angle
+        rest = estimate - value
+        number = dr.round(rest)
+        error = found.error + found.rounding
+        known = inside & sure & clear & (on_triangle == 0)
+        known &= (dr.abs(rest - number) < _SURE) & (_SHARE * error < _SURE)
+        return dr.select(known, value + number, dr.nan)
 
     def sample(
         self, x: Vec3, direction: Vec3 | None, unit: Real, active: Mask

@@ -12,8 +12,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
+import numpy as np
 
+from harnack.backend import to_numpy
 from harnack.backend.elementary import fmin
+from harnack.fields.solid_angles.edge_lift import LiftedProduct, ends_factor, sight_of
 from harnack.fields.solid_angles.edge_trails import with_edge_rates
 from harnack.fields.solid_angles.edges import Edge, EdgeSums, inner_product, spinor
 from harnack.fields.solid_angles.far_edges import COEFFICIENTS, DEGREE
@@ -22,13 +25,17 @@ from harnack.fields.sums import SUM_ROUNDING
 from harnack.tree.nearest import squared_distance_to_segment
 
 if TYPE_CHECKING:
-    from harnack.backend import Backend, Mask, Real, Vec3
+    from harnack.backend import Backend, FloatArray, Mask, Real, Vec3
     from harnack.backend.records import Records
+    from harnack.fields.solid_angles.edge_lift import Sight
     from harnack.fields.solid_angles.edge_trails import Line
     from harnack.tree.cell_lookup import CellLookup
+    from harnack.tree.triangles import Frame
 
 # Numbers of a record before the coefficients, and vertices in a record of near edges.
 HEAD, VERTICES = 15, 2
+# Areas of so many roundings do not tell on which side of a line an edge passes.
+_UNSURE = 64.0
 # Lengths up to this part of the distance to far edges are used along lines.
 _ALONG = 0.5
 
@@ -43,6 +50,8 @@ class CellSums:
     rest: the gradient of the polynomial. cubes, free: of far edges, an upper bound of the integral
         of |dp|/D^3, and a lower bound of the distance.
     first, count: of the records of near edges.
+    cell, center: the number of the cell, and where it is. change: the value of the polynomial
+        less that at the center.
     """
 
     sums: EdgeSums
@@ -54,6 +63,9 @@ class CellSums:
     free: Real
     first: Any
     count: Any
+    cell: Any
+    center: Vec3
+    change: Real
 
 
 @dataclass(frozen=True)
@@ -78,6 +90,11 @@ class CurveCells:
     count: int
     size: int
 
+    def centers(self) -> FloatArray:
+        """(count, 3), which the backend's numbers hold exactly."""
+        row = self.records.row(dr.arange(self.backend.UInt32, self.count))
+        return to_numpy(self.backend.Array3f(*row[:3])).astype(np.float64)
+
     def sums(self, x: Vec3, active: Mask) -> tuple[CellSums, Mask]:
         """The sums over all edges at x, and the mask of points for which they hold: those that are
         active and lie in the cube.
@@ -94,7 +111,8 @@ class CurveCells:
         active = active & inside
         row = self.records.row(number, active)
         inverse, error, slope_error, rounding, least, factor, cubes = row[3:10]
-        u = x - vector(*row[:3])
+        center = vector(*row[:3])
+        u = x - center
         constant, *others = row[HEAD : HEAD + COEFFICIENTS]
         polynomial = [self.backend.Float(0), *others]
         value, *slopes = value_and_gradient(polynomial, [*(u * inverse)], DEGREE)
@@ -114,7 +132,51 @@ class CurveCells:
             near.cubes + far,
             near.fourths + far / free,
         )
-        return CellSums(sums, error, slope_error, rounding, rest, far, free, first, count), active
+        parts = error, slope_error, rounding, rest, far, free, first, count, number, center, value
+        return CellSums(sums, *parts), active
+
+    def change_from_center(
+        self, found: CellSums, frame: Frame, x: Vec3, unit: Real, active: Mask
+    ) -> tuple[Real, Mask]:
+        """How much the solid angle, continued along the line from the cell's center, is larger at
+        x; and where that is known.
+
+        frame: of rays from the center to x. unit: the rounding of a coordinate.
+
+        Proof. What the far edges add is the polynomial in all of the ball. The near loops are
+        closed, so that the lifted sum of their edges (`edge_lift`) is their solid angle; it has no
+        jumps on the line, as long as this does not meet an edge. Where rounding leaves it open on
+        which side an edge passes, nothing is known: a coordinate across is off by a few units of
+        the ends' distances, at most eight, and both parts of a factor by that times the ends'
+        coordinates; only factors near the negative axis leave open which way they turn.
+        """
+        real, vector, index = self.backend.Float, self.backend.Array3f, self.backend.UInt32
+        count, center = dr.select(active, found.count, 0), found.center
+
+        def more(i: Any, *_: Any) -> Mask:
+            return i < count
+
+        def body(i: Any, p: Vec3, sure: Mask, *products: Real) -> tuple[Any, ...]:
+            row = self.near.row(found.first + i, i < count)
+            there, here = LiftedProduct(*products[:3]), LiftedProduct(*products[3:])
+            a, a_here = sight_of(p, frame, x), sight_of(p, frame, center)
+            for k in range(VERTICES):
+                q, inverse = vector(*row[4 * k : 4 * k + 3]), row[4 * k + 3]
+                b, b_here = sight_of(q, frame, x), sight_of(q, frame, center)
+                size = dr.abs(b.u) + dr.abs(b.v)
+                sure &= size > _UNSURE * unit  # off the vertex
+                slack = _UNSURE * unit * (size + dr.abs(a.u) + dr.abs(a.v))
+                there, is_sure = _with_edge(there, a, b, inverse != 0, slack)
+                here, is_sure_here = _with_edge(here, a_here, b_here, inverse != 0, slack)
+                sure &= is_sure & is_sure_here
+                a, a_here, p = b, b_here, q
+            return i + 1, p, sure, *there.parts(), *here.parts()
+
+        one = LiftedProduct.one(real).parts()
+        start = index(0), vector(0), self.backend.Bool(active), *one, *one
+        _, _, sure, *products = dr.while_loop(start, more, body, label="from the center")
+        there, here = LiftedProduct(*products[:3]), LiftedProduct(*products[3:])
+        return there.angle() - here.angle() + found.change, sure
 
     def rates_along(
         self, found: CellSums, line: Line, lengths: tuple[Real, ...], active: Mask
@@ -200,3 +262,13 @@ class CurveCells:
         zr, zi, g, d2, squares, cubes, fourths = found
         angle = 2 * dr.atan2(zi, zr)
         return EdgeSums(angle, 2 * g, dr.sqrt(d2), 4 * squares, 2 * cubes, 2 * fourths)
+
+
+def _with_edge(
+    product: LiftedProduct, a: Sight, b: Sight, is_edge: Mask, slack: Real
+) -> tuple[LiftedProduct, Mask]:
+    """The product with the factor of an edge, if it is one, and where that is not within the slack
+    of the negative axis."""
+    re, im = ends_factor(a, b, type(slack)(1))
+    is_sure = ~is_edge | (dr.abs(im) > slack) | (re > slack)
+    return product.times(dr.select(is_edge, re, 1), dr.select(is_edge, im, 0)), is_sure

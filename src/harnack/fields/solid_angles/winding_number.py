@@ -285,8 +285,13 @@ class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
         if traced and self.cells and len(mesh.singular):
             extent = self.extent((self.default_level,))
             assert extent is not None
-            cells = BoundaryCells.build(backend, mesh, *extent.bounds(), self.most_bytes())
+            cells = BoundaryCells.build(
+                rays, mesh, *extent.bounds(), self.most_bytes(), self._double_values
+            )
         return _MeshBuffers(*placed(backend, mesh.center, mesh.size), winding, rays, cells)
+
+    def _double_values(self, points: FloatArray) -> FloatArray:
+        return np.array(self.value(points, precision="double"))
 
     def _without_cells(self) -> WindingNumber:
         """The same field without cells."""
@@ -335,6 +340,13 @@ class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
         in_cells, inside = on.cells.sample(frame.o, None, epsilon_at(frame.o), detail <= 0)
         other = _at_start(on, frame, on.backend.Float(0), detail, ~inside)
         return other.where(inside, lengthened(in_cells, on.size))
+
+    def value_where_known(self, p: Vec3, active: Mask) -> Real:
+        on = self._on(p)
+        if on.cells is None:
+            return on.backend.Float(dr.nan)
+        x = on.unit(p)
+        return on.cells.value_where_known(x, epsilon_at(x), active)
 
     def _upward(self, p: Vec3) -> tuple[_MeshBuffers, Frame]:
         """The data, and rays from p, on which all triangles lie ahead."""
