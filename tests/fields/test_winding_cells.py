@@ -301,3 +301,74 @@ def test_a_ray_far_from_the_origin_does_not_run_out_of_steps() -> None:
     cells, plain = _ends([corners], 0.9, *ray, tolerance=1e-3)
     assert plain.status[0] == hk.Status.HIT
     assert cells.status[0] == plain.status[0]
+
+
+def lattice_triangles(n: int) -> Mesh:
+    """Right triangles in planes of coordinates, whose corners are multiples of 1/4 in part."""
+    rng = np.random.default_rng(5)
+    corners = np.eye(3) * rng.uniform(0.1, 1, (n, 1, 1)) + rng.integers(-4, 5, (n, 1, 3)) / 4
+    return corners.reshape(-1, 3), np.arange(3 * n).reshape(-1, 3)
+
+
+def far_sphere() -> Mesh:
+    vertices, faces = bumpy_sphere(2)
+    return vertices + np.array([1000.0, -500.0, 200.0]), remove_faces(faces, 0.1, 0)
+
+
+def flipped_faces() -> Mesh:
+    vertices, faces = bumpy_sphere(2)
+    return vertices, np.where(np.arange(len(faces))[:, None] % 5 == 0, faces[:, ::-1], faces)
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize(
+    "mesh", [far_sphere(), flipped_faces(), lattice_triangles(80)], ids=["far", "flips", "lattice"]
+)
+def test_where_a_value_is_known_from_the_middle_of_a_cell_it_is_right(
+    mesh: Mesh, precision: Any
+) -> None:
+    """At random points; beside faces, edges and corners; and on lines of a coordinate through the
+    middles of cells, as corners of the lattice are."""
+    field, backend = with_cells(mesh), choose_backend(precision)
+    field.extent((0.5,))
+    prepared = field.prepare(backend)
+    assert prepared._device is not None
+    assert prepared._device.cells is not None
+    rng, size, n = np.random.default_rng(6), float(np.ptp(mesh[0], axis=0).max()), 4000
+    corners = mesh[0][mesh[1]]
+    weights = rng.dirichlet((1, 1, 1), n) * ((rng.random((n, 3)) < 0.7) | [True, False, False])
+    weights /= weights.sum(axis=1, keepdims=True)
+    on = np.einsum("nk,nkd->nd", weights, corners[rng.integers(len(corners), size=n)])
+    off = size * 10.0 ** rng.uniform(-7, -1, (n, 1)) * rng.normal(size=(n, 3))
+    centers = prepared._device.cells.cells.centers() * field.mesh.size + field.mesh.center
+    beside = rng.normal(size=(n, 3)) * (rng.random((n, 3)) < 0.4)
+    points = np.concatenate([
+        corners.mean(axis=(0, 1)) + size * rng.uniform(-0.5, 0.5, (n, 3)),
+        on,
+        on + off * (rng.random((n, 3)) < 0.6),
+        centers[rng.integers(len(centers), size=n)] + 0.02 * size * beside,
+    ])  # fmt: skip
+    points = points.astype(backend.dtype).astype(np.float64)
+    x = to_vector3(backend, points)
+    value = to_numpy(prepared.value_where_known(x, backend.Bool(True))).astype(np.float64)
+    known = np.isfinite(value)
+    assert known[:n].mean() > 0.9
+    if np.abs(points).max() < 10:  # else rounding moves points off faces
+        assert known[n : 2 * n].mean() < 0.02
+    exact = hk.WindingNumber(*mesh, method="exact").value(points, precision="double")
+    assert np.abs(value - exact)[known].max() < 0.01
+
+
+def test_a_poor_value_in_the_middle_of_a_cell_is_not_used() -> None:
+    rng = np.random.default_rng(7)
+    corners = rng.normal(size=(300, 1, 3)) + 0.5 * rng.normal(size=(300, 3, 3))
+    mesh = corners.reshape(-1, 3), np.arange(900).reshape(-1, 3)
+    field = with_cells(mesh, method="tree", accuracy=1.5, order=0)
+    field.extent((0.5,))
+    prepared = field.prepare(choose_backend("single"))
+    assert prepared._device is not None
+    assert prepared._device.cells is not None
+    cells = prepared._device.cells
+    poor = field.error_bound(cells.cells.centers() * field.mesh.size + field.mesh.center) > 0.13
+    assert poor.mean() > 0.1
+    assert np.isnan(to_numpy(cells.at_centers)[poor]).all()

@@ -53,7 +53,8 @@ _OFF, _SURE = 64.0, 0.125
 class BoundaryCells:
     """Cells of the singular edges of a mesh on a backend, in its unit coordinates.
 
-    rays: the triangles. at_centers: w at the center of each cell; NaN where a triangle is near.
+    rays: the triangles. at_centers: w at the center of each cell; NaN where a triangle is near, and
+        where it is not known up to an eighth.
     """
 
     cells: CurveCells
@@ -63,12 +64,12 @@ class BoundaryCells:
     @classmethod
     def build(
         cls, rays: TriangleRays, mesh: WindingMesh, low: FloatArray, high: FloatArray,
-        most_bytes: int, value: Callable[[FloatArray], FloatArray],
+        most_bytes: int, value: Callable[[FloatArray], tuple[FloatArray, FloatArray]],
     ) -> BoundaryCells | None:  # fmt: skip
         """Cells of a cube around the mesh and the box from low (3,) to high (3,), of at most so
         many bytes; None where that is too little.
 
-        value: w at points (n, 3).
+        value: w at points (n, 3), and bounds of its error.
         """
         backend = rays.tree.backend
         trails = closed_trails(mesh.singular)
@@ -90,8 +91,8 @@ class BoundaryCells:
             return None
         centers = cells.centers()
         near = distance_to_triangles(rays, to_vector3(backend, centers))
-        w = value(centers * mesh.size + mesh.center)
-        w[to_numpy(near) < _OFF * backend.epsilon] = np.nan
+        w, error = value(centers * mesh.size + mesh.center)
+        w[(to_numpy(near) < _OFF * backend.epsilon) | ~(error < _SURE)] = np.nan
         return cls(cells, rays, backend.Float(w.astype(backend.dtype)))
 
     @property
@@ -113,7 +114,7 @@ class BoundaryCells:
         the boundary over 4 pi, and where the line crosses a triangle along its normal, by -1
         (`edge_lift`). So w is known at x with the errors of w(c) and of the cell; it is the number
         nearest to that of those that are what the cell knows modulo 1, as all errors together are
-        below a quarter. On a triangle nothing is known, nor where `turns_between` or
+        below three eighths. On a triangle nothing is known, nor where `turns_between` or
         `change_from_center` are not sure.
         """
         backend, real = self.cells.backend, self.cells.backend.Float

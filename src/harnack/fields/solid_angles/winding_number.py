@@ -286,12 +286,14 @@ class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
             extent = self.extent((self.default_level,))
             assert extent is not None
             cells = BoundaryCells.build(
-                rays, mesh, *extent.bounds(), self.most_bytes(), self._double_values
+                rays, mesh, *extent.bounds(), self.most_bytes(), self._at_centers
             )
         return _MeshBuffers(*placed(backend, mesh.center, mesh.size), winding, rays, cells)
 
-    def _double_values(self, points: FloatArray) -> FloatArray:
-        return np.array(self.value(points, precision="double"))
+    def _at_centers(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """w at points (n, 3), and bounds of its error."""
+        value, error = self.value, self.error_bound
+        return np.array(value(points, precision="double")), error(points, precision="double")
 
     def _without_cells(self) -> WindingNumber:
         """The same field without cells."""
