@@ -512,7 +512,7 @@ def test_no_answer_is_below_the_lower_bound() -> None:
         warnings.simplefilter("error")
         for seed in range(1):
             vertices, faces = messy_mesh(seed)
-            x = beside_faces(vertices, faces, 60, 1e-9, seed)
+            x = beside_faces(vertices, faces, 30, 1e-9, seed)
             for precision in PRECISIONS:
                 for method in ("exact", "tree"):
                     field = hk.WindingNumber(vertices, faces, method=method)

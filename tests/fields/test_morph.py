@@ -250,17 +250,17 @@ def test_first_hits(precision: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("w", [0.06, 0.15, 0.25])
 def test_many_first_hits(w: float) -> None:
-    """500 rays in both precisions: on samples a fifth of the height apart, none before the hit is
+    """250 rays in both precisions: on samples a fifth of the height apart, none before the hit is
     inside the solid; at the hit f is the level within the tolerance."""
     field, tolerance = morph(w), 1e-3
-    o, d = rays(500, 1)
+    o, d = rays(250, 1)
     middle, half = -(o * d).sum(axis=1), 1.1
     reach = np.sqrt(np.maximum(half**2 - ((o + middle[:, None] * d) ** 2).sum(axis=1), 0))
     t = (middle - reach)[:, None] + reach[:, None] * np.arange(0, 2, w / 5 / half)
     inside = exact(field, (o[:, None] + t[..., None] * d[:, None]).reshape(-1, 3))[0] > 0.5
     inside = inside.reshape(t.shape)
     first = np.where(inside.any(axis=1), t[np.arange(len(t)), inside.argmax(axis=1)], np.inf)
-    assert np.isfinite(first).sum() > 60
+    assert np.isfinite(first).sum() > 30
     for precision in ("single", "double"):
         hits = hk.trace(field, o, d, t_max=6.0, tolerance=tolerance, precision=precision)  # type: ignore[arg-type]
         assert not (hits.t > first + 5 * tolerance).any()

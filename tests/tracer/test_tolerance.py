@@ -203,5 +203,5 @@ def test_many_hits_meet_the_tolerance(tolerance: float, precision: Any) -> None:
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("tolerance", [1e-2, 1e-4, 1e-7])
 def test_many_smooth_hits_of_meshes_meet_the_tolerance(tolerance: float, precision: Any) -> None:
-    check_mesh(tolerance, precision, 2000)
-    check_mesh(tolerance, precision, 1000, accuracy=1.5, order=0)
+    check_mesh(tolerance, precision, 1000)
+    check_mesh(tolerance, precision, 500, accuracy=1.5, order=0)
