@@ -48,7 +48,8 @@ def curve_cells() -> str:
         "nanoseconds of CPU time a ray, single precision, tolerance 1e-4, the best of "
         f"{_REPEATS} runs. *Camera*: {_WIDTH} x {_WIDTH} rays. *Chords*: {_RAYS:,} lines through "
         "random points of a sphere. *Bounces*: as many rays from points of the surface that the "
-        "camera sees, in random directions. *Build*: CPU seconds, with a warm kernel cache.\n",
+        "camera sees, in random directions; scattered rays share lanes by a queue, with cells and "
+        "without. *Build*: CPU seconds, with a warm kernel cache.\n",
         f"| N {columns}",
         "|---:|" + "---:|" * 8,
     ]

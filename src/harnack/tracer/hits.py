@@ -339,10 +339,12 @@ def _are_scattered(backend: Backend, o: Vec3, d: Vec3) -> bool:
         at = row if dr.width(rays) > 1 else 0 * row
         return to_numpy(dr.gather(backend.Array3f, rays, at)).astype(np.float64)
 
-    begin, origin, turned = seen(o, first), seen(o, first + 1), seen(d, first) - seen(d, first + 1)
-    stray, spread = np.square(begin - origin).mean(axis=0), 2 * begin.var(axis=0)
-    turns = np.square(turned).sum(axis=1).mean() > _TURN**2
-    return bool(turns or stray.sum() > _STRAY**2 * spread.sum() > 0)
+    with np.errstate(invalid="ignore"):  # of rays that are no rays
+        begin, stray = seen(o, first), seen(o, first) - seen(o, first + 1)
+        turned = seen(d, first) - seen(d, first + 1)
+        turns = np.square(turned).sum(axis=1).mean() > _TURN**2
+        spread = 2 * begin.var(axis=0).sum()
+        return bool(turns or np.square(stray).sum(axis=1).mean() > _STRAY**2 * spread > 0)
 
 
 def _ends(
