@@ -350,7 +350,8 @@ def test_where_a_value_is_known_from_the_middle_of_a_cell_it_is_right(
     ])  # fmt: skip
     points = points.astype(backend.dtype).astype(np.float64)
     x = to_vector3(backend, points)
-    value = to_numpy(prepared.value_where_known(x, backend.Bool(True))).astype(np.float64)
+    found = prepared.value_where_known(x, backend.Float(0), backend.Bool(True))
+    value = to_numpy(found).astype(np.float64)
     known = np.isfinite(value)
     assert known[:n].mean() > 0.9
     if np.abs(points).max() < 10:  # else rounding moves points off faces
@@ -372,3 +373,57 @@ def test_a_poor_value_in_the_middle_of_a_cell_is_not_used() -> None:
     poor = field.error_bound(cells.cells.centers() * field.mesh.size + field.mesh.center) > 0.13
     assert poor.mean() > 0.1
     assert np.isnan(to_numpy(cells.at_centers)[poor]).all()
+
+
+def cube_without_a_triangle() -> Mesh:
+    vertices = np.array([[x, y, z] for z in (-1, 1) for y in (-1, 1) for x in (-1, 1)], float)
+    faces = [[0, 2, 1], [1, 2, 3], [4, 5, 6], [5, 7, 6], [0, 1, 4], [1, 5, 4]]
+    faces += [[2, 6, 3], [3, 6, 7], [0, 4, 2], [2, 4, 6], [1, 3, 5]]
+    return vertices, np.array(faces)
+
+
+def thinned_sphere(x: float) -> Mesh:
+    vertices, faces = icosphere(3)
+    kept = np.random.default_rng(0).random(len(faces)) > 0.1
+    return vertices + np.array([x, 0, 0]), faces[kept]
+
+
+@pytest.mark.parametrize("distance", [30.0, 200.0, 1e4])
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_rays_that_begin_within_rounding_of_a_triangle_know_its_side(
+    distance: float, precision: Any
+) -> None:
+    """The value at the first point was that of the other side: up to two in five rays missed."""
+    mesh, rng, n = cube_without_a_triangle(), np.random.default_rng(0), 1000
+    way = rng.normal(size=(n, 3))
+    way[:, 2] = -np.abs(way[:, 2]) - 0.5
+    way /= np.linalg.norm(way, axis=1)[:, None]
+    o = np.array([0.2, -0.3, 1.0]) - distance * way
+    near = distance * (1 + 1.5 * choose_backend(precision).epsilon * rng.integers(-1, 2, n))
+    settings = {"t_min": near, "precision": precision}
+    hits, plain = (
+        hk.trace(hk.WindingNumber(*mesh, cells=cells), o, way, **settings)
+        for cells in (True, False)
+    )
+    np.testing.assert_array_equal(hits.status, plain.status)
+
+
+@pytest.mark.parametrize(
+    ("x", "o", "d", "settings"),
+    [
+        (0.0, [0.17092786729335785, -0.9515982866287231, 1000.0], [0, 0, -1],
+         {"clip": hk.Box([-2, -2, -2], [2, 2, 0.25])}),
+        (3000.0, [3002.319580078125, -0.8631852269172668, 0.35353776812553406],
+         [-0.9277864098548889, 0.34527409076690674, -0.14141510426998138],
+         {"t_min": 1.5041636797864626}),
+        (1000.0, [1000.4432373046875, 0.2900524139404297, 1.7000000476837158],
+         [0.2510278820991516, 0.16427110135555267, -1.0],
+         {"clip": hk.Box([998, -2, -2], [1002, 2, 0.25])}),
+    ],
+)  # fmt: skip
+def test_rays_of_a_clip_and_far_meshes_know_their_side(
+    x: float, o: Any, d: Any, settings: Any
+) -> None:
+    for cells in (True, False):
+        hits = hk.trace(hk.WindingNumber(*thinned_sphere(x), cells=cells), [o], [d], **settings)
+        assert hits.hit.all()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -115,6 +116,16 @@ def test_rays_are_scattered_where_neighbors_differ(rays: Any) -> None:
     assert not scattered(*(one[:200] for one in shuffled)), "too few to share lanes"
     still = np.repeat([[0.3, 0.2, 2.0]], 6400, axis=0)
     assert not scattered(still, np.repeat([[0, 0, -1.0]], 6400, axis=0))
+
+
+def test_hostile_rays_are_asked_without_a_warning() -> None:
+    rng = np.random.default_rng(2)
+    o, d = rng.normal(size=(5000, 3)), rng.normal(size=(5000, 3))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        hk.trace(saddle(), o * 1e200, d, precision="double")
+        lost, way = (to_vector3(choose_backend("double"), one) for one in (o, d))
+        hk.trace(saddle(), dr.select(lost > 3, dr.inf, lost), way)
 
 
 def test_scattered_rays_end_as_others() -> None:

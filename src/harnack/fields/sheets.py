@@ -116,10 +116,13 @@ class Sheets:
         """f at p but for a whole number, if it `is_modulo`: for less work than `evaluate` takes."""
         return cast("Field", self).evaluate(p)
 
-    def value_where_known(self, p: Vec3, active: Mask) -> Real:
+    def value_where_known(self, p: Vec3, rounding: Real, active: Mask) -> Real:
         """f at p, where active, if it `is_modulo` and less work than `evaluate` takes tells it; NaN
-        elsewhere, and where p may lie on a sheet."""
-        del active
+        elsewhere, and where p may lie on a sheet.
+
+        rounding: that of the coordinates of p, and of the ray on which it lies.
+        """
+        del rounding, active
         return 0 * p.x + math.nan
 
     def next_crossing(

@@ -339,7 +339,7 @@ def _are_scattered(backend: Backend, o: Vec3, d: Vec3) -> bool:
         at = row if dr.width(rays) > 1 else 0 * row
         return to_numpy(dr.gather(backend.Array3f, rays, at)).astype(np.float64)
 
-    with np.errstate(invalid="ignore"):  # of rays that are no rays
+    with np.errstate(over="ignore", invalid="ignore"):  # of rays that are no rays
         begin, stray = seen(o, first), seen(o, first) - seen(o, first + 1)
         turned = seen(d, first) - seen(d, first + 1)
         turns = np.square(turned).sum(axis=1).mean() > _TURN**2

@@ -346,7 +346,8 @@ class PreparedLevelSet:
             entry, _ = self.around.clip(path.origin, path.direction, t_min, t_max)
             outside = (entry > t_min) & (start <= entry)
             begins = state.active & ~outside
-            value = self.field.value_where_known(path.point(start), begins)
+            rounding = backend.epsilon * (largest_coordinate(path.origin) + start)
+            value = self.field.value_where_known(path.point(start), rounding, begins)
             knows = outside | dr.isfinite(value)
             detail = dr.select(knows, 0, real(self.field.coarsest_detail))
             value = dr.select(dr.isfinite(value), value, 0)

@@ -108,14 +108,17 @@ class BoundaryCells:
     def value_where_known(self, x: Vec3, unit: Real, active: Mask) -> Real:
         """w at x where active; NaN where it is not known.
 
-        unit: the rounding of a coordinate.
+        unit: the rounding of a coordinate of x, and of those of the ray on which it lies.
 
         Proof. On the line from the cell's center c to x, w changes by that of the solid angle of
         the boundary over 4 pi, and where the line crosses a triangle along its normal, by -1
         (`edge_lift`). So w is known at x with the errors of w(c) and of the cell; it is the number
         nearest to that of those that are what the cell knows modulo 1, as all errors together are
         below three eighths. On a triangle nothing is known, nor where `turns_between` or
-        `change_from_center` are not sure.
+        `change_from_center` are not sure. Off all triangles it is the number of the side on which
+        the ray has x, too: the t of a crossing is the depth of a point of the triangle that is a
+        few roundings off the ray, and so is the true one. If x were between these two, a point of
+        the triangle would be as near to x.
         """
         backend, real = self.cells.backend, self.cells.backend.Float
         found, inside = self.cells.sums(x, active)

@@ -349,12 +349,12 @@ class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
         other = _at_start(on, frame, on.backend.Float(0), detail, ~inside)
         return other.where(inside, lengthened(in_cells, on.size))
 
-    def value_where_known(self, p: Vec3, active: Mask) -> Real:
+    def value_where_known(self, p: Vec3, rounding: Real, active: Mask) -> Real:
         on = self._on(p)
         if on.cells is None:
             return on.backend.Float(dr.nan)
         x = on.unit(p)
-        return on.cells.value_where_known(x, epsilon_at(x), active)
+        return on.cells.value_where_known(x, fmax(epsilon_at(x), rounding / on.size), active)
 
     def _upward(self, p: Vec3) -> tuple[_MeshBuffers, Frame]:
         """The data, and rays from p, on which all triangles lie ahead."""
