@@ -293,17 +293,20 @@ class EdgeTrails:
         real, index = backend.Float, backend.UInt32
         lanes = -(-n // _POINTS)
         lane = dr.arange(index, lanes)
-        places = [dr.minimum(lane + k * lanes, n - 1) for k in range(_POINTS)]
+        apart, last = dr.opaque(index, lanes), dr.opaque(index, n - 1)  # for any n one kernel
+        places = [dr.minimum(lane + k * apart, last) for k in range(_POINTS)]
         points = [
             (dr.gather(backend.Array3f, x, place), dr.gather(real, way, place)) for place in places
         ]
         products, doubts = self._over_records(points)
         turns = [-one.turns() for one in products]  # of conjugate factors
         dr.eval(*turns, *doubts)
-        order = dr.arange(index, n)
-        some = dr.gather(real, dr.concat(doubts), order) <= 0
+        all_turns, all_doubts = dr.empty(real, n), dr.empty(real, n)
+        for place, turn, doubt in zip(places, turns, doubts, strict=True):
+            dr.scatter(all_turns, turn, place)
+            dr.scatter(all_doubts, doubt, place)
         far = largest_coordinate(x) > _FAR
-        return dr.gather(real, dr.concat(turns), order), some | far
+        return all_turns, (all_doubts <= 0) | far
 
     def _over_records(self, points: list[Point]) -> tuple[list[_Product], list[Real]]:
         """For each point the product of all factors, and a number that is at most 0 where it is
