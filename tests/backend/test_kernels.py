@@ -217,6 +217,13 @@ PICTURES: dict[str, Callable[[int], int]] = {
 }
 
 
+def test_another_number_of_points_compiles_no_kernel() -> None:
+    field, points = cut_sphere(0), np.random.default_rng(0).normal(size=(700, 3))
+    for count in (600, 601):
+        field.value(points[:count])
+    assert [compiled(lambda n=n: field.value(points[:n])) for n in (607, 700)] == [0, 0]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PICTURES)
 def test_no_other_picture_compiles_a_kernel(name: str) -> None:
