@@ -370,6 +370,7 @@ def test_a_poor_value_in_the_middle_of_a_cell_is_not_used() -> None:
     assert prepared._device is not None
     assert prepared._device.cells is not None
     cells = prepared._device.cells
+    assert cells.size == cells.cells.size + 4 * cells.count
     poor = field.error_bound(cells.cells.centers() * field.mesh.size + field.mesh.center) > 0.13
     assert poor.mean() > 0.1
     assert np.isnan(to_numpy(cells.at_centers)[poor]).all()

@@ -42,6 +42,8 @@ _SHARE = 1 / (4 * math.pi)
 # many times as many near edges as those of one curve, and split ones share what is beyond so many
 # radii.
 _NEAR, _SHARED = 4.0, 3.5
+# Of the bytes, for all but w at the centers: a cell has at least 64 numbers besides.
+_OF_BYTES = 64 / 65
 # Roundings of a coordinate: of a point, and within which of an edge nothing is known.
 _PLACE, _MET = 8.0, 16.0
 # In roundings: points are that far off triangles where w is known from a cell's center, and so are
@@ -83,7 +85,7 @@ class BoundaryCells:
             loops,
             points.min(axis=0),
             points.max(axis=0),
-            most_bytes,
+            int(_OF_BYTES * most_bytes),
             near=_NEAR,
             shared=_SHARED,
         )
@@ -102,8 +104,8 @@ class BoundaryCells:
 
     @property
     def size(self) -> int:
-        """Their bytes."""
-        return self.cells.size
+        """Their bytes, with w at the centers."""
+        return self.cells.size + self.count * np.dtype(self.cells.backend.dtype).itemsize
 
     def value_where_known(self, x: Vec3, unit: Real, active: Mask) -> Real:
         """w at x where active; NaN where it is not known.
