@@ -1,12 +1,14 @@
-"""What far dipoles add to balls: local expansions, and bounds of what these leave out.
+"""What far dipoles and triangles add to balls: local expansions, and bounds of what is left out.
 
-- `source_tree`: a tree of dipoles in double precision, with all that expansions need.
-- `FarSums`: sums over far nodes and far dipoles.
-- `Sources`: the dipoles of balls, parted into such sums and what is left to smaller balls.
+- `source_tree`: a tree of primitives, dipoles or triangles, in double precision, with all that
+  expansions need; `triangle_sources`: triangles as records.
+- `FarSums`: sums over far nodes and far primitives.
+- `Sources`: the primitives of balls, parted into such sums and what is left to smaller balls.
 
 A node of radius R is far from a ball of radius rho if their centers are farther apart than k rho +
-`_SPREAD` R, a dipole if it is farther from the ball's center than k rho, for a factor k > 1: then
-its dipoles are all farther from the center than k rho.
+`_SPREAD` R, a triangle if they are farther apart than k rho + `OF_TRIANGLE` R, a dipole if it is
+farther from the ball's center than k rho, for a factor k > 1: then all points of it are farther
+from the center than k rho. A triangle is a sheet of dipoles, along its normal.
 """
 
 from __future__ import annotations
@@ -21,13 +23,17 @@ import numpy as np
 from harnack.backend import BoolArray, FloatArray, IntArray, choose_backend, to_numpy
 from harnack.backend.elementary import fmin
 from harnack.fields.solid_angles.local_expansion import irregular, of_cluster, parts, tail_factors
-from harnack.fields.solid_angles.multipole import NodeMoments, sup_norm, truncation
-from harnack.tree import Node, PackedTree, pack
+from harnack.fields.solid_angles.multipole import (
+    NodeMoments,
+    sup_norm,
+    triangle_levels,
+    truncation,
+)
+from harnack.tree import Hierarchy, Node, PackedTree, pack
 from harnack.tree.lists import Lists, Put, each_entry, make_lists, walk_lists
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
-    from harnack.tree import Hierarchy
 
 # Harmonics have degree l.
 # ruff: noqa: E741
@@ -36,6 +42,11 @@ if TYPE_CHECKING:
 DEGREE, _POLES = 6, 4
 COEFFICIENTS = (DEGREE + 1) ** 2
 _SPREAD = 4.0
+# The same factor of triangles, by experiment; and the moments in their records, besides the first.
+OF_TRIANGLE = 1.5
+_OF_TRIANGLE = tuple(key for key in parts(_POLES) if key[0] > 2)
+# Numbers of a record of a dipole, and of a triangle before its moments.
+_DIPOLE, _TRIANGLE = 8, 14
 # See `_Expanded.of`.
 _ROUNDING = 2.0**-20
 # Moments of a node, in order.
@@ -46,7 +57,8 @@ _ROUNDED_UP = 1 + 1e-9
 
 def source_tree(tree: Hierarchy, levels: list[NodeMoments], rows: FloatArray) -> PackedTree:
     """Nodes: center, `_SPREAD` times the radius, radius, area | moments up to `_POLES`, (E, G) of
-    `multipole.truncation`, and the sup norms of the moments. rows: `far_clusters.in_slots`."""
+    `multipole.truncation`, and the sup norms of the moments. rows: of primitives in slots, dipoles
+    (`far_clusters.dipole_rows`) or `triangle_sources`."""
     numbers: list[FloatArray] = []
     for level in levels:
         reach = _SPREAD * level.radius
@@ -61,16 +73,36 @@ def source_tree(tree: Hierarchy, levels: list[NodeMoments], rows: FloatArray) ->
     return pack(choose_backend("double"), tree, numbers, rows)
 
 
+def triangle_sources(corners: FloatArray) -> FloatArray:
+    """(n, 30) records of triangles (n, 3, 3): centroid, area times normal, area, `OF_TRIANGLE`
+    times the radius | radius, (E, G) of `multipole.truncation`, the sup norms of the moments 1, 3
+    and 4, and the moments 3 and 4.
+
+    The second moment about the centroid is linear in the distance from there, and so is 0. A
+    triangle without an area has one of 1e-30, as its edges count.
+    """
+    alone = Hierarchy(np.arange(len(corners), dtype=np.int64)[:, None], ())
+    level = triangle_levels(alone, corners)[0]
+    moments, reach = level.moments, OF_TRIANGLE * level.radius
+    left_out, slope, _ = truncation(level, reach, _POLES - 1)
+    normal = 2 * moments[1, 1].real, 2 * moments[1, 1].imag, moments[1, 0].real
+    higher = [moments[l, m].imag if part else moments[l, m].real for l, m, part in _OF_TRIANGLE]
+    norms = [sup_norm(moments, l) for l in (1, 3, 4)]
+    head = [level.center, *normal, np.maximum(level.area, 1e-30), reach, level.radius]
+    return np.column_stack([*head, left_out, slope, *norms, *higher])
+
+
 @dataclass(frozen=True)
 class FarSums:
-    """Sums over far dipoles of n balls.
+    """Sums over far primitives of n balls.
 
     coefficients: (n, COEFFICIENTS) of the local expansion (`local_expansion.parts`).
     error, slope: (n,) bounds of what it leaves out of value and gradient, anywhere in the ball.
     tail, tail_slope: (n,) of what it leaves out besides: at a distance a from the center at most
         q^(p+1) and q^p times these, with q = a/radius and p = `DEGREE`.
-    fourth: (n,) bounds of the sums of area/D^4, D the distance of a dipole from the center.
-    least: (n,) a distance from the center within which there are none of these dipoles.
+    fourth: (n,) bounds of the sums of area/D^4, D the least distance of a primitive from the
+        center.
+    least: (n,) a distance from the center within which there are none of these primitives.
     """
 
     coefficients: FloatArray
@@ -83,12 +115,12 @@ class FarSums:
 
     @classmethod
     def none(cls, n: int) -> FarSums:
-        """Sums over no dipoles."""
+        """Sums over nothing."""
         zero = np.zeros(n)
         return cls(np.zeros((n, COEFFICIENTS)), *(5 * [zero]), least=np.full(n, np.inf))
 
     def plus(self, other: FarSums) -> FarSums:
-        """The sums over the dipoles of both."""
+        """The sums over the primitives of both."""
         bounds = "error", "slope", "tail", "tail_slope", "fourth"
         sums = (_ROUNDED_UP * (getattr(self, one) + getattr(other, one)) for one in bounds)
         least = np.minimum(self.least, other.least)
@@ -99,7 +131,7 @@ class FarSums:
         return FarSums(*(one[which] for one in vars(self).values()))
 
     def of_octants(self, shifts: FloatArray, radius: float) -> FarSums:
-        """The same dipoles seen from the eight octants of cells with balls of this radius, octant
+        """The same sums seen from the eight octants of cells with balls of this radius, octant
         by octant of each cell.
 
         Proof. The ball of an octant lies in that of the cell, so that bounds of errors are bounds
@@ -108,7 +140,7 @@ class FarSums:
         shrink by at most that, and 1/D^4 grows by at most (1 - radius/(2 least))^-4, D >= least.
         """
         shifted = np.einsum("oab,kb->koa", shifts, self.coefficients)
-        share = 0.5 * radius / self.least  # 0 where there are no dipoles
+        share = 0.5 * radius / self.least  # 0 where there is nothing
         error, slope = self.error + self.tail, self.slope + self.tail_slope
         far = self.fourth / (1 - share) ** 4, self.least - 0.5 * radius
         bounds = _ROUNDED_UP * error, _ROUNDED_UP * slope, 0 * error, 0 * slope, *far
@@ -123,33 +155,30 @@ class FarSums:
             head, payload = tree.heads.row(i, active), tree.payload(i, active)
             numbers = dict(zip(_MOMENTS, payload, strict=False))
             left_out, slope_left_out, *norms = payload[len(_MOMENTS) :]
-            found = _Expanded.of(
-                c - tree.backend.Array3f(*head[:3]), _pairs(numbers), norms, radius
-            )
-            distance = dr.rcp(found.inverse)
-            near = dr.rcp(distance - radius)
-            power = near
-            for _ in range(_POLES + 1):
-                power = power * near
-            error = found.rounding + left_out * power
-            slope = found.rounding / radius + slope_left_out * power * near
-            least = distance - head[4]
-            rest = found.tail, found.tail_slope, head[5] * _fourth(dr.rcp(least)), least
-            return [*found.coefficients, error, slope, *rest]
+            r = c - tree.backend.Array3f(*head[:3])
+            found = _Expanded.of(r, _pairs(numbers), norms, radius)
+            return found.of_cluster(left_out, slope_left_out, head[4], head[5], radius)
 
         return cls._accumulated(tree.backend, lists, term)
 
     @classmethod
-    def over_dipoles(cls, tree: PackedTree, lists: Lists, c: Vec3, radius: Real) -> FarSums:
-        """Sums over listed far dipoles, for balls around c."""
+    def over_primitives(cls, tree: PackedTree, lists: Lists, c: Vec3, radius: Real) -> FarSums:
+        """Sums over listed far primitives, for balls around c."""
 
         def term(i: Any, active: Mask) -> list[Any]:
             row = tree.primitives.row(i, active)
-            moments = {(1, 0): (row[5], 0.0), (1, 1): (0.5 * row[3], 0.5 * row[4])}
-            found = _Expanded.of(c - tree.backend.Array3f(*row[:3]), moments, [row[6]], radius)
-            bounds = found.rounding, found.rounding / radius, found.tail, found.tail_slope
-            rest = row[6] * _fourth(found.inverse), dr.rcp(found.inverse)
-            return [*found.coefficients, *bounds, *rest]
+            first = {(1, 0): (row[5], 0.0), (1, 1): (0.5 * row[3], 0.5 * row[4])}
+            r = c - tree.backend.Array3f(*row[:3])
+            if tree.primitives.packets == 1:
+                found = _Expanded.of(r, first, [row[6]], radius)
+                bounds = found.rounding, found.rounding / radius, found.tail, found.tail_slope
+                rest = row[6] * _fourth(found.inverse), dr.rcp(found.inverse)
+                return [*found.coefficients, *bounds, *rest]
+            size, left_out, slope_left_out, *norms = row[_DIPOLE:_TRIANGLE]
+            higher = dict(zip(_OF_TRIANGLE, row[_TRIANGLE:], strict=False))
+            norms.insert(1, 0 * size)
+            found = _Expanded.of(r, first | _pairs(higher), norms, radius)
+            return found.of_cluster(left_out, slope_left_out, size, row[6], radius)
 
         return cls._accumulated(tree.backend, lists, term)
 
@@ -233,23 +262,42 @@ class _Expanded:
         slope = (DEGREE + 1) * total * power / (1 - steeper * q)
         return cls(coefficients, tail, slope / radius, _ROUNDING * largest, inverse)
 
+    def of_cluster(
+        self, left_out: Real, slope_left_out: Real, size: Real, area: Real, radius: Real
+    ) -> list[Any]:
+        """The numbers of `FarSums` of a cluster of dipoles with moments up to `_POLES`.
+
+        left_out, slope_left_out: (E, G) of `multipole.truncation`, for points that are no nearer
+        than the ball. size: the cluster's radius. area: that of its dipoles.
+        """
+        distance = dr.rcp(self.inverse)
+        near = dr.rcp(distance - radius)
+        power = near
+        for _ in range(_POLES + 1):
+            power = power * near
+        error = self.rounding + left_out * power
+        slope = self.rounding / radius + slope_left_out * power * near
+        least = distance - size
+        rest = self.tail, self.tail_slope, area * _fourth(dr.rcp(least)), least
+        return [*self.coefficients, error, slope, *rest]
+
 
 @dataclass(frozen=True)
 class Sources:
-    """Dipoles that balls have still to take into account: those of the nodes of one list for each
-    ball, and those of another list, rows of the tree's primitives."""
+    """Primitives that balls have still to take into account: those of the nodes of one list for
+    each ball, and those of another list, rows of the tree's primitives."""
 
     nodes: Lists
-    dipoles: Lists
+    primitives: Lists
 
     @classmethod
     def of_root(cls, backend: Backend) -> Sources:
-        """All dipoles of a tree, for one ball."""
+        """All primitives of a tree, for one ball."""
         return cls(Lists.of_root(backend), Lists.none(backend))
 
     def some(self, backend: Backend, lanes: IntArray) -> Sources:
         """Those of these balls; a ball may occur several times."""
-        return Sources(self.nodes.some(backend, lanes), self.dipoles.some(backend, lanes))
+        return Sources(self.nodes.some(backend, lanes), self.primitives.some(backend, lanes))
 
     def parted(
         self, tree: PackedTree, c: Vec3, radius: Real, factor: float, smallest: Real
@@ -257,9 +305,9 @@ class Sources:
         """Sums over what is farther than `factor` radii from the centers c of balls, and the rest.
 
         smallest: inner nodes up to this radius stay nodes where they are not far. Others are
-            replaced by their children, and leaves by their dipoles, each of which is far or near.
+            replaced by their children, and leaves by their primitives, which are far or near.
 
-        Each dipole is in just one far node, or is itself far, or is in the rest.
+        Each primitive is in just one far node, or is itself far, or is in the rest.
         """
         backend, inner = tree.backend, factor * radius
         far, left = (
@@ -269,33 +317,41 @@ class Sources:
             )
             for far in (True, False)
         )
-        far_dipoles, near = (
+        far_primitives, near = (
             make_lists(
                 backend,
-                lambda put, far=far: self.dipoles_of(tree, c, inner, smallest, put, far=far),
+                lambda put, far=far: self.primitives_of(tree, c, inner, smallest, put, far=far),
             )
             for far in (True, False)
         )
         sums = FarSums.over_nodes(tree, far, c, radius)
-        return sums.plus(FarSums.over_dipoles(tree, far_dipoles, c, radius)), Sources(left, near)
+        sums = sums.plus(FarSums.over_primitives(tree, far_primitives, c, radius))
+        return sums, Sources(left, near)
 
-    def dipoles_of(
+    def primitives_of(
         self, tree: PackedTree, c: Vec3, inner: Real, smallest: Real, put: Put | None, *, far: bool,
         most: Any = None,
     ) -> Any:  # fmt: skip
-        """The number of dipoles, of the second list and of leaves that are not far, that are
-        farther from c than `inner`, or of the others; for `make_lists`. Once it is more than
-        `most`, not all may be counted."""
+        """The number of primitives, of the second list and of leaves that are not far, that are
+        farther from c than `inner` and their reach, or of the others; for `make_lists`. Once it is
+        more than `most`, not all may be counted.
+
+        A leaf that is far has no near primitives. A triangle's box lies in the ball of its node, so
+        that the triangle's radius is at most the diameter of that: its centroid is farther from c
+        than inner + 4 R - R, and the reach is at most 1.5 * 2 R.
+        """
         index, vector = tree.backend.UInt32, tree.backend.Array3f
+        are_points = tree.primitives.packets == 1
 
         def is_chosen(row: list[Real], active: Mask) -> Mask:
-            is_far = dr.squared_norm(c - vector(*row[:3])) > dr.square(inner)
+            reach = inner if are_points else inner + row[7]
+            is_far = dr.squared_norm(c - vector(*row[:3])) > dr.square(reach)
             return (is_far if far else ~is_far) & (row[6] > 0) & active
 
         def visit(node: Node, state: tuple[Any, ...]) -> tuple[Mask, tuple[Any, ...]]:
             square = dr.squared_norm(c - vector(*node.head[:3]))
             down = square <= dr.square(inner + node.head[3])
-            if not far:  # only nodes whose ball comes near have near dipoles
+            if are_points and not far:  # only nodes that come near have near points
                 down &= square <= dr.square(inner + node.head[4] * (1 + 1e-9) + 1e-12)
             down &= node.is_leaf | (node.head[4] > smallest)
             if most is not None:
@@ -310,7 +366,7 @@ class Sources:
                     put(count, node.leaf * tree.leaf_size + slot, chosen)
                 return slot + 1, count + dr.select(chosen, index(1), index(0))
 
-            return down, (dr.while_loop((index(0), state[0]), more, step, label="dipoles")[1],)
+            return down, (dr.while_loop((index(0), state[0]), more, step, label="primitives")[1],)
 
         def listed(i: Any, active: Mask, state: tuple[Any, ...]) -> tuple[Any, ...]:
             chosen = is_chosen(tree.primitives.row(i, active), active)
@@ -319,7 +375,7 @@ class Sources:
             return (state[0] + dr.select(chosen, index(1), index(0)),)
 
         found = walk_lists(tree, self.nodes, visit, (index(0),))
-        return each_entry(tree.backend, self.dipoles, listed, found)[0]
+        return each_entry(tree.backend, self.primitives, listed, found)[0]
 
 
 def _nodes(

@@ -64,7 +64,8 @@ def _signed(values: Pairs, l: int, m: int) -> tuple[Any, Any]:
 
 
 def of_cluster(moments: Pairs, seen: Pairs, degree: int) -> list[Any]:
-    """L_jk, in the order of `parts`, of dipoles with these moments about a point y.
+    """L_jk, in the order of `parts`, of dipoles with these moments about a point y; those of
+    degrees l that are not given are 0.
 
     seen: I_lm (`irregular`) at c - y, of degree `degree` and the largest of the moments together.
 
@@ -74,11 +75,11 @@ def of_cluster(moments: Pairs, seen: Pairs, degree: int) -> list[Any]:
     R_jk(-u) = (-1)^j R_jk(u). So L_jk = -(-1)^j sum_lm conj(M_lm) I_(l+j),(m+k)(c - y).
     """
     out: list[Any] = []
-    largest = max(l for l, _ in moments)
+    degrees = sorted({l for l, _ in moments})
     for j in range(degree + 1):
         for k in range(j + 1):
             re, im = 0.0, 0.0
-            for l in range(1, largest + 1):
+            for l in degrees:
                 for m in range(-l, l + 1):
                     a, b = _signed(moments, l, m)
                     u, v = _signed(seen, l + j, m + k)

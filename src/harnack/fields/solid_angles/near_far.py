@@ -1,9 +1,9 @@
-"""Cells in which a sum over dipoles is a few near dipoles and one polynomial for all others.
+"""Cells in which a sum over dipoles or triangles is a few near ones and one polynomial.
 
-A cube around the dipoles is an octree of cells. In each cell that is not split, the dipoles that
-are within `_NEAR` times the radius of its ball from its center are listed, and all the rest are one
-harmonic polynomial (`local_expansion`), so that a sample costs what is near, whatever the number of
-dipoles.
+A cube around these primitives is an octree of cells. In each cell that is not split, those within
+`_NEAR` times the radius of its ball from its center (`far_sums`) are listed, and all the rest are
+one harmonic polynomial (`local_expansion`), so that a sample costs what is near, whatever their
+number.
 
 - `NearFarCells`: the cells on a backend. `build_cells` makes them, a level at a time, from the
   moments of the tree; what cells share with others is gathered once, for their parent.
@@ -44,13 +44,13 @@ if TYPE_CHECKING:
     from harnack.fields.solid_angles.multipole import NodeMoments
     from harnack.tree import Hierarchy, PackedTree
 
-# Factors k of `far_sums`, by experiment: for a cell's own dipoles, and for those that it gathers
+# Factors k of `far_sums`, by experiment: for a cell's own primitives, and for those that it gathers
 # for all cells in it. The second is larger, as each level of cells adds to the truncation.
 _NEAR, _SHARED = 2.5, 4.0
 # Nodes of the tree are left to the cells in a cell up to this share of the radius of its ball.
 _SMALL = 0.35
-# Cells are split that have more near dipoles, by experiment; where memory is short, twice as many,
-# again and again, up to a number with which the tree is faster.
+# Cells are split that have more near primitives, by experiment; where memory is short, twice as
+# many, again and again, up to a number with which the tree is faster.
 _MOST_NEAR, _TOO_MANY = 64, 512
 # Numbers of a record before the coefficients, and the base in which the first index is stored:
 # single precision holds no integers above 2^24.
@@ -65,10 +65,10 @@ class NearFarCells:
     lookup: of cells, which are its leaves.
     records: center and one over the radius; bounds of truncation of value and gradient, everywhere
         and in powers of the distance (`FarSums`), and of the rounding of the value;
-        `FarSums.fourth` and `least`; first index (two numbers) and number of near dipoles |
+        `FarSums.fourth` and `least`; first index (two numbers) and number of near primitives |
         coefficients.
-    near: the near dipoles, as rows of `dipoles`.
-    dipoles: records of all dipoles, as `far_clusters.in_slots` has them.
+    near: the near primitives, as rows of `primitives`.
+    primitives: records of all of them, in the slots of their tree.
     count, size: the number of cells, and their bytes.
     """
 
@@ -76,19 +76,19 @@ class NearFarCells:
     lookup: CellLookup
     records: Records
     near: Any
-    dipoles: Records
+    primitives: Records
     count: int
     size: int
 
     def sums(
         self, x: Vec3, active: Mask, add: AddPrimitive, own: tuple[Any, ...]
     ) -> tuple[FieldSums, tuple[Any, ...], Mask]:
-        """The sums over all dipoles at x, with gradients, a state of the caller's own, and the mask
-        of points for which they hold: those that are active and lie in the cube.
+        """The sums over all primitives at x, with gradients, a state of the caller's own, and the
+        mask of points for which they hold: those that are active and lie in the cube.
 
-        add: as for `Treecode.sums`, for near dipoles.
+        add: as for `Treecode.sums`, for near primitives.
 
-        Proof of the bounds on far dipoles, D >= least from the center, at a point a from it: the
+        Proof of the bounds on far primitives, D >= least from the center, at a point a from it: the
         distance to x is at least D - a >= D (1 - a/least), so that the sum of area/distance^4 is at
         most `fourth` (1 - a/least)^-4, and that of area/distance^5 at most that over least - a.
         """
@@ -118,12 +118,12 @@ class NearFarCells:
 
         def step(i: Any, sums: Any, own: Any) -> tuple[Any, ...]:
             go = i < count
-            dipole = self.dipoles.row(dr.gather(index, self.near, first + i, go), go)
-            new, own = add(dipole, go, FieldSums.of(sums), own)
+            primitive = self.primitives.row(dr.gather(index, self.near, first + i, go), go)
+            new, own = add(primitive, go, FieldSums.of(sums), own)
             return i + 1, new.parts(), own
 
         start = (index(0), far.parts(), own)
-        _, sums, own = dr.while_loop(start, more, step, label="near dipoles")
+        _, sums, own = dr.while_loop(start, more, step, label="near primitives")
         return FieldSums.of(sums), own, active
 
 
@@ -141,7 +141,7 @@ def _with_tail(
 @dataclass(frozen=True)
 class _Level:
     """The cells of one size: centers (n, 3), the radius of their balls, which are not split, and
-    the number of near dipoles of those."""
+    the number of near primitives of those."""
 
     centers: FloatArray
     radius: float
@@ -151,18 +151,19 @@ class _Level:
 
 def build_cells(
     backend: Backend, tree: Hierarchy, levels: list[NodeMoments], rows: FloatArray,
-    dipoles: Records, half: float, most_bytes: int,
+    primitives: Records, half: float, most_bytes: int,
 ) -> NearFarCells | None:  # fmt: skip
     """Cells of a cube [-h, h]^3, h at least `half`, of at most so many bytes; None where those
     would be too large to be of use.
 
-    levels, rows: the moments of the tree, and its dipoles in their slots. dipoles: the latter on
-        the backend. Where cells would take more bytes, they are larger and have more near dipoles.
+    levels, rows: the moments of the tree, and its primitives in their slots (`source_tree`).
+        primitives: records of the latter on the backend, in the same slots.
+    Where cells would take more bytes, they are larger and have more near primitives.
 
-    Proof that each dipole counts once in each cell that is not split. The root of the octree begins
-    with the root of the tree. A cell that is split adds what is far from it to the expansions of
-    all cells in it, and leaves the rest, nodes and dipoles, to each of its octants
-    (`Sources.parted`). In a cell that is not split nothing but near dipoles is left.
+    Proof that each primitive counts once in each cell that is not split. The root of the octree
+    begins with the root of the tree. A cell that is split adds what is far from it to the
+    expansions of all cells in it, and leaves the rest, nodes and primitives, to each of its octants
+    (`Sources.parted`). In a cell that is not split nothing but near primitives is left.
     """
     packed = source_tree(tree, levels, rows)
     octree = _fitting(packed, half, backend, most_bytes)
@@ -180,11 +181,11 @@ def build_cells(
             own, c = sources.some(double, leaves), to_vector3(double, level.centers[leaves])
             sums, close = own.parted(packed, c, radius, _NEAR, none_stay)
             sums = sums.plus(shared.some(level.is_leaf))
-            lengths = to_numpy(close.dipoles.count).astype(np.int64)
+            lengths = to_numpy(close.primitives.count).astype(np.int64)
             first = total + np.cumsum(lengths) - lengths
             placed = level.centers[leaves], level.radius
             tables.append(_table(backend, *placed, sums, first, lengths))
-            near.append(to_numpy(close.dipoles.entries)[: int(lengths.sum())])
+            near.append(to_numpy(close.primitives.entries)[: int(lengths.sum())])
             total += int(lengths.sum())
         nodes.append(numbered_nodes(level.is_leaf, count, splits))
         count, splits = count + len(leaves), splits + len(split)
@@ -197,7 +198,7 @@ def build_cells(
     return NearFarCells(
         backend, CellLookup.of(backend, np.full(3, -half), 2 * half, nodes),
         Records.upload(backend, table),
-        aligned_integers(backend, entries if len(entries) else np.zeros(1, np.uint32)), dipoles,
+        aligned_integers(backend, entries if len(entries) else np.zeros(1, np.uint32)), primitives,
         count, _bytes(backend, octree),
     )  # fmt: skip
 
@@ -222,8 +223,8 @@ def _table(
 def _fitting(
     packed: PackedTree, half: float, backend: Backend, most_bytes: int
 ) -> list[_Level] | None:
-    """The octree, with as few near dipoles in a cell as memory allows; None where it takes too
-    many: lists of near dipoles take nearly as much memory, whatever the size of the cells."""
+    """The octree, with as few near primitives in a cell as memory allows; None where it takes too
+    many: lists of near ones take nearly as much memory, whatever the size of the cells."""
 
     def is_too_large(levels: list[_Level]) -> bool:
         return _bytes(backend, levels) > most_bytes
@@ -240,8 +241,8 @@ def _fitting(
 def _octree(
     packed: PackedTree, half: float, most_near: int, too_large: Callable[[list[_Level]], bool]
 ) -> list[_Level] | None:
-    """The cells of a cube, level by level, split where more dipoles are near; None where they are
-    too large."""
+    """The cells of a cube, level by level, split where more primitives are near; None where they
+    are too large."""
     backend = packed.backend
     root = Sources.of_root(backend)
     levels: list[_Level] = []
@@ -253,7 +254,7 @@ def _octree(
         most = dr.opaque(backend.UInt32, _ANY if is_last else most_near)
         near, none_stay = dr.opaque(backend.Float, _NEAR * radius), dr.opaque(backend.Float, -1.0)
         ours, c = root.some(backend, np.zeros(len(centers), np.int64)), to_vector3(backend, centers)
-        found = ours.dipoles_of(packed, c, near, none_stay, None, far=False, most=most)
+        found = ours.primitives_of(packed, c, near, none_stay, None, far=False, most=most)
         count = to_numpy(found).astype(np.int64)
         is_leaf = np.broadcast_to(count <= most_near, len(centers)) | is_last
         levels.append(_Level(centers, radius, is_leaf, count))
@@ -264,9 +265,11 @@ def _octree(
 
 
 def _bytes(backend: Backend, levels: list[_Level]) -> int:
-    """Bytes of cells: records, lists of near dipoles, and nodes."""
-    leaves, near = sum(int(one.is_leaf.sum()) for one in levels), 0
+    """Bytes of cells: records, lists of near primitives, and nodes; of cells that are still to be
+    split, no less than eight records each."""
+    leaves, near = 8 * int((~levels[-1].is_leaf).sum()), 0
     for one in levels:
+        leaves += int(one.is_leaf.sum())
         near += int(one.near[one.is_leaf].sum())
     nodes = sum(len(one.is_leaf) for one in levels)
     record = 8 * -(-(_HEAD + COEFFICIENTS) // 8) * np.dtype(backend.dtype).itemsize

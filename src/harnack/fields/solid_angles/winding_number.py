@@ -34,7 +34,7 @@ from harnack.fields.clearance import (
 from harnack.fields.field import AtDetail, Field, Sample, lengthened
 from harnack.fields.sheets import NO_SHEET, Crossing, NearestSheet
 from harnack.fields.solid_angles.boundary_cells import BoundaryCells
-from harnack.fields.solid_angles.cell_choice import HasCells
+from harnack.fields.solid_angles.cell_choice import Cells, HasCells
 from harnack.fields.solid_angles.winding_exact import ExactWinding
 from harnack.fields.solid_angles.winding_mesh import WindingMesh
 from harnack.fields.solid_angles.winding_tree import TreeWinding
@@ -165,6 +165,9 @@ _MOST_EDGES = 2048
 _FEW_EDGES = 64
 # Cells are built from so many rays an edge on, for no fewer rays and for no more edges.
 _PAYS, _LEAST_RAYS, _MOST_IN_CELLS = 3.0, 5e3, 100_000
+# With more edges than this many times the triangles the mesh is a soup, whose cells add up near
+# triangles, not edges; they are built from so many rays a triangle on, for no more triangles.
+_SOUP, _SOUP_PAYS, _MOST_OF_SOUP = 1.5, 12.0, 50_000
 # The accuracy of values at points, and of traces, by experiment.
 _VALUES, _TRACED = 2.0, 4.0
 # See `WindingNumber._at_centers`: 16.5 roundings of each of 100,000 edges, and as much of the steep
@@ -192,9 +195,11 @@ class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
     order: of the multipoles of the tree: 0 (dipoles), 1 or 2 (octupoles).
     cells: for many rays: cells in which w, but for a whole number, is the solid angle of a few
         near edges and one polynomial for all others, with a proved remainder (`boundary_cells`), so
-        that a sample costs the same however many edges there are. None builds them where they pay
-        (`for_rays`), True always, False never; at most the megabytes that are given (True: 256).
-        Values and derivatives at points are those of `method`.
+        that a sample costs the same however many edges there are. In a soup, where triangles have
+        hardly an edge in common, near triangles take the place of edges, with the tree as method
+        (`near_far`). None builds them where they pay (`for_rays`), True always, False never; at
+        most the megabytes that are given (True: 256). Values and derivatives at points are those of
+        `method`.
 
     Hits on triangles have `Hits.sheet`; `faces_of_sheets` gives the face of each. `moved` gives the
     field for the same faces when vertices have moved.
@@ -280,18 +285,35 @@ class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
         accuracy = self.accuracy or (_TRACED if traced else _VALUES)
         mesh = self.mesh
         rays = TriangleRays.of(backend, mesh.ray_tree, mesh.ray_records)
+        most_bytes = self.most_bytes() if traced and len(mesh.singular) else 0
         if self.method == "exact":
             winding = ExactWinding.of(backend, mesh, rays, traced)
         else:
-            winding = TreeWinding.of(backend, mesh, accuracy, self.order)
+            of_soup = most_bytes if self._is_soup else 0
+            half = self._half() if of_soup else 0.0
+            winding = TreeWinding.of(backend, mesh, accuracy, self.order, of_soup, half)
+            if winding.cells is not None:
+                most_bytes = 0
         cells = None
-        if traced and self.cells and len(mesh.singular):
+        if most_bytes:
             extent = self.extent((self.default_level,))
             assert extent is not None
-            cells = BoundaryCells.build(
-                rays, mesh, *extent.bounds(), self.most_bytes(), self._at_centers
-            )
+            cells = BoundaryCells.build(rays, mesh, *extent.bounds(), most_bytes, self._at_centers)
         return _MeshBuffers(*placed(backend, mesh.center, mesh.size), winding, rays, cells)
+
+    @property
+    def _is_soup(self) -> bool:
+        """Whether cells add up triangles."""
+        edges, triangles = len(self.mesh.singular), len(self.mesh.triangles)
+        return self.method == "tree" and edges > _SOUP * triangles
+
+    def _half(self) -> float:
+        """Half the side of a cube around the mesh's center that holds the extent, in unit
+        lengths."""
+        extent = self.extent((self.default_level,))
+        assert extent is not None
+        away = [np.abs(end - self.mesh.center).max() for end in extent.bounds()]
+        return 1.001 * float(max(away)) / self.mesh.size
 
     def _at_centers(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """w at points (n, 3), and bounds of its error; those of the rounding of an exact sum, in
@@ -313,13 +335,15 @@ class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
         return self._device is not None and self._device.cells is not None
 
     def least_rays(self) -> float:
-        edges = len(self.mesh.singular)
+        edges, triangles = len(self.mesh.singular), len(self.mesh.triangles)
+        if self._is_soup:
+            few = triangles <= _MOST_OF_SOUP
+            return max(_LEAST_RAYS, _SOUP_PAYS * triangles) if few else math.inf
         pays = _FEW_EDGES <= edges <= _MOST_IN_CELLS
         return max(_LEAST_RAYS, _PAYS * edges) if pays else math.inf
 
     def occupied(self, levels: tuple[float, ...]) -> OccupiedCells | None:
-        """Cells by `winding_cells`, if edges are not few, for the exact method or by the cells of
-        the boundary."""
+        """Cells by `winding_cells`, if edges are not few, for the exact method or by cells."""
         few = len(self.mesh.singular) < _FEW_EDGES
         if few or (self.method != "exact" and not self.cells):
             return None
@@ -418,7 +442,7 @@ class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
             "triangles": len(mesh.triangles),
             "singular edges": len(mesh.singular),
             "method": self.method,
-            **self.said_of_cells(None if self._device is None else self._device.cells),
+            **self.said_of_cells(None if self._device is None else self._device.built),
         }
 
 
@@ -429,6 +453,13 @@ class _MeshBuffers(UnitCoordinates):
     winding: ExactWinding | TreeWinding
     rays: TriangleRays
     cells: BoundaryCells | None = None
+
+    @property
+    def built(self) -> Cells | None:
+        """The cells, those of edges or of triangles."""
+        if self.cells is None and isinstance(self.winding, TreeWinding):
+            return self.winding.cells
+        return self.cells
 
 
 def _at_start(

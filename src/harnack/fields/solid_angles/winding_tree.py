@@ -24,6 +24,8 @@ from harnack.fields.clearance import epsilon_at
 from harnack.fields.solid_angles.edge_lift import LiftedEdge, LiftedProduct, LiftedSums
 from harnack.fields.solid_angles.edge_trails import Line, known_along, with_edge_rates
 from harnack.fields.solid_angles.far_clusters import Treecode
+from harnack.fields.solid_angles.far_sums import OF_TRIANGLE, triangle_sources
+from harnack.fields.solid_angles.near_far import NearFarCells, build_cells
 from harnack.fields.sums import FieldSums, last_roundings
 from harnack.tree.triangles import (
     EDGES,
@@ -44,6 +46,7 @@ if TYPE_CHECKING:
     from harnack.fields.field import Sample
     from harnack.fields.sheets import Crossing
     from harnack.fields.solid_angles.edge_trails import Rates
+    from harnack.fields.solid_angles.far_clusters import AddPrimitive
     from harnack.fields.solid_angles.winding_mesh import WindingMesh
 
 # The first of three columns of a record after those of `tree.triangles`: 1 where an edge is
@@ -66,6 +69,10 @@ class NearEdge:
         It is not if it is nearer than (reach - 1)/2 times its length L and not singular: a far
         node with a triangle at it has radius R >= L/2 and is farther than reach R, hence the edge
         farther than (reach - 1) R. So all triangles at it are near, and they cancel there.
+
+        In a cell the same holds of a triangle that is far from it, with `OF_TRIANGLE` for the
+        reach: the point is nearer to the center by less than the k > 1 radii of `far_sums`. Far
+        nodes are farther.
         """
         square, inverse = self.edge.edge.square, self.edge.edge.inverse
         closed = ~self.is_singular & (square * inverse < dr.square(0.5 * (reach - 1)))
@@ -89,19 +96,30 @@ _SHARE = 1 / (4 * math.pi)
 
 @dataclass(frozen=True)
 class TreeWinding:
-    """w of a mesh on a backend, in units in which the mesh has a size of about one."""
+    """w of a mesh on a backend, in units in which the mesh has a size of about one. cells: for
+    samples with gradients up to detail 1."""
 
     clusters: Treecode
     rounding: Real
+    cells: NearFarCells | None = None
 
     @classmethod
-    def of(cls, backend: Backend, mesh: WindingMesh, accuracy: float, order: int) -> TreeWinding:
-        """Everything uploaded."""
+    def of(
+        cls, backend: Backend, mesh: WindingMesh, accuracy: float, order: int,
+        most_bytes: int = 0, half: float = 0.0,
+    ) -> TreeWinding:  # fmt: skip
+        """Everything uploaded. most_bytes: of cells of the cube [-half, half]^3; 0 for none."""
         records = np.concatenate([mesh.records, mesh.singular_flags], axis=1)
         slots = in_slots(mesh.tree, records)
         rounding = last_roundings(backend)
         levels = list(mesh.levels)
-        return cls(Treecode.of(backend, mesh.tree, levels, slots, accuracy, order), rounding)
+        clusters = Treecode.of(backend, mesh.tree, levels, slots, accuracy, order)
+        if not most_bytes:
+            return cls(clusters, rounding)
+        sources = mesh.tree.gather(triangle_sources(mesh.corners))
+        triangles = clusters.tree.primitives
+        cells = build_cells(backend, mesh.tree, levels, sources, triangles, half, most_bytes)
+        return cls(clusters, rounding, cells)
 
     @property
     def has_detail(self) -> bool:
@@ -115,7 +133,7 @@ class TreeWinding:
     @property
     def coarsest_detail(self) -> float:
         """`Field.coarsest_detail`."""
-        return self.clusters.coarsest
+        return self.clusters.coarsest if self.cells is None else 1.0
 
     def at(self, x: Vec3, derivatives: int, closer: Real) -> Values:
         """w and the derivatives asked for at points; closer: the detail, at least 1.
@@ -140,23 +158,48 @@ class TreeWinding:
 
         is_ahead(row, t): whether a crossing at t with the triangle of a record is ahead.
         """
-        reach = self.clusters.ratio(detail)
-
-        def add(
-            row: list[Real], active: Mask, sums: FieldSums, own: tuple[Any, ...]
-        ) -> tuple[FieldSums, tuple[Any, ...]]:
-            t, turn = crossing(row, frame)
-            # A crossing is a full turn of the product, which counts them without rounding.
-            re, im, turns = own
-            turns = turns + dr.select(active & is_ahead(row, t), turn, 0)
-            lifted = LiftedSums(sums, LiftedProduct(re, im, turns))
-            for near in edges_of(row, x, frame):
-                lifted = lifted.plus(near.edge, unit, active & near.is_open(reach))
-            return lifted.sums, lifted.product.parts()
-
         one = LiftedProduct.one(self.backend.Float).parts()
-        sums, product = self.clusters.sums(x, detail, add, one, where, derivatives=derivatives)
+
+        def adder(reach: Real) -> AddPrimitive:
+            def add(
+                row: list[Real], active: Mask, sums: FieldSums, own: tuple[Any, ...]
+            ) -> tuple[FieldSums, tuple[Any, ...]]:
+                t, turn = crossing(row, frame)
+                # A crossing is a full turn of the product, which counts them without rounding.
+                re, im, turns = own
+                turns = turns + dr.select(active & is_ahead(row, t), turn, 0)
+                lifted = LiftedSums(sums, LiftedProduct(re, im, turns))
+                for near in edges_of(row, x, frame):
+                    lifted = lifted.plus(near.edge, unit, active & near.is_open(reach))
+                return lifted.sums, lifted.product.parts()
+
+            return add
+
+        sums, product = self._near_sums(x, detail, adder, one, where, derivatives)
         return LiftedSums(sums, LiftedProduct(*product)).whole()
+
+    def _near_sums(
+        self, x: Vec3, detail: Real, adder: Callable[[Real], AddPrimitive], own: tuple[Any, ...],
+        where: Mask, derivatives: int = 1,
+    ) -> tuple[FieldSums, tuple[Any, ...]]:  # fmt: skip
+        """The sums, and a state of the caller's own, by the cells where there are any, the detail
+        is at most 1 and derivatives are first ones.
+
+        adder: from the reach of `NearEdge.is_open`, what adds a near triangle.
+        """
+        reach = self.clusters.ratio(detail)
+        if self.cells is None or derivatives != 1:
+            add = adder(reach)
+            return self.clusters.sums(x, detail, add, own, where, derivatives=derivatives)
+        here, real = self.backend.Bool(where), self.backend.Float
+        add = adder(real(OF_TRIANGLE))
+        found, state, in_cells = self.cells.sums(x, here & (detail <= 1), add, own)
+        finer = fmax(detail, real(1))
+        add = adder(self.clusters.ratio(finer))
+        others, theirs = self.clusters.sums(x, finer, add, own, here & ~in_cells)
+        pairs = zip(state, theirs, strict=True)
+        state = tuple(dr.select(in_cells, one, other) for one, other in pairs)
+        return found.where(~in_cells, others), state
 
     def start(self, frame: Frame, t: Real, active: Mask) -> Real:
         """0: this method does not count crossings along rays, as every sum gives all of w."""
@@ -192,22 +235,24 @@ class TreeWinding:
 
     def _rates(self, line: Line, where: Mask) -> Rates:
         """The rates of `edge_trails.rates_along` for 4 pi w on a line."""
-        reach = self.clusters.rough
 
         def rates(lengths: tuple[Real, ...], active: Mask) -> tuple[Real, ...]:
             active = active & where
 
-            def add(
-                row: list[Real], active: Mask, sums: FieldSums, own: tuple[Any, ...]
-            ) -> tuple[FieldSums, tuple[Any, ...]]:
-                for near in edges_of(row, line.x, Upwards(line.x)):
-                    open_ = active & near.is_open(reach)
-                    new = with_edge_rates(line, near.edge.edge, lengths, own)
-                    own = tuple(dr.select(open_, a, b) for a, b in zip(new, own, strict=True))
-                return sums, own
+            def adder(reach: Real) -> AddPrimitive:
+                def add(
+                    row: list[Real], active: Mask, sums: FieldSums, own: tuple[Any, ...]
+                ) -> tuple[FieldSums, tuple[Any, ...]]:
+                    for near in edges_of(row, line.x, Upwards(line.x)):
+                        open_ = active & near.is_open(reach)
+                        new = with_edge_rates(line, near.edge.edge, lengths, own)
+                        own = tuple(dr.select(open_, a, b) for a, b in zip(new, own, strict=True))
+                    return sums, own
+
+                return add
 
             start = tuple(self.backend.Float(0) for _ in lengths)
-            far, near = self.clusters.sums(line.x, 0, add, start, active)
+            far, near = self._near_sums(line.x, self.backend.Float(0), adder, start, active)
             return far.with_rates(line.v, line.slack, lengths, near, active)
 
         return rates
