@@ -34,6 +34,7 @@ from harnack.fields.solid_angles.local_expansion import (
     value_and_gradient,
 )
 from harnack.fields.sums import SUM_ROUNDING, FieldSums
+from harnack.tree import NO_PRIMITIVE
 from harnack.tree.cell_lookup import DEEPEST, MARGIN, OCTANTS, CellLookup, numbered_nodes
 
 if TYPE_CHECKING:
@@ -50,8 +51,9 @@ _NEAR, _SHARED = 2.5, 4.0
 # Nodes of the tree are left to the cells in a cell up to this share of the radius of its ball.
 _SMALL = 0.35
 # Cells are split that have more near primitives, by experiment; where memory is short, twice as
-# many, again and again, up to a number with which the tree is faster.
-_MOST_NEAR, _TOO_MANY = 64, 512
+# many, again and again, up to a number, or this part of all triangles, with which the tree, or
+# cells of edges, are faster.
+_MOST_NEAR, _TOO_MANY, _PART = 64, 512, 1 / 8
 # Numbers of a record before the coefficients, and the base in which the first index is stored:
 # single precision holds no integers above 2^24.
 _HEAD, _BASE = 14, 4096
@@ -166,7 +168,11 @@ def build_cells(
     (`Sources.parted`). In a cell that is not split nothing but near primitives is left.
     """
     packed = source_tree(tree, levels, rows)
-    octree = _fitting(packed, half, backend, most_bytes)
+    most_near = _TOO_MANY
+    if packed.primitives.packets > 1:
+        part = int(_PART * (tree.slots != NO_PRIMITIVE).sum())
+        most_near = max(_MOST_NEAR, min(_TOO_MANY, part))
+    octree = _fitting(packed, half, backend, most_near, most_bytes)
     if octree is None:
         return None
     double, shifts = packed.backend, shift_matrices(DEGREE, 0.5 / (math.sqrt(3) * MARGIN))
@@ -221,20 +227,21 @@ def _table(
 
 
 def _fitting(
-    packed: PackedTree, half: float, backend: Backend, most_bytes: int
+    packed: PackedTree, half: float, backend: Backend, most_near: int, most_bytes: int
 ) -> list[_Level] | None:
-    """The octree, with as few near primitives in a cell as memory allows; None where it takes too
-    many: lists of near ones take nearly as much memory, whatever the size of the cells."""
+    """The octree, with as few near primitives in a cell as memory allows; None where it takes more
+    than `most_near`: lists of near ones take nearly as much memory, whatever the size of the
+    cells."""
 
     def is_too_large(levels: list[_Level]) -> bool:
         return _bytes(backend, levels) > most_bytes
 
-    most_near = _MOST_NEAR
-    while most_near <= _TOO_MANY:
-        octree = _octree(packed, half, most_near, is_too_large)
+    near = _MOST_NEAR
+    while near <= most_near:
+        octree = _octree(packed, half, near, is_too_large)
         if octree is not None:
             return octree
-        most_near *= 2
+        near *= 2
     return None
 
 

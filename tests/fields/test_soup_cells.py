@@ -1,0 +1,221 @@
+"""Cells of triangle soups: near triangles, and one polynomial for all others."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+import harnack as hk
+from harnack.backend import choose_backend, to_numpy, to_vector3
+from harnack.fields.solid_angles import near_far, winding_number
+from harnack.fields.solid_angles.far_sums import triangle_sources
+from harnack.fields.solid_angles.near_far import NearFarCells
+from harnack.geometry.mesh_shapes import bumpy_sphere, icosphere, remove_faces
+from tests.fields.test_winding import (
+    Mesh,
+    check_first_hits,
+    direct_sum,
+    places,
+    rays,
+    rounded,
+    unit,
+)
+
+PRECISIONS = ["single", "double"]
+
+
+def torn(subdivisions: int, by: float, shift: float = 0.0, seed: int = 0) -> Mesh:
+    """A bumpy sphere, all corners of its triangles moved by about so much."""
+    vertices, faces = bumpy_sphere(subdivisions)
+    corners = vertices[faces]
+    corners = corners + by * np.random.default_rng(seed).normal(size=corners.shape) + shift
+    return rounded(corners.reshape(-1, 3)), np.arange(corners.size // 3).reshape(-1, 3)
+
+
+def scattered(n: int, size: float, seed: int = 0) -> Mesh:
+    """Triangles anywhere in any direction, some of them slivers, some twice."""
+    rng = np.random.default_rng(seed)
+    corners = rng.uniform(-1, 1, (n, 1, 3)) + size * rng.normal(size=(n, 3, 3))
+    corners[::17, 2] = 0.5 * (corners[::17, 0] + corners[::17, 1]) + 1e-4 * size
+    corners[::11, 2] = corners[::11, 1] + 1e-3 * size
+    corners[1::23] = corners[::23][: len(corners[1::23])]
+    return rounded(corners.reshape(-1, 3)), np.arange(3 * n).reshape(-1, 3)
+
+
+def soup(mesh: Mesh, cells: Any = True) -> hk.WindingNumber:
+    return hk.WindingNumber(*mesh, method="tree", cells=cells)
+
+
+def cells_of(prepared: hk.WindingNumber) -> NearFarCells:
+    assert prepared._device is not None
+    cells = prepared._device.built
+    assert isinstance(cells, NearFarCells)
+    return cells
+
+
+MESHES = {
+    "torn": torn(2, 0.01),
+    "torn far away": torn(2, 0.01, shift=300.0),
+    "hardly torn": torn(2, 1e-4),
+    "scattered": scattered(700, 0.03),
+    "large": scattered(200, 0.3),
+}
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("kind", MESHES)
+def test_samples_are_within_their_errors(
+    kind: str, precision: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(near_far, "_PART", 1.0)
+    if kind == "large":  # near them are leaves whose balls are not
+        monkeypatch.setattr(near_far, "_MOST_NEAR", 24)
+    mesh, backend = MESHES[kind], choose_backend(precision)
+    field = soup(mesh).prepare(backend)
+    cells = cells_of(field)
+    assert cells.count > 8
+    middle = rounded(mesh[0].mean(axis=0, keepdims=True))
+    x = rounded(middle + places((mesh[0] - middle, mesh[1]), 3000, 1e-4))
+    sample = field.evaluate(to_vector3(backend, x))
+    plain = soup(mesh, False)
+    gradient = hk.WindingNumber(*mesh, method="exact").gradient(x, precision="double")
+    steep = np.linalg.norm(gradient, axis=1)
+    place = 4 * backend.epsilon * np.abs(x).max(axis=1) * steep
+    off = np.abs(to_numpy(sample.value) - direct_sum(mesh[0][mesh[1]], x))
+    error = to_numpy(sample.error).astype(np.float64)
+    beside = plain.error_bound(x, precision=precision) > 0.5  # of a triangle, by rounding
+    assert beside.mean() < 0.1
+    assert (off <= error + place + 1e-12)[~beside].all()
+    assert np.median(error) < 1e-2
+    turned = np.linalg.norm(to_numpy(sample.gradient) - gradient, axis=1)
+    bent = to_numpy(sample.known[0].constant) * 4 * backend.epsilon * np.abs(x).max()
+    assert (turned <= to_numpy(sample.gradient_error) + bent + 1e-4 * steep).all()
+
+
+def test_errors_are_attained(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Half the error would be too little: at corners of the cells around one triangle, of a
+    large and a small one that are far from them."""
+    monkeypatch.setattr(near_far, "_MOST_NEAR", 1)
+    small = np.array([[0.0, 0, 0], [0.02, 0, 0], [0, 0.02, 0]])
+    large = np.array([[0.0, 0, 0], [0.2, 0, 0.1], [0, 0.25, 0]])
+    corners = np.stack([small, small + 0.5, large + np.array([0.6, -0.6, 0.6])])
+    field = soup((corners.reshape(-1, 3), np.arange(9).reshape(-1, 3)))
+    prepared = field.prepare(choose_backend("double"))
+    cells = cells_of(prepared)
+    table = to_numpy(cells.records.buffer).reshape(cells.count, -1)
+    away = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+    unit_x = table[:, None, :3] + away / math.sqrt(3) / 1.0041 / table[:, None, 3:4]
+    x = field.mesh.center + field.mesh.size * unit_x.reshape(-1, 3)
+    sample = prepared.evaluate(to_vector3(choose_backend("double"), x))
+    off = np.abs(to_numpy(sample.value) - direct_sum(corners, x))
+    used = off / to_numpy(sample.error)
+    assert used.max() <= 1
+    assert used.max() > 0.5
+
+
+def test_triangles_of_no_area_count_for_their_edges() -> None:
+    corners = np.zeros((2, 3, 3))
+    corners[1, 1:] = np.eye(3)[:2]
+    sources = triangle_sources(corners)
+    assert (sources[:, 6] > 0).all()
+    assert (np.abs(sources[0, 3:6]) < 1e-30).all()
+    np.testing.assert_allclose(sources[1, 3:7], [0, 0, 0.5, 0.5])
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("by", [0.01, 1e-4])
+def test_first_hits(by: float, precision: Any) -> None:
+    check_first_hits(torn(2, by), "tree", 400, 3, precision, cells=True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("seed", [1, 2])
+def test_many_first_hits(seed: int, precision: Any) -> None:
+    check_first_hits(torn(3, 0.02 / seed, seed=seed), "tree", 2000, seed, precision, cells=True)
+
+
+def compare(mesh: Mesh, o: np.ndarray, d: np.ndarray, **settings: Any) -> hk.Hits:
+    """Rays end as without cells, but for grazes within the tolerance."""
+    hits, plain = (hk.trace(soup(mesh, cells), o, d, **settings) for cells in (True, False))
+    assert not (hits.status == hk.Status.OUT_OF_STEPS).any()
+    assert (plain.hit != hits.hit).mean() <= 2e-3
+    both = plain.hit & hits.hit
+    apart = np.abs(plain.t[both] - hits.t[both])
+    assert (apart > 2e-3 * (1 + np.abs(o).max() / 100)).mean() <= 5e-3
+    return hits
+
+
+def test_rays_from_inside_far_away_and_along_faces_of_cells() -> None:
+    mesh, rng = torn(2, 0.01), np.random.default_rng(1)
+    o, d = rng.uniform(-0.6, 0.6, (1000, 3)), unit(rng.normal(size=(1000, 3)))
+    compare(mesh, o, d, t_min=0.3)
+    compare(mesh, o - 1e3 * d, d, precision="double")
+    cells = cells_of(soup(mesh).prepare(choose_backend("single")))
+    table = to_numpy(cells.records.buffer).reshape(cells.count, -1).astype(np.float64)
+    some = table[rng.integers(cells.count, size=1000)]
+    corner = some[:, :3] + rng.choice([-1, 1], (1000, 3)) / (1.004 * math.sqrt(3)) / some[:, 3:4]
+    field = soup(mesh)
+    corner = field.mesh.center + field.mesh.size * corner
+    d = np.eye(3)[rng.integers(3, size=1000)]
+    d[500:] = unit(rng.choice([-1.0, 1.0], (500, 3)))
+    hits = compare(mesh, corner - 3 * d, d)
+    assert hits.hit.mean() > 0.3
+
+
+def test_many_rays_and_crossings() -> None:
+    mesh = torn(2, 0.01)
+    hits = compare(mesh, *rays(mesh, 6000, 9))  # so many that a grid of empty cells is made
+    assert hits.hit.mean() > 0.3
+    o, d = rays(mesh, 300, 2)
+    for settings in ({"all_hits": 6}, {"confirm": True}):
+        one, other = (hk.trace(soup(mesh, cells), o, d, **settings) for cells in (True, False))
+        there = np.isfinite(one.t) & np.isfinite(other.t)
+        assert (np.isfinite(one.t) == np.isfinite(other.t)).mean() > 0.98
+        assert (np.abs(one.t[there] - other.t[there]) > 1e-3).mean() < 0.02
+
+
+def test_moved_soups_have_cells_of_their_own() -> None:
+    vertices, faces = torn(2, 0.01)
+    o, d = rays((vertices, faces), 500, 3)
+    field = soup((vertices, faces))
+    hk.trace(field, o, d)
+    moved = 1.3 * vertices + 0.2
+    hits = hk.trace(field.moved(moved), 1.3 * o + 0.2, d)
+    plain = hk.trace(soup((moved, faces), False), 1.3 * o + 0.2, d)
+    assert (hits.hit == plain.hit).mean() > 0.998
+
+
+def test_when_there_are_cells_of_triangles() -> None:
+    mesh = torn(3, 0.01)
+    field = hk.WindingNumber(*mesh)
+    assert field.method == "tree"
+    assert field.describe()["cells"] == "from 15,360 rays on"
+    assert field.for_rays(15_000) is field
+    prepared = field.for_rays(20_000).prepare(choose_backend("single"))
+    cells = cells_of(prepared)
+    assert prepared.describe()["cells"] == f"{cells.count} of {cells.size / 1e6:.1f} MB"
+    assert not prepared.is_modulo
+    short = soup(mesh, 0.01).prepare(choose_backend("single"))
+    assert short.describe()["cells"] == "none, as they need more memory"
+    coarse = cells_of(soup(mesh, 2.0).prepare(choose_backend("single")))
+    assert coarse.size <= 2e6 < cells.size
+
+
+def test_few_or_large_triangles_and_shared_edges_have_cells_of_edges(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Where triangles are as large as all of the soup, all of them are near."""
+    vertices, faces = bumpy_sphere(2)
+    for mesh in (scattered(300, 0.5), (vertices, remove_faces(faces, 0.1, 0))):
+        prepared = soup(mesh).prepare(choose_backend("single"))
+        assert prepared._device is not None
+        assert prepared._device.cells is not None
+        assert prepared.is_modulo
+    monkeypatch.setattr(winding_number, "_MOST_OF_SOUP", 100)
+    assert soup(torn(2, 0.01), None).for_rays(10**9).cells is None
+    assert soup(icosphere(1), True).prepare(choose_backend("single")).describe()["triangles"] == 80
