@@ -104,7 +104,8 @@ def _row(name: str, make: Callable[..., Any], count: _Rays, unit: float = 1e9) -
             work()
             best = min(_seconds(work) for _ in range(count.repeats))
             entries.append(f"{best / len(o) * unit:,.{0 if unit > 1e6 else 1}f}")
-    size = field.prepare(backend)._device.cells.size
+    on = field.prepare(backend)._device
+    size = (on.built if isinstance(field, hk.WindingNumber) else on.cells).size
     return f"| {name} | " + " | ".join(entries) + f" | {built:.2f} s | {size / 1e6:.1f} |"
 
 
