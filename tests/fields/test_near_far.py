@@ -307,7 +307,7 @@ def test_many_rays_get_cells_by_themselves(monkeypatch: pytest.MonkeyPatch) -> N
     assert field.for_rays(99_999) is field
     with_cells = field.for_rays(100_000)
     assert with_cells.cells is True
-    assert field.for_rays(10**8) is with_cells
+    assert field.for_rays(200_000) is with_cells
     assert field.cells is None
     for given in (False, 3.0):
         refused = hk.DipolePotential(*some, cells=given)
@@ -331,9 +331,9 @@ def test_many_rays_get_cells_by_themselves(monkeypatch: pytest.MonkeyPatch) -> N
     made: list[int] = []
     build = dipole.build_cells
 
-    def counted(*given: Any) -> Any:
+    def counted(*given: Any, **settings: Any) -> Any:
         made.append(1)
-        return build(*given)
+        return build(*given, **settings)
 
     monkeypatch.setattr(dipole, "build_cells", counted)
     field = hk.DipolePotential(*some)
@@ -347,6 +347,22 @@ def test_many_rays_get_cells_by_themselves(monkeypatch: pytest.MonkeyPatch) -> N
     assert (plain.hit != hits.hit).mean() < 2e-3
     hk.render(field, size=(32, 32), show="shaded", progress=False)
     assert len(made) == 1
+
+
+def test_very_many_rays_get_smaller_cells(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dipole, "_LEAST_RAYS", 1000)
+    field = hk.DipolePotential(*cloud(600))
+    some, many = field.for_rays(5000), field.for_rays(60 * 600)
+    assert some is not many
+    assert field.for_rays(10**9) is many
+    assert field.for_rays(6000) is some
+    counts: list[int] = []
+    for one in (some, many, hk.DipolePotential(*cloud(600), cells=True)):
+        on = one.prepare(choose_backend("single"))._device
+        assert on is not None
+        assert on.tree.cells is not None
+        counts.append(on.tree.cells.count)
+    assert 1.5 * counts[0] < counts[1] == counts[2]
 
 
 def test_moved_points_keep_cells() -> None:

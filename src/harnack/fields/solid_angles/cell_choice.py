@@ -35,9 +35,14 @@ class Cells(Protocol):
 
 class HasCells(Field):
     """A field that may have cells. Subclasses set `cells` by `set_cells`, and define
-    `least_rays`."""
+    `least_rays`.
+
+    finer: whether there are so many rays that smaller cells pay as well, as where cells were asked
+        for.
+    """
 
     cells: bool | float | None
+    finer: bool
     _device: Any
 
     def set_cells(self, cells: bool | float | None) -> None:
@@ -46,12 +51,16 @@ class HasCells(Field):
             raise ValueError(
                 f"cells must be True, False, a number of megabytes or None, not {cells}"
             )
-        self.cells = cells
+        self.cells, self.finer = cells, True
         self._with_cells: Remembered[tuple[int, ...], Self] = Remembered()
 
     @abc.abstractmethod
     def least_rays(self) -> float:
         """The number of rays from which on cells pay; infinite for never."""
+
+    def least_rays_of_finer(self) -> float:
+        """The number of rays from which on smaller cells pay. The default has one size."""
+        return 0.0
 
     def made_of(self) -> tuple[Any, ...]:
         """Attributes that may be replaced, for which cells are made anew. The default has none."""
@@ -68,9 +77,11 @@ class HasCells(Field):
         """With cells, if none were asked for and none refused, from `least_rays` on."""
         if self.cells is not None or not self.least_rays() <= count:
             return self
-        key = tuple(map(id, self.made_of()))  # of objects that the copy holds
+        finer = self.least_rays_of_finer() <= count
+        key = finer, *map(id, self.made_of())  # of objects that the copy holds
         if key not in self._with_cells:
             self._with_cells[key] = self.having_cells()
+            self._with_cells[key].finer = finer
         return self._with_cells[key]
 
     def most_bytes(self) -> int:

@@ -46,8 +46,10 @@ if TYPE_CHECKING:
 # Where there are cells, the detail of the tree that detail 1 stands for, by experiment.
 _BEYOND_CELLS = 1.0
 # Cells are built by themselves from so many rays a point, and so many rays, on, and up to so many
-# points. To build them takes as long as to trace about 6 rays a point without them.
+# points. To build them takes as long as to trace about 6 rays a point without them; smaller ones,
+# in which a ray takes two thirds of the time, pay from more rays a point on.
 _PAYS, _LEAST_RAYS, _MOST_POINTS = 7, 100_000, 200_000
+_FINER_PAYS = 60
 # A point counts as near if the squared distance is less than this fraction of its area.
 _BESIDE = 0.04
 
@@ -70,12 +72,12 @@ class DipoleTree:
     @classmethod
     def of(
         cls, backend: Backend, tree: Hierarchy, points: FloatArray, moments: FloatArray,
-        accuracy: float, most_bytes: int = 0, half: float = 0.0,
+        accuracy: float, most_bytes: int = 0, half: float = 0.0, *, finer: bool = False,
     ) -> DipoleTree:  # fmt: skip
         """From points (n, 3) of size about one and moments (n, 3), area times normal.
 
         tree: `hierarchy_of` these points, or of the same points at earlier positions.
-        most_bytes: of cells of the cube [-half, half]^3; 0 for no cells.
+        most_bytes: of cells of the cube [-half, half]^3; 0 for no cells. finer: see `build_cells`.
         """
         levels = all_levels(tree, points[:, None], moments[:, None], points, points)
         rows = dipole_rows(points, moments)
@@ -85,7 +87,8 @@ class DipoleTree:
         if not most_bytes:
             return cls(clusters, rounding)
         dipoles = clusters.tree.primitives
-        cells = build_cells(backend, tree, levels, slots, dipoles, half, most_bytes)
+        given = backend, tree, levels, slots, dipoles, half, most_bytes
+        cells = build_cells(*given, finer=finer)
         return cls(clusters, rounding, cells)
 
     @property
@@ -398,9 +401,8 @@ class DipolePotential(HasCells, DetailedField["_DipoleBuffers"], BatchedField):
             tree = SmoothedSum.of(backend, self._hierarchy, rows, height, accuracy)
         else:
             most_bytes = self.most_bytes() if traced else 0
-            tree = DipoleTree.of(
-                backend, self._hierarchy, unit, moments, accuracy, most_bytes, self._half(unit)
-            )
+            given = backend, self._hierarchy, unit, moments, accuracy, most_bytes
+            tree = DipoleTree.of(*given, self._half(unit), finer=self.finer)
         return _DipoleBuffers(*placed(backend, self._center, self._size), tree)
 
     def _half(self, unit: FloatArray) -> float:
@@ -415,6 +417,9 @@ class DipolePotential(HasCells, DetailedField["_DipoleBuffers"], BatchedField):
     def least_rays(self) -> float:
         few = len(self.points) <= _MOST_POINTS and not self.smoothing
         return max(_LEAST_RAYS, _PAYS * len(self.points)) if few else math.inf
+
+    def least_rays_of_finer(self) -> float:
+        return _FINER_PAYS * len(self.points)
 
     def prepare(self, backend: Backend) -> Self:
         prepared = super().prepare(backend)

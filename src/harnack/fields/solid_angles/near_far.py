@@ -52,8 +52,9 @@ _NEAR, _SHARED = 2.5, 4.0
 _SMALL = 0.35
 # Cells are split that have more near primitives, by experiment; where memory is short, twice as
 # many, again and again, up to a number, or this part of all triangles, with which the tree, or
-# cells of edges, are faster.
+# cells of edges, are faster. Cells of points for very many rays have this part as many.
 _MOST_NEAR, _TOO_MANY, _PART = 64, 512, 1 / 8
+_FINER = 3 / 8
 # Numbers of a record before the coefficients, and the base in which the first index is stored:
 # single precision holds no integers above 2^24.
 _HEAD, _BASE = 14, 4096
@@ -153,14 +154,15 @@ class _Level:
 
 def build_cells(
     backend: Backend, tree: Hierarchy, levels: list[NodeMoments], rows: FloatArray,
-    primitives: Records, half: float, most_bytes: int,
+    primitives: Records, half: float, most_bytes: int, *, finer: bool = False,
 ) -> NearFarCells | None:  # fmt: skip
     """Cells of a cube [-h, h]^3, h at least `half`, of at most so many bytes; None where those
     would be too large to be of use.
 
     levels, rows: the moments of the tree, and its primitives in their slots (`source_tree`).
         primitives: records of the latter on the backend, in the same slots.
-    Where cells would take more bytes, they are larger and have more near primitives.
+    finer: whether cells are for very many rays. Where they would take more bytes, they are larger
+        and have more near primitives.
 
     Proof that each primitive counts once in each cell that is not split. The root of the octree
     begins with the root of the tree. A cell that is split adds what is far from it to the
@@ -168,11 +170,13 @@ def build_cells(
     (`Sources.parted`). In a cell that is not split nothing but near primitives is left.
     """
     packed = source_tree(tree, levels, rows)
-    most_near = _TOO_MANY
+    near, most_near = _MOST_NEAR, _TOO_MANY
+    if finer:
+        near = int(_FINER * near)
     if packed.primitives.packets > 1:
         part = int(_PART * (tree.slots != NO_PRIMITIVE).sum())
         most_near = max(_MOST_NEAR, min(_TOO_MANY, part))
-    octree = _fitting(packed, half, backend, most_near, most_bytes)
+    octree = _fitting(packed, half, backend, (near, most_near), most_bytes)
     if octree is None:
         return None
     double, shifts = packed.backend, shift_matrices(DEGREE, 0.5 / (math.sqrt(3) * MARGIN))
@@ -227,21 +231,21 @@ def _table(
 
 
 def _fitting(
-    packed: PackedTree, half: float, backend: Backend, most_near: int, most_bytes: int
+    packed: PackedTree, half: float, backend: Backend, near: tuple[int, int], most_bytes: int
 ) -> list[_Level] | None:
-    """The octree, with as few near primitives in a cell as memory allows; None where it takes more
-    than `most_near`: lists of near ones take nearly as much memory, whatever the size of the
-    cells."""
+    """The octree, with as few near primitives in a cell as memory allows, from the first number on;
+    None where it takes more than the second: lists of near ones take nearly as much memory,
+    whatever the size of the cells."""
 
     def is_too_large(levels: list[_Level]) -> bool:
         return _bytes(backend, levels) > most_bytes
 
-    near = _MOST_NEAR
-    while near <= most_near:
-        octree = _octree(packed, half, near, is_too_large)
+    some, most_near = near
+    while some <= most_near:
+        octree = _octree(packed, half, some, is_too_large)
         if octree is not None:
             return octree
-        near *= 2
+        some *= 2
     return None
 
 
