@@ -117,6 +117,52 @@ def test_errors_are_attained(monkeypatch: pytest.MonkeyPatch) -> None:
     assert used.max() > 0.5
 
 
+# Far from the middle of what sets the size, beside the origin, between two heaps of sources, so
+# that the far field is steep, in a cell with nothing near. Copies, size, place, distance.
+HEAPS = 2000, 1.4e-4, np.full(3, 0.00395965576171875), 0.005096144243526092
+AROUND = np.array([
+    [[0, 1.5, 0], [0.02, 1.5, 0], [0, 1.52, 0]],
+    [[2.12, 2.12, 2.12], [2.10, 2.12, 2.12], [2.12, 2.10, 2.12]],
+    [[0.2, 0, 0], [0.22, 0, 0], [0.2, 0.02, 0]],
+])  # fmt: skip
+
+
+def heaps() -> tuple[np.ndarray, np.ndarray]:
+    """Corners of triangles, the first three those around; and points between the heaps."""
+    copies, size, place, distance = HEAPS
+    axis = np.ones(3) / math.sqrt(3)
+    u = unit(np.cross(axis, [1.0, 0, 0])[None])[0]
+    w = np.cross(axis, u)
+    small = size / 3 * np.array([-u - w, 2 * u - w, 2 * w - u]) + place
+    ends = np.repeat([small + distance * axis, small - distance * axis], copies, axis=0)
+    x = place + 2e-4 * np.random.default_rng(0).uniform(-1, 1, (4000, 3))
+    return rounded(np.concatenate([AROUND, ends])), rounded(x)
+
+
+@pytest.mark.parametrize("kind", ["triangles", "points"])
+def test_rounding_of_positions_counts_where_all_is_far(kind: str) -> None:
+    """Errors were up to three times as large as was said, in single precision."""
+    (corners, x), backend = heaps(), choose_backend("single")
+    flat = corners.reshape(-1, 3)
+    a, b, c = np.moveaxis(corners, 1, 0)
+    normals = 0.5 * np.cross(b - a, c - a)
+    points, areas = rounded(corners.mean(axis=1)), np.linalg.norm(normals, axis=1)
+    field: Any
+    if kind == "triangles":
+        field = soup((flat, np.arange(len(flat)).reshape(-1, 3)))
+        exact = 4 * math.pi * direct_sum(corners, x)
+    else:
+        field = hk.DipolePotential(points, normals, areas, cells=True)
+        away, moments = x[:, None] - points, field.normals * field.areas[:, None]
+        exact = -((moments * away).sum(axis=2) / np.linalg.norm(away, axis=2) ** 3).sum(axis=1)
+    sample = field.prepare(backend).evaluate(to_vector3(backend, x))
+    scale = 4 * math.pi if kind == "triangles" else 1.0
+    off = np.abs(scale * to_numpy(sample.value).astype(np.float64) - exact)
+    steep = scale * np.linalg.norm(to_numpy(sample.gradient), axis=1)
+    place = 4 * backend.epsilon * np.abs(x).max(axis=1) * steep
+    assert (off <= scale * to_numpy(sample.error) + place).all()
+
+
 def test_triangles_of_no_area_count_for_their_edges() -> None:
     corners = np.zeros((2, 3, 3))
     corners[1, 1:] = np.eye(3)[:2]

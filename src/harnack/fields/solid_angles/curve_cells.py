@@ -105,6 +105,9 @@ class CurveCells:
         Gegenbauer's polynomials, which are largest at s = 1. The first two terms are the value and
         the gradient at the center; the others are at most (1-q)^-3 - 1 - 3q = q^2 psi(q), with
         psi = (6 - 8q + 3q^2)/(1-q)^3, which grows with q.
+
+        Rounding of x changes the polynomial by its gradient times that; of near edges
+        `edges.near_rounding` counts it.
         """
         vector, index = self.backend.Array3f, self.backend.UInt32
         number, inside = self.lookup.leaf(x)
@@ -117,6 +120,8 @@ class CurveCells:
         polynomial = [self.backend.Float(0), *others]
         value, *slopes = value_and_gradient(polynomial, [*(u * inverse)], DEGREE)
         rest = inverse * vector(*slopes)
+        steep = dr.norm(rest) + slope_error
+        rounding = dr.fma(2.25 * self.backend.epsilon * (1 + dr.norm(x)), steep, rounding)
         first, count = index(row[13]), dr.select(active, index(row[14]), 0)
         near = self._near(x, first, count)
         away = dr.norm(u) * (1 + SUM_ROUNDING)

@@ -241,7 +241,8 @@ class DipolePotential(HasCells, DetailedField["_DipoleBuffers"], BatchedField):
         They take some 1 kB a point, or the megabytes that are given (True: 256) with larger and
         slower cells; where these would be too large, none are built, and `describe` of a prepared
         field says so. Building takes as long as tracing 100,000 to a million rays without cells,
-        for each precision, at the first trace. All bounds are proved, whatever is given.
+        for each precision, at the first trace, and several times the memory. All bounds are proved,
+        whatever is given.
 
     `moved` gives the field of points that have moved.
 

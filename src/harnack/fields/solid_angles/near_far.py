@@ -21,6 +21,7 @@ import numpy as np
 from harnack.backend import BoolArray, FloatArray, to_numpy, to_vector3
 from harnack.backend.arrays import aligned_integers
 from harnack.backend.records import Records
+from harnack.fields.clearance import epsilon_at
 from harnack.fields.solid_angles.far_sums import (
     COEFFICIENTS,
     DEGREE,
@@ -94,6 +95,9 @@ class NearFarCells:
         Proof of the bounds on far primitives, D >= least from the center, at a point a from it: the
         distance to x is at least D - a >= D (1 - a/least), so that the sum of area/distance^4 is at
         most `fourth` (1 - a/least)^-4, and that of area/distance^5 at most that over least - a.
+
+        Rounding: x was rounded, by less than 2 units as a length; the center is exact. f changes by
+        at most the gradient times that, and by that squared times 4 `s4` (`FieldSums.sample`).
         """
         vector, index = self.backend.Array3f, self.backend.UInt32
         number, inside = self.lookup.leaf(x)
@@ -109,11 +113,11 @@ class NearFarCells:
         error, slope_error = _with_tail(away * inverse, error, slope_error, tail, tail_slope)
         free = least - away
         s4 = fourth * dr.square(dr.square(least / free))
-        zero = self.backend.Float(0)
+        zero, gradient, moved = self.backend.Float(0), inverse * vector(*slopes), 2 * epsilon_at(x)
+        rounding = dr.fma(moved, dr.norm(gradient) + slope_error + 4 * moved * s4, rounding)
         far = FieldSums(
-            value, inverse * vector(*slopes), None, error, slope_error, None, rounding, free, s4,
-            s4 / free, zero,
-        )  # fmt: skip
+            value, gradient, None, error, slope_error, None, rounding, free, s4, s4 / free, zero
+        )
         first, count = index(low) + index(high) * _BASE, dr.select(active, index(count), 0)
 
         def more(i: Any, *_: Any) -> Mask:
@@ -156,8 +160,9 @@ def build_cells(
     backend: Backend, tree: Hierarchy, levels: list[NodeMoments], rows: FloatArray,
     primitives: Records, half: float, most_bytes: int, *, finer: bool = False,
 ) -> NearFarCells | None:  # fmt: skip
-    """Cells of a cube [-h, h]^3, h at least `half`, of at most so many bytes; None where those
-    would be too large to be of use.
+    """Cells of a cube [-h, h]^3, h at least `half`, of at most so many bytes, not counting what it
+    takes to build them, which is several times as much; None where those would be too large to be
+    of use. h has so few digits that single precision holds the centers of all cells exactly.
 
     levels, rows: the moments of the tree, and its primitives in their slots (`source_tree`).
         primitives: records of the latter on the backend, in the same slots.
@@ -170,13 +175,15 @@ def build_cells(
     (`Sources.parted`). In a cell that is not split nothing but near primitives is left.
     """
     packed = source_tree(tree, levels, rows)
-    near, most_near = _MOST_NEAR, _TOO_MANY
+    step = 2.0 ** (math.ceil(math.log2(half)) - 8)
+    half = math.ceil(half / step) * step
+    few, most_near = _MOST_NEAR, _TOO_MANY
     if finer:
-        near = int(_FINER * near)
+        few = int(_FINER * few)
     if packed.primitives.packets > 1:
         part = int(_PART * (tree.slots != NO_PRIMITIVE).sum())
         most_near = max(_MOST_NEAR, min(_TOO_MANY, part))
-    octree = _fitting(packed, half, backend, (near, most_near), most_bytes)
+    octree = _fitting(packed, half, backend, (few, most_near), most_bytes)
     if octree is None:
         return None
     double, shifts = packed.backend, shift_matrices(DEGREE, 0.5 / (math.sqrt(3) * MARGIN))
@@ -217,8 +224,9 @@ def _table(
     backend: Backend, centers: FloatArray, radius: float, sums: FarSums, first: IntArray,
     lengths: IntArray,
 ) -> FloatArray:  # fmt: skip
-    """Records of cells. Rounding is that of `rounding_tables`, for coordinates within a cell and
-    what rounding of positions adds; that of the gradient, over the radius, counts as truncation."""
+    """Records of cells. Rounding is that of `rounding_tables`, for coordinates within a cell; that
+    of positions is counted where they are known, and that of the gradient, over the radius, counts
+    as truncation."""
     tables = rounding_tables(DEGREE, MARGIN / math.sqrt(3))
     rounding = backend.epsilon * np.abs(sums.coefficients) @ tables
     slope = sums.slope + rounding[:, 1:].sum(axis=1) / radius
@@ -241,12 +249,9 @@ def _fitting(
         return _bytes(backend, levels) > most_bytes
 
     some, most_near = near
-    while some <= most_near:
-        octree = _octree(packed, half, some, is_too_large)
-        if octree is not None:
-            return octree
-        some *= 2
-    return None
+    while (octree := _octree(packed, half, some, is_too_large)) is None and some < most_near:
+        some = min(2 * some, most_near)
+    return octree
 
 
 def _octree(

@@ -198,8 +198,8 @@ class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
         that a sample costs the same however many edges there are. In a soup, where triangles have
         hardly an edge in common, near triangles take the place of edges, with the tree as method
         (`near_far`). None builds them where they pay (`for_rays`), True always, False never; at
-        most the megabytes that are given (True: 256). Values and derivatives at points are those of
-        `method`.
+        most the megabytes that are given (True: 256), and several times as much while they are
+        built. Values and derivatives at points are those of `method`.
 
     Hits on triangles have `Hits.sheet`; `faces_of_sheets` gives the face of each. `moved` gives the
     field for the same faces when vertices have moved.
