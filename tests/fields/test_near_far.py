@@ -349,6 +349,20 @@ def test_many_rays_get_cells_by_themselves(monkeypatch: pytest.MonkeyPatch) -> N
     assert len(made) == 1
 
 
+def test_cells_do_not_depend_on_how_many_are_made_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    tables: list[np.ndarray] = []
+    for at_once in (1 << 14, 37):
+        monkeypatch.setattr(near_far, "_AT_ONCE", at_once)
+        field = hk.DipolePotential(*cloud(300), cells=True)
+        on = field.prepare(choose_backend("double"))._device
+        assert on is not None
+        assert on.tree.cells is not None
+        cells = on.tree.cells
+        assert cells.count > 100
+        tables.append(np.concatenate([to_numpy(cells.records.buffer), to_numpy(cells.near)]))
+    np.testing.assert_allclose(tables[0], tables[1], rtol=1e-9, atol=1e-12)
+
+
 def test_very_many_rays_get_smaller_cells(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(dipole, "_LEAST_RAYS", 1000)
     field = hk.DipolePotential(*cloud(600))

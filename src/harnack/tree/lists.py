@@ -25,6 +25,9 @@ Put: TypeAlias = "Callable[[Any, Any, Mask], None]"
 """Writes an entry, where active, at a place in the list of its lane."""
 
 
+_TOO_LONG = "more than 2^31 entries of lists: cut the input in parts"
+
+
 @dataclass(frozen=True)
 class Lists:
     """A list for each lane: where it begins in `entries`, how long it is, all entries."""
@@ -45,6 +48,17 @@ class Lists:
         index = backend.UInt32
         return cls(index(0), index(0), index(0))
 
+    @classmethod
+    def joined(cls, backend: Backend, parts: list[Lists]) -> Lists:
+        """The lists of all lanes, part by part; each part begins with its first entry."""
+        counts = np.concatenate([to_numpy(one.count) for one in parts])
+        entries = [to_numpy(one.entries)[: int(to_numpy(one.count).sum())] for one in parts]
+        first = np.cumsum(counts, dtype=np.int64) - counts
+        if first[-1] + counts[-1] >= 2**31:
+            raise ValueError(_TOO_LONG)
+        arrays = first, counts, np.append(np.concatenate(entries), 0)
+        return cls(*(aligned_integers(backend, one) for one in arrays))
+
     def some(self, backend: Backend, lanes: IntArray) -> Lists:
         """The lists of these lanes; a lane may occur several times."""
         index = backend.UInt32
@@ -61,7 +75,7 @@ def make_lists(backend: Backend, walk: Callable[[Put | None], Any]) -> Lists:
     dr.eval(count)
     start = np.concatenate([[0], np.cumsum(to_numpy(count).astype(np.int64))])
     if start[-1] >= 2**31:
-        raise ValueError("more than 2^31 entries of lists: cut the input in parts")
+        raise ValueError(_TOO_LONG)
     first, entries = aligned_integers(backend, start[:-1]), dr.zeros(index, max(1, int(start[-1])))
 
     def put(place: Any, entry: Any, active: Mask) -> None:

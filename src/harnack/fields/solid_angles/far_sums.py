@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 import numpy as np
 
-from harnack.backend import BoolArray, FloatArray, IntArray, choose_backend, to_numpy
+from harnack.backend import FloatArray, IntArray, choose_backend, to_numpy
 from harnack.backend.elementary import fmin
 from harnack.fields.solid_angles.local_expansion import irregular, of_cluster, parts, tail_factors
 from harnack.fields.solid_angles.multipole import (
@@ -126,9 +126,15 @@ class FarSums:
         least = np.minimum(self.least, other.least)
         return FarSums(self.coefficients + other.coefficients, *sums, least=least)
 
-    def some(self, which: BoolArray) -> FarSums:
-        """Those chosen by a mask."""
+    def some(self, which: IntArray) -> FarSums:
+        """Those of these balls; a ball may occur several times."""
         return FarSums(*(one[which] for one in vars(self).values()))
+
+    @classmethod
+    def joined(cls, parts: list[FarSums]) -> FarSums:
+        """The sums of all balls, part by part."""
+        columns = zip(*(vars(one).values() for one in parts), strict=True)
+        return cls(*(np.concatenate(column) for column in columns))
 
     def of_octants(self, shifts: FloatArray, radius: float) -> FarSums:
         """The same sums seen from the eight octants of cells with balls of this radius, octant
@@ -298,6 +304,12 @@ class Sources:
     def some(self, backend: Backend, lanes: IntArray) -> Sources:
         """Those of these balls; a ball may occur several times."""
         return Sources(self.nodes.some(backend, lanes), self.primitives.some(backend, lanes))
+
+    @classmethod
+    def joined(cls, backend: Backend, parts: list[Sources]) -> Sources:
+        """Those of all balls, part by part."""
+        nodes = Lists.joined(backend, [one.nodes for one in parts])
+        return cls(nodes, Lists.joined(backend, [one.primitives for one in parts]))
 
     def parted(
         self, tree: PackedTree, c: Vec3, radius: Real, factor: float, smallest: Real

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import numpy as np
+import numpy.typing as npt
 
 from harnack.backend import BoolArray, FloatArray, to_numpy, to_vector3
 from harnack.backend.arrays import aligned_integers
@@ -56,6 +57,8 @@ _SMALL = 0.35
 # cells of edges, are faster. Cells of points for very many rays have this part as many.
 _MOST_NEAR, _TOO_MANY, _PART = 64, 512, 1 / 8
 _FINER = 3 / 8
+# So many cells are made at once.
+_AT_ONCE = 1 << 14
 # Numbers of a record before the coefficients, and the base in which the first index is stored:
 # single precision holds no integers above 2^24.
 _HEAD, _BASE = 14, 4096
@@ -187,37 +190,66 @@ def build_cells(
     if octree is None:
         return None
     double, shifts = packed.backend, shift_matrices(DEGREE, 0.5 / (math.sqrt(3) * MARGIN))
-    sources, shared = Sources.of_root(double), FarSums.none(1)
+    sources, above = Sources.of_root(double), _Above(FarSums.none(1), shifts, 0.0)
     nodes: list[IntArray] = []
-    tables, near = [np.zeros((0, 0))], [np.zeros(0, np.uint32)]
+    tables: list[npt.NDArray[Any]] = []
+    near: list[npt.NDArray[Any]] = []
     splits, count, total = 0, 0, 0
     for level in octree:
         leaves, split = np.flatnonzero(level.is_leaf), np.flatnonzero(~level.is_leaf)
         radius, none_stay = (dr.opaque(double.Float, one) for one in (level.radius, -1.0))
-        if len(leaves):
-            own, c = sources.some(double, leaves), to_vector3(double, level.centers[leaves])
+        for some in _parts(leaves):
+            own, c = sources.some(double, some), to_vector3(double, level.centers[some])
             sums, close = own.parted(packed, c, radius, _NEAR, none_stay)
-            sums = sums.plus(shared.some(level.is_leaf))
             lengths = to_numpy(close.primitives.count).astype(np.int64)
             first = total + np.cumsum(lengths) - lengths
-            placed = level.centers[leaves], level.radius
-            tables.append(_table(backend, *placed, sums, first, lengths))
+            placed = level.centers[some], level.radius
+            table = _table(backend, *placed, sums.plus(above.of(some)), first, lengths)
+            tables.append(table.astype(backend.dtype))
             near.append(to_numpy(close.primitives.entries)[: int(lengths.sum())])
             total += int(lengths.sum())
         nodes.append(numbered_nodes(level.is_leaf, count, splits))
         count, splits = count + len(leaves), splits + len(split)
+        found: list[FarSums] = []
+        left: list[Sources] = []
+        for some in _parts(split):
+            ours, c = sources.some(double, some), to_vector3(double, level.centers[some])
+            sums, rest = ours.parted(packed, c, radius, _SHARED, _SMALL * radius)
+            found.append(sums.plus(above.of(some)))
+            left.append(rest)
         if len(split):
-            ours, c = sources.some(double, split), to_vector3(double, level.centers[split])
-            found, left = ours.parted(packed, c, radius, _SHARED, _SMALL * radius)
-            shared = shared.some(~level.is_leaf).plus(found).of_octants(shifts, level.radius)
-            sources = left.some(double, np.repeat(np.arange(len(split)), 8))
-    table, entries = np.concatenate(tables[1:]), np.concatenate(near)
+            above = _Above(FarSums.joined(found), shifts, level.radius)
+            sources = Sources.joined(double, left).some(double, np.repeat(np.arange(len(split)), 8))
+    table, entries = np.concatenate(tables), np.concatenate(near)
     return NearFarCells(
         backend, CellLookup.of(backend, np.full(3, -half), 2 * half, nodes),
         Records.upload(backend, table),
         aligned_integers(backend, entries if len(entries) else np.zeros(1, np.uint32)), primitives,
         count, _bytes(backend, octree),
     )  # fmt: skip
+
+
+def _parts(cells: IntArray) -> list[IntArray]:
+    """Cells by so many at once that lists of what is far from them take little memory."""
+    return [cells[start : start + _AT_ONCE] for start in range(0, len(cells), _AT_ONCE)]
+
+
+@dataclass(frozen=True)
+class _Above:
+    """The sums that cells of a level take over from those around them, `sums` with this radius, in
+    whose order their octants come. shifts: `local_expansion.shift_matrices`."""
+
+    sums: FarSums
+    shifts: FloatArray
+    radius: float
+
+    def of(self, cells: IntArray) -> FarSums:
+        """Those of some cells of the level, by their numbers."""
+        if not self.radius:  # the first level has nothing above
+            return self.sums
+        parents, which = np.unique(cells // 8, return_inverse=True)
+        octants = self.sums.some(parents).of_octants(self.shifts, self.radius)
+        return octants.some(8 * which + cells % 8)
 
 
 def _table(
