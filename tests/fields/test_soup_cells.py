@@ -6,6 +6,7 @@ import itertools
 import math
 from typing import Any
 
+import drjit as dr
 import numpy as np
 import pytest
 
@@ -117,6 +118,28 @@ def test_errors_are_attained(monkeypatch: pytest.MonkeyPatch) -> None:
     assert used.max() > 0.5
 
 
+def test_the_bound_of_bending_is_attained(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Steps in cells are proved by `FieldSums.s4`. Beside a tiny triangle it is nearly exact at the
+    centers of cells: a thousandth less would be too little."""
+    monkeypatch.setattr(near_far, "_MOST_NEAR", 0)
+    tiny = 1e-6 * np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    places = np.array([[0.3, 0.3, 0.3], [1.0, -1.0, 1.0], [-1.0, 1.0, -1.0]])
+    corners = tiny + places[:, None]
+    field = soup((corners.reshape(-1, 3), np.arange(9).reshape(-1, 3)))
+    cells = cells_of(field.prepare(choose_backend("double")))
+    table = to_numpy(cells.records.buffer).reshape(cells.count, -1)
+    c = table[table[:, 13] == 0, :3]  # no near triangles
+    x = to_vector3(choose_backend("double"), c)
+    sums, _, found = cells.sums(x, dr.full(dr.mask_t(x.x), True, 1), lambda *given: given[2:], ())
+    assert to_numpy(found).all()
+    there = (corners.mean(axis=1) - field.mesh.center) / field.mesh.size
+    away = np.linalg.norm(c[:, None] - there, axis=2)
+    exact = (0.5e-12 / field.mesh.size**2 / away**4).sum(axis=1)
+    used = to_numpy(sums.s4) / exact
+    assert used.min() >= 1
+    assert used.min() < 1.001
+
+
 # Far from the middle of what sets the size, beside the origin, between two heaps of sources, so
 # that the far field is steep, in a cell with nothing near. Copies, size, place, distance.
 HEAPS = 2000, 1.4e-4, np.full(3, 0.00395965576171875), 0.005096144243526092
@@ -179,10 +202,10 @@ def test_first_hits(by: float, precision: Any) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("precision", PRECISIONS)
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize(("seed", "precision"), [(1, "single"), (2, "double")])
 def test_many_first_hits(seed: int, precision: Any) -> None:
-    check_first_hits(torn(3, 0.02 / seed, seed=seed), "tree", 2000, seed, precision, cells=True)
+    """So many that a grid of empty cells is made."""
+    check_first_hits(torn(2, 0.04 / seed, seed=seed), "tree", 5000, seed, precision, cells=True)
 
 
 def compare(mesh: Mesh, o: np.ndarray, d: np.ndarray, **settings: Any) -> hk.Hits:

@@ -37,8 +37,7 @@ class HasCells(Field):
     """A field that may have cells. Subclasses set `cells` by `set_cells`, and define
     `least_rays`.
 
-    finer: whether there are so many rays that smaller cells pay as well, as where cells were asked
-        for.
+    finer: whether there are so many rays that smaller cells pay; true where cells were asked for.
     """
 
     cells: bool | float | None

@@ -106,8 +106,8 @@ class CurveCells:
         the gradient at the center; the others are at most (1-q)^-3 - 1 - 3q = q^2 psi(q), with
         psi = (6 - 8q + 3q^2)/(1-q)^3, which grows with q.
 
-        Rounding of x changes the polynomial by its gradient times that; of near edges
-        `edges.near_rounding` counts it.
+        Rounding moves x by less than 2.25 epsilon (1 + |x|), which changes the polynomial by at
+        most its gradient times that; for near edges `edges.near_rounding` counts it.
         """
         vector, index = self.backend.Array3f, self.backend.UInt32
         number, inside = self.lookup.leaf(x)

@@ -43,8 +43,6 @@ if TYPE_CHECKING:
     from harnack.geometry import Volume
     from harnack.tree import Hierarchy
 
-# Where there are cells, the detail of the tree that detail 1 stands for, by experiment.
-_BEYOND_CELLS = 1.0
 # Cells are built by themselves from so many rays a point, and so many rays, on, and up to so many
 # points. To build them takes as long as to trace about 6 rays a point without them; smaller ones,
 # in which a ray takes two thirds of the time, pay from more rays a point on.
@@ -87,8 +85,7 @@ class DipoleTree:
         if not most_bytes:
             return cls(clusters, rounding)
         dipoles = clusters.tree.primitives
-        given = backend, tree, levels, slots, dipoles, half, most_bytes
-        cells = build_cells(*given, finer=finer)
+        cells = build_cells(backend, tree, levels, slots, dipoles, half, most_bytes, finer=finer)
         return cls(clusters, rounding, cells)
 
     @property
@@ -113,10 +110,8 @@ class DipoleTree:
         if self.cells is None:
             return self._sums(x, detail, unit, 1)
         add, none = _adder(x, unit, 1), (self.backend.Array3f(0),)
-        sums, own, found = self.cells.sums(x, detail <= 1, add, none)
-        finer = _BEYOND_CELLS * fmax(detail, self.backend.Float(1))
-        others, theirs = self.clusters.sums(x, finer, add, none, active=~found)
-        return sums.where(~found, others), dr.select(found, own[0], theirs[0])
+        sums, own = self.cells.sums_or_tree(self.clusters, x, detail, (add, add), none)
+        return sums, own[0]
 
     def sample(self, x: Vec3, detail: Real) -> Sample:
         """Value, gradient and promises at x: see `FieldSums.sample`.
@@ -402,8 +397,16 @@ class DipolePotential(HasCells, DetailedField["_DipoleBuffers"], BatchedField):
             tree = SmoothedSum.of(backend, self._hierarchy, rows, height, accuracy)
         else:
             most_bytes = self.most_bytes() if traced else 0
-            given = backend, self._hierarchy, unit, moments, accuracy, most_bytes
-            tree = DipoleTree.of(*given, self._half(unit), finer=self.finer)
+            tree = DipoleTree.of(
+                backend,
+                self._hierarchy,
+                unit,
+                moments,
+                accuracy,
+                most_bytes,
+                self._half(unit),
+                finer=self.finer,
+            )
         return _DipoleBuffers(*placed(backend, self._center, self._size), tree)
 
     def _half(self, unit: FloatArray) -> float:

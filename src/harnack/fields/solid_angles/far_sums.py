@@ -6,14 +6,14 @@
 - `Sources`: the primitives of balls, parted into such sums and what is left to smaller balls.
 
 A node of radius R is far from a ball of radius rho if their centers are farther apart than k rho +
-`_SPREAD` R, a triangle if they are farther apart than k rho + `OF_TRIANGLE` R, a dipole if it is
-farther from the ball's center than k rho, for a factor k > 1: then all points of it are farther
+`_SPREAD` R, a triangle if they are farther apart than k rho + `TRIANGLE_SPREAD` R, a dipole if it
+is farther from the ball's center than k rho, for a factor k > 1: then all points of it are farther
 from the center than k rho. A triangle is a sheet of dipoles, along its normal.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -43,8 +43,8 @@ DEGREE, _POLES = 6, 4
 COEFFICIENTS = (DEGREE + 1) ** 2
 _SPREAD = 4.0
 # The same factor of triangles, by experiment; and the moments in their records, besides the first.
-OF_TRIANGLE = 1.5
-_OF_TRIANGLE = tuple(key for key in parts(_POLES) if key[0] > 2)
+TRIANGLE_SPREAD = 1.5
+_TRIANGLE_MOMENTS = tuple(key for key in parts(_POLES) if key[0] > 2)
 # Numbers of a record of a dipole, and of a triangle before its moments.
 _DIPOLE, _TRIANGLE = 8, 14
 # See `_Expanded.of`.
@@ -63,30 +63,33 @@ def source_tree(tree: Hierarchy, levels: list[NodeMoments], rows: FloatArray) ->
     for level in levels:
         reach = _SPREAD * level.radius
         left_out, slope, _ = truncation(level, reach, _POLES - 1)
-        moments = [
-            level.moments[l, m].imag if part else level.moments[l, m].real
-            for l, m, part in _MOMENTS
-        ]
+        moments = _columns(level, _MOMENTS)
         norms = [sup_norm(level.moments, l) for l in range(1, _POLES + 1)]
         head = [level.center, reach, level.radius, level.area]
         numbers.append(np.column_stack([*head, *moments, left_out, slope, *norms]))
     return pack(choose_backend("double"), tree, numbers, rows)
 
 
+def _columns(level: NodeMoments, keys: Iterable[tuple[int, int, int]]) -> list[FloatArray]:
+    """These of the moments of nodes."""
+    return [level.moments[l, m].imag if part else level.moments[l, m].real for l, m, part in keys]
+
+
 def triangle_sources(corners: FloatArray) -> FloatArray:
-    """(n, 30) records of triangles (n, 3, 3): centroid, area times normal, area, `OF_TRIANGLE`
+    """(n, 30) records of triangles (n, 3, 3): centroid, area times normal, area, `TRIANGLE_SPREAD`
     times the radius | radius, (E, G) of `multipole.truncation`, the sup norms of the moments 1, 3
     and 4, and the moments 3 and 4.
 
-    The second moment about the centroid is linear in the distance from there, and so is 0. A
-    triangle without an area has one of 1e-30, as its edges count.
+    The second moment about the centroid is a mean of vectors from there, and so is 0. A triangle
+    whose area is rounded to 0 is given one of 1e-30: records without an area are empty slots, and
+    its edges count.
     """
     alone = Hierarchy(np.arange(len(corners), dtype=np.int64)[:, None], ())
     level = triangle_levels(alone, corners)[0]
-    moments, reach = level.moments, OF_TRIANGLE * level.radius
+    moments, reach = level.moments, TRIANGLE_SPREAD * level.radius
     left_out, slope, _ = truncation(level, reach, _POLES - 1)
     normal = 2 * moments[1, 1].real, 2 * moments[1, 1].imag, moments[1, 0].real
-    higher = [moments[l, m].imag if part else moments[l, m].real for l, m, part in _OF_TRIANGLE]
+    higher = _columns(level, _TRIANGLE_MOMENTS)
     norms = [sup_norm(moments, l) for l in (1, 3, 4)]
     head = [level.center, *normal, np.maximum(level.area, 1e-30), reach, level.radius]
     return np.column_stack([*head, left_out, slope, *norms, *higher])
@@ -181,7 +184,7 @@ class FarSums:
                 rest = row[6] * _fourth(found.inverse), dr.rcp(found.inverse)
                 return [*found.coefficients, *bounds, *rest]
             size, left_out, slope_left_out, *norms = row[_DIPOLE:_TRIANGLE]
-            higher = dict(zip(_OF_TRIANGLE, row[_TRIANGLE:], strict=False))
+            higher = dict(zip(_TRIANGLE_MOMENTS, row[_TRIANGLE:], strict=False))
             norms.insert(1, 0 * size)
             found = _Expanded.of(r, first | _pairs(higher), norms, radius)
             return found.of_cluster(left_out, slope_left_out, size, row[6], radius)

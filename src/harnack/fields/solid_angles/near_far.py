@@ -21,6 +21,7 @@ import numpy.typing as npt
 
 from harnack.backend import BoolArray, FloatArray, to_numpy, to_vector3
 from harnack.backend.arrays import aligned_integers
+from harnack.backend.elementary import fmax
 from harnack.backend.records import Records
 from harnack.fields.clearance import epsilon_at
 from harnack.fields.solid_angles.far_sums import (
@@ -43,7 +44,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from harnack.backend import Backend, IntArray, Mask, Real, Vec3
-    from harnack.fields.solid_angles.far_clusters import AddPrimitive
+    from harnack.fields.solid_angles.far_clusters import AddPrimitive, Treecode
     from harnack.fields.solid_angles.multipole import NodeMoments
     from harnack.tree import Hierarchy, PackedTree
 
@@ -135,6 +136,23 @@ class NearFarCells:
         start = (index(0), far.parts(), own)
         _, sums, own = dr.while_loop(start, more, step, label="near primitives")
         return FieldSums.of(sums), own, active
+
+    def sums_or_tree(
+        self, tree: Treecode, x: Vec3, detail: Real, add: tuple[AddPrimitive, AddPrimitive],
+        own: tuple[Any, ...], where: Mask = True,
+    ) -> tuple[FieldSums, tuple[Any, ...]]:  # fmt: skip
+        """The sums at x, with gradients, and a state of the caller's own: of details up to 1 by the
+        cells, and of larger ones or outside of the cube by the tree of the same primitives.
+
+        add: what adds a near primitive to the sums of a cell, and to those of the tree.
+        """
+        in_cell, in_tree = add
+        here, finer = self.backend.Bool(where), fmax(detail, self.backend.Float(1))
+        found, state, known = self.sums(x, here & (detail <= 1), in_cell, own)
+        others, theirs = tree.sums(x, finer, in_tree, own, here & ~known)
+        pairs = zip(state, theirs, strict=True)
+        state = tuple(dr.select(known, one, other) for one, other in pairs)
+        return found.where(~known, others), state
 
 
 def _with_tail(

@@ -285,35 +285,28 @@ class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
         accuracy = self.accuracy or (_TRACED if traced else _VALUES)
         mesh = self.mesh
         rays = TriangleRays.of(backend, mesh.ray_tree, mesh.ray_records)
-        most_bytes = self.most_bytes() if traced and len(mesh.singular) else 0
+        most_bytes, low, high = 0, mesh.center, mesh.center
+        if traced and self.cells and len(mesh.singular):
+            extent = self.extent((self.default_level,))
+            assert extent is not None
+            most_bytes, (low, high) = self.most_bytes(), extent.bounds()
         if self.method == "exact":
             winding = ExactWinding.of(backend, mesh, rays, traced)
         else:
+            reach = float(np.maximum(high - mesh.center, mesh.center - low).max()) / mesh.size
             of_soup = most_bytes if self._is_soup else 0
-            half = self._half() if of_soup else 0.0
-            winding = TreeWinding.of(backend, mesh, accuracy, self.order, of_soup, half)
-            if winding.cells is not None:
-                most_bytes = 0
-        cells = None
-        if most_bytes:
-            extent = self.extent((self.default_level,))
-            assert extent is not None
-            cells = BoundaryCells.build(rays, mesh, *extent.bounds(), most_bytes, self._at_centers)
-        return _MeshBuffers(*placed(backend, mesh.center, mesh.size), winding, rays, cells)
+            winding = TreeWinding.of(backend, mesh, accuracy, self.order, of_soup, 1.001 * reach)
+        on = _MeshBuffers(*placed(backend, mesh.center, mesh.size), winding, rays)
+        if not most_bytes or on.built is not None:
+            return on
+        cells = BoundaryCells.build(rays, mesh, low, high, most_bytes, self._at_centers)
+        return dataclasses.replace(on, cells=cells)
 
     @property
     def _is_soup(self) -> bool:
-        """Whether cells add up triangles."""
+        """Whether triangles have so few edges in common that cells add up triangles."""
         edges, triangles = len(self.mesh.singular), len(self.mesh.triangles)
         return self.method == "tree" and edges > _SOUP * triangles
-
-    def _half(self) -> float:
-        """Half the side of a cube around the mesh's center that holds the extent, in unit
-        lengths."""
-        extent = self.extent((self.default_level,))
-        assert extent is not None
-        away = [np.abs(end - self.mesh.center).max() for end in extent.bounds()]
-        return 1.001 * float(max(away)) / self.mesh.size
 
     def _at_centers(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """w at points (n, 3), and bounds of its error; those of the rounding of an exact sum, in

@@ -24,7 +24,7 @@ from harnack.fields.clearance import epsilon_at
 from harnack.fields.solid_angles.edge_lift import LiftedEdge, LiftedProduct, LiftedSums
 from harnack.fields.solid_angles.edge_trails import Line, known_along, with_edge_rates
 from harnack.fields.solid_angles.far_clusters import Treecode
-from harnack.fields.solid_angles.far_sums import OF_TRIANGLE, triangle_sources
+from harnack.fields.solid_angles.far_sums import TRIANGLE_SPREAD, triangle_sources
 from harnack.fields.solid_angles.near_far import NearFarCells, build_cells
 from harnack.fields.sums import FieldSums, last_roundings
 from harnack.tree.triangles import (
@@ -70,7 +70,7 @@ class NearEdge:
         node with a triangle at it has radius R >= L/2 and is farther than reach R, hence the edge
         farther than (reach - 1) R. So all triangles at it are near, and they cancel there.
 
-        In a cell the same holds of a triangle that is far from it, with `OF_TRIANGLE` for the
+        In a cell the same holds of a triangle that is far from it, with `TRIANGLE_SPREAD` for the
         reach: the point is nearer to the center by less than the k > 1 radii of `far_sums`. Far
         nodes are farther.
         """
@@ -187,19 +187,12 @@ class TreeWinding:
 
         adder: from the reach of `NearEdge.is_open`, what adds a near triangle.
         """
-        reach = self.clusters.ratio(detail)
         if self.cells is None or derivatives != 1:
-            add = adder(reach)
+            add = adder(self.clusters.ratio(detail))
             return self.clusters.sums(x, detail, add, own, where, derivatives=derivatives)
-        here, real = self.backend.Bool(where), self.backend.Float
-        add = adder(real(OF_TRIANGLE))
-        found, state, in_cells = self.cells.sums(x, here & (detail <= 1), add, own)
-        finer = fmax(detail, real(1))
-        add = adder(self.clusters.ratio(finer))
-        others, theirs = self.clusters.sums(x, finer, add, own, here & ~in_cells)
-        pairs = zip(state, theirs, strict=True)
-        state = tuple(dr.select(in_cells, one, other) for one, other in pairs)
-        return found.where(~in_cells, others), state
+        beyond = self.clusters.ratio(fmax(detail, self.backend.Float(1)))
+        adders = adder(self.backend.Float(TRIANGLE_SPREAD)), adder(beyond)
+        return self.cells.sums_or_tree(self.clusters, x, detail, adders, own, where)
 
     def start(self, frame: Frame, t: Real, active: Mask) -> Real:
         """0: this method does not count crossings along rays, as every sum gives all of w."""
