@@ -70,7 +70,7 @@ def curve_cells() -> str:
     ]
     for subdivisions in _SUBDIVISIONS:
         for kind in ("holes", "soup"):
-            mesh = _broken(subdivisions, kind)
+            mesh = broken_mesh(subdivisions, kind)
             edges = hk.WindingNumber(*mesh).describe()["singular edges"]
             make = functools.partial(hk.WindingNumber, *mesh)
             name = f"{len(bumpy_sphere(subdivisions)[1]):,} faces, {kind} | {edges:,}"
@@ -79,7 +79,8 @@ def curve_cells() -> str:
     return "\n".join(lines) + "\n"
 
 
-def _broken(subdivisions: int, kind: str) -> tuple[FloatArray, Any]:
+def broken_mesh(subdivisions: int, kind: str) -> tuple[FloatArray, Any]:
+    """A bumpy sphere with "holes", or torn into a "soup"."""
     vertices, faces = bumpy_sphere(subdivisions)
     if kind == "holes":
         return vertices, remove_faces(faces, 0.1, 0)

@@ -16,11 +16,14 @@ from harnack.backend import choose_backend, to_vector3
 from harnack.fields.solid_angles.winding_number import WindingNumber
 from harnack.geometry.mesh_shapes import MeshArrays, bumpy_sphere, remove_faces
 
+from .curve_cells import broken_mesh
 from .rays import machine
 
 POINTS = 1_000_000
 CHECKED = 2_000
 REPEATS = 5
+# Of cells.
+_MEGABYTES = 500
 LIBIGL = "libigl, value"
 
 FloatArray = npt.NDArray[np.float64]
@@ -81,7 +84,8 @@ def kernel_seconds(call: Callable[[], Any]) -> float:
 def compare(mesh: MeshArrays, points: FloatArray, method: Any) -> list[Row]:
     """libigl, then `value` and `value_and_gradient` of harnack: in turn, medians of REPEATS."""
     vertices, faces = mesh
-    field = WindingNumber(vertices, faces, method=method)
+    how: Any = {"cells": _MEGABYTES} if method == "cells" else {"method": method}
+    field = WindingNumber(vertices, faces, **how)
     calls: dict[str, Callable[[], Any]] = {
         LIBIGL: lambda: libigl(vertices, faces, points),
         f"{method}, value": lambda: field.value(points),
@@ -116,9 +120,13 @@ def throughput(surface: Path | None = None) -> str:
     closed = bumpy_sphere(6)
     damaged = closed[0], remove_faces(closed[1], 0.1, 0)
     cube = cube_points()
+    soup = broken_mesh(6, "soup")
+    took = seconds_of(lambda: WindingNumber(*soup, cells=_MEGABYTES).value(cube))
     groups = [
         ("bumpy sphere, 10 % of faces removed", damaged, cube, "tree"),
         ("bumpy sphere, closed", closed, cube, "exact"),
+        ("soup", soup, cube, "tree"),
+        ("soup", soup, cube, "cells"),
     ]
     if surface is not None:
         # Here: `versions` runs this file with earlier versions of the package.
@@ -133,7 +141,8 @@ def throughput(surface: Path | None = None) -> str:
         f"{machine()} for both libraries, which take turns; medians of {REPEATS} runs. libigl is "
         "`igl.fast_winding_number` (order 2, accuracy 2), less the time of a call with 10 points, "
         "which is the time to build its tree. harnack in single precision, its tree as by default "
-        "(order 2, accuracy 2) and built before; its seconds are those of the call on NumPy "
+        "(order 2, accuracy 2) and built before, as are cells of at most "
+        f"{_MEGABYTES} MB, which took {took:.0f} s; its seconds are those of the call on NumPy "
         f"arrays, with sorting the points ({_sorting(cube):.2f} s) and transfers; *kernel* is "
         "what is computing. Errors are against the exact winding number in double precision at "
         f"{CHECKED:,} of the points.\n",

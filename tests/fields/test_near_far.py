@@ -15,7 +15,7 @@ import pytest
 
 import harnack as hk
 from harnack.backend import Precision, choose_backend, to_numpy, to_vector3
-from harnack.fields.solid_angles import dipole, near_far
+from harnack.fields.solid_angles import cell_choice, dipole, near_far
 from harnack.fields.solid_angles.far_sums import COEFFICIENTS, DEGREE
 from harnack.fields.solid_angles.local_expansion import (
     _Sizes,  # pyright: ignore[reportPrivateUsage]
@@ -399,3 +399,48 @@ def test_smoothed_sums_have_no_cells() -> None:
 def test_a_cloud_as_it_comes_keeps_its_contract(cells: bool) -> None:
     """Values at points leave out more than samples do: `check_field` took that for an error."""
     check_field(hk.DipolePotential(*cloud(1000), cells=cells), rng=0, count=40, directions=2)
+
+
+# --- values at points -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("precision", ["single", "double"])
+def test_values_by_cells_are_within_their_bounds(
+    precision: Precision, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In cells and outside of their cube, at points anywhere and close to those of the cloud."""
+    monkeypatch.setattr(cell_choice, "_MANY_POINTS", 1000)
+    given = points, normals, areas = cloud(3000)
+    field, plain = (hk.DipolePotential(*given, cells=some) for some in (True, False))
+    rng = np.random.default_rng(3)
+    x = rng.uniform(-4, 4, (3000, 3))
+    x[:1500] = points[:1500] + 10 ** rng.uniform(-4, 0, (1500, 1)) * rng.normal(size=(1500, 3))
+    x = x.astype(np.float32).astype(np.float64)
+    exact, slopes = dipole_sum(points, areas[:, None] * normals)(x)
+    value, gradient = field.value_and_gradient(x, precision=precision)
+    error = field.error_bound(x, precision=precision)
+    off = np.abs(value - exact)
+    rounding = np.finfo(precision).eps * (np.abs(exact) + np.linalg.norm(slopes, axis=1))
+    assert (off <= error + rounding).all()
+    turned = np.linalg.norm(gradient - slopes, axis=1)
+    bound = field.gradient_error_bound(x, precision=precision)
+    assert (turned <= bound + 1e-5 * np.linalg.norm(slopes, axis=1)).all()
+    inside = np.abs(x).max(axis=1) < 1
+    assert np.median(error[inside]) < 0.1 * np.median(plain.error_bound(x)[inside])
+    np.testing.assert_array_equal(field.value(x[:999]), plain.value(x[:999]))  # too few
+    alone = field.prepare(choose_backend(precision)).value(x, precision=precision)
+    np.testing.assert_array_equal(alone, field.value(x, precision=precision))
+
+
+def test_values_get_cells_where_they_pay(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dipole, "_POINTS_A_RAY", 1)
+    monkeypatch.setattr(dipole, "_LEAST_RAYS", 1)
+    field, x = hk.DipolePotential(*cloud(400)), np.random.default_rng(0).normal(size=(3000, 3))
+    plain = hk.DipolePotential(*cloud(400), cells=False)
+    assert field.least_points() == 2800
+    np.testing.assert_array_equal(field.value(x[:2799]), plain.value(x[:2799]))
+    assert (field.value(x) != plain.value(x)).any()
+    np.testing.assert_allclose(field.value(x), plain.value(x), atol=0.3)
+    assert field.for_points(3000, choose_backend("single")) is field.for_points(
+        5000, choose_backend("single")
+    )

@@ -12,7 +12,7 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.fields.solid_angles import near_far, winding_number
+from harnack.fields.solid_angles import cell_choice, near_far, winding_number
 from harnack.fields.solid_angles.far_sums import triangle_sources
 from harnack.fields.solid_angles.near_far import NearFarCells
 from harnack.geometry.mesh_shapes import bumpy_sphere, icosphere, remove_faces
@@ -288,3 +288,31 @@ def test_few_or_large_triangles_and_shared_edges_have_cells_of_edges(
     monkeypatch.setattr(winding_number, "_MOST_OF_SOUP", 100)
     assert soup(torn(2, 0.01), None).for_rays(10**9).cells is None
     assert soup(icosphere(1), True).prepare(choose_backend("single")).describe()["triangles"] == 80
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_values_by_cells_are_within_their_bounds(
+    precision: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In cells and outside of their cube, at points anywhere and close to triangles; those by rays
+    of a mesh with holes stay what they were."""
+    monkeypatch.setattr(cell_choice, "_MANY_POINTS", 1000)
+    monkeypatch.setattr(near_far, "_PART", 1.0)
+    mesh = MESHES["torn"]
+    field, plain, x = soup(mesh), soup(mesh, False), places(mesh, 3000, 1e-4)
+    x[-100:] *= 5
+    value, gradient = field.value_and_gradient(x, precision=precision)
+    error = field.error_bound(x, precision=precision)
+    beside = error > 0.5  # of a triangle, by rounding
+    assert beside.mean() < 0.1
+    slopes = hk.WindingNumber(*mesh, method="exact").gradient(x, precision="double")
+    place = 4 * np.finfo(precision).eps * np.linalg.norm(slopes, axis=1)
+    off = np.abs(value - direct_sum(mesh[0][mesh[1]], x))
+    assert (off <= error + place)[~beside].all()
+    turned = np.linalg.norm(gradient - slopes, axis=1)
+    bound = field.gradient_error_bound(x, precision=precision)
+    assert (turned <= bound + 1e-5 * np.linalg.norm(slopes, axis=1)).all()
+    assert np.median(error) < 0.5 * np.median(plain.error_bound(x))  # by cells
+    np.testing.assert_array_equal(field.value(x[:999]), plain.value(x[:999]))  # too few
+    holes = hk.WindingNumber(*bumpy_sphere(3), cells=True)
+    assert holes.for_points(10**9, choose_backend("single")) is holes

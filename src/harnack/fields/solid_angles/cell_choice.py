@@ -17,10 +17,14 @@ from harnack.fields.field import Field
 if TYPE_CHECKING:
     from typing import Self
 
+    from harnack.backend import Backend
+
 __all__ = ["Cells", "HasCells"]
 
 # Megabytes that cells may take by default.
 _MEGABYTES = 256.0
+# So many points are many: to build cells that were asked for takes longer than values at fewer.
+_MANY_POINTS = 100_000
 
 
 class Cells(Protocol):
@@ -35,7 +39,7 @@ class Cells(Protocol):
 
 class HasCells(Field):
     """A field that may have cells. Subclasses set `cells` by `set_cells`, and define
-    `least_rays`.
+    `least_rays`, and `least_points` if cells `give_values`.
 
     finer: whether there are so many rays that smaller cells pay; true where cells were asked for.
     """
@@ -76,12 +80,33 @@ class HasCells(Field):
         """With cells, if none were asked for and none refused, from `least_rays` on."""
         if self.cells is not None or not self.least_rays() <= count:
             return self
-        finer = self.least_rays_of_finer() <= count
+        return self._kept_with_cells(finer=self.least_rays_of_finer() <= count)
+
+    def _kept_with_cells(self, *, finer: bool) -> Self:
+        """A copy with cells, the same one as long as what it is made of is the same."""
         key = finer, *map(id, self.made_of())  # of objects that the copy holds
         if key not in self._with_cells:
             self._with_cells[key] = self.having_cells()
             self._with_cells[key].finer = finer
         return self._with_cells[key]
+
+    @property
+    def give_values(self) -> bool:
+        """Whether cells give values and gradients at points. Those of the default do not."""
+        return False
+
+    def least_points(self) -> float:
+        """The number of points from which on cells pay for values at them."""
+        return math.inf
+
+    def for_points(self, count: int, backend: Backend) -> Any:
+        """For values and gradients at so many points (`BatchedField.for_points`): with its cells
+        where these pay, or where some were asked for and points are many."""
+        if not self.give_values or count < (_MANY_POINTS if self.cells else self.least_points()):
+            return self
+        if self.cells is None:
+            return self._kept_with_cells(finer=False).prepare(backend)
+        return self.prepare(backend) if self.cells else self
 
     def most_bytes(self) -> int:
         """How many bytes cells may take."""

@@ -48,6 +48,8 @@ if TYPE_CHECKING:
 # in which a ray takes two thirds of the time, pay from more rays a point on.
 _PAYS, _LEAST_RAYS, _MOST_POINTS = 7, 100_000, 200_000
 _FINER_PAYS = 60
+# Cells save as much time for so many values as for a ray.
+_POINTS_A_RAY = 100
 # A point counts as near if the squared distance is less than this fraction of its area.
 _BESIDE = 0.04
 
@@ -96,7 +98,7 @@ class DipoleTree:
     def at(self, x: Vec3, derivatives: int, closer: Real) -> Values:
         """Value and the derivatives asked for at x; closer: the detail, at least 1."""
         unit, detail = epsilon_at(x), fmax(self.backend.Float(closer), self.backend.Float(1))
-        sums, _ = self._sums(x, detail, unit, derivatives)
+        sums, _ = self._near_sums(x, detail, unit, derivatives)
         return self.clusters.values(sums, 1.0, unit, self.rounding)
 
     def _sums(self, x: Vec3, detail: Real, unit: Real, derivatives: int) -> tuple[FieldSums, Vec3]:
@@ -105,10 +107,12 @@ class DipoleTree:
         sums, own = self.clusters.sums(x, detail, add, (vector(0),), derivatives=derivatives)
         return sums, own[0]
 
-    def _near_sums(self, x: Vec3, detail: Real, unit: Real) -> tuple[FieldSums, Vec3]:
-        """As `_sums`, by the cells where there are any, with gradients."""
-        if self.cells is None:
-            return self._sums(x, detail, unit, 1)
+    def _near_sums(
+        self, x: Vec3, detail: Real, unit: Real, derivatives: int = 1
+    ) -> tuple[FieldSums, Vec3]:
+        """As `_sums`, by the cells where there are any and derivatives are not second ones."""
+        if self.cells is None or derivatives == 2:
+            return self._sums(x, detail, unit, derivatives)
         add, none = _adder(x, unit, 1), (self.backend.Array3f(0),)
         sums, own = self.cells.sums_or_tree(self.clusters, x, detail, (add, add), none)
         return sums, own[0]
@@ -231,8 +235,9 @@ class DipolePotential(HasCells, DetailedField["_DipoleBuffers"], BatchedField):
         for it. At least 1.5.
     cells: for many rays through many points: cells in which the near points count one by one and
         all others as one polynomial, so that an evaluation for tracing costs a tenth. None builds
-        them where they pay (`for_rays`), for pictures of small clouds and for path tracing; True
-        always, False never.
+        them where they pay (`for_rays`), for pictures of small clouds, for path tracing and for
+        values and gradients at millions of points; True always (for values from 100,000 points on),
+        False never.
         They take some 1 kB a point, or the megabytes that are given (True: 256) with larger and
         slower cells; where these would be too large, none are built, and `describe` of a prepared
         field says so. Building takes as long as tracing 100,000 to a million rays without cells,
@@ -377,10 +382,19 @@ class DipolePotential(HasCells, DetailedField["_DipoleBuffers"], BatchedField):
         return field
 
     def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> Values:
-        on = self._batch(backend_of(x))
+        on = self._for_values(backend_of(x))
         x = on.unit(x)
         weight = float(self.areas.sum()) / self._size**2
         return on.tree.at(x, derivatives, closer).far_away(x, 64, weight).rescaled(on.size)
+
+    def _for_values(self, backend: Backend) -> _DipoleBuffers:
+        """The data for values, with the cells for tracing if there are any."""
+        on, traced = self._batch(backend), self._device
+        if traced is None or traced.backend is not backend:
+            return on
+        if not isinstance(on.tree, DipoleTree) or not isinstance(traced.tree, DipoleTree):
+            return on
+        return dataclasses.replace(on, tree=dataclasses.replace(on.tree, cells=traced.tree.cells))
 
     @functools.cached_property
     def _hierarchy(self) -> Hierarchy:
@@ -421,6 +435,13 @@ class DipolePotential(HasCells, DetailedField["_DipoleBuffers"], BatchedField):
     def least_rays(self) -> float:
         few = len(self.points) <= _MOST_POINTS and not self.smoothing
         return max(_LEAST_RAYS, _PAYS * len(self.points)) if few else math.inf
+
+    @property
+    def give_values(self) -> bool:
+        return True
+
+    def least_points(self) -> float:
+        return _POINTS_A_RAY * self.least_rays()
 
     def least_rays_of_finer(self) -> float:
         return _FINER_PAYS * len(self.points)

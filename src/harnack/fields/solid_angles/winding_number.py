@@ -35,6 +35,7 @@ from harnack.fields.field import AtDetail, Field, Sample, lengthened
 from harnack.fields.sheets import NO_SHEET, Crossing, NearestSheet
 from harnack.fields.solid_angles.boundary_cells import BoundaryCells
 from harnack.fields.solid_angles.cell_choice import Cells, HasCells
+from harnack.fields.solid_angles.near_far import NearFarCells
 from harnack.fields.solid_angles.winding_exact import ExactWinding
 from harnack.fields.solid_angles.winding_mesh import WindingMesh
 from harnack.fields.solid_angles.winding_tree import TreeWinding
@@ -168,6 +169,9 @@ _PAYS, _LEAST_RAYS, _MOST_IN_CELLS = 3.0, 5e3, 100_000
 # With more edges than this many times the triangles the mesh is a soup, whose cells add up near
 # triangles, not edges; they are built from so many rays a triangle on, for no more triangles.
 _SOUP, _SOUP_PAYS, _MOST_OF_SOUP = 1.5, 12.0, 50_000
+# Cells of soups save as much time for so many values at points as for a ray; for values their cube
+# is wider than the extent, where all rays begin, by this factor: one large cell more on each side.
+_POINTS_A_RAY, _WIDER = 200, 2.002
 # The accuracy of values at points, and of traces, by experiment.
 _VALUES, _TRACED = 2.0, 4.0
 # See `WindingNumber._at_centers`: 16.5 roundings of each of 100,000 edges, and as much of the steep
@@ -199,7 +203,8 @@ class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
         hardly an edge in common, near triangles take the place of edges, with the tree as method
         (`near_far`). None builds them where they pay (`for_rays`), True always, False never; at
         most the megabytes that are given (True: 256), and several times as much while they are
-        built. Values and derivatives at points are those of `method`.
+        built. Those of soups serve values and gradients at points too, `cells=True` from 100,000
+        points on; all other values and derivatives at points are those of `method`.
 
     Hits on triangles have `Hits.sheet`; `faces_of_sheets` gives the face of each. `moved` gives the
     field for the same faces when vertices have moved.
@@ -267,7 +272,7 @@ class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
         return prepared
 
     def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> Values:
-        on = self._batch(backend_of(x))
+        on = self._for_values(backend_of(x))
         winding, x = on.winding, on.unit(x)
         if isinstance(winding, TreeWinding):
             values = winding.at(x, derivatives, closer)
@@ -280,6 +285,15 @@ class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
         values = dataclasses.replace(values, error=values.error + on_triangle)
         weight = self.mesh.area / (4 * math.pi * self.mesh.size**2)
         return values.far_away(x, 64 + len(self.mesh.singular), weight).rescaled(on.size)
+
+    def _for_values(self, backend: Backend) -> _MeshBuffers:
+        """The data for values, with the cells of triangles for tracing if there are any."""
+        on, traced = self._batch(backend), self._device
+        if traced is None or traced.backend is not backend:
+            return on
+        if not isinstance(on.winding, TreeWinding) or not isinstance(traced.built, NearFarCells):
+            return on
+        return dataclasses.replace(on, winding=dataclasses.replace(on.winding, cells=traced.built))
 
     def _upload(self, backend: Backend, *, traced: bool) -> _MeshBuffers:
         accuracy = self.accuracy or (_TRACED if traced else _VALUES)
@@ -295,7 +309,7 @@ class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
         else:
             reach = float(np.maximum(high - mesh.center, mesh.center - low).max()) / mesh.size
             of_soup = most_bytes if self._is_soup else 0
-            winding = TreeWinding.of(backend, mesh, accuracy, self.order, of_soup, 1.001 * reach)
+            winding = TreeWinding.of(backend, mesh, accuracy, self.order, of_soup, _WIDER * reach)
         on = _MeshBuffers(*placed(backend, mesh.center, mesh.size), winding, rays)
         if not most_bytes or on.built is not None:
             return on
@@ -311,10 +325,11 @@ class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
     def _at_centers(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """w at points (n, 3), and bounds of its error; those of the rounding of an exact sum, in
         double precision and off triangles by many roundings in single precision, are far below."""
-        value = np.array(self.value(points, precision="double"))
+        plain = self._without_cells()
+        value = np.array(plain.value(points, precision="double"))
         if self.method == "exact":
             return value, np.full(len(value), _ROUNDED)
-        return value, self.error_bound(points, precision="double")
+        return value, plain.error_bound(points, precision="double")
 
     def _without_cells(self) -> WindingNumber:
         """The same field without cells."""
@@ -334,6 +349,13 @@ class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
             return max(_LEAST_RAYS, _SOUP_PAYS * triangles) if few else math.inf
         pays = _FEW_EDGES <= edges <= _MOST_IN_CELLS
         return max(_LEAST_RAYS, _PAYS * edges) if pays else math.inf
+
+    @property
+    def give_values(self) -> bool:
+        return self._is_soup
+
+    def least_points(self) -> float:
+        return _POINTS_A_RAY * self.least_rays()
 
     def occupied(self, levels: tuple[float, ...]) -> OccupiedCells | None:
         """Cells by `winding_cells`, if edges are not few, for the exact method or by cells."""

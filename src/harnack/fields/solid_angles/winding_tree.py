@@ -183,11 +183,11 @@ class TreeWinding:
         where: Mask, derivatives: int = 1,
     ) -> tuple[FieldSums, tuple[Any, ...]]:  # fmt: skip
         """The sums, and a state of the caller's own, by the cells where there are any, the detail
-        is at most 1 and derivatives are first ones.
+        is at most 1 and derivatives are not second ones.
 
         adder: from the reach of `NearEdge.is_open`, what adds a near triangle.
         """
-        if self.cells is None or derivatives != 1:
+        if self.cells is None or derivatives == 2:
             add = adder(self.clusters.ratio(detail))
             return self.clusters.sums(x, detail, add, own, where, derivatives=derivatives)
         beyond = self.clusters.ratio(fmax(detail, self.backend.Float(1)))
