@@ -12,7 +12,7 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.fields.solid_angles import cell_choice, near_far, winding_number
+from harnack.fields.solid_angles import near_far, winding_number
 from harnack.fields.solid_angles.far_sums import triangle_sources
 from harnack.fields.solid_angles.near_far import NearFarCells
 from harnack.geometry.mesh_shapes import bumpy_sphere, icosphere, remove_faces
@@ -294,9 +294,8 @@ def test_few_or_large_triangles_and_shared_edges_have_cells_of_edges(
 def test_values_by_cells_are_within_their_bounds(
     precision: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """In cells and outside of their cube, at points anywhere and close to triangles; those by rays
-    of a mesh with holes stay what they were."""
-    monkeypatch.setattr(cell_choice, "_MANY_POINTS", 1000)
+    """In cells and outside of their cube, at points anywhere and close to triangles; those of a
+    mesh with holes stay what they were."""
     monkeypatch.setattr(near_far, "_PART", 1.0)
     mesh = MESHES["torn"]
     field, plain, x = soup(mesh), soup(mesh, False), places(mesh, 3000, 1e-4)
@@ -313,6 +312,18 @@ def test_values_by_cells_are_within_their_bounds(
     bound = field.gradient_error_bound(x, precision=precision)
     assert (turned <= bound + 1e-5 * np.linalg.norm(slopes, axis=1)).all()
     assert np.median(error) < 0.5 * np.median(plain.error_bound(x))  # by cells
-    np.testing.assert_array_equal(field.value(x[:999]), plain.value(x[:999]))  # too few
-    holes = hk.WindingNumber(*bumpy_sphere(3), cells=True)
-    assert holes.for_points(10**9, choose_backend("single")) is holes
+    vertices, faces = bumpy_sphere(3)
+    holes = [hk.WindingNumber(vertices, faces[200:], cells=some) for some in (True, False)]
+    np.testing.assert_array_equal(*(one.value(x) for one in holes))
+
+
+def test_values_of_soups_without_cells_build_no_cells_of_edges(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Those took minutes, and were of no use. The mesh stays as it is."""
+    monkeypatch.setattr(winding_number.BoundaryCells, "build", None)
+    mesh, x = scattered(100, 2.0), 3 * np.eye(3)
+    field = soup(mesh)
+    np.testing.assert_array_equal(field.value(x), soup(mesh, False).value(x))
+    with pytest.raises(AttributeError, match="mesh"):
+        field.mesh = None  # pyright: ignore[reportAttributeAccessIssue]

@@ -60,12 +60,13 @@ SCENES: dict[str, Callable[[], tuple[Any, dict[str, Any]]]] = {
 
 @pytest.mark.parametrize("name", SCENES)
 def test_a_page_shows_what_render_draws(name: str, browser: Any, tmp_path: Path) -> None:
+    """Six of the sixteen samples that a page takes of a pixel show as much."""
     what, settings = SCENES[name]()
     hk.page(what, tmp_path / "a.html", progress=False, **settings)
     hk.render(what, tmp_path / "a.png", show="shaded", size=SIZE, progress=False, **settings)
     expected = np.asarray(Image.open(tmp_path / "a.png").convert("RGB")).astype(float)
     with served(tmp_path) as address:
-        page = Page(browser, f"{address}/a.html", SIZE)
+        page = Page(browser, f"{address}/a.html", SIZE, samples=6)
         assert page.message == ""
         found = page.picture(f"page-{name}").astype(float)
         page.close()

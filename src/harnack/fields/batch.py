@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast
 from weakref import finalize
 
 import drjit as dr
-import numpy as np
 
 from harnack.backend import FloatArray, backend_of
 from harnack.backend.arrays import as_data
@@ -149,11 +148,6 @@ class BatchedField(Field):
             at least 1; infinity approximates nothing.
         """
 
-    def for_points(self, count: int, backend: Backend) -> BatchedField:
-        """The field whose `values_at` is to be asked at so many points. The default is this one."""
-        del count, backend
-        return self
-
     def differentiable_value(self, p: Vec3) -> Real:
         """f to first order about p: its value and, in reverse and forward mode, its gradient."""
         with dr.suspend_grad():
@@ -217,11 +211,9 @@ class BatchedField(Field):
         derivatives: int,
         wanted: Callable[[Values], tuple[Any, ...]],
     ) -> tuple[FloatArray, ...]:
-        count = np.size(points) // 3
-
         def kernel(backend: Backend, x: Vec3) -> tuple[Any, ...]:
-            field = self if derivatives == 2 else self.for_points(count, backend)
-            return wanted(field.values_at(x, derivatives))
+            del backend
+            return wanted(self.values_at(x, derivatives))
 
         return at_points(points, kernel, precision)
 

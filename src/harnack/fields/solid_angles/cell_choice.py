@@ -9,7 +9,8 @@ from __future__ import annotations
 import abc
 import copy
 import math
-from typing import TYPE_CHECKING, Any, Protocol
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 from harnack.cluster.packing import Remembered
 from harnack.fields.field import Field
@@ -23,8 +24,9 @@ __all__ = ["Cells", "HasCells"]
 
 # Megabytes that cells may take by default.
 _MEGABYTES = 256.0
-# So many points are many: to build cells that were asked for takes longer than values at fewer.
-_MANY_POINTS = 100_000
+
+
+Built = TypeVar("Built")
 
 
 class Cells(Protocol):
@@ -39,14 +41,18 @@ class Cells(Protocol):
 
 class HasCells(Field):
     """A field that may have cells. Subclasses set `cells` by `set_cells`, and define
-    `least_rays`, and `least_points` if cells `give_values`.
+    `least_rays`.
 
+    for_values: whether cells are for values at points too: where they were asked for, whatever the
+        number of points, so that values and bounds of their errors are always of one kind.
     finer: whether there are so many rays that smaller cells pay; true where cells were asked for.
     """
 
     cells: bool | float | None
+    for_values: bool
     finer: bool
     _device: Any
+    _batches: Any
 
     def set_cells(self, cells: bool | float | None) -> None:
         """Take the argument. Raises ValueError for what is no number of megabytes."""
@@ -54,8 +60,22 @@ class HasCells(Field):
             raise ValueError(
                 f"cells must be True, False, a number of megabytes or None, not {cells}"
             )
-        self.cells, self.finer = cells, True
-        self._with_cells: Remembered[tuple[int, ...], Self] = Remembered()
+        self.cells, self.for_values, self.finer = cells, bool(cells), True
+        self._with_cells: Remembered[bool, Self] = Remembered()
+        self._built: Remembered[Backend, Any] = Remembered()
+
+    def having_cells(self, cells: bool = True) -> Self:
+        """A copy with cells for rays, or with none."""
+        other = copy.copy(self)
+        other.set_cells(cells)
+        other.for_values, other._device, other._batches = False, None, Remembered()
+        return other
+
+    def built_once(self, backend: Backend, build: Callable[[], Built]) -> Built:
+        """What `build` made for a backend, for values and for tracing."""
+        if backend not in self._built:
+            self._built[backend] = build()
+        return self._built[backend]
 
     @abc.abstractmethod
     def least_rays(self) -> float:
@@ -65,48 +85,15 @@ class HasCells(Field):
         """The number of rays from which on smaller cells pay. The default has one size."""
         return 0.0
 
-    def made_of(self) -> tuple[Any, ...]:
-        """Attributes that may be replaced, for which cells are made anew. The default has none."""
-        return ()
-
-    def having_cells(self) -> Self:
-        """A copy with cells."""
-        other = copy.copy(self)
-        other.set_cells(True)
-        other._device = None
-        return other
-
     def for_rays(self, count: int) -> Self:
         """With cells, if none were asked for and none refused, from `least_rays` on."""
         if self.cells is not None or not self.least_rays() <= count:
             return self
-        return self._kept_with_cells(finer=self.least_rays_of_finer() <= count)
-
-    def _kept_with_cells(self, *, finer: bool) -> Self:
-        """A copy with cells, the same one as long as what it is made of is the same."""
-        key = finer, *map(id, self.made_of())  # of objects that the copy holds
-        if key not in self._with_cells:
-            self._with_cells[key] = self.having_cells()
-            self._with_cells[key].finer = finer
-        return self._with_cells[key]
-
-    @property
-    def give_values(self) -> bool:
-        """Whether cells give values and gradients at points. Those of the default do not."""
-        return False
-
-    def least_points(self) -> float:
-        """The number of points from which on cells pay for values at them."""
-        return math.inf
-
-    def for_points(self, count: int, backend: Backend) -> Any:
-        """For values and gradients at so many points (`BatchedField.for_points`): with its cells
-        where these pay, or where some were asked for and points are many."""
-        if not self.give_values or count < (_MANY_POINTS if self.cells else self.least_points()):
-            return self
-        if self.cells is None:
-            return self._kept_with_cells(finer=False).prepare(backend)
-        return self.prepare(backend) if self.cells else self
+        finer = self.least_rays_of_finer() <= count
+        if finer not in self._with_cells:
+            self._with_cells[finer] = self.having_cells()
+            self._with_cells[finer].finer = finer
+        return self._with_cells[finer]
 
     def most_bytes(self) -> int:
         """How many bytes cells may take."""

@@ -10,7 +10,7 @@ import functools
 import math
 import warnings
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeAlias, cast
 
 import drjit as dr
 import numpy as np
@@ -37,9 +37,12 @@ from harnack.fields.sums import FieldSums, Terms, last_roundings, rounding_of_di
 from harnack.geometry import Box, CloudError, estimate_areas, estimate_normals, validate_cloud
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from typing import Self
 
     from harnack.backend import Backend, FloatArray, Mask, Real, Vec3
+    from harnack.backend.records import Records
+    from harnack.fields.solid_angles.multipole import NodeMoments
     from harnack.geometry import Volume
     from harnack.tree import Hierarchy
 
@@ -48,10 +51,12 @@ if TYPE_CHECKING:
 # in which a ray takes two thirds of the time, pay from more rays a point on.
 _PAYS, _LEAST_RAYS, _MOST_POINTS = 7, 100_000, 200_000
 _FINER_PAYS = 60
-# Cells save as much time for so many values as for a ray.
-_POINTS_A_RAY = 100
 # A point counts as near if the squared distance is less than this fraction of its area.
 _BESIDE = 0.04
+
+
+BuildCells: TypeAlias = "Callable[[list[NodeMoments], FloatArray, Records], NearFarCells | None]"
+"""Makes cells from the moments of a tree, and its dipoles as rows and on the backend."""
 
 
 @dataclass(frozen=True)
@@ -72,22 +77,19 @@ class DipoleTree:
     @classmethod
     def of(
         cls, backend: Backend, tree: Hierarchy, points: FloatArray, moments: FloatArray,
-        accuracy: float, most_bytes: int = 0, half: float = 0.0, *, finer: bool = False,
+        accuracy: float, build: BuildCells | None = None,
     ) -> DipoleTree:  # fmt: skip
         """From points (n, 3) of size about one and moments (n, 3), area times normal.
 
         tree: `hierarchy_of` these points, or of the same points at earlier positions.
-        most_bytes: of cells of the cube [-half, half]^3; 0 for no cells. finer: see `build_cells`.
+        build: makes cells.
         """
         levels = all_levels(tree, points[:, None], moments[:, None], points, points)
         rows = dipole_rows(points, moments)
         rounding = last_roundings(backend, size=max(1.0, float(rows[:, 6].sum())))
         slots = in_slots(tree, rows)
         clusters = Treecode.of(backend, tree, levels, slots, accuracy)
-        if not most_bytes:
-            return cls(clusters, rounding)
-        dipoles = clusters.tree.primitives
-        cells = build_cells(backend, tree, levels, slots, dipoles, half, most_bytes, finer=finer)
+        cells = None if build is None else build(levels, slots, clusters.tree.primitives)
         return cls(clusters, rounding, cells)
 
     @property
@@ -235,9 +237,9 @@ class DipolePotential(HasCells, DetailedField["_DipoleBuffers"], BatchedField):
         for it. At least 1.5.
     cells: for many rays through many points: cells in which the near points count one by one and
         all others as one polynomial, so that an evaluation for tracing costs a tenth. None builds
-        them where they pay (`for_rays`), for pictures of small clouds, for path tracing and for
-        values and gradients at millions of points; True always (for values from 100,000 points on),
-        False never.
+        them where they pay (`for_rays`), for pictures of small clouds and for path tracing; True
+        always, also for values and gradients at points, which pays from some 600 values a point
+        on; False never.
         They take some 1 kB a point, or the megabytes that are given (True: 256) with larger and
         slower cells; where these would be too large, none are built, and `describe` of a prepared
         field says so. Building takes as long as tracing 100,000 to a million rays without cells,
@@ -280,9 +282,10 @@ class DipolePotential(HasCells, DetailedField["_DipoleBuffers"], BatchedField):
         if isinstance(normals, str):
             normals = estimate_normals(points)
         some = np.ones(len(points)) if areas is None else areas
-        self.points, self.normals, self.areas = validate_cloud(points, normals, some)
+        self._points, self._normals, self._areas = validate_cloud(points, normals, some)
         if areas is None:
-            self.areas = estimate_areas(self.points, self.normals)
+            self._areas = estimate_areas(self.points, self.normals)
+            self._areas.setflags(write=False)
         self.accuracy = accuracy
         self.set_cells(cells)
         self._box = low, high = self.points.min(axis=0), self.points.max(axis=0)
@@ -295,6 +298,22 @@ class DipolePotential(HasCells, DetailedField["_DipoleBuffers"], BatchedField):
             raise ValueError("cells are of sums without smoothing: give one of the two")
         if self.smoothing:
             self.default_level = self._level_at_points()
+
+    @property
+    def points(self) -> FloatArray:
+        """(n, 3). They stay as they are, as their normals and areas do, as all else is computed
+        from them once: see `moved`."""
+        return self._points
+
+    @property
+    def normals(self) -> FloatArray:
+        """(n, 3), of unit length."""
+        return self._normals
+
+    @property
+    def areas(self) -> FloatArray:
+        """(n,)."""
+        return self._areas
 
     def _fitted(
         self, points: Any, normals: Any, areas: Any, smoothing: str
@@ -382,19 +401,10 @@ class DipolePotential(HasCells, DetailedField["_DipoleBuffers"], BatchedField):
         return field
 
     def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> Values:
-        on = self._for_values(backend_of(x))
+        on = self._batch(backend_of(x))
         x = on.unit(x)
         weight = float(self.areas.sum()) / self._size**2
         return on.tree.at(x, derivatives, closer).far_away(x, 64, weight).rescaled(on.size)
-
-    def _for_values(self, backend: Backend) -> _DipoleBuffers:
-        """The data for values, with the cells for tracing if there are any."""
-        on, traced = self._batch(backend), self._device
-        if traced is None or traced.backend is not backend:
-            return on
-        if not isinstance(on.tree, DipoleTree) or not isinstance(traced.tree, DipoleTree):
-            return on
-        return dataclasses.replace(on, tree=dataclasses.replace(on.tree, cells=traced.tree.cells))
 
     @functools.cached_property
     def _hierarchy(self) -> Hierarchy:
@@ -410,18 +420,27 @@ class DipolePotential(HasCells, DetailedField["_DipoleBuffers"], BatchedField):
             height, rows = self.smoothing / self._size, dipole_rows(unit, moments)
             tree = SmoothedSum.of(backend, self._hierarchy, rows, height, accuracy)
         else:
-            most_bytes = self.most_bytes() if traced else 0
-            tree = DipoleTree.of(
-                backend,
-                self._hierarchy,
-                unit,
-                moments,
-                accuracy,
-                most_bytes,
-                self._half(unit),
-                finer=self.finer,
-            )
+            build = None
+            if self.cells and (traced or self.for_values):
+                build = self._builder(backend, self._half(unit))
+            tree = DipoleTree.of(backend, self._hierarchy, unit, moments, accuracy, build)
         return _DipoleBuffers(*placed(backend, self._center, self._size), tree)
+
+    def _builder(self, backend: Backend, half: float) -> BuildCells:
+        """What makes cells of the cube [-half, half]^3, once for a backend."""
+
+        def build(
+            levels: list[NodeMoments], rows: FloatArray, dipoles: Records
+        ) -> NearFarCells | None:
+            return self.built_once(
+                backend,
+                lambda: build_cells(
+                    backend, self._hierarchy, levels, rows, dipoles, half, self.most_bytes(),
+                    finer=self.finer,
+                ),
+            )  # fmt: skip
+
+        return build
 
     def _half(self, unit: FloatArray) -> float:
         """Half the side of the cube of cells, which holds the `extent` of the default level: rays
@@ -429,19 +448,9 @@ class DipolePotential(HasCells, DetailedField["_DipoleBuffers"], BatchedField):
         reach = math.sqrt(float(self.areas.sum()) / self.default_level) / self._size
         return 1.001 * (float(np.abs(unit).max()) + reach)
 
-    def made_of(self) -> tuple[Any, ...]:
-        return self.points, self.normals, self.areas
-
     def least_rays(self) -> float:
         few = len(self.points) <= _MOST_POINTS and not self.smoothing
         return max(_LEAST_RAYS, _PAYS * len(self.points)) if few else math.inf
-
-    @property
-    def give_values(self) -> bool:
-        return True
-
-    def least_points(self) -> float:
-        return _POINTS_A_RAY * self.least_rays()
 
     def least_rays_of_finer(self) -> float:
         return _FINER_PAYS * len(self.points)
@@ -466,7 +475,7 @@ class DipolePotential(HasCells, DetailedField["_DipoleBuffers"], BatchedField):
         """A box around the points: at distance rho from all of them |f| <= (sum of areas)/rho^2,
         smoothed or not, as 1 + 5 q/2 <= (1 + q)^(5/2)."""
         reach = 1.0001 * math.sqrt(float(self.areas.sum()) / min(abs(level) for level in levels))
-        low, high = self.points.min(axis=0), self.points.max(axis=0)  # they may be replaced
+        low, high = self._box
         return Box(low - reach, high + reach)
 
     @property

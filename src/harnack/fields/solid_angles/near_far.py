@@ -11,6 +11,7 @@ number.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -134,8 +135,11 @@ class NearFarCells:
             return i + 1, new.parts(), own
 
         start = (index(0), far.parts(), own)
-        _, sums, own = dr.while_loop(start, more, step, label="near primitives")
-        return FieldSums.of(sums), own, active
+        _, parts, own = dr.while_loop(start, more, step, label="near primitives")
+        sums, n = FieldSums.of(parts), self.backend.Float(count)
+        added = (_NEAR + 1) * self.backend.epsilon * n * sums.s4 / inverse
+        sums = dataclasses.replace(sums, slope_truncation=sums.slope_truncation + added)
+        return sums, own, active
 
     def sums_or_tree(
         self, tree: Treecode, x: Vec3, detail: Real, add: tuple[AddPrimitive, AddPrimitive],

@@ -265,7 +265,7 @@ class ScreenedWindingNumber(DetailedField["_ScreenedBuffers"], BatchedField):
             raise ValueError(f"accuracy must lie between 2 and 100, not {accuracy!r}")
         if areas is None:
             areas = estimate_areas(points, normals)
-        self.points, self.normals, self.areas = validate_cloud(points, normals, areas)
+        self._points, self._normals, self._areas = validate_cloud(points, normals, areas)
         self.length, self.accuracy = float(length), float(accuracy)
         few = len(self.points) <= _MOST_SUMMED
         self.method: Literal["sum", "tree"] = (
@@ -282,6 +282,22 @@ class ScreenedWindingNumber(DetailedField["_ScreenedBuffers"], BatchedField):
         self._kappa = self._size / self.length
         self.default_level = mean_at_dipoles(self._rows, self._kappa)
         self._extents: Remembered[tuple[float, ...], Volume | None] = Remembered()
+
+    @property
+    def points(self) -> FloatArray:
+        """(n, 3). They stay as they are, as their normals and areas do, as all else is computed
+        from them once: others make another field."""
+        return self._points
+
+    @property
+    def normals(self) -> FloatArray:
+        """(n, 3), of unit length."""
+        return self._normals
+
+    @property
+    def areas(self) -> FloatArray:
+        """(n,)."""
+        return self._areas
 
     @classmethod
     def of_mesh(

@@ -513,9 +513,9 @@ class SolidAngle(HasCells, UploadedField["_CurveBuffers"]):
         vertices = sum(map(len, self._net)) + 3 * len(self._net_circles)
         return tight_extent(proved, levels, lower, upper, max(8, _MOST_PAIRS // vertices))
 
-    def having_cells(self) -> Self:
-        other = super().having_cells()
-        other.has_detail, other._extents = True, Remembered()
+    def having_cells(self, cells: bool = True) -> Self:
+        other = super().having_cells(cells)
+        other.has_detail, other._extents = cells, Remembered()
         return other
 
     def least_rays(self) -> float:

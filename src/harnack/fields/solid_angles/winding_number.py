@@ -35,7 +35,6 @@ from harnack.fields.field import AtDetail, Field, Sample, lengthened
 from harnack.fields.sheets import NO_SHEET, Crossing, NearestSheet
 from harnack.fields.solid_angles.boundary_cells import BoundaryCells
 from harnack.fields.solid_angles.cell_choice import Cells, HasCells
-from harnack.fields.solid_angles.near_far import NearFarCells
 from harnack.fields.solid_angles.winding_exact import ExactWinding
 from harnack.fields.solid_angles.winding_mesh import WindingMesh
 from harnack.fields.solid_angles.winding_tree import TreeWinding
@@ -169,9 +168,9 @@ _PAYS, _LEAST_RAYS, _MOST_IN_CELLS = 3.0, 5e3, 100_000
 # With more edges than this many times the triangles the mesh is a soup, whose cells add up near
 # triangles, not edges; they are built from so many rays a triangle on, for no more triangles.
 _SOUP, _SOUP_PAYS, _MOST_OF_SOUP = 1.5, 12.0, 50_000
-# Cells of soups save as much time for so many values at points as for a ray; for values their cube
-# is wider than the extent, where all rays begin, by this factor: one large cell more on each side.
-_POINTS_A_RAY, _WIDER = 200, 2.002
+# Their cube is wider than the extent, where all rays begin, by this factor, for values at points:
+# some large cells more.
+_WIDER = 2.002
 # The accuracy of values at points, and of traces, by experiment.
 _VALUES, _TRACED = 2.0, 4.0
 # See `WindingNumber._at_centers`: 16.5 roundings of each of 100,000 edges, and as much of the steep
@@ -203,8 +202,9 @@ class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
         hardly an edge in common, near triangles take the place of edges, with the tree as method
         (`near_far`). None builds them where they pay (`for_rays`), True always, False never; at
         most the megabytes that are given (True: 256), and several times as much while they are
-        built. Those of soups serve values and gradients at points too, `cells=True` from 100,000
-        points on; all other values and derivatives at points are those of `method`.
+        built. Those of soups, where they were asked for, give values and gradients at points too,
+        which pays from some 2,000 points a triangle on; all other values and derivatives at points
+        are those of `method`.
 
     Hits on triangles have `Hits.sheet`; `faces_of_sheets` gives the face of each. `moved` gives the
     field for the same faces when vertices have moved.
@@ -234,7 +234,7 @@ class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
             raise ValueError(f"accuracy must lie between 1.5 and 100, not {accuracy}")
         if order not in (0, 1, 2):
             raise ValueError(f"order must be 0, 1 or 2, not {order}")
-        self.mesh = WindingMesh.of(vertices, faces)
+        self._mesh = WindingMesh.of(vertices, faces)
         few = len(self.mesh.singular) <= _MOST_EDGES
         self.method: Literal["exact", "tree"] = (
             ("exact" if few else "tree") if method == "auto" else method
@@ -255,11 +255,16 @@ class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
         Raises MeshError as for a new mesh, and for vertices that coincided and come apart.
         """
         field = copy.copy(self)
-        field.mesh = self.mesh.moved(vertices)
+        field._mesh = self.mesh.moved(vertices)
         field._batches, field._device = Remembered(), None
         field._extents, field._occupied = Remembered(), Remembered()
         field.set_cells(self.cells)
         return field
+
+    @property
+    def mesh(self) -> WindingMesh:
+        """The triangles. They stay as they are: see `moved`."""
+        return self._mesh
 
     @property
     def faces_of_sheets(self) -> npt.NDArray[np.int64]:
@@ -272,7 +277,7 @@ class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
         return prepared
 
     def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> Values:
-        on = self._for_values(backend_of(x))
+        on = self._batch(backend_of(x))
         winding, x = on.winding, on.unit(x)
         if isinstance(winding, TreeWinding):
             values = winding.at(x, derivatives, closer)
@@ -286,34 +291,35 @@ class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
         weight = self.mesh.area / (4 * math.pi * self.mesh.size**2)
         return values.far_away(x, 64 + len(self.mesh.singular), weight).rescaled(on.size)
 
-    def _for_values(self, backend: Backend) -> _MeshBuffers:
-        """The data for values, with the cells of triangles for tracing if there are any."""
-        on, traced = self._batch(backend), self._device
-        if traced is None or traced.backend is not backend:
-            return on
-        if not isinstance(on.winding, TreeWinding) or not isinstance(traced.built, NearFarCells):
-            return on
-        return dataclasses.replace(on, winding=dataclasses.replace(on.winding, cells=traced.built))
-
     def _upload(self, backend: Backend, *, traced: bool) -> _MeshBuffers:
         accuracy = self.accuracy or (_TRACED if traced else _VALUES)
         mesh = self.mesh
         rays = TriangleRays.of(backend, mesh.ray_tree, mesh.ray_records)
-        most_bytes, low, high = 0, mesh.center, mesh.center
-        if traced and self.cells and len(mesh.singular):
-            extent = self.extent((self.default_level,))
-            assert extent is not None
-            most_bytes, (low, high) = self.most_bytes(), extent.bounds()
         if self.method == "exact":
             winding = ExactWinding.of(backend, mesh, rays, traced)
         else:
-            reach = float(np.maximum(high - mesh.center, mesh.center - low).max()) / mesh.size
-            of_soup = most_bytes if self._is_soup else 0
-            winding = TreeWinding.of(backend, mesh, accuracy, self.order, of_soup, _WIDER * reach)
+            winding = TreeWinding.of(backend, mesh, accuracy, self.order)
         on = _MeshBuffers(*placed(backend, mesh.center, mesh.size), winding, rays)
-        if not most_bytes or on.built is not None:
+        if not self.cells or not len(mesh.singular) or not (traced or self.for_values):
             return on
-        cells = BoundaryCells.build(rays, mesh, low, high, most_bytes, self._at_centers)
+        return self._having(on, traced=traced)
+
+    def _having(self, on: _MeshBuffers, *, traced: bool) -> _MeshBuffers:
+        """The data with cells: those of triangles, or for tracing those of edges."""
+        mesh, most_bytes, winding = self.mesh, self.most_bytes(), on.winding
+        extent = self.extent((self.default_level,))
+        assert extent is not None
+        low, high = extent.bounds()
+        if self._is_soup and isinstance(winding, TreeWinding):
+            reach = float(np.maximum(high - mesh.center, mesh.center - low).max()) / mesh.size
+            cells = self.built_once(
+                on.backend, lambda: winding.build_cells(mesh, _WIDER * reach, most_bytes)
+            )
+            if cells is not None:
+                return dataclasses.replace(on, winding=dataclasses.replace(winding, cells=cells))
+        if not traced:
+            return on
+        cells = BoundaryCells.build(on.rays, mesh, low, high, most_bytes, self._at_centers)
         return dataclasses.replace(on, cells=cells)
 
     @property
@@ -325,18 +331,11 @@ class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
     def _at_centers(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """w at points (n, 3), and bounds of its error; those of the rounding of an exact sum, in
         double precision and off triangles by many roundings in single precision, are far below."""
-        plain = self._without_cells()
+        plain = self.having_cells(False)  # else this would be asked for itself
         value = np.array(plain.value(points, precision="double"))
         if self.method == "exact":
             return value, np.full(len(value), _ROUNDED)
         return value, plain.error_bound(points, precision="double")
-
-    def _without_cells(self) -> WindingNumber:
-        """The same field without cells."""
-        other = copy.copy(self)
-        other.set_cells(False)
-        other._device = None
-        return other
 
     @property
     def is_modulo(self) -> bool:
@@ -349,13 +348,6 @@ class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
             return max(_LEAST_RAYS, _SOUP_PAYS * triangles) if few else math.inf
         pays = _FEW_EDGES <= edges <= _MOST_IN_CELLS
         return max(_LEAST_RAYS, _PAYS * edges) if pays else math.inf
-
-    @property
-    def give_values(self) -> bool:
-        return self._is_soup
-
-    def least_points(self) -> float:
-        return _POINTS_A_RAY * self.least_rays()
 
     def occupied(self, levels: tuple[float, ...]) -> OccupiedCells | None:
         """Cells by `winding_cells`, if edges are not few, for the exact method or by cells."""
@@ -448,7 +440,7 @@ class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
         """All triangles, and cells around them that are not proved empty (`winding_extent`)."""
         if levels not in self._extents:
-            self._extents[levels] = winding_extent(self._without_cells(), self.mesh, levels)
+            self._extents[levels] = winding_extent(self.having_cells(False), self.mesh, levels)
         return self._extents[levels]
 
     def describe(self) -> dict[str, Any]:

@@ -106,20 +106,22 @@ class TreeWinding:
     @classmethod
     def of(
         cls, backend: Backend, mesh: WindingMesh, accuracy: float, order: int,
-        most_bytes: int = 0, half: float = 0.0,
     ) -> TreeWinding:  # fmt: skip
-        """Everything uploaded. most_bytes: of cells of the cube [-half, half]^3; 0 for none."""
+        """Everything but cells, uploaded."""
         records = np.concatenate([mesh.records, mesh.singular_flags], axis=1)
         slots = in_slots(mesh.tree, records)
         rounding = last_roundings(backend)
         levels = list(mesh.levels)
         clusters = Treecode.of(backend, mesh.tree, levels, slots, accuracy, order)
-        if not most_bytes:
-            return cls(clusters, rounding)
-        sources = mesh.tree.gather(triangle_sources(mesh.corners))
-        triangles = clusters.tree.primitives
-        cells = build_cells(backend, mesh.tree, levels, sources, triangles, half, most_bytes)
-        return cls(clusters, rounding, cells)
+        return cls(clusters, rounding)
+
+    def build_cells(self, mesh: WindingMesh, half: float, most_bytes: int) -> NearFarCells | None:
+        """Cells of the cube [-half, half]^3, of at most so many bytes: see `near_far`."""
+        sources, triangles = mesh.tree.gather(triangle_sources(mesh.corners)), self.clusters.tree
+        return build_cells(
+            self.backend, mesh.tree, list(mesh.levels), sources, triangles.primitives, half,
+            most_bytes,
+        )  # fmt: skip
 
     @property
     def has_detail(self) -> bool:
