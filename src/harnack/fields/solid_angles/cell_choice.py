@@ -25,7 +25,6 @@ __all__ = ["Cells", "HasCells"]
 # Megabytes that cells may take by default.
 _MEGABYTES = 256.0
 
-
 Built = TypeVar("Built")
 
 
@@ -62,7 +61,7 @@ class HasCells(Field):
             )
         self.cells, self.for_values, self.finer = cells, bool(cells), True
         self._with_cells: Remembered[bool, Self] = Remembered()
-        self._built: Remembered[Backend, Any] = Remembered()
+        self._built: Remembered[tuple[Backend, int, bool], Any] = Remembered()
 
     def having_cells(self, cells: bool = True) -> Self:
         """A copy with cells for rays, or with none."""
@@ -73,9 +72,10 @@ class HasCells(Field):
 
     def built_once(self, backend: Backend, build: Callable[[], Built]) -> Built:
         """What `build` made for a backend, for values and for tracing."""
-        if backend not in self._built:
-            self._built[backend] = build()
-        return self._built[backend]
+        key = backend, self.most_bytes(), self.finer
+        if key not in self._built:
+            self._built[key] = build()
+        return self._built[key]
 
     @abc.abstractmethod
     def least_rays(self) -> float:
