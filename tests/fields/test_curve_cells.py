@@ -508,8 +508,8 @@ def test_loops_of_a_field_cannot_be_replaced() -> None:
     assert field.for_rays(10**8).loops is field.loops
 
 
-@pytest.mark.parametrize("cells", [-1.0, math.inf, math.nan])
-def test_cells_is_a_number_of_megabytes(cells: float) -> None:
+@pytest.mark.parametrize("cells", [-1.0, math.inf, math.nan, "yes", [1]])
+def test_cells_is_a_number_of_megabytes(cells: Any) -> None:
     with pytest.raises(ValueError, match="megabytes"):
         hk.SolidAngle(wavy(20), cells=cells)
 

@@ -271,6 +271,8 @@ def test_memory_is_bounded_and_stated() -> None:
     assert sizes[0] > sizes[1] > sizes[2] > sizes[3] == 0
     assert "cells" not in hk.DipolePotential(*some, cells=False).describe()
     assert hk.DipolePotential(*some).describe()["cells"] == "from 100,000 rays on"
+    for asked in (True, np.True_):
+        assert hk.DipolePotential(*some, cells=asked).describe()["cells"] == "of at most 256 MB"
 
 
 def test_solids_tell_their_parts_how_many_rays_there_will_be() -> None:
@@ -295,8 +297,8 @@ def test_solids_tell_their_parts_how_many_rays_there_will_be() -> None:
     assert np.quantile(apart, 0.99) < 1e-3
 
 
-@pytest.mark.parametrize("cells", [-1.0, math.inf, math.nan])
-def test_cells_is_a_number_of_megabytes(cells: float) -> None:
+@pytest.mark.parametrize("cells", [-1.0, math.inf, math.nan, "yes", [1]])
+def test_cells_is_a_number_of_megabytes(cells: Any) -> None:
     with pytest.raises(ValueError, match="megabytes"):
         hk.DipolePotential(*cloud(100), cells=cells)
 

@@ -122,8 +122,8 @@ def check_scene_file(path: Path) -> None:
     """
     if path.suffix.lower() in SURFACE_FILES:
         raise Place(path).error(
-            "this is a surface file, not a Mitsuba scene (.xml): draw the field that "
-            "harnack.field_from_file.open_surface(path).field makes of it"
+            "this is a surface file, not a Mitsuba scene (.xml): draw its field, "
+            "open_surface(path).field, with `from harnack.field_from_file import open_surface`"
         )
     if looks_like_formula(str(path)) and not path.exists():
         raise Place(path).error(

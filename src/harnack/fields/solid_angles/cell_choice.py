@@ -10,7 +10,9 @@ import abc
 import copy
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar, cast
+
+import numpy as np
 
 from harnack.cluster.packing import Remembered
 from harnack.fields.field import Field
@@ -53,13 +55,18 @@ class HasCells(Field):
     _device: Any
     _batches: Any
 
-    def set_cells(self, cells: bool | float | None) -> None:
+    def set_cells(self, cells: Any) -> None:
         """Take the argument. Raises ValueError for what is no number of megabytes."""
-        if cells is not None and not 0 <= cells < math.inf:
+        kind = cast("Any", type(cells))
+        if issubclass(kind, np.bool_):  # True is no megabyte
+            cells = bool(cells)
+        is_number = issubclass(kind, (int, float, np.bool_, np.integer, np.floating))
+        if cells is not None and not (is_number and 0 <= cells < math.inf):
             raise ValueError(
-                f"cells must be True, False, a number of megabytes or None, not {cells}"
+                f"cells must be True, False, a number of megabytes or None, not {cells!r}"
             )
-        self.cells, self.for_values, self.finer = cells, bool(cells), True
+        self.cells = cells
+        self.for_values, self.finer = bool(cells), True
         self._with_cells: Remembered[bool, Self] = Remembered()
         self._built: Remembered[tuple[Backend, int, bool], Any] = Remembered()
 
@@ -100,12 +107,14 @@ class HasCells(Field):
         return int(1e6 * (_MEGABYTES if self.cells is True else float(self.cells or 0)))
 
     def said_of_cells(self, built: Cells | None) -> dict[str, str]:
-        """For `describe`: the number and memory of the cells that were built, or from how many rays
-        on there are any."""
+        """For `describe`: the number and memory of the cells of a prepared field, what those of
+        another one may take, or from how many rays on there are any."""
         if self.cells is None and self.least_rays() < math.inf:
             return {"cells": f"from {math.ceil(self.least_rays()):,} rays on"}
-        if self._device is None or not self.cells:
+        if not self.cells:
             return {}
+        if self._device is None:
+            return {"cells": f"of at most {self.most_bytes() / 1e6:g} MB"}
         if built is None:
             return {"cells": "none, as they need more memory"}
         return {"cells": f"{built.count} of {built.size / 1e6:.1f} MB"}
