@@ -303,6 +303,19 @@ def test_cells_is_a_number_of_megabytes(cells: Any) -> None:
         hk.DipolePotential(*cloud(100), cells=cells)
 
 
+def builds(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """A list that grows with each time that cells are built."""
+    made: list[int] = []
+    build = dipole.build_cells
+
+    def counted(*given: Any, **settings: Any) -> Any:
+        made.append(1)
+        return build(*given, **settings)
+
+    monkeypatch.setattr(dipole, "build_cells", counted)
+    return made
+
+
 def test_many_rays_get_cells_by_themselves(monkeypatch: pytest.MonkeyPatch) -> None:
     some = cloud(300)
     field = hk.DipolePotential(*some)
@@ -319,14 +332,7 @@ def test_many_rays_get_cells_by_themselves(monkeypatch: pytest.MonkeyPatch) -> N
     # Tracing asks for them.
     monkeypatch.setattr(dipole, "_LEAST_RAYS", 1000)
     monkeypatch.setattr(dipole, "_PAYS", 1)
-    made: list[int] = []
-    build = dipole.build_cells
-
-    def counted(*given: Any, **settings: Any) -> Any:
-        made.append(1)
-        return build(*given, **settings)
-
-    monkeypatch.setattr(dipole, "build_cells", counted)
+    made = builds(monkeypatch)
     field = hk.DipolePotential(*some)
     few, many = rays(some[0], 999), rays(some[0], 1000)
     hk.trace(field, *few)
@@ -424,14 +430,7 @@ def test_values_by_cells_are_within_their_bounds(precision: Precision) -> None:
 
 def test_values_have_cells_where_those_were_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     """And the same as rays; not where rays asked for them."""
-    made: list[int] = []
-    build = dipole.build_cells
-
-    def counted(*given: Any, **settings: Any) -> Any:
-        made.append(1)
-        return build(*given, **settings)
-
-    monkeypatch.setattr(dipole, "build_cells", counted)
+    made = builds(monkeypatch)
     some, x = cloud(300), np.eye(3)
     hk.DipolePotential(*some).for_rays(10**9).value(x)
     hk.DipolePotential(*some, cells=False).value(x)

@@ -32,6 +32,7 @@ from harnack.fields.solid_angles.far_clusters import (
 from harnack.fields.solid_angles.fitted_cloud import FittedCloud
 from harnack.fields.solid_angles.multipole import all_levels
 from harnack.fields.solid_angles.near_far import NearFarCells, build_cells
+from harnack.fields.solid_angles.oriented_points import OrientedPoints
 from harnack.fields.solid_angles.smoothed import SmoothedSum
 from harnack.fields.sums import FieldSums, Terms, last_roundings, rounding_of_dipole
 from harnack.geometry import Box, CloudError, estimate_areas, estimate_normals, validate_cloud
@@ -202,7 +203,7 @@ _LEAST_PART, _LEAST_LEVEL = 0.1, 1e-3
 _FAR = 0.04
 
 
-class DipolePotential(HasCells, DetailedField["_DipoleBuffers"], BatchedField):
+class DipolePotential(OrientedPoints, HasCells, DetailedField["_DipoleBuffers"], BatchedField):
     """f(x) = sum a_i n_i.(p_i - x)/|p_i - x|^3 of oriented points (paper, Eq. 12).
 
     With a_i the areas that the points stand for, f is about 4 pi inside and 0 outside: the
@@ -282,10 +283,8 @@ class DipolePotential(HasCells, DetailedField["_DipoleBuffers"], BatchedField):
         if isinstance(normals, str):
             normals = estimate_normals(points)
         some = np.ones(len(points)) if areas is None else areas
-        self._points, self._normals, self._areas = validate_cloud(points, normals, some)
-        if areas is None:
-            self._areas = estimate_areas(self.points, self.normals)
-            self._areas.setflags(write=False)
+        points, normals, some = validate_cloud(points, normals, some)
+        self._keep(points, normals, estimate_areas(points, normals) if areas is None else some)
         self.accuracy = accuracy
         self.set_cells(cells)
         self._box = low, high = self.points.min(axis=0), self.points.max(axis=0)
@@ -298,22 +297,6 @@ class DipolePotential(HasCells, DetailedField["_DipoleBuffers"], BatchedField):
             raise ValueError("cells are of sums without smoothing: give one of the two")
         if self.smoothing:
             self.default_level = self._level_at_points()
-
-    @property
-    def points(self) -> FloatArray:
-        """(n, 3). They stay as they are, as their normals and areas do, as all else is computed
-        from them once: see `moved`."""
-        return self._points
-
-    @property
-    def normals(self) -> FloatArray:
-        """(n, 3), of unit length."""
-        return self._normals
-
-    @property
-    def areas(self) -> FloatArray:
-        """(n,)."""
-        return self._areas
 
     def _fitted(
         self, points: Any, normals: Any, areas: Any, smoothing: str

@@ -29,6 +29,7 @@ from harnack.fields.clearance import (
 )
 from harnack.fields.field import Sample
 from harnack.fields.solid_angles.far_clusters import dipole_rows
+from harnack.fields.solid_angles.oriented_points import OrientedPoints
 from harnack.fields.solid_angles.radial_kernel import BALL, Radial, RadialKernel, RadialSums
 from harnack.fields.solid_angles.radial_tree import (
     ClusteredDipoles,
@@ -195,7 +196,7 @@ _SMALLEST_LEVEL = 1e-20
 _ON_DIPOLE, _ANY_LEVEL = 32, 1e5
 
 
-class ScreenedWindingNumber(DetailedField["_ScreenedBuffers"], BatchedField):
+class ScreenedWindingNumber(OrientedPoints, DetailedField["_ScreenedBuffers"], BatchedField):
     """w(x) = (1/4 pi) sum_i a_i n_i.(y_i - x) (1 + rho_i/l) exp(-rho_i/l)/rho_i^3, rho_i = |y_i-x|.
 
     Minus the derivative of the Yukawa kernel exp(-rho/l)/rho along n_i at y_i; as l grows, the
@@ -265,7 +266,7 @@ class ScreenedWindingNumber(DetailedField["_ScreenedBuffers"], BatchedField):
             raise ValueError(f"accuracy must lie between 2 and 100, not {accuracy!r}")
         if areas is None:
             areas = estimate_areas(points, normals)
-        self._points, self._normals, self._areas = validate_cloud(points, normals, areas)
+        self._keep(*validate_cloud(points, normals, areas))
         self.length, self.accuracy = float(length), float(accuracy)
         few = len(self.points) <= _MOST_SUMMED
         self.method: Literal["sum", "tree"] = (
@@ -282,22 +283,6 @@ class ScreenedWindingNumber(DetailedField["_ScreenedBuffers"], BatchedField):
         self._kappa = self._size / self.length
         self.default_level = mean_at_dipoles(self._rows, self._kappa)
         self._extents: Remembered[tuple[float, ...], Volume | None] = Remembered()
-
-    @property
-    def points(self) -> FloatArray:
-        """(n, 3). They stay as they are, as their normals and areas do, as all else is computed
-        from them once: others make another field."""
-        return self._points
-
-    @property
-    def normals(self) -> FloatArray:
-        """(n, 3), of unit length."""
-        return self._normals
-
-    @property
-    def areas(self) -> FloatArray:
-        """(n,)."""
-        return self._areas
 
     @classmethod
     def of_mesh(
