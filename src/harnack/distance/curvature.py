@@ -46,8 +46,10 @@ class Curvatures:
         radius r has 1/r if f grows outward, -1/r if f grows inward.
     gaussian: (n,) product of the principal curvatures, 1/length^2; the same for f and -f.
     normal: (n, 3) grad f/|grad f|.
-    mean_error, gaussian_error: (n,) proved bounds of how far `mean` and `gaussian` may be off, as
-        far as the field states the errors of its derivatives; infinite where they are NaN.
+    mean_error, gaussian_error: (n,) proved bounds of how far `mean` and `gaussian` may be off;
+        infinite where they are NaN, and where the field does not state the errors of its
+        derivatives (`Field.derivative_errors`). The rounding of the coordinates in which a moved
+        field without a formula is evaluated is not included.
     """
 
     mean: FloatArray
@@ -69,8 +71,8 @@ def curvature(field: Field, points: Any, *, precision: Precision = "double") -> 
         mean = tr S/2 = (tr A - n.An)/(2 |grad f|) = (div n)/2,
         gaussian = det S = n.adj(A)n/|grad f|^2.
 
-    Of a sum over a tree (`BatchedField`) both derivatives have an error that the field states.
-    Where it leaves the mean curvature uncertain by more than a thousandth of itself, or of one over
+    Of a sum over a tree, and of a solid made of one, both derivatives have an error that the field
+    states. Where it leaves the mean curvature uncertain by more than a thousandth of itself, or of one over
     the size of the surface, clusters are taken as a whole only from farther away, up to the sum of
     all terms one by one. What remains is in `mean_error` and `gaussian_error` (`_bounds`).
 
@@ -83,14 +85,14 @@ def curvature(field: Field, points: Any, *, precision: Precision = "double") -> 
     if not isinstance(field, BatchedField):
         prepared = field.prepare(backend)
 
-        def directly(p: Vec3) -> tuple[Real | Vec3, ...]:
-            sample = prepared.evaluate(p)
-            rows = prepared.hessian(p)
-            errors = prepared.derivative_errors(p, sample)
+        def directly(p: Vec3, closer: Real) -> tuple[Real | Vec3, ...]:
+            closely = prepared.at_detail(closer) if prepared.has_detail else prepared
+            sample = closely.evaluate(p)
+            errors = closely.derivative_errors(p, sample)
+            rows = closely.hessian(p)
             return _Derivatives(backend, sample.gradient, rows, *errors).curvatures()
 
-        *found, _ = in_batches(backend, directly, points)
-        return Curvatures(*found)
+        return _refined(backend, field, directly, points, prepared.has_detail)
 
     def by_tree(p: Vec3, closer: Real) -> tuple[Real | Vec3, ...]:
         at = field.values_at(p, 2, closer)
@@ -100,24 +102,28 @@ def curvature(field: Field, points: Any, *, precision: Precision = "double") -> 
         found = _Derivatives(backend, at.gradient, rows, at.gradient_error, at.hessian_error)
         return found.curvatures()
 
-    return _refined(backend, field, by_tree, points)
+    return _refined(backend, field, by_tree, points, True)
 
 
 def _refined(
     backend: Backend,
-    field: BatchedField,
-    by_tree: Callable[[Vec3, Real], tuple[Real | Vec3, ...]],
+    field: Field,
+    computed: Callable[[Vec3, Real], tuple[Real | Vec3, ...]],
     points: Any,
+    has_detail: bool,
 ) -> Curvatures:
-    """The curvatures by a tree that is evaluated more closely where the error is too large."""
+    """The curvatures, `computed` more closely where the error is too large and the field
+    `has_detail`."""
 
     def at(closer: float) -> Callable[[Vec3], tuple[Real | Vec3, ...]]:
         def compute(p: Vec3) -> tuple[Real | Vec3, ...]:
-            return by_tree(p, dr.opaque(backend.Float, closer))
+            return computed(p, dr.opaque(backend.Float, closer))
 
         return compute
 
     *found, is_truncated = in_batches(backend, at(_CLOSER[0]), points)
+    if not has_detail:
+        return Curvatures(*found)
     x = np.asarray(points, np.float64)
     flat = _ACCURACY / _size(field, x)
     for closer in _CLOSER[1:]:
@@ -133,7 +139,7 @@ def _refined(
     return Curvatures(*found)
 
 
-def _size(field: BatchedField, points: FloatArray) -> float:
+def _size(field: Field, points: FloatArray) -> float:
     """The size of the surface: of the box that holds it, else the extent of the points."""
     volume = field.extent((field.default_level,))
     if volume is not None:

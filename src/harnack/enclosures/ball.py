@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 
 # Lengths are multiplied by this, to cover the roundings of the two sides of the comparison.
 PULL_BACK = 1.0 - 2e-6
-# k is the difference of numbers of order one: so many units in the last place are added to it,
-# which covers their rounding and that of the given slope.
+# k is the difference of numbers of order one: so many roundings, halves of a unit in the last
+# place, are added to it, which covers their rounding and that of the given slope.
 _ROUNDINGS = 16.0
 
 
@@ -162,7 +162,8 @@ def known_ranges(
     a promise that leaves f no range, but for rounding, would otherwise prove f constant. A radius
     that is not a positive number, or a NaN anywhere, proves nothing (radius 0).
     """
-    total_error = dr.fma(8 * float(dr.epsilon(type(value))), dr.abs(value), error)
+    unit = 2 * float(dr.epsilon(type(value)))  # Dr.Jit's is half the distance to the next number
+    total_error = dr.fma(8 * unit, dr.abs(value), error)
     known = promise.radius > 0
 
     def movement(end: Real, sign: float) -> Real | None:

@@ -22,11 +22,12 @@ from harnack.backend.arrays import as_data
 from harnack.backend.elementary import fmax
 from harnack.backend.tensors import takes_tensors
 from harnack.cluster.lazy import takes_blocks
-from harnack.fields.field import Field
+from harnack.fields.field import AtDetail, Field
 from harnack.fields.points import at_points
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Precision, Real, Vec3
+    from harnack.fields.look import Sample
 
 # The rounding of dipoles' moments, which are summed up in double precision, as a fraction of the
 # total weight.
@@ -183,6 +184,9 @@ class BatchedField(Field):
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         return _hessian(self.values_at(p, 2)).rows(backend_of(p).Array3f)
 
+    def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
+        return sample.gradient_error, self.values_at(p, 2).hessian_error
+
     @takes_blocks("points")
     def error_bound(self, points: Any, *, precision: Precision = "single") -> FloatArray:
         """Bounds (n,) of the error of `value` at points (n, 3).
@@ -216,6 +220,23 @@ class BatchedField(Field):
             return wanted(self.values_at(x, derivatives))
 
         return at_points(points, kernel, precision)
+
+
+class SumAtDetail(AtDetail):
+    """A sum as evaluated at one detail, with second derivatives; values: `values_at` for these, at
+    that detail."""
+
+    def __init__(
+        self, evaluate: Callable[[Vec3], Sample], values: Callable[[Vec3], Values]
+    ) -> None:
+        super().__init__(evaluate)
+        self._values = values
+
+    def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
+        return _hessian(self._values(p)).rows(backend_of(p).Array3f)
+
+    def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
+        return sample.gradient_error, self._values(p).hessian_error
 
 
 def _hessian(values: Values) -> SymmetricSum:

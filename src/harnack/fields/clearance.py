@@ -19,8 +19,8 @@ from harnack.backend import FloatArray, backend_of, choose_backend, to_numpy, to
 from harnack.backend.elementary import fmax, fmin, largest_coordinate, length
 from harnack.cluster.packing import Remembered
 from harnack.enclosures import Gaps, Slopes, TargetLevels, choose_proofs, longest_step
-from harnack.fields.batch import prepared_once
-from harnack.fields.field import AtDetail, Field
+from harnack.fields.batch import BatchedField, SumAtDetail, prepared_once
+from harnack.fields.field import Field
 from harnack.tree.cells import Cells, OccupiedCells, carve, union, wrapped_points
 
 if TYPE_CHECKING:
@@ -193,8 +193,8 @@ class UploadedField(Field, Generic[Uploaded]):
         return self._batches[backend]
 
 
-class DetailedField(UploadedField[Uploaded]):
-    """An uploaded field with a choice of detail (`Field.at_detail`). Subclasses define
+class DetailedField(UploadedField[Uploaded], BatchedField):
+    """An uploaded sum with a choice of detail (`Field.at_detail`). Subclasses define
     `_sample`."""
 
     has_detail = True
@@ -212,7 +212,10 @@ class DetailedField(UploadedField[Uploaded]):
 
     def at_detail(self, detail: Real) -> Field:
         on = self._prepared()
-        return AtDetail(lambda p: self._sample(on, p, detail))
+        closer = fmax(on.backend.Float(detail), on.backend.Float(1))
+        return SumAtDetail(
+            lambda p: self._sample(on, p, detail), lambda p: self.values_at(p, 2, closer)
+        )
 
     def _batch(self, backend: Backend) -> Uploaded:
         device = self._device

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import abc
 import inspect
+import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar, cast
 
@@ -288,10 +289,10 @@ class Field(Sheets, Parts, Detail, Boundary, abc.ABC):
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
         """Bounds of the errors of the gradient, as a length, and of `hessian`, in the spectral
-        norm, at the point p of a sample. The default: what the sample states, and 0 for the
-        Hessian."""
+        norm, at the point p of a sample. The default: what the sample states, and infinite for the
+        Hessian, of which nothing is known."""
         del p
-        return sample.gradient_error, 0.0
+        return sample.gradient_error, math.inf
 
     def describe(self) -> dict[str, Any]:
         """Names and values of what a user may want to know about choices that the field made."""

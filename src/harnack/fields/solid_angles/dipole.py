@@ -18,7 +18,7 @@ import numpy as np
 from harnack.backend import backend_of
 from harnack.backend.elementary import fmax
 from harnack.backend.numbers import positive
-from harnack.fields.batch import BatchedField, SymmetricSum, Values
+from harnack.fields.batch import SymmetricSum, Values
 from harnack.fields.clearance import DetailedField, UnitCoordinates, epsilon_at, placed, single
 from harnack.fields.field import Sample, lengthened
 from harnack.fields.solid_angles.cell_choice import HasCells
@@ -203,7 +203,7 @@ _LEAST_PART, _LEAST_LEVEL = 0.1, 1e-3
 _FAR = 0.04
 
 
-class DipolePotential(OrientedPoints, HasCells, DetailedField["_DipoleBuffers"], BatchedField):
+class DipolePotential(OrientedPoints, HasCells, DetailedField["_DipoleBuffers"]):
     """f(x) = sum a_i n_i.(p_i - x)/|p_i - x|^3 of oriented points (paper, Eq. 12).
 
     With a_i the areas that the points stand for, f is about 4 pi inside and 0 outside: the

@@ -20,7 +20,7 @@ from harnack.backend import backend_of
 from harnack.backend.elementary import fmax
 from harnack.cluster.packing import Remembered
 from harnack.enclosures import HarmonicBall
-from harnack.fields.batch import BatchedField, Values
+from harnack.fields.batch import Values
 from harnack.fields.clearance import (
     DetailedField,
     UnitCoordinates,
@@ -275,7 +275,7 @@ _MOST_CELLS = 40_000
 _ACROSS = 128
 
 
-class MorphSlice(DetailedField["_SliceBuffers"], BatchedField):
+class MorphSlice(DetailedField["_SliceBuffers"]):
     """f(x) = (U_a(x, w) + U_b(x, gap - w))/(2 pi^2), 0 < w < gap: see `Morph`.
 
     corners: two arrays (m, 3, 3) of triangles. w, gap, spacing, accuracy: as for `Morph`.

@@ -18,7 +18,7 @@ from harnack.backend.elementary import fmax, fmin
 from harnack.backend.numbers import positive
 from harnack.cluster.packing import Remembered
 from harnack.enclosures import Curvature, HarmonicBall
-from harnack.fields.batch import BatchedField, Values
+from harnack.fields.batch import Values
 from harnack.fields.clearance import (
     DetailedField,
     UnitCoordinates,
@@ -196,7 +196,7 @@ _SMALLEST_LEVEL = 1e-20
 _ON_DIPOLE, _ANY_LEVEL = 32, 1e5
 
 
-class ScreenedWindingNumber(OrientedPoints, DetailedField["_ScreenedBuffers"], BatchedField):
+class ScreenedWindingNumber(OrientedPoints, DetailedField["_ScreenedBuffers"]):
     """w(x) = (1/4 pi) sum_i a_i n_i.(y_i - x) (1 + rho_i/l) exp(-rho_i/l)/rho_i^3, rho_i = |y_i-x|.
 
     Minus the derivative of the Yukawa kernel exp(-rho/l)/rho along n_i at y_i; as l grows, the

@@ -12,12 +12,12 @@ import numpy as np
 
 from harnack.arithmetic import Interval, Jet
 from harnack.backend import backend_of
-from harnack.backend.elementary import fmax, fmin, length
+from harnack.backend.elementary import fmax, fmin, largest_coordinate, length
 from harnack.backend.numbers import refuses_derivatives
 from harnack.enclosures import Enclosure, Gaps
 from harnack.fields.field import Field, check_is_field
 from harnack.fields.formula import Formula, as_data, is_jet
-from harnack.fields.look import Look, Path, Sample
+from harnack.fields.look import Look, Path, Sample, value_error
 from harnack.fields.solids.combined import Complement, Offset, lipschitz_of, negated_sample
 from harnack.fields.solids.mesh_solid import is_mesh, solid_of_mesh
 from harnack.fields.solids.solid import Derived, Solid
@@ -298,6 +298,18 @@ class Near(Derived):
         below = self._offset(self.inner.evaluate(p).value) < 0
         x, y, z = (dr.select(below, -row, row) for row in self.inner.hessian(p))
         return x, y, z
+
+    def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
+        """Those of the inner field; infinite where rounding leaves it open on which side of a fold
+        the point is: derivatives jump there."""
+        own = self.inner.evaluate(p)
+        slope, bend = self.inner.derivative_errors(p, own)
+        doubt = value_error(own, length(own.gradient), largest_coordinate(p))
+        away = dr.abs(self._offset(own.value))
+        if self.inner.period is not None:
+            away = fmin(away, 0.5 * self.inner.period - away)
+        is_clear = away > doubt
+        return dr.select(is_clear, slope, dr.inf), dr.select(is_clear, bend, dr.inf)
 
     def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
         look = self.inner.look(path, t, ahead, back)
