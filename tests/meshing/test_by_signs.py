@@ -85,6 +85,30 @@ def test_vertices_lie_on_triangles_and_creases_are_sharp() -> None:
     assert facts["far"] <= 0.05 * len(made.vertices)
 
 
+def boxes(*ends: tuple[tuple[int, ...], tuple[int, ...]]) -> hk.WindingNumber:
+    """The winding number of boxes between lowest and highest corners."""
+    parts = [trimesh.creation.box(bounds=np.array(one, float)) for one in ends]
+    whole = trimesh.util.concatenate(parts)
+    return hk.WindingNumber(whole.vertices, whole.faces)
+
+
+@pytest.mark.parametrize(
+    ("parts", "volume"),
+    [
+        (boxes(((0, 0, 0), (30, 20, 10))), 6000),
+        (boxes(((0, 0, 0), (30, 20, 10)), ((5, 5, 10), (15, 15, 35))), 8500),
+    ],
+    ids=["plate", "box on it"],
+)
+def test_flat_parts_and_parts_in_contact(parts: hk.WindingNumber, volume: float) -> None:
+    """Their faces are planes of coordinates, in which every sign is as good as the other."""
+    made = hk.mesh(parts, tolerance=4e-3, spacing=1.5)
+    facts = check(made)
+    assert made.volume == pytest.approx(volume, rel=1e-3)
+    assert facts["far"] <= 0.01 * facts["looked_at"]
+    assert facts["within"] < facts["spacing"]
+
+
 @pytest.mark.few(1)
 @pytest.mark.parametrize(("scale", "shift"), [(1.0, 0.0), (1e-5, 0.0), (1.0, 1e4), (1e6, -1e7)])
 def test_units_and_places(scale: float, shift: float) -> None:

@@ -462,10 +462,13 @@ def check_near_level(
 
     A point is within it if the gradient says so, |f|/|grad f| <= tolerance; or if f changes its
     sign between two points at that distance from it or nearer, along the normal of the face or
-    along an axis, for then a continuous f has its level between them. A solid is cut at the
-    volume's boundary: to be outside of the volume counts as a positive sign. Boundary vertices of
-    an angle's level set are on its curve, where it has no value, and are left out; and triangles
-    smaller than half of the tolerance are as near as their corners.
+    one of 13 other lines, for then a continuous f has its level between them. These lines are
+    askew, since many parts have faces in planes of coordinates, where rounding decides the sign;
+    and every cone of 28 degrees about its axis has one of their directions in it, as the corner of
+    a cube has (35 degrees). A solid is cut at the volume's boundary: to be outside of the volume
+    counts as a positive sign. Boundary vertices of an angle's level set are on its curve, where it
+    has no value, and are left out; and triangles smaller than half of the tolerance are as near as
+    their corners.
 
     Raises:
         FarError: with the points that are not.
@@ -504,13 +507,21 @@ def far_from_level(
     ways /= np.maximum(lengths(ways), 1e-300)[:, None]
     far = np.flatnonzero(~(function.at(points).distance <= tolerance))
     # Nearer ones as well: behind a cap there may be little of a solid.
-    for share, axis in itertools.product((1.0, 0.25, 0.0625), (None, *np.eye(3))):
+    for share, line in itertools.product((1.0, 0.25, 0.0625), (None, *_askew_lines())):
         if not len(far):
             break
-        step = share * tolerance * (ways[far] if axis is None else axis)
+        step = share * tolerance * (ways[far] if line is None else line)
         one, other = (_is_positive(function, points[far] + s * step, volume) for s in (1, -1))
         far = far[one == other]
     return points[far], len(points)
+
+
+def _askew_lines() -> FloatArray:
+    """(13, 3) unit vectors along the axes and both kinds of diagonals of a cube, turned so that
+    none of them is near to a plane of coordinates or to one of their diagonals."""
+    ways = np.array(list(itertools.product((-1.0, 0.0, 1.0), repeat=3)))[14:]
+    frame: FloatArray = np.linalg.qr([[7, 7, -3], [3, -16, -7], [19, 7, -13]])[0]
+    return (ways / lengths(ways)[:, None]) @ frame
 
 
 def _is_positive(
