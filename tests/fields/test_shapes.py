@@ -504,6 +504,13 @@ def test_metric_threads_have_their_sizes() -> None:
     for one in off:
         assert np.median(one[near]) == pytest.approx(0.05, abs=1e-9)
         assert one[near].min() > 0.0249  # beside a corner, where another edge is nearest
+    # On the pitch line of M12, 10.863 across: both flanks are 0.2 apart, and not 0.1 and 0.3.
+    bolt, hole = hk.thread("M12", 20.0, clearance=0.1), hk.thread(
+        "M12", 20.0, internal=True, clearance=0.1
+    )  # fmt: skip
+    flanks = [[10.863 / 2, 0.0, 7.0 + turn * 1.75] for turn in (-3 / 16, 5 / 16)]
+    gaps = (bolt.parts[0].value(flanks), -hole.parts[0].parts[0].value(flanks))
+    assert np.abs(np.array(gaps) - 0.1).max() < 2e-4
     # Counter-clockwise as it rises: a quarter of a turn up, the same a quarter of a pitch higher.
     rise = screw.parts[0].value([[0.0, 3.9, 5.0 + pitch / 4]], precision="double")
     assert rise == pytest.approx(screw.parts[0].value([[3.9, 0.0, 5.0]], precision="double"))
@@ -542,8 +549,8 @@ def test_coils_stay_within_their_flattening() -> None:
         (lambda: hk.Revolved([(-0.1, 0), (1, 0), (1, 1)]), "lies in r >= 0"),
         (lambda: hk.Tube.helix(1.0, 1.0, 0.0, 0.1), "its turns must be positive"),
         (lambda: hk.Tube.helix(1.0, 1.0, 1.0, 0.1, tolerance=1e-30), "larger tolerance"),
-        (lambda: hk.Thread([(0, 1), (1, 1)], 1.0), "rises from 0 to less than the pitch"),
-        (lambda: hk.Thread([(0.1, 1)], 1.0), "rises from 0"),
+        (lambda: hk.Thread([(0, 1), (1, 1)], 1.0), "rises by less than the pitch"),
+        (lambda: hk.Thread([(-0.6, 1)], 1.0), "begins within half a pitch of 0"),
         (lambda: hk.Thread([(0, -1)], 1.0), "must be positive"),
         (lambda: hk.Thread([(0, math.nan)], 1.0), "finite"),
         (lambda: hk.Thread([0, 1], 1.0), "has shape"),

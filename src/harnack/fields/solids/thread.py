@@ -43,8 +43,9 @@ class Thread(Solid):
     """An endless screw along the z axis: the points nearer to the axis than a profile that moves by
     `starts` pitches along it in each turn.
 
-    profile: (n, 2) points (z, r) of a polyline, z rising from 0 to less than the pitch, r positive;
-        behind the last point it goes on to the first, one pitch further. At most 32 points.
+    profile: (n, 2) points (z, r) of a polyline, r positive; z begins within half a pitch of 0 and
+        rises by less than a pitch. Behind the last point it goes on to the first, one pitch
+        further. At most 32 points.
     pitch: the period of the profile along the axis.
     starts: how many grooves there are side by side.
     left_handed: whether it turns clockwise as it rises.
@@ -82,18 +83,20 @@ class Thread(Solid):
         points = np.array(array, dtype=np.float64)
         check_finite(points, "point {} of the profile of a thread", ValueError)
         z = points[:, 0]
-        if z[0] != 0 or (np.diff(z) <= 0).any() or not z[-1] < self.pitch:
+        rises = (np.diff(z) > 0).all() and z[-1] - z[0] < self.pitch
+        if not rises or abs(z[0]) > 0.5 * self.pitch:
             raise ValueError(
-                "z of the profile of a thread rises from 0 to less than the pitch, "
-                f"{self.pitch:g}: {z.tolist()!r:.80} does not"
+                "z of the profile of a thread begins within half a pitch of 0 and rises by less "
+                f"than the pitch, {self.pitch:g}: {z.tolist()!r:.80} does not"
             )
         if not (points[:, 1] > 0).all():
             raise ValueError("r of the profile of a thread must be positive")
         rows = tuple((float(a), float(b)) for a, b in points)
         set_checked(self, "profile", rows)
-        # Three periods: a nearest point is at most half a period away along the axis.
+        # Three periods: a nearest point is at most half a period away along the axis, and these
+        # reach so far beyond the one from 0 to the pitch.
         shifted = [(a + k * self.pitch, b) for k in (-1, 0, 1) for a, b in rows]
-        shifted.append((2 * self.pitch, rows[0][1]))
+        shifted.append((rows[0][0] + 2 * self.pitch, rows[0][1]))
         set_checked(self, "_points", tuple(shifted))
         lead = self.starts * self.pitch * (-1 if self.left_handed else 1)
         set_checked(self, "_lead", lead / (2 * math.pi))
@@ -268,8 +271,9 @@ def thread(
         go through.
     internal: whether it is for a nut.
     clearance: by which the surface lies inside of the basic profile, or outside for an internal
-        thread, across flanks, crests and roots, up to a tenth of the pitch. Printed threads that
-        are to fit want 0.05 to 0.1 on either side.
+        thread, across both flanks, crests and roots, up to a tenth of the pitch. Printed threads
+        that are to fit want 0.05 to 0.1 on either side. Grooves stay in the middle, so that the gap
+        between a bolt and its nut is the sum of their clearances on both flanks.
 
     The profile is the basic one of ISO 68-1, for bolt and nut: flanks at 60 degrees to each other,
     a crest of an eighth and a root of a quarter of the pitch P, and between their radii a depth of
@@ -290,10 +294,10 @@ def thread(
     depth = 0.625 * math.sqrt(0.75) * pitch
     sign = 1.0 if internal else -1.0
     crest, root = 0.5 * diameter + sign * clearance, 0.5 * diameter - depth + sign * clearance
-    # Edges moved across themselves by c meet c tan(30 degrees) farther along.
-    moved = sign * 2 * clearance * math.tan(math.radians(30.0))
-    flat, flank, bottom = pitch / 8 + moved, 5 * pitch / 16, pitch / 4 - moved
-    z = np.cumsum([0.0, flat, flank, bottom])
+    # Edges moved across themselves by c meet c tan(30 degrees) farther along, at both ends.
+    moved = sign * clearance * math.tan(math.radians(30.0))
+    flat, flank, bottom = pitch / 8 + 2 * moved, 5 * pitch / 16, pitch / 4 - 2 * moved
+    z = np.cumsum([-moved, flat, flank, bottom])
     made = Thread(np.column_stack([z, [crest, crest, root, root]]), pitch, 1, left_handed)
     over = crest + 0.25 * depth  # beyond the crests, so that no faces coincide
     bevel = over - root
