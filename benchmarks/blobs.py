@@ -129,6 +129,7 @@ class BlobFormula(Formula):
     exact: bool = True
     groups: int = 1
     records: tuple[Records, ...] = ()
+    may_jump = False
 
     def prepare(self, backend: Any) -> BlobFormula:
         scene = self.scene

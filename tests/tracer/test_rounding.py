@@ -45,3 +45,77 @@ def test_no_surface_slips_through(bound: str, precision: str, tolerance: float) 
     both = over.hit & plain.hit
     assert (over.status != hk.Status.OUT_OF_STEPS).all()
     assert np.quantile(np.abs(over.t - plain.t)[both], 0.99) < 2e-4
+
+
+ALONG = math.pi / 2 / math.sqrt(3)
+# Formulas that jump across a plane, its normal and its distance from the origin.
+JUMPS = {
+    "atan2": (lambda x, y, z: hk.atan2(x - y, -2.0 - x * x) + 0.1 * z, (1, -1, 0), 0.0),
+    "atan2 of y": ("atan2(y, x - 9)", (0, 1, 0), 0.0),
+    "sign": ("(x + y - 0.2) / abs(x + y - 0.2) + 2 + 0.1*z", (1, 1, 0), 0.1 * math.sqrt(2)),
+    "arc of pole": ("atan(1 / (x + 2*y + z)) + 0.01*x", (1, 2, 1), 0.0),
+    "inverse power": (lambda x, y, z: hk.tanh((x - y + 0.1 * z) ** -3.0), (1, -1, 0.1), 0.0),
+    "tangent": (lambda x, y, z: hk.atan(hk.tan(x + y + z)), (1, 1, 1), ALONG),
+    "logarithm": (
+        lambda x, y, z: hk.atan(hk.log(abs(x - y)) * (x - y) / abs(x - y)) + 5, (1, -1, 0), 0.0,
+    ),
+}  # fmt: skip
+
+
+def through(plane: tuple[float, float, float], offset: float) -> tuple[np.ndarray, ...]:
+    """Rays to points of a plane, and their lengths: they arrive there up to rounding."""
+    rng, normal = np.random.default_rng(5), np.array(plane) / np.linalg.norm(plane)
+    x = rng.uniform(-1, 1, (400, 3))
+    x -= ((x @ normal) - offset)[:, None] * normal
+    d = rng.normal(size=x.shape)
+    d /= np.linalg.norm(d, axis=1)[:, None]
+    t = 10 ** rng.uniform(-1, 0, len(x))
+    return x - t[:, None] * d, d, t
+
+
+@pytest.mark.few(3)
+@pytest.mark.parametrize("precision", ["single", "double"])
+@pytest.mark.parametrize("name", list(JUMPS))
+def test_no_ray_passes_a_jump(name: str, precision: str) -> None:
+    """Half of these rays were called misses behind the cut of atan2: its steps shrank to the
+    rounding of t, which led across."""
+    formula, plane, offset = JUMPS[name]
+    o, d, t = through(plane, offset)
+    solid = hk.solid(hk.expression(formula), below=0)
+    hits = hk.trace(solid, o, d, t_max=t + 0.2, precision=precision, max_steps=150)
+    assert (hits.status != hk.Status.MISS).all()
+    assert (hits.t <= t + 1e-5).all()
+
+
+RANGES = (
+    "quadratic-taylor", "linear-taylor", "segment", "bottom-up-linear", "bottom-up-quadratic",
+    "mixed", "affine", "interval",
+)  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [*RANGES, "union", "moved", "confirm"])
+def test_no_ray_passes_a_jump_by_any_proof(kind: str) -> None:
+    o, d, t = through((1, -1, 0), 0.0)
+    surface = hk.expression(JUMPS["atan2"][0])
+    settings = {}
+    if kind == "union":
+        surface = hk.solid(surface, below=0) | hk.Sphere(0.1).moved((50, 0, 0))
+    elif kind == "moved":
+        surface, o = hk.solid(surface, below=0).moved((0.3, 0.1, 0)), o + (0.3, 0.1, 0)
+    else:
+        settings = {"confirm": True} if kind == "confirm" else {"bound": kind}
+    for precision in ("single", "double"):
+        hits = hk.trace(
+            surface, o, d, t_max=t + 0.2, precision=precision, max_steps=150, **settings
+        )
+        assert (hits.status == hk.Status.OUT_OF_STEPS).all()
+        assert (hits.t <= t + 1e-5).all()
+
+
+def test_height_fields_stop_at_jumps() -> None:
+    o, d, t = through((1, -1, 0), 0.0)
+    domain = hk.geometry.Box((-5, -5, -20), (5, 5, 20))
+    field = hk.HeightField(lambda x, y: 10 * hk.atan(1 / (x - y)), domain=domain)
+    hits = hk.trace(field, o, d, t_max=t + 0.2, precision="single", max_steps=150)
+    assert (hits.status != hk.Status.MISS).all()

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import drjit as dr
@@ -36,12 +36,14 @@ class Function:
         are all numbers: f(s) = f(0) + s f'(r) does not hold across such a point.
     plain: the function of Dr.Jit numbers.
     numpy: the function of NumPy arrays and Python numbers.
+    has_pole: whether there is a point across which it is not continuous.
     """
 
     name: str
     ranges: Callable[[Interval], Ranges]
     plain: Callable[[Any], Any]
     numpy: Callable[[Any], Any]
+    has_pole: bool = field(default=False, kw_only=True)
 
     def __reduce__(self) -> str:
         # There is one of each name, in this module.
@@ -312,7 +314,10 @@ def power(n: float) -> Function:
                 defined = (x.low > 0) | (x.high < 0)
                 return _where(defined, (integer_power(one, -k), slope, second))
 
-            return Function(f"power {k}", inverse, lambda x: 1 / _repeated(x, -k), _numpy_power(k))
+            def of_inverse(x: Any) -> Any:
+                return 1 / _repeated(x, -k)
+
+            return Function(f"power {k}", inverse, of_inverse, _numpy_power(k), has_pole=True)
 
         def whole(x: Interval) -> Ranges:
             like = cast("Any", type(x.low))
@@ -335,7 +340,10 @@ def power(n: float) -> Function:
         defined = x.low >= 0 if n > 0 else x.low > 0
         return _where(defined, (_real_power(x, n), slope, second))
 
-    return Function(f"power {n}", real, lambda x: dr.power(fmax(x, 0), n), _numpy_power(n))
+    def of_positive(x: Any) -> Any:
+        return dr.power(fmax(x, 0), n)
+
+    return Function(f"power {n}", real, of_positive, _numpy_power(n), has_pole=n < 0)
 
 
 def _numpy_power(n: float) -> Callable[[Any], Any]:
@@ -363,12 +371,14 @@ def _real_power(x: Interval, n: float) -> Interval:
 
 
 exp = Function("exp", _exp, dr.exp, np.exp)
-log = Function("log", _log, dr.log, np.log)
+log = Function("log", _log, dr.log, np.log, has_pole=True)
 sqrt = Function("sqrt", _sqrt, dr.sqrt, np.sqrt)
-reciprocal = Function("reciprocal", _reciprocal, lambda x: 1 / x, lambda x: 1 / x)
+reciprocal = Function(
+    "reciprocal", _reciprocal, lambda x: 1 / x, lambda x: 1 / x, has_pole=True
+)
 sin = Function("sin", _sine, lambda x: sincos(x)[0], np.sin)
 cos = Function("cos", _cosine, lambda x: sincos(x)[1], np.cos)
-tan = Function("tan", _tan, lambda x: sincos(x)[0] / sincos(x)[1], np.tan)
+tan = Function("tan", _tan, lambda x: sincos(x)[0] / sincos(x)[1], np.tan, has_pole=True)
 tanh = Function("tanh", _tanh, _hyperbolic_tangent, np.tanh)
 atan = Function("atan", _atan, dr.atan, np.arctan)
 asin = Function("asin", _asin, dr.asin, np.arcsin)

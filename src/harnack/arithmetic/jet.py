@@ -17,7 +17,7 @@ import drjit as dr
 
 from harnack.arithmetic.angles import angle_range
 from harnack.arithmetic.functions import Function, exp, log, power, reciprocal, sqrt
-from harnack.arithmetic.interval import ONE, ZERO, Interval, select
+from harnack.arithmetic.interval import ONE, ZERO, Interval, select, unit_of
 from harnack.arithmetic.operators import Operators, exponent_of
 from harnack.backend.elementary import fmax, fmin
 
@@ -69,16 +69,30 @@ class Jet(Operators):
 
     @classmethod
     def along(
-        cls, p: Vec3, direction: Vec3, start: Real, end: Real, *, anchored: bool = True
+        cls,
+        p: Vec3,
+        direction: Vec3,
+        start: Real,
+        end: Real,
+        *,
+        anchored: bool = True,
+        is_rounded: bool = False,
     ) -> tuple[Jet, Jet, Jet]:
-        """The coordinates of p + s d as functions of s, start <= s <= end."""
+        """The coordinates of p + s d as functions of s, start <= s <= end.
+
+        is_rounded: whether the path leads through p up to the rounding of its coordinates alone:
+            ranges then hold for all paths that do, each along d.
+        """
 
         def coordinate(x: Real, slope: Real) -> Jet:
             rate = Interval.exactly(slope)
-            here = _moved(x, slope, start)
+            base = Interval.exactly(x)
+            if is_rounded:
+                base = base.widened(unit_of(x))
+            here = _moved(base, rate, start)
             first, second = (rate,), (ZERO,)
             anchor = Jet(here, first, second, width=0 * x) if anchored else None
-            return Jet(here.hull(_moved(x, slope, end)), first, second, anchor, end - start)
+            return Jet(here.hull(_moved(base, rate, end)), first, second, anchor, end - start)
 
         x, y, z = (coordinate(p[k], direction[k]) for k in range(3))
         return x, y, z
@@ -316,11 +330,11 @@ def spanned(slope: Interval, width: Real) -> Interval:
     return Interval(fmin(moved.low, 0.0), fmax(moved.high, 0.0))
 
 
-def _moved(x: Real, slope: Real, s: Real) -> Interval:
-    """x + slope s."""
+def _moved(base: Interval, rate: Interval, s: Real) -> Interval:
+    """base + rate s."""
     if isinstance(s, float) and s == 0.0:
-        return Interval.exactly(x)
-    return Interval.exactly(x) + Interval.exactly(slope) * Interval.exactly(s)
+        return base
+    return base + rate * Interval.exactly(s)
 
 
 _Partials = tuple[Any, Any, Any]

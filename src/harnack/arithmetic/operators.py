@@ -1,6 +1,6 @@
 """Operators that numbers of every arithmetic share, so that any of them can evaluate a formula.
 
-`operations_of` estimates the size of a formula's kernel before it is recorded.
+`tally_of` estimates the size of a formula's kernel before it is recorded, and whether it may jump.
 """
 
 from __future__ import annotations
@@ -253,14 +253,23 @@ def exponent_of(n: Any) -> float:
 _SUM, _PRODUCT, _FUNCTION = 60, 220, 300
 
 
-@dataclass(frozen=True, eq=False)
-class Counted(Operators):
-    """A number that counts operations.
+@dataclass(eq=False)
+class Tally:
+    """What numbers of a formula have been through.
 
-    tally: a list of one entry, the count, which all numbers of a formula share.
+    operations: how many operations of Dr.Jit their ranges take, about.
+    may_jump: whether a function was used that is not continuous everywhere.
     """
 
-    tally: list[int]
+    operations: int = 0
+    may_jump: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Counted(Operators):
+    """A number that counts operations, in a tally that all numbers of a formula share."""
+
+    tally: Tally
 
     def constant(self, x: Any) -> Counted:
         del x
@@ -278,12 +287,12 @@ class Counted(Operators):
         return self
 
     def __pow__(self, exponent: Any) -> Counted:
-        del exponent
-        return self._spending(_FUNCTION)
+        # Other exponents than numbers are those of exp(exponent log(x)).
+        is_power = not isinstance(exponent, Counted) and exponent_of(exponent) >= 0
+        return self._spending(_FUNCTION, may_jump=not is_power)
 
-    def apply(self, function: Any) -> Counted:
-        del function
-        return self._spending(_FUNCTION)
+    def apply(self, function: Function) -> Counted:
+        return self._spending(_FUNCTION, may_jump=function.has_pole)
 
     def larger(self, other: Any) -> Counted:
         del other
@@ -291,19 +300,21 @@ class Counted(Operators):
 
     def angle(self, x: Any) -> Counted:
         del x
-        return self._spending(_FUNCTION + _PRODUCT)
+        return self._spending(_FUNCTION + _PRODUCT, may_jump=True)
 
-    def _spending(self, operations: int) -> Counted:
-        self.tally[0] += operations
+    def _spending(self, operations: int, *, may_jump: bool = False) -> Counted:
+        self.tally.operations += operations
+        self.tally.may_jump |= may_jump
         return self
 
 
-def operations_of(formula: Callable[[Any, Any, Any], Any]) -> int:
-    """About how many operations the ranges of a formula of three coordinates take; 0 for a formula
-    that does not accept numbers of this kind."""
-    number = Counted([0])
+def tally_of(formula: Callable[[Any, Any, Any], Any]) -> Tally:
+    """What a formula of three coordinates takes; no operations, and a formula that may jump, where
+    it does not accept numbers of this kind."""
+    tally = Tally()
+    number = Counted(tally)
     try:
         formula(number, number, number)
     except (TypeError, AttributeError):
-        return 0
-    return number.tally[0]
+        return Tally(may_jump=True)
+    return tally

@@ -22,17 +22,18 @@ import drjit as dr
 
 from harnack.arithmetic import Interval, Jet
 from harnack.arithmetic.jet import Dual
-from harnack.arithmetic.operators import Operators, operations_of
+from harnack.arithmetic.operators import Operators, tally_of
 from harnack.backend import choose_backend
 from harnack.backend.elementary import fmin, largest_coordinate, length
 from harnack.enclosures import Lipschitz, Slopes
 from harnack.enclosures.enclosure import Piece
 from harnack.enclosures.parabola import Tangent
+from harnack.enclosures.pieces import Pieces
 from harnack.fields.field import Field
 from harnack.fields.look import Look, Path, Sample
 
 if TYPE_CHECKING:
-    from harnack.backend import Backend, Real, Vec3
+    from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.enclosures import Promise
 
 
@@ -43,6 +44,8 @@ _RADII, _LARGEST_RADIUS = (0.25, 1.0, 4.0), 1e12
 _BESIDE, _ASIDE = 64.0, (0.31, 0.19, 0.13)
 # Where the gradient is known up to so many roundings there is no tie.
 _TIE = 1024.0
+# Where a formula may jump, pieces begin so many roundings of t before the point.
+_ROUNDINGS = 8.0
 # A compilation that will take so many seconds is announced by a warning.
 _LONG = 10.0
 
@@ -163,7 +166,15 @@ class Formula(Field):
         return sample.gradient_error, hessian_error(self._jet(Jet.at_point(p, order=2), p.x), p.x)
 
     def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
-        """The sample, and the enclosures that its ranges prove; looking back nothing is proved."""
+        """The sample, and the enclosures that its ranges prove; looking back nothing is proved.
+
+        Proof that no jump of f is passed, given that ranges of f' are all numbers on a piece with a
+        jump. A march steps to t + s rounded, which may lie behind the s that was proved, and looks
+        on from a point that is rounded again: a jump between would be seen from neither. So where
+        f may jump, the piece begins before t, by more than the rounding of t, and is of all paths
+        that lead through the point up to its rounding (`FormulaAlong.rounded`). The exact path up
+        to t + s then lies in such pieces altogether, and they have no jump.
+        """
         del back
         p = path.point(t)
         jet = self._jet(Jet.at_point(p), p.x)
@@ -171,9 +182,14 @@ class Formula(Field):
         slope, slope_error = self._slope(p, path.direction)
         slopes = Slopes.around(slope, slope_error)
         function = self.restricted(p, path.direction)
+        if self.may_jump:
+            function = function.rounded(t)
         enclosures = path.proofs.along(function, slopes, ahead)
         if not enclosures:
             return path.look(sample)
+        if self.may_jump and not all(isinstance(one, Pieces) for one in enclosures):
+            ahead = dr.select(function.is_continuous(ahead), ahead, 0)
+            enclosures = path.proofs.along(function, slopes, ahead)
         growth = max(one.growth for one in enclosures)
         if self.is_convex and Tangent in path.proofs.kinds:
             enclosures = (*enclosures, Tangent(slopes))
@@ -191,6 +207,12 @@ class Formula(Field):
         )
         (slope,) = self._jet((x, y, z), p.x).first
         return zero + slope.middle, zero + slope.radius
+
+    @property
+    def may_jump(self) -> bool:
+        """Whether the formula has functions in it that are not continuous everywhere, or refuses
+        numbers that would tell."""
+        return tally_of(self.formula).may_jump
 
     def restricted(self, p: Vec3, direction: Vec3) -> FormulaAlong:
         """The field along the path from p, for enclosures."""
@@ -221,7 +243,7 @@ def warn_of_price(field: Formula) -> None:
     """Warn if compiling will take long. LLVM took 0.9 s for 11,000 operations on an idle core, 2.7
     s for 32,000, 7.4 s for 53,000 and 30 s for 100,000: the time grows about as their number to the
     power 2.2."""
-    operations = operations_of(field.formula)
+    operations = tally_of(field.formula).operations
     seconds = 30 * (operations / 1e5) ** 2.2
     if seconds > _LONG:
         warnings.warn(
@@ -265,14 +287,30 @@ def as_jet(value: Any, like: Jet, name: str) -> Jet:
 
 @dataclass(frozen=True)
 class FormulaAlong:
-    """A formula along the path p + s d."""
+    """A formula along the path p + s d.
+
+    before: how far before p its first piece begins. If that is not 0.0, its pieces are of all paths
+        that lead through p up to rounding.
+    """
 
     field: Formula
     p: Vec3
     direction: Vec3
+    before: Real = 0.0
     # Ranges of a formula cost as much as its value: one piece takes the least time, four pieces
     # take two thirds of the samples and twice the time.
     piece_count: int = 1
+
+    def rounded(self, t: Real) -> FormulaAlong:
+        """The formula along all paths that lead through p up to its rounding, from a little before
+        p: by more than the rounding of t, of which p is the point."""
+        before = _ROUNDINGS * float(dr.epsilon(type(t))) * dr.abs(t)
+        return dataclasses.replace(self, before=before)
+
+    def is_continuous(self, length: Real) -> Mask:
+        """Whether f is known to be continuous for 0 <= s <= length, as its slopes are bounded."""
+        slopes = self._jet(0.0, length).first[0]
+        return dr.isfinite(0 * length + slopes.low) & dr.isfinite(0 * length + slopes.high)
 
     def pieces(self, knots: Sequence[Real]) -> tuple[Piece, ...]:
         """See `harnack.enclosures.Restriction`."""
@@ -285,8 +323,7 @@ class FormulaAlong:
         return x.constant(float(value)) if isinstance(value, int | float) else value
 
     def _piece(self, start: Real, end: Real) -> Piece:
-        coordinates = Jet.along(self.p, self.direction, start, end)
-        jet = as_jet(self.field.formula(*coordinates), coordinates[0], type(self.field).__name__)
+        jet = self._jet(start, end)
         (slopes,), (curvatures,) = jet.first, jet.second
         zero = 0 * self.p.x
         return Piece(
@@ -295,6 +332,13 @@ class FormulaAlong:
             zero + curvatures.low,
             zero + curvatures.high,
         )
+
+    def _jet(self, start: Real, end: Real) -> Jet:
+        is_exact = isinstance(self.before, float) and self.before == 0.0
+        if not is_exact and isinstance(start, float):  # the first piece starts at 0.0
+            start = -self.before
+        coordinates = Jet.along(self.p, self.direction, start, end, is_rounded=not is_exact)
+        return as_jet(self.field.formula(*coordinates), coordinates[0], type(self.field).__name__)
 
 
 def prepared_numbers(field: Any, backend: Backend) -> Any:

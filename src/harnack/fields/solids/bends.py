@@ -13,6 +13,7 @@ import drjit as dr
 import numpy as np
 
 from harnack.arithmetic import cos, maximum, minimum, sin
+from harnack.arithmetic.operators import tally_of
 from harnack.backend.elementary import fmax, fmin
 from harnack.enclosures import Lipschitz, Promise
 from harnack.fields.field import Field
@@ -78,6 +79,11 @@ class Bent(Shape):
             object.__setattr__(self, "domain", domain)
         waves = self.inner.wavelength
         object.__setattr__(self, "wavelength", None if waves is None else waves * self.map.least)
+
+    @property
+    def may_jump(self) -> bool:
+        """Whether the solid's formula may: maps are continuous."""
+        return tally_of(self.inner.formula).may_jump
 
     def promises(self, p: Vec3) -> tuple[Promise, ...]:
         """The Lipschitz constant of the solid times that of the map on a ball about p."""

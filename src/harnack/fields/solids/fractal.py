@@ -200,6 +200,11 @@ class FractalNoise(Shape):
         made = self if hasattr(self, "_falls") else self.prepare(backend_of(like))
         return vars(made)
 
+    @property
+    def may_jump(self) -> bool:
+        """Noise is continuous."""
+        return False
+
     def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         del level, above
         return None
@@ -317,6 +322,11 @@ class Displaced(Shape):
     def lipschitz(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
         one, two = self.solid.lipschitz, self.noise.lipschitz
         return None if one is None else one + two
+
+    @property
+    def may_jump(self) -> bool:
+        """Whether the shape's function may: noise is continuous."""
+        return self.solid.may_jump
 
     def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         if not isinstance(self.solid, Shape):
