@@ -102,7 +102,7 @@ def test_no_ray_passes_a_jump_by_any_proof(kind: str) -> None:
     if kind == "union":
         surface = hk.solid(surface, below=0) | hk.Sphere(0.1).moved((50, 0, 0))
     elif kind == "moved":
-        surface, o = hk.solid(surface, below=0).moved((0.3, 0.1, 0)), o + (0.3, 0.1, 0)
+        surface, o = hk.solid(surface, below=0).moved((0.3, 0.1, 0)), np.add(o, (0.3, 0.1, 0))
     else:
         settings = {"confirm": True} if kind == "confirm" else {"bound": kind}
     for precision in ("single", "double"):

@@ -373,9 +373,7 @@ def _real_power(x: Interval, n: float) -> Interval:
 exp = Function("exp", _exp, dr.exp, np.exp)
 log = Function("log", _log, dr.log, np.log, has_pole=True)
 sqrt = Function("sqrt", _sqrt, dr.sqrt, np.sqrt)
-reciprocal = Function(
-    "reciprocal", _reciprocal, lambda x: 1 / x, lambda x: 1 / x, has_pole=True
-)
+reciprocal = Function("reciprocal", _reciprocal, lambda x: 1 / x, lambda x: 1 / x, has_pole=True)
 sin = Function("sin", _sine, lambda x: sincos(x)[0], np.sin)
 cos = Function("cos", _cosine, lambda x: sincos(x)[1], np.cos)
 tan = Function("tan", _tan, lambda x: sincos(x)[0] / sincos(x)[1], np.tan, has_pole=True)
