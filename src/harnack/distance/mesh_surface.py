@@ -48,22 +48,26 @@ class MeshSurface:
     @classmethod
     def of(cls, surface: LevelSet) -> MeshSurface | None:
         """Of the winding number of a mesh that nothing clips; else None. Of a mesh that is not
-        closed, those triangles that are proved to belong to the surface as a whole."""
+        closed, those triangles that are proved to belong to the surface as a whole; or all, if the
+        surface is nothing else."""
         mesh = surface.field.mesh_of_sheets()
         if mesh is None or surface.cut is not None or surface.field.domain is not None:
             return None
-        vertices, faces, is_closed = mesh
+        vertices, faces, is_all = mesh
+        only_sheets = surface.field.is_of_sheets_alone(surface.numbers)
         low, high = vertices[faces].min(axis=(0, 1)), vertices[faces].max(axis=(0, 1))
         size = float(2.0 ** np.ceil(np.log2(0.5 * (high - low).max())))
         center = single(0.5 * (low + high))
         unit = (vertices - center) / size
+        if only_sheets:
+            return cls(unit[faces], center, size, True)
         rays = _tree(choose_backend("double"), unit, faces)
         pieces = pieces_of_faces(rays, unit, faces)
-        if is_closed:
+        if is_all:
             on = on_level(rays, pieces, surface.numbers)
         else:
             on = _proved_on_level(surface, center + size * pieces, size)
-        return cls(pieces[on], center, size, is_closed)
+        return cls(pieces[on], center, size, is_all)
 
     def upload(self, backend: Backend) -> Callable[[Vec3], Vec3]:
         """A function that gives the way from points to the nearest; NaN if there are none."""

@@ -107,6 +107,15 @@ class Sheets:
         modulo 1, f lies between the same two of these levels, modulo 1, as 0 does."""
         return False
 
+    def is_of_sheets_alone(self, levels: tuple[float, ...]) -> bool:
+        """Whether the surface of these levels is all of the sheets and nothing else. `for_levels`
+        then gives a field that shows rays the levels at every sheet, and nowhere else."""
+        del levels
+        return False
+
+    only_sheets: bool = False
+    """Whether this field is such a one."""
+
     def smooth_part(self) -> Field | None:
         """A field without sheets whose level sets hold all points of this one's that lie on no
         sheet; None where none is known. Distances use it."""

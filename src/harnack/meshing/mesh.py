@@ -13,6 +13,7 @@ from harnack.fields import Field, Solid
 from harnack.fields.field import check_is_field
 from harnack.fields.solid_angles.dipole import DipolePotential
 from harnack.fields.solid_angles.solid_angle import SolidAngle
+from harnack.fields.solid_angles.winding_number import WindingNumber
 from harnack.geometry import Box, Intersection, Volume
 from harnack.geometry.volume import check_volume
 from harnack.meshing.by_signs import MOST_FAR, SMALLER, signed_surface
@@ -87,7 +88,9 @@ def mesh(
     `ScreenedWindingNumber`, `Morph`, `HRBF`, `Blobs`) are meshed by the signs of their values alone
     (`meshing.by_signs`), which gives a closed surface whatever the mesh or the cloud is. Vertices
     lie where edges of the cells meet the level, so on the very triangles of a sound mesh; parts
-    that are nearer to each other than a cell may be joined, or missed.
+    that are nearer to each other than a cell may be joined, or missed. Of a mesh that is its own
+    spanning surface (`WindingNumber`), such as a file of a `SolidAngle`'s, the triangles are kept
+    as they are.
 
     field: a `SolidAngle` of polygons, a real-valued field that is continuous, or one of those; or a
         `LevelSet` of one level or a solid, whose level, clip, section, solid and largest are used
@@ -145,6 +148,7 @@ def mesh(
             of how many, and a distance within which all are, sampled up to a factor of 2;
         undecided: at how many points of the lattice the error of f leaves its sign open;
         flat: how many triangles were not fitted to creases, as they would pass through others;
+        Where the triangles of a mesh were kept, made_by is "faces", and there is none of this.
         cloud: of a `DipolePotential`, what it says of itself (`describe`), such as how many points
             it has, what was estimated, and the smoothing and noise that were chosen and found.
 
@@ -264,6 +268,8 @@ def _by_signs(
         field.check_levels((level,))
         ends = level, math.inf
     levels = tuple(one for one in ends if math.isfinite(one))
+    if isinstance(field, WindingNumber) and field.is_of_sheets_alone(levels):
+        return _faces_alone(field, levels[0], solid, asked)
     volume, box = asked.volume, _box(field, levels, asked.volume)
     size = float((box.upper - box.lower).max())
     cells, attempts = size / _ACROSS_BY_SIGNS, _ATTEMPTS_BY_SIGNS
@@ -327,6 +333,34 @@ def _by_signs(
         known["cloud"] = field.describe()
     _judge_signs(field, known, asked.tolerance * size)
     return _Made(made, size, known, function(levels[0], 1.0), _nothing, is_apart)
+
+
+def _faces_alone(
+    field: WindingNumber,
+    level: float,
+    solid: tuple[float, float] | bool | None,
+    asked: _Asked,
+) -> _Made:
+    """The triangles of a mesh that is its own surface, as they are, but for what the volume cuts.
+
+    Raises:
+        MeshingError: it is to be closed; nothing is left.
+    """
+    if solid:
+        raise MeshingError(
+            "this mesh is a sheet that lies on its own spanning surface, so that nothing is inside "
+            "of it: mesh the SolidAngle of its boundary with thickness=..."
+        )
+    vertices, faces = field.mesh.vertices, field.mesh.faces
+    size = float(np.ptp(vertices[faces].reshape(-1, 3), axis=0).max())
+    made = Surface.of(vertices, faces)
+    if asked.volume is not None:
+        made = cut_by(made, asked.volume)
+    if not len(made.faces):
+        raise MeshingError("the level set is empty: it lies outside of the clip")
+    known = {"level": level, "made_by": "faces", "spacing": math.nan, "evaluations": 0}
+    function = LevelFunction(field, level, most_faces=asked.most_faces)
+    return _Made(made, size, known, function, _nothing, False)
 
 
 def _check_has_thickness(

@@ -115,7 +115,10 @@ def find_crossings(
             after, sheet = tracer.end_of(walk)
         contact = after.contact
         assert contact is not None
-        found = now.active & (after.status == int(Status.HIT))
+        ended = now.active & (after.status == int(Status.HIT))
+        found = ended
+        if sheet is not None and prepared.field.only_sheets:
+            found = ended & (sheet != NO_SHEET)
         slot = place + now.count
         dr.scatter(t, contact.root, slot, found)
         dr.scatter(side, contact.side, slot, found)
@@ -125,7 +128,7 @@ def find_crossings(
         if sheet is not None:
             dr.scatter(sheets, sheet, slot, found)
         crossings = now.count + dr.select(found, count(1), 0)
-        more = found & (crossings < k)
+        more = ended & (crossings < k)
         status = dr.select(more, count(int(Status.MISS)), after.status)
         if now.sheets is None:
             undecided = after.proved_to + after.proved_step < end

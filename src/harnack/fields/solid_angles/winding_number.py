@@ -22,6 +22,7 @@ import numpy.typing as npt
 from harnack.backend import FloatArray, IntArray, backend_of
 from harnack.backend.elementary import fmax
 from harnack.cluster.packing import Remembered
+from harnack.enclosures import Lipschitz
 from harnack.fields.batch import BatchedField, Values
 from harnack.fields.clearance import (
     UnitCoordinates,
@@ -35,6 +36,7 @@ from harnack.fields.field import AtDetail, Field, Sample, lengthened
 from harnack.fields.sheets import NO_SHEET, Crossing, NearestSheet
 from harnack.fields.solid_angles.boundary_cells import BoundaryCells
 from harnack.fields.solid_angles.cell_choice import Cells, HasCells
+from harnack.fields.solid_angles.own_sheet import lies_on_own_level
 from harnack.fields.solid_angles.winding_exact import ExactWinding
 from harnack.fields.solid_angles.winding_mesh import WindingMesh
 from harnack.fields.solid_angles.winding_tree import TreeWinding
@@ -206,6 +208,13 @@ class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
         which pays from some 2,000 points a triangle on; all other values and derivatives at points
         are those of `method`.
 
+    A mesh that lies on its own spanning surface, such as a file that `mesh` wrote of a
+    `SolidAngle`, or any that is flat, has the level right beside all of its triangles, where
+    rounding decides on which side. Then the surface is the mesh itself, every triangle and nothing
+    else: so it is traced, meshed and measured, while values stay what they are (`own_sheet`). Other
+    open sheets have the level where they lie before the surface that spans their boundary, and not
+    where they lie behind it.
+
     Hits on triangles have `Hits.sheet`; `faces_of_sheets` gives the face of each. `moved` gives the
     field for the same faces when vertices have moved.
 
@@ -243,6 +252,8 @@ class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
         self.set_cells(cells)
         self._extents: Remembered[tuple[float, ...], Volume | None] = Remembered()
         self._occupied: Remembered[tuple[float, ...], OccupiedCells] = Remembered()
+        self._own_levels: Remembered[tuple[float, ...], bool] = Remembered()
+        self._level_of_sheets = 0.0
 
     def moved(self, vertices: Any) -> WindingNumber:
         """The winding number of the same faces with other positions of their vertices (n, 3), for
@@ -258,6 +269,7 @@ class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
         field._mesh = self.mesh.moved(vertices)
         field._batches, field._device = Remembered(), None
         field._extents, field._occupied = Remembered(), Remembered()
+        field._own_levels = Remembered()
         field.set_cells(self.cells)
         return field
 
@@ -352,7 +364,7 @@ class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
     def occupied(self, levels: tuple[float, ...]) -> OccupiedCells | None:
         """Cells by `winding_cells`, if edges are not few, for the exact method or by cells."""
         few = len(self.mesh.singular) < _FEW_EDGES
-        if few or (self.method != "exact" and not self.cells):
+        if few or self.is_of_sheets_alone(levels) or (self.method != "exact" and not self.cells):
             return None
         extent = self.extent(levels)
         if extent is None:
@@ -404,11 +416,28 @@ class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
 
     def offset(self, o: Vec3, d: Vec3, t_min: Real, active: Mask) -> Real:
         on = self._on(o)
+        if self.only_sheets:
+            return on.backend.Float(0)
         frame = Frame.along(on.backend, on.unit(o), d)
         return on.winding.start(frame, t_min / on.size, active)
 
+    def is_of_sheets_alone(self, levels: tuple[float, ...]) -> bool:
+        if len(levels) != 1:
+            return False
+        if levels not in self._own_levels:
+            self._own_levels[levels] = lies_on_own_level(self.mesh, levels[0])
+        return self._own_levels[levels]
+
+    def for_levels(self, levels: tuple[float, ...]) -> WindingNumber:
+        if not self.is_of_sheets_alone(levels):
+            return self
+        field = self.having_cells(False)
+        field.only_sheets, field._level_of_sheets = True, levels[0]
+        return field
+
     def between(self, o: Vec3, d: Vec3, behind: Crossing, ahead: Crossing, offset: Real) -> Field:
-        del ahead
+        if self.only_sheets:
+            return _BesideSheets(self._on(o).backend, self._level_of_sheets, behind, ahead)
         on = self._on(o)
         frame = Frame.along(on.backend, on.unit(o), d)
         start = Crossing(behind.t / on.size, behind.sheet, behind.jump, behind.normal)
@@ -510,3 +539,17 @@ class _Stretch(Field):
         sample = on.winding.on_stretch(frame, x, self._behind, self._offset, detail, ~inside)
         sample = dataclasses.replace(sample.where(inside, in_cells), is_modulo=inside)
         return lengthened(sample, on.size)
+
+
+class _BesideSheets(Field):
+    """On a ray interval of a mesh that is the surface as a whole: constant, and so far from the
+    level that it passes it where it jumps at the sheet ahead; or where none is ahead, as the sheet
+    behind has left it."""
+
+    def __init__(self, backend: Backend, level: float, behind: Crossing, ahead: Crossing) -> None:
+        real = backend.Float
+        jump = dr.select(real(ahead.jump) != 0, -real(ahead.jump), real(behind.jump))
+        self._value = dr.select(jump > 0, real(level + 0.5), level - 0.5)
+
+    def evaluate(self, p: Vec3) -> Sample:
+        return Sample(self._value, 0 * p, (Lipschitz(0.0),), 0.0)

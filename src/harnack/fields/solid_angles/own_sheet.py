@@ -1,0 +1,106 @@
+"""Open meshes that lie on the level set of their own winding number, such as a file that `mesh`
+wrote of a `SolidAngle`.
+
+Off its triangles the winding number w of a mesh is, modulo 1, the solid angle of its boundary over
+4 pi, and the level set of that spans the boundary. Where the triangles themselves lie on it, w has
+the level right beside all of them: on which side of it w is there, and so whether w passes the
+level where it jumps, is a matter of rounding, or of how far a flat triangle is from a round
+surface. What has the level is then a checkerboard; but within the coarseness of the triangles it is
+the mesh itself.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from harnack.backend import FloatArray
+
+if TYPE_CHECKING:
+    from harnack.fields.solid_angles.winding_mesh import WindingMesh
+
+__all__ = ["lies_on_own_level"]
+
+# Of the mesh's size: vertices are on the surface within this, the rounding of single precision and
+# of decimals in files. A box of this height without a bottom is such a sheet.
+_ON_SURFACE = 1e-5
+# Centers of triangles are within this part of the longest edge; those that `mesh` makes within a
+# twentieth.
+_FLAT = 0.1
+# Of so many vertices and centers, this part have to be so; the first decides most meshes.
+_MOST, _NEARLY_ALL, _FIRST = 400, 0.99, 1
+# So many points are compared with the sum over all triangles, within this part of a turn.
+_COUNTED, _SAME = 8, 0.25
+_AT_ONCE = 1 << 20
+# The apex of all edges' triangles; any direction that edges are not likely to have.
+_APEX = np.array([0.3017, 0.5043, 0.8091]) / math.sqrt(0.3017**2 + 0.5043**2 + 0.8091**2)
+
+
+def lies_on_own_level(mesh: WindingMesh, level: float) -> bool:
+    """Whether the triangles of an open mesh lie on the surface that spans its boundary, with this
+    level of w modulo 1, and are the points at which w jumps from the level by one.
+
+    Looked at and not proved: vertices that are not on the boundary, or if there are none the
+    centers of triangles, are on that surface within the rounding of files, in first order, but for
+    one in a hundred; centers within a part of the triangles' edges. Then it is all of the surface:
+    of each edge of the boundary, which is that of one triangle, one sheet of it begins, and every
+    part of it ends there (a harmonic function has no closed level set but about its poles).
+    """
+    if not len(mesh.singular) or (mesh.multiplicity != 1).any():
+        return False
+    inner = np.zeros(len(mesh.vertices), np.bool_)
+    inner[mesh.faces] = True
+    inner[mesh.singular] = False
+    x = mesh.unit_vertices
+    edges = x[mesh.singular]
+    corners = mesh.corners
+    points = x[inner] if inner.any() else corners.mean(axis=1)
+    points = _some(points, _MOST)
+    on_surface = 2 * _ON_SURFACE  # in units in which the mesh has a size of one to two
+    if not (_distances(edges, points[:_FIRST], level) < on_surface).all():
+        return False
+    if np.mean(_distances(edges, points, level) < on_surface) < _NEARLY_ALL:
+        return False
+    corners = _some(corners, _MOST)
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+    far = _distances(edges, corners.mean(axis=1), level)
+    if np.mean(far < _FLAT * longest) < _NEARLY_ALL:
+        return False
+    # The mean of w on both sides, which are the level and one more or less than it.
+    mean = np.array([_mean_winding(mesh.corners, one) for one in _some(points, _COUNTED)])
+    return any(bool((np.abs(mean - level - way) < _SAME).all()) for way in (-0.5, 0.5))
+
+
+def _some(rows: FloatArray, most: int) -> FloatArray:
+    """At most so many rows, from all over."""
+    return rows[:: -(-len(rows) // most)]
+
+
+def _distances(edges: FloatArray, points: FloatArray, level: float) -> FloatArray:
+    """(n,) how far points are from the surface that spans closed edges (k, 2, 3), by the slope of
+    their solid angle: the sum of those of triangles from each edge to an apex far away."""
+    found: list[FloatArray] = []
+    step = max(1, _AT_ONCE // len(edges))
+    for first in range(0, len(points), step):
+        p, q = (edges[None, :, k] - points[first : first + step, None] for k in (0, 1))
+        a, b = np.linalg.norm(p, axis=2), np.linalg.norm(q, axis=2)
+        normal, cosine = np.cross(p, q), a * b + (p * q).sum(axis=2)
+        turn = 2 * np.arctan2(normal @ _APEX, cosine + b * (p @ _APEX) + a * (q @ _APEX))
+        with np.errstate(divide="ignore", invalid="ignore"):  # on an edge it has no slope
+            rates = ((a + b) / (a * b * cosine))[:, :, None] * normal
+        gap = turn.sum(axis=1) / (4 * math.pi) - level
+        slope = np.linalg.norm(rates.sum(axis=1), axis=1) / (4 * math.pi)
+        found.append(np.abs(gap - np.round(gap)) / np.maximum(slope, 1e-300))
+    return np.concatenate(found)
+
+
+def _mean_winding(corners: FloatArray, point: FloatArray) -> float:
+    """The mean of the winding numbers on both sides of a mesh (m, 3, 3) at a point of it, by the
+    solid angles of all triangles but those that it lies on (Van Oosterom and Strackee 1983)."""
+    a, b, c = (corners[:, k] - point for k in range(3))
+    x, y, z = (np.linalg.norm(one, axis=1) for one in (a, b, c))
+    below = x * y * z + (a * b).sum(axis=1) * z + (b * c).sum(axis=1) * x + (c * a).sum(axis=1) * y
+    half = np.arctan2((a * np.cross(b, c)).sum(axis=1), below)
+    return float(half[np.abs(half) < math.pi - _ON_SURFACE].sum()) / (2 * math.pi)
