@@ -31,7 +31,6 @@ from harnack.geometry.chains import (
     OpenChainError,
     boundary_edges,
     join,
-    net_faces,
     singular_edges,
     singular_loops,
     weld_vertices,
@@ -40,6 +39,7 @@ from harnack.geometry.clouds import CloudError, checked_normals, checked_points
 from harnack.geometry.curves import CurveError, validate_loops
 from harnack.geometry.meshes import MeshError, without_zero_area_faces, zero_area_faces
 from harnack.geometry.polygons import triangulate
+from harnack.geometry.welding import Welded
 from harnack.names import did_you_mean
 
 __all__ = [
@@ -178,12 +178,14 @@ SURFACE_FILES = (*_READERS, ".loops", ".blobs", *MOLECULE_FILES)
 @dataclass(frozen=True, eq=False)
 class Mesh:
     """Triangles from a file, as `validate_mesh` returns them. said: what was found, and why. flat:
-    (k, 3) faces of zero area, left out of `faces`, which may close gaps without a width."""
+    (k, 3) faces of zero area, left out of `faces`, which may close gaps without a width. rounded:
+    how many corners were moved to others, from which they were apart by rounding."""
 
     vertices: FloatArray
     faces: IntArray
     said: str
     flat: IntArray
+    rounded: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -341,10 +343,10 @@ def _mesh(contents: Contents) -> Mesh:
     found = triangulate(contents.vertices, contents.faces.corners, contents.faces.sizes)
     vertices, faces = without_zero_area_faces(contents.vertices, found)
     flat = found[zero_area_faces(vertices, found)]
-    net = net_faces(weld_vertices(vertices)[faces])
+    welded = Welded.of(vertices, faces)
+    net, edges = welded.net, welded.edges
     if not len(net.faces):
         raise MeshError(f"its {len(faces):,} faces cancel each other: there is no surface")
-    edges, _ = singular_edges(net.faces, net.multiplicity)
     count = f"{len(faces):,} triangles"
     if len(edges) == 0:
         said = f"{count} without singular edges: a closed mesh"
@@ -355,13 +357,16 @@ def _mesh(contents: Contents) -> Mesh:
         said = f"{count}, {len(edges):,} singular edges: a triangle soup"
     else:
         said = f"{count}, {len(edges):,} singular edges: a mesh with holes or faces turned round"
+    if welded.rounded:
+        vertices = vertices[welded.index]
+        said += f"; {welded.rounded:,} corners joined with others that were apart by rounding"
     if len(found) > len(faces):
         said += f"; {len(found) - len(faces):,} of zero area left out"
     if len(faces) > len(net.faces):
         said += f"; {len(faces) - len(net.faces):,} are added to or canceled by others"
     if len(contents.polylines):
         said += "; polylines not used"
-    return Mesh(vertices, faces, said, flat)
+    return Mesh(vertices, faces, said, flat, welded.rounded)
 
 
 def _centers(mesh: Mesh) -> Cloud:

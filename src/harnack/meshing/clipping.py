@@ -25,6 +25,7 @@ __all__ = [
     "largest_part",
     "parts_of",
     "turned_outwards",
+    "winding_around",
     "without_films",
 ]
 
@@ -139,7 +140,7 @@ class Shells:
     def turns(self, around: Any, part: Any) -> float:
         """How often a part winds around another one, at a point of it."""
         point = self.corners[np.argmax(self.number == part)].mean(axis=0)
-        return _winding(self.corners[self.number == around], point)
+        return winding_around(self.corners[self.number == around], point)
 
     def depths(self) -> IntArray:
         """(k,) how often all other parts wind around each, at a point of it: more than 0 where it
@@ -166,7 +167,7 @@ def _parts(surface: Surface) -> IntArray:
     return np.asarray(csgraph.connected_components(joined, directed=False)[1])[faces[:, 0]]
 
 
-def _winding(corner: FloatArray, point: FloatArray) -> float:
+def winding_around(corner: FloatArray, point: FloatArray) -> float:
     """The winding number around a point of triangles (m, 3, 3), by their solid angles (Van Oosterom
     and Strackee 1983)."""
     a, b, c = (corner[:, k] - point for k in range(3))

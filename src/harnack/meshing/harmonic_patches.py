@@ -42,8 +42,9 @@ __all__ = ["Asked", "HarmonicPatches", "harmonic_patches", "missing_triangles", 
 _LEVEL = 2 * math.pi
 # Cells across the holes at first.
 _ACROSS = 24
-# How often edges of holes that are too near to others are halved for the tetrahedra.
-_MOST_CUTS = 12
+# How often edges of holes that are too near to others are halved for the tetrahedra; but not to
+# more pieces than that, and so many for each edge: as many are cut where edges lie on each other.
+_MOST_CUTS, _MOST_PIECES, _MOST_PER_EDGE = 12, 20_000, 64
 # How often patches that meet the mesh are made again, of smaller cells.
 _MOST_MET = 1
 # How far w may be from 1/2, modulo 1, at vertices of patches.
@@ -247,6 +248,12 @@ def _patches(
         lacks = ~tets.has_edges(cut.edges)
         if not lacks.any():
             break
+        if len(cut.edges) > min(_MOST_PIECES, _MOST_PER_EDGE * len(edges)):
+            raise TooLargeError(
+                f"{len(edges):,} boundary edges of the mesh lie on others or next to them: cut to "
+                f"{len(cut.edges):,} pieces some are still too near to others for a patch that "
+                "ends at them; join or remove the triangles there"
+            )
         middles = np.concatenate([middles, cut.edges[lacks]])
         cut = cut.split(lacks)
         points = place_points(function, root, cut, None, seed, finer)

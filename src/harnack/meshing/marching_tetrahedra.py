@@ -83,6 +83,9 @@ def delaunay(points: FloatArray) -> Tetrahedra:
 
     Eight points far away are added and left out again with their tetrahedra: Qhull takes long over
     a hull that is flat.
+
+    Raises:
+        MeshingError: points are too near to each other, for their distance.
     """
     import scipy.spatial  # here: half a second that few need
 
@@ -93,7 +96,13 @@ def delaunay(points: FloatArray) -> Tetrahedra:
     n = len(points)
     # About the middle, so that Qhull does not round far from the origin.
     together = np.concatenate([points - middle, 20 * size * around])
-    corners: IntArray = qhull.Delaunay(together).simplices.astype(np.int64)
+    try:
+        corners: IntArray = qhull.Delaunay(together).simplices.astype(np.int64)
+    except qhull.QhullError as error:
+        raise MeshingError(
+            f"there are no Delaunay tetrahedra of {n:,} points, some of which are next to nothing "
+            "apart: join corners or edges that lie on each other"
+        ) from error
     corners = corners[(corners < n).all(axis=1)]
     return Tetrahedra.of(points, corners)
 

@@ -16,7 +16,7 @@ from harnack.backend.numbers import positive
 from harnack.fields.solids.mesh_solid import MeshSolid
 from harnack.files.surfaces import Mesh, read_surface
 from harnack.geometry import MeshError, validate_mesh, zero_area_faces
-from harnack.geometry.chains import weld_vertices
+from harnack.geometry.welding import Welded
 from harnack.meshing.checks import intersecting_faces, singular_vertices
 from harnack.meshing.clipping import Shells
 from harnack.meshing.edges import Edges, IntArray, directed_edges, lengths
@@ -91,10 +91,10 @@ def check_print(part: Any, *, wall: float | None = None, bed: Any = None) -> Pri
     Wrong are: open edges, edges of more than two faces, neighbors that do not agree on their two
     sides, parts that are inside out or in the material of others, vertices where sheets touch,
     triangles that pass through each other or lie on each other (decided exactly), faces that are
-    there twice; walls thinner than asked; what does not fit on the bed. Hints are: faces without an
-    area, several parts, tiny ones, cavities without a way out (for powder and resin), and a size
-    that looks like inches or meters, and, of walls, faces so large that a thin place beside their
-    centers may be missed.
+    there twice; walls thinner than asked; what does not fit on the bed. Hints are: corners apart
+    from others by rounding, which count as one, faces without an area, several parts, tiny ones,
+    cavities without a way out (for powder and resin), and a size that looks like inches or meters,
+    and, of walls, faces so large that a thin place beside their centers may be missed.
 
     part: a trimesh.Trimesh, (vertices, faces), or the name of a file. Vertices at the same place
         are one.
@@ -110,7 +110,7 @@ def check_print(part: Any, *, wall: float | None = None, bed: Any = None) -> Pri
     if bed is not None and np.shape(bed) != (3,):
         raise ValueError(f"bed must be (x, y, z), three lengths, not {bed!r}")
     sides = None if bed is None else [positive(one, "bed") for one in bed]
-    x, faces = _mesh_of(part)
+    x, faces, rounded = _mesh_of(part)
     found = _topology(x, faces)
     is_closed = not _is_wrong(found)
     shells = Shells.of(Surface(x, faces))
@@ -122,6 +122,7 @@ def check_print(part: Any, *, wall: float | None = None, bed: Any = None) -> Pri
     low, high = x[faces].min(axis=(0, 1)), x[faces].max(axis=(0, 1))
     size = cast("tuple[float, float, float]", tuple((high - low).tolist()))
     found += _of_size(size, sides)
+    found.append(rounded)
     kept = sorted((one for one in found if one.count), key=lambda one: not one.is_fatal)
     volume = float(shells.volumes.sum()) if is_closed else None
     return PrintCheck(tuple(kept), size, volume, len(faces), len(shells.volumes))
@@ -131,13 +132,14 @@ def _is_wrong(problems: Sequence[PrintProblem]) -> bool:
     return any(one.is_fatal and one.count for one in problems)
 
 
-def _mesh_of(part: Any) -> tuple[FloatArray, IntArray]:
-    """Vertices, those at one place joined, and faces, with those of zero area."""
+def _mesh_of(part: Any) -> tuple[FloatArray, IntArray, PrintProblem]:
+    """Vertices, and faces between those at one place or apart by rounding, with those of zero area;
+    and how many were apart."""
     if isinstance(part, str | os.PathLike):
         read = read_surface(cast("Any", part), "winding")
         if not isinstance(read, Mesh):
             raise MeshError(f"{part}: it holds no faces, so there is nothing to print")
-        x, faces = read.vertices, np.concatenate([read.faces, read.flat])
+        x, faces, rounded = read.vertices, np.concatenate([read.faces, read.flat]), read.rounded
     else:
         pair = (part.vertices, part.faces) if hasattr(part, "faces") else part
         try:
@@ -148,7 +150,12 @@ def _mesh_of(part: Any) -> tuple[FloatArray, IntArray]:
                 f"of type {type(part).__name__}"
             ) from None
         x, faces = validate_mesh(vertices, given, flat=True)
-    return x, weld_vertices(x)[faces]
+        rounded = 0
+    welded = Welded.of(x, faces)
+    count = rounded + welded.rounded
+    text = f"{count:,} {'corner is' if count == 1 else 'corners are'} apart from others by rounding"
+    note = PrintProblem("corners apart by rounding", count, np.zeros((0, 3)), text, is_fatal=False)
+    return x, welded.index[faces], note
 
 
 def _problem(kind: str, where: FloatArray, text: str, *, is_fatal: bool = True) -> PrintProblem:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
@@ -16,12 +17,14 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from harnack.backend.numbers import positive
+from harnack.fields import Solid
 from harnack.fields.solid_angles.winding_number import WindingNumber
 from harnack.fields.solids.mesh_solid import MeshSolid
-from harnack.geometry import MeshError, validate_mesh
-from harnack.geometry.chains import weld_vertices
+from harnack.geometry import MeshError, validate_mesh, zero_area_faces
+from harnack.geometry.chains import singular_edges, weld_vertices
 from harnack.geometry.meshes import without_zero_area_faces
 from harnack.geometry.sides import is_one_sided
+from harnack.meshing.bodies import united_parts
 from harnack.meshing.checks import (
     MeshingError,
     TooLargeError,
@@ -31,11 +34,12 @@ from harnack.meshing.checks import (
 )
 from harnack.meshing.clipping import Shells, largest_body, parts_of
 from harnack.meshing.edges import IntArray
+from harnack.meshing.given import Difference, Given
 from harnack.meshing.harmonic_patches import Asked, HarmonicPatches, harmonic_patches, open_edges
 from harnack.meshing.hole_patches import filled, hole_loops
 from harnack.meshing.lattice_surface import Surface
 from harnack.meshing.mesh import mesh as mesh_of
-from harnack.meshing.sound import joined, mended
+from harnack.meshing.sound import Mended, joined, mended
 
 if TYPE_CHECKING:
     import trimesh
@@ -146,23 +150,32 @@ def repair(
     asked = _checked_settings(keep, patches, tolerance, spacing, seed, progress or _silent)
     _check_is_mesh(mesh)
     _check_encloses(mesh)
+    given = Given.of(mesh, as_it_is=keep == "all")
     stages = {
         "all": _kept, "united": _united, "sound": _sound, "joined": _joined, "none": _anew,
     }  # fmt: skip
     names = list(stages) if keep is None else [keep]
-    reasons: list[str] = []
+    reasons, results = list[str](), list[_Result]()
     for name in names:
         try:
-            surface, facts = stages[name](mesh, asked)
+            surface, facts = stages[name](given, asked)
         except (MeshError, MeshingError) as error:
-            if name == names[-1]:
+            if name == names[-1] and not results:
                 raise
             reasons.append(str(error))
             asked.report(f"{error}; so not all is kept")
             continue
-        facts |= {"why": "; ".join(dict.fromkeys(reasons)) or None}  # each reason once
-        return _result(surface, facts, largest)
-    raise AssertionError("unreachable: the last stage returns or raises")
+        asked.report("comparing with what was given")
+        away = tolerance * given.size + facts.get("moved", 0.0)
+        results.append(_Result(surface, facts, given.difference(surface, away)))
+        if results[-1].difference is None:
+            break
+        reasons.append(f"the result of {facts['stage']} is another solid: {results[-1].difference}")
+        asked.report(f"{reasons[-1]}; so another way")
+    best = min(results, key=lambda one: 0.0 if one.difference is None else one.difference.badness)
+    # Each reason once.
+    why = "; ".join(dict.fromkeys(one for one in reasons)) or None
+    return best.finished({"why": why, "welded": given.rounded}, largest)
 
 
 @dataclass(frozen=True)
@@ -198,24 +211,39 @@ def _checked_settings(
     return _Asked(keep, patches, tolerance, spacing, seed, report)
 
 
-def _result(surface: Surface, facts: dict[str, Any], largest: bool) -> trimesh.Trimesh:
-    """The mesh, with what is known of it and of its parts."""
-    from harnack.meshing.closed_mesh import ClosedMesh
+@dataclass(frozen=True)
+class _Result:
+    """What a stage made, and how that differs from what was given."""
 
-    parts = parts_of(surface)
-    dropped = 0
-    if largest and len(parts) > 1:
-        whole, surface = surface, largest_body(surface)
-        dropped = len(parts) - len(parts_of(surface))
-        facts = facts | {"kept": _count_of(surface, whole, facts["kept"])}
-    made = ClosedMesh(surface.vertices, surface.faces, process=False, validate=False)
-    made.metadata["harnack"] = {
-        **facts,
-        "parts": parts,
-        "dropped": dropped,
-        "euler_characteristic": euler_characteristic(surface.faces),
-    }
-    return made
+    surface: Surface
+    facts: dict[str, Any]
+    difference: Difference | None
+
+    def finished(self, more: dict[str, Any], largest: bool) -> trimesh.Trimesh:
+        """The mesh, with what is known of it and of its parts; a warning if it differs."""
+        from harnack.meshing.closed_mesh import ClosedMesh
+
+        surface, facts = self.surface, self.facts | more | {"differs": None}
+        if self.difference is not None:
+            facts["differs"] = dataclasses.asdict(self.difference)
+            warnings.warn(
+                f"the repaired mesh is not quite the solid that was given: {self.difference}",
+                stacklevel=3,
+            )
+        parts = parts_of(surface)
+        dropped = 0
+        if largest and len(parts) > 1:
+            surface = largest_body(surface)
+            dropped = len(parts) - len(parts_of(surface))
+            facts["kept"] = _count_of(surface, self.surface, facts["kept"])
+        made = ClosedMesh(surface.vertices, surface.faces, process=False, validate=False)
+        made.metadata["harnack"] = {
+            **facts,
+            "parts": parts,
+            "dropped": dropped,
+            "euler_characteristic": euler_characteristic(surface.faces),
+        }
+        return made
 
 
 def _count_of(surface: Surface, whole: Surface, first: int) -> int:
@@ -262,26 +290,47 @@ def _check_encloses(mesh: Any) -> None:
 # Bodies united.
 
 
-def _united(mesh: Any, asked: _Asked) -> tuple[Surface, dict[str, Any]]:
-    """The boundary of the solid that a closed mesh bounds which passes through itself.
+def _united(given: Given, asked: _Asked) -> tuple[Surface, dict[str, Any]]:
+    """The boundary of the solid that a closed mesh bounds which passes through itself, or of parts
+    that touch.
 
     Raises:
         MeshError, MeshingError: as `repair`.
     """
-    vertices, faces = _checked(mesh)
-    if len(open_edges(faces)):
+    vertices, faces = given.vertices, given.oriented
+    if len(singular_edges(faces)[0]):
         raise MeshError("the mesh is not closed")
-    made = mesh_of(MeshSolid(vertices, faces), progress=asked.report)
+    if _is_fine(vertices, faces):
+        raise MeshError("nothing of it passes through or lies in itself")
+    try:
+        solid: Solid = MeshSolid(vertices, faces)
+    except MeshError as error:
+        asked.report(f"{error}; so part by part")
+        try:
+            solid = united_parts(vertices, faces)
+        except MeshError as another:
+            raise MeshError(f"{error}; and part by part {another}") from None
+    made = mesh_of(solid, progress=asked.report)
     surface = Surface(np.asarray(made.vertices), np.asarray(made.faces, np.int64))
     return surface, {"stage": "united", "kept": 0}
+
+
+def _is_fine(vertices: FloatArray, faces: IntArray) -> bool:
+    """Whether no triangles meet beyond what they share, and no part is in another's material."""
+    try:
+        _check_sides(Surface.of(vertices, faces))
+    except MeshError:
+        return False
+    return not len(singular_vertices(faces)) and not len(intersecting_faces(vertices, faces))
 
 
 # All made anew.
 
 
-def _anew(mesh: Any, asked: _Asked) -> tuple[Surface, dict[str, Any]]:
+def _anew(given: Given, asked: _Asked) -> tuple[Surface, dict[str, Any]]:
     """The surface on which the winding number is 1/2, closed whatever the mesh is."""
-    corners = without_zero_area_faces(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    given.check_encloses()
+    corners = without_zero_area_faces(given.vertices, given.oriented)
     field = WindingNumber(*corners)
     if asked.spacing is not None:
         made = _by_signs(field, asked.spacing, asked)
@@ -318,20 +367,20 @@ def _by_signs(
 # What is sound kept.
 
 
-def _sound(mesh: Any, asked: _Asked) -> tuple[Surface, dict[str, Any]]:
+def _sound(given: Given, asked: _Asked) -> tuple[Surface, dict[str, Any]]:
     """The triangles that are sound, with patches.
 
     Raises:
         MeshError, MeshingError: as `repair`.
     """
-    vertices, faces = without_zero_area_faces(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    vertices, faces = without_zero_area_faces(given.vertices, given.faces)
     made = mended(vertices, faces, asked.report)
-    flat = len(np.asarray(mesh.faces)) - len(faces)
+    flat = len(given.faces) - len(faces)
     left_out = {"flat": made.left_out["flat"] + flat}
     return made.surface, {
         "stage": "sound",
         "kept": len(made.kept),
-        "turned": len(made.turned),
+        "turned": _count_turned(given, made),
         "left_out": made.left_out | left_out,
         "holes": made.holes,
         "patches": len(made.surface.faces) - len(made.kept),
@@ -339,16 +388,24 @@ def _sound(mesh: Any, asked: _Asked) -> tuple[Surface, dict[str, Any]]:
     }
 
 
+def _count_turned(given: Given, made: Mended) -> int:
+    """How many of the triangles that were kept run the other way than those that were given."""
+    area = np.delete(given.is_turned, zero_area_faces(given.vertices, given.faces))
+    is_turned = np.zeros(len(area), np.bool_)
+    is_turned[made.turned] = True
+    return int((is_turned ^ area)[made.kept].sum())
+
+
 # Loose triangles joined.
 
 
-def _joined(mesh: Any, asked: _Asked) -> tuple[Surface, dict[str, Any]]:
+def _joined(given: Given, asked: _Asked) -> tuple[Surface, dict[str, Any]]:
     """Triangles with near corners joined, with patches; none is kept bit by bit.
 
     Raises:
         MeshError, MeshingError: as `repair`.
     """
-    corners = without_zero_area_faces(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    corners = without_zero_area_faces(given.vertices, given.faces)
     vertices, faces, moved = joined(*corners)
     made = mended(vertices, faces, asked.report)
     count = len(made.kept)
@@ -358,7 +415,7 @@ def _joined(mesh: Any, asked: _Asked) -> tuple[Surface, dict[str, Any]]:
         "joined": count,
         "moved": moved,
         "turned": len(made.turned),
-        "left_out": made.left_out | {"flat": len(np.asarray(mesh.faces)) - len(faces)},
+        "left_out": made.left_out | {"flat": len(given.faces) - len(faces)},
         "holes": made.holes,
         "patches": len(made.surface.faces) - count,
         "harmonic": 0,
@@ -368,13 +425,15 @@ def _joined(mesh: Any, asked: _Asked) -> tuple[Surface, dict[str, Any]]:
 # All kept.
 
 
-def _kept(mesh: Any, asked: _Asked) -> tuple[Surface, dict[str, Any]]:
+def _kept(given: Given, asked: _Asked) -> tuple[Surface, dict[str, Any]]:
     """The mesh with patches; all its triangles stay.
 
     Raises:
         MeshError, MeshingError: as `repair`.
     """
-    vertices, faces = _checked(mesh)
+    vertices, faces = _checked(given)
+    if given.is_turned.any():
+        raise MeshError("a part of the mesh is inside out")
     edges = open_edges(faces)
     if asked.keep is None and len(crossing := intersecting_faces(vertices, faces)):
         raise MeshError(f"{len(crossing):,} triangles of the mesh pass through others")
@@ -389,9 +448,9 @@ def _kept(mesh: Any, asked: _Asked) -> tuple[Surface, dict[str, Any]]:
     return _kept_with(vertices, faces, loops, dataclasses.replace(asked, patches="harmonic"))
 
 
-def _checked(mesh: Any) -> tuple[FloatArray, IntArray]:
+def _checked(given: Given) -> tuple[FloatArray, IntArray]:
     """Vertices and faces of a mesh all of which can be kept."""
-    vertices, faces = validate_mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    vertices, faces = validate_mesh(given.vertices, given.faces)
     used = np.unique(faces)
     welded = weld_vertices(vertices[used])
     twice = np.flatnonzero(welded != np.arange(len(used)))

@@ -29,7 +29,7 @@ from harnack.meshing.edges import Edges, IntArray, boundary_edges, crosses, dire
 from harnack.meshing.hole_patches import filled, hole_loops
 from harnack.meshing.lattice_surface import Surface
 
-__all__ = ["Mended", "joined", "mended"]
+__all__ = ["Mended", "against_neighbors", "joined", "mended", "pieces_of"]
 
 # How often the rings around holes are left out; and what part of all triangles may be.
 _MOST_RINGS, _MOST_LEFT_OUT = 6, 0.5
@@ -172,7 +172,7 @@ class _State:
         edges = Edges.of(directed_edges(state.faces))
         many = np.asarray((edges.uses > 2)[edges.index].reshape(3, -1).any(axis=0))
         state = state.chosen(~many, "branching")
-        turned = _against_neighbors(state.vertices, state.faces)
+        turned = against_neighbors(state.vertices, state.faces)
         oriented = np.where(turned[:, None], state.faces[:, ::-1], state.faces)
         pairs = directed_edges(oriented)
         edges = Edges.of(pairs)
@@ -193,7 +193,7 @@ class _State:
             edges = Edges.of(directed_edges(state.faces))
             if not (edges.uses > 2).any():
                 return state
-            piece = _pieces(edges, len(state.faces))
+            piece = pieces_of(edges, len(state.faces))
             uses = edges.uses[edges.index].reshape(3, -1)
             count = int(piece.max()) + 1
             branches, ends = (
@@ -243,7 +243,7 @@ class _State:
         return Mended(surface, kept, kept[turned], self.counts, holes)
 
 
-def _pieces(edges: Edges, count: int) -> IntArray:
+def pieces_of(edges: Edges, count: int) -> IntArray:
     """(m,) which of the pieces that edges of two faces hold together each of `count` faces belongs
     to. edges: those of `directed_edges`."""
     import scipy.sparse  # here: half a second that few need
@@ -255,7 +255,7 @@ def _pieces(edges: Edges, count: int) -> IntArray:
     return np.asarray(csgraph.connected_components(joined, directed=False)[1], np.int64)
 
 
-def _against_neighbors(x: FloatArray, faces: IntArray) -> BoolArray:
+def against_neighbors(x: FloatArray, faces: IntArray) -> BoolArray:
     """(m,) which faces are to be turned over for all that share an edge of two to agree: of each
     part those with the smaller area. Parts of one side only are left as they are."""
     m, part = len(faces), sided_parts(faces)

@@ -14,7 +14,7 @@ from harnack.backend import FloatArray, IntArray
 from harnack.fields.clearance import single
 from harnack.fields.solid_angles.multipole import NodeMoments, triangle_levels
 from harnack.geometry import MeshError, validate_mesh
-from harnack.geometry.chains import net_faces, singular_edges, weld_vertices
+from harnack.geometry.welding import Welded, rounding_of
 from harnack.tree import Hierarchy, build_hierarchy
 from harnack.tree.triangles import MOST_TRIANGLES, PARITY, triangle_records
 
@@ -35,7 +35,8 @@ class WindingMesh:
     source: (m,) the face, as given, that each comes from.
     singular: (k, 2) directed edges at which triangles do not cancel, an edge of weight 2 twice.
     given: (g, 3) all faces, as given.
-    welded: (n,) the vertex that stands for each.
+    welded: (n,) the vertex that stands for each. rounded: how many places were joined with others,
+        from which they were apart by rounding (`geometry.welding`).
     center, size: `unit_vertices` = (vertices - center)/size; the size is a power of two, so that
         scaling lengths is exact.
     """
@@ -47,6 +48,7 @@ class WindingMesh:
     singular: IntArray
     given: IntArray
     welded: IntArray
+    rounded: int
     center: FloatArray
     size: float
 
@@ -58,23 +60,23 @@ class WindingMesh:
             MeshError: as `validate_mesh`; or all faces cancel; or there are too many.
         """
         x, f = validate_mesh(vertices, faces)
-        welded = weld_vertices(x)
-        net = net_faces(welded[f])
+        welded = Welded.of(x, f)
+        net = welded.net
         if len(net.faces) == 0:
             raise MeshError("faces: every face is canceled by its own copy turned round")
         if net.multiplicity.sum() >= MOST_TRIANGLES:
             raise MeshError(
                 f"faces: at most {MOST_TRIANGLES - 1} are possible; cut the mesh in parts"
             )
-        edges, weights = singular_edges(net.faces, net.multiplicity)
         return cls(
             x,
             net.faces,
             net.multiplicity,
             net.source,
-            np.repeat(edges, weights, axis=0),
+            np.repeat(welded.edges, welded.weights, axis=0),
             f,
-            welded,
+            welded.index,
+            welded.rounded,
             *_center_and_size(x, net.faces),
         )
 
@@ -94,6 +96,8 @@ class WindingMesh:
                 "vertices keeps their number and their order"
             )
         apart = (x != x[self.welded]).any(axis=1)
+        if self.rounded and apart.any():
+            apart = np.abs(x - x[self.welded]).max(axis=1) > rounding_of(x)
         if apart.any():
             torn = given[apart[given]]
             if len(torn):

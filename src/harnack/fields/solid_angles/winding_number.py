@@ -478,6 +478,7 @@ class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
             "triangles": len(mesh.triangles),
             "singular edges": len(mesh.singular),
             "method": self.method,
+            **({"corners joined by rounding": mesh.rounded} if mesh.rounded else {}),
             **self.said_of_cells(None if self._device is None else self._device.built),
         }
 

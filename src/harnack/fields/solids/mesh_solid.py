@@ -32,8 +32,8 @@ from harnack.fields.look import Path as Ray
 from harnack.fields.solids.solid import Solid, box_around, set_checked
 from harnack.files.surfaces import SURFACE_FILES, Mesh, read_surface
 from harnack.geometry import MeshError, validate_mesh, zero_area_faces
-from harnack.geometry.chains import net_faces, singular_edges, weld_vertices
 from harnack.geometry.sides import is_one_sided
+from harnack.geometry.welding import Welded
 from harnack.tree import build_hierarchy
 from harnack.tree.nearest import NearestTriangle, nearest_triangle, square_to_some_vertex
 from harnack.tree.pieces import pieces_of_faces, windings_beside
@@ -102,7 +102,8 @@ class MeshSolid(Solid):
     """The points inside of a closed triangle mesh: f is the signed distance from its surface.
 
     vertices: (n, 3). faces: (m, 3), indices of vertices, counter-clockwise as seen from outside.
-        Vertices at exactly the same place are one; faces may have zero area.
+        Vertices at the same place are one, and at open edges those that are apart by rounding
+        (`geometry.welding`); faces may have zero area.
 
     A mesh that crosses or holds itself is the solid of the points around which it winds more than
     1/2 times, the union where its parts overlap; f is the distance from the boundary of that.
@@ -445,12 +446,13 @@ class ClosedSurface:
         Raises:
             MeshError: it bounds no solid.
         """
-        net = net_faces(weld_vertices(vertices)[faces])
+        welded = Welded.of(vertices, faces)
+        net = welded.net
         if not len(net.faces):
             raise MeshError("the mesh bounds no volume: every face is canceled by a reversed copy")
         if len(net.faces) >= MOST_TRIANGLES:
             raise MeshError(f"at most {MOST_TRIANGLES - 1:,} faces are possible: decimate the mesh")
-        _check_closed(vertices, net.faces, net.multiplicity)
+        _check_closed(vertices, welded)
         used = vertices[np.unique(net.faces)]
         low, high = used.min(axis=0), used.max(axis=0)
         size = float(2.0 ** np.ceil(np.log2(0.5 * float((high - low).max()))))
@@ -515,9 +517,9 @@ def _boundary(
     return pieces[on]
 
 
-def _check_closed(vertices: FloatArray, faces: IntArray, weights: IntArray) -> None:
+def _check_closed(vertices: FloatArray, welded: Welded) -> None:
     """Raise MeshError unless every edge is run as often one way as the other."""
-    edges, left = singular_edges(faces, weights)
+    faces, edges, left = welded.net.faces, welded.edges, welded.weights
     if not len(edges):
         return
     ends = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
@@ -536,8 +538,8 @@ def _check_closed(vertices: FloatArray, faces: IntArray, weights: IntArray) -> N
         raise MeshError(
             f"the mesh is not closed: {int(is_open.sum()):,} edges have one face alone, such as "
             f"that between {first}; harnack.repair(mesh) closes holes. Welding vertices that are "
-            "apart by rounding (mesh.merge_vertices()) may be enough. harnack.WindingNumber draws "
-            "any mesh as it is"
+            "apart by more than rounding (mesh.merge_vertices(digits_vertex=...)) may be enough. "
+            "harnack.WindingNumber draws any mesh as it is"
         )
     raise MeshError(
         f"the faces at {len(edges):,} edges do not agree on their two sides, such as at that "

@@ -1,0 +1,131 @@
+"""Meshes whose corners are joined: those at one place, and those apart by rounding alone.
+
+Programs compute a corner once for each face around it, and get 0 in one and 2.7e-16 in another.
+Where edges are compared by index, as everywhere here, such faces are no neighbors. So corners at
+open edges are joined that rounding explains; all others stay as they are, and a closed mesh does.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from harnack.backend.numbers import FloatArray, IntArray
+from harnack.geometry.chains import NetFaces, net_faces, singular_edges, weld_vertices
+from harnack.geometry.meshes import zero_area_faces
+
+__all__ = ["Welded", "rounding_of"]
+
+# How many units in the last place of the largest coordinate rounding explains.
+_UNITS = 4
+# It explains no distance that is more than this part of the shortest edge there.
+_OF_EDGES = 1e-3
+# A direction that is in no plane in which a mesh has many corners.
+_ACROSS = (0.6180, 0.5436, 0.5678)
+
+
+def rounding_of(vertices: FloatArray) -> float:
+    """How far corners at one place may be apart by rounding: four units in the last place of the
+    largest coordinate, of single precision if it holds all of them."""
+    single = vertices.astype(np.float32)
+    precision = np.float32 if (single == vertices).all() else np.float64
+    return _UNITS * float(np.finfo(precision).eps) * float(np.abs(vertices).max(initial=0.0))
+
+
+@dataclass(frozen=True)
+class Welded:
+    """The faces of a mesh between corners that stand for all at their place.
+
+    index: (n,) the vertex that stands for each: the first at exactly its place, or the first of
+        those that are apart by rounding. net: the faces between these, duplicates added up
+        (`net_faces`). edges, weights: at which these do not cancel (`singular_edges`).
+    rounded: how many places were joined with others, apart by rounding.
+    """
+
+    index: IntArray
+    net: NetFaces
+    edges: IntArray
+    weights: IntArray
+    rounded: int
+
+    @classmethod
+    def of(cls, vertices: FloatArray, faces: IntArray) -> Welded:
+        """Of vertices (n, 3) and faces (m, 3).
+
+        Corners are joined that are nearer than `rounding_of` and a thousandth of the edges there,
+        and at which edges do not cancel, if fewer of these are left. No face loses two of its
+        corners to one place, or its area: where one would, what it touches stays apart. So there
+        are as many faces as before, but for those that cancel, and a gap that is wider than that
+        stays: two such corners are as near as two results of one computation.
+        """
+        welded = cls._by(weld_vertices(vertices), vertices, faces, 0)
+        if not len(welded.edges):
+            return welded
+        joined = _joined_by_rounding(vertices, welded.net.faces, np.unique(welded.edges))
+        count = int((joined != np.arange(len(vertices))).sum())
+        if not count:
+            return welded
+        closer = cls._by(joined[welded.index], vertices, faces, count)
+        return closer if closer.weights.sum() < welded.weights.sum() else welded
+
+    @classmethod
+    def _by(cls, index: IntArray, vertices: FloatArray, faces: IntArray, rounded: int) -> Welded:
+        net = net_faces(index[faces])
+        return cls(index, net, *singular_edges(net.faces, net.multiplicity), rounded)
+
+
+def _joined_by_rounding(x: FloatArray, faces: IntArray, places: IntArray) -> IntArray:
+    """(n,) the vertex that stands for each, of those at some places, all different."""
+    stands = np.arange(len(x))
+    pairs = _near_pairs(x, places, rounding_of(x[faces]))
+    distance = np.linalg.norm(x[pairs[:, 0]] - x[pairs[:, 1]], axis=1)
+    corner = x[faces]
+    shortest = np.full(len(x), np.inf)
+    edges = np.linalg.norm(corner - np.roll(corner, 1, axis=1), axis=2).min(axis=1)
+    for k in range(3):
+        np.minimum.at(shortest, faces[:, k], edges)
+    pairs = pairs[distance <= _OF_EDGES * shortest[pairs].min(axis=1)]
+    while len(pairs):
+        stands = _first_of_groups(pairs, len(x))
+        made = stands[faces]
+        changed = np.flatnonzero((made != faces).any(axis=1))
+        vanished = (made == np.roll(made, 1, axis=1)).any(axis=1)
+        flat = changed[zero_area_faces(x, made[changed])]
+        vanished[np.setdiff1d(flat, zero_area_faces(x, faces))] = True
+        if not vanished.any():
+            break
+        stays = np.unique(made[vanished])
+        pairs = pairs[~np.isin(stands[pairs[:, 0]], stays)]
+        stands = np.arange(len(x))
+    return stands
+
+
+def _near_pairs(x: FloatArray, places: IntArray, distance: float) -> IntArray:
+    """(k, 2) pairs of some places up to a distance apart, found along one direction."""
+    along = x[places] @ np.array(_ACROSS)  # not longer than 1
+    order = np.argsort(along)
+    along, places = along[order], places[order]
+    reach = distance + 1e-15 * float(np.abs(along).max(initial=0.0))
+    rows, found = np.arange(len(places) - 1), [np.zeros((0, 2), np.int64)]
+    step = 1
+    while len(rows):
+        rows = rows[rows + step < len(places)]
+        rows = rows[along[rows + step] - along[rows] <= reach]
+        pair = np.column_stack([places[rows], places[rows + step]])
+        apart = np.linalg.norm(x[pair[:, 0]] - x[pair[:, 1]], axis=1)
+        found.append(pair[apart <= distance])
+        step += 1
+    return np.concatenate(found)
+
+
+def _first_of_groups(pairs: IntArray, count: int) -> IntArray:
+    """(n,) the first of those that pairs join with each of `count`."""
+    first = np.arange(count)
+    while True:
+        least = first[pairs].min(axis=1)
+        before = first.copy()
+        for k in range(2):
+            np.minimum.at(first, pairs[:, k], least)
+        if (first == before).all():
+            return first

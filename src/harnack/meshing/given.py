@@ -1,0 +1,297 @@
+"""The solid that a damaged mesh means, by its winding number, and how another surface differs.
+
+What is closed need not be right: a patch may cut off half of a solid. So each result of `repair` is
+compared with the winding number w of what was given, at points away from both surfaces: where w is
+clearly above 1/2 the result has to have its inside, and where it is clearly below its outside.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from harnack.backend import BoolArray, FloatArray
+from harnack.fields.solid_angles.winding_number import WindingNumber
+from harnack.geometry import MeshError, validate_mesh, without_zero_area_faces
+from harnack.geometry.welding import Welded
+from harnack.meshing.bodies import closed_parts, nested, volume_of
+from harnack.meshing.edges import IntArray, crosses, dots, lengths
+from harnack.meshing.lattice_surface import Surface
+from harnack.meshing.sound import against_neighbors
+
+__all__ = ["Difference", "Given"]
+
+# Points at which winding numbers are compared: in the box around the mesh, and near each surface.
+_IN_BOX, _NEAR = 2000, 1000
+# Those near a surface are so far from it, as parts of the size; and the box is wider by that part.
+_NEAREST, _FARTHEST, _MARGIN = 2e-3, 0.1, 0.05
+# The winding number is clearly above or below 1/2 if it is by more than smooth patches need.
+_CLEARLY = 0.36
+# Volumes of closed meshes that bound their solid once may differ by this part.
+_VOLUME = 0.01
+# How many points that differ are looked at again, and listed.
+_LOOKED_AT, _LISTED = 40, 10
+# A mesh is an open sheet if this part of its area, or more, has nothing inside.
+_OPEN = 0.4
+
+
+@dataclass(frozen=True)
+class Difference:
+    """How a surface differs from what was given.
+
+    share: of the points that were compared those that are on the wrong side. places: (k, 3), some
+        of them. missing: how many of them should be inside, and are not; added: the reverse.
+    volumes: of the surface and of the closed mesh that bounds its solid once; None if they are the
+        same, or it does not.
+    """
+
+    share: float
+    places: FloatArray
+    missing: int
+    added: int
+    volumes: tuple[float, float] | None
+
+    @property
+    def badness(self) -> float:
+        """Of two surfaces that which has less of it is nearer to what was given."""
+        off = 0.0
+        if self.volumes is not None:
+            made, given = self.volumes
+            off = abs(made - given) / abs(given)
+        return self.share + off
+
+    def __str__(self) -> str:
+        words = [
+            f"{count:,} {what}"
+            for count, what in ((self.missing, "inside of it"), (self.added, "outside"))
+            if count
+        ]
+        told = f"{self.share:.2%} of the points compared" if self.share else "none of the points"
+        if words:
+            x, y, z = self.places[0]
+            told += f" ({' and '.join(words)}, such as near ({x:.4g}, {y:.4g}, {z:.4g}))"
+        told += " lie on the other side"
+        if self.volumes is not None:
+            told += ", and volumes are {:.4g} and {:.4g}".format(*self.volumes)
+        return told
+
+
+@dataclass(frozen=True)
+class Given:
+    """A mesh whose corners are joined and that is not inside out.
+
+    vertices: (n, 3). faces: (m, 3); is_turned: (m,) which of them were turned over.
+    oriented: (k, 3) faces that agree with their neighbors where that is possible.
+    rounded: how many corners were joined with others, apart by rounding.
+    """
+
+    vertices: FloatArray
+    faces: IntArray
+    is_turned: BoolArray
+    oriented: IntArray
+    rounded: int
+
+    @classmethod
+    def of(cls, mesh: Any, *, as_it_is: bool = False) -> Given:
+        """Of anything with vertices and faces, which may have no area.
+
+        Corners apart by rounding are joined. Then each closed part that is inside out is turned
+        over, with all that lies in it; and all the rest, if that then winds around more points
+        clockwise than counter-clockwise.
+
+        as_it_is: turn nothing over.
+
+        Raises:
+            MeshError: as `validate_mesh`.
+        """
+        x, faces = validate_mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces), flat=True)
+        welded = Welded.of(x, faces)
+        if welded.rounded:
+            faces = welded.index[faces]
+        known = welded.index[faces]
+        rows = np.flatnonzero((known != np.roll(known, 1, axis=1)).all(axis=1))
+        if not len(welded.net.faces):  # every face is there with its reverse
+            rows = rows[np.unique(np.sort(known[rows], axis=1), axis=0, return_index=True)[1]]
+        known, is_turned = known[rows], np.zeros(len(faces), np.bool_)
+        if as_it_is or not len(rows):
+            return cls(x, faces, is_turned, known, welded.rounded)
+        disagrees = against_neighbors(x, known)
+        agreeing = _turned(known, disagrees)
+        turned = _inside_out(x, _turned(faces[rows], disagrees), agreeing)
+        oriented = _turned(agreeing, turned)
+        if not disagrees.any():  # else it is no part as a whole that is turned
+            is_turned[rows] = turned
+        return cls(x, _turned(faces, is_turned), is_turned, oriented, welded.rounded)
+
+    @functools.cached_property
+    def size(self) -> float:
+        """The longest side of the box."""
+        return float(np.ptp(self.vertices[self.oriented], axis=(0, 1)).max())
+
+    @functools.cached_property
+    def field(self) -> WindingNumber | None:
+        """The winding number, or None where all faces cancel."""
+        return _winding_number(self.vertices, self.oriented)
+
+    def winding(self, points: FloatArray) -> FloatArray:
+        """(k,) the winding number at points (k, 3)."""
+        return _values(self.field, points)
+
+    @functools.cached_property
+    def samples(self) -> tuple[FloatArray, FloatArray]:
+        """Points in the box and near the faces, and winding numbers there."""
+        rng = np.random.default_rng(0)
+        corner = self.vertices[self.oriented]
+        low, high = corner.min(axis=(0, 1)), corner.max(axis=(0, 1))
+        margin = _MARGIN * self.size
+        box = rng.uniform(low - margin, high + margin, (_IN_BOX, 3))
+        points = np.concatenate([box, _near(corner, self.size, rng)])
+        return points, self.winding(points)
+
+    def check_encloses(self) -> None:
+        """Raise if so much of the area has nothing inside, on neither side, that it is no solid.
+
+        Raises:
+            MeshError: so.
+        """
+        rng = np.random.default_rng(0)
+        corner = self.vertices[self.oriented]
+        points, normals = _on_faces(corner, _NEAR, rng)
+        away = _NEAREST * self.size * normals
+        beside = self.winding(np.concatenate([points + away, points - away]))
+        nothing = (beside.reshape(2, -1) < 0.5).all(axis=0)
+        share = float(nothing.mean())
+        if share > _OPEN:
+            raise MeshError(
+                f"the mesh is an open sheet: {share:.0%} of its area have nothing inside, on "
+                "neither side, so that most of it would be lost; give it a thickness first, in the "
+                "program that made it"
+            )
+
+    def difference(self, surface: Surface, away: float) -> Difference | None:
+        """How a closed surface differs from what was given, at points farther than `away` from
+        both; None if it does not."""
+        points, w = self.samples
+        corner = surface.vertices[surface.faces]
+        more = _near(corner, self.size, np.random.default_rng(1))
+        points, w = np.concatenate([points, more]), np.concatenate([w, self.winding(more)])
+        made = _values(_winding_number(surface.vertices, surface.faces), points) > 0.5
+        missing, added = ~made & (w > 0.5 + _CLEARLY), made & (w < 0.5 - _CLEARLY)
+        rows = np.flatnonzero(missing | added)
+        looked_at = rows[np.linspace(0, len(rows) - 1, min(len(rows), _LOOKED_AT)).astype(int)]
+        both = np.concatenate([self.vertices[self.oriented], corner])
+        far = looked_at[[_distance(points[k], both) > away for k in looked_at]]
+        volumes = self._volumes(surface, away)
+        if not len(far) and volumes is None:
+            return None
+        if not len(far):
+            missing[:], added[:] = False, False
+        share = float((missing | added).mean())
+        return Difference(
+            share, points[far[:_LISTED]], int(missing.sum()), int(added.sum()), volumes
+        )
+
+    def _volumes(self, surface: Surface, away: float) -> tuple[float, float] | None:
+        """Volumes of the surface and the mesh if they differ, of a closed one that winds around no
+        point twice or clockwise."""
+        _, w = self.samples
+        if self.field is None or len(self.field.mesh.singular):
+            return None
+        if (w > 1.5).any() or (w < -0.5).any():
+            return None
+        made, given = (
+            volume_of(surface.vertices, surface.faces),
+            volume_of(self.vertices, self.oriented),
+        )
+        area = 0.5 * float(lengths(crosses(surface.vertices[surface.faces])).sum())
+        allowed = max(_VOLUME * abs(given), away * area)
+        return (made, given) if abs(made - given) > allowed else None
+
+
+def _winding_number(x: FloatArray, faces: IntArray) -> WindingNumber | None:
+    try:
+        return WindingNumber(*without_zero_area_faces(x, faces))
+    except MeshError:  # all faces cancel, or have no area
+        return None
+
+
+def _values(field: WindingNumber | None, points: FloatArray) -> FloatArray:
+    if field is None:
+        return np.zeros(len(points))
+    return np.asarray(field.value(points, precision="double"))
+
+
+def _turned(faces: IntArray, which: BoolArray) -> IntArray:
+    """Faces (m, 3), some of them (m,) turned over."""
+    return np.where(which[:, None], faces[:, ::-1], faces)
+
+
+# Points.
+
+
+def _on_faces(
+    corner: FloatArray, count: int, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """Points (k, 3) spread over faces (m, 3, 3) by area, and unit normals there."""
+    normal = crosses(corner)
+    area = lengths(normal)
+    rows = rng.choice(len(corner), count, p=area / area.sum())
+    shares = rng.dirichlet((1.0, 1.0, 1.0), count)
+    points = np.einsum("ki,kij->kj", shares, corner[rows])
+    return points, normal[rows] / area[rows, None]
+
+
+def _near(corner: FloatArray, size: float, rng: np.random.Generator) -> FloatArray:
+    """Points on both sides of faces (m, 3, 3), at distances of all magnitudes."""
+    points, normals = _on_faces(corner, _NEAR, rng)
+    heights = size * np.exp(rng.uniform(math.log(_NEAREST), math.log(_FARTHEST), len(points)))
+    heights *= rng.choice((-1.0, 1.0), len(points))
+    return points + heights[:, None] * normals
+
+
+def _distance(point: FloatArray, corner: FloatArray) -> float:
+    """The distance of a point from the nearest of some triangles (m, 3, 3)."""
+    least = np.inf
+    for k in range(3):
+        start, way = corner[:, k], corner[:, k - 1] - corner[:, k]
+        share = np.clip(dots(point - start, way) / np.maximum(dots(way, way), 1e-300), 0, 1)
+        least = min(least, float(lengths(point - start - share[:, None] * way).min()))
+    normal = crosses(corner)
+    steep = np.maximum(lengths(normal), 1e-300)
+    height = dots(point - corner[:, 0], normal) / steep
+    foot = point - (height / steep)[:, None] * normal
+    is_within = np.ones(len(corner), np.bool_)
+    for k in range(3):
+        side = np.cross(corner[:, (k + 1) % 3] - corner[:, k], foot - corner[:, k])
+        is_within &= dots(side, normal) >= 0
+    return min(least, float(np.abs(height[is_within]).min(initial=np.inf)))
+
+
+# Parts that are inside out.
+
+
+def _inside_out(x: FloatArray, raw: IntArray, faces: IntArray) -> BoolArray:
+    """(m,) which faces to turn over for what was given not to be inside out. raw: (m, 3), before
+    corners were joined."""
+    turned, is_closed = np.zeros(len(faces), np.bool_), np.zeros(len(faces), np.bool_)
+    parts = closed_parts(raw, faces)
+    volumes = [volume_of(x, faces[rows]) for rows in parts]
+    for rows, around in zip(parts, nested(x, [faces[rows] for rows in parts]), strict=True):
+        outermost = volumes[around[-1]] if around else volume_of(x, faces[rows])
+        is_closed[rows], turned[rows] = True, outermost < 0
+    if not is_closed.all() and _winds_clockwise(x, _turned(faces, turned)):
+        turned |= ~is_closed
+    return turned
+
+
+def _winds_clockwise(x: FloatArray, faces: IntArray) -> bool:
+    """Whether a mesh winds around more points clockwise than counter-clockwise."""
+    rng = np.random.default_rng(0)
+    corner = x[faces]
+    size = float(np.ptp(corner, axis=(0, 1)).max())
+    w = _values(_winding_number(x, faces), _near(corner, size, rng))
+    return bool((w < -0.5).sum() > (w > 0.5).sum())
