@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import itertools
+from typing import TYPE_CHECKING, Any, cast
+
 import numpy as np
 
-from harnack.backend import FloatArray
-from harnack.fields import Solid
-from harnack.fields.solids.combined import Combined, Complement
-from harnack.fields.solids.mesh_solid import MeshSolid
+from harnack.backend import BoolArray, FloatArray
 from harnack.geometry import MeshError
-from harnack.geometry.chains import net_faces, weld_vertices
+from harnack.meshing.checks import check_manifold, intersecting_faces
 from harnack.meshing.clipping import winding_around
+from harnack.meshing.closed_mesh import manifold_of
 from harnack.meshing.edges import Edges, IntArray, directed_edges, dots
-from harnack.meshing.sound import pieces_of
+from harnack.meshing.lattice_surface import Surface
+from harnack.meshing.solids import apart_of
+
+if TYPE_CHECKING:
+    from manifold3d import Manifold
 
 __all__ = ["closed_parts", "nested", "united_parts", "volume_of"]
 
@@ -20,28 +25,81 @@ __all__ = ["closed_parts", "nested", "united_parts", "volume_of"]
 _LEAST_FACES, _MOST_PARTS = 4, 200
 # Places of a part that have to lie in another one for the part to do.
 _PLACES = 16
+# Faces around an edge have one direction if they are turned by less, in full turns.
+_SAME_TURN = 1e-9
 
 
-def closed_parts(*faces: IntArray) -> list[IntArray]:
-    """Faces, by index, of the parts of a mesh that are closed: whose faces edges of two faces hold
-    together, and that run every edge as often one way as the other.
+def closed_parts(x: FloatArray, raw: IntArray, joined: IntArray) -> list[IntArray]:
+    """Faces, by index, of the parts of a mesh that are closed: that run every edge as often one way
+    as the other.
 
-    faces: (m, 3), as given, and again with corners joined, if that is to be looked at as well.
-        Parts that touch are told apart as long as they have corners of their own.
+    raw: (m, 3) faces as they were given: parts that touch are told apart if they have corners of
+        their own. joined: (m, 3) of the corners that stand for all at their place. Here faces at an
+        edge of two belong together, and at edges of more those with the material between them.
     """
     found: list[IntArray] = []
-    is_left = np.ones(len(faces[0]), np.bool_)
-    for corners in faces:
+    is_left = np.ones(len(raw), np.bool_)
+    for faces in (raw, joined):
         left = np.flatnonzero(is_left)
-        if not len(left):
-            break
-        piece = pieces_of(Edges.of(directed_edges(corners[left])), len(left))
-        order = np.argsort(piece, kind="stable")
-        for rows in np.split(left[order], np.flatnonzero(np.diff(piece[order])) + 1):
-            if len(rows) >= _LEAST_FACES and _is_closed(corners[rows]):
+        for rows in _pieces(x, faces[left]) if len(left) else ():
+            rows = left[rows]
+            if len(rows) >= _LEAST_FACES and _is_closed(joined[rows]):
                 found.append(rows)
                 is_left[rows] = False
     return found if len(found) <= _MOST_PARTS else []
+
+
+def _pieces(x: FloatArray, faces: IntArray) -> list[IntArray]:
+    """Faces, by index, that belong together at edges."""
+    import scipy.sparse  # here: half a second that few need
+    import scipy.sparse.csgraph as csgraph_module
+
+    sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
+    pairs, m = directed_edges(faces), len(faces)
+    edges = Edges.of(pairs)
+    beside = [edges.twice() % m]
+    start = np.cumsum(edges.uses) - edges.uses
+    for k in np.flatnonzero((edges.uses > 2) & (edges.uses % 2 == 0)):
+        halves = edges.order[start[k] : start[k] + edges.uses[k]]
+        is_along = pairs[halves, 0] == edges.ends[k, 0]
+        rows = halves % m
+        third = faces[rows].sum(axis=1) - pairs[halves].sum(axis=1)
+        beside.append(rows[_wedges(x[edges.ends[k]], x[third], is_along)])
+    one, other = np.concatenate(beside).T
+    graph = sparse.coo_matrix((np.ones(len(one)), (one, other)), shape=(m, m))
+    piece = np.asarray(csgraph.connected_components(graph, directed=False)[1], np.int64)
+    order = np.argsort(piece, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(piece[order])) + 1)
+
+
+def _wedges(ends: FloatArray, third: FloatArray, is_along: BoolArray) -> IntArray:
+    """(k, 2) which faces around an edge have material between them.
+
+    ends: (2, 3) of the edge. third: (n, 3) the other corners of its faces; is_along: (n,) whether
+        they run it from the first end to the second.
+
+    Seen against the edge's direction, counter-clockwise, material begins behind a face that runs
+    the edge backwards, since its positive side looks back, and ends at the next one that runs it
+    forwards. Of faces in one direction those at which material ends come first.
+    """
+    way = ends[1] - ends[0]
+    away = third - ends[0]
+    away -= np.outer(away @ way / (way @ way), way)
+    one = away[0] / max(float(np.linalg.norm(away[0])), 1e-300)
+    other = np.cross(way / np.linalg.norm(way), one)
+    turn = np.arctan2(away @ other, away @ one) / (2 * np.pi)
+    steps = np.round(turn / _SAME_TURN).astype(np.int64) % round(1 / _SAME_TURN)
+    open_ones, found = list[int](), list[tuple[int, int]]()
+    is_taken = np.zeros(len(third), np.bool_)
+    for k in 2 * np.lexsort((~is_along, steps)).tolist():  # twice around
+        if is_taken[k]:
+            continue
+        if not is_along[k] and k not in open_ones:
+            open_ones.append(k)
+        elif is_along[k] and open_ones:
+            found.append((open_ones.pop(), k))
+            is_taken[list(found[-1])] = True
+    return np.array(found, np.int64).reshape(-1, 2)
 
 
 def _is_closed(faces: IntArray) -> bool:
@@ -80,35 +138,43 @@ def nested(x: FloatArray, parts: list[IntArray]) -> list[list[int]]:
     return found
 
 
-def united_parts(x: FloatArray, faces: IntArray) -> Solid:
-    """The union of the closed parts of a mesh, which may touch; those that are inside out are cut
-    away, from the smallest part that they lie in, or from all.
+def united_parts(x: FloatArray, faces: IntArray, parts: list[IntArray], within: float) -> Surface:
+    """The boundary of the points around which closed parts wind at least once, in all. They may
+    cross, touch and lie in each other, and wind clockwise.
+
+    Proof. Let L_k be the points around which the parts so far wind at least k times. With one more
+    these are, if it winds counter-clockwise around the points of P, those of L_k and those of both
+    L_(k-1) and P, and if it winds clockwise those of L_(k+1), and those of L_k outside of P. Those
+    that wind clockwise come last, so that all sets but L_0, which is all of space, have bounds.
+
+    faces: (m, 3). parts: indices of those of each part. within: a length by which slivers that are
+        made where parts cross may be moved.
 
     Raises:
-        MeshError: a face belongs to no closed part, or there is one part alone; or as `MeshSolid`.
+        MeshError: a part passes through itself.
+        MeshingError: a part is no manifold; or nothing is left.
     """
-    welded = weld_vertices(x)[faces]
-    parts = closed_parts(faces, welded)
-    if sum(map(len, parts)) < len(faces):  # faces on each other hide parts, and are no boundary
-        welded = net_faces(welded).faces
-        parts = closed_parts(welded)
-    if len(parts) < 2 or sum(map(len, parts)) < len(welded):
-        raise MeshError("it is not made of closed parts")
-    shells = [welded[rows] for rows in parts]
-    is_body = [volume_of(x, shell) > 0 for shell in shells]
-    cut: dict[int, list[Solid]] = {k: [] for k in range(-1, len(shells))}
-    for k, around in enumerate(nested(x, shells)):
-        if not is_body[k]:
-            owner = next((j for j in around if is_body[j]), -1)
-            cut[owner].append(Complement(MeshSolid(x, shells[k][:, ::-1])))
-    bodies: list[Solid] = [
-        _all_of(MeshSolid(x, shells[k]), cut[k]) for k in range(len(shells)) if is_body[k]
-    ]
-    if not bodies:
-        raise MeshError("all of its parts are inside out")
-    whole = bodies[0] if len(bodies) == 1 else Combined(tuple(bodies), is_union=True)
-    return _all_of(whole, cut[-1])
+    from manifold3d import Manifold
+
+    made = [_manifold_of_part(x, faces[rows]) for rows in parts]
+    clockwise = [one for one, is_body in made if not is_body]
+    levels = [Manifold() for _ in range(len(clockwise) + 1)]
+    for part in (one for one, is_body in made if is_body):
+        shared = [levels[k] ^ part for k in range(len(levels) - 1)]
+        levels = [levels[0] + part, *(a + b for a, b in zip(levels[1:], shared, strict=True))]
+    for part in clockwise:
+        levels = [above + (one - part) for one, above in itertools.pairwise(levels)]
+    surface = apart_of(levels[0], within)
+    check_manifold(surface.faces, surface.vertices)
+    return surface
 
 
-def _all_of(solid: Solid, cut: list[Solid]) -> Solid:
-    return Combined((solid, *cut), is_union=False) if cut else solid
+def _manifold_of_part(x: FloatArray, faces: IntArray) -> tuple[Manifold, bool]:
+    """What a closed part bounds, and whether it winds counter-clockwise around that."""
+    is_body = volume_of(x, faces) > 0
+    surface = Surface.of(x, faces if is_body else faces[:, ::-1])
+    if len(crossing := intersecting_faces(surface.vertices, surface.faces)):
+        raise MeshError(
+            f"{len(crossing):,} triangles of one of its parts pass through others of it"
+        )
+    return manifold_of(surface), is_body

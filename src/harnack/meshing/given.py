@@ -85,7 +85,8 @@ class Given:
     """A mesh whose corners are joined and that is not inside out.
 
     vertices: (n, 3). faces: (m, 3); is_turned: (m,) which of them were turned over.
-    oriented: (k, 3) faces that agree with their neighbors where that is possible.
+    oriented: (k, 3) faces that agree with their neighbors where that is possible. parts: of these
+        the closed ones, which may touch, cross or lie in each other (`closed_parts`).
     rounded: how many corners were joined with others, apart by rounding.
     """
 
@@ -93,6 +94,7 @@ class Given:
     faces: IntArray
     is_turned: BoolArray
     oriented: IntArray
+    parts: list[IntArray]
     rounded: int
 
     @classmethod
@@ -110,22 +112,23 @@ class Given:
         """
         x, faces = validate_mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces), flat=True)
         welded = Welded.of(x, faces)
+        known, raw = welded.index[faces], faces
         if welded.rounded:
-            faces = welded.index[faces]
-        known = welded.index[faces]
+            faces = known
         rows = np.flatnonzero((known != np.roll(known, 1, axis=1)).all(axis=1))
         if not len(welded.net.faces):  # every face is there with its reverse
             rows = rows[np.unique(np.sort(known[rows], axis=1), axis=0, return_index=True)[1]]
         known, is_turned = known[rows], np.zeros(len(faces), np.bool_)
         if as_it_is or not len(rows):
-            return cls(x, faces, is_turned, known, welded.rounded)
+            return cls(x, faces, is_turned, known, [], welded.rounded)
         disagrees = against_neighbors(x, known)
         agreeing = _turned(known, disagrees)
-        turned = _inside_out(x, _turned(faces[rows], disagrees), agreeing)
+        parts = closed_parts(x, _turned(raw[rows], disagrees), agreeing)
+        turned = _inside_out(x, agreeing, parts)
         oriented = _turned(agreeing, turned)
         if not disagrees.any():  # else it is no part as a whole that is turned
             is_turned[rows] = turned
-        return cls(x, _turned(faces, is_turned), is_turned, oriented, welded.rounded)
+        return cls(x, _turned(faces, is_turned), is_turned, oriented, parts, welded.rounded)
 
     @functools.cached_property
     def size(self) -> float:
@@ -274,11 +277,9 @@ def _distance(point: FloatArray, corner: FloatArray) -> float:
 # Parts that are inside out.
 
 
-def _inside_out(x: FloatArray, raw: IntArray, faces: IntArray) -> BoolArray:
-    """(m,) which faces to turn over for what was given not to be inside out. raw: (m, 3), before
-    corners were joined."""
+def _inside_out(x: FloatArray, faces: IntArray, parts: list[IntArray]) -> BoolArray:
+    """(m,) which faces to turn over for what was given not to be inside out. parts: closed ones."""
     turned, is_closed = np.zeros(len(faces), np.bool_), np.zeros(len(faces), np.bool_)
-    parts = closed_parts(raw, faces)
     volumes = [volume_of(x, faces[rows]) for rows in parts]
     for rows, around in zip(parts, nested(x, [faces[rows] for rows in parts]), strict=True):
         outermost = volumes[around[-1]] if around else volume_of(x, faces[rows])

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from harnack.backend.numbers import positive
-from harnack.fields import Solid
 from harnack.fields.solid_angles.winding_number import WindingNumber
 from harnack.fields.solids.mesh_solid import MeshSolid
 from harnack.geometry import MeshError, validate_mesh, zero_area_faces
@@ -302,17 +301,16 @@ def _united(given: Given, asked: _Asked) -> tuple[Surface, dict[str, Any]]:
         raise MeshError("the mesh is not closed")
     if _is_fine(vertices, faces):
         raise MeshError("nothing of it passes through or lies in itself")
-    try:
-        solid: Solid = MeshSolid(vertices, faces)
-    except MeshError as error:
-        asked.report(f"{error}; so part by part")
+    facts = {"stage": "united", "kept": 0}
+    if len(given.parts) > 1 and sum(map(len, given.parts)) == len(faces):
+        asked.report(f"uniting {len(given.parts):,} parts")
         try:
-            solid = united_parts(vertices, faces)
-        except MeshError as another:
-            raise MeshError(f"{error}; and part by part {another}") from None
-    made = mesh_of(solid, progress=asked.report)
-    surface = Surface(np.asarray(made.vertices), np.asarray(made.faces, np.int64))
-    return surface, {"stage": "united", "kept": 0}
+            slivers = 0.5 * asked.tolerance * given.size
+            return united_parts(vertices, faces, given.parts, slivers), facts
+        except (MeshError, MeshingError) as error:
+            asked.report(f"{error}; so all at once")
+    made = mesh_of(MeshSolid(vertices, faces), progress=asked.report)
+    return Surface(np.asarray(made.vertices), np.asarray(made.faces, np.int64)), facts
 
 
 def _is_fine(vertices: FloatArray, faces: IntArray) -> bool:

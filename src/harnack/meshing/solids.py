@@ -70,6 +70,7 @@ __all__ = [
     "AngleMesher",
     "RegionMesher",
     "SolidMesh",
+    "apart_of",
     "ends_of_solid",
     "is_smooth",
     "mesh_solid",
@@ -609,6 +610,15 @@ def _checked(
     return made
 
 
+def apart_of(whole: Manifold, tolerance: float) -> Surface:
+    """The surface of parts put together, of which no triangles pass through each other.
+
+    Raises:
+        MeshingError: it is empty, or triangles cross.
+    """
+    return _apart(_Joined(whole), tolerance)
+
+
 def _apart(parts: Surface | _Joined, tolerance: float) -> Surface:
     """The surface, of which no triangles pass through each other; of parts put together mended, or
     without slivers.
@@ -633,16 +643,17 @@ def _apart(parts: Surface | _Joined, tolerance: float) -> Surface:
 
 @dataclass(frozen=True)
 class _Joined:
-    """Parts put together, in a volume."""
+    """Parts put together, in a volume or in all of space."""
 
     whole: Manifold
-    volume: Volume
+    volume: Volume | None = None
 
     def without_slivers(self, length: float) -> Surface:
         """The surface, short edges and slivers left out within a length, and bodies that are
         nothing but rounding."""
         made = self.whole.simplify(length) if length > 0 else self.whole
-        return _on_box(without_films(surface_of(made)), self.volume)
+        surface = without_films(surface_of(made))
+        return surface if self.volume is None else _on_box(surface, self.volume)
 
 
 def _put_together(

@@ -29,7 +29,7 @@ from harnack.meshing.edges import Edges, IntArray, boundary_edges, crosses, dire
 from harnack.meshing.hole_patches import filled, hole_loops
 from harnack.meshing.lattice_surface import Surface
 
-__all__ = ["Mended", "against_neighbors", "joined", "mended", "pieces_of"]
+__all__ = ["Mended", "against_neighbors", "joined", "mended"]
 
 # How often the rings around holes are left out; and what part of all triangles may be.
 _MOST_RINGS, _MOST_LEFT_OUT = 6, 0.5
@@ -193,7 +193,7 @@ class _State:
             edges = Edges.of(directed_edges(state.faces))
             if not (edges.uses > 2).any():
                 return state
-            piece = pieces_of(edges, len(state.faces))
+            piece = _pieces(edges, len(state.faces))
             uses = edges.uses[edges.index].reshape(3, -1)
             count = int(piece.max()) + 1
             branches, ends = (
@@ -243,7 +243,7 @@ class _State:
         return Mended(surface, kept, kept[turned], self.counts, holes)
 
 
-def pieces_of(edges: Edges, count: int) -> IntArray:
+def _pieces(edges: Edges, count: int) -> IntArray:
     """(m,) which of the pieces that edges of two faces hold together each of `count` faces belongs
     to. edges: those of `directed_edges`."""
     import scipy.sparse  # here: half a second that few need
