@@ -103,6 +103,8 @@ def test_curves_are_small() -> None:
 
 
 PROGRAM = """
+from typing import Generic, TypeVar
+import constants
 import harnack as hk
 from harnack.cluster.packing import name_of
 
@@ -113,20 +115,30 @@ class Doubled(hk.Sphere):
         return 2 * super().value(*points, **settings)
 
     def another(self):
-        return Doubled(3.0)
+        return Doubled(constants.radius())
+
+T = TypeVar("T")
+class Kept(Generic[T]):
+    pass
 
 factor = 3.0
 def helper(x):
     return factor * x if x in {"a", "b", "c"} else helper(x)
-print(name_of([Doubled(1.0), lambda x: helper(x), {"a", "b", "c"}], "test"))
+print(name_of([Doubled(1.0), Kept[int](), lambda x: helper(x), {"a", "b", "c"}], "test"))
 """
 
 
 def test_programs_find_what_they_did_when_they_are_started_again(tmp_path: Path) -> None:
-    """Also with a comment more, which moves all lines. Another program finds nothing of it."""
+    """Also with a comment more, which moves all lines, and with modules that hold more. With
+    another constant in a module a program finds nothing of it."""
     said: list[str] = []
-    for k, text in enumerate((PROGRAM, "# more\n" + PROGRAM, PROGRAM.replace("2 *", "4 *"))):
-        (tmp_path / "program.py").write_text(text)
+    for k, (more, radius) in enumerate((("", 3), ("# more\n", 3), ("", 4))):
+        (tmp_path / "program.py").write_text(more + PROGRAM)
+        (tmp_path / "constants.py").write_text(
+            "import time\n"
+            f"RADIUS, began = {radius}, time.time()\n"
+            "def radius():\n    return RADIUS\n"
+        )
         given = [sys.executable, str(tmp_path / "program.py")]
         env = {**os.environ, "PYTHONHASHSEED": str(k)}
         said.append(subprocess.run(given, env=env, capture_output=True, check=True).stdout.decode())
@@ -163,20 +175,117 @@ class Mine(hk.Sphere):
     assert names[0] != names[1]
 
 
+@pytest.fixture
+def own_modules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """A module of a user that another one and a package, without a file of its own, lead to."""
+    (tmp_path / "own_settings.py").write_text(
+        "import functools, threading, own_paths\n"
+        "LOCK, RADIUS = threading.Lock(), 1.0\n"
+        "def radius():\n    return own_paths.around()\n"
+        "@functools.cache\ndef kept():\n    return RADIUS\n"
+        "class Own:\n    def radius(self):\n        return RADIUS\n"
+    )
+    (tmp_path / "own_paths.py").write_text(
+        "import own_settings\ndef around():\n    return own_settings.RADIUS\n"
+    )
+    (tmp_path / "own_package").mkdir()
+    (tmp_path / "own_package" / "part.py").write_text("import own_settings as settings\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    yield importlib.import_module("own_package.part")
+    for name in ("own_settings", "own_paths", "own_package.part", "own_package"):
+        sys.modules.pop(name, None)
+
+
+def test_modules_that_functions_name_are_sent_as_they_are_here(own_modules: Any) -> None:
+    """What they hold, by whichever way it is reached, and not what nobody names: a lock."""
+    package, settings = sys.modules["own_package"], own_modules.settings
+    ways: dict[str, Any] = {
+        "attribute": lambda: settings.RADIUS,
+        "function": lambda: settings.radius(),
+        "class": lambda: settings.Own().radius(),
+        "kept": lambda: settings.kept(),
+        "package": lambda: package.part.settings.RADIUS,
+        "argument": lambda module=settings: module.RADIUS,
+        "in a set": lambda functions=frozenset([lambda: settings.RADIUS]): max(
+            function() for function in functions
+        ),
+    }
+    for name, way in ways.items():
+        settings.RADIUS = 1.0
+        before = Packed.of(way, name)
+        settings.RADIUS = 2.0
+        settings.kept.cache_clear()
+        after = Packed.of(way, name)
+        assert before.name != after.name, name
+        settings.RADIUS = 3.0
+        assert (before.open()(), after.open()()) == (1, 2), name
+
+
+def test_what_is_not_seen_of_modules_is_refused(own_modules: Any) -> None:
+    def within() -> Any:
+        import own_settings  # pyright: ignore[reportMissingImports]
+
+        return own_settings.RADIUS  # pyright: ignore[reportUnknownVariableType]
+
+    with pytest.raises(TypeError, match=r"within .* imports your module own_settings when it is "):
+        Packed.of(within, "test")
+
+    def by_name(name: str) -> Any:
+        return getattr(own_modules.settings, name, None)
+
+    there = Packed.of(by_name, "test").open()
+    assert there("NEVER") is None
+    with pytest.raises(RuntimeError, match=r"RADIUS of your module own_settings was not sent"):
+        there("RADIUS")
+
+
+factor = 2.0
+
+
+class Scaled:
+    def factor(self) -> float:
+        return factor
+
+
+def test_opening_leaves_the_classes_of_this_process_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their methods were replaced by those that were sent, for which constants never change."""
+    here = Scaled()
+    there = Packed.of(here, "test").open()
+    monkeypatch.setattr(sys.modules[__name__], "factor", 5.0)
+    assert (here.factor(), there.factor()) == (5, 2)
+
+
+def test_installed_packages_count_by_their_versions() -> None:
+    scipy = importlib.import_module("scipy")
+    packed = Packed.of(lambda: scipy.special.j0(1.0), "test")
+    assert packed.others == (("scipy", scipy.__version__),)
+    with pytest.raises(RuntimeError, match=r"sent by harnack .*scipy 0\.1, and here is .*scipy 1"):
+        replace(packed, others=(("scipy", "0.1"),)).open()
+
+
 def test_files_count_by_what_is_in_them(tmp_path: Path) -> None:
-    file = tmp_path / "wood.png"
-    file.write_bytes(b"brown")
-    for described in ({"type": "bitmap", "filename": str(file)}, [file]):
+    file, scan = tmp_path / "wood.png", tmp_path / "wood"
+    for described in ({"type": "bitmap", "filename": str(file)}, [file], Counted(str(scan))):
+        file = scan if isinstance(described, Counted) else file
         file.write_bytes(b"brown")
         packed = Packed.of(described, "test")
-        assert packed.open() == described
+        assert isinstance(described, Counted) or packed.open() == described
         file.write_bytes(b"green")
         changed = Packed.of(described, "test")
         assert changed.name != packed.name
         missing = Packed.of(described, "test again")
         file.unlink()
-        with pytest.raises(ValueError, match=r"wood.png is not here"):
+        with pytest.raises(ValueError, match=r"wood(.png)? is not here"):
             replace(missing, name="0" * 32).open()
+
+
+def test_names_of_attributes_are_no_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    before = Packed.of(Counted(1), "test")
+    for name in ("number", "kept", "twice", "Remembered"):
+        (tmp_path / name).write_text("a log that grows")
+    assert Packed.of(Counted(1), "test") == before
 
 
 def test_other_versions_open_nothing() -> None:

@@ -5,9 +5,10 @@ equal objects would differ. It is what `functools.cached_property` and a `Rememb
 private fields of dataclasses that are not compared.
 
 Functions and classes are sent by name if they are part of Python or of an installed package. Those
-of users are sent themselves: a worker may lack their module, or have imported it before it was
-changed. They are named by what they do, so that the same program, started again, finds what it
-did: not by the lines on which they stand, nor by the numbers that cloudpickle gives them.
+of users are sent themselves, with what they name of users' modules (`users_code.py`). They are
+named by what they do, so that the same program, started again, finds what it did: not by the lines
+on which they stand, nor by the numbers that cloudpickle gives them. Nor are these numbers sent: by
+them, what is opened here would replace the methods of the classes of this process.
 """
 
 from __future__ import annotations
@@ -22,16 +23,26 @@ import os
 import pickle
 import re
 import sys
-import sysconfig
 import threading
-from collections.abc import Callable, Generator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
 from typing import Any, TypeVar, cast
 
 from harnack._version import __version__
+from harnack.cluster.users_code import (
+    Namespace,
+    attributes_named,
+    compiled_file,
+    fill,
+    function_in,
+    installed_version,
+    is_sent_itself,
+    itself,
+    refuse_imports_within,
+    words_of,
+)
 
 Key = TypeVar("Key")
 Value = TypeVar("Value")
@@ -82,13 +93,15 @@ class Remembered(dict[Key, Value]):
 @dataclass(frozen=True)
 class Packed:
     """An object as bytes. name: 32 hexadecimal digits, the same for what is made of the same
-    numbers by the same versions of this library and of `packages`. files: which it names, and
-    what is in them. made_by: `packages` where it was packed."""
+    numbers by the same versions of this library, of `packages` and of `others`. files: which it
+    names, and what is in them. made_by: `packages` where it was packed. others: installed packages
+    that it uses, and their versions there."""
 
     name: str
     data: bytes
     files: tuple[tuple[str, str], ...] = ()
     made_by: str = ""
+    others: tuple[tuple[str, str], ...] = ()
 
     @classmethod
     def of(cls, thing: Any, what: str) -> Packed:
@@ -98,8 +111,10 @@ class Packed:
             ModuleNotFoundError: the extra `cluster` is not installed.
             TypeError: it cannot be packed. The messages begin with `what`.
         """
-        name, files = _named(thing, what)
-        return cls(name, _bytes_of(thing, what), tuple(sorted(files.items())), packages())
+        name, naming = _named(thing, what)
+        data = _written(_lean, thing, what).file.getvalue()
+        files, others = sorted(naming.files.items()), sorted(naming.others.items())
+        return cls(name, data, tuple(files), packages(), tuple(others))
 
     def open(self) -> Any:
         """The object. The same one as long as it is among the last that were opened here, so that
@@ -117,13 +132,16 @@ class Packed:
 
 @functools.lru_cache(maxsize=4)
 def _opened(packed: Packed) -> Any:
-    if packed.made_by != packages():
+    there = [packed.made_by, *(f"{name} {version}" for name, version in packed.others)]
+    here = [packages(), *(f"{name} {installed_version(name)}" for name, _ in packed.others)]
+    if there != here:
         raise RuntimeError(
-            f"this was sent by {packed.made_by}, and here is {packages()}: install the same on "
-            "all machines"
+            f"this was sent by {', '.join(there)}, and here is {', '.join(here)}: install the same "
+            "on all machines"
         )
     for name, contents in packed.files:
-        if _contents(name) != contents:
+        here_in_it = _contents(name)
+        if here_in_it != contents and not (here_in_it is None and name.isidentifier()):
             raise ValueError(
                 f"the file {name} is not here, or not as it was where it was named: put it on all "
                 "machines under the same name, with the whole path"
@@ -144,80 +162,57 @@ def name_of(thing: Any, what: str) -> str:
     return _named(thing, what)[0]
 
 
-def _named(thing: Any, what: str) -> tuple[str, dict[str, str]]:
-    """The name of an object, and a digest of each file that it names."""
+def _named(thing: Any, what: str, words: frozenset[str] = frozenset()) -> tuple[str, Any]:
+    """The name of an object, and the pickler that wrote down what it is made of."""
     try:
-        data, files = _words_of(thing, what, share=False)
+        pickler = _written(_naming, thing, what, words, fast=True)
     except (RecursionError, TypeError, ValueError):  # an object that holds itself
-        data, files = _words_of(thing, what, share=True)
-    return hashlib.blake2b(packages().encode() + data, digest_size=16).hexdigest(), files
+        pickler = _written(_naming, thing, what, words)
+    data = f"{packages()} {sorted(pickler.others.items())}".encode() + pickler.file.getvalue()
+    return hashlib.blake2b(data, digest_size=16).hexdigest(), pickler
 
 
-def _bytes_of(thing: Any, what: str) -> bytes:
-    file = io.BytesIO()
-    _dump(_lean(_cloudpickle(what).Pickler)(file, protocol=_PROTOCOL), thing, what)
-    return file.getvalue()
+def _written(
+    kind: Callable[[Any], Any], thing: Any, what: str, words: frozenset[str] = frozenset(), *,
+    fast: bool = False,
+) -> Any:  # fmt: skip
+    """The pickler of a kind, after it has written an object into its `file`.
 
-
-def _words_of(thing: Any, what: str, *, share: bool) -> tuple[bytes, dict[str, str]]:
-    """Bytes that say what is in an object, to be compared and not to be read, and its files."""
-    file = io.BytesIO()
-    pickler = _naming(_cloudpickle(what).Pickler)(file, protocol=_PROTOCOL)
-    files: dict[str, str] = {}
-    pickler.what, pickler.files, pickler.begun, pickler.fast = what, files, {}, not share
-    _dump(pickler, thing, what)
-    return file.getvalue(), files
-
-
-def _cloudpickle(what: str) -> Any:
-    return load_module("cloudpickle", what)
-
-
-def _dump(pickler: Any, thing: Any, what: str) -> None:
-    try:
-        with _users_code_by_value(_cloudpickle(what)):
-            pickler.dump(thing)
-    except (pickle.PicklingError, TypeError, AttributeError) as error:
-        raise TypeError(
-            f"{what}: it cannot be sent to another process or written down ({error}); make it of "
-            "arrays, numbers and the classes of this library"
-        ) from error
-
-
-@contextmanager
-def _users_code_by_value(cloudpickle: Any) -> Generator[None]:
-    """Within, cloudpickle writes out functions and classes of modules that are not installed."""
-    with _BY_VALUE:
-        there = set(cloudpickle.list_registry_pickle_by_value())
-        modules = [
-            one
-            for name, one in list(sys.modules.items())
-            if getattr(one, "__name__", None) == name and name not in there
-            and _is_users(name, getattr(one, "__file__", None))
-        ]  # fmt: skip
-        for one in modules:
-            cloudpickle.register_pickle_by_value(one)
+    What is named of modules is known when all code was written. So it writes again until nothing
+    is missing, which ends, since there are so many names in the code.
+    """
+    cloudpickle = load_module("cloudpickle", what)
+    while True:
+        pickler = kind(cloudpickle.Pickler)(what, words)
+        pickler.fast = fast
         try:
-            yield
+            pickler.dump(thing)
+        except (pickle.PicklingError, TypeError, AttributeError) as error:
+            raise TypeError(
+                f"{what}: it cannot be sent to another process or written down ({error}); make it "
+                "of arrays, numbers and the classes of this library"
+            ) from error
+        words = frozenset(pickler.words)
+        if all(len(attributes_named(*one)) == len(attributes_named(one[0], words))
+               for one in pickler.modules):  # fmt: skip
+            return pickler
+
+
+def _by_value(obj: Any, reduce: Callable[[Any], Any]) -> Any:
+    """What cloudpickle's `reduce` makes of a function, class or type variable, which is what it is
+    made of, and not its name, if it is of a user's module."""
+    module = sys.modules.get(str(getattr(obj, "__module__", None)))
+    if module is None or not is_sent_itself(module):
+        return reduce(obj)
+    with _BY_VALUE:
+        cloudpickle = load_module("cloudpickle", "to send code")
+        was_there = module.__name__ in cloudpickle.list_registry_pickle_by_value()
+        cloudpickle.register_pickle_by_value(module)
+        try:
+            return reduce(obj)
         finally:
-            for one in modules:
-                cloudpickle.unregister_pickle_by_value(one)
-
-
-@functools.cache
-def _is_users(name: str, file: str | None) -> bool:
-    """Whether a module is neither a part of Python nor of an installed package or this one."""
-    root = name.partition(".")[0]
-    if file is None or root in sys.stdlib_module_names or root in ("__main__", "harnack"):
-        return False
-    path = Path(file).resolve()
-    if {"site-packages", "dist-packages"} & set(path.parts):
-        return False
-    places = sysconfig.get_paths()
-    return not any(
-        path.is_relative_to(Path(places[one]).resolve())
-        for one in ("stdlib", "platstdlib", "purelib", "platlib")
-    )
+            if not was_there:
+                cloudpickle.unregister_pickle_by_value(module)
 
 
 def _contents(name: str) -> str | None:
@@ -240,20 +235,46 @@ def _cached_property(function: Callable[..., Any], name: str) -> functools.cache
     return made
 
 
+def _cached_function(function: Callable[..., Any], settings: dict[str, Any]) -> Any:
+    return functools.lru_cache(**settings)(function)
+
+
+_CachedFunction = type(functools.cache(_cached_property))
+
+
 @functools.cache
 def _lean(base: Any) -> Callable[..., Any]:
-    """cloudpickle's class, which knows functions too, without what objects remember."""
+    """cloudpickle's class, which knows functions too, without what objects remember.
+
+    words: names in the code of users. modules: those of users that were met, with the words of
+    then. spaces: where functions of a module look for names.
+    """
 
     class Lean(base):
+        def __init__(self, what: str, words: frozenset[str]) -> None:
+            self.file = io.BytesIO()
+            super().__init__(self.file, protocol=_PROTOCOL)
+            self.what = what
+            self.words = set(words)
+            self.modules: list[tuple[ModuleType, frozenset[str]]] = []
+            self.spaces: dict[int, Namespace] = {}
+
         def reducer_override(self, obj: Any) -> Any:
-            if isinstance(obj, ModuleType) and sys.modules.get(obj.__name__) is obj:
-                return importlib.import_module, (obj.__name__,)
+            if isinstance(obj, ModuleType):
+                return self.of_module(obj)
             if isinstance(obj, functools.cached_property):  # which holds a lock in Python 3.11
                 return _cached_property, (obj.func, obj.attrname)
+            reduce = functools.partial(base.reducer_override, self)
+            if isinstance(obj, TypeVar):
+                return _without_number(_by_value(obj, base.dispatch_table[TypeVar]))
+            if isinstance(obj, type):
+                return _without_number(_by_value(obj, reduce))
+            if isinstance(obj, FunctionType):
+                return self.of_function(obj, _by_value(obj, reduce))
             kind: type = obj.__class__
             remembered = _remembered(kind)
             if not remembered:
-                return base.reducer_override(self, obj)
+                return _not_by_name(obj)
             make, arguments, state, *rest = (*obj.__reduce_ex__(_PROTOCOL), None)[:6]
             if isinstance(state, dict):
                 given = cast("dict[str, Any]", state)
@@ -261,51 +282,169 @@ def _lean(base: Any) -> Callable[..., Any]:
                 state = {key: one for key, one in state.items() if one is not _LEFT_OUT}
             return make, arguments, state, *rest[:3]
 
+        def of_module(self, module: ModuleType) -> Any:
+            if not is_sent_itself(module):
+                return importlib.import_module, (module.__name__,)
+            words = frozenset(self.words)
+            self.modules.append((module, words))
+            attributes = attributes_named(module, words)
+            left_out = frozenset(vars(module)) - frozenset(attributes)
+            return itself, (self.space(vars(module)),), (attributes, left_out), None, None, fill
+
+        def of_function(self, function: FunctionType, reduced: Any) -> Any:
+            if not isinstance(reduced, tuple):
+                return reduced
+            refuse_imports_within(function)
+            self.words |= words_of(function)
+            _, (code, _, _, _, closure), *rest = cast("tuple[Any, ...]", reduced)
+            return function_in, (self.space(function.__globals__), code, closure), *rest
+
+        def space(self, names: dict[str, Any]) -> Namespace:
+            return self.spaces.setdefault(id(names), Namespace.of(names))
+
     return Lean
+
+
+def _without_number(reduced: Any) -> Any:
+    """How a class is made anew, without the number by which cloudpickle finds what it made of it
+    before: it would set the methods of that."""
+    if not isinstance(reduced, tuple):
+        return reduced
+    make, arguments, *rest = cast("tuple[Any, ...]", reduced)
+    return make, tuple(None if _is_made_up(one) else one for one in arguments), *rest
+
+
+def _not_by_name(obj: Any) -> Any:
+    """`NotImplemented`, where an object does not stand for a name in a module of a user; else what
+    it is made of.
+
+    Raises:
+        TypeError: that cannot be told.
+    """
+    module = sys.modules.get(str(getattr(obj, "__module__", None)))
+    if module is None or not hasattr(obj, "__qualname__") or not is_sent_itself(module):
+        return NotImplemented
+    if isinstance(obj, _CachedFunction):
+        return _cached_function, (obj.__wrapped__, obj.cache_parameters())
+    if isinstance(obj.__reduce_ex__(_PROTOCOL), str):
+        raise TypeError(
+            f"{obj.__qualname__} of your module {module.__name__} can be sent by its name only, "
+            "which does not tell what it does"
+        )
+    return NotImplemented
 
 
 @functools.cache
 def _naming(base: Any) -> Callable[..., Any]:
     """The same without all that differs when a program is started again, and with what is in the
-    files that are named."""
+    files that are named.
+
+    files: a digest of each. others: versions of installed packages that are used.
+    """
     lean: Any = _lean(base)
 
     class Naming(lean):
-        what: str
-        files: dict[str, str]
-        begun: dict[int, tuple[Any, int]]
+        def __init__(self, what: str, words: frozenset[str]) -> None:
+            super().__init__(what, words)
+            self.files: dict[str, str] = {}
+            self.others: dict[str, str] = {}
+            self.begun: dict[int, tuple[Any, int]] = {}
 
         def persistent_id(self, obj: Any) -> Any:
             kind = cast("type[Any]", type(obj))
-            if id(obj) in self.begun:  # classes and functions may name themselves
+            if id(obj) in self.begun:  # classes, functions and modules may name themselves
                 return f"number {self.begun[id(obj)][1]}"
             if kind is set or kind is frozenset:  # whose order differs
                 members = cast("set[Any] | frozenset[Any]", obj)
-                return kind.__name__, sorted(name_of(one, self.what) for one in members)
-            if not isinstance(obj, str | os.PathLike):
-                return None
+                words = frozenset(cast("set[str]", self.words))
+                named = [_named(one, self.what, words) for one in members]
+                for _, other in named:
+                    self.words |= other.words
+                    self.modules += other.modules
+                    self.files |= other.files
+                    self.others |= other.others
+                return kind.__name__, sorted(name for name, _ in named)
+            return self.of_file(obj) if isinstance(obj, str | os.PathLike) else None
+
+        def of_file(self, obj: Any) -> str | None:
             path = os.fsdecode(cast("str | os.PathLike[str]", obj))
-            suffix = os.path.splitext(path)[1]
-            if not suffix or suffix in _CODE or (contents := _contents(path)) is None:
+            if path.endswith(_CODE) or (contents := _contents(path)) is None:
                 return None
             self.files[path] = contents
             return f"file {contents}"
 
         def reducer_override(self, obj: Any) -> Any:
+            if obj is tuple:  # in which all else is written
+                return NotImplemented
             if isinstance(obj, CodeType):
-                return tuple, ([getattr(obj, one, None) for one in _SAID_BY_CODE],)
+                said = [getattr(obj, one, None) for one in _SAID_BY_CODE]
+                return tuple, ([obj.co_consts, repr(said).encode()],)
+            if isinstance(obj, functools.cached_property):
+                return tuple, ([obj.func],)
+            self.say_where_from(obj)
             found = lean.reducer_override(self, obj)
-            if isinstance(obj, type | FunctionType) and isinstance(found, tuple):
+            is_code = isinstance(obj, type | FunctionType | ModuleType)
+            if found is NotImplemented and type(obj) not in base.dispatch_table:
+                found = obj.__qualname__ if is_code else obj.__reduce_ex__(_PROTOCOL)
+            if isinstance(found, str):
+                return tuple, ([str(getattr(obj, "__module__", None)).encode(), found.encode()],)
+            if not isinstance(found, tuple) or len(cast("tuple[Any, ...]", found)) < 3:
+                return cast("Any", found)
+            make, arguments, state, *rest = cast("tuple[Any, ...]", found)
+            if isinstance(obj, ModuleType):  # what is left out says nothing
+                state, _ = state
+            state = _with_keys_apart(state)
+            if is_code:
                 self.begun[id(obj)] = (obj, len(self.begun))
-                _, arguments, *rest = cast("tuple[Any, ...]", found)
-                return tuple, ([*(one for one in arguments if not _is_made_up(one)), *rest[:-1]],)
-            return found
+                return tuple, ([*map(_apart, arguments), state],)
+            return make, arguments, state, *rest
+
+        def say_where_from(self, obj: Any) -> None:
+            """Note the package or the compiled file that the code of an object is in."""
+            name = obj.__name__ if isinstance(obj, ModuleType) else getattr(obj, "__module__", None)
+            if not isinstance(name, str):
+                return
+            root = name.partition(".")[0]
+            module = sys.modules.get(name)
+            if (
+                root not in (*_PACKAGES, "cloudpickle")
+                and (version := installed_version(root)) is not None
+            ):
+                self.others[root] = version
+            elif module is not None and (path := compiled_file(module)) is not None:
+                self.files[path] = str(_contents(path))
 
     return Naming
 
 
+# Attributes whose values are names as well, or say something of names.
+_SAY_NAMES = ("__name__", "__qualname__", "__module__", "__annotations__")
+_HAVE_NAMES = ("__globals__", "__kwdefaults__")
+
+
+def _with_keys_apart(state: Any) -> Any:
+    """What objects are made of, with names of attributes that are no strings: there may be files
+    that are called so."""
+    if isinstance(state, tuple):
+        return tuple(map(_with_keys_apart, cast("tuple[Any, ...]", state)))
+    if not isinstance(state, dict):
+        return state
+    given = dict(cast("dict[Any, Any]", state))
+    given |= {key: _apart(given[key]) for key in _SAY_NAMES if key in given}
+    given |= {key: _with_keys_apart(given[key]) for key in _HAVE_NAMES if key in given}
+    return [(_apart(key), one) for key, one in given.items()]
+
+
+def _apart(names: Any) -> Any:
+    """Strings, and those in a dictionary, as bytes."""
+    if isinstance(names, dict):
+        given = cast("dict[Any, Any]", names)
+        return [(_apart(key), _apart(one)) for key, one in given.items()]
+    return names.encode() if isinstance(names, str) else names
+
+
 _SAID_BY_CODE = (
-    "co_name", "co_code", "co_consts", "co_names", "co_varnames", "co_freevars", "co_cellvars",
+    "co_name", "co_code", "co_names", "co_varnames", "co_freevars", "co_cellvars",
     "co_argcount", "co_posonlyargcount", "co_kwonlyargcount", "co_flags", "co_exceptiontable",
 )  # fmt: skip
 

@@ -1,0 +1,242 @@
+"""Code of users: which it is, what is used of their modules, and modules as they are sent.
+
+Code of Python itself and of installed packages is sent by name. A user's module is sent itself, as
+it is here and now: a worker may lack it, or have imported it before it was changed, and a folder of
+finished parts must tell two states of it apart. All of it would be too much, since modules hold
+locks, clients and pictures too. What is sent is what the code that is sent names: attributes of
+these names. A module that was sent refuses all others by name, so that nothing is left out in
+silence.
+"""
+
+from __future__ import annotations
+
+import dis
+import functools
+import importlib.machinery
+import importlib.metadata
+import importlib.util
+import sys
+import sysconfig
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from types import CodeType, FunctionType, ModuleType
+from typing import Any, cast
+
+# Of these suffixes a module can be sent; others are compiled, and are files to be compared.
+_SOURCES = (*importlib.machinery.SOURCE_SUFFIXES, *importlib.machinery.BYTECODE_SUFFIXES)
+# Functions that see all attributes of a module at once.
+_FINDERS = frozenset(("vars", "dir", "__dict__", "getmembers"))
+# Functions that find modules whose names are in no import.
+_IMPORTERS = frozenset(("import_module", "__import__"))
+# What a function knows of its module without naming it.
+_OF_EACH = ("__package__", "__name__", "__path__", "__file__")
+# What belongs to the process that imported a module.
+_OF_IMPORT = frozenset(("__builtins__", "__spec__", "__loader__", "__cached__"))
+# The attribute of a module that was sent with the names of those that it lacks.
+_LEFT_OUT = "__left_out__"
+
+
+class SentModule(ModuleType):
+    """A user's module with what was sent of it. It is in no list of modules: what is imported here
+    under its name is another one."""
+
+    def __getattr__(self, name: str) -> Any:
+        if name in vars(self).get(
+            _LEFT_OUT, ()
+        ):  # no AttributeError, which `hasattr` would take for an answer
+            raise RuntimeError(
+                f"{name} of your module {self.__name__} was not sent, since no code that was sent "
+                f"names it; write `{self.__name__}.{name}` where it is used"
+            )
+        raise AttributeError(f"module {self.__name__!r} has no attribute {name!r}")
+
+
+@dataclass(frozen=True)
+class Namespace:
+    """The module in which functions look for names; it is opened as a `SentModule`.
+
+    known: what it holds whatever functions name.
+    """
+
+    known: Mapping[str, Any]
+
+    @classmethod
+    def of(cls, names: Mapping[str, Any]) -> Namespace:
+        """The namespace of a module, from its attributes by name."""
+        return cls({key: names[key] for key in _OF_EACH if key in names})
+
+    def __reduce__(self) -> Any:
+        return sent_module, (self.known,)
+
+
+def sent_module(known: Mapping[str, Any]) -> SentModule:
+    """A module with nothing but what is `known` of it."""
+    module = SentModule(str(known.get("__name__", "")))
+    vars(module).update(known)
+    return module
+
+
+def itself(module: SentModule) -> SentModule:
+    """The module. So a namespace that functions share becomes the module that they name."""
+    return module
+
+
+def fill(module: SentModule, given: tuple[Mapping[str, Any], frozenset[str]]) -> None:
+    """Give a module its attributes, and the names of those that are left out."""
+    attributes, left_out = given
+    vars(module).update(attributes, **{_LEFT_OUT: left_out - _OF_IMPORT})
+
+
+def function_in(module: SentModule, code: CodeType, closure: Any) -> FunctionType:
+    """A function that looks for names in a module."""
+    return FunctionType(code, vars(module), None, None, closure)
+
+
+def attributes_named(module: ModuleType, words: frozenset[str] | set[str]) -> dict[str, Any]:
+    """What code that has these words may use of a module, in the order of names."""
+    every = bool(words & _FINDERS)
+    return {
+        name: value
+        for name, value in sorted(vars(module).items())
+        if (every or name in words or name == "__getattr__") and name not in _OF_IMPORT
+    }
+
+
+def codes_within(code: CodeType) -> Iterator[CodeType]:
+    """A code and those of the functions and classes that it defines."""
+    yield code
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield from codes_within(constant)
+
+
+def words_of(function: FunctionType) -> set[str]:
+    """All names in the code of a function, and its texts, which may be names of attributes."""
+    return {
+        word
+        for code in codes_within(function.__code__)
+        for word in (*code.co_names, *_texts(code.co_consts))
+    }
+
+
+def _texts(constants: Iterable[Any]) -> Iterator[str]:
+    for constant in constants:
+        if isinstance(constant, str):
+            yield constant
+        elif isinstance(constant, tuple | frozenset):
+            yield from _texts(cast("Iterable[Any]", constant))
+
+
+def refuse_imports_within(function: FunctionType) -> None:
+    """Refuse a function that imports modules of users when it is called: which these are then, and
+    what is used of them, cannot be told.
+
+    Raises:
+        TypeError: it does.
+    """
+    package = function.__globals__.get("__package__") or ""
+    for code in codes_within(function.__code__):
+        names = [_imported(steps, package) for steps in _imports(code)]
+        if _IMPORTERS.intersection(code.co_names):
+            names += [
+                text for text in _texts(code.co_consts) if text.replace(".", "_").isidentifier()
+            ]
+        for name in names:
+            if _is_a_users_root(name.partition(".")[0]):
+                raise TypeError(
+                    f"{function.__qualname__} of the module {function.__module__} imports your "
+                    f"module {name} when it is called, and which that is then cannot be told; "
+                    "import it at the top of the module"
+                )
+
+
+def _imports(code: CodeType) -> Iterator[tuple[int, str]]:
+    """(level, name) of each import: how many packages up, and what from there."""
+    steps = [one for one in dis.get_instructions(code) if one.opname != "EXTENDED_ARG"]
+    for k, step in enumerate(steps):
+        if step.opname == "IMPORT_NAME":  # after its level and what is taken from the module
+            yield int(steps[k - 2].argval), str(step.argval)
+
+
+def _imported(step: tuple[int, str], package: str) -> str:
+    level, name = step
+    with suppress(ImportError):  # which the function will meet itself
+        return importlib.util.resolve_name("." * level + name, package)
+    return name
+
+
+def _is_a_users_root(root: str) -> bool:
+    module = sys.modules.get(root)
+    if module is not None:
+        return is_users(module)
+    spec = None
+    with suppress(ImportError, ValueError, AttributeError):
+        spec = importlib.util.find_spec(root)
+    if spec is None or spec.origin in ("built-in", "frozen"):
+        return False
+    place = spec.origin or next(iter(spec.submodule_search_locations or ()), None)
+    return place is not None and _is_users_place(root, place)
+
+
+def is_users(module: ModuleType) -> bool:
+    """Whether a module is neither a part of Python nor of an installed package or this one."""
+    name = module.__name__
+    root = name.partition(".")[0]
+    if name == "__main__" or sys.modules.get(name) is not module:
+        return True
+    place = _place(module)
+    if place is None and root != name and (top := sys.modules.get(root)) is not None:
+        return is_users(top)
+    if place is None:  # one that is built in has a specification
+        return getattr(module, "__spec__", None) is None
+    return _is_users_place(root, place)
+
+
+def is_sent_itself(module: ModuleType) -> bool:
+    """Whether a module is a user's and not a compiled one."""
+    place = _place(module)
+    return is_users(module) and (
+        place is None or place.endswith(_SOURCES) or not Path(place).suffix
+    )
+
+
+def compiled_file(module: ModuleType) -> str | None:
+    """The file of a compiled module of a user; None for another module."""
+    place = _place(module)
+    return place if place is not None and is_users(module) and not is_sent_itself(module) else None
+
+
+def _place(module: ModuleType) -> str | None:
+    """The file or, of a package without one, the folder of a module."""
+    names = vars(module)
+    place = names.get("__file__") or next(iter(names.get("__path__", ())), None)
+    return place if isinstance(place, str) else None
+
+
+@functools.cache
+def _is_users_place(root: str, place: str) -> bool:
+    if root == "harnack":
+        return False
+    path = Path(place).resolve()
+    if {"site-packages", "dist-packages"} & set(path.parts):
+        return False
+    places = sysconfig.get_paths()
+    return not any(
+        path.is_relative_to(Path(places[one]).resolve())
+        for one in ("stdlib", "platstdlib", "purelib", "platlib")
+    )
+
+
+@functools.cache
+def installed_version(root: str) -> str | None:
+    """The version of the installed package that has a module; None for a part of Python, a user's
+    module, and one that is in no package."""
+    if root in sys.stdlib_module_names or root in ("__main__", "harnack") or _is_a_users_root(root):
+        return None
+    with suppress(importlib.metadata.PackageNotFoundError, ValueError):
+        return importlib.metadata.version(root)
+    for name in importlib.metadata.packages_distributions().get(root, ()):
+        return importlib.metadata.version(name)
+    return None
