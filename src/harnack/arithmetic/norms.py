@@ -269,7 +269,8 @@ def corner(*sides: Any) -> Any:
     gradients at right angles to each other.
 
     Proof. Outside, the nearest point is found separately along each of the directions: the distance
-    is the norm of the positive ones (Pythagoras); inside, the nearest side decides.
+    is the norm of the positive ones (Pythagoras); inside, the nearest side decides. Where a single
+    side is positive the norm is that side, the largest.
     """
     most = maximum(*sides)
     outside = norm(*(maximum(one, 0.0) for one in sides))
@@ -277,4 +278,9 @@ def corner(*sides: Any) -> Any:
     if not isinstance(both, Jet):
         return both
     both = outside.selected(most.value.low > 0, both)
-    return most.selected(most.value.high < 0, both)
+    # Where no two sides can be positive, as on a face, the distance is the largest of them: the
+    # kinks of the norm at 0 and of the minimum do not matter.
+    highs = [one.value.high if isinstance(one, Jet) else one for one in sides]
+    second = functools.reduce(fmax, [fmin(a, b) for a, b in itertools.combinations(highs, 2)])
+    known = dr.isfinite(functools.reduce(lambda a, b: a + b, highs))
+    return most.selected((second < 0) & known, both)
