@@ -307,3 +307,14 @@ def test_errors_that_a_field_does_not_state_are_not_known() -> None:
     wall = hk.solid(hk.Gyroid(1.0), between=(-0.3, 0.3))
     known = np.isfinite(hk.curvature(wall, [[0.0, 0.0, 0.0], [0.02, 0.0, 0.01]]).mean_error)
     assert known.tolist() == [False, True]
+
+
+def test_faces_of_boxes_and_cylinders_are_smooth() -> None:
+    """On the surface itself all second derivatives were NaN: the norm of no positive side."""
+    cylinder = hk.Cylinder(2.0, 3.0)
+    side = hk.curvature(cylinder, [[2.0, 0.0, 0.5], [1.2, 1.6, -0.25], [0.5, 0.5, 3.0]])
+    assert side.mean == pytest.approx([0.25, 0.25, 0.0], abs=1e-12)
+    assert side.gaussian == pytest.approx([0.0] * 3, abs=1e-12)
+    assert (side.mean_error < 1e-12).all()
+    assert np.isnan(hk.curvature(cylinder, [[2.0, 0.0, 3.0]]).mean).all()  # its edge
+    assert hk.curvature(hk.Cuboid((1.0, 1.0, 1.0)), [[1.0, 0.2, 0.3]]).mean == pytest.approx([0.0])

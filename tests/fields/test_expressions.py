@@ -103,6 +103,7 @@ def test_formulas_may_be_texts(text: str, function: Any) -> None:
         ("sine(x)", r"no known function, .*; did you mean \"sin\"\?"),
         ("max(x)", "max takes 2 or more arguments, not 1"),
         ("sin x", "the argument of sin stands in brackets"),
+        ("sin^2(x)", "the argument of sin stands in brackets, and a power behind them"),
         ("X + y", r"'X' is unknown, .*; did you mean \"x\"\?"),
         ("1_000*x", "'_' has no meaning"),
         ("0x10*x", "'0x' has no meaning"),

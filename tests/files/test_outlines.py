@@ -107,6 +107,9 @@ def drawn(folder: Path, inside: str, **options: Any) -> Any:
         ('<path d="M0 0Q2 4 4 0z"/>', 16 / 3),
         ('<path d="M0 0C0 4 4 4 4 0z"/>', 9.6),
         ('<path d="M0 0A2 2 0 0 1 4 0z"/>', 2 * math.pi),
+        ('<path d="M4 4h-4a4 4 0 114 4z"/>', 12 * math.pi),  # flags without a space between
+        ('<path d="M0 0A0 5 0 0 1 4 0L4 4z"/>', 8.0),  # an arc of radius 0 is a line
+        ('<rect width="9" height="9" fill="transparent"/><rect width="2px" height="1"/>', 2.0),
     ],
 )
 def test_areas_of_drawings(tmp_path: Path, inside: str, expected: float) -> None:
@@ -131,7 +134,12 @@ def test_drawings_stand_upright(tmp_path: Path) -> None:
         ("<text>a</text>", "<text> is not read"),
         ('<rect width="1" height="1" clip-path="url(#a)"/>', "clip-path is not read"),
         ("<style>.a{fill:none}</style>", "style sheet"),
-        ('<rect width="5mm" height="1"/>', "5mm"),
+        ('<rect width="5mm" height="1"/>', "5mm.* has a unit"),
+        ('<circle cx="50%" r="1"/>', "50%.* has a unit"),
+        ('<svg x="10"><rect width="1" height="1"/></svg>', "place of its own"),
+        ('<svg viewBox="0 0 2 2"><rect width="1" height="1"/></svg>', "place of its own"),
+        ('<rect style="transform:rotate(9deg)" width="1" height="1"/>', "transforms in styles"),
+        ('<path d="M0 0A5 5 0 0 1 0 0L9 0L9 9z"/>', "ends where it begins"),
         ('<rect width="-5" height="1"/>', "negative"),
         ('<circle r="1e300"/><circle r="1"/>', "not finite|too large|too many|overflow|finite"),
         ('<path d="M0 0L1 q"/>', "is none"),

@@ -269,6 +269,14 @@ def test_a_mesh_can_be_taken_as_dipoles(save):
     np.testing.assert_allclose(cloud.points, x[faces].mean(axis=1), atol=1e-7)
 
 
+def test_edges_beside_faces_may_have_any_names(save):
+    numbers = "".join(f"property float {axis}\n" for axis in "xyz")
+    head = f"ply\nformat ascii 1.0\nelement vertex 3\n{numbers}element face 1\n"
+    head += "property list uchar int vertex_indices\nelement edge 1\nproperty int from\n"
+    surface = read_surface(save("a.ply", head + "end_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n0\n"))
+    assert surface.faces.tolist() == [[0, 1, 2]]
+
+
 PENTAGON = SQUARE + "v -1 0.5 0\n"
 
 

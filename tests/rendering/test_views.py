@@ -248,6 +248,14 @@ def test_a_camera_too_far_away_is_refused() -> None:
         draw(hk.Sphere(1.0), camera=(1e5, 0.0, 0.0))
 
 
+def test_a_surface_far_from_the_origin_is_refused_or_blurred() -> None:
+    """Single precision rounds coordinates of maps to half a meter: the picture was another one."""
+    with pytest.raises(ValueError, match="move it to the origin"):
+        draw(hk.Sphere(1.0).moved((4e5, 5.8e6, 100.0)), show="status")
+    with pytest.warns(UserWarning, match="blurred"):
+        draw(hk.Sphere(1.0).moved((2e4, 0.0, 0.0)), show="status")
+
+
 @pytest.mark.parametrize(
     "settings", [{"position": (5.0, 0, 2)}, {"position": (5.0, 0, 2), "fov": 40}, {"distance": 6}]
 )

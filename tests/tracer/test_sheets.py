@@ -11,6 +11,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 import pytest
+import trimesh
 
 import harnack as hk
 from harnack.backend import (
@@ -1027,6 +1028,23 @@ def test_polished_hits_stay_on_the_surface_and_sheets_where_they_are() -> None:
 
 
 @pytest.mark.slow
+def test_walls_thinner_than_rounding_are_not_passed() -> None:
+    """A unit cube at the coordinates of a map was a proved miss in single precision, in which its
+    sides cancel; so was one of two units, 4e6 away."""
+    cube = trimesh.creation.box((1.0, 1.0, 1.0))
+    place = np.array([4e5, 5.8e6, 100.0])
+    near = hk.WindingNumber(cube.vertices, cube.faces)
+    on_map = hk.WindingNumber(cube.vertices + place, cube.faces)
+    rays = np.array([[0.1, 0.2, 4.0], [2.0, 0.0, 4.0]]), np.array([[0, 0, -1.0]] * 2)
+    single = hk.trace(on_map, place + rays[0], rays[1])
+    assert single.status.tolist() == [hk.Status.OUT_OF_STEPS, hk.Status.MISS]
+    double = hk.trace(on_map, place + rays[0], rays[1], precision="double")
+    assert double.t == pytest.approx([3.5, np.inf])
+    far = hk.trace(near, [[0.1, 0.2, 4e6], [0.1, 0.2, 4e5]], rays[1])
+    assert far.status.tolist() == [hk.Status.OUT_OF_STEPS, hk.Status.HIT]
+    assert far.t[1] == pytest.approx(4e5 - 0.5, abs=0.1)
+
+
 def test_views_of_an_open_cube() -> None:
     normal = hk.render(OPEN_CUBE, show="normal", size=(40, 30))
     depth = hk.render(OPEN_CUBE, show="depth", size=(40, 30))

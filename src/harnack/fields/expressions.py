@@ -145,6 +145,10 @@ def _check(text: str, node: ast.expr, own: Iterable[str], depth: int = 0) -> Non
         _check(text, node.operand, own, depth + 1)
     elif isinstance(node, ast.Name):
         known = (*_COORDINATES, *_CONSTANTS, *own)
+        if node.id in _FUNCTIONS:
+            raise _wrong(
+                text, f"the argument of {node.id} stands in brackets, and a power behind them"
+            )
         if node.id not in known:
             raise _wrong(
                 text,

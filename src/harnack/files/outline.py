@@ -256,30 +256,38 @@ def _filled(
         return
     if tag in _UNREAD:
         raise ValueError(f"<{tag}> is not read: turn it into paths before the file is saved")
-    for name in ("clip-path", "mask"):
-        if _styles(element).get(name, "none") != "none":
+    for name in _CUTTING:
+        if own.pop(name, "none") != "none":
             raise ValueError(f"{name} is not read: cut the shapes before the file is saved")
+    if own.get("transform", "none") != "none" or "transform-origin" in own:
+        raise ValueError("transforms in styles are not read, nor a transform-origin: apply them")
     if "transform" in element.attrib:
         parse_transform = _library("svgpathtools.parser").parse_transform
         more: FloatArray = parse_transform(element.attrib["transform"], strict=True)
         transform = transform @ more
-    if tag in _SHAPES and own.get("fill") != "none" and own.get("visibility") != "hidden":
+    is_filled = own.get("fill") not in ("none", "transparent")
+    if tag in _SHAPES and is_filled and own.get("visibility") != "hidden":
         yield (
             _data(element),
             transform,
             "even-odd" if own.get("fill-rule") == "evenodd" else "nonzero",
         )
     for one in element:
+        if one.tag == "svg" and {"x", "y", "viewBox"} & one.attrib.keys():
+            raise ValueError("an <svg> in another with a place of its own is not read: ungroup it")
         yield from _filled(one, transform, {k: v for k, v in own.items() if k in _INHERITED})
 
 
 _INHERITED = ("fill", "fill-rule", "visibility", "display")
+_CUTTING = ("clip-path", "mask")
 
 
 def _styles(element: Element) -> dict[str, str]:
-    """Properties of an element by their names, those of its style first."""
-    names = (*_INHERITED, "clip-path", "mask")
+    """Properties of an element by their names, those of its style first. A transform is one of a
+    style."""
+    names = (*_INHERITED, *_CUTTING, "transform-origin")
     found = {name: element.attrib[name].strip() for name in names if name in element.attrib}
+    names = (*names, "transform")
     for entry in element.attrib.get("style", "").split(";"):
         name, _, value = entry.partition(":")
         if name.strip() in names:
@@ -287,12 +295,21 @@ def _styles(element: Element) -> dict[str, str]:
     return found
 
 
+_LENGTHS = {"x", "y", "cx", "cy", "width", "height", "r", "rx", "ry"}
+
+
 def _data(element: Element) -> str:
     """The path data of a shape."""
     makers = _library("svgpathtools.svg_to_paths")
-    about, kind = element.attrib, element.tag
+    about, kind = {k: v.removesuffix("px") for k, v in element.attrib.items()}, element.tag
     if kind == "path":
         return about.get("d", "")
+    for name in _LENGTHS & about.keys():
+        if re.search(r"[%a-df-z]", about[name], re.IGNORECASE):
+            raise ValueError(
+                f'{name}="{about[name]:.20}" of a <{kind}> has a unit: save the file with plain '
+                "numbers"
+            )
     sizes = {name: float(about[name]) for name in ("width", "height", "r", "rx", "ry")
              if name in about and kind != "polygon"}  # fmt: skip
     if any(not 0 <= one < math.inf for one in sizes.values()):
@@ -339,9 +356,14 @@ def _segments(data: str) -> list[Any]:
     parse_path = _library("svgpathtools.parser").parse_path
     with warnings.catch_warnings():
         warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", "Replacing degenerate")  # an arc of radius 0 is a line
         try:
             made: list[Any] = [*parse_path(data)]
-        except (Warning, AssertionError, ArithmeticError, LookupError, ValueError) as wrong:
+        except AssertionError:
+            raise ValueError(
+                f"in its path {data!r:.60} an arc ends where it begins: leave it out"
+            ) from None
+        except (Warning, ArithmeticError, LookupError, ValueError) as wrong:
             raise ValueError(f"its path {data!r:.60} is none: {wrong}") from None
     if not all(np.isfinite([one.start, one.end]).all() for one in made):
         raise ValueError("a number in it is not finite")

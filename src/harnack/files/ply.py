@@ -196,7 +196,9 @@ def read_ply(path: Path, data: bytes) -> Contents:
     if table := tables.get("face"):
         name = "vertex_index" if "vertex_index" in table.columns else "vertex_indices"
         faces = _polygons(table, *table.lists(name), len(vertices))
-    if table := tables.get("edge"):
+    table = tables.get("edge")
+    # Edges of faces may have names of their own: they are not needed.
+    if table and (table.has("vertex1", "vertex2") or not tables.get("face")):
         ends = np.stack([table.numbers("vertex1"), table.numbers("vertex2")], axis=1)
         edges = _polygons(table, ends.ravel(), np.full(len(ends), 2), len(vertices))
     if differ_in_size(faces):

@@ -35,8 +35,8 @@ _UNITS = {
 
 
 def read_3mf(path: Path, data: bytes) -> Contents:
-    """All triangles of the parts that a file would have printed, where it puts them, in
-    millimeters. Colors and settings are ignored.
+    """All triangles of the parts that a file's build has, where it puts them, in millimeters.
+    Colors and settings are ignored, also that a part is not to be printed.
 
     Raises:
         FileFormatError: no archive, too large when it is unpacked, malformed, without triangles; or

@@ -7,6 +7,7 @@ should be filled by what is visible, so the surface is found by tracing it from 
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -121,6 +122,9 @@ _GRID, _CLOSER = 48, 32
 _TILE = 8
 # Squares of lengths, divided by tolerances, stay far from the ends of single precision.
 _SMALLEST, _LARGEST = 1e-15, 1e16
+# The distance of surfaces from the origin, in lengths of them, beyond which pixels at edges are
+# off, and that beyond which a third of all pixels may be (measured: boxes, curves, meshes, clouds).
+_BLURRED, _NOTHING_LEFT = 5e3, 1e5
 _POINTS: FieldCache[FloatArray] = FieldCache()
 
 
@@ -157,6 +161,22 @@ def check_size(ends: FloatArray) -> None:
         )
 
 
+def check_offset(points: FloatArray) -> None:
+    """Warn of surfaces, given by points (n, 3), that are blurred by the rounding of coordinates far
+    from the origin, as those of maps; raise ValueError where nothing is left of them."""
+    size, far = float(np.ptp(points, axis=0).max()), float(np.abs(points).max())
+    if far <= _BLURRED * size or size == 0:
+        return
+    said = (
+        f"what is drawn is {size:.4g} long and {far:.4g} from the origin, and pictures are "
+        "computed in single precision: {}; move it to the origin: subtract its center from the "
+        "points that it is made of (of formulas and shapes, moved(...) does so)"
+    )
+    if far > _NOTHING_LEFT * size:
+        raise ValueError(said.format("too little is left of its coordinates"))
+    warnings.warn(said.format("its edges are blurred"), stacklevel=4)
+
+
 def _found(surface: LevelSet, backend: Backend, ends: FloatArray) -> FloatArray:
     """Points found on a coarse grid, and on one around them."""
     lower, upper = ends
@@ -167,6 +187,7 @@ def _found(surface: LevelSet, backend: Backend, ends: FloatArray) -> FloatArray:
                 "nothing is to be seen of this surface: its domain, clip and section do not "
                 "overlap, so that nothing is left to draw"
             )
+        check_offset(ends)
         raise NothingVisibleError(
             "nothing is to be seen of this surface: no ray of a grid on the sides of its box "
             f"{_point(ends[0])} to {_point(ends[1])} meets it; "

@@ -17,7 +17,7 @@ from harnack.backend import FloatArray
 from harnack.names import did_you_mean
 from harnack.rendering.backdrops import FLOOR, Backdrop, Ground, ground, lights
 from harnack.rendering.camera import Camera, Pose
-from harnack.rendering.framing import check_size, upright, visible_points
+from harnack.rendering.framing import check_offset, check_size, upright, visible_points
 from harnack.rendering.isolines import Isolines
 from harnack.rendering.mitsuba import mitsuba_backend
 from harnack.rendering.placement import Placement
@@ -275,7 +275,12 @@ def corners_of(ends: FloatArray) -> FloatArray:
 
 
 def on_ground(points: FloatArray, turned: FloatArray | None = None) -> Placement:
-    """Turns points (n, 3), scales them to half a diagonal of 1 and puts them on the ground."""
+    """Turns points (n, 3), scales them to half a diagonal of 1 and puts them on the ground.
+
+    Raises:
+        ValueError: they are too far from the origin for their size (`check_offset`).
+    """
+    check_offset(points)
     turned = np.eye(3) if turned is None else turned
     points = points @ turned.T
     lower, upper = points.min(axis=0), points.max(axis=0)

@@ -27,6 +27,9 @@ if TYPE_CHECKING:
 # of coordinates, and the cosine of the angle between them is larger than the second number. The
 # sine of a ray's angle to a sheet counts as at least the third.
 _SAME, _PARALLEL, _STEEP = 2.0, 0.999, 1 / 64
+# Where that distance is more than this share of the ray, sheets that face each other at one point
+# may be the two sides of a wall.
+_COARSE = 1e-4
 
 
 @dataclass(frozen=True)
@@ -55,6 +58,7 @@ class _Together:
 
     jump: the sum of their jumps. t, last: of the last of them.
     up, down, normal_up, normal_down: the first sheet at which f jumps up, and down.
+    folded: whether a sheet parallel to the first jumps the other way.
     """
 
     jump: Real
@@ -64,6 +68,7 @@ class _Together:
     down: Any
     normal_up: Vec3
     normal_down: Vec3
+    folded: Mask
     active: Mask
 
 
@@ -128,7 +133,11 @@ class SheetTracer:
         count = self.backend.UInt32
         o, d = self.path.origin, self.path.direction
         behind, now = outer.behind, outer.march
-        ahead, last = self._together(self._next(behind, self.end, now.active), now.active)
+        ahead, last, lost = self._together(self._next(behind, self.end, now.active), now.active)
+        out = count(int(Status.OUT_OF_STEPS))
+        now = dataclasses.replace(
+            now, status=dr.select(lost, out, now.status), active=now.active & ~lost
+        )
         stops = ahead.sheet != NO_SHEET
         stop = dr.select(stops, ahead.t, self.end)
         # The last step may already have proved the rest of the ray.
@@ -145,7 +154,7 @@ class SheetTracer:
         if now.contact is not None:
             return self._passed(outer, now, ahead, last, passed, active & stops)
         spent = passed & (now.evaluations >= self.march.max_steps)
-        status = dr.select(spent, count(int(Status.OUT_OF_STEPS)), now.status)
+        status = dr.select(spent, out, now.status)
         # Of several sheets at a point, a hit names `ahead`; a ray that passes goes on from `last`.
         crossing = Crossing(
             dr.select(passed, last.t, ahead.t),
@@ -186,14 +195,19 @@ class SheetTracer:
             dr.select(through, ahead.sheet, outer.named),
         )
 
-    def _together(self, first: Crossing, active: Mask) -> tuple[Crossing, Crossing]:
-        """All crossings at the t of the first as one, and the last of them.
+    def _together(self, first: Crossing, active: Mask) -> tuple[Crossing, Crossing, Mask]:
+        """All crossings at the t of the first as one, the last of them, and where it is open if
+        they are at one point.
 
         A ray through an edge or a vertex crosses several sheets at once, in no particular order: f
         jumps there by the sum of their jumps, and there is no interval between them. The same holds
         for sheets in one plane: those that follow each other more closely than coordinates are
         rounded count as at the same t, for rounding decides their order. The sheet named is the
         first one whose jump has the sign of the sum.
+
+        Far from the origin of rays or coordinates, rounding may be as large as a wall is thick,
+        whose sides would cancel. So where rounding is no small part of the ray, parallel sheets
+        whose jumps cancel leave it open what is there.
         """
         real, count = self.backend.Float, self.backend.UInt32
         size = largest_coordinate(self.path.origin)
@@ -216,6 +230,7 @@ class SheetTracer:
                 down=dr.select(new_down, one.sheet, now.down),
                 normal_up=dr.select(new_up, one.normal, now.normal_up),
                 normal_down=dr.select(new_down, one.normal, now.normal_down),
+                folded=now.folded | (found & level & (one.jump * first.jump < 0)),
                 active=found,
             )
 
@@ -228,6 +243,7 @@ class SheetTracer:
             down=dr.select(first.jump < 0, first.sheet, none),
             normal_up=first.normal,
             normal_down=first.normal,
+            folded=self.backend.Bool(False),
             active=self.backend.Bool(active) & (first.sheet != NO_SHEET),
         )
         all_there = while_active(start, body, "together")
@@ -237,7 +253,9 @@ class SheetTracer:
             up, all_there.normal_up, dr.select(down, all_there.normal_down, first.normal)
         )
         behind = Crossing(all_there.t, all_there.last, first.jump, first.normal)
-        return Crossing(first.t, sheet, real(all_there.jump), normal), behind
+        lost = all_there.folded & (all_there.jump == 0)
+        lost &= close > _COARSE * (self.end - self.start)
+        return Crossing(first.t, sheet, real(all_there.jump), normal), behind, lost
 
     def _next(self, behind: Crossing, end: Real, active: Mask) -> Crossing:
         """The next crossing, as arrays of this backend; none if it lies beyond the end."""
