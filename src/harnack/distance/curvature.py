@@ -72,9 +72,9 @@ def curvature(field: Field, points: Any, *, precision: Precision = "double") -> 
         gaussian = det S = n.adj(A)n/|grad f|^2.
 
     Of a sum over a tree, and of a solid made of one, both derivatives have an error that the field
-    states. Where it leaves the mean curvature uncertain by more than a thousandth of itself, or of one over
-    the size of the surface, clusters are taken as a whole only from farther away, up to the sum of
-    all terms one by one. What remains is in `mean_error` and `gaussian_error` (`_bounds`).
+    states. Where it leaves the mean curvature uncertain by more than a thousandth of itself, or of
+    one over the size of the surface, clusters are taken as a whole only from farther away, up to
+    the sum of all terms one by one. What remains is in `mean_error` and `gaussian_error`.
 
     Raises:
         NotImplementedError: the field has no second derivatives.

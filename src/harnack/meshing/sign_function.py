@@ -137,7 +137,7 @@ class SignFunction(LevelFunction):
             return Samples(self.values(points), np.zeros((len(points), 3)), none)
         self.evaluations += len(points)
         if isinstance(self.field, BatchedField):
-            value, gradient = self.field.value_and_gradient(points, precision=self.precision)
+            value, gradient = self.field.rough_value_and_gradient(points, precision=self.precision)
         else:
             backend = choose_backend(self.precision)
             prepared = self.field.prepare(backend)
@@ -200,7 +200,10 @@ class SignFunction(LevelFunction):
         if not len(x):
             return x
         self.evaluations += len(x)
-        given = self.field.gradient(x, precision=self.precision)
+        if isinstance(self.field, BatchedField) and not self.field.has_sheets:
+            given = self.field.rough_value_and_gradient(x, precision=self.precision)[1]
+        else:
+            given = self.field.gradient(x, precision=self.precision)
         slope = self.side * np.asarray(given, np.float64)
         flat = ~np.isfinite(slope).all(axis=1) | ~slope.any(axis=1)
         slope[flat] = way[flat]

@@ -18,7 +18,7 @@ import numpy as np
 from harnack.backend import backend_of
 from harnack.backend.elementary import fmax
 from harnack.backend.numbers import positive
-from harnack.fields.batch import SymmetricSum, Values
+from harnack.fields.batch import SymmetricSum, Values, sharpened
 from harnack.fields.clearance import DetailedField, UnitCoordinates, epsilon_at, placed, single
 from harnack.fields.field import Sample, lengthened
 from harnack.fields.solid_angles.cell_choice import HasCells
@@ -235,7 +235,9 @@ class DipolePotential(OrientedPoints, HasCells, DetailedField["_DipoleBuffers"])
     smoothing: see above, in the points' unit; 0 for the sum of dipoles itself.
     accuracy: a cluster of points is taken as a whole beyond `accuracy` times its radius; by
         default 2 for values at points and 4 for tracing, which takes more where the tolerance asks
-        for it. At least 1.5.
+        for it. At least 1.5. By default gradients at points are looked at more closely, until their
+        error is about 1 % of their length or less in most places (`gradient_error_bound` bounds
+        it).
     cells: for many rays through many points: cells in which the near points count one by one and
         all others as one polynomial, so that an evaluation for tracing costs a tenth. None builds
         them where they pay (`for_rays`), for pictures of small clouds and for path tracing; True
@@ -312,7 +314,7 @@ class DipolePotential(OrientedPoints, HasCells, DetailedField["_DipoleBuffers"])
 
         def gradients(x: FloatArray, n: FloatArray, areas: FloatArray, length: float) -> FloatArray:
             field = DipolePotential(x, n, areas, smoothing=length)
-            return np.asarray(field.gradient(x, precision="single"), np.float64)
+            return np.asarray(field.rough_value_and_gradient(x)[1], np.float64)
 
         given = None if isinstance(normals, str) else normals
         found = FittedCloud.of(points, given, gradients)
@@ -346,7 +348,8 @@ class DipolePotential(OrientedPoints, HasCells, DetailedField["_DipoleBuffers"])
     def _warn_if_far(self, points: FloatArray, values: FloatArray) -> None:
         """Warn if the smoothed surface leaves a tenth of the points, with values above the level,
         far away, by their slopes."""
-        steep = np.linalg.norm(self.gradient(points, precision="double"), axis=1)
+        slopes = self.rough_value_and_gradient(points, precision="double")[1]
+        steep = np.linalg.norm(slopes, axis=1)
         far = float(np.quantile(np.abs(values) / np.maximum(steep, 1e-300), 0.9))
         longest = float((self._box[1] - self._box[0]).max())
         if far > _FAR * longest:
@@ -388,6 +391,11 @@ class DipolePotential(OrientedPoints, HasCells, DetailedField["_DipoleBuffers"])
         x = on.unit(x)
         weight = float(self.areas.sum()) / self._size**2
         return on.tree.at(x, derivatives, closer).far_away(x, 64, weight).rescaled(on.size)
+
+    def sharp_values_at(self, x: Vec3) -> Values:
+        if self.accuracy is not None:
+            return self.values_at(x, 1)
+        return sharpened(lambda place, closer: self.values_at(place, 1, closer), x)
 
     @functools.cached_property
     def _hierarchy(self) -> Hierarchy:

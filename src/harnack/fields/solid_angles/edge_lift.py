@@ -220,6 +220,24 @@ def lifted_sums(edges: LiftedEdges, x: Vec3, derivatives: int) -> LiftedSums:
     return LiftedSums.of(edges.records.for_each(add, start, "lift"))
 
 
+def edge_rates(edges: LiftedEdges, x: Vec3, derivatives: int) -> FieldSums:
+    """The sums of `lifted_sums` without the value: gradient and, for derivatives = 2, Hessian of
+    the solid angle of closed edges, by Biot and Savart's law."""
+    backend, unit = edges.records.backend, epsilon_at(x)
+    vector = backend.Array3f
+
+    def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
+        p, q, active = vector(*row[:3]), vector(*row[4:7]), row[3] != 0
+        edge = LiftedEdge.between(p, q, row[3], row[7], Upwards(x), x)
+        sums = FieldSums.of(state).plus(edge.terms(derivatives, active), True)
+        _, s4, s5 = edge.bounds(unit)
+        s4, s5 = (dr.select(active, one, 0) for one in (s4, s5))
+        return dataclasses.replace(sums, s4=sums.s4 + s4, s5=sums.s5 + s5).parts()
+
+    start = FieldSums.zero(backend, dr.inf, derivatives).parts()
+    return FieldSums.of(edges.records.for_each(add, start, "rates of edges"))
+
+
 @dataclass(frozen=True)
 class Sight:
     """A vertex relative to x and to rays.

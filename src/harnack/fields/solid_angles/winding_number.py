@@ -39,6 +39,7 @@ from harnack.fields.solid_angles.cell_choice import Cells, HasCells
 from harnack.fields.solid_angles.own_sheet import lies_on_own_level
 from harnack.fields.solid_angles.winding_exact import ExactWinding
 from harnack.fields.solid_angles.winding_mesh import WindingMesh
+from harnack.fields.solid_angles.winding_rates import BoundaryRates, with_rates
 from harnack.fields.solid_angles.winding_tree import TreeWinding
 from harnack.geometry import Box
 from harnack.names import did_you_mean
@@ -196,7 +197,10 @@ class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
         or "auto": exact up to 2048 boundary edges.
     accuracy: for the tree, a cluster of triangles is taken as a whole beyond `accuracy` times its
         radius; more is slower and sharper. At least 1.5; by default 2 for values at points and 4
-        for tracing, which uses more detail where the tolerance asks for it.
+        for tracing, which uses more detail where the tolerance asks for it. By default gradients
+        and Hessians at points are not those of this tree but sums over the boundary edges, right
+        to rounding, up to 32,768 of these; beyond, gradients are looked at closely enough for an
+        error of about 1 % of their length in most places (`gradient_error_bound` bounds it).
     order: of the multipoles of the tree: 0 (dipoles), 1 or 2 (octupoles).
     cells: for many rays: cells in which w, but for a whole number, is the solid angle of a few
         near edges and one polynomial for all others, with a proved remainder (`boundary_cells`), so
@@ -255,6 +259,8 @@ class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
         self._own_levels: Remembered[tuple[float, ...], bool] = Remembered()
         self._level_of_sheets = 0.0
 
+        self._rates: Remembered[Backend, BoundaryRates] = Remembered()
+
     def moved(self, vertices: Any) -> WindingNumber:
         """The winding number of the same faces with other positions of their vertices (n, 3), for
         less work than a new one.
@@ -267,7 +273,7 @@ class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
         """
         field = copy.copy(self)
         field._mesh = self.mesh.moved(vertices)
-        field._batches, field._device = Remembered(), None
+        field._batches, field._device, field._rates = Remembered(), None, Remembered()
         field._extents, field._occupied = Remembered(), Remembered()
         field._own_levels = Remembered()
         field.set_cells(self.cells)
@@ -292,11 +298,37 @@ class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
         on = self._batch(backend_of(x))
         winding, x = on.winding, on.unit(x)
         if isinstance(winding, TreeWinding):
-            values = winding.at(x, derivatives, closer)
+            if derivatives == 2 and self.accuracy is None:
+                rates = self._boundary_rates(on, winding).at(x, 2, closer)
+                values = with_rates(winding.at(x, 0, closer), rates)
+            else:
+                values = winding.at(x, derivatives, closer)
         else:
             values = winding.at(x, derivatives)
             if derivatives == 0:
                 values = dataclasses.replace(values, value=winding.values(x))
+        return self._stated(on, x, values)
+
+    def sharp_values_at(self, x: Vec3) -> Values:
+        on = self._batch(backend_of(x))
+        winding = on.winding
+        if not isinstance(winding, TreeWinding) or self.accuracy is not None:
+            return self.values_at(x, 1)
+        x = on.unit(x)
+        dr.eval(x)
+        rates = self._boundary_rates(on, winding)
+        values = rates.sharp(x)
+        if rates.summed is not winding:
+            values = with_rates(winding.at(x, 0, on.backend.Float(1)), values)
+        return self._stated(on, x, values)
+
+    def _boundary_rates(self, on: _MeshBuffers, winding: TreeWinding) -> BoundaryRates:
+        if on.backend not in self._rates:
+            self._rates[on.backend] = BoundaryRates.of(on.backend, self.mesh, self.order, winding)
+        return self._rates[on.backend]
+
+    def _stated(self, on: _MeshBuffers, x: Vec3, values: Values) -> Values:
+        """Values at unit coordinates x, with all that their errors are made of."""
         # Within rounding of a triangle, it is not known on which side of it x is.
         on_triangle = jumps_within(on.rays, x, _ON_TRIANGLE * epsilon_at(x))
         values = dataclasses.replace(values, error=values.error + on_triangle)
