@@ -258,7 +258,6 @@ class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
         self._occupied: Remembered[tuple[float, ...], OccupiedCells] = Remembered()
         self._own_levels: Remembered[tuple[float, ...], bool] = Remembered()
         self._level_of_sheets = 0.0
-
         self._rates: Remembered[Backend, BoundaryRates] = Remembered()
 
     def moved(self, vertices: Any) -> WindingNumber:
