@@ -109,6 +109,7 @@ def drawn(folder: Path, inside: str, **options: Any) -> Any:
         ('<path d="M0 0A2 2 0 0 1 4 0z"/>', 2 * math.pi),
         ('<path d="M4 4h-4a4 4 0 114 4z"/>', 12 * math.pi),  # flags without a space between
         ('<path d="M0 0A0 5 0 0 1 4 0L4 4z"/>', 8.0),  # an arc of radius 0 is a line
+        ('<rect width="9" height="9" style="fill-opacity:0.0"/><rect width="1" height="1"/>', 1.0),
         ('<rect width="9" height="9" fill="transparent"/><rect width="2px" height="1"/>', 2.0),
     ],
 )

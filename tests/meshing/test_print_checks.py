@@ -77,6 +77,7 @@ def test_cavities_and_tiny_parts() -> None:
 
 def test_thin_walls_beds_and_units() -> None:
     assert kinds(FINE_PLATE, wall=2.1)["thin walls"] == 2 * len(FINE_PLATE.faces) // 6
+    assert "thin walls" not in kinds(FINE_PLATE, wall=2.0)  # no thinner than asked
     assert kinds(PLATE, bed=(19.0, 30.0, 5.0)) == {}
     assert kinds(PLATE, bed=(19.0, 19.0, 5.0)) == {"bed": 1}
     small = PLATE.copy()

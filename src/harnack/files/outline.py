@@ -266,6 +266,7 @@ def _filled(
         more: FloatArray = parse_transform(element.attrib["transform"], strict=True)
         transform = transform @ more
     is_filled = own.get("fill") not in ("none", "transparent")
+    is_filled &= not _NO_OPACITY.fullmatch(own.get("fill-opacity", "1"))
     if tag in _SHAPES and is_filled and own.get("visibility") != "hidden":
         yield (
             _data(element),
@@ -278,7 +279,8 @@ def _filled(
         yield from _filled(one, transform, {k: v for k, v in own.items() if k in _INHERITED})
 
 
-_INHERITED = ("fill", "fill-rule", "visibility", "display")
+_INHERITED = ("fill", "fill-rule", "fill-opacity", "visibility", "display")
+_NO_OPACITY = re.compile(r"[+-]?0*\.?0*%?")
 _CUTTING = ("clip-path", "mask")
 
 

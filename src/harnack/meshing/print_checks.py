@@ -30,6 +30,9 @@ _TINY = 0.01
 # Sizes in millimeters beyond which another unit is likely.
 _SMALLEST, _LARGEST = 1.0, 2000.0
 _INCH = 25.4
+# A part of exactly the least thickness, or the bed's size, may be off by so much of its size: files
+# hold single precision, and thickness is measured to it.
+_ROUNDING = 1e-6
 # Faces longer than so many walls may hide thin places beside their centers.
 _COARSE = 5.0
 # Words for one and for several, in messages.
@@ -273,7 +276,7 @@ def _thin(x: FloatArray, faces: IntArray, wall: float, is_solid: bool) -> PrintP
         why = "how thick walls are is not known before the rest is mended"
         return PrintProblem("walls not measured", 1, np.zeros((0, 3)), why)
     found = thickness(MeshSolid(x, faces))
-    places = found.where(wall)
+    places = found.where(wall - _ROUNDING * float(np.ptp(x, axis=0).max()))
     least = f"; the thinnest is {found.thinnest:.3g}"
     text = f"at {{}} {{triangle|triangles}} the part is thinner than {wall:g}{least}"
     return _problem("thin walls", places, text)
@@ -303,7 +306,8 @@ def _of_size(size: tuple[float, float, float], bed: list[float] | None) -> list[
         found.append(PrintProblem("unit", 1, nowhere, why, is_fatal=False))
     if bed is not None:
         x, y, z = size
-        fits = z <= bed[2] and ((x <= bed[0] and y <= bed[1]) or (y <= bed[0] and x <= bed[1]))
+        a, b, c = (side * (1 + _ROUNDING) for side in bed)
+        fits = z <= c and ((x <= a and y <= b) or (y <= a and x <= b))
         if not fits:
             space = " x ".join(f"{one:g}" for one in bed)
             found.append(PrintProblem("bed", 1, nowhere, f"{text} does not fit on {space}"))
