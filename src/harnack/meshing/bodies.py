@@ -9,10 +9,10 @@ import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
 from harnack.geometry import MeshError
-from harnack.meshing.checks import check_manifold, intersecting_faces
+from harnack.meshing.checks import CrossingError, check_manifold, intersecting_faces
 from harnack.meshing.clipping import winding_around
 from harnack.meshing.closed_mesh import manifold_of
-from harnack.meshing.edges import Edges, IntArray, directed_edges, dots
+from harnack.meshing.edges import Edges, IntArray, crosses, directed_edges, dots, lengths
 from harnack.meshing.lattice_surface import Surface
 from harnack.meshing.solids import apart_of
 
@@ -27,6 +27,8 @@ _LEAST_FACES, _MOST_PARTS = 4, 200
 _PLACES = 16
 # Faces around an edge have one direction if they are turned by less, in full turns.
 _SAME_TURN = 1e-9
+# Parts of the size: faces that are nearer lie on each other, and are moved into each other by that.
+_ON, _INTO = 1e-12, 1e-8
 
 
 def closed_parts(x: FloatArray, raw: IntArray, joined: IntArray) -> list[IntArray]:
@@ -154,9 +156,54 @@ def united_parts(x: FloatArray, faces: IntArray, parts: list[IntArray], within: 
         MeshError: a part passes through itself.
         MeshingError: a part is no manifold; or nothing is left.
     """
+    shells = [Surface.of(x, faces[rows]) for rows in parts]
+    try:
+        return _united(shells, within)
+    except CrossingError:
+        moved = _overlapping(shells)
+        if moved is None:
+            raise
+    return _united(moved, within)
+
+
+def _overlapping(shells: list[Surface]) -> list[Surface] | None:
+    """Parts whose faces that lie on those of an earlier one, but for rounding, are moved into it by
+    next to nothing: where they are in one plane, but not to the last bit, gaps without a width
+    would be left. None if there are no such faces."""
+    corners = [one.vertices[one.faces] for one in shells]
+    size = float(np.ptp(np.concatenate(corners), axis=(0, 1)).max())
+    planes = [_unit_normals(one) for one in corners]
+    lows = [one.min(axis=1) - _ON * size for one in corners]
+    highs = [one.max(axis=1) + _ON * size for one in corners]
+    moved, has_moved = [shells[0]], False
+    for k in range(1, len(shells)):
+        x, faces = shells[k].vertices.copy(), shells[k].faces
+        for j in range(k):
+            low, high = lows[k].min(axis=0), highs[k].max(axis=0)
+            near = np.flatnonzero(((lows[j] <= high) & (highs[j] >= low)).all(axis=1))
+            for face in range(len(faces)) if len(near) else ():
+                normal = planes[k][face]
+                on = near[lengths(planes[j][near] + normal) <= _ON]
+                is_met = (lows[j][on] <= highs[k][face]) & (highs[j][on] >= lows[k][face])
+                on = on[is_met.all(axis=1)]
+                height = np.abs((corners[j][on] - corners[k][face, 0]) @ normal)
+                if (height.max(axis=1, initial=0.0) <= _ON * size).any():
+                    x[faces[face]] = shells[k].vertices[faces[face]] + _INTO * size * normal
+                    has_moved = True
+        moved.append(Surface(x, faces))
+    return moved if has_moved else None
+
+
+def _unit_normals(corner: FloatArray) -> FloatArray:
+    normal = crosses(corner)
+    return normal / np.maximum(lengths(normal), 1e-300)[:, None]
+
+
+def _united(shells: list[Surface], within: float) -> Surface:
+    """As `united_parts`, of parts that do not lie on each other but for rounding."""
     from manifold3d import Manifold
 
-    made = [_manifold_of_part(x, faces[rows]) for rows in parts]
+    made = [_manifold_of_part(one) for one in shells]
     clockwise = [one for one, is_body in made if not is_body]
     levels = [Manifold() for _ in range(len(clockwise) + 1)]
     for part in (one for one, is_body in made if is_body):
@@ -169,12 +216,10 @@ def united_parts(x: FloatArray, faces: IntArray, parts: list[IntArray], within: 
     return surface
 
 
-def _manifold_of_part(x: FloatArray, faces: IntArray) -> tuple[Manifold, bool]:
+def _manifold_of_part(shell: Surface) -> tuple[Manifold, bool]:
     """What a closed part bounds, and whether it winds counter-clockwise around that."""
-    is_body = volume_of(x, faces) > 0
-    surface = Surface.of(x, faces if is_body else faces[:, ::-1])
-    if len(crossing := intersecting_faces(surface.vertices, surface.faces)):
-        raise MeshError(
-            f"{len(crossing):,} triangles of one of its parts pass through others of it"
-        )
-    return manifold_of(surface), is_body
+    is_body = volume_of(shell.vertices, shell.faces) > 0
+    if len(crossing := intersecting_faces(shell.vertices, shell.faces)):
+        raise MeshError(f"{len(crossing):,} triangles of a part pass through others of it")
+    faces = shell.faces if is_body else shell.faces[:, ::-1]
+    return manifold_of(Surface(shell.vertices, faces)), is_body
