@@ -13,6 +13,7 @@ import numpy as np
 
 from harnack.backend import BoolArray, FloatArray, IntArray, to_numpy, to_vector3
 from harnack.backend.arrays import aligned_integers
+from harnack.tree.coplanar import borders_of_overlaps
 from harnack.tree.triangles import NO_TRIANGLE, Frame, TriangleRays
 
 __all__ = ["on_level", "pieces_of_faces", "windings_beside"]
@@ -25,37 +26,27 @@ _MIDDLE = (1 / 3, 1 / 3, 1 / 3)
 
 
 def pieces_of_faces(rays: TriangleRays, vertices: FloatArray, faces: IntArray) -> FloatArray:
-    """Triangles (k, 3, 3) that fill the faces (m, 3), none of which passes through another.
+    """Triangles (k, 3, 3) that fill the faces (m, 3), none of which passes through another or is
+    covered by another in part.
 
     rays: the same faces, with coordinates of at most about one.
 
     Where two triangles meet in a segment, at either end of it an edge of one of them meets the
     other. So all edges are followed as rays, and each of the two faces beside an edge is cut by
     the plane of every triangle that the edge crosses, and these by the planes of the two: as far
-    as the cut would not pass the other triangle by. A cut too many does no harm.
+    as the cut would not pass the other triangle by. Faces in one plane are cut along the borders of
+    what covers them. A cut too many does no harm.
     """
     corners = vertices[faces]
     cut, by = _crossing_faces(rays, vertices, faces)
-    if not len(cut):
+    covered, borders = borders_of_overlaps(rays, vertices, faces)
+    if not len(cut) + len(covered):
         return corners
-    order = np.argsort(cut, kind="stable")
-    cut, by = cut[order], by[order]
-    turn = np.arange(len(cut)) - np.searchsorted(cut, cut)  # number of the cut of its face
+    cut, knives = np.concatenate([cut, covered]), np.concatenate([corners[by], borders])
     whole = np.ones(len(faces), np.bool_)
     whole[cut] = False
-    owner = np.flatnonzero(~whole)
-    pieces = corners[owner]
-    cutter = np.full(len(faces), -1)
-    for k in range(int(turn.max()) + 1):
-        cutter[:] = -1
-        cutter[cut[turn == k]] = by[turn == k]
-        knife = cutter[owner]
-        rows = np.flatnonzero(knife >= 0)
-        parts, parents = _cut(pieces[rows], corners[knife[rows]])
-        stay = np.ones(len(pieces), np.bool_)
-        stay[rows] = False
-        pieces = np.concatenate([pieces[stay], parts])
-        owner = np.concatenate([owner[stay], owner[rows][parents]])
+    number = np.cumsum(~whole) - 1
+    pieces = _cut_up(corners[~whole], number[cut], knives)
     edges = pieces - np.roll(pieces, 1, axis=1)
     longest = np.linalg.norm(edges, axis=2).max(axis=1)
     thick = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) > _THINNEST * longest
@@ -166,29 +157,52 @@ def _next_of_others(
     return dr.while_loop(start, more, body, label="crossings of edges")[:2]
 
 
-def _cut(pieces: FloatArray, knives: FloatArray) -> tuple[FloatArray, IntArray]:
-    """Triangles (k, 3, 3) cut by the planes of others, and which of them each part comes from.
+def _cut_up(pieces: FloatArray, rows: IntArray, knives: FloatArray) -> FloatArray:
+    """The parts of triangles (n, 3, 3) whose entries `rows` (k,) are cut by the planes of knives
+    (k, 3, 3).
 
-    Only where the cut along the plane comes within the other triangle; there each triangle falls
-    into one on one side and two on the other.
+    In each round every piece is cut by one of those knives that meet it, in the middle of its list,
+    and its parts share the rest: so their number falls by about half.
     """
-    height = _heights(pieces, knives)
-    height[np.abs(height) < _SAME] = 0
-    spans = (height.max(axis=1) > 0) & (height.min(axis=1) < 0)
-    spans[spans] = _meets(pieces[spans], height[spans], knives[spans])
-    whole, rows = np.flatnonzero(~spans), np.flatnonzero(spans)
+    done: list[FloatArray] = []
+    by = np.arange(len(knives))
+    while True:
+        height = _heights(pieces[rows], knives[by])
+        height[np.abs(height) < _SAME] = 0
+        meets = (height.max(axis=1) > 0) & (height.min(axis=1) < 0)
+        meets[meets] = _meets(pieces[rows[meets]], height[meets], knives[by[meets]])
+        rows, by, height = rows[meets], by[meets], height[meets]
+        is_cut = np.zeros(len(pieces), np.bool_)
+        is_cut[rows] = True
+        done.append(pieces[~is_cut])
+        if not len(rows):
+            return np.concatenate(done)
+        order = np.argsort(rows, kind="stable")
+        rows, by, height = rows[order], by[order], height[order]
+        owner, first, count = np.unique(rows, return_index=True, return_counts=True)
+        middle = first + count // 2
+        left = np.ones(len(rows), np.bool_)
+        left[middle] = False
+        pieces = _parts(pieces[owner], height[middle])
+        rest = np.searchsorted(owner, rows[left])
+        rows = (rest[:, None] + len(owner) * np.arange(3)).ravel()
+        by = np.repeat(by[left], 3)
+
+
+def _parts(pieces: FloatArray, height: FloatArray) -> FloatArray:
+    """Triangles (3 k, 3, 3) that triangles fall into at a plane above which their corners have
+    heights (k, 3): one on one side and two on the other."""
     # The corner that is alone on its side comes first; one in the plane goes with another.
-    side = np.where(height[rows] > 0, 1, -1)
-    side = np.where((height[rows] == 0), np.where(side.sum(axis=1) > 0, 1, -1)[:, None], side)
+    side = np.where(height > 0, 1, -1)
+    side = np.where((height == 0), np.where(side.sum(axis=1) > 0, 1, -1)[:, None], side)
     minority = np.where(side.sum(axis=1) > 0, -1, 1)
     alone = (side == minority[:, None]).argmax(axis=1)
     turn = (alone[:, None] + np.arange(3)) % 3
-    a, b, c = np.moveaxis(np.take_along_axis(pieces[rows], turn[:, :, None], axis=1), 1, 0)
-    h = np.take_along_axis(height[rows], turn, axis=1)
+    a, b, c = np.moveaxis(np.take_along_axis(pieces, turn[:, :, None], axis=1), 1, 0)
+    h = np.take_along_axis(height, turn, axis=1)
     p = a + (h[:, 0] / (h[:, 0] - h[:, 1]))[:, None] * (b - a)
     q = a + (h[:, 0] / (h[:, 0] - h[:, 2]))[:, None] * (c - a)
-    parts = [np.stack(one, axis=1) for one in ((a, p, q), (p, b, c), (p, c, q))]
-    return np.concatenate([pieces[whole], *parts]), np.concatenate([whole, rows, rows, rows])
+    return np.concatenate([np.stack(part, axis=1) for part in ((a, p, q), (p, b, c), (p, c, q))])
 
 
 def _heights(pieces: FloatArray, knives: FloatArray) -> FloatArray:

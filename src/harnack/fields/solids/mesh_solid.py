@@ -482,7 +482,10 @@ def _boundary(
     """
     rays = _tree(choose_backend("double"), unit, faces, weights, slabs=False)
     whole = np.delete(faces, zero_area_faces(unit, faces), axis=0)
-    pieces = pieces_of_faces(rays, unit, whole)
+    same = rays
+    if len(whole) < len(faces):
+        same = _tree(choose_backend("double"), unit, whole, 1.0, slabs=False)
+    pieces = pieces_of_faces(same, unit, whole)
     edges = pieces - np.roll(pieces, 1, axis=1)
     longest = np.linalg.norm(edges, axis=2).max(axis=1)
     is_thick = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) > _THIN * longest

@@ -1,0 +1,203 @@
+"""Triangles that lie in one plane and overlap, as where parts of a mesh touch; and their borders.
+
+None of two such triangles passes through the other, so that no edge crosses a face; and yet the
+winding number beside one of them changes where the other ends.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import numpy as np
+
+from harnack.backend import FloatArray, IntArray, to_numpy, to_vector3
+from harnack.backend.arrays import aligned_integers
+from harnack.backend.elementary import fmax, fmin
+from harnack.tree.hierarchy import Node, State, for_each, walk
+from harnack.tree.triangles import INDEX, NO_TRIANGLE, TriangleRays, corners_of
+
+if TYPE_CHECKING:
+    from harnack.backend import Mask, Real, Vec3
+
+__all__ = ["borders_of_overlaps"]
+
+# In units of the mesh's size: triangles so near to a plane lie in it, and overlap by more.
+_SAME = 1e-12
+# Planes are told apart in cells of this size, of their normals and distances from the origin.
+_CELL = 1e-6
+# Rounding of a normal, as a length at the corner of a triangle of size one.
+_ROUNDED = 1e-15
+# Odd numbers, by which coordinates of cells are mixed into one.
+_MIXED = np.array(
+    [0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9, 0xD6E8FEB86659FD93], np.uint64
+)
+
+
+def borders_of_overlaps(
+    rays: TriangleRays, vertices: FloatArray, faces: IntArray
+) -> tuple[IntArray, FloatArray]:
+    """Which faces (k,) have parts covered by others in their plane, and knives (k, 3, 3): triangles
+    that meet that plane in one edge of the covered part's border.
+
+    rays: the same faces, with coordinates of at most about one.
+
+    Within a part, where the others meet in edges that no further face has, as much covers the face
+    on both sides: such edges are left out.
+    """
+    one, other = _overlaps(rays, vertices, faces)
+    if not len(one):
+        return one, np.zeros((0, 3, 3))
+    edges, way = _edges(faces[other])
+    key, number = np.unique(edges, axis=0, return_inverse=True)
+    number = number.reshape(-1)
+    pairs = np.repeat(one, 3) * len(key) + number
+    lines, line, count = np.unique(pairs, return_inverse=True, return_counts=True)
+    net = np.zeros(len(lines), np.int64)
+    np.add.at(net, line.reshape(-1), way)
+    face, edge = np.divmod(lines, len(key))
+    ends, faces_at = np.unique(_edges(faces)[0], axis=0, return_counts=True)
+    width = len(vertices)
+    at = np.searchsorted(ends @ [width, 1], key[edge] @ [width, 1])
+    is_border = (net != 0) | (count != faces_at[at])
+    face, edge = face[is_border], edge[is_border]
+    p, q = np.moveaxis(vertices[key[edge]], 1, 0)
+    normal, _ = _normals(vertices[faces[face]])
+    away = np.linalg.norm(q - p, axis=1, keepdims=True) * normal
+    middle, side = 0.5 * (p + q), q - p
+    return face, np.stack([middle - away - side, middle - away + side, middle + away], axis=1)
+
+
+def _edges(faces: IntArray) -> tuple[IntArray, IntArray]:
+    """Edges (3 m, 2) of faces, the lower index first, and 1 or -1 for whether that turns them."""
+    ends = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    return np.sort(ends, axis=1), np.where(ends[:, 0] < ends[:, 1], 1, -1)
+
+
+def _normals(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Unit normals (m, 3) of triangles, 0 for those without one, and heights (m,) over their
+    longest edges."""
+    u, v = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    normal = np.cross(u, v)
+    area = np.sqrt(np.einsum("ni,ni->n", normal, normal))
+    squares = [np.einsum("ni,ni->n", edge, edge) for edge in (u, v, u - v)]
+    longest = np.sqrt(np.max(squares, axis=0))
+    height = area / np.where(longest > 0, longest, 1)
+    return normal / np.where(area > 0, area, 1)[:, None], height
+
+
+def _candidates(corners: FloatArray, normal: FloatArray, height: FloatArray) -> IntArray:
+    """Triangles (k,) in whose plane others may lie.
+
+    A plane is a point of R^4: its normal, the first coordinate of which that is clear of 0 is
+    positive, and its distance from the origin. For two triangles in one plane these points differ
+    by rounding and by what moves corners by `_SAME`, over the smaller of their heights. So of those
+    that are alone in their cell of R^4 only those as near to its walls may have others in their
+    plane; the lower triangle of a pair is always among those that are returned.
+    """
+    clear = np.abs(normal) - 0.3
+    first = np.take_along_axis(normal, (clear > 0).argmax(axis=1)[:, None], axis=1)
+    normal = np.where(first < 0, -normal, normal)
+    place = np.column_stack([normal, np.einsum("ni,ni->n", normal, corners[:, 0])]) / _CELL
+    cell = np.floor(place)
+    within = place - cell
+    to_wall = np.minimum(within, 1 - within).min(axis=1) * _CELL
+    slack = 4 * (_SAME + _ROUNDED) / np.where(height > 0, height, 1e-300)
+    is_sure = (to_wall > slack) & (np.abs(clear).min(axis=1) > slack)
+    # Cells that share a number are taken for one.
+    number = (cell.astype(np.int64).astype(np.uint64) * _MIXED).sum(axis=1)
+    _, group, count = np.unique(number, return_inverse=True, return_counts=True)
+    return np.flatnonzero((count[group] > 1) | ~is_sure)
+
+
+def _overlaps(
+    rays: TriangleRays, vertices: FloatArray, faces: IntArray
+) -> tuple[IntArray, IntArray]:
+    """Pairs of faces (k,), (k,) that overlap in a plane, each both ways round.
+
+    Each looks for others that are not lower than itself, of which it meets few.
+    """
+    backend = rays.tree.backend
+    corners = vertices[faces]
+    normals, heights = _normals(corners)
+    rows = _candidates(corners, normals, heights)
+    sizes, after = backend.Float(heights), np.full(len(rows), -1.0)
+    found: list[IntArray] = []
+    while len(rows):
+        ends = tuple(to_vector3(backend, one) for one in np.moveaxis(corners[rows], 1, 0))
+        own = aligned_integers(backend, rows)
+        found_here = _next_in_plane(rays, ends, own, sizes, backend.Float(after))
+        number = to_numpy(found_here).astype(np.int64)
+        hit = number != NO_TRIANGLE
+        rows, after = rows[hit], number[hit].astype(np.float64)
+        found.append(np.column_stack([rows, number[hit]]))
+    if not found:
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    pairs = np.concatenate(found)
+    pairs = np.unique(np.concatenate([pairs, pairs[:, ::-1]]), axis=0)
+    return pairs[:, 0], pairs[:, 1]
+
+
+def _next_in_plane(
+    rays: TriangleRays, corners: tuple[Vec3, ...], own: Any, sizes: Real, after: Real
+) -> Any:
+    """The first face with a number above `after` that overlaps the face `own`, one in each lane, in
+    its plane, and is no smaller. sizes: of all faces; of two alike the latter counts as larger."""
+    backend = rays.tree.backend
+    real, index, vector = backend.Float, backend.UInt32, backend.Array3f
+    a, b, c = corners
+    size = dr.gather(real, sizes, own)
+    low, high = fmin(fmin(a, b), c) - _SAME, fmax(fmax(a, b), c) + _SAME
+
+    def visit(node: Node, state: State) -> tuple[Mask, State]:
+        below, above = vector(*node.head[:3]), vector(*node.head[3:6])
+        open_ = dr.all((below <= high) & (above >= low))
+        return open_, for_each(node, open_ & node.is_leaf, nearer, state)
+
+    def nearer(row: list[Real], active: Mask, state: State) -> State:
+        number = index(fmax(row[INDEX], real(0)))
+        theirs = corners_of(row, vector)
+        other = dr.gather(real, sizes, number, active)
+        larger = (other > size) | ((other == size) & (number > own))
+        taken = active & (row[INDEX] > after) & (number < state[0]) & larger
+        taken &= _in_plane(corners, theirs) & _overlap(corners, theirs)
+        return (dr.select(taken, number, state[0]),)
+
+    return walk(rays.tree, visit, (index(NO_TRIANGLE),))[0]
+
+
+def _unit(vector: Vec3) -> Vec3:
+    """A vector of length 1; 0 for none."""
+    length = dr.norm(vector)
+    return dr.select(length > 0, vector / dr.select(length > 0, length, 1), 0)
+
+
+def _normal(corners: tuple[Vec3, ...]) -> Vec3:
+    a, b, c = corners
+    return _unit(dr.cross(b - a, c - a))
+
+
+def _in_plane(ours: tuple[Vec3, ...], theirs: tuple[Vec3, ...]) -> Mask:
+    """Whether one of two triangles has all corners in the plane of the other. (The normal of a thin
+    one may be all rounding.)"""
+
+    def lies_in(some: tuple[Vec3, ...], plane: tuple[Vec3, ...]) -> Mask:
+        normal = _normal(plane)
+        near = [dr.abs(dr.dot(normal, p - plane[0])) <= _SAME for p in some]
+        return near[0] & near[1] & near[2] & (dr.squared_norm(normal) > 0.5)
+
+    return lies_in(ours, theirs) | lies_in(theirs, ours)
+
+
+def _overlap(ours: tuple[Vec3, ...], theirs: tuple[Vec3, ...]) -> Mask:
+    """Whether two triangles in a plane overlap by more than `_SAME`: no edge of either has the
+    other triangle on its far side."""
+    overlaps: Mask = True
+    for some, others in ((ours, theirs), (theirs, ours)):
+        normal = _normal(some)
+        for k in range(3):
+            p, q = some[k], some[(k + 1) % 3]
+            inward = dr.cross(normal, _unit(q - p))
+            reach = [dr.dot(inward, x - p) for x in others]
+            overlaps &= fmax(fmax(reach[0], reach[1]), reach[2]) > _SAME
+    return overlaps
