@@ -160,12 +160,6 @@ def turned() -> Any:
     return CUBE.vertices, faces
 
 
-def stacked() -> Any:
-    """Two boxes, the smaller one on a face of the other."""
-    small = trimesh.creation.box((0.5, 0.5, 0.5)).apply_translation((0.1, 0.2, 1.25))
-    return trimesh.util.concatenate([CUBE, small])
-
-
 def half_turned() -> Any:
     other = CUBE.copy().apply_translation((5.0, 0.0, 0.0))
     other.invert()
@@ -179,7 +173,6 @@ def half_turned() -> Any:
         (turned, "do not agree on their two sides.*fix_winding"),
         (lambda: (CUBE.vertices, CUBE.faces[:, ::-1]), "inside out.*mesh.invert"),
         (half_turned, "a part of the mesh is inside out"),
-        (stacked, "lie on parts of others.*union"),
         (lambda: (np.where(CUBE.vertices > 0, np.nan, 0.0), CUBE.faces), "finite"),
         (lambda: (np.zeros((0, 3)), np.zeros((0, 3), int)), "no vertices"),
         (lambda: (CUBE.vertices, np.concatenate([CUBE.faces, CUBE.faces[:, ::-1]])), "canceled"),

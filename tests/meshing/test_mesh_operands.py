@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -31,6 +32,45 @@ def test_parts_that_cross_are_joined() -> None:
     assert made.is_watertight
     united = trimesh.Trimesh(UNITED.vertices, UNITED.faces)
     assert made.volume == pytest.approx(united.volume, rel=1e-9)
+
+
+def box(low: Any, high: Any) -> Any:
+    return trimesh.creation.box(bounds=np.array([low, high], float))
+
+
+PLATE = box((0, 0, 0), (30, 20, 10))
+
+
+@pytest.mark.parametrize(
+    ("parts", "volume"),
+    [
+        ([PLATE, box((5, 5, 10), (15, 15, 35))], 8500),
+        ([PLATE, box((30, 0, 0), (40, 20, 10))], 8000),
+        ([PLATE, box((25, 0, 10), (40, 20, 20))], 9000),
+        ([PLATE, box((10, 0, 0), (40, 20, 10))], 8000),
+        ([PLATE, box((0, 5, 5), (10, 10, 8))], 6000),
+        ([PLATE, PLATE], 6000),
+        ([PLATE, PLATE, box((30, 0, 0), (40, 20, 10))], 8000),
+        ([PLATE, box((0, 20, 0), (20, 40, 10)), box((10, 10, 10), (20, 30, 20))], 12000),
+    ],
+)
+@pytest.mark.parametrize("is_askew", [False, True])
+def test_parts_in_contact_are_joined(parts: list[Any], volume: float, is_askew: bool) -> None:
+    """Exactly in contact, or up to rounding."""
+    whole = trimesh.util.concatenate(parts)
+    if is_askew:
+        whole.apply_transform(trimesh.transformations.rotation_matrix(0.7, (0.3, -1.0, 0.4)))
+    made = hk.mesh(hk.solid(whole))
+    assert made.volume == pytest.approx(volume, rel=1e-7)
+    assert made.is_watertight
+    assert made.body_count == 1
+
+
+def test_within_parts_in_contact_distances_are_from_their_union() -> None:
+    whole = trimesh.util.concatenate([PLATE, box((5, 5, 10), (15, 15, 35))])
+    points = np.array([[7.5, 9, 9], [10, 10, 10], [2.5, 9, 9], [4, 10, 12]])
+    found = hk.solid(whole).value(points, precision="double")
+    assert found == pytest.approx([-math.hypot(2.5, 1), -5, -1, 1], abs=1e-12)
 
 
 def test_shells_are_as_thick_as_asked() -> None:

@@ -18,7 +18,7 @@ from harnack.meshing.checks import (
     check_manifold,
     intersecting_faces,
 )
-from harnack.meshing.edges import IntArray, numbered
+from harnack.meshing.edges import IntArray, dots, numbered
 from harnack.meshing.lattice_surface import Surface
 from harnack.meshing.uncrossing import made_apart
 
@@ -40,6 +40,9 @@ __all__ = [
 ]
 
 _MOST_SEGMENTS = 2000
+# Parts of a union have its area up to this part of it. Else they are grown, by this part of the
+# size; at sharp corners by no more than some times that.
+_SAME_AREA, _GROWN, _LEAST_SLANT = 1e-6, 1e-9, 0.1
 _MOST_CELLS = 1_000_000
 
 
@@ -67,6 +70,9 @@ def mesh_manifold(solid: MeshSolid) -> Manifold | None:
     """The mesh of a `MeshSolid`, itself: of one that crosses itself the union of its parts, or None
     where a part crosses itself, or is a cavity.
 
+    Parts in contact up to rounding would be left with gaps as thin as that, which have an area: if
+    the union has more than the boundary of the solid, parts are grown by next to nothing first.
+
     Raises:
         MeshingError: more than two faces meet at an edge.
     """
@@ -87,7 +93,25 @@ def mesh_manifold(solid: MeshSolid) -> Manifold | None:
         made = surface_of(part)
         if part.volume() <= 0 or len(intersecting_faces(made.vertices, made.faces)):
             return None
-    return Manifold.batch_boolean(parts, OpType.Add)
+    for length in (0.0, _GROWN * surface.size):
+        union = Manifold.batch_boolean([_grown(part, length) for part in parts], OpType.Add)
+        if abs(union.surface_area() - surface.area) <= _SAME_AREA * surface.area:
+            return union
+    return None
+
+
+def _grown(part: Manifold, length: float) -> Manifold:
+    """A part whose vertices are moved outwards so that faces are, by about a length."""
+    if length == 0:
+        return part
+    made = surface_of(part)
+    mesh = trimesh.Trimesh(made.vertices, made.faces, process=False)
+    way = np.array(mesh.vertex_normals)
+    slant = np.ones(len(way))
+    for k in range(3):
+        np.minimum.at(slant, made.faces[:, k], dots(way[made.faces[:, k]], mesh.face_normals))
+    away = way * (length / np.maximum(slant, _LEAST_SLANT))[:, None]
+    return manifold_of(Surface(made.vertices + away, made.faces))
 
 
 def surface_of(manifold: Manifold) -> Surface:

@@ -35,7 +35,9 @@ _MOST, _NEARLY_ALL, _FIRST = 400, 0.99, 1
 _COUNTED, _SAME = 8, 0.25
 _AT_ONCE = 1 << 20
 # The apex of all edges' triangles; any direction that edges are not likely to have.
-_APEX = np.array([0.3017, 0.5043, 0.8091]) / math.sqrt(0.3017**2 + 0.5043**2 + 0.8091**2)
+_APEX: FloatArray = np.array([0.3017, 0.5043, 0.8091]) / math.sqrt(
+    0.3017**2 + 0.5043**2 + 0.8091**2
+)
 
 
 def lies_on_own_level(mesh: WindingMesh, level: float) -> bool:
@@ -84,13 +86,16 @@ def _distances(edges: FloatArray, points: FloatArray, level: float) -> FloatArra
     found: list[FloatArray] = []
     step = max(1, _AT_ONCE // len(edges))
     for first in range(0, len(points), step):
-        p, q = (edges[None, :, k] - points[first : first + step, None] for k in (0, 1))
+        here = points[first : first + step, None]
+        p, q = edges[None, :, 0] - here, edges[None, :, 1] - here
         a, b = np.linalg.norm(p, axis=2), np.linalg.norm(q, axis=2)
-        normal, cosine = np.cross(p, q), a * b + (p * q).sum(axis=2)
-        turn = 2 * np.arctan2(normal @ _APEX, cosine + b * (p @ _APEX) + a * (q @ _APEX))
+        normal: FloatArray = np.cross(p, q)
+        cosine = a * b + (p * q).sum(axis=2)
+        below = cosine + b * (p @ _APEX) + a * (q @ _APEX)
+        turn = 2 * np.arctan2(normal @ _APEX, below)
         with np.errstate(divide="ignore", invalid="ignore"):  # on an edge it has no slope
             rates = ((a + b) / (a * b * cosine))[:, :, None] * normal
-        gap = turn.sum(axis=1) / (4 * math.pi) - level
+        gap: FloatArray = turn.sum(axis=1) / (4 * math.pi) - level
         slope = np.linalg.norm(rates.sum(axis=1), axis=1) / (4 * math.pi)
         found.append(np.abs(gap - np.round(gap)) / np.maximum(slope, 1e-300))
     return np.concatenate(found)

@@ -19,7 +19,7 @@ import numpy as np
 
 from harnack.arithmetic import Interval, Jet
 from harnack.arithmetic.jet import spanned
-from harnack.backend import FloatArray, IntArray, backend_of, choose_backend
+from harnack.backend import BoolArray, FloatArray, IntArray, backend_of, choose_backend
 from harnack.backend.elementary import fmin, largest_coordinate
 from harnack.backend.numbers import vector_text
 from harnack.backend.records import Records
@@ -106,7 +106,8 @@ class MeshSolid(Solid):
         (`geometry.welding`); faces may have zero area.
 
     A mesh that crosses or holds itself is the solid of the points around which it winds more than
-    1/2 times, the union where its parts overlap; f is the distance from the boundary of that.
+    1/2 times, the union where its parts overlap or touch; f is the distance from the boundary of
+    that.
 
     |f| is the distance from the nearest triangle, by a tree; so its constant is 1. It is off by at
     most 16 epsilons of the size of the mesh and the distance from its center
@@ -132,7 +133,8 @@ class MeshSolid(Solid):
 
     Raises:
         MeshError: a mesh that is not closed, whose faces do not agree on its two sides, that is
-            inside out somewhere, or whose faces lie on each other; the message says what to do.
+            inside out somewhere, or whose faces lie on each other up to rounding and not exactly;
+            the message says what to do.
     """
 
     vertices: Any
@@ -411,6 +413,8 @@ def jet_of_signed_distance(solid: MeshSolid, x: Jet, y: Jet, z: Jet) -> Jet:
 
 # Of the mesh's size: triangles not as high as that are not asked what is beside them.
 _THIN = 1e-9
+# Of the area of a closed surface: the integral of its normal is 0 up to this.
+_CLOSED = 1e-10
 # Places of a triangle at which the winding numbers on both sides are the same.
 _PLACES = ((0.98, 0.01, 0.01), (0.01, 0.98, 0.01), (0.01, 0.01, 0.98))
 
@@ -423,7 +427,8 @@ class ClosedSurface:
     vertices: (n, 3). faces: (m, 3), closed, no two alike; weights: (m,) how often each counts.
     pieces: (k, 3, 3) corners of triangles that bound the points of a winding number above 1/2; None
         if these are just the faces.
-    box: the lowest and the highest coordinates of that boundary.
+    box: the lowest and the highest coordinates of that boundary. area: of that boundary, a real
+        one, what is there several times counted once.
     """
 
     vertices: FloatArray
@@ -433,6 +438,7 @@ class ClosedSurface:
     size: float
     pieces: FloatArray | None
     box: tuple[FloatArray, FloatArray]
+    area: float
 
     @property
     def corners(self) -> FloatArray:
@@ -462,17 +468,17 @@ class ClosedSurface:
         def place(corners: FloatArray) -> str:
             return vector_text(center + size * corners.mean(axis=0))
 
-        pieces = _boundary(unit, net.faces, net.multiplicity, place)
+        pieces, area = _boundary(unit, net.faces, net.multiplicity, place)
         corners = unit[net.faces] if pieces is None else pieces
         box = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
-        return cls(unit, net.faces, net.multiplicity, center, size, pieces, box)
+        return cls(unit, net.faces, net.multiplicity, center, size, pieces, box, area * size**2)
 
 
 def _boundary(
     unit: FloatArray, faces: IntArray, weights: IntArray, place: Callable[[FloatArray], str]
-) -> FloatArray | None:
-    """The pieces of faces between winding numbers below and above 1/2; None if these are all faces,
-    uncut.
+) -> tuple[FloatArray | None, float]:
+    """The pieces of faces between winding numbers below and above 1/2, None if these are all faces,
+    uncut; and the area that they have, what is there several times counted once.
 
     Triangles thinner than `_THIN` have no normal along which to look. They are kept with the
     others, if these are all faces; else whatever is found beside them moves the surface by no more.
@@ -480,7 +486,8 @@ def _boundary(
     Raises:
         MeshError: the mesh is inside out, or faces lie on each other.
     """
-    rays = _tree(choose_backend("double"), unit, faces, weights, slabs=False)
+    faces = np.repeat(faces, weights, axis=0)
+    rays = _tree(choose_backend("double"), unit, faces, np.ones(len(faces)), slabs=False)
     whole = np.delete(faces, zero_area_faces(unit, faces), axis=0)
     same = rays
     if len(whole) < len(faces):
@@ -501,23 +508,42 @@ def _boundary(
             "faces of that part (trimesh.repair.fix_normals(mesh, multibody=True) tries), or take "
             "harnack.WindingNumber, which asks for no sides"
         )
-    # Across one triangle the winding number jumps by 1, or by how often it counts.
-    odd = high - low < 1 if weights.max() > 1 else high - low != 1
+    odd = np.zeros(len(pieces), np.bool_)
     for shares in _PLACES:
         one, other = windings_beside(rays, pieces, shares)
         odd |= (one != low) | (other != high)
-        if (odd := odd & is_thick).any():
-            raise MeshError(
-                f"{int(odd.sum()):,} faces of the mesh lie on parts of others, such as near "
-                f"{place(pieces[odd][0])}: join the parts that touch there, as "
-                "trimesh.boolean.union does"
-            )
-    on = (low < 0.5) & (high > 0.5)
-    if on[is_thick].all() and len(pieces) == len(whole):
-        return None
-    if not on.any():
+    on, jump = (low < 0.5) & (high > 0.5), high - low
+    if not _is_closed(pieces[on], jump[on], is_thick[on]):
+        odd |= jump != 1  # where parts are in contact, or faces there several times
+    if (odd := odd & is_thick).any():
+        raise MeshError(
+            f"{int(odd.sum()):,} faces of the mesh lie on parts of others, such as near "
+            f"{place(pieces[odd][0])}: join the parts that touch there, as trimesh.boolean.union "
+            "does"
+        )
+    is_whole = on[is_thick].all() and len(pieces) == len(whole)
+    if not is_whole and not on.any():
         raise MeshError("the mesh bounds no volume: its parts cancel each other")
-    return pieces[on]
+    area = 0.5 * np.linalg.norm(np.cross(edges[on, 0], edges[on, 1]), axis=1) / jump[on]
+    return None if is_whole else pieces[on], float(area.sum())
+
+
+def _is_closed(pieces: FloatArray, jump: FloatArray, is_thick: BoolArray) -> bool:
+    """Whether triangles (k, 3, 3), several of which may be in one place, bound a volume; if the
+    winding number jumps there by `jump` (k,) at each place.
+
+    The integrals of the normal and of x_i n_j over a closed surface are 0, and its volume for i = j
+    and else 0, by Gauss. What a piece in contact with another adds that ought to be left out is
+    none of that. Of those in one place, as many more are turned one way as the other as it jumps
+    by. Pieces that are not thick may count or not.
+    """
+    area = 0.5 * np.cross(pieces[:, 1] - pieces[:, 0], pieces[:, 2] - pieces[:, 0])
+    size = np.linalg.norm(area, axis=1)
+    area = area / np.maximum(jump, 1)[:, None]
+    moment = np.einsum("ki,kj->ij", pieces.mean(axis=1), area)
+    off = moment - np.trace(moment) / 3 * np.eye(3)
+    most = _CLOSED * size.sum() + 4 * size[~is_thick].sum()
+    return bool(max(np.abs(area.sum(axis=0)).max(), np.abs(off).max()) <= most)
 
 
 def _check_closed(vertices: FloatArray, welded: Welded) -> None:
