@@ -727,6 +727,36 @@ def test_points_outside_the_domain_have_no_lower_bound() -> None:
         signed_distance(hk.Gyroid(), [[0, 0, 0], [9, 0, 0], [0, 9, 0]], method="lower")
 
 
+# --- surfaces along which the gradient is zero -------------------------------------------------
+
+BOX = hk.Box((-2.5, -2.5, -2.5), (2.5, 2.5, 2.5))
+
+
+def to_sphere(x: np.ndarray) -> np.ndarray:
+    return np.abs(np.linalg.norm(x, axis=1) - 1)
+
+
+@pytest.mark.few(1)
+@pytest.mark.parametrize(
+    ("text", "exact"),
+    [
+        ("(x^2 + y^2 + z^2 - 1)^3", to_sphere),
+        ("x*x*y", lambda x: np.abs(x[:, :2]).min(axis=1)),
+        ("(x^2 + y^2 + z^2 - 1)^2 * x^3", lambda x: np.fmin(to_sphere(x), np.abs(x[:, 0]))),
+        ("(x^2 + y^2 + z^2 - 1)^2", to_sphere),
+        ("(x^2 + y^2 + z^2 - 1)^7", to_sphere),
+        ("1e-30 * (x^2 + y^2 + z^2 - 1)^3", to_sphere),
+    ],
+)
+def test_surfaces_along_which_the_gradient_is_zero(text: str, exact: Any) -> None:
+    """Of a cube nearly all distances were NaN: Newton's method shrinks by a third at each step."""
+    x = np.concatenate([[[0, 0, 1.5]], np.random.default_rng(4).uniform(-2, 2, (150, 3))])
+    found = signed_distance(hk.expression(text, domain=BOX), x)
+    assert np.abs(np.abs(found) - exact(x)).max() < 1e-7
+    bounds = hk.distance_bounds(hk.expression(text, domain=BOX), x[:10])
+    assert (bounds.lower <= exact(x[:10]) + 1e-12).all()
+
+
 # --- fields that jump --------------------------------------------------------------------------
 
 

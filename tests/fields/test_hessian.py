@@ -273,6 +273,23 @@ def test_check_field_sees_a_wrong_hessian(spoiled: Spoiled, message: str) -> Non
         check_field(spoiled, count=20)
 
 
+class Creased(Spoiled):
+    """Nothing says that it is smooth."""
+
+    has_creases = True
+
+    def evaluate(self, p: Any) -> hk.Sample:
+        return dataclasses.replace(super().evaluate(p), known=(hk.Lipschitz(1.0),))
+
+
+def test_check_field_sees_a_wrong_hessian_where_there_may_be_creases() -> None:
+    """Differences were taken at the spacing at which values tell most of the gradient, 1e-7 of the
+    size: there any Hessian is right up to rounding."""
+    check_field(Creased(), count=20)
+    with pytest.raises(BrokenPromiseError, match="derivative of the gradient"):
+        check_field(Creased(xx=1e-4), count=20)
+
+
 # --- the curve that level sets end in ---------------------------------------------------------
 
 

@@ -199,6 +199,16 @@ def test_a_singular_point_left_out_is_found() -> None:
         check_field(wrong)
 
 
+def test_a_branch_point_whose_constant_is_too_small_is_found() -> None:
+    """Random rays hardly come near: 1.4 of the square root of 2 passed."""
+    point = hk.BranchPoint(0, 0.5, 0.99)
+    wrong = hk.RiemannSurface(
+        root, singular=[point], second=lambda z, r: 0.25 * (abs(z) - r) ** -1.5
+    )
+    with pytest.raises(BrokenPromiseError, match=r"constant must be at least (1|0.9999)"):
+        check_field(wrong, count=20)
+
+
 @pytest.mark.parametrize("factor", [1.0, 1.001])
 @pytest.mark.parametrize("rises", [False, True])
 def test_sheets_that_bend_as_far_as_they_may_are_met(rises: bool, factor: float) -> None:

@@ -33,6 +33,29 @@ def test_films_are_left_out_and_cavities_stay() -> None:
     assert len(made.vertices) == 16
 
 
+@pytest.mark.few(1)
+@pytest.mark.parametrize(
+    "text",
+    ["(x^2 + y^2 + z^2 - 1)^2", "x*x*(y - 3)", "(x^2 + y^2 + z^2 - 1)^4", "abs(x + y - 0.1)",
+     "(x^2 + y^2 + z^2 - 1) * (x - 0.1)^2"],
+)  # fmt: skip
+def test_a_level_that_is_touched_and_not_passed_is_said(text: str) -> None:
+    """It was called empty, or cells were called too large, of which none are small enough."""
+    box = hk.Box((-2, -2, -2), (2, 2, 2))
+    with pytest.raises(hk.MeshingError, match=r"comes to 0 without passing it.*u instead of u\^2"):
+        hk.mesh(hk.expression(text, domain=box), tolerance=1e-2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("power", [3, 7])
+def test_a_level_passed_without_slope_is_meshed(power: int) -> None:
+    field = hk.expression(f"(x^2 + y^2 + z^2 - 1)^{power}", domain=hk.Box((-2,) * 3, (2,) * 3))
+    made = hk.mesh(field, tolerance=1e-2)
+    assert made.is_watertight
+    assert np.abs(np.linalg.norm(made.vertices, axis=1) - 1).max() < 1e-9
+    assert made.volume == pytest.approx(4 / 3 * math.pi, rel=1e-2)
+
+
 @pytest.mark.slow
 def test_between_two_levels_that_are_the_same_triangles_is_nothing() -> None:
     cube = trimesh.creation.box((1.0, 1.0, 1.0))

@@ -16,7 +16,7 @@ import drjit as dr
 from harnack.backend import elementary as lengths
 from harnack.backend.elementary import clamp, fmax, fmin
 from harnack.distance.free_ball import free_radius
-from harnack.distance.surface_cells import remainder
+from harnack.distance.surface_cells import multiplicity, remainder
 from harnack.distance.tangent import Eigen, TangentPlane, has_hessian
 
 if TYPE_CHECKING:
@@ -31,6 +31,8 @@ _STEPS_DIRECT = 10
 _NEAR = 1e-11  # of the distance: the last step is expected to be shorter
 _STEPS_TO_LEVEL = 60
 _STEPS_ALONG = 60
+# Newton's method to a simple root takes fewer steps than that.
+_PATIENT = 16
 _LEAST_SHARE = 1e-7  # of a step: shorter ones are given up
 _LEAST_EIGENVALUE = 0.05  # of B (`Descent.closest`): steps are no longer than 20 gradients
 _INDEFINITE = -1e-3
@@ -59,6 +61,14 @@ class _Place:
     def parts(self) -> tuple[Any, ...]:
         """The fields in the order of the constructor, as loops want them."""
         return self.y, self.gradient, self.noise, self.reach
+
+    def flat_after(self, mask: Mask, before: _Place) -> _Place:
+        """The place, where f - level and its gradient are 0 on lanes of the mask: with the gradient
+        of the place before, and with the rounding of coordinates alone."""
+        epsilon = float(dr.epsilon(type(self.noise)))
+        rounding = 4 * epsilon * lengths.largest_coordinate(self.y)
+        gradient = dr.select(mask, before.gradient, self.gradient)
+        return _Place(self.y, gradient, dr.select(mask, rounding, self.noise), self.reach)
 
     def where(self, mask: Mask, other: _Place) -> tuple[Any, ...]:
         """Its parts in some lanes, another's elsewhere."""
@@ -260,24 +270,33 @@ class Descent:
 
         A step is no longer than the ball on which f is known to be smooth, and counts if it comes
         nearer to a level. Returns the end, and whether it is on a level to rounding.
+
+        Where f - level is a power u^m, as on a surface along which grad f is 0, steps shrink by 1 -
+        1/m only. Those that do so for long are made `multiplicity` times as long. If such a step
+        ends where f - level and its gradient are 0, the direction of the gradient is the last one.
         """
         real, vector, count = self.backend.Float, self.backend.Array3f, self.backend.UInt32
 
         def body(
             above: Real, y: Vec3, g: Vec3, noise: Real, reach: Real,
-            share: Real, close: Mask, n: Any, active: Mask,
+            last: Real, share: Real, close: Mask, n: Any, active: Mask,
         ) -> tuple[Any, ...]:  # fmt: skip
             here, gradient_norm, first = _Place(y, g, noise, reach), lengths.length(g), n == 0
-            length = share * clamp(-above / gradient_norm, -reach, reach)
+            step = -above / gradient_norm
+            longer = dr.select(n > _PATIENT, multiplicity(step, last), 1)
+            length = share * clamp(longer * step, -reach, reach)
             nearer = dr.fma(vector(length / gradient_norm), g, y)
             above2, there = self._evaluate(dr.select(first, y, nearer))
+            is_flat = ~first & (above2 == 0) & (lengths.length(there.gradient) == 0)
+            there = there.flat_after(is_flat, here)
             better = active & (first | (dr.abs(above2) < dr.abs(above)))
             longer = dr.select(better, fmin(2 * share, 1), 0.25 * share)
             share = dr.select(first, share, longer)
             close |= better & self._is_close(above2, there)
             active &= ~close & (n <= _STEPS_TO_LEVEL) & (share > _LEAST_SHARE)
             above = dr.select(better, above2, above)
-            return above, *there.where(better, here), share, close, n + 1, active
+            last = dr.select(first, dr.inf, dr.abs(step))
+            return above, *there.where(better, here), last, share, close, n + 1, active
 
         def more(*state: Any) -> Mask:
             return state[-1]
@@ -285,8 +304,9 @@ class Descent:
         # Round 0 evaluates the start.
         first = _Place(vector(start), vector(0), real(0), real(0))
         close = self.backend.Bool(False)
-        state = (real(dr.inf), *first.parts(), real(1), close, count(0), self.backend.Bool(active))
-        _, *place, _, close, _, _ = dr.while_loop(state, more, body, label="to the level")
+        going = self.backend.Bool(active)
+        state = (real(dr.inf), *first.parts(), real(dr.inf), real(1), close, count(0), going)
+        _, *place, _, _, close, _, _ = dr.while_loop(state, more, body, label="to the level")
         return _Place(*place), close
 
     def _step_along(

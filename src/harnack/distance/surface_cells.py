@@ -191,6 +191,8 @@ class _RimPlace:
 # Cells.
 
 _STEPS = 6
+# More of them where Newton's steps shrink at a rate between these, as to a multiple root.
+_MORE_STEPS, _SHRINKS = 14, (0.4, 0.97)
 # The radius of the ball around a cube of half size 1.
 _WITHIN = 3**0.5 * (1 + 1e-9)
 # A foot is on the level up to this share of its cell.
@@ -207,6 +209,14 @@ def remainder(sample: Sample, radius: Real, degree: int = 1) -> Real:
     for known in sample.promises:
         best = fmin(best, known.remainder(sample.value, radius, degree))
     return best + sample.error + sample.gradient_error * radius
+
+
+def multiplicity(step: Real, last: Real) -> Real:
+    """How many times as long as Newton's the step to a root has to be, by the length of the last
+    one: m, if steps shrink by 1 - 1/m, as for u^m. 1 where they shrink faster, or hardly."""
+    ratio = dr.abs(step) / last
+    is_slow = (ratio > _SHRINKS[0]) & (ratio < _SHRINKS[1])
+    return dr.select(is_slow, 1 / (1 - ratio), 1)
 
 
 @dataclass
@@ -350,16 +360,22 @@ class CellProofs:
         def body(y: Vec3, off: Real, k: Any) -> tuple[Any, ...]:
             sample = self._field.evaluate(y)
             steep = length(sample.gradient)
-            wanted = self._levels.to_nearest(sample.value) / steep
-            move = clamp(wanted, -radius, radius)
+            off_level = self._levels.to_nearest(sample.value)
+            wanted = off_level / steep
+            longer = dr.select(k >= _STEPS - 1, multiplicity(wanted, off), 1)
+            move = clamp(longer * wanted, -radius, radius)
             going = dr.isfinite(move) & (dr.norm(y - p) < 4 * radius)
-            off = dr.select(going, dr.abs(wanted), dr.inf)
+            shrinks = (k < _STEPS - 1) | (dr.abs(wanted) < _SHRINKS[1] * off)
+            # On a surface along which the gradient is 0 the last step was the last one.
+            is_flat = (off_level == 0) & (steep == 0)
+            off = dr.select(going, dr.abs(wanted), dr.select(is_flat, 0, dr.inf))
             y = dr.select(going, dr.fma(vector(move / steep), sample.gradient + zero, y), y)
-            return y, off, dr.select(going & (off > 1e-9 * radius), k + 1, _STEPS)
+            going &= shrinks & (off > 1e-9 * radius)
+            return y, off, dr.select(going, k + 1, _MORE_STEPS)
 
         def more(y: Vec3, off: Real, k: Any) -> Mask:
             del y, off
-            return k < _STEPS
+            return k < _MORE_STEPS
 
         start = (vector(p), real(dr.inf), count(0))
         y, off, _ = dr.while_loop(start, more, body, label="feet of cells")

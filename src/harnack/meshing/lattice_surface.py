@@ -28,7 +28,7 @@ from harnack.meshing.marching_tetrahedra import (
     crossings_of,
     triangles_of,
 )
-from harnack.meshing.points import Boundary, PointSet, newton
+from harnack.meshing.points import Boundary, PointSet, newton, to_multiple_roots
 from harnack.meshing.refinement import refined, smoothed, smoothed_within
 from harnack.meshing.samples import LevelFunction, Samples
 
@@ -57,6 +57,11 @@ _TOGETHER, _LONG = 1.0, 2.0
 _THIN, _LEAST = 0.25, 2.0**-7
 # How near to the level, in cells, a point has to come by Newton's method.
 _ON = 1e-3
+# Newton's method may be on the way to a multiple root where it came nearer by that much.
+_SLOW = 0.7
+# Where the function touches its level: how many points are tried; how far beside them, in cells,
+# the function is looked at; golden sections; and how near it comes, as a part of what it is there.
+_MOST_TRIED, _BESIDE, _SECTIONS, _GOLDEN, _TOUCHES = 60, 0.01, 40, 0.6180339887498949, 1e-8
 # So large a part of vertices may be farther from the level than that many cells: where signs change
 # by a jump.
 _MOST_JUMPS, _FAR = 0.04, 0.1
@@ -111,7 +116,8 @@ def check_nothing_missed(
         how far around points it does not.
 
     Raises:
-        MissedError: with one of the places. HopelessError: the function is its level in a volume.
+        MissedError: with one of the places. HopelessError: the function is its level in a volume,
+            or touches it along a surface.
     """
     import scipy.spatial  # here: half a second that few need
 
@@ -122,7 +128,12 @@ def check_nothing_missed(
     start = points[rows]
     step = np.full(len(rows), 0.5 * size)
     x = newton(function, start, samples.some(rows), step, None)
-    found = function.at(x).distance < _ON * size
+    left = function.at(x)
+    found = left.distance < _ON * size
+    slow = ~found & (left.distance < _SLOW * samples.distance[rows])
+    if slow.any():
+        x[slow] = to_multiple_roots(function, x[slow], left.some(slow), step[slow])
+        found[slow] = function.at(x[slow]).distance < _ON * size
     found &= lengths(x - start) < _FOUND * size
     deep = _DEEP * size
     found &= ((x >= box[0] + deep) & (x <= box[1] - deep)).all(axis=1)
@@ -136,6 +147,7 @@ def check_nothing_missed(
     part = _longest_part(x, _TOGETHER * size)
     if len(part) and np.ptp(part, axis=0).max() >= _LONG * size:
         _check_off_level_around(function, part, _FLAT_AROUND * size)
+        _check_passes_level(function, part, size)
         a, b, c = part[0]
         raise MissedError(
             f"cells of {size:.3g} miss parts of the level set, such as that at ({a:.4g}, {b:.4g}, "
@@ -179,6 +191,43 @@ def _check_off_level_around(function: LevelFunction, part: FloatArray, reach: fl
             f"{type(function.field).__name__} is {function.level:g}, up to rounding, at and around "
             f"points such as ({a:.4g}, {b:.4g}, {c:.4g}): its level there is a volume and no "
             "surface; choose another level"
+        )
+
+
+def _check_passes_level(function: LevelFunction, part: FloatArray, size: float) -> None:
+    """Raise if the function touches its level at most of some points (n, 3) near it, and does not
+    pass it, as a square does, whose sign no cells show.
+
+    Across such a point, on a line along the slope beside it, the function is on one side of the
+    level, and where it comes nearest, by golden sections, it is as near as rounding lets it.
+    """
+    x = part[:: -(-len(part) // _MOST_TRIED)]
+    half = _BESIDE * size
+    beside = function.at((x[:, None] + half * np.eye(3)).reshape(-1, 3)).gradient.reshape(-1, 3, 3)
+    steepest = beside[np.arange(len(x)), (beside**2).sum(axis=2).argmax(axis=1)]
+    way = steepest / np.maximum(lengths(steepest), 1e-300)[:, None]
+
+    def along(s: FloatArray) -> FloatArray:
+        return function.values(x + s[:, None] * way)
+
+    low, high = np.full(len(x), -half), np.full(len(x), half)
+    side = np.sign(along(low))
+    ends = np.minimum(side * along(low), side * along(high))
+    nearest = ends.copy()
+    for _ in range(_SECTIONS):
+        s, t = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
+        one, other = side * along(s), side * along(t)
+        nearest = np.minimum(nearest, np.minimum(one, other))
+        low, high = np.where(one > other, s, low), np.where(one > other, high, t)
+    touches = (ends > 0) & (nearest >= 0) & (nearest <= _TOUCHES * ends)
+    if touches.mean() > 0.5:
+        a, b, c = x[touches][0]
+        name, level = type(function.field).__name__, function.level
+        raise HopelessError(
+            f"{name} comes to {level:g} without passing it, as a square does, at points such as "
+            f"({a:.4g}, {b:.4g}, {c:.4g}): the surface there has one side only and no mesh finds "
+            "it. Give a function that changes its sign there, such as u instead of u^2, or mesh a "
+            f"thin wall, such as hk.solid(f, between=({level:g} - t, {level:g} + t)) with a small t"
         )
 
 

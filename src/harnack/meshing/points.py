@@ -28,6 +28,8 @@ _FREE = 0.45  # no other points are so near to the curve
 _MOST_CELLS = 4_000_000
 # A step of Newton's method that is shorter is the last: a part of the longest one.
 _CONVERGED = 1e-9
+# How often the way to a multiple root is continued as a geometric series, and the rates of that.
+_SERIES, _RATES = 4, (0.4, 0.97)
 _CORNERS = np.array(list(itertools.product((0.0, 1.0), repeat=3)))
 
 
@@ -291,4 +293,21 @@ def newton(
         if k == steps - 1 or not len(rows):
             break
         samples = function.at(x[rows])
+    return x
+
+
+def to_multiple_roots(
+    function: LevelFunction, points: FloatArray, samples: Samples, longest: FloatArray
+) -> FloatArray:
+    """Points (n, 3) after steps towards the level as long as it takes where f - level is a power
+    u^m, to which Newton's shrink by 1 - 1/m only: to where a geometric series of two ends."""
+    x = points
+    for k in range(_SERIES):
+        first = newton(function, x, samples if k == 0 else function.at(x), longest, None, steps=1)
+        second = newton(function, first, function.at(first), longest, None, steps=1)
+        one, other = lengths(first - x), lengths(second - first)
+        ratio = other / np.maximum(one, 1e-300)
+        is_slow = (ratio > _RATES[0]) & (ratio < _RATES[1])
+        factor = np.where(is_slow, 1 / (1 - np.minimum(ratio, _RATES[1])), 1.0)
+        x = first + factor[:, None] * (second - first)
     return x

@@ -57,13 +57,14 @@ def check_derivatives(field: Field, points: FloatArray, look: FieldValues) -> No
     limits = [np.add(*_limits(field, points, look, nearby)) for nearby in trials]
     nearby = _chosen(trials, np.argmin(limits, axis=0))
     _check_gradient(field, points, look, nearby)
-    _check_laplacian(points, look, nearby)
+    _check_laplacian(points, look, trials)
     try:
-        _check_hessian(field, points, look, nearby)
+        _check_hessian(field, points, look, trials)
     except BrokenPromiseError:
         if not field.has_detail:
             raise
-        _check_hessian(field, points, look, _closely(field, points, nearby))
+        closely = [_closely(field, points, one) for one in trials]
+        _check_hessian(field, points, look, closely)
 
 
 def _spacing_within(
@@ -216,25 +217,53 @@ def _second_derivatives(nearby: list[_Nearby]) -> FloatArray:
     return np.sum([np.abs(one.weight * one.gradient[:, one.axis]) for one in nearby], axis=0)
 
 
-def _check_laplacian(points: FloatArray, look: FieldValues, nearby: list[_Nearby]) -> None:
+def _check_laplacian(points: FloatArray, look: FieldValues, trials: list[list[_Nearby]]) -> None:
     """By central differences of the gradient."""
     bounds = [one for one in look.known if isinstance(one, BoundedLaplacian)]
     if not _is_harmonic(look) and not bounds:
         return
-    h = nearby[0].h
-    laplacian = np.sum([one.weight * one.gradient[:, one.axis] for one in nearby], axis=0)
-    allowance = np.sum([np.abs(one.weight) * one.gradient_error for one in nearby], axis=0)
     length = np.linalg.norm(look.gradient, axis=1)
-    wide = np.sum([one.wide * one.gradient[:, one.axis] for one in nearby], axis=0)
-    tolerance = 1e-6 * _second_derivatives(nearby) + _SHARE * np.abs(laplacian - wide)
-    tolerance += 1e-11 * length * (1 + _size(points) / h) / h
+
+    def differences(nearby: list[_Nearby]) -> tuple[FloatArray, FloatArray, FloatArray]:
+        h = nearby[0].h
+        laplacian = np.sum([one.weight * one.gradient[:, one.axis] for one in nearby], axis=0)
+        allowance = np.sum([np.abs(one.weight) * one.gradient_error for one in nearby], axis=0)
+        wide = np.sum([one.wide * one.gradient[:, one.axis] for one in nearby], axis=0)
+        tolerance = 1e-6 * _second_derivatives(nearby) + _SHARE * np.abs(laplacian - wide)
+        tolerance += 1e-11 * length * (1 + _size(points) / h) / h
+        return laplacian, tolerance, allowance
+
+    tried = [differences(nearby) for nearby in trials]
     if _is_harmonic(look):
         message = "HarmonicBall: f is not harmonic, its Laplacian is not 0"
-        _agree(np.abs(laplacian), tolerance, allowance, message, points)
+        _agree(*_likeliest([(np.abs(one), *rest) for one, *rest in tried]), message, points)
     for one in bounds:
-        off = np.maximum(one.laplacian_lower - laplacian, laplacian - one.laplacian_upper)
+        low, high = one.laplacian_lower, one.laplacian_upper
+        beyond = [
+            (np.maximum(np.maximum(low - laplacian, laplacian - high), 0), *rest)
+            for laplacian, *rest in tried
+        ]
         message = "BoundedLaplacian: the Laplacian is not between its ends"
-        _agree(np.maximum(off, 0), tolerance, allowance, message, points)
+        _agree(*_likeliest(beyond), message, points)
+
+
+def _likeliest(
+    tried: list[tuple[FloatArray, ...]],
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """At each point, of the two spacings at which differences tell most, the one at which they
+    agree better: how far off they are, the tolerance and the allowance, (n,) each.
+
+    Differences across a crease may be close at one spacing by accident, and wrong.
+    """
+    off, tolerance, allowance = (np.stack(one) for one in zip(*tried, strict=True))
+    limit = tolerance + allowance
+    best = np.argsort(limit, axis=0)[:2]
+    over = np.take_along_axis(off - limit, best, axis=0)
+    chosen = np.take_along_axis(best, over.argmin(axis=0)[None], axis=0)
+    off, tolerance, allowance = (
+        np.take_along_axis(one, chosen, axis=0)[0] for one in (off, tolerance, allowance)
+    )
+    return off, tolerance, allowance
 
 
 def _is_harmonic(look: FieldValues) -> bool:
@@ -264,9 +293,11 @@ def _agree(
 
 
 def _check_hessian(
-    field: Field, points: FloatArray, look: FieldValues, nearby: list[_Nearby]
+    field: Field, points: FloatArray, look: FieldValues, trials: list[list[_Nearby]]
 ) -> None:
-    """By central differences of the gradient, of two orders: they tell how far to trust them."""
+    """By central differences of the gradient, of two orders: they tell how far to trust them. The
+    spacing at which the gradient is compared with values is far too small for that where f may have
+    creases: so each quantity has its own."""
     backend = choose_backend("double")
     try:
         rows = field.prepare(backend).hessian(to_vector3(backend, points, "points"))
@@ -283,17 +314,22 @@ def _check_hessian(
     if _is_harmonic(look):
         trace = np.abs(np.trace(hessian, axis1=1, axis2=2))
         require(trace <= 1e-9 * size, "f is harmonic, but its Hessian has a trace", points, trace)
-    h = nearby[0].h
-    fine, coarse = np.zeros_like(hessian), np.zeros_like(hessian)
-    for one in nearby:
-        fine[:, :, one.axis] += one.weight[:, None] * one.gradient
-        half = 0.5 * one.node if abs(one.node) == 1 else 0.0
-        coarse[:, :, one.axis] += half * one.gradient / h[:, None]
-    off = np.abs(fine - hessian).max(axis=(1, 2))
-    tolerance = 1e-7 * size + 0.1 * np.abs(fine - coarse).max(axis=(1, 2))
-    tolerance += 1e-11 * length * (1 + _size(points) / h) / h
-    if isinstance(field, BatchedField):  # what it leaves out need not be what the gradient does
-        tolerance += field.hessian_error_bound(points, precision="double")
-    allowance = np.sum([np.abs(one.weight) * one.gradient_error for one in nearby], axis=0)
+    own = 0.0  # what it leaves out need not be what the gradient does
+    if isinstance(field, BatchedField):
+        own = field.hessian_error_bound(points, precision="double")
+
+    def differences(nearby: list[_Nearby]) -> tuple[FloatArray, FloatArray, FloatArray]:
+        h = nearby[0].h
+        fine, coarse = np.zeros_like(hessian), np.zeros_like(hessian)
+        for one in nearby:
+            fine[:, :, one.axis] += one.weight[:, None] * one.gradient
+            half = 0.5 * one.node if abs(one.node) == 1 else 0.0
+            coarse[:, :, one.axis] += half * one.gradient / h[:, None]
+        tolerance = 1e-7 * size + 0.1 * np.abs(fine - coarse).max(axis=(1, 2)) + own
+        tolerance += 1e-11 * length * (1 + _size(points) / h) / h
+        allowance = np.sum([np.abs(one.weight) * one.gradient_error for one in nearby], axis=0)
+        return np.abs(fine - hessian).max(axis=(1, 2)), tolerance, allowance
+
+    found = _likeliest([differences(nearby) for nearby in trials])
     message = "the Hessian is not the derivative of the gradient"
-    _agree(off, tolerance, allowance, message, points, has_creases=field.has_creases)
+    _agree(*found, message, points, has_creases=field.has_creases)

@@ -17,9 +17,11 @@ from harnack.enclosures import (
     choose_proofs,
     longest_step,
 )
+from harnack.fields.analytic.riemann_surface import RiemannSurface
 from harnack.fields.batch import BatchedField
 from harnack.fields.field import Field
 from harnack.fields.look import Path
+from harnack.testing.branch_contracts import check_branch_points
 from harnack.testing.derivative_contracts import check_derivatives
 from harnack.testing.worst_places import (
     BrokenPromiseError,
@@ -147,7 +149,8 @@ def check_field(
     promise); enclosures along paths, of a field that gives its own (`check_looks`), hold; some step
     is possible at most points; no level set leaves its `extent`. Jumps across sheets
     are taken out on the way, and values may move between neighboring points by `Sample.error`
-    besides, as they do where a tree takes other clusters as wholes.
+    besides, as they do where a tree takes other clusters as wholes. Near the branch points of a
+    Riemann surface all branches are within what these say.
 
     The default takes one to three seconds for most fields, on two cores; for meshes about ten, for
     a `Morph` half a minute. It is a search and no proof: a promise that is wrong where nothing
@@ -178,6 +181,8 @@ def check_field(
     for number, known in enumerate(look.known):
         _check_promise(field, points, look, known, generator, directions)
         search_worst_places(field, points, look, number, generator)
+    if isinstance(field, RiemannSurface):
+        check_branch_points(field, float(np.ptp(points, axis=0).max()), generator)
     if _proves_looks(field):
         for precision in ("double", "single"):
             check_looks(field, points, rng=generator, precision=precision)

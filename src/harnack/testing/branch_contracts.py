@@ -1,0 +1,75 @@
+"""What is promised of the branches of a Riemann surface, sampled."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from harnack.backend import FloatArray, choose_backend, to_numpy
+from harnack.fields.analytic.branches import complex_type
+from harnack.testing.worst_places import require
+
+if TYPE_CHECKING:
+    from harnack.fields.analytic.branches import BranchPoint
+    from harnack.fields.analytic.riemann_surface import RiemannSurface
+
+__all__ = ["check_branch_points"]
+
+# Places about each branch point, and the least of their distances, in sizes.
+_PLACES, _NEAREST = 4000, 1e-6
+# More than the rounding of branches and of their power.
+_SLACK = 1e-6
+
+
+def check_branch_points(field: RiemannSurface, size: float, rng: np.random.Generator) -> None:
+    """Test that |g - value| <= constant |z - at|^power within the radius of each branch point, for
+    the part of g that is drawn, up to its period: proofs of steps near it are made of that, and
+    rays that happen to come so near are few.
+
+    size: of the domain, as far as a radius may be infinite.
+
+    Raises:
+        BrokenPromiseError: naming the branch point, and the place where it does not hold.
+    """
+    for point in field.branches.points:
+        if point.power is not None:
+            _check_branch_point(field, point, min(point.radius, size), rng)
+
+
+def _check_branch_point(
+    field: RiemannSurface, point: BranchPoint, radius: float, rng: np.random.Generator
+) -> None:
+    backend = choose_backend("double")
+    assert point.power is not None
+    # As many near the point as near the circle, where the power's share of g is least.
+    away = radius * np.where(
+        rng.random(_PLACES) < 0.5,
+        _NEAREST ** rng.random(_PLACES),
+        np.sqrt(rng.random(_PLACES)) * (1 - 1e-9),
+    )
+    angle = rng.uniform(-math.pi, math.pi, _PLACES)
+    x, y = point.at.real + away * np.cos(angle), point.at.imag + away * np.sin(angle)
+    away = np.hypot(x - point.at.real, y - point.at.imag)  # of the places as rounded
+    branches: Any = field.branches.prepare(backend)
+    imaginary = field.part == "imag"
+    period = branches.period(imaginary)
+    value = point.value.imag if imaginary else point.value.real
+    allowed = point.constant * away**point.power
+    worst = np.zeros(_PLACES)
+    for one in branches.at(complex_type(backend)(backend.Float(x), backend.Float(y))):
+        part = one.value.imag if imaginary else one.value.real
+        off: FloatArray = to_numpy(part) - value
+        if period is not None:
+            off -= period * np.round(off / period)
+        worst = np.fmax(worst, np.abs(off))
+    rounding = _SLACK * (allowed + 1e-6 * abs(value)) + 2.0**-48 * (abs(value) + np.abs(point.at))
+    require(
+        worst <= allowed + rounding,
+        f"BranchPoint({point.at}): a branch is farther from the value {point.value} than "
+        f"{point.constant:g} |z - at|^{point.power:g}: the constant must be at least "
+        f"{(worst / away**point.power).max():.6g}",
+        np.column_stack([x, y, np.full(_PLACES, field.height * value)]),
+        worst - allowed,
+    )
