@@ -362,7 +362,7 @@ def open_surface(
     points = lattice.points(coordinates)
     report(f"{len(points):,} points, {len(corners):,} tetrahedra")
     nowhere = np.zeros(len(points), np.bool_)
-    samples = _sampled(function, points, lattice)
+    samples = _sampled(function, points, lattice, nowhere)
     first = _marched(function, points, samples, corners, nowhere, nowhere, lattice, walls)
     vertices, faces = first.vertices, first.faces
     _check_nothing_missed(function, points, samples, corners, first, faces, lattice, walls)
@@ -421,11 +421,10 @@ def closed_surface(
     report(f"{len(points):,} points, {len(corners):,} tetrahedra")
     is_wall = lattice.is_outer(coordinates)
     is_fixed = is_wall | ((coordinates == 1) | (coordinates == 2 * lattice.counts - 1)).any(axis=1)
-    samples = _sampled(function, points, lattice)
     is_beyond = np.zeros(len(points), np.bool_)
     if does_matter is not None:
         is_beyond = lattice.beside(coordinates, ~does_matter) & ~is_wall
-        samples = _beyond(samples, is_beyond)
+    samples = _sampled(function, points, lattice, is_beyond)
     first = _marched(
         function, points, samples, corners, is_fixed | is_beyond, is_wall, lattice, None
     )
@@ -494,13 +493,6 @@ def _are_negative(function: LevelFunction, lattice: Lattice, cells: IntArray) ->
     return negative
 
 
-def _beyond(samples: Samples, rows: BoolArray) -> Samples:
-    """With points that do not matter far on the positive side."""
-    value, gradient = samples.value.copy(), samples.gradient.copy()
-    value[rows], gradient[rows] = 10 * BEYOND, 1.0
-    return Samples(value, gradient, samples.reach)
-
-
 def _check_nothing_missed(
     function: LevelFunction,
     points: FloatArray,
@@ -558,16 +550,23 @@ def _wall_faces(
     return face
 
 
-def _sampled(function: LevelFunction, points: FloatArray, lattice: Lattice) -> Samples:
-    """The function at points of a lattice; raises HopelessError where it is not finite, or is its
-    level nearly everywhere."""
-    samples = function.at(points)
-    bad = ~np.isfinite(samples.value)
+def _sampled(
+    function: LevelFunction, points: FloatArray, lattice: Lattice, is_beyond: BoolArray
+) -> Samples:
+    """The function at points of a lattice, far on the positive side at those beyond what matters;
+    raises HopelessError where it is not finite, or is its level nearly everywhere."""
+    count = len(points)
+    samples = Samples(np.full(count, 10 * BEYOND), np.ones((count, 3)), np.zeros(count))
+    points = points[~is_beyond]
+    samples = samples.replaced(~is_beyond, function.at(points))
+    bad = ~np.isfinite(samples.value[~is_beyond])
     if bad.any():
         x, y, z = points[bad][0]
+        nearer = ", or a smaller `spacing`: it is asked for three cells around other parts"
         raise HopelessError(
             f"{type(function.field).__name__} has no finite value at {bad.sum():,} points, such "
             f"as ({x:.4g}, {y:.4g}, {z:.4g}): choose a `clip` where it has"
+            + (nearer if is_beyond.any() else "")
         )
     _check_off_level_at_most_points(function, points, lattice)
     return samples

@@ -240,7 +240,10 @@ def triangles_of(
             parts.append((np.stack([*on_level, *crossed], axis=1), rise))
     parts.append(_faces_on_the_level(function, points, tets))
     faces, rise = (np.concatenate(column) for column in zip(*parts, strict=True))
-    turned = dots(crosses(vertices[faces]), rise) < 0
+    # As with vertices in the middles of edges: of a plane through any points of these all corners
+    # above are on one side, and roots at an end, as where f jumps, leave triangles without an area.
+    middles = _mean(points.points, tets.ends[edges])
+    turned = dots(crosses(np.concatenate([points.points, middles])[faces]), rise) < 0
     faces[turned] = faces[turned][:, ::-1]
     return vertices, faces
 

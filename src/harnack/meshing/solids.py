@@ -29,6 +29,7 @@ from harnack.fields.solids.region import Near, Region, bounded_side
 from harnack.fields.solids.region import solid as solid_of
 from harnack.fields.solids.swept import Extruded, Revolved
 from harnack.fields.solids.thread import Thread
+from harnack.fields.solids.tube import Tube
 from harnack.geometry import Ball, Box, Intersection, Volume
 from harnack.meshing.checks import (
     CrossingError,
@@ -61,6 +62,7 @@ from harnack.meshing.lattice_surface import (
 from harnack.meshing.nearing import brought_near
 from harnack.meshing.samples import CELLS_PER_WAVE, LevelFunction, Samples, Uploads
 from harnack.meshing.thread_mesh import thread_manifold
+from harnack.meshing.tube_mesh import tube_manifold
 from harnack.meshing.uncrossing import made_apart
 
 if TYPE_CHECKING:
@@ -79,7 +81,7 @@ __all__ = [
 
 # Cells of offsets of meshes, in tolerances; and how many secants find roots on their edges.
 _CELLS_OF_OFFSET, _SECANTS = 6.0, 2
-# Where other parts leave nothing is looked for in lattices of more cells than this.
+# Where other parts leave nothing is looked for at once in lattices of more cells than this.
 _MANY_CELLS = 100_000
 # How far joining their triangles may move them, in tolerances: the first that does no harm; and how
 # far mending may, which is tried with the least.
@@ -172,6 +174,8 @@ class RegionMesher:
         if isinstance(solid, Thread) and level == 0:
             low, high = float(self.lower[2]), float(self.upper[2])
             return thread_manifold(solid, low, high, self.tolerance)
+        if isinstance(solid, Tube):
+            return tube_manifold(solid, level, self.tolerance)
         if isinstance(solid, MeshSolid):
             return (mesh_manifold(solid) if level == 0 else None) or self._offset(solid, level)
         if isinstance(solid, Plane):
@@ -210,10 +214,28 @@ class RegionMesher:
         finally:
             self.others = kept
 
-    def _elsewhere(self, lattice: Lattice) -> Elsewhere | None:
-        """How far around points the other parts leave nothing, by proof; None if nothing is to be
-        gained by it. The two sides of a wall have the same."""
-        if not self.others or math.prod(lattice.counts.tolist()) < _MANY_CELLS:
+    def _closed(self, function: LevelFunction, lattice: Lattice) -> Surface:
+        """A level set in a box: where the other parts may leave something, if cells are many. Of
+        few all are made, so that what is there twice is the same bit by bit; unless that goes
+        wrong, as it may where nothing is left: a function of the angle about an axis jumps there,
+        and others have no value beyond some surface."""
+        elsewhere: Elsewhere | None = None
+        if math.prod(lattice.counts.tolist()) < _MANY_CELLS:
+            try:
+                return closed_surface(function, lattice, self.tolerance, self.report)
+            except MeshingError as wrong:
+                elsewhere = self._elsewhere()
+                if elsewhere is None:
+                    raise
+                self.report(f"{wrong}; so only where the other parts leave something")
+        return closed_surface(
+            function, lattice, self.tolerance, self.report, elsewhere=elsewhere or self._elsewhere()
+        )
+
+    def _elsewhere(self) -> Elsewhere | None:
+        """How far around points the other parts leave nothing, by proof; None if there are none.
+        The two sides of a wall have the same."""
+        if not self.others:
             return None
         if self.last_elsewhere is not None and self.last_elsewhere[0] is self.others:
             return self.last_elsewhere[1]
@@ -222,9 +244,8 @@ class RegionMesher:
         def clearance(points: FloatArray) -> FloatArray:
             found = np.zeros(len(points))
             for one in functions:
-                rows = np.flatnonzero(found == 0)
-                outside = rows[one.values(points[rows]) > 0]
-                found[outside] = one.clearance(points[outside])
+                outside = np.flatnonzero(one.values(points) > 0)
+                found[outside] = np.maximum(found[outside], one.clearance(points[outside]))
             return found
 
         made = Elsewhere(clearance)
@@ -251,13 +272,7 @@ class RegionMesher:
         function = self.function(_entire(field), level)
         self.report(f"level {level:g} of {type(field).__name__} in cells of {spacing:.3g}")
         lattice = Lattice.filling(lower, upper, spacing, layers=2)
-        made = closed_surface(
-            function,
-            lattice,
-            self.tolerance,
-            self.report,
-            elsewhere=self._elsewhere(lattice),
-        )
+        made = self._closed(function, lattice)
         self.evaluations += function.evaluations
         self.levels += 1
         return made, is_whole
@@ -389,7 +404,7 @@ def is_smooth(solid: Solid) -> bool:
         return not isinstance(solid.inner, Solid) or is_smooth(solid.inner)
     if isinstance(solid, AffineImage):
         return is_smooth(solid.inner)
-    with_edges = Cuboid | Plane | Extruded | Revolved | Thread | MeshSolid
+    with_edges = Cuboid | Plane | Extruded | Revolved | Thread | Tube | MeshSolid
     return not isinstance(solid, Combined | Complement | Offset | Near | with_edges)
 
 

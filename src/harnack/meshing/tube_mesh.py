@@ -1,0 +1,224 @@
+"""The closed mesh of a tube: rings of points swept along its polylines, in pieces put together."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from harnack.backend import FloatArray
+from harnack.fields.solids.tube import Tube
+from harnack.meshing.checks import MeshingError, intersecting_faces
+from harnack.meshing.closed_mesh import manifold_of
+from harnack.meshing.edges import lengths
+from harnack.meshing.lattice_surface import Surface
+
+if TYPE_CHECKING:
+    from manifold3d import Manifold
+
+__all__ = ["tube_manifold"]
+
+_MOST_VERTICES = 4_000_000
+# Of the tolerance, by which polylines may be off.
+_LEFT_OUT = 0.25
+# The least number of points around, and the most: of wires far thinner than the tolerance too.
+_LEAST_AROUND, _MOST_AROUND = 8, 2000
+# An edge leads back where the cosine of its turn is less than this above -1.
+_BACK = 1e-9
+
+
+def tube_manifold(tube: Tube, level: float, tolerance: float) -> Manifold:
+    """The points within radius + level of a tube's polylines; vertices lie on the surface, and
+    faces within `tolerance` of it.
+
+    Vertices of a polyline within a quarter of the tolerance of a shorter one are left out. Each is
+    swept as a whole. Where its mesh would pass through itself, as at corners too
+    sharp for the radius or where the tube comes back to itself, it is cut in two at a vertex, where
+    both parts end with a ball: the tube is the union of theirs.
+
+    Proof of the tolerance, with the angle a = 2 pi/n between points around. Distances from two
+    polylines differ by no more than these do. Faces between lines along an edge have chords of
+    angle a, r a^2/8 deep, and where two edges meet in a single ring, at an angle up to a, lines
+    along the edge lie as deep as that. On the balls outside of corners and at ends both chords are
+    of angle a at most. The sum is at most r a^2/4, three quarters of the tolerance.
+
+    Raises:
+        MeshingError: so fine that it has millions of faces.
+    """
+    from manifold3d import Manifold, OpType
+
+    radius = tube.radius + level
+    if radius <= 0:
+        return Manifold()
+    step = math.sqrt(3 * tolerance / radius)
+    around = min(max(_LEAST_AROUND, math.ceil(2 * math.pi / step)), _MOST_AROUND)
+    waiting = [_simpler(one, _LEFT_OUT * tolerance) for one in np.split(tube.points, tube.starts)]
+    count = around * sum(map(len, waiting))
+    if count > _MOST_VERTICES:
+        raise MeshingError(
+            f"a tube within {tolerance:.3g} has {2 * count:,} faces: choose a larger `tolerance`"
+        )
+    parts: list[Manifold] = []
+    while waiting:
+        points = waiting.pop()
+        swept = _Sweep(radius, around, points).surface()
+        if swept is not None and (len(points) == 2 or _is_apart(swept)):
+            parts.append(manifold_of(swept))
+        else:
+            middle = len(points) // 2
+            waiting += [points[: middle + 1], points[middle:]]
+    return Manifold.batch_boolean(parts, OpType.Add)
+
+
+def _is_apart(surface: Surface) -> bool:
+    """Whether no faces pass through each other."""
+    return not len(intersecting_faces(surface.vertices, surface.faces))
+
+
+def _simpler(points: FloatArray, length: float) -> FloatArray:
+    """A polyline (n, 3) with the vertices left out that are within a length of the edges in their
+    place (Douglas and Peucker 1973). Proof that all of these edges are as near to the polyline: the
+    nearest points on an edge of what it stands for go from one of its ends to the other."""
+    kept = np.zeros(len(points), np.bool_)
+    kept[[0, -1]] = True
+    waiting = [(0, len(points) - 1)]
+    while waiting:
+        first, last = waiting.pop()
+        side, away = points[last] - points[first], points[first + 1 : last] - points[first]
+        square = float(side @ side)
+        share = (away @ side / square if square > 0 else np.zeros(len(away))).clip(0, 1)
+        off = lengths(away - share[:, None] * side)
+        if not len(off) or (square > 0 and off.max() <= length):
+            continue
+        middle = first + 1 + int(off.argmax())
+        kept[middle] = True
+        waiting += [(first, middle), (middle, last)]
+    return points[kept]
+
+
+@dataclass(frozen=True)
+class _Sweep:
+    """A polyline (n, 3) with a radius, and the number of points around it."""
+
+    radius: float
+    around: int
+    points: FloatArray
+
+    def surface(self) -> Surface | None:
+        """Rings of points one after the other; None where a line along an edge would end before it
+        begins."""
+        points, sides = self.points, np.diff(self.points, axis=0)
+        ways = sides / lengths(sides)[:, None]
+        is_closed = len(ways) > 2 and bool((points[0] == points[-1]).all())
+        swung = self._transported(ways, is_closed=is_closed)
+        if swung is None:
+            return None
+        frames, shift = swung
+        turns = itertools.pairwise([*ways, ways[0]] if is_closed else ways)
+        corners = [
+            self._corner(point, turn, self._directions(end))
+            for point, turn, (_, end) in zip(points[1:], turns, frames, strict=False)
+        ]
+        if is_closed:
+            starts, ends = [np.roll(corners[-1], shift, axis=1), *corners[:-1]], corners
+        else:
+            starts = [self._end(points[0], ways[0], frames[0][0], -1), *corners]
+            ends = [*corners, self._end(points[-1], ways[-1], frames[-1][1], 1)]
+        for way, start, end in zip(ways, starts, ends, strict=True):
+            if len(ways) > 1 and not ((end[0] - start[-1]) @ way > 0).all():
+                return None
+        rings = starts if is_closed else [*starts, ends[-1]]
+        return self._joined(np.concatenate(rings), shift if is_closed else None)
+
+    def _directions(self, frame: FloatArray) -> FloatArray:
+        """(around, 3) of the unit vectors in a plane."""
+        angle = 2 * math.pi * np.arange(self.around) / self.around
+        return np.cos(angle)[:, None] * frame[0] + np.sin(angle)[:, None] * frame[1]
+
+    def _corner(
+        self, point: FloatArray, turn: tuple[FloatArray, FloatArray], directions: FloatArray
+    ) -> FloatArray:
+        """Rings (k, around, 3) where two edges meet: lines along them meet in the plane between
+        them on the inner side, and arcs of the ball lead from one to the other on the outer."""
+        before, after = turn
+        cosine, across = float(before @ after), after - (before @ after) * before
+        sine = float(np.linalg.norm(across))
+        if sine == 0:
+            return (point + self.radius * directions)[None]
+        across = across / sine
+        angle = math.atan2(sine, cosine)
+        share = directions @ across
+        step = 2 * math.pi / self.around
+        count = math.ceil(angle / step)
+        angles = np.array([0.5 * angle]) if count <= 1 else np.linspace(0.0, angle, count + 1)
+        turned = directions + share[:, None] * (
+            (np.cos(angles)[:, None, None] - 1) * across - np.sin(angles)[:, None, None] * before
+        )
+        inner = directions - (share * math.tan(0.5 * angle))[:, None] * before
+        return point + self.radius * np.where((share > 0)[:, None], inner, turned)
+
+    def _end(self, point: FloatArray, way: FloatArray, frame: FloatArray, sign: int) -> FloatArray:
+        """Rings from the pole of a half ball to its rim, or the other way at the last point."""
+        count = math.ceil(0.25 * self.around)
+        angle = 0.5 * math.pi * np.arange(count + 1)[:, None, None] / count
+        rings = np.cos(angle) * self._directions(frame) + sign * np.sin(angle) * way
+        return point + self.radius * (rings if sign > 0 else rings[::-1])
+
+    def _joined(self, rings: FloatArray, shift: int | None) -> Surface:
+        """Faces between neighbors of rings (k, around, 3), those of points that are the same left
+        out. shift: by which the numbers around grow from the last to the first; None for poles
+        there."""
+        count, n = rings.shape[:2]
+        row, column = np.mgrid[: count - 1 if shift is None else count, :n].reshape(2, -1)
+        moved = np.where(row == count - 1, shift or 0, 0)
+        above = (row + 1) % count * n
+        a, b = row * n + column, row * n + (column + 1) % n
+        c, d = above + (column + moved + 1) % n, above + (column + moved) % n
+        place = np.arange(count * n).reshape(count, n)
+        for k in range(1, count):
+            same = (rings[k] == rings[k - 1]).all(axis=1)
+            place[k, same] = place[k - 1, same]
+        if shift is None:
+            place[[0, -1]] = place[[0, -1], :1]
+        faces = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
+        faces = place.ravel()[faces]
+        kept = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+        return Surface.of(rings.reshape(-1, 3), faces[kept])
+
+    def _transported(
+        self, ways: FloatArray, *, is_closed: bool
+    ) -> tuple[list[tuple[FloatArray, FloatArray]], int] | None:
+        """Two unit vectors (2, 3) across each edge, at its start and its end, turned as the edges
+        turn; of a closed polyline also a little about them, so that numbers around agree at the
+        last and the first but for a shift. None where an edge leads back along the one before."""
+        first = np.cross(ways[0], np.eye(3)[np.abs(ways[0]).argmin()])
+        first /= np.linalg.norm(first)
+        across = [first]
+        for before, after in itertools.pairwise([*ways, ways[0]] if is_closed else ways):
+            cosine = float(before @ after)
+            if cosine <= -1 + _BACK:
+                return None
+            # The rotation that takes one edge's direction to the next.
+            axis, u = np.cross(before, after), across[-1]
+            turned = cosine * u + np.cross(axis, u) + axis * (axis @ u) / (1 + cosine)
+            turned -= (turned @ after) * after
+            across.append(turned / np.linalg.norm(turned))
+        shift, turn = 0, 0.0
+        if is_closed:
+            off = math.atan2(across[-1] @ np.cross(ways[0], first), across[-1] @ first)
+            step = 2 * math.pi / self.around
+            shift = round(off / step)
+            turn = (off - shift * step) / len(ways)
+        frames = [np.stack([u, np.cross(way, u)]) for u, way in zip(across, ways, strict=False)]
+        return [
+            (_spun(f, -turn * k), _spun(f, -turn * (k + 1))) for k, f in enumerate(frames)
+        ], shift
+
+
+def _spun(frame: FloatArray, angle: float) -> FloatArray:
+    """Turned in its plane."""
+    c, s = math.cos(angle), math.sin(angle)
+    return np.stack([c * frame[0] + s * frame[1], c * frame[1] - s * frame[0]])
