@@ -173,13 +173,17 @@ def test_what_is_returned_must_be_a_number() -> None:
     assert hk.trace(constant, [[0, 0, 3]], [[0, 0, -1]], t_max=5.0).status == hk.Status.MISS
 
 
-def test_where_a_formula_is_not_defined_nothing_is_claimed() -> None:
-    """log(x) - y at x < 0: neither a hit nor a proved miss."""
+def test_where_a_formula_is_not_defined_there_is_no_surface() -> None:
+    """log(x) - y has no value at x < 0: a proved miss. The larger of it and another function may
+    count as that one there: neither a hit nor a proved miss."""
     field = hk.expression(lambda x, y, z: hk.log(x) - y)
     hits = hk.trace(field, [[-1, 0, 3], [1.0, 3.0, 0]], [[0, 0, -1], [0, -1, 0]], t_max=5.0,
                     max_steps=60)  # fmt: skip
-    assert hits.status.tolist() == [hk.Status.OUT_OF_STEPS, hk.Status.HIT]
+    assert hits.status.tolist() == [hk.Status.MISS, hk.Status.HIT]
     assert hits.t[1] == pytest.approx(3.0, abs=1e-3)
+    larger = hk.expression(lambda x, y, z: hk.maximum(hk.log(x) - y, z))
+    ray = hk.trace(larger, [[-1, 0, 3]], [[0, 0, -1]], t_max=5.0, max_steps=60)
+    assert ray.status.tolist() == [hk.Status.OUT_OF_STEPS]
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import drjit as dr
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 Ranges: TypeAlias = "tuple[Interval, Interval, Interval]"
 
+# The domain of roots, powers that are no integers, and logarithms.
+_POSITIVE = (0.0, math.inf)
 # Units in the last place that exp, log and their like are off by at most, on every backend.
 _UNITS = 8.0
 
@@ -36,6 +38,8 @@ class Function:
         are all numbers: f(s) = f(0) + s f'(r) does not hold across such a point.
     plain: the function of Dr.Jit numbers.
     numpy: the function of NumPy arrays and Python numbers.
+    domain: the least and the largest number of which it has a value.
+    is_steep: whether its slope has no bound near a number: a pole, or a vertical tangent.
     has_pole: whether there is a point across which it is not continuous.
     """
 
@@ -43,7 +47,9 @@ class Function:
     ranges: Callable[[Interval], Ranges]
     plain: Callable[[Any], Any]
     numpy: Callable[[Any], Any]
-    has_pole: bool = field(default=False, kw_only=True)
+    domain: tuple[float, float] = (-math.inf, math.inf)
+    is_steep: bool = False
+    has_pole: bool = False
 
     def __reduce__(self) -> str:
         # There is one of each name, in this module.
@@ -314,10 +320,12 @@ def power(n: float) -> Function:
                 defined = (x.low > 0) | (x.high < 0)
                 return _where(defined, (integer_power(one, -k), slope, second))
 
-            def of_inverse(x: Any) -> Any:
+            def plain(x: Any) -> Any:
                 return 1 / _repeated(x, -k)
 
-            return Function(f"power {k}", inverse, of_inverse, _numpy_power(k), has_pole=True)
+            return Function(
+                f"power {k}", inverse, plain, _numpy_power(k), is_steep=True, has_pole=True
+            )
 
         def whole(x: Interval) -> Ranges:
             like = cast("Any", type(x.low))
@@ -338,12 +346,18 @@ def power(n: float) -> Function:
         slope = Interval.constant(n, like) * _real_power(x, n - 1)
         second = Interval.constant(n * (n - 1), like) * _real_power(x, n - 2)
         defined = x.low >= 0 if n > 0 else x.low > 0
-        return _where(defined, (_real_power(x, n), slope, second))
+        value, is_none = _real_power(x, n), x.high < 0
+        value = Interval(
+            select(is_none, dr.nan, value.low, x.low), select(is_none, dr.nan, value.high, x.low)
+        )
+        return _where(defined, (value, slope, second))
 
     def of_positive(x: Any) -> Any:
         return dr.power(fmax(x, 0), n)
 
-    return Function(f"power {n}", real, of_positive, _numpy_power(n), has_pole=n < 0)
+    return Function(
+        f"power {n}", real, of_positive, _numpy_power(n), _POSITIVE, n < 1, has_pole=n < 0
+    )
 
 
 def _numpy_power(n: float) -> Callable[[Any], Any]:
@@ -371,16 +385,20 @@ def _real_power(x: Interval, n: float) -> Interval:
 
 
 exp = Function("exp", _exp, dr.exp, np.exp)
-log = Function("log", _log, dr.log, np.log, has_pole=True)
-sqrt = Function("sqrt", _sqrt, dr.sqrt, np.sqrt)
-reciprocal = Function("reciprocal", _reciprocal, lambda x: 1 / x, lambda x: 1 / x, has_pole=True)
+log = Function("log", _log, dr.log, np.log, _POSITIVE, is_steep=True, has_pole=True)
+sqrt = Function("sqrt", _sqrt, dr.sqrt, np.sqrt, _POSITIVE, is_steep=True)
+reciprocal = Function(
+    "reciprocal", _reciprocal, lambda x: 1 / x, lambda x: 1 / x, is_steep=True, has_pole=True
+)
 sin = Function("sin", _sine, lambda x: sincos(x)[0], np.sin)
 cos = Function("cos", _cosine, lambda x: sincos(x)[1], np.cos)
-tan = Function("tan", _tan, lambda x: sincos(x)[0] / sincos(x)[1], np.tan, has_pole=True)
+tan = Function(
+    "tan", _tan, lambda x: sincos(x)[0] / sincos(x)[1], np.tan, is_steep=True, has_pole=True
+)
 tanh = Function("tanh", _tanh, _hyperbolic_tangent, np.tanh)
 atan = Function("atan", _atan, dr.atan, np.arctan)
-asin = Function("asin", _asin, dr.asin, np.arcsin)
-acos = Function("acos", _acos, dr.acos, np.arccos)
+asin = Function("asin", _asin, dr.asin, np.arcsin, (-1.0, 1.0), is_steep=True)
+acos = Function("acos", _acos, dr.acos, np.arccos, (-1.0, 1.0), is_steep=True)
 sinh = Function("sinh", _sinh, dr.sinh, np.sinh)
 cosh = Function("cosh", _cosh, dr.cosh, np.cosh)
 absolute = Function("abs", _abs, dr.abs, np.abs)

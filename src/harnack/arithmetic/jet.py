@@ -8,6 +8,7 @@ that steps are proved from.
 from __future__ import annotations
 
 import dataclasses
+import math
 import operator
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -42,6 +43,9 @@ class Jet(Operators):
         the jet at a point.
     width: the length of the piece; 0 at a point. A number of the backend, which tells the precision
         where all ranges are Python numbers.
+    roots: the functions of whose squares it is known to be the sum; empty if it is not known to be
+        one. The root of a sum of squares is a norm, whose slopes are bounded; by the chain rule
+        they would not be where all squares are 0.
     """
 
     value: Interval
@@ -49,6 +53,7 @@ class Jet(Operators):
     second: tuple[Interval, ...]
     start: Jet | None = None
     width: Real = 0.0
+    roots: tuple[Jet, ...] = ()
 
     @classmethod
     def at_point(cls, p: Vec3, *, order: int = 1) -> tuple[Jet, Jet, Jet]:
@@ -124,7 +129,10 @@ class Jet(Operators):
             tuple(x + y for x, y in zip(self.second, other.second, strict=True)),
             width=self.width,
         )
-        return jet if self.start is None else jet.anchored(self.start + other.start, self.width)
+        if self.start is not None:
+            jet = jet.anchored(self.start + other.start, self.width)
+        is_square = bool(self.roots and other.roots)
+        return dataclasses.replace(jet, roots=self.roots + other.roots) if is_square else jet
 
     def __neg__(self) -> Jet:
         return dataclasses.replace(
@@ -133,6 +141,7 @@ class Jet(Operators):
             first=tuple(-one for one in self.first),
             second=tuple(-one for one in self.second),
             start=None if self.start is None else -self.start,
+            roots=(),
         )
 
     def product(self, other: Jet) -> Jet:
@@ -147,7 +156,20 @@ class Jet(Operators):
             for k, (i, j) in enumerate(self.pairs())
         )
         jet = Jet(x * y, first, second, width=self.width)
-        return jet if self.start is None else jet.anchored(self.start * other.start, self.width)
+        if self.start is not None:
+            jet = jet.anchored(self.start * other.start, self.width)
+        roots = self._scaled_roots(y) or other._scaled_roots(x)
+        return dataclasses.replace(jet, roots=roots) if roots else jet
+
+    def _scaled_roots(self, factor: Interval) -> tuple[Jet, ...]:
+        """The roots of the product with a positive constant, if there are any."""
+        if not (self.roots and factor.is_static and factor.low > 0):
+            return ()
+        low, high = (math.sqrt(cast("float", one)) for one in (factor.low, factor.high))
+        kind = cast("Any", type(self.kind()))
+        low, high = math.nextafter(low, 0.0), math.nextafter(high, math.inf)
+        scale = Interval.constant(low, kind).hull(Interval.constant(high, kind))
+        return tuple(one * one._constant(scale) for one in self.roots)
 
     def __truediv__(self, other: Any) -> Any:
         if isinstance(other, Jet):
@@ -167,12 +189,17 @@ class Jet(Operators):
                 base = exponent._constant(self.dynamic_value(exponent.kind()))
                 return (base.apply(log) * exponent).apply(exp)
             return (self.apply(log) * exponent).apply(exp)
-        return self.apply(power(exponent_of(exponent)))
+        n = exponent_of(exponent)
+        return self.apply(sqrt if n == 0.5 and self.roots else power(n))
 
     # Functions.
 
     def apply(self, function: Function) -> Jet:
         """A function of this one: f(g)'' = f'' g' g' + f' g''."""
+        if function is sqrt and self.roots:
+            from harnack.arithmetic.norms import norm
+
+            return norm(*self.roots)
         x = self.dynamic_value()
         value, slope, curvature = function.ranges(x)
         first = tuple(slope * one for one in self.first)
@@ -182,7 +209,10 @@ class Jet(Operators):
             for k, (i, j) in enumerate(self.pairs())
         )
         jet = Jet(value, first, second, width=self.width)
-        return jet if self.start is None else jet.anchored(self.start.apply(function), self.width)
+        if self.start is not None:
+            jet = jet.anchored(self.start.apply(function), self.width)
+        is_square = function.name == "power 2"
+        return dataclasses.replace(jet, roots=(self,)) if is_square else jet
 
     def larger(self, other: Jet) -> Jet:
         """The larger of two functions at each point.

@@ -89,7 +89,7 @@ def norm(*values: Any, p: float = 2.0) -> Any:
         # First one whose operators accept numbers of the other kinds.
         powers.sort(key=lambda one: not isinstance(one, Operators))
         total = functools.reduce(lambda a, b: a + b, powers)
-        return total.apply(sqrt if p == 2.0 else power(1 / p))
+        return total.norm_of_powers(p)
     if not jets:
         return _plain_norm(values, p)
     given = [one if isinstance(one, Jet) else jets[0].of(one) for one in values]

@@ -88,6 +88,10 @@ class Operators(abc.ABC):
     def angle(self, x: Any) -> Self:
         """The angle of the point (x, y) with this y: see `harnack.arithmetic.angles`."""
 
+    def norm_of_powers(self, p: float) -> Self:
+        """The p-norm of some numbers, of which this is the sum of the p-th powers."""
+        return self.apply(sqrt if p == 2.0 else power(1 / p))
+
     def _operand(self, other: Any) -> Self | None:
         """Another operand as a number of this arithmetic; None if it is no number."""
         if isinstance(other, type(self)):

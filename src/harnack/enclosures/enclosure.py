@@ -169,6 +169,11 @@ class Enclosure(abc.ABC):
         """Whether f is proved to meet no level for 0 < s < length."""
         return length <= self.step(gaps)
 
+    def arrives(self, gaps: Gaps, length: Real) -> Mask:
+        """Whether f is proved to take a level for some 0 <= s <= length."""
+        del length
+        return (gaps.up == gaps.up) & False
+
 
 @dataclass(frozen=True)
 class TargetLevels:

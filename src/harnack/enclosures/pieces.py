@@ -68,6 +68,14 @@ class Pieces(Enclosure):
         reach = fmax(reach, 0)
         return dr.select(is_free, reach, reach * ROUND_DOWN)
 
+    def arrives(self, gaps: Gaps, length: Real) -> Mask:
+        """Proof. On the first piece F' is known, so F is continuous, and F <= s times the upper end
+        of F': it falls to the level by s = gap over that, if that end is negative."""
+        first = self.parts[0]
+        reach = fmin(first.length, length) * ROUND_DOWN
+        falls = -first.slopes.high * reach >= gaps.down
+        return falls | (first.slopes.low * reach >= gaps.up)
+
     def _reach(self, gap: Real, rises: Mask | bool) -> tuple[Real, Mask]:
         """The first s at which F, or -F, may reach the gap, or the whole length if it cannot; and
         whether it cannot."""

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 
-from harnack.arithmetic import Interval, Jet
+from harnack.arithmetic import Interval, Jet, is_steep
 from harnack.arithmetic.jet import Dual
 from harnack.arithmetic.operators import Operators, tally_of
 from harnack.backend import choose_backend
@@ -85,6 +85,11 @@ class Formula(Field):
         the functions of `harnack.arithmetic`. A Dr.Jit number comes second, as in x * radius: with
         it first, Dr.Jit's own operators would refuse jets."""
 
+    @property
+    def is_steep(self) -> bool:
+        """Whether the formula uses what may have a vertical tangent or a pole."""
+        return is_steep(self.formula)
+
     def evaluate(self, p: Vec3) -> Sample:
         sample = self._one_sided(p, self.sample_alone(p))
         if _WITHOUT_WEAKER.get():
@@ -140,13 +145,13 @@ class Formula(Field):
     def _lipschitz_near(self, p: Vec3, sample: Sample) -> tuple[Lipschitz, ...]:
         """Lipschitz constants on balls about p: the largest gradient on the box around each. The
         radii are some multiples of Newton's estimate of the distance to level 0."""
-        steps = dr.abs(sample.value) / dr.norm(sample.gradient)
+        steps = dr.abs(sample.value) / length(sample.gradient)
         made: list[Lipschitz] = []
         for multiple in _RADII:
             radius = fmin(multiple * steps, _LARGEST_RADIUS)
             jet = self._jet(Jet.within(p, radius), p.x)
             slopes = (0 * p.x + one.largest for one in jet.first)
-            constant = dr.norm(type(p)(*slopes)) * (1 + 1e-5)
+            constant = length(type(p)(*slopes)) * (1 + 1e-5)
             known = dr.isfinite(constant) & (radius > 0)
             made.append(Lipschitz(dr.select(known, constant, dr.inf), dr.select(known, radius, 0)))
         return tuple(made)
@@ -193,7 +198,7 @@ class Formula(Field):
         growth = max(one.growth for one in enclosures)
         if self.is_convex and Tangent in path.proofs.kinds:
             enclosures = (*enclosures, Tangent(slopes))
-        least = dr.norm(type(p)(*(0 * p.x + one.smallest for one in jet.first)))
+        least = length(type(p)(*(0 * p.x + one.smallest for one in jet.first)))
         return Look(sample, enclosures, (), slope, growth, slope_error, least)
 
     def _slope(self, p: Vec3, direction: Vec3) -> tuple[Real, Real]:

@@ -366,7 +366,9 @@ def _ends(
     if end.part is not None:
         sheet = dr.reinterpret_array(backend.Int32, end.part)
     smooth = hit & ~end.on_sheet
-    uncertainty = dr.select(smooth & (end.excess > 0), end.excess / length, 0)
+    # Where the gradient is no number its size has no bound (`tracer.steep`).
+    uncertain = smooth & (end.excess > 0) & (length == length)
+    uncertainty = dr.select(uncertain, end.excess / length, 0)
     position = _along(o, d, end.t)
     return end, Hits(
         end.t, position, normal, end.value, end.evaluations, end.status, sheet, uncertainty

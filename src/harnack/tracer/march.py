@@ -27,6 +27,7 @@ from harnack.tracer.contact import (
     Status,
     compare_with_sheet,
 )
+from harnack.tracer.steep import SteepPlace, beyond, down_or_up
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
@@ -140,6 +141,8 @@ class _Seen:
     excess: as that of `MarchState`.
     is_smooth: whether value and slope predict f.
     passes, is_doubtful: see `WholeNumbers.gaps`; None for fields that know their values.
+    steep: what values prove there; None for fields whose slopes are bounded.
+    looks: evaluations of f beyond the points.
     """
 
     t: Real
@@ -158,6 +161,8 @@ class _Seen:
     is_smooth: bool
     passes: Mask | None = None
     is_doubtful: Mask | None = None
+    steep: SteepPlace | None = None
+    looks: Any = 0
 
     @property
     def value(self) -> Real:
@@ -294,7 +299,7 @@ class March:
             value = value + dr.select(sheet.at_crossing & ~sheet.is_hit, ahead.jump, 0)
 
         # How far to go from there.
-        proved = self._proved(seen, gaps_ahead)
+        proved = self._proved(seen, gaps_ahead, contact)
         trial = self._trial(proved, seen.look, aims, now, path, seen.is_smooth)
         forward = proved
         if self.occupied is not None:
@@ -304,7 +309,7 @@ class March:
         free = self._is_free(now, seen, end, accepted, proved_step, contact)
         if sheet is not None:
             free = dr.select(sheet.has_crossing, sheet.at_crossing, free)
-        evaluations = now.evaluations + 1
+        evaluations = now.evaluations + 1 + seen.looks
         status = self._status(hit, free)
         gradient = dr.select(accepted, seen.look.sample.gradient, now.gradient)
         if sheet is not None:
@@ -354,11 +359,18 @@ class March:
         if self.cover is not None:
             gaps = gaps.less(self.cover * t * gradient_norm)
             gap = gaps.smaller
+        steep = None
+        if field.is_steep:
+            look_ahead = fmin(now.look_ahead, end - t)
+            steep = SteepPlace.at(field, self.levels, path, t, look_ahead, sample)
+            total_error = total_error if steep.error is None else steep.error
         steepness = fmax(gradient_norm - sample.gradient_error, real(0))
         if look.slope_error is not None:  # the gradient is at least as long as its projection
             steepness = fmax(dr.abs(look.slope) - look.slope_error, steepness)
         if look.least_gradient is not None:
             steepness = fmax(look.least_gradient, steepness)
+        if steep is not None:  # the gradient is no number where only slopes along the path are
+            gradient_norm = fmax(gradient_norm, steepness)
         within = self.tolerance.in_value(steepness, t)
         knows_gradient = (sample.gradient_error <= gradient_norm) | (steepness > 0)
         if self.hysteresis is not None:
@@ -366,6 +378,11 @@ class March:
         # Where not even the gradient is known, no hit is due to rounding.
         rounding = dr.select(knows_gradient, total_error - sample.truncation, 0)
         is_near = self._is_near(gap, within, total_error, rounding, look, gradient_norm, size, end)
+        looks: Any = 0
+        if steep is not None:
+            is_near &= now.active & dr.isfinite(total_error)
+            sure = steep.is_level | (gap <= self.tolerance.value)
+            is_near, looks = self._is_there(field, path, t, look, gaps, size, is_near, sure)
         return _Seen(
             t=t,
             at_end=t == end,
@@ -383,7 +400,40 @@ class March:
             is_smooth=ahead is None and not field.has_detail,
             passes=passes,
             is_doubtful=is_doubtful,
+            steep=steep,
+            looks=looks,
         )
+
+    def _is_there(
+        self,
+        field: Field,
+        path: Path,
+        t: Real,
+        look: Look,
+        gaps: Gaps,
+        size: Real,
+        is_near: Mask,
+        sure: Mask,
+    ) -> tuple[Mask, Any]:
+        """At which of the points that are near a level by their slope f takes it within the
+        tolerance, and how many evaluations of f that took.
+
+        It does if rounding alone leaves it open (`sure`), if the enclosures prove it along the ray,
+        or if f is seen on the other side of the level (`steep.beyond`).
+        """
+        sample, p = look.sample, path.point(t)
+        tolerance = dr.fma(t, self.tolerance.per_length, self.tolerance.distance)
+        slack = 8 * self.backend.epsilon * size
+        reach = fmax(tolerance, 2 * slack)
+        for one in look.ahead:
+            sure |= one.arrives(gaps, reach)
+        along = down_or_up(sample.gradient, gaps, path.direction)
+        ways = (along, length(sample.gradient)), (path.direction, look.slope)
+        unsure = is_near & ~sure
+        passed, looks = beyond(
+            self.backend, field, gaps, p, ways, sample.value, reach, slack, unsure
+        )
+        return is_near & (sure | passed), looks
 
     def _in_contact(self, seen: _Seen, hysteresis: Hysteresis, contact: Contact) -> _Seen:
         """The same, with levels where the hysteresis puts them. The band takes all rounding of f
@@ -406,6 +456,8 @@ class March:
             covered = any_covers(seen.look.back, seen.gaps.less(seen.total_error), seen.unproved)
             accepted |= knows_side & covered
         is_known = dr.isfinite(seen.total_error)  # what is not known is not free
+        if seen.steep is not None:  # values prove the next step
+            is_known = is_known | (now.trial_step <= now.proved_step)
         if now.detail is None or not field.has_detail:
             return accepted & is_known, now.detail, self.backend.Bool(False)
         truncation, coarsest = seen.look.sample.truncation, field.coarsest_detail
@@ -450,7 +502,7 @@ class March:
             value = value + dr.select(passed, ahead.jump, 0)
         return contact, hit, sheet, value
 
-    def _proved(self, seen: _Seen, gaps: Gaps) -> Real:
+    def _proved(self, seen: _Seen, gaps: Gaps, contact: Contact | None) -> Real:
         """How far from the trial point rays are proved free of levels that far away in value."""
         spent = _WIDENING * seen.gaps.smaller
         if self.cover is not None:
@@ -462,7 +514,13 @@ class March:
             away = dr.select(seen.gaps.down <= seen.gaps.up, slope, -slope)
             for_ever = (forward == dr.inf) & (away >= widening)
             forward = dr.select(for_ever, forward, fmin(forward, spent / widening))
-        return dr.select(gaps.smaller > seen.total_error, forward, 0)
+        forward = dr.select(gaps.smaller > seen.total_error, forward, 0)
+        if seen.steep is not None and self.cover is None:
+            free = seen.steep.free
+            if contact is not None:  # in contact, levels lie elsewhere
+                free = dr.select(contact.is_touching, 0, free)
+            forward = fmax(free, forward)
+        return forward
 
     def _jump(
         self,

@@ -97,6 +97,10 @@ class Combined(Solid):
             return None
         return _around(known)
 
+    @property
+    def is_steep(self) -> bool:
+        return any(one.is_steep for one in self.parts)
+
     def prepare(self, backend: Backend) -> Solid:
         return self._of([one.prepare(backend) for one in self.parts])
 

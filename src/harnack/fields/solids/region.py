@@ -322,6 +322,11 @@ class Near(Derived):
         ahead_, back_ = folded(look.ahead), folded(look.back)
         return Look(sample, ahead_, back_, slope, look.growth, look.slope_error)
 
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        if not isinstance(self.inner, Formula | Solid):
+            return super().formula(x, y, z)
+        return abs(self.inner.formula(x, y, z) - self.level) - self.half_width
+
     def _offset(self, value: Real) -> Real:
         """f - level, reduced to half a period on either side."""
         offset, period = value - self.level, self.inner.period

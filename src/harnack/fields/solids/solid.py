@@ -295,6 +295,10 @@ class Derived(Solid):
     def leaves(self, change: Callable[[Solid], Solid]) -> Solid:
         return change(self)
 
+    @property
+    def is_steep(self) -> bool:
+        return self.inner.is_steep
+
     def prepare(self, backend: Backend) -> Solid:
         return self._of(self.inner.prepare(backend))
 

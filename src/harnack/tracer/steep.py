@@ -1,0 +1,176 @@
+"""Hits and steps where the slope of a field has no bound (`Field.is_steep`).
+
+|f - level| <= tolerance |grad f| is a length only if f does not bend within it. Beside a vertical
+tangent or a pole it may bend by any amount: at x = 1e-6 the slope of sqrt(|x|) + 0.5 is 500, and
+the level 0 would be 0.001 away, but it is nowhere. So what would be a hit there is looked at on
+the other side, and what steps slopes do not prove, ranges of values may (`arithmetic.values`).
+"""
+
+from __future__ import annotations
+
+import functools
+import operator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, cast
+
+import drjit as dr
+
+from harnack.arithmetic import Values
+from harnack.backend.elementary import fmax, fmin, largest_coordinate, unit
+from harnack.backend.loops import while_active
+from harnack.fields.formula import without_weaker
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Mask, Real, Vec3
+    from harnack.enclosures import Gaps, TargetLevels
+    from harnack.fields.field import Field
+    from harnack.fields.look import Path, Sample
+
+# A level is the value of f up to rounding where it is farther than f changes by rounding by no more
+# than this factor, if f changes on the other side by no more than so many times as much.
+_SLACK, _FAR = 1.25, 8.0
+# How many points are looked at.
+_TRIALS = 5
+
+
+def values_between(field: Field, p: Vec3, q: Vec3, slack: Real) -> Values | None:
+    """The values of a field on a box around two points, larger by `slack`; None for a field without
+    a formula of its values."""
+    coordinates = Values.between(p, q, slack)
+    formula: Any = getattr(field, "formula", None)
+    if formula is None:
+        return None
+    try:
+        value = formula(*coordinates)
+    except TypeError:  # it takes ranges of derivatives alone
+        return None
+    return coordinates[0].of(value)
+
+
+@dataclass(frozen=True)
+class SteepPlace:
+    """What the values of a field prove at a trial point.
+
+    error: a bound of the error of f there, by its own rounding and by that of the point; infinite
+        where none is known. |grad f| times the rounding of the point is no bound. None for fields
+        without a formula of their values.
+    is_level: whether a level may be the value of f at the point that is meant: it lies in the range
+        of f around the rounded one, where f is proved to be continuous.
+    free: a length of the path on which no value of f is a level, because f stays away from them or
+        has no value at all; 0 where none is proved.
+    """
+
+    error: Real | None
+    is_level: Mask
+    free: Real
+
+    @classmethod
+    def at(
+        cls, field: Field, levels: TargetLevels, path: Path, t: Real, ahead: Real, sample: Sample
+    ) -> SteepPlace:
+        """The place at the parameter t, with the sample there. ahead: how far values are asked for.
+
+        Proof of the error. The point that is meant lies in the box of all points that are at most
+        `slack` from the rounded one in each coordinate, and f there lies in the range on the box.
+
+        Proof of the length. All points of the path on it lie in the box around its ends, rounding
+        included, and all values of f in the box lie between `low` and `high`, which hold no level.
+        """
+        p, value = path.point(t), sample.value
+        kind = cast("Any", type(t))
+        slack = 8 * float(dr.epsilon(kind)) * (largest_coordinate(path.origin) + t)
+        ahead = dr.select(dr.isfinite(ahead), ahead, 0)
+        here = values_between(field, p, p, slack)
+        there = values_between(field, p, path.point(t + ahead), slack)
+        if here is None or there is None:
+            return cls(None, t != t, kind(0))
+        below, above = value - here.value.low, here.value.high - value
+        known = (below >= 0) & (above >= 0) & ~here.jumps
+        gaps = levels.gaps(value)
+        is_below = gaps.down < gaps.up
+        near = dr.select(is_below, below, above)
+        far = dr.select(is_below, above, below)
+        # Steps that are shorter than a rounding of t lead nowhere. Beside a pole f changes far more
+        # on the other side.
+        is_level = (gaps.smaller <= near) | ((gaps.smaller <= _SLACK * near) & (far <= _FAR * near))
+        error = near if gaps.is_one_sided else fmax(near, far)
+        error = dr.select(known & dr.isfinite(error), error, dr.inf)
+        off = there.nowhere
+        if levels.period is None:
+            # An end that is NaN stands for an infinite one.
+            sides = [(there.value.low > one) | (there.value.high < one) for one in levels.values]
+            off = off | functools.reduce(operator.and_, sides)
+        free = dr.select(off, ahead, 0)
+        return cls(error, is_level & known, free)
+
+
+@dataclass(frozen=True)
+class _Looking:
+    """The state of looking: how often, and whether a level was passed."""
+
+    looks: Any
+    passed: Mask
+    active: Mask
+
+
+def beyond(
+    backend: Backend,
+    field: Field,
+    gaps: Gaps,
+    p: Vec3,
+    ways: tuple[tuple[Vec3, Real], tuple[Vec3, Real]],
+    value: Real,
+    reach: Real,
+    slack: Real,
+    active: Mask,
+) -> tuple[Mask, Any]:
+    """Whether f takes a level within `reach` of p, and how many evaluations of f that took.
+
+    ways: two directions, each with the slope of f along it. value: f at p. gaps: from there to the
+        levels. slack: how far off rounding may have put a coordinate.
+
+    Proof. At another point, at most `reach` away, f is on the other side of the level, and on the
+    box around both it is continuous and has values everywhere: so it takes the level between them
+    (up to its rounding there). Or f is the level at the other point, up to rounding, as where it
+    touches the level and turns back. The points are along the first way where the slope says that
+    the level is, twice as far, and at `reach`; and the last two along the second way. Where the
+    level is not found nothing is proved: the ray goes on, and comes nearer if it meets the surface.
+    """
+
+    zero = backend.Float(0)
+
+    def body(now: _Looking) -> _Looking:
+        is_first, is_far = now.looks < 3, (now.looks == 2) | (now.looks == 4)
+        way = dr.select(is_first, ways[0][0], ways[1][0])
+        rate = dr.abs(dr.select(is_first, ways[0][1], ways[1][1]))
+        times = dr.select(now.looks == 0, backend.Float(1), 2)
+        distance = dr.select(is_far, reach, fmin(times * gaps.smaller / rate, reach))
+        q = dr.fma(type(p)(distance), way, p)
+        around, between = values_between(field, q, q, slack), values_between(field, p, q, zero)
+        if around is None or between is None:
+            with without_weaker():
+                rise = field.evaluate(q).value - value
+            passed = (rise <= -gaps.down) | (rise >= gaps.up)
+        else:
+            least, most = around.value.low - value, around.value.high - value
+            passed = (most <= -gaps.down) | (least >= gaps.up)
+            passed &= ~(between.jumps | between.gaps | between.nowhere)
+            is_level = (least <= -gaps.down) & (most >= -gaps.down)
+            is_level |= (least <= gaps.up) & (most >= gaps.up)
+            passed |= is_level & ~(around.jumps | around.nowhere)
+        passed = now.passed | passed
+        looks = now.looks + 1
+        return _Looking(looks, passed, now.active & ~passed & (looks < _TRIALS))
+
+    begin = _Looking(backend.UInt32(0), backend.Bool(False), backend.Bool(active))
+    end = while_active(begin, body, "harnack beyond")
+    return end.passed, end.looks
+
+
+def down_or_up(gradient: Vec3, gaps: Gaps, otherwise: Vec3) -> Vec3:
+    """The unit vector along which f goes to the nearer level; another one where the gradient has no
+    direction."""
+    way = unit(gradient)
+    way = dr.select(gaps.down < gaps.up, -way, way)
+    known = dr.isfinite(way.x + way.y + way.z)
+    return dr.select(known, way, otherwise)

@@ -1,0 +1,198 @@
+"""Vertical tangents, poles, and places without a value: hits are there, and rays get past.
+
+The oracle is the formula in double precision: dense samples along rays for first changes of sign,
+and points around a hit for whether the surface is there.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+import harnack as hk
+from harnack.arithmetic import is_steep
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from harnack.backend import FloatArray, Precision
+
+# Texts, the same functions of arrays, half a side of the box, and how many rays of 300 meet them.
+FORMULAS: dict[str, tuple[str, Callable[..., Any], float]] = {
+    "astroid": (
+        "abs(x)^(2/3) + abs(y)^(2/3) + abs(z)^(2/3) = 1",
+        lambda x, y, z: abs(x) ** (2 / 3) + abs(y) ** (2 / 3) + abs(z) ** (2 / 3) - 1,
+        1.5,
+    ),
+    "root of a product": ("sqrt(x*y*z) = 0.5", lambda x, y, z: np.sqrt(x * y * z) - 0.5, 2.0),
+    "logarithm": ("log(x) = y", lambda x, y, z: np.log(x) - y, 1.5),
+    "heart": (
+        "(x^2 + 9/4*y^2 + z^2 - 1) = (x^2*z^3 + 9/80*y^2*z^3)^(1/3)",
+        lambda x, y, z: (
+            (x**2 + 9 / 4 * y**2 + z**2 - 1) - (x**2 * z**3 + 9 / 80 * y**2 * z**3) ** (1 / 3)
+        ),
+        1.5,
+    ),
+    "powers": (
+        "((abs(x)^10 + abs(y)^10)^(1/15) + abs(z)^(2/3))^1.5 = 1",
+        lambda x, y, z: ((abs(x) ** 10 + abs(y) ** 10) ** (1 / 15) + abs(z) ** (2 / 3)) ** 1.5 - 1,
+        1.5,
+    ),
+}
+
+
+def rays(half: float, count: int = 300) -> tuple[FloatArray, FloatArray]:
+    rng = np.random.default_rng(0)
+    o = rng.normal(size=(count, 3))
+    o *= 3 * half / np.linalg.norm(o, axis=1)[:, None]
+    d = rng.uniform(-half, half, (count, 3)) - o
+    return o, d / np.linalg.norm(d, axis=1)[:, None]
+
+
+def first_roots(f: Callable[..., Any], o: FloatArray, d: FloatArray, half: float) -> FloatArray:
+    """The first change of sign on each ray in the box, to 1e-3; inf where there is none."""
+    ends = np.sort([(-half - o) / d, (half - o) / d], axis=0)
+    start, end = ends[0].max(1), ends[1].min(1)
+    t = start[:, None] + np.linspace(0, 1, 4001) * np.maximum(end - start, 0)[:, None]
+    with np.errstate(all="ignore"):
+        values = f(*np.moveaxis(o[:, None] + t[..., None] * d[:, None], 2, 0))
+    changes = (values[:, 1:] * values[:, :-1] <= 0) & (start < end)[:, None]
+    return np.where(changes.any(1), t[np.arange(len(t)), changes.argmax(1)], np.inf)
+
+
+@pytest.mark.parametrize("precision", ["single", pytest.param("double", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "astroid",
+        "root of a product",
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("logarithm", "heart", "powers")),
+    ],
+)
+def test_hits_are_where_the_surface_is(name: str, precision: Precision) -> None:
+    """Rays beside a cusp hit it far from the surface, or stopped there and where there is no f."""
+    text, f, half = FORMULAS[name]
+    o, d = rays(half)
+    truth = first_roots(f, o, d, half)
+    box = hk.Box((-half,) * 3, (half,) * 3)
+    hits = hk.trace(hk.expression(text), o, d, clip=box, precision=precision)
+    assert not (hits.status == hk.Status.OUT_OF_STEPS).any()
+    np.testing.assert_array_equal(hits.status == hk.Status.HIT, np.isfinite(truth))
+    both = np.isfinite(truth)
+    assert both.sum() > 40
+    np.testing.assert_allclose(hits.t[both], truth[both], atol=2e-3)
+    assert hits.evaluations.mean() < 12
+    assert hits.uncertainty.max() < 2e-5
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "sqrt(abs(x)) + 0.5",
+        pytest.param("asin(1 - abs(y)) = 9", marks=pytest.mark.slow),
+        pytest.param("(x^2)^0.25 + 0.3", marks=pytest.mark.slow),
+        pytest.param("abs(x)^(1/3) + 0.5", marks=pytest.mark.slow),
+        pytest.param("sqrt(y) = 2", marks=pytest.mark.slow),
+        pytest.param("1/(abs(x) + 0.0001*abs(y)) + 1", marks=pytest.mark.slow),
+    ],
+)
+def test_no_surface_is_hit_where_there_is_none(text: str) -> None:
+    o, d = rays(1.0)
+    box = hk.Box((-1, -1, -1), (1, 1, 1))
+    hits = hk.trace(hk.expression(text), o, d, clip=box)
+    assert (hits.status == hk.Status.MISS).all()
+
+
+def test_poles_are_no_surfaces() -> None:
+    """1/x = 0.5 at x = 2; at x = 0 it is on both sides of the level, and the ray stops."""
+    field = hk.expression("1/x = 0.5")
+    o, d = [[5.0, 0, 0], [-5.0, 0, 0], [1e-6, 1.0, 0]], [[-1.0, 0, 0], [1.0, 0, 0], [0, -1.0, 0]]
+    hits = hk.trace(field, o, d, t_max=20.0)
+    assert hits.status.tolist() == [1, 2, 0]
+    assert hits.t[0] == pytest.approx(3.0, abs=1e-3)
+    assert hits.t[1] == pytest.approx(5.0, abs=1e-3)
+
+
+@pytest.mark.parametrize("precision", ["single", pytest.param("double", marks=pytest.mark.slow)])
+def test_valley_with_a_vertical_tangent(precision: Precision) -> None:
+    """z = sqrt(|x|): along and down into its valley, from it, and confirmed."""
+    field = hk.HeightField(lambda x, y: hk.sqrt(abs(x)))
+    o = [[0, 0.5, 3], [1e-9, 0.5, 3], [-0.9, 0.1, 0.25], [0, 0.1, 0.25], [0, 0.5, 0.25]]
+    d = [[0, 0, -1], [0, 0, -1], [1, 0, 0], [1, 0, 0], [0, -1, 0]]
+    hits = hk.trace(field, o, d, precision=precision)
+    assert hits.status.tolist() == [1, 1, 1, 1, 0]
+    # The rounding of x alone moves the bottom of the valley by 0.003 in single precision.
+    np.testing.assert_allclose(hits.t[:4], [3, 3, 0.8375, 0.0625], atol=4e-3)
+    assert abs(hits.t[2:4] - [0.8375, 0.0625]).max() < 1e-4
+    assert (hits.uncertainty < 1e-4).all()
+
+
+def test_powers_that_overflow() -> None:
+    """|grad f|^2 = 1e63 at the sides of the box leaves single precision."""
+    field = hk.expression("x^100 + y^100 + z^100 = 1")
+    o, d = rays(2.0)
+    hits = hk.trace(field, o, d, clip=hk.Box((-2, -2, -2), (2, 2, 2)))
+    p = hits.position[hits.status == hk.Status.HIT]
+    assert len(p) > 100
+    assert (abs(np.abs(p).max(1) - 1) < 0.012).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["union", "difference", "near", "rotated"])
+@pytest.mark.parametrize("confirm", [False, True])
+def test_solids_made_of_cusps(kind: str, confirm: bool) -> None:
+    text, f, half = FORMULAS["astroid"]
+    star, ball = hk.solid(hk.expression(text), below=0), hk.Sphere(0.6, center=(0.5, 0, 0))
+
+    def of_ball(x: Any, y: Any, z: Any) -> Any:
+        return np.sqrt((x - 0.5) ** 2 + y * y + z * z) - 0.6
+
+    c, s = np.cos(np.pi / 6), np.sin(np.pi / 6)
+    solid, oracle = {
+        "union": (star | ball, lambda *p: np.minimum(f(*p), of_ball(*p))),
+        "difference": (ball - star, lambda *p: np.maximum(-f(*p), of_ball(*p))),
+        "near": (hk.solid(hk.expression(text), around=(0, 0.05)), lambda *p: abs(f(*p)) - 0.05),
+        "rotated": (
+            star.rotated(30, (0, 0, 1)), lambda x, y, z: f(c * x + s * y, c * y - s * x, z)
+        ),
+    }[kind]  # fmt: skip
+    o, d = rays(half)
+    truth = first_roots(oracle, o, d, half)
+    box = hk.Box((-half,) * 3, (half,) * 3)
+    hits = hk.trace(solid, o, d, clip=box, confirm=confirm)
+    assert not (hits.status == hk.Status.OUT_OF_STEPS).any()
+    np.testing.assert_allclose(hits.t, truth, atol=2e-3)
+
+
+def test_rays_pass_where_all_squares_of_a_norm_are_zero() -> None:
+    """A box as formulas write it: the root of squares that are 0 inside; rays through an axis."""
+
+    def box(x: Any, y: Any, z: Any) -> Any:
+        q = [abs(one) - 0.75 for one in (x, y, z)]
+        out = [hk.maximum(one, 0.0) for one in q]
+        outside = hk.sqrt(out[0] * out[0] + out[1] ** 2 + 4 * out[2] ** 2)
+        return hk.minimum(-outside - hk.minimum(hk.maximum(*q), 0.0), hk.sqrt(x**2 + y**2) - 0.1)
+
+    o, d = rays(1.0, 200)
+    o[:2], d[:2] = [[0.5, 0, 0.1], [0.5, 0.5, 0]], [[-1, 0, 0], [-(0.5**0.5), -(0.5**0.5), 0]]
+    field = hk.expression(box)
+    hits = hk.trace(field, 0.3 * o, d)
+    assert not (hits.status == hk.Status.OUT_OF_STEPS).any()
+    assert hits.evaluations.mean() < 12
+    points = np.random.default_rng(1).uniform(-0.7, 0.7, (50, 3))
+    assert np.isfinite(field.gradient(points)).all()
+
+
+def test_which_formulas_are_steep() -> None:
+    def steep(text: str) -> bool:
+        return hk.expression(text).is_steep
+
+    assert not any(
+        map(steep, ("x^4 + y^2 = 1", "sqrt(x^2 + 2*y^2 + 1) = z/3", "abs(x) = norm(y, z)"))
+    )
+    assert all(map(steep, ("sqrt(x*y)", "1/x", "x^0.3", "tan(x)", "log(x)", "x^y", "atan2(y, x)")))
+    assert not hk.Sphere().is_steep
+    assert (hk.Sphere() | hk.solid(hk.expression("sqrt(x)"), below=1)).is_steep
+    assert not is_steep(lambda x, y, z: 2.0)
