@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import harnack as hk
-from harnack.arithmetic import ZERO, Interval, Jet, maximum, minimum, norm, power
+from harnack.arithmetic import ZERO, Interval, Jet, Values, maximum, minimum, norm, power
 from harnack.arithmetic.functions import Function
 from harnack.backend import choose_backend
 
@@ -458,3 +458,42 @@ def test_kinds_of_numbers() -> None:
 def test_wrong_calls(call: Callable[[], Any], error: type[Exception], words: str) -> None:
     with pytest.raises(error, match=words):
         call()
+
+
+def test_values_hold_all_values_and_say_where_there_are_none() -> None:
+    """Ranges on boxes, against samples: whether they jump and where they have no value."""
+    backend = choose_backend("double")
+    rng = np.random.default_rng(3)
+    centers, half = rng.uniform(-2, 2, (2000, 3)), rng.uniform(0, 0.5, 2000)
+
+    def formula(x: Any, y: Any, z: Any) -> Any:
+        root = hk.sqrt(x * y) if isinstance(x, Values) else np.sqrt(x * y)
+        return maximum(root + z**2, (z + 3.0) ** 0.5 - y) * x
+
+    p = backend.Array3f(*(backend.Float(one) for one in centers.T))
+    values = formula(*Values.between(p, p, backend.Float(half)))
+    low, high = np.array(values.value.low), np.array(values.value.high)
+    nowhere, gaps = np.array(values.nowhere), np.array(values.gaps)
+    assert 50 < nowhere.sum() + gaps.sum() < 1950
+    for _ in range(20):
+        points = centers + half[:, None] * rng.uniform(-1, 1, (2000, 3))
+        with np.errstate(invalid="ignore"):
+            truth = formula(*points.T)
+        there = np.isfinite(truth)
+        assert not (there & nowhere).any()
+        assert (there | gaps | nowhere)[np.isfinite(low)].all()
+        assert not (there & ((truth < low) | (truth > high))).any()
+    x = Values.between(p, p, backend.Float(half))[0]
+    over = np.array((1.0 / x).jumps)
+    np.testing.assert_array_equal(over, np.abs(centers[:, 0]) <= half)
+
+
+def test_roots_of_sums_of_squares_have_the_slopes_of_norms() -> None:
+    backend = choose_backend("double")
+    x, y, _ = Jet.within(backend.Array3f(0.0, 0.1, 0.0), backend.Float(0.2))
+    written = hk.sqrt(x * x / 4 + 2 * y**2)
+    exact = norm(x * 0.5, y * 2**0.5)
+    for one, two in zip(written.first, exact.first, strict=True):
+        np.testing.assert_allclose(np.array(one.low), np.array(two.low), rtol=1e-9)
+        np.testing.assert_allclose(np.array(one.high), np.array(two.high), rtol=1e-9)
+    assert np.isinf(np.array(hk.sqrt(x * x - y * y).first[0].high))

@@ -443,5 +443,5 @@ def clipped_power(n: int) -> ClippedPower:
         ranges,
         lambda x: power(n).plain(fmax(x, 0)),
         lambda x: np.maximum(x, 0.0) ** n,
-        n,
+        exponent=n,
     )

@@ -92,10 +92,6 @@ class Field(Sheets, Parts, Detail, Boundary, abc.ABC):
     has_creases: bool = False
     """Whether the gradient jumps somewhere, as it does where the surfaces of a union meet."""
 
-    is_steep: bool = False
-    """Whether |grad f| may have no bound in a bounded box, so that f may bend by any amount within
-    the tolerance of a hit. The tracer then looks at f beyond the hit (`tracer.steep`)."""
-
     def __new__(cls, *given: Any, **named: Any) -> Self:
         """Refuse arguments with derivatives enabled, unless the class defines `parameters`."""
         if cls.drops_derivatives():
@@ -181,6 +177,12 @@ class Field(Sheets, Parts, Detail, Boundary, abc.ABC):
         default is the field itself."""
         del count
         return self
+
+    @property
+    def is_steep(self) -> bool:
+        """Whether |grad f| may have no bound in a bounded box, so that f may bend by any amount
+        within the tolerance of a hit. The tracer then looks at f beyond the hit."""
+        return False
 
     def slope_change(self, p: Vec3, radius: Real) -> Real:
         """A proved bound of |grad f(y) - grad f(p)| for all y with |y - p| <= radius; infinite, the

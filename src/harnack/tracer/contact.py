@@ -43,14 +43,19 @@ class Status(enum.IntEnum):
 class Tolerance:
     """When a point is close enough to a level to be a hit.
 
-    distance: |f - level| <= distance * |grad f|, a length to first order (paper, Sec. 3.1.2).
+    distance: |f - level| <= distance * |grad f|, a length to first order (paper, Sec. 3.1.2); see
+        below for where that is none.
     per_length: added to `distance` for each unit of t: half the angle of a pixel makes the
         tolerance grow with its footprint.
     value: also a hit where |f - level| <= value, whatever the gradient.
 
-    Near a pole of f, |f - level|/|grad f| is about the distance to the pole, not to the level: rays
-    that pass a point charge within the tolerance count as hits of every level. The same holds where
-    the slope of f has no bound, as that of sqrt(|x|) near x = 0.
+    Where |grad f| may have no bound, as beside a vertical tangent or a pole of a formula
+    (`Field.is_steep`), that is no length. There a point is a hit only if f is proved to take the
+    level within the tolerance, by its slope ahead or by its values beyond, or up to the rounding of
+    the point. At creases |grad f| jumps but has a bound: a crease that stays off the level counts
+    as a hit where it comes as near to it in value. Of fields that are no formulas and have poles,
+    such as clouds of dipoles, rays that pass a pole within the tolerance count as hits of every
+    level.
 
     Where rounding leaves the distance to the level less certain than this, that uncertainty is
     the tolerance: about 1e-6 of the coordinates' size in single precision, 1e-15 in double.

@@ -66,7 +66,8 @@ class Hits:
         rays of fields that have neither.
     uncertainty: (n,) a length: at a hit of a smooth level set, |f - level| is proved to be at most
         (tolerance + uncertainty) |grad f|. It is 0 unless rounding leaves f less certain than the
-        tolerance asks; 0 for all other rays.
+        tolerance asks; 0 for all other rays. Where |grad f| may have no bound the surface is proved
+        to be within the tolerance, or within the rounding of the point (see `Tolerance`).
     """
 
     t: Any

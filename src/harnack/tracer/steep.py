@@ -8,8 +8,6 @@ the other side, and what steps slopes do not prove, ranges of values may (`arith
 
 from __future__ import annotations
 
-import functools
-import operator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
@@ -98,8 +96,10 @@ class SteepPlace:
         off = there.nowhere
         if levels.period is None:
             # An end that is NaN stands for an infinite one.
-            sides = [(there.value.low > one) | (there.value.high < one) for one in levels.values]
-            off = off | functools.reduce(operator.and_, sides)
+            misses = t == t
+            for one in levels.values:
+                misses &= (there.value.low > one) | (there.value.high < one)
+            off = off | misses
         free = dr.select(off, ahead, 0)
         return cls(error, is_level & known, free)
 
