@@ -54,7 +54,7 @@ def _check_branch_point(
     away = np.hypot(x - point.at.real, y - point.at.imag)  # of the places as rounded
     branches: Any = field.branches.prepare(backend)
     imaginary = field.part == "imag"
-    period = branches.period(imaginary)
+    period: float | None = branches.period(imaginary)
     value = point.value.imag if imaginary else point.value.real
     allowed = point.constant * away**point.power
     worst = np.zeros(_PLACES)
@@ -62,7 +62,7 @@ def _check_branch_point(
         part = one.value.imag if imaginary else one.value.real
         off: FloatArray = to_numpy(part) - value
         if period is not None:
-            off -= period * np.round(off / period)
+            off = off - period * np.round(off / period)
         worst = np.fmax(worst, np.abs(off))
     rounding = _SLACK * (allowed + 1e-6 * abs(value)) + 2.0**-48 * (abs(value) + np.abs(point.at))
     require(

@@ -67,7 +67,11 @@ class Hits:
     uncertainty: (n,) a length: at a hit of a smooth level set, |f - level| is proved to be at most
         (tolerance + uncertainty) |grad f|. It is 0 unless rounding leaves f less certain than the
         tolerance asks; 0 for all other rays. Where |grad f| may have no bound the surface is proved
-        to be within the tolerance, or within the rounding of the point (see `Tolerance`).
+        to be within the tolerance, or within the rounding of the point (see `Tolerance`). Elsewhere
+        that is a length to first order: along lines and at points where grad f is 0 and f - level a
+        power u^m, as where m sheets meet, the surface may be m times as far, and along a ray that
+        grazes it t is off by more. In single precision rounding hides the surface there from afar:
+        use `precision="double"`, or `confirm`.
     """
 
     t: Any
