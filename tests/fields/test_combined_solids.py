@@ -47,6 +47,17 @@ def shrunk(p: FloatArray) -> FloatArray:
     return (p - [1, 2, 3]) / 0.7
 
 
+def test_flush_blends_bulge_as_their_docstring_says_and_a_slab_cuts_that_off() -> None:
+    plate, rib = hk.Cuboid((20.0, 20.0, 5.0)), hk.Cylinder(4.0, 5.0)
+    blend = plate.blended(rib, 2.0)
+    ends = np.array([[0.0, 0.0, 5.585], [0.0, 0.0, 5.587], [0.0, 0.0, 4.999]])
+    inside = [blend, blend & hk.Cuboid((30.0, 30.0, 5.0))]
+    assert [(one.value(ends, precision="double") <= 0).tolist() for one in inside] == [
+        [True, False, True],
+        [False, False, True],
+    ]
+
+
 def blended(a: FloatArray, b: FloatArray, radius: float, power: float) -> FloatArray:
     g, h = np.maximum(1 - a / radius, 0), np.maximum(1 - b / radius, 0)
     near = radius * (1 - (g**power + h**power) ** (1 / power))

@@ -274,3 +274,24 @@ def test_scalars_of_numpy_are_numbers_in_samples_and_promises() -> None:
             return hk.Sample(p.z, type(p)(0, 0, 1), known, np.float64(1e-6))
 
     assert hk.trace(Height(), [[0, 0, 0.5]], [[0, 0, -1]]).t[0] == pytest.approx(0.5, abs=2e-4)
+
+
+ROUND_BOX = (
+    "sqrt(max(abs(x) - 1, 0)^2 + max(abs(y) - 0.7, 0)^2 + max(abs(z) - 0.5, 0)^2)"
+    " + min(max(abs(x) - 1, abs(y) - 0.7, abs(z) - 0.5), 0)"
+)
+
+
+def test_roots_of_what_is_zero_all_around_have_slope_zero() -> None:
+    """All 1,000 gradients inside were no numbers."""
+    box = hk.expression(ROUND_BOX)
+    half = np.array([1.0, 0.7, 0.5])
+    points = np.random.default_rng(0).uniform(-1, 1, (1000, 3)) * half
+    nearest = np.eye(3)[(np.abs(points) - half).argmax(axis=1)]
+    assert (box.gradient(points, precision="double") == nearest * np.sign(points)).all()
+
+
+def test_gradients_without_a_bound_are_of_one_side() -> None:
+    cone = hk.expression("sqrt(x^2 + y^2)")
+    gradient = cone.gradient([[0.0, 0.0, 0.3]], precision="double")
+    assert np.linalg.norm(gradient) == pytest.approx(1.0)

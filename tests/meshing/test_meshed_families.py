@@ -174,3 +174,24 @@ def test_strands_that_nearly_touch(gap: float) -> None:
     mesh = hk.mesh(hk.SolidAngle([up, down]), tolerance=4e-3)
     assert (mesh.vertices[:8] == np.concatenate([up, down])).all()
     assert len(mesh.metadata["harnack"]["boundary"]) == 8
+
+
+@pytest.mark.slow
+def test_walls_of_the_angle_about_an_axis_between_cylinders() -> None:
+    """The angle jumps on the axis, where triangles without an area were turned at random."""
+    radius, angle = "6*sqrt(x^2 + y^2)", "6*atan2(y, x)"
+    gyroid = hk.expression(
+        f"sin({angle})*cos(6*z) + sin(6*z)*cos({radius}) + sin({radius})*cos({angle})"
+    )
+    wall = hk.solid(gyroid, between=(-0.3, 0.3)) & hk.Cylinder(1.5, 1.0)
+    mesh = hk.mesh(wall - hk.Cylinder(0.7, 2.0), tolerance=4e-3)
+    assert mesh.is_watertight
+    assert mesh.volume == pytest.approx(2.1754, rel=1e-2)  # by the midpoint rule
+
+
+@pytest.mark.slow
+def test_formulas_without_a_value_where_other_parts_leave_nothing() -> None:
+    field = hk.expression("sqrt(x^2 + y^2 - 0.09)*cos(3*atan2(y, x)) - z")
+    solid = (hk.solid(field, below=0) & hk.Cylinder(1.5, 1.0)) - hk.Cylinder(0.7)
+    mesh = hk.mesh(solid, spacing=0.1)
+    assert mesh.volume == pytest.approx(5.5292, rel=1e-3)  # half of what is between

@@ -227,6 +227,50 @@ def test_parts_that_touch_inside_a_face_are_not_said_to_be_apart() -> None:
     assert "do not touch" not in loose.message
 
 
+CUBE = trimesh.creation.box()
+WEDGE_FACES = [
+    (0, 3, 1),
+    (0, 2, 3),
+    (1, 4, 0),
+    (1, 5, 4),
+    (2, 5, 3),
+    (2, 4, 5),
+    (0, 4, 2),
+    (1, 3, 5),
+]
+TIP = (
+    [(3, 1, 10), (5, 1, 15), (1, 5, 15), (-3, -3, 15)],
+    [(0, 2, 1), (0, 3, 2), (0, 1, 3), (1, 2, 3)],
+)
+
+
+def wedge(half: float) -> tuple[Any, Any]:
+    """On its edge, which is 2 half long."""
+    ends = [(0, 10), (3, 15), (-3, 15)]
+    return [(x, y + 1.1, z) for y, z in ends for x in (-half, half)], WEDGE_FACES
+
+
+@pytest.mark.parametrize(
+    ("other", "count"),
+    [
+        (TIP, 1),
+        (wedge(3.0), 2),  # its ends: a diagonal of the face passes under its edge as well
+        ((CUBE.vertices * 4.0 + np.array([12, 3, 12]), CUBE.faces), 2),
+    ],
+)
+def test_parts_that_touch_inside_a_face_are_wrong(other: Any, count: int) -> None:
+    box = trimesh.creation.box((20.0, 20.0, 20.0))
+    touching = trimesh.Trimesh(*other, process=False)
+    found = hk.check_print(trimesh.util.concatenate([box, touching]))
+    assert {one.kind: one.count for one in found.problems} == {
+        "touching faces": count,
+        "loose parts": 2,
+    }
+    assert not found.is_fine
+    touching.apply_translation((0, 0, 1e-6))
+    assert hk.check_print(trimesh.util.concatenate([box, touching])).is_fine
+
+
 def test_large_faces_are_told_of_where_walls_are_measured() -> None:
     """A pit beside the center of a face was not seen, and nothing said so."""
     box = trimesh.creation.box((20.0, 10.0, 5.0))

@@ -81,6 +81,58 @@ def test_threads_keep_their_edges(profile: Any, starts: int, left_handed: bool) 
     assert mesh.volume == pytest.approx(10.0 * area, rel=1e-2)
 
 
+ACUTE = hk.Tube([(1, 0, 0), (0, 0, 0), (math.cos(math.pi / 6), 0.5, 0)], 0.2)
+SQUARE = hk.Tube([(1, 0, 0), (0, 0, 0), (0, 1, 0), (1, 1, 0.4), (1, 0, 0)], 0.1)
+BACK = hk.Tube([(1, 0, 0), (0, 0, 0), (0.5, 0, 0)], 0.1)
+
+
+def trefoil(radius: float) -> hk.Tube:
+    t = np.linspace(0, 2 * np.pi, 101)
+    x = [np.sin(t) + 2 * np.sin(2 * t), np.cos(t) - 2 * np.cos(2 * t), -np.sin(3 * t)]
+    points = np.stack(x, axis=1)
+    points[-1] = points[0]
+    return hk.Tube(points, radius)
+
+
+def spline(radius: float) -> hk.Tube:
+    points = np.random.default_rng(0).uniform(-1, 1, (10, 3))
+    return hk.Tube(hk.geometry.smooth_curve(points, closed=False), radius)
+
+
+@pytest.mark.parametrize(
+    ("tube", "volume", "tolerance"),
+    [
+        # By sums over distances in NumPy; of one edge twice that of a capsule.
+        (ACUTE, 0.25899, 1e-3),
+        (BACK, 0.01 * math.pi * (1 + 4 / 30), 1e-3),
+        (SQUARE, 0.1288, 1e-3),
+        pytest.param(trefoil(0.8), 56.684, 1e-3, marks=pytest.mark.slow),
+        pytest.param(spline(0.2), 1.9001, 1e-3, marks=pytest.mark.slow),
+        pytest.param(hk.Tube.helix(2.0, 0.3, 4.0, 0.2), None, 1e-3, marks=pytest.mark.slow),
+    ],
+    ids=["acute", "there and back", "closed", "trefoil", "spline", "coil"],
+)
+def test_tubes_that_come_back_to_themselves(
+    tube: hk.Tube, volume: float | None, tolerance: float
+) -> None:
+    """All but the closed one were refused: creases of one function, narrower than cells."""
+    mesh = hk.mesh(tube, tolerance=tolerance)
+    assert mesh.is_watertight
+    assert off(tube, mesh) < tolerance * np.ptp(mesh.vertices, axis=0).max()
+    if volume is not None:
+        assert mesh.volume == pytest.approx(volume, rel=6e-3)
+
+
+def test_tubes_of_several_polylines_offset_and_cut() -> None:
+    cross = hk.Tube.around([[(-1, 0, 0), (1, 0, 0)], [(0, -1, 0), (0, 1, 0)]], 0.1)
+    grown = hk.mesh(cross.grown(0.1), tolerance=1e-3)
+    # Two capsules of radius r less what they have in common, 16/3 r^3.
+    right = 2 * math.pi * 0.2**2 * (2 + 4 / 3 * 0.2) - 16 / 3 * 0.2**3
+    assert grown.volume == pytest.approx(right, rel=6e-3)
+    half = hk.mesh(cross & hk.Plane((0, 0, 1)), tolerance=1e-3)
+    assert half.volume == pytest.approx(0.5 * hk.mesh(cross, tolerance=1e-3).volume, rel=2e-3)
+
+
 def test_a_bolt_and_its_nut_do_not_meet() -> None:
     hexagon = hk.outline.regular(6, 13 / math.sqrt(3))
     bolt = hk.thread("M8", 12.0, clearance=0.1)

@@ -109,7 +109,9 @@ class Formula(Field):
         over these few roundings, as that of a sine of a large angle does. There the middle is used.
         """
         epsilon = float(dr.epsilon(type(p.x)))
-        middle, doubt = sample.gradient, sample.gradient_error
+        is_bounded = dr.isfinite(sample.gradient_error + dr.sum(sample.gradient))
+        middle = dr.select(is_bounded, sample.gradient, 0)
+        doubt = dr.select(is_bounded, sample.gradient_error, dr.inf)
         steep = length(middle)
         way = dr.select(steep > 0, middle / steep, 0) + type(p)(*_ASIDE)
         size = largest_coordinate(p) + dr.abs(sample.value)
@@ -124,7 +126,7 @@ class Formula(Field):
         is_tie = (doubt > _TIE * epsilon * steep) & (off <= 2 * doubt) & dr.isfinite(off)
         return dataclasses.replace(
             sample,
-            gradient=dr.select(is_tie, one_side, middle),
+            gradient=dr.select(is_tie, one_side, sample.gradient),
             gradient_error=dr.select(is_tie, doubt + off, doubt),
         )
 

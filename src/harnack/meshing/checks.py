@@ -10,6 +10,7 @@ one power of two.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Generator
 from typing import TYPE_CHECKING, Any, Never, cast
 
 import numpy as np
@@ -52,6 +53,7 @@ __all__ = [
     "sides_of_lines",
     "sides_of_planes",
     "singular_vertices",
+    "touching_pairs",
     "turned_faces",
 ]
 
@@ -167,15 +169,8 @@ def intersecting_faces(
     among: (m,) mask; pairs of which neither is chosen are not looked at.
     """
     found: list[IntArray] = []
-    many = len(faces) if among is None else int(among.sum())
-    by_kernel = many > _MANY
-    near = near_pairs(vertices, faces, among) if by_kernel else _near_pairs(vertices[faces], among)
-    for start in range(0, len(near), _PAIRS_AT_ONCE):
-        pairs = near[start : start + _PAIRS_AT_ONCE]
-        if not by_kernel:
-            pairs = pairs[~_are_apart(vertices, faces, pairs)]
+    for pairs, heights in _pairs_in_doubt(vertices, faces, among):
         one, other = faces[pairs[:, 0]], faces[pairs[:, 1]]
-        heights = [_heights(vertices, *two) for two in ((one, other), (other, one))]
         meet = np.zeros(len(pairs), np.bool_)
         rows = np.flatnonzero((heights[0] == 0).all(axis=1) & (heights[1] == 0).all(axis=1))
         meet[rows] = _overlap(vertices[one[rows]], vertices[other[rows]])
@@ -185,6 +180,46 @@ def intersecting_faces(
         meet[rows] |= _cross(vertices, other[rows], one[rows], heights[1][rows])
         found.append(pairs[meet].ravel())
     return np.unique(np.concatenate([*found, np.zeros(0, np.int64)]))
+
+
+def touching_pairs(vertices: FloatArray, faces: IntArray) -> tuple[IntArray, FloatArray]:
+    """Pairs (k, 2) of faces (m, 3) without common corners of which one has a corner or an edge on
+    the other, decided exactly; and (k, 3) a corner that is on the other, or the middle of an edge.
+
+    Of a face that lies on another as a whole its edges do. Where edges meet between their ends, and
+    lie in neither face's plane, `intersecting_faces` has the pair.
+    """
+    found: list[IntArray] = []
+    places: list[FloatArray] = []
+    for pairs, heights in _pairs_in_doubt(vertices, faces, None):
+        apart = (faces[pairs[:, 0], :, None] != faces[pairs[:, 1]][:, None]).all(axis=(1, 2))
+        # A corner is an edge from itself to itself.
+        for i, j in ((0, 0), (1, 1), (2, 2), *_EDGES):
+            for (plane, of), height in zip((pairs.T, pairs.T[::-1]), heights, strict=True):
+                rows = np.flatnonzero(apart & (height[:, i] == 0) & (height[:, j] == 0))
+                p, q = (vertices[faces[of[rows], k]] for k in (i, j))
+                on = _is_on(vertices[faces[plane[rows]]], p, q)
+                found.append(pairs[rows[on]])
+                places.append(0.5 * (p + q)[on])
+    both = np.concatenate([*found, np.zeros((0, 2), np.int64)])
+    _, first = np.unique(both, axis=0, return_index=True)
+    return both[first], np.concatenate([*places, np.zeros((0, 3))])[first]
+
+
+def _pairs_in_doubt(
+    vertices: FloatArray, faces: IntArray, among: BoolArray | None
+) -> Generator[tuple[IntArray, tuple[SignArray, SignArray]]]:
+    """Pairs (k, 2) of faces that are not proved apart, some at a time, and the `_heights` of the
+    second over the first and of the first over the second."""
+    many = len(faces) if among is None else int(among.sum())
+    by_kernel = many > _MANY
+    near = near_pairs(vertices, faces, among) if by_kernel else _near_pairs(vertices[faces], among)
+    for start in range(0, len(near), _PAIRS_AT_ONCE):
+        pairs = near[start : start + _PAIRS_AT_ONCE]
+        if not by_kernel:
+            pairs = pairs[~_are_apart(vertices, faces, pairs)]
+        one, other = faces[pairs[:, 0]], faces[pairs[:, 1]]
+        yield pairs, (_heights(vertices, one, other), _heights(vertices, other, one))
 
 
 def _near_pairs(corner: FloatArray, among: BoolArray | None) -> IntArray:
@@ -298,6 +333,22 @@ def _overlap(one: FloatArray, other: FloatArray) -> BoolArray:
             side = [turn * sides_of_lines(a[:, i], a[:, j], b[:, k]) for k in range(3)]
             found &= (np.stack(side) > 0).any(axis=0)
     return found
+
+
+def _is_on(triangle: FloatArray, p: FloatArray, q: FloatArray) -> BoolArray:
+    """(k,) whether segments from p to q (k, 3) meet triangles (k, 3, 3) in whose planes they are:
+    unless the line of an edge or of the segment has them on its two sides (separating axes)."""
+    normal = np.abs(crosses(triangle))
+    axes = np.array([[1, 2], [2, 0], [0, 1]])[normal.argmax(axis=1)]
+    a = np.take_along_axis(triangle, axes[:, None].repeat(3, axis=1), axis=2)
+    p, q = (np.take_along_axis(one, axes, axis=1) for one in (p, q))
+    turn = sides_of_lines(a[:, 0], a[:, 1], a[:, 2])
+    found = turn != 0
+    for i, j in _EDGES:
+        side = [turn * sides_of_lines(a[:, i], a[:, j], one) for one in (p, q)]
+        found &= (np.stack(side) >= 0).any(axis=0)
+    side = np.stack([sides_of_lines(p, q, a[:, k]) for k in range(3)])
+    return found & ~((side > 0).all(axis=0) | (side < 0).all(axis=0))
 
 
 # Checks of whole meshes.

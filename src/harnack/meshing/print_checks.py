@@ -17,7 +17,7 @@ from harnack.fields.solids.mesh_solid import MeshSolid
 from harnack.files.surfaces import Mesh, read_surface
 from harnack.geometry import MeshError, validate_mesh, zero_area_faces
 from harnack.geometry.welding import Welded
-from harnack.meshing.checks import intersecting_faces, singular_vertices
+from harnack.meshing.checks import intersecting_faces, singular_vertices, touching_pairs
 from harnack.meshing.clipping import Shells
 from harnack.meshing.edges import Edges, IntArray, directed_edges, lengths
 from harnack.meshing.lattice_surface import Surface
@@ -93,11 +93,12 @@ def check_print(part: Any, *, wall: float | None = None, bed: Any = None) -> Pri
 
     Wrong are: open edges, edges of more than two faces, neighbors that do not agree on their two
     sides, parts that are inside out or in the material of others, vertices where sheets touch,
-    triangles that pass through each other or lie on each other (decided exactly), faces that are
-    there twice; walls thinner than asked; what does not fit on the bed. Hints are: corners apart
-    from others by rounding, which count as one, faces without an area, several parts, tiny ones,
-    cavities without a way out (for powder and resin), and a size that looks like inches or meters,
-    and, of walls, faces so large that a thin place beside their centers may be missed.
+    corners and edges that lie on other faces, triangles that pass through each other or lie on
+    each other (decided exactly), faces that are there twice; walls thinner than asked; what does
+    not fit on the bed. Hints are: corners apart from others by rounding, which count as one, faces
+    without an area, several parts, tiny ones, cavities without a way out (for powder and resin),
+    and a size that looks like inches or meters, and, of walls, faces so large that a thin place
+    beside their centers may be missed.
 
     part: a trimesh.Trimesh, (vertices, faces), or the name of a file. Vertices at the same place
         are one.
@@ -117,9 +118,9 @@ def check_print(part: Any, *, wall: float | None = None, bed: Any = None) -> Pri
     found = _topology(x, faces)
     is_closed = not _is_wrong(found)
     shells = Shells.of(Surface(x, faces))
-    crossings = _crossings(x, faces, is_closed)
+    crossings, touching = _contacts(x, faces, shells, is_closed)
     is_clear = is_closed and not crossings.count
-    found += [*_of_parts(shells, is_closed, is_clear), crossings]
+    found += [*_of_parts(shells, is_closed, is_clear), crossings, touching]
     if wall is not None:
         found += [_thin(x, faces, wall, not _is_wrong(found)), _coarse(x, faces, wall)]
     low, high = x[faces].min(axis=(0, 1)), x[faces].max(axis=(0, 1))
@@ -256,18 +257,39 @@ def _of_parts(shells: Shells, is_closed: bool, is_clear: bool) -> list[PrintProb
     ]
 
 
-def _crossings(x: FloatArray, faces: IntArray, is_closed: bool) -> PrintProblem:
-    kept = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
-    kept = np.unique(np.sort(kept, axis=1), axis=0)  # duplicates have been counted
-    crossing = intersecting_faces(x, kept)
-    places = x[kept[crossing]].mean(axis=1)
-    found = _problem(
+def _contacts(
+    x: FloatArray, faces: IntArray, shells: Shells, is_closed: bool
+) -> tuple[PrintProblem, PrintProblem]:
+    """Faces that pass through or lie on others, and those that only touch others.
+
+    Faces without an area close gaps between corners and edges that lie on each other: where a part
+    has some, it is not said to touch itself.
+    """
+    is_flat = np.zeros(len(faces), np.bool_)
+    is_flat[zero_area_faces(x, faces)] = True
+    is_plain = np.isin(shells.number, shells.number[is_flat], invert=True)
+    rows = np.flatnonzero((faces != np.roll(faces, 1, axis=1)).all(axis=1))
+    # Duplicates have been counted.
+    rows = rows[np.unique(np.sort(faces[rows], axis=1), axis=0, return_index=True)[1]]
+    crossing = intersecting_faces(x, faces[rows])
+    advice = "; hk.mesh(hk.solid(part)) makes one of parts that overlap" if is_closed else ""
+    crossings = _problem(
         "crossing faces",
-        places,
+        x[faces[rows[crossing]]].mean(axis=1),
         "{} {triangle passes through or lies|triangles pass through or lie} on others",
     )
-    advice = "; hk.mesh(hk.solid(part)) makes one of parts that overlap" if is_closed else ""
-    return dataclasses.replace(found, message=found.message + advice)
+    rows = np.delete(rows, crossing)
+    rows = rows[~is_flat[rows]]
+    pairs, places = touching_pairs(x, faces[rows])
+    one, other = rows[pairs.T]
+    is_contact = is_plain[one] | (shells.number[one] != shells.number[other])
+    touching = _problem(
+        "touching faces",
+        np.unique(places[is_contact], axis=0),
+        "at {} {place|places} a corner or an edge lies on a face that it is not part of: let parts "
+        "overlap, or move them apart",
+    )
+    return dataclasses.replace(crossings, message=crossings.message + advice), touching
 
 
 def _thin(x: FloatArray, faces: IntArray, wall: float, is_solid: bool) -> PrintProblem:

@@ -173,6 +173,14 @@ class Solid(Field):
         """The union with another solid, with a fillet where the surfaces meet (or, with
         intersect=True, the intersection with a rounded edge).
 
+        The fillet fills where both surfaces are near, whatever the angle between them: where faces
+        are flush, as of a plate and a rib of the same height, the blend bulges by
+        radius (1 - 2^(-1/power)), 0.29 radius for a circle. Cut it off by a slab as high as these,
+
+            plate.blended(rib, 2.0) & hk.Cuboid((30.0, 30.0, 5.0))
+
+        with 5 half the height, or let one of them end a radius below the other's face.
+
         radius: how far the fillet reaches along both surfaces, where f is a distance.
         power: the exponent of the superellipse that the fillet is a part of: 2 for a circle, larger
             for a sharper corner (Hart 1996, appendix D.3, corrected).
