@@ -33,7 +33,7 @@ from .arithmetic import (
     tan,
     tanh,
 )
-from .backend.tensors import wrap_for_jax
+from .backend.tensors import wrap_for_jax, wrap_for_torch
 from .cluster.zarr_files import to_zarr
 from .distance import (
     Curvatures,
@@ -249,5 +249,6 @@ __all__ = [
     "union",
     "view",
     "wrap_for_jax",
+    "wrap_for_torch",
     "write_scene",
 ]

@@ -73,7 +73,7 @@ def with_torch(name: str, precision: Precision) -> tuple[np.ndarray, list[np.nda
     function, arrays = CASES[name]
     dtype = torch.float32 if precision == "single" else torch.float64
     given = [torch.tensor(a, dtype=dtype, requires_grad=True) for a in arrays]
-    result = dr.wrap(source="torch", target="drjit")(function)(*given)
+    result = hk.wrap_for_torch(function)(*given)
     weights = torch.arange(1, result.numel() + 1, dtype=dtype).reshape(result.shape)
     (result * weights).sum().backward()
     return result.detach().numpy(), [one.grad.numpy() for one in given]
@@ -189,7 +189,7 @@ def test_all_of_hits_comes_out() -> None:
     in_torch = (torch.tensor(a, dtype=torch.float32) for a in rays)
     in_jax = (jax.numpy.asarray(a, "f4") for a in rays)
     for found in (
-        dr.wrap(source="torch", target="drjit")(everything)(*in_torch),
+        hk.wrap_for_torch(everything)(*in_torch),
         hk.wrap_for_jax(everything)(*in_jax),
     ):
         assert found.keys() == vars(expected).keys()
@@ -214,6 +214,62 @@ def test_a_loss_in_another_framework(target: str) -> None:
     np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(expected).max())
 
 
+def seen(vertices: Any, origins: Any, directions: Any) -> Any:
+    """1 where rays hit, else 0."""
+    hits = hk.trace(hk.SolidAngle(vertices), origins, directions, level=6.0)
+    return dr.select(hits.hit, type(hits.t)(1), 0)
+
+
+@pytest.mark.parametrize("framework", ["torch", "jax"])
+def test_whether_rays_hit_has_no_derivative(framework: str) -> None:
+    """It was exactly 0, without a word; and the value alone is as ever."""
+    given = [np.asarray(one, np.float32) for one in (LOOP, EYE[None], AWAY)]
+    if framework == "torch":
+        tensors = [torch.tensor(one, requires_grad=True) for one in given]
+        result = hk.wrap_for_torch(seen)(*tensors)
+
+        def differentiated() -> None:
+            result.sum().backward()
+    else:
+        result, pull_back = jax.vjp(hk.wrap_for_jax(seen), *given)
+
+        def differentiated() -> None:
+            pull_back(jax.numpy.ones_like(result))
+
+    assert 0 < np.asarray(result.detach() if framework == "torch" else result).mean() <= 1
+    with pytest.raises(NotImplementedError, match="nothing that has a derivative"):
+        differentiated()
+
+
+def test_graphs_of_pytorch_can_be_gone_back_through_again() -> None:
+    """A second pass repeated the first, whatever it was asked for."""
+    vertices = torch.tensor(LOOP, requires_grad=True)
+    rest = [torch.tensor(one) for one in CASES["trace"][1][1:]]
+    weights = torch.arange(1.0, 21.0, dtype=torch.float64), torch.linspace(-3, 1, 20).double()
+
+    def gradient(result: Any, weight: Any, again: bool) -> Any:
+        total = (result * weight).sum()
+        return torch.autograd.grad(total, vertices, retain_graph=again)[0]
+
+    kept = hk.wrap_for_torch(depths)(vertices, *rest)
+    for weight in weights:
+        alone = gradient(hk.wrap_for_torch(depths)(vertices, *rest), weight, False)
+        torch.testing.assert_close(gradient(kept, weight, True), alone)
+    points = torch.tensor(POINTS[:2])
+    assert torch.autograd.gradcheck(lambda v: hk.wrap_for_torch(angles)(v, points), (vertices,))
+
+
+def test_containers_and_other_arguments_are_passed_on() -> None:
+    def both(points: Any, scale: float) -> Any:
+        return {"twice": scale * points, "count": hk.SolidAngle(LOOP).value(points)}
+
+    points = torch.tensor(POINTS, requires_grad=True)
+    result = hk.wrap_for_torch(both)(points, 2.0)
+    assert list(result) == ["twice", "count"]
+    result["twice"].sum().backward()
+    torch.testing.assert_close(points.grad, torch.full_like(points, 2.0))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["trace", "value"])
 def test_a_step_compiles_nothing_after_the_first_two(name: str) -> None:
@@ -224,7 +280,7 @@ def test_a_step_compiles_nothing_after_the_first_two(name: str) -> None:
     vertices = torch.tensor(circle, dtype=torch.float32, requires_grad=True)
     rest = [torch.tensor(a, dtype=torch.float32) for a in arrays[1:]]
     optimizer = torch.optim.Adam([vertices], lr=0.03)
-    in_torch = dr.wrap(source="torch", target="drjit")(function)
+    in_torch = hk.wrap_for_torch(function)
     in_jax = jax.value_and_grad(lambda *given: (hk.wrap_for_jax(function)(*given) ** 2).sum())
     certificates: set[str] = set()
 
@@ -251,14 +307,14 @@ def test_any_order_of_imports(order: str) -> None:
     """Each brings an LLVM or an OpenMP of its own."""
     code = f"""
 import {order}
-import drjit as dr, harnack as hk, jax, numpy as np, torch
+import harnack as hk, jax, numpy as np, torch
 torch.randn(300, 300) @ torch.randn(300, 300)
 (jax.numpy.ones((300, 300)) @ jax.numpy.ones((300, 300))).block_until_ready()
 loop = hk.geometry.shapes.wavy_polygon(12)
 hk.render(hk.SolidAngle(loop), size=(16, 16), show="shaded", progress=False)
 value = lambda v, p: hk.SolidAngle(v).value(p)
 v, p = torch.tensor(loop, requires_grad=True), torch.tensor([[0, 0, 0.5]], dtype=torch.float64)
-dr.wrap(source="torch", target="drjit")(value)(v, p).sum().backward()
+hk.wrap_for_torch(value)(v, p).sum().backward()
 found = jax.grad(lambda *given: hk.wrap_for_jax(value)(*given)[0])(np.float32(loop), np.float32(p))
 np.testing.assert_allclose(v.grad.numpy(), found, atol=1e-5)
 """
@@ -292,7 +348,7 @@ def test_fields_of_learned_numbers_are_refused(framework: str, made: Any) -> Non
     def differentiated() -> Any:
         if framework == "torch":
             r = torch.ones(1, requires_grad=True)
-            return dr.wrap(source="torch", target="drjit")(first_hits)(r)
+            return hk.wrap_for_torch(first_hits)(r)
         return jax.vjp(hk.wrap_for_jax(first_hits), jax.numpy.ones(1))
 
     with pytest.raises(NotImplementedError, match="which carry derivatives"):

@@ -60,7 +60,8 @@ def arguments(function: Callable[..., Any]) -> list[str]:
 
 
 def makers() -> Iterator[tuple[str, Callable[..., Any]]]:
-    """Constructors of fields and volumes, class methods that make them, and methods of solids."""
+    """Constructors of fields and volumes, class methods that make them, and methods of solids and
+    of fields whose data may move."""
     for kind in (*public_classes(hk.Field), *public_classes(Volume)):
         if kind is hk.SolidAngle:
             continue  # it has derivatives by its vertices
@@ -68,6 +69,8 @@ def makers() -> Iterator[tuple[str, Callable[..., Any]]]:
         for name, own in vars(kind).items():
             if isinstance(own, classmethod) and not name.startswith("_"):
                 yield f"{kind.__name__}.{name}", getattr(kind, name)
+    for field in (hk.DipolePotential(POINTS, POINTS), hk.WindingNumber(POINTS[:3], [[0, 1, 2]])):
+        yield f"{type(field).__name__}.moved", field.moved
     for name, own in vars(hk.Solid).items():
         is_maker = inspect.isfunction(own) and own.__annotations__.get("return") == "Solid"
         if is_maker and not name.startswith("_") and name not in ("prepare", "leaves"):
@@ -114,7 +117,7 @@ WITH_DERIVATIVES = {
 OTHERS = {
     "atan2", "maximum", "minimum", "norm", "union", "intersection", "animate", "render", "page",
     "check_print", "mesh", "read_scene", "repair", "thickness", "view", "wrap_for_jax",
-    "write_scene",
+    "wrap_for_torch", "write_scene",
 }  # fmt: skip
 FUNCTIONS = {
     name: getattr(hk, name)

@@ -1,8 +1,10 @@
-"""Tensors (n, 3) and (n,), in which arrays of other frameworks reach Dr.Jit; functions for JAX.
+"""Tensors (n, 3) and (n,), in which arrays of other frameworks reach Dr.Jit; functions for PyTorch
+and JAX.
 
 `drjit.wrap` gives a function tensors and takes back tensors, while what is computed here runs on
 vectors, a lane a row. All conversions pass derivatives on, in both directions. `wrap_for_jax` is
-the direction of `drjit.wrap` that Dr.Jit lacks.
+the direction of `drjit.wrap` that Dr.Jit lacks. `wrap_for_torch` is one that it has, without its
+silent zeros: derivatives that are not there raise, and a graph can be gone back through again.
 """
 
 from __future__ import annotations
@@ -86,6 +88,110 @@ def takes_tensors(method: Method) -> Method:
     return cast("Method", general)
 
 
+# PyTorch.
+
+
+def wrap_for_torch(function: Callable[..., Any]) -> Callable[..., Any]:
+    """A function of Dr.Jit tensors as one of PyTorch tensors, with derivatives.
+
+    As `drjit.wrap(source="torch", target="drjit")`, but nothing is dropped without a word: a result
+    that depends on the arguments by nothing that has a derivative, such as whether rays hit
+    (`hits.hit`), raises where its derivative is asked for; and a second backward pass
+    (`retain_graph=True`) is right, and calls `function` again.
+
+    function: must be pure. It is called with a Dr.Jit tensor for each PyTorch tensor among its
+        arguments, of the same shape and precision, and returns a Dr.Jit array or tensor, or several
+        in a tuple, list or dictionary; 3-vectors become tensors (n, 3). All else that it is given
+        it is given as it is; tensors in lists and the like are not looked for.
+
+    Raises ImportError where PyTorch is not installed.
+    """
+    torch: Any = importlib.import_module("torch")
+
+    def run(given: list[Any], tensors: tuple[Any, ...]) -> tuple[list[Any], Any]:
+        """The inputs, and what `function` returns; given: its arguments, None for tensors."""
+        inputs = [_input(one.detach()) for one in tensors]
+        left = iter(inputs)
+        return inputs, function(*(next(left) if one is None else one for one in given))
+
+    class Wrapped(torch.autograd.Function):
+        @staticmethod
+        def forward(ctx: Any, given: list[Any], shape: list[Any], *tensors: Any) -> Any:
+            inputs, outputs = run(given, tensors)
+            shape.append(outputs)
+            ctx.save_for_backward(*tensors)
+            ctx.given, ctx.graph = given, (inputs, _results(outputs))
+            results = tuple(dr.detach(_as_tensor(one)).torch() for one in ctx.graph[1])
+            ctx.mark_non_differentiable(*(one for one in results if not one.is_floating_point()))
+            return results
+
+        @staticmethod
+        @torch.autograd.function.once_differentiable
+        def backward(ctx: Any, *cotangents: Any) -> Any:
+            graph, ctx.graph = ctx.graph, None
+            if graph is None:  # gone back through already
+                inputs, outputs = run(ctx.given, ctx.saved_tensors)
+                graph = inputs, _results(outputs)
+            inputs, outputs = graph
+            found = _gradients(inputs, outputs, [None if c is None else c for c in cotangents])
+            gradients = iter(found)
+            return (
+                None,
+                None,
+                *(next(gradients).torch() if dr.is_float_v(one) else None for one in inputs),
+            )
+
+    @functools.wraps(function)
+    def wrapped(*args: Any) -> Any:
+        tensors = [one for one in args if isinstance(one, torch.Tensor)]
+        given = [None if isinstance(one, torch.Tensor) else one for one in args]
+        shape: list[Any] = []
+        return _like(shape, iter(Wrapped.apply(given, shape, *tensors)))
+
+    return wrapped
+
+
+def _results(outputs: Any) -> list[Any]:
+    """What a function returned, as a list."""
+    if isinstance(outputs, dict):
+        return list(cast("dict[Any, Any]", outputs).values())
+    return list(cast("list[Any]", outputs)) if isinstance(outputs, (tuple, list)) else [outputs]
+
+
+def _like(shape: list[Any], results: Any) -> Any:
+    """Results in the container that the function returned, the entry of `shape`."""
+    outputs = shape.pop()
+    if isinstance(outputs, dict):
+        return dict(zip(cast("dict[Any, Any]", outputs), results, strict=True))
+    return type(outputs)(results) if type(outputs) in (tuple, list) else next(results)
+
+
+def _gradients(inputs: list[Any], outputs: list[Any], cotangents: list[Any]) -> list[Any]:
+    """Gradients, as tensors, with respect to those inputs that are floats, given those of outputs
+    (None for none).
+
+    Raises:
+        NotImplementedError: an output that is asked for has no derivative at all.
+    """
+    for output, cotangent in zip(outputs, cotangents, strict=True):
+        if cotangent is None or not dr.is_float_v(output):
+            continue
+        given, tensor = _tensor(cotangent), _as_tensor(output)
+        if dr.grad_enabled(tensor):
+            dr.accum_grad(tensor, given)  # one may be there twice, or be an input
+            dr.enqueue(dr.ADMode.Backward, tensor)
+        elif dr.any(given.array != 0, axis=None):
+            raise NotImplementedError(_NO_DERIVATIVE)
+    dr.traverse(dr.ADMode.Backward)
+    return [dr.grad(one) for one in inputs if dr.is_float_v(one)]
+
+
+_NO_DERIVATIVE = (
+    "a result of the wrapped function depends on its arguments by nothing that has a derivative: "
+    "zero would be wrong where it depends on whether rays hit (hits.hit, hits.status), on what was "
+    "hit, or on NumPy arrays. Take t, position or field.value, or detach that result"
+)
+
 # JAX.
 
 _TRACED = (
@@ -108,6 +214,9 @@ def wrap_for_jax(
         tensors, in tuples, lists and dictionaries if it likes; 3-vectors become arrays (n, 3).
     result: only for use inside `jax.jit`: a JAX function of the same arguments whose result has
         the shapes and types of `function`'s. Only these are looked at.
+
+    A result that depends on the arguments by nothing that has a derivative, such as whether rays
+    hit (`hits.hit`), raises where its derivative is asked for.
 
     Derivatives are those of reverse mode (`jax.grad`, `jax.vjp`, `jax.jacrev`). A derivative calls
     `function` a second time: JAX may keep what a forward pass leaves, and Dr.Jit's graph is none
@@ -165,13 +274,9 @@ def _run(jax: Any, function: Callable[..., Any], *args: Any) -> Any:
 def _pull_back(jax: Any, function: Callable[..., Any], args: Any, cotangents: Any) -> list[Any]:
     """Gradients with respect to those arguments that are floats, given those of the result."""
     inputs = jax.tree.map(_input, args)
-    outputs = [_as_tensor(one) for one in jax.tree.leaves(function(*inputs))]
-    for output, cotangent in zip(outputs, jax.tree.leaves(cotangents), strict=True):
-        if dr.grad_enabled(output):
-            dr.accum_grad(output, _tensor(cotangent))  # one may be there twice, or be an input
-            dr.enqueue(dr.ADMode.Backward, output)
-    dr.traverse(dr.ADMode.Backward)
-    return [dr.grad(one).jax() for one in jax.tree.leaves(inputs) if dr.is_float_v(one)]
+    outputs = jax.tree.leaves(function(*inputs))
+    found = _gradients(jax.tree.leaves(inputs), outputs, jax.tree.leaves(cotangents))
+    return [one.jax() for one in found]
 
 
 def _is_traced(jax: Any, values: Any) -> bool:

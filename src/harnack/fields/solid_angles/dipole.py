@@ -17,7 +17,7 @@ import numpy as np
 
 from harnack.backend import backend_of
 from harnack.backend.elementary import fmax
-from harnack.backend.numbers import positive
+from harnack.backend.numbers import positive, refuses_derivatives
 from harnack.fields.batch import SymmetricSum, Values, sharpened
 from harnack.fields.clearance import DetailedField, UnitCoordinates, epsilon_at, placed, single
 from harnack.fields.field import Sample, lengthened
@@ -360,6 +360,7 @@ class DipolePotential(OrientedPoints, HasCells, DetailedField["_DipoleBuffers"])
                 stacklevel=4,
             )
 
+    @refuses_derivatives
     def moved(
         self, points: Any, normals: Any | Literal["estimate"] = None, areas: Any = None
     ) -> DipolePotential:

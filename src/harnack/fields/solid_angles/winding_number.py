@@ -21,6 +21,7 @@ import numpy.typing as npt
 
 from harnack.backend import FloatArray, IntArray, backend_of
 from harnack.backend.elementary import fmax
+from harnack.backend.numbers import refuses_derivatives
 from harnack.cluster.packing import Remembered
 from harnack.enclosures import Lipschitz
 from harnack.fields.batch import BatchedField, Values
@@ -260,6 +261,7 @@ class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
         self._level_of_sheets = 0.0
         self._rates: Remembered[Backend, BoundaryRates] = Remembered()
 
+    @refuses_derivatives
     def moved(self, vertices: Any) -> WindingNumber:
         """The winding number of the same faces with other positions of their vertices (n, 3), for
         less work than a new one.

@@ -13,7 +13,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 import numpy as np
@@ -72,7 +72,7 @@ class BoundaryRates:
         """The derivatives asked for, at one detail, with a value of no meaning."""
         if isinstance(self.summed, TreeWinding):
             return self.summed.at(x, derivatives, closer)
-        real = type(x.x)
+        real = cast("Any", type(x.x))
         if self.summed is None:
             return Values(real(0), real(0), dr.zeros(type(x), dr.width(x)), SymmetricSum.zero(real))
         sums = edge_rates(self.summed, x, derivatives)
