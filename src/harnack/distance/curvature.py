@@ -48,8 +48,8 @@ class Curvatures:
     normal: (n, 3) grad f/|grad f|.
     mean_error, gaussian_error: (n,) proved bounds of how far `mean` and `gaussian` may be off;
         infinite where they are NaN, and where the field does not state the errors of its
-        derivatives (`Field.derivative_errors`). The rounding of the coordinates in which a moved
-        field without a formula is evaluated is not included.
+        derivatives (`Field.derivative_errors`). The rounding of the coordinates in which a moved or
+        bent field without a formula is evaluated is not included.
     """
 
     mean: FloatArray

@@ -176,7 +176,9 @@ def jet_of_field(field: Field, x: Jet, y: Jet, z: Jet) -> Jet:
     let coordinates be within m of q on the piece, rounding included. If m <= r, the gradient on the
     piece differs from that at q by at most H m, by the mean value theorem, and derivatives along
     the path follow by the chain rule; the value is that at the start plus the length times the
-    derivative. Where m > r derivatives are not bounded.
+    derivative. Where m > r derivatives are not bounded. Second derivatives at a point (of
+    coordinates with all six) are those of the field where it has some, up to its error of these
+    (without what the rounding of coordinates adds), or up to 2 H, as both are at most H.
 
     Raises:
         TypeError: the field promises no bound of its second derivatives.
@@ -187,6 +189,11 @@ def jet_of_field(field: Field, x: Jet, y: Jet, z: Jet) -> Jet:
     sample = field.evaluate(q)
     bound, radius = _second_derivatives(field, sample)
     off = length(type(q)(*(0 * x.width + one.value.radius for one in starts)))
+    rows = _second_derivatives_at(field, q) if len(x.second) == _ALL_PAIRS else None
+    doubt = 2 * bound
+    if rows is not None:
+        is_point = off <= _AT_POINT * float(dr.epsilon(type(q.x))) * largest_coordinate(q)
+        doubt = dr.select(is_point, fmin(doubt, field.derivative_errors(q, sample)[1]), doubt)
 
     def derivatives(
         jets: list[Jet], distance: Real
@@ -204,8 +211,17 @@ def jet_of_field(field: Field, x: Jet, y: Jet, z: Jet) -> Jet:
         ]
         second: list[Interval] = []
         for k, (i, j) in enumerate(_pairs(len(x.first), len(x.second))):
-            bent = most * speeds[i] * speeds[j] * (1 + 1e-5)
             along = _sum(g * one.second[k] for g, one in zip(slopes, jets, strict=True))
+            if rows is None:
+                bent = most * speeds[i] * speeds[j] * (1 + 1e-5)
+            else:
+                bent = doubt * speeds[i] * speeds[j] * (1 + 1e-5)
+                own = (
+                    row[n] * (one.first[i] * other.first[j])
+                    for row, one in zip(rows, jets, strict=True)
+                    for n, other in enumerate(jets)
+                )
+                along = along + _sum(own)
             second.append(along + Interval(-bent, bent))
         return first, tuple(second)
 
@@ -237,6 +253,19 @@ def _sum(terms: Iterable[Interval]) -> Interval:
 def _pairs(n: int, count: int) -> list[tuple[int, int]]:
     """The pairs of variables of the entries of `Jet.second`."""
     return [(i, j) for i in range(n) for j in range(i, n)][:count]
+
+
+# All second derivatives by three coordinates; and the roundings of coordinates of a point.
+_ALL_PAIRS, _AT_POINT = 6, 256.0
+
+
+def _second_derivatives_at(field: Field, q: Vec3) -> list[list[Interval]] | None:
+    """The Hessian of a field at a point; None where the field has none."""
+    try:
+        rows = field.hessian(q)
+    except NotImplementedError:
+        return None
+    return [[Interval.exactly(number) for number in row] for row in rows]
 
 
 def _second_derivatives(field: Field, sample: Sample) -> tuple[Real, Real]:
