@@ -17,6 +17,11 @@ _PREFIX = 0.02
 _T = TypeVar("_T", bound=Callable[..., Any])
 
 
+def is_one_of(given: object, known: Iterable[str]) -> bool:
+    """Whether something is one of the known names; nothing but a text is."""
+    return isinstance(given, str) and given in known
+
+
 def did_you_mean(given: object, known: Iterable[str]) -> str:
     """'; did you mean "gold"?' for the known name most like the given one, '' if none is."""
     if not isinstance(given, str):

@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
+from typing import Any, cast
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
@@ -15,6 +16,22 @@ Advance = Callable[[float], None]
 _INTERVAL = 5.0
 # Seconds: what was done before is no measure of what takes time.
 _AT_ONCE = 0.5
+
+
+def teller(progress: Callable[[str], None] | None) -> Callable[[str], None]:
+    """What to tell what is being done: the function of a caller, or nobody.
+
+    Raises:
+        TypeError: it is neither a function nor None.
+    """
+    if progress is None:
+        return lambda message: None
+    if not callable(progress) or isinstance(progress, type):
+        raise TypeError(
+            "progress must be a function that is told what is being done, such as print, not "
+            f"{progress!r:.60}"
+        )
+    return progress
 
 
 @contextmanager
@@ -27,6 +44,8 @@ def progress_bar(name: str, shown: bool | Advance) -> Generator[Advance]:
     It is a bar in a terminal, and lines of text in notebooks and log files: in a notebook a bar
     would need ipywidgets, and control codes of terminals are shown as they are.
     """
+    if not callable(shown) and not isinstance(cast("Any", shown), bool):
+        raise TypeError(f"progress must be True, False or a function, not {shown!r:.60}")
     console = Console(stderr=True)
     if callable(shown):
         yield shown

@@ -596,10 +596,10 @@ def test_walls() -> None:
             lambda: EigenfunctionSum([Product(1.0, sine(1)), Product(-1.0, sine(1))]),
             "the sum is constant",
         ),
-        (lambda: EigenfunctionSum([Product(math.inf, sine(1))]), "term 0 holds numbers"),
+        (lambda: EigenfunctionSum([Product(math.inf, sine(1))]), "amplitude of a product must be finite"),
         (lambda: EigenfunctionSum([PlaneWave(1.0, (1.0, 2.0))]), "three numbers"),  # type: ignore[arg-type]
         (lambda: sine(0.0), "frequency 0 is a constant"),
-        (lambda: cosine(math.nan), "finite numbers"),
+        (lambda: cosine(math.nan), "frequency of a factor must be finite"),
         (lambda: Gyroid(cell=0.0), "edge length of the cell must be positive"),
         (lambda: SchwarzP(cell=math.inf), "edge length of the cell must be positive"),
         (lambda: Gyroid().wall_levels(-1.0), "half width of a wall must be positive"),

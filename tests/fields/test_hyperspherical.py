@@ -259,7 +259,7 @@ def test_extents_hold_the_level() -> None:
         (lambda: hk.HypersphericalHarmonic(7, 0, 0), ValueError, "degree l must be 0 to 6, not 7"),
         (lambda: hk.HypersphericalHarmonic(3, 4, 0), ValueError, "j must be 0 to l = 3, not 4"),
         (lambda: hk.HypersphericalHarmonic(3, 2, -3), ValueError, "order m must be -2 to 2"),
-        (lambda: hk.HypersphericalHarmonic(2.5, 1, 0), TypeError, "integer"),  # type: ignore[arg-type]
+        (lambda: hk.HypersphericalHarmonic(2.5, 1, 0), TypeError, "whole number"),  # type: ignore[arg-type]
         (lambda: polynomial({(2, 0, 0, 0): 1}), ValueError, "not harmonic in R\\^4"),
         (lambda: polynomial({(1, 0, 0, 0): 1, (0, 2, 0, 0): 1}), ValueError, "one degree"),
         (lambda: polynomial({(1, 0, 0, 0): 0}), ValueError, "zero: it has no level sets"),

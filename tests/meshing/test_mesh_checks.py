@@ -30,12 +30,17 @@ _BALL = trimesh.creation.icosphere(subdivisions=3)
 _FACES = np.asarray(_BALL.faces, np.int64)
 
 
+def test_open_meshes_are_not_shown_as_closed() -> None:
+    made = ClosedMesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], process=False)
+    assert repr(made).startswith("<trimesh.Trimesh(")
+
+
 def test_a_limit_of_triangles_is_named():
     with pytest.raises(TooLargeError, match="max_triangles"):
         hk.mesh(hk.Sphere(1.0), max_triangles=1000)
     with pytest.raises(TooLargeError, match="max_triangles is 9,000"):
         hk.mesh(hk.Sphere(1.0), max_triangles=9000, tolerance=1e-5)
-    with pytest.raises(ValueError, match="max_triangles must be positive"):
+    with pytest.raises(ValueError, match="max_triangles must be an integer from 1"):
         hk.mesh(hk.Sphere(1.0), max_triangles=0)
 
 

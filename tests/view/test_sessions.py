@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import socket
+import struct
+import time
 from typing import Any
 
 import drjit as dr
@@ -358,6 +361,23 @@ def test_texts_that_are_no_questions(live: Live) -> None:
     said = client.answer(question, lambda part: None)
     assert isinstance(said, dict)
     assert said["error"].startswith("QuestionError: kind")
+
+
+@pytest.mark.slow
+def test_a_page_that_is_closed_at_once_writes_nothing(caplog: pytest.LogCaptureFixture) -> None:
+    """Its connection is reset before the answer to its request is written."""
+    with hk.view(hk.Sphere(1.0), opens=False, waits=False) as view:
+        port = int(view.address.rstrip("/").rpartition(":")[2])
+        for _ in range(3):
+            with socket.create_connection(("127.0.0.1", port)) as page:
+                page.sendall(
+                    f"GET /questions HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nUpgrade: websocket\r\n"
+                    "Connection: Upgrade\r\nSec-WebSocket-Key: aGFybmFja2hhcm5hY2s9PQ==\r\n"
+                    "Sec-WebSocket-Version: 13\r\n\r\n".encode()
+                )
+                page.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+            time.sleep(0.05)
+    assert [one.getMessage() for one in caplog.records if one.levelname == "ERROR"] == []
 
 
 def test_a_picture_can_be_called_off(live: Live) -> None:

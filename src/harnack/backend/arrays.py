@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from harnack.backend.llvm import ensure_llvm
 from harnack.backend.numbers import FloatArray, check_vectors, real_array
+from harnack.names import is_one_of
 
 # Dr.Jit creates its array types at run time, one family a backend and precision, so no static
 # type describes "a Float of whichever backend". These names say what is meant.
@@ -134,7 +135,7 @@ def choose_backend(precision: Precision = "single") -> Backend:
         LLVMNotFoundError: LLVM is wanted and there is none that Dr.Jit can work with.
         RuntimeError: CUDA or Metal is forced and no device is usable, or Metal's computes wrongly.
     """
-    if precision not in ("single", "double"):
+    if not is_one_of(precision, ("single", "double")):
         raise ValueError(f'precision is "single" or "double", not {precision!r}')
     forced = os.environ.get(BACKEND_VARIABLE, "")
     if forced not in ("", "llvm", *_DEVICES):

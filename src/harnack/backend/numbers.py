@@ -119,7 +119,8 @@ def refuse_derivatives(name: str, *values: Any) -> None:
         raise NotImplementedError(
             f"{name} cannot be differentiated by these numbers, which carry derivatives: detach "
             "them, as drjit.detach and torch.Tensor.detach do (known are derivatives by rays, "
-            "levels, points, and the vertices of a SolidAngle)"
+            "levels, points, the vertices of a SolidAngle, and by what the method parameters() of "
+            "a field of your own returns)"
         )
 
 
@@ -278,6 +279,29 @@ def whole(value: Any, name: str, least: int, most: int) -> int:
         end = f"2^{n} - 1" if (n := most.bit_length()) >= 32 else str(most)
         raise ValueError(f"{name} must be an integer from {least} to {end}, not {value!r}")
     return number
+
+
+def flag(value: Any, name: str) -> bool:
+    """True or False, of Python or NumPy.
+
+    Raises:
+        TypeError: it is neither.
+    """
+    if not isinstance(value, bool | np.bool_):
+        raise TypeError(f"{name} must be True or False, not {short_text(value)}")
+    return bool(cast("Any", value))
+
+
+def integer(value: Any, name: str) -> int:
+    """A whole number of any size.
+
+    Raises:
+        TypeError: it is none.
+    """
+    try:
+        return operator.index(cast("Any", None if isinstance(value, bool | np.bool_) else value))
+    except TypeError:
+        raise TypeError(f"{name} must be a whole number, not {short_text(value)}") from None
 
 
 def triple(value: Any, name: str, *, all_positive: bool = False) -> tuple[float, float, float]:

@@ -14,11 +14,12 @@ from harnack.backend import BoolArray, FloatArray, choose_backend, to_numpy
 from harnack.backend.arrays import finite_vectors, upload_vectors
 from harnack.backend.elementary import fmax, fmin
 from harnack.backend.loops import while_active
-from harnack.backend.numbers import positive, refuses_derivatives
+from harnack.backend.numbers import finite, positive, refuses_derivatives
 from harnack.distance.tangent import Eigen, TangentPlane, in_batches
 from harnack.fields.batch import BatchedField
 from harnack.fields.field import check_is_field
-from harnack.names import did_you_mean
+from harnack.geometry.volume import check_volume
+from harnack.names import did_you_mean, is_one_of
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Precision, Real, Vec3
@@ -283,7 +284,9 @@ def curvature_lines(
         TypeError, ValueError: seeds that are not an (n, 3) array of finite numbers; a step or
             length that is not positive; an unknown family.
     """
-    if family not in get_args(Family):
+    check_is_field(field)
+    check_volume(clip, "clip")
+    if not is_one_of(family, get_args(Family)):
         known = ", ".join(f'"{one}"' for one in get_args(Family))
         hint = did_you_mean(family, get_args(Family))
         raise ValueError(f"unknown family {family!r}; choose one of {known}{hint}")
@@ -294,7 +297,7 @@ def curvature_lines(
     start = finite_vectors(seeds, "seeds")
     if not len(start):
         return []
-    level = field.default_level if level is None else float(level)
+    level = field.default_level if level is None else finite(level, "level")
     backend = choose_backend(precision)
     # Data, so that another level, step or family compiles no other kernel.
     most = 1.0 if family == "largest" else 0.0

@@ -18,7 +18,8 @@ from harnack.distance.tangent import first_order, in_batches, second_order
 from harnack.enclosures import TargetLevels
 from harnack.fields.clearance import distance_below
 from harnack.fields.field import Field, check_is_field
-from harnack.names import did_you_mean
+from harnack.names import did_you_mean, is_one_of
+from harnack.progress import teller
 from harnack.tracer import level_set
 
 if TYPE_CHECKING:
@@ -72,7 +73,7 @@ def signed_distance(
             domain, where it promises nothing.
         NotImplementedError: "second" with a field that has no second derivatives.
     """
-    if method not in get_args(Method):
+    if not is_one_of(method, get_args(Method)):
         known = ", ".join(f'"{one}"' for one in get_args(Method))
         hint = did_you_mean(method, get_args(Method))
         raise ValueError(f"unknown method {method!r}; choose one of {known}{hint}")
@@ -91,7 +92,7 @@ def signed_distance(
     if method == "lower":
         _check_domain(field, x)
     if field.has_sheets and method != "lower":
-        to_sheet = find_closest(backend, surface, levels, x, _silent).distance
+        to_sheet = find_closest(backend, surface, levels, x, teller(None)).distance
         result = np.copysign(np.fmin(to_sheet, np.abs(result)), result)
     return result
 
@@ -173,13 +174,9 @@ def _found(
     backend = choose_backend(precision)
     surface = _surface(field, level)
     levels = surface.levels_on(backend)
-    found = find_closest(backend, surface, levels, points, progress or _silent, is_proved=is_proved)
+    found = find_closest(backend, surface, levels, points, teller(progress), is_proved=is_proved)
     _warn(name, found)
     return found
-
-
-def _silent(message: str) -> None:
-    del message
 
 
 def _surface(field: Field, level: Any) -> LevelSet:

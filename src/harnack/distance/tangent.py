@@ -11,7 +11,7 @@ import numpy as np
 
 from harnack.backend import FloatArray
 from harnack.backend.elementary import across, fmax, length
-from harnack.backend.numbers import LARGEST
+from harnack.backend.numbers import LARGEST, real_array
 from harnack.fields import points as field_points
 
 if TYPE_CHECKING:
@@ -169,8 +169,8 @@ def in_batches(
 
 
 def _check_size(points: Any) -> None:
-    given = None if dr.is_array_v(type(points)) else np.asarray(points)
-    if given is None or not given.size or given.dtype.kind not in "fiu":
+    given = None if dr.is_array_v(type(points)) else real_array(points, "points")
+    if given is None or not given.size:
         return
     size = float(np.abs(given).max())
     if LARGEST < size < np.inf:

@@ -10,13 +10,14 @@ import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
 from harnack import arithmetic
-from harnack.backend.numbers import finite, refuse_derivatives, refuses_derivatives
+from harnack.backend.numbers import finite, flag, refuse_derivatives, refuses_derivatives
 from harnack.fields.formula import Formula, as_jet, probe, warn_of_price
+from harnack.geometry.volume import check_volume
 from harnack.names import did_you_mean
 
 if TYPE_CHECKING:
@@ -292,6 +293,8 @@ def expression(
         NotImplementedError: function uses numbers with derivatives enabled.
         ValueError: level is not finite; a text is no formula, or without such a parameter.
     """
+    if parameters is not None and not isinstance(cast("Any", parameters), Mapping):
+        raise TypeError(f'parameters are numbers by name, such as {{"a": 2}}, not {parameters!r}')
     if isinstance(function, str):
         function = TextFormula.read(function, parameters)
     elif parameters:
@@ -302,10 +305,8 @@ def expression(
             f'"x * y = z", not {function!r}'
         )
     _check_arguments(function)
-    if domain is not None and not callable(getattr(domain, "bounds", None)):
-        raise TypeError(f"domain must be a volume, such as harnack.Ball(), not {domain!r}")
-    if not math.isfinite(level):
-        raise ValueError(f"level must be finite, not {level!r}")
+    check_volume(domain, "domain")
+    level, is_convex = finite(level, "level"), flag(is_convex, "is_convex")
     made = Expression(function, domain, default_level=level, is_convex=is_convex)
     point = probe()
     refuse_derivatives("an expression", as_jet(made.formula(*point), point[0], "expression"))

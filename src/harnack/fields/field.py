@@ -136,6 +136,19 @@ class Field(Sheets, Parts, Detail, Boundary, abc.ABC):
             own += ": make a solid of the field first, by harnack.solid(field, below=level)"
         raise AttributeError(own)
 
+    def _is_no_number(self, *others: Any) -> Any:
+        """Arithmetic and comparisons are refused. `Solid` defines -, and all fields keep ==."""
+        raise TypeError(
+            f"a {type(self).__name__} is a function of space, which is not computed with as "
+            "numbers are: the level c of 2 f is the level c/2 of f, sums and products are written "
+            "as one formula, harnack.expression(lambda x, y, z: ...), and solids, which "
+            "harnack.solid makes of fields, are combined by |, & and -"
+        )
+
+    __add__ = __radd__ = __sub__ = __rsub__ = __mul__ = __rmul__ = _is_no_number
+    __truediv__ = __rtruediv__ = __pow__ = __rpow__ = __neg__ = __abs__ = _is_no_number
+    __lt__ = __le__ = __gt__ = __ge__ = _is_no_number
+
     @abc.abstractmethod
     def evaluate(self, p: Vec3) -> Sample:
         """Value, gradient and promises at p, a Dr.Jit 3-vector of any backend and precision.
@@ -355,7 +368,7 @@ def instead_of_field(given: Any) -> str:
     """For a message: what a thing is that is no field, and how to make a field of it."""
     kind, name = type(given).__name__, getattr(given, "__name__", "")
     if isinstance(getattr(given, "field", None), Field):
-        return f"a {kind}: take its .field, and give its level and clip beside it"
+        return f"a {kind}: take its .field, and what else this takes of it, such as its level"
     parts: list[Any] = [*given] if type(given) in (list, tuple) else []
     if any(isinstance(one, Field) for one in parts):
         return f"a {kind} of fields: give one at a time, or to harnack.render one flat list"

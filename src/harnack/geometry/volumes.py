@@ -6,7 +6,7 @@ import abc
 import sys
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
-from typing import Any, TypeAlias, TypeVar
+from typing import Any, TypeAlias, TypeVar, cast
 
 import drjit as dr
 import numpy as np
@@ -19,6 +19,7 @@ from harnack.geometry.volume import (
     Point,
     Volume,
     as_points,
+    check_volume,
     checked_distance,
     checked_point,
     emptied,
@@ -386,9 +387,13 @@ class Intersection(Volume):
     volumes: tuple[Volume, ...]
 
     def __init__(self, volumes: Iterable[Volume]) -> None:
+        if not isinstance(cast("Any", volumes), Iterable):
+            raise TypeError(f"an intersection is of several volumes, not of {volumes!r:.60}")
         members = tuple(volumes)
         if not members:
             raise ValueError("an intersection needs at least one volume")
+        for one in members:
+            check_volume(cast("Any", one) or "none", "each part of an intersection")
         object.__setattr__(self, "volumes", members)
 
     def prepare(self, backend: Backend) -> Intersection:

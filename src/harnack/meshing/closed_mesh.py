@@ -265,8 +265,11 @@ class ClosedMesh(trimesh.Trimesh):
     over. Vertices are rounded to a grid that single precision holds, edges without a length are
     contracted, and it is checked that what is left is closed and does not pass through itself. The
     mesh itself stays as it is, in double precision; and what is not closed is written as trimesh
-    does.
+    does. It is shown as the trimesh.Trimesh that it is, since it may be open.
     """
+
+    def __repr__(self) -> str:
+        return super().__repr__().replace(type(self).__name__, "Trimesh")
 
     @classmethod
     def of(cls, mesh: trimesh.Trimesh) -> ClosedMesh:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-import operator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from harnack.backend import FloatArray
-from harnack.backend.numbers import real
+from harnack.backend.numbers import real, whole
 from harnack.meshing.checks import MeshingError, euler_characteristic, intersecting_faces
 from harnack.meshing.closed_mesh import manifold_of, surface_of
 from harnack.meshing.edges import (
@@ -170,10 +169,8 @@ def check_options(tolerance: Any, spacing: Any, thickness: Any, seed: Any, most:
     for name, value in (("spacing", spacing), ("thickness", thickness)):
         if value is not None and not 0 < real(value, name) < math.inf:
             raise ValueError(f"{name} must be a positive length, not {value!r}")
-    if operator.index(seed) < 0:
-        raise ValueError(f"seed must not be negative, not {seed}")
-    if operator.index(most) < 1:
-        raise ValueError(f"max_triangles must be positive, not {most}")
+    whole(seed, "seed", 0, 2**63 - 1)
+    whole(most, "max_triangles", 1, 2**63 - 1)
 
 
 def normals_of(function: LevelFunction, surface: Surface) -> FloatArray:

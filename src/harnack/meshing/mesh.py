@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
 
+from harnack.backend.numbers import flag
 from harnack.fields import Field, Solid
 from harnack.fields.field import check_is_field
 from harnack.fields.solid_angles.dipole import DipolePotential
@@ -38,8 +39,9 @@ from harnack.meshing.sign_function import (
     is_meshed_by_signs,
     why_empty,
 )
-from harnack.meshing.solids import AngleMesher, ends_of_solid, mesh_solid, region_of
+from harnack.meshing.solids import AngleMesher, ends_of_solid, mesh_solid, region_of, two_numbers
 from harnack.meshing.spanned import spanned_surface
+from harnack.progress import teller
 from harnack.tracer import LevelSet
 
 if TYPE_CHECKING:
@@ -168,6 +170,10 @@ def mesh(
     check_volume(clip, "clip")
     check_volume(section, "section")
     check_options(tolerance, spacing, thickness, seed, max_triangles)
+    simplify, largest = flag(simplify, "simplify"), flag(largest, "largest")
+    report = teller(progress)
+    if solid is not None and not isinstance(solid, bool):
+        solid = two_numbers(solid)
     field = _checked(field)
     if solid is None and isinstance(field, Solid) and thickness is None:
         solid = True
@@ -176,7 +182,6 @@ def mesh(
     is_closed = bool(solid) or thickness is not None
     if simplify and not is_closed:
         raise ValueError("simplify is for closed meshes: give solid or thickness as well")
-    report = progress or _silent
     volume = _volume(field, clip, section)
     asked = _Asked(volume, tolerance, spacing, seed, max_triangles, report)
     if is_meshed_by_signs(field):
@@ -677,7 +682,3 @@ def _common_bounds(volume: Volume | None) -> tuple[FloatArray, FloatArray]:
     assert volume is not None
     lower, upper = (np.array(end, np.float64) for end in volume.bounds())
     return lower, upper
-
-
-def _silent(text: str) -> None:
-    """Reports nothing."""

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from harnack.backend.numbers import positive
+from harnack.backend.numbers import flag
 from harnack.fields.solid_angles.winding_number import WindingNumber
 from harnack.fields.solids.mesh_solid import MeshSolid
 from harnack.geometry import MeshError, validate_mesh, zero_area_faces
@@ -33,12 +33,15 @@ from harnack.meshing.checks import (
 )
 from harnack.meshing.clipping import Shells, largest_body, parts_of
 from harnack.meshing.edges import IntArray
+from harnack.meshing.finishing import check_options
 from harnack.meshing.given import Difference, Given
 from harnack.meshing.harmonic_patches import Asked, HarmonicPatches, harmonic_patches, open_edges
 from harnack.meshing.hole_patches import filled, hole_loops
 from harnack.meshing.lattice_surface import Surface
 from harnack.meshing.mesh import mesh as mesh_of
 from harnack.meshing.sound import Mended, joined, mended
+from harnack.names import is_one_of
+from harnack.progress import teller
 
 if TYPE_CHECKING:
     import trimesh
@@ -146,7 +149,8 @@ def repair(
             meet the mesh or each other; else if the surface w = 1/2 is empty or takes too many
             cells.
     """
-    asked = _checked_settings(keep, patches, tolerance, spacing, seed, progress or _silent)
+    largest = flag(largest, "largest")
+    asked = _checked_settings(keep, patches, tolerance, spacing, seed, teller(progress))
     _check_is_mesh(mesh)
     _check_encloses(mesh)
     given = Given.of(mesh, as_it_is=keep == "all")
@@ -197,16 +201,11 @@ def _checked_settings(
     seed: int,
     report: Callable[[str], None],
 ) -> _Asked:
-    if keep is not None and keep not in ("all", "sound", "none"):
+    if keep is not None and not is_one_of(keep, ("all", "sound", "none")):
         raise ValueError(f'keep is None, "all", "sound" or "none", not {keep!r}')
-    if patches not in ("smooth", "harmonic"):
+    if not is_one_of(patches, ("smooth", "harmonic")):
         raise ValueError(f'patches are "smooth" or "harmonic", not {patches!r}')
-    if not 0 < tolerance < 0.5:
-        raise ValueError(
-            f"tolerance is a part of the size: it must lie in (0, 0.5), not {tolerance}"
-        )
-    if spacing is not None:
-        spacing = positive(spacing, "spacing")
+    check_options(tolerance, spacing, None, seed, 1)
     return _Asked(keep, patches, tolerance, spacing, seed, report)
 
 
@@ -250,10 +249,6 @@ def _count_of(surface: Surface, whole: Surface, first: int) -> int:
     corners = [one.vertices[one.faces].reshape(-1, 9) for one in (surface, whole)]
     there = {row.tobytes() for row in corners[0]}
     return sum(row.tobytes() in there for row in corners[1][:first])
-
-
-def _silent(text: str) -> None:
-    """Reports nothing."""
 
 
 def _check_is_mesh(mesh: Any) -> None:

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 import numpy as np
 
 from harnack.backend import FloatArray
+from harnack.backend.numbers import finite
 from harnack.fields import Field, Solid
 from harnack.fields.solid_angles.solid_angle import SolidAngle
 from harnack.fields.solids.affine import AffineImage
@@ -504,7 +505,7 @@ def region_of(field: Field, solid: Any, level: float | None) -> tuple[Solid, flo
         TypeError: neither.
     """
     if solid is True and isinstance(field, Solid):
-        level = field.default_level if level is None else float(level)
+        level = field.default_level if level is None else finite(level, "level")
         return field, level
     low, high = ends_of_solid(field, solid, level)
     if low == -math.inf:
@@ -529,13 +530,23 @@ def ends_of_solid(field: Field, solid: Any, level: float | None) -> tuple[float,
         )
     if level is not None:
         raise ValueError("give either level or solid: the ends of a solid are its levels")
+    low, high = two_numbers(solid)
+    if not low < high or not (math.isfinite(low) or math.isfinite(high)):
+        raise ValueError(f"solid must be (low, high) with low < high, one finite, not {solid}")
+    field.check_levels(tuple(one for one in (low, high) if math.isfinite(one)))
+    return low, high
+
+
+def two_numbers(solid: Any) -> tuple[float, float]:
+    """(low, high), of whatever holds two numbers.
+
+    Raises:
+        TypeError: it does not.
+    """
     try:
         low, high = (float(one) for one in solid)
     except (TypeError, ValueError):
         raise TypeError(f"solid must be (low, high), two numbers, or True, not {solid!r}") from None
-    if not low < high or not (math.isfinite(low) or math.isfinite(high)):
-        raise ValueError(f"solid must be (low, high) with low < high, one finite, not {solid}")
-    field.check_levels(tuple(one for one in (low, high) if math.isfinite(one)))
     return low, high
 
 

@@ -57,7 +57,9 @@ class Camera:
     def __post_init__(self) -> None:
         for name in ("azimuth", "elevation", "fov", "zoom", "distance"):
             number = getattr(self, name)
-            if number is not None and (isinstance(number, bool | str) or not _is_number(number)):
+            if (number is not None or name == "zoom") and (
+                isinstance(number, bool | str) or not _is_number(number)
+            ):
                 raise TypeError(f"{name} of a camera must be a number, not {number!r}")
         if self.fov is not None and not 0 < self.fov < 170:
             raise ValueError(f"fov must lie between 0 and 170 degrees, not {self.fov}")

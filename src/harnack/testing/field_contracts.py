@@ -8,6 +8,8 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import FloatArray, choose_backend, to_numpy, to_vector3
+from harnack.backend.arrays import finite_vectors
+from harnack.backend.numbers import whole
 from harnack.enclosures import (
     Choice,
     Curvature,
@@ -19,7 +21,7 @@ from harnack.enclosures import (
 )
 from harnack.fields.analytic.riemann_surface import RiemannSurface
 from harnack.fields.batch import BatchedField
-from harnack.fields.field import Field
+from harnack.fields.field import Field, check_is_field
 from harnack.fields.look import Path
 from harnack.testing.branch_contracts import check_branch_points
 from harnack.testing.derivative_contracts import check_derivatives
@@ -33,6 +35,7 @@ from harnack.testing.worst_places import (
     require,
     search_worst_places,
 )
+from harnack.tracer import level_set
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -161,18 +164,24 @@ def check_field(
         ValueError: none of the points given lies in the field's domain.
         TypeError: `evaluate` returns something else than a `Sample`.
     """
+    check_is_field(field)
     generator = np.random.default_rng(rng)
+    count, directions = (
+        whole(one, name, 1, 2**31 - 1)
+        for one, name in ((count, "count"), (directions, "directions"))
+    )
+    points = None if points is None else finite_vectors(points, "points")
     if points is None:
         points = random_points(field, generator, count)
     elif field.domain is not None:
-        inside = field.domain.contains_points(np.asarray(points, dtype=np.float64))
+        inside = field.domain.contains_points(points)
         if not inside.any():
             raise ValueError(
                 f"points: all {len(points)} lie outside the domain {field.domain} of the field, "
                 "where it promises nothing; give points inside"
             )
-        points = np.asarray(points, dtype=np.float64)[inside]
-    levels = (field.default_level,) if levels is None else tuple(levels)
+        points = points[inside]
+    levels = level_set(field, levels).numbers
     look = look_at(field, points)
     _check_numbers(field, points, look)
     check_derivatives(field, points, look)

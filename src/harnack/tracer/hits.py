@@ -18,6 +18,7 @@ from harnack.backend.elementary import largest_coordinate, unit
 from harnack.backend.elementary import length as norm
 from harnack.backend.tensors import is_tensor, numbers_of, tensor_of, vectors_of
 from harnack.cluster.lazy import takes_blocks
+from harnack.names import is_one_of
 from harnack.tracer.all_hits import (
     AllHits,
     check_all_hits,
@@ -49,6 +50,8 @@ _TURN, _STRAY, _ASKED = 0.15, 0.7, 4096
 class Hits:
     """The ends of n rays, as NumPy arrays or, if the rays were Dr.Jit arrays or tensors, as these.
 
+    hit: (n,) mask of rays that hit. Rays that ran out of steps have a finite t as well, so that
+        `isfinite(t)` is no such mask.
     t: (n,) ray parameter of the hit, inf for a miss; for a ray that ran out of steps, how far
         it is proved free. A hit is within tolerance of the first root, mostly before it. One that
         is confirmed is at a root: between two samples with f on different sides of the level, where
@@ -224,7 +227,11 @@ def trace(
     given = [a for a in (origins, directions) if dr.is_array_v(type(a))]
     if given and precision is not None:
         raise ValueError("precision follows Dr.Jit rays; give it only with NumPy ones")
-    own = backend_of(given[0]) if given else choose_backend(precision or "single")
+    own = (
+        backend_of(given[0])
+        if given
+        else choose_backend("single" if precision is None else precision)
+    )
     o, d, near, far = _rays(own, origins, directions, t_min, t_max)
     n = max(dr.width(array) for array in (o, d, near, far))
     if min(dr.width(array) for array in (o, d, near, far)) == 0:
@@ -390,7 +397,7 @@ def _along(o: Vec3, d: Vec3, t: Real) -> Vec3:
 def _check_backend(
     backend: str, rays: tuple[Any, ...], precision: Precision | None, all_hits: int | None
 ) -> None:
-    if backend != "webgpu":
+    if not is_one_of(backend, ("webgpu",)):
         raise ValueError(
             f'backend is "webgpu", or nothing for the one that Dr.Jit has, not {backend!r}'
         )

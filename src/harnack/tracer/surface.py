@@ -13,7 +13,7 @@ import numpy as np
 
 from harnack.backend import backend_of, to_float
 from harnack.backend.arrays import as_data
-from harnack.backend.numbers import refuse_derivatives, whole
+from harnack.backend.numbers import flag, refuse_derivatives, whole
 from harnack.backend.tensors import is_tensor, numbers_of
 from harnack.enclosures import Choice, Proofs, TargetLevels, choose_proofs
 from harnack.fields.field import check_is_field
@@ -83,12 +83,28 @@ class LevelSet:
     )
 
     def __post_init__(self) -> None:
+        check_is_field(self.field)
+        if not isinstance(cast("Any", self.levels), tuple):
+            raise TypeError(
+                f"levels must be a tuple of numbers, not {self.levels!r:.60}; harnack.level_set "
+                "makes a LevelSet of one number, or of several"
+            )
+        for level in self.levels:
+            if not dr.is_array_v(type(level)):
+                _number(level)
+        if self.solid is not None:
+            _ends(self.solid)
+        if not isinstance(cast("Any", self.tolerance), Tolerance):
+            raise TypeError(f"tolerance must be a Tolerance, not {self.tolerance!r:.60}")
+        if not isinstance(cast("Any", self.bound), Proofs):
+            raise TypeError(
+                f"bound must be the Proofs that harnack.level_set makes, not {self.bound!r:.60}"
+            )
         object.__setattr__(self, "largest", checked_largest(self.largest))
         for name in ("clip", "section"):
             check_volume(getattr(self, name), name)
         object.__setattr__(self, "max_steps", whole(self.max_steps, "max_steps", 1, 2**31 - 1))
-        if not isinstance(cast("Any", self.confirm), bool | np.bool_):
-            raise TypeError(f"confirm must be True or False, not {self.confirm!r:.60}")
+        flag(self.confirm, "confirm")
         overstep = _as_number(self.overstep, "overstep must be a number in [1, 2)")
         if not 1 <= overstep < 2:
             raise ValueError(f"overstep must lie in [1, 2), not {self.overstep}")
@@ -297,13 +313,14 @@ def _as_levels(level: Any) -> tuple[Any, ...]:
         backend = backend_of(numbers)
         each = map(backend.UInt32, range(dr.width(numbers)))
         return tuple(dr.gather(backend.Float, numbers, k) for k in each)
-    if isinstance(level, Sequence) and not isinstance(level, str):
-        if not level:
-            raise ValueError("level: give at least one")
+    is_row = isinstance(level, np.ndarray) and np.ndim(cast("Any", level)) == 1
+    if is_row or (isinstance(level, Sequence) and not isinstance(level, str)):
         several: list[Any] = [*level]
+        if not several:
+            raise ValueError("level: give at least one")
         parts = [_as_levels(one) if is_tensor(one) else (one,) for one in several]
         return tuple(one for part in parts for one in part)
-    return (level,)
+    return (cast("Any", level),)
 
 
 def _ends(solid: Any) -> tuple[float, float]:

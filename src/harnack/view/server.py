@@ -257,7 +257,10 @@ class _Server:
         if wrong:
             return web.Response(status=403, text=wrong)
         socket = web.WebSocketResponse(max_msg_size=_LONGEST, heartbeat=30.0)
-        await socket.prepare(request)
+        try:
+            await socket.prepare(request)
+        except ConnectionError:  # the page was closed before it was answered
+            return web.Response()
         client, waiting = Client(self.live), set[asyncio.Task[None]]()
         self.clients.add(client)
         try:

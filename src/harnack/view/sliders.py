@@ -42,7 +42,7 @@ class Slider:
 
     def __post_init__(self) -> None:
         for name in ("low", "high", "start", "step"):
-            if getattr(self, name) is not None:
+            if name in ("low", "high") or getattr(self, name) is not None:
                 object.__setattr__(self, name, finite(getattr(self, name), name))
         if not self.low < self.high:
             raise ValueError(f"a slider goes from low to high, not from {self.low} to {self.high}")

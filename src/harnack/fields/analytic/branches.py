@@ -12,7 +12,7 @@ import drjit as dr
 
 from harnack.backend import backend_of
 from harnack.backend.elementary import fmax, fmin, sincos
-from harnack.backend.numbers import refuse_derivatives
+from harnack.backend.numbers import real, refuse_derivatives
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -71,10 +71,10 @@ class BranchPoint:
         refuse_derivatives("a BranchPoint", vars(self))
         object.__setattr__(self, "at", _finite(self.at, "the place of a branch point"))
         object.__setattr__(self, "value", _finite(self.value, "the value at a branch point"))
-        if self.power is None:
-            return
         for name in ("power", "constant", "radius"):
-            number = float(getattr(self, name))
+            if name == "power" and self.power is None:
+                continue
+            number = real(getattr(self, name), f"the {name} of a branch point")
             if not number > 0 or (name != "radius" and number == math.inf):
                 raise ValueError(f"the {name} of a branch point must be positive, not {number!r}")
             object.__setattr__(self, name, number)

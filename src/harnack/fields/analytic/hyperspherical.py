@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, cast
 import drjit as dr
 
 from harnack.backend.elementary import fmax, fmin
+from harnack.backend.numbers import integer
 from harnack.enclosures import Curvature, Lipschitz, Slopes
 from harnack.enclosures.parabola import Arc, Parabola
 from harnack.enclosures.pieces import Pieces
@@ -33,6 +34,7 @@ from harnack.fields.analytic.sphere_bounds import (
 )
 from harnack.fields.field import Field, check_in_range
 from harnack.fields.look import Look, Path, Sample
+from harnack.geometry.volume import check_volume
 from harnack.geometry.volumes import Ball
 
 if TYPE_CHECKING:
@@ -129,7 +131,8 @@ class HypersphericalHarmonic(Field):
     is_entire = True
 
     def __init__(self, l: int, j: int, m: int, *, domain: Volume | None = None) -> None:  # noqa: E741
-        l, j, m = operator.index(l), operator.index(j), operator.index(m)  # noqa: E741
+        l, j, m = integer(l, "the degree l"), integer(j, "j"), integer(m, "the order m")  # noqa: E741
+        check_volume(domain, "domain")
         if not 0 <= l <= LARGEST_DEGREE:
             raise ValueError(f"the degree l must be 0 to {LARGEST_DEGREE}, not {l}")
         if not 0 <= j <= l:

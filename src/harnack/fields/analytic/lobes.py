@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 import drjit as dr
 
 from harnack.backend.elementary import fmax, fmin, length
-from harnack.backend.numbers import finite, positive
+from harnack.backend.numbers import finite, integer, positive
 from harnack.enclosures import Curvature, Slopes
 from harnack.enclosures.parabola import Parabola
 from harnack.fields.analytic.rounding import HarmonicRounding
@@ -24,6 +24,7 @@ from harnack.fields.analytic.sphere_bounds import BallRange, range_of_harmonic
 from harnack.fields.field import Field, Sample
 from harnack.fields.look import Look, lengthened
 from harnack.geometry.volumes import Ball
+from harnack.names import is_one_of
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
@@ -82,7 +83,7 @@ class Lobes(Field):
     overstep = 1.6
 
     def __init__(self, l: int, m: int, *, scale: float = 1.0, part: Part = "both") -> None:  # noqa: E741
-        self._fill({(l, m): 1.0}, scale, part)
+        self._fill({(integer(l, "l"), integer(m, "m")): 1.0}, scale, part)
 
     @classmethod
     def combined(
@@ -96,7 +97,7 @@ class Lobes(Field):
     def _fill(self, weights: Any, scale: Any, part: Part) -> None:
         self.weights = _checked(weights)
         scale = positive(scale, "the scale of lobes")
-        if part not in _PARTS:
+        if not is_one_of(part, _PARTS):
             raise ValueError(f"part must be one of {', '.join(_PARTS)}, not {part!r}")
         self.scale, self.part = scale, part
         self._s: Any = self.scale

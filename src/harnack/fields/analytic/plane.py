@@ -39,6 +39,7 @@ from harnack.fields.analytic.branches import (
 from harnack.fields.field import Field
 from harnack.fields.formula import Formula, as_jet, probe, warn_of_price
 from harnack.fields.look import Sample
+from harnack.geometry.volume import check_volume
 from harnack.geometry.volumes import Box, Intersection
 from harnack.names import did_you_mean
 
@@ -352,6 +353,7 @@ class HeightField(Formula):
     def __post_init__(self) -> None:
         if not callable(self.function):
             raise TypeError(f"function must be callable with x, y, not {self.function!r}")
+        check_volume(self.domain, "domain")
         if self.domain is None or not np.isfinite(self.domain.bounds()).all():
             raise ValueError(
                 "a height field needs a bounded domain, such as harnack.Ball() or "

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend.elementary import sincos
-from harnack.backend.numbers import refuses_derivatives
+from harnack.backend.numbers import finite, refuse_derivatives, refuses_derivatives, triple
 
 if TYPE_CHECKING:
     from harnack.backend import Real, Vec3
@@ -33,8 +33,9 @@ class Factor:
     is_cosine: bool
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.frequency) and math.isfinite(self.phase)):
-            raise ValueError(f"a factor needs finite numbers, not {self.frequency}, {self.phase}")
+        refuse_derivatives("a factor of a wave", vars(self))
+        for name in ("frequency", "phase"):
+            object.__setattr__(self, name, finite(getattr(self, name), f"the {name} of a factor"))
         if self.frequency == 0:
             raise ValueError("a factor of frequency 0 is a constant: multiply the amplitude by it")
 
@@ -42,13 +43,13 @@ class Factor:
 @refuses_derivatives
 def sine(frequency: float = 1.0, phase: float = 0.0) -> Factor:
     """sin(frequency * coordinate + phase); frequency in radians per unit length."""
-    return Factor(float(frequency), float(phase), False)
+    return Factor(frequency, phase, False)
 
 
 @refuses_derivatives
 def cosine(frequency: float = 1.0, phase: float = 0.0) -> Factor:
     """cos(frequency * coordinate + phase); frequency in radians per unit length."""
-    return Factor(float(frequency), float(phase), True)
+    return Factor(frequency, phase, True)
 
 
 @dataclass(frozen=True)
@@ -64,6 +65,16 @@ class Product:
     y: Factor | None = None
     z: Factor | None = None
 
+    def __post_init__(self) -> None:
+        refuse_derivatives("a Product", vars(self))
+        finite(self.amplitude, "the amplitude of a product")
+        for name in "xyz":
+            factor = getattr(self, name)
+            if factor is not None and not isinstance(factor, Factor):
+                raise TypeError(
+                    f"{name} of a product is made by sine or cosine, not {factor!r:.60}"
+                )
+
     @property
     def factors(self) -> tuple[tuple[int, Factor], ...]:
         """(axis, factor) of each coordinate that enters."""
@@ -78,6 +89,13 @@ class PlaneWave:
     amplitude: float
     wave_vector: tuple[float, float, float]
     phase: float = 0.0
+
+    def __post_init__(self) -> None:
+        refuse_derivatives("a PlaneWave", vars(self))
+        finite(self.amplitude, "the amplitude of a plane wave")
+        finite(self.phase, "the phase of a plane wave")
+        vector = triple(self.wave_vector, "the wave vector")
+        object.__setattr__(self, "wave_vector", vector)
 
 
 Term = Product | PlaneWave

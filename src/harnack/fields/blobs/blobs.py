@@ -376,7 +376,7 @@ def _checked(
     w = np.ones(len(c)) if weights is None else _numbers(weights, "weights", len(c))
     if groups is None:
         return c, r, w, None
-    g = np.asarray(groups)
+    g = real_array(groups, "groups", BlobError)
     if g.shape != (len(c),) or g.dtype.kind not in "iu":
         raise BlobError(
             f"groups must be {len(c)} integers, one for each blob, not {g.dtype} of shape {g.shape}"

@@ -22,6 +22,7 @@ from harnack.fields.blobs.sums import PIECES, Along, BlobValue, Knots, State, ov
 from harnack.fields.formula import Formula, is_jet
 from harnack.fields.look import Look, Path, Sample
 from harnack.geometry import Box
+from harnack.geometry.volume import check_volume
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -54,6 +55,7 @@ class HRBF(Formula):
     default_level: float = 0.0
 
     def __init__(self, points: Any, normals: Any, *, domain: Volume | None = None) -> None:
+        check_volume(domain, "domain")
         self.points, self.normals = _checked(points, normals)
         self.factors, self.vectors = _solved(self.points, self.normals)
         low, high = self.points.min(axis=0), self.points.max(axis=0)

@@ -25,6 +25,7 @@ import numpy as np
 from harnack.arithmetic import Function, Interval
 from harnack.arithmetic.interval import unit_of
 from harnack.backend.elementary import fmax, fmin
+from harnack.backend.numbers import real
 from harnack.names import did_you_mean
 
 if TYPE_CHECKING:
@@ -336,9 +337,9 @@ class Gaussian(Kernel):
     name = "gaussian"
 
     def __post_init__(self) -> None:
-        if not 0 < self.sharpness <= 12:
+        if not 0 < real(self.sharpness, "sharpness") <= 12:
             raise ValueError(f"sharpness must be in (0, 12], not {self.sharpness!r}")
-        if not 1e-6 <= self.tail <= 0.5:
+        if not 1e-6 <= real(self.tail, "tail") <= 0.5:
             raise ValueError(
                 f"tail must lie between 1e-6 and 0.5, not {self.tail!r}: it is what is left of a "
                 "Gaussian where the blob ends"
@@ -445,7 +446,7 @@ def choose_kernel(kernel: str | Kernel) -> Kernel:
 
 
 def _check_support(support: float) -> None:
-    if not 1.0 < support <= 100.0:
+    if not 1.0 < real(support, "support") <= 100.0:
         raise ValueError(
             f"support must lie between 1 and 100, not {support!r}: it is where a blob ends, in "
             "parts of its radius"

@@ -17,7 +17,7 @@ import numpy as np
 
 from harnack.backend import backend_of
 from harnack.backend.elementary import fmax
-from harnack.backend.numbers import positive, refuses_derivatives
+from harnack.backend.numbers import positive, real, refuses_derivatives
 from harnack.fields.batch import SymmetricSum, Values, sharpened
 from harnack.fields.clearance import DetailedField, UnitCoordinates, epsilon_at, placed, single
 from harnack.fields.field import Sample, lengthened
@@ -274,7 +274,7 @@ class DipolePotential(OrientedPoints, HasCells, DetailedField["_DipoleBuffers"])
                 "normals are missing, and without them inside and outside are not known: give "
                 'them, or normals="estimate" to estimate them from neighboring points'
             )
-        if accuracy is not None and not 1.5 <= accuracy <= 100:
+        if accuracy is not None and not 1.5 <= real(accuracy, "accuracy") <= 100:
             raise ValueError(f"accuracy must lie between 1.5 and 100, not {accuracy}")
         self.estimated = [isinstance(normals, str), areas is None]
         if isinstance(normals, str) and normals != "estimate":
@@ -284,7 +284,7 @@ class DipolePotential(OrientedPoints, HasCells, DetailedField["_DipoleBuffers"])
             points, normals, smoothing = self._fitted(points, normals, areas, smoothing)
         if isinstance(normals, str):
             normals = estimate_normals(points)
-        some = np.ones(len(points)) if areas is None else areas
+        some = 1.0 if areas is None else areas
         points, normals, some = validate_cloud(points, normals, some)
         self._keep(points, normals, estimate_areas(points, normals) if areas is None else some)
         self.accuracy = accuracy
@@ -294,7 +294,9 @@ class DipolePotential(OrientedPoints, HasCells, DetailedField["_DipoleBuffers"])
         extent = max(0.5 * float((high - low).max()), math.sqrt(float(self.areas.sum())) / 4)
         self._size = 2.0 ** math.ceil(math.log2(extent))
         self._given_hierarchy: Hierarchy | None = None
-        self.smoothing = 0.0 if smoothing == 0 else positive(smoothing, "smoothing")
+        self.smoothing = (
+            0.0 if real(smoothing, "smoothing") == 0 else positive(smoothing, "smoothing")
+        )
         if self.smoothing and self.cells:
             raise ValueError("cells are of sums without smoothing: give one of the two")
         if self.smoothing:

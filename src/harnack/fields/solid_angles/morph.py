@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from harnack.backend import FloatArray, IntArray
-from harnack.backend.numbers import positive
+from harnack.backend.numbers import positive, real
 from harnack.fields.batch import BatchedField, Values
 from harnack.fields.field import Field, Sample
 from harnack.fields.solid_angles.morph_slice import MorphSlice
@@ -73,11 +73,11 @@ class Morph(BatchedField):
         accuracy: float = 6.0,
     ) -> None:
         gap = positive(gap, "gap")
-        if not 0 <= w <= gap:
+        if not 0 <= real(w, "w") <= gap:
             raise ValueError(f"w must lie between 0 and the gap {gap!r}, not {w!r}")
-        if not 0 < spacing <= 2:
+        if not 0 < real(spacing, "spacing") <= 2:
             raise ValueError(f"spacing must be above 0 and at most 2, not {spacing!r}")
-        if not 2 <= accuracy <= 100:
+        if not 2 <= real(accuracy, "accuracy") <= 100:
             raise ValueError(f"accuracy must lie between 2 and 100, not {accuracy!r}")
         self.w, self.gap = float(w), float(gap)
         meshes = [_checked(mesh_a, "mesh_a"), _checked(mesh_b, "mesh_b")]

@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from harnack.backend import FloatArray, IntArray, backend_of
 from harnack.backend.elementary import fmax
-from harnack.backend.numbers import refuses_derivatives
+from harnack.backend.numbers import real, refuses_derivatives, whole
 from harnack.cluster.packing import Remembered
 from harnack.enclosures import Lipschitz
 from harnack.fields.batch import BatchedField, Values
@@ -43,7 +43,7 @@ from harnack.fields.solid_angles.winding_mesh import WindingMesh
 from harnack.fields.solid_angles.winding_rates import BoundaryRates, with_rates
 from harnack.fields.solid_angles.winding_tree import TreeWinding
 from harnack.geometry import Box
-from harnack.names import did_you_mean
+from harnack.names import did_you_mean, is_one_of
 from harnack.tree.nearest import distance_to_triangles, jumps_within, nearest_triangle
 from harnack.tree.triangles import Frame, TriangleRays
 
@@ -241,13 +241,12 @@ class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
         cells: bool | float | None = None,
     ) -> None:
         super().__init__()
-        if method not in ("auto", "exact", "tree"):
+        if not is_one_of(method, ("auto", "exact", "tree")):
             hint = did_you_mean(method, ("auto", "exact", "tree"))
             raise ValueError(f'method is "auto", "exact" or "tree", not {method!r}{hint}')
-        if accuracy is not None and not 1.5 <= accuracy <= 100:
+        if accuracy is not None and not 1.5 <= real(accuracy, "accuracy") <= 100:
             raise ValueError(f"accuracy must lie between 1.5 and 100, not {accuracy}")
-        if order not in (0, 1, 2):
-            raise ValueError(f"order must be 0, 1 or 2, not {order}")
+        order = whole(order, "order", 0, 2)
         self._mesh = WindingMesh.of(vertices, faces)
         few = len(self.mesh.singular) <= _MOST_EDGES
         self.method: Literal["exact", "tree"] = (

@@ -19,6 +19,7 @@ from harnack.backend.numbers import finite, positive, whole
 from harnack.enclosures import Curvature, Lipschitz
 from harnack.fields.formula import Formula, is_jet, prepared_numbers
 from harnack.fields.solids.solid import Shape
+from harnack.names import is_one_of
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
@@ -154,7 +155,7 @@ class FractalNoise(Shape):
     def __post_init__(self) -> None:
         object.__setattr__(self, "octaves", whole(self.octaves, "octaves", 1, 24))
         object.__setattr__(self, "seed", whole(self.seed, "the seed", 0, 2**32 - 1))
-        if self.fade not in CONSTANTS:
+        if not is_one_of(self.fade, CONSTANTS):
             raise ValueError(f'the fade must be "quintic" or "cubic", not {self.fade!r}')
         object.__setattr__(self, "beta", finite(self.beta, "beta of noise"))
         for name in ("frequency", "amplitude"):

@@ -17,6 +17,7 @@ from harnack.backend.elementary import clamp, fmax, fmin
 from harnack.backend.numbers import (
     check_finite,
     finite,
+    flag,
     positive,
     real_array,
     refuses_derivatives,
@@ -286,6 +287,8 @@ def thread(
     diameter, pitch = _sizes(name)
     length = positive(length, "the length of a thread")
     clearance = finite(clearance, "the clearance of a thread")
+    internal = flag(internal, "internal")
+    left_handed = flag(left_handed, "left_handed")
     if not 0 <= clearance <= _MOST_CLEARANCE * pitch:
         raise ValueError(
             f"the clearance of {name} must be from 0 to {_MOST_CLEARANCE * pitch:g}, a tenth of "

@@ -14,7 +14,15 @@ import numpy.typing as npt
 
 from harnack.backend import FloatArray, IntArray, backend_of
 from harnack.backend.elementary import clamp, fmax, fmin, largest_coordinate
-from harnack.backend.numbers import check_finite, check_size, check_vectors, positive, real_array
+from harnack.backend.numbers import (
+    check_finite,
+    check_size,
+    check_vectors,
+    positive,
+    real,
+    real_array,
+    whole,
+)
 from harnack.backend.records import Records
 from harnack.enclosures import Curvature, Enclosure, Gaps, Lipschitz, Promise
 from harnack.enclosures.pieces import Pieces
@@ -69,7 +77,12 @@ class Tube(Solid):
         check_finite(points, "point {} of a tube", ValueError)
         check_size(points, ValueError)
         parts: list[FloatArray] = []
-        for part in np.split(points, self.starts):
+        if not isinstance(cast("Any", self.starts), tuple | list | np.ndarray):
+            raise TypeError(f"starts must be indices of vertices, not {self.starts!r:.60}")
+        starts = [whole(one, "each start", 0, len(points)) for one in self.starts]
+        if not 0 <= real(self.flattening, "flattening") < math.inf:
+            raise ValueError(f"flattening must be a length, not {self.flattening!r}")
+        for part in np.split(points, starts):
             if len(part):
                 moves = np.any(part[1:] != part[:-1], axis=1)
                 part = part[np.concatenate([[True], moves])]
