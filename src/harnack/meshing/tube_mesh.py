@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from harnack.backend import FloatArray
+from harnack.backend import FloatArray, IntArray
 from harnack.fields.solids.tube import Tube
 from harnack.meshing.checks import MeshingError, intersecting_faces
 from harnack.meshing.closed_mesh import manifold_of
@@ -24,8 +24,8 @@ __all__ = ["tube_manifold"]
 _MOST_VERTICES = 4_000_000
 # Of the tolerance, by which polylines may be off.
 _LEFT_OUT = 0.25
-# The least number of points around, and the most: of wires far thinner than the tolerance too.
-_LEAST_AROUND, _MOST_AROUND = 8, 2000
+# Points around, of wires far thinner than the tolerance too.
+_LEAST_AROUND = 8
 # An edge leads back where the cosine of its turn is less than this above -1.
 _BACK = 1e-9
 
@@ -35,9 +35,9 @@ def tube_manifold(tube: Tube, level: float, tolerance: float) -> Manifold:
     faces within `tolerance` of it.
 
     Vertices of a polyline within a quarter of the tolerance of a shorter one are left out. Each is
-    swept as a whole. Where its mesh would pass through itself, as at corners too
-    sharp for the radius or where the tube comes back to itself, it is cut in two at a vertex, where
-    both parts end with a ball: the tube is the union of theirs.
+    swept as a whole. Where its mesh would pass through itself, as at corners too sharp for the
+    radius or where the tube comes back to itself, it is cut in two at a vertex, where both parts
+    end with a ball: the tube is the union of theirs.
 
     Proof of the tolerance, with the angle a = 2 pi/n between points around. Distances from two
     polylines differ by no more than these do. Faces between lines along an edge have chords of
@@ -54,19 +54,23 @@ def tube_manifold(tube: Tube, level: float, tolerance: float) -> Manifold:
     if radius <= 0:
         return Manifold()
     step = math.sqrt(3 * tolerance / radius)
-    around = min(max(_LEAST_AROUND, math.ceil(2 * math.pi / step)), _MOST_AROUND)
+    around = max(_LEAST_AROUND, math.ceil(2 * math.pi / step))
     waiting = [_simpler(one, _LEFT_OUT * tolerance) for one in np.split(tube.points, tube.starts)]
-    count = around * sum(map(len, waiting))
-    if count > _MOST_VERTICES:
-        raise MeshingError(
-            f"a tube within {tolerance:.3g} has {2 * count:,} faces: choose a larger `tolerance`"
-        )
     parts: list[Manifold] = []
+    vertices = 0
     while waiting:
+        # Rings of a half ball at both ends, and one at least at each vertex between.
+        least = around * sum(len(one) + around // 2 for one in waiting)
+        if vertices + least > _MOST_VERTICES:
+            raise MeshingError(
+                f"a tube within {tolerance:.3g} has more than {2 * (vertices + least):,} faces: "
+                "choose a larger `tolerance`"
+            )
         points = waiting.pop()
         swept = _Sweep(radius, around, points).surface()
         if swept is not None and (len(points) == 2 or _is_apart(swept)):
             parts.append(manifold_of(swept))
+            vertices += len(swept.vertices)
         else:
             middle = len(points) // 2
             waiting += [points[: middle + 1], points[middle:]]
@@ -111,7 +115,8 @@ class _Sweep:
         """Rings of points one after the other; None where a line along an edge would end before it
         begins."""
         points, sides = self.points, np.diff(self.points, axis=0)
-        ways = sides / lengths(sides)[:, None]
+        ways = sides / np.abs(sides).max(axis=1)[:, None]  # squares of small ones underflow
+        ways /= lengths(ways)[:, None]
         is_closed = len(ways) > 2 and bool((points[0] == points[-1]).all())
         swung = self._transported(ways, is_closed=is_closed)
         if swung is None:
@@ -177,14 +182,14 @@ class _Sweep:
         above = (row + 1) % count * n
         a, b = row * n + column, row * n + (column + 1) % n
         c, d = above + (column + moved + 1) % n, above + (column + moved) % n
-        place = np.arange(count * n).reshape(count, n)
+        place: IntArray = np.arange(count * n).reshape(count, n)
         for k in range(1, count):
             same = (rings[k] == rings[k - 1]).all(axis=1)
             place[k, same] = place[k - 1, same]
         if shift is None:
             place[[0, -1]] = place[[0, -1], :1]
-        faces = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
-        faces = place.ravel()[faces]
+        corners = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
+        faces: IntArray = place.ravel()[corners]
         kept = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
         return Surface.of(rings.reshape(-1, 3), faces[kept])
 
