@@ -404,8 +404,20 @@ def test_holes_that_share_a_corner_are_told_apart() -> None:
 def test_numbers_that_are_none_are_refused_anyway() -> None:
     with pytest.raises(MeshError, match="finite"):
         hk.repair(not_a_number())
-    with pytest.raises(hk.MeshingError, match="empty"):
-        hk.repair(inside_out(), keep="none")
+    with pytest.raises(MeshError, match=r"open sheet: .* have nothing inside"):
+        hk.repair(wavy_sheet(), keep="none")
+
+
+def wavy_sheet() -> trimesh.Trimesh:
+    """Half of it bulges to one side of what spans its rim, and half to the other."""
+    u = np.linspace(0, 1, 20)
+    x, y = (one.ravel() for one in np.meshgrid(u, u, indexing="ij"))
+    vertices = np.column_stack([x, y, 0.1 * np.sin(2 * np.pi * x) * np.cos(2 * np.pi * y)])
+    k = np.arange(400).reshape(20, 20)
+    a, b, c, d = (one.ravel() for one in (k[:-1, :-1], k[1:, :-1], k[1:, 1:], k[:-1, 1:]))
+    faces = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
+    middle = vertices[faces].mean(axis=1)[:, :2] - 0.5
+    return trimesh.Trimesh(vertices, faces[np.hypot(*middle.T) > 0.15], process=False)
 
 
 def inside_out() -> trimesh.Trimesh:

@@ -9,7 +9,7 @@ import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
 from harnack.geometry import MeshError
-from harnack.meshing.checks import CrossingError, check_manifold, intersecting_faces
+from harnack.meshing.checks import check_manifold, intersecting_faces
 from harnack.meshing.clipping import winding_around
 from harnack.meshing.closed_mesh import manifold_of
 from harnack.meshing.edges import Edges, IntArray, crosses, directed_edges, dots, lengths
@@ -157,25 +157,19 @@ def united_parts(x: FloatArray, faces: IntArray, parts: list[IntArray], within: 
         MeshingError: a part is no manifold; or nothing is left.
     """
     shells = [Surface.of(x, faces[rows]) for rows in parts]
-    try:
-        return _united(shells, within)
-    except CrossingError:
-        moved = _overlapping(shells)
-        if moved is None:
-            raise
-    return _united(moved, within)
+    return _united(_overlapping(shells), within)
 
 
-def _overlapping(shells: list[Surface]) -> list[Surface] | None:
+def _overlapping(shells: list[Surface]) -> list[Surface]:
     """Parts whose faces that lie on those of an earlier one, but for rounding, are moved into it by
     next to nothing: where they are in one plane, but not to the last bit, gaps without a width
-    would be left. None if there are no such faces."""
+    would be left."""
     corners = [one.vertices[one.faces] for one in shells]
     size = float(np.ptp(np.concatenate(corners), axis=(0, 1)).max())
     planes = [_unit_normals(one) for one in corners]
     lows = [one.min(axis=1) - _ON * size for one in corners]
     highs = [one.max(axis=1) + _ON * size for one in corners]
-    moved, has_moved = [shells[0]], False
+    moved = [shells[0]]
     for k in range(1, len(shells)):
         x, faces = shells[k].vertices.copy(), shells[k].faces
         for j in range(k):
@@ -187,11 +181,11 @@ def _overlapping(shells: list[Surface]) -> list[Surface] | None:
                 is_met = (lows[j][on] <= highs[k][face]) & (highs[j][on] >= lows[k][face])
                 on = on[is_met.all(axis=1)]
                 height = np.abs((corners[j][on] - corners[k][face, 0]) @ normal)
-                if (height.max(axis=1, initial=0.0) <= _ON * size).any():
+                height = height.max(axis=1, initial=0.0)
+                if ((height > 0) & (height <= _ON * size)).any():
                     x[faces[face]] = shells[k].vertices[faces[face]] + _INTO * size * normal
-                    has_moved = True
         moved.append(Surface(x, faces))
-    return moved if has_moved else None
+    return moved
 
 
 def _unit_normals(corner: FloatArray) -> FloatArray:

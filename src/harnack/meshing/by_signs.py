@@ -30,7 +30,7 @@ from harnack.meshing.checks import (
     far_from_level,
     intersecting_faces,
 )
-from harnack.meshing.closed_mesh import manifold_of, surface_of
+from harnack.meshing.closed_mesh import manifold_of, surface_of, without_short_edges
 from harnack.meshing.edges import (
     Edges,
     IntArray,
@@ -295,7 +295,7 @@ def _without_slivers(
     x, faces = marched.vertices, marched.faces
     if len(boundary_edges(faces)):
         return x, faces, marched.normals, False
-    simpler = surface_of(manifold_of(Surface(x, faces)).simplify(tolerance))
+    simpler = surface_of(without_short_edges(manifold_of(Surface(x, faces)), tolerance))
     away, place = searching.cKDTree(x).query(simpler.vertices)
     if not len(simpler.faces) or away.any():
         return x, faces, marched.normals, False

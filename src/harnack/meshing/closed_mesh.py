@@ -37,6 +37,7 @@ __all__ = [
     "revolved_manifold",
     "surface_of",
     "volume_manifold",
+    "without_short_edges",
 ]
 
 _MOST_SEGMENTS = 2000
@@ -112,6 +113,15 @@ def _grown(part: Manifold, length: float) -> Manifold:
         np.minimum.at(slant, made.faces[:, k], dots(way[made.faces[:, k]], mesh.face_normals))
     away = way * (length / np.maximum(slant, _LEAST_SLANT))[:, None]
     return manifold_of(Surface(made.vertices + away, made.faces))
+
+
+def without_short_edges(solid: Manifold, length: float) -> Manifold:
+    """A solid with short edges and slivers left out that move its surface by up to a length; or as
+    it is, if its volume changed by more than that explains: where slivers are as thin as rounding,
+    manifold3d has been seen to lose a part."""
+    made = solid.simplify(length)
+    most = 2 * length * solid.surface_area()
+    return made if abs(made.volume() - solid.volume()) <= most else solid
 
 
 def surface_of(manifold: Manifold) -> Surface:
@@ -349,7 +359,7 @@ def _snapped(mesh: trimesh.Trimesh, step: float) -> trimesh.Trimesh:
 def _simpler(given: Surface, step: float) -> Surface | None:
     """Without slivers, simplified by manifold3d; None if that does not help either."""
     for steps in _SIMPLER:
-        simpler = surface_of(manifold_of(given).simplify(steps * step))
+        simpler = surface_of(without_short_edges(manifold_of(given), steps * step))
         x, faces, kept = _contracted(simpler, step)
         if not kept.any():
             return None

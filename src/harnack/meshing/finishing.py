@@ -10,7 +10,7 @@ import numpy as np
 from harnack.backend import FloatArray
 from harnack.backend.numbers import real, whole
 from harnack.meshing.checks import MeshingError, euler_characteristic, intersecting_faces
-from harnack.meshing.closed_mesh import manifold_of, surface_of
+from harnack.meshing.closed_mesh import manifold_of, surface_of, without_short_edges
 from harnack.meshing.edges import (
     Edges,
     IntArray,
@@ -208,7 +208,7 @@ def simplified(
     facts = {"triangles_before_simplification": len(surface.faces)}
     solid = manifold_of(surface)
     for part in _SIMPLER:
-        made = surface_of(solid.simplify(part * tolerance))
+        made = surface_of(without_short_edges(solid, part * tolerance))
         if not 0 < len(made.faces) < len(surface.faces):
             continue
         try:

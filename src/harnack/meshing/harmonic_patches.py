@@ -26,6 +26,7 @@ from harnack.meshing.checks import (
     TooLargeError,
     check_manifold,
     intersecting_faces,
+    may_help_again,
     singular_vertices,
 )
 from harnack.meshing.edges import Edges, IntArray, crosses, directed_edges
@@ -129,7 +130,7 @@ def _spanning(
     cell = size / _ACROSS if asked.spacing is None else float(asked.spacing)
     report, tolerance = asked.report, asked.tolerance * size
     finer: tuple[Places, ...] = ()
-    times_met, seed = 0, asked.seed
+    times_met, seed, before = 0, asked.seed, None
     for attempt in range(asked.attempts):
         last = attempt == asked.attempts - 1
         report(f"cells of {cell:.3g}" + ", smaller in places" * bool(finer))
@@ -140,7 +141,8 @@ def _spanning(
             _check(vertices, faces, patches, report)
         except LocalError as error:
             times_met += isinstance(error, _MetError)
-            if last or times_met > _MOST_MET:
+            is_hopeless, before = not may_help_again(error, before), error
+            if last or is_hopeless or times_met > _MOST_MET:
                 place = ", ".join(f"{c:.4g}" for c in error.places[0])
                 raise MeshingError(
                     f"{error} (cells were {cell:.3g} wide, and smaller in {len(error.places)} "

@@ -50,6 +50,7 @@ from harnack.meshing.closed_mesh import (
     revolved_manifold,
     surface_of,
     volume_manifold,
+    without_short_edges,
 )
 from harnack.meshing.common_parts import common_parts_taken_out, flat, without_cut_parts
 from harnack.meshing.lattice import Lattice
@@ -362,7 +363,7 @@ class RegionMesher:
         whole = manifold_of(made)
         self.levels += 1
         for share in _JOINED_WITHIN:
-            joined = surface_of(whole.simplify(share * self.tolerance))
+            joined = surface_of(without_short_edges(whole, share * self.tolerance))
             joined = cut_where_far(function, joined, _FAR_OFF * self.tolerance, _TIMES_CUT)
             try:
                 made = made_apart(joined, _MENDED_WITHIN * self.tolerance)
@@ -677,7 +678,7 @@ class _Joined:
     def without_slivers(self, length: float) -> Surface:
         """The surface, short edges and slivers left out within a length, and bodies that are
         nothing but rounding."""
-        made = self.whole.simplify(length) if length > 0 else self.whole
+        made = without_short_edges(self.whole, length) if length > 0 else self.whole
         surface = without_films(surface_of(made))
         return surface if self.volume is None else _on_box(surface, self.volume)
 

@@ -1,0 +1,261 @@
+"""Whether what `repair` returns is the solid that was given: by sums of solid angles."""
+
+from __future__ import annotations
+
+import itertools
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+
+import harnack as hk
+from harnack.geometry.mesh_shapes import icosphere
+from harnack.meshing.bodies import closed_parts
+from harnack.meshing.given import Given
+from harnack.meshing.lattice_surface import Surface
+from tests.oracles.direct_sums import winding_sum
+from tests.oracles.triangle_pairs import intersecting_pairs
+
+CREATE: Any = trimesh.creation
+
+
+def box(sides: Sequence[float], center: Sequence[float] = (0, 0, 0)) -> trimesh.Trimesh:
+    made = CREATE.box(sides)
+    made.apply_translation(center)
+    return made
+
+
+def together(*parts: trimesh.Trimesh) -> trimesh.Trimesh:
+    return trimesh.util.concatenate(list(parts))
+
+
+def inverted(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    mesh = mesh.copy()
+    mesh.invert()
+    return mesh
+
+
+def repaired(given: trimesh.Trimesh, **options: Any) -> trimesh.Trimesh:
+    """The result, of which nothing is wrong that it does not tell."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message=".*not quite the solid")
+        made = hk.repair(given, **options)
+    assert made.metadata["harnack"]["differs"] is None
+    assert made.is_watertight
+    return made
+
+
+def check_is(made: trimesh.Trimesh, winding: Any, bounds: Any, count: int = 1500) -> None:
+    """The inside is where a winding number is above 1/2, but for where that is in doubt."""
+    low, high = bounds
+    margin = 0.03 * (high - low)
+    points = np.random.default_rng(7).uniform(low - margin, high + margin, (count, 3))
+    w, inside = winding(points), winding_sum(made.triangles)(points) > 0.5
+    assert not (inside & (w < 0.14)).any()
+    assert not (~inside & (w > 0.86)).any()
+
+
+# Literal cases, with their volumes.
+
+
+@pytest.mark.parametrize("is_whole", [True, False])
+def test_a_cube_with_a_cavity_that_is_inside_out(is_whole: bool) -> None:
+    """The cavity was taken for a part of its own, and its volume added: 8,512."""
+    given = inverted(together(box([20, 20, 20]), inverted(box([8, 8, 8]))))
+    if not is_whole:
+        given = together(given, box([5, 5, 5], (40, 0, 0)))
+    made = repaired(given)
+    facts = made.metadata["harnack"]
+    assert made.volume == pytest.approx(7488 + (0 if is_whole else 125))
+    assert (facts["stage"], facts["kept"], facts["turned"]) == ("sound", len(given.faces), 24)
+
+
+def grid(*cells: Sequence[float]) -> trimesh.Trimesh:
+    return together(*(box([1, 1, 1], cell) for cell in cells))
+
+
+@pytest.mark.parametrize(
+    ("make", "volume"),
+    [
+        (lambda: together(box([20, 20, 20]), box([10, 10, 5], (0, 0, 12.5))), 8500.0),
+        (lambda: together(box([20, 20, 20]), box([10, 10, 5], (3, 2, 7.5))), 8000.0),
+        (lambda: grid((0, 0, 0), (1, 0, 0), (1, 1, 0)), 3.0),
+        # A solid in a cavity in a solid; and a hollow in what winds twice, which is no hollow.
+        (lambda: together(box([3] * 3), inverted(box([2] * 3)), box([1] * 3)), 20.0),
+        (lambda: together(box([4] * 3), box([3] * 3), inverted(box([2] * 3))), 64.0),
+        (
+            lambda: together(
+                box([4] * 3), box([3] * 3), inverted(box([2] * 3)), inverted(box([1] * 3))
+            ),
+            63.0,
+        ),
+    ],
+)
+@pytest.mark.parametrize("turns", ["as it is", "inside out", "turned", "merged"])
+def test_parts_that_touch_or_lie_in_each_other(make: Any, volume: float, turns: str) -> None:
+    given = make()
+    if turns == "inside out":
+        given.invert()
+    if turns == "turned":  # so that planes are planes up to rounding
+        turn = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
+        given.vertices = given.vertices @ (turn * np.sign(np.linalg.det(turn)))
+    if turns == "merged":
+        given.merge_vertices()
+    made = repaired(given)
+    assert made.volume == pytest.approx(volume, rel=1e-6)
+    if turns != "turned":  # else corners are apart from planes by rounding, which it cannot tell
+        assert not len(intersecting_pairs(np.asarray(made.vertices), np.asarray(made.faces)))
+
+
+def test_boxes_that_share_an_edge_are_told_apart() -> None:
+    """By what has material in between: all corners and edges are shared."""
+    given = grid((0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0), (2, 2, 0))
+    given.merge_vertices()
+    x, faces = np.asarray(given.vertices), np.asarray(given.faces, np.int64)
+    parts = closed_parts(x, faces, faces)
+    assert [len(one) for one in parts] == [12] * 5
+    assert (np.ptp(x[faces[parts[0]]], axis=(0, 1)) == 1).all()
+
+
+def two_loose_balls() -> tuple[trimesh.Trimesh, float]:
+    ball = CREATE.icosphere(subdivisions=0)
+    corner = np.concatenate([ball.triangles, np.add(ball.triangles, [3, 0, 0])])
+    corner = corner + np.random.default_rng(0).normal(0, 1e-6, corner.shape)
+    every = np.arange(3 * len(corner)).reshape(-1, 3)
+    given = trimesh.Trimesh(corner.reshape(-1, 3), every, process=False)
+    return given, 2 * ball.volume
+
+
+def test_two_loose_balls() -> None:
+    given, volume = two_loose_balls()
+    assert repaired(given).volume == pytest.approx(volume, rel=1e-5)
+
+
+@pytest.mark.slow
+def test_two_loose_balls_raise_no_error_of_qhull() -> None:
+    with pytest.raises(hk.MeshingError, match="too near to others|next to nothing apart"):
+        hk.repair(two_loose_balls()[0], keep="all")
+
+
+def halves_along_a_zigzag() -> trimesh.Trimesh:
+    """Of a ball, moved apart. Edges lie on each other where they were moved along themselves."""
+    ball = CREATE.uv_sphere(count=[10, 10])
+    vertices, faces = np.asarray(ball.vertices), np.asarray(ball.faces)
+    upper = vertices[faces].mean(axis=1)[:, 2] > 1e-9
+    apart = np.concatenate([vertices - [0, 0, 0.05], np.add(vertices, [0, 0, 0.05])])
+    return trimesh.Trimesh(apart, np.where(upper[:, None], faces + len(vertices), faces))
+
+
+@pytest.mark.slow
+def test_halves_of_a_ball_along_a_zigzag() -> None:
+    """Half of the ball was left out, after 40 seconds."""
+    given = halves_along_a_zigzag()
+    made = repaired(given)
+    assert "the result of sound is another solid" in made.metadata["harnack"]["why"]
+    assert made.volume == pytest.approx(4.31, abs=0.03)
+    check_is(made, winding_sum(given.triangles), given.bounds)
+
+
+# What finds it.
+
+
+def test_a_difference_is_told() -> None:
+    vertices, faces = icosphere(3)
+    two = together(
+        trimesh.Trimesh(vertices, faces), trimesh.Trimesh(np.add(vertices, [3, 0, 0]), faces)
+    )
+    given = Given.of(two)
+    assert given.difference(Surface(two.vertices, np.asarray(two.faces)), 1e-3) is None
+    lost = given.difference(Surface(vertices, faces), 1e-3)
+    assert lost is not None
+    assert (lost.missing > 300, lost.added) == (True, 0)
+    assert (np.linalg.norm(lost.places - [3, 0, 0], axis=1) < 1).all()
+    assert "such as near" in str(lost)
+    more = Given.of(trimesh.Trimesh(vertices, faces)).difference(
+        Surface(two.vertices, np.asarray(two.faces)), 1e-3
+    )
+    assert more is not None
+    assert more.volumes == pytest.approx((2 * lost.volumes[0], lost.volumes[0]))
+    # Within the length that is allowed nothing differs.
+    assert given.difference(Surface(1.01 * two.vertices, np.asarray(two.faces)), 0.05) is None
+
+
+def test_what_differs_is_said_if_nothing_better_is_found() -> None:
+    """No patches can be made where edges lie on each other, and the triangles there go."""
+    given = halves_along_a_zigzag()
+    with pytest.warns(UserWarning, match=r"not quite the solid that was given: .* such as near"):
+        made = hk.repair(given, keep="sound")
+    differs = made.metadata["harnack"]["differs"]
+    assert differs["missing"] > 500
+    assert differs["share"] > 0.1
+    assert made.volume < 2.5
+
+
+# Random assemblies.
+
+
+def random_parts(seed: int) -> list[trimesh.Trimesh]:
+    """Two to five closed parts: stacked, overlapping, nested, or on a grid; some inside out."""
+    rng = np.random.default_rng(seed)
+    kind, count = seed % 4, int(rng.integers(2, 6))
+    if kind == 0:
+        heights = rng.uniform(0.3, 1.0, count)
+        ends = np.cumsum(heights)
+        stack = [
+            box([*rng.uniform(0.4, 1.2, 2), h], [*rng.uniform(-0.3, 0.3, 2), end - h / 2])
+            if rng.random() < 0.5
+            else CREATE.cylinder(
+                rng.uniform(0.3, 0.7), segment=[[0, 0, end - h], [0, 0, end]], sections=9
+            )
+            for h, end in zip(heights, ends, strict=True)
+        ]
+        turn = trimesh.transformations.random_rotation_matrix(rng.random(3))
+        for one in stack if seed % 8 else ():
+            one.apply_transform(turn)
+        return stack
+    if kind == 1:
+        return [random_part(rng, inverts=k > 0 and rng.random() < 0.3) for k in range(count)]
+    if kind == 2:
+        scales = np.cumprod(rng.uniform(0.5, 0.75, count))
+        ball = CREATE.icosphere(subdivisions=1)
+        made = [trimesh.Trimesh(scale * ball.vertices, ball.faces) for scale in scales]
+        return [inverted(one) if k and rng.random() < 0.6 else one for k, one in enumerate(made)]
+    cells = rng.choice(8, count, replace=False)
+    corners = np.array(list(itertools.product((0, 1), repeat=3)))
+    return [box([1, 1, 1], corners[cell]) for cell in cells]
+
+
+def random_part(rng: np.random.Generator, *, inverts: bool) -> trimesh.Trimesh:
+    kinds = (
+        lambda: box(rng.uniform(0.6, 1.4, 3).tolist()),
+        lambda: CREATE.icosphere(subdivisions=2, radius=rng.uniform(0.4, 0.8)),
+        lambda: CREATE.torus(0.6, rng.uniform(0.15, 0.3), major_sections=16, minor_sections=10),
+    )
+    made = kinds[int(rng.integers(3))]()
+    made.apply_transform(trimesh.transformations.random_rotation_matrix(rng.random(3)))
+    made.apply_translation(rng.uniform(-0.5, 0.5, 3))
+    return inverted(made) if inverts else made
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(60))
+def test_random_assemblies(seed: int) -> None:
+    parts = random_parts(seed)
+    given = together(*parts)
+    if seed % 3 == 1:
+        given.merge_vertices()
+    if seed % 5 == 4:
+        given.invert()
+    made = repaired(given)
+
+    def winding(points: Any) -> Any:
+        """A part that is inside out counts as one that is not, unless it lies in another."""
+        sums = [winding_sum(one.triangles)(points) for one in parts]
+        if seed % 4 == 1:
+            sums = [w * np.sign(one.volume) for w, one in zip(sums, parts, strict=True)]
+        return sum(sums)
+
+    check_is(made, winding, given.bounds)
