@@ -596,7 +596,7 @@ def test_walls() -> None:
             lambda: EigenfunctionSum([Product(1.0, sine(1)), Product(-1.0, sine(1))]),
             "the sum is constant",
         ),
-        (lambda: EigenfunctionSum([Product(math.inf, sine(1))]), "amplitude of a product must be finite"),
+        (lambda: EigenfunctionSum([Product(math.inf, sine(1))]), "amplitude of a product must"),
         (lambda: EigenfunctionSum([PlaneWave(1.0, (1.0, 2.0))]), "three numbers"),  # type: ignore[arg-type]
         (lambda: sine(0.0), "frequency 0 is a constant"),
         (lambda: cosine(math.nan), "frequency of a factor must be finite"),

@@ -5,8 +5,10 @@
 
 from __future__ import annotations
 
+import copy
 import itertools
 import math
+import pickle
 from typing import Any
 
 import drjit as dr
@@ -455,8 +457,20 @@ def test_a_cloud_stays_as_it_is(name: str) -> None:
         given = getattr(field, name)
         with pytest.raises(AttributeError, match=name):
             setattr(field, name, 2 * given)
-        with pytest.raises(ValueError, match="read-only"):
-            given[0] = 0
+        for one in (field, copy.deepcopy(field), pickle.loads(pickle.dumps(field))):
+            with pytest.raises(ValueError, match="read-only"):
+                getattr(one, name)[0] = 0
+
+
+def test_how_a_field_is_computed_stays_as_it_is() -> None:
+    """`method` and `smoothing` could be set, with no effect on what was made of them."""
+    points, normals, _ = cloud(20)
+    for field, name in (
+        (hk.DipolePotential(points, normals), "smoothing"),
+        (hk.WindingNumber(points[:3], [[0, 1, 2]]), "method"),
+    ):
+        with pytest.raises(AttributeError, match=name):
+            setattr(field, name, getattr(field, name))
 
 
 @pytest.mark.parametrize("precision", ["single", "double"])

@@ -178,6 +178,20 @@ def holds_numbers_alone(value: Any) -> bool:
     return True
 
 
+def make_read_only(value: Any) -> None:
+    """Let nobody write to the arrays of NumPy that a value holds, in tuples, lists, dictionaries
+    and dataclasses of this package."""
+    if isinstance(value, np.ndarray):
+        cast("npt.NDArray[Any]", value).setflags(write=False)
+    elif isinstance(value, tuple | list):
+        for one in cast("Sequence[Any]", value):
+            make_read_only(one)
+    elif isinstance(value, dict):
+        make_read_only(list(cast("dict[Any, Any]", value).values()))
+    elif dataclasses.is_dataclass(value) and type(value).__module__.startswith("harnack."):
+        make_read_only(list(vars(value).values()))
+
+
 _PLAIN = frozenset((str, bytes, bool, int, float, complex, np.ndarray, np.float64, type(None)))
 _GROUPS = (list, tuple, set, frozenset)
 # Functions of these packages refer to no numbers of the caller's.

@@ -18,7 +18,13 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend.arrays import as_data
-from harnack.backend.numbers import is_same, refuse_derivatives, refuses_derivatives, short_text
+from harnack.backend.numbers import (
+    is_same,
+    make_read_only,
+    refuse_derivatives,
+    refuses_derivatives,
+    short_text,
+)
 from harnack.backend.tensors import takes_tensors
 from harnack.cluster.lazy import takes_blocks
 from harnack.enclosures import BoundedLaplacian, Curvature, HarmonicBall, Lipschitz
@@ -117,6 +123,17 @@ class Field(Sheets, Parts, Detail, Boundary, abc.ABC):
         if "hessian" in vars(cls):
             general: Any = also_at_points(cls.hessian)
             cls.hessian = general
+
+    def __copy__(self) -> Self:
+        other = object.__new__(type(self))
+        vars(other).update(vars(self))
+        return other
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Of a deep copy, or of a field that was pickled. NumPy forgets that arrays are not to be
+        written to, which would change nothing of what was computed from them."""
+        vars(self).update(state)
+        make_read_only(state)
 
     def __repr__(self) -> str:
         """The call that makes the field, of arguments it still has, with arrays by their shapes."""

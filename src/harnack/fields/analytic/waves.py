@@ -112,20 +112,12 @@ def checked_terms(terms: Iterable[Term]) -> tuple[Term, ...]:
         raise ValueError("a sum needs at least one term")
     for n, term in enumerate(given):
         if isinstance(term, PlaneWave):
-            numbers: Sequence[float] = (term.amplitude, *term.wave_vector, term.phase)
-            if len(numbers) != 5:
-                raise ValueError(f"term {n}: a wave vector is three numbers: {term.wave_vector}")
+            amplitude, phase = float(term.amplitude), float(term.phase)
+            checked.append(replace(term, amplitude=amplitude, phase=phase))
         elif isinstance(term, Product):  # pyright: ignore[reportUnnecessaryIsInstance]
-            numbers = (term.amplitude,)
+            checked.append(replace(term, amplitude=float(term.amplitude)))
         else:
             raise TypeError(f"term {n} must be a Product or a PlaneWave, not {term!r}")
-        if not all(math.isfinite(v) for v in numbers):
-            raise ValueError(f"term {n} holds numbers that are not finite: {term}")
-        if isinstance(term, PlaneWave):
-            amplitude, x, y, z, phase = (float(v) for v in numbers)
-            checked.append(PlaneWave(amplitude, (x, y, z), phase))
-        else:
-            checked.append(replace(term, amplitude=float(term.amplitude)))
     return tuple(checked)
 
 

@@ -294,7 +294,7 @@ class DipolePotential(OrientedPoints, HasCells, DetailedField["_DipoleBuffers"])
         extent = max(0.5 * float((high - low).max()), math.sqrt(float(self.areas.sum())) / 4)
         self._size = 2.0 ** math.ceil(math.log2(extent))
         self._given_hierarchy: Hierarchy | None = None
-        self.smoothing = (
+        self._smoothing = (
             0.0 if real(smoothing, "smoothing") == 0 else positive(smoothing, "smoothing")
         )
         if self.smoothing and self.cells:
@@ -475,6 +475,11 @@ class DipolePotential(OrientedPoints, HasCells, DetailedField["_DipoleBuffers"])
     @property
     def singular_points(self) -> FloatArray:
         return np.zeros((0, 3)) if self.smoothing else self.points[self.areas > 0]
+
+    @property
+    def smoothing(self) -> float:
+        """How far the surface is smoothed. It stays as it is: the default level depends on it."""
+        return self._smoothing
 
     def describe(self) -> dict[str, Any]:
         said = ("estimated" if one else "given" for one in self.estimated)

@@ -249,7 +249,7 @@ class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
         order = whole(order, "order", 0, 2)
         self._mesh = WindingMesh.of(vertices, faces)
         few = len(self.mesh.singular) <= _MOST_EDGES
-        self.method: Literal["exact", "tree"] = (
+        self._method: Literal["exact", "tree"] = (
             ("exact" if few else "tree") if method == "auto" else method
         )
         self.accuracy, self.order = accuracy, order
@@ -278,6 +278,11 @@ class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
         field._own_levels = Remembered()
         field.set_cells(self.cells)
         return field
+
+    @property
+    def method(self) -> Literal["exact", "tree"]:
+        """How w is computed, which is decided once."""
+        return self._method
 
     @property
     def mesh(self) -> WindingMesh:
