@@ -176,13 +176,13 @@ class _Sweep:
         """Faces between neighbors of rings (k, around, 3), those of points that are the same left
         out. shift: by which the numbers around grow from the last to the first; None for poles
         there."""
-        count, n = rings.shape[:2]
+        count, n = len(rings), self.around
         row, column = np.mgrid[: count - 1 if shift is None else count, :n].reshape(2, -1)
         moved = np.where(row == count - 1, shift or 0, 0)
         above = (row + 1) % count * n
         a, b = row * n + column, row * n + (column + 1) % n
         c, d = above + (column + moved + 1) % n, above + (column + moved) % n
-        place: IntArray = np.arange(count * n).reshape(count, n)
+        place: IntArray = np.arange(count * n, dtype=np.int64).reshape((count, n))
         for k in range(1, count):
             same = (rings[k] == rings[k - 1]).all(axis=1)
             place[k, same] = place[k - 1, same]
