@@ -454,6 +454,11 @@ def _repair(options: Any) -> int:
         made = repair(given, progress=None if options.quiet else status.update, **chosen)
     write_mesh(made, target)
     facts = made.metadata["harnack"]
+    if facts["differs"] is not None:
+        _say(
+            f"not quite what was given: {facts['differs']['share']:.2%} of the points that were "
+            "compared are on the wrong side"
+        )
     _say(f"{_repaired(facts, len(faces), len(made.faces))}, Euler characteristic "
          f"{facts['euler_characteristic']}")  # fmt: skip
     _say(f"wrote {target}")

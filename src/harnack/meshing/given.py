@@ -123,9 +123,13 @@ class Given:
             return cls(x, faces, is_turned, known, [], welded.rounded)
         disagrees = against_neighbors(x, known)
         agreeing = _turned(known, disagrees)
-        parts = closed_parts(x, _turned(raw[rows], disagrees), agreeing)
+        raw = _turned(raw[rows], disagrees)
+        way = 1 if volume_of(x, agreeing) >= 0 else -1  # most has its material inside
+        parts = closed_parts(x, raw[:, ::way], agreeing[:, ::way])
         turned = _inside_out(x, agreeing, parts)
         oriented = _turned(agreeing, turned)
+        if turned.any() and not turned.all():
+            parts = closed_parts(x, _turned(raw, turned), oriented)
         if not disagrees.any():  # else it is no part as a whole that is turned
             is_turned[rows] = turned
         return cls(x, _turned(faces, is_turned), is_turned, oriented, parts, welded.rounded)
