@@ -87,10 +87,10 @@ def _wedges(ends: FloatArray, third: FloatArray, is_along: BoolArray) -> IntArra
     way = ends[1] - ends[0]
     away = third - ends[0]
     away -= np.outer(away @ way / (way @ way), way)
-    one = away[0] / max(float(np.linalg.norm(away[0])), 1e-300)
-    other = np.cross(way / np.linalg.norm(way), one)
-    turn = np.arctan2(away @ other, away @ one) / (2 * np.pi)
-    steps = np.round(turn / _SAME_TURN).astype(np.int64) % round(1 / _SAME_TURN)
+    one: Any = away[0] / max(float(np.linalg.norm(away[0])), 1e-300)
+    other: Any = np.cross(way / float(np.linalg.norm(way)), one)
+    turn: FloatArray = np.arctan2(away @ other, away @ one) / (2 * np.pi)
+    steps: IntArray = np.round(turn / _SAME_TURN).astype(np.int64) % round(1 / _SAME_TURN)
     open_ones, found = list[int](), list[tuple[int, int]]()
     is_taken = np.zeros(len(third), np.bool_)
     for k in 2 * np.lexsort((~is_along, steps)).tolist():  # twice around
@@ -115,7 +115,7 @@ def _is_closed(faces: IntArray) -> bool:
 def volume_of(x: FloatArray, faces: IntArray) -> float:
     """What a closed mesh holds, negative if it is inside out."""
     corner = x[faces] - x[faces].mean(axis=(0, 1))
-    return float(dots(corner[:, 0], np.cross(corner[:, 1], corner[:, 2])).sum()) / 6
+    return float(dots(corner[:, 0], crosses(corner)).sum()) / 6  # the same as of its corners
 
 
 def nested(x: FloatArray, parts: list[IntArray]) -> list[list[int]]:

@@ -93,8 +93,8 @@ def repair(
     - anew: the surface on which the winding number w of the mesh is 1/2 is made by the signs of
       w - 1/2 in cells (`meshing.by_signs`), closed whatever the mesh is.
 
-    Each result is compared with w at some thousand points, farther from both surfaces than the
-    tolerance: where w is above 0.86 the inside has to be, and where it is below 0.14 the outside;
+    Each result is compared with w at some thousand points, farther from both surfaces than two
+    tolerances: where w is above 0.86 the inside has to be, and where it is below 0.14 the outside;
     and the volume has to be that of a closed mesh that winds around no point twice. One that
     differs gives way to the next stage; if all do, the one that differs least is returned, with a
     warning. That is sampled: what differs in less than a thousandth of the box may not be seen.
@@ -181,7 +181,7 @@ def repair(
             asked.report(f"{error}; so not all is kept")
             continue
         asked.report("comparing with what was given")
-        away = tolerance * given.size + facts.get("moved", 0.0)
+        away = 2 * tolerance * given.size + facts.get("moved", 0.0)
         results.append(_Result(surface, facts, given.difference(surface, away)))
         if results[-1].difference is None:
             break
@@ -233,7 +233,8 @@ class _Result:
         """The mesh, with what is known of it and of its parts; a warning if it differs."""
         from harnack.meshing.closed_mesh import ClosedMesh
 
-        surface, facts = self.surface, self.facts | more | {"differs": None}
+        surface = self.surface
+        facts: dict[str, Any] = {**self.facts, **more, "differs": None}
         if self.difference is not None:
             facts["differs"] = dataclasses.asdict(self.difference)
             warnings.warn(
