@@ -33,6 +33,8 @@ _NEAREST, _FARTHEST, _MARGIN = 2e-3, 0.1, 0.05
 _CLEARLY = 0.36
 # Volumes of closed meshes that bound their solid once may differ by this part.
 _VOLUME = 0.01
+# A mesh winds counter-clockwise if cones to its middle hold that part of their volumes added up.
+_PLAINLY = 0.5
 # How many points that differ are looked at again, and listed.
 _LOOKED_AT, _LISTED = 40, 10
 # A mesh is an open sheet if this part of its area, or more, has nothing inside.
@@ -298,5 +300,9 @@ def _winds_clockwise(x: FloatArray, faces: IntArray) -> bool:
     rng = np.random.default_rng(0)
     corner = x[faces]
     size = float(np.ptp(corner, axis=(0, 1)).max())
+    middle: FloatArray = corner.mean(axis=(0, 1))
+    cones = dots(corner[:, 0] - middle, crosses(corner))
+    if float(cones.sum()) > _PLAINLY * float(np.abs(cones).sum()):
+        return False  # nearly all faces look away from the middle
     w = _values(_winding_number(x, faces), _near(corner, size, rng))
     return bool((w < -0.5).sum() > (w > 0.5).sum())
