@@ -106,7 +106,7 @@ def caps_of(mesh: WindingMesh) -> WindingMesh:
     once, own = np.ones(len(faces), np.int64), np.arange(len(faces))
     welded = np.arange(len(vertices))
     return WindingMesh(
-        vertices, faces, once, own, mesh.singular, faces, welded, mesh.center, mesh.size
+        vertices, faces, once, own, mesh.singular, faces, welded, 0, mesh.center, mesh.size
     )
 
 
