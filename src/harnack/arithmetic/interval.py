@@ -271,16 +271,16 @@ def _unknown_or_larger(a: Real, b: Real) -> Real:
     """The larger; NaN where either is."""
     if isinstance(a, float) and isinstance(b, float):
         return math.nan if a != a or b != b else max(a, b)
-    return dr.select((a > b) | (a != a), a, b)
+    return dr.select((a > b) | dr.isnan(a), a, b)
 
 
 def _defined_smaller(a: Real, b: Real) -> Real:
     """The smaller; a where b is NaN, and b where a is."""
-    return dr.select((a <= b) | (b != b), a, b)
+    return dr.select((a <= b) | dr.isnan(b), a, b)
 
 
 def _defined_larger(a: Real, b: Real) -> Real:
-    return dr.select((a >= b) | (b != b), a, b)
+    return dr.select((a >= b) | dr.isnan(b), a, b)
 
 
 def _absolute(x: Real) -> Real:

@@ -177,7 +177,7 @@ def _length_of(sizes: list[Any], p: float) -> Interval:
     """The norm of numbers >= 0."""
     if p == 2.0:
         return sqrt.ranges(_total([Interval.exactly(one).square() for one in sizes]))[0]
-    most = functools.reduce(lambda a, b: dr.select((a > b) | (a != a), a, b), sizes)
+    most = functools.reduce(lambda a, b: dr.select((a > b) | dr.isnan(a), a, b), sizes)
     tiny = float(dr.smallest(cast("Any", type(most))))
     # Divided by the largest, so that no power overflows.
     over = Interval.exactly(fmax(tiny, most)).reciprocal()

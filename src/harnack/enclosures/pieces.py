@@ -103,7 +103,7 @@ class Pieces(Enclosure):
     ) -> tuple[Real, Real, Real]:
         """The slope at the end of a piece, how far it is free, and the rest of the gap there."""
         # A range that is NaN is not known.
-        slope = dr.select((slope <= most) | (most != most), slope, most)
+        slope = dr.select((slope <= most) | dr.isnan(most), slope, most)
         by_line = dr.select(most > 0, left / most, dr.select(most <= 0, dr.inf, 0))
         by_line = dr.select(left > 0, by_line, 0)
         by_parabola = first_root(left, slope, bend)
