@@ -488,6 +488,22 @@ def test_values_hold_all_values_and_say_where_there_are_none() -> None:
     np.testing.assert_array_equal(over, np.abs(centers[:, 0]) <= half)
 
 
+@pytest.mark.parametrize("precision", ["single", "double"])
+def test_ends_that_are_no_number_stay_unknown(precision: Any) -> None:
+    """Of numbers that only a kernel knows: to processors NaN is not unequal to itself."""
+    real = choose_backend(precision).Float
+    unknown, half, one = (dr.opaque(real, x) for x in (math.nan, 0.5, 1.0))
+    high, low = Interval(-half, unknown), Interval(unknown, half)
+    both = Interval(-one, one)
+    for a, b in itertools.permutations((high, low, both), 2):
+        hull = a.hull(b)
+        assert dr.isnan(hull.high)[0] == (high in (a, b))
+        assert dr.isnan(hull.low)[0] == (low in (a, b))
+    assert (high.meet(both).high[0], both.meet(low).low[0]) == (1, -1)
+    assert dr.isnan(high.largest)[0]
+    assert dr.isnan(low.largest)[0]
+
+
 def test_roots_of_sums_of_squares_have_the_slopes_of_norms() -> None:
     backend = choose_backend("double")
     x, y, _ = Jet.within(backend.Array3f(0.0, 0.1, 0.0), backend.Float(0.2))

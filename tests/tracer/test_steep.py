@@ -115,6 +115,63 @@ def test_poles_are_no_surfaces() -> None:
     assert hits.t[1] == pytest.approx(5.0, abs=1e-3)
 
 
+def test_ends_of_ranges_that_are_no_number() -> None:
+    """log(x) has no lower end where x may be negative, and neither has the smaller of it and y."""
+    o, d = [[1.0629, 0, -0.68043], [-0.35924, -0.39349, -0.83078]], [[-1.0, 0, 0], [1.0, 0, 0]]
+    hits = hk.trace(hk.expression("min(log(x), y) = z"), o, d, t_max=2.7)
+    assert hits.status.tolist() == [1, 2]  # the other begins where there is no log(x)
+    assert hits.t[0] == pytest.approx(1.0629 - np.exp(-0.68043), abs=2e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("text", "o", "d", "precision", "t"),
+    [
+        # On these rays f is -z; at the axis it jumps, within [-0.5, 0.5] - z.
+        ("x*y/(x^2 + y^2) = z", (1.66, 0, -0.93), (-1, 0, 0), "double", None),
+        ("x^2*y/(x^4 + y^2) = z", (0.90696, 0, 0.62904), (-1, 0, 0), "double", None),
+        ("x^2*y/(x^4 + y^2) = z", (0.90696, 0, 0.62904), (-1, 0, 0), "single", None),
+        # f is a jump between 1.83 and -0.17.
+        (
+            "abs(x)/x = y + 0.5*z",
+            (-0.45275336503982544, 0.022624239325523376, -1.755385160446167),
+            (0.21221067011356354, -0.4286957383155823, 0.8781722784042358), "single", None,
+        ),
+        # The values at y = 8.8e-8 hide the surface, which is 0.007 ahead.
+        (
+            "abs(x)^(1/3) + abs(y)^(1/3) + abs(z)^(1/3) = 1.2",
+            (-2.9498493671417236, 8.825632846765075e-08, -4.051289792528223e-08), (1, 0, 0),
+            "single", 1.2256,
+        ),
+        # The ray lies in the plane of the cusp.
+        ("sqrt(sqrt(abs(x))) = y + z/2", (0, 1, -1.5), (0, -1, 0), "double", 0.25),
+        ("asin(x) + asin(y) = z", (1, 1, 2), (0, -1, 0), "double", 1 - np.sin(2 - np.pi / 2)),
+    ],
+)  # fmt: skip
+def test_hits_by_rounding(text: str, o: Any, d: Any, precision: Precision, t: float | None) -> None:
+    """Ranges of f around a point hold numbers that are no values of f: they make no hit alone. What
+    rounding hides is found by looking, or the ray stops."""
+    hits = hk.trace(hk.expression(text), [o], [d], t_max=3.0, precision=precision)
+    if t is None:
+        assert hits.status[0] != hk.Status.HIT
+    else:
+        assert hits.status[0] == hk.Status.OUT_OF_STEPS or abs(hits.t[0] - t) < 3e-4
+
+
+@pytest.mark.slow
+def test_crossings_beside_a_vertical_tangent() -> None:
+    """|grad f| times the tolerance is more there than f ever swings."""
+    o, d = [-1.595e-10, 0.040684, -0.99394], np.array([0, 0.11293, 0.9936])
+    d /= np.linalg.norm(d)
+    field = hk.expression("abs(x*y)^(1/3) = z")
+    for precision in ("single", "double"):
+        hits = hk.trace(field, [o], [d], t_max=3.0, confirm=True, precision=precision)
+        assert hits.t[0] == pytest.approx(1.00063, abs=2e-4)
+        crossings = hk.trace(field, [o], [d], t_max=3.0, all_hits=3, precision=precision)
+        assert crossings.count[0] == 1
+        assert crossings.t[0, 0] == pytest.approx(1.00063, abs=2e-4)
+
+
 @pytest.mark.parametrize("precision", ["single", pytest.param("double", marks=pytest.mark.slow)])
 def test_valley_with_a_vertical_tangent(precision: Precision) -> None:
     """z = sqrt(|x|): along and down into its valley, from it, and confirmed."""

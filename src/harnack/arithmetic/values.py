@@ -18,7 +18,7 @@ import drjit as dr
 
 from harnack.arithmetic.angles import angle_range
 from harnack.arithmetic.functions import power, sqrt
-from harnack.arithmetic.interval import Interval
+from harnack.arithmetic.interval import ZERO, Interval
 from harnack.arithmetic.operators import Operators, exponent_of
 
 if TYPE_CHECKING:
@@ -43,11 +43,11 @@ class Values(Operators):
     gaps: Mask
 
     @classmethod
-    def between(cls, p: Vec3, q: Vec3, slack: Real) -> tuple[Values, Values, Values]:
+    def between(cls, p: Vec3, q: Vec3, slack: Real | None) -> tuple[Values, Values, Values]:
         """The coordinates on the smallest box around two points, `slack` larger on all sides."""
         no = p.x != p.x
         no = no & ~no
-        around = Interval(-slack, slack)
+        around = ZERO if slack is None else Interval(-slack, slack)
         x, y, z = (
             cls(Interval.exactly(p[k]).hull(Interval.exactly(q[k])) + around, no, no, no)
             for k in range(3)

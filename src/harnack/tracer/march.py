@@ -27,7 +27,7 @@ from harnack.tracer.contact import (
     Status,
     compare_with_sheet,
 )
-from harnack.tracer.steep import SteepPlace, beyond, down_or_up
+from harnack.tracer.steep import SteepPlace, beyond, down_or_up, largest_change
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
@@ -374,6 +374,10 @@ class March:
         within = self.tolerance.in_value(steepness, t)
         knows_gradient = (sample.gradient_error <= gradient_norm) | (steepness > 0)
         if self.hysteresis is not None:
+            if field.is_steep:  # or what f has to swing is more than it does
+                reach = dr.fma(t, self.tolerance.per_length, self.tolerance.distance)
+                change = largest_change(field, path.point(t), sample.value, reach)
+                within = fmax(fmin(within, change), self.tolerance.value)
             within = self.hysteresis.within(within)
         # Where not even the gradient is known, no hit is due to rounding.
         rounding = dr.select(knows_gradient, total_error - sample.truncation, 0)
@@ -381,8 +385,8 @@ class March:
         looks: Any = 0
         if steep is not None:
             is_near &= now.active & dr.isfinite(total_error)
-            sure = steep.is_level | (gap <= self.tolerance.value)
-            is_near, looks = self._is_there(field, path, t, look, gaps, size, is_near, sure)
+            may_be = steep.is_level
+            is_near, looks = self._is_there(field, path, t, look, gaps, size, is_near, may_be)
         return _Seen(
             t=t,
             at_end=t == end,
@@ -413,25 +417,26 @@ class March:
         gaps: Gaps,
         size: Real,
         is_near: Mask,
-        sure: Mask,
+        may_be: Mask,
     ) -> tuple[Mask, Any]:
         """At which of the points that are near a level by their slope f takes it within the
         tolerance, and how many evaluations of f that took.
 
-        It does if rounding alone leaves it open (`sure`), if the enclosures prove it along the ray,
-        or if f is seen on the other side of the level (`steep.beyond`).
+        It does if the enclosures prove it along the ray, or if f is seen on the other side of the
+        level or at it (`steep.beyond`). may_be: whether the level may be f up to rounding.
         """
         sample, p = look.sample, path.point(t)
         tolerance = dr.fma(t, self.tolerance.per_length, self.tolerance.distance)
         slack = 8 * self.backend.epsilon * size
         reach = fmax(tolerance, 2 * slack)
+        sure = gaps.smaller <= self.tolerance.value
         for one in look.ahead:
             sure |= one.arrives(gaps, reach)
         along = down_or_up(sample.gradient, gaps, path.direction)
         ways = (along, length(sample.gradient)), (path.direction, look.slope)
         unsure = is_near & ~sure
         passed, looks = beyond(
-            self.backend, field, gaps, p, ways, sample.value, reach, slack, unsure
+            self.backend, field, gaps, p, ways, sample.value, reach, may_be, unsure
         )
         return is_near & (sure | passed), looks
 

@@ -8,7 +8,7 @@ the other side, and what steps slopes do not prove, ranges of values may (`arith
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
@@ -24,14 +24,15 @@ if TYPE_CHECKING:
     from harnack.fields.field import Field
     from harnack.fields.look import Path, Sample
 
-# A level is the value of f up to rounding where it is farther than f changes by rounding by no more
-# than this factor, if f changes on the other side by no more than so many times as much.
+# A level may be the value of f up to rounding where it is farther than f changes by rounding by no
+# more than this factor, if f changes on the other side by no more than so many times as much.
 _SLACK, _FAR = 1.25, 8.0
-# How many points are looked at.
-_TRIALS = 5
+# How many points are looked at, and after those of a search; the most before these, and the section
+# of that search.
+_TRIALS, _SIDES, _MOST_LOOKS, _SECTION = 5, 6, 100, 0.381966
 
 
-def values_between(field: Field, p: Vec3, q: Vec3, slack: Real) -> Values | None:
+def values_between(field: Field, p: Vec3, q: Vec3, slack: Real | None = None) -> Values | None:
     """The values of a field on a box around two points, larger by `slack`; None for a field without
     a formula of its values."""
     coordinates = Values.between(p, q, slack)
@@ -45,6 +46,19 @@ def values_between(field: Field, p: Vec3, q: Vec3, slack: Real) -> Values | None
     return coordinates[0].of(value)
 
 
+def largest_change(field: Field, p: Vec3, value: Real, reach: Real) -> Real:
+    """By how much f may differ from its value at p within `reach` of it; infinite if not known.
+
+    Beside a vertical tangent |grad f| times a length is more, and may be more than f changes
+    anywhere: that of |x y|^(1/3) - z at x = 1e-10 is 1e5.
+    """
+    around = values_between(field, p, p, reach)
+    if around is None:
+        return cast("Any", type(value))(dr.inf)
+    change = fmax(around.value.high - value, value - around.value.low)
+    return dr.select(dr.isfinite(change), change, dr.inf)
+
+
 @dataclass(frozen=True)
 class SteepPlace:
     """What the values of a field prove at a trial point.
@@ -53,7 +67,8 @@ class SteepPlace:
         where none is known. |grad f| times the rounding of the point is no bound. None for fields
         without a formula of their values.
     is_level: whether a level may be the value of f at the point that is meant: it lies in the range
-        of f around the rounded one, where f is proved to be continuous.
+        of f around the rounded one, or so near to it that rounding may keep a ray from coming
+        nearer, and f is proved to be continuous there. That is no proof that it is (`beyond`).
     free: a length of the path on which no value of f is a level, because f stays away from them or
         has no value at all; 0 where none is proved.
     """
@@ -81,7 +96,7 @@ class SteepPlace:
         here = values_between(field, p, p, slack)
         there = values_between(field, p, path.point(t + ahead), slack)
         if here is None or there is None:
-            return cls(None, t != t, kind(0))
+            return cls(None, t < t, kind(0))
         below, above = value - here.value.low, here.value.high - value
         known = (below >= 0) & (above >= 0) & ~here.jumps
         gaps = levels.gaps(value)
@@ -106,11 +121,18 @@ class SteepPlace:
 
 @dataclass(frozen=True)
 class _Looking:
-    """The state of looking: how often, and whether a level was passed."""
+    """The state of looking: how often, how often behind a search, and whether a level was passed.
+    And that of the search for where f comes nearest to a level: lengths along the first way between
+    which it does, one in between, and the distance in value there."""
 
     looks: Any
+    sides: Any
     passed: Mask
     active: Mask
+    low: Real
+    high: Real
+    inner: Real
+    least: Real
 
 
 def beyond(
@@ -121,36 +143,49 @@ def beyond(
     ways: tuple[tuple[Vec3, Real], tuple[Vec3, Real]],
     value: Real,
     reach: Real,
-    slack: Real,
+    searches: Mask,
     active: Mask,
 ) -> tuple[Mask, Any]:
     """Whether f takes a level within `reach` of p, and how many evaluations of f that took.
 
     ways: two directions, each with the slope of f along it. value: f at p. gaps: from there to the
-        levels. slack: how far off rounding may have put a coordinate.
+        levels. searches: where it is worth a search, as a ray can come no nearer.
 
     Proof. At another point, at most `reach` away, f is on the other side of the level, and on the
     box around both it is continuous and has values everywhere: so it takes the level between them
     (up to its rounding there). Or f is the level at the other point, up to rounding, as where it
     touches the level and turns back. The points are along the first way where the slope says that
-    the level is, twice as far, and at `reach`; and the last two along the second way. Where the
-    level is not found nothing is proved: the ray goes on, and comes nearer if it meets the surface.
+    the level is, twice as far, and at `reach`; and the next two along the second way. Where f may
+    be the level at p, up to the rounding of p, others follow: along the first way by golden
+    sections towards where f comes nearest to the level, and from there half of `reach` along each
+    axis. Ranges around p are no proof: they hold numbers that are no values of f. Where the level
+    is not found nothing is proved: the ray goes on, and comes nearer if it meets the surface.
     """
-
-    zero = backend.Float(0)
+    finest = 4 * float(dr.epsilon(backend.Float)) * reach
 
     def body(now: _Looking) -> _Looking:
         is_first, is_far = now.looks < 3, (now.looks == 2) | (now.looks == 4)
-        way = dr.select(is_first, ways[0][0], ways[1][0])
+        is_search = now.looks >= _TRIALS
+        is_side = is_search & ((now.high - now.low <= finest) | (now.looks >= _MOST_LOOKS))
+        way = dr.select(is_first | is_search, ways[0][0], ways[1][0])
         rate = dr.abs(dr.select(is_first, ways[0][1], ways[1][1]))
         times = dr.select(now.looks == 0, backend.Float(1), 2)
         distance = dr.select(is_far, reach, fmin(times * gaps.smaller / rate, reach))
-        q = dr.fma(type(p)(distance), way, p)
-        around, between = values_between(field, q, q, slack), values_between(field, p, q, zero)
+        behind, ahead = now.inner - now.low, now.high - now.inner
+        section = now.inner + _SECTION * dr.select(ahead >= behind, ahead, -behind)
+        section = dr.select(is_side, now.inner, section)
+        distance = dr.select(is_search, section, distance)
+        side = dr.select((now.sides & 1) == 0, 0.5 * reach, -0.5 * reach)
+        axis = now.sides >> 1
+        aside = type(p)(*(dr.select(is_side & (axis == k), side, 0) for k in range(3)))
+        q = dr.fma(type(p)(distance), way, p) + aside
+        around = values_between(field, q, q, finest)
+        between = values_between(field, p, q)
         if around is None or between is None:
             with without_weaker():
                 rise = field.evaluate(q).value - value
             passed = (rise <= -gaps.down) | (rise >= gaps.up)
+            left = dr.select(gaps.down < gaps.up, gaps.down + rise, gaps.up - rise)
         else:
             least, most = around.value.low - value, around.value.high - value
             passed = (most <= -gaps.down) | (least >= gaps.up)
@@ -158,13 +193,33 @@ def beyond(
             is_level = (least <= -gaps.down) & (most >= -gaps.down)
             is_level |= (least <= gaps.up) & (most >= gaps.up)
             passed |= is_level & ~(around.jumps | around.nowhere)
+            left = dr.select(gaps.down < gaps.up, gaps.down + least, gaps.up - most)
+        left = dr.select(dr.isfinite(left), left, dr.inf)
+        now = _narrowed(now, distance, left, is_search & ~is_side)
         passed = now.passed | passed
-        looks = now.looks + 1
-        return _Looking(looks, passed, now.active & ~passed & (looks < _TRIALS))
+        looks, sides = now.looks + 1, now.sides + dr.select(is_side, 1, 0)
+        active = now.active & ~passed & ((looks < _TRIALS) | (searches & (sides < _SIDES)))
+        return replace(now, looks=looks, sides=sides, passed=passed, active=active)
 
-    begin = _Looking(backend.UInt32(0), backend.Bool(False), backend.Bool(active))
+    begin = _Looking(
+        backend.UInt32(0), backend.UInt32(0), backend.Bool(False), backend.Bool(active),
+        backend.Float(0), backend.Float(reach), backend.Float(0), backend.Float(gaps.smaller),
+    )  # fmt: skip
     end = while_active(begin, body, "harnack beyond")
     return end.passed, end.looks
+
+
+def _narrowed(now: _Looking, at: Real, left: Real, is_search: Mask) -> _Looking:
+    """The search after f was found so far from a level in value at another length."""
+    nearer, is_farther = left <= now.least, at > now.inner
+    end, is_low = dr.select(nearer, now.inner, at), nearer == is_farther
+    return replace(
+        now,
+        low=dr.select(is_search & is_low, end, now.low),
+        high=dr.select(is_search & ~is_low, end, now.high),
+        inner=dr.select(is_search & nearer, at, now.inner),
+        least=dr.select(is_search & nearer, left, now.least),
+    )
 
 
 def down_or_up(gradient: Vec3, gaps: Gaps, otherwise: Vec3) -> Vec3:
