@@ -78,6 +78,31 @@ def test_a_cube_with_a_cavity_that_is_inside_out(is_whole: bool) -> None:
     assert (facts["stage"], facts["kept"], facts["turned"]) == ("sound", len(given.faces), 24)
 
 
+@pytest.mark.parametrize("turns", [(1, 1), (1, -1), (-1, 1), (-1, -1)])
+@pytest.mark.parametrize("lost", ["outer", "inner"])
+def test_a_cube_in_a_cube_one_of_which_lacks_a_triangle(turns: Any, lost: str) -> None:
+    """The one that was closed was turned by itself, and both volumes were added: 8,512."""
+    outer, inner = box([20, 20, 20]).subdivide(), box([8, 8, 8]).subdivide()
+    broken = {"outer": outer, "inner": inner}[lost]
+    broken.update_faces(np.arange(len(broken.faces)) > 0)
+    parts = (
+        one if turn > 0 else inverted(one) for one, turn in zip((outer, inner), turns, strict=True)
+    )
+    made = repaired(together(*parts))
+    is_hollow = turns[0] != turns[1]
+    assert made.volume == pytest.approx(7488 if is_hollow else 8000)
+    if made.metadata["harnack"]["stage"] == "sound":
+        inside = len(inner.faces)
+        assert made.metadata["harnack"]["left_out"]["inside"] == (0 if is_hollow else inside)
+
+
+def test_a_recess_that_is_inside_out() -> None:
+    """It lies in the cube and shares three of its planes: it was taken for a part of its own."""
+    given = together(box([10, 10, 10]), inverted(box([5, 5, 5], (2.5, 2.5, 2.5))))
+    assert repaired(inverted(given)).volume == pytest.approx(875)
+    assert repaired(given).volume == pytest.approx(875)
+
+
 def grid(*cells: Sequence[float]) -> trimesh.Trimesh:
     return together(*(box([1, 1, 1], cell) for cell in cells))
 

@@ -19,6 +19,7 @@ from harnack.distance.tangent import in_batches
 from harnack.enclosures import TargetLevels
 from harnack.fields.clearance import distance_below, placed, single
 from harnack.fields.field import AtDetail
+from harnack.fields.solids.mesh_solid import MeshSolid
 from harnack.tree import build_hierarchy
 from harnack.tree.nearest import nearest_triangle, square_to_some_vertex
 from harnack.tree.pieces import on_level, pieces_of_faces
@@ -47,9 +48,14 @@ class MeshSurface:
 
     @classmethod
     def of(cls, surface: LevelSet) -> MeshSurface | None:
-        """Of the winding number of a mesh that nothing clips; else None. Of a mesh that is not
-        closed, those triangles that are proved to belong to the surface as a whole; or all, if the
-        surface is nothing else."""
+        """Of the winding number of a mesh that nothing clips, and of the boundary of a `MeshSolid`;
+        else None. Of a mesh that is not closed, those triangles that are proved to belong to the
+        surface as a whole; or all, if the surface is nothing else."""
+        if isinstance(surface.field, MeshSolid) and surface.cut is None:
+            if surface.field.domain is not None or any(surface.numbers):
+                return None
+            closed = surface.field.surface
+            return cls(closed.corners, closed.center, closed.size, True)
         mesh = surface.field.mesh_of_sheets()
         if mesh is None or surface.cut is not None or surface.field.domain is not None:
             return None

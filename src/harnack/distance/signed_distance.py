@@ -55,9 +55,10 @@ def signed_distance(
             field's `hessian`.
         "newton": to the nearest point of the surface that a search finds (`closest_points` says
             how): an upper bound of the distance, exact to rounding if that is the nearest of all.
-            `distance_bounds` says what is proved about it. Of a closed triangle mesh it is exact to
-            rounding. NaN, with a RuntimeWarning that counts them, where no surface is found at all,
-            as where there is none, or only within a radius that the field promises to be free.
+            `distance_bounds` says what is proved about it. Of a closed triangle mesh, and of the
+            boundary of the solid of one, it is exact to rounding. NaN, with a RuntimeWarning that
+            counts them, where no surface is found at all, as where there is none, or only within a
+            radius that the field promises to be free.
         "lower": never longer in size than the true distance, with proof: no level lies in the
             ball of that radius about the point, not even outside the field's domain. Of first
             order too: the nearer the surface, the smaller the share that it falls short by.
@@ -109,13 +110,13 @@ def closest_points(
 ) -> FloatArray:
     """The closest points (n, 3) of a level set to `points` (n, 3), as far as a search finds them.
 
-    Of the winding number of a closed mesh they are exact: the nearest of the triangles that are the
-    level, cut where others pass through them. Of other fields the surface is enclosed in cells, and
-    descents from the points of the surface that cells know lead to places where no neighbor is
-    nearer; `distance_bounds` also splits cells where a nearer point may be. The curve in which the
-    level sets of a field end counts as part of them, such as the vertices and edges of a solid
-    angle, and so does the rim at which the field's domain cuts them. NaN, with a RuntimeWarning
-    that counts them, where no surface is found.
+    Of the winding number of a closed mesh, and of its solid, they are exact: the nearest of the
+    triangles that are the level, cut where others pass through them. Of other fields the surface is
+    enclosed in cells, and descents from the points of the surface that cells know lead to places
+    where no neighbor is nearer; `distance_bounds` also splits cells where a nearer point may be.
+    The curve in which the level sets of a field end counts as part of them, such as the vertices
+    and edges of a solid angle, and so does the rim at which the field's domain cuts them. NaN, with
+    a RuntimeWarning that counts them, where no surface is found.
 
     Raises:
         TypeError, ValueError: as `signed_distance`.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -25,6 +26,8 @@ __all__ = ["closed_parts", "nested", "united_parts", "volume_of"]
 _LEAST_FACES, _MOST_PARTS = 4, 200
 # Places of a part that have to lie in another one for the part to do.
 _PLACES = 16
+# These are so far within it, as a part of its size.
+_WITHIN = 1e-6
 # Faces around an edge have one direction if they are turned by less, in full turns.
 _SAME_TURN = 1e-9
 # Parts of the size: faces that are nearer lie on each other, and are moved into each other by that.
@@ -120,20 +123,24 @@ def volume_of(x: FloatArray, faces: IntArray) -> float:
 
 def nested(x: FloatArray, parts: list[IntArray]) -> list[list[int]]:
     """For each of some closed parts, faces (k, 3), the numbers of those that it lies in as a whole,
-    the smallest first."""
+    the smallest first. Parts may touch: places of each are looked at a little within it."""
     corners = [x[part] for part in parts]
     boxes = [(one.min(axis=(0, 1)), one.max(axis=(0, 1))) for one in corners]
-    sizes = [abs(volume_of(x, part)) for part in parts]
+    volumes = [volume_of(x, part) for part in parts]
+    sizes = np.abs(volumes)
     found: list[list[int]] = []
     for i, (low, high) in enumerate(boxes):
-        points = corners[i][:: max(1, len(parts[i]) // _PLACES)].mean(axis=1)
+        within = _WITHIN * float((high - low).max())
+        some = parts[i][:: max(1, len(parts[i]) // _PLACES)]
+        normals = _unit_normals(x[some])
+        points = x[some].mean(axis=1) - math.copysign(within, volumes[i]) * normals
         around = [
             j
             for j, (lower, upper) in enumerate(boxes)
             if j != i
-            and (lower <= low).all()
-            and (upper >= high).all()
-            and sizes[j] > sizes[i]
+            and (lower <= low + within).all()
+            and (upper >= high - within).all()
+            and sizes[j] > (1 + _WITHIN) * sizes[i]
             and all(abs(winding_around(corners[j], point)) > 0.5 for point in points)
         ]
         found.append(sorted(around, key=lambda j: sizes[j]))

@@ -154,6 +154,13 @@ class Shells:
             depth[k] = round(sum(self.turns(j, k) for j in near))
         return depth
 
+    def bound(self) -> npt.NDArray[np.bool_]:
+        """(m,) which faces bound the points that all parts together wind around at least once, if
+        no two meet: across a part the number changes by one, from that outside of it, so that those
+        that do turn outwards with nothing around, or inwards with one."""
+        does = self.depths() == np.where(self.volumes > 0, 0, 1)
+        return does[self.number]
+
 
 def _parts(surface: Surface) -> IntArray:
     """(m,) of each face the number of its connected part."""

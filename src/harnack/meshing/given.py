@@ -37,6 +37,8 @@ _VOLUME = 0.01
 _PLAINLY = 0.5
 # How many points that differ are looked at again, and listed.
 _LOOKED_AT, _LISTED = 40, 10
+# Places of what is closed that have to lie in what is not for all of it to do; and the reverse.
+_PLACES = 16
 # A mesh is an open sheet if this part of its area, or more, has nothing inside.
 _OPEN = 0.4
 
@@ -104,8 +106,8 @@ class Given:
         """Of anything with vertices and faces, which may have no area.
 
         Corners apart by rounding are joined. Then each closed part that is inside out is turned
-        over, with all that lies in it; and all the rest, if that then winds around more points
-        clockwise than counter-clockwise.
+        over, with all that lies in it; and what is not closed and lies in none, with all that lies
+        in it, if it winds around more points clockwise than counter-clockwise.
 
         as_it_is: turn nothing over.
 
@@ -284,15 +286,39 @@ def _distance(point: FloatArray, corner: FloatArray) -> float:
 
 
 def _inside_out(x: FloatArray, faces: IntArray, parts: list[IntArray]) -> BoolArray:
-    """(m,) which faces to turn over for what was given not to be inside out. parts: closed ones."""
-    turned, is_closed = np.zeros(len(faces), np.bool_), np.zeros(len(faces), np.bool_)
-    volumes = [volume_of(x, faces[rows]) for rows in parts]
-    for rows, around in zip(parts, nested(x, [faces[rows] for rows in parts]), strict=True):
-        outermost = volumes[around[-1]] if around else volume_of(x, faces[rows])
-        is_closed[rows], turned[rows] = True, outermost < 0
-    if not is_closed.all() and _winds_clockwise(x, _turned(faces, turned)):
-        turned |= ~is_closed
+    """(m,) which faces to turn over for what was given not to be inside out. parts: closed ones.
+
+    A part is turned with the outermost one that it lies in. So is what is not closed; where that
+    lies in no part it is turned by itself, and parts that lie in it with it.
+    """
+    turned, is_rest = np.zeros(len(faces), np.bool_), np.ones(len(faces), np.bool_)
+    for rows in parts:
+        is_rest[rows] = False
+    rest = faces[is_rest]
+    closed = [faces[rows] for rows in parts]
+    volumes = [volume_of(x, one) for one in closed]
+    holds_rest = [_lies_in(x, rest, one) for one in closed]
+    is_with_rest = is_rest.copy()
+    for k, around in enumerate(nested(x, closed)):
+        outermost = around[-1] if around else k
+        if not any(holds_rest) and _lies_in(x, closed[outermost], rest):
+            is_with_rest[parts[k]] = True
+        else:
+            turned[parts[k]] = volumes[outermost] < 0
+    if any(holds_rest):
+        sizes = np.where(holds_rest, np.abs(volumes), 0)
+        turned[is_rest] = volumes[int(sizes.argmax())] < 0
+    elif len(rest) and _winds_clockwise(x, rest):
+        turned |= is_with_rest
     return turned
+
+
+def _lies_in(x: FloatArray, part: IntArray, around: IntArray) -> bool:
+    """Whether faces wind around all of some places of others."""
+    if not len(part) or not len(around):
+        return False
+    places = x[part[:: max(1, len(part) // _PLACES)]].mean(axis=1)
+    return bool((np.abs(_values(_winding_number(x, around), places)) > 0.5).all())
 
 
 def _winds_clockwise(x: FloatArray, faces: IntArray) -> bool:

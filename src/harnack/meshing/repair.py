@@ -142,9 +142,9 @@ def repair(
 
         If what was sound was kept: turned (how many triangles were turned over) and left_out, a
         dictionary: how many were "flat" (without an area), "doubled", "crossing", "branching" (at
-        edges of more than two), "one-sided" (at edges where no two sides can be told) or "around"
-        holes that could not be filled. Vertices at one place are joined. No triangles pass through
-        each other, and no part is inside out.
+        edges of more than two), "one-sided" (at edges where no two sides can be told), "around"
+        holes that could not be filled or "inside" the material of other parts. Vertices at one
+        place are joined. No triangles pass through each other, and no part is inside out.
 
         If corners were joined: the same, and joined (how many of the given triangles are there,
         with moved corners) and moved (how far the farthest corner went, a length); kept is 0.

@@ -24,7 +24,7 @@ from harnack.meshing.checks import (
     intersecting_faces,
     singular_vertices,
 )
-from harnack.meshing.clipping import turned_outwards
+from harnack.meshing.clipping import Shells, turned_outwards
 from harnack.meshing.edges import Edges, IntArray, boundary_edges, crosses, directed_edges, lengths
 from harnack.meshing.hole_patches import filled, hole_loops
 from harnack.meshing.lattice_surface import Surface
@@ -147,7 +147,7 @@ class _State:
         corner = vertices[joined]
         area = lengths(crosses(corner))
         rows = every[area > 0]
-        reasons = ("flat", "doubled", "crossing", "branching", "one-sided", "around")
+        reasons = ("flat", "doubled", "crossing", "branching", "one-sided", "around", "inside")
         counts = dict.fromkeys(reasons, 0) | {"flat": len(faces) - len(rows)}
         _, first = np.unique(np.sort(joined[rows], axis=1), axis=0, return_index=True)
         counts["doubled"] = len(rows) - len(first)
@@ -238,9 +238,17 @@ class _State:
         check_manifold(faces)
         inwards = turned_outwards(Surface(self.vertices, faces))
         faces = np.where(inwards[:, None], faces[:, ::-1], faces)
-        kept, turned = kept[kept >= 0], (self.is_turned[order] ^ inwards)[kept >= 0]
+        bounds = Shells.of(Surface(self.vertices, faces)).bound()
+        lost = int((kept[~bounds] >= 0).sum())
+        faces, kept, is_turned = (
+            faces[bounds],
+            kept[bounds],
+            (self.is_turned[order] ^ inwards)[bounds],
+        )
+        turned = kept[is_turned & (kept >= 0)]
         surface = Surface.of(self.vertices, faces)
-        return Mended(surface, kept, kept[turned], self.counts, holes)
+        counts = self.counts | {"inside": lost}
+        return Mended(surface, kept[kept >= 0], turned, counts, holes)
 
 
 def _pieces(edges: Edges, count: int) -> IntArray:
