@@ -137,6 +137,9 @@ def test_ends_of_ranges_that_are_no_number() -> None:
             (-0.45275336503982544, 0.022624239325523376, -1.755385160446167),
             (0.21221067011356354, -0.4286957383155823, 0.8781722784042358), "single", None,
         ),
+        # The pole is no surface; that is at z = 1, or nowhere.
+        ("(1/z)^3 = 1", (0, 0, -1), (0.1, 0, 1), "double", None),
+        ("((y^2 - x^2)/(2*z) + 1)^3 = 1", (0.3, 0.1, -1), (0.1, 0, 1), "double", None),
         # The values at y = 8.8e-8 hide the surface, which is 0.007 ahead.
         (
             "abs(x)^(1/3) + abs(y)^(1/3) + abs(z)^(1/3) = 1.2",

@@ -436,7 +436,7 @@ class March:
         ways = (along, length(sample.gradient)), (path.direction, look.slope)
         unsure = is_near & ~sure
         passed, looks = beyond(
-            self.backend, field, gaps, p, ways, sample.value, reach, may_be, unsure
+            self.backend, field, self.levels, gaps, p, ways, sample.value, reach, may_be, unsure
         )
         return is_near & (sure | passed), looks
 

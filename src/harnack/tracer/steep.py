@@ -135,9 +135,35 @@ class _Looking:
     least: Real
 
 
+def passes(levels: TargetLevels, value: Real, low: Real, high: Real, gaps: Gaps) -> Mask:
+    """Whether all numbers of a range are on the other side of a level than a value, or at it.
+
+    Compared with the level itself: beside a pole differences of values round it away, as 1e28 + 1.
+    gaps: from the value to the levels; they tell those of a ladder.
+    """
+    if levels.period is not None:
+        return (high - value <= -gaps.down) | (low - value >= gaps.up)
+    passed: Mask = value < value
+    for level in levels.values:
+        passed |= ((value < level) & (low >= level)) | ((value > level) & (high <= level))
+    return passed
+
+
+def holds(levels: TargetLevels, value: Real, low: Real, high: Real, gaps: Gaps) -> Mask:
+    """Whether a level lies in a range; see `passes`."""
+    if levels.period is not None:
+        held = (low - value <= -gaps.down) & (high - value >= -gaps.down)
+        return held | ((low - value <= gaps.up) & (high - value >= gaps.up))
+    held: Mask = value < value
+    for level in levels.values:
+        held |= (low <= level) & (high >= level)
+    return held
+
+
 def beyond(
     backend: Backend,
     field: Field,
+    levels: TargetLevels,
     gaps: Gaps,
     p: Vec3,
     ways: tuple[tuple[Vec3, Real], tuple[Vec3, Real]],
@@ -149,7 +175,7 @@ def beyond(
     """Whether f takes a level within `reach` of p, and how many evaluations of f that took.
 
     ways: two directions, each with the slope of f along it. value: f at p. gaps: from there to the
-        levels. searches: where it is worth a search, as a ray can come no nearer.
+        `levels`. searches: where it is worth a search, as a ray can come no nearer.
 
     Proof. At another point, at most `reach` away, f is on the other side of the level, and on the
     box around both it is continuous and has values everywhere: so it takes the level between them
@@ -183,20 +209,17 @@ def beyond(
         between = values_between(field, p, q)
         if around is None or between is None:
             with without_weaker():
-                rise = field.evaluate(q).value - value
-            passed = (rise <= -gaps.down) | (rise >= gaps.up)
-            left = dr.select(gaps.down < gaps.up, gaps.down + rise, gaps.up - rise)
+                low = high = field.evaluate(q).value
+            passed = passes(levels, value, low, high, gaps)
         else:
-            least, most = around.value.low - value, around.value.high - value
-            passed = (most <= -gaps.down) | (least >= gaps.up)
+            low, high = around.value.low, around.value.high
+            passed = passes(levels, value, low, high, gaps)
             passed &= ~(between.jumps | between.gaps | between.nowhere)
-            is_level = (least <= -gaps.down) & (most >= -gaps.down)
-            is_level |= (least <= gaps.up) & (most >= gaps.up)
-            passed |= is_level & ~(around.jumps | around.nowhere)
-            left = dr.select(gaps.down < gaps.up, gaps.down + least, gaps.up - most)
-        left = dr.select(dr.isfinite(left), left, dr.inf)
+            passed |= holds(levels, value, low, high, gaps) & ~(around.jumps | around.nowhere)
+        nearest = dr.select(gaps.down < gaps.up, gaps.down + low - value, gaps.up + value - high)
+        left = dr.select(dr.isfinite(nearest), nearest, dr.inf)
         now = _narrowed(now, distance, left, is_search & ~is_side)
-        passed = now.passed | passed
+        passed |= now.passed
         looks, sides = now.looks + 1, now.sides + dr.select(is_side, 1, 0)
         active = now.active & ~passed & ((looks < _TRIALS) | (searches & (sides < _SIDES)))
         return replace(now, looks=looks, sides=sides, passed=passed, active=active)
