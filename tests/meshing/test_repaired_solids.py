@@ -184,6 +184,20 @@ def test_halves_of_a_ball_along_a_zigzag() -> None:
     check_is(made, winding_sum(given.triangles), given.bounds)
 
 
+@pytest.mark.parametrize("first", ["top", "bottom"])
+def test_a_part_that_passes_through_a_face_along_its_edges(first: str) -> None:
+    """No edge passes through a triangle, so that all was kept, and the part in the box counted
+    twice: 1,010.67."""
+    ends = np.array([[2, 0, 0], [0, 2, 0], [-2, 0, 0], [0, -2, 0], [0, 0, 2], [0, 0, -2.0]])
+    top = [[k, (k + 1) % 4, 4] for k in range(4)]
+    bottom = [[(k + 1) % 4, k, 5] for k in range(4)]
+    octahedron = trimesh.Trimesh(ends, top + bottom if first == "top" else bottom + top)
+    given = together(box([10, 10, 10], (0, 0, -5)), octahedron)
+    assert repaired(given).volume == pytest.approx(1000 + octahedron.volume / 2)
+    apart = together(box([10, 10, 10], (0, 0, -7)), octahedron)  # a corner touches a face
+    assert repaired(apart).metadata["harnack"]["stage"] == "kept"
+
+
 # What finds it.
 
 
@@ -206,6 +220,19 @@ def test_a_difference_is_told() -> None:
     assert more.volumes == pytest.approx((2 * lost.volumes[0], lost.volumes[0]))
     # Within the length that is allowed nothing differs.
     assert given.difference(Surface(1.01 * two.vertices, np.asarray(two.faces)), 0.05) is None
+
+
+@pytest.mark.parametrize("sides", [[1.0, 1.0, 0.003], [0.01, 0.01, 0.01]])
+def test_parts_that_hold_no_other_points_are_missed(sides: Any) -> None:
+    """Made anew, with what else cannot be kept, they were lost without a word."""
+    rest, part = box([3, 3, 3]), box(sides, (4, 0, 0))
+    made = Surface(np.asarray(rest.vertices), np.asarray(rest.faces, np.int64))
+    difference = Given.of(together(rest, part)).difference(made, 4e-3)
+    assert difference is not None
+    assert (difference.missing, difference.added) == (12, 0)
+    cavity = Given.of(together(rest, inverted(box(sides, (0.2, 0, 0))))).difference(made, 4e-3)
+    assert cavity is not None
+    assert (cavity.missing, cavity.added) == (0, 12)
 
 
 def test_what_differs_is_said_if_nothing_better_is_found() -> None:

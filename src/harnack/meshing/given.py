@@ -35,9 +35,11 @@ _CLEARLY = 0.36
 _VOLUME = 0.01
 # A mesh winds counter-clockwise if cones to its middle hold that part of their volumes added up.
 _PLAINLY = 0.5
+# Points next to faces are so far from these, as a part of the size.
+_BESIDE = 1e-6
 # How many points that differ are looked at again, and listed.
 _LOOKED_AT, _LISTED = 40, 10
-# Places of what is closed that have to lie in what is not for all of it to do; and the reverse.
+# So many places of each closed part are looked at, to see where it lies and what became of it.
 _PLACES = 16
 # A mesh is an open sheet if this part of its area, or more, has nothing inside.
 _OPEN = 0.4
@@ -163,6 +165,21 @@ class Given:
         points = np.concatenate([box, _near(corner, self.size, rng)])
         return points, self.winding(points)
 
+    @functools.cached_property
+    def beside(self) -> tuple[FloatArray, FloatArray]:
+        """Points next to faces of closed parts, on both sides, and winding numbers there: the parts
+        may be so small or thin that no other points are in them."""
+        chosen = [self.oriented[part[:: max(1, len(part) // _PLACES)]] for part in self.parts]
+        if not chosen:
+            return np.zeros((0, 3)), np.zeros(0)
+        corner = self.vertices[np.concatenate(chosen)]
+        corner = corner[lengths(crosses(corner)) > 0]
+        normal = crosses(corner)
+        away = _BESIDE * self.size * normal / lengths(normal)[:, None]
+        middle = corner.mean(axis=1)
+        points = np.concatenate([middle - away, middle + away])
+        return points, self.winding(points)
+
     def check_encloses(self) -> None:
         """Raise if so much of the area has nothing inside, on neither side, that it is no solid.
 
@@ -185,26 +202,24 @@ class Given:
 
     def difference(self, surface: Surface, away: float) -> Difference | None:
         """How a closed surface differs from what was given, at points farther than `away` from
-        both; None if it does not."""
+        both, and next to closed parts and farther than that from the surface; None if it does not.
+        """
         points, w = self.samples
         corner = surface.vertices[surface.faces]
         more = _near(corner, self.size, np.random.default_rng(1))
         points, w = np.concatenate([points, more]), np.concatenate([w, self.winding(more)])
-        made = _values(_winding_number(surface.vertices, surface.faces), points) > 0.5
-        missing, added = ~made & (w > 0.5 + _CLEARLY), made & (w < 0.5 - _CLEARLY)
-        rows = np.flatnonzero(missing | added)
-        looked_at = rows[np.linspace(0, len(rows) - 1, min(len(rows), _LOOKED_AT)).astype(int)]
+        made = _winding_number(surface.vertices, surface.faces)
         both = np.concatenate([self.vertices[self.oriented], corner])
-        far = looked_at[[_distance(points[k], both) > away for k in looked_at]]
+        missing, added, far = _on_other_side(points, w, made, both, away)
+        beside, around = self.beside
+        lost, filled, there = _on_other_side(beside, around, made, corner, away)
+        far = np.concatenate([far, there])
         volumes = self._volumes(surface, away)
         if not len(far) and volumes is None:
             return None
-        if not len(far):
-            missing[:], added[:] = False, False
-        share = float((missing | added).mean())
-        return Difference(
-            share, points[far[:_LISTED]], int(missing.sum()), int(added.sum()), volumes
-        )
+        missing, added = missing + lost, added + filled
+        share = (missing + added) / (len(points) + len(beside))
+        return Difference(share, far[:_LISTED], missing, added, volumes)
 
     def _volumes(self, surface: Surface, away: float) -> tuple[float, float] | None:
         """Volumes of the surface and the mesh if they differ, of a closed one that winds around no
@@ -221,6 +236,26 @@ class Given:
         area = 0.5 * float(lengths(crosses(surface.vertices[surface.faces])).sum())
         allowed = max(_VOLUME * abs(given), away * area)
         return (made, given) if abs(made - given) > allowed else None
+
+
+def _on_other_side(
+    points: FloatArray,
+    w: FloatArray,
+    made: WindingNumber | None,
+    corner: FloatArray,
+    away: float,
+) -> tuple[int, int, FloatArray]:
+    """How many points with winding numbers w clearly above 1/2 are not inside of what was made; how
+    many clearly below are; and those of them that are farther than `away` from triangles (m, 3, 3),
+    of some that are looked at. If these are none, there are none."""
+    inside = _values(made, points) > 0.5
+    missing, added = ~inside & (w > 0.5 + _CLEARLY), inside & (w < 0.5 - _CLEARLY)
+    rows = np.flatnonzero(missing | added)
+    rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), _LOOKED_AT)).astype(int)]
+    far = rows[[_distance(points[k], corner) > away for k in rows]]
+    if not len(far):
+        return 0, 0, np.zeros((0, 3))
+    return int(missing.sum()), int(added.sum()), points[far]
 
 
 def _winding_number(x: FloatArray, faces: IntArray) -> WindingNumber | None:

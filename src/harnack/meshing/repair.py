@@ -31,7 +31,7 @@ from harnack.meshing.checks import (
     intersecting_faces,
     singular_vertices,
 )
-from harnack.meshing.clipping import Shells, largest_body, parts_of
+from harnack.meshing.clipping import Shells, largest_body, parts_of, pass_through
 from harnack.meshing.edges import IntArray
 from harnack.meshing.finishing import check_options
 from harnack.meshing.given import Difference, Given
@@ -513,13 +513,15 @@ def _kept_with(
 
 
 def _check_sides(surface: Surface) -> None:
-    """Raise if a part is inside out, or inside the material of another one."""
+    """Raise if a part is inside out, or inside the material of another one, also in part."""
     shells = Shells.of(surface)
     depths = shells.depths()
     if ((shells.volumes < 0) & (depths == 0)).any():
         raise MeshError("a part of the mesh is inside out")
     if ((shells.volumes > 0) & (depths > 0)).any():
         raise MeshError("a part of the mesh is inside the material of another one")
+    if pass_through(surface, shells):
+        raise MeshError("parts of the mesh pass through each other along edges that lie on faces")
 
 
 def _check_touching(faces: IntArray) -> None:

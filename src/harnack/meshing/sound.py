@@ -24,7 +24,7 @@ from harnack.meshing.checks import (
     intersecting_faces,
     singular_vertices,
 )
-from harnack.meshing.clipping import Shells, turned_outwards
+from harnack.meshing.clipping import Shells, pass_through, turned_outwards
 from harnack.meshing.edges import Edges, IntArray, boundary_edges, crosses, directed_edges, lengths
 from harnack.meshing.hole_patches import filled, hole_loops
 from harnack.meshing.lattice_surface import Surface
@@ -231,14 +231,22 @@ class _State:
         return self.chosen(~np.asarray(is_bad[self.faces].any(axis=1)), "around")
 
     def result(self, holes: int) -> Mended:
-        """The surface, with what was given first."""
+        """The surface, with what was given first.
+
+        Raises:
+            MeshingError: parts pass through each other.
+        """
         last = len(self.vertices) + len(self.origin)  # behind all that were given
         order = np.argsort(np.where(self.origin < 0, last, self.origin), kind="stable")
         faces, kept = self.faces[order], self.origin[order]
         check_manifold(faces)
         inwards = turned_outwards(Surface(self.vertices, faces))
         faces = np.where(inwards[:, None], faces[:, ::-1], faces)
-        bounds = Shells.of(Surface(self.vertices, faces)).bound()
+        whole = Surface(self.vertices, faces)
+        shells = Shells.of(whole)
+        if pass_through(whole, shells):
+            raise MeshingError("parts pass through each other along edges that lie on faces")
+        bounds = shells.bound()
         lost = int((kept[~bounds] >= 0).sum())
         faces, kept, is_turned = (
             faces[bounds],
