@@ -198,6 +198,22 @@ def test_a_part_that_passes_through_a_face_along_its_edges(first: str) -> None:
     assert repaired(apart).metadata["harnack"]["stage"] == "kept"
 
 
+def test_an_edge_on_a_face() -> None:
+    """A prism stands with an edge on the side of a box: triangles there passed through each other
+    by rounding, so that `mesh` raised an error, and `repair` made all anew."""
+    turns = 2 * np.pi * np.arange(5) / 5
+    base = np.column_stack([6 * np.cos(turns), 6 * np.sin(turns), np.zeros(5)])
+    prism = trimesh.Trimesh(np.concatenate([base, np.add(base, [0, 0, 4])])).convex_hull
+    corner = np.array([6 * np.cos(turns[1]), 6 * np.sin(turns[1]), 0])
+    prism.apply_translation(np.array([14, 18, 14]) / 3 - corner)
+    given = together(box([5, 4, 5], (5.5, 8, 9.5)), prism)
+    volume = 100 + prism.volume
+    made = repaired(given)
+    assert made.metadata["harnack"]["stage"] == "united"
+    assert made.volume == pytest.approx(volume, rel=1e-7)
+    assert hk.mesh(hk.solid(given)).volume == pytest.approx(volume, rel=1e-7)
+
+
 # What finds it.
 
 

@@ -10,9 +10,9 @@ import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
 from harnack.geometry import MeshError
-from harnack.meshing.checks import check_manifold, intersecting_faces
+from harnack.meshing.checks import CrossingError, check_manifold, intersecting_faces
 from harnack.meshing.clipping import winding_around
-from harnack.meshing.closed_mesh import manifold_of
+from harnack.meshing.closed_mesh import grown, manifold_of
 from harnack.meshing.edges import Edges, IntArray, crosses, directed_edges, dots, lengths
 from harnack.meshing.lattice_surface import Surface
 from harnack.meshing.solids import apart_of
@@ -32,6 +32,8 @@ _WITHIN = 1e-6
 _SAME_TURN = 1e-9
 # Parts of the size: faces that are nearer lie on each other, and are moved into each other by that.
 _ON, _INTO = 1e-12, 1e-8
+# Parts whose union crosses itself are grown by this part of the size.
+_GROWN = 1e-9
 
 
 def closed_parts(x: FloatArray, raw: IntArray, joined: IntArray) -> list[IntArray]:
@@ -164,7 +166,13 @@ def united_parts(x: FloatArray, faces: IntArray, parts: list[IntArray], within: 
         MeshingError: a part is no manifold; or nothing is left.
     """
     shells = [Surface.of(x, faces[rows]) for rows in parts]
-    return _united(_overlapping(shells), within)
+    shells = _overlapping(shells)
+    try:
+        return _united(shells, within)
+    except CrossingError:  # parts touch up to rounding, along an edge
+        size = _GROWN * float(np.ptp(x[faces], axis=(0, 1)).max())
+        signs = [math.copysign(1, volume_of(one.vertices, one.faces)) for one in shells]
+        return _united([grown(one, s * size) for one, s in zip(shells, signs, strict=True)], within)
 
 
 def _overlapping(shells: list[Surface]) -> list[Surface]:

@@ -32,6 +32,7 @@ __all__ = [
     "ClosedMesh",
     "box_manifold",
     "extruded_manifold",
+    "grown",
     "manifold_of",
     "mesh_manifold",
     "revolved_manifold",
@@ -41,8 +42,8 @@ __all__ = [
 ]
 
 _MOST_SEGMENTS = 2000
-# Parts of a union have its area up to this part of it. Else they are grown, by this part of the
-# size; at sharp corners by no more than some times that.
+# Parts of a union have its area up to this part of it. Else, and where triangles of it cross, they
+# are grown, by this part of the size; at sharp corners by no more than some times that.
 _SAME_AREA, _GROWN, _LEAST_SLANT = 1e-6, 1e-9, 0.1
 _MOST_CELLS = 1_000_000
 
@@ -71,8 +72,9 @@ def mesh_manifold(solid: MeshSolid) -> Manifold | None:
     """The mesh of a `MeshSolid`, itself: of one that crosses itself the union of its parts, or None
     where a part crosses itself, or is a cavity.
 
-    Parts in contact up to rounding would be left with gaps as thin as that, which have an area: if
-    the union has more than the boundary of the solid, parts are grown by next to nothing first.
+    Parts in contact up to rounding would be left with gaps as thin as that, which have an area, or
+    pass through each other: if the union has more than the boundary of the solid, or triangles of
+    it cross, parts are grown by next to nothing first.
 
     Raises:
         MeshingError: more than two faces meet at an edge.
@@ -94,25 +96,31 @@ def mesh_manifold(solid: MeshSolid) -> Manifold | None:
         made = surface_of(part)
         if part.volume() <= 0 or len(intersecting_faces(made.vertices, made.faces)):
             return None
+    found: Manifold | None = None
     for length in (0.0, _GROWN * surface.size):
         union = Manifold.batch_boolean([_grown(part, length) for part in parts], OpType.Add)
         if abs(union.surface_area() - surface.area) <= _SAME_AREA * surface.area:
-            return union
-    return None
+            found = found or union
+            made = surface_of(union)
+            if not len(intersecting_faces(made.vertices, made.faces)):
+                return union
+    return found
 
 
 def _grown(part: Manifold, length: float) -> Manifold:
-    """A part whose vertices are moved outwards so that faces are, by about a length."""
-    if length == 0:
-        return part
-    made = surface_of(part)
-    mesh = trimesh.Trimesh(made.vertices, made.faces, process=False)
+    return part if length == 0 else manifold_of(grown(surface_of(part), length))
+
+
+def grown(surface: Surface, length: float) -> Surface:
+    """A closed surface whose vertices are moved outwards so that faces are, by about a length.
+    Parts that touch, up to rounding, overlap then."""
+    x, faces = surface.vertices, surface.faces
+    mesh = trimesh.Trimesh(x, faces, process=False)
     way = np.array(mesh.vertex_normals)
     slant = np.ones(len(way))
     for k in range(3):
-        np.minimum.at(slant, made.faces[:, k], dots(way[made.faces[:, k]], mesh.face_normals))
-    away = way * (length / np.maximum(slant, _LEAST_SLANT))[:, None]
-    return manifold_of(Surface(made.vertices + away, made.faces))
+        np.minimum.at(slant, faces[:, k], dots(way[faces[:, k]], mesh.face_normals))
+    return Surface(x + way * (length / np.maximum(slant, _LEAST_SLANT))[:, None], faces)
 
 
 def without_short_edges(solid: Manifold, length: float) -> Manifold:
