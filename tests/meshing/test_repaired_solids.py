@@ -14,7 +14,7 @@ import trimesh
 import harnack as hk
 from harnack.geometry.mesh_shapes import icosphere
 from harnack.meshing.bodies import closed_parts
-from harnack.meshing.given import Given
+from harnack.meshing.intended_solid import IntendedSolid
 from harnack.meshing.lattice_surface import Surface
 from harnack.meshing.marching_tetrahedra import delaunay
 from tests.oracles.direct_sums import winding_sum
@@ -222,14 +222,14 @@ def test_a_difference_is_told() -> None:
     two = together(
         trimesh.Trimesh(vertices, faces), trimesh.Trimesh(np.add(vertices, [3, 0, 0]), faces)
     )
-    given = Given.of(two)
+    given = IntendedSolid.of(two)
     assert given.difference(Surface(two.vertices, np.asarray(two.faces)), 1e-3) is None
     lost = given.difference(Surface(vertices, faces), 1e-3)
     assert lost is not None
     assert (lost.missing > 300, lost.added) == (True, 0)
     assert (np.linalg.norm(lost.places - [3, 0, 0], axis=1) < 1).all()
     assert "such as near" in str(lost)
-    more = Given.of(trimesh.Trimesh(vertices, faces)).difference(
+    more = IntendedSolid.of(trimesh.Trimesh(vertices, faces)).difference(
         Surface(two.vertices, np.asarray(two.faces)), 1e-3
     )
     assert more is not None
@@ -243,10 +243,12 @@ def test_parts_that_hold_no_other_points_are_missed(sides: Any) -> None:
     """Made anew, with what else cannot be kept, they were lost without a word."""
     rest, part = box([3, 3, 3]), box(sides, (4, 0, 0))
     made = Surface(np.asarray(rest.vertices), np.asarray(rest.faces, np.int64))
-    difference = Given.of(together(rest, part)).difference(made, 4e-3)
+    difference = IntendedSolid.of(together(rest, part)).difference(made, 4e-3)
     assert difference is not None
     assert (difference.missing, difference.added) == (12, 0)
-    cavity = Given.of(together(rest, inverted(box(sides, (0.2, 0, 0))))).difference(made, 4e-3)
+    cavity = IntendedSolid.of(together(rest, inverted(box(sides, (0.2, 0, 0))))).difference(
+        made, 4e-3
+    )
     assert cavity is not None
     assert (cavity.missing, cavity.added) == (0, 12)
 

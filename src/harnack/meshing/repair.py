@@ -34,9 +34,9 @@ from harnack.meshing.checks import (
 from harnack.meshing.clipping import Shells, largest_body, parts_of, pass_through
 from harnack.meshing.edges import IntArray
 from harnack.meshing.finishing import check_options
-from harnack.meshing.given import Difference, Given
 from harnack.meshing.harmonic_patches import Asked, HarmonicPatches, harmonic_patches, open_edges
 from harnack.meshing.hole_patches import filled, hole_loops
+from harnack.meshing.intended_solid import Difference, IntendedSolid
 from harnack.meshing.lattice_surface import Surface
 from harnack.meshing.mesh import mesh as mesh_of
 from harnack.meshing.sound import Mended, joined, mended
@@ -165,7 +165,7 @@ def repair(
     asked = _checked_settings(keep, patches, tolerance, spacing, seed, teller(progress))
     _check_is_mesh(mesh)
     _check_encloses(mesh)
-    given = Given.of(mesh, as_it_is=keep == "all")
+    intended = IntendedSolid.of(mesh, as_it_is=keep == "all")
     stages = {
         "all": _kept, "united": _united, "sound": _sound, "joined": _joined, "none": _anew,
     }  # fmt: skip
@@ -173,7 +173,7 @@ def repair(
     reasons, results = list[str](), list[_Result]()
     for name in names:
         try:
-            surface, facts = stages[name](given, asked)
+            surface, facts = stages[name](intended, asked)
         except (MeshError, MeshingError) as error:
             if name == names[-1] and not results:
                 raise
@@ -181,8 +181,8 @@ def repair(
             asked.report(f"{error}; so not all is kept")
             continue
         asked.report("comparing with what was given")
-        away = 2 * tolerance * given.size + facts.get("moved", 0.0)
-        results.append(_Result(surface, facts, given.difference(surface, away)))
+        away = 2 * tolerance * intended.size + facts.get("moved", 0.0)
+        results.append(_Result(surface, facts, intended.difference(surface, away)))
         if results[-1].difference is None:
             break
         reasons.append(f"the result of {facts['stage']} is another solid: {results[-1].difference}")
@@ -190,7 +190,7 @@ def repair(
     best = min(results, key=lambda one: 0.0 if one.difference is None else one.difference.badness)
     # Each reason once.
     why = "; ".join(dict.fromkeys(one for one in reasons)) or None
-    return best.finished({"why": why, "welded": given.rounded}, largest)
+    return best.finished({"why": why, "welded": intended.rounded}, largest)
 
 
 @dataclass(frozen=True)
@@ -297,24 +297,24 @@ def _check_encloses(mesh: Any) -> None:
 # Bodies united.
 
 
-def _united(given: Given, asked: _Asked) -> tuple[Surface, dict[str, Any]]:
+def _united(intended: IntendedSolid, asked: _Asked) -> tuple[Surface, dict[str, Any]]:
     """The boundary of the solid that a closed mesh bounds which passes through itself, or of parts
     that touch.
 
     Raises:
         MeshError, MeshingError: as `repair`.
     """
-    vertices, faces = given.vertices, given.oriented
+    vertices, faces = intended.vertices, intended.oriented
     if len(singular_edges(faces)[0]):
         raise MeshError("the mesh is not closed")
     if _is_fine(vertices, faces):
         raise MeshError("nothing of it passes through or lies in itself")
     facts = {"stage": "united", "kept": 0}
-    if len(given.parts) > 1 and sum(map(len, given.parts)) == len(faces):
-        asked.report(f"uniting {len(given.parts):,} parts")
+    if len(intended.parts) > 1 and sum(map(len, intended.parts)) == len(faces):
+        asked.report(f"uniting {len(intended.parts):,} parts")
         try:
-            slivers = 0.5 * asked.tolerance * given.size
-            return united_parts(vertices, faces, given.parts, slivers), facts
+            slivers = 0.5 * asked.tolerance * intended.size
+            return united_parts(vertices, faces, intended.parts, slivers), facts
         except (MeshError, MeshingError) as error:
             asked.report(f"{error}; so all at once")
     made = mesh_of(MeshSolid(vertices, faces), progress=asked.report)
@@ -333,10 +333,10 @@ def _is_fine(vertices: FloatArray, faces: IntArray) -> bool:
 # All made anew.
 
 
-def _anew(given: Given, asked: _Asked) -> tuple[Surface, dict[str, Any]]:
+def _anew(intended: IntendedSolid, asked: _Asked) -> tuple[Surface, dict[str, Any]]:
     """The surface on which the winding number is 1/2, closed whatever the mesh is."""
-    given.check_encloses()
-    corners = without_zero_area_faces(given.vertices, given.oriented)
+    intended.check_encloses()
+    corners = without_zero_area_faces(intended.vertices, intended.oriented)
     field = WindingNumber(*corners)
     if asked.spacing is not None:
         made = _by_signs(field, asked.spacing, asked)
@@ -373,20 +373,20 @@ def _by_signs(
 # What is sound kept.
 
 
-def _sound(given: Given, asked: _Asked) -> tuple[Surface, dict[str, Any]]:
+def _sound(intended: IntendedSolid, asked: _Asked) -> tuple[Surface, dict[str, Any]]:
     """The triangles that are sound, with patches.
 
     Raises:
         MeshError, MeshingError: as `repair`.
     """
-    vertices, faces = without_zero_area_faces(given.vertices, given.faces)
+    vertices, faces = without_zero_area_faces(intended.vertices, intended.faces)
     made = mended(vertices, faces, asked.report)
-    flat = len(given.faces) - len(faces)
+    flat = len(intended.faces) - len(faces)
     left_out = {"flat": made.left_out["flat"] + flat}
     return made.surface, {
         "stage": "sound",
         "kept": len(made.kept),
-        "turned": _count_turned(given, made),
+        "turned": _count_turned(intended, made),
         "left_out": made.left_out | left_out,
         "holes": made.holes,
         "patches": len(made.surface.faces) - len(made.kept),
@@ -394,9 +394,9 @@ def _sound(given: Given, asked: _Asked) -> tuple[Surface, dict[str, Any]]:
     }
 
 
-def _count_turned(given: Given, made: Mended) -> int:
+def _count_turned(intended: IntendedSolid, made: Mended) -> int:
     """How many of the triangles that were kept run the other way than those that were given."""
-    area = np.delete(given.is_turned, zero_area_faces(given.vertices, given.faces))
+    area = np.delete(intended.is_turned, zero_area_faces(intended.vertices, intended.faces))
     is_turned = np.zeros(len(area), np.bool_)
     is_turned[made.turned] = True
     return int((is_turned ^ area)[made.kept].sum())
@@ -405,13 +405,13 @@ def _count_turned(given: Given, made: Mended) -> int:
 # Loose triangles joined.
 
 
-def _joined(given: Given, asked: _Asked) -> tuple[Surface, dict[str, Any]]:
+def _joined(intended: IntendedSolid, asked: _Asked) -> tuple[Surface, dict[str, Any]]:
     """Triangles with near corners joined, with patches; none is kept bit by bit.
 
     Raises:
         MeshError, MeshingError: as `repair`.
     """
-    corners = without_zero_area_faces(given.vertices, given.faces)
+    corners = without_zero_area_faces(intended.vertices, intended.faces)
     vertices, faces, moved = joined(*corners)
     made = mended(vertices, faces, asked.report)
     count = len(made.kept)
@@ -421,7 +421,7 @@ def _joined(given: Given, asked: _Asked) -> tuple[Surface, dict[str, Any]]:
         "joined": count,
         "moved": moved,
         "turned": len(made.turned),
-        "left_out": made.left_out | {"flat": len(given.faces) - len(faces)},
+        "left_out": made.left_out | {"flat": len(intended.faces) - len(faces)},
         "holes": made.holes,
         "patches": len(made.surface.faces) - count,
         "harmonic": 0,
@@ -431,14 +431,14 @@ def _joined(given: Given, asked: _Asked) -> tuple[Surface, dict[str, Any]]:
 # All kept.
 
 
-def _kept(given: Given, asked: _Asked) -> tuple[Surface, dict[str, Any]]:
+def _kept(intended: IntendedSolid, asked: _Asked) -> tuple[Surface, dict[str, Any]]:
     """The mesh with patches; all its triangles stay.
 
     Raises:
         MeshError, MeshingError: as `repair`.
     """
-    vertices, faces = _checked(given)
-    if given.is_turned.any():
+    vertices, faces = _checked(intended)
+    if intended.is_turned.any():
         raise MeshError("a part of the mesh is inside out")
     edges = open_edges(faces)
     if asked.keep is None and len(crossing := intersecting_faces(vertices, faces)):
@@ -454,9 +454,9 @@ def _kept(given: Given, asked: _Asked) -> tuple[Surface, dict[str, Any]]:
     return _kept_with(vertices, faces, loops, dataclasses.replace(asked, patches="harmonic"))
 
 
-def _checked(given: Given) -> tuple[FloatArray, IntArray]:
+def _checked(intended: IntendedSolid) -> tuple[FloatArray, IntArray]:
     """Vertices and faces of a mesh all of which can be kept."""
-    vertices, faces = validate_mesh(given.vertices, given.faces)
+    vertices, faces = validate_mesh(intended.vertices, intended.faces)
     used = np.unique(faces)
     welded = weld_vertices(vertices[used])
     twice = np.flatnonzero(welded != np.arange(len(used)))

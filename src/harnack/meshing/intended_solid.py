@@ -23,7 +23,7 @@ from harnack.meshing.edges import IntArray, crosses, dots, lengths
 from harnack.meshing.lattice_surface import Surface
 from harnack.meshing.sound import against_neighbors
 
-__all__ = ["Difference", "Given"]
+__all__ = ["Difference", "IntendedSolid"]
 
 # Points at which winding numbers are compared: in the box around the mesh, and near each surface.
 _IN_BOX, _NEAR = 2000, 1000
@@ -66,8 +66,8 @@ class Difference:
         """Of two surfaces that which has less of it is nearer to what was given."""
         off = 0.0
         if self.volumes is not None:
-            made, given = self.volumes
-            off = abs(made - given) / abs(given)
+            new, intended = self.volumes
+            off = abs(new - intended) / abs(intended)
         return self.share + off
 
     def __str__(self) -> str:
@@ -87,7 +87,7 @@ class Difference:
 
 
 @dataclass(frozen=True)
-class Given:
+class IntendedSolid:
     """A mesh whose corners are joined and that is not inside out.
 
     vertices: (n, 3). faces: (m, 3); is_turned: (m,) which of them were turned over.
@@ -104,7 +104,7 @@ class Given:
     rounded: int
 
     @classmethod
-    def of(cls, mesh: Any, *, as_it_is: bool = False) -> Given:
+    def of(cls, mesh: Any, *, as_it_is: bool = False) -> IntendedSolid:
         """Of anything with vertices and faces, which may have no area.
 
         Corners apart by rounding are joined. Then each closed part that is inside out is turned
@@ -229,13 +229,13 @@ class Given:
             return None
         if (w > 1.5).any() or (w < -0.5).any():
             return None
-        made, given = (
+        new, intended = (
             volume_of(surface.vertices, surface.faces),
             volume_of(self.vertices, self.oriented),
         )
         area = 0.5 * float(lengths(crosses(surface.vertices[surface.faces])).sum())
-        allowed = max(_VOLUME * abs(given), away * area)
-        return (made, given) if abs(made - given) > allowed else None
+        allowed = max(_VOLUME * abs(intended), away * area)
+        return (new, intended) if abs(new - intended) > allowed else None
 
 
 def _on_other_side(
