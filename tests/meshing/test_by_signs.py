@@ -95,11 +95,13 @@ def boxes(*ends: tuple[tuple[int, ...], tuple[int, ...]]) -> hk.WindingNumber:
 @pytest.mark.parametrize(
     ("parts", "volume"),
     [
-        (boxes(((0, 0, 0), (30, 20, 10))), 6000),
-        (boxes(((0, 0, 0), (30, 20, 10)), ((5, 5, 10), (15, 15, 35))), 8500),
+        pytest.param(boxes(((0, 0, 0), (30, 20, 10))), 6000, id="plate"),
+        pytest.param(
+            boxes(((0, 0, 0), (30, 20, 10)), ((5, 5, 10), (15, 15, 35))), 8500,
+            id="box on it", marks=pytest.mark.slow,
+        ),
     ],
-    ids=["plate", "box on it"],
-)
+)  # fmt: skip
 def test_flat_parts_and_parts_in_contact(parts: hk.WindingNumber, volume: float) -> None:
     """Their faces are planes of coordinates, in which every sign is as good as the other."""
     made = hk.mesh(parts, tolerance=4e-3, spacing=1.5)
