@@ -21,7 +21,8 @@ FIELDS: dict[str, hk.Field] = {
     "gyroid": hk.Gyroid(),
     "mesh": hk.WindingNumber(VERTICES, FACES[np.arange(len(FACES)) % 3 > 0]),
     "tree": hk.WindingNumber(VERTICES, FACES[np.arange(len(FACES)) % 3 > 0], method="tree"),
-    "cloud": hk.DipolePotential(VERTICES, VERTICES),
+    # Gradients are right by themselves, values as far as they are asked to be.
+    "cloud": hk.DipolePotential(VERTICES, VERTICES, accuracy=50),
     "screened": hk.ScreenedWindingNumber(VERTICES, VERTICES, length=1.0),
 }
 POINTS = np.array([[0.3, 0.2, 0.5], [0.1, -0.4, 0.25], [-0.6, 0.2, -0.3], [1.4, 0.3, 0.2]])

@@ -456,7 +456,7 @@ def test_formats_whose_packages_lack_are_refused_early(
         (["--ball", "1,2"], "4 numbers"),
         (["--thickness", "0"], "positive"),
         (["--max-triangles", "1000"], "--max-triangles"),
-        (["--max-triangles", "0"], "--max-triangles must be positive"),
+        (["--max-triangles", "0"], "--max-triangles must be an integer"),
         (["--box=0,0,0,1,1,1", "--ball=0,0,0,1"], "not allowed"),
     ],
 )

@@ -57,7 +57,7 @@ JUMPS = {
     "inverse power": (lambda x, y, z: hk.tanh((x - y + 0.1 * z) ** -3.0), (1, -1, 0.1), 0.0),
     "tangent": (lambda x, y, z: hk.atan(hk.tan(x + y + z)), (1, 1, 1), ALONG),
     "logarithm": (
-        lambda x, y, z: hk.atan(hk.log(abs(x - y)) * (x - y) / abs(x - y)) + 5, (1, -1, 0), 0.0,
+        lambda x, y, z: hk.atan(hk.log(abs(x - y)) * (x - y) / abs(x - y)) + 1, (1, -1, 0), 0.0,
     ),
 }  # fmt: skip
 

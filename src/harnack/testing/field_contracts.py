@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import drjit as dr
@@ -9,7 +10,7 @@ import numpy as np
 
 from harnack.backend import FloatArray, choose_backend, to_numpy, to_vector3
 from harnack.backend.arrays import finite_vectors
-from harnack.backend.numbers import whole
+from harnack.backend.numbers import real, whole
 from harnack.enclosures import (
     Choice,
     Curvature,
@@ -35,11 +36,8 @@ from harnack.testing.worst_places import (
     require,
     search_worst_places,
 )
-from harnack.tracer import level_set
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from harnack.backend import Precision
     from harnack.enclosures import Promise
 
@@ -181,7 +179,8 @@ def check_field(
                 "where it promises nothing; give points inside"
             )
         points = points[inside]
-    levels = level_set(field, levels).numbers
+    several = levels if isinstance(levels, Sequence | np.ndarray) else (levels,)
+    levels = [real(field.default_level if one is None else one, "levels") for one in several]
     look = look_at(field, points)
     _check_numbers(field, points, look)
     check_derivatives(field, points, look)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from harnack.backend import FloatArray
+from harnack.backend import BoolArray, FloatArray
 
 if TYPE_CHECKING:
     from harnack.fields.solid_angles.winding_mesh import WindingMesh
@@ -26,6 +26,9 @@ __all__ = ["lies_on_own_level"]
 # Of the mesh's size: vertices are on the surface within this, the rounding of single precision and
 # of decimals in files. A box of this height without a bottom is such a sheet.
 _ON_SURFACE = 1e-5
+# Where all vertices are on the boundary, w at centers of triangles is the level up to this: beside
+# a thin triangle w is so steep that every surface is near it.
+_ROUNDING = 1e-7
 # Centers of triangles are within this part of the longest edge; those that `mesh` makes within a
 # twentieth.
 _FLAT = 0.1
@@ -44,11 +47,12 @@ def lies_on_own_level(mesh: WindingMesh, level: float) -> bool:
     """Whether the triangles of an open mesh lie on the surface that spans its boundary, with this
     level of w modulo 1, and are the points at which w jumps from the level by one.
 
-    Looked at and not proved: vertices that are not on the boundary, or if there are none the
-    centers of triangles, are on that surface within the rounding of files, in first order, but for
-    one in a hundred; centers within a part of the triangles' edges. Then it is all of the surface:
-    of each edge of the boundary, which is that of one triangle, one sheet of it begins, and every
-    part of it ends there (a harmonic function has no closed level set but about its poles).
+    Looked at and not proved: vertices that are not on the boundary are on that surface within the
+    rounding of files, in first order, but for one in a hundred; if there are none, w has the level
+    at centers of triangles, up to rounding; centers are within a part of the triangles' edges. Then
+    it is all of the surface: of each edge of the boundary, which is that of one triangle, one sheet
+    of it begins, and every part of it ends there (a harmonic function has no closed level set but
+    about its poles).
     """
     if not len(mesh.singular) or (mesh.multiplicity != 1).any():
         return False
@@ -58,16 +62,20 @@ def lies_on_own_level(mesh: WindingMesh, level: float) -> bool:
     x = mesh.unit_vertices
     edges = x[mesh.singular]
     corners = mesh.corners
-    points = x[inner] if inner.any() else corners.mean(axis=1)
-    points = _some(points, _MOST)
-    on_surface = 2 * _ON_SURFACE  # in units in which the mesh has a size of one to two
-    if not (_distances(edges, points[:_FIRST], level) < on_surface).all():
-        return False
-    if np.mean(_distances(edges, points, level) < on_surface) < _NEARLY_ALL:
+    is_filled = inner.any()
+    points = _some(x[inner] if is_filled else corners.mean(axis=1), _MOST)
+    # In units in which the mesh has a size of one to two.
+    most = 2 * _ON_SURFACE if is_filled else _ROUNDING
+
+    def is_on(some: FloatArray) -> BoolArray:
+        gap, distance = _offsets(edges, some, level)
+        return (distance if is_filled else gap) < most
+
+    if not is_on(points[:_FIRST]).all() or np.mean(is_on(points)) < _NEARLY_ALL:
         return False
     corners = _some(corners, _MOST)
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
-    far = _distances(edges, corners.mean(axis=1), level)
+    _, far = _offsets(edges, corners.mean(axis=1), level)
     if np.mean(far < _FLAT * longest) < _NEARLY_ALL:
         return False
     # The mean of w on both sides, which are the level and one more or less than it.
@@ -80,10 +88,12 @@ def _some(rows: FloatArray, most: int) -> FloatArray:
     return rows[:: -(-len(rows) // most)]
 
 
-def _distances(edges: FloatArray, points: FloatArray, level: float) -> FloatArray:
-    """(n,) how far points are from the surface that spans closed edges (k, 2, 3), by the slope of
-    their solid angle: the sum of those of triangles from each edge to an apex far away."""
-    found: list[FloatArray] = []
+def _offsets(edges: FloatArray, points: FloatArray, level: float) -> tuple[FloatArray, FloatArray]:
+    """By how much w modulo 1 at points (n, 3) differs from a level, and how far they are from the
+    surface that spans closed edges (k, 2, 3), by the slope of their solid angle: the sum of those
+    of triangles from each edge to an apex far away."""
+    gaps: list[FloatArray] = []
+    slopes: list[FloatArray] = []
     step = max(1, _AT_ONCE // len(edges))
     for first in range(0, len(points), step):
         here = points[first : first + step, None]
@@ -96,9 +106,10 @@ def _distances(edges: FloatArray, points: FloatArray, level: float) -> FloatArra
         with np.errstate(divide="ignore", invalid="ignore"):  # on an edge it has no slope
             rates = ((a + b) / (a * b * cosine))[:, :, None] * normal
         gap: FloatArray = turn.sum(axis=1) / (4 * math.pi) - level
-        slope = np.linalg.norm(rates.sum(axis=1), axis=1) / (4 * math.pi)
-        found.append(np.abs(gap - np.round(gap)) / np.maximum(slope, 1e-300))
-    return np.concatenate(found)
+        gaps.append(np.abs(gap - np.round(gap)))
+        slopes.append(np.linalg.norm(rates.sum(axis=1), axis=1) / (4 * math.pi))
+    gap = np.concatenate(gaps)
+    return gap, gap / np.maximum(np.concatenate(slopes), 1e-300)
 
 
 def _mean_winding(corners: FloatArray, point: FloatArray) -> float:
