@@ -53,9 +53,10 @@ class Tolerance:
     (`Field.is_steep`), that is no length. There a point is a hit only if f is proved to take the
     level within the tolerance, by its slope ahead or by its values beyond, or up to the rounding of
     the point. At creases |grad f| jumps but has a bound: a crease that stays off the level counts
-    as a hit where it comes as near to it in value. Of fields that are no formulas and have poles,
-    such as clouds of dipoles, rays that pass a pole within the tolerance count as hits of every
-    level.
+    as a hit where it comes as near to it in value. So do spikes and steps that are narrower than
+    the tolerance, as those of tanh(1e6 x) - y and of 0.5 + exp(-(1e5 x)^2). Of fields that are no
+    formulas and have poles, such as clouds of dipoles, rays that pass a pole within the tolerance
+    count as hits of every level.
 
     Where rounding leaves the distance to the level less certain than this, that uncertainty is
     the tolerance: about 1e-6 of the coordinates' size in single precision, 1e-15 in double.
