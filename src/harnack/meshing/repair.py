@@ -147,7 +147,8 @@ def repair(
         place are joined. No triangles pass through each other, and no part is inside out.
 
         If corners were joined: the same, and joined (how many of the given triangles are there,
-        with moved corners) and moved (how far the farthest corner went, a length); kept is 0.
+        with moved corners) and moved (how far the farthest corner went, a length); kept is 0. A
+        warning says so where that is more than two tolerances.
 
         If all was made anew, no triangles pass through each other, and there is what `mesh` says of
         meshes by signs, such as far and within; kept is 0.
@@ -188,6 +189,13 @@ def repair(
         reasons.append(f"the result of {facts['stage']} is another solid: {results[-1].difference}")
         asked.report(f"{reasons[-1]}; so another way")
     best = min(results, key=lambda one: 0.0 if one.difference is None else one.difference.badness)
+    moved = best.facts.get("moved", 0.0)
+    if moved > 2 * tolerance * intended.size:
+        warnings.warn(
+            f"faces that were apart were joined, which moved corners by up to {moved:.3g}: the "
+            "repaired mesh may be off by as much",
+            stacklevel=2,
+        )
     # Each reason once.
     why = "; ".join(dict.fromkeys(one for one in reasons)) or None
     return best.finished({"why": why, "welded": intended.rounded}, largest)
