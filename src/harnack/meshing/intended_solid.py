@@ -19,7 +19,7 @@ from harnack.fields.solid_angles.winding_number import WindingNumber
 from harnack.geometry import MeshError, validate_mesh, without_zero_area_faces
 from harnack.geometry.welding import Welded
 from harnack.meshing.bodies import closed_parts, nested, volume_of
-from harnack.meshing.edges import IntArray, crosses, dots, lengths
+from harnack.meshing.edges import IntArray, crosses, distance_from_triangles, dots, lengths
 from harnack.meshing.lattice_surface import Surface
 from harnack.meshing.sound import against_neighbors
 
@@ -252,7 +252,7 @@ def _on_other_side(
     missing, added = ~inside & (w > 0.5 + _CLEARLY), inside & (w < 0.5 - _CLEARLY)
     rows = np.flatnonzero(missing | added)
     rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), _LOOKED_AT)).astype(int)]
-    far = rows[[_distance(points[k], corner) > away for k in rows]]
+    far = rows[[distance_from_triangles(points[k], corner) > away for k in rows]]
     if not len(far):
         return 0, 0, np.zeros((0, 3))
     return int(missing.sum()), int(added.sum()), points[far]
@@ -297,24 +297,6 @@ def _near(corner: FloatArray, size: float, rng: np.random.Generator) -> FloatArr
     heights = size * np.exp(rng.uniform(math.log(_NEAREST), math.log(_FARTHEST), len(points)))
     heights *= rng.choice((-1.0, 1.0), len(points))
     return points + heights[:, None] * normals
-
-
-def _distance(point: FloatArray, corner: FloatArray) -> float:
-    """The distance of a point from the nearest of some triangles (m, 3, 3)."""
-    least = np.inf
-    for k in range(3):
-        start, way = corner[:, k], corner[:, k - 1] - corner[:, k]
-        share = np.clip(dots(point - start, way) / np.maximum(dots(way, way), 1e-300), 0, 1)
-        least = min(least, float(lengths(point - start - share[:, None] * way).min()))
-    normal = crosses(corner)
-    steep = np.maximum(lengths(normal), 1e-300)
-    height = dots(point - corner[:, 0], normal) / steep
-    foot = point - (height / steep)[:, None] * normal
-    is_within = np.ones(len(corner), np.bool_)
-    for k in range(3):
-        side = np.cross(corner[:, (k + 1) % 3] - corner[:, k], foot - corner[:, k])
-        is_within &= dots(side, normal) >= 0
-    return min(least, float(np.abs(height[is_within]).min(initial=np.inf)))
 
 
 # Parts that are inside out.

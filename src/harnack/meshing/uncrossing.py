@@ -21,8 +21,8 @@ from harnack.meshing.edges import (
     IntArray,
     crosses,
     directed_edges,
+    distance_from_triangles,
     distinct,
-    dots,
     edge_keys,
     lengths,
 )
@@ -220,7 +220,7 @@ def _changes(
         for one, other in ((a, b), (b, a)):
             change = patch.contracted(one, other)
             if change is not None and _looks_onward(patch, *change):
-                moved = _distance(patch.vertices[one], patch.vertices[change[1]])
+                moved = distance_from_triangles(patch.vertices[one], patch.vertices[change[1]])
                 if moved <= length:
                     yield moved, *change
         change = patch.flipped(a, b)
@@ -238,26 +238,6 @@ def _looks_onward(patch: _Patch, gone: IntArray, new: IntArray) -> bool:
     mean = old.sum(axis=0)
     most = float(lengths(old).sum())
     return bool(((made @ mean > 0) | (lengths(made) <= _NOTHING * most)).all())
-
-
-def _distance(point: FloatArray, corner: FloatArray) -> float:
-    """The distance (at most) of a point from triangles (k, 3, 3): from planes where its foot is
-    within the triangle, and from edges."""
-    least = np.inf
-    for k in range(3):
-        start, way = corner[:, k], corner[:, k - 1] - corner[:, k]
-        share = dots(point - start, way) / np.maximum(dots(way, way), 1e-300)
-        foot = start + np.clip(share, 0, 1)[:, None] * way
-        least = min(least, float(lengths(point - foot).min(initial=np.inf)))
-    normal = crosses(corner)
-    size = np.maximum(lengths(normal), 1e-300)
-    height = dots(point - corner[:, 0], normal) / size
-    foot = point - (height / size)[:, None] * normal
-    is_within = np.ones(len(corner), np.bool_)
-    for k in range(3):
-        side = np.cross(corner[:, (k + 1) % 3] - corner[:, k], foot - corner[:, k])
-        is_within &= dots(side, normal) >= 0
-    return min(least, float(np.abs(height[is_within]).min(initial=np.inf)))
 
 
 def _between(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> float:
