@@ -1,4 +1,4 @@
-"""Triangle meshes: what is accepted, and faces without an area.
+"""Triangle meshes: what is accepted, faces without an area, and solid angles of triangles.
 
 A mesh is an array (n, 3) of vertices and an array (m, 3) of faces, indices of vertices counted from
 0. The positive side of a face is the one from which its vertices run counter-clockwise. A mesh may
@@ -26,6 +26,7 @@ from harnack.backend.numbers import (
 
 __all__ = [
     "MeshError",
+    "solid_angles",
     "validate_mesh",
     "without_zero_area_faces",
     "zero_area_faces",
@@ -105,6 +106,17 @@ def without_zero_area_faces(
     x.setflags(write=False)
     kept.setflags(write=False)
     return x, kept
+
+
+def solid_angles(corners: FloatArray, point: FloatArray) -> FloatArray:
+    """(m,) solid angles of triangles (m, 3, 3) as seen from a point (3,) (Van Oosterom and Strackee
+    1983), between -2 pi and 2 pi: positive as seen from the negative side of a triangle. Added up
+    over a mesh and divided by 4 pi they are its winding number."""
+    a, b, c = (corners[:, k] - point for k in range(3))
+    x, y, z = (np.sqrt(np.einsum("ij,ij->i", side, side)) for side in (a, b, c))
+    ab, bc, ca = (np.einsum("ij,ij->i", p, q) for p, q in ((a, b), (b, c), (c, a)))
+    below = x * y * z + ab * z + bc * x + ca * y
+    return 2 * np.arctan2(np.einsum("ij,ij->i", a, np.cross(b, c)), below)
 
 
 def _checked_arrays(vertices: Any, faces: Any) -> tuple[FloatArray, IntArray]:

@@ -13,9 +13,17 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import FloatArray
-from harnack.geometry import Ball, Box, ConvexHull, HalfSpace, Intersection, Volume
+from harnack.geometry import (
+    Ball,
+    Box,
+    ConvexHull,
+    HalfSpace,
+    Intersection,
+    Volume,
+    solid_angles,
+)
 from harnack.meshing.checks import MeshingError, touching_pairs
-from harnack.meshing.edges import IntArray, boundary_edges, crosses, dots, edge_keys, lengths
+from harnack.meshing.edges import IntArray, boundary_edges, crosses, dots, edge_keys
 from harnack.meshing.lattice_surface import Surface
 
 __all__ = [
@@ -201,12 +209,8 @@ def _parts(surface: Surface) -> IntArray:
 
 
 def winding_around(corner: FloatArray, point: FloatArray) -> float:
-    """The winding number around a point of triangles (m, 3, 3), by their solid angles (Van Oosterom
-    and Strackee 1983)."""
-    a, b, c = (corner[:, k] - point for k in range(3))
-    x, y, z = lengths(a), lengths(b), lengths(c)
-    below = x * y * z + dots(a, b) * z + dots(b, c) * x + dots(c, a) * y
-    return float(np.arctan2(dots(a, np.cross(b, c)), below).sum()) / (2 * math.pi)
+    """The winding number around a point of triangles (m, 3, 3)."""
+    return float(solid_angles(corner, point).sum()) / (4 * math.pi)
 
 
 # Surfaces cut by volumes.

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
+from harnack.geometry import solid_angles
 
 if TYPE_CHECKING:
     from harnack.fields.solid_angles.winding_mesh import WindingMesh
@@ -113,10 +114,8 @@ def _offsets(edges: FloatArray, points: FloatArray, level: float) -> tuple[Float
 
 
 def _mean_winding(corners: FloatArray, point: FloatArray) -> float:
-    """The mean of the winding numbers on both sides of a mesh (m, 3, 3) at a point of it, by the
-    solid angles of all triangles but those that it lies on (Van Oosterom and Strackee 1983)."""
-    a, b, c = (corners[:, k] - point for k in range(3))
-    x, y, z = (np.linalg.norm(one, axis=1) for one in (a, b, c))
-    below = x * y * z + (a * b).sum(axis=1) * z + (b * c).sum(axis=1) * x + (c * a).sum(axis=1) * y
-    half = np.arctan2((a * np.cross(b, c)).sum(axis=1), below)
-    return float(half[np.abs(half) < math.pi - _ON_SURFACE].sum()) / (2 * math.pi)
+    """The mean of the winding numbers on both sides of a mesh (m, 3, 3) at a point of it: that of
+    all triangles but those that it lies on, which fill half of all directions."""
+    angles = solid_angles(corners, point)
+    is_off = np.abs(angles) < 2 * (math.pi - _ON_SURFACE)
+    return float(angles[is_off].sum()) / (4 * math.pi)
