@@ -31,7 +31,7 @@ from harnack.arithmetic.interval import ONE, ZERO, Interval
 from harnack.arithmetic.jet import Jet
 from harnack.arithmetic.norms import blend_intersection, blend_union, corner, maximum, minimum, norm
 from harnack.arithmetic.parabolas import Parabolas
-from harnack.arithmetic.values import Values, is_steep
+from harnack.arithmetic.values import Values
 
 __all__ = [
     "ONE",
@@ -55,7 +55,6 @@ __all__ = [
     "cos",
     "cosh",
     "exp",
-    "is_steep",
     "log",
     "maximum",
     "minimum",

@@ -1,6 +1,7 @@
 """Operators that numbers of every arithmetic share, so that any of them can evaluate a formula.
 
-`tally_of` estimates the size of a formula's kernel before it is recorded, and whether it may jump.
+`tally_of` says, before anything is recorded, about how large a formula's kernel will be, and
+whether the formula may jump or have a vertical tangent.
 """
 
 from __future__ import annotations
@@ -263,62 +264,87 @@ class Tally:
 
     operations: how many operations of Dr.Jit their ranges take, about.
     may_jump: whether a function was used that is not continuous everywhere.
+    is_steep: whether the slope may have no bound in a bounded box, as where roots, powers below 1,
+        quotients or logarithms are used.
     """
 
     operations: int = 0
     may_jump: bool = False
+    is_steep: bool = False
 
 
 @dataclass(frozen=True, eq=False)
 class Counted(Operators):
-    """A number that counts operations, in a tally that all numbers of a formula share."""
+    """A number that counts operations, in a tally that all numbers of a formula share.
+
+    is_constant: whether it is the same everywhere, so that functions of it have no slope.
+    is_square: whether it is a sum of squares. The root of one has no vertical tangent: with
+        f = sqrt(u^2 + v^2), |grad f| <= |grad u| + |grad v|.
+    """
 
     tally: Tally
+    is_constant: bool = False
+    is_square: bool = False
 
     def constant(self, x: Any) -> Counted:
-        del x
-        return self
+        is_positive = isinstance(x, int | float) and x >= 0
+        return Counted(self.tally, is_constant=True, is_square=is_positive)
 
-    def sum(self, other: Any) -> Counted:
-        del other
-        return self._spending(_SUM)
+    def sum(self, other: Counted) -> Counted:
+        return self._after(_SUM, other, is_square=self.is_square and other.is_square)
 
-    def product(self, other: Any) -> Counted:
-        del other
-        return self._spending(_PRODUCT)
+    def product(self, other: Counted) -> Counted:
+        is_scaled = self.is_constant or other.is_constant
+        is_square = is_scaled and self.is_square and other.is_square
+        return self._after(_PRODUCT, other, is_square=other is self or is_square)
 
     def __neg__(self) -> Counted:
-        return self
+        return self._after(0, self)
 
     def __pow__(self, exponent: Any) -> Counted:
-        # Other exponents than numbers are those of exp(exponent log(x)).
-        is_power = not isinstance(exponent, Counted) and exponent_of(exponent) >= 0
-        return self._spending(_FUNCTION, may_jump=not is_power)
+        if isinstance(exponent, Counted):  # exp(exponent log(x))
+            self._note(log)
+            return self._after(_FUNCTION, exponent)
+        n = exponent_of(exponent)
+        return self.apply(sqrt if n == 0.5 else power(n))
 
     def apply(self, function: Function) -> Counted:
-        return self._spending(_FUNCTION, may_jump=function.has_pole)
+        self._note(function)
+        return self._after(_FUNCTION, self, is_square=function.name == "power 2")
 
-    def larger(self, other: Any) -> Counted:
-        del other
-        return self._spending(_FUNCTION)
+    def larger(self, other: Counted) -> Counted:
+        return self._after(_FUNCTION, other)
 
-    def angle(self, x: Any) -> Counted:
-        del x
-        return self._spending(_FUNCTION + _PRODUCT, may_jump=True)
+    def angle(self, x: Counted) -> Counted:
+        if not (self.is_constant and x.is_constant):
+            self.tally.may_jump = self.tally.is_steep = True
+        return self._after(_FUNCTION + _PRODUCT, x)
 
-    def _spending(self, operations: int, *, may_jump: bool = False) -> Counted:
+    def norm_of_powers(self, p: float) -> Counted:
+        del p
+        return self._after(_FUNCTION, self)
+
+    def _note(self, function: Function) -> None:
+        """Note what a function of this number may do."""
+        if not self.is_constant:
+            is_norm = function is sqrt and self.is_square
+            self.tally.may_jump |= function.has_pole
+            self.tally.is_steep |= function.is_steep and not is_norm
+
+    def _after(self, operations: int, other: Counted, *, is_square: bool = False) -> Counted:
+        """A number made of this and another one by so many operations."""
         self.tally.operations += operations
-        self.tally.may_jump |= may_jump
-        return self
+        return Counted(self.tally, self.is_constant and other.is_constant, is_square)
 
 
 def tally_of(formula: Callable[[Any, Any, Any], Any]) -> Tally:
-    """What a formula of three coordinates takes; no operations, and a formula that may jump, where
-    it does not accept numbers of this kind."""
+    """What a formula of three coordinates takes. One that does not accept numbers of this kind has
+    no operations and may jump; it accepts only ranges of derivatives, as those of the library's own
+    shapes do, which are bounded."""
     tally = Tally()
-    number = Counted(tally)
+    x, y, z = (Counted(tally) for _ in range(3))  # three, as x * x is a square and x * y is not
     try:
-        formula(number, number, number)
+        formula(x, y, z)
     except (TypeError, AttributeError):
         return Tally(may_jump=True)
     return tally

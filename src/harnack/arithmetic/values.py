@@ -4,20 +4,19 @@ Ranges of derivatives prove long steps where a formula is smooth. Beside a verti
 of sqrt(|x|) at x = 0, they have no ends, and where the formula has no value at all they prove
 nothing. The values themselves do: sqrt(|x|) + 0.5 is at least 0.5, whatever its slope.
 
-`is_steep` says of which formulas this may be needed, before anything is recorded.
+`tally_of` says of which formulas this may be needed, before anything is recorded.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 
 from harnack.arithmetic.angles import angle_range
-from harnack.arithmetic.functions import power, sqrt
+from harnack.arithmetic.functions import power
 from harnack.arithmetic.interval import ZERO, Interval
 from harnack.arithmetic.operators import Operators, exponent_of
 
@@ -123,71 +122,3 @@ class Values(Operators):
 def _unless(condition: Mask, x: Interval, y: Interval) -> Interval:
     """x, or y where the condition holds."""
     return Interval(dr.select(condition, y.low, x.low), dr.select(condition, y.high, x.high))
-
-
-@dataclass(frozen=True, eq=False)
-class _Steepness(Operators):
-    """A number that notes whether a formula uses what may have a vertical tangent.
-
-    noted: a list of one entry, which all numbers of the formula share.
-    is_constant: whether it is the same everywhere, so that functions of it have no slope.
-    is_square: whether it is a sum of squares. The root of one has no vertical tangent: with
-        f = sqrt(u^2 + v^2), |grad f| <= |grad u| + |grad v|.
-    """
-
-    noted: list[bool]
-    is_constant: bool = False
-    is_square: bool = False
-
-    def constant(self, x: Any) -> _Steepness:
-        is_positive = isinstance(x, int | float) and x >= 0
-        return _Steepness(self.noted, is_constant=True, is_square=is_positive)
-
-    def sum(self, other: _Steepness) -> _Steepness:
-        return self._with(other, self.is_square and other.is_square)
-
-    def product(self, other: _Steepness) -> _Steepness:
-        scaled = self.is_constant or other.is_constant
-        is_square = scaled and self.is_square and other.is_square
-        return self._with(other, other is self or is_square)
-
-    def larger(self, other: _Steepness) -> _Steepness:
-        return self._with(other)
-
-    def __neg__(self) -> _Steepness:
-        return self._with(self)
-
-    def apply(self, function: Function) -> _Steepness:
-        is_norm = function is sqrt and self.is_square
-        self.noted[0] |= function.is_steep and not (self.is_constant or is_norm)
-        return self._with(self, function.name == "power 2")
-
-    def __pow__(self, exponent: Any) -> Any:
-        if isinstance(exponent, _Steepness):
-            return super().__pow__(exponent)
-        n = exponent_of(exponent)
-        return self.apply(sqrt if n == 0.5 else power(n))
-
-    def angle(self, x: _Steepness) -> _Steepness:
-        self.noted[0] |= not (self.is_constant and x.is_constant)
-        return self._with(x)
-
-    def norm_of_powers(self, p: float) -> _Steepness:
-        del p
-        return self._with(self)
-
-    def _with(self, other: _Steepness, is_square: bool = False) -> _Steepness:
-        return _Steepness(self.noted, self.is_constant and other.is_constant, is_square)
-
-
-def is_steep(formula: Callable[[Any, Any, Any], Any]) -> bool:
-    """Whether the slope of a formula of three coordinates may have no bound in a bounded box: it
-    uses roots, powers below 1, quotients, logarithms and their like. A formula that accepts only
-    ranges of derivatives, as those of the library's own shapes do, has bounded ones."""
-    noted = [False]
-    x, y, z = (_Steepness(noted) for _ in range(3))  # three, as x * x is a square and x * y is not
-    try:
-        formula(x, y, z)
-    except (TypeError, AttributeError):
-        return False
-    return noted[0]

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 
-from harnack.arithmetic import Interval, Jet, is_steep
+from harnack.arithmetic import Interval, Jet
 from harnack.arithmetic.jet import Dual
 from harnack.arithmetic.operators import Operators, tally_of
 from harnack.backend import choose_backend
@@ -88,7 +88,7 @@ class Formula(Field):
     @property
     def is_steep(self) -> bool:
         """Whether the formula uses what may have a vertical tangent or a pole."""
-        return is_steep(self.formula)
+        return tally_of(self.formula).is_steep
 
     def evaluate(self, p: Vec3) -> Sample:
         sample = self._one_sided(p, self.sample_alone(p))
