@@ -13,6 +13,10 @@ import pytest
 
 import harnack as hk
 from harnack.arithmetic.operators import tally_of
+from harnack.backend import choose_backend, to_numpy
+from harnack.enclosures import TargetLevels, choose_proofs
+from harnack.fields.look import Path
+from harnack.tracer.steep import SteepPlace
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -197,6 +201,21 @@ def test_powers_that_overflow() -> None:
     p = hits.position[hits.status == hk.Status.HIT]
     assert len(p) > 100
     assert (abs(np.abs(p).max(1) - 1) < 0.012).all()
+
+
+@pytest.mark.parametrize("text", ["sqrt(x) - 1", "1 - x^(1/3)", "log(x)", "asin(x) - pi/2"])
+def test_steps_proved_by_values_end_before_the_level(text: str) -> None:
+    """The level is at x = 1. A step that is a thousandth longer than what was proved passes it."""
+    backend = choose_backend("double")
+    field = hk.expression(text).prepare(backend)
+    path = Path(backend.Array3f(0, 0, 0), backend.Array3f(1, 0, 0), choose_proofs(None))
+    t, levels = backend.Float(0.25), TargetLevels((backend.Float(0.0),))
+    ahead = backend.Float([0.5, 0.75 - 5e-4, 0.75 + 1e-9])
+    sample = field.evaluate(path.point(t))
+    free = to_numpy(SteepPlace.at(field, levels, path, t, ahead, sample).free)
+    assert free[0] == 0.5
+    assert 0.75 / 1.001 < free[1] < 0.75
+    assert free[2] == 0
 
 
 @pytest.mark.slow
