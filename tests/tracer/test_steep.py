@@ -14,7 +14,7 @@ import pytest
 import harnack as hk
 from harnack.arithmetic.operators import tally_of
 from harnack.backend import choose_backend, to_numpy
-from harnack.enclosures import TargetLevels, choose_proofs
+from harnack.enclosures import Gaps, TargetLevels, choose_proofs
 from harnack.fields.look import Path
 from harnack.tracer.steep import SteepPlace
 
@@ -216,6 +216,18 @@ def test_steps_proved_by_values_end_before_the_level(text: str) -> None:
     assert free[0] == 0.5
     assert 0.75 / 1.001 < free[1] < 0.75
     assert free[2] == 0
+
+
+def test_a_slope_proves_that_a_level_is_taken_no_sooner_than_it_is() -> None:
+    """Of 1 - x at x = 1/2 after half a unit: hits beside vertical tangents rest on it."""
+    backend = choose_backend("double")
+    path = Path(backend.Array3f(0, 0, 0), backend.Array3f(1, 0, 0), choose_proofs(None))
+    t, reach, none = (backend.Float(length) for length in (0.5, 1.0, 0.0))
+    look = hk.expression("1 - x").look(path, t, reach, none)
+    gaps, lengths = Gaps(backend.Float(0.5), backend.Float(np.inf)), backend.Float([0.4998, 0.5002])
+    assert [to_numpy(proof.arrives(gaps, lengths)).tolist() for proof in look.ahead] == [
+        [False, True]
+    ]
 
 
 @pytest.mark.slow
