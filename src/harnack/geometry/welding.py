@@ -8,6 +8,7 @@ open edges are joined that rounding explains; all others stay as they are, and a
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, cast
 
 import numpy as np
 
@@ -21,8 +22,6 @@ __all__ = ["Welded", "rounding_of"]
 _UNITS = 4
 # It explains no distance that is more than this part of the shortest edge there.
 _OF_EDGES = 1e-3
-# A direction that is in no plane in which a mesh has many corners.
-_ACROSS = (0.6180, 0.5436, 0.5678)
 
 
 def rounding_of(vertices: FloatArray) -> float:
@@ -88,44 +87,35 @@ def _joined_by_rounding(x: FloatArray, faces: IntArray, places: IntArray) -> Int
     pairs = pairs[distance <= _OF_EDGES * shortest[pairs].min(axis=1)]
     while len(pairs):
         stands = _first_of_groups(pairs, len(x))
-        made = stands[faces]
-        changed = np.flatnonzero((made != faces).any(axis=1))
-        vanished = (made == np.roll(made, 1, axis=1)).any(axis=1)
-        flat = changed[zero_area_faces(x, made[changed])]
+        joined = stands[faces]
+        changed = np.flatnonzero((joined != faces).any(axis=1))
+        vanished = (joined == np.roll(joined, 1, axis=1)).any(axis=1)
+        flat = changed[zero_area_faces(x, joined[changed])]
         vanished[np.setdiff1d(flat, zero_area_faces(x, faces))] = True
         if not vanished.any():
             break
-        stays = np.unique(made[vanished])
+        stays = np.unique(joined[vanished])
         pairs = pairs[~np.isin(stands[pairs[:, 0]], stays)]
         stands = np.arange(len(x))
     return stands
 
 
 def _near_pairs(x: FloatArray, places: IntArray, distance: float) -> IntArray:
-    """(k, 2) pairs of some places up to a distance apart, found along one direction."""
-    along = x[places] @ np.array(_ACROSS)  # not longer than 1
-    order = np.argsort(along)
-    along, places = along[order], places[order]
-    reach = distance + 1e-15 * float(np.abs(along).max(initial=0.0))
-    rows, found = np.arange(len(places) - 1), [np.zeros((0, 2), np.int64)]
-    step = 1
-    while len(rows):
-        rows = rows[rows + step < len(places)]
-        rows = rows[along[rows + step] - along[rows] <= reach]
-        pair = np.column_stack([places[rows], places[rows + step]])
-        apart = np.linalg.norm(x[pair[:, 0]] - x[pair[:, 1]], axis=1)
-        found.append(pair[apart <= distance])
-        step += 1
-    return np.concatenate(found)
+    """(k, 2) pairs of places, by index, up to a distance apart."""
+    import scipy.spatial  # here: half a second that few need
+
+    spatial = cast("Any", scipy.spatial)
+    pairs = spatial.cKDTree(x[places]).query_pairs(distance, output_type="ndarray")
+    return places[pairs.reshape(-1, 2)]
 
 
 def _first_of_groups(pairs: IntArray, count: int) -> IntArray:
     """(n,) the first of those that pairs join with each of `count`."""
-    first = np.arange(count)
-    while True:
-        least = first[pairs].min(axis=1)
-        before = first.copy()
-        for k in range(2):
-            np.minimum.at(first, pairs[:, k], least)
-        if (first == before).all():
-            return first
+    import scipy.sparse
+    import scipy.sparse.csgraph as csgraph_module
+
+    sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
+    joined = sparse.coo_matrix((np.ones(len(pairs)), pairs.T), shape=(count, count))
+    group: IntArray = csgraph.connected_components(joined, directed=False)[1]
+    first = np.unique(group, return_index=True)[1]
+    return np.asarray(first[group], np.int64)

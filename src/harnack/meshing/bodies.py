@@ -44,16 +44,16 @@ def closed_parts(x: FloatArray, raw: IntArray, joined: IntArray) -> list[IntArra
         their own. joined: (m, 3) of the corners that stand for all at their place. Here faces at an
         edge of two belong together, and at edges of more those with the material between them.
     """
-    found: list[IntArray] = []
+    parts: list[IntArray] = []
     is_left = np.ones(len(raw), np.bool_)
     for faces in (raw, joined):
-        left = np.flatnonzero(is_left)
-        for rows in _pieces(x, faces[left]) if len(left) else ():
-            rows = left[rows]
+        remaining = np.flatnonzero(is_left)
+        for rows in _pieces(x, faces[remaining]) if len(remaining) else ():
+            rows = remaining[rows]
             if len(rows) >= _LEAST_FACES and _is_closed(joined[rows]):
-                found.append(rows)
+                parts.append(rows)
                 is_left[rows] = False
-    return found if len(found) <= _MOST_PARTS else []
+    return parts if len(parts) <= _MOST_PARTS else []
 
 
 def _pieces(x: FloatArray, faces: IntArray) -> list[IntArray]:
@@ -72,8 +72,8 @@ def _pieces(x: FloatArray, faces: IntArray) -> list[IntArray]:
         rows = halves % m
         third = faces[rows].sum(axis=1) - pairs[halves].sum(axis=1)
         beside.append(rows[_wedges(x[edges.ends[k]], x[third], is_along)])
-    one, other = np.concatenate(beside).T
-    graph = sparse.coo_matrix((np.ones(len(one)), (one, other)), shape=(m, m))
+    first, second = np.concatenate(beside).T
+    graph = sparse.coo_matrix((np.ones(len(first)), (first, second)), shape=(m, m))
     piece = np.asarray(csgraph.connected_components(graph, directed=False)[1], np.int64)
     order = np.argsort(piece, kind="stable")
     return np.split(order, np.flatnonzero(np.diff(piece[order])) + 1)
@@ -92,21 +92,21 @@ def _wedges(ends: FloatArray, third: FloatArray, is_along: BoolArray) -> IntArra
     way = ends[1] - ends[0]
     away = third - ends[0]
     away -= np.outer(away @ way / (way @ way), way)
-    one: Any = away[0] / max(float(np.linalg.norm(away[0])), 1e-300)
-    other: Any = np.cross(way / float(np.linalg.norm(way)), one)
-    turn: FloatArray = np.arctan2(away @ other, away @ one) / (2 * np.pi)
+    across: Any = away[0] / max(float(np.linalg.norm(away[0])), 1e-300)
+    upright: Any = np.cross(way / float(np.linalg.norm(way)), across)
+    turn: FloatArray = np.arctan2(away @ upright, away @ across) / (2 * np.pi)
     steps: IntArray = np.round(turn / _SAME_TURN).astype(np.int64) % round(1 / _SAME_TURN)
-    open_ones, found = list[int](), list[tuple[int, int]]()
+    begun, wedges = list[int](), list[tuple[int, int]]()
     is_taken = np.zeros(len(third), np.bool_)
     for k in 2 * np.lexsort((~is_along, steps)).tolist():  # twice around
         if is_taken[k]:
             continue
-        if not is_along[k] and k not in open_ones:
-            open_ones.append(k)
-        elif is_along[k] and open_ones:
-            found.append((open_ones.pop(), k))
-            is_taken[list(found[-1])] = True
-    return np.array(found, np.int64).reshape(-1, 2)
+        if not is_along[k] and k not in begun:
+            begun.append(k)
+        elif is_along[k] and begun:
+            wedges.append((begun.pop(), k))
+            is_taken[list(wedges[-1])] = True
+    return np.array(wedges, np.int64).reshape(-1, 2)
 
 
 def _is_closed(faces: IntArray) -> bool:
@@ -127,15 +127,15 @@ def nested(x: FloatArray, parts: list[IntArray]) -> list[list[int]]:
     """For each of some closed parts, faces (k, 3), the numbers of those that it lies in as a whole,
     the smallest first. Parts may touch: places of each are looked at a little within it."""
     corners = [x[part] for part in parts]
-    boxes = [(one.min(axis=(0, 1)), one.max(axis=(0, 1))) for one in corners]
+    boxes = [(corner.min(axis=(0, 1)), corner.max(axis=(0, 1))) for corner in corners]
     volumes = [volume_of(x, part) for part in parts]
     sizes = np.abs(volumes)
-    found: list[list[int]] = []
+    holders: list[list[int]] = []
     for i, (low, high) in enumerate(boxes):
         within = _WITHIN * float((high - low).max())
-        some = parts[i][:: max(1, len(parts[i]) // _PLACES)]
-        normals = _unit_normals(x[some])
-        points = x[some].mean(axis=1) - math.copysign(within, volumes[i]) * normals
+        sample = parts[i][:: max(1, len(parts[i]) // _PLACES)]
+        normals = _unit_normals(x[sample])
+        points = x[sample].mean(axis=1) - math.copysign(within, volumes[i]) * normals
         around = [
             j
             for j, (lower, upper) in enumerate(boxes)
@@ -145,8 +145,8 @@ def nested(x: FloatArray, parts: list[IntArray]) -> list[list[int]]:
             and sizes[j] > (1 + _WITHIN) * sizes[i]
             and all(abs(winding_around(corners[j], point)) > 0.5 for point in points)
         ]
-        found.append(sorted(around, key=lambda j: sizes[j]))
-    return found
+        holders.append(sorted(around, key=lambda j: sizes[j]))
+    return holders
 
 
 def united_parts(x: FloatArray, faces: IntArray, parts: list[IntArray], within: float) -> Surface:
@@ -171,19 +171,21 @@ def united_parts(x: FloatArray, faces: IntArray, parts: list[IntArray], within: 
         return _united(shells, within)
     except CrossingError:  # parts touch up to rounding, along an edge
         size = _GROWN * float(np.ptp(x[faces], axis=(0, 1)).max())
-        signs = [math.copysign(1, volume_of(one.vertices, one.faces)) for one in shells]
-        return _united([grown(one, s * size) for one, s in zip(shells, signs, strict=True)], within)
+        signs = [math.copysign(1, volume_of(shell.vertices, shell.faces)) for shell in shells]
+        return _united(
+            [grown(shell, s * size) for shell, s in zip(shells, signs, strict=True)], within
+        )
 
 
 def _overlapping(shells: list[Surface]) -> list[Surface]:
     """Parts whose faces that lie on those of an earlier one, but for rounding, are moved into it by
     next to nothing: where they are in one plane, but not to the last bit, gaps without a width
     would be left."""
-    corners = [one.vertices[one.faces] for one in shells]
+    corners = [shell.vertices[shell.faces] for shell in shells]
     size = float(np.ptp(np.concatenate(corners), axis=(0, 1)).max())
-    planes = [_unit_normals(one) for one in corners]
-    lows = [one.min(axis=1) - _ON * size for one in corners]
-    highs = [one.max(axis=1) + _ON * size for one in corners]
+    planes = [_unit_normals(corner) for corner in corners]
+    lows = [corner.min(axis=1) - _ON * size for corner in corners]
+    highs = [corner.max(axis=1) + _ON * size for corner in corners]
     moved = [shells[0]]
     for k in range(1, len(shells)):
         x, faces = shells[k].vertices.copy(), shells[k].faces
@@ -212,14 +214,14 @@ def _united(shells: list[Surface], within: float) -> Surface:
     """As `united_parts`, of parts that do not lie on each other but for rounding."""
     from manifold3d import Manifold
 
-    made = [_manifold_of_part(one) for one in shells]
-    clockwise = [one for one, is_body in made if not is_body]
+    bodies = [_manifold_of_part(shell) for shell in shells]
+    clockwise = [body for body, is_body in bodies if not is_body]
     levels = [Manifold() for _ in range(len(clockwise) + 1)]
-    for part in (one for one, is_body in made if is_body):
+    for part in (body for body, is_body in bodies if is_body):
         shared = [levels[k] ^ part for k in range(len(levels) - 1)]
         levels = [levels[0] + part, *(a + b for a, b in zip(levels[1:], shared, strict=True))]
     for part in clockwise:
-        levels = [above + (one - part) for one, above in itertools.pairwise(levels)]
+        levels = [above + (level - part) for level, above in itertools.pairwise(levels)]
     surface = apart_of(levels[0], within)
     check_manifold(surface.faces, surface.vertices)
     return surface

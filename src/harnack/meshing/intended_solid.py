@@ -206,14 +206,17 @@ class IntendedSolid:
         """
         points, w = self.samples
         corner = surface.vertices[surface.faces]
-        more = _near(corner, self.size, np.random.default_rng(1))
-        points, w = np.concatenate([points, more]), np.concatenate([w, self.winding(more)])
-        made = _winding_number(surface.vertices, surface.faces)
+        near_surface = _near(corner, self.size, np.random.default_rng(1))
+        points, w = (
+            np.concatenate([points, near_surface]),
+            np.concatenate([w, self.winding(near_surface)]),
+        )
+        field = _winding_number(surface.vertices, surface.faces)
         both = np.concatenate([self.vertices[self.oriented], corner])
-        missing, added, far = _on_other_side(points, w, made, both, away)
+        missing, added, far = _on_other_side(points, w, field, both, away)
         beside, around = self.beside
-        lost, filled, there = _on_other_side(beside, around, made, corner, away)
-        far = np.concatenate([far, there])
+        lost, filled, beside_far = _on_other_side(beside, around, field, corner, away)
+        far = np.concatenate([far, beside_far])
         volumes = self._volumes(surface, away)
         if not len(far) and volumes is None:
             return None
@@ -241,14 +244,14 @@ class IntendedSolid:
 def _on_other_side(
     points: FloatArray,
     w: FloatArray,
-    made: WindingNumber | None,
+    field: WindingNumber | None,
     corner: FloatArray,
     away: float,
 ) -> tuple[int, int, FloatArray]:
     """How many points with winding numbers w clearly above 1/2 are not inside of what was made; how
     many clearly below are; and those of them that are farther than `away` from triangles (m, 3, 3),
     of some that are looked at. If these are none, there are none."""
-    inside = _values(made, points) > 0.5
+    inside = _values(field, points) > 0.5
     missing, added = ~inside & (w > 0.5 + _CLEARLY), inside & (w < 0.5 - _CLEARLY)
     rows = np.flatnonzero(missing | added)
     rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), _LOOKED_AT)).astype(int)]
@@ -313,8 +316,8 @@ def _inside_out(x: FloatArray, faces: IntArray, parts: list[IntArray]) -> BoolAr
         is_rest[rows] = False
     rest = faces[is_rest]
     closed = [faces[rows] for rows in parts]
-    volumes = [volume_of(x, one) for one in closed]
-    holds_rest = [_lies_in(x, rest, one) for one in closed]
+    volumes = [volume_of(x, part) for part in closed]
+    holds_rest = [_lies_in(x, rest, part) for part in closed]
     is_with_rest = is_rest.copy()
     for k, around in enumerate(nested(x, closed)):
         outermost = around[-1] if around else k

@@ -55,12 +55,14 @@ def tube_manifold(tube: Tube, level: float, tolerance: float) -> Manifold:
         return Manifold()
     step = math.sqrt(3 * tolerance / radius)
     around = max(_LEAST_AROUND, math.ceil(2 * math.pi / step))
-    waiting = [_simpler(one, _LEFT_OUT * tolerance) for one in np.split(tube.points, tube.starts)]
+    waiting = [
+        _simpler(polyline, _LEFT_OUT * tolerance) for polyline in np.split(tube.points, tube.starts)
+    ]
     parts: list[Manifold] = []
     vertices = 0
     while waiting:
         # Rings of a half ball at both ends, and one at least at each vertex between.
-        least = around * sum(len(one) + around // 2 for one in waiting)
+        least = around * sum(len(polyline) + around // 2 for polyline in waiting)
         if vertices + least > _MOST_VERTICES:
             raise MeshingError(
                 f"a tube within {tolerance:.3g} has more than {2 * (vertices + least):,} faces: "
@@ -86,8 +88,8 @@ def _simpler(points: FloatArray, length: float) -> FloatArray:
     """A polyline (n, 3) with the vertices left out that are within a length of the edges in their
     place (Douglas and Peucker 1973). Proof that all of these edges are as near to the polyline: the
     nearest points on an edge of what it stands for go from one of its ends to the other."""
-    kept = np.zeros(len(points), np.bool_)
-    kept[[0, -1]] = True
+    is_kept = np.zeros(len(points), np.bool_)
+    is_kept[[0, -1]] = True
     waiting = [(0, len(points) - 1)]
     while waiting:
         first, last = waiting.pop()
@@ -98,9 +100,9 @@ def _simpler(points: FloatArray, length: float) -> FloatArray:
         if not len(off) or (square > 0 and off.max() <= length):
             continue
         middle = first + 1 + int(off.argmax())
-        kept[middle] = True
+        is_kept[middle] = True
         waiting += [(first, middle), (middle, last)]
-    return points[kept]
+    return points[is_kept]
 
 
 @dataclass(frozen=True)
@@ -190,8 +192,8 @@ class _Sweep:
             place[[0, -1]] = place[[0, -1], :1]
         corners = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
         faces: IntArray = place.ravel()[corners]
-        kept = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
-        return Surface.of(rings.reshape(-1, 3), faces[kept])
+        is_triangle = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+        return Surface.of(rings.reshape(-1, 3), faces[is_triangle])
 
     def _transported(
         self, ways: FloatArray, *, is_closed: bool

@@ -93,12 +93,12 @@ class SteepPlace:
         kind = cast("Any", type(t))
         slack = 8 * float(dr.epsilon(kind)) * (largest_coordinate(path.origin) + t)
         ahead = dr.select(dr.isfinite(ahead), ahead, 0)
-        here = values_between(field, p, p, slack)
-        there = values_between(field, p, path.point(t + ahead), slack)
-        if here is None or there is None:
+        at_point = values_between(field, p, p, slack)
+        on_path = values_between(field, p, path.point(t + ahead), slack)
+        if at_point is None or on_path is None:
             return cls(None, t < t, kind(0))
-        below, above = value - here.value.low, here.value.high - value
-        known = (below >= 0) & (above >= 0) & ~here.jumps
+        below, above = value - at_point.value.low, at_point.value.high - value
+        known = (below >= 0) & (above >= 0) & ~at_point.jumps
         gaps = levels.gaps(value)
         is_below = gaps.down < gaps.up
         near = dr.select(is_below, below, above)
@@ -108,12 +108,12 @@ class SteepPlace:
         is_level = (gaps.smaller <= near) | ((gaps.smaller <= _SLACK * near) & (far <= _FAR * near))
         error = near if gaps.is_one_sided else fmax(near, far)
         error = dr.select(known & dr.isfinite(error), error, dr.inf)
-        off = there.nowhere
+        off = on_path.nowhere
         if levels.period is None:
             # An end that is NaN stands for an infinite one.
             misses = t == t
-            for one in levels.values:
-                misses &= (there.value.low > one) | (there.value.high < one)
+            for level in levels.values:
+                misses &= (on_path.value.low > level) | (on_path.value.high < level)
             off = off | misses
         free = dr.select(off, ahead, 0)
         return cls(error, is_level & known, free)

@@ -45,13 +45,13 @@ def borders_of_overlaps(
     Within a part, where the others meet in edges that no further face has, as much covers the face
     on both sides: such edges are left out.
     """
-    one, other = _overlaps(rays, vertices, faces)
-    if not len(one):
-        return one, np.zeros((0, 3, 3))
-    edges, way = _edges(faces[other])
+    covered, covering = _overlaps(rays, vertices, faces)
+    if not len(covered):
+        return covered, np.zeros((0, 3, 3))
+    edges, way = _edges(faces[covering])
     key, number = np.unique(edges, axis=0, return_inverse=True)
     number = number.reshape(-1)
-    pairs = np.repeat(one, 3) * len(key) + number
+    pairs = np.repeat(covered, 3) * len(key) + number
     lines, line, count = np.unique(pairs, return_inverse=True, return_counts=True)
     net = np.zeros(len(lines), np.int64)
     np.add.at(net, line.reshape(-1), way)
@@ -122,18 +122,18 @@ def _overlaps(
     normals, heights = _normals(corners)
     rows = _candidates(corners, normals, heights)
     sizes, after = backend.Float(heights), np.full(len(rows), -1.0)
-    found: list[IntArray] = []
+    batches: list[IntArray] = []
     while len(rows):
-        ends = tuple(to_vector3(backend, one) for one in np.moveaxis(corners[rows], 1, 0))
+        ends = tuple(to_vector3(backend, corner) for corner in np.moveaxis(corners[rows], 1, 0))
         own = aligned_integers(backend, rows)
-        found_here = _next_in_plane(rays, ends, own, sizes, backend.Float(after))
-        number = to_numpy(found_here).astype(np.int64)
+        partners = _next_in_plane(rays, ends, own, sizes, backend.Float(after))
+        number = to_numpy(partners).astype(np.int64)
         hit = number != NO_TRIANGLE
         rows, after = rows[hit], number[hit].astype(np.float64)
-        found.append(np.column_stack([rows, number[hit]]))
-    if not found:
+        batches.append(np.column_stack([rows, number[hit]]))
+    if not batches:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    pairs = np.concatenate(found)
+    pairs = np.concatenate(batches)
     pairs = np.unique(np.concatenate([pairs, pairs[:, ::-1]]), axis=0)
     return pairs[:, 0], pairs[:, 1]
 
@@ -157,8 +157,8 @@ def _next_in_plane(
     def nearer(row: list[Real], active: Mask, state: State) -> State:
         number = index(fmax(row[INDEX], real(0)))
         theirs = corners_of(row, vector)
-        other = dr.gather(real, sizes, number, active)
-        larger = (other > size) | ((other == size) & (number > own))
+        their_size = dr.gather(real, sizes, number, active)
+        larger = (their_size > size) | ((their_size == size) & (number > own))
         taken = active & (row[INDEX] > after) & (number < state[0]) & larger
         taken &= _in_plane(corners, theirs) & _overlap(corners, theirs)
         return (dr.select(taken, number, state[0]),)
@@ -181,9 +181,9 @@ def _in_plane(ours: tuple[Vec3, ...], theirs: tuple[Vec3, ...]) -> Mask:
     """Whether one of two triangles has all corners in the plane of the other. (The normal of a thin
     one may be all rounding.)"""
 
-    def lies_in(some: tuple[Vec3, ...], plane: tuple[Vec3, ...]) -> Mask:
+    def lies_in(corners: tuple[Vec3, ...], plane: tuple[Vec3, ...]) -> Mask:
         normal = _normal(plane)
-        near = [dr.abs(dr.dot(normal, p - plane[0])) <= _SAME for p in some]
+        near = [dr.abs(dr.dot(normal, p - plane[0])) <= _SAME for p in corners]
         return near[0] & near[1] & near[2] & (dr.squared_norm(normal) > 0.5)
 
     return lies_in(ours, theirs) | lies_in(theirs, ours)
@@ -193,11 +193,11 @@ def _overlap(ours: tuple[Vec3, ...], theirs: tuple[Vec3, ...]) -> Mask:
     """Whether two triangles in a plane overlap by more than `_SAME`: no edge of either has the
     other triangle on its far side."""
     overlaps: Mask = True
-    for some, others in ((ours, theirs), (theirs, ours)):
-        normal = _normal(some)
+    for triangle, opposite in ((ours, theirs), (theirs, ours)):
+        normal = _normal(triangle)
         for k in range(3):
-            p, q = some[k], some[(k + 1) % 3]
+            p, q = triangle[k], triangle[(k + 1) % 3]
             inward = dr.cross(normal, _unit(q - p))
-            reach = [dr.dot(inward, x - p) for x in others]
+            reach = [dr.dot(inward, x - p) for x in opposite]
             overlaps &= fmax(fmax(reach[0], reach[1]), reach[2]) > _SAME
     return overlaps

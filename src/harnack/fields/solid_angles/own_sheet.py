@@ -68,8 +68,8 @@ def lies_on_own_level(mesh: WindingMesh, level: float) -> bool:
     # In units in which the mesh has a size of one to two.
     most = 2 * _ON_SURFACE if is_filled else _ROUNDING
 
-    def is_on(some: FloatArray) -> BoolArray:
-        gap, distance = _offsets(edges, some, level)
+    def is_on(places: FloatArray) -> BoolArray:
+        gap, distance = _offsets(edges, places, level)
         return (distance if is_filled else gap) < most
 
     if not is_on(points[:_FIRST]).all() or np.mean(is_on(points)) < _NEARLY_ALL:
@@ -80,7 +80,7 @@ def lies_on_own_level(mesh: WindingMesh, level: float) -> bool:
     if np.mean(far < _FLAT * longest) < _NEARLY_ALL:
         return False
     # The mean of w on both sides, which are the level and one more or less than it.
-    mean = np.array([_mean_winding(mesh.corners, one) for one in _some(points, _COUNTED)])
+    mean = np.array([_mean_winding(mesh.corners, point) for point in _some(points, _COUNTED)])
     return any(bool((np.abs(mean - level - way) < _SAME).all()) for way in (-0.5, 0.5))
 
 
@@ -97,8 +97,8 @@ def _offsets(edges: FloatArray, points: FloatArray, level: float) -> tuple[Float
     slopes: list[FloatArray] = []
     step = max(1, _AT_ONCE // len(edges))
     for first in range(0, len(points), step):
-        here = points[first : first + step, None]
-        p, q = edges[None, :, 0] - here, edges[None, :, 1] - here
+        batch = points[first : first + step, None]
+        p, q = edges[None, :, 0] - batch, edges[None, :, 1] - batch
         a, b = np.linalg.norm(p, axis=2), np.linalg.norm(q, axis=2)
         normal: FloatArray = np.cross(p, q)
         cosine = a * b + (p * q).sum(axis=2)

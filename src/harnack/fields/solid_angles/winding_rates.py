@@ -124,7 +124,7 @@ def simple_loops(edges: IntArray) -> list[IntArray]:
                 continue
             start = place[vertex]
             loops.append(np.array(path[start:], np.int64))
-            for left in path[start + 1 :]:
-                del place[left]
+            for passed in path[start + 1 :]:
+                del place[passed]
             path = path[: start + 1]
     return loops
