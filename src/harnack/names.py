@@ -17,9 +17,9 @@ _PREFIX = 0.02
 _T = TypeVar("_T", bound=Callable[..., Any])
 
 
-def is_one_of(given: object, known: Iterable[str]) -> bool:
+def is_one_of(name: object, known: Iterable[str]) -> bool:
     """Whether something is one of the known names; nothing but a text is."""
-    return isinstance(given, str) and given in known
+    return isinstance(name, str) and name in known
 
 
 def did_you_mean(given: object, known: Iterable[str]) -> str:

@@ -165,11 +165,11 @@ class Jet(Operators):
         """The roots of the product with a positive constant, if there are any."""
         if not (self.roots and factor.is_static and factor.low > 0):
             return ()
-        low, high = (math.sqrt(cast("float", one)) for one in (factor.low, factor.high))
+        low, high = (math.sqrt(cast("float", number)) for number in (factor.low, factor.high))
         kind = cast("Any", type(self.kind()))
         low, high = math.nextafter(low, 0.0), math.nextafter(high, math.inf)
         scale = Interval.constant(low, kind).hull(Interval.constant(high, kind))
-        return tuple(one * one._constant(scale) for one in self.roots)
+        return tuple(number * number._constant(scale) for number in self.roots)
 
     def __truediv__(self, other: Any) -> Any:
         if isinstance(other, Jet):

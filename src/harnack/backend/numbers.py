@@ -184,8 +184,8 @@ def make_read_only(value: Any) -> None:
     if isinstance(value, np.ndarray):
         cast("npt.NDArray[Any]", value).setflags(write=False)
     elif isinstance(value, tuple | list):
-        for one in cast("Sequence[Any]", value):
-            make_read_only(one)
+        for member in cast("Sequence[Any]", value):
+            make_read_only(member)
     elif isinstance(value, dict):
         make_read_only(list(cast("dict[Any, Any]", value).values()))
     elif dataclasses.is_dataclass(value) and type(value).__module__.startswith("harnack."):

@@ -108,21 +108,23 @@ def wrap_for_torch(function: Callable[..., Any]) -> Callable[..., Any]:
     """
     torch: Any = importlib.import_module("torch")
 
-    def run(given: list[Any], tensors: tuple[Any, ...]) -> tuple[list[Any], Any]:
-        """The inputs, and what `function` returns; given: its arguments, None for tensors."""
-        inputs = [_input(one.detach()) for one in tensors]
-        left = iter(inputs)
-        return inputs, function(*(next(left) if one is None else one for one in given))
+    def run(arguments: list[Any], tensors: tuple[Any, ...]) -> tuple[list[Any], Any]:
+        """The inputs, and what `function` returns; arguments: of it, None for tensors."""
+        inputs = [_input(tensor.detach()) for tensor in tensors]
+        remaining = iter(inputs)
+        filled = (next(remaining) if value is None else value for value in arguments)
+        return inputs, function(*filled)
 
     class Wrapped(torch.autograd.Function):
         @staticmethod
-        def forward(ctx: Any, given: list[Any], shape: list[Any], *tensors: Any) -> Any:
-            inputs, outputs = run(given, tensors)
+        def forward(ctx: Any, arguments: list[Any], shape: list[Any], *tensors: Any) -> Any:
+            inputs, outputs = run(arguments, tensors)
             shape.append(outputs)
             ctx.save_for_backward(*tensors)
-            ctx.given, ctx.graph = given, (inputs, _results(outputs))
-            results = tuple(dr.detach(_as_tensor(one)).torch() for one in ctx.graph[1])
-            ctx.mark_non_differentiable(*(one for one in results if not one.is_floating_point()))
+            ctx.arguments, ctx.graph = arguments, (inputs, _results(outputs))
+            results = tuple(dr.detach(_as_tensor(value)).torch() for value in ctx.graph[1])
+            whole = (result for result in results if not result.is_floating_point())
+            ctx.mark_non_differentiable(*whole)
             return results
 
         @staticmethod
@@ -130,23 +132,22 @@ def wrap_for_torch(function: Callable[..., Any]) -> Callable[..., Any]:
         def backward(ctx: Any, *cotangents: Any) -> Any:
             graph, ctx.graph = ctx.graph, None
             if graph is None:  # gone back through already
-                inputs, outputs = run(ctx.given, ctx.saved_tensors)
+                inputs, outputs = run(ctx.arguments, ctx.saved_tensors)
                 graph = inputs, _results(outputs)
             inputs, outputs = graph
-            found = _gradients(inputs, outputs, [None if c is None else c for c in cotangents])
-            gradients = iter(found)
+            gradients = iter(_gradients(inputs, outputs, list(cotangents)))
             return (
                 None,
                 None,
-                *(next(gradients).torch() if dr.is_float_v(one) else None for one in inputs),
+                *(next(gradients).torch() if dr.is_float_v(value) else None for value in inputs),
             )
 
     @functools.wraps(function)
     def wrapped(*args: Any) -> Any:
-        tensors = [one for one in args if isinstance(one, torch.Tensor)]
-        given = [None if isinstance(one, torch.Tensor) else one for one in args]
+        tensors = [value for value in args if isinstance(value, torch.Tensor)]
+        arguments = [None if isinstance(value, torch.Tensor) else value for value in args]
         shape: list[Any] = []
-        return _like(shape, iter(Wrapped.apply(given, shape, *tensors)))
+        return _like(shape, iter(Wrapped.apply(arguments, shape, *tensors)))
 
     return wrapped
 
@@ -176,14 +177,14 @@ def _gradients(inputs: list[Any], outputs: list[Any], cotangents: list[Any]) -> 
     for output, cotangent in zip(outputs, cotangents, strict=True):
         if cotangent is None or not dr.is_float_v(output):
             continue
-        given, tensor = _tensor(cotangent), _as_tensor(output)
+        cotangent_tensor, tensor = _tensor(cotangent), _as_tensor(output)
         if dr.grad_enabled(tensor):
-            dr.accum_grad(tensor, given)  # one may be there twice, or be an input
+            dr.accum_grad(tensor, cotangent_tensor)  # an output may occur twice, or be an input
             dr.enqueue(dr.ADMode.Backward, tensor)
-        elif dr.any(given.array != 0, axis=None):
+        elif dr.any(cotangent_tensor.array != 0, axis=None):
             raise NotImplementedError(_NO_DERIVATIVE)
     dr.traverse(dr.ADMode.Backward)
-    return [dr.grad(one) for one in inputs if dr.is_float_v(one)]
+    return [dr.grad(source) for source in inputs if dr.is_float_v(source)]
 
 
 _NO_DERIVATIVE = (
@@ -275,8 +276,8 @@ def _pull_back(jax: Any, function: Callable[..., Any], args: Any, cotangents: An
     """Gradients with respect to those arguments that are floats, given those of the result."""
     inputs = jax.tree.map(_input, args)
     outputs = jax.tree.leaves(function(*inputs))
-    found = _gradients(jax.tree.leaves(inputs), outputs, jax.tree.leaves(cotangents))
-    return [one.jax() for one in found]
+    gradients = _gradients(jax.tree.leaves(inputs), outputs, jax.tree.leaves(cotangents))
+    return [gradient.jax() for gradient in gradients]
 
 
 def _is_traced(jax: Any, values: Any) -> bool:

@@ -193,8 +193,8 @@ def _written(
                 "of arrays, numbers and the classes of this library"
             ) from error
         words = frozenset(pickler.words)
-        if all(len(attributes_named(*one)) == len(attributes_named(one[0], words))
-               for one in pickler.modules):  # fmt: skip
+        if all(len(attributes_named(*module)) == len(attributes_named(module[0], words))
+               for module in pickler.modules):  # fmt: skip
             return pickler
 
 
@@ -311,7 +311,7 @@ def _without_number(reduced: Any) -> Any:
     if not isinstance(reduced, tuple):
         return reduced
     make, arguments, *rest = cast("tuple[Any, ...]", reduced)
-    return make, tuple(None if _is_made_up(one) else one for one in arguments), *rest
+    return make, tuple(None if _is_made_up(argument) else argument for argument in arguments), *rest
 
 
 def _not_by_name(obj: Any) -> Any:
@@ -357,7 +357,7 @@ def _naming(base: Any) -> Callable[..., Any]:
             if kind is set or kind is frozenset:  # whose order differs
                 members = cast("set[Any] | frozenset[Any]", obj)
                 words = frozenset(cast("set[str]", self.words))
-                named = [_named(one, self.what, words) for one in members]
+                named = [_named(member, self.what, words) for member in members]
                 for _, other in named:
                     self.words |= other.words
                     self.modules += other.modules
@@ -429,17 +429,19 @@ def _with_keys_apart(state: Any) -> Any:
         return tuple(map(_with_keys_apart, cast("tuple[Any, ...]", state)))
     if not isinstance(state, dict):
         return state
-    given = dict(cast("dict[Any, Any]", state))
-    given |= {key: _apart(given[key]) for key in _SAY_NAMES if key in given}
-    given |= {key: _with_keys_apart(given[key]) for key in _HAVE_NAMES if key in given}
-    return [(_apart(key), one) for key, one in given.items()]
+    attributes = dict(cast("dict[Any, Any]", state))
+    attributes |= {key: _apart(attributes[key]) for key in _SAY_NAMES if key in attributes}
+    attributes |= {
+        key: _with_keys_apart(attributes[key]) for key in _HAVE_NAMES if key in attributes
+    }
+    return [(_apart(key), value) for key, value in attributes.items()]
 
 
 def _apart(names: Any) -> Any:
     """Strings, and those in a dictionary, as bytes."""
     if isinstance(names, dict):
-        given = cast("dict[Any, Any]", names)
-        return [(_apart(key), _apart(one)) for key, one in given.items()]
+        mapping = cast("dict[Any, Any]", names)
+        return [(_apart(key), _apart(value)) for key, value in mapping.items()]
     return names.encode() if isinstance(names, str) else names
 
 

@@ -83,9 +83,9 @@ def itself(module: SentModule) -> SentModule:
     return module
 
 
-def fill(module: SentModule, given: tuple[Mapping[str, Any], frozenset[str]]) -> None:
+def fill(module: SentModule, contents: tuple[Mapping[str, Any], frozenset[str]]) -> None:
     """Give a module its attributes, and the names of those that are left out."""
-    attributes, left_out = given
+    attributes, left_out = contents
     vars(module).update(attributes, **{_LEFT_OUT: left_out - _OF_IMPORT})
 
 
@@ -154,7 +154,11 @@ def refuse_imports_within(function: FunctionType) -> None:
 
 def _imports(code: CodeType) -> Iterator[tuple[int, str]]:
     """(level, name) of each import: how many packages up, and what from there."""
-    steps = [one for one in dis.get_instructions(code) if one.opname != "EXTENDED_ARG"]
+    steps = [
+        instruction
+        for instruction in dis.get_instructions(code)
+        if instruction.opname != "EXTENDED_ARG"
+    ]
     for k, step in enumerate(steps):
         if step.opname == "IMPORT_NAME":  # after its level and what is taken from the module
             yield int(steps[k - 2].argval), str(step.argval)
@@ -224,8 +228,8 @@ def _is_users_place(root: str, place: str) -> bool:
         return False
     places = sysconfig.get_paths()
     return not any(
-        path.is_relative_to(Path(places[one]).resolve())
-        for one in ("stdlib", "platstdlib", "purelib", "platlib")
+        path.is_relative_to(Path(places[name]).resolve())
+        for name in ("stdlib", "platstdlib", "purelib", "platlib")
     )
 
 

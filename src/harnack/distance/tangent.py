@@ -169,9 +169,9 @@ def in_batches(
 
 
 def _check_size(points: Any) -> None:
-    given = None if dr.is_array_v(type(points)) else real_array(points, "points")
-    if given is None or not given.size:
+    coordinates = None if dr.is_array_v(type(points)) else real_array(points, "points")
+    if coordinates is None or not coordinates.size:
         return
-    size = float(np.abs(given).max())
+    size = float(np.abs(coordinates).max())
     if LARGEST < size < np.inf:
         raise ValueError(f"points: coordinates up to {size:g} are too large: at most {LARGEST:g}")

@@ -16,7 +16,6 @@ from harnack.geometry.curves import (
 )
 from harnack.geometry.meshes import (
     MeshError,
-    solid_angles,
     validate_mesh,
     without_zero_area_faces,
     zero_area_faces,
@@ -44,7 +43,6 @@ __all__ = [
     "mesh_shapes",
     "shapes",
     "smooth_curve",
-    "solid_angles",
     "total_length",
     "validate_cloud",
     "validate_loops",

@@ -189,7 +189,7 @@ def touching_pairs(vertices: FloatArray, faces: IntArray) -> tuple[IntArray, Flo
     Of a face that lies on another as a whole its edges do. Where edges meet between their ends, and
     lie in neither face's plane, `intersecting_faces` has the pair.
     """
-    found: list[IntArray] = []
+    batches: list[IntArray] = []
     places: list[FloatArray] = []
     for pairs, heights in _pairs_in_doubt(vertices, faces, None):
         apart = (faces[pairs[:, 0], :, None] != faces[pairs[:, 1]][:, None]).all(axis=(1, 2))
@@ -199,9 +199,9 @@ def touching_pairs(vertices: FloatArray, faces: IntArray) -> tuple[IntArray, Flo
                 rows = np.flatnonzero(apart & (height[:, i] == 0) & (height[:, j] == 0))
                 p, q = (vertices[faces[of[rows], k]] for k in (i, j))
                 on = _is_on(vertices[faces[plane[rows]]], p, q)
-                found.append(pairs[rows[on]])
+                batches.append(pairs[rows[on]])
                 places.append(0.5 * (p + q)[on])
-    both = np.concatenate([*found, np.zeros((0, 2), np.int64)])
+    both = np.concatenate([*batches, np.zeros((0, 2), np.int64)])
     _, first = np.unique(both, axis=0, return_index=True)
     return both[first], np.concatenate([*places, np.zeros((0, 3))])[first]
 
@@ -218,8 +218,8 @@ def _pairs_in_doubt(
         pairs = near[start : start + _PAIRS_AT_ONCE]
         if not by_kernel:
             pairs = pairs[~_are_apart(vertices, faces, pairs)]
-        one, other = faces[pairs[:, 0]], faces[pairs[:, 1]]
-        yield pairs, (_heights(vertices, one, other), _heights(vertices, other, one))
+        first, second = faces[pairs[:, 0]], faces[pairs[:, 1]]
+        yield pairs, (_heights(vertices, first, second), _heights(vertices, second, first))
 
 
 def _near_pairs(corner: FloatArray, among: BoolArray | None) -> IntArray:
@@ -341,14 +341,14 @@ def _is_on(triangle: FloatArray, p: FloatArray, q: FloatArray) -> BoolArray:
     normal = np.abs(crosses(triangle))
     axes = np.array([[1, 2], [2, 0], [0, 1]])[normal.argmax(axis=1)]
     a = np.take_along_axis(triangle, axes[:, None].repeat(3, axis=1), axis=2)
-    p, q = (np.take_along_axis(one, axes, axis=1) for one in (p, q))
+    p, q = (np.take_along_axis(corner, axes, axis=1) for corner in (p, q))
     turn = sides_of_lines(a[:, 0], a[:, 1], a[:, 2])
-    found = turn != 0
+    is_on = turn != 0
     for i, j in _EDGES:
-        side = [turn * sides_of_lines(a[:, i], a[:, j], one) for one in (p, q)]
-        found &= (np.stack(side) >= 0).any(axis=0)
+        side = [turn * sides_of_lines(a[:, i], a[:, j], corner) for corner in (p, q)]
+        is_on &= (np.stack(side) >= 0).any(axis=0)
     side = np.stack([sides_of_lines(p, q, a[:, k]) for k in range(3)])
-    return found & ~((side > 0).all(axis=0) | (side < 0).all(axis=0))
+    return is_on & ~((side > 0).all(axis=0) | (side < 0).all(axis=0))
 
 
 # Checks of whole meshes.

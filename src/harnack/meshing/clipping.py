@@ -20,8 +20,8 @@ from harnack.geometry import (
     HalfSpace,
     Intersection,
     Volume,
-    solid_angles,
 )
+from harnack.geometry.meshes import solid_angles
 from harnack.meshing.checks import MeshingError, touching_pairs
 from harnack.meshing.edges import IntArray, boundary_edges, crosses, dots, edge_keys
 from harnack.meshing.lattice_surface import Surface

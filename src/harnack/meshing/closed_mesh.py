@@ -93,18 +93,18 @@ def mesh_manifold(solid: MeshSolid) -> Manifold | None:
         return whole
     parts = whole.decompose()
     for part in parts:
-        made = surface_of(part)
-        if part.volume() <= 0 or len(intersecting_faces(made.vertices, made.faces)):
+        boundary = surface_of(part)
+        if part.volume() <= 0 or len(intersecting_faces(boundary.vertices, boundary.faces)):
             return None
-    found: Manifold | None = None
+    first_union: Manifold | None = None
     for length in (0.0, _GROWN * surface.size):
         union = Manifold.batch_boolean([_grown(part, length) for part in parts], OpType.Add)
         if abs(union.surface_area() - surface.area) <= _SAME_AREA * surface.area:
-            found = found or union
-            made = surface_of(union)
-            if not len(intersecting_faces(made.vertices, made.faces)):
+            first_union = first_union or union
+            boundary = surface_of(union)
+            if not len(intersecting_faces(boundary.vertices, boundary.faces)):
                 return union
-    return found
+    return first_union
 
 
 def _grown(part: Manifold, length: float) -> Manifold:
@@ -127,9 +127,9 @@ def without_short_edges(solid: Manifold, length: float) -> Manifold:
     """A solid with short edges and slivers left out that move its surface by up to a length; or as
     it is, if its volume changed by more than that explains: where slivers are as thin as rounding,
     manifold3d has been seen to lose a part."""
-    made = solid.simplify(length)
+    simpler = solid.simplify(length)
     most = 2 * length * solid.surface_area()
-    return made if abs(made.volume() - solid.volume()) <= most else solid
+    return simpler if abs(simpler.volume() - solid.volume()) <= most else solid
 
 
 def surface_of(manifold: Manifold) -> Surface:

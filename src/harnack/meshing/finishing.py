@@ -208,15 +208,15 @@ def simplified(
     facts = {"triangles_before_simplification": len(surface.faces)}
     solid = manifold_of(surface)
     for part in _SIMPLER:
-        made = surface_of(without_short_edges(solid, part * tolerance))
-        if not 0 < len(made.faces) < len(surface.faces):
+        simpler = surface_of(without_short_edges(solid, part * tolerance))
+        if not 0 < len(simpler.faces) < len(surface.faces):
             continue
         try:
-            made = made_apart(made, _MENDED * tolerance)
-            check(made)
+            simpler = made_apart(simpler, _MENDED * tolerance)
+            check(simpler)
         except MeshingError:
             continue
-        return made, facts
+        return simpler, facts
     return surface, facts
 
 

@@ -216,9 +216,9 @@ def _check_passes_level(function: LevelFunction, part: FloatArray, size: float) 
     nearest = ends.copy()
     for _ in range(_SECTIONS):
         s, t = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
-        one, other = side * along(s), side * along(t)
-        nearest = np.minimum(nearest, np.minimum(one, other))
-        low, high = np.where(one > other, s, low), np.where(one > other, high, t)
+        near_low, near_high = side * along(s), side * along(t)
+        nearest = np.minimum(nearest, np.minimum(near_low, near_high))
+        low, high = np.where(near_low > near_high, s, low), np.where(near_low > near_high, high, t)
     touches = (ends > 0) & (nearest >= 0) & (nearest <= _TOUCHES * ends)
     if touches.mean() > 0.5:
         a, b, c = x[touches][0]

@@ -358,14 +358,14 @@ def _faces_alone(
         )
     vertices, faces = field.mesh.vertices, field.mesh.faces
     size = float(np.ptp(vertices[faces].reshape(-1, 3), axis=0).max())
-    made = Surface.of(vertices, faces)
+    surface = Surface.of(vertices, faces)
     if asked.volume is not None:
-        made = cut_by(made, asked.volume)
-    if not len(made.faces):
+        surface = cut_by(surface, asked.volume)
+    if not len(surface.faces):
         raise MeshingError("the level set is empty: it lies outside of the clip")
     known = {"level": level, "made_by": "faces", "spacing": math.nan, "evaluations": 0}
     function = LevelFunction(field, level, most_faces=asked.most_faces)
-    return _Made(made, size, known, function, _nothing, False)
+    return _Made(surface, size, known, function, _nothing, False)
 
 
 def _check_has_thickness(

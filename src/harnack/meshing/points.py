@@ -305,8 +305,8 @@ def to_multiple_roots(
     for k in range(_SERIES):
         first = newton(function, x, samples if k == 0 else function.at(x), longest, None, steps=1)
         second = newton(function, first, function.at(first), longest, None, steps=1)
-        one, other = lengths(first - x), lengths(second - first)
-        ratio = other / np.maximum(one, 1e-300)
+        before, after = lengths(first - x), lengths(second - first)
+        ratio = after / np.maximum(before, 1e-300)
         is_slow = (ratio > _RATES[0]) & (ratio < _RATES[1])
         factor = np.where(is_slow, 1 / (1 - np.minimum(ratio, _RATES[1])), 1.0)
         x = first + factor[:, None] * (second - first)

@@ -281,8 +281,8 @@ def _contacts(
     rows = np.delete(rows, crossing)
     rows = rows[~is_flat[rows]]
     pairs, places = touching_pairs(x, faces[rows])
-    one, other = rows[pairs.T]
-    is_contact = is_plain[one] | (shells.number[one] != shells.number[other])
+    first, second = rows[pairs.T]
+    is_contact = is_plain[first] | (shells.number[first] != shells.number[second])
     touching = _problem(
         "touching faces",
         np.unique(places[is_contact], axis=0),

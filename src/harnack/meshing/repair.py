@@ -188,7 +188,7 @@ def repair(
             break
         reasons.append(f"the result of {facts['stage']} is another solid: {results[-1].difference}")
         asked.report(f"{reasons[-1]}; so another way")
-    best = min(results, key=lambda one: 0.0 if one.difference is None else one.difference.badness)
+    best = min(results, key=lambda result: result.badness)
     moved = best.facts.get("moved", 0.0)
     if moved > 2 * tolerance * intended.size:
         warnings.warn(
@@ -197,7 +197,7 @@ def repair(
             stacklevel=2,
         )
     # Each reason once.
-    why = "; ".join(dict.fromkeys(one for one in reasons)) or None
+    why = "; ".join(dict.fromkeys(reasons)) or None
     return best.finished({"why": why, "welded": intended.rounded}, largest)
 
 
@@ -237,6 +237,11 @@ class _Result:
     facts: dict[str, Any]
     difference: Difference | None
 
+    @property
+    def badness(self) -> float:
+        """0 if it does not differ: see `Difference`."""
+        return 0.0 if self.difference is None else self.difference.badness
+
     def finished(self, more: dict[str, Any], largest: bool) -> trimesh.Trimesh:
         """The mesh, with what is known of it and of its parts; a warning if it differs."""
         from harnack.meshing.closed_mesh import ClosedMesh
@@ -255,14 +260,14 @@ class _Result:
             surface = largest_body(surface)
             dropped = len(parts) - len(parts_of(surface))
             facts["kept"] = _count_of(surface, self.surface, facts["kept"])
-        made = ClosedMesh(surface.vertices, surface.faces, process=False, validate=False)
-        made.metadata["harnack"] = {
+        repaired = ClosedMesh(surface.vertices, surface.faces, process=False, validate=False)
+        repaired.metadata["harnack"] = {
             **facts,
             "parts": parts,
             "dropped": dropped,
             "euler_characteristic": euler_characteristic(surface.faces),
         }
-        return made
+        return repaired
 
 
 def _count_of(surface: Surface, whole: Surface, first: int) -> int:
@@ -402,12 +407,14 @@ def _sound(intended: IntendedSolid, asked: _Asked) -> tuple[Surface, dict[str, A
     }
 
 
-def _count_turned(intended: IntendedSolid, made: Mended) -> int:
+def _count_turned(intended: IntendedSolid, sound: Mended) -> int:
     """How many of the triangles that were kept run the other way than those that were given."""
-    area = np.delete(intended.is_turned, zero_area_faces(intended.vertices, intended.faces))
-    is_turned = np.zeros(len(area), np.bool_)
-    is_turned[made.turned] = True
-    return int((is_turned ^ area)[made.kept].sum())
+    turned_before = np.delete(
+        intended.is_turned, zero_area_faces(intended.vertices, intended.faces)
+    )
+    is_turned = np.zeros(len(turned_before), np.bool_)
+    is_turned[sound.turned] = True
+    return int((is_turned ^ turned_before)[sound.kept].sum())
 
 
 # Loose triangles joined.

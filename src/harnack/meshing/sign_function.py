@@ -201,10 +201,10 @@ class SignFunction(LevelFunction):
             return x
         self.evaluations += len(x)
         if isinstance(self.field, BatchedField) and not self.field.has_sheets:
-            given = self.field.rough_value_and_gradient(x, precision=self.precision)[1]
+            slopes = self.field.rough_value_and_gradient(x, precision=self.precision)[1]
         else:
-            given = self.field.gradient(x, precision=self.precision)
-        slope = self.side * np.asarray(given, np.float64)
+            slopes = self.field.gradient(x, precision=self.precision)
+        slope = self.side * np.asarray(slopes, np.float64)
         flat = ~np.isfinite(slope).all(axis=1) | ~slope.any(axis=1)
         slope[flat] = way[flat]
         return slope

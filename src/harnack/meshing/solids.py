@@ -534,7 +534,7 @@ def ends_of_solid(field: Field, solid: Any, level: float | None) -> tuple[float,
     low, high = two_numbers(solid)
     if not low < high or not (math.isfinite(low) or math.isfinite(high)):
         raise ValueError(f"solid must be (low, high) with low < high, one finite, not {solid}")
-    field.check_levels(tuple(one for one in (low, high) if math.isfinite(one)))
+    field.check_levels(tuple(end for end in (low, high) if math.isfinite(end)))
     return low, high
 
 
@@ -678,8 +678,8 @@ class _Joined:
     def without_slivers(self, length: float) -> Surface:
         """The surface, short edges and slivers left out within a length, and bodies that are
         nothing but rounding."""
-        made = without_short_edges(self.whole, length) if length > 0 else self.whole
-        surface = without_films(surface_of(made))
+        simpler = without_short_edges(self.whole, length) if length > 0 else self.whole
+        surface = without_films(surface_of(simpler))
         return surface if self.volume is None else _on_box(surface, self.volume)
 
 

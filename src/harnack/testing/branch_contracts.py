@@ -58,8 +58,8 @@ def _check_branch_point(
     value = point.value.imag if imaginary else point.value.real
     allowed = point.constant * away**point.power
     worst = np.zeros(_PLACES)
-    for one in branches.at(complex_type(backend)(backend.Float(x), backend.Float(y))):
-        part = one.value.imag if imaginary else one.value.real
+    for branch in branches.at(complex_type(backend)(backend.Float(x), backend.Float(y))):
+        part = branch.value.imag if imaginary else branch.value.real
         off: FloatArray = to_numpy(part) - value
         if period is not None:
             off = off - period * np.round(off / period)

@@ -130,11 +130,11 @@ def _closely(field: Field, points: FloatArray, nearby: list[_Nearby]) -> list[_N
     derivative the Hessian of a field with a choice of detail may be as well."""
     error = look_at(field, points, closely=True).gradient_error
     found: list[_Nearby] = []
-    for one in nearby:
-        there = points + (one.node * one.h)[:, None] * np.eye(3)[one.axis]
+    for neighbor in nearby:
+        there = points + (neighbor.node * neighbor.h)[:, None] * np.eye(3)[neighbor.axis]
         look = look_at(field, there, closely=True)
         errors = error + look.gradient_error
-        found.append(dataclasses.replace(one, gradient=look.gradient, gradient_error=errors))
+        found.append(dataclasses.replace(neighbor, gradient=look.gradient, gradient_error=errors))
     return found
 
 
@@ -183,9 +183,9 @@ def _check_gradient(
 def _difference(nearby: list[_Nearby]) -> tuple[FloatArray, FloatArray]:
     """The gradient (n, 3) by differences of the value, with both spacings."""
     fine, wide = (np.zeros((len(nearby[0].h), 3)) for _ in range(2))
-    for one in nearby:
-        fine[:, one.axis] += one.weight * one.move
-        wide[:, one.axis] += one.wide * one.move
+    for neighbor in nearby:
+        fine[:, neighbor.axis] += neighbor.weight * neighbor.move
+        wide[:, neighbor.axis] += neighbor.wide * neighbor.move
     return fine, wide
 
 
@@ -196,8 +196,8 @@ def _limits(
     rounding, and besides what errors of value and gradient allow."""
     h = nearby[0].h
     allowance = look.gradient_error.copy()
-    for one in nearby:
-        allowance += np.abs(one.weight) * one.error
+    for neighbor in nearby:
+        allowance += np.abs(neighbor.weight) * neighbor.error
     length = np.linalg.norm(look.gradient, axis=1)
     magnitude = np.abs(look.value) + (field.period or 0)
     tolerance = 1e-6 * length + (1e-12 * magnitude + 1e-12 * length * _size(points)) / h
@@ -205,7 +205,7 @@ def _limits(
     tolerance += _SHARE * np.linalg.norm(fine - wide, axis=1)
     if not any(one.is_smooth for one in look.known):
         # There may be a kink between the points: as much as the gradient changes there.
-        changes = [np.linalg.norm(one.gradient - look.gradient, axis=1) for one in nearby]
+        changes = [np.linalg.norm(neighbor.gradient - look.gradient, axis=1) for neighbor in nearby]
         tolerance += 2 * np.max(changes, axis=0)
     else:
         tolerance += 1e-6 * _second_derivatives(nearby) * h
@@ -214,7 +214,10 @@ def _limits(
 
 def _second_derivatives(nearby: list[_Nearby]) -> FloatArray:
     """(n,) sums of the sizes of the second derivatives along the axes."""
-    return np.sum([np.abs(one.weight * one.gradient[:, one.axis]) for one in nearby], axis=0)
+    return np.sum(
+        [np.abs(neighbor.weight * neighbor.gradient[:, neighbor.axis]) for neighbor in nearby],
+        axis=0,
+    )
 
 
 def _check_laplacian(points: FloatArray, look: FieldValues, trials: list[list[_Nearby]]) -> None:
@@ -226,9 +229,15 @@ def _check_laplacian(points: FloatArray, look: FieldValues, trials: list[list[_N
 
     def differences(nearby: list[_Nearby]) -> tuple[FloatArray, FloatArray, FloatArray]:
         h = nearby[0].h
-        laplacian = np.sum([one.weight * one.gradient[:, one.axis] for one in nearby], axis=0)
-        allowance = np.sum([np.abs(one.weight) * one.gradient_error for one in nearby], axis=0)
-        wide = np.sum([one.wide * one.gradient[:, one.axis] for one in nearby], axis=0)
+        laplacian = np.sum(
+            [neighbor.weight * neighbor.gradient[:, neighbor.axis] for neighbor in nearby], axis=0
+        )
+        allowance = np.sum(
+            [np.abs(neighbor.weight) * neighbor.gradient_error for neighbor in nearby], axis=0
+        )
+        wide = np.sum(
+            [neighbor.wide * neighbor.gradient[:, neighbor.axis] for neighbor in nearby], axis=0
+        )
         tolerance = 1e-6 * _second_derivatives(nearby) + _SHARE * np.abs(laplacian - wide)
         tolerance += 1e-11 * length * (1 + _size(points) / h) / h
         return laplacian, tolerance, allowance
@@ -236,9 +245,11 @@ def _check_laplacian(points: FloatArray, look: FieldValues, trials: list[list[_N
     tried = [differences(nearby) for nearby in trials]
     if _is_harmonic(look):
         message = "HarmonicBall: f is not harmonic, its Laplacian is not 0"
-        _agree(*_likeliest([(np.abs(one), *rest) for one, *rest in tried]), message, points)
-    for one in bounds:
-        low, high = one.laplacian_lower, one.laplacian_upper
+        _agree(
+            *_likeliest([(np.abs(laplacian), *rest) for laplacian, *rest in tried]), message, points
+        )
+    for bound in bounds:
+        low, high = bound.laplacian_lower, bound.laplacian_upper
         beyond = [
             (np.maximum(np.maximum(low - laplacian, laplacian - high), 0), *rest)
             for laplacian, *rest in tried
@@ -255,13 +266,13 @@ def _likeliest(
 
     Differences across a crease may be close at one spacing by accident, and wrong.
     """
-    off, tolerance, allowance = (np.stack(one) for one in zip(*tried, strict=True))
+    off, tolerance, allowance = (np.stack(rows) for rows in zip(*tried, strict=True))
     limit = tolerance + allowance
     best = np.argsort(limit, axis=0)[:2]
     over = np.take_along_axis(off - limit, best, axis=0)
     chosen = np.take_along_axis(best, over.argmin(axis=0)[None], axis=0)
     off, tolerance, allowance = (
-        np.take_along_axis(one, chosen, axis=0)[0] for one in (off, tolerance, allowance)
+        np.take_along_axis(rows, chosen, axis=0)[0] for rows in (off, tolerance, allowance)
     )
     return off, tolerance, allowance
 
@@ -321,15 +332,17 @@ def _check_hessian(
     def differences(nearby: list[_Nearby]) -> tuple[FloatArray, FloatArray, FloatArray]:
         h = nearby[0].h
         fine, coarse = np.zeros_like(hessian), np.zeros_like(hessian)
-        for one in nearby:
-            fine[:, :, one.axis] += one.weight[:, None] * one.gradient
-            half = 0.5 * one.node if abs(one.node) == 1 else 0.0
-            coarse[:, :, one.axis] += half * one.gradient / h[:, None]
+        for neighbor in nearby:
+            fine[:, :, neighbor.axis] += neighbor.weight[:, None] * neighbor.gradient
+            half = 0.5 * neighbor.node if abs(neighbor.node) == 1 else 0.0
+            coarse[:, :, neighbor.axis] += half * neighbor.gradient / h[:, None]
         tolerance = 1e-7 * size + 0.1 * np.abs(fine - coarse).max(axis=(1, 2)) + own
         tolerance += 1e-11 * length * (1 + _size(points) / h) / h
-        allowance = np.sum([np.abs(one.weight) * one.gradient_error for one in nearby], axis=0)
+        allowance = np.sum(
+            [np.abs(neighbor.weight) * neighbor.gradient_error for neighbor in nearby], axis=0
+        )
         return np.abs(fine - hessian).max(axis=(1, 2)), tolerance, allowance
 
-    found = _likeliest([differences(nearby) for nearby in trials])
+    likeliest = _likeliest([differences(nearby) for nearby in trials])
     message = "the Hessian is not the derivative of the gradient"
-    _agree(*found, message, points, has_creases=field.has_creases)
+    _agree(*likeliest, message, points, has_creases=field.has_creases)

@@ -116,18 +116,18 @@ def find_crossings(
         contact = after.contact
         assert contact is not None
         ended = now.active & (after.status == int(Status.HIT))
-        found = ended
+        is_crossing = ended
         if sheet is not None and prepared.field.only_sheets:
-            found = ended & (sheet != NO_SHEET)
+            is_crossing = ended & (sheet != NO_SHEET)
         slot = place + now.count
-        dr.scatter(t, contact.root, slot, found)
-        dr.scatter(side, contact.side, slot, found)
-        dr.scatter(before, contact.before, slot, found)
-        dr.scatter(behind, contact.behind, slot, found)
-        dr.scatter(gradient, contact.gradient, slot, found)
+        dr.scatter(t, contact.root, slot, is_crossing)
+        dr.scatter(side, contact.side, slot, is_crossing)
+        dr.scatter(before, contact.before, slot, is_crossing)
+        dr.scatter(behind, contact.behind, slot, is_crossing)
+        dr.scatter(gradient, contact.gradient, slot, is_crossing)
         if sheet is not None:
-            dr.scatter(sheets, sheet, slot, found)
-        crossings = now.count + dr.select(found, count(1), 0)
+            dr.scatter(sheets, sheet, slot, is_crossing)
+        crossings = now.count + dr.select(is_crossing, count(1), 0)
         more = ended & (crossings < k)
         status = dr.select(more, count(int(Status.MISS)), after.status)
         if now.sheets is None:

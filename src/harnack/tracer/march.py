@@ -430,8 +430,8 @@ class March:
         slack = 8 * self.backend.epsilon * size
         reach = fmax(tolerance, 2 * slack)
         sure = gaps.smaller <= self.tolerance.value
-        for one in look.ahead:
-            sure |= one.arrives(gaps, reach)
+        for enclosure in look.ahead:
+            sure |= enclosure.arrives(gaps, reach)
         along = down_or_up(sample.gradient, gaps, path.direction)
         ways = (along, length(sample.gradient)), (path.direction, look.slope)
         unsure = is_near & ~sure

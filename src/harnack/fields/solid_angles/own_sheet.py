@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
-from harnack.geometry import solid_angles
+from harnack.geometry.meshes import solid_angles
 
 if TYPE_CHECKING:
     from harnack.fields.solid_angles.winding_mesh import WindingMesh

@@ -99,7 +99,7 @@ class Combined(Solid):
 
     @property
     def is_steep(self) -> bool:
-        return any(one.is_steep for one in self.parts)
+        return any(part.is_steep for part in self.parts)
 
     def prepare(self, backend: Backend) -> Solid:
         return self._of([one.prepare(backend) for one in self.parts])
