@@ -13,14 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import FloatArray
-from harnack.geometry import (
-    Ball,
-    Box,
-    ConvexHull,
-    HalfSpace,
-    Intersection,
-    Volume,
-)
+from harnack.geometry import Ball, Box, ConvexHull, HalfSpace, Intersection, Volume
 from harnack.geometry.meshes import solid_angles
 from harnack.meshing.checks import MeshingError, touching_pairs
 from harnack.meshing.edges import IntArray, boundary_edges, crosses, dots, edge_keys

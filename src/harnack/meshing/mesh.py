@@ -261,29 +261,13 @@ def _by_signs(
     Raises:
         MeshingError: as `signed_surface`; if it is empty, or not near the level at all.
     """
-    if is_thick and field.has_sheets:
-        raise TypeError(
-            f"{type(field).__name__} jumps, and its surface has no normals to thicken it "
-            "along: mesh it, and move the mesh's vertices instead"
-        )
-    if solid:
-        ends = ends_of_solid(field, solid, level)
-    else:
-        level = field.default_level if level is None else float(level)
-        field.check_levels((level,))
-        ends = level, math.inf
-    levels = tuple(one for one in ends if math.isfinite(one))
+    ends = _ends_by_signs(field, level, solid, is_thick)
+    levels = tuple(end for end in ends if math.isfinite(end))
     if isinstance(field, WindingNumber) and field.is_of_sheets_alone(levels):
         return _faces_alone(field, levels[0], solid, asked)
     volume, box = asked.volume, _box(field, levels, asked.volume)
     size = float((box.upper - box.lower).max())
-    cells, attempts = size / _ACROSS_BY_SIGNS, _ATTEMPTS_BY_SIGNS
-    if asked.spacing is not None:
-        cells, attempts = float(asked.spacing), 1
-    else:
-        detailed = cells_for_details(field, cells, SMALLER, SMALLER**2)
-        if detailed < cells:  # at once what would be tried next
-            cells, attempts = detailed, attempts - 1
+    cells, attempts = _cells_by_signs(field, size, asked.spacing)
     # Where nothing ends at the box, its cells should not lie along what is symmetrical.
     room = np.zeros(3) if box.has_walls else size * np.array([0.0037, 0.0053, 0.0029])
     filled = box.lower - room, box.upper + 0.5 * room
@@ -338,6 +322,41 @@ def _by_signs(
         known["cloud"] = field.describe()
     _judge_signs(field, known, asked.tolerance * size)
     return _Made(made, size, known, function(levels[0], 1.0), _nothing, is_apart)
+
+
+def _ends_by_signs(
+    field: Field,
+    level: float | None,
+    solid: tuple[float, float] | bool | None,
+    is_thick: bool,
+) -> tuple[float, float]:
+    """The values between which the inside is; of a level set that is not closed those from its
+    level on.
+
+    Raises:
+        TypeError: a surface that jumps is to be thickened.
+        ValueError: the field has no such level.
+    """
+    if is_thick and field.has_sheets:
+        raise TypeError(
+            f"{type(field).__name__} jumps, and its surface has no normals to thicken it "
+            "along: mesh it, and move the mesh's vertices instead"
+        )
+    if solid:
+        return ends_of_solid(field, solid, level)
+    level = field.default_level if level is None else float(level)
+    field.check_levels((level,))
+    return level, math.inf
+
+
+def _cells_by_signs(field: Field, size: float, spacing: float | None) -> tuple[float, int]:
+    """How large cells are, and how often smaller ones may be tried."""
+    if spacing is not None:
+        return float(spacing), 1
+    cells, attempts = size / _ACROSS_BY_SIGNS, _ATTEMPTS_BY_SIGNS
+    detailed = cells_for_details(field, cells, SMALLER, SMALLER**2)
+    # At once what would be tried next.
+    return (detailed, attempts - 1) if detailed < cells else (cells, attempts)
 
 
 def _faces_alone(
