@@ -470,7 +470,7 @@ def test_values_hold_all_values_and_say_where_there_are_none() -> None:
         root = hk.sqrt(x * y) if isinstance(x, Values) else np.sqrt(x * y)
         return maximum(root + z**2, (z + 3.0) ** 0.5 - y) * x
 
-    p = backend.Array3f(*(backend.Float(one) for one in centers.T))
+    p = backend.Array3f(*(backend.Float(value) for value in centers.T))
     values = formula(*Values.between(p, p, backend.Float(half)))
     low, high = np.array(values.value.low), np.array(values.value.high)
     nowhere, gaps = np.array(values.nowhere), np.array(values.gaps)
@@ -509,7 +509,7 @@ def test_roots_of_sums_of_squares_have_the_slopes_of_norms() -> None:
     x, y, _ = Jet.within(backend.Array3f(0.0, 0.1, 0.0), backend.Float(0.2))
     written = hk.sqrt(x * x / 4 + 2 * y**2)
     exact = norm(x * 0.5, y * 2**0.5)
-    for one, two in zip(written.first, exact.first, strict=True):
-        np.testing.assert_allclose(np.array(one.low), np.array(two.low), rtol=1e-9)
-        np.testing.assert_allclose(np.array(one.high), np.array(two.high), rtol=1e-9)
+    for slope, right in zip(written.first, exact.first, strict=True):
+        np.testing.assert_allclose(np.array(slope.low), np.array(right.low), rtol=1e-9)
+        np.testing.assert_allclose(np.array(slope.high), np.array(right.high), rtol=1e-9)
     assert np.isinf(np.array(hk.sqrt(x * x - y * y).first[0].high))

@@ -72,11 +72,11 @@ def with_drjit(name: str, precision: Precision) -> tuple[np.ndarray, list[np.nda
 def with_torch(name: str, precision: Precision) -> tuple[np.ndarray, list[np.ndarray]]:
     function, arrays = CASES[name]
     dtype = torch.float32 if precision == "single" else torch.float64
-    given = [torch.tensor(a, dtype=dtype, requires_grad=True) for a in arrays]
-    result = hk.wrap_for_torch(function)(*given)
+    arguments = [torch.tensor(a, dtype=dtype, requires_grad=True) for a in arrays]
+    result = hk.wrap_for_torch(function)(*arguments)
     weights = torch.arange(1, result.numel() + 1, dtype=dtype).reshape(result.shape)
     (result * weights).sum().backward()
-    return result.detach().numpy(), [one.grad.numpy() for one in given]
+    return result.detach().numpy(), [value.grad.numpy() for value in arguments]
 
 
 def with_jax(name: str, precision: Precision) -> tuple[np.ndarray, list[np.ndarray]]:
@@ -223,15 +223,15 @@ def seen(vertices: Any, origins: Any, directions: Any) -> Any:
 @pytest.mark.parametrize("framework", ["torch", "jax"])
 def test_whether_rays_hit_has_no_derivative(framework: str) -> None:
     """It was exactly 0, without a word; and the value alone is as ever."""
-    given = [np.asarray(one, np.float32) for one in (LOOP, EYE[None], AWAY)]
+    arguments = [np.asarray(value, np.float32) for value in (LOOP, EYE[None], AWAY)]
     if framework == "torch":
-        tensors = [torch.tensor(one, requires_grad=True) for one in given]
+        tensors = [torch.tensor(value, requires_grad=True) for value in arguments]
         result = hk.wrap_for_torch(seen)(*tensors)
 
         def differentiated() -> None:
             result.sum().backward()
     else:
-        result, pull_back = jax.vjp(hk.wrap_for_jax(seen), *given)
+        result, pull_back = jax.vjp(hk.wrap_for_jax(seen), *arguments)
 
         def differentiated() -> None:
             pull_back(jax.numpy.ones_like(result))
@@ -244,7 +244,7 @@ def test_whether_rays_hit_has_no_derivative(framework: str) -> None:
 def test_graphs_of_pytorch_can_be_gone_back_through_again() -> None:
     """A second pass repeated the first, whatever it was asked for."""
     vertices = torch.tensor(LOOP, requires_grad=True)
-    rest = [torch.tensor(one) for one in CASES["trace"][1][1:]]
+    rest = [torch.tensor(value) for value in CASES["trace"][1][1:]]
     weights = torch.arange(1.0, 21.0, dtype=torch.float64), torch.linspace(-3, 1, 20).double()
 
     def gradient(result: Any, weight: Any, again: bool) -> Any:

@@ -41,12 +41,12 @@ def test_flags_and_whole_numbers() -> None:
     assert flag(True, "it") is flag(np.True_, "it") is True
     assert flag(np.False_, "it") is False
     assert (integer(np.int64(3), "it"), integer(-(2**70), "it")) == (3, -(2**70))
-    for given in (1, "yes", None, [], np.ones(2)):
+    for original in (1, "yes", None, [], np.ones(2)):
         with pytest.raises(TypeError, match="it must be True or False, not"):
-            flag(given, "it")
-    for given in (1.0, "1", None, True, np.ones(2), {}):
+            flag(original, "it")
+    for original in (1.0, "1", None, True, np.ones(2), {}):
         with pytest.raises(TypeError, match="it must be a whole number, not"):
-            integer(given, "it")
+            integer(original, "it")
 
 
 SPHERE, ROW = hk.Sphere(1.0), np.linspace(1, 6, 5)

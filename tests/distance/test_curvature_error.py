@@ -261,16 +261,16 @@ def test_curvatures_of_bent_fields_are_those_of_the_field() -> None:
     points = np.array([[0.3, 0.2, 0.1], [0.1, 0.4, -0.2]])
     steps = 1e-5 * np.eye(3)
     ahead, behind = (
-        np.stack([bent.gradient(points + s * one, precision="double") for one in steps], axis=1)
+        np.stack([bent.gradient(points + s * step, precision="double") for step in steps], axis=1)
         for s in (1, -1)
     )
     mean, gaussian = true_curvatures(
         bent.gradient(points, precision="double"), (ahead - behind) / 2e-5
     )
-    found = hk.curvature(bent, points)
-    assert found.mean == pytest.approx(mean, rel=1e-7)
-    assert found.gaussian == pytest.approx(gaussian, rel=1e-7)
-    assert (found.mean_error < 1e-9).all()
+    computed = hk.curvature(bent, points)
+    assert computed.mean == pytest.approx(mean, rel=1e-7)
+    assert computed.gaussian == pytest.approx(gaussian, rel=1e-7)
+    assert (computed.mean_error < 1e-9).all()
 
 
 def test_edges_of_solids_have_no_curvature() -> None:
@@ -291,9 +291,9 @@ def test_solids_made_of_sums_over_trees_know_their_curvature() -> None:
     at = 0.97 * points[::100]
     exact = -hk.curvature(cloud, at).mean
     for field in (inside, inside | hk.Sphere(0.1), inside.moved((0.0, 0.0, 0.0))):
-        found = hk.curvature(field, at)
-        assert (np.abs(found.mean - exact) <= found.mean_error + 1e-3 * np.abs(exact)).all()
-        assert np.median(found.mean_error / np.abs(exact)) < 1e-3
+        computed = hk.curvature(field, at)
+        assert (np.abs(computed.mean - exact) <= computed.mean_error + 1e-3 * np.abs(exact)).all()
+        assert np.median(computed.mean_error / np.abs(exact)) < 1e-3
     coarse = inside.prepare(choose_backend("double"))
     p = to_vector3(choose_backend("double"), at)
     assert (to_numpy(coarse.derivative_errors(p, coarse.evaluate(p))[1]) > 0).all()
@@ -312,9 +312,9 @@ class Unstated(hk.Field):
 
 def test_errors_that_a_field_does_not_state_are_not_known() -> None:
     """They counted as 0. At a fold, as half way through a wall, derivatives jump."""
-    found = hk.curvature(Unstated(), [[1.0, 0.0, 0.0]])
-    assert found.mean[0] == 1
-    assert np.isinf([found.mean_error, found.gaussian_error]).all()
+    computed = hk.curvature(Unstated(), [[1.0, 0.0, 0.0]])
+    assert computed.mean[0] == 1
+    assert np.isinf([computed.mean_error, computed.gaussian_error]).all()
     wall = hk.solid(hk.Gyroid(1.0), between=(-0.3, 0.3))
     known = np.isfinite(hk.curvature(wall, [[0.0, 0.0, 0.0], [0.02, 0.0, 0.01]]).mean_error)
     assert known.tolist() == [False, True]

@@ -751,8 +751,8 @@ def to_sphere(x: np.ndarray) -> np.ndarray:
 def test_surfaces_along_which_the_gradient_is_zero(text: str, exact: Any) -> None:
     """Of a cube nearly all distances were NaN: Newton's method shrinks by a third at each step."""
     x = np.concatenate([[[0, 0, 1.5]], np.random.default_rng(4).uniform(-2, 2, (150, 3))])
-    found = signed_distance(hk.expression(text, domain=BOX), x)
-    assert np.abs(np.abs(found) - exact(x)).max() < 1e-7
+    computed = signed_distance(hk.expression(text, domain=BOX), x)
+    assert np.abs(np.abs(computed) - exact(x)).max() < 1e-7
     bounds = hk.distance_bounds(hk.expression(text, domain=BOX), x[:10])
     assert (bounds.lower <= exact(x[:10]) + 1e-12).all()
 

@@ -193,7 +193,7 @@ def test_creases_of_overlapping_boxes(seed: int) -> None:
 def boxes_in_contact(rng: np.random.Generator) -> list[Box]:
     """Two to five boxes with corners on a small lattice: most have faces that lie on others'."""
     low = rng.integers(0, 7, (int(rng.integers(2, 6)), 3)).astype(float)
-    return [(one, one + rng.integers(1, 6, 3), 1) for one in low]
+    return [(corner, corner + rng.integers(1, 6, 3), 1) for corner in low]
 
 
 @pytest.mark.parametrize("count", [6, pytest.param(200, marks=pytest.mark.slow)])
@@ -211,17 +211,19 @@ def test_boxes_in_contact(count: int) -> None:
         turn, shift = np.linalg.qr(rng.normal(size=(3, 3)))[0], rng.normal(size=3)
         turn, shift = (turn * np.linalg.det(turn), shift) if k % 2 else (np.eye(3), np.zeros(3))
         field = hk.WindingNumber(vertices @ turn + shift, faces)
-        found = hk.signed_distance(field, x @ turn + shift)
+        computed = hk.signed_distance(field, x @ turn + shift)
         inside = [((x > low) & (x < high)).all(axis=1) for low, high, _ in boxes]
-        np.testing.assert_allclose(np.abs(found), distance_to_boxes(boxes, x), atol=1e-9)
-        np.testing.assert_array_equal(found > 0, np.any(inside, axis=0))
+        np.testing.assert_allclose(np.abs(computed), distance_to_boxes(boxes, x), atol=1e-9)
+        np.testing.assert_array_equal(computed > 0, np.any(inside, axis=0))
         # Of the solid, whose function is that: a search over cells found feet up to 0.1 too far.
         try:
             solid = hk.solid((vertices @ turn + shift, faces))
         except MeshError:  # rounding left a gap between parts that were turned
             refused.append(k)
             continue
-        np.testing.assert_allclose(hk.signed_distance(solid, x @ turn + shift), -found, atol=1e-9)
+        np.testing.assert_allclose(
+            hk.signed_distance(solid, x @ turn + shift), -computed, atol=1e-9
+        )
     assert len(refused) <= count // 25
 
 
@@ -252,8 +254,8 @@ def test_tetrahedra_in_contact(count: int) -> None:
         turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
         vertices = np.concatenate(corners).reshape(-1, 3) @ (turn * np.linalg.det(turn))
         field = hk.WindingNumber(vertices, np.arange(len(vertices)).reshape(-1, 3))
-        found = hk.signed_distance(field, x @ (turn * np.linalg.det(turn)))
-        np.testing.assert_allclose(np.abs(found), right, atol=1e-9)
+        computed = hk.signed_distance(field, x @ (turn * np.linalg.det(turn)))
+        np.testing.assert_allclose(np.abs(computed), right, atol=1e-9)
 
 
 def test_boxes_in_single_precision() -> None:

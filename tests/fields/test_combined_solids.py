@@ -52,7 +52,7 @@ def test_flush_blends_bulge_as_their_docstring_says_and_a_slab_cuts_that_off() -
     blend = plate.blended(rib, 2.0)
     ends = np.array([[0.0, 0.0, 5.585], [0.0, 0.0, 5.587], [0.0, 0.0, 4.999]])
     inside = [blend, blend & hk.Cuboid((30.0, 30.0, 5.0))]
-    assert [(one.value(ends, precision="double") <= 0).tolist() for one in inside] == [
+    assert [(value.value(ends, precision="double") <= 0).tolist() for value in inside] == [
         [True, False, True],
         [False, False, True],
     ]

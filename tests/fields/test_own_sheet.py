@@ -34,7 +34,7 @@ def share(points: np.ndarray) -> np.ndarray:
 def sheet() -> trimesh.Trimesh:
     """The surface that spans a bent square, above a grid, as a file of single precision has it."""
     n = 8
-    u, v = (one.ravel() for one in np.meshgrid(*[np.linspace(0, 1, n + 1)] * 2))
+    u, v = (axis.ravel() for axis in np.meshgrid(*[np.linspace(0, 1, n + 1)] * 2))
     weights = np.stack([(1 - u) * (1 - v), u * (1 - v), u * v, (1 - u) * v], axis=1)
     points = weights @ SADDLE
     inner = (np.abs(u - 0.5) < 0.499) & (np.abs(v - 0.5) < 0.499)
@@ -66,7 +66,7 @@ def box_without_bottom(height: float) -> trimesh.Trimesh:
 
 def grid(height: Any) -> trimesh.Trimesh:
     """A square of 8 by 8 cells at heights that are a function of x and y."""
-    x, y = (one.ravel() for one in np.meshgrid(*[np.linspace(-1, 1, 9)] * 2))
+    x, y = (axis.ravel() for axis in np.meshgrid(*[np.linspace(-1, 1, 9)] * 2))
     return trimesh.Trimesh(np.column_stack([x, y, height(x, y)]), grid_faces(8), process=False)
 
 
@@ -94,15 +94,15 @@ def test_which_meshes_are_sheets() -> None:
 
 
 def test_a_sheet_is_kept() -> None:
-    given = sheet()
-    made = hk.mesh(field(given))
-    assert made.area == pytest.approx(given.area, rel=1e-12)
-    assert len(made.faces) == len(given.faces)
-    assert made.metadata["harnack"]["made_by"] == "faces"
-    half = hk.mesh(field(given), clip=hk.HalfSpace((1, 0, 0), 0.0))
-    assert half.area == pytest.approx(given.area / 2, rel=0.03)
+    original = sheet()
+    result = hk.mesh(field(original))
+    assert result.area == pytest.approx(original.area, rel=1e-12)
+    assert len(result.faces) == len(original.faces)
+    assert result.metadata["harnack"]["made_by"] == "faces"
+    half = hk.mesh(field(original), clip=hk.HalfSpace((1, 0, 0), 0.0))
+    assert half.area == pytest.approx(original.area / 2, rel=0.03)
     with pytest.raises(hk.MeshingError, match="nothing is inside"):
-        hk.mesh(field(given), solid=(0.5, math.inf))
+        hk.mesh(field(original), solid=(0.5, math.inf))
 
 
 def crossings(part: trimesh.Trimesh, o: np.ndarray, d: np.ndarray) -> np.ndarray:
@@ -117,13 +117,13 @@ def crossings(part: trimesh.Trimesh, o: np.ndarray, d: np.ndarray) -> np.ndarray
 
 
 def test_rays_hit_every_triangle_and_nothing_else() -> None:
-    given, rng = sheet(), np.random.default_rng(2)
+    original, rng = sheet(), np.random.default_rng(2)
     o = rng.normal(size=(400, 3))
     o *= 4 / np.linalg.norm(o, axis=1)[:, None]
     d = rng.uniform(-0.7, 0.7, (400, 3)) * [1, 1, 0.4] - o
     d /= np.linalg.norm(d, axis=1)[:, None]
-    right = crossings(given, o, d)
-    w = field(given)
+    right = crossings(original, o, d)
+    w = field(original)
     first = hk.trace(w, o, d, precision="double")
     assert ((first.sheet >= 0) == np.isfinite(right[:, 0])).all()
     assert np.isfinite(right[:, 0]).sum() > 200
@@ -135,25 +135,25 @@ def test_rays_hit_every_triangle_and_nothing_else() -> None:
 
 
 def test_distances_are_those_from_the_triangles() -> None:
-    given = sheet()
-    corners = np.asarray(given.triangles)[::7]
+    original = sheet()
+    corners = np.asarray(original.triangles)[::7]
     shares = np.random.default_rng(3).dirichlet(np.ones(3), len(corners))
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal /= np.linalg.norm(normal, axis=1)[:, None]
     points = np.einsum("nk,nkj->nj", shares, corners) + 1e-4 * normal
-    found = np.abs(hk.signed_distance(field(given), points))
-    assert np.quantile(found, 0.9) == pytest.approx(1e-4, rel=1e-6)
-    assert (found < 1.000001e-4).all()
+    distances = np.abs(hk.signed_distance(field(original), points))
+    assert np.quantile(distances, 0.9) == pytest.approx(1e-4, rel=1e-6)
+    assert (distances < 1.000001e-4).all()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("level", [2 * math.pi, math.pi])
 def test_what_was_written_is_read_back(level: float) -> None:
-    made = hk.mesh(hk.SolidAngle(SADDLE), level, tolerance=1e-2, spacing=0.25)
-    written: Any = made.export(file_type="stl")
+    result = hk.mesh(hk.SolidAngle(SADDLE), level, tolerance=1e-2, spacing=0.25)
+    written: Any = result.export(file_type="stl")
     w = field(trimesh.load(io.BytesIO(written), file_type="stl"))  # pyright: ignore
     levels = (-0.75, -0.5, -0.25, 0.25, 0.5, 0.75)
-    of = [one for one in levels if w.is_of_sheets_alone((one,))]
+    of = [one_level for one_level in levels if w.is_of_sheets_alone((one_level,))]
     assert of in ([[-0.5, 0.5]] if level > 6 else [[-0.75, 0.25], [-0.25, 0.75]])
-    for one in of:
-        assert hk.mesh(w, one).area == pytest.approx(made.area, rel=1e-6)
+    for one_level in of:
+        assert hk.mesh(w, one_level).area == pytest.approx(result.area, rel=1e-6)

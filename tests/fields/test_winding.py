@@ -212,10 +212,10 @@ def test_single_precision_derivatives(method: Any) -> None:
     np.testing.assert_allclose(one, two, atol=1e-4 * np.abs(two).max())
 
 
-def relative(found: np.ndarray, right: np.ndarray) -> np.ndarray:
+def relative(computed: np.ndarray, right: np.ndarray) -> np.ndarray:
     """(n,) how far vectors or matrices are off, as parts of their sizes."""
     axes = tuple(range(1, right.ndim))
-    return np.sqrt(((found - right) ** 2).sum(axis=axes) / (right**2).sum(axis=axes))
+    return np.sqrt(((computed - right) ** 2).sum(axis=axes) / (right**2).sum(axis=axes))
 
 
 def holed(n: int) -> tuple[Mesh, np.ndarray, np.ndarray]:
@@ -229,8 +229,8 @@ def holed(n: int) -> tuple[Mesh, np.ndarray, np.ndarray]:
 def test_gradients_at_points_are_good_by_default() -> None:
     """Those of the tree of triangles were off by 34 % in the median and 300 % at 95 % of points."""
     mesh, x, exact = holed(300)
-    given = WindingNumber(*mesh, method="tree", accuracy=2.0)
-    assert np.quantile(relative(given.gradient(x, precision="double"), exact), 0.9) > 0.3
+    original = WindingNumber(*mesh, method="tree", accuracy=2.0)
+    assert np.quantile(relative(original.gradient(x, precision="double"), exact), 0.9) > 0.3
     field = WindingNumber(*mesh, method="tree")
     assert relative(field.gradient(x, precision="double"), exact).max() < 1e-9
     at = to_vector3(choose_backend("double"), x)

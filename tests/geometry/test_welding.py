@@ -63,11 +63,11 @@ def test_zero_and_what_programs_get_for_it() -> None:
     check = hk.check_print((vertices, faces))
     assert check.is_fine
     assert check.volume == pytest.approx(8000.0)
-    assert [one.kind for one in check.problems] == ["corners apart by rounding"]
-    made = hk.repair(trimesh.Trimesh(vertices, faces, process=False))
-    facts = made.metadata["harnack"]
+    assert [problem.kind for problem in check.problems] == ["corners apart by rounding"]
+    result = hk.repair(trimesh.Trimesh(vertices, faces, process=False))
+    facts = result.metadata["harnack"]
     assert (facts["stage"], facts["kept"], facts["welded"]) == ("kept", 12, 4)
-    assert made.volume == pytest.approx(8000.0)
+    assert result.volume == pytest.approx(8000.0)
 
 
 def test_files_say_how_many(tmp_path: Path) -> None:

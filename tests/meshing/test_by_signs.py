@@ -87,7 +87,7 @@ def test_vertices_lie_on_triangles_and_creases_are_sharp() -> None:
 
 def boxes(*ends: tuple[tuple[int, ...], tuple[int, ...]]) -> hk.WindingNumber:
     """The winding number of boxes between lowest and highest corners."""
-    parts = [trimesh.creation.box(bounds=np.array(one, float)) for one in ends]
+    parts = [trimesh.creation.box(bounds=np.array(corners, float)) for corners in ends]
     whole = trimesh.util.concatenate(parts)
     return hk.WindingNumber(whole.vertices, whole.faces)
 
@@ -104,9 +104,9 @@ def boxes(*ends: tuple[tuple[int, ...], tuple[int, ...]]) -> hk.WindingNumber:
 )  # fmt: skip
 def test_flat_parts_and_parts_in_contact(parts: hk.WindingNumber, volume: float) -> None:
     """Their faces are planes of coordinates, in which every sign is as good as the other."""
-    made = hk.mesh(parts, tolerance=4e-3, spacing=1.5)
-    facts = check(made)
-    assert made.volume == pytest.approx(volume, rel=1e-3)
+    result = hk.mesh(parts, tolerance=4e-3, spacing=1.5)
+    facts = check(result)
+    assert result.volume == pytest.approx(volume, rel=1e-3)
     assert facts["far"] <= 0.01 * facts["looked_at"]
     assert facts["within"] < facts["spacing"]
 

@@ -31,8 +31,8 @@ _FACES = np.asarray(_BALL.faces, np.int64)
 
 
 def test_open_meshes_are_not_shown_as_closed() -> None:
-    made = ClosedMesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], process=False)
-    assert repr(made).startswith("<trimesh.Trimesh(")
+    result = ClosedMesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], process=False)
+    assert repr(result).startswith("<trimesh.Trimesh(")
 
 
 def test_a_limit_of_triangles_is_named():

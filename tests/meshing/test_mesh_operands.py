@@ -60,17 +60,17 @@ def test_parts_in_contact_are_joined(parts: list[Any], volume: float, is_askew: 
     whole = trimesh.util.concatenate(parts)
     if is_askew:
         whole.apply_transform(trimesh.transformations.rotation_matrix(0.7, (0.3, -1.0, 0.4)))
-    made = hk.mesh(hk.solid(whole))
-    assert made.volume == pytest.approx(volume, rel=1e-7)
-    assert made.is_watertight
-    assert made.body_count == 1
+    result = hk.mesh(hk.solid(whole))
+    assert result.volume == pytest.approx(volume, rel=1e-7)
+    assert result.is_watertight
+    assert result.body_count == 1
 
 
 def test_within_parts_in_contact_distances_are_from_their_union() -> None:
     whole = trimesh.util.concatenate([PLATE, box((5, 5, 10), (15, 15, 35))])
     points = np.array([[7.5, 9, 9], [10, 10, 10], [2.5, 9, 9], [4, 10, 12]])
-    found = hk.solid(whole).value(points, precision="double")
-    assert found == pytest.approx([-math.hypot(2.5, 1), -5, -1, 1], abs=1e-12)
+    computed = hk.solid(whole).value(points, precision="double")
+    assert computed == pytest.approx([-math.hypot(2.5, 1), -5, -1, 1], abs=1e-12)
 
 
 def test_shells_are_as_thick_as_asked() -> None:

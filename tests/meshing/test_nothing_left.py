@@ -50,10 +50,10 @@ def test_a_level_that_is_touched_and_not_passed_is_said(text: str) -> None:
 @pytest.mark.parametrize("power", [3, 7])
 def test_a_level_passed_without_slope_is_meshed(power: int) -> None:
     field = hk.expression(f"(x^2 + y^2 + z^2 - 1)^{power}", domain=hk.Box((-2,) * 3, (2,) * 3))
-    made = hk.mesh(field, tolerance=1e-2)
-    assert made.is_watertight
-    assert np.abs(np.linalg.norm(made.vertices, axis=1) - 1).max() < 1e-9
-    assert made.volume == pytest.approx(4 / 3 * math.pi, rel=1e-2)
+    result = hk.mesh(field, tolerance=1e-2)
+    assert result.is_watertight
+    assert np.abs(np.linalg.norm(result.vertices, axis=1) - 1).max() < 1e-9
+    assert result.volume == pytest.approx(4 / 3 * math.pi, rel=1e-2)
 
 
 @pytest.mark.slow

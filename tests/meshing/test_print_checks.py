@@ -261,12 +261,12 @@ def wedge(half: float) -> tuple[Any, Any]:
 def test_parts_that_touch_inside_a_face_are_wrong(other: Any, count: int) -> None:
     box = trimesh.creation.box((20.0, 20.0, 20.0))
     touching = trimesh.Trimesh(*other, process=False)
-    found = hk.check_print(trimesh.util.concatenate([box, touching]))
-    assert {one.kind: one.count for one in found.problems} == {
+    checked = hk.check_print(trimesh.util.concatenate([box, touching]))
+    assert {problem.kind: problem.count for problem in checked.problems} == {
         "touching faces": count,
         "loose parts": 2,
     }
-    assert not found.is_fine
+    assert not checked.is_fine
     touching.apply_translation((0, 0, 1e-6))
     assert hk.check_print(trimesh.util.concatenate([box, touching])).is_fine
 

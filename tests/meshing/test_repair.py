@@ -310,21 +310,21 @@ def loose(noise: float) -> trimesh.Trimesh:
 
 
 def test_corners_of_cracks_are_joined() -> None:
-    given = loose(2e-3)
+    original = loose(2e-3)
     with pytest.raises(hk.MeshingError, match="open"):
-        hk.repair(given, keep="sound")
+        hk.repair(original, keep="sound")
     with pytest.warns(UserWarning, match="moved corners by up to 0.00"):
-        made = hk.repair(given)
-    facts = made.metadata["harnack"]
-    assert (facts["stage"], facts["kept"], facts["joined"]) == ("joined", 0, len(given.faces))
+        result = hk.repair(original)
+    facts = result.metadata["harnack"]
+    assert (facts["stage"], facts["kept"], facts["joined"]) == ("joined", 0, len(original.faces))
     assert facts["holes"] == 3
-    check_closed(made)
+    check_closed(result)
     # Corners went nowhere but to means near by.
-    x = np.asarray(made.vertices)[np.asarray(made.faces)[: facts["joined"]]]
-    moved = np.linalg.norm(x - given.vertices[given.faces], axis=2)
+    x = np.asarray(result.vertices)[np.asarray(result.faces)[: facts["joined"]]]
+    moved = np.linalg.norm(x - original.vertices[original.faces], axis=2)
     assert 0 < moved.max() == pytest.approx(facts["moved"])
     assert facts["moved"] < 0.01
-    assert np.abs(np.linalg.norm(made.vertices, axis=1) - 1).max() < 0.015
+    assert np.abs(np.linalg.norm(result.vertices, axis=1) - 1).max() < 0.015
 
 
 def test_what_cannot_be_joined_is_made_anew() -> None:
@@ -412,10 +412,10 @@ def test_numbers_that_are_none_are_refused_anyway() -> None:
 def wavy_sheet() -> trimesh.Trimesh:
     """Half of it bulges to one side of what spans its rim, and half to the other."""
     u = np.linspace(0, 1, 20)
-    x, y = (one.ravel() for one in np.meshgrid(u, u, indexing="ij"))
+    x, y = (value.ravel() for value in np.meshgrid(u, u, indexing="ij"))
     vertices = np.column_stack([x, y, 0.1 * np.sin(2 * np.pi * x) * np.cos(2 * np.pi * y)])
     k = np.arange(400).reshape(20, 20)
-    a, b, c, d = (one.ravel() for one in (k[:-1, :-1], k[1:, :-1], k[1:, 1:], k[:-1, 1:]))
+    a, b, c, d = (value.ravel() for value in (k[:-1, :-1], k[1:, :-1], k[1:, 1:], k[:-1, 1:]))
     faces = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
     middle = vertices[faces].mean(axis=1)[:, :2] - 0.5
     return trimesh.Trimesh(vertices, faces[np.hypot(*middle.T) > 0.15], process=False)

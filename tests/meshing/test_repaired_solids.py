@@ -25,9 +25,9 @@ CREATE: Any = trimesh.creation
 
 
 def box(sides: Sequence[float], center: Sequence[float] = (0, 0, 0)) -> trimesh.Trimesh:
-    made = CREATE.box(sides)
-    made.apply_translation(center)
-    return made
+    result = CREATE.box(sides)
+    result.apply_translation(center)
+    return result
 
 
 def together(*parts: trimesh.Trimesh) -> trimesh.Trimesh:
@@ -40,26 +40,26 @@ def inverted(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     return mesh
 
 
-def repaired(given: trimesh.Trimesh, **options: Any) -> trimesh.Trimesh:
+def repaired(damaged: trimesh.Trimesh, **options: Any) -> trimesh.Trimesh:
     """The result, of which nothing is wrong that it does not tell."""
     with warnings.catch_warnings():
         warnings.filterwarnings("error", message=".*not quite the solid")
-        made = hk.repair(given, **options)
-    assert made.metadata["harnack"]["differs"] is None
-    assert made.is_watertight
-    return made
+        result = hk.repair(damaged, **options)
+    assert result.metadata["harnack"]["differs"] is None
+    assert result.is_watertight
+    return result
 
 
-def check_is(made: trimesh.Trimesh, winding: Any, bounds: Any, count: int = 1500) -> None:
+def check_is(result: trimesh.Trimesh, winding: Any, bounds: Any, count: int = 1500) -> None:
     """The inside is where a winding number is above 1/2, but for where that is in doubt, or nearer
     to the surface than it has to be right."""
     low, high = bounds
     margin = 0.03 * (high - low)
     points = np.random.default_rng(7).uniform(low - margin, high + margin, (count, 3))
-    w, inside = winding(points), winding_sum(made.triangles)(points) > 0.5
+    w, inside = winding(points), winding_sum(result.triangles)(points) > 0.5
     wrong = points[(inside & (w < 0.14)) | (~inside & (w > 0.86))]
     assert len(wrong) < 0.01 * count
-    near = distances_to_triangles(wrong, made.triangles[made.area_faces > 0]).min(axis=1)
+    near = distances_to_triangles(wrong, result.triangles[result.area_faces > 0]).min(axis=1)
     assert (near < 2e-3 * (high - low).max()).all()
 
 
@@ -69,13 +69,13 @@ def check_is(made: trimesh.Trimesh, winding: Any, bounds: Any, count: int = 1500
 @pytest.mark.parametrize("is_whole", [True, False])
 def test_a_cube_with_a_cavity_that_is_inside_out(is_whole: bool) -> None:
     """The cavity was taken for a part of its own, and its volume added: 8,512."""
-    given = inverted(together(box([20, 20, 20]), inverted(box([8, 8, 8]))))
+    damaged = inverted(together(box([20, 20, 20]), inverted(box([8, 8, 8]))))
     if not is_whole:
-        given = together(given, box([5, 5, 5], (40, 0, 0)))
-    made = repaired(given)
-    facts = made.metadata["harnack"]
-    assert made.volume == pytest.approx(7488 + (0 if is_whole else 125))
-    assert (facts["stage"], facts["kept"], facts["turned"]) == ("sound", len(given.faces), 24)
+        damaged = together(damaged, box([5, 5, 5], (40, 0, 0)))
+    result = repaired(damaged)
+    facts = result.metadata["harnack"]
+    assert result.volume == pytest.approx(7488 + (0 if is_whole else 125))
+    assert (facts["stage"], facts["kept"], facts["turned"]) == ("sound", len(damaged.faces), 24)
 
 
 @pytest.mark.parametrize("turns", [(1, 1), (1, -1), (-1, 1), (-1, -1)])
@@ -86,21 +86,22 @@ def test_a_cube_in_a_cube_one_of_which_lacks_a_triangle(turns: Any, lost: str) -
     broken = {"outer": outer, "inner": inner}[lost]
     broken.update_faces(np.arange(len(broken.faces)) > 0)
     parts = (
-        one if turn > 0 else inverted(one) for one, turn in zip((outer, inner), turns, strict=True)
+        part if turn > 0 else inverted(part)
+        for part, turn in zip((outer, inner), turns, strict=True)
     )
-    made = repaired(together(*parts))
+    result = repaired(together(*parts))
     is_hollow = turns[0] != turns[1]
-    assert made.volume == pytest.approx(7488 if is_hollow else 8000)
-    if made.metadata["harnack"]["stage"] == "sound":
+    assert result.volume == pytest.approx(7488 if is_hollow else 8000)
+    if result.metadata["harnack"]["stage"] == "sound":
         inside = len(inner.faces)
-        assert made.metadata["harnack"]["left_out"]["inside"] == (0 if is_hollow else inside)
+        assert result.metadata["harnack"]["left_out"]["inside"] == (0 if is_hollow else inside)
 
 
 def test_a_recess_that_is_inside_out() -> None:
     """It lies in the cube and shares three of its planes: it was taken for a part of its own."""
-    given = together(box([10, 10, 10]), inverted(box([5, 5, 5], (2.5, 2.5, 2.5))))
-    assert repaired(inverted(given)).volume == pytest.approx(875)
-    assert repaired(given).volume == pytest.approx(875)
+    damaged = together(box([10, 10, 10]), inverted(box([5, 5, 5], (2.5, 2.5, 2.5))))
+    assert repaired(inverted(damaged)).volume == pytest.approx(875)
+    assert repaired(damaged).volume == pytest.approx(875)
 
 
 def grid(*cells: Sequence[float]) -> trimesh.Trimesh:
@@ -126,27 +127,27 @@ def grid(*cells: Sequence[float]) -> trimesh.Trimesh:
 )
 @pytest.mark.parametrize("turns", ["as it is", "inside out", "turned", "merged"])
 def test_parts_that_touch_or_lie_in_each_other(make: Any, volume: float, turns: str) -> None:
-    given = make()
+    damaged = make()
     if turns == "inside out":
-        given.invert()
+        damaged.invert()
     if turns == "turned":  # so that planes are planes up to rounding
         turn = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
-        given.vertices = given.vertices @ (turn * np.sign(np.linalg.det(turn)))
+        damaged.vertices = damaged.vertices @ (turn * np.sign(np.linalg.det(turn)))
     if turns == "merged":
-        given.merge_vertices()
-    made = repaired(given)
-    assert made.volume == pytest.approx(volume, rel=1e-6)
+        damaged.merge_vertices()
+    result = repaired(damaged)
+    assert result.volume == pytest.approx(volume, rel=1e-6)
     if turns != "turned":  # else corners are apart from planes by rounding, which it cannot tell
-        assert not len(intersecting_pairs(np.asarray(made.vertices), np.asarray(made.faces)))
+        assert not len(intersecting_pairs(np.asarray(result.vertices), np.asarray(result.faces)))
 
 
 def test_boxes_that_share_an_edge_are_told_apart() -> None:
     """By what has material in between: all corners and edges are shared."""
-    given = grid((0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0), (2, 2, 0))
-    given.merge_vertices()
-    x, faces = np.asarray(given.vertices), np.asarray(given.faces, np.int64)
+    damaged = grid((0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0), (2, 2, 0))
+    damaged.merge_vertices()
+    x, faces = np.asarray(damaged.vertices), np.asarray(damaged.faces, np.int64)
     parts = closed_parts(x, faces, faces)
-    assert [len(one) for one in parts] == [12] * 5
+    assert [len(part) for part in parts] == [12] * 5
     assert (np.ptp(x[faces[parts[0]]], axis=(0, 1)) == 1).all()
 
 
@@ -155,8 +156,8 @@ def test_two_loose_balls() -> None:
     corner = np.concatenate([ball.triangles, np.add(ball.triangles, [3, 0, 0])])
     corner = corner + np.random.default_rng(0).normal(0, 1e-6, corner.shape)
     every = np.arange(3 * len(corner)).reshape(-1, 3)
-    given = trimesh.Trimesh(corner.reshape(-1, 3), every, process=False)
-    assert repaired(given).volume == pytest.approx(2 * ball.volume, rel=1e-5)
+    damaged = trimesh.Trimesh(corner.reshape(-1, 3), every, process=False)
+    assert repaired(damaged).volume == pytest.approx(2 * ball.volume, rel=1e-5)
 
 
 def test_qhull_raises_no_error_of_its_own() -> None:
@@ -177,11 +178,11 @@ def halves_along_a_zigzag() -> trimesh.Trimesh:
 @pytest.mark.slow
 def test_halves_of_a_ball_along_a_zigzag() -> None:
     """Half of the ball was left out, after 40 seconds."""
-    given = halves_along_a_zigzag()
-    made = repaired(given)
-    assert "the result of sound is another solid" in made.metadata["harnack"]["why"]
-    assert made.volume == pytest.approx(4.31, abs=0.03)
-    check_is(made, winding_sum(given.triangles), given.bounds)
+    damaged = halves_along_a_zigzag()
+    result = repaired(damaged)
+    assert "the result of sound is another solid" in result.metadata["harnack"]["why"]
+    assert result.volume == pytest.approx(4.31, abs=0.03)
+    check_is(result, winding_sum(damaged.triangles), damaged.bounds)
 
 
 @pytest.mark.parametrize("first", ["top", "bottom"])
@@ -192,8 +193,8 @@ def test_a_part_that_passes_through_a_face_along_its_edges(first: str) -> None:
     top = [[k, (k + 1) % 4, 4] for k in range(4)]
     bottom = [[(k + 1) % 4, k, 5] for k in range(4)]
     octahedron = trimesh.Trimesh(ends, top + bottom if first == "top" else bottom + top)
-    given = together(box([10, 10, 10], (0, 0, -5)), octahedron)
-    assert repaired(given).volume == pytest.approx(1000 + octahedron.volume / 2)
+    damaged = together(box([10, 10, 10], (0, 0, -5)), octahedron)
+    assert repaired(damaged).volume == pytest.approx(1000 + octahedron.volume / 2)
     apart = together(box([10, 10, 10], (0, 0, -7)), octahedron)  # a corner touches a face
     assert repaired(apart).metadata["harnack"]["stage"] == "kept"
 
@@ -206,12 +207,12 @@ def test_an_edge_on_a_face() -> None:
     prism = trimesh.Trimesh(np.concatenate([base, np.add(base, [0, 0, 4])])).convex_hull
     corner = np.array([6 * np.cos(turns[1]), 6 * np.sin(turns[1]), 0])
     prism.apply_translation(np.array([14, 18, 14]) / 3 - corner)
-    given = together(box([5, 4, 5], (5.5, 8, 9.5)), prism)
+    damaged = together(box([5, 4, 5], (5.5, 8, 9.5)), prism)
     volume = 100 + prism.volume
-    made = repaired(given)
-    assert made.metadata["harnack"]["stage"] == "united"
-    assert made.volume == pytest.approx(volume, rel=1e-7)
-    assert hk.mesh(hk.solid(given)).volume == pytest.approx(volume, rel=1e-7)
+    result = repaired(damaged)
+    assert result.metadata["harnack"]["stage"] == "united"
+    assert result.volume == pytest.approx(volume, rel=1e-7)
+    assert hk.mesh(hk.solid(damaged)).volume == pytest.approx(volume, rel=1e-7)
 
 
 # What finds it.
@@ -222,9 +223,9 @@ def test_a_difference_is_told() -> None:
     two = together(
         trimesh.Trimesh(vertices, faces), trimesh.Trimesh(np.add(vertices, [3, 0, 0]), faces)
     )
-    given = IntendedSolid.of(two)
-    assert given.difference(Surface(two.vertices, np.asarray(two.faces)), 1e-3) is None
-    lost = given.difference(Surface(vertices, faces), 1e-3)
+    damaged = IntendedSolid.of(two)
+    assert damaged.difference(Surface(two.vertices, np.asarray(two.faces)), 1e-3) is None
+    lost = damaged.difference(Surface(vertices, faces), 1e-3)
     assert lost is not None
     assert (lost.missing > 300, lost.added) == (True, 0)
     assert (np.linalg.norm(lost.places - [3, 0, 0], axis=1) < 1).all()
@@ -235,19 +236,19 @@ def test_a_difference_is_told() -> None:
     assert more is not None
     assert more.volumes == pytest.approx((2 * lost.volumes[0], lost.volumes[0]))
     # Within the length that is allowed nothing differs.
-    assert given.difference(Surface(1.01 * two.vertices, np.asarray(two.faces)), 0.05) is None
+    assert damaged.difference(Surface(1.01 * two.vertices, np.asarray(two.faces)), 0.05) is None
 
 
 @pytest.mark.parametrize("sides", [[1.0, 1.0, 0.003], [0.01, 0.01, 0.01]])
 def test_parts_that_hold_no_other_points_are_missed(sides: Any) -> None:
     """Made anew, with what else cannot be kept, they were lost without a word."""
     rest, part = box([3, 3, 3]), box(sides, (4, 0, 0))
-    made = Surface(np.asarray(rest.vertices), np.asarray(rest.faces, np.int64))
-    difference = IntendedSolid.of(together(rest, part)).difference(made, 4e-3)
+    result = Surface(np.asarray(rest.vertices), np.asarray(rest.faces, np.int64))
+    difference = IntendedSolid.of(together(rest, part)).difference(result, 4e-3)
     assert difference is not None
     assert (difference.missing, difference.added) == (12, 0)
     cavity = IntendedSolid.of(together(rest, inverted(box(sides, (0.2, 0, 0))))).difference(
-        made, 4e-3
+        result, 4e-3
     )
     assert cavity is not None
     assert (cavity.missing, cavity.added) == (0, 12)
@@ -255,13 +256,13 @@ def test_parts_that_hold_no_other_points_are_missed(sides: Any) -> None:
 
 def test_what_differs_is_said_if_nothing_better_is_found() -> None:
     """No patches can be made where edges lie on each other, and the triangles there go."""
-    given = halves_along_a_zigzag()
+    damaged = halves_along_a_zigzag()
     with pytest.warns(UserWarning, match=r"not quite the solid that was given: .* such as near"):
-        made = hk.repair(given, keep="sound")
-    differs = made.metadata["harnack"]["differs"]
+        result = hk.repair(damaged, keep="sound")
+    differs = result.metadata["harnack"]["differs"]
     assert differs["missing"] > 500
     assert differs["share"] > 0.1
-    assert made.volume < 2.5
+    assert result.volume < 2.5
 
 
 # Random assemblies.
@@ -283,16 +284,18 @@ def random_parts(seed: int) -> list[trimesh.Trimesh]:
             for h, end in zip(heights, ends, strict=True)
         ]
         turn = trimesh.transformations.random_rotation_matrix(rng.random(3))
-        for one in stack if seed % 8 else ():
-            one.apply_transform(turn)
+        for part in stack if seed % 8 else ():
+            part.apply_transform(turn)
         return stack
     if kind == 1:
         return [random_part(rng, inverts=k > 0 and rng.random() < 0.3) for k in range(count)]
     if kind == 2:
         scales = np.cumprod(rng.uniform(0.5, 0.75, count))
         ball = CREATE.icosphere(subdivisions=1)
-        made = [trimesh.Trimesh(scale * ball.vertices, ball.faces) for scale in scales]
-        return [inverted(one) if k and rng.random() < 0.6 else one for k, one in enumerate(made)]
+        result = [trimesh.Trimesh(scale * ball.vertices, ball.faces) for scale in scales]
+        return [
+            inverted(part) if k and rng.random() < 0.6 else part for k, part in enumerate(result)
+        ]
     cells = rng.choice(8, count, replace=False)
     corners = np.array(list(itertools.product((0, 1), repeat=3)))
     return [box([1, 1, 1], corners[cell]) for cell in cells]
@@ -304,28 +307,28 @@ def random_part(rng: np.random.Generator, *, inverts: bool) -> trimesh.Trimesh:
         lambda: CREATE.icosphere(subdivisions=2, radius=rng.uniform(0.4, 0.8)),
         lambda: CREATE.torus(0.6, rng.uniform(0.15, 0.3), major_sections=16, minor_sections=10),
     )
-    made = kinds[int(rng.integers(3))]()
-    made.apply_transform(trimesh.transformations.random_rotation_matrix(rng.random(3)))
-    made.apply_translation(rng.uniform(-0.5, 0.5, 3))
-    return inverted(made) if inverts else made
+    result = kinds[int(rng.integers(3))]()
+    result.apply_transform(trimesh.transformations.random_rotation_matrix(rng.random(3)))
+    result.apply_translation(rng.uniform(-0.5, 0.5, 3))
+    return inverted(result) if inverts else result
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(60))
 def test_random_assemblies(seed: int) -> None:
     parts = random_parts(seed)
-    given = together(*parts)
+    damaged = together(*parts)
     if seed % 3 == 1:
-        given.merge_vertices()
+        damaged.merge_vertices()
     if seed % 5 == 4:
-        given.invert()
-    made = repaired(given)
+        damaged.invert()
+    result = repaired(damaged)
 
     def winding(points: Any) -> Any:
         """A part that is inside out counts as one that is not, unless it lies in another."""
-        sums = [winding_sum(one.triangles)(points) for one in parts]
+        sums = [winding_sum(part.triangles)(points) for part in parts]
         if seed % 4 == 1:
-            sums = [w * np.sign(one.volume) for w, one in zip(sums, parts, strict=True)]
+            sums = [w * np.sign(part.volume) for w, part in zip(sums, parts, strict=True)]
         return sum(sums)
 
-    check_is(made, winding, given.bounds)
+    check_is(result, winding, damaged.bounds)

@@ -261,8 +261,8 @@ def test_rays_pass_where_all_squares_of_a_norm_are_zero() -> None:
     """A box as formulas write it: the root of squares that are 0 inside; rays through an axis."""
 
     def box(x: Any, y: Any, z: Any) -> Any:
-        q = [abs(one) - 0.75 for one in (x, y, z)]
-        out = [hk.maximum(one, 0.0) for one in q]
+        q = [abs(side) - 0.75 for side in (x, y, z)]
+        out = [hk.maximum(side, 0.0) for side in q]
         outside = hk.sqrt(out[0] * out[0] + out[1] ** 2 + 4 * out[2] ** 2)
         return hk.minimum(-outside - hk.minimum(hk.maximum(*q), 0.0), hk.sqrt(x**2 + y**2) - 0.1)
 

@@ -377,7 +377,7 @@ def test_a_page_that_is_closed_at_once_writes_nothing(caplog: pytest.LogCaptureF
                 )
                 page.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
             time.sleep(0.05)
-    assert [one.getMessage() for one in caplog.records if one.levelname == "ERROR"] == []
+    assert [record.getMessage() for record in caplog.records if record.levelname == "ERROR"] == []
 
 
 def test_a_picture_can_be_called_off(live: Live) -> None:

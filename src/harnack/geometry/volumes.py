@@ -392,8 +392,8 @@ class Intersection(Volume):
         members = tuple(volumes)
         if not members:
             raise ValueError("an intersection needs at least one volume")
-        for one in members:
-            check_volume(cast("Any", one) or "none", "each part of an intersection")
+        for member in members:
+            check_volume(cast("Any", member) or "none", "each part of an intersection")
         object.__setattr__(self, "volumes", members)
 
     def prepare(self, backend: Backend) -> Intersection:

@@ -165,8 +165,8 @@ def check_field(
     check_is_field(field)
     generator = np.random.default_rng(rng)
     count, directions = (
-        whole(one, name, 1, 2**31 - 1)
-        for one, name in ((count, "count"), (directions, "directions"))
+        whole(number, name, 1, 2**31 - 1)
+        for number, name in ((count, "count"), (directions, "directions"))
     )
     points = None if points is None else finite_vectors(points, "points")
     if points is None:
@@ -180,7 +180,7 @@ def check_field(
             )
         points = points[inside]
     several = levels if isinstance(levels, Sequence | np.ndarray) else (levels,)
-    levels = [real(field.default_level if one is None else one, "levels") for one in several]
+    levels = [real(field.default_level if level is None else level, "levels") for level in several]
     look = look_at(field, points)
     _check_numbers(field, points, look)
     check_derivatives(field, points, look)

@@ -217,9 +217,9 @@ def jet_of_field(field: Field, x: Jet, y: Jet, z: Jet) -> Jet:
             else:
                 bent = doubt * speeds[i] * speeds[j] * (1 + 1e-5)
                 own = (
-                    row[n] * (one.first[i] * other.first[j])
-                    for row, one in zip(rows, jets, strict=True)
-                    for n, other in enumerate(jets)
+                    row[n] * (jet.first[i] * column.first[j])
+                    for row, jet in zip(rows, jets, strict=True)
+                    for n, column in enumerate(jets)
                 )
                 along = along + _sum(own)
             second.append(along + Interval(-bent, bent))

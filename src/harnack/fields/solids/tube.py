@@ -79,7 +79,7 @@ class Tube(Solid):
         parts: list[FloatArray] = []
         if not isinstance(cast("Any", self.starts), tuple | list | np.ndarray):
             raise TypeError(f"starts must be indices of vertices, not {self.starts!r:.60}")
-        starts = [whole(one, "each start", 0, len(points)) for one in self.starts]
+        starts = [whole(start, "each start", 0, len(points)) for start in self.starts]
         if not 0 <= real(self.flattening, "flattening") < math.inf:
             raise ValueError(f"flattening must be a length, not {self.flattening!r}")
         for part in np.split(points, starts):
