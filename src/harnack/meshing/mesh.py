@@ -21,6 +21,7 @@ from harnack.meshing.by_signs import MOST_FAR, SMALLER, signed_surface
 from harnack.meshing.checks import (
     EmptyError,
     MeshingError,
+    TooLargeError,
     check_apart,
     check_inside,
     check_manifold,
@@ -92,7 +93,7 @@ def mesh(
     lie where edges of the cells meet the level, so on the very triangles of a sound mesh; parts
     that are nearer to each other than a cell may be joined, or missed. Of a mesh that is its own
     spanning surface (`WindingNumber`), such as a file of a `SolidAngle`'s, the triangles are kept
-    as they are.
+    as they are, whatever tolerance, spacing and seed are.
 
     field: a `SolidAngle` of polygons, a real-valued field that is continuous, or one of those; or a
         `LevelSet` of one level or a solid, whose level, clip, section, solid and largest are used
@@ -368,7 +369,7 @@ def _faces_alone(
     """The triangles of a mesh that is its own surface, as they are, but for what the volume cuts.
 
     Raises:
-        MeshingError: it is to be closed; nothing is left.
+        MeshingError: it is to be closed; nothing is left; it has too many triangles.
     """
     if solid:
         raise MeshingError(
@@ -382,6 +383,11 @@ def _faces_alone(
         surface = cut_by(surface, asked.volume)
     if not len(surface.faces):
         raise MeshingError("the level set is empty: it lies outside of the clip")
+    if len(surface.faces) > asked.most_faces:
+        raise TooLargeError(
+            f"{len(surface.faces):,} triangles of the mesh are its surface, and max_triangles is "
+            f"{asked.most_faces:,}: choose a larger max_triangles, or a smaller `clip`"
+        )
     known = {"level": level, "made_by": "faces", "spacing": math.nan, "evaluations": 0}
     function = LevelFunction(field, level, most_faces=asked.most_faces)
     return _Made(surface, size, known, function, _nothing, False)
