@@ -1,12 +1,13 @@
 """Operators that numbers of every arithmetic share, so that any of them can evaluate a formula.
 
 `tally_of` says, before anything is recorded, about how large a formula's kernel will be, and
-whether the formula may jump or have a vertical tangent.
+whether the formula may jump, have a vertical tangent, or turn within the rounding of coordinates.
 """
 
 from __future__ import annotations
 
 import abc
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
@@ -256,6 +257,11 @@ def exponent_of(n: Any) -> float:
 
 # Operations of Dr.Jit, measured for one piece of a path with its sample and slopes.
 _SUM, _PRODUCT, _FUNCTION = 60, 220, 300
+# What is so steep may turn within the rounding of coordinates that are no larger than this: 1/4096
+# is what 16 roundings of single precision are there.
+_ABRUPT, _FAR = 4096.0, 128.0
+# Sizes and slopes are not counted beyond this number, whose square does not overflow.
+_MOST = 1e100
 
 
 @dataclass(eq=False)
@@ -266,11 +272,29 @@ class Tally:
     may_jump: whether a function was used that is not continuous everywhere.
     is_steep: whether the slope may have no bound in a bounded box, as where roots, powers below 1,
         quotients or logarithms are used.
+    steepest: the largest slope, where coordinates are at most 1, of a number that was bent: by a
+        maximum, an absolute value, or a function that is no power.
+    finest: the smallest constant but 0, at most 1: what is bent may turn within so much.
+    farthest: the largest constant that was added.
     """
 
     operations: int = 0
     may_jump: bool = False
     is_steep: bool = False
+    steepest: float = 0.0
+    finest: float = 1.0
+    farthest: float = 0.0
+
+    @property
+    def is_abrupt(self) -> bool:
+        """Whether f may change within the rounding of coordinates by far more than its slopes on
+        both sides say, as max(-1, min(1, 1e9 y)) does: flat, steep, and flat again.
+
+        An estimate from the numbers of the formula, and no proof: sums and products of coordinates
+        alone do not get flat again; a function of 1e9 y does, such as tanh, and so does a maximum
+        with 1e-9.
+        """
+        return self.steepest * max(self.farthest / _FAR, 1.0) >= _ABRUPT * self.finest
 
 
 @dataclass(frozen=True, eq=False)
@@ -280,49 +304,72 @@ class Counted(Operators):
     is_constant: whether it is the same everywhere, so that functions of it have no slope.
     is_square: whether it is a sum of squares. The root of one has no vertical tangent: with
         f = sqrt(u^2 + v^2), |grad f| <= |grad u| + |grad v|.
+    size, rate: bounds of it and of its slope where coordinates are at most 1, and functions that
+        have a pole or grow faster than a power are taken to be about 1 and no steeper than what
+        they are of (`Tally.is_abrupt`). A constant that is an array counts as 1.
     """
 
     tally: Tally
     is_constant: bool = False
     is_square: bool = False
+    size: float = 1.0
+    rate: float = 1.0
 
     def constant(self, x: Any) -> Counted:
-        is_positive = isinstance(x, int | float) and x >= 0
-        return Counted(self.tally, is_constant=True, is_square=is_positive)
+        is_number = isinstance(x, int | float)
+        size = min(abs(float(x)), _MOST) if is_number else 1.0
+        if size > 0.0:
+            self.tally.finest = min(self.tally.finest, size)
+        is_positive = is_number and x >= 0
+        return Counted(self.tally, is_constant=True, is_square=is_positive, size=size, rate=0.0)
 
     def sum(self, other: Counted) -> Counted:
-        return self._after(_SUM, other, is_square=self.is_square and other.is_square)
+        for number in (self, other):
+            if number.is_constant:
+                self.tally.farthest = max(self.tally.farthest, number.size)
+        total = self.size + other.size, self.rate + other.rate
+        return self._after(_SUM, other, *total, is_square=self.is_square and other.is_square)
 
     def product(self, other: Counted) -> Counted:
         is_scaled = self.is_constant or other.is_constant
-        is_square = is_scaled and self.is_square and other.is_square
-        return self._after(_PRODUCT, other, is_square=other is self or is_square)
+        is_square = other is self or (is_scaled and self.is_square and other.is_square)
+        size, rate = self.size * other.size, self.size * other.rate + other.size * self.rate
+        return self._after(_PRODUCT, other, size, rate, is_square=is_square)
 
     def __neg__(self) -> Counted:
-        return self._after(0, self)
+        return self._after(0, self, self.size, self.rate)
 
     def __pow__(self, exponent: Any) -> Counted:
         if isinstance(exponent, Counted):  # exp(exponent log(x))
             self._note(log)
-            return self._after(_FUNCTION, exponent)
+            rate = self.rate + exponent.rate
+            self.tally.steepest = max(self.tally.steepest, rate)
+            return self._after(_FUNCTION, exponent, 1.0, rate)
         n = exponent_of(exponent)
         return self.apply(sqrt if n == 0.5 else power(n))
 
     def apply(self, function: Function) -> Counted:
         self._note(function)
-        return self._after(_FUNCTION, self, is_square=function.name == "power 2")
+        name, _, exponent = function.name.partition(" ")
+        if name == "power" and float(exponent) >= 1.0:
+            n, size = float(exponent), max(self.size, 1.0)
+            size, rate = _power(size, n), n * _power(size, n - 1) * self.rate
+            return self._after(_FUNCTION, self, size, rate, is_square=n == 2.0)
+        size = self.size if function is absolute else 1.0
+        return self._bent(_FUNCTION, self, size, self.rate)
 
     def larger(self, other: Counted) -> Counted:
-        return self._after(_FUNCTION, other)
+        rate = max(self.rate, other.rate)
+        return self._bent(_FUNCTION, other, max(self.size, other.size), rate)
 
     def angle(self, x: Counted) -> Counted:
         if not (self.is_constant and x.is_constant):
             self.tally.may_jump = self.tally.is_steep = True
-        return self._after(_FUNCTION + _PRODUCT, x)
+        return self._bent(_FUNCTION + _PRODUCT, x, 1.0, self.rate + x.rate)
 
     def norm_of_powers(self, p: float) -> Counted:
-        del p
-        return self._after(_FUNCTION, self)
+        size = max(self.size, 1.0) ** (1 / p)
+        return self._bent(_FUNCTION, self, size, self.rate / (p * size ** (p - 1)))
 
     def _note(self, function: Function) -> None:
         """Note what a function of this number may do."""
@@ -331,10 +378,25 @@ class Counted(Operators):
             self.tally.may_jump |= function.has_pole
             self.tally.is_steep |= function.is_steep and not is_norm
 
-    def _after(self, operations: int, other: Counted, *, is_square: bool = False) -> Counted:
+    def _bent(self, operations: int, other: Counted, size: float, rate: float) -> Counted:
+        """A number made of this and another one by what may be flat on both sides of a place."""
+        if not (self.is_constant and other.is_constant):
+            self.tally.steepest = max(self.tally.steepest, self.rate, other.rate)
+        return self._after(operations, other, size, rate)
+
+    def _after(
+        self, operations: int, other: Counted, size: float, rate: float, *, is_square: bool = False
+    ) -> Counted:
         """A number made of this and another one by so many operations."""
         self.tally.operations += operations
-        return Counted(self.tally, self.is_constant and other.is_constant, is_square)
+        is_constant = self.is_constant and other.is_constant
+        rate = 0.0 if is_constant else min(rate, _MOST)
+        return Counted(self.tally, is_constant, is_square, min(size, _MOST), rate)
+
+
+def _power(x: float, n: float) -> float:
+    """x^n for x >= 1, at most `_MOST`."""
+    return math.exp(min(n * math.log(x), math.log(_MOST)))
 
 
 def tally_of(formula: Callable[[Any, Any, Any], Any]) -> Tally:

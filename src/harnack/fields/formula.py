@@ -16,13 +16,13 @@ from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 import drjit as dr
 
 from harnack.arithmetic import Interval, Jet
 from harnack.arithmetic.jet import Dual
-from harnack.arithmetic.operators import Operators, tally_of
+from harnack.arithmetic.operators import Operators, Tally, tally_of
 from harnack.backend import choose_backend
 from harnack.backend.elementary import fmin, largest_coordinate, length
 from harnack.enclosures import Lipschitz, Slopes
@@ -78,6 +78,7 @@ class Formula(Field):
     has_creases = True  # it may use abs, maximum and minimum
     overstep = 1.0  # proved steps are long already; trying longer ones takes more samples
     lipschitz: Real | None = None
+    _prepared_tally: ClassVar[Tally | None] = None
 
     @abc.abstractmethod
     def formula(self, x: Any, y: Any, z: Any) -> Any:
@@ -86,9 +87,15 @@ class Formula(Field):
         it first, Dr.Jit's own operators would refuse jets."""
 
     @property
+    def tally(self) -> Tally:
+        """What the formula is made of; of a prepared one, while its numbers were known."""
+        return tally_of(self.formula) if self._prepared_tally is None else self._prepared_tally
+
+    @property
     def is_steep(self) -> bool:
-        """Whether the formula uses what may have a vertical tangent or a pole."""
-        return tally_of(self.formula).is_steep
+        """Whether the formula uses what may have a vertical tangent or a pole, or is as steep as
+        one for the rounding of coordinates."""
+        return self.tally.is_steep or self.tally.is_abrupt
 
     def evaluate(self, p: Vec3) -> Sample:
         sample = self._one_sided(p, self.sample_alone(p))
@@ -189,7 +196,8 @@ class Formula(Field):
         slope, slope_error = self._slope(p, path.direction)
         slopes = Slopes.around(slope, slope_error)
         function = self.restricted(p, path.direction)
-        if self.may_jump:
+        is_rounded = self.may_jump or self.tally.is_abrupt
+        if is_rounded:
             function = function.rounded(t)
         enclosures = path.proofs.along(function, slopes, ahead)
         if not enclosures:
@@ -219,7 +227,7 @@ class Formula(Field):
     def may_jump(self) -> bool:
         """Whether the formula has functions in it that are not continuous everywhere, or refuses
         numbers that would tell."""
-        return tally_of(self.formula).may_jump
+        return self.tally.may_jump
 
     def restricted(self, p: Vec3, direction: Vec3) -> FormulaAlong:
         """The field along the path from p, for enclosures."""
@@ -228,7 +236,9 @@ class Formula(Field):
     def prepare(self, backend: Backend) -> Field:
         """The same formula with its numbers as kernel parameters, so that other numbers compile no
         other kernel."""
-        return prepared_numbers(self, backend)
+        other = prepared_numbers(self, backend)
+        object.__setattr__(other, "_prepared_tally", self.tally)
+        return other
 
     def _jet(self, coordinates: tuple[Jet, Jet, Jet], like: Real) -> Jet:
         return as_jet(self.formula(*coordinates), coordinates[0], type(self).__name__)

@@ -384,8 +384,8 @@ class March:
         is_near = self._is_near(gap, within, total_error, rounding, look, gradient_norm, size, end)
         looks: Any = 0
         if steep is not None:
-            is_near &= now.active & dr.isfinite(total_error)
             may_be = steep.is_level
+            is_near = (is_near | may_be) & now.active & dr.isfinite(total_error)
             is_near, looks = self._is_there(field, path, t, look, gaps, size, is_near, may_be)
         return _Seen(
             t=t,
