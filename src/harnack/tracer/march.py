@@ -523,7 +523,7 @@ class March:
         if seen.steep is not None and self.cover is None:
             free = seen.steep.free
             if contact is not None:  # in contact, levels lie elsewhere
-                free = dr.select(contact.is_touching, 0, free)
+                free = dr.select(contact.is_touching, seen.steep.free_of(gaps), free)
             forward = fmax(free, forward)
         return forward
 

@@ -71,11 +71,16 @@ class SteepPlace:
         nearer, and f is proved to be continuous there. That is no proof that it is (`beyond`).
     free: a length of the path on which no value of f is a level, because f stays away from them or
         has no value at all; 0 where none is proved.
+    ahead: the length on which values were asked for. fall, rise: by how much f at most is smaller
+        and larger there than at the point; infinite where no bound is known.
     """
 
     error: Real | None
     is_level: Mask
     free: Real
+    ahead: Real
+    fall: Real
+    rise: Real
 
     @classmethod
     def at(
@@ -96,7 +101,7 @@ class SteepPlace:
         at_point = values_between(field, p, p, slack)
         on_path = values_between(field, p, path.point(t + ahead), slack)
         if at_point is None or on_path is None:
-            return cls(None, t < t, kind(0))
+            return cls(None, t < t, kind(0), kind(0), kind(dr.inf), kind(dr.inf))
         below, above = value - at_point.value.low, at_point.value.high - value
         known = (below >= 0) & (above >= 0) & ~at_point.jumps
         gaps = levels.gaps(value)
@@ -116,7 +121,13 @@ class SteepPlace:
                 misses &= (on_path.value.low > level) | (on_path.value.high < level)
             off = off | misses
         free = dr.select(off, ahead, 0)
-        return cls(error, is_level & known, free)
+        fall, rise = value - on_path.value.low, on_path.value.high - value
+        return cls(error, is_level & known, free, ahead, fall, rise)
+
+    def free_of(self, gaps: Gaps) -> Real:
+        """A length of the path on which f moves by less than these gaps; 0 where none is proved.
+        For levels that lie elsewhere, as those of a ray in contact do (`Hysteresis`)."""
+        return dr.select((self.fall < gaps.down) & (self.rise < gaps.up), self.ahead, 0)
 
 
 @dataclass(frozen=True)
