@@ -6,10 +6,12 @@ and points around a hit for whether the surface is there.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 import harnack as hk
 from harnack.arithmetic.operators import tally_of
@@ -21,7 +23,7 @@ from harnack.tracer.steep import SteepPlace
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from harnack.backend import FloatArray, Precision
+    from harnack.backend import BoolArray, FloatArray, Precision
 
 # Texts, the same functions of arrays, half a side of the box, and how many rays of 300 meet them.
 FORMULAS: dict[str, tuple[str, Callable[..., Any], float]] = {
@@ -287,3 +289,78 @@ def test_which_formulas_are_steep() -> None:
     assert not hk.Sphere().is_steep
     assert (hk.Sphere() | hk.solid(hk.expression("sqrt(x)"), below=1)).is_steep
     assert not tally_of(lambda x, y, z: 2.0).is_steep
+
+
+def test_which_formulas_turn_within_rounding() -> None:
+    def abrupt(text: str) -> bool:
+        return hk.expression(text).tally.is_abrupt
+
+    assert all(
+        map(
+            abrupt,
+            (
+                "max(-1, min(1, 1e9*y))", "max(-1e-9, min(1e-9, y))", "1e9*y/sqrt(1 + (1e9*y)^2)",
+                "tanh(1e5*(x + y))", "exp(-(1e9*y)^2)", "max(-1, min(1, 1e3*(y - 1e4)))",
+                "abs(1e6*y + 1) - abs(1e6*y - 1)",
+            ),
+        )
+    )  # fmt: skip
+    assert not any(
+        map(
+            abrupt,
+            (
+                "1e9*y", "1e9*x^2 + y^2 = 1", "max(abs(x) - 1, abs(y) - 1, abs(z) - 0.001)",
+                "exp(-400*(x^2 + y^2)) = 0.5", "sin(20*x)*cos(20*y) + sin(20*y)*cos(20*z)",
+                "x^20 + y^20 + z^20 = 1", "norm(x, y, z) = 1", "1/(x^2 + y^2) = 3",
+            ),
+        )
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Steps(hk.Shape):
+    """The product of two functions of y that go from -1 to 1 at -0.5 and at `offset`."""
+
+    steepness: float = 1e9
+    offset: float = 0.25
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        def step(at: Any) -> Any:
+            return hk.maximum(hk.minimum((y - at) * self.steepness, 1.0), -1.0)
+
+        return step(-0.5) * step(self.offset)
+
+
+def test_numbers_are_told_before_they_are_data_of_a_kernel() -> None:
+    steep, flat = Steps(), Steps(steepness=1.0)
+    backend = choose_backend("single")
+    assert steep.tally.is_abrupt
+    assert steep.prepare(backend).is_steep
+    assert not flat.prepare(backend).is_steep
+
+
+def meets(at: float, o: FloatArray, d: FloatArray) -> BoolArray:
+    """Which rays of length 5 meet the plane y = at."""
+    return np.not_equal(o[:, 1] < at, (o + 5 * d)[:, 1] < at)
+
+
+@pytest.mark.parametrize("precision", ["single", "double"])
+def test_no_level_is_passed_within_the_rounding_of_coordinates(precision: Precision) -> None:
+    """In single precision a fifth of the rays to the first plane were misses, most others ended
+    undecided."""
+    o, d = (np.float64(np.float32(one)) for one in rays(1.0, 1000))
+    settings: dict[str, Any] = {"t_max": 5.0, "precision": precision}
+    for text, level in (("max(-1, min(1, 1e9*y)) - 0.1*x", 0.0), ("tanh(1e9*y)", 0.3)):
+        hits = hk.trace(hk.expression(text), o, d, level=level, **settings)
+        assert_array_equal(hits.status, np.where(meets(0, o, d), hk.Status.HIT, hk.Status.MISS))
+        assert np.abs(hits.position[hits.hit, 1]).max() < 1e-4
+    crossings = hk.trace(Steps(), o, d, all_hits=3, **settings)
+    assert_array_equal(crossings.count, 1 * meets(-0.5, o, d) + meets(0.25, o, d))
+    assert (crossings.status == hk.Status.MISS).all()
+
+
+def test_sheets_thinner_than_rounding_are_never_missed() -> None:
+    o, d = (np.float64(np.float32(one)) for one in rays(1.0))
+    sheet = hk.expression("exp(-(1e9*y)^2) = 0.5")
+    hits = hk.trace(sheet, o, d, precision="single", t_max=5.0, max_steps=300)
+    assert_array_equal(hits.status != hk.Status.MISS, meets(0, o, d))

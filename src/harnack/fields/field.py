@@ -210,8 +210,9 @@ class Field(Sheets, Parts, Detail, Boundary, abc.ABC):
 
     @property
     def is_steep(self) -> bool:
-        """Whether |grad f| may have no bound in a bounded box, so that f may bend by any amount
-        within the tolerance of a hit. The tracer then looks at f beyond the hit."""
+        """Whether |grad f| may have no bound in a bounded box, or none that says how much f changes
+        within the rounding of coordinates, so that f may bend by any amount within the tolerance of
+        a hit. The tracer then looks at f beyond the hit."""
         return False
 
     def slope_change(self, p: Vec3, radius: Real) -> Real:

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, cast
 import drjit as dr
 
 from harnack.arithmetic import Interval, Jet
+from harnack.arithmetic.interval import unit_of
 from harnack.arithmetic.jet import Dual
 from harnack.arithmetic.operators import Operators, Tally, tally_of
 from harnack.backend import choose_backend
@@ -44,7 +45,7 @@ _RADII, _LARGEST_RADIUS = (0.25, 1.0, 4.0), 1e12
 _BESIDE, _ASIDE = 64.0, (0.31, 0.19, 0.13)
 # Where the gradient is known up to so many roundings there is no tie.
 _TIE = 1024.0
-# Where a formula may jump, pieces begin so many roundings of t before the point.
+# Where a formula may jump, or is abrupt, pieces begin so many roundings of t before the point.
 _ROUNDINGS = 8.0
 # A compilation that will take so many seconds is announced by a warning.
 _LONG = 10.0
@@ -188,6 +189,14 @@ class Formula(Field):
         f may jump, the piece begins before t, by more than the rounding of t, and is of all paths
         that lead through the point up to its rounding (`FormulaAlong.rounded`). The exact path up
         to t + s then lies in such pieces altogether, and they have no jump.
+
+        Proof that no level is passed where f is abrupt (`Tally.is_abrupt`), as max(-1, min(1, 1e9
+        y)) is. At a rounded point f may be -1 with slope 0, and 1 at the point of the exact path.
+        So the slopes at the start, too, are those of all points that round to this one: they hold
+        for the exact path, and with the values there, which differ from f here by no more than
+        `tracer.steep.SteepPlace.error`, they prove what is said of it. (Bounds that are made of no
+        such pieces prove it of the path through the rounded point; the error does the rest, except
+        where a path passes the end of a surface that is thinner than rounding.)
         """
         del back
         p = path.point(t)
@@ -196,8 +205,10 @@ class Formula(Field):
         slope, slope_error = self._slope(p, path.direction)
         slopes = Slopes.around(slope, slope_error)
         function = self.restricted(p, path.direction)
-        is_rounded = self.may_jump or self.tally.is_abrupt
-        if is_rounded:
+        is_abrupt = self.tally.is_abrupt
+        if is_abrupt:
+            slopes = Slopes.around(*self._slope(p, path.direction, is_rounded=True))
+        if is_abrupt or self.may_jump:
             function = function.rounded(t)
         enclosures = path.proofs.along(function, slopes, ahead)
         if not enclosures:
@@ -211,15 +222,18 @@ class Formula(Field):
         least = length(type(p)(*(0 * p.x + one.smallest for one in jet.first)))
         return Look(sample, enclosures, (), slope, growth, slope_error, least)
 
-    def _slope(self, p: Vec3, direction: Vec3) -> tuple[Real, Real]:
+    def _slope(self, p: Vec3, direction: Vec3, *, is_rounded: bool = False) -> tuple[Real, Real]:
         """The derivative along a direction and its error: in a crease, where the gradient is a
         range, it is known for directions along the crease. Pieces of the path start from it, so it
-        takes no more work."""
+        takes no more work. is_rounded: the error is then that of all points that round to p."""
         zero = 0 * p.x
-        x, y, z = (
-            Jet(Interval.exactly(p[k]), (Interval.exactly(direction[k]),), (), width=zero)
-            for k in range(3)
-        )
+
+        def coordinate(k: int) -> Jet:
+            at = Interval.exactly(p[k])
+            at = at.widened(unit_of(p[k])) if is_rounded else at
+            return Jet(at, (Interval.exactly(direction[k]),), (), width=zero)
+
+        x, y, z = (coordinate(k) for k in range(3))
         (slope,) = self._jet((x, y, z), p.x).first
         return zero + slope.middle, zero + slope.radius
 

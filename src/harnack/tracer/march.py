@@ -419,8 +419,9 @@ class March:
         is_near: Mask,
         may_be: Mask,
     ) -> tuple[Mask, Any]:
-        """At which of the points that are near a level by their slope f takes it within the
-        tolerance, and how many evaluations of f that took.
+        """At which of the points that are near a level, by their slope or by what f may be within
+        the rounding of the point, f takes it within the tolerance or twice that rounding, and how
+        many evaluations of f that took.
 
         It does if the enclosures prove it along the ray, or if f is seen on the other side of the
         level or at it (`steep.beyond`). may_be: whether the level may be f up to rounding.

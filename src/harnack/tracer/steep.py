@@ -4,6 +4,10 @@
 tangent or a pole it may bend by any amount: at x = 1e-6 the slope of sqrt(|x|) + 0.5 is 500, and
 the level 0 would be 0.001 away, but it is nowhere. So what would be a hit there is looked at on
 the other side, and what steps slopes do not prove, ranges of values may (`arithmetic.values`).
+
+So it is where a formula is steep within the rounding of coordinates only, as max(-1, min(1, 1e9 y))
+is: its slope is 0 on both sides. A rounded point there has a level within its error, which ends all
+steps; the ray hits if f is seen on the other side, and is undecided if it is not.
 """
 
 from __future__ import annotations
@@ -29,7 +33,7 @@ if TYPE_CHECKING:
 _SLACK, _FAR = 1.25, 8.0
 # How many points are looked at, and after those of a search; the most before these, and the section
 # of that search.
-_TRIALS, _SIDES, _MOST_LOOKS, _SECTION = 5, 6, 100, 0.381966
+_TRIALS, _SIDES, _MOST_LOOKS, _SECTION = 5, 7, 100, 0.381966
 
 
 def values_between(field: Field, p: Vec3, q: Vec3, slack: Real | None = None) -> Values | None:
@@ -194,9 +198,10 @@ def beyond(
     touches the level and turns back. The points are along the first way where the slope says that
     the level is, twice as far, and at `reach`; and the next two along the second way. Where f may
     be the level at p, up to the rounding of p, others follow: along the first way by golden
-    sections towards where f comes nearest to the level, and from there half of `reach` along each
-    axis. Ranges around p are no proof: they hold numbers that are no values of f. Where the level
-    is not found nothing is proved: the ray goes on, and comes nearer if it meets the surface.
+    sections towards where f comes nearest to the level, then back along the second way, as rounding
+    may have put p behind the level, and from the nearest place half of `reach` along each axis.
+    Ranges around p are no proof: they hold numbers that are no values of f. Where the level is not
+    found nothing is proved: the ray goes on, and comes nearer if it meets the surface.
     """
     finest = 4 * float(dr.epsilon(backend.Float)) * reach
 
@@ -204,16 +209,17 @@ def beyond(
         is_first, is_far = now.looks < 3, (now.looks == 2) | (now.looks == 4)
         is_search = now.looks >= _TRIALS
         is_side = is_search & ((now.high - now.low <= finest) | (now.looks >= _MOST_LOOKS))
-        way = dr.select(is_first | is_search, ways[0][0], ways[1][0])
+        is_behind = is_side & (now.sides == 0)
+        way = dr.select(is_first | (is_search & ~is_behind), ways[0][0], ways[1][0])
         rate = dr.abs(dr.select(is_first, ways[0][1], ways[1][1]))
         times = dr.select(now.looks == 0, backend.Float(1), 2)
         distance = dr.select(is_far, reach, fmin(times * gaps.smaller / rate, reach))
         behind, ahead = now.inner - now.low, now.high - now.inner
         section = now.inner + _SECTION * dr.select(ahead >= behind, ahead, -behind)
-        section = dr.select(is_side, now.inner, section)
+        section = dr.select(is_behind, -reach, dr.select(is_side, now.inner, section))
         distance = dr.select(is_search, section, distance)
         side = dr.select((now.sides & 1) == 0, 0.5 * reach, -0.5 * reach)
-        axis = now.sides >> 1
+        axis = (now.sides - 1) >> 1  # no axis where it is none: 0 - 1 is a large number
         aside = type(p)(*(dr.select(is_side & (axis == k), side, 0) for k in range(3)))
         q = dr.fma(type(p)(distance), way, p) + aside
         around = values_between(field, q, q, finest)

@@ -103,6 +103,7 @@ class Bent(Shape):
         other = copy.copy(self)
         object.__setattr__(other, "inner", self.inner.prepare(backend))
         object.__setattr__(other, "map", self.map.prepare(backend))
+        object.__setattr__(other, "_prepared_tally", self.tally)
         return other
 
 
