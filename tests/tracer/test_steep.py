@@ -293,7 +293,7 @@ def test_which_formulas_are_steep() -> None:
 
 def test_which_formulas_turn_within_rounding() -> None:
     def abrupt(text: str) -> bool:
-        return hk.expression(text).tally.is_abrupt
+        return hk.expression(text).is_abrupt
 
     assert all(
         map(
@@ -334,9 +334,11 @@ class Steps(hk.Shape):
 def test_numbers_are_told_before_they_are_data_of_a_kernel() -> None:
     steep, flat = Steps(), Steps(steepness=1.0)
     backend = choose_backend("single")
-    assert steep.tally.is_abrupt
+    assert steep.is_abrupt
     assert steep.prepare(backend).is_steep
     assert not flat.prepare(backend).is_steep
+    small = hk.Sphere(1e-5), hk.Cylinder(1e-3, 1e-4), hk.Cuboid((1e-4, 1.0, 1.0))
+    assert not any(shape.prepare(backend).is_steep for shape in small)
 
 
 def meets(at: float, o: FloatArray, d: FloatArray) -> BoolArray:

@@ -285,16 +285,17 @@ class Tally:
     finest: float = 1.0
     farthest: float = 0.0
 
-    @property
-    def is_abrupt(self) -> bool:
+    def turns_within(self, finest: float) -> bool:
         """Whether f may change within the rounding of coordinates by far more than its slopes on
         both sides say, as max(-1, min(1, 1e9 y)) does: flat, steep, and flat again.
+
+        finest: by how much what is bent has to change to turn, at least.
 
         An estimate from the numbers of the formula, and no proof: sums and products of coordinates
         alone do not get flat again; a function of 1e9 y does, such as tanh, and so does a maximum
         with 1e-9.
         """
-        return self.steepest * max(self.farthest / _FAR, 1.0) >= _ABRUPT * self.finest
+        return self.steepest * max(self.farthest / _FAR, 1.0) >= _ABRUPT * finest
 
 
 @dataclass(frozen=True, eq=False)
@@ -306,7 +307,7 @@ class Counted(Operators):
         f = sqrt(u^2 + v^2), |grad f| <= |grad u| + |grad v|.
     size, rate: bounds of it and of its slope where coordinates are at most 1, and functions that
         have a pole or grow faster than a power are taken to be about 1 and no steeper than what
-        they are of (`Tally.is_abrupt`). A constant that is an array counts as 1.
+        they are of (`Tally.turns_within`). A constant that is an array counts as 1.
     """
 
     tally: Tally

@@ -96,7 +96,16 @@ class Formula(Field):
     def is_steep(self) -> bool:
         """Whether the formula uses what may have a vertical tangent or a pole, or is as steep as
         one for the rounding of coordinates."""
-        return self.tally.is_steep or self.tally.is_abrupt
+        return self.tally.is_steep or self.is_abrupt
+
+    @property
+    def is_abrupt(self) -> bool:
+        """Whether f may change within the rounding of coordinates by far more than its slopes say.
+
+        Where a Lipschitz constant is stated, as the library's shapes do, which are about distances,
+        small numbers in a formula are lengths, and only large ones make it abrupt.
+        """
+        return self.tally.turns_within(1.0 if self.lipschitz is not None else self.tally.finest)
 
     def evaluate(self, p: Vec3) -> Sample:
         sample = self._one_sided(p, self.sample_alone(p))
@@ -190,7 +199,7 @@ class Formula(Field):
         that lead through the point up to its rounding (`FormulaAlong.rounded`). The exact path up
         to t + s then lies in such pieces altogether, and they have no jump.
 
-        Proof that no level is passed where f is abrupt (`Tally.is_abrupt`), as max(-1, min(1, 1e9
+        Proof that no level is passed where f is abrupt (`is_abrupt`), as max(-1, min(1, 1e9
         y)) is. At a rounded point f may be -1 with slope 0, and 1 at the point of the exact path.
         So the slopes at the start, too, are those of all points that round to this one: they hold
         for the exact path, and with the values there, which differ from f here by no more than
@@ -205,10 +214,9 @@ class Formula(Field):
         slope, slope_error = self._slope(p, path.direction)
         slopes = Slopes.around(slope, slope_error)
         function = self.restricted(p, path.direction)
-        is_abrupt = self.tally.is_abrupt
-        if is_abrupt:
+        if self.is_abrupt:
             slopes = Slopes.around(*self._slope(p, path.direction, is_rounded=True))
-        if is_abrupt or self.may_jump:
+        if self.is_abrupt or self.may_jump:
             function = function.rounded(t)
         enclosures = path.proofs.along(function, slopes, ahead)
         if not enclosures:
