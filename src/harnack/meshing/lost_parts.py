@@ -38,9 +38,9 @@ __all__ = ["LostParts", "PointsOnLevel"]
 
 # So many points are spread over triangles by area, and so many lie in the middles of others.
 _BY_AREA, _MIDDLES = 2000, 1000
-# Points beside triangles are so far from these, as a part of the size; and w on both sides is by
-# so much off the level at least, else rounding decides.
-_BESIDE, _CLEARLY = 1e-6, 0.02
+# Points beside triangles are so far from these, as a part of the size, or if that is more of the
+# coordinates; and w on both sides is by so much off the level at least, else rounding decides.
+_BESIDE, _ROUNDED, _CLEARLY = 1e-9, 64 * 2.0**-53, 0.02
 # So many smoothing lengths the level may be from the points of a cloud.
 _SMOOTHED = 2.0
 # Parts are lost if more than this share of the points are beyond the tolerance from the mesh, as
@@ -97,7 +97,8 @@ class PointsOnLevel:
         shares[-min(len(corner), _MIDDLES) :] = 1 / 3
         points, normal = np.einsum("ki,kij->kj", shares, corner[rows]), normal[rows]
         normal /= np.maximum(area[rows], 1e-300)[:, None]
-        away = _BESIDE * float(np.ptp(corner, axis=(0, 1)).max()) * normal
+        size, largest = float(np.ptp(corner, axis=(0, 1)).max()), float(np.abs(corner).max())
+        away = max(_BESIDE * size, _ROUNDED * largest) * normal
         beside = np.concatenate([points + away, points - away])
         value = function.wrapped(function.field.value(beside, precision="double"))
         function.evaluations += len(beside)
