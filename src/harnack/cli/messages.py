@@ -97,6 +97,7 @@ _PHRASES = {
     "target=(x, y, z)": "--target X,Y,Z",
     "boundary=0.03": "--boundary-tube 0.03",
     "harnack.Slider(low, high, step=...)": "--slider NAME=LOW:HIGH:STEP",
+    "`harnack.repair`": "`harnack repair`",
     "solid=True": "--solid",
     "solid=(-math.inf, level)": "--solid :LEVEL",
     "solid=(-math.inf, 0.0)": "--solid :0",

@@ -17,7 +17,7 @@ import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -42,11 +42,15 @@ from harnack.meshing.edges import (
 )
 from harnack.meshing.lattice import Lattice, distinct_rows
 from harnack.meshing.lattice_surface import Surface
+from harnack.meshing.lost_parts import LostParts, PointsOnLevel
 from harnack.meshing.marching_tetrahedra import Tetrahedra, crossings_of, triangles_of
 from harnack.meshing.points import PointSet
 from harnack.meshing.refinement import split_faces
 from harnack.meshing.samples import Samples
 from harnack.meshing.sign_function import SignFunction
+
+if TYPE_CHECKING:
+    from harnack.geometry import Volume
 
 __all__ = ["MOST_FAR", "SMALLER", "SignSurface", "sign_surface", "signed_surface"]
 
@@ -108,25 +112,42 @@ def signed_surface(
     report: Callable[[str], None],
     *,
     closed: bool = False,
-) -> tuple[SignSurface, dict[str, Any]]:
-    """`sign_surface` in cells of a box, and facts about it. Where more than a few vertices and
-    centers of triangles are beyond the tolerance, a length, it is made once more of smaller cells;
-    how many are at last, and within what distance all are, is among the facts.
+    volume: Volume | None = None,
+) -> tuple[SignSurface, LostParts, dict[str, Any]]:
+    """`sign_surface` in cells of a box, parts of the level that it lost, and facts about it. Where
+    more than a few vertices and centers of triangles are beyond the tolerance, a length, or lost
+    parts may be found so, it is made once more of smaller cells; how many are at last, and within
+    what distance all are, is among the facts.
+
+    volume: only what is lost within it counts.
 
     Raises:
         MeshingError: as `sign_surface`.
     """
+    known = PointsOnLevel.of(function, tolerance).within(*box, volume)
     while True:
         report(f"cells of {spacing:.3g}")
         layers = 2 if closed else 0
         lattice = Lattice.filling(*box, spacing, layers=layers)
-        made = sign_surface(function, lattice, 0.8 * tolerance, report, closed=closed)
+        try:
+            made = sign_surface(function, lattice, 0.8 * tolerance, report, closed=closed)
+        except EmptyError as error:
+            nothing = Surface(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
+            lost = LostParts.of(function, known, nothing, tolerance, spacing)
+            if not lost.far:
+                raise
+            raise EmptyError(f"the mesh is empty: {lost}; {lost.advice}") from error
         report("measuring distances to the level")
         far, count, within = _distances(function, made.surface, tolerance, lattice, closed)
+        report("looking for parts that were lost")
+        lost = LostParts.of(function, known, made.surface, tolerance, spacing)
         attempts -= 1
-        if attempts <= 0 or far <= MOST_FAR * count or len(made.surface.faces) > _MOST_REMADE:
+        may_help = far > MOST_FAR * count or (lost.matter and lost.are_mended_by(SMALLER))
+        if attempts <= 0 or not may_help or len(made.surface.faces) > _MOST_REMADE:
             break
         report(f"{far:,} of {count:,} vertices and centers are beyond the tolerance")
+        if lost.matter:
+            report(str(lost))
         spacing *= SMALLER
     facts = {
         "made_by": "signs",
@@ -139,8 +160,10 @@ def signed_surface(
         "far": far,
         "looked_at": count,
         "within": within,
+        "lost": lost.far,
+        "sought": lost.looked_at,
     }
-    return made, facts
+    return made, lost, facts
 
 
 def _distances(

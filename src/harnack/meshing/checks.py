@@ -50,6 +50,7 @@ __all__ = [
     "far_from_level",
     "intersecting_faces",
     "may_help_again",
+    "point_text",
     "sides_of_lines",
     "sides_of_planes",
     "singular_vertices",
@@ -476,7 +477,7 @@ def check_apart(vertices: FloatArray, faces: IntArray) -> None:
         places = vertices[faces[crossing]].mean(axis=1)
         raise CrossingError(
             f"{len(crossing):,} of {len(faces):,} triangles pass through each other, such as near "
-            f"{_point(places[0])}: choose a smaller `spacing` or a larger `tolerance`",
+            f"{point_text(places[0])}: choose a smaller `spacing` or a larger `tolerance`",
             places,
             crossing,
         )
@@ -497,7 +498,7 @@ def check_inside(vertices: FloatArray, volume: Volume, slack: float) -> None:
     if out.any():
         raise MeshingError(
             f"{out.sum():,} vertices of the mesh lie outside of what was asked for, such as "
-            f"{_point(vertices[out][0])}: choose a smaller `spacing`"
+            f"{point_text(vertices[out][0])}: choose a smaller `spacing`"
         )
 
 
@@ -528,7 +529,7 @@ def check_near_level(
     if len(far):
         raise FarError(
             f"{len(far):,} of {count:,} vertices and centers of triangles are farther than "
-            f"the tolerance, {tolerance:.3g}, from the level, such as {_point(far[0])}: "
+            f"the tolerance, {tolerance:.3g}, from the level, such as {point_text(far[0])}: "
             "choose a smaller `spacing` or a larger `tolerance`",
             far,
         )
@@ -582,7 +583,8 @@ def _is_positive(
     return above if volume is None else above | ~volume.contains_points(points)
 
 
-def _point(x: FloatArray) -> str:
+def point_text(x: FloatArray) -> str:
+    """A point (3,) as messages show it."""
     return "(" + ", ".join(f"{c:.4g}" for c in x) + ")"
 
 

@@ -20,6 +20,7 @@ __all__ = [
     "crosses",
     "directed_edges",
     "distance_from_triangles",
+    "distances_from_triangles",
     "distinct",
     "dots",
     "edge_keys",
@@ -48,23 +49,28 @@ IntArray = npt.NDArray[np.int64]
 
 
 def distance_from_triangles(point: FloatArray, corner: FloatArray) -> float:
-    """The distance (at most) of a point from triangles (k, 3, 3): from planes where its foot is
-    within the triangle, and from edges."""
-    least = np.inf
+    """The distance (at most) of a point from triangles (k, 3, 3)."""
+    return float(distances_from_triangles(point, corner).min(initial=np.inf))
+
+
+def distances_from_triangles(points: FloatArray, corner: FloatArray) -> FloatArray:
+    """(k,) the distances (at most) of points (k, 3), or of one (3,), each from its triangle (k, 3,
+    3): from the plane where its foot is within the triangle, and from edges."""
+    least = np.full(len(corner), np.inf)
     for k in range(3):
         start, way = corner[:, k], corner[:, k - 1] - corner[:, k]
-        share = dots(point - start, way) / np.maximum(dots(way, way), 1e-300)
+        share = dots(points - start, way) / np.maximum(dots(way, way), 1e-300)
         foot = start + np.clip(share, 0, 1)[:, None] * way
-        least = min(least, float(lengths(point - foot).min(initial=np.inf)))
+        least = np.minimum(least, lengths(points - foot))
     normal = crosses(corner)
     size = np.maximum(lengths(normal), 1e-300)
-    height = dots(point - corner[:, 0], normal) / size
-    foot = point - (height / size)[:, None] * normal
+    height = dots(points - corner[:, 0], normal) / size
+    foot = points - (height / size)[:, None] * normal
     is_within = np.ones(len(corner), np.bool_)
     for k in range(3):
         side = np.cross(corner[:, (k + 1) % 3] - corner[:, k], foot - corner[:, k])
         is_within &= dots(side, normal) >= 0
-    return min(least, float(np.abs(height[is_within]).min(initial=np.inf)))
+    return np.where(is_within, np.minimum(least, np.abs(height)), least)
 
 
 @dataclass(frozen=True)

@@ -33,6 +33,7 @@ from harnack.meshing.closed_mesh import box_manifold, manifold_of, surface_of, v
 from harnack.meshing.finishing import check_options, finished, normals_of, simplified, thickened
 from harnack.meshing.lattice import Lattice
 from harnack.meshing.lattice_surface import Surface, open_surface
+from harnack.meshing.lost_parts import LostParts
 from harnack.meshing.samples import CELLS_PER_WAVE, MOST_FACES, LevelFunction
 from harnack.meshing.sign_function import (
     SignFunction,
@@ -91,9 +92,10 @@ def mesh(
     `ScreenedWindingNumber`, `Morph`, `HRBF`, `Blobs`) are meshed by the signs of their values alone
     (`meshing.by_signs`), which gives a closed surface whatever the mesh or the cloud is. Vertices
     lie where edges of the cells meet the level, so on the very triangles of a sound mesh; parts
-    that are nearer to each other than a cell may be joined, or missed. Of a mesh that is its own
-    spanning surface (`WindingNumber`), such as a file of a `SolidAngle`'s, the triangles are kept
-    as they are, whatever tolerance, spacing and seed are.
+    that are thinner or nearer to each other than a cell may be missed or joined, which is looked
+    for at about three thousand points of the level (`meshing.lost_parts`) and warned of. Of a mesh
+    that is its own spanning surface (`WindingNumber`), such as a file of a `SolidAngle`'s, the
+    triangles are kept as they are, whatever tolerance, spacing and seed are.
 
     field: a `SolidAngle` of polygons, a real-valued field that is continuous, or one of those; or a
         `LevelSet` of one level or a solid, whose level, clip, section, solid and largest are used
@@ -128,7 +130,7 @@ def mesh(
     made of). Else a MeshingError is raised. By signs all is checked but the last: if more than one
     in a hundred vertices and centers are beyond the tolerance, smaller cells are tried; if that is
     not enough, a warning says how many there are and how far they are; and a MeshingError if some
-    are farther than a few cells.
+    are farther than a few cells. The same is done and said where parts of the level set are lost.
 
     Returns:
         A trimesh.Trimesh; if it is closed, `export` writes closed files, in single precision, or
@@ -149,6 +151,8 @@ def mesh(
         Of meshes by signs, made_by is "signs", and
         far, looked_at, within: how many vertices and centers of triangles are beyond the tolerance,
             of how many, and a distance within which all are, sampled up to a factor of 2;
+        lost, sought: how many points of the level are beyond the tolerance from the mesh, of how
+            many: on triangles of a mesh, at points of a cloud, on the way out of blobs;
         undecided: at how many points of the lattice the error of f leaves its sign open;
         flat: how many triangles were not fitted to creases, as they would pass through others;
         Where the triangles of a mesh were kept, made_by is "faces", and there is none of this.
@@ -273,6 +277,7 @@ def _by_signs(
     room = np.zeros(3) if box.has_walls else size * np.array([0.0037, 0.0053, 0.0029])
     filled = box.lower - room, box.upper + 0.5 * room
     facts: list[dict[str, Any]] = []
+    losses: list[LostParts] = []
 
     def function(one: float, side: float) -> SignFunction:
         return SignFunction.of(field, one, filled, cells, side=side, most_faces=asked.most_faces)
@@ -282,7 +287,7 @@ def _by_signs(
     def signed(one: float, side: float, closed: bool) -> Surface:
         nonlocal is_apart
         try:
-            made, more = signed_surface(
+            made, lost, more = signed_surface(
                 function(one, side),
                 filled,
                 cells,
@@ -290,10 +295,12 @@ def _by_signs(
                 attempts,
                 asked.report,
                 closed=closed,
+                volume=asked.volume,
             )
         except EmptyError as error:
             raise EmptyError(f"{error}{why_empty(field)}") from error
         facts.append(more)
+        losses.append(lost)
         is_apart = made.is_apart
         return made.surface
 
@@ -321,7 +328,8 @@ def _by_signs(
     known = {"level": levels[0], **_of_both(facts)}
     if isinstance(field, DipolePotential):
         known["cloud"] = field.describe()
-    _judge_signs(field, known, asked.tolerance * size)
+    is_told = _judge_signs(field, known, asked.tolerance * size)
+    _warn_of_lost(field, losses, is_told)
     return _Made(made, size, known, function(levels[0], 1.0), _nothing, is_apart)
 
 
@@ -408,13 +416,14 @@ def _check_has_thickness(
 
 def _of_both(facts: list[dict[str, Any]]) -> dict[str, Any]:
     """What is known of the surfaces at both ends of a solid."""
-    sums = ("evaluations", "undecided", "flat", "far", "looked_at")
+    sums = ("evaluations", "undecided", "flat", "far", "looked_at", "lost", "sought")
     larger = {key: max(one[key] for one in facts) for key in ("spacing", "within")}
     return {**facts[0], **larger, **{key: sum(one[key] for one in facts) for key in sums}}
 
 
-def _judge_signs(field: Field, facts: dict[str, Any], tolerance: float) -> None:
-    """Warns where more than a few vertices and centers of triangles are beyond the tolerance.
+def _judge_signs(field: Field, facts: dict[str, Any], tolerance: float) -> bool:
+    """Whether more than a few vertices and centers of triangles are beyond the tolerance, which is
+    warned of.
 
     Raises:
         MeshingError: some of them are nowhere near the level.
@@ -436,6 +445,19 @@ def _judge_signs(field: Field, facts: dict[str, Any], tolerance: float) -> None:
             "larger `tolerance`",
             stacklevel=4,
         )
+    return far > MOST_FAR * count
+
+
+def _warn_of_lost(field: Field, losses: list[LostParts], is_told: bool) -> None:
+    """Warns where parts of the level set are missing from the mesh; if it is told already that the
+    mesh is coarse, only of more than that."""
+    for lost in losses:
+        if lost.matter and (lost.show_thin_parts or not is_told):
+            warnings.warn(
+                f"the mesh is not quite the level of this {type(field).__name__}: {lost}; "
+                f"{lost.advice}",
+                stacklevel=4,
+            )
 
 
 def _nothing(surface: Surface) -> None:

@@ -17,7 +17,12 @@ from harnack.fields.solids.mesh_solid import MeshSolid
 from harnack.files.surfaces import Mesh, read_surface
 from harnack.geometry import MeshError, validate_mesh, zero_area_faces
 from harnack.geometry.welding import Welded
-from harnack.meshing.checks import intersecting_faces, singular_vertices, touching_pairs
+from harnack.meshing.checks import (
+    intersecting_faces,
+    point_text,
+    singular_vertices,
+    touching_pairs,
+)
 from harnack.meshing.clipping import Shells
 from harnack.meshing.edges import Edges, IntArray, directed_edges, lengths
 from harnack.meshing.lattice_surface import Surface
@@ -165,13 +170,9 @@ def _mesh_of(part: Any) -> tuple[FloatArray, IntArray, PrintProblem]:
 def _problem(kind: str, where: FloatArray, text: str, *, is_fatal: bool = True) -> PrintProblem:
     """text: with {} for the number, and the words for one and for several as {one|several}."""
     count = len(where)
-    near = "" if not count else f", {'' if count == 1 else 'such as '}at {_point(where[0])}"
+    near = "" if not count else f", {'' if count == 1 else 'such as '}at {point_text(where[0])}"
     text = _WORDS.sub(lambda pair: pair[1 if count == 1 else 2], text)
     return PrintProblem(kind, count, where, text.format(f"{count:,}") + near, is_fatal)
-
-
-def _point(x: FloatArray) -> str:
-    return "(" + ", ".join(f"{c:.4g}" for c in x) + ")"
 
 
 def _topology(x: FloatArray, faces: IntArray) -> list[PrintProblem]:

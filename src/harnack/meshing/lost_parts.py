@@ -1,0 +1,290 @@
+"""Parts of a level set that are missing from its mesh by signs: walls and gaps thinner than a cell.
+
+Signs at the points of a lattice do not show a wall between two of them, nor a gap. What was made of
+the signs is near the level everywhere, which `far_from_level` looks at; here the way back is looked
+at, from points that are known to lie on the level to the mesh. Around a point of the level that is
+farther than d from the mesh the sign of the function changes within d, and that of the mesh does
+not: so there is a part of the solid, or of the space around it, which the mesh does not have.
+
+Where points of the level are known: on the triangles of a mesh across which its winding number
+jumps over the level, beside the points of a cloud, and on the way out of blobs. That is a sample of
+about three thousand, spread evenly, and no proof.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from harnack.backend import BoolArray, FloatArray
+from harnack.fields.blobs.blobs import Blobs
+from harnack.fields.blobs.hrbf import HRBF
+from harnack.fields.solid_angles.dipole import DipolePotential
+from harnack.fields.solid_angles.oriented_points import OrientedPoints
+from harnack.fields.solid_angles.winding_number import WindingNumber
+from harnack.meshing.checks import point_text
+from harnack.meshing.edges import IntArray, crosses, distances_from_triangles, lengths
+from harnack.meshing.lattice_surface import Surface
+from harnack.meshing.sign_function import SignFunction
+
+if TYPE_CHECKING:
+    from harnack.fields import Field
+    from harnack.geometry import Volume
+
+__all__ = ["LostParts", "PointsOnLevel"]
+
+# So many points are spread over triangles by area, and so many lie in the middles of others.
+_BY_AREA, _MIDDLES = 2000, 1000
+# Points beside triangles are so far from these, as a part of the size, or if that is more of the
+# coordinates; and w on both sides is by so much off the level at least, else rounding decides.
+_BESIDE, _ROUNDED, _CLEARLY = 1e-9, 64 * 2.0**-53, 0.02
+# So many smoothing lengths the level may be from the points of a cloud.
+_SMOOTHED = 2.0
+# Parts are lost if more than this share of the points are beyond the tolerance from the mesh, as
+# many as may be of the mesh's own points from the level; or if one is farther than so many cells.
+_SHARE, _CELLS = 0.01, 0.5
+# How thick a part is at so many places, as parts of a cell.
+_LOOKED_AT, _THICKNESSES = 40, 2.0 ** np.arange(-10, 0.5, 0.25)
+# Thinner parts than this many cells are lost nearly everywhere.
+_THIN = 0.25
+
+
+@dataclass(frozen=True)
+class PointsOnLevel:
+    """Points (k, 3) on the level, and unit normals (k, 3) there towards where the function is
+    positive."""
+
+    points: FloatArray
+    normals: FloatArray
+
+    @classmethod
+    def of(cls, function: SignFunction, tolerance: float) -> PointsOnLevel:
+        """Those that are known of a field; none of a field of which nothing is known.
+
+        tolerance: a length, that a cloud's points are looked at from.
+        """
+        mesh = function.field.mesh_of_sheets()
+        if mesh is not None:
+            return cls._on_triangles(function, mesh[0][mesh[1]])
+        field = function.field
+        low = np.zeros((0, 3))
+        high = low
+        if isinstance(field, OrientedPoints | HRBF):
+            rows = _spread(len(field.points), _BY_AREA)
+            smoothed = field.smoothing if isinstance(field, DipolePotential) else 0.0
+            way = max(tolerance, _SMOOTHED * smoothed) * field.normals[rows]
+            way /= np.maximum(lengths(field.normals[rows]), 1e-300)[:, None]
+            low, high = field.points[rows] - way, field.points[rows] + way
+        elif isinstance(field, Blobs):
+            rows = _spread(len(field.centers), _BY_AREA)
+            way = np.random.default_rng(0).normal(size=(len(rows), 3))
+            way *= ((field.radii * field.kernel.support)[rows] / lengths(way))[:, None]
+            low, high = field.centers[rows], field.centers[rows] + way
+        is_low, is_high = function.values(low) > 0, function.values(high) > 0
+        low, high = np.where(is_low[:, None], high, low), np.where(is_low[:, None], low, high)
+        return cls(*function.crossings(low[is_low != is_high], high[is_low != is_high]))
+
+    @classmethod
+    def _on_triangles(cls, function: SignFunction, corner: FloatArray) -> PointsOnLevel:
+        """On triangles (m, 3, 3) across which the function changes its sign."""
+        normal = crosses(corner)
+        area = lengths(normal)
+        rows = np.concatenate([_by_area(area), _spread(len(corner), _MIDDLES)])
+        shares = np.random.default_rng(0).dirichlet((1.0, 1.0, 1.0), len(rows))
+        shares[-min(len(corner), _MIDDLES) :] = 1 / 3
+        points, normal = np.einsum("ki,kij->kj", shares, corner[rows]), normal[rows]
+        normal /= np.maximum(area[rows], 1e-300)[:, None]
+        size, largest = float(np.ptp(corner, axis=(0, 1)).max()), float(np.abs(corner).max())
+        away = max(_BESIDE * size, _ROUNDED * largest) * normal
+        beside = np.concatenate([points + away, points - away])
+        value = function.wrapped(function.field.value(beside, precision="double"))
+        function.evaluations += len(beside)
+        ahead, behind = value.reshape(2, -1)
+        jumps = (ahead > 0) != (behind > 0)
+        jumps &= (np.minimum(np.abs(ahead), np.abs(behind)) > _CLEARLY) & (area[rows] > 0)
+        return cls(points[jumps], np.where(ahead > 0, 1.0, -1.0)[jumps, None] * normal[jumps])
+
+    def some(self, rows: Any) -> PointsOnLevel:
+        """Some of them, by index or mask."""
+        return PointsOnLevel(self.points[rows], self.normals[rows])
+
+    def within(self, lower: FloatArray, upper: FloatArray, volume: Volume | None) -> PointsOnLevel:
+        """Those in a box and in a volume."""
+        is_in = ((self.points > lower) & (self.points < upper)).all(axis=1)
+        if volume is not None:
+            is_in &= volume.contains_points(self.points)
+        return self.some(is_in)
+
+
+@dataclass(frozen=True)
+class LostParts:
+    """Points of the level that are farther from a mesh than they should be.
+
+    far: how many are farther than the tolerance, of `looked_at`; beyond: how many of them are
+        farther than half a cell; within: a distance within which all are, by corners and centers
+        of triangles; inf if there are none.
+    missing, filled: (k, 3), of those that are far some that lie on parts which are missing, and
+        some in gaps which are filled; others: those of which neither is known.
+    thickness: of such parts and gaps, the median; inf if they are wider than cells, or not known.
+    spacing: of cells. advice: what to do.
+    """
+
+    far: int
+    looked_at: int
+    tolerance: float
+    beyond: int
+    within: float
+    missing: FloatArray
+    filled: FloatArray
+    others: FloatArray
+    thickness: float
+    spacing: float
+    advice: str
+
+    @classmethod
+    def of(
+        cls,
+        function: SignFunction,
+        known: PointsOnLevel,
+        surface: Surface,
+        tolerance: float,
+        spacing: float,
+    ) -> LostParts:
+        """Of a mesh of the level in cells of a spacing; known: where it should be."""
+        corner = surface.vertices[surface.faces]
+        far = known.some(_are_farther(known.points, corner, tolerance))
+        beyond = _are_farther(far.points, corner, max(tolerance, _CELLS * spacing))
+        within = _bound_of_distances(far.points, corner) if len(far.points) else tolerance
+        shown = far.some(_spread(len(far.points), _LOOKED_AT))
+        thickness, is_inside = _thicknesses(function, shown, spacing)
+        is_thin = np.isfinite(thickness)
+        thickness = thickness[is_thin]
+        return cls(
+            len(far.points),
+            len(known.points),
+            tolerance,
+            int(beyond.sum()),
+            within,
+            shown.points[is_thin & is_inside],
+            shown.points[is_thin & ~is_inside],
+            shown.points[~is_thin],
+            float(np.median(thickness)) if len(thickness) else np.inf,
+            spacing,
+            _advice(function.field),
+        )
+
+    @property
+    def matter(self) -> bool:
+        """Whether there are more than what creases and corners leave at all meshes."""
+        return self.beyond > 0 or self.far > _SHARE * self.looked_at
+
+    @property
+    def show_thin_parts(self) -> bool:
+        """Whether they are on parts or in gaps that are thinner than cells, or beyond half a cell,
+        so that more is wrong than how coarse the mesh is."""
+        return self.beyond + len(self.missing) + len(self.filled) > 0
+
+    def are_mended_by(self, smaller: float) -> bool:
+        """Whether cells smaller by a factor may show them: not if most are far thinner."""
+        return self.thickness >= _THIN * smaller * self.spacing
+
+    def __str__(self) -> str:
+        thin = (
+            (self.missing, "parts that are thinner than these are missing"),
+            (self.filled, "gaps that are narrower than these are filled"),
+        )
+        shown = [f"{words}, as near {point_text(x[0])}" for x, words in thin if len(x)]
+        within = f" (all within {self.within:.3g})" if math.isfinite(self.within) else ""
+        told = (
+            f"{self.far:,} of {self.looked_at:,} points of the level are farther than "
+            f"{self.tolerance:.3g} from the mesh{within}, which has cells of {self.spacing:.3g}: "
+            f"{' and '.join(shown)}"
+        )
+        if shown:
+            return f"{told}; they are about {self.thickness:.2g} thick"
+        return f"{told}such as {point_text(self.others[0])}"
+
+
+def _advice(field: Field) -> str:
+    """What helps where cells miss parts."""
+    advice = "choose a smaller `spacing`"
+    if isinstance(field, WindingNumber):
+        advice += "; `harnack.repair` keeps thin parts where their triangles are sound"
+    if isinstance(field, DipolePotential) and not field.smoothing:
+        advice += ', or smoothing="auto" if the points have noise'
+    return advice
+
+
+def _by_area(area: FloatArray) -> IntArray:
+    """Rows, each as often as its part of the area asks for."""
+    ends: FloatArray = np.cumsum(area)
+    places: FloatArray = (np.arange(_BY_AREA) + 0.5) / _BY_AREA * ends[-1]
+    return np.searchsorted(ends, places)
+
+
+def _spread(count: int, most: int) -> IntArray:
+    """All of some rows, or no more than `most`, evenly spread."""
+    return np.linspace(0, count - 1, min(count, most)).astype(np.int64)
+
+
+def _thicknesses(
+    function: SignFunction, known: PointsOnLevel, spacing: float
+) -> tuple[FloatArray, BoolArray]:
+    """How far points of the level (k, 3) are, along the normal on either side, from where the sign
+    changes again, up to about a cell, the smaller of both; and whether that is inside. Of clouds
+    that is not known."""
+    if isinstance(function.field, OrientedPoints):  # each point is in a bubble of its own
+        nowhere = np.full(len(known.points), np.inf)
+        return nowhere, nowhere > 0
+    far = spacing * _THICKNESSES
+    sides: list[FloatArray] = []
+    for sign in (1.0, -1.0):
+        places = known.points[:, None] + sign * far[:, None] * known.normals[:, None]
+        is_positive = function.values(places.reshape(-1, 3)).reshape(-1, len(far)) > 0
+        changed = is_positive != (sign > 0)
+        sides.append(np.where(changed.any(axis=1), far[changed.argmax(axis=1)], np.inf))
+    above, below = sides
+    # The function is positive inside, or where its side is -1 outside.
+    return np.minimum(above, below), (above < below) == (function.side > 0)
+
+
+def _bound_of_distances(points: FloatArray, corner: FloatArray) -> float:
+    """A distance within which points (n, 3) are from triangles (m, 3, 3); inf without any."""
+    import scipy.spatial  # here: half a second that few need
+
+    searching: Any = scipy.spatial
+    if not len(corner):
+        return math.inf
+    places = np.concatenate([corner.reshape(-1, 3), corner.mean(axis=1)])
+    tree = searching.cKDTree(places, compact_nodes=False, balanced_tree=False)
+    return float(tree.query(points)[0].max())
+
+
+def _are_farther(points: FloatArray, corner: FloatArray, distance: float) -> BoolArray:
+    """(n,) whether points (n, 3) are farther than a distance from all triangles (m, 3, 3).
+
+    A triangle within the distance has its center within that and its reach. Triangles are taken
+    together whose reach differs by less than a factor of 2.
+    """
+    import scipy.spatial  # here: half a second that few need
+
+    searching: Any = scipy.spatial
+    is_far = np.ones(len(points), np.bool_)
+    if not len(points):
+        return is_far
+    center = corner.mean(axis=1)
+    reach = np.stack([lengths(corner[:, k] - center) for k in range(3)]).max(axis=0)
+    octave = np.ceil(np.log2(np.maximum(reach, distance))).astype(np.int64)
+    for k in np.unique(octave).tolist():
+        left, rows = np.flatnonzero(is_far), np.flatnonzero(octave == k)
+        tree = searching.cKDTree(center[rows], compact_nodes=False, balanced_tree=False)
+        near = tree.query_ball_point(points[left], 2.0**k + distance)
+        counts = np.array([len(one) for one in near], np.int64)
+        if not counts.sum():
+            continue
+        place, of = np.repeat(left, counts), rows[np.concatenate(near).astype(np.int64)]
+        is_far[place[distances_from_triangles(points[place], corner[of]) <= distance]] = False
+    return is_far
