@@ -20,7 +20,7 @@ from harnack.tree.triangles import INDEX, NO_TRIANGLE, TriangleRays, corners_of
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real, Vec3
 
-__all__ = ["borders_of_overlaps"]
+__all__ = ["borders_of_overlaps", "overlapping_faces"]
 
 # In units of the mesh's size: triangles so near to a plane lie in it, and overlap by more.
 _SAME = 1e-12
@@ -45,7 +45,7 @@ def borders_of_overlaps(
     Within a part, where the others meet in edges that no further face has, as much covers the face
     on both sides: such edges are left out.
     """
-    covered, covering = _overlaps(rays, vertices, faces)
+    covered, covering = overlapping_faces(rays, vertices, faces)
     if not len(covered):
         return covered, np.zeros((0, 3, 3))
     edges, way = _edges(faces[covering])
@@ -110,7 +110,7 @@ def _candidates(corners: FloatArray, normal: FloatArray, height: FloatArray) -> 
     return np.flatnonzero((count[group] > 1) | ~is_sure)
 
 
-def _overlaps(
+def overlapping_faces(
     rays: TriangleRays, vertices: FloatArray, faces: IntArray
 ) -> tuple[IntArray, IntArray]:
     """Pairs of faces (k,), (k,) that overlap in a plane, each both ways round.
