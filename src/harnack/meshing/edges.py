@@ -57,10 +57,11 @@ def distance_from_triangles(point: FloatArray, corner: FloatArray) -> float:
         foot = start + np.clip(share, 0, 1)[:, None] * way
         least = min(least, float(lengths(point - foot).min(initial=np.inf)))
     normal = crosses(corner)
-    size = np.maximum(lengths(normal), 1e-300)
+    size = lengths(normal)
+    is_within = size > 0  # what has no area has edges alone
+    size = np.maximum(size, 1e-300)
     height = dots(point - corner[:, 0], normal) / size
     foot = point - (height / size)[:, None] * normal
-    is_within = np.ones(len(corner), np.bool_)
     for k in range(3):
         side = np.cross(corner[:, (k + 1) % 3] - corner[:, k], foot - corner[:, k])
         is_within &= dots(side, normal) >= 0

@@ -117,7 +117,7 @@ class _Cut:
         center = 0.5 * (low + high)
         unit = (vertices - center) / size
         rays = _rays(unit, faces[rows])
-        pieces, owner = pieces_of_faces(rays, unit, faces[rows])
+        pieces, owner = pieces_of_faces(rays, unit, faces[rows], covered_whole=True)
         around = _rays(unit, faces if closed is None else closed)
         front, back = windings_of_sides(around, pieces)
         edges = pieces - np.roll(pieces, 1, axis=1)

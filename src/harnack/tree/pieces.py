@@ -26,12 +26,14 @@ _MIDDLE = (1 / 3, 1 / 3, 1 / 3)
 
 
 def pieces_of_faces(
-    rays: TriangleRays, vertices: FloatArray, faces: IntArray
+    rays: TriangleRays, vertices: FloatArray, faces: IntArray, *, covered_whole: bool = False
 ) -> tuple[FloatArray, IntArray]:
     """Triangles (k, 3, 3) that fill the faces (m, 3), none of which passes through another or is
     covered by another in part; and (k,) which face each is of, and turns as.
 
     rays: the same faces, with coordinates of at most about one.
+    covered_whole: whether faces are also cut where others in their plane meet, so that each of these
+        covers a piece or does not.
 
     Where two triangles meet in a segment, at either end of it an edge of one of them meets the
     other. So all edges are followed as rays, and each of the two faces beside an edge is cut by
@@ -41,7 +43,7 @@ def pieces_of_faces(
     """
     corners = vertices[faces]
     cut, by = _crossing_faces(rays, vertices, faces)
-    covered, borders = borders_of_overlaps(rays, vertices, faces)
+    covered, borders = borders_of_overlaps(rays, vertices, faces, at_every_edge=covered_whole)
     if not len(cut) + len(covered):
         return corners, np.arange(len(faces))
     cut, knives = np.concatenate([cut, covered]), np.concatenate([corners[by], borders])
