@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from harnack.backend import BoolArray, FloatArray
+from harnack.backend import FloatArray
 from harnack.geometry import MeshError
 from harnack.meshing.checks import CrossingError, check_manifold, intersecting_faces
 from harnack.meshing.clipping import winding_around

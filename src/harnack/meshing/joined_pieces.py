@@ -1,5 +1,5 @@
-"""The boundary of the solid that a closed mesh bounds which passes through itself: its faces are cut
-along each other, and those pieces that bound the solid are joined.
+"""The boundary of the solid of a closed mesh that passes through itself: its faces are cut along
+each other, and those pieces that bound the solid are joined.
 
 Of the winding number on both sides of each piece it is known whether the piece bounds the points
 around which the mesh winds at least once. Pieces of two faces that meet are cut by each of them,
@@ -179,8 +179,8 @@ def _cut_at_corners(x: FloatArray, faces: IntArray) -> IntArray:
     Raises:
         MeshingError: they do not fit together.
     """
+    edges, _ = singular_edges(faces)
     for _ in range(_MOST_HALVINGS):
-        edges, _ = singular_edges(faces)
         if not len(edges):
             return faces
         edges = np.unique(np.sort(edges, axis=1), axis=0)
@@ -199,6 +199,7 @@ def _cut_at_corners(x: FloatArray, faces: IntArray) -> IntArray:
         halves = [np.column_stack([a, p, c]), np.column_stack([p, b, c])]
         halves = [half[(half[:, 0] != half[:, 2]) & (half[:, 1] != half[:, 2])] for half in halves]
         faces = np.concatenate([np.delete(faces, rows, axis=0), *halves])
+        edges, _ = singular_edges(faces)
     raise MeshingError(
         f"{len(edges):,} edges of pieces of faces that pass through each other do not fit together"
     )

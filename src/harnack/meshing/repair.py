@@ -84,8 +84,9 @@ def repair(
     are tried in turn:
 
     - kept: all triangles stay, and holes get patches;
-    - united: a closed mesh that crosses itself, or parts that overlap or touch, are cut where they
-      do, exactly, and what is inside is left out: cavities stay where it winds around no point;
+    - united: a closed mesh that crosses itself, also along edges that lie on its faces, or parts
+      that overlap or touch, are cut where they do, exactly, and what is inside is left out, as is
+      what it winds around clockwise: cavities stay where it winds around no point;
     - sound: triangles that are there twice, have no area or pass through others are left out, those
       turned over against their neighbors are turned back, and holes get patches; where one cannot
       be filled, the triangles around it are left out as well, ring by ring;

@@ -32,8 +32,8 @@ def pieces_of_faces(
     covered by another in part; and (k,) which face each is of, and turns as.
 
     rays: the same faces, with coordinates of at most about one.
-    covered_whole: whether faces are also cut where others in their plane meet, so that each of these
-        covers a piece or does not.
+    covered_whole: whether faces are also cut where others in their plane meet, so that each of
+        these covers all of a piece or nothing.
 
     Where two triangles meet in a segment, at either end of it an edge of one of them meets the
     other. So all edges are followed as rays, and each of the two faces beside an edge is cut by
@@ -172,9 +172,7 @@ def _next_of_others(
     return dr.while_loop(start, more, body, label="crossings of edges")[:2]
 
 
-def _cut_up(
-    pieces: FloatArray, rows: IntArray, knives: FloatArray
-) -> tuple[FloatArray, IntArray]:
+def _cut_up(pieces: FloatArray, rows: IntArray, knives: FloatArray) -> tuple[FloatArray, IntArray]:
     """The parts of triangles (n, 3, 3) whose entries `rows` (k,) are cut by the planes of knives
     (k, 3, 3); and the triangle that each is of.
 
