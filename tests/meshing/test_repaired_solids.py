@@ -14,6 +14,7 @@ import trimesh
 import harnack as hk
 from harnack.geometry.mesh_shapes import icosphere
 from harnack.meshing.bodies import closed_parts
+from harnack.meshing.edges import distance_from_triangles
 from harnack.meshing.intended_solid import IntendedSolid
 from harnack.meshing.lattice_surface import Surface
 from harnack.meshing.marching_tetrahedra import delaunay
@@ -215,6 +216,84 @@ def test_an_edge_on_a_face() -> None:
     assert hk.mesh(hk.solid(damaged)).volume == pytest.approx(volume, rel=1e-7)
 
 
+# One shell that passes through itself.
+
+
+def test_a_shell_that_passes_through_its_own_face_along_two_edges() -> None:
+    """All faces at the two edges have a corner in common with that face: nothing was wrong, said
+    `check_print`, and `repair` kept what winds around the lower tetrahedron the other way."""
+    corners = [[0, 0, 0], [4, 0, 0], [2, 4, 0], [2, 1, 0], [2, -1, 3], [2, -1, -3]]
+    upper = [[0, 3, 4], [3, 1, 4], [2, 4, 1], [2, 0, 4]]
+    lower = [[0, 5, 3], [3, 5, 1], [1, 5, 0], [2, 1, 0]]
+    fold = trimesh.Trimesh(corners, upper + lower, process=False)
+    assert fold.is_watertight
+    assert fold.is_winding_consistent
+    assert fold.volume == pytest.approx(6 - 2)
+    assert hk.check_print(fold).problems[0].kind == "touching faces"
+    result = repaired(fold)
+    assert result.metadata["harnack"]["stage"] == "united"
+    assert result.volume == pytest.approx(6)
+    assert hk.check_print(result).is_fine
+
+
+def bridged() -> trimesh.Trimesh:
+    """A box with half an octahedron in its top, whose surfaces are one by a bridge between them."""
+    ball = CREATE.box([10, 10, 10])
+    ends = 1.2 * np.array([[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
+    faces = [[k, (k + 1) % 4, 4] for k in range(4)] + [[(k + 1) % 4, k, 5] for k in range(4)]
+    octahedron = trimesh.Trimesh(np.add(ends, [-2.5, -2.5, 5]), faces, process=False)
+    whole = together(ball, octahedron)
+    middle = whole.triangles_center
+    start = int((middle.sum(axis=1) * (np.abs(middle[:, 2] - 5) < 1e-9)).argmax())
+    end = 12 + int((middle[12:] @ [1, 1, 2]).argmax())
+    rims = [whole.faces[start], whole.faces[end]]
+    holes = [0.1 * whole.vertices[rim] + 0.9 * whole.vertices[rim].mean(axis=0) for rim in rims]
+    first = len(whole.vertices)
+    a, b = [first, first + 1, first + 2], [first + 3, first + 4, first + 5]
+    ways = [[b[(r - k) % 3] for k in range(3)] for r in range(3)]
+    ends = np.concatenate(holes)
+    lengths = [np.linalg.norm(ends[:3] - ends[np.subtract(way, first)], axis=1) for way in ways]
+    loops = [(rims[0], a), (rims[1], b), (a, ways[int(np.argmin(np.sum(lengths, axis=1)))])]
+    made = [
+        face
+        for one, other in loops
+        for k, j in ((0, 1), (1, 2), (2, 0))
+        for face in ([one[k], one[j], other[j]], [one[k], other[j], other[k]])
+    ]
+    kept = np.delete(whole.faces, [start, end], axis=0)
+    return trimesh.Trimesh(
+        np.concatenate([whole.vertices, *holes]), np.concatenate([kept, made]), process=False
+    )
+
+
+def test_a_shell_joined_by_a_bridge() -> None:
+    """It was kept, and half of the octahedron counted twice."""
+    damaged = bridged()
+    assert damaged.is_watertight
+    assert damaged.body_count == 1
+    assert "touching faces" in [one.kind for one in hk.check_print(damaged).problems]
+    assert repaired(damaged).volume == pytest.approx(damaged.volume - 2 / 3 * 1.2**3)
+
+
+@pytest.mark.parametrize(
+    ("corner", "volume"), [((0, 5, 5), 500), ((-3, 5, 5), 500), ((5, 5, 0), 1250 / 3)]
+)
+def test_a_box_bent_into_its_own_face(corner: Any, volume: float) -> None:
+    """It took 20 to 96 s by cells, and its volume was off by 1e-5."""
+    bent = box([10, 10, 10], (5, 5, 5))
+    ends = np.asarray(bent.vertices).copy()
+    ends[(ends == 10).all(axis=1)] = corner
+    result = repaired(trimesh.Trimesh(ends, bent.faces, process=False))
+    assert result.metadata["harnack"]["stage"] == "united"
+    assert result.volume == pytest.approx(volume)
+
+
+def test_faces_without_area_hide_no_difference() -> None:
+    """All places were at distance 0 from these."""
+    flat = np.array([[[0, 0, 0], [1, 0, 0], [2, 0, 0]]], np.float64)
+    assert distance_from_triangles(np.array([1.0, 3, 4]), flat) == pytest.approx(5)
+
+
 # What finds it.
 
 
@@ -332,3 +411,31 @@ def test_random_assemblies(seed: int) -> None:
         return sum(sums)
 
     check_is(result, winding, damaged.bounds)
+
+
+def welded_parts(seed: int) -> trimesh.Trimesh:
+    """Two to four boxes and tetrahedra with whole coordinates, whose corners are joined until they
+    are one shell."""
+    rng = np.random.default_rng(seed)
+    while True:
+        parts = list[trimesh.Trimesh]()
+        for _ in range(rng.integers(2, 5)):
+            low = rng.integers(0, 4, 3)
+            part = CREATE.box(bounds=[low, low + rng.integers(1, 4, 3)])
+            if rng.random() < 0.5:
+                corners = rng.integers(0, 5, (4, 3))
+                if abs(np.linalg.det(corners[1:] - corners[0])) > 2:
+                    part = trimesh.Trimesh(corners).convex_hull
+            parts.append(part)
+        whole = together(*parts)
+        whole.merge_vertices()
+        if len(trimesh.graph.connected_components(whole.edges_unique)) == 1:
+            return whole
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(20))
+def test_random_parts_welded_to_one_shell(seed: int) -> None:
+    damaged = welded_parts(seed)
+    result = repaired(damaged)
+    check_is(result, winding_sum(damaged.triangles), damaged.bounds)

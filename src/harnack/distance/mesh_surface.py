@@ -68,7 +68,7 @@ class MeshSurface:
         if only_sheets:
             return cls(unit[faces], center, size, True)
         rays = _tree(choose_backend("double"), unit, faces)
-        pieces = pieces_of_faces(rays, unit, faces)
+        pieces, _ = pieces_of_faces(rays, unit, faces)
         if is_all:
             on = on_level(rays, pieces, surface.numbers)
         else:

@@ -8,19 +8,20 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from harnack.backend import BoolArray, FloatArray
+from harnack.backend import FloatArray
 from harnack.geometry import MeshError
 from harnack.meshing.checks import CrossingError, check_manifold, intersecting_faces
 from harnack.meshing.clipping import winding_around
 from harnack.meshing.closed_mesh import grown, manifold_of
-from harnack.meshing.edges import Edges, IntArray, crosses, directed_edges, dots, lengths
+from harnack.meshing.edges import IntArray, crosses, directed_edges, dots, lengths
+from harnack.meshing.joined_pieces import boundary_of_solid, neighbors, passes_itself
 from harnack.meshing.lattice_surface import Surface
 from harnack.meshing.solids import apart_of
 
 if TYPE_CHECKING:
     from manifold3d import Manifold
 
-__all__ = ["closed_parts", "nested", "united_parts", "volume_of"]
+__all__ = ["closed_parts", "mended_by_cuts", "nested", "united_parts", "volume_of"]
 
 # Closed parts have so many faces; of more parts than that none are told from the rest.
 _LEAST_FACES, _MOST_PARTS = 4, 200
@@ -28,8 +29,6 @@ _LEAST_FACES, _MOST_PARTS = 4, 200
 _PLACES = 16
 # These are so far within it, as a part of its size.
 _WITHIN = 1e-6
-# Faces around an edge have one direction if they are turned by less, in full turns.
-_SAME_TURN = 1e-9
 # Parts of the size: faces that are nearer lie on each other, and are moved into each other by that.
 _ON, _INTO = 1e-12, 1e-8
 # Parts whose union crosses itself are grown by this part of the size.
@@ -62,51 +61,12 @@ def _pieces(x: FloatArray, faces: IntArray) -> list[IntArray]:
     import scipy.sparse.csgraph as csgraph_module
 
     sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
-    pairs, m = directed_edges(faces), len(faces)
-    edges = Edges.of(pairs)
-    beside = [edges.twice() % m]
-    start = np.cumsum(edges.uses) - edges.uses
-    for k in np.flatnonzero((edges.uses > 2) & (edges.uses % 2 == 0)):
-        halves = edges.order[start[k] : start[k] + edges.uses[k]]
-        is_along = pairs[halves, 0] == edges.ends[k, 0]
-        rows = halves % m
-        third = faces[rows].sum(axis=1) - pairs[halves].sum(axis=1)
-        beside.append(rows[_wedges(x[edges.ends[k]], x[third], is_along)])
-    first, second = np.concatenate(beside).T
+    m = len(faces)
+    first, second = neighbors(x, faces).T % m
     graph = sparse.coo_matrix((np.ones(len(first)), (first, second)), shape=(m, m))
     piece = np.asarray(csgraph.connected_components(graph, directed=False)[1], np.int64)
     order = np.argsort(piece, kind="stable")
     return np.split(order, np.flatnonzero(np.diff(piece[order])) + 1)
-
-
-def _wedges(ends: FloatArray, third: FloatArray, is_along: BoolArray) -> IntArray:
-    """(k, 2) which faces around an edge have material between them.
-
-    ends: (2, 3) of the edge. third: (n, 3) the other corners of its faces; is_along: (n,) whether
-        they run it from the first end to the second.
-
-    Seen against the edge's direction, counter-clockwise, material begins behind a face that runs
-    the edge backwards, since its positive side looks back, and ends at the next one that runs it
-    forwards. Of faces in one direction those at which material ends come first.
-    """
-    way = ends[1] - ends[0]
-    away = third - ends[0]
-    away -= np.outer(away @ way / (way @ way), way)
-    across: Any = away[0] / max(float(np.linalg.norm(away[0])), 1e-300)
-    upright: Any = np.cross(way / float(np.linalg.norm(way)), across)
-    turn: FloatArray = np.arctan2(away @ upright, away @ across) / (2 * np.pi)
-    steps: IntArray = np.round(turn / _SAME_TURN).astype(np.int64) % round(1 / _SAME_TURN)
-    begun, wedges = list[int](), list[tuple[int, int]]()
-    is_taken = np.zeros(len(third), np.bool_)
-    for k in 2 * np.lexsort((~is_along, steps)).tolist():  # twice around
-        if is_taken[k]:
-            continue
-        if not is_along[k] and k not in begun:
-            begun.append(k)
-        elif is_along[k] and begun:
-            wedges.append((begun.pop(), k))
-            is_taken[list(wedges[-1])] = True
-    return np.array(wedges, np.int64).reshape(-1, 2)
 
 
 def _is_closed(faces: IntArray) -> bool:
@@ -147,6 +107,20 @@ def nested(x: FloatArray, parts: list[IntArray]) -> list[list[int]]:
         ]
         holders.append(sorted(around, key=lambda j: sizes[j]))
     return holders
+
+
+def mended_by_cuts(x: FloatArray, faces: IntArray, within: float) -> Surface:
+    """The boundary of the points around which a closed mesh winds at least once, by pieces of its
+    faces (`boundary_of_solid`).
+
+    within: a length by which slivers that are made where faces cross may be moved.
+
+    Raises:
+        MeshingError: nothing is left, or pieces do not fit together.
+    """
+    surface = apart_of(manifold_of(boundary_of_solid(x, faces)), within)
+    check_manifold(surface.faces, surface.vertices)
+    return surface
 
 
 def united_parts(x: FloatArray, faces: IntArray, parts: list[IntArray], within: float) -> Surface:
@@ -232,5 +206,7 @@ def _manifold_of_part(shell: Surface) -> tuple[Manifold, bool]:
     is_body = volume_of(shell.vertices, shell.faces) > 0
     if len(crossing := intersecting_faces(shell.vertices, shell.faces)):
         raise MeshError(f"{len(crossing):,} triangles of a part pass through others of it")
+    if passes_itself(shell, np.zeros(len(shell.faces), np.int64)):
+        raise MeshError("a part passes through itself along edges that lie on faces")
     faces = shell.faces if is_body else shell.faces[:, ::-1]
     return manifold_of(Surface(shell.vertices, faces)), is_body

@@ -184,24 +184,42 @@ def intersecting_faces(
 
 
 def touching_pairs(vertices: FloatArray, faces: IntArray) -> tuple[IntArray, FloatArray]:
-    """Pairs (k, 2) of faces (m, 3) without common corners of which one has a corner or an edge on
-    the other, decided exactly; and (k, 3) a corner that is on the other, or the middle of an edge.
+    """Pairs (k, 2) of faces (m, 3) of which one has a corner or an edge on the other, beyond a
+    corner that they share, decided exactly; and (k, 3) a corner that is on the other, or the middle
+    of an edge.
 
     Of a face that lies on another as a whole its edges do. Where edges meet between their ends, and
-    lie in neither face's plane, `intersecting_faces` has the pair.
+    lie in neither face's plane, `intersecting_faces` has the pair. So it has those that share two
+    corners, which have no more in common unless they overlap in one plane. Of two that share one
+    corner the planes meet in a line through it, or are one: each has a segment from it on that
+    line, and where these lie along each other an edge passes through a face, or the shorter one is
+    an edge at the corner, and in the other's plane.
     """
     batches: list[IntArray] = []
     places: list[FloatArray] = []
+
+    def add(pairs: IntArray, on: BoolArray, p: FloatArray, q: FloatArray) -> None:
+        batches.append(pairs[on])
+        places.append(0.5 * (p + q)[on])
+
     for pairs, heights in _pairs_in_doubt(vertices, faces, None):
-        apart = (faces[pairs[:, 0], :, None] != faces[pairs[:, 1]][:, None]).all(axis=(1, 2))
-        # A corner is an edge from itself to itself.
-        for i, j in ((0, 0), (1, 1), (2, 2), *_EDGES):
-            for (plane, of), height in zip((pairs.T, pairs.T[::-1]), heights, strict=True):
-                rows = np.flatnonzero(apart & (height[:, i] == 0) & (height[:, j] == 0))
+        same = faces[pairs[:, 0], :, None] == faces[pairs[:, 1]][:, None]
+        shared = same.sum(axis=(1, 2))
+        for way, ((plane, of), height) in enumerate(
+            zip((pairs.T, pairs.T[::-1]), heights, strict=True)
+        ):
+            # A corner is an edge from itself to itself.
+            for i, j in ((0, 0), (1, 1), (2, 2), *_EDGES):
+                rows = np.flatnonzero((shared == 0) & (height[:, i] == 0) & (height[:, j] == 0))
                 p, q = (vertices[faces[of[rows], k]] for k in (i, j))
-                on = _is_on(vertices[faces[plane[rows]]], p, q)
-                batches.append(pairs[rows[on]])
-                places.append(0.5 * (p + q)[on])
+                add(pairs[rows], _is_on(vertices[faces[plane[rows]]], p, q), p, q)
+            is_common = same.any(axis=1 + way)  # of the corners of `of`
+            for i in range(3):
+                rows = np.flatnonzero((shared == 1) & ~is_common[:, i] & (height[:, i] == 0))
+                apex = same.any(axis=2 - way)[rows].argmax(axis=1)[:, None]
+                turned = np.take_along_axis(faces[plane[rows]], (apex + np.arange(3)) % 3, axis=1)
+                p = vertices[faces[of[rows], i]]
+                add(pairs[rows], _is_between(vertices[turned], p), p, p)
     both = np.concatenate([*batches, np.zeros((0, 2), np.int64)])
     _, first = np.unique(both, axis=0, return_index=True)
     return both[first], np.concatenate([*places, np.zeros((0, 3))])[first]
@@ -350,6 +368,18 @@ def _is_on(triangle: FloatArray, p: FloatArray, q: FloatArray) -> BoolArray:
         is_on &= (np.stack(side) >= 0).any(axis=0)
     side = np.stack([sides_of_lines(p, q, a[:, k]) for k in range(3)])
     return is_on & ~((side > 0).all(axis=0) | (side < 0).all(axis=0))
+
+
+def _is_between(triangle: FloatArray, p: FloatArray) -> BoolArray:
+    """(k,) whether the ways from the first corners of triangles (k, 3, 3) to points in their planes
+    run between those to the two other corners, or along one of them."""
+    normal = np.abs(crosses(triangle))
+    axes = np.array([[1, 2], [2, 0], [0, 1]])[normal.argmax(axis=1)]
+    a = np.take_along_axis(triangle, axes[:, None].repeat(3, axis=1), axis=2)
+    p = np.take_along_axis(p, axes, axis=1)
+    turn = sides_of_lines(a[:, 0], a[:, 1], a[:, 2])
+    left = turn * sides_of_lines(a[:, 0], a[:, 1], p)
+    return (turn != 0) & (left >= 0) & (turn * sides_of_lines(a[:, 2], a[:, 0], p) >= 0)
 
 
 # Checks of whole meshes.

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from harnack.backend import FloatArray
 from harnack.geometry import Ball, Box, ConvexHull, HalfSpace, Intersection, Volume
 from harnack.geometry.meshes import solid_angles
-from harnack.meshing.checks import MeshingError, touching_pairs
+from harnack.meshing.checks import MeshingError
 from harnack.meshing.edges import IntArray, boundary_edges, crosses, dots, edge_keys
 from harnack.meshing.lattice_surface import Surface
 
@@ -25,7 +25,6 @@ __all__ = [
     "largest_body",
     "largest_part",
     "parts_of",
-    "pass_through",
     "turned_outwards",
     "winding_around",
     "without_films",
@@ -162,31 +161,6 @@ class Shells:
         that do turn outwards with nothing around, or inwards with one."""
         does = self.depths() == np.where(self.volumes > 0, 0, 1)
         return does[self.number]
-
-
-def pass_through(surface: Surface, shells: Shells) -> bool:
-    """Whether connected parts that pass through no triangle do so along edges that lie on faces,
-    where nothing passes through a triangle: of the faces that touch another part, some are then in
-    it and others are not."""
-    x, faces = surface.vertices, surface.faces
-    low, high = shells.corners.min(axis=1), shells.corners.max(axis=1)
-    count = len(shells.volumes)
-    is_near = np.zeros((count, len(faces)), np.bool_)
-    for k in range(count) if count > 1 else ():
-        is_near[k] = ((low <= shells.upper[k]) & (high >= shells.lower[k])).all(axis=1)
-    rows = np.flatnonzero(is_near.sum(axis=0) > 1)
-    if not len(rows):
-        return False
-    pairs = rows[touching_pairs(x, faces[rows])[0]]
-    pairs = pairs[shells.number[pairs[:, 0]] != shells.number[pairs[:, 1]]]
-    both = np.concatenate([pairs, pairs[:, ::-1]])
-    sides: dict[tuple[int, int], int] = {}
-    for face, other in np.unique(np.column_stack([both[:, 0], shells.number[both[:, 1]]]), axis=0):
-        turns = winding_around(shells.corners[shells.number == other], x[faces[face]].mean(axis=0))
-        key = int(shells.number[face]), int(other)
-        if sides.setdefault(key, round(turns)) != round(turns):
-            return True
-    return False
 
 
 def _parts(surface: Surface) -> IntArray:

@@ -63,10 +63,11 @@ def distances_from_triangles(points: FloatArray, corner: FloatArray) -> FloatArr
         foot = start + np.clip(share, 0, 1)[:, None] * way
         least = np.minimum(least, lengths(points - foot))
     normal = crosses(corner)
-    size = np.maximum(lengths(normal), 1e-300)
+    size = lengths(normal)
+    is_within = size > 0  # what has no area has edges alone
+    size = np.maximum(size, 1e-300)
     height = dots(points - corner[:, 0], normal) / size
     foot = points - (height / size)[:, None] * normal
-    is_within = np.ones(len(corner), np.bool_)
     for k in range(3):
         side = np.cross(corner[:, (k + 1) % 3] - corner[:, k], foot - corner[:, k])
         is_within &= dots(side, normal) >= 0

@@ -23,7 +23,7 @@ from harnack.geometry import MeshError, validate_mesh, zero_area_faces
 from harnack.geometry.chains import singular_edges, weld_vertices
 from harnack.geometry.meshes import without_zero_area_faces
 from harnack.geometry.sides import is_one_sided
-from harnack.meshing.bodies import united_parts
+from harnack.meshing.bodies import mended_by_cuts, united_parts
 from harnack.meshing.checks import (
     MeshingError,
     TooLargeError,
@@ -31,12 +31,13 @@ from harnack.meshing.checks import (
     intersecting_faces,
     singular_vertices,
 )
-from harnack.meshing.clipping import Shells, largest_body, parts_of, pass_through
+from harnack.meshing.clipping import Shells, largest_body, parts_of
 from harnack.meshing.edges import IntArray
 from harnack.meshing.finishing import check_options
 from harnack.meshing.harmonic_patches import Asked, HarmonicPatches, harmonic_patches, open_edges
 from harnack.meshing.hole_patches import filled, hole_loops
 from harnack.meshing.intended_solid import Difference, IntendedSolid
+from harnack.meshing.joined_pieces import passes_itself
 from harnack.meshing.lattice_surface import Surface
 from harnack.meshing.mesh import mesh as mesh_of
 from harnack.meshing.sound import Mended, joined, mended
@@ -83,8 +84,9 @@ def repair(
     are tried in turn:
 
     - kept: all triangles stay, and holes get patches;
-    - united: a closed mesh that crosses itself, or parts that overlap or touch, are cut where they
-      do, exactly, and what is inside is left out: cavities stay where it winds around no point;
+    - united: a closed mesh that crosses itself, also along edges that lie on its faces, or parts
+      that overlap or touch, are cut where they do, exactly, and what is inside is left out, as is
+      what it winds around clockwise: cavities stay where it winds around no point;
     - sound: triangles that are there twice, have no area or pass through others are left out, those
       turned over against their neighbors are turned back, and holes get patches; where one cannot
       be filled, the triangles around it are left out as well, ring by ring;
@@ -323,13 +325,18 @@ def _united(intended: IntendedSolid, asked: _Asked) -> tuple[Surface, dict[str, 
     if _is_fine(vertices, faces):
         raise MeshError("nothing of it passes through or lies in itself")
     facts = {"stage": "united", "kept": 0}
+    slivers = 0.5 * asked.tolerance * intended.size
     if len(intended.parts) > 1 and sum(map(len, intended.parts)) == len(faces):
         asked.report(f"uniting {len(intended.parts):,} parts")
         try:
-            slivers = 0.5 * asked.tolerance * intended.size
             return united_parts(vertices, faces, intended.parts, slivers), facts
         except (MeshError, MeshingError) as error:
             asked.report(f"{error}; so all at once")
+    asked.report("cutting faces along each other")
+    try:
+        return mended_by_cuts(vertices, faces, slivers), facts
+    except MeshingError as error:
+        asked.report(f"{error}; so by cells")
     made = mesh_of(MeshSolid(vertices, faces), progress=asked.report)
     return Surface(np.asarray(made.vertices), np.asarray(made.faces, np.int64)), facts
 
@@ -535,8 +542,8 @@ def _check_sides(surface: Surface) -> None:
         raise MeshError("a part of the mesh is inside out")
     if ((shells.volumes > 0) & (depths > 0)).any():
         raise MeshError("a part of the mesh is inside the material of another one")
-    if pass_through(surface, shells):
-        raise MeshError("parts of the mesh pass through each other along edges that lie on faces")
+    if passes_itself(surface, shells.number):
+        raise MeshError("the mesh passes through itself along edges that lie on faces")
 
 
 def _check_touching(faces: IntArray) -> None:

@@ -24,9 +24,10 @@ from harnack.meshing.checks import (
     intersecting_faces,
     singular_vertices,
 )
-from harnack.meshing.clipping import Shells, pass_through, turned_outwards
+from harnack.meshing.clipping import Shells, turned_outwards
 from harnack.meshing.edges import Edges, IntArray, boundary_edges, crosses, directed_edges, lengths
 from harnack.meshing.hole_patches import filled, hole_loops
+from harnack.meshing.joined_pieces import near_groups, passes_itself
 from harnack.meshing.lattice_surface import Surface
 
 __all__ = ["Mended", "against_neighbors", "joined", "mended"]
@@ -97,7 +98,7 @@ def joined(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray,
     usual = float(np.median(lengths((at - np.roll(at, 1, axis=1)).reshape(-1, 3))))
     found: list[tuple[int, FloatArray, IntArray, float]] = []
     for part in _NEAR:
-        group = _near_groups(places, part * usual)
+        group = near_groups(places, part * usual)
         count = np.bincount(group)[:, None]
         mean = np.stack([np.bincount(group, column) for column in places.T], axis=1) / count
         made = group[corners]
@@ -112,20 +113,6 @@ def joined(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray,
             "are joined"
         )
     return mean, whole, moved
-
-
-def _near_groups(places: FloatArray, distance: float) -> IntArray:
-    """(n,) numbers of groups of points, each nearer to another of its group than a distance."""
-    import scipy.sparse  # here: half a second that few need
-    import scipy.sparse.csgraph as csgraph_module
-    import scipy.spatial
-
-    sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
-    searching: Any = scipy.spatial
-    one, other = searching.cKDTree(places).query_pairs(distance, output_type="ndarray").T
-    n = len(places)
-    near = sparse.coo_matrix((np.ones(len(one)), (one, other)), shape=(n, n))
-    return np.asarray(csgraph.connected_components(near, directed=False)[1], np.int64)
 
 
 @dataclass(frozen=True)
@@ -244,8 +231,8 @@ class _State:
         faces = np.where(inwards[:, None], faces[:, ::-1], faces)
         whole = Surface(self.vertices, faces)
         shells = Shells.of(whole)
-        if pass_through(whole, shells):
-            raise MeshingError("parts pass through each other along edges that lie on faces")
+        if passes_itself(whole, shells.number):
+            raise MeshingError("it passes through itself along edges that lie on faces")
         bounds = shells.bound()
         lost = int((kept[~bounds] >= 0).sum())
         faces, kept, is_turned = (

@@ -23,6 +23,7 @@ from harnack.meshing.edges import (
     directed_edges,
     distance_from_triangles,
     distinct,
+    dots,
     edge_keys,
     lengths,
 )
@@ -219,24 +220,30 @@ def _changes(
     for a, b in np.stack(np.divmod(keys, count), axis=1).tolist():
         for one, other in ((a, b), (b, a)):
             change = patch.contracted(one, other)
-            if change is not None and _looks_onward(patch, *change):
+            if change is not None and _looks_onward(patch, *change, length):
                 moved = distance_from_triangles(patch.vertices[one], patch.vertices[change[1]])
                 if moved <= length:
                     yield moved, *change
         change = patch.flipped(a, b)
-        if change is not None and _looks_onward(patch, *change):
+        if change is not None and _looks_onward(patch, *change, length):
             c, d = (patch.vertices[change[1][0, k]] for k in (2, 1))
             moved = _between(patch.vertices[a], patch.vertices[b], c, d)
             if moved <= length:
                 yield moved, *change
 
 
-def _looks_onward(patch: _Patch, gone: IntArray, new: IntArray) -> bool:
+def _looks_onward(patch: _Patch, gone: IntArray, new: IntArray, length: float) -> bool:
     """Whether no new face, but for slivers, looks backwards from where the old ones look in the
-    mean."""
-    old, made = crosses(patch.vertices[patch.faces[gone]]), crosses(patch.vertices[new])
+    mean, and the volume between new and old ones is no more than if these moved by a length: a
+    vertex on the new faces says nothing of old ones that are folded, as at a thin spike."""
+    corner, replaced = patch.vertices[patch.faces[gone]], patch.vertices[new]
+    old, made = crosses(corner), crosses(replaced)
     mean = old.sum(axis=0)
     most = float(lengths(old).sum())
+    origin = corner[0, 0]
+    between = dots(replaced[:, 0] - origin, made).sum() - dots(corner[:, 0] - origin, old).sum()
+    if abs(float(between)) / 6 > length * most / 2:
+        return False
     return bool(((made @ mean > 0) | (lengths(made) <= _NOTHING * most)).all())
 
 

@@ -20,7 +20,7 @@ from harnack.tree.triangles import INDEX, NO_TRIANGLE, TriangleRays, corners_of
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real, Vec3
 
-__all__ = ["borders_of_overlaps"]
+__all__ = ["borders_of_overlaps", "overlapping_faces"]
 
 # In units of the mesh's size: triangles so near to a plane lie in it, and overlap by more.
 _SAME = 1e-12
@@ -35,7 +35,7 @@ _MIXED = np.array(
 
 
 def borders_of_overlaps(
-    rays: TriangleRays, vertices: FloatArray, faces: IntArray
+    rays: TriangleRays, vertices: FloatArray, faces: IntArray, *, at_every_edge: bool = False
 ) -> tuple[IntArray, FloatArray]:
     """Which faces (k,) have parts covered by others in their plane, and knives (k, 3, 3): triangles
     that meet that plane in one edge of the covered part's border.
@@ -43,9 +43,9 @@ def borders_of_overlaps(
     rays: the same faces, with coordinates of at most about one.
 
     Within a part, where the others meet in edges that no further face has, as much covers the face
-    on both sides: such edges are left out.
+    on both sides: such edges are left out, unless at_every_edge.
     """
-    covered, covering = _overlaps(rays, vertices, faces)
+    covered, covering = overlapping_faces(rays, vertices, faces)
     if not len(covered):
         return covered, np.zeros((0, 3, 3))
     edges, way = _edges(faces[covering])
@@ -59,7 +59,7 @@ def borders_of_overlaps(
     ends, faces_at = np.unique(_edges(faces)[0], axis=0, return_counts=True)
     width = len(vertices)
     at = np.searchsorted(ends @ [width, 1], key[edge] @ [width, 1])
-    is_border = (net != 0) | (count != faces_at[at])
+    is_border = at_every_edge | (net != 0) | (count != faces_at[at])
     face, edge = face[is_border], edge[is_border]
     p, q = np.moveaxis(vertices[key[edge]], 1, 0)
     normal, _ = _normals(vertices[faces[face]])
@@ -110,7 +110,7 @@ def _candidates(corners: FloatArray, normal: FloatArray, height: FloatArray) -> 
     return np.flatnonzero((count[group] > 1) | ~is_sure)
 
 
-def _overlaps(
+def overlapping_faces(
     rays: TriangleRays, vertices: FloatArray, faces: IntArray
 ) -> tuple[IntArray, IntArray]:
     """Pairs of faces (k,), (k,) that overlap in a plane, each both ways round.

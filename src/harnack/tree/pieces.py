@@ -16,7 +16,7 @@ from harnack.backend.arrays import aligned_integers
 from harnack.tree.coplanar import borders_of_overlaps
 from harnack.tree.triangles import NO_TRIANGLE, Frame, TriangleRays
 
-__all__ = ["on_level", "pieces_of_faces", "windings_beside"]
+__all__ = ["on_level", "pieces_of_faces", "windings_beside", "windings_of_sides"]
 
 # In units of the mesh's size. Nearer than that two places are the same.
 _SAME = 1e-12
@@ -25,11 +25,15 @@ _THINNEST = 1e-11
 _MIDDLE = (1 / 3, 1 / 3, 1 / 3)
 
 
-def pieces_of_faces(rays: TriangleRays, vertices: FloatArray, faces: IntArray) -> FloatArray:
+def pieces_of_faces(
+    rays: TriangleRays, vertices: FloatArray, faces: IntArray, *, covered_whole: bool = False
+) -> tuple[FloatArray, IntArray]:
     """Triangles (k, 3, 3) that fill the faces (m, 3), none of which passes through another or is
-    covered by another in part.
+    covered by another in part; and (k,) which face each is of, and turns as.
 
     rays: the same faces, with coordinates of at most about one.
+    covered_whole: whether faces are also cut where others in their plane meet, so that each of
+        these covers all of a piece or nothing.
 
     Where two triangles meet in a segment, at either end of it an edge of one of them meets the
     other. So all edges are followed as rays, and each of the two faces beside an edge is cut by
@@ -39,18 +43,19 @@ def pieces_of_faces(rays: TriangleRays, vertices: FloatArray, faces: IntArray) -
     """
     corners = vertices[faces]
     cut, by = _crossing_faces(rays, vertices, faces)
-    covered, borders = borders_of_overlaps(rays, vertices, faces)
+    covered, borders = borders_of_overlaps(rays, vertices, faces, at_every_edge=covered_whole)
     if not len(cut) + len(covered):
-        return corners
+        return corners, np.arange(len(faces))
     cut, knives = np.concatenate([cut, covered]), np.concatenate([corners[by], borders])
     whole = np.ones(len(faces), np.bool_)
     whole[cut] = False
     number = np.cumsum(~whole) - 1
-    pieces = _cut_up(corners[~whole], number[cut], knives)
+    pieces, owner = _cut_up(corners[~whole], number[cut], knives)
     edges = pieces - np.roll(pieces, 1, axis=1)
     longest = np.linalg.norm(edges, axis=2).max(axis=1)
     thick = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) > _THINNEST * longest
-    return np.concatenate([corners[whole], pieces[thick]])
+    owner = np.concatenate([np.flatnonzero(whole), np.flatnonzero(~whole)[owner[thick]]])
+    return np.concatenate([corners[whole], pieces[thick]]), owner
 
 
 def on_level(rays: TriangleRays, pieces: FloatArray, levels: tuple[float, ...]) -> BoolArray:
@@ -64,10 +69,20 @@ def windings_beside(
 ) -> tuple[FloatArray, FloatArray]:
     """(k,), (k,): the smaller and the larger of the winding numbers on both sides of triangles.
 
+    shares: barycentric coordinates of the place; by default the center.
+    """
+    front, back = windings_of_sides(rays, pieces, shares)
+    return np.minimum(front, back), np.maximum(front, back)
+
+
+def windings_of_sides(
+    rays: TriangleRays, pieces: FloatArray, shares: tuple[float, float, float] = _MIDDLE
+) -> tuple[FloatArray, FloatArray]:
+    """(k,), (k,): the winding numbers in front of triangles, whence they are seen to run
+    counter-clockwise, and behind them.
+
     A ray along the normal of each counts the crossings ahead of a place in it, and those ahead of a
     place just behind it: with that, triangles in the same place are passed all at once.
-
-    shares: barycentric coordinates of the place; by default the center.
     """
     backend = rays.tree.backend
     a, b, c = np.moveaxis(pieces, 1, 0)
@@ -76,11 +91,11 @@ def windings_beside(
     normal = np.where(length > 0, normal / np.where(length > 0, length, 1), [0.0, 0.0, 1.0])
     place = shares[0] * a + shares[1] * b + shares[2] * c
     frame = Frame.along(backend, to_vector3(backend, place), to_vector3(backend, normal))
-    ahead, behind = (
+    front, back = (
         to_numpy(rays.turns_ahead(frame, backend.Float(dr.opaque(backend.Float, t))))
         for t in (_SAME, -_SAME)
     )
-    return np.minimum(ahead, behind), np.maximum(ahead, behind)
+    return front, back
 
 
 def _crossing_faces(
@@ -157,15 +172,16 @@ def _next_of_others(
     return dr.while_loop(start, more, body, label="crossings of edges")[:2]
 
 
-def _cut_up(pieces: FloatArray, rows: IntArray, knives: FloatArray) -> FloatArray:
+def _cut_up(pieces: FloatArray, rows: IntArray, knives: FloatArray) -> tuple[FloatArray, IntArray]:
     """The parts of triangles (n, 3, 3) whose entries `rows` (k,) are cut by the planes of knives
-    (k, 3, 3).
+    (k, 3, 3); and the triangle that each is of.
 
     In each round every piece is cut by one of those knives that meet it, in the middle of its list,
     and its parts share the rest: so their number falls by about half.
     """
     done: list[FloatArray] = []
-    by = np.arange(len(knives))
+    owners: list[IntArray] = []
+    by, whole = np.arange(len(knives)), np.arange(len(pieces))
     while True:
         height = _heights(pieces[rows], knives[by])
         height[np.abs(height) < _SAME] = 0
@@ -175,15 +191,16 @@ def _cut_up(pieces: FloatArray, rows: IntArray, knives: FloatArray) -> FloatArra
         is_cut = np.zeros(len(pieces), np.bool_)
         is_cut[rows] = True
         done.append(pieces[~is_cut])
+        owners.append(whole[~is_cut])
         if not len(rows):
-            return np.concatenate(done)
+            return np.concatenate(done), np.concatenate(owners)
         order = np.argsort(rows, kind="stable")
         rows, by, height = rows[order], by[order], height[order]
         owner, first, count = np.unique(rows, return_index=True, return_counts=True)
         middle = first + count // 2
         left = np.ones(len(rows), np.bool_)
         left[middle] = False
-        pieces = _parts(pieces[owner], height[middle])
+        pieces, whole = _parts(pieces[owner], height[middle]), np.tile(whole[owner], 3)
         rest = np.searchsorted(owner, rows[left])
         rows = (rest[:, None] + len(owner) * np.arange(3)).ravel()
         by = np.repeat(by[left], 3)

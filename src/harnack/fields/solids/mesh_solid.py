@@ -492,7 +492,7 @@ def _boundary(
     same = rays
     if len(whole) < len(faces):
         same = _tree(choose_backend("double"), unit, whole, 1.0, slabs=False)
-    pieces = pieces_of_faces(same, unit, whole)
+    pieces, _ = pieces_of_faces(same, unit, whole)
     edges = pieces - np.roll(pieces, 1, axis=1)
     longest = np.linalg.norm(edges, axis=2).max(axis=1)
     is_thick = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) > _THIN * longest

@@ -1,0 +1,294 @@
+"""The boundary of the solid of a closed mesh that passes through itself: its faces are cut along
+each other, and those pieces that bound the solid are joined.
+
+Of the winding number on both sides of each piece it is known whether the piece bounds the points
+around which the mesh winds at least once. Pieces of two faces that meet are cut by each of them,
+with corners apart by rounding, and one may have corners in the middle of an edge of the other. So
+corners are joined first, and then edges are cut at the corners on them.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import Any, cast
+
+import numpy as np
+
+from harnack.backend import BoolArray, FloatArray, choose_backend
+from harnack.geometry.chains import singular_edges
+from harnack.geometry.meshes import without_zero_area_faces
+from harnack.meshing.checks import MeshingError, touching_pairs
+from harnack.meshing.edges import Edges, IntArray, crosses, directed_edges, dots, lengths
+from harnack.meshing.lattice_surface import Surface
+from harnack.tree import build_hierarchy
+from harnack.tree.coplanar import overlapping_faces
+from harnack.tree.pieces import pieces_of_faces, windings_of_sides
+from harnack.tree.triangles import TriangleRays, triangle_records
+
+__all__ = ["boundary_of_solid", "near_groups", "neighbors", "passes_itself"]
+
+_LEAF_SIZE = 4
+# In units of the mesh's size. Pieces not as high as the first are not asked what is beside them.
+_THIN, _SAME = 1e-9, 1e-11
+# Faces around an edge have one direction if they are turned by less, in full turns.
+_SAME_TURN = 1e-9
+# How often edges are halved at corners on them.
+_MOST_HALVINGS = 200
+
+
+def passes_itself(surface: Surface, number: IntArray) -> bool:
+    """Whether a closed surface none of whose triangles pass through others does so along edges that
+    lie on faces, where nothing passes through a triangle.
+
+    number: (m,) of the connected part that each face belongs to.
+
+    Proof. Where one sheet passes through another, each is cut in two, with winding numbers on both
+    sides of one part that are larger by one than those of the other. So the numbers beside pieces
+    of faces that touch others are not the same all over a connected part. Where no sheet passes
+    through it they are: they change at no other place.
+    """
+    pairs, _ = touching_pairs(surface.vertices, surface.faces)
+    if not len(pairs):
+        return False
+    cut = _Cut.of(surface.vertices, surface.faces, np.unique(pairs))
+    beside = np.column_stack([number[cut.owner], cut.front, cut.back])[cut.is_thick]
+    sides = np.unique(beside, axis=0)
+    return len(sides) > len(np.unique(sides[:, 0]))
+
+
+def boundary_of_solid(vertices: FloatArray, faces: IntArray) -> Surface:
+    """The boundary of the points around which a closed mesh winds at least once; it may wind around
+    others clockwise. Where it touches itself it has corners of its own for each sheet.
+
+    Corners of the mesh are as they were, bit by bit.
+
+    Raises:
+        MeshingError: there are no such points, or pieces do not fit together.
+    """
+    x, whole = without_zero_area_faces(vertices, faces)
+    cut = _Cut.of(x, whole, np.arange(len(whole)), closed=faces)
+    bounds = (np.minimum(cut.front, cut.back) < 0.5) & (np.maximum(cut.front, cut.back) > 0.5)
+    bounds &= ~cut.is_there_before()
+    if not bounds.any():
+        raise MeshingError("the solid is empty: the mesh winds around no point")
+    pieces = cut.pieces[bounds]
+    looks_in = (cut.front > cut.back)[bounds]
+    pieces = np.where(looks_in[:, None, None], pieces[:, ::-1], pieces)
+    places = np.concatenate([cut.unit, pieces.reshape(-1, 3)])
+    group = near_groups(places, _SAME)
+    first = np.unique(group, return_index=True)[1][group]  # corners of the mesh come first
+    joined = first[len(x) :].reshape(-1, 3)
+    joined = joined[(joined != np.roll(joined, 1, axis=1)).all(axis=1)]
+    joined = _cut_at_corners(places, joined)
+    moved = np.concatenate([x, cut.center + cut.size * places[len(x) :]])
+    return Surface.of(*_apart_at_contacts(moved, joined))
+
+
+@dataclass(frozen=True)
+class _Cut:
+    """Pieces (k, 3, 3) of some faces of a mesh, cut along each other, in coordinates of at most
+    about one: center + size times them are the real ones.
+
+    unit: (n, 3) vertices. faces: those that were cut; owner: (k,) which of the mesh each piece is
+    of. front, back: (k,) winding numbers on its sides. is_thick: (k,) whether these are known.
+    """
+
+    rays: TriangleRays
+    unit: FloatArray
+    faces: IntArray
+    center: FloatArray
+    size: float
+    pieces: FloatArray
+    owner: IntArray
+    front: FloatArray
+    back: FloatArray
+    is_thick: BoolArray
+
+    @classmethod
+    def of(
+        cls, vertices: FloatArray, faces: IntArray, rows: IntArray, closed: IntArray | None = None
+    ) -> _Cut:
+        """Of the faces `rows`. closed: all faces, with those that have no area, if there are
+        such."""
+        corner = vertices[faces]
+        low, high = corner.min(axis=(0, 1)), corner.max(axis=(0, 1))
+        size = float(2.0 ** np.ceil(np.log2(0.5 * float((high - low).max()))))
+        center = 0.5 * (low + high)
+        unit = (vertices - center) / size
+        rays = _rays(unit, faces[rows])
+        pieces, owner = pieces_of_faces(rays, unit, faces[rows], covered_whole=True)
+        around = _rays(unit, faces if closed is None else closed)
+        front, back = windings_of_sides(around, pieces)
+        edges = pieces - np.roll(pieces, 1, axis=1)
+        longest = np.linalg.norm(edges, axis=2).max(axis=1)
+        is_thick = np.linalg.norm(crosses(pieces), axis=1) > _THIN * longest
+        return cls(
+            rays, unit, faces[rows], center, size, pieces, rows[owner], front, back, is_thick
+        )
+
+    def is_there_before(self) -> BoolArray:
+        """(k,) which pieces lie on a face in front of their own, in one plane, if all were cut: of
+        several in one place one is enough."""
+        is_there = np.zeros(len(self.pieces), np.bool_)
+        covered, covering = overlapping_faces(self.rays, self.unit, self.faces)
+        covered, covering = covered[covering < covered], covering[covering < covered]
+        order = np.argsort(self.owner, kind="stable")
+        start, end = (
+            np.searchsorted(self.owner[order], covered, side=side) for side in ("left", "right")
+        )
+        count = end - start
+        past = np.cumsum(count) - count
+        rows = order[np.arange(int(count.sum())) + np.repeat(start - past, count)]
+        triangle = self.unit[self.faces[np.repeat(covering, count)]]
+        middle, normal = self.pieces[rows].mean(axis=1), crosses(triangle)
+        within = np.ones(len(rows), np.bool_)
+        for i, j in ((0, 1), (1, 2), (2, 0)):
+            inward = np.cross(normal, triangle[:, j] - triangle[:, i])
+            within &= dots(inward, middle - triangle[:, i]) > 0
+        is_there[rows[within]] = True
+        return is_there
+
+
+def _rays(unit: FloatArray, faces: IntArray) -> TriangleRays:
+    tree = build_hierarchy(unit[faces].mean(axis=1), leaf_size=_LEAF_SIZE)
+    return TriangleRays.of(choose_backend("double"), tree, triangle_records(unit, faces))
+
+
+# Pieces joined.
+
+
+def near_groups(places: FloatArray, distance: float) -> IntArray:
+    """(n,) numbers of groups of points, each nearer to another of its group than a distance."""
+    import scipy.sparse  # here: half a second that few need
+    import scipy.sparse.csgraph as csgraph_module
+    import scipy.spatial
+
+    sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
+    searching: Any = scipy.spatial
+    one, other = searching.cKDTree(places).query_pairs(distance, output_type="ndarray").T
+    n = len(places)
+    near = sparse.coo_matrix((np.ones(len(one)), (one, other)), shape=(n, n))
+    return np.asarray(csgraph.connected_components(near, directed=False)[1], np.int64)
+
+
+def _cut_at_corners(x: FloatArray, faces: IntArray) -> IntArray:
+    """Faces, cut until every edge is run as often one way as the other: those at edges where that
+    is not so at a corner of such edges that lies on them, of several the one next to the middle.
+
+    Raises:
+        MeshingError: they do not fit together.
+    """
+    edges, _ = singular_edges(faces)
+    for _ in range(_MOST_HALVINGS):
+        if not len(edges):
+            return faces
+        edges = np.unique(np.sort(edges, axis=1), axis=0)
+        middle, is_cut = _corners_on(x, edges)
+        if not is_cut.any():
+            break
+        key = len(x)
+        names = edges[is_cut] @ [key, 1]
+        corner_pairs = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]], axis=2) @ [key, 1]
+        at = np.searchsorted(names, corner_pairs).clip(max=len(names) - 1)
+        is_met = names[at] == corner_pairs
+        rows, side = np.flatnonzero(is_met.any(axis=1)), is_met.argmax(axis=1)
+        side = side[rows]
+        a, b, c = (faces[rows, (side + k) % 3] for k in range(3))
+        p = middle[is_cut][at[rows, side]]
+        halves = [np.column_stack([a, p, c]), np.column_stack([p, b, c])]
+        halves = [half[(half[:, 0] != half[:, 2]) & (half[:, 1] != half[:, 2])] for half in halves]
+        faces = np.concatenate([np.delete(faces, rows, axis=0), *halves])
+        edges, _ = singular_edges(faces)
+    raise MeshingError(
+        f"{len(edges):,} edges of pieces of faces that pass through each other do not fit together"
+    )
+
+
+def _corners_on(x: FloatArray, edges: IntArray) -> tuple[IntArray, BoolArray]:
+    """For each of some edges (k, 2) that of their ends which lies on it, nearest to its middle; and
+    whether there is one."""
+    import scipy.spatial  # here: half a second that few need
+
+    searching: Any = scipy.spatial
+    corners = np.unique(edges)
+    p, q = x[edges[:, 0]], x[edges[:, 1]]
+    half = 0.5 * lengths(q - p)
+    near = searching.cKDTree(x[corners]).query_ball_point(0.5 * (p + q), half)
+    count = np.array([len(some) for some in near])
+    row = np.repeat(np.arange(len(edges)), count)
+    corner = corners[np.fromiter(itertools.chain.from_iterable(near), np.int64, int(count.sum()))]
+    way = (q - p)[row] / np.maximum(2 * half[row], 1e-300)[:, None]
+    to = x[corner] - p[row]
+    along = dots(to, way)
+    is_on = lengths(to - along[:, None] * way) <= _SAME
+    is_on &= (corner != edges[row, 0]) & (corner != edges[row, 1])
+    is_on &= (along > 0) & (along < 2 * half[row])
+    row, corner, off = row[is_on], corner[is_on], np.abs(along - half[row])[is_on]
+    order = np.lexsort((off, row))
+    row, first = np.unique(row[order], return_index=True)
+    middle, is_cut = np.zeros(len(edges), np.int64), np.zeros(len(edges), np.bool_)
+    middle[row], is_cut[row] = corner[order][first], True
+    return middle, is_cut
+
+
+def neighbors(x: FloatArray, faces: IntArray) -> IntArray:
+    """(k, 2) pairs of `directed_edges` of faces at which two belong together: at edges of two, and
+    at those of more that have the material between them."""
+    pairs, m = directed_edges(faces), len(faces)
+    edges = Edges.of(pairs)
+    beside = [edges.twice()]
+    start = np.cumsum(edges.uses) - edges.uses
+    for k in np.flatnonzero((edges.uses > 2) & (edges.uses % 2 == 0)):
+        halves = edges.order[start[k] : start[k] + edges.uses[k]]
+        is_along = pairs[halves, 0] == edges.ends[k, 0]
+        third = faces[halves % m].sum(axis=1) - pairs[halves].sum(axis=1)
+        beside.append(halves[_wedges(x[edges.ends[k]], x[third], is_along)])
+    return np.concatenate(beside)
+
+
+def _wedges(ends: FloatArray, third: FloatArray, is_along: BoolArray) -> IntArray:
+    """(k, 2) which faces around an edge have material between them.
+
+    ends: (2, 3) of the edge. third: (n, 3) the other corners of its faces; is_along: (n,) whether
+        they run it from the first end to the second.
+
+    Seen against the edge's direction, counter-clockwise, material begins behind a face that runs
+    the edge backwards, since its positive side looks back, and ends at the next one that runs it
+    forwards. Of faces in one direction those at which material ends come first.
+    """
+    way = ends[1] - ends[0]
+    away = third - ends[0]
+    away -= np.outer(away @ way / (way @ way), way)
+    across: Any = away[0] / max(float(np.linalg.norm(away[0])), 1e-300)
+    upright: Any = np.cross(way / float(np.linalg.norm(way)), across)
+    turn: FloatArray = np.arctan2(away @ upright, away @ across) / (2 * np.pi)
+    steps: IntArray = np.round(turn / _SAME_TURN).astype(np.int64) % round(1 / _SAME_TURN)
+    begun, wedges = list[int](), list[tuple[int, int]]()
+    is_taken = np.zeros(len(third), np.bool_)
+    for k in 2 * np.lexsort((~is_along, steps)).tolist():  # twice around
+        if is_taken[k]:
+            continue
+        if not is_along[k] and k not in begun:
+            begun.append(k)
+        elif is_along[k] and begun:
+            wedges.append((begun.pop(), k))
+            is_taken[list(wedges[-1])] = True
+    return np.array(wedges, np.int64).reshape(-1, 2)
+
+
+def _apart_at_contacts(x: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray]:
+    """A closed surface with a corner of its own for each of the sheets that touch in one."""
+    import scipy.sparse  # here: half a second that few need
+    import scipy.sparse.csgraph as csgraph_module
+
+    sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
+    m = len(faces)
+    one, other = neighbors(x, faces).T
+    # Corner k of face i is k m + i, and edge k runs from it to the next.
+    rows = np.concatenate([one, (one + m) % (3 * m)])
+    columns = np.concatenate([(other + m) % (3 * m), other])
+    joined = sparse.coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(3 * m, 3 * m))
+    fan = np.asarray(csgraph.connected_components(joined, directed=False)[1], np.int64)
+    first = np.unique(fan, return_index=True)[1]
+    return x[faces.T.ravel()[first]], fan.reshape(3, m).T
