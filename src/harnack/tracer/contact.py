@@ -59,7 +59,8 @@ class Tolerance:
     count as hits of every level.
 
     Where rounding leaves the distance to the level less certain than this, that uncertainty is
-    the tolerance: about 1e-6 of the coordinates' size in single precision, 1e-15 in double.
+    the tolerance: about 1e-6 of the coordinates' size in single precision, 1e-15 in double, and far
+    more where grad f is 0 on the surface, as where sheets meet (`Hits.uncertainty` says how much).
     """
 
     distance: float = 1e-4

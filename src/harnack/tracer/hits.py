@@ -14,8 +14,9 @@ import numpy as np
 
 from harnack.backend import backend_of, choose_backend, to_float, to_numpy, to_vector3
 from harnack.backend.arrays import as_data
-from harnack.backend.elementary import largest_coordinate, unit
+from harnack.backend.elementary import fmax, largest_coordinate, unit
 from harnack.backend.elementary import length as norm
+from harnack.backend.loops import on_some
 from harnack.backend.tensors import is_tensor, numbers_of, tensor_of, vectors_of
 from harnack.cluster.lazy import takes_blocks
 from harnack.names import is_one_of
@@ -28,11 +29,12 @@ from harnack.tracer.all_hits import (
 )
 from harnack.tracer.contact import Status, Tolerance
 from harnack.tracer.derivatives import attach, refuse_derivative, wants_derivatives
+from harnack.tracer.doubtful import Doubtful, seen_distance
 from harnack.tracer.surface import LevelSet, level_set
 from harnack.webgpu import evaluate, find_device
 
 if TYPE_CHECKING:
-    from harnack.backend import Backend, FloatArray, IntArray, Precision, Real, Vec3
+    from harnack.backend import Backend, FloatArray, IntArray, Mask, Precision, Real, Vec3
     from harnack.enclosures import Choice
     from harnack.fields.field import Field
     from harnack.geometry import Volume
@@ -44,6 +46,11 @@ _MANY = 4096
 # Rays are scattered where the directions of neighbors are farther apart than this, or their origins
 # than this fraction of the spread of all (both as roots of mean squares), by so many of them.
 _TURN, _STRAY, _ASKED = 0.15, 0.7, 4096
+# A hit is doubtful where rounding adds more than this part of the tolerance to how far the surface
+# may be to first order, and more than so many roundings of the point: it is taken for so many times
+# as far, as where so many sheets meet. Where it is farther than so many tolerances to first order
+# the surface is looked for instead, which takes a kernel.
+_PART, _OF_POINTS, _SHEETS, _LARGE = 0.5, 64, 3, 8
 
 
 @dataclass(frozen=True)
@@ -73,9 +80,14 @@ class Hits:
         to be within the tolerance, or within the rounding of the point (see `Tolerance`). Elsewhere
         that is a length to first order: along lines and at points where grad f is 0 and f - level a
         power u^m, as where m sheets meet, the surface may be m times as far (beside the edge of a
-        cusp, as of y^2 = x^3, farther: 0.002 for a tolerance of 1e-4, and 0.02 with x^5), and along
-        a ray that grazes it t is off by more. In single precision rounding hides the surface there
-        from afar: use `precision="double"`, or `confirm`.
+        cusp, as of y^2 = x^3, farther: 0.002 for a tolerance of 1e-4, and 0.02 with x^5). Rounding
+        hides the surface there from afar. Where it adds more than half the tolerance, the
+        uncertainty is that of three sheets; where it adds seven tolerances or more, the surface was
+        seen within tolerance + uncertainty: f is surely on different sides of the level there, or
+        touches it up to its error. It is infinite where the surface was not seen within a sixteenth
+        of the size of coordinates. (What these looks evaluate is not in `evaluations`.) Along a ray
+        that grazes such a place t is early by more: the ray is proved free no farther. Use
+        `precision="double"`, or `confirm`.
     """
 
     t: Any
@@ -324,7 +336,11 @@ def _trace(
     if not prepared.field.is_cheap and _are_scattered(backend, dr.detach(o), dr.detach(d)):
         prepared = replace(prepared, queued=True)
     with dr.suspend_grad():
-        end, hits = _ends(prepared, *(dr.detach(one) for one in (o, d, near, far)))
+        origin, direction = dr.detach(o), dr.detach(d)
+        rays = origin, direction, dr.detach(near), dr.detach(far)
+        end, hits, doubt = _ends(prepared, *rays)
+        if doubt is not None:
+            hits = _with_seen_distances(prepared, hits, doubt)
     if differentiable and wants_derivatives(prepared, o, d):
         t, normal = attach(prepared, o, d, end, hits.normal)
         normal, value, uncertainty = (
@@ -366,8 +382,9 @@ def _are_scattered(backend: Backend, o: Vec3, d: Vec3) -> bool:
 
 def _ends(
     prepared: PreparedLevelSet, o: Vec3, d: Vec3, near: Real, far: Real
-) -> tuple[MarchResult, Hits]:
-    """Ends of rays, and the same as `Hits`, without derivatives."""
+) -> tuple[MarchResult, Hits, _Doubt | None]:
+    """Ends of rays, the same as `Hits`, without derivatives, and how sure hits are; None where
+    no hit leaves a doubt."""
     backend = prepared.backend
     end = prepared.first_hit(o, d, near, far)
     hit = end.status == int(Status.HIT)
@@ -382,10 +399,80 @@ def _ends(
     # Where the gradient is no number its size has no bound (`tracer.steep`).
     uncertain = smooth & (end.excess > 0) & (length == length)
     uncertainty = dr.select(uncertain, end.excess / length, 0)
+    doubt = None
+    if end.side is None and not prepared.field.is_steep:  # others are at a root, or looked at
+        doubt = _Doubt.of(prepared, o, end.t, length, uncertainty)
+        farther = _SHEETS * doubt.distance - doubt.tolerance
+        uncertainty = dr.select(doubt.is_doubtful, farther, uncertainty)
     position = _along(o, d, end.t)
-    return end, Hits(
-        end.t, position, normal, end.value, end.evaluations, end.status, sheet, uncertainty
-    )
+    hits = Hits(end.t, position, normal, end.value, end.evaluations, end.status, sheet, uncertainty)
+    return end, hits, doubt
+
+
+# How far the surface is from hits that rounding may have made.
+
+
+@dataclass(frozen=True)
+class _Doubt:
+    """How sure hits are.
+
+    size: of coordinates up to there. tolerance: as a length. distance: of the surface, to first
+    order, with what rounding may add. is_doubtful: whether that may be much too short.
+    """
+
+    size: Real
+    tolerance: Real
+    distance: Real
+    is_doubtful: Mask
+
+    @classmethod
+    def of(
+        cls, prepared: PreparedLevelSet, o: Vec3, t: Real, steepness: Real, uncertainty: Real
+    ) -> _Doubt:
+        """That of hits where |grad f| is the steepness; uncertainty: to first order."""
+        t = dr.select(dr.isfinite(t), t, 0)
+        size = largest_coordinate(o) + t
+        tolerance = prepared.tolerance.in_value(steepness, t) / steepness
+        least = fmax(_PART * tolerance, _OF_POINTS * prepared.backend.epsilon * size)
+        return cls(size, tolerance, tolerance + uncertainty, uncertainty > least)
+
+
+@dataclass(frozen=True)
+class _Around:
+    """Hits to look around, and the part that each is of."""
+
+    around: Doubtful
+    part: Any
+
+
+@dataclass(frozen=True)
+class _Lengths:
+    """A length for each hit."""
+
+    length: Real
+
+
+def _with_seen_distances(prepared: PreparedLevelSet, hits: Hits, doubt: _Doubt) -> Hits:
+    """The hits, with uncertainties within which the surface was seen where these are large. All are
+    evaluated; nothing else is where there is no such hit."""
+    backend, field = prepared.backend, prepared.field
+    is_far = doubt.is_doubtful & (doubt.distance > _LARGE * doubt.tolerance)
+    has_far = dr.zeros(backend.UInt32, 1)
+    dr.scatter(has_far, 1, 0, is_far)
+    dr.eval(has_far, *vars(hits).values())
+    if not has_far[0]:
+        return hits
+
+    def seen(rays: _Around) -> _Lengths:
+        one = field
+        if field.has_parts:
+            one = field.part_at(dr.reinterpret_array(backend.UInt32, rays.part))
+        return _Lengths(seen_distance(backend, one, prepared.levels, rays.around))
+
+    around = Doubtful(hits.position, hits.normal, doubt.size, doubt.distance)
+    far = on_some(is_far, seen, _Around(around, hits.sheet), _Lengths(doubt.distance))
+    uncertainty = dr.select(is_far, far.length - doubt.tolerance, hits.uncertainty)
+    return replace(hits, uncertainty=uncertainty)
 
 
 def _along(o: Vec3, d: Vec3, t: Real) -> Vec3:

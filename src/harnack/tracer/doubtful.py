@@ -1,0 +1,154 @@
+"""How far the surface is from hits that rounding alone may have made.
+
+Where grad f is 0 on the surface, as where sheets meet, f - level is a power u^m, and rounding hides
+it from afar: f may be 0, up to its error e, out to (e/c)^(1/m). There e/|grad f| is a length to
+first order alone, and m times too short. So the surface is looked for around such hits.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+
+from harnack.backend.elementary import fmax, length, unit
+from harnack.backend.loops import while_active
+from harnack.fields.look import value_error
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Mask, Real, Vec3
+    from harnack.enclosures import TargetLevels
+    from harnack.fields.field import Field
+
+# The surface is looked for so many times as far each time, up to this fraction of the size of
+# coordinates; a change to the other side is sure only if it is no jump from one period to the next.
+_FARTHER, _FARTHEST = 1.25, 1 / 16
+_OF_PERIOD = 0.25
+# Ways from a hit: both along the gradient, and along two axes across it.
+_WAYS = 6
+
+
+@dataclass(frozen=True)
+class Doubtful:
+    """Hits to look around.
+
+    position: of hits. normal: (3,) unit, along the gradient. size: of coordinates up to there.
+    distance: how far from there to begin.
+    """
+
+    position: Vec3
+    normal: Vec3
+    size: Real
+    distance: Real
+
+
+@dataclass(frozen=True)
+class _Looking:
+    """The state of looking.
+
+    distance: to look at. way: index of the way. above, below: whether f was surely seen on these
+    sides of the level. low, high: lengths along the gradient between which f turns back from the
+    level, with the slopes there. searches: whether the place is looked for where it does.
+    may_turn: whether such a place may still be found. looks: so far.
+    """
+
+    distance: Real
+    way: Any
+    above: Mask
+    below: Mask
+    low: Real
+    high: Real
+    low_slope: Real
+    high_slope: Real
+    searches: Mask
+    may_turn: Mask
+    looks: Any
+    seen: Mask
+    active: Mask
+
+
+def seen_distance(backend: Backend, field: Field, levels: TargetLevels, hits: Doubtful) -> Real:
+    """Within what distance of hits the surface was seen, at least `hits.distance`; infinite where
+    it was not seen within a sixteenth of the size of coordinates.
+
+    Proof. f is surely on one side of the level at one of the points looked at, and surely on the
+    other at another: by more than the bound of its error at each. All lie within this distance of
+    the hit, so f takes the level between them, or jumps past it at a sheet. Where f only touches
+    the level it is on one side, and no sign tells. There it turns back: its slope along the
+    gradient of the hit changes sign, and where it does, found by secants and bisection, f is the
+    level up to its error. No look in this precision can tell such a place from the surface.
+    """
+    at_hit = field.evaluate(hits.position)
+    level = at_hit.value + levels.to_nearest(at_hit.value)
+    period = levels.period
+    farthest = fmax(_FARTHEST * hits.size, hits.distance)
+    smallest = 4 * backend.epsilon * hits.size
+
+    def beside(sample: Any) -> tuple[Real, Real, Mask]:
+        """f less the level, the bound of its error, and whether its side is sure."""
+        x, error = sample.value - level, value_error(sample, length(sample.gradient), hits.size)
+        if period is None:
+            return x, error, dr.abs(x) > error
+        x = x - period * dr.round(x / period)
+        return x, error, (dr.abs(x) > error) & (dr.abs(x) < _OF_PERIOD * period)
+
+    normal, vector = hits.normal, backend.Array3f
+    axis = dr.select(dr.abs(normal.x) < 0.6, vector(1, 0, 0), vector(0, 1, 0))
+    across = unit(dr.cross(normal, axis))
+    other = dr.cross(normal, across)
+    x, _, is_sure = beside(at_hit)
+    side = dr.select(x > 0, backend.Float(1), -1)
+
+    def body(now: _Looking) -> _Looking:
+        way = dr.select(now.way < 2, hits.normal, dr.select(now.way < 4, across, other))
+        way = dr.select((now.way & 1) == 0, way, -way)
+        at = dr.select(now.searches, _between(now), now.distance)
+        sample = field.evaluate(dr.fma(type(way)(at), way, hits.position))
+        x, error, is_sure = beside(sample)
+        above, below = now.above | (is_sure & (x > 0)), now.below | (is_sure & (x < 0))
+        slope = side * dr.dot(sample.gradient, way)
+        first_slope = side * dr.dot(at_hit.gradient, way)
+        seen = (above & below) | (now.searches & (dr.abs(x) <= error))
+        # Does f turn back from the level on this way?
+        turns = now.may_turn & ~now.searches & (now.way < 2)
+        turns &= (first_slope < 0) & (slope > sample.gradient_error)
+        is_low = now.searches & (slope < 0)
+        is_high = turns | (now.searches & ~is_low)
+        low = dr.select(turns, 0, dr.select(is_low, at, now.low))
+        high = dr.select(is_high, at, now.high)
+        goes_on = turns | (now.searches & (high - low > smallest))
+        stays = goes_on & ~seen
+        way_index = dr.select(stays, now.way, (now.way + 1) % _WAYS)
+        is_round = ~stays & (way_index == 0)
+        distance = dr.select(is_round & ~seen, _FARTHER * now.distance, now.distance)
+        return _Looking(
+            distance=distance,
+            way=way_index,
+            above=above,
+            below=below,
+            low=low,
+            high=high,
+            low_slope=dr.select(turns, first_slope, dr.select(is_low, slope, now.low_slope)),
+            high_slope=dr.select(is_high, slope, now.high_slope),
+            searches=stays,
+            may_turn=now.may_turn & ~(now.searches & ~goes_on),
+            looks=now.looks + 1,
+            seen=seen,
+            active=now.active & ~seen & (distance <= farthest),
+        )
+
+    zero, yes, no = backend.Float(0), backend.Bool(True), backend.Bool(False)
+    begin = _Looking(
+        hits.distance, backend.UInt32(0), is_sure & (x > 0), is_sure & (x < 0), zero, zero, zero,
+        zero, no, yes, backend.UInt32(0), no, yes,
+    )  # fmt: skip
+    end = while_active(begin, body, "harnack doubtful hits")
+    return dr.select(end.seen, end.distance, dr.inf)
+
+
+def _between(now: _Looking) -> Real:
+    """Where f may turn back: by the secant through the slopes and by bisection, in turns."""
+    share = now.low_slope / (now.low_slope - now.high_slope)
+    by_secant = ((now.looks & 1) == 0) & (share > 0) & (share < 1)
+    return dr.fma(dr.select(by_secant, share, 0.5), now.high - now.low, now.low)
