@@ -86,9 +86,10 @@ class Values(Operators):
             nowhere, gaps = nowhere | (x.high < low), gaps | ~(x.low >= low)
         if high < math.inf:
             nowhere, gaps = nowhere | (x.low > high), gaps | ~(x.high <= high)
-        # A pole in the box has all numbers for its range, and so has what overflows.
-        pole = ~(dr.isfinite(value.low) & dr.isfinite(value.high))
-        return Values(value, nowhere, self.jumps | pole, gaps)
+        jumps = self.jumps
+        if function.has_pole:  # a pole in the box has all numbers for its range
+            jumps = jumps | ~(dr.isfinite(value.low) & dr.isfinite(value.high))
+        return Values(value, nowhere, jumps, gaps)
 
     def larger(self, other: Values) -> Values:
         """The larger of two. Where only one of them has a value, it may count as that one or have
