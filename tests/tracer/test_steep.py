@@ -377,6 +377,14 @@ def test_exponentials_that_overflow() -> None:
     assert (crossings.status == hk.Status.MISS).all()
 
 
+def test_what_overflows_on_the_way_to_a_value_makes_no_hit() -> None:
+    """(...)^80 leaves single precision at the start, where f is -0.68; its range there is wide."""
+    field = hk.expression("1/(1 + (100*(x^2 + y^2 - 0.4) + 1)^80) - 0.5 + 0.1*z")
+    o, d = [[-1.5809962749, -0.8071405888, -1.7603905201]], [[0.8636800647, 0.1104671583, 0.49]]
+    hits = hk.trace(field, o, d, t_max=5.0, precision="single", max_steps=100)
+    assert hits.status[0] == hk.Status.OUT_OF_STEPS
+
+
 @pytest.mark.parametrize("precision", ["single", pytest.param("double", marks=pytest.mark.slow)])
 def test_ranges_beside_a_jump_are_no_values(precision: Precision) -> None:
     """On the axis f jumps, within [-0.5, 0.5] - z; ranges of coordinates far from 0 are wide."""

@@ -108,9 +108,9 @@ def _exponential(f: Callable[[Any], Any], x: Interval) -> Interval:
 
     def end(v: Real, sign: int) -> Real:
         result = f(v)
-        result = select(sign * result == -dr.inf, -sign * large, result, v)
         off = unit_of(v) * (_UNITS + dr.abs(v))
-        return dr.fma(dr.abs(result), sign * off, result) + sign * _tiny(x)
+        moved = dr.fma(dr.abs(result), sign * off, result) + sign * _tiny(x)
+        return select(sign * result == -dr.inf, -sign * large, moved, v)
 
     return Interval(end(x.low, -1), end(x.high, 1))
 

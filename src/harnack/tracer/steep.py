@@ -50,7 +50,7 @@ def values_between(field: Field, p: Vec3, q: Vec3, slack: Real | None = None) ->
         value = formula(*coordinates)
     except TypeError:  # it takes ranges of derivatives alone
         return None
-    return coordinates[0].of(value)
+    return coordinates[0].of(value).checked()
 
 
 def largest_change(field: Field, p: Vec3, value: Real, reach: Real) -> Real:
