@@ -27,7 +27,7 @@ def hostile(dtype: Any) -> Any:
     info = np.finfo(dtype)
     near = [0.0, 1.0, math.pi / 2, math.pi, 3 * math.pi / 2, 2 * math.pi, 0.5, 1 / 3, 1e-3]
     sizes = [info.tiny, 4 * info.tiny, info.tiny**0.5, info.max, info.max**0.5, math.inf]
-    angles = [11.0, 1e3 * math.pi, 1e5, 999999.0, 1e6, 1.5e6, 88.0, 3e7]
+    angles = [11.0, 1e3 * math.pi, 1e5, 999999.0, 1e6, 1.5e6, 88.0, 88.5, 709.6, 3e7]
     numbers = np.array([*near, *sizes, *angles]).astype(dtype)
     with np.errstate(over="ignore"):
         beside = [numbers, *(np.nextafter(numbers, dtype(v)) for v in (0, np.inf))]

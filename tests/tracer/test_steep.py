@@ -361,6 +361,43 @@ def test_no_level_is_passed_within_the_rounding_of_coordinates(precision: Precis
     assert (crossings.status == hk.Status.MISS).all()
 
 
+def test_exponentials_that_overflow() -> None:
+    """In the ball the slope of f is no number. Rays in contact passed through it, and their first
+    crossing was where they leave it; most others ended undecided there."""
+    field = hk.expression("1/(1 + exp(-1e6*(x^2 + y^2 + z^2 - 0.5))) - 0.5 + 0.1*z")
+    o, d = [[-2.5, 0.6435840129852295, 0.16996535658836365], [0.05, 0.1, 0.1]], [[1.0, 0, 0]] * 2
+    half = np.sqrt(0.5 - np.sum(np.square(o)[:, 1:], axis=1))
+    ends = np.stack([-half, half], axis=1) - np.array(o)[:, :1]
+    settings: dict[str, Any] = {"t_max": 5.0, "precision": "single"}
+    hits = hk.trace(field, o, d, confirm=True, **settings)
+    np.testing.assert_allclose(hits.t, [ends[0, 0], ends[1, 1]], atol=1e-4)
+    crossings = hk.trace(field, o, d, all_hits=4, **settings)
+    assert crossings.count.tolist() == [2, 1]
+    np.testing.assert_allclose(crossings.t[0, :2], ends[0], atol=1e-4)
+    assert (crossings.status == hk.Status.MISS).all()
+
+
+def test_what_overflows_on_the_way_to_a_value_makes_no_hit() -> None:
+    """(...)^80 leaves single precision at the start, where f is -0.68; its range there is wide."""
+    field = hk.expression("1/(1 + (100*(x^2 + y^2 - 0.4) + 1)^80) - 0.5 + 0.1*z")
+    o, d = [[-1.5809962749, -0.8071405888, -1.7603905201]], [[0.8636800647, 0.1104671583, 0.49]]
+    hits = hk.trace(field, o, d, t_max=5.0, precision="single", max_steps=100)
+    assert hits.status[0] == hk.Status.OUT_OF_STEPS
+
+
+@pytest.mark.parametrize("precision", ["single", pytest.param("double", marks=pytest.mark.slow)])
+def test_ranges_beside_a_jump_are_no_values(precision: Precision) -> None:
+    """On the axis f jumps, within [-0.5, 0.5] - z; ranges of coordinates far from 0 are wide."""
+    field = hk.expression("(x - 100)*(y + 100)/((x - 100)^2 + (y + 100)^2) = z")
+    o = [[100, -97.5, 0.593], [100, -102.5, 0.827], [98.5, -100, 0.52], [98, -102, 0.4]]
+    d = [[0, -1, 0], [0, 1, 0], [1, 0, 0], [1, 1 / 3, 0]]
+    hits = hk.trace(field, o, d, t_max=5.0, precision=precision, max_steps=300)
+    assert (hits.status[:3] != hk.Status.HIT).all()
+    assert hits.status[3] == hk.Status.HIT
+    x, y, z = hits.position[3] - [100, -100, 0]
+    assert x * y / (x**2 + y**2) == pytest.approx(z, abs=1e-3)
+
+
 def test_sheets_thinner_than_rounding_are_never_missed() -> None:
     o, d = (np.float64(np.float32(one)) for one in rays(1.0))
     sheet = hk.expression("exp(-(1e9*y)^2) = 0.5")

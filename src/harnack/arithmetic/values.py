@@ -10,7 +10,7 @@ nothing. The values themselves do: sqrt(|x|) + 0.5 is at least 0.5, whatever its
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
@@ -25,6 +25,10 @@ if TYPE_CHECKING:
     from harnack.backend import Mask, Real, Vec3
 
 
+# Ranges beyond this power of the largest number are of what overflows, whatever their other end.
+_LARGE = 0.5
+
+
 @dataclass(frozen=True, eq=False)
 class Values(Operators):
     """The range of a function on a box of its variables.
@@ -32,7 +36,8 @@ class Values(Operators):
     value: its range, over the points of the box at which it has a value.
     nowhere: whether it has a value at no point of the box.
     jumps: whether it may jump, or have a pole, in the box: it is not proved to be continuous where
-        it has a value.
+        it has a value. So it counts where numbers overflowed on the way to the value, unless they
+        are known to be large: its range may then be far larger than its values.
     gaps: whether there may be points of the box at which it has no value.
     """
 
@@ -86,9 +91,13 @@ class Values(Operators):
             nowhere, gaps = nowhere | (x.high < low), gaps | ~(x.low >= low)
         if high < math.inf:
             nowhere, gaps = nowhere | (x.low > high), gaps | ~(x.high <= high)
-        # A pole in the box has all numbers for its range, and so has what overflows.
-        pole = ~(dr.isfinite(value.low) & dr.isfinite(value.high))
-        return Values(value, nowhere, self.jumps | pole, gaps)
+        # A pole in the box has all numbers for its range.
+        pole = _is_lost(value, 0.0 if function.has_pole else _LARGE)
+        return Values(value, nowhere, self.jumps | _is_lost(x) | pole, gaps)
+
+    def checked(self) -> Values:
+        """The same; it may jump where numbers that overflowed left no range."""
+        return replace(self, jumps=self.jumps | _is_lost(self.value))
 
     def larger(self, other: Values) -> Values:
         """The larger of two. Where only one of them has a value, it may count as that one or have
@@ -100,14 +109,15 @@ class Values(Operators):
         return Values(
             Interval(least, either.high),
             self.nowhere & other.nowhere,
-            self.jumps | other.jumps | gaps,
+            self.jumps | other.jumps | gaps | _is_lost(x) | _is_lost(y),
             gaps,
         )
 
     def angle(self, x: Values) -> Values:
         value, met = angle_range(self.value, x.value)
         angle = self._with(value, x)
-        return Values(value, angle.nowhere, angle.jumps | met, angle.gaps)
+        jumps = angle.jumps | met | _is_lost(self.value) | _is_lost(x.value)
+        return Values(value, angle.nowhere, jumps, angle.gaps)
 
     def _with(self, value: Interval, other: Values) -> Values:
         """A range made of those of two functions."""
@@ -117,6 +127,16 @@ class Values(Operators):
             self.jumps | other.jumps,
             self.gaps | other.gaps,
         )
+
+
+def _is_lost(x: Interval, large: float = _LARGE) -> Mask:
+    """Whether a range has an infinite end, and is not altogether beyond this power of the largest
+    number; 0 for no such power."""
+    lost = ~(dr.isfinite(x.low) & dr.isfinite(x.high))
+    if large == 0.0:
+        return lost
+    most = float(dr.largest(cast("Any", type(x.low)))) ** large
+    return lost & ~((x.low > most) | (x.high < -most))
 
 
 def _unless(condition: Mask, x: Interval, y: Interval) -> Interval:

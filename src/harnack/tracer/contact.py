@@ -246,7 +246,8 @@ class Hysteresis:
        f was proved not to take the level at all. Beside a pole the band is as large as f is steep,
        and may be larger than f gets anywhere behind it. So the band of a sample counts up to the
        next sample only if the band there is not much smaller (`_MUCH_SMALLER`), or if both are at
-       most `_SHORT` tolerances apart (`may_reach`): a step that fails this is made shorter.
+       most `_SHORT` tolerances apart (`may_reach`): a step that fails this is made shorter. So is
+       one to a sample of which nothing is known, as where an exponential overflows.
     2. *Nothing is counted twice.* A crossing is noticed at a point where f is proved to be on the
        other side of the level, `band/2` being more than its error; the next one only where it is
        proved to be on the first side again. So crossings of a level alternate, and between two that

@@ -277,6 +277,7 @@ class March:
         if self.hysteresis is not None and now.contact is not None:
             tolerance = dr.fma(seen.t, self.tolerance.per_length, self.tolerance.distance)
             reaches = self.hysteresis.may_reach(now.contact, seen.band, now.trial_step, tolerance)
+            reaches &= ~now.contact.is_touching | dr.isfinite(seen.total_error)
             shorter = fmin(now.proved_step, _SHORTER * now.trial_step)
             fallback = dr.select(reaches | too_coarse, now.proved_step, shorter)
             accepted &= reaches

@@ -34,6 +34,9 @@ _SLACK, _FAR = 1.25, 8.0
 # How many points are looked at, and after those of a search; the most before these, and the section
 # of that search.
 _TRIALS, _SIDES, _MOST_LOOKS, _SECTION = 5, 7, 100, 0.381966
+# The range of f on a box around a point is about that of its values if f is continuous so many
+# times as far: that of x y/(x^2 + y^2), which is at most 1/2, is then within 0.502.
+_CLEAR = 1024.0
 
 
 def values_between(field: Field, p: Vec3, q: Vec3, slack: Real | None = None) -> Values | None:
@@ -47,7 +50,7 @@ def values_between(field: Field, p: Vec3, q: Vec3, slack: Real | None = None) ->
         value = formula(*coordinates)
     except TypeError:  # it takes ranges of derivatives alone
         return None
-    return coordinates[0].of(value)
+    return coordinates[0].of(value).checked()
 
 
 def largest_change(field: Field, p: Vec3, value: Real, reach: Real) -> Real:
@@ -200,10 +203,13 @@ def beyond(
     be the level at p, up to the rounding of p, others follow: along the first way by golden
     sections towards where f comes nearest to the level, then back along the second way, as rounding
     may have put p behind the level, and from the nearest place half of `reach` along each axis.
-    Ranges around p are no proof: they hold numbers that are no values of f. Where the level is not
+    Ranges around p are no proof: they hold numbers that are no values of f, and so do those beside
+    a jump: f is at the level up to rounding only where it is continuous on a box that is many times
+    as large as this rounding. Where the level is not
     found nothing is proved: the ray goes on, and comes nearer if it meets the surface.
     """
-    finest = 4 * float(dr.epsilon(backend.Float)) * reach
+    epsilon = float(dr.epsilon(backend.Float))
+    finest = 4 * epsilon * reach
 
     def body(now: _Looking) -> _Looking:
         is_first, is_far = now.looks < 3, (now.looks == 2) | (now.looks == 4)
@@ -222,9 +228,12 @@ def beyond(
         axis = (now.sides - 1) >> 1  # no axis where it is none: 0 - 1 is a large number
         aside = type(p)(*(dr.select(is_side & (axis == k), side, 0) for k in range(3)))
         q = dr.fma(type(p)(distance), way, p) + aside
-        around = values_between(field, q, q, finest)
+        # Where q is rounded more coarsely than that, f is that at q itself.
+        size = type(p)(*(dr.select(finest > epsilon * dr.abs(x), finest, 0) for x in q))
+        around = values_between(field, q - size, q + size)
         between = values_between(field, p, q)
-        if around is None or between is None:
+        clear = values_between(field, q - _CLEAR * size, q + _CLEAR * size)
+        if around is None or between is None or clear is None:
             with without_weaker():
                 low = high = field.evaluate(q).value
             passed = passes(levels, value, low, high, gaps)
@@ -232,7 +241,7 @@ def beyond(
             low, high = around.value.low, around.value.high
             passed = passes(levels, value, low, high, gaps)
             passed &= ~(between.jumps | between.gaps | between.nowhere)
-            passed |= holds(levels, value, low, high, gaps) & ~(around.jumps | around.nowhere)
+            passed |= holds(levels, value, low, high, gaps) & ~(clear.jumps | around.nowhere)
         nearest = dr.select(gaps.down < gaps.up, gaps.down + low - value, gaps.up + value - high)
         left = dr.select(dr.isfinite(nearest), nearest, dr.inf)
         now = _narrowed(now, distance, left, is_search & ~is_side)
