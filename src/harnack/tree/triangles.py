@@ -379,8 +379,9 @@ def _is_beside(row: list[Real], frame: Frame, reach: float) -> Mask:
     p, q, r = corners_of(row, type(frame.o))
     a, b, c = frame.across(p), frame.across(q), frame.across(r)
     near: Mask = False
+    zero = type(a[0])(0)
     for one, other in ((a, b), (b, c), (a, c)):
-        left, square = side(one, other), _square(one, other)
+        left, square = side(one, other), _square((*one, zero), (*other, zero))
         share = -dr.fma(one[0], other[0] - one[0], one[1] * (other[1] - one[1])) / square
         near |= (left * left <= reach * reach * square) & (share > 0) & (share < 1)
     for u, v in (a, b, c):

@@ -531,7 +531,7 @@ def _boundary(
         raise MeshError("the mesh bounds no volume: its parts cancel each other")
     # In one place, as many more look out than in as the winding number jumps by.
     area = 0.5 * np.linalg.norm(np.cross(edges[on, 0], edges[on, 1]), axis=1) / jump[on]
-    area = float(np.where(looks_in[on], -area, area).sum())
+    area = float((area * np.where(looks_in[on], -1.0, 1.0)).sum())
     turned = np.where(looks_in[:, None, None], pieces[:, ::-1], pieces)
     return None if is_whole else turned[on], area
 
