@@ -16,9 +16,20 @@ from harnack.fields.solids.mesh_solid import MeshSolid
 from harnack.geometry import MeshError, mesh_shapes
 from harnack.testing import check_field
 from tests.fields.test_shapes import SPIKES
+from tests.oracles.direct_sums import winding_sum
 from tests.oracles.mesh_distance import signed_distance
 
 CUBE = trimesh.creation.box((2.0, 2.0, 2.0))
+# Two tetrahedra with all corners of a cube.
+STAR = (
+    np.array(
+        [[0, 0, 0], [1, 1, 0], [1, 0, 1], [0, 1, 1], [1, 1, 1], [0, 0, 1], [0, 1, 0], [1, 0, 0]]
+    )
+    / 1.0,
+    np.array(
+        [[0, 1, 2], [0, 3, 1], [1, 3, 2], [0, 2, 3], [4, 6, 5], [4, 5, 7], [5, 6, 7], [4, 7, 6]]
+    ),
+)
 BUMPY = mesh_shapes.bumpy_sphere(3)
 
 
@@ -91,6 +102,40 @@ def test_faces_without_area_join_others() -> None:
     x = np.random.default_rng(3).uniform(-1.5, 1.5, (300, 3))
     expected = hk.solid(CUBE).value(x, precision="double")
     assert np.abs(solid.value(x, precision="double") - expected).max() < 1e-14
+
+
+def test_faces_folded_onto_each_other() -> None:
+    """A prism whose caps are fans of triangles that cover places once one way and twice the
+    other: the sides of the boundary are not those of each face there."""
+    loop = np.array([[0, 2], [4, 1], [3, 2], [1, 0], [4, 2]])
+    vertices = np.concatenate([np.insert(loop, 2, z, axis=1) for z in (0, 4)]).astype(float)
+    walls = [[[i, j, j + 5], [i, j + 5, i + 5]] for i, j in ((i, (i + 1) % 5) for i in range(5))]
+    fan = np.array([[0, i, i + 1] for i in range(1, 4)])
+    faces = np.concatenate([np.reshape(walls, (-1, 3)), fan[:, ::-1], fan + 5])
+    solid = hk.solid((vertices, faces))
+    x = np.random.default_rng(5).uniform((0, 0, -1), (4, 2, 5), (2000, 3))
+    inside = winding_sum(vertices[faces])(x) > 0.5
+    assert ((solid.value(x, precision="double") < 0) == inside).all()
+    # A pentagon turned the same way all around: what its fan covers thrice counts once.
+    loop = np.array([[0, 0], [4, 0], [1, 4], [2, 1], [-2, 2]])
+    vertices = np.concatenate([np.insert(loop, 2, z, axis=1) for z in (0, 1)]).astype(float)
+    around = np.linalg.norm(loop - np.roll(loop, 1, axis=0), axis=1).sum()
+    assert hk.solid((vertices, faces)).surface.area == pytest.approx(15 + around, rel=1e-12)
+
+
+def test_two_tetrahedra_whose_edges_cross() -> None:
+    """The star in a cube: edges meet edges alone, at the centers of the cube's faces."""
+    vertices, faces = STAR
+    x = [[0.5, 0.5, 0.5], [0.5, 0.5, 0.75], [0.7, 0.6, 0.5], [0.5, 0.5, 1.25], [0.8, 0.5, 1.0]]
+    expected = [-(0.125**0.5), -(0.125**0.5) / 2, -(0.02**0.5), 0.25, 0.3 / 3**0.5]
+    turn = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
+    for places, mesh in ((x, STAR), (x @ turn, (vertices @ turn, faces))):
+        if np.linalg.det(turn) < 0 and mesh is not STAR:
+            mesh = (mesh[0], faces[:, ::-1])
+        found = hk.solid(mesh).value(places, precision="double")
+        assert found == pytest.approx(expected, abs=1e-12)
+        found = hk.signed_distance(hk.WindingNumber(*mesh), places, precision="double")
+        assert -found == pytest.approx(expected, abs=1e-12)
 
 
 def test_parts_in_parts_and_cavities() -> None:

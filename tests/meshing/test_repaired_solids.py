@@ -16,6 +16,7 @@ from harnack.geometry.mesh_shapes import icosphere
 from harnack.meshing.bodies import closed_parts
 from harnack.meshing.edges import distance_from_triangles
 from harnack.meshing.intended_solid import IntendedSolid
+from harnack.meshing.joined_pieces import boundary_of_solid
 from harnack.meshing.lattice_surface import Surface
 from harnack.meshing.marching_tetrahedra import delaunay
 from tests.oracles.direct_sums import winding_sum
@@ -286,6 +287,20 @@ def test_a_box_bent_into_its_own_face(corner: Any, volume: float) -> None:
     result = repaired(trimesh.Trimesh(ends, bent.faces, process=False))
     assert result.metadata["harnack"]["stage"] == "united"
     assert result.volume == pytest.approx(volume)
+
+
+def test_two_tetrahedra_whose_edges_cross() -> None:
+    """Edges meet edges alone, at the centers of a cube's faces, and every triangle passes through
+    others."""
+    corners = np.array([[0, 0, 0], [1, 1, 0], [1, 0, 1], [0, 1, 1]])
+    faces = np.array([[0, 1, 2], [0, 3, 1], [1, 3, 2], [0, 2, 3]])
+    star = together(trimesh.Trimesh(corners, faces), trimesh.Trimesh(1 - corners, faces[:, ::-1]))
+    assert star.volume == pytest.approx(2 / 3)
+    cut = boundary_of_solid(star.vertices, star.faces)
+    assert trimesh.Trimesh(cut.vertices, cut.faces).volume == pytest.approx(0.5, rel=1e-12)
+    assert repaired(star).volume == pytest.approx(0.5, rel=1e-12)
+    with pytest.raises(hk.MeshingError, match="none of its triangles is sound"):
+        hk.repair(star, keep="sound")
 
 
 def test_faces_without_area_hide_no_difference() -> None:

@@ -60,13 +60,15 @@ def mended(vertices: FloatArray, faces: IntArray, report: Callable[[str], None])
     """The sound triangles of a mesh, with patches in place of all others and over holes.
 
     Raises:
-        MeshingError: half of the triangles would go, or most of them are loose.
+        MeshingError: half of the triangles would go, or all, or most of them are loose.
     """
     report("looking for triangles that are sound")
     state = _State.of(vertices, faces)
     holes, why, most = 0, "", _MOST_LEFT_OUT * len(state.faces)
     for ring in range(_MOST_RINGS):
         state = state.without_branches()
+        if not len(state.faces):
+            raise MeshingError("none of its triangles is sound")
         edges = boundary_edges(state.faces)
         if len(edges) > _MOST_OPEN * len(state.faces):
             raise MeshingError(f"{len(edges):,} edges of {len(state.faces):,} triangles are open")

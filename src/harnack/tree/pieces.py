@@ -38,7 +38,8 @@ def pieces_of_faces(
     Where two triangles meet in a segment, at either end of it an edge of one of them meets the
     other. So all edges are followed as rays, and each of the two faces beside an edge is cut by
     the plane of every triangle that the edge crosses, and these by the planes of the two: as far
-    as the cut would not pass the other triangle by. Faces in one plane are cut along the borders of
+    as the cut would not pass the other triangle by. An edge that meets another edge, but for
+    rounding, meets all faces beside that. Faces in one plane are cut along the borders of
     what covers them. A cut too many does no harm.
     """
     corners = vertices[faces]
@@ -125,7 +126,8 @@ def _counted(count: IntArray) -> IntArray:
 def _crossings_of_edges(
     rays: TriangleRays, vertices: FloatArray, faces: IntArray, edges: IntArray
 ) -> tuple[IntArray, IntArray]:
-    """Which edges (m, 2) cross which faces that have neither end: indices of both."""
+    """Which edges (m, 2) cross which faces that have neither end, or meet their borders: indices of
+    both."""
     backend = rays.tree.backend
     corner = [aligned_integers(backend, one) for one in faces.T]
     way = vertices[edges[:, 1]] - vertices[edges[:, 0]]
@@ -159,7 +161,7 @@ def _next_of_others(
     index = rays.tree.backend.UInt32
 
     def body(t: Any, n: Any, active: Any) -> tuple[Any, ...]:
-        t, n, _, _ = rays.next(frame, (t, n), end, active)
+        t, n, _, _ = rays.next(frame, (t, n), end, active, _SAME)
         known = active & (n != NO_TRIANGLE)
         ours = [dr.gather(index, one, n, known) for one in corner]
         return t, n, known & dr.any([(one == ends[0]) | (one == ends[1]) for one in ours])

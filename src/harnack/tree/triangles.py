@@ -186,9 +186,17 @@ class TriangleRays:
         return cls(pack(backend, tree, levels, in_slots(tree, records)))
 
     def next(
-        self, frame: Frame, after: tuple[Real, Any], t_max: Real, active: Mask
+        self,
+        frame: Frame,
+        after: tuple[Real, Any],
+        t_max: Real,
+        active: Mask,
+        reach: float = 0.0,
     ) -> tuple[Real, Any, Real, Vec3]:
         """The first crossing behind `after` = (t, number) with t <= t_max, ordered by (t, number).
+
+        reach: if more than 0, triangles whose border is so near to the ray are passed as well, but
+            for those that are at one of its ends, t = 0 and t_max, with their border.
 
         Returns:
             t (inf for none), the triangle's number (NO_TRIANGLE for none), the sign of the crossing
@@ -201,7 +209,7 @@ class TriangleRays:
             self.tree.backend.Array3f,
         )
         t_after, n_after = real(after[0]), index(after[1])
-        inside = self._boxes(frame)
+        inside = self._boxes(frame, reach)
 
         def visit(node: Node, state: State) -> tuple[Mask, State]:
             limit = fmin(state[0], t_max)
@@ -214,7 +222,11 @@ class TriangleRays:
             n = index(fmax(row[INDEX], real(0)))
             later = (t > t_after) | ((t == t_after) & (n > n_after) & (n_after != NO_TRIANGLE))
             first = (t < best) | ((t == best) & (n < number))
-            taken = active & (here != 0) & later & first & (t <= t_max)
+            passed = here != 0
+            if reach > 0:
+                within = (t > 2 * reach) & (t < t_max - 2 * reach)
+                passed |= within & _is_beside(row, frame, reach)
+            taken = active & passed & later & first & (t <= t_max)
             return (
                 dr.select(taken, t, best),
                 dr.select(taken, n, number),
@@ -293,9 +305,9 @@ class TriangleRays:
 
         return walk(self.tree, visit, (real(0),), active)[0]
 
-    def _boxes(self, frame: Frame) -> Any:
-        """A test whether rays meet a node's box between two t. Rounding may turn a no into a yes,
-        never a yes into a no."""
+    def _boxes(self, frame: Frame, reach: float = 0.0) -> Any:
+        """A test whether rays come as near as `reach` to a node's box between two t. Rounding may
+        turn a no into a yes, never a yes into a no."""
         backend = self.tree.backend
         vector = backend.Array3f
         d = frame.d
@@ -304,7 +316,7 @@ class TriangleRays:
         inverse = dr.rcp(steep)
         o = frame.o
         size = largest_coordinate(o)
-        pad = 16 * backend.epsilon * (1 + size)
+        pad = 16 * backend.epsilon * (1 + size) + reach
 
         def inside(node: Node, t_min: Real, t_max: Real) -> Mask:
             low, high = vector(*node.head[:3]) - pad, vector(*node.head[3:]) + pad
@@ -359,6 +371,22 @@ def crossing(row: list[Real], frame: Frame | Upwards) -> tuple[Real, Real]:
     a, b, c = (*a, frame.depth(p)), (*b, frame.depth(q)), (*c, frame.depth(r))
     close = _CLOSE * float(dr.epsilon(frame.o)) * (1 + dr.max(dr.abs(frame.o)))
     return _depth((a, b, c), (ab, bc, ac), close), turn
+
+
+def _is_beside(row: list[Real], frame: Frame, reach: float) -> Mask:
+    """Whether the line of a ray is as near as `reach` to the border of a record's triangle. (What
+    `crossing` computes as well is computed once.)"""
+    p, q, r = corners_of(row, type(frame.o))
+    a, b, c = frame.across(p), frame.across(q), frame.across(r)
+    near: Mask = False
+    zero = type(a[0])(0)
+    for one, other in ((a, b), (b, c), (a, c)):
+        left, square = side(one, other), _square((*one, zero), (*other, zero))
+        share = -dr.fma(one[0], other[0] - one[0], one[1] * (other[1] - one[1])) / square
+        near |= (left * left <= reach * reach * square) & (share > 0) & (share < 1)
+    for u, v in (a, b, c):
+        near |= dr.fma(u, u, v * v) <= reach * reach
+    return near
 
 
 def _depth(corners: tuple[Seen, Seen, Seen], sides: tuple[Real, Real, Real], close: Real) -> Real:

@@ -36,7 +36,7 @@ from harnack.geometry.sides import is_one_sided
 from harnack.geometry.welding import Welded
 from harnack.tree import build_hierarchy
 from harnack.tree.nearest import NearestTriangle, nearest_triangle, square_to_some_vertex
-from harnack.tree.pieces import pieces_of_faces, windings_beside
+from harnack.tree.pieces import pieces_of_faces, windings_beside, windings_of_sides
 from harnack.tree.triangles import (
     MOST_TRIANGLES,
     NO_TRIANGLE,
@@ -480,6 +480,9 @@ def _boundary(
     """The pieces of faces between winding numbers below and above 1/2, None if these are all faces,
     uncut; and the area that they have, what is there several times counted once.
 
+    Pieces run counter-clockwise as seen from outside: where faces lie on each other, more of them
+    turned one way than the other, each stands for the boundary.
+
     Triangles thinner than `_THIN` have no normal along which to look. They are kept with the
     others, if these are all faces; else whatever is found beside them moves the surface by no more.
 
@@ -496,7 +499,8 @@ def _boundary(
     edges = pieces - np.roll(pieces, 1, axis=1)
     longest = np.linalg.norm(edges, axis=2).max(axis=1)
     is_thick = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) > _THIN * longest
-    low, high = windings_beside(rays, pieces)
+    front, back = windings_of_sides(rays, pieces)
+    low, high = np.minimum(front, back), np.maximum(front, back)
     if (odd := is_thick & (low < 0)).any():
         if (high[is_thick] <= 0).all():
             raise MeshError(
@@ -521,11 +525,15 @@ def _boundary(
             f"{place(pieces[odd][0])}: join the parts that touch there, as trimesh.boolean.union "
             "does"
         )
-    is_whole = on[is_thick].all() and len(pieces) == len(whole)
+    looks_in = front > back
+    is_whole = on[is_thick].all() and len(pieces) == len(whole) and not looks_in[is_thick].any()
     if not is_whole and not on.any():
         raise MeshError("the mesh bounds no volume: its parts cancel each other")
+    # In one place, as many more look out than in as the winding number jumps by.
     area = 0.5 * np.linalg.norm(np.cross(edges[on, 0], edges[on, 1]), axis=1) / jump[on]
-    return None if is_whole else pieces[on], float(area.sum())
+    area = float((area * np.where(looks_in[on], -1.0, 1.0)).sum())
+    turned = np.where(looks_in[:, None, None], pieces[:, ::-1], pieces)
+    return None if is_whole else turned[on], area
 
 
 def _is_closed(pieces: FloatArray, jump: FloatArray, is_thick: BoolArray) -> bool:
