@@ -13,7 +13,7 @@ import numpy.typing as npt
 import harnack as hk
 from harnack.fields.solid_angles.winding_number import WindingNumber
 from harnack.files import read_surface
-from harnack.geometry.mesh_shapes import (
+from harnack.geometry.example_meshes import (
     MeshArrays,
     duplicate_faces,
     flip_faces,

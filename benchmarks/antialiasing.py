@@ -11,7 +11,7 @@ import numpy as np
 
 import harnack as hk
 from harnack.gallery import SCENES
-from harnack.geometry import shapes
+from harnack.geometry import example_curves
 from harnack.rendering import Camera, render
 from harnack.rendering.images import tone_mapped
 from harnack.rendering.shading import grid_offsets
@@ -39,7 +39,7 @@ def _wires() -> list[hk.LevelSet]:
 
 def _scenes() -> dict[str, tuple[Surfaces, str, Camera]]:
     letters = SCENES["letters"]
-    knot = hk.SolidAngle(shapes.torus_knot(2, 3, 120))
+    knot = hk.SolidAngle(example_curves.torus_knot(2, 3, 120))
     gyroid = hk.Gyroid(0.5, domain=hk.Ball(radius=1.0))
     carved = hk.Sphere(1.0) - hk.Torus(1.0, 0.25)
     return {

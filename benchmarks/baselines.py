@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 import harnack as hk
-from harnack.geometry import shapes
+from harnack.geometry import example_curves
 
 from .scenes import camera, unit
 
@@ -373,13 +373,13 @@ def compare(field: hk.Field, level: float, across: int = ACROSS) -> tuple[list[R
 
 def trefoil() -> hk.SolidAngle:
     """A knot, within the unit ball: its surface has no inside, and is not a disk."""
-    return hk.SolidAngle(unit(shapes.torus_knot(2, 3, 48)))
+    return hk.SolidAngle(unit(example_curves.torus_knot(2, 3, 48)))
 
 
 def baselines() -> str:
     """The section of the page."""
     scenes: tuple[tuple[str, hk.Field, float], ...] = (
-        ("polygon, N = 12, 2 pi", hk.SolidAngle(shapes.wavy_polygon(12)), 2 * math.pi),
+        ("polygon, N = 12, 2 pi", hk.SolidAngle(example_curves.wavy_polygon(12)), 2 * math.pi),
         ("trefoil, N = 48, 2 pi", trefoil(), 2 * math.pi),
         ("gyroid, 3 cells, 0", hk.Gyroid(cell=2 / 3, domain=hk.Ball(radius=1)), 0.0),
     )

@@ -20,7 +20,7 @@ import numpy as np
 import harnack as hk
 from harnack.arithmetic import clipped_power
 from harnack.backend.elementary import clamp, fmax, fmin
-from harnack.backend.records import Records
+from harnack.backend.record_table import Records
 from harnack.enclosures import Slopes
 from harnack.enclosures.enclosure import Piece
 from harnack.fields.blobs.kernels import Compact

@@ -17,9 +17,9 @@ import trimesh
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.distance.mesh_surface import MeshSurface
+from harnack.distance.level_triangles import MeshSurface
 from harnack.field_from_file import read_surface
-from harnack.geometry.mesh_shapes import bumpy_sphere, torus_mesh
+from harnack.geometry.example_meshes import bumpy_sphere, torus_mesh
 
 FloatArray = npt.NDArray[np.float64]
 Arrays = tuple[FloatArray, npt.NDArray[np.int64]]

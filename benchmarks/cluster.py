@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 import harnack as hk
-from harnack.geometry import mesh_shapes, shapes
+from harnack.geometry import example_curves, example_meshes
 
 POINTS, CHUNK, MEMORY = 100_000_000, 1_000_000, "1GB"
 # Chunks that one worker alone is measured with.
@@ -47,8 +47,8 @@ def cluster() -> str:
 
 
 def _mesh() -> hk.WindingNumber:
-    vertices, faces = mesh_shapes.torus_mesh(1.0, 0.4, 190, 190)
-    return hk.WindingNumber(vertices, mesh_shapes.remove_faces(faces, 0.02, seed=0))
+    vertices, faces = example_meshes.torus_mesh(1.0, 0.4, 190, 190)
+    return hk.WindingNumber(vertices, example_meshes.remove_faces(faces, 0.02, seed=0))
 
 
 @contextmanager
@@ -99,7 +99,7 @@ def _peak() -> int:
 
 def _tiles(workers: int) -> float:
     """Seconds for a picture, the second one."""
-    field = hk.SolidAngle(shapes.wavy_polygon(64))
+    field = hk.SolidAngle(example_curves.wavy_polygon(64))
     seconds = 0.0
     with _client(workers) as client:
         for seed in range(2):

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 import harnack as hk
-from harnack.geometry import shapes
+from harnack.geometry import example_curves
 
 from .scenes import camera
 
@@ -117,7 +117,7 @@ def plot(path: Path) -> dict[str, tuple[float, ...]]:
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    found = errors(shapes.wavy_polygon(64))
+    found = errors(example_curves.wavy_polygon(64))
     figure, axes = pyplot.subplots(1, 2, figsize=(10, 4), layout="constrained")
     summary: dict[str, tuple[float, ...]] = {}
     for name, (gap, along) in found.items():

@@ -14,8 +14,8 @@ import numpy.typing as npt
 
 import harnack as hk
 from harnack.backend import choose_backend, to_vector3
-from harnack.geometry import shapes
-from harnack.geometry.mesh_shapes import bumpy_sphere, remove_faces
+from harnack.geometry import example_curves
+from harnack.geometry.example_meshes import bumpy_sphere, remove_faces
 
 from .scenes import camera
 
@@ -54,7 +54,7 @@ def curve_cells() -> str:
         "|---:|" + "---:|" * 8,
     ]
     for n in _VERTICES:
-        make = functools.partial(hk.SolidAngle, shapes.wavy_polygon(n))
+        make = functools.partial(hk.SolidAngle, example_curves.wavy_polygon(n))
         lines.append(_row(f"{n:,}", make, _OF_CURVES))
         print(lines[-1], flush=True)
     lines += [

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 import harnack as hk
-from harnack.geometry import mesh_shapes, shapes
+from harnack.geometry import example_curves, example_meshes
 
 from .rays import machine
 
@@ -42,16 +42,16 @@ def _cloud(n: int) -> hk.DipolePotential:
 
 
 def _with_holes() -> hk.WindingNumber:
-    vertices, faces = mesh_shapes.bumpy_sphere(4)
-    return hk.WindingNumber(vertices, mesh_shapes.remove_faces(faces, 0.1, 0))
+    vertices, faces = example_meshes.bumpy_sphere(4)
+    return hk.WindingNumber(vertices, example_meshes.remove_faces(faces, 0.1, 0))
 
 
 def distances(n: int = POINTS) -> str:
     """The section's text."""
     fields: dict[str, tuple[hk.Field, int]] = {
-        "closed mesh, 81,920 faces": (hk.WindingNumber(*mesh_shapes.bumpy_sphere(6)), n),
-        "polygon, 24 edges": (hk.SolidAngle(shapes.wavy_polygon(24)), n // 10),
-        "trefoil, 60 edges": (hk.SolidAngle(shapes.torus_knot(2, 3, 60)), n // 10),
+        "closed mesh, 81,920 faces": (hk.WindingNumber(*example_meshes.bumpy_sphere(6)), n),
+        "polygon, 24 edges": (hk.SolidAngle(example_curves.wavy_polygon(24)), n // 10),
+        "trefoil, 60 edges": (hk.SolidAngle(example_curves.torus_knot(2, 3, 60)), n // 10),
         "gyroid": (hk.Gyroid(), n // 10),
         "cloud of 2,000 points": (_cloud(2000), n // 50),
         "mesh of 5,120 faces, a tenth lost": (_with_holes(), n // 10),
@@ -69,7 +69,7 @@ def distances(n: int = POINTS) -> str:
         rows.append(
             f"| {name} | {count:,} | {1e6 * seconds / count:.1f} | {middle:.1g} | {high:.1g} |"
         )
-    vertices, faces = mesh_shapes.bumpy_sphere(6)
+    vertices, faces = example_meshes.bumpy_sphere(6)
     x = _around(fields["closed mesh, 81,920 faces"][0], FEW)
     nearest = _cpu(lambda: cKDTree(vertices).query(x))
     others = [f"scipy's k-d tree, to the nearest vertex alone: {1e6 * nearest / FEW:.1f} us"]

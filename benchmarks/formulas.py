@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 import harnack as hk
-from harnack.geometry import shapes
+from harnack.geometry import example_curves
 
 Array = Any  # of any floating-point type
 
@@ -103,7 +103,7 @@ def _unit(a: Array) -> Array:
 
 def measured() -> tuple[dict[str, Array], dict[str, Array]]:
     """Errors of values in radians, and of gradients as a part of their length."""
-    loop = np.asarray(shapes.wavy_polygon(12), np.float32)
+    loop = np.asarray(example_curves.wavy_polygon(12), np.float32)
     x = np.random.default_rng(0).uniform(-1.2, 1.2, (POINTS, 3)).astype(np.float32)
     fine = np.longdouble
     value, gradient = (

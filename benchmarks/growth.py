@@ -14,7 +14,7 @@ import harnack as hk
 from harnack.backend import choose_backend, to_vector3
 from harnack.fields.solid_angles.dipole import DipolePotential
 from harnack.fields.solid_angles.winding_number import WindingNumber
-from harnack.geometry.mesh_shapes import bumpy_sphere, remove_faces
+from harnack.geometry.example_meshes import bumpy_sphere, remove_faces
 
 from .scenes import EYE, camera
 from .winding import cube_points, seconds_of

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 import harnack as hk
-from harnack.geometry import shapes
+from harnack.geometry import example_curves
 from tests.view.browsers import Page, chromium
 
 VERTICES, SIZE, SECONDS, EVENTS = 64, 512, 4.0, 60
@@ -110,7 +110,7 @@ def measured(choice: str) -> tuple[float, float, float, float]:
 
     choice: what the panel does before, in JavaScript.
     """
-    field = hk.SolidAngle(shapes.torus_knot(2, 3, VERTICES))
+    field = hk.SolidAngle(example_curves.torus_knot(2, 3, VERTICES))
     with (
         chromium() as browser,
         hk.view(field, level=6.0, opens=False, waits=False) as view,

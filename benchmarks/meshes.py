@@ -14,7 +14,7 @@ import numpy.typing as npt
 import trimesh
 
 import harnack as hk
-from harnack.geometry import shapes
+from harnack.geometry import example_curves
 from tests.oracles.oracle import CurveOracle
 
 FloatArray = npt.NDArray[np.float64]
@@ -60,10 +60,10 @@ def meshes() -> str:
         "| ends at the curve | largest error | rms | surface to mesh | volume |",
         "|---|---|---:|---:|---:|---:|---:|---|---:|---:|---:|---:|",
     ]
-    hk.mesh(hk.SolidAngle(shapes.regular_polygon(8)), tolerance=0.05)  # compiles
+    hk.mesh(hk.SolidAngle(example_curves.regular_polygon(8)), tolerance=0.05)  # compiles
     for name, loop, steps in (
-        ("wavy polygon", shapes.wavy_polygon(64), (0.05, 0.025)),
-        ("trefoil", shapes.torus_knot(2, 3, 96), (0.06, 0.03)),
+        ("wavy polygon", example_curves.wavy_polygon(64), (0.05, 0.025)),
+        ("trefoil", example_curves.torus_knot(2, 3, 96), (0.06, 0.03)),
     ):
         rows = [_ours(loop, tolerance) for tolerance in (1e-3, 2.5e-4)]
         for step in steps:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from harnack.geometry.mesh_shapes import MeshArrays
+from harnack.geometry.example_meshes import MeshArrays
 
 # Rays that pass an edge this closely may go either way.
 _BESIDE = 1e-4

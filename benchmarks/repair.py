@@ -20,7 +20,7 @@ import trimesh
 
 import harnack as hk
 from harnack.field_from_file import read_surface
-from harnack.geometry.mesh_shapes import torus_mesh
+from harnack.geometry.example_meshes import torus_mesh
 from harnack.meshing.checks import intersecting_faces
 
 FloatArray = npt.NDArray[np.float64]

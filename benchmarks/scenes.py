@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 import harnack as hk
-from harnack.geometry import shapes
+from harnack.geometry import example_curves
 
 EYE = np.array([2.2, -2.2, 1.6])
 FIELD_OF_VIEW = math.radians(40.0)
@@ -44,7 +44,7 @@ def unit(loops):  # type: ignore[no-untyped-def]
 def polygons() -> list[Scene]:
     """The curve (cos t, sin t, 0.45 cos 3t) with 12, 64 and 256 vertices."""
     return [
-        Scene(f"polygon, N = {n}", lambda n=n: hk.SolidAngle(shapes.wavy_polygon(n)), n)
+        Scene(f"polygon, N = {n}", lambda n=n: hk.SolidAngle(example_curves.wavy_polygon(n)), n)
         for n in (12, 64, 256)
     ]
 
@@ -52,9 +52,15 @@ def polygons() -> list[Scene]:
 def others() -> list[Scene]:
     """Knots, coils and links, and the real-valued fields."""
     return [
-        Scene("trefoil, N = 96", lambda: hk.SolidAngle(unit(shapes.torus_knot(2, 3, 96))), 96),
-        Scene("5-turn coil, N = 160", lambda: hk.SolidAngle(unit(shapes.coil(5, 160))), 160),
-        Scene("Hopf link, N = 2 x 48", lambda: hk.SolidAngle(unit(shapes.hopf_link(48))), 96),
+        Scene(
+            "trefoil, N = 96", lambda: hk.SolidAngle(unit(example_curves.torus_knot(2, 3, 96))), 96
+        ),
+        Scene(
+            "5-turn coil, N = 160", lambda: hk.SolidAngle(unit(example_curves.coil(5, 160))), 160
+        ),
+        Scene(
+            "Hopf link, N = 2 x 48", lambda: hk.SolidAngle(unit(example_curves.hopf_link(48))), 96
+        ),
         Scene("spherical harmonic l = 4, m = 2", lambda: hk.SphericalHarmonic(4, 2)),
         Scene("spherical harmonic l = 9, m = 5", lambda: hk.SphericalHarmonic(9, 5)),
         Scene("gyroid, 3 cells across", lambda: hk.Gyroid(cell=2 / 3, domain=hk.Ball(radius=1))),

@@ -18,7 +18,7 @@ import numpy as np
 
 import harnack as hk
 from harnack.backend import choose_backend, to_vector3
-from harnack.geometry.mesh_shapes import bumpy_sphere, remove_faces
+from harnack.geometry.example_meshes import bumpy_sphere, remove_faces
 
 from .growth import bumpy_cloud, one_hole
 from .scenes import camera, others, polygons

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from harnack.backend import choose_backend, to_vector3
 from harnack.fields.solid_angles.winding_number import WindingNumber
-from harnack.geometry.mesh_shapes import MeshArrays, bumpy_sphere, remove_faces
+from harnack.geometry.example_meshes import MeshArrays, bumpy_sphere, remove_faces
 
 from .curve_cells import broken_mesh
 from .rays import machine
@@ -163,7 +163,7 @@ def throughput(surface: Path | None = None) -> str:
 
 def _sorting(points: FloatArray) -> float:
     # Here: `versions` runs this file with earlier versions of the package.
-    from harnack.fields.points import morton_order
+    from harnack.fields.batch_evaluation import morton_order
 
     backend = choose_backend("single")
     x = to_vector3(backend, points.astype(np.float32))

@@ -15,7 +15,7 @@ import harnack as hk
 
 
 def main(folder: Path, size: tuple[int, int] = (640, 480)) -> dict[str, float]:
-    field = hk.SolidAngle(hk.geometry.shapes.wavy_polygon(64))
+    field = hk.SolidAngle(hk.geometry.example_curves.wavy_polygon(64))
     hk.render(
         field, folder / "comparing_bounds.png", show="evaluations", bound="classic", size=size
     )

@@ -14,7 +14,7 @@ import harnack as hk
 
 
 def main(folder: Path, size: tuple[int, int] = (320, 240), frames: int = 24) -> Path:
-    curve = hk.SolidAngle(hk.geometry.shapes.wavy_polygon(48))
+    curve = hk.SolidAngle(hk.geometry.example_curves.wavy_polygon(48))
     path = folder / "film.gif"
     hk.animate(
         curve,

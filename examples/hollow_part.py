@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 
 import harnack as hk
-from harnack.geometry import mesh_shapes
+from harnack.geometry import example_meshes
 
 
 def main(
     folder: Path, size: tuple[int, int] = (640, 480), tolerance: float = 6e-3
 ) -> hk.PrintCheck:
-    part = hk.solid(mesh_shapes.torus_mesh(20.0, 10.0, 96, 48))
+    part = hk.solid(example_meshes.torus_mesh(20.0, 10.0, 96, 48))
     gyroid = hk.Gyroid(cell=8.0)
     walls = hk.solid(gyroid, between=gyroid.levels_of_thickness(0.8))
     hollow = part.shell(2.0) | (part & walls)

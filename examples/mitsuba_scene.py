@@ -42,7 +42,7 @@ mi.register_bsdf("tinted", Tinted)
 
 def main(folder: Path, size: tuple[int, int] = (640, 480), spp: int = 32) -> hk.rendering.Picture:
     T = mi.ScalarTransform4f()
-    knot = hk.SolidAngle(hk.geometry.shapes.torus_knot(2, 3, 48))
+    knot = hk.SolidAngle(hk.geometry.example_curves.torus_knot(2, 3, 48))
     lamp = {"type": "area", "radiance": {"type": "rgb", "value": 12.0}}
     white, mirror = {"type": "diffuse"}, {"type": "conductor"}
     ground = T.translate([0, 0, -1.4]).scale(30)

@@ -50,7 +50,7 @@ def lattice() -> hk.Solid:
 
 
 def seifert() -> hk.SolidAngle:
-    return hk.SolidAngle(16 * hk.geometry.shapes.torus_knot(2, 3, 128))
+    return hk.SolidAngle(16 * hk.geometry.example_curves.torus_knot(2, 3, 128))
 
 
 PARTS: dict[str, Callable[[], hk.Solid | hk.SolidAngle]] = {

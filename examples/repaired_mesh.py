@@ -16,7 +16,7 @@ import harnack as hk
 
 
 def main(folder: Path, size: tuple[int, int] = (640, 480)) -> trimesh.Trimesh:
-    vertices, faces = hk.geometry.mesh_shapes.bumpy_sphere(3)
+    vertices, faces = hk.geometry.example_meshes.bumpy_sphere(3)
     middles = vertices[faces].mean(axis=1)
     is_lost = (middles[:, 2] > 0.75) | (np.abs(middles - [0.6, -0.6, 0.2]).sum(axis=1) < 0.5)
     broken = trimesh.Trimesh(vertices, faces[~is_lost], process=False)

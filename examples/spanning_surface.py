@@ -15,7 +15,9 @@ import harnack as hk
 
 
 def main(folder: Path, size: tuple[int, int] = (640, 480)) -> int:
-    knot = hk.SolidAngle(hk.geometry.shapes.torus_knot(2, 3, 60))  # points (60, 3), or your own
+    knot = hk.SolidAngle(
+        hk.geometry.example_curves.torus_knot(2, 3, 60)
+    )  # points (60, 3), or your own
     hk.render(
         knot,
         folder / "spanning_surface.png",

@@ -11,7 +11,7 @@ import numpy as np
 import harnack as hk
 from benchmarks import baselines
 from benchmarks.baselines import APART, Method, Rays, Result
-from harnack.geometry import shapes
+from harnack.geometry import example_curves
 from harnack.rendering import Camera
 
 from .figure import Report
@@ -102,7 +102,9 @@ def _contest(name: str, width: int) -> _Contest:
         corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
         view = View.of(0.75 * corners, size, camera)
         return _Contest.of(hk.Gyroid(cell=2 / 3, domain=ball), 0.0, view)
-    field = baselines.trefoil() if name == "trefoil" else hk.SolidAngle(shapes.wavy_polygon(12))
+    field = (
+        baselines.trefoil() if name == "trefoil" else hk.SolidAngle(example_curves.wavy_polygon(12))
+    )
     if name == "trefoil":
         camera = Camera(azimuth=-80, elevation=52, zoom=0.9)
     return _Contest.of(field, 2 * math.pi, View.of(field.loops[0], size, camera))
@@ -196,7 +198,7 @@ def figure_27(width: int) -> Report:
 
 def figure_24(width: int) -> Report:
     """Marching cubes of the raw function."""
-    loop = shapes.wavy_polygon(12)
+    loop = example_curves.wavy_polygon(12)
     field = hk.SolidAngle(loop)
     view = View.of(1.25 * loop, tuple(2 * s for s in fitting(width)), Camera(-60, 24))
     truth = view.trace(field, tolerance=1e-7, precision="double")

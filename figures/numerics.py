@@ -9,7 +9,7 @@ import numpy as np
 import harnack as hk
 from benchmarks import formulas
 from benchmarks.baselines import APART
-from harnack.geometry import shapes
+from harnack.geometry import example_curves
 
 from .figure import Report
 from .panels import Panel, doubled, fitting, montage
@@ -24,7 +24,7 @@ _REACH = 1.3
 
 def figure_12(width: int) -> Report:
     """First hits by three formulas of the value; normals by three of the gradient."""
-    loop = shapes.wavy_polygon(8).astype(np.float32)
+    loop = example_curves.wavy_polygon(8).astype(np.float32)
     field = hk.SolidAngle(loop)
     view = View.of(loop, fitting(width // 2))  # these formulas take a minute in NumPy
     truth = view.trace(field, tolerance=1e-7, precision="double")

@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 
 import harnack as hk
-from harnack.files.file_format import write_atomically
+from harnack.files.file_geometry import write_atomically
 
 from .figure import Figure, Report
 

@@ -8,7 +8,7 @@ import numpy as np
 
 import harnack as hk
 from benchmarks.scenes import WithoutExtent
-from harnack.geometry import shapes
+from harnack.geometry import example_curves
 from harnack.rendering import Camera
 
 from .figure import Counts, Report
@@ -20,7 +20,7 @@ _LEVEL = 2 * math.pi
 
 def figure_1(width: int) -> Report:
     """A polygon, a slice of its solid angle, Harnack balls along a ray, reflection lines."""
-    loop = shapes.wavy_polygon(48)
+    loop = example_curves.wavy_polygon(48)
     field = hk.SolidAngle(loop)
     start, towards = np.array([-1.75, 0.0, 1.0]), np.array([1.95, 0.0, -0.97])
     published = WithoutExtent(loop, certificate="convex")
@@ -129,12 +129,12 @@ def figure_8(width: int) -> Report:
     camera = Camera(azimuth=-60, elevation=26)
     first, second, texts = [], [], []
     for amplitude in (0.0, 0.3, 0.6, 0.9):
-        field = hk.SolidAngle(shapes.wavy_polygon(24, amplitude))
+        field = hk.SolidAngle(example_curves.wavy_polygon(24, amplitude))
         picture, counts = drawn(field, size, camera=camera)
         first.append(Panel(picture, f"amplitude {amplitude:g}"))
         texts.append(f"{counts.evaluations_hitting:.1f}")
         assert counts.out_of_steps == 0
-    field = hk.SolidAngle(shapes.wavy_polygon(24))
+    field = hk.SolidAngle(example_curves.wavy_polygon(24))
     for level in (0.75, 1.5, 2.5, 3.25):
         picture, counts = drawn(field, size, camera=camera, level=level * math.pi)
         second.append(Panel(picture, f"level {level:g} pi"))
@@ -158,7 +158,7 @@ def _motion() -> float:
     grid = np.stack(np.meshgrid(u, u, [2.0], indexing="ij"), axis=-1).reshape(-1, 3)
     heights = [
         hk.trace(
-            hk.SolidAngle(shapes.wavy_polygon(24, amplitude)), grid, [[0, 0, -1.0]],
+            hk.SolidAngle(example_curves.wavy_polygon(24, amplitude)), grid, [[0, 0, -1.0]],
             precision="double", tolerance=1e-9,
         ).t
         for amplitude in (0.60, 0.61)

@@ -10,7 +10,7 @@ from PIL import Image
 
 import harnack as hk
 from benchmarks.convergence import errors
-from harnack.geometry import shapes
+from harnack.geometry import example_curves
 from harnack.rendering import Camera
 
 from .figure import Counts, Report
@@ -88,7 +88,7 @@ def _in_ball(eye: Array, d: Array) -> tuple[Array, Array]:
 
 def figure_5(width: int) -> Report:
     """Where rays end: by value, and by value over slope."""
-    field = hk.SolidAngle(shapes.wavy_polygon(48))
+    field = hk.SolidAngle(example_curves.wavy_polygon(48))
     size = fitting(width, 0.6)
     by_value, by_slope = 0.35, 0.05
     panels, zoomed = [], []
@@ -148,7 +148,7 @@ def _thickness(field: hk.SolidAngle, by_value: float, by_slope: float) -> tuple[
 
 def figure_22(width: int) -> Report:
     """Iterations by the stopping condition."""
-    loop = shapes.wavy_polygon(24)
+    loop = example_curves.wavy_polygon(24)
     field = hk.SolidAngle(loop)
     view = View.of(loop, fitting(width))
     d = view.directions()

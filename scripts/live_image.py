@@ -14,7 +14,7 @@ from tests.view.browsers import Page, chromium
 
 def main(folder: Path) -> None:
     """Open a view of a trefoil's surface, with its points to be moved, and take its picture."""
-    knot = hk.SolidAngle(hk.geometry.shapes.torus_knot(2, 3, 24))
+    knot = hk.SolidAngle(hk.geometry.example_curves.torus_knot(2, 3, 24))
     level = hk.Slider(4.0, 9.0, 6.0)
     with (
         chromium() as browser,

@@ -27,7 +27,7 @@ def main(folder: Path) -> None:
     ]
     graph = hk.HeightField(lambda x, y: (x**3 - 3 * x * y * y) / 2, domain=hk.Ball())
     hk.render(graph, folder / "view-conjugates.png", isolines=net, material="plastic", **shaded)
-    trefoil = hk.SolidAngle(hk.geometry.shapes.torus_knot(2, 3, 60))
+    trefoil = hk.SolidAngle(hk.geometry.example_curves.torus_knot(2, 3, 60))
     heights = hk.Isolines("z", spacing=0.2, color="white")
     sky = ("white", "steelblue")
     hk.render(trefoil, folder / "view-heights.png", isolines=heights, backdrop=sky, **shaded)

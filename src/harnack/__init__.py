@@ -16,7 +16,7 @@ import lazy_loader
 # First of all imports: it decides which LLVM Dr.Jit loads, which happens on `import drjit`.
 from harnack import backend as backend
 from harnack._version import __version__ as __version__
-from harnack.names import did_you_mean
+from harnack.name_suggestions import did_you_mean
 
 _import, __dir__, __all__ = cast("Any", lazy_loader).attach_stub(__name__, __file__)
 

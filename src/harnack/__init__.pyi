@@ -48,7 +48,7 @@ from .enclosures.bounded_laplacian import GreenBall
 from .enclosures.enclosure import Enclosure
 from .enclosures.harmonic_ball import Caps, Classic, Slope
 from .enclosures.parabola import Cone, Parabola, Taylor
-from .enclosures.pieces import Pieces
+from .enclosures.piecewise_taylor import Pieces
 from .enclosures.promises import BoundedLaplacian, Curvature, HarmonicBall, Lipschitz
 from .fields.analytic.branches import BranchPoint
 from .fields.analytic.fourier_series import FourierSeries
@@ -70,8 +70,10 @@ from .fields.solid_angles.polygon_mesh import PolygonMesh
 from .fields.solid_angles.screened import ScreenedWindingNumber
 from .fields.solid_angles.solid_angle import SolidAngle
 from .fields.solid_angles.winding_number import WindingNumber
-from .fields.solids.combined import intersection, union
+from .fields.solids.booleans import intersection, union
+from .fields.solids.extrusions import Extruded, Revolved
 from .fields.solids.fractal import Displaced, FractalNoise, Noise
+from .fields.solids.from_field import solid
 from .fields.solids.julia import Julia
 from .fields.solids.primitives import (
     Capsule,
@@ -85,9 +87,7 @@ from .fields.solids.primitives import (
     Supertorus,
     Torus,
 )
-from .fields.solids.region import solid
 from .fields.solids.solid import Shape, Solid
-from .fields.solids.swept import Extruded, Revolved
 from .fields.solids.thread import Thread, thread
 from .fields.solids.tube import Tube, Tubes
 from .files import outline

@@ -25,7 +25,7 @@ from harnack.files import (
     read_loops,
     read_surface,
 )
-from harnack.files.surfaces import ReadAs, Surface
+from harnack.files.geometry_files import ReadAs, Surface
 from harnack.rendering.framing import UP_AXES, upright
 
 __all__ = ["UP_AXES", "Axis", "OpenedSurface", "open_surface"]

@@ -16,7 +16,7 @@ jax: Any = pytest.importorskip("jax", reason="make test-frameworks installs JAX"
 
 import harnack as hk  # noqa: E402
 from harnack.backend import Precision, choose_backend, to_numpy, to_vector3  # noqa: E402
-from harnack.geometry import shapes  # noqa: E402
+from harnack.geometry import example_curves  # noqa: E402
 from tests.backend.test_kernels import compiled  # noqa: E402
 from tests.project.test_readme import ROOT, blocks_of, run_code  # noqa: E402
 
@@ -26,7 +26,7 @@ pytestmark = pytest.mark.skipif(
 )
 
 PAGE = blocks_of(ROOT / "docs" / "frameworks.md")
-LOOP = shapes.wavy_polygon(12)
+LOOP = example_curves.wavy_polygon(12)
 EYE = np.array([2.2, -2.2, 1.6])
 AWAY = np.random.default_rng(0).uniform(-0.5, 0.5, (20, 3)) - EYE
 POINTS = 0.4 * np.random.default_rng(1).normal(size=(20, 3))
@@ -310,7 +310,7 @@ import {order}
 import harnack as hk, jax, numpy as np, torch
 torch.randn(300, 300) @ torch.randn(300, 300)
 (jax.numpy.ones((300, 300)) @ jax.numpy.ones((300, 300))).block_until_ready()
-loop = hk.geometry.shapes.wavy_polygon(12)
+loop = hk.geometry.example_curves.wavy_polygon(12)
 hk.render(hk.SolidAngle(loop), size=(16, 16), show="shaded", progress=False)
 value = lambda v, p: hk.SolidAngle(v).value(p)
 v, p = torch.tensor(loop, requires_grad=True), torch.tensor([[0, 0, 0.5]], dtype=torch.float64)

@@ -11,7 +11,7 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.geometry.mesh_shapes import icosphere
+from harnack.geometry.example_meshes import icosphere
 from harnack.rendering import Camera, register
 
 register()

@@ -10,9 +10,9 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.geometry import shapes
+from harnack.geometry import example_curves
 
-LOOP = shapes.wavy_polygon(12)
+LOOP = example_curves.wavy_polygon(12)
 EYE = np.array([2.2, -2.2, 1.6])
 AWAY = np.random.default_rng(0).uniform(-0.6, 0.6, (40, 3)) - EYE
 BACKEND = choose_backend("double")

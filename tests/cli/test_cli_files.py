@@ -18,8 +18,8 @@ from harnack.fields.solid_angles.dipole import DipolePotential
 from harnack.fields.solid_angles.solid_angle import SolidAngle
 from harnack.fields.solid_angles.winding_number import WindingNumber
 from harnack.gallery import SCENES
-from harnack.geometry import shapes
-from harnack.geometry.mesh_shapes import icosphere
+from harnack.geometry import example_curves
+from harnack.geometry.example_meshes import icosphere
 
 Run = Callable[..., tuple[int, str, str]]
 
@@ -116,7 +116,7 @@ def test_a_cloud_is_drawn_by_its_dipoles(run, tmp_path, kind):
 @pytest.mark.slow
 def test_curves_are_drawn_by_their_solid_angle(run, tmp_path):
     path = tmp_path / "a.loops"
-    path.write_text(" ".join(f"{c:.6f}" for c in shapes.wavy_polygon(12).ravel()) + "\n")
+    path.write_text(" ".join(f"{c:.6f}" for c in example_curves.wavy_polygon(12).ravel()) + "\n")
     code, said, _ = run(path, "--level", "1.5pi", "--material", "copper")
     assert code == 0
     assert "1 loop of 12 vertices: curves" in said
@@ -128,7 +128,7 @@ def test_meshes_and_clouds_are_shaded_and_curves_drawn_in_color(tmp_path, capsys
     mesh = write_mesh(tmp_path / "a.stl", missing=20)
     cloud = write_cloud(tmp_path / "a.xyz")
     curve = tmp_path / "a.loops"
-    curve.write_text(" ".join(f"{c:.6f}" for c in shapes.wavy_polygon(12).ravel()) + "\n")
+    curve.write_text(" ".join(f"{c:.6f}" for c in example_curves.wavy_polygon(12).ravel()) + "\n")
     target = str(tmp_path / "picture.png")
     pictures = []
     for path, shaded in ((mesh, True), (cloud, True), (curve, False)):

@@ -18,13 +18,13 @@ from harnack.cli.arguments import parsers
 from harnack.cli.messages import OPTIONS, error_line, in_options, level_text, printable
 from harnack.field_from_file import open_surface
 from harnack.files import FileFormatError
-from harnack.geometry import shapes
-from harnack.geometry.mesh_shapes import icosphere
-from harnack.names import did_you_mean
+from harnack.geometry import example_curves
+from harnack.geometry.example_meshes import icosphere
+from harnack.name_suggestions import did_you_mean
 from harnack.rendering import MATERIALS, UnboundedSurfaceError, shape
 
-POLYGON = hk.SolidAngle(shapes.wavy_polygon(12))
-KNOT, RAY = shapes.torus_knot(2, 3, 12), ([[0, 0, 3]], [[0, 0, -1]])
+POLYGON = hk.SolidAngle(example_curves.wavy_polygon(12))
+KNOT, RAY = example_curves.torus_knot(2, 3, 12), ([[0, 0, 3]], [[0, 0, -1]])
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0.3\nv 0 1 0\nf 1 2 3 4\n"
 SMALL = ["--size", "8x8", "--show", "normal", "--quiet"]
 
@@ -91,7 +91,7 @@ def test_a_wrong_value_is_named(settings: dict[str, Any], complaint: str) -> Non
 
 
 def test_a_picture_larger_than_memory_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("harnack.rendering.arguments._memory", lambda: 1e9)
+    monkeypatch.setattr("harnack.rendering.render_options._memory", lambda: 1e9)
     with pytest.raises(ValueError, match=r"needs about 75 GB of memory, .* has 1: choose a sm"):
         draw(size=(16384, 16384), show="shaded")
 
@@ -109,7 +109,7 @@ def test_a_picture_larger_than_memory_is_refused(monkeypatch: pytest.MonkeyPatch
         (lambda: hk.render([KNOT]), "level sets, not what is of type ndarray: of points"),
         (lambda: hk.trace(hk.Gyroid(1.0, domain="ball"), *RAY), "domain of a Gyroid must be a"),  # pyright: ignore
         (lambda: hk.Ball(radius="2"), "radius of a ball must be a number, not '2'"),  # pyright: ignore
-        (lambda: shapes.torus_knot("2", 3, 60), "p of a torus knot must be a whole number"),  # pyright: ignore
+        (lambda: example_curves.torus_knot("2", 3, 60), "p of a torus knot must be a whole number"),  # pyright: ignore
         (lambda: hk.Isolines("z", levels="0.1"), "levels of isolines must be numbers"),
         (lambda: hk.mesh(POLYGON, thickness="0.1"), "thickness must be a number"),  # pyright: ignore
         (lambda: hk.expression(lambda x, y, z: x == y), "write left - right"),
@@ -149,7 +149,7 @@ def test_methods_and_certificates_that_there_are_not() -> None:
     with pytest.raises(ValueError, match=r'unknown method .*; did you mean "newton"\?'):
         hk.signed_distance(POLYGON, [[0, 0, 3]], method="newtn")  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match=r'unknown certificate .*; did you mean "convex"\?'):
-        hk.SolidAngle(shapes.wavy_polygon(12), certificate="convx")  # pyright: ignore[reportArgumentType]
+        hk.SolidAngle(example_curves.wavy_polygon(12), certificate="convx")  # pyright: ignore[reportArgumentType]
 
 
 def test_messages_of_the_library_name_arguments_of_python(tmp_path: Path) -> None:
@@ -184,7 +184,10 @@ def test_a_level_without_bounds_names_one_that_has_them(level: float) -> None:
 def test_what_single_precision_cannot_draw_is_refused_and_not_drawn_empty(scale: float) -> None:
     x = np.random.default_rng(0).normal(size=(60, 3))
     x /= np.linalg.norm(x, axis=1, keepdims=True)
-    for field in (hk.DipolePotential(x * scale, x), hk.SolidAngle(shapes.wavy_polygon(12) * scale)):
+    for field in (
+        hk.DipolePotential(x * scale, x),
+        hk.SolidAngle(example_curves.wavy_polygon(12) * scale),
+    ):
         with pytest.raises(ValueError, match="choose units nearer to 1"):
             hk.render(field, show="normal", size=(8, 8))
 

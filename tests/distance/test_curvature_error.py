@@ -11,8 +11,8 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.distance.curvature import _Derivatives
-from harnack.fields.batch import BatchedField, SymmetricSum, Values
+from harnack.distance.surface_curvature import _Derivatives
+from harnack.fields.batched_fields import BatchedField, SymmetricSum, Values
 
 PRECISIONS = ("double", "single")
 

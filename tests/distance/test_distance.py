@@ -16,15 +16,15 @@ from scipy.spatial import cKDTree
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.distance import closest_points, curvature, signed_distance, tangent
-from harnack.distance.tangent import second_order
+from harnack.distance import closest_points, curvature, signed_distance, tangent_plane
+from harnack.distance.tangent_plane import second_order
 from harnack.enclosures import Curvature, Enclosure, HarmonicBall, Lipschitz
 from harnack.enclosures.harmonic_ball import Caps, Classic, Slope
 from harnack.enclosures.parabola import Cone, Taylor
-from harnack.fields.sheets import NO_SHEET, Crossing
-from harnack.geometry import shapes
-from harnack.testing.bound_contracts import Case
-from harnack.testing.worst_places import look_at, movements
+from harnack.fields.capabilities import NO_SHEET, Crossing
+from harnack.geometry import example_curves
+from harnack.testing.enclosure_contracts import Case
+from harnack.testing.violation_search import look_at, movements
 from tests.oracles.exact import exact_step
 
 # --- fields whose surfaces are known ---------------------------------------------------------
@@ -190,8 +190,8 @@ def outer(u: Any, v: Any, diagonal: Any) -> Any:
     )
 
 
-WAVY = hk.SolidAngle(shapes.wavy_polygon(24))
-KNOT = hk.SolidAngle(shapes.torus_knot(2, 3, 60))
+WAVY = hk.SolidAngle(example_curves.wavy_polygon(24))
+KNOT = hk.SolidAngle(example_curves.torus_knot(2, 3, 60))
 POLYNOMIAL = hk.HarmonicPolynomial(
     {(2, 1, 0): 1, (0, 1, 2): -1, (1, 0, 0): 0.3, (0, 0, 0): 0.1, (1, 1, 1): 0.5},
     domain=hk.Ball(radius=1.5),
@@ -496,7 +496,7 @@ def disk_distance(x: np.ndarray, corners: np.ndarray) -> np.ndarray:
 @pytest.mark.slow
 def test_the_rim_of_a_disk_belongs_to_it() -> None:
     """The 2 pi level of a plane polygon is the polygon; beyond its edges the edge is closest."""
-    corners = shapes.regular_polygon(9)
+    corners = example_curves.regular_polygon(9)
     x = np.random.default_rng(6).uniform(-2, 2, (2000, 3))
     exact = disk_distance(x, corners)
     for scale, shift in ((1.0, 0.0), (1e-3, 1.0), (1e4, -3.0)):
@@ -822,7 +822,7 @@ def test_results_are_float64_arrays_of_the_same_length(method: Any) -> None:
 def test_batches_make_no_difference(method: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     x = points_around(WAVY, 40)
     whole = signed_distance(WAVY, x, method=method)
-    monkeypatch.setattr(tangent, "_AT_ONCE", 17)
+    monkeypatch.setattr(tangent_plane, "_AT_ONCE", 17)
     assert np.allclose(signed_distance(WAVY, x, method=method), whole, rtol=1e-12)
 
 
@@ -879,7 +879,7 @@ def test_several_levels() -> None:
 @pytest.mark.few(1)
 @pytest.mark.parametrize("far", [1e90, 1e99])
 def test_distances_from_very_far_away_come_without_warnings_of_numpy(far: float) -> None:
-    field = hk.SolidAngle(shapes.wavy_polygon(12))
+    field = hk.SolidAngle(example_curves.wavy_polygon(12))
     with warnings.catch_warnings():
         warnings.filterwarnings("error", message="overflow|divide|invalid")
         found = signed_distance(field, [[far, 0, 0]], method="newton", precision="double")

@@ -14,10 +14,10 @@ from scipy.spatial import cKDTree
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.distance import closest
-from harnack.geometry import MeshError, mesh_shapes
-from harnack.tree.nearest import NearestPoint
-from harnack.tree.triangles import triangle_records
+from harnack.distance import closest_point_search
+from harnack.geometry import MeshError, example_meshes
+from harnack.tree.closest_triangles import NearestPoint
+from harnack.tree.triangle_tree import triangle_records
 from tests.oracles.direct_sums import winding_sum
 from tests.oracles.mesh_distance import distances_to_triangles
 
@@ -112,7 +112,7 @@ def beside_faces(
 def test_a_billionth_off_a_flat_ball(flat: float, method: Any) -> None:
     """Differences of distances that short are rounding: three of four answers were as long as the
     ball is wide."""
-    vertices, faces = mesh_shapes.icosphere(2)
+    vertices, faces = example_meshes.icosphere(2)
     vertices = vertices * [1, 1, flat]
     field = hk.WindingNumber(vertices, faces, method=method)
     x = beside_faces(vertices, faces, 2500, np.repeat([1e-6, 1e-9, 1e-12, 1e-15, 0.0], 500))
@@ -122,7 +122,7 @@ def test_a_billionth_off_a_flat_ball(flat: float, method: Any) -> None:
 
 def test_far_from_the_origin() -> None:
     """A mesh of size 1 at a million: coordinates are rounded to 1e-10, and so are distances."""
-    vertices, faces = mesh_shapes.icosphere(2)
+    vertices, faces = example_meshes.icosphere(2)
     vertices = vertices * [1, 1, 0.44] + [1e6, -2e6, 5e5]
     x = beside_faces(vertices, faces, 300, 10 ** np.random.default_rng(0).uniform(-12, 0, 300))
     field, exact = hk.WindingNumber(vertices, faces), distance_to_closed_mesh(vertices, faces, x)
@@ -132,7 +132,7 @@ def test_far_from_the_origin() -> None:
 
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_on_vertices_edges_and_faces(precision: Any) -> None:
-    vertices, faces = mesh_shapes.icosphere(1)
+    vertices, faces = example_meshes.icosphere(1)
     corners = vertices[faces]
     x = np.concatenate([vertices, 0.5 * (corners[:, 0] + corners[:, 1]), corners.mean(axis=1)])
     for scale in (1e-12, 1.0, 1e12):
@@ -147,9 +147,9 @@ def test_on_vertices_edges_and_faces(precision: Any) -> None:
 def test_shells_within_shells(level: float) -> None:
     """Of a ball in a turned-round ball in a doubled torus, only some are the surface; points right
     beside the others are as far from it as any."""
-    shells = [(mesh_shapes.icosphere(2), 1.0, 1), (mesh_shapes.icosphere(1), 0.6, 1)]
-    shells += [(mesh_shapes.icosphere(1), 0.35, -1), (mesh_shapes.icosphere(2), 1.5, -1)]
-    shells += [(mesh_shapes.torus_mesh(4.0, 1.9, 16, 9), 1.0, 2)]
+    shells = [(example_meshes.icosphere(2), 1.0, 1), (example_meshes.icosphere(1), 0.6, 1)]
+    shells += [(example_meshes.icosphere(1), 0.35, -1), (example_meshes.icosphere(2), 1.5, -1)]
+    shells += [(example_meshes.torus_mesh(4.0, 1.9, 16, 9), 1.0, 2)]
     vertices, faces, count = [], [], 0
     for (v, f), scale, times in shells:
         faces += [(f if times > 0 else f[:, ::-1]) + count] * abs(times)
@@ -277,13 +277,13 @@ def test_boxes_in_single_precision() -> None:
 
 def messy_mesh(seed: int) -> tuple[np.ndarray, np.ndarray]:
     """A torus and a ball that overlap, with faces turned round, missing and doubled."""
-    vertices, faces = mesh_shapes.torus_mesh(1.0, 0.42, 16, 8)
-    ball, more = mesh_shapes.icosphere(1)
+    vertices, faces = example_meshes.torus_mesh(1.0, 0.42, 16, 8)
+    ball, more = example_meshes.icosphere(1)
     faces = np.concatenate([faces, more + len(vertices)])
     vertices = np.concatenate([vertices, 0.8 * ball + [0.7, 0.1, 0.2]])
-    faces = mesh_shapes.flip_faces(faces, 0.03, seed)
-    faces = mesh_shapes.remove_faces(faces, 0.05, seed + 1)
-    return vertices, mesh_shapes.duplicate_faces(faces, 0.03, seed + 2)
+    faces = example_meshes.flip_faces(faces, 0.03, seed)
+    faces = example_meshes.remove_faces(faces, 0.05, seed + 1)
+    return vertices, example_meshes.duplicate_faces(faces, 0.03, seed + 2)
 
 
 def points_of_surface(field: Any, vertices: np.ndarray, faces: np.ndarray, n: int) -> np.ndarray:
@@ -335,9 +335,9 @@ def test_meshes_with_holes(
 ) -> None:
     """The surface is triangles and what spans the holes, off which nothing is nearer. A tenth of
     the answers were too long, by up to a tenth, and took rays, a hundred times as long."""
-    vertices, faces = mesh_shapes.torus_mesh(1.0, 0.42, 20, 10)
+    vertices, faces = example_meshes.torus_mesh(1.0, 0.42, 20, 10)
     faces = faces[np.random.default_rng(seed).uniform(size=len(faces)) > 0.1]
-    field = hk.WindingNumber(vertices, mesh_shapes.flip_faces(faces, 0.05, seed), method=method)
+    field = hk.WindingNumber(vertices, example_meshes.flip_faces(faces, 0.05, seed), method=method)
     rng = np.random.default_rng(seed + 10)
     x = np.concatenate([
         rng.uniform(vertices.min(axis=0) - 0.4, vertices.max(axis=0) + 0.4, (300, 3)),
@@ -345,13 +345,13 @@ def test_meshes_with_holes(
     ])  # fmt: skip
     x = x.astype(np.float32).astype(np.float64)
     searched: list[Any] = []
-    search = closest.search
+    search = closest_point_search.search
 
     def counted(surface: Any, *given: Any) -> Any:
         searched.append(surface.field.has_sheets)
         return search(surface, *given)
 
-    monkeypatch.setattr(closest, "search", counted)
+    monkeypatch.setattr(closest_point_search, "search", counted)
     found = hk.distance_bounds(field, x, precision=precision)
     assert searched == [False]
     upper = cKDTree(points_of_surface(field, vertices, faces, 100_000)).query(x)[0]
@@ -368,7 +368,7 @@ def test_meshes_with_holes(
 def test_levels_that_others_are_modulo_one() -> None:
     """What spans a hole has the level of w, and not one that differs by a whole number: a second
     sphere, twice, inside out and open, has the level -1/2 there."""
-    ball, faces = mesh_shapes.icosphere(2)
+    ball, faces = example_meshes.icosphere(2)
     inner = 0.4 * ball + [0.1, 0, 0]
     kept = faces[inner[faces].mean(axis=1)[:, 2] < 0.1]
     vertices = np.concatenate([ball, inner])
@@ -387,7 +387,7 @@ def test_levels_that_others_are_modulo_one() -> None:
 def test_feet_are_where_the_level_comes() -> None:
     """By a singular edge w is steep, and the level seemed near: the foot (0.10, 0.3, -0.3) lay on
     the patch, where w is at least 3/2."""
-    vertices, faces = mesh_shapes.icosphere(2)
+    vertices, faces = example_meshes.icosphere(2)
     u = np.linspace(-0.3, 0.3, 5)
     patch = np.array([[a, b, -0.3] for a in u for b in u])
     quads = [(5 * i + j, 5 * i + j + 5, 5 * i + j + 6, 5 * i + j + 1)
@@ -429,10 +429,10 @@ def test_a_vertex_of_a_soup_that_the_level_does_not_reach() -> None:
 
 def test_points_on_edges_of_flat_wedges() -> None:
     """On both sides of a face, as it was first done, was on the same side of the one beside it."""
-    ball, faces = mesh_shapes.icosphere(2)
+    ball, faces = example_meshes.icosphere(2)
     vertices = ball @ np.array([[30.0, 5.0, 2.0], [0.0, 0.4, 9.0], [1.0, 0.0, 25.0]])
     edges = vertices[faces[:, :2]].mean(axis=1)
-    field = hk.WindingNumber(vertices, mesh_shapes.remove_faces(faces, 0.05, 0))
+    field = hk.WindingNumber(vertices, example_meshes.remove_faces(faces, 0.05, 0))
     found = np.abs(hk.signed_distance(field, edges))
     assert (found < 1e-9).mean() > 0.97
 

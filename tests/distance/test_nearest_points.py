@@ -12,10 +12,10 @@ from scipy.spatial import cKDTree
 
 import harnack as hk
 from harnack.backend import choose_backend
-from harnack.distance import search
-from harnack.distance.surface_cells import remainder
-from harnack.fields.look import Sample
-from harnack.geometry import mesh_shapes, shapes
+from harnack.distance import cell_search
+from harnack.distance.cell_classification import remainder
+from harnack.fields.samples import Sample
+from harnack.geometry import example_curves, example_meshes
 from tests.distance.test_distance import CURVED, Bare, surface_points, true_distance, unit
 from tests.distance.test_mesh_distances import beside_faces, distance_to_closed_mesh
 from tests.oracles.direct_sums import dipole_sum
@@ -39,7 +39,7 @@ def check_bounds(field: hk.Field, x: np.ndarray, **given: Any) -> hk.DistanceBou
 @pytest.mark.few(1)
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_distances_to_a_closed_mesh_are_exact(precision: Any) -> None:
-    vertices, faces = mesh_shapes.bumpy_sphere(3)
+    vertices, faces = example_meshes.bumpy_sphere(3)
     rng = np.random.default_rng(0)
     x = np.concatenate([
         rng.uniform(-1.5, 1.5, (300, 3)), 1e3 * rng.normal(size=(50, 3)), np.zeros((1, 3)),
@@ -73,14 +73,14 @@ def test_slivers_duplicates_and_ties() -> None:
 
 
 def test_a_level_that_a_mesh_has_not() -> None:
-    field = hk.WindingNumber(*mesh_shapes.icosphere(1))
+    field = hk.WindingNumber(*example_meshes.icosphere(1))
     with pytest.warns(RuntimeWarning, match="no closest point was found for 2 of 2"):
         assert np.isnan(hk.signed_distance(field, [[0, 0, 0], [2, 0, 0]], level=1.5)).all()
 
 
 def test_faces_that_pass_through_one_another_are_cut() -> None:
     """Two balls: what of each lies within the other is not the surface."""
-    ball, faces = mesh_shapes.icosphere(2)
+    ball, faces = example_meshes.icosphere(2)
     vertices = np.concatenate([ball, ball + np.array([0.9, 0.05, 0.02])])
     both = np.concatenate([faces, faces + len(ball)])
     x = np.random.default_rng(2).uniform(-1.5, 2.5, (400, 3))
@@ -147,8 +147,8 @@ def test_beside_the_surface_all_is_proved() -> None:
 @pytest.mark.slow
 def test_far_away_and_on_the_axis() -> None:
     """From 1000 sizes away, and from where many points are as near as one another."""
-    disk = hk.SolidAngle(shapes.regular_polygon(12))
-    corners = shapes.regular_polygon(12)
+    disk = hk.SolidAngle(example_curves.regular_polygon(12))
+    corners = example_curves.regular_polygon(12)
     x = np.array([[0, 0, 1e3], [1e3, 0, 0], [0, 0, 0.5], [0, 0, 0], *corners[:2]])
     found = check_bounds(disk, x)
     reach = np.linalg.norm(corners - [1e3, 0, 0], axis=1).min()
@@ -205,7 +205,7 @@ def test_the_rim_of_a_domain() -> None:
 def test_parts_make_no_difference(monkeypatch: pytest.MonkeyPatch) -> None:
     field, x = CURVED["wavy"], np.random.default_rng(8).uniform(-1, 1, (60, 3))
     whole = hk.signed_distance(field, x)
-    monkeypatch.setattr(search, "_AT_ONCE", 17)
+    monkeypatch.setattr(cell_search, "_AT_ONCE", 17)
     messages: list[str] = []
     parts = hk.signed_distance(field, x, progress=messages.append)
     assert np.allclose(parts, whole, rtol=1e-12)
@@ -255,8 +255,8 @@ BOXED = hk.Gyroid(domain=hk.Box((-3, -2, -4), (3.5, 4, 2)))
 @pytest.fixture
 def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
     """Cells as coarse as for many points, and none split for the few of a test."""
-    monkeypatch.setattr(search, "_MOST", 5000)
-    monkeypatch.setattr(search, "_EACH", 1e9)
+    monkeypatch.setattr(cell_search, "_MOST", 5000)
+    monkeypatch.setattr(cell_search, "_EACH", 1e9)
 
 
 def rim_on_sphere(field: hk.Field, radius: float, circles: int) -> np.ndarray:
@@ -343,7 +343,9 @@ def test_sheets_that_cross_within_a_cell() -> None:
 @pytest.mark.parametrize("name", ["wavy", "knot"])
 def test_points_of_the_boundary_and_from_very_far(name: str) -> None:
     field = CURVED[name]
-    corners = shapes.wavy_polygon(24) if name == "wavy" else shapes.torus_knot(2, 3, 60)
+    corners = (
+        example_curves.wavy_polygon(24) if name == "wavy" else example_curves.torus_knot(2, 3, 60)
+    )
     edges = 0.5 * (corners + np.roll(corners, 1, axis=0))
     far = 1e4 * unit(np.random.default_rng(13).normal(size=(40, 3)))
     found = check_bounds(field, np.concatenate([corners, edges, far]))

@@ -26,13 +26,13 @@ from harnack.enclosures import (
     choose_proofs,
     longest_step,
 )
-from harnack.enclosures.ball import Ball
+from harnack.enclosures.free_radius import Ball
 from harnack.enclosures.harmonic_ball import Caps, Classic, Slope
 from harnack.enclosures.parabola import Cone, Parabola, Taylor
 from harnack.testing import BrokenPromiseError, check_bound, scaled
-from harnack.testing.bound_contracts import Case
+from harnack.testing.enclosure_contracts import Case
 from harnack.testing.poisson import cap_mass, cap_movement, cap_slope, kernel_movement
-from harnack.testing.worst_places import unscaled
+from harnack.testing.violation_search import unscaled
 from tests.oracles.exact import BOUNDS, exact_step, on_host
 
 # Solved to the end: the default number of rounds trades a little length for time.

@@ -26,18 +26,18 @@ from harnack.arithmetic import Interval
 from harnack.backend import choose_backend
 from harnack.backend.arrays import aligned
 from harnack.enclosures import Enclosure, Gaps, Slopes, any_covers, longest_step
-from harnack.enclosures.ball import Ball
 from harnack.enclosures.bounded_laplacian import GreenBall
 from harnack.enclosures.enclosure import Piece
 from harnack.enclosures.extremum import Cusp, Greatest, Nearest, Negated, Part, Sheet, Stretched
+from harnack.enclosures.free_radius import Ball
 from harnack.enclosures.literature import Band, Mixed
 from harnack.enclosures.parabola import Arc, Cone, Parabola, Tangent
-from harnack.enclosures.pieces import OnePiece, Pieces
+from harnack.enclosures.piecewise_taylor import OnePiece, Pieces
 from harnack.fields.blobs.blobs import _After  # pyright: ignore[reportPrivateUsage]
-from harnack.fields.blobs.largest import LargestAlong
+from harnack.fields.blobs.group_maximum import LargestAlong
+from harnack.fields.solids.extrusions import ExtrudedAhead
+from harnack.fields.solids.from_field import Folded
 from harnack.fields.solids.outline_distance import SignedAhead
-from harnack.fields.solids.region import Folded
-from harnack.fields.solids.swept import ExtrudedAhead
 from harnack.fields.solids.thread import Beside
 from harnack.fields.solids.tube import TubeAhead
 

@@ -14,8 +14,8 @@ from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.enclosures import Slopes, choose_proofs
 from harnack.enclosures.parabola import Parabola
 from harnack.fields import Field, Sample
-from harnack.fields.look import Look
-from harnack.fields.look import Path as RayPath
+from harnack.fields.samples import Look
+from harnack.fields.samples import Path as RayPath
 
 CENTERS = np.random.default_rng(5).uniform(-0.8, 0.8, (5, 3))
 WIDTH = 0.4

@@ -13,10 +13,10 @@ import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.enclosures import Gaps, choose_proofs, longest_step
 from harnack.fields import Formula
+from harnack.fields.blobs.blob_sums import over, sum_along
 from harnack.fields.blobs.blobs import BlobError
 from harnack.fields.blobs.grid import CellLists
-from harnack.fields.blobs.sums import over, sum_along
-from harnack.fields.look import Path
+from harnack.fields.samples import Path
 from harnack.testing import check_field
 
 KERNELS = {

@@ -15,7 +15,7 @@ from harnack.backend.arrays import aligned
 from harnack.enclosures import HarmonicBall
 from harnack.fields.solid_angles.circle_sums import UnitCircle
 from harnack.fields.solid_angles.planar import planar_region
-from harnack.geometry import CurveError, shapes
+from harnack.geometry import CurveError, example_curves
 from harnack.testing import check_field
 from tests.oracles.circle_oracle import MixedOracle, circle_values
 from tests.oracles.oracle import first_crossings
@@ -183,7 +183,7 @@ FIELDS: dict[str, hk.SolidAngle] = {
     "court": hk.SolidAngle([court(), HOLE]),
     "court, edges": hk.SolidAngle([court(), HOLE], certificate="edges"),
     "bent court": hk.SolidAngle([court(0.4), HOLE]),
-    "trefoil and circle": hk.SolidAngle([shapes.torus_knot(2, 3, 40), hk.Circle(0.5)]),
+    "trefoil and circle": hk.SolidAngle([example_curves.torus_knot(2, 3, 40), hk.Circle(0.5)]),
     "twice": hk.SolidAngle([hk.Circle(1.0), hk.Circle(1.0)]),
 }
 SOME = ("circle", "ring", "coaxial", "court")
@@ -415,7 +415,7 @@ def random_curves(rng: np.random.Generator, kind: int) -> tuple[list[np.ndarray]
         lambda: ([], [random_circle(rng) for _ in range(int(rng.integers(2, 7)))]),
         lambda: ([court()], [HOLE]),
         lambda: ([court(rng.uniform(-0.5, 0.5))], [HOLE, random_circle(rng)]),
-        lambda: ([shapes.spiky_polygon(rng, int(rng.integers(5, 12)))], [hk.Circle(0.5)]),
+        lambda: ([example_curves.spiky_polygon(rng, int(rng.integers(5, 12)))], [hk.Circle(0.5)]),
     ]
     return kinds[kind % len(kinds)]()
 

@@ -30,11 +30,11 @@ from harnack.enclosures import (
 from harnack.enclosures.parabola import Cone
 from harnack.fields import Field, Sample
 from harnack.fields.analytic.waves import PlaneWave, Product, cosine, sine
-from harnack.fields.sheets import NO_SHEET, Crossing
-from harnack.geometry import shapes
-from harnack.geometry.mesh_shapes import bumpy_sphere, icosphere, remove_faces
+from harnack.fields.capabilities import NO_SHEET, Crossing
+from harnack.geometry import example_curves
+from harnack.geometry.example_meshes import bumpy_sphere, icosphere, remove_faces
 from harnack.testing import BrokenPromiseError, check_field, check_looks, scaled
-from harnack.testing.bound_contracts import Case
+from harnack.testing.enclosure_contracts import Case
 from tests.arithmetic.test_arithmetics import PROOFS
 from tests.enclosures.test_bounded_laplacian import FIELDS as SOURCED
 from tests.fields.test_shapes import SHAPES
@@ -92,23 +92,25 @@ def moved(loops: Any, scale: float, shift: float) -> list[np.ndarray]:
 _RNG = np.random.default_rng(5)
 CURVES: dict[str, Field] = {
     "triangle": hk.SolidAngle([[0, 0, 0], [1, 0, 0], [0, 1, 0.4]]),
-    "wavy": hk.SolidAngle(shapes.wavy_polygon(24)),
-    "wavy by edges": hk.SolidAngle(shapes.wavy_polygon(24), certificate="edges"),
-    "flat": hk.SolidAngle(shapes.regular_polygon(9)),
-    "trefoil": hk.SolidAngle(shapes.torus_knot(2, 3, 60)),
-    "figure eight, small": hk.SolidAngle(moved(shapes.figure_eight_knot(48), 1e-3, 0.5)),
-    "trefoil in cells": hk.SolidAngle(shapes.torus_knot(2, 3, 60), cells=True),
-    "link in cells": hk.SolidAngle(moved(shapes.hopf_link(24), 1e2, 0.7), cells=True),
-    "holes in cells": hk.SolidAngle(shapes.square_with_holes(12), cells=True),
-    "coil": hk.SolidAngle(shapes.coil(5, 80, height=0.4)),
-    "coil on its axis, large": hk.SolidAngle(moved(shapes.coil(3, 50, route="axis"), 1e3, 1.0)),
-    "Hopf link": hk.SolidAngle(shapes.hopf_link(20)),
-    "Borromean rings": hk.SolidAngle(shapes.borromean_rings(20)),
-    "holes": hk.SolidAngle(shapes.square_with_holes(12)),
+    "wavy": hk.SolidAngle(example_curves.wavy_polygon(24)),
+    "wavy by edges": hk.SolidAngle(example_curves.wavy_polygon(24), certificate="edges"),
+    "flat": hk.SolidAngle(example_curves.regular_polygon(9)),
+    "trefoil": hk.SolidAngle(example_curves.torus_knot(2, 3, 60)),
+    "figure eight, small": hk.SolidAngle(moved(example_curves.figure_eight_knot(48), 1e-3, 0.5)),
+    "trefoil in cells": hk.SolidAngle(example_curves.torus_knot(2, 3, 60), cells=True),
+    "link in cells": hk.SolidAngle(moved(example_curves.hopf_link(24), 1e2, 0.7), cells=True),
+    "holes in cells": hk.SolidAngle(example_curves.square_with_holes(12), cells=True),
+    "coil": hk.SolidAngle(example_curves.coil(5, 80, height=0.4)),
+    "coil on its axis, large": hk.SolidAngle(
+        moved(example_curves.coil(3, 50, route="axis"), 1e3, 1.0)
+    ),
+    "Hopf link": hk.SolidAngle(example_curves.hopf_link(20)),
+    "Borromean rings": hk.SolidAngle(example_curves.borromean_rings(20)),
+    "holes": hk.SolidAngle(example_curves.square_with_holes(12)),
     "ring of circles": hk.SolidAngle([hk.Circle(1.0), hk.Circle(0.4, normal=(0, 0, -1))]),
-    "trefoil and circle": hk.SolidAngle([shapes.torus_knot(2, 3, 60), hk.Circle(0.5)]),
-    "spiky": hk.SolidAngle(shapes.spiky_polygon(_RNG, 17)),
-    "random": hk.SolidAngle(shapes.random_closed_curve(_RNG, 40)),
+    "trefoil and circle": hk.SolidAngle([example_curves.torus_knot(2, 3, 60), hk.Circle(0.5)]),
+    "spiky": hk.SolidAngle(example_curves.spiky_polygon(_RNG, 17)),
+    "random": hk.SolidAngle(example_curves.random_closed_curve(_RNG, 40)),
 }
 REAL: dict[str, Field] = {
     "Y 2,0": hk.SphericalHarmonic(2, 0),
@@ -666,7 +668,7 @@ BROKEN: dict[str, tuple[Field, str]] = {
         "nothing is known",
     ),
     "range of the paper": (
-        hk.SolidAngle(shapes.coil(5, 80, height=0.2), certificate="paper"),
+        hk.SolidAngle(example_curves.coil(5, 80, height=0.2), certificate="paper"),
         "HarmonicBall: f leaves",
     ),
     "range too narrow": (Broken(TREFOIL, narrower(0.3)), "HarmonicBall: f leaves"),

@@ -14,15 +14,16 @@ import pytest
 
 import harnack as hk
 from harnack.backend import Precision, choose_backend, to_numpy, to_vector3
-from harnack.backend.records import Records
-from harnack.fields.solid_angles import curve_octree
-from harnack.fields.solid_angles.far_edges import (
+from harnack.backend.record_table import Records
+from harnack.fields.solid_angles import curve_cell_builder
+from harnack.fields.solid_angles.edge_expansion import (
     _OF_TERMS,  # pyright: ignore[reportPrivateUsage]
     COEFFICIENTS,
     DEGREE,
     FarEdges,
     _turned,  # pyright: ignore[reportPrivateUsage]
 )
+from harnack.fields.solid_angles.edge_runs import Edges, Runs, VertexTable, left_over
 from harnack.fields.solid_angles.local_expansion import (
     _Sizes,  # pyright: ignore[reportPrivateUsage]
     irregular,
@@ -31,8 +32,7 @@ from harnack.fields.solid_angles.local_expansion import (
     shift_matrices,
     value_and_gradient,
 )
-from harnack.fields.solid_angles.near_runs import Edges, Runs, VertexTable, left_over
-from harnack.geometry import shapes
+from harnack.geometry import example_curves
 from tests.oracles.direct_sums import winding_sum
 
 PERIOD = 4 * math.pi
@@ -58,18 +58,18 @@ def collinear() -> np.ndarray:
 
 CURVES: dict[str, Any] = {
     "wavy": wavy(96),
-    "trefoil": shapes.torus_knot(2, 3, 120),
-    "coil": shapes.coil(5, 160, height=0.4),
-    "link": shapes.hopf_link(40),
-    "rings": shapes.borromean_rings(30),
-    "random": shapes.random_closed_curve(RNG, 60),
-    "spiky": shapes.spiky_polygon(RNG, 33),
+    "trefoil": example_curves.torus_knot(2, 3, 120),
+    "coil": example_curves.coil(5, 160, height=0.4),
+    "link": example_curves.hopf_link(40),
+    "rings": example_curves.borromean_rings(30),
+    "random": example_curves.random_closed_curve(RNG, 60),
+    "spiky": example_curves.spiky_polygon(RNG, 33),
     "twice": [wavy(50), wavy(50)],
     "twice in one": np.concatenate([wavy(30), wavy(30)]),
     "rod": collinear(),
     "triangle": np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0.4]]),
-    "flat": shapes.regular_polygon(40),
-    "holes": shapes.square_with_holes(24),
+    "flat": example_curves.regular_polygon(40),
+    "holes": example_curves.square_with_holes(24),
     "there and back": np.array(
         [[0, 0, 0], [1, 0, 0], [1, 1, 0.2], [2, 1, 0], [1, 1, 0.2], [0, 1, 0]]
     ),
@@ -523,7 +523,7 @@ def test_vertices_that_may_move_have_no_cells() -> None:
 def test_errors_are_attained_in_cells(monkeypatch: pytest.MonkeyPatch) -> None:
     """An eighth of the error would be too little in some cell: all its edges add up in size, and
     what they leave out only in part."""
-    monkeypatch.setattr(curve_octree, "_FINE", 1e-3)
+    monkeypatch.setattr(curve_cell_builder, "_FINE", 1e-3)
     curve = wavy(200)
     field = hk.SolidAngle(curve, cells=True)
     _, table = table_of(field, "double")

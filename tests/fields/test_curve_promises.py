@@ -11,14 +11,14 @@ import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.enclosures import Curvature
 from harnack.fields.solid_angles.edges import LoopEdges, sum_over_edges
-from harnack.geometry import shapes
+from harnack.geometry import example_curves
 from tests.oracles.oracle import CurveOracle
 
 PRECISIONS = ("double", "single")
 CURVES = {
     "square": [np.array([[1.0, 1, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0]])],
-    "wavy": [shapes.wavy_polygon(13)],
-    "link": shapes.hopf_link(9),
+    "wavy": [example_curves.wavy_polygon(13)],
+    "link": example_curves.hopf_link(9),
     "sliver": [np.array([[0.0, 0, 0], [1, 0, 0], [1, 1e-3, 0]])],
 }
 

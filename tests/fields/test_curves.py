@@ -10,8 +10,8 @@ import scipy.spatial
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from harnack.geometry import shapes
-from harnack.geometry.convexity import MAX_VERTICES, segment_clearance_lower
+from harnack.geometry import example_curves
+from harnack.geometry.convex_position import MAX_VERTICES, segment_clearance_lower
 from harnack.geometry.curves import (
     CurveError,
     CurveScaleError,
@@ -49,8 +49,8 @@ def full_turn(n: int) -> np.ndarray:
         (np.array(TRIANGLE, dtype=np.int32), [3]),
         ([TRIANGLE], [3]),
         ([TRIANGLE, TRIANGLE], [3, 3]),
-        ([TRIANGLE, shapes.regular_polygon(5)], [3, 5]),
-        ((shapes.regular_polygon(3), shapes.regular_polygon(3)), [3, 3]),
+        ([TRIANGLE, example_curves.regular_polygon(5)], [3, 5]),
+        ((example_curves.regular_polygon(3), example_curves.regular_polygon(3)), [3, 3]),
         ([*TRIANGLE, TRIANGLE[0]], [3]),  # a repeated closing vertex is dropped
         ([[0, 0, 0], [1, 0, 0], [0, 0, 0], [0, 1, 0]], [4]),  # folds back on itself
     ],
@@ -106,7 +106,7 @@ def test_each_bad_curve_has_its_own_error(loops, error, message):
 
 
 def test_measures_of_a_curve():
-    loops = validate_loops([TRIANGLE, shapes.regular_polygon(4)])
+    loops = validate_loops([TRIANGLE, example_curves.regular_polygon(4)])
     start, end = edges(loops)
     assert start.shape == end.shape == (7, 3)
     assert end[2].tolist() == TRIANGLE[0]
@@ -119,8 +119,8 @@ def test_measures_of_a_curve():
 
 @pytest.mark.parametrize("n", [3, 4, 7, 12, 64, 256])
 def test_curves_on_a_cylinder_are_in_convex_position(n):
-    assert is_convex(shapes.wavy_polygon(n))
-    assert is_convex(shapes.regular_polygon(n))
+    assert is_convex(example_curves.wavy_polygon(n))
+    assert is_convex(example_curves.regular_polygon(n))
 
 
 @settings(deadline=None)
@@ -156,7 +156,7 @@ def test_a_curve_within_the_faces_of_a_cube_is_in_convex_position(seed, scale):
 
 @pytest.mark.parametrize("seed", range(5))
 def test_simple_planar_polygons_count(seed):
-    star = shapes.regular_polygon(10)
+    star = example_curves.regular_polygon(10)
     star[::2] *= 0.4
     assert is_convex(star @ rotation(seed))
     comb = np.array([[0, 0], [4, 0], [4, 2], [3, 2], [3, 1e-3], [1, 1e-3], [1, 2], [0, 2]])
@@ -186,18 +186,21 @@ def spike() -> np.ndarray:
 @pytest.mark.parametrize(
     "curve",
     [
-        shapes.torus_knot(2, 3, 60),
-        shapes.figure_eight_knot(80),
-        shapes.coil(3, 60),
-        shapes.coil(5, 100, route="axis"),
-        shapes.hopf_link(12),
-        [shapes.regular_polygon(5), shapes.regular_polygon(5) + np.array([0, 0, 1.0])],
-        shapes.square_with_holes(),
+        example_curves.torus_knot(2, 3, 60),
+        example_curves.figure_eight_knot(80),
+        example_curves.coil(3, 60),
+        example_curves.coil(5, 100, route="axis"),
+        example_curves.hopf_link(12),
+        [
+            example_curves.regular_polygon(5),
+            example_curves.regular_polygon(5) + np.array([0, 0, 1.0]),
+        ],
+        example_curves.square_with_holes(),
         sphere_figure_eight(),
         flat_figure_eight(),
-        dented(shapes.wavy_polygon(64)),
+        dented(example_curves.wavy_polygon(64)),
         spike(),
-        shapes.wavy_polygon(MAX_VERTICES + 1),  # not examined
+        example_curves.wavy_polygon(MAX_VERTICES + 1),  # not examined
     ],
 )
 def test_no_other_curve_is_claimed_to_be_in_convex_position(curve):
@@ -205,7 +208,7 @@ def test_no_other_curve_is_claimed_to_be_in_convex_position(curve):
 
 
 def test_a_dent_of_rounding_size_is_forgiven_and_a_larger_one_is_not():
-    curve = shapes.regular_polygon(12)
+    curve = example_curves.regular_polygon(12)
     curve[:, 2] = [0, 0.5, 0.5] * 4
     curve = np.insert(curve, 2, 0.5 * (curve[1] + curve[2]), axis=0)  # on an edge of the hull
     assert is_convex(curve)
@@ -222,8 +225,13 @@ def with_tiny_edge(curve: np.ndarray, length: float) -> np.ndarray:
 @pytest.mark.parametrize("length", [1e-90, 1e-30, 1e-17, 1e-12])
 def test_an_edge_too_short_for_a_direction_proves_nothing(length: float) -> None:
     """In the coordinates of the tests it has length zero, and NaN for a direction."""
-    ring = shapes.regular_polygon(20)
-    for curve in (np.tile(ring, (2, 1)), ring, flat_figure_eight(), shapes.wavy_polygon(12)):
+    ring = example_curves.regular_polygon(20)
+    for curve in (
+        np.tile(ring, (2, 1)),
+        ring,
+        flat_figure_eight(),
+        example_curves.wavy_polygon(12),
+    ):
         with np.errstate(all="raise", under="ignore"):
             assert not is_convex(with_tiny_edge(curve, length))
 
@@ -310,27 +318,27 @@ def linking_number(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def test_the_links_are_linked_as_they_should_be():
-    first, second = shapes.hopf_link(20)
+    first, second = example_curves.hopf_link(20)
     assert abs(linking_number(first, second)) == pytest.approx(1.0, abs=1e-9)
-    rings = shapes.borromean_rings(20)
+    rings = example_curves.borromean_rings(20)
     for a, b in ((0, 1), (1, 2), (2, 0)):
         assert linking_number(rings[a], rings[b]) == pytest.approx(0.0, abs=1e-9)
 
 
 def test_a_coil_has_its_turns_and_closes():
     for route in ("outside", "axis"):
-        (loop,) = validate_loops(shapes.coil(5, 200, route=route))
+        (loop,) = validate_loops(example_curves.coil(5, 200, route=route))
         assert len(loop) == 200
         x, y, z = loop[:198].T
         turned = np.unwrap(np.arctan2(y, x))
         assert turned[-1] - turned[0] == pytest.approx(10.0 * np.pi)
         assert np.ptp(z) == pytest.approx(1.0)
-        clearance = edge_distances(shapes.coil(3, 40, route=route))
+        clearance = edge_distances(example_curves.coil(3, 40, route=route))
         assert clearance.min() > 0.1
 
 
 def test_the_holes_of_the_square_run_the_other_way():
-    outer, *holes = shapes.square_with_holes()
+    outer, *holes = example_curves.square_with_holes()
 
     def area(loop):
         return 0.5 * np.cross(loop, np.roll(loop, -1, axis=0))[:, 2].sum()
@@ -343,14 +351,14 @@ def test_the_holes_of_the_square_run_the_other_way():
 @pytest.mark.parametrize(
     "curve",
     [
-        shapes.torus_knot(3, 5, 90),
-        shapes.figure_eight_knot(60),
-        shapes.hopf_link(9),
-        shapes.borromean_rings(12),
-        shapes.square_with_holes(),
-        shapes.random_closed_curve(np.random.default_rng(0), 50),
-        shapes.spiky_polygon(np.random.default_rng(0), 21),
-        shapes.coil(1, 6),
+        example_curves.torus_knot(3, 5, 90),
+        example_curves.figure_eight_knot(60),
+        example_curves.hopf_link(9),
+        example_curves.borromean_rings(12),
+        example_curves.square_with_holes(),
+        example_curves.random_closed_curve(np.random.default_rng(0), 50),
+        example_curves.spiky_polygon(np.random.default_rng(0), 21),
+        example_curves.coil(1, 6),
     ],
 )
 def test_every_shape_is_a_valid_curve_of_size_about_one(curve):
@@ -360,7 +368,7 @@ def test_every_shape_is_a_valid_curve_of_size_about_one(curve):
 
 
 def test_random_shapes_repeat_with_their_generator():
-    for make in (shapes.random_closed_curve, shapes.spiky_polygon):
+    for make in (example_curves.random_closed_curve, example_curves.spiky_polygon):
         one, two = (make(np.random.default_rng(4), 20) for _ in range(2))
         np.testing.assert_array_equal(one, two)
 
@@ -368,13 +376,13 @@ def test_random_shapes_repeat_with_their_generator():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: shapes.regular_polygon(2), "at least 3 vertices"),
-        (lambda: shapes.torus_knot(2, 4, 30), "no common divisor"),
-        (lambda: shapes.coil(0, 30), "at least one turn"),
-        (lambda: shapes.coil(5, 10), "at least 18 vertices"),
-        (lambda: shapes.coil(2, 30, route="inside"), '"outside" or "axis"'),
+        (lambda: example_curves.regular_polygon(2), "at least 3 vertices"),
+        (lambda: example_curves.torus_knot(2, 4, 30), "no common divisor"),
+        (lambda: example_curves.coil(0, 30), "at least one turn"),
+        (lambda: example_curves.coil(5, 10), "at least 18 vertices"),
+        (lambda: example_curves.coil(2, 30, route="inside"), '"outside" or "axis"'),
         (
-            lambda: shapes.random_closed_curve(np.random.default_rng(0), 9, harmonics=0),
+            lambda: example_curves.random_closed_curve(np.random.default_rng(0), 9, harmonics=0),
             "at least one harmonic",
         ),
     ],

@@ -20,11 +20,11 @@ import harnack as hk
 from harnack import geometry
 from harnack.backend import choose_backend
 from harnack.enclosures import Enclosure, Promise
-from harnack.geometry import shapes
+from harnack.geometry import example_curves
 from harnack.geometry.volume import Volume
 
 DOUBLE = choose_backend("double")
-LOOP = shapes.wavy_polygon(12)
+LOOP = example_curves.wavy_polygon(12)
 POINTS = 0.3 * np.random.default_rng(0).normal(size=(4, 3))
 
 

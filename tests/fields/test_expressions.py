@@ -12,7 +12,7 @@ import pytest
 
 import harnack as hk
 from harnack.testing import BrokenPromiseError, check_field, check_looks
-from harnack.testing.worst_places import scaled
+from harnack.testing.violation_search import scaled
 
 POINTS = np.random.default_rng(2).uniform(-0.9, 0.9, (200, 3))
 

@@ -10,9 +10,9 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.fields.points import in_batches
-from harnack.geometry.mesh_shapes import icosphere
-from harnack.geometry.shapes import wavy_polygon
+from harnack.fields.batch_evaluation import in_batches
+from harnack.geometry.example_curves import wavy_polygon
+from harnack.geometry.example_meshes import icosphere
 
 VERTICES, FACES = icosphere(1)
 FIELDS: dict[str, hk.Field] = {

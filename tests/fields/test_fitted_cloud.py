@@ -11,7 +11,7 @@ import pytest
 
 import harnack as hk
 from harnack.cli import main
-from harnack.fields.solid_angles import fitted_cloud
+from harnack.fields.solid_angles import denoised_cloud
 from harnack.geometry.clouds import CloudError
 
 
@@ -69,7 +69,7 @@ def test_normals_that_are_turned_wrongly_are_turned_back(monkeypatch: pytest.Mon
         del points
         return wrong
 
-    monkeypatch.setattr(fitted_cloud, "estimate_normals", estimated)
+    monkeypatch.setattr(denoised_cloud, "estimate_normals", estimated)
     field = hk.DipolePotential(points, "estimate", smoothing="auto")
     assert (np.einsum("ij,ij->i", field.normals, normals) > 0.7).all()
 

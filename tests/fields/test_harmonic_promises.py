@@ -24,8 +24,8 @@ from harnack.fields.analytic.sphere_bounds import (
     order_on_axis,
     value_bound,
 )
-from harnack.testing.bound_contracts import Case
-from harnack.testing.worst_places import look_at
+from harnack.testing.enclosure_contracts import Case
+from harnack.testing.violation_search import look_at
 from tests.oracles.step_contracts import check_steps
 
 SINGLE, DOUBLE = choose_backend("single"), choose_backend("double")

@@ -13,7 +13,7 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.geometry import shapes
+from harnack.geometry import example_curves
 from harnack.geometry.polygons import uncanceled_edges
 from harnack.testing import BrokenPromiseError, check_field
 
@@ -29,9 +29,9 @@ MANY_TERMS = hk.EigenfunctionSum(
 )
 FIELDS: dict[str, hk.Field] = {
     "triangle": hk.SolidAngle([[0, 0, 0], [1, 0, 0], [0, 1, 0.4]]),
-    "wavy": hk.SolidAngle(shapes.wavy_polygon(24)),
-    "large trefoil": hk.SolidAngle(300 * shapes.torus_knot(2, 3, 61) + 100),
-    "holes": hk.SolidAngle(shapes.square_with_holes(12)),
+    "wavy": hk.SolidAngle(example_curves.wavy_polygon(24)),
+    "large trefoil": hk.SolidAngle(300 * example_curves.torus_knot(2, 3, 61) + 100),
+    "holes": hk.SolidAngle(example_curves.square_with_holes(12)),
     "Y 0,0 + x": hk.HarmonicPolynomial({(0, 0, 0): 1.0, (1, 0, 0): 2.0}),
     "Y 12,-7": hk.SphericalHarmonic(12, -7, radius=2.0),
     "polynomial": hk.HarmonicPolynomial(
@@ -294,7 +294,7 @@ def test_check_field_sees_a_wrong_hessian_where_there_may_be_creases() -> None:
 
 
 def test_closest_point_of_the_curve() -> None:
-    field = hk.SolidAngle(10 * shapes.wavy_polygon(12) + 7)
+    field = hk.SolidAngle(10 * example_curves.wavy_polygon(12) + 7)
     x = np.random.default_rng(5).uniform(-10, 25, (200, 3))
     (loop,) = field.loops
     share = np.linspace(0, 1, 2001)[:, None, None]

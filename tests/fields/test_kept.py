@@ -14,7 +14,7 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend, to_vector3
-from harnack.geometry.mesh_shapes import icosphere
+from harnack.geometry.example_meshes import icosphere
 from harnack.rendering import Camera, register
 
 register()

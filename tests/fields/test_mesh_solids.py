@@ -13,7 +13,7 @@ import harnack as hk
 from harnack.arithmetic import Jet
 from harnack.backend import choose_backend, to_numpy
 from harnack.fields.solids.mesh_solid import MeshSolid
-from harnack.geometry import MeshError, mesh_shapes
+from harnack.geometry import MeshError, example_meshes
 from harnack.testing import check_field
 from tests.fields.test_shapes import SPIKES
 from tests.oracles.direct_sums import winding_sum
@@ -30,7 +30,7 @@ STAR = (
         [[0, 1, 2], [0, 3, 1], [1, 3, 2], [0, 2, 3], [4, 6, 5], [4, 5, 7], [5, 6, 7], [4, 7, 6]]
     ),
 )
-BUMPY = mesh_shapes.bumpy_sphere(3)
+BUMPY = example_meshes.bumpy_sphere(3)
 
 
 @pytest.mark.parametrize("precision", ["single", "double"])

@@ -15,9 +15,9 @@ import harnack as hk
 from harnack.backend import choose_backend, to_float, to_numpy
 from harnack.enclosures import Curvature, HarmonicBall
 from harnack.fields.solid_angles.morph_slice import GRADIENT, SlicedKernel, centroids
-from harnack.geometry.mesh_shapes import bumpy_sphere, icosphere, remove_faces, torus_mesh
+from harnack.geometry.example_meshes import bumpy_sphere, icosphere, remove_faces, torus_mesh
 from harnack.geometry.meshes import MeshError
-from harnack.testing.worst_places import look_at, random_directions
+from harnack.testing.violation_search import look_at, random_directions
 from tests.backend.test_kernels import compiled
 from tests.oracles.direct_sums import sliced_sum
 from tests.oracles.oracle import OracleValues, first_crossings

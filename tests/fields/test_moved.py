@@ -12,7 +12,7 @@ import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.fields.solid_angles import winding_mesh
 from harnack.geometry import MeshError
-from harnack.geometry.mesh_shapes import bumpy_sphere, remove_faces
+from harnack.geometry.example_meshes import bumpy_sphere, remove_faces
 
 VERTICES, FACES = bumpy_sphere(3)
 FACES = remove_faces(FACES, 0.1, 0)

@@ -18,7 +18,6 @@ from hypothesis import strategies as st
 
 from harnack.backend import choose_backend, to_numpy
 from harnack.fields.solid_angles import multipole
-from harnack.fields.solid_angles.far_clusters import far_terms, node_columns
 from harnack.fields.solid_angles.multipole import (
     NodeMoments,
     all_levels,
@@ -28,7 +27,8 @@ from harnack.fields.solid_angles.multipole import (
     triangle_rule,
     truncation,
 )
-from harnack.fields.sums import longest_part
+from harnack.fields.solid_angles.treecode import far_terms, node_columns
+from harnack.fields.source_sums import longest_part
 from harnack.tree import Hierarchy, build_hierarchy
 
 ORDERS = [0, 1, 2]

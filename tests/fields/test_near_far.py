@@ -17,8 +17,8 @@ import pytest
 
 import harnack as hk
 from harnack.backend import Precision, choose_backend, to_numpy, to_vector3
-from harnack.fields.solid_angles import dipole, near_far
-from harnack.fields.solid_angles.far_sums import COEFFICIENTS, DEGREE
+from harnack.fields.solid_angles import dipole, dipole_cells
+from harnack.fields.solid_angles.dipole_expansion import COEFFICIENTS, DEGREE
 from harnack.fields.solid_angles.local_expansion import (
     _Sizes,  # pyright: ignore[reportPrivateUsage]
     irregular,
@@ -30,7 +30,7 @@ from harnack.fields.solid_angles.local_expansion import (
     value_and_gradient,
 )
 from harnack.fields.solid_angles.multipole import of_dipole, regular
-from harnack.geometry import shapes
+from harnack.geometry import example_curves
 from harnack.testing import check_field
 from tests.oracles.direct_sums import dipole_sum
 from tests.tracer.test_cloud_hits import Cloud, cloud, rays, unit
@@ -97,7 +97,7 @@ def test_the_tail_of_a_dipole_is_bounded_and_attained(q: float) -> None:
 
 def test_rounding_of_expansions_is_below_what_is_counted() -> None:
     """`far_sums._Expanded.of`: the sums of absolute values, all coordinates as large as can be."""
-    q = 1 / near_far._NEAR
+    q = 1 / dipole_cells._NEAR
     ones = [_Sizes(np.array(1.0))] * 3
     for largest in (1, 2, 3, 4):
         seen = irregular(*ones, _Sizes(np.array(1.0)), DEGREE + largest)
@@ -154,7 +154,7 @@ def test_errors_are_attained(part: float, monkeypatch: pytest.MonkeyPatch) -> No
     """Half the error would be too little, at corners of cells towards a dipole that just misses
     being near, and half way from there to the center: with a dipole alone and in double precision,
     so that all error is truncation."""
-    monkeypatch.setattr(near_far, "_MOST_NEAR", 0)
+    monkeypatch.setattr(dipole_cells, "_MOST_NEAR", 0)
     point, normal = np.full((1, 3), 0.3), unit(np.ones((1, 3)))
     field = hk.DipolePotential(point, normal, [1.0], cells=True)
     prepared = field.prepare(choose_backend("double"))
@@ -177,7 +177,7 @@ def test_errors_are_attained(part: float, monkeypatch: pytest.MonkeyPatch) -> No
 def test_the_bound_of_bending_is_attained(monkeypatch: pytest.MonkeyPatch) -> None:
     """Steps in cells are proved by `FieldSums.s4`. Of a dipole alone it is exact at the centers of
     the cells that take it into account themselves: a thousandth less would be too little."""
-    monkeypatch.setattr(near_far, "_MOST_NEAR", 0)
+    monkeypatch.setattr(dipole_cells, "_MOST_NEAR", 0)
     point = np.full((1, 3), 0.3)
     field = hk.DipolePotential(point, unit(np.ones((1, 3))), [1.0], cells=True)
     on = field.prepare(choose_backend("double"))._device
@@ -280,7 +280,7 @@ def test_memory_is_bounded_and_stated() -> None:
 def test_solids_tell_their_parts_how_many_rays_there_will_be() -> None:
     """Parts of solids had no cells, however many rays there were."""
     points, normals, areas = cloud(300)
-    curve = hk.SolidAngle(shapes.torus_knot(2, 3, 60))
+    curve = hk.SolidAngle(example_curves.torus_knot(2, 3, 60))
     knot = hk.solid(curve, around=(2 * math.pi, 0.4))
     inside = hk.solid(hk.DipolePotential(points, normals, areas), above=2 * math.pi)
     solid = (inside.scaled(2.0) - knot.moved((1.0, 0, 0))).grown(0.01)
@@ -351,7 +351,7 @@ def test_many_rays_get_cells_by_themselves(monkeypatch: pytest.MonkeyPatch) -> N
 def test_cells_do_not_depend_on_how_many_are_made_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     tables: list[np.ndarray] = []
     for at_once in (1 << 14, 37):
-        monkeypatch.setattr(near_far, "_AT_ONCE", at_once)
+        monkeypatch.setattr(dipole_cells, "_AT_ONCE", at_once)
         field = hk.DipolePotential(*cloud(300), cells=True)
         on = field.prepare(choose_backend("double"))._device
         assert on is not None

@@ -13,9 +13,9 @@ import pytest
 
 import harnack as hk
 from harnack.enclosures import Curvature, HarmonicBall, Lipschitz, choose_proofs
-from harnack.enclosures.proofs import BOUNDS
+from harnack.enclosures.selection import BOUNDS
 from harnack.fields import Field, Sample
-from harnack.geometry import shapes
+from harnack.geometry import example_curves
 from harnack.testing import BrokenPromiseError, check_field
 
 RAY = (np.array([[0.0, 0.0, 3.0]]), np.array([[0.0, 0.0, -1.0]]))
@@ -198,7 +198,7 @@ class Charge(Field):
 @pytest.mark.parametrize(
     ("field", "bound", "some"),
     [
-        (hk.SolidAngle(shapes.wavy_polygon(20)), "lipschitz", {"curvature", "caps"}),
+        (hk.SolidAngle(example_curves.wavy_polygon(20)), "lipschitz", {"curvature", "caps"}),
         (Bell(bent, 1.0, 2.0), "caps", {"curvature"}),
         (Charge(), "lipschitz", {"slope", "classic"}),
     ],

@@ -13,14 +13,14 @@ import pytest
 
 import harnack as hk
 from harnack.backend import Backend, backend_of, choose_backend, to_numpy, to_vector3
-from harnack.backend.numbers import FloatArray
-from harnack.fields.sheets import NO_SHEET
-from harnack.geometry.mesh_shapes import bumpy_sphere, icosphere
+from harnack.backend.validation import FloatArray
+from harnack.fields.capabilities import NO_SHEET
+from harnack.geometry.example_meshes import bumpy_sphere, icosphere
 from harnack.geometry.meshes import MeshError
 from harnack.geometry.polygon_meshes import polygon_patches
 from harnack.rendering import Camera
 from harnack.testing import check_field
-from harnack.tree.nearest import NO_BOX, BoxTree
+from harnack.tree.closest_triangles import NO_BOX, BoxTree
 from tests.backend.test_kernels import compiled
 
 PRECISIONS = ("single", "double")

@@ -13,7 +13,6 @@ from scipy.special import eval_legendre, spherical_in, spherical_kn
 import harnack as hk
 from harnack.backend import choose_backend, to_float, to_numpy, to_vector3
 from harnack.enclosures import Curvature, HarmonicBall
-from harnack.fields.solid_angles.far_clusters import dipole_rows
 from harnack.fields.solid_angles.radial_kernel import seen_dipole
 from harnack.fields.solid_angles.radial_tree import (
     ClusterMoments,
@@ -27,11 +26,12 @@ from harnack.fields.solid_angles.screened import (
     accepting_distance,
     thetas,
 )
-from harnack.geometry import mesh_shapes
+from harnack.fields.solid_angles.treecode import dipole_rows
+from harnack.geometry import example_meshes
 from harnack.geometry.clouds import CloudError
 from harnack.geometry.meshes import MeshError
 from harnack.testing import check_field
-from harnack.testing.worst_places import look_at, random_directions
+from harnack.testing.violation_search import look_at, random_directions
 from harnack.tree import build_hierarchy
 from tests.oracles.oracle import OracleValues, first_crossings
 
@@ -436,7 +436,7 @@ def test_extension_to_four_dimensions_stays_in_the_ball_range(name: str) -> None
 def test_dense_sphere_is_one_minus_the_blurred_inside() -> None:
     """w = 1 - u inside, -u outside, (1 - l^2 Laplacian) u = 1 inside: for a sphere in closed form,
     and the default level is the mean of the two limits."""
-    vertices, faces = mesh_shapes.icosphere(4)
+    vertices, faces = example_meshes.icosphere(4)
     for length in (0.25, 1.0, 20.0):
         field = ScreenedWindingNumber.of_mesh(vertices, faces, length=length)
         k = 1 / length
@@ -452,7 +452,7 @@ def test_dense_sphere_is_one_minus_the_blurred_inside() -> None:
 
 
 def test_winding_number_is_the_limit() -> None:
-    vertices, faces = mesh_shapes.torus_mesh(1.0, 0.4, 60, 30)
+    vertices, faces = example_meshes.torus_mesh(1.0, 0.4, 60, 30)
     field = ScreenedWindingNumber.of_mesh(vertices, faces, length=1e6)
     assert field.default_level == pytest.approx(0.5, abs=0.02)
     x = np.array([[1.0, 0, 0], [0, -1, 0.1], [0, 0, 0], [2, 0, 0]])
@@ -618,7 +618,7 @@ def test_bad_input() -> None:
         ScreenedWindingNumber(points, normals[:5], areas, length=1.0)
     with pytest.raises(CloudError, match="area"):
         ScreenedWindingNumber(points, normals, -areas, length=1.0)
-    vertices, faces = mesh_shapes.icosphere(0)
+    vertices, faces = example_meshes.icosphere(0)
     with pytest.raises(ValueError, match="subdivide must lie"):
         ScreenedWindingNumber.of_mesh(vertices, faces, length=1.0, subdivide=-1)
     with pytest.raises(MeshError, match="out of range"):

@@ -16,13 +16,13 @@ from harnack.arithmetic.norms import blend_intersection, blend_union
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.backend.elementary import length
 from harnack.enclosures import Gaps, choose_proofs
-from harnack.enclosures.proofs import longest_step
+from harnack.enclosures.selection import longest_step
 from harnack.fields.formula import Formula
-from harnack.fields.look import Path, value_error
+from harnack.fields.samples import Path, value_error
 from harnack.fields.solids.fractal import CORNERS, lattice_vector
-from harnack.geometry import mesh_shapes
+from harnack.geometry import example_meshes
 from harnack.meshing.closed_mesh import manifold_of, surface_of
-from harnack.meshing.lattice_surface import Surface
+from harnack.meshing.lattice_meshing import Surface
 from harnack.testing import check_field
 from tests.oracles.mesh_distance import signed_distance
 
@@ -148,7 +148,7 @@ STAR = (0.8 + 0.25 * np.cos(5 * TURN))[:, None] * np.column_stack([np.cos(TURN),
 LOOPS = [STAR, [[-0.4, -0.3], [0.45, -0.3], [0.3, 0.4]], [[0.0, -0.2], [0.25, -0.2], [0.2, 0.1]]]
 CUP = [[0.0, -0.6], [0.5, -0.6], [0.9, 0.6], [0.8, 0.65], [0.4, -0.4], [0.0, -0.4]]
 
-SPIKES = mesh_shapes.icosphere(0)
+SPIKES = example_meshes.icosphere(0)
 SPIKES = SPIKES[0] * np.where(np.arange(12) % 3, 1.0, 0.4)[:, None], SPIKES[1]
 # Two tetrahedra through each other, as one mesh; and the surface of their union.
 CORNERS_OF_FOUR = np.array([[0, 0, 0.9], [0.9, 0.1, -0.5], [-0.5, 0.8, -0.4], [-0.4, -0.8, -0.5]])

@@ -128,7 +128,7 @@ def test_normals_that_cancel_each_other_have_no_level() -> None:
 
 def test_smoothing_that_makes_a_blob_is_told_of() -> None:
     """Of a flat ellipsoid: smoothing as long as a cloud is wide was silent."""
-    points, _ = hk.geometry.mesh_shapes.icosphere(3)
+    points, _ = hk.geometry.example_meshes.icosphere(3)
     normals = points / (2.0, 1.0, 0.2)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     cloud = points * (2.0, 1.0, 0.2)

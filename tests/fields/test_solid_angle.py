@@ -12,24 +12,24 @@ import pytest
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.enclosures import choose_proofs
-from harnack.fields.look import Path
-from harnack.geometry import shapes, validate_loops
+from harnack.fields.samples import Path
+from harnack.geometry import example_curves, validate_loops
 from harnack.geometry.polygons import net_loops
 from tests.oracles.oracle import CurveOracle, first_crossings, gap_to_levels
 
 FOUR_PI = 4 * math.pi
 CURVES: dict[str, list[np.ndarray]] = {
     "triangle": [np.array([[1.0, 0, 0], [-0.5, 0.8, 0.1], [-0.4, -0.9, 0.3]])],
-    "square": [shapes.regular_polygon(4)],
-    "wavy": [shapes.wavy_polygon(12)],
-    "wavy, padded": [shapes.wavy_polygon(50)],
-    "fine": [shapes.wavy_polygon(1000)],
-    "trefoil": [shapes.torus_knot(2, 3, 60)],
-    "coil": [shapes.coil(6, 150)],
-    "link": shapes.hopf_link(20),
-    "holes": shapes.square_with_holes(),
-    "rings": shapes.borromean_rings(17),
-    "spiky": [shapes.spiky_polygon(np.random.default_rng(0), 21)],
+    "square": [example_curves.regular_polygon(4)],
+    "wavy": [example_curves.wavy_polygon(12)],
+    "wavy, padded": [example_curves.wavy_polygon(50)],
+    "fine": [example_curves.wavy_polygon(1000)],
+    "trefoil": [example_curves.torus_knot(2, 3, 60)],
+    "coil": [example_curves.coil(6, 150)],
+    "link": example_curves.hopf_link(20),
+    "holes": example_curves.square_with_holes(),
+    "rings": example_curves.borromean_rings(17),
+    "spiky": [example_curves.spiky_polygon(np.random.default_rng(0), 21)],
 }
 PRECISIONS = ["double", "single"]
 
@@ -182,13 +182,15 @@ def test_loops_add_up_and_reversal_changes_the_sign() -> None:
 def test_sign_and_size_above_a_disk() -> None:
     """A counter-clockwise circle seen from above: Omega = 2 pi (1 - z/sqrt(z^2+1)), sign of the
     paper's Eq. 10."""
-    field = hk.SolidAngle(shapes.regular_polygon(512))
+    field = hk.SolidAngle(example_curves.regular_polygon(512))
     z = np.array([0.5, 1.0, 3.0])
     x = to_vector3(choose_backend("double"), np.column_stack([0 * z, 0 * z, z]))
     value = to_numpy(field.evaluate(x).value)
     expected = 2 * math.pi * (1 - z / np.sqrt(z * z + 1))
     np.testing.assert_allclose(np.abs(value), expected, rtol=1e-4)
-    oracle = CurveOracle([shapes.regular_polygon(512)])(np.column_stack([0 * z, 0 * z, z])).value
+    oracle = CurveOracle([example_curves.regular_polygon(512)])(
+        np.column_stack([0 * z, 0 * z, z])
+    ).value
     np.testing.assert_allclose(value, oracle, rtol=1e-12)
 
 
@@ -288,7 +290,7 @@ def aimed_at(loops: list[np.ndarray], n: int) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_a_tiny_edge_hides_no_hits(precision: str) -> None:
     """A ring run through twice: its 2 pi level lies far outside of its flat hull."""
-    ring = np.tile(shapes.regular_polygon(20), (2, 1))
+    ring = np.tile(example_curves.regular_polygon(20), (2, 1))
     ring -= ring[0]
     o, d = aimed_at([ring], 1200)
     plain = hk.trace(hk.SolidAngle(ring), o, d, precision=precision)
@@ -353,7 +355,7 @@ def test_edges_run_both_ways_are_not_there(name: str, precision: str) -> None:
 
 
 def test_parts_that_cancel_are_left_out() -> None:
-    square = shapes.regular_polygon(4)
+    square = example_curves.regular_polygon(4)
     assert hk.SolidAngle(HALVES).describe()["canceled edges"] == 2
     assert hk.SolidAngle(square).describe()["canceled edges"] == 0
     # What is run twice the same way counts twice.
@@ -583,7 +585,7 @@ def test_curves_far_from_the_origin_can_be_traced(name: str) -> None:
 @pytest.mark.parametrize("scale", [1.0, 1e30, 9e99])
 @pytest.mark.parametrize("level", [1.0, 2 * math.pi, 3.0])
 def test_extents_at_any_scale_are_found_without_warnings(scale: float, level: float) -> None:
-    x = shapes.wavy_polygon(12)
+    x = example_curves.wavy_polygon(12)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         found, plain = (hk.SolidAngle(s * x).extent((level,)) for s in (scale, 1.0))

@@ -12,10 +12,10 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.fields.solid_angles import near_far, winding_number
-from harnack.fields.solid_angles.far_sums import triangle_sources
-from harnack.fields.solid_angles.near_far import NearFarCells
-from harnack.geometry.mesh_shapes import bumpy_sphere, icosphere, remove_faces
+from harnack.fields.solid_angles import dipole_cells, winding_number
+from harnack.fields.solid_angles.dipole_cells import NearFarCells
+from harnack.fields.solid_angles.dipole_expansion import triangle_sources
+from harnack.geometry.example_meshes import bumpy_sphere, icosphere, remove_faces
 from tests.fields.test_winding import (
     Mesh,
     check_first_hits,
@@ -72,9 +72,9 @@ MESHES = {
 def test_samples_are_within_their_errors(
     kind: str, precision: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(near_far, "_PART", 1.0)
+    monkeypatch.setattr(dipole_cells, "_PART", 1.0)
     if kind == "large":  # near them are leaves whose balls are not
-        monkeypatch.setattr(near_far, "_MOST_NEAR", 24)
+        monkeypatch.setattr(dipole_cells, "_MOST_NEAR", 24)
     mesh, backend = MESHES[kind], choose_backend(precision)
     field = soup(mesh).prepare(backend)
     cells = cells_of(field)
@@ -100,7 +100,7 @@ def test_samples_are_within_their_errors(
 def test_errors_are_attained(monkeypatch: pytest.MonkeyPatch) -> None:
     """Half the error would be too little: at corners of the cells around one triangle, of a
     large and a small one that are far from them."""
-    monkeypatch.setattr(near_far, "_MOST_NEAR", 1)
+    monkeypatch.setattr(dipole_cells, "_MOST_NEAR", 1)
     small = np.array([[0.0, 0, 0], [0.02, 0, 0], [0, 0.02, 0]])
     large = np.array([[0.0, 0, 0], [0.2, 0, 0.1], [0, 0.25, 0]])
     corners = np.stack([small, small + 0.5, large + np.array([0.6, -0.6, 0.6])])
@@ -121,7 +121,7 @@ def test_errors_are_attained(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_bound_of_bending_is_attained(monkeypatch: pytest.MonkeyPatch) -> None:
     """Steps in cells are proved by `FieldSums.s4`. Beside a tiny triangle it is nearly exact at the
     centers of cells: a thousandth less would be too little."""
-    monkeypatch.setattr(near_far, "_MOST_NEAR", 0)
+    monkeypatch.setattr(dipole_cells, "_MOST_NEAR", 0)
     tiny = 1e-6 * np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
     places = np.array([[0.3, 0.3, 0.3], [1.0, -1.0, 1.0], [-1.0, 1.0, -1.0]])
     corners = tiny + places[:, None]
@@ -296,7 +296,7 @@ def test_values_by_cells_are_within_their_bounds(
 ) -> None:
     """In cells and outside of their cube, at points anywhere and close to triangles; those of a
     mesh with holes stay what they were."""
-    monkeypatch.setattr(near_far, "_PART", 1.0)
+    monkeypatch.setattr(dipole_cells, "_PART", 1.0)
     mesh = MESHES["torn"]
     field, plain, x = soup(mesh), soup(mesh, False), places(mesh, 3000, 1e-4)
     x[-100:] *= 5

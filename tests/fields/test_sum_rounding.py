@@ -8,7 +8,7 @@ import numpy as np
 import harnack as hk
 from harnack.backend import choose_backend
 from harnack.fields.solid_angles.edge_lift import FACTOR_ROUNDINGS, LiftedProduct
-from harnack.fields.sums import FieldSums, Terms
+from harnack.fields.source_sums import FieldSums, Terms
 
 UNIT = 2.0**-24  # the largest relative error of one operation
 

@@ -14,7 +14,7 @@ from harnack.backend import choose_backend, to_numpy
 from harnack.backend.elementary import largest_angle, sincos
 from harnack.enclosures import Curvature
 from harnack.fields.analytic.waves import PlaneWave, Product, cosine, sine
-from harnack.testing.worst_places import look_at
+from harnack.testing.violation_search import look_at
 
 UNIT = 2.0**-24
 

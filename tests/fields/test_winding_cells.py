@@ -13,9 +13,9 @@ import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.enclosures import Lipschitz, TargetLevels, choose_proofs
 from harnack.fields import Sample
-from harnack.fields.look import Path
-from harnack.geometry.mesh_shapes import bumpy_sphere, icosphere, remove_faces
-from harnack.tracer.whole_numbers import WholeNumbers
+from harnack.fields.samples import Path
+from harnack.geometry.example_meshes import bumpy_sphere, icosphere, remove_faces
+from harnack.tracer.branch_tracker import WholeNumbers
 from tests.fields.test_winding import (
     KINDS,
     Mesh,

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from harnack.files.file_format import FileFormatError
-from harnack.files.surfaces import Cloud, read_surface
+from harnack.files.file_geometry import FileFormatError
+from harnack.files.geometry_files import Cloud, read_surface
 
 POINTS = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
 THREE = POINTS + "f 1 3 2\nf 1 2 4\nf 2 3 4\n"

@@ -12,10 +12,10 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from harnack.files import file_format
-from harnack.files.file_format import FileFormatError, check_writable, write_atomically
-from harnack.files.surfaces import read_loops
-from harnack.geometry import chains, shapes
+from harnack.files import file_geometry
+from harnack.files.file_geometry import FileFormatError, check_writable, write_atomically
+from harnack.files.geometry_files import read_loops
+from harnack.geometry import boundary_edges, example_curves
 
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
 CORNERS = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
@@ -69,7 +69,7 @@ def test_obj_of_several_loops(save):
 
 
 def test_obj_segments_of_two_curves_are_told_apart(save):
-    curves = shapes.hopf_link(8)
+    curves = example_curves.hopf_link(8)
     x = np.concatenate(curves)
     segments = [(k, (k + 1) % 8) for k in range(8)] + [(8 + k, 8 + (k + 1) % 8) for k in range(8)]
     order = np.random.default_rng(0).permutation(16)
@@ -308,7 +308,7 @@ def test_what_is_not_a_file_is_said(tmp_path):
 def test_a_file_above_the_limit_is_not_read(tmp_path):
     path = tmp_path / "sparse.ply"
     with path.open("wb") as file:
-        file.truncate(file_format.MAX_BYTES + 1)
+        file.truncate(file_geometry.MAX_BYTES + 1)
     with pytest.raises(FileFormatError, match="bytes are too many"):
         read_loops(path)
 
@@ -370,8 +370,8 @@ def test_a_damaged_file_is_read_or_refused_but_nothing_else(save, seed, edits, c
     )
 )
 def test_boundary_edges_join_to_loops_that_use_each_once(faces):
-    remaining = chains.boundary_edges(faces)
-    loops = chains.join(remaining)
+    remaining = boundary_edges.boundary_edges(faces)
+    loops = boundary_edges.join(remaining)
     used = [(a, b) for loop in loops for a, b in zip(loop, loop[1:] + loop[:1], strict=True)]
     assert sorted(used) == sorted(remaining)
     assert all(len(set(loop)) == len(loop) for loop in loops)
@@ -465,7 +465,7 @@ def test_what_the_system_refuses_is_said_before_the_work(tmp_path, monkeypatch, 
     def refused(*_, **__):
         raise OSError(number, os.strerror(number), str(tmp_path))
 
-    monkeypatch.setattr("harnack.files.file_format.tempfile.TemporaryFile", refused)
+    monkeypatch.setattr("harnack.files.file_geometry.tempfile.TemporaryFile", refused)
     with pytest.raises(OSError, match=f"cannot write .*a.png: {advice}") as caught:
         check_writable(tmp_path / "a.png")
     assert caught.value.errno == number

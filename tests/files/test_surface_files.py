@@ -18,10 +18,10 @@ from harnack.field_from_file import open_surface
 from harnack.fields.solid_angles.polygon_mesh import PolygonMesh
 from harnack.files import gltf
 from harnack.files import ply as ply_files
-from harnack.files.file_format import FileFormatError
-from harnack.files.surfaces import ClosedCurves, Cloud, Mesh, read_surface
-from harnack.geometry.chains import singular_edges, weld_vertices
-from harnack.geometry.mesh_shapes import icosphere, remove_faces, torus_mesh
+from harnack.files.file_geometry import FileFormatError
+from harnack.files.geometry_files import ClosedCurves, Cloud, Mesh, read_surface
+from harnack.geometry.boundary_edges import singular_edges, weld_vertices
+from harnack.geometry.example_meshes import icosphere, remove_faces, torus_mesh
 from harnack.geometry.polygons import triangulate
 
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
@@ -600,7 +600,7 @@ def test_files_of_many_irregular_elements_take_neither_all_memory_nor_minutes(
     save, monkeypatch, name, content
 ):
     if name == "a.obj":
-        monkeypatch.setattr("harnack.files.file_format.MAX_ELEMENTS", 500)
+        monkeypatch.setattr("harnack.files.file_geometry.MAX_ELEMENTS", 500)
     with pytest.raises(FileFormatError, match=r"elements are too many .* let the program"):
         read_surface(save(name, content))
 

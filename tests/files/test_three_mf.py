@@ -12,8 +12,8 @@ import trimesh
 
 import harnack as hk
 from harnack.cli.mesh_files import MESH_FILES, write_mesh
-from harnack.files.file_format import FileFormatError
-from harnack.files.surfaces import Mesh, read_surface
+from harnack.files.file_geometry import FileFormatError
+from harnack.files.geometry_files import Mesh, read_surface
 
 
 @pytest.mark.parametrize("kind", MESH_FILES)

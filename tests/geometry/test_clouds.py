@@ -9,7 +9,7 @@ from scipy.spatial import Voronoi
 import harnack as hk
 from harnack.geometry import clouds
 from harnack.geometry.clouds import CloudError, estimate_areas, estimate_normals, validate_cloud
-from harnack.geometry.mesh_shapes import icosphere
+from harnack.geometry.example_meshes import icosphere
 
 POINTS = [[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]
 UP = [[0.0, 0, 1]] * 3
@@ -326,7 +326,7 @@ def test_a_moved_cloud_is_the_cloud_that_is_there(motion, monkeypatch):
         "shuffled": u[np.random.default_rng(1).permutation(len(u))],
     }[motion]
     monkeypatch.setattr(
-        "harnack.fields.solid_angles.far_clusters.build_hierarchy", None
+        "harnack.fields.solid_angles.treecode.build_hierarchy", None
     )  # no sort again
     moved = field.moved(x, x, areas)
     points = np.random.default_rng(2).uniform(-1.5, 1.5, (800, 3))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from harnack.geometry import CurveError, smooth_curve
-from harnack.geometry.shapes import regular_polygon
+from harnack.geometry.example_curves import regular_polygon
 
 TURN = 2 * np.pi * np.arange(10) / 10
 POINTS = np.column_stack([np.cos(TURN), 1.4 * np.sin(TURN), np.cos(3 * TURN)])

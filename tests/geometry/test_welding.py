@@ -10,7 +10,7 @@ import trimesh
 
 import harnack as hk
 from harnack.files import read_surface
-from harnack.geometry.mesh_shapes import icosphere
+from harnack.geometry.example_meshes import icosphere
 from harnack.geometry.welding import Welded, rounding_of
 
 FloatArray = np.ndarray

@@ -12,7 +12,7 @@ import pytest
 import harnack as hk
 from harnack.cli import main
 from harnack.geometry.clouds import CloudError, estimate_normals
-from harnack.geometry.mesh_shapes import torus_mesh
+from harnack.geometry.example_meshes import torus_mesh
 
 
 def sphere(count: int, noise: float = 0.0) -> tuple[np.ndarray, np.ndarray]:

@@ -12,26 +12,26 @@ from scipy.spatial import Delaunay
 from scipy.spatial.transform import Rotation
 
 import harnack as hk
-from harnack.geometry import shapes
+from harnack.geometry import example_curves
 from harnack.meshing import checks
 from harnack.meshing.checks import intersecting_faces
-from harnack.meshing.relaxation import least_angles, relaxed
-from harnack.meshing.samples import LevelFunction
+from harnack.meshing.level_function import LevelFunction
+from harnack.meshing.mesh_improvement import least_angles, relaxed
 from tests.oracles.oracle import CurveOracle
 from tests.oracles.triangle_pairs import intersecting_pairs
 
 PERIOD = 4 * math.pi
 # Curves with their Euler characteristic at level 2 pi.
 CURVES: dict[str, tuple[Any, int]] = {
-    "wavy": (shapes.wavy_polygon(64), 1),
-    "trefoil": (shapes.torus_knot(2, 3, 96), -1),
-    "Hopf link": (shapes.hopf_link(48), 0),
-    "three holes": (shapes.square_with_holes(24), -2),
-    "T(2,5)": (shapes.torus_knot(2, 5, 160), -3),
-    "T(3,4)": (shapes.torus_knot(3, 4, 200), -5),
-    "Borromean rings": (shapes.borromean_rings(64), -3),
-    "figure-eight": (shapes.figure_eight_knot(160), -5),
-    "coil": (shapes.coil(4, 128), 1),
+    "wavy": (example_curves.wavy_polygon(64), 1),
+    "trefoil": (example_curves.torus_knot(2, 3, 96), -1),
+    "Hopf link": (example_curves.hopf_link(48), 0),
+    "three holes": (example_curves.square_with_holes(24), -2),
+    "T(2,5)": (example_curves.torus_knot(2, 5, 160), -3),
+    "T(3,4)": (example_curves.torus_knot(3, 4, 200), -5),
+    "Borromean rings": (example_curves.borromean_rings(64), -3),
+    "figure-eight": (example_curves.figure_eight_knot(160), -5),
+    "coil": (example_curves.coil(4, 128), 1),
 }
 QUICK = ("Hopf link", "three holes")
 
@@ -102,7 +102,7 @@ def test_angles_at_the_default_tolerance(name: str) -> None:
 def test_relaxed_triangles_have_larger_angles_and_the_same_rim() -> None:
     """Of a disc with random vertices; what is moved stays on the plane and turns no triangle."""
     rng = np.random.default_rng(0)
-    disc = shapes.wavy_polygon(24, amplitude=0.0)
+    disc = example_curves.wavy_polygon(24, amplitude=0.0)
     x = np.concatenate([disc, np.column_stack([*rng.uniform(-0.6, 0.6, (2, 60)), np.zeros(60)])])
     faces = Delaunay(x[:, :2]).simplices.astype(np.int64)
     flat = LevelFunction(hk.Plane((0.0, 0.0, 1.0)), 0.0)
@@ -225,7 +225,7 @@ def test_a_coil_in_cells_that_are_too_large_raises_if_they_stay(
 
 
 def spanned_module() -> Any:
-    return sys.modules["harnack.meshing.spanned"]
+    return sys.modules["harnack.meshing.curve_spanning"]
 
 
 def test_long_edges_of_a_coil_need_to_be_integrated() -> None:
@@ -293,9 +293,9 @@ def test_random_curves(kind: str, seed: int) -> None:
     an edge and the chain beside it went through others when the chain was not convex."""
     rng = np.random.default_rng(seed)
     if kind == "random":
-        loop = shapes.random_closed_curve(rng, 60)
+        loop = example_curves.random_closed_curve(rng, 60)
     else:
-        loop = shapes.spiky_polygon(rng, 16)
+        loop = example_curves.spiky_polygon(rng, 16)
     mesh = hk.mesh(hk.SolidAngle(loop), tolerance=4e-3)
     check_surface(mesh, [loop], mesh.metadata["harnack"]["euler_characteristic"])
     assert mesh.metadata["harnack"]["euler_characteristic"] % 2 == 1  # one rim
@@ -304,7 +304,7 @@ def test_random_curves(kind: str, seed: int) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("length", [1e-4, pytest.param(1e-8, marks=pytest.mark.slow)])
 def test_a_tiny_edge_does_not_force_small_cells(length: float) -> None:
-    plain = shapes.wavy_polygon(48)
+    plain = example_curves.wavy_polygon(48)
     tiny = np.insert(plain, 1, plain[0] + length * (plain[1] - plain[0]) + [0, 0, length], axis=0)
     one, other = (hk.mesh(hk.SolidAngle(loop), tolerance=5e-3) for loop in (plain, tiny))
     check_surface(other, [tiny], 1)
@@ -315,10 +315,10 @@ def test_a_tiny_edge_does_not_force_small_cells(length: float) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(("scale", "offset"), [(1e-3, 0.0), (1e3, 0.0), (1.0, 1e3), (1.0, 1e6)])
 def test_curves_of_any_size_and_place(scale: float, offset: float) -> None:
-    loop = shapes.wavy_polygon(48) * scale + offset
+    loop = example_curves.wavy_polygon(48) * scale + offset
     mesh = hk.mesh(hk.SolidAngle(loop), tolerance=5e-3)
     check_surface(mesh, [loop], 1)
-    plain = hk.mesh(hk.SolidAngle(shapes.wavy_polygon(48)), tolerance=5e-3)
+    plain = hk.mesh(hk.SolidAngle(example_curves.wavy_polygon(48)), tolerance=5e-3)
     assert len(mesh.faces) == pytest.approx(len(plain.faces), rel=0.05)
 
 

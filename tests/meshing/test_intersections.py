@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from harnack.geometry.mesh_shapes import icosphere
+from harnack.geometry.example_meshes import icosphere
 from harnack.meshing.checks import intersecting_faces, sides_of_lines, sides_of_planes
 
 # A rotation without short decimals: coplanar corners are not in planes of three coordinates.

@@ -11,12 +11,12 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.geometry import shapes
+from harnack.geometry import example_curves
 from harnack.meshing import isotopy
 from harnack.meshing.checks import check_manifold, euler_characteristic
+from harnack.meshing.delaunay_points import Boundary, PointSet, box_cells, place_points
+from harnack.meshing.level_function import LevelFunction
 from harnack.meshing.marching_tetrahedra import crossings_of, delaunay, is_cut, triangles_of
-from harnack.meshing.points import Boundary, PointSet, box_cells, place_points
-from harnack.meshing.samples import LevelFunction
 
 BOX = (np.full(3, -0.5), np.full(3, 0.5))
 NO_CURVE = Boundary(np.zeros((0, 3)), np.zeros((0, 2), np.int64))
@@ -25,8 +25,8 @@ NO_CURVE = Boundary(np.zeros((0, 3)), np.zeros((0, 2), np.int64))
 @pytest.mark.parametrize(
     ("field", "tight"),
     [
-        (hk.SolidAngle(shapes.torus_knot(2, 3, 48)), 0.3),
-        (hk.SolidAngle(shapes.wavy_polygon(24)), 0.3),
+        (hk.SolidAngle(example_curves.torus_knot(2, 3, 48)), 0.3),
+        (hk.SolidAngle(example_curves.wavy_polygon(24)), 0.3),
         (hk.SolidAngle([hk.Circle(1.0)]), 0.3),
         (hk.Gyroid(cell=1.0), 0.5),
     ],
@@ -105,7 +105,7 @@ def test_too_large_cells_are_not_proved() -> None:
 
 def test_what_is_proved_holds_where_it_is_sampled() -> None:
     """(b), on random simplices; and most of what holds is proved, after halving."""
-    field, rng = hk.SolidAngle(shapes.torus_knot(2, 3, 96)), np.random.default_rng(1)
+    field, rng = hk.SolidAngle(example_curves.torus_knot(2, 3, 96)), np.random.default_rng(1)
     function = LevelFunction(field, 2 * math.pi)
     center = rng.uniform(-1.2, 1.2, (3000, 1, 3))
     corners = center + rng.normal(size=(3000, 4, 3)) * 10 ** rng.uniform(-2.5, -0.8, (3000, 1, 1))

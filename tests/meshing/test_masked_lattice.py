@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 import harnack as hk
-from harnack.meshing import solids
+from harnack.meshing import csg_meshing
+from harnack.meshing.bcc_lattice import Lattice
 from harnack.meshing.checks import check_apart, check_manifold
 from harnack.meshing.edges import boundary_edges
-from harnack.meshing.lattice import Lattice
-from harnack.meshing.lattice_surface import Elsewhere, closed_surface
-from harnack.meshing.samples import LevelFunction
+from harnack.meshing.lattice_meshing import Elsewhere, closed_surface
+from harnack.meshing.level_function import LevelFunction
 
 FOUR = Lattice.filling(np.zeros(3), np.full(3, 4.0), 1.0)
 
@@ -103,7 +103,7 @@ def test_parts_made_where_they_matter_are_the_same(
 ) -> None:
     volumes: list[float] = []
     for most in (0, math.inf):
-        monkeypatch.setattr(solids, "_MANY_CELLS", most)
+        monkeypatch.setattr(csg_meshing, "_MANY_CELLS", most)
         volumes.append(float(hk.mesh(PARTS[name], tolerance=5e-3).volume))
     assert volumes[0] == pytest.approx(volumes[1], rel=2e-3)
 
@@ -119,6 +119,6 @@ def test_both_sides_of_a_wall_ask_once_where_the_other_parts_are(
         return whole(self, lattice, most)
 
     monkeypatch.setattr(Elsewhere, "cells_beside", counted)
-    monkeypatch.setattr(solids, "_MANY_CELLS", 0)
+    monkeypatch.setattr(csg_meshing, "_MANY_CELLS", 0)
     hk.mesh(BALL & WALLS, tolerance=1e-2)
     assert asked == [0, 0, 1]  # of the ball, and of both sides

@@ -22,8 +22,8 @@ from harnack.meshing.checks import (
 )
 from harnack.meshing.closed_mesh import ClosedMesh
 from harnack.meshing.finishing import simplified
-from harnack.meshing.lattice_surface import Surface
-from harnack.meshing.samples import LevelFunction
+from harnack.meshing.lattice_meshing import Surface
+from harnack.meshing.level_function import LevelFunction
 from tests.oracles.mesh_files import read_closed
 
 _BALL = trimesh.creation.icosphere(subdivisions=3)

@@ -10,7 +10,7 @@ import pytest
 import trimesh
 
 import harnack as hk
-from harnack.geometry import mesh_shapes
+from harnack.geometry import example_meshes
 from tests.fields.test_shapes import CROSSING, UNITED
 
 CUBE = trimesh.creation.box((2.0, 2.0, 2.0))
@@ -74,7 +74,7 @@ def test_within_parts_in_contact_distances_are_from_their_union() -> None:
 
 
 def test_shells_are_as_thick_as_asked() -> None:
-    ball = hk.solid(mesh_shapes.bumpy_sphere(3))
+    ball = hk.solid(example_meshes.bumpy_sphere(3))
     made = hk.mesh(ball.shell(0.2), tolerance=1e-2)
     assert made.is_watertight
     assert made.body_count == 2  # outside and inside

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import harnack as hk
-from harnack.geometry import shapes
-from harnack.geometry.mesh_shapes import bumpy_sphere, torus_mesh
+from harnack.geometry import example_curves
+from harnack.geometry.example_meshes import bumpy_sphere, torus_mesh
 
 BOX = hk.Box((-1, -1, -1), (1, 1, 1))
 BELOW = (-math.inf, 0.0)
@@ -153,9 +153,9 @@ def hairpin(width: float, length: float) -> np.ndarray:
     [
         ([hairpin(1e-3, 1.0)], 1),
         ([hairpin(1.0, 500.0)], 1),
-        ([shapes.wavy_polygon(24) * 1e-3 + 10.0], 1),
-        ([shapes.wavy_polygon(24) + 1e4], 1),
-        ([shapes.wavy_polygon(24).astype(np.float32)], 1),
+        ([example_curves.wavy_polygon(24) * 1e-3 + 10.0], 1),
+        ([example_curves.wavy_polygon(24) + 1e4], 1),
+        ([example_curves.wavy_polygon(24).astype(np.float32)], 1),
     ],
 )
 def test_hostile_curves(loops: list[np.ndarray], expected: int) -> None:

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from harnack.geometry import chains
-from harnack.geometry.chains import net_faces, singular_edges, singular_loops, weld_vertices
-from harnack.geometry.mesh_shapes import (
+from harnack.geometry import boundary_edges
+from harnack.geometry.boundary_edges import net_faces, singular_edges, singular_loops, weld_vertices
+from harnack.geometry.example_meshes import (
     bumpy_sphere,
     duplicate_faces,
     flip_faces,
@@ -155,7 +155,7 @@ def test_welding_agrees_with_the_plain_one(seed, n, kinds):
 
 
 def test_welding_survives_equal_hashes(monkeypatch):
-    monkeypatch.setattr(chains, "_GOLDEN", np.uint64(0))  # every row then has the same hash
+    monkeypatch.setattr(boundary_edges, "_GOLDEN", np.uint64(0))  # every row then has the same hash
     x = np.random.default_rng(0).integers(0, 3, size=(100, 3)).astype(float)
     np.testing.assert_array_equal(weld_vertices(x), plainly_welded(x))
 
@@ -188,7 +188,7 @@ def test_net_faces_and_singular_edges_agree_with_counting(seed, m, n):
     edges, weights = singular_edges(net, multiplicity)
     assert (weights > 0).all()
     listed = Counter(map(tuple, np.repeat(edges, weights, axis=0).tolist()))
-    assert listed == Counter(chains.boundary_edges(faces.tolist()))
+    assert listed == Counter(boundary_edges.boundary_edges(faces.tolist()))
     again, their_weights = singular_edges(faces)
     np.testing.assert_array_equal(edges, again)
     np.testing.assert_array_equal(weights, their_weights)

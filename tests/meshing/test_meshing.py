@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import harnack as hk
-from harnack.geometry import shapes
+from harnack.geometry import example_curves
 from harnack.meshing import checks
-from harnack.meshing.points import Boundary
-from harnack.tree.cells import Cells, carve, octree
+from harnack.meshing.delaunay_points import Boundary
+from harnack.tree.empty_space import Cells, carve, octree
 
 
 def test_periodic_surfaces_end_at_the_faces_of_a_box() -> None:
@@ -65,11 +65,19 @@ def test_a_level_set_is_meshed_as_it_is_traced() -> None:
         (hk.Plane(), {}, "give clip=harnack.Box"),
         (hk.Gyroid(1.0), {"level": 9.0}, "no surface has level"),
         (hk.Sphere(0.5), {"clip": hk.Box((1, 1, 1), (2, 2, 2))}, "is empty"),
-        (hk.SolidAngle(shapes.wavy_polygon(12)), {"level": 4 * math.pi}, "multiple of 4 pi"),
-        (hk.SolidAngle(shapes.wavy_polygon(12)), {"level": 0.0}, "multiple of 4 pi"),
-        (hk.SolidAngle(shapes.wavy_polygon(12)), {"level": -8 * math.pi}, "multiple of 4 pi"),
-        (hk.SolidAngle(shapes.wavy_polygon(12)), {"tolerance": 0.0}, "tolerance"),
-        (hk.SolidAngle(shapes.wavy_polygon(12)), {"spacing": -1.0}, "spacing"),
+        (
+            hk.SolidAngle(example_curves.wavy_polygon(12)),
+            {"level": 4 * math.pi},
+            "multiple of 4 pi",
+        ),
+        (hk.SolidAngle(example_curves.wavy_polygon(12)), {"level": 0.0}, "multiple of 4 pi"),
+        (
+            hk.SolidAngle(example_curves.wavy_polygon(12)),
+            {"level": -8 * math.pi},
+            "multiple of 4 pi",
+        ),
+        (hk.SolidAngle(example_curves.wavy_polygon(12)), {"tolerance": 0.0}, "tolerance"),
+        (hk.SolidAngle(example_curves.wavy_polygon(12)), {"spacing": -1.0}, "spacing"),
         (hk.SolidAngle(hk.Circle(1.0)), {}, "circle.polygon"),
         ("curve", {}, "a harnack field is needed"),
     ],

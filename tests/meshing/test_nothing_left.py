@@ -10,7 +10,7 @@ import trimesh
 
 import harnack as hk
 from harnack.meshing.clipping import without_films
-from harnack.meshing.lattice_surface import Surface
+from harnack.meshing.lattice_meshing import Surface
 
 BALL = trimesh.creation.icosphere(2)
 

@@ -12,8 +12,8 @@ import trimesh
 
 import harnack as hk
 from harnack.cli import main
-from harnack.files.file_format import FileFormatError
-from harnack.geometry import mesh_shapes
+from harnack.files.file_geometry import FileFormatError
+from harnack.geometry import example_meshes
 
 PLATE = trimesh.creation.box((20.0, 10.0, 2.0))
 FINE_PLATE = PLATE.subdivide().subdivide()
@@ -93,7 +93,7 @@ def test_thickness_is_that_of_plates_balls_and_wedges() -> None:
     assert plate.thinnest == pytest.approx(2.0, abs=1e-5)
     assert (np.abs(plate.where(3.0)[:, 2]) == 1.0).all()
     # The widest ball within an inscribed polyhedron of the unit sphere.
-    ball = hk.thickness(mesh_shapes.icosphere(3))
+    ball = hk.thickness(example_meshes.icosphere(3))
     assert 1.98 < ball.thinnest <= ball.values.max() < 2.0
     # A wedge of half-angle a: the ball that touches one side at a distance s from the edge touches
     # the other as well if its radius is s tan a.

@@ -14,15 +14,15 @@ import trimesh
 
 import harnack as hk
 from harnack.cli import main
-from harnack.geometry import shapes
+from harnack.geometry import example_curves
 from harnack.meshing import checks, clipping, finishing
+from harnack.meshing.bcc_lattice import Lattice
 from harnack.meshing.checks import intersecting_faces
-from harnack.meshing.lattice import Lattice
-from harnack.meshing.lattice_surface import Surface
+from harnack.meshing.lattice_meshing import Surface
 from tests.oracles.mesh_files import read_closed
 
 BOX = hk.Box((-1, -1, -1), (1, 1, 1))
-KNOT = shapes.torus_knot(2, 3, 64)
+KNOT = example_curves.torus_knot(2, 3, 64)
 
 
 def is_part(mesh: Any) -> bool:
@@ -222,7 +222,7 @@ def test_spheres_that_are_cut_have_the_area_left(clip: Any) -> None:
 
 @pytest.mark.slow
 def test_a_level_without_extent_is_cut_by_the_clip() -> None:
-    curve = shapes.wavy_polygon(32)
+    curve = example_curves.wavy_polygon(32)
     mesh = hk.mesh(
         hk.SolidAngle(curve), 4 * math.pi, clip=hk.Ball(radius=2.0), tolerance=1e-2, spacing=0.2
     )
@@ -374,7 +374,7 @@ class Holed(hk.Shape):
         return hk.sqrt(x * x + y * y + z * z - 0.3) - 0.7
 
 
-CURVE = hk.SolidAngle(shapes.wavy_polygon(12))
+CURVE = hk.SolidAngle(example_curves.wavy_polygon(12))
 
 
 @pytest.mark.few(4)

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import FloatArray, choose_backend, to_numpy, to_vector3
-from harnack.backend.records import Records
+from harnack.backend.record_table import Records
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3

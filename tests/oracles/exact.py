@@ -26,7 +26,7 @@ from harnack.enclosures import (
 from harnack.enclosures.bounded_laplacian import GreenBall
 from harnack.enclosures.harmonic_ball import Caps, Classic, Slope
 from harnack.enclosures.parabola import Cone, Taylor
-from harnack.testing.bound_contracts import Case
+from harnack.testing.enclosure_contracts import Case
 from harnack.testing.poisson import cap_movement, kernel_movement
 
 __all__ = ["BOUNDS", "exact_step", "on_host"]

@@ -11,9 +11,9 @@ import numpy as np
 
 from harnack.backend import FloatArray, choose_backend, to_numpy, to_vector3
 from harnack.enclosures import Gaps, Promise
-from harnack.enclosures.ball import known_ranges
-from harnack.testing.bound_contracts import Case
-from harnack.testing.worst_places import (
+from harnack.enclosures.free_radius import known_ranges
+from harnack.testing.enclosure_contracts import Case
+from harnack.testing.violation_search import (
     BrokenPromiseError,
     look_at,
     movements,
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from harnack.backend import Precision
     from harnack.enclosures import Enclosure
     from harnack.fields.field import Field
-    from harnack.fields.look import Sample
+    from harnack.fields.samples import Sample
 
 __all__ = ["check_steps"]
 

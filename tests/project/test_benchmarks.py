@@ -9,7 +9,7 @@ import harnack as hk
 from benchmarks import baselines, blobs, formulas, hart, inclusion, povray
 from harnack.backend import choose_backend, to_vector3
 from harnack.enclosures.literature import BottomUpLinear
-from harnack.geometry import shapes
+from harnack.geometry import example_curves
 
 SCENE = blobs.Scene.random(6, 1.5, (0.6, 1.0), 1.6, seed=2)
 
@@ -100,7 +100,7 @@ def test_the_oracle_finds_the_roots_of_the_tracer(monkeypatch: pytest.MonkeyPatc
 @pytest.mark.slow
 def test_methods_without_a_proof_miss_first_hits(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(baselines, "SAMPLES", 1500)
-    field = hk.SolidAngle(shapes.wavy_polygon(12))
+    field = hk.SolidAngle(example_curves.wavy_polygon(12))
     results, truth = baselines.compare(field, 2 * np.pi, across=16)
     found = {one.name: one for one in results}
     assert np.isfinite(truth).sum() > 50
@@ -113,7 +113,7 @@ def test_methods_without_a_proof_miss_first_hits(monkeypatch: pytest.MonkeyPatch
 
 
 def test_formulas_of_the_solid_angle_are_equal_modulo_4_pi() -> None:
-    loop = shapes.wavy_polygon(12)
+    loop = example_curves.wavy_polygon(12)
     x = np.random.default_rng(0).uniform(-1.2, 1.2, (500, 3))
     expected = formulas.fan(loop, x)
     for other in (formulas.quaternions(loop, x), hk.SolidAngle(loop).value(x, precision="double")):

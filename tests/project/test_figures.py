@@ -15,7 +15,7 @@ from figures.page import picture_name, sections, write
 from figures.published import Claim, claimed_angle, published
 from figures.registry import FIGURES
 from figures.view import View, mesh_hits
-from harnack.geometry import mesh_shapes, shapes
+from harnack.geometry import example_curves, example_meshes
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "figures.md"
 # Those that show a result.
@@ -64,7 +64,7 @@ def test_sections_are_written_one_by_one(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_the_published_algorithm_depends_on_what_is_claimed() -> None:
-    loop = shapes.wavy_polygon(12)
+    loop = example_curves.wavy_polygon(12)
     field = hk.SolidAngle(loop)
     view = View.of(loop, (16, 12))
     d = view.directions()
@@ -84,7 +84,7 @@ def test_the_published_algorithm_depends_on_what_is_claimed() -> None:
 
 
 def test_a_view_frames_and_meets_what_it_is_given() -> None:
-    vertices, faces = mesh_shapes.icosphere(2)
+    vertices, faces = example_meshes.icosphere(2)
     view = View.of(vertices, (40, 30))
     pixels, depth = view.project(vertices)
     assert (pixels > 0).all()

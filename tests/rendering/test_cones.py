@@ -10,9 +10,9 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend
-from harnack.geometry import mesh_shapes
+from harnack.geometry import example_meshes
 from harnack.rendering import Camera, register, render, shape
-from harnack.rendering.shaded import balls_of
+from harnack.rendering.shaded_render import balls_of
 from harnack.rendering.shading import Light
 from harnack.tracer.pixel_cones import Cones
 
@@ -223,4 +223,4 @@ def test_wrong_use_is_said_early() -> None:
     with pytest.raises(ValueError, match="spp is 1: give spp=9"):
         small(ball, antialias="cones", spp=1)
     with pytest.raises(ValueError, match="takes fields without jumps"):
-        small(hk.WindingNumber(*mesh_shapes.icosphere(1)), antialias="cones")
+        small(hk.WindingNumber(*example_meshes.icosphere(1)), antialias="cones")

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 import harnack as hk
-from harnack.geometry import shapes
+from harnack.geometry import example_curves
 from harnack.rendering import register, shape
 from harnack.rendering.integrator import PathTracer
 from harnack.rendering.light_paths import Exposing, Exposure, Pace, expose, pace_of
 
 mi = register()
-POLYGON = hk.SolidAngle(shapes.wavy_polygon(24))
+POLYGON = hk.SolidAngle(example_curves.wavy_polygon(24))
 
 
 def draw(what: Any = POLYGON, **settings: Any) -> np.ndarray:
@@ -114,7 +114,7 @@ def test_a_missing_denoiser_is_told_before_anything_is_drawn(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setitem(sys.modules, "pyoidn", None)
-    monkeypatch.setattr("harnack.rendering.picture_job.register", pytest.fail)
+    monkeypatch.setattr("harnack.rendering.render_job.register", pytest.fail)
     with pytest.raises(ModuleNotFoundError, match=r"pip install 'harnack\[denoise\]'"):
         draw(denoise=True)
 

@@ -15,9 +15,9 @@ from PIL import Image, ImageSequence
 
 import harnack as hk
 from harnack.cli import main
-from harnack.geometry import shapes
+from harnack.geometry import example_curves
 
-FIELD = hk.SolidAngle(shapes.wavy_polygon(24))
+FIELD = hk.SolidAngle(example_curves.wavy_polygon(24))
 SMALL: dict[str, Any] = {"size": (48, 36), "spp": 1, "progress": False}
 
 
@@ -115,7 +115,9 @@ def test_nothing_is_compiled_after_the_second_picture(show: str, tmp_path: Path)
     def moved(s: float) -> hk.Field:
         kernels = dr.kernel_history((dr.KernelType.JIT,))
         counts.append(sum(not one["cache_hit"] or one["cache_disk"] for one in kernels))
-        vertices = shapes.wavy_polygon(24) * (1 + np.random.default_rng(round(99 * s)).random())
+        vertices = example_curves.wavy_polygon(24) * (
+            1 + np.random.default_rng(round(99 * s)).random()
+        )
         return hk.SolidAngle(vertices)
 
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):

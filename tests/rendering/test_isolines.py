@@ -17,7 +17,7 @@ from harnack.tracer import Status
 mi = register()
 BACKEND = choose_backend("double")
 SMALL: dict[str, Any] = {"size": (64, 48), "progress": False}
-CIRCLE = hk.SolidAngle(hk.geometry.shapes.wavy_polygon(24))
+CIRCLE = hk.SolidAngle(hk.geometry.example_curves.wavy_polygon(24))
 
 
 def covered(lines: hk.Isolines, points: np.ndarray, normals: np.ndarray) -> np.ndarray:

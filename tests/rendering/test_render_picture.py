@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import harnack as hk
-from harnack.geometry import shapes
+from harnack.geometry import example_curves
 from harnack.rendering import MATERIALS, SHOW_MODES, Camera, Material, picture, register, render
 from harnack.rendering.images import exr_bytes, tone_mapped
 from harnack.rendering.light_paths import Exposing
@@ -23,7 +23,7 @@ from harnack.rendering.stage import on_ground
 
 mi = register()
 SMALL: dict[str, Any] = {"size": (40, 30), "progress": False}
-POLYGON = hk.SolidAngle(shapes.wavy_polygon(24))
+POLYGON = hk.SolidAngle(example_curves.wavy_polygon(24))
 GYROID = hk.Gyroid(1.0, domain=hk.Ball(radius=1.0))
 
 
@@ -88,7 +88,7 @@ def test_the_same_seed_draws_the_same_picture() -> None:
 def test_bands_leave_no_seam(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = draw(spp=64)
     narrow = functools.partial(Exposing, paths_a_band=64 * 50)
-    monkeypatch.setattr("harnack.rendering.picture_job.Exposing", narrow)
+    monkeypatch.setattr("harnack.rendering.render_job.Exposing", narrow)
     bands = draw(spp=64)
     np.testing.assert_array_equal(whole, bands)
 
@@ -119,7 +119,7 @@ def test_modes_agree_with_each_other() -> None:
 
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
 def test_pictures_of_large_and_small_surfaces_are_alike(scale: float) -> None:
-    field = hk.SolidAngle(scale * shapes.wavy_polygon(24))
+    field = hk.SolidAngle(scale * example_curves.wavy_polygon(24))
     depth = draw(field, show="depth") / scale
     reference = draw(show="depth")
     hit = np.isfinite(depth) & np.isfinite(reference)
@@ -340,7 +340,7 @@ def test_mitsuba_is_imported_only_to_draw() -> None:
 DRAW = """
 import harnack as hk, mitsuba as mi
 from harnack.rendering import render
-from harnack.geometry.shapes import wavy_polygon
+from harnack.geometry.example_curves import wavy_polygon
 {before}
 try:
     image = render(hk.SolidAngle(wavy_polygon(12)), size=(24, 18), spp=64, progress=False)
@@ -384,7 +384,7 @@ def test_other_variants_draw_the_same_picture(variant: str) -> None:
 )
 def test_views_look_alike_in_bands(show: str, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = draw(show=show)
-    monkeypatch.setattr("harnack.rendering.views._RAYS_A_BAND", 7)
+    monkeypatch.setattr("harnack.rendering.aov_render._RAYS_A_BAND", 7)
     np.testing.assert_array_equal(draw(show=show), whole)
 
 

@@ -15,7 +15,7 @@ import harnack as hk
 from harnack.enclosures import Lipschitz
 from harnack.fields.field import Field, Sample
 from harnack.rendering import register, render, shape
-from harnack.rendering.views import Viewer
+from harnack.rendering.aov_render import Viewer
 
 mi = register()
 T = mi.ScalarTransform4f

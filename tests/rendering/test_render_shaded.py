@@ -14,18 +14,18 @@ import pytest
 import harnack as hk
 from harnack.enclosures import Lipschitz
 from harnack.fields.field import Field, Sample
-from harnack.geometry import mesh_shapes, shapes
-from harnack.rendering import Camera, Material, register, render, shaded, shape
-from harnack.rendering.shaded import visible_sky
+from harnack.geometry import example_curves, example_meshes
+from harnack.rendering import Camera, Material, register, render, shaded_render, shape
+from harnack.rendering.hybrid_scene import World
+from harnack.rendering.shaded_render import visible_sky
 from harnack.rendering.shading import Floor, Light, grid_offsets, in_tiles
-from harnack.rendering.world import World
 
 mi = register()
 T = mi.ScalarTransform4f
 SKY = (0.2, 0.3, 0.5)
 EYE = np.array([1.5, -4.0, 2.0])
 N = 48
-POLYGON = hk.SolidAngle(shapes.wavy_polygon(24))
+POLYGON = hk.SolidAngle(example_curves.wavy_polygon(24))
 
 
 class Sphere(Field):
@@ -134,7 +134,7 @@ def draw(what: Any = POLYGON, **settings: Any) -> np.ndarray:
 def test_the_picture_is_always_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = draw()
     np.testing.assert_array_equal(whole, draw(seed=7))
-    monkeypatch.setattr("harnack.rendering.shaded._RAYS_A_BAND", 333)
+    monkeypatch.setattr("harnack.rendering.shaded_render._RAYS_A_BAND", 333)
     np.testing.assert_allclose(draw(), whole, atol=1e-5)
 
 
@@ -172,7 +172,7 @@ def test_surfaces_keep_their_own_materials_and_the_nearer_hides_the_other() -> N
 
 @pytest.mark.slow
 def test_what_mends_a_mesh_is_tinted() -> None:
-    vertices, faces = mesh_shapes.icosphere(2)
+    vertices, faces = example_meshes.icosphere(2)
     opened = faces[vertices[faces].mean(axis=1)[:, 2] < 0.7]
     above = Camera(azimuth=0, elevation=90)
     images = [draw(hk.WindingNumber(vertices, f), material="clay", camera=above, spp=1)
@@ -204,7 +204,7 @@ def positions(bend: float) -> tuple[Any, Any]:
 
 
 def test_a_plane_hides_nothing_and_a_wall_hides_what_is_near(monkeypatch: Any) -> None:
-    monkeypatch.setattr("harnack.rendering.shaded._REACH", 0.4)
+    monkeypatch.setattr("harnack.rendering.shaded_render._REACH", 0.4)
     flat = np.array(visible_sky(mi, *positions(0.0), mi.Float(1), (41, 41))).reshape(41, 41)
     np.testing.assert_allclose(flat, 1, atol=1e-6)
     bent = np.array(visible_sky(mi, *positions(2.0), mi.Float(1), (41, 41))).reshape(41, 41)
@@ -247,7 +247,7 @@ def test_lost_rays_are_magenta_and_counted() -> None:
 VARIANT = """
 import mitsuba as mi, harnack as hk
 mi.set_variant("{variant}")
-from harnack.geometry.shapes import wavy_polygon
+from harnack.geometry.example_curves import wavy_polygon
 field = hk.SolidAngle(wavy_polygon(12))
 print(*hk.render(field, size=(48, 36), show="shaded", progress=False).mean(axis=(0, 1)))
 """
@@ -285,15 +285,15 @@ def test_what_first_rays_have_seen_is_not_traced_again(monkeypatch: pytest.Monke
     """Edges are the mean of nine samples, one of which is that of the first ray: the same picture
     as if all nine were traced anew."""
     counts: list[int] = []
-    own = shaded.Shading.refine
+    own = shaded_render.Shading.refine
 
     def refine(self: Any, *part: Any) -> Any:
         counts.append(len(self.offsets))
         return own(self, *part)
 
-    monkeypatch.setattr(shaded.Shading, "refine", refine)
+    monkeypatch.setattr(shaded_render.Shading, "refine", refine)
     image = drawn(shape(Sphere()), spp=9)
-    monkeypatch.setattr(shaded, "grid_offsets", lambda spp: grid_offsets(spp) + 1e-12)
+    monkeypatch.setattr(shaded_render, "grid_offsets", lambda spp: grid_offsets(spp) + 1e-12)
     again = drawn(shape(Sphere()), spp=9)
     assert set(counts) == {8, 9}
     np.testing.assert_allclose(image, again, atol=2e-5)

@@ -12,7 +12,7 @@ import pytest
 import harnack as hk
 from harnack.backend import choose_backend, to_float, to_numpy, to_vector3
 from harnack.geometry.volume import Volume
-from harnack.rendering.encounter import CappedSolid, facing
+from harnack.rendering.surface_hits import CappedSolid, facing
 
 BACKEND = choose_backend()
 BALL = hk.Ball((0.1, 0.0, -0.05), 0.9)

@@ -17,7 +17,7 @@ from harnack.rendering.scales import Scale, hues, viridis, with_bar
 mi = register()
 SMALL: dict[str, Any] = {"size": (64, 48), "progress": False}
 SPHERE = hk.Sphere(1.0)
-KNOT = hk.SolidAngle(hk.geometry.shapes.wavy_polygon(24))
+KNOT = hk.SolidAngle(hk.geometry.example_curves.wavy_polygon(24))
 
 
 def values(of: Any, what: Any = SPHERE, **settings: Any) -> Any:

@@ -11,7 +11,7 @@ import pytest
 
 import harnack as hk
 from harnack.cli import main
-from harnack.files.file_format import FileFormatError
+from harnack.files.file_geometry import FileFormatError
 
 SCENE = """<scene version="3.0.0">
 <sensor type="perspective"><film type="hdrfilm">

@@ -10,7 +10,7 @@ from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.cli.arguments import parse
 from harnack.cli.commands import _section  # pyright: ignore[reportPrivateUsage]
 from harnack.rendering import shape
-from harnack.rendering.placement import PlacedSurface, Placement
+from harnack.rendering.placed_surface import PlacedSurface, Placement
 
 NORMAL, OFFSET = np.array([0.6, 0.0, 0.8]), 0.2
 HALF = hk.HalfSpace((0.6, 0.0, 0.8), OFFSET)

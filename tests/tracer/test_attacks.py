@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import harnack as hk
-from harnack.geometry.mesh_shapes import icosphere
+from harnack.geometry.example_meshes import icosphere
 from tests.oracles.direct_sums import dipole_sum
 
 PRECISIONS = ("single", "double")
@@ -132,7 +132,7 @@ def test_closest_points_of_clouds_are_on_the_surface_whatever_the_accuracy() -> 
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_curvatures_beside_curves_state_their_error(precision: Any) -> None:
     """Mean curvatures were off by up to 1e5 times what was stated."""
-    loop = single(hk.geometry.shapes.wavy_polygon(12))
+    loop = single(hk.geometry.example_curves.wavy_polygon(12))
     rng = np.random.default_rng(0)
     middle = 0.5 * (loop + np.roll(loop, -1, axis=0))
     x = single(middle + 1e-5 * rng.normal(size=middle.shape))
@@ -153,7 +153,7 @@ def test_directions_may_have_any_length(precision: Any) -> None:
     o, d = np.array([[0.1, 0.2, 3.0]]), np.array([[0.0, 0.01, -1.0]])
     fields: tuple[hk.Field, ...] = (
         hk.WindingNumber(*icosphere(1)),
-        hk.SolidAngle(hk.geometry.shapes.wavy_polygon(12)),
+        hk.SolidAngle(hk.geometry.example_curves.wavy_polygon(12)),
     )
     powers = (-35, -19, -17, 17, 19, 30, 37) if precision == "single" else (-300, -161, 153, 300)
     for field in fields:

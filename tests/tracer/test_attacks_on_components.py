@@ -10,7 +10,7 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.rendering.placement import PlacedSurface, Placement
+from harnack.rendering.placed_surface import PlacedSurface, Placement
 
 SPHERES = hk.Sphere(0.5, (-0.6, 0, 0)) | hk.Sphere(0.2, (2, 0, 0))
 FROM_RIGHT = [[3.0, 0, 0]], [[-1.0, 0, 0]]

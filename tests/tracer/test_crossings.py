@@ -13,9 +13,9 @@ import harnack as hk
 from harnack.backend import FloatArray, choose_backend
 from harnack.enclosures import Curvature, Lipschitz
 from harnack.fields.field import Field, Sample
-from harnack.geometry import shapes
-from harnack.geometry.mesh_shapes import icosphere
-from harnack.tracer.contact import root_between
+from harnack.geometry import example_curves
+from harnack.geometry.example_meshes import icosphere
+from harnack.tracer.level_contact import root_between
 
 PRECISIONS = ("single", "double")
 BALL = hk.Ball(radius=1.5)
@@ -144,7 +144,7 @@ def test_crossings_are_those_of_a_dense_oracle(name: str, precision: Any) -> Non
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("level", [2 * math.pi, (0.5, 1.5, 2 * math.pi, 9.0)])
 def test_the_ladder_of_an_angle_is_climbed_rung_by_rung(level: Any, precision: Any) -> None:
-    field, tolerance = hk.SolidAngle(shapes.wavy_polygon(12)), 1e-3
+    field, tolerance = hk.SolidAngle(example_curves.wavy_polygon(12)), 1e-3
     o, d = rays(150, seed=3, distance=3.0)
     found = hk.trace(
         field, o, d, level=level, all_hits=30, t_max=6, tolerance=tolerance, precision=precision

@@ -11,11 +11,11 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend
-from harnack.geometry import mesh_shapes, shapes
+from harnack.geometry import example_curves, example_meshes
 
 DOUBLE = choose_backend("double")
-LOOP = shapes.wavy_polygon(12)
-TREFOIL = shapes.torus_knot(2, 3, 30)
+LOOP = example_curves.wavy_polygon(12)
+TREFOIL = example_curves.torus_knot(2, 3, 30)
 LEVEL = 2 * math.pi
 EYE = np.array([2.2, -2.2, 1.6])
 
@@ -299,7 +299,7 @@ def test_gradients_at_ties_are_those_of_one_side(precision: str) -> None:
 
 def test_hits_of_clouds_are_those_of_the_whole_sum() -> None:
     """t, and its derivative in reverse mode, against a sum over all points."""
-    x = mesh_shapes.icosphere(3)[0]
+    x = example_meshes.icosphere(3)[0]
     areas = np.full(len(x), 4 * math.pi / len(x))
     o, d = rays_at(0.6, 60, 1)
     origin = vector(o)
@@ -321,8 +321,8 @@ def test_hits_of_clouds_are_those_of_the_whole_sum() -> None:
 
 OF_LOOPS: dict[str, tuple[Callable[[], hk.Field], float]] = {
     "Julia set": (lambda: hk.Julia(), 0.0),
-    "closed mesh": (lambda: hk.WindingNumber(*mesh_shapes.icosphere(1)), 0.5),
-    "mesh by tree": (lambda: hk.WindingNumber(*mesh_shapes.icosphere(2), method="tree"), 0.5),
+    "closed mesh": (lambda: hk.WindingNumber(*example_meshes.icosphere(1)), 0.5),
+    "mesh by tree": (lambda: hk.WindingNumber(*example_meshes.icosphere(2), method="tree"), 0.5),
     "cloud of spheres": (lambda: hk.Blobs(LOOP, 0.5), 1.0),
 }
 

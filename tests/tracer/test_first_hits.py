@@ -14,8 +14,8 @@ from scipy.special import lpmv
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.geometry import shapes
-from harnack.geometry.mesh_shapes import icosphere
+from harnack.geometry import example_curves
+from harnack.geometry.example_meshes import icosphere
 from tests.oracles.oracle import CurveOracle, Function, OracleValues, first_crossings, gap_to_levels
 
 FOUR_PI = 4 * math.pi
@@ -33,18 +33,18 @@ def random_curve(rng: np.random.Generator, kind: int) -> Loops:
     height = rng.uniform(0.3, 2.0)
     p, q = [(2, 3), (3, 2), (2, 5), (3, 4), (1, 5), (3, 5)][rng.integers(6)]
     kinds = [
-        lambda: [shapes.torus_knot(p, q, 2 * n, minor_radius=rng.uniform(0.2, 0.6))],
-        lambda: [shapes.figure_eight_knot(2 * n)],
-        lambda: [shapes.coil(turns, long, height=height, route="outside")],
-        lambda: [shapes.coil(turns, long, height=height, route="axis")],
-        lambda: shapes.hopf_link(n),
-        lambda: shapes.borromean_rings(n),
-        lambda: shapes.square_with_holes(int(rng.integers(5, 20))),
-        lambda: [shapes.random_closed_curve(rng, n, harmonics=int(rng.integers(1, 6)))],
-        lambda: [shapes.spiky_polygon(rng, int(rng.integers(5, 40)))],
-        lambda: [shapes.wavy_polygon(n, amplitude=rng.uniform(0, 0.6), waves=3)],
+        lambda: [example_curves.torus_knot(p, q, 2 * n, minor_radius=rng.uniform(0.2, 0.6))],
+        lambda: [example_curves.figure_eight_knot(2 * n)],
+        lambda: [example_curves.coil(turns, long, height=height, route="outside")],
+        lambda: [example_curves.coil(turns, long, height=height, route="axis")],
+        lambda: example_curves.hopf_link(n),
+        lambda: example_curves.borromean_rings(n),
+        lambda: example_curves.square_with_holes(int(rng.integers(5, 20))),
+        lambda: [example_curves.random_closed_curve(rng, n, harmonics=int(rng.integers(1, 6)))],
+        lambda: [example_curves.spiky_polygon(rng, int(rng.integers(5, 40)))],
+        lambda: [example_curves.wavy_polygon(n, amplitude=rng.uniform(0, 0.6), waves=3)],
         lambda: [rng.uniform(-1, 1, (int(rng.integers(3, 9)), 3))],
-        lambda: [shapes.regular_polygon(n, radius) + np.array([0, 0, z]) for radius, z in
+        lambda: [example_curves.regular_polygon(n, radius) + np.array([0, 0, z]) for radius, z in
                  zip(rng.uniform(0.5, 1, turns), np.linspace(-0.5, 0.5, turns), strict=True)],
     ]  # fmt: skip
     return kinds[kind % len(kinds)]()
@@ -211,7 +211,7 @@ def test_many_random_curves(seed: int) -> None:
 
 
 # A closed coil of five turns, and rays down its axis.
-COIL = [shapes.coil(5, 126, height=0.2)]
+COIL = [example_curves.coil(5, 126, height=0.2)]
 COIL_ORIGINS = np.array(
     [
         [0.1847644746303558, -0.1858646124601364, 0.713482677936554],
@@ -261,7 +261,7 @@ def test_the_published_method_misses_hits_of_a_coil_of_eight_turns(
     """Five turns are too few for c = -4 pi with the classic step: at the center of a coil of k
     turns the solid angle falls by 2 pi k per radius, and Harnack's inequality with u >= 4 pi
     allows for 12 pi. It does break the range itself: see the next test."""
-    coil = [shapes.coil(8, 198, height=0.2)]
+    coil = [example_curves.coil(8, 198, height=0.2)]
     o = np.array(
         [
             [-0.06997866928577423, -0.2053578943014145, 0.07299382239580154],
@@ -308,7 +308,7 @@ def movement(oracle: CurveOracle, center: np.ndarray, ball: hk.HarmonicBall) -> 
 def test_padding_edges_near_the_first_vertex() -> None:
     """A loop of 50 vertices is padded to 56 with edges of length zero at its first vertex. Beside
     it their factors underflowed in single precision, and the point counted as on the curve."""
-    loops = [shapes.regular_polygon(50)]
+    loops = [example_curves.regular_polygon(50)]
     target = loops[0][0] + np.array([[0.002, 0.001, 0.0], [0.001, -0.002, 0.001], [2e-4, 0, 0]])
     d = unit(np.array([[0.3, 0.1, 1.0], [0.1, 1.0, 0.2], [0.0, -0.4, 1.0]]))
     failures: list[str] = []

@@ -15,7 +15,7 @@ import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.backend.arrays import aligned
 from harnack.backend.loops import on_some, while_queued
-from harnack.geometry.mesh_shapes import icosphere
+from harnack.geometry.example_meshes import icosphere
 from harnack.tracer.hits import _are_scattered
 
 

@@ -9,9 +9,9 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.fields.sheets import NO_SHEET, Crossing
-from harnack.geometry.mesh_shapes import icosphere
-from harnack.geometry.shapes import wavy_polygon
+from harnack.fields.capabilities import NO_SHEET, Crossing
+from harnack.geometry.example_curves import wavy_polygon
+from harnack.geometry.example_meshes import icosphere
 from tests.fields.test_solid_angle import CurveOracle, lines_beside, moves_along, unit
 
 Mesh = tuple[np.ndarray, np.ndarray]

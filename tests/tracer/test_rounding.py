@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import harnack as hk
-from harnack.geometry import shapes
+from harnack.geometry import example_curves
 
 
 def camera(width: int) -> tuple[np.ndarray, np.ndarray]:
@@ -35,7 +35,7 @@ def camera(width: int) -> tuple[np.ndarray, np.ndarray]:
     [("double", 1e-8), ("double", 1e-11), ("double", 1e-14), ("single", 1e-5), ("single", 1e-7)],
 )
 def test_no_surface_slips_through(bound: str, precision: str, tolerance: float) -> None:
-    field = hk.SolidAngle(shapes.wavy_polygon(64))
+    field = hk.SolidAngle(example_curves.wavy_polygon(64))
     o, d = camera(48)
     plain = hk.trace(field, o, d, overstep=1.0, tolerance=1e-5, precision="double")
     over = hk.trace(field, o, d, bound=bound, tolerance=tolerance, precision=precision)

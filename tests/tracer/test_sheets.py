@@ -35,12 +35,12 @@ from harnack.enclosures import (
 from harnack.enclosures.harmonic_ball import Caps, Slope
 from harnack.enclosures.parabola import Taylor
 from harnack.fields import Field, Sample
-from harnack.fields.look import Path as RayPath
-from harnack.fields.sheets import NO_SHEET, Crossing
-from harnack.rendering.encounter import meet_surface
+from harnack.fields.capabilities import NO_SHEET, Crossing
+from harnack.fields.samples import Path as RayPath
+from harnack.rendering.surface_hits import meet_surface
 from harnack.testing import scaled
-from harnack.testing.bound_contracts import Case
-from harnack.tracer.contact import compare_with_sheet
+from harnack.testing.enclosure_contracts import Case
+from harnack.tracer.level_contact import compare_with_sheet
 from tests.oracles.exact import exact_step, on_host
 from tests.oracles.jump_oracle import first_side_changes, judge
 

@@ -17,7 +17,7 @@ import harnack as hk
 from harnack.arithmetic.operators import tally_of
 from harnack.backend import choose_backend, to_numpy
 from harnack.enclosures import Gaps, TargetLevels, choose_proofs
-from harnack.fields.look import Path
+from harnack.fields.samples import Path
 from harnack.tracer.steep import SteepPlace
 
 if TYPE_CHECKING:

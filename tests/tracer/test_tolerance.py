@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 import harnack as hk
-from harnack.geometry.chains import singular_edges
-from harnack.geometry.mesh_shapes import icosphere
+from harnack.geometry.boundary_edges import singular_edges
+from harnack.geometry.example_meshes import icosphere
 from tests.oracles.direct_sums import dipole_sum, winding_sum
 
 PRECISIONS = ("single", "double")

@@ -11,7 +11,7 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend
-from harnack.geometry import shapes
+from harnack.geometry import example_curves
 from harnack.geometry.curves import (
     CurveShapeError,
     NonFiniteVertexError,
@@ -21,7 +21,7 @@ from harnack.geometry.curves import (
 
 SQUARE = np.array([[1.0, 1, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0]])
 FIELD = hk.SolidAngle(SQUARE)
-WAVY = hk.SolidAngle(shapes.wavy_polygon(12))
+WAVY = hk.SolidAngle(example_curves.wavy_polygon(12))
 GYROID = hk.Gyroid(domain=hk.Ball(radius=5.0))
 DOWN = np.array([[0.0, 0.0, -1.0]])
 BOUNDS = [None, "classic", "slope", "caps", "curvature"]
@@ -161,7 +161,7 @@ def test_precisions_agree() -> None:
 @pytest.mark.parametrize("bound", BOUNDS)
 def test_different_proofs_give_the_same_hits(bound: str | None, overstep: float) -> None:
     o, d = around(300)
-    for field in (WAVY, hk.SolidAngle(shapes.torus_knot(2, 3, 40)), GYROID):
+    for field in (WAVY, hk.SolidAngle(example_curves.torus_knot(2, 3, 40)), GYROID):
         settings: Any = {"tolerance": 1e-7, "precision": "double", "max_steps": 20_000}
         reference = hk.trace(field, o, d, bound="slope", overstep=1.0, **settings)
         hits = hk.trace(field, o, d, bound=bound, overstep=overstep, **settings)
@@ -188,7 +188,7 @@ def test_t_min_and_t_max_of_each_ray() -> None:
 
 def test_a_ray_without_end_ends_in_a_miss() -> None:
     o, d = around(50)
-    knot = hk.SolidAngle(shapes.torus_knot(2, 3, 40))
+    knot = hk.SolidAngle(example_curves.torus_knot(2, 3, 40))
     for field, level in ((WAVY, None), (knot, 1.0), (GYROID, None)):
         hits = hk.trace(field, 50 * o, -d, level=level)
         assert (hits.status == hk.Status.MISS).all()

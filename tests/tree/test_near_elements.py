@@ -11,8 +11,8 @@ import pytest
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.fields.solid_angles.multipole import all_levels, truncation
-from harnack.geometry.chains import singular_edges
-from harnack.geometry.mesh_shapes import icosphere
+from harnack.geometry.boundary_edges import singular_edges
+from harnack.geometry.example_meshes import icosphere
 from harnack.tree import build_hierarchy
 from tests.oracles.direct_sums import dipole_sum, winding_sum
 
@@ -266,7 +266,7 @@ def on_host(number: Any) -> Any:
 def test_solid_angles_beside_curves_are_within_their_bounds(kind: str, precision: Any) -> None:
     """Beside edges and vertices; the rounding of x itself, which the tracer adds, is added here."""
     rng = np.random.default_rng(6)
-    shapes = hk.geometry.shapes
+    shapes = hk.geometry.example_curves
     loop = shapes.wavy_polygon(12) if kind == "polygon" else shapes.torus_knot(2, 3, 60)
     loop = loop + (np.array([64.0, -512.0, 16.0]) if kind == "far" else 0)
     loop = loop.astype(np.float32).astype(np.float64)

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.geometry.mesh_shapes import bumpy_sphere, torus_mesh
+from harnack.geometry.example_meshes import bumpy_sphere, torus_mesh
 from harnack.tree import NO_PRIMITIVE, Hierarchy, build_hierarchy, for_each, pack, walk
-from harnack.tree.triangles import Frame, TriangleRays, triangle_records
+from harnack.tree.triangle_tree import Frame, TriangleRays, triangle_records
 
 SIZES = [1, 2, 3, 7, 8, 9, 15, 16, 17, 33, 63, 100, 257, 1000]
 NO_TRIANGLE = 0xFFFFFFFF

@@ -16,8 +16,8 @@ import pytest
 
 import harnack as hk
 from harnack.cli import main
-from harnack.geometry import shapes
-from harnack.geometry.mesh_shapes import torus_mesh
+from harnack.geometry import example_curves
+from harnack.geometry.example_meshes import torus_mesh
 from harnack.view.sliders import Subject
 from harnack.webgpu import NoDeviceError, find_device
 from harnack.webgpu.device import Program
@@ -55,7 +55,7 @@ def run(surface: dict[str, Any], data: Any) -> tuple[Any, Any]:
 @pytest.mark.parametrize("name", ["trefoil", "gyroid"])
 def test_the_kernel_of_a_page_finds_what_its_rays_say(name: str, tmp_path: Path) -> None:
     fields = {
-        "trefoil": lambda: hk.SolidAngle(shapes.torus_knot(2, 3, 60)),
+        "trefoil": lambda: hk.SolidAngle(example_curves.torus_knot(2, 3, 60)),
         "gyroid": lambda: hk.Gyroid(0.5, domain=hk.Ball(radius=1.0)),
     }
     path = tmp_path / "a.html"
@@ -203,7 +203,7 @@ def test_what_is_no_page(tmp_path: Path) -> None:
     ],
 )  # fmt: skip
 def test_what_is_no_view(given: dict[str, Any], wrong: str) -> None:
-    field: Any = hk.SolidAngle(shapes.torus_knot(2, 3, 12))
+    field: Any = hk.SolidAngle(example_curves.torus_knot(2, 3, 12))
     with pytest.raises((TypeError, ValueError), match=wrong):
         hk.view(field, opens=False, waits=False, **given)
 

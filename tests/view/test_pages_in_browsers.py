@@ -12,8 +12,8 @@ from PIL import Image
 from scipy import ndimage
 
 import harnack as hk
-from harnack.geometry import shapes
-from harnack.geometry.mesh_shapes import icosphere
+from harnack.geometry import example_curves
+from harnack.geometry.example_meshes import icosphere
 from tests.view.browsers import Page, chromium, served
 
 pytestmark = pytest.mark.browser
@@ -34,7 +34,7 @@ def holed() -> hk.WindingNumber:
 # What is drawn, and how: surfaces of a curve, a formula, a mesh with a hole, a solid that is cut
 # and has lines, a union, and two solids.
 SCENES: dict[str, Callable[[], tuple[Any, dict[str, Any]]]] = {
-    "curve": lambda: (hk.SolidAngle(shapes.torus_knot(2, 3, 60)), {}),
+    "curve": lambda: (hk.SolidAngle(example_curves.torus_knot(2, 3, 60)), {}),
     "formula": lambda: (
         hk.expression("x^4 + y^4 + z^4 - x^2 - y^2 - z^2 = -0.4"),
         {"clip": hk.Ball(radius=2.0), "material": "gold", "backdrop": "dark"},

@@ -14,18 +14,18 @@ import pytest
 import harnack as hk
 from harnack.cli import main
 from harnack.gallery import SCENES
-from harnack.geometry import shapes
-from harnack.geometry.mesh_shapes import icosphere
+from harnack.geometry import example_curves
+from harnack.geometry.example_meshes import icosphere
 from harnack.view.scene_file import _kinds, scene_of, text_of
-from harnack.view.value_types import check_types
+from harnack.view.type_checks import check_types
 
-CURVE = hk.SolidAngle(shapes.torus_knot(2, 3, 12))
+CURVE = hk.SolidAngle(example_curves.torus_knot(2, 3, 12))
 SOLIDS = {
     "sphere": hk.Sphere(1.25),
     "moved": hk.Torus(1.0, 0.3).moved((1.0, 2.0, 3.0)).rotated(30.0, "x").scaled(2.0),
     "cut": hk.Sphere(1.0) - hk.Cuboid((0.5, 0.5, 2.0)) | hk.Capsule((0, 0, -1), (0, 0, 1), 0.2),
     "twisted": hk.Cuboid((0.4, 0.4, 1.0)).twisted(0.5),
-    "tube": hk.Tube(shapes.torus_knot(2, 3, 12), 0.1),
+    "tube": hk.Tube(example_curves.torus_knot(2, 3, 12), 0.1),
     "outlines": hk.Extruded(
         [[(0, 0), (2, 0), (0, 2)], [(0.2, 0.2), (1, 0.2), (0.2, 1)]], 0.5, twist=40.0, taper=0.5
     )
@@ -161,7 +161,7 @@ def test_settings_and_sliders_come_back(tmp_path: Path) -> None:
 
 def test_a_file_is_found_beside_the_scene(tmp_path: Path) -> None:
     path = tmp_path / "curve.loops"
-    path.write_text(" ".join(map(str, shapes.wavy_polygon(8).ravel().tolist())))
+    path.write_text(" ".join(map(str, example_curves.wavy_polygon(8).ravel().tolist())))
     about: Any = {"harnack": 1, "surfaces": [{"field": {"file": "curve.loops"}, "level": 2.0}]}
     (tmp_path / "a.json").write_text(json.dumps(about))
     saved = hk.read_scene(tmp_path / "a.json")
@@ -303,7 +303,7 @@ def test_every_command_reads_a_scene_file(
 
 def test_a_file_is_found_beside_the_scene_that_was_sent_with_it(tmp_path: Path) -> None:
     path = tmp_path / "curve.loops"
-    path.write_text(" ".join(map(str, shapes.wavy_polygon(8).ravel().tolist())))
+    path.write_text(" ".join(map(str, example_curves.wavy_polygon(8).ravel().tolist())))
     about = {"harnack": 1, "surfaces": [{"field": {"file": "/elsewhere/curve.loops"}}]}
     (tmp_path / "a.json").write_text(json.dumps(about))
     (field,) = hk.read_scene(tmp_path / "a.json").surfaces

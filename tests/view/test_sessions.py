@@ -14,16 +14,16 @@ import pytest
 import trimesh
 
 import harnack as hk
-from harnack.geometry import shapes
-from harnack.geometry.mesh_shapes import icosphere, torus_mesh
+from harnack.geometry import example_curves
+from harnack.geometry.example_meshes import icosphere, torus_mesh
 from harnack.meshing.checks import LocalError
-from harnack.rendering import studio_scene
-from harnack.view import scene
-from harnack.view.scene import Live, difference
+from harnack.rendering import studio_surfaces
+from harnack.view import live_scene
+from harnack.view.live_scene import Live, difference
 from harnack.view.session import Client, QuestionError, Session
 from harnack.view.sliders import ends_of
 
-LOOP = shapes.torus_knot(2, 3, 18)
+LOOP = example_curves.torus_knot(2, 3, 18)
 FIELD = hk.SolidAngle(LOOP)
 EYE = {
     "origin": [0, -6, 0.3], "right": [1, 0, 0], "up": [0, 0, 1], "forward": [0, 1, 0],
@@ -169,7 +169,7 @@ def test_a_thickness_that_fails_says_at_which_place(monkeypatch: pytest.MonkeyPa
             raise LocalError("sheets meet", np.zeros((1, 3)))
         return trimesh.creation.icosphere(1)
 
-    monkeypatch.setattr(studio_scene, "mesh", fail)
+    monkeypatch.setattr(studio_surfaces, "mesh", fail)
     live = Live.of(FIELD, {"level": 6.0, "thickness": hk.Slider(0.1, 0.3, 0.1)})
     asked = {"kind": "change", "sliders": {"thickness": 0.3}}
     wrong = r"at the place thickness=0\.3 .*thickness=0\.3: sheets meet; give another thickness"
@@ -182,7 +182,7 @@ def test_a_thickness_that_fails_says_at_which_place(monkeypatch: pytest.MonkeyPa
 def test_more_colors_than_are_drawn_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     live = Live.of([hk.Sphere(1.0), hk.Sphere(0.5)], {})
     assert len(live.first["surfaces"]) == 2
-    monkeypatch.setattr(scene, "_MOST_PAINTS", 5)
+    monkeypatch.setattr(live_scene, "_MOST_PAINTS", 5)
     with pytest.raises(ValueError, match="have 6 colors"):
         live.state(live.start)
 
@@ -198,7 +198,9 @@ def test_what_is_sent_is_what_has_changed(live: Live) -> None:
     assert 0 < len(own["at"]) < 0.7 * len(data)
     assert "code" not in own
     assert change["curves"] == state["curves"]
-    longer = live.state(Session(live).controls({"loops": [shapes.torus_knot(2, 3, 99).tolist()]}))
+    longer = live.state(
+        Session(live).controls({"loops": [example_curves.torus_knot(2, 3, 99).tolist()]})
+    )
     assert difference(first, longer) is longer
 
 

@@ -24,12 +24,12 @@ import numpy as np
 import pytest
 
 import harnack as hk
-from harnack.geometry import shapes
+from harnack.geometry import example_curves
 from tests.view.browsers import Page, chromium, launched
 
 pytestmark = pytest.mark.browser
 SIZE = (320, 240)
-LOOP = shapes.torus_knot(2, 3, 15)
+LOOP = example_curves.torus_knot(2, 3, 15)
 
 
 @pytest.fixture(scope="module")
@@ -118,7 +118,7 @@ def test_colors_that_are_numbers_have_a_legend(drawn_by: str, page: Page) -> Non
         float, re.findall(r"from ([\d.]+), bright, to ([\d.]+), dark", page.do(legend))[0]
     )
     position = page.do("panel.attributes().camera.position")
-    away = np.linalg.norm(np.array(position) - shapes.torus_knot(2, 3, 200), axis=1)
+    away = np.linalg.norm(np.array(position) - example_curves.torus_knot(2, 3, 200), axis=1)
     assert 0.7 * away.min() < near < away.min() * 1.1  # in the unit of the surface
     assert near < far < 1.3 * away.max()
     choose(page, "show", "evaluations")

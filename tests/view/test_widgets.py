@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 import harnack as hk
-from harnack.geometry import shapes
+from harnack.geometry import example_curves
 from harnack.view import server
 from tests.view.browsers import Page, chromium, served
 
 widgets = pytest.importorskip("harnack.view.widget")
 traitlets = pytest.importorskip("traitlets")
-LOOP = shapes.torus_knot(2, 3, 12)
+LOOP = example_curves.torus_knot(2, 3, 12)
 
 
 @pytest.fixture

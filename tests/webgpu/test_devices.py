@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import harnack as hk
-from harnack.geometry.mesh_shapes import icosphere
+from harnack.geometry.example_meshes import icosphere
 from harnack.tracer import hits as tracing
 from harnack.webgpu import DeviceDisagreesError, NoDeviceError, find_device
 from tests.fields.test_contracts import APPROXIMATE, FIELDS

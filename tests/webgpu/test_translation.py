@@ -8,7 +8,7 @@ import re
 import pytest
 
 from harnack.webgpu import UntranslatableError
-from harnack.webgpu.kernel import Constant, Load, Loop, Operation, parse
+from harnack.webgpu.llvm_parser import Constant, Load, Loop, Operation, parse
 from harnack.webgpu.wgsl import shader_of
 
 # One number read, one operation, one result.

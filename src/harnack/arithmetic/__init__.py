@@ -30,7 +30,7 @@ from harnack.arithmetic.functions import (
 from harnack.arithmetic.interval import ONE, ZERO, Interval
 from harnack.arithmetic.jet import Jet
 from harnack.arithmetic.norms import blend_intersection, blend_union, corner, maximum, minimum, norm
-from harnack.arithmetic.parabolas import Parabolas
+from harnack.arithmetic.parabola_bounds import Parabolas
 from harnack.arithmetic.values import Values
 
 __all__ = [

@@ -34,7 +34,7 @@ from harnack.backend.arrays import (  # noqa: E402
     to_numpy,
     to_vector3,
 )
-from harnack.backend.numbers import BoolArray, FloatArray, IntArray  # noqa: E402
+from harnack.backend.validation import BoolArray, FloatArray, IntArray  # noqa: E402
 
 __all__ = [
     "Backend",

@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend.llvm import ensure_llvm
-from harnack.backend.numbers import FloatArray, check_vectors, real_array
-from harnack.names import is_one_of
+from harnack.backend.validation import FloatArray, check_vectors, real_array
+from harnack.name_suggestions import is_one_of
 
 # Dr.Jit creates its array types at run time, one family a backend and precision, so no static
 # type describes "a Float of whichever backend". These names say what is meant.

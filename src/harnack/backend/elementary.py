@@ -18,7 +18,7 @@ import numpy as np
 
 if TYPE_CHECKING:
     from harnack.backend.arrays import Real, Vec3
-    from harnack.backend.numbers import FloatArray
+    from harnack.backend.validation import FloatArray
 
 
 def fmin(a: Any, b: Any) -> Any:

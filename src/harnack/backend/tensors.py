@@ -19,7 +19,7 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend.arrays import backend_of
-from harnack.backend.numbers import TRANSPOSE, check_vectors
+from harnack.backend.validation import TRANSPOSE, check_vectors
 
 if TYPE_CHECKING:
     from harnack.backend.arrays import Real, Vec3

@@ -12,18 +12,18 @@ from typing import Any, NoReturn
 from harnack._version import __version__
 from harnack.cli.mesh_files import MESH_FILES
 from harnack.cli.messages import printable
-from harnack.enclosures.proofs import BOUNDS
+from harnack.enclosures.selection import BOUNDS
 from harnack.field_from_file import UP_AXES
 from harnack.fields.expressions import TextFormula
-from harnack.files.surfaces import SURFACE_FILES
-from harnack.meshing.samples import MOST_FACES
-from harnack.names import did_you_mean
+from harnack.files.geometry_files import SURFACE_FILES
+from harnack.meshing.level_function import MOST_FACES
+from harnack.name_suggestions import did_you_mean
 from harnack.rendering import MATERIALS, SHOW_MODES
-from harnack.rendering.arguments import ANTIALIASING, MAX_SIDE, MAX_SPP
 from harnack.rendering.backdrops import IMAGE_FILES, checked_backdrop
+from harnack.rendering.render_options import ANTIALIASING, MAX_SIDE, MAX_SPP
 from harnack.rendering.scales import color_of
 from harnack.rendering.stage import material_of
-from harnack.view.scene import SHOWS
+from harnack.view.live_scene import SHOWS
 from harnack.view.sliders import Slider
 
 # Of what was typed, this much is repeated in messages.

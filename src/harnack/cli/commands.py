@@ -20,19 +20,19 @@ from harnack.cli.messages import in_options, printable
 from harnack.field_from_file import open_surface
 from harnack.fields import Field
 from harnack.fields.expressions import expression, looks_like_formula
-from harnack.files.file_format import write_atomically
-from harnack.files.surfaces import SURFACE_FILES, Mesh, read_surface
+from harnack.files.file_geometry import write_atomically
+from harnack.files.geometry_files import SURFACE_FILES, Mesh, read_surface
 from harnack.gallery import SCENES, Scene
 from harnack.geometry import Ball, Box, HalfSpace
-from harnack.geometry.chains import weld_vertices
+from harnack.geometry.boundary_edges import weld_vertices
 from harnack.meshing import check_print, mesh, repair, thickness
-from harnack.names import did_you_mean
+from harnack.name_suggestions import did_you_mean
 from harnack.rendering import Camera, Isolines, animate, render
-from harnack.rendering.arguments import OF_STUDIO, SETTINGS
-from harnack.rendering.film import check_film_path
+from harnack.rendering.animation import check_film_path
 from harnack.rendering.images import check_picture_path
+from harnack.rendering.render_options import OF_STUDIO, SETTINGS
 from harnack.view import SavedScene, page, read_scene, view
-from harnack.view.scene import live_settings
+from harnack.view.live_scene import live_settings
 from harnack.view.scene_file import Origins
 
 _DEMO_SIZE = (480, 360)

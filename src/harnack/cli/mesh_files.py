@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from harnack.files.file_format import check_writable, write_atomically
+from harnack.files.file_geometry import check_writable, write_atomically
 from harnack.files.three_mf import FOR_3MF
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ from types import FrameType
 from typing import Any
 
 from harnack.rendering import UnboundedSurfaceError
-from harnack.rendering.arguments import SETTINGS
+from harnack.rendering.render_options import SETTINGS
 
 # Ctrl-C.
 

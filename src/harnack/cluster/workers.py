@@ -15,7 +15,7 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import choose_backend, to_numpy
-from harnack.cluster.packing import load_module, packages
+from harnack.cluster.serialization import load_module, packages
 
 # How long to wait for a scheduler.
 _PATIENCE = "10s"

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from harnack.backend.numbers import refuses_derivatives
-from harnack.cluster.lazy import is_lazy
-from harnack.cluster.packing import load_module
+from harnack.backend.validation import refuses_derivatives
+from harnack.cluster.dask_arrays import is_lazy
+from harnack.cluster.serialization import load_module
 from harnack.cluster.workers import connected
 from harnack.progress import Advance, progress_bar
 

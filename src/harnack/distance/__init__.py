@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from harnack.distance.curvature import Curvatures, Family, curvature, curvature_lines
-from harnack.distance.signed_distance import (
+from harnack.distance.distance_estimates import (
     DistanceBounds,
     Method,
     closest_points,
     distance_bounds,
     signed_distance,
 )
+from harnack.distance.surface_curvature import Curvatures, Family, curvature, curvature_lines
 
 __all__ = [
     "Curvatures",

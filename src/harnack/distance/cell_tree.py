@@ -18,12 +18,12 @@ from harnack.backend import BoolArray, FloatArray
 from harnack.backend.elementary import fmax, fmin
 from harnack.backend.loops import changed_where
 from harnack.tree import PackedTree, build_hierarchy, for_each, pack, walk
-from harnack.tree.nearest import square_to_some_point
-from harnack.tree.triangles import box_levels
+from harnack.tree.closest_triangles import square_to_some_point
+from harnack.tree.triangle_tree import box_levels
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
-    from harnack.tree.hierarchy import Node, State
+    from harnack.tree.balanced_tree import Node, State
 
 __all__ = ["FAR", "Best", "CellTree", "SurfaceCells"]
 

@@ -14,8 +14,8 @@ from harnack.enclosures.promises import (
     Lipschitz,
     Promise,
 )
-from harnack.enclosures.proofs import Choice, Proofs, any_covers, choose_proofs, longest_step
-from harnack.names import names_that_moved
+from harnack.enclosures.selection import Choice, Proofs, any_covers, choose_proofs, longest_step
+from harnack.name_suggestions import names_that_moved
 
 __all__ = [
     "BoundedLaplacian",

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, ClassVar
 import drjit as dr
 
 from harnack.backend.elementary import clamp, fmax, fmin
-from harnack.enclosures.ball import is_covered, known_ranges, largest_covered, rounding
 from harnack.enclosures.enclosure import Enclosure, Gaps, Slopes
+from harnack.enclosures.free_radius import is_covered, known_ranges, largest_covered, rounding
 from harnack.enclosures.promises import BoundedLaplacian, Promise
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ import drjit as dr
 from harnack.backend.elementary import fmax, fmin
 from harnack.enclosures.enclosure import ROUND_DOWN, Enclosure, Gaps, Slopes
 from harnack.enclosures.parabola import first_root
-from harnack.enclosures.proofs import any_covers, longest_step
+from harnack.enclosures.selection import any_covers, longest_step
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, ClassVar
 import drjit as dr
 
 from harnack.backend.elementary import clamp, fmax, fmin
-from harnack.enclosures.ball import Ball, Condition, is_covered, largest_covered, rounding
 from harnack.enclosures.enclosure import ROUND_DOWN
+from harnack.enclosures.free_radius import Ball, Condition, is_covered, largest_covered, rounding
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real

@@ -15,7 +15,7 @@ from harnack.arithmetic import Affine, Interval, Jet, Parabolas
 from harnack.backend.elementary import fmax, fmin
 from harnack.enclosures.enclosure import ROUND_DOWN, Enclosure, Evaluable, Gaps, Slopes
 from harnack.enclosures.parabola import Parabola
-from harnack.enclosures.pieces import LinearTaylor, QuadraticTaylor
+from harnack.enclosures.piecewise_taylor import LinearTaylor, QuadraticTaylor
 
 if TYPE_CHECKING:
     from typing import Self

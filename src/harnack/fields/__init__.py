@@ -6,11 +6,11 @@ This package exports what all fields share. The fields themselves are names of `
 
 from __future__ import annotations
 
+from harnack.fields.capabilities import NO_SHEET, Crossing
 from harnack.fields.field import Field, Sample
 from harnack.fields.formula import Formula
-from harnack.fields.sheets import NO_SHEET, Crossing
 from harnack.fields.solids.solid import Shape, Solid
-from harnack.names import names_that_moved
+from harnack.name_suggestions import names_that_moved
 
 __all__ = ["NO_SHEET", "Crossing", "Field", "Formula", "Sample", "Shape", "Solid"]
 

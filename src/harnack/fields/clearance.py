@@ -17,19 +17,19 @@ import numpy as np
 
 from harnack.backend import FloatArray, backend_of, choose_backend, to_numpy, to_vector3
 from harnack.backend.elementary import fmax, fmin, largest_coordinate, length
-from harnack.cluster.packing import Remembered
+from harnack.cluster.serialization import Remembered
 from harnack.enclosures import Gaps, Slopes, TargetLevels, choose_proofs, longest_step
-from harnack.fields.batch import BatchedField, SumAtDetail, prepared_once
+from harnack.fields.batched_fields import BatchedField, SumAtDetail, prepared_once
 from harnack.fields.field import Field
-from harnack.tree.cells import Cells, OccupiedCells, carve, union, wrapped_points
+from harnack.tree.empty_space import Cells, OccupiedCells, carve, union, wrapped_points
 
 if TYPE_CHECKING:
     from typing import Self
 
     from harnack.backend import Backend, Precision, Real, Vec3
-    from harnack.fields.look import Sample
+    from harnack.fields.samples import Sample
     from harnack.geometry import ConvexHull, Volume
-    from harnack.tree.cells import Clearance
+    from harnack.tree.empty_space import Clearance
 
 __all__ = ["clearance_of", "distance_below", "occupied_cells", "tight_extent"]
 

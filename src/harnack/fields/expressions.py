@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from harnack import arithmetic
-from harnack.backend.numbers import finite, flag, refuse_derivatives, refuses_derivatives
+from harnack.backend.validation import finite, flag, refuse_derivatives, refuses_derivatives
 from harnack.fields.formula import Formula, as_jet, probe, warn_of_price
 from harnack.geometry.volume import check_volume
-from harnack.names import did_you_mean
+from harnack.name_suggestions import did_you_mean
 
 if TYPE_CHECKING:
     from harnack.geometry import Volume

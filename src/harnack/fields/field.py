@@ -18,19 +18,19 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend.arrays import as_data
-from harnack.backend.numbers import (
+from harnack.backend.tensors import takes_tensors
+from harnack.backend.validation import (
     is_same,
     make_read_only,
     refuse_derivatives,
     refuses_derivatives,
     short_text,
 )
-from harnack.backend.tensors import takes_tensors
-from harnack.cluster.lazy import takes_blocks
+from harnack.cluster.dask_arrays import takes_blocks
 from harnack.enclosures import BoundedLaplacian, Curvature, HarmonicBall, Lipschitz
-from harnack.fields.look import Look, Path, Sample, checked_samples, lengthened
-from harnack.fields.points import also_at_points, at_points
-from harnack.fields.sheets import Boundary, Detail, Parts, Sheets
+from harnack.fields.batch_evaluation import also_at_points, at_points
+from harnack.fields.capabilities import Boundary, Detail, Parts, Sheets
+from harnack.fields.samples import Look, Path, Sample, checked_samples, lengthened
 from harnack.geometry.volume import check_volume
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
     from harnack.backend import Backend, Precision, Real, Vec3
     from harnack.geometry import Volume
-    from harnack.tree.cells import OccupiedCells
+    from harnack.tree.empty_space import OccupiedCells
 
 
 __all__ = [

@@ -29,9 +29,9 @@ from harnack.backend.elementary import fmin, largest_coordinate, length
 from harnack.enclosures import Lipschitz, Slopes
 from harnack.enclosures.enclosure import Piece
 from harnack.enclosures.parabola import Tangent
-from harnack.enclosures.pieces import Pieces
+from harnack.enclosures.piecewise_taylor import Pieces
 from harnack.fields.field import Field
-from harnack.fields.look import Look, Path, Sample
+from harnack.fields.samples import Look, Path, Sample
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3

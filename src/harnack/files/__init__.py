@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from harnack.files import outline as outline
-from harnack.files.file_format import FileFormatError, write_atomically
-from harnack.files.molecules import Atoms, read_molecule
-from harnack.files.surfaces import (
+from harnack.files.file_geometry import FileFormatError, write_atomically
+from harnack.files.geometry_files import (
     ClosedCurves,
     Cloud,
     Mesh,
@@ -13,6 +12,7 @@ from harnack.files.surfaces import (
     read_loops,
     read_surface,
 )
+from harnack.files.molecules import Atoms, read_molecule
 from harnack.files.text_formats import Metaballs
 
 __all__ = [

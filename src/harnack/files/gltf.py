@@ -17,7 +17,7 @@ from urllib.parse import unquote
 import numpy as np
 
 from harnack.backend import FloatArray, IntArray
-from harnack.files.file_format import (
+from harnack.files.file_geometry import (
     MAX_BYTES,
     Contents,
     FileFormatError,

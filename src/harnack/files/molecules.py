@@ -13,7 +13,7 @@ import gemmi
 import numpy as np
 
 from harnack.backend import FloatArray
-from harnack.files.file_format import FileFormatError, Place, read_bytes
+from harnack.files.file_geometry import FileFormatError, Place, read_bytes
 
 PDB_FILES, CIF_FILES = (".pdb", ".ent"), (".cif", ".mmcif")
 MOLECULE_FILES = (*PDB_FILES, *CIF_FILES)

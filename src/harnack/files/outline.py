@@ -1,7 +1,7 @@
 """Outlines for `harnack.Extruded` and `harnack.Revolved`: of text, of SVG files, regular polygons.
 
 Curves are flattened to a stated tolerance. What is returned are loops that do not cross, the region
-on their left, as `harnack.geometry.outlines` makes them.
+on their left, as `harnack.geometry.outline_loops` makes them.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from xml.parsers import expat
 import numpy as np
 
 from harnack.backend import FloatArray
-from harnack.backend.numbers import positive, whole
-from harnack.files.file_format import FileFormatError
+from harnack.backend.validation import positive, whole
+from harnack.files.file_geometry import FileFormatError
 from harnack.geometry.beziers import flattened
-from harnack.geometry.outlines import Outline, Rule, outline_loops
+from harnack.geometry.outline_loops import Outline, Rule, outline_loops
 
 __all__ = ["regular", "svg", "text"]
 

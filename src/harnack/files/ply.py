@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import IntArray
-from harnack.files.file_format import (
+from harnack.files.file_geometry import (
     NO_POLYGONS,
     Contents,
     FileFormatError,

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from harnack.backend import FloatArray, IntArray
-from harnack.files.file_format import (
+from harnack.files.file_geometry import (
     Contents,
     Place,
     Places,
@@ -34,8 +34,8 @@ from harnack.files.text_tables import (
     read_integers,
     read_table,
 )
-from harnack.geometry.chains import weld_vertices
-from harnack.names import renamed
+from harnack.geometry.boundary_edges import weld_vertices
+from harnack.name_suggestions import renamed
 
 
 def read_xyz(path: Path, data: bytes) -> Contents:

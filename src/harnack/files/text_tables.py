@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import FloatArray, IntArray
-from harnack.files.file_format import Place, Places
+from harnack.files.file_geometry import Place, Places
 
 __all__ = [
     "Lines",

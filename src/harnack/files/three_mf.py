@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from harnack.files.file_format import (
+from harnack.files.file_geometry import (
     MAX_BYTES,
     Contents,
     FileFormatError,

@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from types import MappingProxyType
 
-from harnack.gallery.classic import CURVES, HARMONICS, PLANE, SOLIDS
-from harnack.gallery.damaged import MESHES
+from harnack.gallery.analytic import CURVES, HARMONICS, PLANE, SOLIDS
+from harnack.gallery.meshes_and_clouds import MESHES
 from harnack.gallery.outlines import OUTLINES
 from harnack.gallery.scene import Scene
 from harnack.gallery.shells import EXOSKELETONS, SHELLS

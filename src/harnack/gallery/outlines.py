@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from harnack.fields.solids.swept import Extruded
+from harnack.fields.solids.extrusions import Extruded
 from harnack.fields.solids.thread import thread
 from harnack.files import outline
 from harnack.gallery.scene import DRAWN, Scene

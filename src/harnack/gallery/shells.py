@@ -14,7 +14,7 @@ from harnack.fields.solid_angles.polygon_mesh import PolygonMesh
 from harnack.fields.solid_angles.solid_angle import SolidAngle
 from harnack.fields.solids.tube import Tube, Tubes
 from harnack.gallery.scene import DRAWN, Scene
-from harnack.geometry import Circle, HalfSpace, mesh_shapes
+from harnack.geometry import Circle, HalfSpace, example_meshes
 from harnack.geometry.polygon_meshes import polygon_patches
 from harnack.rendering import Camera
 from harnack.tracer import LevelSet, Tolerance, level_set
@@ -25,7 +25,7 @@ _CLOSE = Tolerance(1e-5)
 
 def _exoskeleton() -> list[LevelSet]:
     """A wavy torus of some 150 patches, and tubes around their edges."""
-    vertices, faces = mesh_shapes.torus_mesh(1.0, 0.45, 240, 108)
+    vertices, faces = example_meshes.torus_mesh(1.0, 0.45, 240, 108)
     turn = np.arctan2(vertices[:, 1], vertices[:, 0])
     ring = np.column_stack([np.cos(turn), np.sin(turn), 0.25 * np.sin(3 * turn)])
     across = vertices - np.column_stack([np.cos(turn), np.sin(turn), 0 * turn])
@@ -37,7 +37,7 @@ def _exoskeleton() -> list[LevelSet]:
 
 def _patches() -> list[LevelSet]:
     """A bumpy sphere of 5,200 patches with some eleven corners each."""
-    vertices, faces = mesh_shapes.bumpy_sphere(6)
+    vertices, faces = example_meshes.bumpy_sphere(6)
     mesh = PolygonMesh(*polygon_patches(vertices, faces, 5200))
     return [level_set(mesh, tolerance=_CLOSE)]
 

@@ -18,15 +18,15 @@ from harnack.fields.blobs.blobs import Blobs, Molecule
 from harnack.fields.blobs.hrbf import HRBF
 from harnack.fields.blobs.kernels import Compact
 from harnack.fields.solid_angles.solid_angle import SolidAngle
-from harnack.fields.solids.combined import union
+from harnack.fields.solids.booleans import union
 from harnack.fields.solids.fractal import Displaced, FractalNoise
+from harnack.fields.solids.from_field import solid
 from harnack.fields.solids.julia import Julia
 from harnack.fields.solids.primitives import Sphere, Torus
-from harnack.fields.solids.region import solid
 from harnack.fields.solids.tube import Tube
 from harnack.files import Atoms
 from harnack.gallery.scene import DRAWN, Scene
-from harnack.geometry import shapes
+from harnack.geometry import example_curves
 from harnack.rendering import Camera
 from harnack.tracer import LevelSet, level_set
 
@@ -186,7 +186,7 @@ def _lattice() -> list[LevelSet]:
 
 def _knot() -> list[LevelSet]:
     """A thick Seifert surface of the trefoil knot, and a tube around the knot itself."""
-    curve: FloatArray = shapes.torus_knot(2, 3, 120)
+    curve: FloatArray = example_curves.torus_knot(2, 3, 120)
     surface = solid(SolidAngle(curve), around=(2 * math.pi, 0.12))
     return _drawn(surface, Tube(np.concatenate([curve, curve[:1]]), 0.09))
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from harnack.geometry import mesh_shapes, shapes
+from harnack.geometry import example_curves, example_meshes
+from harnack.geometry.clip_volumes import Ball, Box, HalfSpace, Intersection
 from harnack.geometry.clouds import CloudError, estimate_areas, estimate_normals, validate_cloud
-from harnack.geometry.convexity import ConvexHull
+from harnack.geometry.convex_position import ConvexHull
 from harnack.geometry.curves import (
     Circle,
     CurveError,
@@ -22,7 +23,6 @@ from harnack.geometry.meshes import (
 )
 from harnack.geometry.splines import smooth_curve
 from harnack.geometry.volume import Volume
-from harnack.geometry.volumes import Ball, Box, HalfSpace, Intersection
 
 __all__ = [
     "Ball",
@@ -39,9 +39,9 @@ __all__ = [
     "edges",
     "estimate_areas",
     "estimate_normals",
+    "example_curves",
+    "example_meshes",
     "is_convex_position",
-    "mesh_shapes",
-    "shapes",
     "smooth_curve",
     "total_length",
     "validate_cloud",

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from harnack.backend.numbers import (
+from harnack.backend.validation import (
     TRANSPOSE,
     FloatArray,
     IntArray,
@@ -28,9 +28,9 @@ from harnack.backend.numbers import (
     real_array,
     vector_text,
 )
-from harnack.geometry.chains import weld_vertices
-from harnack.geometry.tangent_cells import TangentCells
-from harnack.names import renamed
+from harnack.geometry.boundary_edges import weld_vertices
+from harnack.geometry.voronoi_areas import TangentCells
+from harnack.name_suggestions import renamed
 
 __all__ = ["CloudError", "estimate_areas", "estimate_normals", "validate_cloud"]
 

@@ -16,7 +16,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from harnack.backend.numbers import (
+from harnack.backend.validation import (
     LARGEST,
     TRANSPOSE,
     FloatArray,
@@ -26,8 +26,8 @@ from harnack.backend.numbers import (
     real_array,
     vector_text,
 )
-from harnack.geometry.convexity import is_convex_position
-from harnack.names import renamed
+from harnack.geometry.convex_position import is_convex_position
+from harnack.name_suggestions import renamed
 
 __all__ = [
     "MAX_VERTICES",

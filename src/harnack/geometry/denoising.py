@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from harnack.backend.numbers import BoolArray, FloatArray, IntArray
+from harnack.backend.validation import BoolArray, FloatArray, IntArray
 from harnack.geometry.clouds import Indices, in_parts, nearest_others, point_tree
 
 __all__ = ["Denoising", "Noise", "lonely_points", "noise_of"]

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from harnack.backend.numbers import (
+from harnack.backend.validation import (
     TRANSPOSE,
     BoolArray,
     FloatArray,

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from harnack.backend.numbers import (
+from harnack.backend.validation import (
     TRANSPOSE,
     BoolArray,
     FloatArray,
@@ -26,8 +26,8 @@ from harnack.backend.numbers import (
     check_vectors,
     real_array,
 )
-from harnack.geometry.chains import boundary_edges, join
-from harnack.geometry.convexity import is_convex_position
+from harnack.geometry.boundary_edges import boundary_edges, join
+from harnack.geometry.convex_position import is_convex_position
 from harnack.geometry.meshes import MAX_FACES, MAX_VERTICES, MeshError
 
 __all__ = ["PolygonFaces", "polygon_patches", "validate_polygons"]

@@ -5,7 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray, IntArray
-from harnack.geometry.chains import boundary_edges, join, net_edges, singular_loops, weld_vertices
+from harnack.geometry.boundary_edges import (
+    boundary_edges,
+    join,
+    net_edges,
+    singular_loops,
+    weld_vertices,
+)
 from harnack.geometry.curves import Loops
 from harnack.geometry.meshes import MeshError
 

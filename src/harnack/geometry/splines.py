@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from harnack.backend.numbers import FloatArray
+from harnack.backend.validation import FloatArray
 from harnack.geometry.curves import (
     MAX_VERTICES,
     CurveScaleError,

@@ -10,7 +10,7 @@ import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
-from harnack.backend.numbers import check_vectors, real, real_array, refuse_derivatives
+from harnack.backend.validation import check_vectors, real, real_array, refuse_derivatives
 
 if TYPE_CHECKING:
     from typing import Self
@@ -38,7 +38,7 @@ class Volume(abc.ABC):
         return super().__new__(cls)
 
     def __and__(self, other: object) -> Volume:
-        from harnack.geometry.volumes import Intersection
+        from harnack.geometry.clip_volumes import Intersection
 
         if not isinstance(other, Volume):
             return NotImplemented

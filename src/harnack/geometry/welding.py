@@ -12,8 +12,8 @@ from typing import Any, cast
 
 import numpy as np
 
-from harnack.backend.numbers import FloatArray, IntArray
-from harnack.geometry.chains import NetFaces, net_faces, singular_edges, weld_vertices
+from harnack.backend.validation import FloatArray, IntArray
+from harnack.geometry.boundary_edges import NetFaces, net_faces, singular_edges, weld_vertices
 from harnack.geometry.meshes import zero_area_faces
 
 __all__ = ["Welded", "rounding_of"]

@@ -1,9 +1,9 @@
 """Triangle meshes of level sets."""
 
 from harnack.meshing.checks import MeshingError
-from harnack.meshing.mesh import mesh
+from harnack.meshing.mesh_pipeline import mesh
 from harnack.meshing.print_checks import PrintCheck, PrintProblem, check_print
-from harnack.meshing.repair import repair
+from harnack.meshing.repair_stages import repair
 from harnack.meshing.thickness import Thickness, thickness
 
 __all__ = [

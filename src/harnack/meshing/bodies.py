@@ -13,10 +13,10 @@ from harnack.geometry import MeshError
 from harnack.meshing.checks import CrossingError, check_manifold, intersecting_faces
 from harnack.meshing.clipping import winding_around
 from harnack.meshing.closed_mesh import grown, manifold_of
+from harnack.meshing.csg_meshing import apart_of
 from harnack.meshing.edges import IntArray, crosses, directed_edges, dots, lengths
 from harnack.meshing.joined_pieces import boundary_of_solid, neighbors, passes_itself
-from harnack.meshing.lattice_surface import Surface
-from harnack.meshing.solids import apart_of
+from harnack.meshing.lattice_meshing import Surface
 
 if TYPE_CHECKING:
     from manifold3d import Manifold

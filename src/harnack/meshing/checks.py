@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import BoolArray, FloatArray
+from harnack.meshing.broad_phase import ROUNDING, near_pairs
 from harnack.meshing.edges import (
     Edges,
     IntArray,
@@ -26,8 +27,7 @@ from harnack.meshing.edges import (
     dots,
     lengths,
 )
-from harnack.meshing.near_faces import ROUNDING, near_pairs
-from harnack.meshing.samples import LevelFunction
+from harnack.meshing.level_function import LevelFunction
 
 if TYPE_CHECKING:
     from harnack.geometry import Volume

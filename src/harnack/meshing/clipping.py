@@ -17,7 +17,7 @@ from harnack.geometry import Ball, Box, ConvexHull, HalfSpace, Intersection, Vol
 from harnack.geometry.meshes import solid_angles
 from harnack.meshing.checks import MeshingError
 from harnack.meshing.edges import IntArray, boundary_edges, crosses, dots, edge_keys
-from harnack.meshing.lattice_surface import Surface
+from harnack.meshing.lattice_meshing import Surface
 
 __all__ = [
     "Shells",

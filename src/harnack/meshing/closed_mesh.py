@@ -10,7 +10,7 @@ import trimesh
 
 from harnack.backend import BoolArray, FloatArray
 from harnack.geometry import Ball, Box, ConvexHull, HalfSpace, Intersection
-from harnack.geometry.outlines import Outline, for_clipper
+from harnack.geometry.outline_loops import Outline, for_clipper
 from harnack.meshing.checks import (
     CrossingError,
     LocalError,
@@ -19,8 +19,8 @@ from harnack.meshing.checks import (
     intersecting_faces,
 )
 from harnack.meshing.edges import IntArray, dots, numbered
-from harnack.meshing.lattice_surface import Surface
-from harnack.meshing.uncrossing import made_apart
+from harnack.meshing.lattice_meshing import Surface
+from harnack.meshing.self_intersection_repair import made_apart
 
 if TYPE_CHECKING:
     from manifold3d import CrossSection, Manifold

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from harnack.backend import FloatArray
-from harnack.backend.numbers import real, whole
+from harnack.backend.validation import real, whole
 from harnack.meshing.checks import MeshingError, euler_characteristic, intersecting_faces
 from harnack.meshing.closed_mesh import manifold_of, surface_of, without_short_edges
 from harnack.meshing.edges import (
@@ -22,9 +22,9 @@ from harnack.meshing.edges import (
     edge_keys,
     lengths,
 )
-from harnack.meshing.lattice_surface import Surface
-from harnack.meshing.samples import LevelFunction
-from harnack.meshing.uncrossing import made_apart
+from harnack.meshing.lattice_meshing import Surface
+from harnack.meshing.level_function import LevelFunction
+from harnack.meshing.self_intersection_repair import made_apart
 
 if TYPE_CHECKING:
     from collections.abc import Callable

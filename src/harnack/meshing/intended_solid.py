@@ -20,8 +20,8 @@ from harnack.geometry import MeshError, validate_mesh, without_zero_area_faces
 from harnack.geometry.welding import Welded
 from harnack.meshing.bodies import closed_parts, nested, volume_of
 from harnack.meshing.edges import IntArray, crosses, distance_from_triangles, dots, lengths
-from harnack.meshing.lattice_surface import Surface
-from harnack.meshing.sound import against_neighbors
+from harnack.meshing.lattice_meshing import Surface
+from harnack.meshing.mesh_cleaning import against_neighbors
 
 __all__ = ["Difference", "IntendedSolid"]
 

@@ -50,9 +50,9 @@ from typing import Any
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
+from harnack.meshing.delaunay_points import Boundary, PointSet
 from harnack.meshing.edges import IntArray
-from harnack.meshing.points import Boundary, PointSet
-from harnack.meshing.samples import LevelFunction
+from harnack.meshing.level_function import LevelFunction
 
 __all__ = ["Isotopy", "isotopy_of"]
 

@@ -16,15 +16,15 @@ from typing import Any, cast
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray, choose_backend
-from harnack.geometry.chains import singular_edges
+from harnack.geometry.boundary_edges import singular_edges
 from harnack.geometry.meshes import without_zero_area_faces
 from harnack.meshing.checks import MeshingError, touching_pairs
 from harnack.meshing.edges import Edges, IntArray, crosses, directed_edges, dots, lengths
-from harnack.meshing.lattice_surface import Surface
+from harnack.meshing.lattice_meshing import Surface
 from harnack.tree import build_hierarchy
 from harnack.tree.coplanar import overlapping_faces
-from harnack.tree.pieces import pieces_of_faces, windings_of_sides
-from harnack.tree.triangles import TriangleRays, triangle_records
+from harnack.tree.triangle_splitting import pieces_of_faces, windings_of_sides
+from harnack.tree.triangle_tree import TriangleRays, triangle_records
 
 __all__ = ["boundary_of_solid", "near_groups", "neighbors", "passes_itself"]
 

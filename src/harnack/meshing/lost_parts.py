@@ -27,7 +27,7 @@ from harnack.fields.solid_angles.oriented_points import OrientedPoints
 from harnack.fields.solid_angles.winding_number import WindingNumber
 from harnack.meshing.checks import point_text
 from harnack.meshing.edges import IntArray, crosses, distances_from_triangles, lengths
-from harnack.meshing.lattice_surface import Surface
+from harnack.meshing.lattice_meshing import Surface
 from harnack.meshing.sign_function import SignFunction
 
 if TYPE_CHECKING:

@@ -24,9 +24,9 @@ import numpy as np
 from harnack.backend import BoolArray, FloatArray
 from harnack.fields import Field
 from harnack.meshing.checks import LocalError, MeshingError
+from harnack.meshing.delaunay_points import PointSet
 from harnack.meshing.edges import Edges, IntArray, crosses, dots, edge_keys, lengths
-from harnack.meshing.points import PointSet
-from harnack.meshing.samples import LevelFunction
+from harnack.meshing.level_function import LevelFunction
 
 __all__ = [
     "BEYOND",

@@ -12,9 +12,9 @@ from typing import Any, cast
 import numpy as np
 
 from harnack.backend import FloatArray
-from harnack.backend.numbers import positive
+from harnack.backend.validation import positive
 from harnack.fields.solids.mesh_solid import MeshSolid
-from harnack.files.surfaces import Mesh, read_surface
+from harnack.files.geometry_files import Mesh, read_surface
 from harnack.geometry import MeshError, validate_mesh, zero_area_faces
 from harnack.geometry.welding import Welded
 from harnack.meshing.checks import (
@@ -25,7 +25,7 @@ from harnack.meshing.checks import (
 )
 from harnack.meshing.clipping import Shells
 from harnack.meshing.edges import Edges, IntArray, directed_edges, lengths
-from harnack.meshing.lattice_surface import Surface
+from harnack.meshing.lattice_meshing import Surface
 from harnack.meshing.thickness import thickness
 
 __all__ = ["PrintCheck", "PrintProblem", "check_print"]

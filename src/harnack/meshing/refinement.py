@@ -14,6 +14,7 @@ import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
 from harnack.meshing.checks import check_count
+from harnack.meshing.delaunay_points import newton
 from harnack.meshing.edges import (
     Edges,
     IntArray,
@@ -23,9 +24,8 @@ from harnack.meshing.edges import (
     dots,
     lengths,
 )
-from harnack.meshing.points import newton
-from harnack.meshing.relaxation import flipped, relaxed, without_slivers
-from harnack.meshing.samples import LevelFunction, Samples
+from harnack.meshing.level_function import LevelFunction, Samples
+from harnack.meshing.mesh_improvement import flipped, relaxed, without_slivers
 
 __all__ = ["far_places", "improved", "refined", "smoothed", "smoothed_within", "split_faces"]
 

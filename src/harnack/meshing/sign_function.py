@@ -17,21 +17,21 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray, choose_backend
-from harnack.backend.numbers import vector_text
+from harnack.backend.validation import vector_text
 from harnack.enclosures import TargetLevels
-from harnack.fields.batch import BatchedField
+from harnack.fields.batch_evaluation import in_batches
+from harnack.fields.batched_fields import BatchedField
 from harnack.fields.blobs.blobs import Blobs
 from harnack.fields.blobs.hrbf import HRBF
+from harnack.fields.capabilities import NO_SHEET, Crossing
 from harnack.fields.clearance import distance_below
-from harnack.fields.points import in_batches
-from harnack.fields.sheets import NO_SHEET, Crossing
 from harnack.fields.solid_angles.dipole import DipolePotential
 from harnack.fields.solid_angles.winding_number import WindingModuloOne, WindingNumber
 from harnack.geometry.clouds import point_tree
 from harnack.geometry.denoising import lonely_points
 from harnack.meshing.checks import MeshingError
 from harnack.meshing.edges import dots, lengths
-from harnack.meshing.samples import LevelFunction, Samples
+from harnack.meshing.level_function import LevelFunction, Samples
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Precision, Real, Vec3

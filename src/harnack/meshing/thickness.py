@@ -11,7 +11,7 @@ from harnack.backend import BoolArray, FloatArray, choose_backend, to_numpy, to_
 from harnack.fields import Solid
 from harnack.fields.solids.mesh_solid import MeshSolid, solid_of_mesh
 from harnack.meshing.edges import IntArray, crosses, dots, lengths
-from harnack.meshing.mesh import mesh
+from harnack.meshing.mesh_pipeline import mesh
 from harnack.tracer import trace
 
 if TYPE_CHECKING:

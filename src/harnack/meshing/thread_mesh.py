@@ -11,7 +11,7 @@ from harnack.backend import FloatArray, IntArray
 from harnack.fields.solids.thread import Thread
 from harnack.meshing.checks import MeshingError
 from harnack.meshing.closed_mesh import manifold_of
-from harnack.meshing.lattice_surface import Surface
+from harnack.meshing.lattice_meshing import Surface
 
 if TYPE_CHECKING:
     from manifold3d import Manifold

@@ -14,7 +14,7 @@ from harnack.fields.solids.tube import Tube
 from harnack.meshing.checks import MeshingError, intersecting_faces
 from harnack.meshing.closed_mesh import manifold_of
 from harnack.meshing.edges import lengths
-from harnack.meshing.lattice_surface import Surface
+from harnack.meshing.lattice_meshing import Surface
 
 if TYPE_CHECKING:
     from manifold3d import Manifold

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from harnack.rendering.arguments import SHOW_MODES
+from harnack.rendering.animation import animate
 from harnack.rendering.camera import Camera
-from harnack.rendering.film import animate
 from harnack.rendering.framing import UnboundedSurfaceError
 from harnack.rendering.images import Picture
 from harnack.rendering.isolines import Isolines
+from harnack.rendering.mitsuba_plugins import register, register_surfaces, shape
 from harnack.rendering.picture import render
-from harnack.rendering.plugins import register, register_surfaces, shape
+from harnack.rendering.render_options import SHOW_MODES
 from harnack.rendering.stage import MATERIALS, Material
 
 __all__ = [

@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import FloatArray
-from harnack.files.file_format import Place, read_bytes
-from harnack.names import did_you_mean
+from harnack.files.file_geometry import Place, read_bytes
+from harnack.name_suggestions import did_you_mean
 from harnack.rendering.mitsuba import load_mitsuba
 from harnack.rendering.scales import NAMED_COLORS, Color, color_of
 

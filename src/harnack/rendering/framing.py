@@ -16,10 +16,10 @@ import numpy as np
 
 from harnack.backend import FloatArray, to_float, to_numpy, to_vector3
 from harnack.fields import Solid
-from harnack.fields.batch import FieldCache
+from harnack.fields.batched_fields import FieldCache
 from harnack.geometry.volume import checked_point
-from harnack.names import did_you_mean
-from harnack.rendering.placement import PlacedSurface, Placement
+from harnack.name_suggestions import did_you_mean
+from harnack.rendering.placed_surface import PlacedSurface, Placement
 from harnack.tracer import Tolerance
 
 if TYPE_CHECKING:

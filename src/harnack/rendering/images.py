@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import FloatArray
-from harnack.files.file_format import check_writable, write_atomically
+from harnack.files.file_geometry import check_writable, write_atomically
 from harnack.rendering.mitsuba import load_mitsuba
 
 FloatImage = npt.NDArray[np.float32]

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 
 from harnack.backend.loops import gathered, leaves_of, rows_of, wide
+from harnack.rendering.hybrid_scene import World, connecting_ray, leaving_ray
 from harnack.rendering.mitsuba import load_mitsuba, transmittance
-from harnack.rendering.world import World, connecting_ray, leaving_ray
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real

@@ -30,7 +30,7 @@ import numpy as np
 
 from harnack.backend import aligned
 from harnack.backend.elementary import length as norm
-from harnack.backend.numbers import positive
+from harnack.backend.validation import positive
 from harnack.fields import Field
 from harnack.fields.expressions import expression
 from harnack.rendering.scales import Color, color_of

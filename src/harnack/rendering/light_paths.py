@@ -16,10 +16,10 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import Mask, Real, to_numpy
+from harnack.rendering.hybrid_scene import World, leaving_ray
 from harnack.rendering.integrator import PathTracer, Radiance, SobolSampler
 from harnack.rendering.mitsuba import index_of, refracted, transmittance
 from harnack.rendering.shading import Hands, Light, OwnHands, bands, film_places, uploaded
-from harnack.rendering.world import World, leaving_ray
 
 # Paths of one band at most: about two seconds on a CPU. Ctrl-C works between bands.
 PATHS_A_BAND = 2**21

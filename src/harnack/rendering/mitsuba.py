@@ -18,8 +18,8 @@ import numpy as np
 
 from harnack.backend import Backend, backend_of, choose_backend
 from harnack.fields.expressions import looks_like_formula
-from harnack.files.file_format import MAX_BYTES, Place, read_bytes
-from harnack.files.surfaces import SURFACE_FILES
+from harnack.files.file_geometry import MAX_BYTES, Place, read_bytes
+from harnack.files.geometry_files import SURFACE_FILES
 
 _USABLE = re.compile(r"(llvm|cuda|metal)_ad_(mono|rgb|spectral)(_double)?")
 

@@ -12,10 +12,10 @@ import numpy as np
 import numpy.typing as npt
 from rich.console import Console
 
-from harnack.cluster.parts import crew
+from harnack.cluster.executor import crew
 from harnack.fields import Field
 from harnack.progress import Advance, progress_bar
-from harnack.rendering.arguments import OF_STUDIO, Request, check_tiles, refuse_studio_settings
+from harnack.rendering.aov_render import VIEWS, Viewer, drawn
 from harnack.rendering.backdrops import Ground
 from harnack.rendering.camera import Camera
 from harnack.rendering.images import Picture, check_picture_path, tone_mapped, write_image
@@ -28,13 +28,13 @@ from harnack.rendering.light_paths import (
     load_denoiser,
     pace_of,
 )
-from harnack.rendering.picture_job import EDGE_SPP, Elsewhere, PictureJob
-from harnack.rendering.plugins import register
-from harnack.rendering.shaded import Shading, shaded
+from harnack.rendering.mitsuba_plugins import register
+from harnack.rendering.render_job import EDGE_SPP, Elsewhere, PictureJob
+from harnack.rendering.render_options import OF_STUDIO, Request, check_tiles, refuse_studio_settings
+from harnack.rendering.shaded_render import Shading, shaded
 from harnack.rendering.shading import Hands, OwnHands, flat, wall
 from harnack.rendering.stage import Studio
-from harnack.rendering.studio_scene import MaterialLike
-from harnack.rendering.views import VIEWS, Viewer, drawn
+from harnack.rendering.studio_surfaces import MaterialLike
 from harnack.tracer import LevelSet
 
 ShowMode = Literal["color", "shaded", "normal", "evaluations", "status", "depth", "value"]

@@ -12,7 +12,7 @@ from typing import Any, cast
 import numpy as np
 import numpy.typing as npt
 
-from harnack.names import did_you_mean
+from harnack.name_suggestions import did_you_mean
 from harnack.rendering.images import transferred
 
 Color = tuple[float, float, float]

@@ -14,14 +14,14 @@ from typing import Any, cast
 import numpy as np
 
 from harnack.backend import FloatArray
-from harnack.names import did_you_mean
+from harnack.name_suggestions import did_you_mean
 from harnack.rendering.backdrops import FLOOR, Backdrop, Ground, ground, lights
 from harnack.rendering.camera import Camera, Pose
 from harnack.rendering.framing import check_offset, check_size, upright, visible_points
 from harnack.rendering.isolines import Isolines
 from harnack.rendering.mitsuba import mitsuba_backend
-from harnack.rendering.placement import Placement
-from harnack.rendering.plugins import shape
+from harnack.rendering.mitsuba_plugins import shape
+from harnack.rendering.placed_surface import Placement
 from harnack.rendering.scales import NAMED_COLORS, Color, color_of, linear
 from harnack.tracer import LevelSet, Tolerance
 

@@ -6,8 +6,8 @@ on random functions of every kind, among them the extremal ones. Both raise `Bro
 
 from __future__ import annotations
 
-from harnack.testing.bound_contracts import check_bound
+from harnack.testing.enclosure_contracts import check_bound
 from harnack.testing.field_contracts import check_field, check_looks
-from harnack.testing.worst_places import BrokenPromiseError, scaled
+from harnack.testing.violation_search import BrokenPromiseError, scaled
 
 __all__ = ["BrokenPromiseError", "check_bound", "check_field", "check_looks", "scaled"]

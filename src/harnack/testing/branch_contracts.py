@@ -9,7 +9,7 @@ import numpy as np
 
 from harnack.backend import FloatArray, choose_backend, to_numpy
 from harnack.fields.analytic.branches import complex_type
-from harnack.testing.worst_places import require
+from harnack.testing.violation_search import require
 
 if TYPE_CHECKING:
     from harnack.fields.analytic.branches import BranchPoint

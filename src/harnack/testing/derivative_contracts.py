@@ -12,8 +12,14 @@ import numpy.typing as npt
 
 from harnack.backend import BoolArray, FloatArray, choose_backend, to_numpy, to_vector3
 from harnack.enclosures import BoundedLaplacian, HarmonicBall
-from harnack.fields.batch import BatchedField
-from harnack.testing.worst_places import BrokenPromiseError, FieldValues, jumps, look_at, require
+from harnack.fields.batched_fields import BatchedField
+from harnack.testing.violation_search import (
+    BrokenPromiseError,
+    FieldValues,
+    jumps,
+    look_at,
+    require,
+)
 
 if TYPE_CHECKING:
     from harnack.fields.field import Field

@@ -10,7 +10,7 @@ import numpy as np
 
 from harnack.backend import FloatArray, choose_backend, to_numpy, to_vector3
 from harnack.backend.arrays import finite_vectors
-from harnack.backend.numbers import real, whole
+from harnack.backend.validation import real, whole
 from harnack.enclosures import (
     Choice,
     Curvature,
@@ -21,12 +21,12 @@ from harnack.enclosures import (
     longest_step,
 )
 from harnack.fields.analytic.riemann_surface import RiemannSurface
-from harnack.fields.batch import BatchedField
+from harnack.fields.batched_fields import BatchedField
 from harnack.fields.field import Field, check_is_field
-from harnack.fields.look import Path
+from harnack.fields.samples import Path
 from harnack.testing.branch_contracts import check_branch_points
 from harnack.testing.derivative_contracts import check_derivatives
-from harnack.testing.worst_places import (
+from harnack.testing.violation_search import (
     BrokenPromiseError,
     FieldValues,
     look_at,

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from harnack.tracer.all_hits import AllHits
-from harnack.tracer.contact import Status, Tolerance
+from harnack.tracer.crossings import AllHits
 from harnack.tracer.hits import Hits, trace
-from harnack.tracer.prepared import MarchResult, PreparedLevelSet
+from harnack.tracer.level_contact import Status, Tolerance
 from harnack.tracer.surface import LevelSet, level_set
+from harnack.tracer.surface_tracer import MarchResult, PreparedLevelSet
 
 __all__ = [
     "AllHits",

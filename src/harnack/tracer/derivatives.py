@@ -17,15 +17,15 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 
 from harnack.backend.elementary import length as norm
-from harnack.backend.numbers import holds_numbers_alone
+from harnack.backend.validation import holds_numbers_alone
 from harnack.enclosures import TargetLevels
-from harnack.fields.batch import FieldCache
-from harnack.fields.sheets import NO_TRUNCATION
-from harnack.tracer.contact import Status
+from harnack.fields.batched_fields import FieldCache
+from harnack.fields.capabilities import NO_TRUNCATION
+from harnack.tracer.level_contact import Status
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real, Vec3
-    from harnack.tracer.prepared import MarchResult, PreparedLevelSet
+    from harnack.tracer.surface_tracer import MarchResult, PreparedLevelSet
 
 # Newton steps that bring a hit from the tolerance to rounding before the derivative is taken; and
 # for sums over trees, which are then evaluated without truncation.

@@ -14,7 +14,7 @@ import drjit as dr
 
 from harnack.backend.elementary import fmax, length, unit
 from harnack.backend.loops import while_active
-from harnack.fields.look import value_error
+from harnack.fields.samples import value_error
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3

@@ -18,18 +18,18 @@ from harnack.backend.elementary import fmax, largest_coordinate, unit
 from harnack.backend.elementary import length as norm
 from harnack.backend.loops import on_some
 from harnack.backend.tensors import is_tensor, numbers_of, tensor_of, vectors_of
-from harnack.cluster.lazy import takes_blocks
-from harnack.names import is_one_of
-from harnack.tracer.all_hits import (
+from harnack.cluster.dask_arrays import takes_blocks
+from harnack.name_suggestions import is_one_of
+from harnack.tracer.crossings import (
     AllHits,
     check_all_hits,
     crossings_as_numpy,
     no_crossings,
     trace_all,
 )
-from harnack.tracer.contact import Status, Tolerance
 from harnack.tracer.derivatives import attach, refuse_derivative, wants_derivatives
 from harnack.tracer.doubtful import Doubtful, seen_distance
+from harnack.tracer.level_contact import Status, Tolerance
 from harnack.tracer.surface import LevelSet, level_set
 from harnack.webgpu import evaluate, find_device
 
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from harnack.enclosures import Choice
     from harnack.fields.field import Field
     from harnack.geometry import Volume
-    from harnack.tracer.prepared import MarchResult, PreparedLevelSet
+    from harnack.tracer.surface_tracer import MarchResult, PreparedLevelSet
     from harnack.webgpu import Arrays
 
 # From so many rays on it pays to look for empty cells first.

@@ -14,9 +14,9 @@ import drjit as dr
 from harnack.backend.elementary import clamp, fmax, fmin, largest_coordinate, length
 from harnack.backend.loops import while_active
 from harnack.enclosures import any_covers, longest_step
-from harnack.fields.look import value_error
-from harnack.fields.sheets import NO_SHEET, Crossing
-from harnack.tracer.contact import (
+from harnack.fields.capabilities import NO_SHEET, Crossing
+from harnack.fields.samples import value_error
+from harnack.tracer.level_contact import (
     AIM,
     CLOSER,
     Accepted,
@@ -33,9 +33,9 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.enclosures import Gaps, TargetLevels
     from harnack.fields.field import Field
-    from harnack.fields.look import Look, Path
-    from harnack.tracer.whole_numbers import WholeNumbers
-    from harnack.tree.cells import UniformGrid
+    from harnack.fields.samples import Look, Path
+    from harnack.tracer.branch_tracker import WholeNumbers
+    from harnack.tree.empty_space import UniformGrid
 
 # A coarse sample is repeated at higher detail where a level is closer in value than this many times
 # its total error. The detail is chosen to make truncation this fraction of that distance, or of

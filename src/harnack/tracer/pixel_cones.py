@@ -16,13 +16,13 @@ import drjit as dr
 
 from harnack.backend.elementary import fmax, fmin, length
 from harnack.backend.loops import while_active
-from harnack.fields.look import Path
-from harnack.tracer.contact import PreparedTolerance, Status
+from harnack.fields.samples import Path
+from harnack.tracer.level_contact import PreparedTolerance, Status
 from harnack.tracer.march import March, MarchState
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real, Vec3
-    from harnack.tracer.prepared import PreparedLevelSet
+    from harnack.tracer.surface_tracer import PreparedLevelSet
 
 # A passage through the cover begins within this fraction of a radius outside of it, and ends so
 # many radii off the surface; steps are aimed this many radii farther than that, or than a radius

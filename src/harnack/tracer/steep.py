@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.enclosures import Gaps, TargetLevels
     from harnack.fields.field import Field
-    from harnack.fields.look import Path, Sample
+    from harnack.fields.samples import Path, Sample
 
 # A level may be the value of f up to rounding where it is farther than f changes by rounding by no
 # more than this factor, if f changes on the other side by no more than so many times as much.

@@ -13,21 +13,21 @@ import numpy as np
 
 from harnack.backend import backend_of, to_float
 from harnack.backend.arrays import as_data
-from harnack.backend.numbers import flag, refuse_derivatives, whole
 from harnack.backend.tensors import is_tensor, numbers_of
+from harnack.backend.validation import flag, refuse_derivatives, whole
 from harnack.enclosures import Choice, Proofs, TargetLevels, choose_proofs
 from harnack.fields.field import check_is_field
 from harnack.geometry import Intersection
 from harnack.geometry.volume import check_volume
-from harnack.tracer.contact import Tolerance
-from harnack.tracer.largest import checked_largest, largest_cells
-from harnack.tracer.prepared import PreparedLevelSet
+from harnack.tracer.largest_component import checked_largest, largest_cells
+from harnack.tracer.level_contact import Tolerance
+from harnack.tracer.surface_tracer import PreparedLevelSet
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real
     from harnack.fields.field import Field
     from harnack.geometry import Volume
-    from harnack.tree.cells import OccupiedCells
+    from harnack.tree.empty_space import OccupiedCells
 
 _T = TypeVar("_T")
 

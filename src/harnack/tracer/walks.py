@@ -1,4 +1,5 @@
-"""Rays through fields with sheets or parts (see `harnack.fields.sheets`), by the loop of `March`.
+"""Rays through fields with sheets or parts (see `harnack.fields.capabilities`), by the loop of
+`March`.
 
 - `SheetTracer`: fields that jump. A ray goes from one crossing of a sheet to the next.
 - `PartTracer`: surfaces made of many level sets, each in a box. A ray finds the first hit of all.
@@ -14,14 +15,14 @@ import drjit as dr
 
 from harnack.backend.elementary import fmax, fmin, largest_coordinate
 from harnack.backend.loops import while_active
-from harnack.fields.sheets import NO_PART, NO_SHEET, Crossing, PartEntry
-from harnack.tracer.contact import ON_SHEET, Status
+from harnack.fields.capabilities import NO_PART, NO_SHEET, Crossing, PartEntry
+from harnack.tracer.level_contact import ON_SHEET, Status
 from harnack.tracer.march import March, MarchState
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.fields.field import Field
-    from harnack.fields.look import Path
+    from harnack.fields.samples import Path
 
 # Two sheets count as crossed at the same point if they are no farther apart than so many roundings
 # of coordinates, and the cosine of the angle between them is larger than the second number. The

@@ -5,7 +5,7 @@ Built in NumPy, traversed in Dr.Jit. No formulas.
 
 from __future__ import annotations
 
-from harnack.tree.hierarchy import (
+from harnack.tree.balanced_tree import (
     NO_PRIMITIVE,
     Hierarchy,
     Node,

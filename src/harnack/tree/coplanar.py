@@ -14,8 +14,8 @@ import numpy as np
 from harnack.backend import FloatArray, IntArray, to_numpy, to_vector3
 from harnack.backend.arrays import aligned_integers
 from harnack.backend.elementary import fmax, fmin
-from harnack.tree.hierarchy import Node, State, for_each, walk
-from harnack.tree.triangles import INDEX, NO_TRIANGLE, TriangleRays, corners_of
+from harnack.tree.balanced_tree import Node, State, for_each, walk
+from harnack.tree.triangle_tree import INDEX, NO_TRIANGLE, TriangleRays, corners_of
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real, Vec3

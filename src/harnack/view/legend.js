@@ -1,4 +1,4 @@
-// What the colors of a picture mean, beside it: see harnack.view.legends.
+// What the colors of a picture mean, beside it: see harnack.view.legend_data.
 // @ts-check
 
 import { element, format } from "./elements.js";

@@ -20,17 +20,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from harnack.cluster.parts import Arrays, Crew, crew
-from harnack.files.file_format import write_atomically
+from harnack.cluster.executor import Arrays, Crew, crew
+from harnack.files.file_geometry import write_atomically
 from harnack.progress import progress_bar
 from harnack.rendering.camera import Camera
 from harnack.rendering.mitsuba import take_variant
-from harnack.rendering.plugins import register
-from harnack.view.scene import Controls, Live, difference, packed
+from harnack.rendering.mitsuba_plugins import register
+from harnack.view.live_scene import Controls, Live, difference, packed
 from harnack.view.sliders import at_place
 
 if TYPE_CHECKING:
-    from harnack.view.scene import Plain
+    from harnack.view.live_scene import Plain
 
 __all__ = ["MODULES", "check_title", "document", "page", "resource", "script", "still_of"]
 

@@ -15,7 +15,7 @@ import { legend_of } from "./legend.js";
  *     settings: Settings, checks: boolean}): Promise<Change>,
  *   ask?(kind: string, given: object, on_progress?: (done: number, stop: () => void) => void): Promise<any>,
  * }} Link */
-/** Settings of `harnack.render` that are changed here: see `CONTROLLED` in harnack.view.scene.
+/** Settings of `harnack.render` that are changed here: see `CONTROLLED` in harnack.view.live_scene.
  * @typedef {{material?: string, boundary?: number | null}} Settings */
 /** A volume that cuts all surfaces: see `harnack.view.session`.
  * @typedef {{ball?: number[], box?: number[], plane?: number[]}} Cut */

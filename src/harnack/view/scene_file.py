@@ -34,8 +34,8 @@ from typing import Any, cast
 import numpy as np
 
 from harnack import geometry
-from harnack.backend.numbers import positive, real
-from harnack.enclosures.proofs import choose_proofs
+from harnack.backend.validation import positive, real
+from harnack.enclosures.selection import choose_proofs
 from harnack.field_from_file import open_surface
 from harnack.fields import Field, Solid, solids
 from harnack.fields.analytic.periodic import Gyroid, SchwarzD, SchwarzP
@@ -43,18 +43,18 @@ from harnack.fields.analytic.polynomial import SphericalHarmonic
 from harnack.fields.expressions import Expression, TextFormula, expression
 from harnack.fields.solid_angles.solid_angle import SolidAngle
 from harnack.fields.solids.solid import Map
-from harnack.files.file_format import write_atomically
+from harnack.files.file_geometry import write_atomically
 from harnack.gallery import SCENES
 from harnack.geometry import Volume
-from harnack.names import did_you_mean
+from harnack.name_suggestions import did_you_mean
 from harnack.rendering import Camera, Isolines
-from harnack.rendering.arguments import OF_STUDIO, SETTINGS, Request
 from harnack.rendering.framing import upright
+from harnack.rendering.render_options import OF_STUDIO, SETTINGS, Request
 from harnack.rendering.stage import material_of
-from harnack.rendering.studio_scene import with_settings
+from harnack.rendering.studio_surfaces import with_settings
 from harnack.tracer import LevelSet, Tolerance, level_set
 from harnack.view.sliders import NUMBERS, Slider
-from harnack.view.value_types import check_types
+from harnack.view.type_checks import check_types
 
 __all__ = [
     "Origins",

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, cast
 
-from harnack.backend.numbers import whole
+from harnack.backend.validation import whole
+from harnack.view.live_scene import Live
 from harnack.view.page import check_title, document, still_of
-from harnack.view.scene import Live
 from harnack.view.scene_file import Origins
 from harnack.view.session import Client, QuestionError
 from harnack.view.sliders import ends_of
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from aiohttp import web
 
-    from harnack.view.scene import Plain
+    from harnack.view.live_scene import Plain
     from harnack.view.widget import Widget
 
 __all__ = ["View", "check_height", "view"]

@@ -14,17 +14,16 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from harnack.backend.numbers import finite
+from harnack.backend.validation import finite
 from harnack.distance import curvature
 from harnack.geometry import Ball, Box, HalfSpace
-from harnack.names import did_you_mean
+from harnack.name_suggestions import did_you_mean
 from harnack.rendering import Camera
-from harnack.rendering.arguments import check_size
 from harnack.rendering.backdrops import GROUNDS
+from harnack.rendering.render_options import check_size
 from harnack.rendering.stage import material_of
 from harnack.tracer import Status, trace
-from harnack.view.painter import Eye, Painted, Painter
-from harnack.view.scene import (
+from harnack.view.live_scene import (
     CONTROLLED,
     SHOWS,
     Controls,
@@ -35,6 +34,7 @@ from harnack.view.scene import (
     packed,
     paints_of,
 )
+from harnack.view.preview_renderer import Eye, Painted, Painter
 from harnack.view.scene_file import scene_of
 from harnack.view.sliders import ends_of
 
@@ -42,8 +42,8 @@ if TYPE_CHECKING:
     from harnack.backend import FloatArray
     from harnack.geometry import Volume
     from harnack.rendering.stage import StudioObject
-    from harnack.view.painter import Painting
-    from harnack.view.scene import Plain
+    from harnack.view.live_scene import Plain
+    from harnack.view.preview_renderer import Painting
 
 __all__ = ["Client", "QuestionError", "Session", "pose_of"]
 

@@ -10,9 +10,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, cast
 
-from harnack.backend.numbers import finite
+from harnack.backend.validation import finite
 from harnack.fields import Field
-from harnack.names import did_you_mean
+from harnack.name_suggestions import did_you_mean
 from harnack.tracer import LevelSet, level_set
 
 __all__ = ["NUMBERS", "PlaceError", "Slider", "Subject", "at_place", "ends_of"]

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any, cast
 import anywidget
 import traitlets
 
+from harnack.view.live_scene import SHOWS
 from harnack.view.page import MODULES, resource, script, still_of
-from harnack.view.scene import SHOWS
 from harnack.view.server import check_height
 from harnack.view.session import Client, QuestionError, pose_of
 
 if TYPE_CHECKING:
-    from harnack.view.scene import Live, Plain
+    from harnack.view.live_scene import Live, Plain
 
 __all__ = ["Widget"]
 

@@ -12,7 +12,7 @@ from harnack.webgpu.device import (
     evaluate,
     find_device,
 )
-from harnack.webgpu.kernel import UntranslatableError
+from harnack.webgpu.llvm_parser import UntranslatableError
 from harnack.webgpu.recording import Recording, leaves, record
 
 __all__ = [

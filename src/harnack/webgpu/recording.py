@@ -19,7 +19,7 @@ from typing import Any, cast
 
 import drjit as dr
 
-from harnack.webgpu.kernel import parse
+from harnack.webgpu.llvm_parser import parse
 from harnack.webgpu.wgsl import Shader, shader_of
 
 __all__ = ["Recording", "leaves", "record"]

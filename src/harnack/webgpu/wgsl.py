@@ -11,7 +11,7 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 
-from harnack.webgpu.kernel import (
+from harnack.webgpu.llvm_parser import (
     Constant,
     Kernel,
     Load,

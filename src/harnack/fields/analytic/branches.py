@@ -12,7 +12,7 @@ import drjit as dr
 
 from harnack.backend import backend_of
 from harnack.backend.elementary import fmax, fmin, sincos
-from harnack.backend.numbers import real, refuse_derivatives
+from harnack.backend.validation import real, refuse_derivatives
 
 if TYPE_CHECKING:
     from collections.abc import Callable

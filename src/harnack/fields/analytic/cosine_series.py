@@ -18,7 +18,7 @@ import numpy as np
 
 from harnack.backend import aligned
 from harnack.backend.elementary import clamp, fmin, sincos
-from harnack.backend.records import Records
+from harnack.backend.record_table import Records
 from harnack.enclosures import Curvature
 
 if TYPE_CHECKING:

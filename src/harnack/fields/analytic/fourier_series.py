@@ -13,12 +13,12 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import backend_of
-from harnack.backend.numbers import real_array
+from harnack.backend.validation import real_array
 from harnack.fields.analytic.cosine_series import CosineBounds, CosineSums, fit_cosines, midpoints
 from harnack.fields.analytic.waves import mean_wavelength
-from harnack.fields.batch import prepared_once
+from harnack.fields.batched_fields import prepared_once
 from harnack.fields.field import Field, Sample, check_in_range
-from harnack.geometry.volumes import Box
+from harnack.geometry.clip_volumes import Box
 
 if TYPE_CHECKING:
     from typing import Self

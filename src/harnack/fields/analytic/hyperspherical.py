@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any, cast
 import drjit as dr
 
 from harnack.backend.elementary import fmax, fmin
-from harnack.backend.numbers import integer
+from harnack.backend.validation import integer
 from harnack.enclosures import Curvature, Lipschitz, Slopes
 from harnack.enclosures.parabola import Arc, Parabola
-from harnack.enclosures.pieces import Pieces
+from harnack.enclosures.piecewise_taylor import Pieces
 from harnack.fields.analytic.hyperspherical_basis import (
     LARGEST_DEGREE,
     HypersphereRange,
@@ -33,9 +33,9 @@ from harnack.fields.analytic.sphere_bounds import (
     value_bound,
 )
 from harnack.fields.field import Field, check_in_range
-from harnack.fields.look import Look, Path, Sample
+from harnack.fields.samples import Look, Path, Sample
+from harnack.geometry.clip_volumes import Ball
 from harnack.geometry.volume import check_volume
-from harnack.geometry.volumes import Ball
 
 if TYPE_CHECKING:
     from harnack.backend import Real, Vec3

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 import drjit as dr
 
 from harnack.backend.elementary import fmax, fmin, length
-from harnack.backend.numbers import finite, integer, positive
+from harnack.backend.validation import finite, integer, positive
 from harnack.enclosures import Curvature, Slopes
 from harnack.enclosures.parabola import Parabola
 from harnack.fields.analytic.rounding import HarmonicRounding
@@ -22,13 +22,13 @@ from harnack.fields.analytic.solid_harmonics import (
 )
 from harnack.fields.analytic.sphere_bounds import BallRange, range_of_harmonic
 from harnack.fields.field import Field, Sample
-from harnack.fields.look import Look, lengthened
-from harnack.geometry.volumes import Ball
-from harnack.names import is_one_of
+from harnack.fields.samples import Look, lengthened
+from harnack.geometry.clip_volumes import Ball
+from harnack.name_suggestions import is_one_of
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
-    from harnack.fields.look import Path
+    from harnack.fields.samples import Path
     from harnack.geometry.volume import Volume
 
 __all__ = ["Lobes"]

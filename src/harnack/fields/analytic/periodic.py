@@ -33,7 +33,7 @@ from harnack.fields.analytic.waves import (
     sine,
 )
 from harnack.fields.field import Field, Sample, check_in_range
-from harnack.geometry.volumes import Ball
+from harnack.geometry.clip_volumes import Ball
 
 if TYPE_CHECKING:
     from harnack.backend import Real, Vec3

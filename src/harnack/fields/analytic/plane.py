@@ -22,7 +22,7 @@ import numpy as np
 from harnack.arithmetic import Jet
 from harnack.backend import backend_of, choose_backend, to_numpy, to_vector3
 from harnack.backend.elementary import largest_coordinate
-from harnack.backend.numbers import finite
+from harnack.backend.validation import finite
 from harnack.enclosures import Curvature, HarmonicBall
 from harnack.fields.analytic.branches import (
     ArcSine,
@@ -38,10 +38,10 @@ from harnack.fields.analytic.branches import (
 )
 from harnack.fields.field import Field
 from harnack.fields.formula import Formula, as_jet, probe, warn_of_price
-from harnack.fields.look import Sample
+from harnack.fields.samples import Sample
+from harnack.geometry.clip_volumes import Box, Intersection
 from harnack.geometry.volume import check_volume
-from harnack.geometry.volumes import Box, Intersection
-from harnack.names import did_you_mean
+from harnack.name_suggestions import did_you_mean
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, Real, Vec3

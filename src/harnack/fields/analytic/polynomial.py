@@ -38,7 +38,7 @@ from harnack.fields.analytic.sphere_bounds import (
     value_bound,
 )
 from harnack.fields.field import Field, Sample, check_in_range
-from harnack.geometry.volumes import Ball
+from harnack.geometry.clip_volumes import Ball
 
 if TYPE_CHECKING:
     from harnack.backend import Real, Vec3

@@ -13,16 +13,16 @@ import numpy as np
 
 from harnack.backend import backend_of
 from harnack.backend.elementary import fmax, fmin, largest_coordinate
-from harnack.backend.numbers import finite
+from harnack.backend.validation import finite
 from harnack.enclosures import Curvature, Enclosure, HarmonicBall, Lipschitz, Slopes
 from harnack.enclosures.extremum import Cusp, Nearest, Sheet
 from harnack.enclosures.parabola import Parabola
-from harnack.enclosures.pieces import Pieces
+from harnack.enclosures.piecewise_taylor import Pieces
 from harnack.fields.analytic.branches import Branches, Disk, Stretch, complex_of, derivatives
 from harnack.fields.analytic.plane import branches_of
 from harnack.fields.field import Field
-from harnack.fields.look import Look, Path, Sample
-from harnack.geometry.volumes import Ball, Box, Intersection
+from harnack.fields.samples import Look, Path, Sample
+from harnack.geometry.clip_volumes import Ball, Box, Intersection
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3

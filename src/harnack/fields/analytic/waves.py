@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend.elementary import sincos
-from harnack.backend.numbers import finite, refuse_derivatives, refuses_derivatives, triple
+from harnack.backend.validation import finite, refuse_derivatives, refuses_derivatives, triple
 
 if TYPE_CHECKING:
     from harnack.backend import Real, Vec3

@@ -18,14 +18,17 @@ from harnack.arithmetic import Jet
 from harnack.backend import FloatArray, IntArray, backend_of
 from harnack.backend.arrays import aligned_integers
 from harnack.backend.elementary import fmin
-from harnack.backend.numbers import check_finite, check_size, check_vectors, real_array, vector_text
-from harnack.backend.records import Records
+from harnack.backend.record_table import Records
+from harnack.backend.validation import (
+    check_finite,
+    check_size,
+    check_vectors,
+    real_array,
+    vector_text,
+)
 from harnack.enclosures import Enclosure, Gaps, Lipschitz, Slopes
-from harnack.fields.batch import prepared_once
-from harnack.fields.blobs.grid import CellLists, Grid
-from harnack.fields.blobs.kernels import Gaussian, Kernel, choose_kernel
-from harnack.fields.blobs.largest import GroupedList, LargestAlong, largest_at, largest_jet
-from harnack.fields.blobs.sums import (
+from harnack.fields.batched_fields import prepared_once
+from harnack.fields.blobs.blob_sums import (
     PIECES,
     PIECES_IN_CELL,
     BlobValue,
@@ -39,11 +42,14 @@ from harnack.fields.blobs.sums import (
     summed,
     value_at,
 )
+from harnack.fields.blobs.grid import CellLists, Grid
+from harnack.fields.blobs.group_maximum import GroupedList, LargestAlong, largest_at, largest_jet
+from harnack.fields.blobs.kernels import Gaussian, Kernel, choose_kernel
 from harnack.fields.formula import Formula, is_jet
-from harnack.fields.look import Look, Path, Sample
+from harnack.fields.samples import Look, Path, Sample
 from harnack.files.molecules import Atoms, read_molecule
 from harnack.geometry import Box
-from harnack.names import renamed
+from harnack.name_suggestions import renamed
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3

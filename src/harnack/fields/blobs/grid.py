@@ -14,7 +14,7 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend.arrays import aligned_integers
-from harnack.tree.cells import GridLayout, UniformGrid, distances_to_full, short_length
+from harnack.tree.empty_space import GridLayout, UniformGrid, distances_to_full, short_length
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, IntArray, Vec3

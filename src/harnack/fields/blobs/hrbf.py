@@ -13,14 +13,14 @@ import numpy as np
 from harnack.arithmetic import Jet, sqrt
 from harnack.backend import FloatArray, backend_of
 from harnack.backend.elementary import fmax, fmin
-from harnack.backend.numbers import check_finite, check_size, check_vectors, real_array
-from harnack.backend.records import Records
+from harnack.backend.record_table import Records
+from harnack.backend.validation import check_finite, check_size, check_vectors, real_array
 from harnack.enclosures import Lipschitz, Slopes
 from harnack.enclosures.enclosure import Piece
-from harnack.fields.batch import prepared_once
-from harnack.fields.blobs.sums import PIECES, Along, BlobValue, Knots, State, over, summed
+from harnack.fields.batched_fields import prepared_once
+from harnack.fields.blobs.blob_sums import PIECES, Along, BlobValue, Knots, State, over, summed
 from harnack.fields.formula import Formula, is_jet
-from harnack.fields.look import Look, Path, Sample
+from harnack.fields.samples import Look, Path, Sample
 from harnack.geometry import Box
 from harnack.geometry.volume import check_volume
 
@@ -166,10 +166,10 @@ class HRBF(Formula):
         from there. So each has its extreme values at the ends of a piece, or at 0.
 
         Rounding. Positions are right within e = 8 roundings of the largest distance m on the path,
-        as in `harnack.fields.blobs.sums`. That changes the three expressions by at most 3 |a| m^2 e
-        + 2 |b| m e, 6 |a| m e + 4 |b| e and 10 |a| e + 8 |b| min(1, e/r), r the least distance on
-        the path. Sums of n terms add n roundings of the sum of |a| m^3 + |b| m^2, 3 |a| m^2 +
-        3 |b| m and 6 |a| m + 3 |b|.
+        as in `harnack.fields.blobs.blob_sums`. That changes the three expressions by at most 3 |a|
+        m^2 e + 2 |b| m e, 6 |a| m e + 4 |b| e and 10 |a| e + 8 |b| min(1, e/r), r the least
+        distance on the path. Sums of n terms add n roundings of the sum of |a| m^3 + |b| m^2, 3 |a|
+        m^2 + 3 |b| m and 6 |a| m + 3 |b|.
         """
         backend, records = self._prepared_for(backend_of(p))
         real = backend.Float

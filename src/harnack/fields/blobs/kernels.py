@@ -25,8 +25,8 @@ import numpy as np
 from harnack.arithmetic import Function, Interval
 from harnack.arithmetic.interval import unit_of
 from harnack.backend.elementary import fmax, fmin
-from harnack.backend.numbers import real
-from harnack.names import did_you_mean
+from harnack.backend.validation import real
+from harnack.name_suggestions import did_you_mean
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, Real

@@ -17,15 +17,15 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import to_numpy, to_vector3
-from harnack.fields.look import Sample
+from harnack.fields.samples import Sample
+from harnack.fields.solid_angles.curve_cell_builder import build_curve_cells
 from harnack.fields.solid_angles.curve_cells import CurveCells
-from harnack.fields.solid_angles.curve_octree import build_curve_cells
-from harnack.fields.solid_angles.edge_angles import bends, swept_ball
-from harnack.fields.solid_angles.edge_trails import Line, closed_trails, known_along
+from harnack.fields.solid_angles.curve_queries import bends, swept_ball
 from harnack.fields.solid_angles.edges import near_rounding
-from harnack.fields.sums import SLOPE_ROUNDINGS, SUM_ROUNDING
-from harnack.tree.nearest import distance_to_triangles, jumps_within
-from harnack.tree.triangles import Frame
+from harnack.fields.solid_angles.trail_sums import Line, closed_trails, known_along
+from harnack.fields.source_sums import SLOPE_ROUNDINGS, SUM_ROUNDING
+from harnack.tree.closest_triangles import distance_to_triangles, jumps_within
+from harnack.tree.triangle_tree import Frame
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from harnack.backend import FloatArray, Mask, Real, Vec3
     from harnack.enclosures import Lipschitz
     from harnack.fields.solid_angles.winding_mesh import WindingMesh
-    from harnack.tree.triangles import TriangleRays
+    from harnack.tree.triangle_tree import TriangleRays
 
 __all__ = ["BoundaryCells"]
 

@@ -15,12 +15,12 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend.elementary import clamp, fmax, fmin
-from harnack.backend.records import Records
-from harnack.fields.batch import SymmetricSum
+from harnack.backend.record_table import Records
+from harnack.fields.batched_fields import SymmetricSum
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, Mask, Real, Vec3
-    from harnack.fields.solid_angles.edge_trails import Line
+    from harnack.fields.solid_angles.trail_sums import Line
     from harnack.geometry.curves import Circle
 
 __all__ = ["CircleSums", "Circles", "UnitCircle"]

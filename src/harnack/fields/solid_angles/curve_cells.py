@@ -16,21 +16,21 @@ import numpy as np
 
 from harnack.backend import to_numpy
 from harnack.backend.elementary import fmin
+from harnack.fields.solid_angles.edge_expansion import COEFFICIENTS, DEGREE
 from harnack.fields.solid_angles.edge_lift import LiftedProduct, ends_factor, sight_of
-from harnack.fields.solid_angles.edge_trails import with_edge_rates
 from harnack.fields.solid_angles.edges import Edge, EdgeSums, inner_product, spinor
-from harnack.fields.solid_angles.far_edges import COEFFICIENTS, DEGREE
 from harnack.fields.solid_angles.local_expansion import value_and_gradient
-from harnack.fields.sums import SUM_ROUNDING
-from harnack.tree.nearest import squared_distance_to_segment
+from harnack.fields.solid_angles.trail_sums import with_edge_rates
+from harnack.fields.source_sums import SUM_ROUNDING
+from harnack.tree.closest_triangles import squared_distance_to_segment
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, Mask, Real, Vec3
-    from harnack.backend.records import Records
+    from harnack.backend.record_table import Records
     from harnack.fields.solid_angles.edge_lift import Sight
-    from harnack.fields.solid_angles.edge_trails import Line
-    from harnack.tree.cell_lookup import CellLookup
-    from harnack.tree.triangles import Frame
+    from harnack.fields.solid_angles.trail_sums import Line
+    from harnack.tree.octree_lookup import CellLookup
+    from harnack.tree.triangle_tree import Frame
 
 # Numbers of a record before the coefficients, and vertices in a record of near edges.
 HEAD, VERTICES = 15, 2

@@ -17,24 +17,24 @@ import numpy as np
 
 from harnack.backend import backend_of
 from harnack.backend.elementary import fmax
-from harnack.backend.numbers import positive, real, refuses_derivatives
-from harnack.fields.batch import SymmetricSum, Values, sharpened
+from harnack.backend.validation import positive, real, refuses_derivatives
+from harnack.fields.batched_fields import SymmetricSum, Values, sharpened
 from harnack.fields.clearance import DetailedField, UnitCoordinates, epsilon_at, placed, single
 from harnack.fields.field import Sample, lengthened
-from harnack.fields.solid_angles.cell_choice import HasCells
-from harnack.fields.solid_angles.far_clusters import (
+from harnack.fields.solid_angles.cell_options import HasCells
+from harnack.fields.solid_angles.denoised_cloud import FittedCloud
+from harnack.fields.solid_angles.dipole_cells import NearFarCells, build_cells
+from harnack.fields.solid_angles.multipole import all_levels
+from harnack.fields.solid_angles.oriented_points import OrientedPoints
+from harnack.fields.solid_angles.smoothed import SmoothedSum
+from harnack.fields.solid_angles.treecode import (
     AddPrimitive,
     Treecode,
     dipole_rows,
     hierarchy_of,
     in_slots,
 )
-from harnack.fields.solid_angles.fitted_cloud import FittedCloud
-from harnack.fields.solid_angles.multipole import all_levels
-from harnack.fields.solid_angles.near_far import NearFarCells, build_cells
-from harnack.fields.solid_angles.oriented_points import OrientedPoints
-from harnack.fields.solid_angles.smoothed import SmoothedSum
-from harnack.fields.sums import FieldSums, Terms, last_roundings, rounding_of_dipole
+from harnack.fields.source_sums import FieldSums, Terms, last_roundings, rounding_of_dipole
 from harnack.geometry import Box, CloudError, estimate_areas, estimate_normals, validate_cloud
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from typing import Self
 
     from harnack.backend import Backend, FloatArray, Mask, Real, Vec3
-    from harnack.backend.records import Records
+    from harnack.backend.record_table import Records
     from harnack.fields.solid_angles.multipole import NodeMoments
     from harnack.geometry import Volume
     from harnack.tree import Hierarchy

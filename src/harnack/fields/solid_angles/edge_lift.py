@@ -23,17 +23,17 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend.elementary import fmax, fmin
-from harnack.backend.records import Records
-from harnack.fields.batch import SymmetricSum
+from harnack.backend.record_table import Records
+from harnack.fields.batched_fields import SymmetricSum
 from harnack.fields.clearance import epsilon_at
 from harnack.fields.solid_angles.edges import Edge, edge_variation, single_edges
-from harnack.fields.sums import FieldSums, Terms
-from harnack.tree.triangles import Upwards, side
+from harnack.fields.source_sums import FieldSums, Terms
+from harnack.tree.triangle_tree import Upwards, side
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
-    from harnack.tree.hierarchy import FloatArray, IntArray
-    from harnack.tree.triangles import Frame
+    from harnack.tree.balanced_tree import FloatArray, IntArray
+    from harnack.tree.triangle_tree import Frame
 
 # Edges in a trip of the loop; those that pad the last one have no length and no direction.
 _CHUNK = 4

@@ -18,9 +18,9 @@ import numpy as np
 
 from harnack.backend import FloatArray
 from harnack.backend.elementary import fmin
-from harnack.backend.records import Records
-from harnack.fields.batch import SymmetricSum
-from harnack.tree.nearest import squared_distance_to_segment
+from harnack.backend.record_table import Records
+from harnack.fields.batched_fields import SymmetricSum
+from harnack.tree.closest_triangles import squared_distance_to_segment
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from harnack.backend import FloatArray, IntArray
-from harnack.backend.numbers import positive, real
-from harnack.fields.batch import BatchedField, Values
+from harnack.backend.validation import positive, real
+from harnack.fields.batched_fields import BatchedField, Values
 from harnack.fields.field import Field, Sample
 from harnack.fields.solid_angles.morph_slice import MorphSlice
 from harnack.fields.solid_angles.winding_number import WindingNumber
@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from harnack.backend import Backend, Mask, Precision, Real, Vec3
-    from harnack.fields.sheets import Crossing, NearestSheet
+    from harnack.fields.capabilities import Crossing, NearestSheet
     from harnack.geometry import Volume
-    from harnack.tree.cells import OccupiedCells
+    from harnack.tree.empty_space import OccupiedCells
 
 
 class Morph(BatchedField):

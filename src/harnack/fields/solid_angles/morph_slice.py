@@ -18,9 +18,10 @@ from numpy.polynomial import chebyshev, legendre
 
 from harnack.backend import backend_of
 from harnack.backend.elementary import fmax
-from harnack.cluster.packing import Remembered
+from harnack.cluster.serialization import Remembered
 from harnack.enclosures import HarmonicBall
-from harnack.fields.batch import Values
+from harnack.fields.batch_evaluation import at_points
+from harnack.fields.batched_fields import Values
 from harnack.fields.clearance import (
     DetailedField,
     UnitCoordinates,
@@ -31,18 +32,17 @@ from harnack.fields.clearance import (
     tight_extent,
 )
 from harnack.fields.field import Sample
-from harnack.fields.points import at_points
-from harnack.fields.solid_angles.far_clusters import dipole_rows
 from harnack.fields.solid_angles.radial_kernel import BALL, Radial, RadialKernel, RadialSums
 from harnack.fields.solid_angles.radial_tree import ClusteredDipoles, TreeSum
-from harnack.fields.sums import SLOPE_ROUNDINGS, SUM_ROUNDING
+from harnack.fields.solid_angles.treecode import dipole_rows
+from harnack.fields.source_sums import SLOPE_ROUNDINGS, SUM_ROUNDING
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from harnack.backend import Backend, FloatArray, IntArray, Precision, Real, Vec3
     from harnack.geometry import Volume
-    from harnack.tree.cells import OccupiedCells
+    from harnack.tree.empty_space import OccupiedCells
 
 GRADIENT = 1.1855
 """Half the largest gradient of a dipole in four dimensions, times D^3, used as Q_2."""

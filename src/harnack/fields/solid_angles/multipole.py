@@ -31,7 +31,7 @@ import numpy.typing as npt
 from harnack.backend import FloatArray, choose_backend, to_numpy
 from harnack.backend.arrays import aligned, aligned_integers
 from harnack.backend.elementary import fmax, fmin
-from harnack.fields.sums import longest_part, remainder_factor
+from harnack.fields.source_sums import longest_part, remainder_factor
 from harnack.tree import NO_PRIMITIVE, Hierarchy
 
 if TYPE_CHECKING:

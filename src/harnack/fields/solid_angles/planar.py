@@ -34,7 +34,7 @@ import numpy as np
 
 from harnack.backend.elementary import fmax, fmin
 from harnack.enclosures import HarmonicBall
-from harnack.geometry.convexity import is_simple, segment_clearance_lower
+from harnack.geometry.convex_position import is_simple, segment_clearance_lower
 
 if TYPE_CHECKING:
     from harnack.backend import FloatArray, Real

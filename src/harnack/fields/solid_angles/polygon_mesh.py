@@ -19,14 +19,13 @@ import numpy as np
 from harnack.backend import BoolArray, FloatArray, IntArray, choose_backend, to_numpy, to_vector3
 from harnack.backend.arrays import aligned, aligned_integers
 from harnack.backend.elementary import fmin
-from harnack.backend.records import Records
-from harnack.cluster.packing import Remembered
+from harnack.backend.record_table import Records
+from harnack.cluster.serialization import Remembered
 from harnack.enclosures import HarmonicBall, Lipschitz
-from harnack.fields.boxed_parts import BoxedField, BoxedParts
 from harnack.fields.clearance import UnitCoordinates
 from harnack.fields.field import Field, Look, Path, Sample, lengthened
-from harnack.fields.solid_angles.edge_angles import bends, swept_ball
-from harnack.fields.solid_angles.edge_trails import Line, known_along, rates_along
+from harnack.fields.patch_boxes import BoxedField, BoxedParts
+from harnack.fields.solid_angles.curve_queries import bends, swept_ball
 from harnack.fields.solid_angles.edges import (
     Edge,
     LoopEdges,
@@ -36,9 +35,10 @@ from harnack.fields.solid_angles.edges import (
     sum_over_edges,
 )
 from harnack.fields.solid_angles.solid_angle import SolidAngle
-from harnack.fields.sums import SUM_ROUNDING
+from harnack.fields.solid_angles.trail_sums import Line, known_along, rates_along
+from harnack.fields.source_sums import SUM_ROUNDING
 from harnack.geometry.polygon_meshes import PolygonFaces, validate_polygons
-from harnack.tree.nearest import MOST_BOXES
+from harnack.tree.closest_triangles import MOST_BOXES
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
@@ -351,7 +351,7 @@ class PolygonMesh(BoxedField["_MeshBuffers"]):
     to one side. The faces are separate surfaces that meet in their common edges: `Hits.sheet` is
     the index of the face that was hit, the normal is that of its surface, to the positive side.
     Each is traced alone, with the proofs of `SolidAngle`, so that a ray pays only for faces whose
-    boxes it enters (`harnack.fields.sheets`). `face(k)` gives the solid angle of one.
+    boxes it enters (`harnack.fields.capabilities`). `face(k)` gives the solid angle of one.
 
     Raises:
         MeshError: a ValueError, for what `geometry.validate_polygons` refuses.

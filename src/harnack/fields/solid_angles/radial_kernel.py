@@ -24,8 +24,8 @@ import drjit as dr
 
 from harnack.backend.elementary import fmin
 from harnack.enclosures import Curvature
-from harnack.fields.batch import SymmetricSum
-from harnack.fields.sums import SUM_ROUNDING, FieldSums, Terms
+from harnack.fields.batched_fields import SymmetricSum
+from harnack.fields.source_sums import SUM_ROUNDING, FieldSums, Terms
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

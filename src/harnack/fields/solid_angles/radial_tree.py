@@ -37,14 +37,7 @@ import numpy as np
 
 from harnack.backend import FloatArray
 from harnack.backend.elementary import fmax
-from harnack.backend.records import Records
-from harnack.fields.solid_angles.far_clusters import (
-    SeenCluster,
-    hierarchy_of,
-    in_slots,
-    padding_row,
-    walk_clusters,
-)
+from harnack.backend.record_table import Records
 from harnack.fields.solid_angles.radial_kernel import (
     RadialKernel,
     RadialSums,
@@ -53,6 +46,13 @@ from harnack.fields.solid_angles.radial_kernel import (
     cluster_parts,
     combine,
     seen_dipole,
+)
+from harnack.fields.solid_angles.treecode import (
+    SeenCluster,
+    hierarchy_of,
+    in_slots,
+    padding_row,
+    walk_clusters,
 )
 from harnack.tree import Hierarchy, PackedTree, pack
 

@@ -15,10 +15,10 @@ import numpy as np
 
 from harnack.backend import FloatArray, backend_of
 from harnack.backend.elementary import fmax, fmin
-from harnack.backend.numbers import positive
-from harnack.cluster.packing import Remembered
+from harnack.backend.validation import positive
+from harnack.cluster.serialization import Remembered
 from harnack.enclosures import Curvature, HarmonicBall
-from harnack.fields.batch import Values
+from harnack.fields.batched_fields import Values
 from harnack.fields.clearance import (
     DetailedField,
     UnitCoordinates,
@@ -28,7 +28,6 @@ from harnack.fields.clearance import (
     tight_extent,
 )
 from harnack.fields.field import Sample
-from harnack.fields.solid_angles.far_clusters import dipole_rows
 from harnack.fields.solid_angles.oriented_points import OrientedPoints
 from harnack.fields.solid_angles.radial_kernel import BALL, Radial, RadialKernel, RadialSums
 from harnack.fields.solid_angles.radial_tree import (
@@ -37,10 +36,11 @@ from harnack.fields.solid_angles.radial_tree import (
     RadialDipoles,
     TreeSum,
 )
-from harnack.fields.sums import SECOND_ROUNDINGS, SLOPE_ROUNDINGS, SUM_ROUNDING, FieldSums
+from harnack.fields.solid_angles.treecode import dipole_rows
+from harnack.fields.source_sums import SECOND_ROUNDINGS, SLOPE_ROUNDINGS, SUM_ROUNDING, FieldSums
 from harnack.geometry.clouds import estimate_areas, validate_cloud
 from harnack.geometry.meshes import validate_mesh
-from harnack.names import did_you_mean
+from harnack.name_suggestions import did_you_mean
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING
 import drjit as dr
 
 from harnack.backend.elementary import fmax, fmin
-from harnack.fields.batch import Values
+from harnack.fields.batched_fields import Values
 from harnack.fields.clearance import epsilon_at
 from harnack.fields.field import Sample
 from harnack.fields.solid_angles.radial_kernel import Radial, RadialKernel
 from harnack.fields.solid_angles.radial_tree import ClusteredDipoles, TreeSum, clusters
-from harnack.fields.sums import SLOPE_ROUNDINGS, SUM_ROUNDING
+from harnack.fields.source_sums import SLOPE_ROUNDINGS, SUM_ROUNDING
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, Real, Vec3

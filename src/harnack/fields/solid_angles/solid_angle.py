@@ -15,8 +15,10 @@ import numpy as np
 from harnack.backend import FloatArray, backend_of, choose_backend, to_numpy
 from harnack.backend.elementary import fmin
 from harnack.backend.tensors import is_tensor, vectors_of
-from harnack.cluster.packing import Remembered
+from harnack.cluster.serialization import Remembered
 from harnack.enclosures import HarmonicBall, Lipschitz
+from harnack.fields.batch_evaluation import in_batches
+from harnack.fields.capabilities import NO_TRUNCATION
 from harnack.fields.clearance import (
     UnitCoordinates,
     UploadedField,
@@ -25,13 +27,11 @@ from harnack.fields.clearance import (
     tight_extent,
 )
 from harnack.fields.field import Look, Path, Sample, lengthened
-from harnack.fields.points import in_batches
-from harnack.fields.sheets import NO_TRUNCATION
-from harnack.fields.solid_angles.cell_choice import HasCells
+from harnack.fields.solid_angles.cell_options import HasCells
 from harnack.fields.solid_angles.circle_sums import Circles, CircleSums
+from harnack.fields.solid_angles.curve_cell_builder import build_curve_cells
 from harnack.fields.solid_angles.curve_cells import CellSums, CurveCells
-from harnack.fields.solid_angles.curve_octree import build_curve_cells
-from harnack.fields.solid_angles.edge_angles import (
+from harnack.fields.solid_angles.curve_queries import (
     bends,
     change_along_segments,
     closest_on_segments,
@@ -40,7 +40,6 @@ from harnack.fields.solid_angles.edge_angles import (
     slope_change,
     swept_ball,
 )
-from harnack.fields.solid_angles.edge_trails import Line, known_along, rates_along
 from harnack.fields.solid_angles.edges import (
     EdgeSums,
     LoopEdges,
@@ -49,11 +48,12 @@ from harnack.fields.solid_angles.edges import (
     sum_over_edges,
 )
 from harnack.fields.solid_angles.planar import PlanarRegion, planar_region
-from harnack.fields.sums import SECOND_ROUNDINGS, SLOPE_ROUNDINGS, SUM_ROUNDING
+from harnack.fields.solid_angles.trail_sums import Line, known_along, rates_along
+from harnack.fields.source_sums import SECOND_ROUNDINGS, SLOPE_ROUNDINGS, SUM_ROUNDING
 from harnack.geometry import Circle, ConvexHull, is_convex_position, total_length
 from harnack.geometry.curves import CurveShapeError, Loops, net_circles, validate_curves
 from harnack.geometry.polygons import net_loops, uncanceled_edges
-from harnack.names import did_you_mean
+from harnack.name_suggestions import did_you_mean
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -16,11 +16,12 @@ import drjit as dr
 
 from harnack.backend.elementary import fmax
 from harnack.enclosures import Lipschitz
-from harnack.fields.batch import SymmetricSum, Values
+from harnack.fields.batched_fields import SymmetricSum, Values
 from harnack.fields.clearance import epsilon_at
 from harnack.fields.field import Sample
 from harnack.fields.solid_angles.edge_lift import LiftedEdges, lifted_sums
-from harnack.fields.solid_angles.edge_trails import (
+from harnack.fields.solid_angles.edges import LoopEdges
+from harnack.fields.solid_angles.trail_sums import (
     EdgeTrails,
     LiftedTrails,
     Line,
@@ -28,13 +29,12 @@ from harnack.fields.solid_angles.edge_trails import (
     known_along,
     rates_along,
 )
-from harnack.fields.solid_angles.edges import LoopEdges
-from harnack.fields.sums import Terms, last_roundings
-from harnack.tree.triangles import Frame, TriangleRays
+from harnack.fields.source_sums import Terms, last_roundings
+from harnack.tree.triangle_tree import Frame, TriangleRays
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
-    from harnack.fields.sheets import Crossing
+    from harnack.fields.capabilities import Crossing
     from harnack.fields.solid_angles.winding_mesh import WindingMesh
 
 _SHARE = 1 / (4 * math.pi)

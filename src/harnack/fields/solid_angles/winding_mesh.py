@@ -16,7 +16,7 @@ from harnack.fields.solid_angles.multipole import NodeMoments, triangle_levels
 from harnack.geometry import MeshError, validate_mesh
 from harnack.geometry.welding import Welded, rounding_of
 from harnack.tree import Hierarchy, build_hierarchy
-from harnack.tree.triangles import MOST_TRIANGLES, PARITY, triangle_records
+from harnack.tree.triangle_tree import MOST_TRIANGLES, PARITY, triangle_records
 
 # The most triangles in a leaf, and the children of a node: by experiment.
 _LEAF_SIZE, _ARITY = 8, 4

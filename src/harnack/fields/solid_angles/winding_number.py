@@ -21,10 +21,11 @@ import numpy.typing as npt
 
 from harnack.backend import FloatArray, IntArray, backend_of
 from harnack.backend.elementary import fmax
-from harnack.backend.numbers import real, refuses_derivatives, whole
-from harnack.cluster.packing import Remembered
+from harnack.backend.validation import real, refuses_derivatives, whole
+from harnack.cluster.serialization import Remembered
 from harnack.enclosures import Lipschitz
-from harnack.fields.batch import BatchedField, Values
+from harnack.fields.batched_fields import BatchedField, Values
+from harnack.fields.capabilities import NO_SHEET, Crossing, NearestSheet
 from harnack.fields.clearance import (
     UnitCoordinates,
     UploadedField,
@@ -34,25 +35,24 @@ from harnack.fields.clearance import (
     tight_extent,
 )
 from harnack.fields.field import AtDetail, Field, Sample, lengthened
-from harnack.fields.sheets import NO_SHEET, Crossing, NearestSheet
 from harnack.fields.solid_angles.boundary_cells import BoundaryCells
-from harnack.fields.solid_angles.cell_choice import Cells, HasCells
+from harnack.fields.solid_angles.cell_options import Cells, HasCells
 from harnack.fields.solid_angles.own_sheet import lies_on_own_level
 from harnack.fields.solid_angles.winding_exact import ExactWinding
 from harnack.fields.solid_angles.winding_mesh import WindingMesh
 from harnack.fields.solid_angles.winding_rates import BoundaryRates, with_rates
 from harnack.fields.solid_angles.winding_tree import TreeWinding
 from harnack.geometry import Box
-from harnack.names import did_you_mean, is_one_of
-from harnack.tree.nearest import distance_to_triangles, jumps_within, nearest_triangle
-from harnack.tree.triangles import Frame, TriangleRays
+from harnack.name_suggestions import did_you_mean, is_one_of
+from harnack.tree.closest_triangles import distance_to_triangles, jumps_within, nearest_triangle
+from harnack.tree.triangle_tree import Frame, TriangleRays
 
 if TYPE_CHECKING:
     from typing import Self
 
     from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.geometry import Volume
-    from harnack.tree.cells import OccupiedCells
+    from harnack.tree.empty_space import OccupiedCells
 
 __all__ = ["WindingModuloOne", "winding_box", "winding_cells", "winding_extent"]
 

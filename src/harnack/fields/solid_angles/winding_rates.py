@@ -19,10 +19,10 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import IntArray
-from harnack.fields.batch import SymmetricSum, Values, sharpened
+from harnack.fields.batched_fields import SymmetricSum, Values, sharpened
 from harnack.fields.clearance import epsilon_at
 from harnack.fields.solid_angles.edge_lift import LiftedEdges, edge_rates
-from harnack.fields.solid_angles.edge_trails import closed_trails
+from harnack.fields.solid_angles.trail_sums import closed_trails
 from harnack.fields.solid_angles.winding_mesh import WindingMesh
 from harnack.fields.solid_angles.winding_tree import TreeWinding
 

@@ -21,13 +21,13 @@ import numpy as np
 
 from harnack.backend.elementary import fmax
 from harnack.fields.clearance import epsilon_at
+from harnack.fields.solid_angles.dipole_cells import NearFarCells, build_cells
+from harnack.fields.solid_angles.dipole_expansion import TRIANGLE_SPREAD, triangle_sources
 from harnack.fields.solid_angles.edge_lift import LiftedEdge, LiftedProduct, LiftedSums
-from harnack.fields.solid_angles.edge_trails import Line, known_along, with_edge_rates
-from harnack.fields.solid_angles.far_clusters import Treecode
-from harnack.fields.solid_angles.far_sums import TRIANGLE_SPREAD, triangle_sources
-from harnack.fields.solid_angles.near_far import NearFarCells, build_cells
-from harnack.fields.sums import FieldSums, last_roundings
-from harnack.tree.triangles import (
+from harnack.fields.solid_angles.trail_sums import Line, known_along, with_edge_rates
+from harnack.fields.solid_angles.treecode import Treecode
+from harnack.fields.source_sums import FieldSums, last_roundings
+from harnack.tree.triangle_tree import (
     EDGES,
     INDEX,
     PARITY,
@@ -42,11 +42,11 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from harnack.backend import Backend, Mask, Real, Vec3
-    from harnack.fields.batch import Values
+    from harnack.fields.batched_fields import Values
+    from harnack.fields.capabilities import Crossing
     from harnack.fields.field import Sample
-    from harnack.fields.sheets import Crossing
-    from harnack.fields.solid_angles.edge_trails import Rates
-    from harnack.fields.solid_angles.far_clusters import AddPrimitive
+    from harnack.fields.solid_angles.trail_sums import Rates
+    from harnack.fields.solid_angles.treecode import AddPrimitive
     from harnack.fields.solid_angles.winding_mesh import WindingMesh
 
 # The first of three columns of a record after those of `tree.triangles`: 1 where an edge is

@@ -15,11 +15,11 @@ import drjit as dr
 from harnack.arithmetic import Interval, Jet
 from harnack.backend import backend_of
 from harnack.backend.elementary import fmax
-from harnack.backend.numbers import finite, positive, whole
+from harnack.backend.validation import finite, positive, whole
 from harnack.enclosures import Curvature, Lipschitz
 from harnack.fields.formula import Formula, is_jet, prepared_numbers
 from harnack.fields.solids.solid import Shape
-from harnack.names import is_one_of
+from harnack.name_suggestions import is_one_of
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3

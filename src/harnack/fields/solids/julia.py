@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any, cast
 import drjit as dr
 
 from harnack.backend.elementary import clamp, fmax, fmin
-from harnack.backend.numbers import finite, whole
+from harnack.backend.validation import finite, whole
 from harnack.enclosures import Lipschitz
-from harnack.fields.look import Sample
+from harnack.fields.samples import Sample
 from harnack.fields.solids.solid import Solid, ball_around
 
 if TYPE_CHECKING:

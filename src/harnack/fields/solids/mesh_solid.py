@@ -21,23 +21,23 @@ from harnack.arithmetic import Interval, Jet
 from harnack.arithmetic.jet import spanned
 from harnack.backend import BoolArray, FloatArray, IntArray, backend_of, choose_backend
 from harnack.backend.elementary import fmin, largest_coordinate
-from harnack.backend.numbers import vector_text
-from harnack.backend.records import Records
+from harnack.backend.record_table import Records
+from harnack.backend.validation import vector_text
 from harnack.enclosures import Lipschitz
-from harnack.fields.batch import prepared_once
+from harnack.fields.batched_fields import prepared_once
 from harnack.fields.clearance import UnitCoordinates, placed, single
 from harnack.fields.formula import is_jet
-from harnack.fields.look import Look, Sample
-from harnack.fields.look import Path as Ray
+from harnack.fields.samples import Look, Sample
+from harnack.fields.samples import Path as Ray
 from harnack.fields.solids.solid import Solid, box_around, set_checked
-from harnack.files.surfaces import SURFACE_FILES, Mesh, read_surface
+from harnack.files.geometry_files import SURFACE_FILES, Mesh, read_surface
 from harnack.geometry import MeshError, validate_mesh, zero_area_faces
-from harnack.geometry.sides import is_one_sided
+from harnack.geometry.orientability import is_one_sided
 from harnack.geometry.welding import Welded
 from harnack.tree import build_hierarchy
-from harnack.tree.nearest import NearestTriangle, nearest_triangle, square_to_some_vertex
-from harnack.tree.pieces import pieces_of_faces, windings_beside, windings_of_sides
-from harnack.tree.triangles import (
+from harnack.tree.closest_triangles import NearestTriangle, nearest_triangle, square_to_some_vertex
+from harnack.tree.triangle_splitting import pieces_of_faces, windings_beside, windings_of_sides
+from harnack.tree.triangle_tree import (
     MOST_TRIANGLES,
     NO_TRIANGLE,
     PARITY,

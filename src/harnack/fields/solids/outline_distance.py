@@ -16,13 +16,13 @@ import numpy as np
 
 from harnack.backend import FloatArray, IntArray
 from harnack.backend.elementary import clamp, fmax, fmin
-from harnack.backend.records import Records
+from harnack.backend.record_table import Records
 from harnack.enclosures import Enclosure, Gaps
 from harnack.fields.solids.tube import TubeAhead, lowered
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real
-    from harnack.geometry.outlines import Outline
+    from harnack.geometry.outline_loops import Outline
 
 # The number of edges from which on they are read by chains.
 _MANY = 48

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from harnack.arithmetic import cos, maximum, minimum, norm, sin
 from harnack.arithmetic.norms import corner
-from harnack.backend.numbers import finite, positive, triple
+from harnack.backend.validation import finite, positive, triple
 from harnack.fields.formula import prepared_numbers
 from harnack.fields.solids.solid import Point, Shape, ball_around, box_around, set_checked
 

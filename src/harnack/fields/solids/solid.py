@@ -12,8 +12,8 @@ import dataclasses
 import functools
 from typing import TYPE_CHECKING, Any, cast
 
-from harnack.backend.numbers import positive, refuses_derivatives
-from harnack.cluster.packing import Remembered
+from harnack.backend.validation import positive, refuses_derivatives
+from harnack.cluster.serialization import Remembered
 from harnack.fields.field import Field
 from harnack.fields.formula import Formula
 from harnack.geometry import Ball, Box, Volume
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from harnack.backend import Backend, Real, Vec3
-    from harnack.fields.look import Sample
+    from harnack.fields.samples import Sample
 
 # Extents are widened by this fraction of the coordinates, as the numbers of a shape are rounded to
 # the precision in which it is traced.
@@ -142,17 +142,17 @@ class Solid(Field):
     # Combinations. Operands that are no solids are refused.
 
     def __or__(self, other: Any) -> Solid:
-        from harnack.fields.solids.combined import union
+        from harnack.fields.solids.booleans import union
 
         return union(self, other)
 
     def __and__(self, other: Any) -> Solid:
-        from harnack.fields.solids.combined import intersection
+        from harnack.fields.solids.booleans import intersection
 
         return intersection(self, other)
 
     def __sub__(self, other: Any) -> Solid:
-        from harnack.fields.solids.combined import Complement, intersection
+        from harnack.fields.solids.booleans import Complement, intersection
 
         return intersection(self, Complement(other) if isinstance(other, Solid) else other)
 
@@ -162,7 +162,7 @@ class Solid(Field):
     __rand__ = __rsub__ = __ror__
 
     def __invert__(self) -> Solid:
-        from harnack.fields.solids.combined import Complement
+        from harnack.fields.solids.booleans import Complement
 
         return Complement(self)
 
@@ -188,7 +188,7 @@ class Solid(Field):
         Raises:
             ValueError: radius or power out of range. TypeError: a solid without a formula.
         """
-        from harnack.fields.solids.combined import Blend
+        from harnack.fields.solids.booleans import Blend
 
         return Blend((self, other), radius, power, not intersect)
 
@@ -196,7 +196,7 @@ class Solid(Field):
     def grown(self, distance: float) -> Solid:
         """The points where f <= distance: larger by that length, or smaller if it is negative,
         where f is a distance."""
-        from harnack.fields.solids.combined import Offset
+        from harnack.fields.solids.booleans import Offset
 
         return Offset(self, distance)
 
@@ -208,7 +208,7 @@ class Solid(Field):
         Raises:
             ValueError: a thickness that is not positive.
         """
-        from harnack.fields.solids.region import Near
+        from harnack.fields.solids.from_field import Near
 
         half = 0.5 * positive(thickness, "the thickness of a shell")
         return Near(self, -half, half)
@@ -218,7 +218,7 @@ class Solid(Field):
     @refuses_derivatives
     def moved(self, offset: Sequence[float]) -> Solid:
         """The solid, moved by a vector (x, y, z)."""
-        from harnack.fields.solids.affine import Affine
+        from harnack.fields.solids.transforms import Affine
 
         return self._mapped(Affine.translation(offset))
 
@@ -228,7 +228,7 @@ class Solid(Field):
         as seen from the end of the axis.
 
         axis: "x", "y", "z" or a vector (3,)."""
-        from harnack.fields.solids.affine import Affine
+        from harnack.fields.solids.transforms import Affine
 
         return self._mapped(Affine.rotation(degrees, axis))
 
@@ -255,21 +255,21 @@ class Solid(Field):
 
         If all factors are equal f is multiplied by them, so that a distance stays a distance; else
         it is left as it is."""
-        from harnack.fields.solids.affine import Affine
+        from harnack.fields.solids.transforms import Affine
 
         return self._mapped(Affine.scaling(factors))
 
     @refuses_derivatives
     def transformed(self, matrix: npt.ArrayLike) -> Solid:
         """The solid under a linear or an affine map: matrix (3, 3), (3, 4) or (4, 4)."""
-        from harnack.fields.solids.affine import Affine
+        from harnack.fields.solids.transforms import Affine
 
         return self._mapped(Affine.of_matrix(matrix))
 
     @refuses_derivatives
     def twisted(self, rate: float, axis: str = "z") -> Solid:
         """The solid, twisted about an axis by `rate` radians for each unit of length along it."""
-        from harnack.fields.solids.bends import Twist
+        from harnack.fields.solids.deformations import Twist
 
         return self._mapped(Twist(float(rate), axis))
 
@@ -281,7 +281,7 @@ class Solid(Field):
 
         start, end: (coordinate along the axis, scale) at two positions; the scale is linear between
         them and constant beyond. Scales are positive."""
-        from harnack.fields.solids.bends import Taper
+        from harnack.fields.solids.deformations import Taper
 
         return self._mapped(Taper(start, end, axis))
 

@@ -14,7 +14,7 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend.elementary import clamp, fmax, fmin
-from harnack.backend.numbers import (
+from harnack.backend.validation import (
     check_finite,
     finite,
     flag,
@@ -24,12 +24,12 @@ from harnack.backend.numbers import (
     whole,
 )
 from harnack.enclosures import Enclosure, Gaps, Lipschitz
-from harnack.enclosures.pieces import Pieces
+from harnack.enclosures.piecewise_taylor import Pieces
 from harnack.fields.formula import prepared_numbers
-from harnack.fields.look import Look, Path, Sample
+from harnack.fields.samples import Look, Path, Sample
+from harnack.fields.solids.extrusions import Revolved
 from harnack.fields.solids.solid import Solid, set_checked
-from harnack.fields.solids.swept import Revolved
-from harnack.names import did_you_mean
+from harnack.name_suggestions import did_you_mean
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3

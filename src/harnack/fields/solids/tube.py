@@ -14,7 +14,8 @@ import numpy.typing as npt
 
 from harnack.backend import FloatArray, IntArray, backend_of
 from harnack.backend.elementary import clamp, fmax, fmin, largest_coordinate
-from harnack.backend.numbers import (
+from harnack.backend.record_table import Records
+from harnack.backend.validation import (
     check_finite,
     check_size,
     check_vectors,
@@ -23,16 +24,15 @@ from harnack.backend.numbers import (
     real_array,
     whole,
 )
-from harnack.backend.records import Records
 from harnack.enclosures import Curvature, Enclosure, Gaps, Lipschitz, Promise
-from harnack.enclosures.pieces import Pieces
-from harnack.fields.batch import prepared_once
-from harnack.fields.boxed_parts import BoxedField, BoxedParts
+from harnack.enclosures.piecewise_taylor import Pieces
+from harnack.fields.batched_fields import prepared_once
 from harnack.fields.field import Field
-from harnack.fields.look import Look, Path, Sample
+from harnack.fields.patch_boxes import BoxedField, BoxedParts
+from harnack.fields.samples import Look, Path, Sample
 from harnack.fields.solids.solid import Solid, box_around
 from harnack.geometry.beziers import flattened
-from harnack.tree.nearest import MOST_BOXES
+from harnack.tree.closest_triangles import MOST_BOXES
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
@@ -427,9 +427,9 @@ class Tubes(BoxedField["_TubeBuffers"]):
     segments: (m, 2) indices of points, counted from 0.
     radius: a number, or (m,).
 
-    Each segment is a part with rounded ends (`harnack.fields.sheets`): a ray pays only for those
-    whose boxes it enters, so that thousands cost little more than one, and `Hits.sheet` is the
-    index of the segment. `level` makes all tubes thicker by so much. For one polyline, and for
+    Each segment is a part with rounded ends (`harnack.fields.capabilities`): a ray pays only for
+    those whose boxes it enters, so that thousands cost little more than one, and `Hits.sheet` is
+    the index of the segment. `level` makes all tubes thicker by so much. For one polyline, and for
     combinations with other solids, there is `Tube`.
 
     Raises ValueError for arrays of other shapes, numbers that are not finite, an index without a

@@ -1,0 +1,86 @@
+"""The ball about a closest point of a level set that is proved to hold no nearer one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, TypeAlias
+
+import drjit as dr
+
+from harnack.backend.elementary import fmax, fmin, length
+from harnack.distance.cell_classification import remainder
+from harnack.distance.tangent_plane import Eigen, TangentPlane, apply
+
+if TYPE_CHECKING:
+    from harnack.backend import Real, Vec3
+    from harnack.fields.field import Sample
+
+    Rows: TypeAlias = tuple[Vec3, Vec3, Vec3]
+
+__all__ = ["free_radius"]
+
+# Radii that are tried, in distances of the foot: powers of two.
+_POWERS = range(8, -12, -1)
+_LEAST = 1 / 64
+"""What has to be left of 1 in the proof: it covers the rounding of second derivatives, and that
+x - y is at right angles to the surface up to the square root of epsilon only."""
+
+
+def free_radius(sample: Sample, rows: Rows | None, x: Vec3, y: Vec3) -> Real:
+    """A radius about y, the foot of x at right angles to the surface, in which no point of the
+    surface is nearer to x; 0 where none is proved.
+
+    sample: f at y, rounding left out. rows: of its Hessian there, if it is known.
+
+    Proof. Let y + w be a point of the surface, |w| <= r, n = grad f/|g| and x = y + d n, where f
+    is taken with the other sign if x is on the other side. With |f(y + w) - f(y) - g . w| <=
+    R1 |w|^2/r^2 (`remainder` falls at least as the square), |n . w| <= c |w|^2, c = R1/(|g| r^2).
+    So |x - y - w|^2 = d^2 - 2 d n . w + |w|^2 >= d^2 + |w|^2 (1 - 2 d c).
+
+    With second derivatives H: -n . w |g| is w.Hw/2 and a rest of at most R2 |w|^3/r^3. Let t be
+    the part of w along the tangent plane, k the least of the eigenvalues of H in that plane and 0,
+    a = |Hn - (n.Hn) n|, b = |n.Hn|. As |n . w| <= c r |w|,
+
+        w.Hw >= k |t|^2 - 2 |n . w| |t| a - (n . w)^2 b >= |w|^2 (k - 2 c r a - c^2 r^2 b),
+
+    so that in the inequality above 1 - 2 d c may be replaced by
+    1 + d/|g| (k - 2 c r a - c^2 r^2 b - 2 R2/r^2). Here c also is at most (|H|/2 + R2/r^2)/|g|.
+    """
+    steep, d = length(sample.gradient), length(x - y)
+    curved = None if rows is None else _Curved.of(sample, rows, x - y)
+    best = 0 * d
+    for power in _POWERS:
+        r = fmax(d, 1e-12) * 2.0**power
+        first = remainder(sample, r) / (r * r)
+        left = 1 - 2 * d * first / steep
+        if curved is not None:
+            second = remainder(sample, r, 2) / (r * r)
+            c = fmin(first, curved.half_norm + second) * r / steep
+            lift = curved.least - c * (2 * curved.across + c * curved.along)
+            left = fmax(left, 1 + d / steep * (lift - 2 * second))
+        best = dr.select((best == 0) & (left >= _LEAST), r, best)
+    return best
+
+
+@dataclass(frozen=True)
+class _Curved:
+    """Of the Hessian H of f, taken with the sign for which x - y is along its gradient: the least
+    eigenvalue in the tangent plane, if it is negative; |Hn - (n.Hn) n|; |n.Hn|; and at least half
+    the norm."""
+
+    least: Real
+    across: Real
+    along: Real
+    half_norm: Real
+
+    @classmethod
+    def of(cls, sample: Sample, rows: Rows, way: Vec3) -> _Curved:
+        plane = TangentPlane.of(sample.gradient)
+        eigen = Eigen.of(*plane.restricted(rows))
+        least = dr.select(dr.dot(way, plane.n) > 0, eigen.least, -eigen.most)
+        bent = apply(rows, plane.n)
+        squares = dr.squared_norm(rows[0]) + dr.squared_norm(rows[1]) + dr.squared_norm(rows[2])
+        return cls(
+            fmin(least, 0), length(dr.cross(bent, plane.n)), dr.abs(dr.dot(bent, plane.n)),
+            0.5 * dr.sqrt(squares),
+        )  # fmt: skip

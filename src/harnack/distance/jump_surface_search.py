@@ -1,0 +1,420 @@
+"""Closest points of surfaces of fields with sheets, such as meshes: on sheets, and by rays.
+
+A *sheet* is where a field jumps, such as a triangle of a mesh. It is part of the level set where f
+passes a level from one side of it to the other. Whether it does at a point is what a short ray
+through the point tells, in the same arithmetic in which rays meet the surface anywhere else.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
+
+import drjit as dr
+
+from harnack.backend.elementary import across, fmax, fmin, largest_coordinate
+from harnack.fields.capabilities import NO_SHEET, Crossing, NearestSheet
+from harnack.tracer import Status
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Mask, Real, Vec3
+    from harnack.fields.field import Field
+    from harnack.tracer.surface_tracer import MarchResult, PreparedLevelSet
+
+__all__ = ["SheetSearch", "close_in", "is_on_surface", "takes_level"]
+
+# Half the length of a ray through a point of a sheet, in epsilons of coordinates.
+_SHORT = 32.0
+# A regular tetrahedron about the origin, turned so that none of its edges lies in a plane that
+# triangles of meshes often lie in; and its six edges.
+_CORNERS = (
+    (-1.271, -0.030, 1.177),
+    (0.662, -1.591, -0.176),
+    (1.243, 1.088, 0.520),
+    (-0.634, 0.533, -1.521),
+)
+_EDGES = ((0, 1), (1, 2), (2, 3), (3, 0), (0, 2), (1, 3))
+# In these lengths: the distance from y at which f is evaluated, where rounding of y hardly counts.
+_WIDER = 64.0
+# Before a sheet f is evaluated at this part of the way to it.
+_BEFORE = 0.98
+
+Next: TypeAlias = "Callable[[tuple[Any, Any], Any, Any], NearestSheet]"
+
+
+@dataclass(frozen=True)
+class SheetSearch:
+    """The search for the closest point of a prepared surface that lies on a sheet.
+
+    scale: at least the coordinates that the field computes with, for what rounding does.
+    most: sheets that are examined for each point.
+    """
+
+    surface: PreparedLevelSet
+    scale: float
+    most: int
+
+    def closest(self, x: Vec3, limit: Real) -> tuple[Vec3, Vec3]:
+        """A point of the surface on a sheet, nearer to x than `limit` (NaN where none is found),
+        and the way from x to the nearest sheet, part of the surface or not, if that is nearer than
+        `limit` (else infinite).
+
+        Sheets are examined in the order of their distance, each at its nearest point y to x. A
+        short ray through y along the sheet's normal hits the surface there, or the sheet is not
+        part of it at y. Where y lies on the sheet's edge that ray may slip past, and the six edges
+        of a small tetrahedron about y follow: a surface through y separates its corners, and one
+        that ends in a curve through y leaves it through two faces, so that either crosses an edge.
+
+        The first sheet that is hit is the closest point on sheets, unless a sheet nearer than that
+        belongs to the surface elsewhere than at y: the point is one of the surface in any case.
+        """
+        backend = self.surface.backend
+        real, index, vector = backend.Float, backend.UInt32, backend.Array3f
+        following = self._following(x)
+        most = dr.opaque(index, self.most)
+        short = _SHORT * backend.epsilon * fmax(real(self.scale), dr.max(dr.abs(x)))
+        limit = real(limit)
+        nothing = NearestSheet(
+            real(-1), index(NO_SHEET), vector(dr.inf), vector(0), backend.Bool(False)
+        )
+
+        def body(*state: Any) -> tuple[Any, ...]:
+            last = NearestSheet(*state[:5])
+            probe, foot, nearest, n, active = state[5:]
+            fresh = active & (probe == 0)
+            found = following((last.order, last.sheet), limit, fresh)
+            near = _where(fresh, found, last)
+            active &= near.sheet != NO_SHEET
+            nearest = dr.select(active & fresh & (n == 0), near.offset, nearest)
+            y = x + near.offset
+            start, end = _probe(vector, probe, near.normal)
+            met, sheet, at = self._meets(y, short, start, end, active)
+            at = dr.select((sheet == near.sheet) & (probe == 0), y, at)
+            foot = dr.select(met, at, foot)
+            n = n + dr.select(fresh, index(1), 0)
+            last_probe = near.is_inner | (probe == len(_EDGES))
+            active &= ~met & ~(last_probe & (n >= most))
+            probe = dr.select(last_probe, index(0), probe + 1)
+            return *_parts(near), probe, foot, nearest, n, active
+
+        def more(*state: Any) -> Mask:
+            return state[-1]
+
+        start = (
+            *_parts(nothing), index(0), vector(dr.nan), vector(dr.inf), index(0),
+            backend.Bool(True),
+        )  # fmt: skip
+        *_, foot, nearest, _, _ = dr.while_loop(start, more, body, label="sheets in turn")
+        return foot, nearest
+
+    def _meets(
+        self, y: Vec3, short: Real, start: Vec3, end: Vec3, active: Mask
+    ) -> tuple[Mask, Any, Vec3]:
+        """Whether the way between two points about y, in lengths of `short`, meets the surface; the
+        sheet that it meets, and where."""
+        backend = self.surface.backend
+        real, vector = backend.Float, backend.Array3f
+        o = dr.fma(vector(short), start, y)
+        way, length = (end - start) / dr.norm(end - start), dr.norm(end - start)
+        seen = self.surface.first_hit(o, way, real(0), short * length, active)
+        met = active & (seen.status == int(Status.HIT))
+        # To first order any level is near where the gradient has no bound, as at the sheet's edge.
+        met &= takes_level(self.surface, y, _WIDER * short, met)
+        return met, seen.sheet, dr.fma(vector(seen.t), way, o)
+
+    def _following(self, x: Vec3) -> Next:
+        """The sheets of the field in turn; of a field that does not tell them, the nearest
+        alone."""
+        field, backend = self.surface.field, self.surface.backend
+        real, index = backend.Float, backend.UInt32
+        probe = field.nearest_sheet(x, (real(-1), index(NO_SHEET)), real(0), backend.Bool(False))
+        if probe is None:
+            only = _by_differences(backend, field, x)
+
+            def once(after: tuple[Real, Any], limit: Real, active: Mask) -> NearestSheet:
+                del active
+                fresh = (after[0] < 0) & (only.order < limit)
+                order = dr.select(fresh, only.order, dr.inf)
+                sheet = dr.select(fresh, only.sheet, index(NO_SHEET))
+                return NearestSheet(order, sheet, only.offset, only.normal, only.is_inner)
+
+            return once
+
+        def told(after: tuple[Real, Any], limit: Real, active: Mask) -> NearestSheet:
+            found = field.nearest_sheet(x, after, limit, active)
+            if found is None:
+                raise RuntimeError("nearest_sheet tells sheets at some times and not at others")
+            return found
+
+        return told
+
+
+def takes_level(surface: PreparedLevelSet, y: Vec3, radius: Real, active: Mask) -> Mask:
+    """Whether f is on both sides of a level about y, no farther than 1.74 radii away.
+
+    f is evaluated in the corners of a tetrahedron and, on its edges, just before a sheet. Where two
+    of these places are on different sides of a level, the surface lies on the way between them: f
+    passes the level on it steadily, or by a jump. That needs no gradient, which has no bound at the
+    edges of sheets: f takes all values between those on both sides of the sheet there, and no
+    others.
+    """
+    backend, field = surface.backend, surface.field.without_truncation(surface.backend)
+    real, index, vector = backend.Float, backend.UInt32, backend.Array3f
+    nowhere = vector(0)
+
+    def body(k: Any, low: Real, high: Real, active: Mask) -> tuple[Any, ...]:
+        start, end = _probe(vector, k + 1, nowhere)
+        o = dr.fma(vector(radius), start, y)
+        length = dr.norm(end - start)
+        way, reach = (end - start) / length, radius * length
+        behind = Crossing(real(0), index(NO_SHEET), real(0), nowhere)
+        t = real(field.next_crossing(o, way, behind, reach, active).t)
+        inside = dr.select(t < reach, t, 0.5 * reach)
+        for share in (real(0), _BEFORE * inside):
+            value = real(field.evaluate(dr.fma(vector(share), way, o)).value)
+            low, high = fmin(low, value), fmax(high, value)
+        return k + 1, low, high, active & (k + 1 < len(_EDGES))
+
+    def more(*state: Any) -> Mask:
+        return state[-1]
+
+    start = index(0), real(dr.inf), real(-dr.inf), backend.Bool(active)
+    _, low, high, _ = dr.while_loop(start, more, body, label="sides of a level")
+    return (low < high) & (surface.levels.gaps(low).up < high - low)
+
+
+def _parts(near: NearestSheet) -> tuple[Any, ...]:
+    return near.order, near.sheet, near.offset, near.normal, near.is_inner
+
+
+def _where(mask: Mask, one: NearestSheet, other: NearestSheet) -> NearestSheet:
+    pairs = zip(_parts(one), _parts(other), strict=True)
+    return NearestSheet(*(dr.select(mask, a, b) for a, b in pairs))
+
+
+def _probe(vector: Any, number: Any, normal: Vec3) -> tuple[Vec3, Vec3]:
+    """Both ends of a probe about the origin: along the normal, then the tetrahedron's edges."""
+    start, end = -normal, normal
+    for k, (i, j) in enumerate(_EDGES):
+        start = dr.select(number == k + 1, vector(*_CORNERS[i]), start)
+        end = dr.select(number == k + 1, vector(*_CORNERS[j]), end)
+    return start, end
+
+
+def _by_differences(backend: Backend, field: Field, x: Vec3) -> NearestSheet:
+    """The nearest sheet to x, from its distance d alone: along the way on which d falls.
+
+    Central differences over h = r d are off by r^2, and by epsilon s/(r d) as rounding moves d by
+    epsilon s, s the size of coordinates: with r = (epsilon s/d)^(1/3) both are small down to
+    distances of a few roundings. There any direction serves: y = x is on the sheet to rounding.
+    """
+    real, vector = backend.Float, backend.Array3f
+    d = real(field.distance_to_sheets(x))
+    size = fmax(dr.max(dr.abs(x)), d)
+    h = d * fmin(dr.cbrt(backend.epsilon * size / d), 0.5)
+    rate: list[Real] = []
+    for axis in range(3):
+        move = vector(*(h if k == axis else 0 for k in range(3)))
+        ahead, back = (field.distance_to_sheets(q) for q in (x + move, x - move))
+        rate.append(back - ahead)
+    fall = vector(*rate)
+    gradient_norm = dr.norm(fall)
+    has_direction = (gradient_norm > 0.2 * h) & (d > 64 * backend.epsilon * size)
+    way = dr.select(has_direction, fall / gradient_norm, vector(1 / math.sqrt(3)))
+    offset = dr.select(has_direction, d * way, 0)
+    return NearestSheet(d, backend.UInt32(0), offset, way, backend.Bool(False))
+
+
+# Nearer points by rays.
+
+_MOST_RAYS = 600
+# Rays of a turn, which all have to fail before the next turn is narrower: those to where planes
+# meet, then those near the best direction, about 137.5 degrees apart, so that however many there
+# are they are spread evenly, and no turn repeats the one before.
+_MEETINGS, _TILTED, _GOLDEN = 4, 8, 2.399963229728653
+# Steps are tangents of angles.
+_WIDEST, _CLOSER = 1.0, 0.25
+# Rays that leave in directions all over the sphere before that.
+_AROUND = 128
+# Planes whose normals are closer than this, as the sine of an angle, count as the same.
+_APART = 1e-3
+# In epsilons, of coordinates: so far from a hit f is evaluated on both sides of the level.
+_ABOUT = 1024.0
+
+
+@dataclass(frozen=True)
+class _TouchingPlane:
+    """Points x + r with r.normal = offset, |normal| = 1; normal = 0 where there is no plane."""
+
+    normal: Vec3
+    offset: Real
+
+    @classmethod
+    def where(cls, mask: Mask, one: _TouchingPlane, other: _TouchingPlane) -> _TouchingPlane:
+        """One plane in some lanes, another elsewhere."""
+        normal = dr.select(mask, one.normal, other.normal)
+        return cls(normal, dr.select(mask, one.offset, other.offset))
+
+    def is_apart(self, other: _TouchingPlane) -> Mask:
+        """Whether both are planes, and not nearly parallel."""
+        return dr.squared_norm(dr.cross(self.normal, other.normal)) > _APART * _APART
+
+    def meeting(self, other: _TouchingPlane) -> Vec3:
+        """The shortest way to where both are; not finite if they are parallel."""
+        vector = cast("Any", type(self.normal))
+        cosine = dr.dot(self.normal, other.normal)
+        ours = vector(self.offset - cosine * other.offset) * self.normal
+        return (ours + vector(other.offset - cosine * self.offset) * other.normal) / (
+            1 - cosine * cosine
+        )
+
+    def corner(self, second: _TouchingPlane, third: _TouchingPlane) -> Vec3:
+        """The way to where all three are; not finite if they are parallel to a line."""
+        vector = cast("Any", type(self.normal))
+        a, b, c = self.normal, second.normal, third.normal
+        ways = (dr.cross(b, c), dr.cross(c, a), dr.cross(a, b))
+        offsets = (self.offset, second.offset, third.offset)
+        total = sum((vector(o) * w for o, w in zip(offsets, ways, strict=True)), vector(0))
+        return total / dr.dot(a, ways[0])
+
+
+@dataclass(frozen=True)
+class _TouchingPlanes:
+    """Three planes that touch the surface: where the best point is, then the two last seen that are
+    parallel neither to it nor to one another."""
+
+    first: _TouchingPlane
+    second: _TouchingPlane
+    third: _TouchingPlane
+
+    @classmethod
+    def of(cls, parts: tuple[Any, ...]) -> _TouchingPlanes:
+        """From `parts`."""
+        return cls(*(_TouchingPlane(parts[k], parts[k + 1]) for k in (0, 2, 4)))
+
+    def parts(self) -> tuple[Any, ...]:
+        """Normals and offsets, as loops want them."""
+        return tuple(
+            part
+            for plane in (self.first, self.second, self.third)
+            for part in (plane.normal, plane.offset)
+        )
+
+    def with_(self, plane: _TouchingPlane, seen: Mask, best: Mask) -> _TouchingPlanes:
+        """With one more, where `seen`; that of the best point, where `best`."""
+        first, second, third = self.first, self.second, self.third
+        parts = _TouchingPlane.where
+        stays = first.is_apart(plane)
+        ours = _TouchingPlanes(
+            plane,
+            parts(stays, first, second),
+            parts(stays & second.is_apart(plane), second, third),
+        )
+        is_new = seen & ~best & stays
+        theirs = _TouchingPlanes(
+            first,
+            parts(is_new, plane, second),
+            parts(is_new & second.is_apart(plane), second, third),
+        )
+        return _TouchingPlanes(
+            parts(best, ours.first, theirs.first),
+            parts(best, ours.second, theirs.second),
+            parts(best, ours.third, theirs.third),
+        )
+
+    def meeting(self, number: Any) -> Vec3:
+        """The shortest way to where planes meet: all three (0), the first and the second (1), the
+        first and the third (2), or to the first alone (3); not finite where they do not."""
+        first, second, third = self.first, self.second, self.third
+        vector = cast("Any", type(first.normal))
+        pairs = dr.select(number == 1, first.meeting(second), first.meeting(third))
+        alone = vector(first.offset) * first.normal
+        ends = dr.select(number == 0, first.corner(second, third), alone)
+        return dr.select((number == 1) | (number == 2), pairs, ends)
+
+
+def close_in(surface: PreparedLevelSet, x: Vec3, foot: Vec3) -> Vec3:
+    """Points of the surface no farther from x than `foot`: a compass search over directions.
+
+    What other searches cannot follow, a ray sees: the crease in which two sheets meet, the curve at
+    which a smooth part of the surface ends in a sheet, the edge along which a volume cuts it.
+
+    Rays leave x at an angle to the best direction; the first that hits the surface nearer than the
+    best becomes the best. If all of a turn fail, the next turns are narrower, down to an angle of
+    sqrt(epsilon). A compass alone is slow along creases; so each hit adds the plane that touches
+    the surface there, and a turn begins with rays to the nearest points where these planes meet.
+    Every point taken is a first hit that f takes the level about (`takes_level`), hence one of the
+    surface, whatever led there.
+    """
+    backend = surface.backend
+    real, vector, count = backend.Float, backend.Array3f, backend.UInt32
+    r = vector(foot) - x
+    t = dr.norm(r)
+    active = dr.isfinite(t) & (t > 0)
+    d = dr.select(active, r / t, vector(0, 0, 1))
+
+    def body(
+        d: Vec3, t: Real, foot: Vec3, step: Real, angle: Real, failed: Any, n: Any, active: Mask,
+        *parts: Any,
+    ) -> tuple[Any, ...]:  # fmt: skip
+        planes, around = _TouchingPlanes.of(parts), n < _AROUND
+        meets = ~around & (failed < _MEETINGS)
+        way = dr.select(meets, dr.normalize(planes.meeting(failed)), _tilted(d, step, angle))
+        way = dr.select(around, _spiral(vector, real(n)), way)
+        usable = active & dr.isfinite(dr.squared_norm(way))
+        # Beyond t as well, for planes.
+        end = dr.select(around, t, t * (1 + fmin(step, 0.5)))
+        seen = surface.first_hit(x, dr.select(usable, way, d), real(0), end, usable)
+        hit = usable & (seen.status == int(Status.HIT))
+        nearer = hit & (seen.t < t * (1 - 8 * backend.epsilon))
+        there = dr.fma(vector(seen.t), way, x)
+        nearer &= is_on_surface(surface, there, seen, nearer)
+        normal = dr.normalize(seen.gradient)
+        touches = hit & dr.isfinite(dr.squared_norm(normal))
+        touching = _TouchingPlane(normal, dr.dot(normal, way) * seen.t)
+        planes = planes.with_(touching, touches, touches & nearer)
+        d, t = dr.select(nearer, way, d), dr.select(nearer, seen.t, t)
+        foot = dr.select(nearer, there, foot)
+        failed = dr.select(nearer | around, count(0), failed + 1)
+        spent = failed == _MEETINGS + _TILTED
+        narrower = dr.select(spent, _CLOSER * step, step)
+        step = dr.select(nearer & ~around & ~meets, fmin(2 * step, _WIDEST), narrower)
+        angle = dr.select(nearer | meets | around, angle, angle + _GOLDEN)
+        failed = dr.select(spent, count(0), failed)
+        active &= (step > backend.epsilon**0.5) & (n + 1 < _MOST_RAYS)
+        return d, t, foot, step, angle, failed, n + 1, active, *planes.parts()
+
+    def more(*state: Any) -> Mask:
+        return state[7]
+
+    start = (
+        d, t, vector(foot), real(_WIDEST), real(0), count(0), count(0), active,
+        *3 * (vector(0), real(0)),
+    )  # fmt: skip
+    return dr.while_loop(start, more, body, label="closing in")[2]
+
+
+def is_on_surface(surface: PreparedLevelSet, y: Vec3, hit: MarchResult, active: Mask) -> Mask:
+    """Whether f takes the level about hits y: beside the edge of a sheet, where its gradient has no
+    bound, rays are within the tolerance of any level to first order, and a ray that begins there
+    may hit the sheet at once, whatever f is."""
+    radius = _ABOUT * surface.backend.epsilon * fmax(largest_coordinate(y), hit.t)
+    return takes_level(surface, y, radius, active)
+
+
+def _tilted(d: Vec3, step: Real, angle: Real) -> Vec3:
+    """The direction at a distance of `step` from d, seen along d at that angle."""
+    vector = cast("Any", type(d))
+    u, v = across(d)
+    sine, cosine = dr.sincos(angle)
+    return dr.normalize(d + vector(step * cosine) * u + vector(step * sine) * v)
+
+
+def _spiral(vector: Any, n: Real) -> Vec3:
+    """Evenly spread directions, one for each n < `_AROUND`."""
+    z = 1 - (2 * n + 1) / _AROUND
+    flat = dr.sqrt(1 - z * z)
+    sine, cosine = dr.sincos(_GOLDEN * n)
+    return vector(flat * cosine, flat * sine, z)

@@ -1,0 +1,177 @@
+"""Level sets near a point: tangent plane, second derivatives along it, and distances."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import numpy as np
+
+from harnack.backend import FloatArray
+from harnack.backend.elementary import across, fmax, length
+from harnack.backend.validation import LARGEST, real_array
+from harnack.fields import batch_evaluation as field_points
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Real, Vec3
+    from harnack.fields.field import Field
+
+__all__ = [
+    "Eigen",
+    "TangentPlane",
+    "apply",
+    "first_order",
+    "has_hessian",
+    "in_batches",
+    "second_order",
+]
+
+
+@dataclass(frozen=True)
+class TangentPlane:
+    """The tangent plane where grad f is not zero: the length of grad f, the unit normal n along it,
+    and two unit tangents u, v."""
+
+    gradient_norm: Real
+    n: Vec3
+    u: Vec3
+    v: Vec3
+
+    @classmethod
+    def of(cls, gradient: Vec3) -> TangentPlane:
+        """The plane at right angles to a gradient; NaN where that is zero."""
+        gradient_norm = length(gradient)
+        n = gradient / gradient_norm
+        u, v = across(n)
+        return cls(gradient_norm, n, u, v)
+
+    def restricted(self, rows: tuple[Vec3, Vec3, Vec3]) -> tuple[Real, Real, Real]:
+        """u.Au, v.Av and u.Av of a symmetric matrix A given by its rows."""
+        along_u, along_v = apply(rows, self.u), apply(rows, self.v)
+        return dr.dot(self.u, along_u), dr.dot(self.v, along_v), dr.dot(self.u, along_v)
+
+
+@dataclass(frozen=True)
+class Eigen:
+    """The eigenvalues of a symmetric 2x2 matrix and the angle of the larger one's eigenvector."""
+
+    most: Real
+    least: Real
+    cosine: Real
+    sine: Real
+
+    @classmethod
+    def of(cls, uu: Real, vv: Real, uv: Real) -> Eigen:
+        """Of the matrix ((uu, uv), (uv, vv))."""
+        middle, half = 0.5 * (uu + vv), 0.5 * (uu - vv)
+        spread = dr.sqrt(dr.fma(half, half, uv * uv))
+        s, c = dr.sincos(0.5 * dr.atan2(uv, half))
+        return cls(middle + spread, middle - spread, c, s)
+
+    def coordinates(self, u: Real, v: Real) -> tuple[Real, Real]:
+        """Of the vector (u, v) along the two eigenvectors, the larger one's first."""
+        return (
+            dr.fma(self.cosine, u, self.sine * v),
+            dr.fma(self.cosine, v, -self.sine * u),
+        )
+
+    def combination(self, most: Real, least: Real) -> tuple[Real, Real]:
+        """The vector (u, v) with these coordinates."""
+        return (
+            dr.fma(self.cosine, most, -self.sine * least),
+            dr.fma(self.sine, most, self.cosine * least),
+        )
+
+
+def has_hessian(backend: Backend, field: Field) -> bool:
+    """Whether a prepared field knows its second derivatives."""
+    try:
+        field.hessian(backend.Array3f(0))
+    except NotImplementedError:
+        return False
+    return True
+
+
+def apply(rows: tuple[Vec3, Vec3, Vec3], vector: Vec3) -> Vec3:
+    """The matrix with these rows times a vector."""
+    return type(vector)(*(dr.dot(row, vector) for row in rows))
+
+
+def first_order(above: Real, gradient: Vec3) -> Real:
+    """above/|grad f| with above = f - level. Off by O(d^2) at distance d from a smooth surface.
+
+    Proof. Let y be the closest point of the level set, N its normal grad f/|grad f|(y), and
+    x = y + d N (x - y is normal at the closest point; d has the sign of above). Taylor's formula
+    along this line, from x back to y, and |grad f(x)| = |grad f(y)| + O(d) give
+    above = d N.grad f(x) + O(d^2) = d |grad f(x)| + O(d^2).
+
+    Where the gradient is zero it is infinite with the sign of above; zero on the level itself.
+    """
+    return dr.select(above == 0, 0, above / length(gradient))
+
+
+def second_order(above: Real, gradient: Vec3, rows: tuple[Vec3, Vec3, Vec3]) -> Real:
+    """d1/(1 - k d1/2) with d1 = above/|grad f|, k = n.An/|grad f|: off by O(d^3).
+
+    n is the unit gradient, A the Hessian, both at x; k is how fast the slope changes along n, not
+    a curvature of the surface.
+
+    Proof. With x = y + d N as in `first_order`, Taylor along that line is
+    above = d N.g - d^2 N.AN/2 + O(d^3), whose root is d = e + (N.AN/N.g) e^2/2 + O(d^3) with
+    e = above/N.g. N is not n: but n is smooth and n(y) = N, so N = n + O(d); for unit vectors
+    N.n = 1 - |N-n|^2/2, hence N.g = |g| (1 + O(d^2)), and N.AN = n.An + O(d). As above = O(d),
+    replacing N by n changes e and the second term by O(d^3): d = d1 + k d1^2/2 + O(d^3). So does
+    any function with the same expansion.
+
+    Three have it: the polynomial, the smaller root 2 d1/(1 + sqrt(1 - 2 k d1)) of the parabola, and
+    Halley's quotient above. The root does not exist for k d1 > 1/2; the polynomial changes sign at
+    k d1 = -2; the quotient is exact for f = c/r + const along its rays (for every f = (a+bs)/(c+es)
+    on the line), as harmonic functions often are, and bounded for k d1 < 0. For k d1 > 1, where
+    Taylor's formula says nothing, its denominator is held at 1/2: the sign is always that of
+    above, and the size at most 2 |d1|.
+    """
+    gradient_norm = length(gradient)
+    n = gradient / gradient_norm
+    first = first_order(above, gradient)
+    k = dr.dot(n, apply(rows, n)) / gradient_norm
+    quotient = first / fmax(1 - 0.5 * k * first, 0.5)
+    return dr.select(dr.isfinite(first) & (first != 0), quotient, first)
+
+
+# What searches compute at points, in batches: NumPy on both ends, in double precision.
+
+# Bounds memory, and the time until an interrupt is noticed.
+_AT_ONCE = 1 << 18
+
+
+def in_batches(
+    backend: Backend,
+    compute: Callable[..., tuple[Real | Vec3, ...]],
+    points: Any,
+    *others: FloatArray,
+) -> tuple[Any, ...]:
+    """The results of `compute` for points of shape (n, 3), as float64 arrays (n,) or (n, 3).
+
+    others: more vectors of the same shape that `compute` is given, one a lane; their values are
+        not checked.
+
+    Raises:
+        TypeError, ValueError: points that are not an (n, 3) array of finite numbers of at most
+            1e100.
+    """
+    _check_size(points)
+    with np.errstate(over="ignore"):
+        rounded = (one.astype(backend.dtype, copy=False) for one in others)
+        results = field_points.in_batches(backend, compute, points, *rounded, at_once=_AT_ONCE)
+    return tuple(one.astype(np.float64, copy=False) for one in results)
+
+
+def _check_size(points: Any) -> None:
+    coordinates = None if dr.is_array_v(type(points)) else real_array(points, "points")
+    if coordinates is None or not coordinates.size:
+        return
+    size = float(np.abs(coordinates).max())
+    if LARGEST < size < np.inf:
+        raise ValueError(f"points: coordinates up to {size:g} are too large: at most {LARGEST:g}")

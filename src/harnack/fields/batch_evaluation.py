@@ -1,0 +1,156 @@
+"""Running Dr.Jit kernels at many points, batch by batch: NumPy in, NumPy out."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, cast
+
+import drjit as dr
+import numpy as np
+import numpy.typing as npt
+
+from harnack.backend import choose_backend, to_numpy, to_vector3
+from harnack.backend.arrays import aligned_integers, finite_vectors, upload_vectors
+from harnack.backend.validation import refuse_derivatives
+from harnack.cluster.dask_arrays import takes_blocks
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Precision, Vec3
+
+__all__ = ["also_at_points", "at_points", "in_batches", "morton_order"]
+
+# Points in one kernel: enough to keep a GPU busy, few enough to keep memory small.
+_AT_ONCE = 1 << 20
+# Cells along an axis, as a power of two. Three coordinates make a key of 15 bits, for which NumPy
+# uses radix sort.
+_BITS = 5
+
+
+def at_points(
+    points: Any,
+    kernel: Callable[[Backend, Vec3], tuple[Any, ...]],
+    precision: Precision,
+) -> tuple[npt.NDArray[Any], ...]:
+    """The arrays that `kernel` gives at points (n, 3), in their order; for a single point (3,) the
+    only entries.
+
+    The points are visited cell by cell along a Morton curve, so that neighboring lanes visit the
+    same nodes of a tree, which halves the time.
+
+    Raises:
+        TypeError, ValueError: points that are no (n, 3) array of finite numbers.
+    """
+    backend = choose_backend(precision)
+
+    def visit(x: Vec3) -> tuple[Any, ...]:
+        order = morton_order(backend, x)
+        results = kernel(backend, dr.gather(backend.Array3f, x, order))
+        return tuple(_back_in_place(one, order, dr.width(x)) for one in results)
+
+    refuse_derivatives("what NumPy's arrays are given of", points)
+    given = np.asarray(points)
+    if given.shape == (3,):
+        return tuple(one[0] for one in in_batches(backend, visit, given[None]))
+    return in_batches(backend, visit, given)
+
+
+def also_at_points(hessian: Callable[[Any, Vec3], Any]) -> Callable[..., Any]:
+    """A decorator of a field's method `hessian`: it also takes NumPy points and gives NumPy
+    matrices."""
+
+    @takes_blocks("p")
+    @functools.wraps(hessian)
+    def general(self: Any, p: Any, *, precision: Precision = "single") -> Any:
+        if dr.is_array_v(type(p)):
+            refuse_derivatives(f"the Hessian of {type(self).__name__}", p, self.parameters())
+            return hessian(self, p)
+
+        def kernel(backend: Backend, x: Vec3) -> tuple[Vec3, Vec3, Vec3]:
+            return self.prepare(backend).hessian(x)
+
+        return np.stack(at_points(p, kernel, precision), axis=-2)
+
+    return general
+
+
+def in_batches(
+    backend: Backend,
+    compute: Callable[..., tuple[Any, ...]],
+    points: Any,
+    *others: npt.NDArray[Any],
+    at_once: int = _AT_ONCE,
+) -> tuple[npt.NDArray[Any], ...]:
+    """The results of `compute` for points (n, 3), as arrays (n,) or (n, 3) in its precision.
+
+    points: an array-like, or a Dr.Jit 3-vector.
+    others: more vectors (n, 3) that `compute` is given, one in each lane; they may have any values.
+    at_once: how many points make a batch.
+
+    Raises:
+        TypeError, ValueError: points that are no (n, 3) array of finite numbers.
+    """
+    on_device = dr.is_array_v(cast("Any", type(points)))
+    vectors = (
+        to_vector3(backend, points, "points") if on_device else finite_vectors(points, "points")
+    )
+    n = dr.width(vectors) if on_device else len(vectors)
+    parts: list[tuple[npt.NDArray[Any], ...]] = []
+    # One batch even for no points: it tells the shapes, and raises the errors of `compute`.
+    for start in range(0, max(n, 1), at_once):
+        lanes = min(at_once, n - start)
+        with dr.suspend_grad():
+            results = compute(
+                *(
+                    _part(backend, one, start, lanes) if n else backend.Array3f(0)
+                    for one in (vectors, *others)
+                )
+            )
+            dr.eval(*results)
+        parts.append(tuple(_spread(to_numpy(one), max(lanes, 1)) for one in results))
+    if len(parts) == 1:
+        return tuple(one[:n] for one in parts[0])
+    return tuple(np.concatenate(column) for column in zip(*parts, strict=True))
+
+
+def _part(backend: Backend, vectors: Any, start: int, lanes: int) -> Vec3:
+    """Vectors `start` to `start + lanes` of a Dr.Jit vector, or of an array."""
+    if dr.is_array_v(cast("Any", type(vectors))):
+        return dr.gather(backend.Array3f, vectors, dr.arange(backend.UInt32, lanes) + start)
+    return upload_vectors(backend, vectors[start : start + lanes], "points")
+
+
+def _spread(values: npt.NDArray[Any], n: int) -> npt.NDArray[Any]:
+    return values if len(values) == n else np.repeat(values, n, axis=0)
+
+
+def _back_in_place(values: Any, order: Any, n: int) -> Any:
+    """Values that belong to the points in visiting order, brought into the given order."""
+    kind = cast("Any", type(values))
+    if dr.depth_v(kind) == 1:
+        out = dr.zeros(kind, n)
+        dr.scatter(out, values, order)
+        return out
+    return kind([_back_in_place(one, order, n) for one in values])
+
+
+def morton_order(backend: Backend, x: Vec3, bits: int = _BITS) -> Any:
+    """The indices (Dr.Jit UInt32) of points cell by cell, with the cells along a Morton curve.
+
+    bits: cells along an axis, as a power of two, at most 10.
+    """
+    index, vector = backend.UInt32, backend.Array3f
+    n = dr.width(x)
+    if n < 2:
+        return dr.arange(index, n)
+    low = vector(*(dr.min(one) for one in x))
+    sides = [dr.max(x[k]) - low[k] for k in range(3)]
+    size = dr.maximum(dr.maximum(sides[0], sides[1]), sides[2])
+    scale = (2**bits - 1e-3) / dr.maximum(size, 1e-30)
+    key = index(0)
+    for axis in range(3):
+        cell = index((x[axis] - low[axis]) * scale)
+        for bit in range(bits):
+            key |= (cell & (1 << bit)) << (2 * bit + axis)
+    keys = to_numpy(key).astype(np.uint16 if 3 * bits <= 16 else np.uint32)
+    return aligned_integers(backend, np.argsort(keys, kind="stable"))

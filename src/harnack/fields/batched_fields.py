@@ -1,0 +1,359 @@
+"""Fields that can be evaluated at many points at once, and caches that live as long as a field.
+
+- `BatchedField`: values, derivatives and error bounds at points: NumPy in, NumPy out.
+- `FieldCache`, `prepared_once`: what is computed or uploaded only once for a field.
+"""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+import functools
+from collections import defaultdict
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast
+from weakref import finalize
+
+import drjit as dr
+
+from harnack.backend import FloatArray, backend_of
+from harnack.backend.arrays import as_data
+from harnack.backend.elementary import fmax
+from harnack.backend.tensors import takes_tensors
+from harnack.cluster.dask_arrays import takes_blocks
+from harnack.fields.batch_evaluation import at_points
+from harnack.fields.field import AtDetail, Field
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Precision, Real, Vec3
+    from harnack.fields.samples import Sample
+
+# The rounding of dipoles' moments, which are summed up in double precision, as a fraction of the
+# total weight.
+_MOMENTS = 32 * 2.0**-53
+
+
+@dataclass(frozen=True)
+class SymmetricSum:
+    """The state of a sum of symmetric matrices, one in each lane."""
+
+    xx: Real
+    yy: Real
+    zz: Real
+    xy: Real
+    xz: Real
+    yz: Real
+
+    @classmethod
+    def zero(cls, real: Any) -> SymmetricSum:
+        """The matrix of zeros; real: the type of its entries."""
+        return cls(*(real(0) for _ in range(6)))
+
+    def plus(self, u: Vec3, v: Vec3) -> SymmetricSum:
+        """The sum with (u v^T + v u^T)/2."""
+        half = 0.5 * v
+        return SymmetricSum(
+            dr.fma(u.x, v.x, self.xx),
+            dr.fma(u.y, v.y, self.yy),
+            dr.fma(u.z, v.z, self.zz),
+            self.xy + dr.fma(u.x, half.y, u.y * half.x),
+            self.xz + dr.fma(u.x, half.z, u.z * half.x),
+            self.yz + dr.fma(u.y, half.z, u.z * half.y),
+        )
+
+    def parts(self) -> tuple[Real, ...]:
+        """The entries in the order of the constructor, for the state of a loop."""
+        return self.xx, self.yy, self.zz, self.xy, self.xz, self.yz
+
+    def rows(self, vector: Any) -> tuple[Vec3, Vec3, Vec3]:
+        """The three rows; vector: the type of a row."""
+        return (
+            vector(self.xx, self.xy, self.xz),
+            vector(self.xy, self.yy, self.yz),
+            vector(self.xz, self.yz, self.zz),
+        )
+
+
+@dataclass(frozen=True)
+class Values:
+    """Value and, if they were asked for, gradient and Hessian of a field at points, in the field's
+    own units, with bounds of their errors by truncation and rounding.
+
+    error: of the value.
+    gradient_error: of the gradient, as a length.
+    hessian_error: of second derivatives along lines, which is the spectral norm of the Hessian's
+        error.
+    """
+
+    value: Real
+    error: Real
+    gradient: Vec3 | None = None
+    hessian: SymmetricSum | None = None
+    gradient_error: Real = 0.0
+    hessian_error: Real = 0.0
+
+    def far_away(self, x: Vec3, terms: int, weight: float) -> Values:
+        """The same values with error bounds that hold at points far away too.
+
+        x: the points, in coordinates in which the field's data have a size of about one. terms: how
+        many terms were summed up. weight: of all dipoles together.
+
+        Two errors matter only far away. A term of a derivative is a product of a factor that falls
+        like |x|^-5 and one that grows like |x|^2, and the first may underflow. And where dipoles
+        nearly cancel, their summed moments are rounded in proportion to the weight of all of them,
+        not to the small sum.
+        """
+        smallest = float(dr.smallest(type(x.x)))
+        lost = 4 * smallest * terms * (1 + dr.squared_norm(x))
+        inverse = dr.rcp(fmax(dr.norm(x), type(x.x)(4)))
+        moved = _MOMENTS * weight * dr.square(inverse)
+        return dataclasses.replace(
+            self,
+            error=self.error + lost + moved,
+            gradient_error=self.gradient_error + lost + 4 * moved * inverse,
+            hessian_error=self.hessian_error + lost + 24 * moved * dr.square(inverse),
+        )
+
+    def rescaled(self, size: Real) -> Values:
+        """The values of x -> f(x / size) at `size` times the points. Where a number has overflowed
+        its error is infinite."""
+        gradient, hessian, share = self.gradient, self.hessian, 1 / size
+        gradient_error, hessian_error = self.gradient_error, self.hessian_error
+        if gradient is not None:
+            gradient = gradient * share
+            known = dr.isfinite(gradient.x) & dr.isfinite(gradient.y) & dr.isfinite(gradient.z)
+            gradient_error = dr.select(known, gradient_error * share, dr.inf)
+        if hessian is not None:
+            hessian = type(hessian)(*(share * share * one for one in hessian.parts()))
+            known = dr.isfinite(sum(hessian.parts()))
+            hessian_error = dr.select(known, hessian_error * (share * share), dr.inf)
+        error = dr.select(dr.isfinite(self.value), self.error, dr.inf)
+        return Values(self.value, error, gradient, hessian, gradient_error, hessian_error)
+
+
+class BatchedField(Field):
+    """A field that gives values, derivatives and error bounds at many points at once.
+
+    Subclasses define `values_at`.
+    """
+
+    @abc.abstractmethod
+    def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> Values:
+        """Everything at points x, a Dr.Jit 3-vector of any backend and precision.
+
+        Not called while a loop is being recorded, unless derivatives is 2.
+
+        derivatives: 0 for the value alone, 1 with the gradient, 2 with the Hessian.
+        closer: clusters of far terms are approximated only beyond so many times the usual distance,
+            at least 1; infinity approximates nothing.
+        """
+
+    def sharp_values_at(self, x: Vec3) -> Values:
+        """`values_at` with the gradient, which may be looked at more closely: what users are given
+        as the gradient at points. Not called while a loop is being recorded."""
+        return self.values_at(x, 1)
+
+    def differentiable_value(self, p: Vec3) -> Real:
+        """f to first order about p: its value and, in reverse and forward mode, its gradient."""
+        with dr.suspend_grad():
+            at = self.sharp_values_at(dr.detach(p))
+        # A literal 0, the gradient of a closed mesh, would have no derivative in Dr.Jit.
+        return dr.replace_grad(at.value, dr.dot(as_data(at.gradient), p - dr.detach(p)))
+
+    @takes_blocks("points")
+    @takes_tensors
+    def value(self, points: Any, *, precision: Precision = "single") -> Any:
+        if dr.is_array_v(type(points)):
+            if dr.grad_enabled(points):
+                return self.differentiable_value(points)
+            return self.values_at(points, 0).value
+        return self._at(points, precision, 0, lambda at: (at.value,))[0]
+
+    @takes_blocks("points")
+    @takes_tensors
+    def gradient(self, points: Any, *, precision: Precision = "single") -> Any:
+        if dr.is_array_v(type(points)):
+            if dr.grad_enabled(points):
+                return super().gradient(points)
+            return self.sharp_values_at(points).gradient
+        return self._at(points, precision, 1, lambda at: (at.gradient,))[0]
+
+    def value_and_gradient(
+        self, points: Any, *, precision: Precision = "single"
+    ) -> tuple[FloatArray, FloatArray]:
+        """Values (n,) and gradients (n, 3) together, at hardly more cost than the latter."""
+        value, gradient = self._at(points, precision, 1, lambda at: (at.value, at.gradient))
+        return value, gradient
+
+    def rough_value_and_gradient(
+        self, points: Any, *, precision: Precision = "single"
+    ) -> tuple[FloatArray, FloatArray]:
+        """Values (n,) and gradients (n, 3) of one pass over a tree, the latter perhaps far off: for
+        guesses, and where f is steep."""
+
+        def kernel(backend: Backend, x: Vec3) -> tuple[Any, ...]:
+            del backend
+            at = self.values_at(x, 1)
+            return at.value, at.gradient
+
+        value, gradient = at_points(points, kernel, precision)
+        return value, gradient
+
+    def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
+        return _hessian(self.values_at(p, 2)).rows(backend_of(p).Array3f)
+
+    def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
+        return sample.gradient_error, self.values_at(p, 2).hessian_error
+
+    @takes_blocks("points")
+    def error_bound(self, points: Any, *, precision: Precision = "single") -> FloatArray:
+        """Bounds (n,) of the error of `value` at points (n, 3).
+
+        Proved truncation, and rounding. The rounding of the points themselves, in single precision,
+        is not included.
+        """
+        return self._at(points, precision, 0, lambda at: (at.error,))[0]
+
+    @takes_blocks("points")
+    def gradient_error_bound(self, points: Any, *, precision: Precision = "single") -> FloatArray:
+        """Bounds (n,) of the error of `gradient`, as a length, at points (n, 3): see
+        `error_bound`. Of a sum over a tree it is some hundred times the error itself: the tree
+        decides by estimates how closely it looks (`sharpened`)."""
+        return self._at(points, precision, 1, lambda at: (at.gradient_error,))[0]
+
+    @takes_blocks("points")
+    def hessian_error_bound(self, points: Any, *, precision: Precision = "single") -> FloatArray:
+        """Bounds (n,) of the error of `hessian`, in the spectral norm, at points (n, 3): see
+        `error_bound`."""
+        return self._at(points, precision, 2, lambda at: (at.hessian_error,))[0]
+
+    def _at(
+        self,
+        points: Any,
+        precision: Precision,
+        derivatives: int,
+        wanted: Callable[[Values], tuple[Any, ...]],
+    ) -> tuple[FloatArray, ...]:
+        def kernel(backend: Backend, x: Vec3) -> tuple[Any, ...]:
+            del backend
+            sharp = derivatives == 1
+            return wanted(self.sharp_values_at(x) if sharp else self.values_at(x, derivatives))
+
+        return at_points(points, kernel, precision)
+
+
+class SumAtDetail(AtDetail):
+    """A sum as evaluated at one detail, with second derivatives; values: `values_at` for these, at
+    that detail."""
+
+    def __init__(
+        self, evaluate: Callable[[Vec3], Sample], values: Callable[[Vec3], Values]
+    ) -> None:
+        super().__init__(evaluate)
+        self._values = values
+
+    def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
+        return _hessian(self._values(p)).rows(backend_of(p).Array3f)
+
+    def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
+        return sample.gradient_error, self._values(p).hessian_error
+
+
+# Gradients by a tree are looked at more closely, with clusters so many times farther away in turn,
+# where they moved by more than this part of their length when that was last done. (Twice the
+# distance leaves a sixteenth of the error or less, measured: that is 1 % with a reserve of four.)
+_CLOSELY, _MOVED = (2.0, 4.0, 8.0), 0.04
+# A gradient proved to that part of its length is good enough.
+_PROVED = 0.01
+
+
+def sharpened(at: Callable[[Vec3, Real], Values], x: Vec3) -> Values:
+    """Value and gradient at points x by a tree, the gradient to about 1 % of its length.
+
+    at: the values and gradients of points, with clusters taken as a whole beyond so many times the
+        usual distance.
+
+    Far terms that nearly cancel, as those of the triangles of a mesh with small holes, leave a
+    gradient that is far smaller than what clusters leave out. Bounds of that add up absolute values
+    and would ask for all terms nearly everywhere, so what a closer look changed decides; the bounds
+    of the errors stay proved.
+    """
+    real = cast("Any", type(x.x))
+    dr.eval(x)
+    values = at(x, dr.opaque(real, 1.0))
+    gradient, error = as_data(values.gradient), real(values.gradient_error)
+    gradient, error = gradient + dr.zeros(type(x), dr.width(x)), error + dr.zeros(real, dr.width(x))
+    dr.eval(values.value, values.error, gradient, error)
+    rows = dr.compress(~(error <= _PROVED * dr.norm(gradient)))
+    for closer in _CLOSELY:
+        if not len(rows):
+            break
+        place = dr.gather(type(x), x, rows)
+        dr.eval(place)
+        closely = at(place, dr.opaque(real, closer))
+        moved = dr.norm(closely.gradient - dr.gather(type(x), gradient, rows))
+        length = dr.norm(as_data(closely.gradient))
+        is_sharp = (moved <= _MOVED * length) | (closely.gradient_error <= _PROVED * length)
+        dr.scatter(gradient, closely.gradient, rows)
+        dr.scatter(error, closely.gradient_error, rows)
+        dr.eval(gradient, error, is_sharp)
+        rows = dr.gather(type(rows), rows, dr.compress(~is_sharp))
+        dr.eval(rows)
+    return dataclasses.replace(values, gradient=gradient, gradient_error=error)
+
+
+def _hessian(values: Values) -> SymmetricSum:
+    if values.hessian is None:
+        raise RuntimeError("values_at(x, 2) gave no Hessian")
+    return values.hessian
+
+
+Prepare = TypeVar("Prepare", bound=Callable[..., Field])
+Value = TypeVar("Value")
+
+
+class FieldCache(Generic[Value]):
+    """One value for each field, the one that was asked for last, deleted with the field.
+
+    A value must not refer to its field, or neither would ever be deleted.
+    """
+
+    def __init__(self) -> None:
+        # By identity: users' fields may be equal to others, or have no hash.
+        self._kept: dict[int, tuple[Any, dict[str, Any], Value]] = {}
+
+    def get(self, field: Field, key: Any, make: Callable[[], Value]) -> Value:
+        """The value of a field for a key: the last one if that had the same key, else `make()`.
+
+        It is made again if an attribute of the field has been set since.
+        """
+        if id(field) in self._kept:
+            kept_key, attributes, value = self._kept[id(field)]
+            now = vars(field)
+            same = attributes.keys() == now.keys()
+            if same and kept_key == key and all(attributes[name] is now[name] for name in now):
+                return value
+        value = make()
+        if value is not field:
+            if id(field) not in self._kept:
+                finalize(field, self._kept.pop, id(field), None).atexit = False
+            self._kept[id(field)] = key, {**vars(field)}, value
+        return value
+
+
+def prepared_once(prepare: Prepare) -> Prepare:
+    """A decorator of a field's method `prepare`: the field is uploaded to each backend only once.
+
+    Fields with parameters are uploaded each time: a parameter may change in place, and its
+    derivatives belong to one trace.
+    """
+    kept: defaultdict[Backend, FieldCache[Field]] = defaultdict(FieldCache)
+
+    @functools.wraps(prepare)
+    def once(self: Field, backend: Backend) -> Field:
+        if self.parameters():
+            return prepare(self, backend)
+        return kept[backend].get(self, None, lambda: prepare(self, backend))
+
+    return cast("Prepare", once)

@@ -1,0 +1,335 @@
+"""Sums of blobs: at a point, along a path with ranges of both derivatives on its pieces, as jets.
+
+One loop over the blobs. Positions are relative to each blob and in units of its own support, so
+that the same bounds hold for blobs of every size. Jets let blobs be deformed and blended.
+
+Rounding. Let u be the unit roundoff, v the vector from the point to a center in units of the
+support, t = v.d. Centers are stored as the sum of two numbers, so that v is right within 4u|v|;
+then so are t, the distance h of the line from the center (as a length), and the positions
+x = s - t, within 8u(2 + |t|) where they matter: that is a displacement of the blob relative to the
+path, which also covers that |d| is 1 only up to 2u. A displacement by e changes f' by at most
+`Steepness.slope` times e, and f'' by `Steepness.bend` times e (its jumps at the end of the support
+are searched for within a margin), or by `Kernel.share` of that. A sum of n terms adds n u times the
+sum of their largest absolute values. Both are added to the ranges, outwards. The value at the point
+is right within 8u |dk/dq|, by the rounding of q, and (16 + n)u m, with m as in `Kernel.profile`.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import drjit as dr
+
+from harnack.arithmetic import Interval, Jet
+from harnack.backend.elementary import clamp, fmax, fmin
+from harnack.enclosures import Slopes
+from harnack.enclosures.enclosure import Piece
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Mask, Real, Vec3
+    from harnack.backend.record_table import Records
+    from harnack.fields.blobs.kernels import Chord, Kernel
+
+State: TypeAlias = "tuple[Any, ...]"
+# From the record of a blob and a state: the state with that blob added.
+EachBlob: TypeAlias = "Callable[[list[Real], State], State]"
+# Applies that to all blobs that matter, beginning with a state.
+ForEach: TypeAlias = "Callable[[EachBlob, State], State]"
+
+
+@dataclass(frozen=True)
+class BlobValue:
+    """A sum at points: value and gradient, and bounds of their rounding."""
+
+    value: Real
+    gradient: Vec3
+    error: Real
+    gradient_error: Real
+
+
+# The number of pieces of a path that takes the least time, for sums over all blobs, and for those
+# over the blobs of a cell, where lengths are short. Finding the blobs costs more than ranges.
+PIECES, PIECES_IN_CELL = 4, 3
+
+
+@dataclass(frozen=True)
+class Along:
+    """A sum along the path from p: its value at p, and ranges on pieces (a `Restriction`)."""
+
+    start: BlobValue
+    parts: tuple[Piece, ...]
+
+    @property
+    def piece_count(self) -> int:
+        """The number of pieces."""
+        return len(self.parts)
+
+    def pieces(self, knots: Sequence[Real]) -> tuple[Piece, ...]:
+        """The ranges, for the same knots that they were computed with."""
+        assert len(knots) == len(self.parts) + 1
+        return self.parts
+
+
+class Knots:
+    """A stand-in for a `Restriction` that records which knots a proof asks for."""
+
+    def __init__(self, piece_count: int = PIECES) -> None:
+        self.piece_count = piece_count
+        self.knots: tuple[Real, ...] | None = None
+
+    def pieces(self, knots: Sequence[Real]) -> tuple[Piece, ...]:
+        """Record the knots; the ranges returned have no meaning."""
+        self.knots = tuple(knots)
+        ends = itertools.pairwise(knots)
+        return tuple(Piece(b - a, Slopes(0.0, 0.0), 0.0, 0.0) for a, b in ends)
+
+
+def value_at(kernel: Kernel, backend: Backend, p: Vec3, for_each: ForEach) -> BlobValue:
+    """The sum at points p."""
+    real = backend.Float
+
+    def body(row: list[Real], state: State) -> State:
+        inverse, amplitude = row[6], row[7]
+        v = _from(p, row) * inverse
+        return _add_value(kernel, v, inverse, amplitude, state)
+
+    state = for_each(body, tuple(real(0) for _ in range(_VALUE)))
+    return _value(kernel, backend, state)
+
+
+def sum_along(
+    kernel: Kernel,
+    backend: Backend,
+    p: Vec3,
+    d: Vec3,
+    knots: Sequence[Real],
+    for_each: ForEach,
+    *,
+    signed: bool = True,
+) -> Along:
+    """The sum along p + s d. signed: whether amplitudes may be negative."""
+    real = backend.Float
+    count = len(knots) - 1
+    unit = 0.5 * backend.epsilon
+    jumps = kernel.jumps
+
+    def body(row: list[Real], state: State) -> State:
+        start, sums = state[:_VALUE], list(state[_VALUE:])
+        inverse, amplitude = row[6], row[7]
+        v = _from(p, row) * inverse
+        start = _add_value(kernel, v, inverse, amplitude, start)
+
+        along = dr.dot(v, d)
+        beside = v - along * d
+        squared = dr.dot(beside, beside)
+        height = fmin(squared, 1)
+        inside = 1 - height
+        chord = kernel.chord(height, inside)
+        size = 1 + dr.abs(along)
+        margin = (64 * unit) * size
+        places = [dr.fma(knot, inverse, -along) for knot in knots]
+        near = (squared < 1 + margin) & (places[0] < 1 + margin) & (places[-1] > -1 - margin)
+        slope_scale = amplitude * inverse
+        bend_scale = slope_scale * inverse
+
+        a = clamp(places[0], -chord.half, chord.half)
+        first_a, second_a = kernel.derivatives(height, inside, a)
+        for k in range(count):
+            b = clamp(places[k + 1], -chord.half, chord.half)
+            first_b, second_b = kernel.derivatives(height, inside, b)
+            slopes = _slopes(chord, a, b, first_a, first_b)
+            bends = _bends(chord, a, b, second_a, second_b)
+            if jumps:
+                bends = _with_jumps(bends, inside, margin, places[k], places[k + 1])
+            for at, (low, high), scale in ((0, slopes, slope_scale), (2, bends, bend_scale)):
+                if signed:
+                    up = scale > 0
+                    low, high = dr.select(up, low, high), dr.select(up, high, low)
+                sums[4 * k + at] = dr.fma(low, scale, sums[4 * k + at])
+                sums[4 * k + at + 1] = dr.fma(high, scale, sums[4 * k + at + 1])
+            a, first_a, second_a = b, first_b, second_b
+
+        nearest = fmax(fmax(places[0], -places[-1]), 0)
+        share = kernel.share(inside, nearest * nearest)
+        weight = dr.select(near, (size + 1) * share, 0)
+        sums[-3] = dr.fma(dr.abs(slope_scale), weight, sums[-3])
+        sums[-2] = dr.fma(dr.abs(bend_scale), weight, sums[-2])
+        sums[-1] = sums[-1] + dr.select(near, real(1), 0)
+        return (*start, *sums)
+
+    state = for_each(body, tuple(real(0) for _ in range(_VALUE + 4 * count + 3)))
+    steepness = kernel.steepness
+    slope_size, bend_size, terms = state[-3:]
+    rounding = unit * (16 + terms)
+    slope_error = rounding * steepness.slope * slope_size
+    bend_error = rounding * steepness.bend * bend_size
+    parts: list[Piece] = []
+    for k, (begin, end) in enumerate(itertools.pairwise(knots)):
+        low, high, least, most = state[_VALUE + 4 * k : _VALUE + 4 * k + 4]
+        slopes = Slopes(low - slope_error, high + slope_error)
+        parts.append(Piece(end - begin, slopes, least - bend_error, most + bend_error))
+    return Along(_value(kernel, backend, state[:_VALUE]), tuple(parts))
+
+
+def hessian_at(kernel: Kernel, backend: Backend, p: Vec3, for_each: ForEach) -> State:
+    """The second derivatives of the sum at points p: rows of the upper triangle."""
+
+    def body(row: list[Real], state: State) -> State:
+        inverse, amplitude = row[6], row[7]
+        v = _from(p, row) * inverse
+        q = dr.dot(v, v)
+        scale = amplitude * inverse * inverse
+        even = 2 * scale * kernel.profile(q)[1]
+        bend = 4 * scale * kernel.second(q)
+        pairs = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+        return tuple(
+            total + dr.select(q < 1, bend * v[i] * v[j] + (even if i == j else 0), 0)
+            for total, (i, j) in zip(state, pairs, strict=True)
+        )
+
+    return for_each(body, tuple(backend.Float(0) for _ in range(6)))
+
+
+# The length of the part of the state for the value at the point: the value, the gradient, the sums
+# for the errors, and the number of terms.
+_VALUE = 8
+
+
+def _add_value(kernel: Kernel, v: Vec3, inverse: Real, amplitude: Real, state: State) -> State:
+    value, x, y, z, moved, noise, slope_size, terms = state
+    q = dr.dot(v, v)
+    k, slope, scale = kernel.profile(q)
+    steep = amplitude * slope
+    pull = -2 * steep * inverse
+    here = q < 1.001
+    size = dr.abs(amplitude)
+    return (
+        dr.fma(amplitude, k, value),
+        dr.fma(pull, v.x, x),
+        dr.fma(pull, v.y, y),
+        dr.fma(pull, v.z, z),
+        moved + dr.abs(steep),
+        dr.fma(size, scale, noise),
+        slope_size + dr.select(here, size * inverse * kernel.share(1.0, q), 0),
+        terms + dr.select(here, type(q)(1), 0),
+    )
+
+
+def _value(kernel: Kernel, backend: Backend, state: State) -> BlobValue:
+    value, x, y, z, moved, noise, slope_size, terms = state
+    unit = 0.5 * backend.epsilon
+    error = unit * dr.fma(16 + terms, noise, 8 * moved)
+    gradient_error = unit * (32 + terms) * kernel.steepness.slope * slope_size
+    return BlobValue(value, backend.Array3f(x, y, z), error, gradient_error)
+
+
+def _from(p: Vec3, row: list[Real]) -> Vec3:
+    """The vector from p to the center of a blob."""
+    return type(p)(*((row[k] - p[k]) + row[3 + k] for k in range(3)))
+
+
+def _slopes(chord: Chord, a: Real, b: Real, at_a: Real, at_b: Real) -> tuple[Real, Real]:
+    """The range of the first derivative between a and b."""
+    falls = (a <= chord.turn) & (b >= chord.turn)
+    rises = (a <= -chord.turn) & (b >= -chord.turn)
+    low = dr.select(falls, -chord.steepest, fmin(at_a, at_b))
+    return low, dr.select(rises, chord.steepest, fmax(at_a, at_b))
+
+
+def _bends(chord: Chord, a: Real, b: Real, at_a: Real, at_b: Real) -> tuple[Real, Real]:
+    """The range of the second derivative between a and b."""
+    center = (a <= 0) & (b >= 0)
+    right = (a <= chord.bend) & (b >= chord.bend)
+    left = (a <= -chord.bend) & (b >= -chord.bend)
+    low = dr.select(center, chord.least, fmin(at_a, at_b))
+    return low, dr.select(left | right, chord.most, fmax(at_a, at_b))
+
+
+def _with_jumps(
+    bends: tuple[Real, Real], inside: Real, margin: Real, begin: Real, end: Real
+) -> tuple[Real, Real]:
+    """The range, with 0 included where the piece leaves the support, and 0 alone where it does not
+    meet the support."""
+    low, high = bends
+    nearest = fmax(fmax(begin, -end), 0)
+    meets = nearest * nearest < inside + margin
+    farthest = fmax(dr.abs(begin), dr.abs(end))
+    leaves: Mask = ~(farthest * farthest <= inside - margin)
+    low, high = dr.select(leaves, fmin(low, 0), low), dr.select(leaves, fmax(high, 0), high)
+    return dr.select(meets, low, 0), dr.select(meets, high, 0)
+
+
+def over(records: Records, *, active: Mask = True) -> ForEach:
+    """A loop over all records."""
+
+    def for_each(body: EachBlob, state: State) -> State:
+        return records.for_each(body, state, "blobs", active)
+
+    return for_each
+
+
+def over_list(records: Records, entries: Any, begin: Any, end: Any) -> ForEach:
+    """A loop over the records of a list: `entries` from begin to end."""
+    kind = records.backend.UInt32
+
+    def for_each(body: EachBlob, state: State) -> State:
+        def step(i: Any, *state: Any) -> State:
+            return i + 1, *body(records.row(dr.gather(kind, entries, i)), state)
+
+        def more(i: Any, *_: Any) -> Mask:
+            return i < end
+
+        return dr.while_loop((kind(begin), *state), more, step, label="blobs of a cell")[1:]
+
+    return for_each
+
+
+Coordinates: TypeAlias = tuple[Jet, Jet, Jet]
+Term: TypeAlias = "Callable[[list[Real]], Jet]"
+
+
+def summed(term: Term, like: Jet, zero: Real, for_each: ForEach) -> Jet:
+    """The sum of a jet for each record, in a loop whose state is the ends of all intervals.
+
+    like: a jet of the same variables. zero: the number 0 on each lane.
+    """
+
+    def body(row: list[Real], state: State) -> State:
+        total = jet_of(like, iter(state)) + term(row)
+        return tuple(leaves(total, zero))
+
+    start = tuple(leaves(like.constant(0.0), zero))
+    return jet_of(like, iter(for_each(body, start)))
+
+
+def blob_term(kernel: Kernel, coordinates: Coordinates) -> Term:
+    """The jet of one blob at jets of the coordinates."""
+    function = kernel.function()
+
+    def term(row: list[Real]) -> Jet:
+        inverse, amplitude = row[6], row[7]
+        x, y, z = (((one - row[k]) - row[3 + k]) * inverse for k, one in enumerate(coordinates))
+        return (x**2 + y**2 + z**2).apply(function) * amplitude
+
+    return term
+
+
+def leaves(jet: Jet, zero: Real) -> Iterator[Any]:
+    """The ends of all intervals of a jet, as numbers of the backend."""
+    for one in (jet.value, *jet.first, *jet.second):
+        yield zero + one.low
+        yield zero + one.high
+    if jet.start is not None:
+        yield from leaves(jet.start, zero)
+
+
+def jet_of(like: Jet, ends: Iterator[Any]) -> Jet:
+    """A jet of the same variables as another one, with these ends."""
+    value = Interval(next(ends), next(ends))
+    first = tuple(Interval(next(ends), next(ends)) for _ in like.first)
+    second = tuple(Interval(next(ends), next(ends)) for _ in like.second)
+    start = None if like.start is None else jet_of(like.start, ends)
+    return Jet(value, first, second, start, like.width)

@@ -1,0 +1,313 @@
+"""The cells of curves (`curve_cells`), made a level at a time.
+
+What is far from a cell and was near to the one around it is added to the polynomial of the latter,
+moved to the cell's center: so a cell costs what was near, and not the whole curve. Only for bounds
+of what is far, all edges are summed up at each center.
+
+- `build_curve_cells`: the cells of a cube, of at most so many bytes.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import numpy as np
+
+from harnack.backend import BoolArray, FloatArray, IntArray, choose_backend, to_numpy, to_vector3
+from harnack.backend.arrays import aligned_integers
+from harnack.backend.elementary import fmax, fmin
+from harnack.backend.record_table import Records
+from harnack.fields.solid_angles.curve_cells import HEAD, VERTICES, CurveCells
+from harnack.fields.solid_angles.edge_expansion import COEFFICIENTS, DEGREE, FarEdges
+from harnack.fields.solid_angles.edge_runs import Runs, VertexTable, left_over
+from harnack.fields.solid_angles.edges import Edge, LoopEdges, inverse_squares
+from harnack.fields.solid_angles.local_expansion import rounding_tables, shift_matrices
+from harnack.tree.closest_triangles import squared_distance_to_segment
+from harnack.tree.octree_lookup import DEEPEST, MARGIN, OCTANTS, CellLookup, numbered_nodes
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Real, Vec3
+
+_PERIOD = 4 * math.pi
+# Edges within so many radii of a cell's ball from its center are near; for cells that are split so
+# many, as what they add counts in all cells in them.
+_NEAR, _SHARED = 3.0, 4.5
+# Cells are split that have more near edges than this many times the cube root of all, or where
+# about this part of the integral of |dp|/D^2, a bound of the gradient, is left out: by experiment.
+_MOST_NEAR, _FEWEST, _FINE = 2.0, 6.0, 1e-5
+# Where memory is short, cells have twice as many near edges and leave out four times as much, up to
+# so many times.
+_ATTEMPTS = 4
+# Corners and centers of all cells are multiples of this over 2^DEEPEST, in unit coordinates: single
+# precision holds them exactly.
+_STEP = 2.0**-8
+# Sums in single precision, as bounds; edges that are near up to this part count as far as well.
+_SLACK = 1e-3
+# The most records of near edges, whose numbers single precision holds.
+_MOST_RECORDS = 2**24
+
+
+def build_curve_cells(
+    backend: Backend, loops: tuple[FloatArray, ...], low: FloatArray, high: FloatArray,
+    most_bytes: int, near: float = 1.0, shared: float = _SHARED,
+) -> CurveCells | None:  # fmt: skip
+    """Cells of a cube around the box from low (3,) to high (3,), of at most so many bytes; None
+    where they would take more even if they were larger and had more near edges.
+
+    loops: (n, 3) each, of a size of about one.
+    near: cells may have so many times as many near edges as usual, and leave out as much more.
+    shared: of split cells, edges beyond so many radii of the ball count for all cells in them.
+
+    Proof. The cell of the cube begins with all loops as near runs and nothing else. Each cell keeps
+    those edges of the runs of the cell around it that are near, closed again; the cycle of what is
+    left over (`near_runs.left_over`) is far from its ball and goes to the polynomial. So near loops
+    and polynomial have in each cell the solid angle of the curve, modulo 4 pi.
+    """
+    loops = tuple(loop.astype(backend.dtype).astype(np.float64) for loop in loops)
+    middle = np.round(0.5 * (low + high) / _STEP) * _STEP
+    half = float(np.maximum(high - middle, middle - low).max())
+    half = (math.ceil(half / _STEP) + 1) * _STEP
+    edges = LoopEdges.upload(backend, loops)
+    most_near, fine = max(_FEWEST, _MOST_NEAR * sum(map(len, loops)) ** (1 / 3)), _FINE
+    most_near, fine = near * most_near, near * fine
+    for _ in range(_ATTEMPTS):
+        octree = _Octree(
+            backend, VertexTable.of(loops), edges, middle, half, most_near, fine, shared
+        )
+        if octree.grow(most_bytes):
+            return octree.cells()
+        most_near, fine = 2 * most_near, 4 * fine
+    return None
+
+
+@dataclass
+class _Octree:
+    """Cells while they are made. most_near, fine, shared: see `_MOST_NEAR` and `_SHARED`.
+
+    nodes: of each level, for `CellLookup.of`. tables, near: records of `CurveCells`.
+    leaves, packets: the number of cells that are not split, and of records of near edges.
+    """
+
+    backend: Backend
+    vertices: VertexTable
+    edges: LoopEdges
+    middle: FloatArray
+    half: float
+    most_near: float
+    fine: float
+    shared: float
+    nodes: list[IntArray] = field(default_factory=list[IntArray])
+    tables: list[FloatArray] = field(default_factory=list[FloatArray])
+    near: list[FloatArray] = field(default_factory=list[FloatArray])
+    leaves: int = 0
+    packets: int = 0
+
+    def grow(self, most_bytes: int) -> bool:
+        """Make all cells, level by level; False as soon as they take too many bytes."""
+        shifts = shift_matrices(DEGREE, 0.5 / (math.sqrt(3) * MARGIN))
+        centers, runs, far = self.middle[None], Runs.of_loops(self.vertices), FarEdges.none(1)
+        splits = 0
+        for level in range(DEEPEST + 1):
+            side = self.half / 2**level
+            radius = math.sqrt(3) * side * MARGIN
+            is_leaf, runs, far = self._level(centers, radius, runs, far, is_last=level == DEEPEST)
+            split = np.flatnonzero(~is_leaf)
+            self.nodes.append(numbered_nodes(is_leaf, self.leaves - int(is_leaf.sum()), splits))
+            splits += len(split)
+            if self.size > most_bytes or self.packets >= _MOST_RECORDS:
+                return False
+            if not len(split):
+                break
+            runs, far = runs.of_children(~is_leaf), far.of_children(~is_leaf, shifts, radius)
+            centers = (centers[split][:, None] + 0.5 * side * OCTANTS).reshape(-1, 3)
+        return True
+
+    def _level(
+        self, centers: FloatArray, radius: float, runs: Runs, far: FarEdges, *, is_last: bool
+    ) -> tuple[BoolArray, Runs, FarEdges]:
+        """Which cells of a level are not split, and the runs and sums of all; records of the former
+        are made."""
+        double, n = choose_backend("double"), len(centers)
+        run, place = runs.edges()
+        cell = runs.cell[run]
+        distance = _distances(self.vertices, centers, cell, place, double)
+        count = np.bincount(cell, distance <= _NEAR * radius, n)
+        around = _Around.of(self.edges, centers, radius)
+        is_leaf = (count <= self.most_near) & (around.tail <= self.fine * around.total) | is_last
+        inner = np.where(is_leaf, _NEAR, self.shared) * radius
+        chosen, kept = runs.narrowed(run, distance <= inner[cell])
+        chosen = chosen.closed(self.vertices, centers, inner, np.dtype(self.backend.dtype))
+        left = left_over(runs, (run, place), kept, chosen, len(self.vertices.points))
+        points = np.concatenate([self.vertices.points, runs.apex, chosen.apex])
+        rows = Records.upload(double, np.column_stack([points, np.zeros((len(points), 5))]))
+        far = far.plus(
+            FarEdges.of(rows, left, to_vector3(double, centers), dr.opaque(double.Float, radius), n)
+        )
+        if is_leaf.any():
+            table, first, packets = near_records(self.vertices, chosen, is_leaf)
+            self.near.append(table)
+            factor = _factor(self.vertices, chosen, centers, radius)[is_leaf]
+            given = far.some(is_leaf), around.some(is_leaf), factor
+            where = self.packets + first, packets
+            own = _table(self.backend, centers[is_leaf], radius, *given, *where)
+            self.tables.append(own)
+            self.leaves, self.packets = self.leaves + len(own), self.packets + len(table)
+        return is_leaf, chosen, far
+
+    @property
+    def size(self) -> int:
+        """Bytes of records, near edges, nodes, and the grid on top."""
+        number = np.dtype(self.backend.dtype).itemsize
+        record = 8 * -(-(HEAD + COEFFICIENTS) // 8)
+        lookup = CellLookup.size(sum(len(one) for one in self.nodes))
+        return number * (record * self.leaves + 4 * VERTICES * self.packets) + lookup
+
+    def cells(self) -> CurveCells:
+        """The cells on the backend."""
+        backend = self.backend
+        lookup = CellLookup.of(backend, self.middle - self.half, 2 * self.half, self.nodes)
+        near = np.concatenate([*self.near, np.zeros((1, 4 * VERTICES))])
+        records = Records.upload(backend, np.concatenate(self.tables))
+        near_edges = Records.upload(backend, near)
+        return CurveCells(backend, lookup, records, near_edges, self.leaves, self.size)
+
+
+@dataclass(frozen=True)
+class _Around:
+    """Sums over edges at n centers, with distances D from these.
+
+    least, cubes, slope: see `CurveCells.records`.
+    tail: about what a polynomial leaves out of the value. total: an upper bound of the integral of
+        |dp|/D^2 over all edges.
+    """
+
+    least: FloatArray
+    cubes: FloatArray
+    slope: FloatArray
+    tail: FloatArray
+    total: FloatArray
+
+    @classmethod
+    def of(cls, edges: LoopEdges, centers: FloatArray, radius: float) -> _Around:
+        """The sums over edges that are not near; some near edges may count as well."""
+        backend, c = edges.backend, to_vector3(edges.backend, centers)
+        rho = dr.opaque(backend.Float, radius)
+        inner = dr.opaque(backend.Float, _NEAR * radius * (1 - _SLACK))
+
+        def add(p: Vec3, q: Vec3, inverse: Real, state: tuple[Any, ...]) -> tuple[Any, ...]:
+            least, cubes, slope, tail, total = state
+            edge = Edge.between(p, q, inverse, c)
+            square, length = edge.square, dr.rsqrt(inverse)
+            share, near = edge.field()[0] * length, dr.rsqrt(square)
+            is_far, ratio = square > inner * inner, rho * near
+            left_out = share * square
+            for _ in range(DEGREE + 1):
+                left_out = left_out * ratio
+            rate = dr.fma(type(slope)(length), edge.rates()[1], slope)
+            return (
+                dr.select(is_far, fmin(least, square), least),
+                cubes + dr.select(is_far, share, 0),
+                dr.select(is_far, rate, slope),
+                tail + dr.select(is_far, left_out, 0),
+                dr.fma(2 * share, square * near, total),
+            )
+
+        zero = backend.Float(0)
+        start = (backend.Float(1e6), zero, backend.Array3f(0), zero, zero)
+        found = edges.for_each(add, start, "around cells")
+        dr.eval(*found)
+        numbers = (to_numpy(one).astype(np.float64) for one in found)
+        least, cubes, slope, tail, total = numbers
+        return cls(np.sqrt(least) * (1 - _SLACK), cubes * (1 + _SLACK), slope, tail, total)
+
+    def some(self, which: BoolArray) -> _Around:
+        """Those chosen by a mask."""
+        return _Around(*(one[which] for one in vars(self).values()))
+
+
+def _distances(
+    vertices: VertexTable, centers: FloatArray, cell: IntArray, place: IntArray, backend: Backend
+) -> FloatArray:
+    """(k,) distances of the edges that begin at places of the table from the centers of cells."""
+    if not len(cell):
+        return np.zeros(0)
+    vector = backend.Array3f
+    points, middles = to_vector3(backend, vertices.points), to_vector3(backend, centers)
+    at = aligned_integers(backend, place)
+    c = dr.gather(vector, middles, aligned_integers(backend, cell))
+    p, q = dr.gather(vector, points, at), dr.gather(vector, points, at + 1)
+    inverse = dr.rcp(fmax(dr.squared_norm(q - p), backend.Float(1e-30)))
+    return to_numpy(dr.sqrt(squared_distance_to_segment(p - c, q - p, inverse)))
+
+
+def near_records(
+    vertices: VertexTable, runs: Runs, is_leaf: BoolArray
+) -> tuple[FloatArray, IntArray, IntArray]:
+    """Records of near edges (`CurveCells.near`) of cells that are not split; and of each of these
+    the first record and the number of records."""
+    rows = np.flatnonzero(is_leaf[runs.cell])
+    first, count, is_open = runs.first[rows], runs.count[rows], ~runs.is_whole[rows]
+    owner = (np.cumsum(is_leaf) - 1)[runs.cell[rows]]
+    length = count + np.where(is_open, 3, 1)
+    total = np.bincount(owner, length, int(is_leaf.sum())).astype(np.int64)
+    packets = -(-total // VERTICES)
+    start = np.cumsum(packets) - packets
+    # The places of runs one after the other, and how much of that lies in cells before.
+    position = np.cumsum(length) - length - (np.cumsum(total) - total)[owner]
+    position += start[owner] * VERTICES
+    table = np.zeros((int(packets.sum()) * VERTICES, 4))
+    run = np.repeat(np.arange(len(rows)), count + 1)
+    k = np.arange(len(run)) - (np.cumsum(count + 1) - count - 1)[run]
+    place, source = position[run] + k, first[run] + k
+    table[place, :3] = vertices.points[source]
+    later = k > 0
+    edge = vertices.points[source[later]] - vertices.points[source[later] - 1]
+    table[place[later], 3] = inverse_squares(edge)
+    last = (position + count)[is_open]
+    apex, begin = runs.apex[rows[is_open]], vertices.points[first[is_open]]
+    table[last + 1, :3], table[last + 2, :3] = apex, begin
+    table[last + 1, 3] = -inverse_squares(apex - table[last, :3])
+    table[last + 2, 3] = -inverse_squares(apex - begin)
+    return table.reshape(-1, 4 * VERTICES), start, packets
+
+
+def _factor(vertices: VertexTable, runs: Runs, centers: FloatArray, radius: float) -> FloatArray:
+    """(n,) factors with which `edges.near_rounding` holds for the near loops of n cells.
+
+    It assumes edges of half length h <= 1 and vertices no farther than 1 + |x| from x. In h and in
+    that distance it is linear, so that a factor of at least 1, h, and the distance of apexes, which
+    alone may be outside of the unit ball, does for others.
+    """
+    out = np.ones(len(centers))
+    rows = np.flatnonzero(~runs.is_whole)
+    apex, cell, first = runs.apex[rows], runs.cell[rows], runs.first[rows]
+    ends = vertices.points[first], vertices.points[first + runs.count[rows]]
+    for end in ends:
+        np.maximum.at(out, cell, 0.51 * np.linalg.norm(apex - end, axis=1))
+    np.maximum.at(out, cell, 1.01 * (np.linalg.norm(apex - centers[cell], axis=1) + radius))
+    return out
+
+
+def _table(
+    backend: Backend, centers: FloatArray, radius: float, far: FarEdges, around: _Around,
+    factor: FloatArray, first: IntArray, count: IntArray,
+) -> FloatArray:  # fmt: skip
+    """Records of cells (`CurveCells.records`).
+
+    Rounding of the value: that of the polynomial without its constant (`rounding_tables`), that of
+    the angle of the near loops (`LoopEdges.rounding`), and that of the constant, at most 2 pi, and
+    of two sums, at most 6 pi and the polynomial each: 32 epsilon and what the tables count for it.
+    That of the gradient, over the radius, counts as left out.
+    """
+    tables = rounding_tables(DEGREE, MARGIN / math.sqrt(3))
+    coefficients, up = far.coefficients.copy(), 1 + _SLACK
+    coefficients[:, 0] -= _PERIOD * np.round(coefficients[:, 0] / _PERIOD)
+    rounding = backend.epsilon * np.abs(coefficients[:, 1:]) @ tables[1:]
+    value = rounding[:, 0] + backend.epsilon * (48 + 7.25 * VERTICES * count)
+    slope = far.slope + rounding[:, 1:].sum(axis=1) / radius
+    inverse, least = np.full(len(first), 1 / radius), np.minimum(around.least, 1e3)
+    bounds = [far.error * up, slope * up, value * up, least, factor, around.cubes]
+    return np.column_stack([centers, inverse, *bounds, around.slope, first, count, coefficients])

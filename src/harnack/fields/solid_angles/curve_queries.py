@@ -1,0 +1,185 @@
+"""What else is computed from the edges of a curve: derivatives, closest points, changes, promises.
+
+- `differentiable_angle`: the solid angle as an expression that Dr.Jit differentiates.
+- `closest_on_segments`: the closest point of the curve, at which the level sets end.
+- `change_along_segments`: the change of the solid angle along a straight segment.
+- `bends`, `slope_change`, `swept_ball`: what the solid angle promises near a point.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import numpy as np
+
+from harnack.backend import FloatArray, to_vector3
+from harnack.backend.arrays import gather_vectors
+from harnack.backend.elementary import clamp
+from harnack.backend.record_table import Records
+from harnack.enclosures import Curvature, HarmonicBall
+from harnack.fields.solid_angles.edges import inner_product, single_edges, spinor
+from harnack.fields.source_sums import SUM_ROUNDING
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Real, Vec3
+    from harnack.fields.solid_angles.edges import LoopEdges
+
+__all__ = [
+    "bends",
+    "change_along_segments",
+    "closest_on_segments",
+    "segments",
+    "slope_change",
+    "swept_ball",
+]
+
+
+def differentiable_angle(backend: Backend, loops: tuple[Any, ...], x: Vec3) -> Real:
+    """Omega(x) in steradians, modulo 4 pi, of closed loops: (n, 3) arrays or Dr.Jit vectors. One
+    wide expression that Dr.Jit can differentiate in both directions.
+
+    The loop of `sum_over_edges` is the fastest way to a number, but reverse mode cannot pass a
+    recorded loop. Here every pair of a point and an edge is a lane, and a block sum adds them up,
+    so that memory grows with points times vertices. The formula is that of `sum_over_edges`, with
+    one angle for each edge instead of a product: an angle may jump by 4 pi, its derivative does
+        not.
+    """
+    total = dr.zeros(backend.Float, dr.width(x))
+    for loop in loops:
+        vertices = loop if dr.is_array_v(type(loop)) else to_vector3(backend, np.asarray(loop))
+        total = total + _loop_angle(backend, vertices, backend.Array3f(x))
+    return total
+
+
+def _loop_angle(backend: Backend, vertices: Vec3, x: Vec3) -> Real:
+    points, edges = dr.width(x), dr.width(vertices)
+    lane = dr.arange(backend.UInt32, points * edges)
+    point, edge = lane // edges, lane % edges
+    following = dr.select(edge + 1 == edges, 0, edge + 1)
+    here = gather_vectors(backend, x, point)
+    a = gather_vectors(backend, vertices, edge) - here
+    b = gather_vectors(backend, vertices, following) - here
+    # The phase of a vertex's spinor is arbitrary; it enters its two edges with opposite signs.
+    re, im = inner_product(spinor(a)[2], spinor(b)[2])
+    return dr.block_sum(2 * dr.atan2(im, re), edges)
+
+
+def segments(backend: Backend, start: FloatArray, end: FloatArray) -> Records:
+    """Records of segments from (k, 3) to (k, 3), k >= 1, of a size of about one. One whose ends are
+    the same in the backend's precision is a point."""
+    start, end = (q.astype(backend.dtype).astype(np.float64) for q in (start, end))
+    return Records.upload(backend, single_edges(start, end))
+
+
+def closest_on_segments(segments: Records, x: Vec3) -> Vec3:
+    """The point of the segments that is closest to x."""
+    vector = segments.backend.Array3f
+    x = vector(x)
+
+    def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
+        nearest, best = state
+        p, q = vector(*row[:3]), vector(*row[4:7])
+        share = clamp(dr.dot(x - p, q - p) * row[7], 0, 1)
+        foot = dr.fma(vector(share), q - p, p)
+        square = dr.squared_norm(x - foot)
+        closer = square < nearest
+        return dr.select(closer, square, nearest), dr.select(closer, foot, best)
+
+    start = (segments.backend.Float(dr.inf), vector(0))
+    return segments.for_each(add, start, "nearest edge")[1]
+
+
+def change_along_segments(edges: LoopEdges, p: Vec3, q: Vec3) -> Real:
+    """The change of the solid angle, followed continuously from p to q, which differ.
+
+    Biot and Savart's field, integrated along the segment from p to q, gives for each edge from a to
+    b of the curve minus the solid angle of the parallelogram (a - p) + s (b - a) - t (q - p) at the
+    origin: less than 2 pi in size, as it lies in a plane that misses the origin unless the segment
+    meets the edge. As two triangles it is twice two arctangents (van Oosterom and Strackee 1983),
+    so there is no branch to choose.
+    """
+    real = edges.backend.Float
+
+    def add(a: Vec3, b: Vec3, inverse: Real, state: tuple[Any, ...]) -> tuple[Any, ...]:
+        del inverse
+        ap, bp, bq, aq = a - p, b - p, b - q, a - q
+        return (state[0] - _angle(ap, bp, bq) - _angle(ap, bq, aq),)
+
+    return edges.for_each(add, (real(0),), "swept angle")[0]
+
+
+def _angle(a: Vec3, b: Vec3, c: Vec3) -> Real:
+    """The signed solid angle of a triangle at the origin."""
+    la, lb, lc = dr.norm(a), dr.norm(b), dr.norm(c)
+    volume = dr.dot(a, dr.cross(b, c))
+    rest = dr.fma(dr.dot(a, b), lc, dr.fma(dr.dot(b, c), la, dr.dot(c, a) * lb))
+    # A triangle has no solid angle at points of its own plane, whatever rounding does.
+    return dr.select(volume == 0, 0, 2 * dr.atan2(volume, dr.fma(la * lb, lc, rest)))
+
+
+# Radii of the promises as fractions of the distance to the curve, by experiment.
+_REACHES = (0.3, 0.6, 0.85)
+
+
+def bends(cubes: Real, fourths: Real, distance: Real) -> tuple[Curvature, ...]:
+    """Promises of the second derivatives of the solid angle, by integrals over the curve.
+
+    cubes, fourths: I3 and I4, the integrals of |dp|/|D|^3 and |dp|/|D|^4. distance: d, or less.
+
+    Proof. Along a unit direction v the derivative of the solid angle is the integral of
+    v.(D x dp)/|D|^3 over the curve, D = p - x (Biot and Savart), and its second derivative that of
+    3 (v.D)(v.(D x dp))/|D|^5, as D changes by -v. D and D x dp are at right angles, so the product
+    of their components along v is at most half of that of their lengths: the second derivative is
+    at most 3/2 times the integral of |dp|/|D|^3. At x + s v, |D| is less by s at most. So by Taylor
+    the remainder after the linear term is, for t < d, the distance to the curve, at most
+
+        3/2 integral of |dp| integral over [0, t] of (t-s)/(|D|-s)^3 ds
+            = 3/4 t^2 integral of |dp|/(|D|^3 (1 - t/|D|)),
+
+    and 1/(1 - u) <= 1 + u/(1 - q) for 0 <= u <= q. On the ball of radius q d that is `Curvature`
+    with the constant 3/2 (I3 + q d I4/(1 - q)). It holds for any piece of a curve, and adds up.
+    """
+    scale = 1.5 * (1 + SUM_ROUNDING)
+    return tuple(
+        Curvature(scale * dr.fma(q / (1 - q) * distance, fourths, cubes), q * distance)
+        for q in _REACHES
+    )
+
+
+def slope_change(cubes: Real, fourths: Real, distance: Real, radius: Real) -> Real:
+    """A bound of the change of the gradient within `radius`; infinite unless that is less than the
+    distance.
+
+    Proof. The second derivative in every direction is at most 3/2 times the integral of |dp|/|D|^3
+    (`bends`). So is the norm of the Hessian, and from x to x + t v the gradient changes by at most
+
+        3/2 integral of |dp| integral over [0, t] of ds/(|D|-s)^3
+            = 3/4 t integral of |dp|/|D|^3 (2 - u)/(1 - u)^2,    u = t/|D|.
+
+    For 0 <= u <= q < 1 that fraction, which is convex in u, is at most 2 + u (3 - 2q)/(1 - q)^2,
+    its chord. With q = t/d: at most 3/2 t I3 + 3/4 t^2 I4 (3 - 2q)/(1 - q)^2.
+    """
+    q = radius / distance
+    growth = (3 - 2 * q) / dr.square(1 - q)
+    change = radius * (1.5 * cubes + 0.75 * radius * growth * fourths)
+    return dr.select(radius < distance, (1 + SUM_ROUNDING) * change, dr.inf)
+
+
+def swept_ball(
+    value: Real,
+    gradient: Vec3,
+    squares: Real,
+    bends: tuple[Curvature, ...],
+    slope_error: Real = 0.0,
+) -> HarmonicBall:
+    """The range of the lift on the ball of one of the promises, which themselves prove longer
+    steps.
+
+    squares: the integral of |dp|/|D|^2, to which the rounding of the gradient is proportional.
+    slope_error: a bound of other errors of the gradient.
+    """
+    bend = bends[1]
+    slope = dr.norm(gradient) + SUM_ROUNDING * squares + slope_error
+    moved = (1 + SUM_ROUNDING) * bend.radius * dr.fma(0.5 * bend.radius, bend.constant, slope)
+    return HarmonicBall(bend.radius, value - moved, value + moved)

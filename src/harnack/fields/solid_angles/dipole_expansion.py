@@ -1,0 +1,413 @@
+"""What far dipoles and triangles add to balls: local expansions, and bounds of what is left out.
+
+- `source_tree`: a tree of primitives, dipoles or triangles, in double precision, with all that
+  expansions need; `triangle_sources`: triangles as records.
+- `FarSums`: sums over far nodes and far primitives.
+- `Sources`: the primitives of balls, parted into such sums and what is left to smaller balls.
+
+A node of radius R is far from a ball of radius rho if their centers are farther apart than k rho +
+`_SPREAD` R, a triangle if they are farther apart than k rho + `TRIANGLE_SPREAD` R, a dipole if it
+is farther from the ball's center than k rho, for a factor k > 1: then all points of it are farther
+from the center than k rho. A triangle is a sheet of dipoles, along its normal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import numpy as np
+
+from harnack.backend import FloatArray, IntArray, choose_backend, to_numpy
+from harnack.backend.elementary import fmin
+from harnack.fields.solid_angles.local_expansion import irregular, of_cluster, parts, tail_factors
+from harnack.fields.solid_angles.multipole import (
+    NodeMoments,
+    sup_norm,
+    triangle_levels,
+    truncation,
+)
+from harnack.tree import Hierarchy, Node, PackedTree, pack
+from harnack.tree.lane_lists import Lists, Put, each_entry, make_lists, walk_lists
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Mask, Real, Vec3
+
+# Harmonics have degree l.
+# ruff: noqa: E741
+
+# The degree of local expansions, and the largest of the multipoles that they are made of.
+DEGREE, _POLES = 6, 4
+COEFFICIENTS = (DEGREE + 1) ** 2
+_SPREAD = 4.0
+# The same factor of triangles, by experiment; and the moments in their records, besides the first.
+TRIANGLE_SPREAD = 1.5
+_TRIANGLE_MOMENTS = tuple(key for key in parts(_POLES) if key[0] > 2)
+# Numbers of a record of a dipole, and of a triangle before its moments.
+_DIPOLE, _TRIANGLE = 8, 14
+# See `_Expanded.of`.
+_ROUNDING = 2.0**-20
+# Moments of a node, in order.
+_MOMENTS = tuple(key for key in parts(_POLES) if key[0])
+# Sums of many positive numbers in double precision, as bounds.
+_ROUNDED_UP = 1 + 1e-9
+
+
+def source_tree(tree: Hierarchy, levels: list[NodeMoments], rows: FloatArray) -> PackedTree:
+    """Nodes: center, `_SPREAD` times the radius, radius, area | moments up to `_POLES`, (E, G) of
+    `multipole.truncation`, and the sup norms of the moments. rows: of primitives in slots, dipoles
+    (`far_clusters.dipole_rows`) or `triangle_sources`."""
+    numbers: list[FloatArray] = []
+    for level in levels:
+        reach = _SPREAD * level.radius
+        left_out, slope, _ = truncation(level, reach, _POLES - 1)
+        moments = _columns(level, _MOMENTS)
+        norms = [sup_norm(level.moments, l) for l in range(1, _POLES + 1)]
+        head = [level.center, reach, level.radius, level.area]
+        numbers.append(np.column_stack([*head, *moments, left_out, slope, *norms]))
+    return pack(choose_backend("double"), tree, numbers, rows)
+
+
+def _columns(level: NodeMoments, keys: Iterable[tuple[int, int, int]]) -> list[FloatArray]:
+    """These of the moments of nodes."""
+    return [level.moments[l, m].imag if part else level.moments[l, m].real for l, m, part in keys]
+
+
+def triangle_sources(corners: FloatArray) -> FloatArray:
+    """(n, 30) records of triangles (n, 3, 3): centroid, area times normal, area, `TRIANGLE_SPREAD`
+    times the radius | radius, (E, G) of `multipole.truncation`, the sup norms of the moments 1, 3
+    and 4, and the moments 3 and 4.
+
+    The second moment about the centroid is a mean of vectors from there, and so is 0. A triangle
+    whose area is rounded to 0 is given one of 1e-30: records without an area are empty slots, and
+    its edges count.
+    """
+    alone = Hierarchy(np.arange(len(corners), dtype=np.int64)[:, None], ())
+    level = triangle_levels(alone, corners)[0]
+    moments, reach = level.moments, TRIANGLE_SPREAD * level.radius
+    left_out, slope, _ = truncation(level, reach, _POLES - 1)
+    normal = 2 * moments[1, 1].real, 2 * moments[1, 1].imag, moments[1, 0].real
+    higher = _columns(level, _TRIANGLE_MOMENTS)
+    norms = [sup_norm(moments, l) for l in (1, 3, 4)]
+    head = [level.center, *normal, np.maximum(level.area, 1e-30), reach, level.radius]
+    return np.column_stack([*head, left_out, slope, *norms, *higher])
+
+
+@dataclass(frozen=True)
+class FarSums:
+    """Sums over far primitives of n balls.
+
+    coefficients: (n, COEFFICIENTS) of the local expansion (`local_expansion.parts`).
+    error, slope: (n,) bounds of what it leaves out of value and gradient, anywhere in the ball.
+    tail, tail_slope: (n,) of what it leaves out besides: at a distance a from the center at most
+        q^(p+1) and q^p times these, with q = a/radius and p = `DEGREE`.
+    fourth: (n,) bounds of the sums of area/D^4, D the least distance of a primitive from the
+        center.
+    least: (n,) a distance from the center within which there are none of these primitives.
+    """
+
+    coefficients: FloatArray
+    error: FloatArray
+    slope: FloatArray
+    tail: FloatArray
+    tail_slope: FloatArray
+    fourth: FloatArray
+    least: FloatArray
+
+    @classmethod
+    def none(cls, n: int) -> FarSums:
+        """Sums over nothing."""
+        zero = np.zeros(n)
+        return cls(np.zeros((n, COEFFICIENTS)), *(5 * [zero]), least=np.full(n, np.inf))
+
+    def plus(self, other: FarSums) -> FarSums:
+        """The sums over the primitives of both."""
+        bounds = "error", "slope", "tail", "tail_slope", "fourth"
+        sums = (_ROUNDED_UP * (getattr(self, one) + getattr(other, one)) for one in bounds)
+        least = np.minimum(self.least, other.least)
+        return FarSums(self.coefficients + other.coefficients, *sums, least=least)
+
+    def some(self, which: IntArray) -> FarSums:
+        """Those of these balls; a ball may occur several times."""
+        return FarSums(*(one[which] for one in vars(self).values()))
+
+    @classmethod
+    def joined(cls, parts: list[FarSums]) -> FarSums:
+        """The sums of all balls, part by part."""
+        columns = zip(*(vars(one).values() for one in parts), strict=True)
+        return cls(*(np.concatenate(column) for column in columns))
+
+    def of_octants(self, shifts: FloatArray, radius: float) -> FarSums:
+        """The same sums seen from the eight octants of cells with balls of this radius, octant
+        by octant of each cell.
+
+        Proof. The ball of an octant lies in that of the cell, so that bounds of errors are bounds
+        there as well, but what a polynomial leaves out is not small about an octant's center. This
+        center is half a radius away, or less by the margin, so that distances
+        shrink by at most that, and 1/D^4 grows by at most (1 - radius/(2 least))^-4, D >= least.
+        """
+        shifted = np.einsum("oab,kb->koa", shifts, self.coefficients)
+        share = 0.5 * radius / self.least  # 0 where there is nothing
+        error, slope = self.error + self.tail, self.slope + self.tail_slope
+        far = self.fourth / (1 - share) ** 4, self.least - 0.5 * radius
+        bounds = _ROUNDED_UP * error, _ROUNDED_UP * slope, 0 * error, 0 * slope, *far
+        others = (np.repeat(one, 8) for one in bounds)
+        return FarSums(shifted.reshape(-1, COEFFICIENTS), *others)
+
+    @classmethod
+    def over_nodes(cls, tree: PackedTree, lists: Lists, c: Vec3, radius: Real) -> FarSums:
+        """Sums over listed far nodes, for balls around c."""
+
+        def term(i: Any, active: Mask) -> list[Any]:
+            head, payload = tree.heads.row(i, active), tree.payload(i, active)
+            numbers = dict(zip(_MOMENTS, payload, strict=False))
+            left_out, slope_left_out, *norms = payload[len(_MOMENTS) :]
+            r = c - tree.backend.Array3f(*head[:3])
+            found = _Expanded.of(r, _pairs(numbers), norms, radius)
+            return found.of_cluster(left_out, slope_left_out, head[4], head[5], radius)
+
+        return cls._accumulated(tree.backend, lists, term)
+
+    @classmethod
+    def over_primitives(cls, tree: PackedTree, lists: Lists, c: Vec3, radius: Real) -> FarSums:
+        """Sums over listed far primitives, for balls around c."""
+
+        def term(i: Any, active: Mask) -> list[Any]:
+            row = tree.primitives.row(i, active)
+            first = {(1, 0): (row[5], 0.0), (1, 1): (0.5 * row[3], 0.5 * row[4])}
+            r = c - tree.backend.Array3f(*row[:3])
+            if tree.primitives.packets == 1:
+                found = _Expanded.of(r, first, [row[6]], radius)
+                bounds = found.rounding, found.rounding / radius, found.tail, found.tail_slope
+                rest = row[6] * _fourth(found.inverse), dr.rcp(found.inverse)
+                return [*found.coefficients, *bounds, *rest]
+            size, left_out, slope_left_out, *norms = row[_DIPOLE:_TRIANGLE]
+            higher = dict(zip(_TRIANGLE_MOMENTS, row[_TRIANGLE:], strict=False))
+            norms.insert(1, 0 * size)
+            found = _Expanded.of(r, first | _pairs(higher), norms, radius)
+            return found.of_cluster(left_out, slope_left_out, size, row[6], radius)
+
+        return cls._accumulated(tree.backend, lists, term)
+
+    @classmethod
+    def _accumulated(
+        cls, backend: Backend, lists: Lists, term: Callable[[Any, Mask], list[Any]]
+    ) -> FarSums:
+        """term: from an entry of a list, all numbers, the last of which is a minimum."""
+        zero = backend.Float(0)
+
+        def add(i: Any, active: Mask, state: tuple[Any, ...]) -> tuple[Any, ...]:
+            *sums, least = state
+            *added, nearest = term(i, active)
+            pairs = zip(sums, added, strict=True)
+            new = [old + dr.select(active, one, 0) for old, one in pairs]
+            return *new, dr.select(active, fmin(least, nearest), least)
+
+        start = (*([zero] * (COEFFICIENTS + 5)), zero + dr.inf)
+        found = each_entry(backend, lists, add, start)
+        dr.eval(*found)
+        n = dr.width(lists.count)
+        columns = [np.broadcast_to(to_numpy(one), n) for one in found]
+        coefficients = np.stack(columns[:COEFFICIENTS], axis=1)
+        bounds = (one * _ROUNDED_UP for one in columns[COEFFICIENTS:-1])
+        return cls(coefficients, *bounds, least=columns[-1] / _ROUNDED_UP)
+
+
+def _fourth(number: Any) -> Any:
+    square = number * number
+    return square * square
+
+
+def _pairs(numbers: dict[Any, Any]) -> dict[tuple[int, int], tuple[Any, Any]]:
+    return {
+        (l, m): (numbers[l, m, 0], numbers.get((l, m, 1), 0.0))
+        for l, m, part in numbers
+        if not part
+    }
+
+
+@dataclass(frozen=True)
+class _Expanded:
+    """The local expansion of multipole terms: coefficients times powers of the ball's radius,
+    bounds of what it leaves out of value and gradient on the ball's sphere, of the rounding of the
+    value, and one over the distance."""
+
+    coefficients: list[Any]
+    tail: Any
+    tail_slope: Any
+    rounding: Any
+    inverse: Any
+
+    @classmethod
+    def of(cls, r: Vec3, moments: Any, norms: list[Any], radius: Real) -> _Expanded:
+        """r: from the multipoles to the ball's center. norms: of the terms l = 1, 2, ...: term l is
+        at most norms[l-1]/r^(l+1). The bounds are those of `tail_factors`, whose c grows with l:
+        they bound all terms of degree j > p, so that at q times the radius, q <= 1, q^(p+1) times
+        as much, and q^p times as much for the gradient, is left out.
+
+        Rounding, in double precision: each product of a coefficient passes through fewer than 2^10
+        roundings, its shifts to smaller cells included, and the sum of the absolute values of all
+        products, with those of the harmonics of the ball, is below 2^23 norms[l-1]/r^(l+1) (tests
+        compute it). So value, and gradient times the radius, are off by at most 2^-20 of that.
+        """
+        inverse = dr.rsqrt(dr.squared_norm(r))
+        seen = irregular(r.x, r.y, r.z, inverse, DEGREE + len(norms))
+        powers, q = [1.0], radius * inverse
+        total, largest, u, power = 0.0, 0.0, inverse, q
+        for _ in range(DEGREE):
+            powers.append(powers[-1] * radius)
+            power = power * q
+        found = zip(parts(DEGREE), of_cluster(moments, seen, DEGREE), strict=True)
+        coefficients = [one * powers[j] for (j, _, _), one in found]
+        ratio = 1.0
+        for l, norm in enumerate(norms, start=1):
+            u = u * inverse
+            factor, ratio = tail_factors(DEGREE, l)
+            total, largest = total + factor * norm * u, largest + norm * u
+        steeper = ratio * (DEGREE + 2) / (DEGREE + 1)
+        tail = total * power / (1 - ratio * q)
+        slope = (DEGREE + 1) * total * power / (1 - steeper * q)
+        return cls(coefficients, tail, slope / radius, _ROUNDING * largest, inverse)
+
+    def of_cluster(
+        self, left_out: Real, slope_left_out: Real, size: Real, area: Real, radius: Real
+    ) -> list[Any]:
+        """The numbers of `FarSums` of a cluster of dipoles with moments up to `_POLES`.
+
+        left_out, slope_left_out: (E, G) of `multipole.truncation`, for points that are no nearer
+        than the ball. size: the cluster's radius. area: that of its dipoles.
+        """
+        distance = dr.rcp(self.inverse)
+        near = dr.rcp(distance - radius)
+        power = near
+        for _ in range(_POLES + 1):
+            power = power * near
+        error = self.rounding + left_out * power
+        slope = self.rounding / radius + slope_left_out * power * near
+        least = distance - size
+        rest = self.tail, self.tail_slope, area * _fourth(dr.rcp(least)), least
+        return [*self.coefficients, error, slope, *rest]
+
+
+@dataclass(frozen=True)
+class Sources:
+    """Primitives that balls have still to take into account: those of the nodes of one list for
+    each ball, and those of another list, rows of the tree's primitives."""
+
+    nodes: Lists
+    primitives: Lists
+
+    @classmethod
+    def of_root(cls, backend: Backend) -> Sources:
+        """All primitives of a tree, for one ball."""
+        return cls(Lists.of_root(backend), Lists.none(backend))
+
+    def some(self, backend: Backend, lanes: IntArray) -> Sources:
+        """Those of these balls; a ball may occur several times."""
+        return Sources(self.nodes.some(backend, lanes), self.primitives.some(backend, lanes))
+
+    @classmethod
+    def joined(cls, backend: Backend, parts: list[Sources]) -> Sources:
+        """Those of all balls, part by part."""
+        nodes = Lists.joined(backend, [one.nodes for one in parts])
+        return cls(nodes, Lists.joined(backend, [one.primitives for one in parts]))
+
+    def parted(
+        self, tree: PackedTree, c: Vec3, radius: Real, factor: float, smallest: Real
+    ) -> tuple[FarSums, Sources]:
+        """Sums over what is farther than `factor` radii from the centers c of balls, and the rest.
+
+        smallest: inner nodes up to this radius stay nodes where they are not far. Others are
+            replaced by their children, and leaves by their primitives, which are far or near.
+
+        Each primitive is in just one far node, or is itself far, or is in the rest.
+        """
+        backend, inner = tree.backend, factor * radius
+        far, left = (
+            make_lists(
+                backend,
+                lambda put, far=far: _nodes(tree, self.nodes, c, inner, smallest, put, far=far),
+            )
+            for far in (True, False)
+        )
+        far_primitives, near = (
+            make_lists(
+                backend,
+                lambda put, far=far: self.primitives_of(tree, c, inner, smallest, put, far=far),
+            )
+            for far in (True, False)
+        )
+        sums = FarSums.over_nodes(tree, far, c, radius)
+        sums = sums.plus(FarSums.over_primitives(tree, far_primitives, c, radius))
+        return sums, Sources(left, near)
+
+    def primitives_of(
+        self, tree: PackedTree, c: Vec3, inner: Real, smallest: Real, put: Put | None, *, far: bool,
+        most: Any = None,
+    ) -> Any:  # fmt: skip
+        """The number of primitives, of the second list and of leaves that are not far, that are
+        farther from c than `inner` and their reach, or of the others; for `make_lists`. Once it is
+        more than `most`, not all may be counted.
+
+        A leaf that is far has no near primitives. A triangle's box lies in the ball of its node, so
+        that the triangle's radius is at most the diameter of that: its centroid is farther from c
+        than inner + 4 R - R, and the reach is at most 1.5 * 2 R.
+        """
+        index, vector = tree.backend.UInt32, tree.backend.Array3f
+        are_points = tree.primitives.packets == 1
+
+        def is_chosen(row: list[Real], active: Mask) -> Mask:
+            reach = inner if are_points else inner + row[7]
+            is_far = dr.squared_norm(c - vector(*row[:3])) > dr.square(reach)
+            return (is_far if far else ~is_far) & (row[6] > 0) & active
+
+        def visit(node: Node, state: tuple[Any, ...]) -> tuple[Mask, tuple[Any, ...]]:
+            square = dr.squared_norm(c - vector(*node.head[:3]))
+            down = square <= dr.square(inner + node.head[3])
+            if are_points and not far:  # only nodes that come near have near points
+                down &= square <= dr.square(inner + node.head[4] * (1 + 1e-9) + 1e-12)
+            down &= node.is_leaf | (node.head[4] > smallest)
+            if most is not None:
+                down &= state[0] <= most
+
+            def more(slot: Any, *_: Any) -> Mask:
+                return down & node.is_leaf & (slot < tree.leaf_size)
+
+            def step(slot: Any, count: Any) -> tuple[Any, ...]:
+                chosen = is_chosen(tree.primitive(node.leaf, slot, down), down)
+                if put is not None:
+                    put(count, node.leaf * tree.leaf_size + slot, chosen)
+                return slot + 1, count + dr.select(chosen, index(1), index(0))
+
+            return down, (dr.while_loop((index(0), state[0]), more, step, label="primitives")[1],)
+
+        def listed(i: Any, active: Mask, state: tuple[Any, ...]) -> tuple[Any, ...]:
+            chosen = is_chosen(tree.primitives.row(i, active), active)
+            if put is not None:
+                put(state[0], i, chosen)
+            return (state[0] + dr.select(chosen, index(1), index(0)),)
+
+        found = walk_lists(tree, self.nodes, visit, (index(0),))
+        return each_entry(tree.backend, self.primitives, listed, found)[0]
+
+
+def _nodes(
+    tree: PackedTree, lists: Lists, c: Vec3, inner: Real, smallest: Real, put: Put | None, *,
+    far: bool,
+) -> Any:  # fmt: skip
+    """The number of nodes in listed subtrees that are far from c, or of the inner ones that are
+    left: not far, with a radius of at most `smallest`; for `make_lists`. Others are replaced by
+    their children; leaves that are not far are in neither."""
+    index, vector = tree.backend.UInt32, tree.backend.Array3f
+
+    def visit(node: Node, state: tuple[Any, ...]) -> tuple[Mask, tuple[Any, ...]]:
+        is_far = dr.squared_norm(c - vector(*node.head[:3])) > dr.square(inner + node.head[3])
+        is_left = ~is_far & ~node.is_leaf & (node.head[4] <= smallest)
+        chosen = is_far if far else is_left
+        if put is not None:
+            put(state[0], node.index, chosen)
+        return ~(is_far | is_left), (state[0] + dr.select(chosen, index(1), index(0)),)
+
+    return walk_lists(tree, lists, visit, (index(0),))[0]

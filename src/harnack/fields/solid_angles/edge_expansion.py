@@ -1,0 +1,279 @@
+"""What far edges add to balls: harmonic polynomials, and bounds of what these leave out.
+
+Solid angles of cycles of directed edges far from a ball with the center c and the radius rho. With
+p = c + d on an edge from c + a to c + a + e, Biot and Savart's field of the edge at c + u is
+
+    h(u) = (a - u) x e W(u),    W(u) = integral over [0, 1] of dt/|a + te - u|^3,
+
+and grad Omega is the sum of these over the cycle. So Omega(c + u) - Omega(c) is the sum of
+
+    g(u) = integral over [0, 1] of u . h(su) ds = u . (a x e) integral of W(su) ds.
+
+Each g is harmonic in the ball by itself: u . h(u) = e . (u x grad) phi(u), with phi(u) the integral
+of dt/|a + te - u|, and u x grad maps harmonic functions to harmonic ones, degree by degree; the
+integral over s divides the part of degree l by l.
+
+- `FarEdges.of`: the sum over the edges of cycles, for many balls at once.
+- `tail`: the bound of the terms of higher degree.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, cast
+
+import drjit as dr
+import numpy as np
+
+from harnack.backend import FloatArray, to_numpy
+from harnack.backend.arrays import aligned_integers
+from harnack.backend.elementary import fmin
+from harnack.fields.solid_angles.edges import inner_product, spinor
+from harnack.fields.solid_angles.local_expansion import irregular, parts
+
+if TYPE_CHECKING:
+    from harnack.backend import BoolArray, Mask, Real, Vec3
+    from harnack.backend.record_table import Records
+    from harnack.fields.solid_angles.edge_runs import Edges
+
+# Harmonics have degree j.
+
+DEGREE = 6
+COEFFICIENTS = (DEGREE + 1) ** 2
+# Edges are cut into pieces with half lengths of at most this part of their distance from the ball;
+# on each, Gauss's rule has so many nodes.
+_PIECE, _NODES = 1 / 6, 4
+# What rounding does to an edge's share of the angle at the center, and to its polynomial: see
+# `FarEdges.of` and `_Piece.sums`.
+_OF_ANGLE, _OF_TERMS = 2.0**-36, 2.0**-28
+# Sums of many positive numbers in double precision, as bounds.
+_ROUNDED_UP = 1 + 1e-9
+
+
+@dataclass(frozen=True)
+class FarEdges:
+    """Sums over cycles of edges for n balls.
+
+    coefficients: (n, COEFFICIENTS) of the polynomial (`local_expansion.parts`); its value at the
+        center is known modulo 4 pi.
+    error, slope: (n,) bounds of what it leaves out of value and gradient, anywhere in the ball.
+    """
+
+    coefficients: FloatArray
+    error: FloatArray
+    slope: FloatArray
+
+    @classmethod
+    def none(cls, n: int) -> FarEdges:
+        """Sums over no edges."""
+        return cls(np.zeros((n, COEFFICIENTS)), np.zeros(n), np.zeros(n))
+
+    def plus(self, other: FarEdges) -> FarEdges:
+        """The sums over the edges of both."""
+        error, slope = self.error + other.error, self.slope + other.slope
+        total = self.coefficients + other.coefficients
+        return FarEdges(total, error * _ROUNDED_UP, slope * _ROUNDED_UP)
+
+    def some(self, which: Any) -> FarEdges:
+        """Those chosen by a mask or by numbers."""
+        return FarEdges(*(one[which] for one in vars(self).values()))
+
+    def of_children(self, is_split: BoolArray, shifts: FloatArray, radius: float) -> FarEdges:
+        """The same cycles seen from the octants of cells with balls of this radius that are split;
+        the balls of the octants lie in those of the cells. shifts:
+        `local_expansion.shift_matrices`.
+
+        In double precision sums of 49 products lose less than 2^-46 of the sum of absolute values;
+        harmonics R_jk are at most 1 in the ball, and count twice at most.
+        """
+        given, rows = self.coefficients[is_split], shifts.reshape(-1, COEFFICIENTS)
+        shifted = (given @ rows.T).reshape(-1, COEFFICIENTS)
+        sizes = np.abs(shifts).sum(axis=1)
+        lost = 2.0**-44 * (np.abs(given) @ sizes.T).ravel()
+        error, slope = (np.repeat(one[is_split], 8) for one in (self.error, self.slope))
+        return FarEdges(shifted, error + lost, slope + 2 * DEGREE / radius * lost)
+
+    @classmethod
+    def of(cls, points: Records, edges: Edges, c: Vec3, radius: Real, n: int) -> FarEdges:
+        """The sums over edges, for balls around c, n lanes. points: rows (x, y, z).
+
+        Rounding of the angle at the center, as in `LoopEdges.rounding`: each edge is off by less
+        than 2^-46 and by what moving its ends by 2^-50 of coordinates below 2^3 does, which is less
+        than 2^-46 over the distance; all are farther than 2^-9, the radius of the finest cells.
+        """
+        if not len(edges.cell):
+            return cls.none(n)
+        backend = points.backend
+        count = np.bincount(edges.cell, minlength=n)
+        first = aligned_integers(backend, np.cumsum(count) - count)
+        lengths = aligned_integers(backend, count)
+        start, end = (aligned_integers(backend, one) for one in (edges.start, edges.end))
+        sums = _over_pieces(points, start, end, first, lengths, c, radius)
+        dr.eval(*sums)
+        zr, zi, error, slope, *coefficients = (np.broadcast_to(to_numpy(one), n) for one in sums)
+        table = np.stack([2 * np.arctan2(zi, zr), *coefficients], axis=1)
+        return cls(table, error * _ROUNDED_UP + _OF_ANGLE * count, slope * _ROUNDED_UP)
+
+
+def _over_pieces(
+    points: Records, start: Any, end: Any, first: Any, count: Any, c: Vec3, radius: Real
+) -> tuple[Any, ...]:
+    """The product of spinors of edges, bounds of errors, and the coefficients after the first."""
+    backend = points.backend
+    index, real, vector = backend.UInt32, backend.Float, backend.Array3f
+
+    def more(j: Any, *_: Any) -> Mask:
+        return j < count
+
+    def body(j: Any, t: Real, zr: Real, zi: Real, *sums: Real) -> tuple[Any, ...]:
+        active = j < count
+        places = (dr.gather(index, one, first + j, active) for one in (start, end))
+        rows = (points.row(place, active) for place in places)
+        a, b = (vector(*row[:3]) - c for row in rows)
+        piece = _Piece.of(a, b, t, radius)
+        re, im = inner_product(spinor(a)[2], spinor(b)[2])
+        re, im = dr.fma(zr, re, -(zi * im)), dr.fma(zr, im, zi * re)
+        scale = dr.rcp(dr.abs(re) + dr.abs(im))
+        some = active & (t == 0) & dr.isfinite(scale)
+        zr, zi = dr.select(some, re * scale, zr), dr.select(some, im * scale, zi)
+        added = [dr.select(active, one, 0) for one in piece.sums(radius)]
+        new = [old + one for old, one in zip(sums, added, strict=True)]
+        is_last = piece.stop >= 1
+        j = j + dr.select(is_last, index(1), index(0))
+        return j, dr.select(is_last, 0, piece.stop), zr, zi, *new
+
+    zero = real(0)
+    state = (index(0), zero, real(1), zero, *([zero] * (COEFFICIENTS + 1)))
+    return dr.while_loop(state, more, body, label="far edges")[2:]
+
+
+@dataclass(frozen=True)
+class _Piece:
+    """A piece of an edge: its middle, relative to the center of the ball, the vector from its start
+    to its end, and the place on the edge, from 0 to 1, where it ends."""
+
+    middle: Vec3
+    e: Vec3
+    stop: Real
+
+    @classmethod
+    def of(cls, a: Vec3, b: Vec3, t: Real, radius: Real) -> _Piece:
+        """The piece from t on of the edge from a to b."""
+        vector, e = cast("Any", type(a)), b - a
+        begin = dr.fma(vector(t), e, a)
+        longest = (2 * _PIECE / (1 + _PIECE)) * (dr.norm(begin) - radius)
+        step = longest * dr.rsqrt(dr.squared_norm(e))
+        stop = dr.select(step > 0, fmin(t + step, type(t)(1)), 1)
+        stop = dr.select(1 - stop < 0.3 * (stop - t), 1, stop)
+        return cls(dr.fma(vector(0.5 * (t + stop)), e, a), (stop - t) * e, stop)
+
+    def sums(self, radius: Real) -> list[Real]:
+        """Bounds of errors of value and gradient, and all coefficients after the first.
+
+        Rounding: each product of a coefficient with a harmonic of the ball passes through fewer
+        than 2^9 roundings, of 2^-53 each, and the sum of their absolute values is below 2^14 |e|/D
+        (tests compute it), D the distance of a point of the rule. So the value, and the gradient
+        times the radius, are off by at most 2^-29 of that.
+        """
+        half = 0.5 * dr.norm(self.e)
+        area = dr.norm(dr.cross(self.middle, self.e))
+        error, slope = _of_rule(dr.norm(self.middle) - radius, half, area, radius)
+        nodes, weights = np.polynomial.legendre.leggauss(_NODES)
+        total: dict[Any, list[Any]] = {}
+        for node, weight in zip(nodes.tolist(), (0.5 * weights).tolist(), strict=True):
+            d = dr.fma(type(self.e)(0.5 * node), self.e, self.middle)
+            inverse = dr.rcp(dr.norm(d))
+            value_left, slope_left = tail(radius * inverse)
+            strength = weight * area * dr.square(inverse)
+            rounding = _OF_TERMS * weight * 2 * half * inverse
+            error = error + rounding + strength * value_left
+            slope = slope + (rounding + strength * slope_left) / radius
+            for key, pair in irregular(d.x, d.y, d.z, inverse, DEGREE).items():
+                old = total.get(key, [0.0, 0.0])
+                total[key] = [one + weight * new for one, new in zip(old, pair, strict=True)]
+        return [error, slope, *_turned(total, self.e, radius)]
+
+
+def tail(q: Any) -> tuple[Any, Any]:
+    """Bounds of all terms of degree above p = DEGREE of one point of an edge, and of their gradient
+    times rho, as multiples of |d x dp|/|d|^2; q = rho/|d|.
+
+    Proof. With phi = sum over j of |u|^j P_j(s)/|d|^(j+1), s the cosine of the angle between u and
+    d, u x grad phi = sum of |u|^j P_j'(s)/|d|^(j+1) (u x d)/(|u||d|), so that the term of degree j
+    of g is at most |d x dp|/|d|^2 (|u|/|d|)^j sqrt(1-s^2)|P_j'(s)|/j. By the addition theorem the
+    squares of the orthonormal harmonics of degree j add up to (2j+1)/(4 pi); those with m = 1 alone
+    are 2 (2j+1)/(4 pi) (1-s^2) P_j'^2/(j (j+1)). So sqrt(1-s^2)|P_j'|/j <= sqrt((j+1)/(2j)), which
+    falls with j. The sums over j > p of q^j and j q^j are q^(p+1)/(1-q) and
+    q^(p+1) (p+1 - p q)/(1-q)^2; by Bernstein and Szego's inequality a harmonic polynomial of degree
+    j has a gradient of at most j/rho times its largest value on the sphere.
+    """
+    power = q
+    for _ in range(DEGREE):
+        power = power * q
+    factor = math.sqrt((DEGREE + 2) / (2 * (DEGREE + 1)))
+    rest = 1 / (1 - q)
+    rest = dr.select(q < 1, rest, dr.inf)
+    value = factor * power * rest
+    return value, value * rest * (DEGREE + 1 - DEGREE * q)
+
+
+def _of_rule(distance: Real, half: Real, area: Real, radius: Real) -> tuple[Real, Real]:
+    """Bounds of the error of Gauss's rule on a piece, for value and gradient.
+
+    distance: D of the middle of the piece from the ball. half: h, half its length. area:
+    |a x e|.
+
+    Proof. With b from the point su to the middle and v the unit vector along the piece, W is the
+    mean of |b + zv|^-3 over real z in [-h, h]. For complex z, (b + zv)^2 has two roots of modulus
+    |b| >= D, so that |(b + zv)^2| >= (D - |z|)^2. On the ellipse with foci -h and h and half axes
+    that add up to hr, |z| <= h (r + 1/r)/2 =: S. With S = 8/11 D the integrand is at most
+    M = (11/(3D))^3, and its Chebyshev coefficients are at most 2 M r^-k. The rule with n nodes is
+    exact up to degree 2n - 1; beyond, odd terms vanish and for even k >= 8 the mean of T_k over
+    [-1, 1] is at most 1/63, that of the rule at most 1: in all the mean is off by at most
+    2.04 M r^-2n/(1 - r^-2). g is |u||a x e| times a mean of that. The gradient is a x e times the
+    same, plus u . (a x e) times a mean of s times the gradient of W: 3 times the mean of
+    (b + zv)/|b + zv|^5, which on the ellipse is at most 3 (D+S)/(D-S)^5 (that falls with D), and
+    the mean of s is 1/2.
+    """
+    x = (8 / 11) * distance / half
+    r = x + dr.sqrt(dr.square(x) - 1)
+    inverse = dr.square(dr.rcp(r))
+    power = dr.square(dr.square(inverse))
+    near = dr.rcp((3 / 11) * distance)
+    cube = near * dr.square(near)
+    off = area * 2.04 * power / (1 - inverse) * cube
+    steep = 1.5 * (19 / 11) * distance * dr.square(near)
+    good = (distance > 0) & (x > 1)
+    error = dr.select(good, off * radius, dr.select(half > 0, dr.inf, 0))
+    return error, dr.select(good, off * (1 + radius * steep), error)
+
+
+def _turned(phi: dict[Any, list[Any]], e: Vec3, radius: Real) -> list[Real]:
+    """The coefficients of the integral over s of e . (u x grad) phi(su)/s, after the first.
+
+    d/d(angle) about the z axis of conj R_jk is -ik conj R_jk, and with (d/dx +- i d/dy) of
+    `multipole` the turns about x and y lead to the neighbors k - 1 and k + 1:
+
+        L'_jk = -ik e_z L_jk + (j+k)/2 (i e_x - e_y) L_j,k-1 + (j-k)/2 (i e_x + e_y) L_j,k+1.
+    """
+    powers: list[Any] = [1.0]
+    for _ in range(DEGREE):
+        powers.append(powers[-1] * radius)
+    out: list[Real] = []
+    for j, k, part in parts(DEGREE):
+        if j == 0:
+            continue
+        re, im = phi[j, k]
+        real, imag = k * e.z * im, -k * e.z * re
+        down, up = 0.5 * (j + k), 0.5 * (j - k)
+        if k >= 1:
+            a, b = phi[j, k - 1]
+        else:  # L_j,-1 = -conj L_j1
+            a, b = -phi[j, 1][0], phi[j, 1][1]
+        real, imag = real + down * (-e.x * b - e.y * a), imag + down * (e.x * a - e.y * b)
+        if k < j:
+            a, b = phi[j, k + 1]
+            real, imag = real + up * (-e.x * b + e.y * a), imag + up * (e.x * a + e.y * b)
+        out.append(powers[j] / j * (imag if part else real))
+    return out

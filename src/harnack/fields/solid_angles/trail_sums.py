@@ -1,0 +1,507 @@
+"""Sums over the edges of closed curves, for rays that run along edges and for many points.
+
+- `rates_along`: how little a solid angle changes along a line that runs along an edge.
+- `EdgeTrails`: boundary parts of winding numbers at many points; values alone, fast.
+- `LiftedTrails`: the same along rays, with derivatives and bounds.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import defaultdict
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
+
+import drjit as dr
+import numpy as np
+
+from harnack.backend.elementary import clamp, fmax, fmin, largest_coordinate
+from harnack.backend.record_table import Records
+from harnack.enclosures import Lipschitz
+from harnack.fields.clearance import epsilon_at
+from harnack.fields.solid_angles.edge_lift import (
+    FACTOR_ROUNDINGS,
+    STEEP_ROUNDINGS,
+    LiftedProduct,
+    ends_factor,
+    sight_of,
+)
+from harnack.fields.solid_angles.edges import Edge, inverse_squares
+from harnack.fields.source_sums import SUM_ROUNDING, FieldSums
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, FloatArray, IntArray, Mask, Real, Vec3
+    from harnack.fields.solid_angles.edges import LoopEdges
+    from harnack.tree.triangle_tree import Frame
+
+__all__ = ["LiftedTrails", "Line", "known_along", "rates_along", "with_edge_rates"]
+
+# Bounds along the line of a ray are computed where the ray may run along the curve: where it is
+# nearer to it than the first fraction of the curve's size, and its slope is below the second
+# fraction of the gradient. Elsewhere only where the ray may run along a flat part of the surface:
+# where the slope is below the third fraction of the gradient.
+_BESIDE, _FLAT, _GRAZING = 0.001, 0.25, 1e-3
+# The number of lengths for which bounds are computed: in geometric progression from half the
+# distance to the curve towards the size of the curve.
+_LENGTHS = 6
+
+# The rates for lengths, on lanes that are active.
+Rates: TypeAlias = "Callable[[tuple[Real, ...], Mask], tuple[Real, ...]]"
+
+
+@dataclass(frozen=True)
+class Line:
+    """Lines x + s v, with lengths of order one; rounding: that of their points."""
+
+    x: Vec3
+    v: Vec3
+    rounding: Real
+
+    @property
+    def slack(self) -> Real:
+        """The rounding of the points and of differences p - x, which are about as long as x."""
+        return dr.fma(8 * float(dr.epsilon(self.x)), dr.norm(self.x), self.rounding)
+
+
+def known_along(line: Line, gradient: Vec3, distance: Real, rates: Rates) -> tuple[Lipschitz, ...]:
+    """Lipschitz constants of f along lines, for lengths from half the distance to the curve towards
+    its size; finite only on lanes where they may be worth their cost.
+
+    Along a straight edge the longest is of use, near its ends the others; along a flat part of the
+    surface, bounded by a plane curve, the shortest.
+    """
+    slope, steepness = dr.dot(gradient, line.v), dr.norm(gradient)
+    flat = dr.select(distance < _BESIDE, _FLAT, _GRAZING) * steepness
+    first = 0.5 * fmax(distance, type(distance)(1e-30))
+    longer, lengths = dr.power(first, -1 / _LENGTHS), [first]
+    for _ in range(_LENGTHS - 1):
+        lengths.append(lengths[-1] * longer)
+    found = rates(tuple(lengths), dr.abs(slope) < flat)
+    pairs = zip(found, lengths, strict=True)
+    return tuple(Lipschitz(rate * (1 + SUM_ROUNDING), length) for rate, length in pairs)
+
+
+def rates_along(
+    edges: LoopEdges, line: Line, lengths: tuple[Real, ...], active: Mask
+) -> tuple[Real, ...]:
+    """For each length T a constant K with |f(x + s v) - f(x)| <= |s| K for |s| <= T.
+
+    Infinite where the line meets the curve within T, up to rounding, and on lanes that are not
+    active, which cost nothing if their neighbors are not active either.
+
+    A ball about a point near the curve is as small as the distance to it, so a ray that runs along
+    a long edge would need thousands of them. Along a *given* line much more is known. With
+    a = p - x, e the edge from p to q and v the unit direction, an edge's share of df/ds at x + s v
+    is
+
+        v . (a - s v) x e  w(s) = c w(s),   c = v . (a x e),   w(s) = integral over [0, 1] of
+                                                               |a - s v + t e|^-3 dt:
+
+    c does not depend on s, and is zero where the line is parallel to the edge. Let rho be a lower
+    bound of the distance of the edge from the points of a segment of the line, and |e| = 2h. Then
+
+        w <= 1/(rho^2 sqrt(rho^2 + h^2)),
+
+    for a point of the edge at length l from the nearest one is at least sqrt(rho^2 + l^2) away, and
+    the integral over an interval of l of length 2h is largest if it is centered. From x to x + s v,
+    |s| <= T, the distance falls by at most T, and nowhere below the distance rho' of the edge from
+    the whole line, nor below the distance rho" of the segment from the line through the edge (a ray
+    may meet that one at a small angle, far ahead). So for |s| <= T
+
+        |f(x + s v) - f(x)| <= |s| K,   K = sum_e |c| / (rho^2 sqrt(rho^2 + h^2)),
+                                        rho = max(d_e - T, rho', rho").
+    """
+
+    def add(p: Vec3, q: Vec3, inverse: Real, rates: tuple[Real, ...]) -> tuple[Real, ...]:
+        return with_edge_rates(line, Edge.between(p, q, inverse, line.x), lengths, rates)
+
+    start = tuple(edges.backend.Float(0) for _ in lengths)
+    rates = edges.for_each(add, start, "edges along", active)
+    return tuple(dr.select(active, rate, dr.inf) for rate in rates)
+
+
+def with_edge_rates(
+    line: Line, edge: Edge, lengths: tuple[Real, ...], rates: tuple[Real, ...]
+) -> tuple[Real, ...]:
+    """The rates with an edge added, relative to the line's x.
+
+    m = a x v and n = e x v are a and e projected along the line and turned by a right angle.
+    Distances in the plane across the line are computed from them, and so is c = v . m x n, which is
+    then small where both are, whatever the lengths of a and e: its error is at most 8 epsilon |m|
+    |e| and slack |n|.
+    """
+    a, e, inverse, slack = edge.a, edge.e, edge.inverse, line.slack
+    epsilon = float(dr.epsilon(type(inverse)))
+    m, n = dr.cross(a, line.v), dr.cross(e, line.v)
+    c = dr.abs(dr.dot(line.v, dr.cross(m, n)))
+    quarter = 0.25 * dr.rcp(inverse)  # h^2
+    c += 16 * epsilon * dr.norm(m) * dr.sqrt(quarter) + 2 * slack * dr.norm(n)
+    square = dr.squared_norm(n)
+    foot = dr.select(square > 0, clamp(-dr.dot(m, n) / square, 0, 1), 0)
+    passing = dr.norm(dr.fma(type(a)(foot), n, m)) - slack
+    distance = dr.sqrt(edge.square) - slack
+    # (a - s v) x e = area + s n, of length |e| times the distance from the line through the edge.
+    area, per_length = dr.cross(a, e), dr.sqrt(inverse)
+    nearest = dr.select(square > 0, -dr.dot(area, n) / square, 0)
+    grown: list[Real] = []
+    for length, rate in zip(lengths, rates, strict=True):
+        s = clamp(nearest, -length, length)
+        through = dr.norm(dr.fma(type(a)(s), n, area)) * per_length - slack
+        rho = fmax(fmax(distance - length, passing), through)
+        square = rho * rho
+        term = c * dr.rcp(square) * dr.rsqrt(square + quarter)
+        # Infinite where the line may meet the edge.
+        grown.append(rate + dr.select(rho > 0, term, dr.inf))
+    return tuple(grown)
+
+
+# Values at many points.
+
+# Edges of a record: its five vertices and the number of its edges fill two packets of eight.
+_EDGES = 4
+# Points of a lane: as many as registers hold, by experiment.
+_POINTS = 3
+# Signs of `side` are not trusted where it is closer to zero than this many rounding errors of its
+# products; its own are six at most, those of `tree.triangles.side` one.
+_UNSURE = 16
+# Beyond this distance, in sizes of the mesh, the products of lengths could leave float32.
+_FAR = 1024.0
+
+# A point, and 1 or -1 for the direction of its ray along the z axis.
+Point: TypeAlias = "tuple[Vec3, Real]"
+Complex: TypeAlias = "tuple[Real, Real]"
+# u (|a| + |z|), v (|a| + |z|) and s of a vertex.
+Seen: TypeAlias = "tuple[Real, Real, Real]"
+
+
+@dataclass(frozen=True)
+class _Bits:
+    """The parameters of a floating-point format, for operations on its bits."""
+
+    integer: Any
+    mantissa: int
+    bias: int
+
+    @classmethod
+    def of(cls, backend: Backend) -> _Bits:
+        mantissa, bias = (23, 127) if backend.precision == "single" else (52, 1023)
+        return cls(dr.int_array_t(backend.Float), mantissa, bias)
+
+    def sign(self, x: Real) -> Any:
+        """-1 where the sign bit is set, also for -0, else 0."""
+        bits = dr.reinterpret_array(self.integer, x)
+        return bits >> (self.mantissa + self.bias.bit_length() + 1)
+
+    def about_one_over(self, x: Real) -> Real:
+        """The power of two that brings x > 0 between one and two."""
+        exponent = dr.reinterpret_array(self.integer, x) & ((2 * self.bias + 1) << self.mantissa)
+        return dr.reinterpret_array(type(x), (2 * self.bias << self.mantissa) - exponent)
+
+
+@dataclass(frozen=True)
+class _Product:
+    """A product z = x + iy of complex factors, of any length, with the sum of their arguments.
+
+    half: the number of half turns: the sum theta of the factors' principal arguments lies in
+        [half pi, (half + 1) pi]. The sign bit of y is half's parity.
+    """
+
+    x: Real
+    y: Real
+    half: Any
+
+    @classmethod
+    def of(cls, bits: _Bits, factor: Complex) -> _Product:
+        return cls(*factor, bits.sign(factor[1]))
+
+    def times(self, bits: _Bits, factor: Complex) -> _Product:
+        """The product with one factor more.
+
+        The factor's argument, in [-pi, pi], takes theta at most one half plane forward, or one back
+        if the sign bit of its imaginary part is set; and it does so exactly if the sign of y
+        changes. That holds for the computed y as well: its sign differs from that of the exact
+        value only if its two terms cancel, and then the exact theta is close to the very multiple
+        of pi that the count says it has crossed (arguments of like signs and y x' < 0: about +-pi;
+        of
+        unlike signs: about 0). A term that underflows keeps its sign bit.
+        """
+        x = dr.fma(self.x, factor[0], -(self.y * factor[1]))
+        y = dr.fma(self.x, factor[1], self.y * factor[0])
+        changes = bits.sign(self.y) ^ bits.sign(y)
+        return _Product(x, y, self.half + (changes & (bits.sign(factor[1]) | 1)))
+
+    def times_product(self, bits: _Bits, other: _Product) -> _Product:
+        """The product with another one, whose half turns are added."""
+        z = self.times(bits, (other.x, other.y))
+        return _Product(z.x, z.y, z.half + ((other.half + 1) & -2))
+
+    def scaled(self, bits: _Bits) -> tuple[_Product, Real]:
+        """The same with length about one, and the length it had. Scaling by a power of two is
+        exact."""
+        length = dr.abs(self.x) + dr.abs(self.y)
+        scale = bits.about_one_over(length)
+        return _Product(self.x * scale, self.y * scale, self.half), length
+
+    def turns(self) -> Real:
+        """theta/(2 pi)."""
+        real = cast("Any", type(self.x))
+        # atan2 ignores the sign of a zero.
+        y = dr.copysign(fmax(dr.abs(self.y), real(1e-30)), self.y)
+        return dr.fma(dr.atan2(y, self.x), 0.5 / dr.pi, real((self.half + 1) >> 1))
+
+
+@dataclass(frozen=True)
+class EdgeTrails:
+    """Directed edges on a backend, as records of consecutive edges of closed trails.
+
+    For values of `edge_lift`'s sum at many points. The formula is the same, arranged so that little
+    is computed twice. The boundary of a chain of triangles enters every vertex as often as it
+    leaves
+    it, so that its edges make up closed trails: the part of a factor that belongs to a vertex is
+    computed once and not for each of its edges; a record of edges is fetched once for several
+    points; there are no divisions. Points at which rounding could have changed a sign are marked,
+    for `edge_lift` to compute again.
+    """
+
+    records: Records
+
+    @classmethod
+    def upload(cls, backend: Backend, vertices: FloatArray, edges: IntArray) -> EdgeTrails:
+        """Edges (k, 2) between vertices (n, 3), as often out of a vertex as into it."""
+        rows: list[FloatArray] = []
+        for trail in closed_trails(edges):
+            count = len(trail) - 1
+            trips = -(-count // _EDGES)
+            first = _EDGES * np.arange(trips)[:, None]
+            index = np.minimum(first + np.arange(_EDGES + 1), count)
+            filled = np.minimum(count - first, _EDGES)
+            rows.append(np.concatenate([vertices[trail[index]].reshape(trips, -1), filled], 1))
+        return cls(Records.upload(backend, np.concatenate(rows)))
+
+    def turns(self, x: Vec3, way: Real) -> tuple[Real, Mask]:
+        """1/(4 pi) times the sum of Omega_e at points x, and a mask of points to compute again.
+
+        way: 1 for the direction d = z; -1 for x and the edges mirrored in a plane z = const.
+
+        Each lane of the kernel takes several points. The mask holds where rounding could have
+        changed the sign of a `side`, where a product of factors nearly underflows (near an edge or
+        a short one), and farther than 1024 mesh sizes away along any axis.
+        """
+        dr.eval(x, way)
+        backend, n = self.records.backend, dr.width(x)
+        real, index = backend.Float, backend.UInt32
+        lanes = -(-n // _POINTS)
+        lane = dr.arange(index, lanes)
+        apart, last = dr.opaque(index, lanes), dr.opaque(index, n - 1)  # for any n one kernel
+        places = [dr.minimum(lane + k * apart, last) for k in range(_POINTS)]
+        points = [
+            (dr.gather(backend.Array3f, x, place), dr.gather(real, way, place)) for place in places
+        ]
+        products, doubts = self._over_records(points)
+        turns = [-one.turns() for one in products]  # of conjugate factors
+        dr.eval(*turns, *doubts)
+        all_turns, all_doubts = dr.empty(real, n), dr.empty(real, n)
+        for place, turn, doubt in zip(places, turns, doubts, strict=True):
+            dr.scatter(all_turns, turn, place)
+            dr.scatter(all_doubts, doubt, place)
+        far = largest_coordinate(x) > _FAR
+        return all_turns, (all_doubts <= 0) | far
+
+    def _over_records(self, points: list[Point]) -> tuple[list[_Product], list[Real]]:
+        """For each point the product of all factors, and a number that is at most 0 where it is
+        uncertain."""
+        backend = self.records.backend
+        real, bits = backend.Float, _Bits.of(backend)
+        slack = real(-_UNSURE * 0.5 * backend.epsilon)
+
+        def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
+            # Edges that pad a record lead from a vertex to itself: they are never uncertain.
+            slacks = [dr.select(row[15] > k, slack, 1) for k in range(_EDGES)]
+            pairs = zip(points, state, strict=True)
+            return tuple(_with_record(bits, row, slacks, x, old) for x, old in pairs)
+
+        one = (real(1), real(0), bits.integer(0), real(1))
+        out = self.records.for_each(add, tuple(one for _ in points), "trails")
+        return [_Product(*one[:3]) for one in out], [one[3] for one in out]
+
+
+def _with_record(
+    bits: _Bits, row: list[Real], slacks: list[Real], x: Point, state: tuple[Any, ...]
+) -> tuple[Any, ...]:
+    """The product (x, y, half) and the number of `_over_records` with the four edges of a record.
+
+    The four are multiplied among themselves first: that product has an argument of nearly zero,
+    where rounding has the least effect.
+    """
+    z, doubt = _Product(*state[:3]), state[3]
+    smallest = 2.0**-100 if bits.mantissa < 50 else 2.0**-800
+    a = _seen(bits, row[0:3], x)
+    part: _Product | None = None
+    for k in range(_EDGES):
+        b = _seen(bits, row[3 * k + 3 : 3 * k + 6], x)
+        factor, sure = _factor(a, b, slacks[k])
+        doubt = fmin(sure, doubt)
+        part = _Product.of(bits, factor) if part is None else part.times(bits, factor)
+        if k == 1:
+            part, length = part.scaled(bits)
+            doubt = fmin(length - smallest, doubt)
+        a = b
+    z, length = z.times_product(bits, cast("_Product", part)).scaled(bits)
+    return z.x, z.y, z.half, fmin(length - smallest, doubt)
+
+
+def _seen(bits: _Bits, vertex: list[Real], point: Point) -> Seen:
+    """A vertex relative to a point: (u t, v t, s t) with t = |a| + |z| and s = |a| - way z.
+
+    s t is (|a| + |z|)^2 or u^2 + v^2, so that no difference cancels.
+    """
+    x, way = point
+    u, v, z = vertex[0] - x[0], vertex[1] - x[1], vertex[2] - x[2]
+    across = dr.fma(u, u, v * v)
+    t = dr.sqrt(dr.fma(z, z, across)) + dr.abs(z)
+    signs = dr.reinterpret_array(bits.integer, z) ^ dr.reinterpret_array(bits.integer, way)
+    s = dr.select(signs < 0, t * t, across)
+    return u * t, v * t, s
+
+
+def _factor(a: Seen, b: Seen, slack: Real) -> tuple[Complex, Real]:
+    """The conjugate of F_e times a positive number; and a number that is at most 0 where its sign
+    is uncertain."""
+    back = a[1] * b[0]
+    im = dr.fma(a[0], b[1], -back)
+    re = dr.fma(a[2], b[2], dr.fma(a[0], b[0], a[1] * b[1]))
+    return (re, im), dr.fma(dr.abs(back), slack, dr.abs(im))
+
+
+def closed_trails(edges: IntArray) -> list[IntArray]:
+    """Directed edges (k, 2) as trails of vertices, each ending where it begins; each edge once.
+
+    Raises:
+        ValueError: an edge leads to a vertex from which none goes on.
+    """
+    onwards: defaultdict[int, list[int]] = defaultdict(list)
+    for a, b in edges.tolist():
+        onwards[a].append(b)
+    trails: list[IntArray] = []
+    for start in list(onwards):
+        while onwards[start]:
+            trail = [start]
+            while onwards[trail[-1]]:
+                trail.append(onwards[trail[-1]].pop())
+            if trail[-1] != start:
+                raise ValueError(f"edges: not closed, more go to vertex {trail[-1]} than from it")
+            trails.append(np.array(trail, np.int64))
+    return trails
+
+
+# Sums along rays.
+
+# Edges of a record: of these two, that which wastes less memory for padding.
+_RUNS = 3, 4
+
+
+@dataclass(frozen=True)
+class LiftedTrails:
+    """Closed trails of edges on a backend, as records of `run` consecutive edges.
+
+    For `edge_lift`'s sum along rays, edge by edge, with decisions made by the same bits. The part
+    of a factor that belongs to a vertex is computed once and not for each of its edges, and roots
+    and divisions, which cost most, are shared by edges where a bound allows it.
+
+    A record holds run + 1 vertices, run numbers 1/length^2, and run lengths: negative where the
+    edge runs from a higher to a lower index, 0 where there is no edge.
+    """
+
+    records: Records
+    run: int
+
+    @classmethod
+    def upload(cls, backend: Backend, vertices: FloatArray, trails: list[IntArray]) -> LiftedTrails:
+        """Trails of vertices (n, 3), each ending where it begins."""
+        run = min(_RUNS, key=lambda run: sum(-(-(len(t) - 1) // run) for t in trails) * (run + 0.5))
+        rounded = vertices.astype(backend.dtype).astype(np.float64)
+        rows = [_rows(rounded, trail, run) for trail in trails]
+        return cls(Records.upload(backend, np.concatenate(rows)), run)
+
+    def near(self, frame: Frame, x: Vec3, active: Mask = True) -> FieldSums:
+        """The sum of Omega_e at points x of rays, where active, and what promises are made of.
+
+        Derivatives. With w of `Edge`, L w is the integral of |dp|/rho^3 over an edge, and 1/d times
+        that bounds the integral of |dp|/rho^4, d the distance to it; for all edges of a record the
+        d of the nearest serves. So they add to the remainder what s4 += L w/4 and s5 += 3 L w/(16
+        d) do (`LiftedEdge.bounds`).
+
+        Rounding. As in `LiftedEdge.bounds`, with Biot and Savart's field, which is at most d L w,
+        for 2 e': |a x e| is the length of e times the distance from its line. By Cauchy and Schwarz
+        these add up over a record to at most the root of (sum of L w) (sum of d^2 L w). In all
+        bounds d is reduced by its rounding.
+        """
+        backend = self.records.backend
+        real, unit = backend.Float, fmax(epsilon_at(frame.o), epsilon_at(x))
+        own = 0.5 * backend.epsilon * FACTOR_ROUNDINGS * self.run
+        steep = 0.5 * backend.epsilon * STEEP_ROUNDINGS
+
+        def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
+            product, g, least, rounding, s4, s5 = state
+            product = LiftedProduct(*product)
+            a = sight_of(self._vertex(row, 0), frame, x)
+            total, spread, nearest, longest = real(0), real(0), real(dr.inf), real(0)
+            for k in range(self.run):
+                p, q = self._vertex(row, k), self._vertex(row, k + 1)
+                inverse, signed = self._edge(row, k)
+                b = sight_of(q, frame, x)
+                re, im = ends_factor(a, b, signed)
+                is_edge = signed != 0
+                product = product.times(dr.select(is_edge, re, 1), dr.select(is_edge, im, 0))
+                edge = Edge(a.offset, b.offset, q - p, inverse)
+                w, c = edge.field_of_lengths(a.length, b.length)
+                g = dr.fma(type(g)(w), c, g)
+                integral = dr.abs(signed) * w
+                square = dr.select(is_edge, edge.square, dr.inf)
+                total, nearest = total + integral, fmin(nearest, square)
+                longest = fmax(longest, dr.abs(signed))
+                spread = spread + dr.select(is_edge, integral * square, 0)
+                a = b
+            distance = fmax(dr.sqrt(nearest) - 2 * unit, 0)
+            field = dr.fma(steep, longest, unit) * dr.sqrt(total * spread)
+            rounding = rounding + (field + own)
+            s5 = dr.fma(0.1875 * total, dr.rcp(distance), s5)
+            return product.parts(), g, fmin(nearest, least), rounding, s4 + 0.25 * total, s5
+
+        one = LiftedProduct.one(real).parts()
+        start = (one, backend.Array3f(0), real(dr.inf), real(0), real(0), real(0))
+        product, g, least, rounding, s4, s5 = self.records.for_each(
+            add, start, "trails along", active
+        )
+        sums = FieldSums.zero(backend, dr.inf, 1)
+        return dataclasses.replace(
+            sums,
+            total=LiftedProduct(*product).angle(),
+            gradient=g,
+            rounding=rounding,
+            free_distance=dr.sqrt(least),
+            s4=s4,
+            s5=s5,
+        )
+
+    def _vertex(self, row: list[Real], k: int) -> Vec3:
+        return self.records.backend.Array3f(*row[3 * k : 3 * k + 3])
+
+    def _edge(self, row: list[Real], k: int) -> tuple[Real, Real]:
+        """1/length^2 and the signed length of edge k of a record."""
+        first = 3 * (self.run + 1)
+        return row[first + k], row[first + self.run + k]
+
+
+def _rows(vertices: FloatArray, trail: IntArray, run: int) -> FloatArray:
+    """Records of a trail; edges that pad the last one have no length."""
+    count = len(trail) - 1
+    trips = -(-count // run)
+    index = np.minimum(run * np.arange(trips)[:, None] + np.arange(run + 1), count)
+    path = trail[index]
+    begin, end = path[:, :-1], path[:, 1:]
+    inverse = inverse_squares((vertices[end] - vertices[begin]).reshape(-1, 3)).reshape(trips, run)
+    length = np.where(begin < end, 1, -1) / np.sqrt(inverse)
+    length = np.where(index[:, :-1] < index[:, 1:], length, 0)
+    return np.concatenate([vertices[path].reshape(trips, -1), inverse, length], axis=1)

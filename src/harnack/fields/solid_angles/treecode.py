@@ -1,0 +1,349 @@
+"""Sums over a tree of dipoles: far clusters as multipoles, near primitives one by one.
+
+- `walk_clusters`: visits a tree so that far clusters are taken as a whole.
+- `Treecode`: the sums over such a tree; what triangles and points share. The caller adds the
+  primitives of near leaves.
+- `far_terms`: what a far node adds to value, gradient and Hessian.
+- `dipole_rows`, `in_slots`: oriented points as records, also in the leaves of a tree.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
+
+import drjit as dr
+import numpy as np
+
+from harnack.backend.elementary import fmax
+from harnack.fields.batched_fields import SymmetricSum
+from harnack.fields.clearance import epsilon_at
+from harnack.fields.solid_angles.multipole import NodeMoments, bend_columns, cartesian, truncation
+from harnack.fields.source_sums import FieldSums, Terms, free_part
+from harnack.tree import NO_PRIMITIVE, Node, PackedTree, build_hierarchy, for_each, pack, walk
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from harnack.backend import Backend, Mask, Real, Vec3
+    from harnack.fields.batched_fields import Values
+    from harnack.tree import Hierarchy
+    from harnack.tree.balanced_tree import EachPrimitive, FloatArray
+
+State: TypeAlias = "tuple[Any, ...]"
+
+
+@dataclass(frozen=True)
+class SeenCluster:
+    """A node of the tree relative to points x.
+
+    head: its numbers that every visit reads.
+    payload: its other numbers, fetched where it is far.
+    r: from its center to x.
+    square: |r|^2, plus the square of the height.
+    inverse: 1/sqrt(square), or 0 where the node is not far.
+    far: whether it is far enough to be taken as a whole.
+    """
+
+    head: tuple[Real, ...]
+    payload: list[Real]
+    r: Vec3
+    square: Real
+    inverse: Real
+    far: Mask
+
+
+EachCluster: TypeAlias = "Callable[[SeenCluster, State], State]"
+
+
+def walk_clusters(
+    tree: PackedTree, x: Vec3, closer: Real, add_cluster: EachCluster,
+    add_primitive: EachPrimitive, state: State, active: Mask = True, height_square: Real = 0.0,
+) -> State:  # fmt: skip
+    """The state after a walk over a tree whose nodes begin with their center and the distance from
+    which on they may be taken as a whole.
+
+    closer: nodes are taken as a whole from so many times that distance on.
+    add_cluster: from a cluster and the state, the state with the node added where it is far.
+    add_primitive: as for `tree.for_each`, for the leaves that are not far.
+    height_square: added to the squares of all distances: in four dimensions, the square of the
+        distance of the point from the space of the tree.
+    """
+    vector = tree.backend.Array3f
+
+    def visit(node: Node, state: State) -> tuple[Mask, State]:
+        r = x - vector(*node.head[:3])
+        square = dr.squared_norm(r) + height_square
+        far = square > dr.square(node.head[3] * closer)
+        inverse = dr.select(far, dr.rsqrt(square), 0)
+        cluster = SeenCluster(node.head, node.payload(far), r, square, inverse, far)
+        state = add_cluster(cluster, state)
+        return ~far, for_each(node, ~far & node.is_leaf, add_primitive, state)
+
+    return walk(tree, visit, state, active)
+
+
+# The most dipoles in a leaf, and the children of a node: by experiment.
+_LEAF_SIZE, _ARITY = 8, 4
+
+
+def hierarchy_of(points: FloatArray) -> Hierarchy:
+    """The tree over points (n, 3)."""
+    return build_hierarchy(points, leaf_size=_LEAF_SIZE, arity=_ARITY)
+
+
+def dipole_rows(points: FloatArray, moments: FloatArray) -> FloatArray:
+    """(n, 8) records: position, moment, its length, 0. moments: (n, 3) area times normal."""
+    weight = np.linalg.norm(moments, axis=1, keepdims=True)
+    return np.concatenate([points, moments, weight, np.zeros_like(weight)], axis=1)
+
+
+def padding_row(row: FloatArray) -> FloatArray:
+    """Records (..., 8) at the places of dipoles (..., 8), without a moment, which add nothing."""
+    empty = np.zeros_like(row)
+    empty[..., :3] = row[..., :3]
+    return empty
+
+
+def in_slots(tree: Hierarchy, rows: FloatArray) -> FloatArray:
+    """Records (leaves, leaf_size, 8); in empty slots the padding of the leaf's first record."""
+    slots = tree.gather(rows)
+    empty = tree.slots == NO_PRIMITIVE
+    slots[empty] = np.broadcast_to(padding_row(slots[:, :1]), slots.shape)[empty]
+    return slots
+
+
+def far_terms(c: Sequence[Real], r: Vec3, inverse: Real, derivatives: int) -> Terms:
+    """sum_l P_l(r)/r^(2l+1) for l = 1, 2, 3, and its derivatives, with the coefficients c that
+    `multipole.cartesian` lays out; inverse = 1/|r|.
+
+    derivatives: 0 for the value, 1 with the gradient, 2 with the Hessian too. With u = 1/|r|,
+    G_l = grad P_l (so that l P_l = G_l.r by Euler) and H_l the Hessian of P_l,
+
+        f      = sum P_l u^(2l+1)
+        grad f = sum G_l u^(2l+1) - s r,           s = sum (2l+1) P_l u^(2l+3)
+        Hess f = sum H_l u^(2l+1) - (V r^T + r V^T) - s I + w r r^T,
+                 V = sum (2l+1) G_l u^(2l+3),      w = sum (2l+1)(2l+3) P_l u^(2l+5).
+    """
+    vector = cast("Any", type(r))
+    x, y, z = r
+    u2 = inverse * inverse
+    u3 = inverse * u2
+    g1 = vector(c[0], c[1], c[2])
+    czz = -(c[3] + c[4])
+    half = vector(
+        dr.fma(c[3], x, dr.fma(c[5], y, c[6] * z)),
+        dr.fma(c[5], x, dr.fma(c[4], y, c[7] * z)),
+        dr.fma(c[6], x, dr.fma(c[7], y, czz * z)),
+    )
+    xyy, xzz, xxy, yzz, xxz, yyz, xyz = c[8:15]
+    xx, yy, zz = x * x, y * y, z * z
+    # The gradient of P_3; x^3, y^3, z^3 have the coefficients that make it harmonic.
+    g3 = vector(
+        dr.fma(xyy, yy - xx, dr.fma(xzz, zz - xx, 2 * x * dr.fma(xxy, y, xxz * z)) + xyz * y * z),
+        dr.fma(xxy, xx - yy, dr.fma(yzz, zz - yy, 2 * y * dr.fma(xyy, x, yyz * z)) + xyz * x * z),
+        dr.fma(xxz, xx - zz, dr.fma(yyz, yy - zz, 2 * z * dr.fma(xzz, x, yzz * y)) + xyz * x * y),
+    )
+    u4 = u2 * u2
+    p1 = dr.dot(g1, r)
+    p2 = dr.dot(half, r) * u2
+    p3 = dr.dot(g3, r) * (u4 * (1 / 3))
+    value = (p1 + p2 + p3) * u3
+    if derivatives == 0:
+        return Terms(value)
+    g2, g3 = half * (2 * u2), g3 * u4
+    s = dr.fma(3, p1, dr.fma(5, p2, 7 * p3)) * u2
+    gradient = dr.fma(vector(-s), r, g1 + g2 + g3) * u3
+    if derivatives == 1:
+        return Terms(value, gradient)
+    return Terms(value, gradient, _hessian(c, r, (g1, g2, g3), (p1, p2, p3), (u2, u3)))
+
+
+def _hessian(
+    c: Sequence[Real], r: Vec3, g: tuple[Vec3, ...], p: tuple[Real, ...], u: tuple[Real, Real]
+) -> SymmetricSum:
+    """The Hessian of `far_terms`; g and p are scaled by powers of u to the size of those of l =
+    1."""
+    x, y, z = r
+    (g1, g2, g3), (p1, p2, p3), (u2, u3) = g, p, u
+    u4 = u2 * u2
+    s = dr.fma(3, p1, dr.fma(5, p2, 7 * p3)) * u2
+    czz = -(c[3] + c[4])
+    xyy, xzz, xxy, yzz, xxz, yyz, xyz = c[8:15]
+    v = dr.fma(3, g1, dr.fma(5, g2, 7 * g3)) * u2
+    w = dr.fma(15, p1, dr.fma(35, p2, 63 * p3)) * u4
+    cubes = (
+        -2 * dr.fma(xyy + xzz, x, -dr.fma(xxy, y, xxz * z)),
+        -2 * dr.fma(xxy + yzz, y, -dr.fma(xyy, x, yyz * z)),
+        -2 * dr.fma(xxz + yyz, z, -dr.fma(xzz, x, yzz * y)),
+        dr.fma(2, dr.fma(xxy, x, xyy * y), xyz * z),
+        dr.fma(2, dr.fma(xxz, x, xzz * z), xyz * y),
+        dr.fma(2, dr.fma(yyz, y, yzz * z), xyz * x),
+    )
+    squares = (2 * c[3], 2 * c[4], 2 * czz, 2 * c[5], 2 * c[6], 2 * c[7])
+    pairs = ((x, x), (y, y), (z, z), (x, y), (x, z), (y, z))
+    crossed = (
+        (v.x * x, v.x * x), (v.y * y, v.y * y), (v.z * z, v.z * z),
+        (v.x * y, v.y * x), (v.x * z, v.z * x), (v.y * z, v.z * y),
+    )  # fmt: skip
+    parts = [
+        (square * u2 + cube * u4 - one - other + w * a * b - (s if k < 3 else 0)) * u3
+        for k, (square, cube, (one, other), (a, b)) in enumerate(
+            zip(squares, cubes, crossed, pairs, strict=True)
+        )
+    ]
+    return SymmetricSum(*parts)
+
+
+Own: TypeAlias = "tuple[Any, ...]"
+
+# Coarse evaluations take nodes as a whole beyond this many times their radius.
+_ROUGH = 2.5
+# Roundings of a far node's gradient itself.
+_OUTSIDE = 64.0
+# The free distance, in units of coordinates, if no term bounds it.
+_FAR = 1e4
+
+# From a record, a mask, the sums, and a state of the caller's own: the latter two with the record's
+# primitive added where the mask holds.
+AddPrimitive: TypeAlias = "Callable[[list[Real], Mask, FieldSums, Own], tuple[FieldSums, Own]]"
+
+
+def node_columns(level: NodeMoments, order: int, rough: float, error: FloatArray) -> FloatArray:
+    """Numbers of nodes that may be taken as a whole beyond `rough` times their radius, as
+    `Treecode`
+    reads them: center, accepting distance, A and K of `bend_columns`, 15 coefficients, and the
+        value
+    error E (k,)."""
+    head = [rough * level.radius, *bend_columns(level, rough)]
+    parts = (level.center, *head, cartesian(level.moments, order), error)
+    return np.column_stack(parts)
+
+
+@dataclass(frozen=True)
+class Treecode:
+    """Sums over a tree of nodes as `node_columns` lays them out.
+
+    accuracy: at detail 1 nodes are taken as a whole beyond this many times their radius.
+    rough: the same in a coarse evaluation.
+    order: of the multipoles.
+    looser: the truncation of a coarse evaluation is at most this many times the stored bound.
+    steeper, bent: the truncation of the gradient is at most `steeper` times that of the value over
+        r, that of second derivatives `bent` times it over r^2.
+    """
+
+    backend: Backend
+    tree: PackedTree
+    accuracy: float
+    rough: float
+    order: int
+    looser: Real
+    steeper: Real
+    bent: Real
+
+    @classmethod
+    def of(
+        cls,
+        backend: Backend,
+        tree: Hierarchy,
+        levels: list[NodeMoments],
+        primitives: FloatArray,
+        accuracy: float,
+        order: int = 2,
+    ) -> Treecode:
+        """Everything uploaded. primitives: records in their slots, as `tree.pack` takes them.
+
+        One E is stored for both kinds of evaluation: as large as that at detail 1 needs, and at
+        least what the coarse one needs divided by `looser`, the median of the ratio of both.
+        """
+        rough = min(accuracy, _ROUGH)
+        close = [truncation(level, accuracy * level.radius, order) for level in levels]
+        roughly = [truncation(level, rough * level.radius, order) for level in levels]
+        looser = _middle(roughly[0][0], close[0][0])
+        nodes: list[FloatArray] = []
+        steeper = bent = 0.0
+        for level, *bounds in zip(levels, close, roughly, strict=True):
+            error, slope, second = (
+                np.maximum(one, other / looser) for one, other in zip(*bounds, strict=True)
+            )
+            some = error > 0
+            steeper = max(steeper, float((slope[some] / error[some]).max(initial=0.0)))
+            bent = max(bent, float((second[some] / error[some]).max(initial=0.0)))
+            nodes.append(node_columns(level, order, rough, error))
+        packed = pack(backend, tree, nodes, primitives)
+        ratios = looser, steeper * (1 + 1e-6), bent * (1 + 1e-6)
+        on_device = (dr.opaque(backend.Float, ratio) for ratio in ratios)
+        return cls(backend, packed, accuracy, rough, order, *on_device)
+
+    @property
+    def coarsest(self) -> float:
+        """The detail of coarse evaluations (`Field.coarsest_detail`)."""
+        return self.rough / self.accuracy
+
+    def ratio(self, detail: Real) -> Real:
+        """The distance from which on nodes are taken as a whole, in radii of the node."""
+        return fmax(self.accuracy * detail, self.backend.Float(self.rough))
+
+    def sums(
+        self, x: Vec3, detail: Real, add: AddPrimitive, own: Own = (), active: Mask = True,
+        derivatives: int = 1,
+    ) -> tuple[FieldSums, Own]:  # fmt: skip
+        """All sums at points x, and the caller's own state.
+
+        detail: `Field.at_detail`; infinity adds up all terms one by one.
+        add: adds a primitive of a near leaf (`AddPrimitive`).
+        derivatives: 0 for the value alone, 1 with the gradient, 2 with the Hessian.
+        """
+        free, closer = free_part(self.rough), self.ratio(detail) / self.rough
+        unit = epsilon_at(x)
+
+        def add_cluster(node: SeenCluster, state: Own) -> Own:
+            c, inverse = node.payload, node.inverse
+            left_out = c[15] * self._decay(inverse)
+            slope = left_out * inverse
+            sums = FieldSums.of(state[0]).with_far_node(
+                far_terms(c, node.r, inverse, derivatives),
+                node.far,
+                inverse,
+                dr.fma(node.head[5], inverse * inverse, node.head[4]),
+                (left_out, slope, slope * inverse),
+                free * (node.square * inverse),
+                unit,
+            )
+            return sums.parts(), state[1]
+
+        def add_primitive(row: list[Real], active: Mask, state: Own) -> Own:
+            sums, own = add(row, active, FieldSums.of(state[0]), state[1])
+            return sums.parts(), own
+
+        far_off = _FAR * (1 + dr.max(dr.abs(x)))
+        start = (FieldSums.zero(self.backend, far_off, derivatives).parts(), own)
+        state = walk_clusters(self.tree, x, closer, add_cluster, add_primitive, start, active)
+        sums, looser = FieldSums.of(state[0]), dr.select(detail < 1, self.looser, 1)
+        second = sums.second_truncation
+        sums = dataclasses.replace(
+            sums,
+            truncation=looser * sums.truncation,
+            slope_truncation=looser * self.steeper * sums.slope_truncation,
+            second_truncation=None if second is None else looser * self.bent * second,
+        )
+        return sums, state[1]
+
+    def values(self, sums: FieldSums, share: float, unit: Real, rounding: Real) -> Values:
+        """`FieldSums.values` of sums over the tree."""
+        return sums.values(share, unit, rounding, _OUTSIDE)
+
+    def _decay(self, inverse: Real) -> Real:
+        """r^-(order + 3), which the first term left out is proportional to."""
+        power = inverse * inverse * inverse
+        for _ in range(self.order):
+            power = power * inverse
+        return power
+
+
+def _middle(larger: FloatArray, smaller: FloatArray) -> float:
+    """The median of the ratio larger/smaller, at least 1."""
+    some = smaller > 0
+    return max(1.0, float(np.median(larger[some] / smaller[some]))) if some.any() else 1.0

@@ -1,0 +1,449 @@
+"""Combinations of solids: unions, intersections, complements, offsets, and blends."""
+
+from __future__ import annotations
+
+import copy
+import math
+import numbers
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import numpy as np
+
+from harnack.arithmetic import maximum, minimum
+from harnack.arithmetic.norms import blend_intersection, blend_union
+from harnack.backend.elementary import fmax, fmin, largest_coordinate, length
+from harnack.backend.validation import finite
+from harnack.enclosures import Enclosure, Lipschitz
+from harnack.enclosures.extremum import Greatest, Negated, Part
+from harnack.fields.field import Field
+from harnack.fields.formula import as_data, probe
+from harnack.fields.samples import Look, Path, Sample, value_error
+from harnack.fields.solids.solid import Derived, Shape, Solid, not_a_solid
+from harnack.geometry import Box, Intersection
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Real, Vec3
+    from harnack.geometry import Volume
+
+# Other parts are used to narrow the range of the value if that shifts it by more than this fraction
+# of its error; at creases the shift is nearly always smaller.
+_WORTH = 0.25
+
+
+def union(*solids: Solid) -> Solid:
+    """All points of any of the solids. Raises ValueError for none, TypeError for no solids."""
+    return Combined(_parts(solids, is_union=True), is_union=True)
+
+
+def intersection(*solids: Solid) -> Solid:
+    """The points that are in all of the solids. Raises as `union`."""
+    return Combined(_parts(solids, is_union=False), is_union=False)
+
+
+def _parts(solids: tuple[Solid, ...], *, is_union: bool) -> tuple[Solid, ...]:
+    if not solids:
+        raise ValueError("give at least one solid")
+    flat: list[Solid] = []
+    for solid in solids:
+        if not isinstance(solid, Solid):  # pyright: ignore[reportUnnecessaryIsInstance]
+            raise TypeError(not_a_solid(solid))
+        if isinstance(solid, Combined) and solid.is_union == is_union:
+            flat.extend(solid.parts)
+        else:
+            flat.append(solid)
+    return tuple(flat)
+
+
+@dataclass(frozen=True, eq=False)
+class Combined(Solid):
+    """The union, min f_i, or the intersection, max f_i, of solids.
+
+    If the f_i are distances, the minimum is exact outside and only a bound inside, and the maximum
+    is only a bound. Hart 1996, equation 16, calls the union exact inside too; unit discs at -1/2
+    and 1/2 show that it is not: the distance at 0 is 0.866, and not 0.5.
+    """
+
+    parts: tuple[Solid, ...]
+    is_union: bool
+
+    def __post_init__(self) -> None:
+        domains = list(dict.fromkeys(one.domain for one in self.parts if one.domain is not None))
+        domain = None
+        if domains:
+            domain = domains[0] if len(domains) == 1 else Intersection(domains)
+        object.__setattr__(self, "domain", domain)
+        object.__setattr__(self, "has_detail", any(one.has_detail for one in self.parts))
+        coarsest = min((one.coarsest_detail for one in self.parts), default=1.0)
+        object.__setattr__(self, "coarsest_detail", coarsest)
+        # A part that proves nothing looking back would refuse all longer steps.
+        object.__setattr__(self, "overstep", min(one.overstep for one in self.parts))
+        object.__setattr__(self, "wavelength", shortest_wave(self.parts))
+        constants = [one.lipschitz for one in self.parts]
+        known = all(one is not None for one in constants)
+        object.__setattr__(self, "lipschitz", max(constants) if known else None)
+
+    def leaves(self, change: Callable[[Solid], Solid]) -> Solid:
+        return Combined(tuple(one.leaves(change) for one in self.parts), self.is_union)
+
+    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        hulls = [one.hull(level, above=above) for one in self.parts]
+        known = [one for one in hulls if one is not None]
+        if self.is_union == above:
+            return Intersection(known) if len(known) > 1 else next(iter(known), None)
+        if len(known) < len(hulls):
+            return None
+        return _around(known)
+
+    @property
+    def is_steep(self) -> bool:
+        return any(part.is_steep for part in self.parts)
+
+    def prepare(self, backend: Backend) -> Solid:
+        return self._of([one.prepare(backend) for one in self.parts])
+
+    def at_detail(self, detail: Real) -> Field:
+        return self._of([one.at_detail(detail) for one in self.parts])
+
+    def for_rays(self, count: int) -> Field:
+        def make(parts: list[Any]) -> Solid:
+            return Combined(tuple(parts), self.is_union)
+
+        return self._for_rays(self.parts, count, make)
+
+    def _of(self, parts: list[Field]) -> Solid:
+        """The same combination of other parts, which need not be solids."""
+        other = copy.copy(self)
+        object.__setattr__(other, "parts", tuple(parts))
+        return other
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        values = [one.formula(x, y, z) for one in self.parts]
+        if len(values) == 1:
+            return values[0]
+        return minimum(*values) if self.is_union else maximum(*values)
+
+    def evaluate(self, p: Vec3) -> Sample:
+        samples = [one.evaluate(p) for one in self.parts]
+        return self._joined(samples, largest_coordinate(p))[0]
+
+    def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
+        best: Any = None
+        rows: Any = None
+        for one in self.parts:
+            value, own = one.evaluate(p).value, one.hessian(p)
+            if rows is None:
+                best, rows = value, own
+                continue
+            chosen = (value < best) if self.is_union else (value > best)
+            rows = tuple(dr.select(chosen, a, b) for a, b in zip(own, rows, strict=True))
+            best = dr.select(chosen, value, best)
+        return rows
+
+    def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
+        """The largest errors of the parts that may be the extreme one. Infinite where rounding
+        leaves
+        it open which of two parts that is: derivatives jump there."""
+        size = largest_coordinate(p)
+        sign = -1.0 if self.is_union else 1.0
+        whole = value_error(sample, length(sample.gradient), size)
+        near, slopes, bends = 0 * p.x, 0 * p.x, 0 * p.x
+        for one in self.parts:
+            own = one.evaluate(p)
+            doubt = value_error(own, length(own.gradient), size)
+            is_open = ~(sign * (sample.value - own.value) > doubt + whole)
+            near = near + dr.select(is_open, 1.0, 0.0)
+            slope, bend = one.derivative_errors(p, own)
+            # NaN is kept, as it bounds nothing.
+            slopes = dr.select(is_open & ~(slope <= slopes), slope, slopes)
+            bends = dr.select(is_open & ~(bend <= bends), bend, bends)
+        is_one = near <= 1
+        return dr.select(is_one, slopes, dr.inf), dr.select(is_one, bends, dr.inf)
+
+    def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
+        """The look made of the looks of all parts, by `Greatest`."""
+        looks = [one.look(path, t, ahead, back) for one in self.parts]
+        size = largest_coordinate(path.origin) + t
+        sample, below, extreme = self._joined([one.sample for one in looks], size)
+        slope, slope_error = looks[-1].slope, looks[-1].slope_doubt
+        for look in looks[:-1]:
+            is_chosen = look.sample.value == extreme
+            slope = dr.select(is_chosen, look.slope, slope)
+            slope_error = dr.select(is_chosen, look.slope_doubt, slope_error)
+        front = self._enclosures([one.ahead for one in looks], below)
+        behind = self._enclosures([one.back for one in looks], below)
+        growth = max(one.growth for one in looks)
+        return Look(sample, front, behind, slope, growth, slope_error)
+
+    def _enclosures(
+        self, parts: list[tuple[Enclosure, ...]], below: list[tuple[Real, Real]]
+    ) -> tuple[Enclosure, ...]:
+        if not all(parts):
+            return ()
+        if self.is_union:
+            parts = [tuple(Negated(one) for one in part) for part in parts]
+        greatest = Greatest(
+            tuple(Part(*lengths, part) for lengths, part in zip(below, parts, strict=True))
+        )
+        return (Negated(greatest),) if self.is_union else (greatest,)
+
+    def _joined(
+        self, samples: list[Sample], size: Real
+    ) -> tuple[Sample, list[tuple[Real, Real]], Real]:
+        """The sample of the combination; for each part the least and the most that it is below the
+        greatest; and the greatest (for a union, the least) of the values.
+
+        Proof of the errors. Let v_i be values with errors e_i (all rounding, `value_error`), v =
+        v_k the greatest. max f_i <= max(v_i + e_i) = v + max(e_i - (v - v_i)), and max f_i >= v_k -
+        e_k. So max(e_i - (v - v_i)) is the error of the combination. As max f_i >= v_j - e_j for
+        every j,
+        a part that is known better may exclude most of that range: then the value is the middle of
+        the rest, for else a ray would hit, by the rounding of one part, a surface that lies inside
+        of another part. The tracer subtracts the error of the combination from its gaps; where that
+        of a part is larger, the difference is subtracted from how far the part is below.
+        """
+        sign = -1.0 if self.is_union else 1.0
+        values = [sign * one.value for one in samples]
+        greatest = values[0]
+        for one in values[1:]:
+            greatest = fmax(one, greatest)
+        chosen = samples[-1]
+        value, gradient, slope_error = chosen.value, chosen.gradient, chosen.gradient_error
+        value, slope_error = 0 * greatest + value, 0 * greatest + slope_error
+        for sample, own in zip(samples[:-1], values[:-1], strict=True):
+            is_greatest = own >= greatest
+            value = dr.select(is_greatest, sample.value, value)
+            gradient = dr.select(is_greatest, sample.gradient, gradient)
+            slope_error = dr.select(is_greatest, sample.gradient_error, slope_error)
+        errors = [value_error(one, length(one.gradient), size) for one in samples]
+        error, truncation = 0 * greatest, 0 * greatest
+        for sample, own, off in zip(samples, values, errors, strict=True):
+            gap = greatest - own
+            error = fmax(fmax(off - gap, sample.error - gap), error)
+            truncation = fmax(sample.truncation - gap, truncation)
+        least = values[0] - errors[0]
+        for own, off in zip(values[1:], errors[1:], strict=True):
+            least = fmax(own - off, least)
+        shift = 0.5 * (least - (greatest - error))
+        shift = dr.select(shift > _WORTH * error, shift, 0)
+        extreme, value = value, value + sign * shift
+        greatest, error = greatest + shift, error - shift
+        # `Sample.error` leaves out the rounding that follows from value and gradient.
+        plain = Sample(value, gradient, ())
+        stated = value_error(plain, length(gradient), size)
+        joined = Sample(
+            value, gradient, self._known(samples), fmax(error - stated, 0), slope_error,
+            truncation=truncation,
+        )  # fmt: skip
+        whole = value_error(joined, length(gradient), size)
+        return (
+            joined,
+            [
+                (
+                    fmax(greatest - own - fmax(off - whole, 0), 0),
+                    greatest - own + fmax(off - whole, 0),
+                )
+                for own, off in zip(values, errors, strict=True)
+            ],
+            extreme,
+        )
+
+    def _known(self, samples: list[Sample]) -> tuple[Lipschitz, ...]:
+        """The largest of the Lipschitz constants of the parts, which is one of the combination."""
+        constant: Any = 0.0
+        radius: Any = math.inf
+        for sample in samples:
+            own = lipschitz_of(sample)
+            if own is None:
+                return ()
+            constant = fmax(0 * sample.value + own.constant, constant)
+            radius = fmin(0 * sample.value + own.radius, radius)
+        return (Lipschitz(constant, radius),)
+
+
+def shortest_wave(parts: Iterable[Solid]) -> float | None:
+    """The least `Field.wavelength` of several."""
+    return min((one.wavelength for one in parts if one.wavelength is not None), default=None)
+
+
+def lipschitz_of(sample: Sample) -> Lipschitz | None:
+    """A Lipschitz constant that a sample promises, or one that follows from another promise."""
+    found = [one.lipschitz(sample.value) for one in sample.promises]
+    stated = (one for one in sample.promises if isinstance(one, Lipschitz))
+    return next(stated, None) or next((one for one in found if one is not None), None)
+
+
+def _around(volumes: list[Volume]) -> Volume | None:
+    """A box around volumes; None if they have no bounds."""
+    corners = [one.bounds() for one in volumes]
+    low = np.min([one for one, _ in corners], axis=0)
+    high = np.max([one for _, one in corners], axis=0)
+    if not (np.isfinite(low).all() and np.isfinite(high).all()):
+        return None
+    if len(volumes) == 1:
+        return volumes[0]
+    return Box(tuple(low), tuple(high))
+
+
+@dataclass(frozen=True, eq=False)
+class Complement(Derived):
+    """All points that are not inside a solid: -f."""
+
+    inner: Solid
+
+    def __post_init__(self) -> None:
+        self._take_over("domain", "lipschitz")
+
+    def __invert__(self) -> Solid:
+        return self.inner
+
+    def leaves(self, change: Callable[[Solid], Solid]) -> Solid:
+        return Complement(self.inner.leaves(change))
+
+    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        return self.inner.hull(-level, above=not above)
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        return -self.inner.formula(x, y, z)
+
+    def evaluate(self, p: Vec3) -> Sample:
+        return negated_sample(self.inner.evaluate(p))
+
+    def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
+        x, y, z = self.inner.hessian(p)
+        return -x, -y, -z
+
+    def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
+        return negated_look(self.inner.look(path, t, ahead, back))
+
+
+def negated_look(look: Look) -> Look:
+    """The look at -f."""
+    return Look(
+        negated_sample(look.sample),
+        tuple(Negated(one) for one in look.ahead),
+        tuple(Negated(one) for one in look.back),
+        -look.slope,
+        look.growth,
+        look.slope_error,
+    )
+
+
+def negated_sample(sample: Sample) -> Sample:
+    """The sample of -f."""
+    return sample.with_promises(
+        lambda one: one.negated(),
+        value=-sample.value,
+        gradient=-sample.gradient,
+        normal=None if sample.normal is None else -sample.normal,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Offset(Derived):
+    """The points where f <= distance.
+
+    Proof. f - distance has the enclosures of f, and its Lipschitz constant.
+    """
+
+    inner: Solid
+    distance: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "distance", finite(self.distance, "distance"))
+        self._take_over("domain", "lipschitz")
+
+    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        return self.inner.hull(level + self.distance, above=above)
+
+    def prepare(self, backend: Backend) -> Solid:
+        other = super().prepare(backend)
+        object.__setattr__(other, "distance", as_data(self.distance, backend))
+        return other
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        return self.inner.formula(x, y, z) - self.distance
+
+    def evaluate(self, p: Vec3) -> Sample:
+        return self._shifted(self.inner.evaluate(p))
+
+    def _shifted(self, sample: Sample) -> Sample:
+        """The sample of f - distance, with the rounding of the difference."""
+        size = dr.abs(sample.value) + abs(self.distance)
+        return sample.with_promises(
+            lambda one: one.shifted(-self.distance),
+            value=sample.value - self.distance,
+            error=sample.error + 8 * float(dr.epsilon(type(sample.value))) * size,
+        )
+
+    def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
+        return self.inner.hessian(p)
+
+    def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
+        look = self.inner.look(path, t, ahead, back)
+        return replace(look, sample=self._shifted(look.sample))
+
+
+@dataclass(frozen=True, eq=False)
+class Blend(Shape):
+    """The union or intersection of two solids with a fillet: see `arithmetic.norms.blend_union`.
+
+    Its Lipschitz constant is 2^(1/p) times the larger of the solids' own. A union's fillet lies
+    where both functions are at most the radius: within the union of the solids grown by the radius.
+    """
+
+    is_cheap = False
+
+    parts: tuple[Solid, Solid]
+    radius: Any
+    power: Any
+    is_union: bool
+
+    def __post_init__(self) -> None:
+        for name, least, value in (("radius", 0.0, self.radius), ("power", 1.0, self.power)):
+            good = isinstance(value, numbers.Real) and least <= float(value) < math.inf
+            if not good or value == 0:
+                bound = "above 0" if least == 0.0 else f"of at least {least:g}"
+                raise ValueError(f"{name} must be a number {bound}, not {value!r}")
+            object.__setattr__(self, name, float(value))
+        for one in self.parts:
+            if not isinstance(one, Solid):  # pyright: ignore[reportUnnecessaryIsInstance]
+                raise TypeError(not_a_solid(one))
+            one.formula(*probe())  # raises TypeError for a solid without a formula
+        constants = [one.lipschitz for one in self.parts]
+        known = all(one is not None for one in constants)
+        lipschitz = 2 ** (1 / self.power) * max(constants) * (1 + 1e-6) if known else None
+        object.__setattr__(self, "lipschitz", lipschitz)
+        object.__setattr__(self, "wavelength", shortest_wave(self.parts))
+        object.__setattr__(self, "domain", union(*self.parts).domain)
+
+    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        whole = union(*self.parts) if self.is_union else self.parts[0] & self.parts[1]
+        if self.is_union:
+            return whole.hull(level, above=True) if above else whole.hull(self._reached(level))
+        return whole.hull(-self._reached(-level), above=True) if above else whole.hull(level)
+
+    def _reached(self, level: float) -> float:
+        """A bound of the smaller of both functions where their blended union is at most `level`.
+
+        Proof. The blend grows with both, so it is at least that of the lesser value m taken twice:
+        r - 2^(1/p) (r - m) for m < r, and m beyond.
+        """
+        if level >= self.radius:
+            return level
+        return self.radius - (self.radius - level) / 2 ** (1 / self.power) * (1 - 1e-9)
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        a, b = (one.formula(x, y, z) for one in self.parts)
+        blend = blend_union if self.is_union else blend_intersection
+        return blend(a, b, self.radius, self.power)
+
+    def prepare(self, backend: Backend) -> Solid:
+        other = copy.copy(self)
+        parts = tuple(one.prepare(backend) for one in self.parts)
+        object.__setattr__(other, "parts", parts)
+        # The power stays a literal: the ranges of x^p depend on the kind of number that p is.
+        object.__setattr__(other, "radius", as_data(self.radius, backend))
+        return other

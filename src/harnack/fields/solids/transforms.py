@@ -1,0 +1,345 @@
+"""Solids moved, rotated, scaled and sheared."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, cast
+
+import drjit as dr
+import numpy as np
+import numpy.typing as npt
+
+from harnack.arithmetic import Jet
+from harnack.backend.elementary import largest_coordinate, length
+from harnack.enclosures import Promise
+from harnack.enclosures.extremum import Stretched
+from harnack.fields.formula import as_jet, hessian_error, prepared_numbers
+from harnack.fields.samples import Look, Path, Sample
+from harnack.fields.solids.solid import Derived, Shape, Solid
+from harnack.geometry import Ball, ConvexHull
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, FloatArray, Real, Vec3
+    from harnack.geometry import Volume
+
+from harnack.fields.solids.solid import Map, axis_index
+
+
+@dataclass(frozen=True)
+class Affine(Map):
+    """u -> matrix u + offset, in double precision.
+
+    matrix: (3, 3), rows, not singular.
+    offset: (3,).
+    factor: f is multiplied by it. For a similarity it is the factor by which lengths grow, for
+        other maps 1; for several maps in turn it is the product of theirs.
+    """
+
+    matrix: tuple[tuple[float, ...], ...]
+    offset: tuple[float, ...]
+    factor: float
+
+    @classmethod
+    def of_arrays(cls, matrix: npt.ArrayLike, offset: npt.ArrayLike = (0.0, 0.0, 0.0)) -> Affine:
+        """Raises ValueError for other shapes, what is not finite, and a singular matrix."""
+        m, b = np.asarray(matrix, dtype=np.float64), np.asarray(offset, dtype=np.float64)
+        if m.shape != (3, 3) or b.shape != (3,):
+            raise ValueError(
+                f"a map needs a matrix (3, 3) and an offset (3,), not {m.shape}, {b.shape}"
+            )
+        if not (np.isfinite(m).all() and np.isfinite(b).all()):
+            raise ValueError("matrix and offset must be finite")
+        sizes = np.linalg.svd(m, compute_uv=False)
+        if not sizes[-1] > 1e-12 * sizes[0]:
+            raise ValueError(
+                f"the matrix is singular (singular values {sizes[0]:g} to {sizes[-1]:g}): it would "
+                "flatten the solid"
+            )
+        rows = tuple(tuple(float(v) for v in row) for row in m)
+        return cls(rows, tuple(float(v) for v in b), _similarity(m) or 1.0)
+
+    @classmethod
+    def of_matrix(cls, matrix: npt.ArrayLike) -> Affine:
+        """A linear map (3, 3), or an affine one (3, 4) or (4, 4) whose last row is (0, 0, 0, 1)."""
+        m = np.asarray(matrix, dtype=np.float64)
+        if m.shape == (4, 4):
+            if not np.array_equal(m[3], (0.0, 0.0, 0.0, 1.0)):
+                raise ValueError(f"the last row of a (4, 4) map must be (0, 0, 0, 1), not {m[3]}")
+            m = m[:3]
+        if m.shape == (3, 4):
+            return cls.of_arrays(m[:, :3], m[:, 3])
+        return cls.of_arrays(m)
+
+    @classmethod
+    def translation(cls, offset: Sequence[float]) -> Affine:
+        """u -> u + offset."""
+        if np.shape(offset) != (3,):
+            raise ValueError(f"offset (3,): give a vector (x, y, z), not {offset!r}")
+        return cls.of_arrays(np.eye(3), np.asarray(offset, dtype=np.float64))
+
+    @classmethod
+    def rotation(cls, degrees: float, axis: str | Sequence[float]) -> Affine:
+        """The rotation about an axis through the origin (Rodrigues' formula)."""
+        if isinstance(axis, str):
+            unit = np.eye(3)[axis_index(axis)]
+        else:
+            unit = np.asarray(axis, dtype=np.float64)
+            size = np.linalg.norm(unit) if unit.shape == (3,) else 0.0
+            if not (np.isfinite(size) and size > 0):
+                raise ValueError(
+                    "axis must be a vector (3,) that is not zero, or one of x, y, z, not "
+                    f'{axis!r}: write rotated(degrees, axis), such as rotated(30, "x")'
+                )
+            unit = unit / size
+        angle = math.radians(float(degrees))
+        k = np.cross(np.eye(3), unit)  # k v = unit x v
+        turn = np.eye(3) + math.sin(angle) * k + (1 - math.cos(angle)) * (k @ k)
+        return cls.of_arrays(turn)
+
+    @classmethod
+    def scaling(cls, factors: float | Sequence[float]) -> Affine:
+        """u -> factors u."""
+        sizes = np.asarray(factors, dtype=np.float64)
+        sizes = np.broadcast_to(sizes if sizes.shape in ((), (3,)) else np.nan, (3,))
+        if not (np.isfinite(sizes).all() and (sizes > 0).all()):
+            raise ValueError(f"factors must be positive numbers, one or three, not {factors!r}")
+        return cls.of_arrays(np.diag(sizes))
+
+    def of(self, solid: Solid) -> Solid:
+        if isinstance(solid, AffineImage):
+            m, b = np.array(self.matrix), np.array(self.offset)
+            inner = solid.map
+            total = Affine.of_arrays(m @ np.array(inner.matrix), m @ np.array(inner.offset) + b)
+            return AffineImage(solid.inner, replace(total, factor=self.factor * inner.factor))
+        return AffineImage(solid, self)
+
+    @property
+    def inverse(self) -> FloatArray:
+        """The inverse matrix."""
+        return np.linalg.inv(np.array(self.matrix))
+
+    @property
+    def similarity(self) -> float | None:
+        """The factor by which all lengths grow; None if it is no similarity."""
+        return _similarity(np.array(self.matrix))
+
+    def volume(self, volume: Volume | None) -> Volume | None:
+        """A volume that contains the image of another one; None if that has no bounds."""
+        if volume is None:
+            return None
+        m, b = np.array(self.matrix), np.array(self.offset)
+        factor = self.similarity
+        if isinstance(volume, Ball) and factor is not None:
+            center = m @ np.array(volume.center) + b
+            pad = 1e-12 * (np.abs(center).max() + factor * volume.radius)
+            return Ball(
+                (float(center[0]), float(center[1]), float(center[2])), factor * volume.radius + pad
+            )
+        low, high = volume.bounds()
+        if not (np.isfinite(low).all() and np.isfinite(high).all()):
+            return None
+        corners = np.stack(np.meshgrid(*zip(low, high, strict=True)), axis=-1).reshape(-1, 3)
+        image = corners @ m.T + b
+        return ConvexHull.of(image).padded(1e-12 * float(np.abs(image).max()))
+
+
+def _similarity(m: FloatArray) -> float | None:
+    """The factor by which a matrix makes all lengths grow; None if it is no similarity."""
+    factor = abs(float(np.linalg.det(m))) ** (1 / 3)
+    grown = np.abs(m.T @ m - factor**2 * np.eye(3)).max()
+    return factor if grown <= 1e-14 * factor**2 else None
+
+
+@dataclass(frozen=True, eq=False)
+class AffineImage(Derived):
+    """A solid under an affine map.
+
+    Proof. A ray o + t d is the image of the straight path M^-1 (o - b) + t M^-1 d, along which the
+    solid is sampled; lengths on it are |M^-1 d| times as large (`Stretched`). The rounding of
+    coordinates there is a few units of the sum of the sizes of their terms, which enters the error
+    of the value. f is multiplied by the factor of the map.
+    """
+
+    inner: Solid
+    map: Affine
+
+    def __post_init__(self) -> None:
+        self._take_over()
+        domain = self.map.volume(self.inner.domain)
+        if self.inner.domain is not None and domain is None:
+            raise ValueError(
+                f"the domain {self.inner.domain} of the solid has no bounds and cannot be mapped: "
+                "cut the field by a volume that has"
+            )
+        object.__setattr__(self, "domain", domain)
+        numbers = _AffineNumbers.of(self.map)
+        object.__setattr__(self, "_numbers", numbers)
+        inner = self.inner.lipschitz
+        lipschitz = None if inner is None else inner * numbers.stretch * numbers.factor
+        object.__setattr__(self, "lipschitz", lipschitz)
+        own = self.inner.wavelength
+        object.__setattr__(self, "wavelength", None if own is None else own / numbers.stretch)
+
+    @property
+    def numbers(self) -> _AffineNumbers:
+        """The inverse map, as numbers of the backend once prepared."""
+        return cast("Any", self)._numbers
+
+    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        own = level / self.map.factor
+        return self.map.volume(self.inner.hull(own, above=above))
+
+    def prepare(self, backend: Backend) -> Solid:
+        other = super().prepare(backend)
+        object.__setattr__(other, "_numbers", self.numbers.prepare(backend))
+        return other
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        return self.inner.formula(*self.numbers.local(x, y, z)) * self.numbers.factor
+
+    def evaluate(self, p: Vec3) -> Sample:
+        local = type(p)(*self.numbers.local(p.x, p.y, p.z))
+        return self._image(self.inner.evaluate(local), self._size(p, 0.0))
+
+    def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
+        numbers = self.numbers
+        rows = self.inner.hessian(type(p)(*numbers.local(p.x, p.y, p.z)))
+        columns = [numbers.pulled(row) for row in rows]  # H M^-1
+        own = [numbers.pulled(type(p)(*(columns[j][k] for j in range(3)))) for k in range(3)]
+        x, y, z = (one * numbers.factor for one in own)
+        return x, y, z
+
+    def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
+        """For a formula, by its ranges. For another field, its own errors at the local coordinates,
+        without the effect of the rounding of these coordinates, which is not known."""
+        del sample
+        numbers = self.numbers
+        local = type(p)(*numbers.local(p.x, p.y, p.z))
+        slope, bend = self.inner.derivative_errors(local, self.inner.evaluate(local))
+        slope = slope * numbers.stretch * numbers.factor
+        if not isinstance(self.inner, Shape):
+            return slope, bend * numbers.stretch * numbers.stretch * numbers.factor
+        coordinates = Jet.at_point(p, order=2)
+        jet = as_jet(self.formula(*coordinates), coordinates[0], type(self.inner).__name__)
+        # The gradient need not be the middle of its range (`Formula._one_sided`): both are added.
+        return slope + sum(one.radius for one in jet.first), hessian_error(jet, p.x)
+
+    def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
+        numbers, vector = self.numbers, cast("Any", type(path.origin))
+        o, d = path.origin, path.direction
+        direction = vector(*numbers.local_direction(d.x, d.y, d.z))
+        speed = length(direction)
+        own = Path(vector(*numbers.local(o.x, o.y, o.z)), direction / speed, path.proofs)
+        look = self.inner.look(own, t * speed, ahead * speed, back * speed)
+        sample = self._image(look.sample, self._size(o, t))
+
+        def stretched(enclosures: tuple[Any, ...]) -> tuple[Any, ...]:
+            return tuple(Stretched(one, speed, numbers.factor) for one in enclosures)
+
+        slope = look.slope * speed * numbers.factor
+        ahead_, back_ = stretched(look.ahead), stretched(look.back)
+        error = None if look.slope_error is None else look.slope_error * speed * numbers.factor
+        return Look(sample, ahead_, back_, slope, look.growth, error)
+
+    def _size(self, p: Vec3, t: Real) -> Real:
+        """A bound of the terms that the local coordinates of p + t d are sums of."""
+        numbers = self.numbers
+        return numbers.stretch * (largest_coordinate(p) + numbers.offset_size + t) * math.sqrt(3)
+
+    def _image(self, sample: Sample, size: Real) -> Sample:
+        numbers = self.numbers
+        unit = 2 * float(dr.epsilon(type(sample.value)))
+        moved = 8 * unit * size * length(sample.gradient)
+        factor, stretch = numbers.factor, numbers.stretch
+
+        def image(one: Promise) -> Promise:
+            if self.map.similarity is None:
+                one = one.of_any_map(sample.value)
+            return one.scaled(factor).shortened(stretch)
+
+        return sample.with_promises(
+            image,
+            value=sample.value * factor,
+            gradient=numbers.pulled(sample.gradient) * factor,
+            error=(sample.error + moved) * factor,
+            gradient_error=sample.gradient_error * factor * stretch,
+            normal=None,
+            truncation=sample.truncation * factor,
+            along=(),
+        )
+
+
+@dataclass(frozen=True)
+class _AffineNumbers:
+    """The inverse of an affine map as a kernel uses it.
+
+    rows: of M^-1.
+    offset: b.
+    stretch: the largest singular value of M^-1.
+    factor: that of f.
+    offset_size: the largest component of b.
+    """
+
+    rows: tuple[tuple[Any, ...], ...]
+    offset: tuple[Any, ...]
+    stretch: Any
+    factor: Any
+    offset_size: Any
+
+    @classmethod
+    def of(cls, change: Affine) -> _AffineNumbers:
+        inverse = change.inverse
+        stretch = float(np.linalg.svd(inverse, compute_uv=False)[0]) * (1 + 1e-6)
+        return cls(
+            tuple(tuple(float(v) for v in row) for row in inverse),
+            change.offset,
+            stretch,
+            change.factor,
+            float(np.abs(change.offset).max()),
+        )
+
+    def prepare(self, backend: Backend) -> _AffineNumbers:
+        """The numbers as kernel parameters, except 0 and 1, which save most of the work."""
+        prepared = prepared_numbers(self, backend)
+        rows = tuple(
+            tuple(a if a in (0.0, 1.0) else b for a, b in zip(old, new, strict=True))
+            for old, new in zip(
+                (*self.rows, self.offset), (*prepared.rows, prepared.offset), strict=True
+            )
+        )
+        return replace(prepared, rows=rows[:3], offset=rows[3])
+
+    def local(self, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
+        """M^-1 (p - b), for coordinates of any kind."""
+        a, b, c = (
+            one if _is(shift, 0.0) else one - shift
+            for one, shift in zip((x, y, z), self.offset, strict=True)
+        )
+        return self.local_direction(a, b, c)
+
+    def local_direction(self, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
+        """M^-1 d."""
+        u, v, w = (_combined(row, (x, y, z)) for row in self.rows)
+        return u, v, w
+
+    def pulled(self, g: Vec3) -> Vec3:
+        """M^-T g, the gradient of f(M^-1 p) if g is that of f."""
+        columns = (tuple(row[i] for row in self.rows) for i in range(3))
+        return type(g)(*(_combined(column, (g.x, g.y, g.z)) for column in columns))
+
+
+def _combined(weights: tuple[Any, ...], terms: tuple[Any, ...]) -> Any:
+    """The weighted sum, without terms of weight 0."""
+    total: Any = None
+    for weight, term in zip(weights, terms, strict=True):
+        if _is(weight, 0.0):
+            continue
+        one = term if _is(weight, 1.0) else term * weight
+        total = one if total is None else total + one
+    return total
+
+
+def _is(x: Any, number: float) -> bool:
+    return isinstance(x, float) and x == number

@@ -1,0 +1,410 @@
+"""Reading surface files: meshes, clouds, closed curves, blobs and molecules, and which it was."""
+
+from __future__ import annotations
+
+import itertools
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, TypeAlias
+
+import numpy as np
+
+from harnack.backend import FloatArray, IntArray
+from harnack.files.file_geometry import Contents, FileFormatError, Place, read_bytes
+from harnack.files.gltf import read_gltf
+from harnack.files.molecules import MOLECULE_FILES, Atoms, atoms_in
+from harnack.files.ply import read_ply
+from harnack.files.text_formats import (
+    Metaballs,
+    read_loops_text,
+    read_metaballs,
+    read_obj,
+    read_off,
+    read_stl,
+    read_xyz,
+)
+from harnack.files.three_mf import read_3mf
+from harnack.geometry.boundary_edges import (
+    Edge,
+    OpenChainError,
+    boundary_edges,
+    join,
+    singular_edges,
+    singular_loops,
+    weld_vertices,
+)
+from harnack.geometry.clouds import CloudError, checked_normals, checked_points
+from harnack.geometry.curves import CurveError, validate_loops
+from harnack.geometry.meshes import MeshError, without_zero_area_faces, zero_area_faces
+from harnack.geometry.polygons import triangulate
+from harnack.geometry.welding import Welded
+from harnack.name_suggestions import did_you_mean
+
+__all__ = [
+    "SURFACE_FILES",
+    "ClosedCurves",
+    "Cloud",
+    "Mesh",
+    "PolygonSurface",
+    "ReadAs",
+    "loops_in",
+    "read_loops",
+    "read_surface",
+]
+
+# Closed curves.
+
+PlacedLoop = tuple[FloatArray, Place]
+
+_LOOP_READERS: dict[str, Callable[[Path, bytes], Contents]] = {".obj": read_obj, ".ply": read_ply}
+
+
+def read_loops(path: str | os.PathLike[str], *, boundary: bool = False) -> list[FloatArray]:
+    """The closed curves in an .obj, .ply or .loops file, as arrays (n, 3).
+
+    .obj: every `f` face is a loop, every `l` polyline that ends at its first vertex is one, and
+    all other `l` polylines are joined end to end. .ply: every face is a loop, edges are joined;
+    a file with vertices only is one loop in their order. .loops: one loop a line, x y z
+    repeated. Where edges are joined, equal positions count as one vertex.
+
+    boundary: not the faces, but the boundary of the surface they form: the edges that do not
+    cancel between neighboring faces, equal positions counted as one vertex.
+
+    Raises:
+        FileFormatError: unreadable, malformed or hostile; open polylines; a loop that
+            `validate_loops` rejects; a closed surface, which has no boundary.
+    """
+    path = Path(path)
+    kind = path.suffix.lower()
+    if kind not in (*_LOOP_READERS, ".loops"):
+        raise FileFormatError(f"{path}: curves are read from .obj, .ply and .loops files")
+    data = read_bytes(path)
+    if kind == ".loops":
+        if boundary:
+            raise FileFormatError(f"{path}: a .loops file has no faces to take the boundary of")
+        return [_validated(loop, place) for loop, place in read_loops_text(path, data)]
+    return loops_in(_LOOP_READERS[kind](path, data), boundary=boundary)
+
+
+def loops_in(contents: Contents, *, boundary: bool = False) -> list[FloatArray]:
+    """The closed curves in an .obj or .ply file that was read, as `read_loops` has them."""
+    placed = _boundary_loops(contents) if boundary else _all_loops(contents)
+    return [_validated(loop, place) for loop, place in placed]
+
+
+def _validated(loop: FloatArray, place: Place) -> FloatArray:
+    try:
+        return validate_loops(loop)[0]
+    except CurveError as error:
+        raise place.error(str(error)) from error
+
+
+def _all_loops(contents: Contents) -> list[PlacedLoop]:
+    x = contents.vertices
+    loops = [(x[corners], place) for corners, place in contents.faces]
+    if len(contents.polylines):
+        loops += _joined_polylines(contents)
+    if not loops and contents.path.suffix.lower() == ".ply" and len(x):
+        loops.append((x, Place(contents.path)))
+    if not loops:
+        raise Place(contents.path).error("it holds no faces or polylines to make curves of")
+    return loops
+
+
+def _joined_polylines(contents: Contents) -> list[PlacedLoop]:
+    x, same = contents.vertices, weld_vertices(contents.vertices)
+    loops: list[PlacedLoop] = []
+    open_edges: list[Edge] = []
+    places: dict[int, Place] = {}
+    for corners, place in contents.polylines:
+        ids: list[int] = same[corners].tolist()
+        if ids[0] == ids[-1] and len(ids) > 3:
+            loops.append((x[ids[:-1]], place))
+            continue
+        for edge in itertools.pairwise(ids):
+            if edge[0] == edge[1]:
+                raise place.error(f"two vertices in a row are both {x[edge[0]].tolist()}")
+            open_edges.append(edge)
+        places.update(dict.fromkeys(ids, place))
+    try:
+        joined = join(open_edges)
+    except OpenChainError as error:
+        raise places[error.vertex].error(_open_message(error, x[error.vertex])) from None
+    return loops + [(x[ids], places[ids[0]]) for ids in joined]
+
+
+def _open_message(error: OpenChainError, position: FloatArray) -> str:
+    point = position.tolist()
+    if error.count == 1:
+        return (
+            f"the polyline that ends at {point} is open: to close it, end it with its first "
+            "vertex or add the missing segment"
+        )
+    return (
+        f"{error.count} segments meet at {point}: two must meet at every vertex of a closed "
+        "curve, or as many begin there as end"
+    )
+
+
+def _boundary_loops(contents: Contents) -> list[PlacedLoop]:
+    place = Place(contents.path)
+    if not len(contents.faces):
+        raise place.error("it has no faces to take the boundary of")
+    same = weld_vertices(contents.vertices)
+    remaining = boundary_edges(
+        same[corners].tolist() for corners, _ in contents.faces if len(corners)
+    )
+    if not remaining:
+        raise place.error("its faces form a closed surface, which has no boundary")
+    return [(contents.vertices[np.array(ids)], place) for ids in join(remaining)]
+
+
+# All surfaces.
+
+ReadAs: TypeAlias = Literal["winding", "dipole", "loops", "polygons"]
+
+_READ_AS = ("winding", "dipole", "loops", "polygons")
+
+_READERS: dict[str, Callable[[Path, bytes], Contents]] = {
+    ".obj": read_obj, ".ply": read_ply, ".stl": read_stl, ".off": read_off,
+    ".glb": read_gltf, ".gltf": read_gltf, ".3mf": read_3mf, ".xyz": read_xyz,
+}  # fmt: skip
+_LOOP_FILES = (".obj", ".ply", ".loops")
+SURFACE_FILES = (*_READERS, ".loops", ".blobs", *MOLECULE_FILES)
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Triangles from a file, as `validate_mesh` returns them. said: what was found, and why. flat:
+    (k, 3) faces of zero area, left out of `faces`, which may close gaps without a width. rounded:
+    how many corners were moved to others, from which they were apart by rounding."""
+
+    vertices: FloatArray
+    faces: IntArray
+    said: str
+    flat: IntArray
+    rounded: int
+
+
+@dataclass(frozen=True, eq=False)
+class Cloud:
+    """Points (n, 3) from a file, with unit normals (n, 3) and areas (n,) where it has them.
+
+    said: what was found, and why it counts as a point cloud.
+    """
+
+    points: FloatArray
+    normals: FloatArray | None
+    areas: FloatArray | None
+    said: str
+
+
+@dataclass(frozen=True, eq=False)
+class ClosedCurves:
+    """Closed curves from a file, (n, 3) each. said: what was found, and why they are curves."""
+
+    loops: tuple[FloatArray, ...]
+    said: str
+
+
+@dataclass(frozen=True, eq=False)
+class PolygonSurface:
+    """Polygons from a file as they are: vertices (n, 3), and for each face its corners (k,).
+
+    said: what was found.
+    """
+
+    vertices: FloatArray
+    faces: list[IntArray]
+    said: str
+
+
+Surface: TypeAlias = Mesh | Cloud | ClosedCurves | PolygonSurface | Metaballs | Atoms
+
+
+def read_surface(path: str | os.PathLike[str], as_: ReadAs | None = None) -> Surface:
+    """What a surface file describes: .obj, .ply, .stl, .off, .glb, .gltf, .3mf, .xyz, .loops,
+    .blobs, or a molecule's, .pdb, .ent, .cif, .mmcif.
+
+    Faces make a mesh, except polygons of an .obj or .ply file of which some have more than four
+    corners and none share an edge: these are curves, as are polylines without faces. Points alone
+    make a cloud, with normals from nx ny nz (.ply), from as many `vn` as `v` (.obj) or from columns
+    4 to 6 (.xyz). Polygons are cut into triangles, the nodes of a scene put in their places, and
+    faces of zero area left out.
+
+    as_: "winding": the faces, as a mesh. "dipole": the points; of a mesh the centers of its
+    triangles, with their normals and areas. "loops": what `read_loops` finds; of a mesh its
+    boundary, the singular edges joined. "polygons": the faces as they are, not cut into triangles.
+    None decides as above.
+
+    Raises:
+        FileFormatError: unreadable, malformed, truncated or hostile; of another format; nothing in
+            it that can be taken as asked.
+    """
+    path = Path(path)
+    kind = path.suffix.lower()
+    if as_ not in (None, *_READ_AS):
+        raise ValueError(
+            f'as_ must be "winding", "dipole", "loops", "polygons" or None, not {as_!r}'
+            + did_you_mean(as_, _READ_AS)
+        )
+    if kind not in SURFACE_FILES:
+        raise FileFormatError(f"{path}: surfaces are read from {', '.join(SURFACE_FILES)} files")
+    # Wild numbers overflow on the way to the check that refuses them.
+    with np.errstate(over="ignore", invalid="ignore"):
+        return _read(path, kind, as_)
+
+
+def _read(path: Path, kind: str, as_: ReadAs | None) -> Surface:
+    if kind == ".blobs":
+        _refuse(path, as_, (), "blobs")
+        return read_metaballs(path, read_bytes(path))
+    if kind in MOLECULE_FILES:
+        _refuse(path, as_, (), "atoms")
+        return atoms_in(path, read_bytes(path))
+    if kind == ".loops":
+        _refuse(path, as_, ("loops",), "curves")
+        return _loops(read_loops(path), "curves, since the file lists nothing else")
+    contents = _READERS[kind](path, read_bytes(path))
+    try:
+        if (contents.faces.sizes >= 3).any():
+            return _of_faces(contents, as_)
+        if len(contents.polylines):
+            _refuse(path, as_, ("loops",), "polylines")
+            return _loops(loops_in(contents), "polylines without faces: curves")
+        if as_ == "loops" and kind == ".ply":
+            why = "points joined in their order, as asked: a curve"
+            return _loops(loops_in(contents), why)
+        _refuse(path, as_, ("dipole",), "points")
+        return _cloud(contents)
+    except (MeshError, CloudError) as error:
+        raise Place(path).error(str(error)) from error
+
+
+def _refuse(path: Path, as_: ReadAs | None, possible: tuple[str, ...], held: str) -> None:
+    """Raise unless `as_` can be made of what the file holds."""
+    needs = {
+        "winding": "faces", "dipole": "points or faces", "loops": "polylines or faces",
+        "polygons": "faces",
+    }  # fmt: skip
+    if as_ is not None and as_ not in possible:
+        raise Place(path).error(
+            f'it holds {held} only: it cannot be taken as "{as_}", which needs {needs[as_]}'
+        )
+
+
+def _of_faces(
+    contents: Contents, as_: ReadAs | None
+) -> Mesh | Cloud | ClosedCurves | PolygonSurface:
+    if as_ == "polygons":
+        return _polygons(contents)
+    can_be_loops = contents.path.suffix.lower() in _LOOP_FILES
+    if as_ == "loops" and len(contents.polylines) and can_be_loops:
+        return _loops(loops_in(contents), "polylines and faces, taken as curves as asked")
+    if as_ in (None, "loops") and can_be_loops and _are_curves(contents):
+        return _loops(loops_in(contents), "polygons of which no two share an edge: curves")
+    mesh = _mesh(contents)
+    if as_ == "dipole":
+        return _centers(mesh)
+    if as_ == "loops":
+        return _boundary(contents.path, mesh)
+    return mesh
+
+
+def _polygons(contents: Contents) -> PolygonSurface:
+    sizes = contents.faces.sizes
+    end, wide = np.cumsum(sizes), np.flatnonzero(sizes >= 3)
+    kept = [contents.faces.corners[end[k] - sizes[k] : end[k]] for k in wide]
+    few, many = min(map(len, kept)), max(map(len, kept))
+    corners = f"{few}" if few == many else f"{few} to {many}"
+    said = f"{len(kept):,} polygons of {corners} corners, each spanned by a surface, as asked"
+    return PolygonSurface(contents.vertices, kept, said)
+
+
+def _are_curves(contents: Contents) -> bool:
+    """Whether some polygon has more than four corners, and no two share an edge."""
+    faces = contents.faces
+    if faces.sizes.max() <= 4:
+        return False
+    same = weld_vertices(contents.vertices)
+    begin = same[faces.corners]
+    ends = np.cumsum(faces.sizes)
+    after = np.arange(1, len(begin) + 1, dtype=np.int64)
+    after[ends[faces.sizes > 0] - 1] = (ends - faces.sizes)[faces.sizes > 0]
+    end = begin[after]
+    keys = np.minimum(begin, end) * len(same) + np.maximum(begin, end)
+    keys = keys[np.repeat(faces.sizes, faces.sizes) >= 3]
+    return len(np.unique(keys)) == len(keys)
+
+
+def _mesh(contents: Contents) -> Mesh:
+    found = triangulate(contents.vertices, contents.faces.corners, contents.faces.sizes)
+    vertices, faces = without_zero_area_faces(contents.vertices, found)
+    flat = found[zero_area_faces(vertices, found)]
+    welded = Welded.of(vertices, faces)
+    net, edges = welded.net, welded.edges
+    if not len(net.faces):
+        raise MeshError(f"its {len(faces):,} faces cancel each other: there is no surface")
+    count = f"{len(faces):,} triangles"
+    if len(edges) == 0:
+        said = f"{count} without singular edges: a closed mesh"
+        middle = vertices.mean(axis=0)
+        if np.linalg.det(vertices[faces] - middle).sum() < 0.0:
+            said += ", whose faces look inward (the winding number inside is negative)"
+    elif len(edges) >= len(faces):
+        said = f"{count}, {len(edges):,} singular edges: a triangle soup"
+    else:
+        said = f"{count}, {len(edges):,} singular edges: a mesh with holes or faces turned round"
+    if welded.rounded:
+        vertices = vertices[welded.index]
+        said += f"; {welded.rounded:,} corners joined with others that were apart by rounding"
+    if len(found) > len(faces):
+        said += f"; {len(found) - len(faces):,} of zero area left out"
+    if len(faces) > len(net.faces):
+        said += f"; {len(faces) - len(net.faces):,} are added to or canceled by others"
+    if len(contents.polylines):
+        said += "; polylines not used"
+    return Mesh(vertices, faces, said, flat, welded.rounded)
+
+
+def _centers(mesh: Mesh) -> Cloud:
+    corners = mesh.vertices[mesh.faces]
+    normal = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(normal, axis=1)
+    said = f"{len(area):,} triangles, each taken as a point with its normal and area, as asked"
+    return Cloud(corners.mean(axis=1), normal / area[:, None], area, said)
+
+
+def _boundary(path: Path, mesh: Mesh) -> ClosedCurves:
+    edges, weights = singular_edges(weld_vertices(mesh.vertices)[mesh.faces])
+    if not len(edges):
+        raise Place(path).error(
+            'its faces form a closed surface, which has no boundary: it cannot be taken as "loops"'
+        )
+    try:
+        joined = singular_loops(edges, weights)
+        loops = validate_loops([mesh.vertices[loop] for loop in joined])
+    except CurveError as error:
+        raise Place(path).error(str(error)) from error
+    noun = "loop" if len(loops) == 1 else "loops"
+    said = f"{len(loops):,} {noun} of {sum(weights):,} edges: the boundary of the faces, as asked"
+    return ClosedCurves(loops, said)
+
+
+def _cloud(contents: Contents) -> Cloud:
+    points = checked_points(contents.vertices)
+    count = f"{len(points):,} points"
+    if contents.normals is None:
+        said = f"{count} without faces, and no normals read: a point cloud"
+        return Cloud(points, None, None, said)
+    normals = checked_normals(contents.normals, len(points))
+    return Cloud(points, normals, None, f"{count} with normals, no faces: a point cloud")
+
+
+def _loops(loops: list[FloatArray], why: str) -> ClosedCurves:
+    noun = "loop" if len(loops) == 1 else "loops"
+    return ClosedCurves(
+        tuple(loops), f"{len(loops):,} {noun} of {sum(map(len, loops)):,} vertices: {why}"
+    )

@@ -1,0 +1,346 @@
+"""Scenes of curves, harmonic polynomials, periodic surfaces, and functions over the plane.
+
+Those over the plane are Riemann surfaces (the paper's Fig. 19), level curves and height fields.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from harnack.arithmetic import cos, exp, sin
+from harnack.backend import FloatArray
+from harnack.fields import Field
+from harnack.fields.analytic.fourier_series import FourierSeries
+from harnack.fields.analytic.hyperspherical import HypersphericalHarmonic
+from harnack.fields.analytic.lobes import Lobes
+from harnack.fields.analytic.periodic import EigenfunctionSum, Gyroid, SchwarzD, SchwarzP
+from harnack.fields.analytic.plane import HeightField, LevelCurves
+from harnack.fields.analytic.polynomial import HarmonicPolynomial, SphericalHarmonic
+from harnack.fields.analytic.riemann_surface import RiemannSurface
+from harnack.fields.analytic.waves import Product, sine
+from harnack.fields.solid_angles.solid_angle import SolidAngle
+from harnack.gallery.scene import DRAWN, Scene
+from harnack.geometry import Ball, Box, HalfSpace, Volume, example_curves
+from harnack.rendering import Camera
+from harnack.tracer import LevelSet, level_set
+
+
+def _curve(loops: Any, level: Any = None, **settings: Any) -> list[LevelSet]:
+    return [level_set(SolidAngle(loops), level, tolerance=DRAWN, **settings)]
+
+
+def _levels() -> list[LevelSet]:
+    """Five levels of one polygon, cut open."""
+    cut = HalfSpace((0.5, -0.9, 0.0), 0.0)
+    levels = [k * math.pi for k in (1.0, 1.5, 2.0, 2.5, 3.0)]
+    return _curve(example_curves.wavy_polygon(48), levels, clip=cut)
+
+
+def _holes() -> list[LevelSet]:
+    """A square with three holes, bent like a sheet in the wind so that no plane contains it."""
+    edge, *holes = example_curves.square_with_holes(24)
+    s = np.linspace(0, 1, 10, endpoint=False)[:, None]
+    fine = [(1 - s) * a + s * b for a, b in zip(edge, np.roll(edge, -1, axis=0), strict=True)]
+    return _curve([_bent(loop) for loop in (np.concatenate(fine), *holes)])
+
+
+def _bent(loop: FloatArray) -> FloatArray:
+    x, y, _ = loop.T
+    return np.column_stack([x, y, 0.25 * np.sin(2.2 * x) + 0.2 * np.cos(2.0 * y)])
+
+
+def _periodic(kind: Any, *, solid: tuple[float, float], box: bool = False) -> list[LevelSet]:
+    domain = Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)) if box else Ball(radius=1.0)
+    return [level_set(kind(1.0, domain=domain), solid=solid, tolerance=DRAWN)]
+
+
+def _eigenfunctions() -> list[LevelSet]:
+    """The paper's Fig. 21: the 1/2 level of a sum of two eigenfunctions."""
+    terms = [Product(1.0, x=sine(k), y=sine(k), z=sine(k)) for k in (6.0, 2.0)]
+    side = math.pi / 2
+    domain = Box((-side, -side, -side), (side, side, side))
+    solid = (0.5, math.inf)
+    return [level_set(EigenfunctionSum(terms, domain=domain), solid=solid, tolerance=DRAWN)]
+
+
+def _harmonic(field: Field) -> list[LevelSet]:
+    return [level_set(field, tolerance=DRAWN)]
+
+
+def _on_the_sphere(field: HypersphericalHarmonic, level: float) -> list[LevelSet]:
+    """Both levels of a function of S^3, whole: nothing is clipped."""
+    return [level_set(field, [-level, level], tolerance=DRAWN)]
+
+
+def _lobes() -> list[LevelSet]:
+    """Those where the function is positive, and where it is negative."""
+    lobes = Lobes(3, 2)
+    return [
+        level_set(part, solid=(-math.inf, 0.0), tolerance=DRAWN)
+        for part in (lobes.positive, lobes.negative)
+    ]
+
+
+def _quartic() -> list[LevelSet]:
+    """x^3 y + x y^3 - 3 x y (w^2 + z^2), the example of Gillespie et al. 2024, Appendix E.2. On the
+    sphere it is x y (4 (x^2 + y^2) - 3), hence at most 1/2."""
+    terms = {(3, 1, 0, 0): 1.0, (1, 3, 0, 0): 1.0, (1, 1, 0, 2): -3.0, (1, 1, 2, 0): -3.0}
+    return _on_the_sphere(HypersphericalHarmonic.from_polynomial(terms), 0.15)
+
+
+def _fitted_knot() -> list[LevelSet]:
+    """Gaussians along a trefoil knot, by a series of 16 x 16 x 9 cosines."""
+    curve = example_curves.torus_knot(2, 3, 150)
+    step = np.linalg.norm(np.roll(curve, -1, axis=0) - curve, axis=1)
+    width = 0.15 * float(np.ptp(curve, axis=0).max()) / 2
+
+    def density(x: FloatArray) -> FloatArray:
+        parts = [
+            np.exp(-((some[:, None] - curve) ** 2).sum(axis=2) / width**2) @ step
+            for some in np.array_split(x, len(x) // 4000 + 1)
+        ]
+        return np.concatenate(parts) / (width * math.sqrt(math.pi))
+
+    low, high = curve.min(axis=0) - 2.6 * width, curve.max(axis=0) + 2.6 * width
+    box = low.tolist(), high.tolist()
+    series = FourierSeries.fit(density, box, (16, 16, 9), samples=(48, 48, 28))
+    return [level_set(series, solid=(0.4, math.inf), tolerance=DRAWN)]
+
+
+CURVES = (
+    Scene(
+        "polygon",
+        "a nonplanar polygon",
+        lambda: _curve(example_curves.wavy_polygon(64)),
+        demo_spp=36,
+    ),
+    Scene(
+        "levels",
+        "five level sets of a nonplanar polygon, cut open",
+        _levels,
+        camera=Camera(azimuth=-62, elevation=24),
+        demo_spp=25,
+    ),
+    Scene(
+        "evaluations",
+        "evaluations a ray, as the paper's Fig. 22",
+        lambda: _curve(example_curves.wavy_polygon(64)),
+        show="evaluations",
+        demo_spp=1,
+    ),
+    Scene(
+        "trefoil",
+        "a Seifert surface of the trefoil knot",
+        lambda: _curve(example_curves.torus_knot(2, 3, 96)),
+        camera=Camera(azimuth=-80, elevation=52),
+        demo_spp=25,
+    ),
+    Scene(
+        "figure-eight",
+        "a Seifert surface of the figure-eight knot",
+        lambda: _curve(example_curves.figure_eight_knot(120)),
+        camera=Camera(elevation=48),
+    ),
+    Scene(
+        "hopf",
+        "a Seifert surface of the Hopf link",
+        lambda: _curve(example_curves.hopf_link(48)),
+        demo_spp=25,
+    ),
+    Scene(
+        "borromean",
+        "a Seifert surface of the Borromean rings",
+        lambda: _curve(example_curves.borromean_rings(48)),
+    ),
+    Scene(
+        "holes",
+        "a polygon with holes",
+        _holes,
+        ("plastic",),
+        Camera(azimuth=-50, elevation=42),
+        demo_spp=25,
+    ),
+    Scene("coil", "a coil of five turns", lambda: _curve(example_curves.coil(5, 160)), ("copper",)),
+)
+
+HARMONICS = (
+    Scene(
+        "harmonic",
+        "level set of a spherical harmonic, l = 5, m = 3",
+        lambda: _harmonic(SphericalHarmonic(5, 3)),
+        demo_spp=36,
+    ),
+    Scene(
+        "polynomial",
+        "the harmonic polynomial of the paper's Eq. 8",
+        lambda: _harmonic(HarmonicPolynomial({(2, 1, 0): 1.0, (0, 1, 2): -1.0})),
+    ),
+    Scene(
+        "hyperspherical",
+        "a quartic on the sphere S^3, projected: levels of both signs, unclipped",
+        _quartic,
+        camera=Camera(azimuth=-35, elevation=22),
+        demo_spp=25,
+    ),
+    Scene(
+        "hyperspherical-sextic",
+        "a hyperspherical harmonic of degree 6 (j = 4, m = 3)",
+        lambda: _on_the_sphere(HypersphericalHarmonic(6, 4, 3), 0.3),
+        camera=Camera(elevation=48),
+    ),
+    Scene(
+        "orbital",
+        "lobes of a spherical harmonic, l = 3, m = 2, and their signs",
+        _lobes,
+        ("plastic", "porcelain"),
+        demo_spp=36,
+    ),
+)
+
+SOLIDS = (
+    Scene(
+        "gyroid",
+        "a gyroid wall in glass, cut to a ball",
+        lambda: _periodic(Gyroid, solid=(-0.35, 0.35)),
+        ("glass",),
+        demo_spp=144,
+    ),
+    Scene(
+        "gyroid-gold",
+        "half of space behind the gyroid in gold, cut to a box",
+        lambda: _periodic(Gyroid, solid=(-math.inf, 0.0), box=True),
+        ("gold",),
+        demo_spp=64,
+    ),
+    Scene(
+        "schwarz-p",
+        "Schwarz's primitive surface as a wall, cut to a box",
+        lambda: _periodic(SchwarzP, solid=(-0.25, 0.25), box=True),
+        ("porcelain",),
+    ),
+    Scene(
+        "schwarz-d",
+        "Schwarz's diamond surface as a wall, cut to a ball",
+        lambda: _periodic(SchwarzD, solid=(-0.15, 0.15)),
+        ("copper",),
+    ),
+    Scene(
+        "eigenfunctions",
+        "a sum of Laplacian eigenfunctions (the paper's Fig. 21)",
+        _eigenfunctions,
+        ("clay",),
+    ),
+    Scene(
+        "fourier",
+        "a knot of Gaussians by a Fourier series fitted to it",
+        _fitted_knot,
+        ("clay",),
+        Camera(azimuth=-80, elevation=52),
+        show="shaded",
+        demo_spp=4,
+    ),
+)
+
+
+# Over the plane.
+
+
+def _surface(function: Any, part: str = "imag", **settings: Any) -> list[LevelSet]:
+    return [level_set(RiemannSurface(function, part, **settings), tolerance=DRAWN)]
+
+
+def _elliptic(domain: Volume) -> list[LevelSet]:
+    """sqrt(z^3 - z): a torus less its points at infinity."""
+    return _surface("sqrt", of={0: 1, 1: 1, -1: 1}, height=0.6, domain=domain)
+
+
+def _lemniscates() -> list[LevelSet]:
+    """Level curves of the potential of three line charges."""
+    triangle = {complex(math.cos(a), math.sin(a)): 1 for a in (0.5 * math.pi, 3.7, 5.8)}
+    field = LevelCurves("log", of=triangle, domain=Box((-2.2, -2.2, -0.2), (2.2, 2.2, 0.2)))
+    return [level_set(field, [-1.2, -0.6, 0.0, 0.6, 1.2, 1.8], tolerance=DRAWN)]
+
+
+def _field_lines() -> list[LevelSet]:
+    """Field lines of a charge and its opposite: level curves of the conjugate function."""
+    field = LevelCurves("log", "imag", of={1: 1, -1: -1})
+    return [level_set(field, [k * math.pi / 6 for k in range(12)], tolerance=DRAWN)]
+
+
+def _ripples() -> list[LevelSet]:
+    field = HeightField(
+        lambda x, y: exp(-(x**2 + y**2) * 1.5) * sin(x * 5 + cos(y * 4)) * 0.6,
+        domain=Box((-1.5, -1.5, -1.0), (1.5, 1.5, 1.0)),
+    )
+    return [level_set(field, tolerance=DRAWN)]
+
+
+PLANE = (
+    Scene(
+        "riemann-log",
+        "the Riemann surface of log z, cut to a ball (the paper's Fig. 19)",
+        lambda: _surface("log", domain=Ball(radius=7.0)),
+        camera=Camera(azimuth=-60, elevation=18),
+        demo_spp=25,
+    ),
+    Scene(
+        "riemann-sqrt",
+        "the Riemann surface of the square root, in the unit ball (Fig. 19)",
+        lambda: _surface("sqrt"),
+        camera=Camera(azimuth=-60, elevation=24),
+        demo_spp=25,
+    ),
+    Scene(
+        "riemann-cbrt",
+        "the Riemann surface of the cube root, in the unit ball (Fig. 19)",
+        lambda: _surface("cbrt"),
+        camera=Camera(azimuth=-60, elevation=24),
+    ),
+    Scene(
+        "riemann-asin",
+        "the Riemann surface of arc sine, its real part, cut to a ball (Fig. 19)",
+        lambda: _surface("asin", "real", domain=Ball(radius=6.0)),
+        camera=Camera(azimuth=-70, elevation=14),
+        demo_spp=25,
+    ),
+    Scene(
+        "riemann-elliptic",
+        "the Riemann surface of sqrt(z^3 - z)",
+        lambda: _elliptic(Ball(radius=2.0)),
+        camera=Camera(azimuth=-60, elevation=28),
+    ),
+    Scene(
+        "riemann-log-open",
+        "the Riemann surface of log z, without an end in the picture",
+        lambda: _surface("log", domain=Ball(radius=30.0)),
+        camera=Camera(azimuth=-60, elevation=9, zoom=1.7),
+    ),
+    Scene(
+        "riemann-sqrt-open",
+        "the Riemann surface of the square root, without an end in the picture",
+        lambda: _surface("sqrt", domain=Ball(radius=6.0)),
+        camera=Camera(azimuth=-60, elevation=24, zoom=2.2),
+    ),
+    Scene(
+        "lemniscates",
+        "level curves of a harmonic function of the plane, as walls",
+        _lemniscates,
+        camera=Camera(azimuth=-65, elevation=48),
+    ),
+    Scene(
+        "field-lines",
+        "level curves of an angle-valued harmonic function of the plane, as walls",
+        _field_lines,
+        camera=Camera(azimuth=-65, elevation=52),
+    ),
+    Scene(
+        "ripples",
+        "a height field over the plane",
+        _ripples,
+        ("porcelain",),
+        Camera(azimuth=-55, elevation=34),
+    ),
+)

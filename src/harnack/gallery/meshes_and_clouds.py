@@ -1,0 +1,117 @@
+"""Scenes of damaged meshes and of point clouds."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from harnack.backend import FloatArray
+from harnack.fields.solid_angles.dipole import DipolePotential
+from harnack.fields.solid_angles.winding_number import WindingNumber
+from harnack.gallery.scene import DRAWN, Scene
+from harnack.geometry import example_curves, example_meshes
+from harnack.rendering import Camera
+from harnack.tracer import LevelSet, level_set
+
+# Evenly spread over any range: multiples of it, modulo 1.
+_GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
+
+
+def _cut_mesh() -> list[LevelSet]:
+    """A bumpy sphere with round holes cut into it."""
+    vertices, faces = example_meshes.bumpy_sphere(6)
+    middles = vertices[faces].mean(axis=1)
+    middles /= np.linalg.norm(middles, axis=1, keepdims=True)
+    whole = (middles @ _spread(14).T < math.cos(0.27)).all(axis=1)
+    return [level_set(WindingNumber(vertices, faces[whole]), tolerance=DRAWN)]
+
+
+def _spread(n: int) -> FloatArray:
+    """n directions (n, 3), evenly spread."""
+    k = np.arange(n)
+    z, turn = 1.0 - (2.0 * k + 1.0) / n, 2.0 * math.pi * _GOLDEN * k
+    across = np.sqrt(1.0 - z * z)
+    return np.column_stack([across * np.cos(turn), across * np.sin(turn), z])
+
+
+def _soup() -> list[LevelSet]:
+    """Loose triangles: every one shrunk about its middle, a tenth of them missing."""
+    vertices, faces = example_meshes.torus_mesh(1.0, 0.42, 20, 9)
+    faces = example_meshes.remove_faces(faces, 0.1, seed=1)
+    corners = vertices[faces]
+    middle = corners.mean(axis=1, keepdims=True)
+    loose = (middle + 0.86 * (corners - middle)).reshape(-1, 3)
+    field = WindingNumber(loose, np.arange(len(loose)).reshape(-1, 3))
+    return [level_set(field, tolerance=DRAWN)]
+
+
+def _cloud() -> list[LevelSet]:
+    """Random points on a quartic with five handles, with its gradients as normals."""
+    points = np.random.default_rng(2).uniform(-2.5, 2.5, (12000, 3))
+    for _ in range(40):
+        value, gradient = _tangle(points)
+        points = points - 0.7 * (value / (gradient**2).sum(axis=1))[:, None] * gradient
+    value, gradient = _tangle(points)
+    found = (np.abs(value) < 1e-9) & (np.abs(points) < 2.6).all(axis=1)
+    return [level_set(DipolePotential(points[found], gradient[found]), tolerance=DRAWN)]
+
+
+def _tangle(points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """x^4 - 5 x^2 + y^4 - 5 y^2 + z^4 - 5 z^2 + 11.8 and its gradient."""
+    value = (points**4 - 5.0 * points**2).sum(axis=1) + 11.8
+    return value, 4.0 * points**3 - 10.0 * points
+
+
+def _knot_cloud() -> list[LevelSet]:
+    """Points on a tube around a trefoil, like the seeds of a sunflower."""
+    n, count = 1200, 8000
+    curve = example_curves.torus_knot(2, 3, n)
+    along = np.roll(curve, -1, axis=0) - np.roll(curve, 1, axis=0)
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    k = np.arange(count)
+    at = k * n // count
+    turn = (2 * math.pi * _GOLDEN * k)[:, None]
+    u = np.cross(along[at], (0.0, 0.0, 1.0))
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    normals = np.cos(turn) * u + np.sin(turn) * np.cross(along[at], u)
+    radius = 0.055 * float(np.ptp(curve))
+    return [level_set(DipolePotential(curve[at] + radius * normals, normals), tolerance=DRAWN)]
+
+
+MESHES = (
+    Scene(
+        "cut-mesh",
+        "a mesh with holes, spanned by the level set of its winding number",
+        _cut_mesh,
+        ("eggshell",),
+        show="shaded",
+        demo_spp=9,
+    ),
+    Scene(
+        "soup",
+        "a soup of loose triangles, mended by its winding number",
+        _soup,
+        ("two-tone",),
+        Camera(elevation=40),
+        show="shaded",
+        demo_spp=4,
+    ),
+    Scene(
+        "cloud",
+        "a surface through oriented points",
+        _cloud,
+        ("porcelain",),
+        show="shaded",
+        demo_spp=9,
+    ),
+    Scene(
+        "knot-cloud",
+        "a trefoil tube through 8,000 oriented points",
+        _knot_cloud,
+        ("gold",),
+        Camera(azimuth=-90, elevation=70),
+        show="shaded",
+        demo_spp=9,
+    ),
+)

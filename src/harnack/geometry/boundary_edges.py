@@ -1,0 +1,291 @@
+"""Edges by integer index: closed loops of them, and those at which faces of a mesh do not cancel.
+
+At the latter the winding number is singular. Let T be the triangles of a mesh, m_T integers, and
+Omega_T(x) the signed solid angle of T seen from x. Then
+
+    w = 1/(4 pi) sum_T m_T Omega_T
+
+jumps by m_T across T. With its jumps removed along a ray it is smooth everywhere but on the
+*singular edges*: those whose weights, summed over the triangles around them, do not cancel.
+
+Proof. Off T, Omega_T is harmonic, and by Stokes its gradient is the integral of Biot and Savart
+along the boundary of T alone (Gillespie et al. 2024, Eq. 11, edge by edge): grad Omega_T(x) is the
+sum of B_e(x) over the edges e of T, where B_e is analytic off the segment e and B_{-e} = -B_e.
+Hence, off the triangles, 4 pi grad w = G with G = sum_e n_e B_e, where n_e is the sum of the m_T
+with the sign with which e runs around T. Edges with n_e = 0 drop out, so G extends to an analytic
+field on R^3 minus S, S the union of the others. G is curl and divergence free there by continuity,
+so around every point off S it has a local potential, and this is harmonic. The integral of G along
+a closed path off S is a multiple of 4 pi: move the path slightly so that it meets triangles in
+their interiors only; between these crossings it follows 4 pi w, and each crossing of T takes
++-4 pi m_T. So 4 pi w mod 4 pi extends to a function on R^3 minus S that is harmonic in the
+neighborhood of each point, with values mod 4 pi. QED.
+
+The n_e are the boundary of an integral chain, so at each vertex as much weight begins as ends:
+S is made of closed loops, and 4 pi w is mod 4 pi the solid angle of these loops.
+
+Edges are compared by integer index, after equal positions were given one index (`weld_vertices`),
+never by distance: near edges do not cancel, however near they are. Functions of arrays are linear
+but for one sort, and take about a second for a million triangles; `boundary_edges`, `join` and
+`singular_loops` take one Python step an edge.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from harnack.backend.validation import FloatArray, IntArray
+
+__all__ = [
+    "NetFaces",
+    "net_edges",
+    "net_faces",
+    "singular_edges",
+    "singular_loops",
+    "weld_vertices",
+]
+
+Edge = tuple[int, int]
+
+
+class OpenChainError(ValueError):
+    """Edges that do not join to closed loops. vertex: where they end, or meet in too many."""
+
+    def __init__(self, vertex: int, count: int) -> None:
+        super().__init__(f"{count} edges meet at vertex {vertex}")
+        self.vertex = vertex
+        self.count = count
+
+
+def boundary_edges(faces: Iterable[Sequence[int]]) -> list[Edge]:
+    """Directed edges of faces that do not cancel against the same edge run the other way.
+
+    An edge is listed as often as it remains. At every vertex as many of them begin as end,
+    because that is so for each face.
+    """
+    net: Counter[Edge] = Counter()
+    for face in faces:
+        for a, b in zip(face, (*face[1:], face[0]), strict=True):
+            if a < b:
+                net[a, b] += 1
+            elif a > b:
+                net[b, a] -= 1
+    remaining: list[Edge] = []
+    for (a, b), count in net.items():
+        remaining += [(a, b)] * count if count > 0 else [(b, a)] * -count
+    return remaining
+
+
+def join(edges: Sequence[Edge]) -> list[list[int]]:
+    """Loops of vertex indices made of all the edges.
+
+    If as many edges begin as end at every vertex, their directions are kept, and a loop ends
+    where it first meets itself. Otherwise exactly two edges must meet at every vertex, and each
+    loop runs in the direction of its first edge.
+
+    Raises:
+        OpenChainError: neither is the case.
+    """
+    balance: Counter[int] = Counter()
+    for a, b in edges:
+        balance[a] += 1
+        balance[b] -= 1
+    if any(balance.values()):
+        edges = _with_common_direction(edges)
+    leaving: defaultdict[int, list[int]] = defaultdict(list)
+    for a, b in reversed(edges):
+        leaving[a].append(b)
+    loops: list[list[int]] = []
+    for a, _ in edges:
+        while leaving[a]:
+            loops += _walk(a, leaving)
+    return loops
+
+
+def _walk(start: int, leaving: dict[int, list[int]]) -> list[list[int]]:
+    """Loops met on the way from `start` back to it, using up the edges."""
+    loops: list[list[int]] = []
+    path = [start]
+    position = {start: 0}
+    while True:
+        vertex = leaving[path[-1]].pop()
+        if vertex in position:
+            begin = position[vertex]
+            loops.append(path[begin:])
+            for passed in path[begin + 1 :]:
+                del position[passed]
+            del path[begin + 1 :]
+            if begin == 0:
+                return loops
+        else:
+            position[vertex] = len(path)
+            path.append(vertex)
+
+
+def _with_common_direction(edges: Sequence[Edge]) -> list[Edge]:
+    """The edges, reversed where need be so that each loop runs in the direction of its first
+    edge."""
+    touching: defaultdict[int, list[int]] = defaultdict(list)
+    for k, (a, b) in enumerate(edges):
+        touching[a].append(k)
+        touching[b].append(k)
+    for vertex, met in touching.items():
+        if len(met) != 2:
+            raise OpenChainError(vertex, len(met))
+    used = [False] * len(edges)
+    turned: list[Edge] = []
+    for k in range(len(edges)):
+        start, vertex = edges[k]
+        edge = k
+        while not used[edge]:
+            used[edge] = True
+            turned.append((start, vertex))
+            first, second = touching[vertex]
+            edge = second if first == edge else first
+            start, vertex = vertex, sum(edges[edge]) - vertex
+    return turned
+
+
+# 2^64 over the golden ratio, made odd: the multiplier of Fibonacci hashing (Knuth, TAOCP 6.4).
+_GOLDEN = np.uint64(0x9E3779B97F4A7C15)
+
+
+class NetFaces(NamedTuple):
+    """Faces after duplicates were counted.
+
+    faces: (k, 3), no two with the same three vertices. multiplicity: (k,), positive.
+    source: (k,), ascending; `faces[i]` is original face `source[i]`, the first of its orientation.
+    """
+
+    faces: IntArray
+    multiplicity: IntArray
+    source: IntArray
+
+
+def weld_vertices(vertices: FloatArray) -> IntArray:
+    """For each vertex (n, 3) the index of the first vertex at exactly the same position: (n,).
+
+    -0.0 equals 0.0. `weld_vertices(vertices)[faces]` are the faces of the welded mesh.
+    """
+    bits = (np.ascontiguousarray(vertices, dtype=np.float64) + 0.0).view(np.uint64)
+    order, starts = _equal_rows(bits)
+    first = np.minimum.reduceat(order, starts) if len(order) else order
+    welded = np.empty(len(bits), dtype=np.int64)
+    welded[order] = np.repeat(first, _lengths(starts, len(order)))
+    return welded
+
+
+def net_faces(faces: IntArray) -> NetFaces:
+    """The faces (m, 3) with duplicates added up: same vertices +1, reversed -1.
+
+    A face that its reversed duplicates cancel vanishes, and so does one that uses a vertex twice,
+    since it has no area. Whichever corner a face begins with makes no difference. What remains
+    runs so that its multiplicity is positive, and keeps the order of the original faces.
+    """
+    a, b, c = faces.T
+    proper = np.flatnonzero((a != b) & (b != c) & (c != a))
+    corners = np.sort(faces[proper], axis=1)
+    a, b, c = faces[proper].T
+    # A cyclic shift of a sorted row has one descent, any other order has two.
+    descents = (a > b).astype(np.int64) + (b > c) + (c > a)
+    sign = np.where(descents == 1, 1, -1)
+    if not len(proper):
+        none = np.zeros(0, dtype=np.int64)
+        return NetFaces(none.reshape(0, 3), none, none)
+    order, starts = _equal_rows(corners.view(np.uint64))
+    net = np.add.reduceat(sign[order], starts)
+    group_sign = np.repeat(np.sign(net), _lengths(starts, len(order)))
+    agreeing = np.where(sign[order] == group_sign, proper[order], np.iinfo(np.int64).max)
+    source = np.minimum.reduceat(agreeing, starts)[net != 0]
+    net = net[net != 0]
+    by_source = np.argsort(source)
+    source = source[by_source]
+    return NetFaces(faces[source], np.abs(net[by_source]), source)
+
+
+def singular_edges(faces: IntArray, multiplicity: npt.ArrayLike = 1) -> tuple[IntArray, IntArray]:
+    """Directed edges (k, 2) that do not cancel between faces (m, 3), and their weights (k,) > 0.
+
+    faces: of a welded mesh. multiplicity: (m,) integers of any sign, or one for all.
+
+    Edges run the way they run in the faces, and are sorted by their lower, then higher index. The
+    module's docstring has the proof that the winding number is singular at these edges alone.
+    """
+    if not len(faces):
+        return np.zeros((0, 2), dtype=np.int64), np.zeros(0, dtype=np.int64)
+    weight = np.broadcast_to(np.asarray(multiplicity, dtype=np.int64), (len(faces),))
+    return net_edges(faces.ravel(), np.roll(faces, -1, axis=1).ravel(), np.repeat(weight, 3))
+
+
+def net_edges(
+    begin: IntArray, end: IntArray, weight: npt.ArrayLike = 1
+) -> tuple[IntArray, IntArray]:
+    """Directed edges (k, 2) that are left, and their weights (k,) > 0, of edges begin -> end (m,).
+
+    An edge counts `weight` times, (m,) or one integer of any sign for all, and against the same
+    edge run the other way; one from a vertex to itself does not count. The order is by the lower,
+    then the higher index.
+    """
+    if not len(begin):
+        return np.zeros((0, 2), dtype=np.int64), np.zeros(0, dtype=np.int64)
+    low, high = np.minimum(begin, end), np.maximum(begin, end)
+    signed = np.where(begin < end, 1, -1) * np.asarray(weight, dtype=np.int64)
+    count = int(high.max()) + 1
+    keys = low * count + high  # below 2^63: there are at most 10^8 vertices
+    order = np.argsort(keys, kind="stable")
+    keys = keys[order]
+    starts = np.flatnonzero(np.append(True, keys[1:] != keys[:-1]))
+    net = np.add.reduceat(signed[order], starts)
+    keys = keys[starts]
+    low, high = keys // count, keys % count
+    singular = (net != 0) & (low != high)
+    low, high, net = low[singular], high[singular], net[singular]
+    begin, end = np.where(net > 0, low, high), np.where(net > 0, high, low)
+    return np.column_stack([begin, end]), np.abs(net)
+
+
+def singular_loops(edges: IntArray, weights: IntArray) -> list[list[int]]:
+    """The closed loops of vertex indices that singular edges form.
+
+    An edge of weight k occurs k times. A loop is listed without its first vertex at the end, and
+    ends where it first meets itself. One Python step an edge: for up to about a million.
+
+    Raises:
+        OpenChainError: the edges are not those of `singular_edges`: some loop does not close.
+    """
+    repeated: list[list[int]] = np.repeat(edges, weights, axis=0).tolist()
+    return join([(begin, end) for begin, end in repeated])
+
+
+def _equal_rows(rows: npt.NDArray[np.uint64]) -> tuple[IntArray, IntArray]:
+    """An order (n,) that puts equal rows next to each other, and where each group starts in it.
+
+    Rows are ordered by a 64-bit hash, and neighbors then compared in full. Should different rows
+    ever have the same hash, they are sorted by their columns instead, which is three times slower.
+    """
+    hashed = np.zeros(len(rows), dtype=np.uint64)
+    for column in rows.T:
+        hashed ^= column
+        hashed *= _GOLDEN
+        hashed ^= hashed >> np.uint64(29)
+    order = np.argsort(hashed).astype(np.int64, copy=False)
+    hashed = hashed[order]
+    new_hash = hashed[1:] != hashed[:-1]
+    new_row = _differ_from_previous(rows[order])
+    if (new_hash != new_row).any():
+        order = np.lexsort(rows.T[::-1]).astype(np.int64, copy=False)
+        new_row = _differ_from_previous(rows[order])
+    starts = np.flatnonzero(np.append(True, new_row)) if len(rows) else np.zeros(0, dtype=np.int64)
+    return order, starts
+
+
+def _differ_from_previous(rows: npt.NDArray[np.uint64]) -> npt.NDArray[np.bool_]:
+    return (rows[1:] != rows[:-1]).any(axis=1)
+
+
+def _lengths(starts: IntArray, count: int) -> IntArray:
+    return np.diff(np.append(starts, count))

@@ -1,0 +1,438 @@
+"""Clipping volumes: ball, box, half-space and their intersections; polytopes and their planes."""
+
+from __future__ import annotations
+
+import abc
+import sys
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
+from typing import Any, TypeAlias, TypeVar, cast
+
+import drjit as dr
+import numpy as np
+import numpy.typing as npt
+
+from harnack.backend import Backend, BoolArray, FloatArray, Mask, Real, Vec3, aligned, backend_of
+from harnack.backend.elementary import fmax, fmin
+from harnack.backend.validation import real
+from harnack.geometry.volume import (
+    Point,
+    Volume,
+    as_points,
+    check_volume,
+    checked_distance,
+    checked_point,
+    emptied,
+    rounding,
+)
+
+__all__ = ["Ball", "Box", "HalfSpace", "Intersection"]
+
+MAX_UNROLLED = 32
+"""Up to this many planes the loop is unrolled into the kernel."""
+
+_CHUNK = 4
+_NO_CONSTRAINT = (0.0, 0.0, 0.0, 1e30)
+
+State = TypeVar("State", bound=tuple[Any, ...])
+Prepared = TypeVar("Prepared", bound="Polytope")
+
+
+@dataclass(frozen=True, eq=False)
+class Planes:
+    """Planes n.x <= h as rows (n, h) of four numbers, for a kernel.
+
+    backend: where the kernel runs.
+    rows: (m, 4) on the host, of which kernels see the numbers where there is no buffer.
+    buffer: the rows on the backend, or None: literal numbers serve volumes that were not prepared.
+    length: the number of rows in the buffer as a kernel parameter.
+    reach: the largest |h|, a kernel parameter too if there is a buffer.
+
+    Unrolled, a scalar gather at a literal index costs no more than a literal number (0.4 ns a
+    plane and ray in all); a packet gather in a loop makes that 1.1 ns, four planes a trip.
+    """
+
+    backend: Backend
+    rows: FloatArray
+    buffer: Any
+    length: Any
+    reach: Real
+
+    @classmethod
+    def literal(cls, backend: Backend, rows: FloatArray) -> Planes:
+        """The rows (m, 4) as they are."""
+        return cls(backend, rows, None, None, backend.Float(_reach(rows)))
+
+    @classmethod
+    def upload(cls, backend: Backend, rows: FloatArray) -> Planes:
+        """The rows (m, 4) in a buffer; it is filled up to a multiple of eight, if they are more, so
+        that volumes with about as many planes share a kernel."""
+        count = len(rows) if len(rows) <= 8 else -(-len(rows) // 8) * 8
+        filled = np.concatenate([rows, np.tile(_NO_CONSTRAINT, (count - len(rows), 1))])
+        length = dr.opaque(backend.UInt32, count)
+        reach = dr.opaque(backend.Float, _reach(rows))
+        return cls(backend, filled, aligned(backend, filled.ravel()), length, reach)
+
+    def fold(
+        self,
+        state: State,
+        step: Callable[[State, Vec3, Real], State],
+        goes_on: Callable[..., Mask] | None = None,
+    ) -> State:
+        """state = step(state, n, h) for every plane.
+
+        goes_on: whether the planes that are left can still change what is made of a state.
+        """
+        index = self.backend.UInt32
+        if self.buffer is None or len(self.rows) <= MAX_UNROLLED:
+            for k in range(len(self.rows)):
+                x, y, z, h = (self._number(k, i) for i in range(4))
+                state = step(state, self.backend.Array3f(x, y, z), h)
+            return state
+
+        def body(k: Any, *inner: Any) -> tuple[Any, ...]:
+            after: Any = inner
+            for i in range(_CHUNK):
+                row: Any = dr.gather(self.backend.Array4f, self.buffer, k + i)
+                after = step(after, self.backend.Array3f(row.x, row.y, row.z), row.w)
+            return (k + _CHUNK, *after)
+
+        def wanted(*inner: Any) -> Mask:
+            return self.backend.Bool(True) if goes_on is None else goes_on(*inner)
+
+        loop: Any = dr.while_loop  # its overloads do not know run-time array types
+        result: Any = loop(
+            state=(index(0), *state),
+            cond=lambda k, *inner: (k < self.length) & wanted(*inner),  # pyright: ignore
+            body=body,
+            label="planes",
+        )
+        return result[1:]
+
+    def _number(self, k: int, i: int) -> Real:
+        if self.buffer is None:
+            return self.backend.Float(float(self.rows[k, i]))
+        return dr.gather(self.backend.Float, self.buffer, self.backend.UInt32(4 * k + i))
+
+
+Slacks: TypeAlias = tuple[Real, Real]
+
+
+def _reach(rows: FloatArray) -> float:
+    return float(np.abs(rows[:, 3]).max(initial=0.0))
+
+
+@dataclass(frozen=True, eq=False)
+class Polytope(Volume):
+    """The intersection of the half-spaces n.x <= h, with unit normals n.
+
+    Rounding: with u the unit roundoff, the computed N = h - n.o and D = n.d are off by at most
+    a few u times |n|.|o| + |h| and |n|.|d| (absolute values by component). Adding such a bound
+    to N and taking it from D, for t >= 0, turns N - t D >= 0 into a condition that every point
+    of the volume still meets, with no case for nearly parallel rays: where D <= 0, it is
+    t >= |N / D| if N < 0, and no condition if N >= 0.
+    """
+
+    _uploaded: Planes | None = field(default=None, repr=False, compare=False, kw_only=True)
+
+    @abc.abstractmethod
+    def planes(self) -> FloatArray:
+        """Rows (nx, ny, nz, h), shape (m, 4), float64, all finite."""
+
+    def prepare(self: Prepared, backend: Backend) -> Prepared:
+        return replace(self, _uploaded=Planes.upload(backend, self.planes()))
+
+    def _table(self, backend: Backend) -> Planes:
+        if self._uploaded is not None and self._uploaded.backend == backend:
+            return self._uploaded
+        rows = self.planes()
+        is_recording = dr.flag(dr.JitFlag.SymbolicScope)  # nothing can be uploaded then
+        if len(rows) <= MAX_UNROLLED or is_recording:
+            return Planes.literal(backend, rows)
+        return Planes.upload(backend, rows)
+
+    def _slacks(self, table: Planes, o: Vec3, d: Vec3) -> Callable[[Vec3, Real], Slacks]:
+        """(n, h) -> bounds of the errors of h - n.o and n.d."""
+        del table
+        eps = rounding(backend_of(o))
+        abs_o, abs_d = dr.abs(o), dr.abs(d)
+
+        def slacks(n: Vec3, h: Real) -> Slacks:
+            abs_n = dr.abs(n)
+            return eps * (dr.dot(abs_n, abs_o) + dr.abs(h)), eps * dr.dot(abs_n, abs_d)
+
+        return slacks
+
+    def clip(self, o: Vec3, d: Vec3, t_min: Real, t_max: Real) -> tuple[Real, Real]:
+        backend = backend_of(o)
+        table = self._table(backend)
+        slacks = self._slacks(table, o, d)
+
+        def step(state: tuple[Real, Real], n: Vec3, h: Real) -> tuple[Real, Real]:
+            t0, t1 = state
+            room_slack, speed_slack = slacks(n, h)
+            room = h - dr.dot(n, o) + room_slack
+            speed = dr.dot(n, d) - speed_slack
+            t = room / speed
+            leaving = speed > 0
+            t1 = dr.select(leaving, fmin(t, t1), t1)
+            t0 = dr.select(leaving | (room >= 0), t0, fmax(dr.abs(t), t0))
+            return t0, t1
+
+        lanes = dr.zeros(backend.Float, dr.width(o, d, t_min, t_max))
+
+        def holds(t0: Real, t1: Real) -> Mask:  # what is empty stays empty
+            return t0 < t1
+
+        return emptied(*table.fold((lanes + t_min, lanes + t_max), step, holds))
+
+    def contains(self, p: Vec3) -> Mask:
+        backend = backend_of(p)
+        eps = rounding(backend)
+        abs_p = dr.abs(p)
+
+        def step(state: tuple[Mask], n: Vec3, h: Real) -> tuple[Mask]:
+            slack = eps * (dr.dot(dr.abs(n), abs_p) + dr.abs(h))
+            return (state[0] & (dr.dot(n, p) - h <= slack),)
+
+        everywhere = dr.full(backend.Bool, True, dr.width(p))
+        return self._table(backend).fold((everywhere,), step)[0]
+
+    def signed_distance(self, p: Vec3) -> Real:
+        return self._nearest_plane(p)[0]
+
+    def outward_normal(self, p: Vec3) -> Vec3:
+        return self._nearest_plane(p)[1]
+
+    def _nearest_plane(self, p: Vec3) -> tuple[Real, Vec3]:
+        backend = backend_of(p)
+
+        def step(state: tuple[Real, Vec3], n: Vec3, h: Real) -> tuple[Real, Vec3]:
+            distance = dr.dot(n, p) - h
+            nearer = distance > state[0]
+            return dr.select(nearer, distance, state[0]), dr.select(nearer, n, state[1])
+
+        width = dr.width(p)
+        start = (
+            dr.full(backend.Float, -dr.inf, width),
+            backend.Array3f(0, 0, 1) + dr.zeros(backend.Array3f, width),
+        )
+        return self._table(backend).fold(start, step)
+
+    def contains_points(self, points: npt.ArrayLike) -> BoolArray:
+        x = as_points(points)
+        rows = self.planes()
+        inside = np.ones(len(x), dtype=np.bool_)
+        for row in rows:
+            n, h = row[:3], float(row[3])
+            slack = 8.0 * sys.float_info.epsilon * (np.abs(x) @ np.abs(n) + abs(h))
+            inside &= x @ n - h <= slack
+        return inside
+
+
+@dataclass(frozen=True)
+class Ball(Volume):
+    """Points within `radius` (> 0) of `center`."""
+
+    center: Point = (0.0, 0.0, 0.0)
+    radius: float = 1.0
+    _numbers: Any = field(default=None, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        if isinstance(self.center, int | float):
+            raise ValueError(
+                f"the center of a ball must be three numbers, not {self.center!r}: for one about "
+                f"the origin, write Ball(radius={self.center!r})"
+            )
+        object.__setattr__(self, "center", checked_point(self.center, "the center of a ball"))
+        radius = real(self.radius, "the radius of a ball")
+        if not 0.0 < radius < np.inf:
+            raise ValueError(f"the radius of a ball must be positive, not {self.radius!r}")
+        object.__setattr__(self, "radius", radius)
+
+    def _on(self, backend: Backend) -> tuple[Vec3, Real]:
+        if self._numbers is not None and backend_of(self._numbers[0]) == backend:
+            return self._numbers
+        return backend.Array3f(*self.center), backend.Float(self.radius)
+
+    def prepare(self, backend: Backend) -> Ball:
+        center = backend.Array3f(*(dr.opaque(backend.Float, c) for c in self.center))
+        return replace(self, _numbers=(center, dr.opaque(backend.Float, self.radius)))
+
+    def clip(self, o: Vec3, d: Vec3, t_min: Real, t_max: Real) -> tuple[Real, Real]:
+        """The discriminant r^2 - |perp|^2 is taken from perp, the vector from the center to the
+        nearest point of the line: (o.d)^2 - |d|^2 (|o|^2 - r^2) cancels for far origins.
+
+        With u the unit roundoff, perp and the parameter of the nearest point are off by a few
+        u |o - c|, c and r by u |c| and u r: so much is added to r and to both ends."""
+        backend = backend_of(o)
+        c, r = self._on(backend)
+        from_center = o - c
+        speed = dr.norm(d)
+        along = -dr.dot(from_center, d) / (speed * speed)
+        clearance = dr.norm(dr.fma(d, along, from_center))
+        slack = rounding(backend) * (dr.norm(from_center) + dr.norm(c) + r)
+        reach = r + slack
+        half = dr.sqrt(fmax((reach - clearance) * (reach + clearance), 0.0))
+        half = (half + slack) / speed
+        t0 = fmax(along - half, t_min)
+        t1 = fmin(along + half, t_max)
+        return emptied(t0, dr.select(clearance <= reach, t1, -dr.inf))
+
+    def contains(self, p: Vec3) -> Mask:
+        backend = backend_of(p)
+        c, r = self._on(backend)
+        distance = dr.norm(p - c)
+        return distance - r <= rounding(backend) * (distance + dr.norm(c) + r)
+
+    def signed_distance(self, p: Vec3) -> Real:
+        c, r = self._on(backend_of(p))
+        return dr.norm(p - c) - r
+
+    def outward_normal(self, p: Vec3) -> Vec3:
+        backend = backend_of(p)
+        from_center = p - self._on(backend)[0]
+        length = dr.norm(from_center)
+        axis = backend.Array3f(0, 0, 1)
+        return dr.select(length > 0, from_center / length, axis)
+
+    def bounds(self) -> tuple[FloatArray, FloatArray]:
+        c = np.array(self.center)
+        return c - self.radius, c + self.radius
+
+    def contains_points(self, points: npt.ArrayLike) -> BoolArray:
+        distance: FloatArray = np.linalg.norm(as_points(points) - self.center, axis=1)
+        size = distance + float(np.linalg.norm(self.center)) + self.radius
+        return distance - self.radius <= 8.0 * sys.float_info.epsilon * size
+
+    def padded(self, distance: float) -> Ball:
+        return Ball(self.center, self.radius + checked_distance(distance))
+
+
+@dataclass(frozen=True)
+class Box(Polytope):
+    """Points between two corners, lower <= x <= upper; sides may be infinite."""
+
+    lower: Point
+    upper: Point
+
+    def __post_init__(self) -> None:
+        lower = checked_point(self.lower, "the lower corner of a box", finite=False)
+        upper = checked_point(self.upper, "the upper corner of a box", finite=False)
+        if any(a > b or a == np.inf or b == -np.inf for a, b in zip(lower, upper, strict=True)):
+            raise ValueError(
+                f"a box needs lower <= upper in each coordinate, not {lower} and {upper}"
+            )
+        object.__setattr__(self, "lower", lower)
+        object.__setattr__(self, "upper", upper)
+
+    def planes(self) -> FloatArray:
+        rows = np.zeros((6, 4))
+        rows[:3, :3], rows[:3, 3] = np.eye(3), self.upper
+        rows[3:, :3], rows[3:, 3] = -np.eye(3), -np.array(self.lower)
+        return rows[np.isfinite(rows[:, 3])]
+
+    def bounds(self) -> tuple[FloatArray, FloatArray]:
+        return np.array(self.lower), np.array(self.upper)
+
+    def padded(self, distance: float) -> Box:
+        r = checked_distance(distance)
+        x0, y0, z0 = self.lower
+        x1, y1, z1 = self.upper
+        return Box((x0 - r, y0 - r, z0 - r), (x1 + r, y1 + r, z1 + r))
+
+
+@dataclass(frozen=True)
+class HalfSpace(Polytope):
+    """Points with normal.x <= offset. The normal points out; its length is divided out."""
+
+    normal: Point
+    offset: float
+
+    def __post_init__(self) -> None:
+        normal = np.array(checked_point(self.normal, "the normal of a half-space"))
+        size = float(np.abs(normal).max())
+        if size == 0.0:
+            raise ValueError("the normal of a half-space must not be zero")
+        normal /= size  # so that squares neither overflow nor vanish
+        length = float(np.linalg.norm(normal))
+        offset = real(self.offset, "the offset of a half-space") / size / length
+        if not np.isfinite(offset):
+            raise ValueError(
+                f"the offset of a half-space must be finite, not {self.offset!r}, and so must its "
+                f"ratio to the length of the normal {self.normal!r}"
+            )
+        x, y, z = (float(v) for v in normal / length)
+        object.__setattr__(self, "normal", (x, y, z))
+        object.__setattr__(self, "offset", offset)
+
+    def planes(self) -> FloatArray:
+        return np.array([[*self.normal, self.offset]])
+
+    def bounds(self) -> tuple[FloatArray, FloatArray]:
+        lower, upper = np.full(3, -np.inf), np.full(3, np.inf)
+        for k, n in enumerate(self.normal):
+            if n and not any(np.delete(self.normal, k)):  # only an axis bounds it
+                (upper if n > 0 else lower)[k] = n * self.offset
+        return lower, upper
+
+    def padded(self, distance: float) -> HalfSpace:
+        return HalfSpace(self.normal, self.offset + checked_distance(distance))
+
+
+@dataclass(frozen=True)
+class Intersection(Volume):
+    """Points that lie in all of several volumes (at least one)."""
+
+    volumes: tuple[Volume, ...]
+
+    def __init__(self, volumes: Iterable[Volume]) -> None:
+        if not isinstance(cast("Any", volumes), Iterable):
+            raise TypeError(f"an intersection is of several volumes, not of {volumes!r:.60}")
+        members = tuple(volumes)
+        if not members:
+            raise ValueError("an intersection needs at least one volume")
+        for member in members:
+            check_volume(cast("Any", member) or "none", "each part of an intersection")
+        object.__setattr__(self, "volumes", members)
+
+    def prepare(self, backend: Backend) -> Intersection:
+        return Intersection(v.prepare(backend) for v in self.volumes)
+
+    def clip(self, o: Vec3, d: Vec3, t_min: Real, t_max: Real) -> tuple[Real, Real]:
+        t0, t1 = t_min, t_max
+        for volume in self.volumes:
+            t0, t1 = volume.clip(o, d, t0, t1)
+        return t0, t1
+
+    def contains(self, p: Vec3) -> Mask:
+        inside = self.volumes[0].contains(p)
+        for volume in self.volumes[1:]:
+            inside &= volume.contains(p)
+        return inside
+
+    def signed_distance(self, p: Vec3) -> Real:
+        distance = self.volumes[0].signed_distance(p)
+        for volume in self.volumes[1:]:
+            distance = fmax(volume.signed_distance(p), distance)
+        return distance
+
+    def outward_normal(self, p: Vec3) -> Vec3:
+        distance, normal = self.volumes[0].signed_distance(p), self.volumes[0].outward_normal(p)
+        for volume in self.volumes[1:]:
+            other = volume.signed_distance(p)
+            nearer = other > distance
+            distance = dr.select(nearer, other, distance)
+            normal = dr.select(nearer, volume.outward_normal(p), normal)
+        return normal
+
+    def bounds(self) -> tuple[FloatArray, FloatArray]:
+        """Lower and upper corner; lower > upper somewhere if the volumes are seen not to meet."""
+        boxes = [v.bounds() for v in self.volumes]
+        return np.max([b[0] for b in boxes], axis=0), np.min([b[1] for b in boxes], axis=0)
+
+    def contains_points(self, points: npt.ArrayLike) -> BoolArray:
+        return np.all([v.contains_points(points) for v in self.volumes], axis=0)
+
+    def padded(self, distance: float) -> Intersection:
+        return Intersection(v.padded(distance) for v in self.volumes)

@@ -1,0 +1,329 @@
+"""Curves in convex position, and convex hulls as clipping volumes.
+
+`is_convex_position` says whether a closed curve provably lies on the boundary of a convex body.
+That is the hypothesis of Theorems B.1 and C.1 of Gillespie, Yang, Botsch and Crane, 'Ray Tracing
+Harmonic Functions' (2024): a connected curve P without self-intersections on the boundary of a
+convex set. Then the 2 pi level of its solid angle lies in the hull of P, and a segment crosses that
+level at most once, which gives the lower bound -4 pi.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import numpy as np
+import numpy.typing as npt
+
+from harnack.backend import FloatArray, Real, Vec3, backend_of
+from harnack.backend.elementary import across_rows
+from harnack.backend.validation import BoolArray
+from harnack.geometry.clip_volumes import Planes, Polytope, Slacks
+from harnack.geometry.volume import as_points, checked_distance, rounding
+
+MAX_VERTICES = 2048
+"""Longer curves are not examined: the tests take quadratic time."""
+
+# All relative to the curve's size.
+TOLERANCE = 1e-12  # a vertex may lie this far off a supporting plane
+ROUNDING = 1e-14  # bound of the rounding errors of a height above a plane
+MIN_SEPARATION = 1e-9  # edges nearer than this count as touching
+MIN_ANGLE = 1e-6  # so do edges that fold back at a smaller angle (radians)
+
+
+def is_convex_position(loops: tuple[FloatArray, ...]) -> bool:
+    """Whether it is proved that the theorems apply to these (validated) loops.
+
+    True means: one loop; no edge is shorter than 1e-9 (all lengths relative to the curve's
+    size: one that short may be nothing but rounding, and has no direction to be trusted); edges
+    that share no vertex are at least 1e-9 apart, none folds back; and either all vertices lie
+    within 1e-12 of one plane (then P is on the boundary of its flat hull, a degenerate convex
+    set), or every edge has a plane through it that no vertex exceeds by more than 1e-12. False
+    means: no proof found, as for more than 2048 vertices; it says nothing about the curve.
+
+    Stability. Where no vertex exceeds the plane of an edge, that edge lies on the boundary of
+    the hull H, and nothing is left to say. Otherwise let each point move along the normal of its
+    edge until it leaves H: by at most delta = 1e-12. At a vertex the edges' normals n and n' may
+    send it to two places; both lie in the wedge { a n + b n', a, b >= 0 } at the vertex, where
+    n.x <= delta and n'.x <= delta leave |x| <= 2 delta / (1 + n.n'), and n.n' >= -0.9 is
+    required, so a path of that size on the boundary joins them. It cannot meet another edge
+    (1e-9 away); crossings with its neighbor, near the common vertex, are cut off as loops of
+    area below 1e-15. So the theorems hold for a curve within w = 2e-11 of P, and the two
+    solid angles differ by at most 2 w / r for each edge at distance r: at r = 1e-4 that is less
+    than the rounding of the solid angle itself in single precision.
+    """
+    if len(loops) != 1 or not 3 <= len(loops[0]) <= MAX_VERTICES:
+        return False
+    lower, upper = loops[0].min(axis=0), loops[0].max(axis=0)
+    size = float((upper - lower).max())
+    if not 0.0 < size < np.inf:
+        return False
+    x = (loops[0] - 0.5 * (lower + upper)) / size
+    # All comparisons here are written so that NaN makes them fail.
+    if not _edge_lengths(x).min() >= MIN_SEPARATION:
+        return False
+    return (_is_flat(x) or _lies_on_hull(x)) and is_simple(x)
+
+
+def _edge_lengths(x: FloatArray) -> FloatArray:
+    return np.linalg.norm(np.roll(x, -1, axis=0) - x, axis=1)
+
+
+def _is_flat(x: FloatArray) -> bool:
+    axes: FloatArray = np.linalg.svd(x - x.mean(axis=0), full_matrices=False)[2]
+    return bool(np.ptp(x @ axes[2]) <= TOLERANCE)
+
+
+def _lies_on_hull(x: FloatArray) -> bool:
+    """Whether every edge has a supporting plane, and neighbors' planes are not opposite."""
+    count = len(x)
+    normals = np.empty((count, 3))
+    is_strict = np.empty(count, dtype=np.bool_)
+    rows = max(1, 200_000 // count)
+    for begin in range(0, count, rows):
+        part = np.arange(begin, min(begin + rows, count))
+        normals[part], excess, is_strict[part] = _supporting_planes(x, part)
+        if not excess.max() <= TOLERANCE:
+            return False
+    following = np.roll(normals, -1, axis=0)
+    is_exact = is_strict & np.roll(is_strict, -1)
+    return bool((is_exact | ((normals * following).sum(axis=1) >= -0.9)).all())
+
+
+def _supporting_planes(
+    x: FloatArray, part: np.ndarray[tuple[int], np.dtype[np.intp]]
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """For the edges from vertices `part`: a plane that contains the edge and supports all of x.
+
+    Projected along the edge, the vertices have to leave an angle of at least pi free; the
+    normal (k, 3) points to the middle of the largest free angle. Also by how far the vertices
+    exceed the plane (k,), and whether all but the edge's ends stay below it beyond rounding.
+    """
+    count = len(x)
+    start = x[part]
+    edge = x[(part + 1) % count] - start
+    edge /= np.linalg.norm(edge, axis=1, keepdims=True)
+    across, up = across_rows(edge)
+    offset = x[None, :, :] - start[:, None, :]
+    a: FloatArray = np.einsum("kni,ki->kn", offset, across)
+    b: FloatArray = np.einsum("kni,ki->kn", offset, up)
+    angle = _free_direction(a, b)
+    c, s = np.cos(angle), np.sin(angle)
+    height = c[:, None] * a + s[:, None] * b
+    excess = height.max(axis=1)
+    rows = np.arange(len(part))
+    height[rows, part] = -np.inf
+    height[rows, (part + 1) % count] = -np.inf
+    normals = c[:, None] * across + s[:, None] * up
+    return normals, excess, height.max(axis=1) < -ROUNDING
+
+
+def _free_direction(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Middle of the largest angle free of the points (a, b)[k, :] as seen from the origin: (k,).
+
+    Points at the origin, where the edge itself is, have no direction and take their farthest
+    companion's.
+    """
+    distance = np.hypot(a, b)
+    angle = np.arctan2(b, a)
+    farthest = np.take_along_axis(angle, distance.argmax(axis=1)[:, None], axis=1)
+    angle = np.sort(np.where(distance > 1e-10, angle, farthest), axis=1)
+    gap = np.diff(angle, axis=1, append=angle[:, :1] + 2.0 * np.pi)
+    widest = gap.argmax(axis=1)[:, None]
+    middle = np.take_along_axis(angle, widest, axis=1) + 0.5 * np.take_along_axis(gap, widest, 1)
+    return middle[:, 0]
+
+
+def is_simple(x: FloatArray) -> bool:
+    """Whether edges without a common vertex are MIN_SEPARATION apart, and none folds back."""
+    count = len(x)
+    ends = np.roll(x, -1, axis=0)
+    direction = (ends - x) / _edge_lengths(x)[:, None]
+    turned = direction + np.roll(direction, -1, axis=0)
+    if not np.linalg.norm(turned, axis=1).min() >= MIN_ANGLE:
+        return False
+    low, high = np.minimum(x, ends) - MIN_SEPARATION, np.maximum(x, ends)
+    near = np.triu(np.ones((count, count), dtype=np.bool_), k=2)
+    near[0, count - 1] = False
+    for axis in range(3):
+        near &= low[:, None, axis] <= high[None, :, axis]
+        near &= low[None, :, axis] <= high[:, None, axis]
+    first, second = np.nonzero(near)
+    for begin in range(0, len(first), 100_000):
+        i, j = first[begin : begin + 100_000], second[begin : begin + 100_000]
+        clearance = segment_clearance_lower(x[i], ends[i], x[j], ends[j])
+        if not clearance.min() >= MIN_SEPARATION:
+            return False
+    return True
+
+
+def segment_clearance_lower(
+    p1: FloatArray, q1: FloatArray, p2: FloatArray, q2: FloatArray
+) -> FloatArray:
+    """Lower bound of the distance of segments p1 q1 and p2 q2, (k, 3) each: (k,), not above it.
+
+    The nearest points are found by alternating projection (after Ericson, 'Real-Time Collision
+    Detection', 5.1.9). However well that went, the width of the slab between the segments across
+    the line that joins them is a lower bound, and the distance itself if it went well.
+    """
+    d1, d2, r = q1 - p1, q2 - p2, p1 - p2
+    a, e, b = _dot(d1, d1), _dot(d2, d2), _dot(d1, d2)
+    c, f = _dot(d1, r), _dot(d2, r)
+    determinant = a * e - b * b
+    safe = np.where(determinant > 0.0, determinant, 1.0)
+    s = np.where(determinant > 0.0, np.clip((b * f - c * e) / safe, 0.0, 1.0), 0.0)
+    t = np.zeros_like(s)
+    # Of a segment of length zero every share is the same point.
+    a, e = np.where(a > 0.0, a, 1.0), np.where(e > 0.0, e, 1.0)
+    for _ in range(3):
+        t = np.clip((b * s + f) / e, 0.0, 1.0)
+        s = np.clip((b * t - c) / a, 0.0, 1.0)
+    across = (p2 + t[:, None] * d2) - (p1 + s[:, None] * d1)
+    length = np.sqrt(_dot(across, across))
+    n = across / np.where(length > 0.0, length, 1.0)[:, None]
+    nearest = np.minimum(_dot(n, p2), _dot(n, q2))
+    farthest = np.maximum(_dot(n, p1), _dot(n, q1))
+    return np.maximum(nearest - farthest, 0.0)
+
+
+def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
+    return (a * b).sum(axis=1)
+
+
+# Hulls.
+
+MAX_PLANES = 2048
+"""Nearly parallel facets beyond this number are dropped; what is left is a little larger."""
+
+FLATNESS = 1e-6
+"""Points thinner than this part of their size get the hull of a flat or straight set."""
+
+_SPREAD = 24
+"""Planes that rays are clipped to first."""
+
+THIN_PADDING = 1e-6
+"""Half-thickness, as a part of the size, given to the hull of a flat or straight set."""
+
+
+@dataclass(frozen=True, eq=False)
+class ConvexHull(Polytope):
+    """Half-spaces normals[i].x <= offsets[i]; make it with `ConvexHull.of`.
+
+    normals: (m, 3), of unit length. offsets: (m,). lower, upper: (3,), a box around it.
+    """
+
+    normals: FloatArray
+    offsets: FloatArray
+    lower: FloatArray
+    upper: FloatArray
+
+    @staticmethod
+    def of(points: npt.ArrayLike) -> ConvexHull:
+        """The convex hull of points (n, 3), enlarged by about 1e-12 of their size.
+
+        Each plane is pushed out to the farthest point in its direction, so all points lie
+        inside however the facets' normals were rounded or merged. Points in a plane or on a
+        line give a slab or a rod that is thicker than the points by 1e-6 of their size on
+        every side.
+
+        Raises:
+            ValueError: no points, NaN or infinite values, or all points the same.
+        """
+        x = as_points(points)
+        if len(x) == 0 or not np.isfinite(x).all():
+            raise ValueError("a convex hull needs at least two points, all of them finite")
+        lower, upper = x.min(axis=0), x.max(axis=0)
+        size = float((upper - lower).max())
+        if size <= 0.0:
+            raise ValueError("a convex hull needs at least two different points")
+        centered = (x - 0.5 * (lower + upper)) / size
+        normals, is_thin = _hull_normals(centered)
+        normals = _spread_first(normals)
+        padding = (THIN_PADDING if is_thin else 1e-12) * size
+        padding += 4.0 * sys.float_info.epsilon * float(np.abs(x).max())
+        offsets = _support(x, normals) + padding
+        return ConvexHull(normals, offsets, lower - padding, upper + padding)
+
+    def planes(self) -> FloatArray:
+        return np.column_stack([self.normals, self.offsets])
+
+    def _slacks(self, table: Planes, o: Vec3, d: Vec3) -> Callable[[Vec3, Real], Slacks]:
+        """As |n| = 1, |n|.|o| <= |o| serves all planes; in a bounded volume that is enough."""
+        eps = rounding(backend_of(o))
+        room, speed = eps * (dr.norm(o) + table.reach), eps * dr.norm(d)
+        return lambda _n, _h: (room, speed)
+
+    def bounds(self) -> tuple[FloatArray, FloatArray]:
+        return np.array(self.lower), np.array(self.upper)
+
+    def padded(self, distance: float) -> ConvexHull:
+        r = checked_distance(distance)
+        return ConvexHull(self.normals, self.offsets + r, self.lower - r, self.upper + r)
+
+
+def _support(x: FloatArray, normals: FloatArray) -> FloatArray:
+    """Largest n.x of each normal, in slices that keep the memory small."""
+    columns = np.transpose(normals)
+    highest = np.full(len(normals), -np.inf)
+    for start in range(0, len(x), 4096):
+        np.maximum(highest, (x[start : start + 4096] @ columns).max(axis=0), out=highest)
+    return highest
+
+
+def _hull_normals(x: FloatArray) -> tuple[FloatArray, bool]:
+    """Unit outward normals that bound the hull of x (centered, of size 1), and if x is thin."""
+    axes: FloatArray = np.linalg.svd(x - x.mean(axis=0), full_matrices=len(x) < 3)[2]
+    along: FloatArray = np.einsum("ij,kj->ik", x, axes)
+    thickness: FloatArray = np.ptp(along, axis=0)
+    both_sides = np.concatenate([axes, -axes])
+    if thickness[1] <= FLATNESS:
+        return both_sides, True
+    if thickness[2] <= FLATNESS:
+        outline = _facet_normals(along[:, :2])
+        if outline is None:
+            return both_sides, True
+        return np.concatenate([outline @ axes[:2], axes[2:], -axes[2:]]), True
+    normals = _facet_normals(x)
+    if normals is None:
+        return both_sides, True
+    return _without_duplicates(normals), False
+
+
+def _facet_normals(x: FloatArray) -> FloatArray | None:
+    """Facet normals by Qhull, which merges coplanar facets; None where it finds x degenerate."""
+    import scipy.spatial  # here: half a second that few need
+
+    qhull: Any = scipy.spatial
+    try:
+        equations: FloatArray = qhull.ConvexHull(x).equations
+    except scipy.spatial.QhullError:
+        return None
+    return equations[:, :-1]
+
+
+def _spread_first(normals: FloatArray) -> FloatArray:
+    """The same normals, the first of which lie far from each other: a few of these planes show that
+    a ray misses the hull."""
+    order, left = [0], np.full(len(normals), np.inf)
+    for _ in range(min(len(normals), _SPREAD) - 1):
+        left = np.minimum(left, 1.0 - normals @ normals[order[-1]])
+        order.append(int(np.argmax(left)))
+    rest = np.setdiff1d(np.arange(len(normals)), order)
+    return normals[np.concatenate([order, rest]).astype(np.intp)]
+
+
+def _without_duplicates(normals: FloatArray) -> FloatArray:
+    """One of each group of nearly equal normals, at most MAX_PLANES, and the six axes if cut."""
+    digits = 9
+    while True:
+        _, first = np.unique(np.round(normals, digits), axis=0, return_index=True)
+        if len(first) <= MAX_PLANES:
+            break
+        digits -= 1
+    kept = normals[np.sort(first)]
+    if digits < 9:
+        kept = np.concatenate([np.eye(3), -np.eye(3), kept])
+    return kept / np.linalg.norm(kept, axis=1, keepdims=True)

@@ -1,0 +1,173 @@
+"""Closed curves to draw, to test with and to write about. Arrays are (n, 3) float64.
+
+Loops are not closed by a repeated vertex. All are counter-clockwise seen from +z where that
+means something.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import numpy as np
+
+from harnack.backend.validation import FloatArray
+
+Route = Literal["outside", "axis"]
+
+
+def _check_whole(name: str, number: Any) -> None:
+    """Raise TypeError for what is no whole number."""
+    if not isinstance(number, int | np.integer):
+        raise TypeError(f"{name} must be a whole number, not {number!r}")
+
+
+def _angles(n: int, least: int) -> FloatArray:
+    """n angles that divide the full turn.
+
+    Raises:
+        ValueError: fewer than `least`. TypeError: no whole number.
+    """
+    _check_whole("the number of vertices of a curve", n)
+    if n < least:
+        raise ValueError(f"this curve needs at least {least} vertices, not {n}")
+    return 2.0 * np.pi * np.arange(n) / n
+
+
+def regular_polygon(n: int, radius: float = 1.0) -> FloatArray:
+    """The regular n-gon in the plane z = 0, with a vertex on the x axis."""
+    t = _angles(n, 3)
+    return radius * np.column_stack([np.cos(t), np.sin(t), np.zeros(n)])
+
+
+def wavy_polygon(n: int, amplitude: float = 0.45, waves: int = 3) -> FloatArray:
+    """n vertices of (cos t, sin t, amplitude cos(waves t)): a nonplanar polygon on a cylinder."""
+    t = _angles(n, 3)
+    return np.column_stack([np.cos(t), np.sin(t), amplitude * np.cos(waves * t)])
+
+
+def torus_knot(
+    p: int, q: int, n: int, *, major_radius: float = 1.0, minor_radius: float = 0.4
+) -> FloatArray:
+    """A (p, q) torus knot: p turns about the z axis, q through the hole. (2, 3) is a trefoil.
+
+    Raises:
+        ValueError: p and q have a common divisor, which would be a link.
+        TypeError: they are no whole numbers.
+    """
+    _check_whole("p of a torus knot", p)
+    _check_whole("q of a torus knot", q)
+    if np.gcd(p, q) != 1:
+        raise ValueError(f"p and q of a torus knot must have no common divisor, not {p} and {q}")
+    t = _angles(n, 3)
+    distance = major_radius + minor_radius * np.cos(q * t)
+    return np.column_stack(
+        [distance * np.cos(p * t), distance * np.sin(p * t), minor_radius * np.sin(q * t)]
+    )
+
+
+def figure_eight_knot(n: int) -> FloatArray:
+    """The figure-eight knot 4_1, about 1 in size."""
+    t = _angles(n, 3)
+    distance = (2.0 + np.cos(2.0 * t)) / 3.0
+    return np.column_stack(
+        [distance * np.cos(3.0 * t), distance * np.sin(3.0 * t), np.sin(4.0 * t) / 3.0]
+    )
+
+
+def coil(
+    turns: int,
+    n: int,
+    *,
+    radius: float = 1.0,
+    height: float = 1.0,
+    route: Route = "outside",
+) -> FloatArray:
+    """A closed coil of n vertices: a helix about the z axis and a way back to its start.
+
+    turns: full turns of the helix. height: from its lowest to its highest vertex.
+    route: "outside" returns at 1.5 radii, parallel to the axis; "axis" along the axis.
+
+    The solid angle of such a curve spans `turns` times 4 pi, which breaks bounds that hold for
+    curves on convex bodies.
+    """
+    if turns < 1:
+        raise ValueError(f"a coil needs at least one turn, not {turns}")
+    corners = {"outside": 1.5 * radius, "axis": 0.0}
+    if route not in corners:
+        raise ValueError(f'the route of a coil is "outside" or "axis", not {route!r}')
+    if n < 3 * turns + 3:
+        raise ValueError(f"a coil of {turns} turns needs at least {3 * turns + 3} vertices")
+    s = np.linspace(0.0, 1.0, n - 2)
+    t = 2.0 * np.pi * turns * s
+    helix = np.column_stack([radius * np.cos(t), radius * np.sin(t), height * (s - 0.5)])
+    x = corners[route]
+    return np.concatenate([helix, [[x, 0.0, 0.5 * height], [x, 0.0, -0.5 * height]]])
+
+
+def hopf_link(n: int) -> list[FloatArray]:
+    """Two unit circles of n vertices, each through the other's center."""
+    circle = regular_polygon(n)
+    upright = circle[:, [0, 2, 1]] * (-1.0, 1.0, 1.0)
+    shift = np.array([0.5, 0.0, 0.0])
+    return [circle - shift, upright + shift]
+
+
+def borromean_rings(n: int) -> list[FloatArray]:
+    """Three ellipses of n vertices in the coordinate planes: linked, but no two of them are."""
+    circle = regular_polygon(n)
+    ellipse = circle * (1.0, 0.5, 1.0)
+    return [np.roll(ellipse, shift, axis=1) for shift in range(3)]
+
+
+def square_with_holes(
+    n: int = 24,
+    *,
+    side: float = 2.0,
+    holes: Sequence[tuple[float, float, float]] = (
+        (-0.45, -0.45, 0.3),
+        (0.45, -0.3, 0.25),
+        (0.1, 0.5, 0.3),
+    ),
+) -> list[FloatArray]:
+    """A square in the plane z = 0 with round holes of n vertices, which run the other way round.
+
+    holes: x, y and radius of each. They are not checked to lie apart and within the square.
+    """
+    corners = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
+    loops: list[FloatArray] = [0.5 * side * corners]
+    for x, y, radius in holes:
+        clockwise = np.flip(regular_polygon(n, radius), axis=0)
+        loops.append(clockwise + np.array([x, y, 0.0]))
+    return loops
+
+
+def random_closed_curve(
+    rng: np.random.Generator, n: int, *, harmonics: int = 4, decay: float = 1.0
+) -> FloatArray:
+    """n vertices of a random trigonometric polynomial, about 1 in size: often a knot.
+
+    harmonics: how many frequencies. decay: amplitudes fall like frequency^-decay.
+    """
+    t = _angles(n, 3)
+    if harmonics < 1:
+        raise ValueError(f"a random curve needs at least one harmonic, not {harmonics}")
+    k = np.arange(1, harmonics + 1)
+    a, b = rng.normal(size=(2, harmonics, 3)) * (k**-decay)[:, None]
+    phase = np.multiply.outer(t, k)
+    curve: FloatArray = np.cos(phase) @ a + np.sin(phase) @ b
+    return curve / np.abs(curve).max()
+
+
+def spiky_polygon(
+    rng: np.random.Generator, n: int, *, inner: float = 0.2, height: float = 0.5
+) -> FloatArray:
+    """A star of n vertices with random radii in [inner, 1] and heights in [-height, height].
+
+    Even vertices are spikes, odd ones lie near the inner radius.
+    """
+    t = _angles(n, 3) + rng.uniform(-0.3, 0.3, size=n) * (2.0 * np.pi / n)
+    reach = rng.uniform(0.6, 1.0, size=n)
+    reach[1::2] = rng.uniform(inner, 1.5 * inner, size=len(reach[1::2]))
+    z = rng.uniform(-height, height, size=n)
+    return np.column_stack([reach * np.cos(t), reach * np.sin(t), z])

@@ -1,0 +1,140 @@
+"""Meshes to draw, to test with and to write about, and ways to damage them.
+
+Shapes are (vertices (n, 3) float64, faces (m, 3) int64), closed, counter-clockwise from outside.
+Damage takes faces and returns faces; `seed` makes it repeatable.
+"""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+import numpy as np
+
+from harnack.backend.validation import FloatArray, IntArray
+
+__all__ = [
+    "bumpy_sphere",
+    "duplicate_faces",
+    "flip_faces",
+    "icosphere",
+    "remove_faces",
+    "torus_mesh",
+]
+
+MeshArrays: TypeAlias = tuple[FloatArray, IntArray]
+
+
+def icosphere(subdivisions: int) -> MeshArrays:
+    """The icosahedron in the unit sphere, each face cut in four `subdivisions` times.
+
+    20 * 4^subdivisions faces, all vertices on the unit sphere.
+
+    Raises:
+        ValueError: negative, or above 10 (21 million faces).
+    """
+    if not 0 <= subdivisions <= 10:
+        raise ValueError(f"an icosphere takes 0 to 10 subdivisions, not {subdivisions}")
+    vertices, faces = _icosahedron()
+    for _ in range(subdivisions):
+        vertices, faces = _subdivided(vertices, faces)
+        vertices /= np.linalg.norm(vertices, axis=1, keepdims=True)
+    return vertices, faces
+
+
+def bumpy_sphere(subdivisions: int) -> MeshArrays:
+    """The icosphere with radii r = 1 + 0.15 sin 5x sin 5y sin 5z, (x, y, z) on the unit sphere."""
+    vertices, faces = icosphere(subdivisions)
+    radii = 1.0 + 0.15 * np.sin(5.0 * vertices).prod(axis=1, keepdims=True)
+    return vertices * radii, faces
+
+
+def torus_mesh(major_radius: float, minor_radius: float, n: int, m: int) -> MeshArrays:
+    """A torus about the z axis: n segments the long way round, m the short way, 2 n m faces.
+
+    Raises:
+        ValueError: fewer than 3 segments, or not 0 < minor_radius < major_radius.
+    """
+    if n < 3 or m < 3:
+        raise ValueError(f"a torus needs at least 3 segments each way, not {n} and {m}")
+    if not 0.0 < minor_radius < major_radius:
+        raise ValueError(
+            f"a torus needs 0 < minor_radius < major_radius, not {minor_radius} and {major_radius}"
+        )
+    i, j = (index.ravel() for index in np.mgrid[:n, :m])
+    s, t = 2.0 * np.pi * i / n, 2.0 * np.pi * j / m
+    distance = major_radius + minor_radius * np.cos(t)
+    vertices = np.column_stack(
+        [distance * np.cos(s), distance * np.sin(s), minor_radius * np.sin(t)]
+    )
+    a, b = i * m + j, (i + 1) % n * m + j
+    c, d = (i + 1) % n * m + (j + 1) % m, i * m + (j + 1) % m
+    faces = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
+    return vertices, faces.astype(np.int64)
+
+
+def remove_faces(faces: IntArray, fraction: float, seed: int) -> IntArray:
+    """The faces (m, 3) without a random fraction of them, in their order: holes everywhere."""
+    return np.delete(faces, _chosen(faces, fraction, seed), axis=0)
+
+
+def flip_faces(faces: IntArray, fraction: float, seed: int) -> IntArray:
+    """The faces (m, 3), a random fraction of them reversed: w jumps the opposite way there."""
+    flipped = faces.copy()
+    chosen = _chosen(faces, fraction, seed)
+    flipped[chosen] = faces[chosen][:, [0, 2, 1]]
+    return flipped
+
+
+def duplicate_faces(
+    faces: IntArray, fraction: float, seed: int, *, turned: bool = False
+) -> IntArray:
+    """The faces (m, 3), then a random fraction of them once more; turned: reversed.
+
+    A duplicate makes w jump by 2 across that face, a turned one by 0: a hole that is not seen.
+    """
+    copies = faces[_chosen(faces, fraction, seed)]
+    return np.concatenate([faces, copies[:, [0, 2, 1]] if turned else copies])
+
+
+def _chosen(faces: IntArray, fraction: float, seed: int) -> IntArray:
+    """Distinct indices of a random fraction (rounded to a whole number) of the faces.
+
+    Raises:
+        ValueError: fraction outside [0, 1].
+    """
+    if not 0.0 <= fraction <= 1.0:
+        raise ValueError(f"the fraction must lie between 0 and 1, not {fraction}")
+    rng = np.random.default_rng(seed)
+    return rng.permutation(len(faces))[: round(fraction * len(faces))]
+
+
+def _icosahedron() -> MeshArrays:
+    golden = 0.5 * (1.0 + np.sqrt(5.0))
+    corners = [(0.0, y, z) for y in (-1.0, 1.0) for z in (-golden, golden)]
+    vertices = np.concatenate([np.roll(corners, shift, axis=1) for shift in range(3)])
+    # The faces are the triples of vertices 2 apart from each other, turned to face outward.
+    near = np.abs(((vertices[:, None] - vertices) ** 2).sum(axis=2) - 4.0) < 0.1
+    faces = np.array(
+        [
+            (a, b, c) if np.linalg.det(vertices[[a, b, c]]) > 0.0 else (a, c, b)
+            for a in range(12)
+            for b in range(a + 1, 12)
+            for c in range(b + 1, 12)
+            if near[a, b] and near[b, c] and near[c, a]
+        ],
+        dtype=np.int64,
+    )
+    return vertices / np.sqrt(1.0 + golden * golden), faces
+
+
+def _subdivided(vertices: FloatArray, faces: IntArray) -> MeshArrays:
+    """Each face cut in four at the middles of its edges, which become new vertices."""
+    ends = np.roll(faces, -1, axis=1)
+    n = len(vertices)
+    keys = np.minimum(faces, ends) * n + np.maximum(faces, ends)
+    edges, middle = np.unique(keys.ravel(), return_inverse=True)
+    middles = 0.5 * (vertices[edges // n] + vertices[edges % n])
+    a, b, c = faces.T
+    ab, bc, ca = (n + middle.reshape(-1, 3)).T
+    cut = np.stack([a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca], axis=1).reshape(-1, 3)
+    return np.concatenate([vertices, middles]), cut

@@ -1,0 +1,50 @@
+"""The two sides of meshes, and strips that have one alone."""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import numpy as np
+
+from harnack.backend.validation import IntArray
+
+__all__ = ["is_one_sided", "sided_parts"]
+
+
+def is_one_sided(faces: IntArray) -> bool:
+    """Whether a mesh ends in the open and no part of it, of those that edges of two faces hold
+    together, has two sides: as a Moebius strip."""
+    if not (_edges(faces)[2] == 1).any():
+        return False
+    part = sided_parts(faces)
+    return bool((part[: len(faces)] == part[len(faces) :]).all())
+
+
+def sided_parts(faces: IntArray) -> IntArray:
+    """(2m,) the parts that sides of faces belong to, first of all as they are and then of all
+    turned over: sides of neighbors that agree are joined. A part of one side only is joined to
+    itself turned over."""
+    import scipy.sparse  # here: half a second that few need
+    import scipy.sparse.csgraph as csgraph_module
+
+    sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
+    m = len(faces)
+    pairs, index, uses = _edges(faces)
+    order = np.argsort(index, kind="stable")
+    one, other = order[(uses == 2)[index[order]]].reshape(-1, 2).T
+    same = ((pairs[one] == pairs[other]).all(axis=1)).astype(np.int64)
+    one, other = one % m, other % m
+    # Each face as it is and turned over (m more); neighbors that agree are joined.
+    rows = np.concatenate([one, one + m])
+    columns = np.concatenate([other + m * same, other + m * (1 - same)])
+    joined = sparse.coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(2 * m, 2 * m))
+    return np.asarray(csgraph.connected_components(joined, directed=False)[1], np.int64)
+
+
+def _edges(faces: IntArray) -> tuple[IntArray, IntArray, IntArray]:
+    """Edges (3m, 2) as faces run them, the first of all faces first; the number of each, whichever
+    way it is run; and how often each number is run."""
+    pairs = np.concatenate([faces[:, [k, (k + 1) % 3]] for k in range(3)]).astype(np.int64)
+    keys = pairs.min(axis=1) * (int(pairs.max(initial=0)) + 1) + pairs.max(axis=1)
+    _, index, uses = np.unique(keys, return_inverse=True, return_counts=True)
+    return pairs, index, uses

@@ -1,0 +1,232 @@
+"""Tetrahedra that fill cells of a box without a Delaunay triangulation: a body-centered lattice.
+
+Its points are the corners and the centers of equal cells, and where a cell lies on the box, the
+centers of its faces there. Two centers on both sides of a face make four tetrahedra with the four
+edges of the face; at the box, where the outer center is that of the face itself, half as large
+ones. So the tetrahedra fill the box, and those at the faces of some cells contain these cells. In
+cubes their dihedral angles are 60 and 90 degrees (Labelle and Shewchuk 2007).
+
+Cells that are proved empty need none. Proof. Let the level set meet chosen cells only, and let a
+tetrahedron at a face of a chosen cell have its other apex in a cell that is not: that cell holds no
+level, so its center and the corners of the face, which it has too, are on one side. Of the faces of
+the tetrahedron only those with the chosen cell's center and a corner of another side are crossed,
+and the tetrahedron behind such a face belongs to a face of the chosen cell as well.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from harnack.backend import BoolArray, FloatArray
+from harnack.meshing.checks import MeshingError, TooLargeError
+from harnack.meshing.edges import IntArray, distinct
+from harnack.tree.empty_space import Cells, Clearance, octree
+
+__all__ = ["Lattice", "distinct_rows"]
+
+# More cells than that are refused: about five million triangles.
+MOST_CELLS = 2_000_000
+# The points of a lattice that has fewer are found by a table.
+_MOST_LISTED = 20_000_000
+# Cells of the first round of the octree.
+_MOST_ROOTS = 200_000
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """counts: (3,) cells along each side of a box from `lower`, each with edges `size` (3,).
+
+    Points have even coordinates (n, 3) in half cells if they are corners, and odd ones if centers;
+    centers of faces on the box have one even coordinate.
+    """
+
+    lower: FloatArray
+    size: FloatArray
+    counts: IntArray
+
+    @classmethod
+    def filling(
+        cls, lower: FloatArray, upper: FloatArray, spacing: float, layers: int = 0
+    ) -> Lattice:
+        """Cells that fill a box, as nearly cubes of edge `spacing` as possible, and `layers` around
+        it.
+
+        Raises:
+            MeshingError: a box without volume.
+        """
+        sides = upper - lower
+        if not (sides > 0).all():
+            raise MeshingError("the box to be filled has no volume: choose a larger `clip`")
+        counts = np.maximum(1, np.ceil(sides / spacing * (1 - 1e-9))).astype(np.int64)
+        size = sides / counts
+        return cls(lower - layers * size, size, counts + 2 * layers)
+
+    @property
+    def upper(self) -> FloatArray:
+        """(3,) the far corner of the box."""
+        return self.lower + self.counts * self.size
+
+    def points(self, coordinates: IntArray) -> FloatArray:
+        """(n, 3), given their coordinates; those on the box exactly there."""
+        x = self.lower + 0.5 * self.size * coordinates
+        x = np.where(coordinates == 0, self.lower, x)
+        return np.where(coordinates == 2 * self.counts, self.upper, x)
+
+    def is_outer(self, coordinates: IntArray) -> BoolArray:
+        """(n,) whether points lie on the box."""
+        return ((coordinates == 0) | (coordinates == 2 * self.counts)).any(axis=1)
+
+    def cells_not_empty(self, clearance: Clearance, most_faces: int) -> IntArray:
+        """(n, 3) indices of the cells that are not proved empty, by octrees over blocks of them.
+
+        most_faces: triangles that may be made; a cell makes about three.
+
+        Raises:
+            MeshingError: there are too many.
+        """
+        # A surface across the box passes through at least this many cells.
+        most = min(MOST_CELLS, most_faces)
+        if (least := float(np.prod(np.sort(self.counts)[:2].astype(float)))) > most:
+            raise too_large(least, most)
+        halvings = 0
+        while halvings < 3 and (self.counts >= 2 ** (halvings + 2)).all():
+            halvings += 1
+        blocks = -(-self.counts // 2**halvings)
+        while math.prod(blocks.tolist()) > _MOST_ROOTS and halvings < 12:
+            halvings += 1
+            blocks = -(-self.counts // 2**halvings)
+        grid = np.stack(np.meshgrid(*map(np.arange, blocks), indexing="ij"), axis=-1)
+        edges = self.size * 2**halvings
+        root = Cells(self.lower + grid.reshape(-1, 3) * edges, edges)
+        root = root.some(~root.proved_empty(clearance))
+        leaves = octree(root, clearance, 8 * most, halvings).leaves
+        if not len(leaves.corners):
+            return np.zeros((0, 3), np.int64)
+        rounds = round(math.log2(edges[0] / leaves.size[0]))
+        expected = len(leaves.corners) * 4 ** (halvings - rounds)
+        if expected > most or rounds < halvings:
+            raise too_large(expected, most)
+        index = np.rint((leaves.corners - self.lower) / self.size).astype(np.int64)
+        return index[(index < self.counts).all(axis=1)]
+
+    def cells_that_matter(
+        self, clearance: Clearance, matter: IntArray, values: Clearance, most_faces: int
+    ) -> tuple[IntArray, BoolArray]:
+        """(n, 3) indices of the cells that may hold the level set or are negative beside cells that
+        do not matter, and of all cells of the lattice which do (counts).
+
+        matter: (k, 3) indices of the cells that may matter (`cells_not_empty`). values: of the
+            function. What does not matter counts as positive: all points of such cells do. As in
+            the module's proof, tetrahedra at the chosen cells then have all faces between points
+            of two signs: a cell that is not chosen has a center of the sign of its corners that
+            matter, and if one of them does not, all of them are positive.
+
+        Raises:
+            MeshingError: there are too many.
+        """
+        does = np.zeros(tuple(self.counts.tolist()), np.bool_)
+        does[tuple(matter.T)] = True
+        centers = self.points(2 * matter + 1)
+        half_diagonal = 0.5 * float(np.linalg.norm(self.size))
+        chosen = clearance(centers) <= half_diagonal * (1 + 1e-9)
+        rim = np.flatnonzero(~chosen & ~self.deep(does)[tuple(matter.T)])
+        chosen[rim[values(centers[rim]) <= 0]] = True
+        if int(chosen.sum()) > min(MOST_CELLS, most_faces):
+            raise too_large(float(chosen.sum()), min(MOST_CELLS, most_faces))
+        return matter[chosen], does
+
+    def deep(self, cells: BoolArray) -> BoolArray:
+        """Those of some cells (counts) of which all neighbors in the lattice belong to them."""
+        around = np.pad(cells, 1, constant_values=True)
+        inner = cells.copy()
+        for shift in itertools.product((0, 1, 2), repeat=3):
+            inner &= around[tuple(slice(i, i + n) for i, n in zip(shift, cells.shape, strict=True))]
+        return inner
+
+    def cells_of(self, points: FloatArray) -> IntArray:
+        """(n, 3) indices of the cells that points lie in, or that are nearest to them."""
+        index = np.floor((points - self.lower) / self.size).astype(np.int64)
+        return np.clip(index, 0, self.counts - 1)
+
+    def beside(self, coordinates: IntArray, cells: BoolArray) -> BoolArray:
+        """(n,) whether points, by coordinates, are corners or centers of some of the cells
+        (counts)."""
+        padded = np.pad(cells, 1)
+        found = np.zeros(len(coordinates), np.bool_)
+        for ways in itertools.product((-1, 0), repeat=3):
+            # Of an odd coordinate both are the same cell.
+            index = (coordinates + ways) // 2 + 1
+            found |= padded[tuple(index.T)]
+        return found
+
+    def outer_cells(self) -> IntArray:
+        """(n, 3) indices of the cells at the box."""
+        found: list[IntArray] = []
+        for axis in range(3):
+            ends = self.counts.copy()
+            ends[axis] = 1
+            layer: IntArray = np.indices(tuple(ends.tolist())).reshape(3, -1).T.copy()
+            found.append(layer.copy())
+            layer[:, axis] = self.counts[axis] - 1
+            found.append(layer)
+        return distinct_rows(np.concatenate(found))
+
+    def tetrahedra(self, cells: IntArray) -> tuple[IntArray, IntArray]:
+        """Tetrahedra at all faces of cells (k, 3): their points (n, 3) by coordinates, and for each
+        the indices of four of them (m, 4)."""
+        shape = 2 * self.counts + 1
+        found: list[list[IntArray]] = []  # of each face both centers, and its corners in turn
+        for axis in range(3):
+            lower = 2 * cells
+            lower[:, axis] += 2
+            face = np.concatenate([2 * cells, lower])
+            face = _key_rows(distinct(_keys(face, shape)), shape)
+            others = [k for k in range(3) if k != axis]
+            six: list[IntArray] = []
+            for way in (-1, 1):
+                center = face + 1
+                center[:, axis] = np.clip(face[:, axis] + way, 0, shape[axis] - 1)
+                six.append(_keys(center, shape))
+            for i, j in ((0, 0), (2, 0), (2, 2), (0, 2)):
+                corner = face.copy()
+                corner[:, others] += [i, j]
+                six.append(_keys(corner, shape))
+            found.append(six)
+        keys = [np.concatenate(column) for column in zip(*found, strict=True)]
+        used = distinct(np.concatenate(keys))
+        if math.prod(shape.tolist()) < _MOST_LISTED:
+            place = np.zeros(math.prod(shape.tolist()), np.int64)
+            place[used] = np.arange(len(used))
+            one, other, *ring = (place[column] for column in keys)
+        else:
+            one, other, *ring = (np.searchsorted(used, column) for column in keys)
+        fours = [np.stack([one, other, ring[k - 1], ring[k]], axis=1) for k in range(4)]
+        return _key_rows(used, shape), np.concatenate(fours)
+
+
+def distinct_rows(rows: IntArray) -> IntArray:
+    """The rows (n, 3) of numbers that are not negative, each once and in order."""
+    shape = rows.max(axis=0, initial=0) + 1
+    return _key_rows(distinct(_keys(rows, shape)), shape)
+
+
+def too_large(cells: float, most: int) -> TooLargeError:
+    """The error about too many cells."""
+    return TooLargeError(
+        f"about {cells:.1e} cells hold the surface, which makes some {3 * cells:.0e} triangles; "
+        f"at most {most:,} cells are made (max_triangles, and never more than {MOST_CELLS:,}): "
+        "choose a larger `spacing` or `tolerance`, or a smaller `clip`"
+    )
+
+
+def _keys(coordinates: IntArray, shape: IntArray) -> IntArray:
+    return (coordinates[:, 0] * shape[1] + coordinates[:, 1]) * shape[2] + coordinates[:, 2]
+
+
+def _key_rows(keys: IntArray, shape: IntArray) -> IntArray:
+    rest, z = np.divmod(keys, shape[2])
+    return np.stack([*np.divmod(rest, shape[1]), z], axis=1)

@@ -1,0 +1,311 @@
+"""Pairs of triangles that may meet: all others are proved apart, in floating point.
+
+Each triangle walks a tree of boxes, and the pairs whose boxes overlap are listed: about eight for
+each triangle. They are then tested side by side, since tests within the walk would wait for each
+other. Nearly all are apart by a sign that rounding cannot change; what is left is for exact
+arithmetic (`checks.intersecting_faces`).
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, cast
+
+import drjit as dr
+import numpy as np
+
+from harnack.backend import BoolArray, FloatArray, choose_backend, to_numpy
+from harnack.backend.record_table import Records
+from harnack.meshing.edges import IntArray
+from harnack.tree.balanced_tree import (
+    NO_PRIMITIVE,
+    Node,
+    PackedTree,
+    State,
+    build_hierarchy,
+    for_each,
+    pack,
+    walk,
+)
+from harnack.tree.triangle_tree import box_levels
+
+if TYPE_CHECKING:
+    from harnack.backend import Mask, Real, Vec3
+
+    Corners = tuple[Vec3, Vec3, Vec3]
+
+__all__ = ["ROUNDING", "near_pairs"]
+
+# Columns of a record behind the box: the face's number, and whether it is chosen.
+_NUMBER, _CHOSEN = 6, 7
+_LEAF_SIZE = 8
+# Triangles that walk the tree at once, and pairs that there is room for then, at the least.
+_ROWS_AT_ONCE, _PAIRS_AT_ONCE = 1 << 17, 1 << 22
+# Rounding of a product of three vectors and of two, of differences of coordinates, over the product
+# of their lengths: at most seven roundings of up to six terms, which are 1.16 times that product
+# together, and four of three terms, which are as much as it. So that is a third of what is allowed.
+ROUNDING = 16 * 2.0**-52
+# What underflow may add, for coordinates of order one.
+_UNDERFLOW = 1e-290
+
+
+def near_pairs(vertices: FloatArray, faces: IntArray, among: BoolArray | None) -> IntArray:
+    """Pairs (k, 2) of faces (m, 3) that may have more in common than the vertices that they share,
+    each once; all others are proved not to (`_are_apart`).
+
+    vertices: (n, 3), finite.
+    among: (m,) mask; pairs of which neither is chosen are left out.
+    """
+    chosen = np.ones(len(faces), np.bool_) if among is None else among
+    found = [np.zeros((0, 2), np.int64)]
+    if not chosen.any():
+        return found[0]
+    largest = float(np.abs(vertices).max(initial=0.0))
+    # A power of two, so that nothing is rounded.
+    unit = np.ldexp(vertices, -int(np.frexp(largest)[1])) if largest else vertices
+    boxes, pairs = _Boxes.of(unit[faces], chosen), _Pairs.of(unit, faces)
+    rows = boxes.order[chosen[boxes.order]]
+    room = max(_PAIRS_AT_ONCE, len(faces))
+    left = [rows[start : start + _ROWS_AT_ONCE] for start in range(0, len(rows), _ROWS_AT_ONCE)]
+    while left:
+        some = left.pop()
+        listed = boxes.overlapping(some, room)
+        if listed is None:  # a single triangle always has room
+            left += np.array_split(some, 2)
+            continue
+        found.append(pairs.not_apart(*listed))
+    return np.concatenate(found)
+
+
+@dataclass(frozen=True)
+class _Boxes:
+    """Boxes of faces in a tree. records: (m, 8); order: their indices leaf by leaf."""
+
+    tree: PackedTree
+    records: FloatArray
+    order: IntArray
+
+    @classmethod
+    def of(cls, corners: FloatArray, chosen: BoolArray) -> _Boxes:
+        a, b, c = (corners[:, k] for k in range(3))
+        lower, upper = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
+        hierarchy = build_hierarchy(0.5 * (lower + upper), leaf_size=_LEAF_SIZE)
+        numbers = np.column_stack([np.arange(len(corners)), chosen]).astype(np.float64)
+        records = np.concatenate([lower, upper, numbers], axis=1)
+        placed = hierarchy.gather(records)
+        placed[hierarchy.slots == NO_PRIMITIVE, _NUMBER] = -1.0
+        levels = box_levels(hierarchy, lower, upper)
+        order = hierarchy.slots[hierarchy.slots != NO_PRIMITIVE]
+        return cls(pack(choose_backend("double"), hierarchy, levels, placed), records, order)
+
+    def overlapping(self, rows: IntArray, room: int) -> tuple[Any, Any] | None:
+        """Pairs of some faces, and of others, whose boxes overlap, in no order; None if there are
+        more than `room`."""
+        backend = self.tree.backend
+        real, vector, whole = backend.Float, backend.Array3f, backend.UInt32
+        columns = [real(np.ascontiguousarray(one)) for one in self.records[rows].T]
+        low, high, own = vector(*columns[:3]), vector(*columns[3:6]), columns[_NUMBER]
+        number, most = dr.zeros(whole, 1), dr.opaque(whole, room)
+        one, other = dr.zeros(whole, room), dr.zeros(whole, room)
+
+        def overlap(row: Any) -> Mask:
+            return dr.all((vector(*row[:3]) <= high) & (vector(*row[3:6]) >= low))
+
+        def visit(node: Node, state: State) -> tuple[Mask, State]:
+            near = overlap(node.head)
+            return near, for_each(node, near & node.is_leaf, put, state)
+
+        def put(row: list[Real], active: Mask, state: State) -> State:
+            with_number = row[_NUMBER]
+            # Two that are chosen meet once.
+            once = (with_number > own) | ((row[_CHOSEN] == 0) & (with_number >= 0))
+            met = active & once & overlap(row)
+            place = dr.scatter_inc(number, whole(0), met)
+            has_room = met & (place < most)
+            dr.scatter(one, whole(own), place, has_room)
+            dr.scatter(other, whole(with_number), place, has_room)
+            return state
+
+        walk(self.tree, visit, (real(0),))
+        dr.eval(number, one, other)
+        count = int(to_numpy(number)[0])
+        if count > room:
+            return None
+        listed = dr.arange(whole, count)
+        return dr.gather(whole, one, listed), dr.gather(whole, other, listed)
+
+
+@dataclass(frozen=True)
+class _Pairs:
+    """Tests of pairs of faces. points: of vertices. corners: of the faces, three columns."""
+
+    points: Records
+    corners: tuple[Any, Any, Any]
+
+    @classmethod
+    def of(cls, vertices: FloatArray, faces: IntArray) -> _Pairs:
+        backend = choose_backend("double")
+        a, b, c = (backend.UInt32(np.ascontiguousarray(one, np.uint32)) for one in faces.T)
+        return cls(Records.upload(backend, vertices), (a, b, c))
+
+    def not_apart(self, one: Any, other: Any) -> IntArray:
+        """Those pairs (k, 2) that are not proved apart, in order."""
+        backend = self.points.backend
+        names = [[dr.gather(backend.UInt32, k, i) for k in self.corners] for i in (one, other)]
+        triangles = [
+            tuple(backend.Array3f(*self.points.row(name)[:3]) for name in three) for three in names
+        ]
+        shared = [[name == another for another in names[1]] for name in names[0]]
+        a, b = cast("tuple[Corners, Corners]", triangles)
+        rows = dr.compress(~_are_apart(a, b, shared))
+        pairs = [to_numpy(dr.gather(backend.UInt32, i, rows)) for i in (one, other)]
+        found = np.stack(pairs, axis=1).astype(np.int64)
+        return found[np.lexsort(found.T[::-1])]
+
+
+def _are_apart(a: Corners, b: Corners, shared: list[list[Mask]]) -> Mask:
+    """Whether two triangles have nothing in common but the corners they share, proved.
+
+    shared: whether corner i of a is corner k of b.
+
+    - *A plane*: all corners of one that are not shared lie strictly on one side of the other's
+      plane (`_sides`). Points of the one on that plane then are combinations of shared corners.
+    - *Edges*, where at most one corner is shared: triangles in different planes meet in a segment
+      on the line of both planes, whose ends lie on edges that pass through the other triangle.
+      None does: each edge without a shared corner has its ends strictly on one side of the other's
+      plane, or passes two of its edges on different sides (`_passes`). In one plane all these
+      signs are 0, and nothing is proved.
+    - *A line*, for triangles in one plane: `_beside`.
+    """
+    in_a = [shared[i][0] | shared[i][1] | shared[i][2] for i in range(3)]
+    in_b = [shared[0][k] | shared[1][k] | shared[2][k] for k in range(3)]
+    real = cast("Any", type(a[0].x))
+    count: Real = sum((dr.select(one, real(1), real(0)) for one in in_a), real(0))
+    of_b, of_a = _sides(a, b), _sides(b, a)
+    by_plane = _on_one_side(of_b, in_b) | _on_one_side(of_a, in_a)
+    by_plane &= count < 2.5
+
+    def by_edges_or_line(*numbers: Any) -> Mask:
+        one, other = cast("tuple[Corners, Corners]", (numbers[:3], numbers[3:6]))
+        in_one, in_other, common = list(numbers[6:9]), list(numbers[9:12]), numbers[12]
+        passes = _passes(one, other, _sides(one, other), in_other)
+        passes |= _passes(other, one, _sides(other, one), in_one)
+        turned = _turned(one, in_one, common), _turned(other, in_other, common)
+        return ((common < 1.5) & ~passes) | _beside(*turned, common)
+
+    def is_open(*numbers: Any) -> Mask:
+        return numbers[12] < 0
+
+    numbers = (*a, *b, *in_a, *in_b, count)
+    return by_plane | dr.if_stmt(numbers, ~by_plane, by_edges_or_line, is_open)
+
+
+def _sides(plane: Corners, of: Corners) -> list[tuple[Mask, Mask]]:
+    """Of each corner of a triangle, whether it is strictly above another's plane, and strictly
+    below it; neither where rounding leaves it open."""
+    u, v = plane[1] - plane[0], plane[2] - plane[0]
+    normal = dr.cross(u, v)
+    most = ROUNDING * dr.norm(u) * dr.norm(v)
+    found: list[tuple[Mask, Mask]] = []
+    for corner in of:
+        way = corner - plane[0]
+        height, error = dr.dot(normal, way), most * dr.norm(way) + _UNDERFLOW
+        found.append((height > error, height < -error))
+    return found
+
+
+def _on_one_side(sides: list[tuple[Mask, Mask]], shared: list[Mask]) -> Mask:
+    above, below = (
+        (sides[0][k] | shared[0]) & (sides[1][k] | shared[1]) & (sides[2][k] | shared[2])
+        for k in range(2)
+    )
+    return above | below
+
+
+def _passes(
+    through: Corners, of: Corners, sides: list[tuple[Mask, Mask]], shared: list[Mask]
+) -> Mask:
+    """Whether an edge of a triangle without shared corners may pass through another: unless both
+    ends are strictly on one side of its plane, or the line of the edge has two edges of it on
+    different sides of itself."""
+    found = False
+    for i, j in ((0, 1), (1, 2), (2, 0)):
+        stays = (sides[i][0] & sides[j][0]) | (sides[i][1] & sides[j][1]) | shared[i] | shared[j]
+        way = of[j] - of[i]
+        to = [corner - of[i] for corner in through]
+        length, lengths = dr.norm(way), [dr.norm(one) for one in to]
+        left, right = False, False
+        for k, m in ((0, 1), (1, 2), (2, 0)):
+            value = dr.dot(way, dr.cross(to[k], to[m]))
+            error = ROUNDING * length * lengths[k] * lengths[m] + _UNDERFLOW
+            left, right = left | (value > error), right | (value < -error)
+        found = found | ~(stays | (left & right))
+    return found
+
+
+def _turned(of: Corners, shared: list[Mask], count: Real) -> Corners:
+    """The corners in another order: what is shared first."""
+    once = count < 1.5
+    # One that is shared comes first; of two, the one that is not shared comes last.
+    from_second = dr.select(once, shared[1], ~shared[0])
+    from_third = dr.select(once, shared[2], ~shared[1])
+    none = count < 0.5
+    from_second, from_third = from_second & ~none, from_third & ~none
+    return tuple(
+        dr.select(from_second, of[(k + 1) % 3], dr.select(from_third, of[(k + 2) % 3], of[k]))
+        for k in range(3)
+    )  # type: ignore[return-value]
+
+
+def _beside(a: Corners, b: Corners, count: Real) -> Mask:
+    """Whether a plane through an edge, at right angles to its triangle, has the triangles on its
+    two sides; shared corners come first.
+
+    m is any vector, and m' = m - (m.e/|e|^2) e, for an edge e, exactly: so m'.e = 0, and m'.x is
+    m.x up to |m.e| |x|/|e|, which is rounding if m was made at right angles to e.
+    - No shared corner: m.x is less on one triangle than on the other (separating axes).
+    - One, the origin: m' < 0 or = 0 on e, < 0 at the other corner of e's triangle and > 0 at both
+      corners of the other. Points of both have m' = 0, so of the latter only the origin. Or m < 0
+      at both corners of one and m > 0 at those of the other: m along the difference of the
+      directions of their middles.
+    - Two: e is between them, m' < 0 at the last corner of one, and > 0 at that of the other. Points
+      of both have m' = 0: they lie on e.
+    """
+    none, once = count < 0.5, (count > 0.5) & (count < 1.5)
+    twice = (count > 1.5) & (count < 2.5)
+    found = False
+    for one, other in ((a, b), (b, a)):
+        for i, j, k in ((0, 1, 2), (0, 2, 1), (1, 2, 0)):
+            origin = one[i]
+            e, x = one[j] - origin, one[k] - origin
+            m = dr.fma(e, dr.dot(x, e) / dr.squared_norm(e), -x)
+            size, length = dr.norm(m), dr.norm(e)
+            off = 1.01 * (dr.abs(dr.dot(m, e)) + ROUNDING * size * length) / length
+            slack = ROUNDING * size + off
+
+            def past(to: Vec3, m: Vec3 = m, slack: Real = slack) -> tuple[Mask, Mask]:
+                value, error = dr.dot(m, to), slack * dr.norm(to) + _UNDERFLOW
+                return value > error, value < -error
+
+            behind = past(x)[1]
+            beyond = [past(corner - origin)[0] for corner in other]
+            if i == 0:
+                found = found | (once & behind & beyond[1] & beyond[2])
+            if (i, j) == (0, 1):
+                found = found | (twice & behind & beyond[2])
+            # Without a shared corner the edge itself is behind as well: m'.e = 0.
+            found = found | (none & behind & beyond[0] & beyond[1] & beyond[2])
+    return found | (once & _opposite(a, b))
+
+
+def _opposite(a: Corners, b: Corners) -> Mask:
+    """Whether a plane through the first corner, which is that of both, has the others of a and
+    those of b on different sides, at right angles to the difference of their mean directions."""
+    ways = [one[k] - one[0] for one, k in itertools.product((a, b), (1, 2))]
+    mean = [dr.normalize(ways[k]) + dr.normalize(ways[k + 1]) for k in (0, 2)]
+    m = dr.normalize(mean[1]) - dr.normalize(mean[0])
+    slack = ROUNDING * dr.norm(m)
+    values = [(dr.dot(m, way), slack * dr.norm(way) + _UNDERFLOW) for way in ways]
+    (p, one), (q, two), (r, three), (s, four) = values
+    return (p < -one) & (q < -two) & (r > three) & (s > four)

@@ -1,0 +1,341 @@
+"""Triangles of an angle's level set that end at its curve, in Delaunay's tetrahedra.
+
+Where a check fails in known places, cells are made smaller there alone and all is done again. Where
+that does not help, or the places are not known, cells are made smaller everywhere.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from harnack.backend import FloatArray
+from harnack.fields.solid_angles.solid_angle import SolidAngle
+from harnack.geometry.polygons import net_loops
+from harnack.meshing.checks import (
+    LocalError,
+    MeshingError,
+    check_manifold,
+    intersecting_faces,
+    turned_faces,
+)
+from harnack.meshing.delaunay_points import (
+    Boundary,
+    Places,
+    PointSet,
+    box_cells,
+    newton,
+    place_points,
+)
+from harnack.meshing.edges import IntArray, boundary_edges, edge_keys
+from harnack.meshing.isotopy import Isotopy, isotopy_of
+from harnack.meshing.lattice_meshing import check_size
+from harnack.meshing.level_function import LevelFunction
+from harnack.meshing.marching_tetrahedra import (
+    Crossings,
+    Tetrahedra,
+    crossings_of,
+    delaunay,
+    is_cut,
+    triangles_of,
+)
+from harnack.meshing.refinement import improved, refined, smoothed
+from harnack.tree.empty_space import Cells
+
+__all__ = ["Spanned", "spanned_surface", "whole_edges"]
+
+# How far points are moved, at most, as a part of the edges of triangles beside them.
+_SHALLOW = 0.1
+
+
+def whole_edges(
+    function: LevelFunction,
+    vertices: FloatArray,
+    faces: IntArray,
+    kept: int,
+    cut: int,
+    height: float,
+) -> tuple[FloatArray, IntArray]:
+    """Vertices and faces whose boundary runs through the first `kept` vertices alone: edges of a
+    curve in one piece again, where they were cut for the tetrahedra.
+
+    A long edge of a curve is cut by points on it, so that cells near it need not be as large as it
+    is. In the triangles these points are moved off the edge, into the surface, by no more than the
+    tolerance, and the gap to the edge is filled: the mesh then ends at the curve as it was given.
+    The triangles in the gap are thin. That cannot be helped: the surface winds about the edge, and
+    a triangle on all of it is within the tolerance only if it is about as low as that.
+
+    kept, cut: vertices before `kept` are those of the curve, those from there to `cut` lie on its
+        edges.
+    height: how far these are moved, at most.
+    """
+    if cut == kept:
+        return vertices, faces
+    successor = dict(boundary_edges(faces).tolist())
+    chains: list[list[int]] = []
+    for start in range(kept):
+        chain = [start]
+        while (place := successor.get(chain[-1])) is not None:
+            chain.append(place)
+            if place < kept:
+                break
+        if len(chain) > 2:
+            chains.append(chain)
+    inner = np.array([place for chain in chains for place in chain[1:-1]], np.int64)
+    if not len(inner):
+        return vertices, faces
+    owner = np.repeat(np.arange(len(chains)), [len(one) - 2 for one in chains])
+    ends = np.array([(one[0], one[-1]) for one in chains], np.int64)
+    vertices = vertices.copy()
+    vertices[inner] = _moved_in(function, vertices, faces, inner, owner, ends, height)
+    gaps = [face for chain in chains for face in _filling(chain)]
+    return vertices, np.concatenate([faces, np.array(gaps, np.int64)])
+
+
+def _moved_in(
+    function: LevelFunction,
+    vertices: FloatArray,
+    faces: IntArray,
+    inner: IntArray,
+    owner: IntArray,
+    ends: IntArray,
+    height: float,
+) -> FloatArray:
+    """Points (k, 3) `inner` of the edges owner (k,) with these ends (m, 2), moved off the edges and
+    onto the surface. The heights over an edge are one parabola, so that its filling lies below the
+    chain."""
+    here = vertices[inner]
+    a, along = vertices[ends[:, 0]], vertices[ends[:, 1]] - vertices[ends[:, 0]]
+    length = np.linalg.norm(along, axis=1)
+    along, a = (along / length[:, None])[owner], a[owner]
+    share = ((here - a) * along).sum(axis=1) / length[owner]
+    inward, shortest = np.zeros_like(vertices), np.full(len(vertices), np.inf)
+    for k in range(3):
+        place, one, other = (faces[:, (k + j) % 3] for j in range(3))
+        np.add.at(inward, place, vertices[one] + vertices[other] - 2 * vertices[place])
+        for end in (one, other):
+            span = np.linalg.norm(vertices[end] - vertices[place], axis=1)
+            np.minimum.at(shortest, place, span)
+    most = np.full(len(ends), height)
+    np.minimum.at(most, owner, _SHALLOW * shortest[inner])
+    far = 4 * share * (1 - share) * most[owner]
+    way = _across(inward[inner], along)
+    start = here + far[:, None] * way
+    there = newton(function, start, function.at(start), 0.3 * far, None)
+    # Points keep their place along the edge and their distance from it: they are turned about it.
+    turned = _across(there - here, along)
+    good = (turned * way).sum(axis=1) > 0.3
+    return here + far[:, None] * np.where(good[:, None], turned, way)
+
+
+def _across(vectors: FloatArray, along: FloatArray) -> FloatArray:
+    """The unit vectors (k, 3) of parts of vectors at right angles to unit vectors."""
+    part = vectors - (vectors * along).sum(axis=1)[:, None] * along
+    return part / np.maximum(np.linalg.norm(part, axis=1), 1e-300)[:, None]
+
+
+def _filling(chain: list[int]) -> list[tuple[int, int, int]]:
+    """Triangles between the edge from the first to the last point of a chain, and the chain."""
+    if len(chain) < 3:
+        return []
+    middle = len(chain) // 2
+    return [
+        (chain[0], chain[-1], chain[middle]),
+        *_filling(chain[: middle + 1]),
+        *_filling(chain[middle:]),
+    ]
+
+
+# The whole surface.
+
+# How often all is done again because finished triangles fail.
+_MOST_ATTEMPTS = 4
+# How often cells are made smaller where the first triangles fail, before that is done everywhere.
+_MOST_LOCAL = 4
+# Edges of a curve that are longer than this many cells are cut.
+_LONGEST = 2.5
+# How often edges of a curve that are too near to others are halved.
+_MOST_CUTS = 4
+# The size of smaller cells everywhere, as a part of that before.
+_SMALLER = 0.6
+
+
+@dataclass(frozen=True)
+class Spanned:
+    """Triangles, and how they were found.
+
+    vertices: (n, 3). faces: (m, 3). curve: what they end on, cut as it was. spacing: of cells.
+    finer: where cells were smaller. crossings: of the edges of tetrahedra. isotopy: what is proved.
+    turned: how many faces are turned over.
+    """
+
+    vertices: FloatArray
+    faces: IntArray
+    curve: Boundary
+    spacing: float
+    finer: tuple[Places, ...]
+    crossings: Crossings
+    isotopy: Isotopy
+    turned: int = 0
+
+
+@dataclass(frozen=True)
+class _Task:
+    """What is to be filled, with what.
+
+    lower, upper: (3,) the box.
+    walls: the same, where the surface may end there, or None.
+    """
+
+    function: LevelFunction
+    lower: FloatArray
+    upper: FloatArray
+    walls: tuple[FloatArray, FloatArray] | None
+    seed: int
+    report: Callable[[str], None]
+
+
+def spanned_surface(
+    function: LevelFunction,
+    spacing: float,
+    attempts: int,
+    box: tuple[FloatArray, FloatArray],
+    has_walls: bool,
+    seed: int,
+    tolerance: float,
+    report: Callable[[str], None],
+) -> Spanned:
+    """Triangles within the tolerance, none of which pass through others; where some do, or are
+    turned over, cells are made smaller and all is done again.
+
+    attempts: how many spacings are tried, each smaller than the one before. box: to be filled.
+        has_walls: whether the surface may end at the box's faces. tolerance: a length.
+
+    Raises:
+        MeshingError: it could not be done.
+    """
+    task = _Task(function, *box, box if has_walls else None, seed, report)
+    walls = task.walls
+    finer: tuple[Places, ...] = ()
+    best: Spanned | None = None
+    crossing = np.zeros(0, np.int64)
+    for attempt in range(_MOST_ATTEMPTS):
+        first = _first_surface(task, spacing, attempts, finer)
+        spacing, finer = first.spacing, first.finer
+        faces = first.faces
+        check_size(function, first.vertices, faces, tolerance)
+        vertices = smoothed(function, first.vertices, faces, walls)
+        vertices, faces = refined(function, vertices, faces, tolerance, walls, report)
+        vertices, faces = improved(function, vertices, faces, tolerance, walls, report)
+        turned = turned_faces(function, vertices, faces)
+        kept = sum(map(len, _loops(function)))
+        vertices, faces = whole_edges(
+            function, vertices, faces, kept, len(first.curve.points), tolerance
+        )
+        check_manifold(faces)
+        crossing = intersecting_faces(vertices, faces)
+        if not len(crossing) and (best is None or len(turned) < best.turned):
+            best = dataclasses.replace(first, vertices=vertices, faces=faces, turned=len(turned))
+        bad = np.union1d(crossing, turned)
+        if not len(bad):
+            break
+        if attempt < _MOST_ATTEMPTS - 1:
+            report(f"{len(bad)} triangles fail: smaller cells there")
+            finer = (*finer, Places(vertices[faces[bad]].mean(axis=1), spacing))
+    if best is None:
+        raise MeshingError(
+            f"{len(crossing)} triangles pass through others, in cells as small as "
+            f"{spacing / 2 ** len(finer):.3g}: choose a smaller `tolerance` or `spacing`"
+        )
+    return best
+
+
+def _loops(function: LevelFunction) -> tuple[FloatArray, ...]:
+    assert isinstance(function.field, SolidAngle)
+    return net_loops(function.field.loops)
+
+
+def _first_surface(
+    task: _Task, spacing: float, attempts: int, finer: tuple[Places, ...]
+) -> Spanned:
+    """Triangles in cells of that spacing, smaller where they have to be; or where that fails, in
+    smaller ones everywhere."""
+    task.report(f"cells of {spacing:.3g}")
+    local = finer
+    try:
+        for trial in range(_MOST_LOCAL):
+            try:
+                return _in_cells(task, spacing, local)
+            except LocalError as error:
+                task.report(f"{len(error.places)} places fail: smaller cells there")
+                local = (*local, Places(error.places, spacing * 0.5**trial))
+        return _in_cells(task, spacing, local)
+    except MeshingError:
+        if attempts == 1:
+            raise
+    return _first_surface(task, _SMALLER * spacing, attempts - 1, finer)
+
+
+def _in_cells(task: _Task, spacing: float, finer: tuple[Places, ...]) -> Spanned:
+    """Triangles in cells of that spacing, split in some places, with what is proved of them.
+
+    Raises:
+        MeshingError: checks that fail, or edges of the curve that are in no tetrahedron.
+    """
+    function, walls = task.function, task.walls
+    curve = Boundary.of(_loops(function), _LONGEST * spacing)
+    for k, places in enumerate(finer):  # balls on long edges leave no room for points
+        curve = curve.split_near(places, spacing * 0.5**k)
+    margin = 0.5 * spacing if walls is None else 0.0
+    root = box_cells(task.lower - margin, task.upper + margin, spacing, exact=walls is not None)
+    curve, points, tets = _filled(task, root, curve, finer)
+    task.report(f"{len(points.points):,} points, {len(tets.corners):,} tetrahedra")
+    crossings = crossings_of(function, points, tets)
+    vertices, faces = triangles_of(function, points, tets, crossings)
+    if not len(faces):
+        raise MeshingError("the level set is empty: no cell of the box holds the level")
+    check_manifold(faces, vertices)
+    _check_boundary(vertices, faces, curve, walls)
+    cut = is_cut(points, tets, crossings)
+    isotopy = isotopy_of(function, points, tets.corners, cut, faces, curve, spacing, walls)
+    return Spanned(vertices, faces, curve, spacing, finer, crossings, isotopy)
+
+
+def _filled(
+    task: _Task, root: tuple[Cells, int], curve: Boundary, finer: tuple[Places, ...]
+) -> tuple[Boundary, PointSet, Tetrahedra]:
+    """Tetrahedra that have all edges of the curve, which is cut where others are too near."""
+    for _ in range(_MOST_CUTS):
+        points = place_points(task.function, root, curve, task.walls, task.seed, finer)
+        tets = delaunay(points.points)
+        has_edge = tets.has_edges(curve.edges)
+        if has_edge.all():
+            return curve, points, tets
+        curve = curve.split(~has_edge)
+    raise MeshingError("edges of the curve are too near to others: choose a smaller `spacing`")
+
+
+def _check_boundary(
+    vertices: FloatArray,
+    faces: IntArray,
+    curve: Boundary,
+    walls: tuple[FloatArray, FloatArray] | None,
+) -> None:
+    edges = boundary_edges(faces)
+    count = max(int(faces.max()) + 1, len(curve.points))
+    if walls is not None:  # where the surface ends as well
+        slack = 1e-9 * (walls[1] - walls[0])
+        near = np.minimum(np.abs(vertices - walls[0]), np.abs(vertices - walls[1]))
+        on = np.asarray((near <= slack).any(axis=1))
+        edges = edges[~on[edges].all(axis=1)]
+    wrong = np.setxor1d(edge_keys(edges, count), edge_keys(curve.edges, count))
+    if len(wrong):
+        ends = np.stack(np.divmod(wrong, count), axis=1)
+        raise LocalError(
+            "the mesh does not end at the curve: cells are too large for it; choose a smaller "
+            "`spacing`",
+            vertices[ends].mean(axis=1),
+        )

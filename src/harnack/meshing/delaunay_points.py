@@ -1,0 +1,313 @@
+"""Points for the tetrahedra: those of an octree around the level set, and the curve it ends on.
+
+Vertices of the curve are points as they are. Others keep so far from it that no point lies in the
+ball on an edge as diameter, so that every edge of the curve is one of Delaunay's tetrahedra
+(Gabriel's condition). Points near the level set are moved onto it: most slivers go.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from harnack.backend import BoolArray, FloatArray
+from harnack.meshing.edges import IntArray, dots, lengths
+from harnack.meshing.level_function import LevelFunction, Samples
+from harnack.tree.empty_space import Cells, Octree, octree
+
+__all__ = ["Boundary", "Places", "PointSet", "box_cells", "place_points"]
+
+# All in parts of the size of a cell, by experiment.
+_JITTER = 1e-3  # no five points on a sphere
+_SNAPPED = 0.3  # points this near to the level are moved onto it
+_FREE = 0.45  # no other points are so near to the curve
+_MOST_CELLS = 4_000_000
+# A step of Newton's method that is shorter is the last: a part of the longest one.
+_CONVERGED = 1e-9
+# How often the way to a multiple root is continued as a geometric series, and the rates of that.
+_SERIES, _RATES = 4, (0.4, 0.97)
+_CORNERS = np.array(list(itertools.product((0.0, 1.0), repeat=3)))
+
+
+@dataclass(frozen=True)
+class Places:
+    """Balls about points (n, 3) in which cells are split once more. radius: of all."""
+
+    points: FloatArray
+    radius: float
+
+    def meet(self, centers: FloatArray, radii: FloatArray | float) -> BoolArray:
+        """(k,) whether balls about points (k, 3) meet one of these."""
+        if not len(centers):
+            return np.zeros(0, np.bool_)
+        import scipy.spatial  # here: half a second that few need
+
+        searching: Any = scipy.spatial
+        apart: FloatArray = searching.cKDTree(self.points).query(centers)[0]
+        return apart < self.radius + radii
+
+
+@dataclass(frozen=True)
+class Boundary:
+    """The curve that a level set ends on.
+
+    points: (n, 3). edges: (n, 2) indices of points, in the direction in which the curve is run.
+    """
+
+    points: FloatArray
+    edges: IntArray
+
+    @classmethod
+    def of(cls, loops: tuple[FloatArray, ...], longest: float) -> Boundary:
+        """Closed loops, their vertices first and in their order; edges longer than `longest` are
+        cut into equal parts."""
+        points = [*loops]
+        more: list[FloatArray] = []
+        edges: list[tuple[int, int]] = []
+        first, last = 0, sum(map(len, loops))
+        for loop in loops:
+            for k, (a, b) in enumerate(zip(loop, np.roll(loop, -1, axis=0), strict=True)):
+                parts = max(1, math.ceil(float(np.linalg.norm(b - a)) / longest))
+                inner = a + (np.arange(1, parts)[:, None] / parts) * (b - a)
+                more.append(inner)
+                ends = [first + k, *range(last, last + parts - 1), first + (k + 1) % len(loop)]
+                edges += itertools.pairwise(ends)
+                last += parts - 1
+            first += len(loop)
+        pairs = np.array(edges, np.int64).reshape(-1, 2)
+        return cls(np.concatenate([*points, *more, np.zeros((0, 3))]), pairs)
+
+    def split(self, which: BoolArray) -> Boundary:
+        """With the middles of some edges (k,) as additional points."""
+        a, b = self.edges[which].T
+        middle = len(self.points) + np.arange(len(a))
+        points = np.concatenate([self.points, 0.5 * (self.points[a] + self.points[b])])
+        halves = np.concatenate([np.stack([a, middle], axis=1), np.stack([middle, b], axis=1)])
+        return Boundary(points, np.concatenate([self.edges[~which], halves]))
+
+    def split_near(self, places: Places, longest: float) -> Boundary:
+        """With edges in some places cut until they are no longer than `longest`."""
+        curve = self
+        while True:
+            ends = curve.points[curve.edges]
+            half = 0.5 * lengths(ends[:, 1] - ends[:, 0])
+            which = (2 * half > longest) & places.meet(ends.mean(axis=1), half)
+            if not which.any():
+                return curve
+            curve = curve.split(which)
+
+
+@dataclass(frozen=True)
+class PointSet:
+    """points: (n, 3), those of the boundary first. is_on: (n,) on the level, the boundary too.
+    samples: at all points; those of the boundary are 0."""
+
+    points: FloatArray
+    is_on: BoolArray
+    samples: Samples
+
+
+def box_cells(
+    lower: FloatArray, upper: FloatArray, spacing: float, exact: bool
+) -> tuple[Cells, int]:
+    """Cells that fill a box, and how often they are to be split to be no larger than `spacing`.
+
+    exact: the box itself is filled; else one that may be larger, by cubes.
+    """
+    size = upper - lower
+    finest = max(1, math.ceil(math.log2(float(size.max()) / spacing)))
+    if exact:
+        edge = float(size.max()) / 2 ** min(finest, 3)
+        counts = np.maximum(1, np.ceil(size / edge * (1 - 1e-9))).astype(int)
+        finest = max(0, math.ceil(math.log2(float((size / counts).max()) / spacing)))
+        edges = size / counts
+    else:
+        edge = spacing * 2.0 ** max(0, finest - 3)
+        counts = np.maximum(1, np.ceil(size / edge)).astype(int)
+        lower, edges = 0.5 * (lower + upper - counts * edge), np.full(3, edge)
+        finest = round(math.log2(edge / spacing))
+    grid = np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), axis=-1).reshape(-1, 3)
+    return Cells(lower + grid * edges, edges), finest
+
+
+def place_points(
+    function: LevelFunction,
+    root: tuple[Cells, int],
+    boundary: Boundary,
+    walls: tuple[FloatArray, FloatArray] | None,
+    seed: int,
+    finer: tuple[Places, ...] = (),
+) -> PointSet:
+    """Points for the tetrahedra: see the module's docstring.
+
+    walls: a box whose faces points on them do not leave. finer: where leaves of the octree are
+    split again, once for each of the entries that they meet.
+
+    Raises MemoryError for more than four million cells.
+    """
+    tree = octree(root[0], function.clearance, _MOST_CELLS, root[1])
+    points, size = _corners_and_centers(tree, _finer_cells(function, tree.leaves, finer))
+    free = _FREE * np.minimum(size, 2 * float(tree.leaves.size.max()))
+    is_far = _is_far(points, free, boundary)
+    points, size = points[is_far], size[is_far]
+    rng = np.random.default_rng(seed)
+    jitter = rng.uniform(-1, 1, points.shape) * _JITTER * size[:, None]
+    points = points + (jitter if walls is None else jitter * _off_walls(points, walls))
+    samples = function.at(points)
+    points, samples, is_on = _snapped(
+        function, points, size, free[is_far], samples, boundary, walls
+    )
+    n = len(boundary.points)
+    zeros = Samples(np.zeros(n), np.zeros((n, 3)), np.zeros(n))
+    together = [
+        np.concatenate([getattr(one, name) for one in (zeros, samples)])
+        for name in ("value", "gradient", "reach")
+    ]
+    return PointSet(
+        np.concatenate([boundary.points, points]),
+        np.concatenate([np.ones(n, np.bool_), is_on]),
+        Samples(*together),
+    )
+
+
+def _finer_cells(function: LevelFunction, leaves: Cells, finer: tuple[Places, ...]) -> list[Cells]:
+    """Cells that leaves are split into, smallest first; those proved empty are left out."""
+    pool = [leaves]
+    for places in finer:
+        split: list[Cells] = []
+        for cells in pool:
+            halves = cells.some(places.meet(cells.centers, cells.half_diagonal)).split()
+            split.append(halves.some(~halves.proved_empty(function.clearance)))
+        pool += split
+    found = [cells for cells in pool[1:] if len(cells.corners)]
+    return sorted(found, key=lambda cells: float(cells.size.max()))
+
+
+def _corners_and_centers(tree: Octree, finer: list[Cells]) -> tuple[FloatArray, FloatArray]:
+    """Points (n, 3), each once: corners of all cells, and centers of leaves and of `finer` ones;
+    and the size (n,) of the smallest cell at each."""
+    leaves = [*finer, tree.leaves]
+    points = [cells.centers for cells in leaves]
+    sizes = [np.full(len(cells.corners), float(cells.size.max())) for cells in leaves]
+    for some in [*leaves, *reversed(tree.empty)]:
+        corners = (some.corners[:, None] + _CORNERS * some.size).reshape(-1, 3)
+        points.append(corners)
+        sizes.append(np.full(len(corners), float(some.size.max())))
+    x, size = np.concatenate(points), np.concatenate(sizes)
+    order = np.argsort(size, kind="stable")
+    x, size = x[order], size[order]
+    steps: FloatArray = (x - x.min(axis=0)) / (0.25 * leaves[0].size)
+    keys = np.rint(steps).astype(np.int64)
+    # Of points at one place the first, which is that of the smallest cell.
+    first: IntArray = np.sort(np.unique(keys, axis=0, return_index=True)[1])
+    return x[first], size[first]
+
+
+def _is_far(points: FloatArray, free: FloatArray, boundary: Boundary) -> BoolArray:
+    """Whether points are farther from the curve than `free` (n,), and out of the balls on its edges
+    as diameters."""
+    if not len(boundary.edges):
+        return np.ones(len(points), np.bool_)
+    import scipy.spatial  # here: half a second that few need
+
+    searching: Any = scipy.spatial
+    a, b = (boundary.points[boundary.edges[:, k]] for k in (0, 1))
+    middle, half = 0.5 * (a + b), 0.5 * lengths(b - a)
+    near = np.full(len(points), np.inf)
+    is_far = np.ones(len(points), np.bool_)
+    # Curves may have edges of any lengths: those of one size at a time.
+    octave = np.floor(np.log2(half))
+    for one in np.unique(octave):
+        rows = np.flatnonzero(octave == one)
+        few = min(8, len(rows))
+        found: IntArray = searching.cKDTree(middle[rows]).query(points, k=few)[1]
+        index = rows[found.reshape(len(points), few)]
+        e, w = (b - a)[index], points[:, None] - a[index]
+        share = np.clip((w * e).sum(axis=2) / (e * e).sum(axis=2), 0, 1)
+        gap = np.linalg.norm(w - share[..., None] * e, axis=2)
+        away = np.linalg.norm(points[:, None] - middle[index], axis=2)
+        near = np.minimum(near, gap.min(axis=1))
+        is_far &= (away > 1.1 * half[index]).all(axis=1)
+    return is_far & (near > free)
+
+
+def _off_walls(points: FloatArray, walls: tuple[FloatArray, FloatArray]) -> FloatArray:
+    """(n, 3): 0 in directions in which a point on a face of the box would leave it, else 1."""
+    slack = 1e-9 * (walls[1] - walls[0])
+    on = (np.abs(points - walls[0]) <= slack) | (np.abs(points - walls[1]) <= slack)
+    return np.where(on, 0.0, 1.0)
+
+
+def _snapped(
+    function: LevelFunction,
+    points: FloatArray,
+    size: FloatArray,
+    free: FloatArray,
+    samples: Samples,
+    boundary: Boundary,
+    walls: tuple[FloatArray, FloatArray] | None,
+) -> tuple[FloatArray, Samples, BoolArray]:
+    """Points, with those near the level moved onto it, their samples, and which are on it."""
+    near = np.flatnonzero(samples.distance < _SNAPPED * size)
+    moved = newton(function, points[near], samples.some(near), 0.25 * size[near], walls)
+    there = function.at(moved)
+    apart = lengths(moved - points[near])
+    steep = lengths(there.gradient)
+    good = np.abs(there.value) < 1e-9 * np.maximum(steep * size[near], 1e-300)
+    good &= (apart < 1.5 * _SNAPPED * size[near]) & _is_far(moved, free[near], boundary)
+    rows = near[good]
+    points, is_on = points.copy(), np.zeros(len(points), np.bool_)
+    points[rows], is_on[rows] = moved[good], True
+    return points, samples.replaced(rows, there.some(good)), is_on
+
+
+def newton(
+    function: LevelFunction,
+    points: FloatArray,
+    samples: Samples,
+    longest: FloatArray,
+    walls: tuple[FloatArray, FloatArray] | None,
+    steps: int = 5,
+) -> FloatArray:
+    """Points (n, 3) after steps of Newton's method along the gradient towards the level, each no
+    longer than `longest` (n,). On walls they stay on them. Points are left alone after a step that
+    was so short that the next one, of its square, would be lost in rounding; and where there is no
+    finite step, as beside a pole."""
+    x, rows = points.copy(), np.arange(len(points))
+    for k in range(steps):
+        here = x[rows]
+        g = samples.gradient if walls is None else samples.gradient * _off_walls(here, walls)
+        square = dots(g, g)
+        with np.errstate(invalid="ignore", over="ignore"):
+            move = -(samples.value / np.maximum(square, 1e-300))[:, None] * g
+            length = lengths(move)
+        lost = ~np.isfinite(length)
+        move[lost], length[lost] = 0.0, 0.0
+        there = here + move * np.minimum(1, longest[rows] / np.maximum(length, 1e-300))[:, None]
+        x[rows] = there if walls is None else np.clip(there, *walls)
+        rows = rows[length > _CONVERGED * longest[rows]]
+        if k == steps - 1 or not len(rows):
+            break
+        samples = function.at(x[rows])
+    return x
+
+
+def to_multiple_roots(
+    function: LevelFunction, points: FloatArray, samples: Samples, longest: FloatArray
+) -> FloatArray:
+    """Points (n, 3) after steps towards the level as long as it takes where f - level is a power
+    u^m, to which Newton's shrink by 1 - 1/m only: to where a geometric series of two ends."""
+    x = points
+    for k in range(_SERIES):
+        first = newton(function, x, samples if k == 0 else function.at(x), longest, None, steps=1)
+        second = newton(function, first, function.at(first), longest, None, steps=1)
+        before, after = lengths(first - x), lengths(second - first)
+        ratio = after / np.maximum(before, 1e-300)
+        is_slow = (ratio > _RATES[0]) & (ratio < _RATES[1])
+        factor = np.where(is_slow, 1 / (1 - np.minimum(ratio, _RATES[1])), 1.0)
+        x = first + factor[:, None] * (second - first)
+    return x

@@ -1,0 +1,424 @@
+"""Patches over the holes of a mesh, on which its winding number is 1/2: spanning all holes at once.
+
+The 1/2 level of the winding number w modulo 1 is the 2 pi level of the solid angle of the boundary
+edges (`geometry.chains`), a smooth surface that ends at them. It is meshed with these very edges in
+it, and joined to the mesh by index. It joins the rims of a gap, where `hole_patches` closes each.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections import defaultdict
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from harnack.fields.solid_angles.solid_angle import SolidAngle
+from harnack.fields.solid_angles.winding_number import WindingNumber
+from harnack.geometry import MeshError
+from harnack.geometry.boundary_edges import singular_loops
+from harnack.meshing.checks import (
+    LocalError,
+    MeshingError,
+    TooLargeError,
+    check_manifold,
+    intersecting_faces,
+    may_help_again,
+    singular_vertices,
+)
+from harnack.meshing.delaunay_points import Boundary, Places, box_cells, place_points
+from harnack.meshing.edges import Edges, IntArray, crosses, directed_edges
+from harnack.meshing.level_function import LevelFunction
+from harnack.meshing.marching_tetrahedra import crossings_of, delaunay, triangles_of
+from harnack.meshing.refinement import far_places, improved, refined, smoothed
+
+if TYPE_CHECKING:
+    from harnack.backend import FloatArray
+
+__all__ = ["Asked", "HarmonicPatches", "harmonic_patches", "missing_triangles", "open_edges"]
+
+_LEVEL = 2 * math.pi
+# Cells across the holes at first.
+_ACROSS = 24
+# How often edges of holes that are too near to others are halved for the tetrahedra; but not to
+# more pieces than that, and so many for each edge: as many are cut where edges lie on each other.
+_MOST_CUTS, _MOST_PIECES, _MOST_PER_EDGE = 12, 20_000, 64
+# How often patches that meet the mesh are made again, of smaller cells.
+_MOST_MET = 1
+# How far w may be from 1/2, modulo 1, at vertices of patches.
+_NEAR = 1e-6
+
+
+@dataclass(frozen=True)
+class Asked:
+    """How patches are made.
+
+    tolerance: how far they may be from the surface, as a part of the size of the box around all
+        holes. spacing: of cells at first, or None. seed: of random moves. attempts: how many sizes
+        of cells are tried.
+    """
+
+    tolerance: float
+    spacing: float | None
+    seed: int
+    attempts: int
+    report: Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class HarmonicPatches:
+    """What is added.
+
+    vertices: (k, 3).
+    faces: (p, 3); indices below the number of given vertices are of these.
+    is_fine: whether they were refined to the tolerance.
+    missing: how many of the faces are triangles that holes of three edges lacked.
+    """
+
+    vertices: FloatArray
+    faces: IntArray
+    is_fine: bool
+    spacing: float
+    evaluations: int
+    missing: int = 0
+
+
+def harmonic_patches(
+    vertices: FloatArray, faces: IntArray, edges: IntArray, asked: Asked
+) -> HarmonicPatches:
+    """Patches that end at the open edges (k, 2) of a mesh, as its faces run them; or, where these
+    cannot be made, triangles in holes of three edges, and patches over the rest.
+
+    Raises:
+        MeshingError: they could not be made, or meet the mesh or each other.
+    """
+    try:
+        return _spanning(vertices, faces, edges, asked)
+    except MeshingError as error:
+        missing = missing_triangles(vertices, faces, edges)
+        if not len(missing):
+            raise
+        first = error
+    asked.report(f"once more, with triangles in {len(missing):,} holes of three edges")
+    together = np.concatenate([faces, missing])
+    try:
+        rest = _spanning(vertices, together, open_edges(together), asked)
+    except MeshingError as error:
+        raise MeshingError(
+            f"{first}; and with triangles in {len(missing):,} holes of three edges: {error}"
+        ) from error
+    both = np.concatenate([missing, rest.faces])
+    return dataclasses.replace(rest, faces=both, missing=len(missing))
+
+
+def _spanning(
+    vertices: FloatArray, faces: IntArray, edges: IntArray, asked: Asked
+) -> HarmonicPatches:
+    """Patches that end at open edges; cells are made smaller where checks fail.
+
+    Raises:
+        MeshingError: as `harmonic_patches`.
+    """
+    if not len(edges):
+        return HarmonicPatches(vertices[:0], faces[:0], True, 0.0, 0)
+    loops = singular_loops(edges, np.ones(len(edges), np.int64))
+    function = LevelFunction(SolidAngle([vertices[loop] for loop in loops]), _LEVEL)
+    size = float(np.ptp(vertices[np.unique(edges)], axis=0).max())
+    cell = size / _ACROSS if asked.spacing is None else float(asked.spacing)
+    report, tolerance = asked.report, asked.tolerance * size
+    finer: tuple[Places, ...] = ()
+    times_met, seed, before = 0, asked.seed, None
+    for attempt in range(asked.attempts):
+        last = attempt == asked.attempts - 1
+        report(f"cells of {cell:.3g}" + ", smaller in places" * bool(finer))
+        try:
+            patches = _patches(
+                function, vertices, edges, cell, finer, tolerance, seed, last, report
+            )
+            _check(vertices, faces, patches, report)
+        except LocalError as error:
+            times_met += isinstance(error, _MetError)
+            is_hopeless, before = not may_help_again(error, before), error
+            if last or is_hopeless or times_met > _MOST_MET:
+                place = ", ".join(f"{c:.4g}" for c in error.places[0])
+                raise MeshingError(
+                    f"{error} (cells were {cell:.3g} wide, and smaller in {len(error.places)} "
+                    f"places, such as near ({place}))"
+                ) from None
+            report(f"{error} ({len(error.places)} places)")
+            finer = (*finer, Places(error.places, 2 * cell * 0.5 ** len(finer)))
+        except TooLargeError:
+            raise
+        except MeshingError as error:  # a point lies where the function is too inaccurate
+            if last:
+                raise
+            report(f"{error}; once more, with points moved at random in another way")
+            seed += 1
+        else:
+            return patches
+    raise AssertionError("unreachable: the last attempt returns or raises")
+
+
+class _MetError(LocalError):
+    """Patches intersect the mesh."""
+
+
+def open_edges(faces: IntArray) -> IntArray:
+    """(k, 2): edges of one face, in its direction.
+
+    Raises:
+        MeshError: an edge of more than two faces, or of two that have it in the same direction.
+    """
+    pairs = directed_edges(faces)
+    edges = Edges.of(pairs)
+    index, uses = edges.index, edges.uses
+    several = np.flatnonzero(uses > 2)
+    if len(several):
+        a, b = edges.ends[several[0]].tolist()
+        raise MeshError(
+            f"{len(several):,} edges have more than two faces, the first of them between vertices "
+            f"{a} and {b}: such a mesh has no two sides there, and where all faces are kept none "
+            "are left out"
+        )
+    sign = np.bincount(index, np.where(pairs[:, 0] < pairs[:, 1], 1, -1), minlength=len(uses))
+    turned = np.flatnonzero((uses == 2) & (sign != 0))
+    if len(turned):
+        a, b = edges.ends[turned[0]].tolist()
+        raise MeshError(
+            f"the faces at {len(turned):,} edges do not agree which side is outside, the first of "
+            f"them between vertices {a} and {b}, and where all faces are kept none are turned over"
+        )
+    return pairs[uses[index] == 1]
+
+
+def missing_triangles(vertices: FloatArray, faces: IntArray, edges: IntArray) -> IntArray:
+    """The triangles (k, 3) that holes of three edges lack, where these pass through no others.
+
+    edges: (n, 2) open ones, as the faces run them.
+    """
+    leads: dict[int, set[int]] = defaultdict(set)
+    for a, b in edges.tolist():
+        leads[a].add(b)
+    there = {tuple(sorted(face)) for face in faces.tolist()}
+    found: list[tuple[int, int, int]] = []
+    for a, b in edges.tolist():
+        for c in leads[b]:
+            if a in leads[c] and tuple(sorted((a, b, c))) not in there and b in leads[a]:
+                found.append((a, c, b))
+                for one, other in ((a, b), (b, c), (c, a)):
+                    leads[one].discard(other)
+                break
+    made = np.array(found, np.int64).reshape(-1, 3)
+    corners = vertices[made]
+    made = made[np.linalg.norm(_normals(corners), axis=1) > 0]
+    together = np.concatenate([faces, made])
+    is_made = np.arange(len(together)) >= len(faces)
+    met = np.setdiff1d(intersecting_faces(vertices, together, is_made), np.arange(len(faces)))
+    return np.delete(made, met - len(faces), axis=0)
+
+
+def _patches(
+    function: LevelFunction,
+    vertices: FloatArray,
+    edges: IntArray,
+    spacing: float,
+    finer: tuple[Places, ...],
+    tolerance: float,
+    seed: int,
+    last: bool,
+    report: Callable[[str], None],
+) -> HarmonicPatches:
+    """The level set, ending at the edges (k, 2) of the mesh.
+
+    last: whether patches that cannot be refined will do.
+
+    Raises:
+        MeshingError: as `mesh`; or Delaunay's tetrahedra lack an edge.
+    """
+    rim, place = np.unique(edges, return_inverse=True)
+    boundary = Boundary(vertices[rim], place.reshape(-1, 2))
+    hull: Any = function.field.extent((_LEVEL,))
+    lower, upper = (np.array(end, np.float64) for end in hull.bounds())
+    root = box_cells(lower - 0.5 * spacing, upper + 0.5 * spacing, spacing, exact=False)
+    cut, middles = boundary, np.zeros((0, 2), np.int64)
+    points = place_points(function, root, cut, None, seed, finer)
+    tets = delaunay(points.points)
+    for _ in range(_MOST_CUTS):
+        lacks = ~tets.has_edges(cut.edges)
+        if not lacks.any():
+            break
+        if len(cut.edges) > min(_MOST_PIECES, _MOST_PER_EDGE * len(edges)):
+            raise TooLargeError(
+                f"{len(edges):,} boundary edges of the mesh lie on others or next to them: cut to "
+                f"{len(cut.edges):,} pieces some are still too near to others for a patch that "
+                "ends at them; join or remove the triangles there"
+            )
+        middles = np.concatenate([middles, cut.edges[lacks]])
+        cut = cut.split(lacks)
+        points = place_points(function, root, cut, None, seed, finer)
+        tets = delaunay(points.points)
+    lacks = ~tets.has_edges(cut.edges)
+    if lacks.any():
+        raise LocalError(
+            f"{int(lacks.sum())} boundary edges of the mesh are too near to others for a patch "
+            "that ends at them: subdivide the mesh there, or choose a smaller `spacing`",
+            cut.points[cut.edges[lacks]].mean(axis=1),
+        )
+    report(f"{len(points.points):,} points, {len(tets.corners):,} tetrahedra")
+    x, faces = triangles_of(function, points, tets, crossings_of(function, points, tets))
+    for k, ends in reversed(list(enumerate(middles.tolist(), start=len(rim)))):
+        faces = _collapsed(x, faces, k, ends)
+    if not len(faces):
+        raise LocalError("no patch was found: choose a smaller `spacing`", boundary.points)
+    _check_boundary(x, faces, boundary)
+    is_fine = True
+    try:
+        x, faces = _finished(function, x, faces, tolerance, report)
+    except LocalError:
+        if not last or len(intersecting_faces(x, faces)):
+            raise
+        is_fine = False
+    # Faces of level sets are seen from where w is greater, those of meshes from outside.
+    faces = faces[:, ::-1]
+    kept = np.unique(faces)
+    inner = kept[kept >= len(rim)]
+    index = np.full(len(x), -1, np.int64)
+    index[: len(rim)] = rim
+    index[inner] = len(vertices) + np.arange(len(inner))
+    return HarmonicPatches(x[inner], index[faces], is_fine, spacing, function.evaluations)
+
+
+def _finished(
+    function: LevelFunction,
+    x: FloatArray,
+    faces: IntArray,
+    tolerance: float,
+    report: Callable[[str], None],
+) -> tuple[FloatArray, IntArray]:
+    """Vertices and faces of patches refined to the tolerance: smoothed and improved, or only
+    smoothed, or as they are, whichever first does not pass through itself.
+
+    Raises:
+        MeshingError: all do, as small triangles turn over each other beside sharp corners of holes.
+    """
+    bad = x[:0]
+    for way in ("improving", "smoothing", "refining alone"):
+        report(way)
+        finer, split = (x if way == "refining alone" else smoothed(function, x, faces, None)), faces
+        finer, split = refined(function, finer, split, 0.5 * tolerance, None, report)
+        far = far_places(function, finer, split, 0.5 * tolerance)
+        if len(far):  # the patch takes another way than the surface, or connects two of its sheets
+            raise LocalError(
+                f"{len(far):,} triangles of patches do not come near the surface, however they are "
+                "cut: subdivide the mesh there, or choose a smaller `spacing`",
+                far,
+            )
+        if way == "improving":
+            finer, split = improved(function, finer, split, 0.5 * tolerance, None, report)
+        elif way == "smoothing":
+            finer = smoothed(function, finer, split, None)
+        met = finer[split[intersecting_faces(finer, split)]].mean(axis=1)
+        bad = np.concatenate([met, finer[_new_singular(faces, split)]])
+        if not len(bad):
+            return finer, split
+    raise LocalError("the patches meet each other: choose a smaller `spacing`", bad)
+
+
+def _new_singular(before: IntArray, after: IntArray) -> IntArray:
+    """Vertices at which faces are not a manifold any more; holes may touch in others."""
+    return np.setdiff1d(singular_vertices(after), singular_vertices(before))
+
+
+def _collapsed(x: FloatArray, faces: IntArray, middle: int, ends: list[int]) -> IntArray:
+    """The faces with a vertex in the middle of a boundary edge moved to one of its ends: that with
+    which fewer faces meet or, if they are as many, the faces around it are turned less.
+
+    Raises:
+        MeshingError: both ends would join more than the two faces at the edge.
+    """
+    around = (faces == middle).any(axis=1)
+    star, rest = faces[around], faces[~around]
+    found: list[tuple[int, float, IntArray]] = []
+    for end in ends:
+        joined = (faces == end).any(axis=1)
+        if len(np.intersect1d(star, faces[joined])) != 3:  # these two, and the face's third corner
+            continue
+        moved = np.where(star == middle, end, star)
+        kept = ~(star == end).any(axis=1)
+        one, other = _normals(x[star[kept]]), _normals(x[moved[kept]])
+        turned = float((one * other).sum(axis=1).min(initial=1.0))
+        made = np.concatenate([rest, moved[kept]])
+        is_moved = np.arange(len(made)) >= len(rest)
+        found.append((len(intersecting_faces(x, made, is_moved)), -turned, made))
+    if not found:
+        raise LocalError(
+            "boundary edges of the mesh are too near to others for patches that end at them: "
+            "subdivide the mesh there, or choose a smaller `spacing`",
+            x[[middle]],
+        )
+    return min(found, key=lambda one: one[:2])[2]
+
+
+def _normals(corners: FloatArray) -> FloatArray:
+    """Unit normals of triangles (m, 3, 3), 0 of those without an area."""
+    normal = crosses(corners)
+    return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
+
+
+def _check_boundary(x: FloatArray, faces: IntArray, boundary: Boundary) -> None:
+    """Raise unless patches end at the boundary, and run each of its edges as the mesh does: they
+    are reversed afterwards."""
+    directed = {(int(a), int(b)) for a, b in directed_edges(faces)}
+    rim = {(a, b) for a, b in directed if (b, a) not in directed}
+    wrong = rim ^ {(int(a), int(b)) for a, b in boundary.edges}
+    if wrong:
+        raise LocalError(
+            "the patches do not end at the edges of the holes: cells are too large for them; "
+            "choose a smaller `spacing`",
+            x[np.array(sorted(wrong))].mean(axis=1),
+        )
+
+
+def _check(
+    vertices: FloatArray,
+    faces: IntArray,
+    patches: HarmonicPatches,
+    report: Callable[[str], None],
+) -> None:
+    """Raise unless the mesh with its patches is what `repair` promises.
+
+    Raises:
+        MeshingError: it is not.
+    """
+    report("checking the patches")
+    x = np.concatenate([vertices, patches.vertices])
+    together = np.concatenate([faces, patches.faces])
+    try:
+        check_manifold(together)
+    except MeshingError as error:
+        raise LocalError(str(error), x[singular_vertices(together)]) from None
+    added = patches.vertices
+    w = WindingNumber(vertices, faces).value(added, precision="double")
+    off = np.abs(w - np.floor(w) - 0.5)
+    if not (off <= _NEAR).all():
+        raise LocalError(
+            f"the winding number is off 1/2 by {off.max():.2g} at a vertex of the patches: choose "
+            "a smaller `spacing`",
+            added[off > _NEAR],
+        )
+    is_patch = np.arange(len(together)) >= len(faces)
+    met = intersecting_faces(x, together, is_patch)
+    if not len(met):
+        return
+    places = x[together[met[is_patch[met]]]].mean(axis=1)
+    if is_patch[met].all():
+        raise LocalError("the patches meet each other: choose a smaller `spacing`", places)
+    raise _MetError(
+        f"the patches meet {int((~is_patch[met]).sum()):,} triangles of the mesh, where the "
+        "winding number jumps: the hole cannot be closed by its 1/2 level alone; remove the "
+        "triangles that stand in it, or draw the mesh with WindingNumber, which needs no repair",
+        places,
+    )

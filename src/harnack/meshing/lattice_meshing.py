@@ -1,0 +1,740 @@
+"""Triangles of a real-valued level set in the tetrahedra of a lattice, and checks of them.
+
+Points of the lattice near the level set are moved onto it and become vertices, which makes most
+slivers go (Labelle and Shewchuk 2007). Where parts of the surface then touch in a vertex or an
+edge, points are put back until they do not. With none moved the surface is a manifold: every
+tetrahedron is cut by one triangle or quadrilateral, and signs at its corners alone say how.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+
+from harnack.backend import BoolArray, FloatArray
+from harnack.meshing.bcc_lattice import Lattice, distinct_rows
+from harnack.meshing.checks import HopelessError, MeshingError, TooLargeError, singular_vertices
+from harnack.meshing.delaunay_points import Boundary, PointSet, newton, to_multiple_roots
+from harnack.meshing.edges import IntArray, distinct, lengths, numbered
+from harnack.meshing.isotopy import Isotopy, isotopy_of
+from harnack.meshing.level_function import LevelFunction, Samples
+from harnack.meshing.marching_tetrahedra import (
+    BEYOND,
+    Tetrahedra,
+    crossings_of,
+    triangles_of,
+)
+from harnack.meshing.refinement import refined, smoothed, smoothed_within
+
+if TYPE_CHECKING:
+    from harnack.tree.empty_space import Clearance
+
+__all__ = [
+    "Elsewhere",
+    "MissedError",
+    "Surface",
+    "check_nothing_missed",
+    "check_size",
+    "closed_surface",
+    "cut_where_far",
+    "open_surface",
+]
+
+# Lengths in cells, for points of missed parts: how near the level seems to a lattice point; how far
+# the point may be moved to it; how far a point that is found has to be from all triangles, by their
+# corners and centers, which are less than half a cell from all that is on them; and from the faces
+# of the box, beyond which there may be more.
+_NEAR, _FOUND, _APART, _DEEP = 1.0, 1.5, 0.75, 0.5
+# Points nearer than the first belong together; parts at least as long as the second are missed.
+_TOGETHER, _LONG = 1.0, 2.0
+# Parts thinner than this many cells are missed nearly everywhere; and the thinnest measured.
+_THIN, _LEAST = 0.25, 2.0**-7
+# How near to the level, in cells, a point has to come by Newton's method.
+_ON = 1e-3
+# Newton's method may be on the way to a multiple root where it came nearer by that much.
+_SLOW = 0.7
+# Where the function touches its level: how many points are tried; how far beside them, in cells,
+# the function is looked at; golden sections; and how near it comes, as a part of what it is there.
+_MOST_TRIED, _BESIDE, _SECTIONS, _GOLDEN, _TOUCHES = 60, 0.01, 40, 0.6180339887498949, 1e-8
+# So large a part of vertices may be farther from the level than that many cells: where signs change
+# by a jump.
+_MOST_JUMPS, _FAR = 0.04, 0.1
+# A function that is its level at a larger part of so many points has no surface there.
+_MOST_FLAT, _MOST_PROBES = 0.75, 2000
+# How far around a point, in cells, the function has to be its level for that to be a volume.
+_FLAT_AROUND = 0.25
+
+
+class MissedError(MeshingError):
+    """A level set of which some parts lie between the points of a lattice.
+
+    places: (k, 3) of the longest one, on the level; thickness: (k,) of the part there, a multiple
+        of `_LEAST` cells: 0 where it is thinner, inf where it is thicker than a cell.
+    size: of cells.
+    """
+
+    def __init__(
+        self, message: str, places: FloatArray, thickness: FloatArray, size: float
+    ) -> None:
+        super().__init__(message)
+        self.places, self.thickness, self.size = places, thickness, size
+
+    def is_mended_by(self, smaller: float) -> bool:
+        """Not if these cells would miss a part of it as well, two of them long and far thinner than
+        one: as beside a cusp or a cone's tip, which cells of no size show."""
+        thin = self.places[self.thickness < _THIN * smaller * self.size]
+        part = _longest_part(thin, _TOGETHER * self.size)
+        reach = float(np.ptp(part, axis=0).max()) if len(part) else 0.0
+        return reach < _LONG * smaller * self.size
+
+
+def check_nothing_missed(
+    function: LevelFunction,
+    points: FloatArray,
+    samples: Samples,
+    is_beside: BoolArray,
+    surface: tuple[FloatArray, IntArray],
+    size: float,
+    box: tuple[FloatArray, FloatArray],
+    elsewhere: Clearance | None = None,
+) -> None:
+    """Raise if the level set has parts, two cells long or longer, away from its triangles: thin
+    walls, knife edges, islands.
+
+    Signs at the points of a lattice do not show a wall between two of them. Its sides are found
+    from there by Newton's method: where that ends, on the level, should be near triangles. So many
+    points are a dense sample, and no proof. Islands smaller than a cell may be missed.
+
+    samples: at points (n, 3) of the lattice. is_beside: (n,) those of tetrahedra that are cut.
+    surface: vertices and faces. size: of a cell. box: where the level set counts; elsewhere: and
+        how far around points it does not.
+
+    Raises:
+        MissedError: with one of the places. HopelessError: the function is its level in a volume,
+            or touches it along a surface.
+    """
+    import scipy.spatial  # here: half a second that few need
+
+    searching: Any = scipy.spatial
+    rows = np.flatnonzero(~is_beside & (samples.distance < _NEAR * size))
+    if not len(rows):
+        return
+    start = points[rows]
+    step = np.full(len(rows), 0.5 * size)
+    x = newton(function, start, samples.some(rows), step, None)
+    left = function.at(x)
+    found = left.distance < _ON * size
+    slow = ~found & (left.distance < _SLOW * samples.distance[rows])
+    if slow.any():
+        x[slow] = to_multiple_roots(function, x[slow], left.some(slow), step[slow])
+        found[slow] = function.at(x[slow]).distance < _ON * size
+    found &= lengths(x - start) < _FOUND * size
+    deep = _DEEP * size
+    found &= ((x >= box[0] + deep) & (x <= box[1] - deep)).all(axis=1)
+    x = x[found]
+    vertices, faces = surface
+    if len(faces) and len(x):
+        around = np.concatenate([vertices[np.unique(faces)], vertices[faces].mean(axis=1)])
+        x = x[searching.cKDTree(around).query(x)[0] > _APART * size]
+    if elsewhere is not None and len(x):
+        x = x[elsewhere(x) <= 0]
+    part = _longest_part(x, _TOGETHER * size)
+    if len(part) and np.ptp(part, axis=0).max() >= _LONG * size:
+        _check_off_level_around(function, part, _FLAT_AROUND * size)
+        _check_passes_level(function, part, size)
+        a, b, c = part[0]
+        raise MissedError(
+            f"cells of {size:.3g} miss parts of the level set, such as that at ({a:.4g}, {b:.4g}, "
+            f"{c:.4g}), which are thinner or smaller: choose a smaller `spacing`, or for a wall or "
+            "an edge make the solid of smooth parts, such as hk.solid(f, between=(low, high)) or "
+            "hk.solid(f, below=0) & hk.solid(g, below=0)",
+            part,
+            _thickness(function, part, size),
+            size,
+        )
+
+
+def _thickness(function: LevelFunction, x: FloatArray, size: float) -> FloatArray:
+    """(k,) how far points (k, 3) on the level are from where the sign changes again along the
+    slope, up to `size`: 0 where it does not change at the point itself, inf where not again."""
+    slope = function.at(x).gradient
+    way = slope / np.maximum(lengths(slope), 1e-300)[:, None]
+    far = size * 2.0 ** np.arange(round(math.log2(_LEAST)), 1)
+    sides: list[BoolArray] = []
+    least = np.full(len(x), np.inf)
+    for sign in (1.0, -1.0):
+        there = x[:, None] + sign * far[:, None] * way[:, None]
+        is_above = function.values(there.reshape(-1, 3)).reshape(len(x), len(far)) > 0
+        changed = is_above != is_above[:, :1]
+        first = far[changed.argmax(axis=1)]
+        least = np.minimum(least, np.where(changed.any(axis=1), first, np.inf))
+        sides.append(is_above[:, 0])
+    return np.where(sides[0] == sides[1], 0.0, least)
+
+
+def _check_off_level_around(function: LevelFunction, part: FloatArray, reach: float) -> None:
+    """Raise if the function is its level, up to rounding, at most of some points (n, 3) and on all
+    sides of them: such as max(x, 0), of which no cells are small enough."""
+    some = part[:: -(-len(part) // _MOST_PROBES)]
+    ways = reach * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
+    around = (some[:, None] + ways).reshape(-1, 3)
+    is_flat = function.is_on_level(around).reshape(len(some), -1).all(axis=1)
+    if is_flat.mean() > 0.5:
+        a, b, c = some[is_flat][0]
+        raise HopelessError(
+            f"{type(function.field).__name__} is {function.level:g}, up to rounding, at and around "
+            f"points such as ({a:.4g}, {b:.4g}, {c:.4g}): its level there is a volume and no "
+            "surface; choose another level"
+        )
+
+
+def _check_passes_level(function: LevelFunction, part: FloatArray, size: float) -> None:
+    """Raise if the function touches its level at most of some points (n, 3) near it, and does not
+    pass it, as a square does, whose sign no cells show.
+
+    Across such a point, on a line along the slope beside it, the function is on one side of the
+    level, and where it comes nearest, by golden sections, it is as near as rounding lets it.
+    """
+    x = part[:: -(-len(part) // _MOST_TRIED)]
+    half = _BESIDE * size
+    beside = function.at((x[:, None] + half * np.eye(3)).reshape(-1, 3)).gradient.reshape(-1, 3, 3)
+    steepest = beside[np.arange(len(x)), (beside**2).sum(axis=2).argmax(axis=1)]
+    way = steepest / np.maximum(lengths(steepest), 1e-300)[:, None]
+
+    def along(s: FloatArray) -> FloatArray:
+        return function.values(x + s[:, None] * way)
+
+    low, high = np.full(len(x), -half), np.full(len(x), half)
+    side = np.sign(along(low))
+    ends = np.minimum(side * along(low), side * along(high))
+    nearest = ends.copy()
+    for _ in range(_SECTIONS):
+        s, t = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
+        near_low, near_high = side * along(s), side * along(t)
+        nearest = np.minimum(nearest, np.minimum(near_low, near_high))
+        low, high = np.where(near_low > near_high, s, low), np.where(near_low > near_high, high, t)
+    touches = (ends > 0) & (nearest >= 0) & (nearest <= _TOUCHES * ends)
+    if touches.mean() > 0.5:
+        a, b, c = x[touches][0]
+        name, level = type(function.field).__name__, function.level
+        raise HopelessError(
+            f"{name} comes to {level:g} without passing it, as a square does, at points such as "
+            f"({a:.4g}, {b:.4g}, {c:.4g}): the surface there has one side only and no mesh finds "
+            "it. Give a function that changes its sign there, such as u instead of u^2, or mesh a "
+            f"thin wall, such as hk.solid(f, between=({level:g} - t, {level:g} + t)) with a small t"
+        )
+
+
+def _longest_part(x: FloatArray, apart: float) -> FloatArray:
+    """Of points (n, 3) those of the longest chain of which neighbors are no farther apart."""
+    import scipy.sparse  # here: half a second that few need
+    import scipy.sparse.csgraph as csgraph_module
+    import scipy.spatial
+
+    sparse, csgraph, searching = (
+        cast("Any", one) for one in (scipy.sparse, csgraph_module, scipy.spatial)
+    )
+    if not len(x):
+        return x
+    one, other = searching.cKDTree(x).query_pairs(apart, output_type="ndarray").T
+    joined = sparse.coo_matrix((np.ones(len(one)), (one, other)), shape=(len(x), len(x)))
+    count, part = csgraph.connected_components(joined, directed=False)
+    low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
+    np.minimum.at(low, part, x)
+    np.maximum.at(high, part, x)
+    return x[part == (high - low).max(axis=1).argmax()]
+
+
+def check_size(
+    function: LevelFunction, vertices: FloatArray, faces: IntArray, tolerance: float
+) -> None:
+    """Raise if refinement would make more triangles of these than the function allows: an estimate,
+    before they are made.
+
+    How far the middle of a triangle is from the surface falls with its area: one that is k times
+    the tolerance away takes about k others. One triangle in several is examined.
+
+    Raises:
+        MeshingError: the function has no slope between the vertices.
+        TooLargeError: with the estimate, and a tolerance that would do.
+    """
+    some = faces[:: max(1, len(faces) // 20_000)]
+    if not len(some):
+        return
+    corner = vertices[some]
+    at = function.at(0.5 * (corner + np.roll(corner, 1, axis=1)).reshape(-1, 3))
+    is_flat = (at.value != 0) & ~at.gradient.any(axis=1)
+    if is_flat.any():
+        raise MeshingError(
+            f"{type(function.field).__name__} is constant at {is_flat.sum():,} of "
+            f"{len(is_flat):,} middles of edges, so that it does not say how far the surface is: "
+            "choose a smaller `spacing`, or a function with a slope within a cell of its surface"
+        )
+    middle = at.distance
+    ratio = middle.reshape(-1, 3).max(axis=1) / tolerance
+    expected = float(np.maximum(1.0, ratio).mean()) * len(faces)
+    most = function.most_faces
+    if expected > most:
+        enough = expected / most
+        raise TooLargeError(
+            f"the tolerance takes about {expected:.1e} triangles, and max_triangles is {most:,}: "
+            f"choose a `tolerance` {enough:.2g} times as large, or a larger max_triangles"
+        )
+
+
+# Points this near to the level, in parts of the length of a cell, are moved onto it.
+_SNAPPED = 0.25
+# So many cells around what matters are made as if they did.
+_BORDER = 2.0
+# So many cells along an edge of a block.
+_BLOCK = 8
+_MOST_ROUNDS = 20
+
+
+@dataclass(frozen=True)
+class Surface:
+    """vertices: (n, 3). faces: (m, 3), counter-clockwise as seen from where f is greater."""
+
+    vertices: FloatArray
+    faces: IntArray
+
+    @classmethod
+    def of(cls, vertices: FloatArray, faces: IntArray) -> Surface:
+        """Without the vertices that are not in use."""
+        used = np.flatnonzero(np.bincount(faces.ravel()))
+        place = np.full(len(vertices), -1, np.int64)
+        place[used] = np.arange(len(used))
+        return cls(vertices[used], place[faces])
+
+    def reversed(self) -> Surface:
+        """With the faces' other side outside."""
+        return Surface(self.vertices, self.faces[:, ::-1])
+
+
+@dataclass(frozen=True)
+class Elsewhere:
+    """Where nothing matters, of one or several surfaces: how far around points (k, 3) nothing does.
+
+    found: the cells of lattices that are not proved to be there, each looked for once.
+    """
+
+    clearance: Clearance
+    found: dict[tuple[float, ...], IntArray] = dataclasses.field(
+        default_factory=dict[tuple[float, ...], IntArray]
+    )
+
+    def cells_beside(self, lattice: Lattice, most: int) -> IntArray:
+        """(n, 3) indices of the cells that are not there, and of some around them.
+
+        Raises:
+            MeshingError: there are more than `most` triangles would take.
+        """
+        key = (*lattice.lower.tolist(), *lattice.size.tolist(), *lattice.counts.tolist(), most)
+        if key not in self.found:
+            border = _BORDER * float(lattice.size.max())
+            self.found[key] = lattice.cells_not_empty(
+                lambda points: self.clearance(points) - border, most
+            )
+        return self.found[key]
+
+
+def open_surface(
+    function: LevelFunction, lattice: Lattice, tolerance: float, report: Callable[[str], None]
+) -> tuple[Surface, Isotopy]:
+    """The level set in the box of a lattice, which ends on the box's faces; and what is proved of
+    it, before it is refined.
+
+    tolerance: of the middles of edges and faces, a length.
+
+    Raises:
+        MeshingError: no cell is cut, or there are too many; a HopelessError where the function is
+            not finite, or its level is a volume.
+    """
+    walls = lattice.lower, lattice.upper
+    cells = lattice.cells_not_empty(function.clearance, function.most_faces)
+    coordinates, corners = lattice.tetrahedra(cells)
+    points = lattice.points(coordinates)
+    report(f"{len(points):,} points, {len(corners):,} tetrahedra")
+    nowhere = np.zeros(len(points), np.bool_)
+    samples = _sampled(function, points, lattice, nowhere)
+    first = _marched(function, points, samples, corners, nowhere, nowhere, lattice, walls)
+    vertices, faces = first.vertices, first.faces
+    _check_nothing_missed(function, points, samples, corners, first, faces, lattice, walls)
+    if not len(faces):
+        raise MeshingError("the level set is empty: no cell of the box holds the level")
+    _check_is_continuous(function, vertices, faces, lattice)
+    check_size(function, vertices, faces, tolerance)
+    none = Boundary(np.zeros((0, 3)), np.zeros((0, 2), np.int64))
+    size = float(lattice.size.max())
+    cut = first.is_cut(corners)
+    isotopy = isotopy_of(function, first.points, corners, cut, faces, none, size, walls)
+    vertices = smoothed(function, vertices, faces, walls)
+    vertices, faces = refined(function, vertices, faces, tolerance, walls, report)
+    vertices = smoothed_within(function, vertices, faces, walls, tolerance)
+    return Surface.of(vertices, faces), isotopy
+
+
+def closed_surface(
+    function: LevelFunction,
+    lattice: Lattice,
+    tolerance: float,
+    report: Callable[[str], None],
+    *,
+    as_cut: bool = False,
+    elsewhere: Elsewhere | None = None,
+) -> Surface:
+    """The boundary of the points of a lattice's box where the function is negative.
+
+    On the box it is made of the faces of the cells whose centers are negative, as if the points of
+    the lattice there were on the level. Triangles in the two outermost layers of cells are coarse
+    and may touch in vertices: they are to be cut away. There are no faces if the function is
+    nowhere negative.
+
+    as_cut: leave the triangles as the cells cut them, which never pass through each other, and
+        leave out what lies between points of the lattice: for functions with creases everywhere, as
+        distances from meshes have, and cells of about the tolerance.
+    elsewhere: where nothing matters: there, but for a few cells at the border, the function counts
+        as positive, and the surface is closed by coarse triangles.
+
+    Raises:
+        MeshingError: too many cells.
+    """
+    most, does_matter = function.most_faces, None
+    if elsewhere is None:
+        cells = lattice.cells_not_empty(function.clearance, most)
+    else:
+        cells, does_matter = lattice.cells_that_matter(
+            function.clearance, elsewhere.cells_beside(lattice, most), function.values, most
+        )
+    outer = lattice.outer_cells()
+    if does_matter is not None:
+        outer = outer[does_matter[tuple(outer.T)]]
+    outer = outer[_are_negative(function, lattice, outer)]
+    coordinates, corners = lattice.tetrahedra(distinct_rows(np.concatenate([cells, outer])))
+    points = lattice.points(coordinates)
+    report(f"{len(points):,} points, {len(corners):,} tetrahedra")
+    is_wall = lattice.is_outer(coordinates)
+    is_fixed = is_wall | ((coordinates == 1) | (coordinates == 2 * lattice.counts - 1)).any(axis=1)
+    is_beyond = np.zeros(len(points), np.bool_)
+    if does_matter is not None:
+        is_beyond = lattice.beside(coordinates, ~does_matter) & ~is_wall
+    samples = _sampled(function, points, lattice, is_beyond)
+    first = _marched(
+        function, points, samples, corners, is_fixed | is_beyond, is_wall, lattice, None
+    )
+    vertices, faces = first.vertices, first.faces
+    is_coarse = first.is_beside(is_wall | is_beyond)
+    is_cap = is_coarse[faces].any(axis=1)
+    rest, caps = faces[~is_cap], [faces[is_cap], _wall_faces(points, samples, corners, is_wall)]
+    inner = lattice.lower + 2 * lattice.size, lattice.upper - 2 * lattice.size
+    if as_cut:
+        return Surface.of(vertices, np.concatenate([rest, *caps]))
+    _check_nothing_missed(
+        function, points, samples, corners, first, faces, lattice, inner,
+        None if elsewhere is None else elsewhere.clearance,
+    )  # fmt: skip
+    # What ends at the outermost cells is moved and cut, its ends are not.
+    if len(rest):
+        _check_is_continuous(function, vertices, rest, lattice)
+        check_size(function, vertices, rest, tolerance)
+        vertices = smoothed(function, vertices, rest, None)
+        counts = _inside(lattice, does_matter)
+        vertices, rest = refined(function, vertices, rest, tolerance, None, report, counts)
+        vertices = smoothed_within(function, vertices, rest, None, tolerance, counts)
+    faces = np.concatenate([rest, *caps])
+    return Surface.of(vertices, faces) if len(faces) else Surface(np.zeros((0, 3)), faces)
+
+
+def cut_where_far(
+    function: LevelFunction, surface: Surface, farthest: float, times: int
+) -> Surface:
+    """Faces whose center is farther than that from the level, as across a crease, cut into three at
+    a point on it; so are the new ones, a few times. All edges stay."""
+    vertices, faces = surface.vertices, surface.faces
+    asked = np.arange(len(faces))
+    for _ in range(times):
+        corner = vertices[faces[asked]]
+        center = corner.mean(axis=1)
+        samples = function.at(center)
+        far = np.flatnonzero(samples.distance > farthest)
+        if not len(far):
+            break
+        span = 0.5 * lengths(corner[far, 1] - corner[far, 0])
+        moved = newton(function, center[far], samples.some(far), span, None)
+        rows, inner = asked[far], len(vertices) + np.arange(len(far))
+        a, b, c = faces[rows].T
+        vertices = np.concatenate([vertices, moved])
+        fans = [np.stack([*ends, inner], axis=1) for ends in ((a, b), (b, c), (c, a))]
+        faces = np.concatenate([np.delete(faces, rows, axis=0), *fans])
+        asked = np.arange(len(faces) - 3 * len(rows), len(faces))
+    return Surface(vertices, faces)
+
+
+def _are_negative(function: LevelFunction, lattice: Lattice, cells: IntArray) -> BoolArray:
+    """(k,) whether the centers of cells (k, 3) are negative: as those of blocks of cells, where it
+    is proved that the level is not in the block."""
+    shape = lattice.counts // _BLOCK + 1
+    x, y, z = (cells // _BLOCK).T
+    keys, index, _, _ = numbered((x * shape[1] + y) * shape[2] + z)
+    rest, z = np.divmod(keys, shape[2])
+    blocks = np.stack([*np.divmod(rest, shape[1]), z], axis=1)
+    centers = lattice.points(_BLOCK * (2 * blocks + 1))
+    half_diagonal = 0.5 * _BLOCK * float(np.linalg.norm(lattice.size))
+    is_sure = function.clearance(centers) > half_diagonal * (1 + 1e-9)
+    negative = (function.values(centers) <= 0)[index]
+    open_rows = np.flatnonzero(~is_sure[index])
+    negative[open_rows] = function.values(lattice.points(2 * cells[open_rows] + 1)) <= 0
+    return negative
+
+
+def _check_nothing_missed(
+    function: LevelFunction,
+    points: FloatArray,
+    samples: Samples,
+    corners: IntArray,
+    first: _First,
+    faces: IntArray,
+    lattice: Lattice,
+    box: tuple[FloatArray, FloatArray],
+    elsewhere: Clearance | None = None,
+) -> None:
+    # Tetrahedra with corners on both sides; those with corners on the level may have no face.
+    side = np.where(first.points.is_on, 0.0, np.sign(first.points.samples.value))[corners]
+    is_beside = np.zeros(len(points), np.bool_)
+    is_beside[corners[(side.min(axis=1) < 0) & (side.max(axis=1) > 0)]] = True
+    surface = first.vertices, faces
+    size = float(lattice.size.max())
+    check_nothing_missed(function, points, samples, is_beside, surface, size, box, elsewhere)
+
+
+def _inside(lattice: Lattice, does_matter: BoolArray | None) -> Callable[[FloatArray], BoolArray]:
+    """Which points are farther than one and a half cells from the box, and neither in nor beside
+    cells that do not matter (counts).
+
+    Triangles that end in the outermost cells would be cut again and again: the edge they end with
+    stays as it is, and their centers are no deeper than that.
+    """
+    lower, upper = lattice.lower + 1.5 * lattice.size, lattice.upper - 1.5 * lattice.size
+    deep = None if does_matter is None else lattice.deep(does_matter)
+
+    def counts(points: FloatArray) -> BoolArray:
+        found = np.ones(len(points), np.bool_)
+        for x, low, high in zip(points.T, lower, upper, strict=True):
+            found &= (x >= low) & (x <= high)
+        if deep is not None:
+            found &= deep[tuple(lattice.cells_of(points).T)]
+        return found
+
+    return counts
+
+
+def _wall_faces(
+    points: FloatArray, samples: Samples, corners: IntArray, is_wall: BoolArray
+) -> IntArray:
+    """Faces (m, 3) on the box of tetrahedra whose fourth corner is negative, seen from outside."""
+    on = is_wall[corners]
+    rows = np.flatnonzero(on.sum(axis=1) == 3)
+    order = np.argsort(on[rows], axis=1, kind="stable")  # the fourth corner first
+    apex, *rest = np.take_along_axis(corners[rows], order, axis=1).T
+    below = samples.value[apex] <= 0
+    face, apex = np.stack(rest, axis=1)[below], apex[below]
+    a, b, c = (points[face[:, k]] for k in range(3))
+    inward = (np.cross(b - a, c - a) * (points[apex] - a)).sum(axis=1) > 0
+    face[inward] = face[inward][:, ::-1]
+    return face
+
+
+def _sampled(
+    function: LevelFunction, points: FloatArray, lattice: Lattice, is_beyond: BoolArray
+) -> Samples:
+    """The function at points of a lattice, far on the positive side at those beyond what matters;
+    raises HopelessError where it is not finite, or is its level nearly everywhere."""
+    count = len(points)
+    samples = Samples(np.full(count, 10 * BEYOND), np.ones((count, 3)), np.zeros(count))
+    points = points[~is_beyond]
+    samples = samples.replaced(~is_beyond, function.at(points))
+    bad = ~np.isfinite(samples.value[~is_beyond])
+    if bad.any():
+        x, y, z = points[bad][0]
+        nearer = ", or a smaller `spacing`: it is asked for three cells around other parts"
+        raise HopelessError(
+            f"{type(function.field).__name__} has no finite value at {bad.sum():,} points, such "
+            f"as ({x:.4g}, {y:.4g}, {z:.4g}): choose a `clip` where it has"
+            + (nearer if is_beyond.any() else "")
+        )
+    _check_off_level_at_most_points(function, points, lattice)
+    return samples
+
+
+def _check_is_continuous(
+    function: LevelFunction, vertices: FloatArray, faces: IntArray, lattice: Lattice
+) -> None:
+    """Raise if at many vertices the sign of the function changes and the level is not near: it
+    jumps there, and refinement would never come to an end."""
+    x = vertices[np.unique(faces)]
+    is_far = function.at(x).distance > _FAR * float(lattice.size.max())
+    if is_far.sum() > _MOST_JUMPS * len(x):
+        a, b, c = x[is_far][0]
+        raise HopelessError(
+            f"{type(function.field).__name__} changes its sign without coming to its level at "
+            f"{is_far.sum():,} of {len(x):,} places, such as ({a:.4g}, {b:.4g}, {c:.4g}): it jumps "
+            "there, as at the cut of atan2 or a pole; choose a `clip` without it, or write it "
+            "otherwise, such as with the sine of an angle"
+        )
+
+
+def _check_off_level_at_most_points(
+    function: LevelFunction, points: FloatArray, lattice: Lattice
+) -> None:
+    """Raise if the function is its level nearly everywhere, up to rounding: such as x - x, of which
+    no cells are proved empty, however small they are."""
+    if len(points) <= _MOST_FLAT * 2 * math.prod(lattice.counts.tolist()):
+        return
+    some = points[:: -(-len(points) // _MOST_PROBES)]
+    share = float(function.is_on_level(some).mean())
+    if share > _MOST_FLAT:
+        raise HopelessError(
+            f"{type(function.field).__name__} is {function.level:g}, up to rounding, at "
+            f"{share:.0%} of the points looked at: its level there is a volume and no surface; "
+            "choose another level"
+        )
+
+
+@dataclass(frozen=True)
+class _First:
+    """Vertices and faces before they are refined, and the points of the tetrahedra, those near the
+    level moved onto it; rows: (k,) the tetrahedra that the level may pass through between points,
+    and crossed: (k,) whether it does; ends: (j, 2) points at the ends of the edges on which the
+    other vertices lie."""
+
+    vertices: FloatArray
+    faces: IntArray
+    points: PointSet
+    rows: IntArray
+    crossed: BoolArray
+    ends: IntArray
+
+    def is_cut(self, corners: IntArray) -> BoolArray:
+        """(m,) which of all tetrahedra, by their corners (m, 4), hold points of the faces."""
+        cut = _have_any(self.points.is_on, corners)
+        cut[self.rows] |= self.crossed
+        return cut
+
+    def is_beside(self, chosen: BoolArray) -> BoolArray:
+        """Whether each vertex is one of the chosen points, or on an edge that ends there."""
+        return np.concatenate([chosen, chosen[self.ends].any(axis=1)])
+
+
+def _marched(
+    function: LevelFunction,
+    points: FloatArray,
+    samples: Samples,
+    corners: IntArray,
+    is_fixed: BoolArray,
+    is_wall: BoolArray,
+    lattice: Lattice,
+    walls: tuple[FloatArray, FloatArray] | None,
+) -> _First:
+    """Vertices and faces of a manifold, with points near the level moved onto it.
+
+    is_fixed: (n,) points that are not moved. is_wall: (n,) those that count as on the level.
+    """
+    at_rest, original = points, samples
+    points, samples, is_on = _snapped(function, points, samples, is_fixed, lattice, walls)
+    is_on |= is_wall
+    wrong, is_asked = np.zeros(0, np.int64), np.ones(len(points), np.bool_)
+    rows = found = np.flatnonzero(_may_be_cut(samples.value, is_on, corners))
+    for _ in range(_MOST_ROUNDS):
+        some, tets = PointSet(points, is_on, samples), Tetrahedra.of(points, corners[rows])
+        crossings = crossings_of(function, some, tets)
+        # Where vertices lie on edges does not matter for what touches.
+        _, faces = triangles_of(function, some, tets, crossings, _middles)
+        wrong = singular_vertices(faces)
+        wrong = wrong[wrong < len(points)]
+        wrong = wrong[(is_asked & ~is_wall)[wrong]]
+        if not len(wrong):
+            break
+        points, is_on = points.copy(), is_on.copy()
+        points[wrong], is_on[wrong] = at_rest[wrong], False
+        samples = samples.replaced(wrong, original.some(wrong))
+        # Only points beside these may touch anew: with all of their tetrahedra.
+        near, is_asked = np.zeros(len(points), np.bool_), np.zeros(len(points), np.bool_)
+        near[wrong] = True
+        is_asked[corners[_have_any(near, corners)]] = True
+        asked = np.flatnonzero(_have_any(is_asked, corners))
+        rows = asked[_may_be_cut(samples.value, is_on, corners[asked])]
+        found = np.concatenate([found, rows])
+    else:
+        raise MeshingError(
+            f"sheets of the level set touch at {len(wrong)} places: choose a smaller `spacing`"
+        )
+    # Others have the same points as before.
+    rows = distinct(found)
+    rows = rows[_may_be_cut(samples.value, is_on, corners[rows])]
+    some, tets = PointSet(points, is_on, samples), Tetrahedra.of(points, corners[rows])
+    crossings = crossings_of(function, some, tets)
+    vertices, faces = triangles_of(function, some, tets, crossings)
+    crossed: BoolArray = np.asarray((crossings.count[tets.edges] != 0).any(axis=1))
+    ends = tets.ends[np.flatnonzero(crossings.count)]
+    return _First(vertices, faces, some, rows, crossed, ends)
+
+
+def _middles(low: FloatArray, high: FloatArray) -> FloatArray:
+    return 0.5 * (low + high)
+
+
+def _snapped(
+    function: LevelFunction,
+    points: FloatArray,
+    samples: Samples,
+    is_fixed: BoolArray,
+    lattice: Lattice,
+    walls: tuple[FloatArray, FloatArray] | None,
+) -> tuple[FloatArray, Samples, BoolArray]:
+    """Points, those near the level moved onto it; their samples; and which are on it."""
+    size = float(lattice.size.min())
+    near = np.flatnonzero((samples.distance < _SNAPPED * size) & ~is_fixed)
+    longest = np.full(len(near), 0.5 * _SNAPPED * size)
+    moved = newton(function, points[near], samples.some(near), longest, walls, steps=4)
+    there = function.at(moved)
+    apart = lengths(moved - points[near])
+    steep = lengths(there.gradient)
+    good = np.abs(there.value) < 1e-9 * np.maximum(steep * size, 1e-300)
+    good &= apart < 1.2 * _SNAPPED * size
+    rows = near[good]
+    # A value of exactly 0 counts as on the level where it is, so that others have a sign.
+    points, is_on = points.copy(), (samples.value == 0) & ~is_fixed
+    points[rows], is_on[rows] = moved[good], True
+    return points, samples.replaced(rows, there.some(good)), is_on
+
+
+def _have_any(chosen: BoolArray, corners: IntArray) -> BoolArray:
+    """(m,) which tetrahedra (m, 4) have some of the chosen points."""
+    found = np.zeros(len(corners), np.bool_)
+    for column in corners.T:  # four times as fast as chosen[corners].any(axis=1)
+        found |= chosen[column]
+    return found
+
+
+# Of a point above the level, below it, and on it: sums of four tell how many there are of each.
+_ABOVE, _BELOW, _ON_LEVEL = 1, 5, 25
+
+
+def _may_be_cut(value: FloatArray, is_on: BoolArray, corners: IntArray) -> BoolArray:
+    """(m,) whether the level may pass through tetrahedra (m, 4)."""
+    kind = np.where(is_on, _ON_LEVEL, np.where(value > 0, _ABOVE, _BELOW)).astype(np.uint8)
+    sums = np.zeros(len(corners), np.uint8)
+    for column in corners.T:
+        sums += kind[column]
+    cut = np.zeros(4 * _ON_LEVEL + 1, np.bool_)
+    for above, below in itertools.product(range(5), repeat=2):
+        on = 4 - above - below
+        if on >= 0:
+            cut[above * _ABOVE + below * _BELOW + on * _ON_LEVEL] = (above and below) or on >= 3
+    return cut[sums]

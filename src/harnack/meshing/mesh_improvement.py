@@ -1,0 +1,368 @@
+"""Better triangles: edges flipped, slivers contracted, vertices moved along the surface.
+
+Flips. Two triangles (a, b, c) and (b, a, d) become (c, d, b) and (d, c, a) where that makes the
+smaller of their least angles larger, where the new edge is as near to the surface as is asked for,
+and where the new triangles face the way the surface does.
+
+Contractions. The ends of a sliver's shortest edge are merged: see `without_slivers`.
+
+Moves. Means of neighbors, to which `smoothed` moves vertices, make thin triangles where lengths of
+edges change quickly, as beside long boundary edges that cannot be cut. Here some places are tried
+for each vertex of a thin triangle, and it moves to the best of them if the least angle of all
+triangles around it grows. No two neighbors move at once, so that what was measured is what is made:
+the least angle around a moved vertex never falls.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from harnack.backend import BoolArray, FloatArray
+from harnack.meshing.delaunay_points import newton
+from harnack.meshing.edges import (
+    IntArray,
+    boundary_edges,
+    crosses,
+    directed_edges,
+    distinct,
+    dots,
+    edge_keys,
+    lengths,
+)
+from harnack.meshing.level_function import LevelFunction
+
+__all__ = ["flipped", "least_angles", "relaxed", "without_slivers"]
+
+# By how much a least angle has to grow: its cosine in flips, in radians in moves; and the least
+# cosine between normals of a triangle before and after, and between it and the gradient.
+_GAIN = 0.01
+_FACING = 0.5
+_MOST_ROUNDS_OF_FLIPS = 12
+# Triangles with a smaller angle, in radians, are slivers: 4 degrees.
+_SLIVER = 0.07
+# The least cosine between normals of the triangles around a contracted edge and the gradient.
+_STILL_FACING = 0.3
+
+
+def flipped(
+    function: LevelFunction,
+    vertices: FloatArray,
+    faces: IntArray,
+    tolerance: float,
+) -> IntArray:
+    """Faces after rounds of flips, each of which improves the two triangles it touches; of several
+    flips of one triangle the best is made.
+
+    tolerance: how far the middles of new edges, and the centers of new triangles, may be from the
+        surface, by the slope there.
+    """
+    refused = np.zeros(0, np.int64)
+    boundary = edge_keys(boundary_edges(faces), len(vertices))
+    for _ in range(_MOST_ROUNDS_OF_FLIPS):
+        pairs, quads = _quadrilaterals(faces)
+        a, b, c, d = quads.T
+        before = least_angles(vertices, faces)[pairs].min(axis=1)
+        new = np.stack([np.stack([c, d, b], axis=1), np.stack([d, c, a], axis=1)], axis=1)
+        after = np.minimum(*(least_angles(vertices, new[:, k]) for k in (0, 1)))
+        gain = np.cos(before) - np.cos(after)
+        count = len(vertices)
+        key = edge_keys(quads[:, 2:], count)
+        good = gain > _GAIN
+        good[good] = ~np.isin(key[good], refused)
+        taken = distinct(edge_keys(quads[:, :2], count))
+        good[good] = ~_holds(taken, key[good]) & ~np.isin(key[good], boundary)
+        rows = _independent_flips(np.flatnonzero(good), gain, pairs, key, len(faces))
+        if not len(rows):
+            break
+        allowed = _flips_stay_near(function, vertices, new[rows], tolerance)
+        refused = np.concatenate([refused, key[rows[~allowed]]])
+        rows = rows[allowed]
+        faces = faces.copy()
+        faces[pairs[rows, 0]], faces[pairs[rows, 1]] = new[rows, 0], new[rows, 1]
+    return faces
+
+
+def _quadrilaterals(faces: IntArray) -> tuple[IntArray, IntArray]:
+    """Pairs (k, 2) of faces with a common edge, and their corners (k, 4): the edge (a, b) as the
+    first runs it, and the third corners of both."""
+    edges, count = directed_edges(faces), int(faces.max()) + 1
+    keys = edge_keys(edges, count)
+    order = np.argsort(keys, kind="stable")
+    same = np.flatnonzero(keys[order[1:]] == keys[order[:-1]])
+    one, other = order[same], order[same + 1]
+    m = len(faces)
+    third = np.concatenate([faces[:, 2], faces[:, 0], faces[:, 1]])
+    quads = np.column_stack([edges[one], third[one], third[other]])
+    return np.column_stack([one % m, other % m]), quads
+
+
+def _independent_flips(
+    rows: IntArray, gain: FloatArray, pairs: IntArray, key: IntArray, count: int
+) -> IntArray:
+    """Those candidates that are the best of both their faces, and the only ones of their edge."""
+    rows = rows[np.argsort(-gain[rows], kind="stable")]
+    rank = np.arange(len(rows))
+    first = np.full(count, len(rows))
+    for k in (0, 1):
+        np.minimum.at(first, pairs[rows, k], rank)
+    best = (first[pairs[rows]] == rank[:, None]).all(axis=1)
+    rows = rows[best]
+    return rows[np.unique(key[rows], return_index=True)[1]]
+
+
+def _flips_stay_near(
+    function: LevelFunction, vertices: FloatArray, new: IntArray, tolerance: float
+) -> BoolArray:
+    """(k,) whether both new triangles (k, 2, 3) are near the surface and face the way it does."""
+    corner = vertices[new]  # (k, 2, 3, 3)
+    normal = np.cross(corner[:, :, 1] - corner[:, :, 0], corner[:, :, 2] - corner[:, :, 0])
+    middle = corner[:, 0, :2].mean(axis=1)
+    places = np.concatenate([middle, *corner.mean(axis=2).transpose(1, 0, 2)])
+    samples = function.at(places)
+    near = (samples.distance <= tolerance).reshape(3, -1).all(axis=0)
+    slope = samples.gradient.reshape(3, -1, 3)[1:].transpose(1, 0, 2)
+    size = np.linalg.norm(normal, axis=2) * np.linalg.norm(slope, axis=2)
+    facing = ((normal * slope).sum(axis=2) > _FACING * size).all(axis=1)
+    return near & facing
+
+
+def _holds(numbers: IntArray, wanted: IntArray) -> BoolArray:
+    """(k,) whether ascending numbers (n,) hold those wanted (k,)."""
+    place = np.searchsorted(numbers, wanted)
+    return numbers[np.minimum(place, len(numbers) - 1)] == wanted if len(numbers) else place < 0
+
+
+def least_angles(vertices: FloatArray, faces: IntArray) -> FloatArray:
+    """(m,) of triangles, in radians; 0 for one without an area."""
+    corner = vertices[faces]
+    side = np.stack([corner[:, (k + 2) % 3] - corner[:, (k + 1) % 3] for k in range(3)], axis=1)
+    square = np.einsum("ijk,ijk->ij", side, side)
+    twice_area = lengths(np.cross(side[:, 0], side[:, 1]))
+    # The least angle is opposite the shortest side: tan = 2 area/(b . c).
+    shortest = square.argmin(axis=1)
+    rest = 0.5 * (square.sum(axis=1) - 2 * square[np.arange(len(faces)), shortest])
+    return np.arctan2(twice_area, rest)
+
+
+def without_slivers(
+    function: LevelFunction,
+    vertices: FloatArray,
+    faces: IntArray,
+    fixed: BoolArray,
+    tolerance: float,
+) -> IntArray:
+    """Faces without those slivers of which an end of the shortest edge can be moved to the other.
+
+    An edge (u, v) can be contracted to u without a change of topology if u and v have just the two
+    neighbors in common that are the third corners of its faces (the link condition), and v is not
+    `fixed` (n,), as boundary vertices are. It is contracted if no new triangle is a sliver, all
+    face the way that the surface does, and their centers are within `tolerance` of it.
+    """
+    slivers = np.flatnonzero(least_angles(vertices, faces) < _SLIVER)
+    gone = np.zeros(len(faces), np.bool_)
+    faces = faces.copy()
+    for row in slivers:
+        if gone[row]:
+            continue
+        corner = vertices[faces[row]]
+        sides = lengths(np.roll(corner, -1, axis=0) - corner)
+        k = int(sides.argmin())
+        ends = int(faces[row, k]), int(faces[row, (k + 1) % 3])
+        for kept, lost in (ends, ends[::-1]):
+            if fixed[lost]:
+                continue
+            around = np.flatnonzero((faces == lost).any(axis=1) & ~gone)
+            beside = (faces[around] == kept).any(axis=1)
+            if not _can_contract(faces[~gone], kept, lost):
+                continue
+            new = np.where(faces[around[~beside]] == lost, kept, faces[around[~beside]])
+            if _is_good(function, vertices, new, tolerance):
+                faces[around[~beside]] = new
+                gone[around[beside]] = True
+                break
+    return faces[~gone]
+
+
+def _can_contract(faces: IntArray, kept: int, lost: int) -> bool:
+    """The link condition, of an edge with two faces."""
+    near, far = (faces[(faces == v).any(axis=1)] for v in (kept, lost))
+    common = np.setdiff1d(np.intersect1d(near, far), [kept, lost])
+    beside = far[(far == kept).any(axis=1)]
+    return len(beside) == 2 and np.array_equal(common, np.setdiff1d(beside, [kept, lost]))
+
+
+def _is_good(
+    function: LevelFunction, vertices: FloatArray, new: IntArray, tolerance: float
+) -> bool:
+    corner = vertices[new]
+    normal = crosses(corner)
+    samples = function.at(corner.mean(axis=1))
+    size = lengths(normal) * lengths(samples.gradient)
+    facing = dots(normal, samples.gradient) > _STILL_FACING * size
+    near = samples.distance <= tolerance
+    return bool((facing & near & (least_angles(vertices, new) > _SLIVER)).all())
+
+
+Walls = tuple[FloatArray, FloatArray] | None
+# Triangles with a smaller angle are thin, in radians: 30 degrees.
+_THIN = 0.52
+_MOST_ROUNDS_OF_MOVES = 6
+# Parts of the way to each aim that are tried.
+_PARTS = (1.0, 0.5)
+
+
+def relaxed(
+    function: LevelFunction,
+    vertices: FloatArray,
+    faces: IntArray,
+    tolerance: float,
+    walls: Walls,
+) -> FloatArray:
+    """Vertices (n, 3), moved where that makes the least angles of triangles larger; those of the
+    boundary stay.
+
+    tolerance: how far the centers of triangles around moved vertices may be from the surface.
+    """
+    fixed = np.zeros(len(vertices), np.bool_)
+    fixed[boundary_edges(faces)] = True
+    vertices = vertices.copy()
+    for _ in range(_MOST_ROUNDS_OF_MOVES):
+        angles = least_angles(vertices, faces)
+        thin = np.unique(faces[angles < _THIN])
+        stars = _Stars.of(faces, thin[~fixed[thin]], len(vertices))
+        if not len(stars.centers):
+            break
+        before = stars.least(angles[stars.face])
+        there, after = _best_places(function, vertices, faces, stars, walls)
+        gain = after - before
+        rows = _independent_moves(np.flatnonzero(gain > _GAIN), gain, stars, faces, len(vertices))
+        rows = rows[_moves_stay_near(function, vertices, faces, stars, there, rows, tolerance)]
+        if not len(rows):
+            break
+        vertices[stars.centers[rows]] = there[rows]
+    return vertices
+
+
+@dataclass(frozen=True)
+class _Stars:
+    """Faces around some vertices: centers (k,), and pairs of one of these, owner (p,), and a face,
+    face (p,), with the corners of that face, corners (p, 3), the center first."""
+
+    centers: IntArray
+    owner: IntArray
+    face: IntArray
+    corners: IntArray
+
+    @classmethod
+    def of(cls, faces: IntArray, centers: IntArray, count: int) -> _Stars:
+        place = np.full(count, -1, np.int64)
+        place[centers] = np.arange(len(centers))
+        face, column = np.nonzero(place[faces] >= 0)
+        corners = np.stack([faces[face, (column + k) % 3] for k in range(3)], axis=1)
+        return cls(centers, place[corners[:, 0]], face, corners)
+
+    def least(self, of_pairs: FloatArray) -> FloatArray:
+        """(k,) the least of numbers (p,) around each vertex."""
+        found = np.full(len(self.centers), np.inf)
+        np.minimum.at(found, self.owner, of_pairs)
+        return found
+
+    def mean(self, of_pairs: FloatArray) -> FloatArray:
+        """(k, 3) means of vectors (p, 3) around each vertex."""
+        count = np.bincount(self.owner, minlength=len(self.centers))
+        sums = [
+            np.bincount(self.owner, of_pairs[:, axis], minlength=len(self.centers))
+            for axis in range(3)
+        ]
+        return np.stack(sums, axis=1) / count[:, None]
+
+
+def _best_places(
+    function: LevelFunction,
+    vertices: FloatArray,
+    faces: IntArray,
+    stars: _Stars,
+    walls: Walls,
+) -> tuple[FloatArray, FloatArray]:
+    """Where each vertex is best (k, 3), and the least angle around it there (k,)."""
+    here, a, b = (vertices[stars.corners[:, k]] for k in range(3))
+    normal = np.cross(a - here, b - here)
+    normal /= np.maximum(lengths(normal), 1e-300)[:, None]
+    middle = 0.5 * (a + b)
+    # Where the triangle over the opposite edge has equal sides.
+    apex = middle + np.sqrt(0.75) * np.cross(normal, b - a)
+    start = vertices[stars.centers]
+    aims = [stars.mean(apex), stars.mean(middle), 0.5 * (stars.mean(apex) + stars.mean(middle))]
+    angles = least_angles(vertices, faces[stars.face])
+    thinnest = angles <= stars.least(angles)[stars.owner]
+    aims.append(start.copy())
+    aims[-1][stars.owner[thinnest]] = apex[thinnest]
+    best, found = start.copy(), np.full(len(start), -np.inf)
+    for aim in aims:
+        for part in _PARTS:
+            x = start + part * (aim - start)
+            least = _least_at(x, stars, a, b, normal)
+            better = least > found
+            best[better], found[better] = x[better], least[better]
+    # Onto the surface only the best of them, which changes little: the aims are beside it.
+    span = lengths(best - start) + 1e-300
+    best = newton(function, best, function.at(best), 2 * span, walls, steps=4)
+    return best, _least_at(best, stars, a, b, normal)
+
+
+def _least_at(
+    x: FloatArray, stars: _Stars, a: FloatArray, b: FloatArray, normal: FloatArray
+) -> FloatArray:
+    """(k,) the least angle around vertices if they are at x (k, 3); -1 where a triangle turns.
+
+    a, b, normal: (p, 3) the other corners of each pair's face, and its unit normal.
+    """
+    apex = x[stars.owner]
+    cross = np.cross(a - apex, b - apex)
+    size = lengths(cross)
+    corner = np.stack([apex, a, b], axis=1)
+    angles = least_angles(corner.reshape(-1, 3), np.arange(3 * len(a)).reshape(-1, 3))
+    facing = dots(cross, normal) > _FACING * size
+    return stars.least(np.where(facing, angles, -1.0))
+
+
+def _independent_moves(
+    rows: IntArray, gain: FloatArray, stars: _Stars, faces: IntArray, count: int
+) -> IntArray:
+    """Those vertices that gain more than all their neighbors do."""
+    rank = np.full(count, len(rows))
+    ordered = rows[np.argsort(-gain[rows], kind="stable")]
+    rank[stars.centers[ordered]] = np.arange(len(rows))
+    first = np.full(len(stars.centers), len(rows))
+    np.minimum.at(first, stars.owner, rank[stars.corners].min(axis=1))
+    return rows[first[rows] == rank[stars.centers[rows]]]
+
+
+def _moves_stay_near(
+    function: LevelFunction,
+    vertices: FloatArray,
+    faces: IntArray,
+    stars: _Stars,
+    there: FloatArray,
+    rows: IntArray,
+    tolerance: float,
+) -> BoolArray:
+    """(k,) whether some vertices, where they would be, are on the surface, and the triangles
+    around them near it, facing the way it does."""
+    moved = np.zeros(len(stars.centers), np.bool_)
+    moved[rows] = True
+    pairs = np.flatnonzero(moved[stars.owner])
+    corner = vertices[stars.corners[pairs]]
+    corner[:, 0] = there[stars.owner[pairs]]
+    samples = function.at(corner.mean(axis=1))
+    normal = crosses(corner)
+    size = lengths(normal) * lengths(samples.gradient)
+    good = dots(normal, samples.gradient) > _FACING * size
+    good &= samples.distance <= tolerance
+    off = np.zeros(len(stars.centers), np.int64)
+    np.add.at(off, stars.owner[pairs[~good]], 1)
+    length = lengths(there[rows] - vertices[stars.centers[rows]])
+    on = function.at(there[rows]).distance <= 1e-7 * np.maximum(length, 0.1 * tolerance)
+    return on & (off[rows] == 0)

@@ -1,0 +1,737 @@
+"""Meshes of level sets: `mesh`."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, cast
+
+import numpy as np
+
+from harnack.backend.validation import flag
+from harnack.fields import Field, Solid
+from harnack.fields.field import check_is_field
+from harnack.fields.solid_angles.dipole import DipolePotential
+from harnack.fields.solid_angles.solid_angle import SolidAngle
+from harnack.fields.solid_angles.winding_number import WindingNumber
+from harnack.geometry import Box, Intersection, Volume
+from harnack.geometry.volume import check_volume
+from harnack.meshing.bcc_lattice import Lattice
+from harnack.meshing.checks import (
+    EmptyError,
+    MeshingError,
+    TooLargeError,
+    check_apart,
+    check_inside,
+    check_manifold,
+    check_near_level,
+    may_help_again,
+)
+from harnack.meshing.clipping import cut_by, largest_body, largest_part
+from harnack.meshing.closed_mesh import box_manifold, manifold_of, surface_of, volume_manifold
+from harnack.meshing.csg_meshing import (
+    AngleMesher,
+    ends_of_solid,
+    mesh_solid,
+    region_of,
+    two_numbers,
+)
+from harnack.meshing.curve_spanning import spanned_surface
+from harnack.meshing.finishing import check_options, finished, normals_of, simplified, thickened
+from harnack.meshing.lattice_meshing import Surface, open_surface
+from harnack.meshing.level_function import CELLS_PER_WAVE, MOST_FACES, LevelFunction
+from harnack.meshing.lost_parts import LostParts
+from harnack.meshing.sign_function import (
+    SignFunction,
+    cells_for_details,
+    is_meshed_by_signs,
+    why_empty,
+)
+from harnack.meshing.sign_isosurface import MOST_FAR, SMALLER, signed_surface
+from harnack.progress import teller
+from harnack.tracer import LevelSet
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    import trimesh
+    from manifold3d import Manifold
+
+    from harnack.backend import FloatArray
+
+__all__ = ["mesh"]
+
+# Cells across the level set, unless a spacing is given; curves have their own length besides.
+_ACROSS = 24
+_MOST_ATTEMPTS = 4
+_ACROSS_BY_SIGNS, _ATTEMPTS_BY_SIGNS = 48, 2
+# Room around what has an extent, and around a curve whose surface has none, as a part of the size.
+_MARGIN = 0.01
+_ROOM = 0.05
+
+
+def mesh(
+    field: Field | LevelSet,
+    level: float | None = None,
+    *,
+    tolerance: float = 1e-3,
+    spacing: float | None = None,
+    clip: Volume | None = None,
+    section: Volume | None = None,
+    solid: tuple[float, float] | bool | None = None,
+    thickness: float | None = None,
+    simplify: bool = False,
+    largest: bool = False,
+    seed: int = 0,
+    max_triangles: int = MOST_FACES,
+    progress: Callable[[str], None] | None = None,
+) -> trimesh.Trimesh:
+    """Triangles of a level set, or the closed surface of a solid.
+
+    Tetrahedra around the level set, found by an octree whose empty cells are proved empty, are cut
+    by it; the surface of an angle ends exactly at its curve. Then edges are cut and vertices moved
+    onto the surface until middles of edges and centers of triangles are within the tolerance.
+    Solids are put together from the meshes of smooth levels by manifold3d, and so cut by the clip.
+
+    Fields that are sums over meshes, points and blobs (`WindingNumber`, `DipolePotential`,
+    `ScreenedWindingNumber`, `Morph`, `HRBF`, `Blobs`) are meshed by the signs of their values alone
+    (`meshing.by_signs`), which gives a closed surface whatever the mesh or the cloud is. Vertices
+    lie where edges of the cells meet the level, so on the very triangles of a sound mesh; parts
+    that are thinner or nearer to each other than a cell may be missed or joined, which is looked
+    for at about three thousand points of the level (`meshing.lost_parts`) and warned of. Of a mesh
+    that is its own spanning surface (`WindingNumber`), such as a file of a `SolidAngle`'s, the
+    triangles are kept as they are, whatever tolerance, spacing and seed are.
+
+    field: a `SolidAngle` of polygons, a real-valued field that is continuous, or one of those; or a
+        `LevelSet` of one level or a solid, whose level, clip, section, solid and largest are used
+        unless others are given here. Its tolerance and other settings of rays are not used.
+    level: None for the field's default.
+    tolerance: how far triangles may be from the surface, as a part of the size of the level set's
+        box (its longest side), sampled and not proved.
+    spacing: of cells before anything is refined, in the field's unit; None chooses a 24th of the
+        longest side (by signs a 48th), and of waves (`Field.wavelength`) a fifth of theirs at the
+        most. Sheets that are nearer to each other are told apart where that is noticed; else a
+        MeshingError says so.
+    clip: a volume, needed where the level set has no extent. The surface ends at its boundary; a
+        solid is closed there. None for the field's domain.
+    section: another one, such as a `HalfSpace`, besides the clip or the domain.
+    solid: the closed surface of the points where low <= f <= high, given as (low, high); one of
+        them may be infinite, as in `level_set` and `render`. For an angle-valued field, those
+        between the two levels. None is True for a `Solid`, whose inside is f <= level; False for
+        its surface alone, open where it is cut.
+    thickness: makes a closed part so thick, in the field's unit, of a surface: half on each side.
+    simplify: leave out vertices that are not needed within the tolerance, of closed meshes: of the
+        mesh that is made without it, whose middles of edges are within half of the tolerance.
+    largest: keep one connected part alone: of a surface that with the largest area, of a closed
+        mesh that with the largest volume, whose cavities stay.
+    seed: of the small random moves that keep points in general position.
+    max_triangles: of one level set, before anything is simplified; what would take more is not
+        begun or given up, with a MeshingError. Cells are limited with them, to two millions.
+    progress: told what is being done.
+
+    All that is returned has been checked: every edge has two faces, or one at the boundary, no two
+    triangles pass through each other, vertices and centers of triangles are within the tolerance of
+    the level by samples of the field, and inside the clip (of a thick part, the surface that it is
+    made of). Else a MeshingError is raised. By signs all is checked but the last: if more than one
+    in a hundred vertices and centers are beyond the tolerance, smaller cells are tried; if that is
+    not enough, a warning says how many there are and how far they are; and a MeshingError if some
+    are farther than a few cells. The same is done and said where parts of the level set are lost.
+
+    Returns:
+        A trimesh.Trimesh; if it is closed, `export` writes closed files, in single precision, or
+        raises a MeshingError. Vertices of a curve come first, in order, bit by bit, and its edges
+        are the boundary. Without a boundary, faces are turned outwards: the volume is positive;
+        else they are turned towards larger values. `metadata["harnack"]` has level, spacing,
+        evaluations, the Euler characteristic,
+        boundary: indices (k, 2) of edges of one face,
+        creases: how many edges have faces more than 30 degrees apart: a function with kinks, such
+            as |x| or max(f, g), has them where its level set does. That these are within the
+            tolerance is checked at middles of edges and triangles; nothing is proved there; and
+        proved, integrated: how many changes along edges of tetrahedra are proved to be differences
+            of wrapped values, and how many were integrated;
+        isotopy, isotopy_far: the shares of tetrahedra on which the first triangles are proved to
+            have the topology of the level set (`meshing.isotopy`), of all and of those farther than
+            1.5 times the spacing from the curve;
+        turned: triangles of an angle, smaller than the tolerance, that are turned over.
+        Of meshes by signs, made_by is "signs", and
+        far, looked_at, within: how many vertices and centers of triangles are beyond the tolerance,
+            of how many, and a distance within which all are, sampled up to a factor of 2;
+        lost, sought: how many points of the level are beyond the tolerance from the mesh, of how
+            many: on triangles of a mesh, at points of a cloud, on the way out of blobs;
+        undecided: at how many points of the lattice the error of f leaves its sign open;
+        flat: how many triangles were not fitted to creases, as they would pass through others;
+        Where the triangles of a mesh were kept, made_by is "faces", and there is none of this.
+        cloud: of a `DipolePotential`, what it says of itself (`describe`), such as how many points
+            it has, what was estimated, and the smoothing and noise that were chosen and found.
+
+        Solids and thick surfaces have more: see `docs/printing.md`.
+
+    Raises:
+        MeshingError: a ValueError, if it could not be done; the message says why.
+        TypeError: a field that has parts; a clip that is no volume.
+        ValueError: options out of range, or that contradict each other; a `LevelSet` of several
+            levels.
+    """
+    if isinstance(field, LevelSet):
+        level, solid = _level_and_solid(field, level, solid)
+        clip = field.clip if clip is None else clip
+        section = field.section if section is None else section
+        field, largest = field.field, largest or field.largest > 0
+    check_volume(clip, "clip")
+    check_volume(section, "section")
+    check_options(tolerance, spacing, thickness, seed, max_triangles)
+    simplify, largest = flag(simplify, "simplify"), flag(largest, "largest")
+    report = teller(progress)
+    if solid is not None and not isinstance(solid, bool):
+        solid = two_numbers(solid)
+    field = _checked(field)
+    if solid is None and isinstance(field, Solid) and thickness is None:
+        solid = True
+    if solid and thickness is not None:
+        raise ValueError("give either solid or thickness, not both: a solid has an inside already")
+    is_closed = bool(solid) or thickness is not None
+    if simplify and not is_closed:
+        raise ValueError("simplify is for closed meshes: give solid or thickness as well")
+    volume = _volume(field, clip, section)
+    asked = _Asked(volume, tolerance, spacing, seed, max_triangles, report)
+    if is_meshed_by_signs(field):
+        made = _by_signs(field, level, solid, thickness is not None, asked)
+    elif solid:
+        made = _solid(field, level, solid, asked)
+    else:
+        made = _surface(field, level, asked)
+    surface, facts = made.surface, dict(made.facts)
+    if solid:
+        facts["solid"] = solid
+    else:
+        surface = largest_part(surface) if largest else surface
+        made.check_level(surface)
+    if thickness is not None:
+        report("thickening")
+        normals = normals_of(made.function, surface)
+        surface, more = thickened(surface, normals, float(thickness), 0.5 * tolerance * made.size)
+        facts |= more
+    if largest and is_closed:
+        surface = largest_body(surface)
+
+    def check(one: Surface) -> None:
+        if solid:
+            made.check_level(one)
+        check_manifold(one.faces)
+
+    if not made.is_checked:
+        report("checking")
+        check(surface)
+        check_apart(surface.vertices, surface.faces)
+    if simplify:
+        report("simplifying")
+        surface, more = simplified(surface, tolerance * made.size, check)
+        facts |= more
+    return finished(surface, facts, is_closed)
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """Arguments of `mesh`; volume: what the level set is cut by."""
+
+    volume: Volume | None
+    tolerance: float
+    spacing: float | None
+    seed: int
+    most_faces: int
+    report: Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class _Made:
+    """A surface, its size, what is known of it, and the function that it is a level set of.
+
+    check_level: raises a MeshingError unless a surface is within the tolerance of the level.
+    is_checked: whether that has been done, and the surface is known to be a manifold that does not
+        pass through itself.
+    """
+
+    surface: Surface
+    size: float
+    facts: dict[str, Any]
+    function: LevelFunction
+    check_level: Callable[[Surface], None]
+    is_checked: bool
+
+
+def _by_signs(
+    field: Field,
+    level: float | None,
+    solid: tuple[float, float] | bool | None,
+    is_thick: bool,
+    asked: _Asked,
+) -> _Made:
+    """A level set by the signs of f, or the closed surface of a solid.
+
+    Raises:
+        MeshingError: as `signed_surface`; if it is empty, or not near the level at all.
+    """
+    ends = _ends_by_signs(field, level, solid, is_thick)
+    levels = tuple(end for end in ends if math.isfinite(end))
+    if isinstance(field, WindingNumber) and field.is_of_sheets_alone(levels):
+        return _faces_alone(field, levels[0], solid, asked)
+    volume, box = asked.volume, _box(field, levels, asked.volume)
+    size = float((box.upper - box.lower).max())
+    cells, attempts = _cells_by_signs(field, size, asked.spacing)
+    # Where nothing ends at the box, its cells should not lie along what is symmetrical.
+    room = np.zeros(3) if box.has_walls else size * np.array([0.0037, 0.0053, 0.0029])
+    filled = box.lower - room, box.upper + 0.5 * room
+    facts: list[dict[str, Any]] = []
+    losses: list[LostParts] = []
+
+    def function(one: float, side: float) -> SignFunction:
+        return SignFunction.of(field, one, filled, cells, side=side, most_faces=asked.most_faces)
+
+    is_apart = False
+
+    def signed(one: float, side: float, closed: bool) -> Surface:
+        nonlocal is_apart
+        try:
+            made, lost, more = signed_surface(
+                function(one, side),
+                filled,
+                cells,
+                asked.tolerance * size,
+                attempts,
+                asked.report,
+                closed=closed,
+                volume=asked.volume,
+            )
+        except EmptyError as error:
+            raise EmptyError(f"{error}{why_empty(field)}") from error
+        facts.append(more)
+        losses.append(lost)
+        is_apart = made.is_apart
+        return made.surface
+
+    if not solid:
+        made = signed(levels[0], 1.0, False)
+        if volume is not None and not (isinstance(volume, Box) and box.has_walls):
+            made, is_apart = cut_by(made, volume), False
+    elif volume is None and ends[1] == math.inf:
+        made = signed(levels[0], -1.0, False)
+    else:
+        whole = box_manifold(box.lower, box.upper)
+        if math.isfinite(ends[0]):
+            whole = manifold_of(signed(ends[0], -1.0, True))
+        if math.isfinite(ends[1]):
+            whole = whole - manifold_of(signed(ends[1], -1.0, True))
+        if field.has_sheets and len(levels) == 2:
+            _check_has_thickness(field, whole, ends, asked.tolerance * size)
+        cut = volume or Box(tuple(box.lower.tolist()), tuple(box.upper.tolist()))
+        whole ^= volume_manifold(cut, box.lower, box.upper, 0.5 * asked.tolerance * size)
+        made, is_apart = surface_of(whole), False
+    if not len(made.faces):
+        raise MeshingError("the level set is empty: it lies outside of the clip")
+    if is_apart:
+        check_manifold(made.faces)
+    known = {"level": levels[0], **_of_both(facts)}
+    if isinstance(field, DipolePotential):
+        known["cloud"] = field.describe()
+    is_told = _judge_signs(field, known, asked.tolerance * size)
+    _warn_of_lost(field, losses, is_told)
+    return _Made(made, size, known, function(levels[0], 1.0), _nothing, is_apart)
+
+
+def _ends_by_signs(
+    field: Field,
+    level: float | None,
+    solid: tuple[float, float] | bool | None,
+    is_thick: bool,
+) -> tuple[float, float]:
+    """The values between which the inside is; of a level set that is not closed those from its
+    level on.
+
+    Raises:
+        TypeError: a surface that jumps is to be thickened.
+        ValueError: the field has no such level.
+    """
+    if is_thick and field.has_sheets:
+        raise TypeError(
+            f"{type(field).__name__} jumps, and its surface has no normals to thicken it "
+            "along: mesh it, and move the mesh's vertices instead"
+        )
+    if solid:
+        return ends_of_solid(field, solid, level)
+    level = field.default_level if level is None else float(level)
+    field.check_levels((level,))
+    return level, math.inf
+
+
+def _cells_by_signs(field: Field, size: float, spacing: float | None) -> tuple[float, int]:
+    """How large cells are, and how often smaller ones may be tried."""
+    if spacing is not None:
+        return float(spacing), 1
+    cells, attempts = size / _ACROSS_BY_SIGNS, _ATTEMPTS_BY_SIGNS
+    detailed = cells_for_details(field, cells, SMALLER, SMALLER**2)
+    # At once what would be tried next.
+    return (detailed, attempts - 1) if detailed < cells else (cells, attempts)
+
+
+def _faces_alone(
+    field: WindingNumber,
+    level: float,
+    solid: tuple[float, float] | bool | None,
+    asked: _Asked,
+) -> _Made:
+    """The triangles of a mesh that is its own surface, as they are, but for what the volume cuts.
+
+    Raises:
+        MeshingError: it is to be closed; nothing is left; it has too many triangles.
+    """
+    if solid:
+        raise MeshingError(
+            "this mesh is a sheet that lies on its own spanning surface, so that nothing is inside "
+            "of it: mesh the SolidAngle of its boundary with thickness=..."
+        )
+    vertices, faces = field.mesh.vertices, field.mesh.faces
+    size = float(np.ptp(vertices[faces].reshape(-1, 3), axis=0).max())
+    surface = Surface.of(vertices, faces)
+    if asked.volume is not None:
+        surface = cut_by(surface, asked.volume)
+    if not len(surface.faces):
+        raise MeshingError("the level set is empty: it lies outside of the clip")
+    if len(surface.faces) > asked.most_faces:
+        raise TooLargeError(
+            f"{len(surface.faces):,} triangles of the mesh are its surface, and max_triangles is "
+            f"{asked.most_faces:,}: choose a larger max_triangles, or a smaller `clip`"
+        )
+    known = {"level": level, "made_by": "faces", "spacing": math.nan, "evaluations": 0}
+    function = LevelFunction(field, level, most_faces=asked.most_faces)
+    return _Made(surface, size, known, function, _nothing, False)
+
+
+def _check_has_thickness(
+    field: Field, whole: Manifold, ends: tuple[float, float], tolerance: float
+) -> None:
+    """Raise if both levels are the same triangles, where the field jumps across them."""
+    if 2 * abs(whole.volume()) < tolerance * whole.surface_area():
+        low, high = (f"{one:g}" for one in ends)
+        raise MeshingError(
+            f"the part between the levels {low} and {high} of this {type(field).__name__} has no "
+            f"thickness: it jumps across both at its triangles; for what is inside give "
+            f"solid=(0.5, math.inf)"
+        )
+
+
+def _of_both(facts: list[dict[str, Any]]) -> dict[str, Any]:
+    """What is known of the surfaces at both ends of a solid."""
+    sums = ("evaluations", "undecided", "flat", "far", "looked_at", "lost", "sought")
+    larger = {key: max(one[key] for one in facts) for key in ("spacing", "within")}
+    return {**facts[0], **larger, **{key: sum(one[key] for one in facts) for key in sums}}
+
+
+def _judge_signs(field: Field, facts: dict[str, Any], tolerance: float) -> bool:
+    """Whether more than a few vertices and centers of triangles are beyond the tolerance, which is
+    warned of.
+
+    Raises:
+        MeshingError: some of them are nowhere near the level.
+    """
+    far, count, within = facts["far"], facts["looked_at"], facts["within"]
+    kind = type(field).__name__
+    if not math.isfinite(within):
+        raise MeshingError(
+            f"some of {far:,} vertices and centers of triangles are farther than several cells "
+            f"from where the sign of {kind} changes: its values are not what it promises there; "
+            "choose a smaller `spacing`, or a `clip` without these places"
+        )
+    if far > MOST_FAR * count:
+        warnings.warn(
+            f"{far:,} of {count:,} vertices and centers of triangles are farther from the level of "
+            f"this {kind} than the tolerance, which is {tolerance:.3g}; all are within "
+            f"{within:.3g}. The level is rough there, or has parts that are nearer to each other "
+            f"than its cells of {facts['spacing']:.3g} are wide: choose a smaller `spacing`, or a "
+            "larger `tolerance`",
+            stacklevel=4,
+        )
+    return far > MOST_FAR * count
+
+
+def _warn_of_lost(field: Field, losses: list[LostParts], is_told: bool) -> None:
+    """Warns where parts of the level set are missing from the mesh; if it is told already that the
+    mesh is coarse, only of more than that."""
+    for lost in losses:
+        if lost.matter and (lost.show_thin_parts or not is_told):
+            warnings.warn(
+                f"the mesh is not quite the level of this {type(field).__name__}: {lost}; "
+                f"{lost.advice}",
+                stacklevel=4,
+            )
+
+
+def _nothing(surface: Surface) -> None:
+    """Accepts every surface: by signs distances were measured when it was made."""
+
+
+def _level_and_solid(
+    surface: LevelSet, level: float | None, solid: tuple[float, float] | bool | None
+) -> tuple[float | None, tuple[float, float] | bool | None]:
+    """The level and the solid to mesh: those that are given, else those of a `LevelSet`."""
+    if level is not None or not (solid is None or isinstance(solid, bool)):
+        return level, solid
+    if surface.solid is not None and solid is not False:
+        return None, surface.solid
+    if len(surface.levels) > 1:
+        kind, numbers = type(surface.field).__name__, ", ".join(f"{x:g}" for x in surface.numbers)
+        raise ValueError(
+            f"this LevelSet of a {kind} has {len(surface.levels)} levels ({numbers}) and a mesh is "
+            f"of one: give it beside, as in mesh(surface, level={surface.numbers[0]:g}), one after "
+            "the other"
+        )
+    return surface.numbers[0], solid
+
+
+def _check_level(
+    function: LevelFunction, made: Surface, tolerance: float, volume: Volume | None
+) -> None:
+    """Raise unless a surface is within the tolerance of the level, and inside the volume."""
+    if volume is not None:
+        check_inside(made.vertices, volume, tolerance)
+    check_near_level(function, made.vertices, made.faces, tolerance, volume)
+
+
+def _checked(field: Field) -> Field:
+    check_is_field(field)
+    if field.has_parts or (field.has_sheets and not is_meshed_by_signs(field)):
+        raise TypeError(
+            f"{type(field).__name__} is not one continuous function: mesh its parts, or the "
+            "solid angle of its boundary"
+        )
+    if isinstance(field, SolidAngle):
+        if field.circles:
+            raise TypeError(
+                "the mesh of a circle ends on a polygon: give circle.polygon(n) in its place"
+            )
+        return SolidAngle(list(field.loops))
+    if field.period is not None:
+        raise TypeError(
+            f"{type(field).__name__} is angle-valued, and mesh() knows of no other angle-valued "
+            "field than SolidAngle where its surfaces end"
+        )
+    return field
+
+
+def _volume(field: Field, clip: Volume | None, section: Volume | None) -> Volume | None:
+    """What the level sets are cut by: the clip, the domain where the field ends there or there is
+    no clip, and the section."""
+    ends = field.domain is not None and not (field.is_entire and clip is not None)
+    parts = dict.fromkeys((clip, field.domain if ends else None, section))
+    kept = [one for one in parts if one is not None]
+    if len(kept) < 2:
+        return kept[0] if kept else None
+    return Intersection(kept)
+
+
+def _solid(
+    field: Field,
+    level: float | None,
+    solid: tuple[float, float] | Literal[True],
+    asked: _Asked,
+) -> _Made:
+    """The closed surface of a solid that is put together from smooth levels."""
+    region = LevelFunction(*region_of(field, solid, level), most_faces=asked.most_faces)
+    evaluations = [0]
+
+    def angle_mesher(error: float, cells: float) -> AngleMesher:
+        def mesh_angle(angle: SolidAngle, value: float) -> Surface:
+            angle = cast("SolidAngle", _checked(angle))
+            box = _box(angle, (value,), None)
+            function = LevelFunction(angle, value, most_faces=asked.most_faces)
+            made, facts = _spanned(function, box, error, cells, 1, asked.seed, asked.report)
+            evaluations[0] += facts["evaluations"]
+            return made
+
+        return mesh_angle
+
+    def check_level(made: Surface, size: float) -> None:
+        _check_level(region, made, asked.tolerance * size, asked.volume)
+
+    def check(made: Surface, size: float) -> None:
+        check_manifold(made.faces, made.vertices)
+        check_level(made, size)
+
+    made = mesh_solid(
+        cast("Solid", region.field),
+        region.level,
+        asked.volume,
+        asked.tolerance,
+        asked.spacing,
+        angle_mesher,
+        asked.most_faces,
+        check,
+        asked.report,
+    )
+    facts = {
+        "level": region.level,
+        "spacing": made.spacing,
+        "evaluations": made.evaluations + evaluations[0],
+        "level_sets": made.levels,
+    }
+    return _Made(
+        made.surface, made.size, facts, region, lambda one: check_level(one, made.size), True
+    )
+
+
+def _surface(field: Field, level: float | None, asked: _Asked) -> _Made:
+    """A level set of a function that is smooth nearly everywhere, or of an angle."""
+    level = field.default_level if level is None else float(level)
+    function = LevelFunction(field, level, most_faces=asked.most_faces)
+    field.check_levels((level,))
+    volume, report = asked.volume, asked.report
+    box = _box(field, (level,), volume)
+    size = float((box.upper - box.lower).max())
+    error = 0.5 * asked.tolerance * size
+    cells = size / _ACROSS if asked.spacing is None else float(asked.spacing)
+    if asked.spacing is None and field.wavelength is not None:
+        cells = min(cells, field.wavelength / CELLS_PER_WAVE)
+    attempts = 1 if asked.spacing is not None else _MOST_ATTEMPTS
+    if isinstance(field, SolidAngle):
+        made, facts = _spanned(function, box, error, cells, attempts, asked.seed, report)
+    else:
+        made, facts = _filling(function, box, error, cells, attempts, report)
+    if volume is not None and not (isinstance(volume, Box) and box.has_walls):
+        made = cut_by(made, volume)
+        if not len(made.faces):
+            raise MeshingError("the level set is empty: it lies outside of the clip")
+
+    def check_level(one: Surface) -> None:
+        _check_level(function, one, asked.tolerance * size, volume)
+
+    return _Made(made, size, {"level": level, **facts}, function, check_level, False)
+
+
+def _filling(
+    function: LevelFunction,
+    box: _Filled,
+    tolerance: float,
+    spacing: float,
+    attempts: int,
+    report: Callable[[str], None],
+) -> tuple[Surface, dict[str, Any]]:
+    """The level set of a real-valued field in a box, in cells of a lattice."""
+    before: MeshingError | None = None
+    while True:
+        report(f"cells of {spacing:.3g}")
+        try:
+            lattice = Lattice.filling(box.lower, box.upper, spacing)
+            made, isotopy = open_surface(function, lattice, tolerance, report)
+            check_manifold(made.faces, made.vertices)
+            check_near_level(function, made.vertices, made.faces, 2 * tolerance, None)
+            check_apart(made.vertices, made.faces)
+            break
+        except MeshingError as wrong:
+            attempts -= 1
+            if not attempts or not may_help_again(wrong, before, SMALLER**attempts):
+                raise
+            before, spacing = wrong, SMALLER * spacing
+            report(f"{wrong}; so smaller cells")
+    facts = {
+        "spacing": spacing,
+        "evaluations": function.evaluations,
+        "proved": 0,
+        "integrated": 0,
+        **isotopy.shares(),
+    }
+    return made, facts
+
+
+def _spanned(
+    function: LevelFunction,
+    box: _Filled,
+    tolerance: float,
+    spacing: float,
+    attempts: int,
+    seed: int,
+    report: Callable[[str], None],
+) -> tuple[Surface, dict[str, Any]]:
+    """The level set of an angle, which ends at its curve."""
+    ends = box.lower, box.upper
+    made = spanned_surface(
+        function, spacing, attempts, ends, box.has_walls, seed, tolerance, report
+    )
+    facts = {
+        "spacing": made.spacing,
+        "evaluations": function.evaluations,
+        "proved": made.crossings.proved,
+        "integrated": made.crossings.integrated,
+        **made.isotopy.shares(),
+        "turned": made.turned,
+    }
+    return Surface.of(made.vertices, made.faces), facts
+
+
+@dataclass(frozen=True)
+class _Filled:
+    """The box to be filled, from `lower` to `upper`, (3,) each, and whether the surface may end at
+    its faces."""
+
+    lower: FloatArray
+    upper: FloatArray
+    has_walls: bool
+
+
+def _box(field: Field, levels: tuple[float, ...], volume: Volume | None) -> _Filled:
+    """The box to be filled: around the level sets, if it has an extent, and the volume.
+
+    Raises:
+        MeshingError: neither has bounds, or they have nothing in common.
+    """
+    extent, level = field.extent(levels), levels[0]
+    if volume is None and extent is None and isinstance(field, SolidAngle):
+        raise MeshingError(
+            f"level {level:g} is a multiple of 4 pi: the surface of a curve has no end there; "
+            "choose a level between them, such as 2 pi, or give clip=harnack.Box(lower, upper)"
+        )
+    if volume is None and extent is None:
+        raise MeshingError(
+            f"{type(field).__name__} does not say where its level {level:g} ends: give "
+            "clip=harnack.Box(lower, upper) or harnack.Ball(center, radius)"
+        )
+    if isinstance(field, SolidAngle):
+        return _around_curve(field, extent, volume)
+    lower, upper = _common_bounds(extent if volume is None else volume)
+    if volume is not None and extent is not None and extent != volume:
+        # A little room, so that what touches its extent does not end there.
+        low, high = _common_bounds(extent)
+        pad = _MARGIN * float((high - low).max())
+        if math.isfinite(pad):
+            lower, upper = np.maximum(lower, low - pad), np.minimum(upper, high + pad)
+    elif volume is None:
+        pad = _MARGIN * (upper - lower).max()
+        lower, upper = lower - pad, upper + pad
+    if not (np.isfinite(lower).all() and np.isfinite(upper).all()):
+        raise MeshingError(
+            f"the clip {volume} has no bounds, and {type(field).__name__} does not say where its "
+            f"level {level:g} ends: give clip=harnack.Box(lower, upper)"
+        )
+    if not (lower < upper).all():
+        raise MeshingError("the level set is empty: it lies outside of the clip")
+    return _Filled(lower, upper, volume is not None)
+
+
+def _around_curve(field: SolidAngle, extent: Volume | None, volume: Volume | None) -> _Filled:
+    """Around the whole surface that a curve spans, which is cut later; or if that has no extent,
+    around the curve and the volume."""
+    if extent is not None:
+        return _Filled(*_common_bounds(extent), False)
+    assert volume is not None
+    points = np.concatenate(list(field.loops))
+    low, high = _common_bounds(volume)
+    lower, upper = np.minimum(low, points.min(axis=0)), np.maximum(high, points.max(axis=0))
+    if not np.isfinite(upper - lower).all():
+        raise MeshingError("the clip has no bounds: give clip=harnack.Box(lower, upper)")
+    pad = _ROOM * (upper - lower).max()
+    return _Filled(lower - pad, upper + pad, True)
+
+
+def _common_bounds(volume: Volume | None) -> tuple[FloatArray, FloatArray]:
+    assert volume is not None
+    lower, upper = (np.array(end, np.float64) for end in volume.bounds())
+    return lower, upper

@@ -1,0 +1,156 @@
+"""Closed meshes of which a few vertices or faces are too far from the level, mended there alone.
+
+Offsets of meshes have creases everywhere. Where another part cuts a triangle that lies across one,
+the pieces have centers and corners of their own, of which one in a hundred thousand may be farther
+from the level than the triangle's center. Edges across the crease are cut on it there, and what is
+new is checked with what is around it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from harnack.backend import BoolArray, FloatArray
+from harnack.meshing.checks import FarError, MeshingError, intersecting_faces
+from harnack.meshing.delaunay_points import newton
+from harnack.meshing.edges import IntArray, directed_edges, distinct, edge_keys, lengths
+from harnack.meshing.lattice_meshing import Surface
+from harnack.meshing.level_function import LevelFunction
+from harnack.meshing.refinement import split_faces
+from harnack.meshing.self_intersection_repair import uncrossed
+
+__all__ = ["brought_near"]
+
+# More places than this are no exceptions; and how often faces may be cut, one after the other.
+_MOST, _TIMES = 100, 4
+# Edges of such faces are cut if their middle is farther off than that, in tolerances.
+_FAR = 0.5
+# How far mending may move what is cut, in tolerances.
+_MENDED_WITHIN = 0.25
+
+
+def brought_near(
+    function: LevelFunction,
+    surface: Surface,
+    places: FloatArray,
+    tolerance: float,
+    check: Callable[[Surface], None],
+) -> Surface | None:
+    """The surface with vertices that are far from the level moved onto it, and faces with such a
+    center cut at the middles of their edges that are far, or at their own, moved onto it; None if
+    that cannot be done.
+
+    surface: of which no triangles pass through each other, and all but some are near the level.
+    places: (k, 3) these vertices, and centers of faces. tolerance: nothing is moved farther than
+        twice that.
+    check: raises a MeshingError of a surface that is not near the level. It is given what has
+        changed; that this passes through no other triangle is decided exactly.
+    """
+    if len(places) > _MOST:
+        return None
+    vertices, faces = surface.vertices, surface.faces
+    is_new = np.zeros(len(faces), np.bool_)
+    for _ in range(_TIMES):
+        changed = _moved(function, Surface(vertices, faces), is_new, places, tolerance)
+        if changed is None:
+            return None
+        (vertices, faces), is_new = changed
+        try:
+            check(Surface.of(vertices, faces[is_new]))
+        except FarError as far:
+            places = far.places
+            continue
+        except MeshingError:
+            return None
+        return _apart(Surface(vertices, faces), is_new, tolerance, check)
+    return None
+
+
+def _moved(
+    function: LevelFunction,
+    surface: Surface,
+    is_new: BoolArray,
+    places: FloatArray,
+    tolerance: float,
+) -> tuple[tuple[FloatArray, IntArray], BoolArray] | None:
+    """Vertices and faces with what is at some places moved onto the level, or cut; and which faces
+    are new (m,), those that were included. None if something is elsewhere, or too far from it."""
+    vertices, faces = surface.vertices, surface.faces
+    corners = _rows_at(places, vertices)
+    centers = _rows_at(places, vertices[faces].mean(axis=1))
+    if len(corners) + len(centers) < len(places):
+        return None
+    pairs = directed_edges(faces[centers])
+    middle = vertices[pairs].mean(axis=1)
+    pairs = pairs[function.at(middle).distance > _FAR * tolerance]
+    count = len(vertices)
+    keys = distinct(edge_keys(pairs, count))
+    ends = np.stack(np.divmod(keys, count), axis=1)
+    # Edges of all faces at these ends: which of them is cut.
+    place = np.full(faces.shape, -1, np.int64)
+    rows = np.flatnonzero(np.isin(faces, ends).any(axis=1))
+    found = np.searchsorted(keys, own := edge_keys(directed_edges(faces[rows]), count))
+    found = np.minimum(found, max(len(keys) - 1, 0))
+    if len(keys):
+        is_cut = keys[found] == own
+        place[rows] = np.where(is_cut, count + found, -1).reshape(3, -1).T
+    whole = np.setdiff1d(centers, np.flatnonzero((place >= 0).any(axis=1)))
+    start = np.concatenate(
+        [vertices[corners], vertices[ends].mean(axis=1), vertices[faces[whole]].mean(axis=1)]
+    )
+    moved = newton(function, start, function.at(start), np.full(len(start), tolerance), None)
+    if not (lengths(moved - start) <= 2 * tolerance).all():
+        return None
+    vertices = np.concatenate([vertices, moved[len(corners) :]])
+    vertices[corners] = moved[: len(corners)]
+    is_split = (place >= 0).any(axis=1)
+    split = split_faces(vertices, faces[is_split], place[is_split])
+    inner = count + len(ends) + np.arange(len(whole))
+    a, b, c = faces[whole].T
+    new = [split, *(np.stack([*two, inner], axis=1) for two in ((a, b), (b, c), (c, a)))]
+    gone = np.union1d(np.flatnonzero(is_split), whole)
+    kept = np.delete(faces, gone, axis=0)
+    is_moved = np.zeros(len(vertices), np.bool_)
+    is_moved[corners] = True
+    is_new = np.delete(is_new, gone) | is_moved[kept].any(axis=1)
+    faces = np.concatenate([kept, *new])
+    is_new = np.concatenate([is_new, np.ones(len(faces) - len(kept), np.bool_)])
+    return (vertices, faces), is_new
+
+
+def _apart(
+    surface: Surface, is_new: BoolArray, tolerance: float, check: Callable[[Surface], None]
+) -> Surface | None:
+    """The surface if its new faces (m,) pass through no others; mended there if need be, and then
+    checked as a whole; None if that does not help."""
+    vertices, faces = surface.vertices, surface.faces
+    around = _in_boxes_of(vertices[faces], np.flatnonzero(is_new))
+    crossing = around[intersecting_faces(vertices, faces[around])]
+    if not len(crossing):
+        return surface
+    mended, left = uncrossed(surface, crossing, _MENDED_WITHIN * tolerance)
+    if left:
+        return None
+    try:
+        check(mended)
+    except MeshingError:
+        return None
+    return mended
+
+
+def _in_boxes_of(corner: FloatArray, some: IntArray) -> IntArray:
+    """Triangles (m, 3, 3), by index, whose box meets that of one of some."""
+    lower, upper = corner.min(axis=1), corner.max(axis=1)
+    found = np.zeros(len(corner), np.bool_)
+    for row in some.tolist():
+        found |= (lower <= upper[row]).all(axis=1) & (upper >= lower[row]).all(axis=1)
+    return np.flatnonzero(found)
+
+
+def _rows_at(places: FloatArray, points: FloatArray) -> IntArray:
+    """Points, by index, that are one of some places."""
+    rows = np.flatnonzero(np.isin(points[:, 0], places[:, 0]))
+    same = (points[rows, None] == places).all(axis=2).any(axis=1)
+    return rows[same]

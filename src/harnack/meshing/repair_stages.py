@@ -1,0 +1,555 @@
+"""Repair of triangle meshes: a closed mesh of a damaged one, in which what was sound stays.
+
+It goes by stages: all triangles are kept, and holes get patches; or bodies that overlap are united;
+or the triangles that are sound are kept; or the surface on which the winding number is 1/2 is made
+anew.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from harnack.backend.validation import flag
+from harnack.fields.solid_angles.winding_number import WindingNumber
+from harnack.fields.solids.mesh_solid import MeshSolid
+from harnack.geometry import MeshError, validate_mesh, zero_area_faces
+from harnack.geometry.boundary_edges import singular_edges, weld_vertices
+from harnack.geometry.meshes import without_zero_area_faces
+from harnack.geometry.orientability import is_one_sided
+from harnack.meshing.bodies import mended_by_cuts, united_parts
+from harnack.meshing.checks import (
+    MeshingError,
+    TooLargeError,
+    euler_characteristic,
+    intersecting_faces,
+    singular_vertices,
+)
+from harnack.meshing.clipping import Shells, largest_body, parts_of
+from harnack.meshing.edges import IntArray
+from harnack.meshing.finishing import check_options
+from harnack.meshing.harmonic_filling import Asked, HarmonicPatches, harmonic_patches, open_edges
+from harnack.meshing.hole_filling import filled, hole_loops
+from harnack.meshing.intended_solid import Difference, IntendedSolid
+from harnack.meshing.joined_pieces import passes_itself
+from harnack.meshing.lattice_meshing import Surface
+from harnack.meshing.mesh_cleaning import Mended, joined, mended
+from harnack.meshing.mesh_pipeline import mesh as mesh_of
+from harnack.name_suggestions import is_one_of
+from harnack.progress import teller
+
+if TYPE_CHECKING:
+    import trimesh
+
+    from harnack.backend import FloatArray
+
+__all__ = ["repair"]
+
+# How many sizes of cells are tried for patches on which w is 1/2, if all triangles have to stay;
+# and if they need not, where there are no more open edges than that.
+_ATTEMPTS, _FEW_ATTEMPTS, _FEW_EDGES = 6, 1, 1000
+# Cells across the mesh if all is made anew; larger ones by this factor, up to so many times, where
+# the surface is rough and has more triangles than that.
+_ACROSS_ANEW = 48
+_MOST_ANEW, _LARGER, _MOST_LARGER = 80_000, 1.4, 3
+
+# Points lie in a plane if the least of their singular values is this part of the largest.
+_FLAT = 1e-9
+
+Keep = Literal["all", "sound", "none"]
+Patches = Literal["smooth", "harmonic"]
+
+
+def repair(
+    mesh: trimesh.Trimesh,
+    *,
+    keep: Keep | None = None,
+    patches: Patches = "smooth",
+    largest: bool = False,
+    tolerance: float = 1e-3,
+    spacing: float | None = None,
+    seed: int = 0,
+    progress: Callable[[str], None] | None = None,
+) -> trimesh.Trimesh:
+    """A closed mesh of a damaged one: with patches over its holes, or made anew.
+
+    Corners that are apart by rounding are joined first, and what is inside out as a whole is turned
+    over: each closed part that does not lie in another, with all that lies in it. Then five stages
+    are tried in turn:
+
+    - kept: all triangles stay, and holes get patches;
+    - united: a closed mesh that crosses itself, also along edges that lie on its faces, or parts
+      that overlap or touch, are cut where they do, exactly, and what is inside is left out, as is
+      what it winds around clockwise: cavities stay where it winds around no point;
+    - sound: triangles that are there twice, have no area or pass through others are left out, those
+      turned over against their neighbors are turned back, and holes get patches; where one cannot
+      be filled, the triangles around it are left out as well, ring by ring;
+    - joined: corners of loose triangles that lie near each other, as in a mesh full of cracks, are
+      moved to their mean, and the rest is done as before;
+    - anew: the surface on which the winding number w of the mesh is 1/2 is made by the signs of
+      w - 1/2 in cells (`meshing.by_signs`), closed whatever the mesh is.
+
+    Each result is compared with w at some thousand points, farther from both surfaces than two
+    tolerances: where w is above 0.86 the inside has to be, and where it is below 0.14 the outside;
+    and the volume has to be that of a closed mesh that winds around no point twice. One that
+    differs gives way to the next stage; if all do, the one that differs least is returned, with a
+    warning. That is sampled: what differs in less than a thousandth of the box may not be seen.
+
+    mesh: anything with `vertices` (n, 3) and `faces` (m, 3).
+    keep: "all" does the first stage or raises an error, "sound" the second one, "none" the last;
+        None does the first that succeeds of all.
+    patches: "smooth" ones continue the surface around each hole, with its tangents, and bend least.
+        They are made hole by hole, and used where w is within 0.36 of 1/2 modulo 1 on them; the
+        rest is done by "harmonic" ones, on which w is 1/2 modulo 1: they join the rims of a gap
+        between two parts, and have a dent where the surface was round. Only of these is it proved
+        what they are.
+    largest: keep the body of the largest volume alone, with its cavities.
+    tolerance: how far harmonic patches may be from the surface w = 1/2, as a part of the size of
+        the box around all holes, and triangles made anew, as a part of the mesh's; sampled and not
+        proved.
+    spacing: of cells before anything is refined, in the mesh's unit; None chooses.
+    seed: of the small random moves that keep points in general position.
+    progress: told what is being done.
+
+    Returns:
+        A closed trimesh.Trimesh: every edge has two faces, which agree. `metadata["harnack"]` has
+        stage: "kept", "united", "sound", "joined" or "anew"; why: what those before failed with, or
+        None; kept: how many of the given triangles are there; parts: of each part, largest first, a
+        dictionary of its faces, volume and center; dropped: how many parts of these were left out
+        for `largest`; welded: how many corners were joined since they were apart by rounding;
+        differs: None, or a dictionary of what differs from what was given (share of the points on
+        the wrong side, some places, how many are missing and added, and volumes of both); and the
+        Euler characteristic.
+
+        Unless all was made anew there are also holes (loops of edges that were open), patches
+        (triangles added) and harmonic (how many of these are harmonic). Vertices and faces that
+        were given come first, bit by bit and in their order: all of them if all was kept and
+        nothing dropped, else those that are in use. Patches meet no other triangle but at the edges
+        and corners that they share, decided exactly.
+
+        If all was kept: missing (how many patches are the triangles of holes of three edges),
+        refined (whether harmonic patches are within the tolerance: they stay as the cells cut them
+        if finer ones would pass through each other), spacing and evaluations of these. A closed
+        mesh gets nothing added; unless keep is "all", it is only returned if no triangles pass
+        through each other.
+
+        If it was united, kept is 0: triangles that were not cut lie where they were, but may be
+        divided otherwise.
+
+        If what was sound was kept: turned (how many triangles were turned over) and left_out, a
+        dictionary: how many were "flat" (without an area), "doubled", "crossing", "branching" (at
+        edges of more than two), "one-sided" (at edges where no two sides can be told), "around"
+        holes that could not be filled or "inside" the material of other parts. Vertices at one
+        place are joined. No triangles pass through each other, and no part is inside out.
+
+        If corners were joined: the same, and joined (how many of the given triangles are there,
+        with moved corners) and moved (how far the farthest corner went, a length); kept is 0. A
+        warning says so where that is more than two tolerances.
+
+        If all was made anew, no triangles pass through each other, and there is what `mesh` says of
+        meshes by signs, such as far and within; kept is 0.
+
+    Raises:
+        MeshError: a ValueError, for a mesh that has no triangles, or numbers that are none; one
+            that is an open sheet, most of which has nothing inside, if it would be made anew; with
+            keep="all" also for edges of more than two faces, faces that disagree on their sides,
+            faces without an area and vertices at one place.
+        MeshingError: a ValueError, with keep="all" or "sound", if patches could not be made, or
+            meet the mesh or each other; else if the surface w = 1/2 is empty or takes too many
+            cells.
+    """
+    largest = flag(largest, "largest")
+    asked = _checked_settings(keep, patches, tolerance, spacing, seed, teller(progress))
+    _check_is_mesh(mesh)
+    _check_encloses(mesh)
+    intended = IntendedSolid.of(mesh, as_it_is=keep == "all")
+    stages = {
+        "all": _kept, "united": _united, "sound": _sound, "joined": _joined, "none": _anew,
+    }  # fmt: skip
+    names = list(stages) if keep is None else [keep]
+    reasons, results = list[str](), list[_Result]()
+    for name in names:
+        try:
+            surface, facts = stages[name](intended, asked)
+        except (MeshError, MeshingError) as error:
+            if name == names[-1] and not results:
+                raise
+            reasons.append(str(error))
+            asked.report(f"{error}; so not all is kept")
+            continue
+        asked.report("comparing with what was given")
+        away = 2 * tolerance * intended.size + facts.get("moved", 0.0)
+        results.append(_Result(surface, facts, intended.difference(surface, away)))
+        if results[-1].difference is None:
+            break
+        reasons.append(f"the result of {facts['stage']} is another solid: {results[-1].difference}")
+        asked.report(f"{reasons[-1]}; so another way")
+    best = min(results, key=lambda result: result.badness)
+    moved = best.facts.get("moved", 0.0)
+    if moved > 2 * tolerance * intended.size:
+        warnings.warn(
+            f"faces that were apart were joined, which moved corners by up to {moved:.3g}: the "
+            "repaired mesh may be off by as much",
+            stacklevel=2,
+        )
+    # Each reason once.
+    why = "; ".join(dict.fromkeys(reasons)) or None
+    return best.finished({"why": why, "welded": intended.rounded}, largest)
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """The arguments of `repair`."""
+
+    keep: Keep | None
+    patches: Patches
+    tolerance: float
+    spacing: float | None
+    seed: int
+    report: Callable[[str], None]
+
+
+def _checked_settings(
+    keep: Keep | None,
+    patches: Patches,
+    tolerance: float,
+    spacing: float | None,
+    seed: int,
+    report: Callable[[str], None],
+) -> _Asked:
+    if keep is not None and not is_one_of(keep, ("all", "sound", "none")):
+        raise ValueError(f'keep is None, "all", "sound" or "none", not {keep!r}')
+    if not is_one_of(patches, ("smooth", "harmonic")):
+        raise ValueError(f'patches are "smooth" or "harmonic", not {patches!r}')
+    check_options(tolerance, spacing, None, seed, 1)
+    return _Asked(keep, patches, tolerance, spacing, seed, report)
+
+
+@dataclass(frozen=True)
+class _Result:
+    """What a stage made, and how that differs from what was given."""
+
+    surface: Surface
+    facts: dict[str, Any]
+    difference: Difference | None
+
+    @property
+    def badness(self) -> float:
+        """0 if it does not differ: see `Difference`."""
+        return 0.0 if self.difference is None else self.difference.badness
+
+    def finished(self, more: dict[str, Any], largest: bool) -> trimesh.Trimesh:
+        """The mesh, with what is known of it and of its parts; a warning if it differs."""
+        from harnack.meshing.closed_mesh import ClosedMesh
+
+        surface = self.surface
+        facts: dict[str, Any] = {**self.facts, **more, "differs": None}
+        if self.difference is not None:
+            facts["differs"] = dataclasses.asdict(self.difference)
+            warnings.warn(
+                f"the repaired mesh is not quite the solid that was given: {self.difference}",
+                stacklevel=3,
+            )
+        parts = parts_of(surface)
+        dropped = 0
+        if largest and len(parts) > 1:
+            surface = largest_body(surface)
+            dropped = len(parts) - len(parts_of(surface))
+            facts["kept"] = _count_of(surface, self.surface, facts["kept"])
+        repaired = ClosedMesh(surface.vertices, surface.faces, process=False, validate=False)
+        repaired.metadata["harnack"] = {
+            **facts,
+            "parts": parts,
+            "dropped": dropped,
+            "euler_characteristic": euler_characteristic(surface.faces),
+        }
+        return repaired
+
+
+def _count_of(surface: Surface, whole: Surface, first: int) -> int:
+    """How many of the first faces of a whole are in a surface that is a part of it."""
+    corners = [one.vertices[one.faces].reshape(-1, 9) for one in (surface, whole)]
+    there = {row.tobytes() for row in corners[0]}
+    return sum(row.tobytes() in there for row in corners[1][:first])
+
+
+def _check_is_mesh(mesh: Any) -> None:
+    if not hasattr(mesh, "vertices") or not hasattr(mesh, "faces"):
+        raise TypeError(
+            f"repair takes a mesh with vertices and faces, such as a trimesh.Trimesh, not "
+            f"{type(mesh).__name__}"
+        )
+
+
+def _check_encloses(mesh: Any) -> None:
+    """Raise if all faces lie in a plane, or form a strip of one side only.
+
+    Raises:
+        MeshError: so; or as `validate_mesh`.
+    """
+    vertices, faces = validate_mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces), flat=True)
+    x = vertices[np.unique(faces)]
+    x = x - x.mean(axis=0)
+    largest, *_, least = np.linalg.svd(x / np.abs(x).max(), compute_uv=False)
+    if least <= _FLAT * largest:
+        raise MeshError(
+            "all faces of the mesh lie in a plane, or nearly so: they enclose nothing that could "
+            "be closed; give it a thickness first, or mesh its boundary with `thickness`"
+        )
+    if is_one_sided(weld_vertices(vertices)[faces]):
+        raise MeshError(
+            "the mesh has one side only, as a Moebius strip has: nothing is inside of it that "
+            "could be closed; give it a thickness first, in the program that made it"
+        )
+
+
+# Bodies united.
+
+
+def _united(intended: IntendedSolid, asked: _Asked) -> tuple[Surface, dict[str, Any]]:
+    """The boundary of the solid that a closed mesh bounds which passes through itself, or of parts
+    that touch.
+
+    Raises:
+        MeshError, MeshingError: as `repair`.
+    """
+    vertices, faces = intended.vertices, intended.oriented
+    if len(singular_edges(faces)[0]):
+        raise MeshError("the mesh is not closed")
+    if _is_fine(vertices, faces):
+        raise MeshError("nothing of it passes through or lies in itself")
+    facts = {"stage": "united", "kept": 0}
+    slivers = 0.5 * asked.tolerance * intended.size
+    if len(intended.parts) > 1 and sum(map(len, intended.parts)) == len(faces):
+        asked.report(f"uniting {len(intended.parts):,} parts")
+        try:
+            return united_parts(vertices, faces, intended.parts, slivers), facts
+        except (MeshError, MeshingError) as error:
+            asked.report(f"{error}; so all at once")
+    asked.report("cutting faces along each other")
+    try:
+        return mended_by_cuts(vertices, faces, slivers), facts
+    except MeshingError as error:
+        asked.report(f"{error}; so by cells")
+    made = mesh_of(MeshSolid(vertices, faces), progress=asked.report)
+    return Surface(np.asarray(made.vertices), np.asarray(made.faces, np.int64)), facts
+
+
+def _is_fine(vertices: FloatArray, faces: IntArray) -> bool:
+    """Whether no triangles meet beyond what they share, and no part is in another's material."""
+    try:
+        _check_sides(Surface.of(vertices, faces))
+    except MeshError:
+        return False
+    return not len(singular_vertices(faces)) and not len(intersecting_faces(vertices, faces))
+
+
+# All made anew.
+
+
+def _anew(intended: IntendedSolid, asked: _Asked) -> tuple[Surface, dict[str, Any]]:
+    """The surface on which the winding number is 1/2, closed whatever the mesh is."""
+    intended.check_encloses()
+    corners = without_zero_area_faces(intended.vertices, intended.oriented)
+    field = WindingNumber(*corners)
+    if asked.spacing is not None:
+        made = _by_signs(field, asked.spacing, asked)
+    else:
+        spacing = float(np.ptp(corners[0], axis=0).max()) / _ACROSS_ANEW
+        try:
+            made = _of_bounded_size(field, spacing, asked)
+        except MeshingError:
+            made = _by_signs(field, 0.6 * spacing, asked)
+    facts = made.metadata["harnack"] | {"stage": "anew", "kept": 0}
+    return Surface(np.asarray(made.vertices), np.asarray(made.faces, np.int64)), facts
+
+
+def _of_bounded_size(field: WindingNumber, spacing: float, asked: _Asked) -> trimesh.Trimesh:
+    """Of larger cells where there would be too many triangles, as of noisy meshes: the time of
+    checks grows with their number."""
+    for k in range(_MOST_LARGER):
+        try:
+            return _by_signs(field, spacing * _LARGER**k, asked, _MOST_ANEW)
+        except TooLargeError as error:
+            asked.report(f"{error}; so of larger cells")
+    return _by_signs(field, spacing * _LARGER**_MOST_LARGER, asked)
+
+
+def _by_signs(
+    field: WindingNumber, spacing: float, asked: _Asked, most: int = 2_000_000
+) -> trimesh.Trimesh:
+    return mesh_of(
+        field, solid=(0.5, math.inf), tolerance=asked.tolerance, spacing=spacing,
+        max_triangles=most, progress=asked.report,
+    )  # fmt: skip
+
+
+# What is sound kept.
+
+
+def _sound(intended: IntendedSolid, asked: _Asked) -> tuple[Surface, dict[str, Any]]:
+    """The triangles that are sound, with patches.
+
+    Raises:
+        MeshError, MeshingError: as `repair`.
+    """
+    vertices, faces = without_zero_area_faces(intended.vertices, intended.faces)
+    made = mended(vertices, faces, asked.report)
+    flat = len(intended.faces) - len(faces)
+    left_out = {"flat": made.left_out["flat"] + flat}
+    return made.surface, {
+        "stage": "sound",
+        "kept": len(made.kept),
+        "turned": _count_turned(intended, made),
+        "left_out": made.left_out | left_out,
+        "holes": made.holes,
+        "patches": len(made.surface.faces) - len(made.kept),
+        "harmonic": 0,
+    }
+
+
+def _count_turned(intended: IntendedSolid, sound: Mended) -> int:
+    """How many of the triangles that were kept run the other way than those that were given."""
+    turned_before = np.delete(
+        intended.is_turned, zero_area_faces(intended.vertices, intended.faces)
+    )
+    is_turned = np.zeros(len(turned_before), np.bool_)
+    is_turned[sound.turned] = True
+    return int((is_turned ^ turned_before)[sound.kept].sum())
+
+
+# Loose triangles joined.
+
+
+def _joined(intended: IntendedSolid, asked: _Asked) -> tuple[Surface, dict[str, Any]]:
+    """Triangles with near corners joined, with patches; none is kept bit by bit.
+
+    Raises:
+        MeshError, MeshingError: as `repair`.
+    """
+    corners = without_zero_area_faces(intended.vertices, intended.faces)
+    vertices, faces, moved = joined(*corners)
+    made = mended(vertices, faces, asked.report)
+    count = len(made.kept)
+    return made.surface, {
+        "stage": "joined",
+        "kept": 0,
+        "joined": count,
+        "moved": moved,
+        "turned": len(made.turned),
+        "left_out": made.left_out | {"flat": len(intended.faces) - len(faces)},
+        "holes": made.holes,
+        "patches": len(made.surface.faces) - count,
+        "harmonic": 0,
+    }
+
+
+# All kept.
+
+
+def _kept(intended: IntendedSolid, asked: _Asked) -> tuple[Surface, dict[str, Any]]:
+    """The mesh with patches; all its triangles stay.
+
+    Raises:
+        MeshError, MeshingError: as `repair`.
+    """
+    vertices, faces = _checked(intended)
+    if intended.is_turned.any():
+        raise MeshError("a part of the mesh is inside out")
+    edges = open_edges(faces)
+    if asked.keep is None and len(crossing := intersecting_faces(vertices, faces)):
+        raise MeshError(f"{len(crossing):,} triangles of the mesh pass through others")
+    loops = hole_loops(vertices, faces, edges)
+    if asked.patches == "smooth":
+        try:
+            return _kept_with(vertices, faces, loops, asked)
+        except MeshingError as error:
+            if asked.keep is None:
+                raise
+            asked.report(f"{error}; once more, with harmonic patches alone")
+    return _kept_with(vertices, faces, loops, dataclasses.replace(asked, patches="harmonic"))
+
+
+def _checked(intended: IntendedSolid) -> tuple[FloatArray, IntArray]:
+    """Vertices and faces of a mesh all of which can be kept."""
+    vertices, faces = validate_mesh(intended.vertices, intended.faces)
+    used = np.unique(faces)
+    welded = weld_vertices(vertices[used])
+    twice = np.flatnonzero(welded != np.arange(len(used)))
+    if len(twice):
+        raise MeshError(
+            f"vertices {used[welded[twice[0]]]} and {used[twice[0]]} are at the same place, and "
+            f"{len(twice):,} in all: join such vertices first, for instance by "
+            "mesh.merge_vertices() of trimesh, or faces are not known to be neighbors"
+        )
+    return vertices, faces
+
+
+def _kept_with(
+    vertices: FloatArray, faces: IntArray, loops: list[IntArray], asked: _Asked
+) -> tuple[Surface, dict[str, Any]]:
+    """The mesh with patches over its holes: smooth ones if asked for, and harmonic ones.
+
+    Raises:
+        MeshingError: as `repair`.
+    """
+    x, together, left = vertices, faces, loops
+    if loops and asked.patches == "smooth":
+        asked.report(f"filling {len(loops):,} holes")
+        field = WindingNumber(vertices, faces)
+        made = filled(vertices, faces, loops, lambda p: field.value(p, precision="double"))
+        x, together = np.concatenate([x, made.vertices]), np.concatenate([faces, made.faces])
+        left = made.left
+        asked.report(f"{len(left):,} holes are left" + f": {made.why}" * bool(left))
+    rest = HarmonicPatches(vertices[:0], faces[:0], True, 0.0, 0)
+    if left:
+        edges = open_edges(together)
+        if asked.keep is None and len(edges) > _FEW_EDGES:
+            raise MeshingError(f"{len(left):,} holes of {len(edges):,} edges have no smooth patch")
+        attempts = _ATTEMPTS if asked.keep == "all" else _FEW_ATTEMPTS
+        how = Asked(asked.tolerance, asked.spacing, asked.seed, attempts, asked.report)
+        rest = harmonic_patches(x, together, edges, how)
+        x, together = np.concatenate([x, rest.vertices]), np.concatenate([together, rest.faces])
+    surface = Surface.of(x, together)
+    if loops or asked.keep is None:
+        _check_touching(together)
+    if asked.keep is None:
+        _check_sides(surface)
+    return surface, {
+        "stage": "kept",
+        "kept": len(faces),
+        "holes": len(loops),
+        "patches": len(together) - len(faces),
+        "harmonic": len(rest.faces),
+        "missing": rest.missing,
+        "refined": rest.is_fine,
+        "spacing": rest.spacing,
+        "evaluations": rest.evaluations,
+    }
+
+
+def _check_sides(surface: Surface) -> None:
+    """Raise if a part is inside out, or inside the material of another one, also in part."""
+    shells = Shells.of(surface)
+    depths = shells.depths()
+    if ((shells.volumes < 0) & (depths == 0)).any():
+        raise MeshError("a part of the mesh is inside out")
+    if ((shells.volumes > 0) & (depths > 0)).any():
+        raise MeshError("a part of the mesh is inside the material of another one")
+    if passes_itself(surface, shells.number):
+        raise MeshError("the mesh passes through itself along edges that lie on faces")
+
+
+def _check_touching(faces: IntArray) -> None:
+    """Raise unless the faces around each vertex are joined by edges."""
+    if len(places := singular_vertices(faces)):
+        raise MeshingError(
+            f"faces touch in {len(places):,} vertices alone, such as vertex {places[0]}: such a "
+            "mesh has no two sides there"
+        )

@@ -1,0 +1,254 @@
+"""Closed meshes of which a few triangles pass through each other, mended there alone.
+
+Where solids are cut by each other corners are rounded, and where triangles in a plane are joined
+slivers without an area are left: such triangles pass through their neighbors by next to nothing.
+One edge near them, contracted or flipped, mends that mostly. Which one is tried, with exact signs,
+on the few triangles around.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, cast
+
+import numpy as np
+
+from harnack.backend import BoolArray, FloatArray
+from harnack.meshing.checks import CrossingError, check_apart, intersecting_faces
+from harnack.meshing.edges import (
+    IntArray,
+    crosses,
+    directed_edges,
+    distance_from_triangles,
+    distinct,
+    dots,
+    edge_keys,
+    lengths,
+)
+from harnack.meshing.lattice_meshing import Surface
+
+__all__ = ["made_apart", "uncrossed"]
+
+# More crossing triangles than this, or in a larger neighborhood, are no slivers.
+_MOST, _MOST_AROUND = 400, 5_000
+# How many changes are made in one place, and how many are tried for each.
+_MOST_CHANGES, _MOST_TRIED = 40, 80
+# New triangles of this part of the area that they are to cover may look backwards.
+_NOTHING = 1e-4
+
+
+def made_apart(surface: Surface, length: float) -> Surface:
+    """A closed surface, mended where its triangles pass through each other (`uncrossed`), so that
+    none do.
+
+    Raises:
+        MeshingError: vertices that are not finite; a CrossingError where that is not enough.
+    """
+    try:
+        check_apart(surface.vertices, surface.faces)
+    except CrossingError as error:
+        mended, left = uncrossed(surface, error.faces, length)
+        if left:
+            raise
+        return mended
+    return surface
+
+
+def uncrossed(surface: Surface, crossing: IntArray, length: float) -> tuple[Surface, int]:
+    """A closed surface with edges contracted and flipped where triangles cross; and how many
+    triangles cross still.
+
+    crossing: all faces that do (`intersecting_faces`).
+    length: how far the surface may be moved by one change; vertices stay where they are, or go.
+    """
+    if not 0 < len(crossing) <= _MOST or length <= 0:
+        return surface, len(crossing)
+    vertices, faces = surface.vertices, surface.faces
+    is_gone, made, left = np.zeros(len(faces), np.bool_), [faces[:0]], 0
+    for rows, movable in _regions(vertices, faces, crossing):
+        is_gone[rows] = True
+        if len(rows) > _MOST_AROUND:
+            made.append(faces[rows])
+            left += int(np.isin(crossing, rows).sum())
+            continue
+        patch, count = _mended(_Patch.of(vertices, faces[rows], movable), length)
+        made.append(patch)
+        left += count
+    return Surface.of(vertices, np.concatenate([faces[~is_gone], *made])), left
+
+
+def _regions(
+    vertices: FloatArray, faces: IntArray, crossing: IntArray
+) -> Iterator[tuple[IntArray, IntArray]]:
+    """Faces, by index, of separate neighborhoods, and the vertices that may go in each.
+
+    A neighborhood is all faces whose boxes meet that of the faces around the faces around crossing
+    ones. Vertices of the latter may go: the new faces then lie within that box, so that they cross
+    no others.
+    """
+    import scipy.sparse  # here: half a second that few need
+    import scipy.sparse.csgraph as csgraph_module
+
+    sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
+    corner = vertices[faces]
+    lower, upper = corner.min(axis=1), corner.max(axis=1)
+    near = _touching(faces, faces[crossing])
+    around = _touching(faces, faces[near])
+    pairs = directed_edges(faces[around])
+    joined = sparse.coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(vertices),) * 2)
+    part = csgraph.connected_components(joined, directed=False)[1]
+    boxes: list[IntArray] = []
+    for one in np.unique(part[faces[around, 0]]):
+        rows = around[part[faces[around, 0]] == one]
+        low, high = lower[rows].min(axis=0), upper[rows].max(axis=0)
+        found = np.flatnonzero((lower <= high).all(axis=1) & (upper >= low).all(axis=1))
+        for k in reversed(range(len(boxes))):
+            if len(np.intersect1d(found, boxes[k])):
+                found = np.union1d(found, boxes.pop(k))
+        boxes.append(found)
+    for rows in boxes:
+        yield rows, np.unique(faces[near[np.isin(near, rows)]])
+
+
+def _touching(faces: IntArray, some: IntArray) -> IntArray:
+    """Faces, by index, with a corner of some."""
+    is_asked = np.zeros(int(faces.max()) + 1, np.bool_)
+    is_asked[some] = True
+    return np.flatnonzero(is_asked[faces].any(axis=1))
+
+
+@dataclass(frozen=True)
+class _Patch:
+    """Faces (m, 3) of a neighborhood, between vertices (n, 3) of the mesh; is_movable: (n,) those
+    of which all faces are here."""
+
+    vertices: FloatArray
+    faces: IntArray
+    is_movable: BoolArray
+    names: IntArray
+
+    @classmethod
+    def of(cls, vertices: FloatArray, faces: IntArray, movable: IntArray) -> _Patch:
+        """names: of the vertices, in the mesh."""
+        names, place = np.unique(faces, return_inverse=True)
+        return cls(vertices[names], place.reshape(-1, 3), np.isin(names, movable), names)
+
+    def crossing(self) -> IntArray:
+        """Faces, by index, that pass through others."""
+        return intersecting_faces(self.vertices, self.faces)
+
+    def around(self, vertex: int) -> IntArray:
+        """Faces, by index, at a vertex."""
+        return np.flatnonzero((self.faces == vertex).any(axis=1))
+
+    def neighbors(self, vertex: int) -> set[int]:
+        """Vertices that edges join a vertex with."""
+        return set(self.faces[self.around(vertex)].ravel().tolist()) - {vertex}
+
+    def with_faces(self, gone: IntArray, new: IntArray) -> _Patch:
+        """With faces, by index, replaced."""
+        return dataclasses.replace(
+            self, faces=np.concatenate([np.delete(self.faces, gone, axis=0), new])
+        )
+
+    def contracted(self, a: int, b: int) -> tuple[IntArray, IntArray] | None:
+        """Faces that go and that come if a is moved to b; None where sheets would touch."""
+        if not (self.is_movable[a] and self.is_movable[b]):
+            return None
+        if len(self.neighbors(a) & self.neighbors(b)) != 2:
+            return None
+        gone = self.around(a)
+        new = np.where(self.faces[gone] == a, b, self.faces[gone])
+        return gone, new[(new != np.roll(new, 1, axis=1)).all(axis=1)]
+
+    def flipped(self, a: int, b: int) -> tuple[IntArray, IntArray] | None:
+        """Faces that go and that come if the edge between a and b joins the corners opposite to it
+        instead; None if there is such an edge."""
+        if not (self.is_movable[a] and self.is_movable[b]):
+            return None
+        gone = np.intersect1d(self.around(a), self.around(b))
+        if len(gone) != 2:
+            return None
+        first, second = (self.faces[row].tolist() for row in gone)
+        if first[(first.index(a) + 1) % 3] != b:
+            first, second = second, first
+        (c,), (d,) = set(first) - {a, b}, set(second) - {a, b}
+        if c == d or d in self.neighbors(c):
+            return None
+        if not (self.is_movable[c] or self.is_movable[d]):
+            return None
+        return gone, np.array([[a, d, c], [d, b, c]])
+
+
+def _mended(patch: _Patch, length: float) -> tuple[IntArray, int]:
+    """Faces of a patch, by vertices of the mesh, in which fewer cross; and how many still do."""
+    bad = patch.crossing()
+    for _ in range(_MOST_CHANGES):
+        better = _better(patch, bad, length) if len(bad) else None
+        if better is None:
+            break
+        patch, bad = better
+    return patch.names[patch.faces], len(bad)
+
+
+def _better(patch: _Patch, bad: IntArray, length: float) -> tuple[_Patch, IntArray] | None:
+    """The patch after one change, after which fewer faces cross, and these; None if none is known.
+
+    Those are tried first that move the surface least: of edges of faces that cross, then of all
+    edges at their corners.
+    """
+    for rows in (bad, _touching(patch.faces, patch.faces[bad])):
+        for _, gone, new in sorted(_changes(patch, rows, length), key=lambda one: one[0])[
+            :_MOST_TRIED
+        ]:
+            made = patch.with_faces(gone, new)
+            crossing = made.crossing()
+            if len(crossing) < len(bad):
+                return made, crossing
+    return None
+
+
+def _changes(
+    patch: _Patch, rows: IntArray, length: float
+) -> Iterator[tuple[float, IntArray, IntArray]]:
+    """Changes of the edges of some faces: how far they move the surface, and the faces that go and
+    that come."""
+    count = len(patch.vertices)
+    keys = distinct(edge_keys(directed_edges(patch.faces[rows]), count))
+    for a, b in np.stack(np.divmod(keys, count), axis=1).tolist():
+        for one, other in ((a, b), (b, a)):
+            change = patch.contracted(one, other)
+            if change is not None and _looks_onward(patch, *change, length):
+                moved = distance_from_triangles(patch.vertices[one], patch.vertices[change[1]])
+                if moved <= length:
+                    yield moved, *change
+        change = patch.flipped(a, b)
+        if change is not None and _looks_onward(patch, *change, length):
+            c, d = (patch.vertices[change[1][0, k]] for k in (2, 1))
+            moved = _between(patch.vertices[a], patch.vertices[b], c, d)
+            if moved <= length:
+                yield moved, *change
+
+
+def _looks_onward(patch: _Patch, gone: IntArray, new: IntArray, length: float) -> bool:
+    """Whether no new face, but for slivers, looks backwards from where the old ones look in the
+    mean, and the volume between new and old ones is no more than if these moved by a length: a
+    vertex on the new faces says nothing of old ones that are folded, as at a thin spike."""
+    corner, replaced = patch.vertices[patch.faces[gone]], patch.vertices[new]
+    old, made = crosses(corner), crosses(replaced)
+    mean = old.sum(axis=0)
+    most = float(lengths(old).sum())
+    origin = corner[0, 0]
+    between = dots(replaced[:, 0] - origin, made).sum() - dots(corner[:, 0] - origin, old).sum()
+    if abs(float(between)) / 6 > length * most / 2:
+        return False
+    return bool(((made @ mean > 0) | (lengths(made) <= _NOTHING * most)).all())
+
+
+def _between(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> float:
+    """How far the lines through a and b and through c and d are from each other."""
+    across = np.cross(b - a, d - c)
+    size = float(np.linalg.norm(across))
+    return abs(float(across @ (c - a))) / size if size > 0 else np.inf

@@ -1,0 +1,308 @@
+"""Films: pictures one after the other, with one frame for all of them."""
+
+from __future__ import annotations
+
+import base64
+import html
+import math
+import os
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import numpy.typing as npt
+
+from harnack.backend import FloatArray
+from harnack.backend.validation import finite
+from harnack.cluster.executor import Arrays, crew
+from harnack.files.file_geometry import check_writable, write_atomically
+from harnack.geometry import Box
+from harnack.progress import progress_bar
+from harnack.rendering.camera import Camera
+from harnack.rendering.framing import UnboundedSurfaceError, upright, visible_points
+from harnack.rendering.mitsuba import mitsuba_backend, take_variant
+from harnack.rendering.mitsuba_plugins import register
+from harnack.rendering.picture import render
+from harnack.rendering.render_options import OF_PICTURES, check_camera, check_integer, check_size
+from harnack.rendering.studio_surfaces import surfaces_of
+
+FILM_FILES = (".gif", ".mp4")
+_SIZE = (320, 240)
+_MOST_FRAMES = 10_000
+# The palette's last entry in a GIF, which stands for transparent.
+_CLEAR = 255
+Pixels = npt.NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Film:
+    """A film that was written. path: of its file. size: (width, height) of its pictures."""
+
+    path: Path
+    size: tuple[int, int]
+
+    def _repr_html_(self) -> str:
+        """For notebooks: the film itself, in the page."""
+        data = base64.b64encode(self.path.read_bytes()).decode()
+        width, height = self.size
+        size = f'width="{width}" height="{height}"'
+        if self.path.suffix.lower() == ".gif":
+            name = html.escape(self.path.name)
+            return f'<img {size} alt="{name}" src="data:image/gif;base64,{data}">'
+        source = f'<source src="data:video/mp4;base64,{data}" type="video/mp4">'
+        return f"<video {size} controls loop muted autoplay>{source}</video>"
+
+
+def animate(
+    what: Any,
+    path: str | os.PathLike[str],
+    *,
+    frames: int = 24,
+    fps: float = 24.0,
+    turn: float = 0.0,
+    camera: Any = None,
+    size: tuple[int, int] = _SIZE,
+    show: str = "shaded",
+    progress: bool = True,
+    client: Any = None,
+    checkpoint: str | os.PathLike[str] | None = None,
+    **settings: Any,
+) -> Film:
+    """Draw a film and write it to `path`; notebooks show what is returned.
+
+        hk.animate(field, "turntable.gif", turn=360)
+        hk.animate(lambda s: hk.Morph(a, b, gap=0.2, w=0.2 * s), "morph.mp4")
+        hk.animate(field, "levels.gif", level=lambda s: 1 + 4 * s)
+
+    what: what `render` draws in its studio. It, the camera and settings may be functions of
+        s, which goes from 0 in the first picture to 1 in the last; with a `turn` of 360 degrees,
+        to just before 1, so that the film can be repeated.
+    path: .gif (Pillow) or .mp4 (PyAV: `pip install harnack[film]`).
+    frames: number of pictures. fps: pictures a second; those of a GIF last whole hundredths.
+    turn: degrees that the camera goes around during the film.
+    camera: as `render` takes it. What it does not say (target, distance, angle of view) is the same
+        for all pictures, and such that all is always in view. It goes around its target.
+    client, checkpoint: as `render` takes them; workers draw whole pictures, and a film with more of
+        them, or at another speed, draws only those that the folder does not have.
+    settings: of `render`; `size` and `show` are the same for all pictures.
+
+    Raises what `render` raises; ValueError for no or too many frames, and for another file type;
+    ModuleNotFoundError where Pillow or PyAV is missing. Nothing is written unless all is.
+    """
+    target = check_film_path(path)
+    count = check_integer("frames", frames)
+    if not 1 <= count <= _MOST_FRAMES:
+        raise ValueError(f"frames must be from 1 to {_MOST_FRAMES:,}, not {count}")
+    fps, turn = finite(fps, "fps"), finite(turn, "turn")
+    if not 0 < fps <= 240:
+        raise ValueError(f"fps must be more than 0 and at most 240, not {fps}")
+    for name, value in (("size", size), ("show", show)):
+        if callable(value):
+            raise TypeError(
+                f"{name} is the same for all pictures of a film, and no function of s: give it as "
+                "render takes it"
+            )
+    size = check_size(size)
+    with write_atomically(target) as partial, _encoder(partial, size, fps) as add:
+        repeats = turn != 0 and turn % 360 == 0
+        steps = np.arange(count) / max(count if repeats else count - 1, 1)
+        given = {"what": what, "camera": camera, **settings}
+        moments = [{name: _at(value, s) for name, value in given.items()} for s in steps.tolist()]
+        cameras = _cameras(moments, steps, turn, size)
+        frames_of = [
+            {**moment, "camera": one} for moment, one in zip(moments, cameras, strict=True)
+        ]
+        job, parts = _job(frames_of, {"size": size, "show": show, "progress": False})
+        with progress_bar("film", progress) as advance, crew(client, checkpoint) as workers:
+            for found in workers.each(job, "frame", parts):
+                add(found["shown"])
+                advance(1 / count)
+    return Film(target, size)
+
+
+@dataclass(frozen=True)
+class _FilmJob:
+    """What all pictures of a film have in common, as arguments of `render`; Mitsuba's variant."""
+
+    arguments: dict[str, Any]
+    variant: str
+
+    def frame(self, others: dict[str, Any]) -> Arrays:
+        """The pixels of one picture. others: its other arguments."""
+        take_variant(self.variant)
+        given = {**self.arguments, **others}
+        return {"shown": render(given.pop("what"), **given).shown}
+
+
+def _job(
+    frames: list[dict[str, Any]], same: dict[str, Any]
+) -> tuple[_FilmJob, list[tuple[dict[str, Any]]]]:
+    """The job of a film, and what each picture has of its own."""
+    first = frames[0]
+    moving = [name for name in first if any(one[name] is not first[name] for one in frames)]
+    same = {**same, **{name: first[name] for name in first if name not in moving}}
+    return _FilmJob(same, register().variant()), [
+        ({name: one[name] for name in moving},) for one in frames
+    ]
+
+
+def check_film_path(path: str | os.PathLike[str]) -> Path:
+    """The path of a film to write.
+
+    Raises:
+        ValueError: its extension is neither .gif nor .mp4.
+        OSError: no file can be created there.
+    """
+    target = Path(path)
+    if target.suffix.lower() not in FILM_FILES:
+        raise ValueError(f"{target}: films are written as {' or '.join(FILM_FILES)}")
+    check_writable(target)
+    return target
+
+
+def _at(value: Any, s: float) -> Any:
+    """A setting at the time s: functions of s are called, all else is constant."""
+    return value(s) if callable(value) and not isinstance(value, type) else value
+
+
+def _cameras(
+    moments: list[dict[str, Any]], steps: FloatArray, turn: float, size: tuple[int, int]
+) -> list[Camera]:
+    """The camera of each picture: all have one box, target, distance and angle of view, except
+    where they set their own."""
+    asked = [moment.get("camera") for moment in moments]
+    cameras = [Camera() if one is None else check_camera(one) for one in asked]
+    ups = [moment.get("up") for moment in moments]
+    stand = [upright("z" if up is None else up) for up in ups]
+    boxes = [np.array(one.box.bounds()) for one in cameras if one.box is not None]
+    points = np.concatenate(boxes or [_points(moments, steps)])
+    ends = np.array([points.min(axis=0), points.max(axis=0)])
+    if boxes:
+        points = np.array(np.meshgrid(*ends.T)).reshape(3, -1).T
+    box, middle = Box(*map(_three, ends)), _three(ends.mean(axis=0))
+    framed = [
+        _turned(replace(one, box=box, target=one.target or middle), turn * s, way)
+        for one, s, way in zip(cameras, steps.tolist(), stand, strict=True)
+    ]
+    free = [one.position is None and one.distance is None for one in framed]
+    poses = [
+        replace(one, zoom=1.0).pose(points @ way.T, size, lambda local, way=way: local @ way.T)
+        for one, way in zip(framed, stand, strict=True)
+    ]
+    away = [float(np.linalg.norm(pose.origin - pose.target)) for pose in poses]
+    farthest = max((one for one, is_free in zip(away, free, strict=True) if is_free), default=1.0)
+    widest = max(
+        (p.fov for p, is_free in zip(poses, free, strict=True) if not is_free), default=1.0
+    )
+    return [
+        replace(one, distance=farthest / one.zoom, fov=one.angle, zoom=1.0) if is_free
+        else replace(one, fov=widest if one.fov is None else one.fov)
+        for one, is_free in zip(framed, free, strict=True)
+    ]  # fmt: skip
+
+
+def _turned(camera: Camera, turn: float, stand: FloatArray) -> Camera:
+    """The camera after it has gone around its target. stand: (3, 3), rotates up to z."""
+    if camera.position is None:
+        return replace(camera, azimuth=camera.angles[0] + turn)
+    c, s = math.cos(math.radians(turn)), math.sin(math.radians(turn))
+    around = stand.T @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ stand
+    target = np.array(camera.target)
+    place = target + around @ (np.array(camera.position) - target)
+    return replace(camera, position=_three(place))
+
+
+def _points(moments: list[dict[str, Any]], steps: FloatArray) -> FloatArray:
+    """Points (n, 3) of all that is seen in a film."""
+    backend = mitsuba_backend(register())
+    seen: list[FloatArray] = []
+    last: Any = None
+    for moment, s in zip(moments, steps.tolist(), strict=True):
+        rest = {name: value for name, value in moment.items() if name not in OF_PICTURES}
+        if last is not None and all(rest[name] is last[name] for name in rest):
+            continue  # the same surfaces
+        last = rest
+        try:
+            seen += [visible_points(one, backend) for one in surfaces_of(**rest)]
+        except UnboundedSurfaceError as error:
+            raise ValueError(f"at s = {s:g} of the film, {error}") from None
+    return np.concatenate(seen)
+
+
+def _three(point: FloatArray) -> tuple[float, float, float]:
+    x, y, z = (float(c) for c in point)
+    return x, y, z
+
+
+@contextmanager
+def _encoder(path: Path, size: tuple[int, int], fps: float) -> Generator[Callable[[Pixels], None]]:
+    """Yields a function that takes pictures; the film is in `path` when the block ends."""
+    if path.suffix.lower() == ".gif":
+        with _gif(path, fps) as add:
+            yield add
+    else:
+        with _mp4(path, size, fps) as add:
+            yield add
+
+
+@contextmanager
+def _gif(path: Path, fps: float) -> Generator[Callable[[Pixels], None]]:
+    try:
+        from PIL import Image
+    except ModuleNotFoundError:
+        raise ModuleNotFoundError(
+            "films in .gif files need Pillow: pip install 'harnack[film]'"
+        ) from None
+    pictures: list[Any] = []
+
+    def add(pixels: Pixels) -> None:
+        opaque = Image.fromarray(np.ascontiguousarray(pixels[..., :3]))
+        chosen = opaque.quantize(_CLEAR, method=Image.Quantize.MEDIANCUT)
+        if pixels.shape[-1] == 4:  # a GIF has no partly transparent pixels
+            clear = Image.fromarray(np.where(pixels[..., 3] < 128, np.uint8(255), np.uint8(0)))
+            chosen.paste(_CLEAR, mask=clear)
+            chosen.info["transparency"] = _CLEAR
+        pictures.append(chosen)
+
+    yield add
+    duration = 10 * max(2, round(100 / fps))
+    pictures[0].save(
+        path, save_all=True, append_images=pictures[1:], duration=duration, loop=0, disposal=2
+    )
+
+
+@contextmanager
+def _mp4(path: Path, size: tuple[int, int], fps: float) -> Generator[Callable[[Pixels], None]]:
+    try:
+        import av
+    except ModuleNotFoundError:
+        raise ModuleNotFoundError(
+            "films in .mp4 files need PyAV: pip install 'harnack[film]', or write a .gif"
+        ) from None
+    library = cast("Any", av)
+    # H.264 stores colors for pairs of pixels.
+    if min(size) < 2:
+        raise ValueError(f"a film in .mp4 has sides of at least 2 pixels, not {size}")
+    with library.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001))
+        stream.pix_fmt = "yuv420p"
+        stream.options = {"crf": "16"}
+
+        def add(pixels: Pixels) -> None:
+            if pixels.shape[-1] == 4:
+                raise ValueError("films in .mp4 have no alpha: choose another backdrop, or a .gif")
+            height, width = (side - side % 2 for side in pixels.shape[:2])
+            if not stream.codec_context.is_open:
+                stream.width, stream.height = width, height
+            height, width = stream.height, stream.width
+            frame = library.VideoFrame.from_ndarray(
+                np.ascontiguousarray(pixels[:height, :width]), format="rgb24"
+            )
+            container.mux(stream.encode(frame))
+
+        yield add
+        container.mux(stream.encode())

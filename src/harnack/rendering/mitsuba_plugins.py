@@ -1,0 +1,317 @@
+"""Plug-ins for Mitsuba: a shape, an integrator, and what stands in for Mitsuba's own integrators.
+
+Scene files can name them once they are registered (`register`); `shape` makes surfaces for scenes
+that are put together in Python.
+
+<shape type="harnack">
+    <string name="file" value="curve.loops"/>      curves of an .obj, .ply or .loops file, or
+    <string name="field" value="gyroid"/>          gyroid, schwarz_p or schwarz_d with cell,
+                                                    spherical_harmonic with integers l and m
+    <float name="level" value="0"/>                or low and/or high, of a closed solid
+    <float name="clip_radius" value="1"/>          a ball about clip_center, and/or a box from
+    <point name="clip_lower" x="-1" y="0" z="0"/>  clip_lower to clip_upper
+    <float name="tolerance" value="1e-4"/>         and the integer max_steps
+    <boolean name="confirm" value="true"/>         hits only where the field changes sign
+    <transform name="to_world"> ... </transform>   moves, turns and one scale for all axes
+    <bsdf type="..."/>
+</shape>
+<integrator type="harnack_path"/>                  max_depth, rr_depth, hide_emitters, clamp
+
+Mitsuba's own integrators ask Mitsuba's shapes alone, for which a carrier is two points: they would
+draw nothing, and say nothing. No method of a shape is called while they render, so `mitsuba.render`
+looks first and warns. `harnack.render` follows paths itself where the integrator asks for the same
+light, leaves scenes without our surfaces to Mitsuba, and refuses the rest.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import re
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, cast
+
+from harnack.fields.analytic.periodic import Gyroid, SchwarzD, SchwarzP
+from harnack.fields.analytic.polynomial import SphericalHarmonic
+from harnack.fields.solid_angles.solid_angle import SolidAngle
+from harnack.files import read_loops
+from harnack.geometry import Ball, Box, Intersection
+from harnack.name_suggestions import did_you_mean
+from harnack.rendering import integrator, mitsuba_proxy
+from harnack.rendering.integrator import INTEGRATOR, PLUGIN, PathTracer
+from harnack.rendering.isolines import Isolines, checked_isolines
+from harnack.rendering.mitsuba import load_dictionary, load_mitsuba
+from harnack.rendering.mitsuba_proxy import as_matrix, from_properties, is_carrier
+from harnack.tracer import LevelSet, level_set
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
+
+    from harnack.fields import Field
+    from harnack.geometry import Volume
+
+_MARK = "watched_by_harnack"
+# Integrators that follow paths, and those among them that see media.
+_PATHS, _IN_MEDIA = "PathIntegrator", ("VolumetricSimplePath", "VolumetricMisPath")
+_DIRECT, _CHANNELS = "DirectIntegrator", "AOVIntegrator"
+
+
+def watch(mi: Any) -> None:
+    """Have `mitsuba.render` warn of surfaces that it will not draw; it renders as before."""
+    original = mi.render
+    if _MARK in vars(original):
+        return
+
+    @functools.wraps(original)
+    def render(scene: Any, *args: Any, **settings: Any) -> Any:
+        chosen = settings.get("integrator") or (args[2] if len(args) > 2 else None)
+        if isinstance(scene, mi.Scene):
+            warn_of_unseen(scene, chosen or scene.integrator())
+        return original(scene, *args, **settings)
+
+    vars(render)[_MARK] = True
+    mi.render = render
+
+
+def warn_of_unseen(scene: Any, integrator: Any) -> None:
+    """Warn if the integrator is Mitsuba's own, and the scene holds surfaces of ours."""
+    if not type(integrator).__module__.startswith("mitsuba") or _sees_ours(integrator):
+        return
+    unseen = sum(is_carrier(shape) for shape in scene.shapes())
+    if unseen:
+        kind = _kind(integrator)
+        if INTEGRATOR in str(integrator):
+            kind = f"apart from {PLUGIN} inside it, {kind}"
+        warnings.warn(
+            f"{unseen} of the scene's shapes are level sets of harnack, which Mitsuba's own "
+            f"integrators cannot see: {kind} draws nothing of them. Take the integrator "
+            f'{{"type": "{PLUGIN}"}}, or draw the scene with harnack.render(scene)',
+            stacklevel=3,
+        )
+
+
+def stand_in(mi: Any, scene: Any) -> PathTracer | None:
+    """The path tracer that finds the light that the scene's integrator asks for; None for scenes
+    without surfaces of ours that Mitsuba has to draw itself.
+
+    Raises:
+        ValueError: the scene holds surfaces of ours, and its integrator asks for what no path
+            tracer without media finds, such as light in a medium or channels of its own.
+    """
+    integrator = scene.integrator()
+    if integrator is None:
+        return PathTracer(mi)
+    own = getattr(integrator, "tracer", None)
+    ours = sum(is_carrier(shape) for shape in scene.shapes())
+    has_medium = any(shape.is_medium_transition() for shape in scene.shapes())
+    has_medium |= any(sensor.get_medium() is not None for sensor in scene.sensors())
+    if isinstance(own, PathTracer):
+        if has_medium:
+            warnings.warn(f"{PLUGIN} follows no light in media: they are left out", stacklevel=5)
+        return own
+    kind = _kind(integrator)
+    follows_paths = kind == _PATHS or (kind.startswith(_IN_MEDIA) and not has_medium)
+    if follows_paths:
+        return _with_settings(mi, integrator)
+    if not ours or _sees_ours(integrator):
+        return None
+    if kind == _DIRECT:
+        return PathTracer(mi, 2, hide_emitters=bool(integrator.hide_emitters))
+    wrong = "light in its media" if kind.startswith(_IN_MEDIA) else f"what {kind} asks for"
+    raise ValueError(
+        f"{ours} of the scene's shapes are level sets of harnack, which Mitsuba's own integrators "
+        f"cannot see, and {wrong} is not found by paths alone. Take the integrator "
+        f'{{"type": "{PLUGIN}"}} (or path, direct, volpath without media); depths and normals are '
+        'drawn by show="depth" and show="normal"'
+    )
+
+
+def _with_settings(mi: Any, integrator: Any) -> PathTracer:
+    """A path tracer with the settings of one of Mitsuba's, which shows them in its text alone."""
+    words = str(integrator)
+    found = {name: int(n) for name, n in re.findall(r"(max_depth|rr_depth) = (\d+)", words)}
+    depth = found.get("max_depth", 2**32 - 1)
+    return PathTracer(
+        mi, -1 if depth >= 2**31 else depth, found["rr_depth"], bool(integrator.hide_emitters)
+    )
+
+
+def _sees_ours(integrator: Any) -> bool:
+    """Whether all that it finds comes from our integrator inside it: so do moments of its light,
+    but not the channels of `aov`."""
+    words = str(integrator)
+    return INTEGRATOR in words and _CHANNELS not in words
+
+
+def _kind(integrator: Any) -> str:
+    """The name of its class in Mitsuba."""
+    moments = "MomentIntegrator"  # says that it is a Scene
+    kind = str(integrator).partition("[")[0]
+    return moments if kind == "Scene" else kind
+
+
+_PERIODIC = {"gyroid": Gyroid, "schwarz_p": SchwarzP, "schwarz_d": SchwarzD}
+
+
+def register() -> Any:
+    """Make `harnack` (shape) and `harnack_path` (integrator) known, and return `mitsuba`.
+
+    Needed once in each variant, before a scene that names them is loaded with Mitsuba's own
+    functions; `render` and `shape` do it by themselves. From then on `mitsuba.render` warns of
+    surfaces that another integrator would leave out.
+    """
+    mi = register_surfaces(mitsuba_proxy.PLUGIN, surface_of)
+    mi.register_integrator(integrator.PLUGIN, integrator.integrator_class(mi.variant()))
+    watch(mi)
+    return mi
+
+
+def register_surfaces(plugin: str, surface: Callable[[Any], LevelSet]) -> Any:
+    """Make a shape known whose surfaces come from a function of `mitsuba.Properties`.
+
+    The function reads what it understands; `to_world` and BSDF are taken care of.
+    """
+    mi = load_mitsuba()
+
+    def made(props: Any) -> Any:
+        return mitsuba_proxy.from_properties(mi, props, surface(props).in_one_call())
+
+    mi.register_shape(plugin, made)
+    return mi
+
+
+def surface_of(props: Any) -> LevelSet:
+    """The surface that the properties of a `harnack` shape describe.
+
+    Raises:
+        ValueError: they describe none, or contradict each other.
+    """
+    settings: dict[str, Any] = {"clip": _clip(props)}
+    if "low" in props or "high" in props:
+        settings["solid"] = (props.get("low", -math.inf), props.get("high", math.inf))
+    for name in ("level", "tolerance", "max_steps", "confirm"):
+        if name in props:
+            settings[name] = props[name]
+    return level_set(_field(props), **settings)
+
+
+def _field(props: Any) -> Field:
+    if ("file" in props) == ("field" in props):
+        raise ValueError("a harnack shape needs either a file of curves or a field")
+    if "file" in props:
+        path = load_mitsuba().file_resolver().resolve(props["file"])
+        return SolidAngle(read_loops(str(path), boundary=props.get("boundary", False)))
+    name = props["field"]
+    if name in _PERIODIC:
+        # The clip takes the place of the field's own domain.
+        return _PERIODIC[name](props.get("cell", 2 * math.pi), domain=_clip(props))
+    if name == "spherical_harmonic":
+        return SphericalHarmonic(props["l"], props["m"])
+    known = (*_PERIODIC, "spherical_harmonic")
+    raise ValueError(
+        f"unknown field {name!r}; there are {', '.join(known)}{did_you_mean(name, known)}"
+    )
+
+
+def _clip(props: Any) -> Volume | None:
+    volumes: list[Volume] = []
+    if "clip_radius" in props:
+        center = props.get("clip_center", [0.0, 0.0, 0.0])
+        volumes.append(Ball(_point(center), props["clip_radius"]))
+    if ("clip_lower" in props) != ("clip_upper" in props):
+        raise ValueError("a clip box needs both clip_lower and clip_upper")
+    if "clip_lower" in props:
+        volumes.append(Box(_point(props["clip_lower"]), _point(props["clip_upper"])))
+    if len(volumes) > 1:
+        return Intersection(volumes)
+    return volumes[0] if volumes else None
+
+
+def _point(value: Any) -> tuple[float, float, float]:
+    x, y, z = (float(component) for component in value)
+    return x, y, z
+
+
+def shape(
+    surface: Field | LevelSet,
+    *,
+    bsdf: Mapping[str, Any] | Any = None,
+    to_world: npt.ArrayLike | Any = None,
+    tint: Sequence[float] | None = None,
+    cut_bsdf: Mapping[str, Any] | Any = None,
+    isolines: Isolines | Sequence[Isolines] | None = None,
+    **settings: Any,
+) -> Any:
+    """A Mitsuba shape of a field's level set, for a scene dictionary or a scene.
+
+        scene = mitsuba.load_dict({
+            "type": "scene",
+            "integrator": {"type": "harnack_path"},
+            "surface": harnack.rendering.shape(field, bsdf={"type": "roughconductor"}),
+            ...
+        })
+
+    bsdf: dictionary or BSDF object; gray diffuse, seen from both sides, if left out. Open
+        surfaces have two sides: wrap one-sided BSDFs as {"type": "twosided", ...}.
+    to_world: matrix (4, 4) or Mitsuba transform of moves, turns and one scale for all axes.
+    tint: of a solid of glass, what is left of red, green and blue light after one unit of length
+        in it, in the world: (1, 1, 1) for clear (Beer and Lambert).
+    cut_bsdf: of the faces at which `section` cuts an opaque solid; by default that of the rest.
+    isolines: `harnack.Isolines` to draw on it, or several; later ones cover earlier ones.
+    settings: as `harnack.level_set` takes them: level, clip, tolerance, solid, ... Glass needs a
+        `solid`.
+
+    Raises:
+        ValueError: the surface has no bounds and no `clip`, or `to_world` is no similarity.
+    """
+    mi = register()
+    if isinstance(surface, LevelSet):
+        if settings:
+            raise ValueError(f"{', '.join(settings)}: a LevelSet holds its settings already")
+    else:
+        if "material" in settings:
+            raise TypeError(
+                "a shape takes bsdf=..., not material=...: that is an argument of harnack.render"
+            )
+        surface = level_set(surface, **settings)
+    surface = surface.in_one_call()
+    props = mi.Properties()
+    props["bsdf"] = as_bsdf(mi, bsdf)
+    if to_world is not None:
+        props["to_world"] = mi.ScalarTransform4f(as_matrix(to_world))
+    of_cut = _of_cut(mi, surface, props["bsdf"], cut_bsdf)
+    return from_properties(mi, props, surface, tint, of_cut, checked_isolines(isolines))
+
+
+def _of_cut(mi: Any, surface: LevelSet, bsdf: Any, cut_bsdf: Any) -> Any:
+    """The BSDF of the faces at which a section cuts a solid; None for that of the rest."""
+    if cut_bsdf is None:
+        return None
+    if surface.solid is None or surface.section is None:
+        raise ValueError(
+            "faces of a cut are those of a solid on its section: give solid=(low, high) and "
+            "section=harnack.HalfSpace(normal, offset) as well"
+        )
+    made = as_bsdf(mi, cut_bsdf)
+    for one in (bsdf, made):
+        if mi.has_flag(one.flags(), mi.BSDFFlags.Transmission):
+            raise ValueError(
+                "the faces of a cut have a material of their own on opaque solids only"
+            )
+    return made
+
+
+def as_bsdf(mi: Any, bsdf: Any) -> Any:
+    """A BSDF object, from one, its dictionary, or None."""
+    if bsdf is None:
+        bsdf = {"type": "twosided", "nested": {"type": "diffuse"}}
+    made: Any = bsdf
+    if isinstance(bsdf, Mapping):
+        made = load_dictionary(mi, cast("Mapping[str, Any]", bsdf))
+    if not isinstance(made, mi.BSDF):
+        raise TypeError(
+            "bsdf must be a BSDF or its dictionary, such as harnack.rendering.MATERIALS['gold']"
+            f".front, not {type(made).__name__}"
+        )
+    return made

@@ -1,0 +1,222 @@
+"""Level sets in Mitsuba scenes: the meshes that carry them, and BSDFs with isolines.
+
+Mitsuba 3.9 has no shapes written in Python, except meshes. So a level set travels in a *carrier*, a
+mesh of two triangles that are each a point, at opposite corners of its bounding box: no ray hits
+them, but the scene's bounding box is right, and the mesh holds the BSDF. `world.World` finds the
+carriers in a scene and traces their level sets.
+
+On isolines the BSDF is another one, chosen by the number of the isoline (`with_lines`).
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import numpy as np
+
+from harnack.backend import aligned
+from harnack.rendering.framing import box_of
+from harnack.rendering.isolines import Isolines
+from harnack.rendering.mitsuba import load_dictionary, load_mitsuba, mitsuba_backend, tint_of
+from harnack.rendering.placed_surface import PlacedSurface, Placement
+from harnack.rendering.scales import Color, linear
+from harnack.tracer import LevelSet
+
+if TYPE_CHECKING:
+    from harnack.backend import FloatArray, Mask
+
+
+def with_lines(mi: Any, bsdf: Any, colors: Sequence[Color]) -> Any:
+    """A BSDF that is the given one off the isolines, and diffuse on both sides on them.
+
+    colors: of the isolines, in sRGB.
+    """
+    paints = [load_dictionary(mi, _matt(color)) for color in colors]
+    return _lined_class(mi.variant())(bsdf, paints)
+
+
+def _matt(color: Color) -> dict[str, Any]:
+    reflectance = {"type": "rgb", "value": list(linear(color))}
+    return {"type": "twosided", "nested": {"type": "diffuse", "reflectance": reflectance}}
+
+
+@functools.cache
+def _lined_class(variant: str) -> Any:
+    """The class of such BSDFs; Mitsuba's classes differ from variant to variant."""
+    mi = load_mitsuba()
+    assert mi.variant() == variant
+
+    class Lined(mi.BSDF):
+        """`world.surface_interaction` gives the isoline's number as the index of the primitive."""
+
+        def __init__(self, base: Any, paints: Sequence[Any]) -> None:
+            mi.BSDF.__init__(self, mi.Properties())
+            self.base, self.paints = base, tuple(paints)
+            parts = (base, *self.paints)
+            self.m_components = [
+                part.flags(k) for part in parts for k in range(part.component_count())
+            ]
+            flags = 0
+            for part in parts:
+                flags |= part.flags()
+            self.m_flags = flags
+
+        def _chosen(self, ask: Callable[[Any, Mask], Any], si: Any, active: Mask) -> Any:
+            """The result of `ask(bsdf, mask)` for the BSDF that is seen in each lane."""
+            line = si.prim_index
+            found = ask(self.base, active & (line == 0))
+            for number, paint in enumerate(self.paints, start=1):
+                here = line == number
+                found = dr.select(here, ask(paint, active & here), found)
+            return found
+
+        def sample(
+            self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Mask = True
+        ) -> tuple[Any, Any]:
+            def ask(part: Any, here: Mask) -> tuple[Any, Any]:
+                return part.sample(ctx, si, sample1, sample2, here)
+
+            return self._chosen(ask, si, active)
+
+        def eval(self, ctx: Any, si: Any, wo: Any, active: Mask = True) -> Any:
+            return self._chosen(lambda part, here: part.eval(ctx, si, wo, here), si, active)
+
+        def pdf(self, ctx: Any, si: Any, wo: Any, active: Mask = True) -> Any:
+            return self._chosen(lambda part, here: part.pdf(ctx, si, wo, here), si, active)
+
+        def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Mask = True) -> tuple[Any, Any]:
+            return self._chosen(lambda part, here: part.eval_pdf(ctx, si, wo, here), si, active)
+
+        def eval_diffuse_reflectance(self, si: Any, active: Mask = True) -> Any:
+            return self._chosen(
+                lambda part, here: part.eval_diffuse_reflectance(si, here), si, active
+            )
+
+        def eval_null_transmission(self, si: Any, active: Mask = True) -> Any:
+            return self._chosen(
+                lambda part, here: part.eval_null_transmission(si, here), si, active
+            )
+
+        def traverse(self, callback: Any) -> None:
+            self.base.traverse(callback)
+
+        def parameters_changed(self, keys: Any) -> None:
+            self.base.parameters_changed(keys)
+
+        def to_string(self) -> str:
+            return f"Lined[{self.base}, lines = {len(self.paints)}]"
+
+    return Lined
+
+
+PLUGIN = "harnack"
+
+
+def from_properties(
+    mi: Any,
+    props: Any,
+    surface: LevelSet,
+    tint: Any = None,
+    cut_bsdf: Any = None,
+    isolines: Sequence[Isolines] = (),
+) -> Any:
+    """The shape of a surface with the `to_world` and the BSDF that a plug-in's properties hold.
+
+    tint: of a solid, what is left of light after one unit of length in it, in the world.
+    cut_bsdf: of the faces at which a section cuts a solid; None for the BSDF of the rest.
+    isolines: to be drawn on the surface.
+
+    Raises:
+        ValueError: as `shape`; or the properties hold an emitter or a medium.
+    """
+    if tint is not None and surface.solid is None:
+        raise ValueError(
+            "tint needs a solid, which light goes through: give solid=(low, high), for instance "
+            "solid=(-math.inf, level)"
+        )
+    placement = Placement.identity()
+    if "to_world" in props:
+        placement = Placement.of(as_matrix(props["to_world"]))
+    for one in isolines:
+        if one.function is surface.field and surface.solid is None:
+            raise ValueError(
+                f"isolines of {surface.field!r} on its own level set: it is constant there. Draw "
+                "those of another function, or a solid, whose caps show them"
+            )
+    if isolines:
+        colors = [one.rgb for one in isolines]
+        props["bsdf"] = with_lines(mi, props["bsdf"], colors)
+        cut_bsdf = None if cut_bsdf is None else with_lines(mi, cut_bsdf, colors)
+    if any("MeshAttribute" in _words(one) for one in (props.get("bsdf", None), cut_bsdf)):
+        raise ValueError(
+            "a mesh_attribute belongs to vertices or faces, which a level set has not: take a "
+            "texture of uv, which are x and y in the world, or draw the mesh of harnack.mesh(field)"
+        )
+    made = _carrier_class(mi.variant())(props, surface, placement, tint, cut_bsdf, isolines)
+    if made.emitter() is not None or made.is_medium_transition():
+        raise ValueError("surfaces that are traced can neither emit light nor bound a medium")
+    return made
+
+
+def _words(bsdf: Any) -> str:
+    """The text of a BSDF; empty if it was written in Python without `to_string`."""
+    try:
+        return str(bsdf)
+    except RuntimeError:
+        return ""
+
+
+def as_matrix(transform: Any) -> FloatArray:
+    """A Mitsuba transform or an array as a float64 matrix (4, 4)."""
+    matrix = getattr(transform, "matrix", transform)
+    return np.array(matrix, dtype=np.float64).reshape(4, 4)
+
+
+@functools.cache
+def _carrier_class(variant: str) -> Any:
+    """The class of carriers; Mitsuba's classes differ from variant to variant."""
+    mi = load_mitsuba()
+    assert mi.variant() == variant
+
+    class Carrier(mi.Mesh):
+        """A mesh that no ray hits, with the surface that it stands for."""
+
+        def __init__(
+            self, props: Any, surface: LevelSet, placement: Placement, tint: Any, cut_bsdf: Any,
+            isolines: Sequence[Isolines],
+        ) -> None:  # fmt: skip
+            ends = box_of(surface)
+            mi.Mesh.__init__(self, PLUGIN, 2, 2, props=props)
+            self.surface = surface
+            self.placement = placement
+            self.tint = tint_of(mi, tint)
+            # Hits on the section belong to a shape of their own, which no ray hits either.
+            self.cut_face = None if cut_bsdf is None else _bsdf_holder(mi, cut_bsdf)
+            backend, size = mitsuba_backend(mi), float(np.linalg.norm(np.diff(ends, axis=0)))
+            self.placed = PlacedSurface.of(surface, placement, backend, isolines, size)
+            self.line_colors = tuple(one.rgb for one in isolines)
+            params = mi.traverse(self)
+            corners = np.concatenate(placement.world_bounds(ends))
+            params["vertex_positions"] = aligned(backend, corners)
+            params["faces"] = mi.UInt32([0, 0, 0, 1, 1, 1])
+            params.update()
+
+        def to_string(self) -> str:
+            return f"HarnackSurface[field = {self.surface.field!r}, bsdf = {self.bsdf()}]"
+
+    return Carrier
+
+
+def _bsdf_holder(mi: Any, bsdf: Any) -> Any:
+    """A mesh in no scene, which only holds a BSDF."""
+    props = mi.Properties()
+    props["bsdf"] = bsdf
+    return mi.Mesh(PLUGIN, 1, 1, props=props)
+
+
+def is_carrier(shape: Any) -> bool:
+    """Whether a Mitsuba shape carries one of our surfaces."""
+    return isinstance(getattr(shape, "placed", None), PlacedSurface)

@@ -1,0 +1,367 @@
+"""The arguments of `render`, checked before anything is drawn."""
+
+from __future__ import annotations
+
+import inspect
+import math
+import operator
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+
+from harnack.backend.validation import whole
+from harnack.fields import Field
+from harnack.name_suggestions import did_you_mean
+from harnack.rendering.aov_render import GROUND_OF_VIEWS, SCALED, VIEWS
+from harnack.rendering.backdrops import Backdrop, Gradient, Ground, checked_backdrop
+from harnack.rendering.camera import Camera
+from harnack.rendering.isolines import Isolines, checked_isolines, function_of
+from harnack.rendering.scales import require_pillow, typeface_for
+from harnack.tracer import level_set
+
+SHOW_MODES: tuple[str, ...] = ("color", "shaded", *VIEWS)
+# Pictures that may have isolines.
+LINED = ("color", "shaded", "value")
+ANTIALIASING = ("edges", "cones")
+MAX_SIDE = 32768
+MAX_SPP = 1_000_000
+_MOST_TILES = 1_000_000
+# The largest number that the path tracer's counters hold.
+_MAX_INTEGER = 2**31 - 1
+# Names of settings in other programs, and what they are called here.
+_CALLED_ELSEWHERE = {
+    "color": '"material"', "colour": '"material"', "bsdf": '"material"', "samples": '"spp"',
+    "resolution": '"size"', "width": '"size"', "height": '"size"',
+    "filename": '"path", the second argument', "output": '"path", the second argument',
+    "file": '"path", the second argument', "title": '"colorbar"', "domain": '"clip"',
+    **dict.fromkeys(
+        ("azimuth", "elevation", "fov", "zoom", "position", "target", "distance"),
+        "camera=harnack.Camera(...), which has it",
+    ),
+}  # fmt: skip
+# Peak memory in bytes per pixel, measured at 2048 x 2048 and 4096 x 4096, rounded up.
+_BYTES = {"color": 50, "shaded": 280, "value": 240}
+_BYTES_OF_VIEWS = 130
+
+
+def check_max_depth(max_depth: Any, show: str) -> int | None:
+    """The longest light path, or None; ValueError for pictures without light paths."""
+    if max_depth is None:
+        return None
+    _check_has_paths("max_depth", show)
+    return check_integer("max_depth", max_depth)
+
+
+def check_denoise(denoise: Any, show: str) -> bool:
+    """Whether to denoise; ValueError for pictures without noise."""
+    if not isinstance(denoise, bool):
+        raise TypeError(f"denoise must be True or False, not {denoise!r}")
+    if denoise:
+        _check_has_paths("denoise", show)
+    return denoise
+
+
+def _check_has_paths(setting: str, show: str) -> None:
+    if show != "color":
+        raise ValueError(f'{setting} needs a picture with show="color", not show="{show}"')
+
+
+def check_isolines(isolines: Any, show: str) -> tuple[Isolines, ...]:
+    """Isolines as a tuple; ValueError for pictures that cannot have any."""
+    lines = checked_isolines(isolines)
+    if lines and show not in LINED:
+        raise ValueError(f'isolines need a picture with show={_either(LINED)}, not "{show}"')
+    return lines
+
+
+def check_function(of: Any, show: str) -> Field | None:
+    """The function whose values are shown; ValueError if it is missing, or given for another kind
+    of picture."""
+    if show != "value":
+        if of is not None:
+            raise ValueError(f'of=... needs a picture with show="value", not show="{show}"')
+        return None
+    if of is None:
+        raise ValueError(
+            'show="value" needs the function whose values are shown on the surface, such as '
+            'of="z", another field, or a function of x, y and z'
+        )
+    return function_of(of)
+
+
+def check_value_range(value_range: Any, show: str) -> tuple[float, float] | None:
+    """The ends of the color scale, or None; ValueError for pictures without such a scale."""
+    if value_range is None:
+        return None
+    _check_scaled("value_range", show)
+    wrong = f"value_range must be (low, high), two finite numbers in order, not {value_range!r}"
+    try:
+        low, high = (float(end) for end in value_range)
+    except (TypeError, ValueError):
+        raise TypeError(wrong) from None
+    if not (low < high and math.isfinite(high - low)):
+        raise ValueError(wrong)
+    return low, high
+
+
+def check_colorbar(colorbar: Any, show: str) -> bool | str:
+    """Whether to draw a color bar, or its title; ValueError for pictures without a color scale."""
+    if not isinstance(colorbar, bool | str):
+        raise TypeError(f"colorbar must be True, False or the bar's title, not {colorbar!r}")
+    if colorbar:
+        _check_scaled("colorbar", show)
+        require_pillow()
+    if isinstance(colorbar, str):
+        if not colorbar.isprintable():
+            raise ValueError(f"the title of a color bar is one line of letters, not {colorbar!r}")
+        typeface_for(colorbar, 10)
+    return colorbar
+
+
+def check_behind(backdrop: Any, show: str) -> Backdrop:
+    """What is behind the surfaces: any backdrop, or one color for pictures of numbers (`VIEWS`).
+
+    Raises:
+        TypeError, ValueError: it is no backdrop, or not one color where that is required.
+    """
+    if backdrop is None:
+        return Ground("light")
+    behind = checked_backdrop(backdrop)
+    if show in VIEWS and isinstance(behind, Ground):
+        return Gradient(*(GROUND_OF_VIEWS[behind.name],) * 2)
+    if show in VIEWS and not (isinstance(behind, Gradient) and behind.bottom == behind.top):
+        raise ValueError(
+            f'with show="{show}", backdrop must be one color, such as backdrop="white", '
+            f"not {backdrop!r}"
+        )
+    return behind
+
+
+def _check_scaled(setting: str, show: str) -> None:
+    if show not in SCALED:
+        raise ValueError(f'{setting} needs a picture with show={_either(SCALED)}, not "{show}"')
+
+
+def _either(names: Sequence[str]) -> str:
+    return " or ".join(f'"{name}"' for name in names)
+
+
+def check_show(show: Any) -> str:
+    """The mode; ValueError if it is unknown."""
+    if not isinstance(show, str) or show not in SHOW_MODES:
+        raise ValueError(
+            f"show must be one of {', '.join(SHOW_MODES)}, not {show!r}"
+            f"{did_you_mean(show, SHOW_MODES)}"
+        )
+    return show
+
+
+def check_antialias(antialias: Any, show: str) -> str | None:
+    """The way to choose pixels for more samples, or None; ValueError if it is unknown, or the
+    picture is not shaded."""
+    if antialias is None:
+        return None
+    if not isinstance(antialias, str) or antialias not in ANTIALIASING:
+        raise ValueError(
+            f"antialias must be one of {', '.join(ANTIALIASING)}, not {antialias!r}"
+            f"{did_you_mean(antialias, ANTIALIASING)}"
+        )
+    if show != "shaded":
+        raise ValueError(f'antialias needs a picture with show="shaded", not show="{show}"')
+    return antialias
+
+
+def check_size(size: Any) -> tuple[int, int]:
+    """A size in pixels.
+
+    Raises:
+        TypeError: not two integers.
+        ValueError: a side of no pixel, or of more than MAX_SIDE.
+    """
+    wrong = f"size must be (width, height) in pixels, such as (800, 600), not {size!r}"
+    try:
+        width, height = (_index(side) for side in size)
+    except (TypeError, ValueError):
+        raise TypeError(wrong) from None
+    if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
+        raise ValueError(f"{wrong}: each side must be 1 to {MAX_SIDE}")
+    return width, height
+
+
+def check_spp(spp: Any, *, source: str = "") -> int:
+    """Samples per pixel. source: where the number is from, for messages, if not from the call."""
+    number = check_integer("spp", spp)
+    if not 1 <= number <= MAX_SPP:
+        raise ValueError(f"spp must be at least 1 and at most {MAX_SPP}, not {number}{source}")
+    return number
+
+
+def check_integer(name: str, number: Any) -> int:
+    """An integer of any sign.
+
+    Raises:
+        TypeError: it is no integer.
+        ValueError: a max_depth too large for the path tracer's counters.
+    """
+    try:
+        integer = _index(number)
+    except TypeError:
+        raise TypeError(f"{name} must be an integer, not {number!r}") from None
+    if name == "max_depth" and integer > _MAX_INTEGER:
+        raise ValueError(f"max_depth must be at most {_MAX_INTEGER}, or -1 for no limit")
+    return integer
+
+
+def check_tiles(tiles: Any, *, divided: bool) -> int | None:
+    """How many parts a task is cut into, or None; divided: whether it is cut at all."""
+    if tiles is not None and not divided:
+        raise ValueError("tiles: parts are drawn one by one with a client or a checkpoint only")
+    return None if tiles is None else whole(tiles, "tiles", 1, _MOST_TILES)
+
+
+def _index(number: Any) -> int:
+    """An integer; True and False are none."""
+    if isinstance(number, bool | np.bool_):
+        raise TypeError
+    return operator.index(number)
+
+
+def check_camera(camera: Any) -> Camera:
+    """A `Camera`: the given one, one at a position (x, y, z), or the default for None."""
+    if camera is None:
+        return Camera()
+    if isinstance(camera, Camera):
+        return camera
+    try:
+        x, y, z = (float(c) for c in (() if isinstance(camera, str) else camera))
+    except (TypeError, ValueError):
+        raise TypeError(
+            "camera must be a harnack.Camera, such as Camera(azimuth=-50, elevation=28), or the "
+            f"(x, y, z) where it stands, not a {type(camera).__name__} {camera!r}"
+        ) from None
+    return Camera(position=(x, y, z))
+
+
+Check = Callable[[Any, str], Any]
+
+
+def _by(check: Callable[[Any], Any]) -> Check:
+    """A check that does not depend on what is shown."""
+    return lambda given, show: check(given)
+
+
+def _if_given(check: Callable[[Any], Any]) -> Check:
+    """A check, of a setting that may be None."""
+    return lambda given, show: None if given is None else check(given)
+
+
+def _as_given(given: Any, show: str) -> Any:
+    """No check: what uses the setting checks it."""
+    del show
+    return given
+
+
+def _integer(name: str) -> Check:
+    return lambda given, show: check_integer(name, given)
+
+
+def _setting(check: Check = _as_given, **marks: bool) -> Mapping[str, Any]:
+    """The metadata of a setting: its check, which gets the setting and `show`, and marks.
+
+    of_studio: it is for the studio alone; a Mitsuba scene does not take it.
+    of_surfaces: it changes where surfaces are.
+    """
+    return {"check": check, **marks}
+
+
+@dataclass(frozen=True)
+class Request:
+    """The settings of `render`, checked: sizes and counts are integers, None means not set. Each
+    field holds its check; films read this table too."""
+
+    show: str = field(metadata=_setting(_by(check_show)))
+    size: tuple[int, int] | None = field(metadata=_setting(_if_given(check_size)))
+    spp: int | None = field(metadata=_setting(_if_given(check_spp)))
+    antialias: str | None = field(metadata=_setting(check_antialias))
+    material: Any = field(metadata=_setting(of_studio=True))
+    camera: Camera = field(metadata=_setting(_by(check_camera), of_studio=True))
+    backdrop: Backdrop = field(metadata=_setting(check_behind, of_studio=True))
+    up: Any = field(metadata=_setting(of_studio=True))
+    boundary: float | None = field(metadata=_setting(of_studio=True, of_surfaces=True))
+    boundary_material: Any = field(metadata=_setting(of_studio=True))
+    cut_material: Any = field(metadata=_setting(of_studio=True))
+    isolines: tuple[Isolines, ...] = field(metadata=_setting(check_isolines, of_studio=True))
+    thickness: float | None = field(metadata=_setting(of_studio=True, of_surfaces=True))
+    of: Field | None = field(metadata=_setting(check_function))
+    value_range: tuple[float, float] | None = field(metadata=_setting(check_value_range))
+    colorbar: bool | str = field(metadata=_setting(check_colorbar))
+    max_depth: int | None = field(metadata=_setting(check_max_depth))
+    seed: int = field(metadata=_setting(_integer("seed")))
+    denoise: bool = field(metadata=_setting(check_denoise))
+    progress: Any = field(metadata=_setting())
+
+    def __post_init__(self) -> None:
+        if self.antialias == "cones" and self.spp == 1:
+            raise ValueError(
+                'antialias="cones" finds pixels for more than one sample, and spp is 1: give '
+                "spp=9, or leave antialias out"
+            )
+
+    @classmethod
+    def checked(cls, given: Mapping[str, Any]) -> Request:
+        """The settings, from the arguments of `render` by name.
+
+        Raises:
+            TypeError, ValueError: naming the setting that is wrong, and what it should be.
+        """
+        show: str = given["show"]
+        return cls(
+            **{one.name: one.metadata["check"](given[one.name], show) for one in fields(cls)}
+        )
+
+
+SETTINGS = tuple(one.name for one in fields(Request))
+OF_STUDIO = tuple(one.name for one in fields(Request) if "of_studio" in one.metadata)
+# Those that do not change where surfaces are.
+OF_PICTURES = tuple(one.name for one in fields(Request) if "of_surfaces" not in one.metadata)
+
+
+def check_settings(settings: Mapping[str, Any]) -> None:
+    """Raise TypeError for a setting that neither `render` nor `level_set` has."""
+    of_surface = [name for name in inspect.signature(level_set).parameters if name != "field"]
+    for name in settings:
+        if name not in of_surface:
+            ours = _CALLED_ELSEWHERE.get(name.lower())
+            hint = did_you_mean(name, (*SETTINGS, *of_surface))
+            raise TypeError(
+                f"there is no setting {name!r}; there are {', '.join(SETTINGS)} and, of surfaces, "
+                f"{', '.join(of_surface)}{hint if ours is None else f'; did you mean {ours}?'}"
+            )
+
+
+def refuse_studio_settings(given: Mapping[str, Any]) -> None:
+    """Raise ValueError for settings of the studio, which a Mitsuba scene does not take."""
+    wrong = [name for name, value in given.items() if value is not None]
+    if wrong:
+        raise ValueError(f"{', '.join(wrong)}: a Mitsuba scene is drawn as it is")
+
+
+def check_memory(show: str, width: int, height: int) -> None:
+    """Raise ValueError for a picture that does not fit into this machine's memory."""
+    needed = width * height * _BYTES.get(show, _BYTES_OF_VIEWS)
+    if width * height > 2**30 or needed > _memory():
+        raise ValueError(
+            f"a picture of {width}x{height} pixels needs about {needed / 1e9:,.0f} GB of memory, "
+            f"and this machine has {_memory() / 1e9:,.0f}: choose a smaller size"
+        )
+
+
+def _memory() -> float:
+    """Bytes of memory in this machine; infinite if unknown."""
+    try:
+        return float(os.sysconf("SC_PAGE_SIZE")) * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, ValueError, OSError):
+        return math.inf

@@ -1,0 +1,429 @@
+"""Shaded pictures: one ray a pixel, more where the picture has edges, and no noise.
+
+The rays through the middles of all pixels are traced first. Pixels that differ visibly from a
+neighbor are then drawn again as the mean of a fixed grid of samples, and so are those that the edge
+of an isoline may pass through: outlines are smooth, lines thinner than a pixel have no gaps, and
+the inside of a surface costs one ray a pixel. Cones find more pixels to draw again, if asked for:
+those that a surface covers in part, though no ray through a middle tells.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import numpy as np
+import numpy.typing as npt
+
+from harnack.backend import FloatArray, IntArray, aligned, choose_backend, to_numpy
+from harnack.fields import Solid
+from harnack.rendering.hybrid_scene import World
+from harnack.rendering.images import tone_mapped
+from harnack.rendering.integrator import LOST_COLOR
+from harnack.rendering.light_paths import Through, as_rgb, mean_of_blocks
+from harnack.rendering.mitsuba import mitsuba_backend
+from harnack.rendering.placed_surface import PlacedSurface
+from harnack.rendering.shading import (
+    Floor,
+    Light,
+    edges_of,
+    film_places,
+    grid_offsets,
+    in_tiles,
+    of_mended,
+    of_side,
+    reflectance,
+    uploaded,
+)
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Real, Vec3
+    from harnack.geometry import Volume
+    from harnack.rendering.shading import Hands
+
+
+class Finder:
+    """Finds pixels that surfaces may cover in part, by cones, so that no thin part is overlooked.
+
+    The ray through the middle of a pixel misses what is thinner than the pixel more often than not,
+    and so do those of its neighbors. The cone that holds the pixel does not.
+
+    Raises:
+        ValueError: a field that jumps, such as the winding number of a mesh: it is constant on both
+            sides of the surface, so that its values tell no distance.
+    """
+
+    def __init__(self, mi: Any, world: World) -> None:
+        self.mi = mi
+        self.placed = tuple(_prepared(mi, carrier) for carrier in world.carriers)
+
+    def find(self, ray: Any, position: Any) -> Any:
+        """Whether the cones of pixels are covered in part before the points that rays see.
+
+        ray: through the middles, with differentials. position: seen; NaN where nothing is.
+        """
+        mi = self.mi
+        away = dr.norm(position - ray.o)
+        t = dr.select(dr.isfinite(away), away, dr.largest(mi.Float))
+        x, y = ray.d_x - ray.d, ray.d_y - ray.d
+        radius = 0.5 * dr.maximum(dr.norm(x + y), dr.norm(x - y))  # half the longer diagonal
+        found = dr.zeros(mi.Bool, dr.width(ray.d))
+        for placed, around in self.placed:
+            found |= placed.covers_in_part(ray.o, ray.d, radius, t, around)
+        return found
+
+
+def _prepared(mi: Any, carrier: Any) -> tuple[PlacedSurface, Any]:
+    """A surface that cones can be tested against outside its extent, and balls in and around the
+    extent."""
+    surface, backend = carrier.surface, mitsuba_backend(mi)
+    if surface.field.has_parts:
+        raise ValueError(
+            f'antialias="cones" takes a level set of one function, and {surface.field!r} has one '
+            'for each part. Leave antialias at "edges"'
+        )
+    if surface.field.has_sheets:
+        raise ValueError(
+            f'antialias="cones" takes fields without jumps, and {surface.field!r} jumps: its '
+            'values tell no distance. Leave antialias at "edges"'
+        )
+    placed = replace(carrier.placed, prepared=surface.prepare(backend, crosses=True))
+    return placed, balls_of(surface.volume, backend)
+
+
+def balls_of(volume: Volume | None, backend: Backend) -> tuple[Vec3, Real, Real] | None:
+    """The middle of a volume, and the radii about it of a ball in it and of one around it; None
+    where it has no end or no such ball was found."""
+    if volume is None:
+        return None
+    lower, upper = (np.asarray(end, dtype=np.float64) for end in volume.bounds())
+    if not np.isfinite(upper - lower).all():
+        return None
+    middle = (0.5 * (lower + upper)).tolist()
+    # Not half the box: other volumes have faces that lie nearer to its middle.
+    there = choose_backend("double").Array3f(*middle)
+    depth = -float(to_numpy(volume.signed_distance(there))[0]) * (1 - 1e-6)
+    if not depth > 0:
+        return None
+    size = 0.5 * float(np.linalg.norm(upper - lower))
+    numbers = [dr.opaque(backend.Float, x) for x in (*middle, depth, size)]
+    return backend.Array3f(*numbers[:3]), numbers[3], numbers[4]
+
+
+# Directions across the picture, and taps along each, up to this share of its larger side.
+_DIRECTIONS = 16
+_TAPS = 8
+_REACH = 0.16
+
+
+def visible_sky(mi: Any, position: Any, normal: Any, width: Any, size: tuple[int, int]) -> Any:
+    """The part of the hemisphere over each pixel's point that nothing near it hides, in [0, 1].
+
+    position: points seen by the pixels, counted by rows; NaN where nothing is seen. normal: unit,
+    towards the eye. width: of a pixel, there. size: (width, height) in pixels.
+
+    Along each direction across the picture the highest point over the tangent plane, at elevation
+    h, hides sin^2 h of the light with a cosine (Bavoil and Sainz 2008), less so the farther away it
+    is. Only what the picture shows can hide light. The directions are the same everywhere: no
+    noise.
+    """
+    columns, rows = size
+    count = columns * rows
+    index = dr.arange(mi.UInt32, count)
+    x, y = mi.Float(index % columns), mi.Float(index // columns)
+    reach = _REACH * max(size)
+    radius = reach * width
+
+    def tap(k: int, direction: Any) -> Any:
+        """The sine of the elevation of a tap, faded with its distance; 0 if nothing is there."""
+        far = 1.0 + reach * ((k + 0.5) / _TAPS) ** 2
+        u, v = x + far * direction.x, y + far * direction.y
+        inside = (u >= 0) & (v >= 0) & (u <= columns - 1) & (v <= rows - 1)
+        other = mi.UInt32(dr.round(v)) * columns + mi.UInt32(dr.round(u))
+        way = dr.gather(mi.Vector3f, position, other, inside) - position
+        length = dr.norm(way)
+        fade = dr.maximum(1 - dr.square(length / radius), 0)
+        height = dr.dot(way, normal) / length - 0.06  # facets and rounding stay below that
+        return dr.select(inside & (height > 0), height * fade, 0)
+
+    def along(way: Any, hidden: Any) -> tuple[Any, Any]:
+        s, c = dr.sincos((mi.Float(way) + 0.5) * (dr.two_pi / _DIRECTIONS))
+        highest = mi.Float(0)
+        for k in range(_TAPS):
+            highest = dr.maximum(highest, tap(k, mi.Vector2f(c, s)))
+        return way + 1, hidden + dr.square(highest)
+
+    def more(way: Any, hidden: Any) -> Any:
+        del hidden
+        return way < _DIRECTIONS
+
+    start = (mi.UInt32(0), dr.zeros(mi.Float, count))
+    _, hidden = dr.while_loop(start, more, along, label="visible sky")
+    return 1 - hidden / _DIRECTIONS
+
+
+# Rays of one band.
+_RAYS_A_BAND = 2**17
+# Where in its pixel the first ray goes through.
+_MIDDLE = 0.5
+# The share of the time that is spent on the first rays, as the progress bar guesses.
+_FIRST = 0.6
+
+
+@dataclass
+class Seen:
+    """What rays hit first, or first behind clear matter.
+
+    position, normal, eye: the point, its unit normal towards the eye, and the direction to the eye.
+    width: of a pixel, there.
+    color: reflectance.
+    light: shone by an emitter or the environment and reflected by clear matter, or magenta for
+        lost.
+    through: what clear matter leaves of the light from what is hit.
+    glossy: whether the material is glossy. met, lost: whether there is a hit; and whether the ray
+        ran out of steps.
+    covered: whether there is anything at all, and not the environment alone.
+    marked: whether to draw the pixel again, as the edge of an isoline may pass through it, or a
+        cone found that a surface covers a part of it.
+    """
+
+    position: Any
+    normal: Any
+    eye: Any
+    width: Any
+    color: Any
+    light: Any
+    through: Any
+    glossy: Any
+    met: Any
+    lost: Any
+    covered: Any
+    marked: Any
+
+    @classmethod
+    def nothing(cls, mi: Any, count: int) -> Seen:
+        """Empty arrays for `count` pixels, to scatter to."""
+        vectors, colors, masks = (mi.Vector3f,) * 3, (mi.Color3f,) * 3, (mi.Bool,) * 5
+        kinds = (*vectors, mi.Float, *colors, *masks)
+        return cls(*(dr.zeros(kind, count) for kind in kinds))
+
+    def numbers(self) -> dict[str, npt.NDArray[Any]]:
+        """As arrays of NumPy, by name."""
+        return {name: to_numpy(value) for name, value in vars(self).items()}
+
+    @classmethod
+    def from_numbers(cls, mi: Any, numbers: Mapping[str, npt.NDArray[Any]]) -> Seen:
+        """From what `numbers` gave, here or in another process."""
+        empty = vars(cls.nothing(mi, 0))
+        return cls(
+            **{name: _of_numbers(mi, type(kind), numbers[name]) for name, kind in empty.items()}
+        )
+
+
+def _of_numbers(mi: Any, kind: Any, numbers: npt.NDArray[Any]) -> Any:
+    """A Dr.Jit array of a type, from numbers (n,) or (n, 3). Kernels depend on the alignment."""
+    if dr.is_mask_v(kind):
+        return kind(np.ascontiguousarray(numbers))
+    columns = numbers.reshape(len(numbers), -1).T
+    return kind(*(aligned(mitsuba_backend(mi), one) for one in columns))
+
+
+class Shading:
+    """A sensor in a world, its light, and what of a shaded picture can be done pixel by pixel.
+
+    spp: rays of a pixel on an edge, at least; 1 for one ray a pixel everywhere.
+    on_floor: whether the scene is a studio's, whose floor shows shadows.
+    cut_out: whether to leave out the light of what is behind everything.
+    cones: whether cones find pixels to draw again, besides the edges in the picture.
+
+    Raises:
+        ValueError: the Mitsuba variant is spectral, whose four wavelengths a ray are no color;
+            or cones are asked to find a field that jumps.
+    """
+
+    def __init__(
+        self, mi: Any, scene: Any, sensor: Any, *, spp: int, on_floor: bool,
+        cut_out: bool = False, cones: bool = False,
+    ) -> None:  # fmt: skip
+        if mi.is_spectral:
+            raise ValueError(
+                "shaded pictures know red, green and blue, and the Mitsuba variant is "
+                f'{mi.variant()}: set one such as "llvm_ad_rgb", or draw in color'
+            )
+        world = World.of(mi, scene)
+        self.mi, self.world, self.sensor, self.cut_out = mi, world, sensor, cut_out
+        width, height = (int(n) for n in sensor.film().crop_size())
+        self.size = (width, height)
+        self.order = in_tiles(self.size)
+        self.finder = Finder(mi, world) if cones else None
+        offsets = grid_offsets(spp)
+        traced = (offsets == _MIDDLE).all(axis=1)  # what a pixel's first ray has seen
+        self.offsets, self.share_of_first = offsets[~traced], float(traced.mean())
+        self.refines = spp > 1
+        matrix = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
+        self.light = Light.of(matrix)
+        self.through = Through(world, self.light, hides_lights=cut_out)
+        self.floor = Floor.of(world, self.light) if on_floor else None
+
+    def look(self, start: int, stop: int) -> Seen:
+        """What the rays through the middles of some pixels hit first; `order` counts pixels."""
+        mi = self.mi
+        pixel = uploaded(mi, self.order[start:stop])
+        seen = self._look(pixel, mi.Vector2f(_MIDDLE))
+        dr.eval(seen)
+        if self.finder is not None:
+            ray, _ = self.ray(pixel, mi.Vector2f(_MIDDLE))
+            seen.marked |= self.finder.find(ray, seen.position)
+            dr.eval(seen)
+        return seen
+
+    def _look(self, pixel: Any, offset: Any) -> Seen:
+        """What rays through places in pixels hit first."""
+        mi, scene = self.mi, self.world.scene
+        ray, weight = self.ray(pixel, offset)
+        sight = self.through.look(mi.Ray3f(ray))
+        si, first = sight.si, sight.first
+        lost = first.lost | dr.zeros(mi.Bool, dr.width(pixel))
+        met = first.met & ~lost
+        inside, open_surface = si.wi.z > 0, self._is_open(si)
+        color, other = (self._reflectance(si, side) * weight for side in (1, -1))
+        color, other = (as_rgb(mi, c, ray.wavelengths) for c in (color, other))
+        painted = first.line > 0
+        color, other = reflectance(color, painted), reflectance(other, painted)
+        plain = ~painted  # lines have their own color
+        color = of_side(color, other, inside & open_surface & plain)
+        color = of_mended(color, first.mended & plain)
+        shone = si.emitter(scene).eval(si, ~lost) * weight
+        light = as_rgb(mi, sight.throughput * shone + weight * sight.gathered, ray.wavelengths)
+        light = dr.select(lost, mi.Color3f(LOST_COLOR), light)
+        covered = met | lost | (sight.boundaries > 1)  # what is clear covers, too
+        if self.cut_out:
+            light = dr.select(covered, light, 0)
+        through = as_rgb(mi, sight.throughput, ray.wavelengths)
+        d = sight.ray.d
+        normal = mi.Vector3f(dr.mulsign(mi.Vector3f(si.n), -dr.dot(si.n, d)))
+        t = dr.select(met, sight.traveled + first.t, 0)
+        width = dr.norm(ray.o_x + t * ray.d_x - ray.o - t * ray.d)
+        flags = si.bsdf().flags()
+        glossy = mi.has_flag(flags, mi.BSDFFlags.Glossy) | mi.has_flag(flags, mi.BSDFFlags.Delta)
+        glossy &= plain
+        lined = met & self.world.has_line_near(si, ray, d, t)
+        position = dr.select(met, mi.Vector3f(si.p), dr.nan)
+        return Seen(
+            position, normal, -d, width, color, light, through, glossy, met, lost, covered, lined
+        )
+
+    def ray(self, pixel: Any, offset: Any) -> tuple[Any, Any]:
+        """Rays with differentials through places in pixels, and what their light is weighted by."""
+        mi = self.mi
+        place = film_places(mi, pixel, offset, self.size)
+        return self.sensor.sample_ray_differential(
+            self.sensor.shutter_open(), 0.5, place, mi.Point2f(0.5)
+        )
+
+    def _reflectance(self, si: Any, side: int) -> Any:
+        """Reflectance of the side that is seen (1) or the other (-1), seen straight on."""
+        mi = self.mi
+        straight = mi.SurfaceInteraction3f(si)
+        straight.wi = mi.Vector3f(0, 0, dr.mulsign(mi.Float(side), si.wi.z))
+        return si.bsdf().eval_diffuse_reflectance(straight, si.is_valid())
+
+    def _is_open(self, si: Any) -> Any:
+        """Whether it is one of our surfaces, and an open one, of which both sides can be seen."""
+        found = self.mi.Bool(False)
+        for carrier in self.world.carriers:
+            surface = carrier.surface
+            if surface.solid is None and not isinstance(surface.field, Solid):
+                found |= si.shape == self.mi.ShapePtr(carrier)
+        return found
+
+    def paint(self, seen: Seen, sky: Any) -> Any:
+        """Radiance towards the eye, and whether there is anything."""
+        key = 1.0
+        if self.floor is not None:
+            key, above = self.floor.at(seen.position)
+            sky = dr.minimum(sky, above)
+        lit = self.light.on(seen.color, seen.normal, seen.eye, seen.glossy, sky, key)
+        light = dr.select(seen.met, seen.through * lit, 0) + seen.light
+        return self.mi.Vector4f(*light, dr.select(seen.covered, self.mi.Float(1), 0))
+
+    def refine(
+        self, chosen: IntArray, position: FloatArray, sky: FloatArray
+    ) -> tuple[npt.NDArray[np.float32], int]:
+        """Means (n, 4) of samples in chosen pixels, and how many of them were lost.
+
+        position, sky: seen by the pixels and their neighbors, (n, 5, 3) and (n, 5) (`around`).
+        """
+        mi, spp = self.mi, len(self.offsets)
+        lane = dr.arange(mi.UInt32, len(chosen) * spp)
+        many = dr.opaque(mi.UInt32, spp)
+        pixel = dr.gather(mi.UInt32, uploaded(mi, chosen), lane // many)
+        table = mi.Vector2f(*(aligned(mitsuba_backend(mi), one) for one in self.offsets.T))
+        seen = self._look(pixel, dr.gather(mi.Vector2f, table, lane % many))
+        color = self.paint(seen, _nearest_sky(mi, seen, lane // many, position, sky))
+        dr.eval(color, seen.lost)
+        return to_numpy(mean_of_blocks(color, spp)), int(dr.count(seen.lost)[0])
+
+    def around(self, chosen: IntArray, *arrays: Any) -> tuple[npt.NDArray[Any], ...]:
+        """Entries (n, 5, ...) of arrays of all pixels, counted by rows, at chosen pixels and their
+        four neighbors; at the picture's border some are there twice."""
+        columns, rows = self.size
+        x, y = chosen % columns, chosen // columns
+        u = np.clip(x[:, None] + np.array([0, 1, -1, 0, 0]), 0, columns - 1)
+        v = np.clip(y[:, None] + np.array([0, 0, 0, 1, -1]), 0, rows - 1)
+        other = uploaded(self.mi, (v * columns + u).ravel())
+        found = [to_numpy(dr.gather(type(one), one, other)) for one in arrays]
+        return tuple(one.reshape(len(chosen), 5, *one.shape[1:]) for one in found)
+
+
+def _nearest_sky(mi: Any, seen: Seen, row: Any, position: FloatArray, sky: FloatArray) -> Any:
+    """The visible sky of the pixel around whose point lies nearest to the sample; row: of the
+    sample's pixel among those that were chosen."""
+    nearest, found = mi.Float(dr.inf), mi.Float(1)
+    for k in range(position.shape[1]):
+        there = dr.gather(mi.Vector3f, _of_numbers(mi, mi.Vector3f, position[:, k]), row)
+        away = dr.norm(there - seen.position)
+        nearer = away < nearest  # not where NaN: nothing is there
+        nearest = dr.select(nearer, away, nearest)
+        found = dr.select(
+            nearer, dr.gather(mi.Float, _of_numbers(mi, mi.Float, sky[:, k]), row), found
+        )
+    return found
+
+
+def shaded(
+    shading: Shading, hands: Hands, advance: Callable[[float], None]
+) -> tuple[npt.NDArray[np.float32], int]:
+    """Linear sRGB radiance and, last, the part that something covers (h, w, 4); and how many rays
+    ran out of steps.
+
+    hands: call methods of `shading`.
+    advance: told what part of the picture has been finished since the last call.
+    """
+    mi, order, size = shading.mi, shading.order, shading.size
+    count = len(order)
+    seen = Seen.nothing(mi, count)
+    parts = hands.cut(count, _RAYS_A_BAND)
+    for (start, stop), part in zip(parts, hands.each("look", parts), strict=True):
+        dr.scatter(seen, part, uploaded(mi, order[start:stop]))
+        dr.eval(seen)
+        dr.sync_thread()
+        advance(_FIRST * (stop - start) / count)
+    sky = visible_sky(mi, seen.position, seen.normal, seen.width, size)
+    dr.eval(sky)
+    image = to_numpy(shading.paint(seen, sky)).reshape(*size[::-1], 4)
+    lost = int(dr.count(seen.lost)[0])
+    again = edges_of(tone_mapped(image[..., :3] + (1 - image[..., 3:]))).ravel()
+    again |= to_numpy(seen.marked)
+    edges = order[again[order]] if shading.refines else order[:0]
+    pixels = image.reshape(-1, 4)
+    at_once = max(1, _RAYS_A_BAND // max(1, len(shading.offsets)))
+    chosen = [edges[start:stop] for start, stop in hands.cut(len(edges), at_once)]
+    around = ((one, *shading.around(one, seen.position, sky)) for one in chosen)
+    for one, (color, gone) in zip(chosen, hands.each("refine", list(around)), strict=True):
+        pixels[one] = color + shading.share_of_first * (pixels[one] - color)
+        lost += int(gone)
+        advance((1 - _FIRST) * len(one) / len(edges))
+    return image, lost

@@ -1,0 +1,426 @@
+"""`check_bound`: proofs tried on functions that keep a promise, with levels put where they go.
+
+A proof is right if no function that the promise allows meets a level within its step. The functions
+drawn here include the extremal ones of the proofs in `harnack.enclosures`, so a proof that is a
+thousandth too long is found out. A `Case` is a promise with the levels asked for, on which every
+proof can be tried.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+
+from harnack.backend import BoolArray, FloatArray, choose_backend, to_numpy
+from harnack.enclosures import (
+    BoundedLaplacian,
+    Curvature,
+    Enclosure,
+    Gaps,
+    HarmonicBall,
+    Lipschitz,
+    Promise,
+    Slopes,
+)
+from harnack.enclosures.bounded_laplacian import GreenBall
+from harnack.enclosures.free_radius import Ball
+from harnack.testing.poisson import AxialFunctions, GreenPotentials, cap_mass, kernel_movement
+from harnack.testing.violation_search import BrokenPromiseError
+
+if TYPE_CHECKING:
+    from harnack.backend import Mask, Precision, Real
+
+__all__ = [
+    "Case",
+    "Trial",
+    "check_bound",
+    "trials",
+]
+
+
+@dataclass(frozen=True)
+class Case:
+    """promise: what is known near p of a function with f(p) = 0. gap_down, gap_up: how far in value
+    the levels below and above are."""
+
+    promise: Promise
+    gap_down: Real
+    gap_up: Real
+
+    def each(self, change: Callable[[Any], Any]) -> Case:
+        """The case with all its numbers changed, of Python, NumPy or Dr.Jit."""
+        promise = self.promise.each(lambda number, _, __: change(number))
+        return Case(promise, change(self.gap_down), change(self.gap_up))
+
+    def enclosure(self, kind: type[Enclosure], slopes: Slopes) -> Enclosure | None:
+        """The enclosure that a proof makes of this; None if it makes none."""
+        promise: Any = self.promise
+        # Without what `of` takes off for rounding, so that steps can be compared exactly.
+        if isinstance(promise, HarmonicBall) and issubclass(kind, Ball):
+            ends = -promise.lower, promise.upper
+            below, above = (None if _is_open(end) else end for end in ends)
+            if not kind.applies(promise.dimension, below is not None, above is not None):
+                return None
+            return kind(promise.radius, below, above, promise.dimension, slopes)
+        if isinstance(promise, BoundedLaplacian) and issubclass(kind, GreenBall):
+            ranges = -promise.lower, promise.upper
+            ends = promise.laplacian_lower, promise.laplacian_upper
+            return kind.of_ranges(promise.radius, ranges, ends, slopes)
+        return kind.of(promise, type(slopes.low)(0), 0.0, slopes)
+
+    def accepts(self, kind: type[Enclosure]) -> bool:
+        """Whether a proof applies to this."""
+        lows = [low for low, _ in self.promise.ends]
+        plain = {
+            name: -1.0 if name in lows else 1.0
+            for name, *_ in self.promise.units
+            if not _is_open(getattr(self.promise, name))
+        }
+        case = Case(dataclasses.replace(self.promise, **plain), 1.0, 1.0)
+        return case.enclosure(kind, Slopes(0.0, 0.0)) is not None
+
+    def step(self, kind: type[Enclosure], slope: Real, error: Real = 0.0) -> Real:
+        """The step along a direction with a slope known up to an error."""
+        enclosure = self.enclosure(kind, Slopes.around(slope, error))
+        assert enclosure is not None
+        return enclosure.step(Gaps(self.gap_down, self.gap_up))
+
+    def covers(self, kind: type[Enclosure], slope: Real, length: Real, error: Real = 0.0) -> Mask:
+        """Whether a length along such a direction is proved free."""
+        enclosure = self.enclosure(kind, Slopes.around(slope, error))
+        assert enclosure is not None
+        return enclosure.covers(Gaps(self.gap_down, self.gap_up), length)
+
+
+def _is_open(end: Any) -> bool:
+    """Whether this is no limit at all."""
+    return isinstance(end, float) and math.isinf(end)
+
+
+# Functions that keep a promise.
+
+_SAMPLES = 48
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Functions along rays, (rows,), and cases at t = 0 whose promise they keep.
+
+    movement: f(t) - f(0) for t (rows, m) with 0 <= t < reach, the distance of the promise.
+    slope: f'(0). The gaps of the cases are such that levels are met.
+    """
+
+    name: str
+    case: Case
+    slope: FloatArray
+    reach: FloatArray
+    movement: Callable[[FloatArray], FloatArray]
+
+
+def check_bound(
+    kind: type[Enclosure],
+    *,
+    rng: np.random.Generator | int = 0,
+    rows: int = 400,
+    precision: Precision = "double",
+) -> None:
+    """Test a proof against random functions of every kind of promise that it applies to.
+
+    rng: a generator or a seed. rows: how many functions of each kind.
+
+    Checked: steps are numbers in [0, reach]; no level is met within a step; `covers` agrees with
+    `step`; no level is met within any length that is covered.
+
+    Raises:
+        BrokenPromiseError: with the numbers of the first function that shows it.
+        ValueError: it applies to none of the promises there are.
+    """
+    accepted = 0
+    generator = np.random.default_rng(rng)
+    for trial in trials(generator, rows):
+        on_device, slope = _upload(trial, precision)
+        if on_device.accepts(kind):
+            accepted += 1
+            _check_trial(kind, trial, on_device, slope, generator, precision)
+    if not accepted:
+        raise ValueError(
+            f"{kind.__name__} applies to none of the promises there are; define its classmethod "
+            "of(promise, value, error, slopes), which returns an enclosure for its kind of promise"
+        )
+
+
+def trials(rng: np.random.Generator, rows: int) -> Iterator[Trial]:
+    """One trial of each kind: harmonic in 2, 3, 4 dimensions, of bounded Laplacian, Lipschitz,
+    of bounded curvature."""
+    with np.errstate(all="ignore"):
+        for dimension in (2, 3, 4):
+            yield _positive(rng, rows, dimension, mirrored=False)
+            yield _positive(rng, rows, dimension, mirrored=True)
+            yield _bounded(rng, rows, dimension)
+        yield _sourced(rng, rows, mirrored=False)
+        yield _sourced(rng, rows, mirrored=True)
+        yield _lipschitz(rng, rows)
+        yield _curved(rng, rows)
+
+
+def _positive(rng: np.random.Generator, rows: int, n: int, *, mirrored: bool) -> Trial:
+    """f - lower (mirrored: upper - f) is the Poisson integral of one, two or three rings."""
+    radius, mass = _log_uniform(rng, rows, -3, 3), _log_uniform(rng, rows, -3, 3)
+    places = rng.uniform(-1, 1, (rows, 3))
+    close = rng.choice([-1.0, 1.0], (rows, 3)) * (1 - 10 ** rng.uniform(-8, 0, (rows, 3)))
+    places = np.where(rng.random((rows, 3)) < 0.3, close, places)
+    shares = rng.dirichlet([0.7] * 3, rows)
+    kind = rng.integers(0, 3, rows)
+    shares[kind == 0] = (1, 0, 0)  # equality in Jensen's inequality
+    poles = kind == 1  # equality in the chord's
+    places[poles, :2] = (1, -1)
+    shares[poles, 2] = 0
+    shares /= shares.sum(axis=1, keepdims=True)
+    u = AxialFunctions("points", places, shares * mass[:, None], radius, n)
+    sign = -1.0 if mirrored else 1.0
+    ends = (-math.inf, mass) if mirrored else (-mass, math.inf)
+    return _with_gaps(
+        rng,
+        f"positive harmonic, n = {n}, {'upper' if mirrored else 'lower'} end known",
+        mass,
+        radius,
+        sign * u.slope,
+        lambda t: sign * u.movement(t),
+        HarmonicBall(radius, *ends, n),
+    )
+
+
+def _bounded(rng: np.random.Generator, rows: int, n: int) -> Trial:
+    """Boundary values in [lower, upper]: steps at random heights, among them two caps."""
+    radius, span = _log_uniform(rng, rows, -3, 3), _log_uniform(rng, rows, -3, 3)
+    heights = np.sort(rng.uniform(0, 2, (rows, 3)), axis=1)
+    thin = rng.random(rows) < 0.2
+    heights[thin] *= 10 ** rng.uniform(-4, 0, thin.sum())[:, None]
+    values = rng.uniform(0, 1, (rows, 4))  # from the cap ahead to what lies behind the third
+    kind = rng.integers(0, 3, rows)
+    values[kind == 0] = (1, 0, 0, 1)  # equality in the upper cap bound
+    values[kind == 1] = (0, 1, 1, 0)  # and in the lower one
+    weights = values[:, :3] - values[:, 1:]
+    u = AxialFunctions("caps", heights, weights * span[:, None], radius, n)
+    mean = values[:, 3] + (weights * cap_mass(heights, n)).sum(axis=1)
+    below, above = span * mean, span * (1 - mean)
+    return _with_gaps(
+        rng,
+        f"bounded harmonic, n = {n}",
+        np.minimum(below, above),
+        radius,
+        u.slope,
+        u.movement,
+        HarmonicBall(radius, -below, above, n),
+    )
+
+
+def _sourced(rng: np.random.Generator, rows: int, *, mirrored: bool) -> Trial:
+    """Poisson integrals of rings of mass with sources: the Laplacian jumps and varies.
+
+    It is that of an even density, two balls of even density and a multiple of the Legendre
+    polynomial P_2 of the latitude, whose f, q^2 ln(q) P_2/5, has the logarithm of the bound. With
+    one density everywhere, not negative, and mass at the poles alone, the bound is attained.
+    """
+    radius, mass = _log_uniform(rng, rows, -3, 3), _log_uniform(rng, rows, -3, 3)
+    places, shares = rng.uniform(-1, 1, (rows, 3)), rng.dirichlet([0.7] * 3, rows)
+    # As h - c >= mass (1-q^2)/8, f stays above c if its Laplacian stays below 0.75 of the mass: a
+    # potential is at most (1-q^2)/6 times the largest density.
+    centers = rng.uniform(-0.9, 0.9, (rows, 2))
+    sizes = (1 - np.abs(centers)) * rng.uniform(0.1, 1, (rows, 2))
+    density = rng.uniform(-0.18, 0.18, (rows, 4)) * 10 ** rng.uniform(-3, 0, (rows, 1))
+    kind = rng.integers(0, 4, rows)
+    places[kind < 2, :2], shares[kind < 2, 2], density[kind < 2, 1:3] = (1, -1), 0, 0
+    density[kind == 0, 0], density[kind == 0, 3] = np.abs(density[kind == 0, 0]), 0
+    density[kind == 1, 0] = 0
+    density[kind == 1, 3] = rng.choice([-0.7, 0.7], rows)[kind == 1]
+    shares /= shares.sum(axis=1, keepdims=True)
+    density *= mass[:, None]
+    balls = GreenPotentials(
+        np.column_stack([np.zeros(rows), centers]), np.column_stack([np.ones(rows), sizes])
+    )
+    even, wave = density[:, :3], density[:, 3]
+    u = AxialFunctions("points", places, shares * mass[:, None], radius, 3)
+    potential, slope = balls.at_center(even)
+    turns = np.stack([-0.5 * wave, wave])  # P_2 is between -1/2 and 1
+    least = density[:, 0] + np.minimum(even[:, 1:], 0).sum(axis=1) + turns.min(axis=0)
+    most = density[:, 0] + np.maximum(even[:, 1:], 0).sum(axis=1) + turns.max(axis=0)
+    sign = -1.0 if mirrored else 1.0
+
+    def movement(t: FloatArray) -> FloatArray:
+        q = t / radius[:, None]
+        turned = wave[:, None] / 5 * q * q * np.log(np.maximum(q, 1e-300))
+        return sign * (u.movement(t) - balls.movement(q, even) + turned)
+
+    # The ball is taken a little smaller, on which even point masses are bounded.
+    near, far = mass - potential, 1e18 * mass
+    below, above = (far, near) if mirrored else (near, far)
+    low, high = np.sort(sign * np.stack([least, most]) / radius**2, axis=0)
+    return _with_gaps(
+        rng,
+        f"bounded Laplacian, {'upper' if mirrored else 'lower'} end near",
+        near,
+        radius,
+        sign * (u.slope - slope / radius),
+        movement,
+        BoundedLaplacian(radius * (1 - 1e-9), -below, above, low, high),
+    )
+
+
+def _lipschitz(rng: np.random.Generator, rows: int) -> Trial:
+    """Straight and zigzag lines of slope at most the constant."""
+    radius, constant = _log_uniform(rng, rows, -3, 3), _log_uniform(rng, rows, -3, 3)
+    knots = np.sort(rng.uniform(0, 1, (rows, 2)), axis=1) * radius[:, None]
+    slopes = rng.uniform(-1, 1, (rows, 3)) * constant[:, None]
+    straight = rng.random(rows) < 0.4
+    slopes[straight] = (rng.choice([-1.0, 1.0], rows) * constant)[straight, None]
+
+    def movement(t: FloatArray) -> FloatArray:
+        bends = np.maximum(t[:, :, None] - knots[:, None, :], 0)
+        return slopes[:, :1] * t + (bends * np.diff(slopes, axis=1)[:, None, :]).sum(axis=2)
+
+    return _with_gaps(
+        rng,
+        "Lipschitz",
+        constant * radius,
+        radius,
+        slopes[:, 0],
+        movement,
+        Lipschitz(constant, radius),
+    )
+
+
+def _curved(rng: np.random.Generator, rows: int) -> Trial:
+    """Parabolas whose second derivative jumps once, at most the constant in size."""
+    radius, constant = _log_uniform(rng, rows, -3, 3), _log_uniform(rng, rows, -3, 3)
+    bends = rng.uniform(-1, 1, (rows, 2)) * constant[:, None]
+    extremal = rng.random(rows) < 0.5
+    bends[extremal] = (rng.choice([-1.0, 1.0], rows) * constant)[extremal, None]
+    knot = rng.uniform(0, 1, rows) * radius
+    slope = constant * radius * rng.choice([-1.0, 1.0], rows) * 10 ** rng.uniform(-4, 1, rows)
+
+    def movement(t: FloatArray) -> FloatArray:
+        late = np.maximum(t - knot[:, None], 0)
+        turn = (bends[:, 1] - bends[:, 0])[:, None]
+        return slope[:, None] * t + 0.5 * bends[:, :1] * t * t + 0.5 * turn * late * late
+
+    return _with_gaps(
+        rng,
+        "bounded curvature",
+        constant * radius**2,
+        radius,
+        slope,
+        movement,
+        Curvature(constant, radius),
+    )
+
+
+def _with_gaps(
+    rng: np.random.Generator,
+    name: str,
+    scale: FloatArray,
+    reach: FloatArray,
+    slope: FloatArray,
+    movement: Callable[[FloatArray], FloatArray],
+    promise: Promise,
+) -> Trial:
+    """Levels where the function is at a random place, and others at random."""
+    rows = len(scale)
+    down, up = scale * _log_uniform(rng, rows, -9, 2), scale * _log_uniform(rng, rows, -9, 2)
+    place = np.where(rng.random(rows) < 0.5, rng.random(rows), _log_uniform(rng, rows, -8, 0))
+    met = movement((place * reach)[:, None])[:, 0]
+    is_met = (rng.random(rows) < 0.8) & (met != 0) & np.isfinite(met)
+    up = np.where(is_met & (met > 0), met, up)
+    down = np.where(is_met & (met < 0), -met, down)
+    far = rng.random(rows) < 0.5  # else the other level is often met first
+    up = np.where(is_met & far & (met < 0), np.inf, up)
+    down = np.where(is_met & far & (met > 0), np.inf, down)
+    return Trial(name, Case(promise, down, up), slope, reach, movement)
+
+
+def _log_uniform(rng: np.random.Generator, rows: int, low: float, high: float) -> FloatArray:
+    return 10 ** rng.uniform(low, high, rows)
+
+
+def _upload(trial: Trial, precision: Precision) -> tuple[Case, Any]:
+    """The cases and slopes as Dr.Jit arrays."""
+    real = choose_backend(precision).Float
+    upload = trial.case.each(lambda one: real(one) if isinstance(one, np.ndarray) else one)
+    return upload, real(trial.slope)
+
+
+def _check_trial(
+    kind: type[Enclosure],
+    trial: Trial,
+    case: Case,
+    slope: Any,
+    rng: np.random.Generator,
+    precision: Precision,
+) -> None:
+    rows = len(trial.slope)
+    real = cast("Any", type(slope))
+    step = to_numpy(case.step(kind, slope)).astype(np.float64)
+    met = _meets(trial, np.minimum(step, trial.reach), precision)
+    _require(trial, ~met, kind, "a level is met within the step {length}", step)
+    good = (step >= 0) & (step <= trial.reach * (1 + 1e-6))
+    beyond = "the step {length} is no length up to {reach}, where the promise ends"
+    _require(trial, good, kind, beyond, step)
+    # In single precision both are rounded, each on its safe side.
+    shares = [1 - 1e-5 if precision == "double" else 0.98, *rng.uniform(0.01, 0.98, 2)]
+    for share in shares:
+        length = step * share
+        free = to_numpy(case.covers(kind, slope, real(length)))
+        _require(trial, free, kind, "{length} is not covered, but lies within the step", length)
+    lengths = [step * (1 + 10 ** rng.uniform(-4, 0, rows)), trial.reach * rng.random(rows)]
+    for length in lengths:
+        covered = to_numpy(case.covers(kind, slope, real(length)))
+        inside = np.minimum(length, trial.reach)
+        wrong = covered & (_meets(trial, inside, precision) | (length > trial.reach * (1 + 1e-6)))
+        _require(trial, ~wrong, kind, "a level is met within {length}, which is covered", length)
+
+
+def _meets(trial: Trial, length: FloatArray, precision: Precision) -> BoolArray:
+    """Whether the functions are seen to meet a level strictly within the length, (rows,)."""
+    tolerance = 1e-9 if precision == "double" else 1e-5
+    shares = np.concatenate([np.linspace(0, 1, _SAMPLES // 2), 1 - np.geomspace(1e-7, 0.5, 24)])
+    t = (1 - tolerance) * length[:, None] * shares
+    with np.errstate(all="ignore"):
+        moved = trial.movement(t)
+        # Rounding of the inputs moves a function by so much at most.
+        q = np.minimum(t / trial.reach[:, None], 1 - 1e-12)
+        growth = kernel_movement(q, 1.0, 4) + 1
+    slack = 0.0
+    if precision == "single":
+        slack = 2e-6 * _size(trial)[:, None] * growth
+    c = trial.case
+    over = moved > c.gap_up[:, None] * (1 + tolerance) + slack
+    under = -moved > c.gap_down[:, None] * (1 + tolerance) + slack
+    return (over | under).any(axis=1)
+
+
+def _size(trial: Trial) -> FloatArray:
+    promise, size = trial.case.promise, np.abs(trial.slope) * trial.reach
+    for low, high in promise.ends[:1]:  # the nearer one: the other may be as good as open
+        size = size + np.minimum(np.abs(getattr(promise, low)), np.abs(getattr(promise, high)))
+    return size
+
+
+def _require(
+    trial: Trial, good: Any, kind: type[Enclosure], promise: str, length: FloatArray
+) -> None:
+    bad = np.flatnonzero(~good)
+    if not bad.size:
+        return
+    row = bad[0]
+    numbers = trial.case.each(lambda one: float(one[row]) if np.ndim(one) else one)
+    what = promise.format(reach=float(trial.reach[row]), length=float(length[row]))
+    raise BrokenPromiseError(
+        f"{kind.__name__} does not keep its promise ({trial.name}): {what}. Wrong in "
+        f"{bad.size} of {len(good)} trials; the first: {numbers}, "
+        f"slope = {float(trial.slope[row])!r}"
+    )

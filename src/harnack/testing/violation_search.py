@@ -1,0 +1,452 @@
+"""Fields sampled as NumPy arrays, the worst places of promises, and reports of broken ones."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import numpy as np
+
+from harnack.backend import BoolArray, FloatArray, choose_backend, to_numpy, to_vector3
+from harnack.enclosures import BoundedLaplacian, Enclosure, Gaps, HarmonicBall, Slopes
+from harnack.fields.capabilities import NO_SHEET, Crossing
+
+if TYPE_CHECKING:
+    from harnack.backend import Mask, Precision, Real
+    from harnack.enclosures import Promise
+    from harnack.fields.field import Field, Sample
+
+__all__ = [
+    "BrokenPromiseError",
+    "FieldValues",
+    "LiftAlongRays",
+    "jumps",
+    "look_at",
+    "movements",
+    "random_directions",
+    "random_points",
+    "require",
+    "scaled",
+    "search_worst_places",
+    "unscaled",
+]
+
+
+class BrokenPromiseError(AssertionError):
+    """A field or a bound promised something that is not true; the message says what and where."""
+
+
+def require(
+    good: Any,
+    message: str,
+    points: FloatArray,
+    amount: FloatArray | None = None,
+    there: FloatArray | None = None,
+) -> None:
+    """Raise BrokenPromiseError for the worst of the points (n, 3) that are not good (n,).
+
+    amount: (n,) how wrong.
+    there: (n, 3) where it shows, if not at the point.
+    """
+    broken: BoolArray = ~np.asarray(good, dtype=np.bool_)
+    bad = np.flatnonzero(broken)
+    if not bad.size:
+        return
+    worst = bad[0] if amount is None else bad[np.abs(amount[bad]).argmax()]
+    by = "" if amount is None else f" (by {amount[worst]:.3g})"
+    where = "" if there is None else f", at {there[worst].tolist()}"
+    raise BrokenPromiseError(
+        f"{message}{by}: point {points[worst].tolist()}{where}; {bad.size} of {len(points)} points"
+    )
+
+
+def scaled(kind: type[Enclosure], factor: float, *, covers: float | None = None) -> Any:
+    """A proof made wrong on purpose, as a test suite that accepts it is worth nothing: with every
+    step multiplied by `factor`, and every length that it covers by `covers` (None: by the same)."""
+    loose = factor if covers is None else covers
+    base: Any = kind
+
+    class Scaled(base):
+        original = kind
+
+        def step(self, gaps: Gaps) -> Real:
+            inner: Any = super()
+            return factor * inner.step(gaps)
+
+        def covers(self, gaps: Gaps, length: Real) -> Mask:
+            inner: Any = super()
+            return inner.covers(gaps, length / loose)
+
+    Scaled.__name__ = f"Scaled{kind.__name__}"
+    return Scaled
+
+
+def unscaled(kind: type[Enclosure]) -> type[Enclosure]:
+    """The proof that `scaled` was given; any other as it is."""
+    return getattr(kind, "original", kind)
+
+
+# Fields from outside: values, gradients and continuous lifts.
+
+
+@dataclass(frozen=True)
+class FieldValues:
+    """A field at n points: value (n,), gradient (n, 3), their errors and promises (n,) each."""
+
+    value: FloatArray
+    gradient: FloatArray
+    error: FloatArray
+    gradient_error: FloatArray
+    known: tuple[Promise, ...]
+
+    def at(self, rows: BoolArray) -> FieldValues:
+        """The same at some of the points."""
+        return FieldValues(
+            self.value[rows],
+            self.gradient[rows],
+            self.error[rows],
+            self.gradient_error[rows],
+            tuple(one.each(lambda number, _, __: number[rows]) for one in self.known),
+        )
+
+
+def look_at(
+    field: Field, points: FloatArray, precision: Precision = "double", *, closely: bool = False
+) -> FieldValues:
+    """The field at points (n, 3), all numbers of its promises as float64 arrays (n,).
+
+    closely: without truncation.
+    """
+    n = len(points)
+    sample = _sample(field, points, precision, closely)
+    numbers_known = [list(vars(one).values()) for one in sample.promises]
+    # At once, or each would be computed by a kernel of its own.
+    dr.eval(sample.value, sample.gradient, sample.error, sample.gradient_error, numbers_known)
+
+    known = tuple(one.each(lambda number, _, __: _spread(number, n)) for one in sample.promises)
+    return FieldValues(
+        _spread(sample.value, n),
+        np.broadcast_to(to_numpy(sample.gradient), (n, 3)).astype(np.float64),
+        _spread(sample.error, n),
+        _spread(sample.gradient_error, n),
+        known,
+    )
+
+
+@dataclass(frozen=True)
+class LiftAlongRays:
+    """The continuous lift of f at m points along each of n rays, all arrays (n, m).
+
+    moved: how far the lift has moved since the ray's first point.
+    jumped: by how much f has jumped besides, across sheets.
+    gradient_norm: |grad f| at the points.
+    error: `Sample.error` at the points.
+    """
+
+    moved: FloatArray
+    jumped: FloatArray
+    gradient_norm: FloatArray
+    error: FloatArray
+
+
+def movements(
+    field: Field, start: FloatArray, direction: FloatArray, lengths: FloatArray
+) -> LiftAlongRays:
+    """How far the continuous lift of f moves along rays: f(start + t direction) - f(start).
+
+    start, direction: (n, 3), unit directions. lengths: t (n, m), each row rising from 0. A value
+    known modulo the period is continued to the one that the mean of the gradients at both ends of
+    an interval predicts; jumps across sheets are taken out.
+    """
+    n, m = lengths.shape
+    points = start[:, None] + lengths[..., None] * direction[:, None]
+    look = look_at(field, points.reshape(-1, 3))
+    value, gradient = look.value.reshape(n, m), look.gradient.reshape(n, m, 3)
+    slope = np.einsum("nmk,nk->nm", gradient, direction)
+    move = np.diff(value, axis=1)
+    if field.period is not None:
+        expected = 0.5 * (slope[:, 1:] + slope[:, :-1]) * np.diff(lengths, axis=1)
+        expected = np.where(np.isfinite(expected), expected, 0)
+        # A gradient may grow without limit at a curve; there the lift still moves little.
+        expected = np.clip(expected, -0.5 * field.period, 0.5 * field.period)
+        move -= field.period * np.round((move - expected) / field.period)
+    total = np.concatenate([np.zeros((n, 1)), np.cumsum(move, axis=1)], axis=1)
+    jumped = jumps(field, start, direction, lengths)
+    return LiftAlongRays(
+        total - jumped, jumped, np.linalg.norm(gradient, axis=2), look.error.reshape(n, m)
+    )
+
+
+def jumps(
+    field: Field, start: FloatArray, direction: FloatArray, lengths: FloatArray
+) -> FloatArray:
+    """By how much f has jumped (n, m) since the first of the lengths (n, m) along rays, as
+    `next_crossing` says."""
+    total = np.zeros_like(lengths)
+    if not field.has_sheets:
+        return total
+    backend = choose_backend("double")
+    prepared = field.prepare(backend)
+    o, d = to_vector3(backend, start), to_vector3(backend, direction)
+    first, far = (backend.Float(np.ascontiguousarray(lengths[:, k])) for k in (0, -1))
+    behind = Crossing(first, backend.UInt32(NO_SHEET), backend.Float(0), d)
+    while True:
+        behind = prepared.next_crossing(o, d, behind, far, backend.Bool(True))
+        t, jump = (_spread(one, len(start)) for one in (behind.t, behind.jump))
+        ahead = np.isfinite(t)
+        if not ahead.any():
+            return total
+        passed = ahead[:, None] & (lengths >= t[:, None])
+        total += np.where(passed, np.where(ahead, jump, 0)[:, None], 0)
+
+
+def random_points(field: Field, rng: np.random.Generator, n: int) -> FloatArray:
+    """n points of the field's domain; where that is unbounded, around its default surface."""
+    volume = field.domain if field.domain is not None else field.extent((field.default_level,))
+    if volume is None:
+        return 3 * random_directions(rng, n) * rng.random((n, 1))
+    lower, upper = volume.bounds()
+    lower, upper = np.where(np.isfinite(lower), lower, -3), np.where(np.isfinite(upper), upper, 3)
+    found = np.zeros((0, 3))
+    while len(found) < n:
+        points = rng.uniform(lower, upper, (4 * n, 3))
+        if field.domain is not None:
+            points = points[field.domain.contains_points(points)]
+        found = np.concatenate([found, points])
+    return found[:n]
+
+
+def random_directions(rng: np.random.Generator, n: int) -> FloatArray:
+    """n unit vectors, uniform on the sphere."""
+    directions = rng.normal(size=(n, 3))
+    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def _sample(field: Field, points: FloatArray, precision: Precision, closely: bool) -> Sample:
+    backend = choose_backend(precision)
+    prepared = field.prepare(backend)
+    seen = prepared.without_truncation(backend) if closely else prepared
+    return seen.evaluate(to_vector3(backend, points, "points"))
+
+
+def _spread(value: object, n: int) -> FloatArray:
+    array = to_numpy(value) if dr.is_array_v(value) else np.asarray(value)
+    return np.broadcast_to(array, (n,)).astype(np.float64)
+
+
+# The search for the worst places.
+
+# Pairs that climb: at most, and of the points given; how many moves each tries in a round, and
+# rounds. Where f is known along a path only, which costs one evaluation a sample, fewer.
+_MOST_PAIRS, _PAIRS_OF_POINTS = 48, 0.25
+_MOVES, _ROUNDS, _WALKED = 8, 36, 2
+# Of the radius: how near places come to the border of the ball.
+_BORDER = 1 - 1e-6
+# Sizes of moves, in radii: the first, the least, and what success and failure make of them.
+_FIRST, _LEAST, _FARTHER, _SHORTER = 0.25, 1e-9, 1.6, 0.6
+# Of the coordinates: radii below this are left out, for rounding moves places in them.
+_SMALLEST = 1e-6
+# Samples on the path to a place, where f is known along it only: searching, and to be sure.
+_ON_THE_WAY, _SURE = 24, 600
+# What a ratio may be above one for rounding, and rounding of the values.
+_ALLOWED, _ROUNDING = 1e-6, 1e-9
+# Of the radius: the spacing of differences of gradients.
+_SPACING = 1e-3
+
+
+@dataclass(frozen=True)
+class _Pairs:
+    """Points p (n, 3) and places p + reach * w, |w| < 1, and how near the promise is to being
+    broken there, (n,): above one it is."""
+
+    p: FloatArray
+    w: FloatArray
+    reach: FloatArray
+    ratio: FloatArray
+
+    def best_of(self, others: _Pairs) -> tuple[_Pairs, BoolArray]:
+        """Each of these n, or the best of its m others of n * m; and whether that is another."""
+        n = len(self.p)
+        m = len(others.p) // n
+        which = np.arange(n) * m + others.ratio.reshape(n, m).argmax(axis=1)
+        better = others.ratio[which] > self.ratio
+        rows = better[:, None]
+        return _Pairs(
+            np.where(rows, others.p[which], self.p),
+            np.where(rows, others.w[which], self.w),
+            np.where(better, others.reach[which], self.reach),
+            np.where(better, others.ratio[which], self.ratio),
+        ), better
+
+
+def search_worst_places(
+    field: Field, points: FloatArray, look: FieldValues, number: int, rng: np.random.Generator
+) -> None:
+    """Search for places that break a promise, the one of that number in `Sample.promises`.
+
+    A promise that is wrong by a few percent is broken only near what makes it: beside a singularity
+    that lies just inside the ball, or in the one direction in which a range is attained. Random
+    places miss that. So places climb: pairs of a point p and a place y that the promise made at p
+    speaks of move at random, farther as long as they succeed, to where the promise is closer to
+    being broken.
+
+    points: (n, 3), and `look` the field there. The climb begins at those with the smallest radius
+    and at others, towards the border along the gradient, against it, and in random directions.
+
+    Raises:
+        BrokenPromiseError: naming the point and the place of the worst pair.
+    """
+    search = _Search(field, number, 2 * float(np.ptp(points, axis=0).max()) + 1e-300)
+    part = _WALKED if search.is_walked else 1
+    pairs = min(max(int(_PAIRS_OF_POINTS * len(points)), 6), _MOST_PAIRS) // part
+    moves_each = _MOVES // part
+    order = np.argsort(np.broadcast_to(look.known[number].radius, len(points)), kind="stable")
+    rows = np.concatenate([order[: pairs // 3], rng.choice(len(points), pairs)])[:pairs]
+    steepest = look.gradient[rows]
+    length = np.linalg.norm(steepest, axis=1, keepdims=True)
+    steepest = np.where(length > 0, steepest / np.maximum(length, 1e-300), [1.0, 0.0, 0.0])
+    turn = np.arange(pairs)[:, None] % 3
+    along = np.where(turn == 1, -1, 1) * steepest
+    ways = np.where(turn == 2, random_directions(rng, pairs), along)
+    found = search.pairs(points[rows], ways * rng.uniform(0.3, 1, (pairs, 1)))
+    size = np.full(pairs, _FIRST)
+    for _ in range(_ROUNDS // part):
+        step = np.repeat(size, moves_each)[:, None]
+        p, w = (np.repeat(one, moves_each, axis=0) for one in (found.p, found.w))
+        reach = np.repeat(found.reach, moves_each)[:, None]
+        # Half of the moves keep the point, a quarter of them the place.
+        kind = np.arange(len(p))[:, None] % 4
+        moves = kind >= 2
+        way = rng.normal(size=p.shape) * step * 10 ** rng.uniform(-1, 0, (len(p), 1))
+        shift = np.where(moves, rng.normal(size=p.shape) * step, 0)
+        near = w - np.where(kind == 3, shift, 0) + np.where(kind == 3, 0, way)
+        # A promise of slopes or second derivatives is broken most between neighbors: a way that is
+        # turned and made shorter or longer, by a share of its length.
+        length = np.linalg.norm(w, axis=1, keepdims=True)
+        turned = (w + length * way) * 10 ** rng.uniform(-1, 0.5, (len(p), 1))
+        near = np.where(np.arange(len(p))[:, None] % 8 == 1, turned, near)
+        near = np.where(np.arange(len(p))[:, None] % 8 == 2, w + length * way, near)
+        found, better = found.best_of(search.pairs(p + reach * shift, near))
+        size = np.where(better, np.minimum(_FARTHER * size, 1), _SHORTER * size)
+        size = np.where(size < _LEAST, _FIRST, size)
+    worst = found.ratio > 1 + _ALLOWED
+    if worst.any():
+        found = search.pairs(found.p[worst], found.w[worst], samples=_SURE)
+        there = found.p + found.reach[:, None] * found.w
+        good = ~(found.ratio > 1 + _ALLOWED)
+        name = type(look.known[number]).__name__
+        message = f"{name}: f leaves what is promised here, by this factor"
+        require(good, message, found.p, found.ratio, there)
+
+
+@dataclass(frozen=True)
+class _Search:
+    """The promise that pairs are to break.
+
+    number: of the promise in `Sample.promises`.
+    longest: the length that stands for a radius without an end.
+    """
+
+    field: Field
+    number: int
+    longest: float
+
+    @property
+    def is_walked(self) -> bool:
+        """Whether how f moves is known along a path only, jumps taken out."""
+        return self.field.period is not None or self.field.has_sheets
+
+    def pairs(self, p: FloatArray, w: FloatArray, samples: int = _ON_THE_WAY) -> _Pairs:
+        """The pairs of points (n, 3) and shares of their radii, cut to the ball."""
+        length = np.linalg.norm(w, axis=1, keepdims=True)
+        w = w * np.minimum(1, _BORDER / np.maximum(length, 1e-300))
+        ratio, reach = np.full(len(p), -np.inf), np.full(len(p), 1.0)
+        rows = np.flatnonzero(self._within(p))
+        if len(rows):
+            look = look_at(self.field, p[rows])
+            known = look.known[self.number]
+            reach[rows] = np.minimum(known.radius, self.longest)
+            y = p + reach[:, None] * w
+            usable = reach[rows] > _SMALLEST * np.abs(p[rows]).max(axis=1)
+            if not known.of_all_space:
+                usable &= self._within(y[rows])
+            rows, look = rows[usable], look.at(usable)
+            if len(rows):
+                ratio[rows] = self._ratio(look, p[rows], w[rows], reach[rows], samples)
+        return _Pairs(p, w, reach, np.where(np.isnan(ratio), -np.inf, ratio))
+
+    def _within(self, p: FloatArray) -> BoolArray:
+        inside = np.asarray(np.isfinite(p).all(axis=1))
+        if self.field.domain is not None:
+            inside &= self.field.domain.contains_points(np.nan_to_num(p))
+        return inside
+
+    def _ratio(
+        self, look: FieldValues, p: FloatArray, w: FloatArray, reach: FloatArray, samples: int
+    ) -> FloatArray:
+        known, y = look.known[self.number], p + reach[:, None] * w
+        there = look_at(self.field, y)
+        moved = there.value - look.value
+        if self.is_walked:
+            moved = self._lift(p, y, samples)
+        error = look.error + there.error
+        error = error + _ROUNDING * (np.abs(look.value) + (self.field.period or 0) + np.abs(moved))
+        distance = reach * np.linalg.norm(w, axis=1)
+        with np.errstate(all="ignore"):
+            slope = np.einsum("nk,nk->n", look.gradient, y - p) / distance
+            low, high = known.movement(look.value, Slopes(slope, slope), distance)
+            if not known.of_all_space:
+                middle, half = 0.5 * (low + high), 0.5 * (high - low)
+                error = error + look.gradient_error * distance * (middle != 0)
+                return (np.abs(moved - middle) - error) / half
+            below, above = error - low, error + high
+            ratio, free = np.maximum(moved / above, -moved / below), reach - distance
+            if isinstance(known, HarmonicBall):
+                gap = np.minimum(below + moved, above - moved)
+                ratio = np.fmax(ratio, _slope_ratio(known, there, free, gap))
+            if isinstance(known, BoundedLaplacian):
+                spacing = _SPACING * free
+                ratio = np.fmax(ratio, self._laplacian_ratio(known, y, there, spacing))
+            return ratio
+
+    def _lift(self, p: FloatArray, y: FloatArray, samples: int) -> FloatArray:
+        """How far the continuous lift moves from p to y (n,)."""
+        way = y - p
+        length = np.linalg.norm(way, axis=1)
+        d = way / np.maximum(length, 1e-300)[:, None]
+        # Denser towards the border, where singularities may lie.
+        share = 1 - np.linspace(1, 0, samples) ** 2
+        return movements(self.field, p, d, length[:, None] * share).moved[:, -1]
+
+    def _laplacian_ratio(
+        self, known: BoundedLaplacian, y: FloatArray, there: FieldValues, h: FloatArray
+    ) -> FloatArray:
+        """One more than by how much the Laplacian at y (n, 3) leaves its ends, in their size."""
+        fine, wide = np.zeros(len(y)), np.zeros(len(y))
+        rounding = 4 * there.gradient_error / h
+        for axis in range(3):
+            for node, weight, wider in ((1, 1.0, 0.0), (2, 0.0, 0.5)):
+                way = (node * h)[:, None] * np.eye(3)[axis]
+                rate = look_at(self.field, y + way).gradient - look_at(self.field, y - way).gradient
+                fine += weight * rate[:, axis] / (2 * h)
+                wide += wider * rate[:, axis] / (2 * h)
+        size = np.linalg.norm(there.gradient, axis=1)
+        rounding += 1e-11 * size * (1 + np.abs(y).max(axis=1) / h) / h + np.abs(fine - wide)
+        off = np.maximum(known.laplacian_lower - fine, fine - known.laplacian_upper) - rounding
+        scale = np.abs(known.laplacian_lower) + np.abs(known.laplacian_upper) + 1e-300
+        return 1 + off / scale
+
+
+def _slope_ratio(
+    known: HarmonicBall, there: FieldValues, free: FloatArray, gap: FloatArray
+) -> FloatArray:
+    """|grad f| at places of a ball, as a share of what a harmonic function allows there that is
+    `gap` away from the nearer end of its range.
+
+    Proof. At y, `free` from the border, f - lower is positive and harmonic on B(y, free), so that
+    by Harnack's inequality |grad f(y)| <= n (f(y) - lower)/free; likewise upper - f. Where a
+    singularity lies in the ball, the left side grows faster than the right one beside it.
+    """
+    slope = np.maximum(np.linalg.norm(there.gradient, axis=1) - there.gradient_error, 0)
+    return np.where(gap > 0, slope * free / (known.dimension * gap), -np.inf)

@@ -1,0 +1,280 @@
+"""All crossings of rays with level sets: `trace(..., all_hits=k)`.
+
+`find_crossings` finds them one after the other while a kernel is recorded; `AllHits` is what users
+get: NumPy in, NumPy out; Dr.Jit stays Dr.Jit.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import operator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import numpy as np
+
+from harnack.backend import to_numpy
+from harnack.backend.arrays import gather_vectors
+from harnack.backend.elementary import length as norm
+from harnack.backend.loops import while_active
+from harnack.fields.capabilities import NO_SHEET
+from harnack.tracer.derivatives import attach, refuse_derivative, wants_derivatives
+from harnack.tracer.level_contact import Contact, Status
+from harnack.tracer.surface_tracer import MarchResult
+from harnack.tracer.walks import SheetTracer, SheetWalk
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Mask, Real, Vec3
+    from harnack.tracer.march import MarchState
+    from harnack.tracer.surface import LevelSet
+    from harnack.tracer.surface_tracer import PreparedLevelSet
+
+
+@dataclass(frozen=True)
+class CrossingsFound:
+    """The first k crossings of n rays, as Dr.Jit arrays.
+
+    t: (n k) of crossing j of ray i at i k + j; inf where there are fewer.
+    gradient: (n k, 3) of f there, or the normal of the sheet; 0 where there is no crossing.
+    sheet: (n k) index of the sheet that was crossed, NO_SHEET for none.
+    side: (n k) 1 where f rises through the level along the ray, -1 where it falls, 0 for none.
+    count: (n) how many there are, at most k.
+    end: (n) how far the ray was followed; inf if it was to its end.
+    evaluations, status: (n). HIT: k crossings, and what follows was not examined. MISS: there are
+        no others.
+    """
+
+    t: Real
+    gradient: Vec3
+    sheet: Any
+    side: Real
+    count: Any
+    end: Real
+    evaluations: Any
+    status: Any
+
+
+@dataclass(frozen=True)
+class _Walk:
+    """Where rays are, and how many crossings they have found.
+
+    march: the state of the march; None for a field with sheets.
+    sheets: for a field with sheets the state of `SheetTracer`, which includes that of the march.
+    count: of the crossings.
+    """
+
+    march: MarchState | None
+    sheets: SheetWalk | None
+    count: Any
+
+    @property
+    def active(self) -> Mask:
+        return self.now.active
+
+    @property
+    def now(self) -> MarchState:
+        """The state of the march."""
+        state = self.march if self.sheets is None else self.sheets.march
+        assert state is not None
+        return state
+
+    def with_march(self, now: MarchState, count: Any) -> _Walk:
+        if self.sheets is None:
+            return _Walk(now, None, count)
+        return _Walk(None, dataclasses.replace(self.sheets, march=now), count)
+
+
+def find_crossings(
+    prepared: PreparedLevelSet, o: Vec3, d: Vec3, t_min: Real, t_max: Real, k: int
+) -> CrossingsFound:
+    """The first k crossings of rays o + t d, |d| = 1, for t_min <= t <= t_max.
+
+    `Hysteresis` says what is guaranteed, and why: between two crossings the ray is one march, in
+    which contacts may begin and end any number of times.
+    """
+    backend = prepared.backend
+    real, vector, count = backend.Float, backend.Array3f, backend.UInt32
+    march, path, start, end, state = prepared.ready(o, d, t_min, t_max, True, crosses=True)
+    n = max(dr.width(array) for array in (path.origin, path.direction, start, end))
+    place = dr.arange(count, n) * k
+    # The loop scatters into these arrays, so they must lie in memory before it is recorded.
+    t, side = dr.full(real, dr.inf, n * k), dr.zeros(real, n * k)
+    before, behind = dr.zeros(real, n * k), dr.zeros(real, n * k)
+    gradient, sheets = dr.zeros(vector, n * k), dr.full(count, NO_SHEET, n * k)
+    dr.make_opaque(t, side, before, behind, gradient, sheets)
+    tracer = SheetTracer(march, prepared.field, path, start, end)
+
+    def one(now: _Walk) -> _Walk:
+        there, sheet = now, None
+        if now.sheets is None:
+            after = march.advance(prepared.field, path, end, now.now)
+        else:
+            walk = tracer.next(now.sheets)
+            there = _Walk(None, walk, now.count)
+            after, sheet = tracer.end_of(walk)
+        contact = after.contact
+        assert contact is not None
+        ended = now.active & (after.status == int(Status.HIT))
+        is_crossing = ended
+        if sheet is not None and prepared.field.only_sheets:
+            is_crossing = ended & (sheet != NO_SHEET)
+        slot = place + now.count
+        dr.scatter(t, contact.root, slot, is_crossing)
+        dr.scatter(side, contact.side, slot, is_crossing)
+        dr.scatter(before, contact.before, slot, is_crossing)
+        dr.scatter(behind, contact.behind, slot, is_crossing)
+        dr.scatter(gradient, contact.gradient, slot, is_crossing)
+        if sheet is not None:
+            dr.scatter(sheets, sheet, slot, is_crossing)
+        crossings = now.count + dr.select(is_crossing, count(1), 0)
+        more = ended & (crossings < k)
+        status = dr.select(more, count(int(Status.MISS)), after.status)
+        if now.sheets is None:
+            undecided = after.proved_to + after.proved_step < end
+            if march.hysteresis is not None:
+                undecided |= march.hysteresis.samples_end(contact, end) & (after.proved_to < end)
+            more &= undecided
+        else:
+            more |= after.active
+        return there.with_march(dataclasses.replace(after, status=status, active=more), crossings)
+
+    begun = _Walk(state, None, dr.zeros(count, n))
+    if prepared.field.has_sheets:
+        begun = _Walk(None, tracer.begin(state), dr.zeros(count, n))
+    walk = while_active(begun, one, "harnack crossings")
+    last = walk.now
+    ray, none = dr.arange(count, n * k) // k, real(0)
+    roots = Contact(side, backend.Bool(False), t, gradient, none, before, behind, none)
+    origins, directions = gather_vectors(backend, o, ray), gather_vectors(backend, d, ray)
+    t, gradient, looks = prepared.settled(origins, directions, roots, dr.isfinite(t))
+    evaluations = last.evaluations + dr.block_reduce(dr.ReduceOp.Add, looks, k)
+    followed = dr.select(last.status == int(Status.MISS), dr.inf, last.proved_to)
+    return CrossingsFound(t, gradient, sheets, side, walk.count, followed, evaluations, last.status)
+
+
+@dataclass(frozen=True)
+class AllHits:
+    """The first k crossings of n rays with the level set, in order: `trace(..., all_hits=k)`.
+
+    As NumPy arrays, or as tensors if the rays were; if they were Dr.Jit arrays, as Dr.Jit arrays,
+    in which (n, k) is flat: crossing j of ray i is at i k + j.
+
+    t: (n, k) ray parameter of the crossing, inf where a ray has fewer. It lies between two samples
+        with f on different sides of the level: where the cubic through their values and slopes
+        takes the level or, if there is a crease between them, where bisection finds it.
+    position: (n, k, 3) point at t, NaN where there is none.
+    normal: (n, k, 3) unit normal grad f/|grad f|, to the side of larger f; zero where there is
+        none.
+    sheet: (n, k) index of the sheet, such as a triangle, that was crossed; -1 where none was.
+    side: (n, k) integers: 1 where f rises through the level along the ray, -1 where it falls
+        through it, 0 where there is no crossing.
+    count: (n,) how many crossings there are, at most k.
+    end: (n,) how far the ray was followed: inf if to its end; else up to where the last crossing
+        was noticed, just behind it, or to where the ray ran out of steps.
+    status: (n,) a `Status`, of the end of the ray. MISS: it is proved that there are no other
+        crossings. HIT: there are k, and what follows was not examined. OUT_OF_STEPS: what follows
+        `end` is not known.
+    evaluations: (n,) how many times the field was evaluated.
+    """
+
+    t: Any
+    position: Any
+    normal: Any
+    sheet: Any
+    side: Any
+    count: Any
+    end: Any
+    status: Any
+    evaluations: Any
+
+
+def check_all_hits(all_hits: Any, surface: LevelSet) -> int:
+    """How many crossings to look for.
+
+    Raises:
+        TypeError: not an integer.
+        ValueError: less than 1; or several levels of a field with sheets.
+    """
+    try:
+        k = operator.index(all_hits)
+    except TypeError:
+        raise TypeError(
+            "all_hits is how many crossings of a ray to look for, an integer such as 8, "
+            f"not {all_hits!r}"
+        ) from None
+    if k < 1 or isinstance(all_hits, bool):
+        raise ValueError(f"all_hits must be at least 1, such as 8, not {all_hits}")
+    surface.check_crossings("all_hits")
+    return k
+
+
+def trace_all(
+    surface: LevelSet,
+    backend: Backend,
+    o: Vec3,
+    d: Vec3,
+    near: Real,
+    far: Real,
+    k: int,
+    *,
+    differentiable: bool,
+) -> AllHits:
+    """The first k crossings as `AllHits` of Dr.Jit arrays."""
+    prepared = surface.prepare(backend, crosses=True)
+    with dr.suspend_grad():
+        found = find_crossings(
+            prepared, dr.detach(o), dr.detach(d), dr.detach(near), dr.detach(far), k
+        )
+        is_found = dr.isfinite(found.t)
+        length = norm(found.gradient)
+        normal = dr.select(length > 0, found.gradient / length, 0)
+        dr.eval(*vars(found).values(), normal)
+    ray = dr.arange(backend.UInt32, dr.width(found.t)) // k
+    o, d = gather_vectors(backend, o, ray), gather_vectors(backend, d, ray)
+    t, end = found.t, found.end
+    if differentiable and wants_derivatives(prepared, o, d):
+        with dr.suspend_grad():
+            status = dr.select(is_found, backend.UInt32(int(Status.HIT)), int(Status.MISS))
+            none = dr.zeros(backend.Float, dr.width(t))
+            ends = MarchResult(t, none, found.gradient, none, none, status, found.sheet, found.side)
+        t, normal = attach(prepared, o, d, ends, normal)
+        normal = refuse_derivative(prepared, o, d, "normal", normal)
+        end = refuse_derivative(prepared, o, d, "end", end)
+    position = dr.select(dr.isfinite(t), dr.fma(backend.Array3f(t), d, o), dr.nan)
+    side = backend.Int32(found.side)
+    sheet = dr.reinterpret_array(backend.Int32, found.sheet)  # NO_SHEET becomes -1
+    of_rays = found.count, end, found.status, found.evaluations
+    hits = AllHits(t, position, normal, sheet, side, *of_rays)
+    dr.eval(*vars(hits).values())
+    return hits
+
+
+def no_crossings(backend: Backend) -> AllHits:
+    """The crossings of no rays."""
+    number, vector = dr.zeros(backend.Float, 0), dr.zeros(backend.Array3f, 0)
+    count, side = dr.zeros(backend.UInt32, 0), dr.zeros(backend.Int32, 0)
+    return AllHits(number, vector, vector, side, side, count, number, count, count)
+
+
+def crossings_as_numpy(hits: AllHits, n: int, k: int) -> AllHits:
+    """Crossings of n rays as NumPy arrays."""
+
+    def each(array: Any) -> Any:
+        values = to_numpy(array)
+        return values.reshape(n, k, *values.shape[1:])
+
+    def of_ray(array: Any) -> Any:
+        return np.broadcast_to(to_numpy(array), (n,)).copy()
+
+    return AllHits(
+        each(hits.t),
+        each(hits.position),
+        each(hits.normal),
+        each(hits.sheet).astype(np.int64),
+        each(hits.side).astype(np.int64),
+        of_ray(hits.count).astype(np.int64),
+        of_ray(hits.end),
+        of_ray(hits.status).astype(np.int64),
+        of_ray(hits.evaluations).astype(np.int64),
+    )

@@ -1,0 +1,208 @@
+"""Cells around the largest component of a level set, or of a solid."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable
+from typing import TYPE_CHECKING, TypeAlias
+
+import drjit as dr
+import numpy as np
+
+from harnack.backend import FloatArray, choose_backend, to_numpy, to_vector3
+from harnack.backend.elementary import length
+from harnack.enclosures import TargetLevels
+from harnack.fields.batched_fields import FieldCache
+from harnack.fields.clearance import clearance_of
+from harnack.tree.empty_space import OccupiedCells, largest_connected_component
+
+if TYPE_CHECKING:
+    from harnack.backend import BoolArray
+    from harnack.fields.field import Field
+    from harnack.geometry import Volume
+
+__all__ = ["CELLS_ACROSS", "largest_cells"]
+
+# Cells along the longest side of the box around a surface, unless users ask for another number.
+CELLS_ACROSS = 128
+# Centers so many cells away from the surface, to first order, are far from it; the cells tell
+# nothing if more than this share of them is far.
+_FAR, _MOST_FAR = 4.0, 0.5
+
+_Ends: TypeAlias = tuple[float, float]
+_CELLS: FieldCache[OccupiedCells] = FieldCache()
+
+
+def largest_cells(
+    field: Field, levels: tuple[float, ...], volume: Volume | None, solid: _Ends | None, across: int
+) -> OccupiedCells:
+    """Cells that hold the component of a level set in a volume, or of a solid {low <= f <= high},
+    with the largest sum of projected areas along x, y and z, and all that is not separated from it
+    by cells proved empty (see `largest_connected_component`).
+
+    A cell is left out if it, or each of its eight octants, is proved to have nothing of the level
+    set, as the ball around it is within the clearance of its center (or, where that is outside of
+    the field's domain, of a point at the domain's boundary), or nothing of the volume, as its
+    signed distance says. Of a solid, cells that hold no level but lie inside of it are kept too.
+    For the rest of the proof see `largest_connected_component`.
+
+    Raises:
+        ValueError: the volume is not bounded; or most of the cells that could not be proved empty
+            are far from the surface, so that the groups would say nothing.
+    """
+    ends = None if volume is None else np.array(volume.bounds(), np.float64)
+    if volume is None or ends is None or not np.isfinite(ends).all():
+        raise ValueError(
+            "largest needs a surface with bounds: give it a clip, such as "
+            "clip=harnack.Ball((0, 0, 0), 1)"
+        )
+
+    def made() -> OccupiedCells:
+        return _made(field.for_levels(levels), levels, volume, solid, across)
+
+    if field.parameters():  # they may change in place
+        return made()
+    return _CELLS.get(field, (levels, volume, solid, across), made)
+
+
+def _made(
+    field: Field, levels: tuple[float, ...], volume: Volume, solid: _Ends | None, across: int
+) -> OccupiedCells:
+    beyond = _distance_beyond(volume)
+    into_domain = _into_domain(field)
+    within = None if solid is None else _within(field, solid)
+    to_levels = clearance_of(field, levels, "double")
+
+    def clearance(points: FloatArray) -> FloatArray:
+        free = np.maximum(beyond(points), 0.0)
+        asked, moved = into_domain(points)
+        known = np.isfinite(moved)
+        if not known.any():
+            return free
+        length = to_levels(asked[known]) - moved[known]
+        if within is not None:
+            length[within(asked[known])] = 0.0
+        free[known] = np.maximum(free[known], length)
+        return free
+
+    lower, upper = (np.array(end, np.float64) for end in volume.bounds())
+    if (lower > upper).any() or (lower == upper).all():  # rays do not meet a single point
+        return OccupiedCells.none()
+    cells = OccupiedCells.of(lower, upper, clearance, across).thinned(clearance)
+    _check_proved(field, levels, solid, cells)
+    return largest_connected_component(cells)
+
+
+def _check_proved(
+    field: Field, levels: tuple[float, ...], solid: _Ends | None, cells: OccupiedCells
+) -> None:
+    """Raise ValueError if most cells that are left are far from the surface."""
+    centers = cells.centers()
+    if field.domain is not None:
+        centers = centers[field.domain.contains_points(centers)]
+    if not len(centers):
+        return
+    gap, slope, value = _samples(field, levels)(centers)
+    far = gap > _FAR * cells.cell * slope
+    if solid is not None:
+        far &= ~((value >= solid[0]) & (value <= solid[1]))
+    if far.sum() > _MOST_FAR * len(far):
+        raise ValueError(
+            f"largest: with {round(max(cells.shape))} cells along the longest side, most cells of "
+            f"this {type(field).__name__} could not be proved empty, so that its components cannot "
+            "be told apart: give a larger number of cells, or mesh it with largest=True"
+        )
+
+
+def _into_domain(field: Field) -> Callable[[FloatArray], tuple[FloatArray, FloatArray]]:
+    """For points (n, 3), points nearby in the field's domain, outside of which its promises need
+    not hold, and the distances between the two, (n,), infinite where none was found. If the point
+    found is at least c away from a set, the point given is at least c minus that distance away from
+    it.
+    """
+    domain = None if field.is_entire else field.domain
+    backend = choose_backend("double")
+    prepared = None if domain is None else domain.prepare(backend)
+
+    def into(points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        moved = np.zeros(len(points))
+        if domain is None or prepared is None:
+            return points, moved
+        outside = ~domain.contains_points(points)
+        if not outside.any():
+            return points, moved
+        x = points[outside]
+        p = to_vector3(backend, x)
+        far = (1 + 1e-9) * to_numpy(prepared.signed_distance(p)) + 1e-12 * np.abs(x).max()
+        y = x - far[:, None] * to_numpy(prepared.outward_normal(p))
+        asked = points.copy()
+        asked[outside] = y
+        length = 1.000001 * np.linalg.norm(x - y, axis=1)
+        moved[outside] = np.where(domain.contains_points(y), length, np.inf)
+        return asked, moved
+
+    return into
+
+
+def _distance_beyond(volume: Volume) -> Callable[[FloatArray], FloatArray]:
+    """For points (n, 3), a lower bound of their distances from the volume, negative inside."""
+    backend = choose_backend("double")
+    prepared = volume.prepare(backend)
+
+    def beyond(points: FloatArray) -> FloatArray:
+        distance = to_numpy(prepared.signed_distance(to_vector3(backend, points)))
+        rounding = 64 * float(np.finfo(np.float64).eps) * (1 + float(np.abs(points).max()))
+        return np.broadcast_to(distance, len(points)) - rounding
+
+    return beyond
+
+
+def _samples(
+    field: Field, levels: tuple[float, ...]
+) -> Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]]:
+    """For points (n, 3): how far values are from a level, the lengths of gradients, and values."""
+    backend = choose_backend("double")
+    prepared = field.prepare(backend)
+    targets = TargetLevels(tuple(dr.opaque(backend.Float, level) for level in levels), field.period)
+
+    def samples(points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        seen = prepared.evaluate(to_vector3(backend, points))
+        found = (targets.gaps(seen.value).smaller, length(seen.gradient), seen.value)
+        gap, slope, value = (np.broadcast_to(to_numpy(one), len(points)) for one in found)
+        return gap, slope, value
+
+    return samples
+
+
+def _within(field: Field, solid: _Ends) -> Callable[[FloatArray], BoolArray]:
+    """For points (n, 3), whether low <= f <= high."""
+    backend = choose_backend("double")
+    prepared = field.prepare(backend)
+
+    def within(points: FloatArray) -> BoolArray:
+        value = to_numpy(prepared.evaluate(to_vector3(backend, points)).value)
+        return np.broadcast_to((value >= solid[0]) & (value <= solid[1]), len(points))
+
+    return within
+
+
+def checked_largest(largest: object) -> int:
+    """Cells across, 0 for all components.
+
+    Raises:
+        TypeError: neither a truth value nor a whole number.
+        ValueError: fewer cells than 8, or more than 512.
+    """
+    wrong = (
+        "largest is True, or how many cells to tell components apart by along the longest side, "
+        f"from 8 to 512, not {largest!r}"
+    )
+    if isinstance(largest, bool | np.bool_):
+        return CELLS_ACROSS if largest else 0
+    try:
+        across = operator.index(largest)  # pyright: ignore[reportArgumentType]
+    except TypeError:
+        raise TypeError(wrong) from None
+    if across and not 8 <= across <= 512:
+        raise ValueError(wrong)
+    return across

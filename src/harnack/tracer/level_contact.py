@@ -1,0 +1,493 @@
+"""When a point of a ray counts as a hit or as a crossing, and how a ray can end.
+
+- First hits: a ray ends where f is within the `Tolerance` of a level, or at a sheet across which f
+  jumps past a level (`compare_with_sheet`).
+- Crossings: a ray goes on behind the level. `Contact` is its state near the level that it reached,
+  `Hysteresis` the rule by which each crossing is counted once.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+
+from harnack.backend.elementary import fmax, fmin, largest_coordinate, length
+from harnack.backend.loops import while_active
+from harnack.backend.validation import real
+from harnack.enclosures import Gaps, TargetLevels
+from harnack.fields.capabilities import NO_SHEET, Crossing
+from harnack.fields.samples import value_error
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Mask, Real, Vec3
+    from harnack.fields.field import Field
+    from harnack.fields.samples import Path
+
+
+class Status(enum.IntEnum):
+    """How a ray ended."""
+
+    MISS = 0
+    """It is proved that the ray meets no level between t_min and t_max."""
+    HIT = 1
+    """The ray is proved free up to t, where the surface is within tolerance."""
+    OUT_OF_STEPS = 2
+    """The ray is proved free up to t; what follows is not known. Raise max_steps."""
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """When a point is close enough to a level to be a hit.
+
+    distance: |f - level| <= distance * |grad f|, a length to first order (paper, Sec. 3.1.2); see
+        below for where that is none.
+    per_length: added to `distance` for each unit of t: half the angle of a pixel makes the
+        tolerance grow with its footprint.
+    value: also a hit where |f - level| <= value, whatever the gradient.
+
+    Where |grad f| may have no bound, as beside a vertical tangent or a pole of a formula
+    (`Field.is_steep`), that is no length. There a point is a hit only if f is proved to take the
+    level within the tolerance, by its slope ahead or by its values beyond, or up to the rounding of
+    the point. At creases |grad f| jumps but has a bound: a crease that stays off the level counts
+    as a hit where it comes as near to it in value. So do spikes and steps that are narrower than
+    the tolerance, as those of tanh(1e6 x) - y and of 0.5 + exp(-(1e5 x)^2). Of fields that are no
+    formulas and have poles, such as clouds of dipoles, rays that pass a pole within the tolerance
+    count as hits of every level.
+
+    Where rounding leaves the distance to the level less certain than this, that uncertainty is
+    the tolerance: about 1e-6 of the coordinates' size in single precision, 1e-15 in double, and far
+    more where grad f is 0 on the surface, as where sheets meet (`Hits.uncertainty` says how much).
+    """
+
+    distance: float = 1e-4
+    per_length: float = 0.0
+    value: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("distance", "per_length", "value"):
+            number = real(getattr(self, name), f"tolerance: {name}")
+            if not 0 <= number < math.inf:
+                raise ValueError(f"tolerance: {name} must be finite and >= 0, not {number!r}")
+        if self.distance == 0 and self.value == 0 and self.per_length == 0:
+            raise ValueError("tolerance must be positive: a level set is never met exactly")
+
+    def prepare(self, backend: Backend) -> PreparedTolerance:
+        """As kernel parameters of a backend: another tolerance compiles no new kernel."""
+        numbers = (self.distance, self.per_length, self.value)
+        return PreparedTolerance(*(dr.opaque(backend.Float, number) for number in numbers))
+
+
+@dataclass(frozen=True)
+class PreparedTolerance:
+    """A `Tolerance` on a backend."""
+
+    distance: Real
+    per_length: Real
+    value: Real
+
+    def in_value(self, gradient_norm: Real, t: Real) -> Real:
+        """By how much f may differ from a level at a hit, where |grad f| = gradient_norm."""
+        return fmax(gradient_norm * dr.fma(t, self.per_length, self.distance), self.value)
+
+
+ON_SHEET = max(Status) + 1
+"""Status of a ray that hit a sheet, until `SheetTracer` turns it into a plain HIT."""
+
+
+@dataclass(frozen=True)
+class SheetComparison:
+    """Result of comparing a sample with the sheet at the end of its ray interval.
+
+    has_crossing: the interval ends at a sheet.
+    at_crossing: the sample is accepted and lies at that sheet.
+    is_hit: also, a level lies between the values on both sides, up to the total error.
+    gaps: to the levels below and above, of the value behind the sheet if `at_crossing`.
+    normal: of the sheet.
+    """
+
+    has_crossing: Mask
+    at_crossing: Mask
+    is_hit: Mask
+    gaps: Gaps
+    normal: Vec3
+
+    def mark(self, status: Any, gradient: Vec3) -> tuple[Any, Vec3]:
+        """Status and gradient, replaced by those of the sheet where it was hit."""
+        marked = type(status)(dr.select(self.is_hit, ON_SHEET, status))
+        return marked, dr.select(self.is_hit, self.normal, gradient)
+
+
+def compare_with_sheet(
+    ahead: Crossing, there: Mask, value: Real, total_error: Real, levels: TargetLevels
+) -> SheetComparison:
+    """Compare the values on the two sides of a sheet with the levels.
+
+    ahead: the crossing at the end of the ray interval.
+    there: where samples are accepted and lie at that crossing.
+    value: f there, before the jump, known up to `total_error`.
+
+    The sheet is the surface if a level lies between the values on its two sides. They are known
+    up to `total_error`, and a level within that of either counts as between: such a sheet is the
+    surface or just fails to be, and its points are no farther than rounding from the level. To
+    decide the other way could lose a surface, for the march has proved that the level is not met
+    *before* the sheet, which rounding may contradict by as much. Sheets at the same t count as one,
+    with the sum of their jumps (`SheetTracer._together`).
+    """
+    has_crossing = ahead.sheet != NO_SHEET
+    at_crossing = has_crossing & there
+    behind = value + dr.select(at_crossing, ahead.jump, 0)
+    low, high = fmin(value, behind) - total_error, fmax(value, behind) + total_error
+    is_hit = at_crossing & (levels.gaps(low).up <= high - low)
+    return SheetComparison(has_crossing, at_crossing, is_hit, levels.gaps(behind), ahead.normal)
+
+
+# The band around a level is at least so many roundings of f, and at most this fraction of the
+# difference between two levels, so that there is no doubt which of them was reached.
+_ROUNDINGS = 8.0
+_OF_SPACING = 0.25
+# In contact, f may come as near to the next level as this fraction of that difference.
+_HALFWAY = 0.5
+# A crossing is complete where f is beyond the level by this fraction of the band. The rest is the
+# gap that a ray in contact always has.
+_PASSED = 0.5
+# In contact, trials aim at where f is beyond the level by this fraction of the band: there the
+# crossing is complete, and it is clear on which side of the level f is.
+AIM = 0.75
+# In contact, truncation is judged by this fraction of the tolerance.
+CLOSER = 0.5
+# In contact, a step must not lead to where the band is less than this fraction of what it was,
+# unless it is at most so many tolerances long.
+_MUCH_SMALLER, _SHORT = 0.25, 4.0
+# Rounds of the search for the root of a cubic.
+_ROUNDS = 4
+
+
+@dataclass(frozen=True)
+class Contact:
+    """What a ray knows of the level that it has reached last.
+
+    side: on which side of that level the ray is: 1 where f is larger, -1 where it is smaller; 0 as
+        long as no sample has been off the level at which the ray started. While there is no contact
+        only whether it is 0 has a meaning.
+    is_touching: whether f is, or may still be, within the tolerance of that level.
+    root: where f took the level last, between two samples on different sides of it; where the
+        contact began if it began beyond the level.
+    gradient: of f at the root.
+    excess: by how much f at the root may be farther from the level than the tolerance allows, where
+        rounding leaves f less certain than that: the root lies between the two samples.
+    before, behind: the places of the two samples, or the root itself.
+    band: that of the last sample.
+    """
+
+    side: Real
+    is_touching: Mask
+    root: Real
+    gradient: Vec3
+    excess: Real
+    before: Real
+    behind: Real
+    band: Real
+
+    @classmethod
+    def none(cls, backend: Backend) -> Contact:
+        """Before the first sample."""
+        zero = backend.Float(0)
+        return cls(zero, backend.Bool(False), zero, backend.Array3f(0), zero, zero, zero, zero)
+
+
+@dataclass(frozen=True)
+class Accepted:
+    """A sample at an accepted point of a ray.
+
+    t, value, gradient, slope: there.
+    before: (t, value, slope, gradient) of the accepted point before it.
+    excess: by how much f at the two may be farther from a level than the tolerance allows, where
+        the error of f is more than that; 0 elsewhere.
+    total_error: of the value.
+    is_near: whether it would be a hit.
+    band: the tolerance in value (`Hysteresis.band`).
+    is_end: whether the ray ends there.
+    """
+
+    t: Real
+    value: Real
+    gradient: Vec3
+    slope: Real
+    before: tuple[Real, Real, Real, Vec3]
+    excess: Real
+    total_error: Real
+    is_near: Mask
+    band: Real
+    is_end: Mask
+
+
+@dataclass(frozen=True)
+class Hysteresis:
+    """The rule by which contacts begin, count as crossings, and end.
+
+    A first hit ends a ray where f is within the tolerance of a level. A ray that goes on has to get
+    off the surface with a proof, and rounding, or a ray that runs along the surface, must not make
+    several crossings of one. So a level that has been reached counts as lying a tolerance *beyond*,
+    until f has left the tolerance around it (hysteresis): there is always a gap to it, and steps
+    stay long.
+
+    Let W be the largest of the tolerances in value (`band`) at the samples of a contact. What is
+    guaranteed:
+
+    1. *Nothing is missed.* If f is farther than W from a level on one side at some point of the
+       ray, and on the other side at a later one, there is a crossing between them. Proof: in
+       contact on the side of larger values, the ray is proved free of `level - band`, the band
+       being that of the last sample, as a ray is proved free of a level before contact
+       (`March.advance`). So f > level - W as long as no crossing was noticed. Before the contact,
+       f was proved not to take the level at all. Beside a pole the band is as large as f is steep,
+       and may be larger than f gets anywhere behind it. So the band of a sample counts up to the
+       next sample only if the band there is not much smaller (`_MUCH_SMALLER`), or if both are at
+       most `_SHORT` tolerances apart (`may_reach`): a step that fails this is made shorter. So is
+       one to a sample of which nothing is known, as where an exponential overflows.
+    2. *Nothing is counted twice.* A crossing is noticed at a point where f is proved to be on the
+       other side of the level, `band/2` being more than its error; the next one only where it is
+       proved to be on the first side again. So crossings of a level alternate, and between two that
+       are noticed f takes the level. A ray that starts within the tolerance of a level is on
+       neither side until a sample is half the tolerance off it: leaving it is no crossing.
+    3. *Nothing sticks.* In contact, f is `band/2` or more away from the level beyond, up to its
+       error, so the gap that steps are solved for is at least a fifth of the band.
+
+    The lift of an angle-valued f. Before contact, f lies between two neighboring levels of the
+    ladder, and in contact it is proved to stay nearer to the level reached than to all others: the
+    window is less than a period wide, and the value tells where in it f is. (Looking back from a
+    point takes the window there, and the two proved intervals share a point, so their lifts agree.)
+
+    levels: all of them.
+    spacing: the difference between the two closest, inf for one level.
+    is_free_before, is_free_after: whether the ray is proved free before the interval that is
+        marched, and behind it, by where the surface lies. Then f stays on the side of a level on
+        which it is at that end of the interval, and there it need be off the level by no more than
+        its error.
+    start, rounding: where the interval begins, and how far off a sheet rounding may have put a ray
+        that starts on it.
+    """
+
+    levels: TargetLevels
+    spacing: Real
+    is_free_before: Mask
+    is_free_after: Mask
+    start: Real
+    rounding: Real
+
+    @classmethod
+    def of(
+        cls,
+        levels: TargetLevels,
+        free: tuple[Mask, Mask],
+        start: Real,
+        rounding: Real,
+    ) -> Hysteresis:
+        """The rule for some levels. free: `is_free_before` and `is_free_after`."""
+        period = levels.period
+        spacing: Real = dr.inf if period is None else period
+        for k, one in enumerate(levels.values):
+            for other in levels.values[:k]:
+                apart = dr.abs(one - other)
+                if period is not None:
+                    apart = apart - period * dr.floor(apart / period)
+                    apart = fmin(apart, period - apart)
+                spacing = fmin(spacing, dr.select(apart > 0, apart, dr.inf))
+        return cls(levels, spacing, *free, start, rounding)
+
+    def within(self, within: Real) -> Real:
+        """How near in value a level must be for contact: `within`, which the tolerance asks for,
+        or less where levels are close together."""
+        return fmin(within, _OF_SPACING * self.spacing)
+
+    def band(self, within: Real, rounding: Real) -> Real:
+        """The tolerance in value around a level: `within`, or more where rounding asks for it."""
+        return fmin(fmax(within, _ROUNDINGS * rounding), _OF_SPACING * self.spacing)
+
+    def may_reach(self, now: Contact, band: Real, step: Real, tolerance: Real) -> Mask:
+        """Whether the band of the last sample may count for a step to a point with this band.
+
+        tolerance: a length, at that point.
+        """
+        holds = now.band * _MUCH_SMALLER <= band
+        return ~now.is_touching | holds | (step <= _SHORT * tolerance)
+
+    def samples_end(self, now: Contact, end: Real) -> Mask:
+        """Whether a ray that is proved free to its end has to sample it: in contact it is proved
+        free of levels that lie a band beyond."""
+        return now.is_touching & (self.is_free_after | (end < dr.inf))
+
+    def gaps(
+        self, contact: Contact, value: Real, gaps: Gaps, band: Real, part: float = 1.0
+    ) -> Gaps:
+        """How far f may move, given the gaps to the true levels.
+
+        In contact the level counts as lying `part` of the band beyond, and steps end within that
+        part of half the way to the next level.
+        """
+        x, far = -self.levels.to_nearest(value), part * _HALFWAY * self.spacing
+        band = part * band
+        below = dr.select(contact.side < 0, far, band)
+        above = dr.select(contact.side > 0, far, band)
+        return Gaps(
+            dr.select(contact.is_touching, fmax(below + x, 0), gaps.down),
+            dr.select(contact.is_touching, fmax(above - x, 0), gaps.up),
+        )
+
+    def update(self, now: Contact, active: Mask, seen: Accepted) -> tuple[Contact, Mask]:
+        """The contact behind an accepted point, and whether the ray has crossed the level."""
+        x = -self.levels.to_nearest(seen.value)
+        touching = now.is_touching
+        side = dr.select(touching, now.side, self._side(now, seen, x))
+
+        # The root, if f has changed sides since the last point.
+        t, value, slope, gradient = seen.before
+        x_before = -self.levels.to_nearest(value)
+        passes = active & touching & (side * x_before > 0) & (side * x <= 0)
+        share = root_between(x_before, x, (seen.t - t) * slope, (seen.t - t) * seen.slope)
+        begins = active & ~touching & seen.is_near
+        root = dr.select(passes, t + share * (seen.t - t), dr.select(begins, seen.t, now.root))
+        at_root = dr.select(begins, seen.gradient, now.gradient)
+        at_root = dr.select(passes, dr.lerp(gradient, seen.gradient, share), at_root)
+        excess = dr.select(passes | begins, seen.excess, now.excess)
+        before = dr.select(passes, t, dr.select(begins, seen.t, now.before))
+        behind = dr.select(passes | begins, seen.t, now.behind)
+
+        # Is f far enough beyond the level to have crossed it, or has it left the band?
+        is_first = (now.side == 0) & ~touching
+        stays = (is_first & self.is_free_before) | (seen.is_end & self.is_free_after)
+        enough = dr.select(stays, 0, _PASSED * seen.band)
+        is_off = dr.abs(x) > fmax(enough, seen.total_error)
+        crosses = active & touching & is_off & (side * x < 0)
+        settles = active & is_off & (side == 0)
+        side = dr.select(settles | crosses, dr.select(x > 0, type(x)(1), -1), side)
+        is_touching = dr.select(touching, dr.abs(x) <= seen.band, seen.is_near)
+        return Contact(
+            dr.select(active, side, now.side),
+            dr.select(active, is_touching, touching),
+            root,
+            at_root,
+            excess,
+            before,
+            behind,
+            dr.select(active, seen.band, now.band),
+        ), crosses
+
+    def jump(
+        self, now: Contact, active: Mask, seen: Accepted, ahead: Crossing, d: Vec3
+    ) -> tuple[Contact, Mask]:
+        """The contact behind the sheet `ahead`, and whether the jump of f there crosses the level.
+
+        now: the contact at an accepted point just before the sheet. d: the direction of the ray.
+        A field with sheets has one level here. A ray that starts on a sheet is on neither side.
+        """
+        x = -self.levels.to_nearest(seen.value)
+        one = type(x)(1)
+        side = dr.select(now.is_touching, now.side, dr.select(x > 0, one, -1))
+        starts = dr.abs(dr.dot(ahead.normal, d)) * (seen.t - self.start) <= self.rounding
+        side = dr.select(starts, 0, side)
+        behind = x + ahead.jump
+        passes = active & (side * x > 0) & (side * behind <= 0)
+        begins = active & ~now.is_touching & (dr.abs(behind) <= seen.band)
+        is_off = dr.abs(behind) > fmax(_PASSED * seen.band, seen.total_error)
+        crosses = active & is_off & (side * behind < 0)
+        side = dr.select(is_off, dr.select(behind > 0, one, -1), side)
+        at_sheet = passes | begins
+        return Contact(
+            dr.select(active, side, now.side),
+            dr.select(active, dr.abs(behind) <= seen.band, now.is_touching),
+            dr.select(at_sheet, seen.t, now.root),
+            dr.select(at_sheet, ahead.normal, now.gradient),
+            dr.select(at_sheet, 0, now.excess),
+            dr.select(at_sheet, seen.t, now.before),
+            dr.select(at_sheet, seen.t, now.behind),
+            dr.select(active, seen.band, now.band),
+        ), crosses
+
+    def _side(self, now: Contact, seen: Accepted, x: Real) -> Real:
+        """From which side of the nearest level a ray comes that was not in contact with it.
+
+        x: f less that level. The ray was proved free, so a real-valued f is on the side of the last
+        accepted value. If f is periodic that value may lie on both sides: there the present value
+        decides and, where it is the level up to its error, the slope.
+        """
+        if self.levels.period is None:
+            above = seen.before[1] > seen.value - x
+        else:
+            above = dr.select(dr.abs(x) > seen.total_error, x > 0, seen.slope < 0)
+        # 0 stays only for a ray of which every sample so far was near a level.
+        known = (now.side != 0) | ~seen.is_near
+        return dr.select(known, dr.select(above, type(x)(1), -1), 0)
+
+
+@dataclass(frozen=True)
+class _Settling:
+    """The state of bisection: f takes the level between before and behind."""
+
+    before: Real
+    behind: Real
+    t: Real
+    gradient: Vec3
+    looks: Any
+    active: Mask
+
+
+def settled(
+    field: Field, levels: TargetLevels, tolerance: PreparedTolerance, path: Path, found: Contact,
+    active: Mask,
+) -> tuple[Real, Vec3, Any]:  # fmt: skip
+    """The root of a crossing, the gradient of f there, and how many evaluations of f that took.
+
+    Between two points with a crease between them f is no cubic. So f is evaluated at the root, and
+    where it is farther from the level than the tolerance and its rounding, the two points are
+    brought together by bisection: f stays on different sides of the level at both.
+    """
+    side = -found.side
+    count = dr.uint32_array_t(type(found.root))
+    smallest = 4 * float(dr.epsilon(type(found.root)))
+
+    def body(now: _Settling) -> _Settling:
+        sample, size = field.evaluate(path.point(now.t)), largest_coordinate(path.origin) + now.t
+        x, steepness = -levels.to_nearest(sample.value), length(sample.gradient)
+        near = dr.abs(x) <= fmax(
+            tolerance.in_value(steepness, now.t), value_error(sample, steepness, size)
+        )
+        is_before = side * x > 0
+        before = dr.select(is_before, now.t, now.before)
+        behind = dr.select(is_before, now.behind, now.t)
+        goes_on = ~near & (behind - before > smallest * size)
+        is_first = near & (now.looks == 0)
+        return _Settling(
+            before,
+            behind,
+            dr.select(goes_on, 0.5 * (before + behind), now.t),
+            dr.select(is_first, now.gradient, sample.gradient),
+            now.looks + 1,
+            now.active & goes_on,
+        )
+
+    begin = _Settling(found.before, found.behind, found.root, found.gradient, count(0), active)
+    end = while_active(begin, body, "harnack roots")
+    return end.t, end.gradient, end.looks
+
+
+def root_between(start: Real, end: Real, slope: Real, end_slope: Real) -> Any:
+    """A root in [0, 1] of the cubic with these values at 0 and 1, of different signs, and these
+    slopes: Newton's method, and bisection where it leaves the bracket."""
+    # start + slope u + b u^2 + c u^3
+    b = 3 * (end - start) - 2 * slope - end_slope
+    c = slope + end_slope - 2 * (end - start)
+    low, high = type(start)(0), type(start)(1)
+    u = start / (start - end)
+    for _ in range(_ROUNDS):
+        value = dr.fma(dr.fma(dr.fma(c, u, b), u, slope), u, start)
+        rate = dr.fma(dr.fma(3 * c, u, 2 * b), u, slope)
+        before = (value > 0) == (start > 0)
+        low, high = dr.select(before, u, low), dr.select(before, high, u)
+        next_u = u - value / rate
+        inside = (next_u >= low) & (next_u <= high)
+        u = dr.select(inside, next_u, 0.5 * (low + high))
+    return dr.clip(u, 0, 1)

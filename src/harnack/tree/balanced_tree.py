@@ -1,0 +1,308 @@
+"""Balanced trees: built by median splits, stored as records, traversed without a stack.
+
+- `Hierarchy`: which primitive lies in which leaf, from `build_hierarchy`, in vectorized NumPy.
+- `PackedTree`: nodes and primitives as records on a backend, from `pack`.
+- `walk`: visits nodes depth first, into a subtree or past it; `for_each`: the primitives of a leaf.
+
+What a node means, and when to go past it, is up to the caller.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
+
+import drjit as dr
+import numpy as np
+import numpy.typing as npt
+
+from harnack.backend import FloatArray, IntArray
+from harnack.backend.record_table import PACKET, Records
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Mask, Real
+
+NO_PRIMITIVE = -1
+# So many points and their indices fit into the cache.
+_POINTS_AT_ONCE = 1 << 17
+# Rows up to this length are reduced faster by a loop over columns than by NumPy's reductions.
+_LONG_ROW = 48
+
+
+@dataclass(frozen=True)
+class Hierarchy:
+    """A balanced tree: primitives in leaves, and levels of nodes above them.
+
+    Every leaf holds w or w - 1 primitives and every level is complete, so that a level is a reshape
+    and every sum over nodes a sum along an axis.
+
+    slots: (leaves, leaf_size) index of the primitive in each slot, NO_PRIMITIVE for an empty one
+        (the last of a leaf, if any).
+    arities: children of every inner node, level by level from the leaves' parents to the root.
+    """
+
+    slots: IntArray
+    arities: tuple[int, ...]
+
+    @property
+    def leaf_size(self) -> int:
+        """Slots of a leaf."""
+        return self.slots.shape[1]
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """Nodes of each level, from the leaves to the root."""
+        counts = [len(self.slots)]
+        for arity in self.arities:
+            counts.append(counts[-1] // arity)
+        return tuple(counts)
+
+    @property
+    def node_count(self) -> int:
+        """Nodes of all levels."""
+        return sum(self.counts)
+
+    def links(self) -> tuple[tuple[IntArray, ...], tuple[IntArray, ...], tuple[IntArray, ...]]:
+        """Number of each node, of its first child, and of the node that follows its subtree when
+        all are visited depth first (`node_count` for the last); each level by level, leaves first.
+
+        Children of a node are numbered one after the other, then the children of the first of
+        them, and so on, so that siblings, of which mostly all are visited, lie side by side in
+        memory. The first child of a leaf is 0, the number of the root, which stands for none.
+        """
+        below = [0]  # nodes below one of each level
+        for arity in self.arities:
+            below.append(arity * (1 + below[-1]))
+        number, after = [np.zeros(1, np.int64)], [np.array([self.node_count], np.int64)]
+        first = [np.ones(1, np.int64)]
+        for level, arity in reversed(list(enumerate(self.arities))):
+            place = np.arange(arity)
+            child = first[0][:, None] + place
+            following = np.where(place < arity - 1, child + 1, after[0][:, None])
+            start = first[0][:, None] + arity + place * below[level]
+            number.insert(0, child.reshape(-1))
+            after.insert(0, following.reshape(-1))
+            first.insert(0, start.reshape(-1))
+        first[0] = np.zeros_like(first[0])
+        return tuple(number), tuple(first), tuple(after)
+
+    def gather(self, values: FloatArray, empty: float = 0.0) -> FloatArray:
+        """Values of primitives (n, ...) in slots (leaves, leaf_size, ...); `empty` in empty
+        ones."""
+        out = values.take(self.slots, axis=0, mode="clip")
+        leaf, slot = np.nonzero(self.slots == NO_PRIMITIVE)
+        out[leaf, slot] = empty
+        return out
+
+
+def build_hierarchy(points: FloatArray, *, leaf_size: int = 8, arity: int = 4) -> Hierarchy:
+    """A tree over finite points (n, 3), n >= 1: each split halves a node along its longest side.
+
+    arity: 2 or 4 (two splits at once; the root may have 2 children).
+
+    O(n log n): each of log2(n / leaf_size) levels is one partial sort. Nodes that fit into the
+    cache are split down to their leaves, one after the other: threads would not make it faster.
+    """
+    if arity not in (2, 4):
+        raise ValueError(f"arity must be 2 or 4, not {arity}")
+    rows = np.arange(len(points), dtype=np.int64)[None]
+    x = np.array(points.T, dtype=np.float64, order="C")[:, None]
+    depth = max(0, math.ceil(math.log2(len(points) / leaf_size)))
+    left = depth
+    while left and rows.shape[1] > _POINTS_AT_ONCE:
+        rows, x = _split(rows, x)
+        left -= 1
+    at_once = max(1, _POINTS_AT_ONCE // rows.shape[1])
+    leaves: list[IntArray] = []
+    for start in range(0, len(rows), at_once):
+        some, places = rows[start : start + at_once], x[:, start : start + at_once]
+        for _ in range(left):
+            some, places = _split(some, places)
+        leaves.append(some)
+    slots = np.concatenate(leaves)
+    if arity == 2:
+        return Hierarchy(slots, (2,) * depth)
+    return Hierarchy(slots, (4,) * (depth // 2) + (2,) * (depth % 2))
+
+
+def _split(rows: IntArray, x: FloatArray) -> tuple[IntArray, FloatArray]:
+    """The points of nodes, a row each, halved: indices (k, w) and positions x (3, k, w) become
+    (2k, ceil(w/2)) and (3, 2k, ceil(w/2)).
+
+    The last of a row may be empty: NO_PRIMITIVE, at NaN, which sorts behind all numbers. If each
+    row holds w or w - 1 points, each of the new ones holds ceil(w/2) or one less.
+    """
+    count, width = rows.shape
+    half, middle = (width + 1) // 2, width // 2
+    key = x[_sides(x).argmax(axis=0), np.arange(count)]
+    order = cast("IntArray", np.argpartition(key, middle, axis=1))
+    short = np.flatnonzero(np.isnan(key[:, -1]))
+    at = (order[short] == width - 1).argmax(axis=1)  # the empty slot: somewhere on the right
+    order[short, at], order[short, -1] = order[short, -1], width - 1
+    if width % 2:  # m points of 2m on either side, the empty slot on the left
+        order[short, -1], order[short, middle] = order[short, middle], width - 1
+    order += np.arange(0, rows.size, width, dtype=np.int64)[:, None]
+    return _halves(rows, order, half, NO_PRIMITIVE), np.stack(
+        [_halves(one, order, half, np.nan) for one in x]
+    )
+
+
+def _sides(x: FloatArray) -> FloatArray:
+    """Lengths (3, k) of the boxes of rows of points (3, k, w)."""
+    if x.shape[2] > _LONG_ROW:
+        return np.fmax.reduce(x, axis=2) - np.fmin.reduce(x, axis=2)
+    low = high = x[..., 0]
+    for k in range(1, x.shape[2]):
+        low, high = np.fmin(low, x[..., k]), np.fmax(high, x[..., k])
+    return high - low
+
+
+def _halves(values: npt.NDArray[Any], order: IntArray, half: int, empty: float) -> Any:
+    """Rows (k, w), reordered by flat indices and cut in two (2k, half), with `empty` at the end."""
+    count, width = order.shape
+    out = np.empty((count, 2, half), values.dtype)
+    flat = values.reshape(-1)
+    out[:, 0] = flat[order[:, :half]]
+    out[:, 1, : width - half] = flat[order[:, half:]]
+    if width % 2:
+        out[:, 1, half - 1] = empty
+    return out.reshape(-1, half)
+
+
+_HEAD = 6  # numbers in the first packet of a node that are the caller's; two links follow
+# Links are stored as floats, and single precision holds no larger integers without gaps.
+_MOST_NODES = 2**24
+
+
+@dataclass(frozen=True)
+class PackedTree:
+    """Nodes with links, siblings side by side (`Hierarchy.links`); primitives leaf by leaf.
+
+    heads: of each node six numbers of the caller's, the node that follows its subtree, and the
+        number of its leaf or, for an inner node, minus that of its first child.
+    payloads: the caller's other numbers of each node, kept apart because a walk reads many heads in
+        a row and few of these; None for none.
+    primitives: `leaf_size` rows for each leaf.
+    """
+
+    backend: Backend
+    heads: Records
+    payloads: Records | None
+    node_count: Any
+    primitives: Records
+    leaf_size: Any
+
+    def head(self, i: Any) -> list[Real]:
+        """The eight numbers of node i that a walk needs."""
+        return self.heads.row(i)
+
+    def payload(self, i: Any, active: Mask) -> list[Real]:
+        """The other numbers of node i."""
+        return [] if self.payloads is None else self.payloads.row(i, active)
+
+    def primitive(self, leaf: Any, slot: Any, active: Mask) -> list[Real]:
+        """All numbers of a primitive."""
+        return self.primitives.row(leaf * self.leaf_size + slot, active)
+
+
+def pack(
+    backend: Backend, tree: Hierarchy, levels: Sequence[FloatArray], primitives: FloatArray
+) -> PackedTree:
+    """A tree with the numbers of its nodes (k, 6 or more), level by level from the leaves, and of
+    its primitives in their slots (leaves, leaf_size, c).
+
+    Raises:
+        ValueError: more nodes than links in single precision can count.
+    """
+    if tree.node_count >= _MOST_NODES:
+        raise ValueError(f"a tree of {tree.node_count} nodes is too large: cut the input in parts")
+    extra = levels[0].shape[1] - _HEAD
+    heads = np.zeros((tree.node_count, PACKET), backend.dtype)
+    payloads = np.zeros((tree.node_count, extra), backend.dtype)
+    links = tree.links()
+    for number, first, after, values in zip(*links, levels, strict=True):
+        heads[number, :_HEAD] = values[:, :_HEAD]
+        heads[number, _HEAD] = after
+        heads[number, _HEAD + 1] = -first
+        payloads[number] = values[:, _HEAD:]
+    leaves = links[0][0]
+    heads[leaves, _HEAD + 1] = np.arange(len(leaves))
+    return PackedTree(
+        backend,
+        Records.upload(backend, heads),
+        Records.upload(backend, payloads) if extra else None,
+        dr.opaque(backend.UInt32, tree.node_count),
+        Records.upload(backend, primitives.reshape(-1, primitives.shape[2])),
+        dr.opaque(backend.UInt32, tree.leaf_size),
+    )
+
+
+State: TypeAlias = "tuple[Any, ...]"
+
+
+@dataclass(frozen=True)
+class Node:
+    """The node that a walk visits; each lane may be at a different one.
+
+    index: number of the node.
+    head: the six numbers of the caller's that every visit reads.
+    leaf: number of its leaf, if it is one.
+    """
+
+    tree: PackedTree
+    index: Any
+    head: tuple[Real, ...]
+    leaf: Any
+    is_leaf: Mask
+
+    def payload(self, active: Mask) -> list[Real]:
+        """The other numbers, fetched where active."""
+        return self.tree.payload(self.index, active)
+
+
+Visit: TypeAlias = "Callable[[Node, State], tuple[Mask, State]]"
+EachPrimitive: TypeAlias = "Callable[[list[Real], Mask, State], State]"
+
+
+def walk(tree: PackedTree, visit: Visit, state: State, active: Mask = True) -> State:
+    """The state after visiting nodes from the root on.
+
+    visit: from a node and the state, whether to go into the node's children, and the new state.
+        Else the walk goes on behind the subtree.
+
+    May be called while a loop is being recorded.
+    """
+    index, mask = tree.backend.UInt32, tree.backend.Bool
+
+    def body(i: Any, *state: Any) -> State:
+        head = tree.head(i)
+        is_leaf, number = head[7] >= 0, index(dr.abs(head[7]))
+        node = Node(tree, i, tuple(head[:6]), number, is_leaf)
+        descend, state = visit(node, state)
+        i = dr.select(descend & ~is_leaf, number, index(head[6]))
+        return i, *state
+
+    def more(i: Any, *_: Any) -> Mask:
+        return i < tree.node_count
+
+    start = dr.select(mask(active), index(0), tree.node_count)
+    return dr.while_loop((start, *state), more, body, label="walk")[1:]
+
+
+def for_each(node: Node, active: Mask, body: EachPrimitive, state: State) -> State:
+    """The state after visiting the primitives of a leaf, where active; costs nothing elsewhere.
+
+    Empty slots are visited as well: the caller of `pack` has filled them with harmless numbers.
+    """
+    tree = node.tree
+    index = tree.backend.UInt32
+
+    def more(slot: Any, *_: Any) -> Mask:
+        return active & (slot < tree.leaf_size)
+
+    def step(slot: Any, *state: Any) -> State:
+        return slot + 1, *body(tree.primitive(node.leaf, slot, active), active, state)
+
+    return dr.while_loop((index(0), *state), more, step, label="leaf")[1:]

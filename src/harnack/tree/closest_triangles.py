@@ -1,0 +1,398 @@
+"""Queries of trees: the boxes that a ray enters, in order, and the triangles nearest to a point."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, cast
+
+import drjit as dr
+import numpy as np
+
+from harnack.backend import FloatArray
+from harnack.backend.elementary import clamp, fmax, fmin, largest_coordinate
+from harnack.tree.balanced_tree import (
+    Node,
+    PackedTree,
+    State,
+    build_hierarchy,
+    for_each,
+    pack,
+    walk,
+)
+from harnack.tree.triangle_tree import (
+    EDGES,
+    INDEX,
+    NO_TRIANGLE,
+    PARITY,
+    TriangleRays,
+    box_levels,
+    corners_of,
+    normal_of,
+)
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Mask, Real, Vec3
+
+__all__ = ["MOST_BOXES", "NO_BOX", "BoxTree"]
+
+# Boxes are numbered in floats; single precision holds no larger integers without gaps.
+MOST_BOXES = 2**24
+NO_BOX = 0xFFFFFFFF
+# Column of a record behind its box.
+_NUMBER = 6
+_LEAF_SIZE = 4
+
+
+@dataclass(frozen=True)
+class BoxTree:
+    """Boxes with coordinates of at most about one, which may overlap."""
+
+    tree: PackedTree
+
+    @classmethod
+    def of(cls, backend: Backend, lower: FloatArray, upper: FloatArray) -> BoxTree:
+        """Boxes from their corners (n, 3)."""
+        hierarchy = build_hierarchy(0.5 * (lower + upper), leaf_size=_LEAF_SIZE)
+        number = np.arange(len(lower), dtype=np.float64)[:, None]
+        records = hierarchy.gather(np.concatenate([lower, upper, number], axis=1))
+        records[hierarchy.slots < 0] = [np.inf] * 3 + [-np.inf] * 3 + [-1.0]
+        return cls(pack(backend, hierarchy, box_levels(hierarchy, lower, upper), records))
+
+    def next(
+        self, o: Vec3, d: Vec3, after: tuple[Real, Any], start: Real, end: Real, active: Mask
+    ) -> tuple[Real, Real, Any]:
+        """The first box behind `after` = (t, number) that rays o + t d, |d| = 1, enter by t <= end.
+
+        Boxes are ordered by (t, number), where t is where a ray enters the box, at least `start`;
+        boxes that it has left by then are not entered. From after = (t, NO_BOX) with t < start on,
+        each comes up once. A box is a little wider than given, so that rounding lets no ray pass by
+        a box that it meets.
+
+        Returns:
+            The t where the ray enters, the t where it leaves, and the box's number (NO_BOX for
+            none).
+        """
+        real, index = self.tree.backend.Float, self.tree.backend.UInt32
+        t_after, n_after = real(after[0]), index(after[1])
+        span = self._spans(o, d)
+
+        def visit(node: Node, state: State) -> tuple[Mask, State]:
+            near, far = span(node.head)
+            open_ = (near <= far) & (far >= start) & (near <= fmin(state[0], end))
+            return open_, for_each(node, open_ & node.is_leaf, nearer, state)
+
+        def nearer(row: list[Real], active: Mask, state: State) -> State:
+            best, leave, number = state
+            near, far = span(row)
+            t, n = fmax(near, start), index(fmax(row[_NUMBER], real(0)))
+            later = (t > t_after) | ((t == t_after) & (n > n_after))
+            first = (t < best) | ((t == best) & (n < number))
+            entered = (near <= far) & (far >= start) & (t <= end) & (row[_NUMBER] >= 0)
+            taken = active & entered & later & first
+            return (
+                dr.select(taken, t, best),
+                dr.select(taken, far, leave),
+                dr.select(taken, n, number),
+            )
+
+        begun = (real(dr.inf), real(dr.inf), index(NO_BOX))
+        near, far, number = walk(self.tree, visit, begun, active)
+        return near, far, number
+
+    def _spans(self, o: Vec3, d: Vec3) -> Any:
+        """Where rays enter and leave a box, a little earlier and later to cover rounding.
+
+        Each plane of the box is moved outwards by 16 roundings of the size of coordinates, and t is
+        widened by 8 roundings of itself: (x - o)/d has three roundings, of which that of x - o is
+        at most half a unit of coordinates.
+        """
+        backend = self.tree.backend
+        vector = backend.Array3f
+        # Never zero: 1e-18 of the boxes' size is far below their padding.
+        steep = dr.select(dr.abs(d) < 1e-18, dr.select(d < 0, vector(-1e-18), vector(1e-18)), d)
+        inverse = dr.rcp(steep)
+        pad = 16 * backend.epsilon * (1 + largest_coordinate(o))
+
+        def span(box: Any) -> tuple[Real, Real]:
+            low, high = vector(*box[:3]) - pad, vector(*box[3:6]) + pad
+            a, b = (low - o) * inverse, (high - o) * inverse
+            near = fmax(fmax(fmin(a.x, b.x), fmin(a.y, b.y)), fmin(a.z, b.z))
+            far = fmin(fmin(fmax(a.x, b.x), fmax(a.y, b.y)), fmax(a.z, b.z))
+            slack = 8 * backend.epsilon
+            return near - slack * dr.abs(near), far + slack * dr.abs(far)
+
+        return span
+
+
+# How far rounding may move a distance, in epsilons of the coordinates and of the mesh's size.
+_ROUNDING = 16.0
+
+
+@dataclass(frozen=True)
+class NearestTriangle:
+    """The nearest triangle to points x, of those that a query considers.
+
+    square: squared distance; inf where there is no triangle.
+    number: of the triangle; NO_TRIANGLE where there is none.
+    offset: (3,) from x to the nearest point of the triangle.
+    normal: (3,) of the triangle by the right-hand rule, of any length; zero without an area.
+    is_inner: whether the nearest point lies inside the triangle, not on its edges.
+    """
+
+    square: Real
+    number: Any
+    offset: Vec3
+    normal: Vec3
+    is_inner: Mask
+
+
+def distance_to_triangles(rays: TriangleRays, x: Vec3) -> Real:
+    """A proved lower bound of the distance from x to the triangles, exact up to rounding; the
+    triangles have coordinates of at most about one.
+
+    Proof. `NearestPoint` is off by a few epsilons of |x| + 1, by its docstring; boxes are skipped
+    only if they are farther than the best so far by that much. 16 epsilons of |x| + 1 are
+    subtracted, several times the largest error found with random needles and random triangles.
+    """
+    real, vector = rays.tree.backend.Float, rays.tree.backend.Array3f
+    x = vector(x)
+    pad = _pad(rays, x)
+    inside = _boxes(rays, x, pad)
+
+    def visit(node: Node, state: State) -> tuple[Mask, State]:
+        closer = inside(node, state[0])
+        return closer, for_each(node, closer & node.is_leaf, nearer, state)
+
+    def nearer(row: list[Real], active: Mask, state: State) -> State:
+        square = NearestPoint.of(row, x).square
+        return (dr.select(active, fmin(square, state[0]), state[0]),)
+
+    start = (square_to_some_vertex(rays, x),)
+    return fmax(dr.sqrt(walk(rays.tree, visit, start)[0]) - pad, real(0))
+
+
+def square_to_some_vertex(rays: TriangleRays, x: Vec3) -> Real:
+    """The squared distance from x to a vertex of a triangle nearby, rounded up: walks that begin
+    with it skip most boxes."""
+    square, pad = square_to_some_point(rays.tree, x, 0), _pad(rays, x)
+    return square + 2 * pad * (dr.sqrt(square) + pad)
+
+
+def square_to_some_point(tree: PackedTree, x: Vec3, column: int) -> Real:
+    """The least squared distance from x to the points of a leaf nearby.
+
+    The leaf is found from the root on by the child whose box has the nearest center.
+
+    column: where in a record the coordinates of its point begin.
+    """
+    backend = tree.backend
+    real, index, vector = backend.Float, backend.UInt32, backend.Array3f
+    x = vector(x)
+
+    def body(i: Any, end: Any, best: Real, first: Any, after: Any, found: Any) -> State:
+        head = tree.head(i)
+        middle = 0.5 * (vector(*head[:3]) + vector(*head[3:6]))
+        square = dr.squared_norm(middle - x)
+        nearer, following = square < best, index(head[6])
+        best = dr.select(nearer, square, best)
+        is_leaf, number = head[7] >= 0, index(dr.abs(head[7]))
+        # Of the nearest sibling so far: its leaf if it is one, or its first child and their end.
+        found = dr.select(nearer, dr.select(is_leaf, number, NO_TRIANGLE), found)
+        first = dr.select(nearer, number, first)
+        after = dr.select(nearer, following, after)
+        is_last = following == end
+        down = is_last & (found == NO_TRIANGLE)
+        i = dr.select(down, first, following)
+        end, best = dr.select(down, after, end), dr.select(down, dr.inf, best)
+        return i, end, best, first, after, found
+
+    def more(i: Any, end: Any, *state: Any) -> Mask:
+        return i != end
+
+    start = (
+        index(0), index(tree.node_count), real(dr.inf), index(0), index(0), index(NO_TRIANGLE),
+    )  # fmt: skip
+    leaf = dr.while_loop(start, more, body, label="to a leaf")[5]
+
+    def add(slot: Any, square: Real) -> State:
+        row = tree.primitive(leaf, slot, backend.Bool(True))
+        point = vector(*row[column : column + 3])
+        return slot + 1, fmin(square, dr.squared_norm(point - x))
+
+    def left(slot: Any, square: Real) -> Mask:
+        del square
+        return slot < tree.leaf_size
+
+    return dr.while_loop((index(0), real(dr.inf)), left, add, label="points of a leaf")[1]
+
+
+def nearest_triangle(
+    rays: TriangleRays, x: Vec3, after: tuple[Real, Any], limit: Real, active: Mask
+) -> NearestTriangle:
+    """The first triangle behind `after` = (squared distance, number), nearer than `limit`.
+
+    Triangles are ordered by (squared distance, number), so that each comes up once; from
+    (-1, NO_TRIANGLE) on, all do. limit: a squared distance.
+    """
+    backend = rays.tree.backend
+    real, index, vector = backend.Float, backend.UInt32, backend.Array3f
+    x, limit = vector(x), real(limit)
+    square_after, number_after = real(after[0]), index(after[1])
+    inside = _boxes(rays, x, _pad(rays, x))
+
+    def visit(node: Node, state: State) -> tuple[Mask, State]:
+        closer = inside(node, state[0])
+        return closer, for_each(node, closer & node.is_leaf, nearer, state)
+
+    def nearer(row: list[Real], active: Mask, state: State) -> State:
+        best, number, offset, normal, is_inner = state
+        point = NearestPoint.of(row, x)
+        square, n = point.square, index(fmax(row[INDEX], real(0)))
+        later = (square > square_after) | ((square == square_after) & (n > number_after))
+        first = (square < best) | ((square == best) & (n < number))
+        taken = active & later & first & (row[INDEX] >= 0)
+        return (
+            dr.select(taken, square, best),
+            dr.select(taken, n, number),
+            dr.select(taken, point.offset, offset),
+            dr.select(taken, normal_of(row, vector), normal),
+            dr.select(taken, point.is_inner, is_inner),
+        )
+
+    start = (limit, index(NO_TRIANGLE), vector(0), vector(0), backend.Bool(False))
+    square, number, offset, normal, is_inner = walk(rays.tree, visit, start, active)
+    found = number != NO_TRIANGLE
+    return NearestTriangle(dr.select(found, square, dr.inf), number, offset, normal, is_inner)
+
+
+def _pad(rays: TriangleRays, x: Vec3) -> Real:
+    return _ROUNDING * rays.tree.backend.epsilon * (1 + dr.max(dr.abs(x)))
+
+
+def _boxes(rays: TriangleRays, x: Vec3, pad: Real) -> Any:
+    """A test whether a node comes within a squared distance of x: its box widened by `pad` and,
+    if the tree has them, its slab (`slab_levels`) as well."""
+    vector = rays.tree.backend.Array3f
+
+    def within(node: Node, square: Real) -> Mask:
+        low, high = vector(*node.head[:3]) - pad, vector(*node.head[3:]) + pad
+        away = dr.select(x < low, low - x, dr.select(x > high, x - high, 0))
+        close = dr.squared_norm(away) <= square
+        slab = node.payload(close)
+        if not slab:
+            return close
+        n, offset, thickness, radius = vector(*slab[:3]), slab[3], slab[4], slab[5]
+        from_center = x - 0.5 * (low + high)
+        height = dr.dot(from_center, n)
+        across = dr.norm(dr.fma(vector(-height), n, from_center))
+        off = fmax(dr.abs(height - offset) - (thickness + pad), 0)
+        beside = fmax(across - (radius + pad), 0)
+        return close & (dr.fma(off, off, beside * beside) <= square)
+
+    return within
+
+
+@dataclass(frozen=True)
+class NearestPoint:
+    """The nearest point of a record's triangle to x.
+
+    square: the squared distance.
+    offset: (3,) from x to the point.
+    is_inner: whether the point lies inside the triangle, not on its edges.
+
+    It is the nearest point of the plane where that lies in the triangle, else that of the edges.
+    That of the plane is found along the longest edge e, from a and of length L, and along the
+    altitude h on it, made orthogonal to e twice.
+
+    Proof that the distance is off by only a few epsilons of l = L + |x - a|, however thin the
+    triangle (a cross product's direction is off by epsilon L/|h|, which for a needle is an error of
+    any size): x - a less its part along e, done twice, is right up to
+    epsilon l and orthogonal to e up to epsilon^2 l, and so is h, whose direction within the plane
+    normal to e is off by d <= epsilon L/|h|. So the point a + alpha e + s h lies off the plane by
+    at most s|h| d <= epsilon L, and off the nearest point within it by k <= epsilon l + min(d H,
+    |h|), H the distance from the plane. That lengthens H by at most k^2/(2H), where k >= epsilon l
+    counts as min(d H, |h|)^2/(2H) <= d |h|/2 <= epsilon L/2, and by k <= 3 epsilon l for H <
+    epsilon l. If the same k puts the point on the wrong side of an edge, the edges' distance or
+    the plane's is off by as much.
+    """
+
+    square: Real
+    offset: Vec3
+    is_inner: Mask
+
+    @classmethod
+    def of(cls, row: list[Real], x: Vec3) -> NearestPoint:
+        vector = cast("Any", type(x))
+        p, q, r = (corner - x for corner in corners_of(row, vector))
+        first, second, third = row[EDGES : EDGES + 3]
+        pq, qr, pr = q - p, r - q, r - p
+        best, offset = _smaller(
+            _on_segment(p, pq, first), _on_segment(q, qr, second), _on_segment(p, pr, third)
+        )
+        squares = [dr.squared_norm(edge) for edge in (pq, qr, pr)]
+        by_pr = (squares[2] > squares[0]) & (squares[2] >= squares[1])
+        by_qr = ~by_pr & (squares[1] > squares[0])
+
+        def chosen(one: Any, two: Any, three: Any) -> Any:
+            """The one that belongs to the longest of the edges pq, qr and pr."""
+            return dr.select(by_pr, three, dr.select(by_qr, two, one))
+
+        a, e, inverse = chosen(p, q, p), chosen(pq, qr, pr), chosen(first, second, third)
+        alpha, away = _split(-a, e, inverse)
+        beta, h = _split(chosen(r, p, q) - a, e, inverse)
+        s = dr.dot(away, h) / dr.squared_norm(h)  # NaN for a triangle without an area: not inside
+        inside = (s >= 0) & (s <= 1) & (alpha >= s * beta) & (1 - alpha >= s * (1 - beta))
+        across = dr.fma(vector(s), h, -away)
+        square = dr.squared_norm(across)
+        inside &= square < best
+        return cls(dr.select(inside, square, best), dr.select(inside, across, offset), inside)
+
+
+def _split(v: Vec3, e: Vec3, inverse: Real) -> tuple[Real, Vec3]:
+    """share and rest of v = share e + rest, with the rest orthogonal to e, even if it is short;
+    inverse = 1/|e|^2."""
+    vector = cast("Any", type(v))
+    share = dr.dot(v, e) * inverse
+    rest = dr.fma(vector(-share), e, v)
+    more = dr.dot(rest, e) * inverse
+    return share + more, dr.fma(vector(-more), e, rest)
+
+
+def _on_segment(a: Vec3, e: Vec3, inverse: Real) -> Vec3:
+    """The nearest point to the origin of the segment from a to a + e."""
+    real, vector = cast("Any", type(inverse)), cast("Any", type(a))
+    return dr.fma(vector(clamp(-dr.dot(a, e) * inverse, real(0), real(1))), e, a)
+
+
+def _smaller(*vectors: Vec3) -> tuple[Real, Vec3]:
+    """The smallest of them, its squared length first."""
+    best, *others = vectors
+    square = dr.squared_norm(best)
+    for other in others:
+        one = dr.squared_norm(other)
+        best, square = dr.select(one < square, other, best), fmin(one, square)
+    return square, best
+
+
+def squared_distance_to_segment(a: Vec3, e: Vec3, inverse: Real) -> Real:
+    """From the origin to the segment from a to a + e; inverse: 1/|e|^2, any finite number if e =
+    0."""
+    return dr.squared_norm(_on_segment(a, e, inverse))
+
+
+def jumps_within(rays: TriangleRays, x: Vec3, distance: Real, active: Mask = True) -> Real:
+    """The sum of the sizes of the winding number's jumps across triangles within a distance of
+    x."""
+    real, vector = rays.tree.backend.Float, rays.tree.backend.Array3f
+    x, distance = vector(x), real(distance)
+    reach, inside = distance * distance, _boxes(rays, x, distance)
+
+    def visit(node: Node, state: State) -> tuple[Mask, State]:
+        close = inside(node, reach)
+        return close, for_each(node, close & node.is_leaf, add, state)
+
+    def add(row: list[Real], active: Mask, state: State) -> State:
+        within = active & (row[INDEX] >= 0) & (NearestPoint.of(row, x).square <= reach)
+        return (state[0] + dr.select(within, dr.abs(row[PARITY]), 0),)
+
+    return walk(rays.tree, visit, (real(0),), active)[0]

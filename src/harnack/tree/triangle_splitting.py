@@ -1,0 +1,260 @@
+"""Triangles cut where they pass through each other, and the jumps of the winding number at them.
+
+A closed mesh that crosses itself bounds the points of a winding number above 1/2 by parts of its
+triangles: each triangle is inside or on the boundary as a whole once it is cut along the others.
+"""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import drjit as dr
+import numpy as np
+
+from harnack.backend import BoolArray, FloatArray, IntArray, to_numpy, to_vector3
+from harnack.backend.arrays import aligned_integers
+from harnack.tree.coplanar import borders_of_overlaps
+from harnack.tree.triangle_tree import NO_TRIANGLE, Frame, TriangleRays
+
+__all__ = ["on_level", "pieces_of_faces", "windings_beside", "windings_of_sides"]
+
+# In units of the mesh's size. Nearer than that two places are the same.
+_SAME = 1e-12
+# Pieces thinner than that are left out: others that touch them stand for them.
+_THINNEST = 1e-11
+_MIDDLE = (1 / 3, 1 / 3, 1 / 3)
+
+
+def pieces_of_faces(
+    rays: TriangleRays, vertices: FloatArray, faces: IntArray, *, covered_whole: bool = False
+) -> tuple[FloatArray, IntArray]:
+    """Triangles (k, 3, 3) that fill the faces (m, 3), none of which passes through another or is
+    covered by another in part; and (k,) which face each is of, and turns as.
+
+    rays: the same faces, with coordinates of at most about one.
+    covered_whole: whether faces are also cut where others in their plane meet, so that each of
+        these covers all of a piece or nothing.
+
+    Where two triangles meet in a segment, at either end of it an edge of one of them meets the
+    other. So all edges are followed as rays, and each of the two faces beside an edge is cut by
+    the plane of every triangle that the edge crosses, and these by the planes of the two: as far
+    as the cut would not pass the other triangle by. An edge that meets another edge, but for
+    rounding, meets all faces beside that. Faces in one plane are cut along the borders of
+    what covers them. A cut too many does no harm.
+    """
+    corners = vertices[faces]
+    cut, by = _crossing_faces(rays, vertices, faces)
+    covered, borders = borders_of_overlaps(rays, vertices, faces, at_every_edge=covered_whole)
+    if not len(cut) + len(covered):
+        return corners, np.arange(len(faces))
+    cut, knives = np.concatenate([cut, covered]), np.concatenate([corners[by], borders])
+    whole = np.ones(len(faces), np.bool_)
+    whole[cut] = False
+    number = np.cumsum(~whole) - 1
+    pieces, owner = _cut_up(corners[~whole], number[cut], knives)
+    edges = pieces - np.roll(pieces, 1, axis=1)
+    longest = np.linalg.norm(edges, axis=2).max(axis=1)
+    thick = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) > _THINNEST * longest
+    owner = np.concatenate([np.flatnonzero(whole), np.flatnonzero(~whole)[owner[thick]]])
+    return np.concatenate([corners[whole], pieces[thick]]), owner
+
+
+def on_level(rays: TriangleRays, pieces: FloatArray, levels: tuple[float, ...]) -> BoolArray:
+    """(k,) whether the winding number passes a level from one side of a triangle to the other."""
+    low, high = windings_beside(rays, pieces)
+    return np.any([(low < level) & (level < high) for level in levels], axis=0)
+
+
+def windings_beside(
+    rays: TriangleRays, pieces: FloatArray, shares: tuple[float, float, float] = _MIDDLE
+) -> tuple[FloatArray, FloatArray]:
+    """(k,), (k,): the smaller and the larger of the winding numbers on both sides of triangles.
+
+    shares: barycentric coordinates of the place; by default the center.
+    """
+    front, back = windings_of_sides(rays, pieces, shares)
+    return np.minimum(front, back), np.maximum(front, back)
+
+
+def windings_of_sides(
+    rays: TriangleRays, pieces: FloatArray, shares: tuple[float, float, float] = _MIDDLE
+) -> tuple[FloatArray, FloatArray]:
+    """(k,), (k,): the winding numbers in front of triangles, whence they are seen to run
+    counter-clockwise, and behind them.
+
+    A ray along the normal of each counts the crossings ahead of a place in it, and those ahead of a
+    place just behind it: with that, triangles in the same place are passed all at once.
+    """
+    backend = rays.tree.backend
+    a, b, c = np.moveaxis(pieces, 1, 0)
+    normal = np.cross(b - a, c - a)
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    normal = np.where(length > 0, normal / np.where(length > 0, length, 1), [0.0, 0.0, 1.0])
+    place = shares[0] * a + shares[1] * b + shares[2] * c
+    frame = Frame.along(backend, to_vector3(backend, place), to_vector3(backend, normal))
+    front, back = (
+        to_numpy(rays.turns_ahead(frame, backend.Float(dr.opaque(backend.Float, t))))
+        for t in (_SAME, -_SAME)
+    )
+    return front, back
+
+
+def _crossing_faces(
+    rays: TriangleRays, vertices: FloatArray, faces: IntArray
+) -> tuple[IntArray, IntArray]:
+    """Pairs of faces (k,), (k,) that pass through one another, each both ways round."""
+    ends = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    edges, edge = np.unique(ends, axis=0, return_inverse=True)
+    edge = edge.reshape(-1)
+    beside = np.argsort(edge, kind="stable") // 3  # faces, edge after edge
+    first = np.searchsorted(np.sort(edge), np.arange(len(edges) + 1))
+    crossed, crossing = _crossings_of_edges(rays, vertices, faces, edges)
+    count = first[crossed + 1] - first[crossed]
+    rows = np.repeat(first[crossed], count) + _counted(count)
+    one, other = beside[rows], np.repeat(crossing, count)
+    pairs = np.concatenate([np.column_stack([one, other]), np.column_stack([other, one])])
+    pairs = np.unique(pairs[pairs[:, 0] != pairs[:, 1]], axis=0)
+    return pairs[:, 0], pairs[:, 1]
+
+
+def _counted(count: IntArray) -> IntArray:
+    """0, 1, .. for each of the counts in turn."""
+    first = np.cumsum(count) - count
+    return cast("IntArray", np.arange(int(count.sum())) - np.repeat(first, count))
+
+
+def _crossings_of_edges(
+    rays: TriangleRays, vertices: FloatArray, faces: IntArray, edges: IntArray
+) -> tuple[IntArray, IntArray]:
+    """Which edges (m, 2) cross which faces that have neither end, or meet their borders: indices of
+    both."""
+    backend = rays.tree.backend
+    corner = [aligned_integers(backend, one) for one in faces.T]
+    way = vertices[edges[:, 1]] - vertices[edges[:, 0]]
+    length = np.linalg.norm(way, axis=1)
+    rows = np.flatnonzero(length > 0)
+    after_t, after_n = np.full(len(edges), -_SAME), np.full(len(edges), NO_TRIANGLE, np.int64)
+    found: list[tuple[IntArray, IntArray]] = []
+    while len(rows):
+        o = to_vector3(backend, vertices[edges[rows, 0]])
+        d = to_vector3(backend, way[rows] / length[rows, None])
+        frame = Frame.along(backend, o, d)
+        end = backend.Float(length[rows] + _SAME)
+        p, q = (aligned_integers(backend, one) for one in edges[rows].T)
+
+        after = backend.Float(after_t[rows]), aligned_integers(backend, after_n[rows])
+        t, n = _next_of_others(rays, corner, frame, (p, q), end, after)
+        number = to_numpy(n).astype(np.int64)
+        hit = number != NO_TRIANGLE
+        after_t[rows], after_n[rows] = to_numpy(t), number
+        rows, number = rows[hit], number[hit]
+        found.append((rows, number))
+    return np.concatenate([one for one, _ in found]), np.concatenate([one for _, one in found])
+
+
+def _next_of_others(
+    rays: TriangleRays, corner: list[Any], frame: Frame, ends: tuple[Any, Any], end: Any,
+    after: tuple[Any, Any],
+) -> tuple[Any, Any]:  # fmt: skip
+    """The first crossing of rays behind another one with a face that has neither of two vertices;
+    corner: those of the faces."""
+    index = rays.tree.backend.UInt32
+
+    def body(t: Any, n: Any, active: Any) -> tuple[Any, ...]:
+        t, n, _, _ = rays.next(frame, (t, n), end, active, _SAME)
+        known = active & (n != NO_TRIANGLE)
+        ours = [dr.gather(index, one, n, known) for one in corner]
+        return t, n, known & dr.any([(one == ends[0]) | (one == ends[1]) for one in ours])
+
+    def more(t: Any, n: Any, active: Any) -> Any:
+        del t, n
+        return active
+
+    start = (*after, rays.tree.backend.Bool(True))
+    return dr.while_loop(start, more, body, label="crossings of edges")[:2]
+
+
+def _cut_up(pieces: FloatArray, rows: IntArray, knives: FloatArray) -> tuple[FloatArray, IntArray]:
+    """The parts of triangles (n, 3, 3) whose entries `rows` (k,) are cut by the planes of knives
+    (k, 3, 3); and the triangle that each is of.
+
+    In each round every piece is cut by one of those knives that meet it, in the middle of its list,
+    and its parts share the rest: so their number falls by about half.
+    """
+    done: list[FloatArray] = []
+    owners: list[IntArray] = []
+    by, whole = np.arange(len(knives)), np.arange(len(pieces))
+    while True:
+        height = _heights(pieces[rows], knives[by])
+        height[np.abs(height) < _SAME] = 0
+        meets = (height.max(axis=1) > 0) & (height.min(axis=1) < 0)
+        meets[meets] = _meets(pieces[rows[meets]], height[meets], knives[by[meets]])
+        rows, by, height = rows[meets], by[meets], height[meets]
+        is_cut = np.zeros(len(pieces), np.bool_)
+        is_cut[rows] = True
+        done.append(pieces[~is_cut])
+        owners.append(whole[~is_cut])
+        if not len(rows):
+            return np.concatenate(done), np.concatenate(owners)
+        order = np.argsort(rows, kind="stable")
+        rows, by, height = rows[order], by[order], height[order]
+        owner, first, count = np.unique(rows, return_index=True, return_counts=True)
+        middle = first + count // 2
+        left = np.ones(len(rows), np.bool_)
+        left[middle] = False
+        pieces, whole = _parts(pieces[owner], height[middle]), np.tile(whole[owner], 3)
+        rest = np.searchsorted(owner, rows[left])
+        rows = (rest[:, None] + len(owner) * np.arange(3)).ravel()
+        by = np.repeat(by[left], 3)
+
+
+def _parts(pieces: FloatArray, height: FloatArray) -> FloatArray:
+    """Triangles (3 k, 3, 3) that triangles fall into at a plane above which their corners have
+    heights (k, 3): one on one side and two on the other."""
+    # The corner that is alone on its side comes first; one in the plane goes with another.
+    side = np.where(height > 0, 1, -1)
+    side = np.where((height == 0), np.where(side.sum(axis=1) > 0, 1, -1)[:, None], side)
+    minority = np.where(side.sum(axis=1) > 0, -1, 1)
+    alone = (side == minority[:, None]).argmax(axis=1)
+    turn = (alone[:, None] + np.arange(3)) % 3
+    a, b, c = np.moveaxis(np.take_along_axis(pieces, turn[:, :, None], axis=1), 1, 0)
+    h = np.take_along_axis(height, turn, axis=1)
+    p = a + (h[:, 0] / (h[:, 0] - h[:, 1]))[:, None] * (b - a)
+    q = a + (h[:, 0] / (h[:, 0] - h[:, 2]))[:, None] * (c - a)
+    return np.concatenate([np.stack(part, axis=1) for part in ((a, p, q), (p, b, c), (p, c, q))])
+
+
+def _heights(pieces: FloatArray, knives: FloatArray) -> FloatArray:
+    """(k, 3) of corners of triangles above the planes of others."""
+    a, b, c = np.moveaxis(knives, 1, 0)
+    normal = np.cross(b - a, c - a)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
+    return np.einsum("nij,nj->ni", pieces - a[:, None], normal)
+
+
+def _meets(pieces: FloatArray, height: FloatArray, knives: FloatArray) -> BoolArray:
+    """(k,) whether the segment in which a plane cuts a triangle meets the plane's triangle."""
+    a, b, c = np.moveaxis(knives, 1, 0)
+    normal = np.cross(b - a, c - a)
+    ends: list[FloatArray] = []
+    for i, j in ((0, 1), (1, 2), (2, 0)):
+        hi, hj = height[:, i], height[:, j]
+        crosses = (hi * hj < 0) | ((hi == 0) ^ (hj == 0))
+        share = np.where(crosses, hi / np.where(crosses, hi - hj, 1), np.nan)
+        ends.append(pieces[:, i] + share[:, None] * (pieces[:, j] - pieces[:, i]))
+    low, high = np.zeros(len(pieces)), np.ones(len(pieces))
+    points = np.stack(ends, axis=1)
+    # The two ends: of three places at most two differ.
+    start = np.where(np.isnan(points[:, 0]), points[:, 1], points[:, 0])
+    apart = np.nan_to_num(np.linalg.norm(points - start[:, None], axis=2), nan=-1.0)
+    end = points[np.arange(len(points)), apart.argmax(axis=1)]
+    for p, q in ((a, b), (b, c), (c, a)):
+        inward = np.cross(normal, q - p)
+        inward /= np.maximum(np.linalg.norm(inward, axis=1, keepdims=True), 1e-300)
+        one, other = (np.einsum("nk,nk->n", x - p, inward) + 1e-9 for x in (start, end))
+        rate = other - one
+        root = -one / np.where(rate == 0, 1, rate)
+        low = np.where(rate > 0, np.maximum(low, root), low)
+        high = np.where(rate < 0, np.minimum(high, root), high)
+        high = np.where((rate == 0) & (one < 0), -1.0, high)
+    return low <= high

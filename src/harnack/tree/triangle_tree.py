@@ -1,0 +1,445 @@
+"""Triangles as records of a tree, and the rays that cross them.
+
+A record (16 numbers) holds the corners in the order of their vertices' indices, so that an edge
+shared by two triangles has the same two ends in the same order in both: every decision about the
+edge is the same for both, to the last bit, so that no ray slips through between them or crosses
+both.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
+
+import drjit as dr
+import numpy as np
+
+from harnack.backend import FloatArray, IntArray
+from harnack.backend.elementary import across, clamp, fmax, fmin, largest_coordinate
+from harnack.tree.balanced_tree import Hierarchy, Node, PackedTree, State, for_each, pack, walk
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Mask, Real, Vec3
+
+    # A point across a ray (u, v) and along it.
+    Seen: TypeAlias = tuple[Real, Real, Real]
+
+# Columns of a record; 0 to 8 are the corners.
+PARITY, INDEX, EDGES = 9, 10, 11
+# A ray that is so many roundings of a coordinate from an edge counts as passing through the edge.
+_CLOSE = 4.0
+# A crossing so many roundings of a coordinate from the end of a line may be on either side of it.
+_UNSURE = 64.0
+# Triangles are numbered in floats; single precision holds no larger integers without gaps.
+MOST_TRIANGLES = 2**24
+NO_TRIANGLE = 0xFFFFFFFF
+
+
+def triangle_records(vertices: FloatArray, faces: IntArray) -> FloatArray:
+    """(m, 14): corners ordered by index; +1, or -1 if that order reverses the face; the face's
+    number; 1/length^2 of the edges 01, 12 and 02."""
+    order = np.argsort(faces, axis=1, kind="stable")
+    corners = vertices[np.take_along_axis(faces, order, axis=1)]
+    even = np.isin(order @ np.array([9, 3, 1]), (5, 15, 19))  # 012, 120, 201 in base three
+    edges = corners[:, [1, 2, 2]] - corners[:, [0, 1, 0]]
+    square = (edges * edges).sum(axis=2)
+    inverse = np.where(square > 0, 1 / np.where(square > 0, square, 1), 0)
+    parity = np.where(even, 1.0, -1.0)[:, None]
+    number = np.arange(len(faces), dtype=np.float64)[:, None]
+    return np.concatenate([corners.reshape(-1, 9), parity, number, inverse], axis=1)
+
+
+def in_slots(tree: Hierarchy, records: FloatArray) -> FloatArray:
+    """Records (leaves, leaf_size, c); empty slots are points at the leaf's first corner."""
+    placed = tree.gather(records)
+    empty = tree.slots < 0
+    first = np.tile(placed[:, 0, :3], 3)
+    placed[empty, :9] = np.broadcast_to(first[:, None], (*empty.shape, 9))[empty]
+    placed[empty, PARITY], placed[empty, INDEX] = 1.0, -1.0
+    placed[empty, EDGES : EDGES + 3] = 0.0
+    return placed
+
+
+def box_levels(tree: Hierarchy, low: FloatArray, high: FloatArray) -> list[FloatArray]:
+    """Boxes (k, 6) of the nodes of all levels, from those of primitives (n, 3)."""
+    low, high = tree.gather(low, np.inf).min(axis=1), tree.gather(high, -np.inf).max(axis=1)
+    levels = [np.concatenate([low, high], axis=1)]
+    for arity in tree.arities:
+        low = low.reshape(-1, arity, 3).min(axis=1)
+        high = high.reshape(-1, arity, 3).max(axis=1)
+        levels.append(np.concatenate([low, high], axis=1))
+    return levels
+
+
+def slab_levels(tree: Hierarchy, corners: FloatArray, boxes: list[FloatArray]) -> list[FloatArray]:
+    """Slabs (k, 6) of the nodes of all levels: a unit normal n, an offset, half a thickness and a
+    radius. With c the center of a node's box, the triangles' points are c + h n + r, r at right
+    angles to n, with |h - offset| <= thickness and |r| <= radius.
+
+    A patch of a smooth surface is much thinner than its box, which matters for points far away:
+    with boxes alone, a walk visits the whole cap of the surface whose bulge is less than a box is
+    wide.
+    """
+    points = tree.gather(corners, np.nan).reshape(len(tree.slots), -1, 3)
+    edges = corners - corners[:, :1]
+    normals = tree.gather(np.cross(edges[:, 1], edges[:, 2])).sum(axis=1)
+    levels: list[FloatArray] = []
+    for box, arity in zip(boxes, (*tree.arities, 1), strict=True):
+        n = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+        n[~(np.linalg.norm(n, axis=1) > 0.5)] = (0.0, 0.0, 1.0)
+        away = points.reshape(len(n), -1, 3) - 0.5 * (box[:, None, :3] + box[:, None, 3:])
+        height = (away @ n[:, :, None])[..., 0]
+        low, high = np.nanmin(height, axis=1), np.nanmax(height, axis=1)
+        square = np.einsum("nij,nij->ni", away, away) - height * height
+        radius = np.sqrt(np.maximum(np.nanmax(square, axis=1), 0)) * (1 + 1e-6) + 1e-7
+        levels.append(np.column_stack([n, 0.5 * (low + high), 0.5 * (high - low), radius]))
+        normals = normals.reshape(-1, arity, 3).sum(axis=1)
+    return levels
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Coordinates along and across rays o + t d: right-handed unit vectors u, v and d."""
+
+    o: Vec3
+    u: Vec3
+    v: Vec3
+    d: Vec3
+
+    @classmethod
+    def along(cls, backend: Backend, o: Vec3, d: Vec3) -> Frame:
+        """The frame of rays o + t d, |d| = 1."""
+        vector = backend.Array3f
+        o, d = vector(o), vector(d)
+        u, v = across(d)
+        return cls(o, u, v, d)
+
+    def across(self, p: Vec3) -> tuple[Real, Real]:
+        """The coordinates of p in the plane normal to the rays."""
+        a = p - self.o
+        return _plain(dr.dot(a, self.u)), _plain(dr.dot(a, self.v))
+
+    def depth(self, p: Vec3) -> Real:
+        """The coordinate of p along the rays."""
+        return dr.dot(p - self.o, self.d)
+
+    def component(self, a: Vec3) -> Real:
+        """The component of a vector along the rays."""
+        return dr.dot(a, self.d)
+
+
+@dataclass(frozen=True)
+class Upwards:
+    """The frame of rays from points o along the z axis, which takes no computation."""
+
+    o: Vec3
+
+    def across(self, p: Vec3) -> tuple[Real, Real]:
+        """As `Frame.across`."""
+        return _plain(p.x - self.o.x), _plain(p.y - self.o.y)
+
+    def depth(self, p: Vec3) -> Real:
+        """As `Frame.depth`."""
+        return p.z - self.o.z
+
+    def component(self, a: Vec3) -> Real:
+        """As `Frame.component`."""
+        return a.z
+
+
+def _plain(u: Real) -> Real:
+    """A coordinate across a ray, with 0 for one so small that a product of two could underflow.
+
+    Such a coordinate is far smaller than the rounding error of a vertex.
+    """
+    is_double = dr.type_v(type(u)) == dr.VarType.Float64
+    return dr.select(dr.abs(u) < (1e-140 if is_double else 1e-16), 0, u)
+
+
+def side(a: tuple[Real, Real], b: tuple[Real, Real]) -> Real:
+    """Twice the area of (0, a, b): its sign says on which side of the edge ab a ray passes.
+
+    The same bits for every triangle at the edge, if a and b come in the same order.
+    """
+    return dr.fma(a[0], b[1], -(a[1] * b[0]))
+
+
+@dataclass(frozen=True)
+class TriangleRays:
+    """Crossings of rays with triangles, by a tree of boxes."""
+
+    tree: PackedTree
+
+    @classmethod
+    def of(
+        cls, backend: Backend, tree: Hierarchy, records: FloatArray, *, slabs: bool = False
+    ) -> TriangleRays:
+        """From the records of `triangle_records`.
+
+        slabs: whether nodes have slabs besides boxes, for nearest points from far away.
+        """
+        corners = records[:, :9].reshape(-1, 3, 3)
+        levels = box_levels(tree, corners.min(axis=1), corners.max(axis=1))
+        if slabs:
+            pairs = zip(levels, slab_levels(tree, corners, levels), strict=True)
+            levels = [np.concatenate(pair, axis=1) for pair in pairs]
+        return cls(pack(backend, tree, levels, in_slots(tree, records)))
+
+    def next(
+        self,
+        frame: Frame,
+        after: tuple[Real, Any],
+        t_max: Real,
+        active: Mask,
+        reach: float = 0.0,
+    ) -> tuple[Real, Any, Real, Vec3]:
+        """The first crossing behind `after` = (t, number) with t <= t_max, ordered by (t, number).
+
+        reach: if more than 0, triangles whose border is so near to the ray are passed as well, but
+            for those that are at one of its ends, t = 0 and t_max, with their border.
+
+        Returns:
+            t (inf for none), the triangle's number (NO_TRIANGLE for none), the sign of the crossing
+            (1 where the triangle's normal by the right-hand rule points along the ray, -1 where it
+            points back, 0 for none), and that normal (unit).
+        """
+        real, index, vector = (
+            self.tree.backend.Float,
+            self.tree.backend.UInt32,
+            self.tree.backend.Array3f,
+        )
+        t_after, n_after = real(after[0]), index(after[1])
+        inside = self._boxes(frame, reach)
+
+        def visit(node: Node, state: State) -> tuple[Mask, State]:
+            limit = fmin(state[0], t_max)
+            open_ = inside(node, t_after, limit)
+            return open_, for_each(node, open_ & node.is_leaf, nearer, state)
+
+        def nearer(row: list[Real], active: Mask, state: State) -> State:
+            best, number, turn, normal = state
+            t, here = crossing(row, frame)
+            n = index(fmax(row[INDEX], real(0)))
+            later = (t > t_after) | ((t == t_after) & (n > n_after) & (n_after != NO_TRIANGLE))
+            first = (t < best) | ((t == best) & (n < number))
+            passed = here != 0
+            if reach > 0:
+                within = (t > 2 * reach) & (t < t_max - 2 * reach)
+                passed |= within & _is_beside(row, frame, reach)
+            taken = active & passed & later & first & (t <= t_max)
+            return (
+                dr.select(taken, t, best),
+                dr.select(taken, n, number),
+                dr.select(taken, here, turn),
+                dr.select(taken, normal_of(row, vector), normal),
+            )
+
+        start = (real(dr.inf), index(NO_TRIANGLE), real(0), vector(0))
+        best, number, turn, normal = walk(self.tree, visit, start, active)
+        return best, number, turn, normal * dr.rsqrt(fmax(dr.squared_norm(normal), real(1e-37)))
+
+    def turns_ahead(self, frame: Frame, t_min: Real, active: Mask = True) -> Real:
+        """The sum of the signs of all crossings with t > t_min."""
+        real, inside = self.tree.backend.Float, self._boxes(frame)
+
+        def visit(node: Node, state: State) -> tuple[Mask, State]:
+            open_ = inside(node, real(t_min), real(dr.inf))
+            return open_, for_each(node, open_ & node.is_leaf, add, state)
+
+        def add(row: list[Real], active: Mask, state: State) -> State:
+            t, turn = crossing(row, frame)
+            return (state[0] + dr.select(active & (t > t_min), turn, 0),)
+
+        return walk(self.tree, visit, (real(0),), active)[0]
+
+    def turns_between(self, frame: Frame, end: Real, unit: Real, active: Mask) -> tuple[Real, Mask]:
+        """The sum of the signs of all crossings with 0 < t < end, and where that is sure.
+
+        unit: the rounding of a coordinate.
+
+        A computed t belongs to a point of the triangle within a few units of the ray, so that it is
+        off by that over the cosine between ray and normal. Where this leaves it open whether t is
+        between the ends, nothing is sure.
+        """
+        real, inside = self.tree.backend.Float, self._boxes(frame)
+
+        def visit(node: Node, state: State) -> tuple[Mask, State]:
+            open_ = inside(node, real(0), real(end))
+            return open_, for_each(node, open_ & node.is_leaf, add, state)
+
+        def add(row: list[Real], active: Mask, state: State) -> State:
+            turns, sure = state
+            t, turn = crossing(row, frame)
+            normal = normal_of(row, self.tree.backend.Array3f)
+            steep, off = dr.abs(dr.dot(normal, frame.d)), _UNSURE * unit * dr.norm(normal)
+            clear = (dr.abs(t) * steep > off) & (dr.abs(t - end) * steep > off)
+            between = active & (t > 0) & (t < end)
+            return turns + dr.select(between, turn, 0), sure & (clear | (turn == 0) | ~active)
+
+        start = real(0), self.tree.backend.Bool(active)
+        turns, sure = walk(self.tree, visit, start, active)
+        return turns, sure
+
+    def turns_along(self, x: Vec3, way: Real, active: Mask = True) -> Real:
+        """The sum of the signs of all crossings of rays from x up (way 1) or down (-1) the z axis.
+
+        For both the signs are those with respect to the upward direction. Testing boxes costs less
+        than for other directions.
+        """
+        real = self.tree.backend.Float
+        up, height = way > 0, way * x.z
+        pad = 4 * self.tree.backend.epsilon * (1 + dr.max(dr.abs(x)))
+        low_x, high_x, low_y, high_y = x.x - pad, x.x + pad, x.y - pad, x.y + pad
+
+        def visit(node: Node, state: State) -> tuple[Mask, State]:
+            x0, y0, z0, x1, y1, z1 = node.head
+            open_ = (
+                (high_x >= x0) & (low_x <= x1) & (high_y >= y0) & (low_y <= y1)
+                & (height - pad <= dr.select(up, z1, -z0))
+            )  # fmt: skip
+            return open_, for_each(node, open_ & node.is_leaf, add, state)
+
+        def add(row: list[Real], active: Mask, state: State) -> State:
+            t, turn = crossing(row, Upwards(x))
+            return (state[0] + dr.select(active & (way * t > 0), turn, 0),)
+
+        return walk(self.tree, visit, (real(0),), active)[0]
+
+    def _boxes(self, frame: Frame, reach: float = 0.0) -> Any:
+        """A test whether rays come as near as `reach` to a node's box between two t. Rounding may
+        turn a no into a yes, never a yes into a no."""
+        backend = self.tree.backend
+        vector = backend.Array3f
+        d = frame.d
+        # Never zero: 1e-18 of the box's size is far below its padding.
+        steep = dr.select(dr.abs(d) < 1e-18, dr.select(d < 0, vector(-1e-18), vector(1e-18)), d)
+        inverse = dr.rcp(steep)
+        o = frame.o
+        size = largest_coordinate(o)
+        pad = 16 * backend.epsilon * (1 + size) + reach
+
+        def inside(node: Node, t_min: Real, t_max: Real) -> Mask:
+            low, high = vector(*node.head[:3]) - pad, vector(*node.head[3:]) + pad
+            a, b = (low - o) * inverse, (high - o) * inverse
+            near = fmax(fmax(fmin(a.x, b.x), fmin(a.y, b.y)), fmin(a.z, b.z))
+            far = fmin(fmin(fmax(a.x, b.x), fmax(a.y, b.y)), fmax(a.z, b.z))
+            slack = 8 * backend.epsilon * dr.abs(far) + pad
+            return (near <= far + slack) & (far + slack >= t_min) & (near - slack <= t_max)
+
+        return inside
+
+
+def corners_of(row: list[Real], vector: Any) -> tuple[Vec3, Vec3, Vec3]:
+    """The corners of a record."""
+    return vector(*row[0:3]), vector(*row[3:6]), vector(*row[6:9])
+
+
+def normal_of(row: list[Real], vector: Any) -> Vec3:
+    """The normal of a record's triangle by the right-hand rule, of any length."""
+    p, q, r = corners_of(row, vector)
+    return row[PARITY] * dr.cross(q - p, r - p)
+
+
+def crossing(row: list[Real], frame: Frame | Upwards) -> tuple[Real, Real]:
+    """t and the sign of the crossing of a ray with the triangle of a record; 0 where there is none.
+
+    In the plane across the ray, the sign is the winding number of the triangle about the ray:
+    over its edges, +1 for each that crosses the half-line v = 0, u > 0 upwards and -1 downwards.
+    Upwards means from v <= 0 to v > 0, which v alone decides; that u > 0 there is the sign of
+    `side`. Both are the same for all triangles around a vertex or an edge, so that a rounding error
+    that adds a crossing to one of them takes it from its neighbor: the sum over a closed surface is
+    right whatever the rounding did, and rays through edges and vertices need no special case.
+
+    t is the depth of a point of the triangle within a few roundings of coordinates of the ray,
+    however thin the triangle is (`_depth`).
+    """
+    vector = cast("Any", type(frame.o))
+    p, q, r = corners_of(row, vector)
+    a, b, c = frame.across(p), frame.across(q), frame.across(r)
+    ab, bc, ac = side(a, b), side(b, c), side(a, c)
+    up_a, up_b, up_c = a[1] > 0, b[1] > 0, c[1] > 0
+
+    def upwards(from_up: Mask, to_up: Mask, left: Real) -> Real:
+        one = type(left)(1)
+        return dr.select(~from_up & to_up & (left > 0), one, 0) - dr.select(
+            from_up & ~to_up & (left < 0), one, 0
+        )
+
+    turn = row[PARITY] * (
+        upwards(up_a, up_b, ab) + upwards(up_b, up_c, bc) - upwards(up_a, up_c, ac)
+    )
+    a, b, c = (*a, frame.depth(p)), (*b, frame.depth(q)), (*c, frame.depth(r))
+    close = _CLOSE * float(dr.epsilon(frame.o)) * (1 + dr.max(dr.abs(frame.o)))
+    return _depth((a, b, c), (ab, bc, ac), close), turn
+
+
+def _is_beside(row: list[Real], frame: Frame, reach: float) -> Mask:
+    """Whether the line of a ray is as near as `reach` to the border of a record's triangle. (What
+    `crossing` computes as well is computed once.)"""
+    p, q, r = corners_of(row, type(frame.o))
+    a, b, c = frame.across(p), frame.across(q), frame.across(r)
+    near: Mask = False
+    zero = type(a[0])(0)
+    for one, other in ((a, b), (b, c), (a, c)):
+        left, square = side(one, other), _square((*one, zero), (*other, zero))
+        share = -dr.fma(one[0], other[0] - one[0], one[1] * (other[1] - one[1])) / square
+        near |= (left * left <= reach * reach * square) & (share > 0) & (share < 1)
+    for u, v in (a, b, c):
+        near |= dr.fma(u, u, v * v) <= reach * reach
+    return near
+
+
+def _depth(corners: tuple[Seen, Seen, Seen], sides: tuple[Real, Real, Real], close: Real) -> Real:
+    """The t at which a ray passes through a triangle.
+
+    corners: (u, v, depth) of each, in the frame of the ray. sides: `side` of the edges.
+
+    The barycentric weight of a corner is an area divided by that of the triangle, which is all
+    rounding where the triangle is thin. So the weight w of the corner off the longest edge is cut
+    to what the ray's coordinate along that edge allows, and the coordinate s of the point on the
+    edge
+    is then chosen for w: the ray is at s + w s', with s' the coordinate of that corner, 0 <= s <=
+    1 - w, and coordinates along the longest edge are accurate. A wrong w moves the point across
+    that edge only, by no more than the rounding of an area over the edge's length.
+
+    A ray that is as close as `close` to an edge or a vertex passes all triangles there at the depth
+    of that edge or vertex, the same bits for all: their jumps of w are at exactly the same t.
+    """
+    (a, b, c), (ab, bc, ac) = corners, sides
+    squares = _square(a, b), _square(b, c), _square(a, c)
+    is_first = (squares[0] >= squares[1]) & (squares[0] >= squares[2])
+    is_last = squares[2] > squares[1]
+
+    def of_longest(first: Real, second: Real, last: Real) -> Real:
+        return dr.select(is_first, first, dr.select(is_last, last, second))
+
+    start, end, apex = (
+        tuple(of_longest(*some) for some in zip(*choice, strict=True))
+        for choice in ((a, b, a), (b, c, c), (c, a, b))
+    )
+    e = end[0] - start[0], end[1] - start[1]
+    share = dr.rcp(of_longest(*squares))
+    here = -dr.fma(start[0], e[0], start[1] * e[1]) * share
+    aside = dr.fma(apex[0] - start[0], e[0], (apex[1] - start[1]) * e[1]) * share
+    zero = type(ab)(0)
+    here, aside = clamp(here, zero, 1), clamp(aside, zero, 1)
+    most = fmin((1 - here) / (1 - aside), fmin(here / aside, type(ab)(1)))
+    w = clamp(of_longest(ab, bc, -ac) / (bc - ac + ab), zero, most)
+    s = clamp(dr.fma(-w, aside, here), zero, 1 - w)
+    t = dr.fma(s, end[2] - start[2], dr.fma(w, apex[2] - start[2], start[2]))
+    near = close * close
+    for (one, other), side_, square in zip(
+        ((a, b), (b, c), (a, c)), (ab, bc, ac), squares, strict=True
+    ):
+        share = -dr.fma(one[0], other[0] - one[0], one[1] * (other[1] - one[1])) / square
+        at = dr.fma(clamp(share, zero, 1), other[2] - one[2], one[2])
+        beside = (side_ * side_ <= near * square) & (share > 0) & (share < 1)
+        t = dr.select(beside, at, t)
+    for u, v, depth in corners:
+        t = dr.select(dr.fma(u, u, v * v) <= 4 * near, depth, t)
+    return t
+
+
+def _square(a: Seen, b: Seen) -> Real:
+    u, v = b[0] - a[0], b[1] - a[1]
+    return dr.fma(u, u, v * v)

@@ -1,0 +1,582 @@
+"""Live scenes: surfaces on the studio's stage, each as a kernel for other GPUs with its data.
+
+Everything here is plain: numbers, lists and text, as `drawing.js` takes it.
+"""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import hashlib
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, cast
+
+import drjit as dr
+import numpy as np
+
+from harnack.backend import choose_backend, to_vector3
+from harnack.fields import Solid
+from harnack.fields.solid_angles.solid_angle import SolidAngle
+from harnack.geometry import HalfSpace, Intersection, Volume
+from harnack.rendering import render
+from harnack.rendering.backdrops import FLOOR, Ground, checked_backdrop, reflectance_of
+from harnack.rendering.camera import Camera
+from harnack.rendering.framing import NothingVisibleError, box_of, visible_points
+from harnack.rendering.isolines import checked_isolines
+from harnack.rendering.mitsuba_plugins import register
+from harnack.rendering.placed_surface import PlacedSurface
+from harnack.rendering.render_options import OF_STUDIO, SETTINGS, check_camera
+from harnack.rendering.scales import linear
+from harnack.rendering.shading import of_mended, of_side, reflectance
+from harnack.rendering.stage import MATERIALS, Material, StudioObject
+from harnack.rendering.studio_surfaces import studio_objects
+from harnack.tracer import LevelSet, Status, Tolerance
+from harnack.view.legend_data import EVALUATIONS_TOP, legends
+from harnack.view.live_framing import Framing, extreme_points
+from harnack.view.scene_file import STILL_SETTINGS, Origins, of_surfaces, text_of
+from harnack.view.sliders import PlaceError, Subject, at_place
+from harnack.webgpu import bits_of, data_of, leaves, record
+
+if TYPE_CHECKING:
+    from harnack.backend import FloatArray, Real, Vec3
+    from harnack.rendering.images import Picture
+    from harnack.rendering.placed_surface import Placement
+    from harnack.rendering.surface_hits import SurfaceHit
+    from harnack.webgpu import Recording
+
+__all__ = [
+    "CONTROLLED",
+    "SHOWS",
+    "Controls",
+    "Live",
+    "Plain",
+    "check_opaque",
+    "difference",
+    "live_settings",
+    "packed",
+    "paint_of",
+    "paints_of",
+    "status_of",
+]
+
+Plain = dict[str, Any]
+# Rays that travel with a surface, and are traced first on the visitor's device.
+_RAYS = 2048
+# Of surfaces without a tolerance of their own, on the stage.
+_TOLERANCE = 1e-4
+_LANES = ("o 0", "o 1", "o 2", "d 0", "d 1", "d 2", "far")
+_RESULTS = ("status", "t", "normal 0", "normal 1", "normal 2", "evaluations", "paint")
+# The place of a result that no shader writes, because it is 0 for all rays.
+_NO_OUTPUT = 99
+# Paints of a surface: the first is its own, then those of what spans what a mesh leaves open and of
+# faces on a section, then those of isolines.
+_MENDED, _CUT = 1, 2
+# `PAINTS` in drawing.js.
+_MOST_PAINTS = 2048
+_OF_STUDIO = ("boundary", "boundary_material", "thickness")
+# Of gzip: more takes longer, and gains little.
+_LEVEL = 5
+_OF_STAGE = ("camera", "backdrop", "up", "show")
+SHOWS = ("shaded", "normal", "depth", "evaluations", "status")
+"""The values of `show` that pages and views have."""
+
+
+CONTROLLED = ("material", "boundary")
+"""Settings of `render` that can be changed in a view: what surfaces are made of, and the radius of
+tubes around the curves at which they end (None for no tubes)."""
+
+
+@dataclass(frozen=True)
+class Controls:
+    """What the controls of a live scene say: its sliders, its edited curve, its cut and settings.
+
+    values: of all sliders. loops: vertices (n, 3) in the place of those of the field's curve.
+    cut: a volume that cuts all surfaces; a half-space opens them, as `section` of `level_set` does.
+    settings: some of `CONTROLLED`, in the place of those that the scene was opened with.
+    """
+
+    values: Mapping[str, float]
+    loops: Sequence[FloatArray] | None = None
+    cut: Volume | None = None
+    settings: Mapping[str, Any] = field(default_factory=dict[str, Any])
+
+
+@dataclass(frozen=True)
+class Live:
+    """A live scene: what is drawn as a function of sliders, where it stands on the stage, and the
+    rays by which devices are checked.
+
+    points: (n, 3) of each surface, as it is seen at first. camera, up: as `render` takes them.
+    editable: whether the vertices of its curve can be moved. show: what is shown at first.
+    """
+
+    subject: Subject
+    points: tuple[FloatArray, ...]
+    camera: Camera
+    up: Any
+    framing: Framing
+    ground: str
+    editable: bool
+    show: str
+    origins: Origins = ()
+
+    @classmethod
+    def of(
+        cls, what: Any, given: Mapping[str, Any], *, edits: bool = False, origins: Origins = ()
+    ) -> Live:
+        """From what users give `page` and `view`.
+
+        edits: whether vertices of curves are to be moved, so that they must not decide what is
+            recorded. origins: where fields come from, to be said in scene files.
+
+        Raises:
+            TypeError, ValueError: as `render` does; also for a transparent material, a `show` that
+                is not in `SHOWS`, and a backdrop that is not "light" or "dark".
+        """
+        still = [name for name in given if name in SETTINGS and name not in (*OF_STUDIO, "show")]
+        if still:
+            raise TypeError(
+                f"{', '.join(still)}: for still pictures only, as `harnack.render` draws them; "
+                "pages and views have no such setting"
+            )
+        given = dict(given)
+        camera, backdrop, up, show = (given.pop(name, None) for name in _OF_STAGE)
+        show = "shaded" if show is None else show
+        if show not in SHOWS:
+            raise ValueError(f"show must be one of {', '.join(SHOWS)} where it moves, not {show!r}")
+        ground = Ground("light") if backdrop is None else checked_backdrop(backdrop)
+        if not isinstance(ground, Ground):
+            raise ValueError('backdrop: what is drawn live stands on a ground: "light" or "dark"')
+        subject = Subject.of(what, given)
+        start = subject.starts
+        with at_place(start):
+            drawn = _objects_at(subject, start)
+            backend = choose_backend("single")
+            points = tuple(visible_points(one.surface, backend) for one in drawn)
+        curve = _curve_of(drawn) if edits else None
+        up, camera = "z" if up is None else up, check_camera(camera)
+        framing = Framing.of(camera, up, np.concatenate(points), is_whole=True)
+        return cls(
+            subject, points, camera, up, framing, ground.name, curve is not None, show, origins
+        )
+
+    def framed(self, places: Iterable[Mapping[str, float]]) -> Live:
+        """The same, framed such that nothing leaves the picture at these places of its sliders; a
+        box of the camera stays what is framed.
+
+        Places at which nothing can be drawn are left out: what is wrong there is said where they
+        are drawn.
+        """
+        if not self.subject.sliders or self.camera.box is not None:
+            return self
+        backend = choose_backend("single")
+        points = [*self.points]
+        for values in places:
+            with suppress(PlaceError), at_place(values):
+                for one in _objects_at(self.subject, values):
+                    with suppress(NothingVisibleError):
+                        points.append(extreme_points(visible_points(one.surface, backend)))
+        framing = Framing.of(self.camera, self.up, np.concatenate(points), is_whole=False)
+        return replace(self, framing=framing)
+
+    @property
+    def placement(self) -> Placement:
+        """Where the surfaces stand on the stage."""
+        return self.framing.placement
+
+    @cached_property
+    def rays(self) -> tuple[tuple[FloatArray, FloatArray], ...]:
+        """Rays on the stage by which devices are checked, of each surface."""
+        return tuple(_rays(self.placement.apply(one)) for one in self.points)
+
+    def scene(self, title: str) -> Plain:
+        """All that a page is given when it opens, as plain data for `drawing.js`."""
+        place, points = self.placement, np.concatenate(self.points)
+        _, settings = self._at(self.start)
+        material = settings.get("material")
+        # The ball around what is seen at first, by which cuts are measured.
+        middle: FloatArray = 0.5 * (points.min(axis=0) + points.max(axis=0))
+        return {
+            "title": title,
+            "placement": [*place.rotation.ravel().tolist(), *place.translation.tolist(),
+                          place.scale],
+            "camera": self.framing.camera,
+            "floor": FLOOR,
+            "show": self.show,
+            "ground": reflectance_of(self.ground).tolist(),
+            "sliders": [
+                {"name": name, "low": one.low, "high": one.high, "start": one.start,
+                 "step": one.step}
+                for name, one in self.subject.sliders.items()
+            ],
+            "editable": self.editable,
+            "materials": [name for name, one in MATERIALS.items() if not one.transparent],
+            "material": material if isinstance(material, str) else None,
+            "tube": None if (tube := settings.get("boundary")) is None else float(tube),
+            "middle": middle.tolist(),
+            "reach": float(np.linalg.norm(points - middle, axis=1).max()),
+            "legends": legends(),
+            "evaluations_top": EVALUATIONS_TOP,
+            "state": packed(self.first),
+        }  # fmt: skip
+
+    @cached_property
+    def first(self) -> Plain:
+        """The state at the start. Later states are sent as differences from it."""
+        return self.state(self.start)
+
+    @property
+    def pose(self) -> Plain:
+        """The camera's position, target and field of view, in the surfaces' coordinates."""
+        seen, place = self.framing.camera, self.placement
+        azimuth, elevation = np.radians([seen["azimuth"], seen["elevation"]])
+        back = np.array([np.cos(azimuth), np.sin(azimuth), np.tan(elevation)]) * np.cos(elevation)
+        target = np.array(seen["target"])
+        eye, at = place.undo(np.stack([target + seen["distance"] * back, target]))
+        return {"position": eye.tolist(), "target": at.tolist(), "fov": seen["fov"]}
+
+    @property
+    def start(self) -> Controls:
+        """The state in which nothing has been moved yet."""
+        return Controls(self.subject.starts)
+
+    def state(self, controls: Controls) -> Plain:
+        """The surfaces of a state as plain data, and the curves at which they end. Its arrays are
+        NumPy's; `packed` makes them text."""
+        drawn = self.drawn(controls)
+        with at_place(controls.values):
+            placed = [self.placed(one) for one in drawn]
+        surfaces = [
+            _traced(one, where, *self.rays[min(k, len(self.rays) - 1)])
+            for k, (one, where) in enumerate(zip(drawn, placed, strict=True))
+        ]
+        colors = sum(len(one["paints"]) for one in surfaces)
+        if colors > _MOST_PAINTS:
+            raise ValueError(
+                f"the surfaces and their isolines have {colors:,} colors, and what moves is drawn "
+                f"with {_MOST_PAINTS:,} at most: draw fewer surfaces at once"
+            )
+        curves: list[Any] = []
+        for k, one in enumerate(drawn):
+            if all(one.surface.field is not other.surface.field for other in drawn[:k]):
+                curves += one.surface.field.boundary_curves
+        return {"surfaces": surfaces, "curves": [np.asarray(one).tolist() for one in curves]}
+
+    def drawn(self, controls: Controls) -> list[StudioObject]:
+        """The surfaces of a state as objects of the studio."""
+        with at_place(controls.values):
+            return self._drawn(controls)
+
+    def _at(self, controls: Controls) -> tuple[Any, dict[str, Any]]:
+        """What is drawn, and its settings."""
+        what, settings = self.subject.at(controls.values)
+        settings |= controls.settings
+        if "boundary" in controls.settings and settings["boundary"] is None:
+            settings.pop("boundary_material", None)
+        return what, settings
+
+    def _drawn(self, controls: Controls) -> list[StudioObject]:
+        what, settings = self._at(controls)
+        drawn = _objects(what, settings)
+        curve = _curve_of(drawn) if self.editable else None
+        if (
+            curve is not None
+            and controls.loops is not None
+            and settings.get("boundary") is not None
+        ):
+            # The tube around the curve is that of the moved one.
+            drawn = _objects(_with_loops(what, curve, controls.loops), settings)
+            curve = _curve_of(drawn)
+        drawn = [self._fitted(one) for one in drawn]
+        if controls.cut is not None:
+            drawn = [replace(one, surface=cut_by(one.surface, controls.cut)) for one in drawn]
+        if curve is None:
+            return drawn
+        # As Dr.Jit's arrays: those of NumPy decide which proof is taken.
+        backend = choose_backend("single")
+        loops = curve.loops if controls.loops is None else controls.loops
+        field = SolidAngle([to_vector3(backend, one) for one in loops])
+        return [
+            replace(one, surface=replace(one.surface, field=field).in_one_call(begins=True))
+            if one.surface.field is curve
+            else one
+            for one in drawn
+        ]
+
+    def rendered(self, controls: Controls, **others: Any) -> Picture:
+        """A still picture of a state by `render`. others: settings of `render`."""
+        _, settings = self._at(controls)
+        own = {name: settings[name] for name in ("isolines", "cut_material") if name in settings}
+        drawn = self.drawn(controls)
+        if isinstance(others.get("camera"), Camera):
+            others["camera"] = self.framing.with_box(others["camera"])
+        usual: dict[str, Any] = {"backdrop": self.ground, "up": self.up, "progress": False}
+        materials = [one.material for one in drawn]
+        return render(
+            [one.surface for one in drawn], material=materials, **{**usual, **own, **others}
+        )
+
+    def saved(self, controls: Controls, **others: Any) -> tuple[str, list[str]]:
+        """It as the text of a scene file, and the names of the sliders that are not in it, because
+        their functions are Python's: what they make of it is. others: settings of `render` besides
+        those of what is drawn.
+
+        Raises:
+            SceneFileError: a text cannot hold it.
+        """
+        if isinstance(others.get("camera"), Camera):
+            others["camera"] = self.framing.with_box(others["camera"])
+        what, settings = self._at(controls)
+        several: list[Any] = [*what] if isinstance(what, list | tuple) else [what]
+        curve = _curve_of(_objects(what, settings)) if controls.loops else None
+        if curve is not None:
+            several = _with_loops(what, curve, controls.loops)
+        if controls.cut is not None:
+            own = of_surfaces(settings)
+            settings = {name: one for name, one in settings.items() if name not in own}
+            made = studio_objects(several, settings.get("material"), own)
+            several = [cut_by(one.surface, controls.cut) for one in made]
+        lost: list[str] = []
+        for name, one in self.subject.sliders.items():
+            if (
+                self.subject.settings.get(name) is one and name not in controls.settings
+            ):  # in the place of what surfaces have
+                settings[name] = replace(one, start=controls.values[name])
+            else:
+                lost.append(name)
+        return text_of(several, {**settings, **others}, self.origins), lost
+
+    def _fitted(self, one: StudioObject) -> StudioObject:
+        """The same, with a tolerance that suits its size on the stage if it has none."""
+        if not one.fitted:
+            return one
+        tolerance = Tolerance(_TOLERANCE / self.placement.scale)
+        return replace(one, surface=replace(one.surface, tolerance=tolerance))
+
+    def placed(self, one: StudioObject) -> PlacedSurface:
+        """A surface on the stage, with its data on the backend."""
+        size = float(np.linalg.norm(np.diff(box_of(one.surface), axis=0)))
+        backend = choose_backend("single")
+        return PlacedSurface.of(one.surface, self.placement, backend, one.isolines, size)
+
+
+def live_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Those of a picture that pages and views take: without what only still pictures have, such as
+    a size, and with "shaded" in the place of a `show` that cannot follow a mouse."""
+    taken = {name: one for name, one in settings.items() if name not in STILL_SETTINGS}
+    return {**taken, "show": taken["show"] if taken.get("show") in SHOWS else "shaded"}
+
+
+def cut_by(surface: LevelSet, volume: Volume) -> LevelSet:
+    """A surface cut by one more volume; by a half-space, it is opened to be looked into."""
+    name = "section" if isinstance(volume, HalfSpace) else "clip"
+    own = getattr(surface, name)
+    both = volume if own is None else Intersection((own, volume))
+    made = replace(surface, **cast("Any", {name: both})).in_one_call(begins=True)
+    is_whole = isinstance(made.field, Solid) and made.solid is None and len(made.levels) == 1
+    if name == "clip" or not is_whole:
+        return made
+    return replace(made, solid=(-math.inf, made.numbers[0]))
+
+
+def _with_loops(what: Any, curve: SolidAngle, loops: Any) -> list[Any]:
+    """Fields and surfaces with other vertices of one curve."""
+    moved = SolidAngle([*loops])
+
+    def edited(one: Any) -> Any:
+        if isinstance(one, LevelSet) and one.field is curve:
+            return replace(one, field=moved)
+        return moved if one is curve else one
+
+    several: list[Any] = [*what] if isinstance(what, list | tuple) else [what]
+    return [edited(one) for one in several]
+
+
+def _objects_at(subject: Subject, values: Mapping[str, float]) -> list[StudioObject]:
+    return _objects(*subject.at(values))
+
+
+def _objects(what: Any, given: Mapping[str, Any]) -> list[StudioObject]:
+    settings = dict(given)
+    studio = {name: settings.pop(name) for name in _OF_STUDIO if name in settings}
+    material, cut = (settings.pop(name, None) for name in ("material", "cut_material"))
+    isolines = checked_isolines(settings.pop("isolines", None))
+    drawn = studio_objects(what, material, settings, cut=cut, isolines=isolines, **studio)
+    for one in drawn:
+        check_opaque(one.material)
+    return drawn
+
+
+def check_opaque(material: Material) -> None:
+    """Raise ValueError for a material that live pictures cannot show."""
+    if material.transparent:
+        raise ValueError(
+            'what moves is not drawn transparent: choose another material, such as material="clay"'
+        )
+
+
+def _curve_of(drawn: Sequence[StudioObject]) -> SolidAngle | None:
+    """The one field whose curve can be edited; None where there is none, or more than one."""
+    found = {id(one.surface.field): one.surface.field for one in drawn}
+    curves = [one for one in found.values() if isinstance(one, SolidAngle) and not one.circles]
+    return curves[0] if len(curves) == 1 else None
+
+
+def _traced(one: StudioObject, placed: PlacedSurface, o: FloatArray, d: FloatArray) -> Plain:
+    """A surface as plain data: its shader, the words that the shader reads, its colors, and rays
+    with Dr.Jit's answers."""
+    backend = choose_backend("single")
+    lanes = {
+        "o": to_vector3(backend, o),
+        "d": to_vector3(backend, d),
+        "far": backend.Float(np.full(len(o), np.inf, np.float32)),
+    }
+
+    def compute(o: Vec3, d: Vec3, far: Real) -> Plain:
+        met = placed.meet(o, d, far, backend.Bool(True))
+        return {
+            "status": status_of(met), "t": met.t, "normal": met.normal,
+            "evaluations": met.evaluations, "paint": paint_of(met),
+        }  # fmt: skip
+
+    made = record(compute, lanes, placed)
+    given = dict(leaves("lane", lanes))
+    results = {name: made.results.get(f"result {name}") for name in _RESULTS}
+    if any(results[name] is None for name in _RESULTS[:-1]):
+        raise ValueError("what rays meet is the same for all of them: there is nothing to draw")
+    answers = [np.zeros(len(o), np.uint32) if x is None else bits_of(x) for x in results.values()]
+    return {
+        "key": hashlib.sha256(made.shader.code.encode()).hexdigest()[:16],
+        "code": made.shader.code,
+        "data": data_of(made.shader, made.data),
+        "lanes": [_LANES.index(label.removeprefix("lane ")) for label in made.shader.lanes],
+        "results": [_place(made, f"result {name}") for name in _RESULTS],
+        "paints": paints_of(one),
+        "tolerance": placed_tolerance(one, placed),
+        "check": {
+            "lanes": np.stack([bits_of(given[label]) for label in made.shader.lanes]),
+            "results": np.stack(answers),
+            "count": len(o),
+        },
+    }
+
+
+def status_of(met: SurfaceHit) -> Any:
+    """The `Status` of each ray."""
+    hit, out, miss = (
+        type(met.evaluations)(int(one)) for one in (Status.HIT, Status.OUT_OF_STEPS, Status.MISS)
+    )
+    return dr.select(met.lost, out, dr.select(met.met, hit, miss))
+
+
+def paint_of(met: SurfaceHit) -> Any:
+    """The index in `paints_of` of the color that each ray meets."""
+    index = cast("Any", type(met.evaluations))
+    plain = dr.select(met.cut, index(_CUT), dr.select(met.mended, index(_MENDED), index(0)))
+    return dr.select(met.line > 0, index(met.line) + _CUT, plain)
+
+
+def placed_tolerance(one: StudioObject, placed: PlacedSurface) -> float:
+    """The tolerance as a length of the stage."""
+    return one.surface.tolerance.distance * float(placed.scale[0])
+
+
+def _place(made: Recording, label: str) -> int:
+    """The place of a result in the shader's output, or `_NO_OUTPUT` if it is 0 for all rays."""
+    if label in made.constants:
+        return _NO_OUTPUT
+    return made.shader.results.index(label)
+
+
+def _rays(points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Origins and unit directions (n, 3) of rays from all sides to places near points of the
+    stage."""
+    rng = np.random.default_rng(0)
+    away = rng.normal(size=(_RAYS, 3))
+    away /= np.linalg.norm(away, axis=1, keepdims=True)
+    o = 0.5 * (points.min(axis=0) + points.max(axis=0)) + 5.0 * away
+    aims = points[rng.integers(0, len(points), _RAYS)]
+    direction = aims + 0.05 * rng.normal(size=(_RAYS, 3)) - o
+    return o, direction / np.linalg.norm(direction, axis=1, keepdims=True)
+
+
+def paints_of(one: StudioObject) -> list[Plain]:
+    """Linear sRGB of the sides of larger and of smaller values in shaded pictures, and whether they
+    are glossy: of each paint."""
+    surface, mi = one.surface, register()
+    is_solid = surface.solid is not None
+    front, back, glossy = _reflectances(one.material.bsdf(solid=is_solid, traced_light=False))
+    inside = mi.Bool(not is_solid and not isinstance(surface.field, Solid))
+    sides = of_side(front, back, inside), back
+    mended = [of_mended(side, mi.Bool(True)) for side in sides]
+    paints = [_paint(sides[0], sides[1], glossy), _paint(mended[0], mended[1], glossy)]
+    cut = one.material if one.cut is None else one.cut
+    front, back, glossy = _reflectances(cut.bsdf(solid=is_solid, traced_light=False))
+    paints.append(_paint(front, back, glossy))
+    lines = [mi.Color3f(*linear(line.rgb)) for line in one.isolines]
+    return [*paints, *(_paint(line, line, False) for line in lines)]
+
+
+def _paint(front: Any, back: Any, glossy: bool) -> Plain:
+    sides = {"front": front, "back": back}
+    return {
+        "glossy": glossy,
+        **{name: [float(part[0]) for part in color] for name, color in sides.items()},
+    }
+
+
+def _reflectances(bsdf: Mapping[str, Any]) -> tuple[Any, Any, bool]:
+    """The reflectances of a BSDF's two sides, as shaded pictures use them, and whether it is
+    glossy."""
+    mi = register()
+    made = mi.load_dict(dict(bsdf), parallel=False)
+    colors: list[Any] = []
+    for side in (1, -1):
+        si = dr.zeros(mi.SurfaceInteraction3f)
+        si.wi, si.t = mi.Vector3f(0, 0, side), mi.Float(1)
+        straight = mi.Color3f(made.eval_diffuse_reflectance(si, True))
+        colors.append(reflectance(straight, mi.Bool(False)))
+    flags = made.flags()
+    glossy = mi.has_flag(flags, mi.BSDFFlags.Glossy) or mi.has_flag(flags, mi.BSDFFlags.Delta)
+    return colors[0], colors[1], bool(glossy)
+
+
+def packed(value: Any) -> Any:
+    """The same with arrays of 32-bit words as text, which `words` in drawing.js reads: base64 of
+    what gzip makes of them. The tables of meshes repeat themselves, and become a tenth."""
+    if isinstance(value, np.ndarray):
+        return base64.b64encode(gzip.compress(value.tobytes(), _LEVEL, mtime=0)).decode()
+    if isinstance(value, dict):
+        return {name: packed(one) for name, one in cast("Plain", value).items()}
+    if isinstance(value, list):
+        return [packed(one) for one in cast("list[Any]", value)]
+    return value
+
+
+def difference(first: Plain, state: Plain, *, checks: bool = True) -> Plain:
+    """What a state changes of the first: words of the data of its surfaces, and whatever else
+    differs; or all of it where there are other kernels. `changed` in frames.js is the way back.
+
+    checks: whether rays with answers go along; with other kernels they always do, as no device has
+        been asked about these.
+    """
+    pairs = [*zip(first["surfaces"], state["surfaces"], strict=False)]
+    alike = len(first["surfaces"]) == len(state["surfaces"]) and all(
+        old["key"] == new["key"] and len(old["data"]) == len(new["data"]) for old, new in pairs
+    )
+    if not alike:
+        return state
+    surfaces: list[Plain] = []
+    for old, new in pairs:
+        own = {k: one for k, one in new.items() if k not in ("data", "check") and one != old[k]}
+        at = np.flatnonzero(old["data"] != new["data"]).astype(np.uint32)
+        own |= {"at": at, "to": new["data"][at]}
+        surfaces.append(own | ({"check": new["check"]} if checks else {}))
+    made: Plain = {"surfaces": surfaces}
+    if state["curves"] != first["curves"]:
+        made["curves"] = state["curves"]
+    return made
