@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 import harnack as hk
 from harnack.fields.solid_angles.winding_number import WindingNumber
-from harnack.files import read_surface
+from harnack.files import read_geometry
 from harnack.geometry.example_meshes import (
     MeshArrays,
     duplicate_faces,
@@ -84,7 +84,7 @@ class RayRow:
 
 def read(path: Path) -> MeshArrays:
     """Vertices and faces of a surface file, moved and scaled to a largest coordinate of one."""
-    surface: Any = read_surface(path, "winding")
+    surface: Any = read_geometry(path, "winding")
     vertices = np.asarray(surface.vertices, np.float64)
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     vertices = (vertices - 0.5 * (low + high)) / (0.5 * float((high - low).max()))
@@ -106,7 +106,7 @@ def damaged(mesh: MeshArrays, kind: str, seed: int) -> MeshArrays:
         faces = flip_faces(faces, share, seed)
     elif kind == "duplicates":
         faces = duplicate_faces(faces, share, seed)
-        faces = duplicate_faces(faces, 0.5 * share, seed + 1, turned=True)
+        faces = duplicate_faces(faces, 0.5 * share, seed + 1, flipped=True)
     elif kind == "self-intersections":
         ball, more = icosphere(3)
         faces = np.concatenate([remove_faces(faces, 0.5 * share, seed), more + len(vertices)])
@@ -126,7 +126,7 @@ def at_points(name: str, mesh: MeshArrays) -> Iterator[PointRow]:
         off = np.abs(field.value(x) - expected)
         bound = field.error_bound(x)
         yield PointRow(
-            name, len(faces), len(field.mesh.singular),
+            name, len(faces), len(field.mesh.singular_edges),
             method if method == "exact" else f"{method}, order {order}",
             int((off > bound).sum()), float(np.median(off)), float(off.max()),
             float((off / bound).max()),
@@ -141,7 +141,7 @@ def along_rays(
     low, high = vertices.min(axis=0) - 0.05, vertices.max(axis=0) + 0.05
     o, d = mesh_rays(vertices, faces, RAYS, seed, low, high)
     oracle = WindingNumber(vertices, faces, method="exact")
-    edges = oracle.mesh.vertices[oracle.mesh.singular]
+    edges = oracle.mesh.vertices[oracle.mesh.singular_edges]
 
     def exact(x: FloatArray) -> FloatArray:
         return oracle.value(x, precision="double")
@@ -154,7 +154,7 @@ def along_rays(
     for method in ("exact", "tree"):
         field: Any = WindingNumber(vertices, faces, method=method)
         hits = hk.trace(field, o, d, level=level, t_max=far, tolerance=TOLERANCE)
-        t = np.where(hits.hit, hits.t, np.inf).astype(np.float64)
+        t = np.where(hits.is_hit, hits.t, np.inf).astype(np.float64)
         verdict = judge(
             t, exact, o, d, 0.0, far,
             level=level, reach=REACH, edges=edges, truth=truth, samples=SAMPLES,
@@ -163,10 +163,10 @@ def along_rays(
         at = o[early] + t[early, None] * d[early]
         yield RayRow(
             name, damage, level, len(edges), method,
-            verdict.hits, int((hits.hit & (hits.sheet < 0)).sum()),
+            verdict.hits, int((hits.is_hit & (hits.primitive_index < 0)).sum()),
             len(verdict.missed), len(early),
             int(_explained(field, exact, level, at, d[early]).sum()),
-            int((hits.status == hk.Status.OUT_OF_STEPS).sum()),
+            int((hits.status == hk.RayStatus.OUT_OF_STEPS).sum()),
             0 if plain is None else int(plain.clear.sum()),
             0 if plain is None else plain.others(t),
         )  # fmt: skip
@@ -239,7 +239,8 @@ def _section(points: list[PointRow], hits: list[RayRow]) -> str:
     lines += [
         "",
         f"First hits of {RAYS:,} rays each, half of them aimed at vertices and edges, on "
-        f"{len(broken)} meshes with boundary edges and on closed ones; tolerance {TOLERANCE:g} of "
+        f"{len(broken)} meshes with boundary edges and on closed ones; tolerance "
+        f"{TOLERANCE:g} of "
         f"the size. Against the sides of the exact w at {SAMPLES + 1} points a ray: *missed* hits "
         f"are more than {REACH:g} late, *early* ones have no surface that near; of these, at the "
         "*explained* ones w is within twice its bound of the level. *Plain* rays pass every edge "

@@ -13,17 +13,17 @@ import harnack as hk
 from harnack.gallery import SCENES
 from harnack.geometry import example_curves
 from harnack.rendering import Camera, render
-from harnack.rendering.images import tone_mapped
-from harnack.rendering.shading import grid_offsets
+from harnack.rendering.images import tone_map
+from harnack.rendering.shading import multijitter_offsets
 
 _SIZE = (320, 240)
 _REFERENCE, _ROUNDS = 100, 3
 _WAYS = (("edges", 1), ("edges", 9), ("edges", 25), ("cones", 9), ("cones", 25))
 
-Surfaces = Callable[[], "list[hk.LevelSet]"]
+Surfaces = Callable[[], "list[hk.Surface]"]
 
 
-def _wires() -> list[hk.LevelSet]:
+def _wires() -> list[hk.Surface]:
     """Three rings, each a tenth to a fifth of a pixel wide."""
     turn = np.linspace(0, 2 * math.pi, 61)
     rings = [
@@ -55,12 +55,12 @@ def _scenes() -> dict[str, tuple[Surfaces, str, Camera]]:
     }  # fmt: skip
 
 
-def _many_rays(surfaces: list[hk.LevelSet], material: str, camera: Camera) -> np.ndarray:
+def _many_rays(surfaces: list[hk.Surface], material: str, camera: Camera) -> np.ndarray:
     """The picture with the same rays in every pixel, without choosing any.
 
     A picture that is `side` times as wide and high has them all, each in the middle of a pixel.
     """
-    side = math.isqrt(len(grid_offsets(_REFERENCE)))
+    side = math.isqrt(len(multijitter_offsets(_REFERENCE)))
     large = (side * _SIZE[0], side * _SIZE[1])
     image = render(
         surfaces, show="shaded", size=large, material=material, camera=camera, spp=1, progress=False
@@ -70,7 +70,7 @@ def _many_rays(surfaces: list[hk.LevelSet], material: str, camera: Camera) -> np
 
 def _error(image: np.ndarray, reference: np.ndarray) -> float:
     """Root mean square over all pixels and colors, of 255 steps of the picture that is shown."""
-    shown = (tone_mapped(one.astype(np.float32)).astype(float) for one in (image, reference))
+    shown = (tone_map(one.astype(np.float32)).astype(float) for one in (image, reference))
     first, second = shown
     return float(np.sqrt(np.mean((first - second) ** 2)))
 

@@ -359,7 +359,7 @@ def measure_ours(rays: Rays, truth: Array) -> Result:
         rays.field, rays.origins, rays.directions, level=rays.level, t_max=rays.far,
         tolerance=1e-6,
     )  # fmt: skip
-    t = np.where(ours.hit, ours.t, np.inf)
+    t = np.where(ours.is_hit, ours.t, np.inf)
     return Result.of("harnack", t, float(ours.evaluations.mean()), truth)
 
 

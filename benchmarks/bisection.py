@@ -14,8 +14,8 @@ from typing import Any
 import drjit as dr
 
 from harnack.backend.arrays import Backend
-from harnack.enclosures import Enclosure, Slopes, TargetLevels
-from harnack.enclosures.literature import Band
+from harnack.enclosures import Enclosure, Levels, SlopeRange
+from harnack.enclosures.literature import BandEnclosure
 
 _DEPTH, _MOST = 48, 2000
 
@@ -30,7 +30,7 @@ def bisect(
     """
     o, d, end = rays
     prepared = field.prepare(backend)
-    levels = TargetLevels((dr.opaque(backend.Float, 0.0),))
+    levels = Levels((dr.opaque(backend.Float, 0.0),))
     real, count = backend.Float, backend.UInt32
 
     def look(start: Any, stop: Any) -> tuple[Any, Any]:
@@ -39,18 +39,18 @@ def bisect(
         sample = prepared.evaluate(p)
         length = stop - start
         slope = dr.dot(sample.gradient, d)
-        made: Any = kind.along(prepared.restricted(p, d), Slopes(slope, slope), length)
-        gaps = levels.gaps(sample.value).less(sample.error)
-        front = made.step(gaps)
+        made: Any = kind.from_restriction(prepared.restrict(p, d), SlopeRange(slope, slope), length)
+        gaps = levels.gaps(sample.value).reduced_by(sample.value_error)
+        front = made.free_length(gaps)
         back = length
-        if isinstance(made, Band):
+        if isinstance(made, BandEnclosure):
             # Lines that fall into the gap at the end: from where on they are inside.
-            up = (gaps.up - made.offsets.high) / made.slopes.high
-            down = -(gaps.down + made.offsets.low) / made.slopes.low
-            above = (made.offsets.high >= gaps.up) & (made.slopes.high < 0) & (up < length)
-            below = (-made.offsets.low >= gaps.down) & (made.slopes.low > 0) & (down < length)
-            upper = dr.select(above, up, dr.select(gaps.up == dr.inf, 0, length))
-            lower = dr.select(below, down, dr.select(gaps.down == dr.inf, 0, length))
+            up = (gaps.above - made.offsets.upper) / made.slopes.upper
+            down = -(gaps.below + made.offsets.lower) / made.slopes.lower
+            above = (made.offsets.upper >= gaps.above) & (made.slopes.upper < 0) & (up < length)
+            below = (-made.offsets.lower >= gaps.below) & (made.slopes.lower > 0) & (down < length)
+            upper = dr.select(above, up, dr.select(gaps.above == dr.inf, 0, length))
+            lower = dr.select(below, down, dr.select(gaps.below == dr.inf, 0, length))
             back = dr.clip(dr.maximum(upper, lower) * (1 + 1e-6), 0, length)
             back = dr.select(dr.isfinite(back) & (back > front), back, length)
         return front, back

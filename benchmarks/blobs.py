@@ -20,11 +20,11 @@ import numpy as np
 import harnack as hk
 from harnack.arithmetic import clipped_power
 from harnack.backend.elementary import clamp, fmax, fmin
-from harnack.backend.record_table import Records
-from harnack.enclosures import Slopes
-from harnack.enclosures.enclosure import Piece
-from harnack.fields.blobs.kernels import Compact
-from harnack.fields.formula import Formula, FormulaAlong
+from harnack.backend.record_table import RecordTable
+from harnack.enclosures import SlopeRange
+from harnack.enclosures.enclosure import PathPiece
+from harnack.fields.blobs.kernels import CompactKernel
+from harnack.fields.formula import Formula, FormulaOnRay
 
 # Rounding of a blob's derivatives, in units of their largest absolute values.
 _ROUNDINGS = 64.0
@@ -101,7 +101,7 @@ class Scene:
     def field(self, groups: int = 1) -> hk.Blobs:
         """The same field plus its threshold, as the library has it."""
         grouped = None if groups == 1 else np.arange(len(self.centers)) % groups
-        kernel = Compact(support=self.width)
+        kernel = CompactKernel(support=self.width)
         return hk.Blobs(self.centers, self.reaches / self.width, kernel=kernel, groups=grouped)
 
     def first_inside(self, rays: tuple[np.ndarray, ...], samples: int) -> np.ndarray:
@@ -128,13 +128,13 @@ class BlobFormula(Formula):
     scene: Scene
     exact: bool = True
     groups: int = 1
-    records: tuple[Records, ...] = ()
+    records: tuple[RecordTable, ...] = ()
     may_jump = False
 
     def prepare(self, backend: Any) -> BlobFormula:
         scene = self.scene
         table = np.column_stack([scene.centers, scene.reaches**-2.0, scene.heights])
-        parts = [Records.upload(backend, table[k :: self.groups]) for k in range(self.groups)]
+        parts = [RecordTable.upload(backend, table[k :: self.groups]) for k in range(self.groups)]
         return dataclasses.replace(self, records=tuple(parts))
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
@@ -150,15 +150,15 @@ class BlobFormula(Formula):
             sums[0] = hk.maximum(sums[0], one)
         return sums[0] - self.scene.threshold
 
-    def restricted(self, p: Any, direction: Any) -> BlobsAlong:
+    def restrict(self, p: Any, direction: Any) -> BlobsAlong:
         return BlobsAlong(self, p, direction, piece_count=4)
 
 
 @dataclass(frozen=True)
-class BlobsAlong(FormulaAlong):
+class BlobsAlong(FormulaOnRay):
     """Blobs along a path, with ranges of derivatives in closed form."""
 
-    def pieces(self, knots: Sequence[Any]) -> tuple[Piece, ...]:
+    def derivative_ranges(self, knots: Sequence[Any]) -> tuple[PathPiece, ...]:
         """With x = s - s0 along the path and S half the chord, the derivative of
         a (w0 - x^2/R^2)^3 has its extrema at x^2 = S^2/5, the second at 0 and x^2 = 3 S^2/5."""
         field: Any = self.field
@@ -205,7 +205,9 @@ class BlobsAlong(FormulaAlong):
 
         state = field.records[0].for_each(body, (zero,) * (4 * count), "blobs along")
         return tuple(
-            Piece(end - start, Slopes(*state[4 * k : 4 * k + 2]), *state[4 * k + 2 : 4 * k + 4])
+            PathPiece(
+                end - start, SlopeRange(*state[4 * k : 4 * k + 2]), *state[4 * k + 2 : 4 * k + 4]
+            )
             for k, (start, end) in enumerate(itertools.pairwise(knots))
         )
 
@@ -244,17 +246,17 @@ def _product(away: Any, rate: Any, height: Any, x: Any, y: Any) -> tuple[Any, An
     return least, most
 
 
-def summed(records: Records, term: Callable[[list[Any]], Any]) -> Any:
+def summed(records: RecordTable, term: Callable[[list[Any]], Any]) -> Any:
     """The sum of `term` of every record, in numbers of any arithmetic, in one recorded loop."""
-    start = term(records.row(records.backend.UInt32(0)))
+    start = term(records.read_record(records.backend.UInt32(0)))
     zero = records.backend.Float(0)
 
     def body(i: Any, *state: Any) -> tuple[Any, ...]:
-        total = _rebuilt(start, iter(state)) + term(records.row(i))
+        total = _rebuilt(start, iter(state)) + term(records.read_record(i))
         return i + 1, *(zero + one for one in _numbers(total))
 
     first = (records.backend.UInt32(1), *(zero + one for one in _numbers(start)))
-    state = dr.while_loop(first, lambda i, *_: i < records.trips, body, label="blobs")
+    state = dr.while_loop(first, lambda i, *_: i < records.iteration_count, body, label="blobs")
     return _rebuilt(start, iter(state[1:]))
 
 

@@ -17,8 +17,8 @@ import trimesh
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.distance.level_triangles import MeshSurface
-from harnack.field_from_file import read_surface
+from harnack.distance.level_triangles import LevelTriangles
+from harnack.field_from_file import read_geometry
 from harnack.geometry.example_meshes import bumpy_sphere, torus_mesh
 
 FloatArray = npt.NDArray[np.float64]
@@ -102,7 +102,7 @@ def _entry(row: _Row | None) -> str:
 def _meshes(folder: Path | None) -> dict[str, Arrays]:
     found: dict[str, Arrays] = {}
     for name in _NAMES if folder else ():
-        mesh: Any = read_surface(Path(folder or "") / f"{name}.obj", "winding")
+        mesh: Any = read_geometry(Path(folder or "") / f"{name}.obj", "winding")
         joined = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
         joined.merge_vertices(merge_tex=True, merge_norm=True)
         found[name] = np.array(joined.vertices), np.array(joined.faces)
@@ -231,7 +231,7 @@ def _sampled(made: Arrays, other: Arrays, seed: int) -> tuple[FloatArray, npt.ND
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     center, size = 0.5 * (low + high), float((high - low).max())
     backend = choose_backend("double")
-    surface = MeshSurface((vertices[faces] - center) / size, center, size, True)
+    surface = LevelTriangles((vertices[faces] - center) / size, center, size, True)
     way = surface.upload(backend)(to_vector3(backend, np.asarray(points)))
     distance = np.linalg.norm(to_numpy(way), axis=1)
     return distance, np.unique(place[np.argsort(distance)[-_FARTHEST:]])

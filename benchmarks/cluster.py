@@ -18,7 +18,7 @@ from harnack.geometry import example_curves, example_meshes
 POINTS, CHUNK, MEMORY = 100_000_000, 1_000_000, "1GB"
 # Chunks that one worker alone is measured with.
 _FEW = 20
-_PICTURE: dict[str, Any] = {"size": (640, 480), "spp": 16, "show": "color", "progress": False}
+_PICTURE: dict[str, Any] = {"size": (640, 480), "spp": 16, "show": "path", "progress": False}
 
 
 def cluster() -> str:

@@ -36,7 +36,7 @@ def meshed(loop: np.ndarray, rings: int = 320, spokes: int = 960) -> tuple[np.nd
     xy = np.concatenate([[[0.0, 0.0]], inner])
     start = np.column_stack([xy, np.full(len(xy), 3.0)])
     hits = hk.trace(hk.SolidAngle(loop), start, [[0, 0, -1.0]], precision="double", tolerance=1e-10)
-    assert (hits.status == hk.Status.HIT).all()
+    assert (hits.status == hk.RayStatus.HIT).all()
     vertices = np.concatenate([hits.position, border])
     k = np.arange(spokes)
     n = (k + 1) % spokes
@@ -62,7 +62,7 @@ def errors(
     field = hk.SolidAngle(loop)
     eye, d = camera(across)
     exact = hk.trace(field, eye[None], d, precision="double", tolerance=1e-10)
-    d, star = d[exact.status == hk.Status.HIT], exact.t[exact.status == hk.Status.HIT]
+    d, star = d[exact.status == hk.RayStatus.HIT], exact.t[exact.status == hk.RayStatus.HIT]
     start, _ = _clip(field, eye, d)
     found: dict[str, tuple[np.ndarray, np.ndarray]] = {}
     for bound, overstep in rules:

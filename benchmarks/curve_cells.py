@@ -139,7 +139,7 @@ def _chords(count: int) -> tuple[FloatArray, FloatArray]:
 
 def _bounces(field: Any, count: _Rays) -> tuple[FloatArray, FloatArray]:
     hits = hk.trace(field, *_camera(count.width))
-    position, normal = hits.position[hits.hit], hits.normal[hits.hit]
+    position, normal = hits.position[hits.is_hit], hits.normal[hits.is_hit]
     rng = np.random.default_rng(1)
     chosen = rng.integers(len(position), size=count.count)
     d, normal = _unit(rng.normal(size=(count.count, 3))), normal[chosen]

@@ -113,8 +113,8 @@ def along_rays(series: str, elements: int, field: hk.Field) -> AlongRays:
     seconds = float(np.median([seconds_of(call) for _ in range(REPEATS)]))
     n, status = kept[0].evaluations.numpy(), kept[0].status.numpy()
     return AlongRays(
-        series, elements, float((status == int(hk.Status.HIT)).mean()), float(n.mean()),
-        int(n.max()), int((status == int(hk.Status.OUT_OF_STEPS)).sum()), seconds / n.size * 1e6,
+        series, elements, float((status == int(hk.RayStatus.HIT)).mean()), float(n.mean()),
+        int(n.max()), int((status == int(hk.RayStatus.OUT_OF_STEPS)).sum()), seconds / n.size * 1e6,
     )  # fmt: skip
 
 

@@ -18,8 +18,8 @@ import numpy as np
 
 import harnack as hk
 from harnack.backend import choose_backend, to_vector3
-from harnack.enclosures import Lipschitz, Slopes
-from harnack.enclosures.parabola import Parabola
+from harnack.enclosures import Lipschitz, SlopeRange
+from harnack.enclosures.parabola import ParabolaEnclosure
 from harnack.fields.formula import Formula
 
 _WIDTH, _FAR, _NEAR, _MOST = 96, 40.0, 1e-4, 600
@@ -240,15 +240,17 @@ class _Ellipsoid(Formula):
         return (x * x + (2 * y) ** 2 + (2 * z) ** 2) ** 0.5 * 0.5 - 0.5  # type: ignore[operator]
 
 
-class _Tangent(Parabola):
+class _Tangent(ParabolaEnclosure):
     """Of a convex f with a Lipschitz constant K: slope s <= F(s) <= K s (Hart's Theorem 4, asked of
     f itself)."""
 
     @classmethod
-    def of(cls, promise: Any, value: Any, error: Any, slopes: Slopes) -> _Tangent | None:
+    def from_promise(
+        cls, promise: Any, value: Any, error: Any, slopes: SlopeRange
+    ) -> _Tangent | None:
         if not isinstance(promise, Lipschitz):
             return None
-        return cls(Slopes(slopes.low, promise.constant), 0.0, 0.0, promise.radius)
+        return cls(SlopeRange(slopes.lower, promise.constant), 0.0, 0.0, promise.radius)
 
 
 def hart() -> str:

@@ -88,7 +88,7 @@ def _measured(path: Path) -> _Row | str:
     (x, _, z), vent = whole.bounds.mean(axis=0), hk.Cylinder(_VENT, 6.0).rotated(90, "x")
     axes = [np.array((x + side, whole.bounds[0, 1], z)) for side in (-15.0, 5.0)]
     for place in axes:
-        made = made - vent.moved(tuple(place))
+        made = made - vent.translated(tuple(place))
     said: list[str] = []
     with tempfile.TemporaryDirectory() as folder:
         try:

@@ -12,7 +12,7 @@ import numpy as np
 import harnack as hk
 from harnack.backend import choose_backend, to_float, to_vector3
 from harnack.enclosures import Enclosure
-from harnack.enclosures.literature import AffineBand, BottomUpLinear
+from harnack.enclosures.literature import AffineEnclosure, BottomUpLinearEnclosure
 
 from .bisection import bisect
 from .blobs import BlobFormula, Scene
@@ -35,8 +35,8 @@ METHODS: tuple[Method, ...] = (
     ("pieces, hk.Blobs (the default)", "blobs", True, None),
 )
 _BISECTED: dict[str | None, type[Enclosure]] = {
-    "bisect affine": AffineBand,
-    "bisect linear": BottomUpLinear,
+    "bisect affine": AffineEnclosure,
+    "bisect linear": BottomUpLinearEnclosure,
 }
 
 
@@ -83,7 +83,7 @@ def measure(
         level,
         bound=bound,
         overstep=1.0,
-        tolerance=hk.Tolerance(distance=0.0, value=1e-3),
+        tolerance=hk.HitTolerance(distance=0.0, value=1e-3),
     )
     hits = None
     for _ in range(3):  # the first run compiles
@@ -92,8 +92,8 @@ def measure(
         dr.sync_thread()
         seconds.append(time.process_time() - core)
     assert hits is not None
-    hit = hits.status.numpy() == int(hk.Status.HIT)
-    assert not (hits.status.numpy() == int(hk.Status.OUT_OF_STEPS)).any()
+    hit = hits.status.numpy() == int(hk.RayStatus.HIT)
+    assert not (hits.status.numpy() == int(hk.RayStatus.OUT_OF_STEPS)).any()
     looks = hits.evaluations.numpy()
     return _row(method, hits.t.numpy(), hit, looks, seconds, lengths, reference)
 

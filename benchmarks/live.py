@@ -90,7 +90,8 @@ _DRAG = """async ([seconds, rate]) => {
 def live() -> str:
     """A table of both ways to draw."""
     lines = [
-        f"A vertex of a trefoil of {VERTICES} vertices is dragged in Chromium, in a window of "
+        f"A vertex of a trefoil of {VERTICES} vertices is dragged in Chromium, in a "
+        "window of "
         f"{SIZE} x {SIZE} pixels, with {EVENTS} events a second. *Latency* is the time from an "
         "event to the first picture that shows it. The last "
         "column is the time from the last event to the first picture with a ray for every pixel. "

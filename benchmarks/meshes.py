@@ -123,7 +123,7 @@ def _curve_errors(loop: FloatArray, made: trimesh.Trimesh) -> tuple[float, float
     direction = rng.normal(size=(8 * _HITS, 3))
     origin = 4 * direction / np.linalg.norm(direction, axis=1)[:, None]
     hits = hk.trace(hk.SolidAngle(loop), origin, rng.uniform(-1, 1, origin.shape) - origin)
-    missed = _distances(made, np.asarray(hits.position[hits.hit])[:_HITS]).max() / size
+    missed = _distances(made, np.asarray(hits.position[hits.is_hit])[:_HITS]).max() / size
     return float(error.max()), float(np.sqrt((error**2).mean())), float(missed)
 
 

@@ -13,8 +13,8 @@ import numpy as np
 import harnack as hk
 from harnack.rendering import Camera, register
 from harnack.rendering.integrator import PathTracer
-from harnack.rendering.light_paths import Exposing, expose
-from harnack.rendering.stage import StudioObject, material_of, studio
+from harnack.rendering.light_paths import PathRenderTask, render_paths
+from harnack.rendering.stage import StudioObject, build_studio, parse_material
 
 _SIZE, _SPP, _ROUNDS = (400, 300), 16, 3
 _RINGS = 350
@@ -28,13 +28,13 @@ def _field(move: float = 0.0) -> hk.Field:
 def pictures() -> str:
     """The section of the page."""
     mi = register()
-    material = material_of("two-tone")
+    material = parse_material("two-tone")
 
     def staged(fields: list[hk.Field]) -> Any:
         rays = 3 * _SIZE[0] * _SIZE[1] * _SPP  # as `render` counts them
         surfaces = (hk.level_set(one).for_rays(rays) for one in fields)
-        objects = [StudioObject(one, material, fitted=True) for one in surfaces]
-        return studio(mi, objects, size=_SIZE, camera=Camera())
+        objects = [StudioObject(one, material, has_default_tolerance=True) for one in surfaces]
+        return build_studio(mi, objects, size=_SIZE, camera=Camera())
 
     one, three = staged([_field()]), staged([_field(x) for x in (-2.2, 0.0, 2.2)])
     ours = _radiance(mi, mi.load_dict(one.scene, parallel=False))
@@ -81,7 +81,9 @@ def _radiance(mi: Any, scene: Any, clamp: float | None = None) -> Callable[[], n
 
     def draw() -> np.ndarray:
         sensor = scene.sensors()[0]
-        image = expose(Exposing(mi, scene, sensor, tracer, _SPP, 0), lambda _: None).image
+        image = render_paths(
+            PathRenderTask(mi, scene, sensor, tracer, _SPP, 0), lambda _: None
+        ).image
         return image[..., :3]
 
     return draw
@@ -109,7 +111,7 @@ def _as_mesh(mi: Any, made: Any) -> tuple[Any, int]:
     r, turn = (part.ravel() for part in np.meshgrid(r, turn, indexing="ij"))
     flat = 0.9995 * r[:, None] * np.column_stack([np.cos(turn), np.sin(turn)])
     o = np.column_stack([np.vstack([[0, 0], flat]), np.full(len(flat) + 1, 2.0)])
-    fine = replace(carrier.surface, tolerance=hk.Tolerance(1e-5))
+    fine = replace(carrier.surface, tolerance=hk.HitTolerance(1e-5))
     hits = hk.trace(fine, o, [[0, 0, -1.0]])
     j, i = np.meshgrid(np.arange(_RINGS), np.arange(_RINGS - 2))
 
@@ -120,7 +122,7 @@ def _as_mesh(mi: Any, made: Any) -> tuple[Any, int]:
     middle = np.column_stack([0 * first, at(0, first), at(0, first + 1)])
     a, b, c, d = at(i, j), at(i, j + 1), at(i + 1, j), at(i + 1, j + 1)
     faces = np.vstack([middle, np.column_stack([a, c, d]), np.column_stack([a, d, b])])
-    faces = faces[hits.hit[faces].all(axis=1)]
+    faces = faces[hits.is_hit[faces].all(axis=1)]
     vertices = carrier.placement.apply(np.nan_to_num(hits.position))
     props = mi.Properties()
     props["bsdf"] = carrier.bsdf()

@@ -291,7 +291,7 @@ def by_harnack(
     finally:
         dr.set_thread_count(before)
     assert hits is not None
-    hit = hits.status.numpy() == int(hk.Status.HIT)
+    hit = hits.status.numpy() == int(hk.RayStatus.HIT)
     return np.where(hit, hits.t.numpy(), np.inf), min(cores[1:]), min(walls[1:])
 
 
@@ -383,7 +383,7 @@ def by_isoray(drawn: Drawn, d: np.ndarray) -> tuple[np.ndarray, float]:
         np.broadcast_to(EYE, d.shape), d, near, far, far > near,
         NaturalIntervalInclusion(recipe), function, threshold=TOLERANCE,
     )  # fmt: skip
-    return np.where(made.hit, made.t, np.inf), time.process_time() - core
+    return np.where(made.is_hit, made.t, np.inf), time.process_time() - core
 
 
 @contextlib.contextmanager

@@ -70,12 +70,12 @@ def measure(
         seconds.append(wall if backend.name == "cuda" else core)
     assert hits is not None
     n, status = hits.evaluations.numpy(), hits.status.numpy()
-    hit = status == int(hk.Status.HIT)
+    hit = status == int(hk.RayStatus.HIT)
     median = float(np.median(seconds[1:]))
     vertex = median / (n.sum() * scene.vertices) * 1e9 if scene.vertices else float("nan")
     return Row(
         scene.name, name, float(n.mean()), float(n[hit].mean()), int(n.max()),
-        int((status == int(hk.Status.OUT_OF_STEPS)).sum()), int(hit.sum()), median, vertex,
+        int((status == int(hk.RayStatus.OUT_OF_STEPS)).sum()), int(hit.sum()), median, vertex,
     )  # fmt: skip
 
 
@@ -83,7 +83,7 @@ def published(scene: Scene) -> Row:
     """The classic rule as published: no clip volume, so rays march past the surface to t_max."""
     field = scene.make()
     assert isinstance(field, hk.SolidAngle)
-    open_field = WithoutExtent(list(field.loops), certificate="paper")
+    open_field = WithoutExtent(list(field.loops), lift_bound="paper")
     return measure(scene, ("classic, as published (no clip)", "classic", 1.75), open_field)
 
 

@@ -19,7 +19,7 @@ import numpy.typing as npt
 import trimesh
 
 import harnack as hk
-from harnack.field_from_file import read_surface
+from harnack.field_from_file import read_geometry
 from harnack.geometry.example_meshes import torus_mesh
 from harnack.meshing.checks import intersecting_faces
 
@@ -169,7 +169,7 @@ def _meshes(folder: Path | None) -> dict[str, Arrays]:
         "box": _arrays(trimesh.creation.box((1.0, 0.7, 0.4)).subdivide_to_size(0.04)),
         "knot": _knot(),
         "rings": _rings(),
-        "gear": _arrays(hk.mesh(hk.Extruded([_gear()], 0.4)).subdivide_to_size(0.06)),
+        "gear": _arrays(hk.mesh(hk.Extrusion([_gear()], 0.4)).subdivide_to_size(0.06)),
         "gyroid": _arrays(
             hk.mesh(
                 hk.solid(hk.Gyroid(1.0), between=(-0.4, 0.4)) & hk.Sphere(0.6),
@@ -187,7 +187,7 @@ def _meshes(folder: Path | None) -> dict[str, Arrays]:
         ),
     }
     for path in sorted(folder.glob("*.obj")) if folder else []:
-        mesh: Any = read_surface(path, "winding")
+        mesh: Any = read_geometry(path, "winding")
         vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
         joined = trimesh.Trimesh(vertices, faces, process=False)
         joined.merge_vertices(merge_tex=True, merge_norm=True)

@@ -63,7 +63,7 @@ def measure() -> dict[str, list[float]]:
             hits = hk.trace(surface, o, d, t_max=10.0)
             dr.sync_thread()
             seconds.append(time.process_time() - start)
-        n, hit = hits.evaluations.numpy(), hits.hit.numpy()
+        n, hit = hits.evaluations.numpy(), hits.is_hit.numpy()
         rows[name] = [float(n.mean()), float(n[hit].mean()), min(seconds) / len(n) * 1e6]
     return rows
 

@@ -132,9 +132,9 @@ def throughput(surface: Path | None = None) -> str:
     ]
     if surface is not None:
         # Here: `versions` runs this file with earlier versions of the package.
-        from harnack.files import read_surface
+        from harnack.files import read_geometry
 
-        read: Any = read_surface(surface, "winding")
+        read: Any = read_geometry(surface, "winding")
         mesh = np.asarray(read.vertices, np.float64), np.asarray(read.faces, np.int64)
         groups += [(surface.stem, mesh, query_points(mesh[0]), m) for m in ("exact", "tree")]
     lines = [

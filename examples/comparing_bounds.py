@@ -25,7 +25,7 @@ def main(folder: Path, size: tuple[int, int] = (640, 480)) -> dict[str, float]:
     for bound in ("classic", "slope", "caps", None):
         hits = hk.trace(field, origins, [[0.1, 0.2, -1.0]], bound=bound)
         work[bound or "default"] = float(hits.evaluations.mean())
-        found.add(int((hits.status == hk.Status.HIT).sum()))
+        found.add(int((hits.status == hk.RayStatus.HIT).sum()))
     for name, evaluations in work.items():
         print(f"{name:8} {evaluations:6.1f} evaluations a ray")
     print(f"hits of each: {found}")

@@ -56,7 +56,7 @@ def main(folder: Path, size: tuple[int, int] = (640, 480), spp: int = 32) -> hk.
         "lamp": {"type": "sphere", "center": [5, -1, 6], "radius": 1.2, "emitter": lamp},
         "floor": {"type": "rectangle", "to_world": ground, "bsdf": white},
         "mirror": {"type": "sphere", "center": [0.6, 3, -0.3], "radius": 1.1, "bsdf": mirror},
-        "knot": hk.rendering.shape(knot, bsdf={"type": "tinted"}),
+        "knot": hk.rendering.mitsuba_shape(knot, bsdf={"type": "tinted"}),
     }
     return hk.render(scene, folder / "mitsuba_scene.png", spp=spp)
 

@@ -13,15 +13,15 @@ import numpy as np
 
 import harnack as hk
 
-HEXAGON = hk.outline.regular(6, 13 / math.sqrt(3))  # 13 mm from side to side
+HEXAGON = hk.outline.regular_polygon(6, 13 / math.sqrt(3))  # 13 mm from side to side
 
 
 def bolt() -> hk.Solid:
-    return hk.thread("M8", 22.0) | hk.Extruded(HEXAGON, 5.3).moved((0, 0, -5.3))
+    return hk.metric_thread("M8", 22.0) | hk.Extrusion(HEXAGON, 5.3).translated((0, 0, -5.3))
 
 
 def nut() -> hk.Solid:
-    return hk.Extruded(HEXAGON, 6.5) - hk.thread("M8", 8.0, internal=True, clearance=0.1)
+    return hk.Extrusion(HEXAGON, 6.5) - hk.metric_thread("M8", 8.0, internal=True, clearance=0.1)
 
 
 def vase() -> hk.Solid:
@@ -29,10 +29,10 @@ def vase() -> hk.Solid:
     angle = np.linspace(0, 2 * math.pi, 420, endpoint=False)
     radius = 24 + 2.5 * np.cos(7 * angle)
     ring = np.column_stack([radius * np.cos(angle), radius * np.sin(angle)])
-    body = hk.Extruded([ring], 90.0, twist=90.0, taper=1.5)
+    body = hk.Extrusion([ring], 90.0, twist=90.0, taper=1.5)
     # The hollow goes on above the rim, and ends above the floor.
-    hollow = hk.Extruded([(1 - 1.8 / 24) * ring], 99.0, twist=99.0, taper=1.55)
-    return body - (hollow & hk.Cuboid((60.0, 60.0, 60.0)).moved((0, 0, 62)))
+    hollow = hk.Extrusion([(1 - 1.8 / 24) * ring], 99.0, twist=99.0, taper=1.55)
+    return body - (hollow & hk.Cuboid((60.0, 60.0, 60.0)).translated((0, 0, 62)))
 
 
 def plate() -> hk.Solid:
@@ -40,7 +40,7 @@ def plate() -> hk.Solid:
     low, high = np.concatenate(word).min(axis=0) - 4, np.concatenate(word).max(axis=0) + 4
     rim = np.array([low, (high[0], low[1]), high, (low[0], high[1])])
     # A little way into the plate, so that no faces coincide.
-    return hk.Extruded([rim], 2.0) | hk.Extruded(word, 1.5).moved((0, 0, 1.5))
+    return hk.Extrusion([rim], 2.0) | hk.Extrusion(word, 1.5).translated((0, 0, 1.5))
 
 
 def lattice() -> hk.Solid:
@@ -67,11 +67,11 @@ PLACES = {
 }
 
 
-def standing(name: str) -> hk.LevelSet:
+def standing(name: str) -> hk.Surface:
     part, place = PARTS[name](), PLACES[name]
     if isinstance(part, hk.SolidAngle):
         return hk.level_set(hk.SolidAngle([loop + place for loop in part.loops]))
-    return hk.level_set(part.moved(place), tolerance=hk.Tolerance(2e-3))
+    return hk.level_set(part.translated(place), tolerance=hk.HitTolerance(2e-3))
 
 
 def main(

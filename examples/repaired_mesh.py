@@ -28,7 +28,7 @@ def main(folder: Path, size: tuple[int, int] = (640, 480)) -> trimesh.Trimesh:
         size=size,
         camera=hk.Camera(elevation=40),
     )
-    whole = hk.repair(broken, patches="harmonic")
+    whole = hk.repair(broken, filling="harmonic")
     whole.export(folder / "repaired_mesh.stl")
     print(f"watertight: {broken.is_watertight}, then {whole.is_watertight}")
     return whole

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from harnack.cli.messages import interrupts_noticed
+from harnack.cli.messages import track_interrupts
 
 from .page import write
 from .registry import FIGURES
@@ -37,7 +37,7 @@ def main() -> int:
     columns = (
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
     )  # fmt: skip
-    with interrupts_noticed() as interrupts:
+    with track_interrupts() as interrupts:
         try:
             with Progress(*columns) as progress:
                 task = progress.add_task("figures", total=len(chosen))
@@ -55,7 +55,7 @@ def main() -> int:
             pass
         except RuntimeError:
             # Ctrl-C within a plug-in reaches us as an error of Mitsuba or Dr.Jit.
-            if not interrupts.asked:
+            if not interrupts.pressed:
                 raise
     print("stopped; the figures before this one are written", file=sys.stderr)
     return 130

@@ -36,7 +36,7 @@ def figure_7(width: int) -> Report:
             most, lost = max(most, counts.most), lost + counts.out_of_steps
             positive = (found.value > 0)[:, None]
             color = np.where(positive, FRONT, BACK)
-            row.append(Panel(halved(view.shade(found.normal, found.hit, color, 0.8 * color)),
+            row.append(Panel(halved(view.shade(found.normal, found.is_hit, color, 0.8 * color)),
                              f"l = {degree}, m = {order}"))  # fmt: skip
         rows.append(row)
     caption = (
@@ -141,8 +141,9 @@ def figure_21(width: int) -> Report:
     camera = Camera(azimuth=-50, elevation=26)
     picture, counts = scene("eigenfunctions", 2 * width, camera=camera)
     terms = [
-        hk.Product(1.0, x=hk.sine(k), y=hk.sine(k), z=hk.sine(k)) for k in (6.0, 2.0)
-    ]  # fmt: skip
+        hk.WaveProduct(1.0, x=hk.sine_factor(k), y=hk.sine_factor(k), z=hk.sine_factor(k))
+        for k in (6.0, 2.0)
+    ]
     side = math.pi / 2
     box = hk.Box((-side, -side, -side), (side, side, side))
     field = hk.EigenfunctionSum(terms, domain=box)

@@ -54,8 +54,8 @@ class Counts:
     @classmethod
     def of(cls, status: npt.NDArray[np.int64], evaluations: npt.NDArray[np.int64]) -> Counts:
         """Of the status and the number of evaluations of each ray, in arrays of one shape."""
-        hit = status == int(hk.Status.HIT)
-        lost = status == int(hk.Status.OUT_OF_STEPS)
+        hit = status == int(hk.RayStatus.HIT)
+        lost = status == int(hk.RayStatus.OUT_OF_STEPS)
         hitting = float(evaluations[hit].mean()) if hit.any() else 0.0
         return cls(
             status.size, int(hit.sum()), int(lost.sum()), float(evaluations.mean()), hitting,

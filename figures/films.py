@@ -29,12 +29,12 @@ def figure_11(width: int) -> Report:
     for distance in _DISTANCES:
         field = hk.SolidAngle([_square(distance), _square(-distance)[::-1]])
         hits = view.trace(field)
-        assert (hits.status != hk.Status.OUT_OF_STEPS).all()
-        top.append(Panel(halved(view.shade(hits.normal, hits.hit)), f"d = {distance:g}"))
+        assert (hits.status != hk.RayStatus.OUT_OF_STEPS).all()
+        top.append(Panel(halved(view.shade(hits.normal, hits.is_hit)), f"d = {distance:g}"))
         necks.append(_neck(field))
         film = _film(distance)
         met = mesh_hits(film.vertices, film.faces, view.eye, view.directions())
-        below.append(Panel(halved(view.shade(met.normal, met.hit, BACK, FRONT)), film.name))
+        below.append(Panel(halved(view.shade(met.normal, met.is_hit, BACK, FRONT)), film.name))
         texts.append(f"{film.neck:.2f}" if film.neck else "two squares")
     last = _last_film()
     caption = (
@@ -63,7 +63,7 @@ def _square(height: float) -> Array:
 def _neck(field: hk.SolidAngle) -> float | None:
     """Distance of the level set from the axis at z = 0, along x; None if it is not met."""
     hits = hk.trace(field, [[0, 0, 0]], [[1, 0, 0]], precision="double", t_max=3.0)
-    return float(hits.t[0]) if hits.hit[0] else None
+    return float(hits.t[0]) if hits.is_hit[0] else None
 
 
 @dataclass(frozen=True)

@@ -202,28 +202,28 @@ def figure_24(width: int) -> Report:
     field = hk.SolidAngle(loop)
     view = View.of(1.25 * loop, tuple(2 * s for s in fitting(width)), Camera(-60, 24))
     truth = view.trace(field, tolerance=1e-7, precision="double")
-    real = np.where(truth.hit, truth.t, np.inf)
+    real = np.where(truth.is_hit, truth.t, np.inf)
     panels, texts = [], []
     for cells, keep in ((48, False), (144, False), (48, True), (144, True)):
         vertices, faces, close = _marching_cubes(field, cells)
         faces, close = (faces[close], close[close]) if keep else (faces, close)
         met = mesh_hits(vertices, faces, view.eye, view.directions())
-        face = np.where(met.hit, met.face, 0)
+        face = np.where(met.is_hit, met.face, 0)
         front, back = (np.where(close[face][:, None], c, _FALSE_SHEET) for c in (FRONT, BACK))
-        shown = view.shade(met.normal, met.hit, front, back)
-        lost = truth.hit & ~met.hit
+        shown = view.shade(met.normal, met.is_hit, front, back)
+        lost = truth.is_hit & ~met.is_hit
         shown = marked(shown, lost, MISSED)
-        wrong = met.hit & ~((met.t < real + APART) & (met.t > real - APART))
+        wrong = met.is_hit & ~((met.t < real + APART) & (met.t > real - APART))
         name = f"{cells}^3 cells, filtered" if keep else f"{cells}^3 cells"
         panels.append(Panel(halved(shown), name))
         texts.append(
             f"{name}: {len(faces):,} triangles, {100 * (~close).mean():.0f} % of them far from "
-            f"the level; of {int(truth.hit.sum()):,} hits {int(lost.sum()):,} are lost, and "
+            f"the level; of {int(truth.is_hit.sum()):,} hits {int(lost.sum()):,} are lost, and "
             f"{int(wrong.sum()):,} rays end more than {APART} from the surface"
         )
     ours = view.trace(field)
-    off = ours.hit != truth.hit
-    panels.append(Panel(halved(view.shade(ours.normal, ours.hit)), "harnack"))
+    off = ours.is_hit != truth.is_hit
+    panels.append(Panel(halved(view.shade(ours.normal, ours.is_hit)), "harnack"))
     caption = (
         "Marching cubes (scikit-image; unproved) of the solid angle of 12 vertices modulo 4π, "
         "level 2π, on grids of [-1.3, 1.3]³. Triangles whose middle is farther than π/2 from the "

@@ -48,12 +48,12 @@ def figure_12(width: int) -> Report:
             ends = published(claim, view.eye, d, middle - _REACH, middle + _REACH)
         t = np.full(len(near), np.inf)
         t[near] = ends.t
-        real = np.where(truth.hit, truth.t, np.inf)
+        real = np.where(truth.is_hit, truth.t, np.inf)
         lost = np.zeros(len(near), bool)
         lost[near] = ~np.isfinite(ends.t) & (ends.evaluations >= MOST)
-        missed = truth.hit & (t > real + APART) & ~lost
+        missed = truth.is_hit & (t > real + APART) & ~lost
         false = np.isfinite(t) & (t < real - APART)
-        shown = view.shade(truth.normal, truth.hit)
+        shown = view.shade(truth.normal, truth.is_hit)
         for where, color in ((missed, MISSED), (false, FALSE)):
             shown = marked(shown, where, color)
         first.append(Panel(doubled(shown), name))
@@ -62,32 +62,35 @@ def figure_12(width: int) -> Report:
             f"{int(lost.sum()):,} out of {MOST} steps"
         )
     ours = view.trace(field)
-    gone = truth.hit & ~(ours.t < truth.t + APART) | ours.hit & ~truth.hit
+    gone = truth.is_hit & ~(ours.t < truth.t + APART) | ours.is_hit & ~truth.is_hit
     wrong: list[str] = []
     gradients: tuple[tuple[str, Callable[[Array, Array], Array]], ...] = (
         ("Biot-Savart", formulas.biot_savart), ("Adiels", formulas.adiels),
         ("differences", formulas.differences),
     )  # fmt: skip
-    at = truth.position[truth.hit].astype(np.float32)
+    at = truth.position[truth.is_hit].astype(np.float32)
     for name, gradient in gradients:
         with np.errstate(all="ignore"):
             found = gradient(loop, at).astype(np.float64)
             found /= np.linalg.norm(found, axis=1, keepdims=True)
-        angle = np.degrees(np.arccos(np.clip((found * truth.normal[truth.hit]).sum(axis=1), -1, 1)))
+        angle = np.degrees(
+            np.arccos(np.clip((found * truth.normal[truth.is_hit]).sum(axis=1), -1, 1))
+        )
         normal = np.zeros_like(truth.normal)
-        normal[truth.hit] = np.nan_to_num(found)
+        normal[truth.is_hit] = np.nan_to_num(found)
         off = np.zeros(len(near), bool)
-        off[truth.hit] = ~(angle < _OFF)
-        shown = marked(view.shade(normal, truth.hit), off, MISSED)
+        off[truth.is_hit] = ~(angle < _OFF)
+        shown = marked(view.shade(normal, truth.is_hit), off, MISSED)
         second.append(Panel(doubled(shown), name))
         wrong.append(f"{name} {int(off.sum()):,} (median {np.nanmedian(angle):.1e} degrees)")
     caption = (
         "Top (unproved): first hits by the published algorithm in single precision with three "
-        f"formulas of the solid angle of 8 vertices, of {int(truth.hit.sum()):,} hits; missed "
+        f"formulas of the solid angle of 8 vertices, of {int(truth.is_hit.sum()):,} hits; missed "
         f"ones are magenta, hits where nothing is or more than {APART} before the surface green: "
         f"{'; '.join(texts)}. `hk.trace` in single precision differs from the reference on "
         f"{int(gone.sum())} rays. Bottom: normals at the same hits by three formulas of the "
-        f"gradient; off by more than {_OFF:g} degree in magenta: {'; '.join(wrong)}. The errors "
+        f"gradient; off by more than {_OFF:g} degree in magenta: "
+        f"{'; '.join(wrong)}. The errors "
         "at random points are in [benchmarks](benchmarks.md)."
     )
     differs = (

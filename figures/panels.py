@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 import harnack as hk
-from harnack.rendering.images import tone_mapped
+from harnack.rendering.images import tone_map
 from harnack.rendering.scales import viridis
 
 from .figure import Counts
@@ -71,7 +71,7 @@ def drawn(what: Any, size: tuple[int, int], **settings: Any) -> tuple[Pixels, Co
     """A picture by `hk.render`, shaded if nothing else is asked for, and what its first hits took:
     one ray through the middle of each pixel."""
     settings = {"show": "shaded", **settings}
-    image = tone_mapped(hk.render(what, size=size, progress=False, **settings))
+    image = tone_map(hk.render(what, size=size, progress=False, **settings))
     only = {k: v for k, v in settings.items() if k not in ("show", "spp", "seed", "antialias")}
     status, evaluations = (
         hk.render(what, size=size, show=show, progress=False, **only)

@@ -23,22 +23,22 @@ def figure_1(width: int) -> Report:
     loop = example_curves.wavy_polygon(48)
     field = hk.SolidAngle(loop)
     start, towards = np.array([-1.75, 0.0, 1.0]), np.array([1.95, 0.0, -0.97])
-    published = WithoutExtent(loop, certificate="convex")
+    published = WithoutExtent(loop, lift_bound="convex")
     places = _steps(published, start, towards, "classic", 1.0)
     ours = _steps(field, start, towards, None, None)
     size = fitting(4 * width)  # four samples a pixel
     view = View.of([*loop, start], size, Camera(azimuth=-68, elevation=24, zoom=1.05))
     hits = view.trace(field, tolerance=1e-6)
     points, segments = _isolines(field)
-    picture = view.shade(hits.normal, hits.hit)
-    t = np.where(hits.hit, hits.t, np.inf)
+    picture = view.shade(hits.normal, hits.is_hit)
+    t = np.where(hits.is_hit, hits.t, np.inf)
     for lines, color in (
-        (hk.Tubes(points, segments, 0.006), (0.25, 0.25, 0.25)),
-        (hk.Tubes(places[[0, -1]], [(0, 1)], 0.012), (0.75, 0.55, 0.1)),
+        (hk.TubeNetwork(points, segments, 0.006), (0.25, 0.25, 0.25)),
+        (hk.TubeNetwork(places[[0, -1]], [(0, 1)], 0.012), (0.75, 0.55, 0.1)),
     ):
         met = view.trace(lines)
-        nearer = met.hit & (met.t < t)
-        drawn_lines = view.shade(met.normal, met.hit, color, color).reshape(-1, 3)
+        nearer = met.is_hit & (met.t < t)
+        drawn_lines = view.shade(met.normal, met.is_hit, color, color).reshape(-1, 3)
         picture.reshape(-1, 3)[nearer] = drawn_lines[nearer]
         t = np.where(nearer, met.t, t)
     radii = np.linalg.norm(np.diff(places, axis=0), axis=1)
@@ -47,7 +47,7 @@ def figure_1(width: int) -> Report:
     mirrored = d - 2 * (d * hits.normal).sum(axis=1, keepdims=True) * hits.normal
     light = np.sin(16 * np.arcsin(np.clip(mirrored[:, 2], -1, 1))) > 0
     colors = np.where(light[:, None], 0.92, 0.16) * np.ones(3)
-    stripes = view.pixels(np.where(hits.hit[:, None], colors, 1.0))
+    stripes = view.pixels(np.where(hits.is_hit[:, None], colors, 1.0))
     caption = (
         f"The 2π level of the solid angle of a polygon of {len(loop)} vertices, isolines of a "
         "slice every π/2, a ray, and the balls that the published rule proves empty along it: "
@@ -95,7 +95,7 @@ def _steps(
         )  # fmt: skip
         if hits.t[0] > at[-1]:
             at.append(float(hits.t[0]))
-        if hits.status[0] != hk.Status.OUT_OF_STEPS:
+        if hits.status[0] != hk.RayStatus.OUT_OF_STEPS:
             break
     return start + np.array(at)[:, None] * d
 
@@ -179,7 +179,7 @@ def figure_9(width: int) -> Report:
         view = View.of(quad, (2 * size[0], 2 * size[1]), camera)
         patch = _drawn_patch(view, vertices, faces, folded)
         hits = view.trace(field)
-        ours = view.shade(hits.normal, hits.hit, FRONT, FRONT)
+        ours = view.shade(hits.normal, hits.is_hit, FRONT, FRONT)
         rows.append([
             Panel(halved(patch), f"{name}: bilinear patch"),
             Panel(halved(ours), f"{name}: level set"),
@@ -202,10 +202,10 @@ def _drawn_patch(view: View, vertices: Array, faces: Array, folded: Array) -> Pi
     """A patch, pink where a part that is turned over is in front or lies on another."""
     d = view.directions()
     one, other = (mesh_hits(vertices, faces[some], view.eye, d) for some in (~folded, folded))
-    over = (other.t <= one.t + 1e-3) & other.hit
+    over = (other.t <= one.t + 1e-3) & other.is_hit
     normal = np.where(over[:, None], other.normal, one.normal)
     color = np.where(over[:, None], (0.9, 0.2, 0.6), FRONT)
-    return view.shade(normal, one.hit | other.hit, color, color)
+    return view.shade(normal, one.is_hit | other.is_hit, color, color)
 
 
 def _bilinear(quad: Array, n: int) -> tuple[Array, Array, Array]:
@@ -252,8 +252,8 @@ def figure_13(width: int) -> Report:
     caption = (
         "2π levels of a bent square with holes, a link and two knots: scenes of `harnack "
         f"gallery`. Evaluations of all rays and of those that hit: {'; '.join(texts)}; none ran "
-        "out of steps. All steps are proved by the edges' certificate, which needs no property "
-        "of the curve."
+        "out of steps. All steps are proved by the edges' bound of the lift, which needs no "
+        "property of the curve."
     )
     differs = (
         "The paper's curves are not public; ours are of the same kinds. The paper's own constant "

@@ -86,13 +86,13 @@ def published(
 
 def claimed_angle(field: hk.SolidAngle) -> Claim:
     """The solid angle of one loop as the paper claims it: more than -4 pi, up to the loop."""
-    assert field.certificate == "range"
+    assert field.lift_bound == "range"
     backend = choose_backend("double")
     ready = field.prepare(backend)
 
     def look(p: Array) -> tuple[Array, Array, Array]:
         sample = ready.evaluate(to_vector3(backend, p))
-        (ball,) = [one for one in sample.promises if isinstance(one, hk.HarmonicBall)]
+        (ball,) = [one for one in sample.all_promises if isinstance(one, hk.HarmonicBall)]
         return to_numpy(sample.value), to_numpy(sample.gradient), to_numpy(ball.radius)
 
     return Claim(look, -4 * math.pi, field.default_level, 4 * math.pi)

@@ -39,7 +39,7 @@ def figure_14(width: int) -> Report:
     met = mesh_hits(
         fans.reshape(-1, 3), np.arange(3 * len(fans)).reshape(-1, 3), view.eye, view.directions()
     )
-    triangles = view.shade(met.normal, met.hit, (0.72, 0.30, 0.22), (0.85, 0.80, 0.72))
+    triangles = view.shade(met.normal, met.is_hit, (0.72, 0.30, 0.22), (0.85, 0.80, 0.72))
     _, many = scene("patches", width)
     patches = SCENES["patches"].surfaces()[0].field.describe()["faces"]
     caption = (
@@ -115,24 +115,26 @@ def figure_16(width: int) -> Report:
         field = surface.field
         assert isinstance(field, hk.WindingNumber)
         size = fitting(width)
-        vertices, faces = field.mesh.vertices, field.mesh.given
+        vertices, faces = field.mesh.vertices, field.mesh.input_faces
         view = View.of(vertices, (2 * size[0], 2 * size[1]), chosen.camera)
         met = mesh_hits(vertices, faces, view.eye, view.directions())
-        before = view.shade(met.normal, met.hit)
+        before = view.shade(met.normal, met.is_hit)
         start = time.perf_counter()
         picture, counts = scene(name, width)
         seconds = time.perf_counter() - start
         same = replace(view, size=size)  # a quarter of the rays
         hits = same.trace(surface)
-        spans = hits.hit & (hits.sheet < 0)
+        spans = hits.is_hit & (hits.primitive_index < 0)
         met = mesh_hits(vertices, faces, same.eye, same.directions())
-        through = met.hit & ((met.normal * same.directions()).sum(axis=1) > 0)
+        through = met.is_hit & ((met.normal * same.directions()).sum(axis=1) > 0)
         rows.append(
             [Panel(halved(before), f"{len(faces):,} triangles"), Panel(picture, "repaired")]
         )
         texts.append(
-            f"{label}, {len(faces):,} triangles with {len(field.mesh.singular):,} open edges: "
-            f"{counts}; of the hits, {100 * (~spans[hits.hit]).mean():.0f} % are on triangles and "
+            f"{label}, {len(faces):,} triangles with {len(field.mesh.singular_edges):,} open "
+            "edges: "
+            f"{counts}; of the hits, {100 * (~spans[hits.is_hit]).mean():.0f} % are on triangles "
+            "and "
             f"the others on what spans the gaps, where {int(through.sum()):,} rays met the inside "
             f"of a triangle before; {seconds:.1f} s with compilation"
         )

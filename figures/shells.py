@@ -6,7 +6,7 @@ import time
 
 import harnack as hk
 from harnack.gallery import SCENES
-from harnack.rendering.images import tone_mapped
+from harnack.rendering.images import tone_map
 
 from .figure import Report
 from .panels import Panel, drawn, fitting, halved, montage
@@ -31,7 +31,7 @@ def figure_17(width: int) -> Report:
         shell = surfaces[0]
         _, counts = drawn(shell, fitting(width), camera=chosen.camera)
         outline, holes = shell.field.loops[0], shell.field.circles
-        panels.append(Panel(halved(tone_mapped(image)), name))
+        panels.append(Panel(halved(tone_map(image)), name))
         texts.append(
             f"`{name}` ({len(outline)} corners, circles: {len(holes)}): {counts}; the picture "
             f"took {seconds:.1f} s at {size[0]} x {size[1]}"

@@ -42,11 +42,11 @@ def figure_4(width: int) -> Report:
             start, end = _in_ball(view.eye, d)
             truth = view.trace(field, level=level, clip=ball, tolerance=1e-6, confirm=True)
             ends = published(claim, view.eye, d, start, end)
-            missed = truth.hit & ~(ends.t < truth.t + 0.01) & (ends.evaluations < MOST)
+            missed = truth.is_hit & ~(ends.t < truth.t + 0.01) & (ends.evaluations < MOST)
             rising = (truth.normal * d).sum(axis=1) > 0
             for kind, some in ((below, rising), (above, ~rising)):
                 kind[0] += int((missed & some).sum())
-                kind[1] += int((truth.hit & some).sum())
+                kind[1] += int((truth.is_hit & some).sum())
             hit = np.isfinite(ends.t)
             p = view.eye + np.where(hit, ends.t, 0)[:, None] * d
             normal = claim.look(p)[1]
@@ -135,7 +135,7 @@ def _thickness(field: hk.SolidAngle, by_value: float, by_slope: float) -> tuple[
     u = np.linspace(-1, 1, 60)
     grid = np.stack(np.meshgrid(u, u, [2.0], indexing="ij"), axis=-1).reshape(-1, 3)
     hits = hk.trace(field, grid, [[0, 0, -1.0]], precision="double", tolerance=1e-9)
-    foot, normal = hits.position[hits.hit], hits.normal[hits.hit]
+    foot, normal = hits.position[hits.is_hit], hits.normal[hits.is_hit]
     reach = np.geomspace(1e-4, 1.0, 500)
     points = foot[:, None] + reach[:, None] * normal[:, None]
     gap, slope = (a.reshape(len(foot), -1) for a in _gap_and_slope(field, points.reshape(-1, 3)))

@@ -41,8 +41,8 @@ class View:
     def of(cls, points: Any, size: tuple[int, int], camera: Camera | None = None) -> View:
         """That frames points (n, 3), as the studio's camera does."""
         camera = Camera() if camera is None else camera
-        eye, _ = camera.fit(np.asarray(points, np.float64), size)
-        return cls(eye, np.stack(camera.frame()), camera.angle, size)
+        eye, _ = camera.frame_points(np.asarray(points, np.float64), size)
+        return cls(eye, np.stack(camera.axes()), camera.fov_or_default, size)
 
     @property
     def _scale(self) -> float:
@@ -112,7 +112,7 @@ class MeshHits:
     face: npt.NDArray[np.int64]
 
     @property
-    def hit(self) -> npt.NDArray[np.bool_]:
+    def is_hit(self) -> npt.NDArray[np.bool_]:
         return np.isfinite(self.t)
 
 

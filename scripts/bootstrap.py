@@ -171,8 +171,8 @@ def llvm_package(apt: Apt | None) -> list[str]:
         listing = apt.search(pattern)
     found = re.findall(r"^libllvm(\d+)(\S*)", listing, re.MULTILINE)
     packages = {int(major): f"libllvm{major}{suffix}" for major, suffix in found}
-    best = max(packages, key=llvm.preference, default=None)
-    if best is None or llvm.refusal_of(best) is not None:
+    best = max(packages, key=llvm.preference_key, default=None)
+    if best is None or llvm.rejection_reason(best) is not None:
         print(f"setup: the package archive has no LLVM {llvm.MINIMUM_MAJOR} or newer")
         return []
     return [packages[best]]
@@ -212,7 +212,7 @@ class Apt:
             run(command, DEBIAN_FRONTEND="noninteractive")
 
     def missing_dependencies(self, packages: Sequence[str]) -> list[str]:
-        """What `packages` need, directly or not, that this system does not have."""
+        """What `package_versions` need, directly or not, that this system does not have."""
         kinds = ("recommends", "suggests", "conflicts", "breaks", "replaces", "enhances")
         switches = [f"--no-{kind}" for kind in kinds]
         tree = run(["apt-cache", *self.options, "depends", "--recurse", *switches, *packages])

@@ -20,15 +20,15 @@ def main(folder: Path) -> None:
     """Draw all of them into a folder."""
     shaded: dict[str, Any] = {"show": "shaded", "size": (400, 300)}
     net = [
-        hk.Isolines("z", spacing=0.1, width=0.012),
+        hk.Isolines("z", interval=0.1, width=0.012),
         hk.Isolines(
-            lambda x, y, z: (3 * x * x * y - y**3) / 2, spacing=0.1, width=0.012, color="white"
+            lambda x, y, z: (3 * x * x * y - y**3) / 2, interval=0.1, width=0.012, color="white"
         ),
     ]
     graph = hk.HeightField(lambda x, y: (x**3 - 3 * x * y * y) / 2, domain=hk.Ball())
     hk.render(graph, folder / "view-conjugates.png", isolines=net, material="plastic", **shaded)
     trefoil = hk.SolidAngle(hk.geometry.example_curves.torus_knot(2, 3, 60))
-    heights = hk.Isolines("z", spacing=0.2, color="white")
+    heights = hk.Isolines("z", interval=0.2, color="white")
     sky = ("white", "steelblue")
     hk.render(trefoil, folder / "view-heights.png", isolines=heights, backdrop=sky, **shaded)
     gyroid = hk.Gyroid(1.0, domain=hk.Ball(radius=1.0))

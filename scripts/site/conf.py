@@ -96,7 +96,7 @@ CONTENTS = {
         )
     ],
     "Measured": ["docs/benchmarks", "docs/figures", "docs/misprints"],
-    "Project": ["docs/architecture", "CONTRIBUTING", "CHANGELOG"],
+    "Project": ["docs/architecture", "docs/glossary", "CONTRIBUTING", "CHANGELOG"],
 }
 
 

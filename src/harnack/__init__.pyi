@@ -36,7 +36,7 @@ from .arithmetic import (
 from .backend.tensors import wrap_for_jax, wrap_for_torch
 from .cluster.zarr_files import to_zarr
 from .distance import (
-    Curvatures,
+    CurvatureSamples,
     DistanceBounds,
     closest_points,
     curvature,
@@ -44,12 +44,12 @@ from .distance import (
     distance_bounds,
     signed_distance,
 )
-from .enclosures.bounded_laplacian import GreenBall
+from .enclosures.bounded_laplacian import BoundedLaplacianEnclosure
 from .enclosures.enclosure import Enclosure
-from .enclosures.harmonic_ball import Caps, Classic, Slope
-from .enclosures.parabola import Cone, Parabola, Taylor
-from .enclosures.piecewise_taylor import Pieces
-from .enclosures.promises import BoundedLaplacian, Curvature, HarmonicBall, Lipschitz
+from .enclosures.harmonic_ball import HarnackEnclosure, HarnackSlopeEnclosure, SphericalCapEnclosure
+from .enclosures.parabola import LipschitzEnclosure, ParabolaEnclosure, TaylorEnclosure
+from .enclosures.piecewise_taylor import PiecewiseTaylorEnclosure
+from .enclosures.promises import BoundedLaplacian, HarmonicBall, Lipschitz, TaylorRemainder
 from .fields.analytic.branches import BranchPoint
 from .fields.analytic.fourier_series import FourierSeries
 from .fields.analytic.hyperspherical import HypersphericalHarmonic
@@ -58,10 +58,10 @@ from .fields.analytic.periodic import EigenfunctionSum, Gyroid, SchwarzD, Schwar
 from .fields.analytic.plane import HeightField, LevelCurves
 from .fields.analytic.polynomial import HarmonicPolynomial, SphericalHarmonic
 from .fields.analytic.riemann_surface import RiemannSurface
-from .fields.analytic.waves import PlaneWave, Product, cosine, sine
+from .fields.analytic.waves import PlaneWave, WaveProduct, cosine_factor, sine_factor
 from .fields.blobs.blobs import Blobs, Molecule
 from .fields.blobs.hrbf import HRBF
-from .fields.blobs.kernels import Compact, Cubic, Gaussian, Sextic
+from .fields.blobs.kernels import CompactKernel, CubicKernel, GaussianKernel, SexticKernel
 from .fields.expressions import expression
 from .fields.field import Field, Sample
 from .fields.solid_angles.dipole import DipolePotential
@@ -71,8 +71,8 @@ from .fields.solid_angles.screened import ScreenedWindingNumber
 from .fields.solid_angles.solid_angle import SolidAngle
 from .fields.solid_angles.winding_number import WindingNumber
 from .fields.solids.booleans import intersection, union
-from .fields.solids.extrusions import Extruded, Revolved
-from .fields.solids.fractal import Displaced, FractalNoise, Noise
+from .fields.solids.extrusions import Extrusion, SolidOfRevolution
+from .fields.solids.fractal import DisplacedSolid, FractalNoise, Noise
 from .fields.solids.from_field import solid
 from .fields.solids.julia import Julia
 from .fields.solids.primitives import (
@@ -87,112 +87,112 @@ from .fields.solids.primitives import (
     Supertorus,
     Torus,
 )
-from .fields.solids.solid import Shape, Solid
-from .fields.solids.thread import Thread, thread
-from .fields.solids.tube import Tube, Tubes
+from .fields.solids.solid import FormulaSolid, Solid
+from .fields.solids.thread import Thread, metric_thread
+from .fields.solids.tube import Tube, TubeNetwork
 from .files import outline
-from .geometry import Ball, Box, Circle, ConvexHull, HalfSpace, Intersection
+from .geometry import Ball, Box, Circle, ConvexHull, HalfSpace, VolumeIntersection
 from .meshing import (
     MeshingError,
     PrintCheck,
     PrintProblem,
-    Thickness,
+    WallThickness,
     check_print,
     mesh,
     repair,
-    thickness,
+    wall_thickness,
 )
 from .rendering import Camera, Isolines, animate, render
-from .tracer import AllHits, Hits, LevelSet, Status, Tolerance, level_set, trace
-from .view import SavedScene, SceneFileError, Slider, View, page, read_scene, view, write_scene
+from .tracer import Hits, HitTolerance, RayCrossings, RayStatus, Surface, level_set, trace
+from .view import LiveView, SceneFile, SceneFileError, Slider, page, read_scene, view, write_scene
 
 __all__ = [
     "HRBF",
-    "AllHits",
     "Ball",
     "Blobs",
     "BoundedLaplacian",
+    "BoundedLaplacianEnclosure",
     "Box",
     "BranchPoint",
     "Camera",
-    "Caps",
     "Capsule",
     "Circle",
-    "Classic",
-    "Compact",
-    "Cone",
+    "CompactKernel",
     "ConvexHull",
-    "Cubic",
+    "CubicKernel",
     "Cuboid",
-    "Curvature",
-    "Curvatures",
+    "CurvatureSamples",
     "Cylinder",
     "DipolePotential",
-    "Displaced",
+    "DisplacedSolid",
     "DistanceBounds",
     "DoubleCone",
     "EigenfunctionSum",
     "Ellipsoid",
     "Enclosure",
-    "Extruded",
+    "Extrusion",
     "Field",
+    "FormulaSolid",
     "FourierSeries",
     "FractalNoise",
-    "Gaussian",
-    "GreenBall",
+    "GaussianKernel",
     "Gyroid",
     "HalfSpace",
     "HarmonicBall",
     "HarmonicPolynomial",
+    "HarnackEnclosure",
+    "HarnackSlopeEnclosure",
     "HeightField",
+    "HitTolerance",
     "Hits",
     "HypersphericalHarmonic",
-    "Intersection",
     "Isolines",
     "Julia",
     "LevelCurves",
-    "LevelSet",
     "Lipschitz",
+    "LipschitzEnclosure",
+    "LiveView",
     "Lobes",
     "MeshingError",
     "Molecule",
     "Morph",
     "Noise",
-    "Parabola",
-    "Pieces",
+    "ParabolaEnclosure",
+    "PiecewiseTaylorEnclosure",
     "Plane",
     "PlaneWave",
     "PolygonMesh",
     "PrintCheck",
     "PrintProblem",
-    "Product",
-    "Revolved",
+    "RayCrossings",
+    "RayStatus",
     "RiemannSurface",
     "Sample",
-    "SavedScene",
+    "SceneFile",
     "SceneFileError",
     "SchwarzD",
     "SchwarzP",
     "ScreenedWindingNumber",
-    "Sextic",
-    "Shape",
+    "SexticKernel",
     "Slider",
-    "Slope",
     "Solid",
     "SolidAngle",
+    "SolidOfRevolution",
     "Sphere",
+    "SphericalCapEnclosure",
     "SphericalHarmonic",
-    "Status",
     "Superellipsoid",
     "Supertorus",
-    "Taylor",
-    "Thickness",
+    "Surface",
+    "TaylorEnclosure",
+    "TaylorRemainder",
     "Thread",
-    "Tolerance",
     "Torus",
     "Tube",
-    "Tubes",
-    "View",
+    "TubeNetwork",
+    "VolumeIntersection",
+    "WallThickness",
+    "WaveProduct",
     "WindingNumber",
     "__version__",
     "absolute",
@@ -207,7 +207,7 @@ __all__ = [
     "closest_points",
     "cos",
     "cosh",
-    "cosine",
+    "cosine_factor",
     "curvature",
     "curvature_lines",
     "distance",
@@ -224,6 +224,7 @@ __all__ = [
     "maximum",
     "mesh",
     "meshing",
+    "metric_thread",
     "minimum",
     "norm",
     "outline",
@@ -234,20 +235,19 @@ __all__ = [
     "repair",
     "signed_distance",
     "sin",
-    "sine",
+    "sine_factor",
     "sinh",
     "solid",
     "sqrt",
     "tan",
     "tanh",
     "testing",
-    "thickness",
-    "thread",
     "to_zarr",
     "trace",
     "tracer",
     "union",
     "view",
+    "wall_thickness",
     "wrap_for_jax",
     "wrap_for_torch",
     "write_scene",

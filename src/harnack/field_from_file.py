@@ -16,125 +16,129 @@ from harnack.fields.solid_angles.solid_angle import SolidAngle
 from harnack.fields.solid_angles.winding_number import WindingNumber
 from harnack.files import (
     Atoms,
-    ClosedCurves,
-    Cloud,
     FileFormatError,
-    Mesh,
+    LoadedCloud,
+    LoadedCurves,
+    LoadedMesh,
+    LoadedPolygons,
     Metaballs,
-    PolygonSurface,
+    read_geometry,
     read_loops,
-    read_surface,
 )
-from harnack.files.geometry_files import ReadAs, Surface
-from harnack.rendering.framing import UP_AXES, upright
+from harnack.files.geometry_files import LoadedGeometry, ReadAs
+from harnack.rendering.framing import UP_AXES, rotation_to_z_up
 
-__all__ = ["UP_AXES", "Axis", "OpenedSurface", "open_surface"]
+__all__ = ["UP_AXES", "Axis", "FieldFromFile", "field_from_file"]
 
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 
-_Y_UP_BY_STANDARD = (".glb", ".gltf")
-_Y_UP_BY_HABIT = (".obj",)
+_Y_UP_FORMATS = (".glb", ".gltf")
+_Y_UP_BY_CONVENTION = (".obj",)
 # Where `read_loops` itself takes the boundary of faces.
 _LOOP_FILES = (".obj", ".ply", ".loops")
 
 
 @dataclass(frozen=True, eq=False)
-class OpenedSurface:
+class FieldFromFile:
     """A field made of a file.
 
-    said: what was decided and why, in one line.
+    summary: what was decided and why, in one line.
     show, material: how it is drawn unless asked for otherwise. Surfaces of meshes and clouds are
         shaded, with one ray a pixel, as their rays cost many times what rays of a curve's surface
         do.
     """
 
     field: Field
-    said: str
+    summary: str
     show: str
     material: str
 
 
-def open_surface(
+def field_from_file(
     path: str | os.PathLike[str],
     *,
-    as_: ReadAs | None = None,
-    boundary: bool = False,
+    read_as: ReadAs | None = None,
+    take_boundary: bool = False,
     normals: Literal["estimate"] | None = None,
     smoothing: float | Literal["auto"] | None = None,
     up: Axis | None = None,
-) -> OpenedSurface:
+) -> FieldFromFile:
     """The field of a surface file: of a mesh a `WindingNumber`, of a cloud with normals a
     `DipolePotential`, of closed curves a `SolidAngle`, of polygons, if asked for, a `PolygonMesh`,
     of metaballs and molecules `Blobs`.
 
-    as_: "winding", "dipole", "loops" or "polygons" instead of what `read_surface` decides.
-    boundary: the curves that bound the faces. normals: "estimate" finds those of a point cloud,
+    read_as: "winding", "dipole", "loops" or "polygons" instead of what `read_geometry` decides.
+    take_boundary: the curves that bound the faces. normals: "estimate" finds those of a point
+        cloud,
     and replaces those of the file. smoothing: for clouds with noise, a length in the file's unit
     or "auto", as for `DipolePotential`. up: the file's axis that turns to z, by default y for glTF,
     whose standard says so, and for meshes and clouds of .obj files, most of which have it so;
     else z.
 
     Raises:
-        FileFormatError: as `read_surface`; a point cloud without normals.
+        FileFormatError: as `read_geometry`; a point cloud without normals.
         ValueError: settings that contradict each other or the file, or that no field accepts.
     """
     path = Path(path)
-    if boundary and as_ not in (None, "loops"):
-        raise ValueError(f'boundary=True takes faces as curves, which contradicts as_="{as_}"')
+    if take_boundary and read_as not in (None, "loops"):
+        raise ValueError(
+            f'take_boundary=True takes faces as curves, which contradicts read_as="{read_as}"'
+        )
     if normals not in (None, "estimate"):
         raise ValueError(f'normals must be "estimate" or None, not {normals!r}')
     if up not in (None, *UP_AXES):
         raise ValueError(f"up must be one of {', '.join(UP_AXES)} or None, not {up!r}")
-    surface = _read(path, as_, boundary)
-    if normals is not None and not isinstance(surface, Cloud):
+    surface = _read(path, read_as, take_boundary)
+    if normals is not None and not isinstance(surface, LoadedCloud):
         raise ValueError(
             f"{path}: normals are estimated for point clouds, and this is something else: "
-            f'{surface.said}; leave out normals="estimate", or take its points with as_="dipole"'
+            f'{surface.summary}; leave out normals="estimate", or take its points with '
+            'read_as="dipole"'
         )
-    is_curve = isinstance(surface, ClosedCurves)
-    if smoothing is not None and not isinstance(surface, Cloud):
+    is_curve = isinstance(surface, LoadedCurves)
+    if smoothing is not None and not isinstance(surface, LoadedCloud):
         raise ValueError(
-            f"{path}: smoothing is for point clouds, and this is something else: {surface.said}"
+            f"{path}: smoothing is for point clouds, and this is something else: {surface.summary}"
         )
-    axis, why = (up, "as asked") if up is not None else _usual_up(path, is_curve=is_curve)
+    axis, why = (up, "as asked") if up is not None else _default_up_axis(path, is_curve=is_curve)
     try:
-        field = _field(surface, normals, smoothing or 0.0, upright(axis))
+        field = _field(surface, normals, smoothing or 0.0, rotation_to_z_up(axis))
     except ValueError as error:
         raise FileFormatError(f"{path}: {error}") from error
-    show, material = ("color", "two-tone") if is_curve else ("shaded", "eggshell")
-    return OpenedSurface(field, f"{surface.said}; {axis} is up, {why}", show, material)
+    show, material = ("path", "two-tone") if is_curve else ("shaded", "eggshell")
+    return FieldFromFile(field, f"{surface.summary}; {axis} is up, {why}", show, material)
 
 
-def _usual_up(path: Path, *, is_curve: bool) -> tuple[Axis, str]:
+def _default_up_axis(path: Path, *, is_curve: bool) -> tuple[Axis, str]:
     """The axis that is up in files of this kind, and why."""
     kind = path.suffix.lower()
-    if kind in _Y_UP_BY_STANDARD:
+    if kind in _Y_UP_FORMATS:
         return "y", "the standard of the format"
-    if kind in _Y_UP_BY_HABIT and not is_curve:
+    if kind in _Y_UP_BY_CONVENTION and not is_curve:
         return "y", "as in most .obj files"
     return "z", "for want of a standard (up= turns it)"
 
 
-def _read(path: Path, as_: ReadAs | None, boundary: bool) -> Surface:
+def _read(path: Path, read_as: ReadAs | None, boundary: bool) -> LoadedGeometry:
     if boundary and path.suffix.lower() in _LOOP_FILES:
         loops = tuple(read_loops(path, boundary=True))
         noun = "loop" if len(loops) == 1 else "loops"
         count = f"{len(loops):,} {noun} of {sum(map(len, loops)):,} vertices"
-        return ClosedCurves(loops, f"{count}: the boundary of the faces, as asked")
-    return read_surface(path, "loops" if boundary else as_)
+        return LoadedCurves(loops, f"{count}: the boundary of the faces, as asked")
+    return read_geometry(path, "loops" if boundary else read_as)
 
 
 def _field(
-    surface: Surface,
+    surface: LoadedGeometry,
     normals: str | None,
     smoothing: float | Literal["auto"],
     rotation: FloatArray,
 ) -> Field:
-    if isinstance(surface, Mesh):
+    if isinstance(surface, LoadedMesh):
         return WindingNumber(surface.vertices @ rotation.T, surface.faces)
-    if isinstance(surface, ClosedCurves):
+    if isinstance(surface, LoadedCurves):
         return SolidAngle([loop @ rotation.T for loop in surface.loops])
-    if isinstance(surface, PolygonSurface):
+    if isinstance(surface, LoadedPolygons):
         return PolygonMesh(surface.vertices @ rotation.T, surface.faces)
     if isinstance(surface, Metaballs):
         centers = surface.centers @ rotation.T
@@ -146,7 +150,7 @@ def _field(
         return DipolePotential(points, normals, surface.areas, smoothing=smoothing)
     if surface.normals is None:
         raise ValueError(
-            f"{surface.said}. Its normals are missing, which say where outside is: add them to "
+            f"{surface.summary}. Its normals are missing, which say where outside is: add them to "
             'the file, or let them be estimated with normals="estimate"'
         )
     given = surface.normals @ rotation.T

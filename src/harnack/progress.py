@@ -13,9 +13,9 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 
 Advance = Callable[[float], None]
 # Seconds between lines. What is done sooner writes none.
-_INTERVAL = 5.0
+_SECONDS_BETWEEN_LINES = 5.0
 # Seconds: what was done before is no measure of what takes time.
-_AT_ONCE = 0.5
+_INSTANT_SECONDS = 0.5
 
 
 def teller(progress: Callable[[str], None] | None) -> Callable[[str], None]:
@@ -35,21 +35,22 @@ def teller(progress: Callable[[str], None] | None) -> Callable[[str], None]:
 
 
 @contextmanager
-def progress_bar(name: str, shown: bool | Advance) -> Generator[Advance]:
+def progress_bar(name: str, progress: bool | Advance) -> Generator[Advance]:
     """Progress of `name` on stderr; what it yields is told each part, of 1, that has been finished.
 
-    shown: whether to show it; or a function that is told in its place, and may raise an exception
+    progress: whether to show it; or a function that is told in its place, and may raise an
+        exception
     to stop the task.
 
     It is a bar in a terminal, and lines of text in notebooks and log files: in a notebook a bar
     would need ipywidgets, and control codes of terminals are shown as they are.
     """
-    if not callable(shown) and not isinstance(cast("Any", shown), bool):
-        raise TypeError(f"progress must be True, False or a function, not {shown!r:.60}")
+    if not callable(progress) and not isinstance(cast("Any", progress), bool):
+        raise TypeError(f"progress must be True, False or a function, not {progress!r:.60}")
     console = Console(stderr=True)
-    if callable(shown):
-        yield shown
-    elif not shown:
+    if callable(progress):
+        yield progress
+    elif not progress:
         yield lambda part: None
     elif console.is_terminal and not console.is_jupyter:
         columns = (TextColumn(name), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
@@ -57,27 +58,27 @@ def progress_bar(name: str, shown: bool | Advance) -> Generator[Advance]:
             task = bar.add_task("", total=1.0)
             yield lambda part: bar.advance(task, part)
     else:
-        yield _Lines(name)
+        yield _TextProgress(name)
 
 
-class _Lines:
+class _TextProgress:
     """Prints a line of text now and then."""
 
     def __init__(self, name: str) -> None:
         self._name = name
         self._done = 0.0
-        self._kept = 0.0
+        self._cached_fraction = 0.0
         self._start = self._last = time.monotonic()
 
     def __call__(self, part: float) -> None:
         self._done += part
         now = time.monotonic()
-        if now - self._start < _AT_ONCE:  # parts that are there already
-            self._kept = self._done
-        if now - self._last < _INTERVAL or self._done >= 1 - 1e-9:
+        if now - self._start < _INSTANT_SECONDS:  # parts that are there already
+            self._cached_fraction = self._done
+        if now - self._last < _SECONDS_BETWEEN_LINES or self._done >= 1 - 1e-9:
             return
         self._last = now
         past = now - self._start
-        left = past * (1 - self._done) / (self._done - self._kept or self._done)
+        left = past * (1 - self._done) / (self._done - self._cached_fraction or self._done)
         text = f"{self._name}: {self._done:.0%} after {past:.0f} s, about {left:.0f} s left"
         print(text, file=sys.stderr, flush=True)

@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 
 import harnack as hk
 from harnack.arithmetic import (
-    Affine,
+    AffineForm,
     Jet,
-    Parabolas,
+    ParabolaBounds,
     absolute,
     atan2,
     clipped_power,
@@ -27,15 +27,15 @@ from harnack.arithmetic import (
     tanh,
 )
 from harnack.backend import choose_backend, to_float, to_vector3
-from harnack.enclosures import Gaps, Slopes
+from harnack.enclosures import LevelGaps, SlopeRange
 from harnack.enclosures.literature import (
-    AffineBand,
-    BottomUpLinear,
-    BottomUpQuadratic,
-    IntervalRange,
-    Mixed,
+    AffineEnclosure,
+    BottomUpLinearEnclosure,
+    BottomUpQuadraticEnclosure,
+    IntervalEnclosure,
+    LongestOfEnclosure,
 )
-from harnack.fields.formula import FormulaAlong
+from harnack.fields.formula import FormulaOnRay
 
 Formula = Callable[[Any, Any, Any], Any]
 PROOFS = ("bottom-up-linear", "bottom-up-quadratic", "mixed", "affine", "interval")
@@ -100,7 +100,7 @@ def test_parabolas_enclose(name: str, precision: str) -> None:
     moved = values - values[0]
     allowed = 4e-18 * (np.abs(values) + np.abs(values[0]) + 50)  # of the samples' own rounding
     for degree in (1, 2):
-        made = formula(*Parabolas.along(p, d, h, degree=degree))
+        made = formula(*ParabolaBounds.along_ray(p, d, h, degree=degree))
         (a, b), (c, e) = ([wide(one, h) for one in pair] for pair in made.bounds)
         known = np.isfinite(a + b) & np.isfinite(c + e)
         assert known.mean() > 0.55, "hardly anything is proved"
@@ -111,7 +111,7 @@ def test_parabolas_enclose(name: str, precision: str) -> None:
         lower, upper = a * s + b * s * s, c * s + e * s * s
         wrong = (moved < lower - allowed) | (moved > upper + allowed)
         assert not wrong[:, known].any()
-        low, high = wide(made.value.low, h), wide(made.value.high, h)
+        low, high = wide(made.value.lower, h), wide(made.value.upper, h)
         assert ((low <= values[0] + allowed[0]) & (values[0] <= high + allowed[0])).all()
 
 
@@ -122,7 +122,7 @@ def test_affine_forms_enclose(name: str, precision: str) -> None:
     formula = FORMULAS[name]
     p, d, h, *exact = paths(precision, 3000, 2)
     s, values = along(formula, tuple(exact))
-    made = formula(*Affine.along(p, d, h))
+    made = formula(*AffineForm.along_ray(p, d, h))
     center, slope, error = (wide(one, h) for one in (made.center, made.slope, made.error))
     known = np.isfinite(center + slope + error)
     assert known.mean() > 0.8
@@ -163,7 +163,7 @@ def test_random_expressions_are_enclosed(text: str, seed: int) -> None:
     # Of the samples' own rounding: intermediate results may be larger than values.
     size = np.abs(values).max(0) + 1e3 * (1 + np.abs(exact[0]).max(0) + exact[2]) ** 6
     for degree in (1, 2):
-        made = formula(*Parabolas.along(p, d, h, degree=degree))
+        made = formula(*ParabolaBounds.along_ray(p, d, h, degree=degree))
         (a, b), (c, e) = ([wide(one, h) for one in pair] for pair in made.bounds)
         known = np.isfinite(a + b) & np.isfinite(c + e)
         a, b, c, e = (np.where(known, one, 0) for one in (a, b, c, e))
@@ -176,13 +176,13 @@ def test_parabolas_are_exact_where_they_can_be() -> None:
     """Quadratics are themselves; a convex function of a line is its tangent and its chord."""
     p, d, h, *exact = paths("double", 500, 3)
     s, values = along(FORMULAS["quadric"], tuple(exact))
-    made = FORMULAS["quadric"](*Parabolas.along(p, d, h))
+    made = FORMULAS["quadric"](*ParabolaBounds.along_ray(p, d, h))
     (a, b), (c, e) = ([wide(one, h) for one in pair] for pair in made.bounds)
     moved = values - values[0]
     for x, y in ((a, b), (c, e)):
         np.testing.assert_allclose(x * s + y * s * s, moved, atol=1e-11)
 
-    x, _, _ = Parabolas.along(p, d, h, degree=1)
+    x, _, _ = ParabolaBounds.along_ray(p, d, h, degree=1)
     (a, _), (c, _) = exp(x).bounds
     start, rate, length = exact[0][0], exact[1][0], exact[2]
     np.testing.assert_allclose(wide(a, h), rate * np.exp(start), rtol=1e-6, atol=1e-9)
@@ -195,35 +195,45 @@ def test_parabolas_of_smooth_functions_have_their_slope_at_the_start() -> None:
     """Exact to first order on short lengths: that is what makes the march converge."""
     p, d = paths("double", 500, 4)[:2]
     for name in ("gyroid", "blobs", "gaussians", "quotient", "powers"):
-        made = FORMULAS[name](*Parabolas.along(p, d, to_float(choose_backend("double"), 1e-5)))
+        made = FORMULAS[name](
+            *ParabolaBounds.along_ray(p, d, to_float(choose_backend("double"), 1e-5))
+        )
         (a, _), (c, _) = made.bounds
-        jet = FORMULAS[name](*Jet.along(p, d, 0.0, dr.zeros(type(p.x)) + 1e-5))
+        jet = FORMULAS[name](*Jet.along_ray(p, d, 0.0, dr.zeros(type(p.x)) + 1e-5))
         assert float(dr.max(dr.abs(c - a))[0]) < 1e-3
-        slope = jet.start.first[0]
-        assert not np.any((a > slope.high + 1e-12).numpy())
-        assert not np.any((c < slope.low - 1e-12).numpy())
+        slope = jet.start.first_derivatives[0]
+        assert not np.any((a > slope.upper + 1e-12).numpy())
+        assert not np.any((c < slope.lower - 1e-12).numpy())
 
 
-@pytest.mark.parametrize("kind", [BottomUpLinear, BottomUpQuadratic, Mixed, AffineBand,
-                                  IntervalRange])  # fmt: skip
+@pytest.mark.parametrize(
+    "kind",
+    [
+        BottomUpLinearEnclosure,
+        BottomUpQuadraticEnclosure,
+        LongestOfEnclosure,
+        AffineEnclosure,
+        IntervalEnclosure,
+    ],
+)
 def test_steps_meet_no_level_and_slightly_longer_ones_would(kind: Any) -> None:
     """A step may end at the length asked; a step 1.001 times as long meets the level somewhere."""
     formula = FORMULAS["quadric"]
     p, d, h, *exact = paths("double", 4000, 5)
     field = hk.expression(formula)
-    function = FormulaAlong(field, p, d)
+    function = FormulaOnRay(field, p, d)
     slope = dr.dot(field.evaluate(p).gradient, d)
-    made = kind.along(function, Slopes(slope, slope), h)
+    made = kind.from_restriction(function, SlopeRange(slope, slope), h)
     generator = np.random.default_rng(6)
     gap = generator.uniform(0.05, 2, 4000)
-    gaps = Gaps(to_float(choose_backend("double"), gap), dr.zeros(type(h)) + dr.inf)
-    step = wide(made.step(gaps), h)
+    gaps = LevelGaps(to_float(choose_backend("double"), gap), dr.zeros(type(h)) + dr.inf)
+    step = wide(made.free_length(gaps), h)
     assert (step >= 0).all()
     assert (step <= exact[2]).all()
     assert (step > 0).mean() > 0.3
     _, values = along(formula, (exact[0], exact[1], step * (1 - 1e-9)), 129)
     assert (values[0] - values.min(0) < gap).all()
-    if kind in (BottomUpQuadratic, Mixed):  # exact of a quadric
+    if kind in (BottomUpQuadraticEnclosure, LongestOfEnclosure):  # exact of a quadric
         cut = (step > 0) & (step < exact[2])
         _, values = along(formula, (exact[0], exact[1], 1.001 * step), 129)
         assert ((values[0] - values.min(0))[cut] >= gap[cut]).all()
@@ -247,11 +257,11 @@ def test_all_proofs_hit_the_same(name: str, precision: str) -> None:
         return found.status.numpy(), found.t.numpy()
 
     status, t = hits(None)
-    hit = status == int(hk.Status.HIT)
+    hit = status == int(hk.RayStatus.HIT)
     assert 20 < hit.sum() < 400
     for bound in PROOFS:
         other, there = hits(bound)
-        out_of_steps = other == int(hk.Status.OUT_OF_STEPS)
+        out_of_steps = other == int(hk.RayStatus.OUT_OF_STEPS)
         # Bands are not relative to the value: in single precision they stall beside a surface.
         stalls = precision == "single" and bound in ("affine", "interval")
         assert stalls or not out_of_steps.any()
@@ -275,7 +285,7 @@ def test_proofs_of_formulas_say_what_they_need() -> None:
 
 
 def test_formulas_with_what_has_no_ranges_are_refused() -> None:
-    x, y, _ = Parabolas.along(*paths("single", 3, 8)[:3])
+    x, y, _ = ParabolaBounds.along_ray(*paths("single", 3, 8)[:3])
     with pytest.raises(TypeError, match="no proved ranges"):
         np.fmod(x, y)
     with pytest.raises(TypeError, match="plain numbers"):
@@ -286,19 +296,21 @@ def test_formulas_with_what_has_no_ranges_are_refused() -> None:
         x / 0
     with pytest.raises(ValueError, match="clipped power"):
         clipped_power(0)
-    assert np.sin(x).value.low.numpy() == pytest.approx(np.sin(x.value.low.numpy()), abs=1e-5)
+    assert np.sin(x).value.lower.numpy() == pytest.approx(np.sin(x.value.lower.numpy()), abs=1e-5)
 
 
 def test_float_lanes_with_no_length_prove_nothing_false() -> None:
     backend = choose_backend("single")
     p, d = to_vector3(backend, np.zeros((2, 3)) + 0.1), to_vector3(backend, np.eye(3)[:2])
-    made = FORMULAS["quartic"](*Parabolas.along(p, d, to_float(backend, [0.0, 1e-30])))
+    made = FORMULAS["quartic"](*ParabolaBounds.along_ray(p, d, to_float(backend, [0.0, 1e-30])))
     field = hk.expression(FORMULAS["quartic"])
-    enclosure = BottomUpQuadratic.along(
-        FormulaAlong(field, p, d), Slopes(0.0, 0.0), to_float(backend, [0.0, 1e-30])
+    enclosure = BottomUpQuadraticEnclosure.from_restriction(
+        FormulaOnRay(field, p, d), SlopeRange(0.0, 0.0), to_float(backend, [0.0, 1e-30])
     )
     assert enclosure is not None
-    step = enclosure.step(Gaps(to_float(backend, [1.0, 1.0]), to_float(backend, [1.0, 1.0])))
+    step = enclosure.free_length(
+        LevelGaps(to_float(backend, [1.0, 1.0]), to_float(backend, [1.0, 1.0]))
+    )
     assert (step.numpy() >= 0).all()
     assert (step.numpy() <= [0.0, 1e-30]).all()
-    assert made.degree == 2
+    assert made.bound_degree == 2

@@ -22,7 +22,7 @@ from rich.console import Console
 
 import harnack.backend as hb
 from harnack.backend import arrays, doctor, llvm
-from harnack.backend.elementary import across, across_rows
+from harnack.backend.elementary import orthonormal_basis, orthonormal_basis_rows
 from harnack.rendering.mitsuba import load_mitsuba
 
 ELF_WITH_SONAME = b"\x7fELF...\0libc.so.6\0%s\0LLVMCreateMessage\0"
@@ -108,12 +108,12 @@ def test_version_of_a_library_that_is_not_there(tmp_path: Path) -> None:
     ("major", "word"), [(14, "too old"), (15, "aborts"), (16, "aborts"), (None, "cannot be told")]
 )
 def test_refused_versions(major: int | None, word: str) -> None:
-    assert word in (llvm.refusal_of(major) or "")
+    assert word in (llvm.rejection_reason(major) or "")
 
 
 @pytest.mark.parametrize("major", [17, 18, 19, 20, 21, 22, 23, 24])
 def test_accepted_versions(major: int) -> None:
-    assert llvm.refusal_of(major) is None
+    assert llvm.rejection_reason(major) is None
 
 
 def test_libraries_are_found_once_each_and_best_first(tmp_path: Path) -> None:
@@ -162,7 +162,7 @@ def test_import_leaves_the_environment_alone_and_picks_an_acceptable_llvm() -> N
         "import os, harnack.backend as hb\n"
         "assert 'DRJIT_LIBLLVM_PATH' not in os.environ\n"
         "assert hb.loaded_library().major == hb.best_library().major == hb.ensure_llvm()\n"
-        "assert hb.loaded_library().refusal is None\n"
+        "assert hb.loaded_library().rejection_reason is None\n"
     )
     done = run_python(code)
     assert done.returncode == 0, done.stderr
@@ -475,7 +475,7 @@ def test_aligned_memory_is_aligned_and_its_own(backend: hb.Backend) -> None:
     for offset in range(1, 8):
         source = np.arange(40, dtype=kind)[offset:]
         expected = source.copy()
-        buffer = hb.aligned(backend, source)
+        buffer = hb.upload_floats(backend, source)
         source[:] = -1
         np.testing.assert_array_equal(hb.to_numpy(buffer), expected)
         if backend.name == "llvm":
@@ -483,8 +483,8 @@ def test_aligned_memory_is_aligned_and_its_own(backend: hb.Backend) -> None:
 
 
 def test_where_memory_lies_compiles_no_kernel(backend: hb.Backend) -> None:
-    integers = functools.partial(hb.arrays.aligned_integers, backend)
-    for upload in (functools.partial(hb.aligned, backend), integers):
+    integers = functools.partial(hb.arrays.upload_integers, backend)
+    for upload in (functools.partial(hb.upload_floats, backend), integers):
         dr.eval(upload(np.arange(40)) + 1)
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
             dr.kernel_history_clear()
@@ -498,9 +498,9 @@ def test_where_memory_lies_compiles_no_kernel(backend: hb.Backend) -> None:
 
 def test_aligned_takes_strided_arrays_and_only_one_dimension(backend: hb.Backend) -> None:
     table = np.arange(12.0).reshape(4, 3)
-    np.testing.assert_array_equal(hb.to_numpy(hb.aligned(backend, table[:, 1])), table[:, 1])
+    np.testing.assert_array_equal(hb.to_numpy(hb.upload_floats(backend, table[:, 1])), table[:, 1])
     with pytest.raises(ValueError, match="one-dimensional"):
-        hb.aligned(backend, table)
+        hb.upload_floats(backend, table)
 
 
 def test_to_numpy_of_lanes_masks_and_other_things(backend: hb.Backend) -> None:
@@ -518,7 +518,7 @@ def test_to_numpy_of_lanes_masks_and_other_things(backend: hb.Backend) -> None:
 
 def test_doctor_finds_this_installation_well() -> None:
     console = Console(record=True, width=200, file=open(os.devnull, "w"))  # noqa: SIM115
-    assert doctor.render_report(console)
+    assert doctor.print_report(console)
     text = console.export_text()
     for word in ("drjit", "mitsuba", "LLVM", "backend", "kernel, single precision", "runs"):
         assert word in text
@@ -528,7 +528,7 @@ def test_doctor_says_what_to_do(tmp_path: Path) -> None:
     fake = touch(tmp_path / "libLLVM-15.so.1")
     code = (
         "from rich.console import Console; from harnack.backend import doctor\n"
-        "assert not doctor.render_report(Console(width=80))\n"
+        "assert not doctor.print_report(Console(width=80))\n"
     )
     done = run_python(code, HARNACK_BACKEND="llvm", DRJIT_LIBLLVM_PATH=str(fake))
     assert done.returncode == 0, done.stderr
@@ -539,7 +539,7 @@ def test_doctor_says_what_to_do(tmp_path: Path) -> None:
 def test_doctor_survives_a_kernel_that_ends_its_process(monkeypatch: pytest.MonkeyPatch) -> None:
     aborting = subprocess.CompletedProcess([], -6, stdout="", stderr="LLVM ERROR: Cannot select")
     monkeypatch.setattr(doctor.subprocess, "run", lambda *args, **options: aborting)
-    findings = [finding for finding in doctor.report() if finding.subject.startswith("kernel")]
+    findings = [finding for finding in doctor.diagnose() if finding.subject.startswith("kernel")]
     assert len(findings) == 2
     for finding in findings:
         assert not finding.ok
@@ -550,7 +550,7 @@ def test_doctor_survives_a_kernel_that_ends_its_process(monkeypatch: pytest.Monk
 def test_numbers_of_a_field_that_single_precision_cannot_hold_are_refused() -> None:
     backend = hb.choose_backend("single")
     with pytest.raises(ValueError, match="too large for single precision"):
-        hb.aligned(backend, np.array([1.0, 1e39]))
+        hb.upload_floats(backend, np.array([1.0, 1e39]))
 
 
 def test_rows_have_frames() -> None:
@@ -558,13 +558,13 @@ def test_rows_have_frames() -> None:
     rng = np.random.default_rng(3)
     d = np.concatenate([rng.normal(size=(200, 3)), [[0, 0, 1], [0, 0, -1], [1e-9, 0, -1]]])
     d /= np.linalg.norm(d, axis=1, keepdims=True)
-    u, v = across_rows(d)
+    u, v = orthonormal_basis_rows(d)
     frame = np.stack([u, v, d], axis=1)
     np.testing.assert_allclose(frame @ frame.transpose(0, 2, 1), np.tile(np.eye(3), (203, 1, 1)),
                                atol=1e-14)  # fmt: skip
     np.testing.assert_allclose(np.linalg.det(frame), 1.0, atol=1e-14)
     backend = hb.choose_backend("double")
-    on_backend = across(hb.to_vector3(backend, d))
+    on_backend = orthonormal_basis(hb.to_vector3(backend, d))
     for ours, theirs in zip((u, v), on_backend, strict=True):
         np.testing.assert_allclose(ours, hb.to_numpy(theirs), atol=1e-15)
 
@@ -586,5 +586,5 @@ except AttributeError as error:
 """
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     rooms, missed = run.stdout.splitlines()
-    assert rooms == "['_version', 'backend', 'names']"
+    assert rooms == "['_version', 'backend', 'name_suggestions']"
     assert missed == "module 'harnack' has no attribute 'traec'; did you mean \"trace\"?"

@@ -34,7 +34,7 @@ POINTS = 0.4 * np.random.default_rng(1).normal(size=(20, 3))
 
 def depths(vertices: Any, origins: Any, directions: Any, level: Any) -> Any:
     hits = hk.trace(hk.SolidAngle(vertices), origins, directions, level=level)
-    return dr.select(hits.hit, hits.t, 0)
+    return dr.select(hits.is_hit, hits.t, 0)
 
 
 def angles(vertices: Any, points: Any) -> Any:
@@ -139,7 +139,7 @@ def test_jax_compiles_around_a_wrapped_function() -> None:
 
     x, n = jax.numpy.asarray(POINTS, "f4"), jax.numpy.array([3], "i4")
     plain = hk.wrap_for_jax(count)
-    shaped = hk.wrap_for_jax(count, result=lambda x, n: {"sum": x[:, 0], "repeats": n})
+    shaped = hk.wrap_for_jax(count, result_like=lambda x, n: {"sum": x[:, 0], "repeats": n})
     assert jax.jit(shaped)(x, n)["repeats"] == 3
     expected = 2 * POINTS * np.arange(20)[:, None]
     for gradient in (
@@ -172,7 +172,7 @@ def test_results_that_are_arguments_or_come_twice() -> None:
 def test_compiled_gradients_of_many_points() -> None:
     """So many that JAX hands them over by another thread."""
     points = jax.numpy.asarray(np.tile(POINTS, (5000, 1)), "f4")
-    wrapped = hk.wrap_for_jax(angles, result=lambda vertices, points: points[:, 0])
+    wrapped = hk.wrap_for_jax(angles, result_like=lambda vertices, points: points[:, 0])
     gradient = jax.jit(jax.grad(lambda v, p: wrapped(v, 2 * p).mean()))
     vertices = jax.numpy.asarray(LOOP, "f4")
     few = jax.grad(lambda v, p: hk.wrap_for_jax(angles)(v, 2 * p).mean())(vertices, points[:20])
@@ -217,7 +217,7 @@ def test_a_loss_in_another_framework(target: str) -> None:
 def seen(vertices: Any, origins: Any, directions: Any) -> Any:
     """1 where rays hit, else 0."""
     hits = hk.trace(hk.SolidAngle(vertices), origins, directions, level=6.0)
-    return dr.select(hits.hit, type(hits.t)(1), 0)
+    return dr.select(hits.is_hit, type(hits.t)(1), 0)
 
 
 @pytest.mark.parametrize("framework", ["torch", "jax"])
@@ -291,9 +291,9 @@ def test_a_step_compiles_nothing_after_the_first_two(name: str) -> None:
         optimizer.step()
         now = vertices.detach().numpy()
         in_jax(now, *(jax.numpy.asarray(one.numpy()) for one in batch))
-        certificates.add(hk.SolidAngle(now).certificate)
+        certificates.add(hk.SolidAngle(now).lift_bound)
 
-    certificates.add(hk.SolidAngle(circle).certificate)
+    certificates.add(hk.SolidAngle(circle).lift_bound)
     step(0), step(1)
     assert [compiled(lambda k=k: step(k)) for k in range(2, 10)] == [0] * 8
     assert len(certificates) > 1

@@ -97,8 +97,8 @@ def around_a_circle(k: int) -> np.ndarray:
 
 def test_curves_around_a_circle_have_hulls_of_all_kinds() -> None:
     curves = [hk.SolidAngle(around_a_circle(k)) for k in range(10)]
-    assert [one.certificate for one in curves[:2]] == ["planar", "range"]
-    assert curves[-1].certificate == "edges"
+    assert [one.lift_bound for one in curves[:2]] == ["planar", "range"]
+    assert curves[-1].lift_bound == "edges"
     assert len({len(one.extent((2 * np.pi,)).planes()) for one in curves}) > 2
 
 
@@ -121,7 +121,7 @@ def test_a_step_of_an_optimization_compiles_no_kernel(wanted: str, level: float 
         else:
             # What is literal must not become a part of kernels: `own`, and where rays start.
             hits = hk.trace(curve, backend.Array3f(0, 0.01 * k, 3), d, level=own)
-            loss = dr.select(hits.hit, dr.square(hits.t), 0)
+            loss = dr.select(hits.is_hit, dr.square(hits.t), 0)
         dr.backward(dr.sum(loss))
         assert np.abs(to_numpy(vertices.grad)).max() > 0
         assert own is None or (float(own.grad[0]) != 0) == (wanted == "trace")
@@ -143,11 +143,11 @@ def drawn(what: Any, k: int, show: str, **settings: Any) -> int:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("show", [pytest.param("color", marks=pytest.mark.slow), "shaded"])
+@pytest.mark.parametrize("show", [pytest.param("path", marks=pytest.mark.slow), "shaded"])
 def test_another_picture_compiles_no_kernel(show: str) -> None:
     def picture(k: int) -> int:
         settings: dict[str, Any] = {"level": 6 - 0.02 * k}
-        if show == "color":
+        if show == "path":
             settings["max_depth"] = 3 + k
         return drawn(knot(k), k, show, tolerance=1e-4 * (1 + 0.1 * k), **settings)
 
@@ -160,7 +160,7 @@ HARMONIC = hk.SphericalHarmonic(3, 2)
 
 def cut(k: int) -> hk.geometry.Volume:
     box = hk.Box((-1 - 0.1 * k, -1, -1), (1, 2, 0.5 + 0.01 * k))
-    return hk.Intersection([hk.Ball((0.01 * k, 0, 0), 1 + 0.1 * k), box])
+    return hk.VolumeIntersection([hk.Ball((0.01 * k, 0, 0), 1 + 0.1 * k), box])
 
 
 def lines(k: int) -> list[hk.Isolines]:
@@ -169,8 +169,8 @@ def lines(k: int) -> list[hk.Isolines]:
     color = (0.04 * k, 1 - 0.04 * k, 0.5)
     return [
         hk.Isolines("z", levels, width=0.01 + 0.001 * k, color=color),
-        hk.Isolines(knot(k), spacing=np.pi / (1 + k), color="white"),
-        hk.Isolines("x", spacing=0.1 + 0.01 * k),
+        hk.Isolines(knot(k), interval=np.pi / (1 + k), color="white"),
+        hk.Isolines("x", interval=0.1 + 0.01 * k),
     ]
 
 
@@ -190,9 +190,9 @@ PICTURES: dict[str, Callable[[int], int]] = {
         )
         for show in hk.rendering.SHOW_MODES
     },
-    "clipped": lambda k: drawn(HARMONIC, k, "color", level=0.1 + 0.01 * k, clip=cut(k)),
+    "clipped": lambda k: drawn(HARMONIC, k, "path", level=0.1 + 0.01 * k, clip=cut(k)),
     "glass": lambda k: drawn(
-        HARMONIC, k, "color", solid=(-np.inf, 0.1 + 0.01 * k), clip=cut(k), material="glass"
+        HARMONIC, k, "path", solid=(-np.inf, 0.1 + 0.01 * k), clip=cut(k), material="glass"
     ),
     "amber": lambda k: drawn(
         HARMONIC, k, "shaded", solid=(-np.inf, 0.1 + 0.01 * k), clip=cut(k), material="amber"
@@ -212,8 +212,8 @@ PICTURES: dict[str, Callable[[int], int]] = {
     "mesh": lambda k: drawn(cut_sphere(k), k, "shaded"),
     "tree": lambda k: drawn(tree(k), k, "shaded"),
     "cloud": lambda k: drawn(cloud(k), k, "shaded", level=6 - 0.06 * k),
-    "isolines": lambda k: drawn(HARMONIC, k, "color", level=0.2, clip=cut(k), isolines=lines(k)),
-    "two": lambda k: drawn([knot(k), cut_sphere(k)], k, "color"),
+    "isolines": lambda k: drawn(HARMONIC, k, "path", level=0.2, clip=cut(k), isolines=lines(k)),
+    "two": lambda k: drawn([knot(k), cut_sphere(k)], k, "path"),
 }
 
 

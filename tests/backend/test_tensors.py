@@ -30,7 +30,7 @@ def vector(values: Any) -> Any:
 @pytest.mark.parametrize("settings", [{}, {"all_hits": 3}])
 def test_tensors_are_traced_as_numpy_arrays_are(settings: dict[str, Any]) -> None:
     levels = [5.0, 2 * np.pi]
-    field = hk.SolidAngle(LOOP, certificate="edges")
+    field = hk.SolidAngle(LOOP, lift_bound="edges")
     asked: Any = {"level": levels, "precision": "double", **settings}
     expected = hk.trace(field, EYE[None], AWAY, t_max=np.full(40, 9.0), **asked)
     asked = {"level": tensor(levels), **settings}
@@ -59,7 +59,7 @@ def test_levels_may_be_tensors_one_by_one() -> None:
     found = hk.trace(hk.SolidAngle(LOOP), *rays, level=[*levels])
     expected = hk.trace(hk.SolidAngle(LOOP), *rays, level=tensor([5.0, 2 * np.pi]))
     np.testing.assert_allclose(found.t.numpy(), expected.t.numpy(), atol=1e-3)
-    dr.backward(dr.sum(dr.select(found.hit, found.t, 0)))
+    dr.backward(dr.sum(dr.select(found.is_hit, found.t, 0)))
     assert levels[1].grad.shape == ()
     assert abs(levels[1].grad.numpy()) > 0
 
@@ -100,7 +100,7 @@ def test_derivatives_pass_through_tensors() -> None:
         dr.enable_grad(*given)
         hits = hk.trace(hk.SolidAngle(given[0]), *given[1:])
         total = dr.sum(hk.SolidAngle(given[0]).value(make(0.3 * AWAY)))
-        dr.backward(dr.sum(dr.select(hits.hit, hits.t, 0)) + total)
+        dr.backward(dr.sum(dr.select(hits.is_hit, hits.t, 0)) + total)
         gradients = (dr.grad(one) for one in given)
         found[name] = [g.numpy() if name == "tensor" else to_numpy(g) for g in gradients]
     for got, expected in zip(*found.values(), strict=True):

@@ -10,10 +10,18 @@ import numpy as np
 import pytest
 
 import harnack as hk
-from harnack.backend.validation import finite, flag, integer, positive, real, triple, whole
+from harnack.backend.validation import (
+    as_finite,
+    as_integer_in_range,
+    as_positive,
+    as_real,
+    as_triple,
+    flag,
+    integer,
+)
 
 
-@pytest.mark.parametrize("check", [real, finite, positive])
+@pytest.mark.parametrize("check", [as_real, as_finite, as_positive])
 def test_numbers_are_floats(check: Callable[[Any, str], float]) -> None:
     for given in (2, 2.0, np.float32(2), np.int64(2), np.array(2.0)):
         assert (check(given, "it"), type(check(given, "it"))) == (2.0, float)
@@ -24,17 +32,17 @@ def test_numbers_are_floats(check: Callable[[Any, str], float]) -> None:
 
 def test_numbers_out_of_range() -> None:
     for given in (math.nan, math.inf, -math.inf):
-        assert str(real(given, "it")) == str(given)
+        assert str(as_real(given, "it")) == str(given)
         with pytest.raises(ValueError, match="it must be finite"):
-            finite(given, "it")
+            as_finite(given, "it")
     for given in (0, -1.0, math.nan, math.inf):
         with pytest.raises(ValueError, match="it must be positive and finite"):
-            positive(given, "it")
+            as_positive(given, "it")
     with pytest.raises(ValueError, match=r"it must be an integer from 0 to 2\^32 - 1"):
-        whole(1.5, "it", 0, 2**32 - 1)
+        as_integer_in_range(1.5, "it", 0, 2**32 - 1)
     for wrong in (3, (1, 2), (1, 2, "3"), (1, 2, math.inf)):
         with pytest.raises((TypeError, ValueError), match="it must be"):
-            triple(wrong, "it")
+            as_triple(wrong, "it")
 
 
 def test_flags_and_whole_numbers() -> None:
@@ -84,10 +92,10 @@ WRONG: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: hk.testing.check_field(SPHERE, count=0),
         "^count must be an integer",
     ),
-    "field of a level set": (lambda: hk.LevelSet(None), "harnack field is needed"),
-    "levels of a level set": (lambda: hk.LevelSet(SPHERE, "abc"), "^levels must be a tuple"),
+    "field of a level set": (lambda: hk.Surface(None), "harnack field is needed"),
+    "levels of a level set": (lambda: hk.Surface(SPHERE, "abc"), "^levels must be a tuple"),
     "tolerance of a level set": (
-        lambda: hk.LevelSet(SPHERE, tolerance=1e-3),
+        lambda: hk.Surface(SPHERE, tolerance=1e-3),
         "^tolerance must be a Tolerance",
     ),
     "a level set for a field": (
@@ -105,7 +113,10 @@ WRONG: dict[str, tuple[Callable[[], Any], str]] = {
         "^spacing must be a num",
     ),
     "starts": (lambda: hk.Tube(TRIANGLE[0], 0.1, starts=3), "^starts must be indices"),
-    "flattening": (lambda: hk.Tube(TRIANGLE[0], 0.1, flattening=None), "^flattening must be a num"),
+    "flattening_error": (
+        lambda: hk.Tube(TRIANGLE[0], 0.1, flattening_error=None),
+        "^flattening_error must be a num",
+    ),
     "fade": (lambda: hk.Noise(fade={}), "^the fade must be"),
     "domain of points": (
         lambda: hk.HRBF([[1, 0, 0]], [[1, 0, 0]], domain=SPHERE),
@@ -117,16 +128,19 @@ WRONG: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "amplitude": (lambda: hk.PlaneWave("a", (1, 0, 0)), "^the amplitude of a plane wave must"),
     "wave vector": (lambda: hk.PlaneWave(1.0, 3.0), "^the wave vector must be three numbers"),
-    "factor": (lambda: hk.Product(1.0, x=2.0), "^x of a product is made by sine or cosine"),
-    "frequency": (lambda: hk.sine(None), "^the frequency of a factor must be a number"),
+    "factor": (lambda: hk.WaveProduct(1.0, x=2.0), "^x of a product is made by sine or cosine"),
+    "frequency": (lambda: hk.sine_factor(None), "^the frequency of a factor must be a number"),
     "radius of a branch point": (lambda: hk.BranchPoint(0, radius="a"), "^the radius of a branch "),
     "order of an harmonic": (
         lambda: hk.HypersphericalHarmonic(2, 1, 0.5),
         "^the order m must be a",
     ),
     "order of a lobe": (lambda: hk.Lobes(2, {}), "^m must be a whole number"),
-    "support": (lambda: hk.Compact(ROW), "^support must be a number"),
-    "parts": (lambda: hk.Intersection([None]), "^each part of an intersection must be a volume"),
+    "support": (lambda: hk.CompactKernel(ROW), "^support must be a number"),
+    "parts": (
+        lambda: hk.VolumeIntersection([None]),
+        "^each part of an intersection must be a volume",
+    ),
     "end of a slider": (lambda: hk.Slider(None, 1.0), "^low must be a number"),
     "twice a field": (lambda: 2 * SPHERE, "the level c of 2 f is the level c/2 of f"),
     "a field less than": (lambda: hk.Gyroid() < 0, "is a function of space"),
@@ -149,8 +163,8 @@ def test_levels_in_a_row_of_numpy() -> None:
 
 
 @pytest.mark.parametrize("make", [
-    lambda x: hk.Sphere(x), lambda x: hk.Ball(radius=x), lambda x: hk.Tolerance(x),
-    lambda x: hk.Sphere(1.0).grown(x),
+    lambda x: hk.Sphere(x), lambda x: hk.Ball(radius=x), lambda x: hk.HitTolerance(x),
+    lambda x: hk.Sphere(1.0).offset(x),
 ])  # fmt: skip
 def test_what_is_no_number_is_a_type_error(make: Callable[[Any], Any]) -> None:
     for given in ("1", None, 1j):

@@ -13,7 +13,7 @@ import pytest
 import trimesh
 
 from harnack.cli import main
-from harnack.field_from_file import open_surface
+from harnack.field_from_file import field_from_file
 from harnack.fields.solid_angles.dipole import DipolePotential
 from harnack.fields.solid_angles.solid_angle import SolidAngle
 from harnack.fields.solid_angles.winding_number import WindingNumber
@@ -78,7 +78,7 @@ def picture(tmp_path: Path) -> np.ndarray:
 
 def extent_of(path: Path, **settings: Any) -> np.ndarray:
     """Sides of the box around what a mesh file becomes."""
-    field = open_surface(path, **settings).field
+    field = field_from_file(path, **settings).field
     assert isinstance(field, WindingNumber)
     return np.ptp(field.mesh.vertices, axis=0)
 
@@ -134,9 +134,9 @@ def test_meshes_and_clouds_are_shaded_and_curves_drawn_in_color(tmp_path, capsys
     for path, shaded in ((mesh, True), (cloud, True), (curve, False)):
         small = ["-o", target, "--size", "32x24", "--spp", "1", "--quiet"]
         assert main(["render", str(path), *small]) == 0
-        assert ("drawn shaded; --show color" in capsys.readouterr().out) == shaded
+        assert ("drawn shaded; --show path" in capsys.readouterr().out) == shaded
         pictures.append(picture(tmp_path))
-        assert main(["render", str(path), *small, "--show", "shaded" if shaded else "color"]) == 0
+        assert main(["render", str(path), *small, "--show", "shaded" if shaded else "path"]) == 0
         assert "drawn shaded" not in capsys.readouterr().out
         np.testing.assert_array_equal(picture(tmp_path), pictures[-1])
     outside = pictures[1][12, 16].astype(int)
@@ -161,13 +161,15 @@ def test_the_camera_goes_where_it_is_sent(run, tmp_path):
 @pytest.mark.parametrize(
     ("options", "field", "said"),
     [
-        (["--as", "winding"], "WindingNumber: triangles: 60", "a mesh with holes"),
-        (["--as", "dipole"], "DipolePotential: points: 60, normals: given, areas: given",
+        (["--read-as", "winding"], "WindingNumber: triangles: 60", "a mesh with holes"),
+        (["--read-as", "dipole"], "DipolePotential: points: 60, normals: given, areas: given",
          "60 triangles, each taken as a point"),
-        (["--as", "dipole", "--normals", "estimate"], "normals: estimated, areas: given", "60"),
-        (["--as", "loops"], "SolidAngle: loops: ", "the boundary of the faces, as asked"),
-        (["--boundary"], "SolidAngle: loops: ", "the boundary of the faces, as asked"),
-        (["--boundary", "--as", "loops"], "SolidAngle: loops: ", "the boundary of the faces"),
+        (["--read-as", "dipole", "--normals", "estimate"],
+         "normals: estimated, areas: given", "60"),
+        (["--read-as", "loops"], "SolidAngle: loops: ", "the boundary of the faces, as asked"),
+        (["--take-boundary"], "SolidAngle: loops: ", "the boundary of the faces, as asked"),
+        (["--take-boundary", "--read-as", "loops"],
+         "SolidAngle: loops: ", "the boundary of the faces"),
     ],
 )  # fmt: skip
 def test_the_same_file_is_taken_as_asked(run, tmp_path, options, field, said):
@@ -180,7 +182,10 @@ def test_the_same_file_is_taken_as_asked(run, tmp_path, options, field, said):
 @pytest.mark.parametrize("kind", ["obj", "stl"])
 def test_a_boundary_is_the_same_by_either_name(tmp_path, kind):
     path = write_mesh(tmp_path / f"a.{kind}", missing=20)
-    fields = [open_surface(path, boundary=True).field, open_surface(path, as_="loops").field]
+    fields = [
+        field_from_file(path, take_boundary=True).field,
+        field_from_file(path, read_as="loops").field,
+    ]
     edges = []
     for field in fields:
         assert isinstance(field, SolidAngle)
@@ -194,7 +199,7 @@ def test_normals_of_a_cloud_are_estimated_if_asked(run, tmp_path):
     code, said, _ = run(path, "--normals", "estimate")
     assert code == 0
     assert "normals: estimated, areas: estimated" in said
-    field = open_surface(path, normals="estimate").field
+    field = field_from_file(path, normals="estimate").field
     assert isinstance(field, DipolePotential)
     assert ((field.normals * field.points).sum(axis=1) > 0.0).all()  # outward
 
@@ -204,14 +209,14 @@ def test_the_axis_named_up_turns_to_z(tmp_path, up):
     tall = write_mesh(tmp_path / "a.stl")
     sides = np.ptp(tall_ball()[0], axis=0)
     assert extent_of(tall, up=up)[2] == pytest.approx(sides["xyz".index(up)], rel=1e-6)
-    field = open_surface(tall, up=up).field
+    field = field_from_file(tall, up=up).field
     assert isinstance(field, WindingNumber)
     assert field.value([[0.0, 0.0, 0.0]])[0] == pytest.approx(1.0, abs=1e-4)  # not mirrored
 
 
 def test_up_turns_points_and_normals_of_a_cloud_together(tmp_path):
     path = write_cloud(tmp_path / "a.xyz")
-    plain, turned = (open_surface(path, up=up).field for up in ("z", "y"))
+    plain, turned = (field_from_file(path, up=up).field for up in ("z", "y"))
     assert isinstance(plain, DipolePotential)
     assert isinstance(turned, DipolePotential)
     np.testing.assert_allclose(turned.points[:, 2], plain.points[:, 1])
@@ -233,19 +238,20 @@ def test_gltf_and_obj_are_y_up_and_other_formats_z_up(tmp_path):
         ("a.xyz", "0 0 0\n1 0 0\n0 1 0\n0 0 1\n", [],
          r"a.xyz: 4 points without faces, and no normals read: .* --normals estimate"),
         ("a.xyz", "0 0 0\n1 0 0\n", ["--normals", "estimate"], "a.xyz: .*at least 4"),
-        ("a.xyz", "0 0 0\n1 0 0\n", ["--as", "winding"], "it holds points only"),
+        ("a.xyz", "0 0 0\n1 0 0\n", ["--read-as", "winding"], "it holds points only"),
         ("a.step", "ISO-10303-21;", [], r"a.step' is no scene: .*\.glb, .*\.xyz"),
         ("a.stl", "", [], "a.stl: the file is empty"),
         ("a.obj", "", [], "a.obj: the file is empty"),
         ("a.glb", None, [], "a.glb: there is no such file"),
         ("a.gltf", json.dumps({"asset": {"version": "2.0"}}), [], "a.gltf: "),
         ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", ["--normals", "estimate"],
-         "normals are estimated for point clouds.* --as dipole"),
-        ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", ["--boundary", "--as", "dipole"],
-         "--boundary takes faces as curves, which contradicts --as dipole"),
+         "normals are estimated for point clouds.* --read-as dipole"),
+        ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n",
+         ["--take-boundary", "--read-as", "dipole"],
+         "--take-boundary takes faces as curves, which contradicts --read-as dipole"),
         ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", ["--level", "0"], "level 0 "),
         ("a.xml", "<scene/>", ["--up", "y"], "up: a Mitsuba scene sets this in its own file"),
-        ("trefoil", None, ["--as", "loops"], "--as is for surface files"),
+        ("trefoil", None, ["--read-as", "loops"], "--read-as is for surface files"),
     ],
 )  # fmt: skip
 def test_errors_say_what_to_do_and_nothing_is_written(
@@ -262,7 +268,7 @@ def test_errors_say_what_to_do_and_nothing_is_written(
 
 def test_a_closed_mesh_has_no_boundary_to_draw(run, tmp_path):
     for kind in ("obj", "glb"):
-        code, _, said = run(write_mesh(tmp_path / f"a.{kind}"), "--boundary")
+        code, _, said = run(write_mesh(tmp_path / f"a.{kind}"), "--take-boundary")
         assert code == 1
         assert "closed surface, which has no boundary" in said
 

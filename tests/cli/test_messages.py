@@ -15,13 +15,13 @@ import pytest
 import harnack as hk
 from harnack.cli import main
 from harnack.cli.arguments import parsers
-from harnack.cli.messages import OPTIONS, error_line, in_options, level_text, printable
-from harnack.field_from_file import open_surface
+from harnack.cli.messages import OPTIONS, error_line, level_text, printable, python_to_cli_terms
+from harnack.field_from_file import field_from_file
 from harnack.files import FileFormatError
 from harnack.geometry import example_curves
 from harnack.geometry.example_meshes import icosphere
 from harnack.name_suggestions import did_you_mean
-from harnack.rendering import MATERIALS, UnboundedSurfaceError, shape
+from harnack.rendering import MATERIALS, UnboundedSurfaceError, mitsuba_shape
 
 POLYGON = hk.SolidAngle(example_curves.wavy_polygon(12))
 KNOT, RAY = example_curves.torus_knot(2, 3, 12), ([[0, 0, 3]], [[0, 0, -1]])
@@ -70,7 +70,7 @@ def test_a_wrong_kind_of_argument_is_named(settings: dict[str, Any], complaint: 
 @pytest.mark.parametrize(
     ("settings", "complaint"),
     [
-        ({"max_depth": 3, "show": "shaded"}, 'max_depth needs a picture with show="color"'),
+        ({"max_depth": 3, "show": "shaded"}, 'max_depth needs a picture with show="path"'),
         ({"material": "goldd"}, r"unknown material 'goldd'; .*; did you mean \"gold\"\?$"),
         ({"material": "tomatoe"}, r"unknown material 'tomatoe'; .*; did you mean \"tomato\"\?$"),
         ({"material": (0.5, 0.5, 2.0)}, r"unknown material \(0.5, 0.5, 2.0\); .* from 0 to 1$"),
@@ -104,7 +104,7 @@ def test_a_picture_larger_than_memory_is_refused(monkeypatch: pytest.MonkeyPatch
         (lambda: hk.signed_distance(icosphere(1), [[0, 0, 1]]), "needed, .* not of type"),  # pyright: ignore
         (lambda: hk.mesh(abs), "a function: of a formula, take harnack.expression"),  # pyright: ignore
         (lambda: hk.render("x^2 + y^2 = 1"), "no such file; of a formula, take"),
-        (lambda: hk.signed_distance(hk.level_set(POLYGON), [[0, 0, 1]]), "LevelSet: take its .f"),  # pyright: ignore
+        (lambda: hk.signed_distance(hk.level_set(POLYGON), [[0, 0, 1]]), "Surface: take its .f"),  # pyright: ignore
         (lambda: hk.render([[POLYGON]]), "give one at a time, or to harnack.render one flat list"),
         (lambda: hk.render([KNOT]), "level sets, not what is of type ndarray: of points"),
         (lambda: hk.trace(hk.Gyroid(1.0, domain="ball"), *RAY), "domain of a Gyroid must be a"),  # pyright: ignore
@@ -113,8 +113,8 @@ def test_a_picture_larger_than_memory_is_refused(monkeypatch: pytest.MonkeyPatch
         (lambda: hk.Isolines("z", levels="0.1"), "levels of isolines must be numbers"),
         (lambda: hk.mesh(POLYGON, thickness="0.1"), "thickness must be a number"),  # pyright: ignore
         (lambda: hk.expression(lambda x, y, z: x == y), "write left - right"),
-        (lambda: shape(POLYGON, material="gold"), "takes bsdf=..., not material="),
-        (lambda: shape(POLYGON, bsdf="gold"), r"MATERIALS\['gold'\].front, not str"),
+        (lambda: mitsuba_shape(POLYGON, material="gold"), "takes bsdf=..., not material="),
+        (lambda: mitsuba_shape(POLYGON, bsdf="gold"), r"MATERIALS\['gold'\].front, not str"),
         (lambda: hk.SphericalHarmonic(2.5, 1), r"two whole numbers, .* not \(2.5, 1\)"),  # pyright: ignore[reportArgumentType]
         (lambda: hk.HarmonicPolynomial("x"), r"such as \{\(2, 1, 0\): 1, .* not by 'x'"),  # pyright: ignore[reportArgumentType]
         (lambda: hk.Gyroid("a"), "edge length of the cell must be a number, not 'a'"),  # pyright: ignore[reportArgumentType]
@@ -146,10 +146,10 @@ def test_what_cannot_be_seen_or_drawn_is_said(tmp_path: Path) -> None:
 
 
 def test_methods_and_certificates_that_there_are_not() -> None:
-    with pytest.raises(ValueError, match=r'unknown method .*; did you mean "newton"\?'):
-        hk.signed_distance(POLYGON, [[0, 0, 3]], method="newtn")  # pyright: ignore[reportArgumentType]
-    with pytest.raises(ValueError, match=r'unknown certificate .*; did you mean "convex"\?'):
-        hk.SolidAngle(example_curves.wavy_polygon(12), certificate="convx")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match=r'unknown method .*; did you mean "closest_point"\?'):
+        hk.signed_distance(POLYGON, [[0, 0, 3]], method="closest_pont")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match=r'unknown lift_bound .*; did you mean "convex"\?'):
+        hk.SolidAngle(example_curves.wavy_polygon(12), lift_bound="convx")  # pyright: ignore[reportArgumentType]
 
 
 def test_messages_of_the_library_name_arguments_of_python(tmp_path: Path) -> None:
@@ -157,15 +157,19 @@ def test_messages_of_the_library_name_arguments_of_python(tmp_path: Path) -> Non
     mesh.write_text(SQUARE)
     cloud.write_text("0 0 0\n1 0 0\n0 1 0\n0 0 1\n")
     for path, settings, complaint in (
-        (mesh, {"normals": "estimate"}, 'leave out normals="estimate", or .* as_="dipole"'),
-        (mesh, {"boundary": True, "as_": "dipole"}, 'boundary=True .* contradicts as_="dipole"'),
+        (mesh, {"normals": "estimate"}, 'leave out normals="estimate", or .* read_as="dipole"'),
+        (
+            mesh,
+            {"take_boundary": True, "read_as": "dipole"},
+            'take_boundary=True .* contradicts read_as="dipole"',
+        ),
         (cloud, {}, 'let them be estimated with normals="estimate"'),
-        (mesh, {"as_": "dipoles"}, r'as_ must be .*; did you mean "dipole"\?'),
+        (mesh, {"read_as": "dipoles"}, r'read_as must be .*; did you mean "dipole"\?'),
         (mesh, {"up": "w"}, "up must be one of x, y, z"),
         (mesh, {"normals": "guess"}, 'normals must be "estimate" or None'),
     ):
         with pytest.raises(ValueError, match=complaint) as caught:
-            open_surface(path, **settings)
+            field_from_file(path, **settings)
         assert "--" not in str(caught.value)
 
 
@@ -176,7 +180,7 @@ def test_a_level_without_bounds_names_one_that_has_them(level: float) -> None:
     ) as e:
         draw(level=level)
     assert "multiples of its period" in str(e.value)
-    assert e.value.usual == 2 * math.pi
+    assert e.value.bounded_level == 2 * math.pi
     assert draw(level=level, clip=hk.Ball((0, 0, 0), 1), show="normal").shape == (8, 8, 3)
 
 
@@ -210,7 +214,8 @@ def run(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str]:
         (["gallery", "Trefoyl"], 1, r"no scene is named .*; did you mean \"trefoil\"\?"),
         (["render", "polygon", "--material", "goldd"], 2, r"--material: unknown .* \"gold\"\?"),
         (["render", "polygon", "--show", "normals"], 2, r"--show: 'normals' .* \"normal\"\?"),
-        (["render", "a.obj", "--as", "dipol"], 2, r"--as: 'dipol' is none of .* \"dipole\"\?"),
+        (["render", "a.obj", "--read-as", "dipol"], 2,
+         r"--read-as: 'dipol' is none of .* \"dipole\"\?"),
         (["render", "polygon", "--elevaton", "3"], 2, r"no option '--elevaton'; .*--elevation"),
         (["render", "polygon", "--level", "4pi"], 1,
          r"level 12.5664 reaches to infinity.*; choose another --level, such as 2pi$"),
@@ -307,7 +312,9 @@ def test_lines_are_printable() -> None:
     assert printable("a\x1b[31m\r\u202eb") == r"a\x1b[31m\r\u202eb"
     assert error_line(RuntimeError("two\n  lines")) == "error: two lines"
     assert "choose a smaller --size" in error_line(MemoryError("of 11 TiB"))
-    assert error_line(ValueError('up= turns as_="loops"')) == "error: --up turns --as loops"
+    assert (
+        error_line(ValueError('up= turns read_as="loops"')) == "error: --up turns --read-as loops"
+    )
 
 
 def raised_messages() -> list[str]:
@@ -333,18 +340,20 @@ def test_the_command_line_names_its_options_and_not_arguments_of_python() -> Non
     options = {option for one in actions for option in one.option_strings}
     named = {one.dest for one in actions if one.option_strings}
     assert {f"--{name.rstrip('_').replace('_', '-')}" for name in OPTIONS} <= options
-    python = re.compile(rf"(?<![(\w])({'|'.join(named)}|as_|solid|section|clip|box|ball)=\S")
+    python = re.compile(rf"(?<![(\w])({'|'.join(named)}|read_as|solid|section|clip|box|ball)=\S")
     only_in_python = "level=[a, b]"  # as no command can be given two fields
     messages = raised_messages()
     assert len(messages) > 500
     for message in messages:
-        said = re.sub(r"\w+\([^()]*=[^()]*\)", "a call", in_options(message))
+        said = re.sub(r"\w+\([^()]*=[^()]*\)", "a call", python_to_cli_terms(message))
         if only_in_python not in message:
             assert not python.search(said), said
-    assert in_options('show="value" needs the function, such as of="z"') == (
+    assert python_to_cli_terms('show="value" needs the function, such as of="z"') == (
         "--show value needs the function, such as --of z"
     )
-    said = in_options("give clip=harnack.Box(lower, upper) or harnack.Ball(center, radius)")
+    said = python_to_cli_terms(
+        "give clip=harnack.Box(lower, upper) or harnack.Ball(center, radius)"
+    )
     assert said == "give --box X,Y,Z,X,Y,Z or --ball X,Y,Z,RADIUS"
 
 
@@ -356,7 +365,7 @@ def test_warnings_are_notes_without_places_in_files(
     x /= np.linalg.norm(x, axis=1, keepdims=True)
     cloud = tmp_path / "rough.xyz"
     np.savetxt(cloud, np.column_stack([x + rng.normal(0, 0.03, x.shape), x]))
-    command = ["mesh", str(cloud), "--spacing", "0.2", "-o", str(tmp_path / "a.stl"), "--quiet"]
+    command = ["mesh", str(cloud), "--cell-size", "0.2", "-o", str(tmp_path / "a.stl"), "--quiet"]
     assert main([*command, "--tolerance", "1e-4"]) == 0
     notes = capsys.readouterr().err.splitlines()
     assert len(notes) == 1

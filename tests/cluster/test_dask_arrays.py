@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import harnack as hk
-from harnack.cluster.dask_arrays import is_lazy
+from harnack.cluster.dask_arrays import is_dask_array
 from harnack.gallery import SCENES
 from harnack.geometry import example_curves
 
@@ -37,19 +37,19 @@ def directions() -> Any:
 def test_blocks_give_what_whole_arrays_give(field: hk.Field, points: Any, directions: Any) -> None:
     for name, more in (("value", {}), ("gradient", {"precision": "double"}), ("hessian", {})):
         lazy, expected = (getattr(field, name)(one, **more) for one in (points, POINTS))
-        assert is_lazy(lazy)
+        assert is_dask_array(lazy)
         assert lazy.shape == expected.shape
         assert lazy.dtype == expected.dtype
         np.testing.assert_array_equal(lazy.compute(), expected)
     hits, expected = hk.trace(field, points, directions), hk.trace(field, POINTS, DIRECTIONS)
     for name, found in dask.compute(vars(hits))[0].items():
         np.testing.assert_array_equal(found, getattr(expected, name))
-    assert int(hits.hit.sum().compute()) == expected.hit.sum()
+    assert int(hits.is_hit.sum().compute()) == expected.is_hit.sum()
 
 
 def test_distances_by_blocks(points: Any) -> None:
-    first = hk.signed_distance(POLYGON, points, method="first").compute()
-    np.testing.assert_array_equal(first, hk.signed_distance(POLYGON, POINTS, method="first"))
+    first = hk.signed_distance(POLYGON, points, method="first_order").compute()
+    np.testing.assert_array_equal(first, hk.signed_distance(POLYGON, POINTS, method="first_order"))
     bounds = hk.distance_bounds(hk.Sphere(1.0), points)
     lower, upper = dask.compute(bounds.lower, bounds.upper)
     true = np.abs(np.linalg.norm(POINTS, axis=1) - 1)
@@ -65,12 +65,12 @@ def test_crossings_and_rays_that_share_a_direction(points: Any) -> None:
 
 
 def test_a_cluster_gives_the_same_and_opens_a_field_once(points: Any, client: Any) -> None:
-    from harnack.cluster.serialization import _opened
+    from harnack.cluster.serialization import _deserialize_cached
 
-    client.run(_opened.cache_clear)
+    client.run(_deserialize_cached.cache_clear)
     found = client.compute(FIELDS[1].value(points)).result()
     np.testing.assert_array_equal(found, FIELDS[1].value(POINTS))
-    assert all(one.misses <= 1 for one in client.run(_opened.cache_info).values())
+    assert all(one.misses <= 1 for one in client.run(_deserialize_cached.cache_info).values())
 
 
 def test_names_are_the_same_in_every_run(points: Any) -> None:
@@ -110,8 +110,8 @@ def test_wrong_arrays_are_refused_by_name(which: int, points: Any, directions: A
 
 
 def test_nothing_is_loaded_that_is_not_asked_for() -> None:
-    assert not is_lazy(POINTS)
-    assert not is_lazy(type("Array", (), {"__module__": "dask.array.core"})())
+    assert not is_dask_array(POINTS)
+    assert not is_dask_array(type("Array", (), {"__module__": "dask.array.core"})())
 
 
 zarr_only = pytest.mark.skipif(sys.version_info < (3, 11), reason="Zarr 3 needs a newer Python")

@@ -15,13 +15,13 @@ import numpy as np
 import pytest
 
 import harnack as hk
-from harnack.cluster.executor import Crew, Folder, crew
+from harnack.cluster.executor import CheckpointFolder, Executor, open_executor
 from harnack.geometry import example_curves
 
 POLYGON = hk.SolidAngle(example_curves.wavy_polygon(24))
 SMALL: dict[str, Any] = {"size": (40, 30), "progress": False}
 WAYS: list[dict[str, Any]] = [
-    {"show": "color", "spp": 4},
+    {"show": "path", "spp": 4},
     {"show": "shaded"},
     {"show": "shaded", "antialias": "cones", "isolines": hk.Isolines("z", 0.1)},
     {"show": "value", "of": "z"},
@@ -30,7 +30,7 @@ WAYS: list[dict[str, Any]] = [
 
 
 def pixels(picture: Any) -> tuple[Any, Any]:
-    return np.asarray(picture), picture.shown
+    return np.asarray(picture), picture.srgb
 
 
 def assert_same(one: Any, other: Any) -> None:
@@ -72,7 +72,7 @@ sys.path.insert(0, {str(Path(__file__).parents[2])!r})
 import harnack as hk, mitsuba as mi, numpy as np
 from harnack.geometry import example_curves
 mi.set_variant("llvm_ad_mono")
-way = {{"size": (24, 18), "progress": False, "show": "color", "spp": 4}}
+way = {{"size": (24, 18), "progress": False, "show": "path", "spp": 4}}
 field = hk.SolidAngle(example_curves.wavy_polygon(24))
 alone = hk.render(field, **way)
 there = hk.render(field, client={client.scheduler.address!r}, **way)
@@ -80,8 +80,8 @@ print(np.array_equal(alone, there), (alone[..., 0] == alone[..., 1]).all())
 """
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert found.stdout.split() == ["True", "True"]
-    one = hk.render(POLYGON, show="color", spp=4, client=client, **SMALL)
-    assert_same(one, hk.render(POLYGON, show="color", spp=4, **SMALL))
+    one = hk.render(POLYGON, show="path", spp=4, client=client, **SMALL)
+    assert_same(one, hk.render(POLYGON, show="path", spp=4, **SMALL))
 
 
 @pytest.mark.parametrize("way", WAYS[:2], ids=str)
@@ -91,19 +91,19 @@ def test_a_checkpoint_spares_what_is_done(
     alone = hk.render(POLYGON, **SMALL, **way)
     kept: dict[str, Any] = {"checkpoint": tmp_path, "tiles": 5, **SMALL, **way}
     put: list[str] = []
-    own = Folder.put
+    own = CheckpointFolder.save
 
-    def counted(self: Folder, name: str, arrays: Any) -> None:
+    def counted(self: CheckpointFolder, name: str, arrays: Any) -> None:
         if len(put) == 3:
             raise KeyboardInterrupt
         put.append(name)
         own(self, name, arrays)
 
-    monkeypatch.setattr(Folder, "put", counted)
+    monkeypatch.setattr(CheckpointFolder, "save", counted)
     with pytest.raises(KeyboardInterrupt):
         hk.render(POLYGON, **kept)
     assert len(list(tmp_path.iterdir())) == 3
-    monkeypatch.setattr(Folder, "put", own)
+    monkeypatch.setattr(CheckpointFolder, "save", own)
     there = {one.name: one.stat().st_mtime_ns for one in tmp_path.iterdir()}
     assert_same(hk.render(POLYGON, **kept), alone)
     assert all((tmp_path / name).stat().st_mtime_ns == when for name, when in there.items())
@@ -131,7 +131,7 @@ def test_films_are_the_same_and_grow(tmp_path: Path, client: Any) -> None:
 def test_a_worker_that_is_killed_takes_nothing_with_it(tmp_path: Path) -> None:
     """Its parts go to the other; a run that is stopped then goes on from what is kept."""
     distributed = pytest.importorskip("distributed")
-    way: dict[str, Any] = {"size": (64, 48), "show": "color", "spp": 64, "tiles": 24}
+    way: dict[str, Any] = {"size": (64, 48), "show": "path", "spp": 64, "tiles": 24}
     alone = hk.render(POLYGON, progress=False, **{**way, "tiles": None})
     kept: dict[str, Any] = {**way, "checkpoint": tmp_path}
     local = {"threads_per_worker": 1, "processes": True, "dashboard_address": None}
@@ -160,18 +160,20 @@ def test_a_worker_that_is_killed_takes_nothing_with_it(tmp_path: Path) -> None:
 
 
 def test_a_job_is_opened_once_by_each_worker(client: Any) -> None:
-    from harnack.cluster.serialization import _opened
+    from harnack.cluster.serialization import _deserialize_cached
 
-    client.run(_opened.cache_clear)
-    found = list(Crew(client).each(Squares(), "square", [(k,) for k in range(40)]))
+    client.run(_deserialize_cached.cache_clear)
+    found = list(Executor(client).run_tasks(Squares(), "square", [(k,) for k in range(40)]))
     assert [int(one["square"]) for one in found] == [k * k for k in range(40)]
-    assert all(one.misses <= 1 for one in client.run(_opened.cache_info).values())
+    assert all(one.misses <= 1 for one in client.run(_deserialize_cached.cache_info).values())
 
 
 def test_equal_parts_are_done_once(tmp_path: Path) -> None:
-    folder = Folder.at(tmp_path)
+    folder = CheckpointFolder.open(tmp_path)
     for _ in range(2):
-        found = list(Crew(folder=folder).each(Squares(), "square", [(k,) for k in (3, 2, 3, 3)]))
+        found = list(
+            Executor(checkpoint=folder).run_tasks(Squares(), "square", [(k,) for k in (3, 2, 3, 3)])
+        )
         assert [int(one["square"]) for one in found] == [9, 4, 9, 9]
     assert len(list(tmp_path.iterdir())) == 2
 
@@ -179,24 +181,28 @@ def test_equal_parts_are_done_once(tmp_path: Path) -> None:
 def test_errors_of_parts_come_back_and_the_rest_is_kept(client: Any, tmp_path: Path) -> None:
     parts = [(k,) for k in (1, 2, 3, -4, 5)]
     with pytest.raises(ValueError, match="-4 is negative"):
-        list(Crew(client, Folder.at(tmp_path)).each(Squares(folder=tmp_path), "square", parts))
+        list(
+            Executor(client, CheckpointFolder.open(tmp_path)).run_tasks(
+                Squares(folder=tmp_path), "square", parts
+            )
+        )
     assert len(list(tmp_path.iterdir())) >= 3
 
 
 def test_damaged_parts_are_refused_by_name(tmp_path: Path) -> None:
-    folder = Folder.at(tmp_path)
-    list(Crew(folder=folder).each(Squares(), "square", [(3,)]))
+    folder = CheckpointFolder.open(tmp_path)
+    list(Executor(checkpoint=folder).run_tasks(Squares(), "square", [(3,)]))
     (path,) = tmp_path.iterdir()
     for damaged in (b"", path.read_bytes()[:40], b"no numbers"):
         path.write_bytes(damaged)
         with pytest.raises(ValueError, match=f"{path.name} is damaged.*delete it"):
-            list(Crew(folder=folder).each(Squares(), "square", [(3,)]))
+            list(Executor(checkpoint=folder).run_tasks(Squares(), "square", [(3,)]))
 
 
 @pytest.mark.parametrize("tiles", [1, 3, 100])
 @pytest.mark.parametrize("count", [0, 1, 17])
 def test_runs_hold_everything_once(count: int, tiles: int) -> None:
-    runs = Crew(tiles=tiles).cut(count, 6)
+    runs = Executor(chunks=tiles).split_range(count, 6)
     assert [k for start, stop in runs for k in range(start, stop)] == list(range(count))
     assert all(0 < stop - start <= 6 for start, stop in runs)
 
@@ -215,7 +221,7 @@ def test_wrong_settings_are_refused_by_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("distributed")
-    monkeypatch.setattr("harnack.cluster.workers._PATIENCE", "0.2s")
+    monkeypatch.setattr("harnack.cluster.workers._CONNECT_TIMEOUT", "0.2s")
     for settings, message in everything_refused(tmp_path):
         with pytest.raises((TypeError, ValueError, OSError), match=message):
             hk.render(POLYGON, **SMALL, **settings)
@@ -265,21 +271,21 @@ def test_workers_that_cannot_work_are_refused_by_name(
         return own(*given, **settings) if answer is None else answer
 
     monkeypatch.setattr(client, "run", run)
-    with pytest.raises(RuntimeError, match=message), crew(client):
+    with pytest.raises(RuntimeError, match=message), open_executor(client):
         pass
 
 
 def test_other_processors_are_told_of(client: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("harnack.cluster.workers.fingerprint", lambda: "another")
-    with pytest.warns(UserWarning, match="round differently"), crew(client):
+    monkeypatch.setattr("harnack.cluster.workers.rounding_fingerprint", lambda: "another")
+    with pytest.warns(UserWarning, match="round differently"), open_executor(client):
         pass
 
 
 def test_workers_that_came_late_are_told_of(client: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("harnack.cluster.executor.worker_threads", lambda _: {})
-    monkeypatch.setattr("harnack.cluster.executor.fingerprint", lambda: "another")
+    monkeypatch.setattr("harnack.cluster.executor.rounding_fingerprint", lambda: "another")
     with pytest.warns(UserWarning, match=r"processors of tcp://.* round differently"):
-        list(Crew(client).each(Squares(), "square", [(2,)]))
+        list(Executor(client).run_tasks(Squares(), "square", [(2,)]))
 
 
 def test_a_lost_scheduler_is_told(client: Any, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -288,4 +294,4 @@ def test_a_lost_scheduler_is_told(client: Any, monkeypatch: pytest.MonkeyPatch) 
 
     monkeypatch.setattr(client, "nthreads", lost)
     with pytest.raises(RuntimeError, match="the scheduler was lost"):
-        list(Crew(client).each(Squares(), "square", [(2,)]))
+        list(Executor(client).run_tasks(Squares(), "square", [(2,)]))

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 import harnack as hk
-from harnack.cluster.serialization import Packed, Remembered, name_of
+from harnack.cluster.serialization import SerializedObject, TransientCache, content_hash
 from harnack.gallery import SCENES
 from harnack.geometry import example_curves
 
@@ -28,7 +28,7 @@ class Counted:
 
     def __init__(self, number: Any) -> None:
         self.number = number
-        self.kept: Remembered[str, int] = Remembered()
+        self.kept: TransientCache[str, int] = TransientCache()
 
     @cached_property
     def twice(self) -> Any:
@@ -37,29 +37,29 @@ class Counted:
 
 def test_what_was_computed_is_not_sent_and_changes_no_name() -> None:
     one = Counted(3)
-    before = Packed.of(one, "test")
+    before = SerializedObject.serialize(one, "test")
     assert one.twice == 6
     one.kept["a"] = 1
-    after = Packed.of(one, "test")
+    after = SerializedObject.serialize(one, "test")
     assert after == before
-    there = after.open()
+    there = after.deserialize()
     assert "twice" not in vars(there)
     assert there.kept == {}
     assert there.twice == 6
-    assert after.open() is there
+    assert after.deserialize() is there
 
 
 def test_names_tell_objects_apart() -> None:
-    names = {name_of(one, "test") for one in (1, 1.0, "1", [1], (1,), None, True, Counted(1))}
+    names = {content_hash(one, "test") for one in (1, 1.0, "1", [1], (1,), None, True, Counted(1))}
     assert len(names) == 8
-    assert name_of(Counted(np.zeros(3)), "test") != name_of(
+    assert content_hash(Counted(np.zeros(3)), "test") != content_hash(
         Counted(np.zeros(3, np.float32)), "test"
     )
 
 
 def test_names_do_not_depend_on_which_equal_objects_are_the_same() -> None:
     array = np.arange(3.0)
-    assert name_of([array, array], "test") == name_of([array, array.copy()], "test")
+    assert content_hash([array, array], "test") == content_hash([array, array.copy()], "test")
 
 
 @pytest.mark.parametrize("name", ["trefoil", "cloud", "soup", "helix", "letters", "gyroid", "lava"])
@@ -67,9 +67,9 @@ def test_surfaces_keep_their_names_when_they_are_used(name: str) -> None:
     fresh, used = SCENES[name].surfaces(), SCENES[name].surfaces()
     for one in used:
         hk.trace(one, POINTS * 3, -POINTS)
-    packed = Packed.of(fresh, "test")
-    assert Packed.of(used, "test") == packed
-    for one, other in zip(packed.open(), fresh, strict=True):
+    packed = SerializedObject.serialize(fresh, "test")
+    assert SerializedObject.serialize(used, "test") == packed
+    for one, other in zip(packed.deserialize(), fresh, strict=True):
         np.testing.assert_array_equal(one.field.value(POINTS), other.field.value(POINTS))
 
 
@@ -79,13 +79,15 @@ def test_functions_of_formulas_are_sent_by_name() -> None:
 
 
 def test_functions_that_name_modules_are_sent() -> None:
-    there = Packed.of(lambda r: hk.Sphere(r).value(np.zeros((1, 3))), "test").open()
+    there = SerializedObject.serialize(
+        lambda r: hk.Sphere(r).value(np.zeros((1, 3))), "test"
+    ).deserialize()
     assert there(2.0) == -2
 
 
 def test_what_cannot_be_sent_is_refused_by_name() -> None:
     with pytest.raises(TypeError, match=r"^client: it cannot be sent.*generator"):
-        Packed.of((k for k in range(3)), "client")
+        SerializedObject.serialize((k for k in range(3)), "client")
 
 
 def test_moved_clouds_take_their_tree_with_them() -> None:
@@ -93,20 +95,23 @@ def test_moved_clouds_take_their_tree_with_them() -> None:
     cloud = SCENES["cloud"].surfaces()[0].field
     assert isinstance(cloud, hk.DipolePotential)
     cloud.value(POINTS)
-    moved = cloud.moved(cloud.points * [1, 1, 3], cloud.normals, cloud.areas)
-    there = Packed.of(moved, "test").open()
+    moved = cloud.with_points(cloud.points * [1, 1, 3], cloud.normals, cloud.areas)
+    there = SerializedObject.serialize(moved, "test").deserialize()
     np.testing.assert_array_equal(moved.value(POINTS), there.value(POINTS))
 
 
 def test_curves_are_small() -> None:
-    assert len(Packed.of(hk.SolidAngle(example_curves.wavy_polygon(24)), "test").data) < 3000
+    assert (
+        len(SerializedObject.serialize(hk.SolidAngle(example_curves.wavy_polygon(24)), "test").data)
+        < 3000
+    )
 
 
 PROGRAM = """
 from typing import Generic, TypeVar
 import constants
 import harnack as hk
-from harnack.cluster.serialization import name_of
+from harnack.cluster.serialization import content_hash
 
 class Doubled(hk.Sphere):
     names = frozenset(["one", "two", "three"])
@@ -124,7 +129,7 @@ class Kept(Generic[T]):
 factor = 3.0
 def helper(x):
     return factor * x if x in {"a", "b", "c"} else helper(x)
-print(name_of([Doubled(1.0), Kept[int](), lambda x: helper(x), {"a", "b", "c"}], "test"))
+print(content_hash([Doubled(1.0), Kept[int](), lambda x: helper(x), {"a", "b", "c"}], "test"))
 """
 
 
@@ -164,12 +169,12 @@ class Mine(hk.Sphere):
     names: list[str] = []
     for factor in (2.0, 30.0):
         (tmp_path / "of_a_user.py").write_text(text.replace("2.0", str(factor)))
-        packed = Packed.of(importlib.import_module("of_a_user").Mine(1.0), "test")
-        names.append(packed.name)
+        packed = SerializedObject.serialize(importlib.import_module("of_a_user").Mine(1.0), "test")
+        names.append(packed.content_hash)
         del sys.modules["of_a_user"]
         (tmp_path / "of_a_user.py").unlink()
         importlib.invalidate_caches()
-        there = packed.open()
+        there = packed.deserialize()
         assert there.value(np.zeros((1, 3))) == -factor
         assert there.factor is there.factor
     assert names[0] != names[1]
@@ -213,13 +218,13 @@ def test_modules_that_functions_name_are_sent_as_they_are_here(own_modules: Any)
     }
     for name, way in ways.items():
         settings.RADIUS = 1.0
-        before = Packed.of(way, name)
+        before = SerializedObject.serialize(way, name)
         settings.RADIUS = 2.0
         settings.kept.cache_clear()
-        after = Packed.of(way, name)
-        assert before.name != after.name, name
+        after = SerializedObject.serialize(way, name)
+        assert before.content_hash != after.content_hash, name
         settings.RADIUS = 3.0
-        assert (before.open()(), after.open()()) == (1, 2), name
+        assert (before.deserialize()(), after.deserialize()()) == (1, 2), name
 
 
 def test_what_is_not_seen_of_modules_is_refused(own_modules: Any) -> None:
@@ -229,12 +234,12 @@ def test_what_is_not_seen_of_modules_is_refused(own_modules: Any) -> None:
         return own_settings.RADIUS  # pyright: ignore[reportUnknownVariableType]
 
     with pytest.raises(TypeError, match=r"within .* imports your module own_settings when it is "):
-        Packed.of(within, "test")
+        SerializedObject.serialize(within, "test")
 
     def by_name(name: str) -> Any:
         return getattr(own_modules.settings, name, None)
 
-    there = Packed.of(by_name, "test").open()
+    there = SerializedObject.serialize(by_name, "test").deserialize()
     assert there("NEVER") is None
     with pytest.raises(RuntimeError, match=r"RADIUS of your module own_settings was not sent"):
         there("RADIUS")
@@ -251,17 +256,17 @@ class Scaled:
 def test_opening_leaves_the_classes_of_this_process_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """Their methods were replaced by those that were sent, for which constants never change."""
     here = Scaled()
-    there = Packed.of(here, "test").open()
+    there = SerializedObject.serialize(here, "test").deserialize()
     monkeypatch.setattr(sys.modules[__name__], "factor", 5.0)
     assert (here.factor(), there.factor()) == (5, 2)
 
 
 def test_installed_packages_count_by_their_versions() -> None:
     scipy = importlib.import_module("scipy")
-    packed = Packed.of(lambda: scipy.special.j0(1.0), "test")
+    packed = SerializedObject.serialize(lambda: scipy.special.j0(1.0), "test")
     assert packed.others == (("scipy", scipy.__version__),)
     with pytest.raises(RuntimeError, match=r"sent by harnack .*scipy 0\.1, and here is .*scipy 1"):
-        replace(packed, others=(("scipy", "0.1"),)).open()
+        replace(packed, others=(("scipy", "0.1"),)).deserialize()
 
 
 def test_files_count_by_what_is_in_them(tmp_path: Path) -> None:
@@ -269,28 +274,28 @@ def test_files_count_by_what_is_in_them(tmp_path: Path) -> None:
     for described in ({"type": "bitmap", "filename": str(file)}, [file], Counted(str(scan))):
         file = scan if isinstance(described, Counted) else file
         file.write_bytes(b"brown")
-        packed = Packed.of(described, "test")
-        assert isinstance(described, Counted) or packed.open() == described
+        packed = SerializedObject.serialize(described, "test")
+        assert isinstance(described, Counted) or packed.deserialize() == described
         file.write_bytes(b"green")
-        changed = Packed.of(described, "test")
-        assert changed.name != packed.name
-        missing = Packed.of(described, "test again")
+        changed = SerializedObject.serialize(described, "test")
+        assert changed.content_hash != packed.content_hash
+        missing = SerializedObject.serialize(described, "test again")
         file.unlink()
         with pytest.raises(ValueError, match=r"wood(.png)? is not here"):
-            replace(missing, name="0" * 32).open()
+            replace(missing, content_hash="0" * 32).deserialize()
 
 
 def test_names_of_attributes_are_no_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    before = Packed.of(Counted(1), "test")
-    for name in ("number", "kept", "twice", "Remembered"):
+    before = SerializedObject.serialize(Counted(1), "test")
+    for name in ("number", "kept", "twice", "TransientCache"):
         (tmp_path / name).write_text("a log that grows")
-    assert Packed.of(Counted(1), "test") == before
+    assert SerializedObject.serialize(Counted(1), "test") == before
 
 
 def test_other_versions_open_nothing() -> None:
     with pytest.raises(RuntimeError, match=r"sent by harnack 0\.0, and here is harnack .*drjit"):
-        replace(Packed.of(3, "test"), made_by="harnack 0.0").open()
+        replace(SerializedObject.serialize(3, "test"), package_versions="harnack 0.0").deserialize()
 
 
 def test_what_users_do_not_compare_is_sent() -> None:
@@ -298,5 +303,5 @@ def test_what_users_do_not_compare_is_sent() -> None:
     class Named:
         radius: float = field(default=1.0, compare=False)
 
-    assert Packed.of(Named(2.0), "test").open().radius == 2
-    assert name_of(Named(2.0), "test") != name_of(Named(3.0), "test")
+    assert SerializedObject.serialize(Named(2.0), "test").deserialize().radius == 2
+    assert content_hash(Named(2.0), "test") != content_hash(Named(3.0), "test")

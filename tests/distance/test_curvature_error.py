@@ -12,7 +12,7 @@ import pytest
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.distance.surface_curvature import _Derivatives
-from harnack.fields.batched_fields import BatchedField, SymmetricSum, Values
+from harnack.fields.batched_fields import BatchedField, PointValues, SymmetricMatrix
 
 PRECISIONS = ("double", "single")
 
@@ -120,7 +120,7 @@ class Truncated(BatchedField):
         r = dr.norm(p)
         return hk.Sample(1 / r - 1, -p / (r * r * r), (hk.HarmonicBall(r, -1.0, math.inf),))
 
-    def values_at(self, x: Any, derivatives: int, closer: Any = 1.0) -> Values:
+    def values_at(self, x: Any, derivatives: int, closer: Any = 1.0) -> PointValues:
         dr.eval(x, closer)
         self.asked.append((dr.width(x), float(to_numpy(closer)[0])))
         r = dr.norm(x)
@@ -129,11 +129,11 @@ class Truncated(BatchedField):
         off_g, off_a = (dr.maximum(one * near, self.left) for one in self.errors)
         ways = (dr.sin(40 * x.x), dr.cos(30 * x.y), dr.sin(50 * x.z + 1))
         way = dr.normalize(type(x)(*ways))
-        wrong = SymmetricSum(*(self.share * off_a * (way[i] * way[j]) for i, j in INDICES))
+        wrong = SymmetricMatrix(*(self.share * off_a * (way[i] * way[j]) for i, j in INDICES))
         p = (x.x, x.y, x.z)
         right = [3 * p[i] * p[j] / r**5 - (third if i == j else 0) for i, j in INDICES]
-        total = SymmetricSum(*(a + b for a, b in zip(right, wrong.parts(), strict=True)))
-        return Values(
+        total = SymmetricMatrix(*(a + b for a, b in zip(right, wrong.components(), strict=True)))
+        return PointValues(
             1 / r - 1, dr.zeros(type(r)), g + self.share * off_g * way, total, off_g, off_a
         )
 
@@ -186,7 +186,7 @@ def test_exact_fields_have_rounding_alone() -> None:
     x = np.random.default_rng(2).uniform(-1, 1, (200, 3))
     for precision in PRECISIONS:
         found = hk.curvature(hk.Gyroid(), x, precision=precision)
-        epsilon = choose_backend(precision).epsilon
+        epsilon = choose_backend(precision).machine_epsilon
         sample = np.abs(found.mean) + np.sqrt(np.abs(found.gaussian)) + 10
         assert (found.mean_error < 1e3 * epsilon * sample**2).mean() > 0.9
         assert np.isfinite(found.gaussian_error).all()
@@ -275,7 +275,7 @@ def test_curvatures_of_bent_fields_are_those_of_the_field() -> None:
 
 def test_edges_of_solids_have_no_curvature() -> None:
     """On the circle in which two spheres meet, either may be the one."""
-    two = hk.Sphere(1.0) | hk.Sphere(1.0).moved((1.0, 0.0, 0.0))
+    two = hk.Sphere(1.0) | hk.Sphere(1.0).translated((1.0, 0.0, 0.0))
     found = hk.curvature(two, [[0.5, np.sqrt(0.75), 0.0], [-1.0, 0.0, 0.0]])
     assert np.isinf(found.mean_error).tolist() == [True, False]
     assert abs(found.mean[1] - 1) <= found.mean_error[1] < 1e-12
@@ -290,7 +290,7 @@ def test_solids_made_of_sums_over_trees_know_their_curvature() -> None:
     inside = hk.solid(cloud, above=2 * np.pi)
     at = 0.97 * points[::100]
     exact = -hk.curvature(cloud, at).mean
-    for field in (inside, inside | hk.Sphere(0.1), inside.moved((0.0, 0.0, 0.0))):
+    for field in (inside, inside | hk.Sphere(0.1), inside.translated((0.0, 0.0, 0.0))):
         computed = hk.curvature(field, at)
         assert (np.abs(computed.mean - exact) <= computed.mean_error + 1e-3 * np.abs(exact)).all()
         assert np.median(computed.mean_error / np.abs(exact)) < 1e-3
@@ -303,7 +303,7 @@ class Unstated(hk.Field):
     """|p|^2 - 1, with second derivatives whose errors it does not state."""
 
     def evaluate(self, p: Any) -> hk.Sample:
-        return hk.Sample(dr.squared_norm(p) - 1, 2 * p, (hk.Curvature(2.0),))
+        return hk.Sample(dr.squared_norm(p) - 1, 2 * p, (hk.TaylorRemainder(2.0),))
 
     def hessian(self, p: Any) -> tuple[Any, Any, Any]:
         kind = type(p)

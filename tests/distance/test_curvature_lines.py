@@ -23,8 +23,8 @@ def azimuth(line: np.ndarray) -> np.ndarray:
 def test_lines_of_a_torus_are_its_circles(precision: Any) -> None:
     small = 1e-4 if precision == "single" else 1e-9
     settings: dict[str, Any] = {"step": 0.05, "length": 1.5, "precision": precision}
-    around = hk.curvature_lines(TORUS, SEEDS, family="largest", **settings)
-    along = hk.curvature_lines(TORUS, SEEDS, family="smallest", **settings)
+    around = hk.curvature_lines(TORUS, SEEDS, family="maximum", **settings)
+    along = hk.curvature_lines(TORUS, SEEDS, family="minimum", **settings)
     for one, other in zip(around, along, strict=True):
         assert len(one) == len(other) == 61
         assert np.abs(TORUS.value(one, precision="double")).max() < small
@@ -63,7 +63,7 @@ def test_lines_end_at_umbilics_at_curves_and_at_the_clip_volume() -> None:
     # circle, near which the surface is ever more bent, or at the axis, where there is an umbilic.
     field = hk.SolidAngle(hk.Circle(1.0))
     seeds = np.array([[0.5, 0.0, -1.0], [0.9, 0.1, -0.5]])
-    families: tuple[Any, ...] = ("largest", "smallest")
+    families: tuple[Any, ...] = ("maximum", "minimum")
     lines = [
         hk.curvature_lines(field, seeds, level=1.2, step=0.02, length=4.0, family=one)
         for one in families
@@ -76,7 +76,7 @@ def test_lines_end_at_umbilics_at_curves_and_at_the_clip_volume() -> None:
         assert len(line) < 200
         assert np.hypot(line[:, 0], line[:, 1]).max() < 2.0
     (cut,) = hk.curvature_lines(
-        TORUS, SEEDS[:1], step=0.05, length=9.0, family="smallest",
+        TORUS, SEEDS[:1], step=0.05, length=9.0, family="minimum",
         clip=hk.HalfSpace((-1.0, 0, 0), -0.5),
     )  # fmt: skip
     assert 0.5 <= cut[:, 0].min() < 0.55
@@ -95,7 +95,7 @@ def test_the_rim_of_a_constant_angle_is_a_line_of_curvature() -> None:
     seed = [[0.0, radius, near * math.sin(0.6)]]
     lines = [
         hk.curvature_lines(field, seed, level=level, step=0.002, length=0.3, family=family)[0]
-        for family in ("largest", "smallest")
+        for family in ("maximum", "minimum")
     ]
     spread = sorted(float(np.ptp(np.hypot(line[:, 0], line[:, 1]))) for line in lines)
     assert spread[0] < 0.2 * near < 0.2 < spread[1]
@@ -107,7 +107,7 @@ def test_what_is_no_line() -> None:
         settings: dict[str, Any] = {"step": 0.1, "length": 1.0, **wrong}
         with pytest.raises(ValueError, match=r"must be positive|at most"):
             hk.curvature_lines(TORUS, SEEDS, **settings)
-    with pytest.raises(ValueError, match='did you mean "largest"'):
-        hk.curvature_lines(TORUS, SEEDS, step=0.1, length=1.0, family="larges")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match='did you mean "maximum"'):
+        hk.curvature_lines(TORUS, SEEDS, step=0.1, length=1.0, family="maximu")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="seeds"):
         hk.curvature_lines(TORUS, [[0.0, math.nan, 1.0]], step=0.1, length=1.0)

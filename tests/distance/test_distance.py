@@ -17,14 +17,18 @@ from scipy.spatial import cKDTree
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.distance import closest_points, curvature, signed_distance, tangent_plane
-from harnack.distance.tangent_plane import second_order
-from harnack.enclosures import Curvature, Enclosure, HarmonicBall, Lipschitz
-from harnack.enclosures.harmonic_ball import Caps, Classic, Slope
-from harnack.enclosures.parabola import Cone, Taylor
-from harnack.fields.capabilities import NO_SHEET, Crossing
+from harnack.distance.tangent_plane import second_order_distance
+from harnack.enclosures import Enclosure, HarmonicBall, Lipschitz, TaylorRemainder
+from harnack.enclosures.harmonic_ball import (
+    HarnackEnclosure,
+    HarnackSlopeEnclosure,
+    SphericalCapEnclosure,
+)
+from harnack.enclosures.parabola import LipschitzEnclosure, TaylorEnclosure
+from harnack.fields.capabilities import NO_FACET, JumpCrossing
 from harnack.geometry import example_curves
-from harnack.testing.enclosure_contracts import Case
-from harnack.testing.violation_search import look_at, movements
+from harnack.testing.enclosure_contracts import PromiseCase
+from harnack.testing.violation_search import lift_along_rays, sample_field
 from tests.oracles.exact import exact_step
 
 # --- fields whose surfaces are known ---------------------------------------------------------
@@ -55,7 +59,7 @@ class Ellipsoid(hk.Field):
     def evaluate(self, p: Any) -> hk.Sample:
         q = type(p)(p.x / self.a**2, p.y / self.b**2, p.z / self.c**2)
         return hk.Sample(
-            dr.dot(p, q) - 1, 2 * q, (hk.Curvature(2 / min(self.a, self.b, self.c) ** 2),)
+            dr.dot(p, q) - 1, 2 * q, (hk.TaylorRemainder(2 / min(self.a, self.b, self.c) ** 2),)
         )
 
 
@@ -102,7 +106,7 @@ class Helicoid(hk.Field):
         xx, xy = -2 * x * y / fourth, (x * x - y * y) / fourth
         return type(p)(xx, xy, 0), type(p)(xy, -xx, 0), type(p)(0.0)
 
-    def closest_on_boundary(self, p: Any) -> Any:
+    def closest_boundary_point(self, p: Any) -> Any:
         return type(p)(0.0, 0.0, p.z)
 
 
@@ -136,7 +140,7 @@ class Step(hk.Field):
     Level 0.5 is z = 5/3 for x <= 0, z = -5/3 for x >= 0, and the strip of the sheet between.
     """
 
-    has_sheets = True
+    has_jumps = True
     default_level = 0.5
     domain = hk.Box((-4, -4, -4), (4, 4, 4))
 
@@ -148,25 +152,25 @@ class Step(hk.Field):
         known = (hk.Lipschitz(0.3),)
         return hk.Sample(0.3 * p.z + side, type(p)(0.0, 0.0, 0.3), known)
 
-    def next_crossing(self, o: Any, d: Any, after: Any, t_max: Any, active: Any) -> Crossing:
+    def next_jump(self, o: Any, d: Any, after: Any, t_max: Any, active: Any) -> JumpCrossing:
         t = -o.x / d.x
-        later = (t > after.t) | ((t == after.t) & (after.sheet < 0))
+        later = (t > after.t) | ((t == after.t) & (after.facet < 0))
         meets = active & later & (t <= t_max) & (d.x != 0)
-        return Crossing(
+        return JumpCrossing(
             dr.select(meets, t, dr.inf),
-            dr.select(meets, dr.uint32_array_t(o.x)(0), dr.uint32_array_t(o.x)(NO_SHEET)),
+            dr.select(meets, dr.uint32_array_t(o.x)(0), dr.uint32_array_t(o.x)(NO_FACET)),
             dr.select(meets, dr.copysign(type(o.x)(1), d.x), 0),
             type(o)(1.0, 0.0, 0.0),
         )
 
-    def offset(self, o: Any, d: Any, t_min: Any, active: Any) -> Any:
+    def initial_offset(self, o: Any, d: Any, t_min: Any, active: Any) -> Any:
         at = o.x + t_min * d.x
         return dr.select((at > 0) | ((at == 0) & (d.x > 0)), 1.0, 0.0)
 
-    def between(self, o: Any, d: Any, behind: Any, ahead: Any, offset: Any) -> Step:
+    def continuation(self, o: Any, d: Any, behind: Any, ahead: Any, offset: Any) -> Step:
         return Step(offset)
 
-    def distance_to_sheets(self, p: Any) -> Any:
+    def distance_to_jumps(self, p: Any) -> Any:
         return dr.abs(p.x)
 
     @staticmethod
@@ -212,7 +216,7 @@ def unit(v: np.ndarray) -> np.ndarray:
 
 def off_level(field: hk.Field, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """f - level, modulo the period, and the gradient."""
-    look = look_at(field, x)
+    look = sample_field(field, x)
     above = look.value - field.default_level
     if field.period is not None:
         above -= field.period * np.round(above / field.period)
@@ -228,7 +232,7 @@ def surface_points(field: hk.Field, n: int, seed: int = 0) -> np.ndarray:
     center, size = 0.5 * (lower + upper), 0.5 * float(np.linalg.norm(upper - lower))
     o = center + 0.5 * size * rng.normal(size=(n, 3))
     hits = hk.trace(field, o, unit(rng.normal(size=(n, 3))), t_max=3 * size, tolerance=1e-5 * size)
-    x = hits.position[hits.hit].astype(np.float64)
+    x = hits.position[hits.is_hit].astype(np.float64)
     for _ in range(4):
         above, g = off_level(field, x)
         x = x - (above / np.einsum("nk,nk->n", g, g))[:, None] * g
@@ -287,13 +291,13 @@ def test_curvature_is_how_the_normal_turns(name: str) -> None:
     field = CURVED[name]
     x = surface_points(field, 2000)[:200]
     scale = np.abs(curvature(field, x).gaussian) ** 0.5 + np.abs(curvature(field, x).mean)
-    normal = unit(look_at(field, x).gradient)
+    normal = unit(sample_field(field, x).gradient)
     u = unit(np.cross(normal, np.eye(3)[np.abs(normal).argmin(axis=1)]))
     frame = (u, np.cross(normal, u))
     h = 1e-3 * np.minimum(boundary_distance(field, x), 0.1)[:, None]
     shape = np.empty((len(x), 2, 2))
     for j, way in enumerate(frame):
-        ahead, back = (unit(look_at(field, x + s * h * way).gradient) for s in (1, -1))
+        ahead, back = (unit(sample_field(field, x + s * h * way).gradient) for s in (1, -1))
         for i, along in enumerate(frame):
             shape[:, i, j] = np.einsum("nk,nk->n", (ahead - back) / (2 * h), along)
     found = curvature(field, x)
@@ -333,16 +337,16 @@ def test_the_example_of_a_charge() -> None:
     """f = 1/r - 1 at r = 0.8: 0.16 to first order, 0.2 is true. With the sign that was printed,
     d (1 - k d/2), the second order would be 0.128."""
     x = [[0.0, 0.8, 0.0]]
-    assert signed_distance(Charge(), x, method="first") == pytest.approx([0.16], rel=1e-12)
-    assert signed_distance(Charge(), x, method="second") == pytest.approx([0.2], rel=1e-12)
-    assert signed_distance(Charge(), x, method="newton") == pytest.approx([0.2], rel=1e-12)
+    assert signed_distance(Charge(), x, method="first_order") == pytest.approx([0.16], rel=1e-12)
+    assert signed_distance(Charge(), x, method="second_order") == pytest.approx([0.2], rel=1e-12)
+    assert signed_distance(Charge(), x, method="closest_point") == pytest.approx([0.2], rel=1e-12)
 
 
 def order_of(field: hk.Field, method: Any) -> float:
     """The slope of log(error) over log(distance)."""
     lengths = np.geomspace(1e-3, 1e-2, 5)
     y = surface_points(field, 3000)
-    normal = unit(look_at(field, y).gradient)
+    normal = unit(sample_field(field, y).gradient)
     bend = np.sqrt(np.abs(curvature(field, y).gaussian)) + np.abs(curvature(field, y).mean)
     # Where the surface is bent the least: distances along the normal are true far out.
     y, normal = (one[np.argsort(bend)[: len(y) // 2]] for one in (y, normal))
@@ -363,8 +367,8 @@ def test_orders_of_accuracy(name: str) -> None:
     if field is None:  # at level 0 it is a cone: flat along rays, with planes among its sheets
         field = hk.SphericalHarmonic(5, 2)
         field.default_level = 0.05
-    assert 1.9 < order_of(field, "first") < 2.1
-    assert 2.9 < order_of(field, "second") < 3.1
+    assert 1.9 < order_of(field, "first_order") < 2.1
+    assert 2.9 < order_of(field, "second_order") < 3.1
 
 
 @given(above=st.floats(-10, 10), steepness=st.floats(0.01, 10), bend=st.floats(-100, 100))
@@ -373,7 +377,7 @@ def test_second_order_stays_a_distance(above: float, steepness: float, bend: flo
     v = choose_backend("double").Array3f
     rows = (v(0.0), v(0.0), v(0.0, 0.0, bend))
     real = choose_backend("double").Float
-    found = to_numpy(second_order(real(above), v(0.0, 0.0, steepness), rows))[0]
+    found = to_numpy(second_order_distance(real(above), v(0.0, 0.0, steepness), rows))[0]
     first = above / steepness
     assert abs(found) <= 2 * abs(first)
     assert found == 0 or math.copysign(1, found) == math.copysign(1, above)
@@ -383,10 +387,10 @@ def test_second_order_stays_a_distance(above: float, steepness: float, bend: flo
 
 def test_where_the_gradient_vanishes() -> None:
     field = Ellipsoid2()
-    assert signed_distance(field, [[0.0, 0.0, 0.0]], method="first").tolist() == [-math.inf]
-    assert signed_distance(field, [[0.0, 0.0, 0.0]], method="second").tolist() == [-math.inf]
+    assert signed_distance(field, [[0.0, 0.0, 0.0]], method="first_order").tolist() == [-math.inf]
+    assert signed_distance(field, [[0.0, 0.0, 0.0]], method="second_order").tolist() == [-math.inf]
     level = [[0.0, 0.0, 0.0]]
-    for method in ("first", "second", "newton"):
+    for method in ("first_order", "second_order", "closest_point"):
         assert signed_distance(field, level, level=-1.0, method=method).tolist() == [0.0]  # type: ignore[arg-type]
 
 
@@ -394,7 +398,7 @@ def test_where_the_gradient_vanishes() -> None:
 def test_the_sign_is_that_of_the_nearest_level() -> None:
     """Of the ladder 0, 2 pi, ..: above it up to half a period, then below the next one."""
     x = np.array([[1.0, 0.0, z] for z in (0.3, 2.8, 3.5, 6.0, 6.6)])
-    for method in ("first", "second", "newton", "lower"):
+    for method in ("first_order", "second_order", "closest_point", "lower_bound"):
         found = signed_distance(Helicoid(), x, method=method)  # type: ignore[arg-type]
         assert np.sign(found).tolist() == [1, 1, -1, -1, 1]
 
@@ -477,7 +481,7 @@ def points_around(field: hk.Field, n: int, seed: int = 0) -> np.ndarray:
 
 def boundary_distance(field: hk.Field, x: np.ndarray) -> np.ndarray:
     """From points (n, 3) to the curve that the surface ends in; inf without one."""
-    nearest = field.closest_on_boundary(to_vector3(choose_backend("double"), x))
+    nearest = field.closest_boundary_point(to_vector3(choose_backend("double"), x))
     if nearest is None:
         return np.full(len(x), np.inf)
     return np.linalg.norm(to_numpy(nearest) - x, axis=1)
@@ -503,7 +507,7 @@ def test_the_rim_of_a_disk_belongs_to_it() -> None:
         field = hk.SolidAngle(scale * (corners + shift))
         found = np.abs(signed_distance(field, scale * (x + shift)))
         assert np.abs(found / scale - exact).max() < 1e-10
-        lower = np.abs(signed_distance(field, scale * (x + shift), method="lower"))
+        lower = np.abs(signed_distance(field, scale * (x + shift), method="lower_bound"))
         assert (lower <= scale * exact * (1 + 1e-12)).all()
         assert np.median(lower / (scale * exact)) > 0.3
 
@@ -568,11 +572,11 @@ def test_every_point_has_a_distance_from_a_cloud(kind: str, n: int) -> None:
         warnings.simplefilter("error")
         found, y = signed_distance(field, x), closest_points(field, x)
     assert np.allclose(np.linalg.norm(x - y, axis=1), np.abs(found), rtol=1e-12)
-    look = look_at(field, y)
+    look = sample_field(field, y)
     steepness = np.linalg.norm(look.gradient, axis=1)
     off = np.abs(look.value - field.default_level)
     assert (off <= 2 * look.error + 1e-12 * steepness).all()
-    assert (signed_distance(field, x, method="lower") / found <= 1 + 1e-9).all()
+    assert (signed_distance(field, x, method="lower_bound") / found <= 1 + 1e-9).all()
     # The level sets pass through all points: that bounds the distance, but the foot is a minimum.
     nearest, _ = cKDTree(cloud[0]).query(x)
     assert (np.abs(found) <= nearest + 1e-9).mean() > 0.98
@@ -590,14 +594,14 @@ def test_the_lower_bound_is_attained_by_planes_and_spheres(precision: Any) -> No
     class Plane(hk.Field):
         def evaluate(self, p: Any) -> hk.Sample:
             slope = type(p)(2.0, 1.0, -2.0)
-            return hk.Sample(dr.dot(p, slope), slope, (hk.Curvature(0.0),))
+            return hk.Sample(dr.dot(p, slope), slope, (hk.TaylorRemainder(0.0),))
 
     flat = np.abs(x @ [2, 1, -2]) / 3
-    found = np.abs(signed_distance(Plane(), x, method="lower", precision=precision))
+    found = np.abs(signed_distance(Plane(), x, method="lower_bound", precision=precision))
     slack = 1e-5 if precision == "single" else 1e-5 * flat
     assert (found <= flat).all()
     assert (found >= flat - slack).all()
-    found = np.abs(signed_distance(Bare(), x, method="lower", precision=precision))
+    found = np.abs(signed_distance(Bare(), x, method="lower_bound", precision=precision))
     round_ = np.abs(np.linalg.norm(x, axis=1) - 1)
     assert (found <= round_).all()
     assert (found >= round_ * (1 - 1e-5)).all()
@@ -607,30 +611,42 @@ def test_the_lower_bound_is_attained_by_planes_and_spheres(precision: Any) -> No
 def test_the_lower_bound_is_of_first_order() -> None:
     for name, field in CURVED.items():
         y = surface_points(field, 500)
-        normal = unit(look_at(field, y).gradient)
+        normal = unit(sample_field(field, y).gradient)
         inner = boundary_distance(field, y) > 0.3
         d = 1e-4
-        found = np.abs(signed_distance(field, y + d * normal, method="lower"))[inner] / d
+        found = np.abs(signed_distance(field, y + d * normal, method="lower_bound"))[inner] / d
         assert found.max() <= 1, name
         assert np.median(found) > 0.99, name
 
 
-def cases(rng: np.random.Generator, n: int) -> list[tuple[type[Enclosure], Case, np.ndarray]]:
+def cases(
+    rng: np.random.Generator, n: int
+) -> list[tuple[type[Enclosure], PromiseCase, np.ndarray]]:
     """Random ones of each kind, the bounds for them, and how large slopes may be."""
     radius, below, above = (10 ** rng.uniform(-2, 1, n) for _ in range(3))
     down, up = (share * 10 ** rng.uniform(-2, 1, n) for share in (below, above))
-    result: list[tuple[type[Enclosure], Case, np.ndarray]] = []
+    result: list[tuple[type[Enclosure], PromiseCase, np.ndarray]] = []
     for dimension in (2, 3, 4):
         for low, high in ((-below, above), (-below, np.inf), (-np.inf, above)):
-            ball = Case(HarmonicBall(radius, low, high, dimension), down, up)
+            ball = PromiseCase(HarmonicBall(radius, low, high, dimension), down, up)
             steepest = dimension * np.minimum(-low, high) / radius
             if dimension == 3 and np.ndim(low) == np.ndim(high):
                 share = below / (below + above)
-                result.append((Caps, ball, 3 * (below + above) / radius * share * (1 - share)))
-            result += [(Slope, ball, steepest), (Classic, ball, steepest)]
+                result.append(
+                    (
+                        SphericalCapEnclosure,
+                        ball,
+                        3 * (below + above) / radius * share * (1 - share),
+                    )
+                )
+            result += [(HarnackSlopeEnclosure, ball, steepest), (HarnackEnclosure, ball, steepest)]
     constant, slopes = 10 ** rng.uniform(-2, 2, n), 10 ** rng.uniform(-2, 1, n)
-    result.append((Cone, Case(Lipschitz(constant, radius), down, up), constant))
-    result.append((Taylor, Case(Curvature(constant, radius), down, up), slopes))
+    result.append(
+        (LipschitzEnclosure, PromiseCase(Lipschitz(constant, radius), down, up), constant)
+    )
+    result.append(
+        (TaylorEnclosure, PromiseCase(TaylorRemainder(constant, radius), down, up), slopes)
+    )
     return result
 
 
@@ -648,10 +664,16 @@ def test_the_steepest_directions_have_the_shortest_steps() -> None:
             any_way = exact_step(bound, case, steep * rng.uniform(-1, 1, n))
             assert (ends <= any_way * (1 + 1e-12)).all(), bound
         # The comparison would notice slopes of no influence or of the wrong sign.
-        if bound not in (Classic, Cone):
+        if bound not in (HarnackEnclosure, LipschitzEnclosure):
             assert (exact_step(bound, case, steep) > ends * 1.01).mean() > 0.05
         kinds.add(bound)
-    assert kinds == {Caps, Slope, Classic, Cone, Taylor}
+    assert kinds == {
+        SphericalCapEnclosure,
+        HarnackSlopeEnclosure,
+        HarnackEnclosure,
+        LipschitzEnclosure,
+        TaylorEnclosure,
+    }
 
 
 def true_distance(field: hk.Field, x: np.ndarray, rays: int) -> np.ndarray:
@@ -683,7 +705,7 @@ def check_lower_bound(field: hk.Field, points: int, rays: int, precision: Any) -
     if field.domain is not None:
         near = near[field.domain.contains_points(near)]
     x[: len(near)] = near
-    lower = np.abs(signed_distance(field, x, method="lower", precision=precision))
+    lower = np.abs(signed_distance(field, x, method="lower_bound", precision=precision))
     exact = true_distance(field, x, rays)
     assert (lower <= exact * (1 + 1e-12)).all()
     # It is close enough to the truth for the comparison to notice three percent.
@@ -711,12 +733,12 @@ def test_the_lower_bound_holds_in_random_directions() -> None:
     for name in ("knot", "polynomial", "Y 5,3"):
         field = CURVED[name]
         x = points_around(field, 400, seed=13)
-        lower = np.abs(signed_distance(field, x, method="lower"))
+        lower = np.abs(signed_distance(field, x, method="lower_bound"))
         above, _ = off_level(field, x)
         room = np.inf if field.period is None else field.period - np.abs(above)
         for _ in range(20):
             d = unit(rng.normal(size=(len(x), 3)))
-            moved = movements(field, x, d, lower[:, None] * np.linspace(0, 1, 17)).moved
+            moved = lift_along_rays(field, x, d, lower[:, None] * np.linspace(0, 1, 17)).moved
             away = np.sign(above)[:, None] * moved  # from the nearest level in value
             assert (away >= -np.abs(above)[:, None] - 1e-12).all(), name
             assert (away <= np.broadcast_to(room, len(x))[:, None] + 1e-12).all(), name
@@ -724,7 +746,7 @@ def test_the_lower_bound_holds_in_random_directions() -> None:
 
 def test_points_outside_the_domain_have_no_lower_bound() -> None:
     with pytest.raises(ValueError, match=r"entry 1 and 1 more outside the domain of Gyroid"):
-        signed_distance(hk.Gyroid(), [[0, 0, 0], [9, 0, 0], [0, 9, 0]], method="lower")
+        signed_distance(hk.Gyroid(), [[0, 0, 0], [9, 0, 0], [0, 9, 0]], method="lower_bound")
 
 
 # --- surfaces along which the gradient is zero -------------------------------------------------
@@ -763,14 +785,16 @@ def test_surfaces_along_which_the_gradient_is_zero(text: str, exact: Any) -> Non
 def test_sheets_count() -> None:
     x = np.random.default_rng(14).uniform(-2, 2, (2000, 3))
     exact = Step.distance(x)
-    lower = signed_distance(Step(), x, method="lower")
+    lower = signed_distance(Step(), x, method="lower_bound")
     assert (np.abs(lower) <= exact * (1 + 1e-12)).all()
     assert np.median(np.abs(lower) / exact) > 0.9
-    for method in ("newton", "first"):
+    for method in ("closest_point", "first_order"):
         found = signed_distance(Step(), x, method=method)  # type: ignore[arg-type]
         assert (np.sign(found) == np.sign(0.3 * x[:, 2] + (x[:, 0] > 0) - 0.5)).all()
         # Where a smooth half-plane ends at the sheet the closest point of its rim is no foot.
-        assert (np.abs(found) >= exact - 1e-12).mean() > (0.99 if method == "newton" else 0.5)
+        assert (np.abs(found) >= exact - 1e-12).mean() > (
+            0.99 if method == "closest_point" else 0.5
+        )
         assert (np.abs(np.abs(found) - exact) < 1e-9).mean() > 0.5
 
 
@@ -778,7 +802,7 @@ def test_sheets_count_in_single_precision() -> None:
     x = np.random.default_rng(15).uniform(-1, 1, (500, 3))
     found = np.abs(signed_distance(Step(), x, precision="single"))
     assert np.abs(found - Step.distance(x)).max() < 1e-6
-    lower = np.abs(signed_distance(Step(), x, method="lower", precision="single"))
+    lower = np.abs(signed_distance(Step(), x, method="lower_bound", precision="single"))
     assert (lower <= Step.distance(x)).all()
 
 
@@ -788,20 +812,20 @@ def test_points_on_a_sheet() -> None:
     found = np.abs(signed_distance(Step(), x))
     assert found[:2] == pytest.approx([0, 0], abs=1e-9)
     assert found[2] == pytest.approx(1 / 3, abs=1e-6)
-    assert signed_distance(Step(), x, method="lower").tolist() == [0, 0, 0]
+    assert signed_distance(Step(), x, method="lower_bound").tolist() == [0, 0, 0]
 
 
 def test_a_field_must_say_how_far_its_sheets_are() -> None:
     class Silent(Step):
-        distance_to_sheets = hk.Field.distance_to_sheets
+        distance_to_jumps = hk.Field.distance_to_jumps
 
-    with pytest.raises(NotImplementedError, match=r"Silent has sheets.*distance_to_sheets"):
-        signed_distance(Silent(), [[1.0, 0.0, 0.0]], method="lower")
+    with pytest.raises(NotImplementedError, match=r"Silent has jumps.*distance_to_jumps"):
+        signed_distance(Silent(), [[1.0, 0.0, 0.0]], method="lower_bound")
 
 
 # --- input -------------------------------------------------------------------------------------
 
-METHODS = ("first", "second", "newton", "lower")
+METHODS = ("first_order", "second_order", "closest_point", "lower_bound")
 
 
 @pytest.mark.few(1)
@@ -833,7 +857,7 @@ def test_precisions_agree(method: Any) -> None:
     double = signed_distance(WAVY, x, method=method)
     single = signed_distance(WAVY, x, method=method, precision="single")
     assert np.quantile(np.abs(single - double) / np.abs(double), 0.95) < 2e-3
-    if method == "lower":
+    if method == "lower_bound":
         assert np.median(single / double) > 0.99
 
 
@@ -856,10 +880,12 @@ def test_bad_points(method: Any, points: Any, message: str) -> None:
 
 def test_other_bad_input() -> None:
     x = [[0.1, 0.2, 0.3]]
-    with pytest.raises(ValueError, match=r"unknown method 'third'; choose one of \"first\", "):
+    with pytest.raises(
+        ValueError, match=r"unknown method 'third'; choose one of \"first_order\", "
+    ):
         signed_distance(WAVY, x, method="third")  # type: ignore[arg-type]
     with pytest.raises(NotImplementedError, match="Bare gives no second derivatives"):
-        signed_distance(Bare(), x, method="second")
+        signed_distance(Bare(), x, method="second_order")
     with pytest.raises(ValueError, match="no surface has level 7"):
         signed_distance(hk.Gyroid(), x, level=7.0)
     with pytest.raises(ValueError, match="level must be finite"):
@@ -882,5 +908,5 @@ def test_distances_from_very_far_away_come_without_warnings_of_numpy(far: float)
     field = hk.SolidAngle(example_curves.wavy_polygon(12))
     with warnings.catch_warnings():
         warnings.filterwarnings("error", message="overflow|divide|invalid")
-        found = signed_distance(field, [[far, 0, 0]], method="newton", precision="double")
+        found = signed_distance(field, [[far, 0, 0]], method="closest_point", precision="double")
     assert np.isnan(found) | (np.abs(found) >= 0.99 * far)

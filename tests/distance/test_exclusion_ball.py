@@ -11,8 +11,8 @@ import pytest
 import harnack as hk
 from harnack.backend import choose_backend
 from harnack.backend.arrays import upload_vectors
-from harnack.distance.cell_classification import remainder
-from harnack.distance.exclusion_ball import free_radius
+from harnack.distance.cell_classification import taylor_remainder
+from harnack.distance.exclusion_ball import exclusion_radius
 from harnack.fields.analytic.waves import WaveBounds
 from harnack.fields.samples import Sample
 from tests.distance.test_distance import CURVED, surface_points
@@ -26,13 +26,13 @@ def test_the_ball_ends_at_the_center_of_curvature(side: int, share: float) -> No
     """Of the cylinder side z = y^2: within the radius 1/2 of curvature its vertex is nearest, and
     beyond that it is not, so that no ball may be free."""
     vector, real = DOUBLE.Array3f, DOUBLE.Float
-    sample = Sample(real(0), vector(0, 0, side), (hk.Curvature(2.0, change=0.0),))
+    sample = Sample(real(0), vector(0, 0, side), (hk.TaylorRemainder(2.0, cubic_constant=0.0),))
     rows = vector(0, 0, 0), vector(0, -2, 0), vector(0, 0, 0)
     x = vector(0, 0, side * 0.5 * share)
-    free = float(np.array(free_radius(sample, rows, x, vector(0)))[0])
+    free = float(np.array(exclusion_radius(sample, rows, x, vector(0)))[0])
     assert (free > 1) == (share < 1)
     # On the other side it always is.
-    free = float(np.array(free_radius(sample, rows, -10 * x, vector(0)))[0])
+    free = float(np.array(exclusion_radius(sample, rows, -10 * x, vector(0)))[0])
     assert free > 100
 
 
@@ -44,7 +44,7 @@ def test_the_second_remainder_is_attained_by_poissons_kernel(dimension: int) -> 
     rest = (1 + q) / (1 - q) ** (dimension - 1) - 1 - dimension * q - second * q * q
     ball = hk.HarmonicBall(1.0, -1.0, math.inf, dimension)
     found = np.array(
-        remainder(Sample(DOUBLE.Float(0), DOUBLE.Array3f(0), (ball,)), DOUBLE.Float(q), 2)
+        taylor_remainder(Sample(DOUBLE.Float(0), DOUBLE.Array3f(0), (ball,)), DOUBLE.Float(q), 2)
     )
     assert found == pytest.approx(rest, rel=1e-9)
 
@@ -52,14 +52,14 @@ def test_the_second_remainder_is_attained_by_poissons_kernel(dimension: int) -> 
 def test_third_derivatives_of_waves() -> None:
     """Attained by one wave; of the gyroid, by differences of second derivatives."""
     wave = hk.PlaneWave(3.0, (0.0, 4.0, 3.0))
-    assert WaveBounds.of([wave]).largest_change == pytest.approx(3 * 5**3, rel=1e-9)
+    assert WaveBounds.of([wave]).max_third_derivative == pytest.approx(3 * 5**3, rel=1e-9)
     rng, h = np.random.default_rng(0), 1e-4
     p, v = rng.uniform(-4, 4, (2000, 3)), rng.normal(size=(2000, 3))
     v /= np.linalg.norm(v, axis=1, keepdims=True)
     field = hk.Gyroid()
     ahead, back = (field.hessian(p + s * h * v, precision="double") for s in (1, -1))
     third = np.abs(np.einsum("ni,nij,nj->n", v, ahead - back, v)) / (2 * h)
-    assert 0.5 * field.waves.largest_change < third.max() < field.waves.largest_change
+    assert 0.5 * field.waves.max_third_derivative < third.max() < field.waves.max_third_derivative
 
 
 @pytest.mark.parametrize("name", ["wavy", "gyroid"])
@@ -73,7 +73,7 @@ def test_no_sample_in_the_ball_is_nearer(name: str) -> None:
     far = rng.uniform(-1.5, 1.5, (300, 1)) * (1.0 if name == "gyroid" else 0.3)
     x = y + far * g / np.linalg.norm(g, axis=1, keepdims=True)
     at, rows = upload_vectors(DOUBLE, y), prepared.hessian(upload_vectors(DOUBLE, y))
-    free = np.array(free_radius(prepared.evaluate(at), rows, upload_vectors(DOUBLE, x), at))
+    free = np.array(exclusion_radius(prepared.evaluate(at), rows, upload_vectors(DOUBLE, x), at))
     assert (free > 0.1 * np.abs(far[:, 0])).mean() > 0.3
     for k in range(300):
         within = on[np.linalg.norm(on - y[k], axis=1) < free[k]]

@@ -16,7 +16,7 @@ import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.distance import closest_point_search
 from harnack.geometry import MeshError, example_meshes
-from harnack.tree.closest_triangles import NearestPoint
+from harnack.tree.closest_triangles import ClosestPointOnTriangle
 from harnack.tree.triangle_tree import triangle_records
 from tests.oracles.direct_sums import winding_sum
 from tests.oracles.mesh_distance import distances_to_triangles
@@ -127,7 +127,7 @@ def test_far_from_the_origin() -> None:
     x = beside_faces(vertices, faces, 300, 10 ** np.random.default_rng(0).uniform(-12, 0, 300))
     field, exact = hk.WindingNumber(vertices, faces), distance_to_closed_mesh(vertices, faces, x)
     assert np.abs(np.abs(hk.signed_distance(field, x)) - exact).max() < 2e-9
-    assert (np.abs(hk.signed_distance(field, x, method="lower")) <= exact + 1e-12).all()
+    assert (np.abs(hk.signed_distance(field, x, method="lower_bound")) <= exact + 1e-12).all()
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)
@@ -138,9 +138,9 @@ def test_on_vertices_edges_and_faces(precision: Any) -> None:
     for scale in (1e-12, 1.0, 1e12):
         field = hk.WindingNumber(scale * vertices, faces)
         found = np.abs(hk.signed_distance(field, scale * x, precision=precision)) / scale
-        assert found.max() < 64 * choose_backend(precision).epsilon
-        lower = hk.signed_distance(field, scale * x, precision=precision, method="lower")
-        assert np.abs(lower).max() / scale < 64 * choose_backend(precision).epsilon
+        assert found.max() < 64 * choose_backend(precision).machine_epsilon
+        lower = hk.signed_distance(field, scale * x, precision=precision, method="lower_bound")
+        assert np.abs(lower).max() / scale < 64 * choose_backend(precision).machine_epsilon
 
 
 @pytest.mark.parametrize("level", [0.5, pytest.param(1.5, marks=pytest.mark.slow)])
@@ -184,10 +184,10 @@ def test_creases_of_overlapping_boxes(seed: int) -> None:
     longer = found > exact * (1 + 1e-6) + 1e-13
     assert longer.mean() <= 0.015, (longer.sum(), (found / exact)[longer])
     assert (found <= 1.25 * exact + 1e-13).all()
-    for method in ("first", "lower"):
+    for method in ("first_order", "lower_bound"):
         other = np.abs(hk.signed_distance(field, x, method=method))  # type: ignore[arg-type]
         below = other <= exact + 1e-15
-        assert below.all() if method == "lower" else (other >= exact - 1e-14).all()
+        assert below.all() if method == "lower_bound" else (other >= exact - 1e-14).all()
 
 
 def boxes_in_contact(rng: np.random.Generator) -> list[Box]:
@@ -268,7 +268,7 @@ def test_boxes_in_single_precision() -> None:
     found = np.abs(hk.signed_distance(field, x, precision="single"))
     assert (found >= exact - 1e-5).all()
     assert (found <= exact * 1.01 + 1e-5).mean() > 0.98
-    lower = np.abs(hk.signed_distance(field, x, precision="single", method="lower"))
+    lower = np.abs(hk.signed_distance(field, x, precision="single", method="lower_bound"))
     assert (lower <= exact).all()
 
 
@@ -298,7 +298,7 @@ def points_of_surface(field: Any, vertices: np.ndarray, faces: np.ndarray, n: in
     on = (np.minimum(*sides) < 0.5 - 1e-6) & (np.maximum(*sides) > 0.5 + 1e-6)
     o = rng.uniform(vertices.min(axis=0) - 0.2, vertices.max(axis=0) + 0.2, (n // 4, 3))
     hits = hk.trace(field, o, rng.normal(size=o.shape), tolerance=1e-9, precision="double")
-    return np.concatenate([y[on], hits.position[hits.hit]])
+    return np.concatenate([y[on], hits.position[hits.is_hit]])
 
 
 @pytest.mark.slow
@@ -318,7 +318,7 @@ def test_messy_meshes(seed: int) -> None:
     upper = np.concatenate([np.linalg.norm(part[:, None] - on, axis=2).min(axis=1)
                             for part in np.array_split(x, 100)])  # fmt: skip
     found = np.abs(hk.signed_distance(field, x))
-    assert (found >= np.abs(hk.signed_distance(field, x, method="lower"))).all()
+    assert (found >= np.abs(hk.signed_distance(field, x, method="lower_bound"))).all()
     # No foot is off the surface: 1 in 20 was, up to half the size too near, which hid 1 in 300 that
     # are too far.
     assert (found >= upper - 0.03).all()
@@ -348,7 +348,7 @@ def test_meshes_with_holes(
     search = closest_point_search.search
 
     def counted(surface: Any, *given: Any) -> Any:
-        searched.append(surface.field.has_sheets)
+        searched.append(surface.field.has_jumps)
         return search(surface, *given)
 
     monkeypatch.setattr(closest_point_search, "search", counted)
@@ -359,7 +359,7 @@ def test_meshes_with_holes(
     assert (found.lower <= upper + rounding).all()
     assert (found.upper <= 1.002 * upper + rounding).all()
     # Feet lie on the surface: w is on both sides of the level about them, or takes it.
-    about = found.feet[:, None] + 3 * rounding * rng.normal(size=(60, 3))
+    about = found.closest_points[:, None] + 3 * rounding * rng.normal(size=(60, 3))
     w = field.value(about.reshape(-1, 3), precision="double").reshape(-1, 60)
     assert (w.min(axis=1) < 0.5 + 1e-3).all()
     assert (w.max(axis=1) > 0.5 - 1e-3).all()
@@ -410,7 +410,7 @@ def test_one_triangle_has_no_level_beyond_a_half(level: float) -> None:
     field = hk.WindingNumber([(0, 0, 0), (1, 0, 0), (0, 1, 0)], [(0, 1, 2)])
     with pytest.warns(RuntimeWarning, match="no closest point was found for 2 of 2"):
         found = hk.distance_bounds(field, [[0.3, 0.3, 0.5], [0.0, 0.0, 0.0]], level=level)
-    assert np.isnan(found.feet).all()
+    assert np.isnan(found.closest_points).all()
 
 
 @pytest.mark.slow
@@ -422,7 +422,9 @@ def test_a_vertex_of_a_soup_that_the_level_does_not_reach() -> None:
     found = hk.distance_bounds(field, x)
     assert 0.19 < found.upper[0] < 0.25
     about = 1e-6 * np.random.default_rng(1).normal(size=(2000, 3))
-    largest = [field.value(one + about, precision="double").max() for one in (x, found.feet)]
+    largest = [
+        field.value(one + about, precision="double").max() for one in (x, found.closest_points)
+    ]
     assert largest[0] < 0.2
     assert largest[1] > 0.5
 
@@ -488,10 +490,12 @@ def test_needles_are_as_far_as_they_are(precision: Any) -> None:
     x = x.astype(kind).astype(np.float64)
     faces = np.arange(3 * len(corners)).reshape(-1, 3)
     records = triangle_records(corners.reshape(-1, 3), faces).astype(kind)
-    near = NearestPoint.of([backend.Float(one) for one in records.T.copy()], to_vector3(backend, x))
-    found = np.sqrt(to_numpy(near.square).astype(np.float64))
+    near = ClosestPointOnTriangle.of(
+        [backend.Float(one) for one in records.T.copy()], to_vector3(backend, x)
+    )
+    found = np.sqrt(to_numpy(near.squared_distance).astype(np.float64))
     exact = np.array([float(exact_square(*one)) ** 0.5 for one in zip(x, corners, strict=True)])
-    off = (found - exact) / (backend.epsilon * (1 + np.abs(x).max(axis=1)))
+    off = (found - exact) / (backend.machine_epsilon * (1 + np.abs(x).max(axis=1)))
     assert np.abs(off).max() < 2
 
 
@@ -501,7 +505,7 @@ def test_lower_bounds_beside_needles(precision: Any) -> None:
     too long, by up to 30,000 roundings."""
     rng, n = np.random.default_rng(4), 100
     epsilon, kind = (
-        choose_backend(precision).epsilon,
+        choose_backend(precision).machine_epsilon,
         np.float32 if precision == "single" else float,
     )
     cells = np.stack(np.meshgrid(np.arange(5), np.arange(5), np.arange(4)), axis=-1)
@@ -518,7 +522,7 @@ def test_lower_bounds_beside_needles(precision: Any) -> None:
     x = on + 10 ** rng.uniform(-16, -3, (n, 1)) * rng.normal(size=(n, 3))
     x = x.astype(kind).astype(np.float64)
     field = hk.WindingNumber(corners.reshape(-1, 3), faces)
-    lower = np.abs(hk.signed_distance(field, x, method="lower", precision=precision))
+    lower = np.abs(hk.signed_distance(field, x, method="lower_bound", precision=precision))
     squares = [
         min(exact_square(a, b[face]) for face in one) for a, b in zip(x, corners, strict=True)
     ]
@@ -534,22 +538,22 @@ def test_sheets_come_in_turn() -> None:
     prepared, x = field.prepare(backend), np.random.default_rng(6).uniform(-1, 1, (20, 3))
     p, always = to_vector3(backend, x), backend.Bool(True)
     after, seen = (backend.Float(-1), backend.UInt32(0xFFFFFFFF)), []
-    distances = distances_to_triangles(x, vertices[faces[field.faces_of_sheets]])
+    distances = distances_to_triangles(x, vertices[faces[field.facet_faces]])
     for _ in range(distances.shape[1]):
-        near = prepared.nearest_sheet(p, after, backend.Float(np.inf), always)
-        dr.eval(near.order, near.sheet, near.offset)
-        after = (near.order, near.sheet)
-        number = to_numpy(near.sheet)
+        near = prepared.nearest_facet(p, after, backend.Float(np.inf), always)
+        dr.eval(near.sort_key, near.facet, near.offset)
+        after = (near.sort_key, near.facet)
+        number = to_numpy(near.facet)
         length = np.linalg.norm(to_numpy(near.offset), axis=1)
         assert np.abs(length - distances[np.arange(20), number]).max() < 1e-14
         seen.append(number)
     assert (np.sort(seen, axis=0) == np.arange(distances.shape[1])[:, None]).all()
     order = np.array([distances[np.arange(20), number] for number in seen])
     assert (np.diff(order, axis=0) > -1e-14).all()
-    none = prepared.nearest_sheet(p, after, backend.Float(np.inf), always)
-    assert np.isinf(to_numpy(none.order)).all()
-    short = prepared.nearest_sheet(p, (backend.Float(-1), after[1]), backend.Float(1e-9), always)
-    assert np.isinf(to_numpy(short.order)).all()
+    none = prepared.nearest_facet(p, after, backend.Float(np.inf), always)
+    assert np.isinf(to_numpy(none.sort_key)).all()
+    short = prepared.nearest_facet(p, (backend.Float(-1), after[1]), backend.Float(1e-9), always)
+    assert np.isinf(to_numpy(short.sort_key)).all()
 
 
 # --- what is proved is compared ----------------------------------------------------------------
@@ -584,7 +588,7 @@ def test_no_answer_is_below_the_lower_bound() -> None:
             for precision, method in zip(PRECISIONS, ("exact", "tree"), strict=True):
                 field = hk.WindingNumber(vertices, faces, method=method)
                 found = np.abs(hk.signed_distance(field, x, precision=precision))
-                lower = hk.signed_distance(field, x, method="lower", precision=precision)
+                lower = hk.signed_distance(field, x, method="lower_bound", precision=precision)
                 slack = 1e-14 if precision == "double" else 1e-5
                 assert (found >= np.abs(lower) - slack).all()
 
@@ -608,7 +612,10 @@ def test_a_rim_that_the_level_meets_modulo_one_alone_is_none_of_the_surface() ->
     u = rng.normal(size=(24, 2000, 3))
     u /= np.linalg.norm(u, axis=2, keepdims=True)
     # w is seen on both sides of the level about every foot, and on one within the lower bound.
-    for at, radius, both in ((found.feet, 1e-7, True), (x, 0.999 * found.lower[:, None], False)):
+    for at, radius, both in (
+        (found.closest_points, 1e-7, True),
+        (x, 0.999 * found.lower[:, None], False),
+    ):
         share = radius * rng.random((24, 2000)) ** (1 / 3)
         q = (at[:, None] + share[..., None] * u).reshape(-1, 3)
         above = (TWO.value(q, precision="double") > 0.2).reshape(24, 2000)

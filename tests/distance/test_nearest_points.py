@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 import harnack as hk
 from harnack.backend import choose_backend
 from harnack.distance import cell_search
-from harnack.distance.cell_classification import remainder
+from harnack.distance.cell_classification import taylor_remainder
 from harnack.fields.samples import Sample
 from harnack.geometry import example_curves, example_meshes
 from tests.distance.test_distance import CURVED, Bare, surface_points, true_distance, unit
@@ -27,7 +27,7 @@ PRECISIONS = ("double", "single")
 def check_bounds(field: hk.Field, x: np.ndarray, **given: Any) -> hk.DistanceBounds:
     """That the parts of the answer agree with one another."""
     found = hk.distance_bounds(field, x, **given)
-    away = np.linalg.norm(x - found.feet, axis=1)
+    away = np.linalg.norm(x - found.closest_points, axis=1)
     assert np.allclose(found.upper, away, rtol=1e-6, atol=1e-12 * (1 + np.abs(x).max()))
     assert (found.lower <= found.upper).all()
     return found
@@ -94,7 +94,7 @@ def test_faces_that_pass_through_one_another_are_cut() -> None:
     assert (found.upper <= nearest + 1e-12).all()
     # No foot lies inside either ball, but for rounding.
     for part in (faces, faces + len(ball)):
-        off = hk.signed_distance(hk.WindingNumber(vertices, part), found.feet)
+        off = hk.signed_distance(hk.WindingNumber(vertices, part), found.closest_points)
         assert off.max() < 1e-9
 
 
@@ -167,7 +167,7 @@ def test_a_surface_without_extent() -> None:
         def evaluate(self, p: Any) -> hk.Sample:
             import drjit as dr
 
-            return hk.Sample(dr.sin(p.x), type(p)(dr.cos(p.x), 0, 0), (hk.Curvature(1.0),))
+            return hk.Sample(dr.sin(p.x), type(p)(dr.cos(p.x), 0, 0), (hk.TaylorRemainder(1.0),))
 
     x = np.random.default_rng(6).uniform(-20, 20, (200, 3))
     exact = np.abs(x[:, 0] - np.pi * np.round(x[:, 0] / np.pi))
@@ -183,7 +183,7 @@ def test_an_empty_level_set() -> None:
         domain = hk.Ball(radius=1.0)
 
         def evaluate(self, p: Any) -> hk.Sample:
-            return hk.Sample(2 + p.x, type(p)(1, 0, 0), (hk.Curvature(0.0),))
+            return hk.Sample(2 + p.x, type(p)(1, 0, 0), (hk.TaylorRemainder(0.0),))
 
     with pytest.warns(RuntimeWarning, match="no closest point was found for 1 of 1"):
         found = hk.distance_bounds(Positive(), [[0.1, 0.2, 0.3]])
@@ -205,7 +205,7 @@ def test_the_rim_of_a_domain() -> None:
 def test_parts_make_no_difference(monkeypatch: pytest.MonkeyPatch) -> None:
     field, x = CURVED["wavy"], np.random.default_rng(8).uniform(-1, 1, (60, 3))
     whole = hk.signed_distance(field, x)
-    monkeypatch.setattr(cell_search, "_AT_ONCE", 17)
+    monkeypatch.setattr(cell_search, "_BATCH_SIZE", 17)
     messages: list[str] = []
     parts = hk.signed_distance(field, x, progress=messages.append)
     assert np.allclose(parts, whole, rtol=1e-12)
@@ -225,10 +225,10 @@ def test_the_remainder_is_attained_by_poissons_kernel(dimension: int) -> None:
     rest = (1 + q) / (1 - q) ** (dimension - 1) - 1 - dimension * q
     ball = hk.HarmonicBall(1.0, -1.0, math.inf, dimension)
     zero = choose_backend("double").Array3f(0)
-    found = np.array(remainder(Sample(real(0), zero, (ball,)), real(q)))
+    found = np.array(taylor_remainder(Sample(real(0), zero, (ball,)), real(q)))
     assert (found >= rest * (1 - 1e-9)).all()
     assert found == pytest.approx(rest, rel=1e-9)
-    assert np.isinf(np.array(remainder(Sample(real(0), zero, (ball,)), real(1.5)))).all()
+    assert np.isinf(np.array(taylor_remainder(Sample(real(0), zero, (ball,)), real(1.5)))).all()
 
 
 @pytest.mark.slow
@@ -255,8 +255,8 @@ BOXED = hk.Gyroid(domain=hk.Box((-3, -2, -4), (3.5, 4, 2)))
 @pytest.fixture
 def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
     """Cells as coarse as for many points, and none split for the few of a test."""
-    monkeypatch.setattr(cell_search, "_MOST", 5000)
-    monkeypatch.setattr(cell_search, "_EACH", 1e9)
+    monkeypatch.setattr(cell_search, "_MAX_CELLS", 5000)
+    monkeypatch.setattr(cell_search, "_CELLS_PER_POINT", 1e9)
 
 
 def rim_on_sphere(field: hk.Field, radius: float, circles: int) -> np.ndarray:
@@ -354,7 +354,7 @@ def test_points_of_the_boundary_and_from_very_far(name: str) -> None:
     nearest, _ = cKDTree(on).query(far)
     assert (found.upper[2 * len(corners) :] <= nearest + 1e-9).all()
     for n in (0, 1):
-        assert hk.distance_bounds(field, far[:n]).feet.shape == (n, 3)
+        assert hk.distance_bounds(field, far[:n]).closest_points.shape == (n, 3)
 
 
 @pytest.mark.slow
@@ -395,10 +395,10 @@ def test_feet_on_clouds_are_on_the_exact_surface(cells: Any) -> None:
     field = hk.DipolePotential(points, n, cells=cells)
     x = 1.7 * rng.normal(size=(400, 3))
     found = hk.distance_bounds(field, x)
-    at_points = cKDTree(points).query(found.feet)[0] == 0
+    at_points = cKDTree(points).query(found.closest_points)[0] == 0
     assert at_points.mean() < 0.5
     total = dipole_sum(points, n * field.areas[:, None])
-    x, feet, upper = x[~at_points], found.feet[~at_points], found.upper[~at_points]
+    x, feet, upper = x[~at_points], found.closest_points[~at_points], found.upper[~at_points]
     value, gradient = total(feet)
     steep = np.linalg.norm(gradient, axis=1)
     off = np.abs(value - 2 * np.pi) / steep

@@ -12,11 +12,15 @@ import pytest
 import harnack as hk
 from benchmarks.laplacian import GyroidByLaplacian
 from harnack.backend import choose_backend, to_numpy
-from harnack.enclosures import BoundedLaplacian, Gaps, Lipschitz, Slopes, choose_proofs
-from harnack.enclosures.bounded_laplacian import KERNEL_NORM, SLOPE_NORM, GreenBall
-from harnack.enclosures.parabola import Cone
+from harnack.enclosures import BoundedLaplacian, LevelGaps, Lipschitz, SlopeRange, choose_enclosures
+from harnack.enclosures.bounded_laplacian import (
+    GREEN_KERNEL_BOUND,
+    GREEN_SLOPE_BOUND,
+    BoundedLaplacianEnclosure,
+)
+from harnack.enclosures.parabola import LipschitzEnclosure
 from harnack.fields import Field, Sample
-from harnack.testing import BrokenPromiseError, check_bound, check_field
+from harnack.testing import BrokenPromiseError, check_enclosure, check_field
 from tests.oracles.green_kernel import Proof, kappa_ratio
 from tests.oracles.oracle import OracleValues, first_crossings
 
@@ -67,12 +71,12 @@ FIELDS: dict[str, tuple[Field, float]] = {
 
 def test_a_stretch_of_the_proof_of_the_kernels_norm() -> None:
     """Where it is tight; `test_the_kernels_norm_is_proved` does all of it."""
-    proof = Proof(KERNEL_NORM, first=0.47, last=0.5)
+    proof = Proof(GREEN_KERNEL_BOUND, first=0.47, last=0.5)
     assert proof.table_margin() > 0
-    assert Proof(KERNEL_NORM).below()
-    assert Proof(KERNEL_NORM).above()
-    assert Proof(KERNEL_NORM).is_convex(SLOPE_NORM)
-    assert Proof(KERNEL_NORM).is_convex()
+    assert Proof(GREEN_KERNEL_BOUND).below()
+    assert Proof(GREEN_KERNEL_BOUND).above()
+    assert Proof(GREEN_KERNEL_BOUND).is_convex(GREEN_SLOPE_BOUND)
+    assert Proof(GREEN_KERNEL_BOUND).is_convex()
     too_small = Proof(0.39, first=0.47, last=0.5)
     assert too_small.table_margin() < 0
     assert not Proof(0.39).below()
@@ -82,7 +86,7 @@ def test_a_stretch_of_the_proof_of_the_kernels_norm() -> None:
 
 @pytest.mark.slow
 def test_the_kernels_norm_is_proved() -> None:
-    assert Proof(KERNEL_NORM).holds()
+    assert Proof(GREEN_KERNEL_BOUND).holds()
     assert not Proof(0.391).holds()
 
 
@@ -149,34 +153,34 @@ def test_the_function_with_the_kernels_sign_nearly_attains_the_bound(
     assert movement > 0
     real = choose_backend(precision).Float
     promise = BoundedLaplacian(real(1), real(0), real(1e9), real(-1), real(1))
-    slopes = Slopes(real(slope), real(slope))
-    made = GreenBall.of(promise, real(value), 0.0, slopes)
+    slopes = SlopeRange(real(slope), real(slope))
+    made = BoundedLaplacianEnclosure.from_promise(promise, real(value), 0.0, slopes)
     assert made is not None
-    step = float(to_numpy(made.step(Gaps(real(np.inf), real(movement))))[0])
+    step = float(to_numpy(made.free_length(LevelGaps(real(np.inf), real(movement))))[0])
     # A grid has an error, too.
     tightness = 1.001 if q >= 0.5 else 1.005
     assert q / tightness < step < q * (1 + 1e-5)
 
 
-class WithoutKernel(GreenBall):
+class WithoutKernel(BoundedLaplacianEnclosure):
     def _growth(self, *given: Any) -> Any:
         return dataclasses.replace(super()._growth(*given), spread=0)
 
 
-class WithoutMean(GreenBall):
+class WithoutMean(BoundedLaplacianEnclosure):
     def _growth(self, *given: Any) -> Any:
         return dataclasses.replace(super()._growth(*given), mean=0)
 
 
-class WrongSign(GreenBall):
+class WrongSign(BoundedLaplacianEnclosure):
     def _growth(self, gap: Any, u: Any, most: Any, mean: Any, slope: Any) -> Any:
         return super()._growth(gap, u, most, -mean, slope)
 
 
 @pytest.mark.parametrize("wrong", [WithoutKernel, WithoutMean, WrongSign])
-def test_a_term_left_out_is_seen_by_check_bound(wrong: type[GreenBall]) -> None:
+def test_a_term_left_out_is_seen_by_check_bound(wrong: type[BoundedLaplacianEnclosure]) -> None:
     with pytest.raises(BrokenPromiseError, match="a level is met within the step"):
-        check_bound(wrong)
+        check_enclosure(wrong)
 
 
 # --- promises --------------------------------------------------------------------------------
@@ -187,7 +191,7 @@ def test_one_proof_of_a_bounded_laplacian_is_used_by_default(name: str) -> None:
     field, level = FIELDS[name]
     o, d = rays(np.random.default_rng(1), 200)
     plain = hk.trace(field, o, d, level=level)
-    for bound in ("laplacian", GreenBall):
+    for bound in ("laplacian", BoundedLaplacianEnclosure):
         np.testing.assert_array_equal(hk.trace(field, o, d, level=level, bound=bound).t, plain.t)
     with pytest.raises(ValueError, match=r'BoundedLaplacian.*choose .*"laplacian"'):
         hk.trace(field, o, d, level=level, bound="lipschitz")
@@ -195,29 +199,33 @@ def test_one_proof_of_a_bounded_laplacian_is_used_by_default(name: str) -> None:
 
 def test_the_name_takes_lipschitz_constants_where_there_is_nothing_else() -> None:
     real = choose_backend("double").Float
-    given = (real(0), 0.0, Slopes(real(0.4), real(0.4)))
-    (made,) = choose_proofs("laplacian").enclose((Lipschitz(real(1), real(1)),), (), *given)
-    assert type(made) is Cone
+    given = (real(0), 0.0, SlopeRange(real(0.4), real(0.4)))
+    (made,) = choose_enclosures("laplacian").from_promises(
+        (Lipschitz(real(1), real(1)),), (), *given
+    )
+    assert type(made) is LipschitzEnclosure
     endless = BoundedLaplacian(real(1), -np.inf, real(1), real(0), real(1))
     with pytest.raises(ValueError, match="a BoundedLaplacian both"):
-        choose_proofs("laplacian").enclose((endless,), (), *given)
+        choose_enclosures("laplacian").from_promises((endless,), (), *given)
 
 
 @pytest.mark.parametrize("precision", ["single", "double"])
 def test_what_is_no_number_proves_nothing(precision: Any) -> None:
     real = choose_backend(precision).Float
-    slopes, gaps = Slopes(real(0.1), real(0.1)), Gaps(real(0.5), real(0.5))
+    slopes, gaps = SlopeRange(real(0.1), real(0.1)), LevelGaps(real(0.5), real(0.5))
     numbers = [1.0, -1.0, 1.0, -1.0, 1.0]
     for place in range(len(numbers)):
         given = [real(np.nan if i == place else one) for i, one in enumerate(numbers)]
-        made = GreenBall.of(BoundedLaplacian(*given), real(0), 0.0, slopes)
+        made = BoundedLaplacianEnclosure.from_promise(
+            BoundedLaplacian(*given), real(0), 0.0, slopes
+        )
         assert made is not None
-        assert to_numpy(made.step(gaps))[0] == 0
-        assert not to_numpy(made.covers(gaps, real(0.1)))[0]
+        assert to_numpy(made.free_length(gaps))[0] == 0
+        assert not to_numpy(made.is_free(gaps, real(0.1)))[0]
     swapped = BoundedLaplacian(*(real(one) for one in (1.0, -1.0, 1.0, 1.0, -1.0)))
-    made = GreenBall.of(swapped, real(0), 0.0, slopes)
+    made = BoundedLaplacianEnclosure.from_promise(swapped, real(0), 0.0, slopes)
     assert made is not None
-    assert to_numpy(made.step(gaps))[0] == 0
+    assert to_numpy(made.free_length(gaps))[0] == 0
 
 
 class Wrong(Field):
@@ -252,7 +260,7 @@ def test_wrong_promises_are_found() -> None:
 SOLID = hk.solid(Matter(), above=1.3)
 SOLIDS: dict[str, Field] = {
     "inside out": ~SOLID,
-    "scaled and turned": SOLID.scaled(2.5).rotated(40.0, (1, 2, 0)).moved((0.1, 0, -2)),
+    "scaled and turned": SOLID.scaled(2.5).rotated(40.0, (1, 2, 0)).translated((0.1, 0, -2)),
     "sheared": SOLID.transformed([[1, 0.4, 0], [0, 1.5, 0], [0.2, 0, 0.7]]),
     "with a bite": SOLID - hk.Sphere(0.8),
 }
@@ -269,9 +277,9 @@ def test_maps_of_space_keep_the_promise_tight() -> None:
     o, d = rays(np.random.default_rng(5), 300)
     plain = hk.trace(SOLID, o, d, precision="double")
     grown = hk.trace(SOLID.scaled(3.0), 3 * o, d, precision="double")
-    assert plain.hit.mean() > 0.3
-    np.testing.assert_array_equal(grown.hit, plain.hit)
-    np.testing.assert_allclose(grown.t[grown.hit], 3 * plain.t[plain.hit], atol=1e-3)
+    assert plain.is_hit.mean() > 0.3
+    np.testing.assert_array_equal(grown.is_hit, plain.is_hit)
+    np.testing.assert_allclose(grown.t[grown.is_hit], 3 * plain.t[plain.is_hit], atol=1e-3)
     assert grown.evaluations.mean() < 1.2 * plain.evaluations.mean()
 
 
@@ -322,14 +330,14 @@ def check_hits(name: str, precision: Any, count: int, seed: int) -> float:
     inside = near < far
     o, d, near, far = o[inside], d[inside], near[inside], far[inside]
     hits = hk.trace(field, o, d, level=level, tolerance=TOLERANCE, t_max=8.0, precision=precision)
-    assert not (hits.status == hk.Status.OUT_OF_STEPS).any()
+    assert not (hits.status == hk.RayStatus.OUT_OF_STEPS).any()
     truth = first_crossings(
         oracle, o, d, near, far, levels=[level], depth=TOLERANCE, spacing=0.05, finest=TOLERANCE
     )
     assert len(o) > 0.7 * count
     assert np.isfinite(truth.beyond).mean() > 0.2
     assert not (hits.t > truth.beyond + 3 * TOLERANCE).any()
-    at = oracle((o + hits.t[:, None] * d)[hits.hit])
+    at = oracle((o + hits.t[:, None] * d)[hits.is_hit])
     off = np.abs(at.value - level) / at.gradient_norm
     assert (off < 3 * TOLERANCE).all()
     return float(hits.evaluations.mean())

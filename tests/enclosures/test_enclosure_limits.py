@@ -24,22 +24,35 @@ import harnack
 from harnack import enclosures
 from harnack.arithmetic import Interval
 from harnack.backend import choose_backend
-from harnack.backend.arrays import aligned
-from harnack.enclosures import Enclosure, Gaps, Slopes, any_covers, longest_step
-from harnack.enclosures.bounded_laplacian import GreenBall
-from harnack.enclosures.enclosure import Piece
-from harnack.enclosures.extremum import Cusp, Greatest, Nearest, Negated, Part, Sheet, Stretched
-from harnack.enclosures.free_radius import Ball
-from harnack.enclosures.literature import Band, Mixed
-from harnack.enclosures.parabola import Arc, Cone, Parabola, Tangent
-from harnack.enclosures.piecewise_taylor import OnePiece, Pieces
-from harnack.fields.blobs.blobs import _After  # pyright: ignore[reportPrivateUsage]
-from harnack.fields.blobs.group_maximum import LargestAlong
-from harnack.fields.solids.extrusions import ExtrudedAhead
-from harnack.fields.solids.from_field import Folded
-from harnack.fields.solids.outline_distance import SignedAhead
-from harnack.fields.solids.thread import Beside
-from harnack.fields.solids.tube import TubeAhead
+from harnack.backend.arrays import upload_floats
+from harnack.enclosures import Enclosure, LevelGaps, SlopeRange, any_is_free, longest_free_length
+from harnack.enclosures.bounded_laplacian import BoundedLaplacianEnclosure
+from harnack.enclosures.enclosure import PathPiece
+from harnack.enclosures.extremum import (
+    BranchPointEnclosure,
+    BranchSample,
+    MaximumEnclosure,
+    MaximumOperand,
+    NearestBranchEnclosure,
+    NegatedEnclosure,
+    ScaledEnclosure,
+)
+from harnack.enclosures.free_radius import HarmonicBallEnclosure
+from harnack.enclosures.literature import BandEnclosure, LongestOfEnclosure
+from harnack.enclosures.parabola import (
+    ConvexityEnclosure,
+    LipschitzEnclosure,
+    ParabolaEnclosure,
+    SphereArcEnclosure,
+)
+from harnack.enclosures.piecewise_taylor import PiecewiseTaylorEnclosure, SinglePieceEnclosure
+from harnack.fields.blobs.blobs import DelayedEnclosure  # pyright: ignore[reportPrivateUsage]
+from harnack.fields.blobs.group_maximum import GroupMaximumEnclosure
+from harnack.fields.solids.extrusions import ExtrusionEnclosure
+from harnack.fields.solids.from_field import FoldedEnclosure
+from harnack.fields.solids.outline_distance import SignedDistanceEnclosure
+from harnack.fields.solids.thread import OutsideCylinderEnclosure
+from harnack.fields.solids.tube import TangentEnclosure
 
 SIZES = [0.0, 1e-12, 1e-4, 0.3, 1.0, 7.0, 1e5, 1e12, 1e25, np.inf]
 NUMBERS = SIZES + [-one for one in SIZES]
@@ -53,9 +66,9 @@ def sizes(draw: Draw) -> Any:
     return draw(SIZES)
 
 
-def slopes(draw: Draw) -> Slopes:
+def slopes(draw: Draw) -> SlopeRange:
     one, other = draw(NUMBERS), draw(NUMBERS)
-    return Slopes(dr.minimum(one, other), dr.maximum(one, other))
+    return SlopeRange(dr.minimum(one, other), dr.maximum(one, other))
 
 
 def rising(draw: Draw, count: int) -> list[Any]:
@@ -65,11 +78,11 @@ def rising(draw: Draw, count: int) -> list[Any]:
     return made
 
 
-def parts(draw: Draw, count: int) -> tuple[Piece, ...]:
-    made: list[Piece] = []
+def parts(draw: Draw, count: int) -> tuple[PathPiece, ...]:
+    made: list[PathPiece] = []
     for length in rising(draw, count):
         bend = slopes(draw)
-        made.append(Piece(length, slopes(draw), bend.low, bend.high))
+        made.append(PathPiece(length, slopes(draw), bend.lower, bend.upper))
     return tuple(made)
 
 
@@ -77,24 +90,24 @@ def ball(kind: Any, draw: Draw) -> list[Enclosure]:
     made: list[Enclosure] = []
     for dimension in (2, 3, 4):
         for below, above in ((True, True), (True, False), (False, True)):
-            if kind.applies(dimension, below, above):
+            if kind.applies_to(dimension, below, above):
                 ends = (sizes(draw) if one else None for one in (below, above))
                 made.append(kind(sizes(draw), *ends, dimension, slopes(draw)))
     return made
 
 
-def tube(draw: Draw) -> TubeAhead:
+def tube(draw: Draw) -> TangentEnclosure:
     """Tangents of which the least counts, at knots of which the last may be infinite."""
     length = draw([1e-12, 1e-4, 1.0, 1e12])
     knots = (*(k * length for k in (0.125, 0.25, 0.5)), draw([1e13, 1e25, np.inf]))
     fall, delay = draw([-1.0, -0.3, 1e-12, 1.0, np.nan]), sizes(draw)
     lows = tuple(dr.minimum(0.5 * k, fall * k + delay) for k in knots)
-    return TubeAhead(sizes(draw), draw([-1.0, -0.3, 0.0, 1e-12, 1.0]), knots, lows)
+    return TangentEnclosure(sizes(draw), draw([-1.0, -0.3, 0.0, 1e-12, 1.0]), knots, lows)
 
 
-def signed(draw: Draw) -> SignedAhead:
+def signed(draw: Draw) -> SignedDistanceEnclosure:
     size = tube(draw)
-    return SignedAhead(size.distance * draw(SIGNS), size)
+    return SignedDistanceEnclosure(size.distance * draw(SIGNS), size)
 
 
 def extruded(kind: Any, draw: Draw) -> Any:
@@ -115,21 +128,21 @@ def beside(kind: Any, draw: Draw) -> Any:
 
 def cone(kind: Any, draw: Draw) -> Any:
     constant = sizes(draw)
-    return kind(Slopes(-constant, constant), 0.0, 0.0, sizes(draw))
+    return kind(SlopeRange(-constant, constant), 0.0, 0.0, sizes(draw))
 
 
 def parabola(kind: Any, draw: Draw) -> Any:
     bend = slopes(draw)
-    return kind(slopes(draw), bend.low, bend.high, sizes(draw))
+    return kind(slopes(draw), bend.lower, bend.upper, sizes(draw))
 
 
 def band(kind: Any, draw: Draw) -> Any:
     offsets = slopes(draw)
-    return kind(Interval(offsets.low, offsets.high), slopes(draw), sizes(draw))
+    return kind(Interval(offsets.lower, offsets.upper), slopes(draw), sizes(draw))
 
 
 def nearest(kind: Any, draw: Draw) -> Any:
-    sheets = tuple(Sheet(slopes(draw), draw(NUMBERS)) for _ in range(2))
+    sheets = tuple(BranchSample(slopes(draw), draw(NUMBERS)) for _ in range(2))
     return kind(sheets, sheets[0], sizes(draw), draw(SIGNS) > 0, sizes(draw), sizes(draw))
 
 
@@ -139,38 +152,44 @@ def cusp(kind: Any, draw: Draw) -> Any:
 
 
 def greatest(kind: Any, draw: Draw) -> Any:
-    inner = (parabola(Parabola, draw), tube(draw))
-    return kind(tuple(Part(low := sizes(draw), low, (one,)) for one in inner))
+    inner = (parabola(ParabolaEnclosure, draw), tube(draw))
+    return kind(tuple(MaximumOperand(low := sizes(draw), low, (one,)) for one in inner))
 
 
 # How enclosures of a class are made, and of those derived from it that are not listed themselves.
 MAKERS: dict[type[Enclosure], Callable[[Any, Draw], Any]] = {
-    Parabola: parabola,
-    Cone: cone,
-    Ball: ball,
-    Pieces: lambda kind, draw: kind(slopes(draw), parts(draw, 3)),
-    OnePiece: lambda kind, draw: kind(slopes(draw), parts(draw, 1)),
-    Mixed: lambda kind, draw: kind((parabola(Parabola, draw), cone(Cone, draw))),
-    Band: band,
-    Tangent: lambda kind, draw: kind(slopes(draw)),
-    GreenBall: lambda kind, draw: kind(
+    ParabolaEnclosure: parabola,
+    LipschitzEnclosure: cone,
+    HarmonicBallEnclosure: ball,
+    PiecewiseTaylorEnclosure: lambda kind, draw: kind(slopes(draw), parts(draw, 3)),
+    SinglePieceEnclosure: lambda kind, draw: kind(slopes(draw), parts(draw, 1)),
+    LongestOfEnclosure: lambda kind, draw: kind(
+        (parabola(ParabolaEnclosure, draw), cone(LipschitzEnclosure, draw))
+    ),
+    BandEnclosure: band,
+    ConvexityEnclosure: lambda kind, draw: kind(slopes(draw)),
+    BoundedLaplacianEnclosure: lambda kind, draw: kind(
         sizes(draw), sizes(draw), sizes(draw), draw(NUMBERS), sizes(draw), slopes(draw)
     ),
-    Arc: lambda kind, draw: kind(slopes(draw), sizes(draw), draw(NUMBERS), 1 + sizes(draw)),
-    Nearest: nearest,
-    Cusp: cusp,
-    Greatest: greatest,
-    Negated: lambda kind, draw: kind(tube(draw)),
-    Stretched: lambda kind, draw: kind(parabola(Parabola, draw), sizes(draw), sizes(draw)),
-    Folded: lambda kind, draw: kind(parabola(Parabola, draw), draw(NUMBERS), 1.0),
-    SignedAhead: lambda _, draw: signed(draw),
-    ExtrudedAhead: extruded,
-    Beside: beside,
-    TubeAhead: lambda _, draw: tube(draw),
-    _After: lambda kind, draw: kind(sizes(draw), parabola(Parabola, draw)),
+    SphereArcEnclosure: lambda kind, draw: kind(
+        slopes(draw), sizes(draw), draw(NUMBERS), 1 + sizes(draw)
+    ),
+    NearestBranchEnclosure: nearest,
+    BranchPointEnclosure: cusp,
+    MaximumEnclosure: greatest,
+    NegatedEnclosure: lambda kind, draw: kind(tube(draw)),
+    ScaledEnclosure: lambda kind, draw: kind(
+        parabola(ParabolaEnclosure, draw), sizes(draw), sizes(draw)
+    ),
+    FoldedEnclosure: lambda kind, draw: kind(parabola(ParabolaEnclosure, draw), draw(NUMBERS), 1.0),
+    SignedDistanceEnclosure: lambda _, draw: signed(draw),
+    ExtrusionEnclosure: extruded,
+    OutsideCylinderEnclosure: beside,
+    TangentEnclosure: lambda _, draw: tube(draw),
+    DelayedEnclosure: lambda kind, draw: kind(sizes(draw), parabola(ParabolaEnclosure, draw)),
 }
 # It asks the others, group by group, and holds no numbers of its own but those of a kernel.
-ASKS_OTHERS = {LargestAlong}
+ASKS_OTHERS = {GroupMaximumEnclosure}
 
 
 def kinds_of(package: ModuleType) -> set[type[Enclosure]]:
@@ -183,7 +202,7 @@ def kinds_of(package: ModuleType) -> set[type[Enclosure]]:
     while waiting:
         kind = waiting.pop()
         waiting += kind.__subclasses__()
-        own = kind.__module__.startswith("harnack.") and kind is not OnePiece
+        own = kind.__module__.startswith("harnack.") and kind is not SinglePieceEnclosure
         own &= not kind.__module__.startswith("harnack.testing")
         if own and not inspect.isabstract(kind):
             found.add(kind)
@@ -211,17 +230,17 @@ class Numbers:
             drawn[:] = self.by
         self.count += 1
         self.lists.append(values)
-        return aligned(choose_backend("single" if self.real is Float else "double"), drawn)
+        return upload_floats(choose_backend("single" if self.real is Float else "double"), drawn)
 
 
 def answers(kind: type[Enclosure], draw: Numbers) -> tuple[np.ndarray, np.ndarray]:
     """Steps of enclosures of a kind, and whether they cover a length."""
-    gaps, length = Gaps(sizes(draw), sizes(draw)), sizes(draw)
+    gaps, length = LevelGaps(sizes(draw), sizes(draw)), sizes(draw)
     make = next(MAKERS[base] for base in kind.__mro__ if base in MAKERS)
     made = make(kind, draw)
     many: list[Any] = made if isinstance(made, list) else [made]
-    steps = [np.asarray(longest_step((one,), gaps)) for one in many]
-    covered = [np.array(any_covers((one,), gaps, length)) for one in many]
+    steps = [np.asarray(longest_free_length((one,), gaps)) for one in many]
+    covered = [np.array(any_is_free((one,), gaps, length)) for one in many]
     return np.concatenate(steps), np.concatenate(covered)
 
 

@@ -11,11 +11,11 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.enclosures import Slopes, choose_proofs
-from harnack.enclosures.parabola import Parabola
+from harnack.enclosures import SlopeRange, choose_enclosures
+from harnack.enclosures.parabola import ParabolaEnclosure
 from harnack.fields import Field, Sample
-from harnack.fields.samples import Look
-from harnack.fields.samples import Path as RayPath
+from harnack.fields.samples import Ray as RayPath
+from harnack.fields.samples import RaySample
 
 CENTERS = np.random.default_rng(5).uniform(-0.8, 0.8, (5, 3))
 WIDTH = 0.4
@@ -35,7 +35,7 @@ class Blobs(Field):
             u = (p - type(p)(*center.tolist())) / WIDTH
             one = dr.exp(-dr.squared_norm(u))
             value, gradient = value + one, gradient - 2 / WIDTH * one * u
-        return Sample(value, gradient, (hk.Curvature(2 * len(CENTERS) / WIDTH**2),), 1e-6)
+        return Sample(value, gradient, (hk.TaylorRemainder(2 * len(CENTERS) / WIDTH**2),), 1e-6)
 
 
 class TaylorBlobs(Blobs):
@@ -46,16 +46,16 @@ class TaylorBlobs(Blobs):
     (most), so that its range on an interval is that of its ends and of those inside it.
     """
 
-    def look(self, path: RayPath, t: Any, ahead: Any, back: Any) -> Look:
-        look = path.look(self.evaluate(path.point(t)))
+    def sample_ray(self, path: RayPath, t: Any, ahead: Any, back: Any) -> RaySample:
+        look = path.enclose(self.evaluate(path.point(t)))
         slope, sample = look.slope, look.sample
-        slopes = Slopes.around(slope, sample.gradient_error)
+        slopes = SlopeRange.around(slope, sample.gradient_error)
         ahead = dr.select(dr.isfinite(ahead), ahead, 10.0)
         least, most = self.second_derivatives(path, t, t + ahead)
-        forward = Parabola(slopes, least, most, ahead)
+        forward = ParabolaEnclosure(slopes, least, most, ahead)
         least, most = self.second_derivatives(path, t - back, t)
-        backward = Parabola(slopes.negated(), least, most, back)
-        return Look(sample, (*look.ahead, forward), (*look.back, backward), slope)
+        backward = ParabolaEnclosure(slopes.negated(), least, most, back)
+        return RaySample(sample, (*look.forward, forward), (*look.backward, backward), slope)
 
     def second_derivatives(self, path: RayPath, start: Any, end: Any) -> tuple[Any, Any]:
         least, most = type(start)(0), type(start)(0)
@@ -89,14 +89,14 @@ def test_what_a_field_proves_along_a_path_is_used(precision: Any) -> None:
     o, d = rays(4000)
     plain = hk.trace(Blobs(), o, d, precision=precision, tolerance=1e-5)
     taylor = hk.trace(TaylorBlobs(), o, d, precision=precision, tolerance=1e-5)
-    same = plain.hit == taylor.hit
+    same = plain.is_hit == taylor.is_hit
     assert same.mean() > 0.999  # those that graze within the tolerance may differ
-    assert 500 < plain.hit.sum() < 3500
-    both = plain.hit & taylor.hit
+    assert 500 < plain.is_hit.sum() < 3500
+    both = plain.is_hit & taylor.is_hit
     grazing = np.abs((plain.normal * d).sum(axis=1)) < 0.05
     np.testing.assert_allclose(plain.t[both & ~grazing], taylor.t[both & ~grazing], atol=5e-4)
     assert taylor.evaluations.mean() < 0.6 * plain.evaluations.mean()
-    assert (taylor.status != int(hk.Status.OUT_OF_STEPS)).all()
+    assert (taylor.status != int(hk.RayStatus.OUT_OF_STEPS)).all()
 
 
 @pytest.mark.slow
@@ -120,14 +120,17 @@ def test_enclosures_hold_along_the_path_in_both_directions() -> None:
     o, d = rays(600)
     rng = np.random.default_rng(2)
     t, ahead, back = (rng.uniform(0, high, 600) for high in (2.5, 1.5, 1.0))
-    path = RayPath(to_vector3(backend, o), to_vector3(backend, d), choose_proofs(None))
+    path = RayPath(to_vector3(backend, o), to_vector3(backend, d), choose_enclosures(None))
     field = TaylorBlobs()
-    look = field.look(path, real(t), real(ahead), real(back))
+    look = field.sample_ray(path, real(t), real(ahead), real(back))
     closest = np.inf
-    for enclosure, sign, length in ((look.ahead[-1], 1, ahead), (look.back[-1], -1, back)):
-        assert isinstance(enclosure, Parabola)
-        slopes = to_numpy(enclosure.slopes.low)
-        least, most = to_numpy(enclosure.least_curvature), to_numpy(enclosure.most_curvature)
+    for enclosure, sign, length in ((look.forward[-1], 1, ahead), (look.backward[-1], -1, back)):
+        assert isinstance(enclosure, ParabolaEnclosure)
+        slopes = to_numpy(enclosure.slopes.lower)
+        least, most = (
+            to_numpy(enclosure.min_second_derivative),
+            to_numpy(enclosure.max_second_derivative),
+        )
         for share in np.linspace(0.02, 1, 40):
             s = share * length
             there = field.value(o + (t + sign * s)[:, None] * d, precision="double")
@@ -150,19 +153,19 @@ def test_candidates_grow_and_shrink() -> None:
         def evaluate(self, p: Any) -> Sample:
             return Sample(p.x - 1, type(p)(1, 0, 0), (hk.Lipschitz(math.inf),))
 
-        def look(self, path: RayPath, t: Any, ahead: Any, back: Any) -> Look:
-            look = path.look(self.evaluate(path.point(t)))
-            slopes = Slopes.around(look.slope, 0.0)
+        def sample_ray(self, path: RayPath, t: Any, ahead: Any, back: Any) -> RaySample:
+            look = path.enclose(self.evaluate(path.point(t)))
+            slopes = SlopeRange.around(look.slope, 0.0)
             short = dr.select(ahead < 0.1, ahead, 0)
-            return Look(
+            return RaySample(
                 look.sample,
-                (*look.ahead, Parabola(slopes, 0.0, 0.0, short)),
-                look.back,
+                (*look.forward, ParabolaEnclosure(slopes, 0.0, 0.0, short)),
+                look.backward,
                 look.slope,
             )
 
     hits = hk.trace(Bisecting(), [[-4.0, 0, 0]], [[1.0, 0, 0]], max_steps=5000)
-    assert hits.hit[0]
+    assert hits.is_hit[0]
     assert hits.t[0] == pytest.approx(5.0, abs=2e-4)
     assert hits.evaluations[0] < 400
     endless = Bisecting()
@@ -179,23 +182,25 @@ def test_enclosures_of_values_of_any_size_miss_nothing(unit: float) -> None:
     class Scaled(TaylorBlobs):
         default_level = 0.5 * unit
 
-        def look(self, path: RayPath, t: Any, ahead: Any, back: Any) -> Look:
-            look = super().look(path, t, ahead, back)
+        def sample_ray(self, path: RayPath, t: Any, ahead: Any, back: Any) -> RaySample:
+            look = super().sample_ray(path, t, ahead, back)
             sample = look.sample
 
-            def scaled(one: Parabola) -> Parabola:
-                slopes = Slopes(one.slopes.low * unit, one.slopes.high * unit)
-                bends = one.least_curvature * unit, one.most_curvature * unit
-                return Parabola(slopes, *bends, one.reach)
+            def scaled(one: ParabolaEnclosure) -> ParabolaEnclosure:
+                slopes = SlopeRange(one.slopes.lower * unit, one.slopes.upper * unit)
+                bends = one.min_second_derivative * unit, one.max_second_derivative * unit
+                return ParabolaEnclosure(slopes, *bends, one.reach)
 
-            seen = Sample(sample.value * unit, sample.gradient * unit, (), sample.error * unit)
-            ahead, back = scaled(look.ahead[-1]), scaled(look.back[-1])
-            return Look(seen, (ahead,), (back,), look.slope * unit)
+            seen = Sample(
+                sample.value * unit, sample.gradient * unit, (), sample.value_error * unit
+            )
+            ahead, back = scaled(look.forward[-1]), scaled(look.backward[-1])
+            return RaySample(seen, (ahead,), (back,), look.slope * unit)
 
     o, d = rays(20_000)
     plain = hk.trace(TaylorBlobs(), o, d, tolerance=1e-5, overstep=1.8)
     scaled = hk.trace(Scaled(), o, d, tolerance=1e-5, overstep=1.8)
-    assert (plain.hit == scaled.hit).mean() > 0.9998
+    assert (plain.is_hit == scaled.is_hit).mean() > 0.9998
 
 
 def test_a_level_within_a_large_error_is_not_passed() -> None:
@@ -208,10 +213,10 @@ def test_a_level_within_a_large_error_is_not_passed() -> None:
             near = dr.abs(p.x) < 0.3
             value = p.x - dr.select(near, 0.001, 0.0)
             error = dr.select(near, 0.001001, 0.0)
-            return Sample(value, type(p)(1, 0, 0), (hk.Curvature(1.0),), error)
+            return Sample(value, type(p)(1, 0, 0), (hk.TaylorRemainder(1.0),), error)
 
     hits = hk.trace(Off(), [[2e-4, 0, 0]], [[-1.0, 0, 0]], level=0.0)
-    assert hits.status[0] != int(hk.Status.MISS)
+    assert hits.status[0] != int(hk.RayStatus.MISS)
 
 
 @pytest.mark.parametrize("distance", [1e-5, 1e-6, 1e-7])
@@ -225,5 +230,5 @@ def test_rays_beside_the_origin_of_coordinates_reach_the_surface(distance: float
     down = d[:, 2] < -0.2
     circle = hk.SolidAngle(np.column_stack([np.cos(t), np.sin(t), 0 * t]))
     hits = hk.trace(circle, o[down], d[down], tolerance=1e-6)
-    assert hits.hit.all()
+    assert hits.is_hit.all()
     assert (hits.evaluations < 50).all()

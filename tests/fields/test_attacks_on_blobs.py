@@ -13,7 +13,7 @@ import pytest
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.fields.blobs.blobs import BlobError
-from harnack.fields.blobs.grid import _MARGIN, CellLists, Grid
+from harnack.fields.blobs.grid import _MARGIN, BlobGrid, CellLists
 from harnack.files import FileFormatError, read_molecule
 
 PRECISIONS = ("single", "double")
@@ -21,11 +21,11 @@ SHARPNESS, TAIL = 1.0, 1e-3
 GAUSSIAN = math.sqrt(1 - math.log(TAIL) / SHARPNESS)
 # A kernel, where it ends, and its formula in the squared distance as a part of that.
 KERNELS: dict[str, tuple[Any, float, Any]] = {
-    "compact": (hk.Compact(1.02), 1.02, lambda q: (1 - q) ** 3),
-    "cubic": (hk.Cubic(2.0), 2.0, lambda q: 1 - 3 * q + 2 * q**1.5),
-    "sextic": (hk.Sextic(1.3), 1.3, lambda q: 1 - (22 * q - 17 * q**2 + 4 * q**3) / 9),
+    "compact": (hk.CompactKernel(1.02), 1.02, lambda q: (1 - q) ** 3),
+    "cubic": (hk.CubicKernel(2.0), 2.0, lambda q: 1 - 3 * q + 2 * q**1.5),
+    "sextic": (hk.SexticKernel(1.3), 1.3, lambda q: 1 - (22 * q - 17 * q**2 + 4 * q**3) / 9),
     "gaussian": (
-        hk.Gaussian(SHARPNESS, TAIL),
+        hk.GaussianKernel(SHARPNESS, TAIL),
         GAUSSIAN,
         lambda q: np.exp(SHARPNESS * GAUSSIAN**2 * (1 - q)) - 1 - SHARPNESS * GAUSSIAN**2 * (1 - q),
     ),
@@ -117,10 +117,10 @@ def check_rays(scene: Sum, o: Any, d: Any, precision: Any, tolerance: float) -> 
     epsilon = float(np.finfo(dtype).eps)
     o, d = (one.astype(dtype).astype(np.float64) for one in (o, d))
     hits = hk.trace(scene.blobs, o, d, precision=precision, tolerance=tolerance)
-    assert (hits.status != hk.Status.OUT_OF_STEPS).all()
+    assert (hits.status != hk.RayStatus.OUT_OF_STEPS).all()
     size = np.abs(o).max() + 3 * np.ptp(scene.c) + 10 * scene.r.max()
     for i in range(len(o)):
-        way, hit = unit(d[i]), hits.hit[i]
+        way, hit = unit(d[i]), hits.is_hit[i]
         # A hit may lie behind the root by less than the tolerance.
         end = max(float(hits.t[i]) - 2 * tolerance, 0.0) if hit else float(size)
         t = scene.times(o[i], way, end)
@@ -196,7 +196,7 @@ def test_rays_along_faces_and_edges_of_cells(precision: Any, kind: str) -> None:
     scene = Sum("compact", centers, radii, np.ones(216), None)
     lists = scene.blobs.cell_lists
     assert lists is not None
-    low, cell = lists.origin, lists.cell
+    low, cell = lists.origin, lists.cell_size
     count = 60
     # From corners, edges and faces of cells that hold blobs, along axes and diagonals.
     place = np.floor((centers[rng.integers(0, 216, count)] - low) / cell)
@@ -218,18 +218,21 @@ def test_no_path_leaves_the_lists_of_its_cells(precision: Any) -> None:
     centers = rng.uniform(-9, 9, (80, 3))
     lists = CellLists.of(centers, np.full(80, 0.7))
     backend = choose_backend(precision)
-    grid = Grid.upload(backend, lists)
+    grid = BlobGrid.upload(backend, lists)
     p = rng.uniform(-10, 10, (4000, 3)).astype(backend.dtype).astype(np.float64)
-    p[:900] = lists.origin + rng.integers(0, lists.shape, (900, 3)) * lists.cell  # corners
+    p[:900] = lists.origin + rng.integers(0, lists.shape, (900, 3)) * lists.cell_size  # corners
     d = rng.normal(size=p.shape)
     d[::4] = np.eye(3)[rng.integers(0, 3, 1000)]
     d /= np.linalg.norm(d, axis=1)[:, None]
     here = grid.cell(to_vector3(backend, p))
     corner = to_numpy(here.corner).astype(np.float64)
     shape = np.array(lists.shape)
-    for around in (np.ones(len(p)), np.maximum(to_numpy(here.free).astype(np.float64), 1)):
-        length = to_numpy(here.exit(to_vector3(backend, d), backend.Float(around)))
-        place = (p + np.minimum(length, 1e3)[:, None] * d - lists.origin) / lists.cell
+    for around in (
+        np.ones(len(p)),
+        np.maximum(to_numpy(here.empty_distance).astype(np.float64), 1),
+    ):
+        length = to_numpy(here.exit_distance(to_vector3(backend, d), backend.Float(around)))
+        place = (p + np.minimum(length, 1e3)[:, None] * d - lists.origin) / lists.cell_size
         lower, upper = corner + 1 - around[:, None], corner + around[:, None]
         assert ((place <= upper + _MARGIN) | (upper >= shape)).all()
         assert ((place >= lower - _MARGIN) | (lower <= 0)).all()
@@ -258,14 +261,15 @@ def test_slopes_of_hrbf_on_short_pieces(precision: Any, offset: float) -> None:
     v = p[:, None] - f.points
     r = np.linalg.norm(v, axis=-1)
     along = (v * d[:, None]).sum(-1)
-    b = 3 * f.vectors
+    b = 3 * f.gradient_coefficients
     # Of a r^3 + r b.v along d.
-    slope = 3 * f.factors * r * along + (v * b).sum(-1) * along / r + r * (d @ b.T)
+    slope = 3 * f.value_coefficients * r * along + (v * b).sum(-1) * along / r + r * (d @ b.T)
     slope = slope.sum(1)
     tiny = 1e-13 * (1 + np.abs(slope)) if precision == "single" else 0.0
     for part in found.parts:
         low, high = (
-            to_numpy(end).astype(np.float64) for end in (part.slopes.low, part.slopes.high)
+            to_numpy(end).astype(np.float64)
+            for end in (part.slope_range.lower, part.slope_range.upper)
         )
         assert (low - tiny <= slope).all()
         assert (slope <= high + tiny).all()

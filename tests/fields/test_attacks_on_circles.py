@@ -34,7 +34,7 @@ def test_windows_far_above_small_circles_hold() -> None:
     field = hk.SolidAngle([big, small]).prepare(backend)
     sample = field.evaluate(to_vector3(backend, x, "points"))
     value = to_numpy(sample.value).astype(float)
-    balls = [one for one in sample.promises if isinstance(one, HarmonicBall)]
+    balls = [one for one in sample.all_promises if isinstance(one, HarmonicBall)]
     assert len(balls) == 1
     for ball in balls:
         radius, lower, upper = (
@@ -63,10 +63,10 @@ def test_rays_beside_circles_far_from_the_origin_end(offset: float) -> None:
     target = center + radius * (np.cos(turn) * first + np.sin(turn) * np.cross(normal, first))
     o = center + 3 * unit(rng.normal(size=(n, 3)))
     field = hk.SolidAngle(ring)
-    assert field.describe()["certificate"] == "planar"
+    assert field.describe()["lift_bound"] == "planar"
     hits = hk.trace(field, o, target - o, level=1.2, precision="single", t_max=8)
-    assert (hits.status != hk.Status.OUT_OF_STEPS).all()
-    assert hits.hit.sum() > 500
+    assert (hits.status != hk.RayStatus.OUT_OF_STEPS).all()
+    assert hits.is_hit.sum() > 500
 
 
 def test_small_circles_that_are_tilted_are_in_no_plane() -> None:
@@ -76,7 +76,7 @@ def test_small_circles_that_are_tilted_are_in_no_plane() -> None:
         hole = hk.Circle(radius, (0.3, 0, 0), normal)
         for both in ([outline, hole], [hole, outline]):
             with pytest.raises(ValueError, match="neither"):
-                hk.SolidAngle([np.eye(3) + 9, *both], certificate="planar")
+                hk.SolidAngle([np.eye(3) + 9, *both], lift_bound="planar")
             assert hk.SolidAngle(both)._region is None  # pyright: ignore[reportPrivateUsage]
     flat = hk.SolidAngle([outline, hk.Circle(1e-10, (0.3, 0, 0), (0, 0, -1))])
     assert flat._region is not None  # pyright: ignore[reportPrivateUsage]

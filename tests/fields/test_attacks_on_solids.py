@@ -37,7 +37,7 @@ def test_solids_turn_anticlockwise(axis: Any, degrees: float, start: Any, end: A
     ("solid", "o", "d", "t"),
     [
         (hk.DoubleCone(), (0, 0, 3), (0, 0, -1), 3.0),
-        (hk.DoubleCone().rotated(90, "x").moved((0, 3, 0)), (0, 0, 0), (0, 1, 0), 3.0),
+        (hk.DoubleCone().rotated(90, "x").translated((0, 3, 0)), (0, 0, 0), (0, 1, 0), 3.0),
         (hk.DoubleCone().twisted(2.0) - hk.Torus(1.0, 0.2), (0, 0, 3), (0, 0, -1), 3.0),
         (hk.Torus(0.5, 0.75), (0, 0, 3), (0, 0, -1), 3 - np.sqrt(0.75**2 - 0.5**2)),
         (hk.Superellipsoid((1.0, 1.0)), (-3, 0, 0), (1, 0, 0), 2.0),
@@ -49,7 +49,7 @@ def test_solids_turn_anticlockwise(axis: Any, degrees: float, start: Any, end: A
 def test_rays_along_creases_hit(solid: Any, o: Any, d: Any, t: float, precision: Any) -> None:
     """Where f has no gradient but a derivative along the ray; they ran out of steps."""
     hits = hk.trace(solid, [o], [d], precision=precision)
-    assert hits.hit.all()
+    assert hits.is_hit.all()
     assert hits.t[0] == pytest.approx(t, abs=2e-3)
     assert hits.evaluations[0] < 40
 
@@ -58,9 +58,9 @@ def test_what_is_near_a_level_and_grown_is_not_clipped() -> None:
     """Far from the blobs the value is 0, within 0.9 + 0.2 of the level 1: all but a core is inside,
     but the whole was clipped to where blobs are."""
     blobs = hk.Blobs([[0, 0, 0], [0.9, 0, 0]], radii=0.5)
-    solid = hk.solid(blobs, around=(1.0, 0.9)).grown(0.2) & hk.Sphere(2.0)
+    solid = hk.solid(blobs, around=(1.0, 0.9)).offset(0.2) & hk.Sphere(2.0)
     hits = hk.trace(solid, [[0, 1.8, 3.0]], [[0, 0, -1.0]])
-    assert hits.hit.all()
+    assert hits.is_hit.all()
     assert hits.t[0] == pytest.approx(3 - np.sqrt(4 - 1.8**2), abs=1e-3)
 
 
@@ -69,14 +69,14 @@ def test_what_is_near_a_level_and_grown_is_not_clipped() -> None:
 def test_shrunk_blends_are_not_clipped(power: float) -> None:
     """Where both solids are deep inside, their blend is lower than the lesser less the radius: rays
     along their common axis hit the clipped volume."""
-    two = (hk.Sphere(1.0), hk.Sphere(1.0).moved((0.6, 0.0, 0.0)))
-    shrunk = two[0].blended(two[1], 0.1, power=power).grown(-0.3)
+    two = (hk.Sphere(1.0), hk.Sphere(1.0).translated((0.6, 0.0, 0.0)))
+    shrunk = two[0].blended(two[1], 0.1, power=power).offset(-0.3)
     factor = 2 ** (1 / power)
 
     # In the plane of symmetry both distances are m, and f = 0.1 - factor (0.1 - m) + 0.3.
     m = 0.1 - 0.4 / factor
     hits = hk.trace(shrunk, [[0.3, 0, 3.0]], [[0, 0, -1.0]])
-    assert hits.hit.all()
+    assert hits.is_hit.all()
     assert hits.t[0] == pytest.approx(3 - np.sqrt((1 + m) ** 2 - 0.09), abs=1e-3)
 
 
@@ -99,8 +99,8 @@ def test_little_is_lost_far_from_the_origin() -> None:
     o = -3 * d + 0.4 * rng.normal(size=(2000, 3)) + [10.0, -5.0, 2.5]
     walls = hk.solid(hk.Gyroid(1.0), between=(-0.3, 0.3)) & hk.Sphere(1.0)
     for solid in (hk.Sphere(1.0) - hk.Torus(0.8, 0.3), walls):
-        hits = hk.trace(solid.moved((10.0, -5.0, 2.5)), o, d)
-        assert (hits.status != hk.Status.OUT_OF_STEPS).all()
+        hits = hk.trace(solid.translated((10.0, -5.0, 2.5)), o, d)
+        assert (hits.status != hk.RayStatus.OUT_OF_STEPS).all()
         assert hits.evaluations.mean() < 10
 
 
@@ -145,12 +145,12 @@ def test_constants_made_of_coordinates_are_held(formula: Any, value: float, prec
     sines of them were those of single precision, and were not held by their ranges."""
     backend = choose_backend(precision)
     p, d = (backend.Array3f(*one) for one in ((1.0, 2.0, 3.0), (1.0, 0.0, 0.0)))
-    along = Jet.along(p, d, backend.Float(0), backend.Float(1))[0]
+    along = Jet.along_ray(p, d, backend.Float(0), backend.Float(1))[0]
     jets = [formula(one) for one in (along, Jet.at_point(p)[0])]
-    for one in (jets[0].value, jets[0].start.value, jets[1].value):
-        low, high = (np.float64((backend.Float(0) + end)[0]) for end in (one.low, one.high))
-        if one.is_static:  # numbers of the precision themselves
-            low, high = one.low, one.high
+    for one in (jets[0].value, jets[0].jet_at_start.value, jets[1].value):
+        low, high = (np.float64((backend.Float(0) + end)[0]) for end in (one.lower, one.upper))
+        if one.is_literal:  # numbers of the precision themselves
+            low, high = one.lower, one.upper
         assert low <= value <= high
         assert high - low < 1e2 * float(dr.epsilon(backend.Float))
 
@@ -179,7 +179,7 @@ def test_functions_of_numpy_with_the_same_meaning() -> None:
 )  # fmt: skip
 def test_no_crossing_is_lost(solid: Any, o: Any, d: Any, roots: Any, precision: Any) -> None:
     all_hits = hk.trace(solid, [o], [d], all_hits=4, precision=precision)
-    assert all_hits.status[0] == hk.Status.MISS  # there are no others
+    assert all_hits.status[0] == hk.RayStatus.MISS  # there are no others
     assert all_hits.count[0] == len(roots)
     off = 2.0 if d[2] == 2e-5 else 1e-2  # at so small an angle rounding moves it far
     assert all_hits.t[0, : len(roots)] == pytest.approx(roots, abs=off)
@@ -192,10 +192,12 @@ def test_the_rounding_of_one_part_makes_no_hit_inside_of_another() -> None:
     greatest is not zero, and was called a hit with an uncertainty of 1.5e-5."""
     twisted = hk.solid(hk.expression("x*y*z - 0.089375"), below=0).twisted(1.3472932840911636)
     hill = hk.solid(hk.expression("exp(-x^2 - y^2) - z - 0.644"), below=0)
-    solid = (twisted & ~hill).scaled(1e-5).moved((-1.080524678e-4, 2.767405466e-4, -4.17053243e-5))
+    solid = (
+        (twisted & ~hill).scaled(1e-5).translated((-1.080524678e-4, 2.767405466e-4, -4.17053243e-5))
+    )
     o = [[-1.0094386616119177e-4, 2.895665143994727e-4, -5.2641241924609245e-5]]
     hits = hk.trace(solid, o, [[0, 0, 1]], precision="single", tolerance=1e-9)
-    assert hits.status[0] == hk.Status.OUT_OF_STEPS
+    assert hits.status[0] == hk.RayStatus.OUT_OF_STEPS
 
 
 @pytest.mark.slow

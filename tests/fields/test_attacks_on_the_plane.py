@@ -25,13 +25,13 @@ def test_rays_from_creases_miss_nothing(bound: str, precision: Any) -> None:
     d = rng.normal(size=(n, 3))
     d /= np.linalg.norm(d, axis=1)[:, None]
     hits = hk.trace(hk.RiemannSurface("asin"), o, d, bound=bound, precision=precision)
-    assert (hits.status != hk.Status.OUT_OF_STEPS).all()
+    assert (hits.status != hk.RayStatus.OUT_OF_STEPS).all()
     end = np.minimum(hits.t, 1.2)
     x = o[:, None] + (np.linspace(0, 1, 800) * end[:, None])[..., None] * d[:, None]
     u = np.abs(np.arcsin(x[..., 0] + 1j * x[..., 1]).imag)
     product = (x[..., 2] - u) * (x[..., 2] + u)  # which is positive at the start
     assert (product > -5e-3).all()
-    assert hits.hit.sum() > 100
+    assert hits.is_hit.sum() > 100
 
 
 @pytest.mark.few(5)
@@ -52,7 +52,7 @@ def test_rays_through_zeros_of_whole_powers_end(
 @pytest.mark.parametrize("bound", [None, "curvature", "slope"])
 def test_what_is_not_a_number_is_not_free(bound: Any) -> None:
     """A value that is not a number had no level above nor below it, and rays passed: a miss."""
-    settings: dict[str, Any] = {"singular": [], "second": lambda z, r: 1.0}
+    settings: dict[str, Any] = {"singular_points": [], "second_bound": lambda z, r: 1.0}
 
     def lost(z: Any) -> list[tuple[Any, Any]]:
         return [(z * math.nan, z)]
@@ -68,7 +68,7 @@ def test_what_is_not_a_number_is_not_free(bound: Any) -> None:
         hk.LevelCurves(lost, **settings),
     ):
         hits = hk.trace(field, o, d, bound=bound, max_steps=20)
-        assert (hits.status == hk.Status.OUT_OF_STEPS).all()
+        assert (hits.status == hk.RayStatus.OUT_OF_STEPS).all()
 
 
 def test_functions_of_ones_own_are_tried_at_once() -> None:
@@ -79,12 +79,16 @@ def test_functions_of_ones_own_are_tried_at_once() -> None:
 
     for function, settings, error, words in (
         (lambda z: [(np.sqrt(z), 1)], {}, TypeError, "drjit.sqrt"),
-        (identity, {"second": lambda z, r: z}, TypeError, "real number"),
-        (identity, {"second": lambda z, r: "1"}, TypeError, "real number"),
-        (identity, {"second": lambda z: 1.0}, TypeError, "z and a radius"),
+        (identity, {"second_bound": lambda z, r: z}, TypeError, "real number"),
+        (identity, {"second_bound": lambda z, r: "1"}, TypeError, "real number"),
+        (identity, {"second_bound": lambda z: 1.0}, TypeError, "z and a radius"),
         (identity, {"period": "1"}, ValueError, "positive number"),
     ):
-        given: dict[str, Any] = {"singular": [], "second": lambda z, r: 0.0, **settings}
+        given: dict[str, Any] = {
+            "singular_points": [],
+            "second_bound": lambda z, r: 0.0,
+            **settings,
+        }
         with pytest.raises(error, match=words):
             hk.RiemannSurface(function, **given)
     with pytest.raises(ValueError, match="level must be finite"):

@@ -11,20 +11,20 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.enclosures import Gaps, choose_proofs, longest_step
+from harnack.enclosures import LevelGaps, choose_enclosures, longest_free_length
 from harnack.fields import Formula
-from harnack.fields.blobs.blob_sums import over, sum_along
+from harnack.fields.blobs.blob_sums import for_each_record, sum_along
 from harnack.fields.blobs.blobs import BlobError
 from harnack.fields.blobs.grid import CellLists
-from harnack.fields.samples import Path
+from harnack.fields.samples import Ray
 from harnack.testing import check_field
 
 KERNELS = {
-    "compact": hk.Compact(1.6),
-    "cubic": hk.Cubic(2.0),
-    "sextic": hk.Sextic(1.8),
-    "gaussian": hk.Gaussian(1.0, 1e-2),
-    "sharp": hk.Gaussian(5.0, 0.2),
+    "compact": hk.CompactKernel(1.6),
+    "cubic": hk.CubicKernel(2.0),
+    "sextic": hk.SexticKernel(1.8),
+    "gaussian": hk.GaussianKernel(1.0, 1e-2),
+    "sharp": hk.GaussianKernel(5.0, 0.2),
 }
 PRECISIONS = ("single", "double")
 SLOWLY = pytest.mark.slow
@@ -147,9 +147,9 @@ def test_single_precision_is_within_the_stated_error(kernel: Any) -> None:
         (x,) = rounded(single, np.random.default_rng(3).uniform(-6, 6, (2000, 3)) + offset)
         sample = blobs.prepare(single).evaluate(to_vector3(single, x))
         value = to_numpy(sample.value).astype(np.float64)
-        error = to_numpy(sample.error) + 8 * 2.0**-23 * np.abs(value) + 1e-37
+        error = to_numpy(sample.value_error) + 8 * 2.0**-23 * np.abs(value) + 1e-37
         assert (np.abs(value - Oracle(blobs).value(x)) <= error).all()
-        assert np.median(to_numpy(sample.error)) < 1e-5 * kernel.steepness.value
+        assert np.median(to_numpy(sample.value_error)) < 1e-5 * kernel.steepness.value
         gradient = to_numpy(sample.gradient).astype(np.float64)
         off = np.linalg.norm(gradient - blobs.gradient(x, precision="double"), axis=1)
         assert (off <= to_numpy(sample.gradient_error)).all()
@@ -181,7 +181,7 @@ def test_ranges_hold_and_are_attained(kernel: Any, precision: Any, offset: float
     prepared: Any = blob.prepare(backend)
     found = sum_along(
         prepared.kernel, backend, to_vector3(backend, p), to_vector3(backend, d), knots,
-        over(prepared._on.records),
+        for_each_record(prepared._on.records),
     )  # fmt: skip
     ends = [np.zeros(count), *(to_numpy(one).astype(np.float64) for one in knots[1:])]
     slack: list[Any] = []
@@ -198,9 +198,12 @@ def test_ranges_hold_and_are_attained(kernel: Any, precision: Any, offset: float
         low, high, least, most = (
             to_numpy(one).astype(np.float64)[:, None]
             for one in (
-                part.slopes.low, part.slopes.high, part.least_curvature, part.most_curvature,
+                part.slope_range.lower,
+                part.slope_range.upper,
+                part.min_second_derivative,
+                part.max_second_derivative,
             )
-        )  # fmt: skip
+        )
         tiny = 1e-11 * kernel.amplitude * kernel.steepness.bend
         assert (low - first).max() <= tiny
         assert (first - high).max() <= tiny
@@ -258,17 +261,17 @@ def test_steps_are_free_and_no_longer(
     blobs = scene(count, weights=np.linspace(1.5, -0.3, count), groups=groups)
     p, d, length = lines(250, 11)
     p, d, length = rounded(backend, p, d, length)
-    path = Path(to_vector3(backend, p), to_vector3(backend, d), choose_proofs(bound))
-    look = blobs.prepare(backend).look(path, backend.Float(0), backend.Float(length), 0.0)
+    path = Ray(to_vector3(backend, p), to_vector3(backend, d), choose_enclosures(bound))
+    look = blobs.prepare(backend).sample_ray(path, backend.Float(0), backend.Float(length), 0.0)
     value = to_numpy(look.sample.value).astype(np.float64)
     rng = np.random.default_rng(1)
     size = 10 ** rng.uniform(-4, 0.5, len(p))
     up = np.where(rng.random(len(p)) < 0.3, np.inf, size)
     down = np.where(rng.random(len(p)) < 0.3, np.inf, size * rng.uniform(0.1, 3, len(p)))
     up, down = rounded(backend, up, down)
-    error = to_numpy(look.sample.error).astype(np.float64) + 1e-6 * (precision == "single")
-    gaps = Gaps(backend.Float(down), backend.Float(up))
-    step = to_numpy(longest_step(look.ahead, gaps)).astype(np.float64)
+    error = to_numpy(look.sample.value_error).astype(np.float64) + 1e-6 * (precision == "single")
+    gaps = LevelGaps(backend.Float(down), backend.Float(up))
+    step = to_numpy(longest_free_length(look.forward, gaps)).astype(np.float64)
     assert (step >= 0).all()
     assert np.median(step) > 0
     # A path beyond the blobs is never left.
@@ -309,11 +312,11 @@ def check_first_hits(blobs: hk.Blobs, count: int, precision: Any, most_looks: fl
     """Against values sampled densely in double precision: no crossing before a hit, none on a miss,
     and the surface at a hit."""
     o, d, length = rounded(choose_backend(precision), *box_rays(blobs, count))
-    tolerance = hk.Tolerance(value=1e-3, distance=1e-30)
+    tolerance = hk.HitTolerance(value=1e-3, distance=1e-30)
     hits = hk.trace(blobs, o, d, t_max=length, tolerance=tolerance, precision=precision)
-    assert (hits.status != hk.Status.OUT_OF_STEPS).all()
+    assert (hits.status != hk.RayStatus.OUT_OF_STEPS).all()
     assert np.mean(hits.evaluations) <= most_looks
-    found = hits.status == hk.Status.HIT
+    found = hits.status == hk.RayStatus.HIT
     assert 0.2 < found.mean() < 0.8
     oracle = Oracle(blobs)
     for part in np.array_split(np.arange(len(o)), max(1, len(o) // 500)):
@@ -348,7 +351,7 @@ def test_lists_hold_every_support_that_meets_a_cell() -> None:
     centers, radii = rng.uniform(-3, 3, (200, 3)), 10 ** rng.uniform(-1.5, 0.4, 200)
     lists = CellLists.of(centers, radii)
     x = rng.uniform(-4, 4, (4000, 3))
-    place = np.floor((x - lists.origin) / lists.cell).astype(int)
+    place = np.floor((x - lists.origin) / lists.cell_size).astype(int)
     inside = ((place >= 0) & (place < np.array(lists.shape))).all(1)
     near = ((x[:, None] - centers) ** 2).sum(-1) < radii**2
     assert not near[~inside].any()
@@ -358,7 +361,7 @@ def test_lists_hold_every_support_that_meets_a_cell() -> None:
         listed = lists.entries[lists.starts[index] : lists.starts[index + 1]]
         assert set(np.flatnonzero(near[k])) <= set(listed.tolist())
         assert (np.diff(listed) > 0).all()
-        assert (lists.free[index] == 0) == (len(listed) > 0)
+        assert (lists.empty_distance[index] == 0) == (len(listed) > 0)
 
 
 def test_other_blobs_compile_nothing() -> None:
@@ -402,11 +405,11 @@ def test_equal_centers_far_from_the_origin(precision: Any) -> None:
     o = np.array([1e4, 1e4, 1e4 - 10.0])
     beside = np.array([[0.0, 0, 0], [3, 0, 0], [20, 0, 0]])
     hits = hk.trace(blobs, o + beside, [[0, 0, 1.0]] * 3, precision=precision)
-    kernel = hk.Compact(1.6)
+    kernel = hk.CompactKernel(1.6)
     level = np.cbrt(0.5 / kernel.amplitude)  # two equal blobs are one of twice the weight
     radius = 1.6 * np.sqrt(1 - level)
     np.testing.assert_allclose(hits.t[:2], [10 - radius, 9.5], atol=4e-3)
-    assert hits.status[2] == hk.Status.MISS
+    assert hits.status[2] == hk.RayStatus.MISS
 
 
 def test_rays_that_begin_inside_or_behind() -> None:
@@ -414,7 +417,7 @@ def test_rays_that_begin_inside_or_behind() -> None:
     ways = [[0, 0, 1.0]] * 3
     hits = hk.trace(blobs, [[0, 0, 0.0], [0, 0, 5.0], [0, 0, -0.5]], ways)
     np.testing.assert_allclose(hits.t[[0, 2]], [1.0, 1.5], atol=1e-3)
-    assert hits.status[1] == hk.Status.MISS
+    assert hits.status[1] == hk.RayStatus.MISS
 
 
 def test_negative_blobs_carve() -> None:
@@ -456,7 +459,11 @@ def test_what_are_no_blobs(arguments: Any, settings: Any, message: str) -> None:
 
 
 def test_what_no_kernel_can_be() -> None:
-    for wrong in (lambda: hk.Compact(0.9), lambda: hk.Gaussian(0.0), lambda: hk.Gaussian(1.0, 2.0)):
+    for wrong in (
+        lambda: hk.CompactKernel(0.9),
+        lambda: hk.GaussianKernel(0.0),
+        lambda: hk.GaussianKernel(1.0, 2.0),
+    ):
         with pytest.raises(ValueError, match="must"):
             wrong()
     with pytest.raises(TypeError, match="kernel"):

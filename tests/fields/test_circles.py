@@ -11,7 +11,7 @@ import pytest
 
 import harnack as hk
 from harnack.backend import backend_of, choose_backend, to_numpy, to_vector3
-from harnack.backend.arrays import aligned
+from harnack.backend.arrays import upload_floats
 from harnack.enclosures import HarmonicBall
 from harnack.fields.solid_angles.circle_sums import UnitCircle
 from harnack.fields.solid_angles.planar import planar_region
@@ -59,7 +59,7 @@ KNOWN = np.array([
 def unit_circle(r: np.ndarray, z: np.ndarray, precision: Any) -> tuple[np.ndarray, ...]:
     """Omega, its derivatives along r and z, Omega_zz and Omega_rz."""
     backend = choose_backend(precision)
-    one = UnitCircle.at(aligned(backend, r), aligned(backend, z))
+    one = UnitCircle.at(upload_floats(backend, r), upload_floats(backend, z))
     along, mixed, _ = one.second_derivatives()
     found = one.angle, one.across * one.r, one.axial, along, mixed * one.r
     return tuple(to_numpy(value).astype(float) for value in found)
@@ -67,7 +67,7 @@ def unit_circle(r: np.ndarray, z: np.ndarray, precision: Any) -> tuple[np.ndarra
 
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_values_of_forty_digits(precision: Any) -> None:
-    epsilon = choose_backend(precision).epsilon
+    epsilon = choose_backend(precision).machine_epsilon
     r, z, angle, radial, axial, zz, rz = KNOWN.T
     found = unit_circle(r, z, precision)
     assert np.abs(found[0] - angle).max() < 16 * epsilon
@@ -82,7 +82,7 @@ def test_values_of_forty_digits(precision: Any) -> None:
 
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_values_on_the_axis_and_in_the_plane(precision: Any) -> None:
-    epsilon = choose_backend(precision).epsilon
+    epsilon = choose_backend(precision).machine_epsilon
     z = np.array([-3.0, -0.5, 0.25, 2.0, 50.0])
     angle, radial, axial, zz, _ = unit_circle(0 * z, z, precision)
     expected = -2 * np.pi * np.sign(z) * (1 - np.abs(z) / np.sqrt(1 + z * z))
@@ -121,7 +121,7 @@ def points_about(rng: np.random.Generator, circle: hk.Circle, n: int) -> np.ndar
 
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_any_circle_agrees_with_carlson_s_integrals(precision: Any) -> None:
-    rng, epsilon = np.random.default_rng(1), choose_backend(precision).epsilon
+    rng, epsilon = np.random.default_rng(1), choose_backend(precision).machine_epsilon
     for _ in range(4):
         circle = random_circle(rng, 10 ** rng.uniform(-2, 2))
         x = points_about(rng, circle, 1500)
@@ -152,7 +152,7 @@ def test_a_circle_agrees_with_a_polygon_of_4096_sides(precision: Any) -> None:
     loop = center + share * (circle.polygon(4096) - center)
     x = points_about(rng, circle, 600)
     x = x[np.abs(np.linalg.norm(x - center, axis=1) - 0.7) > 0.02]
-    one, other = hk.SolidAngle(circle), hk.SolidAngle(loop, certificate="edges")
+    one, other = hk.SolidAngle(circle), hk.SolidAngle(loop, lift_bound="edges")
     tolerance = 1e-4 if precision == "single" else 1e-5
     apart = one.value(x, precision=precision) - other.value(x, precision=precision)
     apart = np.remainder(apart + FOUR_PI / 2, FOUR_PI) - FOUR_PI / 2
@@ -175,13 +175,13 @@ HOLE = hk.Circle(0.6, normal=(0, 0, -1))
 TILTED = hk.Circle(0.8, (0.1, 0.2, 0.3), (1, 2, 3))
 FIELDS: dict[str, hk.SolidAngle] = {
     "circle": hk.SolidAngle(hk.Circle(1.0)),
-    "circle, edges": hk.SolidAngle(TILTED, certificate="edges"),
+    "circle, edges": hk.SolidAngle(TILTED, lift_bound="edges"),
     "large circle": hk.SolidAngle(hk.Circle(300.0, (500.0, 0, -200.0), (1, 0, 1))),
     "ring": hk.SolidAngle([hk.Circle(1.0), hk.Circle(0.4, (0.2, 0, 0), (0, 0, -1))]),
     "coaxial": hk.SolidAngle([hk.Circle(1.0), hk.Circle(0.8, (0, 0, 0.5))]),
     "linked": hk.SolidAngle([hk.Circle(1.0), hk.Circle(1.0, (1.0, 0, 0), (0, 1, 0))]),
     "court": hk.SolidAngle([court(), HOLE]),
-    "court, edges": hk.SolidAngle([court(), HOLE], certificate="edges"),
+    "court, edges": hk.SolidAngle([court(), HOLE], lift_bound="edges"),
     "bent court": hk.SolidAngle([court(0.4), HOLE]),
     "trefoil and circle": hk.SolidAngle([example_curves.torus_knot(2, 3, 40), hk.Circle(0.5)]),
     "twice": hk.SolidAngle([hk.Circle(1.0), hk.Circle(1.0)]),
@@ -219,20 +219,20 @@ def test_lifts_stay_in_the_range_promised(name: str, precision: Any) -> None:
     x = x.astype(np.float32).astype(float)
     sample = sample_at(field, x, precision)
     value, error = (
-        np.broadcast_to(to_numpy(v).astype(float), n) for v in (sample.value, sample.error)
+        np.broadcast_to(to_numpy(v).astype(float), n) for v in (sample.value, sample.value_error)
     )
     ok = oracle(x).smooth > 1e-4 * size
     direction = unit(rng.normal(size=(n, 3)))
     # Towards the nearest point of the curve, roughly, half of the time.
     p = to_vector3(choose_backend("double"), x)
-    toward = to_numpy(field.closest_on_boundary(p)) - x
+    toward = to_numpy(field.closest_boundary_point(p)) - x
     direction[::2] = unit(toward[::2] + 0.2 * np.linalg.norm(toward[::2], axis=1)[:, None]
                           * direction[::2])  # fmt: skip
     start = oracle(x).value
     drift = np.abs(np.remainder(value - start + FOUR_PI / 2, FOUR_PI) - FOUR_PI / 2)
     # Where the whole ball is small (beside the curve), what rounding did to x shows.
     slack = drift + error + 1e-6 + (1e-3 if precision == "single" else 0)
-    balls = [one for one in sample.promises if isinstance(one, HarmonicBall)]
+    balls = [one for one in sample.all_promises if isinstance(one, HarmonicBall)]
     assert balls
     for ball in balls:
         radius, low, high = (
@@ -252,13 +252,13 @@ def test_lifts_stay_in_the_range_promised(name: str, precision: Any) -> None:
 def sums_over(field: hk.SolidAngle, x: np.ndarray) -> Any:
     """The sums over a field's circles, in its unit coordinates."""
     p = to_vector3(choose_backend("double"), x)
-    on = field.prepare(choose_backend("double"))._on(p)  # type: ignore[attr-defined]
-    return on.circles.sums(on.unit(p))
+    on = field.prepare(choose_backend("double"))._data_for(p)  # type: ignore[attr-defined]
+    return on.circles.sums(on.to_unit(p))
 
 
 def test_the_gradient_s_bound_is_attained_at_the_center() -> None:
     """The integral of |dp|/D^2 bounds it: at the center it is the gradient."""
-    field = hk.SolidAngle(TILTED, certificate="edges")
+    field = hk.SolidAngle(TILTED, lift_bound="edges")
     sums = sums_over(field, np.array([TILTED.center]))
     share = dr.norm(sums.gradient) / sums.squares
     assert 1 - 1e-12 < share[0] <= 1 + 1e-12
@@ -307,7 +307,7 @@ def test_hessians_are_derivatives_of_gradients(name: str) -> None:
 def test_circles_that_are_run_back_cancel() -> None:
     there = hk.Circle(1.0, (0.5, 0, 0), (0, 3, 4))
     nothing = hk.SolidAngle([there, there.reversed()])
-    assert not hk.trace(nothing, [[0.5, 0, 2]], [[0, 0, -1]]).hit.any()
+    assert not hk.trace(nothing, [[0.5, 0, 2]], [[0, 0, -1]]).is_hit.any()
     with pytest.raises(ValueError, match="cancel each other"):
         hk.trace(nothing, [[0.5, 0, 2]], [[0, 0, -1]], level=0.0)
     left = hk.SolidAngle([there, there.reversed(), TILTED])
@@ -331,9 +331,9 @@ def test_regions_of_planes_are_found() -> None:
     assert planar_region((), (ring, hk.Circle(0.5, (0, 0, 1e-3), (0, 0, -1)))) is None
     assert planar_region((court(),), (hk.Circle(1.05, normal=(0, 0, -1)),)) is None
     assert planar_region((court(1e-6),), (HOLE,)) is None
-    assert FIELDS["bent court"].describe()["certificate"] == "edges"
+    assert FIELDS["bent court"].describe()["lift_bound"] == "edges"
     with pytest.raises(ValueError, match="region of a plane"):
-        hk.SolidAngle([court(0.4), HOLE], certificate="planar")
+        hk.SolidAngle([court(0.4), HOLE], lift_bound="planar")
 
 
 @pytest.mark.parametrize(
@@ -368,7 +368,7 @@ def test_where_a_circle_is() -> None:
     # Counter-clockwise as seen from the normal's tip; the one around it touches it from outside.
     area = np.cross(polygon, np.roll(polygon, -1, axis=0)).sum(axis=0) / 2
     np.testing.assert_allclose(area, math.pi * 4 * np.array(circle.normal), rtol=1e-4, atol=1e-4)
-    around = circle.polygon(6, around=True)
+    around = circle.polygon(6, circumscribed=True)
     middle = 0.5 * (around + np.roll(around, -1, axis=0)) - np.array(circle.center)
     np.testing.assert_allclose(np.linalg.norm(middle, axis=1), 2.0)
 
@@ -379,7 +379,7 @@ def test_closest_points_of_the_boundary() -> None:
     x = rng.normal(0, 1.5, (400, 3))
     x[0] = 0, 0, 1.0  # on the axis, all points of the circle are as near
     backend = choose_backend("double")
-    nearest = to_numpy(field.closest_on_boundary(to_vector3(backend, x)))
+    nearest = to_numpy(field.closest_boundary_point(to_vector3(backend, x)))
     d = MixedOracle(field.loops, field.circles)(x).smooth
     np.testing.assert_allclose(np.linalg.norm(nearest - x, axis=1), d, rtol=1e-9)
     on = MixedOracle(field.loops, field.circles)(nearest + 1e-12).smooth
@@ -468,10 +468,10 @@ def compare(seed: int, curves: int, rays: int, precision: Any) -> tuple[int, int
                                 depth=tolerance, finest=0.5 * tolerance)  # fmt: skip
         missed = hits.t > truth.beyond + 10 * tolerance
         early = np.zeros(rays, bool)
-        at = np.flatnonzero(hits.hit)
+        at = np.flatnonzero(hits.is_hit)
         early[at] = ~is_near_surface(oracle, o[at], d[at], hits.t[at].astype(float), level,  # type: ignore[arg-type]
                                      10 * tolerance)  # fmt: skip
-        out = hits.status == hk.Status.OUT_OF_STEPS
+        out = hits.status == hk.RayStatus.OUT_OF_STEPS
         failures += [
             f"seed {seed} kind {kind} missed {missed[k]} early {early[k]} out {out[k]} "
             f"{o[k].tolist()} {d[k].tolist()} {level} {hits.t[k]} {truth.beyond[k]}"
@@ -508,8 +508,8 @@ def test_rays_in_the_plane_and_at_the_circle(precision: Any) -> None:
     )
     d = np.array([[1.0, 0, 0], [1, 0, 0], [0, 0, -1], [1, 0, 0], [1, 0, 0], [0, 0, -1]])
     hits = hk.trace(field, o, d, tolerance=1e-4, precision=precision)
-    assert (hits.status != hk.Status.OUT_OF_STEPS).all()
-    np.testing.assert_array_equal(hits.hit, [True, True, True, True, False, True])
+    assert (hits.status != hk.RayStatus.OUT_OF_STEPS).all()
+    np.testing.assert_array_equal(hits.is_hit, [True, True, True, True, False, True])
     np.testing.assert_allclose(hits.t[[0, 1, 2, 5]], [2, 2, 3, 2], atol=2e-3)
     # Level 1: near the plane, rays that run beside the disk are far from the surface.
     assert (hits.evaluations < 60).all()
@@ -524,5 +524,5 @@ def test_few_evaluations_a_ray() -> None:
     for name, level in (("circle", 1.2), ("ring", 1.2), ("court", 0.7), ("court", 1.2),
                         ("coaxial", 2 * math.pi)):  # fmt: skip
         hits = hk.trace(FIELDS[name], np.broadcast_to(o, d.shape), d, level=-level, t_max=20.0)
-        assert hits.hit.mean() > 0.1
-        assert hits.evaluations[hits.hit].mean() < 12.0, name
+        assert hits.is_hit.mean() > 0.1
+        assert hits.evaluations[hits.is_hit].mean() < 12.0, name

@@ -10,9 +10,9 @@ import pytest
 
 import harnack as hk
 from harnack.backend import FloatArray, choose_backend, to_numpy
-from harnack.enclosures import Gaps, Slopes
-from harnack.enclosures.extremum import Greatest, Negated, Part
-from harnack.enclosures.parabola import Parabola
+from harnack.enclosures import LevelGaps, SlopeRange
+from harnack.enclosures.extremum import MaximumEnclosure, MaximumOperand, NegatedEnclosure
+from harnack.enclosures.parabola import ParabolaEnclosure
 from harnack.testing import check_field
 from tests.fields.test_shapes import CUP, LOOPS, SCREW, SHAPES, extruded, screw
 
@@ -94,15 +94,16 @@ CASES: dict[str, tuple[Callable[[], hk.Solid], Values]] = {
         lambda p: np.maximum(np.maximum(sphere(p), -sphere(p, 0.9)), p[..., 2] - 0.2),
     ),
     "grown": (
-        lambda: (hk.Sphere(0.7) | hk.Torus(1.0, 0.1)).grown(0.1),
+        lambda: (hk.Sphere(0.7) | hk.Torus(1.0, 0.1)).offset(0.1),
         lambda p: np.minimum(sphere(p, 0.7), torus(p, 1.0, 0.1)) - 0.1,
     ),
     "affine": (
-        lambda: hk.Sphere(1.0).scaled((1, 0.5, 1.5)).rotated(40, (1, 2, 3)).moved((0.2, 0.1, -0.3)),
+        lambda: hk.Sphere(1.0).scaled((1, 0.5, 1.5)).rotated(40,
+        (1, 2, 3)).translated((0.2, 0.1, -0.3)),
         lambda p: sphere(((p - [0.2, 0.1, -0.3]) @ TURN) / [1, 0.5, 1.5]),
     ),
     "twisted": (
-        lambda: (hk.Sphere(1.0) - hk.Torus(0.8, 0.3).moved((0.3, 0, 0))).twisted(2.0),
+        lambda: (hk.Sphere(1.0) - hk.Torus(0.8, 0.3).translated((0.3, 0, 0))).twisted(2.0),
         lambda p: np.maximum(
             sphere(untwisted(p, 2.0)), -torus(untwisted(p, 2.0) - [0.3, 0, 0], 0.8, 0.3)
         ),
@@ -116,7 +117,8 @@ CASES: dict[str, tuple[Callable[[], hk.Solid], Values]] = {
         lambda p: np.maximum(np.abs(gyroid(p)) - 0.3, torus(p, 0.8, 0.4)),
     ),
     "moved gyroid": (
-        lambda: (hk.solid(hk.Gyroid(1.0), above=0.1) & hk.Sphere(1.0)).scaled(0.7).moved((1, 2, 3)),
+        lambda: (hk.solid(hk.Gyroid(1.0), above=0.1) & hk.Sphere(1.0)).scaled(0.7).translated((1,
+        2, 3)),
         lambda p: 0.7 * np.maximum(0.1 - gyroid(shrunk(p)), sphere(shrunk(p))),
     ),
     "twisted gyroid": (
@@ -124,7 +126,7 @@ CASES: dict[str, tuple[Callable[[], hk.Solid], Values]] = {
         lambda p: np.maximum(gyroid(untwisted(p, 1.0)) - 0.2, torus(untwisted(p, 1.0), 0.8, 0.4)),
     ),
     "blend": (
-        lambda: hk.Sphere(1.0).blended(hk.Sphere(0.7).moved((1.2, 0, 0)), 0.4),
+        lambda: hk.Sphere(1.0).blended(hk.Sphere(0.7).translated((1.2, 0, 0)), 0.4),
         lambda p: blended(sphere(p), sphere(p, 0.7, (1.2, 0, 0)), 0.4, 2.0),
     ),
     "blended gyroid": (
@@ -137,9 +139,9 @@ CASES: dict[str, tuple[Callable[[], hk.Solid], Values]] = {
     ),
     "outlines cut, mirrored and scaled": (
         lambda: (
-            (hk.Extruded(FRAME, 0.6) - hk.Extruded(LOOPS[1:2], 2.0).moved((0.5, 0.1, -1.0)))
+            (hk.Extrusion(FRAME, 0.6) - hk.Extrusion(LOOPS[1:2], 2.0).translated((0.5, 0.1, -1.0)))
             .transformed(np.diag([-1.0, 1.0, 1.0])).scaled((1.0, 0.8, 1.4))
-            | hk.Revolved(CUP).scaled(0.5).moved((0.0, 0.0, -0.4))
+            | hk.SolidOfRevolution(CUP).scaled(0.5).translated((0.0, 0.0, -0.4))
         ),
         lambda p: np.minimum(
             np.maximum(extruded(p / FACTORS, FRAME, 0.6),
@@ -148,7 +150,7 @@ CASES: dict[str, tuple[Callable[[], hk.Solid], Values]] = {
         ),
     ),
     "outline blended and bent": (
-        lambda: hk.Extruded(FRAME, 0.6).twisted(1.0).blended(hk.Sphere(0.4), 0.2),
+        lambda: hk.Extrusion(FRAME, 0.6).twisted(1.0).blended(hk.Sphere(0.4), 0.2),
         lambda p: blended(extruded(untwisted(p, 1.0), FRAME, 0.6), sphere(p, 0.4), 0.2, 2.0),
     ),
     "thread in a block": (
@@ -181,10 +183,10 @@ def missed(make: Callable[[], hk.Solid], value: Values, precision: Any, count: i
     inside = np.stack([value(o + one * d) <= 0 for one in t], axis=1)
     first = np.where(inside.any(axis=1), t[inside.argmax(axis=1)], np.inf)
     hits = hk.trace(make(), o, d, t_max=8.0, precision=precision)
-    assert (hits.status != hk.Status.OUT_OF_STEPS).all()
+    assert (hits.status != hk.RayStatus.OUT_OF_STEPS).all()
     assert np.isfinite(first).mean() > 0.1
     # What is hit lies on the surface, within the tolerance and the slope of f.
-    on = hits.hit
+    on = hits.is_hit
     p, n = hits.position[on].astype(float), 1e-4 * hits.normal[on]
     slope = np.abs(value(p + n) - value(p - n)) / 2e-4
     assert (np.abs(value(p)) < 4e-4 * np.maximum(slope, 1)).all()
@@ -219,9 +221,9 @@ def test_sphere_tracing_finds_the_same_hits(name: str) -> None:
     o, d = rays(2000, 5, (0, 0, 0), 1.3)
     solid = CASES[name][0]()
     ours, theirs = (hk.trace(solid, o, d, t_max=8.0, bound=one) for one in (None, "lipschitz"))
-    same = ours.hit == theirs.hit
+    same = ours.is_hit == theirs.is_hit
     assert same.mean() > 0.998  # rays that graze within the tolerance stop anywhere
-    both = ours.hit & theirs.hit
+    both = ours.is_hit & theirs.is_hit
     assert np.quantile(np.abs(ours.t - theirs.t)[both], 0.98) < 1e-3
     assert ours.evaluations.mean() < 0.7 * theirs.evaluations.mean()
 
@@ -229,18 +231,20 @@ def test_sphere_tracing_finds_the_same_hits(name: str) -> None:
 def test_the_greatest_falls_only_where_all_parts_have_fallen() -> None:
     """Two functions 1 - s and -1 + 3s: the greatest is 0 at s = 1/2 at the lowest."""
     real = choose_backend("double").Float
-    down = Parabola(Slopes(real(-1), real(-1)), real(0), real(0), real(10))
-    up = Parabola(Slopes(real(3), real(3)), real(0), real(0), real(10))
-    parts = (Part(real(0), real(0), (down,)), Part(real(2), real(2), (up,)))
+    down = ParabolaEnclosure(SlopeRange(real(-1), real(-1)), real(0), real(0), real(10))
+    up = ParabolaEnclosure(SlopeRange(real(3), real(3)), real(0), real(0), real(10))
+    parts = (MaximumOperand(real(0), real(0), (down,)), MaximumOperand(real(2), real(2), (up,)))
 
     def step(enclosure: Any, below: Any, above: Any) -> float:
-        return float(to_numpy(enclosure.step(Gaps(real(below), real(above))) + real(0))[0])
+        return float(
+            to_numpy(enclosure.free_length(LevelGaps(real(below), real(above))) + real(0))[0]
+        )
 
-    greatest = Greatest(parts)
+    greatest = MaximumEnclosure(parts)
     assert step(greatest, np.inf, 0.5) == pytest.approx(2.5 / 3, rel=1e-5)  # -1 + 3s = 1.5
     assert step(greatest, 0.25, np.inf) == pytest.approx(0.25, rel=1e-5)  # 1 - s = 0.75
     assert step(greatest, 0.25, 0.5) == pytest.approx(0.25, rel=1e-5)
-    negative = Negated(greatest)
+    negative = NegatedEnclosure(greatest)
     assert step(negative, 0.5, np.inf) == pytest.approx(2.5 / 3, rel=1e-5)
 
 
@@ -248,18 +252,21 @@ def test_a_part_past_the_level_proves_nothing() -> None:
     """A part that lies below the level below already does not keep the greatest above it,
     whichever way it runs."""
     real = choose_backend("double").Float
-    falling = Parabola(Slopes(real(-1), real(-1)), real(0), real(0), real(10))
-    rising = Parabola(Slopes(real(-1), real(-1)), real(4), real(4), real(10))
-    parts = (Part(real(0), real(0), (falling,)), Part(real(2), real(2), (rising,)))
-    step = Greatest(parts).step(Gaps(real(1), real(np.inf)))
+    falling = ParabolaEnclosure(SlopeRange(real(-1), real(-1)), real(0), real(0), real(10))
+    rising = ParabolaEnclosure(SlopeRange(real(-1), real(-1)), real(4), real(4), real(10))
+    parts = (
+        MaximumOperand(real(0), real(0), (falling,)),
+        MaximumOperand(real(2), real(2), (rising,)),
+    )
+    step = MaximumEnclosure(parts).free_length(LevelGaps(real(1), real(np.inf)))
     assert float(to_numpy(step + real(0))[0]) <= 1.0
 
 
 def test_operators_and_methods_read_like_the_drawing() -> None:
     model = (hk.Sphere(1.0) - hk.Torus(0.8, 0.2)).twisted(2.0)
     hits = hk.trace(model, [[3.0, 0.1, 0.2]], [[-1.0, 0.0, 0.0]])
-    assert hits.hit.all()
-    assert (~(~model)).hull() == model.hull()
+    assert hits.is_hit.all()
+    assert (~(~model)).sublevel_extent() == model.sublevel_extent()
     flat = hk.union(hk.Sphere(1.0), hk.Sphere(0.5) | hk.Torus(1.0, 0.1))
     assert len(flat.parts) == 3  # type: ignore[attr-defined]
 
@@ -270,23 +277,23 @@ def test_lower_bounds_of_distances_hold_for_parts_of_any_kind() -> None:
     walls = hk.solid(hk.SphericalHarmonic(3, 1), between=(-0.2, 0.2))
     for model in (walls & hk.Sphere(0.9), hk.Capsule((0, 0, -1), (0, 0, 1), 0.3) - walls):
         points = np.random.default_rng(3).uniform(-0.6, 0.6, (40, 3))
-        lower = hk.signed_distance(model, points, method="lower")
+        lower = hk.signed_distance(model, points, method="lower_bound")
         near = np.abs(hk.signed_distance(model, points))
         assert (np.abs(lower) <= near * (1 + 1e-6) + 1e-9)[np.isfinite(near)].all()
         assert (np.abs(lower) > 0).mean() > 0.9
 
 
 def test_a_union_reaches_as_far_as_its_parts() -> None:
-    far = hk.Sphere(1.0) | hk.Sphere(1.0).moved((5, 0, 0))
-    hull = far.hull()
+    far = hk.Sphere(1.0) | hk.Sphere(1.0).translated((5, 0, 0))
+    hull = far.sublevel_extent()
     assert hull is not None
     low, high = hull.bounds()
     assert low[0] <= -1
     assert high[0] >= 6
-    assert (far - hk.Sphere(9.0)).hull() is not None
-    assert (far | hk.Plane()).hull() is None
-    assert (~far).hull() is None
-    inside = hk.solid(hk.Blobs([[0, 0, 0]], [1.0]), above=0.5).hull()
+    assert (far - hk.Sphere(9.0)).sublevel_extent() is not None
+    assert (far | hk.Plane()).sublevel_extent() is None
+    assert (~far).sublevel_extent() is None
+    inside = hk.solid(hk.Blobs([[0, 0, 0]], [1.0]), above=0.5).sublevel_extent()
     assert inside is None or np.isfinite(inside.bounds()).all()
 
 
@@ -304,13 +311,13 @@ def test_a_union_reaches_as_far_as_its_parts() -> None:
         (lambda: hk.Sphere(1.0).scaled((1, 2)), ValueError, "factors must be positive"),
         (lambda: hk.Sphere(1.0).rotated(10, "w"), ValueError, 'axis must be "x", "y" or "z"'),
         (lambda: hk.Sphere(1.0).rotated(10, (0, 0, 0)), ValueError, "axis must be a vector"),
-        (lambda: hk.Sphere(1.0).moved((1, 2)), ValueError, r"offset \(3,\)"),
+        (lambda: hk.Sphere(1.0).translated((1, 2)), ValueError, r"offset \(3,\)"),
         (lambda: hk.Sphere(1.0).transformed(np.ones((3, 3))), ValueError, "singular"),
         (lambda: hk.Sphere(1.0).transformed(np.eye(2)), ValueError, r"matrix \(3, 3\)"),
         (lambda: hk.Sphere(1.0).twisted(np.nan), ValueError, "rate must be finite"),
         (lambda: hk.Sphere(1.0).tapered((1, 1), (0, 1)), ValueError, "start must lie before end"),
         (lambda: hk.Sphere(1.0).tapered((0, 1), (1, -1)), ValueError, "scales must be positive"),
-        (lambda: hk.Sphere(1.0).grown(np.inf), ValueError, "distance must be finite"),
+        (lambda: hk.Sphere(1.0).offset(np.inf), ValueError, "distance must be finite"),
         (lambda: hk.Sphere(1.0).blended(hk.Torus(1, 0.1), 0), ValueError, "radius must be"),
         (lambda: hk.Sphere(1.0).blended(hk.Torus(1, 0.1), 1, power=0.5), ValueError, "power must"),
         (lambda: hk.solid(SPANNING, below=1.0), ValueError, "is angle-valued"),
@@ -339,27 +346,27 @@ def reach(solid: hk.Field, axis: int) -> float:
 def test_f_is_measured_in_the_units_of_each_map_in_turn() -> None:
     """A map that makes all lengths grow alike multiplies f; in a row, the others hid that."""
     ball = hk.Sphere(1)
-    stretched = ball.scaled((1, 1, 2)).scaled(2).grown(0.5)  # |x/2| - 1 <= 0.25
+    stretched = ball.scaled((1, 1, 2)).scaled(2).offset(0.5)  # |x/2| - 1 <= 0.25
     assert reach(stretched, 0) == pytest.approx(2.5, abs=1e-5)
     assert reach(stretched, 2) == pytest.approx(5.0, abs=1e-5)
-    other = ball.scaled(2).rotated(90, "x").scaled((1, 1, 2)).grown(0.5)
+    other = ball.scaled(2).rotated(90, "x").scaled((1, 1, 2)).offset(0.5)
     assert reach(other, 0) == pytest.approx(2.5, abs=1e-5)
     # Neither of two maps makes all lengths grow alike, though both together do.
-    both = ball.scaled((1, 1, 2)).scaled((2, 2, 1)).grown(0.5)
+    both = ball.scaled((1, 1, 2)).scaled((2, 2, 1)).offset(0.5)
     assert reach(both, 0) == pytest.approx(3.0, abs=1e-5)
     for solid, value in ((stretched, 0.5), (other, 0.5), (both, 0.5)):
         _, high = solid.extent((0.0,)).bounds()  # type: ignore[union-attr]
         assert high[0] >= reach(solid, 0) - 1e-5
         assert high[2] >= reach(solid, 2) - 1e-5
         assert solid.value([[0.0, 0.0, 0.0]])[0] < -value
-    assert reach(ball.grown(0.5).scaled(2), 0) == pytest.approx(3.0, abs=1e-5)
+    assert reach(ball.offset(0.5).scaled(2), 0) == pytest.approx(3.0, abs=1e-5)
 
 
 def test_second_derivatives_of_walls() -> None:
     """They raised a TypeError, of an option that was right."""
     walls = hk.solid(hk.Gyroid(0.5), between=(-0.4, 0.4))
     x, h = np.array([[0.11, 0.07, -0.03], [-0.2, 0.1, 0.05]]), 1e-4
-    for solid in (walls, walls.moved((0.1, 0.2, 0.3)), walls & hk.Sphere(2)):
+    for solid in (walls, walls.translated((0.1, 0.2, 0.3)), walls & hk.Sphere(2)):
         exact = solid.hessian(x, precision="double")
         for k in range(3):
             step = h * np.eye(3)[k]
@@ -379,8 +386,8 @@ def test_numbers_of_numpy_are_numbers() -> None:
     tapered = hk.Sphere(1).tapered((np.float64(0), np.int64(1)), (np.int64(2), np.float32(0.5)))
     assert tapered.value(x) == hk.Sphere(1).tapered((0, 1), (2, 0.5)).value(x)
     ball = hk.Sphere(1)
-    blend = ball.blended(ball.moved((1, 0, 0)), np.float32(0.5), power=np.int64(2))
-    assert blend.value(x) == ball.blended(ball.moved((1, 0, 0)), 0.5).value(x)
+    blend = ball.blended(ball.translated((1, 0, 0)), np.float32(0.5), power=np.int64(2))
+    assert blend.value(x) == ball.blended(ball.translated((1, 0, 0)), 0.5).value(x)
     noise = hk.FractalNoise(octaves=np.int64(2), seed=np.int32(1))  # type: ignore[arg-type]
     assert noise.value(x) == hk.FractalNoise(octaves=2, seed=1).value(x)
     assert hk.Julia(iterations=np.int64(5)).iterations == 5  # type: ignore[arg-type]
@@ -404,4 +411,4 @@ def test_a_ray_through_a_crease_is_a_hit_where_its_gradients_say_how_near_the_su
     d /= np.linalg.norm(d, axis=1)[:, None]
     o = foot + 3e-6 * rng.normal(size=(5000, 3)) - 2.148 * d
     found = hk.trace(carved, o, d, tolerance=2e-4)
-    assert found.hit.all()
+    assert found.is_hit.all()

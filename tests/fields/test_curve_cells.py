@@ -14,23 +14,23 @@ import pytest
 
 import harnack as hk
 from harnack.backend import Precision, choose_backend, to_numpy, to_vector3
-from harnack.backend.record_table import Records
+from harnack.backend.record_table import RecordTable
 from harnack.fields.solid_angles import curve_cell_builder
 from harnack.fields.solid_angles.edge_expansion import (
-    _OF_TERMS,  # pyright: ignore[reportPrivateUsage]
+    _TERM_ROUNDING,  # pyright: ignore[reportPrivateUsage]
     COEFFICIENTS,
     DEGREE,
-    FarEdges,
-    _turned,  # pyright: ignore[reportPrivateUsage]
+    EdgeExpansions,
+    _rotated_coefficients,  # pyright: ignore[reportPrivateUsage]
 )
-from harnack.fields.solid_angles.edge_runs import Edges, Runs, VertexTable, left_over
+from harnack.fields.solid_angles.edge_runs import CellEdges, EdgeRuns, VertexTable, subtract_runs
 from harnack.fields.solid_angles.local_expansion import (
-    _Sizes,  # pyright: ignore[reportPrivateUsage]
-    irregular,
-    parts,
+    _AbsoluteValues,  # pyright: ignore[reportPrivateUsage]
+    coefficient_keys,
+    evaluate_expansion,
+    irregular_harmonics,
+    local_to_local_matrices,
     rounding_tables,
-    shift_matrices,
-    value_and_gradient,
 )
 from harnack.geometry import example_curves
 from tests.oracles.direct_sums import winding_sum
@@ -97,11 +97,11 @@ def wrapped(difference: np.ndarray) -> np.ndarray:
     return difference - PERIOD * np.round(difference / PERIOD)
 
 
-def expanded(points: np.ndarray, start: list[int], end: list[int], radius: float) -> FarEdges:
+def expanded(points: np.ndarray, start: list[int], end: list[int], radius: float) -> EdgeExpansions:
     backend = choose_backend("double")
-    rows = Records.upload(backend, np.column_stack([points, np.zeros((len(points), 5))]))
-    edges = Edges(np.array(start), np.array(end), np.zeros(len(start), np.int64))
-    return FarEdges.of(rows, edges, backend.Array3f(0.0), dr.opaque(backend.Float, radius), 1)
+    rows = RecordTable.upload(backend, np.column_stack([points, np.zeros((len(points), 5))]))
+    edges = CellEdges(np.array(start), np.array(end), np.zeros(len(start), np.int64))
+    return EdgeExpansions.of(rows, edges, backend.Array3f(0.0), dr.opaque(backend.Float, radius), 1)
 
 
 @pytest.mark.parametrize("q", [0.1, 1 / 3, 0.5])
@@ -112,11 +112,11 @@ def test_far_loops_are_polynomials(q: float) -> None:
         loop = unit(np.cumsum(rng.normal(size=(n, 3)), axis=0) + 4 * rng.normal(size=3))
         backend = choose_backend("double")
         curve = hk.SolidAngle(loop).prepare(backend)
-        nearest = curve.closest_on_boundary(backend.Array3f(0.0))
+        nearest = curve.closest_boundary_point(backend.Array3f(0.0))
         radius = q * float(to_numpy(dr.norm(nearest))[0])
         found = expanded(loop, [*range(n)], [*range(1, n), 0], radius)
         u = unit(rng.normal(size=(500, 3)))
-        f, *g = value_and_gradient(found.coefficients[0], [*u.T], DEGREE)
+        f, *g = evaluate_expansion(found.coefficients[0], [*u.T], DEGREE)
         off = np.abs(wrapped(f - angle_of(loop)(radius * u)))
         true = hk.SolidAngle(loop).gradient(radius * u, precision="double")
         steep = np.linalg.norm(np.stack(g, axis=1) / radius - true, axis=1)
@@ -125,7 +125,7 @@ def test_far_loops_are_polynomials(q: float) -> None:
 
 
 def of_one_edge(a: np.ndarray, e: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """g of `far_edges` at points u, for a short edge."""
+    """g of `edge_expansion` at points u, for a short edge."""
     s, w = np.polynomial.legendre.leggauss(40)
     s, w = 0.5 * (s + 1), 0.5 * w
     d = a + 0.5 * e
@@ -141,41 +141,46 @@ def test_the_tail_is_attained(q: float) -> None:
     angle, turn = np.meshgrid(np.linspace(0, np.pi, 200), np.linspace(0, np.pi, 41))
     u = np.stack([np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), np.cos(angle)], -1)
     u = u.reshape(-1, 3)
-    f, *_ = value_and_gradient([0.0, *found.coefficients[0, 1:]], [*u.T], DEGREE)
+    f, *_ = evaluate_expansion([0.0, *found.coefficients[0, 1:]], [*u.T], DEGREE)
     used = np.abs(f - of_one_edge(a, e, q * u)).max() / (found.error[0] - 2.0**-36)
     assert 0.5 < used <= 1
 
 
 def test_rounding_of_polynomials_is_below_what_is_counted() -> None:
-    """`_Piece.sums`: the sums of absolute values, all coordinates as large as can be."""
-    one, q = _Sizes(np.array(1.0)), 0.5
+    """`_EdgePiece.sums`: the sums of absolute values, all coordinates as large as can be."""
+    one, q = _AbsoluteValues(np.array(1.0)), 0.5
 
     class Ones:
         x = y = z = one
 
-    phi = {key: list(pair) for key, pair in irregular(one, one, one, one, DEGREE).items()}
-    phi = {key: [part if isinstance(part, _Sizes) else _Sizes(np.array(part)) for part in pair]
-           for key, pair in phi.items()}  # fmt: skip
-    sizes = [float(part.number) for part in _turned(phi, Ones(), q)]  # pyright: ignore[reportArgumentType]
+    phi = {key: list(pair) for key, pair in irregular_harmonics(one, one, one, one, DEGREE).items()}
+    phi = {
+        key: [
+            part if isinstance(part, _AbsoluteValues) else _AbsoluteValues(np.array(part))
+            for part in pair
+        ]
+        for key, pair in phi.items()
+    }
+    sizes = [float(part.number) for part in _rotated_coefficients(phi, Ones(), q)]  # pyright: ignore[reportArgumentType]
     roundings = 0.51 * (9 * DEGREE + 2 * COEFFICIENTS)
     harmonics = rounding_tables(DEGREE, 1.0) / roundings
     assert (np.array(sizes) @ harmonics[1:]).max() < 2**14
-    assert _OF_TERMS >= 2.0**-53 * 2**9 * 2**14
+    assert _TERM_ROUNDING >= 2.0**-53 * 2**9 * 2**14
 
 
 def test_polynomials_move_with_cells() -> None:
     rng = np.random.default_rng(2)
-    given = FarEdges(rng.normal(size=(1, COEFFICIENTS)), np.ones(1), np.ones(1))
-    shifts = shift_matrices(DEGREE, 0.28)
-    found = given.of_children(np.array([True]), shifts, 1.0)
+    given = EdgeExpansions(rng.normal(size=(1, COEFFICIENTS)), np.ones(1), np.ones(1))
+    shifts = local_to_local_matrices(DEGREE, 0.28)
+    found = given.to_octants(np.array([True]), shifts, 1.0)
     u = 0.3 * rng.normal(size=3)
-    before = value_and_gradient(given.coefficients[0], u, DEGREE)[0]
+    before = evaluate_expansion(given.coefficients[0], u, DEGREE)[0]
     for k, corner in enumerate(itertools.product((-0.28, 0.28), repeat=3)):
-        after = value_and_gradient(found.coefficients[k], 2 * (u - corner), DEGREE)[0]
+        after = evaluate_expansion(found.coefficients[k], 2 * (u - corner), DEGREE)[0]
         assert abs(after - before) < 1e-12
     assert (found.error >= 1).all()
     assert (found.error < 1 + 1e-10).all()
-    assert len(parts(DEGREE)) == COEFFICIENTS
+    assert len(coefficient_keys(DEGREE)) == COEFFICIENTS
 
 
 @pytest.mark.parametrize("name", CURVES)
@@ -185,16 +190,16 @@ def test_what_is_left_over_is_a_cycle_far_away(name: str) -> None:
     rng = np.random.default_rng(3)
     loops = [loop - loop.mean() for loop in loops_of(CURVES[name])]
     table = VertexTable.of(tuple(loops))
-    before = Runs.of_loops(table)
+    before = EdgeRuns.of_loops(table)
     centers = np.array([np.concatenate(loops)[rng.integers(3)] + 0.1 * rng.normal(size=3)])
     for radius in (0.5, 0.25, 0.1, 0.03):
         run, place = before.edges()
         p, q = table.points[place], table.points[place + 1]
         distance = to_segments(centers[0], p, q)
-        after, kept = before.narrowed(run, distance <= radius)
-        after = after.closed(table, centers, np.array([radius]), np.dtype(np.float64))
+        after, kept = before.restrict_to_near(run, distance <= radius)
+        after = after.with_apexes(table, centers, np.array([radius]), np.dtype(np.float64))
         assert kept[distance <= radius].all()
-        left = left_over(before, (run, place), kept, after, len(table.points))
+        left = subtract_runs(before, (run, place), kept, after, len(table.points))
         points = np.concatenate([table.points, before.apex, after.apex])
         degree: dict[bytes, int] = {}
         for at, sign in ((left.start, 1), (left.end, -1)):
@@ -230,7 +235,13 @@ def places(curve: Any, n: int, seed: int) -> np.ndarray:
 def sampled(field: hk.SolidAngle, x: np.ndarray, precision: Precision) -> Any:
     backend = choose_backend(precision)
     sample = field.prepare(backend).evaluate(to_vector3(backend, x))
-    numbers = sample.value, sample.gradient, sample.error, sample.gradient_error, sample.truncation
+    numbers = (
+        sample.value,
+        sample.gradient,
+        sample.value_error,
+        sample.gradient_error,
+        sample.truncation_error,
+    )
     numbers = tuple(backend.Float(one) if isinstance(one, float) else one for one in numbers)
     dr.eval(*numbers)
     return tuple(to_numpy(one).astype(np.float64) for one in numbers)
@@ -247,7 +258,7 @@ def test_errors_are_bounded(name: str, precision: Precision) -> None:
     gradient = hk.SolidAngle(curve).gradient(x, precision="double")
     steep = np.linalg.norm(gradient, axis=1)
     # The bounds leave out the rounding of the point itself.
-    point = 8 * choose_backend(precision).epsilon * (1 + np.abs(x).max(axis=1))
+    point = 8 * choose_backend(precision).machine_epsilon * (1 + np.abs(x).max(axis=1))
     off = np.abs(wrapped(found - angle_of(curve)(x))) - point * steep
     assert (off <= error + 1e-9).all()
     off = np.linalg.norm(slope - gradient, axis=1)
@@ -294,11 +305,11 @@ def test_promises_hold(name: str) -> None:
     field = hk.SolidAngle(curve, cells=True).prepare(backend)
     p, v = to_vector3(backend, x), to_vector3(backend, d)
     sample = field._sample(p, v)
-    known = [(one.radius, one.constant) for one in (*sample.known, *sample.along)]
+    known = [(one.radius, one.constant) for one in (*sample.promises, *sample.ray_promises)]
     dr.eval(sample.value, sample.gradient, known)
     value, gradient = to_numpy(sample.value), to_numpy(sample.gradient)
     exact = hk.SolidAngle(curve)
-    bends, found = len(sample.known), 0
+    bends, found = len(sample.promises), 0
     for k, (radius, constant) in enumerate(known):
         radius = np.minimum(to_numpy(radius + 0 * p.x), 1e3)
         constant = to_numpy(constant + 0 * p.x)
@@ -342,12 +353,12 @@ def compare(curve: Any, o: np.ndarray, d: np.ndarray, **settings: Any) -> None:
     """Rays with cells end as those without, but for grazes within the tolerance."""
     hits = hk.trace(hk.SolidAngle(curve, cells=True), o, d, **settings)
     plain = hk.trace(hk.SolidAngle(curve, cells=False), o, d, **settings)
-    assert not (hits.status == hk.Status.OUT_OF_STEPS).any()
-    assert (plain.hit != hits.hit).mean() < 2e-3
+    assert not (hits.status == hk.RayStatus.OUT_OF_STEPS).any()
+    assert (plain.is_hit != hits.is_hit).mean() < 2e-3
     value, exact = angle_of(curve), hk.SolidAngle(curve)
     near = 1.3e-4 + 1e-6 * np.abs(o).max()
     for one, other in ((plain, hits), (hits, plain)):
-        early = np.flatnonzero(one.hit & ~(other.t < one.t + 10 * near))
+        early = np.flatnonzero(one.is_hit & ~(other.t < one.t + 10 * near))
         assert len(early) < 0.02 * len(o)
         if len(early):
             x = o[early] + one.t[early, None] * d[early]
@@ -412,8 +423,8 @@ def test_levels_and_tolerances_that_cells_do_not_reach() -> None:
     for settings in ({"level": 1.0}, {"tolerance": 1e-6}):
         plain = hk.trace(hk.SolidAngle(CURVES["trefoil"]), o, d, **settings)
         hits = hk.trace(hk.SolidAngle(CURVES["trefoil"], cells=True), o, d, **settings)
-        both = plain.hit & hits.hit
-        assert (plain.hit != hits.hit).mean() < 2e-3
+        both = plain.is_hit & hits.is_hit
+        assert (plain.is_hit != hits.is_hit).mean() < 2e-3
         assert np.quantile(np.abs(plain.t[both] - hits.t[both]), 0.9) < 2e-4
 
 
@@ -433,18 +444,18 @@ def test_values_and_derivatives_are_those_of_all_edges() -> None:
     dr.forward(level)
     found = to_numpy(dr.grad(t))
     hits = hk.trace(plain, o, d, level=2.0, precision="double", tolerance=1e-8)
-    x = o[hits.hit] + hits.t[hits.hit, None] * d[hits.hit]
-    slope = (plain.gradient(x, precision="double") * d[hits.hit]).sum(axis=1)
+    x = o[hits.is_hit] + hits.t[hits.is_hit, None] * d[hits.is_hit]
+    slope = (plain.gradient(x, precision="double") * d[hits.is_hit]).sum(axis=1)
     steady = np.abs(slope) > 0.5
-    np.testing.assert_allclose(found[hits.hit][steady] * slope[steady], 1.0, atol=0.01)
+    np.testing.assert_allclose(found[hits.is_hit][steady] * slope[steady], 1.0, atol=0.01)
 
 
 def test_circles_beside_cells() -> None:
     loops = [wavy(64), hk.Circle(0.4, normal=(0, 0, -1))]
     o, d = rays(wavy(64), 2000)
     plain, hits = (hk.trace(hk.SolidAngle(loops, cells=some), o, d) for some in (False, True))
-    assert (plain.hit != hits.hit).mean() < 2e-3
-    both = plain.hit & hits.hit
+    assert (plain.is_hit != hits.is_hit).mean() < 2e-3
+    both = plain.is_hit & hits.is_hit
     assert np.quantile(np.abs(plain.t[both] - hits.t[both]), 0.98) < 1e-3
 
 
@@ -476,20 +487,20 @@ def test_many_rays_get_cells_by_themselves() -> None:
     assert hk.SolidAngle(wavy(100)).describe()["cells"] == "from 2,500,000 rays on"
     curve = wavy(1000)
     field = hk.SolidAngle(curve)
-    assert field.for_rays(999_999) is field
-    with_cells = field.for_rays(1_000_000)
+    assert field.for_ray_count(999_999) is field
+    with_cells = field.for_ray_count(1_000_000)
     assert with_cells.cells is True
-    assert field.for_rays(10**8) is with_cells
+    assert field.for_ray_count(10**8) is with_cells
     assert field.cells is None
     vector = choose_backend("single").Array3f
     for one in (
         hk.SolidAngle(wavy(47)),
         hk.SolidAngle(curve, cells=False),
-        hk.SolidAngle(curve, certificate="paper"),
+        hk.SolidAngle(curve, lift_bound="paper"),
         hk.SolidAngle(vector(*curve.T)),
         hk.SolidAngle(hk.Circle(1.0, (0, 0, 0), (0, 0, 1))),
     ):
-        assert one.for_rays(10**9) is one
+        assert one.for_ray_count(10**9) is one
     x = places(curve, 500, 6)
     found, _, error, *_ = sampled(with_cells, x, "double")
     assert (np.abs(wrapped(found - angle_of(curve)(x))) <= error + 1e-9).all()
@@ -505,7 +516,7 @@ def test_loops_of_a_field_cannot_be_replaced() -> None:
         field.loops[0][:] *= 2
     given *= 2  # the caller's own
     assert field.loops[0].max() < 1.01
-    assert field.for_rays(10**8).loops is field.loops
+    assert field.for_ray_count(10**8).loops is field.loops
 
 
 @pytest.mark.parametrize("cells", [-1.0, math.inf, math.nan, "yes", [1]])
@@ -523,7 +534,7 @@ def test_vertices_that_may_move_have_no_cells() -> None:
 def test_errors_are_attained_in_cells(monkeypatch: pytest.MonkeyPatch) -> None:
     """An eighth of the error would be too little in some cell: all its edges add up in size, and
     what they leave out only in part."""
-    monkeypatch.setattr(curve_cell_builder, "_FINE", 1e-3)
+    monkeypatch.setattr(curve_cell_builder, "_MAX_TAIL_RATIO", 1e-3)
     curve = wavy(200)
     field = hk.SolidAngle(curve, cells=True)
     _, table = table_of(field, "double")

@@ -9,7 +9,7 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.enclosures import Curvature
+from harnack.enclosures import TaylorRemainder
 from harnack.fields.solid_angles.edges import LoopEdges, sum_over_edges
 from harnack.geometry import example_curves
 from tests.oracles.oracle import CurveOracle
@@ -101,8 +101,8 @@ def remainders(field: hk.SolidAngle, x: np.ndarray, d: np.ndarray) -> list[np.nd
     sample = field.prepare(backend).evaluate(p)
     value, slope = to_numpy(sample.value), (to_numpy(sample.gradient) * d).sum(axis=1)
     out: list[np.ndarray] = []
-    for one in sample.known:
-        assert isinstance(one, Curvature)
+    for one in sample.promises:
+        assert isinstance(one, TaylorRemainder)
         radius, constant = to_numpy(one.radius), to_numpy(one.constant)
         shares = []
         for part in np.linspace(0.08, 0.9999, 24):
@@ -120,7 +120,7 @@ def test_taylor_s_remainder(name: str) -> None:
     field, rng = FIELDS[name], np.random.default_rng(1)
     loops = list(field.loops) or CURVES["square"]
     x = np.concatenate([places(loops, 250), rng.normal(size=(500, 3))])
-    nearest = to_numpy(field.closest_on_boundary(to_vector3(choose_backend("double"), x))) - x
+    nearest = to_numpy(field.closest_boundary_point(to_vector3(choose_backend("double"), x))) - x
     distance = np.linalg.norm(nearest, axis=1)
     x, nearest = x[distance > 1e-3], nearest[distance > 1e-3]
     d = rng.normal(size=x.shape)
@@ -142,8 +142,8 @@ def test_the_remainder_is_attained_on_the_axis_of_a_circle() -> None:
     x, d = np.array([[0.0, 0.0, 1.0]]), np.array([[0.0, 0.0, -1.0]])
     backend = choose_backend("double")
     sample = FIELDS["circle"].prepare(backend).evaluate(to_vector3(backend, x))
-    narrowest = sample.known[0]
-    assert isinstance(narrowest, Curvature)
+    narrowest = sample.promises[0]
+    assert isinstance(narrowest, TaylorRemainder)
     field = FIELDS["circle"]
     # The constant is 3/2 (I3 + r I4/(1 - q)); of that, 3/2 I3 is attained as t tends to 0.
     circle = 3 / 2 * 2 * math.pi / 2**1.5

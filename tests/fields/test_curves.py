@@ -11,7 +11,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from harnack.geometry import example_curves
-from harnack.geometry.convex_position import MAX_VERTICES, segment_clearance_lower
+from harnack.geometry.convex_position import MAX_EXAMINED_VERTICES, segment_distance_lower_bound
 from harnack.geometry.curves import (
     CurveError,
     CurveScaleError,
@@ -21,7 +21,7 @@ from harnack.geometry.curves import (
     TooFewVerticesError,
     TooManyVerticesError,
     bounding_box,
-    edges,
+    edge_endpoints,
     is_convex_position,
     total_length,
     validate_loops,
@@ -107,7 +107,7 @@ def test_each_bad_curve_has_its_own_error(loops, error, message):
 
 def test_measures_of_a_curve():
     loops = validate_loops([TRIANGLE, example_curves.regular_polygon(4)])
-    start, end = edges(loops)
+    start, end = edge_endpoints(loops)
     assert start.shape == end.shape == (7, 3)
     assert end[2].tolist() == TRIANGLE[0]
     np.testing.assert_allclose(end[6], start[3])
@@ -189,7 +189,7 @@ def spike() -> np.ndarray:
         example_curves.torus_knot(2, 3, 60),
         example_curves.figure_eight_knot(80),
         example_curves.coil(3, 60),
-        example_curves.coil(5, 100, route="axis"),
+        example_curves.coil(5, 100, return_path="axis"),
         example_curves.hopf_link(12),
         [
             example_curves.regular_polygon(5),
@@ -200,7 +200,7 @@ def spike() -> np.ndarray:
         flat_figure_eight(),
         dented(example_curves.wavy_polygon(64)),
         spike(),
-        example_curves.wavy_polygon(MAX_VERTICES + 1),  # not examined
+        example_curves.wavy_polygon(MAX_EXAMINED_VERTICES + 1),  # not examined
     ],
 )
 def test_no_other_curve_is_claimed_to_be_in_convex_position(curve):
@@ -239,9 +239,9 @@ def test_an_edge_too_short_for_a_direction_proves_nothing(length: float) -> None
 def test_segments_of_length_zero_have_a_clearance() -> None:
     point, other = np.zeros((1, 3)), np.array([[3.0, 4.0, 0.0]])
     with np.errstate(all="raise"):
-        assert segment_clearance_lower(point, point, other, other) == pytest.approx(5.0)
-        assert segment_clearance_lower(point, other, other, other) == 0.0
-        assert segment_clearance_lower(other, other, point, -other) == pytest.approx(5.0)
+        assert segment_distance_lower_bound(point, point, other, other) == pytest.approx(5.0)
+        assert segment_distance_lower_bound(point, other, other, other) == 0.0
+        assert segment_distance_lower_bound(other, other, point, -other) == pytest.approx(5.0)
 
 
 def edge_depth(x: np.ndarray) -> np.ndarray:
@@ -292,7 +292,7 @@ def test_the_clearance_of_segments_is_a_lower_bound_and_sharp(seed, flatten):
     p1, q1, p2, q2 = rng.normal(size=(4, 200, 3)) * [1, 1, flatten]
     parallel = rng.random(200) < 0.2
     q2[parallel] = p2[parallel] + (q1 - p1)[parallel] * rng.normal(size=(parallel.sum(), 1))
-    lower = segment_clearance_lower(p1, q1, p2, q2)
+    lower = segment_distance_lower_bound(p1, q1, p2, q2)
     s = np.linspace(0, 1, 201)
     a = p1[:, None] + s[:, None] * (q1 - p1)[:, None]
     b = p2[:, None] + s[:, None] * (q2 - p2)[:, None]
@@ -327,13 +327,13 @@ def test_the_links_are_linked_as_they_should_be():
 
 def test_a_coil_has_its_turns_and_closes():
     for route in ("outside", "axis"):
-        (loop,) = validate_loops(example_curves.coil(5, 200, route=route))
+        (loop,) = validate_loops(example_curves.coil(5, 200, return_path=route))
         assert len(loop) == 200
         x, y, z = loop[:198].T
         turned = np.unwrap(np.arctan2(y, x))
         assert turned[-1] - turned[0] == pytest.approx(10.0 * np.pi)
         assert np.ptp(z) == pytest.approx(1.0)
-        clearance = edge_distances(example_curves.coil(3, 40, route=route))
+        clearance = edge_distances(example_curves.coil(3, 40, return_path=route))
         assert clearance.min() > 0.1
 
 
@@ -380,7 +380,7 @@ def test_random_shapes_repeat_with_their_generator():
         (lambda: example_curves.torus_knot(2, 4, 30), "no common divisor"),
         (lambda: example_curves.coil(0, 30), "at least one turn"),
         (lambda: example_curves.coil(5, 10), "at least 18 vertices"),
-        (lambda: example_curves.coil(2, 30, route="inside"), '"outside" or "axis"'),
+        (lambda: example_curves.coil(2, 30, return_path="inside"), '"outside" or "axis"'),
         (
             lambda: example_curves.random_closed_curve(np.random.default_rng(0), 9, harmonics=0),
             "at least one harmonic",

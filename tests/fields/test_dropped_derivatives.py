@@ -70,10 +70,11 @@ def makers() -> Iterator[tuple[str, Callable[..., Any]]]:
             if isinstance(own, classmethod) and not name.startswith("_"):
                 yield f"{kind.__name__}.{name}", getattr(kind, name)
     for field in (hk.DipolePotential(POINTS, POINTS), hk.WindingNumber(POINTS[:3], [[0, 1, 2]])):
-        yield f"{type(field).__name__}.moved", field.moved
+        move = getattr(field, "with_points", None) or field.with_vertices
+        yield f"{type(field).__name__}.{move.__name__}", move
     for name, own in vars(hk.Solid).items():
         is_maker = inspect.isfunction(own) and own.__annotations__.get("return") == "Solid"
-        if is_maker and not name.startswith("_") and name not in ("prepare", "leaves"):
+        if is_maker and not name.startswith("_") and name not in ("prepare", "map_operands"):
             yield f"Solid.{name}", getattr(hk.Sphere(1.0), name)
 
 
@@ -83,7 +84,7 @@ MAKERS = dict(makers())
 @pytest.mark.parametrize("name", MAKERS)
 def test_makers_refuse_each_argument_that_carries_derivatives(name: str) -> None:
     names = arguments(MAKERS[name])
-    assert names or name in ("Sextic", "Cubic")
+    assert names or name in ("SexticKernel", "CubicKernel")
     for argument in names:
         for mark in MARKS:
             with pytest.raises(NotImplementedError, match=REFUSED):
@@ -93,8 +94,10 @@ def test_makers_refuse_each_argument_that_carries_derivatives(name: str) -> None
 
 
 def test_the_list_of_makers_has_what_is_known() -> None:
-    known = {"Blobs", "Sphere", "Ball", "Tube.bezier", "FourierSeries.fit", "Solid.moved", "Morph"}
-    assert known | {"Solid.twisted", "Solid.grown", "WindingNumber"} <= set(MAKERS)
+    known = {"Blobs", "Sphere", "Ball", "Tube.bezier", "FourierSeries.fit", "Morph"}
+    assert known | {"Solid.translated", "Solid.twisted", "Solid.offset", "WindingNumber"} <= set(
+        MAKERS
+    )
 
 
 # Functions of fields, rays and numbers: an argument for each name that they have.
@@ -116,8 +119,8 @@ WITH_DERIVATIVES = {
 # Functions of any numbers, of solids, and of scenes and files, whose results carry nothing.
 OTHERS = {
     "atan2", "maximum", "minimum", "norm", "union", "intersection", "animate", "render", "page",
-    "check_print", "mesh", "read_scene", "repair", "thickness", "view", "wrap_for_jax",
-    "wrap_for_torch", "write_scene",
+    "check_print", "mesh", "read_scene", "repair", "view", "wall_thickness",
+    "wrap_for_jax", "wrap_for_torch", "write_scene",
 }  # fmt: skip
 FUNCTIONS = {
     name: getattr(hk, name)
@@ -167,18 +170,21 @@ PARTS: dict[str, tuple[dict[str, Any], Callable[[Any], Any]]] = {
         {"amplitude": 1.0, "wave_vector": (1.0, 2.0, 3.0)},
         lambda one: hk.EigenfunctionSum([one]),
     ),
-    "Product": ({"amplitude": 1.0, "x": hk.sine(2.0)}, lambda one: hk.EigenfunctionSum([one])),
-    "BranchPoint": ({"at": 0j}, lambda one: hk.RiemannSurface("sqrt", singular=[one])),
+    "WaveProduct": (
+        {"amplitude": 1.0, "x": hk.sine_factor(2.0)},
+        lambda one: hk.EigenfunctionSum([one]),
+    ),
+    "BranchPoint": ({"location": 0j}, lambda one: hk.RiemannSurface("sqrt", singular_points=[one])),
     "Circle": ({"radius": 1.0}, lambda one: hk.SolidAngle([one])),
     **{
         name: ({}, lambda one: hk.Blobs(POINTS, 0.5, kernel=one))
-        for name in ("Compact", "Cubic", "Gaussian", "Sextic")
+        for name in ("CompactKernel", "CubicKernel", "GaussianKernel", "SexticKernel")
     },
 }
 # Records of settings, results and pictures, and proofs.
-NO_PARTS = {"AllHits", "Camera", "Curvatures", "DistanceBounds", "Hits", "Isolines", "LevelSet",
-            "PrintCheck", "PrintProblem", "Sample", "SavedScene", "Slider", "Thickness",
-            "Tolerance", "View"}  # fmt: skip
+NO_PARTS = {"RayCrossings", "Camera", "CurvatureSamples", "DistanceBounds", "Hits", "Isolines",
+            "Surface", "PrintCheck", "PrintProblem", "Sample", "SceneFile", "Slider",
+            "WallThickness", "HitTolerance", "LiveView"}  # fmt: skip
 
 
 def test_the_list_of_records_is_whole() -> None:

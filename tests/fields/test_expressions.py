@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import harnack as hk
-from harnack.testing import BrokenPromiseError, check_field, check_looks
-from harnack.testing.violation_search import scaled
+from harnack.testing import BrokenPromiseError, check_field, check_ray_samples
+from harnack.testing.violation_search import mutated_enclosure
 
 POINTS = np.random.default_rng(2).uniform(-0.9, 0.9, (200, 3))
 
@@ -170,7 +170,7 @@ def test_what_is_returned_must_be_a_number() -> None:
     with pytest.raises(TypeError, match="returned an object of type str"):
         hk.expression(lambda x, y, z: "nothing")
     constant = hk.expression(lambda x, y, z: 1.0)
-    assert hk.trace(constant, [[0, 0, 3]], [[0, 0, -1]], t_max=5.0).status == hk.Status.MISS
+    assert hk.trace(constant, [[0, 0, 3]], [[0, 0, -1]], t_max=5.0).status == hk.RayStatus.MISS
 
 
 def test_where_a_formula_is_not_defined_there_is_no_surface() -> None:
@@ -179,11 +179,11 @@ def test_where_a_formula_is_not_defined_there_is_no_surface() -> None:
     field = hk.expression(lambda x, y, z: hk.log(x) - y)
     hits = hk.trace(field, [[-1, 0, 3], [1.0, 3.0, 0]], [[0, 0, -1], [0, -1, 0]], t_max=5.0,
                     max_steps=60)  # fmt: skip
-    assert hits.status.tolist() == [hk.Status.MISS, hk.Status.HIT]
+    assert hits.status.tolist() == [hk.RayStatus.MISS, hk.RayStatus.HIT]
     assert hits.t[1] == pytest.approx(3.0, abs=1e-3)
     larger = hk.expression(lambda x, y, z: hk.maximum(hk.log(x) - y, z))
     ray = hk.trace(larger, [[-1, 0, 3]], [[0, 0, -1]], t_max=5.0, max_steps=60)
-    assert ray.status.tolist() == [hk.Status.OUT_OF_STEPS]
+    assert ray.status.tolist() == [hk.RayStatus.OUT_OF_STEPS]
 
 
 @pytest.mark.slow
@@ -199,20 +199,20 @@ def test_a_false_claim_of_convexity_is_found() -> None:
     check_field(hk.expression(lambda x, y, z: x * x + 2 * y * y + z * z - 1, is_convex=True))
     saddle = hk.expression(lambda x, y, z: x * x - y * y + z, is_convex=True)
     with pytest.raises(BrokenPromiseError, match="an enclosure looking ahead is left"):
-        check_looks(saddle, POINTS)
+        check_ray_samples(saddle, POINTS)
 
 
 def test_steps_of_a_parabola_are_the_longest_there_are() -> None:
     """x^2 has a constant second derivative: the proof is attained, and 1.001 times it is wrong."""
     field = hk.expression(lambda x, y, z: x * x + 0 * y)
-    check_looks(field, POINTS, rng=4)
+    check_ray_samples(field, POINTS, rng=4)
     for factor in (1.001, 1.01):
         with pytest.raises(BrokenPromiseError):
-            check_looks(field, POINTS, rng=4, bound=scaled_pieces(factor))
+            check_ray_samples(field, POINTS, rng=4, bound=scaled_pieces(factor))
 
 
 def scaled_pieces(factor: float) -> Any:
-    return scaled(hk.Pieces, factor)
+    return mutated_enclosure(hk.PiecewiseTaylorEnclosure, factor)
 
 
 def test_a_twisted_ellipsoid_takes_less_than_six_looks() -> None:
@@ -230,9 +230,9 @@ def test_a_twisted_ellipsoid_takes_less_than_six_looks() -> None:
     o = rng.normal(size=(4000, 3))
     o *= 5 / np.linalg.norm(o, axis=1, keepdims=True)
     hits = hk.trace(field, o, rng.uniform(-1, 1, (4000, 3)) * box - o,
-                    tolerance=hk.Tolerance(value=1e-3, distance=1e-12))  # fmt: skip
+                    tolerance=hk.HitTolerance(value=1e-3, distance=1e-12))  # fmt: skip
     assert hits.evaluations.mean() < 6
-    assert (hits.status != hk.Status.OUT_OF_STEPS).all()
+    assert (hits.status != hk.RayStatus.OUT_OF_STEPS).all()
 
 
 def test_a_formula_that_compiles_for_long_says_so_before() -> None:
@@ -270,7 +270,10 @@ def test_scalars_of_numpy_are_numbers_in_samples_and_promises() -> None:
         domain = hk.Ball()
 
         def evaluate(self, p: Any) -> hk.Sample:
-            known = (hk.Lipschitz(np.float64(1.001)), hk.Curvature(np.float64(0.0), np.float32(9)))
+            known = (
+                hk.Lipschitz(np.float64(1.001)),
+                hk.TaylorRemainder(np.float64(0.0), np.float32(9)),
+            )
             return hk.Sample(p.z, type(p)(0, 0, 1), known, np.float64(1e-6))
 
     assert hk.trace(Height(), [[0, 0, 0.5]], [[0, 0, -1]]).t[0] == pytest.approx(0.5, abs=2e-4)

@@ -10,7 +10,7 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.fields.batch_evaluation import in_batches
+from harnack.fields.batch_evaluation import map_batches
 from harnack.geometry.example_curves import wavy_polygon
 from harnack.geometry.example_meshes import icosphere
 
@@ -85,7 +85,7 @@ def test_points_in_batches_are_points_one_by_one(n: int) -> None:
 
     for points in (x, to_vector3(backend, x)):
         calls.clear()
-        product, total, three = in_batches(backend, compute, points, other, at_once=7)
+        product, total, three = map_batches(backend, compute, points, other, at_once=7)
         assert calls == {0: [1], 1: [1], 7: [7], 8: [7, 1], 20: [7, 7, 6]}[n]
         np.testing.assert_allclose(product, (x * other).sum(axis=1), rtol=1e-13, atol=1e-13)
         np.testing.assert_allclose(total, x + other)
@@ -152,7 +152,7 @@ def test_hits_carry_derivatives_backwards(name: str) -> None:
     dr.enable_grad(start)
     end = hk.trace(field, start, to_vector3(backend, target - o), tolerance=1e-11)
     t = to_numpy(dr.detach(end.t))
-    smooth = np.isfinite(t) & (to_numpy(end.sheet) < 0)
+    smooth = np.isfinite(t) & (to_numpy(end.primitive_index) < 0)
     dr.backward(dr.sum(dr.select(dr.isfinite(end.t), end.t, 0)))
     smooth &= np.isfinite(ahead.t) & np.isfinite(behind.t)
     rate = np.where(smooth, ahead.t, 0) - np.where(smooth, behind.t, 0)
@@ -168,13 +168,18 @@ def test_fields_print_as_they_were_made() -> None:
     assert repr(hk.Gyroid(0.5, domain=hk.Ball())).startswith("Gyroid(cell=0.5, domain=Ball(")
     assert repr(hk.SphericalHarmonic(3, 1)) == "SphericalHarmonic(l=3, m=1)"
     cut = hk.Sphere(1.0) - hk.Torus(0.8, 0.2)
-    assert repr(cut).startswith("Combined(parts=(Sphere(), Complement(")
+    assert repr(cut).startswith("BooleanSolid(parts=(Sphere(), Complement(")
     assert repr(hk.Tube([[0, 0, 0], [1, 0, 0]], 0.1)) == "Tube(points=<array 2 x 3>, radius=0.1)"
     many = (
-        hk.SolidAngle(wavy_polygon(64)), hk.WindingNumber(*icosphere(2)), cut.twisted(1.0),
-        hk.expression(lambda x, y, z: x + y - z), hk.LevelCurves("log", "imag"),
-        hk.Blobs([[0, 0, 0]], 1.0), hk.RiemannSurface("sqrt"), cut.moved((1, 2, 3)) | hk.Plane(),
-    )  # fmt: skip
+        hk.SolidAngle(wavy_polygon(64)),
+        hk.WindingNumber(*icosphere(2)),
+        cut.twisted(1.0),
+        hk.expression(lambda x, y, z: x + y - z),
+        hk.LevelCurves("log", "imag"),
+        hk.Blobs([[0, 0, 0]], 1.0),
+        hk.RiemannSurface("sqrt"),
+        cut.translated((1, 2, 3)) | hk.Plane(),
+    )
     for field in many:
         assert "0x" not in repr(field)
         assert len(repr(field)) < 200

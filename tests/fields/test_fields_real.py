@@ -15,7 +15,7 @@ import pytest
 from scipy.special import lpmv
 
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.enclosures import Curvature, HarmonicBall, Lipschitz
+from harnack.enclosures import HarmonicBall, Lipschitz, TaylorRemainder
 from harnack.fields import Field
 from harnack.fields.analytic.periodic import EigenfunctionSum, Gyroid, SchwarzD, SchwarzP
 from harnack.fields.analytic.polynomial import HarmonicPolynomial, SphericalHarmonic
@@ -26,7 +26,7 @@ from harnack.fields.analytic.sphere_bounds import (
     range_of_harmonic,
     unit_sphere,
 )
-from harnack.fields.analytic.waves import PlaneWave, Product, cosine, sine
+from harnack.fields.analytic.waves import PlaneWave, WaveProduct, cosine_factor, sine_factor
 from harnack.geometry import Ball, Box, HalfSpace
 
 DOUBLE = choose_backend("double")
@@ -34,14 +34,17 @@ SINGLE = choose_backend("single")
 
 # The paper's Fig. 21, a sum of plane waves with a constant, and one of unlike frequencies.
 FIGURE_21 = EigenfunctionSum(
-    [Product(1.0, sine(6), sine(6), sine(6)), Product(1.0, sine(2), sine(2), sine(2))]
+    [
+        WaveProduct(1.0, sine_factor(6), sine_factor(6), sine_factor(6)),
+        WaveProduct(1.0, sine_factor(2), sine_factor(2), sine_factor(2)),
+    ]
 )
 PLANE_WAVES = EigenfunctionSum(
     [
         PlaneWave(0.7, (1.0, -2.0, 0.5), 0.3),
         PlaneWave(-1.1, (0.0, 1.5, 2.0), 1.0),
-        Product(0.4, y=sine(3.0, 0.2)),
-        Product(0.25),
+        WaveProduct(0.4, y=sine_factor(3.0, 0.2)),
+        WaveProduct(0.25),
     ]
 )
 MIXED = HarmonicPolynomial(
@@ -198,7 +201,9 @@ def test_diamond_formula() -> None:
 
 def test_plane_waves_and_products_agree() -> None:
     p = np.random.default_rng(5).uniform(-3, 3, (200, 3))
-    product = EigenfunctionSum([Product(2.0, x=cosine(3.0, 0.4), z=sine(2.0, -0.1))])
+    product = EigenfunctionSum(
+        [WaveProduct(2.0, x=cosine_factor(3.0, 0.4), z=sine_factor(2.0, -0.1))]
+    )
     # 2 cos a sin b = sin(b + a) + sin(b - a)
     half = math.pi / 2
     waves = EigenfunctionSum(
@@ -303,7 +308,7 @@ def violation(field: Field, n_points: int, n_samples: int, seed: int = 0) -> flo
     p = points_in(field, n_points, seed)
     sample = field.evaluate(to_vector3(DOUBLE, p))
     f = to_numpy(sample.value) + np.zeros(len(p))
-    balls = [k for k in sample.promises if isinstance(k, HarmonicBall)]
+    balls = [k for k in sample.all_promises if isinstance(k, HarmonicBall)]
     assert balls
     worst = -np.inf
     for ball in balls:
@@ -341,7 +346,7 @@ def test_single_precision_promises_no_more(name: str) -> None:
     field = FIELDS[name]
     p = points_in(field, 3000).astype(np.float32).astype(float)
     exact, rounded = (
-        ends(field.evaluate(to_vector3(backend, p)).weaker[0], len(p))
+        ends(field.evaluate(to_vector3(backend, p)).alternative_promises[0], len(p))
         for backend in (DOUBLE, SINGLE)
     )
     margin = 0.45e-5 * (exact[2] - exact[1])
@@ -372,7 +377,7 @@ def test_lipschitz_constants_keep_their_promise(name: str) -> None:
     p = points_in(field, 200)
     sample = field.evaluate(to_vector3(DOUBLE, p))
     f = to_numpy(sample.value)
-    known = [k for k in sample.promises if isinstance(k, Lipschitz)]
+    known = [k for k in sample.all_promises if isinstance(k, Lipschitz)]
     assert known
     for promise in known:
         constant = to_numpy(promise.constant) + np.zeros(len(p))
@@ -389,7 +394,9 @@ def test_curvature_keeps_its_promise(name: str) -> None:
     field = FIELDS[name]
     p = points_in(field, 200)
     f, g = value(field, p), gradient(field, p)
-    known = [k for k in field.evaluate(to_vector3(DOUBLE, p)).known if isinstance(k, Curvature)]
+    known = [
+        k for k in field.evaluate(to_vector3(DOUBLE, p)).promises if isinstance(k, TaylorRemainder)
+    ]
     assert known
     u = on_unit_sphere(2000) * np.random.default_rng(1).random(2000)[:, None]
     # A global promise is tried on a few periods.
@@ -414,14 +421,14 @@ def test_proved_constants_hold_and_are_tight_for_minimal_surfaces(name: str) -> 
     low, high = field.value_range
     assert low <= f.min()
     assert f.max() <= high
-    assert g.max() <= field.steepness
+    assert g.max() <= field.max_gradient
     h = 1e-4 / max(field.waves.wavenumbers)
     v = on_unit_sphere(len(p))
     bend = np.abs(np.sum((gradient(field, p + h * v) - gradient(field, p - h * v)) * v, axis=1))
     assert bend.max() / (2 * h) <= field.curvature * (1 + 1e-6)
     if isinstance(field, Gyroid | SchwarzP | SchwarzD):
         assert f.max() >= 0.97 * high
-        assert g.max() >= 0.97 * field.steepness
+        assert g.max() >= 0.97 * field.max_gradient
         assert bend.max() / (2 * h) >= 0.93 * field.curvature
 
 
@@ -433,7 +440,9 @@ def test_minimal_surface_bounds_are_attained() -> None:
         (SchwarzD(), (q, q, q), (0.0, 0.0, 0.0)),
     ):
         assert value(field, np.array([top]))[0] == pytest.approx(field.value_range[1])
-        assert np.linalg.norm(gradient(field, np.array([steep]))) == pytest.approx(field.steepness)
+        assert np.linalg.norm(gradient(field, np.array([steep]))) == pytest.approx(
+            field.max_gradient
+        )
 
 
 # --- proved ranges --------------------------------------------------------------------------
@@ -527,7 +536,7 @@ def test_proved_range_refuses_points_too_far_apart() -> None:
 
 
 def test_levels_out_of_range_are_refused() -> None:
-    Gyroid().check_levels((0.0, 1.4))
+    Gyroid().validate_levels((0.0, 1.4))
     for field, level in (
         (Gyroid(), 1.6),
         (SchwarzD(), -1.5),
@@ -537,15 +546,15 @@ def test_levels_out_of_range_are_refused() -> None:
         (POLYNOMIALS["Eq. 8"], 0.4),
     ):
         with pytest.raises(ValueError, match=r"no surface has level .* stays within"):
-            field.check_levels((0.0, level) if level else (level,))
+            field.validate_levels((0.0, level) if level else (level,))
 
 
 def test_a_constant_moves_the_range_only() -> None:
-    plain = EigenfunctionSum([Product(1.0, sine(2), sine(2))])
-    moved = EigenfunctionSum([Product(1.0, sine(2), sine(2)), Product(5.0)])
+    plain = EigenfunctionSum([WaveProduct(1.0, sine_factor(2), sine_factor(2))])
+    moved = EigenfunctionSum([WaveProduct(1.0, sine_factor(2), sine_factor(2)), WaveProduct(5.0)])
     assert moved.value_range == pytest.approx((4.0, 6.0))
     p = points_in(plain, 50)
-    a, b = (f.evaluate(to_vector3(DOUBLE, p)).weaker[0] for f in (plain, moved))
+    a, b = (f.evaluate(to_vector3(DOUBLE, p)).alternative_promises[0] for f in (plain, moved))
     for x, y, shift in zip(ends(a, len(p)), ends(b, len(p)), (0, 5, 5), strict=True):
         np.testing.assert_allclose(x + shift, y, atol=1e-12)
 
@@ -591,15 +600,20 @@ def test_walls() -> None:
             "bounded domain",
         ),
         (lambda: EigenfunctionSum([]), "at least one term"),
-        (lambda: EigenfunctionSum([Product(2.0)]), "the sum is constant"),
+        (lambda: EigenfunctionSum([WaveProduct(2.0)]), "the sum is constant"),
         (
-            lambda: EigenfunctionSum([Product(1.0, sine(1)), Product(-1.0, sine(1))]),
+            lambda: EigenfunctionSum(
+                [WaveProduct(1.0, sine_factor(1)), WaveProduct(-1.0, sine_factor(1))]
+            ),
             "the sum is constant",
         ),
-        (lambda: EigenfunctionSum([Product(math.inf, sine(1))]), "amplitude of a product must"),
+        (
+            lambda: EigenfunctionSum([WaveProduct(math.inf, sine_factor(1))]),
+            "amplitude of a product must",
+        ),
         (lambda: EigenfunctionSum([PlaneWave(1.0, (1.0, 2.0))]), "three numbers"),  # type: ignore[arg-type]
-        (lambda: sine(0.0), "frequency 0 is a constant"),
-        (lambda: cosine(math.nan), "frequency of a factor must be finite"),
+        (lambda: sine_factor(0.0), "frequency 0 is a constant"),
+        (lambda: cosine_factor(math.nan), "frequency of a factor must be finite"),
         (lambda: Gyroid(cell=0.0), "edge length of the cell must be positive"),
         (lambda: SchwarzP(cell=math.inf), "edge length of the cell must be positive"),
         (lambda: Gyroid().wall_levels(-1.0), "half width of a wall must be positive"),
@@ -635,5 +649,5 @@ def test_domains() -> None:
 def test_promises_at_the_origin_are_finite() -> None:
     for field in (*POLYNOMIALS.values(), Gyroid()):
         sample = field.evaluate(to_vector3(SINGLE, np.zeros((1, 3))))
-        for number in (sample.value, sample.gradient, *ends(sample.weaker[0], 1)):
+        for number in (sample.value, sample.gradient, *ends(sample.alternative_promises[0], 1)):
             assert np.isfinite(to_numpy(number) if dr.is_array_v(type(number)) else number).all()

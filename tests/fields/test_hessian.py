@@ -14,17 +14,17 @@ import pytest
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.geometry import example_curves
-from harnack.geometry.polygons import uncanceled_edges
+from harnack.geometry.polygons import remaining_edges
 from harnack.testing import BrokenPromiseError, check_field
 
 MANY_TERMS = hk.EigenfunctionSum(
     [
         hk.PlaneWave(0.7, (1.0, -2.0, 0.5), 0.3),
         hk.PlaneWave(-0.4, (0.0, 3.0, 0.0)),
-        hk.Product(0.4, x=hk.cosine(2.0), y=hk.sine(3.0, 0.2)),
-        hk.Product(1.3, hk.sine(1.0), hk.cosine(2.0, -1.0), hk.sine(0.5)),
-        hk.Product(0.25, z=hk.sine(2.0)),
-        hk.Product(0.1),
+        hk.WaveProduct(0.4, x=hk.cosine_factor(2.0), y=hk.sine_factor(3.0, 0.2)),
+        hk.WaveProduct(1.3, hk.sine_factor(1.0), hk.cosine_factor(2.0, -1.0), hk.sine_factor(0.5)),
+        hk.WaveProduct(0.25, z=hk.sine_factor(2.0)),
+        hk.WaveProduct(0.1),
     ]
 )
 FIELDS: dict[str, hk.Field] = {
@@ -103,7 +103,7 @@ def test_it_is_the_derivative_of_the_gradient(name: str) -> None:
 def away_from_curve(field: hk.SolidAngle, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Points that are not too near, and their distances to the curve."""
     backend = choose_backend("double")
-    nearest = field.closest_on_boundary(to_vector3(backend, x))
+    nearest = field.closest_boundary_point(to_vector3(backend, x))
     distance = np.linalg.norm(to_numpy(nearest) - x, axis=1)
     clear = distance > 1e-3 * np.ptp(x)
     return x[clear], distance[clear]
@@ -148,7 +148,9 @@ def test_closed_form_of_a_polynomial() -> None:
 
 def test_a_product_of_waves_is_a_sum_of_plane_waves() -> None:
     """2 sin a cos b = sin(a+b) + sin(a-b), with the same factor twice in the sum."""
-    product = hk.EigenfunctionSum([hk.Product(2.0, x=hk.sine(1.5), z=hk.cosine(2.5))])
+    product = hk.EigenfunctionSum(
+        [hk.WaveProduct(2.0, x=hk.sine_factor(1.5), z=hk.cosine_factor(2.5))]
+    )
     waves = hk.EigenfunctionSum(
         [
             hk.PlaneWave(1.0, (1.5, 0.0, 2.5), -0.5 * math.pi),
@@ -279,7 +281,7 @@ class Creased(Spoiled):
     has_creases = True
 
     def evaluate(self, p: Any) -> hk.Sample:
-        return dataclasses.replace(super().evaluate(p), known=(hk.Lipschitz(1.0),))
+        return dataclasses.replace(super().evaluate(p), promises=(hk.Lipschitz(1.0),))
 
 
 def test_check_field_sees_a_wrong_hessian_where_there_may_be_creases() -> None:
@@ -301,7 +303,7 @@ def test_closest_point_of_the_curve() -> None:
     dense = (loop + share * (np.roll(loop, -1, axis=0) - loop)).reshape(-1, 3)
     expected = np.array([np.linalg.norm(dense - one, axis=1).min() for one in x])
     backend = choose_backend("double")
-    found = to_numpy(field.closest_on_boundary(to_vector3(backend, x)))
+    found = to_numpy(field.closest_boundary_point(to_vector3(backend, x)))
     assert np.abs(np.linalg.norm(found - x, axis=1) - expected).max() < 1e-4
 
 
@@ -310,12 +312,12 @@ def test_edges_run_both_ways_are_no_boundary() -> None:
     square = [[-2, -2, 0], [2, -2, 0], [2, 2, 0], [-2, 2, 0]]
     hole = [[-1, -1, 0], [-1, 1, 0], [1, 1, 0], [1, -1, 0]]
     keyhole = [*square, square[0], *hole, hole[0]]
-    start, end = uncanceled_edges((np.array(keyhole, float),))
+    start, end = remaining_edges((np.array(keyhole, float),))
     assert len(start) == 8
     assert not (np.abs(start - end) == 1).any()
     field = hk.SolidAngle(keyhole)
     backend = choose_backend("double")
-    nearest = field.closest_on_boundary(to_vector3(backend, [[-1.5, -1.5, 0.0]]))
+    nearest = field.closest_boundary_point(to_vector3(backend, [[-1.5, -1.5, 0.0]]))
     assert np.linalg.norm(to_numpy(nearest) - [-1.5, -1.5, 0.0]) == pytest.approx(0.5)
 
 
@@ -323,8 +325,8 @@ def test_a_curve_that_cancels_as_a_whole_has_none() -> None:
     there = [[0, 0, 0], [1, 0, 0], [1, 1, 0]]
     field = hk.SolidAngle([there, there[::-1]])
     backend = choose_backend("double")
-    assert field.closest_on_boundary(to_vector3(backend, [[0.0, 0.0, 1.0]])) is None
-    assert hk.Gyroid().closest_on_boundary(to_vector3(backend, [[0.0, 0.0, 1.0]])) is None
+    assert field.closest_boundary_point(to_vector3(backend, [[0.0, 0.0, 1.0]])) is None
+    assert hk.Gyroid().closest_boundary_point(to_vector3(backend, [[0.0, 0.0, 1.0]])) is None
 
 
 @pytest.mark.parametrize("precision", ["single", "double"])
@@ -337,13 +339,16 @@ def test_tiny_edges_leave_all_numbers_finite(length: float, precision: str) -> N
     # Beside the tiny edge and at right angles to it, among others.
     x = [[0.0, 0.3, 0.1], [0, 0, 0.5], [0.3, 0.4, -0.2], [0, -0.1, 0], [3, 3, 3]]
     p = to_vector3(backend, x)
-    field, other = (hk.SolidAngle(one, certificate="edges") for one in (tiny, square))
+    field, other = (hk.SolidAngle(one, lift_bound="edges") for one in (tiny, square))
     for rows, expected in zip(field.hessian(p), other.hessian(p), strict=True):
         np.testing.assert_allclose(to_numpy(rows), to_numpy(expected), rtol=2e-3, atol=1e-4)
     sample, plain = field.evaluate(p), other.evaluate(p)
     np.testing.assert_allclose(to_numpy(sample.value), to_numpy(plain.value), atol=1e-5)
     np.testing.assert_allclose(
-        to_numpy(sample.known[0].radius), to_numpy(plain.known[0].radius), rtol=1e-3, atol=1e-6
+        to_numpy(sample.promises[0].radius),
+        to_numpy(plain.promises[0].radius),
+        rtol=1e-3,
+        atol=1e-6,
     )
-    nearest = to_numpy(field.closest_on_boundary(p))
-    np.testing.assert_allclose(nearest, to_numpy(other.closest_on_boundary(p)), atol=1e-6)
+    nearest = to_numpy(field.closest_boundary_point(p))
+    np.testing.assert_allclose(nearest, to_numpy(other.closest_boundary_point(p)), atol=1e-6)

@@ -50,7 +50,7 @@ def test_single_precision_is_within_the_stated_error(offset: float) -> None:
     x = x.astype(np.float32).astype(np.float64)
     sample = f.prepare(choose_backend("single")).evaluate(to_vector3(choose_backend("single"), x))
     off = np.abs(to_numpy(sample.value) - f.value(x, precision="double"))
-    assert (off <= to_numpy(sample.error)).all()
+    assert (off <= to_numpy(sample.value_error)).all()
     turned = to_numpy(sample.gradient) - f.gradient(x, precision="double")
     assert (np.linalg.norm(turned, axis=1) <= to_numpy(sample.gradient_error)).all()
 
@@ -84,8 +84,11 @@ def test_ranges_hold_and_are_attained(precision: Any) -> None:
         second = np.einsum("njkl,nk,nl->nj", hessian, d, d)
         tiny = 1e-10 * (1 + np.abs(start).max() ** 2)
         ends_of = (
-            part.slopes.low, part.slopes.high, part.least_curvature, part.most_curvature,
-        )  # fmt: skip
+            part.slope_range.lower,
+            part.slope_range.upper,
+            part.min_second_derivative,
+            part.max_second_derivative,
+        )
         low, high, least, most = (to_numpy(one).astype(np.float64)[:, None] for one in ends_of)
         assert (low - first).max() <= tiny
         assert (first - high).max() <= tiny
@@ -106,8 +109,8 @@ def test_first_hits(precision: Any, bound: Any) -> None:
     d /= np.linalg.norm(d, axis=1)[:, None]
     o, d = (one.astype(np.float32).astype(np.float64) for one in (o, d))
     hits = hk.trace(f, o, d, precision=precision, bound=bound)
-    assert (hits.status != hk.Status.OUT_OF_STEPS).all()
-    found = hits.status == hk.Status.HIT
+    assert (hits.status != hk.RayStatus.OUT_OF_STEPS).all()
+    found = hits.status == hk.RayStatus.HIT
     assert 0.6 < found.mean() < 0.95
     if bound is None:
         assert np.mean(hits.evaluations) < 10

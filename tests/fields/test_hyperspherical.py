@@ -11,11 +11,11 @@ from scipy.special import eval_gegenbauer, gamma, lpmv
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy
-from harnack.enclosures import Gaps, Slopes
-from harnack.enclosures.parabola import Arc
+from harnack.enclosures import LevelGaps, SlopeRange
+from harnack.enclosures.parabola import SphereArcEnclosure
 from harnack.fields.analytic.hyperspherical_basis import from_monomials, gegenbauer, norm
 from harnack.fields.analytic.solid_harmonics import evaluate
-from harnack.testing import BrokenPromiseError, check_field, check_looks
+from harnack.testing import BrokenPromiseError, check_field, check_ray_samples
 from tests.oracles.oracle import OracleValues, first_crossings
 
 ALL = [(n, j, m) for n in range(7) for j in range(n + 1) for m in range(-j, j + 1)]
@@ -108,26 +108,28 @@ def test_an_arc_is_attained(degree: int, precision: Any) -> None:
         gap = np.array([1e-6, 1e-5])
         turn = np.arccos(1 - gap) / degree
         exact = np.tan(0.5 * (start + turn)) - t
-        arc = Arc(Slopes(0.0, 0.0), degree**2, backend.Float(t), 1.0)
-        gaps = Gaps(backend.Float(gap), backend.Float([math.inf] * 2))
-        ratio = to_numpy(arc.step(gaps)) / exact
+        arc = SphereArcEnclosure(SlopeRange(0.0, 0.0), degree**2, backend.Float(t), 1.0)
+        gaps = LevelGaps(backend.Float(gap), backend.Float([math.inf] * 2))
+        ratio = to_numpy(arc.free_length(gaps)) / exact
         assert (ratio <= 1 + (1e-7 if precision == "double" else 2e-6)).all()
         assert (ratio > 1 - 4e-5).all()
 
 
 def test_arcs_end_at_infinity() -> None:
     backend = choose_backend("double")
-    wide = Gaps(backend.Float([5.0, 0.3]), backend.Float([5.0, 0.3]))
-    step = to_numpy(Arc(Slopes(0.0, 0.0), 0.5, backend.Float(0.7), 1.0).step(wide))
+    wide = LevelGaps(backend.Float([5.0, 0.3]), backend.Float([5.0, 0.3]))
+    step = to_numpy(
+        SphereArcEnclosure(SlopeRange(0.0, 0.0), 0.5, backend.Float(0.7), 1.0).free_length(wide)
+    )
     assert step[0] == math.inf
     assert 0 < step[1] < math.inf
 
 
 def test_an_arc_that_is_too_flat_is_seen() -> None:
     class TooFlat(hk.HypersphericalHarmonic):
-        def look(self, *given: Any) -> Any:
+        def sample_ray(self, *given: Any) -> Any:
             self._known = self._narrow
-            return super().look(*given)
+            return super().sample_ray(*given)
 
     field = TooFlat(4, 2, 1)
     kept = field._known
@@ -135,7 +137,7 @@ def test_an_arc_that_is_too_flat_is_seen() -> None:
         kept.degree, 0.6 * kept.low, 0.6 * kept.high, kept.lower, kept.upper, kept.pole
     )
     with pytest.raises(BrokenPromiseError, match="an enclosure looking"):
-        check_looks(field, points(4000))
+        check_ray_samples(field, points(4000))
 
 
 @pytest.mark.slow
@@ -170,13 +172,13 @@ def missed(field: Any, value: Any, level: float, n: int, precision: Any, seed: i
     """Traces, and asserts that no ray passes a crossing and that every hit is one."""
     o, d = rays(n, seed)
     hits = hk.trace(field, o, d, level=level, precision=precision)
-    assert (hits.status != int(hk.Status.OUT_OF_STEPS)).all()
+    assert (hits.status != int(hk.RayStatus.OUT_OF_STEPS)).all()
     truth = first_crossings(
         oracle_of(value, field.degree), o, d, 0.0, 14.0,
         levels=[level], depth=1e-4, spacing=0.05, finest=1e-4,
     )  # fmt: skip
     assert (hits.t <= truth.beyond + 1e-3).all()
-    at = oracle_of(value, field.degree)(hits.position[hits.hit])
+    at = oracle_of(value, field.degree)(hits.position[hits.is_hit])
     assert (np.abs(at.value - level) <= 4e-4 * at.gradient_norm + 1e-5).all()
     assert np.isfinite(truth.beyond).mean() > 0.3
     return hits
@@ -230,9 +232,9 @@ def test_rays_without_an_end_are_proved_to_miss(precision: Any) -> None:
     level = 0.4 * field.value_range[1]
     ended = hk.trace(hk.HypersphericalHarmonic(4, 2, 1), o, d, level=level, precision=precision)
     hits = hk.trace(field, o, d, level=level, t_max=math.inf, precision=precision)
-    assert (hits.status != int(hk.Status.OUT_OF_STEPS)).all()
-    assert (hits.hit == ended.hit).mean() > 0.999
-    assert 0.2 < hits.hit.mean() < 0.9
+    assert (hits.status != int(hk.RayStatus.OUT_OF_STEPS)).all()
+    assert (hits.is_hit == ended.is_hit).mean() > 0.999
+    assert 0.2 < hits.is_hit.mean() < 0.9
 
 
 def test_extents_hold_the_level() -> None:

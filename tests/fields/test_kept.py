@@ -59,7 +59,9 @@ def test_a_field_with_an_attribute_set_is_uploaded_again() -> None:
 
         def evaluate(self, p: Any) -> hk.Sample:
             sample = super().evaluate(p)
-            return hk.Sample(sample.value + self.shift, sample.gradient, sample.known, sample.error)
+            return hk.Sample(
+                sample.value + self.shift, sample.gradient, sample.promises, sample.value_error
+            )
 
     field = Shifted([[1, 0, 0], [0, 1, 0], [-1, 0, 0.3], [0, -1, 0]])
     rays = [[0.0, 0, 3]], [[0.0, 0.1, -1]]

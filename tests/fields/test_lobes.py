@@ -13,14 +13,14 @@ from tests.oracles.oracle import OracleValues, first_crossings
 
 SMALL = {
     "both": hk.Lobes(2, 0),
-    "positive": hk.Lobes(3, -2, part="positive", scale=2.5),
+    "positive": hk.Lobes(3, -2, sign="positive", scale=2.5),
     "sum": hk.Lobes.combined({(0, 0): 0.3, (2, 0): 1.0, (3, 3): -0.4}),
 }
 MORE = {
-    "p": hk.Lobes(1, 0, part="negative"),
+    "p": hk.Lobes(1, 0, sign="negative"),
     "constant": hk.Lobes(0, 0, scale=1e-3),
     "steep": hk.Lobes(12, 5),
-    "sum, negative": hk.Lobes.combined({(5, 1): 1.0, (4, 0): 0.7}, part="negative", scale=1e4),
+    "sum, negative": hk.Lobes.combined({(5, 1): 1.0, (4, 0): 0.7}, sign="negative", scale=1e4),
 }
 
 
@@ -90,7 +90,7 @@ def compare(field, n, seed, precision, tolerance):
         d /= np.linalg.norm(d, axis=1)[:, None]
     tol = tolerance * size
     hits = hk.trace(field, o, d, t_max=4 * size, tolerance=tol, precision=precision)
-    assert not (hits.status == hk.Status.OUT_OF_STEPS).any()
+    assert not (hits.status == hk.RayStatus.OUT_OF_STEPS).any()
     truth = first_crossings(
         oracle(field), o, d, 0.0, 4 * size, levels=[0.0], depth=tol, finest=0.5 * tol
     )
@@ -99,9 +99,9 @@ def compare(field, n, seed, precision, tolerance):
     at = o + truth.before[:, None] * d
     passed &= ~(np.linalg.norm(at, axis=1) < 4 * tol)
     assert not passed.any(), np.flatnonzero(passed)[:5]
-    x = (o + hits.t[:, None] * d)[hits.hit]
+    x = (o + hits.t[:, None] * d)[hits.is_hit]
     around = np.random.default_rng(1).normal(size=(len(x), 96, 3))
-    reach = tol + hits.uncertainty[hits.hit]
+    reach = tol + hits.uncertainty[hits.is_hit]
     around *= 3 * reach[:, None, None] / np.linalg.norm(around, axis=2)[..., None]
     states = lobe(field, (x[:, None] + around).reshape(-1, 3)).reshape(len(x), -1)
     near = (states != states[:, :1]).any(axis=1) | (np.linalg.norm(x, axis=1) < 4 * reach)
@@ -164,7 +164,7 @@ def test_the_values_are_those_of_spherical_harmonics():
 def test_rays_down_the_axis_end_at_the_origin():
     """From below, where Y_10 is negative, the positive lobe begins at the origin."""
     hits = hk.trace(hk.Lobes(1, 0).positive, [[0, 0, -2]], [[0, 0, 1]], tolerance=1e-5)
-    assert hits.hit.all()
+    assert hits.is_hit.all()
     assert abs(hits.t[0] - 2) < 1e-4
 
 
@@ -174,7 +174,7 @@ def test_rays_down_the_axis_end_at_the_origin():
         (lambda: hk.Lobes(13, 0), "degree"),
         (lambda: hk.Lobes(2, 3), "order"),
         (lambda: hk.Lobes(2, 1, scale=0.0), "scale"),
-        (lambda: hk.Lobes(2, 1, part="left"), "part must be"),
+        (lambda: hk.Lobes(2, 1, sign="left"), "part must be"),
         (lambda: hk.Lobes(0, 0).negative, "no direction"),
         (lambda: hk.Lobes.combined({}), "coefficient"),
     ],

@@ -66,7 +66,7 @@ def test_rays_to_vertices_and_edges_hit(precision: Any, shift: float) -> None:
     o = 3.0 * targets / np.linalg.norm(targets, axis=1, keepdims=True)
     d = -o / 3.0
     hits = hk.trace(solid, o + shift, d, precision=precision)
-    assert (np.array(hits.status) == int(hk.Status.HIT)).all()
+    assert (np.array(hits.status) == int(hk.RayStatus.HIT)).all()
     at = o + np.array(hits.t)[:, None] * d
     blur = 3e-3 if precision == "single" and shift else 2e-4
     assert np.linalg.norm(at - targets, axis=1).max() < 3 * blur  # seen at a slant
@@ -74,7 +74,7 @@ def test_rays_to_vertices_and_edges_hit(precision: Any, shift: float) -> None:
     cube = hk.solid((CUBE.vertices + shift, CUBE.faces))
     start = np.array([[1 - 0.01, 1 - 0.01, 5.0], [1 + 0.01, 1 + 0.01, 5.0]]) + shift
     status = hk.trace(cube, start, np.array([[0.0, 0.0, -1.0]] * 2), precision=precision).status
-    assert np.array(status).tolist() == [int(hk.Status.HIT), int(hk.Status.MISS)]
+    assert np.array(status).tolist() == [int(hk.RayStatus.HIT), int(hk.RayStatus.MISS)]
 
 
 def test_first_hits_are_those_of_the_winding_number() -> None:
@@ -162,7 +162,7 @@ def test_parts_in_parts_and_cavities() -> None:
         lambda one: one.blended(hk.Sphere(0.4, (0.8, 0.0, 0.0)), 0.2),
         lambda one: one.twisted(1.0),
         lambda one: one.shell(0.1) - hk.Cylinder(0.2),
-        lambda one: (one.grown(0.1) & hk.solid(hk.Gyroid(0.8), between=(-0.4, 0.4))).scaled(0.5),
+        lambda one: (one.offset(0.1) & hk.solid(hk.Gyroid(0.8), between=(-0.4, 0.4))).scaled(0.5),
         lambda one: one.rotated(30.0, "x").moved((100.0, -50.0, 20.0)),
     ],
 )
@@ -181,16 +181,16 @@ def test_meshes_come_from_files_and_go_through_pickles(tmp_path: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    "solid", [hk.solid(CUBE), hk.Extruded([(-1, -1), (1, -1), (1, 1), (-1, 1)], 2.0)]
+    "solid", [hk.solid(CUBE), hk.Extrusion([(-1, -1), (1, -1), (1, 1), (-1, 1)], 2.0)]
 )
 def test_ranges_on_balls_hold_the_slopes_beside_corners(solid: Any) -> None:
     """At the middle of the ball one face is nearest, elsewhere in it others."""
     backend, middle, radius = choose_backend("double"), np.array([0.9, 0.7, 0.6]), 0.4
-    coordinates = Jet.within(backend.Array3f(*map(float, middle)), backend.Float(radius))
-    slopes = solid.prepare(backend).formula(*coordinates).first
+    coordinates = Jet.over_ball(backend.Array3f(*map(float, middle)), backend.Float(radius))
+    slopes = solid.prepare(backend).formula(*coordinates).first_derivatives
     x = middle + np.random.default_rng(5).uniform(-radius, radius, (200, 3))
     for slope, own in zip(slopes, solid.gradient(x, precision="double").T, strict=True):
-        low, high = (to_numpy(backend.Float(one))[0] for one in (slope.low, slope.high))
+        low, high = (to_numpy(backend.Float(one))[0] for one in (slope.lower, slope.upper))
         assert low <= own.min() + 1e-9
         assert own.max() - 1e-9 <= high
 

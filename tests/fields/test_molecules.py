@@ -10,9 +10,9 @@ import pytest
 
 import harnack as hk
 from harnack.cli import main
-from harnack.field_from_file import open_surface
+from harnack.field_from_file import field_from_file
 from harnack.fields.blobs.blobs import Blobs, Molecule
-from harnack.files import Atoms, FileFormatError, Metaballs, read_molecule, read_surface
+from harnack.files import Atoms, FileFormatError, Metaballs, read_geometry, read_molecule
 
 ATOM = "ATOM  {:>5d}  {:<3s} GLY A{:>4d}    {:8.3f}{:8.3f}{:8.3f}  1.00  0.00          {:>2s}\n"
 CIF = """data_small
@@ -55,7 +55,7 @@ def test_atoms_of_both_formats(tmp_path: Path) -> None:
         np.testing.assert_allclose(found.positions, [[0, 0, 0], [1.2, 0, 0]])
         assert found.elements == ("C", "O")
         np.testing.assert_allclose(found.radii, [1.7, 1.52])
-        assert found.said == "2 atoms (1 C, 1 O)"
+        assert found.summary == "2 atoms (1 C, 1 O)"
 
 
 def test_one_model_and_one_conformation(tmp_path: Path) -> None:
@@ -65,8 +65,8 @@ def test_one_model_and_one_conformation(tmp_path: Path) -> None:
     text = "MODEL        1\n" + "\n".join(lines[:3]) + "\nENDMDL\nMODEL        2\n"
     found = read_molecule(written(tmp_path, "b.ent", text + "\n".join(lines[:1]) + "\nENDMDL\n"))
     np.testing.assert_allclose(found.positions, [[0, 0, 0]])
-    assert "first of 2 models" in found.said
-    assert "1 alternatives, 1 of unknown elements left out" in found.said
+    assert "first of 2 models" in found.summary
+    assert "1 alternatives, 1 of unknown elements left out" in found.summary
 
 
 def test_atoms_of_one_name_all_count(tmp_path: Path) -> None:
@@ -77,13 +77,13 @@ def test_atoms_of_one_name_all_count(tmp_path: Path) -> None:
     ]
     found = read_molecule(written(tmp_path, "a.pdb", "\n".join([*lines, "END", ""])))
     np.testing.assert_allclose(found.positions[:, 0], 1.4 * np.arange(1, 7))
-    assert found.said == "6 atoms (6 C)"
+    assert found.summary == "6 atoms (6 C)"
     ended = read_molecule(written(tmp_path, "b.pdb", "\n".join([*lines, "END", *lines[:2], ""])))
-    assert ended.said == "6 atoms (6 C); 2 behind the line END left out"
+    assert ended.summary == "6 atoms (6 C); 2 behind the line END left out"
     many = [CIF.splitlines()[-2].replace("1.0", f"{k}.0") for k in range(6)]
     head = "\n".join(CIF.splitlines()[:-2])
     read = read_molecule(written(tmp_path, "a.cif", "\n".join([head, *many, ""])))
-    assert read.said == "6 atoms (6 C)"
+    assert read.summary == "6 atoms (6 C)"
 
 
 def test_alternatives_are_what_the_file_marks(tmp_path: Path) -> None:
@@ -97,7 +97,7 @@ def test_alternatives_are_what_the_file_marks(tmp_path: Path) -> None:
     )
     found = read_molecule(written(tmp_path, "a.pdb", text))
     np.testing.assert_allclose(np.sort(found.positions[:, 0]), [0, 1, 2, 5])
-    assert found.said.endswith("; 2 alternatives left out")
+    assert found.summary.endswith("; 2 alternatives left out")
 
 
 @pytest.mark.parametrize(
@@ -127,30 +127,30 @@ def test_alternatives_are_what_the_file_marks(tmp_path: Path) -> None:
 def test_what_cannot_be_read(tmp_path: Path, name: str, text: str, message: str) -> None:
     path = written(tmp_path, name, text)
     with pytest.raises(FileFormatError, match=message):
-        read_molecule(path) if name == "a.txt" else read_surface(path)
+        read_molecule(path) if name == "a.txt" else read_geometry(path)
 
 
 def test_metaballs_of_a_file(tmp_path: Path) -> None:
     text = "# a pair\n0 0 0 1\n1.5 0 0 0.8 -0.5 # carves\n"
-    found = read_surface(written(tmp_path, "a.blobs", text))
+    found = read_geometry(written(tmp_path, "a.blobs", text))
     assert isinstance(found, Metaballs)
     np.testing.assert_allclose(found.centers, [[0, 0, 0], [1.5, 0, 0]])
     np.testing.assert_allclose(found.radii, [1, 0.8])
     np.testing.assert_allclose(found.weights, [1, -0.5])
     assert found.groups is None
-    grouped = read_surface(written(tmp_path, "b.blobs", "0 0 0 1 1 7\n1 0 0 1 1 3\n"))
+    grouped = read_geometry(written(tmp_path, "b.blobs", "0 0 0 1 1 7\n1 0 0 1 1 3\n"))
     assert isinstance(grouped, Metaballs)
     assert grouped.groups is not None
     assert grouped.groups.tolist() == [7, 3]
     with pytest.raises(FileFormatError, match="blobs only"):
-        read_surface(tmp_path / "b.blobs", "winding")
+        read_geometry(tmp_path / "b.blobs", "winding")
 
 
 def test_opening_turns_the_axis_up(tmp_path: Path) -> None:
-    opened = open_surface(written(tmp_path, "a.blobs", "1 2 3 0.5\n"), up="x")
+    opened = field_from_file(written(tmp_path, "a.blobs", "1 2 3 0.5\n"), up="x")
     assert isinstance(opened.field, Blobs)
     np.testing.assert_allclose(opened.field.centers, [[2, 3, 1]])
-    opened = open_surface(written(tmp_path, "a.pdb", pdb([("N", (1, 2, 3))])))
+    opened = field_from_file(written(tmp_path, "a.pdb", pdb([("N", (1, 2, 3))])))
     assert isinstance(opened.field, Molecule)
     assert opened.field.describe()["atoms"] == 1
     assert opened.show == "shaded"
@@ -202,9 +202,9 @@ def test_a_helix_of_atoms(precision: Any) -> None:
     d = positions[rng.integers(0, 400, 400)] + rng.uniform(-3, 3, (400, 3)) - o
     d /= np.linalg.norm(d, axis=1)[:, None]
     o, d = (one.astype(np.float32).astype(np.float64) for one in (o, d))
-    hits = hk.trace(field, o, d, precision=precision, tolerance=hk.Tolerance(1e-4))
+    hits = hk.trace(field, o, d, precision=precision, tolerance=hk.HitTolerance(1e-4))
     assert np.mean(hits.evaluations) < 7
-    found = hits.status == hk.Status.HIT
+    found = hits.status == hk.RayStatus.HIT
     assert 0.5 < found.mean() < 1
     end = np.where(found, np.nan_to_num(hits.t, posinf=0), 120.0)
     s = np.linspace(0, 1, 2500) * end[:, None]

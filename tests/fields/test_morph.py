@@ -13,11 +13,11 @@ from scipy.special import beta, betainc, eval_chebyu
 
 import harnack as hk
 from harnack.backend import choose_backend, to_float, to_numpy
-from harnack.enclosures import Curvature, HarmonicBall
-from harnack.fields.solid_angles.morph_slice import GRADIENT, SlicedKernel, centroids
+from harnack.enclosures import HarmonicBall, TaylorRemainder
+from harnack.fields.solid_angles.morph_slice import GRADIENT_BOUND, SlicedKernel, quadrature_points
 from harnack.geometry.example_meshes import bumpy_sphere, icosphere, remove_faces, torus_mesh
 from harnack.geometry.meshes import MeshError
-from harnack.testing.violation_search import look_at, random_directions
+from harnack.testing.violation_search import random_directions, sample_field
 from tests.backend.test_kernels import compiled
 from tests.oracles.direct_sums import sliced_sum
 from tests.oracles.oracle import OracleValues, first_crossings
@@ -112,7 +112,7 @@ def test_gradient_of_a_dipole_in_four_dimensions() -> None:
     across = (phi - s * c) / (2 * s**3)
     along = 2 * across - c
     largest = 4 / math.pi * max(np.sqrt(along**2 + s * s).max(), across.max())
-    assert 0.9999 <= largest / (2 * GRADIENT) <= 1
+    assert 0.9999 <= largest / (2 * GRADIENT_BOUND) <= 1
 
 
 # ---------------------------------------------------------------- quadrature
@@ -124,7 +124,7 @@ def test_pieces_keep_area_and_first_moment() -> None:
         [0.02, 1.0], (40, 1, 1)
     )
     normal = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    pieces = centroids(corners, 0.3)
+    pieces = quadrature_points(corners, 0.3)
     np.testing.assert_allclose(pieces.moments.sum(axis=0), normal.sum(axis=0), atol=1e-12)
     assert len(pieces.points) > 100
     flat = corners * [1, 1, 0]
@@ -133,7 +133,7 @@ def test_pieces_keep_area_and_first_moment() -> None:
         flat[:, [1, 2]],
         flat[:, [2, 1]],
     )
-    pieces = centroids(flat, 0.3)
+    pieces = quadrature_points(flat, 0.3)
     area = 0.5 * np.cross(flat[:, 1] - flat[:, 0], flat[:, 2] - flat[:, 0])[:, 2]
     first = (area[:, None] * flat.mean(axis=1)).sum(axis=0)
     np.testing.assert_allclose((pieces.moments[:, 2:] * pieces.points).sum(axis=0), first)
@@ -181,18 +181,18 @@ def test_tree_is_the_sum_within_its_error(w: float) -> None:
     x = np.random.default_rng(4).uniform(-1, 1, (60, 3)).astype(np.float32).astype(float)
     value, gradient = exact(field, x)
     for precision in ("single", "double"):
-        look = look_at(field, x, precision=precision) if precision == "double" else None
+        look = sample_field(field, x, precision=precision) if precision == "double" else None
         off = np.abs(field.value(x, precision=precision) - value)  # type: ignore[arg-type]
         assert (off <= field.error_bound(x, precision=precision)).all()  # type: ignore[arg-type]
         assert off.max() > 1e-6  # there is something to bound
         slant = np.linalg.norm(field.gradient(x, precision=precision) - gradient, axis=1)  # type: ignore[arg-type]
         assert (slant <= field.gradient_error_bound(x, precision=precision)).all()  # type: ignore[arg-type]
         if look is not None:
-            for known in look.known:
+            for known in look.promises:
                 d = random_directions(np.random.default_rng(5), len(x))
                 t = 0.99 * known.radius  # type: ignore[union-attr]
                 there = exact(field, x + t[:, None] * d)[0]  # type: ignore[index]
-                if isinstance(known, Curvature):
+                if isinstance(known, TaylorRemainder):
                     line = value + t * (gradient * d).sum(axis=1)
                     assert (np.abs(there - line) <= 0.5 * known.constant * t * t).all()
                 else:
@@ -235,10 +235,10 @@ def compare(field: hk.Morph, n: int, precision: str, seed: int) -> int:
         function, o, d, 0.0, 6.0, levels=[0.5], depth=tolerance, finest=0.5 * tolerance
     )
     assert not (hits.t > truth.beyond + 5 * tolerance).any()
-    value, gradient = exact(field, hits.position[hits.hit])
+    value, gradient = exact(field, hits.position[hits.is_hit])
     assert (np.abs(value - 0.5) <= 5 * tolerance * np.linalg.norm(gradient, axis=1)).all()
-    assert not (hits.status == hk.Status.OUT_OF_STEPS).any()
-    return int(hits.hit.sum())
+    assert not (hits.status == hk.RayStatus.OUT_OF_STEPS).any()
+    return int(hits.is_hit.sum())
 
 
 @pytest.mark.slow
@@ -264,8 +264,8 @@ def test_many_first_hits(w: float) -> None:
     for precision in ("single", "double"):
         hits = hk.trace(field, o, d, t_max=6.0, tolerance=tolerance, precision=precision)  # type: ignore[arg-type]
         assert not (hits.t > first + 5 * tolerance).any()
-        assert not (hits.status == hk.Status.OUT_OF_STEPS).any()
-        value, gradient = exact(field, hits.position[hits.hit])
+        assert not (hits.status == hk.RayStatus.OUT_OF_STEPS).any()
+        value, gradient = exact(field, hits.position[hits.is_hit])
         steep = np.linalg.norm(gradient, axis=1)
         assert (np.abs(value - 0.5) <= 2 * tolerance * steep).all()
 
@@ -274,11 +274,11 @@ def test_many_first_hits(w: float) -> None:
 def test_ends_are_the_meshes(w: float, mesh: Any) -> None:
     o, d = rays(300, 7)
     field = morph(w)
-    assert field.has_sheets
+    assert field.has_jumps
     found, wanted = hk.trace(field, o, d), hk.trace(hk.WindingNumber(*mesh), o, d)
-    np.testing.assert_array_equal(found.hit, wanted.hit)
+    np.testing.assert_array_equal(found.is_hit, wanted.is_hit)
     np.testing.assert_array_equal(found.t, wanted.t)
-    np.testing.assert_array_equal(found.sheet, wanted.sheet)
+    np.testing.assert_array_equal(found.primitive_index, wanted.primitive_index)
     assert (field.quadrature_displacement(o) == 0).all()
     assert field.describe()["shows"] == ("mesh a" if w == 0 else "mesh b")
 
@@ -287,9 +287,9 @@ def test_ends_are_the_meshes(w: float, mesh: Any) -> None:
 def test_slices_near_an_end_are_near_the_mesh_in_proportion() -> None:
     o, d = rays(200, 8)
     farther, near, at = (hk.trace(morph(w), o, d, tolerance=1e-3) for w in (0.02, 0.01, 0.0))
-    all_ = farther.hit & near.hit & at.hit
+    all_ = farther.is_hit & near.is_hit & at.is_hit
     assert all_.sum() > 10
-    assert (near.hit != at.hit).mean() < 0.03
+    assert (near.is_hit != at.is_hit).mean() < 0.03
     first, second = (np.median(one.t[all_] - at.t[all_]) for one in (farther, near))
     assert 0 < second < 0.7 * first < 0.05
 
@@ -298,7 +298,7 @@ def test_slices_near_an_end_are_near_the_mesh_in_proportion() -> None:
 def test_meshes_with_holes() -> None:
     vertices, faces = BUMPY
     field = hk.Morph(TORUS, (vertices, remove_faces(faces, 0.1, seed=0)), gap=GAP, w=0.2)
-    assert hk.trace(field, *rays(100, 9), tolerance=1e-3).hit.any()
+    assert hk.trace(field, *rays(100, 9), tolerance=1e-3).is_hit.any()
 
 
 @pytest.mark.slow
@@ -317,11 +317,11 @@ def test_extent_holds_the_hits() -> None:
     field = morph(0.15)
     low, high = field.extent((0.5,)).bounds()  # type: ignore[union-attr]
     hits = hk.trace(field, *rays(200, 11), tolerance=1e-3)
-    at = hits.position[hits.hit]
+    at = hits.position[hits.is_hit]
     assert len(at) > 10
     assert ((at >= low) & (at <= high)).all()
     with pytest.raises(ValueError, match="level 0"):
-        field.check_levels((0.0,))
+        field.validate_levels((0.0,))
 
 
 @pytest.mark.parametrize("w", [-0.1, 0.31, math.nan, math.inf])

@@ -54,7 +54,7 @@ def test_values_are_within_the_bound(motion: Any) -> None:
     field = winding(VERTICES, method="tree")
     field.value(VERTICES[:2] * 0.9)
     x = motion(VERTICES)
-    moved, points = field.moved(x), around(x, 3000)
+    moved, points = field.with_vertices(x), around(x, 3000)
     assert moved.mesh.tree is field.mesh.tree
     exact = winding(x, method="exact").value(points, precision="double")
     off = np.abs(moved.value(points, precision="double") - exact)
@@ -74,7 +74,7 @@ def test_moved_is_as_new(method: Any, motion: Any) -> None:
     field.value(VERTICES[:2] * 0.9)
     x = motion(VERTICES)
     points = around(x, 500)
-    new, moved = winding(x, method=method), field.moved(x)
+    new, moved = winding(x, method=method), field.with_vertices(x)
     if method == "tree":
         vars(new.mesh).update(tree=field.mesh.tree)
     for name in ("value", "gradient", "hessian", "error_bound"):
@@ -89,12 +89,12 @@ def test_nothing_moved_nothing_changed(method: Any) -> None:
     field = winding(VERTICES, method=method)
     points = around(VERTICES, 500)
     before = field.value(points)
-    there = field.moved(breathed(VERTICES))
-    back = there.moved(VERTICES)
+    there = field.with_vertices(breathed(VERTICES))
+    back = there.with_vertices(VERTICES)
     np.testing.assert_array_equal(back.value(points), before)
     np.testing.assert_array_equal(field.value(points), before)
     assert (there.value(points) != before).any()
-    np.testing.assert_array_equal(back.faces_of_sheets, field.faces_of_sheets)
+    np.testing.assert_array_equal(back.facet_faces, field.facet_faces)
 
 
 @pytest.mark.few(1)
@@ -113,11 +113,11 @@ def test_hits_are_those_of_a_new_field(motion: Any, method: Any) -> None:
     rays = to_vector3(backend, o), to_vector3(backend, d)
     moved, new = (
         hk.trace(hk.level_set(one.prepare(backend)), *rays, t_max=10 * size)
-        for one in (field.moved(x), winding(x, method=method))
+        for one in (field.with_vertices(x), winding(x, method=method))
     )
     dr.eval(moved.t, new.t)
-    hit = to_numpy(moved.status) == int(hk.Status.HIT)
-    same = hit == (to_numpy(new.status) == int(hk.Status.HIT))
+    hit = to_numpy(moved.status) == int(hk.RayStatus.HIT)
+    same = hit == (to_numpy(new.status) == int(hk.RayStatus.HIT))
     assert same.mean() >= 0.999  # rays may graze
     assert hit.mean() > 0.4
     both = np.flatnonzero(hit & same)
@@ -134,9 +134,9 @@ def test_nothing_is_sorted_again(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: Any, **__: Any) -> None:
         raise AssertionError("this is for new meshes")
 
-    monkeypatch.setattr(winding_mesh, "build_hierarchy", refuse)
+    monkeypatch.setattr(winding_mesh, "build_balanced_tree", refuse)
     monkeypatch.setattr(winding_mesh.Welded, "of", refuse)
-    moved = field.moved(breathed(VERTICES))
+    moved = field.with_vertices(breathed(VERTICES))
     assert np.isfinite(moved.value(breathed(points))).all()
     with pytest.raises(AssertionError, match="this is for new meshes"):
         winding(VERTICES)
@@ -149,14 +149,14 @@ def test_soups_that_move_together() -> None:
     field = hk.WindingNumber(corners, faces)
     points = around(breathed(VERTICES), 500)
     np.testing.assert_allclose(
-        field.moved(breathed(corners)).value(points, precision="double"),
+        field.with_vertices(breathed(corners)).value(points, precision="double"),
         winding(breathed(VERTICES)).value(points, precision="double"),
         atol=1e-9,
     )
     apart = corners.copy()
     apart[-1] += 0.01
     with pytest.raises(MeshError, match=r"were at the same place.*make a new winding number"):
-        field.moved(apart)
+        field.with_vertices(apart)
 
 
 def test_vertices_without_faces_may_part() -> None:
@@ -164,7 +164,7 @@ def test_vertices_without_faces_may_part() -> None:
     field = winding(x)
     x[-1] += 1.0
     np.testing.assert_array_equal(
-        field.moved(x).value([[0.1, 0.2, 0.3]]), field.value([[0.1, 0.2, 0.3]])
+        field.with_vertices(x).value([[0.1, 0.2, 0.3]]), field.value([[0.1, 0.2, 0.3]])
     )
 
 
@@ -193,4 +193,4 @@ def with_nan(x: np.ndarray) -> np.ndarray:
 )
 def test_bad_vertices_are_refused(vertices: Any, message: str) -> None:
     with pytest.raises(MeshError, match=message):
-        winding(VERTICES).moved(vertices)
+        winding(VERTICES).with_vertices(vertices)

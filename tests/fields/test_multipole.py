@@ -20,16 +20,16 @@ from harnack.backend import choose_backend, to_numpy
 from harnack.fields.solid_angles import multipole
 from harnack.fields.solid_angles.multipole import (
     NodeMoments,
-    all_levels,
-    cartesian,
+    cartesian_coefficients,
+    dipole_tree_moments,
     sup_norm,
-    triangle_levels,
     triangle_rule,
-    truncation,
+    triangle_tree_moments,
+    truncation_bounds,
 )
-from harnack.fields.solid_angles.treecode import far_terms, node_columns
-from harnack.fields.source_sums import longest_part
-from harnack.tree import Hierarchy, build_hierarchy
+from harnack.fields.solid_angles.treecode import multipole_terms, node_records
+from harnack.fields.source_sums import max_step_fraction
+from harnack.tree import BalancedTree, build_balanced_tree
 
 ORDERS = [0, 1, 2]
 
@@ -41,13 +41,14 @@ def complex_of(pairs: Any) -> Any:
 
 def regular(x: np.ndarray, order: int) -> Any:
     """R_lm at x (..., 3)."""
-    return complex_of(multipole.regular(x[..., 0], x[..., 1], x[..., 2], order))
+    return complex_of(multipole.regular_harmonics(x[..., 0], x[..., 1], x[..., 2], order))
 
 
 def of_dipoles(d: np.ndarray, normal: np.ndarray) -> Any:
     """M_lm of clusters of dipoles (k, s, 3)."""
-    pairs = multipole.of_dipole(
-        multipole.regular(*np.moveaxis(d, -1, 0), multipole.KNOWN - 1), *np.moveaxis(normal, -1, 0)
+    pairs = multipole.dipole_moments(
+        multipole.regular_harmonics(*np.moveaxis(d, -1, 0), multipole.MAX_DEGREE - 1),
+        *np.moveaxis(normal, -1, 0),
     )
     return {key: value.sum(axis=1) for key, value in complex_of(pairs).items()}
 
@@ -117,18 +118,20 @@ def cluster(seed: int, count: int = 12) -> tuple[np.ndarray, np.ndarray]:
 
 def level_of(y: np.ndarray, normal: np.ndarray) -> NodeMoments:
     """The cluster as one leaf."""
-    tree = Hierarchy(np.zeros((1, 1), np.int64), ())
+    tree = BalancedTree(np.zeros((1, 1), np.int64), ())
     low, high = y.min(axis=0)[None], y.max(axis=0)[None]
-    return all_levels(tree, y[None], normal[None], low, high)[0]
+    return dipole_tree_moments(tree, y[None], normal[None], low, high)[0]
 
 
 def terms(level: NodeMoments, x: np.ndarray, order: int, derivatives: int) -> Any:
     """Value, gradient and Hessian that a node alone gives at x (k, 3)."""
     backend = choose_backend("double")
-    c = [dr.opaque(backend.Float, float(v)) for v in cartesian(level.moments, order)[0]]
+    c = [
+        dr.opaque(backend.Float, float(v)) for v in cartesian_coefficients(level.moments, order)[0]
+    ]
     r = x - level.center[0]
     inverse = backend.Float(1 / np.linalg.norm(r, axis=1))
-    found = far_terms(c, backend.Array3f(r.T), inverse, derivatives)
+    found = multipole_terms(c, backend.Array3f(r.T), inverse, derivatives)
     out = [to_numpy(found.value)]
     if found.gradient is not None:
         out.append(np.stack([to_numpy(v) for v in found.gradient], axis=1))
@@ -206,7 +209,7 @@ def test_moments_moved_are_moments(seed: int) -> None:
     shift = rng.normal(size=(4, 3))
     expected = of_dipoles(d + shift[:, None], normal)
     given = {key: (value.real, value.imag) for key, value in of_dipoles(d, normal).items()}
-    found = complex_of(multipole.moved(given, *shift.T))
+    found = complex_of(multipole.multipole_to_multipole(given, *shift.T))
     assert found.keys() == expected.keys()
     for key, value in expected.items():
         np.testing.assert_allclose(found[key], value, rtol=1e-10, atol=1e-10)
@@ -219,12 +222,16 @@ def test_nodes_have_the_moments_of_what_they_hold(n: int, spread: bool) -> None:
     """Of triangles, or of the dipoles that stand for them: the same moments."""
     rng = np.random.default_rng(n)
     corners = rng.normal(size=(n, 1, 3)) + 0.3 * rng.normal(size=(n, 3, 3))
-    tree = build_hierarchy(corners.mean(axis=1))
+    tree = build_balanced_tree(corners.mean(axis=1))
     points, normals = triangle_dipoles(corners)
     boxes = corners.min(axis=1), corners.max(axis=1)
-    levels = triangle_levels(tree, corners) if spread else all_levels(tree, points, normals, *boxes)
+    levels = (
+        triangle_tree_moments(tree, corners)
+        if spread
+        else dipole_tree_moments(tree, points, normals, *boxes)
+    )
     assert [len(level.center) for level in levels] == list(tree.counts)
-    held = tree.slots
+    held = tree.leaf_slots
     for level, arity in zip(levels, (*tree.arities, 1), strict=True):
         for node in range(len(level.center)):
             rows = held[node][held[node] >= 0]
@@ -236,9 +243,9 @@ def test_nodes_have_the_moments_of_what_they_hold(n: int, spread: bool) -> None:
             assert level.area[node] == pytest.approx(size.sum())
             square = (d * d).sum(axis=-1)
             powers = (
-                (level.second, np.einsum("ks,ksi,ksj->ij", size, d, d)),
-                (level.third, np.einsum("ks,ks,ksi->i", size, square, d)),
-                (level.fourth, (size * square * square).sum()),
+                (level.second_moment, np.einsum("ks,ksi,ksj->ij", size, d, d)),
+                (level.third_moment, np.einsum("ks,ks,ksi->i", size, square, d)),
+                (level.fourth_moment, (size * square * square).sum()),
             )
             for found, expected in powers:
                 np.testing.assert_allclose(found[node], expected, rtol=1e-9, atol=1e-9)
@@ -254,7 +261,7 @@ def test_nodes_without_area_have_a_center() -> None:
     level = level_of(y, np.zeros((2, 3)))
     np.testing.assert_array_equal(level.center, [[1.0, 0, 0]])
     assert level.area.tolist() == [0]
-    assert all(np.isfinite(value).all() for value in truncation(level, 2 * level.radius))
+    assert all(np.isfinite(value).all() for value in truncation_bounds(level, 2 * level.radius))
 
 
 def test_triangle_dipoles_integrate_to_degree_four() -> None:
@@ -354,7 +361,7 @@ def test_truncation_is_bounded(order: int, accuracy: float) -> None:
         y, normal = cluster(seed, 2 if seed % 5 == 4 else 12)
         level = level_of(y, normal)
         nearest = accuracy * level.radius
-        e, g, _ = (bound[0] for bound in truncation(level, nearest, order))
+        e, g, _ = (bound[0] for bound in truncation_bounds(level, nearest, order))
         x = viewpoints(level, 1 / accuracy, seed)
         r = np.linalg.norm(x - level.center[0], axis=1)
         value, gradient = terms(level, x, order, 1)
@@ -376,9 +383,9 @@ def test_bounds_are_not_rounded_below_their_series(order: int, accuracy: float) 
         level = level_of(*cluster(seed))
         r, k = accuracy * level.radius[0], order + 2
         powers = [(l, l * (level.radius[0] / r) ** (l - 5) / r**4) for l in range(6, 200)]
-        parts = [(l, level.fourth[0] * term * r**k / r) for l, term in powers]
+        parts = [(l, level.fourth_moment[0] * term * r**k / r) for l, term in powers]
         parts += [(l, sup_norm(level.moments, l)[0] / r ** (l - k)) for l in range(k, 6)]
-        e, g, h = truncation(level, np.array([r]), order)
+        e, g, h = truncation_bounds(level, np.array([r]), order)
         value, slope = sum(one for _, one in parts), sum((l + 1) * one for l, one in parts)
         second = sum((l + 1) * (l + 2) * one for l, one in parts)
         assert second <= np.float32(h[0]) <= second * (1 + 2e-6)
@@ -394,10 +401,10 @@ def test_truncation_is_bounded_for_triangles(order: int) -> None:
         rng = np.random.default_rng(seed)
         corners = rng.normal(size=(8, 1, 3)) * rng.choice([0.1, 1.0], 3)
         corners = corners + rng.choice([0.1, 1.0]) * rng.normal(size=(8, 3, 3))
-        tree = build_hierarchy(corners.mean(axis=1))
-        level = triangle_levels(tree, corners)[-1]
+        tree = build_balanced_tree(corners.mean(axis=1))
+        level = triangle_tree_moments(tree, corners)[-1]
         for accuracy in (1.5, 2.0, 4.0):
-            e = truncation(level, accuracy * level.radius, order)[0][0]
+            e = truncation_bounds(level, accuracy * level.radius, order)[0][0]
             x = viewpoints(level, 1 / accuracy, seed)
             r = np.linalg.norm(x - level.center[0], axis=1)
             off = np.abs(terms(level, x, order, 0)[0] - solid_angles(x, corners))
@@ -413,12 +420,12 @@ def bent(
     normal: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """How far f moves off the linear on steps along `way` (60, 3), and the bound of it."""
-    columns = node_columns(level, 2, rough, np.zeros(1))[0]
+    columns = node_records(level, 2, rough, np.zeros(1))[0]
     np.testing.assert_array_equal(columns[:3], level.center[0])
     assert columns[3] == pytest.approx(rough * level.radius[0])
     x = viewpoints(level, 1 / rough, 7)
     r = np.linalg.norm(x - level.center[0], axis=1)
-    q = part * longest_part(rough)
+    q = part * max_step_fraction(rough)
     t = q * r
     linear = (dipole_gradient(x, y, normal) * way).sum(axis=1) * t
     off = dipole_sum(x + t[:, None] * way, y, normal) - dipole_sum(x, y, normal) - linear
@@ -448,9 +455,9 @@ def test_a_dipole_alone_attains_the_bound_of_its_bend(rough: float) -> None:
     normal = np.array([[0.0, 0, 2], [0, 0, 0], [0, 0, 0]])
     level = level_of(y, normal)
     assert level.radius[0] == pytest.approx(1)
-    columns = node_columns(level, 2, rough, np.zeros(1))[0]
+    columns = node_records(level, 2, rough, np.zeros(1))[0]
     r = 3.0
-    for q in (0.1, longest_part(rough)):
+    for q in (0.1, max_step_fraction(rough)):
         x, way = np.array([[0, 0, r]]), np.array([[0, 0, -1.0]])
         slope = (dipole_gradient(x, y[:1], normal[:1]) * way).sum()
         moved, still = (dipole_sum(at, y[:1], normal[:1])[0] for at in (x + q * r * way, x))

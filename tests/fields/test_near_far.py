@@ -20,16 +20,16 @@ from harnack.backend import Precision, choose_backend, to_numpy, to_vector3
 from harnack.fields.solid_angles import dipole, dipole_cells
 from harnack.fields.solid_angles.dipole_expansion import COEFFICIENTS, DEGREE
 from harnack.fields.solid_angles.local_expansion import (
-    _Sizes,  # pyright: ignore[reportPrivateUsage]
-    irregular,
-    of_cluster,
-    parts,
+    _AbsoluteValues,  # pyright: ignore[reportPrivateUsage]
+    coefficient_keys,
+    evaluate_expansion,
+    irregular_harmonics,
+    local_to_local_matrices,
+    multipole_to_local,
     rounding_tables,
-    shift_matrices,
     tail_factors,
-    value_and_gradient,
 )
-from harnack.fields.solid_angles.multipole import of_dipole, regular
+from harnack.fields.solid_angles.multipole import dipole_moments, regular_harmonics
 from harnack.geometry import example_curves
 from harnack.testing import check_field
 from tests.oracles.direct_sums import dipole_sum
@@ -39,7 +39,7 @@ from tests.tracer.test_cloud_hits import Cloud, cloud, rays, unit
 def moments_of(d: np.ndarray, n: np.ndarray, largest: int) -> Any:
     total: Any = {}
     for at, normal in zip(d, n, strict=True):
-        for key, (re, im) in of_dipole(regular(*at, 4), *normal).items():
+        for key, (re, im) in dipole_moments(regular_harmonics(*at, 4), *normal).items():
             if key[0] <= largest:
                 old = total.get(key, (0.0, 0.0))
                 total[key] = old[0] + re, old[1] + im
@@ -48,8 +48,8 @@ def moments_of(d: np.ndarray, n: np.ndarray, largest: int) -> Any:
 
 def expanded(r: np.ndarray, moments: Any, degree: int) -> np.ndarray:
     largest = max(key[0] for key in moments)
-    seen = irregular(*r, 1 / np.linalg.norm(r), degree + largest)
-    return np.array(of_cluster(moments, seen, degree))
+    seen = irregular_harmonics(*r, 1 / np.linalg.norm(r), degree + largest)
+    return np.array(multipole_to_local(moments, seen, degree))
 
 
 def test_expansions_are_the_sum_over_dipoles() -> None:
@@ -59,17 +59,17 @@ def test_expansions_are_the_sum_over_dipoles() -> None:
     u = 0.2 * unit(rng.normal(size=(50, 3)))
     value, gradient = dipole_sum(d, n)(r + u)
     for k, at in enumerate(u):
-        f, *g = value_and_gradient(found, at, 10)
+        f, *g = evaluate_expansion(found, at, 10)
         np.testing.assert_allclose([f, *g], [value[k], *gradient[k]], atol=2e-5)
 
 
 def test_shifts_are_exact() -> None:
     rng = np.random.default_rng(1)
     given, u = rng.normal(size=COEFFICIENTS), rng.uniform(-0.5, 0.5, 3)
-    before = np.array(value_and_gradient(given, u, DEGREE))
+    before = np.array(evaluate_expansion(given, u, DEGREE))
     corners = itertools.product((-0.28, 0.28), repeat=3)
-    for matrix, corner in zip(shift_matrices(DEGREE, 0.28), corners, strict=True):
-        after = value_and_gradient(matrix @ given, 2 * (u - corner), DEGREE)
+    for matrix, corner in zip(local_to_local_matrices(DEGREE, 0.28), corners, strict=True):
+        after = evaluate_expansion(matrix @ given, 2 * (u - corner), DEGREE)
         np.testing.assert_allclose(after, before * [1, 0.5, 0.5, 0.5], atol=1e-12)
 
 
@@ -86,7 +86,7 @@ def test_the_tail_of_a_dipole_is_bounded_and_attained(q: float) -> None:
     rng = np.random.default_rng(2)
     u = q * np.concatenate([[[0, 0, -1.0]], unit(rng.normal(size=(300, 3)))])
     value, gradient = dipole_sum(at, normal)(r + u)
-    off = np.array([value_and_gradient(found, one, DEGREE) for one in u])
+    off = np.array([evaluate_expansion(found, one, DEGREE) for one in u])
     used = np.abs(off[:, 0] - value) / error
     steep = np.linalg.norm(off[:, 1:] - gradient, axis=1) / slope
     assert used.max() <= 1 + 1e-6
@@ -96,18 +96,24 @@ def test_the_tail_of_a_dipole_is_bounded_and_attained(q: float) -> None:
 
 
 def test_rounding_of_expansions_is_below_what_is_counted() -> None:
-    """`far_sums._Expanded.of`: the sums of absolute values, all coordinates as large as can be."""
+    """`far_sums._ClusterExpansion.of`: the sums of absolute values, all coordinates as large as can
+    be."""
     q = 1 / dipole_cells._NEAR
-    ones = [_Sizes(np.array(1.0))] * 3
+    ones = [_AbsoluteValues(np.array(1.0))] * 3
     for largest in (1, 2, 3, 4):
-        seen = irregular(*ones, _Sizes(np.array(1.0)), DEGREE + largest)
+        seen = irregular_harmonics(*ones, _AbsoluteValues(np.array(1.0)), DEGREE + largest)
         keys = [(largest, m) for m in range(largest + 1)]
         moments: Any = {(l, m): (0.0, 0.0) for l in range(1, largest) for m in range(l + 1)}
         for l, m in keys:
-            size = _Sizes(np.array(1 / math.sqrt(math.factorial(l + m) * math.factorial(l - m))))
+            size = _AbsoluteValues(
+                np.array(1 / math.sqrt(math.factorial(l + m) * math.factorial(l - m)))
+            )
             moments[l, m] = size, size
-        found = of_cluster(moments, seen, DEGREE)
-        powers = [one.number * q**j for (j, _, _), one in zip(parts(DEGREE), found, strict=True)]
+        found = multipole_to_local(moments, seen, DEGREE)
+        powers = [
+            one.number * q**j
+            for (j, _, _), one in zip(coefficient_keys(DEGREE), found, strict=True)
+        ]
         harmonics = rounding_tables(DEGREE, 1 / math.sqrt(3))
         roundings = 0.51 * (9 * DEGREE + 2 * COEFFICIENTS)
         assert (powers @ harmonics / roundings).max() < 2**23
@@ -116,8 +122,8 @@ def test_rounding_of_expansions_is_below_what_is_counted() -> None:
 def sampled(field: hk.DipolePotential, x: np.ndarray, precision: Precision) -> Any:
     backend = choose_backend(precision)
     sample = field.prepare(backend).evaluate(to_vector3(backend, x))
-    dr.eval(sample.value, sample.gradient, sample.error, sample.gradient_error)
-    numbers = sample.value, sample.gradient, sample.error, sample.gradient_error
+    dr.eval(sample.value, sample.gradient, sample.value_error, sample.gradient_error)
+    numbers = sample.value, sample.gradient, sample.value_error, sample.gradient_error
     return tuple(to_numpy(one).astype(np.float64) for one in numbers)
 
 
@@ -139,7 +145,7 @@ def test_errors_are_bounded(n: int, count: int, precision: Precision) -> None:
     value, gradient = dipole_sum(some[0], some[1] * some[2][:, None])(x)
     found, slope, error, slope_error = sampled(hk.DipolePotential(*some, cells=True), x, precision)
     # The bounds leave out the rounding of the point itself.
-    point = 4 * choose_backend(precision).epsilon * np.abs(x).max(axis=1)
+    point = 4 * choose_backend(precision).machine_epsilon * np.abs(x).max(axis=1)
     off = np.abs(found - value) - point * np.linalg.norm(gradient, axis=1) - 1e-6 * np.abs(value)
     assert (off <= error).all()
     known = slope_error < np.linalg.norm(slope, axis=1)
@@ -175,7 +181,7 @@ def test_errors_are_attained(part: float, monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_the_bound_of_bending_is_attained(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Steps in cells are proved by `FieldSums.s4`. Of a dipole alone it is exact at the centers of
+    """Steps in cells are proved by `SourceSums.s4`. Of a dipole alone it is exact at the centers of
     the cells that take it into account themselves: a thousandth less would be too little."""
     monkeypatch.setattr(dipole_cells, "_MOST_NEAR", 0)
     point = np.full((1, 3), 0.3)
@@ -202,14 +208,14 @@ def compare(some: Cloud, o: np.ndarray, d: np.ndarray, **settings: Any) -> None:
     with_cells = hk.DipolePotential(*some, cells=True)
     plain = hk.trace(hk.DipolePotential(*some), o, d, **settings)
     hits = hk.trace(with_cells, o, d, **settings)
-    assert not (hits.status == hk.Status.OUT_OF_STEPS).any()
-    assert (plain.hit != hits.hit).mean() < 2e-3
+    assert not (hits.status == hk.RayStatus.OUT_OF_STEPS).any()
+    assert (plain.is_hit != hits.is_hit).mean() < 2e-3
     # Where one hits before the other, the level is within its tolerance there; with what single
     # precision does to positions.
     near = 1.3e-4 + 1e-6 * np.abs(o).max()
     value_at = dipole_sum(some[0], some[1] * some[2][:, None])
     for one, other in ((plain, hits), (hits, plain)):
-        early = np.flatnonzero(one.hit & (one.t < other.t - 10 * near))
+        early = np.flatnonzero(one.is_hit & (one.t < other.t - 10 * near))
         assert len(early) < 0.02 * len(o)
         if len(early):
             x = o[early] + one.t[early, None] * d[early]
@@ -283,18 +289,18 @@ def test_solids_tell_their_parts_how_many_rays_there_will_be() -> None:
     curve = hk.SolidAngle(example_curves.torus_knot(2, 3, 60))
     knot = hk.solid(curve, around=(2 * math.pi, 0.4))
     inside = hk.solid(hk.DipolePotential(points, normals, areas), above=2 * math.pi)
-    solid = (inside.scaled(2.0) - knot.moved((1.0, 0, 0))).grown(0.01)
-    assert solid.for_rays(1000) is solid
-    assert not knot.has_detail
-    many = solid.for_rays(10**8)
-    assert many.for_rays(10) is many
-    assert solid.for_rays(10**8) is many
-    assert knot.for_rays(10**8).has_detail
+    solid = (inside.scaled(2.0) - knot.translated((1.0, 0, 0))).offset(0.01)
+    assert solid.for_ray_count(1000) is solid
+    assert not knot.has_variable_accuracy
+    many = solid.for_ray_count(10**8)
+    assert many.for_ray_count(10) is many
+    assert solid.for_ray_count(10**8) is many
+    assert knot.for_ray_count(10**8).has_variable_accuracy
     o = np.random.default_rng(3).normal(size=(2000, 3)) * 0.2 + [0.0, 0.0, 6.0]
     d = np.random.default_rng(4).uniform(-2, 2, (2000, 3)) - o
     hits, same = (hk.trace(one, o, d) for one in (solid, many))
-    assert (np.asarray(hits.hit) == np.asarray(same.hit)).mean() > 0.998
-    both = np.asarray(hits.hit & same.hit)
+    assert (np.asarray(hits.is_hit) == np.asarray(same.is_hit)).mean() > 0.998
+    both = np.asarray(hits.is_hit & same.is_hit)
     apart = np.abs(np.asarray(hits.t)[both] - np.asarray(same.t)[both])
     assert np.quantile(apart, 0.99) < 1e-3
 
@@ -321,16 +327,16 @@ def builds(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 def test_many_rays_get_cells_by_themselves(monkeypatch: pytest.MonkeyPatch) -> None:
     some = cloud(300)
     field = hk.DipolePotential(*some)
-    assert field.for_rays(99_999) is field
-    with_cells = field.for_rays(100_000)
+    assert field.for_ray_count(99_999) is field
+    with_cells = field.for_ray_count(100_000)
     assert with_cells.cells is True
-    assert field.for_rays(200_000) is with_cells
+    assert field.for_ray_count(200_000) is with_cells
     assert field.cells is None
     for given in (False, 3.0):
         refused = hk.DipolePotential(*some, cells=given)
-        assert refused.for_rays(10**8) is refused
+        assert refused.for_ray_count(10**8) is refused
     smooth = hk.DipolePotential(*some, smoothing=0.05)
-    assert smooth.for_rays(10**8) is smooth
+    assert smooth.for_ray_count(10**8) is smooth
     # Tracing asks for them.
     monkeypatch.setattr(dipole, "_LEAST_RAYS", 1000)
     monkeypatch.setattr(dipole, "_PAYS", 1)
@@ -343,7 +349,7 @@ def test_many_rays_get_cells_by_themselves(monkeypatch: pytest.MonkeyPatch) -> N
     hk.trace(field, *many)
     assert len(made) == 1
     plain = hk.trace(hk.DipolePotential(*some, cells=False), *many)
-    assert (plain.hit != hits.hit).mean() < 2e-3
+    assert (plain.is_hit != hits.is_hit).mean() < 2e-3
     hk.render(field, size=(32, 32), show="shaded", progress=False)
     assert len(made) == 1
 
@@ -351,7 +357,7 @@ def test_many_rays_get_cells_by_themselves(monkeypatch: pytest.MonkeyPatch) -> N
 def test_cells_do_not_depend_on_how_many_are_made_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     tables: list[np.ndarray] = []
     for at_once in (1 << 14, 37):
-        monkeypatch.setattr(dipole_cells, "_AT_ONCE", at_once)
+        monkeypatch.setattr(dipole_cells, "_CHUNK_SIZE", at_once)
         field = hk.DipolePotential(*cloud(300), cells=True)
         on = field.prepare(choose_backend("double"))._device
         assert on is not None
@@ -365,10 +371,10 @@ def test_cells_do_not_depend_on_how_many_are_made_at_once(monkeypatch: pytest.Mo
 def test_very_many_rays_get_smaller_cells(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(dipole, "_LEAST_RAYS", 1000)
     field = hk.DipolePotential(*cloud(600))
-    some, many = field.for_rays(5000), field.for_rays(60 * 600)
+    some, many = field.for_ray_count(5000), field.for_ray_count(60 * 600)
     assert some is not many
-    assert field.for_rays(10**9) is many
-    assert field.for_rays(6000) is some
+    assert field.for_ray_count(10**9) is many
+    assert field.for_ray_count(6000) is some
     counts: list[int] = []
     for one in (some, many, hk.DipolePotential(*cloud(600), cells=True)):
         on = one.prepare(choose_backend("single"))._device
@@ -380,7 +386,7 @@ def test_very_many_rays_get_smaller_cells(monkeypatch: pytest.MonkeyPatch) -> No
 
 def test_moved_points_keep_cells() -> None:
     some = cloud(200)
-    moved = hk.DipolePotential(*some, cells=8).moved(1.5 * some[0], some[1], 2.25 * some[2])
+    moved = hk.DipolePotential(*some, cells=8).with_points(1.5 * some[0], some[1], 2.25 * some[2])
     assert moved.cells == 8
     x = places(some, 500, 6)
     value, _ = dipole_sum(1.5 * some[0], some[1] * 2.25 * some[2][:, None])(x)
@@ -434,7 +440,7 @@ def test_values_have_cells_where_those_were_asked_for(monkeypatch: pytest.Monkey
     """And the same as rays; not where rays asked for them."""
     made = builds(monkeypatch)
     some, x = cloud(300), np.eye(3)
-    hk.DipolePotential(*some).for_rays(10**9).value(x)
+    hk.DipolePotential(*some).for_ray_count(10**9).value(x)
     hk.DipolePotential(*some, cells=False).value(x)
     assert not made
     field = hk.DipolePotential(*some, cells=True)

@@ -14,8 +14,8 @@ from harnack.testing import check_field
 WAVES = hk.HeightField(lambda x, y: 0.3 * hk.sin(3 * x) * hk.cos(3 * y))
 THREE = {1: 1, -1: 1, 1j: -1}
 CURVES = {
-    "charges": hk.LevelCurves("log", of=THREE),
-    "angles": hk.LevelCurves("log", "imag", of=THREE, level=1.0),
+    "charges": hk.LevelCurves("log", argument=THREE),
+    "angles": hk.LevelCurves("log", "imag", argument=THREE, level=1.0),
     "cubic": hk.LevelCurves({0: 1, 1: 1, 1j: 1}, level=0.2),
     "pole": hk.LevelCurves({0.3: -2}, "imag", level=0.5),
 }
@@ -55,8 +55,8 @@ def check_curves(name: str, n: int, precision: Any, bound: Any, samples: int) ->
     field = CURVES[name]
     o, d = rays(n)
     hits = hk.trace(field, o, d, precision=precision, bound=bound)
-    hit = hits.status == hk.Status.HIT
-    assert (hits.status != hk.Status.OUT_OF_STEPS).all()
+    hit = hits.status == hk.RayStatus.HIT
+    assert (hits.status != hk.RayStatus.OUT_OF_STEPS).all()
     assert hit.sum() > 0.2 * n
     share = np.linspace(0, 1, samples)
     end = np.where(hit, hits.t - 3e-4, 8.0)
@@ -96,7 +96,7 @@ def check_heights(n: int, precision: Any) -> None:
     target = rng.uniform(-1, 1, (n, 3)) * [1, 1, 0.3]
     d = (target - o) / np.linalg.norm(target - o, axis=1, keepdims=True)
     hits = hk.trace(WAVES, o, d, precision=precision)
-    hit = hits.status == hk.Status.HIT
+    hit = hits.status == hk.RayStatus.HIT
     assert hit.sum() > 0.5 * n
     end = np.where(hit, hits.t - 3e-4, 6.0)
     p = o[:, None] + (end[:, None] * np.linspace(0, 1, 1500))[..., None] * d[:, None]
@@ -128,7 +128,7 @@ def test_height_fields_are_clipped_to_their_heights() -> None:
 
 def test_harnack_in_the_plane_takes_few_steps() -> None:
     """The lemniscate |z^2 - 1| = 1 from a horizontal ray: it meets the axis at sqrt 2."""
-    field = hk.LevelCurves("log", of={1: 1, -1: 1})
+    field = hk.LevelCurves("log", argument={1: 1, -1: 1})
     hits = hk.trace(field, [[3.0, 0, 0]], [[-1, 0, 0]], bound="slope")
     assert hits.t[0] == pytest.approx(3 - math.sqrt(2), abs=1e-3)
     assert hits.evaluations[0] < 20

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 import harnack as hk
-from harnack.enclosures import Curvature, HarmonicBall, Lipschitz, choose_proofs
-from harnack.enclosures.selection import BOUNDS
+from harnack.enclosures import HarmonicBall, Lipschitz, TaylorRemainder, choose_enclosures
+from harnack.enclosures.selection import ENCLOSURE_NAMES
 from harnack.fields import Field, Sample
 from harnack.geometry import example_curves
 from harnack.testing import BrokenPromiseError, check_field
@@ -46,7 +46,7 @@ def steep(width: float) -> tuple[Any, ...]:
 
 
 def bent(width: float) -> tuple[Any, ...]:
-    return (Curvature(2.001 / width**2),)
+    return (TaylorRemainder(2.001 / width**2),)
 
 
 @pytest.mark.few(2)
@@ -94,7 +94,7 @@ class Logarithm(Field):
     domain = hk.Box((0.01, -1, -1), (2, 1, 1))
 
     def evaluate(self, p: Any) -> Sample:
-        return Sample(dr.log(p.x), type(p)(1 / p.x, 0, 0), (Lipschitz(100.0), Curvature(1e4)))
+        return Sample(dr.log(p.x), type(p)(1 / p.x, 0, 0), (Lipschitz(100.0), TaylorRemainder(1e4)))
 
 
 class Square(Field):
@@ -149,11 +149,11 @@ WRONG: dict[str, tuple[Callable[[Any], Any], str]] = {
     "nothing": (lambda p: None, "returned nothing, not a Sample"),
     "a bare promise": (
         lambda p: Sample(number(p), p, Lipschitz(1.0)),  # type: ignore[arg-type]
-        "Sample.known is an object of type Lipschitz, not a tuple",
+        "Sample.promises is an object of type Lipschitz, not a tuple",
     ),
     "numbers for promises": (
         lambda p: Sample(number(p), p, (1.0,)),  # type: ignore[arg-type]
-        "Sample.known holds an object of type float, no promise",
+        "Sample.promises holds an object of type float, no promise",
     ),
     "a number for a gradient": (
         lambda p: Sample(number(p), number(p), (Lipschitz(1.0),)),
@@ -181,7 +181,7 @@ def test_what_evaluate_must_return_is_said_at_first_use(name: str, use: str) -> 
     }
     with pytest.raises(TypeError, match=message) as raised:
         uses[use]()
-    assert "return harnack.Sample(value, gradient, known)" in str(raised.value)
+    assert "return harnack.Sample(value, gradient, promises)" in str(raised.value)
 
 
 class Charge(Field):
@@ -211,12 +211,12 @@ def test_bounds_that_do_not_apply_name_those_that_do(
         hk.trace(field, *RAY, bound=bound)
     named = set(re.findall(r'"(.+?)"', str(raised.value)))
     assert named >= some
-    for name in BOUNDS:
+    for name in ENCLOSURE_NAMES:
         with nullcontext() if name in named else pytest.raises(ValueError, match="no bound appl"):
-            hk.trace(field, *RAY, bound=choose_proofs(name).kinds[0])
+            hk.trace(field, *RAY, bound=choose_enclosures(name).kinds[0])
 
 
 def test_a_promise_is_needed_and_half_a_range_is_enough() -> None:
-    with pytest.raises(ValueError, match=r"Sample\.known is empty.*Lipschitz"):
+    with pytest.raises(ValueError, match=r"Sample\.promises is empty.*Lipschitz"):
         hk.trace(Bell(lambda w: (), 1.0, 2.0), *RAY)
-    assert hk.trace(Charge(), *RAY).hit.all()
+    assert hk.trace(Charge(), *RAY).is_hit.all()

@@ -127,9 +127,9 @@ def test_rays_hit_every_triangle_and_nothing_else() -> None:
     right = crossings(original, o, d)
     w = field(original)
     first = hk.trace(w, o, d, precision="double")
-    assert ((first.sheet >= 0) == np.isfinite(right[:, 0])).all()
+    assert ((first.primitive_index >= 0) == np.isfinite(right[:, 0])).all()
     assert np.isfinite(right[:, 0]).sum() > 200
-    hit = np.asarray(first.hit)
+    hit = np.asarray(first.is_hit)
     assert np.abs(first.t[hit] - right[hit, 0]).max() < 1e-12
     every = hk.trace(w, o, d, precision="double", all_hits=4)
     assert (every.count == np.isfinite(right).sum(axis=1)).all()
@@ -151,7 +151,7 @@ def test_distances_are_those_from_the_triangles() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("level", [2 * math.pi, math.pi])
 def test_what_was_written_is_read_back(level: float) -> None:
-    result = hk.mesh(hk.SolidAngle(SADDLE), level, tolerance=1e-2, spacing=0.25)
+    result = hk.mesh(hk.SolidAngle(SADDLE), level, tolerance=1e-2, cell_size=0.25)
     written: Any = result.export(file_type="stl")
     w = field(trimesh.load(io.BytesIO(written), file_type="stl"))  # pyright: ignore
     levels = (-0.75, -0.5, -0.25, 0.25, 0.5, 0.75)

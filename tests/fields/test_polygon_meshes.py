@@ -14,10 +14,10 @@ import pytest
 import harnack as hk
 from harnack.backend import Backend, backend_of, choose_backend, to_numpy, to_vector3
 from harnack.backend.validation import FloatArray
-from harnack.fields.capabilities import NO_SHEET
+from harnack.fields.capabilities import NO_FACET
 from harnack.geometry.example_meshes import bumpy_sphere, icosphere
 from harnack.geometry.meshes import MeshError
-from harnack.geometry.polygon_meshes import polygon_patches
+from harnack.geometry.polygon_meshes import cluster_into_polygons
 from harnack.rendering import Camera
 from harnack.testing import check_field
 from harnack.tree.closest_triangles import NO_BOX, BoxTree
@@ -29,7 +29,7 @@ SQUARE = np.array([(0.0, 0, 0), (1, 0, 0.2), (1, 1, 0), (0, 1, 0.2)])
 
 
 def patches(count: int, subdivisions: int = 3) -> tuple[FloatArray, list[list[list[int]]]]:
-    return polygon_patches(*bumpy_sphere(subdivisions), count)
+    return cluster_into_polygons(*bumpy_sphere(subdivisions), count)
 
 
 def hostile() -> hk.PolygonMesh:
@@ -68,12 +68,12 @@ def by_face(
     """First hits of all faces, traced one by one without any box: t, face and normal."""
     t, face = np.full(len(o), np.inf), np.full(len(o), -1)
     normal = np.zeros((len(o), 3))
-    for k in range(mesh.faces.count):
+    for k in range(mesh.faces.face_count):
         field = mesh.face(k)
         field.extent = lambda levels: None  # type: ignore[method-assign]
         hits = hk.trace(field, o, d, t_max=8.0, **settings)
-        assert not (hits.status == hk.Status.OUT_OF_STEPS).any()
-        nearer = hits.hit & (hits.t < t)
+        assert not (hits.status == hk.RayStatus.OUT_OF_STEPS).any()
+        nearer = hits.is_hit & (hits.t < t)
         t[nearer], face[nearer], normal[nearer] = hits.t[nearer], k, hits.normal[nearer]
     return t, face, normal
 
@@ -81,7 +81,7 @@ def by_face(
 class OnePart(hk.Field):
     """One part of a field, as a field of its own."""
 
-    def __init__(self, whole: hk.PolygonMesh | hk.Tubes, index: int) -> None:
+    def __init__(self, whole: hk.PolygonMesh | hk.TubeNetwork, index: int) -> None:
         self.whole, self.index, self.one = whole, index, whole
         self.period, self.default_level = whole.period, whole.default_level  # type: ignore[misc]
         lower, upper = (ends[index] for ends in whole.boxes())
@@ -89,7 +89,7 @@ class OnePart(hk.Field):
 
     def prepare(self, backend: Backend) -> hk.Field:
         made = copy.copy(self)
-        made.one = self.whole.prepare(backend).part_at(dr.opaque(backend.UInt32, self.index))
+        made.one = self.whole.prepare(backend).patch(dr.opaque(backend.UInt32, self.index))
         return made
 
     def evaluate(self, p: Any) -> hk.Sample:
@@ -97,8 +97,8 @@ class OnePart(hk.Field):
             return self.prepare(backend_of(p)).evaluate(p)
         return self.one.evaluate(p)
 
-    def look(self, path: Any, t: Any, ahead: Any, back: Any) -> Any:
-        return self.one.look(path, t, ahead, back)
+    def sample_ray(self, path: Any, t: Any, ahead: Any, back: Any) -> Any:
+        return self.one.sample_ray(path, t, ahead, back)
 
     def extent(self, levels: tuple[float, ...]) -> hk.Box:
         return self.box
@@ -112,7 +112,7 @@ def test_parts_keep_their_promises(index: int) -> None:
 
 @pytest.mark.slow
 def test_segments_keep_their_promises() -> None:
-    tubes = hk.Tubes(10 * SQUARE, [[0, 1], [1, 2], [0, 2]], [0.5, 0.1, 1e-3])
+    tubes = hk.TubeNetwork(10 * SQUARE, [[0, 1], [1, 2], [0, 2]], [0.5, 0.1, 1e-3])
     for index in range(3):
         check_field(OnePart(tubes, index), count=60, directions=4)
 
@@ -126,13 +126,13 @@ def test_rays_enter_all_boxes_in_order(precision: Any) -> None:
     o, d = rng.uniform(-2, 2, (50, 3)), rng.normal(size=(50, 3))
     d[:9] = np.repeat(np.eye(3), 3, axis=0) * np.array([1, -1, 1])  # along axes
     d /= np.linalg.norm(d, axis=1)[:, None]
-    tree = BoxTree.of(backend, middle - half, middle + half)
+    tree = BoxTree.from_corners(backend, middle - half, middle + half)
     origin, direction = to_vector3(backend, o), to_vector3(backend, d)
     start, end = dr.full(backend.Float, 0.25, 50), dr.full(backend.Float, 2.0, 50)
     behind = dr.full(backend.Float, -1.0, 50), dr.full(backend.UInt32, NO_BOX, 50)
     entered: list[list[tuple[float, float, int]]] = [[] for _ in range(50)]
     for _ in range(301):
-        near, far, box = tree.next(origin, direction, behind, start, end, True)
+        near, far, box = tree.next_box(origin, direction, behind, start, end, True)
         dr.eval(near, far, box)
         behind = near, box
         for k, one in enumerate(zip(to_numpy(near), to_numpy(far), to_numpy(box), strict=True)):
@@ -164,16 +164,16 @@ def assert_same_hits(mesh: hk.PolygonMesh, n: int, precision: Any, **settings: A
     hits = hk.trace(mesh, o, d, t_max=8.0, **settings)
     t, face, normal = by_face(mesh, o, d, **settings)
     # Rays that the one hits and the other does not pass an edge within the tolerance.
-    assert (hits.hit != np.isfinite(t)).sum() <= n / 1000
-    both = hits.hit & np.isfinite(t)
+    assert (hits.is_hit != np.isfinite(t)).sum() <= n / 1000
+    both = hits.is_hit & np.isfinite(t)
     assert both.sum() > n / 10
-    same = both & (hits.sheet == face)
+    same = both & (hits.primitive_index == face)
     assert same.sum() >= 0.995 * both.sum()
     off = np.abs(hits.t[same] - t[same])
     assert (off > 2e-3).sum() <= n / 1000  # grazing
     turned = np.einsum("ij,ij->i", hits.normal, normal) < 0.9
     assert (turned & same).sum() <= 0.005 * n
-    assert (hits.sheet[~hits.hit] == -1).all()
+    assert (hits.primitive_index[~hits.is_hit] == -1).all()
 
 
 @pytest.mark.few(1)
@@ -215,8 +215,8 @@ def test_rays_along_edges_and_through_vertices(precision: Any, level: float) -> 
         for o, d in ways:
             hits = hk.trace(mesh, o, d, t_max=8.0, **settings)
             t, _, _ = by_face(mesh, o, d, **settings)
-            assert not (hits.status == hk.Status.OUT_OF_STEPS).any()
-            found = np.where(hits.hit, hits.t, np.inf)
+            assert not (hits.status == hk.RayStatus.OUT_OF_STEPS).any()
+            found = np.where(hits.is_hit, hits.t, np.inf)
             with np.errstate(invalid="ignore"):
                 apart = (found != t) & ~(np.abs(found - t) < 1e-2)
             assert apart.sum() <= 6
@@ -230,9 +230,9 @@ def test_hits_move_with_the_mesh(scale: float, shift: float) -> None:
     plain = hk.trace(hk.PolygonMesh(vertices, faces), o, d, tolerance=1e-4)
     mesh = hk.PolygonMesh(scale * vertices + shift, faces)
     moved = hk.trace(mesh, scale * o + shift, d, tolerance=1e-4 * scale)
-    assert (moved.hit != plain.hit).sum() <= 2
-    both = moved.hit & plain.hit & (moved.sheet == plain.sheet)
-    assert both.sum() >= 0.98 * plain.hit.sum()
+    assert (moved.is_hit != plain.is_hit).sum() <= 2
+    both = moved.is_hit & plain.is_hit & (moved.primitive_index == plain.primitive_index)
+    assert both.sum() >= 0.98 * plain.is_hit.sum()
     np.testing.assert_allclose(moved.t[both] / scale, plain.t[both], atol=2e-2)
     assert np.median(np.abs(moved.t[both] / scale - plain.t[both])) < 2e-4
 
@@ -242,25 +242,25 @@ def test_rays_start_and_end_anywhere() -> None:
     mesh = hk.PolygonMesh(*patches(24))
     o, d = rays(500, 3, mesh.vertices)
     hits = hk.trace(mesh, o, d)
-    reached = hits.hit & (hits.t > 0.05)
+    reached = hits.is_hit & (hits.t > 0.05)
     before = hk.trace(mesh, o[reached], d[reached], t_max=hits.t[reached] - 0.01)
-    assert not before.hit.any()
+    assert not before.is_hit.any()
     again = hk.trace(mesh, o[reached], d[reached], t_min=hits.t[reached] - 0.01)
     # By another way, and on grazing rays, another point within the tolerance.
     np.testing.assert_allclose(again.t, hits.t[reached], atol=2e-3)
     assert np.median(np.abs(again.t - hits.t[reached])) < 1e-4
-    assert (again.sheet == hits.sheet[reached]).mean() > 0.99
+    assert (again.primitive_index == hits.primitive_index[reached]).mean() > 0.99
 
 
 def test_out_of_steps_is_no_miss() -> None:
     mesh = hk.PolygonMesh(*patches(24))
     o, d = rays(200, 4, mesh.vertices)
     hits, few = hk.trace(mesh, o, d), hk.trace(mesh, o, d, max_steps=3)
-    lost = few.status == hk.Status.OUT_OF_STEPS
+    lost = few.status == hk.RayStatus.OUT_OF_STEPS
     assert lost.any()
-    assert (few.sheet[lost] == -1).all()
+    assert (few.primitive_index[lost] == -1).all()
     assert (few.t[lost] <= hits.t[lost] + 1e-3).all()
-    assert (few.hit <= hits.hit).all()
+    assert (few.is_hit <= hits.is_hit).all()
     assert (few.evaluations <= 3).all()
 
 
@@ -270,12 +270,12 @@ def test_a_face_in_a_lane_is_the_solid_angle_of_that_face(precision: Any) -> Non
     mesh, backend = hostile(), choose_backend(precision)
     rng = np.random.default_rng(5)
     p = rng.uniform(-1.5, 1.5, (600, 3))
-    index = np.arange(600) % mesh.faces.count
+    index = np.arange(600) % mesh.faces.face_count
     prepared = mesh.prepare(backend)
-    part = prepared.part_at(backend.UInt32(index.astype(np.uint32)))
+    part = prepared.patch(backend.UInt32(index.astype(np.uint32)))
     sample = part.evaluate(to_vector3(backend, p))
     tolerance = 2e-4 if precision == "single" else 1e-11
-    for k in range(mesh.faces.count):
+    for k in range(mesh.faces.face_count):
         here, face = index == k, mesh.face(k)
         value = to_numpy(sample.value)[here] - face.value(p[here], precision=precision)
         turns = value / (4 * np.pi)
@@ -284,9 +284,9 @@ def test_a_face_in_a_lane_is_the_solid_angle_of_that_face(precision: Any) -> Non
         size = 1 + np.abs(gradient).max()
         np.testing.assert_allclose(to_numpy(sample.gradient)[here], gradient, atol=tolerance * size)
         alone = face.prepare(backend).evaluate(to_vector3(backend, p[here]))
-        for one, mine in zip(alone.known, sample.known, strict=True):
-            assert isinstance(one, hk.Curvature)
-            assert isinstance(mine, hk.Curvature)
+        for one, mine in zip(alone.promises, sample.promises, strict=True):
+            assert isinstance(one, hk.TaylorRemainder)
+            assert isinstance(mine, hk.TaylorRemainder)
             for ours, its in ((mine.radius, one.radius), (mine.constant, one.constant)):
                 np.testing.assert_allclose(
                     to_numpy(ours)[here], to_numpy(its), rtol=1e-3, atol=1e-5
@@ -298,7 +298,7 @@ def test_a_face_in_a_lane_is_the_solid_angle_of_that_face(precision: Any) -> Non
 def test_boxes_hold_the_surfaces(level: float) -> None:
     for mesh in (hostile(), hk.PolygonMesh(*patches(12))):
         lower, upper = mesh.boxes((level,))
-        for k in range(mesh.faces.count):
+        for k in range(mesh.faces.face_count):
             face = mesh.face(k)
             face.extent = lambda levels: None  # type: ignore[method-assign]
             middle = np.concatenate(mesh.faces.loops(k)).mean(axis=0)
@@ -306,7 +306,7 @@ def test_boxes_hold_the_surfaces(level: float) -> None:
             o = middle + 3 * rng.normal(size=(1000, 3))
             d = middle + 0.3 * rng.normal(size=(1000, 3)) - o
             hits = hk.trace(face, o, d, level=level, t_max=20.0, precision="double", confirm=True)
-            seen = hits.position[hits.hit]
+            seen = hits.position[hits.is_hit]
             assert len(seen)
             assert (seen >= lower[k] - 1e-6).all()
             assert (seen <= upper[k] + 1e-6).all()
@@ -352,11 +352,11 @@ def test_derivatives_by_rays() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("show", ["shaded", pytest.param("color", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("show", ["shaded", pytest.param("path", marks=pytest.mark.slow)])
 def test_pictures(show: str) -> None:
     vertices, faces = patches(24)
     mesh = hk.PolygonMesh(vertices, faces)
-    tubes = hk.Tubes(mesh.vertices, mesh.edges, 0.02)
+    tubes = hk.TubeNetwork(mesh.vertices, mesh.edges, 0.02)
     settings: dict[str, Any] = {"show": show, "size": (64, 48), "spp": 4, "camera": Camera()}
     alone = hk.render(mesh, **settings)
     both = hk.render([mesh, tubes], material=["eggshell", "gold"], **settings)
@@ -419,17 +419,17 @@ def test_tubes_are_the_union_of_tubes(precision: Any) -> None:
     edges = np.unique(np.sort(edges, axis=1), axis=0)
     radius = np.linspace(0.02, 0.1, len(edges))
     o, d = rays(400, 7, vertices)
-    hits = hk.trace(hk.Tubes(vertices, edges, radius), o, d, level=0.01, precision=precision)
+    hits = hk.trace(hk.TubeNetwork(vertices, edges, radius), o, d, level=0.01, precision=precision)
     t, which = np.full(len(o), np.inf), np.full(len(o), -1)
     for k, (pair, r) in enumerate(zip(edges, radius, strict=True)):
         one = hk.trace(hk.Tube(vertices[pair], r), o, d, level=0.01, precision=precision)
-        nearer = one.hit & (one.t < t)
+        nearer = one.is_hit & (one.t < t)
         t[nearer], which[nearer] = one.t[nearer], k
-    assert (hits.hit == np.isfinite(t)).mean() > 0.995
-    both = hits.hit & np.isfinite(t) & (hits.sheet == which)
-    assert both.sum() > 0.98 * hits.hit.sum() > 100
+    assert (hits.is_hit == np.isfinite(t)).mean() > 0.995
+    both = hits.is_hit & np.isfinite(t) & (hits.primitive_index == which)
+    assert both.sum() > 0.98 * hits.is_hit.sum() > 100
     assert np.median(np.abs(hits.t[both] - t[both])) < 1e-4
-    assert NO_SHEET == 2**32 - 1
+    assert NO_FACET == 2**32 - 1
 
 
 @pytest.mark.parametrize(
@@ -447,16 +447,16 @@ def test_tubes_are_the_union_of_tubes(precision: Any) -> None:
 )
 def test_bad_tubes_are_refused(points: Any, segments: Any, radius: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        hk.Tubes(points, segments, radius)
+        hk.TubeNetwork(points, segments, radius)
 
 
 def test_patches_cover_a_mesh_once() -> None:
     vertices, faces = bumpy_sphere(3)
-    points, polygons = polygon_patches(vertices, faces, 30)
+    points, polygons = cluster_into_polygons(vertices, faces, 30)
     mesh = hk.PolygonMesh(points, polygons)
-    assert 20 <= mesh.faces.count <= 30
+    assert 20 <= mesh.faces.face_count <= 30
     # Each edge is run once each way: what is left of the solid angles of a closed mesh is none.
-    runs = np.column_stack([mesh.faces.corners, mesh.faces.corners[mesh.faces.following]])
+    runs = np.column_stack([mesh.faces.corners, mesh.faces.corners[mesh.faces.next_corner]])
     assert {tuple(run) for run in runs} == {tuple(run[::-1]) for run in runs}
     total = sum(mesh.face(k).value([(0.1, 0, 0)], precision="double") for k in range(30))
     turns = float(np.asarray(total).ravel()[0]) / (4 * math.pi)

@@ -14,10 +14,10 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy
-from harnack.enclosures import Gaps, Slopes
-from harnack.enclosures.extremum import Cusp, Nearest, Sheet
-from harnack.fields.analytic.branches import Branches, Disk, Stretch, complex_type
-from harnack.fields.analytic.plane import branches_of
+from harnack.enclosures import LevelGaps, SlopeRange
+from harnack.enclosures.extremum import BranchPointEnclosure, BranchSample, NearestBranchEnclosure
+from harnack.fields.analytic.branches import Branches, Disk, PlaneSegment, complex_type
+from harnack.fields.analytic.plane import make_branches
 from harnack.testing import BrokenPromiseError, check_field
 from tests.backend.test_kernels import compiled
 
@@ -73,8 +73,8 @@ def root(z: Any) -> Any:
 
 OWN = hk.RiemannSurface(
     root,
-    singular=[hk.BranchPoint(0, power=0.5)],
-    second=lambda z, r: 0.25 * (abs(z) - r) ** -1.5,
+    singular_points=[hk.BranchPoint(0, power=0.5)],
+    second_bound=lambda z, r: 0.25 * (abs(z) - r) ** -1.5,
 )
 HALF, THIRD = Fraction(1, 2), Fraction(1, 3)
 CASES = {
@@ -90,7 +90,9 @@ CASES = {
     "asin": Case(hk.RiemannSurface("asin"), lambda z, h: of_asin(z, h, "imag"), 2.0),
     "real asin": Case(hk.RiemannSurface("asin", "real"), lambda z, h: of_asin(z, h, "real"), 2.0),
     "elliptic": Case(
-        hk.RiemannSurface("sqrt", of={0: 1, 1: 1, -1: 1}, height=0.5, domain=hk.Ball(radius=2.0)),
+        hk.RiemannSurface(
+            "sqrt", argument={0: 1, 1: 1, -1: 1}, height=0.5, domain=hk.Ball(radius=2.0)
+        ),
         of_powers({0: HALF, 1: HALF, -1: HALF}, height=0.5),
         2.0,
     ),
@@ -119,7 +121,7 @@ def hostile_rays(n: int, case: Case, seed: int = 1) -> tuple[np.ndarray, np.ndar
     """Past singular points, at distances from 0 to the radius; a quarter level and a quarter
     upright; half of them start within the ball."""
     rng = np.random.default_rng(seed)
-    points = [point.at for point in case.field.branches.points] or [0j]
+    points = [point.location for point in case.field.branches.branch_points] or [0j]
     at = np.array(points)[rng.integers(len(points), size=n)]
     beside = case.radius * 10.0 ** rng.uniform(-7, 0, n) * (rng.random(n) < 0.9)
     turn = rng.uniform(0, 2 * math.pi, n)
@@ -138,8 +140,8 @@ def hostile_rays(n: int, case: Case, seed: int = 1) -> tuple[np.ndarray, np.ndar
 def check_first_hits(case: Case, o: np.ndarray, d: np.ndarray, precision: Any, samples: int) -> int:
     """No crossing before the first hit, and every hit is at a sheet. Returns how many hits."""
     hits = hk.trace(case.field, o, d, precision=precision)
-    assert (hits.status != hk.Status.OUT_OF_STEPS).all()
-    hit = hits.status == hk.Status.HIT
+    assert (hits.status != hk.RayStatus.OUT_OF_STEPS).all()
+    hit = hits.status == hk.RayStatus.HIT
     across = -np.einsum("nk,nk->n", o, d)
     half = case.radius**2 - np.einsum("nk,nk->n", o, o) + across**2
     half = np.sqrt(np.maximum(half, 0)) * (1 - 1e-6)
@@ -188,13 +190,17 @@ def test_promises_and_looks_of_all_hold(name: str) -> None:
 
 
 def test_a_bound_that_is_too_small_is_found() -> None:
-    wrong = hk.RiemannSurface(root, singular=[0], second=lambda z, r: 0.05 * (abs(z) - r) ** -1.5)
+    wrong = hk.RiemannSurface(
+        root, singular_points=[0], second_bound=lambda z, r: 0.05 * (abs(z) - r) ** -1.5
+    )
     with pytest.raises(BrokenPromiseError):
         check_field(wrong)
 
 
 def test_a_singular_point_left_out_is_found() -> None:
-    wrong = hk.RiemannSurface(root, singular=[5], second=lambda z, r: 0.25 * abs(z) ** -1.5)
+    wrong = hk.RiemannSurface(
+        root, singular_points=[5], second_bound=lambda z, r: 0.25 * abs(z) ** -1.5
+    )
     with pytest.raises(BrokenPromiseError):
         check_field(wrong)
 
@@ -203,7 +209,7 @@ def test_a_branch_point_whose_constant_is_too_small_is_found() -> None:
     """Random rays hardly come near: 1.4 of the square root of 2 passed."""
     point = hk.BranchPoint(0, 0.5, 0.99)
     wrong = hk.RiemannSurface(
-        root, singular=[point], second=lambda z, r: 0.25 * (abs(z) - r) ** -1.5
+        root, singular_points=[point], second_bound=lambda z, r: 0.25 * (abs(z) - r) ** -1.5
     )
     with pytest.raises(BrokenPromiseError, match=r"constant must be at least (1|0.9999)"):
         check_field(wrong, count=20)
@@ -223,13 +229,15 @@ def test_sheets_that_bend_as_far_as_they_may_are_met(rises: bool, factor: float)
     gap = rng.uniform(0.1, 2, n) * near
 
     sheets = [
-        Sheet(Slopes(real(slope), real(slope)), real(beyond))
+        BranchSample(SlopeRange(real(slope), real(slope)), real(beyond))
         for slope, beyond in zip(slopes, (0 * near, far - near), strict=True)
     ]
-    nearest = Nearest(tuple(sheets), sheets[0], real(near), real(near) > 0, real(bend), real(1e9))
+    nearest = NearestBranchEnclosure(
+        tuple(sheets), sheets[0], real(near), real(near) > 0, real(bend), real(1e9)
+    )
     none = real(np.full(n, np.inf))
-    gaps = Gaps(none, real(gap)) if rises else Gaps(real(gap), none)
-    s = factor * to_numpy(nearest.step(gaps))
+    gaps = LevelGaps(none, real(gap)) if rises else LevelGaps(real(gap), none)
+    s = factor * to_numpy(nearest.free_length(gaps))
     # Towards zero sheets fall as fast as they may; away from it the nearest rises so, or falls.
     sign = 1 if rises else -1
     first, second = (
@@ -259,11 +267,11 @@ def test_branches_that_turn_as_far_as_they_may_are_met(factor: float) -> None:
     room = height - (distance - gap)
     across = (0.5 * room / constant) ** (1 / power) * (1 - 2e-5)
     zero, none = real(0 * across), real(np.full(n, np.inf))
-    cusp = Cusp(
+    cusp = BranchPointEnclosure(
         real(height), real(fall), zero, real(across), zero, real(power), real(constant),
         none, real(distance), zero == 0,
     )  # fmt: skip
-    s = factor * to_numpy(cusp.step(Gaps(real(gap), none)))
+    s = factor * to_numpy(cusp.free_length(LevelGaps(real(gap), none)))
     left = height - fall * s - constant * across**power
     passed = left < distance - gap
     assert (s > 0).all()
@@ -275,7 +283,7 @@ def test_few_evaluations_are_needed(name: str, most: float) -> None:
     case = CASES[name]
     hits = hk.trace(case.field, *rays(3000, case.radius))
     assert hits.evaluations.mean() <= most
-    assert hits.evaluations[hits.status == hk.Status.HIT].mean() <= most
+    assert hits.evaluations[hits.status == hk.RayStatus.HIT].mean() <= most
 
 
 @pytest.mark.few(3)
@@ -286,7 +294,7 @@ def test_hits_beside_branch_points_are_near_the_surface(name: str, precision: An
     case = CASES[name]
     o, d = hostile_rays(400, case, seed=7)
     hits = hk.trace(case.field, o, d, precision=precision)
-    x = hits.position[hits.status == hk.Status.HIT].astype(float)
+    x = hits.position[hits.status == hk.RayStatus.HIT].astype(float)
     rng = np.random.default_rng(0)
     shifts = unit(rng.normal(size=(600, 3))) * rng.random((600, 1)) * 4e-4
     p = x[:, None] + shifts
@@ -320,7 +328,7 @@ def test_rays_along_and_through_the_axis_end() -> None:
         hits = hk.trace(CASES["sqrt"].field, o, d, precision=precision)
         # The axis meets the surface at 0 alone, and to a tolerance of 1e-4 up to twice its root.
         assert abs(hits.t[0] - 3) < 0.02
-        assert hits.status[1] == hk.Status.MISS  # |h| <= |z|^(1/2) is less than 0.9 on its way
+        assert hits.status[1] == hk.RayStatus.MISS  # |h| <= |z|^(1/2) is less than 0.9 on its way
         assert hits.t[2] == 0
         assert hits.t[3] == pytest.approx(2, abs=1e-4)
         assert hits.t[4] == pytest.approx(math.sqrt(3), abs=1e-3)
@@ -346,12 +354,12 @@ def test_other_bounds_find_the_same_hits(bound: str) -> None:
 @pytest.mark.parametrize(
     ("branches", "sharpest"),
     [
-        (branches_of("log"), 1.0),
-        (branches_of("sqrt"), 1.0),
-        (branches_of("power", exponent=2.5), 1.0),
-        (branches_of({0: -1}), 1.0),
-        (branches_of("asin"), 0.5),
-        (branches_of({0: 0.5, 1: -0.5, 1j: 2}), 0.2),
+        (make_branches("log"), 1.0),
+        (make_branches("sqrt"), 1.0),
+        (make_branches("power", exponent=2.5), 1.0),
+        (make_branches({0: -1}), 1.0),
+        (make_branches("asin"), 0.5),
+        (make_branches({0: 0.5, 1: -0.5, 1j: 2}), 0.2),
     ],
 )
 def test_second_derivatives_on_stretches_and_disks(branches: Branches, sharpest: float) -> None:
@@ -369,11 +377,13 @@ def test_second_derivatives_on_stretches_and_disks(branches: Branches, sharpest:
         return complex_number(*(backend.Float(one) for one in parts))
 
     def second(points: np.ndarray) -> np.ndarray:
-        found = branches.at(upload(points.ravel()))
+        found = branches.evaluate(upload(points.ravel()))
         return np.max([to_numpy(abs(one.second)) for one in found], axis=0).reshape(points.shape)
 
     start, way, ahead = upload(z), upload(w), backend.Float(length)
-    bound = to_numpy(branches.bend(Stretch(start, way, ahead, backend.Float(0))))
+    bound = to_numpy(
+        branches.second_derivative_bound(PlaneSegment(start, way, ahead, backend.Float(0)))
+    )
     there = second(z[:, None] + w[:, None] * length[:, None] * np.linspace(0, 1, 2001)).max(axis=1)
     assert (there <= bound).all()
     assert np.max(there / bound) > sharpest * (1 - 1e-3)
@@ -381,7 +391,7 @@ def test_second_derivatives_on_stretches_and_disks(branches: Branches, sharpest:
     radius = rng.uniform(0, 0.95, n) * clear
     disk = Disk(start, backend.Float(radius), backend.Float(0))
     circle = z[:, None] + radius[:, None] * np.exp(1j * np.linspace(0, 2 * math.pi, 1000))
-    assert (second(circle).max(axis=1) <= to_numpy(branches.bend(disk))).all()
+    assert (second(circle).max(axis=1) <= to_numpy(branches.second_derivative_bound(disk))).all()
 
 
 def test_values_are_those_of_numpy() -> None:
@@ -421,21 +431,29 @@ def test_extents_are_the_heights_that_there_are() -> None:
         (("power",), {"exponent": math.pi}, "is no fraction"),
         (("power",), {"exponent": "x"}, "must be a rational number"),
         (("sqrt",), {"exponent": 2}, "exponent cannot be given"),
-        (("asin",), {"of": {0: 1}}, "of cannot be given"),
-        (("log",), {"of": {0: 0.5}}, "whole numbers"),
-        (("log",), {"of": {}}, "at least one zero"),
+        (("asin",), {"argument": {0: 1}}, "argument cannot be given"),
+        (("log",), {"argument": {0: 0.5}}, "whole numbers"),
+        (("log",), {"argument": {}}, "at least one zero"),
         (("log", "both"), {}, 'must be "imag" or "real"'),
         (({0: Fraction(1, 23), 1: Fraction(1, 7)},), {}, "161 sheets"),
         (({},), {}, "at least one exponent"),
         (({0: 99},), {}, "at most 6"),
         ((3,), {}, "function must be one of"),
         (("log",), {"height": 0.0}, "other than 0"),
-        ((root,), {}, "needs singular="),
-        ((root,), {"singular": [0], "second": 3}, "second must be a function"),
-        ((root,), {"singular": 0, "second": abs}, "singular must be"),
-        ((lambda z: z,), {"singular": [], "second": abs}, "must return its branches"),
-        ((lambda z: [(z,)],), {"singular": [], "second": abs}, "must return its branches"),
-        ((root,), {"singular": [0], "second": abs, "period": 1.0}, "must have one branch"),
+        ((root,), {}, "needs singular_points="),
+        ((root,), {"singular_points": [0], "second_bound": 3}, "second_bound must be a function"),
+        ((root,), {"singular_points": 0, "second_bound": abs}, "singular_points must be"),
+        ((lambda z: z,), {"singular_points": [], "second_bound": abs}, "must return its branches"),
+        (
+            (lambda z: [(z,)],),
+            {"singular_points": [], "second_bound": abs},
+            "must return its branches",
+        ),
+        (
+            (root,),
+            {"singular_points": [0], "second_bound": abs, "period": 1.0},
+            "must have one branch",
+        ),
     ],
 )
 def test_errors_say_what_is_wrong(arguments: Any, settings: Any, message: str) -> None:
@@ -455,8 +473,8 @@ def test_walls_about_all_sheets_are_met_first(precision: Any) -> None:
     field = hk.RiemannSurface("cbrt")
     o, d = rays(300, 1.0, seed=8)
     hits = hk.trace(field, o, d, level=(-0.05, 0.05), precision=precision)
-    hit = hits.status == hk.Status.HIT
-    assert (hits.status != hk.Status.OUT_OF_STEPS).all()
+    hit = hits.status == hk.RayStatus.HIT
+    assert (hits.status != hk.RayStatus.OUT_OF_STEPS).all()
     across = -np.einsum("nk,nk->n", o, d)
     half = np.sqrt(1 - np.einsum("nk,nk->n", o, o) + across**2) * (1 - 1e-6)
     end = np.where(hit, hits.t - 3e-5, across + half)
@@ -488,7 +506,8 @@ def test_own_branches_without_second_derivatives_say_so() -> None:
 
 @pytest.mark.parametrize("name", ["sqrt", "real asin"])
 def test_rays_past_branch_points_take_no_small_steps(name: str) -> None:
-    """Down to no distance at all: without `Cusp` such rays end out of steps in single precision."""
+    """Down to no distance at all: without `BranchPointEnclosure` such rays end out of steps in
+    single precision."""
     hits = hk.trace(CASES[name].field, *hostile_rays(1000, CASES[name], seed=3))
     assert hits.evaluations.max() <= 40
 

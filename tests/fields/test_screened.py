@@ -12,13 +12,13 @@ from scipy.special import eval_legendre, spherical_in, spherical_kn
 
 import harnack as hk
 from harnack.backend import choose_backend, to_float, to_numpy, to_vector3
-from harnack.enclosures import Curvature, HarmonicBall
-from harnack.fields.solid_angles.radial_kernel import seen_dipole
+from harnack.enclosures import HarmonicBall, TaylorRemainder
+from harnack.fields.solid_angles.radial_kernel import dipole_source
 from harnack.fields.solid_angles.radial_tree import (
-    ClusterMoments,
-    clusters,
+    TaylorMoments,
+    cluster_source,
     coefficients,
-    seen_cluster,
+    taylor_tree_moments,
 )
 from harnack.fields.solid_angles.screened import (
     ScreenedWindingNumber,
@@ -26,13 +26,13 @@ from harnack.fields.solid_angles.screened import (
     accepting_distance,
     thetas,
 )
-from harnack.fields.solid_angles.treecode import dipole_rows
+from harnack.fields.solid_angles.treecode import dipole_records
 from harnack.geometry import example_meshes
 from harnack.geometry.clouds import CloudError
 from harnack.geometry.meshes import MeshError
 from harnack.testing import check_field
-from harnack.testing.violation_search import look_at, random_directions
-from harnack.tree import build_hierarchy
+from harnack.testing.violation_search import random_directions, sample_field
+from harnack.tree import build_balanced_tree
 from tests.oracles.oracle import OracleValues, first_crossings
 
 DOUBLE = choose_backend("double")
@@ -128,7 +128,7 @@ def test_kernel_in_single_precision_from_far_below_a_length_to_a_hundred() -> No
     rng = np.random.default_rng(1)
     n = 20_000
     tau = 10 ** rng.uniform(-4, 2, n)
-    rows = dipole_rows(random_directions(rng, n), random_directions(rng, n))
+    rows = dipole_records(random_directions(rng, n), random_directions(rng, n))
     results = []
     for precision in ("double", "single"):
         backend = choose_backend(precision)  # type: ignore[arg-type]
@@ -137,8 +137,8 @@ def test_kernel_in_single_precision_from_far_below_a_length_to_a_hundred() -> No
         kappa = to_float(backend, tau.astype(np.float32).astype(number))
         yukawa = YukawaKernel(backend, 1.0)
         yukawa.kappa = kappa  # another in each lane
-        terms = seen_dipole(row, backend.Array3f(0), yukawa, 2).terms
-        parts = [terms.value, *terms.gradient, *terms.hessian.parts()]  # type: ignore[union-attr]
+        terms = dipole_source(row, backend.Array3f(0), yukawa, 2).terms
+        parts = [terms.value, *terms.gradient, *terms.hessian.components()]  # type: ignore[union-attr]
         results.append(np.stack([np.broadcast_to(to_numpy(part), n) for part in parts]))
     scale = np.abs(results[0]).max(axis=0)
     some = tau < 79  # beyond that both stay at exp(-80)
@@ -192,13 +192,13 @@ def test_derivatives_are_largest_along_the_line_to_the_pole() -> None:
 # ---------------------------------------------------------------- clusters
 
 
-def seen(level: ClusterMoments, x: np.ndarray, kappa: float) -> tuple[Any, ...]:
+def seen(level: TaylorMoments, x: np.ndarray, kappa: float) -> tuple[Any, ...]:
     """Clusters from x (k, 3): value, gradient, error, gradient_error, sums as NumPy arrays."""
     zeros = np.zeros((len(x), 4))
     head = np.concatenate([zeros, level.radius[:, None], level.weight[:, None]], axis=1)
     c = np.concatenate([coefficients(level), level.third[:, None]], axis=1)
     z = level.center - x
-    source = seen_cluster(
+    source = cluster_source(
         [to_float(DOUBLE, column) for column in head.T],
         [to_float(DOUBLE, column) for column in c.T],
         to_vector3(DOUBLE, z),
@@ -212,8 +212,8 @@ def seen(level: ClusterMoments, x: np.ndarray, kappa: float) -> tuple[Any, ...]:
     )
 
 
-def repeated(level: ClusterMoments, views: int) -> ClusterMoments:
-    return ClusterMoments(*(np.repeat(value, views, axis=0) for value in vars(level).values()))
+def repeated(level: TaylorMoments, views: int) -> TaylorMoments:
+    return TaylorMoments(*(np.repeat(value, views, axis=0) for value in vars(level).values()))
 
 
 @pytest.mark.few(1)
@@ -222,12 +222,12 @@ def test_truncation_stays_within_its_bound(kappa: float) -> None:
     """100,000 views of clusters of 8 to 2048 dipoles, their moments moved up from the leaves."""
     rng = np.random.default_rng(3)
     n = 8192
-    rows = dipole_rows(rng.normal(size=(n, 3)), rng.normal(size=(n, 3)))
-    tree = build_hierarchy(rows[:, :3], leaf_size=8, arity=4)
+    rows = dipole_records(rng.normal(size=(n, 3)), rng.normal(size=(n, 3)))
+    tree = build_balanced_tree(rows[:, :3], leaf_size=8, arity=4)
     worst = 0.0
-    for level, views in zip(clusters(tree, rows)[:5], (25, 40, 40, 40, 40), strict=True):
+    for level, views in zip(taylor_tree_moments(tree, rows)[:5], (25, 40, 40, 40, 40), strict=True):
         count = len(level.radius)
-        members = tree.gather(rows).reshape(count, -1, 8)
+        members = tree.values_in_slots(rows).reshape(count, -1, 8)
         level = repeated(level, views)
         away = level.radius * 10 ** rng.uniform(0.02, 1.5, len(level.radius))
         x = level.center + away[:, None] * random_directions(rng, len(away))
@@ -253,7 +253,7 @@ def test_truncation_bound_is_attained() -> None:
     t2 = np.einsum("ki,kj->kij", m, d)
     t3 = np.einsum("kij,kl->kijl", t2, d)
     radius, one = np.array([0.3]), np.ones(1)
-    level = ClusterMoments(np.zeros((1, 3)), radius, one, radius**3, m, t2, t3)
+    level = TaylorMoments(np.zeros((1, 3)), radius, one, radius**3, m, t2, t3)
     x = np.array([[0.0, 0, 0.7]])
     value, gradient, error, slope = seen(level, x, 1e-9)
     f, g = kernel(d - x, m, 1e-9)
@@ -364,7 +364,7 @@ def test_tree_keeps_its_promises_for_the_exact_function(length: float) -> None:
     for precision in ("double", "single"):
         x = x.astype(np.float32).astype(np.float64)
         f, g = exact(field, x)
-        look = look_at(field, x, precision)  # type: ignore[arg-type]
+        look = sample_field(field, x, precision)  # type: ignore[arg-type]
         sample = field.prepare(choose_backend(precision)).evaluate(  # type: ignore[arg-type]
             to_vector3(choose_backend(precision), x)  # type: ignore[arg-type]
         )
@@ -381,13 +381,13 @@ def test_tree_keeps_its_promises_for_the_exact_function(length: float) -> None:
         )
         assert (off <= doubt + spread + 10 * unit * np.linalg.norm(g, axis=1)).all()
         doubt = doubt + spread
-        for known in look.known:
+        for known in look.promises:
             share = np.linspace(0.1, 0.999, 6)
             for _ in range(2):
                 d = random_directions(rng, len(x))
                 t = known.radius[:, None] * share  # type: ignore[union-attr]
                 there = exact(field, x[:, None] + t[..., None] * d[:, None])[0]
-                if isinstance(known, Curvature):
+                if isinstance(known, TaylorRemainder):
                     line = look.value[:, None] + t * (look.gradient * d).sum(axis=1)[:, None]
                     room = 0.5 * known.constant[:, None] * t * t  # type: ignore[index]
                     room = room + error[:, None] + t * doubt[:, None]
@@ -402,9 +402,9 @@ def test_promises_are_attained_by_one_dipole() -> None:
     """Moving straight at it, without screening: no constant could be smaller."""
     field = field_of((np.zeros((1, 3)), np.array([[0, 0, 1.0]]), np.array([1.0])), 1e9)
     x = np.array([[0.0, 0, 0.8]])
-    look = look_at(field, x)
-    for known in look.known:
-        if isinstance(known, Curvature):
+    look = sample_field(field, x)
+    for known in look.promises:
+        if isinstance(known, TaylorRemainder):
             y = x - (1 - 1e-9) * known.radius * np.array([[0, 0, 1.0]])
             slope = look.gradient[0] @ (y - x)[0]
             bent = abs(exact(field, y)[0] - look.value - slope)
@@ -423,7 +423,7 @@ def test_extension_to_four_dimensions_stays_in_the_ball_range(name: str) -> None
     field = SMALL[name]
     rng = np.random.default_rng(9)
     x = rng.uniform(-1.3, 1.3, (80, 3))
-    (ball,) = [one for one in look_at(field, x).known if isinstance(one, HarmonicBall)]
+    (ball,) = [one for one in sample_field(field, x).promises if isinstance(one, HarmonicBall)]
     assert ball.dimension == 4
     w = rng.normal(size=(80, 200, 4))
     w /= np.linalg.norm(w, axis=2, keepdims=True)
@@ -519,14 +519,14 @@ def compare(field: ScreenedWindingNumber, level: float, seed: int, **options: An
     truth = first_crossings(
         function, o, d, 0.0, 6.0, levels=[level], depth=tolerance, finest=0.5 * tolerance
     )
-    allowed = 5 * tolerance + np.where(hits.hit, blur, 0)
+    allowed = 5 * tolerance + np.where(hits.is_hit, blur, 0)
     missed = hits.t > truth.beyond + allowed
     assert not missed.any(), (o[missed], d[missed], hits.t[missed], truth.beyond[missed])
     away = np.abs(here.value - level) > here.gradient_norm * allowed
-    early = hits.hit & away & (here.smooth > 5 * tolerance)
+    early = hits.is_hit & away & (here.smooth > 5 * tolerance)
     assert not early.any(), (o[early], d[early], hits.t[early], here.value[early])
-    assert not (hits.status == hk.Status.OUT_OF_STEPS).any()
-    return int(hits.hit.sum())
+    assert not (hits.status == hk.RayStatus.OUT_OF_STEPS).any()
+    return int(hits.is_hit.sum())
 
 
 @pytest.mark.few(1)
@@ -557,9 +557,9 @@ def test_rays_at_a_dipole_hit() -> None:
     field = SMALL["sphere"]
     d = field.points[:50]
     hits = hk.trace(field, -2 * d, d, level=0.5)
-    assert hits.hit.all()
+    assert hits.is_hit.all()
     on = hk.trace(field, d, d, level=0.5)
-    assert on.hit.all()
+    assert on.is_hit.all()
 
 
 @pytest.mark.slow
@@ -586,9 +586,9 @@ def test_extent_and_levels() -> None:
     assert narrow is not None
     assert (wide.bounds()[1] > narrow.bounds()[1]).all()
     assert (np.abs(narrow.bounds()[0]) < 1.6).all()
-    field.check_levels((0.0, 0.5, -3.0))
+    field.validate_levels((0.0, 0.5, -3.0))
     with pytest.raises(ValueError, match="too small to be told from 0"):
-        field.check_levels((1e-25,))
+        field.validate_levels((1e-25,))
 
 
 def test_describe() -> None:

@@ -14,15 +14,15 @@ import pytest
 import harnack as hk
 from harnack.arithmetic.norms import blend_intersection, blend_union
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.backend.elementary import length
-from harnack.enclosures import Gaps, choose_proofs
-from harnack.enclosures.selection import longest_step
+from harnack.backend.elementary import safe_norm
+from harnack.enclosures import LevelGaps, choose_enclosures
+from harnack.enclosures.selection import longest_free_length
 from harnack.fields.formula import Formula
-from harnack.fields.samples import Path, value_error
+from harnack.fields.samples import Ray, value_error_bound
 from harnack.fields.solids.fractal import CORNERS, lattice_vector
 from harnack.geometry import example_meshes
-from harnack.meshing.closed_mesh import manifold_of, surface_of
-from harnack.meshing.lattice_meshing import Surface
+from harnack.meshing.closed_mesh import from_manifold, to_manifold
+from harnack.meshing.lattice_meshing import TriangleMesh
 from harnack.testing import check_field
 from tests.oracles.mesh_distance import signed_distance
 
@@ -157,8 +157,8 @@ CROSSING = (
     np.concatenate([CORNERS_OF_FOUR, [0.1, 0.2, 0.0] - CORNERS_OF_FOUR[[0, 1, 3, 2]]]),
     (np.concatenate([FOUR, FOUR + 4])),
 )
-UNITED = surface_of(
-    manifold_of(Surface(CROSSING[0], FOUR)) + manifold_of(Surface(CROSSING[0], FOUR + 4))
+UNITED = from_manifold(
+    to_manifold(TriangleMesh(CROSSING[0], FOUR)) + to_manifold(TriangleMesh(CROSSING[0], FOUR + 4))
 )
 
 SHAPES: dict[str, tuple[Any, Oracle]] = {
@@ -205,17 +205,17 @@ SHAPES: dict[str, tuple[Any, Oracle]] = {
         for p, q in ((4.0, 4.0), (1.2, 1.5))
     },
     "tube": (TUBE, lambda x: segments(x, TUBE.points) - 0.2),
-    "outline": (hk.Extruded(LOOPS, 0.6), lambda x: extruded(x, LOOPS, 0.6)),
+    "outline": (hk.Extrusion(LOOPS, 0.6), lambda x: extruded(x, LOOPS, 0.6)),
     "few edges": (
-        hk.Extruded(LOOPS[1:], 0.6),
+        hk.Extrusion(LOOPS[1:], 0.6),
         lambda x: extruded(x, LOOPS[1:], 0.6),
     ),
     "turned outline": (
-        hk.Extruded(LOOPS, 0.8, twist=70.0, taper=0.6),
+        hk.Extrusion(LOOPS, 0.8, twist=70.0, taper=0.6),
         lambda x: extruded(x, LOOPS, 0.8, 70.0, 0.6),
     ),
     "cup": (
-        hk.Revolved(CUP),
+        hk.SolidOfRevolution(CUP),
         # Mirrored at the axis, where the edges on it are none.
         lambda x: region(
             np.stack([norm(x[..., :2]), x[..., 2]], -1),
@@ -230,7 +230,7 @@ SHAPES: dict[str, tuple[Any, Oracle]] = {
     "thread": (SCREW, lambda x: screw(x, SCREW)),
     "noise": (NOISE, lambda x: noise(x, NOISE)),
     "displaced": (
-        hk.Displaced(hk.Sphere(), FRACTAL),
+        hk.DisplacedSolid(hk.Sphere(), FRACTAL),
         lambda x: norm(x) - 1 + noise(x, FRACTAL),
     ),
     "julia": (hk.Julia(C, 8, 0.1), lambda x: julia(x, C, 8, 0.1)),
@@ -284,13 +284,13 @@ def test_no_level_within_a_step(name: str, precision: Any) -> None:
     ahead = 10.0 ** rng.uniform(-4, 0.5, n)
     gaps = ahead * 10.0 ** rng.uniform(-2, 0.5, (2, n))
     p, along = to_vector3(backend, x), to_vector3(backend, d)
-    path = Path(p, along, choose_proofs(None))
-    look = shape.prepare(backend).look(
+    path = Ray(p, along, choose_enclosures(None))
+    look = shape.prepare(backend).sample_ray(
         path, backend.Float(0), backend.Float(ahead), backend.Float(0)
     )
-    blur = value_error(look.sample, length(look.sample.gradient), 1.5)
-    seen = Gaps(*(backend.Float(one) for one in gaps)).less(blur)
-    step = to_numpy(longest_step(look.ahead, seen)).astype(float) * np.ones(n)
+    blur = value_error_bound(look.sample, safe_norm(look.sample.gradient), 1.5)
+    seen = LevelGaps(*(backend.Float(one) for one in gaps)).reduced_by(blur)
+    step = to_numpy(longest_free_length(look.forward, seen)).astype(float) * np.ones(n)
     start = oracle(x)
     assert (step > 0).mean() > 0.5
 
@@ -366,14 +366,14 @@ def test_constants_of_norms_are_attained(powers: tuple[float, float]) -> None:
 )
 def test_hulls_hold_the_solid(name: str, level: float) -> None:
     shape, oracle = SHAPES[name]
-    hull = shape.hull(level)
+    hull = shape.sublevel_extent(level)
     if name in ("plane", "cylinder", "double cone", "thread", "noise"):
         assert hull is None
         return
     rng = np.random.default_rng(6)
     if name == "julia":
         level *= 0.1
-        hull = shape.hull(level)
+        hull = shape.sublevel_extent(level)
     x = rng.uniform(-2.5, 2.5, (8_000, 3))
     inside = oracle(x) <= level
     assert hull.contains_points(x[inside]).all()
@@ -393,8 +393,8 @@ def test_first_hits(name: str, precision: Any) -> None:
     d /= norm(d)[:, None]
     hits = hk.trace(shape, o, d, t_max=6.0, precision=precision)
     status = np.array(hits.status)
-    assert (status != int(hk.Status.OUT_OF_STEPS)).all()
-    is_hit = status == int(hk.Status.HIT)
+    assert (status != int(hk.RayStatus.OUT_OF_STEPS)).all()
+    is_hit = status == int(hk.RayStatus.HIT)
     end = np.where(is_hit, np.array(hits.t), 6.0)
     t = end[:, None] * np.linspace(0, 1, 501)[:-1]
     start = np.sign(oracle(o))
@@ -468,8 +468,8 @@ def test_flattening_is_as_stated() -> None:
     for start in (0, 3):
         a, b, c, e = CURVE[start : start + 4]
         curve = (1 - t) ** 3 * a + 3 * t * (1 - t) ** 2 * b + 3 * t**2 * (1 - t) * c + t**3 * e
-        assert segments(curve, TUBE.points).max() <= TUBE.flattening + 1e-12
-    assert TUBE.flattening <= 2e-3
+        assert segments(curve, TUBE.points).max() <= TUBE.flattening_error + 1e-12
+    assert TUBE.flattening_error <= 2e-3
     finer = hk.Tube.bezier(CURVE, 0.2, tolerance=1e-5)
     assert finer.describe()["segments"] > 5 * TUBE.describe()["segments"]
 
@@ -477,7 +477,7 @@ def test_flattening_is_as_stated() -> None:
 def test_metric_threads_have_their_sizes() -> None:
     """M8: 8 mm across crests, 6.647 mm across roots (ISO 724), 7.188 mm across the pitch line."""
     pitch = 1.25
-    screw, cut = hk.thread("M8", 20.0), hk.thread("M8", 20.0, internal=True)
+    screw, cut = hk.metric_thread("M8", 20.0), hk.metric_thread("M8", 20.0, internal=True)
     z = 10.0 + pitch * np.linspace(0, 1, 2001)
     for solid in (screw, cut):
         angle = 0.7
@@ -492,7 +492,7 @@ def test_metric_threads_have_their_sizes() -> None:
         assert np.mean(edge > 3.998) == pytest.approx(1 / 8, abs=5e-3)
         assert np.mean(edge < 6.65 / 2) == pytest.approx(1 / 4, abs=5e-3)
     # A screw and its nut are twice the clearance apart, across crests, roots and flanks.
-    loose, wide = hk.thread("M8", 20.0, clearance=0.05), hk.thread(
+    loose, wide = hk.metric_thread("M8", 20.0, clearance=0.05), hk.metric_thread(
         "M8", 20.0, internal=True, clearance=0.05
     )  # fmt: skip
     points = x.reshape(-1, 3)
@@ -505,7 +505,7 @@ def test_metric_threads_have_their_sizes() -> None:
         assert np.median(one[near]) == pytest.approx(0.05, abs=1e-9)
         assert one[near].min() > 0.0249  # beside a corner, where another edge is nearest
     # On the pitch line of M12, 10.863 across: both flanks are 0.2 apart, and not 0.1 and 0.3.
-    bolt, hole = hk.thread("M12", 20.0, clearance=0.1), hk.thread(
+    bolt, hole = hk.metric_thread("M12", 20.0, clearance=0.1), hk.metric_thread(
         "M12", 20.0, internal=True, clearance=0.1
     )  # fmt: skip
     flanks = [[10.863 / 2, 0.0, 7.0 + turn * 1.75] for turn in (-3 / 16, 5 / 16)]
@@ -521,7 +521,7 @@ def test_coils_stay_within_their_flattening() -> None:
     t = np.linspace(0, 6 * np.pi, 5000)
     curve = np.column_stack([2 * np.cos(t), -2 * np.sin(t), 0.5 * t / (2 * np.pi)])
     off = np.abs(coil.value(curve, precision="double") + 0.2).max()
-    assert 0.9 * coil.flattening < off <= coil.flattening <= 2e-4
+    assert 0.9 * coil.flattening_error < off <= coil.flattening_error <= 2e-4
 
 
 @pytest.mark.parametrize(
@@ -542,11 +542,11 @@ def test_coils_stay_within_their_flattening() -> None:
         (lambda: hk.Tube(np.zeros((3, 3)), 0.1), "two points or more"),
         (lambda: hk.Tube(np.zeros((3, 2)), 0.1), "must have shape"),
         (lambda: hk.Tube.bezier(np.zeros((5, 3)), 0.1), "3 n \\+ 1"),
-        (lambda: hk.Extruded(CUP, 0.0), "height of an extruded outline"),
-        (lambda: hk.Extruded(CUP, 1.0, twist=math.inf), "twist of an extruded outline"),
-        (lambda: hk.Extruded(CUP, 1.0, taper=-1.0), "taper of an extruded outline"),
-        (lambda: hk.Extruded([(0, 0), (1, 1)], 1.0), "three points or more"),
-        (lambda: hk.Revolved([(-0.1, 0), (1, 0), (1, 1)]), "lies in r >= 0"),
+        (lambda: hk.Extrusion(CUP, 0.0), "height of an extruded outline"),
+        (lambda: hk.Extrusion(CUP, 1.0, twist=math.inf), "twist of an extruded outline"),
+        (lambda: hk.Extrusion(CUP, 1.0, taper=-1.0), "taper of an extruded outline"),
+        (lambda: hk.Extrusion([(0, 0), (1, 1)], 1.0), "three points or more"),
+        (lambda: hk.SolidOfRevolution([(-0.1, 0), (1, 0), (1, 1)]), "lies in r >= 0"),
         (lambda: hk.Tube.helix(1.0, 1.0, 0.0, 0.1), "its turns must be positive"),
         (lambda: hk.Tube.helix(1.0, 1.0, 1.0, 0.1, tolerance=1e-30), "larger tolerance"),
         (lambda: hk.Thread([(0, 1), (1, 1)], 1.0), "rises by less than the pitch"),
@@ -555,13 +555,13 @@ def test_coils_stay_within_their_flattening() -> None:
         (lambda: hk.Thread([(0, math.nan)], 1.0), "finite"),
         (lambda: hk.Thread([0, 1], 1.0), "has shape"),
         (lambda: hk.Thread([(0, 1)], 1.0, starts=0), "starts of a thread"),
-        (lambda: hk.thread("8", 10.0), "named as"),
-        (lambda: hk.thread(8, 10.0), "named as"),
-        (lambda: hk.thread("M13", 10.0), "no coarse thread M13"),
-        (lambda: hk.thread("M8x7", 10.0), "leaves no core"),
-        (lambda: hk.thread("M8", 1.0), "must be longer"),
-        (lambda: hk.thread("M8", 10.0, clearance=0.2), "clearance of M8"),
-        (lambda: hk.thread("M8", 10.0, clearance=-0.1), "clearance of M8"),
+        (lambda: hk.metric_thread("8", 10.0), "named as"),
+        (lambda: hk.metric_thread(8, 10.0), "named as"),
+        (lambda: hk.metric_thread("M13", 10.0), "no coarse thread M13"),
+        (lambda: hk.metric_thread("M8x7", 10.0), "leaves no core"),
+        (lambda: hk.metric_thread("M8", 1.0), "must be longer"),
+        (lambda: hk.metric_thread("M8", 10.0, clearance=0.2), "clearance of M8"),
+        (lambda: hk.metric_thread("M8", 10.0, clearance=-0.1), "clearance of M8"),
         (lambda: hk.Noise(0.0), "frequency of noise"),
         (lambda: hk.Noise(fade="linear"), "quintic"),
         (lambda: hk.FractalNoise(0), "octaves"),

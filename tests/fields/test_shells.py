@@ -22,7 +22,7 @@ def test_beams_lie_on_the_shell(name: str) -> None:
     field, tube = shell.field, beams.field
     assert isinstance(field, hk.SolidAngle)
     assert isinstance(tube, hk.Tube)
-    assert field.describe()["certificate"] == "planar"
+    assert field.describe()["lift_bound"] == "planar"
     assert len(tube.starts) > 25
     points = tube.points[tube.points[:, 2] > 0.02]
     assert len(points) > 200
@@ -34,5 +34,5 @@ def test_beams_lie_on_the_shell(name: str) -> None:
     rng = np.random.default_rng(0)
     o = np.array([3.0, -2.5, 2.5]) + 0 * points[:300]
     hits = hk.trace(shell, o, rng.permutation(points)[:300] - o)
-    assert hits.hit.mean() > 0.95
-    assert (hits.status != hk.Status.OUT_OF_STEPS).all()
+    assert hits.is_hit.mean() > 0.95
+    assert (hits.status != hk.RayStatus.OUT_OF_STEPS).all()

@@ -73,8 +73,8 @@ def test_the_level_lies_between_the_points() -> None:
     assert 0.45 < inside.mean() < 0.55
     directions = noisy_sphere(200, 0.0, seed=5)[1]
     hits = hk.trace(field, -3 * directions, directions)
-    radius = np.linalg.norm(hits.position[hits.hit], axis=1)
-    assert hits.hit.all()
+    radius = np.linalg.norm(hits.position[hits.is_hit], axis=1)
+    assert hits.is_hit.all()
     assert np.abs(radius - 1).max() < 0.03  # the noise of single points is 0.03, up to 0.1
     assert np.abs(radius - 1).mean() < 0.008
 
@@ -94,7 +94,7 @@ def test_units_do_not_matter(scale: float) -> None:
 def test_moved_points_stay_smoothed() -> None:
     points, normals = noisy_sphere(500, 0.03)
     field = hk.DipolePotential(points, normals, smoothing=0.1)
-    moved = field.moved(2 * points, normals, 4 * field.areas)
+    moved = field.with_points(2 * points, normals, 4 * field.areas)
     assert moved.smoothing == field.smoothing
     x = np.array([[1.9, 0.1, 0.3], [0.4, 0.2, 0.1]])
     np.testing.assert_allclose(

@@ -11,10 +11,10 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.enclosures import choose_proofs
-from harnack.fields.samples import Path
+from harnack.enclosures import choose_enclosures
+from harnack.fields.samples import Ray
 from harnack.geometry import example_curves, validate_loops
-from harnack.geometry.polygons import net_loops
+from harnack.geometry.polygons import cancel_opposite_edges
 from tests.oracles.oracle import CurveOracle, first_crossings, gap_to_levels
 
 FOUR_PI = 4 * math.pi
@@ -86,16 +86,16 @@ def test_values_and_gradients(name: str, precision: str) -> None:
     size = 1 + np.abs(x).max(axis=1)
     off = gap_to_levels(to_numpy(sample.value) - truth.value, [0.0], FOUR_PI)
     # The last term is the rounding of the truth.
-    error = sample.error
+    error = sample.value_error
     error = to_numpy(error) if dr.is_array_v(type(error)) else error
-    allowed = error + 4 * backend.epsilon * (2 + steep * size) + 1e-10
+    allowed = error + 4 * backend.machine_epsilon * (2 + steep * size) + 1e-10
     worst = np.argmax(off / allowed)
     assert off[worst] <= allowed[worst], (x[worst], off[worst], truth.smooth[worst])
     # A gradient changes by about itself over the distance to the curve.
     wrong = np.linalg.norm(to_numpy(sample.gradient) - truth.gradient, axis=1)
     edges = sum(len(loop) for loop in loops)
     total = sum_of_edge_fields(loops, x)
-    blur = backend.epsilon * total * (4 * math.sqrt(edges) + 8 * size / truth.smooth)
+    blur = backend.machine_epsilon * total * (4 * math.sqrt(edges) + 8 * size / truth.smooth)
     worst = np.argmax(wrong / blur)
     assert wrong[worst] <= blur[worst], (x[worst], wrong[worst], blur[worst])
 
@@ -157,12 +157,12 @@ def test_scale_and_translation(scale: float, precision: str) -> None:
     )
     off = gap_to_levels(to_numpy(moved.value) - to_numpy(plain.value), [0.0], FOUR_PI)
     steep = np.linalg.norm(to_numpy(plain.gradient), axis=1)
-    assert (off <= 2 * moved.error + 16 * backend.epsilon * (1 + 4 * steep)).all()
+    assert (off <= 2 * moved.value_error + 16 * backend.machine_epsilon * (1 + 4 * steep)).all()
     scaled = scale * to_numpy(moved.gradient)
     np.testing.assert_allclose(
-        scaled, to_numpy(plain.gradient), rtol=0, atol=2e3 * backend.epsilon * steep.max()
+        scaled, to_numpy(plain.gradient), rtol=0, atol=2e3 * backend.machine_epsilon * steep.max()
     )
-    radius, before = to_numpy(moved.known[0].radius) / scale, to_numpy(plain.known[0].radius)
+    radius, before = to_numpy(moved.promises[0].radius) / scale, to_numpy(plain.promises[0].radius)
     np.testing.assert_allclose(radius, before, rtol=3e-3 if precision == "single" else 1e-9)
 
 
@@ -247,14 +247,14 @@ def test_the_extent_holds_every_hit_found_without_it(name: str, level: float) ->
     o = 4.0 * unit(rng.normal(size=(1500, 3)))
     d = unit(rng.uniform(-1.2, 1.2, (1500, 3)) - o)
     free = hk.trace(Unbounded(loops), o, d, level=level, t_max=9.0, max_steps=500)
-    assert free.hit.sum() > 200
+    assert free.is_hit.sum() > 200
     extent = hk.SolidAngle(loops).extent((level,))
     assert extent is not None
-    assert extent.padded(1e-3).contains_points(free.position[free.hit]).all()
+    assert extent.padded(1e-3).contains_points(free.position[free.is_hit]).all()
     bounded = hk.trace(hk.SolidAngle(loops), o, d, level=level)
     # Rays that graze the border within the tolerance may go either way.
-    assert (bounded.hit & ~free.hit).sum() + (free.hit & ~bounded.hit).sum() <= 3
-    both = bounded.hit & free.hit
+    assert (bounded.is_hit & ~free.is_hit).sum() + (free.is_hit & ~bounded.is_hit).sum() <= 3
+    both = bounded.is_hit & free.is_hit
     assert np.quantile(np.abs(bounded.t[both] - free.t[both]), 0.99) < 1e-3
 
 
@@ -265,15 +265,15 @@ def test_extent_of_a_multiple_of_the_period_is_unknown() -> None:
 
 
 def test_convex_position_is_found_out() -> None:
-    assert hk.SolidAngle(CURVES["wavy"]).describe()["certificate"] == "range"
+    assert hk.SolidAngle(CURVES["wavy"]).describe()["lift_bound"] == "range"
     for name in ("trefoil", "coil", "link", "spiky"):
-        assert hk.SolidAngle(CURVES[name]).describe()["certificate"] == "edges"
+        assert hk.SolidAngle(CURVES[name]).describe()["lift_bound"] == "edges"
     for name in ("square", "holes"):
-        assert hk.SolidAngle(CURVES[name]).describe()["certificate"] == "planar"
+        assert hk.SolidAngle(CURVES[name]).describe()["lift_bound"] == "planar"
     with pytest.raises(ValueError, match="convex"):
-        hk.SolidAngle(CURVES["trefoil"], certificate="convex")
-    with pytest.raises(ValueError, match="unknown certificate"):
-        hk.SolidAngle(CURVES["trefoil"], certificate="best")  # type: ignore[arg-type]
+        hk.SolidAngle(CURVES["trefoil"], lift_bound="convex")
+    with pytest.raises(ValueError, match="unknown lift_bound"):
+        hk.SolidAngle(CURVES["trefoil"], lift_bound="best")  # type: ignore[arg-type]
     assert len(validate_loops(CURVES["link"])) == 2
 
 
@@ -295,11 +295,11 @@ def test_a_tiny_edge_hides_no_hits(precision: str) -> None:
     o, d = aimed_at([ring], 1200)
     plain = hk.trace(hk.SolidAngle(ring), o, d, precision=precision)
     field = hk.SolidAngle(np.insert(ring, 1, [1e-30, 0, 0], axis=0))
-    assert field.describe()["certificate"] == "edges"
+    assert field.describe()["lift_bound"] == "edges"
     tiny = hk.trace(field, o, d, precision=precision)
-    assert plain.hit.sum() > 400
+    assert plain.is_hit.sum() > 400
     assert (plain.status == tiny.status).all()
-    np.testing.assert_allclose(plain.t[plain.hit], tiny.t[plain.hit], atol=1e-3)
+    np.testing.assert_allclose(plain.t[plain.is_hit], tiny.t[plain.is_hit], atol=1e-3)
 
 
 # --- edges run both ways ----------------------------------------------------------------------
@@ -337,20 +337,22 @@ def test_edges_run_both_ways_are_not_there(name: str, precision: str) -> None:
     assert field.convex_position == other.convex_position
     found = hk.trace(field, o, d, precision=precision)
     expected = hk.trace(other, o, d, precision=precision)
-    assert (expected.status != int(hk.Status.OUT_OF_STEPS)).all()
-    assert (found.status != int(hk.Status.OUT_OF_STEPS)).all()
-    assert (found.hit != expected.hit).sum() <= 4  # graze within the tolerance
-    both = found.hit & expected.hit
+    assert (expected.status != int(hk.RayStatus.OUT_OF_STEPS)).all()
+    assert (found.status != int(hk.RayStatus.OUT_OF_STEPS)).all()
+    assert (found.is_hit != expected.is_hit).sum() <= 4  # graze within the tolerance
+    both = found.is_hit & expected.is_hit
     assert np.quantile(np.abs(found.t[both] - expected.t[both]), 0.99) < 1e-3
     # And by an oracle of its own: the field is near the level where it hits.
-    look = CurveOracle(net)(found.position[found.hit].astype(float))
+    look = CurveOracle(net)(found.position[found.is_hit].astype(float))
     gap = gap_to_levels(look.value, [2 * math.pi], FOUR_PI)
     assert (gap <= 3e-4 * look.gradient_norm).all()
     backend = choose_backend(precision)  # type: ignore[arg-type]
     p = to_vector3(backend, o[:50])
-    for one, two in ((field.evaluate(p).gradient, other.evaluate(p).gradient),
-                     (field.hessian(p)[0], other.hessian(p)[0]),
-                     (field.closest_on_boundary(p), other.closest_on_boundary(p))):  # fmt: skip
+    for one, two in (
+        (field.evaluate(p).gradient, other.evaluate(p).gradient),
+        (field.hessian(p)[0], other.hessian(p)[0]),
+        (field.closest_boundary_point(p), other.closest_boundary_point(p)),
+    ):
         np.testing.assert_allclose(to_numpy(one), to_numpy(two), rtol=1e-3, atol=1e-4)
 
 
@@ -360,13 +362,13 @@ def test_parts_that_cancel_are_left_out() -> None:
     assert hk.SolidAngle(square).describe()["canceled edges"] == 0
     # What is run twice the same way counts twice.
     assert hk.SolidAngle([square, square]).describe()["canceled edges"] == 0
-    (net,) = net_loops((square, square, square[::-1].copy()))
+    (net,) = cancel_opposite_edges((square, square, square[::-1].copy()))
     assert sorted(map(tuple, net)) == sorted(map(tuple, square))
     kept = (square, square)
-    assert net_loops(kept) is kept
+    assert cancel_opposite_edges(kept) is kept
     # A spike is run out and back.
     spike = np.insert(square, 1, [[3.0, 0, 0], square[0]], axis=0)
-    assert len(net_loops((spike,))[0]) == 4
+    assert len(cancel_opposite_edges((spike,))[0]) == 4
 
 
 NOTHING: dict[str, list[np.ndarray]] = {
@@ -382,22 +384,22 @@ NOTHING: dict[str, list[np.ndarray]] = {
 def test_a_curve_that_cancels_as_a_whole_has_no_surface(
     name: str, certificate: str, precision: str
 ) -> None:
-    field = hk.SolidAngle(NOTHING[name], certificate=certificate)  # type: ignore[arg-type]
+    field = hk.SolidAngle(NOTHING[name], lift_bound=certificate)  # type: ignore[arg-type]
     o, d = aimed_at(NOTHING[name], 300)
     o[:3], d[:3] = [0, 0, 0], np.eye(3)  # on the curve
     for level in (2 * math.pi, 0.5):
         for bound in (None, "classic", "slope"):
             end = hk.trace(field, o, d, level=level, precision=precision, bound=bound)
-            assert (end.status == int(hk.Status.MISS)).all()
+            assert (end.status == int(hk.RayStatus.MISS)).all()
     far = hk.trace(Unbounded(NOTHING[name]), o, d, precision=precision)
-    assert (far.status == int(hk.Status.MISS)).all()
+    assert (far.status == int(hk.RayStatus.MISS)).all()
     backend = choose_backend(precision)  # type: ignore[arg-type]
     p = to_vector3(backend, o)
     assert (to_numpy(field.evaluate(p).value) == 0).all()
     assert (to_numpy(field.evaluate(p).gradient) == 0).all()
     assert all((to_numpy(row) == 0).all() for row in field.hessian(p))
     assert (to_numpy(field.differentiable_value(p)) == 0).all()
-    assert field.closest_on_boundary(p) is None
+    assert field.closest_boundary_point(p) is None
     assert field.describe()["canceled edges"] == sum(map(len, NOTHING[name]))
     for level in (0.0, FOUR_PI, -2 * FOUR_PI):
         with pytest.raises(ValueError, match="cancel"):
@@ -488,9 +490,9 @@ def test_what_is_promised_along_a_line_holds(name: str, precision: str) -> None:
     if precision == "single":
         x, d = (v.astype(np.float32).astype(float) for v in (x, d))
         x, d = x[away > 1e-4], unit(d[away > 1e-4])
-    path = Path(to_vector3(backend, x), to_vector3(backend, d), choose_proofs(None))
+    path = Ray(to_vector3(backend, x), to_vector3(backend, d), choose_enclosures(None))
     start = backend.Float(0)
-    promises = hk.SolidAngle(loops).look(path, start, start, start).sample.along
+    promises = hk.SolidAngle(loops).sample_ray(path, start, start, start).sample.ray_promises
     gain = 0.0
     assert len(promises) == 6
     for promise in promises:
@@ -534,9 +536,9 @@ def test_hostile_rays_end(name: str, tolerance: float, precision: str) -> None:
         for pair in rays
     ]
     for end in ends:
-        assert (end.status != int(hk.Status.OUT_OF_STEPS)).all()
+        assert (end.status != int(hk.RayStatus.OUT_OF_STEPS)).all()
     # Aimed at the curve, within the tolerance of which every level is.
-    assert all(end.hit.all() for end in ends[: 4 if tolerance == 1e-4 else 1])
+    assert all(end.is_hit.all() for end in ends[: 4 if tolerance == 1e-4 else 1])
 
 
 @pytest.mark.few(1)
@@ -557,9 +559,9 @@ def test_no_hit_is_missed_along_the_curve(name: str, away: float) -> None:
         levels=[2 * math.pi], period=FOUR_PI, depth=1e-6, spacing=0.2, finest=1e-5,
     )  # fmt: skip
     assert np.isfinite(found.beyond).any()
-    proved = np.where(end.status == int(hk.Status.MISS), 4.0, end.t)
+    proved = np.where(end.status == int(hk.RayStatus.MISS), 4.0, end.t)
     assert (proved <= found.beyond + 1e-6).all()
-    look = CurveOracle(loops)(end.position[end.hit])
+    look = CurveOracle(loops)(end.position[end.is_hit])
     gap = gap_to_levels(look.value, [2 * math.pi], FOUR_PI)
     assert (gap <= 2e-7 * look.gradient_norm).all()
 
@@ -572,14 +574,14 @@ def test_curves_far_from_the_origin_can_be_traced(name: str) -> None:
     loops = [loop + shift for loop in CURVES[name]]
     o, d = aimed_at(loops, 1600)
     one, two = (hk.trace(hk.SolidAngle(loops), o, d, precision=p) for p in PRECISIONS)  # type: ignore[arg-type]
-    assert (two.status != int(hk.Status.OUT_OF_STEPS)).all()
+    assert (two.status != int(hk.RayStatus.OUT_OF_STEPS)).all()
     # Hits are as near the surface as rounding lets anyone know, and no surface is passed.
-    look = CurveOracle(loops)(two.position[two.hit].astype(float))
+    look = CurveOracle(loops)(two.position[two.is_hit].astype(float))
     gap = gap_to_levels(look.value, [2 * math.pi], FOUR_PI)
     assert (gap <= 0.03 * look.gradient_norm).all()
-    both = one.hit & two.hit
+    both = one.is_hit & two.is_hit
     assert (two.t[both] - one.t[both] < 0.02).all()
-    assert (one.hit & ~two.hit).sum() < 8  # within as much of the surface's border
+    assert (one.is_hit & ~two.is_hit).sum() < 8  # within as much of the surface's border
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e30, 9e99])

@@ -8,7 +8,7 @@ import numpy as np
 import harnack as hk
 from harnack.backend import choose_backend
 from harnack.fields.solid_angles.edge_lift import FACTOR_ROUNDINGS, LiftedProduct
-from harnack.fields.source_sums import FieldSums, Terms
+from harnack.fields.source_sums import SourceSums, SourceTerm
 
 UNIT = 2.0**-24  # the largest relative error of one operation
 
@@ -35,14 +35,16 @@ def test_rounding_of_a_product_grows_with_its_factors() -> None:
 def test_terms_that_are_lost_in_a_sum_are_found_again() -> None:
     """Each is less than a rounding of the sum, so that the total alone would stay where it was."""
     backend = choose_backend("single")
-    sums = FieldSums.zero(backend, dr.inf, 0).plus(Terms(backend.Float(1)), True)
+    sums = SourceSums.zero(backend, dr.inf, 0).add_term(SourceTerm(backend.Float(1)), True)
     for _ in range(200):
-        sums = sums.plus(Terms(backend.Float(0.99 * UNIT)), True)
-        sums = sums.plus(Terms(backend.Float(0)), True).plus(Terms(backend.Float(5)), False)
+        sums = sums.add_term(SourceTerm(backend.Float(0.99 * UNIT)), True)
+        sums = sums.add_term(SourceTerm(backend.Float(0)), True).add_term(
+            SourceTerm(backend.Float(5)), False
+        )
     bound = float(sums.rounding[0]) + UNIT
     assert abs(float(sums.value[0]) - (1 + 200 * 0.99 * UNIT)) <= 2 * UNIT
     assert abs(float(sums.total[0]) - (1 + 200 * 0.99 * UNIT)) > 2 * bound
-    back = sums.plus(Terms(backend.Float(-1)), True)
+    back = sums.add_term(SourceTerm(backend.Float(-1)), True)
     assert abs(float(back.value[0]) / (200 * 0.99 * UNIT) - 1) < 1e-5
 
 
@@ -51,11 +53,11 @@ def test_the_value_of_a_long_sum_is_within_its_bound() -> None:
     backend, rng = choose_backend("single"), np.random.default_rng(1)
     terms = rng.normal(size=(3000, 300)) * 10.0 ** rng.uniform(-6, 1, (3000, 300))
     terms = terms.astype(np.float32)
-    sums = FieldSums.zero(backend, dr.inf, 0)
+    sums = SourceSums.zero(backend, dr.inf, 0)
     for k, row in enumerate(terms):
-        sums = sums.plus(Terms(backend.Float(row)), True)
+        sums = sums.add_term(SourceTerm(backend.Float(row)), True)
         if k % 20 == 0:
-            dr.eval(sums.total, sums.lost, sums.rounding)
+            dr.eval(sums.total, sums.compensation, sums.rounding)
     exact = terms.astype(float).sum(axis=0)
     bound = sums.rounding.numpy() + UNIT * np.abs(exact)
     assert (np.abs(sums.value.numpy() - exact) <= bound).all()
@@ -73,7 +75,7 @@ def test_error_of_a_curve_covers_single_precision() -> None:
     for precision in ("single", "double"):
         backend = choose_backend(precision)
         sample = field.prepare(backend).evaluate(backend.Array3f(points.T.astype(backend.dtype)))
-        values.append((sample.value.numpy().astype(float), sample.error.numpy()))
+        values.append((sample.value.numpy().astype(float), sample.value_error.numpy()))
     (rounded, error), (exact, _) = values
     assert (np.abs(rounded - exact) <= error).all()
     assert (np.abs(rounded - exact) > 2 * UNIT * (8 + 2 * np.sqrt(len(z)))).any()

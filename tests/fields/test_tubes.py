@@ -37,7 +37,7 @@ def distance(x: np.ndarray, lines: list[np.ndarray]) -> np.ndarray:
 def test_the_distance_is_that_from_the_nearest_of_all(count: int, precision: Any) -> None:
     """With few segments one by one, with many in groups; nothing joins one line to the next."""
     lines = polylines(count)
-    tube = hk.Tube.around(lines, 0.03)
+    tube = hk.Tube.from_polylines(lines, 0.03)
     assert tube.describe()["segments"] == sum(len(line) - 1 for line in lines)
     x = np.random.default_rng(1).uniform(-1.3, 1.3, (2000, 3))
     x[:200] = np.concatenate(lines * 200)[:200]  # at vertices themselves
@@ -48,13 +48,13 @@ def test_the_distance_is_that_from_the_nearest_of_all(count: int, precision: Any
 
 @pytest.mark.slow
 def test_contracts_of_tubes_in_groups() -> None:
-    check_field(hk.Tube.around(polylines(25), 0.03))
+    check_field(hk.Tube.from_polylines(polylines(25), 0.03))
 
 
 @pytest.mark.parametrize("precision", ["single", "double"])
 def test_first_hits_of_tubes_in_groups(precision: Any) -> None:
     lines = polylines(12)
-    whole = hk.Tube.around(lines, 0.03)
+    whole = hk.Tube.from_polylines(lines, 0.03)
     rng = np.random.default_rng(2)
     o = 3 * rng.normal(size=(400, 3))
     aim = np.concatenate(lines)[rng.integers(0, sum(map(len, lines)), 400)]
@@ -62,8 +62,8 @@ def test_first_hits_of_tubes_in_groups(precision: Any) -> None:
     found = hk.trace(whole, o, d, precision=precision, tolerance=1e-5)
     first = np.min([hk.trace(hk.Tube(one, 0.03), o, d, precision=precision, tolerance=1e-5).t
                     for one in lines], axis=0)  # fmt: skip
-    assert (found.status != hk.Status.OUT_OF_STEPS).all()
-    assert found.hit.mean() > 0.3
+    assert (found.status != hk.RayStatus.OUT_OF_STEPS).all()
+    assert found.is_hit.mean() > 0.3
     # Rays that graze the tube within the tolerance may hit one and not the other.
     both = np.isfinite(found.t) & np.isfinite(first)
     assert (np.isfinite(found.t) != np.isfinite(first)).mean() < 0.01
@@ -72,27 +72,32 @@ def test_first_hits_of_tubes_in_groups(precision: Any) -> None:
 
 def test_what_is_no_bundle_of_tubes() -> None:
     with pytest.raises(ValueError, match="there are none"):
-        hk.Tube.around([], 0.1)
+        hk.Tube.from_polylines([], 0.1)
     with pytest.raises(ValueError, match="two points or more"):
-        hk.Tube.around([[[0, 0, 0], [1, 0, 0]], [[0, 0, 1.0]]], 0.1)
+        hk.Tube.from_polylines([[[0, 0, 0], [1, 0, 0]], [[0, 0, 1.0]]], 0.1)
     with pytest.raises(ValueError, match="polyline 1 of a tube"):
-        hk.Tube.around([[[0, 0, 0], [1, 0, 0]], [[0, 0.0]]], 0.1)
+        hk.Tube.from_polylines([[[0, 0, 0], [1, 0, 0]], [[0, 0.0]]], 0.1)
 
 
 def _in_unbounded_solids() -> dict[str, tuple[Any, float]]:
     """Solids without bounds that hold a tube, and where a ray down at (.3, .02) meets it first."""
     tube, plane = hk.Tube([[-1, 0, 0], [1, 0, 0]], 0.1), hk.Plane((0, 0, 1), -0.5)
     bent = hk.Tube.bezier([[-1, 0, 0], [-0.3, 0, 0], [0.3, 0, 0], [1, 0, 0]], 0.1)
-    many = hk.Tube.around([[[x, 0, 0], [x + 0.1, 0, 0]] for x in np.arange(-5, 5, 0.1)], 0.1)
+    many = hk.Tube.from_polylines(
+        [[[x, 0, 0], [x + 0.1, 0, 0]] for x in np.arange(-5, 5, 0.1)], 0.1
+    )
     top, wide = 2 - math.sqrt(0.1**2 - 0.02**2), 2 - math.sqrt(0.15**2 - 0.02**2)
     return {
         "union": (tube | plane, top),
         "Bezier curve": (bent | plane, top),
         "groups": (many | plane, top),
-        "grown": ((tube | plane).grown(0.05), wide),
+        "grown": ((tube | plane).offset(0.05), wide),
         "moved and scaled": ((tube.scaled(0.5) | plane).scaled(2), top),
         "complements": (~(~tube & ~plane), top),
-        "difference": (hk.Plane((0, 0, 1), 1.0) - tube.moved((0, 0, 0.95)), 1.0 + 0.05 + 0.098),
+        "difference": (
+            hk.Plane((0, 0, 1), 1.0) - tube.translated((0, 0, 0.95)),
+            1.0 + 0.05 + 0.098,
+        ),
         "without a plane": (tube, top),
     }
 
@@ -109,5 +114,5 @@ def test_tubes_are_seen_in_solids_without_bounds(name: str, precision: Any) -> N
         found = hk.trace(solid, o, d, precision=precision, **options)
         assert float(np.ravel(found.t)[0]) == pytest.approx(t, abs=2e-4), options
     misses = hk.trace(solid, o, [[0.0, 0.1, 1.0]], precision=precision)
-    assert misses.status[0] == hk.Status.MISS
+    assert misses.status[0] == hk.RayStatus.MISS
     assert misses.evaluations[0] < 10

@@ -11,10 +11,10 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy
-from harnack.backend.elementary import largest_angle, sincos
-from harnack.enclosures import Curvature
-from harnack.fields.analytic.waves import PlaneWave, Product, cosine, sine
-from harnack.testing.violation_search import look_at
+from harnack.backend.elementary import max_sincos_argument, sincos
+from harnack.enclosures import TaylorRemainder
+from harnack.fields.analytic.waves import PlaneWave, WaveProduct, cosine_factor, sine_factor
+from harnack.testing.violation_search import sample_field
 
 UNIT = 2.0**-24
 
@@ -60,7 +60,8 @@ FIELDS = {
         domain=hk.Ball(radius=3.0),
     ),
     "unlike frequencies": hk.EigenfunctionSum(
-        [Product(1.0, sine(6.3), sine(5.1, 1.0)), Product(-0.4, cosine(63.0), None, sine(2.0))],
+        [WaveProduct(1.0, sine_factor(6.3), sine_factor(5.1, 1.0)),
+        WaveProduct(-0.4, cosine_factor(63.0), None, sine_factor(2.0))],
         domain=hk.Box((-3, -3, -3), (3, 3, 3)),
     ),
     "many": hk.EigenfunctionSum(
@@ -83,7 +84,7 @@ def test_error_of_waves_covers_single_precision(name: str) -> None:
     lower, upper = field.domain.bounds()
     p = np.random.default_rng(1).uniform(lower, upper, (20_000, 3))
     p = p.astype(np.float32).astype(np.float64)
-    exact, rounded = look_at(field, p), look_at(field, p, "single")
+    exact, rounded = sample_field(field, p), sample_field(field, p, "single")
     off = np.abs(rounded.value - exact.value)
     assert (off <= rounded.error).all()
     assert off.max() > 0.01 * rounded.error.max()
@@ -99,14 +100,14 @@ def test_taylor_with_a_rounded_gradient_holds(name: str) -> None:
     lower, upper = field.domain.bounds()
     rng = np.random.default_rng(2)
     p = rng.uniform(lower, upper, (4000, 3)).astype(np.float32).astype(np.float64)
-    exact, rounded = look_at(field, p), look_at(field, p, "single")
+    exact, rounded = sample_field(field, p), sample_field(field, p, "single")
     d = rng.normal(size=p.shape)
     d /= np.linalg.norm(d, axis=1, keepdims=True)
-    (promise,) = [one for one in rounded.known if isinstance(one, Curvature)]
+    (promise,) = [one for one in rounded.promises if isinstance(one, TaylorRemainder)]
     steep = np.linalg.norm(exact.gradient, axis=1)
     moved_point = 8 * UNIT * np.abs(p).max(axis=1)
     for t in np.geomspace(1e-4, 2, 8) / np.sqrt(field.curvature):
-        true = look_at(field, p + t * d)
+        true = sample_field(field, p + t * d)
         said = rounded.value + t * np.einsum("nk,nk->n", rounded.gradient, d)
         room = 0.5 * promise.constant * t * t + rounded.error
         room += moved_point * (steep + field.curvature * t)
@@ -118,7 +119,7 @@ def test_sines_are_right_as_far_as_they_are_known_and_no_numbers_beyond(precisio
     """In double precision they were wrong from some 10^9 on: a gyroid had values of 1e122 there."""
     backend = choose_backend(precision)
     real, kind = backend.Float, backend.dtype
-    rng, most = np.random.default_rng(0), largest_angle(real)
+    rng, most = np.random.default_rng(0), max_sincos_argument(real)
     near_zeros = np.round(rng.uniform(-1, 1, 20_000) * most / math.pi) * math.pi
     x = np.concatenate([rng.uniform(-most, most, 20_000), near_zeros]).astype(kind)
     x = x[np.abs(x) <= most]
@@ -135,13 +136,13 @@ def test_sines_are_right_as_far_as_they_are_known_and_no_numbers_beyond(precisio
 @pytest.mark.parametrize(
     ("precision", "far", "status"),
     [
-        ("single", 1e3, hk.Status.HIT), ("single", 1e8, hk.Status.OUT_OF_STEPS),
-        ("double", 1e9, hk.Status.HIT), ("double", 1e12, hk.Status.HIT),
-        ("double", 1e16, hk.Status.OUT_OF_STEPS),
+        ("single", 1e3, hk.RayStatus.HIT), ("single", 1e8, hk.RayStatus.OUT_OF_STEPS),
+        ("double", 1e9, hk.RayStatus.HIT), ("double", 1e12, hk.RayStatus.HIT),
+        ("double", 1e16, hk.RayStatus.OUT_OF_STEPS),
     ],
 )  # fmt: skip
 def test_gyroids_far_from_the_origin_are_right_or_not_known(
-    precision: Any, far: float, status: hk.Status
+    precision: Any, far: float, status: hk.RayStatus
 ) -> None:
     rng = np.random.default_rng(1)
     center = far * np.array([1.0, -1.0, 0.5])
@@ -151,7 +152,7 @@ def test_gyroids_far_from_the_origin_are_right_or_not_known(
         assert (hk.trace(field, o, d, precision=precision).status == status).all()
     x = o.astype(np.float32) if precision == "single" else o
     values = gyroid.value(x, precision=precision)
-    if status == hk.Status.HIT:
+    if status == hk.RayStatus.HIT:
         angles = [2 * np.pi * x.astype(np.longdouble)[:, k] for k in range(3)]
         sines, cosines = np.sin(angles), np.cos(angles)
         right = sum(sines[k] * cosines[(k + 1) % 3] for k in range(3))
@@ -173,7 +174,7 @@ def test_formulas_of_angles_that_are_not_known_have_no_value(precision: Any, far
     assert np.isnan(f.value([[far, 0.5, 0.0]], precision=precision)).all()
     o, d = np.array([[far, 0.0, 0.0]] * 3), np.eye(3)
     found = hk.trace(f, o, d, precision=precision, clip=hk.Ball((far, 0.0, 0.0), 10.0))
-    assert (found.status == hk.Status.OUT_OF_STEPS).all()
+    assert (found.status == hk.RayStatus.OUT_OF_STEPS).all()
 
 
 def test_gradients_of_large_angles_are_not_taken_beside_the_point() -> None:

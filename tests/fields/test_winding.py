@@ -17,7 +17,7 @@ import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.enclosures import HarmonicBall
 from harnack.fields.solid_angles import winding_rates
-from harnack.fields.solid_angles.trail_sums import EdgeTrails, closed_trails
+from harnack.fields.solid_angles.trail_sums import TrailValues, closed_trails
 from harnack.fields.solid_angles.winding_number import WindingNumber
 from harnack.geometry import MeshError
 from harnack.geometry.example_meshes import (
@@ -299,7 +299,7 @@ def test_duplicates_and_flips_count(method: Any) -> None:
     twice = np.concatenate([faces, faces])
     some: dict[str, np.ndarray] = {
         "duplicated": duplicate_faces(faces, 0.2, seed=1),
-        "hidden": duplicate_faces(faces, 0.2, seed=2, turned=True),
+        "hidden": duplicate_faces(faces, 0.2, seed=2, flipped=True),
         "flipped": flip_faces(faces, 0.2, seed=3),
         "all flipped": faces[:, ::-1],
         "three times": np.concatenate([faces, faces, np.roll(faces, 1, axis=1)]),
@@ -409,14 +409,14 @@ def test_lattices_are_all_ties(count: int, precision: Any) -> None:
     steps = np.arange(-0.5, 5, 0.5)
     x = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
     backend = choose_backend("double")
-    apart = to_numpy(field.prepare(backend).distance_to_sheets(to_vector3(backend, x)))
+    apart = to_numpy(field.prepare(backend).distance_to_jumps(to_vector3(backend, x)))
     x = x[apart > 0.2]
     assert len(x) > 300
     expected = direct_sum(vertices[faces], x)
     off = np.abs(field.value(x, precision=precision) - expected)
     assert (off <= field.error_bound(x, precision=precision)).all()
     # Nearly every such ray meets an edge or the line that it lies on.
-    trails = EdgeTrails.upload(backend, vertices, field.mesh.singular)
+    trails = TrailValues.upload(backend, vertices, field.mesh.singular_edges)
     ways = backend.Float(np.where(np.arange(len(x)) % 2, 1.0, -1.0))
     assert to_numpy(trails.turns(to_vector3(backend, x), ways)[1]).mean() > 0.3
 
@@ -434,7 +434,7 @@ def test_hard_points(precision: Any) -> None:
     )
     vertices = rounded(vertices)
     field = WindingNumber(vertices, faces, method="exact")
-    ends = vertices[field.mesh.singular]
+    ends = vertices[field.mesh.singular_edges]
     middle = rounded(0.5 * (ends[:, 0] + ends[:, 1]))
     below = rng.uniform(0.1, 2, (len(ends), 1)) * [0, 0, -1]
     # Rays go away from the middle, which is at a height of about zero.
@@ -538,7 +538,7 @@ def damaged(kind: str, seed: int) -> Mesh:
         faces = flip_faces(faces, rng.uniform(0.02, 0.2), seed)
     elif kind == "duplicates":
         faces = duplicate_faces(faces, 0.2, seed)
-        faces = duplicate_faces(faces, 0.1, seed + 1, turned=True)
+        faces = duplicate_faces(faces, 0.1, seed + 1, flipped=True)
     elif kind == "self-intersections":
         other, more = icosphere(1)
         vertices, faces = merged((vertices, faces), (0.7 * other + [0.5, 0.3, 0.2], more))
@@ -570,11 +570,11 @@ def check_first_hits(
     far = 5.0
     truth = first_side_changes(exact, o, d, 0.0, far, level=0.5, samples=384)
     hits = hk.trace(field, o, d, t_max=far, precision=precision, tolerance=TOLERANCE)
-    assert not (hits.status == hk.Status.OUT_OF_STEPS).any()
-    t = np.where(hits.hit, hits.t, np.inf).astype(np.float64)
+    assert not (hits.status == hk.RayStatus.OUT_OF_STEPS).any()
+    t = np.where(hits.is_hit, hits.t, np.inf).astype(np.float64)
     verdict = judge(
         t, exact, o, d, 0.0, far,
-        level=0.5, reach=REACH, edges=vertices[field.mesh.singular], truth=truth, samples=384,
+        level=0.5, reach=REACH, edges=vertices[field.mesh.singular_edges], truth=truth, samples=384,
     )  # fmt: skip
     assert verdict.wrong == 0, verdict
     assert verdict.changes > n / 5
@@ -584,9 +584,9 @@ def check_first_hits(
 def check_sheets(hits: Any, field: WindingNumber, exact: Any, mesh: Mesh, d: np.ndarray) -> None:
     """Hits on sheets lie on the face that they name, with its normal to the larger side."""
     vertices, faces = mesh
-    rows = np.flatnonzero(hits.sheet >= 0)
+    rows = np.flatnonzero(hits.primitive_index >= 0)
     assert len(rows) > 20
-    corners = vertices[faces[field.faces_of_sheets[hits.sheet[rows]]]]
+    corners = vertices[faces[field.facet_faces[hits.primitive_index[rows]]]]
     normal = unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     np.testing.assert_allclose(hits.normal[rows], -normal, atol=1e-4)
     plane = ((hits.position[rows] - corners[:, 0]) * normal).sum(axis=1)
@@ -594,7 +594,7 @@ def check_sheets(hits: Any, field: WindingNumber, exact: Any, mesh: Mesh, d: np.
     low = corners.min(axis=1) - 1e-4 <= hits.position[rows]
     assert (low & (hits.position[rows] <= corners.max(axis=1) + 1e-4)).all()
     # Elsewhere the value is the level.
-    smooth = hits.hit & (hits.sheet < 0)
+    smooth = hits.is_hit & (hits.primitive_index < 0)
     off = np.abs(exact(hits.position[smooth].astype(np.float64)) - 0.5)
     if smooth.sum() > 20:
         assert np.median(off) < 0.01
@@ -634,13 +634,13 @@ def test_closed_meshes_are_hit_where_rays_meet_triangles(method: Any, precision:
     t = np.where((margin >= 0) & (t > 0), t, np.inf)
     first = t.min(axis=1)
     hits = hk.trace(WindingNumber(vertices, faces, method=method), o, d, precision=precision)
-    np.testing.assert_array_equal(hits.hit[clear], np.isfinite(first)[clear])
-    rows = np.flatnonzero(clear & hits.hit)
+    np.testing.assert_array_equal(hits.is_hit[clear], np.isfinite(first)[clear])
+    rows = np.flatnonzero(clear & hits.is_hit)
     assert len(rows) > 500
     # Rounding across a ray moves t by as much as the triangle leans.
     lean = np.abs((unit(np.cross(e, f))[t.argmin(axis=1)] * d).sum(axis=1))
     assert (np.abs(hits.t - first)[rows] <= 2e-6 + 1e-6 / lean[rows]).all()
-    np.testing.assert_array_equal(hits.sheet[rows], t.argmin(axis=1)[rows])
+    np.testing.assert_array_equal(hits.primitive_index[rows], t.argmin(axis=1)[rows])
 
 
 def test_sheets_name_faces_as_given() -> None:
@@ -648,10 +648,10 @@ def test_sheets_name_faces_as_given() -> None:
     vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [5, 5, 5]])
     faces = np.array([[0, 1, 2], [0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2], [0, 2, 1]])
     field = WindingNumber(vertices, faces)
-    assert field.faces_of_sheets.tolist() == [1, 2, 3, 4]
+    assert field.facet_faces.tolist() == [1, 2, 3, 4]
     assert field.describe()["singular edges"] == 0
     hits = hk.trace(field, [[2.0, 2.1, 2.2]], [(np.array([-1.8, -1.9, -1.9])).tolist()])
-    assert field.faces_of_sheets[hits.sheet].tolist() == [3]
+    assert field.facet_faces[hits.primitive_index].tolist() == [3]
 
 
 # --- what is refused ------------------------------------------------------------------------
@@ -723,10 +723,12 @@ def test_lifts_stay_within_their_promise(method: str) -> None:
     x = rng.uniform(-1.4, 1.4, (300, 3))
     backend = choose_backend("double")
     sample = field.prepare(backend).evaluate(to_vector3(backend, x))
-    ball = next(one for one in sample.promises if isinstance(one, HarmonicBall))
+    ball = next(one for one in sample.all_promises if isinstance(one, HarmonicBall))
     value, radius = to_numpy(sample.value), to_numpy(ball.radius)
     room = np.stack([to_numpy(ball.lower) - value, to_numpy(ball.upper) - value])
-    slack = 2 * np.broadcast_to(to_numpy(type(sample.value)(sample.error)), value.shape) + 1e-9
+    slack = (
+        2 * np.broadcast_to(to_numpy(type(sample.value)(sample.value_error)), value.shape) + 1e-9
+    )
     assert (radius > 0).all()
     largest = 0.0
     for _ in range(6):

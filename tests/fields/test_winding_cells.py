@@ -11,11 +11,11 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.enclosures import Lipschitz, TargetLevels, choose_proofs
+from harnack.enclosures import Levels, Lipschitz, choose_enclosures
 from harnack.fields import Sample
-from harnack.fields.samples import Path
+from harnack.fields.samples import Ray
 from harnack.geometry.example_meshes import bumpy_sphere, icosphere, remove_faces
-from harnack.tracer.branch_tracker import WholeNumbers
+from harnack.tracer.branch_tracker import BranchTracker
 from tests.fields.test_winding import (
     KINDS,
     Mesh,
@@ -50,12 +50,12 @@ def test_samples_in_cells_are_within_their_errors(kind: str, precision: Any) -> 
     off = modulo_one(to_numpy(sample.value) - direct_sum(mesh[0][mesh[1]], x))
     gradient = hk.WindingNumber(*mesh, method="exact").gradient(x, precision="double")
     steep = np.linalg.norm(gradient, axis=1)
-    place = 4 * backend.epsilon * np.abs(x).max(axis=1) * steep
-    error = to_numpy(sample.error).astype(np.float64)
+    place = 4 * backend.machine_epsilon * np.abs(x).max(axis=1) * steep
+    error = to_numpy(sample.value_error).astype(np.float64)
     assert (np.abs(off) <= error + place + 1e-12).all()
     assert np.median(error) < 2e-3
     turned = np.linalg.norm(to_numpy(sample.gradient) - gradient, axis=1)
-    bent = to_numpy(sample.known[0].constant) * 4 * backend.epsilon
+    bent = to_numpy(sample.promises[0].constant) * 4 * backend.machine_epsilon
     assert (turned <= to_numpy(sample.gradient_error) + bent + 1e-4 * steep).all()
 
 
@@ -78,12 +78,12 @@ def compare(mesh: Mesh, o: np.ndarray, d: np.ndarray, **settings: Any) -> hk.Hit
     """Rays end as without cells, but for grazes within the tolerance."""
     hits = hk.trace(with_cells(mesh), o, d, **settings)
     plain = hk.trace(with_cells(mesh, False), o, d, **settings)
-    assert not (hits.status == hk.Status.OUT_OF_STEPS).any()
-    assert (plain.hit != hits.hit).mean() <= 2e-3
-    both = plain.hit & hits.hit
+    assert not (hits.status == hk.RayStatus.OUT_OF_STEPS).any()
+    assert (plain.is_hit != hits.is_hit).mean() <= 2e-3
+    both = plain.is_hit & hits.is_hit
     apart = np.abs(plain.t[both] - hits.t[both])
     assert (apart > 2e-3 * (1 + np.abs(o).max() / 100)).mean() <= 5e-3
-    assert (plain.sheet[both] != hits.sheet[both]).mean() <= 5e-3
+    assert (plain.primitive_index[both] != hits.primitive_index[both]).mean() <= 5e-3
     return hits
 
 
@@ -98,7 +98,7 @@ def test_other_levels_of_overlapping_parts(level: Any) -> None:
     table = [turn + k * len(vertices) for k, turn in enumerate(turns)]
     mesh = np.concatenate(copies), np.concatenate(table)
     hits = compare(mesh, *rays(mesh, 1500, 4), level=level)
-    assert hits.hit.mean() > 0.05
+    assert hits.is_hit.mean() > 0.05
 
 
 def test_rays_from_inside_and_far_away_and_of_a_clip() -> None:
@@ -112,8 +112,8 @@ def test_rays_from_inside_and_far_away_and_of_a_clip() -> None:
     clip = hk.Ball((0.3, 0.1, 0.0), 0.7)
     fields = with_cells(mesh), with_cells(mesh, False)
     one, other = (hk.trace(hk.level_set(field, clip=clip), far, d) for field in fields)
-    assert (one.hit != other.hit).mean() <= 2e-3
-    assert one.hit.sum() > 100
+    assert (one.is_hit != other.is_hit).mean() <= 2e-3
+    assert one.is_hit.sum() > 100
 
 
 def test_many_rays_end_as_without_cells() -> None:
@@ -135,7 +135,7 @@ def test_a_rung_within_the_tolerance_is_no_hit() -> None:
     o = middle + 1.5 * unit(rng.normal(size=(4000, 3)))
     d = unit(middle + 0.4 * rng.normal(size=(4000, 3)) - o)
     hits = hk.trace(with_cells(mesh), o, d, precision="double", tolerance=1e-4)
-    smooth = hits.hit & (hits.sheet < 0)
+    smooth = hits.is_hit & (hits.primitive_index < 0)
     x = hits.position[smooth]
     gradient = hk.WindingNumber(*mesh, method="exact").gradient(x, precision="double")
     off = np.abs(direct_sum(corners, x) - 0.5)
@@ -163,7 +163,7 @@ def test_moved_meshes_have_cells_of_their_own() -> None:
     o, d = rays((vertices, faces), 500, 3)
     field = with_cells((vertices, faces))
     hk.trace(field, o, d)
-    moved = field.moved(1.3 * vertices + 0.2)
+    moved = field.with_vertices(1.3 * vertices + 0.2)
     hits = hk.trace(moved, o, d)
     fresh = hk.trace(with_cells((1.3 * vertices + 0.2, faces)), o, d)
     np.testing.assert_array_equal(hits.t, fresh.t)
@@ -175,17 +175,17 @@ def test_when_there_are_cells() -> None:
     edges = field.describe()["singular edges"]
     assert edges > 64
     assert field.describe()["cells"] == "from 5,000 rays on"
-    assert field.for_rays(100) is field
-    assert field.for_rays(10**6).cells is True
-    assert field.for_rays(10**6) is field.for_rays(2 * 10**6)
-    prepared = field.for_rays(10**6).prepare(choose_backend("single"))
+    assert field.for_ray_count(100) is field
+    assert field.for_ray_count(10**6).cells is True
+    assert field.for_ray_count(10**6) is field.for_ray_count(2 * 10**6)
+    prepared = field.for_ray_count(10**6).prepare(choose_backend("single"))
     assert prepared.describe()["cells"].endswith("MB")
-    assert prepared.is_modulo
+    assert prepared.has_unknown_branch
     short = with_cells(mesh, 0.01).prepare(choose_backend("single"))
     assert short.describe()["cells"] == "none, as they need more memory"
-    assert not short.is_modulo
-    assert hk.WindingNumber(*icosphere(1)).for_rays(10**9).cells is None
-    assert with_cells(mesh, False).for_rays(10**9).cells is False
+    assert not short.has_unknown_branch
+    assert hk.WindingNumber(*icosphere(1)).for_ray_count(10**9).cells is None
+    assert with_cells(mesh, False).for_ray_count(10**9).cells is False
     with pytest.raises(ValueError, match="megabytes"):
         with_cells(mesh, -1.0)
 
@@ -208,10 +208,12 @@ def test_whole_numbers(value: float, before: float, step: float, expected: float
     backend = choose_backend("double")
     real, vector = backend.Float, backend.Array3f
     known = (Lipschitz(real(1.0), real(0.2)),)
-    sample = Sample(real(value), vector(0.5, 0, 0), known, real(1e-6), is_modulo=backend.Bool(True))
-    path = Path(vector(0), vector(1, 0, 0), choose_proofs(None))
-    numbers = WholeNumbers(TargetLevels((0.5,)))
-    look, is_sure = numbers.continued(path.look(sample), real(before), real(step), real(1e-6))
+    sample = Sample(
+        real(value), vector(0.5, 0, 0), known, real(1e-6), branch_unknown=backend.Bool(True)
+    )
+    path = Ray(vector(0), vector(1, 0, 0), choose_enclosures(None))
+    numbers = BranchTracker(Levels((0.5,)))
+    look, is_sure = numbers.resolve(path.enclose(sample), real(before), real(step), real(1e-6))
     assert bool(is_sure[0]) == (step < 1)
     assert look.sample.value[0] == pytest.approx(expected, abs=1e-12)
 
@@ -238,8 +240,8 @@ def test_gaps_to_rungs(
     real = backend.Float
     sample = Sample(real(value), backend.Array3f(1, 0, 0), ())
     asked = backend.Bool(not knows), backend.Bool(False), real(error)
-    gaps, *said = WholeNumbers(TargetLevels((0.5,))).gaps(sample, *asked)
-    assert gaps.up[0] == pytest.approx(up)
+    gaps, *said = BranchTracker(Levels((0.5,))).gaps(sample, *asked)
+    assert gaps.above[0] == pytest.approx(up)
     assert [bool(one[0]) for one in said] == [passes, is_doubtful]
     assert not dr.any(said[0] & said[1])
 
@@ -260,7 +262,7 @@ def _ends(
 def test_a_ray_that_enters_beyond_a_rung_next_to_zero_knows_the_number() -> None:
     # Where it enters, w is about -0.2, between the rungs -1.1 and -0.1 of the level 0.9.
     cells, plain = _ends([_TRIANGLE, _SMALL], 0.9, [(-0.387, -0.093, 5.0)], [(0.0, 0, -1)])
-    assert plain.status[0] == hk.Status.MISS
+    assert plain.status[0] == hk.RayStatus.MISS
     assert cells.status[0] == plain.status[0]
 
 
@@ -268,8 +270,8 @@ def test_the_first_sample_of_a_ray_is_not_the_value_nearest_to_zero() -> None:
     # Where it enters, w is about -0.6, between the rungs -0.7 and 0.3.
     ray = [(-0.087, -0.093, 5.0)], [(0.0, 0, -1)]
     cells, plain = _ends([_TRIANGLE] * 3 + [_SMALL], 0.3, *ray, tolerance=1e-3)
-    assert plain.sheet[0] == 0
-    assert cells.sheet[0] == plain.sheet[0]
+    assert plain.primitive_index[0] == 0
+    assert cells.primitive_index[0] == plain.primitive_index[0]
     assert abs(cells.t[0] - plain.t[0]) < 1e-3
     assert abs(cells.value[0] - plain.value[0]) < 1e-3
 
@@ -285,7 +287,7 @@ def test_behind_a_rung_passed_off_the_cells_the_next_sample_knows_the_number() -
     origin = (-10000.1025390625, -10001.2021484375, -10004.2509765625)
     ray = [origin], [(-0.029849009588360786, 0.31229814887046814, 0.9495151042938232)]
     cells, plain = _ends(corners, 0.9, *ray, tolerance=1e-3, t_min=1.2875842, t_max=4.0504760)
-    assert plain.status[0] == hk.Status.MISS
+    assert plain.status[0] == hk.RayStatus.MISS
     assert cells.status[0] == plain.status[0]
 
 
@@ -299,7 +301,7 @@ def test_a_ray_far_from_the_origin_does_not_run_out_of_steps() -> None:
     )
     ray = [(-10002.29296875, 9995.697265625, -10000.619140625)], [(0.460142, 0.874011, 0.156120)]
     cells, plain = _ends([corners], 0.9, *ray, tolerance=1e-3)
-    assert plain.status[0] == hk.Status.HIT
+    assert plain.status[0] == hk.RayStatus.HIT
     assert cells.status[0] == plain.status[0]
 
 
@@ -350,7 +352,7 @@ def test_where_a_value_is_known_from_the_middle_of_a_cell_it_is_right(
     ])  # fmt: skip
     points = points.astype(backend.dtype).astype(np.float64)
     x = to_vector3(backend, points)
-    found = prepared.value_where_known(x, backend.Float(0), backend.Bool(True))
+    found = prepared.value_if_cheap(x, backend.Float(0), backend.Bool(True))
     value = to_numpy(found).astype(np.float64)
     known = np.isfinite(value)
     assert known[:n].mean() > 0.9
@@ -373,7 +375,7 @@ def test_a_poor_value_in_the_middle_of_a_cell_is_not_used() -> None:
     assert cells.size == cells.cells.size + 4 * cells.count
     poor = field.error_bound(cells.cells.centers() * field.mesh.size + field.mesh.center) > 0.13
     assert poor.mean() > 0.1
-    assert np.isnan(to_numpy(cells.at_centers)[poor]).all()
+    assert np.isnan(to_numpy(cells.center_values)[poor]).all()
 
 
 def cube_without_a_triangle() -> Mesh:
@@ -400,7 +402,7 @@ def test_rays_that_begin_within_rounding_of_a_triangle_know_its_side(
     way[:, 2] = -np.abs(way[:, 2]) - 0.5
     way /= np.linalg.norm(way, axis=1)[:, None]
     o = np.array([0.2, -0.3, 1.0]) - distance * way
-    near = distance * (1 + 1.5 * choose_backend(precision).epsilon * rng.integers(-1, 2, n))
+    near = distance * (1 + 1.5 * choose_backend(precision).machine_epsilon * rng.integers(-1, 2, n))
     settings = {"t_min": near, "precision": precision}
     hits, plain = (
         hk.trace(hk.WindingNumber(*mesh, cells=cells), o, way, **settings)
@@ -427,4 +429,4 @@ def test_rays_of_a_clip_and_far_meshes_know_their_side(
 ) -> None:
     for cells in (True, False):
         hits = hk.trace(hk.WindingNumber(*thinned_sphere(x), cells=cells), [o], [d], **settings)
-        assert hits.hit.all()
+        assert hits.is_hit.all()

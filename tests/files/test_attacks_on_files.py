@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from harnack.files.file_geometry import FileFormatError
-from harnack.files.geometry_files import Cloud, read_surface
+from harnack.files.geometry_files import LoadedCloud, read_geometry
 
 POINTS = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
 THREE = POINTS + "f 1 3 2\nf 1 2 4\nf 2 3 4\n"
@@ -109,17 +109,17 @@ def test_what_would_be_left_out_is_refused(
     save: Any, name: str, content: str | bytes, complaint: str
 ) -> None:
     with pytest.raises(FileFormatError, match=complaint):
-        read_surface(save(name, content))
+        read_geometry(save(name, content))
 
 
 def test_the_scene_by_itself_is_read(save: Any) -> None:
-    assert len(read_surface(save("a.gltf", scene())).faces) == 4
+    assert len(read_geometry(save("a.gltf", scene())).faces) == 4
 
 
 def test_points_choose_vertices_and_normals(save: Any) -> None:
     text = "v 0 0 0\nv 9 9 9\nv 1 0 0\nvn 1 0 0\nvn 0 0 1\np 1//2 3//1\n"
-    cloud = read_surface(save("a.obj", text))
-    assert isinstance(cloud, Cloud)
+    cloud = read_geometry(save("a.obj", text))
+    assert isinstance(cloud, LoadedCloud)
     np.testing.assert_array_equal(cloud.points, [[0, 0, 0], [1, 0, 0]])
     np.testing.assert_array_equal(cloud.normals, [[0, 0, 1], [1, 0, 0]])
 
@@ -141,5 +141,5 @@ def test_points_choose_vertices_and_normals(save: Any) -> None:
     ],
 )  # fmt: skip
 def test_every_atom_counts_where_it_stands(save: Any, content: str | bytes, xs: Any) -> None:
-    atoms = read_surface(save("a.pdb", content))
+    atoms = read_geometry(save("a.pdb", content))
     np.testing.assert_allclose(atoms.positions[:, 0], xs)

@@ -371,7 +371,7 @@ def test_a_damaged_file_is_read_or_refused_but_nothing_else(save, seed, edits, c
 )
 def test_boundary_edges_join_to_loops_that_use_each_once(faces):
     remaining = boundary_edges.boundary_edges(faces)
-    loops = boundary_edges.join(remaining)
+    loops = boundary_edges.join_edges(remaining)
     used = [(a, b) for loop in loops for a, b in zip(loop, loop[1:] + loop[:1], strict=True)]
     assert sorted(used) == sorted(remaining)
     assert all(len(set(loop)) == len(loop) for loop in loops)

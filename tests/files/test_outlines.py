@@ -21,12 +21,12 @@ def area(loops: Any) -> float:
 
 
 def test_regular_polygons() -> None:
-    (corners,) = hk.outline.regular(6, 2.0)
+    (corners,) = hk.outline.regular_polygon(6, 2.0)
     assert np.linalg.norm(corners, axis=1) == pytest.approx(2.0)
     assert area([corners]) == pytest.approx(6 * math.sqrt(3))
     for sides in (2, 2.5, True, 10**7):
         with pytest.raises(ValueError, match="number of sides"):
-            hk.outline.regular(sides, 1.0)  # type: ignore[arg-type]
+            hk.outline.regular_polygon(sides, 1.0)  # type: ignore[arg-type]
 
 
 # Text.

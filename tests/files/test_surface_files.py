@@ -14,12 +14,12 @@ import trimesh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from harnack.field_from_file import open_surface
+from harnack.field_from_file import field_from_file
 from harnack.fields.solid_angles.polygon_mesh import PolygonMesh
 from harnack.files import gltf
 from harnack.files import ply as ply_files
 from harnack.files.file_geometry import FileFormatError
-from harnack.files.geometry_files import ClosedCurves, Cloud, Mesh, read_surface
+from harnack.files.geometry_files import LoadedCloud, LoadedCurves, LoadedMesh, read_geometry
 from harnack.geometry.boundary_edges import singular_edges, weld_vertices
 from harnack.geometry.example_meshes import icosphere, remove_faces, torus_mesh
 from harnack.geometry.polygons import triangulate
@@ -47,9 +47,9 @@ def area(vertices, faces) -> np.ndarray:
 @pytest.mark.parametrize("kind", FORMATS)
 def test_a_mesh_is_the_same_in_every_format(save, kind):
     x, faces = icosphere(2)
-    mesh = read_surface(save(f"a.{kind.split('_')[0]}", exported(x, faces, kind)))
-    assert isinstance(mesh, Mesh)
-    assert mesh.said == "320 triangles without singular edges: a closed mesh"
+    mesh = read_geometry(save(f"a.{kind.split('_')[0]}", exported(x, faces, kind)))
+    assert isinstance(mesh, LoadedMesh)
+    assert mesh.summary == "320 triangles without singular edges: a closed mesh"
     assert mesh.vertices.dtype == np.float64
     assert mesh.faces.dtype == np.int64
     np.testing.assert_allclose(mesh.vertices[mesh.faces], x[faces], atol=1e-7)
@@ -69,7 +69,7 @@ def test_a_mesh_is_the_same_in_every_format(save, kind):
 def test_what_is_said_of_a_mesh(save, damage, said):
     x, faces = icosphere(2)
     path = save("a.off", exported(x, damage(faces), "off"))
-    assert re.search(said, read_surface(path).said)
+    assert re.search(said, read_geometry(path).summary)
 
 
 def scene_of_two(tmp_path: Path, kind: str) -> Path:
@@ -90,9 +90,9 @@ def scene_of_two(tmp_path: Path, kind: str) -> Path:
 
 @pytest.mark.parametrize("kind", ["glb", "gltf"])
 def test_the_nodes_of_a_scene_are_put_in_their_places(tmp_path, kind):
-    mesh = read_surface(scene_of_two(tmp_path, kind))
+    mesh = read_geometry(scene_of_two(tmp_path, kind))
     assert len(mesh.faces) == 160
-    assert mesh.said == "160 triangles without singular edges: a closed mesh"
+    assert mesh.summary == "160 triangles without singular edges: a closed mesh"
     x = mesh.vertices
     np.testing.assert_allclose(np.linalg.norm(np.abs(x) - [5.0, 0, 0], axis=1), 2.0, atol=1e-6)
     for side in (-1.0, 1.0):
@@ -105,7 +105,7 @@ def test_a_missing_buffer_of_a_scene_is_named(tmp_path):
     path = scene_of_two(tmp_path, "gltf")
     (tmp_path / "gltf_buffer_1.bin").unlink()
     with pytest.raises(FileFormatError, match=r"gltf_buffer_1.bin: there is no such file"):
-        read_surface(path)
+        read_geometry(path)
 
 
 L_SHAPE = [[0, 0, 0], [2, 0, 0], [2, 1, 0], [1, 1, 0], [1, 2, 0], [0, 2, 0]]
@@ -115,7 +115,7 @@ L_SHAPE = [[0, 0, 0], [2, 0, 0], [2, 1, 0], [1, 1, 0], [1, 2, 0], [0, 2, 0]]
 def test_polygons_with_dents_are_cut_without_overlaps(save, shift):
     corners = np.roll(L_SHAPE, shift, axis=0)
     text = "".join(f"v {x} {y} {z}\n" for x, y, z in corners) + "f 1 2 3 4 5 6\n"
-    mesh = read_surface(save("l.obj", text), "winding")
+    mesh = read_geometry(save("l.obj", text), "winding")
     assert np.linalg.norm(area(mesh.vertices, mesh.faces), axis=1).sum() == pytest.approx(3.0)
     assert area(mesh.vertices, mesh.faces).sum(axis=0).tolist() == [0, 0, 3]
 
@@ -141,8 +141,8 @@ def test_a_corner_in_the_middle_of_an_edge_leaves_no_gap(save):
     # Two quads beside a pentagon whose first corners lie on a line: no triangle of zero area.
     text = "v 0 0 0\nv 1 0 0\nv 2 0 0\nv 2 1 0\nv 0 1 0\nv 0 -1 0\nv 1 -1 0\nv 2 -1 0\n"
     text += "f 1 2 3 4 5\nf 6 7 2 1\nf 7 8 3 2\n"
-    mesh = read_surface(save("t.obj", text))
-    assert "left out" not in mesh.said
+    mesh = read_geometry(save("t.obj", text))
+    assert "left out" not in mesh.summary
     edges, _ = singular_edges(weld_vertices(mesh.vertices)[mesh.faces])
     assert len(edges) == 7
 
@@ -188,7 +188,7 @@ def test_corners_in_the_middle_of_edges_leave_no_triangle_without_area(seed):
 
 def test_faces_of_different_sizes_keep_their_order(save):
     text = SQUARE + "v 0 0 1\nf 1 2 5\nf 1 2 3 4\nf 2 3 5\nf 1 2 3 4\n"
-    mesh = read_surface(save("mixed.obj", text))
+    mesh = read_geometry(save("mixed.obj", text))
     corners = [sorted(face) for face in mesh.faces.tolist()]
     assert corners[0] == [0, 1, 4]
     assert corners[3] == [1, 2, 4]
@@ -229,9 +229,9 @@ CLOUDS = [
 
 @pytest.mark.parametrize(("name", "content"), CLOUDS)
 def test_points_with_normals_are_a_cloud(save, name, content):
-    cloud = read_surface(save(name, content))
-    assert isinstance(cloud, Cloud)
-    assert cloud.said == "4 points with normals, no faces: a point cloud"
+    cloud = read_geometry(save(name, content))
+    assert isinstance(cloud, LoadedCloud)
+    assert cloud.summary == "4 points with normals, no faces: a point cloud"
     assert cloud.points.tolist() == [row[:3] for row in ROWS]
     assert cloud.normals is not None
     assert cloud.normals.tolist() == [row[3:] for row in ROWS]
@@ -251,18 +251,20 @@ def test_points_with_normals_are_a_cloud(save, name, content):
     ],
 )  # fmt: skip
 def test_points_without_normals_are_a_cloud(save, name, content):
-    cloud = read_surface(save(name, content))
-    assert isinstance(cloud, Cloud)
-    assert cloud.said == "4 points without faces, and no normals read: a point cloud"
+    cloud = read_geometry(save(name, content))
+    assert isinstance(cloud, LoadedCloud)
+    assert cloud.summary == "4 points without faces, and no normals read: a point cloud"
     assert cloud.normals is None
     assert cloud.points.tolist() == [row[:3] for row in ROWS]
 
 
 def test_a_mesh_can_be_taken_as_dipoles(save):
     x, faces = torus_mesh(1.0, 0.4, 30, 20)
-    cloud = read_surface(save("t.ply", exported(x, faces, "ply")), "dipole")
-    assert isinstance(cloud, Cloud)
-    assert cloud.said == "1,200 triangles, each taken as a point with its normal and area, as asked"
+    cloud = read_geometry(save("t.ply", exported(x, faces, "ply")), "dipole")
+    assert isinstance(cloud, LoadedCloud)
+    assert (
+        cloud.summary == "1,200 triangles, each taken as a point with its normal and area, as asked"
+    )
     assert cloud.areas is not None
     assert cloud.normals is not None
     np.testing.assert_allclose(cloud.normals * cloud.areas[:, None], area(x, faces), atol=1e-7)
@@ -273,7 +275,7 @@ def test_edges_beside_faces_may_have_any_names(save):
     numbers = "".join(f"property float {axis}\n" for axis in "xyz")
     head = f"ply\nformat ascii 1.0\nelement vertex 3\n{numbers}element face 1\n"
     head += "property list uchar int vertex_indices\nelement edge 1\nproperty int from\n"
-    surface = read_surface(save("a.ply", head + "end_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n0\n"))
+    surface = read_geometry(save("a.ply", head + "end_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n0\n"))
     assert surface.faces.tolist() == [[0, 1, 2]]
 
 
@@ -281,7 +283,7 @@ PENTAGON = SQUARE + "v -1 0.5 0\n"
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "as_", "said"),
+    ("name", "content", "read_as", "said"),
     [
         ("a.obj", SQUARE + "l 1 2 3 4 1\n", None, "1 loop of 4 vertices: polylines without faces"),
         ("a.obj", SQUARE + "l 1 2\nl 2 3\nl 3 1\n", "loops", "1 loop of 3 vertices: polylines"),
@@ -299,10 +301,10 @@ PENTAGON = SQUARE + "v -1 0.5 0\n"
          "1 loop of 3 edges: the boundary of the faces"),
     ],
 )  # fmt: skip
-def test_curves(save, name, content, as_, said):
-    loops = read_surface(save(name, content), as_)
-    assert isinstance(loops, ClosedCurves)
-    assert loops.said.startswith(said)
+def test_curves(save, name, content, read_as, said):
+    loops = read_geometry(save(name, content), read_as)
+    assert isinstance(loops, LoadedCurves)
+    assert loops.summary.startswith(said)
     assert all(loop.shape[1] == 3 for loop in loops.loops)
 
 
@@ -311,15 +313,17 @@ def test_faces_that_share_edges_or_have_few_corners_are_no_curves(save):
         SQUARE + "f 1 2 3 4\n",
         PENTAGON + "v -2 2 0\nf 1 2 3 4 5\nf 5 4 6\n",
     ):
-        assert isinstance(read_surface(save("a.obj", text)), Mesh)
-    assert isinstance(read_surface(save("a.obj", PENTAGON + "f 1 2 3 4 5\n"), "winding"), Mesh)
-    both = read_surface(save("a.obj", SQUARE + "f 1 2 3 4\nl 1 2 4 1\n"))
-    assert isinstance(both, Mesh)
-    assert both.said.endswith("polylines not used")
+        assert isinstance(read_geometry(save("a.obj", text)), LoadedMesh)
+    assert isinstance(
+        read_geometry(save("a.obj", PENTAGON + "f 1 2 3 4 5\n"), "winding"), LoadedMesh
+    )
+    both = read_geometry(save("a.obj", SQUARE + "f 1 2 3 4\nl 1 2 4 1\n"))
+    assert isinstance(both, LoadedMesh)
+    assert both.summary.endswith("polylines not used")
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "as_", "message"),
+    ("name", "content", "read_as", "message"),
     [
         ("a.xyz", XYZ, "winding", 'it holds points only: .* as "winding", which needs faces'),
         ("a.xyz", XYZ, "loops", 'it holds points only: .* "loops", which needs polylines or faces'),
@@ -329,14 +333,14 @@ def test_faces_that_share_edges_or_have_few_corners_are_no_curves(save):
         ("a.off", exported(*icosphere(0), "off"), "loops", "closed surface, which has no boundary"),
     ],
 )
-def test_what_cannot_be_taken_as_asked(save, name, content, as_, message):
+def test_what_cannot_be_taken_as_asked(save, name, content, read_as, message):
     with pytest.raises(FileFormatError, match=message):
-        read_surface(save(name, content), as_)
+        read_geometry(save(name, content), read_as)
 
 
 def test_as_must_be_known(save):
-    with pytest.raises(ValueError, match=r'as_ must be .*"loops", "polygons" or None'):
-        read_surface(save("a.xyz", XYZ), "mesh")
+    with pytest.raises(ValueError, match=r'read_as must be .*"loops", "polygons" or None'):
+        read_geometry(save("a.xyz", XYZ), "mesh")
 
 
 # --- ways to write the same --------------------------------------------------------------------
@@ -362,7 +366,7 @@ def test_as_must_be_known(save):
     ],
 )  # fmt: skip
 def test_ways_to_write_faces_in_obj_files(save, text, faces):
-    mesh = read_surface(save("a.obj", text))
+    mesh = read_geometry(save("a.obj", text))
     assert mesh.vertices.tolist() == [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
     assert mesh.faces.tolist() == faces
 
@@ -375,13 +379,13 @@ MIXED = struct.pack("<BB3iBB4i", 7, 3, 0, 1, 2, 7, 4, 0, 1, 2, 3)
 def test_ply_faces_are_read_quickly_if_regular(save, monkeypatch):
     rows = [row[:3] for row in ROWS]
     mixed = ply("<", NAMES[:3], rows, (FACES, MIXED))
-    assert len(read_surface(save("m.ply", mixed)).faces) == 3
+    assert len(read_geometry(save("m.ply", mixed)).faces) == 3
     regular = ply("<", NAMES[:3], rows, (FACES, REGULAR))
     text = ply("", NAMES[:3], rows, (FACES, b"7 3 0 1 2\n7 3 0 2 3\n"))
     # Called before rows are gone through one by one.
     monkeypatch.setattr(ply_files, "check_element_count", None)
     for data in (regular, text):
-        assert read_surface(save("r.ply", data)).faces.tolist() == [[0, 1, 2], [0, 2, 3]]
+        assert read_geometry(save("r.ply", data)).faces.tolist() == [[0, 1, 2], [0, 2, 3]]
 
 
 # --- hostile and mistaken files ----------------------------------------------------------------
@@ -528,7 +532,7 @@ BAD = [
 def test_each_bad_file_has_its_own_error(save, name, content, message):
     path = save(name, content)
     with pytest.raises(FileFormatError, match=message) as caught:
-        read_surface(path)
+        read_geometry(path)
     assert str(path) in str(caught.value)
     assert len(str(caught.value)) < 350 + len(str(path))
 
@@ -536,10 +540,10 @@ def test_each_bad_file_has_its_own_error(save, name, content, message):
 @pytest.mark.parametrize("kind", ["obj", "ply", "stl", "off", "glb", "gltf", "xyz", "loops"])
 def test_what_is_not_a_file_is_said(tmp_path, kind):
     with pytest.raises(FileFormatError, match="no such file"):
-        read_surface(tmp_path / f"missing.{kind}")
+        read_geometry(tmp_path / f"missing.{kind}")
     (tmp_path / f"folder.{kind}").mkdir()
     with pytest.raises(FileFormatError, match="a directory"):
-        read_surface(tmp_path / f"folder.{kind}")
+        read_geometry(tmp_path / f"folder.{kind}")
 
 
 def test_a_scene_that_draws_one_mesh_too_often_is_refused(save, monkeypatch):
@@ -548,10 +552,10 @@ def test_a_scene_that_draws_one_mesh_too_often_is_refused(save, monkeypatch):
         header["scenes"] = [{"nodes": list(range(50))}]
 
     path = save("repeat.glb", glb(repeat))
-    assert len(read_surface(path).faces) == 100
+    assert len(read_geometry(path).faces) == 100
     monkeypatch.setattr(gltf, "MAX_BYTES", 299)
     with pytest.raises(FileFormatError, match="draws 300 corners: at most 299"):
-        read_surface(path)
+        read_geometry(path)
 
 
 SEEDS = [
@@ -572,15 +576,15 @@ SEEDS = [
     seed=st.sampled_from(SEEDS),
     edits=st.lists(st.tuples(st.integers(0, 900), st.binary(max_size=4)), max_size=4),
     cut=st.integers(0, 900) | st.none(),
-    as_=st.sampled_from([None, "winding", "dipole", "loops", "polygons"]),
+    read_as=st.sampled_from([None, "winding", "dipole", "loops", "polygons"]),
 )
-def test_a_damaged_file_is_read_or_refused_but_nothing_else(save, seed, edits, cut, as_):
+def test_a_damaged_file_is_read_or_refused_but_nothing_else(save, seed, edits, cut, read_as):
     name, data = seed
     for position, bytes_ in edits:
         position %= len(data)
         data = data[:position] + bytes_ + data[position + len(bytes_) :]
     with contextlib.suppress(FileFormatError):
-        assert read_surface(save(name, data[:cut]), as_).said
+        assert read_geometry(save(name, data[:cut]), read_as).summary
 
 
 EMPTY_FACES = (
@@ -602,22 +606,22 @@ def test_files_of_many_irregular_elements_take_neither_all_memory_nor_minutes(
     if name == "a.obj":
         monkeypatch.setattr("harnack.files.file_geometry.MAX_ELEMENTS", 500)
     with pytest.raises(FileFormatError, match=r"elements are too many .* let the program"):
-        read_surface(save(name, content))
+        read_geometry(save(name, content))
 
 
 def test_polygons_are_read_as_they_are(save):
     corners = "v 0 0 0\nv 2 0 0\nv 2 1 1\nv 1 2 0\nv 0 1 1\nv 3 3 0\n"
     path = save("net.obj", corners + "f 1 2 3 4 5\nf 3 2 6\nf 4/1 3/2 6/3\n")
-    surface = read_surface(path, "polygons")
+    surface = read_geometry(path, "polygons")
     assert [face.tolist() for face in surface.faces] == [[0, 1, 2, 3, 4], [2, 1, 5], [3, 2, 5]]
-    assert surface.said.startswith("3 polygons of 3 to 5 corners")
-    opened = open_surface(path, as_="polygons", up="z")
+    assert surface.summary.startswith("3 polygons of 3 to 5 corners")
+    opened = field_from_file(path, read_as="polygons", up="z")
     assert isinstance(opened.field, PolygonMesh)
-    assert opened.field.faces.count == 3
+    assert opened.field.faces.face_count == 3
     assert opened.show == "shaded"
     # Without being asked they are cut into triangles.
-    assert len(read_surface(path, "winding").faces) == 5
+    assert len(read_geometry(path, "winding").faces) == 5
     with pytest.raises(FileFormatError, match="face 1 visits vertex 0 twice"):
-        open_surface(save("bad.obj", corners + "f 1 2 3\nf 1 2 1 3\n"), as_="polygons")
+        field_from_file(save("bad.obj", corners + "f 1 2 3\nf 1 2 1 3\n"), read_as="polygons")
     with pytest.raises(FileFormatError, match='cannot be taken as "polygons", which needs faces'):
-        read_surface(save("a.xyz", XYZ), "polygons")
+        read_geometry(save("a.xyz", XYZ), "polygons")

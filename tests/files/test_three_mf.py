@@ -13,7 +13,7 @@ import trimesh
 import harnack as hk
 from harnack.cli.mesh_files import MESH_FILES, write_mesh
 from harnack.files.file_geometry import FileFormatError
-from harnack.files.geometry_files import Mesh, read_surface
+from harnack.files.geometry_files import LoadedMesh, read_geometry
 
 
 @pytest.mark.parametrize("kind", MESH_FILES)
@@ -22,7 +22,7 @@ def test_what_is_written_is_read_closed_and_of_the_same_volume(kind: str, tmp_pa
     path = tmp_path / f"ring{kind}"
     write_mesh(ring, path)
     found = hk.check_print(path)
-    assert found.is_fine
+    assert found.is_printable
     assert found.volume is not None
     assert math.isclose(found.volume, ring.volume, rel_tol=1e-6)
     assert np.allclose(found.size, ring.extents, rtol=1e-6)
@@ -57,8 +57,8 @@ def test_units_become_millimeters_and_items_stand_where_they_are_put(tmp_path: P
         '<item objectid="1"/><item objectid="1" transform="1 0 0 0 1 0 0 0 1 5 0 0"/>'
         '<item objectid="1" transform="-1 0 0 0 1 0 0 0 1 0 5 0"/>'
     )
-    found = read_surface(write(tmp_path / "a.3mf", model("inch", items)))
-    assert isinstance(found, Mesh)
+    found = read_geometry(write(tmp_path / "a.3mf", model("inch", items)))
+    assert isinstance(found, LoadedMesh)
     assert len(found.faces) == 12
     assert np.allclose(np.ptp(found.vertices, axis=0), 25.4 * np.array([7.0, 6.0, 1.0]))
     corner = found.vertices[found.faces]
@@ -78,7 +78,7 @@ def test_units_become_millimeters_and_items_stand_where_they_are_put(tmp_path: P
 )
 def test_unsound_files_are_refused(text: str, why: str, tmp_path: Path) -> None:
     with pytest.raises(FileFormatError, match=why):
-        read_surface(write(tmp_path / "a.3mf", text))
+        read_geometry(write(tmp_path / "a.3mf", text))
 
 
 def test_what_is_no_archive_or_too_large_is_refused(
@@ -86,7 +86,7 @@ def test_what_is_no_archive_or_too_large_is_refused(
 ) -> None:
     (tmp_path / "a.3mf").write_text("no archive")
     with pytest.raises(FileFormatError, match="no zip archive"):
-        read_surface(tmp_path / "a.3mf")
+        read_geometry(tmp_path / "a.3mf")
     monkeypatch.setattr("harnack.files.three_mf.MAX_BYTES", 100)
     with pytest.raises(FileFormatError, match="unpacked"):
-        read_surface(write(tmp_path / "b.3mf", model("inch", '<item objectid="1"/>')))
+        read_geometry(write(tmp_path / "b.3mf", model("inch", '<item objectid="1"/>')))

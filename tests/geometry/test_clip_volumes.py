@@ -12,7 +12,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from harnack.geometry.clip_volumes import MAX_UNROLLED, Ball, Box, HalfSpace, Intersection, Polytope
+from harnack.geometry.clip_volumes import (
+    MAX_UNROLLED,
+    Ball,
+    Box,
+    HalfSpace,
+    Polytope,
+    VolumeIntersection,
+)
 from harnack.geometry.convex_position import MAX_PLANES, ConvexHull
 from harnack.geometry.volume import Volume
 
@@ -42,16 +49,16 @@ def make_volume(kind: str, shift: np.ndarray, scale: float) -> Volume:
         case "half-space":
             return HalfSpace((1.0, -2.0, 0.5), float(np.dot(shift, (1, -2, 0.5))))
         case "tetrahedron":
-            return ConvexHull.of(shift + scale * tetrahedron())
+            return ConvexHull.from_points(shift + scale * tetrahedron())
         case "round hull":
-            return ConvexHull.of(shift + scale * sphere_points(rng, 60))
+            return ConvexHull.from_points(shift + scale * sphere_points(rng, 60))
         case "flat hull":
-            return ConvexHull.of(shift + scale * sphere_points(rng, 20) * [1, 1, 0])
+            return ConvexHull.from_points(shift + scale * sphere_points(rng, 20) * [1, 1, 0])
         case "rod":
-            return ConvexHull.of(shift + scale * sphere_points(rng, 20) * [0, 1, 0])
+            return ConvexHull.from_points(shift + scale * sphere_points(rng, 20) * [0, 1, 0])
         case "cut ball":
             cut = float(np.dot(shift, (1, -2, 0.5)))
-            return Intersection([Ball(c, scale), HalfSpace((1.0, -2.0, 0.5), cut)])
+            return VolumeIntersection([Ball(c, scale), HalfSpace((1.0, -2.0, 0.5), cut)])
     raise AssertionError(kind)
 
 
@@ -60,7 +67,7 @@ KINDS += ["cut ball"]
 
 
 def members(volume: Volume) -> list[Volume]:
-    return list(volume.volumes) if isinstance(volume, Intersection) else [volume]
+    return list(volume.volumes) if isinstance(volume, VolumeIntersection) else [volume]
 
 
 def exact_clip(volume: Volume, o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -185,7 +192,7 @@ def test_the_clip_keeps_the_given_interval():
 
 def test_volumes_that_do_not_meet_leave_nothing():
     backend = hb.choose_backend()
-    apart = Intersection([Ball((-2, 0, 0), 1.0), Ball((2, 0, 0), 1.0)])
+    apart = VolumeIntersection([Ball((-2, 0, 0), 1.0), Ball((2, 0, 0), 1.0)])
     o, d = hb.to_vector3(backend, [[-9, 0, 0]]), hb.to_vector3(backend, [[1, 0, 0]])
     t0, t1 = apart.clip(o, d, 0.0, dr.inf)
     assert (hb.to_numpy(t0)[0], hb.to_numpy(t1)[0]) == (np.inf, -np.inf)
@@ -198,7 +205,7 @@ def test_clip_can_be_recorded_in_a_loop(points):
     """As an integrator does at each bounce; 60 points make a loop within a loop."""
     backend = hb.choose_backend()
     rng = np.random.default_rng(1)
-    hull = ConvexHull.of(sphere_points(rng, points))
+    hull = ConvexHull.from_points(sphere_points(rng, points))
     assert (len(hull.normals) > MAX_UNROLLED) == (points == 60)
     o, d = random_rays(rng, np.zeros(3), 1.0, 300)
     origins, directions = hb.to_vector3(backend, o), hb.to_vector3(backend, d)
@@ -224,7 +231,7 @@ def test_another_volume_of_the_kind_uses_the_same_kernel(kind):
     backend = hb.choose_backend()
     rng = np.random.default_rng(5)
     if kind == "large hulls":
-        volumes: list[Volume] = [ConvexHull.of(sphere_points(rng, n)) for n in (50, 90)]
+        volumes: list[Volume] = [ConvexHull.from_points(sphere_points(rng, n)) for n in (50, 90)]
     else:
         volumes = [make_volume(kind, np.array([0.1, k, 0.3]), 1.0 + k) for k in (0.0, 1.5)]
     volumes = [v.prepare(backend) for v in volumes]
@@ -306,9 +313,9 @@ def test_a_hull_holds_its_points_and_little_more(points, scale):
     x = scale * np.array(points)
     if len(np.unique(x, axis=0)) < 2:
         with pytest.raises(ValueError, match="two different points"):
-            ConvexHull.of(x)
+            ConvexHull.from_points(x)
         return
-    hull = ConvexHull.of(x)
+    hull = ConvexHull.from_points(x)
     weights = np.random.default_rng(0).dirichlet(np.ones(len(x)), size=50)
     assert hull.contains_points(x).all()
     assert hull.contains_points(weights @ x).all()
@@ -327,7 +334,7 @@ def test_a_hull_holds_its_points_and_little_more(points, scale):
 
 def test_a_hull_of_many_points_has_few_planes():
     x = sphere_points(np.random.default_rng(0), 6000)
-    hull = ConvexHull.of(x)
+    hull = ConvexHull.from_points(x)
     assert len(hull.normals) <= MAX_PLANES + 6
     assert hull.contains_points(x).all()
     assert not hull.contains_points(1.1 * x).any()
@@ -336,15 +343,15 @@ def test_a_hull_of_many_points_has_few_planes():
 def test_coplanar_facets_become_one_plane():
     grid = np.linspace(-1, 1, 5)
     x = np.array([(a, b, c) for a in grid for b in grid for c in grid])
-    assert len(ConvexHull.of(x).normals) == 6
+    assert len(ConvexHull.from_points(x).normals) == 6
 
 
 def test_flat_and_straight_sets_get_thin_hulls():
     square = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
-    flat = ConvexHull.of(square)
+    flat = ConvexHull.from_points(square)
     assert flat.contains_points([[0.5, 0.5, 0.0]])[0]
     assert not flat.contains_points([[0.5, 0.5, 1e-5], [1.00001, 0.5, 0.0]]).any()
-    rod = ConvexHull.of(np.outer([0.0, 0.5, 2.0], [1.0, 1.0, 0.0]))
+    rod = ConvexHull.from_points(np.outer([0.0, 0.5, 2.0], [1.0, 1.0, 0.0]))
     assert rod.contains_points([[0.7, 0.7, 0.0]])[0]
     assert not rod.contains_points([[0.7, 0.7, 1e-4], [0.7, 0.71, 0], [2.1, 2.1, 0]]).any()
 
@@ -363,12 +370,12 @@ def test_flat_and_straight_sets_get_thin_hulls():
         (lambda: Box((np.inf, 0, 0), (np.inf, 1, 1)), "lower <= upper"),
         (lambda: HalfSpace((0, 0, 0), 1.0), "must not be zero"),
         (lambda: HalfSpace((0, 0, 1), np.inf), "offset of a half-space must be finite"),
-        (lambda: Intersection([]), "at least one volume"),
+        (lambda: VolumeIntersection([]), "at least one volume"),
         (lambda: Ball().padded(-1.0), "not negative"),
         (lambda: Ball().padded(np.nan), "not negative"),
-        (lambda: ConvexHull.of(np.zeros((0, 3))), "at least two points"),
-        (lambda: ConvexHull.of([[0, 0, 0], [0, 0, np.nan]]), "all of them finite"),
-        (lambda: ConvexHull.of(np.zeros((4, 2))), r"shape \(n, 3\)"),
+        (lambda: ConvexHull.from_points(np.zeros((0, 3))), "at least two points"),
+        (lambda: ConvexHull.from_points([[0, 0, 0], [0, 0, np.nan]]), "all of them finite"),
+        (lambda: ConvexHull.from_points(np.zeros((4, 2))), r"shape \(n, 3\)"),
         (lambda: Ball().contains_points([0, 0, 0]), r"shape \(n, 3\)"),
     ],
 )

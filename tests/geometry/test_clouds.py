@@ -294,7 +294,7 @@ def test_signs_are_carried_along_any_tree():
     x, _ = icosphere(2)
     parent = np.maximum(np.arange(len(x)) - 1, 0)
     normals = x * np.where(rng().random(len(x)) < 0.5, -1.0, 1.0)[:, None]
-    sign = clouds._carried_signs(clouds._Planes(x, normals, parent[:, None]), parent)
+    sign = clouds._propagate_signs(clouds._TangentPlanes(x, normals, parent[:, None]), parent)
     for k in range(1, len(x)):
         edge = x[k] - x[k - 1]
         edge /= np.linalg.norm(edge)
@@ -326,9 +326,9 @@ def test_a_moved_cloud_is_the_cloud_that_is_there(motion, monkeypatch):
         "shuffled": u[np.random.default_rng(1).permutation(len(u))],
     }[motion]
     monkeypatch.setattr(
-        "harnack.fields.solid_angles.treecode.build_hierarchy", None
+        "harnack.fields.solid_angles.treecode.build_balanced_tree", None
     )  # no sort again
-    moved = field.moved(x, x, areas)
+    moved = field.with_points(x, x, areas)
     points = np.random.default_rng(2).uniform(-1.5, 1.5, (800, 3))
     z = x - points[:, None]
     r = np.linalg.norm(z, axis=2)
@@ -338,10 +338,10 @@ def test_a_moved_cloud_is_the_cloud_that_is_there(motion, monkeypatch):
     assert (np.abs(moved.value(points) - exact) <= bound).all()
     hits = hk.trace(moved, points[:50] * 3, -points[:50], t_max=20.0)
     inside = np.linalg.norm(points[:50] * 3, axis=1) > 1.3
-    assert hits.hit[inside].all()
+    assert hits.is_hit[inside].all()
 
 
 def test_a_moved_cloud_keeps_its_number_of_points():
     u, areas = moved_cloud(100)
     with pytest.raises(CloudError, match="99 of them, where 100 were before"):
-        hk.DipolePotential(u, u, areas).moved(u[1:], u[1:], areas[1:])
+        hk.DipolePotential(u, u, areas).with_points(u[1:], u[1:], areas[1:])

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from harnack.geometry.clouds import point_tree
-from harnack.geometry.denoising import Denoising, Noise, lonely_points, noise_of
+from harnack.geometry.clouds import build_point_tree
+from harnack.geometry.denoising import CloudDenoiser, NoiseEstimate, estimate_noise, outlier_indices
 
 
 def sphere(count: int, noise: float = 0.0, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -32,32 +32,32 @@ def cube(count: int, noise: float) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("is_given", [True, False])
 def test_noise_and_spacing_are_found(count: int, noise: float, off: float, is_given: bool) -> None:
     points, normals = sphere(count, noise)
-    found = noise_of(points, normals if is_given else None, point_tree(points))
+    found = estimate_noise(points, normals if is_given else None, build_point_tree(points))
     assert found.deviation == pytest.approx(noise, rel=off)
     assert found.spacing == pytest.approx(np.sqrt(4 * np.pi / count), rel=0.2)
 
 
 def test_without_noise_next_to_none_is_found() -> None:
     points, normals = sphere(4000)
-    tree = point_tree(points)
+    tree = build_point_tree(points)
     spacing = np.sqrt(4 * np.pi / 4000)
-    assert noise_of(points, normals, tree).deviation < 1e-12
-    assert noise_of(points, None, tree).deviation < 0.05 * spacing
+    assert estimate_noise(points, normals, tree).deviation < 1e-12
+    assert estimate_noise(points, None, tree).deviation < 0.05 * spacing
 
 
 def test_points_of_a_sphere_stay_where_they_are() -> None:
     """As neighbors say exactly that they are on it, however far these are."""
     points, normals = sphere(500)
-    moved = Denoising(points, Noise(0.1, 0.16)).moved(normals)
+    moved = CloudDenoiser(points, NoiseEstimate(0.1, 0.16)).denoise_points(normals)
     assert np.abs(moved - points).max() < 1e-12
 
 
 @pytest.mark.parametrize(("count", "noise", "left"), [(4000, 0.04, 0.3), (40_000, 0.06, 0.15)])
 def test_noise_is_taken_away_and_nothing_shrinks(count: int, noise: float, left: float) -> None:
     points, normals = sphere(count, noise)
-    cloud = Denoising(points, Noise(noise, float(np.sqrt(4 * np.pi / count))))
-    assert (len(cloud.chosen) < count) == (count == 40_000)
-    off = np.linalg.norm(cloud.moved(normals), axis=1) - 1
+    cloud = CloudDenoiser(points, NoiseEstimate(noise, float(np.sqrt(4 * np.pi / count))))
+    assert (len(cloud.selected) < count) == (count == 40_000)
+    off = np.linalg.norm(cloud.denoise_points(normals), axis=1) - 1
     assert np.sqrt((off**2).mean()) < left * noise
     # Noise along the sphere moves points out by noise^2.
     assert abs(off.mean()) < 2 * noise**2
@@ -65,7 +65,7 @@ def test_noise_is_taken_away_and_nothing_shrinks(count: int, noise: float, left:
 
 def test_points_beside_edges_stay_on_their_faces() -> None:
     points, normals = cube(6000, 0.03)
-    moved = Denoising(points, Noise(0.03, 0.063)).moved(normals)
+    moved = CloudDenoiser(points, NoiseEstimate(0.03, 0.063)).denoise_points(normals)
     height = np.einsum("ij,ij->i", moved, normals) - 1
     beside = (np.abs(moved) > 0.9).sum(axis=1) > 1
     assert beside.sum() > 500
@@ -76,10 +76,12 @@ def test_points_beside_edges_stay_on_their_faces() -> None:
 
 def test_estimated_normals_get_better_at_edges() -> None:
     points, normals = cube(6000, 0.03)
-    tree = point_tree(points)
+    tree = build_point_tree(points)
     rounded = normals[tree.query(points, k=32)[1]].mean(axis=1)
     rounded /= np.linalg.norm(rounded, axis=1, keepdims=True)
-    moved, turned = Denoising(points, Noise(0.03, 0.063), tree).moved_and_turned(rounded)
+    moved, turned = CloudDenoiser(
+        points, NoiseEstimate(0.03, 0.063), tree
+    ).denoise_points_and_normals(rounded)
     assert len(moved) > 0.99 * len(points)
     before = np.einsum("ij,ij->i", rounded, normals)
     after = np.einsum("ij,ij->i", turned, normals[tree.query(moved)[1]])
@@ -93,7 +95,9 @@ def test_points_in_the_middle_of_thin_parts_are_left_out() -> None:
     points = walls + rng.normal(0, 0.01, walls.shape)
     normals = np.column_stack([np.zeros((6000, 2)), np.sign(walls[:, 2])])
     points[:5], normals[:5] = [[x, 0, 0] for x in (-0.8, -0.4, 0, 0.4, 0.8)], (1, 0, 0)
-    moved, turned = Denoising(points, Noise(0.03, 0.052)).moved_and_turned(normals)
+    moved, turned = CloudDenoiser(points, NoiseEstimate(0.03, 0.052)).denoise_points_and_normals(
+        normals
+    )
     assert len(moved) == len(turned) == 5995
     assert (np.abs(moved[:, 2]) > 0.1).all()
 
@@ -103,4 +107,4 @@ def test_points_far_from_all_others_are_found() -> None:
     dense, _ = sphere(8000, seed=1)
     some = np.array([[3.0, 0, 0], [3.01, 0, 0], [0, 0, 0], [-40, 9, 5]])
     x = np.concatenate([points, dense[dense[:, 2] > 0], some])
-    assert lonely_points(x, point_tree(x)).tolist() == list(range(len(x) - 4, len(x)))
+    assert outlier_indices(x, build_point_tree(x)).tolist() == list(range(len(x) - 4, len(x)))

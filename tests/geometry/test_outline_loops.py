@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from harnack.geometry.outline_loops import outline_loops
+from harnack.geometry.outline_loops import make_outline
 
 
 def square(r: float, x: float = 0.0) -> Any:
@@ -39,24 +39,24 @@ def test_loops_have_the_region_on_their_left(loops: Any, inside: float, count: A
     for size in (1.0, 1e-9, 1e9):
         for offset in (0.0, 7.0):
             several = [loops] if np.ndim(loops[0]) == 1 else loops
-            made = outline_loops([size * (np.asarray(one) + offset) for one in several])
+            made = make_outline([size * (np.asarray(one) + offset) for one in several])
             assert area(made) / size**2 == pytest.approx(inside, rel=1e-9)
             assert count in (None, len(made))
-            again = outline_loops(made)
+            again = make_outline(made)
             assert all(np.array_equal(a, b) for a, b in zip(made, again, strict=True))
 
 
 def test_loops_that_do_not_cross_keep_their_vertices() -> None:
     given = [square(1 / 3), square(0.1, 0.07)]
-    made = outline_loops(given)
+    made = make_outline(given)
     assert np.array_equal(made[0], given[0])
     assert np.array_equal(made[1], given[1][::-1])
 
 
 def test_windings_count_where_they_are_asked_for() -> None:
     loops = [square(1), square(1, 1.0), square(0.2, 0.5)[::-1]]
-    assert area(outline_loops(loops, "nonzero")) == pytest.approx(6.0)
-    assert area(outline_loops(loops, "even-odd")) == pytest.approx(4.0 + 0.16)
+    assert area(make_outline(loops, "nonzero")) == pytest.approx(6.0)
+    assert area(make_outline(loops, "even-odd")) == pytest.approx(4.0 + 0.16)
 
 
 @pytest.mark.parametrize(
@@ -78,4 +78,4 @@ def test_windings_count_where_they_are_asked_for() -> None:
 )
 def test_what_is_no_outline_is_said(loops: Any, error: Any, words: str) -> None:
     with pytest.raises(error, match=words):
-        outline_loops(loops)
+        make_outline(loops)

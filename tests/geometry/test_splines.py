@@ -72,8 +72,9 @@ def test_points_that_make_no_smooth_curve_are_refused(
 
 @pytest.mark.parametrize(
     ("settings", "message"),
-    [({"samples": True}, "whole"), ({"samples": 2.5}, "whole"), ({"samples": 0}, "at least 1"),
-     ({"spacing": "even"}, "centripetal"), ({"samples": 10**7}, "fewer samples")],
+    [({"samples_per_segment": True}, "whole"), ({"samples_per_segment": 2.5}, "whole"),
+     ({"samples_per_segment": 0}, "at least 1"), ({"spacing": "even"}, "centripetal"),
+     ({"samples_per_segment": 10**7}, "fewer samples")],
 )  # fmt: skip
 def test_settings_of_smooth_curves_are_checked(settings: Any, message: str) -> None:
     with pytest.raises((TypeError, ValueError), match=message):

@@ -9,7 +9,7 @@ import pytest
 import trimesh
 
 import harnack as hk
-from harnack.files import read_surface
+from harnack.files import read_geometry
 from harnack.geometry.example_meshes import icosphere
 from harnack.geometry.welding import Welded, rounding_of
 
@@ -61,12 +61,12 @@ def test_zero_and_what_programs_get_for_it() -> None:
     assert (field.describe()["singular edges"], field.mesh.rounded) == (0, 4)
     assert hk.solid(trimesh.Trimesh(vertices, faces, process=False)).describe()["triangles"] == 12
     check = hk.check_print((vertices, faces))
-    assert check.is_fine
+    assert check.is_printable
     assert check.volume == pytest.approx(8000.0)
     assert [problem.kind for problem in check.problems] == ["corners apart by rounding"]
     result = hk.repair(trimesh.Trimesh(vertices, faces, process=False))
     facts = result.metadata["harnack"]
-    assert (facts["stage"], facts["kept"], facts["welded"]) == ("kept", 12, 4)
+    assert (facts["stage"], facts["kept"], facts["welded"]) == ("filled", 12, 4)
     assert result.volume == pytest.approx(8000.0)
 
 
@@ -74,11 +74,11 @@ def test_files_say_how_many(tmp_path: Path) -> None:
     vertices, faces = halves((0.0, 0.0, 1e-7))
     path = tmp_path / "halves.stl"
     trimesh.Trimesh(vertices, faces, process=False).export(path)
-    read = read_surface(path, "winding")
-    assert isinstance(read, hk.files.surfaces.Mesh)
+    read = read_geometry(path, "winding")
+    assert isinstance(read, hk.files.geometry_files.LoadedMesh)
     assert 0 < read.rounded < 40
-    assert "a closed mesh" in read.said
-    assert f"{read.rounded} corners joined with others that were apart by rounding" in read.said
+    assert "a closed mesh" in read.summary
+    assert f"{read.rounded} corners joined with others that were apart by rounding" in read.summary
 
 
 def test_no_face_loses_corners_or_its_area() -> None:
@@ -113,5 +113,5 @@ def test_moved_meshes_stay_joined() -> None:
     vertices, faces = halves(2e-16)
     field = hk.WindingNumber(vertices, faces)
     turned = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
-    inside = field.moved(2 * vertices @ turned).value([[0.3, 0.2, 0.1]], precision="double")
+    inside = field.with_vertices(2 * vertices @ turned).value([[0.3, 0.2, 0.1]], precision="double")
     assert abs(inside[0]) == pytest.approx(1.0)

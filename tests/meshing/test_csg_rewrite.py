@@ -6,19 +6,19 @@ import numpy as np
 import pytest
 
 import harnack as hk
-from harnack.fields.solids.booleans import Combined, Complement
+from harnack.fields.solids.booleans import BooleanSolid, Complement
 from harnack.geometry import example_meshes
-from harnack.meshing.csg_rewrite import common_parts_taken_out
+from harnack.meshing.csg_rewrite import factor_common_operands
 
 BALL, CUBE, ROD = hk.Sphere(1.0), hk.Cuboid((1.0, 1.0, 1.0)), hk.Cylinder(0.3, 4.0)
-NEAR = hk.Sphere(0.5).moved((0.7, 0.0, 0.0))
+NEAR = hk.Sphere(0.5).translated((0.7, 0.0, 0.0))
 UNIONS = {
     "of a shell": BALL.shell(0.2) | (BALL & CUBE),
     "of a shell, without a hole": (BALL.shell(0.2) - ROD) | ((BALL & CUBE) - ROD),
     "of a part of another": BALL | (BALL & CUBE),
     "of others besides": (BALL & CUBE) | ROD | (BALL & NEAR) | (CUBE - ROD),
     "of what was moved": (BALL.shell(0.2) | (BALL & CUBE)).rotated(30, "x").scaled(1.2),
-    "of what was grown": (BALL.grown(0.1) - ROD) | (BALL.grown(0.1) & NEAR),
+    "of what was grown": (BALL.offset(0.1) - ROD) | (BALL.offset(0.1) & NEAR),
 }
 
 
@@ -26,8 +26,8 @@ UNIONS = {
 @pytest.mark.parametrize("name", UNIONS)
 def test_what_they_have_in_common_is_taken_out_of_the_same_points(name: str, level: float) -> None:
     union = UNIONS[name]
-    assert isinstance(union, Combined)
-    made = common_parts_taken_out(union, level)
+    assert isinstance(union, BooleanSolid)
+    made = factor_common_operands(union, level)
     assert made is not None
     points = np.random.default_rng(1).uniform(-1.5, 1.5, (20_000, 3))
     inside = union.value(points, precision="double") <= level
@@ -37,11 +37,11 @@ def test_what_they_have_in_common_is_taken_out_of_the_same_points(name: str, lev
 
 def test_nothing_is_changed_where_there_is_nothing_in_common() -> None:
     same = BALL | (hk.Sphere(1.0) & CUBE)  # another ball, as far as one can tell
-    assert isinstance(same, Combined)
-    assert common_parts_taken_out(same, 0.0) is None
-    other_level = BALL | (BALL.grown(0.1) & CUBE)
-    assert isinstance(other_level, Combined)
-    assert common_parts_taken_out(other_level, 0.0) is None
+    assert isinstance(same, BooleanSolid)
+    assert factor_common_operands(same, 0.0) is None
+    other_level = BALL | (BALL.offset(0.1) & CUBE)
+    assert isinstance(other_level, BooleanSolid)
+    assert factor_common_operands(other_level, 0.0) is None
 
 
 @pytest.mark.parametrize("hole", [ROD, NEAR, BALL & NEAR])
@@ -64,15 +64,15 @@ def test_of_what_is_cut_away_whole_nothing_is_left() -> None:
 def test_of_a_hollow_part_the_hollow_is_cut_away() -> None:
     """So that no space around it is made, and the lattice only where the hollow is."""
     hollow = BALL.shell(0.2) | (BALL & CUBE)
-    assert isinstance(hollow, Combined)
-    made = common_parts_taken_out(hollow, 0.0)
-    assert isinstance(made, Combined)
+    assert isinstance(hollow, BooleanSolid)
+    made = factor_common_operands(hollow, 0.0)
+    assert isinstance(made, BooleanSolid)
     assert not made.is_union
     assert made.parts[0] is BALL
     hole = made.parts[1]
     assert isinstance(hole, Complement)
-    assert isinstance(hole.inner, Combined)
-    assert not hole.inner.is_union
+    assert isinstance(hole.field, BooleanSolid)
+    assert not hole.field.is_union
 
 
 def test_the_surface_of_a_hollow_part_stays_as_it_was_given() -> None:

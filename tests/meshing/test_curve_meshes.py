@@ -16,7 +16,7 @@ from harnack.geometry import example_curves
 from harnack.meshing import checks
 from harnack.meshing.checks import intersecting_faces
 from harnack.meshing.level_function import LevelFunction
-from harnack.meshing.mesh_improvement import least_angles, relaxed
+from harnack.meshing.mesh_improvement import least_angles, relax_vertices
 from tests.oracles.oracle import CurveOracle
 from tests.oracles.triangle_pairs import intersecting_pairs
 
@@ -106,7 +106,7 @@ def test_relaxed_triangles_have_larger_angles_and_the_same_rim() -> None:
     x = np.concatenate([disc, np.column_stack([*rng.uniform(-0.6, 0.6, (2, 60)), np.zeros(60)])])
     faces = Delaunay(x[:, :2]).simplices.astype(np.int64)
     flat = LevelFunction(hk.Plane((0.0, 0.0, 1.0)), 0.0)
-    moved = relaxed(flat, x, faces, 1.0, None)
+    moved = relax_vertices(flat, x, faces, 1.0, None)
     before, after = (least_angles(y, faces) for y in (x, moved))
     assert (moved[: len(disc)] == disc).all()
     assert np.abs(moved[:, 2]).max() < 1e-12
@@ -130,7 +130,7 @@ def test_topology_does_not_depend_on_place_or_spacing(name: str, seed: int) -> N
     turn, move = Rotation.random(random_state=rng).as_matrix(), rng.uniform(-0.5, 0.5, 3)
     loops = [loop @ turn.T + move for loop in loops_of(name)]
     for spacing in (None, 0.09):
-        mesh = hk.mesh(hk.SolidAngle(loops), spacing=spacing, seed=seed, tolerance=4e-3)
+        mesh = hk.mesh(hk.SolidAngle(loops), cell_size=spacing, seed=seed, tolerance=4e-3)
         check_surface(mesh, loops, CURVES[name][1])
 
 
@@ -167,7 +167,7 @@ def test_mesh_and_surface_are_within_the_tolerance(name: str, tolerance: float, 
         origin = 4 * direction / np.linalg.norm(direction, axis=1)[:, None]
         aim = rng.uniform(-1.0, 1.0, origin.shape)
         seen_by = hk.trace(field, origin, aim - origin)
-        found = np.concatenate([found, seen_by.position[seen_by.hit]])
+        found = np.concatenate([found, seen_by.position[seen_by.is_hit]])
     assert distances(mesh, found[:hits]).max() < reach
 
 
@@ -210,7 +210,7 @@ def test_cells_that_are_too_large_for_a_coil_are_made_smaller_where_checks_fail(
 ) -> None:
     said: list[str] = []
     field = hk.SolidAngle(loops_of("coil"))
-    mesh = hk.mesh(field, spacing=spacing, tolerance=0.02, progress=said.append)
+    mesh = hk.mesh(field, cell_size=spacing, tolerance=0.02, progress=said.append)
     assert any("places fail: smaller cells there" in text for text in said)
     assert mesh.metadata["harnack"]["spacing"] == spacing
     check_surface(mesh, loops_of("coil"), 1)
@@ -220,8 +220,8 @@ def test_a_coil_in_cells_that_are_too_large_raises_if_they_stay(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(spanned_module(), "_MOST_LOCAL", 0)
-    with pytest.raises(hk.MeshingError, match="smaller `spacing`"):
-        hk.mesh(hk.SolidAngle(loops_of("coil")), spacing=0.4, tolerance=0.02)
+    with pytest.raises(hk.MeshingError, match="smaller `cell_size`"):
+        hk.mesh(hk.SolidAngle(loops_of("coil")), cell_size=0.4, tolerance=0.02)
 
 
 def spanned_module() -> Any:
@@ -234,7 +234,7 @@ def test_long_edges_of_a_coil_need_to_be_integrated() -> None:
     rng = np.random.default_rng(0)
     p = rng.uniform(-1, 1, (4000, 3)) * [1.2, 1.2, 0.8]
     q = p + rng.normal(size=p.shape) * 0.2
-    exact = field.change_along(p, q)
+    exact = field.continuous_change(p, q)
     assert exact is not None
     value = field.value(p, precision="double"), field.value(q, precision="double")
     wrapped = value[1] - value[0]
@@ -255,12 +255,12 @@ def test_wrapping_alone_would_be_noticed(monkeypatch: pytest.MonkeyPatch) -> Non
     """Without integration a mesh of the coil in large cells fails its checks, and says so."""
     field, spacing = hk.SolidAngle(loops_of("coil")), 0.16
     monkeypatch.setattr(spanned_module(), "_MOST_LOCAL", 0)
-    mesh = hk.mesh(field, spacing=spacing, tolerance=0.05)
+    mesh = hk.mesh(field, cell_size=spacing, tolerance=0.05)
     assert mesh.metadata["harnack"]["euler_characteristic"] == 1
     marching = sys.modules["harnack.meshing.marching_tetrahedra"]
-    monkeypatch.setattr(marching, "_integrated", lambda field, p, q, wrapped, period: wrapped)
+    monkeypatch.setattr(marching, "_integrate_change", lambda field, p, q, wrapped, period: wrapped)
     with pytest.raises(hk.MeshingError, match="spacing"):
-        hk.mesh(field, spacing=spacing, tolerance=0.05)
+        hk.mesh(field, cell_size=spacing, tolerance=0.05)
 
 
 def test_reaches_are_proved() -> None:
@@ -268,10 +268,10 @@ def test_reaches_are_proved() -> None:
     field, rng = hk.SolidAngle(loops_of("trefoil")), np.random.default_rng(2)
     function = LevelFunction(field, 2 * math.pi)
     x = rng.uniform(-3, 3, (2000, 3))
-    samples = function.at(x)
+    samples = function.sample(x)
     d = rng.normal(size=x.shape)
     d /= np.linalg.norm(d, axis=1)[:, None]
-    change = field.change_along(x, x + samples.reach[:, None] * d)
+    change = field.continuous_change(x, x + samples.quarter_period_radius[:, None] * d)
     assert change is not None
     assert np.abs(change).max() <= math.pi
     assert np.abs(change).max() > 0.55 * math.pi

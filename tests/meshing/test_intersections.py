@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from harnack.geometry.example_meshes import icosphere
-from harnack.meshing.checks import intersecting_faces, sides_of_lines, sides_of_planes
+from harnack.meshing.checks import intersecting_faces, orient2d, orient3d
 
 # A rotation without short decimals: coplanar corners are not in planes of three coordinates.
 TURN = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
@@ -32,7 +32,7 @@ def exact_side(points: np.ndarray) -> int:
 def test_signs_are_those_of_exact_arithmetic(scale: float) -> None:
     """Of points in a line or a plane up to rounding, and of some that are exactly there."""
     rng = np.random.default_rng(0)
-    for size, function in ((2, sides_of_lines), (3, sides_of_planes)):
+    for size, function in ((2, orient2d), (3, orient3d)):
         points = rng.normal(size=(600, size + 1, size))
         share = rng.dirichlet(np.ones(size), 600)
         points[:, -1] = np.einsum("nk,nkj->nj", share, points[:, :-1])
@@ -47,7 +47,7 @@ def test_signs_are_those_of_exact_arithmetic(scale: float) -> None:
 
 def test_tiny_differences_do_not_underflow() -> None:
     a, b, c = np.array([[0.0, 0]]), np.array([[1e-200, 0]]), np.array([[0, 1e-200]])
-    assert sides_of_lines(np.concatenate([a, a]), np.concatenate([b, b]),
+    assert orient2d(np.concatenate([a, a]), np.concatenate([b, b]),
                           np.concatenate([c, [[1.0, 1.0]]])).tolist() == [1, 1]  # fmt: skip
 
 

@@ -14,12 +14,17 @@ from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.geometry import example_curves
 from harnack.meshing import isotopy
 from harnack.meshing.checks import check_manifold, euler_characteristic
-from harnack.meshing.delaunay_points import Boundary, PointSet, box_cells, place_points
+from harnack.meshing.delaunay_points import (
+    BoundaryCurve,
+    TetrahedronPoints,
+    box_cells,
+    sample_delaunay_points,
+)
 from harnack.meshing.level_function import LevelFunction
-from harnack.meshing.marching_tetrahedra import crossings_of, delaunay, is_cut, triangles_of
+from harnack.meshing.marching_tetrahedra import count_crossings, delaunay, extract_triangles, is_cut
 
 BOX = (np.full(3, -0.5), np.full(3, 0.5))
-NO_CURVE = Boundary(np.zeros((0, 3)), np.zeros((0, 2), np.int64))
+NO_CURVE = BoundaryCurve(np.zeros((0, 3)), np.zeros((0, 2), np.int64))
 
 
 @pytest.mark.parametrize(
@@ -37,7 +42,7 @@ def test_gradients_change_by_no_more_than_promised(field: Any, tight: float) -> 
     radius = 10 ** rng.uniform(-3, -0.5, len(x))
     prepared = field.prepare(backend)
     p = to_vector3(backend, x)
-    bound = to_numpy(prepared.slope_change(p, backend.Float(radius)))
+    bound = to_numpy(prepared.gradient_change_bound(p, backend.Float(radius)))
     d = rng.normal(size=x.shape)
     d *= (radius / np.linalg.norm(d, axis=1))[:, None]
     start, end = (field.gradient(y, precision="double") for y in (x, x + d))
@@ -49,14 +54,16 @@ def test_gradients_change_by_no_more_than_promised(field: Any, tight: float) -> 
 
 def first_mesh(
     field: Any, level: float, spacing: float, change: Any = None
-) -> tuple[isotopy.Isotopy, Any]:
+) -> tuple[isotopy.IsotopyCoverage, Any]:
     """What is proved about a mesh in a box, of points that `change` has changed."""
     function = LevelFunction(field, level)
-    points = place_points(function, box_cells(*BOX, spacing, exact=True), NO_CURVE, BOX, 0)
+    points = sample_delaunay_points(
+        function, box_cells(*BOX, spacing, exact=True), NO_CURVE, BOX, 0
+    )
     if change is not None:
         points = change(points)
     tets = delaunay(points.points)
-    crossings = crossings_of(function, points, tets)
+    crossings = count_crossings(function, points, tets)
     cut, faces = is_cut(points, tets, crossings), np.zeros((0, 3), np.int64)
     found = isotopy.isotopy_of(function, points, tets.corners, cut, faces, NO_CURVE, spacing, BOX)
     return found, points
@@ -67,12 +74,12 @@ def first_mesh(
 )
 def test_all_of_a_gyroid_is_proved(level: float, spacing: float | None) -> None:
     box = hk.Box(*(end.tolist() for end in BOX))
-    mesh = hk.mesh(hk.Gyroid(cell=1.0), level, clip=box, tolerance=0.02, spacing=spacing)
+    mesh = hk.mesh(hk.Gyroid(cell=1.0), level, clip=box, tolerance=0.02, cell_size=spacing)
     assert mesh.metadata["harnack"]["isotopy"] == 1.0
 
 
 def test_a_field_that_promises_nothing_proves_nothing() -> None:
-    mesh = hk.mesh(hk.Sphere(0.8), solid=False, tolerance=0.01, spacing=0.2)
+    mesh = hk.mesh(hk.Sphere(0.8), solid=False, tolerance=0.01, cell_size=0.2)
     assert mesh.metadata["harnack"]["isotopy"] == 0.0
 
 
@@ -86,7 +93,7 @@ def test_wrong_values_and_wrong_topology_are_not_proved() -> None:
     inner = (np.abs(x).max(axis=1) < 0.4) & ~points.is_on & (np.abs(value) > 0.3)
     for row in np.flatnonzero(inner)[:3]:
 
-        def turn(given: PointSet, row: int = row) -> PointSet:
+        def turn(given: TetrahedronPoints, row: int = row) -> TetrahedronPoints:
             other = given.samples.value.copy()
             other[row] = -other[row]
             return dataclasses.replace(
@@ -94,7 +101,7 @@ def test_wrong_values_and_wrong_topology_are_not_proved() -> None:
             )
 
         spoiled, _ = first_mesh(field, 0.2, 0.07, turn)
-        near = (np.linalg.norm(x[spoiled.open_far] - x[row], axis=2) < 0.1).any(axis=1)
+        near = (np.linalg.norm(x[spoiled.unproved_off_curve] - x[row], axis=2) < 0.1).any(axis=1)
         assert near.sum() >= 4
 
 
@@ -109,9 +116,9 @@ def test_what_is_proved_holds_where_it_is_sampled() -> None:
     function = LevelFunction(field, 2 * math.pi)
     center = rng.uniform(-1.2, 1.2, (3000, 1, 3))
     corners = center + rng.normal(size=(3000, 4, 3)) * 10 ** rng.uniform(-2.5, -0.8, (3000, 1, 1))
-    slope = function.at(center[:, 0]).gradient + rng.normal(size=(3000, 3))
+    slope = function.sample(center[:, 0]).gradient + rng.normal(size=(3000, 3))
     # F is 0 at a corner of each, so that (a) cannot hold.
-    proved = isotopy._regular(function, corners, np.zeros(3000), slope, np.ones(3))
+    proved = isotopy._proved_regular(function, corners, np.zeros(3000), slope, np.ones(3))
     share = rng.dirichlet([0.6] * 4, (3000, 60))
     x = np.einsum("nks,nsi->nki", share, corners)
     seen = field.gradient(x.reshape(-1, 3), precision="double").reshape(x.shape)
@@ -131,11 +138,11 @@ def test_four_corners_on_the_level() -> None:
     off = np.concatenate([3 * axes, 2 * signs])
     points = np.concatenate([on, off + 1e-3 * rng.normal(size=off.shape)])
     is_on = np.arange(len(points)) < len(on)
-    given = PointSet(points, is_on, function.at(points))
+    given = TetrahedronPoints(points, is_on, function.sample(points))
     tets = delaunay(points)
     assert is_on[tets.corners].all(axis=1).sum() >= 3
-    crossings = crossings_of(function, given, tets)
-    vertices, faces = triangles_of(function, given, tets, crossings)
+    crossings = count_crossings(function, given, tets)
+    vertices, faces = extract_triangles(function, given, tets, crossings)
     check_manifold(faces)
     assert euler_characteristic(faces) == 2
     assert np.abs(np.linalg.norm(vertices[np.unique(faces)], axis=1) - 1).max() < 1e-9
@@ -145,5 +152,5 @@ def test_four_corners_on_the_level() -> None:
 def test_thin_necks_of_a_gyroid_are_proved_by_small_pieces() -> None:
     """0.9936 with three halvings of tetrahedra, 0.9997 with five: near level 1 necks are thin."""
     box = hk.Box((-1, -1, -1), (1, 1, 1))
-    mesh = hk.mesh(hk.Gyroid(1.0), 0.9, clip=box, spacing=0.09, tolerance=1e-2)
+    mesh = hk.mesh(hk.Gyroid(1.0), 0.9, clip=box, cell_size=0.09, tolerance=1e-2)
     assert mesh.metadata["harnack"]["isotopy"] > 0.9995

@@ -9,13 +9,13 @@ import pytest
 
 import harnack as hk
 from harnack.meshing import csg_meshing
-from harnack.meshing.bcc_lattice import Lattice
-from harnack.meshing.checks import check_apart, check_manifold
+from harnack.meshing.bcc_lattice import BccLattice
+from harnack.meshing.checks import check_manifold, check_no_self_intersection
 from harnack.meshing.edges import boundary_edges
-from harnack.meshing.lattice_meshing import Elsewhere, closed_surface
+from harnack.meshing.lattice_meshing import IrrelevantRegion, mesh_closed_surface
 from harnack.meshing.level_function import LevelFunction
 
-FOUR = Lattice.filling(np.zeros(3), np.full(3, 4.0), 1.0)
+FOUR = BccLattice.covering_box(np.zeros(3), np.full(3, 4.0), 1.0)
 
 
 def distance_to_plane(points: np.ndarray) -> np.ndarray:
@@ -34,8 +34,8 @@ def beyond_two(points: np.ndarray) -> np.ndarray:
 def test_cells_at_the_level_are_chosen_where_they_matter_and_negative_ones_at_the_end() -> None:
     """Of 4 x 4 x 4 cells those of y > 3 are proved not to matter: their centers are 1.5 away from
     what does, and their corners 0.87 from their centers."""
-    matter = FOUR.cells_not_empty(beyond_two, 1000)
-    chosen, does = FOUR.cells_that_matter(distance_to_plane, matter, side_of_plane, 1000)
+    matter = FOUR.nonempty_cells(beyond_two, 1000)
+    chosen, does = FOUR.relevant_cells(distance_to_plane, matter, side_of_plane, 1000)
     assert does[:, :3].all()
     assert not does[:, 3].any()
     expected = {(x, y, z) for x in (1, 2) for y in range(3) for z in range(4)}
@@ -44,18 +44,18 @@ def test_cells_at_the_level_are_chosen_where_they_matter_and_negative_ones_at_th
 
 
 def test_all_cells_matter_where_nothing_is_elsewhere() -> None:
-    matter = FOUR.cells_not_empty(lambda p: np.zeros(len(p)), 1000)
-    chosen, does = FOUR.cells_that_matter(distance_to_plane, matter, side_of_plane, 1000)
+    matter = FOUR.nonempty_cells(lambda p: np.zeros(len(p)), 1000)
+    chosen, does = FOUR.relevant_cells(distance_to_plane, matter, side_of_plane, 1000)
     assert does.all()
     assert sorted(map(tuple, chosen.tolist())) == sorted(
-        map(tuple, FOUR.cells_not_empty(distance_to_plane, 1000).tolist())
+        map(tuple, FOUR.nonempty_cells(distance_to_plane, 1000).tolist())
     )
 
 
 def test_deep_cells_have_only_such_neighbors() -> None:
     cells = np.zeros((5, 5, 5), np.bool_)
     cells[:4] = True
-    deep = FOUR.deep(cells)
+    deep = FOUR.interior_cells(cells)
     assert deep[:3].all()  # beyond the lattice counts as well
     assert not deep[3:].any()
 
@@ -64,22 +64,22 @@ def test_points_are_beside_the_cells_of_which_they_are_corners_or_centers() -> N
     cells = np.zeros((4, 4, 4), np.bool_)
     cells[1, 2, 3] = True
     points = np.array([[2, 4, 6], [4, 6, 8], [3, 5, 7], [1, 5, 7], [6, 4, 6], [2, 4, 4]])
-    assert FOUR.beside(points, cells).tolist() == [True, True, True, False, False, False]
+    assert FOUR.touches_cells(points, cells).tolist() == [True, True, True, False, False, False]
 
 
 def test_a_surface_is_closed_where_nothing_matters_and_as_it_was_elsewhere() -> None:
     """A ball, of which only the lower half is asked for."""
-    lattice = Lattice.filling(np.full(3, -1.3), np.full(3, 1.3), 0.1, layers=2)
+    lattice = BccLattice.covering_box(np.full(3, -1.3), np.full(3, 1.3), 0.1, layers=2)
 
-    def made(elsewhere: Elsewhere | None) -> tuple[np.ndarray, np.ndarray]:
+    def made(elsewhere: IrrelevantRegion | None) -> tuple[np.ndarray, np.ndarray]:
         function = LevelFunction(hk.Sphere(1.0), 0.0)
-        one = closed_surface(function, lattice, 5e-3, lambda _: None, elsewhere=elsewhere)
+        one = mesh_closed_surface(function, lattice, 5e-3, lambda _: None, elsewhere=elsewhere)
         return one.vertices, one.faces
 
-    vertices, faces = made(Elsewhere(lambda p: np.maximum(p[:, 2], 0.0)))
+    vertices, faces = made(IrrelevantRegion(lambda p: np.maximum(p[:, 2], 0.0)))
     assert not len(boundary_edges(faces))
     check_manifold(faces, vertices)
-    check_apart(vertices, faces)
+    check_no_self_intersection(vertices, faces)
     assert vertices[:, 2].max() < 0.5  # closed below the top
     whole, _ = made(None)
     for x in (vertices, whole):
@@ -112,13 +112,13 @@ def test_both_sides_of_a_wall_ask_once_where_the_other_parts_are(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     asked: list[int] = []
-    whole = Elsewhere.cells_beside
+    whole = IrrelevantRegion.relevant_cells
 
-    def counted(self: Elsewhere, lattice: Lattice, most: int) -> np.ndarray:
-        asked.append(len(self.found))
+    def counted(self: IrrelevantRegion, lattice: BccLattice, most: int) -> np.ndarray:
+        asked.append(len(self.cached_cells))
         return whole(self, lattice, most)
 
-    monkeypatch.setattr(Elsewhere, "cells_beside", counted)
+    monkeypatch.setattr(IrrelevantRegion, "relevant_cells", counted)
     monkeypatch.setattr(csg_meshing, "_MANY_CELLS", 0)
     hk.mesh(BALL & WALLS, tolerance=1e-2)
     assert asked == [0, 0, 1]  # of the ball, and of both sides

@@ -13,16 +13,16 @@ import trimesh
 import harnack as hk
 from harnack.cli.mesh_files import write_mesh
 from harnack.meshing.checks import (
-    LocalError,
+    LocalizedMeshingError,
     MeshingError,
-    TooLargeError,
-    check_apart,
+    TriangleLimitError,
     check_inside,
     check_near_level,
+    check_no_self_intersection,
 )
 from harnack.meshing.closed_mesh import ClosedMesh
-from harnack.meshing.finishing import simplified
-from harnack.meshing.lattice_meshing import Surface
+from harnack.meshing.finishing import simplify_mesh
+from harnack.meshing.lattice_meshing import TriangleMesh
 from harnack.meshing.level_function import LevelFunction
 from tests.oracles.mesh_files import read_closed
 
@@ -36,9 +36,9 @@ def test_open_meshes_are_not_shown_as_closed() -> None:
 
 
 def test_a_limit_of_triangles_is_named():
-    with pytest.raises(TooLargeError, match="max_triangles"):
+    with pytest.raises(TriangleLimitError, match="max_triangles"):
         hk.mesh(hk.Sphere(1.0), max_triangles=1000)
-    with pytest.raises(TooLargeError, match="max_triangles is 9,000"):
+    with pytest.raises(TriangleLimitError, match="max_triangles is 9,000"):
         hk.mesh(hk.Sphere(1.0), max_triangles=9000, tolerance=1e-5)
     with pytest.raises(ValueError, match="max_triangles must be an integer from 1"):
         hk.mesh(hk.Sphere(1.0), max_triangles=0)
@@ -48,12 +48,12 @@ def test_vertices_and_centers_are_looked_at():
     function = LevelFunction(hk.Sphere(1.0), 0.0)
     x = np.array(_BALL.vertices, np.float64)
     check_near_level(function, x, _FACES, 0.02, None)
-    with pytest.raises(LocalError, match="farther than the tolerance"):
+    with pytest.raises(LocalizedMeshingError, match="farther than the tolerance"):
         check_near_level(function, x, _FACES, 1e-3, None)  # the centers are not so near
     x[7] *= 1.05
-    with pytest.raises(LocalError, match="farther than the tolerance") as found:
+    with pytest.raises(LocalizedMeshingError, match="farther than the tolerance") as found:
         check_near_level(function, x, _FACES, 0.02, None)
-    assert (np.linalg.norm(found.value.places - x[7], axis=1) == 0).any()
+    assert (np.linalg.norm(found.value.locations - x[7], axis=1) == 0).any()
     check_inside(x, hk.Ball((0, 0, 0), 2.0), 0.0)
     with pytest.raises(MeshingError, match="outside of what was asked for"):
         check_inside(x, hk.Box((-1, -1, -1), (1, 1, 0.5)), 0.1)
@@ -66,13 +66,13 @@ def test_vertices_and_centers_are_looked_at():
 
 def test_faces_through_each_other_are_found():
     x = np.array(_BALL.vertices, np.float64)
-    check_apart(x, _FACES)
+    check_no_self_intersection(x, _FACES)
     both = np.concatenate([x, x + np.array([0.3, 0.1, 0.2])])
-    with pytest.raises(LocalError, match="pass through each other"):
-        check_apart(both, np.concatenate([_FACES, _FACES + len(x)]))
+    with pytest.raises(LocalizedMeshingError, match="pass through each other"):
+        check_no_self_intersection(both, np.concatenate([_FACES, _FACES + len(x)]))
     x[0, 0] = math.nan
     with pytest.raises(MeshingError, match="no numbers"):
-        check_apart(x, _FACES)
+        check_no_self_intersection(x, _FACES)
 
 
 @pytest.mark.parametrize("kind", ["stl", "ply", "obj", "glb", "3mf", "off"])
@@ -102,10 +102,19 @@ _CARVED = hk.Sphere(1.0) - hk.Cuboid((0.5, 0.5, 2.0))
     ("part", "message"),
     [
         (_CARVED.scaled(1e-5), r"2e-05 long.*scale it \(apply_scale\)"),
-        (hk.Torus(0.8, 0.3).moved((1e6, 0, 0)), r"up to 1e\+06 from the origin.*move it"),
-        ((hk.Torus(0.8, 0.3) | hk.Cuboid((0.2, 0.2, 1.0))).moved((1e6, 0, 0)), "move it to the"),
-        (_CUBE.moved((-0.5, -0.5, 0)) | _CUBE.moved((0.5, 0.5, 0)), r"parts touch.*near \(0, 0,"),
-        (_CUBE.moved((-0.5,) * 3) | _CUBE.moved((0.5,) * 3), r"parts touch.*near \(0, 0, 0\)"),
+        (hk.Torus(0.8, 0.3).translated((1e6, 0, 0)), r"up to 1e\+06 from the origin.*move it"),
+        (
+            (hk.Torus(0.8, 0.3) | hk.Cuboid((0.2, 0.2, 1.0))).translated((1e6, 0, 0)),
+            "move it to the",
+        ),
+        (
+            _CUBE.translated((-0.5, -0.5, 0)) | _CUBE.translated((0.5, 0.5, 0)),
+            r"parts touch.*near \(0, 0,",
+        ),
+        (
+            _CUBE.translated((-0.5,) * 3) | _CUBE.translated((0.5,) * 3),
+            r"parts touch.*near \(0, 0, 0\)",
+        ),
     ],
     ids=["tiny", "far", "union far", "touching in an edge", "touching in a point"],
 )
@@ -124,7 +133,7 @@ def test_what_is_closed_in_memory_and_not_in_a_file_is_not_written(
 
 @pytest.mark.slow
 def test_what_was_refused_is_right_once_it_is_moved_and_scaled(tmp_path: Path):
-    made = hk.mesh(hk.Torus(0.8, 0.3).moved((1e6, 0, 0)), tolerance=2e-2)
+    made = hk.mesh(hk.Torus(0.8, 0.3).translated((1e6, 0, 0)), tolerance=2e-2)
     made.apply_translation((-1e6, 0, 0))
     made.apply_scale(1e20)
     with pytest.raises(hk.MeshingError, match=r"up to 6.9e\+10.*scale it"):
@@ -152,7 +161,7 @@ def test_slivers_that_turn_over_in_single_precision_are_left_out(scale: float, t
     n = len(x) + np.arange(len(_FACES))
     parts = [np.column_stack([_FACES[:, k], _FACES[:, (k + 1) % 3], n]) for k in range(3)]
     made = ClosedMesh(scale * np.concatenate([x, new]), np.concatenate(parts), process=False)
-    check_apart(np.array(made.vertices), np.array(made.faces))
+    check_no_self_intersection(np.array(made.vertices), np.array(made.faces))
     path = tmp_path / "a.stl"
     made.export(path)
     assert read_closed(path).volume == pytest.approx(made.volume, rel=1e-5)
@@ -182,13 +191,13 @@ def test_simplified_meshes_have_no_more_triangles_than_without(
 
 
 def test_simplification_keeps_what_no_simpler_mesh_passes_the_check_for():
-    ball = Surface(np.array(_BALL.vertices), _FACES)
+    ball = TriangleMesh(np.array(_BALL.vertices), _FACES)
 
-    def never(surface: Surface) -> None:
+    def never(surface: TriangleMesh) -> None:
         raise MeshingError("no")
 
-    assert simplified(ball, 0.1, never)[0] is ball
-    assert len(simplified(ball, 0.1, lambda surface: None)[0].faces) < len(_FACES)
+    assert simplify_mesh(ball, 0.1, never)[0] is ball
+    assert len(simplify_mesh(ball, 0.1, lambda surface: None)[0].faces) < len(_FACES)
 
 
 _GYROID = hk.Gyroid(5.0)
@@ -203,8 +212,8 @@ def test_solids_know_the_waves_they_are_made_of():
         (hk.SchwarzP(5.0), 5.0),
         (_WALLS, wave),
         (~_WALLS, wave),
-        (_WALLS.grown(0.1), wave),
-        (_WALLS.moved((1, 2, 3)).rotated(30, "x").scaled((1.0, 2.0, 0.5)), 0.5 * wave),
+        (_WALLS.offset(0.1), wave),
+        (_WALLS.translated((1, 2, 3)).rotated(30, "x").scaled((1.0, 2.0, 0.5)), 0.5 * wave),
         (_WALLS & hk.Sphere(1.0) | hk.solid(hk.SchwarzP(2.0), below=0.0), 2.0),
         (below.twisted(0.1), wave),
         (below.tapered((0, 1.0), (1, 0.5)), 0.5 * wave),
@@ -213,8 +222,8 @@ def test_solids_know_the_waves_they_are_made_of():
          2 * math.pi),
         (hk.FourierSeries(np.eye(4)[3].reshape(4, 1, 1), hk.Box((0, 0, 0), (3, 1, 1))), 2.0),
     ]:  # fmt: skip
-        assert part.wavelength == pytest.approx(expected, rel=1e-5)
-    assert (hk.Sphere(1.0) | hk.Torus(0.8, 0.3)).wavelength is None
+        assert part.min_wavelength == pytest.approx(expected, rel=1e-5)
+    assert (hk.Sphere(1.0) | hk.Torus(0.8, 0.3)).min_wavelength is None
 
 
 def _volume(part: hk.Solid, half: tuple[float, float, float], step: float) -> float:
@@ -242,7 +251,7 @@ def test_cells_are_as_small_as_a_lattice_needs(
     in pieces, the wrong volume and all."""
     made = hk.mesh(part, tolerance=2e-3 if bodies else 4e-3)
     assert made.is_watertight
-    assert made.metadata["harnack"]["spacing"] < part.wavelength / 4.999
+    assert made.metadata["harnack"]["spacing"] < part.min_wavelength / 4.999
     assert made.volume == pytest.approx(
         _volume(part, half, half[2] / (400 if bodies else 150)), rel=2e-2 if bodies else 3e-2
     )
@@ -252,8 +261,8 @@ def test_cells_are_as_small_as_a_lattice_needs(
 @pytest.mark.slow
 def test_a_spacing_that_is_asked_for_is_not_changed_for_waves():
     part = hk.solid(hk.SchwarzP(1.0), below=0.0) & hk.Cuboid((0.3, 0.3, 3.0))
-    assert hk.mesh(part, spacing=0.25, tolerance=2e-2).metadata["harnack"]["spacing"] == 0.25
-    with pytest.raises(TooLargeError, match="max_triangles"):
+    assert hk.mesh(part, cell_size=0.25, tolerance=2e-2).metadata["harnack"]["spacing"] == 0.25
+    with pytest.raises(TriangleLimitError, match="max_triangles"):
         hk.mesh(part, tolerance=2e-2, max_triangles=500)
 
 
@@ -261,14 +270,14 @@ def test_a_spacing_that_is_asked_for_is_not_changed_for_waves():
 def test_thin_parts_are_made_finer_until_no_faces_pass_through_each_other():
     made = hk.mesh(hk.Cylinder(0.01, 1.0), tolerance=4e-3)
     assert made.is_watertight
-    check_apart(np.array(made.vertices), np.array(made.faces))
+    check_no_self_intersection(np.array(made.vertices), np.array(made.faces))
     x = np.array(made.triangles_center)
     assert (np.hypot(x[:, 0], x[:, 1]) <= 0.01 + 1e-9).all()
 
 
 @pytest.mark.slow
 def test_sharp_creases_are_found_and_not_cut_into_ever_smaller_triangles():
-    made = hk.mesh(hk.Cylinder(0.3, 1.0).moved((0.2, 0, 0)))
+    made = hk.mesh(hk.Cylinder(0.3, 1.0).translated((0.2, 0, 0)))
     assert made.is_watertight
     assert len(made.faces) < 10_000
     x = np.concatenate([made.vertices, made.triangles_center]) - (0.2, 0, 0)

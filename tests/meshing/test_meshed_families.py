@@ -53,7 +53,7 @@ def test_walls_thinner_than_cells_are_noticed() -> None:
     """Between points of the lattice a wall changes no sign: this one came back as ten pieces with
     264 holes and a third of its volume, without a word."""
     with pytest.raises(hk.MeshingError, match="miss parts of the level set"):
-        hk.mesh(wall(0.02), solid=BELOW, clip=BOX, tolerance=4e-3, spacing=1 / 12)
+        hk.mesh(wall(0.02), solid=BELOW, clip=BOX, tolerance=4e-3, cell_size=1 / 12)
     mesh = hk.mesh(wall(0.02), solid=BELOW, clip=BOX, tolerance=1e-2)
     assert mesh.metadata["harnack"]["spacing"] == pytest.approx(0.6 / 12)
     assert mesh.metadata["harnack"]["euler_characteristic"] == 2
@@ -63,15 +63,15 @@ def test_walls_thinner_than_cells_are_noticed() -> None:
 @pytest.mark.parametrize("half", [0.002, 0.0002])
 def test_walls_far_thinner_than_cells_are_refused(half: float) -> None:
     for arguments in ({"solid": BELOW}, {"level": 0.0}):
-        with pytest.raises(hk.MeshingError, match="spacing"):
-            hk.mesh(wall(half), clip=BOX, tolerance=4e-3, spacing=1 / 12, **arguments)
+        with pytest.raises(hk.MeshingError, match="cell_size"):
+            hk.mesh(wall(half), clip=BOX, tolerance=4e-3, cell_size=1 / 12, **arguments)
 
 
 @pytest.mark.slow
 def test_knife_edges_are_noticed() -> None:
     edge = hk.expression(lambda x, y, z: hk.maximum(z - 0.05 * x, -z - 0.05 * x) + 0 * y)
     with pytest.raises(hk.MeshingError, match="make the solid of smooth parts"):
-        hk.mesh(edge, solid=BELOW, clip=BOX, tolerance=4e-3, spacing=1 / 12)
+        hk.mesh(edge, solid=BELOW, clip=BOX, tolerance=4e-3, cell_size=1 / 12)
     above = hk.solid(hk.expression(lambda x, y, z: z - 0.05 * x + 0 * y), below=0)
     below = hk.solid(hk.expression(lambda x, y, z: -z - 0.05 * x + 0 * y), below=0)
     mesh = hk.mesh(above & below, clip=BOX, tolerance=4e-3)
@@ -112,11 +112,11 @@ def test_superellipsoids(powers: Any, radii: Any, volume: float) -> None:
 def test_level_curves_are_walls_and_angles_are_refused() -> None:
     """Re log((z-1)/(z+1)) = 0 is the plane x = 0; the imaginary part is an angle."""
     charges = {1: 1, -1: -1}
-    mesh = hk.mesh(hk.LevelCurves("log", of=charges), tolerance=4e-3)
+    mesh = hk.mesh(hk.LevelCurves("log", argument=charges), tolerance=4e-3)
     assert np.abs(mesh.vertices[:, 0]).max() < 1e-9
     assert mesh.area == pytest.approx(4 * 0.5, rel=1e-6)
     with pytest.raises(TypeError, match="is angle-valued, and mesh"):
-        hk.mesh(hk.LevelCurves("log", "imag", of=charges))
+        hk.mesh(hk.LevelCurves("log", "imag", argument=charges))
 
 
 def test_dipoles_of_a_sphere() -> None:
@@ -193,5 +193,5 @@ def test_walls_of_the_angle_about_an_axis_between_cylinders() -> None:
 def test_formulas_without_a_value_where_other_parts_leave_nothing() -> None:
     field = hk.expression("sqrt(x^2 + y^2 - 0.09)*cos(3*atan2(y, x)) - z")
     solid = (hk.solid(field, below=0) & hk.Cylinder(1.5, 1.0)) - hk.Cylinder(0.7)
-    mesh = hk.mesh(solid, spacing=0.1)
+    mesh = hk.mesh(solid, cell_size=0.1)
     assert mesh.volume == pytest.approx(5.5292, rel=1e-3)  # half of what is between

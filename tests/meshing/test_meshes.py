@@ -236,7 +236,7 @@ def damaged(kind: str, faces):
         return flip_faces(faces, 0.1, 0)
     if kind == "duplicates":
         return duplicate_faces(faces, 0.1, 0)
-    return duplicate_faces(faces, 0.1, 0, turned=True) if kind == "turned" else faces
+    return duplicate_faces(faces, 0.1, 0, flipped=True) if kind == "turned" else faces
 
 
 @pytest.mark.parametrize("kind", ["whole", "holes", "flips", "duplicates", "turned"])
@@ -310,7 +310,7 @@ def test_damage_is_of_the_size_asked_for_and_repeats():
     assert (flip_faces(faces, 0.1, 3) != faces).any(axis=1).sum() == 32
     assert len(net_faces(flip_faces(faces, 0.1, 3)).faces) == 320
     assert sorted(net_faces(duplicate_faces(faces, 0.25, 3)).multiplicity)[-81:] == [1] + 80 * [2]
-    assert len(net_faces(duplicate_faces(faces, 0.25, 3, turned=True)).faces) == 240
+    assert len(net_faces(duplicate_faces(faces, 0.25, 3, flipped=True)).faces) == 240
     for make in (remove_faces, flip_faces, duplicate_faces):
         np.testing.assert_array_equal(make(faces, 0.1, 3), make(faces, 0.1, 3))
         assert not np.array_equal(make(faces, 0.1, 3), make(faces, 0.1, 4))

@@ -11,13 +11,13 @@ import pytest
 import harnack as hk
 from harnack.geometry import example_curves
 from harnack.meshing import checks
-from harnack.meshing.delaunay_points import Boundary
-from harnack.tree.empty_space import Cells, carve, octree
+from harnack.meshing.delaunay_points import BoundaryCurve
+from harnack.tree.empty_space import BoxCells, nonempty_cells, refine_cells
 
 
 def test_periodic_surfaces_end_at_the_faces_of_a_box() -> None:
     box = hk.Box((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
-    mesh = hk.mesh(hk.Gyroid(cell=1.0), 0.2, clip=box, tolerance=4e-3, spacing=0.09)
+    mesh = hk.mesh(hk.Gyroid(cell=1.0), 0.2, clip=box, tolerance=4e-3, cell_size=0.09)
     rim = mesh.vertices[np.unique(mesh.metadata["harnack"]["boundary"])]
     assert (np.abs(np.abs(rim).max(axis=1) - 0.5) < 1e-12).all()
     assert np.abs(mesh.vertices).max() <= 0.5
@@ -42,7 +42,7 @@ def test_closed_surfaces_are_watertight() -> None:
 def test_a_level_set_is_meshed_as_it_is_traced() -> None:
     """Level, solid, clip and section are its own, unless others are given."""
     box, half = hk.Box((-0.3, -0.3, -0.3), (0.3, 0.3, 0.3)), hk.HalfSpace((0, 0, 1), 0.1)
-    coarse: dict[str, Any] = {"tolerance": 2e-2, "spacing": 0.1}
+    coarse: dict[str, Any] = {"tolerance": 2e-2, "cell_size": 0.1}
     field = hk.Gyroid(1.0)
     made = hk.mesh(hk.level_set(field, 0.2, clip=box, section=half), **coarse)
     same = hk.mesh(field, 0.2, clip=box, section=half, **coarse)
@@ -99,7 +99,7 @@ def test_a_mesh_with_too_many_faces_at_an_edge_is_noticed() -> None:
 
 def test_long_edges_of_a_curve_are_cut_and_its_vertices_stay_first() -> None:
     square = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
-    curve = Boundary.of((square,), 0.4)
+    curve = BoundaryCurve.of((square,), 0.4)
     assert (curve.points[:4] == square).all()
     assert len(curve.points) == len(curve.edges) == 12
     lengths = np.linalg.norm(np.diff(curve.points[curve.edges], axis=1), axis=2)
@@ -114,19 +114,19 @@ def test_cells_of_an_octree_fill_the_box_and_keep_the_set() -> None:
         return np.abs(np.linalg.norm(x, axis=1) - 1)
 
     lower, upper = np.full(3, -2.0), np.array([2.0, 2.0, 3.0])
-    tree = octree(Cells(lower[None], upper - lower), clearance, 10_000, 4)
-    volume = sum(len(one.corners) * one.size.prod() for one in (tree.leaves, *tree.empty))
+    tree = refine_cells(BoxCells(lower[None], upper - lower), clearance, 10_000, 4)
+    volume = sum(len(one.corners) * one.size.prod() for one in (tree.occupied, *tree.empty))
     assert volume == pytest.approx((upper - lower).prod())
     on = np.random.default_rng(0).normal(size=(2000, 3))
     on /= np.linalg.norm(on, axis=1)[:, None]
-    inside = (on[:, None] >= tree.leaves.corners) & (
-        on[:, None] <= tree.leaves.corners + tree.leaves.size
+    inside = (on[:, None] >= tree.occupied.corners) & (
+        on[:, None] <= tree.occupied.corners + tree.occupied.size
     )
     assert inside.all(axis=2).any(axis=1).all()
-    assert len(tree.leaves.corners) < 16**3 / 4
-    hull = carve(lower, upper, clearance, 10_000, 4).wrapped(0.0)
+    assert len(tree.occupied.corners) < 16**3 / 4
+    hull = nonempty_cells(lower, upper, clearance, 10_000, 4).bounding_kdop(0.0)
     assert hull.contains_points(on).all()
-    assert not len(carve(lower, upper, lambda x: np.full(len(x), 9.0), 100, 3).corners)
+    assert not len(nonempty_cells(lower, upper, lambda x: np.full(len(x), 9.0), 100, 3).corners)
 
 
 def test_closed_meshes_are_turned_outwards() -> None:

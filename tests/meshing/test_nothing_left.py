@@ -9,8 +9,8 @@ import pytest
 import trimesh
 
 import harnack as hk
-from harnack.meshing.clipping import without_films
-from harnack.meshing.lattice_meshing import Surface
+from harnack.meshing.clipping import drop_degenerate_components
+from harnack.meshing.lattice_meshing import TriangleMesh
 
 BALL = trimesh.creation.icosphere(2)
 
@@ -28,7 +28,7 @@ def test_films_are_left_out_and_cavities_stay() -> None:
     film.apply_translation((4.0, 0.0, 0.0))
     parts = [outer.faces, inner.faces[:, ::-1] + 8, film.faces + 16]
     x = np.concatenate([outer.vertices, inner.vertices, film.vertices])
-    made = without_films(Surface(x, np.concatenate(parts)))
+    made = drop_degenerate_components(TriangleMesh(x, np.concatenate(parts)))
     assert np.array_equal(made.faces, np.concatenate(parts[:2]))
     assert len(made.vertices) == 16
 
@@ -103,7 +103,7 @@ def test_fins_cost_no_sound_triangle() -> None:
     given = trimesh.Trimesh(np.concatenate([x, tips]), np.concatenate([faces, fins]), process=False)
     made = hk.repair(given)
     facts = made.metadata["harnack"]
-    assert (facts["stage"], facts["kept"], facts["patches"]) == ("sound", len(faces), 0)
+    assert (facts["stage"], facts["kept"], facts["patches"]) == ("cleaned", len(faces), 0)
     assert facts["left_out"]["branching"] == len(fins)
     assert math.isclose(made.volume, BALL.volume)
     assert len(made.vertices) == n
@@ -112,7 +112,7 @@ def test_fins_cost_no_sound_triangle() -> None:
 def test_vertices_of_no_face_are_left_out_where_all_is_kept() -> None:
     x = np.concatenate([[[9.0, 9.0, 9.0]], BALL.vertices])
     made = hk.repair(trimesh.Trimesh(x, BALL.faces[:-1] + 1, process=False))
-    assert made.metadata["harnack"]["stage"] == "kept"
+    assert made.metadata["harnack"]["stage"] == "filled"
     assert np.abs(made.vertices).max() < 2
 
 

@@ -24,10 +24,10 @@ def kinds(part: Any, **options: Any) -> dict[str, int]:
 
 
 def test_a_plate_is_fine() -> None:
-    found = hk.check_print(PLATE, wall=1.9, bed=(10.0, 20.0, 2.0))
-    assert found.is_fine
+    found = hk.check_print(PLATE, min_thickness=1.9, build_volume=(10.0, 20.0, 2.0))
+    assert found.is_printable
     assert [one.kind for one in found.problems] == ["walls measured coarsely"]
-    assert hk.check_print(PLATE, bed=(10.0, 20.0, 2.0)).problems == ()
+    assert hk.check_print(PLATE, build_volume=(10.0, 20.0, 2.0)).problems == ()
     assert found.volume == pytest.approx(400.0)
     assert found.size == (20.0, 10.0, 2.0)
 
@@ -45,7 +45,7 @@ def test_faults_are_named_and_placed() -> None:
     assert opened.message.startswith("3 edges have one face alone, such as at (")
     ends = x[faces[0]]
     middles = 0.5 * (ends + np.roll(ends, 1, axis=0))
-    assert {*map(tuple, opened.where)} == {*map(tuple, middles)}
+    assert {*map(tuple, opened.locations)} == {*map(tuple, middles)}
 
 
 def test_parts_that_cross_are_found() -> None:
@@ -58,7 +58,7 @@ def test_parts_that_cross_are_found() -> None:
     far = PLATE.copy()
     far.apply_translation((50.0, 0.0, 0.0))
     apart = hk.check_print(trimesh.util.concatenate([PLATE, far]))
-    assert apart.is_fine  # a hint alone
+    assert apart.is_printable  # a hint alone
     assert [one.kind for one in apart.problems] == ["loose parts"]
 
 
@@ -76,24 +76,24 @@ def test_cavities_and_tiny_parts() -> None:
 
 
 def test_thin_walls_beds_and_units() -> None:
-    assert kinds(FINE_PLATE, wall=2.1)["thin walls"] == 2 * len(FINE_PLATE.faces) // 6
-    assert "thin walls" not in kinds(FINE_PLATE, wall=2.0)  # no thinner than asked
-    assert kinds(PLATE, bed=(19.0, 30.0, 5.0)) == {}
-    assert kinds(PLATE, bed=(19.0, 19.0, 5.0)) == {"bed": 1}
+    assert kinds(FINE_PLATE, min_thickness=2.1)["thin walls"] == 2 * len(FINE_PLATE.faces) // 6
+    assert "thin walls" not in kinds(FINE_PLATE, min_thickness=2.0)  # no thinner than asked
+    assert kinds(PLATE, build_volume=(19.0, 30.0, 5.0)) == {}
+    assert kinds(PLATE, build_volume=(19.0, 19.0, 5.0)) == {"bed": 1}
     small = PLATE.copy()
     small.apply_scale(1 / 25.4)
     assert kinds(small) == {"unit": 1}
-    with pytest.raises(ValueError, match="wall must be positive and finite"):
-        hk.check_print(PLATE, wall=-1.0)
+    with pytest.raises(ValueError, match="min_thickness must be positive and finite"):
+        hk.check_print(PLATE, min_thickness=-1.0)
 
 
 def test_thickness_is_that_of_plates_balls_and_wedges() -> None:
-    plate = hk.thickness(FINE_PLATE)
+    plate = hk.wall_thickness(FINE_PLATE)
     assert np.unique(plate.values.round(5)).tolist() == [2.0, 10.0, 20.0]
     assert plate.thinnest == pytest.approx(2.0, abs=1e-5)
-    assert (np.abs(plate.where(3.0)[:, 2]) == 1.0).all()
+    assert (np.abs(plate.thin_locations(3.0)[:, 2]) == 1.0).all()
     # The widest ball within an inscribed polyhedron of the unit sphere.
-    ball = hk.thickness(example_meshes.icosphere(3))
+    ball = hk.wall_thickness(example_meshes.icosphere(3))
     assert 1.98 < ball.thinnest <= ball.values.max() < 2.0
     # A wedge of half-angle a: the ball that touches one side at a distance s from the edge touches
     # the other as well if its radius is s tan a.
@@ -101,7 +101,7 @@ def test_thickness_is_that_of_plates_balls_and_wedges() -> None:
     wedge = trimesh.convex.convex_hull(half)
     for _ in range(4):
         wedge = wedge.subdivide()
-    found = hk.thickness(wedge)
+    found = hk.wall_thickness(wedge)
     center = wedge.triangles_center
     side = (wedge.face_normals[:, 1] < -0.9) & (center[:, 0] > 3)
     side &= np.abs(center[:, 2]) < 0.6  # beside the ends the ray's length is given
@@ -111,12 +111,12 @@ def test_thickness_is_that_of_plates_balls_and_wedges() -> None:
 
 def test_thickness_of_a_solid_is_that_of_its_mesh() -> None:
     shell = hk.Sphere(1.0) - hk.Sphere(0.8)
-    found = hk.thickness(shell, tolerance=4e-3)
+    found = hk.wall_thickness(shell, tolerance=4e-3)
     assert found.values.min() > 0.2 - 0.02
-    colored = found.colored(0.1, 0.3)
+    colored = found.to_colored_mesh(0.1, 0.3)
     assert len(colored.visual.face_colors) == len(found.values)
     with pytest.raises(TypeError, match="tolerance is for solids"):
-        hk.thickness(PLATE, tolerance=1e-3)
+        hk.wall_thickness(PLATE, tolerance=1e-3)
 
 
 def test_the_command_says_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -125,14 +125,14 @@ def test_the_command_says_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFi
     assert main(["check", name]) == 0
     assert "nothing is wrong" in capsys.readouterr().out
     colors = str(tmp_path / "thin.ply")
-    assert main(["check", name, "--wall", "2.5", "--colors", colors]) == 1
+    assert main(["check", name, "--min-thickness", "2.5", "--colors", colors]) == 1
     assert "wrong: thin walls" in capsys.readouterr().out
     assert len(trimesh.load(colors).faces) == len(PLATE.faces)
-    assert main(["check", name, "--json", "--bed", "5", "5", "5"]) == 1
+    assert main(["check", name, "--json", "--build-volume", "5", "5", "5"]) == 1
     found = json.loads(capsys.readouterr().out)
     assert [one["kind"] for one in found["problems"]] == ["bed"]
     assert main(["check", name, "--colors", colors]) == 1
-    assert "--wall" in capsys.readouterr().err
+    assert "--min-thickness" in capsys.readouterr().err
 
 
 def test_hostile_files_are_refused(tmp_path: Path) -> None:
@@ -157,7 +157,7 @@ def test_faces_without_area_that_close_a_file_are_kept(tmp_path: Path) -> None:
     trimesh.Trimesh(x, faces, process=False).export(path)
     assert hk.solid(path).value([[0.2, 0.2, 0.2]])[0] < 0
     found = hk.check_print(path)
-    assert found.is_fine
+    assert found.is_printable
     assert found.volume == pytest.approx(1 / 6)
     assert [one.kind for one in found.problems] == ["faces without area", "unit"]
 
@@ -184,7 +184,7 @@ def test_parts_in_the_material_of_others_are_wrong() -> None:
 def test_thickness_knows_no_unit(scale: float) -> None:
     # Rays ended at once where a mesh was less than 1 long, and it was said to be thin all over.
     plate = (FINE_PLATE.vertices * scale, FINE_PLATE.faces)
-    found = hk.thickness(plate)
+    found = hk.wall_thickness(plate)
     assert found.thinnest == pytest.approx(2.0 * scale, rel=1e-5)
     assert np.median(found.values) > 2.5 * scale
 
@@ -194,22 +194,22 @@ def test_foils_are_thin(height: float) -> None:
     # Rays that began beyond the other side ran into the open: 0.0067 and 32 were found.
     foil = trimesh.creation.box((20.0, 10.0, height))
     is_flat = np.abs(foil.face_normals[:, 2]) > 0.5
-    assert hk.thickness(foil).values[is_flat].max() < 3.3e-5
+    assert hk.wall_thickness(foil).values[is_flat].max() < 3.3e-5
 
 
 @pytest.mark.parametrize("bed", [220, (220, 220), (220, 220, 0), "abc"])
 def test_beds_that_are_none_are_refused(bed: Any) -> None:
-    with pytest.raises(ValueError, match="bed must be"):
-        hk.check_print(PLATE, bed=bed)
+    with pytest.raises(ValueError, match="build_volume must be"):
+        hk.check_print(PLATE, build_volume=bed)
 
 
 def test_what_overlaps_can_be_united_and_that_is_said() -> None:
     ball = trimesh.creation.icosphere(1)
     two = trimesh.util.concatenate([ball, ball.copy().apply_translation((0.7, 0.1, 0.05))])
-    [found] = hk.check_print(two, wall=0.1).problems[:1]
+    [found] = hk.check_print(two, min_thickness=0.1).problems[:1]
     assert found.kind == "crossing faces"
     assert "hk.mesh(hk.solid(part))" in found.message
-    assert "walls not measured" in kinds(two, wall=0.1)  # and not: thin
+    assert "walls not measured" in kinds(two, min_thickness=0.1)  # and not: thin
     united = hk.mesh(hk.solid(two))
     assert "crossing faces" not in kinds(united)
     other = ball.copy().apply_translation((0.7, 0.1, 0.05))
@@ -266,16 +266,16 @@ def test_parts_that_touch_inside_a_face_are_wrong(other: Any, count: int) -> Non
         "touching faces": count,
         "loose parts": 2,
     }
-    assert not checked.is_fine
+    assert not checked.is_printable
     touching.apply_translation((0, 0, 1e-6))
-    assert hk.check_print(trimesh.util.concatenate([box, touching])).is_fine
+    assert hk.check_print(trimesh.util.concatenate([box, touching])).is_printable
 
 
 def test_large_faces_are_told_of_where_walls_are_measured() -> None:
     """A pit beside the center of a face was not seen, and nothing said so."""
     box = trimesh.creation.box((20.0, 10.0, 5.0))
-    found = {one.kind: one for one in hk.check_print(box, wall=1.0).problems}
+    found = {one.kind: one for one in hk.check_print(box, min_thickness=1.0).problems}
     assert found["walls measured coarsely"].count == 12
-    assert not found["walls measured coarsely"].is_fatal
+    assert not found["walls measured coarsely"].is_error
     fine = box.subdivide_to_size(4.0)
-    assert not hk.check_print(fine, wall=1.0).problems
+    assert not hk.check_print(fine, min_thickness=1.0).problems

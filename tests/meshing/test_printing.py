@@ -16,9 +16,9 @@ import harnack as hk
 from harnack.cli import main
 from harnack.geometry import example_curves
 from harnack.meshing import checks, clipping, finishing
-from harnack.meshing.bcc_lattice import Lattice
+from harnack.meshing.bcc_lattice import BccLattice
 from harnack.meshing.checks import intersecting_faces
-from harnack.meshing.lattice_meshing import Surface
+from harnack.meshing.lattice_meshing import TriangleMesh
 from tests.oracles.mesh_files import read_closed
 
 BOX = hk.Box((-1, -1, -1), (1, 1, 1))
@@ -35,7 +35,7 @@ def is_part(mesh: Any) -> bool:
 
 
 def test_tetrahedra_fill_the_box_and_share_their_faces() -> None:
-    lattice = Lattice.filling(np.zeros(3), np.array([1.0, 2.0, 1.5]), 0.5)
+    lattice = BccLattice.covering_box(np.zeros(3), np.array([1.0, 2.0, 1.5]), 0.5)
     cells = np.argwhere(np.ones(lattice.counts))
     coordinates, corners = lattice.tetrahedra(cells)
     points = lattice.points(coordinates)
@@ -53,7 +53,7 @@ def test_tetrahedra_fill_the_box_and_share_their_faces() -> None:
 
 def test_tetrahedra_of_a_lattice_have_no_small_angles() -> None:
     """60 and 90 degrees, 45 where halves lie at the box."""
-    lattice = Lattice.filling(np.zeros(3), np.ones(3), 0.25)
+    lattice = BccLattice.covering_box(np.zeros(3), np.ones(3), 0.25)
     coordinates, corners = lattice.tetrahedra(np.argwhere(np.ones(lattice.counts)))
     t = lattice.points(coordinates)[corners]
     for i, j in itertools.combinations(range(4), 2):
@@ -67,10 +67,10 @@ def test_tetrahedra_of_a_lattice_have_no_small_angles() -> None:
 
 def test_vertices_where_faces_are_no_manifold_are_found() -> None:
     two = np.array([[0, 1, 2], [0, 3, 4]])  # fans that touch in 0
-    assert checks.singular_vertices(two).tolist() == [0]
+    assert checks.nonmanifold_vertices(two).tolist() == [0]
     fin = np.array([[0, 1, 2], [1, 0, 3], [0, 1, 4]])
-    assert checks.singular_vertices(fin).tolist() == [0, 1]
-    assert not len(checks.singular_vertices(np.array([[0, 1, 2], [1, 0, 3]])))
+    assert checks.nonmanifold_vertices(fin).tolist() == [0, 1]
+    assert not len(checks.nonmanifold_vertices(np.array([[0, 1, 2], [1, 0, 3]])))
 
 
 # Solids
@@ -136,9 +136,9 @@ def lens(r: float, s: float, d: float) -> float:
     ("part", "volume"),
     [
         (hk.Sphere(0.8), 4 / 3 * math.pi * 0.512),
-        (hk.Sphere(0.8) - hk.Sphere(0.5).moved((0.6, 0, 0)),
+        (hk.Sphere(0.8) - hk.Sphere(0.5).translated((0.6, 0, 0)),
          4 / 3 * math.pi * 0.512 - lens(0.8, 0.5, 0.6)),
-        (hk.Sphere(0.8) | hk.Sphere(0.5).moved((0.6, 0, 0)),
+        (hk.Sphere(0.8) | hk.Sphere(0.5).translated((0.6, 0, 0)),
          4 / 3 * math.pi * (0.512 + 0.125) - lens(0.8, 0.5, 0.6)),
         (hk.Sphere(0.8) & ~hk.Plane((0, 0, 1), 0.0), 2 / 3 * math.pi * 0.512),
         (hk.Torus(0.8, 0.2).rotated(20, "x"), 2 * math.pi**2 * 0.8 * 0.04),
@@ -163,8 +163,8 @@ def test_boxes_are_exact_and_so_are_their_creases() -> None:
 @pytest.mark.parametrize(
     "part",
     [
-        hk.Cuboid((0.5, 0.4, 0.3)).moved((1, 2, 3)),
-        hk.Cuboid((0.5, 0.4, 0.3)).rotated(30, (1, 1, 0)).moved((100, 0, 0)),
+        hk.Cuboid((0.5, 0.4, 0.3)).translated((1, 2, 3)),
+        hk.Cuboid((0.5, 0.4, 0.3)).rotated(30, (1, 1, 0)).translated((100, 0, 0)),
         hk.Cuboid((0.5, 0.4, 0.3)).scaled(0.5).rotated(20, "x").scaled(2),
     ],
     ids=["moved", "rotated", "scaled"],
@@ -224,7 +224,7 @@ def test_spheres_that_are_cut_have_the_area_left(clip: Any) -> None:
 def test_a_level_without_extent_is_cut_by_the_clip() -> None:
     curve = example_curves.wavy_polygon(32)
     mesh = hk.mesh(
-        hk.SolidAngle(curve), 4 * math.pi, clip=hk.Ball(radius=2.0), tolerance=1e-2, spacing=0.2
+        hk.SolidAngle(curve), 4 * math.pi, clip=hk.Ball(radius=2.0), tolerance=1e-2, cell_size=0.2
     )
     assert np.linalg.norm(mesh.vertices, axis=1).max() <= 2 * (1 + 1e-9)
     rim = mesh.vertices[np.unique(mesh.metadata["harnack"]["boundary"])]
@@ -259,7 +259,7 @@ def test_a_thick_sphere_is_a_shell() -> None:
 @pytest.mark.slow
 def test_beyond_its_reach_a_surface_is_made_of_hulls() -> None:
     """A small sphere, thicker than its diameter, is a ball."""
-    mesh = hk.mesh(hk.Sphere(0.3), thickness=0.8, tolerance=0.05, spacing=0.2)
+    mesh = hk.mesh(hk.Sphere(0.3), thickness=0.8, tolerance=0.05, cell_size=0.2)
     facts = mesh.metadata["harnack"]
     assert is_part(mesh)
     assert facts["thickened_by"] == "hulls of balls"
@@ -271,19 +271,19 @@ def test_beyond_its_reach_a_surface_is_made_of_hulls() -> None:
 def test_too_many_hulls_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(finishing, "_MOST_HULLS", 10)
     with pytest.raises(hk.MeshingError, match="reach"):
-        hk.mesh(hk.Sphere(0.3), thickness=0.8, tolerance=0.05, spacing=0.2)
+        hk.mesh(hk.Sphere(0.3), thickness=0.8, tolerance=0.05, cell_size=0.2)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("part", "volume", "bodies"),
     [
-        (hk.Sphere(0.5) | hk.Sphere(0.5).moved((1, 0, 0)), math.pi / 3, 2),
+        (hk.Sphere(0.5) | hk.Sphere(0.5).translated((1, 0, 0)), math.pi / 3, 2),
         (hk.Sphere(0.5) | hk.Sphere(0.5), math.pi / 6, 1),
-        (hk.Sphere(0.5).moved((1e6, 0, 0)), math.pi / 6, 1),
+        (hk.Sphere(0.5).translated((1e6, 0, 0)), math.pi / 6, 1),
         (hk.Sphere(1e-6), 8e-18 * math.pi / 6, 1),
         (hk.Sphere(1e6), 8e18 * math.pi / 6, 1),
-        (hk.Cuboid((0.5,) * 3) | hk.Cuboid((0.5,) * 3).moved((1, 0, 0)), 2.0, 1),
+        (hk.Cuboid((0.5,) * 3) | hk.Cuboid((0.5,) * 3).translated((1, 0, 0)), 2.0, 1),
     ],
     ids=["touching", "twice", "far", "tiny", "huge", "sharing a face"],
 )
@@ -316,7 +316,7 @@ def test_simplified_parts_are_within_the_tolerance() -> None:
 
 @pytest.mark.slow
 def test_the_largest_part_is_kept() -> None:
-    both = hk.Sphere(0.3) | hk.Sphere(0.5).moved((1.5, 0, 0))
+    both = hk.Sphere(0.3) | hk.Sphere(0.5).translated((1.5, 0, 0))
     mesh = hk.mesh(both, largest=True, tolerance=4e-3)
     assert is_part(mesh)
     assert mesh.body_count == 1
@@ -343,17 +343,17 @@ def test_cavities_belong_to_the_innermost_shell_around_them() -> None:
     """A ball in the cavity of another one has a cavity itself; beside them lies a ball which is
     smaller than the outer shell and larger than what that bounds."""
     ball = trimesh.creation.icosphere(2)
-    unit = Surface(np.array(ball.vertices), np.array(ball.faces, np.int64))
+    unit = TriangleMesh(np.array(ball.vertices), np.array(ball.faces, np.int64))
     shells = [(1.0, 0.0, False), (0.8, 0.0, True), (0.6, 0.0, False), (0.2, 0.0, True)]
 
-    def nested(*rows: tuple[float, float, bool]) -> Surface:
+    def nested(*rows: tuple[float, float, bool]) -> TriangleMesh:
         moved = [r * unit.vertices + np.array([x, 0, 0]) for r, x, _ in rows]
         faces = [unit.faces[:, ::-1] if inwards else unit.faces for _, _, inwards in rows]
         n = len(unit.vertices)
-        return Surface(np.concatenate(moved), np.concatenate(
+        return TriangleMesh(np.concatenate(moved), np.concatenate(
             [one + k * n for k, one in enumerate(faces)]))  # fmt: skip
 
-    def kept(surface: Surface) -> float:
+    def kept(surface: TriangleMesh) -> float:
         body = clipping.largest_body(surface)
         return float(trimesh.Trimesh(body.vertices, body.faces, process=False).volume)
 
@@ -367,7 +367,7 @@ def test_cavities_belong_to_the_innermost_shell_around_them() -> None:
         kept(nested((1.0, 0.0, True)))
 
 
-class Holed(hk.Shape):
+class Holed(hk.FormulaSolid):
     """A sphere that is no number beside its center."""
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
@@ -393,7 +393,7 @@ CURVE = hk.SolidAngle(example_curves.wavy_polygon(12))
         (~hk.Sphere(0.5), {}, "where it ends"),
         (hk.Sphere(0.5), {"clip": hk.Box((1, 1, 1), (2, 2, 2))}, "empty"),
         (hk.Sphere(0.5), {"solid": False, "clip": hk.Ball((3, 0, 0), 1)}, "empty"),
-        (hk.Sphere(0.5) & hk.Sphere(0.5).moved((3, 0, 0)), {}, "empty"),
+        (hk.Sphere(0.5) & hk.Sphere(0.5).translated((3, 0, 0)), {}, "empty"),
         (hk.Sphere(0.5), {"clip": "box"}, "must be a volume"),
         (hk.Sphere(0.5), {"thickness": 0.0}, "thickness must be a positive length"),
         (hk.Sphere(0.5), {"thickness": -1.0}, "thickness must be a positive length"),

@@ -49,7 +49,7 @@ def random_solid(rng: np.random.Generator) -> tuple[hk.Solid, Function]:
         part, own = primitive(rng)
         offset = rng.uniform(-0.6, 0.6, 3)
         degrees = float(rng.uniform(0, 180))
-        part = part.rotated(degrees, "z").moved(tuple(offset.tolist()))
+        part = part.rotated(degrees, "z").translated(tuple(offset.tolist()))
         c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
         turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
 

@@ -16,11 +16,11 @@ from harnack.cli import main
 from harnack.geometry import MeshError
 from harnack.geometry.example_meshes import icosphere, remove_faces, torus_mesh
 from harnack.meshing.harmonic_filling import (
-    Asked,
-    _collapsed,  # pyright: ignore[reportPrivateUsage]
+    HoleFillingOptions,
+    _collapse_midpoint,  # pyright: ignore[reportPrivateUsage]
+    checked_boundary_edges,
     harmonic_patches,
-    missing_triangles,
-    open_edges,
+    triangle_fills,
 )
 from harnack.meshing.hole_filling import hole_loops
 from tests.oracles.mesh_files import read_closed
@@ -40,8 +40,8 @@ def ball(directions: Any = AXES, radius: float = 0.5, subdivisions: int = 3) -> 
 
 def check(given: trimesh.Trimesh, euler: int = 2) -> trimesh.Trimesh:
     """Repairs a mesh and judges the result by other means than `repair` does."""
-    made = hk.repair(given, keep="all", patches="harmonic")
-    assert made.metadata["harnack"]["stage"] == "kept"
+    made = hk.repair(given, keep="all", filling="harmonic")
+    assert made.metadata["harnack"]["stage"] == "filled"
     given = given.copy()
     given.remove_unreferenced_vertices()
     n, m = len(given.vertices), len(given.faces)
@@ -148,7 +148,7 @@ def test_patches_that_meet_the_mesh_are_refused() -> None:
         process=False,
     )
     with pytest.raises(hk.MeshingError, match=r"meet \d+ triangles of the mesh"):
-        hk.repair(together, spacing=0.08, keep="all", patches="harmonic")
+        hk.repair(together, cell_size=0.08, keep="all", filling="harmonic")
 
 
 def doubled() -> trimesh.Trimesh:
@@ -236,7 +236,7 @@ def test_what_is_sound_is_kept(make: Any, message: str, reason: str | None, turn
     given = make()
     made = hk.repair(given)
     facts = made.metadata["harnack"]
-    assert facts["stage"] == "sound"
+    assert facts["stage"] == "cleaned"
     assert message in facts["why"]
     check_closed(made)
     # But for what was left out all is there, first and in its order.
@@ -263,7 +263,7 @@ def test_flipped_and_doubled_faces_are_all_told() -> None:
     broken = faces.copy()
     broken[some[:128]] = broken[some[:128], ::-1]
     broken = np.concatenate([broken, faces[some[128:]]])
-    made = hk.repair(trimesh.Trimesh(vertices, broken, process=False), keep="sound")
+    made = hk.repair(trimesh.Trimesh(vertices, broken, process=False), keep="valid")
     facts = made.metadata["harnack"]
     assert (facts["turned"], facts["patches"], facts["left_out"]["doubled"]) == (128, 0, 128)
     assert corners(made) == corners(trimesh.Trimesh(vertices, faces, process=False))
@@ -278,9 +278,9 @@ def test_noise_of_the_size_of_triangles(seed: int) -> None:
     rng = np.random.default_rng(seed)
     noisy = vertices + rng.normal(0, 0.08 + 0.02 * seed, vertices.shape)
     given = trimesh.Trimesh(noisy, faces[rng.random(len(faces)) > 0.05], process=False)
-    made = hk.repair(given, spacing=0.2, tolerance=1e-2)
+    made = hk.repair(given, cell_size=0.2, tolerance=1e-2)
     check_closed(made)
-    assert made.metadata["harnack"]["stage"] != "kept"
+    assert made.metadata["harnack"]["stage"] != "filled"
     assert made.volume == pytest.approx(4.1, abs=0.5)
 
 
@@ -312,11 +312,11 @@ def loose(noise: float) -> trimesh.Trimesh:
 def test_corners_of_cracks_are_joined() -> None:
     original = loose(2e-3)
     with pytest.raises(hk.MeshingError, match="open"):
-        hk.repair(original, keep="sound")
+        hk.repair(original, keep="valid")
     with pytest.warns(UserWarning, match="moved corners by up to 0.00"):
         result = hk.repair(original)
     facts = result.metadata["harnack"]
-    assert (facts["stage"], facts["kept"], facts["joined"]) == ("joined", 0, len(original.faces))
+    assert (facts["stage"], facts["kept"], facts["joined"]) == ("welded", 0, len(original.faces))
     assert facts["holes"] == 3
     check_closed(result)
     # Corners went nowhere but to means near by.
@@ -330,9 +330,9 @@ def test_corners_of_cracks_are_joined() -> None:
 def test_what_cannot_be_joined_is_made_anew() -> None:
     """Triangles that are moved by more than half of their size."""
     given = loose(0.05)
-    made = hk.repair(given, spacing=0.15, tolerance=1e-2)
+    made = hk.repair(given, cell_size=0.15, tolerance=1e-2)
     facts = made.metadata["harnack"]
-    assert (facts["stage"], facts["kept"]) == ("anew", 0)
+    assert (facts["stage"], facts["kept"]) == ("remeshed", 0)
     assert "are loose" in facts["why"]
     check_closed(made)
     assert made.volume == pytest.approx(4.0, abs=0.3)
@@ -343,7 +343,7 @@ def test_smooth_patches_continue_the_surface() -> None:
     given = ball()
     made = hk.repair(given, keep="all")
     facts = made.metadata["harnack"]
-    assert (facts["stage"], facts["holes"], facts["harmonic"]) == ("kept", 3, 0)
+    assert (facts["stage"], facts["holes"], facts["harmonic"]) == ("filled", 3, 0)
     given = given.copy()
     given.remove_unreferenced_vertices()
     n, m = len(given.vertices), len(given.faces)
@@ -366,7 +366,7 @@ def test_a_tube_that_is_half_open_is_not_cut_through() -> None:
     given = trimesh.Trimesh(vertices, faces[kept], process=False)
     made = hk.repair(given)
     facts = made.metadata["harnack"]
-    assert (facts["stage"], facts["holes"], facts["harmonic"]) == ("kept", 1, 0)
+    assert (facts["stage"], facts["holes"], facts["harmonic"]) == ("filled", 1, 0)
     check_closed(made)
     x, y, z = np.asarray(made.vertices)[len(np.unique(faces[kept])) :].T
     off = np.hypot(np.hypot(x, y) - 1, z) - 0.3
@@ -396,7 +396,7 @@ def test_holes_that_share_a_corner_are_told_apart() -> None:
     one = around[0]
     other = next(k for k in around if len(set(faces[k]) & set(faces[one])) == 1)
     rest = np.delete(faces, [one, other], axis=0)
-    loops = hole_loops(vertices, rest, open_edges(rest))
+    loops = hole_loops(vertices, rest, checked_boundary_edges(rest))
     assert sorted(map(len, loops)) == [3, 3]
     lost = {tuple(sorted(faces[k].tolist())) for k in (one, other)}
     assert {tuple(sorted(loop.tolist())) for loop in loops} == lost
@@ -429,7 +429,7 @@ def inside_out() -> trimesh.Trimesh:
 def test_what_is_inside_out_is_turned() -> None:
     made = hk.repair(inside_out())
     facts = made.metadata["harnack"]
-    assert facts["stage"] == "sound"
+    assert facts["stage"] == "cleaned"
     assert "inside out" in facts["why"]
     assert facts["turned"] == len(made.faces) == 80
     assert made.volume > 3.5
@@ -443,7 +443,7 @@ def test_a_cavity_is_not_turned() -> None:
     )  # fmt: skip
     made = hk.repair(shells)
     facts = made.metadata["harnack"]
-    assert facts["stage"] == "kept"
+    assert facts["stage"] == "filled"
     outer, inner = facts["parts"]
     assert outer["volume"] == pytest.approx(-8 * inner["volume"])
     assert made.volume == pytest.approx(outer["volume"] + inner["volume"])
@@ -455,15 +455,15 @@ def test_loose_parts_are_kept_or_dropped() -> None:
         np.concatenate([vertices, 0.3 * vertices + 2]), np.concatenate([faces, faces + 162]),
         process=False,
     )  # fmt: skip
-    made = hk.repair(both, keep="none", spacing=0.2, tolerance=1e-2)
+    made = hk.repair(both, keep="none", cell_size=0.2, tolerance=1e-2)
     assert made.body_count == 2
-    one = hk.repair(both, keep="none", largest=True, spacing=0.2, tolerance=1e-2)
+    one = hk.repair(both, keep="none", largest=True, cell_size=0.2, tolerance=1e-2)
     assert one.body_count == 1
     assert one.volume > 3.5
     assert one.metadata["harnack"]["dropped"] == 1
 
 
-@pytest.mark.parametrize("keep", ["all", "sound"])
+@pytest.mark.parametrize("keep", ["all", "valid"])
 def test_loose_parts_that_are_kept_are_listed(keep: Any) -> None:
     vertices, faces = icosphere(2)
     both = trimesh.Trimesh(
@@ -486,19 +486,19 @@ def test_settings_that_are_refused() -> None:
         hk.repair(np.zeros((3, 3)))  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="tolerance"):
         hk.repair(ball(), tolerance=0)
-    with pytest.raises(ValueError, match='keep is None, "all", "sound" or "none"'):
+    with pytest.raises(ValueError, match='keep is None, "all", "valid" or "none"'):
         hk.repair(ball(), keep="some")  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match='patches are "smooth" or "harmonic"'):
-        hk.repair(ball(), patches="flat")  # pyright: ignore[reportArgumentType]
+        hk.repair(ball(), filling="flat")  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="spacing"):
-        hk.repair(ball(), spacing=float("nan"))
+        hk.repair(ball(), cell_size=float("nan"))
 
 
 def test_a_middle_goes_to_an_end_of_its_edge() -> None:
     """Vertex 4 halves the edge from 0 to 1 of two triangles below vertex 2 and 3."""
     x = np.array([[0.0, 0, 0], [2, 0, 0], [2, 1, 0], [0, 1, 0], [1, 0, 0]])
     faces = np.array([[0, 4, 3], [4, 2, 3], [4, 1, 2]])
-    left = _collapsed(x, faces, 4, [0, 1])
+    left = _collapse_midpoint(x, faces, 4, [0, 1])
     assert sorted(map(sorted, left.tolist())) in ([[0, 1, 2], [0, 2, 3]], [[0, 1, 3], [1, 2, 3]])
 
 
@@ -507,8 +507,8 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     ball(AXES[:1], subdivisions=2).export(source)
     assert main(["repair", str(source), "-o", str(target), "--quiet"]) == 0
     assert "1 hole," in capsys.readouterr().out
-    again = ["repair", str(source), "-o", str(target), "--quiet", "--keep", "sound"]
-    assert main([*again, "--patches", "smooth"]) == 0
+    again = ["repair", str(source), "-o", str(target), "--quiet", "--keep", "valid"]
+    assert main([*again, "--filling", "smooth"]) == 0
     said = capsys.readouterr().out
     assert "kept what is sound: " in said
     assert "left out none; 1 hole," in said
@@ -525,7 +525,7 @@ def test_meshes_that_lack_single_triangles_get_them_back() -> None:
     rest = remove_faces(faces, 0.1, seed=1)
     given = trimesh.Trimesh(vertices, rest, process=False)
     made = hk.repair(given)
-    assert made.metadata["harnack"]["stage"] == "kept"
+    assert made.metadata["harnack"]["stage"] == "filled"
     assert made.faces[: len(rest)].tobytes() == given.faces.tobytes()
     assert made.is_watertight
     assert made.is_winding_consistent
@@ -543,12 +543,12 @@ def test_meshes_that_lack_single_triangles_get_them_back() -> None:
 def test_harmonic_patches_get_the_triangles_of_holes_of_three_edges() -> None:
     vertices, faces = torus_mesh(1.0, 0.35, 24, 24)
     given = trimesh.Trimesh(vertices, remove_faces(faces, 0.1, seed=1), process=False)
-    edges = open_edges(np.asarray(given.faces, np.int64))
-    how = Asked(1e-3, None, 0, 1, lambda _: None)
+    edges = checked_boundary_edges(np.asarray(given.faces, np.int64))
+    how = HoleFillingOptions(1e-3, None, 0, 1, lambda _: None)
     made = harmonic_patches(vertices, np.asarray(given.faces, np.int64), edges, how)
-    assert made.missing > 50
-    assert made.is_fine
-    assert (made.faces[: made.missing] < len(vertices)).all()
+    assert made.triangle_fill_count > 50
+    assert made.is_refined
+    assert (made.faces[: made.triangle_fill_count] < len(vertices)).all()
 
 
 @pytest.mark.slow
@@ -585,7 +585,7 @@ def test_a_lone_triangle_is_not_covered_by_itself() -> None:
 
 
 def missing(vertices: Any, faces: Any) -> Any:
-    return missing_triangles(np.asarray(vertices), faces, open_edges(faces))
+    return triangle_fills(np.asarray(vertices), faces, checked_boundary_edges(faces))
 
 
 def test_bodies_that_overlap_are_united_exactly() -> None:
@@ -593,7 +593,7 @@ def test_bodies_that_overlap_are_united_exactly() -> None:
     ball = trimesh.creation.icosphere(2)
     other = trimesh.Trimesh(np.add(ball.vertices, (0.7, 0.3, 0.2)), ball.faces)
     made = hk.repair(trimesh.util.concatenate([ball, other]))
-    assert made.metadata["harnack"]["stage"] == "united"
+    assert made.metadata["harnack"]["stage"] == "boolean_union"
     assert made.is_watertight
     assert not len(intersecting_pairs(np.asarray(made.vertices), np.asarray(made.faces)))
     expected = trimesh.boolean.union([ball, other]).volume
@@ -607,7 +607,7 @@ def test_what_is_inside_the_material_of_another_part_is_left_out() -> None:
     assert made.volume == pytest.approx(ball.volume)
     inner.invert()
     hollow = hk.repair(trimesh.util.concatenate([ball, inner]))
-    assert hollow.metadata["harnack"]["stage"] == "kept"
+    assert hollow.metadata["harnack"]["stage"] == "filled"
     assert hollow.volume == pytest.approx(0.875 * ball.volume)
 
 

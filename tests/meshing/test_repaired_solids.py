@@ -17,7 +17,7 @@ from harnack.meshing.bodies import closed_parts
 from harnack.meshing.edges import distance_from_triangles
 from harnack.meshing.intended_solid import IntendedSolid
 from harnack.meshing.joined_pieces import boundary_of_solid
-from harnack.meshing.lattice_meshing import Surface
+from harnack.meshing.lattice_meshing import TriangleMesh
 from harnack.meshing.marching_tetrahedra import delaunay
 from tests.oracles.direct_sums import winding_sum
 from tests.oracles.mesh_distance import distances_to_triangles
@@ -77,7 +77,7 @@ def test_a_cube_with_a_cavity_that_is_inside_out(is_whole: bool) -> None:
     result = repaired(damaged)
     facts = result.metadata["harnack"]
     assert result.volume == pytest.approx(7488 + (0 if is_whole else 125))
-    assert (facts["stage"], facts["kept"], facts["turned"]) == ("sound", len(damaged.faces), 24)
+    assert (facts["stage"], facts["kept"], facts["turned"]) == ("cleaned", len(damaged.faces), 24)
 
 
 @pytest.mark.parametrize("turns", [(1, 1), (1, -1), (-1, 1), (-1, -1)])
@@ -94,7 +94,7 @@ def test_a_cube_in_a_cube_one_of_which_lacks_a_triangle(turns: Any, lost: str) -
     result = repaired(together(*parts))
     is_hollow = turns[0] != turns[1]
     assert result.volume == pytest.approx(7488 if is_hollow else 8000)
-    if result.metadata["harnack"]["stage"] == "sound":
+    if result.metadata["harnack"]["stage"] == "cleaned":
         inside = len(inner.faces)
         assert result.metadata["harnack"]["left_out"]["inside"] == (0 if is_hollow else inside)
 
@@ -198,7 +198,7 @@ def test_a_part_that_passes_through_a_face_along_its_edges(first: str) -> None:
     damaged = together(box([10, 10, 10], (0, 0, -5)), octahedron)
     assert repaired(damaged).volume == pytest.approx(1000 + octahedron.volume / 2)
     apart = together(box([10, 10, 10], (0, 0, -7)), octahedron)  # a corner touches a face
-    assert repaired(apart).metadata["harnack"]["stage"] == "kept"
+    assert repaired(apart).metadata["harnack"]["stage"] == "filled"
 
 
 def test_an_edge_on_a_face() -> None:
@@ -212,7 +212,7 @@ def test_an_edge_on_a_face() -> None:
     damaged = together(box([5, 4, 5], (5.5, 8, 9.5)), prism)
     volume = 100 + prism.volume
     result = repaired(damaged)
-    assert result.metadata["harnack"]["stage"] == "united"
+    assert result.metadata["harnack"]["stage"] == "boolean_union"
     assert result.volume == pytest.approx(volume, rel=1e-7)
     assert hk.mesh(hk.solid(damaged)).volume == pytest.approx(volume, rel=1e-7)
 
@@ -232,9 +232,9 @@ def test_a_shell_that_passes_through_its_own_face_along_two_edges() -> None:
     assert fold.volume == pytest.approx(6 - 2)
     assert hk.check_print(fold).problems[0].kind == "touching faces"
     result = repaired(fold)
-    assert result.metadata["harnack"]["stage"] == "united"
+    assert result.metadata["harnack"]["stage"] == "boolean_union"
     assert result.volume == pytest.approx(6)
-    assert hk.check_print(result).is_fine
+    assert hk.check_print(result).is_printable
 
 
 def bridged() -> trimesh.Trimesh:
@@ -285,7 +285,7 @@ def test_a_box_bent_into_its_own_face(corner: Any, volume: float) -> None:
     ends = np.asarray(bent.vertices).copy()
     ends[(ends == 10).all(axis=1)] = corner
     result = repaired(trimesh.Trimesh(ends, bent.faces, process=False))
-    assert result.metadata["harnack"]["stage"] == "united"
+    assert result.metadata["harnack"]["stage"] == "boolean_union"
     assert result.volume == pytest.approx(volume)
 
 
@@ -300,7 +300,7 @@ def test_two_tetrahedra_whose_edges_cross() -> None:
     assert trimesh.Trimesh(cut.vertices, cut.faces).volume == pytest.approx(0.5, rel=1e-12)
     assert repaired(star).volume == pytest.approx(0.5, rel=1e-12)
     with pytest.raises(hk.MeshingError, match="none of its triangles is sound"):
-        hk.repair(star, keep="sound")
+        hk.repair(star, keep="valid")
 
 
 def test_faces_without_area_hide_no_difference() -> None:
@@ -318,26 +318,28 @@ def test_a_difference_is_told() -> None:
         trimesh.Trimesh(vertices, faces), trimesh.Trimesh(np.add(vertices, [3, 0, 0]), faces)
     )
     damaged = IntendedSolid.of(two)
-    assert damaged.difference(Surface(two.vertices, np.asarray(two.faces)), 1e-3) is None
-    lost = damaged.difference(Surface(vertices, faces), 1e-3)
+    assert damaged.difference(TriangleMesh(two.vertices, np.asarray(two.faces)), 1e-3) is None
+    lost = damaged.difference(TriangleMesh(vertices, faces), 1e-3)
     assert lost is not None
     assert (lost.missing > 300, lost.added) == (True, 0)
     assert (np.linalg.norm(lost.places - [3, 0, 0], axis=1) < 1).all()
     assert "such as near" in str(lost)
     more = IntendedSolid.of(trimesh.Trimesh(vertices, faces)).difference(
-        Surface(two.vertices, np.asarray(two.faces)), 1e-3
+        TriangleMesh(two.vertices, np.asarray(two.faces)), 1e-3
     )
     assert more is not None
     assert more.volumes == pytest.approx((2 * lost.volumes[0], lost.volumes[0]))
     # Within the length that is allowed nothing differs.
-    assert damaged.difference(Surface(1.01 * two.vertices, np.asarray(two.faces)), 0.05) is None
+    assert (
+        damaged.difference(TriangleMesh(1.01 * two.vertices, np.asarray(two.faces)), 0.05) is None
+    )
 
 
 @pytest.mark.parametrize("sides", [[1.0, 1.0, 0.003], [0.01, 0.01, 0.01]])
 def test_parts_that_hold_no_other_points_are_missed(sides: Any) -> None:
     """Made anew, with what else cannot be kept, they were lost without a word."""
     rest, part = box([3, 3, 3]), box(sides, (4, 0, 0))
-    result = Surface(np.asarray(rest.vertices), np.asarray(rest.faces, np.int64))
+    result = TriangleMesh(np.asarray(rest.vertices), np.asarray(rest.faces, np.int64))
     difference = IntendedSolid.of(together(rest, part)).difference(result, 4e-3)
     assert difference is not None
     assert (difference.missing, difference.added) == (12, 0)
@@ -352,7 +354,7 @@ def test_what_differs_is_said_if_nothing_better_is_found() -> None:
     """No patches can be made where edges lie on each other, and the triangles there go."""
     damaged = halves_along_a_zigzag()
     with pytest.warns(UserWarning, match=r"not quite the solid that was given: .* such as near"):
-        result = hk.repair(damaged, keep="sound")
+        result = hk.repair(damaged, keep="valid")
     differs = result.metadata["harnack"]["differs"]
     assert differs["missing"] > 500
     assert differs["share"] > 0.1

@@ -6,13 +6,21 @@ import numpy as np
 import pytest
 
 from harnack.geometry.example_meshes import icosphere
-from harnack.meshing.checks import CrossingError, check_apart, check_manifold, intersecting_faces
+from harnack.meshing.checks import (
+    SelfIntersectionError,
+    check_manifold,
+    check_no_self_intersection,
+    intersecting_faces,
+)
 from harnack.meshing.edges import boundary_edges
-from harnack.meshing.lattice_meshing import Surface
-from harnack.meshing.self_intersection_repair import made_apart, uncrossed
+from harnack.meshing.lattice_meshing import TriangleMesh
+from harnack.meshing.self_intersection_repair import (
+    resolve_local_intersections,
+    resolve_self_intersections,
+)
 
 
-def with_slivers(count: int, depth: float) -> Surface:
+def with_slivers(count: int, depth: float) -> TriangleMesh:
     """A sphere with some faces cut in three at a point a little beyond an edge, and a little above
     the face there, so that edges to it pass through that."""
     vertices, faces = icosphere(3)
@@ -31,7 +39,7 @@ def with_slivers(count: int, depth: float) -> Surface:
         vertices = np.concatenate([vertices, place[None]])
         fans = np.array([[a, b, new], [b, c, new], [c, a, new]])
         faces = np.concatenate([faces[:row], fans[:1], faces[row + 1 :], fans[1:]])
-    return Surface(vertices, faces)
+    return TriangleMesh(vertices, faces)
 
 
 @pytest.mark.parametrize(("count", "depth"), [(1, 1e-3), (5, 1e-6), (5, 1e-2)])
@@ -39,9 +47,9 @@ def test_slivers_that_pass_through_others_are_left_out(count: int, depth: float)
     given = with_slivers(count, depth)
     crossing = intersecting_faces(given.vertices, given.faces)
     assert len(crossing) >= 2 * count
-    made, left = uncrossed(given, crossing, 0.2)
+    made, left = resolve_local_intersections(given, crossing, 0.2)
     assert left == 0
-    check_apart(made.vertices, made.faces)
+    check_no_self_intersection(made.vertices, made.faces)
     check_manifold(made.faces, made.vertices)
     assert not len(boundary_edges(made.faces))
     # Vertices are a part of those before, and nearly all faces are as they were.
@@ -56,13 +64,13 @@ def test_slivers_that_pass_through_others_are_left_out(count: int, depth: float)
 def test_what_would_move_the_surface_too_far_is_left_and_refused() -> None:
     given = with_slivers(1, 1e-2)
     crossing = intersecting_faces(given.vertices, given.faces)
-    made, left = uncrossed(given, crossing, 0.0)
+    made, left = resolve_local_intersections(given, crossing, 0.0)
     assert made is given
     assert left == len(crossing)
-    with pytest.raises(CrossingError):
-        made_apart(given, 0.0)
+    with pytest.raises(SelfIntersectionError):
+        resolve_self_intersections(given, 0.0)
 
 
 def test_a_sound_mesh_is_returned_as_it_is() -> None:
-    given = Surface(*icosphere(2))
-    assert made_apart(given, 1.0) is given
+    given = TriangleMesh(*icosphere(2))
+    assert resolve_self_intersections(given, 1.0) is given

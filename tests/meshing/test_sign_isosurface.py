@@ -12,9 +12,9 @@ import trimesh
 import harnack as hk
 from harnack.geometry.example_meshes import flip_faces, icosphere, remove_faces
 from harnack.meshing import sign_isosurface
-from harnack.meshing.bcc_lattice import Lattice
+from harnack.meshing.bcc_lattice import BccLattice
 from harnack.meshing.sign_function import SignFunction
-from harnack.meshing.sign_isosurface import sign_surface
+from harnack.meshing.sign_isosurface import extract_from_signs
 from tests.oracles.triangle_pairs import intersecting_pairs
 
 
@@ -49,7 +49,7 @@ def check(made: trimesh.Trimesh) -> dict[str, Any]:
 
 def test_a_soup_is_closed() -> None:
     with pytest.warns(UserWarning, match="are farther from the level of this WindingNumber"):
-        made = hk.mesh(hk.WindingNumber(*soup()), tolerance=4e-3, spacing=0.1)
+        made = hk.mesh(hk.WindingNumber(*soup()), tolerance=4e-3, cell_size=0.1)
     facts = check(made)
     assert facts["made_by"] == "signs"
     assert made.volume == pytest.approx(1.0, abs=0.03)
@@ -58,7 +58,7 @@ def test_a_soup_is_closed() -> None:
 
 def test_both_ends_of_a_solid_are_told_of() -> None:
     ball = hk.DipolePotential(*sphere_points(1000))
-    ends = {end: hk.mesh(ball, solid=end, tolerance=4e-3, spacing=0.12).metadata["harnack"]
+    ends = {end: hk.mesh(ball, solid=end, tolerance=4e-3, cell_size=0.12).metadata["harnack"]
             for end in ((5.0, math.inf), (-math.inf, 8.0), (5.0, 8.0))}  # fmt: skip
     low, high, both = ends.values()
     for key in ("evaluations", "looked_at", "far", "undecided"):
@@ -67,9 +67,9 @@ def test_both_ends_of_a_solid_are_told_of() -> None:
 
 
 def test_what_is_nowhere_near_the_level_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sign_isosurface, "far_from_level", lambda *_: (np.zeros((1, 3)), 1000))
+    monkeypatch.setattr(sign_isosurface, "points_off_level", lambda *_: (np.zeros((1, 3)), 1000))
     with pytest.raises(hk.MeshingError, match="farther than several cells"):
-        hk.mesh(hk.WindingNumber(*icosphere(1)), spacing=0.2)
+        hk.mesh(hk.WindingNumber(*icosphere(1)), cell_size=0.2)
 
 
 def test_vertices_lie_on_triangles_and_creases_are_sharp() -> None:
@@ -77,7 +77,7 @@ def test_vertices_lie_on_triangles_and_creases_are_sharp() -> None:
     turn = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
     turn[0] *= np.sign(np.linalg.det(turn))
     vertices = np.asarray(box.vertices) @ turn.T
-    made = hk.mesh(hk.WindingNumber(vertices, box.faces), tolerance=4e-3, spacing=0.1)
+    made = hk.mesh(hk.WindingNumber(vertices, box.faces), tolerance=4e-3, cell_size=0.1)
     facts = check(made)
     off = np.abs(np.abs(made.vertices @ turn).max(axis=1) - 0.5)
     assert np.quantile(off, 0.95) < 1e-4 * 0.1  # within edges of tetrahedra, not at their ends
@@ -104,7 +104,7 @@ def boxes(*ends: tuple[tuple[int, ...], tuple[int, ...]]) -> hk.WindingNumber:
 )  # fmt: skip
 def test_flat_parts_and_parts_in_contact(parts: hk.WindingNumber, volume: float) -> None:
     """Their faces are planes of coordinates, in which every sign is as good as the other."""
-    result = hk.mesh(parts, tolerance=4e-3, spacing=1.5)
+    result = hk.mesh(parts, tolerance=4e-3, cell_size=1.5)
     facts = check(result)
     assert result.volume == pytest.approx(volume, rel=1e-3)
     assert facts["far"] <= 0.01 * facts["looked_at"]
@@ -116,19 +116,19 @@ def test_flat_parts_and_parts_in_contact(parts: hk.WindingNumber, volume: float)
 def test_units_and_places(scale: float, shift: float) -> None:
     vertices, faces = icosphere(2)
     given = scale * vertices + shift
-    made = hk.mesh(hk.WindingNumber(given, faces[3:]), tolerance=1e-2, spacing=0.2 * scale)
+    made = hk.mesh(hk.WindingNumber(given, faces[3:]), tolerance=1e-2, cell_size=0.2 * scale)
     check(made)
     assert np.linalg.norm(made.vertices - shift, axis=1).max() < 1.001 * scale
 
 
 def test_a_cloud_is_closed_and_near() -> None:
     points, _ = sphere_points(1000)
-    made = hk.mesh(hk.DipolePotential(points, points), tolerance=4e-3, spacing=0.12)
+    made = hk.mesh(hk.DipolePotential(points, points), tolerance=4e-3, cell_size=0.12)
     check(made)
     assert np.abs(np.linalg.norm(made.vertices, axis=1) - 1).max() < 0.02
     half = hk.mesh(
         hk.DipolePotential(points, points), solid=(2 * math.pi, math.inf), tolerance=4e-3,
-        spacing=0.12, section=hk.HalfSpace((0, 0, 1), 0.0),
+        cell_size=0.12, section=hk.HalfSpace((0, 0, 1), 0.0),
     )  # fmt: skip
     check(half)
     assert half.volume == pytest.approx(2 * math.pi / 3, rel=0.03)
@@ -146,8 +146,8 @@ def test_signs_by_chance_give_a_closed_surface() -> None:
     field = Noise(np.eye(3), np.eye(3))
     function = SignFunction(field, 2 * math.pi)
     function.clearance = lambda points: np.zeros(len(points))  # nothing is proved empty
-    lattice = Lattice.filling(np.full(3, -1.0), np.full(3, 1.0), 0.25, layers=1)
-    made = sign_surface(function, lattice, 1e-2, print, closed=True).surface
+    lattice = BccLattice.covering_box(np.full(3, -1.0), np.full(3, 1.0), 0.25, layers=1)
+    made = extract_from_signs(function, lattice, 1e-2, print, closed=True).surface
     mesh = trimesh.Trimesh(made.vertices, made.faces, process=False)
     assert mesh.is_watertight
     assert mesh.is_winding_consistent

@@ -25,7 +25,7 @@ def off(solid: Any, mesh: Any) -> float:
 
 @pytest.mark.parametrize("taper", [1.0, 0.5])
 def test_flat_faces_are_exact(taper: float) -> None:
-    solid = hk.Extruded([STAR, HOLE], 2.0, taper=taper)
+    solid = hk.Extrusion([STAR, HOLE], 2.0, taper=taper)
     mesh = hk.mesh(solid)
     assert mesh.is_watertight
     assert len(mesh.vertices) == 26
@@ -36,7 +36,7 @@ def test_flat_faces_are_exact(taper: float) -> None:
 
 
 def test_twisted_faces_are_within_the_tolerance() -> None:
-    solid = hk.Extruded([STAR, HOLE], 2.0, twist=90.0, taper=0.7)
+    solid = hk.Extrusion([STAR, HOLE], 2.0, twist=90.0, taper=0.7)
     mesh = hk.mesh(solid, tolerance=4e-3)
     assert mesh.is_watertight
     assert off(solid, mesh) < 4e-3 * 8.0
@@ -47,7 +47,7 @@ def test_twisted_faces_are_within_the_tolerance() -> None:
 
 
 def test_revolved_outlines_keep_their_rings() -> None:
-    solid = hk.Revolved(CUP)
+    solid = hk.SolidOfRevolution(CUP)
     mesh = hk.mesh(solid)
     assert mesh.is_watertight
     r = np.linalg.norm(mesh.vertices[:, :2], axis=1)
@@ -124,8 +124,8 @@ def test_tubes_that_come_back_to_themselves(
 
 
 def test_tubes_of_several_polylines_offset_and_cut() -> None:
-    cross = hk.Tube.around([[(-1, 0, 0), (1, 0, 0)], [(0, -1, 0), (0, 1, 0)]], 0.1)
-    grown = hk.mesh(cross.grown(0.1), tolerance=1e-3)
+    cross = hk.Tube.from_polylines([[(-1, 0, 0), (1, 0, 0)], [(0, -1, 0), (0, 1, 0)]], 0.1)
+    grown = hk.mesh(cross.offset(0.1), tolerance=1e-3)
     # Two capsules of radius r less what they have in common, 16/3 r^3.
     right = 2 * math.pi * 0.2**2 * (2 + 4 / 3 * 0.2) - 16 / 3 * 0.2**3
     assert grown.volume == pytest.approx(right, rel=6e-3)
@@ -134,10 +134,10 @@ def test_tubes_of_several_polylines_offset_and_cut() -> None:
 
 
 def test_a_bolt_and_its_nut_do_not_meet() -> None:
-    hexagon = hk.outline.regular(6, 13 / math.sqrt(3))
-    bolt = hk.thread("M8", 12.0, clearance=0.1)
-    nut = hk.Extruded(hexagon, 6.5) - hk.thread("M8", 8.0, internal=True)
+    hexagon = hk.outline.regular_polygon(6, 13 / math.sqrt(3))
+    bolt = hk.metric_thread("M8", 12.0, clearance=0.1)
+    nut = hk.Extrusion(hexagon, 6.5) - hk.metric_thread("M8", 8.0, internal=True)
     meshes = [hk.mesh(one, tolerance=2e-3) for one in (bolt, nut)]
     assert all(one.is_watertight for one in meshes)
-    inside = bolt.moved((0.0, 0.0, -2.5)).value(meshes[1].vertices, precision="double")
+    inside = bolt.translated((0.0, 0.0, -2.5)).value(meshes[1].vertices, precision="double")
     assert inside.min() > 0.1 - 2e-3 * 2 * 13

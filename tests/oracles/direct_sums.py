@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import FloatArray, choose_backend, to_numpy, to_vector3
-from harnack.backend.record_table import Records
+from harnack.backend.record_table import RecordTable
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
@@ -106,7 +106,7 @@ def _summed(
     start: tuple[Any, ...],
 ) -> tuple[Any, ...]:
     """`add` of every row (k,) of numbers, one after the other, by one loop."""
-    return Records.upload(backend, rows).for_each(add, start, "direct sum")
+    return RecordTable.upload(backend, rows).for_each(add, start, "direct sum")
 
 
 def _in_parts(

@@ -17,22 +17,26 @@ import numpy.typing as npt
 from harnack.backend import FloatArray, to_numpy
 from harnack.enclosures import (
     BoundedLaplacian,
-    Curvature,
     Enclosure,
     HarmonicBall,
     Lipschitz,
     Promise,
+    TaylorRemainder,
 )
-from harnack.enclosures.bounded_laplacian import GreenBall
-from harnack.enclosures.harmonic_ball import Caps, Classic, Slope
-from harnack.enclosures.parabola import Cone, Taylor
-from harnack.testing.enclosure_contracts import Case
-from harnack.testing.poisson import cap_movement, kernel_movement
+from harnack.enclosures.bounded_laplacian import BoundedLaplacianEnclosure
+from harnack.enclosures.harmonic_ball import (
+    HarnackEnclosure,
+    HarnackSlopeEnclosure,
+    SphericalCapEnclosure,
+)
+from harnack.enclosures.parabola import LipschitzEnclosure, TaylorEnclosure
+from harnack.testing.enclosure_contracts import PromiseCase
+from harnack.testing.poisson import cap_movement, kernel_difference
 
 __all__ = ["BOUNDS", "exact_step", "on_host"]
 
 
-def exact_step(kind: type[Enclosure], case: Case, slope: FloatArray) -> FloatArray:
+def exact_step(kind: type[Enclosure], case: PromiseCase, slope: FloatArray) -> FloatArray:
     """The longest step (n,) that this proof allows from a case of NumPy arrays (n,).
 
     No longer than the radius. Raises TypeError for a proof whose extremal functions are not
@@ -45,14 +49,14 @@ def exact_step(kind: type[Enclosure], case: Case, slope: FloatArray) -> FloatArr
     raise TypeError(f"no exact step is known for {kind.__name__} and {case.promise}")
 
 
-def on_host(case: Case, lanes: int) -> Case:
+def on_host(case: PromiseCase, lanes: int) -> PromiseCase:
     """The same case with NumPy arrays (lanes,) in the place of numbers and Dr.Jit arrays."""
 
     def host(value: object) -> FloatArray:
         array = to_numpy(value) if dr.is_array_v(value) else np.asarray(value)
         return np.broadcast_to(array.astype(np.float64), (lanes,))
 
-    return case.each(host)
+    return case.map_numbers(host)
 
 
 def largest_free(movement: Callable[[FloatArray], FloatArray], gap: FloatArray) -> FloatArray:
@@ -65,11 +69,11 @@ def largest_free(movement: Callable[[FloatArray], FloatArray], gap: FloatArray) 
     return low
 
 
-def _parabolas(known: Any, c: Case, slope: FloatArray) -> FloatArray:
+def _parabolas(known: Any, c: PromiseCase, slope: FloatArray) -> FloatArray:
     """Second derivatives of plus and minus the constant."""
     h = known.constant
     # An infinite radius is replaced by one within which a level is surely met.
-    down, up = np.minimum(c.gap_down, 1e30), np.minimum(c.gap_up, 1e30)
+    down, up = np.minimum(c.gap_below, 1e30), np.minimum(c.gap_above, 1e30)
     steep = np.abs(slope)
     with np.errstate(divide="ignore", invalid="ignore"):
         bent: FloatArray = 4 * (steep / h + np.sqrt(2 * np.minimum(down, up) / h))
@@ -82,10 +86,10 @@ def _parabolas(known: Any, c: Case, slope: FloatArray) -> FloatArray:
     def fall(q: FloatArray) -> FloatArray:
         return -slope * q * r + 0.5 * h * (q * r) ** 2
 
-    return r * np.minimum(largest_free(rise, c.gap_up), largest_free(fall, c.gap_down))
+    return r * np.minimum(largest_free(rise, c.gap_above), largest_free(fall, c.gap_below))
 
 
-def _green(known: Any, c: Case, slope: FloatArray) -> FloatArray:
+def _green(known: Any, c: PromiseCase, slope: FloatArray) -> FloatArray:
     """Mass at the poles, and a density of the kernel's sign, with the constant that is proved."""
     square, below, above = known.radius**2, -known.lower, known.upper
     mean = 0.5 * square * (known.laplacian_lower + known.laplacian_upper)
@@ -93,8 +97,8 @@ def _green(known: Any, c: Case, slope: FloatArray) -> FloatArray:
     norm = 0.1907  # of G(0,.) + d_v G(0,.)/3, rounded up: see `green_kernel.Proof.convex`
     reach: list[FloatArray] = []
     for u, most, sign, gap in (
-        (below, above, 1.0, c.gap_up),
-        (above, below, -1.0, c.gap_down),
+        (below, above, 1.0, c.gap_above),
+        (above, below, -1.0, c.gap_below),
     ):
         w, m = np.maximum(u + sign * mean / 6, 0), np.maximum(sign * mean, 0)
         s = np.clip(sign * known.radius * slope / 3, -w - norm * spread, w + norm * spread)
@@ -111,17 +115,17 @@ def _green(known: Any, c: Case, slope: FloatArray) -> FloatArray:
     return known.radius * np.minimum(*reach)
 
 
-def _sides(ball: Any, c: Case) -> list[tuple[FloatArray, float, FloatArray, FloatArray]]:
+def _sides(ball: Any, c: PromiseCase) -> list[tuple[FloatArray, float, FloatArray, FloatArray]]:
     """(u, sign, gap away from the end, gap towards it) of the positive functions u at p."""
     sides: list[tuple[FloatArray, float, FloatArray, FloatArray]] = []
     if np.isfinite(ball.lower).any():
-        sides.append((-ball.lower, 1.0, c.gap_up, c.gap_down))
+        sides.append((-ball.lower, 1.0, c.gap_above, c.gap_below))
     if np.isfinite(ball.upper).any():
-        sides.append((ball.upper, -1.0, c.gap_down, c.gap_up))
+        sides.append((ball.upper, -1.0, c.gap_below, c.gap_above))
     return sides
 
 
-def _classic(ball: Any, c: Case, slope: FloatArray) -> FloatArray:
+def _classic(ball: Any, c: PromiseCase, slope: FloatArray) -> FloatArray:
     """Point masses at the poles."""
     del slope
     best = np.zeros_like(ball.radius)
@@ -133,27 +137,27 @@ def _classic(ball: Any, c: Case, slope: FloatArray) -> FloatArray:
     return ball.radius * best
 
 
-def _slope(ball: Any, c: Case, slope: FloatArray) -> FloatArray:
+def _slope(ball: Any, c: PromiseCase, slope: FloatArray) -> FloatArray:
     """Two point masses at the poles; a ring of mass at one latitude."""
     n = ball.dimension
     reach = {1.0: np.zeros_like(ball.radius), -1.0: np.zeros_like(ball.radius)}
     for u, sign, away, toward in _sides(ball, c):
         m = np.where(u > 0, np.clip(sign * ball.radius * slope / (n * u), -1, 1), 0.0)
         chord = largest_free(lambda q, m=m, u=u: u * _poles_movement(q, m, n), away)
-        jensen = largest_free(lambda q, m=m, u=u: -u * kernel_movement(q, m, n), toward)
+        jensen = largest_free(lambda q, m=m, u=u: -u * kernel_difference(q, m, n), toward)
         reach[sign] = np.maximum(reach[sign], chord)
         reach[-sign] = np.maximum(reach[-sign], jensen)
     return ball.radius * np.minimum(reach[1.0], reach[-1.0])
 
 
-def _caps(ball: Any, c: Case, slope: FloatArray) -> FloatArray:
+def _caps(ball: Any, c: PromiseCase, slope: FloatArray) -> FloatArray:
     """Two caps on the axis, and all but two caps."""
     below, above = -ball.lower, ball.upper
     span = below + above
     reach: list[FloatArray] = []
     for near, far, sign, gap in (
-        (below, above, 1.0, c.gap_up),
-        (above, below, -1.0, c.gap_down),
+        (below, above, 1.0, c.gap_above),
+        (above, below, -1.0, c.gap_below),
     ):
         p, rest = near / span, far / span
         shift = np.where(rest > 0, sign * ball.radius * slope / (3 * span * rest), 0.0)
@@ -190,25 +194,25 @@ def _belt(q: FloatArray, middle: FloatArray, half: FloatArray) -> FloatArray:
     nodes, weights = np.polynomial.legendre.leggauss(12)
     total = np.zeros_like(q)
     for x, w in zip(nodes, weights, strict=True):
-        total += 0.5 * w * half * kernel_movement(q, np.clip(middle + half * x, -1, 1), 3)
+        total += 0.5 * w * half * kernel_difference(q, np.clip(middle + half * x, -1, 1), 3)
     return total
 
 
-def _cone(known: Any, c: Case, slope: FloatArray) -> FloatArray:
+def _cone(known: Any, c: PromiseCase, slope: FloatArray) -> FloatArray:
     del slope
-    return np.minimum(np.minimum(c.gap_down, c.gap_up) / known.constant, known.radius)
+    return np.minimum(np.minimum(c.gap_below, c.gap_above) / known.constant, known.radius)
 
 
 # Of each proof the kind of promise it is made of, and the longest step from such a promise with
 # these gaps along these slopes: a new proof goes in here.
 _EXACT: dict[
-    type[Enclosure], tuple[type[Promise], Callable[[Any, Case, FloatArray], FloatArray]]
+    type[Enclosure], tuple[type[Promise], Callable[[Any, PromiseCase, FloatArray], FloatArray]]
 ] = {
-    Classic: (HarmonicBall, _classic),
-    Slope: (HarmonicBall, _slope),
-    Caps: (HarmonicBall, _caps),
-    GreenBall: (BoundedLaplacian, _green),
-    Cone: (Lipschitz, _cone),
-    Taylor: (Curvature, _parabolas),
+    HarnackEnclosure: (HarmonicBall, _classic),
+    HarnackSlopeEnclosure: (HarmonicBall, _slope),
+    SphericalCapEnclosure: (HarmonicBall, _caps),
+    BoundedLaplacianEnclosure: (BoundedLaplacian, _green),
+    LipschitzEnclosure: (Lipschitz, _cone),
+    TaylorEnclosure: (TaylorRemainder, _parabolas),
 }
 BOUNDS = tuple(_EXACT)

@@ -1,7 +1,8 @@
 """How much a bounded Laplacian moves f: the kernel's norm, bounded by a proof on a computer.
 
 With G the Green function of the unit ball, x = q v, A = (1+3q^2)/(1-q^2)^2 and
-B = (3q+q^3)/(1-q^2)^2, what `harnack.enclosures.GreenBall` rests on is, for all 0 < q < 1,
+B = (3q+q^3)/(1-q^2)^2, what `harnack.enclosures.BoundedLaplacianEnclosure` rests on is, for all 0 <
+q < 1,
 
     kappa(q) = integral |-G(x,.) + A G(0,.) + (B/3) d_v G(0,.)| dy
              <= constant q^2 (2 + ln(1/q)) / (1-q^2)^2.

@@ -9,7 +9,7 @@ import numpy as np
 import trimesh
 from manifold3d import Error, Manifold, Mesh64
 
-from harnack.meshing.checks import check_apart
+from harnack.meshing.checks import check_no_self_intersection
 
 
 def read_closed(path: Path) -> Any:
@@ -24,5 +24,5 @@ def read_closed(path: Path) -> Any:
     vertices = np.ascontiguousarray(read.vertices, np.float64)
     faces = np.ascontiguousarray(read.faces, np.int64)
     assert Manifold(Mesh64(vertices, faces.astype(np.uint64))).status() == Error.NoError
-    check_apart(vertices, faces)
+    check_no_self_intersection(vertices, faces)
     return read

@@ -10,16 +10,16 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import FloatArray, choose_backend, to_numpy, to_vector3
-from harnack.enclosures import Gaps, Promise
-from harnack.enclosures.free_radius import known_ranges
-from harnack.testing.enclosure_contracts import Case
+from harnack.enclosures import LevelGaps, Promise
+from harnack.enclosures.free_radius import allowed_movement
+from harnack.testing.enclosure_contracts import PromiseCase
 from harnack.testing.violation_search import (
     BrokenPromiseError,
-    look_at,
-    movements,
+    lift_along_rays,
+    original_enclosure,
     random_directions,
     random_points,
-    unscaled,
+    sample_field,
 )
 from tests.oracles.exact import exact_step, on_host
 
@@ -64,9 +64,9 @@ def check_steps(
     sample = field.prepare(backend).evaluate(p)
     slope = dr.dot(sample.gradient, d)
     down, up = _gaps(field, points, generator)
-    blur = _blur(sample, points, backend.epsilon)
-    near = Gaps(*(real(np.maximum(gap - blur, 0)) for gap in (down, up)))
-    cases = [_case_of(one, sample, near) for one in sample.promises]
+    blur = _blur(sample, points, backend.machine_epsilon)
+    near = LevelGaps(*(real(np.maximum(gap - blur, 0)) for gap in (down, up)))
+    cases = [_case_of(one, sample, near) for one in sample.all_promises]
     accepted = [one for one in cases if one.accepts(kind)]
     for one in accepted:
         step = to_numpy(one.step(kind, slope)).astype(np.float64) * np.ones(count)
@@ -80,7 +80,7 @@ def _gaps(
 ) -> tuple[FloatArray, FloatArray]:
     """Distances to the levels below and above: parts of what f varies by, and the first crossing
     of nearby levels."""
-    value = look_at(field, points).value
+    value = sample_field(field, points).value
     variation = float(np.quantile(np.abs(value - np.median(value)), 0.9)) or 1.0
     down, up = variation * 10 ** rng.uniform(-6, 0.5, (2, len(points)))
     return down, up
@@ -89,13 +89,15 @@ def _gaps(
 def _blur(sample: Any, points: FloatArray, epsilon: float) -> FloatArray:
     steepness = to_numpy(dr.norm(sample.gradient)).astype(np.float64)
     value = np.abs(to_numpy(sample.value).astype(np.float64))
-    error = to_numpy(sample.error) if dr.is_array_v(sample.error) else sample.error
+    error = (
+        to_numpy(sample.value_error) if dr.is_array_v(sample.value_error) else sample.value_error
+    )
     position = 4 * epsilon * np.abs(points).max(axis=1)
     return steepness * position + 8 * epsilon * value + np.asarray(error, dtype=np.float64)
 
 
 def _check_step(
-    field: Field, kind: type[Enclosure], case: Case, slope: Any, points: FloatArray,
+    field: Field, kind: type[Enclosure], case: PromiseCase, slope: Any, points: FloatArray,
     directions: FloatArray, step: FloatArray, gaps: tuple[FloatArray, FloatArray],
 ) -> None:  # fmt: skip
     def require(good: Any, message: str) -> None:
@@ -105,14 +107,14 @@ def _check_step(
     require(~_meets(field, points, directions, step, gaps), "a level lies within the step")
     try:
         along = to_numpy(slope).astype(np.float64) * np.ones(len(points))
-        exact = exact_step(unscaled(kind), on_host(case, len(points)), along)
+        exact = exact_step(original_enclosure(kind), on_host(case, len(points)), along)
     except TypeError:
         return  # a proof of the user's own
     require(step <= exact * (1 + 1e-12), "the step is longer than the proof allows")
 
 
 def _check_covers(
-    field: Field, kind: type[Enclosure], case: Case, slope: Any, points: FloatArray,
+    field: Field, kind: type[Enclosure], case: PromiseCase, slope: Any, points: FloatArray,
     directions: FloatArray, step: FloatArray, gaps: tuple[FloatArray, FloatArray],
     rng: np.random.Generator,
 ) -> None:  # fmt: skip
@@ -137,8 +139,8 @@ def _meets(
 ) -> Any:  # fmt: skip
     """Whether the lift is seen to move by more than a gap within the length, (n,)."""
     share = np.concatenate([np.linspace(0, 0.98, 40), 1 - np.geomspace(0.01, 1e-6, 8)])
-    moved = movements(field, points, directions, length[:, None] * share).moved
-    rounding = 1e-12 * (1 + np.abs(look_at(field, points).value[:, None]))
+    moved = lift_along_rays(field, points, directions, length[:, None] * share).moved
+    rounding = 1e-12 * (1 + np.abs(sample_field(field, points).value[:, None]))
     down, up = gaps
     return ((moved > up[:, None] + rounding) | (-moved > down[:, None] + rounding)).any(axis=1)
 
@@ -155,12 +157,14 @@ def _require(
         )
 
 
-def _case_of(promise: Promise, sample: Sample, gaps: Gaps) -> Case:
+def _case_of(promise: Promise, sample: Sample, gaps: LevelGaps) -> PromiseCase:
     """A promise of a sample with levels these gaps away, less what proofs take off for rounding."""
-    if promise.ends:
-        radius, below, above = known_ranges(cast("Any", promise), sample.value, sample.error)
+    if promise.interval_pairs:
+        radius, below, above = allowed_movement(
+            cast("Any", promise), sample.value, sample.value_error
+        )
         lower = -math.inf if below is None else -below
         upper = math.inf if above is None else above
-        (low, high), *_ = promise.ends
+        (low, high), *_ = promise.interval_pairs
         promise = dataclasses.replace(promise, **{"radius": radius, low: lower, high: upper})
-    return Case(promise, gaps.down, gaps.up)
+    return PromiseCase(promise, gaps.below, gaps.above)

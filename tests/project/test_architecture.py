@@ -13,7 +13,7 @@ FILES = sorted(SOURCE.rglob("*.py"))
 
 # Each room imports from itself and from the rooms before it.
 ROOMS = (
-    "names",
+    "name_suggestions",
     "progress",
     "backend",
     "webgpu",
@@ -35,15 +35,15 @@ ROOMS = (
 )
 # Within `fields`: the interface, what families share, and the families.
 FIELD_ROOMS = (
-    "sheets",
-    "points",
-    "look",
+    "capabilities",
+    "batch_evaluation",
+    "samples",
     "field",
     "formula",
-    "batch",
+    "batched_fields",
     "clearance",
-    "boxed_parts",
-    "sums",
+    "patch_boxes",
+    "source_sums",
     "solid_angles",
     "analytic",
     "expressions",
@@ -51,7 +51,7 @@ FIELD_ROOMS = (
     "blobs",
 )
 # Bases of `Field`, which answer with fields and so name it in their types.
-CAPABILITIES = ("sheets",)
+CAPABILITIES = ("capabilities",)
 # Families do not know each other. A new one is added above and in docs/architecture.md.
 FAMILIES = FIELD_ROOMS[FIELD_ROOMS.index("solid_angles") :]
 FREE = ("__init__", "__main__", "testing")  # at the top: may import from any room

@@ -8,7 +8,7 @@ import pytest
 import harnack as hk
 from benchmarks import baselines, blobs, formulas, hart, inclusion, povray
 from harnack.backend import choose_backend, to_vector3
-from harnack.enclosures.literature import BottomUpLinear
+from harnack.enclosures.literature import BottomUpLinearEnclosure
 from harnack.geometry import example_curves
 
 SCENE = blobs.Scene.random(6, 1.5, (0.6, 1.0), 1.6, seed=2)
@@ -64,7 +64,7 @@ def test_bisection_is_bounded_by_its_depth() -> None:
     backend = choose_backend("double")
     o, d, length = SCENE.rays(200)
     rays = to_vector3(backend, o), to_vector3(backend, d), backend.Float(length)
-    t, looks, _ = bisect(backend, blobs.BlobFormula(SCENE), BottomUpLinear, rays, 1e-3)
+    t, looks, _ = bisect(backend, blobs.BlobFormula(SCENE), BottomUpLinearEnclosure, rays, 1e-3)
     assert looks.numpy().max() < 300
     hit = np.isfinite(t.numpy())
     values = SCENE.values((o + np.where(hit, t.numpy(), 0)[:, None] * d)[hit])

@@ -73,13 +73,13 @@ def test_the_published_algorithm_depends_on_what_is_claimed() -> None:
     claim = claimed_angle(field)
     proved = published(claim, view.eye, d, *limits, eps=1e-3, most=300)
     certain = proved.evaluations < 300
-    np.testing.assert_array_equal(np.isfinite(proved.t)[certain], truth.hit[certain])
+    np.testing.assert_array_equal(np.isfinite(proved.t)[certain], truth.is_hit[certain])
     assert certain.mean() > 0.9
     np.testing.assert_allclose(
-        proved.t[truth.hit & certain], truth.t[truth.hit & certain], atol=0.02
+        proved.t[truth.is_hit & certain], truth.t[truth.is_hit & certain], atol=0.02
     )
     wrong = Claim(claim.look, math.pi, claim.level, claim.period)
-    passed = ~np.isfinite(published(wrong, view.eye, d, *limits, most=300).t) & truth.hit
+    passed = ~np.isfinite(published(wrong, view.eye, d, *limits, most=300).t) & truth.is_hit
     assert passed.sum() > 5
 
 
@@ -91,10 +91,10 @@ def test_a_view_frames_and_meets_what_it_is_given() -> None:
     assert (pixels < [40, 30]).all()
     assert (depth > 0).all()
     met = mesh_hits(vertices, faces, view.eye, view.directions())
-    middle = met.hit.reshape(30, 40)[15, 20]
+    middle = met.is_hit.reshape(30, 40)[15, 20]
     assert middle
-    assert not met.hit.reshape(30, 40)[0, 0]
-    points = view.eye + met.t[met.hit, None] * view.directions()[met.hit]
+    assert not met.is_hit.reshape(30, 40)[0, 0]
+    points = view.eye + met.t[met.is_hit, None] * view.directions()[met.is_hit]
     radii = np.linalg.norm(points, axis=1)
     assert (radii < 1.001).all()
     assert (radii > 0.95).all()

@@ -114,6 +114,6 @@ def test_marks_of_restructured_text_are_taken_as_they_stand() -> None:
 
 def test_names_of_ours_become_links() -> None:
     inline = extension("docstrings").inline
-    assert inline("`harnack.Caps` and `x`s") == (
-        "\\ :py:obj:`harnack.Caps <harnack.Caps>`\\  and \\ ``x``\\ s"
+    assert inline("`harnack.Surface` and `x`s") == (
+        "\\ :py:obj:`harnack.Surface <harnack.Surface>`\\  and \\ ``x``\\ s"
     )

@@ -17,8 +17,8 @@ import harnack as hk
 from harnack.cli import main
 from harnack.geometry import example_curves
 from harnack.rendering import register, scales
-from harnack.rendering.framing import upright
-from harnack.rendering.scales import Scale
+from harnack.rendering.framing import rotation_to_z_up
+from harnack.rendering.scales import ColorScale
 
 FIELD = hk.SolidAngle(example_curves.wavy_polygon(24))
 mi = register()
@@ -30,7 +30,7 @@ def draw(what: Any = FIELD, **settings: Any) -> Any:
 
 
 def seen(camera: Any, **settings: Any) -> np.ndarray:
-    return draw(camera=camera, show="status", **settings) == hk.Status.HIT
+    return draw(camera=camera, show="status", **settings) == hk.RayStatus.HIT
 
 
 def middle(mask: np.ndarray) -> np.ndarray:
@@ -113,7 +113,7 @@ def test_what_is_no_camera_is_refused(camera: Any) -> None:
     "up", ["x", "y", "z", "-x", "-y", "-z", (1, 2, -3), (0, 0, -2), (0, 0, 1e-9)]
 )
 def test_up_is_turned_to_z_and_lengths_are_kept(up: Any) -> None:
-    turn = upright(up)
+    turn = rotation_to_z_up(up)
     way = up
     if isinstance(up, str):
         way = (-1 if up[0] == "-" else 1) * np.eye(3)["xyz".index(up[-1])]
@@ -124,7 +124,7 @@ def test_up_is_turned_to_z_and_lengths_are_kept(up: Any) -> None:
 
 def test_up_turns_the_picture() -> None:
     """A surface turned by hand looks as one that is turned by the stage."""
-    turned = hk.SolidAngle(example_curves.wavy_polygon(24) @ upright("x").T)
+    turned = hk.SolidAngle(example_curves.wavy_polygon(24) @ rotation_to_z_up("x").T)
     a, b = draw(turned, show="depth"), draw(up="x", show="depth")
     both = np.isfinite(a) & np.isfinite(b)
     assert (np.isfinite(a) != np.isfinite(b)).mean() < 0.01
@@ -138,7 +138,7 @@ def test_what_is_no_direction_is_refused(up: Any) -> None:
 
 
 @pytest.mark.few(1)
-@pytest.mark.parametrize("show", ["color", "shaded"])
+@pytest.mark.parametrize("show", ["path", "shaded"])
 def test_white_is_white_and_transparent_is_as_much_as_is_covered(show: str, tmp_path: Path) -> None:
     from PIL import Image
 
@@ -146,7 +146,7 @@ def test_white_is_white_and_transparent_is_as_much_as_is_covered(show: str, tmp_
     clear = draw(show=show, backdrop="transparent", path=tmp_path / "clear.png")
     assert white.shape == (48, 64, 3)
     assert clear.shape == (48, 64, 4)
-    hit = draw(show="status") == hk.Status.HIT
+    hit = draw(show="status") == hk.RayStatus.HIT
     alpha = clear[..., 3]
     assert alpha.min() == 0
     assert alpha.max() == 1
@@ -165,7 +165,7 @@ TORUS = hk.Torus(1, 0.3)
 
 
 @pytest.mark.few(1)
-@pytest.mark.parametrize("show", ["color", "shaded"])
+@pytest.mark.parametrize("show", ["path", "shaded"])
 @pytest.mark.parametrize(
     "settings",
     [
@@ -177,7 +177,7 @@ TORUS = hk.Torus(1, 0.3)
 )
 def test_the_lamp_is_not_in_the_picture(show: str, settings: dict[str, Any]) -> None:
     alpha = draw(TORUS, show=show, backdrop="transparent", **settings)[..., 3]
-    hit = draw(TORUS, show="status", **settings) == hk.Status.HIT
+    hit = draw(TORUS, show="status", **settings) == hk.RayStatus.HIT
     assert hit.any()
     near = np.zeros_like(hit)
     rows, columns = np.nonzero(hit)
@@ -234,7 +234,7 @@ def test_the_depth_of_another_integrator_is_taken() -> None:
 
 
 @pytest.mark.few(1)
-@pytest.mark.parametrize("show", ["color", "shaded"])
+@pytest.mark.parametrize("show", ["path", "shaded"])
 @pytest.mark.parametrize("far", [50.0, 1e3, 4e3])
 def test_a_surface_seen_from_far_away_is_as_large(show: str, far: float) -> None:
     """The camera frames it: a picture from farther away is a picture with less perspective."""
@@ -251,9 +251,9 @@ def test_a_camera_too_far_away_is_refused() -> None:
 def test_a_surface_far_from_the_origin_is_refused_or_blurred() -> None:
     """Single precision rounds coordinates of maps to half a meter: the picture was another one."""
     with pytest.raises(ValueError, match="move it to the origin"):
-        draw(hk.Sphere(1.0).moved((4e5, 5.8e6, 100.0)), show="status")
+        draw(hk.Sphere(1.0).translated((4e5, 5.8e6, 100.0)), show="status")
     with pytest.warns(UserWarning, match="blurred"):
-        draw(hk.Sphere(1.0).moved((2e4, 0.0, 0.0)), show="status")
+        draw(hk.Sphere(1.0).translated((2e4, 0.0, 0.0)), show="status")
 
 
 @pytest.mark.parametrize(
@@ -279,7 +279,7 @@ def test_the_alpha_of_a_film_is_kept() -> None:
         "integrator": {"type": "harnack_path"},
         "light": {"type": "directional", "direction": [0, 0, -1]},
         "sensor": {"type": "orthographic", "film": film},
-        "surface": hk.rendering.shape(GYROID),
+        "surface": hk.rendering.mitsuba_shape(GYROID),
     }
     image = hk.render(scene, spp=4, progress=False)
     assert image.shape == (24, 32, 4)
@@ -333,17 +333,17 @@ def test_a_tube_needs_a_curve() -> None:
 def test_pictures_show_themselves() -> None:
     image = draw(show="shaded")
     assert image._repr_png_().startswith(b"\x89PNG")
-    assert image.shown.shape == (48, 64, 3)
+    assert image.srgb.shape == (48, 64, 3)
     assert image.to_pil().size == (64, 48)
     for made in (image[:, :, 0], image + 1, image.mean(axis=0), np.sqrt(image)):
         assert type(made) is np.ndarray
     assert isinstance(image.mean(), np.floating)
-    assert not hasattr(image[0], "shown")
+    assert not hasattr(image[0], "srgb")
     for same in (image.copy(), copy.copy(image), copy.deepcopy(image)):
-        np.testing.assert_array_equal(same.shown, image.shown)
+        np.testing.assert_array_equal(same.srgb, image.srgb)
     sent = pickle.loads(pickle.dumps(image))
     np.testing.assert_array_equal(sent, image)
-    np.testing.assert_array_equal(sent.shown, image.shown)
+    np.testing.assert_array_equal(sent.srgb, image.srgb)
 
 
 @pytest.mark.few(1)
@@ -382,7 +382,7 @@ def test_axes_with_a_minus_turn_files_from_the_command_line(up: str, tmp_path: P
     (tmp_path / "a.obj").write_text("\n".join(lines))
     small = ["--show", "depth", "--size", "32x24", "--quiet", "-o", str(tmp_path / "a.exr")]
     assert main(["render", str(tmp_path / "a.obj"), "--up", up, *small]) == 0
-    turned = hk.SolidAngle(curve @ upright(up).T)
+    turned = hk.SolidAngle(curve @ rotation_to_z_up(up).T)
     expected = hk.render(turned, show="depth", size=(32, 24), progress=False)
     # Not by Mitsuba, which waits for ever where Dr.Jit has one thread.
     with OpenEXR.File(str(tmp_path / "a.exr")) as file:
@@ -428,11 +428,11 @@ def test_pictures_of_numbers_stand_before_a_color(show: str) -> None:
         hk.Sphere(1.0), show=show, backdrop="white", colorbar=True, size=(40, 120),
         progress=False, **asked,
     )  # fmt: skip
-    assert (picture.shown[-1, -1] == 255).all()
+    assert (picture.srgb[-1, -1] == 255).all()
     if show != "evaluations":
-        assert (picture.shown[0, 0] == 255).all()
+        assert (picture.srgb[0, 0] == 255).all()
     light = hk.render(hk.Sphere(1.0), show=show, backdrop="light", size=(8, 6), **asked)
-    assert show == "evaluations" or light.shown[0, 0].min() > 200
+    assert show == "evaluations" or light.srgb[0, 0].min() > 200
     for other in ("transparent", ("white", "black")):
         with pytest.raises(ValueError, match="must be one color"):
             hk.render(hk.Sphere(1.0), show=show, backdrop=other, **asked)
@@ -446,7 +446,7 @@ def test_titles_of_bars_have_the_letters_of_some_typeface(monkeypatch: pytest.Mo
         seen = hk.render(
             hk.Sphere(1.0), show="depth", colorbar="ψ in Höhe", size=(40, 30), progress=False
         )
-        assert seen.shown.shape[1] > 40
+        assert seen.srgb.shape[1] > 40
     monkeypatch.setattr(scales, "_TYPEFACES", ())
     with pytest.raises(ValueError, match=r"no typeface .* all letters of 'über 4π'"):
         hk.render(hk.Sphere(1.0), show="depth", colorbar="über 4π")
@@ -456,7 +456,7 @@ def test_titles_of_bars_have_the_letters_of_some_typeface(monkeypatch: pytest.Mo
 
 @pytest.mark.parametrize(("low", "high"), [(-0.953, 0.9999), (-0.7767, 0.9999)])
 def test_small_bars_have_nice_numbers(low: float, high: float) -> None:
-    assert [text for _, text in Scale(low, high, "z").ticks(4)] == ["-0.5", "0", "0.5"]
+    assert [text for _, text in ColorScale(low, high, "z").ticks(4)] == ["-0.5", "0", "0.5"]
 
 
 def test_a_camera_has_a_position_or_angles() -> None:
@@ -464,8 +464,8 @@ def test_a_camera_has_a_position_or_angles() -> None:
     for name in ("azimuth", "elevation", "distance"):
         with pytest.raises(ValueError, match=f"a position or {name}, not both"):
             hk.Camera(position=(1, 2, 3), **{name: 10.0})
-    assert hk.Camera().angles == (-50.0, 28.0)
-    assert hk.Camera(elevation=10.0).angles == (-50.0, 10.0)
+    assert hk.Camera().azimuth_elevation == (-50.0, 28.0)
+    assert hk.Camera(elevation=10.0).azimuth_elevation == (-50.0, 10.0)
 
 
 def test_the_command_alone_shows_its_help(capsys: pytest.CaptureFixture[str]) -> None:

@@ -11,7 +11,7 @@ from PIL import Image
 
 import harnack as hk
 from harnack.rendering.images import exr_bytes
-from harnack.rendering.scales import NAMED_COLORS, color_of, linear
+from harnack.rendering.scales import NAMED_COLORS, linear_from_srgb, parse_color
 
 SMALL: dict[str, Any] = {"size": (40, 30), "progress": False, "show": "shaded", "spp": 4}
 
@@ -21,7 +21,7 @@ def drawn(backdrop: Any, **settings: Any) -> Any:
 
 
 def corners(picture: Any) -> np.ndarray:
-    return picture.shown[[0, 0, -1, -1], [0, -1, 0, -1]]
+    return picture.srgb[[0, 0, -1, -1], [0, -1, 0, -1]]
 
 
 @pytest.mark.few(3)
@@ -41,18 +41,20 @@ def test_colors_are_shown_as_they_are(given: Any, pixel: tuple[int, int, int]) -
     picture = drawn(given)
     assert np.abs(corners(picture).astype(int) - pixel).max() <= 1
     shown = [part / 255 for part in pixel]
-    np.testing.assert_allclose(picture[0, 0], linear((shown[0], shown[1], shown[2])), atol=0.004)
+    np.testing.assert_allclose(
+        picture[0, 0], linear_from_srgb((shown[0], shown[1], shown[2])), atol=0.004
+    )
 
 
 def test_the_surface_is_the_same_before_any_color() -> None:
     middle = np.s_[10:20, 15:25]
-    reference = drawn("white").shown[middle]
+    reference = drawn("white").srgb[middle]
     for backdrop in ("black", ("red", "blue")):
-        np.testing.assert_array_equal(drawn(backdrop).shown[middle], reference)
+        np.testing.assert_array_equal(drawn(backdrop).srgb[middle], reference)
 
 
 def test_gradients_go_from_the_bottom_to_the_top() -> None:
-    column = drawn(("white", "black")).shown[:, 0, 0].astype(int)
+    column = drawn(("white", "black")).srgb[:, 0, 0].astype(int)
     expected = 255 * (np.arange(30) + 0.5) / 30
     assert np.abs(column - expected).max() <= 1
 
@@ -67,7 +69,7 @@ def blocks(shape: tuple[int, int]) -> np.ndarray:
 
 def check_blocks(picture: Any) -> None:
     """That the picture shows the three colors of `blocks` in its upper corner rows."""
-    row = picture.shown[0].astype(int)
+    row = picture.srgb[0].astype(int)
     assert np.abs(row[0] - (200, 0, 0)).max() <= 2
     assert np.abs(row[20] - (0, 200, 0)).max() <= 2
     assert np.abs(row[-1] - (0, 0, 200)).max() <= 2
@@ -80,7 +82,7 @@ def test_images_cover_the_picture(shape: tuple[int, int]) -> None:
 
 
 def test_a_wide_image_is_cut_at_its_sides() -> None:
-    row = drawn(blocks((30, 1200))).shown[0].astype(int)
+    row = drawn(blocks((30, 1200))).srgb[0].astype(int)
     assert np.abs(row - (0, 200, 0)).max() <= 2
 
 
@@ -88,7 +90,7 @@ def test_a_wide_image_is_cut_at_its_sides() -> None:
 def test_images_are_read_from_files(name: str, tmp_path: Path) -> None:
     Image.fromarray(blocks((60, 80))).save(tmp_path / name, quality=98, subsampling=0)
     for path in (tmp_path / name, str(tmp_path / name)):
-        row = drawn(path).shown[0].astype(int)
+        row = drawn(path).srgb[0].astype(int)
         assert np.abs(row[[0, 20, -1]] - np.diag([200] * 3)).max() <= 6
 
 
@@ -98,7 +100,7 @@ def test_gray_images_and_clear_ones_are_read(tmp_path: Path) -> None:
     clear = np.zeros((30, 40, 4), dtype=np.uint8)
     clear[:, :20, 3] = 255
     Image.fromarray(clear).save(tmp_path / "clear.png")
-    row = drawn(tmp_path / "clear.png").shown[0]
+    row = drawn(tmp_path / "clear.png").srgb[0]
     assert (row[0] == 0).all()
     assert (row[-1] == 255).all()
 
@@ -113,8 +115,8 @@ def test_exr_files_are_radiance(channels: int, tmp_path: Path) -> None:
     picture = drawn(tmp_path / "a.exr")
     np.testing.assert_allclose(picture[0, 0], 0.25)
     np.testing.assert_allclose(picture[0, -1], 3.0)
-    assert np.abs(picture.shown[0, 0].astype(int) - 137).max() <= 1
-    assert (picture.shown[0, -1] == 255).all()
+    assert np.abs(picture.srgb[0, 0].astype(int) - 137).max() <= 1
+    assert (picture.srgb[0, -1] == 255).all()
 
 
 def test_floats_are_linear() -> None:
@@ -157,4 +159,4 @@ def test_files_that_hold_no_image_are_refused(name: str, tmp_path: Path) -> None
 
 def test_names_of_colors_are_those_of_css() -> None:
     assert len(NAMED_COLORS) == 148
-    assert color_of("RebeccaPurple", "it") == (0x66 / 255, 0x33 / 255, 0x99 / 255)
+    assert parse_color("RebeccaPurple", "it") == (0x66 / 255, 0x33 / 255, 0x99 / 255)

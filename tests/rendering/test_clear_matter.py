@@ -12,8 +12,8 @@ import pytest
 import harnack as hk
 from harnack.enclosures import Lipschitz
 from harnack.fields.field import Field, Sample
-from harnack.rendering import Material, register, render, shape
-from harnack.rendering.mitsuba import refracted
+from harnack.rendering import Material, mitsuba_shape, register, render
+from harnack.rendering.mitsuba import refract
 
 mi = register()
 T = mi.ScalarTransform4f
@@ -47,7 +47,7 @@ def drawn(*members: Any, show: str = "shaded", spp: int = 1) -> np.ndarray:
 def ball(index: float, radius: float = 1.0, **settings: Any) -> Any:
     bsdf = {"type": "dielectric", "int_ior": index, "ext_ior": 1.0}
     settings = {"solid": (-math.inf, 0.0), "tint": TINT, "tolerance": 1e-5, **settings}
-    return shape(Sphere(), bsdf=bsdf, to_world=T().scale(radius), **settings)
+    return mitsuba_shape(Sphere(), bsdf=bsdf, to_world=T().scale(radius), **settings)
 
 
 def chords(radius: float = 1.0) -> np.ndarray:
@@ -79,7 +79,7 @@ def test_lengths_are_those_of_the_world() -> None:
 
 
 def test_light_paths_lose_the_same_light() -> None:
-    image, chord = drawn(ball(1.0), show="color", spp=64), chords()[..., None]
+    image, chord = drawn(ball(1.0), show="path", spp=64), chords()[..., None]
     inside = chord[..., 0] > 1.6  # where the mean over a pixel is that of its middle
     expected = (SKY * TINT**chord)[inside]
     assert np.quantile(np.abs(image[inside] / expected - 1), 0.98) < 0.03
@@ -112,7 +112,7 @@ def test_rays_follow_snell_and_fresnel(index: float) -> None:
     d = mi.Vector3f(np.sin(angle).astype(np.float32), 0, -np.cos(angle).astype(np.float32))
     for into in (True, False):
         normal = mi.Vector3f(0, 0, 1 if into else -1)
-        onward, reflected = (np.array(each) for each in refracted(normal, d, mi.Float(index)))
+        onward, reflected = (np.array(each) for each in refract(normal, d, mi.Float(index)))
         ratio = index if into else 1 / index
         sine = np.sin(angle) / ratio
         passes = sine < 0.9999
@@ -133,7 +133,7 @@ def test_rays_follow_snell_and_fresnel(index: float) -> None:
 def test_named_glass_is_tinted_in_both_kinds_of_picture() -> None:
     gyroid = hk.Gyroid(1.0, domain=hk.Ball(radius=1.0))
     small: dict[str, Any] = {"solid": (-0.4, 0.4), "size": (40, 30), "progress": False}
-    for show in ("shaded", "color"):
+    for show in ("shaded", "path"):
         amber = render(gyroid, material="amber", show=show, spp=8, **small)[10:20, 14:26]
         clear = render(gyroid, material="glass", show=show, spp=8, **small)[10:20, 14:26]
         warm = amber[..., 0].mean() / amber[..., 2].mean()
@@ -146,7 +146,7 @@ def test_bad_tints_are_refused() -> None:
     with pytest.raises(TypeError, match=r"such as \(0.9, 0.5, 0.1\)"):
         ball(1.5, tint="amber")
     with pytest.raises(ValueError, match="give solid="):
-        shape(Sphere(), tint=(0.5, 0.5, 0.5))
+        mitsuba_shape(Sphere(), tint=(0.5, 0.5, 0.5))
     with pytest.raises(ValueError, match="needs an inside"):
         render(Sphere(), material="amber", progress=False)
     with pytest.raises(ValueError, match="light passes through"):

@@ -11,10 +11,10 @@ import pytest
 import harnack as hk
 from harnack.backend import choose_backend
 from harnack.geometry import example_meshes
-from harnack.rendering import Camera, register, render, shape
-from harnack.rendering.shaded_render import balls_of
-from harnack.rendering.shading import Light
-from harnack.tracer.pixel_cones import Cones
+from harnack.rendering import Camera, mitsuba_shape, register, render
+from harnack.rendering.shaded_render import inner_and_outer_ball
+from harnack.rendering.shading import StudioLight
+from harnack.tracer.pixel_cones import PixelCones
 
 mi = register()
 T = mi.ScalarTransform4f
@@ -31,8 +31,8 @@ def covered(what: Any, o: Any, d: Any, precision: str = "single", **settings: An
     prepared = surface.prepare(backend, crosses=True)
     kind = np.float32 if precision == "single" else np.float64
     rays = (backend.Array3f(np.asarray(a, dtype=kind).T.copy()) for a in np.broadcast_arrays(o, d))
-    around = balls_of(surface.volume, backend)
-    found, _ = Cones(prepared, *rays, backend.Float(RADIUS / AWAY), around).are_covered_in_part(
+    around = inner_and_outer_ball(surface.volume, backend)
+    found, _ = PixelCones(prepared, *rays, backend.Float(RADIUS / AWAY), around).partially_covered(
         backend.Float(dr.inf), backend.Bool(True)
     )
     return np.array(found)
@@ -103,7 +103,7 @@ def test_what_is_covered_altogether_is_not_found() -> None:
 @pytest.fixture
 def black(monkeypatch: pytest.MonkeyPatch) -> None:
     """Surfaces are black: on a sky of one, pictures show how much of a pixel is free."""
-    monkeypatch.setattr(Light, "on", lambda _, color, *others: color * 0)
+    monkeypatch.setattr(StudioLight, "shade", lambda _, color, *others: color * 0)
 
 
 def drawn(what: Any, **settings: Any) -> np.ndarray:
@@ -111,7 +111,7 @@ def drawn(what: Any, **settings: Any) -> np.ndarray:
     look = T().look_at(origin=[AWAY, 0, 0], target=[0, 0, 0], up=[0, 0, 1])
     film = {"type": "hdrfilm", "width": N, "height": N}
     scene = {
-        "type": "scene", "sky": {"type": "constant"}, "what": shape(what),
+        "type": "scene", "sky": {"type": "constant"}, "what": mitsuba_shape(what),
         "sensor": {"type": "perspective", "fov": 20, "to_world": look, "film": film},
     }  # fmt: skip
     image = render(scene, show="shaded", progress=False, **settings)

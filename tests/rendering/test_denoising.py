@@ -10,9 +10,15 @@ import pytest
 
 import harnack as hk
 from harnack.geometry import example_curves
-from harnack.rendering import register, shape
+from harnack.rendering import mitsuba_shape, register
 from harnack.rendering.integrator import PathTracer
-from harnack.rendering.light_paths import Exposing, Exposure, Pace, expose, pace_of
+from harnack.rendering.light_paths import (
+    PathRender,
+    PathRenderTask,
+    TimeEstimate,
+    estimate_time,
+    render_paths,
+)
 
 mi = register()
 POLYGON = hk.SolidAngle(example_curves.wavy_polygon(24))
@@ -39,7 +45,7 @@ def test_what_is_covered_stays_as_it_is() -> None:
     assert not clean[few[..., 3] == 0][:, 3].any()
 
 
-def exposed(features: bool, bsdf: dict[str, Any], **settings: Any) -> Exposure:
+def exposed(features: bool, bsdf: dict[str, Any], **settings: Any) -> PathRender:
     scene = mi.load_dict(
         {
             "type": "scene",
@@ -49,11 +55,13 @@ def exposed(features: bool, bsdf: dict[str, Any], **settings: Any) -> Exposure:
                 "film": {"type": "hdrfilm", "width": 24, "height": 24},
             },
             "light": {"type": "constant"},
-            "ball": shape(hk.Sphere(1.0), bsdf=bsdf),
+            "ball": mitsuba_shape(hk.Sphere(1.0), bsdf=bsdf),
         }
     )
-    exposing = Exposing(mi, scene, scene.sensors()[0], PathTracer(mi), 16, 1, features, **settings)
-    return expose(exposing, lambda _: None)
+    exposing = PathRenderTask(
+        mi, scene, scene.sensors()[0], PathTracer(mi), 16, 1, features, **settings
+    )
+    return render_paths(exposing, lambda _: None)
 
 
 CLAY = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.7, 0.5, 0.2]}}
@@ -104,7 +112,7 @@ def test_features_change_no_light() -> None:
 
 
 def test_denoising_is_refused_where_there_is_no_noise() -> None:
-    with pytest.raises(ValueError, match='show="color"'):
+    with pytest.raises(ValueError, match='show="path"'):
         draw(denoise=True, show="shaded")
     with pytest.raises(TypeError, match="True or False"):
         draw(denoise="yes")
@@ -124,13 +132,13 @@ def test_a_missing_denoiser_is_told_before_anything_is_drawn(
     [(17.2, "17 s"), (89, "89 s"), (150, "2 min 30 s"), (1500, "25 min"), (9000, "2 h 30 min")],
 )
 def test_times_are_told_in_words(seconds: float, text: str) -> None:
-    assert str(Pace(1e-6, seconds)) == text
+    assert str(TimeEstimate(1e-6, seconds)) == text
 
 
 def test_bands_last_a_few_seconds() -> None:
-    assert Pace(1e-2, 1e5).paths_a_band == 2**14
-    assert Pace(4e-5, 1e3).paths_a_band == 100_000
-    assert Pace(0, 0).paths_a_band == 2**21
+    assert TimeEstimate(1e-2, 1e5).paths_a_band == 2**14
+    assert TimeEstimate(4e-5, 1e3).paths_a_band == 100_000
+    assert TimeEstimate(0, 0).paths_a_band == 2**21
 
 
 @pytest.mark.slow
@@ -140,11 +148,11 @@ def test_a_long_picture_is_announced(
     quiet = draw(spp=100)
     assert not capsys.readouterr().err
 
-    def paced(*_: Any, **__: Any) -> Pace:
-        return Pace(1e-4, 30.0)
+    def paced(*_: Any, **__: Any) -> TimeEstimate:
+        return TimeEstimate(1e-4, 30.0)
 
     # What is measured depends on the machine, and a quick one is not told about.
-    monkeypatch.setattr("harnack.rendering.picture.pace_of", paced)
+    monkeypatch.setattr("harnack.rendering.picture.estimate_time", paced)
     told = draw(spp=100, progress=True)
     assert "about 30 s, with 100 samples a pixel" in capsys.readouterr().err
     np.testing.assert_array_equal(quiet, told)
@@ -160,7 +168,7 @@ def test_the_pace_of_a_picture_is_that_of_its_paths() -> None:
         }
     )
     sensor, tracer = scene.sensors()[0], PathTracer(mi)
-    one = pace_of(mi, scene, sensor, tracer, spp=4096, features=False)
+    one = estimate_time(mi, scene, sensor, tracer, spp=4096, features=False)
     assert one.path > 0
     width, height = sensor.film().crop_size()
     assert one.picture == pytest.approx(one.path * width * height * 4096)

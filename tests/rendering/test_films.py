@@ -108,7 +108,7 @@ def test_what_is_up_may_change(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("show", ["shaded", pytest.param("color", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("show", ["shaded", pytest.param("path", marks=pytest.mark.slow)])
 def test_nothing_is_compiled_after_the_second_picture(show: str, tmp_path: Path) -> None:
     counts: list[int] = []
 

@@ -10,9 +10,9 @@ import pytest
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy
 from harnack.backend.arrays import upload_vectors
-from harnack.rendering import register, shape
-from harnack.rendering.isolines import line_at
-from harnack.tracer import Status
+from harnack.rendering import mitsuba_shape, register
+from harnack.rendering.isolines import isoline_index_at
+from harnack.tracer import RayStatus
 
 mi = register()
 BACKEND = choose_backend("double")
@@ -23,7 +23,7 @@ CIRCLE = hk.SolidAngle(hk.geometry.example_curves.wavy_polygon(24))
 def covered(lines: hk.Isolines, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
     prepared = lines.prepare(BACKEND, size=1.0)
     p, n = upload_vectors(BACKEND, points), upload_vectors(BACKEND, normals)
-    return np.broadcast_to(to_numpy(prepared.cover(p, n)), len(points))
+    return np.broadcast_to(to_numpy(prepared.contains(p, n)), len(points))
 
 
 def on_sphere(count: int) -> np.ndarray:
@@ -65,7 +65,7 @@ def test_width_does_not_depend_on_how_steep_the_function_is() -> None:
 def test_spacing_is_lines_at_its_multiples() -> None:
     points, normals = around_cylinder(20_000)
     away = np.abs(points[:, 2] - 0.3 * np.round(points[:, 2] / 0.3))
-    check_distances(hk.Isolines("z", spacing=0.3, width=0.04), points, normals, away, 0.04)
+    check_distances(hk.Isolines("z", interval=0.3, width=0.04), points, normals, away, 0.04)
 
 
 @pytest.mark.parametrize("count", [1, 2, 5, 63, 64, 200])
@@ -97,7 +97,7 @@ class Turn(hk.Field):
         ({"levels": -3.1}, [-3.1]),
         ({"levels": [3.1 + 4 * np.pi]}, [3.1]),
         ({"levels": [0.0]}, [0.0]),
-        ({"spacing": np.pi / 3}, np.arange(6) * np.pi / 3),
+        ({"interval": np.pi / 3}, np.arange(6) * np.pi / 3),
         ({}, np.arange(12) * np.pi / 6),
     ],
 )
@@ -113,7 +113,7 @@ def test_isolines_of_angles_are_right_where_these_jump(
 
 def test_a_spacing_that_does_not_divide_the_period_is_refused() -> None:
     with pytest.raises(ValueError, match=r"period 6\.28319.*does not divide"):
-        hk.Isolines(Turn(), spacing=1.0)
+        hk.Isolines(Turn(), interval=1.0)
 
 
 def test_lines_near_a_maximum_reach_at_most_half_a_width_too_far() -> None:
@@ -131,7 +131,7 @@ def test_a_function_that_is_constant_on_the_surface_has_no_lines() -> None:
     lines = hk.Isolines(hk.Sphere(1.0), [0.0], width=0.1)
     single = choose_backend("single")
     p = upload_vectors(single, points)
-    assert not to_numpy(lines.prepare(single, 1.0).cover(p, p)).any()
+    assert not to_numpy(lines.prepare(single, 1.0).contains(p, p)).any()
 
 
 def test_the_last_of_several_lines_covers_the_others() -> None:
@@ -139,7 +139,7 @@ def test_the_last_of_several_lines_covers_the_others() -> None:
     lines = [hk.Isolines("z", [0.0], width=1.0), hk.Isolines("x", [0.0], width=0.5)]
     p, n = upload_vectors(BACKEND, points), upload_vectors(BACKEND, normals)
     prepared = tuple(one.prepare(BACKEND, 1.0) for one in lines)
-    number = to_numpy(line_at(prepared, p, n, BACKEND.UInt32))
+    number = to_numpy(isoline_index_at(prepared, p, n, BACKEND.UInt32))
     first, second = (covered(one, points, normals) for one in lines)
     assert (first & second).any()
     np.testing.assert_array_equal(number, np.where(second, 2, np.where(first, 1, 0)))
@@ -148,14 +148,14 @@ def test_the_last_of_several_lines_covers_the_others() -> None:
 @pytest.mark.parametrize(
     ("arguments", "settings", "message"),
     [
-        (("w",), {"spacing": 1}, "isolines are drawn: 'w' is no formula"),
-        ((3,), {"spacing": 1}, 'must be a text such as "z" or'),
+        (("w",), {"interval": 1}, "isolines are drawn: 'w' is no formula"),
+        ((3,), {"interval": 1}, 'must be a text such as "z" or'),
         (("z",), {}, "say which isolines"),
-        (("z", [0]), {"spacing": 1}, "either levels or a spacing"),
+        (("z", [0]), {"interval": 1}, "either levels or an interval"),
         (("z", []), {}, "at least one"),
         (("z", [np.nan]), {}, "finite"),
         (("z", "high"), {}, "must be numbers"),
-        (("z",), {"spacing": -1}, "spacing of isolines must be positive"),
+        (("z",), {"interval": -1}, "interval of isolines must be positive"),
         (("z", 0), {"width": 0}, "width of isolines must be positive"),
         (("z", 0), {"color": "blak"}, 'did you mean "black"'),
     ],
@@ -166,10 +166,10 @@ def test_what_is_wrong_is_said(arguments: Any, settings: dict[str, Any], message
 
 
 def test_pictures_refuse_isolines_that_make_no_sense() -> None:
-    lines = hk.Isolines("z", spacing=0.1)
+    lines = hk.Isolines("z", interval=0.1)
     with pytest.raises(TypeError, match=r"must be harnack\.Isolines"):
         hk.render(CIRCLE, show="shaded", isolines="z", **SMALL)
-    with pytest.raises(ValueError, match='isolines need a picture with show="color"'):
+    with pytest.raises(ValueError, match='isolines need a picture with show="path"'):
         hk.render(CIRCLE, show="depth", isolines=lines, **SMALL)
     with pytest.raises(ValueError, match="on its own level set: it is constant there"):
         hk.render(CIRCLE, show="shaded", isolines=hk.Isolines(CIRCLE), **SMALL)
@@ -179,7 +179,7 @@ def test_pictures_refuse_isolines_that_make_no_sense() -> None:
 
 def seen(what: Any, isolines: Any, show: str, **settings: Any) -> np.ndarray:
     asked = {"backdrop": "white", "spp": 16, **SMALL, **settings}
-    return hk.render(what, show=show, isolines=isolines, **asked).shown.astype(int)
+    return hk.render(what, show=show, isolines=isolines, **asked).srgb.astype(int)
 
 
 @pytest.mark.slow
@@ -189,16 +189,16 @@ def test_pictures_of_values_have_isolines_and_smooth_edges() -> None:
     lines = hk.Isolines("x", [0.0], width=0.15, color="black")
     plain, lined = hk.render(CIRCLE, spp=1, **asked), hk.render(CIRCLE, isolines=lines, **asked)
     np.testing.assert_array_equal(plain, np.asarray(lined))
-    on_line = (lined.shown < 60).all(axis=-1) & ~np.isnan(lined)
+    on_line = (lined.srgb < 60).all(axis=-1) & ~np.isnan(lined)
     assert on_line.any()
     assert np.abs(np.asarray(lined)[on_line]).max() < 0.1
     beside = np.isnan(plain)  # pixels that a ray through the middle does not see covered
-    assert (plain.shown[beside] == 255).all()
-    smooth = beside & (hk.render(CIRCLE, **asked).shown < 255).any(axis=-1)
+    assert (plain.srgb[beside] == 255).all()
+    smooth = beside & (hk.render(CIRCLE, **asked).srgb < 255).any(axis=-1)
     assert smooth.any()
     # A line of half a pixel has no gaps.
     thin = hk.Isolines("x", [0.0], width=0.02, color="black")
-    with_line, without = (hk.render(CIRCLE, isolines=one, **asked).shown for one in (thin, None))
+    with_line, without = (hk.render(CIRCLE, isolines=one, **asked).srgb for one in (thin, None))
     step = np.nanmedian(np.abs(np.diff(plain, axis=1)))
     crossed = np.abs(plain) < 0.4 * step
     assert crossed.sum() > 10
@@ -206,7 +206,7 @@ def test_pictures_of_values_have_isolines_and_smooth_edges() -> None:
 
 
 @pytest.mark.few(1)
-@pytest.mark.parametrize("show", ["color", "shaded"])
+@pytest.mark.parametrize("show", ["path", "shaded"])
 def test_lines_have_their_colors(show: str) -> None:
     plain = seen(hk.Sphere(1.0), None, show, material="clay")
     width = 0.3
@@ -214,8 +214,10 @@ def test_lines_have_their_colors(show: str) -> None:
     image = seen(hk.Sphere(1.0), lines, show, material="clay")
     changed = np.abs(image - plain).max(axis=-1) > 25
     status = hk.render(hk.Sphere(1.0), show="status", **SMALL)
-    on = changed & (status == Status.HIT)
-    assert 0.1 < on.sum() / (status == Status.HIT).sum() < 0.25  # the band has 0.15 of the sphere
+    on = changed & (status == RayStatus.HIT)
+    assert (
+        0.1 < on.sum() / (status == RayStatus.HIT).sum() < 0.25
+    )  # the band has 0.15 of the sphere
     red, green, blue = np.median(image[on], axis=0)
     assert blue > 2 * max(red, green, 1)
 
@@ -268,8 +270,8 @@ def test_of_several_surfaces_those_that_a_function_is_constant_on_have_no_lines(
 def test_there_are_no_lines_where_the_function_is_not_defined() -> None:
     points, normals = around_cylinder(5000)
     half = hk.expression(lambda x, y, z: z, domain=hk.HalfSpace((1, 0, 0), 0))
-    on = covered(hk.Isolines(half, spacing=0.5, width=0.1), points, normals)
-    everywhere = covered(hk.Isolines("z", spacing=0.5, width=0.1), points, normals)
+    on = covered(hk.Isolines(half, interval=0.5, width=0.1), points, normals)
+    everywhere = covered(hk.Isolines("z", interval=0.5, width=0.1), points, normals)
     inside = half.domain.contains_points(points)
     assert 0.3 < inside.mean() < 0.7
     np.testing.assert_array_equal(on, everywhere & inside)
@@ -281,7 +283,7 @@ def test_shapes_of_mitsuba_scenes_have_lines_in_their_own_coordinates() -> None:
 
     def scene(isolines: Any) -> Any:
         bsdf = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.8}}
-        ball = shape(hk.Sphere(1.0), bsdf=bsdf, to_world=turned, isolines=isolines)
+        ball = mitsuba_shape(hk.Sphere(1.0), bsdf=bsdf, to_world=turned, isolines=isolines)
         look = mi.ScalarTransform4f().look_at([5, -9, 0], [5, 0, 0], [0, 0, 1])
         film = {"type": "hdrfilm", "width": 64, "height": 48}
         sensor = {"type": "perspective", "fov": 40, "to_world": look, "film": film}

@@ -16,10 +16,10 @@ import pytest
 import harnack as hk
 from harnack.geometry import example_curves
 from harnack.rendering import MATERIALS, SHOW_MODES, Camera, Material, picture, register, render
-from harnack.rendering.images import exr_bytes, tone_mapped
-from harnack.rendering.light_paths import Exposing
+from harnack.rendering.images import exr_bytes, tone_map
+from harnack.rendering.light_paths import PathRenderTask
 from harnack.rendering.scales import viridis
-from harnack.rendering.stage import on_ground
+from harnack.rendering.stage import stage_placement
 
 mi = register()
 SMALL: dict[str, Any] = {"size": (40, 30), "progress": False}
@@ -41,7 +41,7 @@ def test_a_png_and_an_exr_are_written(tmp_path: Path) -> None:
     assert image.shape == (30, 40, 3)
     assert image.dtype == np.float32
     assert np.isfinite(image).all()
-    np.testing.assert_array_equal(read(tmp_path / "a.png"), tone_mapped(image))
+    np.testing.assert_array_equal(read(tmp_path / "a.png"), tone_map(image))
     draw(path=tmp_path / "a.exr")
     assert (tmp_path / "a.exr").read_bytes() == exr_bytes(image)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.exr", "a.png"]
@@ -87,8 +87,8 @@ def test_the_same_seed_draws_the_same_picture() -> None:
 @pytest.mark.slow
 def test_bands_leave_no_seam(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = draw(spp=64)
-    narrow = functools.partial(Exposing, paths_a_band=64 * 50)
-    monkeypatch.setattr("harnack.rendering.render_job.Exposing", narrow)
+    narrow = functools.partial(PathRenderTask, paths_a_band=64 * 50)
+    monkeypatch.setattr("harnack.rendering.render_job.PathRenderTask", narrow)
     bands = draw(spp=64)
     np.testing.assert_array_equal(whole, bands)
 
@@ -106,9 +106,9 @@ def test_every_mode_makes_numbers_and_a_picture(show: str, tmp_path: Path) -> No
 def test_modes_agree_with_each_other() -> None:
     status, depth = draw(show="status"), draw(show="depth")
     normal, evaluations = draw(show="normal"), draw(show="evaluations")
-    hit = status == hk.Status.HIT
+    hit = status == hk.RayStatus.HIT
     assert 0.2 < hit.mean() < 0.8
-    assert (status[~hit] == hk.Status.MISS).all()
+    assert (status[~hit] == hk.RayStatus.MISS).all()
     np.testing.assert_array_equal(np.isfinite(depth), hit)
     np.testing.assert_allclose(np.linalg.norm(normal, axis=-1)[hit], 1, atol=1e-5)
     assert (normal[~hit] == 0).all()
@@ -130,7 +130,7 @@ def test_pictures_of_large_and_small_surfaces_are_alike(scale: float) -> None:
 @pytest.mark.slow
 def test_out_of_steps_is_never_background(tmp_path: Path) -> None:
     status = draw(path=tmp_path / "a.png", show="status", max_steps=4)
-    lost = status == hk.Status.OUT_OF_STEPS
+    lost = status == hk.RayStatus.OUT_OF_STEPS
     assert lost.sum() > 20
     assert (read(tmp_path / "a.png")[lost] == (255, 0, 255)).all()
     with pytest.warns(UserWarning, match=r"\d+ light paths ran out of steps"):
@@ -236,19 +236,19 @@ def test_camera_and_backdrop_change_the_picture() -> None:
 @pytest.mark.parametrize("elevation", [-30.0, 0.0, 35.0, 90.0])
 def test_the_camera_frames_the_surface(size: tuple[int, int], elevation: float) -> None:
     camera = Camera(azimuth=25.0, elevation=elevation)
-    hit = draw(show="status", size=size, camera=camera) == hk.Status.HIT
+    hit = draw(show="status", size=size, camera=camera) == hk.RayStatus.HIT
     edge = np.concatenate([hit[0], hit[-1], hit[:, 0], hit[:, -1]])
     assert not edge.any()
     filled = max(hit.any(axis=0).mean(), hit.any(axis=1).mean())
     assert 0.7 < filled <= 0.95
     closer = draw(show="status", size=size, camera=Camera(25.0, elevation, zoom=1.5))
-    assert (closer == hk.Status.HIT).sum() > hit.sum()
+    assert (closer == hk.RayStatus.HIT).sum() > hit.sum()
 
 
 def test_surfaces_stand_on_the_ground() -> None:
     rng = np.random.default_rng(1)
     points = rng.uniform((5, -3, 2), (9, -2, 3), (100, 3))
-    stage = on_ground(points).apply(points)
+    stage = stage_placement(points).apply(points)
     assert stage[:, 2].min() == pytest.approx(0, abs=1e-12)
     extent = stage.max(axis=0) - stage.min(axis=0)
     assert np.linalg.norm(extent) == pytest.approx(2)
@@ -296,7 +296,7 @@ def test_ctrl_c_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         advance(0.5)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(picture, "expose", interrupted)
+    monkeypatch.setattr(picture, "render_paths", interrupted)
     with pytest.raises(KeyboardInterrupt):
         draw(path=tmp_path / "a.png", progress=True)
     assert [p.name for p in tmp_path.iterdir()] == ["a.png"]
@@ -305,12 +305,12 @@ def test_ctrl_c_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 
 def test_tone_mapping_keeps_order_and_range() -> None:
     x = np.linspace(0, 8, 500, dtype=np.float32)
-    mapped = tone_mapped(x)
+    mapped = tone_map(x)
     assert mapped[0] == 0
     assert mapped[-1] == 255
     assert (np.diff(mapped.astype(int)) >= 0).all()
-    assert tone_mapped(np.array([0.21586], np.float32))[0] == 128  # sRGB's middle gray
-    assert tone_mapped(np.array([np.nan], np.float32))[0] == 0
+    assert tone_map(np.array([0.21586], np.float32))[0] == 128  # sRGB's middle gray
+    assert tone_map(np.array([np.nan], np.float32))[0] == 0
 
 
 def test_viridis_is_viridis() -> None:
@@ -390,6 +390,6 @@ def test_views_look_alike_in_bands(show: str, monkeypatch: pytest.MonkeyPatch) -
 
 def test_tone_mapping_of_many_rows_is_that_of_each() -> None:
     radiance = np.random.default_rng(0).uniform(0, 3, (150, 2, 3)).astype(np.float32)
-    whole = tone_mapped(radiance)
-    rows = [tone_mapped(radiance[k : k + 1]) for k in range(len(radiance))]
+    whole = tone_map(radiance)
+    rows = [tone_map(radiance[k : k + 1]) for k in range(len(radiance))]
     np.testing.assert_array_equal(whole, np.concatenate(rows))

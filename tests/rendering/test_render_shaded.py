@@ -15,10 +15,15 @@ import harnack as hk
 from harnack.enclosures import Lipschitz
 from harnack.fields.field import Field, Sample
 from harnack.geometry import example_curves, example_meshes
-from harnack.rendering import Camera, Material, register, render, shaded_render, shape
-from harnack.rendering.hybrid_scene import World
-from harnack.rendering.shaded_render import visible_sky
-from harnack.rendering.shading import Floor, Light, grid_offsets, in_tiles
+from harnack.rendering import Camera, Material, mitsuba_shape, register, render, shaded_render
+from harnack.rendering.hybrid_scene import HybridScene
+from harnack.rendering.shaded_render import ambient_visibility
+from harnack.rendering.shading import (
+    FloorShadow,
+    StudioLight,
+    multijitter_offsets,
+    tiled_pixel_order,
+)
 
 mi = register()
 T = mi.ScalarTransform4f
@@ -88,7 +93,7 @@ def sphere_by_hand(color: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_matt_sphere_is_lit_by_the_formula_on_both_sides(sign: float) -> None:
     color = np.array([0.8, 0.5, 0.3])
-    image = drawn(shape(Sphere(sign), bsdf={"type": "twosided", "nested": diffuse(*color)}))
+    image = drawn(mitsuba_shape(Sphere(sign), bsdf={"type": "twosided", "nested": diffuse(*color)}))
     tint = np.array([0.52, 0.60, 0.74]) if sign > 0 else 1.0  # seen from the larger values
     expected, hit = sphere_by_hand(color * tint)
     assert 0.2 < hit.mean() < 0.7
@@ -99,18 +104,20 @@ def test_a_matt_sphere_is_lit_by_the_formula_on_both_sides(sign: float) -> None:
 
 
 def test_the_background_is_that_of_color_pictures() -> None:
-    image = drawn(shape(Sphere(), bsdf=diffuse(0.5, 0.5, 0.5)))
+    image = drawn(mitsuba_shape(Sphere(), bsdf=diffuse(0.5, 0.5, 0.5)))
     _, hit = sphere_by_hand(np.ones(3))
     np.testing.assert_allclose(image[~hit], np.broadcast_to(SKY, image[~hit].shape), rtol=1e-6)
-    dark = scene(shape(Sphere(), bsdf=diffuse(0.5, 0.5, 0.5)))
+    dark = scene(mitsuba_shape(Sphere(), bsdf=diffuse(0.5, 0.5, 0.5)))
     del dark["sky"]
     assert (render(dark, show="shaded", spp=1, progress=False)[~hit] == 0).all()
 
 
 def test_mitsubas_sphere_is_drawn_as_ours() -> None:
     theirs = drawn({"type": "sphere", "bsdf": diffuse(0.7, 0.2, 0.2)}, spp=4)
-    ours = drawn(shape(Sphere(-1.0), bsdf={"type": "twosided", "bsdf": diffuse(0.7, 0.2, 0.2)}),
-                 spp=4)  # fmt: skip
+    ours = drawn(
+        mitsuba_shape(Sphere(-1.0), bsdf={"type": "twosided", "bsdf": diffuse(0.7, 0.2, 0.2)}),
+        spp=4,
+    )
     assert np.mean(np.abs(ours - theirs).max(axis=-1) > 2e-3) < 0.01
 
 
@@ -150,7 +157,7 @@ def test_more_samples_smooth_edges_and_nothing_else() -> None:
 
 @pytest.mark.parametrize("count", [1, 2, 4, 5, 9, 16, 30])
 def test_samples_of_a_pixel_are_spread(count: int) -> None:
-    places = grid_offsets(count)
+    places = multijitter_offsets(count)
     n = len(places)
     assert count <= n <= count + 5
     assert ((places > 0) & (places < 1)).all()
@@ -205,9 +212,9 @@ def positions(bend: float) -> tuple[Any, Any]:
 
 def test_a_plane_hides_nothing_and_a_wall_hides_what_is_near(monkeypatch: Any) -> None:
     monkeypatch.setattr("harnack.rendering.shaded_render._REACH", 0.4)
-    flat = np.array(visible_sky(mi, *positions(0.0), mi.Float(1), (41, 41))).reshape(41, 41)
+    flat = np.array(ambient_visibility(mi, *positions(0.0), mi.Float(1), (41, 41))).reshape(41, 41)
     np.testing.assert_allclose(flat, 1, atol=1e-6)
-    bent = np.array(visible_sky(mi, *positions(2.0), mi.Float(1), (41, 41))).reshape(41, 41)
+    bent = np.array(ambient_visibility(mi, *positions(2.0), mi.Float(1), (41, 41))).reshape(41, 41)
     at = bent[20]
     assert 0.5 < at[20] < 0.85  # a slope of 2 hides 0.8 of the sines squared of its half, fading
     assert at[20] < at[14] < 1
@@ -216,10 +223,10 @@ def test_a_plane_hides_nothing_and_a_wall_hides_what_is_near(monkeypatch: Any) -
 
 
 def test_the_floor_is_dark_beneath_a_ball_and_light_far_from_it() -> None:
-    ball = shape(Sphere(), to_world=T().translate([0, 0, 1]), bsdf=diffuse(0.5, 0.5, 0.5))
-    world = World.of(mi, mi.load_dict({"type": "scene", "ball": ball}))
+    ball = mitsuba_shape(Sphere(), to_world=T().translate([0, 0, 1]), bsdf=diffuse(0.5, 0.5, 0.5))
+    world = HybridScene.of(mi, mi.load_dict({"type": "scene", "ball": ball}))
     key = np.array([-0.6, 0.0, 0.8])
-    floor = Floor.of(world, Light(key.tolist(), [0, 0, 1]))
+    floor = FloorShadow.of(world, StudioLight(key.tolist(), [0, 0, 1]))
     points = np.array([[0, 0, -0.002], [0.75, 0, -0.002], [-2.2, 2.2, -0.002], [0, 0, 1.0]])
     lit, sky = (np.array(part) for part in floor.at(mi.Vector3f(points.T.astype(np.float32))))
     assert lit[1] < 0.05  # where the light's axis through the ball meets the floor
@@ -237,7 +244,7 @@ def test_the_floor_is_dark_beneath_a_ball_and_light_far_from_it() -> None:
 def test_lost_rays_are_magenta_and_counted() -> None:
     with pytest.warns(UserWarning, match=r"\d+ rays ran out of steps"):
         image = draw(max_steps=4, tolerance=1e-4, spp=1)
-    lost = draw(show="status", max_steps=4, tolerance=1e-4) == hk.Status.OUT_OF_STEPS
+    lost = draw(show="status", max_steps=4, tolerance=1e-4) == hk.RayStatus.OUT_OF_STEPS
     assert lost.sum() > 20
     magenta = (image == (1, 0, 1)).all(axis=-1)
     assert not (magenta & ~lost).any()
@@ -274,7 +281,7 @@ def test_other_variants_draw_much_the_same_or_say_no() -> None:
 
 @pytest.mark.parametrize("size", [(1, 1), (3, 2), (4, 4), (9, 5), (16, 7)])
 def test_tiles_hold_every_pixel_once(size: tuple[int, int]) -> None:
-    order = in_tiles(size)
+    order = tiled_pixel_order(size)
     assert sorted(order) == list(range(size[0] * size[1]))
     if size == (9, 5):  # the first tile, and the first of the narrow one at the right
         assert order[:16].tolist() == [y * 9 + x for y in range(4) for x in range(4)]
@@ -285,16 +292,18 @@ def test_what_first_rays_have_seen_is_not_traced_again(monkeypatch: pytest.Monke
     """Edges are the mean of nine samples, one of which is that of the first ray: the same picture
     as if all nine were traced anew."""
     counts: list[int] = []
-    own = shaded_render.Shading.refine
+    own = shaded_render.ShadedTask.refine_pixels
 
     def refine(self: Any, *part: Any) -> Any:
         counts.append(len(self.offsets))
         return own(self, *part)
 
-    monkeypatch.setattr(shaded_render.Shading, "refine", refine)
-    image = drawn(shape(Sphere()), spp=9)
-    monkeypatch.setattr(shaded_render, "grid_offsets", lambda spp: grid_offsets(spp) + 1e-12)
-    again = drawn(shape(Sphere()), spp=9)
+    monkeypatch.setattr(shaded_render.ShadedTask, "refine_pixels", refine)
+    image = drawn(mitsuba_shape(Sphere()), spp=9)
+    monkeypatch.setattr(
+        shaded_render, "multijitter_offsets", lambda spp: multijitter_offsets(spp) + 1e-12
+    )
+    again = drawn(mitsuba_shape(Sphere()), spp=9)
     assert set(counts) == {8, 9}
     np.testing.assert_allclose(image, again, atol=2e-5)
 

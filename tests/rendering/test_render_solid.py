@@ -12,7 +12,7 @@ import pytest
 import harnack as hk
 from harnack.backend import choose_backend, to_float, to_numpy, to_vector3
 from harnack.geometry.volume import Volume
-from harnack.rendering.surface_hits import CappedSolid, facing
+from harnack.rendering.surface_hits import CappedSolid, orient_normal
 
 BACKEND = choose_backend()
 BALL = hk.Ball((0.1, 0.0, -0.05), 0.9)
@@ -41,7 +41,7 @@ def rays(n: int, seed: int, spread: float) -> tuple[np.ndarray, np.ndarray]:
 def met_by(
     solid: CappedSolid, o: np.ndarray, d: np.ndarray, t_max: float, leaves: float = 0.0
 ) -> Any:
-    return solid.meet(
+    return solid.intersect(
         to_vector3(BACKEND, o),
         to_vector3(BACKEND, d),
         to_float(BACKEND, np.full(len(o), t_max)),
@@ -70,7 +70,7 @@ def dense_crossings(
     [
         pytest.param(BALL, marks=pytest.mark.slow),
         pytest.param(BOX, marks=pytest.mark.slow),
-        hk.Intersection((BALL, BOX)),
+        hk.VolumeIntersection((BALL, BOX)),
     ],
 )
 @pytest.mark.parametrize(("low", "high"), [(-0.4, 0.3), (-math.inf, 0.1), (0.2, math.inf)])
@@ -80,9 +80,9 @@ def test_rays_cross_the_boundary_where_the_solid_begins_or_ends(
 ) -> None:
     o, d = rays(600, 7, 1.2)
     met = met_by(solid_of(low, high, volume), o, d, t_max)
-    t = np.where(to_numpy(met.met), to_numpy(met.t), np.inf)
+    t = np.where(to_numpy(met.is_hit), to_numpy(met.t), np.inf)
     expected, inside = dense_crossings(low, high, volume, o, d, t_max)
-    assert not to_numpy(met.lost).any()
+    assert not to_numpy(met.is_out_of_steps).any()
     # A dense march misses what is thinner than its step, and a hit may be early by the
     # tolerance over the sine of the ray to the surface.
     with np.errstate(invalid="ignore"):
@@ -91,7 +91,7 @@ def test_rays_cross_the_boundary_where_the_solid_begins_or_ends(
     assert not (np.isinf(t) & np.isfinite(expected) & (expected < t_max - 0.01)).any()
     assert np.isfinite(expected).mean() > 0.05
 
-    hit = to_numpy(met.met)
+    hit = to_numpy(met.is_hit)
     towards = (to_numpy(met.normal) * d).sum(axis=1)
     np.testing.assert_allclose(np.linalg.norm(to_numpy(met.normal), axis=1)[hit], 1, atol=1e-5)
     assert (towards[hit & inside] > 0).all()  # rays from inside go out, along the normal
@@ -102,7 +102,7 @@ def test_hits_lie_on_the_boundary_far_closer_than_the_tolerance() -> None:
     low, high = -0.4, 0.3
     o, d = rays(2000, 3, 1.2)
     met = met_by(solid_of(low, high, BALL), o, d, 5.0)
-    p = to_numpy(met.position)[to_numpy(met.met)].astype(float)
+    p = to_numpy(met.position)[to_numpy(met.is_hit)].astype(float)
     off_level = np.minimum(np.abs(gyroid(p) - low), np.abs(gyroid(p) - high)) / (2 * np.pi)
     off_cap = np.abs(np.linalg.norm(p - BALL.center, axis=1) - BALL.radius)
     assert len(p) > 500
@@ -122,7 +122,7 @@ def test_occlusion_is_meeting() -> None:
             to_float(BACKEND, np.full(len(o), t_max)),
             BACKEND.Bool(True),
         )
-        np.testing.assert_array_equal(to_numpy(occluded), to_numpy(met.met))
+        np.testing.assert_array_equal(to_numpy(occluded), to_numpy(met.is_hit))
 
 
 @pytest.mark.slow
@@ -133,7 +133,7 @@ def test_a_ray_that_slipped_through_a_thin_part_crosses_back_at_once() -> None:
     going_in, going_out = met_by(solid, o, d, 9.0, -1.0), met_by(solid, o, d, 9.0, 1.0)
     slipped = ~inside
     assert (to_numpy(going_in.t)[slipped] == 0).all()
-    assert to_numpy(going_in.met)[slipped].all()
+    assert to_numpy(going_in.is_hit)[slipped].all()
     assert ((to_numpy(going_in.normal) * d).sum(axis=1)[slipped] > 0.99).all()
     assert (to_numpy(going_out.t)[inside] == 0).all()
     assert ((to_numpy(going_out.normal) * d).sum(axis=1)[inside] < -0.99).all()
@@ -153,7 +153,7 @@ def test_a_normal_is_turned_only_if_it_faces_away() -> None:
     n, d = (BACKEND.Array3f(rng.normal(size=(3, 500))) for _ in range(2))
     n, d = dr.normalize(n), dr.normalize(d)
     for side in (1.0, -1.0):
-        turned = facing(n, d, BACKEND.Float(side))
+        turned = orient_normal(n, d, BACKEND.Float(side))
         along = side * to_numpy(dr.dot(turned, d))
         assert (along > 0).all()
         np.testing.assert_allclose(to_numpy(dr.norm(turned)), 1.0, atol=1e-5)

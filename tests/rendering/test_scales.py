@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import harnack as hk
-from harnack.rendering import register, shape
-from harnack.rendering.images import as_bytes
-from harnack.rendering.scales import Scale, hues, viridis, with_bar
+from harnack.rendering import mitsuba_shape, register
+from harnack.rendering.images import to_uint8
+from harnack.rendering.scales import ColorScale, add_color_bar, cyclic_colormap, viridis
 
 mi = register()
 SMALL: dict[str, Any] = {"size": (64, 48), "progress": False}
@@ -29,7 +29,7 @@ def test_values_are_those_of_the_function_on_the_surface() -> None:
     x, y, z = (np.asarray(values(axis)) for axis in "xyz")
     met = np.isfinite(x)
     status = hk.render(SPHERE, show="status", **SMALL)
-    np.testing.assert_array_equal(met, status == hk.Status.HIT)
+    np.testing.assert_array_equal(met, status == hk.RayStatus.HIT)
     np.testing.assert_allclose(np.sqrt(x * x + y * y + z * z)[met], 1, atol=1e-5)
     points = np.column_stack([x[met], y[met], z[met]])
     product = values(lambda x, y, z: x * y)
@@ -43,17 +43,17 @@ def test_where_the_function_is_not_defined_there_is_no_value() -> None:
     z, x = np.asarray(values("z")), values(lower)
     met = np.isfinite(z)
     np.testing.assert_array_equal(np.isfinite(x)[met], z[met] < 1e-4)
-    assert (x.shown[met & (z > 1e-4)] == 115).all()
+    assert (x.srgb[met & (z > 1e-4)] == 115).all()
 
 
 def test_values_do_not_depend_on_where_the_surface_stands() -> None:
-    moved = values("x", hk.level_set(SPHERE.moved((5, 0, 0))), up="-y")
+    moved = values("x", hk.level_set(SPHERE.translated((5, 0, 0))), up="-y")
     assert np.nanmin(moved) > 4
     assert np.nanmax(moved) < 6.001
 
 
 def test_values_of_scenes_are_in_the_coordinates_of_the_world() -> None:
-    ball = shape(SPHERE, to_world=mi.ScalarTransform4f().translate([3, 0, 0]))
+    ball = mitsuba_shape(SPHERE, to_world=mi.ScalarTransform4f().translate([3, 0, 0]))
     look = mi.ScalarTransform4f().look_at([3, -9, 0], [3, 0, 0], [0, 0, 1])
     film = {"type": "hdrfilm", "width": 16, "height": 12}
     sensor = {"type": "perspective", "fov": 10, "to_world": look, "film": film}
@@ -64,24 +64,24 @@ def test_values_of_scenes_are_in_the_coordinates_of_the_world() -> None:
 def test_values_from_low_to_high_go_from_blue_to_yellow() -> None:
     picture = values("z")
     z, met = np.asarray(picture), np.isfinite(picture)
-    ends = as_bytes(viridis(np.array([0.0, 1.0])))
-    assert np.abs(picture.shown[z == z[met].min()].astype(int) - ends[0]).max() <= 1
-    assert np.abs(picture.shown[z == z[met].max()].astype(int) - ends[1]).max() <= 1
+    ends = to_uint8(viridis(np.array([0.0, 1.0])))
+    assert np.abs(picture.srgb[z == z[met].min()].astype(int) - ends[0]).max() <= 1
+    assert np.abs(picture.srgb[z == z[met].max()].astype(int) - ends[1]).max() <= 1
     fixed = values("z", value_range=(-3, 3))
     np.testing.assert_array_equal(z, fixed)
-    expected = as_bytes(viridis((z[met] + 3) / 6))
-    assert np.abs(fixed.shown[met].astype(int) - expected).max() <= 1
+    expected = to_uint8(viridis((z[met] + 3) / 6))
+    assert np.abs(fixed.srgb[met].astype(int) - expected).max() <= 1
 
 
 def test_angles_are_hues_without_a_jump_at_the_period() -> None:
-    ends = hues(np.array([0.0, 1.0, 0.5]))
+    ends = cyclic_colormap(np.array([0.0, 1.0, 0.5]))
     np.testing.assert_allclose(ends[0], ends[1], atol=1e-9)
     assert np.abs(ends[0] - ends[2]).max() > 0.2
-    turns = hues(np.linspace(0, 1, 361))
+    turns = cyclic_colormap(np.linspace(0, 1, 361))
     assert np.abs(np.diff(turns, axis=0)).max() < 0.02
     assert turns.min() > 0
     assert turns.max() < 1  # none was cut off
-    scale = Scale.cyclic(4 * np.pi, "angle")
+    scale = ColorScale.cyclic(4 * np.pi, "angle")
     np.testing.assert_allclose(*scale.colors(np.array([[0.5], [0.5 + 8 * np.pi]])), atol=1e-9)
 
 
@@ -104,7 +104,7 @@ def test_angles_are_hues_without_a_jump_at_the_period() -> None:
     ],
 )
 def test_ticks_are_nice_numbers(low: float, high: float, written: list[str]) -> None:
-    ticks = Scale(low, high, "it").ticks(6)
+    ticks = ColorScale(low, high, "it").ticks(6)
     assert [text for _, text in ticks] == written
     assert all(low - 1e-9 <= number <= high + 1e-9 for number, _ in ticks)
 
@@ -114,7 +114,7 @@ def test_ticks_stand_for_the_numbers_that_are_written() -> None:
     for _ in range(500):
         low = rng.normal() * 10.0 ** rng.uniform(-9, 9)
         high = low + 10.0 ** rng.uniform(-3, 9) * max(1e-3 * abs(low), 1e-9)
-        ticks = Scale(low, high, "it").ticks(6)
+        ticks = ColorScale(low, high, "it").ticks(6)
         texts = [text for _, text in ticks]
         assert 2 <= len(ticks) <= 7
         assert len(set(texts)) == len(texts)
@@ -133,7 +133,7 @@ def test_ticks_stand_for_the_numbers_that_are_written() -> None:
     ],
 )
 def test_ticks_of_angles_are_parts_of_turns(turns: int, most: int, written: list[str]) -> None:
-    ticks = Scale.cyclic(turns * np.pi, "it").ticks(most)
+    ticks = ColorScale.cyclic(turns * np.pi, "it").ticks(most)
     assert [text for _, text in ticks] == written
     assert ticks[-1][0] == pytest.approx(turns * np.pi)
 
@@ -149,16 +149,16 @@ def test_a_bar_changes_no_number_and_no_pixel_of_the_picture(
     plain = hk.render(SPHERE, **settings)
     beside = hk.render(SPHERE, tmp_path / "a.png", colorbar=True, **settings)
     np.testing.assert_array_equal(plain, beside)
-    np.testing.assert_array_equal(beside.shown[:, :64], plain.shown)
-    assert beside.shown.shape[1] > 80
+    np.testing.assert_array_equal(beside.srgb[:, :64], plain.srgb)
+    assert beside.srgb.shape[1] > 80
     titled = hk.render(SPHERE, colorbar="a title that takes its room", **settings)
-    assert titled.shown.shape[1] > beside.shown.shape[1]
+    assert titled.srgb.shape[1] > beside.srgb.shape[1]
 
 
 def test_bars_show_the_colors_of_their_numbers() -> None:
-    scale = Scale(-1.0, 3.0, "it")
+    scale = ColorScale(-1.0, 3.0, "it")
     dark = (26 / 255, 26 / 255, 28 / 255)
-    strip = with_bar(np.zeros((400, 5, 3), dtype=np.uint8), scale, dark)[:, 5:].astype(int)
+    strip = add_color_bar(np.zeros((400, 5, 3), dtype=np.uint8), scale, dark)[:, 5:].astype(int)
     column = strip[:, 14 + 16]  # right of the title
     inside = np.flatnonzero(np.abs(column - (26, 26, 28)).max(axis=1) > 8)
     inside = np.arange(inside[0], inside[-1] + 1)
@@ -173,15 +173,15 @@ def test_bars_show_the_colors_of_their_numbers() -> None:
 
 @pytest.mark.parametrize("passed", [(False, True), (True, False), (True, True)])
 def test_ends_of_bars_are_points_where_numbers_lie_beyond(passed: tuple[bool, bool]) -> None:
-    scale = Scale(-1.0, 3.0, "it")
+    scale = ColorScale(-1.0, 3.0, "it")
     numbers = np.array([-1.0 - passed[0], 0.0, 3.0 + passed[1]])
-    assert scale.passed_by(numbers).passed == passed
-    assert scale.passed_by(numbers.clip(-1, 3)).passed == (False, False)
-    assert Scale.cyclic(1.0, "it").passed_by(numbers).passed == (False, False)
+    assert scale.with_exceeded(numbers).exceeded == passed
+    assert scale.with_exceeded(numbers.clip(-1, 3)).exceeded == (False, False)
+    assert ColorScale.cyclic(1.0, "it").with_exceeded(numbers).exceeded == (False, False)
     black = np.zeros((400, 5, 3), dtype=np.uint8)
     plain, pointed = (
-        with_bar(black, one, (0, 0, 0))[50:, 5 + 14 : 5 + 14 + 18].max(axis=(1, 2)) > 8
-        for one in (scale, scale.passed_by(numbers))
+        add_color_bar(black, one, (0, 0, 0))[50:, 5 + 14 : 5 + 14 + 18].max(axis=(1, 2)) > 8
+        for one in (scale, scale.with_exceeded(numbers))
     )
     assert bool(np.flatnonzero(pointed)[-1] > np.flatnonzero(plain)[-1]) == passed[0]
 
@@ -189,7 +189,7 @@ def test_ends_of_bars_are_points_where_numbers_lie_beyond(passed: tuple[bool, bo
 @pytest.mark.parametrize("size", [(1, 1), (8, 6), (3, 40)])
 def test_the_smallest_pictures_have_bars(size: tuple[int, int]) -> None:
     picture = hk.render(SPHERE, show="depth", colorbar=True, size=size, progress=False)
-    assert picture.shown.shape[0] == size[1]
+    assert picture.srgb.shape[0] == size[1]
 
 
 @pytest.mark.parametrize(
@@ -198,7 +198,7 @@ def test_the_smallest_pictures_have_bars(size: tuple[int, int]) -> None:
         ({"show": "value"}, "needs the function"),
         ({"show": "value", "of": "height"}, "of: 'height' is no formula"),
         ({"show": "depth", "of": "z"}, 'needs a picture with show="value"'),
-        ({"show": "color", "colorbar": True}, 'colorbar needs a picture with show="evaluations"'),
+        ({"show": "path", "colorbar": True}, 'colorbar needs a picture with show="evaluations"'),
         ({"show": "normal", "value_range": (0, 1)}, "value_range needs a picture with"),
         ({"show": "depth", "value_range": (1, 0)}, "two finite numbers in order"),
         ({"show": "depth", "value_range": 3}, "two finite numbers in order"),

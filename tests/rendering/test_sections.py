@@ -9,7 +9,7 @@ import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.cli.arguments import parse
 from harnack.cli.commands import _section  # pyright: ignore[reportPrivateUsage]
-from harnack.rendering import shape
+from harnack.rendering import mitsuba_shape
 from harnack.rendering.placed_surface import PlacedSurface, Placement
 
 NORMAL, OFFSET = np.array([0.6, 0.0, 0.8]), 0.2
@@ -28,8 +28,8 @@ def _rays(n, seed):
 def test_volumes_have_something_in_common():
     box, ball = hk.Box((-1, -1, -1), (1, 1, 1)), hk.Ball(radius=1.2)
     both = box & HALF
-    assert both == hk.Intersection((box, HALF))
-    assert (both & ball) == hk.Intersection((box, HALF, ball)) == (box & (HALF & ball))
+    assert both == hk.VolumeIntersection((box, HALF))
+    assert (both & ball) == hk.VolumeIntersection((box, HALF, ball)) == (box & (HALF & ball))
     points = np.random.default_rng(0).uniform(-1.5, 1.5, (500, 3))
     inside = box.contains_points(points) & HALF.contains_points(points)
     np.testing.assert_array_equal(both.contains_points(points), inside)
@@ -54,8 +54,8 @@ def test_what_lies_beyond_a_section_is_not_hit(precision):
     for root in (-b - np.sqrt(np.abs(square)), -b + np.sqrt(np.abs(square))):
         decided &= np.abs((o + root[:, None] * d) @ NORMAL - OFFSET) > 1e-3
     assert decided.sum() > 1500
-    np.testing.assert_array_equal(hits.hit[decided], np.isfinite(t[decided]))
-    both = decided & hits.hit
+    np.testing.assert_array_equal(hits.is_hit[decided], np.isfinite(t[decided]))
+    both = decided & hits.is_hit
     np.testing.assert_allclose(hits.t[both], t[both], atol=1e-3)
 
 
@@ -68,10 +68,10 @@ def test_faces_of_a_solid_on_its_section_are_told_from_all_others():
     placed = PlacedSurface.of(surface, Placement.identity(), backend)
     o, d = _rays(3000, 4)
     o[1500:] = 0.3 * o[1500:] / np.linalg.norm(o[1500:], axis=1)[:, None] - [0.1, 0, 0]  # inside
-    met = placed.meet(
+    met = placed.intersect(
         to_vector3(backend, o), to_vector3(backend, d), backend.Float(1e3), backend.Bool(True)
     )
-    x, is_met, cut = to_numpy(met.position), to_numpy(met.met), to_numpy(met.cut)
+    x, is_met, cut = to_numpy(met.position), to_numpy(met.is_hit), to_numpy(met.is_on_section)
     on_plane = np.abs(x @ NORMAL - OFFSET) < 1e-6
     elsewhere = (np.abs(np.linalg.norm(x, axis=1) - 1) < 1e-3) | (np.abs(x[:, 0] + 0.5) < 1e-6)
     assert is_met[1500:].all()
@@ -109,7 +109,7 @@ def test_wrong_faces_are_refused():
     with pytest.raises(ValueError, match="opaque"):
         hk.render(hk.Sphere(1.0), material="glass", section=cut, cut_material="gold", **small)
     with pytest.raises(ValueError, match="solid on its section"):
-        shape(hk.Sphere(1.0), section=cut, cut_bsdf={"type": "diffuse"})
+        mitsuba_shape(hk.Sphere(1.0), section=cut, cut_bsdf={"type": "diffuse"})
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from harnack.backend.arrays import aligned_integers
+from harnack.backend.arrays import upload_integers
 from harnack.rendering import register
 from harnack.rendering.integrator import SobolSampler
 from harnack.rendering.mitsuba import mitsuba_backend
@@ -18,7 +18,7 @@ mi: Any = register()
 
 def sampler(pixel: np.ndarray, index: np.ndarray, seed: int = 0, dimension: int = 0) -> Any:
     backend = mitsuba_backend(mi)
-    pixels, indices = (aligned_integers(backend, one) for one in (pixel, index))
+    pixels, indices = (upload_integers(backend, one) for one in (pixel, index))
     return SobolSampler(mi, pixels, indices, mi.UInt32(seed), mi.UInt32(dimension))
 
 

@@ -53,7 +53,7 @@ def test_vertices_of_inner_sheets_are_no_surface(kind: str, method: Any, precisi
     o = single(o) if precision == "single" else o
     field = hk.WindingNumber(*both, method=method)
     hits = hk.trace(field, o, target - o, t_max=1.6, precision=precision)
-    assert (hits.status == hk.Status.MISS).all(), d[some][hits.hit][:1]
+    assert (hits.status == hk.RayStatus.MISS).all(), d[some][hits.is_hit][:1]
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)
@@ -73,9 +73,9 @@ def test_hits_of_triangles_seen_edge_on_lie_on_them(precision: Any) -> None:
     d = np.concatenate([single(d), [[-0.15844034, -0.27559111, 0.94812775]]])
     field = hk.WindingNumber(vertices, faces)
     hits = hk.trace(field, o, d, tolerance=1e-5, precision=precision)
-    rows = np.flatnonzero(hits.hit & (hits.sheet >= 0))
+    rows = np.flatnonzero(hits.is_hit & (hits.primitive_index >= 0))
     assert len(rows) > 1000
-    a, b, c = np.moveaxis(vertices[faces[field.faces_of_sheets[hits.sheet[rows]]]], 1, 0)
+    a, b, c = np.moveaxis(vertices[faces[field.facet_faces[hits.primitive_index[rows]]]], 1, 0)
     x, normal = hits.position[rows], np.cross(b - a, c - a)
     normal /= np.linalg.norm(normal, axis=1)[:, None]
     assert np.abs(((x - a) * normal).sum(axis=1)).max() < 1e-5
@@ -98,7 +98,7 @@ def test_what_is_lost_in_rounding_is_no_hit(precision: Any) -> None:
     o *= 8 / np.linalg.norm(o, axis=1)[:, None]
     d = np.cross(o, rng.normal(size=(100, 3)))
     hits = hk.trace(field, o, d, level=0, t_max=10, precision=precision)
-    assert not hits.hit.any()
+    assert not hits.is_hit.any()
     assert np.isfinite(hits.uncertainty).all()
 
 
@@ -110,7 +110,7 @@ def test_rays_that_start_at_vertices_of_curves_hit_them(precision: Any) -> None:
     loops = [ring, single(0.6 * ring[::-1]), single(0.3 * ring)]
     o = np.concatenate(loops)
     hits = hk.trace(hk.SolidAngle(loops), o, np.roll(o, 3, axis=0) - o, precision=precision)
-    assert hits.hit.all()
+    assert hits.is_hit.all()
     assert hits.t.max() < 1e-4
 
 
@@ -160,7 +160,7 @@ def test_directions_may_have_any_length(precision: Any) -> None:
         hit = hk.trace(field, o, d, precision=precision)
         for power in powers:
             same = hk.trace(field, o, d * 10.0**power, precision=precision)
-            assert same.hit.all()
+            assert same.is_hit.all()
             np.testing.assert_allclose(same.t, hit.t, rtol=1e-6)
 
 
@@ -193,9 +193,9 @@ def test_rays_along_boundary_edges_miss_no_hit(method: Any) -> None:
     o = start - d * rng.choice([0.125, 0.25, 0.5, 1, 2], (n, 1))
     field = hk.WindingNumber(vertices, faces, method=method)
     hits = hk.trace(field, o, d, level=0.02, tolerance=1e-5, precision="double")
-    assert (hits.status != int(hk.Status.OUT_OF_STEPS)).all()
+    assert (hits.status != int(hk.RayStatus.OUT_OF_STEPS)).all()
     exact = hk.WindingNumber(vertices, faces, method="exact")
-    smooth = hits.hit & (hits.sheet < 0)
+    smooth = hits.is_hit & (hits.primitive_index < 0)
     w, gradient = exact.value_and_gradient(hits.position[smooth], precision="double")
     steep = np.linalg.norm(gradient, axis=1)
     # On a singular edge itself all values meet.
@@ -229,7 +229,7 @@ def test_sheets_in_one_plane_that_cancel_are_no_surface(method: Any, precision: 
         vertices = single(np.array([*large, *small]) @ axes)
         field = hk.WindingNumber(vertices, [[0, 1, 2], [3, 4, 5]], method=method)
         hits = hk.trace(field, o @ axes, (target - o) @ axes, level=0.3, precision=precision)
-        assert not (hits.sheet >= 0).any()
+        assert not (hits.primitive_index >= 0).any()
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)
@@ -243,7 +243,7 @@ def test_walls_thicker_than_rounding_are_hit(precision: Any) -> None:
     o = rng.normal(size=(n, 3)) * [1, 1, 0] + [0, 0, 3]
     target = np.column_stack([rng.uniform(-0.4, 0.4, n), rng.uniform(-0.8, 0, n), np.zeros(n)])
     hits = hk.trace(field, o, target - o, precision=precision)
-    assert (hits.sheet == 0).all()
+    assert (hits.primitive_index == 0).all()
 
 
 @pytest.mark.slow
@@ -257,12 +257,12 @@ def test_hits_on_dipoles_say_how_far_off_they_are() -> None:
     chosen, o = rng.integers(n, size=400), single(rng.normal(size=(400, 3)))
     field = hk.ScreenedWindingNumber(points, points, areas, length=5.0, method="sum")
     hits = hk.trace(field, o, points[chosen] - o, level=-0.1, tolerance=1e-5, precision="single")
-    value, gradient = field.value_and_gradient(hits.position[hits.hit], precision="double")
+    value, gradient = field.value_and_gradient(hits.position[hits.is_hit], precision="double")
     off = np.abs(value + 0.1) / np.linalg.norm(gradient, axis=1)
-    apart = np.linalg.norm(hits.position[hits.hit][:, None] - points, axis=2).min(axis=1)
-    stated = 1.05e-5 + hits.uncertainty[hits.hit] + 2e-6
+    apart = np.linalg.norm(hits.position[hits.is_hit][:, None] - points, axis=2).min(axis=1)
+    stated = 1.05e-5 + hits.uncertainty[hits.is_hit] + 2e-6
     assert (np.minimum(off, apart) <= stated).all()
-    assert (hits.uncertainty[hits.hit] > 1e-5).sum() > 50
+    assert (hits.uncertainty[hits.is_hit] > 1e-5).sum() > 50
 
 
 @pytest.mark.few(2)

@@ -35,16 +35,16 @@ def test_a_component_on_which_the_gradient_vanishes_is_no_larger_for_it(
 @pytest.mark.parametrize("half", [0.005, 0.001, 1e-4])
 def test_both_sides_of_a_thin_plate_are_no_smaller_than_one_of_a_thick_one(half: float) -> None:
     """Where both sides passed the same cells, one was left out of the area."""
-    solid = hk.Cuboid((0.9, 0.9, half)).moved((-1, 0, 0)) | hk.Sphere(0.535, (0.7, 0, 0))
+    solid = hk.Cuboid((0.9, 0.9, half)).translated((-1, 0, 0)) | hk.Sphere(0.535, (0.7, 0, 0))
     o, d = [[-1, 0.1, 5], [0.7, 0, 5]], [[0, 0, -1.0]]
-    assert hk.trace(solid, o, d, largest=True).hit.tolist() == [True, False]
+    assert hk.trace(solid, o, d, largest=True).is_hit.tolist() == [True, False]
 
 
 @pytest.mark.few(3)
 @pytest.mark.parametrize("largest", [True, np.True_, 64, np.int64(64)])
 def test_level_sets_take_what_calls_take(largest: Any) -> None:
     """True was taken for one cell; NumPy's were refused."""
-    made = hk.LevelSet(SPHERES, (0.0,), largest=largest)
+    made = hk.Surface(SPHERES, (0.0,), largest=largest)
     assert hk.trace(made, *FROM_RIGHT).t[0] == pytest.approx(3.1, abs=1e-3)
     assert hk.level_set(SPHERES, 0.0, largest=largest).largest == made.largest
 
@@ -54,7 +54,7 @@ def test_level_sets_take_what_calls_take(largest: Any) -> None:
     [("x", TypeError), (8.0, TypeError), (None, TypeError), (-3, ValueError), (3, ValueError)],
 )
 def test_what_is_no_number_of_cells_is_refused(largest: Any, error: type[Exception]) -> None:
-    for make in (hk.level_set, hk.LevelSet):
+    for make in (hk.level_set, hk.Surface):
         with pytest.raises(error, match="from 8 to 512, not"):
             make(SPHERES, (0.0,), largest=largest)
 
@@ -63,7 +63,7 @@ def test_what_is_no_number_of_cells_is_refused(largest: Any, error: type[Excepti
 @pytest.mark.parametrize("given", [3, hk.HalfSpace])
 def test_what_is_no_volume_is_refused(name: str, given: Any) -> None:
     """A class of volumes passed for one."""
-    for make in (hk.level_set, hk.LevelSet):
+    for make in (hk.level_set, hk.Surface):
         with pytest.raises(TypeError, match=f"{name} must be a volume"):
             make(SPHERES, (0.0,), **{name: given})
 
@@ -81,13 +81,13 @@ def test_what_is_no_volume_is_refused(name: str, given: Any) -> None:
 def test_clips_that_leave_nothing_are_missed(clip: hk.Volume) -> None:
     """They raised ValueError or OverflowError, of arrays."""
     hits = hk.trace(hk.Sphere(1.0), [[0, 0, 3.0]], [[0, 0, -1.0]], clip=clip, largest=True)
-    assert hits.status.tolist() == [hk.Status.MISS]
+    assert hits.status.tolist() == [hk.RayStatus.MISS]
 
 
 def test_cells_of_tiny_clips_do_not_fill_the_memory() -> None:
     clip = hk.Ball((0, 0, 1), 1e-12)
     hits = hk.trace(hk.Sphere(1.0), [[0, 0, 3.0]], [[0, 0, -1.0]], clip=clip, largest=True)
-    assert hits.status.tolist() == [hk.Status.OUT_OF_STEPS]  # cells as small as roundings
+    assert hits.status.tolist() == [hk.RayStatus.OUT_OF_STEPS]  # cells as small as roundings
 
 
 @pytest.mark.slow
@@ -99,8 +99,11 @@ def test_faces_of_solids_are_lost_where_rounding_leaves_open_which_component_it_
     )
     placed = PlacedSurface.of(surface, Placement.identity(), backend)
     o, d = to_vector3(backend, [[-0.6, 0, 1e5]]), to_vector3(backend, [[0, 0, -1.0]])
-    seen = placed.meet(o, d, backend.Float(1e6), backend.Bool(True))
-    assert [to_numpy(one).tolist() for one in (seen.met, seen.lost)] == [[False], [True]]
+    seen = placed.intersect(o, d, backend.Float(1e6), backend.Bool(True))
+    assert [to_numpy(one).tolist() for one in (seen.is_hit, seen.is_out_of_steps)] == [
+        [False],
+        [True],
+    ]
     assert to_numpy(placed.occludes(o, d, backend.Float(1e6), backend.Bool(True))).all()
 
 

@@ -86,14 +86,14 @@ def wrong_hits(
     behind a crossing than the error is long.
     """
     points, normals, areas = some
-    at = np.flatnonzero(hits.hit)
+    at = np.flatnonzero(hits.is_hit)
     x = (o + hits.t[:, None] * d)[at]
     value, gradient = dipole_sum(points, areas[:, None] * normals)(x)
     steepness = np.linalg.norm(gradient, axis=1)
     error = hk.DipolePotential(*some, accuracy=4.0).error_bound(x) + 1e-6 * np.abs(value)
     latest = truth.beyond + ROUNDING
     latest[at] += 1.05 * error / steepness
-    missed = np.flatnonzero(np.where(hits.hit, hits.t, np.inf) > latest)
+    missed = np.flatnonzero(np.where(hits.is_hit, hits.t, np.inf) > latest)
     off = np.abs(value - LEVEL) > 1.05 * (TOLERANCE + ROUNDING) * steepness + 3 * error
     # On a point itself all values meet.
     return missed, at[off & (cKDTree(points).query(x)[0] > 1e-5)]
@@ -109,14 +109,14 @@ def test_first_hits_agree_with_the_sum_over_all_points(n: int, count: int, spaci
     o, d = rays(some[0], count)
     truth = crossings_of(some, o, d, spacing)
     hits = hk.trace(hk.DipolePotential(*some), o, d, t_max=FAR, tolerance=TOLERANCE)
-    assert not (hits.status == hk.Status.OUT_OF_STEPS).any()
+    assert not (hits.status == hk.RayStatus.OUT_OF_STEPS).any()
     missed, early = wrong_hits(hits, truth, some, o, d)
     assert len(missed) == 0, (o[missed], d[missed], hits.t[missed], truth.beyond[missed])
     assert len(early) == 0, (o[early], d[early], hits.t[early])
     crossed = np.isfinite(truth.beyond)
     assert crossed.sum() > 0.6 * count
     # Hits that cross nothing touch the surface; where it is crossed, they are mostly just there.
-    assert hits.hit[crossed].all()
+    assert hits.is_hit[crossed].all()
     gap = truth.beyond[crossed] - hits.t[crossed]
     assert np.median(gap) < 3 * TOLERANCE
 
@@ -140,11 +140,11 @@ def test_a_tree_that_hides_its_error_misses_hits() -> None:
     class Sure(hk.DipolePotential):
         """As coarse as can be, and nothing said of it."""
 
-        has_detail = False
+        has_variable_accuracy = False
 
         def evaluate(self, p: Any) -> hk.Sample:
             sample = super().evaluate(p)
-            return hk.Sample(sample.value, sample.gradient, sample.known)
+            return hk.Sample(sample.value, sample.gradient, sample.promises)
 
     some = cloud(1000)
     o, d = rays(some[0], 1000)
@@ -153,7 +153,7 @@ def test_a_tree_that_hides_its_error_misses_hits() -> None:
     for kind in (Sure, hk.DipolePotential):
         field = kind(*some, accuracy=1.5)
         hits = hk.trace(field, o, d, t_max=FAR, tolerance=1e-5)
-        at = hits.hit
+        at = hits.is_hit
         error = field.error_bound(o + np.where(at, hits.t, 0)[:, None] * d)
         steepness = np.linalg.norm(field.gradient(o + np.where(at, hits.t, 0)[:, None] * d), axis=1)
         late = np.where(at, hits.t, np.inf) > truth.beyond + ROUNDING

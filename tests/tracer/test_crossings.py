@@ -11,11 +11,11 @@ import pytest
 
 import harnack as hk
 from harnack.backend import FloatArray, choose_backend
-from harnack.enclosures import Curvature, Lipschitz
+from harnack.enclosures import Lipschitz, TaylorRemainder
 from harnack.fields.field import Field, Sample
 from harnack.geometry import example_curves
 from harnack.geometry.example_meshes import icosphere
-from harnack.tracer.level_contact import root_between
+from harnack.tracer.level_contact import cubic_root
 
 PRECISIONS = ("single", "double")
 BALL = hk.Ball(radius=1.5)
@@ -40,7 +40,7 @@ class Wave(Field):
     def evaluate(self, p: Any) -> Sample:
         s, c = dr.sincos(self.k * p.x)
         zero = dr.zeros(type(s))
-        return Sample(c, type(p)(-self.k * s, zero, zero), (Curvature(self.k**2),))
+        return Sample(c, type(p)(-self.k * s, zero, zero), (TaylorRemainder(self.k**2),))
 
 
 def rays(n: int, seed: int = 0, distance: float = 2.5) -> tuple[FloatArray, FloatArray]:
@@ -87,7 +87,7 @@ CASES: dict[str, tuple[Any, Any, tuple[float, ...], float]] = {
             [
                 hk.PlaneWave(1.0, (3, 2, 0), -np.pi / 2),
                 hk.PlaneWave(1.0, (-1, 0, 4)),
-                hk.Product(-0.7, y=hk.sine(5.0)),
+                hk.WaveProduct(-0.7, y=hk.sine_factor(5.0)),
             ],
             domain=BALL,
         ),
@@ -109,8 +109,8 @@ def test_crossings_are_those_of_a_dense_oracle(name: str, precision: Any) -> Non
     )  # fmt: skip
     t = np.linspace(0, 2.5, _MANY)
     assert 1 < found.count.mean() < k
-    assert (found.status == hk.Status.MISS).all()
-    assert (found.end == np.inf).all()
+    assert (found.status == hk.RayStatus.MISS).all()
+    assert (found.traced_to == np.inf).all()
     for i in range(n):
         p = o[i] + t[:, None] * d[i]
         f = function(p[(p * p).sum(axis=1) <= 1.5**2])
@@ -149,7 +149,7 @@ def test_the_ladder_of_an_angle_is_climbed_rung_by_rung(level: Any, precision: A
     found = hk.trace(
         field, o, d, level=level, all_hits=30, t_max=6, tolerance=tolerance, precision=precision
     )
-    assert (found.status == hk.Status.MISS).all()
+    assert (found.status == hk.RayStatus.MISS).all()
     t, wrong = np.linspace(0, 6, 6001), 0
     for i in range(len(o)):
         p = o[i] + t[:, None] * d[i]
@@ -212,14 +212,14 @@ def test_rays_that_graze_do_not_stick(precision: Any, overstep: float) -> None:
     np.testing.assert_array_equal(found.count[:3], 2)
     assert set(found.count[3:5]) <= {0, 2}
     np.testing.assert_array_equal(found.count[5:], 0)
-    assert (found.status == hk.Status.MISS).all()
+    assert (found.status == hk.RayStatus.MISS).all()
     # |f| stays within the tolerance for a length of 0.09, of which a step is 1/5 of it or more.
     assert found.evaluations.max() < 600
     plain = hk.trace(Sphere(), o, d, **settings)
     sure = hk.trace(Sphere(), o, d, confirm=True, **settings)
-    np.testing.assert_array_equal(plain.hit, off <= tolerance)
-    np.testing.assert_array_equal(sure.hit, found.count > 0)
-    np.testing.assert_array_equal(sure.t[sure.hit], found.t[sure.hit, 0])
+    np.testing.assert_array_equal(plain.is_hit, off <= tolerance)
+    np.testing.assert_array_equal(sure.is_hit, found.count > 0)
+    np.testing.assert_array_equal(sure.t[sure.is_hit], found.t[sure.is_hit, 0])
 
 
 def test_a_ray_along_the_surface_runs_out_of_steps_or_is_proved() -> None:
@@ -230,15 +230,15 @@ def test_a_ray_along_the_surface_runs_out_of_steps_or_is_proved() -> None:
             self.curvature = curvature
 
         def evaluate(self, p: Any) -> Sample:
-            known = Lipschitz(1.0) if self.curvature is None else Curvature(self.curvature)
+            known = Lipschitz(1.0) if self.curvature is None else TaylorRemainder(self.curvature)
             return Sample(p.z, type(p)(0, 0, 1), (known,))
 
     o, d = np.zeros((1, 3)), np.array([[1.0, 0, 0]])
     lost = hk.trace(Plane(None), o, d, all_hits=2, t_max=50.0, tolerance=1e-3, max_steps=300)
-    assert (lost.status[0], lost.count[0]) == (hk.Status.OUT_OF_STEPS, 0)
-    assert 0.05 < lost.end[0] < 1
+    assert (lost.status[0], lost.count[0]) == (hk.RayStatus.OUT_OF_STEPS, 0)
+    assert 0.05 < lost.traced_to[0] < 1
     proved = hk.trace(Plane(1e-3), o, d, all_hits=2, t_max=50.0, tolerance=1e-3)
-    assert (proved.status[0], proved.count[0]) == (hk.Status.MISS, 0)
+    assert (proved.status[0], proved.count[0]) == (hk.RayStatus.MISS, 0)
     assert proved.evaluations[0] < 100
 
 
@@ -270,21 +270,21 @@ def test_the_first_k_are_the_first_of_all() -> None:
         np.testing.assert_array_equal(first.side, every.side[:, :k])
         np.testing.assert_array_equal(first.count, np.minimum(every.count, k))
         full = every.count >= k
-        np.testing.assert_array_equal(first.status[full], hk.Status.HIT)
-        np.testing.assert_array_equal(first.status[~full], hk.Status.MISS)
-        assert (first.end[full] > first.t[full, -1]).all()
+        np.testing.assert_array_equal(first.status[full], hk.RayStatus.HIT)
+        np.testing.assert_array_equal(first.status[~full], hk.RayStatus.MISS)
+        assert (first.traced_to[full] > first.t[full, -1]).all()
         assert (first.evaluations <= every.evaluations).all()
 
 
 def test_steps_are_for_all_of_the_ray() -> None:
     found = hk.trace(Wave(), [[0.0, 0, 0]], [[1.0, 0, 0]], all_hits=40, t_max=20.0, max_steps=25)
     whole = hk.trace(Wave(), [[0.0, 0, 0]], [[1.0, 0, 0]], all_hits=40, t_max=20.0)
-    assert found.status[0] == hk.Status.OUT_OF_STEPS
+    assert found.status[0] == hk.RayStatus.OUT_OF_STEPS
     assert 25 <= found.evaluations[0] <= 26
     n = found.count[0]
     assert 1 <= n < whole.count[0] == 32
     np.testing.assert_array_equal(found.t[0, :n], whole.t[0, :n])
-    assert found.t[0, n - 1] < found.end[0] < whole.t[0, n + 1]
+    assert found.t[0, n - 1] < found.traced_to[0] < whole.t[0, n + 1]
     np.testing.assert_allclose(whole.t[0, :32], (np.arange(32) + 0.5) * math.pi / 5, atol=4e-6)
 
 
@@ -305,13 +305,13 @@ def test_confirmed_hits_are_all_hits_but_those_that_turn_back(precision: Any) ->
     surface = hk.level_set(field, 1.2, tolerance=3e-3, confirm=True)
     same = hk.trace(surface, o, d, precision=precision)
     np.testing.assert_array_equal(sure.t, same.t)
-    assert (plain.hit | ~sure.hit).all()
-    assert 5 < (plain.hit & ~sure.hit).sum() < 200
-    off = np.abs(gyroid(sure.position[sure.hit].astype(float)) - 1.2)
+    assert (plain.is_hit | ~sure.is_hit).all()
+    assert 5 < (plain.is_hit & ~sure.is_hit).sum() < 200
+    off = np.abs(gyroid(sure.position[sure.is_hit].astype(float)) - 1.2)
     assert off.max() < 1e-4
     assert (sure.uncertainty == 0).all()
     t = np.linspace(0, 4, 4001)
-    for i in np.flatnonzero(plain.hit & ~sure.hit):
+    for i in np.flatnonzero(plain.is_hit & ~sure.is_hit):
         p = o[i] + t[:, None] * d[i]
         f = gyroid(p[(p * p).sum(axis=1) <= 1.5**2])
         assert alternations(f, 1.2, 12 * 3e-3) == 0
@@ -350,7 +350,7 @@ def test_rays_between_poles_leave_the_solid_behind_them(precision: Any) -> None:
     assert leaves.sum() > 200
     solid = hk.solid(cloud, below=6.0) & hk.Sphere(1.3)
     hits = hk.trace(solid, o, d, all_hits=32, precision=precision, max_steps=4000)
-    known = leaves & (hits.status == hk.Status.MISS) & np.isinf(hits.t[:, -1])
+    known = leaves & (hits.status == hk.RayStatus.MISS) & np.isinf(hits.t[:, -1])
     assert known.sum() > 0.9 * leaves.sum()
     apart = np.abs(hits.t - out[:, None]).min(axis=1)
     assert (apart[known] < 1e-3).all()
@@ -439,13 +439,13 @@ def test_closed_meshes_are_crossed_at_their_triangles(method: str, precision: An
         n = found.count[i]
         assert n == len(t)
         np.testing.assert_allclose(found.t[i, :n], t, atol=2e-5)
-        np.testing.assert_array_equal(found.sheet[i, :n], triangles)
+        np.testing.assert_array_equal(found.primitive_index[i, :n], triangles)
         np.testing.assert_array_equal(found.side[i, :n], np.resize([1, -1], n))
-    assert (found.sheet[np.isinf(found.t)] == -1).all()
-    assert (found.status == hk.Status.MISS).all()
+    assert (found.primitive_index[np.isinf(found.t)] == -1).all()
+    assert (found.status == hk.RayStatus.MISS).all()
     sure = hk.trace(mesh, o, d, confirm=True, precision=precision)
     np.testing.assert_array_equal(sure.t, found.t[:, 0])
-    np.testing.assert_array_equal(sure.sheet, found.sheet[:, 0])
+    np.testing.assert_array_equal(sure.primitive_index, found.primitive_index[:, 0])
 
 
 @pytest.mark.slow
@@ -473,7 +473,7 @@ def test_meshes_with_holes_are_crossed_where_the_winding_number_passes(method: s
             alike += 1
             np.testing.assert_allclose(crossed, t[:-1][np.diff(w > 0.5)], atol=1e-3)
     assert alike > 25
-    smooth = np.isfinite(found.t) & (found.sheet < 0)
+    smooth = np.isfinite(found.t) & (found.primitive_index < 0)
     assert 5 < smooth.sum() < np.isfinite(found.t).sum() - 10
     value = exact.value(found.position[smooth].astype(float), precision="double")
     assert np.quantile(np.abs(value - 0.5), 0.9) < 1e-4
@@ -493,7 +493,7 @@ def test_the_root_of_a_cubic_is_found_in_its_bracket() -> None:
     start, end = rng.uniform(0.01, 1, 1000), -rng.uniform(0, 1, 1000)
     slope, last = rng.uniform(-4, 4, (2, 1000))
     numbers = (backend.Float(each) for each in (start, end, slope, last))
-    u = root_between(*numbers).numpy()
+    u = cubic_root(*numbers).numpy()
     assert ((u >= 0) & (u <= 1)).all()
     b, c = 3 * (end - start) - 2 * slope - last, slope + last - 2 * (end - start)
     value = start + u * (slope + u * (b + u * c))

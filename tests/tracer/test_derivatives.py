@@ -38,7 +38,7 @@ def clean_rays(field: hk.Field, levels: list[float], **settings: object) -> tupl
     hits = hk.trace(field, o, d, level=levels, precision="double", tolerance=1e-6, **settings)  # type: ignore[arg-type]
     direction = d / np.linalg.norm(d, axis=1, keepdims=True)
     steep = np.abs((hits.normal * direction).sum(axis=1)) > 0.1
-    keep = hits.hit & steep
+    keep = hits.is_hit & steep
     assert keep.sum() >= 8
     return o[keep], d[keep]
 
@@ -46,7 +46,7 @@ def clean_rays(field: hk.Field, levels: list[float], **settings: object) -> tupl
 def solve(field: hk.Field, o: np.ndarray, d: np.ndarray, level: object) -> np.ndarray:
     """t to rounding, without any derivative: what differences are taken of."""
     hits = hk.trace(field, o, d, level=level, precision="double", tolerance=1e-13)
-    assert hits.hit.all()
+    assert hits.is_hit.all()
     return hits.t
 
 
@@ -191,8 +191,8 @@ def test_misses_have_no_derivative_and_positions_move_with_t() -> None:
     dr.enable_grad(origin)
     hits = hk.trace(hk.SolidAngle(LOOP), origin, vector(d))
     status = numpy(hits.status)
-    assert status.tolist() == [hk.Status.HIT, hk.Status.MISS]
-    dr.backward(dr.sum(dr.select(hits.hit, hits.position.x, 0)))
+    assert status.tolist() == [hk.RayStatus.HIT, hk.RayStatus.MISS]
+    dr.backward(dr.sum(dr.select(hits.is_hit, hits.position.x, 0)))
     gradient = numpy(dr.grad(origin))
     assert np.isfinite(gradient).all()
     assert (gradient[1] == 0).all()
@@ -223,12 +223,12 @@ def test_the_value_of_t_is_polished_to_rounding() -> None:
 
 TALL, CAN = hk.Cuboid((0.5, 0.5, 2.0)), hk.Cylinder(0.4, 1.4)
 SOLIDS: dict[str, hk.Solid] = {
-    "union, moved and rotated": (TALL | CAN.rotated(70, "x")).moved((0.1, 0.2, 0)).rotated(20),
+    "union, moved and rotated": (TALL | CAN.rotated(70, "x")).translated((0.1, 0.2, 0)).rotated(20),
     "cuboid": TALL,
     "cylinder": CAN,
     "difference": TALL - CAN.rotated(50, (1, 1, 0)),
-    "intersection": TALL & CAN.moved((0.2, 0, 0.1)),
-    "grown": CAN.grown(0.1),
+    "intersection": TALL & CAN.translated((0.2, 0, 0.1)),
+    "grown": CAN.offset(0.1),
 }
 
 
@@ -263,13 +263,15 @@ def test_hits_on_faces_and_edges_of_solids(name: str) -> None:
     # Where both ends of a difference lie on one face, which is not seen from its edge.
     normals = np.array([one.normal for one in ends])
     unit = d / np.linalg.norm(d, axis=1, keepdims=True)
-    good = np.all([one.hit for one in ends], axis=0) & (np.ptp(normals, axis=0) < 1e-5).all(axis=1)
+    good = np.all([one.is_hit for one in ends], axis=0) & (np.ptp(normals, axis=0) < 1e-5).all(
+        axis=1
+    )
     good &= np.abs((normals[0] * unit).sum(axis=1)) > 0.1
     assert good.sum() > 100
     origin, level = vector(o), DOUBLE.Float(np.zeros(len(o)))
     dr.enable_grad(origin)
     hits = hk.trace(solid, origin, vector(d))
-    dr.backward(dr.sum(dr.select(hits.hit, hits.t, 0)))
+    dr.backward(dr.sum(dr.select(hits.is_hit, hits.t, 0)))
     found = (numpy(dr.grad(origin)) * motion).sum(axis=1)
     np.testing.assert_allclose(found[good], moved[good], rtol=1e-5, atol=1e-5)
     level = DOUBLE.Float(0)
@@ -305,8 +307,8 @@ def test_hits_of_clouds_are_those_of_the_whole_sum() -> None:
     origin = vector(o)
     dr.enable_grad(origin)
     hits = hk.trace(hk.DipolePotential(x, x, areas), origin, vector(d), level=0.5)
-    dr.backward(dr.sum(dr.select(hits.hit, hits.t, 0)))
-    hit = np.array(hits.hit)
+    dr.backward(dr.sum(dr.select(hits.is_hit, hits.t, 0)))
+    hit = np.array(hits.is_hit)
     assert hit.sum() > 20
     away = numpy(dr.detach(hits.position))[hit][:, None] - x
     r, along = np.linalg.norm(away, axis=2)[..., None], (away * x).sum(axis=2)[..., None]
@@ -337,8 +339,8 @@ def test_reverse_mode_passes_every_field(name: str) -> None:
     origin = vector(o)
     dr.enable_grad(origin)
     hits = hk.trace(field, origin, vector(d), level=level)
-    dr.backward(dr.sum(dr.select(hits.hit, hits.t, 0)))
-    hit, normal = np.array(hits.hit), numpy(dr.detach(hits.normal))
+    dr.backward(dr.sum(dr.select(hits.is_hit, hits.t, 0)))
+    hit, normal = np.array(hits.is_hit), numpy(dr.detach(hits.normal))
     assert hit.sum() > 8
     unit = d / np.linalg.norm(d, axis=1, keepdims=True)
     slope = (normal * unit).sum(axis=1, keepdims=True)

@@ -35,8 +35,8 @@ def random_curve(rng: np.random.Generator, kind: int) -> Loops:
     kinds = [
         lambda: [example_curves.torus_knot(p, q, 2 * n, minor_radius=rng.uniform(0.2, 0.6))],
         lambda: [example_curves.figure_eight_knot(2 * n)],
-        lambda: [example_curves.coil(turns, long, height=height, route="outside")],
-        lambda: [example_curves.coil(turns, long, height=height, route="axis")],
+        lambda: [example_curves.coil(turns, long, height=height, return_path="outside")],
+        lambda: [example_curves.coil(turns, long, height=height, return_path="axis")],
         lambda: example_curves.hopf_link(n),
         lambda: example_curves.borromean_rings(n),
         lambda: example_curves.square_with_holes(int(rng.integers(5, 20))),
@@ -125,7 +125,7 @@ def compare(
     _, size = size_of(loops)
     tolerance = TOLERANCE * size
     far = 8.0 * size
-    field = hk.SolidAngle(loops, certificate=settings.pop("certificate", "auto"))  # type: ignore[arg-type]
+    field = hk.SolidAngle(loops, lift_bound=settings.pop("lift_bound", "auto"))  # type: ignore[arg-type]
     hits = hk.trace(field, o, d, level=level, t_max=far, tolerance=tolerance, **settings)  # type: ignore[arg-type]
     oracle = CurveOracle(loops)
     truth = first_crossings(
@@ -134,9 +134,9 @@ def compare(
     )  # fmt: skip
     missed = hits.t > truth.beyond + SHARE * tolerance
     early = np.zeros(len(o), bool)
-    at = np.flatnonzero(hits.hit)
+    at = np.flatnonzero(hits.is_hit)
     early[at] = ~is_near_surface(oracle, o[at], unit(d[at]), hits.t[at], level, SHARE * tolerance)
-    out = hits.status == hk.Status.OUT_OF_STEPS
+    out = hits.status == hk.RayStatus.OUT_OF_STEPS
     if failures is not None:
         for k in np.flatnonzero(missed | early | out):
             failures.append(
@@ -245,7 +245,7 @@ def test_the_assumed_range_misses_hits_of_a_coil_and_ours_does_not() -> None:
     points that are tried."""
     o, d = rays_down_a_coil(200)
     o, d = np.concatenate([COIL_ORIGINS, o]), np.concatenate([COIL_DIRECTIONS, d])
-    assumed = compare(COIL, o, d, 2 * math.pi, certificate="paper", bound="caps")
+    assumed = compare(COIL, o, d, 2 * math.pi, lift_bound="paper", bound="caps")
     failures: list[str] = []
     ours = compare(COIL, o, d, 2 * math.pi, failures=failures)
     assert assumed.missed > 80
@@ -278,7 +278,7 @@ def test_the_published_method_misses_hits_of_a_coil_of_eight_turns(
     )
     more = rays_down_a_coil(200)
     o, d = np.concatenate([o, more[0]]), np.concatenate([d, more[1]])
-    tally = compare(coil, o, d, 2 * math.pi, certificate=certificate, bound="classic")
+    tally = compare(coil, o, d, 2 * math.pi, lift_bound=certificate, bound="classic")
     assert tally.missed > 10 if certificate == "paper" else tally.missed == 0
 
 
@@ -287,8 +287,8 @@ def test_the_lift_of_a_coil_leaves_the_assumed_range() -> None:
     c = -4 pi allows for at most twice 4 pi. What we promise there is kept."""
     center = np.array([[0.0, 0.0, 1.0]])
     oracle, p = CurveOracle(COIL), to_vector3(choose_backend("double"), center)
-    assumed = hk.SolidAngle(COIL, certificate="paper").evaluate(p).known[0]
-    proved = hk.SolidAngle(COIL).evaluate(p).weaker[0]
+    assumed = hk.SolidAngle(COIL, lift_bound="paper").evaluate(p).promises[0]
+    proved = hk.SolidAngle(COIL).evaluate(p).alternative_promises[0]
     assert movement(oracle, center, assumed).min() < -2.5 * FOUR_PI
     assert assumed.lower == -1.5 * FOUR_PI
     value = oracle(center).value[0]
@@ -349,7 +349,7 @@ def figure_21(p: np.ndarray) -> np.ndarray:
 
 
 FIGURE_21 = hk.EigenfunctionSum(
-    [hk.Product(1.0, *[hk.sine(6)] * 3), hk.Product(1.0, *[hk.sine(2)] * 3)]
+    [hk.WaveProduct(1.0, *[hk.sine_factor(6)] * 3), hk.WaveProduct(1.0, *[hk.sine_factor(2)] * 3)]
 )
 EQUATION_8 = hk.HarmonicPolynomial({(2, 1, 0): 1, (0, 1, 2): -1})
 # name: field, the same function in NumPy, levels, the shortest length of interest
@@ -407,15 +407,15 @@ def test_real_valued_fields(name: str, bound: str | None) -> None:
     )  # fmt: skip
     assert np.isfinite(truth.beyond).sum() > 20
     # The published rule runs out of steps where the range is much larger than the gradient.
-    assert bound == "classic" or not (hits.status == hk.Status.OUT_OF_STEPS).any()
+    assert bound == "classic" or not (hits.status == hk.RayStatus.OUT_OF_STEPS).any()
     missed = hits.t > truth.beyond + SHARE * tolerance
     assert not missed.any(), (o[missed], d[missed], hits.t[missed], truth.beyond[missed])
-    at = np.flatnonzero(hits.hit)
+    at = np.flatnonzero(hits.is_hit)
     x = (o + hits.t[:, None] * d)[at]
     here = looking(value, smooth)(x)
     # To first order, or to rounding: near cones and crossings the gradient tells nothing.
     sample = field.evaluate(to_vector3(choose_backend("single"), x))
-    rounding = 2 * (to_numpy(sample.error + 0 * sample.value) + 1e-6 * np.abs(here.value))
+    rounding = 2 * (to_numpy(sample.value_error + 0 * sample.value) + 1e-6 * np.abs(here.value))
     gap = gap_to_levels(here.value, levels)
     assert (gap <= SHARE * tolerance * here.gradient_norm + rounding).all()
 
@@ -442,11 +442,11 @@ def test_small_closed_meshes_by_tree(subdivisions: int, precision: Any) -> None:
     limits: Any = {"t_max": 70.0, "tolerance": 1e-5, "precision": precision}
     exact = hk.trace(hk.WindingNumber(*mesh, method="exact"), o, d, **limits)
     tree = hk.trace(hk.WindingNumber(*mesh, method="tree"), o, d, **limits)
-    assert exact.hit.sum() > 400
-    assert not exact.hit.all()
+    assert exact.is_hit.sum() > 400
+    assert not exact.is_hit.all()
     np.testing.assert_array_equal(tree.status, exact.status)
-    np.testing.assert_array_equal(tree.sheet, exact.sheet)
-    np.testing.assert_allclose(tree.t[exact.hit], exact.t[exact.hit], rtol=1e-5, atol=1e-5)
+    np.testing.assert_array_equal(tree.primitive_index, exact.primitive_index)
+    np.testing.assert_allclose(tree.t[exact.is_hit], exact.t[exact.is_hit], rtol=1e-5, atol=1e-5)
     assert (tree.evaluations < 200).all()
 
 
@@ -471,10 +471,10 @@ def test_rays_through_a_flat_mesh(method: Any, precision: Any) -> None:
             hk.WindingNumber(vertices, faces, method=method), o, d, level=0.49,
             tolerance=1e-5, precision=precision,
         )  # fmt: skip
-        assert hits.hit.all()
+        assert hits.is_hit.all()
         assert (np.abs(hits.position[:, 2]) < 0.2).all()
         if height > 0:  # on this side w is negative up to the mesh
-            assert (hits.sheet >= 0).all()
+            assert (hits.primitive_index >= 0).all()
 
 
 @pytest.mark.slow
@@ -494,8 +494,8 @@ def test_rays_beside_an_edge_of_a_mesh_by_tree() -> None:
     o, d = o[steep], d[steep]
     exact = hk.trace(hk.WindingNumber(vertices, faces, method="exact"), o, d)
     tree = hk.trace(hk.WindingNumber(vertices, faces, method="tree"), o, d)
-    assert exact.hit.all()
-    assert tree.hit.all()
+    assert exact.is_hit.all()
+    assert tree.is_hit.all()
     np.testing.assert_allclose(tree.t, exact.t, atol=1e-5)
 
 
@@ -516,7 +516,7 @@ def test_overlapping_sheets_by_tree(precision: Any) -> None:
     for method in ("exact", "tree"):
         field = hk.WindingNumber(vertices, faces, method=method)  # type: ignore[arg-type]
         hits = hk.trace(field, o, d, precision=precision)
-        assert hits.hit.all()
+        assert hits.is_hit.all()
         np.testing.assert_allclose(hits.position[:, 2], 0.3, atol=1e-4)
 
 
@@ -537,12 +537,12 @@ def test_repeated_points(precision: Any) -> None:
     assert np.isfinite(field.error_bound([[0.1, 0.2, 0.3], [2.0, 0.0, 0.0]])).all()
     o = 3 * unit(rng.normal(size=(500, 3)))
     hits = hk.trace(field, o, -o + 0.3 * rng.uniform(-1, 1, o.shape), precision=precision)
-    assert hits.hit.all()
+    assert hits.is_hit.all()
     alone = hk.trace(
         hk.DipolePotential([[0.0, 0, 0]], [[0.0, 0, 1]], [1.0]),
         [[0.05, 0.02, 3.0], [0.0, 0.0, -3.0]], [[0.0, 0, -1], [0.0, 0, 1]], precision=precision,
     )  # fmt: skip
-    assert (alone.status != hk.Status.OUT_OF_STEPS).all()
+    assert (alone.status != hk.RayStatus.OUT_OF_STEPS).all()
 
 
 def test_what_is_not_known_is_not_free() -> None:
@@ -554,7 +554,7 @@ def test_what_is_not_known_is_not_free() -> None:
             return hk.Sample(p.z, type(p)(0, 0, 1), (hk.Lipschitz(1.0),), error)
 
     hits = hk.trace(Unknown(), [[0.1, 0, 1]], [[0.0, 0, -1]], t_max=3.0)
-    assert hits.status[0] == hk.Status.OUT_OF_STEPS
+    assert hits.status[0] == hk.RayStatus.OUT_OF_STEPS
 
 
 @pytest.mark.parametrize("height", [1.0, 1e-2, 1e-4])

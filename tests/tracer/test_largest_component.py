@@ -40,7 +40,7 @@ def rays(n, seed):
     o[:part] = np.array(SMALL[1]) + SMALL[0] * ball[:part]
     o[part : 2 * part] = np.array(BIG[1]) + BIG[0] * ball[part:]
     cells = occupied_cells(FIELDS["solids"], (0.0,), FIELDS["solids"].extent((0.0,)), 128)
-    corners = cells.origin + cells.cell * rng.integers(0, cells.shape, (2 * part, 3))
+    corners = cells.origin + cells.cell_size * rng.integers(0, cells.shape, (2 * part, 3))
     o[2 * part : 4 * part] = corners
     d[2 * part : 3 * part] = np.eye(3)[rng.integers(0, 3, part)] * rng.choice([-1, 1], (part, 1))
     d[3 * part : 4 * part] = rng.choice([-1.0, 0.0, 1.0], (part, 3))
@@ -69,10 +69,10 @@ def wrong(field, n, seed, **settings):
     t, certain = through_sphere(o, d, *BIG)
     hit = np.isfinite(t)
     assert 0.2 * n < (hit & certain).sum() < 0.8 * n
-    off = hits.hit != hit
-    both = hits.hit & hit
+    off = hits.is_hit != hit
+    both = hits.is_hit & hit
     off[both] = np.abs(hits.t[both] - t[both]) > 5e-3
-    return int((certain & (off | (hits.status == hk.Status.OUT_OF_STEPS))).sum())
+    return int((certain & (off | (hits.status == hk.RayStatus.OUT_OF_STEPS))).sum())
 
 
 @pytest.mark.few(1)
@@ -97,7 +97,7 @@ def test_wrong_groups_are_noticed(monkeypatch):
     alone[1, 1, 1] = True
     field = hk.Sphere(*BIG) | hk.Sphere(*SMALL)
     with monkeypatch.context() as patch:
-        patch.setattr(empty_space, "_AROUND", alone)  # no cell has a neighbor
+        patch.setattr(empty_space, "_NEIGHBOR_STENCIL", alone)  # no cell has a neighbor
         assert wrong(field, 1000, 0) > 100
     field = hk.Sphere(*BIG) | hk.Sphere(*SMALL)  # nothing is kept of it
     with monkeypatch.context() as patch:
@@ -115,10 +115,10 @@ def test_pieces_that_a_clip_leaves_are_left_out():
     cell = hk.Box((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
     alone = hk.trace(field, o, d, level=1.2, clip=cell, tolerance=1e-5)
     whole = hk.trace(field, o, d, level=1.2, clip=ball, tolerance=1e-5)
-    assert (whole.hit & ~alone.hit).sum() > 200
-    assert alone.hit.sum() > 100
-    assert (hits.hit != alone.hit).sum() <= 2  # rays that graze it
-    both = hits.hit & alone.hit
+    assert (whole.is_hit & ~alone.is_hit).sum() > 200
+    assert alone.is_hit.sum() > 100
+    assert (hits.is_hit != alone.is_hit).sum() <= 2  # rays that graze it
+    both = hits.is_hit & alone.is_hit
     assert (np.abs(hits.t[both] - alone.t[both]) < 5e-3).mean() > 0.999
 
 
@@ -129,14 +129,14 @@ def test_parts_that_end_at_the_domain_are_told_apart_there():
     field = hk.HarmonicPolynomial({(1, 1, 1): 1.0})
     o, d = rays(4000, 6)
     hits = hk.trace(field, o, d, level=0.05, largest=True)
-    x = hits.position[hits.hit]
+    x = hits.position[hits.is_hit]
     octant = np.sign(x).mean(axis=0)
     assert np.abs(octant).tolist() == [1, 1, 1]
     corner = 2.0 * octant
     box = hk.Box(tuple(np.minimum(corner, 0)), tuple(np.maximum(corner, 0)))
     alone = hk.trace(field, o, d, level=0.05, clip=box)
-    assert alone.hit.sum() > 100
-    assert (hits.hit != alone.hit).sum() <= 3  # rays that graze it
+    assert alone.is_hit.sum() > 100
+    assert (hits.is_hit != alone.is_hit).sum() <= 3  # rays that graze it
 
 
 def test_a_section_is_for_looking_into_what_was_the_largest():
@@ -145,7 +145,7 @@ def test_a_section_is_for_looking_into_what_was_the_largest():
     cut = hk.HalfSpace((-1, 0, 0), 0.2)  # x >= -0.2
     o, d = np.array([[3.0, 0, 0], [0.5, 0, 3.0]]), np.array([[-1.0, 0, 0], [0, 0, -1.0]])
     hits = hk.trace(field, o, d, section=cut, largest=True)
-    assert hits.hit.tolist() == [True, False]
+    assert hits.is_hit.tolist() == [True, False]
     assert hits.t[0] == pytest.approx(3.1, abs=1e-3)
 
 
@@ -161,9 +161,9 @@ def test_of_a_solid_the_part_of_largest_volume_is_there(precision):
         surface = hk.level_set(field, solid=(-math.inf, 0.0), clip=clip, largest=largest)
         placed = PlacedSurface.of(surface, Placement.identity(), backend)
         rays_of = to_vector3(backend, o), to_vector3(backend, d)
-        seen = placed.meet(*rays_of, backend.Float(1e3), backend.Bool(True))
+        seen = placed.intersect(*rays_of, backend.Float(1e3), backend.Bool(True))
         blocked = placed.occludes(*rays_of, backend.Float(1e3), backend.Bool(True))
-        met.append([to_numpy(one) for one in (seen.met, seen.t, blocked, seen.lost)])
+        met.append([to_numpy(one) for one in (seen.is_hit, seen.t, blocked, seen.is_out_of_steps)])
     (has, t, blocked, lost), (has_alone, t_alone, blocked_alone, _) = met
     assert not lost.any()
     assert 500 < has_alone.sum() < 3500
@@ -177,18 +177,18 @@ def test_of_a_solid_the_part_of_largest_volume_is_there(precision):
 def test_what_is_not_told_apart_stays_together():
     near = hk.Sphere(0.5, (-0.5005, 0, 0)) | hk.Sphere(0.4, (0.4005, 0, 0))
     o, d = np.array([[0.4, 0, 3.0], [-0.5, 0, 3.0]]), np.array([[0, 0, -1.0]])
-    assert hk.trace(near, o, d, largest=True).hit.all()
+    assert hk.trace(near, o, d, largest=True).is_hit.all()
     apart = hk.Sphere(0.5, (-0.55, 0, 0)) | hk.Sphere(0.4, (0.45, 0, 0))
-    assert hk.trace(apart, o, d, largest=True).hit.tolist() == [False, True]
-    assert hk.trace(apart, o, d, largest=16).hit.all()
+    assert hk.trace(apart, o, d, largest=True).is_hit.tolist() == [False, True]
+    assert hk.trace(apart, o, d, largest=16).is_hit.all()
 
 
 @pytest.mark.slow
 def test_rays_whose_cells_rounding_leaves_open_are_out_of_steps():
     o, d = [[1e5, 0.0, 0.0], [10.0, 0.0, 0.0]], [[-1.0, 0.0, 0.0]]
     hits = hk.trace(FIELDS["solids"], o, d, largest=True)
-    assert hits.status.tolist() == [hk.Status.OUT_OF_STEPS, hk.Status.HIT]
-    assert hk.trace(FIELDS["solids"], o, d, largest=True, precision="double").hit.all()
+    assert hits.status.tolist() == [hk.RayStatus.OUT_OF_STEPS, hk.RayStatus.HIT]
+    assert hk.trace(FIELDS["solids"], o, d, largest=True, precision="double").is_hit.all()
 
 
 @pytest.mark.slow

@@ -56,11 +56,11 @@ _VERBS: dict[str, Callable[[Any], Any]] = {
     "picture of a solid": lambda f: hk.render(
         f, solid=(-math.inf, 0), section=hk.HalfSpace((1, 0, 0), 0), show="shaded", **_PICTURE
     ),
-    "mesh": lambda f: hk.mesh(f, spacing=0.4, tolerance=0.02),
-    "thick mesh": lambda f: hk.mesh(f, spacing=0.4, tolerance=0.02, thickness=0.1),
-    "mesh of a solid": lambda f: hk.mesh(f, solid=(-0.3, 0), spacing=0.4, tolerance=0.02),
+    "mesh": lambda f: hk.mesh(f, cell_size=0.4, tolerance=0.02),
+    "thick mesh": lambda f: hk.mesh(f, cell_size=0.4, tolerance=0.02, thickness=0.1),
+    "mesh of a solid": lambda f: hk.mesh(f, solid=(-0.3, 0), cell_size=0.4, tolerance=0.02),
     "signed distance": lambda f: hk.signed_distance(f, 0.6 * _POINTS),
-    "distance, first order": lambda f: hk.signed_distance(f, 0.6 * _POINTS, method="first"),
+    "distance, first order": lambda f: hk.signed_distance(f, 0.6 * _POINTS, method="first_order"),
     "distance bounds": lambda f: hk.distance_bounds(f, 0.6 * _POINTS),
     "closest points": lambda f: hk.closest_points(f, 0.6 * _POINTS),
     "curvature": lambda f: hk.curvature(f, 0.6 * _POINTS),

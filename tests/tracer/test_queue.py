@@ -13,34 +13,34 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.backend.arrays import aligned
-from harnack.backend.loops import on_some, while_queued
+from harnack.backend.arrays import upload_floats
+from harnack.backend.loops import compute_on_active, loop_with_queue
 from harnack.geometry.example_meshes import icosphere
 from harnack.tracer.hits import _are_scattered
 
 
-def cut_sphere() -> hk.LevelSet:
+def cut_sphere() -> hk.Surface:
     vertices, faces = icosphere(2)
     return hk.level_set(hk.WindingNumber(vertices, faces[np.arange(len(faces)) % 7 > 0]))
 
 
-def saddle() -> hk.LevelSet:
+def saddle() -> hk.Surface:
     t = np.linspace(0, 2 * np.pi, 48, endpoint=False)
     return hk.level_set(hk.SolidAngle(np.column_stack([np.cos(t), np.sin(t), 0.4 * np.cos(2 * t)])))
 
 
-def parts() -> hk.LevelSet:
+def parts() -> hk.Surface:
     from harnack.gallery import SCENES
 
     return SCENES["exoskeleton"].surfaces()[0]
 
 
-def fourier_series() -> hk.LevelSet:
+def fourier_series() -> hk.Surface:
     waves = np.random.default_rng(1).normal(size=(3, 3, 3))
     return hk.level_set(hk.FourierSeries(waves, ((-1, -1, -1), (1, 1, 1))))
 
 
-CASES: dict[str, Callable[[], hk.LevelSet]] = {
+CASES: dict[str, Callable[[], hk.Surface]] = {
     "curve": saddle,
     "domain": fourier_series,
     "combined": lambda: hk.level_set(hk.Torus(1.0, 0.4) & hk.Cuboid((1.0, 1.5, 1.5))),
@@ -67,22 +67,22 @@ def test_a_queue_changes_no_bit(name: str, precision: Any) -> None:
     ends = rng.uniform(0.5, 4, n)
 
     def ended(queued: bool) -> list[np.ndarray]:
-        one = replace(prepared, queued=queued)
+        one = replace(prepared, uses_ray_queue=queued)
         rays = to_vector3(backend, o), to_vector3(backend, d)
-        wanted = backend.Float(aligned(backend, active.astype(float))) > 0
-        hit = one.first_hit(*rays, 0, aligned(backend, ends), wanted)
-        blocked = one.occluded(*rays, 0, aligned(backend, ends), wanted)
-        found = [hit.t, hit.value, hit.gradient, hit.evaluations, hit.status, hit.sheet, blocked]
-        found += [] if hit.part is None else [hit.part]
+        wanted = backend.Float(upload_floats(backend, active.astype(float))) > 0
+        hit = one.first_hit(*rays, 0, upload_floats(backend, ends), wanted)
+        blocked = one.occluded(*rays, 0, upload_floats(backend, ends), wanted)
+        found = [hit.t, hit.value, hit.gradient, hit.evaluations, hit.status, hit.facet, blocked]
+        found += [] if hit.patch is None else [hit.patch]
         dr.eval(found)
         return [np.broadcast_to(to_numpy(x), (n, *to_numpy(x).shape[1:])) for x in found]
 
     one_by_one, queued = ended(False), ended(True)
     some = one_by_one[4]
-    assert (some == int(hk.Status.HIT)).sum() > n // 20
-    assert (some[~active] == int(hk.Status.MISS)).all()
+    assert (some == int(hk.RayStatus.HIT)).sum() > n // 20
+    assert (some[~active] == int(hk.RayStatus.MISS)).all()
     if name == "few steps":
-        assert (some == int(hk.Status.OUT_OF_STEPS)).any()
+        assert (some == int(hk.RayStatus.OUT_OF_STEPS)).any()
     for a, b in zip(one_by_one, queued, strict=True):
         # What a ray that missed saw last is of no meaning, but no other lane may write it.
         np.testing.assert_array_equal(a[active], b[active])
@@ -133,7 +133,7 @@ def test_scattered_rays_end_as_others() -> None:
     o, d = eye_rays(80)
     order = np.random.default_rng(0).permutation(6400)
     hits, others = hk.trace(surface, o, d), hk.trace(surface, o, d[order])
-    assert hits.hit.sum() > 1000
+    assert hits.is_hit.sum() > 1000
     for name in ("t", "position", "normal", "evaluations", "status"):
         np.testing.assert_array_equal(getattr(hits, name)[order], getattr(others, name))
 
@@ -162,7 +162,7 @@ def test_each_lane_of_a_queue_is_followed_to_its_end(n: int, share: float) -> No
     def down(now: _Count) -> _Count:
         return _Count(now.left - 1, now.steps + 2, now.active & (now.left > 1))
 
-    end = while_queued(start, down, lambda now: now, "count")
+    end = loop_with_queue(start, down, lambda now: now, "count")
     np.testing.assert_array_equal(to_numpy(end.left), np.where(active, 0, numbers))
     np.testing.assert_array_equal(to_numpy(end.steps), np.where(active, 2 * numbers, 0))
     assert not to_numpy(end.active)[active].any()
@@ -186,7 +186,9 @@ def test_only_some_lanes_are_computed(n: int, share: float) -> None:
         return Pair(2 * pair.a, pair.b + 1)
 
     lanes = Pair(backend.Float(x), backend.Float(3))
-    made = on_some(backend.Bool(mask), double, lanes, Pair(backend.Float(-1), backend.Float(-2)))
+    made = compute_on_active(
+        backend.Bool(mask), double, lanes, Pair(backend.Float(-1), backend.Float(-2))
+    )
     np.testing.assert_array_equal(to_numpy(made.a), np.where(mask, 2 * x, -1))
     np.testing.assert_array_equal(to_numpy(made.b), np.where(mask, 4, -2))
     # One number counts as the same in all lanes.

@@ -9,7 +9,7 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.fields.capabilities import NO_SHEET, Crossing
+from harnack.fields.capabilities import NO_FACET, JumpCrossing
 from harnack.geometry.example_curves import wavy_polygon
 from harnack.geometry.example_meshes import icosphere
 from tests.fields.test_solid_angle import CurveOracle, lines_beside, moves_along, unit
@@ -55,9 +55,9 @@ def test_what_is_promised_along_rays_holds(thinness: float, method: str, precisi
     field = hk.WindingNumber(*mesh, method=method).prepare(backend)  # type: ignore[arg-type]
     o, along = to_vector3(backend, x), to_vector3(backend, d)
     start = backend.Float(-1e-20)
-    first = Crossing(start, backend.UInt32(NO_SHEET), backend.Float(0), along)
-    turns = field.offset(o, along, start, backend.Bool(True))
-    promises = field.between(o, along, first, first, turns).evaluate(o).along
+    first = JumpCrossing(start, backend.UInt32(NO_FACET), backend.Float(0), along)
+    turns = field.initial_offset(o, along, start, backend.Bool(True))
+    promises = field.continuation(o, along, first, first, turns).evaluate(o).ray_promises
     gain = 0.0
     for promise in promises:
         rate, length = to_numpy(promise.constant) * 4 * math.pi, to_numpy(promise.radius)
@@ -73,8 +73,8 @@ def test_what_is_promised_along_rays_holds(thinness: float, method: str, precisi
 def test_a_sample_off_rays_promises_nothing_along_one() -> None:
     field, backend = hk.WindingNumber(*slivers(1e-2, 4)), choose_backend("double")
     sample = field.evaluate(backend.Array3f(0.1, 0.2, 0.3))
-    assert sample.known
-    assert not sample.along
+    assert sample.promises
+    assert not sample.ray_promises
 
 
 @pytest.mark.few(3)
@@ -89,12 +89,12 @@ def test_rays_in_the_planes_of_slivers_end(thinness: float, method: str, precisi
     o = (q - 2 * d).astype(np.float32).astype(float)
     field = hk.WindingNumber(*mesh, method=method)  # type: ignore[arg-type]
     end = hk.trace(field, o, d, tolerance=1e-6, precision=precision)  # type: ignore[arg-type]
-    assert (end.status != int(hk.Status.OUT_OF_STEPS)).all()
+    assert (end.status != int(hk.RayStatus.OUT_OF_STEPS)).all()
     assert end.evaluations.mean() < 60
     if precision == "single":
         return
     exact = hk.WindingNumber(*mesh, method="exact")
-    missed = np.flatnonzero(end.status == int(hk.Status.MISS))
+    missed = np.flatnonzero(end.status == int(hk.RayStatus.MISS))
     t = np.linspace(0, 10, 4000)[:, None]
     for k in missed:
         assert (exact.value(o[k] + t * unit(d[[k]]), precision="double") < 0.5).all()
@@ -131,7 +131,7 @@ def test_rays_that_pass_edges_at_small_angles_end(kind: str, precision: str) -> 
         d = b - a + tilt * length * rng.normal(size=(n, 3))
         for tolerance in (1e-4, 1e-6):
             end = hk.trace(field, at - 2 * d, d, tolerance=tolerance, precision=precision)  # type: ignore[arg-type]
-            assert (end.status != int(hk.Status.OUT_OF_STEPS)).all()
+            assert (end.status != int(hk.RayStatus.OUT_OF_STEPS)).all()
 
 
 @pytest.mark.few(1)
@@ -156,4 +156,4 @@ def test_rays_along_cracks_of_t_junctions_end(method: str, precision: str) -> No
     for level in (0.01, 0.05):
         for target in (b - a, a - 3 * b):
             end = hk.trace(field, a - 1.5 * target, target, level=level, precision=precision)  # type: ignore[arg-type]
-            assert (end.status != int(hk.Status.OUT_OF_STEPS)).mean() > 0.99
+            assert (end.status != int(hk.RayStatus.OUT_OF_STEPS)).mean() > 0.99

@@ -39,11 +39,11 @@ def test_no_surface_slips_through(bound: str, precision: str, tolerance: float) 
     o, d = camera(48)
     plain = hk.trace(field, o, d, overstep=1.0, tolerance=1e-5, precision="double")
     over = hk.trace(field, o, d, bound=bound, tolerance=tolerance, precision=precision)
-    assert plain.hit.sum() > 500
+    assert plain.is_hit.sum() > 500
     # Rays within the coarser tolerance of the border may go either way.
-    assert (over.hit != plain.hit).sum() <= 2
-    both = over.hit & plain.hit
-    assert (over.status != hk.Status.OUT_OF_STEPS).all()
+    assert (over.is_hit != plain.is_hit).sum() <= 2
+    both = over.is_hit & plain.is_hit
+    assert (over.status != hk.RayStatus.OUT_OF_STEPS).all()
     assert np.quantile(np.abs(over.t - plain.t)[both], 0.99) < 2e-4
 
 
@@ -83,7 +83,7 @@ def test_no_ray_passes_a_jump(name: str, precision: str) -> None:
     o, d, t = through(plane, offset)
     solid = hk.solid(hk.expression(formula), below=0)
     hits = hk.trace(solid, o, d, t_max=t + 0.2, precision=precision, max_steps=150)
-    assert (hits.status != hk.Status.MISS).all()
+    assert (hits.status != hk.RayStatus.MISS).all()
     assert (hits.t <= t + 1e-5).all()
 
 
@@ -100,16 +100,16 @@ def test_no_ray_passes_a_jump_by_any_proof(kind: str) -> None:
     surface = hk.expression(JUMPS["atan2"][0])
     settings = {}
     if kind == "union":
-        surface = hk.solid(surface, below=0) | hk.Sphere(0.1).moved((50, 0, 0))
+        surface = hk.solid(surface, below=0) | hk.Sphere(0.1).translated((50, 0, 0))
     elif kind == "moved":
-        surface, o = hk.solid(surface, below=0).moved((0.3, 0.1, 0)), np.add(o, (0.3, 0.1, 0))
+        surface, o = hk.solid(surface, below=0).translated((0.3, 0.1, 0)), np.add(o, (0.3, 0.1, 0))
     else:
         settings = {"confirm": True} if kind == "confirm" else {"bound": kind}
     for precision in ("single", "double"):
         hits = hk.trace(
             surface, o, d, t_max=t + 0.2, precision=precision, max_steps=150, **settings
         )
-        assert (hits.status == hk.Status.OUT_OF_STEPS).all()
+        assert (hits.status == hk.RayStatus.OUT_OF_STEPS).all()
         assert (hits.t <= t + 1e-5).all()
 
 
@@ -118,4 +118,4 @@ def test_height_fields_stop_at_jumps() -> None:
     domain = hk.geometry.Box((-5, -5, -20), (5, 5, 20))
     field = hk.HeightField(lambda x, y: 10 * hk.atan(1 / (x - y)), domain=domain)
     hits = hk.trace(field, o, d, t_max=t + 0.2, precision="single", max_steps=150)
-    assert (hits.status != hk.Status.MISS).all()
+    assert (hits.status != hk.RayStatus.MISS).all()

@@ -25,22 +25,22 @@ from harnack.backend import (
 )  # fmt: skip
 from harnack.backend.elementary import clamp, fmax, fmin
 from harnack.enclosures import (
-    Curvature,
     Enclosure,
     HarmonicBall,
-    Slopes,
-    TargetLevels,
-    choose_proofs,
+    Levels,
+    SlopeRange,
+    TaylorRemainder,
+    choose_enclosures,
 )
-from harnack.enclosures.harmonic_ball import Caps, Slope
-from harnack.enclosures.parabola import Taylor
+from harnack.enclosures.harmonic_ball import HarnackSlopeEnclosure, SphericalCapEnclosure
+from harnack.enclosures.parabola import TaylorEnclosure
 from harnack.fields import Field, Sample
-from harnack.fields.capabilities import NO_SHEET, Crossing
-from harnack.fields.samples import Path as RayPath
-from harnack.rendering.surface_hits import meet_surface
-from harnack.testing import scaled
-from harnack.testing.enclosure_contracts import Case
-from harnack.tracer.level_contact import compare_with_sheet
+from harnack.fields.capabilities import NO_FACET, JumpCrossing
+from harnack.fields.samples import Ray as RayPath
+from harnack.rendering.surface_hits import intersect_surface
+from harnack.testing import mutated_enclosure
+from harnack.testing.enclosure_contracts import PromiseCase
+from harnack.tracer.level_contact import test_jump as jump_test
 from tests.oracles.exact import exact_step, on_host
 from tests.oracles.jump_oracle import first_side_changes, judge
 
@@ -105,13 +105,13 @@ class Stretch:
 
     d: Vec3
     passage: Passage
-    behind: Crossing
+    behind: JumpCrossing
     offset: Real
 
     def is_behind(self, i: int) -> Mask:
         """Whether the crossing of triangle i, if there is one, has been passed."""
         t = self.passage.crossings[i][0]
-        return (t < self.behind.t) | ((t == self.behind.t) & (self.behind.sheet >= i))
+        return (t < self.behind.t) | ((t == self.behind.t) & (self.behind.facet >= i))
 
 
 class BruteForceWinding(hk.Field):
@@ -122,7 +122,7 @@ class BruteForceWinding(hk.Field):
     edges that do not cancel. jump: a factor that spoils what is said of jumps, 1 for the truth.
     """
 
-    has_sheets = True
+    has_jumps = True
     default_level = 0.5
 
     def __init__(self, vertices: Any, faces: Any, *, jump: float = 1.0) -> None:
@@ -139,7 +139,7 @@ class BruteForceWinding(hk.Field):
         corners = [backend.Array3f(*v.tolist()) - p for v in self.vertices]
         gradient, distance, variation = self._edge_sums(backend, corners)
         value, error = self._value(backend, corners)
-        error = backend.epsilon * (8 + error)
+        error = backend.machine_epsilon * (8 + error)
         if not self.edges:
             return hk.Sample(value, gradient, (hk.Lipschitz(1e-9),), error)
         r = 0.5 * distance
@@ -193,22 +193,24 @@ class BruteForceWinding(hk.Field):
             variation += n * fmin(length / (left * left), 2 / left)
         return gradient / FOUR_PI, near, variation / FOUR_PI
 
-    def next_crossing(
-        self, o: Vec3, d: Vec3, after: Crossing, t_max: Real, active: Mask
-    ) -> Crossing:
-        best = Crossing(type(o.x)(dr.inf), dr.uint32_array_t(o.x)(NO_SHEET), 0 * o.x, 0 * d)
+    def next_jump(
+        self, o: Vec3, d: Vec3, after: JumpCrossing, t_max: Real, active: Mask
+    ) -> JumpCrossing:
+        best = JumpCrossing(type(o.x)(dr.inf), dr.uint32_array_t(o.x)(NO_FACET), 0 * o.x, 0 * d)
         passage = Passage.of(o, d, self.vertices, self.faces)
         for i, (t, side) in enumerate(passage.crossings):
-            later = (t > after.t) | ((t == after.t) & (after.sheet < i))
+            later = (t > after.t) | ((t == after.t) & (after.facet < i))
             better = active & (side != 0) & later & (t <= t_max) & (t < best.t)
             normal = -self._normal(d, i)
             found = (t, i, -self.jump * side, normal)
-            mine = (best.t, best.sheet, best.jump, best.normal)
-            best = Crossing(*(dr.select(better, x, y) for x, y in zip(found, mine, strict=True)))
+            mine = (best.t, best.facet, best.jump, best.normal)
+            best = JumpCrossing(
+                *(dr.select(better, x, y) for x, y in zip(found, mine, strict=True))
+            )
         return best
 
-    def between(
-        self, o: Vec3, d: Vec3, behind: Crossing, ahead: Crossing, offset: Real
+    def continuation(
+        self, o: Vec3, d: Vec3, behind: JumpCrossing, ahead: JumpCrossing, offset: Real
     ) -> BruteForceWinding:
         other = type(self)(self.vertices, self.faces)
         passage = Passage.of(o, d, self.vertices, self.faces)
@@ -242,7 +244,7 @@ class CountedWinding(BruteForceWinding):
     triangles, taken as they appear, is off.
     """
 
-    def offset(self, o: Vec3, d: Vec3, t_min: Real, active: Mask) -> Real:
+    def initial_offset(self, o: Vec3, d: Vec3, t_min: Real, active: Mask) -> Real:
         del active
         passage = Passage.of(o, d, self.vertices, self.faces)
         return sum(dr.select(t > t_min, side, 0) for t, side in passage.crossings)
@@ -384,7 +386,7 @@ def leaves_domain(o: np.ndarray, d: np.ndarray) -> np.ndarray:
 
 
 def hit_t(hits: hk.Hits) -> np.ndarray:
-    return np.where(hits.hit, hits.t, np.inf).astype(np.float64)
+    return np.where(hits.is_hit, hits.t, np.inf).astype(np.float64)
 
 
 KINDS = [BruteForceWinding, CountedWinding]
@@ -414,23 +416,23 @@ def test_first_hits_agree_with_samples_of_the_exact_value(name: str) -> None:
             where = f"{kind.__name__} {precision}: {verdict}"
             assert verdict.wrong == 0, where
             assert verdict.changes > 600, where
-            assert not (hits.status == hk.Status.OUT_OF_STEPS).any(), where
+            assert not (hits.status == hk.RayStatus.OUT_OF_STEPS).any(), where
             check_sheets_hit(hits, exact, faces, d)
-            smooth = (hits.hit & (hits.sheet < 0)).sum()
+            smooth = (hits.is_hit & (hits.primitive_index < 0)).sum()
             if len(exact.edges) == 0:
                 assert smooth == 0, where
             elif name != "doubled faces":  # whose smooth level 1/2 is the edges alone
                 assert smooth > 50, where
-            assert (hits.sheet >= 0).sum() > 300, where
+            assert (hits.primitive_index >= 0).sum() > 300, where
 
 
 def check_sheets_hit(hits: hk.Hits, exact: ExactWinding, faces: np.ndarray, d: np.ndarray) -> None:
     """The index is that of a triangle that the hit lies on, the normal its own, to the side of
     the larger value, and the value is that before it."""
-    rows = np.flatnonzero(hits.sheet >= 0)
-    assert hits.hit[rows].all()
-    assert (hits.sheet < len(faces)).all()
-    triangle = exact.triangles[hits.sheet[rows]]
+    rows = np.flatnonzero(hits.primitive_index >= 0)
+    assert hits.is_hit[rows].all()
+    assert (hits.primitive_index < len(faces)).all()
+    triangle = exact.triangles[hits.primitive_index[rows]]
     normal = unit(np.cross(triangle[:, 1] - triangle[:, 0], triangle[:, 2] - triangle[:, 0]))
     # The winding number is larger behind the faces.
     np.testing.assert_allclose(hits.normal[rows], -normal, atol=1e-6)
@@ -490,7 +492,7 @@ def test_the_oracle_sees_hits_that_are_late_early_or_not_there() -> None:
     end = leaves_domain(o, d)
     hits = hk.trace(BruteForceWinding(vertices, faces), o, d, tolerance=TOLERANCE)
     limits: Any = {"level": 0.5, "reach": REACH, "edges": exact.edges, "samples": 400}
-    t, found = hit_t(hits), hits.hit & (hits.t > 0.1)
+    t, found = hit_t(hits), hits.is_hit & (hits.t > 0.1)
     for spoiled, wrong in (
         (t + 10 * REACH, "missed"),
         (np.full_like(t, np.inf), "missed"),
@@ -520,7 +522,7 @@ def test_a_level_that_a_jump_cuts_off_is_within_reach_or_not(short: float, early
 class Staircase(hk.Field):
     """slope * x, and a jump at each of some planes x = const: all steps are known exactly."""
 
-    has_sheets = True
+    has_jumps = True
 
     def __init__(self, slope: float, planes: dict[float, float], lift: Real | None = None) -> None:
         self.slope, self.planes, self.lift = slope, planes, lift
@@ -532,19 +534,19 @@ class Staircase(hk.Field):
         gradient = type(p)(self.slope, 0, 0)
         return hk.Sample(self.slope * p.x + lift, gradient, (hk.Lipschitz(abs(self.slope)),))
 
-    def next_crossing(
-        self, o: Vec3, d: Vec3, after: Crossing, t_max: Real, active: Mask
-    ) -> Crossing:
-        t, sheet, jump = type(o.x)(dr.inf), dr.uint32_array_t(o.x)(NO_SHEET), type(o.x)(0)
+    def next_jump(
+        self, o: Vec3, d: Vec3, after: JumpCrossing, t_max: Real, active: Mask
+    ) -> JumpCrossing:
+        t, sheet, jump = type(o.x)(dr.inf), dr.uint32_array_t(o.x)(NO_FACET), type(o.x)(0)
         for i, (x, height) in enumerate(self.planes.items()):
             there = (x - o.x) / d.x
-            later = (there > after.t) | ((there == after.t) & (after.sheet < i))
+            later = (there > after.t) | ((there == after.t) & (after.facet < i))
             better = active & later & (there <= t_max) & (there < t)
             t, sheet = dr.select(better, there, t), dr.select(better, i, sheet)
             jump = dr.select(better, dr.mulsign(type(t)(height), d.x), jump)
-        return Crossing(t, sheet, jump, type(d)(dr.mulsign(1 + 0 * t, jump * d.x), 0, 0))
+        return JumpCrossing(t, sheet, jump, type(d)(dr.mulsign(1 + 0 * t, jump * d.x), 0, 0))
 
-    def offset(self, o: Vec3, d: Vec3, t_min: Real, active: Mask) -> Real:
+    def initial_offset(self, o: Vec3, d: Vec3, t_min: Real, active: Mask) -> Real:
         del active
         total = type(o.x)(0)
         for x, height in self.planes.items():
@@ -552,8 +554,8 @@ class Staircase(hk.Field):
             total += dr.select(is_ahead == (d.x > 0), 0, height)
         return total
 
-    def between(
-        self, o: Vec3, d: Vec3, behind: Crossing, ahead: Crossing, offset: Real
+    def continuation(
+        self, o: Vec3, d: Vec3, behind: JumpCrossing, ahead: JumpCrossing, offset: Real
     ) -> Staircase:
         del o, d, behind, ahead
         return Staircase(self.slope, self.planes, offset)
@@ -593,7 +595,7 @@ def test_staircases(precision: Any, overstep: float) -> None:
             t_max=t_max, precision=precision, overstep=overstep, tolerance=1e-5,
         )  # fmt: skip
         assert hits.t[0] == pytest.approx(t, abs=1e-4), (slope, planes, x)
-        assert hits.sheet[0] == sheet, (slope, planes, x)
+        assert hits.primitive_index[0] == sheet, (slope, planes, x)
 
 
 class Approximate(hk.Field):
@@ -633,7 +635,7 @@ def test_gradients_known_up_to_an_error(bound: Any, overstep: float, direction: 
 # --- steps with slopes known up to an error ------------------------------------------------------
 
 
-def uncertain(rows: int, seed: int) -> list[tuple[type[Enclosure], Case, Any, Any]]:
+def uncertain(rows: int, seed: int) -> list[tuple[type[Enclosure], PromiseCase, Any, Any]]:
     """(proof, case, slope, error) of all kinds; slopes so large that they matter."""
     rng, real = np.random.default_rng(seed), choose_backend("double").Float
 
@@ -645,11 +647,15 @@ def uncertain(rows: int, seed: int) -> list[tuple[type[Enclosure], Case, Any, An
     slope = 2 * rng.uniform(-1, 1, rows) * np.minimum(below, above) / radius
     error = around_one() * 0.2 * np.abs(slope)
     on_ball = HarmonicBall(*map(real, (radius, -below, above)))
-    ball = Case(on_ball, real(np.minimum(down, below)), real(np.minimum(up, above)))
-    curved = Case(Curvature(real(around_one()), real(radius)), real(down), real(up))
+    ball = PromiseCase(on_ball, real(np.minimum(down, below)), real(np.minimum(up, above)))
+    curved = PromiseCase(TaylorRemainder(real(around_one()), real(radius)), real(down), real(up))
     return [
         (kind, case, real(slope), real(error))
-        for kind, case in ((Slope, ball), (Caps, ball), (Taylor, curved))
+        for kind, case in (
+            (HarnackSlopeEnclosure, ball),
+            (SphericalCapEnclosure, ball),
+            (TaylorEnclosure, curved),
+        )
     ]
 
 
@@ -662,7 +668,7 @@ def check_uncertain_steps(factor: float = 1.0, covers: float = 1.0) -> None:
         host, middle, off = on_host(case, 2000), to_numpy(slope), to_numpy(error)
         exact = np.minimum(*(exact_step(kind, host, middle + s * off) for s in (1, -1)))
         alone = exact_step(kind, host, middle)
-        wrong = scaled(kind, factor, covers=covers)
+        wrong = mutated_enclosure(kind, factor, covers=covers)
         found = to_numpy(case.step(wrong, slope, error))
         ratio = found / exact
         assert ratio.max() <= 1 + 1e-12, kind
@@ -694,7 +700,9 @@ def test_steps_too_long_for_the_worst_slope_are_seen(factor: float) -> None:
 def test_steps_that_ignore_the_error_of_the_slope_are_seen(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(Slopes, "around", classmethod(lambda cls, slope, error: cls(slope, slope)))
+    monkeypatch.setattr(
+        SlopeRange, "around", classmethod(lambda cls, slope, error: cls(slope, slope))
+    )
     with pytest.raises(AssertionError):
         check_uncertain_steps()
 
@@ -706,14 +714,16 @@ def test_looks_see_the_error_of_the_slope_in_both_directions() -> None:
 
     class Uncertain(Field):
         def evaluate(self, p: Any) -> Sample:
-            return Sample(p.x, backend.Array3f(1, 0, 0), (Curvature(1.0),), gradient_error=0.25)
+            return Sample(
+                p.x, backend.Array3f(1, 0, 0), (TaylorRemainder(1.0),), gradient_error=0.25
+            )
 
     o, d = backend.Array3f(0, 0, 0), backend.Array3f(1, 0, 0)
-    look = Uncertain().look(RayPath(o, d, choose_proofs(None)), real(0), real(1), real(1))
-    (ahead,), (back,) = look.ahead, look.back
-    assert isinstance(ahead, Taylor)
-    assert isinstance(back, Taylor)
-    ends = [ahead.slopes.low, ahead.slopes.high, back.slopes.low, back.slopes.high]
+    look = Uncertain().sample_ray(RayPath(o, d, choose_enclosures(None)), real(0), real(1), real(1))
+    (ahead,), (back,) = look.forward, look.backward
+    assert isinstance(ahead, TaylorEnclosure)
+    assert isinstance(back, TaylorEnclosure)
+    ends = [ahead.slopes.lower, ahead.slopes.upper, back.slopes.lower, back.slopes.upper]
     assert [float(end[0]) for end in ends] == [0.75, 1.25, -1.25, -0.75]
 
 
@@ -743,8 +753,8 @@ def test_rays_that_begin_and_end_anywhere(kind: type[BruteForceWinding]) -> None
         assert len(rows) > 200
         hits = hk.trace(field, o, d, tolerance=TOLERANCE, **settings)
         t = hit_t(hits)
-        assert not hits.hit[start > end + 1e-5].any()
-        assert ((t >= start - 1e-5) | ~hits.hit).all()
+        assert not hits.is_hit[start > end + 1e-5].any()
+        assert ((t >= start - 1e-5) | ~hits.is_hit).all()
         verdict = judge(
             t[rows], exact, o[rows], d[rows], start[rows], end[rows],
             level=0.5, reach=REACH, samples=400,
@@ -773,7 +783,7 @@ def test_a_sheet_at_the_start_is_met_there() -> None:
     assert hits.t.tolist() == [0.0]
     hits = hk.trace(field, o + np.array([[0, 0, 1.0]]), d, t_min=1.0)
     assert hits.t.tolist() == [1.0]
-    assert hits.sheet.tolist() == hk.trace(field, o, d).sheet.tolist()
+    assert hits.primitive_index.tolist() == hk.trace(field, o, d).primitive_index.tolist()
     beyond = hk.trace(field, o, d, t_min=1e-3)
     assert beyond.t[0] > 1e-3
 
@@ -786,18 +796,18 @@ def test_few_steps_end_with_the_proved_length() -> None:
     full = hk.trace(field, o, d)
     for steps in (1, 2, 3, 6):
         short = hk.trace(field, o, d, max_steps=steps)
-        out = short.status == hk.Status.OUT_OF_STEPS
+        out = short.status == hk.RayStatus.OUT_OF_STEPS
         assert out.any()
         assert (short.evaluations <= steps).all()
         assert (short.t[out] <= full.t[out] + 1e-5).all()
-        assert (short.sheet[out] == -1).all()
+        assert (short.primitive_index[out] == -1).all()
         np.testing.assert_array_equal(short.t[~out], full.t[~out])
     boxes = BruteForceWinding(*MESHES["nested boxes"])
     ray = np.array([[0.05, 0.1, 2.9]]), np.array([[0.0, 0.0, -1.0]])
     for steps in (1, 2, 3):  # the second passes the outer box, the third hits the inner one
         hits = hk.trace(boxes, *ray, level=1.5, max_steps=steps)
         assert hits.evaluations.tolist() == [steps]
-        assert hits.hit.tolist() == [steps == 3]
+        assert hits.is_hit.tolist() == [steps == 3]
 
 
 def test_closed_meshes_cost_one_evaluation_a_crossing() -> None:
@@ -823,8 +833,8 @@ def test_drjit_rays_get_the_same(precision: Any) -> None:
     o, d = rays(vertices, 300)
     plain = hk.trace(field, o, d, precision=precision)
     hits = hk.trace(field, backend.Array3f(o.T), backend.Array3f(d.T))
-    assert type(hits.sheet) is backend.Int32
-    for name in ("t", "normal", "evaluations", "status", "sheet"):
+    assert type(hits.primitive_index) is backend.Int32
+    for name in ("t", "normal", "evaluations", "status", "primitive_index"):
         np.testing.assert_array_equal(to_numpy(getattr(hits, name)), getattr(plain, name))
 
 
@@ -837,7 +847,7 @@ def test_occlusion_is_a_hit() -> None:
     active = dr.arange(backend.UInt32, 400) % 3 != 0
     status = to_numpy(prepared.first_hit(o, d, 0, far, active).status)
     blocked = to_numpy(prepared.occluded(o, d, 0, far, active))
-    np.testing.assert_array_equal(blocked, status != hk.Status.MISS)
+    np.testing.assert_array_equal(blocked, status != hk.RayStatus.MISS)
     assert not blocked[~to_numpy(active)].any()
     assert 50 < blocked.sum() < 300
 
@@ -846,23 +856,23 @@ def test_fields_without_sheets_are_not_asked_for_them(monkeypatch: pytest.Monkey
     def fail(*_: Any) -> None:
         raise AssertionError("asked")
 
-    for name in ("next_crossing", "between", "offset"):
+    for name in ("next_jump", "continuation", "initial_offset"):
         monkeypatch.setattr(hk.Field, name, fail)
     o, d = rays(CUBE, 50)
     hits = hk.trace(hk.Gyroid(domain=hk.Ball(radius=3.0)), o, d)
-    assert hits.hit.any()
-    assert (hits.sheet == -1).all()
-    assert hits.sheet.dtype == np.int64
-    assert hk.trace(hk.Gyroid(), o[:0], d[:0]).sheet.shape == (0,)
+    assert hits.is_hit.any()
+    assert (hits.primitive_index == -1).all()
+    assert hits.primitive_index.dtype == np.int64
+    assert hk.trace(hk.Gyroid(), o[:0], d[:0]).primitive_index.shape == (0,)
 
 
 def test_defaults_know_no_sheets() -> None:
     field, backend = hk.Gyroid(), choose_backend("single")
     one, ray = backend.Float(1), backend.Array3f(1, 0, 0)
-    start = Crossing(one, backend.UInt32(NO_SHEET), one, ray)
-    assert field.next_crossing(ray, ray, start, one, backend.Bool(True)).t == math.inf
-    assert field.between(ray, ray, start, start, one) is field
-    assert field.distance_to_sheets(ray) == math.inf
+    start = JumpCrossing(one, backend.UInt32(NO_FACET), one, ray)
+    assert field.next_jump(ray, ray, start, one, backend.Bool(True)).t == math.inf
+    assert field.continuation(ray, ray, start, start, one) is field
+    assert field.distance_to_jumps(ray) == math.inf
 
 
 # --- a level on the value of a side ---------------------------------------------------------
@@ -883,12 +893,10 @@ def test_a_level_within_rounding_of_a_side_counts_as_between(
 ) -> None:
     backend = choose_backend("single")
     real, vector = backend.Float, backend.Array3f
-    for sheet, there in ((3, True), (3, False), (NO_SHEET, True)):
-        ahead = Crossing(real(1), backend.UInt32(sheet), real(jump), vector(0, 0, 1))
-        met = compare_with_sheet(
-            ahead, backend.Bool(there), real(before), real(1e-6), TargetLevels((0.5,))
-        )
-        reached = there and sheet != NO_SHEET
+    for sheet, there in ((3, True), (3, False), (NO_FACET, True)):
+        ahead = JumpCrossing(real(1), backend.UInt32(sheet), real(jump), vector(0, 0, 1))
+        met = jump_test(ahead, backend.Bool(there), real(before), real(1e-6), Levels((0.5,)))
+        reached = there and sheet != NO_FACET
         assert met.at_crossing == [reached]
         assert met.is_hit == [hit and reached]
 
@@ -904,14 +912,14 @@ def test_derivatives_by_rays_are_those_of_the_plane() -> None:
     o, d = rays(vertices, 200, seed=3, closest=1e-3)
     plain = hk.trace(field, o, d, precision="double", tolerance=1e-12)
     steep = np.abs((plain.normal * d).sum(axis=1)) > 0.1
-    keep = plain.hit & steep & (plain.t > 1e-3)
-    o, d, on_sheet = o[keep], d[keep], plain.sheet[keep] >= 0
+    keep = plain.is_hit & steep & (plain.t > 1e-3)
+    o, d, on_sheet = o[keep], d[keep], plain.primitive_index[keep] >= 0
     assert 20 < on_sheet.sum() < keep.sum() - 10
     way, turn = np.array([0.3, -0.2, 0.5]), np.array([-0.1, 0.25, 0.15])
 
     def solve(s: float) -> np.ndarray:
         hits = hk.trace(field, o + s * way, d + s * turn, precision="double", tolerance=1e-12)
-        assert hits.hit.all()
+        assert hits.is_hit.all()
         return hits.t
 
     h = 1e-6
@@ -942,7 +950,7 @@ def test_the_level_moves_smooth_hits_only() -> None:
         backend.Array3f(o.T), backend.Array3f(d.T), level=level,
     )  # fmt: skip
     dr.set_grad(level, 1)
-    moved, sheet = to_numpy(dr.forward_to(hits.t)), to_numpy(hits.sheet)
+    moved, sheet = to_numpy(dr.forward_to(hits.t)), to_numpy(hits.primitive_index)
     assert (moved[sheet >= 0] == 0).all()
     assert (moved[(sheet < 0) & np.isfinite(to_numpy(hits.t))] != 0).sum() > 10
 
@@ -990,16 +998,18 @@ def test_rays_that_leave_a_sheet_do_not_meet_it_again() -> None:
         prepared = hk.level_set(field, tolerance=1e-6 * scale).prepare(backend)
         o, d = rays(vertices, 1000, seed=4)
         ray = backend.Array3f((scale * o).T), backend.Array3f(d.T)
-        met = meet_surface(prepared, *ray, math.inf, backend.Bool(True))
+        met = intersect_surface(prepared, *ray, math.inf, backend.Bool(True))
         normal = to_numpy(met.normal)
         side = np.sign((normal * d).sum(axis=1))
-        np.testing.assert_allclose(np.linalg.norm(normal, axis=1)[to_numpy(met.met)], 1, atol=1e-5)
-        outside = to_numpy(met.met) & (side > 0)  # the normal points into the tetrahedron
+        np.testing.assert_allclose(
+            np.linalg.norm(normal, axis=1)[to_numpy(met.is_hit)], 1, atol=1e-5
+        )
+        outside = to_numpy(met.is_hit) & (side > 0)  # the normal points into the tetrahedron
         assert outside.sum() > 200
         way = unit(np.random.default_rng(0).normal(size=d.shape))
         away = (way * normal).sum(axis=1, keepdims=True)
         way = unit(way - (away + 1e-4 * np.abs(away)) * normal)  # nearly along the face, outwards
-        start = to_numpy(met.position) - to_numpy(met.clearance)[:, None] * normal
+        start = to_numpy(met.position) - to_numpy(met.ray_offset)[:, None] * normal
         blocked = prepared.occluded(
             backend.Array3f(start.T), backend.Array3f(way.T), 0, math.inf,
             backend.Bool(outside),
@@ -1014,9 +1024,9 @@ def test_polished_hits_stay_on_the_surface_and_sheets_where_they_are() -> None:
     prepared = hk.level_set(BruteForceWinding(vertices, faces), tolerance=1e-4).prepare(backend)
     o, d = rays(vertices, 500, closest=1e-2)
     ray = backend.Array3f(o.T), backend.Array3f(d.T)
-    met = meet_surface(prepared, *ray, math.inf, backend.Bool(True))
+    met = intersect_surface(prepared, *ray, math.inf, backend.Bool(True))
     trace = prepared.first_hit(*ray, 0, math.inf)
-    found, on_sheet = to_numpy(met.met), to_numpy(trace.on_sheet)
+    found, on_sheet = to_numpy(met.is_hit), to_numpy(trace.at_jump)
     position = to_numpy(met.position)
     np.testing.assert_array_equal(to_numpy(met.t)[on_sheet], to_numpy(trace.t)[on_sheet])
     smooth = found & ~on_sheet
@@ -1037,11 +1047,11 @@ def test_walls_thinner_than_rounding_are_not_passed() -> None:
     on_map = hk.WindingNumber(cube.vertices + place, cube.faces)
     rays = np.array([[0.1, 0.2, 4.0], [2.0, 0.0, 4.0]]), np.array([[0, 0, -1.0]] * 2)
     single = hk.trace(on_map, place + rays[0], rays[1])
-    assert single.status.tolist() == [hk.Status.OUT_OF_STEPS, hk.Status.MISS]
+    assert single.status.tolist() == [hk.RayStatus.OUT_OF_STEPS, hk.RayStatus.MISS]
     double = hk.trace(on_map, place + rays[0], rays[1], precision="double")
     assert double.t == pytest.approx([3.5, np.inf])
     far = hk.trace(near, [[0.1, 0.2, 4e6], [0.1, 0.2, 4e5]], rays[1])
-    assert far.status.tolist() == [hk.Status.OUT_OF_STEPS, hk.Status.HIT]
+    assert far.status.tolist() == [hk.RayStatus.OUT_OF_STEPS, hk.RayStatus.HIT]
     assert far.t[1] == pytest.approx(4e5 - 0.5, abs=0.1)
 
 
@@ -1049,8 +1059,8 @@ def test_views_of_an_open_cube() -> None:
     normal = hk.render(OPEN_CUBE, show="normal", size=(40, 30))
     depth = hk.render(OPEN_CUBE, show="depth", size=(40, 30))
     status = hk.render(OPEN_CUBE, show="status", size=(40, 30))
-    hit = status == hk.Status.HIT
-    assert (status != hk.Status.OUT_OF_STEPS).all()
+    hit = status == hk.RayStatus.HIT
+    assert (status != hk.RayStatus.OUT_OF_STEPS).all()
     assert 200 < hit.sum() < 1100
     np.testing.assert_allclose(np.linalg.norm(normal[hit], axis=1), 1, atol=1e-4)
     assert np.isfinite(depth[hit]).all()

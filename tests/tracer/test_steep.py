@@ -16,8 +16,8 @@ from numpy.testing import assert_array_equal
 import harnack as hk
 from harnack.arithmetic.operators import tally_of
 from harnack.backend import choose_backend, to_numpy
-from harnack.enclosures import Gaps, TargetLevels, choose_proofs
-from harnack.fields.samples import Path
+from harnack.enclosures import LevelGaps, Levels, choose_enclosures
+from harnack.fields.samples import Ray
 from harnack.tracer.steep import SteepPlace
 
 if TYPE_CHECKING:
@@ -84,8 +84,8 @@ def test_hits_are_where_the_surface_is(name: str, precision: Precision) -> None:
     truth = first_roots(f, o, d, half)
     box = hk.Box((-half,) * 3, (half,) * 3)
     hits = hk.trace(hk.expression(text), o, d, clip=box, precision=precision)
-    assert not (hits.status == hk.Status.OUT_OF_STEPS).any()
-    np.testing.assert_array_equal(hits.status == hk.Status.HIT, np.isfinite(truth))
+    assert not (hits.status == hk.RayStatus.OUT_OF_STEPS).any()
+    np.testing.assert_array_equal(hits.status == hk.RayStatus.HIT, np.isfinite(truth))
     both = np.isfinite(truth)
     assert both.sum() > 40
     np.testing.assert_allclose(hits.t[both], truth[both], atol=2e-3)
@@ -108,7 +108,7 @@ def test_no_surface_is_hit_where_there_is_none(text: str) -> None:
     o, d = rays(1.0)
     box = hk.Box((-1, -1, -1), (1, 1, 1))
     hits = hk.trace(hk.expression(text), o, d, clip=box)
-    assert (hits.status == hk.Status.MISS).all()
+    assert (hits.status == hk.RayStatus.MISS).all()
 
 
 def test_poles_are_no_surfaces() -> None:
@@ -162,9 +162,9 @@ def test_hits_by_rounding(text: str, o: Any, d: Any, precision: Precision, t: fl
     rounding hides is found by looking, or the ray stops."""
     hits = hk.trace(hk.expression(text), [o], [d], t_max=3.0, precision=precision)
     if t is None:
-        assert hits.status[0] != hk.Status.HIT
+        assert hits.status[0] != hk.RayStatus.HIT
     else:
-        assert hits.status[0] == hk.Status.OUT_OF_STEPS or abs(hits.t[0] - t) < 3e-4
+        assert hits.status[0] == hk.RayStatus.OUT_OF_STEPS or abs(hits.t[0] - t) < 3e-4
 
 
 @pytest.mark.slow
@@ -200,7 +200,7 @@ def test_powers_that_overflow() -> None:
     field = hk.expression("x^100 + y^100 + z^100 = 1")
     o, d = rays(2.0)
     hits = hk.trace(field, o, d, clip=hk.Box((-2, -2, -2), (2, 2, 2)))
-    p = hits.position[hits.status == hk.Status.HIT]
+    p = hits.position[hits.status == hk.RayStatus.HIT]
     assert len(p) > 100
     assert (abs(np.abs(p).max(1) - 1) < 0.012).all()
 
@@ -210,8 +210,8 @@ def test_steps_proved_by_values_end_before_the_level(text: str) -> None:
     """The level is at x = 1. A step that is a thousandth longer than what was proved passes it."""
     backend = choose_backend("double")
     field = hk.expression(text).prepare(backend)
-    path = Path(backend.Array3f(0, 0, 0), backend.Array3f(1, 0, 0), choose_proofs(None))
-    t, levels = backend.Float(0.25), TargetLevels((backend.Float(0.0),))
+    path = Ray(backend.Array3f(0, 0, 0), backend.Array3f(1, 0, 0), choose_enclosures(None))
+    t, levels = backend.Float(0.25), Levels((backend.Float(0.0),))
     ahead = backend.Float([0.5, 0.75 - 5e-4, 0.75 + 1e-9])
     sample = field.evaluate(path.point(t))
     free = to_numpy(SteepPlace.at(field, levels, path, t, ahead, sample).free)
@@ -223,11 +223,14 @@ def test_steps_proved_by_values_end_before_the_level(text: str) -> None:
 def test_a_slope_proves_that_a_level_is_taken_no_sooner_than_it_is() -> None:
     """Of 1 - x at x = 1/2 after half a unit: hits beside vertical tangents rest on it."""
     backend = choose_backend("double")
-    path = Path(backend.Array3f(0, 0, 0), backend.Array3f(1, 0, 0), choose_proofs(None))
+    path = Ray(backend.Array3f(0, 0, 0), backend.Array3f(1, 0, 0), choose_enclosures(None))
     t, reach, none = (backend.Float(length) for length in (0.5, 1.0, 0.0))
-    look = hk.expression("1 - x").look(path, t, reach, none)
-    gaps, lengths = Gaps(backend.Float(0.5), backend.Float(np.inf)), backend.Float([0.4998, 0.5002])
-    assert [to_numpy(proof.arrives(gaps, lengths)).tolist() for proof in look.ahead] == [
+    look = hk.expression("1 - x").sample_ray(path, t, reach, none)
+    gaps, lengths = (
+        LevelGaps(backend.Float(0.5), backend.Float(np.inf)),
+        backend.Float([0.4998, 0.5002]),
+    )
+    assert [to_numpy(proof.arrives(gaps, lengths)).tolist() for proof in look.forward] == [
         [False, True]
     ]
 
@@ -255,7 +258,7 @@ def test_solids_made_of_cusps(kind: str, confirm: bool) -> None:
     truth = first_roots(oracle, o, d, half)
     box = hk.Box((-half,) * 3, (half,) * 3)
     hits = hk.trace(solid, o, d, clip=box, confirm=confirm)
-    assert not (hits.status == hk.Status.OUT_OF_STEPS).any()
+    assert not (hits.status == hk.RayStatus.OUT_OF_STEPS).any()
     np.testing.assert_allclose(hits.t, truth, atol=2e-3)
 
 
@@ -272,7 +275,7 @@ def test_rays_pass_where_all_squares_of_a_norm_are_zero() -> None:
     o[:2], d[:2] = [[0.5, 0, 0.1], [0.5, 0.5, 0]], [[-1, 0, 0], [-(0.5**0.5), -(0.5**0.5), 0]]
     field = hk.expression(box)
     hits = hk.trace(field, 0.3 * o, d)
-    assert not (hits.status == hk.Status.OUT_OF_STEPS).any()
+    assert not (hits.status == hk.RayStatus.OUT_OF_STEPS).any()
     assert hits.evaluations.mean() < 12
     points = np.random.default_rng(1).uniform(-0.7, 0.7, (50, 3))
     assert np.isfinite(field.gradient(points)).all()
@@ -318,7 +321,7 @@ def test_which_formulas_turn_within_rounding() -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class Steps(hk.Shape):
+class Steps(hk.FormulaSolid):
     """The product of two functions of y that go from -1 to 1 at -0.5 and at `offset`."""
 
     steepness: float = 1e9
@@ -354,11 +357,13 @@ def test_no_level_is_passed_within_the_rounding_of_coordinates(precision: Precis
     settings: dict[str, Any] = {"t_max": 5.0, "precision": precision}
     for text, level in (("max(-1, min(1, 1e9*y)) - 0.1*x", 0.0), ("tanh(1e9*y)", 0.3)):
         hits = hk.trace(hk.expression(text), o, d, level=level, **settings)
-        assert_array_equal(hits.status, np.where(meets(0, o, d), hk.Status.HIT, hk.Status.MISS))
-        assert np.abs(hits.position[hits.hit, 1]).max() < 1e-4
+        assert_array_equal(
+            hits.status, np.where(meets(0, o, d), hk.RayStatus.HIT, hk.RayStatus.MISS)
+        )
+        assert np.abs(hits.position[hits.is_hit, 1]).max() < 1e-4
     crossings = hk.trace(Steps(), o, d, all_hits=3, **settings)
     assert_array_equal(crossings.count, 1 * meets(-0.5, o, d) + meets(0.25, o, d))
-    assert (crossings.status == hk.Status.MISS).all()
+    assert (crossings.status == hk.RayStatus.MISS).all()
 
 
 def test_exponentials_that_overflow() -> None:
@@ -374,7 +379,7 @@ def test_exponentials_that_overflow() -> None:
     crossings = hk.trace(field, o, d, all_hits=4, **settings)
     assert crossings.count.tolist() == [2, 1]
     np.testing.assert_allclose(crossings.t[0, :2], ends[0], atol=1e-4)
-    assert (crossings.status == hk.Status.MISS).all()
+    assert (crossings.status == hk.RayStatus.MISS).all()
 
 
 def test_what_overflows_on_the_way_to_a_value_makes_no_hit() -> None:
@@ -382,7 +387,7 @@ def test_what_overflows_on_the_way_to_a_value_makes_no_hit() -> None:
     field = hk.expression("1/(1 + (100*(x^2 + y^2 - 0.4) + 1)^80) - 0.5 + 0.1*z")
     o, d = [[-1.5809962749, -0.8071405888, -1.7603905201]], [[0.8636800647, 0.1104671583, 0.49]]
     hits = hk.trace(field, o, d, t_max=5.0, precision="single", max_steps=100)
-    assert hits.status[0] == hk.Status.OUT_OF_STEPS
+    assert hits.status[0] == hk.RayStatus.OUT_OF_STEPS
 
 
 @pytest.mark.parametrize("precision", ["single", pytest.param("double", marks=pytest.mark.slow)])
@@ -392,8 +397,8 @@ def test_ranges_beside_a_jump_are_no_values(precision: Precision) -> None:
     o = [[100, -97.5, 0.593], [100, -102.5, 0.827], [98.5, -100, 0.52], [98, -102, 0.4]]
     d = [[0, -1, 0], [0, 1, 0], [1, 0, 0], [1, 1 / 3, 0]]
     hits = hk.trace(field, o, d, t_max=5.0, precision=precision, max_steps=300)
-    assert (hits.status[:3] != hk.Status.HIT).all()
-    assert hits.status[3] == hk.Status.HIT
+    assert (hits.status[:3] != hk.RayStatus.HIT).all()
+    assert hits.status[3] == hk.RayStatus.HIT
     x, y, z = hits.position[3] - [100, -100, 0]
     assert x * y / (x**2 + y**2) == pytest.approx(z, abs=1e-3)
 
@@ -402,4 +407,4 @@ def test_sheets_thinner_than_rounding_are_never_missed() -> None:
     o, d = (np.float64(np.float32(one)) for one in rays(1.0))
     sheet = hk.expression("exp(-(1e9*y)^2) = 0.5")
     hits = hk.trace(sheet, o, d, precision="single", t_max=5.0, max_steps=300)
-    assert_array_equal(hits.status != hk.Status.MISS, meets(0, o, d))
+    assert_array_equal(hits.status != hk.RayStatus.MISS, meets(0, o, d))

@@ -80,8 +80,8 @@ def check_cloud(
 ) -> hk.Hits:
     o, d = rays_around(n)
     hits = hk.trace(field, o, d, level=level, tolerance=tolerance, precision=precision)
-    assert not (hits.status == hk.Status.OUT_OF_STEPS).any()
-    rows = np.flatnonzero(hits.hit)
+    assert not (hits.status == hk.RayStatus.OUT_OF_STEPS).any()
+    rows = np.flatnonzero(hits.is_hit)
     assert len(rows) > 0.5 * n
     value, gradient = truth(hits.position[rows])
     steepness = np.linalg.norm(gradient, axis=1)
@@ -119,8 +119,8 @@ def check_mesh(tolerance: float, precision: Any, n: int, **settings: Any) -> Non
     o = 3 * rng.normal(size=(n, 3))
     target = vertices[rng.integers(len(vertices), size=n)] * rng.uniform(0.5, 1.1, (n, 1))
     hits = hk.trace(field, o, target - o, tolerance=tolerance, precision=precision)
-    assert (hits.status == hk.Status.OUT_OF_STEPS).sum() <= 1e-4 * n
-    rows = np.flatnonzero(hits.hit & (hits.sheet < 0))
+    assert (hits.status == hk.RayStatus.OUT_OF_STEPS).sum() <= 1e-4 * n
+    rows = np.flatnonzero(hits.is_hit & (hits.primitive_index < 0))
     assert len(rows) > 0.1 * n
     x = hits.position[rows]
     steepness = np.linalg.norm(edge_fields(vertices, faces, x), axis=1)
@@ -164,9 +164,9 @@ def test_edges_between_triangles_are_no_surface(precision: Any) -> None:
     for method in ("exact", "tree"):
         field = hk.WindingNumber(*both, method=method)
         hits = hk.trace(field, o, target - o, level=1.5, precision=precision)
-        assert not (hits.status == hk.Status.OUT_OF_STEPS).any()
-        assert (hits.sheet[hits.hit] >= 0).all()
-        face = field.faces_of_sheets[hits.sheet[hits.hit]]
+        assert not (hits.status == hk.RayStatus.OUT_OF_STEPS).any()
+        assert (hits.primitive_index[hits.is_hit] >= 0).all()
+        face = field.facet_faces[hits.primitive_index[hits.is_hit]]
         assert (face >= len(faces)).all()
         found.append(hits.t)
     np.testing.assert_array_equal(np.isfinite(found[0]), np.isfinite(found[1]))
@@ -178,10 +178,10 @@ def test_tight_tolerances_in_single_precision_state_their_rounding() -> None:
     field = hk.DipolePotential(points, normals)
     truth = dipole_sum(field.points, field.areas[:, None] * field.normals)
     hits = check_cloud(field, truth, 2 * np.pi, 1e-8, "single", 300)
-    stated = hits.uncertainty[hits.hit]
+    stated = hits.uncertainty[hits.is_hit]
     assert (stated > 0).all()
     assert np.median(stated) < 1e-4
-    assert (hits.uncertainty[~hits.hit] == 0).all()
+    assert (hits.uncertainty[~hits.is_hit] == 0).all()
 
 
 @pytest.mark.slow
@@ -227,9 +227,9 @@ def test_hits_that_rounding_makes_say_how_far_the_surface_is(power: int) -> None
     field = hk.expression(text, domain=hk.Box((-1.5,) * 3, (1.5,) * 3))
     o, d = grazing_rays(300)
     hits = hk.trace(field, o, d, precision="single")
-    assert hits.hit.mean() > 0.8
-    off = np.abs(np.linalg.norm(hits.position[hits.hit], axis=1) - 1)
-    stated = 1e-4 + hits.uncertainty[hits.hit]
+    assert hits.is_hit.mean() > 0.8
+    off = np.abs(np.linalg.norm(hits.position[hits.is_hit], axis=1) - 1)
+    stated = 1e-4 + hits.uncertainty[hits.is_hit]
     assert (off <= 1.05 * stated).all()
     assert (stated <= 4 * np.maximum(off, 1e-3)).all()
 

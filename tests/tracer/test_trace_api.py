@@ -49,12 +49,12 @@ def test_shapes_and_types_of_numpy_output() -> None:
     shapes_of = {name: array.shape for name, array in vars(hits).items()}
     assert shapes_of == {
         "t": (7,), "position": (7, 3), "normal": (7, 3), "value": (7,),
-        "evaluations": (7,), "status": (7,), "sheet": (7,), "uncertainty": (7,),
+        "evaluations": (7,), "status": (7,), "primitive_index": (7,), "uncertainty": (7,),
     }  # fmt: skip
     assert all(type(array) is np.ndarray for array in vars(hits).values())
     assert hits.t.dtype == hits.position.dtype == hits.value.dtype == np.float32
     assert hits.evaluations.dtype == hits.status.dtype == np.int64
-    assert hits.hit.dtype == bool
+    assert hits.is_hit.dtype == bool
     assert hk.trace(FIELD, above(7), DOWN, precision="double").t.dtype == np.float64
 
 
@@ -102,21 +102,21 @@ def test_a_planar_square_is_met_where_its_plane_is() -> None:
     inside = np.abs(x[:, :2]).max(axis=1)
     hits = hk.trace(FIELD, o, d, tolerance=1e-5)
     clear = np.abs(inside - 1) > 1e-3
-    np.testing.assert_array_equal(hits.hit[clear], inside[clear] < 1)
-    hit = hits.hit & clear
+    np.testing.assert_array_equal(hits.is_hit[clear], inside[clear] < 1)
+    hit = hits.is_hit & clear
     np.testing.assert_allclose(hits.t[hit], t[hit], atol=1e-4)
     np.testing.assert_allclose(hits.position[hit], x[hit], atol=1e-4)
     np.testing.assert_allclose(np.abs(hits.normal[hit, 2]), 1, atol=1e-3)
-    assert np.isinf(hits.t[~hits.hit]).all()
-    assert np.isnan(hits.position[~hits.hit]).all()
-    assert (hits.normal[~hits.hit] == 0).all()
+    assert np.isinf(hits.t[~hits.is_hit]).all()
+    assert np.isnan(hits.position[~hits.is_hit]).all()
+    assert (hits.normal[~hits.is_hit] == 0).all()
 
 
 def test_normals_are_unit_gradients() -> None:
     o, d = around(100)
     for field, level in ((WAVY, None), (GYROID, 0.4)):
         hits = hk.trace(field, o, d, level=level, tolerance=1e-9, precision="double")
-        x, h = hits.position[hits.hit], 1e-6
+        x, h = hits.position[hits.is_hit], 1e-6
         backend = choose_backend("double")
         rise = []
         for axis in np.eye(3):
@@ -130,14 +130,14 @@ def test_normals_are_unit_gradients() -> None:
             rise.append(move / (2 * h))
         gradient = np.stack(rise, axis=1)
         expected = gradient / np.linalg.norm(gradient, axis=1, keepdims=True)
-        np.testing.assert_allclose(hits.normal[hits.hit], expected, atol=1e-5)
+        np.testing.assert_allclose(hits.normal[hits.is_hit], expected, atol=1e-5)
 
 
 def test_t_is_a_length_whatever_the_direction() -> None:
     o, d = around(50)
     plain, long = hk.trace(WAVY, o, d), hk.trace(WAVY, o, 37.0 * d)
     np.testing.assert_allclose(plain.t, long.t, rtol=1e-5)
-    hit = plain.hit
+    hit = plain.is_hit
     np.testing.assert_allclose(
         np.linalg.norm(plain.position - o, axis=1)[hit], plain.t[hit], rtol=1e-5
     )
@@ -149,7 +149,7 @@ def test_precisions_agree() -> None:
         single = hk.trace(field, o, d, tolerance=1e-5)
         double = hk.trace(field, o, d, tolerance=1e-5, precision="double")
         assert (single.status != double.status).sum() <= 1  # a ray that grazes the border
-        both = single.hit & double.hit
+        both = single.is_hit & double.is_hit
         assert both.sum() > 50
         assert np.quantile(np.abs(single.t[both] - double.t[both]), 0.98) < 2e-4
 
@@ -166,7 +166,7 @@ def test_different_proofs_give_the_same_hits(bound: str | None, overstep: float)
         reference = hk.trace(field, o, d, bound="slope", overstep=1.0, **settings)
         hits = hk.trace(field, o, d, bound=bound, overstep=overstep, **settings)
         assert (hits.status != reference.status).sum() <= 1
-        both = hits.hit & reference.hit
+        both = hits.is_hit & reference.is_hit
         assert both.sum() > 50
         assert np.quantile(np.abs(hits.t[both] - reference.t[both]), 0.98) < 1e-5
 
@@ -191,7 +191,7 @@ def test_a_ray_without_end_ends_in_a_miss() -> None:
     knot = hk.SolidAngle(example_curves.torus_knot(2, 3, 40))
     for field, level in ((WAVY, None), (knot, 1.0), (GYROID, None)):
         hits = hk.trace(field, 50 * o, -d, level=level)
-        assert (hits.status == hk.Status.MISS).all()
+        assert (hits.status == hk.RayStatus.MISS).all()
         assert (hits.evaluations < 200).all()
 
 
@@ -199,31 +199,31 @@ def test_a_ray_without_end_ends_in_a_miss() -> None:
 def test_clip_volumes() -> None:
     o, d = above(100), DOWN
     half = hk.trace(FIELD, o, d, clip=hk.HalfSpace((1.0, 0.0, 0.0), 0.0))
-    np.testing.assert_array_equal(half.hit, o[:, 0] <= 0)
+    np.testing.assert_array_equal(half.is_hit, o[:, 0] <= 0)
     ball = hk.trace(FIELD, o, d, clip=hk.Ball(radius=0.5))
     distance = np.linalg.norm(o[:, :2], axis=1)
     clear = np.abs(distance - 0.5) > 1e-3
-    np.testing.assert_array_equal(ball.hit[clear], distance[clear] < 0.5)
+    np.testing.assert_array_equal(ball.is_hit[clear], distance[clear] < 0.5)
     box = hk.trace(FIELD, o, d, clip=hk.Box((-2, -2, 0.5), (2, 2, 3)))
-    assert not box.hit.any()
+    assert not box.is_hit.any()
 
 
 def test_tolerances() -> None:
     o, d = around(100)
     exact = hk.trace(WAVY, o, d, tolerance=1e-12, precision="double")
-    hit = exact.hit
+    hit = exact.is_hit
     fewer = []
-    growing, by_value = hk.Tolerance(1e-4, per_length=1e-2), hk.Tolerance(0.0, value=0.05)
+    growing, by_value = hk.HitTolerance(1e-4, per_length=1e-2), hk.HitTolerance(0.0, value=0.05)
     for tolerance in (1e-2, growing, by_value, 1e-6):
         hits = hk.trace(WAVY, o, d, tolerance=tolerance, precision="double")
-        both = hit & hits.hit
+        both = hit & hits.is_hit
         assert both.sum() > 0.9 * hit.sum()
         assert (hits.t[both] <= exact.t[both] + 1e-9).all()
         assert np.quantile(np.abs(hits.t[both] - exact.t[both]), 0.9) < 0.2
         fewer.append(hits.evaluations.sum())
     assert max(fewer[:3]) < fewer[3] < exact.evaluations.sum()
     hits = hk.trace(WAVY, o, d, tolerance=by_value, precision="double")
-    away = np.abs(np.remainder(hits.value[hits.hit], 4 * math.pi) - 2 * math.pi)
+    away = np.abs(np.remainder(hits.value[hits.is_hit], 4 * math.pi) - 2 * math.pi)
     assert (away <= 0.05).all()
 
 
@@ -232,7 +232,7 @@ def test_few_steps_end_with_the_proved_length() -> None:
     full = hk.trace(WAVY, o, d)
     for steps in (1, 2, 5):
         short = hk.trace(WAVY, o, d, max_steps=steps)
-        out = short.status == hk.Status.OUT_OF_STEPS
+        out = short.status == hk.RayStatus.OUT_OF_STEPS
         assert out.any()
         assert (short.evaluations <= steps).all()
         assert (short.t[out] <= full.t[out] + 1e-5).all()

@@ -11,8 +11,8 @@ from harnack.fields.solid_angles.edge_lift import LiftedEdges, lifted_sums
 from harnack.fields.solid_angles.trail_sums import LiftedTrails, closed_trails
 from harnack.fields.solid_angles.winding_number import winding_box
 from harnack.geometry.example_meshes import icosphere
-from harnack.tree.empty_space import OccupiedCells, distances_to_full
-from harnack.tree.triangle_tree import Frame
+from harnack.tree.empty_space import OccupancyGrid, distance_to_occupied
+from harnack.tree.triangle_tree import RayFrame
 from tests.oracles.direct_sums import winding_sum
 
 
@@ -28,9 +28,9 @@ def off_the_level(field: hk.WindingNumber, x: np.ndarray, level: float = 0.5) ->
     return np.abs(np.remainder(w - level + 0.5, 1.0) - 0.5)
 
 
-def index_of(cells: OccupiedCells, empty: bool) -> np.ndarray:
+def index_of(cells: OccupancyGrid, empty: bool) -> np.ndarray:
     """(n, 3) cells that are empty, or are not."""
-    at = np.argwhere((cells.free.reshape(cells.shape[::-1]) > 0) == empty)
+    at = np.argwhere((cells.empty_distance.reshape(cells.shape[::-1]) > 0) == empty)
     return at[:, ::-1]
 
 
@@ -38,20 +38,21 @@ def index_of(cells: OccupiedCells, empty: bool) -> np.ndarray:
 @pytest.mark.parametrize("seed", range(2))
 def test_empty_cells_are_off_the_level(seed: int) -> None:
     field = broken(seed=seed)
-    cells = field.occupied((0.5,))
+    cells = field.occupied_cells((0.5,))
     assert cells is not None
     rng = np.random.default_rng(seed)
     empty, rest = index_of(cells, empty=True), index_of(cells, empty=False)
     assert 0.01 < len(rest) / len(empty) < 0.6
     some = rng.choice(empty, 3000)
-    x = cells.origin + (some + rng.uniform(-1 / 16, 17 / 16, some.shape)) * cells.cell
+    x = cells.origin + (some + rng.uniform(-1 / 16, 17 / 16, some.shape)) * cells.cell_size
     assert off_the_level(field, x).min() > 0
     w = winding_sum(field.mesh.vertices[field.mesh.triangles])
     side = [
-        np.remainder(w(cells.origin + (some + k) * cells.cell) - 0.5, 1.0) for k in (0.01, 0.99)
+        np.remainder(w(cells.origin + (some + k) * cells.cell_size) - 0.5, 1.0)
+        for k in (0.01, 0.99)
     ]
     assert np.abs(side[0] - side[1]).max() < 0.99  # no level between two corners, modulo 1
-    x = cells.origin + (rng.choice(rest, 3000) + 0.5) * cells.cell
+    x = cells.origin + (rng.choice(rest, 3000) + 0.5) * cells.cell_size
     assert off_the_level(field, x).min() < 0.01  # the surface is in some of them
 
 
@@ -62,12 +63,12 @@ def test_coarse_samples_are_w_less_a_whole_number(precision: str) -> None:
     backend = choose_backend(precision)  # type: ignore[arg-type]
     p = to_vector3(backend, x)
     sample = field.prepare(backend).evaluate_modulo_one(p)
-    error = to_numpy(backend.Float(sample.error))
+    error = to_numpy(backend.Float(sample.value_error))
     whole = winding_sum(field.mesh.vertices[field.mesh.triangles])(x)
     off = to_numpy(sample.value) - whole
-    slack = np.linalg.norm(to_numpy(sample.gradient), axis=1) * 4 * backend.epsilon
+    slack = np.linalg.norm(to_numpy(sample.gradient), axis=1) * 4 * backend.machine_epsilon
     off = np.abs(off - np.round(off))
-    assert (off <= error + slack + 8 * backend.epsilon).all()
+    assert (off <= error + slack + 8 * backend.machine_epsilon).all()
     assert np.median(error) < 0.05
 
 
@@ -91,19 +92,19 @@ def test_extents_hold_the_level_set_and_the_triangles() -> None:
 @pytest.mark.slow
 def test_hits_are_those_without_cells() -> None:
     field = broken()
-    field.set_cells(False)
+    field.configure_cells(False)
     rng = np.random.default_rng(3)
     o = 4 * unit(rng.normal(size=(5000, 3)))
     d = unit(rng.uniform(-1, 1, (5000, 3)) * [1.0, 0.6, 1.4] - o)
     fast = hk.trace(field, o, d)
-    field.occupied = lambda levels: None  # pyright: ignore[reportAttributeAccessIssue]
+    field.occupied_cells = lambda levels: None  # pyright: ignore[reportAttributeAccessIssue]
     plain = hk.trace(field, o, d)
     assert (fast.status == plain.status).all()
-    hit = plain.hit
+    hit = plain.is_hit
     apart = np.abs(fast.t[hit] - plain.t[hit])
     assert (apart < 3e-4).mean() > 0.998  # others graze the surface
     assert apart.max() < 2e-3
-    assert (fast.sheet == plain.sheet)[hit].mean() > 0.999
+    assert (fast.primitive_index == plain.primitive_index)[hit].mean() > 0.999
     assert fast.evaluations.mean() < 0.8 * plain.evaluations.mean()
 
 
@@ -113,12 +114,12 @@ def unit(v: np.ndarray) -> np.ndarray:
 
 def test_a_moved_mesh_has_cells_of_its_own() -> None:
     field = broken(2)
-    one = field.occupied((0.5,))
-    other = field.moved(field.mesh.vertices * 2).occupied((0.5,))
+    one = field.occupied_cells((0.5,))
+    other = field.with_vertices(field.mesh.vertices * 2).occupied_cells((0.5,))
     assert one is not None
     assert other is not None
-    assert other.cell == pytest.approx(2 * one.cell, rel=1e-3)
-    assert field.occupied((0.5,)) is one
+    assert other.cell_size == pytest.approx(2 * one.cell_size, rel=1e-3)
+    assert field.occupied_cells((0.5,)) is one
 
 
 @pytest.mark.parametrize("precision", ["single", "double"])
@@ -130,17 +131,17 @@ def test_rays_through_cells_stop_before_those_that_are_not_empty(
     rng = np.random.default_rng(0)
     empty = rng.random((9, 12, 16)) > 0.15
     corner = np.array([-1.0, -0.5, 0.0]) + shift
-    cells = OccupiedCells(corner, 0.125, empty.shape[::-1], distances_to_full(empty))  # type: ignore[arg-type]
+    cells = OccupancyGrid(corner, 0.125, empty.shape[::-1], distance_to_occupied(empty))  # type: ignore[arg-type]
     backend = choose_backend(precision)  # type: ignore[arg-type]
     o = rng.uniform([-1, -0.5, 0], [1, 1, 1.125], (600, 3)) + shift
     d = unit(rng.normal(size=(600, 3)))
     d[:60] = np.eye(3)[rng.integers(0, 3, 60)]  # along cells
     x = to_vector3(backend, o), to_vector3(backend, d)
-    t = cells.upload(backend).free_until(*x, backend.Float(0), backend.Float(4))
+    t = cells.upload(backend).end_of_empty_run(*x, backend.Float(0), backend.Float(4))
     length = to_numpy(t).astype(float)
     assert length.max() == 4  # beyond the grid all is empty
     share = np.linspace(0, 1, 400)[None, :, None]
-    p = (o[:, None] + share * length[:, None, None] * d[:, None] - corner) / cells.cell
+    p = (o[:, None] + share * length[:, None, None] * d[:, None] - corner) / cells.cell_size
 
     def is_empty(p: np.ndarray) -> np.ndarray:
         index = np.floor(p).astype(int)
@@ -154,18 +155,20 @@ def test_rays_through_cells_stop_before_those_that_are_not_empty(
     assert ok[length > 0].all()
     # And they do not stop early: a little behind the end is a cell that is not empty, or outside of
     # the grid one next to it.
-    behind = (o + (length + 0.02 * cells.cell)[:, None] * d - corner) / cells.cell
+    behind = (o + (length + 0.02 * cells.cell_size)[:, None] * d - corner) / cells.cell_size
     behind = np.clip(behind, 0, np.array(cells.shape) - 1e-6)
     assert is_empty(behind)[length < 4].mean() < 0.05
 
 
 def test_rays_that_rounding_moves_prove_nothing() -> None:
-    cells = OccupiedCells(np.zeros(3), 1e-3, (4, 4, 4), distances_to_full(np.ones((4, 4, 4), bool)))
+    cells = OccupancyGrid(
+        np.zeros(3), 1e-3, (4, 4, 4), distance_to_occupied(np.ones((4, 4, 4), bool))
+    )
     backend = choose_backend("single")
     grid, d = cells.upload(backend), to_vector3(backend, np.eye(3)[:1])
     for far, expected in ((0.0, 1.0), (1e3, 0.0), (np.nan, 0.0)):
         o = backend.Array3f(far, 0, 0)
-        found = to_numpy(grid.free_until(o, d, backend.Float(0), backend.Float(1)))
+        found = to_numpy(grid.end_of_empty_run(o, d, backend.Float(0), backend.Float(1)))
         assert found[0] == expected
 
 
@@ -173,28 +176,32 @@ def test_cells_are_empty_where_the_clearance_says_so() -> None:
     def clearance(x: np.ndarray) -> np.ndarray:
         return np.abs(np.linalg.norm(x, axis=1) - 0.5)
 
-    ball = OccupiedCells.of(np.full(3, -1.0), np.full(3, 1.0), clearance, 64)
-    rest = ball.origin + (index_of(ball, empty=False) + 0.5) * ball.cell
-    assert np.abs(np.linalg.norm(rest, axis=1) - 0.5).max() <= 1.01 * ball.cell
-    empty = ball.origin + (index_of(ball, empty=True) + 0.5) * ball.cell
+    ball = OccupancyGrid.from_clearance(np.full(3, -1.0), np.full(3, 1.0), clearance, 64)
+    rest = ball.origin + (index_of(ball, empty=False) + 0.5) * ball.cell_size
+    assert np.abs(np.linalg.norm(rest, axis=1) - 0.5).max() <= 1.01 * ball.cell_size
+    empty = ball.origin + (index_of(ball, empty=True) + 0.5) * ball.cell_size
     # A ball around the cell and a sixteenth more: clearances 1.001 times as long would be seen.
-    least = 0.5 * 3**0.5 * (1 + 2 / 16) * ball.cell
+    least = 0.5 * 3**0.5 * (1 + 2 / 16) * ball.cell_size
     assert least <= np.abs(np.linalg.norm(empty, axis=1) - 0.5).min() < 1.001 * least
-    full = OccupiedCells.of(np.full(3, -1.0), np.full(3, 1.0), lambda x: np.zeros(len(x)), 8)
-    assert not full.free.any()
-    none = OccupiedCells.of(np.full(3, -1.0), np.full(3, 1.0), lambda x: np.full(len(x), 9.0), 8)
-    assert (none.free == max(none.shape)).all()
+    full = OccupancyGrid.from_clearance(
+        np.full(3, -1.0), np.full(3, 1.0), lambda x: np.zeros(len(x)), 8
+    )
+    assert not full.empty_distance.any()
+    none = OccupancyGrid.from_clearance(
+        np.full(3, -1.0), np.full(3, 1.0), lambda x: np.full(len(x), 9.0), 8
+    )
+    assert (none.empty_distance == max(none.shape)).all()
 
 
 def test_sums_over_trails_are_those_over_single_edges() -> None:
     field = broken()
     backend = choose_backend("double")
-    vertices, edges = field.mesh.unit_vertices, field.mesh.singular
+    vertices, edges = field.mesh.unit_vertices, field.mesh.singular_edges
     x = to_vector3(backend, np.random.default_rng(0).normal(size=(3000, 3)))
-    up = Frame(x, backend.Array3f(1, 0, 0), backend.Array3f(0, 1, 0), backend.Array3f(0, 0, 1))
-    found = LiftedTrails.upload(backend, vertices, closed_trails(edges)).near(up, x)
-    other = lifted_sums(LiftedEdges.upload(backend, vertices, edges), x, 1).whole()
-    for name, places in (("value", 1e-12), ("gradient", 1e-10), ("free_distance", 1e-13)):
+    up = RayFrame(x, backend.Array3f(1, 0, 0), backend.Array3f(0, 1, 0), backend.Array3f(0, 0, 1))
+    found = LiftedTrails.upload(backend, vertices, closed_trails(edges)).sum(up, x)
+    other = lifted_sums(LiftedEdges.upload(backend, vertices, edges), x, 1).total()
+    for name, places in (("value", 1e-12), ("gradient", 1e-10), ("singularity_distance", 1e-13)):
         one, two = to_numpy(getattr(found, name)), to_numpy(getattr(other, name))
         np.testing.assert_allclose(one, two, atol=places)
     # Integrals over edges, where single edges have a bound of them.
@@ -208,8 +215,10 @@ def test_a_step_ends_at_its_margin() -> None:
     """Steps 1.001 times as long would be seen."""
     empty = np.ones((1, 1, 64), np.bool_)
     empty[0, 0, 40] = False
-    cells = OccupiedCells(np.zeros(3), 1.0, (64, 1, 1), distances_to_full(empty))
+    cells = OccupancyGrid(np.zeros(3), 1.0, (64, 1, 1), distance_to_occupied(empty))
     backend = choose_backend("double")
     o, d = to_vector3(backend, np.array([[0.5, 0.5, 0.5]])), to_vector3(backend, np.eye(3)[:1])
-    found = to_numpy(cells.upload(backend).free_until(o, d, backend.Float(0), backend.Float(60)))
+    found = to_numpy(
+        cells.upload(backend).end_of_empty_run(o, d, backend.Float(0), backend.Float(60))
+    )
     assert found[0] == pytest.approx(39.5 + 1 / 16 - 1 / 64, abs=1e-9)

@@ -10,10 +10,10 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.fields.solid_angles.multipole import all_levels, truncation
+from harnack.fields.solid_angles.multipole import dipole_tree_moments, truncation_bounds
 from harnack.geometry.boundary_edges import singular_edges
 from harnack.geometry.example_meshes import icosphere
-from harnack.tree import build_hierarchy
+from harnack.tree import build_balanced_tree
 from tests.oracles.direct_sums import dipole_sum, winding_sum
 
 PRECISIONS = ("single", "double")
@@ -171,9 +171,9 @@ def test_bounds_of_truncation_are_attained() -> None:
     z[:, 2] = [-1.5, -0.5, 0.5, 1.5]
     normals = np.zeros((4, 3))
     normals[:, 2] = [-1, 3, -3, 1]
-    level = all_levels(build_hierarchy(z), z[:, None], normals[:, None], z, z)[-1]
+    level = dipole_tree_moments(build_balanced_tree(z), z[:, None], normals[:, None], z, z)[-1]
     r = 300 * level.radius[0]
-    error, slope, second = (one[0] for one in truncation(level, np.array([r])))
+    error, slope, second = (one[0] for one in truncation_bounds(level, np.array([r])))
     value, gradient = dipole_sum(z, normals)(np.array([[0, 0, r]]))
     for bound, found in ((error / r**5, value[0]), (slope / r**6, gradient[0, 2])):
         assert 0.95 * bound < abs(found) <= bound
@@ -277,20 +277,26 @@ def test_solid_angles_beside_curves_are_within_their_bounds(kind: str, precision
     x = x + 10.0 ** -rng.uniform(1, 7, (n, 1)) * rng.normal(size=(n, 3))
     x = x.astype(ROUNDED[precision]).astype(np.float64)
     sample = hk.SolidAngle(loop).evaluate(to_vector3(backend, x))
-    value, error = to_numpy(sample.value), on_host(sample.error)
+    value, error = to_numpy(sample.value), on_host(sample.value_error)
     faces = np.array([[0, k, k + 1] for k in range(1, len(loop) - 1)])
     truth = 4 * np.pi * winding_modulo_one(loop, faces, x)
     slope = 4 * np.pi * np.linalg.norm(gradients(loop, faces, x), axis=1)
     size = np.abs(x).max() if precision == "single" else np.abs(loop).max()
-    allowed = error + 4 * backend.epsilon * size * slope + 8 * backend.epsilon * np.abs(value)
+    allowed = (
+        error
+        + 4 * backend.machine_epsilon * size * slope
+        + 8 * backend.machine_epsilon * np.abs(value)
+    )
     off = np.abs(np.remainder(value - truth + 2 * np.pi, 4 * np.pi) - 2 * np.pi)
     # Every level meets there; on the curve itself nothing is defined.
-    beside_curve = ~(slope * 16 * backend.epsilon * (1 + size) <= 1)
+    beside_curve = ~(slope * 16 * backend.machine_epsilon * (1 + size) <= 1)
     assert ((off <= allowed) | beside_curve).all(), (off / allowed)[~beside_curve].max()
     assert beside_curve.mean() < 0.8
     steep = 4 * np.pi * gradients(loop, faces, x)
     off = np.linalg.norm(to_numpy(sample.gradient) - steep, axis=1)
-    assert (off <= (1e-3 + 32 * backend.epsilon * (1 + size) * slope) * slope)[~beside_curve].all()
+    assert (off <= (1e-3 + 32 * backend.machine_epsilon * (1 + size) * slope) * slope)[
+        ~beside_curve
+    ].all()
 
 
 def test_second_derivatives_by_tree_are_within_their_bounds() -> None:

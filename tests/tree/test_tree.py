@@ -10,8 +10,15 @@ import pytest
 
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.geometry.example_meshes import bumpy_sphere, torus_mesh
-from harnack.tree import NO_PRIMITIVE, Hierarchy, build_hierarchy, for_each, pack, walk
-from harnack.tree.triangle_tree import Frame, TriangleRays, triangle_records
+from harnack.tree import (
+    NO_PRIMITIVE,
+    BalancedTree,
+    build_balanced_tree,
+    for_each_primitive,
+    pack_tree,
+    traverse,
+)
+from harnack.tree.triangle_tree import RayFrame, TriangleTree, triangle_records
 
 SIZES = [1, 2, 3, 7, 8, 9, 15, 16, 17, 33, 63, 100, 257, 1000]
 NO_TRIANGLE = 0xFFFFFFFF
@@ -28,15 +35,15 @@ def points(n: int, seed: int = 0) -> np.ndarray:
 @pytest.mark.parametrize("leaf_size", [1, 2, 5, 8])
 @pytest.mark.parametrize("arity", [2, 4])
 def test_every_primitive_lies_in_one_slot(n: int, leaf_size: int, arity: int) -> None:
-    tree = build_hierarchy(points(n), leaf_size=leaf_size, arity=arity)
-    taken = tree.slots[tree.slots != NO_PRIMITIVE]
+    tree = build_balanced_tree(points(n), leaf_size=leaf_size, arity=arity)
+    taken = tree.leaf_slots[tree.leaf_slots != NO_PRIMITIVE]
     np.testing.assert_array_equal(np.sort(taken), np.arange(n))
-    filled = (tree.slots != NO_PRIMITIVE).sum(axis=1)
+    filled = (tree.leaf_slots != NO_PRIMITIVE).sum(axis=1)
     assert filled.max() - filled.min() <= 1
     assert filled.max() <= leaf_size
     # The empty slot of a leaf is its last.
-    assert (tree.slots[:, :-1] != NO_PRIMITIVE).all()
-    assert tree.counts[0] == len(tree.slots)
+    assert (tree.leaf_slots[:, :-1] != NO_PRIMITIVE).all()
+    assert tree.counts[0] == len(tree.leaf_slots)
     assert tree.counts[-1] == 1
     assert tree.node_count == sum(tree.counts)
     assert set(tree.arities[:-1]) <= {arity}
@@ -50,8 +57,8 @@ def test_points_that_coincide(where: str) -> None:
         "on a line": np.arange(n)[:, None] * np.ones(3),
         "on a grid": np.random.default_rng(0).integers(0, 3, (n, 3)).astype(float),
     }[where]
-    tree = build_hierarchy(x)
-    taken = tree.slots[tree.slots != NO_PRIMITIVE]
+    tree = build_balanced_tree(x)
+    taken = tree.leaf_slots[tree.leaf_slots != NO_PRIMITIVE]
     np.testing.assert_array_equal(np.sort(taken), np.arange(n))
 
 
@@ -59,8 +66,8 @@ def test_splits_are_along_the_longest_side() -> None:
     """Both halves of the points of a thin rod lie apart."""
     x = points(64)
     x[:, 0] = 100 * np.arange(64)[::-1]
-    tree = build_hierarchy(x, leaf_size=8, arity=2)
-    spans = x[tree.slots][..., 0]
+    tree = build_balanced_tree(x, leaf_size=8, arity=2)
+    spans = x[tree.leaf_slots][..., 0]
     order = spans.min(axis=1).argsort()
     assert (spans.max(axis=1)[order][:-1] < spans.min(axis=1)[order][1:]).all()
 
@@ -68,14 +75,14 @@ def test_splits_are_along_the_longest_side() -> None:
 @pytest.mark.parametrize("arity", [0, 3, 8])
 def test_other_arities_are_refused(arity: int) -> None:
     with pytest.raises(ValueError, match="arity must be 2 or 4"):
-        build_hierarchy(points(5), arity=arity)
+        build_balanced_tree(points(5), arity=arity)
 
 
 @pytest.mark.parametrize("n", SIZES)
 @pytest.mark.parametrize("arity", [2, 4])
 def test_links_lead_depth_first_and_keep_siblings_together(n: int, arity: int) -> None:
-    tree = build_hierarchy(points(n), leaf_size=2, arity=arity)
-    number, first, after = tree.links()
+    tree = build_balanced_tree(points(n), leaf_size=2, arity=arity)
+    number, first, after = tree.node_links()
     assert sorted(np.concatenate(number).tolist()) == list(range(tree.node_count))
     assert (first[0] == 0).all()
 
@@ -94,29 +101,31 @@ def test_links_lead_depth_first_and_keep_siblings_together(n: int, arity: int) -
 
 
 def test_gather_fills_empty_slots() -> None:
-    tree = build_hierarchy(points(9), leaf_size=8)
+    tree = build_balanced_tree(points(9), leaf_size=8)
     values = np.arange(9.0) + 1
-    placed = tree.gather(values, -7.0)
-    assert placed.shape == tree.slots.shape
-    np.testing.assert_array_equal(placed[tree.slots >= 0], values[tree.slots[tree.slots >= 0]])
-    assert (placed[tree.slots < 0] == -7).all()
-    assert (tree.slots < 0).sum() == 1
+    placed = tree.values_in_slots(values, -7.0)
+    assert placed.shape == tree.leaf_slots.shape
+    np.testing.assert_array_equal(
+        placed[tree.leaf_slots >= 0], values[tree.leaf_slots[tree.leaf_slots >= 0]]
+    )
+    assert (placed[tree.leaf_slots < 0] == -7).all()
+    assert (tree.leaf_slots < 0).sum() == 1
 
 
 # --- walk -----------------------------------------------------------------------------------
 
 
-def visits(tree: Hierarchy, flags: list[np.ndarray], lanes: int = 1, active: Any = True) -> Any:
+def visits(tree: BalancedTree, flags: list[np.ndarray], lanes: int = 1, active: Any = True) -> Any:
     """How often each primitive is met by all lanes together; nodes without a flag are passed."""
     backend = choose_backend("single")
-    n = int(tree.slots.max()) + 1
+    n = int(tree.leaf_slots.max()) + 1
     levels = [np.tile(flag.astype(float)[:, None], (1, 6)) for flag in flags]
-    packed = pack(backend, tree, levels, tree.slots[..., None].astype(float))
+    packed = pack_tree(backend, tree, levels, tree.leaf_slots[..., None].astype(float))
     counts = dr.zeros(backend.UInt32, n)
 
     def visit(node: Any, state: tuple[Any, ...]) -> Any:
         open_ = node.head[0] > 0
-        return open_, for_each(node, open_ & node.is_leaf, meet, state)
+        return open_, for_each_primitive(node, open_ & node.is_leaf, meet, state)
 
     def meet(row: list[Any], active: Any, state: tuple[Any, ...]) -> Any:
         taken = active & (row[0] >= 0)
@@ -125,7 +134,7 @@ def visits(tree: Hierarchy, flags: list[np.ndarray], lanes: int = 1, active: Any
         return (state[0] + dr.select(taken, backend.UInt32(1), 0),)
 
     start = dr.zeros(backend.UInt32, lanes)
-    (total,) = walk(packed, visit, (start,), active)
+    (total,) = traverse(packed, visit, (start,), active)
     dr.eval(total, counts)
     return to_numpy(counts), to_numpy(total)
 
@@ -133,7 +142,7 @@ def visits(tree: Hierarchy, flags: list[np.ndarray], lanes: int = 1, active: Any
 @pytest.mark.parametrize("n", SIZES)
 def test_a_walk_meets_every_primitive_once(n: int) -> None:
     for arity in (2, 4):
-        tree = build_hierarchy(points(n), leaf_size=4, arity=arity)
+        tree = build_balanced_tree(points(n), leaf_size=4, arity=arity)
         counts, total = visits(tree, [np.ones(k) for k in tree.counts])
         np.testing.assert_array_equal(counts, np.ones(n))
         assert total.tolist() == [n]
@@ -142,7 +151,7 @@ def test_a_walk_meets_every_primitive_once(n: int) -> None:
 @pytest.mark.parametrize("arity", [2, 4])
 def test_a_walk_passes_over_subtrees(arity: int) -> None:
     rng = np.random.default_rng(5)
-    tree = build_hierarchy(points(200), leaf_size=4, arity=arity)
+    tree = build_balanced_tree(points(200), leaf_size=4, arity=arity)
     flags = [rng.random(k) < 0.8 for k in tree.counts]
     flags[-1][:] = True
     above = np.ones(1, bool)
@@ -151,7 +160,7 @@ def test_a_walk_passes_over_subtrees(arity: int) -> None:
         if level:
             above = np.repeat(above, tree.arities[level - 1])
     expected = np.zeros(200)
-    slots = tree.slots[above]
+    slots = tree.leaf_slots[above]
     expected[slots[slots >= 0]] = 1
     assert 10 < expected.sum() < 190
     np.testing.assert_array_equal(visits(tree, flags)[0], expected)
@@ -159,7 +168,7 @@ def test_a_walk_passes_over_subtrees(arity: int) -> None:
 
 def test_lanes_that_are_not_active_do_not_walk() -> None:
     backend = choose_backend("single")
-    tree = build_hierarchy(points(50))
+    tree = build_balanced_tree(points(50))
     active = dr.arange(backend.UInt32, 8) % 2 == 0
     _, total = visits(tree, [np.ones(k) for k in tree.counts], 8, active)
     assert total.tolist() == [50, 0] * 4
@@ -168,10 +177,10 @@ def test_lanes_that_are_not_active_do_not_walk() -> None:
 @pytest.mark.slow
 def test_payload_and_leaves_are_those_of_the_node() -> None:
     backend = choose_backend("double")
-    tree = build_hierarchy(points(100), leaf_size=4)
+    tree = build_balanced_tree(points(100), leaf_size=4)
     levels = [np.random.default_rng(0).normal(size=(k, 6 + 13)) for k in tree.counts]
-    packed = pack(backend, tree, levels, tree.slots[..., None].astype(float))
-    number, first, after = tree.links()
+    packed = pack_tree(backend, tree, levels, tree.leaf_slots[..., None].astype(float))
+    number, first, after = tree.node_links()
     for level, values in enumerate(levels):
         for node in (0, len(values) // 2, len(values) - 1):
             i = backend.UInt32(int(number[level][node]))
@@ -186,13 +195,13 @@ def test_payload_and_leaves_are_those_of_the_node() -> None:
 # --- rays -----------------------------------------------------------------------------------
 
 
-def ray_tree(backend: Any, vertices: np.ndarray, faces: np.ndarray) -> TriangleRays:
-    tree = build_hierarchy(vertices[faces].mean(axis=1))
-    return TriangleRays.of(backend, tree, triangle_records(vertices, faces))
+def ray_tree(backend: Any, vertices: np.ndarray, faces: np.ndarray) -> TriangleTree:
+    tree = build_balanced_tree(vertices[faces].mean(axis=1))
+    return TriangleTree.of(backend, tree, triangle_records(vertices, faces))
 
 
-def frame_of(backend: Any, o: np.ndarray, d: np.ndarray) -> Frame:
-    return Frame.along(backend, to_vector3(backend, o), to_vector3(backend, d))
+def frame_of(backend: Any, o: np.ndarray, d: np.ndarray) -> RayFrame:
+    return RayFrame.along(backend, to_vector3(backend, o), to_vector3(backend, d))
 
 
 def unit(v: np.ndarray) -> np.ndarray:
@@ -232,10 +241,10 @@ def test_turns_ahead_tell_inside_from_outside(precision: Any, shape: str) -> Non
     rays = ray_tree(backend, vertices, faces)
     d = unit(targets(vertices, faces, n, 2) - o)
     d[::50] = np.eye(3)[rng.integers(3, size=len(d[::50]))]
-    turns = to_numpy(rays.turns_ahead(frame_of(backend, o, d), 0, backend.Bool(True)))
+    turns = to_numpy(rays.signed_crossings_ahead(frame_of(backend, o, d), 0, backend.Bool(True)))
     np.testing.assert_array_equal(turns, inside)
     for way in (1, -1):  # turns are about the axis upwards
-        turns = to_numpy(rays.turns_along(to_vector3(backend, o), backend.Float(way)))
+        turns = to_numpy(rays.signed_crossings_vertical(to_vector3(backend, o), backend.Float(way)))
         np.testing.assert_array_equal(way * turns, inside)
 
 
@@ -261,10 +270,14 @@ def test_rays_exactly_through_vertices_and_edges(precision: Any) -> None:
     for vertices, faces in ((cube, cube_faces), (octahedron, octahedron_faces)):
         rays = ray_tree(backend, vertices, faces)
         inside = np.abs(o).sum(axis=1) < 1
-        turns = to_numpy(rays.turns_ahead(frame_of(backend, o, d), 0, backend.Bool(True)))
+        turns = to_numpy(
+            rays.signed_crossings_ahead(frame_of(backend, o, d), 0, backend.Bool(True))
+        )
         np.testing.assert_array_equal(turns, inside)
         for way in (1, -1):
-            turns = to_numpy(rays.turns_along(to_vector3(backend, o), backend.Float(way)))
+            turns = to_numpy(
+                rays.signed_crossings_vertical(to_vector3(backend, o), backend.Float(way))
+            )
             np.testing.assert_array_equal(way * turns, inside)
 
 
@@ -302,7 +315,7 @@ def test_crossings_come_in_order(copies: int) -> None:
     after: Any = (backend.Float(0), backend.UInt32(NO_TRIANGLE))
     met = 0
     for k in range(200):
-        where, number, side, normal = rays.next(
+        where, number, side, normal = rays.next_crossing(
             frame, after, backend.Float(t_max), backend.Bool(True)
         )
         dr.eval(where, number, side, normal)

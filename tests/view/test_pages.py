@@ -18,9 +18,9 @@ import harnack as hk
 from harnack.cli import main
 from harnack.geometry import example_curves
 from harnack.geometry.example_meshes import torus_mesh
-from harnack.view.sliders import Subject
+from harnack.view.sliders import SlidingContent
 from harnack.webgpu import NoDeviceError, find_device
-from harnack.webgpu.device import Program
+from harnack.webgpu.device import CompiledShader
 from harnack.webgpu.wgsl import Shader
 
 page_module = import_module("harnack.view.page")  # beside the function of that name
@@ -46,7 +46,7 @@ def run(surface: dict[str, Any], data: Any) -> tuple[Any, Any]:
     names = tuple(map(str, range(len(lanes))))
     places = surface["results"]
     outputs = tuple(map(str, range(sum(place < 99 for place in places))))
-    program: Program = device.compile(Shader(surface["code"], (), (), names, outputs))
+    program: CompiledShader = device.compile(Shader(surface["code"], (), (), names, outputs))
     given = program._dispatch(data, lanes)
     found = np.array([0 * given[0] if place == 99 else given[place] for place in places])
     return words(surface["check"]["results"]).reshape(7, -1), found
@@ -69,7 +69,7 @@ def test_the_kernel_of_a_page_finds_what_its_rays_say(name: str, tmp_path: Path)
     (surface,) = scene_of(path)["state"]["surfaces"]
     expected, found = run(surface, words(surface["data"]))
     status = expected[0]
-    assert (status == int(hk.Status.HIT)).mean() > 0.4
+    assert (status == int(hk.RayStatus.HIT)).mean() > 0.4
     assert (found[0] != status).mean() <= 1e-3
     both = (status == 1) & (found[0] == 1)
     off = np.abs(found[1].view(np.float32)[both] - expected[1].view(np.float32)[both])
@@ -113,7 +113,7 @@ def test_the_places_of_sliders_are_in_the_page(tmp_path: Path) -> None:
     torus = hk.level_set(hk.Torus(1.0, 0.4), 0.1, tolerance=surface["tolerance"] / scale[0])
     expected = hk.trace(torus, o, d)
     assert (found[0] != expected.status).mean() <= 2e-3
-    both = expected.hit & (found[0] == 1)
+    both = expected.is_hit & (found[0] == 1)
     assert both.mean() > 0.4
     off = np.abs(found[1].view(np.float32)[both] - scale * expected.t[both])
     assert np.quantile(off, 0.9) < 1e-4
@@ -125,7 +125,7 @@ def test_a_page_holds_fewer_places_where_they_are_large(
     """Each place of a parameter of a formula brings a kernel of its own."""
     formula, path = "x^2 + a*y^2 + z^2 = 1", str(tmp_path / "a.html")
     command = ["page", formula, "--ball", "0,0,0,2", "-o", path, "--quiet", "--slider"]
-    monkeypatch.setattr(page_module, "_USUAL_BYTES", 1e6)
+    monkeypatch.setattr(page_module, "_TARGET_BYTES", 1e6)
     monkeypatch.setattr(page_module, "_MANY_BYTES", 1e6)
     assert main([*command, "a=1:2"]) == 0
     assert len(scene_of(Path(path))["frames"]["frames"]) == 9
@@ -141,7 +141,7 @@ def test_a_kernel_that_is_not_the_first_one_brings_rays_to_check(tmp_path: Path)
     path = tmp_path / "a.html"
 
     def lens(c: float) -> hk.Field:
-        return hk.Sphere(1.0) & hk.Sphere(1.0).moved((c, 0, 0))
+        return hk.Sphere(1.0) & hk.Sphere(1.0).translated((c, 0, 0))
 
     hk.page(lens, path, c=hk.Slider(0, 9, 1, step=1), progress=False)
     first, *_, last = scene_of(path)["frames"]["frames"]
@@ -210,18 +210,20 @@ def test_what_is_no_view(given: dict[str, Any], wrong: str) -> None:
 
 def test_sliders() -> None:
     assert hk.Slider(0, 1).start == 0.5
-    assert hk.Slider(1, 8, step=2).places(99) == [1, 3, 5, 7]
+    assert hk.Slider(1, 8, step=2).values(99) == [1, 3, 5, 7]
     assert hk.Slider(1, 8, step=2).start == 3
-    assert hk.Slider(0, 1, step=0.1).places(9)[3] == pytest.approx(0.3)
+    assert hk.Slider(0, 1, step=0.1).values(9)[3] == pytest.approx(0.3)
     tenths = hk.Slider(0, 0.3, step=0.1)
-    assert (tenths.nearest(0.3), tenths.nearest(0.2999), max(tenths.places(9))) == (0.3, 0.2, 0.3)
+    assert (tenths.nearest(0.3), tenths.nearest(0.2999), max(tenths.values(9))) == (0.3, 0.2, 0.3)
     for wrong in ((1, 1), (0, 1, 2), (0, 1, 0.5, 0), (0, 1, 0.5, 2)):
         with pytest.raises(ValueError, match=r"slider goes|step must|start must"):
             hk.Slider(*wrong)
     for low in ("0", False, np.False_, 10**400):
         with pytest.raises(TypeError, match="low"):
             hk.Slider(low, 1)  # type: ignore[arg-type]
-    subject = Subject.of(lambda r: hk.Sphere(r), {"level": hk.Slider(0, 1), "r": hk.Slider(1, 2)})
+    subject = SlidingContent.of(
+        lambda r: hk.Sphere(r), {"level": hk.Slider(0, 1), "r": hk.Slider(1, 2)}
+    )
     what, settings = subject.at({"level": 0.25, "r": 2.0})
     assert (what.radius, settings) == (2.0, {"level": 0.25})
     for function in (
@@ -230,9 +232,9 @@ def test_sliders() -> None:
         lambda other=2, r=1, /, *more, **named: hk.Sphere(r),
         functools.partial(lambda center, r: hk.Sphere(r, center), center=(0, 0, 0)),
     ):
-        what, _ = Subject.of(function, {"r": hk.Slider(1, 2)}).at({"r": 2.0})
+        what, _ = SlidingContent.of(function, {"r": hk.Slider(1, 2)}).at({"r": 2.0})
         assert what.radius == 2.0
     with pytest.raises(TypeError, match=r"a function of 'q'.*no such slider"):
-        Subject.of(lambda q: hk.Sphere(q), {"r": hk.Slider(1, 2)})
+        SlidingContent.of(lambda q: hk.Sphere(q), {"r": hk.Slider(1, 2)})
     with pytest.raises(TypeError, match="nothing depends on the slider 'r'"):
-        Subject.of(hk.Sphere(1.0), {"r": hk.Slider(1, 2)})
+        SlidingContent.of(hk.Sphere(1.0), {"r": hk.Slider(1, 2)})

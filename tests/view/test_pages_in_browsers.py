@@ -44,7 +44,7 @@ SCENES: dict[str, Callable[[], tuple[Any, dict[str, Any]]]] = {
         hk.Gyroid(0.6, domain=hk.Ball(radius=1.0)),
         {
             "solid": (-0.6, 0.6), "section": hk.HalfSpace((1.0, -1.0, 0.5), 0.1),
-            "cut_material": "coral", "isolines": hk.Isolines("z", spacing=0.25),
+            "cut_material": "coral", "isolines": hk.Isolines("z", interval=0.25),
         },
     ),
     "union": lambda: (

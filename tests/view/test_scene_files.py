@@ -16,21 +16,21 @@ from harnack.cli import main
 from harnack.gallery import SCENES
 from harnack.geometry import example_curves
 from harnack.geometry.example_meshes import icosphere
-from harnack.view.scene_file import _kinds, scene_of, text_of
+from harnack.view.scene_file import _constructible_types, parse_scene, to_scene_text
 from harnack.view.type_checks import check_types
 
 CURVE = hk.SolidAngle(example_curves.torus_knot(2, 3, 12))
 SOLIDS = {
     "sphere": hk.Sphere(1.25),
-    "moved": hk.Torus(1.0, 0.3).moved((1.0, 2.0, 3.0)).rotated(30.0, "x").scaled(2.0),
+    "moved": hk.Torus(1.0, 0.3).translated((1.0, 2.0, 3.0)).rotated(30.0, "x").scaled(2.0),
     "cut": hk.Sphere(1.0) - hk.Cuboid((0.5, 0.5, 2.0)) | hk.Capsule((0, 0, -1), (0, 0, 1), 0.2),
     "twisted": hk.Cuboid((0.4, 0.4, 1.0)).twisted(0.5),
     "tube": hk.Tube(example_curves.torus_knot(2, 3, 12), 0.1),
-    "outlines": hk.Extruded(
+    "outlines": hk.Extrusion(
         [[(0, 0), (2, 0), (0, 2)], [(0.2, 0.2), (1, 0.2), (0.2, 1)]], 0.5, twist=40.0, taper=0.5
     )
-    | hk.Revolved([(0, 0), (1, 0), (0, 1)]),
-    "threads": hk.thread("M8", 10.0) | hk.Tube.helix(5.0, 2.0, 1.5, 0.3),
+    | hk.SolidOfRevolution([(0, 0), (1, 0), (0, 1)]),
+    "threads": hk.metric_thread("M8", 10.0) | hk.Tube.helix(5.0, 2.0, 1.5, 0.3),
     "mesh": hk.solid(icosphere(0)).shell(0.2) - hk.solid(icosphere(0)).scaled(0.3),
     "gyroid": hk.Gyroid(0.5, domain=hk.Ball((0.1, 0.0, 0.0), 1.5)),
     "formula": hk.expression("x^2 + a*y^2 = 1 + z", parameters={"a": 0.1}, level=0.25),
@@ -41,34 +41,34 @@ SOLIDS = {
 @pytest.mark.parametrize("name", SOLIDS)
 def test_fields_come_back_as_they_were(name: str) -> None:
     field = SOLIDS[name]
-    text = text_of(field, {})
-    saved = scene_of(text)
+    text = to_scene_text(field, {})
+    saved = parse_scene(text)
     (found,) = saved.surfaces
     points = np.random.default_rng(1).normal(size=(100, 3))
     assert isinstance(found, hk.Field)
     assert np.array_equal(found.value(points), field.value(points), equal_nan=True)
     assert (found.default_level, found.domain) == (field.default_level, field.domain)
-    assert text_of(saved.surfaces, saved.settings) == text
+    assert to_scene_text(saved.surfaces, saved.settings) == text
 
 
 def test_how_curves_are_traced_comes_back() -> None:
     """A curve of certificate "paper" came back as one that is proved."""
     loops = CURVE.loops
-    for how in ({"certificate": "paper"}, {"cells": True}, {"cells": False}, {}):
-        text = text_of(hk.SolidAngle(loops, **how), {})
+    for how in ({"lift_bound": "paper"}, {"cells": True}, {"cells": False}, {}):
+        text = to_scene_text(hk.SolidAngle(loops, **how), {})
         about = json.loads(text)["surfaces"][0]["field"]
         assert {name: about[name] for name in about if name != "curves"} == how
-        (field,) = scene_of(text).surfaces
+        (field,) = parse_scene(text).surfaces
         assert isinstance(field, hk.SolidAngle)
-        assert field.asked_certificate == how.get("certificate", "auto")
+        assert field.lift_bound_option == how.get("lift_bound", "auto")
         assert field.cells is how.get("cells")
     with pytest.raises(ValueError, match="true or false, not 3"):
-        text_of(hk.SolidAngle(loops, cells=3.0), {})
-    for wrong, said in (({"cells": 9e9}, "true or false"), ({"certificate": "x"}, "certificate")):
-        given = json.loads(text_of(CURVE, {}))
+        to_scene_text(hk.SolidAngle(loops, cells=3.0), {})
+    for wrong, said in (({"cells": 9e9}, "true or false"), ({"lift_bound": "x"}, "lift_bound")):
+        given = json.loads(to_scene_text(CURVE, {}))
         given["surfaces"][0]["field"] |= wrong
         with pytest.raises(ValueError, match=said):
-            scene_of(json.dumps(given))
+            parse_scene(json.dumps(given))
 
 
 def test_every_scene_of_the_gallery_comes_back() -> None:
@@ -76,11 +76,11 @@ def test_every_scene_of_the_gallery_comes_back() -> None:
         surfaces = scene.surfaces()
         origins = [(one.field, {"scene": name, "number": k}) for k, one in enumerate(surfaces)]
         settings = scene.settings(len(surfaces))
-        saved = scene_of(text_of(surfaces, settings, origins))
+        saved = parse_scene(to_scene_text(surfaces, settings, origins))
         assert saved.settings == settings, name
         for one, other in zip(surfaces, saved.surfaces, strict=True):
-            assert isinstance(other, hk.LevelSet)
-            for part in ("numbers", "clip", "section", "solid", "tolerance", "largest"):
+            assert isinstance(other, hk.Surface)
+            for part in ("level_values", "clip", "section", "solid", "tolerance", "largest"):
                 assert getattr(one, part) == getattr(other, part), (name, part)
 
 
@@ -88,7 +88,7 @@ def test_a_scene_is_traced_at_its_level(tmp_path: Path) -> None:
     hk.write_scene(
         tmp_path / "a.json", hk.Sphere(1.0), level=0.5, clip=hk.HalfSpace((0, 0, 1), 0.0)
     )
-    (surface,) = hk.read_scene(tmp_path / "a.json").level_sets
+    (surface,) = hk.read_scene(tmp_path / "a.json").surfaces_with_options
     hits = hk.trace(surface, [[0, 0, 5.0]], [[0, 0, -1.0]])
     assert hits.t[0] == pytest.approx(6.5, abs=1e-3)
 
@@ -106,7 +106,7 @@ def test_a_scene_is_traced_at_its_level(tmp_path: Path) -> None:
 def test_settings_are_checked_when_they_are_read(settings: dict[str, Any], wrong: str) -> None:
     about = {"harnack": 1, "surfaces": [{"field": {"Sphere": {}}}], "settings": settings}
     with pytest.raises(hk.SceneFileError, match=f"settings: .*{wrong}"):
-        scene_of(json.dumps(about))
+        parse_scene(json.dumps(about))
 
 
 @pytest.mark.parametrize(
@@ -126,13 +126,15 @@ def test_what_could_not_be_read_is_not_written(
 
 def test_scene_files_know_every_solid() -> None:
     solids = [getattr(hk, name) for name in hk.__all__]
-    solids = [one for one in solids if inspect.isclass(one) and issubclass(one, hk.Shape)]
+    solids = [one for one in solids if inspect.isclass(one) and issubclass(one, hk.FormulaSolid)]
     assert len(solids) > 10
-    for kind in _kinds().values():
+    for kind in _constructible_types().values():
         check_types(kind, {})  # whose annotations can be read
-    for one in set(solids) - {hk.Shape}:
+    for one in set(solids) - {hk.FormulaSolid}:
         with pytest.raises(hk.SceneFileError, match="argument of"):
-            scene_of(json.dumps({"harnack": 1, "surfaces": [{"field": {one.__name__: {"q": 1}}}]}))
+            parse_scene(
+                json.dumps({"harnack": 1, "surfaces": [{"field": {one.__name__: {"q": 1}}}]})
+            )
 
 
 def test_settings_and_sliders_come_back(tmp_path: Path) -> None:
@@ -140,22 +142,22 @@ def test_settings_and_sliders_come_back(tmp_path: Path) -> None:
         "clip": hk.Ball((0, 0, 0), 2.0), "section": hk.HalfSpace((1.0, 0.0, 0.0), 0.5),
         "tolerance": 1e-3, "material": ["gold"], "backdrop": "dark", "up": "y", "boundary": 0.05,
         "camera": hk.Camera(position=(3.0, 2.0, 1.0), target=(0.0, 0.0, 0.0), fov=30.0),
-        "isolines": [hk.Isolines("x*y", spacing=0.25, color="navy")],
+        "isolines": [hk.Isolines("x*y", interval=0.25, color="navy")],
     }  # fmt: skip
     path = tmp_path / "a.json"
     hk.write_scene(path, CURVE, level=hk.Slider(1.0, 12.0, 5.0), **settings)
     saved = hk.read_scene(path)
     assert saved.sliders == {"level": hk.Slider(1.0, 12.0, 5.0)}
     isolines = saved.settings["isolines"]
-    assert [(one.of, one.spacing, one.color) for one in isolines] == [("x*y", 0.25, "navy")]
+    assert [(one.function, one.interval, one.color) for one in isolines] == [("x*y", 0.25, "navy")]
     kept = {name: one for name, one in saved.settings.items() if name != "isolines"}
     assert kept == {name: one for name, one in settings.items() if name != "isolines"} | {
         "level": 5.0
     }
-    assert scene_of(text_of(CURVE, {"level": np.float32(0.5)})).settings == {"level": 0.5}
+    assert parse_scene(to_scene_text(CURVE, {"level": np.float32(0.5)})).settings == {"level": 0.5}
     surface = hk.level_set(hk.Gyroid(0.5), solid=(-np.inf, 0.1), clip=hk.Ball())
-    (found,) = scene_of(text_of([surface], {})).surfaces
-    assert isinstance(found, hk.LevelSet)
+    (found,) = parse_scene(to_scene_text([surface], {})).surfaces
+    assert isinstance(found, hk.Surface)
     assert (found.solid, found.clip) == (surface.solid, surface.clip)
 
 
@@ -166,11 +168,13 @@ def test_a_file_is_found_beside_the_scene(tmp_path: Path) -> None:
     (tmp_path / "a.json").write_text(json.dumps(about))
     saved = hk.read_scene(tmp_path / "a.json")
     (one,) = saved.surfaces
-    assert isinstance(one, hk.LevelSet)
+    assert isinstance(one, hk.Surface)
     assert isinstance(one.field, hk.SolidAngle)
-    assert json.loads(text_of(saved.surfaces, {}, saved.origins))["surfaces"][0]["level"] == 2.0
+    assert (
+        json.loads(to_scene_text(saved.surfaces, {}, saved.sources))["surfaces"][0]["level"] == 2.0
+    )
     with pytest.raises(hk.SceneFileError, match="must not name files"):
-        scene_of(json.dumps(about))
+        parse_scene(json.dumps(about))
 
 
 # Texts that are no scenes, and fields, surfaces and other parts of scenes that are none.
@@ -202,26 +206,31 @@ WRONG_FIELDS = {
     '{"scene": "gyroid", "path": 9}': "no part of a field",
     '{"file": "a.ply"}': "must not name files",
     '{"file": ["a.ply"]}': "file must be a text",
-    '{"file": "a.ply", "as": "x"}': "as_ must be",
+    '{"file": "a.ply", "read_as": "x"}': "read_as must be",
     """{"formula": "__import__('os')"}""": "no formula",
     '{"formula": 3}': "a formula is a text",
     '{"formula": "x=1", "parameters": {"a": 1}}': "no parameter 'a'",
-    '{"Offset": {"distance": 0.1, "inner": ' * 450 + '{"Sphere": {}}' + "}}" * 450: "each other",
+    '{"OffsetSolid": {"distance": 0.1, "field": ' * 450
+    + '{"Sphere": {}}'
+    + "}}" * 450: "each other",
     '{"Sphere": {}}, "level": ' + "[" * 900 + "]" * 900: "within each other",
-    '{"Complement": {"inner": null}}': "Complement",
-    '{"Bent": {"inner": {"Sphere": {}}, "map": {"Sphere": {}}}}': "Bent: map must be a Bend",
-    '{"Combined": {"parts": [{"Sphere": {}}, 3], "is_union": true}}': "parts must be a list",
-    '{"Combined": {"parts": [{"Sphere": {}}], "is_union": 1}}': "is_union must be true or false",
-    '{"Region": {"inner": {"Ball": {}}}}': "Region: inner must be a Field",
-    '{"Offset": {"inner": {"Sphere": {}}, "distance": true}}': "distance must be a number",
-    '{"Displaced": {"solid": {"Sphere": {}}, "noise": {"Sphere": {}}}}': "noise must be a Fractal",
+    '{"Complement": {"field": null}}': "Complement",
+    '{"DeformedSolid": {"inner": {"Sphere": {}}, '
+    '"map": {"Sphere": {}}}}': "DeformedSolid: map must be a Deformation",
+    '{"BooleanSolid": {"parts": [{"Sphere": {}}, 3], "is_union": true}}': "parts must be a list",
+    '{"BooleanSolid": {"parts": [{"Sphere": {}}], '
+    '"is_union": 1}}': "is_union must be true or false",
+    '{"SublevelSolid": {"field": {"Ball": {}}}}': "SublevelSolid: field must be a Field",
+    '{"OffsetSolid": {"field": {"Sphere": {}}, "distance": true}}': "distance must be a number",
+    '{"DisplacedSolid": {"solid": {"Sphere": {}}, '
+    '"noise": {"Sphere": {}}}}': "noise must be a FractalNoise",
     '{"Gyroid": {"domain": {"Sphere": {}}}}': "Gyroid: domain must be a Volume or null",
     '{"SphericalHarmonic": {"l": 2.5, "m": 0}}': "l must be a whole number",
     '{"formula": "x=1", "is_convex": "yes"}': "is_convex must be true or false",
     '{"formula": "x=1", "domain": {"Sphere": {}}}': "domain must be a Volume or null",
     '{"formula": "x=1", "level": "0"}': "level must be a number",
     '{"formula": "x=a", "parameters": {"a": true}}': "parameters: a must be a number",
-    '{"file": "a.ply", "boundary": "yes"}': "boundary must be true or false",
+    '{"file": "a.ply", "take_boundary": "yes"}': "take_boundary must be true or false",
     '{"Gyroid": {"cell": 1e308}}': "Gyroid",
     '{"scene": []}': "no scene is named",
     '{"curves": [[1, 2]]}': "surfaces",
@@ -235,7 +244,8 @@ WRONG_PARTS = {
     '"settings": {"camera": {"eye": 1}}': "no argument of Camera",
     '"settings": {"camera": {"zoom": "2"}}': "zoom must be a number",
     '"settings": {"camera": {"box": {"Ball": {}}}}': "box must be a Box or null",
-    '"settings": {"clip": {"Intersection": {"volumes": [{"Sphere": {}}]}}}': "volumes must be",
+    '"settings": {"clip": {"VolumeIntersection": '
+    '{"volumes": [{"Sphere": {}}]}}}': "volumes must be",
     '"settings": {"camera": 3}': "must be an object",
     '"sliders": {"level": {"low": 1}}': "sliders: level",
     '"sliders": {"material": {"low": 1, "high": 2}}': "no slider",
@@ -256,7 +266,7 @@ WHOLE = '{"harnack": 1, "surfaces": [{"field": %s}]}'
 )
 def test_what_is_not_known_is_refused(text: str, wrong: str) -> None:
     with pytest.raises(hk.SceneFileError, match=wrong):
-        scene_of(text)
+        parse_scene(text)
 
 
 def test_what_cannot_be_written_is_refused(tmp_path: Path) -> None:
@@ -271,7 +281,7 @@ def test_what_cannot_be_written_is_refused(tmp_path: Path) -> None:
         hk.write_scene(tmp_path / "a.txt", CURVE)
     with pytest.raises(hk.SceneFileError, match="only those of a formula as text"):
         hk.write_scene(
-            tmp_path / "a.json", CURVE, isolines=hk.Isolines(hk.Sphere(1.0), spacing=1.0)
+            tmp_path / "a.json", CURVE, isolines=hk.Isolines(hk.Sphere(1.0), interval=1.0)
         )
     with pytest.raises(hk.SceneFileError, match="material"):
         hk.write_scene(tmp_path / "a.json", CURVE, material={"type": "diffuse"})
@@ -290,7 +300,7 @@ def test_every_command_reads_a_scene_file(
     small = ["--size", "32x24", "--quiet"]
     assert main(["render", path, "-o", str(picture), *small]) == 0
     assert main(["render", path, "-o", str(tmp_path / "b.png"), "--azimuth", "90", *small]) == 0
-    assert main(["mesh", path, "-o", str(tmp_path / "a.stl"), "--spacing", "0.2", "--quiet"]) == 0
+    assert main(["mesh", path, "-o", str(tmp_path / "a.stl"), "--cell-size", "0.2", "--quiet"]) == 0
     assert main(["page", path, "-o", str(tmp_path / "a.html"), "--quiet"]) == 0
     written = (tmp_path / "a.html").read_text()
     assert '"name": "level", "low": -0.1' in written

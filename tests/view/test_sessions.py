@@ -16,12 +16,12 @@ import trimesh
 import harnack as hk
 from harnack.geometry import example_curves
 from harnack.geometry.example_meshes import icosphere, torus_mesh
-from harnack.meshing.checks import LocalError
+from harnack.meshing.checks import LocalizedMeshingError
 from harnack.rendering import studio_surfaces
 from harnack.view import live_scene
-from harnack.view.live_scene import Live, difference
-from harnack.view.session import Client, QuestionError, Session
-from harnack.view.sliders import ends_of
+from harnack.view.live_scene import LiveScene, state_delta
+from harnack.view.session import MessageHandler, RequestError, Session
+from harnack.view.sliders import extreme_slider_values
 
 LOOP = example_curves.torus_knot(2, 3, 18)
 FIELD = hk.SolidAngle(LOOP)
@@ -33,8 +33,8 @@ POSE = {"position": [0, -5, 1], "target": [0, 0, 0], "fov": 30}
 
 
 @pytest.fixture(scope="module")
-def live() -> Live:
-    return Live.of(FIELD, {"level": hk.Slider(1.0, 12.0, 6.0)}, edits=True)
+def live() -> LiveScene:
+    return LiveScene.of(FIELD, {"level": hk.Slider(1.0, 12.0, 6.0)}, edits=True)
 
 
 def compiled(session: Session, questions: list[dict[str, Any]]) -> set[str]:
@@ -43,7 +43,7 @@ def compiled(session: Session, questions: list[dict[str, Any]]) -> set[str]:
     return {surface["key"] for surfaces in every for surface in surfaces if "key" in surface}
 
 
-def test_nothing_is_compiled_for_sliders_and_points(live: Live) -> None:
+def test_nothing_is_compiled_for_sliders_and_points(live: LiveScene) -> None:
     rng = np.random.default_rng(0)
     questions: list[dict[str, Any]] = [{}]
     for k in range(4):
@@ -65,25 +65,25 @@ NUMBERS: dict[str, tuple[Any, dict[str, Any]]] = {
 @pytest.mark.parametrize("name", NUMBERS)
 def test_nothing_is_compiled_for_numbers_of_surfaces(name: str) -> None:
     what, settings = NUMBERS[name]
-    session = Session(Live.of(what, {**settings, "a": hk.Slider(0.1, 0.5)}))
+    session = Session(LiveScene.of(what, {**settings, "a": hk.Slider(0.1, 0.5)}))
     questions = [{"sliders": {"a": one}} for one in (0.1, 0.23, 0.5)]
     assert compiled(session, questions) == set()
 
 
 def test_the_tube_follows_the_curve() -> None:
-    live = Live.of(hk.SolidAngle(LOOP), {"boundary": 0.05, "level": 6.0}, edits=True)
+    live = LiveScene.of(hk.SolidAngle(LOOP), {"boundary": 0.05, "level": 6.0}, edits=True)
     session = Session(live)
     moved = LOOP.copy()
     moved[0] *= 1.5
     assert compiled(session, [{"loops": [moved.tolist()]}]) == set()
-    _, tube = live.drawn(session.controls({"loops": [moved.tolist()]}))
+    _, tube = live.surfaces_at(session.controls({"loops": [moved.tolist()]}))
     assert abs(float(tube.surface.field.value(moved[0]))) < 0.06
-    _, before = live.drawn(live.start)
+    _, before = live.surfaces_at(live.initial_controls)
     assert float(before.surface.field.value(moved[0])) > 0.2
 
 
 def test_material_and_tube_are_changed_and_saved() -> None:
-    live = Live.of(hk.SolidAngle(LOOP), {"level": 6.0, "material": "clay"}, edits=True)
+    live = LiveScene.of(hk.SolidAngle(LOOP), {"level": 6.0, "material": "clay"}, edits=True)
     session, scene = Session(live), live.scene("T")
     assert (scene["material"], scene["tube"]) == ("clay", None)
     assert "gold" in scene["materials"]
@@ -94,9 +94,9 @@ def test_material_and_tube_are_changed_and_saved() -> None:
     assert surface["paints"][0]["front"][2] > 2 * surface["paints"][0]["front"][0]
     settings = {"material": "copper", "boundary": 0.05}
     controls = session.controls({"settings": settings})
-    surface, tube = live.drawn(controls)
+    surface, tube = live.surfaces_at(controls)
     assert abs(float(tube.surface.field.value(LOOP[0]))) < 0.06
-    (one,) = live.drawn(session.controls({"settings": {"boundary": None}}))
+    (one,) = live.surfaces_at(session.controls({"settings": {"boundary": None}}))
     assert one.material != surface.material
     saved = session.answer({"kind": "save", "camera": POSE, "settings": settings})
     opened = session.answer({"kind": "load", "text": saved["text"]})
@@ -106,7 +106,7 @@ def test_material_and_tube_are_changed_and_saved() -> None:
 
 def test_a_probe_of_a_triangle_says_no_derivatives() -> None:
     vertices, faces = icosphere(1)
-    session = Session(Live.of(hk.WindingNumber(vertices, faces[5:]), {}))
+    session = Session(LiveScene.of(hk.WindingNumber(vertices, faces[5:]), {}))
     middle = vertices[faces[20]].mean(axis=0)
     ray = {"origin": (3 * middle).tolist(), "direction": (-middle).tolist()}
     found = session.answer({"kind": "probe", **ray})
@@ -114,7 +114,7 @@ def test_a_probe_of_a_triangle_says_no_derivatives() -> None:
     assert not {"value", "mean", "gaussian"} & set(found)
 
 
-def test_a_probe_says_the_value_next_to_the_level(live: Live) -> None:
+def test_a_probe_says_the_value_next_to_the_level(live: LiveScene) -> None:
     found = Session(live).answer(
         {"kind": "probe", "origin": [0.3, 0.2, 6.0], "direction": [0, 0, -1]}
     )
@@ -124,19 +124,19 @@ def test_a_probe_says_the_value_next_to_the_level(live: Live) -> None:
 def test_nothing_leaves_the_picture_when_a_slider_is_moved() -> None:
     """The farthest places of a ball that moves and grows stay within the picture of 4 : 3."""
     z, r = hk.Slider(-1.0, 3.0, 0.0), hk.Slider(0.2, 0.7, 0.5)
-    live = Live.of(lambda z, r: hk.Sphere(r).moved((0, 0, z)), {"z": z, "r": r})
+    live = LiveScene.of(lambda z, r: hk.Sphere(r).translated((0, 0, z)), {"z": z, "r": r})
     assert outermost(live, hk.Ball((0, 0, 3.0), 0.7)) > 1
-    framed = live.framed(ends_of(live.subject.sliders))
+    framed = live.framed(extreme_slider_values(live.content.sliders))
     for center in (-1.0, 0.0, 3.0):
         assert outermost(framed, hk.Ball((0, 0, center), 0.7)) < 0.95
     # What stands on the ground is all of it, in still pictures and in scene files too.
     assert framed.placement.apply([[0, 0, -1.7]])[0, 2] == pytest.approx(0.0, abs=0.01)
     camera = hk.Camera(position=(0, -5, 1), target=(0, 0, 0), fov=30)
-    saved = json.loads(framed.saved(framed.start, camera=camera)[0])
+    saved = json.loads(framed.to_scene_text(framed.initial_controls, camera=camera)[0])
     assert saved["settings"]["camera"]["box"]["Box"]["upper"][2] == pytest.approx(3.7, abs=0.01)
 
 
-def outermost(live: Live, ball: hk.Ball) -> float:
+def outermost(live: LiveScene, ball: hk.Ball) -> float:
     """How far a ball is from the middle of the picture, where 1 is its edge."""
     points = np.random.default_rng(0).normal(size=(999, 3))
     points = ball.center + ball.radius * points / np.linalg.norm(points, axis=1, keepdims=True)
@@ -155,42 +155,42 @@ def test_a_place_at_which_nothing_can_be_drawn_is_named() -> None:
     def torus(r: float) -> hk.Field:
         return hk.Torus(1.0, r) if r < 0.35 else hk.Plane((0, 0, 1))
 
-    live = Live.of(torus, {"r": hk.Slider(0.2, 0.4, 0.3)})
-    live = live.framed(ends_of(live.subject.sliders))
+    live = LiveScene.of(torus, {"r": hk.Slider(0.2, 0.4, 0.3)})
+    live = live.framed(extreme_slider_values(live.content.sliders))
     with pytest.raises(ValueError, match=r"at the place r=0\.4 .*reaches to infinity"):
         Session(live).answer({"kind": "change", "sliders": {"r": 0.4}})
     with pytest.raises(ValueError, match=r"at the place r=0\.38 .*reaches to infinity"):
-        Live.of(torus, {"r": hk.Slider(0.2, 0.4, 0.38)})
+        LiveScene.of(torus, {"r": hk.Slider(0.2, 0.4, 0.38)})
 
 
 def test_a_thickness_that_fails_says_at_which_place(monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: Any, thickness: float, **__: Any) -> Any:
         if thickness > 0.2:
-            raise LocalError("sheets meet", np.zeros((1, 3)))
+            raise LocalizedMeshingError("sheets meet", np.zeros((1, 3)))
         return trimesh.creation.icosphere(1)
 
     monkeypatch.setattr(studio_surfaces, "mesh", fail)
-    live = Live.of(FIELD, {"level": 6.0, "thickness": hk.Slider(0.1, 0.3, 0.1)})
+    live = LiveScene.of(FIELD, {"level": 6.0, "thickness": hk.Slider(0.1, 0.3, 0.1)})
     asked = {"kind": "change", "sliders": {"thickness": 0.3}}
     wrong = r"at the place thickness=0\.3 .*thickness=0\.3: sheets meet; give another thickness"
     with pytest.raises(ValueError, match=wrong):
         Session(live).answer(asked)
     with pytest.raises(ValueError, match=r"at the place t=0\.4 .*give another thickness"):
-        Live.of(FIELD, {"level": 6.0, "thickness": lambda t: t, "t": hk.Slider(0.1, 0.7)})
+        LiveScene.of(FIELD, {"level": 6.0, "thickness": lambda t: t, "t": hk.Slider(0.1, 0.7)})
 
 
 def test_more_colors_than_are_drawn_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    live = Live.of([hk.Sphere(1.0), hk.Sphere(0.5)], {})
-    assert len(live.first["surfaces"]) == 2
+    live = LiveScene.of([hk.Sphere(1.0), hk.Sphere(0.5)], {})
+    assert len(live.initial_state["surfaces"]) == 2
     monkeypatch.setattr(live_scene, "_MOST_PAINTS", 5)
     with pytest.raises(ValueError, match="have 6 colors"):
-        live.state(live.start)
+        live.state(live.initial_controls)
 
 
-def test_what_is_sent_is_what_has_changed(live: Live) -> None:
+def test_what_is_sent_is_what_has_changed(live: LiveScene) -> None:
     moved = Session(live).controls({"sliders": {"level": 3.0}, "loops": [(1.1 * LOOP).tolist()]})
-    state, first = live.state(moved), live.first
-    change = difference(first, state)
+    state, first = live.state(moved), live.initial_state
+    change = state_delta(first, state)
     ((new,), (old,), (own,)) = (one["surfaces"] for one in (state, first, change))
     data = old["data"].copy()
     data[own["at"]] = own["to"]
@@ -201,10 +201,10 @@ def test_what_is_sent_is_what_has_changed(live: Live) -> None:
     longer = live.state(
         Session(live).controls({"loops": [example_curves.torus_knot(2, 3, 99).tolist()]})
     )
-    assert difference(first, longer) is longer
+    assert state_delta(first, longer) is longer
 
 
-def test_nothing_is_compiled_by_python_either(live: Live) -> None:
+def test_nothing_is_compiled_by_python_either(live: LiveScene) -> None:
     session = Session(live)
     asked = {"kind": "draw", "size": (64, 48), "eye": EYE}
     session.answer({**asked, "loops": [LOOP.tolist()]})
@@ -218,7 +218,7 @@ def test_nothing_is_compiled_by_python_either(live: Live) -> None:
     assert all(one["cache_hit"] for one in kernels)
 
 
-def test_a_drawn_picture_is_that_of_render(live: Live) -> None:
+def test_a_drawn_picture_is_that_of_render(live: LiveScene) -> None:
     session = Session(live)
     size = (64, 48)
     asked = {"kind": "draw", "size": size, "eye": EYE, "show": "normal"}
@@ -229,7 +229,7 @@ def test_a_drawn_picture_is_that_of_render(live: Live) -> None:
     assert (again != drawn).any()
 
 
-def test_a_probe_says_what_is_there(live: Live) -> None:
+def test_a_probe_says_what_is_there(live: LiveScene) -> None:
     asked = {"kind": "probe", "origin": [0.3, 0.2, 5], "direction": [0, 0, -1]}
     found = Session(live).answer(asked)
     hit = hk.trace(FIELD, [[0.3, 0.2, 5]], [[0, 0, -1]], level=6.0)
@@ -246,7 +246,7 @@ def test_a_probe_says_what_is_there(live: Live) -> None:
 
 @pytest.mark.parametrize("cut", [{"ball": [0, 0, 0, 0.9]}, {"box": [-1, -1, -1, 1, 1, 0.1]},
                                  {"plane": [0, 0, 1, 0.05]}])  # fmt: skip
-def test_a_cut_leaves_what_clip_leaves(cut: dict[str, Any], live: Live) -> None:
+def test_a_cut_leaves_what_clip_leaves(cut: dict[str, Any], live: LiveScene) -> None:
     volumes = {
         "ball": hk.Ball(radius=0.9), "box": hk.Box((-1, -1, -1), (1, 1, 0.1)),
         "plane": hk.HalfSpace((0, 0, 1.0), 0.05),
@@ -257,12 +257,12 @@ def test_a_cut_leaves_what_clip_leaves(cut: dict[str, Any], live: Live) -> None:
         asked = {"kind": "probe", "origin": [x, y, 5], "direction": [0, 0, -1], "cut": cut}
         found = session.answer(asked)
         hit = hk.trace(FIELD, [[x, y, 5]], [[0, 0, -1]], level=6.0, clip=volumes[kind])
-        assert ("t" in found) == bool(hit.hit[0])
+        assert ("t" in found) == bool(hit.is_hit[0])
         if "t" in found:
             assert found["t"] == pytest.approx(float(hit.t[0]), abs=2e-3)
 
 
-def test_what_is_saved_can_be_opened(live: Live) -> None:
+def test_what_is_saved_can_be_opened(live: LiveScene) -> None:
     session = Session(live)
     moved = (LOOP + 0.1).tolist()
     asked = {
@@ -286,14 +286,14 @@ def test_what_is_saved_can_be_opened(live: Live) -> None:
         assert cut["lost"] == []
         scene = session.answer({"kind": "load", "text": cut["text"]})
         assert scene["sliders"][0]["start"] == 5.0
-        (opened,) = session.live.drawn(session.controls({"sliders": {"level": 7.0}}))
-        assert opened.surface.numbers == (7.0,)
+        (opened,) = session.live.surfaces_at(session.controls({"sliders": {"level": 7.0}}))
+        assert opened.surface.level_values == (7.0,)
         is_ball = kind == "ball"
         assert (opened.surface.clip if is_ball else opened.surface.section) is not None
-    solid = Session(Live.of(hk.Sphere(1.0), {"level": hk.Slider(0.0, 0.5, 0.25)}, edits=True))
+    solid = Session(LiveScene.of(hk.Sphere(1.0), {"level": hk.Slider(0.0, 0.5, 0.25)}, edits=True))
     saved = solid.answer({"kind": "save", "camera": POSE, "cut": {"plane": [1, 0, 0, 0.1]}})
     solid.answer({"kind": "load", "text": saved["text"]})
-    (opened,) = solid.live.drawn(solid.controls({"sliders": {"level": 0.5}}))
+    (opened,) = solid.live.surfaces_at(solid.controls({"sliders": {"level": 0.5}}))
     assert opened.surface.solid == (-np.inf, 0.5)  # with a face, at the level of the slider
     text = '{"harnack": 1, "surfaces": [{"field": {"file": "/etc/hosts"}}]}'
     with pytest.raises(hk.SceneFileError, match="must not name files"):
@@ -339,13 +339,13 @@ def test_what_is_saved_can_be_opened(live: Live) -> None:
         ({"kind": "load"}, "text must be"),
     ],
 )
-def test_questions_that_make_no_sense(question: Any, wrong: str, live: Live) -> None:
-    with pytest.raises((QuestionError, ValueError, TypeError), match=wrong):
+def test_questions_that_make_no_sense(question: Any, wrong: str, live: LiveScene) -> None:
+    with pytest.raises((RequestError, ValueError, TypeError), match=wrong):
         Session(live).answer(question)
 
 
-def test_texts_that_are_no_questions(live: Live) -> None:
-    client = Client(live)
+def test_texts_that_are_no_questions(live: LiveScene) -> None:
+    client = MessageHandler(live)
     for text in (
         "",
         "[]",
@@ -356,13 +356,13 @@ def test_texts_that_are_no_questions(live: Live) -> None:
         '{"id": -1}',
         '{"id": true}',
     ):
-        with pytest.raises(QuestionError):
+        with pytest.raises(RequestError):
             client.read(text)
     question = client.read('{"id": 1, "kind": "none"}')
     assert question is not None
     said = client.answer(question, lambda part: None)
     assert isinstance(said, dict)
-    assert said["error"].startswith("QuestionError: kind")
+    assert said["error"].startswith("RequestError: kind")
 
 
 @pytest.mark.slow
@@ -382,8 +382,8 @@ def test_a_page_that_is_closed_at_once_writes_nothing(caplog: pytest.LogCaptureF
     assert [record.getMessage() for record in caplog.records if record.levelname == "ERROR"] == []
 
 
-def test_a_picture_can_be_called_off(live: Live) -> None:
-    client, said = Client(live), []
+def test_a_picture_can_be_called_off(live: LiveScene) -> None:
+    client, said = MessageHandler(live), []
     text = json.dumps({"id": 7, "kind": "picture", "camera": POSE, "size": [64, 48]})
     question = client.read(text)
     assert question is not None
@@ -398,7 +398,9 @@ def test_a_picture_can_be_called_off(live: Live) -> None:
 
 def test_the_floor_hides_nothing_that_moves_below_it() -> None:
     """The floor stands where the surface did at first, and hid what a slider moved."""
-    ball = Live.of(lambda z: hk.Sphere(0.5).moved((0, 0, z)), {"z": hk.Slider(-1.0, 0.0, 0.0)})
+    ball = LiveScene.of(
+        lambda z: hk.Sphere(0.5).translated((0, 0, z)), {"z": hk.Slider(-1.0, 0.0, 0.0)}
+    )
     session = Session(ball)
     eye = {**EYE, "origin": [0, -6, 0.8], "pixel": 0.02}
     asked = {"kind": "draw", "size": (64, 64), "eye": eye, "is_idle": True}
@@ -414,8 +416,8 @@ def test_many_pictures_are_painted_with_cells() -> None:
     """Of a broken mesh, from the second on: and they show the same."""
     vertices, faces = torus_mesh(1.0, 0.4, 24, 12)
     broken = np.delete(faces, slice(None, None, 9), axis=0)
-    session = Session(Live.of(hk.WindingNumber(vertices, broken), {}))
-    plain = Session(Live.of(hk.WindingNumber(vertices, broken, cells=False), {}))
+    session = Session(LiveScene.of(hk.WindingNumber(vertices, broken), {}))
+    plain = Session(LiveScene.of(hk.WindingNumber(vertices, broken, cells=False), {}))
     asked = {"kind": "draw", "size": (64, 48), "eye": EYE}
     for has_cells in (False, True, True):
         pictures = [one.answer(asked).pixels[..., :3].astype(int) for one in (session, plain)]

@@ -39,7 +39,7 @@ def browser() -> Iterator[Any]:
 
 
 @pytest.fixture(scope="module")
-def view() -> Iterator[hk.View]:
+def view() -> Iterator[hk.LiveView]:
     level = hk.Slider(2.0, 11.0, 6.0)
     with hk.view(
         hk.SolidAngle(LOOP), level=level, title="T", camera=hk.Camera(zoom=1.5), opens=False,
@@ -49,7 +49,7 @@ def view() -> Iterator[hk.View]:
 
 
 @pytest.fixture
-def page(browser: Any, view: hk.View) -> Iterator[Page]:
+def page(browser: Any, view: hk.LiveView) -> Iterator[Page]:
     one = Page(browser, view.address, SIZE, samples=1)
     yield one
     one.close()
@@ -247,7 +247,7 @@ def test_a_picture_is_rendered_and_called_off(page: Page) -> None:
     page.tab.wait_for_function("() => panel.message.textContent.includes('stopped')")
 
 
-def test_two_windows_and_a_hundred_connections(browser: Any, view: hk.View) -> None:
+def test_two_windows_and_a_hundred_connections(browser: Any, view: hk.LiveView) -> None:
     pages = [Page(browser, view.address, SIZE, samples=1) for _ in range(2)]
     pages[0].set("level", 3.0)
     pictures = [one.picture() for one in pages]
@@ -270,7 +270,7 @@ def test_two_windows_and_a_hundred_connections(browser: Any, view: hk.View) -> N
     assert count(view) == 0
 
 
-def count(view: hk.View) -> int:
+def count(view: hk.LiveView) -> int:
     with urllib.request.urlopen(f"{view.address}clients") as answer:
         return int(json.load(answer)["clients"])
 
@@ -301,7 +301,7 @@ def test_messages_that_make_no_sense_are_answered_and_harm_nobody(page: Page) ->
     assert page.message == ""
 
 
-def test_a_tab_that_is_closed_ends_its_work(browser: Any, view: hk.View) -> None:
+def test_a_tab_that_is_closed_ends_its_work(browser: Any, view: hk.LiveView) -> None:
     page = Page(browser, view.address, SIZE, samples=1)
     page.do("() => { panel.picture(4000, 'color').catch(() => {}); }")
     page.tab.wait_for_function("() => panel.root.querySelector('progress')?.value > 0")
@@ -315,7 +315,7 @@ def test_a_tab_that_is_closed_ends_its_work(browser: Any, view: hk.View) -> None
     page.close()
 
 
-def test_without_webgpu_python_draws_and_the_page_says_so(browser: Any, view: hk.View) -> None:
+def test_without_webgpu_python_draws_and_the_page_says_so(browser: Any, view: hk.LiveView) -> None:
     flags = ("--no-sandbox", "--disable-gpu", "--disable-features=WebGPU")
     with closing(launched(browser.browser_type, *flags)) as plain:
         page = Page(plain, view.address, SIZE, samples=1)
@@ -331,7 +331,7 @@ def test_without_webgpu_python_draws_and_the_page_says_so(browser: Any, view: hk
         page.close()
 
 
-def test_a_device_that_lies_is_not_believed(browser: Any, view: hk.View) -> None:
+def test_a_device_that_lies_is_not_believed(browser: Any, view: hk.LiveView) -> None:
     """One factor in the shader is wrong by 1e-3. Where that is not noticed, it does nothing: as
     where a shorter proof than another one is a little shorter, or beside an edge that no ray meets.
     """
@@ -371,7 +371,7 @@ def test_a_change_during_a_check_neither_accuses_the_device_nor_is_lost(page: Pa
     assert found == ["", "", True]
 
 
-def test_others_are_not_answered(view: hk.View) -> None:
+def test_others_are_not_answered(view: hk.LiveView) -> None:
     assert view.address.startswith("http://127.0.0.1:")
     for headers in ({"Host": "elsewhere.example"}, {"Origin": "http://elsewhere.example"}):
         with pytest.raises(urllib.error.HTTPError, match="403"):
@@ -445,7 +445,7 @@ def test_ctrl_c_while_a_picture_is_rendered() -> None:
             session.ws_connect(f"{address}questions") as talk,
         ):
             camera = {"position": [0, -5, 1], "target": [0, 0, 0], "fov": 30}
-            asked = {"id": 1, "kind": "picture", "size": [3000, 2000], "show": "color"}
+            asked = {"id": 1, "kind": "picture", "size": [3000, 2000], "show": "path"}
             await talk.send_json({**asked, "camera": camera, "spp": 1000})
             while not json.loads(answer := (await talk.receive()).data).get("done"):
                 assert "error" not in answer, answer

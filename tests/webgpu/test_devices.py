@@ -13,7 +13,7 @@ import pytest
 import harnack as hk
 from harnack.geometry.example_meshes import icosphere
 from harnack.tracer import hits as tracing
-from harnack.webgpu import DeviceDisagreesError, NoDeviceError, find_device
+from harnack.webgpu import DeviceMismatchError, NoDeviceError, find_device
 from tests.fields.test_contracts import APPROXIMATE, FIELDS
 from tests.fields.test_shapes import SHAPES
 
@@ -56,16 +56,16 @@ def check_same_hits(field: hk.Field, count: int) -> None:
     """Against Dr.Jit's own: the same ends but for grazes, and hits within the tolerance."""
     o, d, tolerance = rays(field, count)
     if isinstance(field, hk.WindingNumber):
-        field.set_cells(False)  # devices have them where they are asked for
+        field.configure_cells(False)  # devices have them where they are asked for
     other = hk.trace(field, o, d, tolerance=tolerance, backend="webgpu")
     own = hk.trace(field, o, d, tolerance=tolerance)
     unit = d / np.linalg.norm(d, axis=1, keepdims=True)
-    assert tracing._differences(own, other, unit, hk.Tolerance(tolerance)) == ""
-    both = own.hit & other.hit
+    assert tracing._compare_hits(own, other, unit, hk.HitTolerance(tolerance)) == ""
+    both = own.is_hit & other.is_hit
     assert (own.status != other.status).sum() <= 1e-3 * count
     assert both.any()
     assert np.quantile(np.abs(own.t[both] - other.t[both]), 0.9) <= 0.1 * tolerance
-    np.testing.assert_array_equal(own.sheet[both], other.sheet[both])
+    np.testing.assert_array_equal(own.primitive_index[both], other.primitive_index[both])
 
 
 # Walks its tree for more turns than Mesa's compiler lets loops have.
@@ -107,11 +107,11 @@ def test_a_device_that_lies_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(tracing, "find_device", lambda k=line: Lying(find_device(), k))
         try:
             other = hk.trace(field, o, d, tolerance=tolerance, backend="webgpu")
-        except DeviceDisagreesError:
+        except DeviceMismatchError:
             refused += 1
             continue
         assert (own.status == other.status).mean() > 0.998
-        both = own.hit & other.hit
+        both = own.is_hit & other.is_hit
         assert np.quantile(np.abs(own.t[both] - other.t[both]), 0.9) < tolerance
     assert refused >= 5
 
@@ -120,7 +120,7 @@ def test_the_device_is_named_that_lies(monkeypatch: pytest.MonkeyPatch) -> None:
     field = hk.Gyroid(0.5, domain=hk.Ball(radius=1.0))
     o, d, _ = rays(field, 4096)
     monkeypatch.setattr(tracing, "find_device", lambda: Lying(find_device(), 0))
-    with pytest.raises(DeviceDisagreesError, match=r"a device that lies does not .*leave out back"):
+    with pytest.raises(DeviceMismatchError, match=r"a device that lies does not .*leave out back"):
         hk.trace(field, o, d, backend="webgpu")
 
 
@@ -144,6 +144,8 @@ def test_few_rays_and_many() -> None:
         o, d, _ = rays(field, count)
         own, other = hk.trace(field, o, d), hk.trace(field, o, d, backend="webgpu")
         np.testing.assert_array_equal(own.status, other.status)
-        np.testing.assert_allclose(other.position[other.hit], own.position[own.hit], atol=1e-4)
+        np.testing.assert_allclose(
+            other.position[other.is_hit], own.position[own.is_hit], atol=1e-4
+        )
     none = hk.trace(field, np.zeros((0, 3)), np.zeros((0, 3)), backend="webgpu")
     assert len(none.t) == 0

@@ -10,7 +10,7 @@ _SCRIPT = """
 import faulthandler, gc, sys, threading
 import drjit as dr
 from harnack.backend import choose_backend
-from harnack.webgpu.recording import record
+from harnack.webgpu.recording import record_kernel
 
 faulthandler.dump_traceback_later(50, exit=True)
 real = choose_backend("single").Float
@@ -28,7 +28,7 @@ def cycle():
 
 def recorded():
     for k in range(60):
-        record(lambda x, k=k: {"y": dr.sin(x) * (k + 1.0)}, {"x": real([1.0, 2.0, 3.0])}, ())
+        record_kernel(lambda x, k=k: {"y": dr.sin(x) * (k + 1.0)}, {"x": real([1.0, 2.0, 3.0])}, ())
 
 
 waste = [cycle() for _ in range(50_000)]

@@ -9,7 +9,7 @@ import pytest
 
 from harnack.webgpu import UntranslatableError
 from harnack.webgpu.llvm_parser import Constant, Load, Loop, Operation, parse
-from harnack.webgpu.wgsl import shader_of
+from harnack.webgpu.wgsl import to_shader
 
 # One number read, one operation, one result.
 KERNEL = """
@@ -44,7 +44,7 @@ done:
 
 
 def translated(*lines: str) -> str:
-    return shader_of(parse(KERNEL.format("\n".join(f"    {line}" for line in lines)))).code
+    return to_shader(parse(KERNEL.format("\n".join(f"    {line}" for line in lines)))).code
 
 
 @pytest.mark.parametrize(("line", "written"), [
@@ -82,12 +82,12 @@ def test_no_kernel() -> None:
 
 
 def test_arrays_keep_their_names() -> None:
-    shader = shader_of(parse(KERNEL.format("    %f2 = fneg <16 x float> %f1")))
+    shader = to_shader(parse(KERNEL.format("    %f2 = fneg <16 x float> %f1")))
     assert (shader.lanes, shader.results) == (("lane x",), ("result y",))
     assert (shader.numbers, shader.tables) == ((), ())
     unnamed = KERNEL.replace("; lane x", "").format("    %f2 = fneg <16 x float> %f1")
     with pytest.raises(UntranslatableError, match="no name"):
-        shader_of(parse(unnamed))
+        to_shader(parse(unnamed))
 
 
 def test_a_loop_changes_its_variables_at_once() -> None:
@@ -122,7 +122,7 @@ l_7_done:
     assert [(one.before, one.after) for one in loop.variables] == [
         ("%f1", "%f4"), (Constant("f32", 0), "%f3"),
     ]  # fmt: skip
-    code = shader_of(kernel).code
+    code = to_shader(kernel).code
     assert code.index("let next_v_f4 = v_f3;") < code.index("v_f3 = next_v_f3;")
 
 

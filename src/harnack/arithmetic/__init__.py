@@ -5,11 +5,11 @@ Intervals, jets, parabolas and affine forms; formulas are written once and evalu
 
 from __future__ import annotations
 
-from harnack.arithmetic.affine import Affine
+from harnack.arithmetic.affine import AffineForm
 from harnack.arithmetic.angles import atan2
 from harnack.arithmetic.functions import (
     ClippedPower,
-    Function,
+    ElementaryFunction,
     absolute,
     acos,
     asin,
@@ -29,19 +29,26 @@ from harnack.arithmetic.functions import (
 )
 from harnack.arithmetic.interval import ONE, ZERO, Interval
 from harnack.arithmetic.jet import Jet
-from harnack.arithmetic.norms import blend_intersection, blend_union, corner, maximum, minimum, norm
-from harnack.arithmetic.parabola_bounds import Parabolas
+from harnack.arithmetic.norms import (
+    blend_intersection,
+    blend_union,
+    maximum,
+    minimum,
+    norm,
+    orthogonal_intersection,
+)
+from harnack.arithmetic.parabola_bounds import ParabolaBounds
 from harnack.arithmetic.values import Values
 
 __all__ = [
     "ONE",
     "ZERO",
-    "Affine",
+    "AffineForm",
     "ClippedPower",
-    "Function",
+    "ElementaryFunction",
     "Interval",
     "Jet",
-    "Parabolas",
+    "ParabolaBounds",
     "Values",
     "absolute",
     "acos",
@@ -51,7 +58,6 @@ __all__ = [
     "blend_intersection",
     "blend_union",
     "clipped_power",
-    "corner",
     "cos",
     "cosh",
     "exp",
@@ -59,6 +65,7 @@ __all__ = [
     "maximum",
     "minimum",
     "norm",
+    "orthogonal_intersection",
     "power",
     "reciprocal",
     "sin",

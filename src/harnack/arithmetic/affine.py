@@ -1,7 +1,7 @@
 """Revised affine arithmetic along a path: a line and a constant bound of the error.
 
 A function of 0 <= s <= h is c + l e + r, with e = 2s/h - 1 and |r| <= error. Sums are exact;
-products and functions put what is not linear in s into the error. Unlike `Parabolas` it is not
+products and functions put what is not linear in s into the error. Unlike `ParabolaBounds` it is not
 exact at s = 0, so the march tries shorter lengths where it proves nothing.
 
 Source: Vu, Sam-Haroud and Faltings 2009; Fryazinov, Pasko and Comninos 2010.
@@ -15,21 +15,21 @@ from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 
-from harnack.arithmetic.angles import angle_range, meets_cut, unit_vector
+from harnack.arithmetic.angles import angle_range, approximate_direction, meets_branch_cut
 from harnack.arithmetic.functions import atan, reciprocal
-from harnack.arithmetic.interval import Interval, unit_of
-from harnack.arithmetic.operators import Operators
+from harnack.arithmetic.interval import Interval, machine_epsilon
+from harnack.arithmetic.operators import FormulaNumber
 from harnack.backend.elementary import fmax, fmin
 
 if TYPE_CHECKING:
-    from harnack.arithmetic.functions import Function
+    from harnack.arithmetic.functions import ElementaryFunction
     from harnack.backend import Real, Vec3
 
 _ROUNDINGS = 16.0
 
 
 @dataclass(frozen=True, eq=False)
-class Affine(Operators):
+class AffineForm(FormulaNumber):
     """center + slope e + r for -1 <= e <= 1, with |r| <= error.
 
     center, slope, error: numbers of the backend.
@@ -40,12 +40,14 @@ class Affine(Operators):
     error: Real
 
     @classmethod
-    def along(cls, p: Vec3, direction: Vec3, length: Real) -> tuple[Affine, Affine, Affine]:
+    def along_ray(
+        cls, p: Vec3, direction: Vec3, length: Real
+    ) -> tuple[AffineForm, AffineForm, AffineForm]:
         """The coordinates of p + s d for 0 <= s <= length."""
 
-        def coordinate(x: Real, rate: Real) -> Affine:
+        def coordinate(x: Real, rate: Real) -> AffineForm:
             half = 0.5 * length * rate
-            return cls(x + half, half, _slack(dr.abs(x) + dr.abs(half)))
+            return cls(x + half, half, _rounding_bound(dr.abs(x) + dr.abs(half)))
 
         x, y, z = (coordinate(p[k], direction[k]) for k in range(3))
         return x, y, z
@@ -54,26 +56,28 @@ class Affine(Operators):
     def range(self) -> Interval:
         """The range of the function."""
         room = dr.abs(self.slope) + self.error
-        slack = _slack(dr.abs(self.center) + room)
+        slack = _rounding_bound(dr.abs(self.center) + room)
         return Interval(self.center - room - slack, self.center + room + slack)
 
-    def constant(self, x: float | Real) -> Affine:
+    def constant(self, x: float | Real) -> AffineForm:
         kind = cast("Any", type(self.center))
         value = kind(x)
         exact = not isinstance(x, int | float) or (float(x).is_integer() and abs(x) < 2**20)
-        error = 0 * value if exact else _slack(dr.abs(value))
-        return Affine(value, 0 * self.center, error)
+        error = 0 * value if exact else _rounding_bound(dr.abs(value))
+        return AffineForm(value, 0 * self.center, error)
 
-    def __neg__(self) -> Affine:
-        return Affine(-self.center, -self.slope, self.error)
+    def __neg__(self) -> AffineForm:
+        return AffineForm(-self.center, -self.slope, self.error)
 
-    def sum(self, other: Any) -> Affine:
+    def sum(self, other: Any) -> AffineForm:
         center, slope = self.center + other.center, self.slope + other.slope
-        return Affine(
-            center, slope, self.error + other.error + _slack(dr.abs(center) + dr.abs(slope))
+        return AffineForm(
+            center,
+            slope,
+            self.error + other.error + _rounding_bound(dr.abs(center) + dr.abs(slope)),
         )
 
-    def product(self, other: Any) -> Affine:
+    def product(self, other: Any) -> AffineForm:
         """Proof. Of (c + l e + r)(d + m e + q), e^2 lies in [0, 1], so l m e^2 within l m/2 of
         l m/2; everything else that is not linear in e is an error."""
         c, l, r = self.center, self.slope, self.error  # noqa: E741
@@ -81,9 +85,9 @@ class Affine(Operators):
         both = 0.5 * l * m
         error = (dr.abs(c) + dr.abs(l)) * q + (dr.abs(d) + dr.abs(m)) * r + r * q + dr.abs(both)
         size = (dr.abs(c) + dr.abs(l) + r) * (dr.abs(d) + dr.abs(m) + q)
-        return Affine(c * d + both, c * m + d * l, error + _slack(size))
+        return AffineForm(c * d + both, c * m + d * l, error + _rounding_bound(size))
 
-    def apply(self, function: Function) -> Affine:
+    def apply(self, function: ElementaryFunction) -> AffineForm:
         """phi(f), by the best of three lines: its chord, its mean slope, a constant.
 
         Proof. On a range [x, y] of width w, phi lies above its chord by -phi''(z) (t - x)(y - t)/2
@@ -93,59 +97,63 @@ class Affine(Operators):
         """
         x = self.range
         value, slopes, curvature = function.ranges(x)
-        width = x.high - x.low
-        unit = unit_of(width)
-        ends = [function.ranges(Interval(one, one))[0] for one in (x.low, x.high)]
-        rise = dr.select(width > 0, (ends[1].middle - ends[0].middle) / width, 0)
+        width = x.upper - x.lower
+        unit = machine_epsilon(width)
+        ends = [function.ranges(Interval(one, one))[0] for one in (x.lower, x.upper)]
+        rise = dr.select(width > 0, (ends[1].midpoint - ends[0].midpoint) / width, 0)
         rise = dr.select(dr.isfinite(rise), rise, 0)
         eighth = 0.125 * width * width
-        over, under = fmax(-curvature.low * eighth, 0), fmin(-curvature.high * eighth, 0)
-        size = dr.abs(ends[0].middle) + dr.abs(ends[1].middle)
+        over, under = fmax(-curvature.lower * eighth, 0), fmin(-curvature.upper * eighth, 0)
+        size = dr.abs(ends[0].midpoint) + dr.abs(ends[1].midpoint)
         chord = (
-            0.5 * (ends[0].middle + ends[1].middle) + 0.5 * (over + under),
+            0.5 * (ends[0].midpoint + ends[1].midpoint) + 0.5 * (over + under),
             rise,
-            0.5 * (over - under) + ends[0].radius + ends[1].radius + _slack(size),
+            0.5 * (over - under) + ends[0].radius + ends[1].radius + _rounding_bound(size),
         )
-        middle = 0.5 * x.low + 0.5 * x.high
+        middle = 0.5 * x.lower + 0.5 * x.upper
         there = function.ranges(Interval(middle, middle))[0]
         mean = (
-            there.middle,
-            slopes.middle,
+            there.midpoint,
+            slopes.midpoint,
             (slopes.radius * width * 0.5 + there.radius) * (1 + 8 * unit)
-            + _slack(dr.abs(there.middle) + dr.abs(slopes.middle) * width),
+            + _rounding_bound(dr.abs(there.midpoint) + dr.abs(slopes.midpoint) * width),
         )
-        flat = (value.middle, 0 * width, value.radius + _slack(dr.abs(value.middle)))
-        best = _better(_better(chord, mean), flat)
+        flat = (value.midpoint, 0 * width, value.radius + _rounding_bound(dr.abs(value.midpoint)))
+        best = _smaller_error(_smaller_error(chord, mean), flat)
         center, rate, error = best
         moved = rate * (self.center - middle)
-        slack = _slack(
+        slack = _rounding_bound(
             dr.abs(center) + dr.abs(rate) * (dr.abs(self.center) + dr.abs(self.slope) + self.error)
         )
-        return Affine(center + moved, rate * self.slope, error + dr.abs(rate) * self.error + slack)
+        return AffineForm(
+            center + moved, rate * self.slope, error + dr.abs(rate) * self.error + slack
+        )
 
-    def larger(self, other: Any) -> Affine:
+    def pointwise_maximum(self, other: Any) -> AffineForm:
         """max(f, g) = g + max(f - g, 0); f or g itself where it is proved to be the larger."""
         difference = self.sum(-other)
         x = difference.range
-        one, two = x.low >= 0, x.high <= 0
+        one, two = x.lower >= 0, x.upper <= 0
         # max(t, 0) on [x, y], x < 0 < y: its chord has slope y/(y - x) and lies above by at most
         # -x y/(y - x), at 0.
-        rate = x.high / (x.high - x.low)
-        above = -x.low * rate
-        center = rate * (difference.center - x.low) - 0.5 * above
-        size = dr.abs(rate) * (dr.abs(difference.center) + dr.abs(x.low) + dr.abs(x.high))
-        part = Affine(
-            center, rate * difference.slope, rate * difference.error + 0.5 * above + _slack(size)
+        rate = x.upper / (x.upper - x.lower)
+        above = -x.lower * rate
+        center = rate * (difference.center - x.lower) - 0.5 * above
+        size = dr.abs(rate) * (dr.abs(difference.center) + dr.abs(x.lower) + dr.abs(x.upper))
+        part = AffineForm(
+            center,
+            rate * difference.slope,
+            rate * difference.error + 0.5 * above + _rounding_bound(size),
         )
         both = other.sum(part)
-        return Affine(
+        return AffineForm(
             *(
                 dr.select(one, u, dr.select(two, v, w))
                 for u, v, w in zip(_entries(self), _entries(other), _entries(both), strict=True)
             )
         )
 
-    def angle(self, x: Any) -> Affine:
+    def polar_angle(self, x: Any) -> AffineForm:
         """The angle of a point c in the middle, and of all others as seen from there.
 
         Proof. With c = (a, b) any vector, the angle of z = (x, y) is that of c plus that of
@@ -154,27 +162,31 @@ class Affine(Operators):
         most pi; and where x a + y b > 0 that of the second vector is an arc tangent, less than
         pi/2 in size: so there is no such multiple. Elsewhere only [-pi, pi] is known.
         """
-        a, b = unit_vector(x.center, self.center)
+        a, b = approximate_direction(x.center, self.center)
         ahead, aside = x * a + self * b, self * a - x * b
         seen = aside.product(ahead.apply(reciprocal)).apply(atan)
-        turned, _ = angle_range(Interval.exactly(b), Interval.exactly(a))
-        known = ~meets_cut(self.range, x.range) & (ahead.range.low > 0)
-        center = seen.center + turned.middle
-        error = seen.error + turned.radius + _slack(dr.abs(center) + dr.abs(turned.middle))
+        turned, _ = angle_range(Interval.point(b), Interval.point(a))
+        known = ~meets_branch_cut(self.range, x.range) & (ahead.range.lower > 0)
+        center = seen.center + turned.midpoint
+        error = (
+            seen.error + turned.radius + _rounding_bound(dr.abs(center) + dr.abs(turned.midpoint))
+        )
         known &= dr.isfinite(center) & dr.isfinite(seen.slope) & dr.isfinite(error)
         whole = math.pi * (1 + 1e-6)
-        return Affine(
+        return AffineForm(
             dr.select(known, center, 0),
             dr.select(known, seen.slope, 0),
             dr.select(known, error, whole),
         )
 
 
-def _entries(x: Affine) -> tuple[Real, Real, Real]:
+def _entries(x: AffineForm) -> tuple[Real, Real, Real]:
     return x.center, x.slope, x.error
 
 
-def _better(one: tuple[Real, Real, Real], two: tuple[Real, Real, Real]) -> tuple[Real, Real, Real]:
+def _smaller_error(
+    one: tuple[Real, Real, Real], two: tuple[Real, Real, Real]
+) -> tuple[Real, Real, Real]:
     """The one with the smaller error; if one is not finite, the other."""
     known = dr.isfinite(one[0]) & dr.isfinite(one[1]) & dr.isfinite(one[2])
     other = dr.isfinite(two[0]) & dr.isfinite(two[1]) & dr.isfinite(two[2])
@@ -183,7 +195,7 @@ def _better(one: tuple[Real, Real, Real], two: tuple[Real, Real, Real]) -> tuple
     return x, y, z
 
 
-def _slack(size: Real) -> Real:
+def _rounding_bound(size: Real) -> Real:
     """A bound of the rounding and underflow in a sum of numbers with this sum of sizes."""
     smallest = float(dr.smallest(cast("Any", type(size))))
-    return dr.fma(size, _ROUNDINGS * unit_of(size), _ROUNDINGS * smallest)
+    return dr.fma(size, _ROUNDINGS * machine_epsilon(size), _ROUNDINGS * smallest)

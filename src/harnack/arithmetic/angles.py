@@ -14,16 +14,16 @@ from typing import TYPE_CHECKING, Any, cast
 import drjit as dr
 import numpy as np
 
-from harnack.arithmetic.interval import Interval, unit_of
-from harnack.arithmetic.operators import Operators
+from harnack.arithmetic.interval import Interval, machine_epsilon
+from harnack.arithmetic.operators import FormulaNumber
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real
 
-__all__ = ["angle_range", "atan2", "unit_vector"]
+__all__ = ["angle_range", "approximate_direction", "atan2"]
 
 # Units in the last place that Dr.Jit's atan2 is off by at most; measured: 3.3.
-_UNITS = 8.0
+_MAX_ULP_ERROR = 8.0
 # A number of double precision above pi.
 _PI = math.nextafter(math.pi, 4.0)
 
@@ -34,18 +34,18 @@ def atan2(y: Any, x: Any) -> Any:
     It jumps along the negative x axis, where nothing is proved: a ray stops there. Where only the
     cosine or sine of the angle is wanted, x / norm(x, y) and y / norm(x, y) have no cut.
     """
-    if isinstance(y, Operators):
+    if isinstance(y, FormulaNumber):
         return y.atan2(x)
-    if isinstance(x, Operators):
-        return x.of(y).atan2(x)
+    if isinstance(x, FormulaNumber):
+        return x.coerce(y).atan2(x)
     if any(dr.is_array_v(cast("Any", type(one))) for one in (y, x)):
         return dr.atan2(y, x)
     return np.arctan2(y, x)
 
 
-def meets_cut(y: Interval, x: Interval) -> Mask:
+def meets_branch_cut(y: Interval, x: Interval) -> Mask:
     """Whether a box of numbers of the backend may meet the cut; also where an end is NaN."""
-    return ~((x.low > 0) | (y.low > 0) | (y.high < 0))
+    return ~((x.lower > 0) | (y.lower > 0) | (y.upper < 0))
 
 
 def angle_range(y: Interval, x: Interval) -> tuple[Interval, Mask]:
@@ -60,17 +60,17 @@ def angle_range(y: Interval, x: Interval) -> tuple[Interval, Mask]:
     has x > 0 where y may be of either sign, and at most one coordinate of its corner is an end of
     the kind that may be infinite.
     """
-    met = meets_cut(y, x)
-    is_point = x.low is x.high and y.low is y.high
-    whole = Interval.constant(_PI, type(x.low)).high
+    met = meets_branch_cut(y, x)
+    is_point = x.lower is x.upper and y.lower is y.upper
+    whole = Interval.enclosing(_PI, type(x.lower)).upper
     if is_point:
-        angle = dr.atan2(y.low, x.low)
-        angle = dr.select((y.low == 0) & (x.low < 0), math.pi, angle)
+        angle = dr.atan2(y.lower, x.lower)
+        angle = dr.select((y.lower == 0) & (x.lower < 0), math.pi, angle)
         low, high = _widened(angle, angle)
-        unknown = met & ~((y.low == 0) & (x.low < 0))
+        unknown = met & ~((y.lower == 0) & (x.lower < 0))
     else:
-        y, x = _without_nan(y), _without_nan(x)
-        low, high = _widened(-_largest_angle(Interval(-y.high, -y.low), x), _largest_angle(y, x))
+        y, x = _nan_to_infinite(y), _nan_to_infinite(x)
+        low, high = _widened(-_largest_angle(Interval(-y.upper, -y.lower), x), _largest_angle(y, x))
         unknown = met
     low, high = (dr.select(one == one, one, sign * dr.inf) for one, sign in ((low, -1), (high, 1)))
     low, high = dr.maximum(low, -whole), dr.minimum(high, whole)
@@ -79,8 +79,8 @@ def angle_range(y: Interval, x: Interval) -> tuple[Interval, Mask]:
 
 def _largest_angle(y: Interval, x: Interval) -> Real:
     """The largest angle on a box that does not meet the cut."""
-    at_x = dr.select(y.high > 0, x.low, x.high)
-    at_y = dr.select(at_x > 0, y.high, y.low)
+    at_x = dr.select(y.upper > 0, x.lower, x.upper)
+    at_y = dr.select(at_x > 0, y.upper, y.lower)
     # The limit at infinity, along one axis.
     far_x, far_y = dr.isinf(at_x), dr.isinf(at_y)
     at_x, at_y = (
@@ -92,17 +92,18 @@ def _largest_angle(y: Interval, x: Interval) -> Real:
 
 def _widened(low: Real, high: Real) -> tuple[Real, Real]:
     tiny = float(dr.smallest(cast("Any", type(low))))
-    wide = Interval(low, high).widened(_UNITS * unit_of(low), tiny)
-    return wide.low, wide.high
+    wide = Interval(low, high).widened(_MAX_ULP_ERROR * machine_epsilon(low), tiny)
+    return wide.lower, wide.upper
 
 
-def _without_nan(x: Interval) -> Interval:
+def _nan_to_infinite(x: Interval) -> Interval:
     return Interval(
-        dr.select(x.low == x.low, x.low, -dr.inf), dr.select(x.high == x.high, x.high, dr.inf)
+        dr.select(x.lower == x.lower, x.lower, -dr.inf),
+        dr.select(x.upper == x.upper, x.upper, dr.inf),
     )
 
 
-def unit_vector(x: Real, y: Real) -> tuple[Real, Real]:
+def approximate_direction(x: Real, y: Real) -> tuple[Real, Real]:
     """A vector about along (x, y), of a length between 1/2 and 2; (1, 0) for what has no
     direction."""
     size = dr.maximum(dr.abs(x), dr.abs(y))

@@ -1,6 +1,7 @@
 """Elementary functions: their ranges, and those of their first two derivatives, on intervals.
 
-One `Function` serves every arithmetic: it knows the function for plain numbers, and the ranges of
+One `ElementaryFunction` serves every arithmetic: it knows the function for plain numbers, and the
+    ranges of
 it and of its first two derivatives on an interval. `sin(x)` and its like take numbers of any
 arithmetic, Dr.Jit and NumPy arrays, and Python numbers.
 """
@@ -15,40 +16,40 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 import drjit as dr
 import numpy as np
 
-from harnack.arithmetic.interval import ONE, ZERO, Interval, select, unit_of
-from harnack.backend.elementary import clamp, fmax, fmin, largest_angle, sincos
+from harnack.arithmetic.interval import ONE, ZERO, Interval, machine_epsilon, typed_select
+from harnack.backend.elementary import clamp, fmax, fmin, max_sincos_argument, sincos
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real
 
-Ranges: TypeAlias = "tuple[Interval, Interval, Interval]"
+DerivativeRanges: TypeAlias = "tuple[Interval, Interval, Interval]"
 
 # The domain of roots, powers that are no integers, and logarithms.
 _POSITIVE = (0.0, math.inf)
 # No function here overflows sooner than at this part of the largest number: LLVM's exp does at 0.7.
 _OVERFLOWS = 1 / 16
 # Units in the last place that exp, log and their like are off by at most, on every backend.
-_UNITS = 8.0
+_MAX_ULP_ERROR = 8.0
 
 
 @dataclass(frozen=True)
-class Function:
+class ElementaryFunction:
     """A function of one number.
 
     ranges: of it, its derivative and its second derivative on an interval. Where the interval
         contains a pole, or a point at which the function is not defined, the ranges of derivatives
         are all numbers: f(s) = f(0) + s f'(r) does not hold across such a point.
-    plain: the function of Dr.Jit numbers.
-    numpy: the function of NumPy arrays and Python numbers.
+    on_drjit: the function of Dr.Jit numbers.
+    on_numpy: the function of NumPy arrays and Python numbers.
     domain: the least and the largest number of which it has a value.
     is_steep: whether its slope has no bound near a number: a pole, or a vertical tangent.
     has_pole: whether there is a point across which it is not continuous.
     """
 
     name: str
-    ranges: Callable[[Interval], Ranges]
-    plain: Callable[[Any], Any]
-    numpy: Callable[[Any], Any]
+    ranges: Callable[[Interval], DerivativeRanges]
+    on_drjit: Callable[[Any], Any]
+    on_numpy: Callable[[Any], Any]
     domain: tuple[float, float] = (-math.inf, math.inf)
     is_steep: bool = False
     has_pole: bool = False
@@ -62,80 +63,82 @@ class Function:
         if hasattr(x, "apply"):
             return x.apply(self)
         if dr.is_array_v(type(x)):
-            return self.plain(x)
-        return self.numpy(x)
+            return self.on_drjit(x)
+        return self.on_numpy(x)
 
 
-def _rising(f: Callable[[Any], Any], x: Interval) -> Interval:
-    """The range of an increasing function that is accurate to `_UNITS`."""
-    low = f(x.low)
-    high = low if x.low is x.high else f(x.high)
-    return Interval(low, high).widened(_UNITS * unit_of(x.low), _tiny(x))
+def _increasing_range(f: Callable[[Any], Any], x: Interval) -> Interval:
+    """The range of an increasing function that is accurate to `_MAX_ULP_ERROR`."""
+    low = f(x.lower)
+    high = low if x.lower is x.upper else f(x.upper)
+    return Interval(low, high).widened(
+        _MAX_ULP_ERROR * machine_epsilon(x.lower), _smallest_normal(x)
+    )
 
 
-def _tiny(x: Interval) -> float:
-    return float(dr.smallest(cast("Any", type(x.low))))
+def _smallest_normal(x: Interval) -> float:
+    return float(dr.smallest(cast("Any", type(x.lower))))
 
 
 def _two(x: Interval) -> Interval:
     return x + x
 
 
-def _where(defined: Mask, ranges: Ranges) -> Ranges:
+def _unbounded_where_undefined(defined: Mask, ranges: DerivativeRanges) -> DerivativeRanges:
     """The ranges; where the function is not defined, those of derivatives are all numbers."""
     value, *rest = ranges
     slope, second = (
         Interval(
-            select(defined, one.low, -dr.inf, value.low),
-            select(defined, one.high, dr.inf, value.low),
+            typed_select(defined, one.lower, -dr.inf, value.lower),
+            typed_select(defined, one.upper, dr.inf, value.lower),
         )
         for one in rest
     )
     return value, slope, second
 
 
-def _exp(x: Interval) -> Ranges:
-    e = _exponential(dr.exp, x)
-    e = Interval(fmax(e.low, 0), e.high)
+def _exp(x: Interval) -> DerivativeRanges:
+    e = _exponential_range(dr.exp, x)
+    e = Interval(fmax(e.lower, 0), e.upper)
     return e, e, e
 
 
-def _exponential(f: Callable[[Any], Any], x: Interval) -> Interval:
+def _exponential_range(f: Callable[[Any], Any], x: Interval) -> Interval:
     """The range of an increasing function computed from 2^y, whose exponent is rounded: on CUDA it
     is off by |x| units more. What overflows is large, so that 1/(1 + exp(x)) is known to be small.
     """
-    large = _OVERFLOWS * float(dr.largest(type(x.low)))
+    large = _OVERFLOWS * float(dr.largest(type(x.lower)))
 
     def end(v: Real, sign: int) -> Real:
         result = f(v)
-        off = unit_of(v) * (_UNITS + dr.abs(v))
-        moved = dr.fma(dr.abs(result), sign * off, result) + sign * _tiny(x)
-        return select(sign * result == -dr.inf, -sign * large, moved, v)
+        off = machine_epsilon(v) * (_MAX_ULP_ERROR + dr.abs(v))
+        moved = dr.fma(dr.abs(result), sign * off, result) + sign * _smallest_normal(x)
+        return typed_select(sign * result == -dr.inf, -sign * large, moved, v)
 
-    return Interval(end(x.low, -1), end(x.high, 1))
+    return Interval(end(x.lower, -1), end(x.upper, 1))
 
 
-def _log(x: Interval) -> Ranges:
+def _log(x: Interval) -> DerivativeRanges:
     one = x.reciprocal()
     # Near 1 a logarithm is off by four units of 1 on CUDA.
-    value = _rising(dr.log, x).widened(0.0, 4 * unit_of(x.low))
-    return _where(x.low > 0, (value, one, -one.square()))
+    value = _increasing_range(dr.log, x).widened(0.0, 4 * machine_epsilon(x.lower))
+    return _unbounded_where_undefined(x.lower > 0, (value, one, -one.square()))
 
 
-def _sqrt(x: Interval) -> Ranges:
-    low = fmax(x.low, 0)
-    high = low if x.low is x.high else x.high
-    root = _rising(dr.sqrt, Interval(low, high))
+def _sqrt(x: Interval) -> DerivativeRanges:
+    low = fmax(x.lower, 0)
+    high = low if x.lower is x.upper else x.upper
+    root = _increasing_range(dr.sqrt, Interval(low, high))
     # Ends that rounding took below 0 count as 0; where both are below, there is no root.
-    is_none = x.high < 0
-    like = root.low
+    is_none = x.upper < 0
+    like = root.lower
     root = Interval(
-        select(is_none, dr.nan, fmax(root.low, 0), like),
-        select(is_none, dr.nan, root.high, like),
+        typed_select(is_none, dr.nan, fmax(root.lower, 0), like),
+        typed_select(is_none, dr.nan, root.upper, like),
     )
     slope = _half(_positive_reciprocal(root))
     second = -_half(slope * _positive_reciprocal(Interval(low, high)))
-    return _where(x.low >= 0, (root, slope, second))
+    return _unbounded_where_undefined(x.lower >= 0, (root, slope, second))
 
 
 def _half(x: Interval) -> Interval:
@@ -144,22 +147,24 @@ def _half(x: Interval) -> Interval:
 
 def _positive_reciprocal(x: Interval) -> Interval:
     """1/x for numbers >= 0; its upper end is infinite if 0 is one of them."""
-    above = Interval(x.high, x.high).reciprocal()
-    return Interval(fmax(above.low, 0), Interval(fmax(x.low, 0), x.high).reciprocal().high)
+    above = Interval(x.upper, x.upper).reciprocal()
+    return Interval(fmax(above.lower, 0), Interval(fmax(x.lower, 0), x.upper).reciprocal().upper)
 
 
-def _reciprocal(x: Interval) -> Ranges:
+def _reciprocal(x: Interval) -> DerivativeRanges:
     one = x.reciprocal()
     slope = -one.square()
-    return _where((x.low > 0) | (x.high < 0), (one, slope, _two(-slope * one)))
+    return _unbounded_where_undefined(
+        (x.lower > 0) | (x.upper < 0), (one, slope, _two(-slope * one))
+    )
 
 
-def _sine(x: Interval) -> Ranges:
+def _sine(x: Interval) -> DerivativeRanges:
     s, c = _sine_and_cosine(x)
     return s, c, -s
 
 
-def _cosine(x: Interval) -> Ranges:
+def _cosine(x: Interval) -> DerivativeRanges:
     s, c = _sine_and_cosine(x)
     return c, -s, -c
 
@@ -170,59 +175,63 @@ def _sine_and_cosine(x: Interval) -> tuple[Interval, Interval]:
     Proof. Both are monotone between the multiples of pi/2 at which they are 1 or -1: the range is
     given by the ends, and by such points inside. Whether one is inside is tested for an interval
     widened by the rounding of the test; if one is counted wrongly, it is that near to an end.
-    Beyond `largest_angle` sines are not known: on pieces the range is [-1, 1] there; at a point it
+    Beyond `max_sincos_argument` sines are not known: on pieces the range is [-1, 1] there; at a
+        point it
     is all numbers, as the value at a point is taken half way between the ends, and 0 would look
     like one.
     """
-    unit, most = unit_of(x.low), largest_angle(type(x.low))
-    s0, c0 = sincos(x.low)
-    if x.low is x.high:
-        known = dr.abs(x.low) <= most
+    unit, most = machine_epsilon(x.lower), max_sincos_argument(type(x.lower))
+    s0, c0 = sincos(x.lower)
+    if x.lower is x.upper:
+        known = dr.abs(x.lower) <= most
 
         def at_point(one: Real) -> Interval:
             plain = Interval(one, one).widened(4 * unit, 4 * unit)
-            low = dr.select(known, fmax(plain.low, -1), -dr.inf)
-            return Interval(low, dr.select(known, fmin(plain.high, 1), dr.inf))
+            low = dr.select(known, fmax(plain.lower, -1), -dr.inf)
+            return Interval(low, dr.select(known, fmin(plain.upper, 1), dr.inf))
 
         return at_point(s0), at_point(c0)
-    s1, c1 = sincos(x.high)
+    s1, c1 = sincos(x.upper)
     turn = 1 / (2 * math.pi)
-    slack = 8 * unit * (fmax(dr.abs(x.low), dr.abs(x.high)) + 1) * turn
-    low, high = x.low * turn - slack, x.high * turn + slack
-    wide = ~(fmax(dr.abs(x.low), dr.abs(x.high)) <= most) | ~(high - low < 1)
+    slack = 8 * unit * (fmax(dr.abs(x.lower), dr.abs(x.upper)) + 1) * turn
+    low, high = x.lower * turn - slack, x.upper * turn + slack
+    wide = ~(fmax(dr.abs(x.lower), dr.abs(x.upper)) <= most) | ~(high - low < 1)
 
     def passes(phase: float) -> Mask:
         return dr.floor(high - phase) > dr.floor(low - phase)
 
     def over(a: Real, b: Real, top: float, bottom: float) -> Interval:
         plain = Interval(fmin(a, b), fmax(a, b)).widened(4 * unit, 4 * unit)
-        least = dr.select(passes(bottom), -1, plain.low)
-        return _unit_range(Interval(least, dr.select(passes(top), 1, plain.high)), wide)
+        least = dr.select(passes(bottom), -1, plain.lower)
+        return _clip_to_unit(Interval(least, dr.select(passes(top), 1, plain.upper)), wide)
 
     return over(s0, s1, 0.25, 0.75), over(c0, c1, 0.0, 0.5)
 
 
-def _unit_range(x: Interval, wide: Mask) -> Interval:
+def _clip_to_unit(x: Interval, wide: Mask) -> Interval:
     return Interval(
-        dr.select(wide, -1, fmax(x.low, -1)),
-        dr.select(wide, 1, fmin(x.high, 1)),
+        dr.select(wide, -1, fmax(x.lower, -1)),
+        dr.select(wide, 1, fmin(x.upper, 1)),
     )
 
 
-def _tan(x: Interval) -> Ranges:
+def _tan(x: Interval) -> DerivativeRanges:
     s, c = _sine_and_cosine(x)
     t = s * c.reciprocal()
     # Monotone where the cosine has no zero: the ends are the range.
     ends = [
         one * two.reciprocal()
         for one, two in (
-            _sine_and_cosine(Interval(x.low, x.low)), _sine_and_cosine(Interval(x.high, x.high)),
+            _sine_and_cosine(Interval(x.lower, x.lower)),
+            _sine_and_cosine(Interval(x.upper, x.upper)),
         )
-    ]  # fmt: skip
-    no_pole = c.smallest > 0
-    t = Interval(dr.select(no_pole, ends[0].low, t.low), dr.select(no_pole, ends[1].high, t.high))
+    ]
+    no_pole = c.min_abs > 0
+    t = Interval(
+        dr.select(no_pole, ends[0].lower, t.lower), dr.select(no_pole, ends[1].upper, t.upper)
+    )
     slope = ONE + t.square()
-    return _where(no_pole, (t, slope, _two(t * slope)))
+    return _unbounded_where_undefined(no_pole, (t, slope, _two(t * slope)))
 
 
 def _hyperbolic_tangent(x: Real) -> Real:
@@ -231,56 +240,58 @@ def _hyperbolic_tangent(x: Real) -> Real:
     return dr.sinh(x) / dr.cosh(x)
 
 
-def _tanh(x: Interval) -> Ranges:
-    t = _rising(_hyperbolic_tangent, x).widened(_UNITS * unit_of(x.low))
-    high = dr.select(x.high == x.high, fmin(t.high, 1), 1)  # also if an end is NaN
-    t = Interval(fmax(t.low, -1), high)
+def _tanh(x: Interval) -> DerivativeRanges:
+    t = _increasing_range(_hyperbolic_tangent, x).widened(_MAX_ULP_ERROR * machine_epsilon(x.lower))
+    high = dr.select(x.upper == x.upper, fmin(t.upper, 1), 1)  # also if an end is NaN
+    t = Interval(fmax(t.lower, -1), high)
     slope = ONE - t.square()
-    slope = Interval(fmax(slope.low, 0), slope.high)
+    slope = Interval(fmax(slope.lower, 0), slope.upper)
     return t, slope, -_two(t * slope)
 
 
-def _atan(x: Interval) -> Ranges:
+def _atan(x: Interval) -> DerivativeRanges:
     slope = (ONE + x.square()).reciprocal()
     most = 3 * math.sqrt(3) / 8 * (1 + 1e-6)  # of |2x/(1+x^2)^2|, at x = 1/sqrt(3)
     second = -_two(x * slope.square())
-    second = Interval(fmax(second.low, -most), fmin(second.high, most))
-    return _rising(dr.atan, x), slope, second
+    second = Interval(fmax(second.lower, -most), fmin(second.upper, most))
+    return _increasing_range(dr.atan, x), slope, second
 
 
-def _asin(x: Interval) -> Ranges:
-    inside = Interval(fmax(x.low, -1), fmin(x.high, 1))
+def _asin(x: Interval) -> DerivativeRanges:
+    inside = Interval(fmax(x.lower, -1), fmin(x.upper, 1))
     slope = _positive_reciprocal(_sqrt(ONE - inside.square())[0])
     second = inside * slope * slope.square()
-    return _where((x.low >= -1) & (x.high <= 1), (_rising(dr.asin, inside), slope, second))
+    return _unbounded_where_undefined(
+        (x.lower >= -1) & (x.upper <= 1), (_increasing_range(dr.asin, inside), slope, second)
+    )
 
 
-def _acos(x: Interval) -> Ranges:
+def _acos(x: Interval) -> DerivativeRanges:
     value, slope, second = _asin(x)
-    quarter = Interval.constant(math.pi / 2, type(x.low))
+    quarter = Interval.enclosing(math.pi / 2, type(x.lower))
     return quarter - value, -slope, -second
 
 
-def _sinh(x: Interval) -> Ranges:
-    s, c = _exponential(dr.sinh, x), _cosh_range(x)
+def _sinh(x: Interval) -> DerivativeRanges:
+    s, c = _exponential_range(dr.sinh, x), _cosh_range(x)
     return s, c, s
 
 
-def _cosh(x: Interval) -> Ranges:
-    s, c = _exponential(dr.sinh, x), _cosh_range(x)
+def _cosh(x: Interval) -> DerivativeRanges:
+    s, c = _exponential_range(dr.sinh, x), _cosh_range(x)
     return c, s, c
 
 
 def _cosh_range(x: Interval) -> Interval:
-    return _exponential(dr.cosh, Interval(x.smallest, x.largest))
+    return _exponential_range(dr.cosh, Interval(x.min_abs, x.max_abs))
 
 
-def _abs(x: Interval) -> Ranges:
+def _abs(x: Interval) -> DerivativeRanges:
     """|x|: its second derivative at 0 is a Dirac impulse, upwards."""
-    positive, negative = x.low > 0, x.high < 0
-    slope = Interval(select(positive, 1, -1, x.low), select(negative, -1, 1, x.low))
-    kink = select(positive | negative, 0, dr.inf, x.low)
-    return Interval(x.smallest, x.largest), slope, Interval(type(x.low)(0), kink)
+    positive, negative = x.lower > 0, x.upper < 0
+    slope = Interval(typed_select(positive, 1, -1, x.lower), typed_select(negative, -1, 1, x.lower))
+    kink = typed_select(positive | negative, 0, dr.inf, x.lower)
+    return Interval(x.min_abs, x.max_abs), slope, Interval(type(x.lower)(0), kink)
 
 
 def integer_power(x: Interval, n: int) -> Interval:
@@ -290,19 +301,19 @@ def integer_power(x: Interval, n: int) -> Interval:
     if n == 1:
         return x
     if n % 2 == 0:
-        low, high = x.smallest, x.largest
-        if x.low is x.high:
+        low, high = x.min_abs, x.max_abs
+        if x.lower is x.upper:
             low = high
     else:
-        low, high = x.low, x.high
-    a = _repeated(low, n)
-    b = a if low is high else _repeated(high, n)
+        low, high = x.lower, x.upper
+    a = _power_by_squaring(low, n)
+    b = a if low is high else _power_by_squaring(high, n)
     # Every product is off by at most half a unit.
-    result = Interval(a, b).widened(n * unit_of(x.low), n * _tiny(x))
-    return Interval(fmax(result.low, 0), result.high) if n % 2 == 0 else result
+    result = Interval(a, b).widened(n * machine_epsilon(x.lower), n * _smallest_normal(x))
+    return Interval(fmax(result.lower, 0), result.upper) if n % 2 == 0 else result
 
 
-def _repeated(x: Real, n: int) -> Real:
+def _power_by_squaring(x: Real, n: int) -> Real:
     result: Real = None
     while n:
         if n & 1:
@@ -312,29 +323,29 @@ def _repeated(x: Real, n: int) -> Real:
     return result
 
 
-def power(n: float) -> Function:
+def power(n: float) -> ElementaryFunction:
     """x -> x^n; for x >= 0 if n is no integer."""
     if float(n).is_integer():
         k = int(n)
         if k < 0:
 
-            def inverse(x: Interval) -> Ranges:
+            def inverse(x: Interval) -> DerivativeRanges:
                 one = x.reciprocal()
-                slope = Interval.constant(k, type(x.low)) * integer_power(one, 1 - k)
-                second = Interval.constant(k * (k - 1), type(x.low)) * integer_power(one, 2 - k)
-                defined = (x.low > 0) | (x.high < 0)
-                return _where(defined, (integer_power(one, -k), slope, second))
+                slope = Interval.enclosing(k, type(x.lower)) * integer_power(one, 1 - k)
+                second = Interval.enclosing(k * (k - 1), type(x.lower)) * integer_power(one, 2 - k)
+                defined = (x.lower > 0) | (x.upper < 0)
+                return _unbounded_where_undefined(defined, (integer_power(one, -k), slope, second))
 
             def plain(x: Any) -> Any:
-                return 1 / _repeated(x, -k)
+                return 1 / _power_by_squaring(x, -k)
 
-            return Function(
+            return ElementaryFunction(
                 f"power {k}", inverse, plain, _numpy_power(k), is_steep=True, has_pole=True
             )
 
-        def whole(x: Interval) -> Ranges:
-            like = cast("Any", type(x.low))
-            slope, second = Interval.constant(k, like), Interval.constant(k * (k - 1), like)
+        def whole(x: Interval) -> DerivativeRanges:
+            like = cast("Any", type(x.lower))
+            slope, second = Interval.enclosing(k, like), Interval.enclosing(k * (k - 1), like)
             return (
                 integer_power(x, k),
                 slope * integer_power(x, max(k - 1, 0)),
@@ -342,25 +353,26 @@ def power(n: float) -> Function:
             )
 
         def of_numbers(x: Any) -> Any:
-            return 0 * x + 1 if k == 0 else _repeated(x, k)
+            return 0 * x + 1 if k == 0 else _power_by_squaring(x, k)
 
-        return Function(f"power {k}", whole, of_numbers, _numpy_power(k))
+        return ElementaryFunction(f"power {k}", whole, of_numbers, _numpy_power(k))
 
-    def real(x: Interval) -> Ranges:
-        like = cast("Any", type(x.low))
-        slope = Interval.constant(n, like) * _real_power(x, n - 1)
-        second = Interval.constant(n * (n - 1), like) * _real_power(x, n - 2)
-        defined = x.low >= 0 if n > 0 else x.low > 0
-        value, is_none = _real_power(x, n), x.high < 0
+    def real(x: Interval) -> DerivativeRanges:
+        like = cast("Any", type(x.lower))
+        slope = Interval.enclosing(n, like) * _real_power(x, n - 1)
+        second = Interval.enclosing(n * (n - 1), like) * _real_power(x, n - 2)
+        defined = x.lower >= 0 if n > 0 else x.lower > 0
+        value, is_none = _real_power(x, n), x.upper < 0
         value = Interval(
-            select(is_none, dr.nan, value.low, x.low), select(is_none, dr.nan, value.high, x.low)
+            typed_select(is_none, dr.nan, value.lower, x.lower),
+            typed_select(is_none, dr.nan, value.upper, x.lower),
         )
-        return _where(defined, (value, slope, second))
+        return _unbounded_where_undefined(defined, (value, slope, second))
 
     def of_positive(x: Any) -> Any:
         return dr.power(fmax(x, 0), n)
 
-    return Function(
+    return ElementaryFunction(
         f"power {n}", real, of_positive, _numpy_power(n), _POSITIVE, n < 1, has_pole=n < 0
     )
 
@@ -374,43 +386,49 @@ def _real_power(x: Interval, n: float) -> Interval:
 
     An x below the smallest normal number may be any number from 0 to that.
     """
-    least = fmax(x.low, 0)
-    most = fmax(_tiny(x), x.high) if x.high is not x.low else fmax(_tiny(x), least)
+    least = fmax(x.lower, 0)
+    most = (
+        fmax(_smallest_normal(x), x.upper)
+        if x.upper is not x.lower
+        else fmax(_smallest_normal(x), least)
+    )
 
     def end(v: Real, sign: int) -> Real:
         result = dr.power(v, n)
-        off = unit_of(v) * (_UNITS + abs(n) * (4 + 2 * dr.abs(dr.log2(v))))
-        return result + sign * (off * result + _tiny(x))
+        off = machine_epsilon(v) * (_MAX_ULP_ERROR + abs(n) * (4 + 2 * dr.abs(dr.log2(v))))
+        return result + sign * (off * result + _smallest_normal(x))
 
-    at_least = fmax(least, _tiny(x))
+    at_least = fmax(least, _smallest_normal(x))
     if n > 0:
-        return Interval(dr.select(least >= _tiny(x), fmax(end(at_least, -1), 0), 0), end(most, 1))
-    high = dr.select(least >= _tiny(x), end(at_least, 1), dr.inf)
+        return Interval(
+            dr.select(least >= _smallest_normal(x), fmax(end(at_least, -1), 0), 0), end(most, 1)
+        )
+    high = dr.select(least >= _smallest_normal(x), end(at_least, 1), dr.inf)
     return Interval(fmax(end(most, -1), 0), high)
 
 
-exp = Function("exp", _exp, dr.exp, np.exp)
-log = Function("log", _log, dr.log, np.log, _POSITIVE, is_steep=True, has_pole=True)
-sqrt = Function("sqrt", _sqrt, dr.sqrt, np.sqrt, _POSITIVE, is_steep=True)
-reciprocal = Function(
+exp = ElementaryFunction("exp", _exp, dr.exp, np.exp)
+log = ElementaryFunction("log", _log, dr.log, np.log, _POSITIVE, is_steep=True, has_pole=True)
+sqrt = ElementaryFunction("sqrt", _sqrt, dr.sqrt, np.sqrt, _POSITIVE, is_steep=True)
+reciprocal = ElementaryFunction(
     "reciprocal", _reciprocal, lambda x: 1 / x, lambda x: 1 / x, is_steep=True, has_pole=True
 )
-sin = Function("sin", _sine, lambda x: sincos(x)[0], np.sin)
-cos = Function("cos", _cosine, lambda x: sincos(x)[1], np.cos)
-tan = Function(
+sin = ElementaryFunction("sin", _sine, lambda x: sincos(x)[0], np.sin)
+cos = ElementaryFunction("cos", _cosine, lambda x: sincos(x)[1], np.cos)
+tan = ElementaryFunction(
     "tan", _tan, lambda x: sincos(x)[0] / sincos(x)[1], np.tan, is_steep=True, has_pole=True
 )
-tanh = Function("tanh", _tanh, _hyperbolic_tangent, np.tanh)
-atan = Function("atan", _atan, dr.atan, np.arctan)
-asin = Function("asin", _asin, dr.asin, np.arcsin, (-1.0, 1.0), is_steep=True)
-acos = Function("acos", _acos, dr.acos, np.arccos, (-1.0, 1.0), is_steep=True)
-sinh = Function("sinh", _sinh, dr.sinh, np.sinh)
-cosh = Function("cosh", _cosh, dr.cosh, np.cosh)
-absolute = Function("abs", _abs, dr.abs, np.abs)
+tanh = ElementaryFunction("tanh", _tanh, _hyperbolic_tangent, np.tanh)
+atan = ElementaryFunction("atan", _atan, dr.atan, np.arctan)
+asin = ElementaryFunction("asin", _asin, dr.asin, np.arcsin, (-1.0, 1.0), is_steep=True)
+acos = ElementaryFunction("acos", _acos, dr.acos, np.arccos, (-1.0, 1.0), is_steep=True)
+sinh = ElementaryFunction("sinh", _sinh, dr.sinh, np.sinh)
+cosh = ElementaryFunction("cosh", _cosh, dr.cosh, np.cosh)
+absolute = ElementaryFunction("abs", _abs, dr.abs, np.abs)
 
 
 @dataclass(frozen=True)
-class ClippedPower(Function):
+class ClippedPower(ElementaryFunction):
     """x -> max(x, 0)^n, n >= 1: convex, and n - 1 times continuously differentiable. A kernel of
     blobs with compact support.
 
@@ -430,11 +448,11 @@ def clipped_power(n: int) -> ClippedPower:
     if int(n) != n or n < 1:
         raise ValueError(f"the exponent of a clipped power must be an integer >= 1, not {n}")
 
-    def ranges(x: Interval) -> Ranges:
-        low = fmax(x.low, 0)
-        u = Interval(low, low if x.low is x.high else fmax(x.high, 0))
+    def ranges(x: Interval) -> DerivativeRanges:
+        low = fmax(x.lower, 0)
+        u = Interval(low, low if x.lower is x.upper else fmax(x.upper, 0))
         value, slope, second = power(n).ranges(u)
-        low, high = x.low, x.high
+        low, high = x.lower, x.upper
         if n == 1:
             slope = Interval(dr.select(low > 0, 1, 0), dr.select(high >= 0, 1, 0))
             crosses = (low <= 0) & (high >= 0)
@@ -446,7 +464,7 @@ def clipped_power(n: int) -> ClippedPower:
     return ClippedPower(
         f"clipped power {n}",
         ranges,
-        lambda x: power(n).plain(fmax(x, 0)),
+        lambda x: power(n).on_drjit(fmax(x, 0)),
         lambda x: np.maximum(x, 0.0) ** n,
         exponent=n,
     )

@@ -3,6 +3,10 @@
 Every operation gives an interval that contains the result for all numbers of its operands, in the
 rounded arithmetic of the backend too. So the ranges of a function and of its derivatives are proved
 (Moore 1966).
+
+Ranges are rounded outwards: an enclosure violated by one rounding in float32 is a missed hit. One
+piece of the path is the fastest for formulas, four for blobs, whose ranges share the work of
+finding what is near (measured; `PathRestriction.piece_count`).
 """
 
 from __future__ import annotations
@@ -24,7 +28,7 @@ Number: TypeAlias = "Interval | float"
 
 @dataclass(frozen=True)
 class Interval:
-    """All numbers from `low` to `high`, Dr.Jit numbers of one kind or Python floats.
+    """All numbers from `lower` to `upper`, Dr.Jit numbers of one kind or Python floats.
 
     An end that is NaN stands for an infinite one: nothing is known on that side. Python floats are
     constants known while a kernel is recorded, so that some operations with them can be left out.
@@ -34,78 +38,78 @@ class Interval:
 
     Proof of the rounding. An operation of the backend is off by half a unit in the last place, or
     by less than the smallest normal number where the result is no normal number. Each end is moved
-    outwards by a whole unit (`_down`, `_up`), which covers its own rounding and that of the move.
-    A sum that is no normal number is exact, or 0 on a backend that flushes it: it may be off by
-    less than the smallest normal number, which the tracer adds to every value.
+    outwards by a whole unit (`_round_down`, `_round_up`), which covers its own rounding and that of
+    the move. A sum that is no normal number is exact, or 0 on a backend that flushes it: it may be
+    off by less than the smallest normal number, which the tracer adds to every value.
     """
 
-    low: Real
-    high: Real
+    lower: Real
+    upper: Real
     is_single: bool = False
 
     @classmethod
-    def exactly(cls, x: Real) -> Interval:
+    def point(cls, x: Real) -> Interval:
         """The number x alone."""
         return cls(x, x)
 
     @classmethod
-    def constant(cls, x: float, like: Any) -> Interval:
+    def enclosing(cls, x: float, like: Any) -> Interval:
         """The narrowest interval around a Python number x whose ends are numbers of the type
         `like`."""
         if dr.is_array_v(like) and dr.type_v(like) == dr.VarType.Float32:
-            return cls(*_single(float(x), float(x)), is_single=True)
+            return cls(*_outward_single(float(x), float(x)), is_single=True)
         return cls(float(x), float(x))
 
     @property
-    def is_static(self) -> bool:
+    def is_literal(self) -> bool:
         """Whether it is known while a kernel is being recorded."""
-        return isinstance(self.low, float) and isinstance(self.high, float)
+        return isinstance(self.lower, float) and isinstance(self.upper, float)
 
     @property
     def is_zero(self) -> bool:
         """Whether it is known, while a kernel is being recorded, to be 0 alone."""
-        return self.is_static and self.low == 0.0 == self.high
+        return self.is_literal and self.lower == 0.0 == self.upper
 
     @property
-    def middle(self) -> Real:
+    def midpoint(self) -> Real:
         """A number of the interval, half way."""
-        if self.low is self.high:
-            return self.low
-        return 0.5 * self.low + 0.5 * self.high
+        if self.lower is self.upper:
+            return self.lower
+        return 0.5 * self.lower + 0.5 * self.upper
 
     @property
     def radius(self) -> Real:
-        """The largest distance of a number of the interval from `middle`."""
-        if self.low is self.high:
+        """The largest distance of a number of the interval from `midpoint`."""
+        if self.lower is self.upper:
             return 0.0
-        return _up(0.5 * self.high - 0.5 * self.low)
+        return _round_up(0.5 * self.upper - 0.5 * self.lower)
 
     @property
-    def largest(self) -> Real:
+    def max_abs(self) -> Real:
         """The largest absolute value."""
-        return _unknown_or_larger(_absolute(self.low), _absolute(self.high))
+        return _maximum_or_nan(_absolute(self.lower), _absolute(self.upper))
 
     @property
-    def smallest(self) -> Real:
+    def min_abs(self) -> Real:
         """The smallest absolute value."""
-        return _larger(-self.high, _larger(self.low, 0.0))
+        return _maximum(-self.upper, _maximum(self.lower, 0.0))
 
-    def holds(self, x: Real) -> Mask:
+    def contains(self, x: Real) -> Mask:
         """Whether x lies in the interval."""
-        return ~((x < self.low) | (x > self.high))
+        return ~((x < self.lower) | (x > self.upper))
 
     def hull(self, other: Interval) -> Interval:
         """The smallest interval that contains both."""
-        low = -_unknown_or_larger(-self.low, -other.low)
-        high = _unknown_or_larger(self.high, other.high)
+        low = -_maximum_or_nan(-self.lower, -other.lower)
+        high = _maximum_or_nan(self.upper, other.upper)
         return Interval(low, high, self.is_single or other.is_single)
 
-    def meet(self, other: Interval) -> Interval:
+    def intersect(self, other: Interval) -> Interval:
         """The intersection of two that are known to have a common number; where an end is NaN, that
         of the other."""
         return Interval(
-            _defined_larger(self.low, other.low),
-            _defined_smaller(self.high, other.high),
+            _maximum_ignoring_nan(self.lower, other.lower),
+            _minimum_ignoring_nan(self.upper, other.upper),
             self.is_single or other.is_single,
         )
 
@@ -114,17 +118,17 @@ class Interval:
         return self + Interval(x, x)
 
     def __neg__(self) -> Interval:
-        if self.low is self.high:
-            low = -self.low
+        if self.lower is self.upper:
+            low = -self.lower
             return Interval(low, low, self.is_single)
-        return Interval(-self.high, -self.low, self.is_single)
+        return Interval(-self.upper, -self.lower, self.is_single)
 
     def __add__(self, other: Interval) -> Interval:
         if other.is_zero:
             return self
         if self.is_zero:
             return other
-        return self._outwards(self.low + other.low, self.high + other.high, other)
+        return self._rounded_outward(self.lower + other.lower, self.upper + other.upper, other)
 
     def __sub__(self, other: Interval) -> Interval:
         return self + -other
@@ -132,83 +136,85 @@ class Interval:
     def __mul__(self, other: Interval) -> Interval:
         if self.is_zero or other.is_zero:
             return ZERO
-        if self.is_static:
+        if self.is_literal:
             return other._times(self)
-        if other.is_static:
+        if other.is_literal:
             return self._times(other)
         ends = (
-            self.low * other.low,
-            self.low * other.high,
-            self.high * other.low,
-            self.high * other.high,
+            self.lower * other.lower,
+            self.lower * other.upper,
+            self.upper * other.lower,
+            self.upper * other.upper,
         )
-        if self.low is self.high or other.low is other.high:
+        if self.lower is self.upper or other.lower is other.upper:
             ends = (ends[0], ends[3])
-        if self.low is self.high and other.low is other.high:
+        if self.lower is self.upper and other.lower is other.upper:
             ends = (ends[0],)
         low = high = ends[0]
         for one in ends[1:]:
-            low, high = _smaller(low, one), _larger(high, one)
+            low, high = _minimum(low, one), _maximum(high, one)
         # 0 times infinity is NaN: the smallest of the other ends may then be wrong.
-        known = _all_defined(ends)
+        known = _none_is_nan(ends)
         if known is not None:
             low, high = dr.select(known, low, -dr.inf), dr.select(known, high, dr.inf)
-        return Interval(_down(_lost(low, -1)), _up(_lost(high, 1)))
+        return Interval(_round_down(_pad_underflow(low, -1)), _round_up(_pad_underflow(high, 1)))
 
     def _times(self, constant: Interval) -> Interval:
         """The product with an interval of Python floats."""
-        a, b = cast("tuple[float, float]", (constant.low, constant.high))
+        a, b = cast("tuple[float, float]", (constant.lower, constant.upper))
         if a == b == 1.0:
             return self
         if a == b == -1.0:
             return -self
         if a < 0.0 < b:
-            most = _lost(self.largest * max(-a, b), 1)
-            return self._outwards(-most, most, constant)
+            most = _pad_underflow(self.max_abs * max(-a, b), 1)
+            return self._rounded_outward(-most, most, constant)
         if b <= 0.0:
             return -self._times(Interval(-b, -a, constant.is_single))
         if a == b <= 1.0 and np.frexp(a)[0] == 0.5:  # a power of two: exact, but for underflow
-            low, high = _lost(self.low * a, -1), _lost(self.high * a, 1)
+            low, high = _pad_underflow(self.lower * a, -1), _pad_underflow(self.upper * a, 1)
             return Interval(low, high, self.is_single or constant.is_single)
-        low = self.low * a if a == b else _smaller(self.low * a, self.low * b)
-        high = self.high * b if a == b else _larger(self.high * a, self.high * b)
-        return self._outwards(_lost(low, -1), _lost(high, 1), constant)
+        low = self.lower * a if a == b else _minimum(self.lower * a, self.lower * b)
+        high = self.upper * b if a == b else _maximum(self.upper * a, self.upper * b)
+        return self._rounded_outward(_pad_underflow(low, -1), _pad_underflow(high, 1), constant)
 
     def square(self) -> Interval:
         """The range of the squares."""
-        low, high = self.smallest, self.largest
-        if self.low is self.high:
+        low, high = self.min_abs, self.max_abs
+        if self.lower is self.upper:
             low = high
-        result = self._outwards(_lost(low * low, -1), _lost(high * high, 1))
-        return Interval(_larger(result.low, 0.0), result.high, self.is_single)
+        result = self._rounded_outward(
+            _pad_underflow(low * low, -1), _pad_underflow(high * high, 1)
+        )
+        return Interval(_maximum(result.lower, 0.0), result.upper, self.is_single)
 
     def reciprocal(self) -> Interval:
         """1/x; all numbers where 0 lies in the interval."""
-        if self.is_static:
-            if self.low <= 0.0 <= self.high:
+        if self.is_literal:
+            if self.lower <= 0.0 <= self.upper:
                 return Interval(-math.inf, math.inf, self.is_single)
-            return self._outwards(1 / self.high, 1 / self.low)
-        has_zero = ~((self.low > 0) | (self.high < 0))
+            return self._rounded_outward(1 / self.upper, 1 / self.lower)
+        has_zero = ~((self.lower > 0) | (self.upper < 0))
         # Quotients are off by two units on CUDA.
-        low = _down(_lost(1 / self.high, -1), 4.0)
-        high = _up(_lost(1 / self.low, 1), 4.0)
+        low = _round_down(_pad_underflow(1 / self.upper, -1), 4.0)
+        high = _round_up(_pad_underflow(1 / self.lower, 1), 4.0)
         return Interval(dr.select(has_zero, -dr.inf, low), dr.select(has_zero, dr.inf, high))
 
-    def _outwards(self, low: Real, high: Real, other: Interval | None = None) -> Interval:
+    def _rounded_outward(self, low: Real, high: Real, other: Interval | None = None) -> Interval:
         """The result of an operation on this and another interval, its ends moved outwards."""
         single = self.is_single or (other is not None and other.is_single)
-        low, high = _down(low), _up(high)
+        low, high = _round_down(low), _round_up(high)
         if single and isinstance(low, float) and isinstance(high, float):
-            low, high = _single(low, high)
+            low, high = _outward_single(low, high)
         return Interval(low, high, single)
 
     def widened(self, relative: float, absolute: float = 0.0) -> Interval:
         """The interval with each end moved outwards by a fraction of itself and by an absolute
         length: for functions of the backend that are accurate to so much."""
-        low, high = self.low, self.high
+        low, high = self.lower, self.upper
         return Interval(
-            _down(low - relative * _absolute(low) - absolute),
-            _up(high + relative * _absolute(high) + absolute),
+            _round_down(low - relative * _absolute(low) - absolute),
+            _round_up(high + relative * _absolute(high) + absolute),
         )
 
 
@@ -216,36 +222,36 @@ ZERO = Interval(0.0, 0.0)
 ONE = Interval(1.0, 1.0)
 
 
-def unit_of(x: Real) -> float:
+def machine_epsilon(x: Real) -> float:
     """The distance from 1 to the next number of x's precision."""
     return float(dr.epsilon(type(x))) * 2 if dr.is_array_v(cast("Any", type(x))) else 2.0**-52
 
 
-def select(condition: Mask, a: Real, b: Real, like: Real) -> Real:
+def typed_select(condition: Mask, a: Real, b: Real, like: Real) -> Real:
     """a or b as numbers of the type of `like`: from two Python numbers Dr.Jit would make integers
     or numbers of single precision."""
     kind = cast("Any", type(like))
     return dr.select(condition, kind(a) if dr.is_array_v(kind) else a, b)
 
 
-def _down(x: Real, units: float = 1.0) -> Real:
+def _round_down(x: Real, units: float = 1.0) -> Real:
     """A number below x by at least so many units in the last place."""
-    return dr.fma(dr.abs(x), -units * unit_of(x), x)
+    return dr.fma(dr.abs(x), -units * machine_epsilon(x), x)
 
 
-def _up(x: Real, units: float = 1.0) -> Real:
+def _round_up(x: Real, units: float = 1.0) -> Real:
     """A number above x by at least so many units in the last place."""
-    return dr.fma(dr.abs(x), units * unit_of(x), x)
+    return dr.fma(dr.abs(x), units * machine_epsilon(x), x)
 
 
-def _lost(x: Real, sign: int) -> Real:
+def _pad_underflow(x: Real, sign: int) -> Real:
     """A product x, moved outwards by what underflow may have cost it."""
     kind = cast("Any", type(x))
     return x + sign * float(dr.smallest(kind)) if dr.is_array_v(kind) else x
 
 
-def _single(low: float, high: float) -> tuple[float, float]:
-    """The nearest numbers of single precision, at most `low` and at least `high`."""
+def _outward_single(low: float, high: float) -> tuple[float, float]:
+    """The nearest numbers of single precision, at most `lower` and at least `upper`."""
     with np.errstate(over="ignore"):
         a, b = np.float32(low), np.float32(high)
     if float(a) > low:
@@ -255,31 +261,31 @@ def _single(low: float, high: float) -> tuple[float, float]:
     return float(a), float(b)
 
 
-def _smaller(a: Real, b: Real) -> Real:
+def _minimum(a: Real, b: Real) -> Real:
     if isinstance(a, float) and isinstance(b, float):
         return min(a, b)
     return fmin(a, b)
 
 
-def _larger(a: Real, b: Real) -> Real:
+def _maximum(a: Real, b: Real) -> Real:
     if isinstance(a, float) and isinstance(b, float):
         return max(a, b)
     return fmax(a, b)
 
 
-def _unknown_or_larger(a: Real, b: Real) -> Real:
+def _maximum_or_nan(a: Real, b: Real) -> Real:
     """The larger; NaN where either is."""
     if isinstance(a, float) and isinstance(b, float):
         return math.nan if a != a or b != b else max(a, b)
     return dr.select((a > b) | dr.isnan(a), a, b)
 
 
-def _defined_smaller(a: Real, b: Real) -> Real:
+def _minimum_ignoring_nan(a: Real, b: Real) -> Real:
     """The smaller; a where b is NaN, and b where a is."""
     return dr.select((a <= b) | dr.isnan(b), a, b)
 
 
-def _defined_larger(a: Real, b: Real) -> Real:
+def _maximum_ignoring_nan(a: Real, b: Real) -> Real:
     return dr.select((a >= b) | dr.isnan(b), a, b)
 
 
@@ -287,7 +293,7 @@ def _absolute(x: Real) -> Real:
     return abs(x) if isinstance(x, float) else dr.abs(x)
 
 
-def _all_defined(numbers: tuple[Real, ...]) -> Mask | None:
+def _none_is_nan(numbers: tuple[Real, ...]) -> Mask | None:
     total = numbers[0]
     for one in numbers[1:]:
         total = total + one

@@ -16,8 +16,8 @@ import numpy as np
 
 from harnack.arithmetic.functions import absolute, power, reciprocal, sqrt
 from harnack.arithmetic.interval import ONE, Interval
-from harnack.arithmetic.jet import Jet, across
-from harnack.arithmetic.operators import Operators
+from harnack.arithmetic.jet import Jet, wronskian_range
+from harnack.arithmetic.operators import FormulaNumber
 from harnack.backend.elementary import fmax, fmin
 
 if TYPE_CHECKING:
@@ -26,22 +26,22 @@ if TYPE_CHECKING:
 
 def maximum(*values: Any) -> Any:
     """The largest of two or more numbers of any kind."""
-    return _folded("maximum", values)
+    return _reduce_extremum("maximum", values)
 
 
 def minimum(*values: Any) -> Any:
     """The smallest of two or more numbers of any kind."""
-    return _folded("minimum", values)
+    return _reduce_extremum("minimum", values)
 
 
-def _folded(name: str, values: tuple[Any, ...]) -> Any:
+def _reduce_extremum(name: str, values: tuple[Any, ...]) -> Any:
     if len(values) < 2:
         raise TypeError(f"{name} compares two numbers or more, and {len(values)} was given")
-    if any(isinstance(one, Operators) for one in values):
+    if any(isinstance(one, FormulaNumber) for one in values):
         # Jets and their like first: their methods accept numbers of the other kinds.
-        ordered = sorted(values, key=lambda one: not isinstance(one, Operators))
+        ordered = sorted(values, key=lambda one: not isinstance(one, FormulaNumber))
         return functools.reduce(lambda a, b: getattr(a, name)(b), ordered)
-    of_arrays, of_others = _PAIRS[name]
+    of_arrays, of_others = _EXTREMUM_FUNCTIONS[name]
 
     def plain(a: Any, b: Any) -> Any:
         is_array = any(dr.is_array_v(cast("Any", type(one))) for one in (a, b))
@@ -50,7 +50,7 @@ def _folded(name: str, values: tuple[Any, ...]) -> Any:
     return functools.reduce(plain, values)
 
 
-_PAIRS: dict[str, tuple[Callable[[Any, Any], Any], Callable[[Any, Any], Any]]] = {
+_EXTREMUM_FUNCTIONS: dict[str, tuple[Callable[[Any, Any], Any], Callable[[Any, Any], Any]]] = {
     "maximum": (fmax, np.maximum),
     "minimum": (fmin, np.minimum),
 }
@@ -83,16 +83,18 @@ def norm(*values: Any, p: float = 2.0) -> Any:
     if p == 1.0:
         return functools.reduce(lambda a, b: a + b, [absolute(one) for one in values])
     jets = [one for one in values if isinstance(one, Jet)]
-    if not jets and any(isinstance(one, Operators) for one in values):
+    if not jets and any(isinstance(one, FormulaNumber) for one in values):
         sizes = [one if p == 2.0 else absolute(one) for one in values]
-        powers = [one.apply(power(p)) if isinstance(one, Operators) else one**p for one in sizes]
+        powers = [
+            one.apply(power(p)) if isinstance(one, FormulaNumber) else one**p for one in sizes
+        ]
         # First one whose operators accept numbers of the other kinds.
-        powers.sort(key=lambda one: not isinstance(one, Operators))
+        powers.sort(key=lambda one: not isinstance(one, FormulaNumber))
         total = functools.reduce(lambda a, b: a + b, powers)
         return total.norm_of_powers(p)
     if not jets:
         return _plain_norm(values, p)
-    given = [one if isinstance(one, Jet) else jets[0].of(one) for one in values]
+    given = [one if isinstance(one, Jet) else jets[0].coerce(one) for one in values]
     return _norm(given, p)
 
 
@@ -120,97 +122,103 @@ def _plain_power(x: Any, p: float) -> Any:
 
 
 def _norm(xs: list[Jet], p: float) -> Jet:
-    like = next((one.value.low for one in xs if not one.value.is_static), None)
-    like = xs[0].kind() if like is None else like
-    values = [_dynamic(one.value, like) for one in xs]
-    length = _length(values, p)
-    over = _one_over(length)
-    unit = [_clipped(one * over, ONE) for one in values]
+    like = next((one.value.lower for one in xs if not one.value.is_literal), None)
+    like = xs[0].backend_number() if like is None else like
+    values = [as_backend_interval(one.value, like) for one in xs]
+    length = _norm_range(values, p)
+    over = _reciprocal_norm(length)
+    unit = [_clip_magnitude(one * over, ONE) for one in values]
     pulls = unit if p == 2.0 else [_signed_power(one, p - 1) for one in unit]
     count = range(len(xs))
     first = tuple(
-        _clipped(
-            _total([pulls[k] * xs[k].first[i] for k in count]),
-            _length([_dynamic(one.first[i], like) for one in xs], p),
+        _clip_magnitude(
+            _total([pulls[k] * xs[k].first_derivatives[i] for k in count]),
+            _norm_range([as_backend_interval(one.first_derivatives[i], like) for one in xs], p),
         )
-        for i in range(len(xs[0].first))
+        for i in range(len(xs[0].first_derivatives))
     )
     second: list[Interval] = []
-    for k, (i, j) in enumerate(xs[0].pairs()):
+    for k, (i, j) in enumerate(xs[0].hessian_indices()):
         if p == 2.0:
-            bent = _turning(xs, values, over, i, j)
+            bent = _wronskian_term(xs, values, over, i, j)
         else:
             bent = -(first[i] * first[j])
             for one, u in zip(xs, unit, strict=True):
-                by = power(p - 2).ranges(Interval(u.smallest, u.largest))[0]
-                bent = bent + by * _product(one.first[i], one.first[j])
-            bent = bent * over * Interval.constant(p - 1, type(like))
+                by = power(p - 2).ranges(Interval(u.min_abs, u.max_abs))[0]
+                bent = bent + by * _product(one.first_derivatives[i], one.first_derivatives[j])
+            bent = bent * over * Interval.enclosing(p - 1, type(like))
         if i == j:
-            bent = Interval(fmax(bent.low, 0), bent.high)
-        second.append(bent + _total([u * x.second[k] for u, x in zip(pulls, xs, strict=True)]))
-    jet = Jet(length, first, tuple(second), width=xs[0].width)
-    starts = [one.start for one in xs]
+            bent = Interval(fmax(bent.lower, 0), bent.upper)
+        second.append(
+            bent + _total([u * x.second_derivatives[k] for u, x in zip(pulls, xs, strict=True)])
+        )
+    jet = Jet(length, first, tuple(second), piece_length=xs[0].piece_length)
+    starts = [one.jet_at_start for one in xs]
     if any(one is None for one in starts):
         return jet
-    return jet.anchored(_norm(cast("list[Jet]", starts), p), xs[0].width)
+    return jet.narrowed_from_start(_norm(cast("list[Jet]", starts), p), xs[0].piece_length)
 
 
-def _turning(xs: list[Jet], values: list[Interval], over: Interval, i: int, j: int) -> Interval:
+def _wronskian_term(
+    xs: list[Jet], values: list[Interval], over: Interval, i: int, j: int
+) -> Interval:
     """sum_(k<l) w_kl,i w_kl,j / N^3."""
     parts: list[Interval] = []
     for k, m in itertools.combinations(range(len(xs)), 2):
         pair = xs[k], xs[m], values[k], values[m]
-        a = across(*pair, i) * over
-        parts.append(a.square() if i == j else a * (across(*pair, j) * over))
+        a = wronskian_range(*pair, i) * over
+        parts.append(a.square() if i == j else a * (wronskian_range(*pair, j) * over))
     return _total(parts) * over
 
 
-def _length(values: list[Interval], p: float) -> Interval:
+def _norm_range(values: list[Interval], p: float) -> Interval:
     """The range of the norm of independent numbers."""
-    smallest, largest = [one.smallest for one in values], [one.largest for one in values]
-    low = _length_of(smallest, p).low
+    smallest, largest = [one.min_abs for one in values], [one.max_abs for one in values]
+    low = _norm_of_magnitudes(smallest, p).lower
     most = functools.reduce(fmax, smallest)  # rounding and underflow cannot make it shorter
-    return Interval(fmax(low, most), _length_of(largest, p).high)
+    return Interval(fmax(low, most), _norm_of_magnitudes(largest, p).upper)
 
 
-def _length_of(sizes: list[Any], p: float) -> Interval:
+def _norm_of_magnitudes(sizes: list[Any], p: float) -> Interval:
     """The norm of numbers >= 0."""
     if p == 2.0:
-        return sqrt.ranges(_total([Interval.exactly(one).square() for one in sizes]))[0]
+        return sqrt.ranges(_total([Interval.point(one).square() for one in sizes]))[0]
     most = functools.reduce(lambda a, b: dr.select((a > b) | dr.isnan(a), a, b), sizes)
     tiny = float(dr.smallest(cast("Any", type(most))))
     # Divided by the largest, so that no power overflows.
-    over = Interval.exactly(fmax(tiny, most)).reciprocal()
+    over = Interval.point(fmax(tiny, most)).reciprocal()
     root, raised = power(1 / p).ranges, power(p).ranges
-    parts = [raised(Interval.exactly(one) * over)[0] for one in sizes]
-    total = root(_total(parts))[0] * Interval.exactly(most)
-    return Interval(dr.select(most > tiny, total.low, 0), fmax(total.high, 0) + len(sizes) * tiny)
+    parts = [raised(Interval.point(one) * over)[0] for one in sizes]
+    total = root(_total(parts))[0] * Interval.point(most)
+    return Interval(
+        dr.select(most > tiny, total.lower, 0), fmax(total.upper, 0) + len(sizes) * tiny
+    )
 
 
 def _signed_power(x: Interval, q: float) -> Interval:
     """sign(x) |x|^q, q > 0, which rises."""
 
     def of(v: Any) -> Interval:
-        size = power(q).ranges(Interval.exactly(dr.abs(v)))[0]
+        size = power(q).ranges(Interval.point(dr.abs(v)))[0]
         return Interval(
-            dr.select(v >= 0, size.low, -size.high), dr.select(v >= 0, size.high, -size.low)
+            dr.select(v >= 0, size.lower, -size.upper), dr.select(v >= 0, size.upper, -size.lower)
         )
 
-    low = of(x.low)
-    return low if x.low is x.high else Interval(low.low, of(x.high).high)
+    low = of(x.lower)
+    return low if x.lower is x.upper else Interval(low.lower, of(x.upper).upper)
 
 
-def _one_over(length: Interval) -> Interval:
+def _reciprocal_norm(length: Interval) -> Interval:
     """1/N for N >= 0; infinite above where N may be 0."""
     over = reciprocal.ranges(length)[0]
-    least = Interval.exactly(length.high).reciprocal()
-    return Interval(fmax(least.low, 0), over.high)
+    least = Interval.point(length.upper).reciprocal()
+    return Interval(fmax(least.lower, 0), over.upper)
 
 
-def _clipped(x: Interval, most: Interval) -> Interval:
+def _clip_magnitude(x: Interval, most: Interval) -> Interval:
     """x cut to the numbers that are no larger in size than `most`."""
-    bound = most.high
-    return Interval(fmax(x.low, -bound), fmin(x.high, bound))
+    bound = most.upper
+    return Interval(fmax(x.lower, -bound), fmin(x.upper, bound))
 
 
 def _product(a: Interval, b: Interval) -> Interval:
@@ -221,13 +229,13 @@ def _total(parts: list[Interval]) -> Interval:
     return functools.reduce(lambda a, b: a + b, parts)
 
 
-def _dynamic(x: Interval, like: Any) -> Interval:
+def as_backend_interval(x: Interval, like: Any) -> Interval:
     """An interval of numbers of the backend."""
-    if not x.is_static:
+    if not x.is_literal:
         return x
     kind = cast("Any", type(like))
-    low = kind(x.low)
-    return Interval(low, low if x.low == x.high else kind(x.high))
+    low = kind(x.lower)
+    return Interval(low, low if x.lower == x.upper else kind(x.upper))
 
 
 def blend_union(a: Any, b: Any, radius: Any, power: float = 2.0) -> Any:
@@ -255,8 +263,8 @@ def blend_union(a: Any, b: Any, radius: Any, power: float = 2.0) -> Any:
         return both
     # Where only one of the two forms applies, the kinks of the other do not matter.
     far = least - radius
-    both = near.selected(far.value.high < 0, both)
-    return least.selected(far.value.low > 0, both)
+    both = near.select(far.value.upper < 0, both)
+    return least.select(far.value.lower > 0, both)
 
 
 def blend_intersection(a: Any, b: Any, radius: Any, power: float = 2.0) -> Any:
@@ -264,7 +272,7 @@ def blend_intersection(a: Any, b: Any, radius: Any, power: float = 2.0) -> Any:
     return -blend_union(-a, -b, radius, power)
 
 
-def corner(*sides: Any) -> Any:
+def orthogonal_intersection(*sides: Any) -> Any:
     """The signed distance of the set where all sides are <= 0, if these are signed distances with
     gradients at right angles to each other.
 
@@ -277,10 +285,10 @@ def corner(*sides: Any) -> Any:
     both = outside + minimum(most, 0.0)
     if not isinstance(both, Jet):
         return both
-    both = outside.selected(most.value.low > 0, both)
+    both = outside.select(most.value.lower > 0, both)
     # Where no two sides can be positive, as on a face, the distance is the largest of them: the
     # kinks of the norm at 0 and of the minimum do not matter.
-    highs = [one.value.high if isinstance(one, Jet) else one for one in sides]
+    highs = [one.value.upper if isinstance(one, Jet) else one for one in sides]
     second = functools.reduce(fmax, [fmin(a, b) for a, b in itertools.combinations(highs, 2)])
     known = dr.isfinite(functools.reduce(lambda a, b: a + b, highs))
-    return most.selected((second < 0) & known, both)
+    return most.select((second < 0) & known, both)

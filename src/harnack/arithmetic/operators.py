@@ -35,7 +35,7 @@ from harnack.arithmetic.functions import (
 if TYPE_CHECKING:
     from typing import Self
 
-    from harnack.arithmetic.functions import Function
+    from harnack.arithmetic.functions import ElementaryFunction
     from harnack.backend import Real
 
 # NumPy's functions of such numbers: numpy.sin(x) is sin(x).
@@ -59,7 +59,7 @@ _NAMES = (
 )
 
 
-class Operators(abc.ABC):
+class FormulaNumber(abc.ABC):
     """`+ - * / **`, abs, NumPy's functions, maximum, minimum and atan2, from the sums, products,
     functions of one number, the larger of two and the angle that a subclass defines.
 
@@ -80,21 +80,21 @@ class Operators(abc.ABC):
     def __neg__(self) -> Self: ...
 
     @abc.abstractmethod
-    def apply(self, function: Function) -> Self:
+    def apply(self, function: ElementaryFunction) -> Self:
         """A function of this number."""
 
     @abc.abstractmethod
-    def larger(self, other: Any) -> Self: ...
+    def pointwise_maximum(self, other: Any) -> Self: ...
 
     @abc.abstractmethod
-    def angle(self, x: Any) -> Self:
+    def polar_angle(self, x: Any) -> Self:
         """The angle of the point (x, y) with this y: see `harnack.arithmetic.angles`."""
 
     def norm_of_powers(self, p: float) -> Self:
         """The p-norm of some numbers, of which this is the sum of the p-th powers."""
         return self.apply(sqrt if p == 2.0 else power(1 / p))
 
-    def _operand(self, other: Any) -> Self | None:
+    def _coerce_or_none(self, other: Any) -> Self | None:
         """Another operand as a number of this arithmetic; None if it is no number."""
         if isinstance(other, type(self)):
             return other
@@ -105,19 +105,19 @@ class Operators(abc.ABC):
         except (TypeError, ValueError):
             return None
 
-    def of(self, other: Any) -> Self:
+    def coerce(self, other: Any) -> Self:
         """A number of any kind as one of this arithmetic.
 
         Raises:
             TypeError: it is no number.
         """
-        b = self._operand(other)
+        b = self._coerce_or_none(other)
         if b is None:
             raise TypeError(f"expected a number, not an object of type {type(other).__name__}")
         return b
 
     def __add__(self, other: Any) -> Any:
-        b = self._operand(other)
+        b = self._coerce_or_none(other)
         return NotImplemented if b is None else self.sum(b)
 
     __radd__ = __add__
@@ -126,14 +126,14 @@ class Operators(abc.ABC):
         return self
 
     def __sub__(self, other: Any) -> Any:
-        b = self._operand(other)
+        b = self._coerce_or_none(other)
         return NotImplemented if b is None else self.sum(-b)
 
     def __rsub__(self, other: Any) -> Self:
         return -self + other
 
     def __mul__(self, other: Any) -> Any:
-        b = self._operand(other)
+        b = self._coerce_or_none(other)
         return NotImplemented if b is None else self.product(b)
 
     __rmul__ = __mul__
@@ -143,7 +143,7 @@ class Operators(abc.ABC):
             if other == 0:
                 raise ZeroDivisionError("a formula divides by the constant 0")
             return self * (1.0 / other)
-        b = self._operand(other)
+        b = self._coerce_or_none(other)
         return NotImplemented if b is None else self.product(b.apply(reciprocal))
 
     def __rtruediv__(self, other: Any) -> Self:
@@ -155,20 +155,24 @@ class Operators(abc.ABC):
         n = exponent_of(exponent)
         if not n.is_integer():
             return self.apply(power(n))
-        return self._repeated(int(n)) if n >= 0 else self._repeated(int(-n)).apply(reciprocal)
+        return (
+            self._power_by_squaring(int(n))
+            if n >= 0
+            else self._power_by_squaring(int(-n)).apply(reciprocal)
+        )
 
-    def _repeated(self, n: int) -> Self:
+    def _power_by_squaring(self, n: int) -> Self:
         """x^n by products, n >= 0."""
         if n == 0:
             return self.constant(1.0)
         if n == 1:
             return self
-        half = self._repeated(n // 2)
+        half = self._power_by_squaring(n // 2)
         square = half.product(half)
         return square.product(self) if n % 2 else square
 
     def __rpow__(self, base: Any) -> Any:
-        b = self._operand(base)
+        b = self._coerce_or_none(base)
         if b is None:
             return NotImplemented
         if not dr.is_array_v(cast("Any", type(base))) and not float(base) > 0:
@@ -187,18 +191,18 @@ class Operators(abc.ABC):
 
     def maximum(self, other: Any) -> Self:
         """The larger of two functions at each place."""
-        return self.larger(self.of(other))
+        return self.pointwise_maximum(self.coerce(other))
 
     def minimum(self, other: Any) -> Self:
         """The smaller of two functions at each place."""
-        return -((-self).larger(-self.of(other)))
+        return -((-self).pointwise_maximum(-self.coerce(other)))
 
     def atan2(self, x: Any) -> Self:
         """The angle of the point (x, y) with this y."""
-        return self.angle(self.of(x))
+        return self.polar_angle(self.coerce(x))
 
     def _atan2_of(self, y: Any) -> Self:
-        return self.of(y).angle(self)
+        return self.coerce(y).polar_angle(self)
 
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **settings: Any) -> Any:
         """NumPy's functions and operators, applied to these numbers."""
@@ -209,7 +213,7 @@ class Operators(abc.ABC):
             if name in _OPERATORS:
                 a, b = inputs
                 left, right = _OPERATORS[name]
-                is_left = isinstance(a, Operators)
+                is_left = isinstance(a, FormulaNumber)
                 made = getattr(a, left)(b) if is_left else getattr(b, right)(a)
                 if made is NotImplemented:
                     other = type(b if is_left else a).__name__
@@ -299,7 +303,7 @@ class Tally:
 
 
 @dataclass(frozen=True, eq=False)
-class Counted(Operators):
+class OperationCounter(FormulaNumber):
     """A number that counts operations, in a tally that all numbers of a formula share.
 
     is_constant: whether it is the same everywhere, so that functions of it have no slope.
@@ -316,32 +320,34 @@ class Counted(Operators):
     size: float = 1.0
     rate: float = 1.0
 
-    def constant(self, x: Any) -> Counted:
+    def constant(self, x: Any) -> OperationCounter:
         is_number = isinstance(x, int | float)
         size = min(abs(float(x)), _MOST) if is_number else 1.0
         if size > 0.0:
             self.tally.finest = min(self.tally.finest, size)
         is_positive = is_number and x >= 0
-        return Counted(self.tally, is_constant=True, is_square=is_positive, size=size, rate=0.0)
+        return OperationCounter(
+            self.tally, is_constant=True, is_square=is_positive, size=size, rate=0.0
+        )
 
-    def sum(self, other: Counted) -> Counted:
+    def sum(self, other: OperationCounter) -> OperationCounter:
         for number in (self, other):
             if number.is_constant:
                 self.tally.farthest = max(self.tally.farthest, number.size)
         total = self.size + other.size, self.rate + other.rate
         return self._after(_SUM, other, *total, is_square=self.is_square and other.is_square)
 
-    def product(self, other: Counted) -> Counted:
+    def product(self, other: OperationCounter) -> OperationCounter:
         is_scaled = self.is_constant or other.is_constant
         is_square = other is self or (is_scaled and self.is_square and other.is_square)
         size, rate = self.size * other.size, self.size * other.rate + other.size * self.rate
         return self._after(_PRODUCT, other, size, rate, is_square=is_square)
 
-    def __neg__(self) -> Counted:
+    def __neg__(self) -> OperationCounter:
         return self._after(0, self, self.size, self.rate)
 
-    def __pow__(self, exponent: Any) -> Counted:
-        if isinstance(exponent, Counted):  # exp(exponent log(x))
+    def __pow__(self, exponent: Any) -> OperationCounter:
+        if isinstance(exponent, OperationCounter):  # exp(exponent log(x))
             self._note(log)
             rate = self.rate + exponent.rate
             self.tally.steepest = max(self.tally.steepest, rate)
@@ -349,7 +355,7 @@ class Counted(Operators):
         n = exponent_of(exponent)
         return self.apply(sqrt if n == 0.5 else power(n))
 
-    def apply(self, function: Function) -> Counted:
+    def apply(self, function: ElementaryFunction) -> OperationCounter:
         self._note(function)
         name, _, exponent = function.name.partition(" ")
         if name == "power" and float(exponent) >= 1.0:
@@ -359,40 +365,48 @@ class Counted(Operators):
         size = self.size if function is absolute else 1.0
         return self._bent(_FUNCTION, self, size, self.rate)
 
-    def larger(self, other: Counted) -> Counted:
+    def pointwise_maximum(self, other: OperationCounter) -> OperationCounter:
         rate = max(self.rate, other.rate)
         return self._bent(_FUNCTION, other, max(self.size, other.size), rate)
 
-    def angle(self, x: Counted) -> Counted:
+    def polar_angle(self, x: OperationCounter) -> OperationCounter:
         if not (self.is_constant and x.is_constant):
             self.tally.may_jump = self.tally.is_steep = True
         return self._bent(_FUNCTION + _PRODUCT, x, 1.0, self.rate + x.rate)
 
-    def norm_of_powers(self, p: float) -> Counted:
+    def norm_of_powers(self, p: float) -> OperationCounter:
         size = max(self.size, 1.0) ** (1 / p)
         return self._bent(_FUNCTION, self, size, self.rate / (p * size ** (p - 1)))
 
-    def _note(self, function: Function) -> None:
+    def _note(self, function: ElementaryFunction) -> None:
         """Note what a function of this number may do."""
         if not self.is_constant:
             is_norm = function is sqrt and self.is_square
             self.tally.may_jump |= function.has_pole
             self.tally.is_steep |= function.is_steep and not is_norm
 
-    def _bent(self, operations: int, other: Counted, size: float, rate: float) -> Counted:
+    def _bent(
+        self, operations: int, other: OperationCounter, size: float, rate: float
+    ) -> OperationCounter:
         """A number made of this and another one by what may be flat on both sides of a place."""
         if not (self.is_constant and other.is_constant):
             self.tally.steepest = max(self.tally.steepest, self.rate, other.rate)
         return self._after(operations, other, size, rate)
 
     def _after(
-        self, operations: int, other: Counted, size: float, rate: float, *, is_square: bool = False
-    ) -> Counted:
+        self,
+        operations: int,
+        other: OperationCounter,
+        size: float,
+        rate: float,
+        *,
+        is_square: bool = False,
+    ) -> OperationCounter:
         """A number made of this and another one by so many operations."""
         self.tally.operations += operations
         is_constant = self.is_constant and other.is_constant
         rate = 0.0 if is_constant else min(rate, _MOST)
-        return Counted(self.tally, is_constant, is_square, min(size, _MOST), rate)
+        return OperationCounter(self.tally, is_constant, is_square, min(size, _MOST), rate)
 
 
 def _power(x: float, n: float) -> float:
@@ -405,9 +419,11 @@ def tally_of(formula: Callable[[Any, Any, Any], Any]) -> Tally:
     no operations and may jump; it accepts only ranges of derivatives, as those of the library's own
     shapes do, which are bounded."""
     tally = Tally()
-    x, y, z = (Counted(tally) for _ in range(3))  # three, as x * x is a square and x * y is not
+    x, y, z = (
+        OperationCounter(tally) for _ in range(3)
+    )  # three, as x * x is a square and x * y is not
     try:
         formula(x, y, z)
-    except (TypeError, AttributeError):
+    except (TypeError, AttributeError, RuntimeError):  # the last is Dr.Jit's, of its loops
         return Tally(may_jump=True)
     return tally

@@ -23,14 +23,14 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import drjit as dr
 
-from harnack.arithmetic.angles import angle_range, meets_cut, unit_vector
+from harnack.arithmetic.angles import angle_range, approximate_direction, meets_branch_cut
 from harnack.arithmetic.functions import ClippedPower, atan, reciprocal
-from harnack.arithmetic.interval import Interval, unit_of
-from harnack.arithmetic.operators import Operators
+from harnack.arithmetic.interval import Interval, machine_epsilon
+from harnack.arithmetic.operators import FormulaNumber
 from harnack.backend.elementary import clamp, fmax, fmin
 
 if TYPE_CHECKING:
-    from harnack.arithmetic.functions import Function
+    from harnack.arithmetic.functions import ElementaryFunction
     from harnack.backend import Real, Vec3
 
 # a s + b s^2, as (a, b).
@@ -42,33 +42,33 @@ _COMPARED_AT = 0.6
 
 
 @dataclass(frozen=True, eq=False)
-class Parabolas(Operators):
+class ParabolaBounds(FormulaNumber):
     """A function along a path between two parabolas through its value at the start.
 
     value: at s = 0.
     lower, upper: (a, b) of the parabolas a s + b s^2 around f(s) - f(0).
-    length: h; the bounds hold for 0 <= s <= h.
-    degree: 1 if the bounds are lines (bottom-up linear arithmetic), else 2.
-    polynomial: the degree of f, at most 2, if it is a polynomial: then the two parabolas differ by
-        rounding alone. None for other functions.
+    piece_length: h; the bounds hold for 0 <= s <= h.
+    bound_degree: 1 if the bounds are lines (bottom-up linear arithmetic), else 2.
+    polynomial_degree: the degree of f, at most 2, if it is a polynomial: then the two parabolas
+        differ by rounding alone. None for other functions.
     """
 
     value: Interval
     lower: Quadratic
     upper: Quadratic
-    length: Real
-    degree: int = 2
-    polynomial: int | None = None
+    piece_length: Real
+    bound_degree: int = 2
+    polynomial_degree: int | None = None
 
     @classmethod
-    def along(
+    def along_ray(
         cls, p: Vec3, direction: Vec3, length: Real, *, degree: int = 2
-    ) -> tuple[Parabolas, Parabolas, Parabolas]:
+    ) -> tuple[ParabolaBounds, ParabolaBounds, ParabolaBounds]:
         """The coordinates of p + s d for 0 <= s <= length."""
 
-        def coordinate(x: Real, slope: Real) -> Parabolas:
+        def coordinate(x: Real, slope: Real) -> ParabolaBounds:
             line = slope, 0.0
-            return cls(Interval.exactly(x), line, line, length, degree, 1)
+            return cls(Interval.point(x), line, line, length, degree, 1)
 
         x, y, z = (coordinate(p[k], direction[k]) for k in range(3))
         return x, y, z
@@ -76,74 +76,74 @@ class Parabolas(Operators):
     @property
     def bounds(self) -> tuple[Quadratic, Quadratic]:
         """The parabolas below and above, straight if the degree is 1."""
-        if self.degree == 2:
+        if self.bound_degree == 2:
             return self.lower, self.upper
-        return _straight(self.lower, self.upper, self.length)
+        return _lines_bounding_parabolas(self.lower, self.upper, self.piece_length)
 
-    def constant(self, x: float | Real) -> Parabolas:
+    def constant(self, x: float | Real) -> ParabolaBounds:
         if isinstance(x, int | float):
-            value = Interval.constant(float(x), cast("Any", type(self.length)))
+            value = Interval.enclosing(float(x), cast("Any", type(self.piece_length)))
         else:
-            value = Interval.exactly(x)
+            value = Interval.point(x)
         return self._made(value, (0.0, 0.0), (0.0, 0.0), 0)
 
     def _made(
         self, value: Interval, lower: Quadratic, upper: Quadratic, polynomial: int | None = None
-    ) -> Parabolas:
-        made = Parabolas(value, lower, upper, self.length, self.degree, polynomial)
-        if polynomial is None and self.degree == 1:
+    ) -> ParabolaBounds:
+        made = ParabolaBounds(value, lower, upper, self.piece_length, self.bound_degree, polynomial)
+        if polynomial is None and self.bound_degree == 1:
             lower, upper = made.bounds
             return dataclasses.replace(made, lower=lower, upper=upper)
         return made
 
-    def __neg__(self) -> Parabolas:
+    def __neg__(self) -> ParabolaBounds:
         (a, b), (c, d) = self.lower, self.upper
         return dataclasses.replace(self, value=-self.value, lower=(-c, -d), upper=(-a, -b))
 
-    def sum(self, other: Any) -> Parabolas:
+    def sum(self, other: Any) -> ParabolaBounds:
         value = self.value + other.value
         lower = _added(self.lower, other.lower, -1)
         upper = _added(self.upper, other.upper, 1)
-        if self.polynomial is None or other.polynomial is None:
+        if self.polynomial_degree is None or other.polynomial_degree is None:
             return self._made(value, lower, upper)
-        return self._made(value, lower, upper, max(self.polynomial, other.polynomial))
+        return self._made(value, lower, upper, max(self.polynomial_degree, other.polynomial_degree))
 
     # Products.
 
-    def product(self, other: Any) -> Parabolas:
+    def product(self, other: Any) -> ParabolaBounds:
         """f g - f(0) g(0) = f(0) G + g(0) F + F G.
 
         Proof. F and G lie between two parabolas each, and F G is linear in each of them: f g lies
         between the least and the largest of the products of one bound of f with one of g. Each of
         those is a quartic. Straight bounds: f(0) c + g(0) a + a c s is the slope of a chord, which
         is between its values at both ends. Parabolas: the derivative of the quartic is a cubic,
-        which `_lines_around` puts between two lines; their integrals are parabolas.
+        which `_lines_bounding_cubic` puts between two lines; their integrals are parabolas.
         """
-        if other.polynomial == 0:
+        if other.polynomial_degree == 0:
             return self._scaled(other.value)
-        if self.polynomial == 0:
+        if self.polynomial_degree == 0:
             return other._scaled(self.value)
         value = self.value * other.value
         if self is other:
             value = self.value.square()
         both = None
-        if self.polynomial is not None and other.polynomial is not None:
-            both = self.polynomial + other.polynomial
+        if self.polynomial_degree is not None and other.polynomial_degree is not None:
+            both = self.polynomial_degree + other.polynomial_degree
         if both == 2:
             lower, upper = self._product_of_lines(other)
             return self._made(value, lower, upper, 2)
-        if self.degree == 1:
+        if self.bound_degree == 1:
             return self._made(value, *self._straight_product(other))
         return self._made(value, *self._curved_product(other))
 
-    def _scaled(self, factor: Interval) -> Parabolas:
+    def _scaled(self, factor: Interval) -> ParabolaBounds:
         """The product with a constant.
 
         Proof. k f for k = m + e, |e| <= r: m f has the bounds of f times m, swapped if m < 0, and
         |e f| <= r max(|lower|, |upper|), coefficient by coefficient.
         """
         value = self.value * factor
-        middle, radius = factor.middle, factor.radius
+        middle, radius = factor.midpoint, factor.radius
         if factor.is_zero:
             return self._made(value, (0.0, 0.0), (0.0, 0.0), 0)
         low, high = self.lower, self.upper
@@ -154,48 +154,48 @@ class Parabolas(Operators):
         sizes = [fmax(dr.abs(u), dr.abs(v)) for u, v in zip(low, high, strict=True)]
         slack = [
             0.0 if _is_zero(low[k]) and _is_zero(high[k])
-            else radius * sizes[k] + _slack(dr.abs(middle) * sizes[k])
+            else radius * sizes[k] + _rounding_bound(dr.abs(middle) * sizes[k])
             for k in range(2)
         ]  # fmt: skip
         return self._made(
             value,
             (lower[0] - slack[0], lower[1] - slack[1]),
             (upper[0] + slack[0], upper[1] + slack[1]),
-            self.polynomial,
+            self.polynomial_degree,
         )
 
-    def _product_of_lines(self, other: Parabolas) -> tuple[Quadratic, Quadratic]:
+    def _product_of_lines(self, other: ParabolaBounds) -> tuple[Quadratic, Quadratic]:
         """The product of two polynomials of degree 1: exact, up to rounding."""
-        a, ra = _middle(self.lower[0], self.upper[0])
-        c, rc = _middle(other.lower[0], other.upper[0])
-        v, rv, w, rw = *_ends(self.value), *_ends(other.value)
+        a, ra = _midpoint_and_half_width(self.lower[0], self.upper[0])
+        c, rc = _midpoint_and_half_width(other.lower[0], other.upper[0])
+        v, rv, w, rw = *_midpoint_and_radius(self.value), *_midpoint_and_radius(other.value)
         linear = v * c + w * a
-        slack = _slack(dr.abs(v * c) + dr.abs(w * a))
+        slack = _rounding_bound(dr.abs(v * c) + dr.abs(w * a))
         slack += rv * dr.abs(c) + rw * dr.abs(a) + (dr.abs(v) + rv) * rc + (dr.abs(w) + rw) * ra
         bent = a * c
-        loose = _slack(dr.abs(bent)) + dr.abs(a) * rc + dr.abs(c) * ra + ra * rc
+        loose = _rounding_bound(dr.abs(bent)) + dr.abs(a) * rc + dr.abs(c) * ra + ra * rc
         return (linear - slack, bent - loose), (linear + slack, bent + loose)
 
-    def _straight_product(self, other: Parabolas) -> tuple[Quadratic, Quadratic]:
-        h = self.length
-        v, rv, w, rw = *_ends(self.value), *_ends(other.value)
+    def _straight_product(self, other: ParabolaBounds) -> tuple[Quadratic, Quadratic]:
+        h = self.piece_length
+        v, rv, w, rw = *_midpoint_and_radius(self.value), *_midpoint_and_radius(other.value)
         lows: list[Real] = []
         highs: list[Real] = []
         for a, _ in self.bounds:
             for c, _ in other.bounds:
                 linear, bent = v * c + w * a, a * c * h
-                slack = _slack(dr.abs(v * c) + dr.abs(w * a) + dr.abs(bent))
+                slack = _rounding_bound(dr.abs(v * c) + dr.abs(w * a) + dr.abs(bent))
                 slack += rv * dr.abs(c) + rw * dr.abs(a)
                 lows += [linear - slack, linear + bent - slack]
                 highs += [linear + slack, linear + bent + slack]
-        return (_least(*lows), 0.0), (_most(*highs), 0.0)
+        return (_minimum_or_inf(*lows), 0.0), (_maximum_or_inf(*highs), 0.0)
 
-    def _curved_product(self, other: Parabolas) -> tuple[Quadratic, Quadratic]:
-        h = self.length
-        v, rv, w, rw = *_ends(self.value), *_ends(other.value)
+    def _curved_product(self, other: ParabolaBounds) -> tuple[Quadratic, Quadratic]:
+        h = self.piece_length
+        v, rv, w, rw = *_midpoint_and_radius(self.value), *_midpoint_and_radius(other.value)
         lows: list[Real] = []
         highs: list[Real] = []
-        firsts, seconds = self._corners(), other._corners()
+        firsts, seconds = self._bound_coefficients(), other._bound_coefficients()
         pairs = [(f, g) for f in firsts for g in seconds]
         if self is other and len(firsts) == 2:  # of a square, two of the four are the same
             pairs = [(firsts[0], firsts[0]), (firsts[0], firsts[1]), (firsts[1], firsts[1])]
@@ -219,26 +219,26 @@ class Parabolas(Operators):
             off_f, off_g = ra * h + 2 * rb * h * h, rc * h + 2 * rd * h * h
             loose += off_f * (dr.abs(w) + rw + size_g + off_g)
             loose += off_g * (dr.abs(v) + rv + size_f)
-            slack = _slack(size) + loose
-            l0, l1, u0, u1 = _lines_around(c0, c1, c2, c3)
+            slack = _rounding_bound(size) + loose
+            l0, l1, u0, u1 = _lines_bounding_cubic(c0, c1, c2, c3)
             lows += [l0 - slack, l1 - slack]
             highs += [u0 + slack, u1 + slack]
         return (
-            _integral(_least(*lows[::2]), _least(*lows[1::2]), h),
-            _integral(_most(*highs[::2]), _most(*highs[1::2]), h),
+            _integral(_minimum_or_inf(*lows[::2]), _minimum_or_inf(*lows[1::2]), h),
+            _integral(_maximum_or_inf(*highs[::2]), _maximum_or_inf(*highs[1::2]), h),
         )
 
-    def _corners(self) -> list[tuple[Real, Real, Real, Real]]:
+    def _bound_coefficients(self) -> list[tuple[Real, Real, Real, Real]]:
         """The two bounds as (a, b, 0, 0); of a polynomial one, (a, b, radius of a, radius of b)."""
-        if self.polynomial is None:
+        if self.polynomial_degree is None:
             return [(*self.lower, 0.0, 0.0), (*self.upper, 0.0, 0.0)]
-        a, ra = _middle(self.lower[0], self.upper[0])
-        b, rb = _middle(self.lower[1], self.upper[1])
+        a, ra = _midpoint_and_half_width(self.lower[0], self.upper[0])
+        b, rb = _midpoint_and_half_width(self.lower[1], self.upper[1])
         return [(a, b, ra, rb)]
 
     # Functions.
 
-    def apply(self, function: Function) -> Parabolas:
+    def apply(self, function: ElementaryFunction) -> ParabolaBounds:
         """phi(f), by the tighter of two proofs on either side.
 
         Chords. With x = f(s) - f(0) between x- and x+, phi(f(0) + x) - phi(f(0)) = m x, where m is
@@ -246,46 +246,50 @@ class Parabolas(Operators):
         the slopes of the chords to x- and to x+. For an upper bound of a convex phi the two chords
         themselves are enough, and for a lower one the tangent at f(0), as phi lies above it; for
         concave phi the two are exchanged. So f's two parabolas times the ends of the range of m
-        bound phi, and one parabola bounds several (`_above`).
+        bound phi, and one parabola bounds several (`_common_upper_bound`).
 
         Taylor. It is phi'(f(0)) x + phi''(z) x^2/2, and x^2 lies in s^2 times the squares of the
         slopes of f's own chords.
         """
-        if self.polynomial == 0:
-            value = function.ranges(_dynamic(self.value, self.length))[0]
+        if self.polynomial_degree == 0:
+            value = function.ranges(_dynamic(self.value, self.piece_length))[0]
             return self._made(value, (0.0, 0.0), (0.0, 0.0), 0)
-        if isinstance(function, ClippedPower) and self.polynomial is not None:
+        if isinstance(function, ClippedPower) and self.polynomial_degree is not None:
             return self._clipped_power(function)
         lower, upper = self.bounds
-        h = self.length
+        h = self.piece_length
         start = _dynamic(self.value, h)
-        fall, rise = -_peak(_negative(lower), h), _peak(upper, h)
+        fall, rise = -_maximum_on_piece(_negative(lower), h), _maximum_on_piece(upper, h)
         value, slope, _ = function.ranges(start)
         _, slopes, curvature = function.ranges(
-            Interval((start + Interval(fall, fall)).low, (start + Interval(rise, rise)).high)
+            Interval((start + Interval(fall, fall)).lower, (start + Interval(rise, rise)).upper)
         )
         chords = [
-            ((function.ranges(start.shifted(x))[0] - value) * Interval.exactly(x).reciprocal())
+            ((function.ranges(start.shifted(x))[0] - value) * Interval.point(x).reciprocal())
             for x in (fall, rise)
         ]
-        first, last = (one.meet(slopes) for one in chords)
-        convex, concave = curvature.low >= 0, curvature.high <= 0
+        first, last = (one.intersect(slopes) for one in chords)
+        convex, concave = curvature.lower >= 0, curvature.upper <= 0
 
         # For convex phi, x > 0 needs the upper chord and x < 0 the lower one.
         upper_slopes = (
-            dr.select(concave, slope.low, dr.select(convex, first.low, slopes.low)),
-            dr.select(concave, slope.high, dr.select(convex, last.high, slopes.high)),
+            dr.select(concave, slope.lower, dr.select(convex, first.lower, slopes.lower)),
+            dr.select(concave, slope.upper, dr.select(convex, last.upper, slopes.upper)),
         )
         lower_slopes = (
-            dr.select(convex, slope.low, dr.select(concave, last.low, slopes.low)),
-            dr.select(convex, slope.high, dr.select(concave, first.high, slopes.high)),
+            dr.select(convex, slope.lower, dr.select(concave, last.lower, slopes.lower)),
+            dr.select(convex, slope.upper, dr.select(concave, first.upper, slopes.upper)),
         )
-        above = _above([_times(m, one) for m in upper_slopes for one in (lower, upper)], h)
-        below = _below([_times(m, one) for m in lower_slopes for one in (lower, upper)], h)
+        above = _common_upper_bound(
+            [_times(m, one) for m in upper_slopes for one in (lower, upper)], h
+        )
+        below = _common_lower_bound(
+            [_times(m, one) for m in lower_slopes for one in (lower, upper)], h
+        )
         by_taylor = self._taylor(slope, curvature)
-        if self.degree == 1:
-            by_taylor = _straight(*by_taylor, h)
-            below, above = _straight(below, above, h)
+        if self.bound_degree == 1:
+            by_taylor = _lines_bounding_parabolas(*by_taylor, h)
+            below, above = _lines_bounding_parabolas(below, above, h)
         return self._made(
             value,
             _tighter(below, by_taylor[0], h, -1),
@@ -294,53 +298,57 @@ class Parabolas(Operators):
 
     def _taylor(self, slope: Interval, curvature: Interval) -> tuple[Quadratic, Quadratic]:
         moved = self._scaled(slope)
-        (least, _), (most, _) = _straight(self.lower, self.upper, self.length)
-        half = Interval(0.5 * curvature.low, 0.5 * curvature.high)
+        (least, _), (most, _) = _lines_bounding_parabolas(self.lower, self.upper, self.piece_length)
+        half = Interval(0.5 * curvature.lower, 0.5 * curvature.upper)
         bend = half * Interval(least, most).square()
         return (
-            _added(moved.lower, (0.0, bend.low), -1),
-            _added(moved.upper, (0.0, bend.high), 1),
+            _added(moved.lower, (0.0, bend.lower), -1),
+            _added(moved.upper, (0.0, bend.upper), 1),
         )
 
-    def larger(self, other: Any) -> Parabolas:
+    def pointwise_maximum(self, other: Any) -> ParabolaBounds:
         """max(f, g).
 
         Proof. Above: f <= f(0) + F+ and g the same; with V = max(f(0), g(0)) both lie below V
-        + (f(0) - V) + F+, and one parabola bounds both (`_above`), unless one is larger on the
-        whole length. Below: max(f, g) is at least whichever is the larger at 0.
+        + (f(0) - V) + F+, and one parabola bounds both (`_common_upper_bound`), unless one is
+        larger on the whole length. Below: max(f, g) is at least whichever is the larger at 0.
         """
         f, g = self.value, other.value
-        h = self.length
+        h = self.piece_length
         (f_low, f_high), (g_low, g_high) = self.bounds, other.bounds
-        left, right = (f - g).low >= 0, (g - f).low >= 0  # proved to be larger at 0
-        below = _below([f_low, g_low], h)
+        left, right = (f - g).lower >= 0, (g - f).lower >= 0  # proved to be larger at 0
+        below = _common_lower_bound([f_low, g_low], h)
         below = _where(left, f_low, _where(right, g_low, below))
         # Proved to be larger on the whole length: f's least is above g's largest.
-        f_least, f_most = -_peak(_negative(f_low), h), _peak(f_high, h)
-        g_least, g_most = -_peak(_negative(g_low), h), _peak(g_high, h)
-        always_f = (f - g).low + _rounded(f_least - g_most, -1, dr.abs(f_least) + g_most) >= 0
-        always_g = (g - f).low + _rounded(g_least - f_most, -1, dr.abs(g_least) + f_most) >= 0
-        offsets = fmin((f - g).high, 0), fmin((g - f).high, 0)
-        above = _above([f_high, g_high], h, offsets)
+        f_least, f_most = -_maximum_on_piece(_negative(f_low), h), _maximum_on_piece(f_high, h)
+        g_least, g_most = -_maximum_on_piece(_negative(g_low), h), _maximum_on_piece(g_high, h)
+        always_f = (f - g).lower + _shift_by_rounding(
+            f_least - g_most, -1, dr.abs(f_least) + g_most
+        ) >= 0
+        always_g = (g - f).lower + _shift_by_rounding(
+            g_least - f_most, -1, dr.abs(g_least) + f_most
+        ) >= 0
+        offsets = fmin((f - g).upper, 0), fmin((g - f).upper, 0)
+        above = _common_upper_bound([f_high, g_high], h, offsets)
         above = _where(always_f, f_high, _where(always_g, g_high, above))
         below = _where(always_f, f_low, _where(always_g, g_low, below))
-        value = Interval(fmax(f.low, g.low), fmax(f.high, g.high))
+        value = Interval(fmax(f.lower, g.lower), fmax(f.upper, g.upper))
         return self._made(value, below, above)
 
-    def angle(self, x: Any) -> Parabolas:
+    def polar_angle(self, x: Any) -> ParabolaBounds:
         """The angle of a point, which moves as it does seen from any direction.
 
         Proof. For any vector c = (a, b) the angle of z = (x, y) differs from that of
         (x a + y b, y a - x b) by a constant along a path that does not meet the cut, and where
         x a + y b > 0 the latter is an arc tangent. Elsewhere nothing is known beyond the start.
         """
-        h = self.length
+        h = self.piece_length
         v, u = (_dynamic(one.value, h) for one in (self, x))
         value, _ = angle_range(v, u)
-        a, b = unit_vector(u.middle, v.middle)
+        a, b = approximate_direction(u.midpoint, v.midpoint)
         ahead, aside = x * a + self * b, self * a - x * b
         seen = aside.product(ahead.apply(reciprocal)).apply(atan)
-        known = ~meets_cut(self._range(), x._range()) & (ahead._range().low > 0)
+        known = ~meets_branch_cut(self._range(), x._range()) & (ahead._range().lower > 0)
         zero = 0 * h
         return self._made(
             value,
@@ -350,11 +358,13 @@ class Parabolas(Operators):
 
     def _range(self) -> Interval:
         """The range of the function on the whole length."""
-        h, value = self.length, _dynamic(self.value, self.length)
-        fall, rise = _peak(_negative(self.lower), h), _peak(self.upper, h)
-        return Interval((value + Interval(-fall, -fall)).low, (value + Interval(rise, rise)).high)
+        h, value = self.piece_length, _dynamic(self.value, self.piece_length)
+        fall, rise = _maximum_on_piece(_negative(self.lower), h), _maximum_on_piece(self.upper, h)
+        return Interval(
+            (value + Interval(-fall, -fall)).lower, (value + Interval(rise, rise)).upper
+        )
 
-    def _clipped_power(self, function: ClippedPower) -> Parabolas:
+    def _clipped_power(self, function: ClippedPower) -> ParabolaBounds:
         """max(f, 0)^n for a polynomial f.
 
         Proof. If f = v + a s + b s^2 is concave, f > 0 on at most one interval [s0, s1] of [0, h].
@@ -366,11 +376,13 @@ class Parabolas(Operators):
 
         Source: Aydinlilar and Zanni 2023, section 6.2.1, with a corrected extension to [0, h].
         """
-        h = self.length
-        (a, ra), (b, rb) = (_middle(self.lower[k], self.upper[k]) for k in range(2))
-        v, rv = _ends(self.value)
+        h = self.piece_length
+        (a, ra), (b, rb) = (
+            _midpoint_and_half_width(self.lower[k], self.upper[k]) for k in range(2)
+        )
+        v, rv = _midpoint_and_radius(self.value)
         size = dr.abs(v) + dr.abs(a) * h + dr.abs(b) * h * h
-        off = _slack(size) + rv + ra * h + rb * h * h
+        off = _rounding_bound(size) + rv + ra * h + rb * h * h
         # The roots of v + a s + b s^2, b < 0, without cancellation.
         square = a * a - 4 * b * v
         root = dr.sqrt(fmax(square, 0))
@@ -385,25 +397,25 @@ class Parabolas(Operators):
         n = function.exponent
         inner = fmax(v + start * (a + b * start), 0)
         turned = a + 2 * b * start
-        on_it = Parabolas(
+        on_it = ParabolaBounds(
             Interval(fmax(inner - off, 0), inner + off),
-            (turned - _slack(dr.abs(a) + 2 * dr.abs(b) * h) - ra - 2 * rb * h, b - rb),
-            (turned + _slack(dr.abs(a) + 2 * dr.abs(b) * h) + ra + 2 * rb * h, b + rb),
+            (turned - _rounding_bound(dr.abs(a) + 2 * dr.abs(b) * h) - ra - 2 * rb * h, b - rb),
+            (turned + _rounding_bound(dr.abs(a) + 2 * dr.abs(b) * h) + ra + 2 * rb * h, b + rb),
             end - start,
-            self.degree,
+            self.bound_degree,
             2,
-        )._repeated(n)
+        )._power_by_squaring(n)
         value, _, _ = function.ranges(_dynamic(self.value, h))
         tail = n * (2 * off) ** (n - 1) * (dr.abs(a) + ra + 2 * (dr.abs(b) + rb) * h)
         is_cut = (start > 0) | (end < h)
-        if self.degree == 1:
-            lower, upper = on_it._spread(start, end, h, value, is_cut, tail)
+        if self.bound_degree == 1:
+            lower, upper = on_it._extend_lines(start, end, h, value, is_cut, tail)
         else:
-            lower, upper = on_it._extended(start, h, is_cut, tail)
+            lower, upper = on_it._extend_parabolas(start, h, is_cut, tail)
         lower = _where(empty, (-tail, 0.0), lower)
         upper = _where(empty, (tail, 0.0), upper)
-        general = Parabolas(self.value, self.lower, self.upper, h, self.degree)
-        general = Parabolas.apply(general, function)
+        general = ParabolaBounds(self.value, self.lower, self.upper, h, self.bound_degree)
+        general = ParabolaBounds.apply(general, function)
         bends_down = b + rb < 0
         return self._made(
             value,
@@ -411,7 +423,7 @@ class Parabolas(Operators):
             _where(bends_down, upper, general.upper),
         )
 
-    def _extended(
+    def _extend_parabolas(
         self, start: Real, length: Real, is_cut: Any, tail: Real
     ) -> tuple[Quadratic, Quadratic]:
         """Bounds, on all of [0, length], of a function that is this one on an interval that begins
@@ -420,14 +432,14 @@ class Parabolas(Operators):
         for sign, (a, b) in ((-1, self.lower), (1, self.upper)):
             at_start = a - 2 * b * start
             at_end = a + 2 * b * (length - start)
-            slack = _slack(dr.abs(a) + 2 * dr.abs(b) * length) + tail
+            slack = _rounding_bound(dr.abs(a) + 2 * dr.abs(b) * length) + tail
             ends = [one + sign * slack for one in (at_start, at_end)]
-            extreme = _most if sign > 0 else _least
+            extreme = _maximum_or_inf if sign > 0 else _minimum_or_inf
             ends = [dr.select(is_cut, extreme(one, 0 * one), one) * length for one in ends]
             made.append(_integral(ends[0], ends[1], length))
         return made[0], made[1]
 
-    def _spread(
+    def _extend_lines(
         self, start: Real, end: Real, length: Real, value: Interval, is_cut: Any, tail: Real
     ) -> tuple[Quadratic, Quadratic]:
         """The same with straight bounds.
@@ -437,19 +449,19 @@ class Parabolas(Operators):
         s >= end, if it is at least -value/length.
         """
         (low, _), (high, _) = self.bounds
-        part = (end - start) / end * (1 + 8 * unit_of(length))
-        behind = -(value.low / length)
-        behind = behind + _slack(dr.abs(behind))
+        part = (end - start) / end * (1 + 8 * machine_epsilon(length))
+        behind = -(value.lower / length)
+        behind = behind + _rounding_bound(dr.abs(behind))
         before = start > 0
-        high = dr.select(before, _most(high, 0 * high) * part, high)
-        low = dr.select(before, _least(low, 0 * low) * part, low)
-        high = dr.select(end < length, _most(high, behind), high)
-        low = dr.select(end < length, _least(low, -(value.high / end) * (1 + 1e-6)), low)
+        high = dr.select(before, _maximum_or_inf(high, 0 * high) * part, high)
+        low = dr.select(before, _minimum_or_inf(low, 0 * low) * part, low)
+        high = dr.select(end < length, _maximum_or_inf(high, behind), high)
+        low = dr.select(end < length, _minimum_or_inf(low, -(value.upper / end) * (1 + 1e-6)), low)
         slack = dr.select(is_cut, tail, 0)
         return (low - slack, 0.0), (high + slack, 0.0)
 
 
-def _lines_around(c0: Real, c1: Real, c2: Real, c3: Real) -> tuple[Real, Real, Real, Real]:
+def _lines_bounding_cubic(c0: Real, c1: Real, c2: Real, c3: Real) -> tuple[Real, Real, Real, Real]:
     """Lines below and above c0 + c1 r + c2 r^2 + c3 r^3 on [0, 1]: their values at 0 and 1.
 
     Proof. On either side of its inflection the cubic is convex or concave, so it lies between a
@@ -479,14 +491,16 @@ def _lines_around(c0: Real, c1: Real, c2: Real, c3: Real) -> tuple[Real, Real, R
     return l0, l1, u0, u1
 
 
-def _straight(lower: Quadratic, upper: Quadratic, h: Real) -> tuple[Quadratic, Quadratic]:
+def _lines_bounding_parabolas(
+    lower: Quadratic, upper: Quadratic, h: Real
+) -> tuple[Quadratic, Quadratic]:
     """Lines below and above two parabolas: a parabola through 0 lies between its tangent at 0 and
     its chord to h."""
     (a, b), (c, d) = lower, upper
     if _is_zero(b) and _is_zero(d):
         return lower, upper
-    low = _least(a, _rounded(a + b * h, -1, dr.abs(a) + dr.abs(b) * h))
-    high = _most(c, _rounded(c + d * h, 1, dr.abs(c) + dr.abs(d) * h))
+    low = _minimum_or_inf(a, _shift_by_rounding(a + b * h, -1, dr.abs(a) + dr.abs(b) * h))
+    high = _maximum_or_inf(c, _shift_by_rounding(c + d * h, 1, dr.abs(c) + dr.abs(d) * h))
     return (low, 0.0), (high, 0.0)
 
 
@@ -498,7 +512,9 @@ def _integral(at_start: Real, at_end: Real, length: Real) -> Quadratic:
     return a, b
 
 
-def _above(several: list[Quadratic], length: Real, offsets: tuple[Real, ...] = ()) -> Quadratic:
+def _common_upper_bound(
+    several: list[Quadratic], length: Real, offsets: tuple[Real, ...] = ()
+) -> Quadratic:
     """A parabola through 0 above several, each with an offset <= 0, on [0, length].
 
     Proof. On [0, h] c + a s + b s^2 is a mean, with weights >= 0, of the control values c,
@@ -510,19 +526,19 @@ def _above(several: list[Quadratic], length: Real, offsets: tuple[Real, ...] = (
     for k, (a, b) in enumerate(several):
         offset = offsets[k] if offsets else 0.0
         first, second = a * h, b * h * h
-        slack = _slack(dr.abs(offset) + dr.abs(first) + dr.abs(second) + 0 * h)
+        slack = _rounding_bound(dr.abs(offset) + dr.abs(first) + dr.abs(second) + 0 * h)
         middles.append(offset + 0.5 * first + slack)
         lasts.append(offset + (first + second) + slack)
-    middle, last = _most(*middles), _most(*lasts)
-    slack = _slack(dr.abs(middle) + dr.abs(last))
+    middle, last = _maximum_or_inf(*middles), _maximum_or_inf(*lasts)
+    slack = _rounding_bound(dr.abs(middle) + dr.abs(last))
     there = h > 0
     a = dr.select(there, 2 * middle / h, 0)
     b = dr.select(there, (last - 2 * middle + slack) / (h * h), 0)
-    return a + _slack(dr.abs(a)), b
+    return a + _rounding_bound(dr.abs(a)), b
 
 
-def _below(several: list[Quadratic], length: Real) -> Quadratic:
-    return _negative(_above([_negative(one) for one in several], length))
+def _common_lower_bound(several: list[Quadratic], length: Real) -> Quadratic:
+    return _negative(_common_upper_bound([_negative(one) for one in several], length))
 
 
 def _tighter(first: Quadratic, second: Quadratic, length: Real, sign: int) -> Quadratic:
@@ -532,24 +548,24 @@ def _tighter(first: Quadratic, second: Quadratic, length: Real, sign: int) -> Qu
     return _where((one <= two) | ~dr.isfinite(two), first, second)
 
 
-def _peak(q: Quadratic, length: Real) -> Real:
+def _maximum_on_piece(q: Quadratic, length: Real) -> Real:
     """The largest value of a s + b s^2 on [0, length]."""
     a, b = q
     if _is_zero(a) and _is_zero(b):
         return 0 * length
     last = length * (a + b * length)
-    last = last + _slack(length * (dr.abs(a) + dr.abs(b) * length))
+    last = last + _rounding_bound(length * (dr.abs(a) + dr.abs(b) * length))
     inside = (b < 0) & (a > 0) & (a + 2 * b * length < 0)
     vertex = a * (a / (-4 * b))
-    vertex = dr.select(inside, vertex + _slack(dr.abs(vertex)), 0)
-    return _most(0 * length, last, vertex)
+    vertex = dr.select(inside, vertex + _rounding_bound(dr.abs(vertex)), 0)
+    return _maximum_or_inf(0 * length, last, vertex)
 
 
 def _added(one: Quadratic, two: Quadratic, sign: int) -> Quadratic:
     def plus(x: Real, y: Real) -> Real:
         if _is_zero(y):
             return x
-        return y if _is_zero(x) else _rounded(x + y, sign, 0.0)
+        return y if _is_zero(x) else _shift_by_rounding(x + y, sign, 0.0)
 
     return plus(one[0], two[0]), plus(one[1], two[1])
 
@@ -566,54 +582,54 @@ def _where(mask: Any, one: Quadratic, two: Quadratic) -> Quadratic:
     return dr.select(mask, one[0], two[0]), dr.select(mask, one[1], two[1])
 
 
-def _middle(low: Real, high: Real) -> tuple[Real, Real]:
+def _midpoint_and_half_width(low: Real, high: Real) -> tuple[Real, Real]:
     """The middle of two numbers and how far both are from it."""
     if low is high or (_is_zero(low) and _is_zero(high)):
         return low, 0.0
     middle = 0.5 * low + 0.5 * high
-    return middle, _rounded(0.5 * high - 0.5 * low, 1, dr.abs(middle))
+    return middle, _shift_by_rounding(0.5 * high - 0.5 * low, 1, dr.abs(middle))
 
 
-def _ends(x: Interval) -> tuple[Real, Real]:
-    return x.middle, _radius(x)
+def _midpoint_and_radius(x: Interval) -> tuple[Real, Real]:
+    return x.midpoint, _radius(x)
 
 
 def _radius(x: Interval) -> Real:
     """How far numbers of an interval are from its middle, the rounding of the middle included."""
-    if x.low is x.high or x.is_zero:
+    if x.lower is x.upper or x.is_zero:
         return 0.0
     radius = x.radius
-    return radius if isinstance(radius, float) else radius + _slack(dr.abs(x.middle))
+    return radius if isinstance(radius, float) else radius + _rounding_bound(dr.abs(x.midpoint))
 
 
 def _dynamic(x: Interval, like: Real) -> Interval:
     """The interval as numbers of the backend."""
-    if not x.is_static:
+    if not x.is_literal:
         return x
     kind = cast("Any", type(like))
-    low = kind(x.low)
-    return Interval(low, low if x.low == x.high else kind(x.high))
+    low = kind(x.lower)
+    return Interval(low, low if x.lower == x.upper else kind(x.upper))
 
 
 def _is_zero(x: Real) -> bool:
     return isinstance(x, float) and x == 0.0
 
 
-def _rounded(x: Real, sign: int, size: Real) -> Real:
+def _shift_by_rounding(x: Real, sign: int, size: Real) -> Real:
     """x, computed from numbers of that size, moved up (sign 1) or down by its rounding."""
-    return x + sign * _slack(dr.abs(x) + size)
+    return x + sign * _rounding_bound(dr.abs(x) + size)
 
 
-def _slack(size: Real) -> Real:
+def _rounding_bound(size: Real) -> Real:
     """A bound of the rounding and underflow in a sum of numbers with this sum of sizes."""
     if isinstance(size, float):
         assert size == 0.0
         return 0.0
     smallest = float(dr.smallest(cast("Any", type(size))))
-    return dr.fma(size, _ROUNDINGS * unit_of(size), _ROUNDINGS * smallest)
+    return dr.fma(size, _ROUNDINGS * machine_epsilon(size), _ROUNDINGS * smallest)
 
 
-def _most(*numbers: Real) -> Real:
+def _maximum_or_inf(*numbers: Real) -> Real:
     """The largest; infinite if one is NaN."""
     largest, total = numbers[0], numbers[0]
     for one in numbers[1:]:
@@ -621,5 +637,5 @@ def _most(*numbers: Real) -> Real:
     return dr.select(total == total, largest, dr.inf)
 
 
-def _least(*numbers: Real) -> Real:
-    return -_most(*(-one for one in numbers))
+def _minimum_or_inf(*numbers: Real) -> Real:
+    return -_maximum_or_inf(*(-one for one in numbers))

@@ -18,10 +18,10 @@ import drjit as dr
 from harnack.arithmetic.angles import angle_range
 from harnack.arithmetic.functions import power
 from harnack.arithmetic.interval import ZERO, Interval
-from harnack.arithmetic.operators import Operators, exponent_of
+from harnack.arithmetic.operators import FormulaNumber, exponent_of
 
 if TYPE_CHECKING:
-    from harnack.arithmetic.functions import Function
+    from harnack.arithmetic.functions import ElementaryFunction
     from harnack.backend import Mask, Real, Vec3
 
 
@@ -30,7 +30,7 @@ _LARGE = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class Values(Operators):
+class Values(FormulaNumber):
     """The range of a function on a box of its variables.
 
     value: its range, over the points of the box at which it has a value.
@@ -53,19 +53,21 @@ class Values(Operators):
         no = no & ~no
         around = ZERO if slack is None else Interval(-slack, slack)
         x, y, z = (
-            cls(Interval.exactly(p[k]).hull(Interval.exactly(q[k])) + around, no, no, no)
+            cls(Interval.point(p[k]).hull(Interval.point(q[k])) + around, no, no, no)
             for k in range(3)
         )
         return x, y, z
 
     def constant(self, x: float | Real) -> Values:
         no = self.nowhere & ~self.nowhere
-        kind = cast("Any", type(self.value.low))
+        kind = cast("Any", type(self.value.lower))
         if dr.is_array_v(cast("Any", type(x))):
-            return Values(Interval.exactly(kind(x)), no, no, no)
-        ends = Interval.constant(float(cast("Any", x)), kind)
-        low = kind(ends.low)
-        return Values(Interval(low, low if ends.low == ends.high else kind(ends.high)), no, no, no)
+            return Values(Interval.point(kind(x)), no, no, no)
+        ends = Interval.enclosing(float(cast("Any", x)), kind)
+        low = kind(ends.lower)
+        return Values(
+            Interval(low, low if ends.lower == ends.upper else kind(ends.upper)), no, no, no
+        )
 
     def sum(self, other: Values) -> Values:
         return self._with(self.value + other.value, other)
@@ -83,14 +85,14 @@ class Values(Operators):
             return super().__pow__(exponent)
         return self.apply(power(exponent_of(exponent)))
 
-    def apply(self, function: Function) -> Values:
+    def apply(self, function: ElementaryFunction) -> Values:
         x = self.value
         value, (low, high) = function.ranges(x)[0], function.domain
         nowhere, gaps = self.nowhere, self.gaps
         if low > -math.inf:
-            nowhere, gaps = nowhere | (x.high < low), gaps | ~(x.low >= low)
+            nowhere, gaps = nowhere | (x.upper < low), gaps | ~(x.lower >= low)
         if high < math.inf:
-            nowhere, gaps = nowhere | (x.low > high), gaps | ~(x.high <= high)
+            nowhere, gaps = nowhere | (x.lower > high), gaps | ~(x.upper <= high)
         # A pole in the box has all numbers for its range.
         pole = _is_lost(value, 0.0 if function.has_pole else _LARGE)
         return Values(value, nowhere, self.jumps | _is_lost(x) | pole, gaps)
@@ -99,21 +101,21 @@ class Values(Operators):
         """The same; it may jump where numbers that overflowed left no range."""
         return replace(self, jumps=self.jumps | _is_lost(self.value))
 
-    def larger(self, other: Values) -> Values:
+    def pointwise_maximum(self, other: Values) -> Values:
         """The larger of two. Where only one of them has a value, it may count as that one or have
         none: the range holds both, and may jump."""
         x, y = self.value, other.value
         gaps = self.gaps | other.gaps
         either = _unless(self.nowhere, x, y).hull(_unless(other.nowhere, y, x))
-        least = dr.select(gaps, either.low, x.meet(y).low)
+        least = dr.select(gaps, either.lower, x.intersect(y).lower)
         return Values(
-            Interval(least, either.high),
+            Interval(least, either.upper),
             self.nowhere & other.nowhere,
             self.jumps | other.jumps | gaps | _is_lost(x) | _is_lost(y),
             gaps,
         )
 
-    def angle(self, x: Values) -> Values:
+    def polar_angle(self, x: Values) -> Values:
         value, met = angle_range(self.value, x.value)
         angle = self._with(value, x)
         jumps = angle.jumps | met | _is_lost(self.value) | _is_lost(x.value)
@@ -132,13 +134,13 @@ class Values(Operators):
 def _is_lost(x: Interval, large: float = _LARGE) -> Mask:
     """Whether a range has an infinite end, and is not altogether beyond this power of the largest
     number; 0 for no such power."""
-    lost = ~(dr.isfinite(x.low) & dr.isfinite(x.high))
+    lost = ~(dr.isfinite(x.lower) & dr.isfinite(x.upper))
     if large == 0.0:
         return lost
-    most = float(dr.largest(cast("Any", type(x.low)))) ** large
-    return lost & ~((x.low > most) | (x.high < -most))
+    most = float(dr.largest(cast("Any", type(x.lower)))) ** large
+    return lost & ~((x.lower > most) | (x.upper < -most))
 
 
 def _unless(condition: Mask, x: Interval, y: Interval) -> Interval:
     """x, or y where the condition holds."""
-    return Interval(dr.select(condition, y.low, x.low), dr.select(condition, y.high, x.high))
+    return Interval(dr.select(condition, y.lower, x.lower), dr.select(condition, y.upper, x.upper))

@@ -27,12 +27,12 @@ from harnack.backend.arrays import (  # noqa: E402
     Precision,
     Real,
     Vec3,
-    aligned,
     backend_of,
     choose_backend,
     to_float,
     to_numpy,
     to_vector3,
+    upload_floats,
 )
 from harnack.backend.validation import BoolArray, FloatArray, IntArray  # noqa: E402
 
@@ -49,7 +49,6 @@ __all__ = [
     "Precision",
     "Real",
     "Vec3",
-    "aligned",
     "backend_of",
     "best_library",
     "choose_backend",
@@ -61,4 +60,5 @@ __all__ = [
     "to_float",
     "to_numpy",
     "to_vector3",
+    "upload_floats",
 ]

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend.llvm import ensure_llvm
-from harnack.backend.validation import FloatArray, check_vectors, real_array
+from harnack.backend.validation import FloatArray, as_real_array, check_vectors
 from harnack.name_suggestions import is_one_of
 
 # Dr.Jit creates its array types at run time, one family a backend and precision, so no static
@@ -61,7 +61,7 @@ class Backend:
         return np.float32 if self.precision == "single" else np.float64
 
     @property
-    def epsilon(self) -> float:
+    def machine_epsilon(self) -> float:
         """The distance from 1 to the next number of this precision."""
         return 2.0**-23 if self.precision == "single" else 2.0**-52
 
@@ -89,11 +89,11 @@ def _backend(name: BackendName, precision: Precision) -> Backend:
         ArrayXf=real("ArrayXf"),
     )
     if name == "metal":
-        _check_arithmetic(backend)
+        _check_ieee_arithmetic(backend)
     return backend
 
 
-def _check_arithmetic(backend: Backend) -> None:
+def _check_ieee_arithmetic(backend: Backend) -> None:
     """Metal's compiler may, by default, treat infinities and NaN as if there were none, and round
     otherwise; proofs rest on both. So a device is asked before it is believed. It may flush
     subnormal numbers to zero, which none of the questions leads to.
@@ -102,7 +102,7 @@ def _check_arithmetic(backend: Backend) -> None:
         RuntimeError: it computes otherwise than IEEE 754 says.
     """
     given = np.array([1, 3, 0, -0.0, 1e-30, 8e37, np.inf, np.nan, 0.1, 16777216], np.float32)
-    x, one = aligned(backend, given), dr.opaque(backend.Float, 1)
+    x, one = upload_floats(backend, given), dr.opaque(backend.Float, 1)
     unit = np.float32(1)
     with np.errstate(all="ignore"):
         # A quotient and a root may be two units off: bounds take more into account.
@@ -219,17 +219,17 @@ def to_vector3(backend: Backend, vectors: Any, name: str = "vectors") -> Vec3:
         if dr.depth_v(type(vectors)) != 2 or dr.size_v(type(vectors)) != 3:
             raise TypeError(f"{name} must be a 3-vector, got {type(vectors).__name__}")
         return backend.Array3f(vectors)
-    return upload_vectors(backend, finite_vectors(vectors, name), name)
+    return upload_vectors(backend, as_finite_vectors(vectors, name), name)
 
 
-def finite_vectors(vectors: Any, name: str) -> FloatArray:
+def as_finite_vectors(vectors: Any, name: str) -> FloatArray:
     """An array-like of shape (n, 3) as a float64 array, all of it finite.
 
     Raises:
         TypeError: not numbers.
         ValueError: wrong shape; NaN or infinite values. The message starts with `name`.
     """
-    values = real_array(vectors, name, type_error=TypeError).astype(np.float64, copy=False)
+    values = as_real_array(vectors, name, type_error=TypeError).astype(np.float64, copy=False)
     check_vectors(values, name)
     finite = np.isfinite(values)
     if not finite.all():
@@ -238,8 +238,9 @@ def finite_vectors(vectors: Any, name: str) -> FloatArray:
 
 
 def upload_vectors(backend: Backend, rows: npt.NDArray[Any], name: str = "vectors") -> Vec3:
-    """An array (n, 3) as backend.Array3f, whatever its values, as `aligned` uploads numbers."""
-    return backend.Array3f(*(aligned(backend, one) for one in _cast(backend, rows, name).T))
+    """An array (n, 3) as backend.Array3f, whatever its values, as `upload_floats` uploads
+    numbers."""
+    return backend.Array3f(*(upload_floats(backend, one) for one in _cast(backend, rows, name).T))
 
 
 def to_float(backend: Backend, values: Any, name: str = "values") -> Real:
@@ -257,14 +258,14 @@ def to_float(backend: Backend, values: Any, name: str = "values") -> Real:
         if dr.depth_v(type(values)) != 1:
             raise TypeError(f"{name} must be one number a lane, got {type(values).__name__}")
         return backend.Float(values)
-    numbers = real_array(values, name, type_error=TypeError).astype(np.float64, copy=False)
+    numbers = as_real_array(values, name, type_error=TypeError).astype(np.float64, copy=False)
     if numbers.ndim > 1:
         raise ValueError(f"{name} must be a number or have shape (n,), not {numbers.shape}")
     _check_rows(np.isnan(numbers), "NaN", name)
     cast = _cast(backend, numbers, name)
     if cast.ndim == 0:
         return dr.opaque(backend.Float, float(cast))
-    return aligned(backend, cast)
+    return upload_floats(backend, cast)
 
 
 def gather_vectors(backend: Backend, vectors: Vec3, index: Index) -> Vec3:
@@ -278,12 +279,12 @@ def gather_vectors(backend: Backend, vectors: Vec3, index: Index) -> Vec3:
     )
 
 
-def as_data(array: Any) -> Any:
+def as_kernel_parameters(array: Any) -> Any:
     """The same numbers, with their derivatives; literals as kernel parameters, so that others in
     their place do not compile another kernel."""
     kind = _type_of(array)
     if dr.depth_v(kind) > 1:
-        return kind(*map(as_data, array))
+        return kind(*map(as_kernel_parameters, array))
     if array.state != dr.VarState.Literal:
         return array
     data = dr.detach(kind(array))
@@ -322,7 +323,7 @@ def _cast(backend: Backend, values: npt.NDArray[Any], name: str) -> npt.NDArray[
     return cast
 
 
-def aligned(backend: Backend, values: npt.NDArray[Any]) -> Real:
+def upload_floats(backend: Backend, values: npt.NDArray[Any]) -> Real:
     """A copy of a one-dimensional NumPy array as an evaluated backend.Float in aligned memory."""
     if values.ndim != 1:
         raise ValueError(f"expected a one-dimensional array, got shape {values.shape}")
@@ -331,7 +332,7 @@ def aligned(backend: Backend, values: npt.NDArray[Any]) -> Real:
     return backend.Float(_aligned(_cast(backend, values, "an array"), np.dtype(backend.dtype)))
 
 
-def aligned_integers(backend: Backend, values: npt.NDArray[Any]) -> Index:
+def upload_integers(backend: Backend, values: npt.NDArray[Any]) -> Index:
     """A copy of a one-dimensional NumPy array of integers >= 0 as backend.UInt32, likewise."""
     return backend.UInt32(_aligned(values, np.dtype(np.uint32)))
 

@@ -39,7 +39,7 @@ class Finding:
     advice: str = ""
 
 
-def report() -> tuple[Finding, ...]:
+def diagnose() -> tuple[Finding, ...]:
     """Examine this installation. Never raises; kernels are tried in processes of their own."""
     findings = [
         Finding("harnack", __version__),
@@ -79,8 +79,8 @@ def _llvm() -> list[Finding]:
     findings = [Finding("LLVM", text)]
     for library in find_libraries():
         version = "unknown" if library.major is None else library.major
-        verdict = library.refusal or "acceptable"
-        name = "LLVM passed over" if library.refusal else "LLVM found"
+        verdict = library.rejection_reason or "acceptable"
+        name = "LLVM passed over" if library.rejection_reason else "LLVM found"
         findings.append(Finding(name, f"{library.path}, version {version}: {verdict}"))
     return findings
 
@@ -146,9 +146,9 @@ def try_kernel(precision: str) -> None:
         raise RuntimeError(f"the kernel gave {total[-1]} instead of 26")
 
 
-def render_report(console: Console) -> bool:
+def print_report(console: Console) -> bool:
     """Print the report; return True if harnack can work as it is."""
-    findings = report()
+    findings = diagnose()
     table = Table(show_header=False, box=None, pad_edge=False)
     table.add_column()
     table.add_column(no_wrap=True)

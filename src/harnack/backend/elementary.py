@@ -5,7 +5,7 @@ NaN-propagating `minimum`, three instructions with AVX2 (and a crash with LLVM 1
 comparison and a select become a single `minps`. With a NaN in either place the *second* argument is
 returned: put the safe value there.
 
-`length` is right for vectors whose squares would overflow or vanish. `sincos` is as accurate on
+`safe_norm` is right for vectors whose squares would overflow or vanish. `sincos` is as accurate on
 every backend as what is promised of sums of waves assumes.
 """
 
@@ -38,40 +38,47 @@ def clamp(x: Any, low: Any, high: Any) -> Any:
 
 # Vectors shorter than the first and longer than the last of these powers of two are multiplied by
 # the power in between, which is exact: squares then neither vanish nor overflow.
-_SINGLE, _DOUBLE = ((-50, 76), (60, -68)), ((-450, 572), (500, -524))
+_SCALING_EXPONENTS_SINGLE, _SCALING_EXPONENTS_DOUBLE = (
+    ((-50, 76), (60, -68)),
+    ((-450, 572), (500, -524)),
+)
 
 
-def length(v: Vec3) -> Real:
+def safe_norm(v: Vec3) -> Real:
     """|v|, right for every vector of ordinary numbers; NaN if a component is NaN.
 
     `drjit.norm` squares first: in single precision it is 0 for vectors shorter than 1e-19, such as
     the gradient of a polynomial of degree 12 at a fiftieth of its size from a zero of that order.
     """
-    largest = largest_coordinate(v)
+    largest = max_norm(v)
     real = cast("Any", type(largest))
-    (low, up), (high, down) = _powers(largest)
+    (low, up), (high, down) = _norm_scaling_exponents(largest)
     short, long = largest < 2.0**low, largest > 2.0**high
     scale = dr.select(short, real(2.0**up), dr.select(long, real(2.0**down), real(1)))
     back = dr.select(short, real(2.0**-up), dr.select(long, real(2.0**-down), real(1)))
     return dr.norm(v * scale) * back
 
 
-def unit(v: Vec3) -> Vec3:
+def safe_normalize(v: Vec3) -> Vec3:
     """v/|v|, right for every vector whose largest component is a normal number."""
-    largest = dr.detach(largest_coordinate(v))
-    (low, _), (high, _) = _powers(largest)
+    largest = dr.detach(max_norm(v))
+    (low, _), (high, _) = _norm_scaling_exponents(largest)
     ordinary = (largest >= 2.0**low) & (largest <= 2.0**high)
     scaled = v / dr.select(ordinary, 1, largest)
     return scaled / dr.norm(scaled)
 
 
-def largest_coordinate(v: Vec3) -> Real:
+def max_norm(v: Vec3) -> Real:
     """The largest of |x|, |y| and |z|."""
     return fmax(fmax(dr.abs(v.x), dr.abs(v.y)), dr.abs(v.z))
 
 
-def _powers(x: Real) -> tuple[tuple[int, int], tuple[int, int]]:
-    return _DOUBLE if dr.type_v(type(x)) == dr.VarType.Float64 else _SINGLE
+def _norm_scaling_exponents(x: Real) -> tuple[tuple[int, int], tuple[int, int]]:
+    return (
+        _SCALING_EXPONENTS_DOUBLE
+        if dr.type_v(type(x)) == dr.VarType.Float64
+        else _SCALING_EXPONENTS_SINGLE
+    )
 
 
 # pi/2 in three parts, the first two so short that their products with integers below 2^11 are exact
@@ -84,8 +91,8 @@ _COSINE = (2.443315711809948e-5, -1.388731625493765e-3, 4.166664568298827e-2)
 
 
 def sincos(x: Any) -> tuple[Any, Any]:
-    """sin x and cos x, each within 2u (u the unit roundoff) for |x| <= `largest_angle`; beyond it
-    they are not numbers.
+    """sin x and cos x, each within 2u (u the unit roundoff) for |x| <= `max_sincos_argument`;
+    beyond it they are not numbers.
 
     In single precision by arithmetic alone. Dr.Jit's own functions are one instruction on CUDA,
     off by 2^-20.5 = 11u and by 600u for an angle of 300 (PTX ISA, sin.approx), and on LLVM they
@@ -95,7 +102,7 @@ def sincos(x: Any) -> tuple[Any, Any]:
     """
     is_double = dr.type_v(type(x)) == dr.VarType.Float64
     quarter = dr.round(x * 0.6366197723675814)
-    rest = dr.select(dr.abs(x) <= largest_angle(type(x)), x, dr.nan)
+    rest = dr.select(dr.abs(x) <= max_sincos_argument(type(x)), x, dr.nan)
     for part in _HALF_PI_DOUBLE if is_double else _HALF_PI:
         rest = dr.fma(quarter, -part, rest)
     if is_double:
@@ -113,7 +120,7 @@ def sincos(x: Any) -> tuple[Any, Any]:
     return dr.select(is_late, -s, s), dr.select(is_late ^ is_odd, -c, c)
 
 
-def largest_angle(real: Any) -> float:
+def max_sincos_argument(real: Any) -> float:
     """The largest angle whose sine is known in the precision of `real`: an angle that is itself
     rounded is off by 0.06 there in single precision, and by 0.01 in double."""
     return 2.0**47 if dr.type_v(real) == dr.VarType.Float64 else 1e6
@@ -126,7 +133,7 @@ def _polynomial(coefficients: tuple[float, ...], x: Any) -> Any:
     return total
 
 
-def across(d: Vec3) -> tuple[Vec3, Vec3]:
+def orthonormal_basis(d: Vec3) -> tuple[Vec3, Vec3]:
     """u and v with (u, v, d) orthonormal and right-handed, |d| = 1 (Duff et al. 2017, "Building an
     Orthonormal Basis, Revisited")."""
     vector = cast("Any", type(d))
@@ -138,8 +145,8 @@ def across(d: Vec3) -> tuple[Vec3, Vec3]:
     return u, v
 
 
-def across_rows(d: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """`across` of rows (n, 3) on the host."""
+def orthonormal_basis_rows(d: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """`orthonormal_basis` of rows (n, 3) on the host."""
     x, y, z = d.T
     sign = np.copysign(1.0, z)
     a = -1.0 / (sign + z)

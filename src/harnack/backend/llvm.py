@@ -49,12 +49,12 @@ class LLVMLibrary:
     major: int | None
 
     @property
-    def refusal(self) -> str | None:
+    def rejection_reason(self) -> str | None:
         """Why this library must not be used; None if it may be."""
-        return refusal_of(self.major)
+        return rejection_reason(self.major)
 
 
-def refusal_of(major: int | None) -> str | None:
+def rejection_reason(major: int | None) -> str | None:
     """Why LLVM of this major version must not be used; None if it may be."""
     if major is None:
         return "its version cannot be told"
@@ -127,19 +127,26 @@ def find_libraries(folders: Iterable[Path] | None = None) -> tuple[LLVMLibrary, 
                 if real not in found and os.path.isfile(real):
                     found[real] = LLVMLibrary(path, library_version(path))
     # The sort is stable, so among equals the order of the folders decides.
-    best_first = sorted(found.values(), key=lambda library: preference(library.major), reverse=True)
+    best_first = sorted(
+        found.values(), key=lambda library: preference_key(library.major), reverse=True
+    )
     return tuple(best_first)
 
 
-def preference(major: int | None) -> tuple[bool, bool, bool, int]:
+def preference_key(major: int | None) -> tuple[bool, bool, bool, int]:
     """Sort key of LLVM versions: the greatest is the one to use."""
     known = major or 0
-    return refusal_of(major) is None, known == PREFERRED_MAJOR, known <= NEWEST_TRIED_MAJOR, known
+    return (
+        rejection_reason(major) is None,
+        known == PREFERRED_MAJOR,
+        known <= NEWEST_TRIED_MAJOR,
+        known,
+    )
 
 
 def best_library() -> LLVMLibrary | None:
     """The acceptable LLVM library on this machine that is used if nobody says otherwise."""
-    return next((library for library in find_libraries() if library.refusal is None), None)
+    return next((library for library in find_libraries() if library.rejection_reason is None), None)
 
 
 def import_drjit() -> None:
@@ -208,30 +215,33 @@ def ensure_llvm() -> int:
     """
     major = _loaded_major()
     if major is None:
-        raise LLVMNotFoundError(_why_none_loaded())
-    reason = refusal_of(major)
+        raise LLVMNotFoundError(_load_failure_message())
+    reason = rejection_reason(major)
     if reason is not None:
-        raise LLVMNotFoundError(f"Dr.Jit has loaded an LLVM it cannot work with: {reason}. {fix()}")
+        raise LLVMNotFoundError(
+            f"Dr.Jit has loaded an LLVM it cannot work with: {reason}. {repair_advice()}"
+        )
     return major
 
 
-def _why_none_loaded() -> str:
+def _load_failure_message() -> str:
     """What kept Dr.Jit from loading LLVM, and what to do."""
     requested = os.environ.get(PATH_VARIABLE)
     if requested:
-        reason = refusal_of(library_version(Path(requested)))
+        reason = rejection_reason(library_version(Path(requested)))
         if not Path(requested).exists():
             reason = "there is no such file"
-        return f"{PATH_VARIABLE} names {requested}: {reason or 'Dr.Jit cannot load it'}. {fix()}"
+        reason = reason or "Dr.Jit cannot load it"
+        return f"{PATH_VARIABLE} names {requested}: {reason}. {repair_advice()}"
     found = find_libraries()
-    if found and found[0].refusal is None:
-        return f"Dr.Jit did not load {found[0].path}. {fix()}"
-    listing = "; ".join(f"{library.path} ({library.refusal})" for library in found)
+    if found and found[0].rejection_reason is None:
+        return f"Dr.Jit did not load {found[0].path}. {repair_advice()}"
+    listing = "; ".join(f"{library.path} ({library.rejection_reason})" for library in found)
     only = f" Found only {listing}." if found else ""
-    return f"The CPU backend needs LLVM {MINIMUM_MAJOR} or newer.{only} {fix()}"
+    return f"The CPU backend needs LLVM {MINIMUM_MAJOR} or newer.{only} {repair_advice()}"
 
 
-def fix() -> str:
+def repair_advice() -> str:
     """The one thing to do on this machine to get an acceptable LLVM."""
     best = best_library()
     requested = os.environ.get(PATH_VARIABLE)

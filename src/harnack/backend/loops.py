@@ -2,9 +2,9 @@
 
 A recorded loop follows the rays of one packet until the last of them has ended, and lanes that are
 masked cost as much as the others. Where arrays may be evaluated, outside of any recording,
-`on_some` gathers the lanes of a mask, and in `while_queued` a lane that has finished a ray fetches
-the next. Both evaluate what they compute, and give what would be computed for each lane by itself,
-in any order of lanes.
+`compute_on_active` gathers the lanes of a mask, and in `loop_with_queue` a lane that has finished a
+ray fetches the next. Both evaluate what they compute, and give what would be computed for each lane
+by itself, in any order of lanes.
 """
 
 from __future__ import annotations
@@ -32,26 +32,26 @@ class LoopState(Protocol):
 State = TypeVar("State", bound=LoopState)
 
 
-def while_active(state: State, body: Callable[[State], State], label: str) -> State:
+def loop_while_active(state: State, body: Callable[[State], State], label: str) -> State:
     """Runs `body` on the lanes of the state that are active, until none is.
 
     Errors that the body raises while it is recorded come out as they are.
     """
 
     def running(*leaves: Any) -> Mask:
-        return record_of(state, iter(leaves)).active
+        return rebuild_record(state, iter(leaves)).active
 
     def step(*leaves: Any) -> tuple[Any, ...]:
-        return tuple(leaves_of(body(record_of(state, iter(leaves)))))
+        return tuple(array_leaves(body(rebuild_record(state, iter(leaves)))))
 
     try:
-        leaves = dr.while_loop(tuple(leaves_of(state)), running, step, label=label)
+        leaves = dr.while_loop(tuple(array_leaves(state)), running, step, label=label)
     except RuntimeError as error:  # Dr.Jit wraps what the body raises
         raise (error.__cause__ or error) from None
-    return record_of(state, iter(leaves))
+    return rebuild_record(state, iter(leaves))
 
 
-def changed_where(
+def update_where_active(
     active: Mask, change: Callable[[tuple[Any, ...]], tuple[Any, ...]], state: tuple[Any, ...],
     label: str,
 ) -> tuple[Any, ...]:  # fmt: skip
@@ -68,21 +68,21 @@ def changed_where(
     return dr.while_loop((index(0), *state), is_first, step, label=label)[1:]
 
 
-def leaves_of(record: Any) -> Iterator[Any]:
+def array_leaves(record: Any) -> Iterator[Any]:
     """The arrays of a record of arrays and records, in order; None is left out."""
     for value in _entries(record):
         if dataclasses.is_dataclass(value):
-            yield from leaves_of(value)
+            yield from array_leaves(value)
         elif value is not None:
             yield value
 
 
-def record_of(like: Any, leaves: Iterator[Any]) -> Any:
+def rebuild_record(like: Any, leaves: Iterator[Any]) -> Any:
     """The leaves as a record like another one."""
     values: list[Any] = []
     for value in _entries(like):
         if dataclasses.is_dataclass(value):
-            values.append(record_of(value, leaves))
+            values.append(rebuild_record(value, leaves))
         else:
             values.append(None if value is None else next(leaves))
     return type(like)(*values)
@@ -99,10 +99,10 @@ Lanes = TypeVar("Lanes")
 Result = TypeVar("Result")
 
 # Lanes that share a queue: so many for each thread of a processor, and on a GPU in all.
-_OF_A_THREAD, _OF_GPU = 1024, 1 << 17
+_LANES_PER_THREAD, _LANES_ON_GPU = 1024, 1 << 17
 
 
-def rows_of(mask: Mask) -> tuple[Any, int]:
+def active_lanes(mask: Mask) -> tuple[Any, int]:
     """Indices of the lanes where a mask is set, and how many these are.
 
     A single one is named twice: Dr.Jit compiles kernels of their own for arrays of one number.
@@ -110,80 +110,83 @@ def rows_of(mask: Mask) -> tuple[Any, int]:
     rows = dr.compress(mask)
     count = len(rows)
     if count == 1:
-        rows = _own(lambda: dr.full(type(rows), int(rows[0]), 2))
+        rows = _evaluate_unshared(lambda: dr.full(type(rows), int(rows[0]), 2))
     return rows, count
 
 
-def wide(record: Lanes, width: int, index: Any) -> Lanes:
+def broadcast_copy(record: Lanes, width: int, index: Any) -> Lanes:
     """A copy of a record in which all lanes may differ, evaluated. index: the type of lanes."""
-    copies = _own(lambda: [_wide(leaf, width, index) for leaf in leaves_of(record)])
-    return record_of(record, iter(copies))
+    copies = _evaluate_unshared(
+        lambda: [_broadcast(leaf, width, index) for leaf in array_leaves(record)]
+    )
+    return rebuild_record(record, iter(copies))
 
 
-def gathered(record: Lanes, rows: Any) -> Lanes:
+def gather_record(record: Lanes, rows: Any) -> Lanes:
     """Some lanes of a record. What is the same in all lanes stays one number."""
 
     def some(leaf: Any) -> Any:
         return leaf if dr.width(leaf) == 1 else dr.gather(type(leaf), leaf, rows)
 
-    return record_of(record, map(some, leaves_of(record)))
+    return rebuild_record(record, map(some, array_leaves(record)))
 
 
-def on_some(
-    mask: Mask, compute: Callable[[Lanes], Result], lanes: Lanes, elsewhere: Result
+def compute_on_active(
+    mask: Mask, compute: Callable[[Lanes], Result], lanes: Lanes, inactive_result: Result
 ) -> Result:
-    """What `compute` makes of a record's lanes where `mask` is set, `elsewhere` on the others.
+    """What `compute` makes of a record's lanes where `mask` is set, `inactive_result` on the
+    others.
 
     All lanes are evaluated first and last, so that kernels do not depend on how many there are.
-    `elsewhere` is a record like the result.
+    `inactive_result` is a record like the result.
     """
     width = dr.width(mask)
-    dr.eval(mask, *leaves_of(lanes), *leaves_of(elsewhere))
-    rows, count = rows_of(mask)
-    result = wide(elsewhere, width, type(rows))
+    dr.eval(mask, *array_leaves(lanes), *array_leaves(inactive_result))
+    rows, count = active_lanes(mask)
+    result = broadcast_copy(inactive_result, width, type(rows))
     if not count:
-        _as_after_a_loop(rows)
+        _begin_new_scope(rows)
         return result
-    targets, values = [*leaves_of(result)], [*leaves_of(compute(gathered(lanes, rows)))]
+    targets, values = [*array_leaves(result)], [*array_leaves(compute(gather_record(lanes, rows)))]
     dr.eval(values)
     for target, value in zip(targets, values, strict=True):
         dr.scatter(target, value, rows)
     dr.eval(targets)
-    _as_after_a_loop(rows)
-    return record_of(result, iter(targets))
+    _begin_new_scope(rows)
+    return rebuild_record(result, iter(targets))
 
 
-def while_queued(
+def loop_with_queue(
     start: State, body: Callable[[State], State], result: Callable[[State], Result], label: str
 ) -> Result:
-    """What `result` makes of each lane after `while_active(start, body, label)`, evaluated.
+    """What `result` makes of each lane after `loop_while_active(start, body, label)`, evaluated.
 
     Far fewer lanes run the loop than `start` has: one whose ray has ended writes the result and
     fetches the next ray from a queue, so that none waits for the slowest ray of its packet.
 
     body: must know of its lane by the state alone, and hold nothing that differs between lanes.
     """
-    dr.eval(*leaves_of(start))
-    width = max(dr.width(leaf) for leaf in leaves_of(start))
+    dr.eval(*array_leaves(start))
+    width = max(dr.width(leaf) for leaf in array_leaves(start))
     active = dr.full(type(start.active), True, width) & start.active
-    rows, count = rows_of(active)
-    done = wide(result(start), width, type(rows))
+    rows, count = active_lanes(active)
+    done = broadcast_copy(result(start), width, type(rows))
     if count:
-        _run_queue(start, body, result, rows, count, [*leaves_of(done)], label)
-    _as_after_a_loop(rows)
+        _run_queue(start, body, result, rows, count, [*array_leaves(done)], label)
+    _begin_new_scope(rows)
     return done
 
 
 @dataclass(frozen=True)
-class _Lane:
+class _QueueLane:
     """row: in the queue, of the ray that the lane follows. ray: its state."""
 
-    row: Any
-    ray: Any
+    queue_index: Any
+    state: Any
 
     @property
     def active(self) -> Mask:
-        return self.ray.active
+        return self.state.active
 
 
 def _run_queue(
@@ -194,8 +197,10 @@ def _run_queue(
     index = cast("Any", type(rows))
     count = dr.opaque(index, total)
     threads = dr.thread_count() if dr.backend_v(rows) == dr.JitBackend.LLVM else 0
-    at_once = min(len(rows), _OF_A_THREAD * threads or _OF_GPU)
-    taken, first = _own(lambda: [dr.full(index, at_once, 1), dr.arange(index, at_once)])
+    at_once = min(len(rows), _LANES_PER_THREAD * threads or _LANES_ON_GPU)
+    taken, first = _evaluate_unshared(
+        lambda: [dr.full(index, at_once, 1), dr.arange(index, at_once)]
+    )
 
     def fetched(row: Any, wanted: Mask) -> Any:
         which = dr.gather(index, rows, row, wanted)
@@ -203,30 +208,30 @@ def _run_queue(
         def of_ray(leaf: Any) -> Any:
             return leaf if dr.width(leaf) == 1 else dr.gather(type(leaf), leaf, which, wanted)
 
-        return record_of(start, map(of_ray, leaves_of(start)))
+        return rebuild_record(start, map(of_ray, array_leaves(start)))
 
-    def one_step(lane: _Lane) -> _Lane:
-        now = body(lane.ray)
+    def one_step(lane: _QueueLane) -> _QueueLane:
+        now = body(lane.state)
         ended = lane.active & ~now.active
-        which = dr.gather(index, rows, lane.row, ended)
-        for target, value in zip(done, leaves_of(result(now)), strict=True):
+        which = dr.gather(index, rows, lane.queue_index, ended)
+        for target, value in zip(done, array_leaves(result(now)), strict=True):
             dr.scatter(target, value, which, ended)
-        row = dr.select(ended, dr.scatter_inc(taken, index(0), ended), lane.row)
+        row = dr.select(ended, dr.scatter_inc(taken, index(0), ended), lane.queue_index)
         again = ended & (row < count)
-        both = zip(leaves_of(fetched(row, again)), leaves_of(now), strict=True)
-        return _Lane(row, record_of(now, (dr.select(again, *pair) for pair in both)))
+        both = zip(array_leaves(fetched(row, again)), array_leaves(now), strict=True)
+        return _QueueLane(row, rebuild_record(now, (dr.select(again, *pair) for pair in both)))
 
-    while_active(_Lane(first, fetched(first, first < count)), one_step, label)
+    loop_while_active(_QueueLane(first, fetched(first, first < count)), one_step, label)
     dr.eval(done)
 
 
-def _as_after_a_loop(array: Any) -> None:
+def _begin_new_scope(array: Any) -> None:
     """Begin a new scope, as loops do: Dr.Jit looks for equal numbers in one scope only, so that
     what follows would be another kernel where there was nothing to do."""
     dr.detail.new_scope(dr.backend_v(array))
 
 
-def _own(make: Callable[[], Any]) -> Any:
+def _evaluate_unshared(make: Callable[[], Any]) -> Any:
     """What is made, evaluated, in memory of its own.
 
     Dr.Jit keeps equal arrays once, and kernels differ by what they share: those for as many lanes
@@ -238,5 +243,5 @@ def _own(make: Callable[[], Any]) -> Any:
     return made
 
 
-def _wide(leaf: Any, width: int, index: Any) -> Any:
+def _broadcast(leaf: Any, width: int, index: Any) -> Any:
     return dr.gather(type(leaf), leaf, dr.arange(index, width) * (dr.width(leaf) > 1))

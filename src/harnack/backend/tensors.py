@@ -5,6 +5,13 @@ and JAX.
 vectors, a lane a row. All conversions pass derivatives on, in both directions. `wrap_for_jax` is
 the direction of `drjit.wrap` that Dr.Jit lacks. `wrap_for_torch` is one that it has, without its
 silent zeros: derivatives that are not there raise, and a graph can be gone back through again.
+
+Other frameworks come in as tensors, the shape in which `drjit.wrap` hands arrays over, and
+`wrap_for_jax` there is the one direction that it lacks; `wrap_for_torch` is one that it has,
+without its zeros for derivatives that are not there. Neither framework is imported before it is
+used. What moves from step to step of an optimization is data too: literals with derivatives are
+made kernel parameters, and curves whose vertices are Dr.Jit arrays do not choose proofs or hulls by
+their shape.
 """
 
 from __future__ import annotations
@@ -19,7 +26,7 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend.arrays import backend_of
-from harnack.backend.validation import TRANSPOSE, check_vectors
+from harnack.backend.validation import TRANSPOSE_ADVICE, check_vectors
 
 if TYPE_CHECKING:
     from harnack.backend.arrays import Real, Vec3
@@ -32,15 +39,17 @@ def is_tensor(value: Any) -> bool:
     return dr.is_tensor_v(cast("Any", type(value)))
 
 
-def vectors_of(tensor: Any, name: str = "vectors", error: type[Exception] = ValueError) -> Vec3:
+def tensor_to_vectors(
+    tensor: Any, name: str = "vectors", error: type[Exception] = ValueError
+) -> Vec3:
     """The rows of a tensor (n, 3) as a 3-vector of n lanes.
 
     Raises:
         TypeError: not of 32- or 64-bit floats.
         `error`: another shape. The message starts with `name`.
     """
-    check_vectors(tensor, name, error, transposed=TRANSPOSE)
-    numbers = numbers_of(tensor, name)
+    check_vectors(tensor, name, error, transposed=TRANSPOSE_ADVICE)
+    numbers = tensor_to_array(tensor, name)
     backend = backend_of(numbers)
     count = 3 * tensor.shape[0]
     places = (dr.arange(backend.UInt32, k, count, 3) for k in range(3 if count else 0))
@@ -48,7 +57,7 @@ def vectors_of(tensor: Any, name: str = "vectors", error: type[Exception] = Valu
     return backend.Array3f(*rows) if rows else dr.zeros(backend.Array3f, 0)
 
 
-def numbers_of(tensor: Any, name: str = "values") -> Real:
+def tensor_to_array(tensor: Any, name: str = "values") -> Real:
     """All numbers of a tensor, row by row; a TypeError if these are no 32- or 64-bit floats."""
     array = tensor.array
     try:
@@ -57,7 +66,7 @@ def numbers_of(tensor: Any, name: str = "values") -> Real:
         raise TypeError(f"{name}: {error}") from None
 
 
-def tensor_of(array: Any, shape: tuple[int, ...]) -> Any:
+def array_to_tensor(array: Any, shape: tuple[int, ...]) -> Any:
     """A Dr.Jit array as a tensor of a shape, a 3-vector as one of shape (*shape, 3).
 
     What is the same in all lanes is repeated. Counts become signed, as PyTorch has no others.
@@ -74,7 +83,7 @@ def tensor_of(array: Any, shape: tuple[int, ...]) -> Any:
     return dr.tensor_t(type(array))(array, shape)
 
 
-def takes_tensors(method: Method) -> Method:
+def accepts_tensors(method: Method) -> Method:
     """The same method of points, which also takes a tensor of points and then gives tensors."""
 
     @functools.wraps(method)
@@ -83,7 +92,9 @@ def takes_tensors(method: Method) -> Method:
             return method(self, points, **settings)
         *shape, _ = points.shape or (0,)
         rows = cast("Any", type(points))(points.array, (1, 3)) if points.shape == (3,) else points
-        return tensor_of(method(self, vectors_of(rows, "points"), **settings), tuple(shape))
+        return array_to_tensor(
+            method(self, tensor_to_vectors(rows, "points"), **settings), tuple(shape)
+        )
 
     return cast("Method", general)
 
@@ -96,7 +107,7 @@ def wrap_for_torch(function: Callable[..., Any]) -> Callable[..., Any]:
 
     As `drjit.wrap(source="torch", target="drjit")`, but nothing is dropped without a word: a result
     that depends on the arguments by nothing that has a derivative, such as whether rays hit
-    (`hits.hit`), raises where its derivative is asked for; and a second backward pass
+    (`hits.is_hit`), raises where its derivative is asked for; and a second backward pass
     (`retain_graph=True`) is right, and calls `function` again.
 
     function: must be pure. It is called with a Dr.Jit tensor for each PyTorch tensor among its
@@ -110,7 +121,7 @@ def wrap_for_torch(function: Callable[..., Any]) -> Callable[..., Any]:
 
     def run(arguments: list[Any], tensors: tuple[Any, ...]) -> tuple[list[Any], Any]:
         """The inputs, and what `function` returns; arguments: of it, None for tensors."""
-        inputs = [_input(tensor.detach()) for tensor in tensors]
+        inputs = [_differentiable_tensor(tensor.detach()) for tensor in tensors]
         remaining = iter(inputs)
         filled = (next(remaining) if value is None else value for value in arguments)
         return inputs, function(*filled)
@@ -189,13 +200,13 @@ def _gradients(inputs: list[Any], outputs: list[Any], cotangents: list[Any]) -> 
 
 _NO_DERIVATIVE = (
     "a result of the wrapped function depends on its arguments by nothing that has a derivative: "
-    "zero would be wrong where it depends on whether rays hit (hits.hit, hits.status), on what was "
-    "hit, or on NumPy arrays. Take t, position or field.value, or detach that result"
+    "zero would be wrong where it depends on whether rays hit (hits.is_hit, hits.status), on what "
+    "was hit, or on NumPy arrays. Take t, position or field.value, or detach that result"
 )
 
 # JAX.
 
-_TRACED = (
+_TRACED_MESSAGE = (
     "wrap_for_jax(function) cannot run inside jax.jit, jax.vmap or the like, where shapes of "
     "results must be known beforehand: call it outside, or inside jax.jit give result=, a function "
     "of the same arguments whose result has these shapes and types, such as "
@@ -204,7 +215,7 @@ _TRACED = (
 
 
 def wrap_for_jax(
-    function: Callable[..., Any], *, result: Callable[..., Any] | None = None
+    function: Callable[..., Any], *, result_like: Callable[..., Any] | None = None
 ) -> Callable[..., Any]:
     """A function of Dr.Jit tensors as one of JAX arrays, with derivatives for `jax.grad`.
 
@@ -213,11 +224,11 @@ def wrap_for_jax(
     function: must be pure. It is called with a Dr.Jit tensor for each array or number among its
         arguments, of the shape and precision that it has in JAX, and returns Dr.Jit arrays or
         tensors, in tuples, lists and dictionaries if it likes; 3-vectors become arrays (n, 3).
-    result: only for use inside `jax.jit`: a JAX function of the same arguments whose result has
-        the shapes and types of `function`'s. Only these are looked at.
+    result_like: only for use inside `jax.jit`: a JAX function of the same arguments whose result
+        has the shapes and types of `function`'s. Only these are looked at.
 
     A result that depends on the arguments by nothing that has a derivative, such as whether rays
-    hit (`hits.hit`), raises where its derivative is asked for.
+    hit (`hits.is_hit`), raises where its derivative is asked for.
 
     Derivatives are those of reverse mode (`jax.grad`, `jax.vjp`, `jax.jacrev`). A derivative calls
     `function` a second time: JAX may keep what a forward pass leaves, and Dr.Jit's graph is none
@@ -232,9 +243,9 @@ def wrap_for_jax(
     def call(*args: Any) -> Any:
         if not _is_traced(jax, args):
             return run(*args)
-        if result is None:
-            raise TypeError(_TRACED)
-        return _called_back(jax, run, jax.eval_shape(result, *args), *args)
+        if result_like is None:
+            raise TypeError(_TRACED_MESSAGE)
+        return _pure_callback(jax, run, jax.eval_shape(result_like, *args), *args)
 
     def forward(*args: Any) -> tuple[Any, Any]:
         return call(*args), args
@@ -245,7 +256,7 @@ def wrap_for_jax(
             shapes = [
                 jax.ShapeDtypeStruct(one.shape, one.dtype) for one in leaves if _is_float(jax, one)
             ]
-            found = iter(_called_back(jax, pull_back, shapes, args, cotangents))
+            found = iter(_pure_callback(jax, pull_back, shapes, args, cotangents))
         else:
             found = iter(pull_back(args, cotangents))
         # JAX has a type of its own for derivatives with respect to integers.
@@ -268,13 +279,13 @@ def wrap_for_jax(
 def _run(jax: Any, function: Callable[..., Any], *args: Any) -> Any:
     """The result of `function` as JAX arrays. Derivatives are enabled in any case, since hits are
     polished to rounding where they are: so the result is the same with `jax.grad` and without."""
-    outputs = function(*jax.tree.map(_input, args))
+    outputs = function(*jax.tree.map(_differentiable_tensor, args))
     return jax.tree.map(_as_jax, outputs)
 
 
 def _pull_back(jax: Any, function: Callable[..., Any], args: Any, cotangents: Any) -> list[Any]:
     """Gradients with respect to those arguments that are floats, given those of the result."""
-    inputs = jax.tree.map(_input, args)
+    inputs = jax.tree.map(_differentiable_tensor, args)
     outputs = jax.tree.leaves(function(*inputs))
     gradients = _gradients(jax.tree.leaves(inputs), outputs, jax.tree.leaves(cotangents))
     return [gradient.jax() for gradient in gradients]
@@ -285,7 +296,7 @@ def _is_traced(jax: Any, values: Any) -> bool:
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
 
 
-def _called_back(jax: Any, compute: Callable[..., Any], shapes: Any, *args: Any) -> Any:
+def _pure_callback(jax: Any, compute: Callable[..., Any], shapes: Any, *args: Any) -> Any:
     """What `compute` gives, called while a program that JAX has compiled runs."""
 
     def on_host(*values: Any) -> Any:
@@ -304,7 +315,7 @@ def _tensor(array: Any) -> Any:
     return dr.detail.import_tensor(array, True)
 
 
-def _input(array: Any) -> Any:
+def _differentiable_tensor(array: Any) -> Any:
     """Likewise, with derivatives enabled if it holds floats."""
     tensor = _tensor(array)
     if dr.is_float_v(tensor):
@@ -318,7 +329,7 @@ def _as_tensor(value: Any) -> Any:
             "a function for JAX returns Dr.Jit arrays or tensors, in tuples, lists and "
             f"dictionaries, not {type(value).__name__}: vars(hits) is a dictionary of hits"
         )
-    return value if is_tensor(value) else tensor_of(value, (dr.width(value),))
+    return value if is_tensor(value) else array_to_tensor(value, (dr.width(value),))
 
 
 def _as_jax(value: Any) -> Any:

@@ -24,17 +24,17 @@ FloatArray: TypeAlias = npt.NDArray[np.float64]
 IntArray: TypeAlias = npt.NDArray[np.int64]
 BoolArray: TypeAlias = npt.NDArray[np.bool_]
 
-TRANSPOSE = "; transpose it"
+TRANSPOSE_ADVICE = "; transpose it"
 """Advice of `check_vectors` where an array (3, n) surely holds n vectors."""
 
-# Entries of a list, and letters of a value, that `short_text` writes.
-_MOST_SHOWN, _LONGEST = 4, 60
+# Entries of a list, and letters of a value, that `format_short` writes.
+_MOST_SHOWN, _MAX_TEXT_LENGTH = 4, 60
 
-LARGEST = 1e100
+MAX_COORDINATE = 1e100
 """Coordinates beyond this are refused: their squares would overflow soon."""
 
 
-def real_array(
+def as_real_array(
     values: Any,
     name: str,
     error: type[Exception] = ValueError,
@@ -49,7 +49,7 @@ def real_array(
     ragged, other: what messages say, behind `name`, of rows of different lengths and of what is no
         real number.
     """
-    refuse_derivatives(name, values)
+    check_no_derivatives(name, values)
     try:
         array = np.asarray(values)
     except (ValueError, OverflowError):
@@ -89,33 +89,34 @@ def check_finite(
     bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
     if bad.size:
         raise error(
-            f"{name.format(bad[0])} is {vector_text(rows[bad[0]])}{and_more(bad.size)}: {advice}"
+            f"{name.format(bad[0])} is {format_vector(rows[bad[0]])}{others_suffix(bad.size)}: "
+            f"{advice}"
         )
 
 
-def check_size(x: FloatArray, error: type[Exception]) -> None:
-    """Check that no coordinate is larger than `LARGEST`."""
-    if (size := float(np.abs(x).max(initial=0.0))) > LARGEST:
+def check_coordinate_size(x: FloatArray, error: type[Exception]) -> None:
+    """Check that no coordinate is larger than `MAX_COORDINATE`."""
+    if (size := float(np.abs(x).max(initial=0.0))) > MAX_COORDINATE:
         raise error(f"coordinates up to {size:g} are too large: choose units nearer to 1")
 
 
-def vector_text(row: FloatArray) -> str:
+def format_vector(row: FloatArray) -> str:
     """A vector as messages show it: (1, 2, 3)."""
     return "(" + ", ".join(f"{v:g}" for v in row) + ")"
 
 
-def and_more(count: int) -> str:
+def others_suffix(count: int) -> str:
     """What a message about the first of `count` entries says of the others."""
     return f" (and {count - 1:,} more)" if count > 1 else ""
 
 
-def refuse_derivatives(name: str, *values: Any) -> None:
+def check_no_derivatives(name: str, *values: Any) -> None:
     """Check that nothing carries derivatives, where they would be dropped.
 
     Raises:
-        NotImplementedError: something does (`carries_derivatives`). The message starts with `name`.
+        NotImplementedError: something does (`has_derivatives`). The message starts with `name`.
     """
-    if carries_derivatives(values):
+    if has_derivatives(values):
         raise NotImplementedError(
             f"{name} cannot be differentiated by these numbers, which carry derivatives: detach "
             "them, as drjit.detach and torch.Tensor.detach do (known are derivatives by rays, "
@@ -124,19 +125,19 @@ def refuse_derivatives(name: str, *values: Any) -> None:
         )
 
 
-def refuses_derivatives(function: Function) -> Function:
-    """The same function, which refuses arguments that carry derivatives (`refuse_derivatives`):
+def no_derivatives(function: Function) -> Function:
+    """The same function, which refuses arguments that carry derivatives (`check_no_derivatives`):
     for those that make other numbers of them."""
 
     @functools.wraps(function)
     def checked(*given: Any, **named: Any) -> Any:
-        refuse_derivatives(function.__qualname__, given, named)
+        check_no_derivatives(function.__qualname__, given, named)
         return function(*given, **named)
 
     return cast("Function", checked)
 
 
-def carries_derivatives(value: Any) -> bool:
+def has_derivatives(value: Any) -> bool:
     """Whether a value is, or holds, an array with derivatives enabled: one of Dr.Jit or of PyTorch,
     in containers, in what functions refer to, and in attributes of fields, of what can be called,
     and of dataclasses."""
@@ -145,8 +146,8 @@ def carries_derivatives(value: Any) -> bool:
     for one in left:  # which grows
         kind = cast("Any", type(one))
         if kind is tuple:  # most of what fields hold
-            left += [entry for entry in one if type(entry) not in _PLAIN]
-        elif kind in _PLAIN:
+            left += [entry for entry in one if type(entry) not in _PLAIN_TYPES]
+        elif kind in _PLAIN_TYPES:
             continue
         elif dr.is_array_v(kind):
             if dr.is_diff_v(kind) and dr.grad_enabled(one):
@@ -155,17 +156,17 @@ def carries_derivatives(value: Any) -> bool:
             return True
         elif id(one) not in seen and not isinstance(one, type):
             seen.add(id(one))
-            left += _held(one)
+            left += _contained_values(one)
     return False
 
 
-def holds_numbers_alone(value: Any) -> bool:
+def is_plain_data(value: Any) -> bool:
     """Whether a value holds numbers of Python and NumPy, in tuples, dictionaries and dataclasses of
     this package, and nothing that may get derivatives later: no Dr.Jit array, no function."""
     left: list[Any] = [value]
     for one in left:  # which grows
         kind = cast("Any", type(one))
-        if kind in _PLAIN:
+        if kind in _PLAIN_TYPES:
             continue
         if kind is tuple:
             left += one
@@ -192,16 +193,18 @@ def make_read_only(value: Any) -> None:
         make_read_only(list(vars(value).values()))
 
 
-_PLAIN = frozenset((str, bytes, bool, int, float, complex, np.ndarray, np.float64, type(None)))
-_GROUPS = (list, tuple, set, frozenset)
+_PLAIN_TYPES = frozenset(
+    (str, bytes, bool, int, float, complex, np.ndarray, np.float64, type(None))
+)
+_CONTAINER_TYPES = (list, tuple, set, frozenset)
 # Functions of these packages refer to no numbers of the caller's.
 _KNOWN_PACKAGES = frozenset(("harnack", "drjit", "numpy", "math"))
 
 
-def _held(value: Any) -> list[Any]:
+def _contained_values(value: Any) -> list[Any]:
     """What a value holds, as far as it is looked into."""
-    if isinstance(value, _GROUPS):
-        return [one for one in cast("Any", value) if type(one) not in _PLAIN]
+    if isinstance(value, _CONTAINER_TYPES):
+        return [one for one in cast("Any", value) if type(one) not in _PLAIN_TYPES]
     if isinstance(value, dict):
         return list(cast("Any", value).values())
     if inspect.isfunction(value):
@@ -216,7 +219,7 @@ def _held(value: Any) -> list[Any]:
     return [*getattr(value, "__dict__", {}).values()] if is_known else []
 
 
-def short_text(value: Any) -> str:
+def format_short(value: Any) -> str:
     """A value as a line has room for it: arrays by their shapes, long lists by their lengths."""
     if isinstance(value, float):  # of NumPy too
         return f"{value:.6g}"
@@ -228,22 +231,22 @@ def short_text(value: Any) -> str:
         if len(entries) > _MOST_SHOWN:
             return f"<{len(entries)} entries>"
         comma = "," if len(entries) == 1 else ""
-        return f"({', '.join(map(short_text, entries))}{comma})"
+        return f"({', '.join(map(format_short, entries))}{comma})"
     if dr.is_array_v(cast("Any", type(value))):
         return f"<{type(value).__name__}>"
     text = repr(value)
-    if len(text) <= _LONGEST and " at 0x" not in text and "\n" not in text:
+    if len(text) <= _MAX_TEXT_LENGTH and " at 0x" not in text and "\n" not in text:
         return text
     return f"<{getattr(value, '__name__', type(value).__name__)}>"
 
 
-def is_same(a: Any, b: Any) -> bool:
+def is_same_or_equal(a: Any, b: Any) -> bool:
     """Whether two values are one, or equal numbers, texts or tuples of these."""
     plain = (int, float, str, tuple)
     return a is b or (isinstance(a, plain) and isinstance(b, plain) and bool(np.all(a == b)))
 
 
-def real(value: Any, name: str) -> float:
+def as_real(value: Any, name: str) -> float:
     """A number of Python or NumPy, as a float; infinities and NaN too.
 
     Raises:
@@ -255,43 +258,43 @@ def real(value: Any, name: str) -> float:
         raise TypeError(f"{name} must be a number, not {value!r}") from None
 
 
-def positive(value: Any, name: str) -> float:
+def as_positive(value: Any, name: str) -> float:
     """A positive finite number.
 
     Raises:
         TypeError: it is no number. ValueError: it is another one.
     """
-    number = real(value, name)
+    number = as_real(value, name)
     if not 0.0 < number < math.inf:
         raise ValueError(f"{name} must be positive and finite, not {value!r}")
     return number
 
 
-def finite(value: Any, name: str) -> float:
+def as_finite(value: Any, name: str) -> float:
     """A finite number.
 
     Raises:
         TypeError: it is no number. ValueError: it is another one.
     """
-    number = real(value, name)
+    number = as_real(value, name)
     if not math.isfinite(number):
         raise ValueError(f"{name} must be finite, not {value!r}")
     return number
 
 
-def whole(value: Any, name: str, least: int, most: int) -> int:
-    """An integer from `least` to `most`.
+def as_integer_in_range(value: Any, name: str, minimum: int, maximum: int) -> int:
+    """An integer from `minimum` to `maximum`.
 
     Raises:
         ValueError: it is none.
     """
     try:
-        number = least - 1 if isinstance(value, bool | np.bool_) else operator.index(value)
+        number = minimum - 1 if isinstance(value, bool | np.bool_) else operator.index(value)
     except TypeError:
-        number = least - 1
-    if not least <= number <= most:
-        end = f"2^{n} - 1" if (n := most.bit_length()) >= 32 else str(most)
-        raise ValueError(f"{name} must be an integer from {least} to {end}, not {value!r}")
+        number = minimum - 1
+    if not minimum <= number <= maximum:
+        end = f"2^{n} - 1" if (n := maximum.bit_length()) >= 32 else str(maximum)
+        raise ValueError(f"{name} must be an integer from {minimum} to {end}, not {value!r}")
     return number
 
 
@@ -302,7 +305,7 @@ def flag(value: Any, name: str) -> bool:
         TypeError: it is neither.
     """
     if not isinstance(value, bool | np.bool_):
-        raise TypeError(f"{name} must be True or False, not {short_text(value)}")
+        raise TypeError(f"{name} must be True or False, not {format_short(value)}")
     return bool(cast("Any", value))
 
 
@@ -315,10 +318,10 @@ def integer(value: Any, name: str) -> int:
     try:
         return operator.index(cast("Any", None if isinstance(value, bool | np.bool_) else value))
     except TypeError:
-        raise TypeError(f"{name} must be a whole number, not {short_text(value)}") from None
+        raise TypeError(f"{name} must be a whole number, not {format_short(value)}") from None
 
 
-def triple(value: Any, name: str, *, all_positive: bool = False) -> tuple[float, float, float]:
+def as_triple(value: Any, name: str, *, all_positive: bool = False) -> tuple[float, float, float]:
     """Three finite numbers.
 
     Raises:
@@ -330,6 +333,6 @@ def triple(value: Any, name: str, *, all_positive: bool = False) -> tuple[float,
         raise TypeError(f"{name} must be three numbers, not {value!r}") from None
     if len(entries) != 3:
         raise ValueError(f"{name} must be three numbers, not {len(entries)}: {value!r}")
-    check = positive if all_positive else finite
+    check = as_positive if all_positive else as_finite
     x, y, z = (check(one, f"each of {name}") for one in entries)
     return x, y, z

@@ -7,22 +7,22 @@ from collections.abc import Sequence
 
 from harnack.cli.arguments import parse, parse_level, parse_size
 from harnack.cli.commands import COMMANDS
-from harnack.cli.messages import error_line, interrupts_noticed, warnings_noted
+from harnack.cli.messages import error_line, print_warnings, track_interrupts
 
 __all__ = ["main", "parse_level", "parse_size"]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; 0 on success, 1 for what went wrong, 2 for wrong usage, 130 for Ctrl-C."""
-    with interrupts_noticed() as interrupts, warnings_noted():
+    with track_interrupts() as interrupts, print_warnings():
         try:
             options = parse(arguments)
             return COMMANDS[options.command](options)
         except KeyboardInterrupt:
-            interrupts.asked = True
+            interrupts.pressed = True
         except (ValueError, TypeError, OSError, ImportError, RuntimeError, MemoryError) as error:
             # A Ctrl-C within a plug-in reaches us as an error of Mitsuba or Dr.Jit.
-            if not interrupts.asked:
+            if not interrupts.pressed:
                 print(error_line(error), file=sys.stderr)
                 return 1
         print("stopped; nothing was written for what was in progress", file=sys.stderr)

@@ -12,18 +12,18 @@ from typing import Any, NoReturn
 from harnack._version import __version__
 from harnack.cli.mesh_files import MESH_FILES
 from harnack.cli.messages import printable
-from harnack.enclosures.selection import BOUNDS
+from harnack.enclosures.selection import ENCLOSURE_NAMES
 from harnack.field_from_file import UP_AXES
 from harnack.fields.expressions import TextFormula
-from harnack.files.geometry_files import SURFACE_FILES
+from harnack.files.geometry_files import GEOMETRY_SUFFIXES
 from harnack.meshing.level_function import MOST_FACES
 from harnack.name_suggestions import did_you_mean
 from harnack.rendering import MATERIALS, SHOW_MODES
-from harnack.rendering.backdrops import IMAGE_FILES, checked_backdrop
+from harnack.rendering.backdrops import IMAGE_FILES, parse_backdrop
 from harnack.rendering.render_options import ANTIALIASING, MAX_SIDE, MAX_SPP
-from harnack.rendering.scales import color_of
-from harnack.rendering.stage import material_of
-from harnack.view.live_scene import SHOWS
+from harnack.rendering.scales import parse_color
+from harnack.rendering.stage import parse_material
+from harnack.view.live_scene import LIVE_MODES
 from harnack.view.sliders import Slider
 
 # Of what was typed, this much is repeated in messages.
@@ -62,9 +62,9 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
         command: _Parser = commands[found.command]
         known = command.options()
         if rest[0] in known:  # behind "--"
-            command.error(f"{_shown(rest[0])} is an option: write it before --")
+            command.error(f"{_quoted(rest[0])} is an option: write it before --")
         what = "there is no option" if rest[0].startswith("-") else "there is no use for"
-        command.error(f"{what} {_shown(rest[0])}{did_you_mean(rest[0], known)}")
+        command.error(f"{what} {_quoted(rest[0])}{did_you_mean(rest[0], known)}")
     return found
 
 
@@ -86,7 +86,7 @@ def parsers() -> tuple[_Parser, dict[str, _Parser]]:
     many.add_argument("--list", action="store_true", help="list them and draw nothing")
     many.add_argument("--demo", action="store_true", help="only those of `make demo`, small")
     many.add_argument("-o", "--output", metavar="FOLDER", default="out", help="folder (out)")
-    _add_quality(many)
+    _add_image_options(many)
     commands.add_parser("doctor", help="say what is installed, what works, what is missing")
     return whole, commands.choices
 
@@ -96,11 +96,11 @@ def _add_render(commands: Any) -> None:
         "render", help="draw one picture",
         description="Draw a gallery scene, the surface of a file, a formula, or a Mitsuba scene "
         "(.xml). A formula is written as 'x^2 + y^2 = 1 + sin(2*z)'; --ball or --box cuts it. "
-        f"Surface files are {', '.join(SURFACE_FILES)}: meshes with any defects, point clouds, "
+        f"Surface files are {', '.join(GEOMETRY_SUFFIXES)}: meshes with any defects, point clouds, "
         "and curves; what a file was taken for is printed.",
     )  # fmt: skip
     one.add_argument("-o", "--output", metavar="FILE", help="picture, .png or .exr (SCENE.png)")
-    _add_drawn(one, "meshes and clouds, else color")
+    _add_render_options(one, "meshes and clouds, else color")
     _add_cluster(one, tiles=True)
     _add_choice(
         one, "--antialias", ANTIALIASING,
@@ -118,12 +118,12 @@ def _add_turntable(commands: Any) -> None:
     one.add_argument("-o", "--output", metavar="FILE", help="film, .gif or .mp4 (SCENE.gif)")
     one.add_argument("--frames", type=_samples, metavar="N", default=48, help="pictures (48)")
     one.add_argument(
-        "--fps", type=_positive, metavar="N", default=24.0, help="pictures a second (24)"
+        "--fps", type=_parse_positive, metavar="N", default=24.0, help="pictures a second (24)"
     )
     one.add_argument(
         "--turn", type=_angle, metavar="DEG", default=360.0, help="how far it goes around (360)"
     )
-    _add_drawn(one, "all")
+    _add_render_options(one, "all")
     _add_cluster(one)
 
 
@@ -150,7 +150,7 @@ def _add_live(commands: Any) -> None:
     view.add_argument("--no-browser", action="store_true", help="open no browser")
     view.set_defaults(quiet=True)
     for one in (page, view):
-        _add_choice(one, "--show", SHOWS, "what to show at first (shaded)")
+        _add_choice(one, "--show", LIVE_MODES, "what to show at first (shaded)")
         one.add_argument("--title", metavar="TEXT", help="of the page")
         one.add_argument(
             "--slider", type=_slider, metavar="NAME=LOW:HIGH[:STEP]", action="append", default=[],
@@ -160,11 +160,11 @@ def _add_live(commands: Any) -> None:
         _add_scene(one)
         _add_surface(one)
         _add_isolines(one)
-        _add_view(one)
+        _add_camera_options(one)
         _add_file(one)
 
 
-def _add_drawn(one: Any, shaded: str) -> None:
+def _add_render_options(one: Any, shaded: str) -> None:
     """What is drawn, how, and seen from where. shaded: what is drawn so unless asked otherwise."""
     _add_scene(one)
     _add_choice(
@@ -174,9 +174,9 @@ def _add_drawn(one: Any, shaded: str) -> None:
     )  # fmt: skip
     _add_surface(one)
     _add_values(_add_isolines(one))
-    _add_view(one)
+    _add_camera_options(one)
     _add_file(one)
-    _add_quality(one)
+    _add_image_options(one)
     one.add_argument(
         "--denoise", action="store_true",
         help="take the noise out of a color picture (needs pip install 'harnack[denoise]')",
@@ -214,14 +214,15 @@ def _add_parameters(one: Any) -> None:
 def _add_file(one: Any) -> Any:
     file = one.add_argument_group("surface files")
     _add_choice(
-        file, "--as", ("winding", "dipole", "loops", "polygons"),
+        file, "--read-as", ("winding", "dipole", "loops", "polygons"),
         "take the file as a mesh, as points with normals (of a mesh: the centers of its "
         "faces), as curves (of a mesh: its boundary) or as polygons that need not be flat, each "
         "spanned by a surface, whatever it looks like",
-        dest="as_",
     )  # fmt: skip
     file.add_argument(
-        "--boundary", action="store_true", help="take the boundary of a file's faces as the curves"
+        "--take-boundary",
+        action="store_true",
+        help="take the boundary of a file's faces as the curves",
     )
     _add_choice(file, "--normals", ("estimate",), "estimate the normals of a point cloud")
     file.add_argument(
@@ -242,7 +243,7 @@ def _add_up(group: Any) -> None:
 def _add_surface(one: Any) -> None:
     group = one.add_argument_group("what of a surface is drawn")
     group.add_argument(
-        "--solid", type=_ends, metavar="LOW:HIGH",
+        "--solid", type=_parse_range, metavar="LOW:HIGH",
         help="the solid where the function is between two values; one may be left out: :0",
     )  # fmt: skip
     _add_clip(group)
@@ -253,18 +254,21 @@ def _add_surface(one: Any) -> None:
     )  # fmt: skip
     group.add_argument("--largest", action="store_true", help="only the largest connected part")
     group.add_argument(
-        "--thickness", type=_positive, metavar="LENGTH",
+        "--thickness", type=_parse_positive, metavar="LENGTH",
         help="draw it as a sheet so thick, half on each side, by a mesh",
     )  # fmt: skip
     group.add_argument(
-        "--boundary-tube", type=_positive, metavar="RADIUS",
+        "--boundary-tube", type=_parse_positive, metavar="RADIUS",
         help="draw a tube around the curve at which it ends",
     )  # fmt: skip
     group.add_argument(
         "--boundary-material", type=_material, metavar="NAME", help="what it is made of (gold)"
     )
     _add_choice(
-        group, "--bound", BOUNDS, "the proof that steps are made by (the longest of all that apply)"
+        group,
+        "--bound",
+        ENCLOSURE_NAMES,
+        "the proof that steps are made by (the longest of all that apply)",
     )
 
 
@@ -275,7 +279,7 @@ def _add_isolines(one: Any) -> Any:
         help="lines where a coordinate or a formula is a multiple of the spacing, as z:0.1, x*y:1",
     )  # fmt: skip
     group.add_argument(
-        "--isolines-width", type=_positive, metavar="LENGTH",
+        "--isolines-width", type=_parse_positive, metavar="LENGTH",
         help="how wide they are, in the surface's coordinates (0.4 percent of its size)",
     )  # fmt: skip
     group.add_argument(
@@ -290,7 +294,7 @@ def _add_values(group: Any) -> None:
         help="the coordinate or the formula of x, y and z that --show value shows",
     )  # fmt: skip
     group.add_argument(
-        "--value-range", type=_ends, metavar="LOW:HIGH",
+        "--value-range", type=_parse_range, metavar="LOW:HIGH",
         help="of the colors of values, depths or evaluations (what is seen)",
     )  # fmt: skip
     group.add_argument(
@@ -312,13 +316,13 @@ def _add_clip(group: Any) -> None:
 
 def _add_section(group: Any) -> None:
     group.add_argument(
-        "--section", type=_plane, metavar="X,Y,Z[,OFFSET]",
+        "--section", type=_parse_plane, metavar="X,Y,Z[,OFFSET]",
         help="leave out what lies beyond a plane, on the side that the vector X,Y,Z points to, at "
         "a distance from the origin (0)",
     )  # fmt: skip
 
 
-def _add_view(one: Any) -> None:
+def _add_camera_options(one: Any) -> None:
     group = one.add_argument_group("camera and backdrop")
     for name, what in (("azimuth", "is turned"), ("elevation", "looks down")):
         group.add_argument(
@@ -326,7 +330,10 @@ def _add_view(one: Any) -> None:
         )
     group.add_argument("--fov", type=_angle, metavar="DEG", help="its angle of view (26)")
     group.add_argument(
-        "--zoom", type=_positive, metavar="FACTOR", help="closer than what frames the surface (1)"
+        "--zoom",
+        type=_parse_positive,
+        metavar="FACTOR",
+        help="closer than what frames the surface (1)",
     )
     for name, what in (("position", "where it stands"), ("target", "what it looks at")):
         group.add_argument(
@@ -334,7 +341,7 @@ def _add_view(one: Any) -> None:
             help=f"{what}, in the surface's coordinates",
         )  # fmt: skip
     group.add_argument(
-        "--distance", type=_positive, metavar="LENGTH", help="how far it is from its target"
+        "--distance", type=_parse_positive, metavar="LENGTH", help="how far it is from its target"
     )
     group.add_argument(
         "--backdrop", type=_backdrop, metavar="BACKDROP",
@@ -361,18 +368,21 @@ def _add_mesh(commands: Any) -> None:
     one.add_argument("--level", type=parse_level, help="as for render")
     _add_parameters(one)
     one.add_argument(
-        "--tolerance", type=_positive, metavar="PART",
+        "--tolerance", type=_parse_positive, metavar="PART",
         help="how far triangles may be from the surface, as a part of its size (0.001)",
     )  # fmt: skip
     one.add_argument(
-        "--spacing", type=_positive, metavar="LENGTH", help="of cells before anything is refined"
+        "--cell-size",
+        type=_parse_positive,
+        metavar="LENGTH",
+        help="of cells before anything is refined",
     )
     one.add_argument(
-        "--solid", type=_ends, metavar="LOW:HIGH",
+        "--solid", type=_parse_range, metavar="LOW:HIGH",
         help="the closed part where the function is between two values; one may be left out: :0",
     )  # fmt: skip
     one.add_argument(
-        "--thickness", type=_positive, metavar="LENGTH",
+        "--thickness", type=_parse_positive, metavar="LENGTH",
         help="a closed part so thick, in the scene's unit, half on each side of the surface",
     )  # fmt: skip
     _add_clip(one)
@@ -387,7 +397,7 @@ def _add_mesh(commands: Any) -> None:
         f"given up ({MOST_FACES:,})",
     )  # fmt: skip
     one.add_argument(
-        "--scale", type=_positive, metavar="FACTOR",
+        "--scale", type=_parse_positive, metavar="FACTOR",
         help="multiply all lengths at the end: millimeters for one unit of the scene (1)",
     )  # fmt: skip
     _add_up(_add_file(one))
@@ -403,16 +413,23 @@ def _add_check(commands: Any) -> None:
     )  # fmt: skip
     one.add_argument("mesh", metavar="FILE", help=_MESH_FILE)
     one.add_argument(
-        "--wall", type=_positive, metavar="LENGTH", help="the least thickness that is fine"
+        "--min-thickness",
+        type=_parse_positive,
+        metavar="LENGTH",
+        help="the least thickness that is fine",
     )
     one.add_argument(
-        "--bed", type=_positive, nargs=3, metavar=("X", "Y", "Z"), help="what it has to fit on"
+        "--build-volume",
+        type=_parse_positive,
+        nargs=3,
+        metavar=("X", "Y", "Z"),
+        help="what it has to fit on",
     )
     one.add_argument("--json", action="store_true", help="all of it as JSON")
     one.add_argument(
         "--colors", metavar="FILE",
-        help="write the mesh with its thickness as colors, .ply or .glb (needs --wall): red below "
-        "the wall, gray from three times that on",
+        help="write the mesh with its thickness as colors, .ply or .glb (needs --min-thickness): "
+        "red below the wall, gray from three times that on",
     )  # fmt: skip
 
 
@@ -429,16 +446,16 @@ def _add_repair(commands: Any) -> None:
         "-o", "--output", metavar="FILE", help=f"{', '.join(MESH_FILES)} (FILE-repaired.ply)"
     )
     one.add_argument(
-        "--tolerance", type=_positive, metavar="PART",
+        "--tolerance", type=_parse_positive, metavar="PART",
         help="how far new triangles may be from the surface, as a part of their size (0.001)",
     )  # fmt: skip
     one.add_argument(
-        "--keep", choices=("all", "sound", "none"),
+        "--keep", choices=("all", "valid", "none"),
         help="all: fail if the triangles cannot all be kept; sound: keep those that are sound; "
         "none: make all anew (the first that can be done)",
     )  # fmt: skip
     one.add_argument(
-        "--patches", choices=("smooth", "harmonic"),
+        "--filling", choices=("smooth", "harmonic"),
         help="smooth: continue the surface around holes; harmonic: where the winding number is "
         "1/2 (smooth, and harmonic where those do not fit)",
     )  # fmt: skip
@@ -446,12 +463,15 @@ def _add_repair(commands: Any) -> None:
         "--largest", action="store_true", default=None, help="keep the largest part alone"
     )
     one.add_argument(
-        "--spacing", type=_positive, metavar="LENGTH", help="of cells before anything is refined"
+        "--cell-size",
+        type=_parse_positive,
+        metavar="LENGTH",
+        help="of cells before anything is refined",
     )
     one.add_argument("--quiet", action="store_true", help="do not say what is being done")
 
 
-def _add_quality(parser: argparse.ArgumentParser) -> None:
+def _add_image_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--size", type=parse_size, metavar="WxH", help="pixels (800x600; of films 320x240)"
     )
@@ -486,37 +506,37 @@ def _add_cluster(one: Any, *, tiles: bool = False) -> None:
 def _add_choice(parser: Any, option: str, names: Iterable[str], help: str, **settings: Any) -> None:
     known = tuple(names)
     shown = "{" + ",".join(known) + "}"
-    parser.add_argument(option, type=_one_of(known), metavar=shown, help=help, **settings)
+    parser.add_argument(option, type=_choice_parser(known), metavar=shown, help=help, **settings)
 
 
-def _one_of(known: Sequence[str]) -> Callable[[str], str]:
+def _choice_parser(known: Sequence[str]) -> Callable[[str], str]:
     def chosen(text: str) -> str:
         if text not in known:
             raise argparse.ArgumentTypeError(
-                f"{_shown(text)} is none of {', '.join(known)}{did_you_mean(text, known)}"
+                f"{_quoted(text)} is none of {', '.join(known)}{did_you_mean(text, known)}"
             )
         return text
 
     return chosen
 
 
-def _positive(text: str) -> float:
+def _parse_positive(text: str) -> float:
     try:
         number = float(text)
     except ValueError:
         number = math.nan
     if not 0 < number < math.inf:
-        raise argparse.ArgumentTypeError(f"{_shown(text)} must be a positive number")
+        raise argparse.ArgumentTypeError(f"{_quoted(text)} must be a positive number")
     return number
 
 
 def _smoothing(text: str) -> float | str:
-    return text if text == "auto" else _positive(text)
+    return text if text == "auto" else _parse_positive(text)
 
 
 def _port(text: str) -> int:
     if not re.fullmatch(r"[0-9]{1,5}", text) or int(text) > 65535:
-        raise argparse.ArgumentTypeError(f"{_shown(text)} must be a number from 0 to 65535")
+        raise argparse.ArgumentTypeError(f"{_quoted(text)} must be a number from 0 to 65535")
     return int(text)
 
 
@@ -524,7 +544,7 @@ def _parameter(text: str) -> tuple[str, float]:
     """ "a=0.5" as ("a", 0.5)."""
     name, equals, number = text.partition("=")
     if not equals or not name.strip().isidentifier():
-        raise argparse.ArgumentTypeError(f"{_shown(text)}: write a name and a number as a=0.5")
+        raise argparse.ArgumentTypeError(f"{_quoted(text)}: write a name and a number as a=0.5")
     return name.strip(), parse_level(number)
 
 
@@ -534,24 +554,24 @@ def _slider(text: str) -> tuple[str, Slider]:
     numbers = rest.split(":")
     if not name.strip().isidentifier() or len(numbers) not in (2, 3):
         raise argparse.ArgumentTypeError(
-            f"{_shown(text)}: write a name and two ends as level=1:12, a step behind them as "
+            f"{_quoted(text)}: write a name and two ends as level=1:12, a step behind them as "
             "level=1:12:0.5"
         )
     low, high, *step = map(parse_level, numbers)
     try:
         return name.strip(), Slider(low, high, step=step[0] if step else None)
     except ValueError as error:
-        raise argparse.ArgumentTypeError(f"{_shown(text)}: {error}") from None
+        raise argparse.ArgumentTypeError(f"{_quoted(text)}: {error}") from None
 
 
-def _ends(text: str) -> tuple[float, float]:
+def _parse_range(text: str) -> tuple[float, float]:
     """ "-0.3:0.3" as (-0.3, 0.3), ":0" as (-inf, 0)."""
     low, colon, high = text.partition(":")
     if not colon:
-        raise argparse.ArgumentTypeError(f"{_shown(text)}: write two values as -0.3:0.3")
+        raise argparse.ArgumentTypeError(f"{_quoted(text)}: write two values as -0.3:0.3")
     ends = (parse_level(low) if low else -math.inf, parse_level(high) if high else math.inf)
     if not ends[0] < ends[1] or all(map(math.isinf, ends)):
-        raise argparse.ArgumentTypeError(f"{_shown(text)}: the first value must be the lower one")
+        raise argparse.ArgumentTypeError(f"{_quoted(text)}: the first value must be the lower one")
     return ends
 
 
@@ -560,14 +580,14 @@ def _isolines(text: str) -> tuple[str, float]:
     formula, colon, spacing = text.rpartition(":")
     if not colon:
         raise argparse.ArgumentTypeError(
-            f"{_shown(text)}: write a coordinate or a formula, and a spacing, as z:0.1"
+            f"{_quoted(text)}: write a coordinate or a formula, and a spacing, as z:0.1"
         )
-    return _formula(formula), _positive(spacing)
+    return _formula(formula), _parse_positive(spacing)
 
 
 def _formula(text: str) -> str:
     try:
-        TextFormula.read(text)
+        TextFormula.parse(text)
     except ValueError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
     return text
@@ -575,7 +595,7 @@ def _formula(text: str) -> str:
 
 def _material(text: str) -> str:
     try:
-        material_of(text)
+        parse_material(text)
     except ValueError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
     return text
@@ -583,7 +603,7 @@ def _material(text: str) -> str:
 
 def _color(text: str) -> str:
     try:
-        color_of(text, "a color")
+        parse_color(text, "a color")
     except ValueError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
     return text
@@ -595,7 +615,7 @@ def _backdrop(text: str) -> Any:
     is_file = text.lower().endswith(IMAGE_FILES)
     given: Any = text if is_file or len(parts) != 2 else tuple(parts)
     try:
-        checked_backdrop(given)
+        parse_backdrop(given)
     except ValueError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
     return given
@@ -613,11 +633,11 @@ def _four_numbers(text: str) -> tuple[float, ...]:
     return _numbers(text, 4)
 
 
-def _plane(text: str) -> tuple[float, ...]:
+def _parse_plane(text: str) -> tuple[float, ...]:
     """ "0,0,1" as (0, 0, 1, 0); a fourth number is the distance from the origin."""
     plane = _numbers(text, 4 if text.count(",") == 3 else 3)
     if not any(plane[:3]):
-        raise argparse.ArgumentTypeError(f"{_shown(text)}: the vector must not be zero")
+        raise argparse.ArgumentTypeError(f"{_quoted(text)}: the vector must not be zero")
     return plane if len(plane) == 4 else (*plane, 0.0)
 
 
@@ -627,7 +647,7 @@ def _numbers(text: str, count: int) -> tuple[float, ...]:
     except ValueError:
         numbers = ()
     if len(numbers) != count or not all(map(math.isfinite, numbers)):
-        raise argparse.ArgumentTypeError(f"{_shown(text)} must be {count} numbers with commas")
+        raise argparse.ArgumentTypeError(f"{_quoted(text)} must be {count} numbers with commas")
     return numbers
 
 
@@ -638,7 +658,7 @@ def _angle(text: str) -> float:
         angle = math.nan
     if not math.isfinite(angle):
         raise argparse.ArgumentTypeError(
-            f"an angle is a finite number of degrees, not {_shown(text)}"
+            f"an angle is a finite number of degrees, not {_quoted(text)}"
         )
     return angle
 
@@ -647,7 +667,7 @@ def parse_size(text: str) -> tuple[int, int]:
     """ "800x600" as (800, 600)."""
     match = re.fullmatch(r"([0-9]{1,9})[xX]([0-9]{1,9})", text)
     if not match:
-        raise argparse.ArgumentTypeError(f"{_shown(text)} is no size; write it as 800x600")
+        raise argparse.ArgumentTypeError(f"{_quoted(text)} is no size; write it as 800x600")
     width, height = int(match[1]), int(match[2])
     if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
         raise argparse.ArgumentTypeError(f"{text}: each side must be 1 to {MAX_SIDE} pixels")
@@ -673,23 +693,23 @@ def parse_level(text: str) -> float:
         return level
     except (ValueError, ZeroDivisionError):
         raise argparse.ArgumentTypeError(
-            f"{_shown(text)} is no level; write 0.5, 2pi or pi/3"
+            f"{_quoted(text)} is no level; write 0.5, 2pi or pi/3"
         ) from None
 
 
 def _samples(text: str) -> int:
     number = int(text) if re.fullmatch(r"[0-9]{1,9}", text) else 0
     if not 1 <= number <= MAX_SPP:
-        raise argparse.ArgumentTypeError(f"{_shown(text)} must be a number from 1 to {MAX_SPP}")
+        raise argparse.ArgumentTypeError(f"{_quoted(text)} must be a number from 1 to {MAX_SPP}")
     return number
 
 
 def _seed(text: str) -> int:
     if not re.fullmatch(r"[+-]?[0-9]{1,18}", text):
-        raise argparse.ArgumentTypeError(f"{_shown(text)} must be an integer of at most 18 digits")
+        raise argparse.ArgumentTypeError(f"{_quoted(text)} must be an integer of at most 18 digits")
     return int(text)
 
 
-def _shown(text: str) -> str:
+def _quoted(text: str) -> str:
     """What was typed, in quotes, its beginning if it is long."""
     return repr(text if len(text) <= _SHOWN else text[:_SHOWN] + "...")

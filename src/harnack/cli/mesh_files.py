@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from harnack.files.file_geometry import check_writable, write_atomically
-from harnack.files.three_mf import FOR_3MF
+from harnack.files.three_mf import REQUIRED_PACKAGES
 
 if TYPE_CHECKING:
     import trimesh
@@ -31,7 +31,7 @@ def check_mesh_path(path: str | os.PathLike[str]) -> Path:
     if target.suffix.lower() not in MESH_FILES:
         raise ValueError(f"{target} has no extension of a mesh: name it {', '.join(MESH_FILES)}")
     if target.suffix.lower() == ".3mf":
-        missing = [name for name in FOR_3MF if importlib.util.find_spec(name) is None]
+        missing = [name for name in REQUIRED_PACKAGES if importlib.util.find_spec(name) is None]
         if missing:
             raise ImportError(
                 f"{target}: 3MF needs {' and '.join(missing)}: pip install 'harnack[3mf]', or name "

@@ -18,7 +18,7 @@ from types import FrameType
 from typing import Any
 
 from harnack.rendering import UnboundedSurfaceError
-from harnack.rendering.render_options import SETTINGS
+from harnack.rendering.render_options import OPTION_NAMES
 
 # Ctrl-C.
 
@@ -30,21 +30,21 @@ _SAME = 1.0
 class Interrupts:
     """Whether Ctrl-C was pressed, and when (`time.monotonic`)."""
 
-    asked: bool = False
+    pressed: bool = False
     when: float = -_SAME
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
         """Raise KeyboardInterrupt, but not again while the first one is being answered."""
         del number, frame
         now = time.monotonic()
-        if self.asked and now - self.when < _SAME:
+        if self.pressed and now - self.when < _SAME:
             return
-        self.asked, self.when = True, now
+        self.pressed, self.when = True, now
         raise KeyboardInterrupt
 
 
 @contextmanager
-def interrupts_noticed() -> Generator[Interrupts]:
+def track_interrupts() -> Generator[Interrupts]:
     """Keeps account of Ctrl-C within the block, where signals can be handled (the main thread)."""
     interrupts = Interrupts()
     if threading.current_thread() is not threading.main_thread():
@@ -61,14 +61,14 @@ def interrupts_noticed() -> Generator[Interrupts]:
 
 
 @contextmanager
-def warnings_noted() -> Generator[None]:
+def print_warnings() -> Generator[None]:
     """What is warned of within the block is printed on a line, in the words of the command line."""
     with warnings.catch_warnings():
         shown = warnings.showwarning
 
         def note(message: Any, category: type[Warning], *place: Any, **more: Any) -> None:
             if issubclass(category, UserWarning | RuntimeWarning):
-                print(f"note: {in_options(str(message))}", file=sys.stderr)
+                print(f"note: {python_to_cli_terms(str(message))}", file=sys.stderr)
             else:
                 shown(message, category, *place, **more)
 
@@ -77,17 +77,19 @@ def warnings_noted() -> Generator[None]:
 
 
 # Arguments of Python that are options of the command line.
-_WRITTEN_OTHERWISE = ("backdrop", "camera", "isolines", "max_depth", "progress", "value_range")
+_DIFFERENT_CLI_NAMES = (
+    "backdrop", "boundary", "camera", "isolines", "max_depth", "progress", "value_range",
+)  # fmt: skip
 OPTIONS = (
-    *(name for name in SETTINGS if name not in _WRITTEN_OTHERWISE), "as_", "bound", "confirm",
-    "keep", "largest", "level", "max_triangles", "normals", "simplify", "smoothing", "spacing",
-    "tolerance",
+    *(name for name in OPTION_NAMES if name not in _DIFFERENT_CLI_NAMES),
+    "bound", "cell_size", "confirm", "keep", "largest", "level", "max_triangles", "normals",
+    "read_as", "simplify", "smoothing", "take_boundary", "tolerance",
 )  # fmt: skip
 _PARAMETER = re.compile(r'parameters=\{"(\w+)": 1\.0\}')
 # One of them with a value, as messages write it, that is not inside of a call.
 _ARGUMENT = re.compile(rf'(?<![(\w])({"|".join(OPTIONS)})=("[^"]*"|True\b|[\w.-]+)')
 # What is written otherwise. Longer phrases come before their parts.
-_PHRASES = {
+_CLI_PHRASES = {
     "with a client or a checkpoint": "with --scheduler or --checkpoint",
     "(tiles=)": "(--tiles)",
     "clip=harnack.Ball((0, 0, 0), 1)": "--ball 0,0,0,1",
@@ -122,17 +124,19 @@ def printable(text: str) -> str:
 
 def _explanation(error: Exception) -> str:
     if isinstance(error, UnboundedSurfaceError):
-        if error.usual is not None:
-            return f"{error.reason}; choose another --level, such as {level_text(error.usual)}"
+        if error.bounded_level is not None:
+            return (
+                f"{error.reason}; choose another --level, such as {level_text(error.bounded_level)}"
+            )
         return f"{error.reason}; cut it, such as by --ball 0,0,0,2"
     if isinstance(error, MemoryError):
         return f"there is not enough memory: choose a smaller --size ({error})"
-    return in_options(str(error))
+    return python_to_cli_terms(str(error))
 
 
-def in_options(text: str) -> str:
+def python_to_cli_terms(text: str) -> str:
     """A message of the library, with options of the command line for arguments of Python."""
-    for written, option in _PHRASES.items():
+    for written, option in _CLI_PHRASES.items():
         text = text.replace(written, option)
     text = _PARAMETER.sub(r"--set \1=1", text)
     return _ARGUMENT.sub(lambda found: _option(*found.groups()), text)

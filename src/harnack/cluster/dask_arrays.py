@@ -11,18 +11,18 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 
-from harnack.cluster.serialization import Packed, load_module, name_of
-from harnack.cluster.workers import alone
+from harnack.cluster.serialization import SerializedObject, content_hash, import_optional
+from harnack.cluster.workers import exclusive_compute
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
-def is_lazy(value: Any) -> bool:
+def is_dask_array(value: Any) -> bool:
     """Whether a value is a Dask array; Dask is not imported to tell."""
     return type(value).__module__.startswith("dask.array") and hasattr(value, "dask")
 
 
-def takes_blocks(*names: str) -> Callable[[Function], Function]:
+def accepts_dask_arrays(*names: str) -> Callable[[Function], Function]:
     """A decorator of a function or method of points or rays: where one of the named arguments is a
     Dask array, the results are Dask arrays, whose blocks are the function's results for the blocks
     of the arguments. What else it is given, such as a field, is sent to each worker once.
@@ -35,28 +35,30 @@ def takes_blocks(*names: str) -> Callable[[Function], Function]:
 
         @functools.wraps(function)
         def general(*given: Any, **settings: Any) -> Any:
-            if not any(map(is_lazy, (*given, *settings.values()))):
+            if not any(map(is_dask_array, (*given, *settings.values()))):
                 return function(*given, **settings)
             arguments = signature.bind(*given, **settings).arguments
             # Methods take the place of `self` by position, and the rest by name.
             rest = arguments.pop(next(iter(signature.parameters)))
             named = {**arguments.pop("settings", {}), **arguments}
-            return _in_blocks(functools.partial(general, rest), names, named)
+            return _map_blocks(functools.partial(general, rest), names, named)
 
         return cast("Function", general)
 
     return decorate
 
 
-def _in_blocks(call: Callable[..., Any], names: tuple[str, ...], arguments: dict[str, Any]) -> Any:
+def _map_blocks(call: Callable[..., Any], names: tuple[str, ...], arguments: dict[str, Any]) -> Any:
     """What `call` gives for arguments, some of which are Dask arrays."""
     what = "Dask arrays"
-    delayed = load_module("dask", what).delayed
-    array = load_module("dask.array", what)
-    lazy = {name: one for name, one in arguments.items() if is_lazy(one)}
+    delayed = import_optional("dask", what).delayed
+    array = import_optional("dask.array", what)
+    lazy = {name: one for name, one in arguments.items() if is_dask_array(one)}
     for name in lazy.keys() - set(names):
         raise TypeError(f"{name} cannot be a Dask array: call its method compute() first")
-    lazy = _alike(array, lazy, {name: arguments[name] for name in names if name in arguments})
+    lazy = _align_blocks(
+        array, lazy, {name: arguments[name] for name in names if name in arguments}
+    )
     fixed = {name: one for name, one in arguments.items() if name not in lazy}
     for name, one in lazy.items():
         if one.dtype.kind not in "iuf":
@@ -65,9 +67,11 @@ def _in_blocks(call: Callable[..., Any], names: tuple[str, ...], arguments: dict
     # What there is to be expected, told by no points; wrong settings are told here as well.
     result = call(**{name: np.zeros((0, *one.shape[1:]), one.dtype) for name, one in lazy.items()})
     empty = _arrays_of(result)
-    packed = Packed.of(call, what)
-    token = name_of((packed.name, [(name, one.name) for name, one in lazy.items()]), what)
-    sent = delayed(packed, name=f"harnack-{packed.name}", traverse=False)
+    packed = SerializedObject.serialize(call, what)
+    token = content_hash(
+        (packed.content_hash, [(name, one.name) for name, one in lazy.items()]), what
+    )
+    sent = delayed(packed, name=f"harnack-{packed.content_hash}", traverse=False)
     run = delayed(_run, pure=False)
     columns = [one.to_delayed().reshape(-1).tolist() for one in lazy.values()]
     lengths: tuple[int, ...] = next(iter(lazy.values())).chunks[0]
@@ -82,7 +86,7 @@ def _in_blocks(call: Callable[..., Any], names: tuple[str, ...], arguments: dict
     return type(result)(**results) if is_dataclass(result) else results[""]
 
 
-def _alike(array: Any, lazy: dict[str, Any], others: Mapping[str, Any]) -> dict[str, Any]:
+def _align_blocks(array: Any, lazy: dict[str, Any], others: Mapping[str, Any]) -> dict[str, Any]:
     """Dask arrays, and what else has an entry for each of their rows, in the same blocks of rows.
 
     Raises:
@@ -115,10 +119,10 @@ def _arrays_of(result: Any) -> dict[str, np.ndarray[Any, Any]]:
     return dict(vars(result)) if is_dataclass(result) else {"": np.asarray(result)}
 
 
-def _run(packed: Packed, blocks: dict[str, Any], start: int) -> dict[str, Any]:
+def _run(packed: SerializedObject, blocks: dict[str, Any], start: int) -> dict[str, Any]:
     """The results for one block of rows, which begins at row `start`."""
-    with alone():
+    with exclusive_compute():
         try:
-            return _arrays_of(packed.open()(**blocks))
+            return _arrays_of(packed.deserialize()(**blocks))
         except (TypeError, ValueError) as error:
             raise type(error)(f"in the block that begins at row {start}: {error}") from error

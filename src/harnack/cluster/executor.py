@@ -3,6 +3,14 @@
 Parts are named by what they are made of, so that a folder can be used again after a crash, with
 other workers, or for a film with more frames: what is there is not done again, and what belongs to
 something else is not touched.
+
+Work in parts has one path. Pictures were drawn band by band already; who does a band, this
+process or Dask's workers, is all that differs (`shading`, `RenderExecutor`), so that the result is
+the same bit for bit. What needs the whole picture (hidden sky, outlines) is done where the picture
+is put together. Parts are named by a hash of what they are made of, files and users' code included,
+without what objects only remember (`serialization`, `users_code`): a folder of parts needs no
+book-keeping. A surface is sent as a task and not as data in a worker's memory, which would be lost
+with it.
 """
 
 from __future__ import annotations
@@ -22,38 +30,38 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from harnack.cluster.serialization import Packed, load_module, name_of
+from harnack.cluster.serialization import SerializedObject, content_hash, import_optional
 from harnack.cluster.workers import (
     SCHEDULER_LOST,
-    alone,
-    connected,
-    fingerprint,
-    warn_of_rounding,
+    connect_client,
+    exclusive_compute,
+    rounding_fingerprint,
+    warn_rounding_differs,
     worker_threads,
 )
 from harnack.files.file_geometry import check_writable, write_atomically
 
-Arrays = dict[str, npt.NDArray[Any]]
+TaskResult = dict[str, npt.NDArray[Any]]
 """What a part gives, by name, and all of it: it is sent and kept as plain numbers."""
-Step = Callable[..., Arrays]
+TaskFunction = Callable[..., TaskResult]
 
 # Parts in the hands of the cluster for each of its threads. More hide the time that messages take;
 # results wait in the memory of workers.
-_AHEAD = 3
+_PENDING_PER_THREAD = 3
 # Parts that a task is cut into for each thread, so that all end at about the same time.
-_OF_A_THREAD = 6
+_TASKS_PER_THREAD = 6
 # Seconds between two looks at what is done, and without a worker until a warning says so.
-_PAUSE, _ALONE = 0.005, 20.0
+_POLL_SECONDS, _NO_WORKER_SECONDS = 0.005, 20.0
 
 
 @dataclass(frozen=True)
-class Folder:
+class CheckpointFolder:
     """Finished parts, a file of arrays for each."""
 
     path: Path
 
     @classmethod
-    def at(cls, path: str | os.PathLike[str]) -> Folder:
+    def open(cls, path: str | os.PathLike[str]) -> CheckpointFolder:
         """A folder, made if it is not there.
 
         Raises:
@@ -67,7 +75,7 @@ class Folder:
         check_writable(folder / "part.npz")
         return cls(folder)
 
-    def get(self, name: str) -> Arrays | None:
+    def load(self, name: str) -> TaskResult | None:
         """The arrays of a part, None if it is not there.
 
         Raises:
@@ -88,7 +96,7 @@ class Folder:
         """Whether a part is there."""
         return self._file(name).exists()
 
-    def put(self, name: str, arrays: Arrays) -> None:
+    def save(self, name: str, arrays: TaskResult) -> None:
         """Write the arrays of a part."""
         with write_atomically(self._file(name)) as partial:
             np.savez(partial, allow_pickle=False, **arrays)
@@ -98,119 +106,129 @@ class Folder:
 
 
 @dataclass(frozen=True)
-class Crew:
-    """Who does the parts of tasks (`crew`).
+class Executor:
+    """Who does the parts of tasks (`open_executor`).
 
     client: a Dask client, None for this process. folder: where finished parts are kept, None for
     nowhere. tiles: how many parts a task is cut into, None for as many as suit the workers.
     """
 
     client: Any = None
-    folder: Folder | None = None
-    tiles: int | None = None
+    checkpoint: CheckpointFolder | None = None
+    chunks: int | None = None
 
-    def cut(self, count: int, most: int) -> list[tuple[int, int]]:
+    def split_range(self, count: int, most: int) -> list[tuple[int, int]]:
         """(start, stop) of runs of things that are counted from 0, at most `most` a run."""
         size = max(1, min(most, count))
-        if self.tiles is not None:
-            size = max(1, min(size, -(-count // self.tiles)))
+        if self.chunks is not None:
+            size = max(1, min(size, -(-count // self.chunks)))
         elif self.client is not None:
-            size = max(1, min(size, -(-count // (_OF_A_THREAD * self._threads()))))
+            size = max(1, min(size, -(-count // (_TASKS_PER_THREAD * self._threads()))))
         return [(start, min(start + size, count)) for start in range(0, count, size)]
 
-    def each(self, job: Any, step: str, parts: Sequence[tuple[Any, ...]]) -> Iterator[Arrays]:
+    def run_tasks(
+        self, job: Any, step: str, parts: Sequence[tuple[Any, ...]]
+    ) -> Iterator[TaskResult]:
         """What the method `step` of a job gives for the arguments of each part, in their order.
 
-        job: what `Packed.of` takes. It is sent to each worker once, and opened there once.
+        job: what `SerializedObject.serialize` takes. It is sent to each worker once, and opened
+            there once.
         """
-        if self.client is None and self.folder is None:
-            do: Step = getattr(job, step)
+        if self.client is None and self.checkpoint is None:
+            do: TaskFunction = getattr(job, step)
             for part in parts:
                 yield do(*part)
             return
-        packed = Packed.of(job, "checkpoint" if self.client is None else "client")
-        names = [f"{packed.name}-{step}-{name_of(part, 'a part')}" for part in parts]
-        doing = _Here(packed, step) if self.client is None else _There(self.client, packed, step)
+        packed = SerializedObject.serialize(job, "checkpoint" if self.client is None else "client")
+        names = [f"{packed.content_hash}-{step}-{content_hash(part, 'a part')}" for part in parts]
+        doing = (
+            _LocalTasks(packed, step)
+            if self.client is None
+            else _DaskTasks(self.client, packed, step)
+        )
         try:
-            yield from _in_order(names, parts, self.folder, doing, self._ahead)
+            yield from _ordered_results(names, parts, self.checkpoint, doing, self._max_pending)
         finally:
-            for name, arrays in doing.end():
-                if self.folder is not None:
-                    self.folder.put(name, arrays)
+            for name, arrays in doing.cancel():
+                if self.checkpoint is not None:
+                    self.checkpoint.save(name, arrays)
 
-    def _ahead(self) -> int:
-        return 1 if self.client is None else _AHEAD * self._threads()
+    def _max_pending(self) -> int:
+        return 1 if self.client is None else _PENDING_PER_THREAD * self._threads()
 
     def _threads(self) -> int:
         return max(1, sum(worker_threads(self.client).values()))
 
 
 @contextmanager
-def crew(client: Any = None, checkpoint: Any = None, tiles: int | None = None) -> Generator[Crew]:
+def open_executor(
+    client: Any = None, checkpoint: Any = None, tiles: int | None = None
+) -> Generator[Executor]:
     """A crew, from the arguments of those who have something done.
 
     Raises:
-        ModuleNotFoundError, TypeError, OSError, RuntimeError: as `connected` and `Folder.at`.
+        ModuleNotFoundError, TypeError, OSError, RuntimeError: as `connect_client` and
+            `CheckpointFolder.open`.
     """
     folder = None
     if checkpoint is not None:
-        load_module("cloudpickle", "checkpoint")
-        folder = Folder.at(checkpoint)
-    with connected(client) as one:
-        yield Crew(one, folder, tiles)
+        import_optional("cloudpickle", "checkpoint")
+        folder = CheckpointFolder.open(checkpoint)
+    with connect_client(client) as one:
+        yield Executor(one, folder, tiles)
 
 
-class _Here:
+class _LocalTasks:
     """Parts that this process does, one after the other."""
 
-    def __init__(self, packed: Packed, step: str) -> None:
-        self.do: Step = getattr(packed.open(), step)
+    def __init__(self, packed: SerializedObject, step: str) -> None:
+        self.do: TaskFunction = getattr(packed.deserialize(), step)
         self.waiting: list[tuple[str, tuple[Any, ...]]] = []
 
-    def begin(self, name: str, part: tuple[Any, ...]) -> None:
+    def submit(self, name: str, part: tuple[Any, ...]) -> None:
         """Have a part done."""
         self.waiting.append((name, part))
 
-    def next_done(self) -> tuple[str, Arrays]:
+    def next_completed(self) -> tuple[str, TaskResult]:
         """The name and the arrays of a part that is done."""
         name, part = self.waiting.pop(0)
         return name, self.do(*part)
 
-    def end(self) -> list[tuple[str, Arrays]]:
+    def cancel(self) -> list[tuple[str, TaskResult]]:
         """Forget what is not done; what is done and nobody asked for."""
         return []
 
 
-class _There:
+class _DaskTasks:
     """Parts that workers do. A lost worker's parts go to others: Dask sees to that."""
 
-    def __init__(self, client: Any, packed: Packed, step: str) -> None:
-        distributed = load_module("distributed", "client")
+    def __init__(self, client: Any, packed: SerializedObject, step: str) -> None:
+        distributed = import_optional("distributed", "client")
         self.client, self.step = client, step
         self.worker_lost = distributed.KilledWorker
-        self.scheduler_lost = load_module("distributed.client", "client").FuturesCancelledError
-        self.done = distributed.as_completed(loop=client.loop)
+        self.scheduler_lost = import_optional("distributed.client", "client").FuturesCancelledError
+        self.completed = distributed.as_completed(loop=client.loop)
         self.names: dict[Any, str] = {}
-        self.looked_at = set(worker_threads(client))
+        self.checked_workers = set(worker_threads(client))
         # As a task and not as data in a worker's memory, which would be lost with that worker.
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="Sending large graph")
-            self.packed = client.submit(_same, packed, key=f"harnack-{packed.name}")
+            self.packed = client.submit(_identity, packed, key=f"harnack-{packed.content_hash}")
 
-    def begin(self, name: str, part: tuple[Any, ...]) -> None:
+    def submit(self, name: str, part: tuple[Any, ...]) -> None:
         """Have a part done."""
-        future = self.client.submit(_done, self.packed, self.step, part, key=name)
+        future = self.client.submit(_run_task, self.packed, self.step, part, key=name)
         self.names[future] = name
-        self.done.add(future)
+        self.completed.add(future)
 
-    def next_done(self) -> tuple[str, Arrays]:
+    def next_completed(self) -> tuple[str, TaskResult]:
         """The name and the arrays of a part that is done.
 
         Raises what the part raised; RuntimeError: it took several workers with it, or the scheduler
         is gone.
         """
         self._wait()
-        future = next(self.done)
+        future = next(self.completed)
         try:
             arrays, worker, rounding = future.result()
         except self.worker_lost as error:
@@ -222,18 +240,18 @@ class _There:
             raise RuntimeError(SCHEDULER_LOST) from None
         name = self.names.pop(future)
         future.release()
-        if worker not in self.looked_at:
-            self.looked_at.add(worker)
-            if rounding != fingerprint():
-                warn_of_rounding([worker])
+        if worker not in self.checked_workers:
+            self.checked_workers.add(worker)
+            if rounding != rounding_fingerprint():
+                warn_rounding_differs([worker])
         return name, arrays
 
     def _wait(self) -> None:
         """Until a part is done. A warning says if nobody is there to do one."""
         alone_since, warned = None, False
         look_again = time.monotonic() + 1
-        while not self.done.has_ready():
-            time.sleep(_PAUSE)
+        while not self.completed.has_ready():
+            time.sleep(_POLL_SECONDS)
             now = time.monotonic()
             if now < look_again:
                 continue
@@ -242,45 +260,45 @@ class _There:
                 alone_since = None
                 continue
             alone_since = alone_since or now
-            if now - alone_since > _ALONE and not warned:
+            if now - alone_since > _NO_WORKER_SECONDS and not warned:
                 warned = True
                 warnings.warn("the cluster has no worker: this waits for one", stacklevel=2)
 
-    def end(self) -> list[tuple[str, Arrays]]:
+    def cancel(self) -> list[tuple[str, TaskResult]]:
         """Forget what is not done; what is done and nobody asked for."""
         ready = [one for one in self.names if one.status == "finished"]
-        found: list[tuple[str, Arrays]] = []
+        found: list[tuple[str, TaskResult]] = []
         # Without a scheduler there is nobody to ask; what is raised already says so.
         with suppress(OSError, TimeoutError, asyncio.CancelledError, self.scheduler_lost):
             self.client.cancel([one for one in self.names if one.status != "finished"])
             for one in ready:
-                found.append((self.names[one], one.result(timeout=_ALONE)[0]))
+                found.append((self.names[one], one.result(timeout=_NO_WORKER_SECONDS)[0]))
         self.names.clear()
         self.packed.release()
         return found
 
 
-def _in_order(
+def _ordered_results(
     names: list[str],
     parts: Sequence[tuple[Any, ...]],
-    folder: Folder | None,
-    doing: _Here | _There,
+    folder: CheckpointFolder | None,
+    doing: _LocalTasks | _DaskTasks,
     ahead: Callable[[], int],
-) -> Iterator[Arrays]:
+) -> Iterator[TaskResult]:
     """The arrays of parts in their order, several of which are done at the same time.
 
     A part that occurs several times is done once.
     """
-    found: dict[str, Arrays] = {}
+    found: dict[str, TaskResult] = {}
     waiting: set[str] = set()
     uses, begun = Counter(names), 0
 
     def begin(index: int) -> None:
-        doing.begin(names[index], parts[index])
+        doing.submit(names[index], parts[index])
         waiting.add(names[index])
 
     for index, name in enumerate(names):
-        kept = None if folder is None or name in found else folder.get(name)
+        kept = None if folder is None or name in found else folder.load(name)
         if kept is not None:
             yield kept
             continue
@@ -298,21 +316,23 @@ def _in_order(
                 ):
                     begin(begun)
                 begun += 1
-            done, arrays = doing.next_done()
+            done, arrays = doing.next_completed()
             waiting.remove(done)
             found[done] = arrays
             if folder is not None:
-                folder.put(done, arrays)
+                folder.save(done, arrays)
         uses[name] -= 1
         yield found[name] if uses[name] else found.pop(name)
 
 
-def _same(packed: Packed) -> Packed:
+def _identity(packed: SerializedObject) -> SerializedObject:
     return packed
 
 
-def _done(packed: Packed, step: str, part: tuple[Any, ...]) -> tuple[Arrays, str, str]:
-    """A part, done by this worker; the worker's address, and its `fingerprint`."""
-    with alone() as address:
-        do: Step = getattr(packed.open(), step)
-        return do(*part), address, fingerprint()
+def _run_task(
+    packed: SerializedObject, step: str, part: tuple[Any, ...]
+) -> tuple[TaskResult, str, str]:
+    """A part, done by this worker; the worker's address, and its `rounding_fingerprint`."""
+    with exclusive_compute() as address:
+        do: TaskFunction = getattr(packed.deserialize(), step)
+        return do(*part), address, rounding_fingerprint()

@@ -1,7 +1,7 @@
 """Objects as bytes to send, and names that say what is in them.
 
 What an object has only computed and remembers is left out: it would be sent for nothing, and two
-equal objects would differ. It is what `functools.cached_property` and a `Remembered` keep, and
+equal objects would differ. It is what `functools.cached_property` and a `TransientCache` keep, and
 private fields of dataclasses that are not compared.
 
 Functions and classes are sent by name if they are part of Python or of an installed package. Those
@@ -47,7 +47,7 @@ from harnack.cluster.users_code import (
 Key = TypeVar("Key")
 Value = TypeVar("Value")
 # In the place of an attribute: none.
-_LEFT_OUT = object()
+_OMIT = object()
 # The newest protocol of the oldest Python that is supported.
 _PROTOCOL = 5
 # Bits of kernels and of pictures depend on these.
@@ -55,16 +55,16 @@ _PACKAGES = ("drjit", "mitsuba", "numpy")
 # Names of files whose contents are code, which is sent itself.
 _CODE = (".py", ".pyc", ".ipynb")
 # Numbers that cloudpickle makes up for classes.
-_MADE_UP = re.compile(r"[0-9a-f]{32}")
+_GENERATED_ID = re.compile(r"[0-9a-f]{32}")
 # cloudpickle's list of modules is one for all threads.
-_BY_VALUE = threading.RLock()
+_REGISTRY_LOCK = threading.RLock()
 _MISSING = (
     "{what} needs Dask, which is not installed: pip install 'harnack[cluster]', on each machine of "
     "the cluster in the same version"
 )
 
 
-def load_module(name: str, what: str) -> Any:
+def import_optional(name: str, what: str) -> Any:
     """A module that the extra `cluster` brings.
 
     Raises:
@@ -77,46 +77,47 @@ def load_module(name: str, what: str) -> Any:
 
 
 @functools.cache
-def packages() -> str:
+def package_versions() -> str:
     """Versions of this library and of those on which the bits of its results depend."""
     others = (f"{name} {importlib.metadata.version(name)}" for name in _PACKAGES)
     return ", ".join((f"harnack {__version__}", *others))
 
 
-class Remembered(dict[Key, Value]):
+class TransientCache(dict[Key, Value]):
     """Results that an object keeps by what they were asked for; it is packed and copied empty."""
 
     def __reduce__(self) -> Any:
-        return Remembered, ()
+        return TransientCache, ()
 
 
 @dataclass(frozen=True)
-class Packed:
+class SerializedObject:
     """An object as bytes. name: 32 hexadecimal digits, the same for what is made of the same
-    numbers by the same versions of this library, of `packages` and of `others`. files: which it
-    names, and what is in them. made_by: `packages` where it was packed. others: installed packages
+    numbers by the same versions of this library, of `package_versions` and of `others`. files:
+    which it names, and what is in them. package_versions: `package_versions` where it was packed.
+        others: installed packages
     that it uses, and their versions there."""
 
-    name: str
+    content_hash: str
     data: bytes
-    files: tuple[tuple[str, str], ...] = ()
-    made_by: str = ""
+    file_digests: tuple[tuple[str, str], ...] = ()
+    package_versions: str = ""
     others: tuple[tuple[str, str], ...] = ()
 
     @classmethod
-    def of(cls, thing: Any, what: str) -> Packed:
+    def serialize(cls, thing: Any, what: str) -> SerializedObject:
         """Pack an object.
 
         Raises:
             ModuleNotFoundError: the extra `cluster` is not installed.
             TypeError: it cannot be packed. The messages begin with `what`.
         """
-        name, naming = _named(thing, what)
-        data = _written(_lean, thing, what).file.getvalue()
+        name, naming = _hash_and_files(thing, what)
+        data = _written(_cacheless_pickler, thing, what).file.getvalue()
         files, others = sorted(naming.files.items()), sorted(naming.others.items())
-        return cls(name, data, tuple(files), packages(), tuple(others))
+        return cls(name, data, tuple(files), package_versions(), tuple(others))
 
-    def open(self) -> Any:
+    def deserialize(self) -> Any:
         """The object. The same one as long as it is among the last that were opened here, so that
         what it has prepared is not prepared again.
 
@@ -124,23 +125,23 @@ class Packed:
             RuntimeError: it was packed by other versions of packages than there are here.
             ValueError: a file that it names is another one here.
         """
-        return _opened(self)
+        return _deserialize_cached(self)
 
     def __hash__(self) -> int:
-        return hash(self.name)
+        return hash(self.content_hash)
 
 
 @functools.lru_cache(maxsize=4)
-def _opened(packed: Packed) -> Any:
-    there = [packed.made_by, *(f"{name} {version}" for name, version in packed.others)]
-    here = [packages(), *(f"{name} {installed_version(name)}" for name, _ in packed.others)]
+def _deserialize_cached(packed: SerializedObject) -> Any:
+    there = [packed.package_versions, *(f"{name} {version}" for name, version in packed.others)]
+    here = [package_versions(), *(f"{name} {installed_version(name)}" for name, _ in packed.others)]
     if there != here:
         raise RuntimeError(
             f"this was sent by {', '.join(there)}, and here is {', '.join(here)}: install the same "
             "on all machines"
         )
-    for name, contents in packed.files:
-        here_in_it = _contents(name)
+    for name, contents in packed.file_digests:
+        here_in_it = _file_digest(name)
         if here_in_it != contents and not (here_in_it is None and name.isidentifier()):
             raise ValueError(
                 f"the file {name} is not here, or not as it was where it was named: put it on all "
@@ -149,26 +150,28 @@ def _opened(packed: Packed) -> Any:
     return pickle.loads(packed.data)
 
 
-def name_of(thing: Any, what: str) -> str:
+def content_hash(thing: Any, what: str) -> str:
     """32 hexadecimal digits that depend on all that is in an object and in the files that it names,
-    and on the versions of `packages`.
+    and on the versions of `package_versions`.
 
     Each object is written out wherever it occurs, so that it does not matter which of several equal
     ones are the same object.
 
     Raises:
-        ModuleNotFoundError, TypeError: as `Packed.of`.
+        ModuleNotFoundError, TypeError: as `SerializedObject.serialize`.
     """
-    return _named(thing, what)[0]
+    return _hash_and_files(thing, what)[0]
 
 
-def _named(thing: Any, what: str, words: frozenset[str] = frozenset()) -> tuple[str, Any]:
+def _hash_and_files(thing: Any, what: str, words: frozenset[str] = frozenset()) -> tuple[str, Any]:
     """The name of an object, and the pickler that wrote down what it is made of."""
     try:
-        pickler = _written(_naming, thing, what, words, fast=True)
+        pickler = _written(_hashing_pickler, thing, what, words, fast=True)
     except (RecursionError, TypeError, ValueError):  # an object that holds itself
-        pickler = _written(_naming, thing, what, words)
-    data = f"{packages()} {sorted(pickler.others.items())}".encode() + pickler.file.getvalue()
+        pickler = _written(_hashing_pickler, thing, what, words)
+    data = (
+        f"{package_versions()} {sorted(pickler.others.items())}".encode() + pickler.file.getvalue()
+    )
     return hashlib.blake2b(data, digest_size=16).hexdigest(), pickler
 
 
@@ -181,7 +184,7 @@ def _written(
     What is named of modules is known when all code was written. So it writes again until nothing
     is missing, which ends, since there are so many names in the code.
     """
-    cloudpickle = load_module("cloudpickle", what)
+    cloudpickle = import_optional("cloudpickle", what)
     while True:
         pickler = kind(cloudpickle.Pickler)(what, words)
         pickler.fast = fast
@@ -204,8 +207,8 @@ def _by_value(obj: Any, reduce: Callable[[Any], Any]) -> Any:
     module = sys.modules.get(str(getattr(obj, "__module__", None)))
     if module is None or not is_sent_itself(module):
         return reduce(obj)
-    with _BY_VALUE:
-        cloudpickle = load_module("cloudpickle", "to send code")
+    with _REGISTRY_LOCK:
+        cloudpickle = import_optional("cloudpickle", "to send code")
         was_there = module.__name__ in cloudpickle.list_registry_pickle_by_value()
         cloudpickle.register_pickle_by_value(module)
         try:
@@ -215,7 +218,7 @@ def _by_value(obj: Any, reduce: Callable[[Any], Any]) -> Any:
                 cloudpickle.unregister_pickle_by_value(module)
 
 
-def _contents(name: str) -> str | None:
+def _file_digest(name: str) -> str | None:
     """A digest of what is in a file; None where there is none."""
     try:
         if not Path(name).is_file():  # pipes never end
@@ -243,7 +246,7 @@ _CachedFunction = type(functools.cache(_cached_property))
 
 
 @functools.cache
-def _lean(base: Any) -> Callable[..., Any]:
+def _cacheless_pickler(base: Any) -> Callable[..., Any]:
     """cloudpickle's class, which knows functions too, without what objects remember.
 
     words: names in the code of users. modules: those of users that were met, with the words of
@@ -272,14 +275,14 @@ def _lean(base: Any) -> Callable[..., Any]:
             if isinstance(obj, FunctionType):
                 return self.of_function(obj, _by_value(obj, reduce))
             kind: type = obj.__class__
-            remembered = _remembered(kind)
+            remembered = _transient_attributes(kind)
             if not remembered:
                 return _not_by_name(obj)
             make, arguments, state, *rest = (*obj.__reduce_ex__(_PROTOCOL), None)[:6]
             if isinstance(state, dict):
                 given = cast("dict[str, Any]", state)
                 state = {key: remembered.get(key, one) for key, one in given.items()}
-                state = {key: one for key, one in state.items() if one is not _LEFT_OUT}
+                state = {key: one for key, one in state.items() if one is not _OMIT}
             return make, arguments, state, *rest[:3]
 
         def of_module(self, module: ModuleType) -> Any:
@@ -311,7 +314,11 @@ def _without_number(reduced: Any) -> Any:
     if not isinstance(reduced, tuple):
         return reduced
     make, arguments, *rest = cast("tuple[Any, ...]", reduced)
-    return make, tuple(None if _is_made_up(argument) else argument for argument in arguments), *rest
+    return (
+        make,
+        tuple(None if _is_generated_id(argument) else argument for argument in arguments),
+        *rest,
+    )
 
 
 def _not_by_name(obj: Any) -> Any:
@@ -335,13 +342,13 @@ def _not_by_name(obj: Any) -> Any:
 
 
 @functools.cache
-def _naming(base: Any) -> Callable[..., Any]:
+def _hashing_pickler(base: Any) -> Callable[..., Any]:
     """The same without all that differs when a program is started again, and with what is in the
     files that are named.
 
     files: a digest of each. others: versions of installed packages that are used.
     """
-    lean: Any = _lean(base)
+    lean: Any = _cacheless_pickler(base)
 
     class Naming(lean):
         def __init__(self, what: str, words: frozenset[str]) -> None:
@@ -357,7 +364,7 @@ def _naming(base: Any) -> Callable[..., Any]:
             if kind is set or kind is frozenset:  # whose order differs
                 members = cast("set[Any] | frozenset[Any]", obj)
                 words = frozenset(cast("set[str]", self.words))
-                named = [_named(member, self.what, words) for member in members]
+                named = [_hash_and_files(member, self.what, words) for member in members]
                 for _, other in named:
                     self.words |= other.words
                     self.modules += other.modules
@@ -368,7 +375,7 @@ def _naming(base: Any) -> Callable[..., Any]:
 
         def of_file(self, obj: Any) -> str | None:
             path = os.fsdecode(cast("str | os.PathLike[str]", obj))
-            if path.endswith(_CODE) or (contents := _contents(path)) is None:
+            if path.endswith(_CODE) or (contents := _file_digest(path)) is None:
                 return None
             self.files[path] = contents
             return f"file {contents}"
@@ -377,7 +384,7 @@ def _naming(base: Any) -> Callable[..., Any]:
             if obj is tuple:  # in which all else is written
                 return NotImplemented
             if isinstance(obj, CodeType):
-                said = [getattr(obj, one, None) for one in _SAID_BY_CODE]
+                said = [getattr(obj, one, None) for one in _CODE_ATTRIBUTES]
                 return tuple, ([obj.co_consts, repr(said).encode()],)
             if isinstance(obj, functools.cached_property):
                 return tuple, ([obj.func],)
@@ -412,7 +419,7 @@ def _naming(base: Any) -> Callable[..., Any]:
             ):
                 self.others[root] = version
             elif module is not None and (path := compiled_file(module)) is not None:
-                self.files[path] = str(_contents(path))
+                self.files[path] = str(_file_digest(path))
 
     return Naming
 
@@ -445,21 +452,21 @@ def _apart(names: Any) -> Any:
     return names.encode() if isinstance(names, str) else names
 
 
-_SAID_BY_CODE = (
+_CODE_ATTRIBUTES = (
     "co_name", "co_code", "co_names", "co_varnames", "co_freevars", "co_cellvars",
     "co_argcount", "co_posonlyargcount", "co_kwonlyargcount", "co_flags", "co_exceptiontable",
 )  # fmt: skip
 
 
-def _is_made_up(argument: Any) -> bool:
-    return isinstance(argument, str) and _MADE_UP.fullmatch(argument) is not None
+def _is_generated_id(argument: Any) -> bool:
+    return isinstance(argument, str) and _GENERATED_ID.fullmatch(argument) is not None
 
 
 @functools.lru_cache(maxsize=1024)
-def _remembered(kind: type) -> dict[str, Any]:
+def _transient_attributes(kind: type) -> dict[str, Any]:
     """What to put in the place of attributes that objects of a class compute and remember."""
     found: dict[str, Any] = {
-        name: _LEFT_OUT
+        name: _OMIT
         for one in kind.__mro__
         for name, value in vars(one).items()
         if isinstance(value, functools.cached_property)

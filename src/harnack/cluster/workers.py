@@ -15,20 +15,21 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import choose_backend, to_numpy
-from harnack.cluster.serialization import load_module, packages
+from harnack.cluster.serialization import import_optional, package_versions
 
 # How long to wait for a scheduler.
-_PATIENCE = "10s"
+_CONNECT_TIMEOUT = "10s"
 SCHEDULER_LOST = "the scheduler was lost, or somebody cancelled what this task waits for"
 _INSTALL = "install the same there as here, such as by pip install 'harnack[cluster]=={version}'"
 
 
 @contextmanager
-def connected(client: Any) -> Generator[Any]:
+def connect_client(client: Any) -> Generator[Any]:
     """A Dask client, given as one or by the address of a scheduler, all of whose workers can work;
     None for None. What was opened here is closed when the block ends.
 
-    Workers that come later are looked at when they get a task: by `alone` and `Packed.open`.
+    Workers that come later are looked at when they get a task: by `exclusive_compute` and
+        `SerializedObject.deserialize`.
 
     Raises:
         ModuleNotFoundError: Dask is not installed.
@@ -40,11 +41,13 @@ def connected(client: Any) -> Generator[Any]:
     if client is None:
         yield None
         return
-    distributed = load_module("distributed", "client")
+    distributed = import_optional("distributed", "client")
     opened = None
     if isinstance(client, str):
         try:
-            client = opened = distributed.Client(client, timeout=_PATIENCE, set_as_default=False)
+            client = opened = distributed.Client(
+                client, timeout=_CONNECT_TIMEOUT, set_as_default=False
+            )
         except (OSError, ValueError, TimeoutError) as error:
             raise OSError(
                 f"no scheduler answers at {client!r} ({error}); start one by `dask scheduler`, "
@@ -64,7 +67,7 @@ def connected(client: Any) -> Generator[Any]:
 
 
 @contextmanager
-def alone() -> Generator[str]:
+def exclusive_compute() -> Generator[str]:
     """Lets one task at a time compute in this process, as Dr.Jit itself uses all threads that a
     worker has. Yields the address of the worker that this is, "" for none.
 
@@ -81,8 +84,8 @@ def alone() -> Generator[str]:
     except RuntimeError as error:
         raise RuntimeError(f"worker {worker and worker.address} cannot work: {error}") from None
     if worker is not None:
-        take_threads(worker.nanny is not None, worker.state.nthreads)
-    with load_module("dask.utils", "client").SerializableLock("harnack"):
+        adopt_worker_threads(worker.nanny is not None, worker.state.nthreads)
+    with import_optional("dask.utils", "client").SerializableLock("harnack"):
         yield "" if worker is None else worker.address
 
 
@@ -110,21 +113,21 @@ def _check_workers(client: Any) -> None:
                 f"worker {address} has {found}, and here it is {here}: "
                 f"{_INSTALL.format(version=here)}"
             )
-    states = client.run(_state, on_error="return")
+    states = client.run(_worker_state, on_error="return")
     for address, state in states.items():
         if isinstance(state, BaseException):
             raise RuntimeError(f"worker {address} cannot work: {state}") from state
-        if state[0] != packages():
+        if state[0] != package_versions():
             raise RuntimeError(
-                f"worker {address} has {state[0]}, and here it is {packages()}: "
+                f"worker {address} has {state[0]}, and here it is {package_versions()}: "
                 f"{_INSTALL.format(version=here)}"
             )
-    strange = [address for address, state in states.items() if state[1] != fingerprint()]
+    strange = [address for address, state in states.items() if state[1] != rounding_fingerprint()]
     if strange:
-        warn_of_rounding(strange)
+        warn_rounding_differs(strange)
 
 
-def warn_of_rounding(workers: Iterable[str]) -> None:
+def warn_rounding_differs(workers: Iterable[str]) -> None:
     """Say that the processors of workers, given by their addresses, round differently."""
     warnings.warn(
         f"the processors of {', '.join(sorted(workers))} round differently from this one: "
@@ -133,16 +136,16 @@ def warn_of_rounding(workers: Iterable[str]) -> None:
     )
 
 
-def _state(dask_worker: Any = None) -> tuple[str, str]:
-    """`packages` and `fingerprint` of a worker; LLVMNotFoundError if Dr.Jit has nothing to work
-    with."""
+def _worker_state(dask_worker: Any = None) -> tuple[str, str]:
+    """`package_versions` and `rounding_fingerprint` of a worker; LLVMNotFoundError if Dr.Jit has
+    nothing to work with."""
     choose_backend()
-    take_threads(dask_worker.nanny is not None, dask_worker.state.nthreads)
-    return packages(), fingerprint()
+    adopt_worker_threads(dask_worker.nanny is not None, dask_worker.state.nthreads)
+    return package_versions(), rounding_fingerprint()
 
 
 @functools.cache
-def take_threads(has_nanny: bool, threads: int) -> None:
+def adopt_worker_threads(has_nanny: bool, threads: int) -> None:
     """Let Dr.Jit have the threads that Dask gave this worker.
 
     has_nanny: whether a process watches over this one, which so is the worker's alone.
@@ -151,7 +154,7 @@ def take_threads(has_nanny: bool, threads: int) -> None:
         dr.set_thread_count(threads)
 
 
-def fingerprint() -> str:
+def rounding_fingerprint() -> str:
     """What this machine makes of some numbers, the same where kernels give the same bits."""
     name = choose_backend().name
     return f"{name} {_rounding(name)}"

@@ -9,17 +9,17 @@ from typing import Any
 
 import numpy as np
 
-from harnack.backend.validation import refuses_derivatives
-from harnack.cluster.dask_arrays import is_lazy
-from harnack.cluster.serialization import load_module
-from harnack.cluster.workers import connected
+from harnack.backend.validation import no_derivatives
+from harnack.cluster.dask_arrays import is_dask_array
+from harnack.cluster.serialization import import_optional
+from harnack.cluster.workers import connect_client
 from harnack.progress import Advance, progress_bar
 
 # The attribute of a Zarr array that says what it holds.
-_MARK = "harnack"
+_NAME_ATTRIBUTE = "harnack"
 
 
-@refuses_derivatives
+@no_derivatives
 def to_zarr(
     array: Any,
     path: str | os.PathLike[str],
@@ -43,9 +43,9 @@ def to_zarr(
         ValueError: there is another array at the path, or its blocks have unequal lengths.
         OSError: it cannot be written there, or workers did not write there.
     """
-    zarr = load_module("zarr", "to_zarr")
-    dask = load_module("dask", "to_zarr")
-    if not is_lazy(array):
+    zarr = import_optional("zarr", "to_zarr")
+    dask = import_optional("dask", "to_zarr")
+    if not is_dask_array(array):
         raise TypeError(f"to_zarr writes a Dask array, not a {type(array).__name__}")
     for lengths in array.chunks:
         if any(one != lengths[0] for one in lengths[:-1]) or lengths[-1] > lengths[0]:
@@ -53,20 +53,20 @@ def to_zarr(
                 f"the blocks have unequal lengths, {lengths[:9]}: call rechunk() first"
             )
     target = Path(path).resolve()
-    file = _zarr_file(zarr, array, target)
+    file = _open_or_create(zarr, array, target)
     missing = [
         index
         for index in np.ndindex(*array.numblocks)
-        if all(one.stop > one.start for one in _places(array, index))
+        if all(one.stop > one.start for one in _chunk_slices(array, index))
         and not _chunk(file, target, index).exists()
     ]
     blocks = array.to_delayed()
     write = dask.delayed(_write, pure=False)
-    tasks = [write(str(target), _places(array, index), blocks[index]) for index in missing]
+    tasks = [write(str(target), _chunk_slices(array, index), blocks[index]) for index in missing]
     part = 1 / max(1, array.npartitions)
-    with progress_bar("writing", progress) as advance, connected(client) as one:
+    with progress_bar("writing", progress) as advance, connect_client(client) as one:
         advance(1 - part * len(missing))
-        for _ in _computed(one, tasks):
+        for _ in _compute_tasks(one, tasks):
             advance(part)
     for index in missing:
         if not _chunk(file, target, index).exists():
@@ -77,7 +77,7 @@ def to_zarr(
     return file
 
 
-def _computed(client: Any, tasks: list[Any]) -> Iterator[None]:
+def _compute_tasks(client: Any, tasks: list[Any]) -> Iterator[None]:
     """Computes tasks, all at once by a client, else one by one, and yields after each."""
     if client is None:
         for task in tasks:
@@ -86,14 +86,16 @@ def _computed(client: Any, tasks: list[Any]) -> Iterator[None]:
         return
     futures = client.compute(tasks)
     try:
-        for future in load_module("distributed", "client").as_completed(futures, loop=client.loop):
+        for future in import_optional("distributed", "client").as_completed(
+            futures, loop=client.loop
+        ):
             future.result()
             yield
     finally:
         client.cancel([one for one in futures if one.status == "pending"])
 
 
-def _zarr_file(zarr: Any, array: Any, target: Path) -> Any:
+def _open_or_create(zarr: Any, array: Any, target: Path) -> Any:
     """The Zarr array of a Dask array, made if it is not there."""
     if not target.parent.is_dir():
         raise FileNotFoundError(f"cannot write {target}: create the folder {target.parent} first")
@@ -101,14 +103,14 @@ def _zarr_file(zarr: Any, array: Any, target: Path) -> Any:
     if not target.exists():
         return zarr.create_array(
             str(target), shape=array.shape, chunks=chunks, dtype=array.dtype,
-            attributes={_MARK: array.name},
+            attributes={_NAME_ATTRIBUTE: array.name},
         )  # fmt: skip
     try:
         file = zarr.open_array(str(target), mode="r+")
     except Exception as error:  # of many kinds
         raise ValueError(f"{target} is no Zarr array ({error}): name another folder") from None
     same = file.shape == array.shape and file.chunks == chunks and file.dtype == array.dtype
-    if not same or file.attrs.get(_MARK) != array.name:
+    if not same or file.attrs.get(_NAME_ATTRIBUTE) != array.name:
         raise ValueError(
             f"{target} holds another array, or the same one made of other numbers: delete it, or "
             "name another folder"
@@ -121,14 +123,14 @@ def _chunk(file: Any, target: Path, index: tuple[int, ...]) -> Path:
     return target / file.metadata.encode_chunk_key(index)
 
 
-def _places(array: Any, index: tuple[int, ...]) -> tuple[slice, ...]:
+def _chunk_slices(array: Any, index: tuple[int, ...]) -> tuple[slice, ...]:
     starts = [sum(lengths[:k]) for lengths, k in zip(array.chunks, index, strict=True)]
     ends = [sum(lengths[: k + 1]) for lengths, k in zip(array.chunks, index, strict=True)]
     return tuple(slice(a, b) for a, b in zip(starts, ends, strict=True))
 
 
 def _write(path: str, places: tuple[slice, ...], block: Any) -> None:
-    zarr = load_module("zarr", "to_zarr")
+    zarr = import_optional("zarr", "to_zarr")
     # Chunks of zeros would be left out, and computed again.
     with zarr.config.set({"array.write_empty_chunks": True}):
         zarr.open_array(path, mode="r+")[places] = block

@@ -9,10 +9,10 @@ from harnack.distance.distance_estimates import (
     distance_bounds,
     signed_distance,
 )
-from harnack.distance.surface_curvature import Curvatures, Family, curvature, curvature_lines
+from harnack.distance.surface_curvature import CurvatureSamples, Family, curvature, curvature_lines
 
 __all__ = [
-    "Curvatures",
+    "CurvatureSamples",
     "DistanceBounds",
     "Family",
     "Method",

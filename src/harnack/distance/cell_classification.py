@@ -1,7 +1,7 @@
 """What is known of a level set in cells: that it is absent, or a slab that it lies in, and points.
 
-Some points are on the *rim*, the curve at which the field's domain cuts the level set: `RimDescent`
-searches for the closest.
+Some points are on the *rim*, the curve at which the field's domain cuts the level set:
+`ClipCurveDescent` searches for the closest.
 """
 
 from __future__ import annotations
@@ -14,28 +14,28 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import FloatArray, choose_backend
-from harnack.backend.elementary import clamp, fmax, fmin, largest_coordinate, length
-from harnack.distance.cell_tree import FAR, SurfaceCells
+from harnack.backend.elementary import clamp, fmax, fmin, max_norm, safe_norm
+from harnack.distance.cell_tree import FAR_SENTINEL, SurfaceCells
 from harnack.distance.jump_surface_search import is_on_surface
 from harnack.distance.tangent_plane import TangentPlane, has_hessian, in_batches
-from harnack.fields.clearance import distance_below
-from harnack.tracer import Status
+from harnack.fields.clearance import level_distance_lower_bound
+from harnack.tracer import RayStatus
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from harnack.backend import Backend, Mask, Real, Vec3
-    from harnack.enclosures import TargetLevels
+    from harnack.enclosures import Levels
     from harnack.fields.field import Field, Sample
     from harnack.geometry import Volume
-    from harnack.tracer import LevelSet
+    from harnack.tracer import Surface
 
-__all__ = ["CellProofs", "RimDescent", "remainder"]
+__all__ = ["CellClassifier", "ClipCurveDescent", "taylor_remainder"]
 
-_ROUNDS, _LANDINGS = 80, 8
+_ROUNDS, _MAX_CURVE_CORRECTIONS = 80, 8
 # In epsilons, of coordinates: so far inside the domain feet are put, by how much they may miss
 # that, and how near they are to the level.
-_INSIDE, _MISS, _NEAR = 64.0, 48.0, 256.0
+_DOMAIN_INSET, _MISS, _NEAR = 64.0, 48.0, 256.0
 # Of the way to another face: steps end there.
 _BEFORE = 0.999
 # States of a search at a corner of the domain: it turns into the other face, or has done so.
@@ -47,13 +47,13 @@ _LEAST_STEP = 1e-8  # of the distance: what is left is half its square
 
 
 @dataclass(frozen=True)
-class RimDescent:
+class ClipCurveDescent:
     """The search for a closest point with f = level and h = 0, h the distance from the domain's
     boundary; all prepared for one backend."""
 
     backend: Backend
     field: Field
-    levels: TargetLevels
+    levels: Levels
     domain: Volume
 
     def closest(self, x: Vec3, start: Vec3) -> tuple[Vec3, Real]:
@@ -78,7 +78,7 @@ class RimDescent:
             active: Mask,
         ) -> tuple[Any, ...]:  # fmt: skip
             there = self._at(y)
-            distance = length(x - y)
+            distance = safe_norm(x - y)
             met = dr.isfinite(nearest)
             is_other = dr.dot(there.normal, normal) < 1 - _SAME
             gap = fmax(wall_height - dr.dot(wall, best), 0)
@@ -89,19 +89,19 @@ class RimDescent:
             # Beyond another face: that is a wall. Else off the curve: back to it, for some rounds.
             is_free = ~(dr.squared_norm(wall) > 0)
             crosses = met & is_other & is_free & ~counts & (corner != _TURNING)
-            lands = ~there.is_on & ~crosses & (landing < _LANDINGS)
-            lands &= dr.isfinite(dr.squared_norm(there.back))
+            lands = ~there.is_on & ~crosses & (landing < _MAX_CURVE_CORRECTIONS)
+            lands &= dr.isfinite(dr.squared_norm(there.correction))
             fails = ~counts & ~lands
             # On the curve, and nearer: the next step.
-            slope = 1 - dr.dot(x - y, there.bend)
+            slope = 1 - dr.dot(x - y, there.second_derivative)
             step = dr.dot(x - y, there.tangent) / fmax(dr.abs(slope), _LEAST_SLOPE)
             w = dr.select(counts, clamp(step, -distance, distance), w)
             best, nearest = dr.select(counts, y, best), dr.select(counts, distance, nearest)
             tangent = dr.select(counts, there.tangent, tangent)
-            bend = dr.select(counts, there.bend, bend)
+            bend = dr.select(counts, there.second_derivative, bend)
             moves = counts & is_other
             wall = dr.select(crosses, there.normal, dr.select(moves, 0, wall))
-            wall_height = dr.select(crosses, dr.dot(there.normal, y) + there.inwards, wall_height)
+            wall_height = dr.select(crosses, dr.dot(there.normal, y) + there.depth, wall_height)
             normal = dr.select(counts, there.normal, normal)
             share = dr.select(counts, fmin(4 * share, 1), share)
             share = dr.select(fails & ~crosses, 0.25 * share, share)
@@ -121,7 +121,10 @@ class RimDescent:
             onward = dr.select(ends, dr.fma(vector(gap + 8 * there.near), wall, best), onward)
             active &= (lands | counts | met) & (share > _LEAST_SHARE) & (k + 1 < _ROUNDS)
             active &= lands | ends | ~is_short
-            y, landing = dr.select(lands, y + there.back, onward), dr.select(lands, landing + 1, 0)
+            y, landing = (
+                dr.select(lands, y + there.correction, onward),
+                dr.select(lands, landing + 1, 0),
+            )
             return (
                 y, best, nearest, w, tangent, bend, normal, wall, wall_height, corner, share,
                 landing, k + 1, active,
@@ -136,17 +139,19 @@ class RimDescent:
             count(0), real(1), count(0), count(0), self.backend.Bool(True),
         )  # fmt: skip
         found = dr.while_loop(state, more, body, label="along the rim")
-        return found[1], length(found[5])
+        return found[1], safe_norm(found[5])
 
-    def _at(self, y: Vec3) -> _RimPlace:
+    def _at(self, y: Vec3) -> _ClipCurveState:
         real, vector = self.backend.Float, self.backend.Array3f
         sample = self.field.evaluate(y)
-        gradient, size = vector(sample.gradient), largest_coordinate(y)
-        steep, n = length(gradient), vector(self.domain.outward_normal(y))
+        gradient, size = vector(sample.gradient), max_norm(y)
+        steep, n = safe_norm(gradient), vector(self.domain.outward_normal(y))
         u = gradient / steep
-        inwards = -self.domain.signed_distance(y) - _INSIDE * self.backend.epsilon * size
-        off = self.levels.to_nearest(sample.value) / steep
-        near = dr.fma(_NEAR * self.backend.epsilon, size, real(sample.error) / steep)
+        inwards = (
+            -self.domain.signed_distance(y) - _DOMAIN_INSET * self.backend.machine_epsilon * size
+        )
+        off = self.levels.offset_to_nearest(sample.value) / steep
+        near = dr.fma(_NEAR * self.backend.machine_epsilon, size, real(sample.value_error) / steep)
         cosine = dr.dot(n, u)
         sine = 1 - cosine * cosine
 
@@ -156,36 +161,38 @@ class RimDescent:
             return (vector(first) * u + vector(second) * n) / sine
 
         t = dr.cross(u, n) * dr.rsqrt(sine)
-        h = self.backend.epsilon**0.5 * fmax(size, real(1e-30))
+        h = self.backend.machine_epsilon**0.5 * fmax(size, real(1e-30))
         ahead = dr.fma(vector(h), t, y)
         falls = dr.dot(vector(self.field.evaluate(ahead).gradient) - gradient, t) / (steep * h)
         turns = dr.dot(vector(self.domain.outward_normal(ahead)) - n, t) / h
         # Beside an edge of the domain the normal is another one ahead: no curvature.
         turns = dr.select(dr.abs(turns) * h < 1e-3, turns, 0)
-        is_on = (dr.abs(off) <= near) & (dr.abs(inwards) <= _MISS * self.backend.epsilon * size)
-        return _RimPlace(
+        is_on = (dr.abs(off) <= near) & (
+            dr.abs(inwards) <= _MISS * self.backend.machine_epsilon * size
+        )
+        return _ClipCurveState(
             is_on, near, solution(off, inwards), t, solution(-falls, -turns), n, inwards
         )
 
 
 @dataclass(frozen=True)
-class _RimPlace:
+class _ClipCurveState:
     """A place near the rim.
 
     is_on: whether it is on it, to `near`.
-    back: the step back to it, to first order.
-    tangent, bend: unit tangent and second derivative of the rim.
+    correction: the step back to it, to first order.
+    tangent, second_derivative: unit tangent and second derivative of the rim.
     normal: of the domain.
-    inwards: how far the place is inside the domain, less a margin.
+    depth: how far the place is inside the domain, less a margin.
     """
 
     is_on: Mask
     near: Real
-    back: Vec3
+    correction: Vec3
     tangent: Vec3
-    bend: Vec3
+    second_derivative: Vec3
     normal: Vec3
-    inwards: Real
+    depth: Real
 
 
 # Cells.
@@ -194,21 +201,21 @@ _STEPS = 6
 # More of them where Newton's steps shrink at a rate between these, as to a multiple root.
 _MORE_STEPS, _SHRINKS = 14, (0.4, 0.97)
 # The radius of the ball around a cube of half size 1.
-_WITHIN = 3**0.5 * (1 + 1e-9)
+_CUBE_CIRCUMRADIUS = 3**0.5 * (1 + 1e-9)
 # A foot is on the level up to this share of its cell.
 _CLOSE = 1e-7
 # Rays through a cell of a field with sheets.
 _DIAGONALS = ((1.0, 1.0, 1.0), (1.0, 1.0, -1.0), (1.0, -1.0, 1.0), (-1.0, 1.0, 1.0))
 
 
-def remainder(sample: Sample, radius: Real, degree: int = 1) -> Real:
+def taylor_remainder(sample: Sample, radius: Real, degree: int = 1) -> Real:
     """A bound of what Taylor's polynomial of degree 1 or 2 leaves out of f(y) for |y - p| <=
     radius; infinite where the field promises none. It falls at least as the power degree + 1 of the
     radius."""
     best: Real = dr.inf
-    for known in sample.promises:
-        best = fmin(best, known.remainder(sample.value, radius, degree))
-    return best + sample.error + sample.gradient_error * radius
+    for known in sample.all_promises:
+        best = fmin(best, known.taylor_remainder_bound(sample.value, radius, degree))
+    return best + sample.value_error + sample.gradient_error * radius
 
 
 def multiplicity(step: Real, last: Real) -> Real:
@@ -220,10 +227,10 @@ def multiplicity(step: Real, last: Real) -> Real:
 
 
 @dataclass
-class CellProofs:
+class CellClassifier:
     """Cells of a level set, evaluated in double precision."""
 
-    surface: LevelSet
+    surface: Surface
 
     def __post_init__(self) -> None:
         self._backend = choose_backend("double")
@@ -232,53 +239,60 @@ class CellProofs:
         self._volume = _domain(self.surface)
         self._has_hessian = has_hessian(self._backend, self._field)
         self._rim = None
-        if self._volume is not None and not self.surface.field.has_sheets:
+        if self._volume is not None and not self.surface.field.has_jumps:
             volume = self._volume.prepare(self._backend)
-            self._rim = RimDescent(self._backend, self._field, self._levels, volume)
+            self._rim = ClipCurveDescent(self._backend, self._field, self._levels, volume)
 
     @property
     def _field(self) -> Field:
         return self._prepared.field
 
-    def not_empty(self, center: FloatArray, half: FloatArray) -> SurfaceCells:
+    def nonempty_cells(self, center: FloatArray, half: FloatArray) -> SurfaceCells:
         """Of cubes (n, 3), half the length of an edge (n,), those that are not proved empty, with
         the slabs that the surface lies in."""
         inside = np.ones(len(center), np.bool_)
         if self._volume is not None and len(center):
             inside = self._volume.contains_points(center)
-            (away,) = self._at(self._away, center)
-            some = inside | (away <= _WITHIN * half)
+            (away,) = self._at(self._distance_outside, center)
+            some = inside | (away <= _CUBE_CIRCUMRADIUS * half)
             center, half, inside = center[some], half[some], inside[some]
         cells = SurfaceCells.unknown(center, half)
         if not inside.any():
             return cells
         # Nothing is promised about places outside the domain.
         empty, cells.normal[inside], cells.offset[inside], cells.thickness[inside] = self._at(
-            self._slab, center[inside], _WITHIN * half[inside]
+            self._slab, center[inside], _CUBE_CIRCUMRADIUS * half[inside]
         )
         not_empty = np.ones(len(cells), np.bool_)
         not_empty[inside] = empty == 0
-        return cells.some(not_empty)
+        return cells.select(not_empty)
 
-    def with_feet(self, cells: SurfaceCells) -> SurfaceCells:
+    def with_surface_points(self, cells: SurfaceCells) -> SurfaceCells:
         """The cells with points of the surface and of the rim."""
         if not len(cells):
             return cells
-        radius, start = _WITHIN * cells.half, cells.center
+        radius, start = _CUBE_CIRCUMRADIUS * cells.half, cells.center
         away = np.full(len(cells), np.inf)
         if self._volume is not None:
             away, start = self._at(self._pulled_inside, cells.center)
-        foot, normal, spread, curvature = self._at(self._disk, start, radius, cells.normal)
+        foot, normal, spread, curvature = self._at(
+            self._surface_point_and_plane, start, radius, cells.normal
+        )
         self._outside(foot)
-        rim, rim_curvature = cells.rim.copy(), cells.rim_curvature.copy()
+        rim, rim_curvature = cells.clip_point.copy(), cells.clip_curvature.copy()
         if self._rim is not None:
             cut = np.flatnonzero(np.abs(away) <= radius)
             rim[cut], rim_curvature[cut] = self._at(self._on_rim, start[cut], radius[cut])
             self._outside(rim)
         return dataclasses.replace(
-            cells, foot=foot, normal=normal, spread=spread, curvature=curvature, rim=rim,
-            rim_curvature=rim_curvature,
-        )  # fmt: skip
+            cells,
+            surface_point=foot,
+            normal=normal,
+            plane_radius=spread,
+            curvature=curvature,
+            clip_point=rim,
+            clip_curvature=rim_curvature,
+        )
 
     def _at(
         self, compute: Callable[..., tuple[Any, ...]], points: FloatArray, *others: FloatArray
@@ -290,9 +304,11 @@ class CellProofs:
     def _outside(self, feet: FloatArray) -> None:
         """Put feet (n, 3) that lie outside the domain far away."""
         if self._volume is not None and len(feet):
-            feet[~self._volume.contains_points(np.where(feet < FAR, feet, 0))] = FAR
+            feet[~self._volume.contains_points(np.where(feet < FAR_SENTINEL, feet, 0))] = (
+                FAR_SENTINEL
+            )
 
-    def _away(self, p: Vec3) -> tuple[Real]:
+    def _distance_outside(self, p: Vec3) -> tuple[Real]:
         return (self._volume.signed_distance(p),)
 
     def _pulled_inside(self, p: Vec3) -> tuple[Real, Vec3]:
@@ -307,60 +323,66 @@ class CellProofs:
         real, vector, radius = self._backend.Float, self._backend.Array3f, radii.x
         sample = self._field.evaluate(p)
         free = real(0)
-        if sample.promises:
-            free = distance_below(self._backend, self._field, self._levels, p, sample)
-        above, steep = -self._levels.to_nearest(sample.value), length(sample.gradient)
-        rest = remainder(sample, radius) + 8 * self._backend.epsilon * dr.abs(sample.value)
-        known = (steep > 0) & dr.isfinite(rest) & (rest < FAR * steep)
-        if len(self._levels.values) > 1 or self.surface.field.has_sheets:
+        if sample.all_promises:
+            free = level_distance_lower_bound(self._backend, self._field, self._levels, p, sample)
+        above, steep = -self._levels.offset_to_nearest(sample.value), safe_norm(sample.gradient)
+        rest = taylor_remainder(sample, radius) + 8 * self._backend.machine_epsilon * dr.abs(
+            sample.value
+        )
+        known = (steep > 0) & dr.isfinite(rest) & (rest < FAR_SENTINEL * steep)
+        if len(self._levels.values) > 1 or self.surface.field.has_jumps:
             known &= False
         elif self._levels.period is not None:  # no second level reaches into the ball
             known &= dr.fma(steep, radius, rest) < self._levels.period - dr.abs(above)
         slope = dr.select(known, steep, 1)
         normal = dr.select(known, sample.gradient / slope, vector(0, 0, 0))
         offset = dr.select(known, -above / slope, 0)
-        thickness = dr.select(known, rest / slope, FAR)
+        thickness = dr.select(known, rest / slope, FAR_SENTINEL)
         empty = (free > radius) | (known & (dr.abs(offset) > radius + thickness))
         return dr.select(empty, real(1), 0), normal, offset, thickness
 
-    def _disk(self, p: Vec3, radii: Vec3, normal: Vec3) -> tuple[Vec3, Vec3, Real, Real]:
+    def _surface_point_and_plane(
+        self, p: Vec3, radii: Vec3, normal: Vec3
+    ) -> tuple[Vec3, Vec3, Real, Real]:
         """A foot near p, the normal of a plane that is nearly the surface there, how far about the
         foot: as far as the cell, up to the curve that the surface ends in; and its curvature."""
-        radius, unknown = radii.x, self._backend.Float(FAR)
-        if self.surface.field.has_sheets:
-            return self._hit(p, radius), normal, self._backend.Float(0), unknown
-        foot = self._foot(p, radius)
-        found = foot.x < 0.5 * FAR
+        radius, unknown = radii.x, self._backend.Float(FAR_SENTINEL)
+        if self.surface.field.has_jumps:
+            return self._nearest_ray_hit(p, radius), normal, self._backend.Float(0), unknown
+        foot = self._newton_point(p, radius)
+        found = foot.x < 0.5 * FAR_SENTINEL
         at = dr.select(found, foot, p)
         gradient = self._field.evaluate(at).gradient
-        n = gradient / length(gradient)
+        n = gradient / safe_norm(gradient)
         is_plane = found & ~(dr.squared_norm(normal) > 0) & dr.isfinite(dr.squared_norm(n))
-        spread, boundary = radius + length(at - p), self._field.closest_on_boundary(at)
+        spread, boundary = radius + safe_norm(at - p), self._field.closest_boundary_point(at)
         if boundary is not None:
-            spread = fmin(spread, length(boundary - at))
+            spread = fmin(spread, safe_norm(boundary - at))
         curvature = unknown
         if self._has_hessian:
-            uu, vv, uv = TangentPlane.of(gradient).restricted(self._field.hessian(at))
-            bent = dr.sqrt(dr.fma(uu, uu, dr.fma(vv, vv, 2 * uv * uv))) / length(gradient)
-            curvature = dr.select(bent < FAR, bent, unknown)
+            uu, vv, uv = TangentPlane.of(gradient).restrict_hessian(self._field.hessian(at))
+            bent = dr.sqrt(dr.fma(uu, uu, dr.fma(vv, vv, 2 * uv * uv))) / safe_norm(gradient)
+            curvature = dr.select(bent < FAR_SENTINEL, bent, unknown)
         return foot, dr.select(is_plane, n, normal), dr.select(found, spread, 0), curvature
 
     def _on_rim(self, p: Vec3, radii: Vec3) -> tuple[Vec3, Real]:
         """A point of the rim near p, and the rim's curvature."""
         assert self._rim is not None
         y, curvature = self._rim.closest(p, p)
-        near = length(y - p) < 2 * radii.x
-        return dr.select(near, y, self._backend.Array3f(FAR)), dr.select(near, curvature, 0)
+        near = safe_norm(y - p) < 2 * radii.x
+        return dr.select(near, y, self._backend.Array3f(FAR_SENTINEL)), dr.select(
+            near, curvature, 0
+        )
 
-    def _foot(self, p: Vec3, radius: Real) -> Vec3:
+    def _newton_point(self, p: Vec3, radius: Real) -> Vec3:
         """Where Newton's method leads from the center, if that is near."""
         real, vector, count = self._backend.Float, self._backend.Array3f, self._backend.UInt32
         zero = dr.opaque(real, 0.0)  # no component of a gradient is a constant of the loop
 
         def body(y: Vec3, off: Real, k: Any) -> tuple[Any, ...]:
             sample = self._field.evaluate(y)
-            steep = length(sample.gradient)
-            off_level = self._levels.to_nearest(sample.value)
+            steep = safe_norm(sample.gradient)
+            off_level = self._levels.offset_to_nearest(sample.value)
             wanted = off_level / steep
             longer = dr.select(k >= _STEPS - 1, multiplicity(wanted, off), 1)
             move = clamp(longer * wanted, -radius, radius)
@@ -380,9 +402,9 @@ class CellProofs:
         start = (vector(p), real(dr.inf), count(0))
         y, off, _ = dr.while_loop(start, more, body, label="feet of cells")
         near = (off < _CLOSE * radius) & (dr.norm(y - p) < 2 * radius)
-        return dr.select(near, y, vector(FAR))
+        return dr.select(near, y, vector(FAR_SENTINEL))
 
-    def _hit(self, p: Vec3, radius: Real) -> Vec3:
+    def _nearest_ray_hit(self, p: Vec3, radius: Real) -> Vec3:
         """The hit nearest to the center of rays through the cell, of a field that jumps."""
         real, vector, count = self._backend.Float, self._backend.Array3f, self._backend.UInt32
 
@@ -392,7 +414,7 @@ class CellProofs:
                 d = dr.select(k == number, vector(*diagonal) / 3**0.5, d)
             o = dr.fma(vector(-radius), d, p)
             seen = self._prepared.first_hit(o, d, real(0), 2 * radius, self._backend.Bool(True))
-            hit = seen.status == int(Status.HIT)
+            hit = seen.status == int(RayStatus.HIT)
             y = dr.fma(vector(seen.t), d, o)
             square = dr.squared_norm(y - p)
             nearer = hit & (square < best)
@@ -403,9 +425,9 @@ class CellProofs:
             del foot, best
             return k < len(_DIAGONALS)
 
-        start = (vector(FAR), real(dr.inf), count(0))
+        start = (vector(FAR_SENTINEL), real(dr.inf), count(0))
         return dr.while_loop(start, more, body, label="rays through cells")[0]
 
 
-def _domain(surface: LevelSet) -> Any:
-    return surface.field.domain if surface.cut is None else surface.volume
+def _domain(surface: Surface) -> Any:
+    return surface.field.domain if surface.clip_volume is None else surface.volume

@@ -15,17 +15,17 @@ import drjit as dr
 
 from harnack.backend import elementary as lengths
 from harnack.backend.elementary import clamp, fmax, fmin
-from harnack.distance.cell_classification import multiplicity, remainder
-from harnack.distance.exclusion_ball import free_radius
-from harnack.distance.tangent_plane import Eigen, TangentPlane, has_hessian
+from harnack.distance.cell_classification import multiplicity, taylor_remainder
+from harnack.distance.exclusion_ball import exclusion_radius
+from harnack.distance.tangent_plane import SymmetricEigen2, TangentPlane, has_hessian
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.distance.exclusion_ball import Rows
-    from harnack.enclosures import TargetLevels
+    from harnack.enclosures import Levels
     from harnack.fields.field import Field, Sample
 
-__all__ = ["Descent"]
+__all__ = ["ClosestPointDescent"]
 
 _STEPS_DIRECT = 10
 _NEAR = 1e-11  # of the distance: the last step is expected to be shorter
@@ -33,69 +33,73 @@ _STEPS_TO_LEVEL = 60
 _STEPS_ALONG = 60
 # Newton's method to a simple root takes fewer steps than that.
 _PATIENT = 16
-_LEAST_SHARE = 1e-7  # of a step: shorter ones are given up
-_LEAST_EIGENVALUE = 0.05  # of B (`Descent.closest`): steps are no longer than 20 gradients
+_MIN_STEP_FRACTION = 1e-7  # of a step: shorter ones are given up
+_LEAST_EIGENVALUE = (
+    0.05  # of B (`ClosestPointDescent.descend`): steps are no longer than 20 gradients
+)
 _INDEFINITE = -1e-3
 # A place counts as on the level if rounding moves the level by at most this part of its coordinates
 # or of the radius of the ball on which f is smooth.
-_CLEAR = 1 / 16
+_MAX_RELATIVE_UNCERTAINTY = 1 / 16
 # No minimum is looked for nearer than this share of the distance to where f is singular, as the
 # surface ends there: its boundary is farther by a share of half the square.
-_RIM = 1e-5
+_MIN_SINGULARITY_FRACTION = 1e-5
 
 
 @dataclass(frozen=True)
-class _Place:
+class _DescentState:
     """A point y and the field there.
 
     gradient: of the field.
-    noise: the length by which rounding may have moved the level.
-    reach: the radius of the ball on which f is smooth.
+    level_uncertainty: the length by which rounding may have moved the level.
+    smooth_radius: the radius of the ball on which f is smooth.
     """
 
     y: Vec3
     gradient: Vec3
-    noise: Real
-    reach: Real
+    level_uncertainty: Real
+    smooth_radius: Real
 
     def parts(self) -> tuple[Any, ...]:
         """The fields in the order of the constructor, as loops want them."""
-        return self.y, self.gradient, self.noise, self.reach
+        return self.y, self.gradient, self.level_uncertainty, self.smooth_radius
 
-    def flat_after(self, mask: Mask, before: _Place) -> _Place:
+    def flat_after(self, mask: Mask, before: _DescentState) -> _DescentState:
         """The place, where f - level and its gradient are 0 on lanes of the mask: with the gradient
         of the place before, and with the rounding of coordinates alone."""
-        epsilon = float(dr.epsilon(type(self.noise)))
-        rounding = 4 * epsilon * lengths.largest_coordinate(self.y)
+        epsilon = float(dr.epsilon(type(self.level_uncertainty)))
+        rounding = 4 * epsilon * lengths.max_norm(self.y)
         gradient = dr.select(mask, before.gradient, self.gradient)
-        return _Place(self.y, gradient, dr.select(mask, rounding, self.noise), self.reach)
+        return _DescentState(
+            self.y, gradient, dr.select(mask, rounding, self.level_uncertainty), self.smooth_radius
+        )
 
-    def where(self, mask: Mask, other: _Place) -> tuple[Any, ...]:
+    def where(self, mask: Mask, other: _DescentState) -> tuple[Any, ...]:
         """Its parts in some lanes, another's elsewhere."""
         pairs = zip(self.parts(), other.parts(), strict=True)
         return tuple(dr.select(mask, one, two) for one, two in pairs)
 
 
 @dataclass(frozen=True)
-class Descent:
+class ClosestPointDescent:
     """The search for closest points of the level set of a prepared field."""
 
     backend: Backend
     field: Field
-    levels: TargetLevels
+    levels: Levels
     has_hessian: bool
 
     @classmethod
-    def of(cls, backend: Backend, field: Field, levels: TargetLevels) -> Descent:
+    def of(cls, backend: Backend, field: Field, levels: Levels) -> ClosestPointDescent:
         return cls(backend, field, levels, has_hessian(backend, field))
 
-    def directly(self, x: Vec3, start: Vec3, limit: Real) -> tuple[Vec3, Real, Mask, Mask]:
+    def newton(self, x: Vec3, start: Vec3, limit: Real) -> tuple[Vec3, Real, Mask, Mask]:
         """A place from which Newton's method for f(y) = level and (x - y) parallel to grad f(y),
-        begun at a point of the surface nearby, ends with one more step (`end`); how far `start` is
-        off the level; and whether the search was given up, as it goes on to where f is singular, or
-        to a point that is farther from x than `limit`.
+        begun at a point of the surface nearby, ends with one more step (`finish`); how far `start`
+        is off the level; and whether the search was given up, as it goes on to where f is singular,
+        or to a point that is farther from x than `limit`.
 
-        Each step is that of `closest` along the surface, which follows its curvature, and one to
+        Each step is that of `descend` along the surface, which follows its curvature, and one to
         the level, both from derivatives at one place: errors are squared by each of both. So the
         step after the next is about its length times the square of its ratio to the last one.
         Where steps become shorter the end is within twice the next.
@@ -107,18 +111,21 @@ class Descent:
             y: Vec3, first: Real, last: Real, is_lost: Mask, is_far: Mask, k: Any, active: Mask
         ) -> tuple[Any, ...]:
             # What rounding does to f takes as long as f itself, and is of no matter here.
-            above, here = self._place(y, dataclasses.replace(self.field.evaluate(y), error=0.0))
+            sample = dataclasses.replace(self.field.evaluate(y), value_error=0.0)
+            above, here = self._place(y, sample)
             move, _ = self._step_along(x, here, real(1))
-            off = -above / lengths.length(here.gradient)
+            off = -above / lengths.safe_norm(here.gradient)
             first = dr.select(k == 0, dr.abs(off), first)
-            move = dr.fma(vector(off), here.gradient / lengths.length(here.gradient), move)
+            move = dr.fma(vector(off), here.gradient / lengths.safe_norm(here.gradient), move)
             length, distance = dr.norm(move), dr.norm(x - y)
-            longest = 0.5 * here.reach
+            longest = 0.5 * here.smooth_radius
             is_lost = dr.select(active, length > longest, is_lost)
             shrinks = (k > 0) & (length < 0.5 * last)
             is_far = dr.select(active, shrinks & (distance - 2 * length > limit), is_far)
             after = length * dr.square(length / last)
-            is_near = shrinks & ~is_lost & (after <= dr.fma(_NEAR, distance, here.noise))
+            is_near = (
+                shrinks & ~is_lost & (after <= dr.fma(_NEAR, distance, here.level_uncertainty))
+            )
             active &= ~is_far & dr.isfinite(length)
             y = dr.select(active, y + dr.select(is_lost, longest / length, 1) * move, y)
             active &= ~is_near & (k + 1 < _STEPS_DIRECT)
@@ -133,9 +140,9 @@ class Descent:
         y, first, _, is_lost, is_far, _, _ = found
         return y, first, is_lost, is_far
 
-    def end(self, x: Vec3, y: Vec3) -> tuple[Vec3, Mask, Real]:
+    def finish(self, x: Vec3, y: Vec3) -> tuple[Vec3, Mask, Real]:
         """The last step from y onto the level; whether that leads to a closest point to x, by the
-        criterion of `closest`; and a radius about it in which no point of the surface is nearer.
+        criterion of `descend`; and a radius about it in which no point of the surface is nearer.
 
         Proof that the step, of length s along grad f, ends on the level: by Newton's formula f is
         off the level there by at most what Taylor's polynomial of first degree leaves out within s.
@@ -145,17 +152,17 @@ class Descent:
         above, here = self._place(y, sample)
         rows = self.field.hessian(y) if self.has_hessian else None
         _, settled = self._step_along(x, here, self.backend.Float(1), rows)
-        steep = lengths.length(here.gradient)
+        steep = lengths.safe_norm(here.gradient)
         off = -above / steep
-        exact = dataclasses.replace(sample, error=0.0, gradient_error=0.0)
-        lands = remainder(exact, dr.abs(off)) <= steep * here.noise
+        exact = dataclasses.replace(sample, value_error=0.0, gradient_error=0.0)
+        lands = taylor_remainder(exact, dr.abs(off)) <= steep * here.level_uncertainty
         foot, is_short = self._step_to_level(x, above, here)
         lands &= is_short
-        found = settled & (self._is_close(above, here) | (self._is_known(here) & lands))
-        free = free_radius(exact, rows, x, y)
+        found = settled & (self._is_on_level(above, here) | (self._is_level_resolved(here) & lands))
+        free = exclusion_radius(exact, rows, x, y)
         return foot, found, dr.select(found, free, 0)
 
-    def closest(self, x: Vec3, start: Vec3) -> tuple[Vec3, Mask, Mask]:
+    def descend(self, x: Vec3, start: Vec3) -> tuple[Vec3, Mask, Mask]:
         """The closest point y to x that is found from `start`, whether it is one (see above), and
         whether it is a point of the level set at all.
 
@@ -178,20 +185,20 @@ class Descent:
             y: Vec3, g: Vec3, noise: Real, reach: Real,
             share: Real, on_level: Mask, found: Mask, n: Any, active: Mask,
         ) -> tuple[Any, ...]:  # fmt: skip
-            here, first = _Place(y, g, noise, reach), n == 0
+            here, first = _DescentState(y, g, noise, reach), n == 0
             move, settled = self._step_along(x, here, share)
             settled &= ~first
             going = active & ~settled
             there, arrived = self._to_level(dr.select(first, y, y + move), going)
-            limit = dr.norm(x - y) * (1 + 8 * self.backend.epsilon) + 4 * noise
+            limit = dr.norm(x - y) * (1 + 8 * self.backend.machine_epsilon) + 4 * noise
             better = going & arrived & (dr.norm(x - there.y) <= limit)
             longer = dr.select(better, fmin(4 * share, 1), 0.25 * share)
             share = dr.select(first, share, longer)
             found |= active & settled
             on_level = dr.select(first, arrived, on_level)
             # Where f ceases to be smooth the surface ends: no minimum inside it.
-            inner = there.reach > _RIM * dr.norm(x - there.y)
-            inner &= (n <= _STEPS_ALONG) & (share > _LEAST_SHARE)
+            inner = there.smooth_radius > _MIN_SINGULARITY_FRACTION * dr.norm(x - there.y)
+            inner &= (n <= _STEPS_ALONG) & (share > _MIN_STEP_FRACTION)
             active = going & dr.select(first, arrived, inner)
             return *there.where(better | first, here), share, on_level, found, n + 1, active
 
@@ -200,7 +207,7 @@ class Descent:
 
         # Round 0 goes to the level: f is recorded once for both.
         state = (
-            *_Place(vector(start), vector(0), real(0), real(0)).parts(),
+            *_DescentState(vector(start), vector(0), real(0), real(0)).parts(),
             real(1), mask(False), mask(False), count(0), mask(True),
         )  # fmt: skip
         y, _, _, _, _, on_level, found, _, _ = dr.while_loop(
@@ -208,64 +215,68 @@ class Descent:
         )
         return y, found, on_level
 
-    def onto_level(self, start: Vec3) -> Vec3:
+    def newton_to_level(self, start: Vec3) -> Vec3:
         """The point of a level that Newton's method along the gradient leads to; NaN for none."""
         place, found = self._to_level(start, self.backend.Bool(True))
         return dr.select(found, place.y, dr.nan)
 
     def noise(self, y: Vec3) -> Real:
         """How far rounding and approximation may have moved the level at y, as a length."""
-        return self._evaluate(y)[1].noise
+        return self._evaluate(y)[1].level_uncertainty
 
     def last_step(self, x: Vec3, y: Vec3) -> Vec3:
-        """y moved onto the level, where it is closest to x but for so short a step as in `end`; NaN
-        elsewhere."""
+        """y moved onto the level, where it is closest to x but for so short a step as in `finish`;
+        NaN elsewhere."""
         above, here = self._evaluate(y)
         foot, is_short = self._step_to_level(x, above, here)
-        return dr.select(is_short & self._is_known(here), foot, dr.nan)
+        return dr.select(is_short & self._is_level_resolved(here), foot, dr.nan)
 
-    def _step_to_level(self, x: Vec3, above: Real, here: _Place) -> tuple[Vec3, Mask]:
+    def _step_to_level(self, x: Vec3, above: Real, here: _DescentState) -> tuple[Vec3, Mask]:
         """Where Newton's step along the gradient leads, and whether it is so short that the point
         stays the closest to x, to rounding."""
-        steep = lengths.length(here.gradient)
+        steep = lengths.safe_norm(here.gradient)
         off = -above / steep
         foot = dr.fma(self.backend.Array3f(off / steep), here.gradient, here.y)
-        limit = self.backend.epsilon**0.5 * dr.norm(x - here.y) + here.noise
+        limit = self.backend.machine_epsilon**0.5 * dr.norm(x - here.y) + here.level_uncertainty
         return foot, dr.abs(off) <= limit
 
-    def _evaluate(self, y: Vec3) -> tuple[Real, _Place]:
+    def _evaluate(self, y: Vec3) -> tuple[Real, _DescentState]:
         """f - level at y, and the place."""
         return self._place(y, self.field.evaluate(y))
 
-    def _place(self, y: Vec3, sample: Sample) -> tuple[Real, _Place]:
+    def _place(self, y: Vec3, sample: Sample) -> tuple[Real, _DescentState]:
         real = self.backend.Float
-        size = lengths.largest_coordinate(y)
-        epsilon, gradient_norm = self.backend.epsilon, lengths.length(sample.gradient)
-        total_error = dr.fma(8 * epsilon, dr.abs(sample.value), sample.error)
+        size = lengths.max_norm(y)
+        epsilon, gradient_norm = self.backend.machine_epsilon, lengths.safe_norm(sample.gradient)
+        total_error = dr.fma(8 * epsilon, dr.abs(sample.value), sample.value_error)
         noise = dr.fma(4 * epsilon, size, total_error / gradient_norm)
         reach = real(0)
-        for known in sample.promises:
-            if not known.is_smooth:
+        for known in sample.all_promises:
+            if not known.implies_smooth:
                 continue
             radius = real(known.radius)
             reach = fmax(reach, dr.select(dr.isfinite(radius), radius, 0))
         reach = dr.select(reach > 0, reach, dr.inf)
-        above = real(-self.levels.to_nearest(sample.value))
-        return above, _Place(y, self.backend.Array3f(sample.gradient), noise, reach)
+        above = real(-self.levels.offset_to_nearest(sample.value))
+        return above, _DescentState(y, self.backend.Array3f(sample.gradient), noise, reach)
 
     @staticmethod
-    def _is_close(above: Real, place: _Place) -> Mask:
+    def _is_on_level(above: Real, place: _DescentState) -> Mask:
         """Whether a place is on the level, to rounding; False where rounding leaves that open."""
-        known = Descent._is_known(place)
-        return known & (dr.abs(above) <= 2 * lengths.length(place.gradient) * place.noise)
+        known = ClosestPointDescent._is_level_resolved(place)
+        return known & (
+            dr.abs(above) <= 2 * lengths.safe_norm(place.gradient) * place.level_uncertainty
+        )
 
     @staticmethod
-    def _is_known(place: _Place) -> Mask:
+    def _is_level_resolved(place: _DescentState) -> Mask:
         """Whether rounding tells anything of the level."""
-        size = lengths.largest_coordinate(place.y)
-        return place.noise <= _CLEAR * fmax(size, place.reach)
+        size = lengths.max_norm(place.y)
+        return place.level_uncertainty <= _MAX_RELATIVE_UNCERTAINTY * fmax(
+            size, place.smooth_radius
+        )
 
-    def _to_level(self, start: Vec3, active: Mask) -> tuple[_Place, Mask]:
+    def _to_level(self, start: Vec3, active: Mask) -> tuple[_DescentState, Mask]:
         """From `start` to the nearest level by Newton's method along the gradient.
 
         A step is no longer than the ball on which f is known to be smooth, and counts if it comes
@@ -281,19 +292,23 @@ class Descent:
             above: Real, y: Vec3, g: Vec3, noise: Real, reach: Real,
             last: Real, share: Real, close: Mask, n: Any, active: Mask,
         ) -> tuple[Any, ...]:  # fmt: skip
-            here, gradient_norm, first = _Place(y, g, noise, reach), lengths.length(g), n == 0
+            here, gradient_norm, first = (
+                _DescentState(y, g, noise, reach),
+                lengths.safe_norm(g),
+                n == 0,
+            )
             step = -above / gradient_norm
             longer = dr.select(n > _PATIENT, multiplicity(step, last), 1)
             length = share * clamp(longer * step, -reach, reach)
             nearer = dr.fma(vector(length / gradient_norm), g, y)
             above2, there = self._evaluate(dr.select(first, y, nearer))
-            is_flat = ~first & (above2 == 0) & (lengths.length(there.gradient) == 0)
+            is_flat = ~first & (above2 == 0) & (lengths.safe_norm(there.gradient) == 0)
             there = there.flat_after(is_flat, here)
             better = active & (first | (dr.abs(above2) < dr.abs(above)))
             longer = dr.select(better, fmin(2 * share, 1), 0.25 * share)
             share = dr.select(first, share, longer)
-            close |= better & self._is_close(above2, there)
-            active &= ~close & (n <= _STEPS_TO_LEVEL) & (share > _LEAST_SHARE)
+            close |= better & self._is_on_level(above2, there)
+            active &= ~close & (n <= _STEPS_TO_LEVEL) & (share > _MIN_STEP_FRACTION)
             above = dr.select(better, above2, above)
             last = dr.select(first, dr.inf, dr.abs(step))
             return above, *there.where(better, here), last, share, close, n + 1, active
@@ -302,15 +317,15 @@ class Descent:
             return state[-1]
 
         # Round 0 evaluates the start.
-        first = _Place(vector(start), vector(0), real(0), real(0))
+        first = _DescentState(vector(start), vector(0), real(0), real(0))
         close = self.backend.Bool(False)
         going = self.backend.Bool(active)
         state = (real(dr.inf), *first.parts(), real(dr.inf), real(1), close, count(0), going)
         _, *place, _, _, close, _, _ = dr.while_loop(state, more, body, label="to the level")
-        return _Place(*place), close
+        return _DescentState(*place), close
 
     def _step_along(
-        self, x: Vec3, here: _Place, share: Real, rows: Rows | None = None
+        self, x: Vec3, here: _DescentState, share: Real, rows: Rows | None = None
     ) -> tuple[Vec3, Mask]:
         """The step along the surface, and whether y already is a local minimum of the distance.
 
@@ -320,21 +335,23 @@ class Descent:
         r = x - here.y
         distance = dr.norm(r)
         if rows is not None:
-            uu, vv, uv = plane.restricted(rows)
+            uu, vv, uv = plane.restrict_hessian(rows)
         else:
-            uu, vv, uv = self._second_derivatives(here.y, plane, fmin(here.reach, distance))
+            uu, vv, uv = self._second_derivatives(here.y, plane, fmin(here.smooth_radius, distance))
         lift = dr.dot(r, plane.n) / plane.gradient_norm
-        eigen = Eigen.of(dr.fma(lift, uu, 1), dr.fma(lift, vv, 1), lift * uv)  # of B
+        eigen = SymmetricEigen2.of(dr.fma(lift, uu, 1), dr.fma(lift, vv, 1), lift * uv)  # of B
         tu, tv = dr.dot(r, plane.u), dr.dot(r, plane.v)
         slant = dr.sqrt(dr.fma(tu, tu, tv * tv))
-        level = slant <= dr.fma(4 * self.backend.epsilon**0.5, distance, 8 * here.noise)
-        saddle = level & (eigen.least < _INDEFINITE)
+        level = slant <= dr.fma(
+            4 * self.backend.machine_epsilon**0.5, distance, 8 * here.level_uncertainty
+        )
+        saddle = level & (eigen.smallest < _INDEFINITE)
         most, least = eigen.coordinates(tu, tv)
-        most = most / fmax(dr.abs(eigen.most), _LEAST_EIGENVALUE)
-        least = least / fmax(dr.abs(eigen.least), _LEAST_EIGENVALUE)
+        most = most / fmax(dr.abs(eigen.largest), _LEAST_EIGENVALUE)
+        least = least / fmax(dr.abs(eigen.smallest), _LEAST_EIGENVALUE)
         least = dr.select(saddle, 0.5 * distance, least)
         length = dr.sqrt(dr.fma(most, most, least * least))
-        limit = share * dr.select(saddle, length, fmin(here.reach, distance))
+        limit = share * dr.select(saddle, length, fmin(here.smooth_radius, distance))
         scale = dr.select(length > 0, fmin(limit / length, 1), 0)
         a, b = eigen.combination(scale * most, scale * least)
         vector = self.backend.Array3f
@@ -349,9 +366,9 @@ class Descent:
         """u.Au, v.Av, u.Av; by differences of the gradient where the field has no Hessian, for
         their errors only cost steps."""
         if self.has_hessian:
-            return plane.restricted(self.field.hessian(y))
+            return plane.restrict_hessian(self.field.hessian(y))
         vector, count = self.backend.Array3f, self.backend.UInt32
-        h = fmax(self.backend.epsilon**0.5 * size, 1e-30)
+        h = fmax(self.backend.machine_epsilon**0.5 * size, 1e-30)
 
         def body(ahead: Vec3, aside: Vec3, k: Any) -> tuple[Any, ...]:
             way, sign = dr.select(k < 2, plane.u, plane.v), dr.select((k & 1) == 0, h, -h)

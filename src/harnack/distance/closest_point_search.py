@@ -1,4 +1,17 @@
-"""The closest points of a surface: of the triangles of a closed mesh, or by search in cells."""
+"""The closest points of a surface: of the triangles of a closed mesh, or by search in cells.
+
+Closest points are points of the surface: every search ends at a root of f, at a first hit or on a
+triangle, so that distances are upper bounds whatever led there, and what is nearer than the proved
+lower bound is refused. Cells that are proved empty are left out; a point of the surface in each of
+the others is where descents begin (`cell_search`): in one kernel from a few coarse cells, and where
+finer ones may be nearer from four of their points. The ball about a foot that holds no nearer point
+(`exclusion_ball`) closes most points; boxes within it are left out. What is left bounds the
+distance from below, and for proofs is split. Closed meshes are
+triangles and a tree (`level_triangles`). Of a mesh with holes the part off its triangles is a
+smooth surface of w modulo one (`JumpSurface.without_jumps`), whose feet count where w itself has
+the level: rays that closed in on each point took 18 times as long, and a tenth of them ended too
+far.
+"""
 
 from __future__ import annotations
 
@@ -11,132 +24,137 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray, choose_backend, to_numpy
-from harnack.backend.arrays import finite_vectors, upload_vectors
-from harnack.backend.elementary import largest_coordinate, length
-from harnack.distance.cell_classification import RimDescent
-from harnack.distance.cell_search import Found, Known, Tolerance, search
-from harnack.distance.closest_point_descent import Descent
-from harnack.distance.jump_surface_search import SheetSearch, close_in
-from harnack.distance.level_triangles import MeshSurface
-from harnack.distance.tangent_plane import first_order, in_batches
+from harnack.backend.arrays import as_finite_vectors, upload_vectors
+from harnack.backend.elementary import max_norm, safe_norm
+from harnack.distance.cell_classification import ClipCurveDescent
+from harnack.distance.cell_search import InitialGuess, SearchResult, StoppingRule, search
+from harnack.distance.closest_point_descent import ClosestPointDescent
+from harnack.distance.jump_surface_search import JumpSurfaceSearch, compass_search
+from harnack.distance.level_triangles import LevelTriangles
+from harnack.distance.tangent_plane import first_order_distance, in_batches
 from harnack.fields.batch_evaluation import morton_order
-from harnack.fields.capabilities import NO_SHEET
-from harnack.fields.clearance import distance_below
+from harnack.fields.capabilities import NO_FACET
+from harnack.fields.clearance import level_distance_lower_bound
 from harnack.fields.field import Field
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
-    from harnack.enclosures import TargetLevels
+    from harnack.enclosures import Levels
     from harnack.fields.samples import Sample
     from harnack.geometry import Volume
-    from harnack.tracer import LevelSet
+    from harnack.tracer import Surface
 
-__all__ = ["Closest", "find_closest"]
+__all__ = ["ClosestPoints", "find_closest"]
 
 # In epsilons, of coordinates: what rounding may do to a distance.
 _ROUNDING = 64.0
 # Of the size of the surface: cells are split until none can hold a point so much nearer.
 _TOLERANCE = 1e-6
 # Cells along an axis that points are sorted by, as a power of two.
-_BITS = 10
+_MORTON_BITS = 10
 # The surface may leave its boundary at this cosine away from a point and yet come nearer to it.
-_AWAY = 0.2
+_MAX_OPPOSING_COSINE = 0.2
 # About the boundary the surface may be as far along a circle, in radii.
-_LONGEST_ARC = 2.5
+_MAX_ARC_RADII = 2.5
 # Of feet of a field without jumps, which knows f but for a whole number: so near to a level f is.
-_SAME_LEVEL = 0.25
+_LEVEL_MATCH = 0.25
 # Where f is compared on both sides of a triangle: so far from the point towards the middle, in
 # parts of the way to it, and so far on either side, in sizes of the surface. By how much f has to
 # be on different sides of a level.
-_WITHIN_FACE, _BESIDE_FACE, _SURE = 1e-7, 1e-12, 1e-3
+_WITHIN_FACE, _BESIDE_FACE, _LEVEL_MARGIN = 1e-7, 1e-12, 1e-3
 # How often what clusters leave out is computed for a foot.
-_CORRECTIONS = 2
+_TRUNCATION_CORRECTIONS = 2
 # Samples of a smooth part for each point, about.
-_LOOKS = 10
+_SAMPLES_PER_POINT = 10
 # Sheets that are examined for each point before cells are.
-_SHEETS = 16
+_MAX_JUMPS_EXAMINED = 16
 
 
 @dataclass(frozen=True)
-class Closest:
+class ClosestPoints:
     """The closest points found.
 
     points: (n, 3), rounded to the precision in use.
-    feet: (n, 3) the closest points of the surface, NaN where none was found.
+    closest: (n, 3) the closest points of the surface, NaN where none was found.
     distance: (n,) to these, NaN likewise.
-    above: (n,) f - level, of the level nearest in value.
+    signed_value: (n,) f - level, of the level nearest in value.
     lower: (n,) proved: no point of the surface is nearer.
-    is_refused: (n,) whether a point was found that is nearer than the field's promises allow.
+    violates_promises: (n,) whether a point was found that is nearer than the field's promises
+        allow.
     """
 
     points: FloatArray
-    feet: FloatArray
+    closest: FloatArray
     distance: FloatArray
-    above: FloatArray
+    signed_value: FloatArray
     lower: FloatArray
-    is_refused: BoolArray
+    violates_promises: BoolArray
 
 
 def find_closest(
-    backend: Backend, surface: LevelSet, levels: TargetLevels, points: Any,
+    backend: Backend, surface: Surface, levels: Levels, points: Any,
     progress: Callable[[str], None], *, is_proved: bool = False,
-) -> Closest:  # fmt: skip
+) -> ClosestPoints:  # fmt: skip
     """The closest point of a surface to each of the points (n, 3).
 
     is_proved: whether `lower` is wanted as close as cells can prove it.
 
     Points are sorted along a Morton curve, so that neighboring lanes traverse a tree together.
     """
-    x = finite_vectors(points, "points")
-    order = to_numpy(morton_order(backend, upload_vectors(backend, x), _BITS))
-    found = _in_order(backend, surface, levels, x[order], progress, is_proved)
+    x = as_finite_vectors(points, "points")
+    order = to_numpy(morton_order(backend, upload_vectors(backend, x), _MORTON_BITS))
+    found = _find_sorted(backend, surface, levels, x[order], progress, is_proved)
     back = np.empty_like(order)
     back[order] = np.arange(len(order), dtype=order.dtype)
-    return Closest(*(part[back] for part in vars(found).values()))
+    return ClosestPoints(*(part[back] for part in vars(found).values()))
 
 
-def _in_order(
-    backend: Backend, surface: LevelSet, levels: TargetLevels, points: FloatArray,
+def _find_sorted(
+    backend: Backend, surface: Surface, levels: Levels, points: FloatArray,
     progress: Callable[[str], None], is_proved: bool,
-) -> Closest:  # fmt: skip
-    mesh = MeshSurface.of(surface)
-    if mesh is not None and mesh.is_all:
+) -> ClosestPoints:  # fmt: skip
+    mesh = LevelTriangles.of(surface)
+    if mesh is not None and mesh.is_complete:
         return _closest_on_mesh(backend, surface, levels, mesh, points)
-    job = _Points(backend, surface, levels)
-    x, start, above, lower, near = job.look(points)
+    job = _QueryEvaluator(backend, surface, levels)
+    x, start, above, lower, near = job.evaluate(points)
     if mesh is not None:
-        start = _nearer(x, start, mesh)
-    if surface.field.has_sheets:
-        start = job.on_sheets(x, start)
-    tolerance = Tolerance(_TOLERANCE * _size(surface, x), is_proved)
-    many = surface.field.for_rays(_LOOKS * len(x))
-    smooth = many.smooth_part() if surface.cut is None else None
+        start = _with_mesh_points(x, start, mesh)
+    if surface.field.has_jumps:
+        start = job.with_jump_points(x, start)
+    tolerance = StoppingRule(_TOLERANCE * _size(surface, x), is_proved)
+    many = surface.field.for_ray_count(_SAMPLES_PER_POINT * len(x))
+    smooth = many.without_jumps() if surface.clip_volume is None else None
     if smooth is None:
-        found = search(surface, x, Known(start, near), job, tolerance, progress)
+        found = search(surface, x, InitialGuess(start, near), job, tolerance, progress)
     else:
-        found = _besides_sheets(job, smooth, x, Known(start, near), tolerance, progress)
-    found.feet = _or_singular(surface, x, job.refined(x, found.feet))
-    distance = _length(x - found.feet)
+        found = _search_smooth_part(job, smooth, x, InitialGuess(start, near), tolerance, progress)
+    found.closest = _with_singular_points(surface, x, job.remove_truncation(x, found.closest))
+    distance = _length(x - found.closest)
     # A foot nearer than the proof allows: either it is off the surface by rounding, or a promise of
     # the field does not hold.
     short = distance < lower
     slack = np.zeros(len(x))
-    slack[short] = 4 * job.noise(found.feet[short])
-    slack += _ROUNDING * backend.epsilon * (np.abs(x).max(axis=1, initial=0.0) + lower)
+    slack[short] = 4 * job.level_uncertainty(found.closest[short])
+    slack += _ROUNDING * backend.machine_epsilon * (np.abs(x).max(axis=1, initial=0.0) + lower)
     refused = distance < lower - slack
-    feet = np.where(refused[:, None], np.nan, found.feet)
+    feet = np.where(refused[:, None], np.nan, found.closest)
     distance = np.where(refused, np.nan, distance)
-    lower = np.fmin(np.maximum(lower, found.lower), distance)
-    return Closest(x, feet, distance, above, lower, refused)
+    lower = np.fmin(np.maximum(lower, found.lower_bounds), distance)
+    return ClosestPoints(x, feet, distance, above, lower, refused)
 
 
-def _besides_sheets(
-    job: _Points, smooth: Field, points: FloatArray, known: Known, tolerance: Tolerance,
+def _search_smooth_part(
+    job: _QueryEvaluator,
+    smooth: Field,
+    points: FloatArray,
+    known: InitialGuess,
+    tolerance: StoppingRule,
     progress: Callable[[str], None],
-) -> Found:  # fmt: skip
+) -> SearchResult:
     """What is found of a surface with sheets: on its smooth part, or what is known on sheets.
 
-    smooth: `Sheets.smooth_part` of the surface's field. known: feet on sheets.
+    smooth: `JumpSurface.without_jumps` of the surface's field. known: feet on sheets.
 
     Proof of the lower bounds: the surface lies on level sets of `smooth` and on sheets, and is no
     nearer than the nearest of either. Feet on the former are of the surface where f has the level
@@ -144,37 +162,41 @@ def _besides_sheets(
     elsewhere than at its nearest point, rays look further.
     """
     backend, surface = job.backend, job.surface
-    alone = replace(surface, field=smooth).in_one_call(begins=True)
-    parts = _Points(backend, alone, alone.levels_on(backend))
-    near = parts.look(points)[-1]
+    alone = replace(surface, field=smooth).with_call_cache(begins=True)
+    parts = _QueryEvaluator(backend, alone, alone.target_levels(backend))
+    near = parts.evaluate(points)[-1]
     found = search(
-        alone, points, Known(known.feet, near, on_boundary=False), parts, tolerance, progress
+        alone, points, InitialGuess(known.feet, near, on_boundary=False), parts, tolerance, progress
     )
-    sheets = job.to_sheets(points)
-    rounding = _ROUNDING * backend.epsilon * (np.abs(points).max(axis=1, initial=0.0) + sheets)
-    lower = np.maximum(np.minimum(found.lower, sheets - rounding), 0)
+    sheets = job.distance_to_jumps(points)
+    rounding = (
+        _ROUNDING * backend.machine_epsilon * (np.abs(points).max(axis=1, initial=0.0) + sheets)
+    )
+    lower = np.maximum(np.minimum(found.lower_bounds, sheets - rounding), 0)
     away, feet = _length(points - known.feet), known.feet.copy()
-    rows = np.flatnonzero(_length(points - found.feet) < np.nan_to_num(away, nan=np.inf) - rounding)
-    there = parts.refined(points[rows], found.feet[rows])
+    rows = np.flatnonzero(
+        _length(points - found.closest) < np.nan_to_num(away, nan=np.inf) - rounding
+    )
+    there = parts.remove_truncation(points[rows], found.closest[rows])
     value = np.asarray(surface.field.value(there, precision="double"))
-    is_level = np.abs(value[:, None] - surface.numbers).min(axis=1) < _SAME_LEVEL
+    is_level = np.abs(value[:, None] - surface.level_values).min(axis=1) < _LEVEL_MATCH
     feet[rows[is_level]] = there[is_level]
     is_known = _length(points - feet) <= sheets + rounding + tolerance.length
     is_known[rows[~is_level]] = False
     again = np.flatnonzero(~is_known)
     if len(again):
-        rest = Known(feet[again], known.near[again])
+        rest = InitialGuess(feet[again], known.estimate[again])
         others = search(surface, points[again], rest, job, tolerance, progress)
-        feet[again], lower[again] = others.feet, np.maximum(lower[again], others.lower)
-    return Found(feet, lower)
+        feet[again], lower[again] = others.closest, np.maximum(lower[again], others.lower_bounds)
+    return SearchResult(feet, lower)
 
 
-def _or_singular(surface: LevelSet, points: FloatArray, feet: FloatArray) -> FloatArray:
+def _with_singular_points(surface: Surface, points: FloatArray, feet: FloatArray) -> FloatArray:
     """The feet (n, 3), or the nearest singular points where these are nearer: beside those the
     surface is a tiny loop that descents do not see."""
     singular = surface.field.singular_points
-    if surface.cut is not None and len(singular):
-        singular = singular[surface.cut.contains_points(singular)]
+    if surface.clip_volume is not None and len(singular):
+        singular = singular[surface.clip_volume.contains_points(singular)]
     if not len(singular) or not len(points):
         return feet
     import scipy.spatial  # here: half a second that few need
@@ -186,22 +208,22 @@ def _or_singular(surface: LevelSet, points: FloatArray, feet: FloatArray) -> Flo
 
 
 def _closest_on_mesh(
-    backend: Backend, surface: LevelSet, levels: TargetLevels, mesh: MeshSurface, points: Any
-) -> Closest:
-    prepared, nearest = surface.field_on(backend), mesh.upload(backend)
+    backend: Backend, surface: Surface, levels: Levels, mesh: LevelTriangles, points: Any
+) -> ClosestPoints:
+    prepared, nearest = surface.evaluator(backend), mesh.upload(backend)
 
     def look(p: Vec3) -> tuple[Real | Vec3, ...]:
-        above = -levels.to_nearest(prepared.evaluate(p).value)
+        above = -levels.offset_to_nearest(prepared.evaluate(p).value)
         offset = nearest(p)
-        return p, p + offset, length(offset), above
+        return p, p + offset, safe_norm(offset), above
 
     x, feet, distance, above = in_batches(backend, look, points)
-    slack = _ROUNDING * backend.epsilon * (np.abs(x).max(axis=1, initial=0.0) + mesh.size)
+    slack = _ROUNDING * backend.machine_epsilon * (np.abs(x).max(axis=1, initial=0.0) + mesh.size)
     lower = np.maximum(distance - slack, 0)
-    return Closest(x, feet, distance, above, lower, np.zeros(len(x), np.bool_))
+    return ClosestPoints(x, feet, distance, above, lower, np.zeros(len(x), np.bool_))
 
 
-def _nearer(points: FloatArray, start: FloatArray, mesh: MeshSurface) -> FloatArray:
+def _with_mesh_points(points: FloatArray, start: FloatArray, mesh: LevelTriangles) -> FloatArray:
     """The places (n, 3), or the nearest points of triangles where these are nearer."""
     backend = choose_backend("double")
     nearest = mesh.upload(backend)
@@ -211,110 +233,120 @@ def _nearer(points: FloatArray, start: FloatArray, mesh: MeshSurface) -> FloatAr
 
 
 @dataclass(frozen=True)
-class _Points:
+class _QueryEvaluator:
     """What is computed at points of a surface that is searched in cells."""
 
     backend: Backend
-    surface: LevelSet
-    levels: TargetLevels
+    surface: Surface
+    levels: Levels
 
     def __post_init__(self) -> None:
-        backend, field = self.backend, self.surface.field_on(self.backend)
+        backend, field = self.backend, self.surface.evaluator(self.backend)
         set_ = object.__setattr__
         set_(self, "_field", field)
-        exact = field.without_truncation(backend)
-        set_(self, "_descent", Descent.of(backend, field, self.levels))
-        set_(self, "_exact", Descent.of(backend, exact, self.levels) if field.has_detail else None)
+        exact = field.exact(backend)
+        set_(self, "_descent", ClosestPointDescent.of(backend, field, self.levels))
+        set_(
+            self,
+            "_exact",
+            ClosestPointDescent.of(backend, exact, self.levels)
+            if field.has_variable_accuracy
+            else None,
+        )
         domain = field.domain and field.domain.prepare(backend)
         set_(self, "_domain", domain)
-        set_(self, "_rim", domain and RimDescent(backend, field, self.levels, domain))
+        set_(self, "_rim", domain and ClipCurveDescent(backend, field, self.levels, domain))
         # Rays are compared by differences of angles, for which single precision is too short.
         double = choose_backend("double")
-        set_(self, "_prepared", self.surface.prepare(double) if field.has_sheets else None)
+        set_(self, "_prepared", self.surface.prepare(double) if field.has_jumps else None)
 
     _field: Field = dataclasses.field(init=False)
-    _descent: Descent = dataclasses.field(init=False)
-    _exact: Descent | None = dataclasses.field(init=False)
+    _descent: ClosestPointDescent = dataclasses.field(init=False)
+    _exact: ClosestPointDescent | None = dataclasses.field(init=False)
     _domain: Volume | None = dataclasses.field(init=False)
-    _rim: RimDescent | None = dataclasses.field(init=False)
+    _rim: ClipCurveDescent | None = dataclasses.field(init=False)
     _prepared: Any = dataclasses.field(init=False)
 
-    def look(self, points: Any) -> tuple[FloatArray, ...]:
+    def evaluate(self, points: Any) -> tuple[FloatArray, ...]:
         """The points as rounded, what is known of the surface near them, f - level, proved lower
         bounds of the distance, and what it is to first order."""
 
         def compute(p: Vec3) -> tuple[Real | Vec3, ...]:
             sample = self._field.evaluate(p)
-            above = -self.levels.to_nearest(sample.value)
-            boundary = self._field.closest_on_boundary(p)
+            above = -self.levels.offset_to_nearest(sample.value)
+            boundary = self._field.closest_boundary_point(p)
             start = self.backend.Array3f(dr.nan) if boundary is None else boundary
             start = dr.select(above == 0, p, start)
             lower = self.backend.Float(0)
-            if sample.promises:
-                lower = distance_below(self.backend, self._field, self.levels, p, sample)
-            return p, start, above, lower, dr.abs(first_order(above, sample.gradient))
+            if sample.all_promises:
+                lower = level_distance_lower_bound(
+                    self.backend, self._field, self.levels, p, sample
+                )
+            return p, start, above, lower, dr.abs(first_order_distance(above, sample.gradient))
 
         x, start, above, lower, near = in_batches(self.backend, compute, points)
         domain = self.surface.field.domain
         if domain is not None and len(x):
             lower[~domain.contains_points(x)] = 0
-        return x, self._within(start), above, lower, near
+        return x, self._inside_domain_or_nan(start), above, lower, near
 
-    def on_sheets(self, points: FloatArray, start: FloatArray) -> FloatArray:
+    def with_jump_points(self, points: FloatArray, start: FloatArray) -> FloatArray:
         """The places (n, 3), or points of the surface on sheets where these are nearer."""
         away, start = _length(points - start), start.copy()
-        rows = np.flatnonzero(~(away <= self.to_sheets(points) * (1 + 1e-12)))
-        start[rows] = self._on_nearest_face(points[rows])
+        rows = np.flatnonzero(~(away <= self.distance_to_jumps(points) * (1 + 1e-12)))
+        start[rows] = self._nearest_face_points(points[rows])
         rows = rows[np.isnan(start[rows, 0])]
         if len(rows):
             start[rows] = self._on_sheets(points[rows], start[rows])
         return start
 
-    def _on_nearest_face(self, points: FloatArray) -> FloatArray:
+    def _nearest_face_points(self, points: FloatArray) -> FloatArray:
         """The nearest points (n, 3) of triangles that are the sheets, where the level lies between
         the values of f on both sides right beside them; NaN elsewhere."""
-        mesh, prepared = self.surface.field.mesh_of_sheets(), self._prepared
+        mesh, prepared = self.surface.field.jump_mesh(), self._prepared
         feet = np.full_like(points, np.nan)
         if mesh is None or not len(points):
             return feet
         real, index = prepared.backend.Float, prepared.backend.UInt32
 
         def nearest(p: Vec3) -> tuple[Vec3, Any, Vec3]:
-            none, always = (real(-1), index(NO_SHEET)), prepared.backend.Bool(True)
-            found = prepared.field.nearest_sheet(p, none, real(dr.inf), always)
-            return p + found.offset, found.sheet, found.normal
+            none, always = (real(-1), index(NO_FACET)), prepared.backend.Bool(True)
+            found = prepared.field.nearest_facet(p, none, real(dr.inf), always)
+            return p + found.offset, found.facet, found.normal
 
         y, sheet, normal = in_batches(prepared.backend, nearest, points)
         corners = mesh[0][mesh[1][sheet.astype(np.int64)]]
         y_within = y + _WITHIN_FACE * (corners.mean(axis=1) - y)
         way = _BESIDE_FACE * _size(self.surface, points) * normal
         sides = [self.surface.field.value(y_within + k * way, precision="double") for k in (1, -1)]
-        low, high = np.minimum(*sides) + _SURE, np.maximum(*sides) - _SURE
-        on = np.any([(low < one) & (one < high) for one in self.surface.numbers], axis=0)
+        low, high = np.minimum(*sides) + _LEVEL_MARGIN, np.maximum(*sides) - _LEVEL_MARGIN
+        on = np.any([(low < one) & (one < high) for one in self.surface.level_values], axis=0)
         feet[on] = y[on]
         return feet
 
-    def to_sheets(self, points: FloatArray) -> FloatArray:
+    def distance_to_jumps(self, points: FloatArray) -> FloatArray:
         """The distances (n,) to sheets, of the surface or not."""
         prepared = self._prepared
 
         def compute(p: Vec3) -> tuple[Real]:
-            return (prepared.field.distance_to_sheets(p),)
+            return (prepared.field.distance_to_jumps(p),)
 
         return in_batches(prepared.backend, compute, points)[0]
 
     def _on_sheets(self, points: FloatArray, start: FloatArray) -> FloatArray:
         x = np.concatenate([points, np.nan_to_num(start)])
-        search = SheetSearch(self._prepared, max(float(np.abs(x).max(initial=0)), 1e-30), _SHEETS)
+        search = JumpSurfaceSearch(
+            self._prepared, max(float(np.abs(x).max(initial=0)), 1e-30), _MAX_JUMPS_EXAMINED
+        )
 
         def look(p: Vec3, foot: Vec3) -> tuple[Vec3]:
-            away = length(foot - p)
+            away = safe_norm(foot - p)
             return (search.closest(p, dr.select(dr.isnan(away), dr.inf, away))[0],)
 
         (feet,) = in_batches(self._prepared.backend, look, points, start)
         return np.where(np.isnan(feet), start, feet)
 
-    def _within(self, feet: FloatArray) -> FloatArray:
+    def _inside_domain_or_nan(self, feet: FloatArray) -> FloatArray:
         """The points (n, 3), NaN for those outside the field's domain: the surface is cut there."""
         domain = self.surface.field.domain
         if domain is None or not len(feet):
@@ -322,14 +354,14 @@ class _Points:
         inside = domain.contains_points(np.nan_to_num(feet))
         return np.where(inside[:, None], feet, np.nan)
 
-    def polish(
+    def descend(
         self, points: FloatArray, start: FloatArray, limit: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """`search.Descents`: by descent, or with sheets by rays."""
-        if self.surface.field.has_sheets:
+        """`search.DescentMethods`: by descent, or with sheets by rays."""
+        if self.surface.field.has_jumps:
 
             def close(p: Vec3, start: Vec3) -> tuple[Vec3]:
-                return (close_in(self._prepared, p, start),)
+                return (compass_search(self._prepared, p, start),)
 
             return in_batches(self._prepared.backend, close, points, start)[0], np.zeros(
                 len(points)
@@ -338,7 +370,7 @@ class _Points:
         if is_far_off.any():
 
             def to_level(p: Vec3) -> tuple[Vec3]:
-                y = self._descent.onto_level(p)
+                y = self._descent.newton_to_level(p)
                 return (dr.select(dr.isnan(y.x), p, y),)
 
             start = start.copy()
@@ -350,7 +382,7 @@ class _Points:
         rows = np.flatnonzero(goes_on)
         if len(rows):
             feet[rows], free[rows] = in_batches(self.backend, self._descend, points[rows], y[rows])
-        feet = self._within(feet)
+        feet = self._inside_domain_or_nan(feet)
         left, rim = np.flatnonzero(np.isnan(feet[:, 0]) & (is_far == 0)), self._rim
         if rim is not None and len(left):  # out of the domain
 
@@ -358,23 +390,25 @@ class _Points:
                 return (rim.closest(p, y)[0],)
 
             (there,) = in_batches(self.backend, along, points[left], start[left])
-            feet[left], free[left] = self._within(there), 0
+            feet[left], free[left] = self._inside_domain_or_nan(there), 0
         return feet, free
 
-    def leave_boundary(
+    def descend_from_boundary(
         self, points: FloatArray, boundary: FloatArray, aside: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """`search.Descents`."""
+        """`search.DescentMethods`."""
 
         def level_away(p: Vec3, b: Vec3, length_: Vec3) -> tuple[Real]:
             way = p - b
-            sample = self._field.evaluate(b + length_.x / length(way) * way)
-            return (first_order(self.levels.to_nearest(sample.value), sample.gradient),)
+            sample = self._field.evaluate(b + length_.x / safe_norm(way) * way)
+            return (
+                first_order_distance(self.levels.offset_to_nearest(sample.value), sample.gradient),
+            )
 
         def beside(p: Vec3, b: Vec3, length_: Vec3) -> tuple[Vec3]:
             way = p - b
-            y = self._descent.onto_level(b + length_.x / length(way) * way)
-            towards = dr.dot(way, y - b) > -_AWAY * length(way) * length(y - b)
+            y = self._descent.newton_to_level(b + length_.x / safe_norm(way) * way)
+            towards = dr.dot(way, y - b) > -_MAX_OPPOSING_COSINE * safe_norm(way) * safe_norm(y - b)
             return (dr.select(towards, y, dr.nan),)
 
         feet, free = np.full_like(points, np.nan), np.zeros(len(points))
@@ -383,33 +417,33 @@ class _Points:
             return feet, free
         # Beside an edge f is the angle about it: to first order the level is as far as the arc.
         (away,) = in_batches(self.backend, level_away, points, boundary, lengths)
-        rows = np.flatnonzero(~(np.abs(away) > _LONGEST_ARC * aside))
+        rows = np.flatnonzero(~(np.abs(away) > _MAX_ARC_RADII * aside))
         start = points[rows]
         if len(rows):
             (start,) = in_batches(self.backend, beside, points[rows], boundary[rows], lengths[rows])
         rows, start = rows[~np.isnan(start[:, 0])], start[~np.isnan(start[:, 0])]
         if len(rows):
             feet[rows], free[rows] = in_batches(self.backend, self._descend, points[rows], start)
-        return self._within(feet), free
+        return self._inside_domain_or_nan(feet), free
 
-    def directly(self, x: Vec3, start: Vec3, limit: Real) -> tuple[Vec3, Real, Mask]:
-        """`search.Descents`."""
+    def newton_in_kernel(self, x: Vec3, start: Vec3, limit: Real) -> tuple[Vec3, Real, Mask]:
+        """`search.DescentMethods`."""
         p, vector = self.backend.Array3f(x), cast("Any", type(x))
         foot, _, free, goes_on, _ = self._newton(p, self.backend.Array3f(start), limit)
         if self._domain is not None:
-            slack = _ROUNDING * self.backend.epsilon * largest_coordinate(foot)
+            slack = _ROUNDING * self.backend.machine_epsilon * max_norm(foot)
             goes_on |= ~(self._domain.signed_distance(foot) < -slack)
         return vector(foot), type(x.x)(free), goes_on
 
     def _newton(self, p: Vec3, start: Vec3, limit: Real) -> tuple[Vec3, Vec3, Real, Mask, Mask]:
         """By Newton's method: feet, NaN where there is none; where the search goes on; radii about
         feet; whether it does go on, and whether it ends farther than `limit` away."""
-        y, first, is_lost, is_far = self._descent.directly(p, start, self.backend.Float(limit))
-        foot, found, free = self._descent.end(p, y)
-        most = (length(p - start) + 2 * first) * (1 + 64 * self.backend.epsilon)
-        most = dr.fma(64 * self.backend.epsilon, largest_coordinate(y), most)
+        y, first, is_lost, is_far = self._descent.newton(p, start, self.backend.Float(limit))
+        foot, found, free = self._descent.finish(p, y)
+        most = (safe_norm(p - start) + 2 * first) * (1 + 64 * self.backend.machine_epsilon)
+        most = dr.fma(64 * self.backend.machine_epsilon, max_norm(y), most)
         is_lost |= is_far
-        is_foot = found & ~is_lost & (length(p - foot) <= most)
+        is_foot = found & ~is_lost & (safe_norm(p - foot) <= most)
         return dr.select(is_foot, foot, dr.nan), y, free, ~(found | is_lost), is_far
 
     def _directly(self, p: Vec3, start: Vec3, limit: Vec3) -> tuple[Vec3, Vec3, Real, Real, Real]:
@@ -419,10 +453,10 @@ class _Points:
         return *found, dr.select(goes_on, one, zero), dr.select(is_far, one, zero)
 
     def _descend(self, p: Vec3, start: Vec3) -> tuple[Vec3, Real]:
-        y, found, on_level = self._descent.closest(p, start)
-        return dr.select(on_level, y, dr.nan), dr.select(found, self._descent.end(p, y)[2], 0)
+        y, found, on_level = self._descent.descend(p, start)
+        return dr.select(on_level, y, dr.nan), dr.select(found, self._descent.finish(p, y)[2], 0)
 
-    def refined(self, points: FloatArray, feet: FloatArray) -> FloatArray:
+    def remove_truncation(self, points: FloatArray, feet: FloatArray) -> FloatArray:
         """The feet (n, 3) moved onto the level of the field without what clusters leave out: by
         Newton's method for the closest point, else straight to the level."""
         rows = np.flatnonzero(np.isfinite(feet[:, 0]))
@@ -431,7 +465,7 @@ class _Points:
             return feet
 
         def to_level(start: Vec3) -> tuple[Vec3]:
-            y = exact.onto_level(start)
+            y = exact.newton_to_level(start)
             return (dr.select(dr.isfinite(dr.squared_norm(y)), y, start),)
 
         feet = feet.copy()
@@ -439,11 +473,13 @@ class _Points:
         left = np.flatnonzero(np.isnan(there[:, 0]))
         if len(left):
             (there[left],) = in_batches(self.backend, to_level, feet[rows[left]])
-        inside = ~np.isnan(self._within(there)[:, 0])
+        inside = ~np.isnan(self._inside_domain_or_nan(there)[:, 0])
         feet[rows[inside]] = there[inside]
         return feet
 
-    def _corrected(self, exact: Descent, points: FloatArray, feet: FloatArray) -> FloatArray:
+    def _corrected(
+        self, exact: ClosestPointDescent, points: FloatArray, feet: FloatArray
+    ) -> FloatArray:
         """The feet (n, 3) on the level of the exact field, NaN where they are not found.
 
         What clusters leave out hardly changes on the way, and costs as much as all of the field: so
@@ -459,17 +495,17 @@ class _Points:
             return vector(one.value - other.value), vector(one.gradient) - vector(other.gradient)
 
         def newton(p: Vec3, y: Vec3, value: Vec3, slope: Vec3) -> tuple[Vec3]:
-            field = _Corrected(rough.field, y, value.x, slope)
+            field = _LinearlyShiftedField(rough.field, y, value.x, slope)
             descent = replace(rough, field=field)
-            end, _, is_lost, _ = descent.directly(p, y, self.backend.Float(dr.inf))
-            foot, found, _ = descent.end(p, end)
+            end, _, is_lost, _ = descent.newton(p, y, self.backend.Float(dr.inf))
+            foot, found, _ = descent.finish(p, end)
             return (dr.select(found & ~is_lost, foot, dr.nan),)
 
         def on_level(p: Vec3, y: Vec3) -> tuple[Vec3]:
             return (exact.last_step(p, y),)
 
         feet, rows = feet.copy(), np.arange(len(feet))
-        for _ in range(_CORRECTIONS):
+        for _ in range(_TRUNCATION_CORRECTIONS):
             if len(rows):
                 given = points[rows], feet[rows], *in_batches(self.backend, left_out, feet[rows])
                 (feet[rows],) = in_batches(self.backend, newton, *given)
@@ -478,7 +514,7 @@ class _Points:
             (feet[rows],) = in_batches(self.backend, on_level, points[rows], feet[rows])
         return feet
 
-    def noise(self, feet: FloatArray) -> FloatArray:
+    def level_uncertainty(self, feet: FloatArray) -> FloatArray:
         """How far rounding and approximation may have moved the level at feet (n, 3)."""
         if not len(feet):
             return np.zeros(0)
@@ -489,7 +525,7 @@ class _Points:
         return in_batches(self.backend, compute, feet)[0]
 
 
-class _Corrected(Field):
+class _LinearlyShiftedField(Field):
     """A field plus a linear function of the way from a point, other ones in each lane; its error is
     what rounding does."""
 
@@ -500,9 +536,11 @@ class _Corrected(Field):
         sample = self._field.evaluate(p)
         shifted = sample.shifted(dr.dot(self._slope, p - self._at) + self._value)
         return replace(
-            shifted, gradient=sample.gradient + self._slope, error=sample.error - sample.truncation,
-            truncation=0.0,
-        )  # fmt: skip
+            shifted,
+            gradient=sample.gradient + self._slope,
+            value_error=sample.value_error - sample.truncation_error,
+            truncation_error=0.0,
+        )
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         return self._field.hessian(p)
@@ -514,7 +552,7 @@ def _length(vectors: FloatArray) -> FloatArray:
     return np.hypot(np.hypot(x, y), z)
 
 
-def _size(surface: LevelSet, points: FloatArray) -> float:
+def _size(surface: Surface, points: FloatArray) -> float:
     """The size of the surface, or of the points where it is unknown."""
     if surface.volume is not None:
         lower, upper = surface.volume.bounds()

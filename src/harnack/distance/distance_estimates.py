@@ -11,12 +11,12 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import FloatArray, choose_backend
-from harnack.backend.validation import refuses_derivatives
-from harnack.cluster.dask_arrays import takes_blocks
-from harnack.distance.closest_point_search import Closest, find_closest
-from harnack.distance.tangent_plane import first_order, in_batches, second_order
-from harnack.enclosures import TargetLevels
-from harnack.fields.clearance import distance_below
+from harnack.backend.validation import no_derivatives
+from harnack.cluster.dask_arrays import accepts_dask_arrays
+from harnack.distance.closest_point_search import ClosestPoints, find_closest
+from harnack.distance.tangent_plane import first_order_distance, in_batches, second_order_distance
+from harnack.enclosures import Levels
+from harnack.fields.clearance import level_distance_lower_bound
 from harnack.fields.field import Field, check_is_field
 from harnack.name_suggestions import did_you_mean, is_one_of
 from harnack.progress import teller
@@ -24,23 +24,23 @@ from harnack.tracer import level_set
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Precision, Real, Vec3
-    from harnack.tracer import LevelSet
+    from harnack.tracer import Surface
 
 __all__ = ["DistanceBounds", "Method", "closest_points", "distance_bounds", "signed_distance"]
 
-Method = Literal["first", "second", "newton", "lower"]
+Method = Literal["first_order", "second_order", "closest_point", "lower_bound"]
 # As close as rounding allows: the tracer raises it to that.
 _CLOSE = 1e-15
 
 
-@takes_blocks("points")
-@refuses_derivatives
+@accepts_dask_arrays("points")
+@no_derivatives
 def signed_distance(
     field: Field,
     points: Any,
     *,
     level: Any = None,
-    method: Method = "newton",
+    method: Method = "closest_point",
     precision: Precision = "double",
     progress: Callable[[str], None] | None = None,
 ) -> FloatArray:
@@ -50,56 +50,58 @@ def signed_distance(
         angle-valued field every level stands for all that differ from it by periods, and the sign
         is that of the one nearest in value.
     method:
-        "first": (f - level)/|grad f|. Off by O(d^2) at distance d; infinite where grad f = 0.
-        "second": the same with the curvature of f along its gradient. Off by O(d^3); needs the
+        "first_order": (f - level)/|grad f|. Off by O(d^2) at distance d; infinite where grad f = 0.
+        "second_order": the same with the curvature of f along its gradient. Off by O(d^3); needs
+        the
             field's `hessian`.
-        "newton": to the nearest point of the surface that a search finds (`closest_points` says
+        "closest_point": to the nearest point of the surface that a search finds (`closest_points`
+        says
             how): an upper bound of the distance, exact to rounding if that is the nearest of all.
             `distance_bounds` says what is proved about it. Of a closed triangle mesh, and of the
             boundary of the solid of one, it is exact to rounding. NaN, with a RuntimeWarning that
             counts them, where no surface is found at all, as where there is none, or only within a
             radius that the field promises to be free.
-        "lower": never longer in size than the true distance, with proof: no level lies in the
+        "lower_bound": never longer in size than the true distance, with proof: no level lies in the
             ball of that radius about the point, not even outside the field's domain. Of first
             order too: the nearer the surface, the smaller the share that it falls short by.
-        Of a field that jumps across sheets, "first" and "second" see the smooth part of the
-        surface, and the nearest sheet if that is nearer and the surface lies there.
-    precision: of the computation; "lower" allows for rounding in both. The search of "newton" is
-        done in double precision in any case.
+        Of a field that jumps across sheets, "first_order" and "second_order" see the smooth part of
+        the surface, and the nearest sheet if that is nearer and the surface lies there.
+    precision: of the computation; "lower_bound" allows for rounding in both. The search of
+        "closest_point" is done in double precision in any case.
     progress: told what is being done.
 
     Raises:
         TypeError, ValueError: points that are not an (n, 3) array of finite numbers, an unknown
-            method, a level that no surface has or, with "lower", points outside the field's
+            method, a level that no surface has or, with "lower_bound", points outside the field's
             domain, where it promises nothing.
-        NotImplementedError: "second" with a field that has no second derivatives.
+        NotImplementedError: "second_order" with a field that has no second derivatives.
     """
     if not is_one_of(method, get_args(Method)):
         known = ", ".join(f'"{one}"' for one in get_args(Method))
         hint = did_you_mean(method, get_args(Method))
         raise ValueError(f"unknown method {method!r}; choose one of {known}{hint}")
-    if method == "newton":
-        found = _found("signed_distance", field, points, level, precision, progress)
-        return np.copysign(found.distance, found.above)
+    if method == "closest_point":
+        found = _find("signed_distance", field, points, level, precision, progress)
+        return np.copysign(found.distance, found.signed_value)
     backend = choose_backend(precision)
     surface = _surface(field, level)
-    levels, prepared = surface.levels_on(backend), surface.field_on(backend)
+    levels, prepared = surface.target_levels(backend), surface.evaluator(backend)
     compute = _COMPUTE[method]
 
     def of_points(p: Vec3) -> tuple[Real | Vec3, ...]:
         return p, compute(backend, prepared, levels, p)
 
     x, result = in_batches(backend, of_points, points)
-    if method == "lower":
+    if method == "lower_bound":
         _check_domain(field, x)
-    if field.has_sheets and method != "lower":
+    if field.has_jumps and method != "lower_bound":
         to_sheet = find_closest(backend, surface, levels, x, teller(None)).distance
         result = np.copysign(np.fmin(to_sheet, np.abs(result)), result)
     return result
 
 
-@takes_blocks("points")
-@refuses_derivatives
+@accepts_dask_arrays("points")
+@no_derivatives
 def closest_points(
     field: Field,
     points: Any,
@@ -121,26 +123,26 @@ def closest_points(
     Raises:
         TypeError, ValueError: as `signed_distance`.
     """
-    found = _found("closest_points", field, points, level, precision, progress)
-    return found.feet
+    found = _find("closest_points", field, points, level, precision, progress)
+    return found.closest
 
 
 @dataclass(frozen=True)
 class DistanceBounds:
     """What is known about distances to a surface. The true distance d has lower <= d <= upper.
 
-    feet: (n, 3) points of the surface, NaN where none was found.
+    closest_points: (n, 3) points of the surface, NaN where none was found.
     upper: (n,) distances to these; NaN likewise. lower: (n,) proved; infinite where there is proved
         to be no surface.
     """
 
-    feet: FloatArray
+    closest_points: FloatArray
     upper: FloatArray
     lower: FloatArray
 
 
-@takes_blocks("points")
-@refuses_derivatives
+@accepts_dask_arrays("points")
+@no_derivatives
 def distance_bounds(
     field: Field,
     points: Any,
@@ -164,36 +166,36 @@ def distance_bounds(
     Raises:
         TypeError, ValueError: as `signed_distance`.
     """
-    found = _found("distance_bounds", field, points, level, precision, progress, is_proved=True)
-    return DistanceBounds(found.feet, found.distance, found.lower)
+    found = _find("distance_bounds", field, points, level, precision, progress, is_proved=True)
+    return DistanceBounds(found.closest, found.distance, found.lower)
 
 
-def _found(
+def _find(
     name: str, field: Field, points: Any, level: Any, precision: Precision,
     progress: Callable[[str], None] | None, *, is_proved: bool = False,
-) -> Closest:  # fmt: skip
+) -> ClosestPoints:  # fmt: skip
     backend = choose_backend(precision)
     surface = _surface(field, level)
-    levels = surface.levels_on(backend)
+    levels = surface.target_levels(backend)
     found = find_closest(backend, surface, levels, points, teller(progress), is_proved=is_proved)
     _warn(name, found)
     return found
 
 
-def _surface(field: Field, level: Any) -> LevelSet:
+def _surface(field: Field, level: Any) -> Surface:
     check_is_field(field)
-    if field.has_sheets and type(field).distance_to_sheets is Field.distance_to_sheets:
+    if field.has_jumps and type(field).distance_to_jumps is Field.distance_to_jumps:
         raise NotImplementedError(
-            f"{type(field).__name__} has sheets but does not say how far they are: define its "
-            "method distance_to_sheets(p)"
+            f"{type(field).__name__} has jumps but does not say how far they are: define its "
+            "method distance_to_jumps(p)"
         )
-    return level_set(field, level, tolerance=_CLOSE, overstep=1.0).in_one_call()
+    return level_set(field, level, tolerance=_CLOSE, overstep=1.0).with_call_cache()
 
 
-def _warn(name: str, found: Closest) -> None:
+def _warn(name: str, found: ClosestPoints) -> None:
     """Of points without an answer, and of answers that a promise of the field contradicts."""
-    n = len(found.feet)
-    unresolved = int(np.isnan(found.feet[:, 0]).sum())
+    n = len(found.closest)
+    unresolved = int(np.isnan(found.closest[:, 0]).sum())
     if unresolved:
         warnings.warn(
             f"{name}: no closest point was found for {unresolved} of {n} points (NaN): no cell "
@@ -201,12 +203,12 @@ def _warn(name: str, found: Closest) -> None:
             RuntimeWarning,
             stacklevel=4,
         )
-    refused = int(found.is_refused.sum())
+    refused = int(found.violates_promises.sum())
     if refused:
         warnings.warn(
             f"{name}: for {refused} of {n} points, points of the surface were found within the "
             "radius that the field's own promises prove to be free of it, and left out: the "
-            "promises in `Sample.known` do not hold (harnack.testing.check_field tests them)",
+            "promises in `Sample.promises` do not hold (harnack.testing.check_field tests them)",
             RuntimeWarning,
             stacklevel=4,
         )
@@ -224,26 +226,26 @@ def _check_domain(field: Field, points: FloatArray) -> None:
         )
 
 
-def _first(backend: Backend, field: Field, levels: TargetLevels, p: Vec3) -> Real:
+def _first(backend: Backend, field: Field, levels: Levels, p: Vec3) -> Real:
     del backend
     sample = field.evaluate(p)
-    return first_order(-levels.to_nearest(sample.value), sample.gradient)
+    return first_order_distance(-levels.offset_to_nearest(sample.value), sample.gradient)
 
 
-def _second(backend: Backend, field: Field, levels: TargetLevels, p: Vec3) -> Real:
+def _second(backend: Backend, field: Field, levels: Levels, p: Vec3) -> Real:
     del backend
     sample, rows = field.evaluate(p), field.hessian(p)
-    return second_order(-levels.to_nearest(sample.value), sample.gradient, rows)
+    return second_order_distance(-levels.offset_to_nearest(sample.value), sample.gradient, rows)
 
 
-def _lower(backend: Backend, field: Field, levels: TargetLevels, p: Vec3) -> Real:
+def _lower(backend: Backend, field: Field, levels: Levels, p: Vec3) -> Real:
     sample = field.evaluate(p)
-    above = -levels.to_nearest(sample.value)
-    return dr.copysign(distance_below(backend, field, levels, p, sample), above)
+    above = -levels.offset_to_nearest(sample.value)
+    return dr.copysign(level_distance_lower_bound(backend, field, levels, p, sample), above)
 
 
-_COMPUTE: dict[str, Callable[[Backend, Field, TargetLevels, Vec3], Real]] = {
-    "first": _first,
-    "second": _second,
-    "lower": _lower,
+_COMPUTE: dict[str, Callable[[Backend, Field, Levels, Vec3], Real]] = {
+    "first_order": _first,
+    "second_order": _second,
+    "lower_bound": _lower,
 }

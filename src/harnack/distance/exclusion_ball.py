@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import drjit as dr
 
-from harnack.backend.elementary import fmax, fmin, length
-from harnack.distance.cell_classification import remainder
-from harnack.distance.tangent_plane import Eigen, TangentPlane, apply
+from harnack.backend.elementary import fmax, fmin, safe_norm
+from harnack.distance.cell_classification import taylor_remainder
+from harnack.distance.tangent_plane import SymmetricEigen2, TangentPlane, matvec
 
 if TYPE_CHECKING:
     from harnack.backend import Real, Vec3
@@ -17,16 +17,16 @@ if TYPE_CHECKING:
 
     Rows: TypeAlias = tuple[Vec3, Vec3, Vec3]
 
-__all__ = ["free_radius"]
+__all__ = ["exclusion_radius"]
 
 # Radii that are tried, in distances of the foot: powers of two.
-_POWERS = range(8, -12, -1)
-_LEAST = 1 / 64
+_RADIUS_EXPONENTS = range(8, -12, -1)
+_PROOF_MARGIN = 1 / 64
 """What has to be left of 1 in the proof: it covers the rounding of second derivatives, and that
 x - y is at right angles to the surface up to the square root of epsilon only."""
 
 
-def free_radius(sample: Sample, rows: Rows | None, x: Vec3, y: Vec3) -> Real:
+def exclusion_radius(sample: Sample, rows: Rows | None, x: Vec3, y: Vec3) -> Real:
     """A radius about y, the foot of x at right angles to the surface, in which no point of the
     surface is nearer to x; 0 where none is proved.
 
@@ -46,41 +46,41 @@ def free_radius(sample: Sample, rows: Rows | None, x: Vec3, y: Vec3) -> Real:
     so that in the inequality above 1 - 2 d c may be replaced by
     1 + d/|g| (k - 2 c r a - c^2 r^2 b - 2 R2/r^2). Here c also is at most (|H|/2 + R2/r^2)/|g|.
     """
-    steep, d = length(sample.gradient), length(x - y)
-    curved = None if rows is None else _Curved.of(sample, rows, x - y)
+    steep, d = safe_norm(sample.gradient), safe_norm(x - y)
+    curved = None if rows is None else _HessianBounds.of(sample, rows, x - y)
     best = 0 * d
-    for power in _POWERS:
+    for power in _RADIUS_EXPONENTS:
         r = fmax(d, 1e-12) * 2.0**power
-        first = remainder(sample, r) / (r * r)
+        first = taylor_remainder(sample, r) / (r * r)
         left = 1 - 2 * d * first / steep
         if curved is not None:
-            second = remainder(sample, r, 2) / (r * r)
+            second = taylor_remainder(sample, r, 2) / (r * r)
             c = fmin(first, curved.half_norm + second) * r / steep
-            lift = curved.least - c * (2 * curved.across + c * curved.along)
+            lift = curved.least_tangential - c * (2 * curved.across + c * curved.along)
             left = fmax(left, 1 + d / steep * (lift - 2 * second))
-        best = dr.select((best == 0) & (left >= _LEAST), r, best)
+        best = dr.select((best == 0) & (left >= _PROOF_MARGIN), r, best)
     return best
 
 
 @dataclass(frozen=True)
-class _Curved:
+class _HessianBounds:
     """Of the Hessian H of f, taken with the sign for which x - y is along its gradient: the least
     eigenvalue in the tangent plane, if it is negative; |Hn - (n.Hn) n|; |n.Hn|; and at least half
     the norm."""
 
-    least: Real
+    least_tangential: Real
     across: Real
     along: Real
     half_norm: Real
 
     @classmethod
-    def of(cls, sample: Sample, rows: Rows, way: Vec3) -> _Curved:
+    def of(cls, sample: Sample, rows: Rows, way: Vec3) -> _HessianBounds:
         plane = TangentPlane.of(sample.gradient)
-        eigen = Eigen.of(*plane.restricted(rows))
-        least = dr.select(dr.dot(way, plane.n) > 0, eigen.least, -eigen.most)
-        bent = apply(rows, plane.n)
+        eigen = SymmetricEigen2.of(*plane.restrict_hessian(rows))
+        least = dr.select(dr.dot(way, plane.n) > 0, eigen.smallest, -eigen.largest)
+        bent = matvec(rows, plane.n)
         squares = dr.squared_norm(rows[0]) + dr.squared_norm(rows[1]) + dr.squared_norm(rows[2])
         return cls(
-            fmin(least, 0), length(dr.cross(bent, plane.n)), dr.abs(dr.dot(bent, plane.n)),
+            fmin(least, 0), safe_norm(dr.cross(bent, plane.n)), dr.abs(dr.dot(bent, plane.n)),
             0.5 * dr.sqrt(squares),
         )  # fmt: skip

@@ -14,19 +14,19 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import drjit as dr
 
-from harnack.backend.elementary import across, fmax, fmin, largest_coordinate
-from harnack.fields.capabilities import NO_SHEET, Crossing, NearestSheet
-from harnack.tracer import Status
+from harnack.backend.elementary import fmax, fmin, max_norm, orthonormal_basis
+from harnack.fields.capabilities import NO_FACET, JumpCrossing, NearestFacet
+from harnack.tracer import RayStatus
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.fields.field import Field
-    from harnack.tracer.surface_tracer import MarchResult, PreparedLevelSet
+    from harnack.tracer.surface_tracer import MarchResult, SurfaceTracer
 
-__all__ = ["SheetSearch", "close_in", "is_on_surface", "takes_level"]
+__all__ = ["JumpSurfaceSearch", "compass_search", "is_on_surface", "straddles_level"]
 
 # Half the length of a ray through a point of a sheet, in epsilons of coordinates.
-_SHORT = 32.0
+_PROBE_HALF_LENGTH = 32.0
 # A regular tetrahedron about the origin, turned so that none of its edges lies in a plane that
 # triangles of meshes often lie in; and its six edges.
 _CORNERS = (
@@ -37,22 +37,22 @@ _CORNERS = (
 )
 _EDGES = ((0, 1), (1, 2), (2, 3), (3, 0), (0, 2), (1, 3))
 # In these lengths: the distance from y at which f is evaluated, where rounding of y hardly counts.
-_WIDER = 64.0
+_SIGN_TEST_SCALE = 64.0
 # Before a sheet f is evaluated at this part of the way to it.
 _BEFORE = 0.98
 
-Next: TypeAlias = "Callable[[tuple[Any, Any], Any, Any], NearestSheet]"
+NextJump: TypeAlias = "Callable[[tuple[Any, Any], Any, Any], NearestFacet]"
 
 
 @dataclass(frozen=True)
-class SheetSearch:
+class JumpSurfaceSearch:
     """The search for the closest point of a prepared surface that lies on a sheet.
 
     scale: at least the coordinates that the field computes with, for what rounding does.
     most: sheets that are examined for each point.
     """
 
-    surface: PreparedLevelSet
+    surface: SurfaceTracer
     scale: float
     most: int
 
@@ -72,26 +72,28 @@ class SheetSearch:
         """
         backend = self.surface.backend
         real, index, vector = backend.Float, backend.UInt32, backend.Array3f
-        following = self._following(x)
+        following = self._next_jump(x)
         most = dr.opaque(index, self.most)
-        short = _SHORT * backend.epsilon * fmax(real(self.scale), dr.max(dr.abs(x)))
+        short = (
+            _PROBE_HALF_LENGTH * backend.machine_epsilon * fmax(real(self.scale), dr.max(dr.abs(x)))
+        )
         limit = real(limit)
-        nothing = NearestSheet(
-            real(-1), index(NO_SHEET), vector(dr.inf), vector(0), backend.Bool(False)
+        nothing = NearestFacet(
+            real(-1), index(NO_FACET), vector(dr.inf), vector(0), backend.Bool(False)
         )
 
         def body(*state: Any) -> tuple[Any, ...]:
-            last = NearestSheet(*state[:5])
+            last = NearestFacet(*state[:5])
             probe, foot, nearest, n, active = state[5:]
             fresh = active & (probe == 0)
-            found = following((last.order, last.sheet), limit, fresh)
-            near = _where(fresh, found, last)
-            active &= near.sheet != NO_SHEET
+            found = following((last.sort_key, last.facet), limit, fresh)
+            near = _select(fresh, found, last)
+            active &= near.facet != NO_FACET
             nearest = dr.select(active & fresh & (n == 0), near.offset, nearest)
             y = x + near.offset
             start, end = _probe(vector, probe, near.normal)
-            met, sheet, at = self._meets(y, short, start, end, active)
-            at = dr.select((sheet == near.sheet) & (probe == 0), y, at)
+            met, sheet, at = self._probe_hits(y, short, start, end, active)
+            at = dr.select((sheet == near.facet) & (probe == 0), y, at)
             foot = dr.select(met, at, foot)
             n = n + dr.select(fresh, index(1), 0)
             last_probe = near.is_inner | (probe == len(_EDGES))
@@ -109,7 +111,7 @@ class SheetSearch:
         *_, foot, nearest, _, _ = dr.while_loop(start, more, body, label="sheets in turn")
         return foot, nearest
 
-    def _meets(
+    def _probe_hits(
         self, y: Vec3, short: Real, start: Vec3, end: Vec3, active: Mask
     ) -> tuple[Mask, Any, Vec3]:
         """Whether the way between two points about y, in lengths of `short`, meets the surface; the
@@ -119,31 +121,31 @@ class SheetSearch:
         o = dr.fma(vector(short), start, y)
         way, length = (end - start) / dr.norm(end - start), dr.norm(end - start)
         seen = self.surface.first_hit(o, way, real(0), short * length, active)
-        met = active & (seen.status == int(Status.HIT))
+        met = active & (seen.status == int(RayStatus.HIT))
         # To first order any level is near where the gradient has no bound, as at the sheet's edge.
-        met &= takes_level(self.surface, y, _WIDER * short, met)
-        return met, seen.sheet, dr.fma(vector(seen.t), way, o)
+        met &= straddles_level(self.surface, y, _SIGN_TEST_SCALE * short, met)
+        return met, seen.facet, dr.fma(vector(seen.t), way, o)
 
-    def _following(self, x: Vec3) -> Next:
+    def _next_jump(self, x: Vec3) -> NextJump:
         """The sheets of the field in turn; of a field that does not tell them, the nearest
         alone."""
         field, backend = self.surface.field, self.surface.backend
         real, index = backend.Float, backend.UInt32
-        probe = field.nearest_sheet(x, (real(-1), index(NO_SHEET)), real(0), backend.Bool(False))
+        probe = field.nearest_facet(x, (real(-1), index(NO_FACET)), real(0), backend.Bool(False))
         if probe is None:
-            only = _by_differences(backend, field, x)
+            only = _nearest_jump_by_differences(backend, field, x)
 
-            def once(after: tuple[Real, Any], limit: Real, active: Mask) -> NearestSheet:
+            def once(after: tuple[Real, Any], limit: Real, active: Mask) -> NearestFacet:
                 del active
-                fresh = (after[0] < 0) & (only.order < limit)
-                order = dr.select(fresh, only.order, dr.inf)
-                sheet = dr.select(fresh, only.sheet, index(NO_SHEET))
-                return NearestSheet(order, sheet, only.offset, only.normal, only.is_inner)
+                fresh = (after[0] < 0) & (only.sort_key < limit)
+                order = dr.select(fresh, only.sort_key, dr.inf)
+                sheet = dr.select(fresh, only.facet, index(NO_FACET))
+                return NearestFacet(order, sheet, only.offset, only.normal, only.is_inner)
 
             return once
 
-        def told(after: tuple[Real, Any], limit: Real, active: Mask) -> NearestSheet:
-            found = field.nearest_sheet(x, after, limit, active)
+        def told(after: tuple[Real, Any], limit: Real, active: Mask) -> NearestFacet:
+            found = field.nearest_facet(x, after, limit, active)
             if found is None:
                 raise RuntimeError("nearest_sheet tells sheets at some times and not at others")
             return found
@@ -151,7 +153,7 @@ class SheetSearch:
         return told
 
 
-def takes_level(surface: PreparedLevelSet, y: Vec3, radius: Real, active: Mask) -> Mask:
+def straddles_level(surface: SurfaceTracer, y: Vec3, radius: Real, active: Mask) -> Mask:
     """Whether f is on both sides of a level about y, no farther than 1.74 radii away.
 
     f is evaluated in the corners of a tetrahedron and, on its edges, just before a sheet. Where two
@@ -160,7 +162,7 @@ def takes_level(surface: PreparedLevelSet, y: Vec3, radius: Real, active: Mask) 
     edges of sheets: f takes all values between those on both sides of the sheet there, and no
     others.
     """
-    backend, field = surface.backend, surface.field.without_truncation(surface.backend)
+    backend, field = surface.backend, surface.field.exact(surface.backend)
     real, index, vector = backend.Float, backend.UInt32, backend.Array3f
     nowhere = vector(0)
 
@@ -169,8 +171,8 @@ def takes_level(surface: PreparedLevelSet, y: Vec3, radius: Real, active: Mask) 
         o = dr.fma(vector(radius), start, y)
         length = dr.norm(end - start)
         way, reach = (end - start) / length, radius * length
-        behind = Crossing(real(0), index(NO_SHEET), real(0), nowhere)
-        t = real(field.next_crossing(o, way, behind, reach, active).t)
+        behind = JumpCrossing(real(0), index(NO_FACET), real(0), nowhere)
+        t = real(field.next_jump(o, way, behind, reach, active).t)
         inside = dr.select(t < reach, t, 0.5 * reach)
         for share in (real(0), _BEFORE * inside):
             value = real(field.evaluate(dr.fma(vector(share), way, o)).value)
@@ -182,16 +184,16 @@ def takes_level(surface: PreparedLevelSet, y: Vec3, radius: Real, active: Mask) 
 
     start = index(0), real(dr.inf), real(-dr.inf), backend.Bool(active)
     _, low, high, _ = dr.while_loop(start, more, body, label="sides of a level")
-    return (low < high) & (surface.levels.gaps(low).up < high - low)
+    return (low < high) & (surface.levels.gaps(low).above < high - low)
 
 
-def _parts(near: NearestSheet) -> tuple[Any, ...]:
-    return near.order, near.sheet, near.offset, near.normal, near.is_inner
+def _parts(near: NearestFacet) -> tuple[Any, ...]:
+    return near.sort_key, near.facet, near.offset, near.normal, near.is_inner
 
 
-def _where(mask: Mask, one: NearestSheet, other: NearestSheet) -> NearestSheet:
+def _select(mask: Mask, one: NearestFacet, other: NearestFacet) -> NearestFacet:
     pairs = zip(_parts(one), _parts(other), strict=True)
-    return NearestSheet(*(dr.select(mask, a, b) for a, b in pairs))
+    return NearestFacet(*(dr.select(mask, a, b) for a, b in pairs))
 
 
 def _probe(vector: Any, number: Any, normal: Vec3) -> tuple[Vec3, Vec3]:
@@ -203,7 +205,7 @@ def _probe(vector: Any, number: Any, normal: Vec3) -> tuple[Vec3, Vec3]:
     return start, end
 
 
-def _by_differences(backend: Backend, field: Field, x: Vec3) -> NearestSheet:
+def _nearest_jump_by_differences(backend: Backend, field: Field, x: Vec3) -> NearestFacet:
     """The nearest sheet to x, from its distance d alone: along the way on which d falls.
 
     Central differences over h = r d are off by r^2, and by epsilon s/(r d) as rounding moves d by
@@ -211,20 +213,20 @@ def _by_differences(backend: Backend, field: Field, x: Vec3) -> NearestSheet:
     distances of a few roundings. There any direction serves: y = x is on the sheet to rounding.
     """
     real, vector = backend.Float, backend.Array3f
-    d = real(field.distance_to_sheets(x))
+    d = real(field.distance_to_jumps(x))
     size = fmax(dr.max(dr.abs(x)), d)
-    h = d * fmin(dr.cbrt(backend.epsilon * size / d), 0.5)
+    h = d * fmin(dr.cbrt(backend.machine_epsilon * size / d), 0.5)
     rate: list[Real] = []
     for axis in range(3):
         move = vector(*(h if k == axis else 0 for k in range(3)))
-        ahead, back = (field.distance_to_sheets(q) for q in (x + move, x - move))
+        ahead, back = (field.distance_to_jumps(q) for q in (x + move, x - move))
         rate.append(back - ahead)
     fall = vector(*rate)
     gradient_norm = dr.norm(fall)
-    has_direction = (gradient_norm > 0.2 * h) & (d > 64 * backend.epsilon * size)
+    has_direction = (gradient_norm > 0.2 * h) & (d > 64 * backend.machine_epsilon * size)
     way = dr.select(has_direction, fall / gradient_norm, vector(1 / math.sqrt(3)))
     offset = dr.select(has_direction, d * way, 0)
-    return NearestSheet(d, backend.UInt32(0), offset, way, backend.Bool(False))
+    return NearestFacet(d, backend.UInt32(0), offset, way, backend.Bool(False))
 
 
 # Nearer points by rays.
@@ -233,35 +235,35 @@ _MOST_RAYS = 600
 # Rays of a turn, which all have to fail before the next turn is narrower: those to where planes
 # meet, then those near the best direction, about 137.5 degrees apart, so that however many there
 # are they are spread evenly, and no turn repeats the one before.
-_MEETINGS, _TILTED, _GOLDEN = 4, 8, 2.399963229728653
+_PLANE_TRIALS, _TILTED, _GOLDEN = 4, 8, 2.399963229728653
 # Steps are tangents of angles.
-_WIDEST, _CLOSER = 1.0, 0.25
+_INITIAL_STEP, _STEP_REDUCTION = 1.0, 0.25
 # Rays that leave in directions all over the sphere before that.
-_AROUND = 128
+_SPHERE_RAYS = 128
 # Planes whose normals are closer than this, as the sine of an angle, count as the same.
 _APART = 1e-3
 # In epsilons, of coordinates: so far from a hit f is evaluated on both sides of the level.
-_ABOUT = 1024.0
+_HIT_TEST_RADIUS = 1024.0
 
 
 @dataclass(frozen=True)
-class _TouchingPlane:
+class _HitPlane:
     """Points x + r with r.normal = offset, |normal| = 1; normal = 0 where there is no plane."""
 
     normal: Vec3
     offset: Real
 
     @classmethod
-    def where(cls, mask: Mask, one: _TouchingPlane, other: _TouchingPlane) -> _TouchingPlane:
+    def where(cls, mask: Mask, one: _HitPlane, other: _HitPlane) -> _HitPlane:
         """One plane in some lanes, another elsewhere."""
         normal = dr.select(mask, one.normal, other.normal)
         return cls(normal, dr.select(mask, one.offset, other.offset))
 
-    def is_apart(self, other: _TouchingPlane) -> Mask:
+    def is_apart(self, other: _HitPlane) -> Mask:
         """Whether both are planes, and not nearly parallel."""
         return dr.squared_norm(dr.cross(self.normal, other.normal)) > _APART * _APART
 
-    def meeting(self, other: _TouchingPlane) -> Vec3:
+    def nearest_on_line(self, other: _HitPlane) -> Vec3:
         """The shortest way to where both are; not finite if they are parallel."""
         vector = cast("Any", type(self.normal))
         cosine = dr.dot(self.normal, other.normal)
@@ -270,7 +272,7 @@ class _TouchingPlane:
             1 - cosine * cosine
         )
 
-    def corner(self, second: _TouchingPlane, third: _TouchingPlane) -> Vec3:
+    def intersection_point(self, second: _HitPlane, third: _HitPlane) -> Vec3:
         """The way to where all three are; not finite if they are parallel to a line."""
         vector = cast("Any", type(self.normal))
         a, b, c = self.normal, second.normal, third.normal
@@ -281,18 +283,18 @@ class _TouchingPlane:
 
 
 @dataclass(frozen=True)
-class _TouchingPlanes:
+class _HitPlanes:
     """Three planes that touch the surface: where the best point is, then the two last seen that are
     parallel neither to it nor to one another."""
 
-    first: _TouchingPlane
-    second: _TouchingPlane
-    third: _TouchingPlane
+    first: _HitPlane
+    second: _HitPlane
+    third: _HitPlane
 
     @classmethod
-    def of(cls, parts: tuple[Any, ...]) -> _TouchingPlanes:
+    def of(cls, parts: tuple[Any, ...]) -> _HitPlanes:
         """From `parts`."""
-        return cls(*(_TouchingPlane(parts[k], parts[k + 1]) for k in (0, 2, 4)))
+        return cls(*(_HitPlane(parts[k], parts[k + 1]) for k in (0, 2, 4)))
 
     def parts(self) -> tuple[Any, ...]:
         """Normals and offsets, as loops want them."""
@@ -302,23 +304,23 @@ class _TouchingPlanes:
             for part in (plane.normal, plane.offset)
         )
 
-    def with_(self, plane: _TouchingPlane, seen: Mask, best: Mask) -> _TouchingPlanes:
+    def updated(self, plane: _HitPlane, seen: Mask, best: Mask) -> _HitPlanes:
         """With one more, where `seen`; that of the best point, where `best`."""
         first, second, third = self.first, self.second, self.third
-        parts = _TouchingPlane.where
+        parts = _HitPlane.where
         stays = first.is_apart(plane)
-        ours = _TouchingPlanes(
+        ours = _HitPlanes(
             plane,
             parts(stays, first, second),
             parts(stays & second.is_apart(plane), second, third),
         )
         is_new = seen & ~best & stays
-        theirs = _TouchingPlanes(
+        theirs = _HitPlanes(
             first,
             parts(is_new, plane, second),
             parts(is_new & second.is_apart(plane), second, third),
         )
-        return _TouchingPlanes(
+        return _HitPlanes(
             parts(best, ours.first, theirs.first),
             parts(best, ours.second, theirs.second),
             parts(best, ours.third, theirs.third),
@@ -329,13 +331,13 @@ class _TouchingPlanes:
         first and the third (2), or to the first alone (3); not finite where they do not."""
         first, second, third = self.first, self.second, self.third
         vector = cast("Any", type(first.normal))
-        pairs = dr.select(number == 1, first.meeting(second), first.meeting(third))
+        pairs = dr.select(number == 1, first.nearest_on_line(second), first.nearest_on_line(third))
         alone = vector(first.offset) * first.normal
-        ends = dr.select(number == 0, first.corner(second, third), alone)
+        ends = dr.select(number == 0, first.intersection_point(second, third), alone)
         return dr.select((number == 1) | (number == 2), pairs, ends)
 
 
-def close_in(surface: PreparedLevelSet, x: Vec3, foot: Vec3) -> Vec3:
+def compass_search(surface: SurfaceTracer, x: Vec3, foot: Vec3) -> Vec3:
     """Points of the surface no farther from x than `foot`: a compass search over directions.
 
     What other searches cannot follow, a ray sees: the crease in which two sheets meet, the curve at
@@ -345,8 +347,8 @@ def close_in(surface: PreparedLevelSet, x: Vec3, foot: Vec3) -> Vec3:
     best becomes the best. If all of a turn fail, the next turns are narrower, down to an angle of
     sqrt(epsilon). A compass alone is slow along creases; so each hit adds the plane that touches
     the surface there, and a turn begins with rays to the nearest points where these planes meet.
-    Every point taken is a first hit that f takes the level about (`takes_level`), hence one of the
-    surface, whatever led there.
+    Every point taken is a first hit that f takes the level about (`straddles_level`), hence one of
+    the surface, whatever led there.
     """
     backend = surface.backend
     real, vector, count = backend.Float, backend.Array3f, backend.UInt32
@@ -359,62 +361,64 @@ def close_in(surface: PreparedLevelSet, x: Vec3, foot: Vec3) -> Vec3:
         d: Vec3, t: Real, foot: Vec3, step: Real, angle: Real, failed: Any, n: Any, active: Mask,
         *parts: Any,
     ) -> tuple[Any, ...]:  # fmt: skip
-        planes, around = _TouchingPlanes.of(parts), n < _AROUND
-        meets = ~around & (failed < _MEETINGS)
-        way = dr.select(meets, dr.normalize(planes.meeting(failed)), _tilted(d, step, angle))
-        way = dr.select(around, _spiral(vector, real(n)), way)
+        planes, around = _HitPlanes.of(parts), n < _SPHERE_RAYS
+        meets = ~around & (failed < _PLANE_TRIALS)
+        way = dr.select(
+            meets, dr.normalize(planes.meeting(failed)), _tilt_direction(d, step, angle)
+        )
+        way = dr.select(around, _spiral_direction(vector, real(n)), way)
         usable = active & dr.isfinite(dr.squared_norm(way))
         # Beyond t as well, for planes.
         end = dr.select(around, t, t * (1 + fmin(step, 0.5)))
         seen = surface.first_hit(x, dr.select(usable, way, d), real(0), end, usable)
-        hit = usable & (seen.status == int(Status.HIT))
-        nearer = hit & (seen.t < t * (1 - 8 * backend.epsilon))
+        hit = usable & (seen.status == int(RayStatus.HIT))
+        nearer = hit & (seen.t < t * (1 - 8 * backend.machine_epsilon))
         there = dr.fma(vector(seen.t), way, x)
         nearer &= is_on_surface(surface, there, seen, nearer)
         normal = dr.normalize(seen.gradient)
         touches = hit & dr.isfinite(dr.squared_norm(normal))
-        touching = _TouchingPlane(normal, dr.dot(normal, way) * seen.t)
-        planes = planes.with_(touching, touches, touches & nearer)
+        touching = _HitPlane(normal, dr.dot(normal, way) * seen.t)
+        planes = planes.updated(touching, touches, touches & nearer)
         d, t = dr.select(nearer, way, d), dr.select(nearer, seen.t, t)
         foot = dr.select(nearer, there, foot)
         failed = dr.select(nearer | around, count(0), failed + 1)
-        spent = failed == _MEETINGS + _TILTED
-        narrower = dr.select(spent, _CLOSER * step, step)
-        step = dr.select(nearer & ~around & ~meets, fmin(2 * step, _WIDEST), narrower)
+        spent = failed == _PLANE_TRIALS + _TILTED
+        narrower = dr.select(spent, _STEP_REDUCTION * step, step)
+        step = dr.select(nearer & ~around & ~meets, fmin(2 * step, _INITIAL_STEP), narrower)
         angle = dr.select(nearer | meets | around, angle, angle + _GOLDEN)
         failed = dr.select(spent, count(0), failed)
-        active &= (step > backend.epsilon**0.5) & (n + 1 < _MOST_RAYS)
+        active &= (step > backend.machine_epsilon**0.5) & (n + 1 < _MOST_RAYS)
         return d, t, foot, step, angle, failed, n + 1, active, *planes.parts()
 
     def more(*state: Any) -> Mask:
         return state[7]
 
     start = (
-        d, t, vector(foot), real(_WIDEST), real(0), count(0), count(0), active,
+        d, t, vector(foot), real(_INITIAL_STEP), real(0), count(0), count(0), active,
         *3 * (vector(0), real(0)),
     )  # fmt: skip
     return dr.while_loop(start, more, body, label="closing in")[2]
 
 
-def is_on_surface(surface: PreparedLevelSet, y: Vec3, hit: MarchResult, active: Mask) -> Mask:
+def is_on_surface(surface: SurfaceTracer, y: Vec3, hit: MarchResult, active: Mask) -> Mask:
     """Whether f takes the level about hits y: beside the edge of a sheet, where its gradient has no
     bound, rays are within the tolerance of any level to first order, and a ray that begins there
     may hit the sheet at once, whatever f is."""
-    radius = _ABOUT * surface.backend.epsilon * fmax(largest_coordinate(y), hit.t)
-    return takes_level(surface, y, radius, active)
+    radius = _HIT_TEST_RADIUS * surface.backend.machine_epsilon * fmax(max_norm(y), hit.t)
+    return straddles_level(surface, y, radius, active)
 
 
-def _tilted(d: Vec3, step: Real, angle: Real) -> Vec3:
+def _tilt_direction(d: Vec3, step: Real, angle: Real) -> Vec3:
     """The direction at a distance of `step` from d, seen along d at that angle."""
     vector = cast("Any", type(d))
-    u, v = across(d)
+    u, v = orthonormal_basis(d)
     sine, cosine = dr.sincos(angle)
     return dr.normalize(d + vector(step * cosine) * u + vector(step * sine) * v)
 
 
-def _spiral(vector: Any, n: Real) -> Vec3:
-    """Evenly spread directions, one for each n < `_AROUND`."""
-    z = 1 - (2 * n + 1) / _AROUND
+def _spiral_direction(vector: Any, n: Real) -> Vec3:
+    """Evenly spread directions, one for each n < `_SPHERE_RAYS`."""
+    z = 1 - (2 * n + 1) / _SPHERE_RAYS
     flat = dr.sqrt(1 - z * z)
     sine, cosine = dr.sincos(_GOLDEN * n)
     return vector(flat * cosine, flat * sine, z)

@@ -11,11 +11,11 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray, choose_backend, to_numpy
-from harnack.backend.arrays import finite_vectors, upload_vectors
+from harnack.backend.arrays import as_finite_vectors, upload_vectors
 from harnack.backend.elementary import fmax, fmin
-from harnack.backend.loops import while_active
-from harnack.backend.validation import finite, positive, refuses_derivatives
-from harnack.distance.tangent_plane import Eigen, TangentPlane, in_batches
+from harnack.backend.loops import loop_while_active
+from harnack.backend.validation import as_finite, as_positive, no_derivatives
+from harnack.distance.tangent_plane import SymmetricEigen2, TangentPlane, in_batches
 from harnack.fields.batched_fields import BatchedField
 from harnack.fields.field import check_is_field
 from harnack.geometry.volume import check_volume
@@ -26,20 +26,20 @@ if TYPE_CHECKING:
     from harnack.fields.field import Field
     from harnack.geometry import Volume
 
-__all__ = ["Curvatures", "Family", "curvature", "curvature_lines"]
+__all__ = ["CurvatureSamples", "Family", "curvature", "curvature_lines"]
 
 # The error of a mean curvature that is good enough: this share of it, or of one over the size of
 # the surface where that is more.
 _ACCURACY = 1e-3
 # How many times farther than usual clusters have to be to count as a whole, in turn, until the
 # error is small enough; at infinity all terms of a sum are taken one by one.
-_CLOSER = (1.0, 2.0, 4.0, 8.0, 16.0, math.inf)
+_ACCEPTANCE_FACTORS = (1.0, 2.0, 4.0, 8.0, 16.0, math.inf)
 # In epsilons, of gradient and Hessian: what the arithmetic here may do.
 _ROUNDING = 16.0
 
 
 @dataclass(frozen=True)
-class Curvatures:
+class CurvatureSamples:
     """Of the level sets through n points. NaN where the gradient is zero, so that there is no
     surface, and where its error is not less than the gradient: nothing is known of the surface.
 
@@ -60,8 +60,8 @@ class Curvatures:
     gaussian_error: FloatArray
 
 
-@refuses_derivatives
-def curvature(field: Field, points: Any, *, precision: Precision = "double") -> Curvatures:
+@no_derivatives
+def curvature(field: Field, points: Any, *, precision: Precision = "double") -> CurvatureSamples:
     """Mean and Gaussian curvature of the level sets of a field through points (n, 3).
 
     The derivative of n = grad f/|grad f| along a tangent u of the level set has the tangential
@@ -87,13 +87,13 @@ def curvature(field: Field, points: Any, *, precision: Precision = "double") -> 
         prepared = field.prepare(backend)
 
         def directly(p: Vec3, closer: Real) -> tuple[Real | Vec3, ...]:
-            closely = prepared.at_detail(closer) if prepared.has_detail else prepared
+            closely = prepared.at_accuracy(closer) if prepared.has_variable_accuracy else prepared
             sample = closely.evaluate(p)
             errors = closely.derivative_errors(p, sample)
             rows = closely.hessian(p)
             return _Derivatives(backend, sample.gradient, rows, *errors).curvatures()
 
-        return _refined(backend, field, directly, points, prepared.has_detail)
+        return _refine_accuracy(backend, field, directly, points, prepared.has_variable_accuracy)
 
     def by_tree(p: Vec3, closer: Real) -> tuple[Real | Vec3, ...]:
         at = field.values_at(p, 2, closer)
@@ -103,16 +103,16 @@ def curvature(field: Field, points: Any, *, precision: Precision = "double") -> 
         found = _Derivatives(backend, at.gradient, rows, at.gradient_error, at.hessian_error)
         return found.curvatures()
 
-    return _refined(backend, field, by_tree, points, True)
+    return _refine_accuracy(backend, field, by_tree, points, True)
 
 
-def _refined(
+def _refine_accuracy(
     backend: Backend,
     field: Field,
     computed: Callable[[Vec3, Real], tuple[Real | Vec3, ...]],
     points: Any,
     has_detail: bool,
-) -> Curvatures:
+) -> CurvatureSamples:
     """The curvatures, `computed` more closely where the error is too large and the field
     `has_detail`."""
 
@@ -122,12 +122,12 @@ def _refined(
 
         return compute
 
-    *found, is_truncated = in_batches(backend, at(_CLOSER[0]), points)
+    *found, is_truncated = in_batches(backend, at(_ACCEPTANCE_FACTORS[0]), points)
     if not has_detail:
-        return Curvatures(*found)
+        return CurvatureSamples(*found)
     x = np.asarray(points, np.float64)
     flat = _ACCURACY / _size(field, x)
-    for closer in _CLOSER[1:]:
+    for closer in _ACCEPTANCE_FACTORS[1:]:
         mean, error = found[0], found[3]
         with np.errstate(invalid="ignore"):
             good = error <= np.maximum(_ACCURACY * np.abs(mean), flat)
@@ -137,7 +137,7 @@ def _refined(
         *closely, is_truncated[rows] = in_batches(backend, at(closer), x[rows])
         for whole, part in zip(found, closely, strict=True):
             whole[rows] = part
-    return Curvatures(*found)
+    return CurvatureSamples(*found)
 
 
 def _size(field: Field, points: FloatArray) -> float:
@@ -190,12 +190,12 @@ class _Derivatives:
         real = self.backend.Float
         x, y, z = self.rows
         plane = TangentPlane.of(self.gradient)
-        uu, vv, uv = plane.restricted(self.rows)
+        uu, vv, uv = plane.restrict_hessian(self.rows)
         share = 1 / plane.gradient_norm
         mean = 0.5 * (uu + vv) * share
         gaussian = (uu * share) * (vv * share) - (uv * share) * (uv * share)
 
-        rounding = _ROUNDING * self.backend.epsilon
+        rounding = _ROUNDING * self.backend.machine_epsilon
         third = (x.x + y.y + z.z) / 3
         off = dr.square(x.y) + dr.square(x.z) + dr.square(y.z)
         diagonal = dr.square(x.x - third) + dr.square(y.y - third) + dr.square(z.z - third)
@@ -230,28 +230,28 @@ def _or_infinite(known: Any, error: Real) -> Real:
 
 # Lines of curvature.
 
-Family = Literal["largest", "smallest"]
+Family = Literal["maximum", "minimum"]
 
 # Newton steps that bring a seed to the surface.
-_TO_SURFACE = 8
+_SEED_NEWTON_STEPS = 8
 # A line ends where the two principal curvatures differ by less than this part of their size: what
 # direction is principal is not known there, and about an umbilic all are.
 _UMBILIC = 1e-3
 # It ends where it turns in one step by more than this angle (its cosine), and where a step is
 # longer than this part of the least radius of curvature: what follows would be no line of the
 # surface but the step's.
-_TURN, _PART = math.cos(math.radians(40)), 0.5
+_MIN_STEP_COSINE, _MAX_STEP_PER_RADIUS = math.cos(math.radians(40)), 0.5
 _MOST_STEPS = 100_000
 
 
-@refuses_derivatives
+@no_derivatives
 def curvature_lines(
     field: Field,
     seeds: Any,
     *,
     step: float,
     length: float,
-    family: Family = "largest",
+    family: Family = "maximum",
     level: float | None = None,
     clip: Volume | None = None,
     precision: Precision = "double",
@@ -290,26 +290,26 @@ def curvature_lines(
         known = ", ".join(f'"{one}"' for one in get_args(Family))
         hint = did_you_mean(family, get_args(Family))
         raise ValueError(f"unknown family {family!r}; choose one of {known}{hint}")
-    step, length = positive(step, "step"), positive(length, "length")
+    step, length = as_positive(step, "step"), as_positive(length, "length")
     count = math.ceil(length / step)
     if count > _MOST_STEPS:
         raise ValueError(f"length/step asks for {count:,} steps: at most {_MOST_STEPS:,}")
-    start = finite_vectors(seeds, "seeds")
+    start = as_finite_vectors(seeds, "seeds")
     if not len(start):
         return []
-    level = field.default_level if level is None else finite(level, "level")
+    level = field.default_level if level is None else as_finite(level, "level")
     backend = choose_backend(precision)
     # Data, so that another level, step or family compiles no other kernel.
-    most = 1.0 if family == "largest" else 0.0
+    most = 1.0 if family == "maximum" else 0.0
     at, h, share = (dr.opaque(backend.Float, one) for one in (level, step, most))
-    guide = _Guide(backend, field.prepare(backend), at, h, share)
+    guide = _CurvatureLineTracer(backend, field.prepare(backend), at, h, share)
     with dr.suspend_grad():
         both = guide.follow(start, count)
-    return [_joined(ahead, back, step, clip) for ahead, back in zip(*both, strict=True)]
+    return [_join_halves(ahead, back, step, clip) for ahead, back in zip(*both, strict=True)]
 
 
 @dataclass(frozen=True)
-class _Step:
+class _LineState:
     """Where lines are, by which way they came, and which of them go on."""
 
     x: Vec3
@@ -319,7 +319,7 @@ class _Step:
 
 
 @dataclass(frozen=True)
-class _Guide:
+class _CurvatureLineTracer:
     """Follows the lines of one family: largest is 1 for the larger curvature, 0 for the smaller."""
 
     backend: Backend
@@ -332,7 +332,7 @@ class _Guide:
         """The points of each line to both sides of its seed, each from the seed on."""
         integer, vector, n = self.backend.UInt32, self.backend.Array3f, len(seeds)
         x = upload_vectors(self.backend, np.concatenate([seeds, seeds]))
-        x = self._on_surface(x, _TO_SURFACE)
+        x = self._on_surface(x, _SEED_NEWTON_STEPS)
         direction, is_known = self._direction(x, None)
         lane = dr.arange(integer, 2 * n)
         direction = dr.select(lane < n, direction, -direction)
@@ -341,19 +341,19 @@ class _Guide:
         dr.eval(points, x, direction, is_known)
         most = dr.opaque(integer, count)
 
-        def body(state: _Step) -> _Step:
+        def body(state: _LineState) -> _LineState:
             x, direction, goes_on = self._advance(state)
             index = state.index + 1
             dr.scatter(points, x, index * (2 * n) + lane, state.active & goes_on)
-            return _Step(x, direction, index, state.active & goes_on & (index < most))
+            return _LineState(x, direction, index, state.active & goes_on & (index < most))
 
         index = dr.zeros(integer, 2 * n)
-        while_active(_Step(x, direction, index, is_known & True), body, "curvature lines")
+        loop_while_active(_LineState(x, direction, index, is_known & True), body, "curvature lines")
         found = to_numpy(points).reshape(count + 1, 2 * n, 3).astype(np.float64)
         lines = [one[np.isfinite(one).all(axis=1)] for one in found.swapaxes(0, 1)]
         return lines[:n], lines[n:]
 
-    def _advance(self, state: _Step) -> tuple[Vec3, Vec3, Mask]:
+    def _advance(self, state: _LineState) -> tuple[Vec3, Vec3, Mask]:
         """The next point, the direction there, and whether it is one of the line."""
         x, h = state.x, self.step
         first = state.direction
@@ -363,19 +363,21 @@ class _Guide:
         end = x + h / 6 * (first + 2 * (second + third) + fourth)
         end = self._on_surface(end, 1)
         last, is_known = self._direction(end, fourth)
-        return end, last, is_known & (dr.dot(first, last) > _TURN)
+        return end, last, is_known & (dr.dot(first, last) > _MIN_STEP_COSINE)
 
     def _direction(self, x: Vec3, before: Vec3 | None) -> tuple[Vec3, Mask]:
         """The principal direction that agrees with the one before, and whether there is one."""
         plane = TangentPlane.of(self.field.evaluate(x).gradient)
-        eigen = Eigen.of(*plane.restricted(self.field.hessian(x)))
+        eigen = SymmetricEigen2.of(*plane.restrict_hessian(self.field.hessian(x)))
         u, v = eigen.combination(self.largest, 1 - self.largest)
         direction = u * plane.u + v * plane.v
         if before is not None:
             direction = dr.select(dr.dot(direction, before) < 0, -direction, direction)
-        most = fmax(dr.abs(eigen.most), dr.abs(eigen.least))
-        is_known = (eigen.most - eigen.least > _UMBILIC * most) & dr.isfinite(dr.norm(direction))
-        return direction, is_known & (most * self.step < _PART * plane.gradient_norm)
+        most = fmax(dr.abs(eigen.largest), dr.abs(eigen.smallest))
+        is_known = (eigen.largest - eigen.smallest > _UMBILIC * most) & dr.isfinite(
+            dr.norm(direction)
+        )
+        return direction, is_known & (most * self.step < _MAX_STEP_PER_RADIUS * plane.gradient_norm)
 
     def _on_surface(self, x: Vec3, steps: int) -> Vec3:
         """The point to which Newton's method along the gradient leads in `steps` steps."""
@@ -387,10 +389,10 @@ class _Guide:
                 gap = gap - self.field.period * dr.round(gap / self.field.period)
             return x - gap / dr.squared_norm(sample.gradient) * sample.gradient
 
-        return _repeated(step, x, steps, self.backend)
+        return _iterate(step, x, steps, self.backend)
 
 
-def _repeated(step: Callable[[Vec3], Vec3], x: Vec3, times: int, backend: Backend) -> Vec3:
+def _iterate(step: Callable[[Vec3], Vec3], x: Vec3, times: int, backend: Backend) -> Vec3:
     """The step repeated `times` times, recorded once."""
     if times == 1:
         return step(x)
@@ -406,7 +408,9 @@ def _repeated(step: Callable[[Vec3], Vec3], x: Vec3, times: int, backend: Backen
     return dr.while_loop(start, more, body, label="to the surface")[1]
 
 
-def _joined(ahead: FloatArray, back: FloatArray, step: float, clip: Volume | None) -> FloatArray:
+def _join_halves(
+    ahead: FloatArray, back: FloatArray, step: float, clip: Volume | None
+) -> FloatArray:
     """One line of its two halves, each cut where it first leaves the volume; of one that comes
     back to its seed, one turn, which ends in the seed."""
     if clip is not None:
@@ -417,13 +421,15 @@ def _joined(ahead: FloatArray, back: FloatArray, step: float, clip: Volume | Non
         share = (moves * to_seed).sum(axis=1) / np.maximum((moves * moves).sum(axis=1), 1e-300)
         passing = np.linalg.norm(to_seed - share[:, None] * moves, axis=1) < 0.25 * step
         agrees = moves @ moves[0] > 0
-        closed = np.flatnonzero(passing & (share > 0) & (share <= 1) & agrees & _far(len(moves)))
+        closed = np.flatnonzero(
+            passing & (share > 0) & (share <= 1) & agrees & _after_second_step(len(moves))
+        )
         if closed.size:
             return np.concatenate([ahead[: closed[0] + 1], ahead[:1]])
     return np.concatenate([back[:0:-1], ahead])
 
 
-def _far(count: int) -> BoolArray:
+def _after_second_step(count: int) -> BoolArray:
     """Not one of the first two steps, which pass near the seed."""
     return np.arange(count) > 1
 

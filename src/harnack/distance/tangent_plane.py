@@ -10,8 +10,8 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import FloatArray
-from harnack.backend.elementary import across, fmax, length
-from harnack.backend.validation import LARGEST, real_array
+from harnack.backend.elementary import fmax, orthonormal_basis, safe_norm
+from harnack.backend.validation import MAX_COORDINATE, as_real_array
 from harnack.fields import batch_evaluation as field_points
 
 if TYPE_CHECKING:
@@ -19,13 +19,13 @@ if TYPE_CHECKING:
     from harnack.fields.field import Field
 
 __all__ = [
-    "Eigen",
+    "SymmetricEigen2",
     "TangentPlane",
-    "apply",
-    "first_order",
+    "first_order_distance",
     "has_hessian",
     "in_batches",
-    "second_order",
+    "matvec",
+    "second_order_distance",
 ]
 
 
@@ -42,28 +42,28 @@ class TangentPlane:
     @classmethod
     def of(cls, gradient: Vec3) -> TangentPlane:
         """The plane at right angles to a gradient; NaN where that is zero."""
-        gradient_norm = length(gradient)
+        gradient_norm = safe_norm(gradient)
         n = gradient / gradient_norm
-        u, v = across(n)
+        u, v = orthonormal_basis(n)
         return cls(gradient_norm, n, u, v)
 
-    def restricted(self, rows: tuple[Vec3, Vec3, Vec3]) -> tuple[Real, Real, Real]:
+    def restrict_hessian(self, rows: tuple[Vec3, Vec3, Vec3]) -> tuple[Real, Real, Real]:
         """u.Au, v.Av and u.Av of a symmetric matrix A given by its rows."""
-        along_u, along_v = apply(rows, self.u), apply(rows, self.v)
+        along_u, along_v = matvec(rows, self.u), matvec(rows, self.v)
         return dr.dot(self.u, along_u), dr.dot(self.v, along_v), dr.dot(self.u, along_v)
 
 
 @dataclass(frozen=True)
-class Eigen:
+class SymmetricEigen2:
     """The eigenvalues of a symmetric 2x2 matrix and the angle of the larger one's eigenvector."""
 
-    most: Real
-    least: Real
+    largest: Real
+    smallest: Real
     cosine: Real
     sine: Real
 
     @classmethod
-    def of(cls, uu: Real, vv: Real, uv: Real) -> Eigen:
+    def of(cls, uu: Real, vv: Real, uv: Real) -> SymmetricEigen2:
         """Of the matrix ((uu, uv), (uv, vv))."""
         middle, half = 0.5 * (uu + vv), 0.5 * (uu - vv)
         spread = dr.sqrt(dr.fma(half, half, uv * uv))
@@ -94,12 +94,12 @@ def has_hessian(backend: Backend, field: Field) -> bool:
     return True
 
 
-def apply(rows: tuple[Vec3, Vec3, Vec3], vector: Vec3) -> Vec3:
+def matvec(rows: tuple[Vec3, Vec3, Vec3], vector: Vec3) -> Vec3:
     """The matrix with these rows times a vector."""
     return type(vector)(*(dr.dot(row, vector) for row in rows))
 
 
-def first_order(above: Real, gradient: Vec3) -> Real:
+def first_order_distance(above: Real, gradient: Vec3) -> Real:
     """above/|grad f| with above = f - level. Off by O(d^2) at distance d from a smooth surface.
 
     Proof. Let y be the closest point of the level set, N its normal grad f/|grad f|(y), and
@@ -109,16 +109,16 @@ def first_order(above: Real, gradient: Vec3) -> Real:
 
     Where the gradient is zero it is infinite with the sign of above; zero on the level itself.
     """
-    return dr.select(above == 0, 0, above / length(gradient))
+    return dr.select(above == 0, 0, above / safe_norm(gradient))
 
 
-def second_order(above: Real, gradient: Vec3, rows: tuple[Vec3, Vec3, Vec3]) -> Real:
+def second_order_distance(above: Real, gradient: Vec3, rows: tuple[Vec3, Vec3, Vec3]) -> Real:
     """d1/(1 - k d1/2) with d1 = above/|grad f|, k = n.An/|grad f|: off by O(d^3).
 
     n is the unit gradient, A the Hessian, both at x; k is how fast the slope changes along n, not
     a curvature of the surface.
 
-    Proof. With x = y + d N as in `first_order`, Taylor along that line is
+    Proof. With x = y + d N as in `first_order_distance`, Taylor along that line is
     above = d N.g - d^2 N.AN/2 + O(d^3), whose root is d = e + (N.AN/N.g) e^2/2 + O(d^3) with
     e = above/N.g. N is not n: but n is smooth and n(y) = N, so N = n + O(d); for unit vectors
     N.n = 1 - |N-n|^2/2, hence N.g = |g| (1 + O(d^2)), and N.AN = n.An + O(d). As above = O(d),
@@ -132,10 +132,10 @@ def second_order(above: Real, gradient: Vec3, rows: tuple[Vec3, Vec3, Vec3]) -> 
     Taylor's formula says nothing, its denominator is held at 1/2: the sign is always that of
     above, and the size at most 2 |d1|.
     """
-    gradient_norm = length(gradient)
+    gradient_norm = safe_norm(gradient)
     n = gradient / gradient_norm
-    first = first_order(above, gradient)
-    k = dr.dot(n, apply(rows, n)) / gradient_norm
+    first = first_order_distance(above, gradient)
+    k = dr.dot(n, matvec(rows, n)) / gradient_norm
     quotient = first / fmax(1 - 0.5 * k * first, 0.5)
     return dr.select(dr.isfinite(first) & (first != 0), quotient, first)
 
@@ -164,14 +164,16 @@ def in_batches(
     _check_size(points)
     with np.errstate(over="ignore"):
         rounded = (one.astype(backend.dtype, copy=False) for one in others)
-        results = field_points.in_batches(backend, compute, points, *rounded, at_once=_AT_ONCE)
+        results = field_points.map_batches(backend, compute, points, *rounded, at_once=_AT_ONCE)
     return tuple(one.astype(np.float64, copy=False) for one in results)
 
 
 def _check_size(points: Any) -> None:
-    coordinates = None if dr.is_array_v(type(points)) else real_array(points, "points")
+    coordinates = None if dr.is_array_v(type(points)) else as_real_array(points, "points")
     if coordinates is None or not coordinates.size:
         return
     size = float(np.abs(coordinates).max())
-    if LARGEST < size < np.inf:
-        raise ValueError(f"points: coordinates up to {size:g} are too large: at most {LARGEST:g}")
+    if MAX_COORDINATE < size < np.inf:
+        raise ValueError(
+            f"points: coordinates up to {size:g} are too large: at most {MAX_COORDINATE:g}"
+        )

@@ -6,32 +6,35 @@ This package exports what all proofs share. The proofs themselves are names of `
 
 from __future__ import annotations
 
-from harnack.enclosures.enclosure import Enclosure, Gaps, Slopes, TargetLevels
+from harnack.enclosures.enclosure import Enclosure, LevelGaps, Levels, SlopeRange
 from harnack.enclosures.promises import (
     BoundedLaplacian,
-    Curvature,
     HarmonicBall,
     Lipschitz,
     Promise,
+    TaylorRemainder,
 )
-from harnack.enclosures.selection import Choice, Proofs, any_covers, choose_proofs, longest_step
-from harnack.name_suggestions import names_that_moved
+from harnack.enclosures.selection import (
+    EnclosureChoice,
+    EnclosureKinds,
+    any_is_free,
+    choose_enclosures,
+    longest_free_length,
+)
 
 __all__ = [
     "BoundedLaplacian",
-    "Choice",
-    "Curvature",
     "Enclosure",
-    "Gaps",
+    "EnclosureChoice",
+    "EnclosureKinds",
     "HarmonicBall",
+    "LevelGaps",
+    "Levels",
     "Lipschitz",
     "Promise",
-    "Proofs",
-    "Slopes",
-    "TargetLevels",
-    "any_covers",
-    "choose_proofs",
-    "longest_step",
+    "SlopeRange",
+    "TaylorRemainder",
+    "any_is_free",
+    "choose_enclosures",
+    "longest_free_length",
 ]
-
-__getattr__ = names_that_moved(__name__)

@@ -12,8 +12,13 @@ from typing import TYPE_CHECKING, ClassVar
 import drjit as dr
 
 from harnack.backend.elementary import clamp, fmax, fmin
-from harnack.enclosures.enclosure import Enclosure, Gaps, Slopes
-from harnack.enclosures.free_radius import is_covered, known_ranges, largest_covered, rounding
+from harnack.enclosures.enclosure import Enclosure, LevelGaps, SlopeRange
+from harnack.enclosures.free_radius import (
+    allowed_movement,
+    condition_rounding,
+    is_free_fraction,
+    largest_free_fraction,
+)
 from harnack.enclosures.promises import BoundedLaplacian, Promise
 
 if TYPE_CHECKING:
@@ -21,25 +26,27 @@ if TYPE_CHECKING:
 
     from harnack.backend import Mask, Real
 
-KERNEL_NORM = 0.394
-"""kappa <= KERNEL_NORM q^2 (2 + ln(1/q))/(1-q^2)^2, proved by `tests/oracles/green_kernel.py`."""
+GREEN_KERNEL_BOUND = 0.394
+"""kappa <= GREEN_KERNEL_BOUND q^2 (2 + ln(1/q))/(1-q^2)^2, proved by
+`tests/oracles/green_kernel.py`."""
 
-SLOPE_NORM = 0.1907
+GREEN_SLOPE_BOUND = 0.1907
 """The integral of |G(0,.) + d_v G(0,.)/3| over the unit ball, (19 - 6 ln 3 - 2 sqrt(3) pi)/8,
 rounded up."""
 
 # A gap of this many times the scale of the bound is reached only within 1e-6 of the sphere.
-_NEVER = 1e18
+_UNREACHABLE_GAP = 1e18
 
 
 @dataclass(frozen=True)
-class GreenBall(Enclosure):
+class BoundedLaplacianEnclosure(Enclosure):
     """c <= f <= C and a <= Laplacian f <= b on B(p, R) of space.
 
     Proof, R = 1, x = p + q v. With G the Green function of the ball, f = h - integral of G Lap f,
-    where h is harmonic with the boundary values of f, so c <= h <= C. As in `Slope` the chord of
-    the Poisson kernel gives h(x) <= c + (h(p)-c) A + (h_v(p)/3) B with A = (1+3q^2)/(1-q^2)^2 and
-    B = (3q+q^3)/(1-q^2)^2. Put h = f + integral of G Lap f in all three places:
+    where h is harmonic with the boundary values of f, so c <= h <= C. As in `HarnackSlopeEnclosure`
+    the chord of the Poisson kernel gives h(x) <= c + (h(p)-c) A + (h_v(p)/3) B with A =
+    (1+3q^2)/(1-q^2)^2 and B = (3q+q^3)/(1-q^2)^2. Put h = f + integral of G Lap f in all three
+    places:
 
         f(x) <= c + (f(p)-c) A + (f_v(p)/3) B + integral of K Lap f,
         K = -G(x,.) + A G(p,.) + (B/3) d_v G(p,.).
@@ -64,32 +71,34 @@ class GreenBall(Enclosure):
     """
 
     radius: Real
-    range_below: Real
-    range_above: Real
-    mean: Real  # m R^2
-    spread: Real  # l R^2
-    slopes: Slopes
+    max_fall: Real
+    max_rise: Real
+    laplacian_mean: Real  # m R^2
+    laplacian_spread: Real  # l R^2
+    slopes: SlopeRange
 
-    rounds: ClassVar[int] = 5
-    """Rounds of `largest_covered`."""
+    solver_iterations: ClassVar[int] = 5
+    """Rounds of `largest_free_fraction`."""
 
     @classmethod
-    def of(cls, promise: Promise, value: Real, error: Real, slopes: Slopes) -> Self | None:
+    def from_promise(
+        cls, promise: Promise, value: Real, error: Real, slopes: SlopeRange
+    ) -> Self | None:
         if not isinstance(promise, BoundedLaplacian):
             return None
-        radius, below, above = known_ranges(promise, value, error)
+        radius, below, above = allowed_movement(promise, value, error)
         if below is None or above is None:
             return None
         ends = promise.laplacian_lower, promise.laplacian_upper
-        return cls.of_ranges(radius, (below, above), ends, slopes)
+        return cls.from_ranges(radius, (below, above), ends, slopes)
 
     @classmethod
-    def of_ranges(
+    def from_ranges(
         cls,
         radius: Real,
         ranges: tuple[Real, Real],
         laplacian: tuple[Real, Real],
-        slopes: Slopes,
+        slopes: SlopeRange,
     ) -> Self:
         """The enclosure of an f that may move so far, down and up, with these ends of its
         Laplacian."""
@@ -101,52 +110,57 @@ class GreenBall(Enclosure):
         spread = dr.select(spread >= 0, spread + slack * (spread + dr.abs(mean)), dr.nan)
         return cls(radius, *ranges, mean, spread, slopes)
 
-    def step(self, gaps: Gaps) -> Real:
+    def free_length(self, gaps: LevelGaps) -> Real:
         up, down = self._conditions(gaps)
-        q = fmin(largest_covered(up, self.rounds), largest_covered(down, self.rounds))
+        q = fmin(
+            largest_free_fraction(up, self.solver_iterations),
+            largest_free_fraction(down, self.solver_iterations),
+        )
         return dr.select(self._is_known(gaps), q * self.radius, 0)
 
-    def covers(self, gaps: Gaps, length: Real) -> Mask:
+    def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
         up, down = self._conditions(gaps)
         q = length / self.radius
         inside = (q <= 1) & self._is_known(gaps)
         q = clamp(q, 0, 1)
-        return (length <= 0) | (inside & is_covered(up, q) & is_covered(down, q))
+        return (length <= 0) | (inside & is_free_fraction(up, q) & is_free_fraction(down, q))
 
-    def _is_known(self, gaps: Gaps) -> Mask:
+    def _is_known(self, gaps: LevelGaps) -> Mask:
         """Whether ranges, Laplacian and gaps are numbers, and not too large or small."""
-        known = (gaps.down >= 0) & (gaps.up >= 0) & dr.isfinite(self.mean)
-        for side in (self.range_below + self.range_above, self.spread):
+        known = (gaps.below >= 0) & (gaps.above >= 0) & dr.isfinite(self.laplacian_mean)
+        for side in (self.max_fall + self.max_rise, self.laplacian_spread):
             known = known & ((side == 0) | (dr.isfinite(1 / side) & dr.isfinite(4 * side)))
         return known
 
-    def _conditions(self, gaps: Gaps) -> tuple[_Growth, _Growth]:
+    def _conditions(self, gaps: LevelGaps) -> tuple[_GreenCondition, _GreenCondition]:
         """The conditions for f not to reach the level above, and the level below."""
-        below, above, slopes = self.range_below, self.range_above, self.slopes
+        below, above, slopes = self.max_fall, self.max_rise, self.slopes
         return (
-            self._growth(gaps.up, below, above, self.mean, slopes.high),
-            self._growth(gaps.down, above, below, -self.mean, slopes.negated().high),
+            self._growth(gaps.above, below, above, self.laplacian_mean, slopes.upper),
+            self._growth(gaps.below, above, below, -self.laplacian_mean, slopes.negated().upper),
         )
 
-    def _growth(self, gap: Real, u: Real, most: Real, mean: Real, slope: Real) -> _Growth:
+    def _growth(self, gap: Real, u: Real, most: Real, mean: Real, slope: Real) -> _GreenCondition:
         """The condition in units of w + l; u, most: how far f is above c, and may rise."""
         w = fmax(dr.fma(mean, 1 / 6, u), 0)
-        scale = w + self.spread
+        scale = w + self.laplacian_spread
         share = dr.select(scale > 0, 1 / scale, 0)
-        w, spread = w * share, self.spread * share
-        steepest = dr.fma(SLOPE_NORM, spread, w)
-        slack = rounding(type(gap))
+        w, spread = w * share, self.laplacian_spread * share
+        steepest = dr.fma(GREEN_SLOPE_BOUND, spread, w)
+        slack = condition_rounding(type(gap))
         # A slope that is not a number counts as the steepest.
         slope = fmin(slope * (self.radius / 3 * share) + slack, steepest)
         slope = fmax(slope, slack - steepest)
         # A level outside of the range is never met, and a constant function meets none.
         is_met = (gap <= most) & (scale > 0)
-        gap = dr.select(is_met, fmin(gap * share, _NEVER), _NEVER)
-        return _Growth(gap / (dr.sqrt(1 + gap) + 1), w, slope, spread, fmax(mean * share, 0))
+        gap = dr.select(is_met, fmin(gap * share, _UNREACHABLE_GAP), _UNREACHABLE_GAP)
+        return _GreenCondition(
+            gap / (dr.sqrt(1 + gap) + 1), w, slope, spread, fmax(mean * share, 0)
+        )
 
 
 @dataclass(frozen=True)
-class _Growth:
+class _GreenCondition:
     """w (A-1) + s B + l kappa + m q^2/6 <= gap, with `gap` for sqrt(1 + gap) - 1.
 
     With S = (1-q)^2 (1 + left side), which has no pole, it says sqrt(S) <= (1 + gap) (1-q), that is
@@ -159,18 +173,18 @@ class _Growth:
     spread: Real
     mean: Real  # m where positive, else 0
 
-    def start(self) -> tuple[Real, Real]:
+    def expansion_at_zero(self) -> tuple[Real, Real]:
         # The logarithm, taken at about the root for slope 0.
         log = clamp(-0.5 * dr.log(fmax(self.gap, 1e-12)), 0, 14)
         first = 3 * self.slope
-        bend = dr.fma(KERNEL_NORM * self.spread, 2 + log, 5 * self.weight - 2 * first)
+        bend = dr.fma(GREEN_KERNEL_BOUND * self.spread, 2 + log, 5 * self.weight - 2 * first)
         second = 0.5 * (1 + bend + self.mean / 6) - 0.125 * (first - 2) * (first - 2)
         return self.gap + 0.5 * first, second
 
     def __call__(self, q: Real) -> Real:
         s, r, back = q * q, 1 / (1 + q), 1 - q
         log = 2 - dr.log(fmax(q, 1e-30))
-        inner = q * dr.fma(self.weight, 5 - s, KERNEL_NORM * self.spread * log)
+        inner = q * dr.fma(self.weight, 5 - s, GREEN_KERNEL_BOUND * self.spread * log)
         inner = dr.fma(self.slope, 3 + s, inner)
         c = dr.fma(inner, r * r, q * dr.fma(self.mean * (1 / 6) * back, back, 1))  # (S-1)/q + 2
         root = dr.sqrt(fmax(dr.fma(q, c - 2, 1), 0))

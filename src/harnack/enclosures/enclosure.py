@@ -1,8 +1,9 @@
 """What an enclosure is: a proof of how far f can move along a path. And what it is given.
 
 - `Enclosure`: the base of all proofs. A new proof is a class derived from it, in this package.
-- `Restriction`: f along a path, for proofs that use ranges of its derivatives on `Piece`s of it.
-- `TargetLevels`: the levels to find, and their distances from a value (`Gaps`).
+- `PathRestriction`: f along a path, for proofs that use ranges of its derivatives on `PathPiece`s
+  of it.
+- `Levels`: the levels to find, and their distances from a value (`LevelGaps`).
 """
 
 from __future__ import annotations
@@ -25,22 +26,22 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Piece:
+class PathPiece:
     """Ranges of F' and F'' on one piece of the path.
 
     length: of the piece.
-    slopes: the range of F' on it.
-    least_curvature, most_curvature: the range of F''; an end may be infinite, for functions with
-        kinks.
+    slope_range: the range of F' on it.
+    min_second_derivative, max_second_derivative: the range of F''; an end may be infinite, for
+        functions with kinks.
     """
 
     length: Real
-    slopes: Slopes
-    least_curvature: Real
-    most_curvature: Real
+    slope_range: SlopeRange
+    min_second_derivative: Real
+    max_second_derivative: Real
 
 
-class Restriction(Protocol):
+class PathRestriction(Protocol):
     """A function along a path, of which ranges can be computed.
 
     piece_count: into how many pieces to cut the path for the least time, by experiment.
@@ -49,7 +50,7 @@ class Restriction(Protocol):
     @property
     def piece_count(self) -> int: ...
 
-    def pieces(self, knots: Sequence[Real]) -> tuple[Piece, ...]:
+    def derivative_ranges(self, knots: Sequence[Real]) -> tuple[PathPiece, ...]:
         """Ranges of the derivatives of f(path(t+s)) between each knot and the next.
 
         knots: increasing lengths s, the first of them 0.
@@ -58,10 +59,10 @@ class Restriction(Protocol):
 
 
 @runtime_checkable
-class Evaluable(Protocol):
+class EvaluableRestriction(Protocol):
     """A restriction given by a formula, which can be evaluated in any arithmetic."""
 
-    def through(self, coordinates: Callable[[Vec3, Vec3], tuple[Any, Any, Any]]) -> Any:
+    def evaluate_with(self, coordinates: Callable[[Vec3, Vec3], tuple[Any, Any, Any]]) -> Any:
         """The formula applied to the x, y and z that `coordinates` makes from a point p and the
         direction d of the path."""
         ...
@@ -69,11 +70,11 @@ class Evaluable(Protocol):
 
 # A length that is proved in exact arithmetic, times this, is proved in single precision too: the
 # formulas of steps have some ten roundings.
-ROUND_DOWN = 1.0 - 1e-6
+STEP_SAFETY = 1.0 - 1e-6
 
 
 @dataclass(frozen=True)
-class Gaps:
+class LevelGaps:
     """How far f must move, down or up, to reach a level: differences of values, >= 0.
 
     Infinite where there is no level on that side.
@@ -83,42 +84,42 @@ class Gaps:
         side.
     """
 
-    down: Real
-    up: Real
+    below: Real
+    above: Real
     is_one_sided: bool = False
 
     @property
-    def smaller(self) -> Real:
+    def nearest(self) -> Real:
         """The distance in value to the nearest level."""
-        return fmin(self.down, self.up)
+        return fmin(self.below, self.above)
 
-    def less(self, error: Real) -> Gaps:
+    def reduced_by(self, error: Real) -> LevelGaps:
         """The gaps that surely remain if the value is known up to `error`."""
-        down, up = fmax(self.down - error, 0), fmax(self.up - error, 0)
-        return Gaps(down, up, self.is_one_sided)
+        down, up = fmax(self.below - error, 0), fmax(self.above - error, 0)
+        return LevelGaps(down, up, self.is_one_sided)
 
-    def exchanged(self) -> Gaps:
+    def swapped(self) -> LevelGaps:
         """The gaps of -f."""
-        return Gaps(self.up, self.down, self.is_one_sided)
+        return LevelGaps(self.above, self.below, self.is_one_sided)
 
 
 @dataclass(frozen=True)
-class Slopes:
+class SlopeRange:
     """An interval that contains the derivative of f along a unit direction, in f per length."""
 
-    low: Real
-    high: Real
+    lower: Real
+    upper: Real
 
     @classmethod
-    def around(cls, slope: Real, error: Real) -> Slopes:
+    def around(cls, slope: Real, error: Real) -> SlopeRange:
         """The slopes within `error` of one; an error that is the Python float 0.0 costs nothing."""
         if isinstance(error, float) and error == 0.0:
             return cls(slope, slope)
         return cls(slope - error, slope + error)
 
-    def negated(self) -> Slopes:
+    def negated(self) -> SlopeRange:
         """The slopes in the opposite direction."""
-        return Slopes(-self.high, -self.low)
+        return SlopeRange(-self.upper, -self.lower)
 
 
 class Enclosure(abc.ABC):
@@ -126,24 +127,27 @@ class Enclosure(abc.ABC):
 
     F(s) = f(path(t+s)) - f(path(t)) is the movement of f relative to its value at a sample, so that
     two large numbers are never subtracted: in float32 that is the difference between a march and a
-    stall. Given how far levels are in value (`Gaps`), an enclosure proves a length free of them
-    (`step`), or says whether a given length is free (`covers`), which takes one evaluation of the
+    stall. Given how far levels are in value (`LevelGaps`), an enclosure proves a length free of
+    them (`free_length`), or says whether a given length is free (`is_free`), which takes one
+    evaluation of the
     proof and no solver: the tracer uses it looking back.
 
     Neither end of the range may fall as the slope grows, and every proof says why: then the range
-    for the upper end of `Slopes` bounds F from above and that for the lower end bounds it from
+    for the upper end of `SlopeRange` bounds F from above and that for the lower end bounds it from
     below, whatever the slope in between is. In particular slopes in [-|grad f|, |grad f|] bound F
     in every direction.
     """
 
     @property
-    def growth(self) -> float:
+    def reach_growth(self) -> float:
         """How far an enclosure should reach at the next sample, as a multiple of the step that this
         one proved; by experiment."""
         return 2.0
 
     @classmethod
-    def of(cls, promise: Promise, value: Real, error: Real, slopes: Slopes) -> Self | None:
+    def from_promise(
+        cls, promise: Promise, value: Real, error: Real, slopes: SlopeRange
+    ) -> Self | None:
         """The enclosure that this proof makes of a promise; None if it uses no promise of that
         kind.
 
@@ -153,7 +157,9 @@ class Enclosure(abc.ABC):
         return None
 
     @classmethod
-    def along(cls, function: Restriction, slopes: Slopes, length: Real) -> Self | None:
+    def from_restriction(
+        cls, function: PathRestriction, slopes: SlopeRange, length: Real
+    ) -> Self | None:
         """The enclosure that this proof makes of ranges of f along the path; None if it uses none.
 
         length: how far it should reach. slopes: of f along the path, where it starts.
@@ -162,21 +168,21 @@ class Enclosure(abc.ABC):
         return None
 
     @abc.abstractmethod
-    def step(self, gaps: Gaps) -> Real:
+    def free_length(self, gaps: LevelGaps) -> Real:
         """A length L >= 0 such that f meets no level for 0 < s < L. NaN proves nothing."""
 
-    def covers(self, gaps: Gaps, length: Real) -> Mask:
+    def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
         """Whether f is proved to meet no level for 0 < s < length."""
-        return length <= self.step(gaps)
+        return length <= self.free_length(gaps)
 
-    def arrives(self, gaps: Gaps, length: Real) -> Mask:
+    def arrives(self, gaps: LevelGaps, length: Real) -> Mask:
         """Whether f is proved to take a level for some 0 <= s <= length."""
         del length
-        return (gaps.up == gaps.up) & False
+        return (gaps.above == gaps.above) & False
 
 
 @dataclass(frozen=True)
-class TargetLevels:
+class Levels:
     """A finite set of target levels, repeated with `period` if there is one.
 
     An angle-valued function is known modulo its period, so its levels form a ladder: every level
@@ -190,7 +196,7 @@ class TargetLevels:
     values: tuple[Real, ...]
     period: float | None = None
 
-    def gaps(self, f: Real) -> Gaps:
+    def gaps(self, f: Real) -> LevelGaps:
         """Distances in value from f to the next level below and above.
 
         Either is infinite when there is no such level. A value on a level has a gap of zero on one
@@ -211,9 +217,9 @@ class TargetLevels:
                 below_gap = dr.select(above < 0, math.inf, above)
                 above_gap = dr.select(above > 0, math.inf, -above)
             down, up = fmin(down, below_gap), fmin(up, above_gap)
-        return Gaps(down, up, len(self.values) == 1 and self.period is None)
+        return LevelGaps(down, up, len(self.values) == 1 and self.period is None)
 
-    def to_nearest(self, f: Real) -> Real:
+    def offset_to_nearest(self, f: Real) -> Real:
         """level - f for the level nearest to f."""
         gaps = self.gaps(f)
-        return dr.select(gaps.up < gaps.down, gaps.up, -gaps.down)
+        return dr.select(gaps.above < gaps.below, gaps.above, -gaps.below)

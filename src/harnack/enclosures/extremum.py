@@ -1,9 +1,10 @@
 """Enclosures of functions that are the greatest or the nearest of several, and of maps of others.
 
-- `Greatest`, with `Negated` and `Stretched`: unions, intersections and differences of solids, and
+- `MaximumEnclosure`, with `NegatedEnclosure` and `ScaledEnclosure`: unions, intersections and
+  differences of solids, and
   solids that were moved and scaled.
-- `Nearest`: the surfaces of all branches of a multivalued function.
-- `Cusp`: the same near a branch point, where all branches are close to one value.
+- `NearestBranchEnclosure`: the surfaces of all branches of a multivalued function.
+- `BranchPointEnclosure`: the same near a branch point, where all branches are close to one value.
 """
 
 from __future__ import annotations
@@ -14,29 +15,29 @@ from typing import TYPE_CHECKING
 import drjit as dr
 
 from harnack.backend.elementary import fmax, fmin
-from harnack.enclosures.enclosure import ROUND_DOWN, Enclosure, Gaps, Slopes
-from harnack.enclosures.parabola import first_root
-from harnack.enclosures.selection import any_covers, longest_step
+from harnack.enclosures.enclosure import STEP_SAFETY, Enclosure, LevelGaps, SlopeRange
+from harnack.enclosures.parabola import first_reach
+from harnack.enclosures.selection import any_is_free, longest_free_length
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real
 
 
 @dataclass(frozen=True)
-class Part:
+class MaximumOperand:
     """One of several functions, at a sample.
 
-    least_below, most_below: bounds, by rounding, of how far its value is below the greatest.
+    min_deficit, max_deficit: bounds, by rounding, of how far its value is below the greatest.
     enclosures: of its movement along the path.
     """
 
-    least_below: Real
-    most_below: Real
+    min_deficit: Real
+    max_deficit: Real
     enclosures: tuple[Enclosure, ...]
 
 
 @dataclass(frozen=True)
-class Greatest(Enclosure):
+class MaximumEnclosure(Enclosure):
     """The movement of max f_i, from enclosures of the movements of all f_i.
 
     Proof. The greatest rises by a gap g only where some f_i rises by g plus its distance below the
@@ -45,62 +46,62 @@ class Greatest(Enclosure):
     the greatest has not. The proofs of the parts may be of any kind, and of different kinds.
     """
 
-    parts: tuple[Part, ...]
+    operands: tuple[MaximumOperand, ...]
 
-    def step(self, gaps: Gaps) -> Real:
-        none = type(gaps.up)(dr.inf)
-        up, down = none, type(gaps.up)(0)
-        for part in self.parts:
+    def free_length(self, gaps: LevelGaps) -> Real:
+        none = type(gaps.above)(dr.inf)
+        up, down = none, type(gaps.above)(0)
+        for part in self.operands:
             rise, fall = self._gaps(gaps, part)
-            up = fmin(longest_step(part.enclosures, rise), up)
-            fallen = longest_step(part.enclosures, fall)
+            up = fmin(longest_free_length(part.enclosures, rise), up)
+            fallen = longest_free_length(part.enclosures, fall)
             # A part that may lie below the level already proves nothing, whatever its slope.
-            down = fmax(dr.select(fall.down > 0, fallen, 0), down)
-        up = dr.select(gaps.up == dr.inf, none, up)
-        down = dr.select(gaps.down == dr.inf, none, down)
+            down = fmax(dr.select(fall.below > 0, fallen, 0), down)
+        up = dr.select(gaps.above == dr.inf, none, up)
+        down = dr.select(gaps.below == dr.inf, none, down)
         reach = fmin(up, down)
         return dr.select(reach == dr.inf, self._reach(none), reach)
 
-    def covers(self, gaps: Gaps, length: Real) -> Mask:
-        up, down = gaps.up == gaps.up, gaps.down == dr.inf
-        for part in self.parts:
+    def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
+        up, down = gaps.above == gaps.above, gaps.below == dr.inf
+        for part in self.operands:
             rise, fall = self._gaps(gaps, part)
-            up &= any_covers(part.enclosures, rise, length)
-            down |= (fall.down > 0) & any_covers(part.enclosures, fall, length)
-        return (up | (gaps.up == dr.inf)) & down
+            up &= any_is_free(part.enclosures, rise, length)
+            down |= (fall.below > 0) & any_is_free(part.enclosures, fall, length)
+        return (up | (gaps.above == dr.inf)) & down
 
     def _reach(self, none: Real) -> Real:
         """How far the enclosures of all parts reach, if there is no level."""
         reach = none
-        for part in self.parts:
-            reach = fmin(longest_step(part.enclosures, Gaps(none, none)), reach)
+        for part in self.operands:
+            reach = fmin(longest_free_length(part.enclosures, LevelGaps(none, none)), reach)
         return reach
 
     @staticmethod
-    def _gaps(gaps: Gaps, part: Part) -> tuple[Gaps, Gaps]:
+    def _gaps(gaps: LevelGaps, part: MaximumOperand) -> tuple[LevelGaps, LevelGaps]:
         """How far the part must rise, or fall, for the greatest to meet a level."""
-        none = type(gaps.up)(dr.inf)
+        none = type(gaps.above)(dr.inf)
         return (
-            Gaps(none, gaps.up + part.least_below, is_one_sided=True),
-            Gaps(fmax(gaps.down - part.most_below, 0), none, is_one_sided=True),
+            LevelGaps(none, gaps.above + part.min_deficit, is_one_sided=True),
+            LevelGaps(fmax(gaps.below - part.max_deficit, 0), none, is_one_sided=True),
         )
 
 
 @dataclass(frozen=True)
-class Negated(Enclosure):
+class NegatedEnclosure(Enclosure):
     """The movement of -f: that of f with the levels above and below exchanged."""
 
     inner: Enclosure
 
-    def step(self, gaps: Gaps) -> Real:
-        return self.inner.step(gaps.exchanged())
+    def free_length(self, gaps: LevelGaps) -> Real:
+        return self.inner.free_length(gaps.swapped())
 
-    def covers(self, gaps: Gaps, length: Real) -> Mask:
-        return self.inner.covers(gaps.exchanged(), length)
+    def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
+        return self.inner.is_free(gaps.swapped(), length)
 
 
 @dataclass(frozen=True)
-class Stretched(Enclosure):
+class ScaledEnclosure(Enclosure):
     """The movement of factor * f(map(path)), where the map stretches the path by `speed`.
 
     Proof. A length s of the path is a length speed s of the path that `inner` is about, and a gap g
@@ -110,18 +111,18 @@ class Stretched(Enclosure):
 
     inner: Enclosure
     speed: Real
-    factor: Real
+    value_factor: Real
 
-    def step(self, gaps: Gaps) -> Real:
-        return self.inner.step(self._gaps(gaps)) / self.speed * ROUND_DOWN
+    def free_length(self, gaps: LevelGaps) -> Real:
+        return self.inner.free_length(self._gaps(gaps)) / self.speed * STEP_SAFETY
 
-    def covers(self, gaps: Gaps, length: Real) -> Mask:
-        return self.inner.covers(self._gaps(gaps), length * self.speed / ROUND_DOWN)
+    def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
+        return self.inner.is_free(self._gaps(gaps), length * self.speed / STEP_SAFETY)
 
-    def _gaps(self, gaps: Gaps) -> Gaps:
-        share = ROUND_DOWN / self.factor
-        down, up = _scaled(gaps.down, share), _scaled(gaps.up, share)
-        return Gaps(down, up, gaps.is_one_sided)
+    def _gaps(self, gaps: LevelGaps) -> LevelGaps:
+        share = STEP_SAFETY / self.value_factor
+        down, up = _scaled(gaps.below, share), _scaled(gaps.above, share)
+        return LevelGaps(down, up, gaps.is_one_sided)
 
 
 def _scaled(gap: Real, share: Real) -> Real:
@@ -131,19 +132,19 @@ def _scaled(gap: Real, share: Real) -> Real:
 
 
 @dataclass(frozen=True)
-class Sheet:
+class BranchSample:
     """One of several functions phi_j, continued along the path from a sample.
 
-    opening: slopes of |phi_j| there.
-    beyond: by how much |phi_j| exceeds the smallest of them, less what rounding may have added.
+    slopes: slopes of |phi_j| there.
+    excess: by how much |phi_j| exceeds the smallest of them, less what rounding may have added.
     """
 
-    opening: Slopes
-    beyond: Real
+    slopes: SlopeRange
+    excess: Real
 
 
 @dataclass(frozen=True)
-class Nearest(Enclosure):
+class NearestBranchEnclosure(Enclosure):
     """The movement of f = s min_j |phi_j|, s the sign of the product of all phi_j.
 
     Such an f is continuous and single-valued wherever the set of all phi_j is, however the branches
@@ -162,44 +163,47 @@ class Nearest(Enclosure):
     step is free of all sheets, not of the nearest alone, and another one may become the nearest on
     the way.
 
-    sheets: one for each phi_j.
+    branches: one for each phi_j.
     nearest: that with the smallest |phi_j|.
     distance: |f|.
     is_positive: whether f is positive.
     """
 
-    sheets: tuple[Sheet, ...]
-    nearest: Sheet
+    branches: tuple[BranchSample, ...]
+    nearest: BranchSample
     distance: Real
     is_positive: Mask
-    bend: Real
+    second_derivative_bound: Real
     reach: Real
 
-    def step(self, gaps: Gaps) -> Real:
-        towards = dr.select(self.is_positive, gaps.down, gaps.up)
-        away = dr.select(self.is_positive, gaps.up, gaps.down)
-        length = first_root(away, self.nearest.opening.high, self.bend)
+    def free_length(self, gaps: LevelGaps) -> Real:
+        towards = dr.select(self.is_positive, gaps.below, gaps.above)
+        away = dr.select(self.is_positive, gaps.above, gaps.below)
+        length = first_reach(away, self.nearest.slopes.upper, self.second_derivative_bound)
         length = fmin(
-            first_root(away + 2 * self.distance, -self.nearest.opening.low, self.bend), length
+            first_reach(
+                away + 2 * self.distance, -self.nearest.slopes.lower, self.second_derivative_bound
+            ),
+            length,
         )
         known = (length >= 0) & (self.distance >= 0)
-        for sheet in self.sheets:
-            gap = fmax(towards + sheet.beyond, 0)
-            one = first_root(gap, -sheet.opening.low, self.bend)
+        for sheet in self.branches:
+            gap = fmax(towards + sheet.excess, 0)
+            one = first_reach(gap, -sheet.slopes.lower, self.second_derivative_bound)
             known &= one >= 0
             length = fmin(length, one)
-        known &= (self.bend >= 0) & (self.reach > 0)
-        return fmax(dr.select(known, fmin(length, self.reach), 0) * ROUND_DOWN, 0)
+        known &= (self.second_derivative_bound >= 0) & (self.reach > 0)
+        return fmax(dr.select(known, fmin(length, self.reach), 0) * STEP_SAFETY, 0)
 
 
-# What powers may round by is more than `ROUND_DOWN` takes off.
-_ROUND_POWERS_DOWN = 1.0 - 1e-5
-# The values of q in the proof of `Cusp` that are tried.
-_PARTS = (0.5, 0.95)
+# What powers may round by is more than `STEP_SAFETY` takes off.
+_POWER_SAFETY = 1.0 - 1e-5
+# The values of q in the proof of `BranchPointEnclosure` that are tried.
+_TRIED_FRACTIONS = (0.5, 0.95)
 
 
 @dataclass(frozen=True)
-class Cusp(Enclosure):
+class BranchPointEnclosure(Enclosure):
     """The movement of f = s min_j |h - u_j| near a branch point a: around the line z = a the
     branches u_j pass into each other.
 
@@ -213,45 +217,51 @@ class Cusp(Enclosure):
     (1 - q) w/v make that |f| - gap: so f, whose sign changes only where one of them is 0, does not
     fall by the gap up to L, or up to where the path leaves the disk if that is earlier.
 
-    height: y.
-    fall: v.
-    foot, across: how far ahead the path's closest point to the line is, and how far from it, both
-        as lengths in the plane.
+    distance_to_limit: y.
+    max_fall_rate: v.
+    closest_parameter, closest_distance: how far ahead the path's closest point to the line is, and
+        how far from it, both as lengths in the plane.
     speed: of the path in the plane.
-    power, constant: alpha and C.
-    inside: the largest r that may be used, R less rounding.
+    exponent, constant: alpha and C.
+    max_radius: the largest r that may be used, R less rounding.
     distance: |f|.
     is_positive: whether f is positive.
     """
 
-    height: Real
-    fall: Real
-    foot: Real
-    across: Real
+    distance_to_limit: Real
+    max_fall_rate: Real
+    closest_parameter: Real
+    closest_distance: Real
     speed: Real
-    power: Real
+    exponent: Real
     constant: Real
-    inside: Real
+    max_radius: Real
     distance: Real
     is_positive: Mask
 
-    def step(self, gaps: Gaps) -> Real:
-        towards = dr.select(self.is_positive, gaps.down, gaps.up)
-        away = dr.select(self.is_positive, gaps.up, gaps.down)
-        room = self.height - fmax(self.distance - towards, 0)
-        together = room + self.distance + towards + self.fall + self.speed
+    def free_length(self, gaps: LevelGaps) -> Real:
+        towards = dr.select(self.is_positive, gaps.below, gaps.above)
+        away = dr.select(self.is_positive, gaps.above, gaps.below)
+        room = self.distance_to_limit - fmax(self.distance - towards, 0)
+        together = room + self.distance + towards + self.max_fall_rate + self.speed
         room = dr.select(together == together, room, 0)  # NaN proves nothing
-        best = 0 * self.height
-        for part in _PARTS:
+        best = 0 * self.distance_to_limit
+        for part in _TRIED_FRACTIONS:
             share = fmax(part * room / self.constant, 0)
-            radius = dr.power(share, 1 / self.power) * _ROUND_POWERS_DOWN
-            radius = dr.select(dr.isfinite(share) & (radius >= 0), fmin(radius, self.inside), 0)
-            chord = (radius - self.across) * (radius + self.across)
-            leaves = self.foot + dr.sqrt(fmax(chord, 0))
+            radius = dr.power(share, 1 / self.exponent) * _POWER_SAFETY
+            radius = dr.select(dr.isfinite(share) & (radius >= 0), fmin(radius, self.max_radius), 0)
+            chord = (radius - self.closest_distance) * (radius + self.closest_distance)
+            leaves = self.closest_parameter + dr.sqrt(fmax(chord, 0))
             leaves = dr.select(self.speed > 0, leaves / self.speed, dr.inf)
-            length = dr.select(self.fall > 0, (1 - part) * room / self.fall, dr.inf)
+            length = dr.select(
+                self.max_fall_rate > 0, (1 - part) * room / self.max_fall_rate, dr.inf
+            )
             length = fmin(leaves, length)
-            start = self.across * self.across + self.foot * self.foot < radius * radius
+            start = (
+                self.closest_distance * self.closest_distance
+                + self.closest_parameter * self.closest_parameter
+                < radius * radius
+            )
             known = start & (room > 0) & (chord > 0) & dr.isfinite(chord)  # squares may overflow
             best = fmax(dr.select(known, length, 0), best)
-        return dr.select(away == dr.inf, best * _ROUND_POWERS_DOWN, 0)
+        return dr.select(away == dr.inf, best * _POWER_SAFETY, 0)

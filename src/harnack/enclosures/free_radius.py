@@ -1,10 +1,12 @@
-"""What proofs on balls share: the solver for the proved length, and `Ball`, for harmonic functions.
+"""What proofs on balls share: the solver for the proved length, and `HarmonicBallEnclosure`, for
+harmonic functions.
 
 Every proof on a ball B(p, R) shows that f meets no level at distance q R as long as
 
     q k(q) <= gap,
 
-with a k that has no poles on [0, 1] and a dimensionless gap. `largest_covered` finds the largest
+with a k that has no poles on [0, 1] and a dimensionless gap. `largest_free_fraction` finds the
+largest
 such q from the safe side: nothing large is ever subtracted, and q is accurate relative to itself.
 Near a surface the gap is tiny, and a q found to an absolute accuracy would stall the march.
 """
@@ -18,7 +20,7 @@ from typing import TYPE_CHECKING, Any, Protocol, cast
 import drjit as dr
 
 from harnack.backend.elementary import clamp, fmax
-from harnack.enclosures.enclosure import Enclosure, Gaps, Slopes
+from harnack.enclosures.enclosure import Enclosure, LevelGaps, SlopeRange
 from harnack.enclosures.promises import BoundedLaplacian, HarmonicBall, Promise
 
 if TYPE_CHECKING:
@@ -27,13 +29,13 @@ if TYPE_CHECKING:
     from harnack.backend import Mask, Real
 
 # Lengths are multiplied by this, to cover the roundings of the two sides of the comparison.
-PULL_BACK = 1.0 - 2e-6
+CONDITION_SAFETY = 1.0 - 2e-6
 # k is the difference of numbers of order one: so many roundings, halves of a unit in the last
 # place, are added to it, which covers their rounding and that of the given slope.
 _ROUNDINGS = 16.0
 
 
-class Condition(Protocol):
+class FreeRadiusCondition(Protocol):
     """A condition q k(q) <= gap under which distance q is proved free; q k(q) crosses the gap
     upwards at most once on [0, 1]."""
 
@@ -44,23 +46,23 @@ class Condition(Protocol):
         """k(q)."""
         ...
 
-    def start(self) -> tuple[Real, Real]:
+    def expansion_at_zero(self) -> tuple[Real, Real]:
         """k(0) and k'(0), for a first guess: no proof rests on them."""
         ...
 
 
-def rounding(real: Any) -> float:
+def condition_rounding(real: Any) -> float:
     """What is added to k in the precision of `real`."""
     return _ROUNDINGS * float(dr.epsilon(real))
 
 
-def is_covered(condition: Condition, q: Real) -> Mask:
+def is_free_fraction(condition: FreeRadiusCondition, q: Real) -> Mask:
     """Whether all of [0, q] is proved free, for 0 <= q <= 1."""
-    slack = rounding(type(q))
-    return q * (condition(q) + slack) <= condition.gap * PULL_BACK
+    slack = condition_rounding(type(q))
+    return q * (condition(q) + slack) <= condition.gap * CONDITION_SAFETY
 
 
-def largest_covered(condition: Condition, rounds: int) -> Real:
+def largest_free_fraction(condition: FreeRadiusCondition, rounds: int) -> Real:
     """The largest q in [0, 1) that is proved free, approached from below.
 
     Four rounds come within 1e-5 of it for four balls in five, and within a few percent wherever
@@ -74,9 +76,9 @@ def largest_covered(condition: Condition, rounds: int) -> Real:
     is covered if q k(q) is convex.
     """
     real = cast("Any", type(condition.gap))
-    gap, slack = condition.gap, rounding(real)
+    gap, slack = condition.gap, condition_rounding(real)
     previous_q = real(0)
-    previous_k, bend = condition.start()
+    previous_k, bend = condition.expansion_at_zero()
     q = clamp(_root(gap, previous_k, bend), 0, 1)
     safe, below = real(0), -gap  # q k(q) - gap at the ends of the bracket
     unsafe, above = real(1), real(dr.inf)
@@ -84,7 +86,7 @@ def largest_covered(condition: Condition, rounds: int) -> Real:
         if i == rounds - 1:
             part = dr.select(dr.isfinite(above), below / (below - above), 1)
             q = fmax(safe, dr.select(dr.isfinite(above), dr.fma(part, unsafe - safe, safe), q))
-            q = q * PULL_BACK
+            q = q * CONDITION_SAFETY
         # Candidates aim at twice the slack, so that rounding does not fail them.
         k = condition(q) + 2 * slack
         excess = dr.fma(q, k - slack, -gap)
@@ -97,7 +99,7 @@ def largest_covered(condition: Condition, rounds: int) -> Real:
         bend = dr.select(run == 0, 0, (k - previous_k) / run)
         previous_q, previous_k = q, k
         q = clamp(_root(gap, dr.fma(-bend, q, k), bend), safe, unsafe)
-    return safe * PULL_BACK
+    return safe * CONDITION_SAFETY
 
 
 def _root(gap: Real, constant: Real, slope: Real) -> Real:
@@ -112,48 +114,50 @@ def _root(gap: Real, constant: Real, slope: Real) -> Real:
 
 
 # A radius is multiplied by this, as distances carry a few roundings of float32.
-_RADIUS_SLACK = 1.0 - 1e-6
+_RADIUS_SAFETY = 1.0 - 1e-6
 
 
 @dataclass(frozen=True)
-class Ball(Enclosure):
+class HarmonicBallEnclosure(Enclosure):
     """f is harmonic on B(p, radius) of R^dimension and moves there by less than the two ranges.
 
-    range_below, range_above: f - lower and upper - f, how far the promise lets f move, so that
+    max_fall, max_rise: f - lower and upper - f, how far the promise lets f move, so that
         bounds never subtract two large numbers. None for a side that is not bounded.
     """
 
     radius: Real
-    range_below: Real | None
-    range_above: Real | None
+    max_fall: Real | None
+    max_rise: Real | None
     dimension: int
-    slopes: Slopes
+    slopes: SlopeRange
 
     @classmethod
-    def of(cls, promise: Promise, value: Real, error: Real, slopes: Slopes) -> Self | None:
+    def from_promise(
+        cls, promise: Promise, value: Real, error: Real, slopes: SlopeRange
+    ) -> Self | None:
         if not isinstance(promise, HarmonicBall):
             return None
-        radius, below, above = known_ranges(promise, value, error)
-        if not cls.applies(promise.dimension, below is not None, above is not None):
+        radius, below, above = allowed_movement(promise, value, error)
+        if not cls.applies_to(promise.dimension, below is not None, above is not None):
             return None
         return cls(radius, below, above, promise.dimension, slopes)
 
-    def is_known(self, gaps: Gaps) -> Mask:
+    def is_valid(self, gaps: LevelGaps) -> Mask:
         """Whether ranges and gaps are numbers, and large enough to divide by."""
-        known = (gaps.down >= 0) & (gaps.up >= 0)
-        for one in (self.range_below, self.range_above):
+        known = (gaps.below >= 0) & (gaps.above >= 0)
+        for one in (self.max_fall, self.max_rise):
             if one is not None:
                 known &= (one == 0) | (dr.isfinite(1 / one) & dr.isfinite(2 * one))
         return known
 
     @classmethod
-    def applies(cls, dimension: int, is_bounded_below: bool, is_bounded_above: bool) -> bool:
+    def applies_to(cls, dimension: int, is_bounded_below: bool, is_bounded_above: bool) -> bool:
         """Whether this proof holds for balls of this dimension with these ends bounded."""
         del dimension
         return is_bounded_below or is_bounded_above
 
 
-def known_ranges(
+def allowed_movement(
     promise: HarmonicBall | BoundedLaplacian, value: Real, error: Real
 ) -> tuple[Real, Real | None, Real | None]:
     """Radius, and how far the promise lets f move down and up (None: that side is not bounded).
@@ -175,4 +179,4 @@ def known_ranges(
         return fmax(distance, 0) + total_error
 
     below, above = movement(promise.lower, -1.0), movement(promise.upper, 1.0)
-    return dr.select(known, promise.radius * _RADIUS_SLACK, 0), below, above
+    return dr.select(known, promise.radius * _RADIUS_SAFETY, 0), below, above

@@ -1,8 +1,9 @@
 """Proofs for functions that are harmonic and bounded on a ball: from the promise `HarmonicBall`.
 
-- `Classic`: the published rule, Harnack's inequality with a lower bound alone.
-- `Slope`: Harnack's inequality that also uses the directional derivative.
-- `Caps`: spherical caps, the sharpest enclosure where both a lower and an upper bound are known.
+- `HarnackEnclosure`: the published rule, Harnack's inequality with a lower bound alone.
+- `HarnackSlopeEnclosure`: Harnack's inequality that also uses the directional derivative.
+- `SphericalCapEnclosure`: spherical caps, the sharpest enclosure where both a lower and an upper
+  bound are known.
 """
 
 from __future__ import annotations
@@ -13,16 +14,22 @@ from typing import TYPE_CHECKING, ClassVar
 import drjit as dr
 
 from harnack.backend.elementary import clamp, fmax, fmin
-from harnack.enclosures.enclosure import ROUND_DOWN
-from harnack.enclosures.free_radius import Ball, Condition, is_covered, largest_covered, rounding
+from harnack.enclosures.enclosure import STEP_SAFETY
+from harnack.enclosures.free_radius import (
+    FreeRadiusCondition,
+    HarmonicBallEnclosure,
+    condition_rounding,
+    is_free_fraction,
+    largest_free_fraction,
+)
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real
-    from harnack.enclosures.enclosure import Gaps
+    from harnack.enclosures.enclosure import LevelGaps
 
 
 @dataclass(frozen=True)
-class Classic(Ball):
+class HarnackEnclosure(HarmonicBallEnclosure):
     """Harnack's inequality for u = f - lower > 0 on B(p, R), in every direction alike.
 
     Proof. u is a Poisson integral of a positive measure of mass u(p), and the kernel
@@ -36,23 +43,23 @@ class Classic(Ball):
 
         n = 2:  |v-u| / (u+v)         n = 3:  2 |v-u| / (u + 2v + sqrt(u (u + 8v)))
 
-    and for n = 4 the cubic is solved by Newton's method from the safe side (`_quartic_growing`).
+    and for n = 4 the cubic is solved by Newton's method from the safe side (`_fraction_4d_up`).
     A level at or below `lower` cannot be reached inside the ball: the step is R. The slope is not
     used.
 
     Source: Gillespie, Yang, Botsch, Crane 2024, Eq. 4-7 (n = 3) and Eq. 27 (n = 4).
     """
 
-    def step(self, gaps: Gaps) -> Real:
-        return dr.select(self.is_known(gaps), self.radius * self._fraction(gaps), 0)
+    def free_length(self, gaps: LevelGaps) -> Real:
+        return dr.select(self.is_valid(gaps), self.radius * self._fraction(gaps), 0)
 
-    def _fraction(self, gaps: Gaps) -> Real:
+    def _fraction(self, gaps: LevelGaps) -> Real:
         """The step divided by the radius, from whichever sides are bounded."""
         below = above = None
-        if self.range_below is not None:
-            below = _one_sided(self.range_below, gaps.up, gaps.down, self.dimension)
-        if self.range_above is not None:  # the same for upper - f, positive and harmonic
-            above = _one_sided(self.range_above, gaps.down, gaps.up, self.dimension)
+        if self.max_fall is not None:
+            below = _fraction_from_one_side(self.max_fall, gaps.above, gaps.below, self.dimension)
+        if self.max_rise is not None:  # the same for upper - f, positive and harmonic
+            above = _fraction_from_one_side(self.max_rise, gaps.below, gaps.above, self.dimension)
         if below is None or above is None:
             one = below if above is None else above
             assert one is not None
@@ -60,26 +67,26 @@ class Classic(Ball):
         return fmax(below, above)
 
 
-def _one_sided(u: Real, gap_away: Real, gap_toward: Real, dimension: int) -> Real:
+def _fraction_from_one_side(u: Real, gap_away: Real, gap_toward: Real, dimension: int) -> Real:
     """A safe q for positive u, with levels `gap_away` above u and `gap_toward` below it."""
-    growing, falling = _LEVEL_RULES[dimension]
+    growing, falling = _FRACTION_FORMULAS[dimension]
     # u = 0 forces u to vanish identically: no level is ever reached.
     up = dr.select((gap_away == dr.inf) | (u <= 0), 1, growing(u, u + gap_away, gap_away))
     v = u - gap_toward
     down = dr.select((v <= 0) | (gap_toward == dr.inf), 1, falling(u, fmax(v, 0), gap_toward))
-    return clamp(fmin(up, down), 0, 1) * ROUND_DOWN
+    return clamp(fmin(up, down), 0, 1) * STEP_SAFETY
 
 
-def _plane(u: Real, v: Real, gap: Real) -> Real:
+def _fraction_2d(u: Real, v: Real, gap: Real) -> Real:
     return gap / (u + v)
 
 
-def _space(u: Real, v: Real, gap: Real) -> Real:
+def _fraction_3d(u: Real, v: Real, gap: Real) -> Real:
     # Two square roots, as the product u (u + 8v) may underflow or overflow.
     return 2 * gap / (u + 2 * v + dr.sqrt(u) * dr.sqrt(u + 8 * v))
 
 
-def _quartic_growing(u: Real, v: Real, gap: Real) -> Real:
+def _fraction_4d_up(u: Real, v: Real, gap: Real) -> Real:
     """(1+q)/(1-q)^3 = w, w = v/u, by Newton's method from the safe side, in two forms.
 
     For w < 2, from the left: h(q) = gap - q (u + v (3 - 3q + q^2)) is decreasing and convex. That
@@ -95,7 +102,7 @@ def _quartic_growing(u: Real, v: Real, gap: Real) -> Real:
     return dr.select(v < 2 * u, q, dr.fma(y, -1 - 1e-6, 1))
 
 
-def _quartic_falling(u: Real, v: Real, gap: Real) -> Real:
+def _fraction_4d_down(u: Real, v: Real, gap: Real) -> Real:
     """(1-q)/(1+q)^3 = v/u: h(q) = gap - q (u + v (3 + 3q + q^2)) is decreasing and concave, so
     Newton's method ends right of the root and the chord from (0, gap) to there ends left of it,
     the safe side."""
@@ -107,19 +114,19 @@ def _quartic_falling(u: Real, v: Real, gap: Real) -> Real:
     return q * gap / (gap - h)
 
 
-_LEVEL_RULES = {
-    2: (_plane, _plane),
-    3: (_space, _space),
-    4: (_quartic_growing, _quartic_falling),
+_FRACTION_FORMULAS = {
+    2: (_fraction_2d, _fraction_2d),
+    3: (_fraction_3d, _fraction_3d),
+    4: (_fraction_4d_up, _fraction_4d_down),
 }
 
 
 # A gap of this many times u is reached only within 1e-6 of the sphere.
-_NEVER = 1e18
+_UNREACHABLE_GAP = 1e18
 
 
 @dataclass(frozen=True)
-class Slope(Ball):
+class HarnackSlopeEnclosure(HarmonicBallEnclosure):
     """One- or two-sided slope bound in 2, 3 and 4 dimensions.
 
     Proof. A positive harmonic u on B(p, R) is, along a unit direction v and with q = t/R,
@@ -140,57 +147,61 @@ class Slope(Ball):
     lower one as P(q, .) does. For upper - f, whose slope is negated, they change places and signs.
     """
 
-    rounds: ClassVar[int] = 4
-    """Rounds of `largest_covered`."""
+    solver_iterations: ClassVar[int] = 4
+    """Rounds of `largest_free_fraction`."""
 
-    def step(self, gaps: Gaps) -> Real:
-        q = type(gaps.up)(1)
+    def free_length(self, gaps: LevelGaps) -> Real:
+        q = type(gaps.above)(1)
         for alternatives in self._conditions(gaps):
             side = type(q)(0)
             for condition in alternatives:
-                side = fmax(side, largest_covered(condition, self.rounds))
+                side = fmax(side, largest_free_fraction(condition, self.solver_iterations))
             q = fmin(q, side)
-        return dr.select(self.is_known(gaps), q * self.radius, 0)
+        return dr.select(self.is_valid(gaps), q * self.radius, 0)
 
-    def covers(self, gaps: Gaps, length: Real) -> Mask:
+    def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
         q = length / self.radius
         covered = q <= 1
         q = clamp(q, 0, 1)
         for alternatives in self._conditions(gaps):
             free = None
             for condition in alternatives:
-                proved = is_covered(condition, q)
+                proved = is_free_fraction(condition, q)
                 free = proved if free is None else free | proved
             covered = covered & free
-        return (length <= 0) | (covered & self.is_known(gaps))
+        return (length <= 0) | (covered & self.is_valid(gaps))
 
-    def _conditions(self, gaps: Gaps) -> tuple[list[Condition], list[Condition]]:
+    def _conditions(
+        self, gaps: LevelGaps
+    ) -> tuple[list[FreeRadiusCondition], list[FreeRadiusCondition]]:
         """The conditions for f not to reach the level above, and the level below; on each side one
         of them is enough."""
-        up: list[Condition] = []
-        down: list[Condition] = []
+        up: list[FreeRadiusCondition] = []
+        down: list[FreeRadiusCondition] = []
         rising = self.slopes
         for u, slopes, gap_away, away, gap_toward, toward in (
-            (self.range_below, rising, gaps.up, up, gaps.down, down),  # u = f - lower
-            (self.range_above, rising.negated(), gaps.down, down, gaps.up, up),  # u = upper - f
+            (self.max_fall, rising, gaps.above, up, gaps.below, down),  # u = f - lower
+            (self.max_rise, rising.negated(), gaps.below, down, gaps.above, up),  # u = upper - f
         ):
             if u is None:
                 continue
             # u = 0 forces u to vanish identically: no level is ever reached.
             share = dr.select(u > 0, 1 / u, dr.inf)
             scale = self.radius * share / self.dimension
-            most = dr.select(u > 0, slopes.high * scale, 0)
-            least = dr.select(u > 0, slopes.low * scale, 0)
-            slack = rounding(type(gaps.up))
+            most = dr.select(u > 0, slopes.upper * scale, 0)
+            least = dr.select(u > 0, slopes.lower * scale, 0)
+            slack = condition_rounding(type(gaps.above))
             # NaN for a slope counts as the worst one, on both sides.
             steep, flat = fmax(fmin(most + slack, 1), -1), clamp(least - slack, -1, 1)
-            away.append(_Chord.of(fmin(gap_away * share, _NEVER), steep, self.dimension))
-            toward.append(_Jensen(fmin(gap_toward * share, 1), flat, self.dimension))
+            away.append(
+                _ChordCondition.of(fmin(gap_away * share, _UNREACHABLE_GAP), steep, self.dimension)
+            )
+            toward.append(_JensenCondition(fmin(gap_toward * share, 1), flat, self.dimension))
         return up, down
 
 
 @dataclass(frozen=True)
-class _Chord:
+class _ChordCondition:
     """(1+m)/2 P(q,1) + (1-m)/2 P(q,-1) <= w = 1 + gap/u.
 
     The left side times (1-q)^K, K = n-1, is B = (1-q)^K + q A/(1+q)^K with a polynomial A, and
@@ -203,7 +214,7 @@ class _Chord:
     dimension: int
 
     @classmethod
-    def of(cls, gap: Real, mean: Real, dimension: int) -> _Chord:
+    def of(cls, gap: Real, mean: Real, dimension: int) -> _ChordCondition:
         if dimension == 3:
             gap = gap / (dr.sqrt(1 + gap) + 1)
         elif dimension == 4:
@@ -211,7 +222,7 @@ class _Chord:
             gap = gap / dr.fma(root, root + 1, 1)
         return cls(gap, mean, dimension)
 
-    def start(self) -> tuple[Real, Real]:
+    def expansion_at_zero(self) -> tuple[Real, Real]:
         n, k = self.dimension, self.dimension - 1
         first = n * self.mean - k
         second = n * (1 - self.mean) - 0.5 * (k - 1) / (k * k) * first * first
@@ -234,7 +245,7 @@ class _Chord:
 
 
 @dataclass(frozen=True)
-class _Jensen:
+class _JensenCondition:
     """P(q, m) >= 1 - gap/u.
 
     With D = 1+q^2-2qm it says (1-g) D^(n/2) <= 1-q^2, that is q k(q) <= g with
@@ -245,7 +256,7 @@ class _Jensen:
     mean: Real
     dimension: int
 
-    def start(self) -> tuple[Real, Real]:
+    def expansion_at_zero(self) -> tuple[Real, Real]:
         n, m, rest = self.dimension, self.mean, 1 - self.gap
         second = 1 + 0.5 * n * (1 + (n - 2) * m * m)
         return -rest * n * m, dr.fma(rest, second, self.gap)
@@ -264,7 +275,7 @@ class _Jensen:
 
 
 @dataclass(frozen=True)
-class Caps(Ball):
+class SphericalCapEnclosure(HarmonicBallEnclosure):
     """The cap bound, for f bounded on both sides, in space: the extremal boundary values are the
     indicator of two spherical caps.
 
@@ -295,50 +306,53 @@ class Caps(Ball):
     at most those sign changes, in that order, and where it starts negative it turns once.
     """
 
-    rounds: ClassVar[int] = 4
-    """Rounds of `largest_covered`."""
+    solver_iterations: ClassVar[int] = 4
+    """Rounds of `largest_free_fraction`."""
 
     @classmethod
-    def applies(cls, dimension: int, is_bounded_below: bool, is_bounded_above: bool) -> bool:
+    def applies_to(cls, dimension: int, is_bounded_below: bool, is_bounded_above: bool) -> bool:
         return dimension == 3 and is_bounded_below and is_bounded_above
 
-    def step(self, gaps: Gaps) -> Real:
+    def free_length(self, gaps: LevelGaps) -> Real:
         up, down = self._conditions(gaps)
-        q = fmin(largest_covered(up, self.rounds), largest_covered(down, self.rounds))
-        return dr.select(self.is_known(gaps), q * self.radius, 0)
+        q = fmin(
+            largest_free_fraction(up, self.solver_iterations),
+            largest_free_fraction(down, self.solver_iterations),
+        )
+        return dr.select(self.is_valid(gaps), q * self.radius, 0)
 
-    def covers(self, gaps: Gaps, length: Real) -> Mask:
+    def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
         up, down = self._conditions(gaps)
         q = length / self.radius
-        inside = (q <= 1) & self.is_known(gaps)
+        inside = (q <= 1) & self.is_valid(gaps)
         q = clamp(q, 0, 1)
-        return (length <= 0) | (inside & is_covered(up, q) & is_covered(down, q))
+        return (length <= 0) | (inside & is_free_fraction(up, q) & is_free_fraction(down, q))
 
-    def _conditions(self, gaps: Gaps) -> tuple[_TwoCaps, _TwoCaps]:
+    def _conditions(self, gaps: LevelGaps) -> tuple[_CapCondition, _CapCondition]:
         """The conditions for f not to reach the level above, and the level below."""
-        below, above = self.range_below, self.range_above
+        below, above = self.max_fall, self.max_rise
         assert below is not None
         assert above is not None
         share = 1 / (below + above)
         p, rest = below * share, above * share
         moment = self.radius * share / 3
-        rising, falling = moment * self.slopes.high, -moment * self.slopes.low
+        rising, falling = moment * self.slopes.upper, -moment * self.slopes.lower
         return (
-            _two_caps(gaps.up, above, p, rest, rising),
-            _two_caps(gaps.down, below, rest, p, falling),
+            _two_caps(gaps.above, above, p, rest, rising),
+            _two_caps(gaps.below, below, rest, p, falling),
         )
 
 
-def _two_caps(gap: Real, most: Real, p: Real, rest: Real, mu: Real) -> _TwoCaps:
+def _two_caps(gap: Real, most: Real, p: Real, rest: Real, mu: Real) -> _CapCondition:
     # Without a range f is constant: no level is ever reached.
-    slack = rounding(type(gap)) * p
+    slack = condition_rounding(type(gap)) * p
     shift = dr.select(rest > 0, mu / rest, 0) + slack
     shift = fmax(fmin(shift, p), -p)  # the worst one, p, if the slope is not a number
-    return _TwoCaps(dr.select(gap < most, gap / most, 1), p, rest, shift)
+    return _CapCondition(dr.select(gap < most, gap / most, 1), p, rest, shift)
 
 
 @dataclass(frozen=True)
-class _TwoCaps:
+class _CapCondition:
     """(1-g) S(q) <= 1-q^2 with S = s1 s2 (s1+s2)/2, g = gap/(C-f) and heights b, a of the caps.
 
     That is q k(q) <= g with k = (1-g) (S - 1 + q^2)/q + g q.
@@ -349,7 +363,7 @@ class _TwoCaps:
     rest: Real  # 1 - p, accurate where it is small
     shift: Real  # mu/(1-p)
 
-    def start(self) -> tuple[Real, Real]:
+    def expansion_at_zero(self) -> tuple[Real, Real]:
         x, y, rest = self.rest - self.shift, self.rest + self.shift, 1 - self.gap
         second = 2.5 - 0.75 * dr.fma(x, x, y * y) - x * y + 2 * self.shift * self.shift
         return 3 * rest * self.shift, dr.fma(rest, second, self.gap)

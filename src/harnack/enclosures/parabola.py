@@ -1,8 +1,10 @@
-"""Proofs by lines and parabolas: `Parabola` and those derived from it, `Tangent` and `Arc`.
+"""Proofs by lines and parabolas: `ParabolaEnclosure` and those derived from it,
+`ConvexityEnclosure` and `SphereArcEnclosure`.
 
-- `Cone`: from a Lipschitz constant. `Taylor`: from a bound of the second derivatives.
-- `Tangent`: a convex function lies above its tangents.
-- `Arc`: a parabola in the angle along a circle, for functions on the sphere S^3.
+- `LipschitzEnclosure`: from a Lipschitz constant. `TaylorEnclosure`: from a bound of the second
+  derivatives.
+- `ConvexityEnclosure`: a convex function lies above its tangents.
+- `SphereArcEnclosure`: a parabola in the angle along a circle, for functions on the sphere S^3.
 """
 
 from __future__ import annotations
@@ -14,8 +16,8 @@ from typing import TYPE_CHECKING
 import drjit as dr
 
 from harnack.backend.elementary import fmax, fmin, sincos
-from harnack.enclosures.enclosure import ROUND_DOWN, Enclosure, Gaps, Slopes
-from harnack.enclosures.promises import Curvature, Lipschitz, Promise
+from harnack.enclosures.enclosure import STEP_SAFETY, Enclosure, LevelGaps, SlopeRange
+from harnack.enclosures.promises import Lipschitz, Promise, TaylorRemainder
 
 if TYPE_CHECKING:
     from typing import Self
@@ -26,8 +28,9 @@ _ROOT_OF_TWO = math.sqrt(2.0)
 
 
 @dataclass(frozen=True)
-class Parabola(Enclosure):
-    """slopes.low s + least_curvature s^2/2 <= F(s) <= slopes.high s + most_curvature s^2/2.
+class ParabolaEnclosure(Enclosure):
+    """slopes.lower s + min_second_derivative s^2/2 <= F(s)
+    <= slopes.upper s + max_second_derivative s^2/2.
 
     For 0 <= s < reach. Curvatures are second derivatives, of either sign.
 
@@ -40,25 +43,25 @@ class Parabola(Enclosure):
     least.
     """
 
-    slopes: Slopes
-    least_curvature: Real
-    most_curvature: Real
+    slopes: SlopeRange
+    min_second_derivative: Real
+    max_second_derivative: Real
     reach: Real
 
-    def step(self, gaps: Gaps) -> Real:
-        up = first_root(gaps.up, self.slopes.high, self.most_curvature)
-        down = first_root(gaps.down, -self.slopes.low, -self.least_curvature)
+    def free_length(self, gaps: LevelGaps) -> Real:
+        up = first_reach(gaps.above, self.slopes.upper, self.max_second_derivative)
+        down = first_reach(gaps.below, -self.slopes.lower, -self.min_second_derivative)
         known = (up >= 0) & (down >= 0) & (self.reach > 0)  # and not NaN
-        return fmax(dr.select(known, fmin(fmin(up, down), self.reach), 0) * ROUND_DOWN, 0)
+        return fmax(dr.select(known, fmin(fmin(up, down), self.reach), 0) * STEP_SAFETY, 0)
 
-    def covers(self, gaps: Gaps, length: Real) -> Mask:
-        free = _stays_below(gaps.up, self.slopes.high, self.most_curvature, length)
-        free &= _stays_below(gaps.down, -self.slopes.low, -self.least_curvature, length)
+    def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
+        free = _stays_below(gaps.above, self.slopes.upper, self.max_second_derivative, length)
+        free &= _stays_below(gaps.below, -self.slopes.lower, -self.min_second_derivative, length)
         return (length <= 0) | ((length <= self.reach) & free)
 
 
 @dataclass(frozen=True)
-class Cone(Parabola):
+class LipschitzEnclosure(ParabolaEnclosure):
     """The Lipschitz cone: the step of sphere tracing.
 
     Proof. |F(s)| <= K s for s < radius by the promise: a parabola without curvature, whose step is
@@ -66,27 +69,29 @@ class Cone(Parabola):
     """
 
     @classmethod
-    def of(cls, promise: Promise, value: Real, error: Real, slopes: Slopes) -> Self | None:
+    def from_promise(
+        cls, promise: Promise, value: Real, error: Real, slopes: SlopeRange
+    ) -> Self | None:
         if not isinstance(promise, Lipschitz):
             return None
-        constant = _not_negative(promise.constant)
-        return cls(Slopes(-constant, constant), 0.0, 0.0, promise.radius)
+        constant = _nan_if_negative(promise.constant)
+        return cls(SlopeRange(-constant, constant), 0.0, 0.0, promise.radius)
 
     # Both sides in one formula, for speed: a ray along an edge uses a dozen cones at each point.
 
-    def step(self, gaps: Gaps) -> Real:
-        length = gaps.smaller / self.slopes.high
-        known = (gaps.down > 0) & (gaps.up > 0) & (self.slopes.high >= 0) & (self.reach > 0)
-        return dr.select(known, fmin(length, self.reach), 0) * ROUND_DOWN
+    def free_length(self, gaps: LevelGaps) -> Real:
+        length = gaps.nearest / self.slopes.upper
+        known = (gaps.below > 0) & (gaps.above > 0) & (self.slopes.upper >= 0) & (self.reach > 0)
+        return dr.select(known, fmin(length, self.reach), 0) * STEP_SAFETY
 
-    def covers(self, gaps: Gaps, length: Real) -> Mask:
-        moved = self.slopes.high * length
-        free = (length <= self.reach) & (moved <= gaps.down) & (moved <= gaps.up)
+    def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
+        moved = self.slopes.upper * length
+        free = (length <= self.reach) & (moved <= gaps.below) & (moved <= gaps.above)
         return (length <= 0) | free
 
 
 @dataclass(frozen=True)
-class Taylor(Parabola):
+class TaylorEnclosure(ParabolaEnclosure):
     """Taylor's formula with a bound H of the second derivatives.
 
     Proof. With a slope in [low, high], F(s) lies between low s - H s^2/2 and high s + H s^2/2 for
@@ -94,19 +99,21 @@ class Taylor(Parabola):
     """
 
     @classmethod
-    def of(cls, promise: Promise, value: Real, error: Real, slopes: Slopes) -> Self | None:
-        if not isinstance(promise, Curvature):
+    def from_promise(
+        cls, promise: Promise, value: Real, error: Real, slopes: SlopeRange
+    ) -> Self | None:
+        if not isinstance(promise, TaylorRemainder):
             return None
-        constant = _not_negative(promise.constant)
+        constant = _nan_if_negative(promise.constant)
         return cls(slopes, -constant, constant, promise.radius)
 
 
-def _not_negative(constant: Real) -> Real:
+def _nan_if_negative(constant: Real) -> Real:
     """The constant; NaN where it is negative, so that nothing is proved."""
     return dr.select(constant >= 0, constant, dr.nan)
 
 
-def first_root(gap: Real, slope: Real, curvature: Real) -> Real:
+def first_reach(gap: Real, slope: Real, curvature: Real) -> Real:
     """The first s > 0 at which slope s + curvature s^2/2 reaches the gap; infinite if none does.
 
     In a form whose squares neither overflow nor underflow: near a zero of high order, slope,
@@ -115,7 +122,7 @@ def first_root(gap: Real, slope: Real, curvature: Real) -> Real:
     none = gap == dr.inf  # there is no level on this side
     turns = curvature < 0
     gap = _rounded_down_where(turns, dr.select(none, 0, gap))
-    steep, bent = dr.abs(slope), _steepest_that_turns(gap, curvature)
+    steep, bent = dr.abs(slope), _max_turning_slope(gap, curvature)
     longer, shorter = fmax(steep, bent), fmin(steep, bent)
     ratio = dr.select(longer > 0, shorter / longer, 0)
     root = longer * dr.sqrt(dr.fma(dr.select(turns, -ratio, ratio), ratio, 1))
@@ -131,11 +138,11 @@ def _stays_below(gap: Real, slope: Real, curvature: Real, length: Real) -> Mask:
     The largest value is at an end, or at the vertex of a parabola that rises and then falls."""
     bend = 0.5 * curvature * length
     turned = (slope > 0) & (slope + 2 * bend < 0)
-    steepest = _steepest_that_turns(_rounded_down_where(turned, gap), curvature)
+    steepest = _max_turning_slope(_rounded_down_where(turned, gap), curvature)
     return dr.select(turned, slope <= steepest, (bend + slope) * length <= gap)
 
 
-def _steepest_that_turns(gap: Real, curvature: Real) -> Real:
+def _max_turning_slope(gap: Real, curvature: Real) -> Real:
     """sqrt(2 |curvature| gap): a parabola with a smaller slope falls again before the gap."""
     return dr.sqrt(dr.abs(curvature)) * (_ROOT_OF_TWO * dr.sqrt(gap))
 
@@ -147,8 +154,8 @@ def _rounded_down_where(turns: Mask, gap: Real) -> Real:
 
 
 @dataclass(frozen=True)
-class Tangent(Enclosure):
-    """F(s) >= slopes.low s for all s >= 0: f is convex along the path.
+class ConvexityEnclosure(Enclosure):
+    """F(s) >= slopes.lower s for all s >= 0: f is convex along the path.
 
     Proof. A convex function lies above its tangents, so f does not fall to a level g below before
     g/|slope|, and never if it rises here. Nothing is proved about levels above. f itself must be
@@ -156,22 +163,22 @@ class Tangent(Enclosure):
     1 - e^-d is not convex). The lower end rises with the slope.
     """
 
-    slopes: Slopes
+    slopes: SlopeRange
 
-    def step(self, gaps: Gaps) -> Real:
-        falls = -self.slopes.low
-        down = dr.select(falls > 0, gaps.down / falls, dr.select(falls <= 0, dr.inf, 0))
-        down = dr.select(gaps.down > 0, down * ROUND_DOWN, 0)
-        return dr.select(gaps.up == dr.inf, fmax(down, 0), 0)
+    def free_length(self, gaps: LevelGaps) -> Real:
+        falls = -self.slopes.lower
+        down = dr.select(falls > 0, gaps.below / falls, dr.select(falls <= 0, dr.inf, 0))
+        down = dr.select(gaps.below > 0, down * STEP_SAFETY, 0)
+        return dr.select(gaps.above == dr.inf, fmax(down, 0), 0)
 
 
 # Covers the roundings, in single precision, of the angle and of the length that it becomes.
-_ROUND_DOWN = 1.0 - 1e-5
+_ARC_SAFETY = 1.0 - 1e-5
 _PI_BELOW = 3.14159
 
 
 @dataclass(frozen=True)
-class Arc(Enclosure):
+class SphereArcEnclosure(Enclosure):
     """|F - slope psi| <= curvature psi^2/2, psi the angle traveled along the path's circle.
 
     For functions of points on a sphere: by stereographic projection a line of space becomes a
@@ -182,7 +189,7 @@ class Arc(Enclosure):
     slopes: of f along the path, in f per length, where it starts.
     curvature: a bound of the second derivative of f in the angle, on the whole circle.
     offset: the path's parameter from the point of the line that is closest to the origin.
-    square: 1 + (that point's distance to the origin)^2, called c^2.
+    squared_radius: 1 + (that point's distance to the origin)^2, called c^2.
 
     Proof. The line q + t v, q.v = 0, becomes the circle of the points
 
@@ -190,35 +197,35 @@ class Arc(Enclosure):
 
     with t = c tan(a/2) and c^2 = 1 + |q|^2, at speed da/dt = 2c/S, S = c^2 + t^2. So the slope in
     the angle is S/(2c) times the slope, f keeps within the parabola of `curvature`, and the first
-    psi at which that meets a gap is `first_root`. From t the angle psi leads to t + s with
+    psi at which that meets a gap is `first_reach`. From t the angle psi leads to t + s with
 
         s = S sin(psi/2)/(c cos(psi/2) - t sin(psi/2)),
 
     and to infinity, where the path ends, as soon as the denominator is not positive: then no level
     is ever met. Relative errors of slope, curvature, gap and length change psi by as much at most,
-    and an error of the denominator is one of psi of the same relative size: `_ROUND_DOWN`.
+    and an error of the denominator is one of psi of the same relative size: `_ARC_SAFETY`.
     The range rises and falls with the slope at both ends.
     """
 
-    slopes: Slopes
+    slopes: SlopeRange
     curvature: Real
     offset: Real
-    square: Real
+    squared_radius: Real
 
-    def step(self, gaps: Gaps) -> Real:
-        c = dr.sqrt(self.square)
-        total = dr.fma(self.offset, self.offset, self.square)
+    def free_length(self, gaps: LevelGaps) -> Real:
+        c = dr.sqrt(self.squared_radius)
+        total = dr.fma(self.offset, self.offset, self.squared_radius)
         rate = 0.5 * total / c
-        up = first_root(gaps.up, self.slopes.high * rate, self.curvature)
-        down = first_root(gaps.down, -self.slopes.low * rate, self.curvature)
-        half = 0.5 * _ROUND_DOWN * fmin(up, down)
+        up = first_reach(gaps.above, self.slopes.upper * rate, self.curvature)
+        down = first_reach(gaps.below, -self.slopes.lower * rate, self.curvature)
+        half = 0.5 * _ARC_SAFETY * fmin(up, down)
         known = (up >= 0) & (down >= 0) & (self.curvature >= 0)  # and not NaN
         known &= dr.isfinite(total)  # its square does not overflow
         ends = half >= _PI_BELOW  # once around the circle
         s, k = sincos(dr.select(ends, 0, half))
         left = dr.fma(c, k, -self.offset * s)
-        length = dr.select((left > 0) & ~ends, total * s / left * _ROUND_DOWN, dr.inf)
+        length = dr.select((left > 0) & ~ends, total * s / left * _ARC_SAFETY, dr.inf)
         return dr.select(known, fmax(length, 0), 0)
 
-    def covers(self, gaps: Gaps, length: Real) -> Mask:
-        return (length <= 0) | (length <= self.step(gaps))
+    def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
+        return (length <= 0) | (length <= self.free_length(gaps))

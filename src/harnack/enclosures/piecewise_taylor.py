@@ -9,18 +9,18 @@ from typing import TYPE_CHECKING
 import drjit as dr
 
 from harnack.backend.elementary import fmax, fmin
-from harnack.enclosures.enclosure import ROUND_DOWN, Enclosure, Gaps, Piece, Slopes
-from harnack.enclosures.parabola import first_root
+from harnack.enclosures.enclosure import STEP_SAFETY, Enclosure, LevelGaps, PathPiece, SlopeRange
+from harnack.enclosures.parabola import first_reach
 
 if TYPE_CHECKING:
     from typing import Self
 
     from harnack.backend import Mask, Real
-    from harnack.enclosures.enclosure import Restriction
+    from harnack.enclosures.enclosure import PathRestriction
 
 
 @dataclass(frozen=True)
-class Pieces(Enclosure):
+class PiecewiseTaylorEnclosure(Enclosure):
     """F' and F'' stay within ranges on successive pieces of the path.
 
     slopes: of F at s = 0.
@@ -36,69 +36,71 @@ class Pieces(Enclosure):
     (Aydinlilar and Zanni 2023, section 6.1).
     """
 
-    slopes: Slopes
-    parts: tuple[Piece, ...]
+    slopes: SlopeRange
+    pieces: tuple[PathPiece, ...]
 
     @classmethod
-    def along(cls, function: Restriction, slopes: Slopes, length: Real) -> Self | None:
+    def from_restriction(
+        cls, function: PathRestriction, slopes: SlopeRange, length: Real
+    ) -> Self | None:
         """The first two pieces are equally long, each of the others is twice as long as the one
         before it."""
         count = cls._count(function)
         knots = [length * 2.0 ** (k + 1 - count) for k in range(count)]
-        return cls(slopes, function.pieces([0.0, *knots]))
+        return cls(slopes, function.derivative_ranges([0.0, *knots]))
 
     @classmethod
-    def _count(cls, function: Restriction) -> int:
+    def _count(cls, function: PathRestriction) -> int:
         return function.piece_count
 
     @property
-    def growth(self) -> float:
-        return max(2.0, float(len(self.parts)))
+    def reach_growth(self) -> float:
+        return max(2.0, float(len(self.pieces)))
 
-    def step(self, gaps: Gaps) -> Real:
+    def free_length(self, gaps: LevelGaps) -> Real:
         if gaps.is_one_sided:
-            rises = gaps.down == dr.inf
-            reach, is_free = self._reach(fmin(gaps.up, gaps.down), rises)
+            rises = gaps.below == dr.inf
+            reach, is_free = self._free_on_pieces(fmin(gaps.above, gaps.below), rises)
         else:
-            up, is_free_above = self._reach(gaps.up, True)
-            down, is_free_below = self._reach(gaps.down, False)
+            up, is_free_above = self._free_on_pieces(gaps.above, True)
+            down, is_free_below = self._free_on_pieces(gaps.below, False)
             reach, is_free = fmin(up, down), is_free_above & is_free_below
         # The end of the last piece is exact: shortened, a ray that misses would need one more
         # sample.
         reach = fmax(reach, 0)
-        return dr.select(is_free, reach, reach * ROUND_DOWN)
+        return dr.select(is_free, reach, reach * STEP_SAFETY)
 
-    def arrives(self, gaps: Gaps, length: Real) -> Mask:
+    def arrives(self, gaps: LevelGaps, length: Real) -> Mask:
         """Proof. On the first piece F' is known, so F is continuous, and F <= s times the upper end
         of F': it falls to the level by s = gap over that, if that end is negative."""
-        first = self.parts[0]
-        reach = fmin(first.length, length) * ROUND_DOWN
-        falls = -first.slopes.high * reach >= gaps.down
-        return falls | (first.slopes.low * reach >= gaps.up)
+        first = self.pieces[0]
+        reach = fmin(first.length, length) * STEP_SAFETY
+        falls = -first.slope_range.upper * reach >= gaps.below
+        return falls | (first.slope_range.lower * reach >= gaps.above)
 
-    def _reach(self, gap: Real, rises: Mask | bool) -> tuple[Real, Mask]:
+    def _free_on_pieces(self, gap: Real, rises: Mask | bool) -> tuple[Real, Mask]:
         """The first s at which F, or -F, may reach the gap, or the whole length if it cannot; and
         whether it cannot."""
 
         def chosen(upper: Real, lower: Real) -> Real:
             return dr.select(rises, upper, -lower)
 
-        slope = chosen(self.slopes.high, self.slopes.low)
+        slope = chosen(self.slopes.upper, self.slopes.lower)
         none = gap == dr.inf
         left = dr.select(none, 0, gap)  # the rest of the gap at the start of the piece
         total = type(gap)(0)
         free = gap >= 0  # and not NaN
-        for part in self.parts:
-            most = chosen(part.slopes.high, part.slopes.low)
-            bend = chosen(part.most_curvature, part.least_curvature)
-            slope, reach, left = self._on_piece(left, slope, most, bend, part.length)
+        for part in self.pieces:
+            most = chosen(part.slope_range.upper, part.slope_range.lower)
+            bend = chosen(part.max_second_derivative, part.min_second_derivative)
+            slope, reach, left = self._advance_piece(left, slope, most, bend, part.length)
             reach = dr.select(none, part.length, reach)
             total = dr.select(free, total + reach, total)
             free &= reach >= part.length
         return total, free
 
     @classmethod
-    def _on_piece(
+    def _advance_piece(
         cls, left: Real, slope: Real, most: Real, bend: Real, length: Real
     ) -> tuple[Real, Real, Real]:
         """The slope at the end of a piece, how far it is free, and the rest of the gap there."""
@@ -106,8 +108,8 @@ class Pieces(Enclosure):
         slope = dr.select((slope <= most) | dr.isnan(most), slope, most)
         by_line = dr.select(most > 0, left / most, dr.select(most <= 0, dr.inf, 0))
         by_line = dr.select(left > 0, by_line, 0)
-        by_parabola = first_root(left, slope, bend)
-        reach = fmin(fmax(by_parabola, by_line) * ROUND_DOWN, length)
+        by_parabola = first_reach(left, slope, bend)
+        reach = fmin(fmax(by_parabola, by_line) * STEP_SAFETY, length)
         # Both terms may cancel: the rounding is that of each, not that of their sum.
         unit = 4 * float(dr.epsilon(type(left)))
         bent, straight = 0.5 * length * length * bend, slope * length
@@ -117,45 +119,47 @@ class Pieces(Enclosure):
         return dr.fma(0.25 * unit, dr.abs(slope), slope), reach, left - risen
 
 
-class OnePiece(Pieces, abc.ABC):
+class SinglePieceEnclosure(PiecewiseTaylorEnclosure, abc.ABC):
     """Base of proofs from ranges on the whole length at once: those of the literature."""
 
     @classmethod
-    def _count(cls, function: Restriction) -> int:
+    def _count(cls, function: PathRestriction) -> int:
         del function
         return 1
 
 
-class QuadraticTaylor(OnePiece):
+class QuadraticTaylorEnclosure(SinglePieceEnclosure):
     """The parabola from the slope at the start and the range of F''.
 
-    Source: Aydinlilar and Zanni 2023, section 6.1. Proof: that of `Pieces`, without the line.
+    Source: Aydinlilar and Zanni 2023, section 6.1. Proof: that of `PiecewiseTaylorEnclosure`,
+        without the line.
     """
 
     @classmethod
-    def _on_piece(
+    def _advance_piece(
         cls, left: Real, slope: Real, most: Real, bend: Real, length: Real
     ) -> tuple[Real, Real, Real]:
         del most
-        return super()._on_piece(left, slope, type(left)(dr.inf), bend, length)
+        return super()._advance_piece(left, slope, type(left)(dr.inf), bend, length)
 
 
-class LinearTaylor(OnePiece):
+class LinearTaylorEnclosure(SinglePieceEnclosure):
     """The line from the range of F'.
 
-    Source: Aydinlilar and Zanni 2023, section 4.1, with the exact range. Proof: that of `Pieces`,
+    Source: Aydinlilar and Zanni 2023, section 4.1, with the exact range. Proof: that of
+        `PiecewiseTaylorEnclosure`,
     without the parabola.
     """
 
     @classmethod
-    def _on_piece(
+    def _advance_piece(
         cls, left: Real, slope: Real, most: Real, bend: Real, length: Real
     ) -> tuple[Real, Real, Real]:
         del slope, bend
-        return super()._on_piece(left, most, most, type(left)(0), length)
+        return super()._advance_piece(left, most, most, type(left)(0), length)
 
 
-class Segment(OnePiece):
+class SegmentTracingEnclosure(SinglePieceEnclosure):
     """The largest |F'| on the length: segment tracing.
 
     Source: Galin, Guerin, Paris and Peytavie 2020; Aydinlilar and Zanni 2023, equation 10. Proof:
@@ -163,8 +167,10 @@ class Segment(OnePiece):
     """
 
     @classmethod
-    def along(cls, function: Restriction, slopes: Slopes, length: Real) -> Self | None:
-        (part,) = function.pieces([0.0, length])
-        most = fmax(part.slopes.high, -part.slopes.low)
-        both = Slopes(-most, most)
-        return cls(both, (Piece(part.length, both, 0.0, 0.0),))
+    def from_restriction(
+        cls, function: PathRestriction, slopes: SlopeRange, length: Real
+    ) -> Self | None:
+        (part,) = function.derivative_ranges([0.0, length])
+        most = fmax(part.slope_range.upper, -part.slope_range.lower)
+        both = SlopeRange(-most, most)
+        return cls(both, (PathPiece(part.length, both, 0.0, 0.0),))

@@ -5,7 +5,7 @@ rests on it. Enclosures are made of promises, once the slope along a direction i
 
 What a promise of f says of other functions is derived here and nowhere else. For f scaled, shifted,
 negated and stretched in space it follows from the units of the promise's numbers. A new kind of
-promise states those units, what it says of f (`movement`), and what else follows from it.
+promise states those units, what it says of f (`movement_bounds`), and what else follows from it.
 """
 
 from __future__ import annotations
@@ -25,12 +25,16 @@ if TYPE_CHECKING:
     from typing import Self
 
     from harnack.backend import Mask, Real
-    from harnack.enclosures.enclosure import Slopes
+    from harnack.enclosures.enclosure import SlopeRange
 
 # For a harmonic f on a ball of radius 1 with upper - lower = 1: the largest |f''| at the center, in
 # up to three and in four dimensions, and a bound of |f'| within half the radius, in up to four. See
 # `HarmonicBall`.
-_SECOND, _SECOND_IN_4D, _FIRST = 10 / (3 * math.sqrt(3)), 9 * math.sqrt(3) / (2 * math.pi), 1.7001
+_SECOND_DERIVATIVE_BOUND, _SECOND_DERIVATIVE_BOUND_4D, _FIRST_DERIVATIVE_BOUND = (
+    10 / (3 * math.sqrt(3)),
+    9 * math.sqrt(3) / (2 * math.pi),
+    1.7001,
+)
 
 
 @dataclass(frozen=True)
@@ -41,13 +45,13 @@ class Promise(abc.ABC):
     units: ClassVar[tuple[tuple[str, int, int], ...]]
     """The names of its numbers, and the powers of the units of f and of length that each is in."""
 
-    ends: ClassVar[tuple[tuple[str, str], ...]] = ()
+    interval_pairs: ClassVar[tuple[tuple[str, str], ...]] = ()
     """The pairs of numbers that are a lower and an upper end; the first pair bounds f itself."""
 
-    of_all_space: ClassVar[bool] = False
+    holds_outside_domain: ClassVar[bool] = False
     """Whether it holds on the whole ball, also where that leaves the field's domain."""
 
-    is_smooth: ClassVar[bool] = True
+    implies_smooth: ClassVar[bool] = True
     """Whether it says that f has no creases within the radius."""
 
     if TYPE_CHECKING:
@@ -56,28 +60,28 @@ class Promise(abc.ABC):
         def radius(self) -> Any: ...
 
     @abc.abstractmethod
-    def movement(self, value: Any, slopes: Slopes, length: Any) -> tuple[Any, Any]:
+    def movement_bounds(self, value: Any, slopes: SlopeRange, length: Any) -> tuple[Any, Any]:
         """Lower and upper bound of f(y) - f(p), for y at that length, less than the radius, from p
         along a direction with these slopes; value: f(p). For NumPy and Dr.Jit arrays alike."""
 
-    def remainder(self, value: Real, length: Real, degree: int = 1) -> Real:
+    def taylor_remainder_bound(self, value: Real, length: Real, degree: int = 1) -> Real:
         """A bound of what Taylor's polynomial of a degree (1 or 2) about p leaves out of f(y), for
         |y - p| <= length, which decreases at least as the power degree + 1 of the length; infinite
         where none follows."""
         del value, length, degree
         return dr.inf
 
-    def lipschitz(self, value: Real) -> Lipschitz | None:
+    def implied_lipschitz(self, value: Real) -> Lipschitz | None:
         """A Lipschitz constant that follows from it; None where none does."""
         del value
         return None
 
-    def second_derivatives(self, value: Real) -> tuple[Real, Real] | None:
+    def implied_second_derivative_bound(self, value: Real) -> tuple[Real, Real] | None:
         """A bound of |f_vv| for all unit vectors v, and the distance within which it holds at every
         point; None where none follows. A remainder is less: it is seen from one point alone."""
         del value
 
-    def of_any_map(self, value: Real) -> Promise:
+    def weakened_for_linear_maps(self, value: Real) -> Promise:
         """A promise that follows from this one and holds, transformed, for f(A x) with any linear
         map A. Laplacians do not survive a map that is no similarity; other kinds do."""
         del value
@@ -85,23 +89,25 @@ class Promise(abc.ABC):
 
     def scaled(self, factor: Real) -> Self:
         """The promise of factor * f, factor > 0."""
-        return self.each(lambda number, of_f, _: number * factor if of_f else number)
+        return self.map_numbers(lambda number, of_f, _: number * factor if of_f else number)
 
     def shifted(self, offset: Real) -> Self:
         """The promise of f + offset."""
-        numbers = {name: getattr(self, name) + offset for pair in self.ends[:1] for name in pair}
+        numbers = {
+            name: getattr(self, name) + offset for pair in self.interval_pairs[:1] for name in pair
+        }
         return dataclasses.replace(self, **numbers)
 
     def negated(self) -> Self:
         """The promise of -f."""
         numbers = {
             name: -getattr(self, other)
-            for low, high in self.ends
+            for low, high in self.interval_pairs
             for name, other in ((low, high), (high, low))
         }
         return dataclasses.replace(self, **numbers)
 
-    def lengthened(self, size: Real) -> Self:
+    def space_scaled(self, size: Real) -> Self:
         """The promise of x -> f(x / size), at size * p."""
 
         def longer(number: Real, power: int) -> Real:
@@ -109,9 +115,9 @@ class Promise(abc.ABC):
                 return number
             return number * size if power > 0 else number / _power(size, -power)
 
-        return self.each(lambda number, _, power: longer(number, power))
+        return self.map_numbers(lambda number, _, power: longer(number, power))
 
-    def shortened(self, stretch: Real) -> Self:
+    def linearly_mapped(self, stretch: Real) -> Self:
         """The promise of x -> f(A x) for a linear map A that makes no length more than `stretch`
         times as long."""
 
@@ -122,14 +128,14 @@ class Promise(abc.ABC):
                 number = number * stretch
             return number
 
-        return self.each(lambda number, _, power: shorter(number, power))
+        return self.map_numbers(lambda number, _, power: shorter(number, power))
 
-    def each(self, change: Callable[[Any, int, int], Any]) -> Self:
+    def map_numbers(self, change: Callable[[Any, int, int], Any]) -> Self:
         """The promise with other numbers; change: from a number and the powers of its unit."""
         numbers = {name: change(getattr(self, name), *powers) for name, *powers in self.units}
         return dataclasses.replace(self, **numbers)
 
-    def where(self, mask: Mask, other: Self) -> Self:
+    def select(self, mask: Mask, other: Self) -> Self:
         """The other promise, of the same kind, where the mask holds, this one elsewhere."""
         numbers: dict[str, Any] = {}
         for name, *_ in self.units:
@@ -158,13 +164,13 @@ class HarmonicBall(Promise):
     dimension: int = 3
 
     units = (("radius", 0, 1), ("lower", 1, 0), ("upper", 1, 0))
-    ends = (("lower", "upper"),)
-    of_all_space = True
+    interval_pairs = (("lower", "upper"),)
+    holds_outside_domain = True
 
-    def movement(self, value: Any, slopes: Slopes, length: Any) -> tuple[Any, Any]:
+    def movement_bounds(self, value: Any, slopes: SlopeRange, length: Any) -> tuple[Any, Any]:
         return self.lower - value, self.upper - value
 
-    def remainder(self, value: Real, length: Real, degree: int = 1) -> Real:
+    def taylor_remainder_bound(self, value: Real, length: Real, degree: int = 1) -> Real:
         """Proof for a harmonic f >= c on a ball of radius R in n dimensions: f - c is the integral
         of Poisson's kernel P(q, s) = sum over l of the zonal harmonics, all largest at s = 1, with
         a measure of mass f(p) - c; those of degree 0 and 1 are the value and the gradient. The rest
@@ -184,19 +190,21 @@ class HarmonicBall(Promise):
         }[self.dimension, degree]
         return dr.select((q < 1) & (mass < dr.inf), mass * rest, dr.inf)
 
-    def lipschitz(self, value: Real) -> Lipschitz | None:
+    def implied_lipschitz(self, value: Real) -> Lipschitz | None:
         """On half the ball. Proof. Let f be within M of a constant on a ball of radius r in R^n. At
         its center f_v is n/r times the mean of f s over the sphere, s the cosine of the angle to v,
         so at most n M/r times the mean of |s|: 1.28, 1.5 and 1.7 M/r for n = 2, 3, 4. Points within
         R/2 are centers of balls of radius R/2, on which M is half of upper - lower.
         """
-        if _is_open(self.lower) or _is_open(self.upper):
+        if _is_infinite(self.lower) or _is_infinite(self.upper):
             return None
-        return Lipschitz(_FIRST * self._span(value) / self.radius, 0.5 * self.radius)
+        return Lipschitz(
+            _FIRST_DERIVATIVE_BOUND * self._span(value) / self.radius, 0.5 * self.radius
+        )
 
-    def of_any_map(self, value: Real) -> Promise:
-        """`Curvature` on half the ball. Proof in space (and so in the plane). At the center of a
-        ball of radius R, f_vv = R^-2 times the mean of f 5 (3 s^2 - 1) over the sphere, s the
+    def weakened_for_linear_maps(self, value: Real) -> Promise:
+        """`TaylorRemainder` on half the ball. Proof in space (and so in the plane). At the center
+        of a ball of radius R, f_vv = R^-2 times the mean of f 5 (3 s^2 - 1) over the sphere, s the
         cosine of the angle to v; for f between lower and upper that is at most 10/(3 sqrt 3)
         (upper - lower)/R^2. Points within R/2 are centers of balls of radius R/2.
 
@@ -208,16 +216,18 @@ class HarmonicBall(Promise):
         constant, 7.7/R^2.
         """
         half = 0.5 * self.radius
-        return Curvature(1.0001 * _SECOND * self._span(value) / (half * half), half)
+        return TaylorRemainder(
+            1.0001 * _SECOND_DERIVATIVE_BOUND * self._span(value) / (half * half), half
+        )
 
-    def second_derivatives(self, value: Real) -> tuple[Real, Real] | None:
-        """As for `of_any_map`, at the centers of balls of radius R/2. In R^4, where f_vv is R^-2
-        times the mean of f 6 (4 s^2 - 1), the mean of the positive part of that kernel is
-        9 sqrt(3)/(2 pi) = 2.48, which is half the mean of its absolute value."""
-        if _is_open(self.lower) or _is_open(self.upper):
+    def implied_second_derivative_bound(self, value: Real) -> tuple[Real, Real] | None:
+        """As for `weakened_for_linear_maps`, at the centers of balls of radius R/2. In R^4, where
+        f_vv is R^-2 times the mean of f 6 (4 s^2 - 1), the mean of the positive part of that kernel
+        is 9 sqrt(3)/(2 pi) = 2.48, which is half the mean of its absolute value."""
+        if _is_infinite(self.lower) or _is_infinite(self.upper):
             return None
         half = 0.5 * self.radius
-        most = _SECOND_IN_4D if self.dimension == 4 else _SECOND
+        most = _SECOND_DERIVATIVE_BOUND_4D if self.dimension == 4 else _SECOND_DERIVATIVE_BOUND
         return 1.0001 * most * self._span(value) / (half * half), half
 
     def _span(self, value: Real) -> Real:
@@ -246,13 +256,13 @@ class BoundedLaplacian(Promise):
         ("radius", 0, 1), ("lower", 1, 0), ("upper", 1, 0),
         ("laplacian_lower", 1, -2), ("laplacian_upper", 1, -2),
     )  # fmt: skip
-    ends = (("lower", "upper"), ("laplacian_lower", "laplacian_upper"))
-    of_all_space = True
+    interval_pairs = (("lower", "upper"), ("laplacian_lower", "laplacian_upper"))
+    holds_outside_domain = True
 
-    def movement(self, value: Any, slopes: Slopes, length: Any) -> tuple[Any, Any]:
+    def movement_bounds(self, value: Any, slopes: SlopeRange, length: Any) -> tuple[Any, Any]:
         return self.lower - value, self.upper - value
 
-    def lipschitz(self, value: Real) -> Lipschitz:
+    def implied_lipschitz(self, value: Real) -> Lipschitz:
         """On half the ball. Proof. Points within R/2 are centers of balls of radius r = R/2. There
         f is a harmonic h with the same boundary values, which are between lower and upper, less the
         integral of G Laplacian f: so |h_v| <= 3/2 (upper - lower)/(2 r), and the integral of
@@ -263,16 +273,16 @@ class BoundedLaplacian(Promise):
         steepest = 0.75 * (self.upper - self.lower) / half + 0.375 * half * most
         return Lipschitz(1.0001 * steepest, half)
 
-    def of_any_map(self, value: Real) -> Promise:
-        return self.lipschitz(value)
+    def weakened_for_linear_maps(self, value: Real) -> Promise:
+        return self.implied_lipschitz(value)
 
-    def shortened(self, stretch: Real) -> BoundedLaplacian:
+    def linearly_mapped(self, stretch: Real) -> BoundedLaplacian:
         """For a similarity A: the Laplacian of f(A x) is that of f times the square of the factor
         by which A stretches lengths, which is `stretch` up to some roundings."""
         slack = 5e-6 * (dr.abs(self.laplacian_lower) + dr.abs(self.laplacian_upper))
         low, high = self.laplacian_lower - slack, self.laplacian_upper + slack
         wider = dataclasses.replace(self, laplacian_lower=low, laplacian_upper=high)
-        return super(BoundedLaplacian, wider).shortened(stretch)
+        return super(BoundedLaplacian, wider).linearly_mapped(stretch)
 
 
 @dataclass(frozen=True)
@@ -287,18 +297,18 @@ class Lipschitz(Promise):
     radius: Real = float("inf")
 
     units = (("constant", 1, -1), ("radius", 0, 1))
-    is_smooth = False
+    implies_smooth = False
 
-    def movement(self, value: Any, slopes: Slopes, length: Any) -> tuple[Any, Any]:
+    def movement_bounds(self, value: Any, slopes: SlopeRange, length: Any) -> tuple[Any, Any]:
         most = self.constant * length
         return -most, most
 
-    def lipschitz(self, value: Real) -> Lipschitz:
+    def implied_lipschitz(self, value: Real) -> Lipschitz:
         return self
 
 
 @dataclass(frozen=True)
-class Curvature(Promise):
+class TaylorRemainder(Promise):
     """|f(y) - f(p) - grad f(p).(y-p)| <= constant |y-p|^2/2 for every y with |y-p| < radius.
 
     For a field with a domain: for every such y in it. There too, what Taylor's polynomial of second
@@ -307,25 +317,25 @@ class Curvature(Promise):
 
     constant: Real
     radius: Real = float("inf")
-    change: Real = float("inf")
+    cubic_constant: Real = float("inf")
 
-    units = (("constant", 1, -2), ("radius", 0, 1), ("change", 1, -3))
+    units = (("constant", 1, -2), ("radius", 0, 1), ("cubic_constant", 1, -3))
 
-    def movement(self, value: Any, slopes: Slopes, length: Any) -> tuple[Any, Any]:
+    def movement_bounds(self, value: Any, slopes: SlopeRange, length: Any) -> tuple[Any, Any]:
         bend = 0.5 * self.constant * length * length
-        return slopes.low * length - bend, slopes.high * length + bend
+        return slopes.lower * length - bend, slopes.upper * length + bend
 
-    def second_derivatives(self, value: Real) -> tuple[Real, Real] | None:
+    def implied_second_derivative_bound(self, value: Real) -> tuple[Real, Real] | None:
         """By definition, at every point that promises it; without a radius all do."""
         del value
-        return (self.constant, self.radius) if _is_open(self.radius) else None
+        return (self.constant, self.radius) if _is_infinite(self.radius) else None
 
-    def remainder(self, value: Real, length: Real, degree: int = 1) -> Real:
-        if degree == 2 and _is_open(self.change):
+    def taylor_remainder_bound(self, value: Real, length: Real, degree: int = 1) -> Real:
+        if degree == 2 and _is_infinite(self.cubic_constant):
             return dr.inf
-        rest = 0.5 * self.constant if degree == 1 else self.change * length / 6
+        rest = 0.5 * self.constant if degree == 1 else self.cubic_constant * length / 6
         return dr.select(length < self.radius, rest * length * length, dr.inf)
 
 
-def _is_open(end: Any) -> bool:
+def _is_infinite(end: Any) -> bool:
     return isinstance(end, float) and math.isinf(end)

@@ -6,12 +6,9 @@ This package exports what all fields share. The fields themselves are names of `
 
 from __future__ import annotations
 
-from harnack.fields.capabilities import NO_SHEET, Crossing
+from harnack.fields.capabilities import NO_FACET, JumpCrossing
 from harnack.fields.field import Field, Sample
 from harnack.fields.formula import Formula
-from harnack.fields.solids.solid import Shape, Solid
-from harnack.name_suggestions import names_that_moved
+from harnack.fields.solids.solid import FormulaSolid, Solid
 
-__all__ = ["NO_SHEET", "Crossing", "Field", "Formula", "Sample", "Shape", "Solid"]
-
-__getattr__ = names_that_moved(__name__)
+__all__ = ["NO_FACET", "Field", "Formula", "FormulaSolid", "JumpCrossing", "Sample", "Solid"]

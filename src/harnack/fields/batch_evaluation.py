@@ -11,23 +11,23 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.backend.arrays import aligned_integers, finite_vectors, upload_vectors
-from harnack.backend.validation import refuse_derivatives
-from harnack.cluster.dask_arrays import takes_blocks
+from harnack.backend.arrays import as_finite_vectors, upload_integers, upload_vectors
+from harnack.backend.validation import check_no_derivatives
+from harnack.cluster.dask_arrays import accepts_dask_arrays
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Precision, Vec3
 
-__all__ = ["also_at_points", "at_points", "in_batches", "morton_order"]
+__all__ = ["accepts_numpy_points", "evaluate_points", "map_batches", "morton_order"]
 
 # Points in one kernel: enough to keep a GPU busy, few enough to keep memory small.
-_AT_ONCE = 1 << 20
+_BATCH_SIZE = 1 << 20
 # Cells along an axis, as a power of two. Three coordinates make a key of 15 bits, for which NumPy
 # uses radix sort.
 _BITS = 5
 
 
-def at_points(
+def evaluate_points(
     points: Any,
     kernel: Callable[[Backend, Vec3], tuple[Any, ...]],
     precision: Precision,
@@ -46,40 +46,40 @@ def at_points(
     def visit(x: Vec3) -> tuple[Any, ...]:
         order = morton_order(backend, x)
         results = kernel(backend, dr.gather(backend.Array3f, x, order))
-        return tuple(_back_in_place(one, order, dr.width(x)) for one in results)
+        return tuple(_restore_order(one, order, dr.width(x)) for one in results)
 
-    refuse_derivatives("what NumPy's arrays are given of", points)
+    check_no_derivatives("what NumPy's arrays are given of", points)
     given = np.asarray(points)
     if given.shape == (3,):
-        return tuple(one[0] for one in in_batches(backend, visit, given[None]))
-    return in_batches(backend, visit, given)
+        return tuple(one[0] for one in map_batches(backend, visit, given[None]))
+    return map_batches(backend, visit, given)
 
 
-def also_at_points(hessian: Callable[[Any, Vec3], Any]) -> Callable[..., Any]:
+def accepts_numpy_points(hessian: Callable[[Any, Vec3], Any]) -> Callable[..., Any]:
     """A decorator of a field's method `hessian`: it also takes NumPy points and gives NumPy
     matrices."""
 
-    @takes_blocks("p")
+    @accepts_dask_arrays("p")
     @functools.wraps(hessian)
     def general(self: Any, p: Any, *, precision: Precision = "single") -> Any:
         if dr.is_array_v(type(p)):
-            refuse_derivatives(f"the Hessian of {type(self).__name__}", p, self.parameters())
+            check_no_derivatives(f"the Hessian of {type(self).__name__}", p, self.parameters())
             return hessian(self, p)
 
         def kernel(backend: Backend, x: Vec3) -> tuple[Vec3, Vec3, Vec3]:
             return self.prepare(backend).hessian(x)
 
-        return np.stack(at_points(p, kernel, precision), axis=-2)
+        return np.stack(evaluate_points(p, kernel, precision), axis=-2)
 
     return general
 
 
-def in_batches(
+def map_batches(
     backend: Backend,
     compute: Callable[..., tuple[Any, ...]],
     points: Any,
     *others: npt.NDArray[Any],
-    at_once: int = _AT_ONCE,
+    at_once: int = _BATCH_SIZE,
 ) -> tuple[npt.NDArray[Any], ...]:
     """The results of `compute` for points (n, 3), as arrays (n,) or (n, 3) in its precision.
 
@@ -92,7 +92,7 @@ def in_batches(
     """
     on_device = dr.is_array_v(cast("Any", type(points)))
     vectors = (
-        to_vector3(backend, points, "points") if on_device else finite_vectors(points, "points")
+        to_vector3(backend, points, "points") if on_device else as_finite_vectors(points, "points")
     )
     n = dr.width(vectors) if on_device else len(vectors)
     parts: list[tuple[npt.NDArray[Any], ...]] = []
@@ -124,14 +124,14 @@ def _spread(values: npt.NDArray[Any], n: int) -> npt.NDArray[Any]:
     return values if len(values) == n else np.repeat(values, n, axis=0)
 
 
-def _back_in_place(values: Any, order: Any, n: int) -> Any:
+def _restore_order(values: Any, order: Any, n: int) -> Any:
     """Values that belong to the points in visiting order, brought into the given order."""
     kind = cast("Any", type(values))
     if dr.depth_v(kind) == 1:
         out = dr.zeros(kind, n)
         dr.scatter(out, values, order)
         return out
-    return kind([_back_in_place(one, order, n) for one in values])
+    return kind([_restore_order(one, order, n) for one in values])
 
 
 def morton_order(backend: Backend, x: Vec3, bits: int = _BITS) -> Any:
@@ -153,4 +153,4 @@ def morton_order(backend: Backend, x: Vec3, bits: int = _BITS) -> Any:
         for bit in range(bits):
             key |= (cell & (1 << bit)) << (2 * bit + axis)
     keys = to_numpy(key).astype(np.uint16 if 3 * bits <= 16 else np.uint32)
-    return aligned_integers(backend, np.argsort(keys, kind="stable"))
+    return upload_integers(backend, np.argsort(keys, kind="stable"))

@@ -1,7 +1,7 @@
 """Fields that can be evaluated at many points at once, and caches that live as long as a field.
 
 - `BatchedField`: values, derivatives and error bounds at points: NumPy in, NumPy out.
-- `FieldCache`, `prepared_once`: what is computed or uploaded only once for a field.
+- `FieldCache`, `cached_prepare`: what is computed or uploaded only once for a field.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from weakref import finalize
 import drjit as dr
 
 from harnack.backend import FloatArray, backend_of
-from harnack.backend.arrays import as_data
+from harnack.backend.arrays import as_kernel_parameters
 from harnack.backend.elementary import fmax
-from harnack.backend.tensors import takes_tensors
-from harnack.cluster.dask_arrays import takes_blocks
-from harnack.fields.batch_evaluation import at_points
-from harnack.fields.field import AtDetail, Field
+from harnack.backend.tensors import accepts_tensors
+from harnack.cluster.dask_arrays import accepts_dask_arrays
+from harnack.fields.batch_evaluation import evaluate_points
+from harnack.fields.field import EvaluateOnly, Field
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Precision, Real, Vec3
@@ -31,11 +31,11 @@ if TYPE_CHECKING:
 
 # The rounding of dipoles' moments, which are summed up in double precision, as a fraction of the
 # total weight.
-_MOMENTS = 32 * 2.0**-53
+_MOMENT_ROUNDING = 32 * 2.0**-53
 
 
 @dataclass(frozen=True)
-class SymmetricSum:
+class SymmetricMatrix:
     """The state of a sum of symmetric matrices, one in each lane."""
 
     xx: Real
@@ -46,14 +46,14 @@ class SymmetricSum:
     yz: Real
 
     @classmethod
-    def zero(cls, real: Any) -> SymmetricSum:
+    def zero(cls, real: Any) -> SymmetricMatrix:
         """The matrix of zeros; real: the type of its entries."""
         return cls(*(real(0) for _ in range(6)))
 
-    def plus(self, u: Vec3, v: Vec3) -> SymmetricSum:
+    def add_outer_product(self, u: Vec3, v: Vec3) -> SymmetricMatrix:
         """The sum with (u v^T + v u^T)/2."""
         half = 0.5 * v
-        return SymmetricSum(
+        return SymmetricMatrix(
             dr.fma(u.x, v.x, self.xx),
             dr.fma(u.y, v.y, self.yy),
             dr.fma(u.z, v.z, self.zz),
@@ -62,7 +62,7 @@ class SymmetricSum:
             self.yz + dr.fma(u.y, half.z, u.z * half.y),
         )
 
-    def parts(self) -> tuple[Real, ...]:
+    def components(self) -> tuple[Real, ...]:
         """The entries in the order of the constructor, for the state of a loop."""
         return self.xx, self.yy, self.zz, self.xy, self.xz, self.yz
 
@@ -76,7 +76,7 @@ class SymmetricSum:
 
 
 @dataclass(frozen=True)
-class Values:
+class PointValues:
     """Value and, if they were asked for, gradient and Hessian of a field at points, in the field's
     own units, with bounds of their errors by truncation and rounding.
 
@@ -89,11 +89,11 @@ class Values:
     value: Real
     error: Real
     gradient: Vec3 | None = None
-    hessian: SymmetricSum | None = None
+    hessian: SymmetricMatrix | None = None
     gradient_error: Real = 0.0
     hessian_error: Real = 0.0
 
-    def far_away(self, x: Vec3, terms: int, weight: float) -> Values:
+    def with_far_field_errors(self, x: Vec3, terms: int, weight: float) -> PointValues:
         """The same values with error bounds that hold at points far away too.
 
         x: the points, in coordinates in which the field's data have a size of about one. terms: how
@@ -107,7 +107,7 @@ class Values:
         smallest = float(dr.smallest(type(x.x)))
         lost = 4 * smallest * terms * (1 + dr.squared_norm(x))
         inverse = dr.rcp(fmax(dr.norm(x), type(x.x)(4)))
-        moved = _MOMENTS * weight * dr.square(inverse)
+        moved = _MOMENT_ROUNDING * weight * dr.square(inverse)
         return dataclasses.replace(
             self,
             error=self.error + lost + moved,
@@ -115,7 +115,7 @@ class Values:
             hessian_error=self.hessian_error + lost + 24 * moved * dr.square(inverse),
         )
 
-    def rescaled(self, size: Real) -> Values:
+    def rescaled(self, size: Real) -> PointValues:
         """The values of x -> f(x / size) at `size` times the points. Where a number has overflowed
         its error is infinite."""
         gradient, hessian, share = self.gradient, self.hessian, 1 / size
@@ -125,11 +125,11 @@ class Values:
             known = dr.isfinite(gradient.x) & dr.isfinite(gradient.y) & dr.isfinite(gradient.z)
             gradient_error = dr.select(known, gradient_error * share, dr.inf)
         if hessian is not None:
-            hessian = type(hessian)(*(share * share * one for one in hessian.parts()))
-            known = dr.isfinite(sum(hessian.parts()))
+            hessian = type(hessian)(*(share * share * one for one in hessian.components()))
+            known = dr.isfinite(sum(hessian.components()))
             hessian_error = dr.select(known, hessian_error * (share * share), dr.inf)
         error = dr.select(dr.isfinite(self.value), self.error, dr.inf)
-        return Values(self.value, error, gradient, hessian, gradient_error, hessian_error)
+        return PointValues(self.value, error, gradient, hessian, gradient_error, hessian_error)
 
 
 class BatchedField(Field):
@@ -139,7 +139,7 @@ class BatchedField(Field):
     """
 
     @abc.abstractmethod
-    def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> Values:
+    def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> PointValues:
         """Everything at points x, a Dr.Jit 3-vector of any backend and precision.
 
         Not called while a loop is being recorded, unless derivatives is 2.
@@ -149,7 +149,7 @@ class BatchedField(Field):
             at least 1; infinity approximates nothing.
         """
 
-    def sharp_values_at(self, x: Vec3) -> Values:
+    def sharp_values_at(self, x: Vec3) -> PointValues:
         """`values_at` with the gradient, which may be looked at more closely: what users are given
         as the gradient at points. Not called while a loop is being recorded."""
         return self.values_at(x, 1)
@@ -159,10 +159,12 @@ class BatchedField(Field):
         with dr.suspend_grad():
             at = self.sharp_values_at(dr.detach(p))
         # A literal 0, the gradient of a closed mesh, would have no derivative in Dr.Jit.
-        return dr.replace_grad(at.value, dr.dot(as_data(at.gradient), p - dr.detach(p)))
+        return dr.replace_grad(
+            at.value, dr.dot(as_kernel_parameters(at.gradient), p - dr.detach(p))
+        )
 
-    @takes_blocks("points")
-    @takes_tensors
+    @accepts_dask_arrays("points")
+    @accepts_tensors
     def value(self, points: Any, *, precision: Precision = "single") -> Any:
         if dr.is_array_v(type(points)):
             if dr.grad_enabled(points):
@@ -170,8 +172,8 @@ class BatchedField(Field):
             return self.values_at(points, 0).value
         return self._at(points, precision, 0, lambda at: (at.value,))[0]
 
-    @takes_blocks("points")
-    @takes_tensors
+    @accepts_dask_arrays("points")
+    @accepts_tensors
     def gradient(self, points: Any, *, precision: Precision = "single") -> Any:
         if dr.is_array_v(type(points)):
             if dr.grad_enabled(points):
@@ -197,7 +199,7 @@ class BatchedField(Field):
             at = self.values_at(x, 1)
             return at.value, at.gradient
 
-        value, gradient = at_points(points, kernel, precision)
+        value, gradient = evaluate_points(points, kernel, precision)
         return value, gradient
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
@@ -206,7 +208,7 @@ class BatchedField(Field):
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
         return sample.gradient_error, self.values_at(p, 2).hessian_error
 
-    @takes_blocks("points")
+    @accepts_dask_arrays("points")
     def error_bound(self, points: Any, *, precision: Precision = "single") -> FloatArray:
         """Bounds (n,) of the error of `value` at points (n, 3).
 
@@ -215,14 +217,14 @@ class BatchedField(Field):
         """
         return self._at(points, precision, 0, lambda at: (at.error,))[0]
 
-    @takes_blocks("points")
+    @accepts_dask_arrays("points")
     def gradient_error_bound(self, points: Any, *, precision: Precision = "single") -> FloatArray:
         """Bounds (n,) of the error of `gradient`, as a length, at points (n, 3): see
         `error_bound`. Of a sum over a tree it is some hundred times the error itself: the tree
         decides by estimates how closely it looks (`sharpened`)."""
         return self._at(points, precision, 1, lambda at: (at.gradient_error,))[0]
 
-    @takes_blocks("points")
+    @accepts_dask_arrays("points")
     def hessian_error_bound(self, points: Any, *, precision: Precision = "single") -> FloatArray:
         """Bounds (n,) of the error of `hessian`, in the spectral norm, at points (n, 3): see
         `error_bound`."""
@@ -233,22 +235,22 @@ class BatchedField(Field):
         points: Any,
         precision: Precision,
         derivatives: int,
-        wanted: Callable[[Values], tuple[Any, ...]],
+        wanted: Callable[[PointValues], tuple[Any, ...]],
     ) -> tuple[FloatArray, ...]:
         def kernel(backend: Backend, x: Vec3) -> tuple[Any, ...]:
             del backend
             sharp = derivatives == 1
             return wanted(self.sharp_values_at(x) if sharp else self.values_at(x, derivatives))
 
-        return at_points(points, kernel, precision)
+        return evaluate_points(points, kernel, precision)
 
 
-class SumAtDetail(AtDetail):
+class SumAtDetail(EvaluateOnly):
     """A sum as evaluated at one detail, with second derivatives; values: `values_at` for these, at
     that detail."""
 
     def __init__(
-        self, evaluate: Callable[[Vec3], Sample], values: Callable[[Vec3], Values]
+        self, evaluate: Callable[[Vec3], Sample], values: Callable[[Vec3], PointValues]
     ) -> None:
         super().__init__(evaluate)
         self._values = values
@@ -268,7 +270,7 @@ _CLOSELY, _MOVED = (2.0, 4.0, 8.0), 0.04
 _PROVED = 0.01
 
 
-def sharpened(at: Callable[[Vec3, Real], Values], x: Vec3) -> Values:
+def sharpened(at: Callable[[Vec3, Real], PointValues], x: Vec3) -> PointValues:
     """Value and gradient at points x by a tree, the gradient to about 1 % of its length.
 
     at: the values and gradients of points, with clusters taken as a whole beyond so many times the
@@ -282,7 +284,7 @@ def sharpened(at: Callable[[Vec3, Real], Values], x: Vec3) -> Values:
     real = cast("Any", type(x.x))
     dr.eval(x)
     values = at(x, dr.opaque(real, 1.0))
-    gradient, error = as_data(values.gradient), real(values.gradient_error)
+    gradient, error = as_kernel_parameters(values.gradient), real(values.gradient_error)
     gradient, error = gradient + dr.zeros(type(x), dr.width(x)), error + dr.zeros(real, dr.width(x))
     dr.eval(values.value, values.error, gradient, error)
     rows = dr.compress(~(error <= _PROVED * dr.norm(gradient)))
@@ -293,7 +295,7 @@ def sharpened(at: Callable[[Vec3, Real], Values], x: Vec3) -> Values:
         dr.eval(place)
         closely = at(place, dr.opaque(real, closer))
         moved = dr.norm(closely.gradient - dr.gather(type(x), gradient, rows))
-        length = dr.norm(as_data(closely.gradient))
+        length = dr.norm(as_kernel_parameters(closely.gradient))
         is_sharp = (moved <= _MOVED * length) | (closely.gradient_error <= _PROVED * length)
         dr.scatter(gradient, closely.gradient, rows)
         dr.scatter(error, closely.gradient_error, rows)
@@ -303,7 +305,7 @@ def sharpened(at: Callable[[Vec3, Real], Values], x: Vec3) -> Values:
     return dataclasses.replace(values, gradient=gradient, gradient_error=error)
 
 
-def _hessian(values: Values) -> SymmetricSum:
+def _hessian(values: PointValues) -> SymmetricMatrix:
     if values.hessian is None:
         raise RuntimeError("values_at(x, 2) gave no Hessian")
     return values.hessian
@@ -342,7 +344,7 @@ class FieldCache(Generic[Value]):
         return value
 
 
-def prepared_once(prepare: Prepare) -> Prepare:
+def cached_prepare(prepare: Prepare) -> Prepare:
     """A decorator of a field's method `prepare`: the field is uploaded to each backend only once.
 
     Fields with parameters are uploaded each time: a parameter may change in place, and its

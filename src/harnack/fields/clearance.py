@@ -1,7 +1,8 @@
 """Clearances: proved lower bounds of the distance to a level set, and the extents they prove.
 
-`clearance_of` gives them at points, `tight_extent` and `occupied_cells` prove where level sets are.
-Also here: `UploadedField`, the base of fields whose data lie on a backend, in coordinates in which
+`clearance_function` gives them at points, `tight_extent` and `occupied_cells` prove where level
+sets are.
+Also here: `DeviceField`, the base of fields whose data lie on a backend, in coordinates in which
 they have a size of about one.
 """
 
@@ -16,12 +17,18 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import FloatArray, backend_of, choose_backend, to_numpy, to_vector3
-from harnack.backend.elementary import fmax, fmin, largest_coordinate, length
-from harnack.cluster.serialization import Remembered
-from harnack.enclosures import Gaps, Slopes, TargetLevels, choose_proofs, longest_step
-from harnack.fields.batched_fields import BatchedField, SumAtDetail, prepared_once
+from harnack.backend.elementary import fmax, fmin, max_norm, safe_norm
+from harnack.cluster.serialization import TransientCache
+from harnack.enclosures import LevelGaps, Levels, SlopeRange, choose_enclosures, longest_free_length
+from harnack.fields.batched_fields import BatchedField, SumAtDetail, cached_prepare
 from harnack.fields.field import Field
-from harnack.tree.empty_space import Cells, OccupiedCells, carve, union, wrapped_points
+from harnack.tree.empty_space import (
+    BoxCells,
+    OccupancyGrid,
+    kdop_of_points,
+    merge_kdops,
+    nonempty_cells,
+)
 
 if TYPE_CHECKING:
     from typing import Self
@@ -31,25 +38,27 @@ if TYPE_CHECKING:
     from harnack.geometry import ConvexHull, Volume
     from harnack.tree.empty_space import Clearance
 
-__all__ = ["clearance_of", "distance_below", "occupied_cells", "tight_extent"]
+__all__ = ["clearance_function", "level_distance_lower_bound", "occupied_cells", "tight_extent"]
 
 # Uses all promises of a field: points are few, and the longest proof counts.
-_PROOFS = choose_proofs("curvature")
+_PROOFS = choose_enclosures("curvature")
 
 
-def clearance_of(
+def clearance_function(
     field: Field, levels: tuple[float, ...], precision: Precision = "double"
 ) -> Clearance:
-    """`distance_below` at points (n, 3)."""
+    """`level_distance_lower_bound` at points (n, 3)."""
     backend = choose_backend(precision)
     prepared = field.prepare(backend)
     # Kernel parameters, so that other levels compile nothing.
     values = tuple(dr.opaque(backend.Float, level) for level in levels)
-    targets = TargetLevels(values, field.period)
+    targets = Levels(values, field.period)
 
     def clearance(points: FloatArray) -> FloatArray:
         p = to_vector3(backend, points)
-        return to_numpy(distance_below(backend, prepared, targets, p, prepared.evaluate(p)))
+        return to_numpy(
+            level_distance_lower_bound(backend, prepared, targets, p, prepared.evaluate(p))
+        )
 
     return clearance
 
@@ -59,7 +68,7 @@ def tight_extent(
     levels: tuple[float, ...],
     lower: FloatArray,
     upper: FloatArray,
-    most: int,
+    max_cells: int,
     finest: int = 5,
     points: FloatArray | None = None,
 ) -> ConvexHull:
@@ -68,20 +77,20 @@ def tight_extent(
     Cells of the box are left out if the ball around them is within the clearance of its center; the
     polytope is around those that are left.
 
-    most, finest: as for `carve`.
+    max_cells, finest: as for `nonempty_cells`.
     points: (n, 3) that the polytope is to contain in any case. The polytope around them need not be
         tested: a ball inside of it may be left out as well.
     """
-    clearance = clearance_of(field, levels)
+    clearance = clearance_function(field, levels)
     slack = 1e-4 * float(np.linalg.norm(upper - lower))
     if points is not None:
-        held = wrapped_points(points, slack)
-        cells = carve(lower, upper, _outside(held, clearance), most, finest)
-        return union(held, cells.wrapped(slack)) if len(cells.corners) else held
-    cells = carve(lower, upper, clearance, most, finest)
+        held = kdop_of_points(points, slack)
+        cells = nonempty_cells(lower, upper, _outside(held, clearance), max_cells, finest)
+        return merge_kdops(held, cells.bounding_kdop(slack)) if len(cells.corners) else held
+    cells = nonempty_cells(lower, upper, clearance, max_cells, finest)
     if not len(cells.corners):  # no level anywhere: any box will do
-        cells = Cells(np.array(lower)[None], np.array(upper) - np.array(lower))
-    return cells.wrapped(slack)
+        cells = BoxCells(np.array(lower)[None], np.array(upper) - np.array(lower))
+    return cells.bounding_kdop(slack)
 
 
 def _outside(held: ConvexHull, clearance: Clearance) -> Clearance:
@@ -98,14 +107,16 @@ def _outside(held: ConvexHull, clearance: Clearance) -> Clearance:
 
 
 def occupied_cells(
-    field: Field, levels: tuple[float, ...], extent: Volume, across: int
-) -> OccupiedCells:
+    field: Field, levels: tuple[float, ...], extent: Volume, cells_across: int
+) -> OccupancyGrid:
     """A grid over an extent, with about so many cells along its longest side."""
-    return OccupiedCells.of(*extent.bounds(), clearance_of(field, levels, "single"), across)
+    return OccupancyGrid.from_clearance(
+        *extent.bounds(), clearance_function(field, levels, "single"), cells_across
+    )
 
 
-def distance_below(
-    backend: Backend, field: Field, levels: TargetLevels, p: Vec3, sample: Sample
+def level_distance_lower_bound(
+    backend: Backend, field: Field, levels: Levels, p: Vec3, sample: Sample
 ) -> Real:
     """A proved lower bound of the distance from p to the nearest level; sample: the field at p.
 
@@ -121,25 +132,29 @@ def distance_below(
     result is shortened by the rounding of p itself. Where f jumps, all this is about f with the
     jumps taken out, which is f up to the nearest sheet.
     """
-    steepest = length(sample.gradient) + sample.gradient_error
-    size = largest_coordinate(p)
-    epsilon = backend.epsilon
+    steepest = safe_norm(sample.gradient) + sample.gradient_error
+    size = max_norm(p)
+    epsilon = backend.machine_epsilon
     rounding = 8 * epsilon * dr.abs(sample.value) + 4 * epsilon * size * steepest
-    gaps = levels.gaps(sample.value).less(rounding + sample.error)
-    enclosures = _PROOFS.enclose(
-        sample.known, sample.weaker, sample.value, sample.error, Slopes(-steepest, steepest)
+    gaps = levels.gaps(sample.value).reduced_by(rounding + sample.value_error)
+    enclosures = _PROOFS.from_promises(
+        sample.promises,
+        sample.alternative_promises,
+        sample.value,
+        sample.value_error,
+        SlopeRange(-steepest, steepest),
     )
     none = backend.Float(dr.inf)
-    above = longest_step(enclosures, Gaps(none, gaps.up))
-    below = longest_step(enclosures, Gaps(gaps.down, none))
-    distance = dr.select(gaps.smaller > 0, fmin(above, below), 0)
-    if field.has_sheets:
-        distance = fmin(distance, field.distance_to_sheets(p))
+    above = longest_free_length(enclosures, LevelGaps(none, gaps.above))
+    below = longest_free_length(enclosures, LevelGaps(gaps.below, none))
+    distance = dr.select(gaps.nearest > 0, fmin(above, below), 0)
+    if field.has_jumps:
+        distance = fmin(distance, field.distance_to_jumps(p))
     return fmax(backend.Float(distance) - 2 * epsilon * size, 0)
 
 
 @dataclass(frozen=True)
-class UnitCoordinates:
+class UnitFrame:
     """Data on a backend in unit coordinates x: the point is center + size * x. Subclasses add the
     data."""
 
@@ -147,26 +162,26 @@ class UnitCoordinates:
     center: Vec3
     size: Real
 
-    def unit(self, p: Vec3) -> Vec3:
+    def to_unit(self, p: Vec3) -> Vec3:
         """A point p in unit coordinates."""
         return (self.backend.Array3f(p) - self.center) / self.size
 
 
-Uploaded = TypeVar("Uploaded", bound=UnitCoordinates)
+Uploaded = TypeVar("Uploaded", bound=UnitFrame)
 
 
-class UploadedField(Field, Generic[Uploaded]):
+class DeviceField(Field, Generic[Uploaded]):
     """A field that is evaluated from data on a backend. Subclasses define `_upload`."""
 
     def __init__(self) -> None:
         self._device: Uploaded | None = None
-        self._batches: Remembered[Backend, Uploaded] = Remembered()
+        self._batches: TransientCache[Backend, Uploaded] = TransientCache()
 
     @abc.abstractmethod
     def _upload(self, backend: Backend, *, traced: bool) -> Uploaded:
         """The data, for tracing or for values at points."""
 
-    @prepared_once
+    @cached_prepare
     def prepare(self, backend: Backend) -> Self:
         if self._device is not None and self._device.backend is backend:
             return self
@@ -174,32 +189,32 @@ class UploadedField(Field, Generic[Uploaded]):
         prepared._device = self._upload(backend, traced=True)
         return prepared
 
-    def _on(self, p: Vec3) -> Uploaded:
+    def _data_for(self, p: Vec3) -> Uploaded:
         """The data for tracing; on the backend of p if `prepare` was not called."""
         if self._device is None:
             return self._upload(backend_of(p), traced=True)
         return self._device
 
-    def _prepared(self) -> Uploaded:
+    def _require_data(self) -> Uploaded:
         """The data for tracing; RuntimeError if `prepare` was not called."""
         if self._device is None:
             raise RuntimeError("prepare(backend) comes first, before at_detail")
         return self._device
 
-    def _batch(self, backend: Backend) -> Uploaded:
+    def _batch_data(self, backend: Backend) -> Uploaded:
         """The data for values at points, uploaded once for each backend."""
         if backend not in self._batches:
             self._batches[backend] = self._upload(backend, traced=False)
         return self._batches[backend]
 
 
-class DetailedField(UploadedField[Uploaded], BatchedField):
+class VariableAccuracyField(DeviceField[Uploaded], BatchedField):
     """An uploaded sum with a choice of detail (`Field.at_detail`). Subclasses define
     `_sample`."""
 
-    has_detail = True
+    has_variable_accuracy = True
 
-    values_take_more: ClassVar[bool] = True
+    has_separate_batch_data: ClassVar[bool] = True
     """Whether the data for values at points differ from those for tracing."""
 
     @abc.abstractmethod
@@ -207,24 +222,24 @@ class DetailedField(UploadedField[Uploaded], BatchedField):
         """f at p from the data, at a detail (`Field.at_detail`)."""
 
     def evaluate(self, p: Vec3) -> Sample:
-        on = self._on(p)
+        on = self._data_for(p)
         return self._sample(on, p, on.backend.Float(1))
 
-    def at_detail(self, detail: Real) -> Field:
-        on = self._prepared()
+    def at_accuracy(self, detail: Real) -> Field:
+        on = self._require_data()
         closer = fmax(on.backend.Float(detail), on.backend.Float(1))
         return SumAtDetail(
             lambda p: self._sample(on, p, detail), lambda p: self.values_at(p, 2, closer)
         )
 
-    def _batch(self, backend: Backend) -> Uploaded:
+    def _batch_data(self, backend: Backend) -> Uploaded:
         device = self._device
-        if self.values_take_more or device is None or device.backend is not backend:
-            return super()._batch(backend)
+        if self.has_separate_batch_data or device is None or device.backend is not backend:
+            return super()._batch_data(backend)
         return device
 
 
-def single(center: FloatArray) -> FloatArray:
+def round_to_single(center: FloatArray) -> FloatArray:
     """The nearest center that single precision holds exactly: subtracting it from points nearby is
     then exact, however far the origin is."""
     with np.errstate(over="ignore"):
@@ -232,12 +247,14 @@ def single(center: FloatArray) -> FloatArray:
     return np.where(np.isfinite(rounded), rounded, center)
 
 
-def placed(backend: Backend, center: FloatArray, size: float) -> tuple[Backend, Vec3, Real]:
-    """The attributes of `UnitCoordinates`, as kernel parameters."""
+def frame_parameters(
+    backend: Backend, center: FloatArray, size: float
+) -> tuple[Backend, Vec3, Real]:
+    """The attributes of `UnitFrame`, as kernel parameters."""
     opaque = (dr.opaque(backend.Float, float(c)) for c in center)
     return backend, backend.Array3f(*opaque), dr.opaque(backend.Float, size)
 
 
-def epsilon_at(x: Vec3) -> Real:
+def coordinate_rounding(x: Vec3) -> Real:
     """The rounding of a coordinate of x, or of a vertex of size about one."""
     return float(dr.epsilon(x)) * (1 + dr.max(dr.abs(x)))

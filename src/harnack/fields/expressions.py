@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from harnack import arithmetic
-from harnack.backend.validation import finite, flag, refuse_derivatives, refuses_derivatives
-from harnack.fields.formula import Formula, as_jet, probe, warn_of_price
+from harnack.backend.validation import as_finite, check_no_derivatives, flag, no_derivatives
+from harnack.fields.formula import Formula, as_jet, probe_jets, warn_if_slow_to_compile
 from harnack.geometry.volume import check_volume
 from harnack.name_suggestions import did_you_mean
 
@@ -37,7 +37,7 @@ _FUNCTIONS: Mapping[str, Callable[..., Any]] = MappingProxyType(
     }
 )  # fmt: skip
 # Functions with several arguments: the least and the largest number of them.
-_SEVERAL = {"max": (2, 99), "min": (2, 99), "norm": (2, 3), "atan2": (2, 2)}
+_ARGUMENT_COUNTS = {"max": (2, 99), "min": (2, 99), "norm": (2, 3), "atan2": (2, 2)}
 _OPERATORS: Mapping[type[ast.operator], Callable[[Any, Any], Any]] = MappingProxyType(
     {
         ast.Add: lambda a, b: a + b,
@@ -48,7 +48,7 @@ _OPERATORS: Mapping[type[ast.operator], Callable[[Any, Any], Any]] = MappingProx
 )
 # Limits of the number of characters, and of nested operations: Python allows some 1000 nested
 # calls.
-_LONGEST, _DEEPEST = 4000, 200
+_MAX_LENGTH, _MAX_DEPTH = 4000, 200
 
 
 @dataclass(frozen=True)
@@ -66,22 +66,22 @@ class TextFormula:
     parameters: Mapping[str, float] = field(default_factory=dict[str, float])
 
     @classmethod
-    def read(cls, text: str, parameters: Mapping[str, float] | None = None) -> TextFormula:
+    def parse(cls, text: str, parameters: Mapping[str, float] | None = None) -> TextFormula:
         """The formula of a text.
 
         Raises:
             ValueError: the text is no formula, saying where and what is wrong; or a parameter is
                 not in it, or has a name that means something else.
         """
-        parameters = {name: finite(one, name) for name, one in (parameters or {}).items()}
-        if len(text) > _LONGEST:
-            raise ValueError(f"a formula has at most {_LONGEST:,} characters, not {len(text):,}")
+        parameters = {name: as_finite(one, name) for name, one in (parameters or {}).items()}
+        if len(text) > _MAX_LENGTH:
+            raise ValueError(f"a formula has at most {_MAX_LENGTH:,} characters, not {len(text):,}")
         strange = re.search(r"[^A-Za-z0-9\s.,+*/^()=<>!-]|\b0[xob]", text, re.IGNORECASE)
         if strange:
-            raise _wrong(text, f"{strange[0]!r} has no meaning here")
+            raise _formula_error(text, f"{strange[0]!r} has no meaning here")
         sides = [cls._side(text, side) for side in re.split(r"(?<![<>=!])=(?!=)", text)]
         if len(sides) > 2:
-            raise _wrong(text, "more than one = sign")
+            raise _formula_error(text, "more than one = sign")
         tree = sides[0] if len(sides) == 1 else ast.BinOp(sides[0], ast.Sub(), sides[1])
         _check(text, tree, parameters)
         names = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
@@ -100,19 +100,19 @@ class TextFormula:
             pass
         bare = re.search(rf"\b({'|'.join(_FUNCTIONS)})\s+[A-Za-z0-9]", side)
         if bare:
-            raise _wrong(text, f"the argument of {bare[1]} stands in brackets")
+            raise _formula_error(text, f"the argument of {bare[1]} stands in brackets")
         missing = re.search(r"(?:[0-9](?<!atan2)|\))\s*[A-Za-z(]|[xyz)]\s+[A-Za-z0-9(]", side)
         hint = f"is a * missing at {missing[0]!r}" if missing else "an operator or bracket is amiss"
-        raise _wrong(text, hint)
+        raise _formula_error(text, hint)
 
     def __call__(self, x: Any, y: Any, z: Any) -> Any:
         try:
             with np.errstate(all="ignore"):  # in constants; a result that is not finite is refused
                 return _value(self.tree, {"x": x, "y": y, "z": z, **_CONSTANTS, **self.parameters})
         except ZeroDivisionError:
-            raise _wrong(self.text, "it divides by zero") from None
+            raise _formula_error(self.text, "it divides by zero") from None
         except OverflowError:
-            raise _wrong(self.text, "a number in it is too large, or not real") from None
+            raise _formula_error(self.text, "a number in it is too large, or not real") from None
 
     def __repr__(self) -> str:
         numbers = "".join(f", {name} = {one:g}" for name, one in self.parameters.items())
@@ -124,7 +124,7 @@ def looks_like_formula(text: str) -> bool:
     return any(sign in text for sign in ("=", "^", "*", "("))
 
 
-def _wrong(text: str, why: str) -> ValueError:
+def _formula_error(text: str, why: str) -> ValueError:
     shown = text if len(text) <= 80 else text[:77] + "..."
     return ValueError(
         f'{shown!r} is no formula in x, y and z: {why}; write it as in "x^2 + y^2 = 1 + sin(2*z)"'
@@ -133,25 +133,25 @@ def _wrong(text: str, why: str) -> ValueError:
 
 def _check(text: str, node: ast.expr, own: Iterable[str], depth: int = 0) -> None:
     """Raise ValueError for anything in a tree that is not allowed or not known."""
-    if depth > _DEEPEST:
-        raise _wrong(text, f"more than {_DEEPEST} operations are within each other")
+    if depth > _MAX_DEPTH:
+        raise _formula_error(text, f"more than {_MAX_DEPTH} operations are within each other")
     if isinstance(node, ast.BinOp):
         if not isinstance(node.op, ast.Pow) and type(node.op) not in _OPERATORS:
-            raise _wrong(text, "the operators are + - * / ^")
+            raise _formula_error(text, "the operators are + - * / ^")
         _check(text, node.left, own, depth + 1)
         _check(text, node.right, own, depth + 1)
     elif isinstance(node, ast.UnaryOp):
         if not isinstance(node.op, ast.USub | ast.UAdd):
-            raise _wrong(text, "the signs are + and -")
+            raise _formula_error(text, "the signs are + and -")
         _check(text, node.operand, own, depth + 1)
     elif isinstance(node, ast.Name):
         known = (*_COORDINATES, *_CONSTANTS, *own)
         if node.id in _FUNCTIONS:
-            raise _wrong(
+            raise _formula_error(
                 text, f"the argument of {node.id} stands in brackets, and a power behind them"
             )
         if node.id not in known:
-            raise _wrong(
+            raise _formula_error(
                 text,
                 f"{node.id!r} is unknown, there are {', '.join(known)} and {', '.join(_FUNCTIONS)}"
                 f"{did_you_mean(node.id, (*known, *_FUNCTIONS))}; of a number of your own, give "
@@ -160,37 +160,37 @@ def _check(text: str, node: ast.expr, own: Iterable[str], depth: int = 0) -> Non
     elif isinstance(node, ast.Constant):
         value = node.value
         if isinstance(value, bool) or not isinstance(value, int | float):
-            raise _wrong(text, f"{value!r} is no real number")
+            raise _formula_error(text, f"{value!r} is no real number")
         if not math.isfinite(_as_float(text, value)):
-            raise _wrong(text, "a number is too large")
+            raise _formula_error(text, "a number is too large")
     elif isinstance(node, ast.Call):
         _check_call(text, node, own, depth + 1)
     elif isinstance(node, ast.Compare):
-        raise _wrong(text, "an equation has one = between its two sides")
+        raise _formula_error(text, "an equation has one = between its two sides")
     else:
-        raise _wrong(text, f"{ast.unparse(node)!r} is not understood")
+        raise _formula_error(text, f"{ast.unparse(node)!r} is not understood")
 
 
 def _as_float(text: str, value: float) -> float:
     try:
         return float(value)
     except OverflowError:
-        raise _wrong(text, "a number is too large") from None
+        raise _formula_error(text, "a number is too large") from None
 
 
 def _check_call(text: str, node: ast.Call, own: Iterable[str], depth: int) -> None:
     name = node.func.id if isinstance(node.func, ast.Name) else ast.unparse(node.func)
     if name in (*_COORDINATES, *_CONSTANTS, *own) or not isinstance(node.func, ast.Name):
-        raise _wrong(text, f"is a * missing after {name!r}")
+        raise _formula_error(text, f"is a * missing after {name!r}")
     if name not in _FUNCTIONS:
         known = ", ".join(_FUNCTIONS)
         hint = did_you_mean(name, _FUNCTIONS)
-        raise _wrong(text, f"{name!r} is no known function, there are {known}{hint}")
-    least, most = _SEVERAL.get(name, (1, 1))
+        raise _formula_error(text, f"{name!r} is no known function, there are {known}{hint}")
+    least, most = _ARGUMENT_COUNTS.get(name, (1, 1))
     if node.keywords or not least <= len(node.args) <= most:
         count = f"{least} or {most}" if least < most < 9 else f"{least}{' or more' * (most > 9)}"
         plural = "s" if most > 1 else ""
-        raise _wrong(text, f"{name} takes {count} argument{plural}, not {len(node.args)}")
+        raise _formula_error(text, f"{name} takes {count} argument{plural}, not {len(node.args)}")
     for one in node.args:
         _check(text, one, own, depth)
 
@@ -201,13 +201,13 @@ def _value(node: ast.expr, names: Mapping[str, Any]) -> Any:
     Raises:
         OverflowError: a part that is constant is not finite.
     """
-    value = _computed(node, names)
+    value = _evaluate_node(node, names)
     if isinstance(value, float) and not math.isfinite(value):
         raise OverflowError
     return value
 
 
-def _computed(node: ast.expr, names: Mapping[str, Any]) -> Any:
+def _evaluate_node(node: ast.expr, names: Mapping[str, Any]) -> Any:
     match node:
         case ast.BinOp(left, ast.Pow(), right):
             base, exponent = _value(left, names), _value(right, names)
@@ -262,7 +262,7 @@ class Expression(Formula):
         return self
 
 
-@refuses_derivatives
+@no_derivatives
 def expression(
     function: Callable[[Any, Any, Any], Any] | str,
     *,
@@ -296,7 +296,7 @@ def expression(
     if parameters is not None and not isinstance(cast("Any", parameters), Mapping):
         raise TypeError(f'parameters are numbers by name, such as {{"a": 2}}, not {parameters!r}')
     if isinstance(function, str):
-        function = TextFormula.read(function, parameters)
+        function = TextFormula.parse(function, parameters)
     elif parameters:
         raise TypeError("parameters are of formulas as text: a Python function has its own numbers")
     if not callable(function):
@@ -306,11 +306,11 @@ def expression(
         )
     _check_arguments(function)
     check_volume(domain, "domain")
-    level, is_convex = finite(level, "level"), flag(is_convex, "is_convex")
+    level, is_convex = as_finite(level, "level"), flag(is_convex, "is_convex")
     made = Expression(function, domain, default_level=level, is_convex=is_convex)
-    point = probe()
-    refuse_derivatives("an expression", as_jet(made.formula(*point), point[0], "expression"))
-    warn_of_price(made)
+    point = probe_jets()
+    check_no_derivatives("an expression", as_jet(made.formula(*point), point[0], "expression"))
+    warn_if_slow_to_compile(made)
     return made
 
 

@@ -17,20 +17,20 @@ import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
-from harnack.backend.arrays import as_data
-from harnack.backend.tensors import takes_tensors
+from harnack.backend.arrays import as_kernel_parameters
+from harnack.backend.tensors import accepts_tensors
 from harnack.backend.validation import (
-    is_same,
+    check_no_derivatives,
+    format_short,
+    is_same_or_equal,
     make_read_only,
-    refuse_derivatives,
-    refuses_derivatives,
-    short_text,
+    no_derivatives,
 )
-from harnack.cluster.dask_arrays import takes_blocks
-from harnack.enclosures import BoundedLaplacian, Curvature, HarmonicBall, Lipschitz
-from harnack.fields.batch_evaluation import also_at_points, at_points
-from harnack.fields.capabilities import Boundary, Detail, Parts, Sheets
-from harnack.fields.samples import Look, Path, Sample, checked_samples, lengthened
+from harnack.cluster.dask_arrays import accepts_dask_arrays
+from harnack.enclosures import BoundedLaplacian, HarmonicBall, Lipschitz, TaylorRemainder
+from harnack.fields.batch_evaluation import accepts_numpy_points, evaluate_points
+from harnack.fields.capabilities import CommonBoundary, JumpSurface, PatchUnion, VariableAccuracy
+from harnack.fields.samples import Ray, RaySample, Sample, space_scaled, validate_samples
 from harnack.geometry.volume import check_volume
 
 if TYPE_CHECKING:
@@ -38,29 +38,39 @@ if TYPE_CHECKING:
 
     from harnack.backend import Backend, Precision, Real, Vec3
     from harnack.geometry import Volume
-    from harnack.tree.empty_space import OccupiedCells
+    from harnack.tree.empty_space import OccupancyGrid
 
 
 __all__ = [
-    "AtDetail",
     "BoundedLaplacian",
-    "Curvature",
+    "EvaluateOnly",
     "Field",
     "HarmonicBall",
     "Lipschitz",
-    "Look",
-    "Path",
+    "Ray",
+    "RaySample",
     "Sample",
-    "lengthened",
+    "TaylorRemainder",
+    "space_scaled",
 ]
 
 # Methods that only solids have.
-_OF_SOLIDS = frozenset(
-    ("moved", "rotated", "scaled", "transformed", "twisted", "tapered", "grown", "shell", "blended")
+_SOLID_METHODS = frozenset(
+    (
+        "translated",
+        "rotated",
+        "scaled",
+        "transformed",
+        "twisted",
+        "tapered",
+        "offset",
+        "shell",
+        "blended",
+    )
 )
 
 
-class Field(Sheets, Parts, Detail, Boundary, abc.ABC):
+class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
     """A scalar function on R^3 whose level sets can be traced with a proof.
 
     Subclasses define `evaluate`; the class attributes are defaults that an instance may override.
@@ -74,20 +84,20 @@ class Field(Sheets, Parts, Detail, Boundary, abc.ABC):
     default_level: float = 0.0
     """The level drawn when none is asked for."""
 
-    overstep: float = 1.4
-    """The over-stepping factor (`LevelSet.overstep`) that needs the fewest evaluations, by
+    over_relaxation: float = 1.4
+    """The over-stepping factor (`Surface.overstep`) that needs the fewest evaluations, by
     experiment; at least 1."""
 
     domain: Volume | None = None
     """Where the field may be evaluated and is drawn; None for all of space. Rays are clipped to
     it, and what a sample promises need only hold for p in it. As it is convex, a ray from p stays
-    in it up to where it is clipped; `Lipschitz` and `Curvature` need not hold beyond."""
+    in it up to where it is clipped; `Lipschitz` and `TaylorRemainder` need not hold beyond."""
 
-    is_entire: bool = False
+    is_global: bool = False
     """Whether f and its promises are right in all of space, so that `domain` is only where it is
     drawn."""
 
-    wavelength: float | None = None
+    min_wavelength: float | None = None
     """The shortest wavelength of f that matters, where it is known: code that samples f in cells
     makes them smaller than this."""
 
@@ -100,8 +110,8 @@ class Field(Sheets, Parts, Detail, Boundary, abc.ABC):
 
     def __new__(cls, *given: Any, **named: Any) -> Self:
         """Refuse arguments with derivatives enabled, unless the class defines `parameters`."""
-        if cls.drops_derivatives():
-            refuse_derivatives(cls.__name__, given, named)
+        if cls.has_no_parameters():
+            check_no_derivatives(cls.__name__, given, named)
         return super().__new__(cls)
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
@@ -113,15 +123,15 @@ class Field(Sheets, Parts, Detail, Boundary, abc.ABC):
             cls.__repr__ = Field.__repr__
         for name, own in list(vars(cls).items()):
             if isinstance(own, classmethod) and not name.startswith("_"):
-                checked_maker = refuses_derivatives(cast("Any", own).__func__)
+                checked_maker = no_derivatives(cast("Any", own).__func__)
                 setattr(cls, name, classmethod(checked_maker))
         if "evaluate" in vars(cls):
-            checked: Any = checked_samples(cls.evaluate)
+            checked: Any = validate_samples(cls.evaluate)
             cls.evaluate = checked
-            if "look" not in vars(cls):  # a base's `look` might not call this `evaluate`
-                cls.look = Field.look
+            if "sample_ray" not in vars(cls):  # a base's might not call this `evaluate`
+                cls.sample_ray = Field.sample_ray
         if "hessian" in vars(cls):
-            general: Any = also_at_points(cls.hessian)
+            general: Any = accepts_numpy_points(cls.hessian)
             cls.hessian = general
 
     def __copy__(self) -> Self:
@@ -140,16 +150,16 @@ class Field(Sheets, Parts, Detail, Boundary, abc.ABC):
         given = inspect.signature(type(self).__init__).parameters
         own = {key.removeprefix("_"): value for key, value in vars(self).items()}
         said = [
-            f"{key}={short_text(own[key])}"
+            f"{key}={format_short(own[key])}"
             for key, one in given.items()
-            if key in own and not is_same(own[key], one.default)
+            if key in own and not is_same_or_equal(own[key], one.default)
         ]
         return f"{type(self).__name__}({', '.join(said)})"
 
     def __getattr__(self, name: str) -> Any:
         """For methods that only solids have, the error says how to make a solid of the field."""
         own = f"{type(self).__name__!r} object has no attribute {name!r}"
-        if name in _OF_SOLIDS:
+        if name in _SOLID_METHODS:
             own += ": make a solid of the field first, by harnack.solid(field, below=level)"
         raise AttributeError(own)
 
@@ -191,7 +201,7 @@ class Field(Sheets, Parts, Detail, Boundary, abc.ABC):
         del levels
         return self.domain
 
-    def occupied(self, levels: tuple[float, ...]) -> OccupiedCells | None:
+    def occupied_cells(self, levels: tuple[float, ...]) -> OccupancyGrid | None:
         """A grid of cells outside of which there are proved to be no points of the level sets; None
         where none is known. First hits jump across empty cells: for fields that are expensive to
         evaluate.
@@ -201,7 +211,7 @@ class Field(Sheets, Parts, Detail, Boundary, abc.ABC):
         del levels
         return None
 
-    def for_rays(self, count: int) -> Field:
+    def for_ray_count(self, count: int) -> Field:
         """This field, to be traced by so many rays: a field may take longer to prepare where that
         pays for them. The same object for the same count, so that nothing is prepared twice. The
         default is the field itself."""
@@ -215,12 +225,12 @@ class Field(Sheets, Parts, Detail, Boundary, abc.ABC):
         a hit. The tracer then looks at f beyond the hit."""
         return False
 
-    def slope_change(self, p: Vec3, radius: Real) -> Real:
+    def gradient_change_bound(self, p: Vec3, radius: Real) -> Real:
         """A proved bound of |grad f(y) - grad f(p)| for all y with |y - p| <= radius; infinite, the
         default, where none is known. Proofs that a mesh has the surface's topology use it."""
         return 0 * p.x + radius + dr.inf
 
-    def check_levels(self, levels: tuple[float, ...]) -> None:
+    def validate_levels(self, levels: tuple[float, ...]) -> None:
         """Raise ValueError if a level is one that no surface can have. The default accepts all."""
         del levels
 
@@ -232,18 +242,18 @@ class Field(Sheets, Parts, Detail, Boundary, abc.ABC):
         return ()
 
     @classmethod
-    def drops_derivatives(cls) -> bool:
+    def has_no_parameters(cls) -> bool:
         """Whether the class names no `parameters`, so that derivatives by any would be dropped."""
         return cls.parameters is Field.parameters
 
-    def check_parameters(self) -> None:
+    def refuse_hidden_parameters(self) -> None:
         """Raise NotImplementedError if numbers that the field does not name in `parameters`, such
         as
         those that its formula refers to, have derivatives enabled: they would be dropped."""
-        if self.drops_derivatives():
+        if self.has_no_parameters():
             kind = type(self)
             is_own = not kind.__module__.startswith("harnack.")
-            refuse_derivatives(kind.__name__, vars(self), kind.evaluate if is_own else None)
+            check_no_derivatives(kind.__name__, vars(self), kind.evaluate if is_own else None)
 
     def differentiable_value(self, p: Vec3) -> Real:
         """f(p) as an expression that Dr.Jit can differentiate in p and in the field's parameters.
@@ -255,15 +265,17 @@ class Field(Sheets, Parts, Detail, Boundary, abc.ABC):
         """
         if any(dr.grad_enabled(one) for one in self.parameters()):
             return self.evaluate(p).value
-        self.check_parameters()
+        self.refuse_hidden_parameters()
         at = dr.detach(p)
         with dr.suspend_grad():
             sample = self.evaluate(at)
-        gradient = as_data(sample.gradient)  # a literal 0 would have no derivative in Dr.Jit
+        gradient = as_kernel_parameters(
+            sample.gradient
+        )  # a literal 0 would have no derivative in Dr.Jit
         return dr.replace_grad(sample.value, dr.dot(gradient, p - at))
 
-    @takes_blocks("points")
-    @takes_tensors
+    @accepts_dask_arrays("points")
+    @accepts_tensors
     def value(self, points: Any, *, precision: Precision = "single") -> Any:
         """f at points (n, 3): (n,); at a single point (3,): a number.
 
@@ -274,14 +286,14 @@ class Field(Sheets, Parts, Detail, Boundary, abc.ABC):
         Raises TypeError or ValueError for other shapes, NaN or infinity.
         """
         if dr.is_array_v(type(points)):
-            self.check_parameters()
+            self.refuse_hidden_parameters()
             if any(dr.grad_enabled(one) for one in (points, *self.parameters())):
                 return self.differentiable_value(points)
             return self.evaluate(points).value
-        return self._samples_at(points, precision, lambda sample: sample.value)
+        return self._evaluate_points(points, precision, lambda sample: sample.value)
 
-    @takes_blocks("points")
-    @takes_tensors
+    @accepts_dask_arrays("points")
+    @accepts_tensors
     def gradient(self, points: Any, *, precision: Precision = "single") -> Any:
         """The gradients of f at points (n, 3): (n, 3); at a single point (3,): (3,).
 
@@ -291,9 +303,9 @@ class Field(Sheets, Parts, Detail, Boundary, abc.ABC):
         derivatives enabled.
         """
         if not dr.is_array_v(type(points)):
-            return self._samples_at(points, precision, lambda sample: sample.gradient)
-        self.check_parameters()
-        refuse_derivatives(f"the gradient of {type(self).__name__}", self.parameters())
+            return self._evaluate_points(points, precision, lambda sample: sample.gradient)
+        self.refuse_hidden_parameters()
+        check_no_derivatives(f"the gradient of {type(self).__name__}", self.parameters())
         if not dr.grad_enabled(points):
             return self.evaluate(points).gradient
         with dr.suspend_grad():
@@ -302,15 +314,15 @@ class Field(Sheets, Parts, Detail, Boundary, abc.ABC):
         moved = points - p
         return gradient + type(points)(*(dr.dot(row, moved) for row in rows))
 
-    def _samples_at(
+    def _evaluate_points(
         self, points: Any, precision: Precision, wanted: Callable[[Sample], Any]
     ) -> npt.NDArray[Any]:
         def kernel(backend: Backend, x: Vec3) -> tuple[Any, ...]:
             return (wanted(self.prepare(backend).evaluate(x)),)
 
-        return at_points(points, kernel, precision)[0]
+        return evaluate_points(points, kernel, precision)[0]
 
-    @also_at_points
+    @accepts_numpy_points
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         """Rows of the symmetric matrix of second derivatives at p, in f per length squared.
 
@@ -321,7 +333,7 @@ class Field(Sheets, Parts, Detail, Boundary, abc.ABC):
         del p
         raise NotImplementedError(
             f"{type(self).__name__} gives no second derivatives: define its method hessian(p), or "
-            'ask for what needs none, such as signed_distance(..., method="first")'
+            'ask for what needs none, such as signed_distance(..., method="first_order")'
         )
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
@@ -335,7 +347,7 @@ class Field(Sheets, Parts, Detail, Boundary, abc.ABC):
         """Names and values of what a user may want to know about choices that the field made."""
         return {}
 
-    def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
+    def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
         """What is proved about f along a path from its point at t, in both directions.
 
         The default evaluates the field there and applies its promises to the slope along the path.
@@ -345,10 +357,10 @@ class Field(Sheets, Parts, Detail, Boundary, abc.ABC):
             shorter length need reach no farther.
         """
         del ahead, back
-        return path.look(self.evaluate(path.point(t)))
+        return path.enclose(self.evaluate(path.point(t)))
 
 
-class AtDetail(Field):
+class EvaluateOnly(Field):
     """A field as evaluated at one detail: what `Field.at_detail` returns."""
 
     def __init__(self, evaluate: Callable[[Vec3], Sample]) -> None:
@@ -358,7 +370,7 @@ class AtDetail(Field):
         return self._evaluate(p)
 
 
-def check_in_range(
+def validate_levels_in_range(
     levels: tuple[float, ...], value_range: tuple[float, float], what: str = "the function"
 ) -> None:
     """Raise ValueError for a level outside the range in which values are proved to lie.
@@ -377,12 +389,12 @@ def check_is_field(given: Any) -> None:
     """Raise TypeError for what is no field, or one whose domain is no volume."""
     if not isinstance(given, Field):
         raise TypeError(
-            f"a harnack field is needed, such as harnack.Gyroid(1.0), not {instead_of_field(given)}"
+            f"a harnack field is needed, such as harnack.Gyroid(1.0), not {suggest_field(given)}"
         )
     check_volume(given.domain, f"the domain of a {type(given).__name__}")
 
 
-def instead_of_field(given: Any) -> str:
+def suggest_field(given: Any) -> str:
     """For a message: what a thing is that is no field, and how to make a field of it."""
     kind, name = type(given).__name__, getattr(given, "__name__", "")
     if isinstance(getattr(given, "field", None), Field):

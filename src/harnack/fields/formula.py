@@ -3,6 +3,9 @@
 A formula is evaluated in two ways. Given jets of the coordinates at a point, it returns value and
 gradient with bounds of their rounding; given jets along a piece of a path, it returns ranges of its
 derivatives there, from which steps are proved.
+
+A formula's kernel is counted before it is compiled: LLVM's time grows faster than the number of
+operations, so that a warning comes before minutes of silence, and says what to do.
 """
 
 from __future__ import annotations
@@ -21,17 +24,17 @@ from typing import TYPE_CHECKING, Any, ClassVar, cast
 import drjit as dr
 
 from harnack.arithmetic import Interval, Jet
-from harnack.arithmetic.interval import unit_of
+from harnack.arithmetic.interval import machine_epsilon
 from harnack.arithmetic.jet import Dual
-from harnack.arithmetic.operators import Operators, Tally, tally_of
+from harnack.arithmetic.operators import FormulaNumber, Tally, tally_of
 from harnack.backend import choose_backend
-from harnack.backend.elementary import fmin, largest_coordinate, length
-from harnack.enclosures import Lipschitz, Slopes
-from harnack.enclosures.enclosure import Piece
-from harnack.enclosures.parabola import Tangent
-from harnack.enclosures.piecewise_taylor import Pieces
+from harnack.backend.elementary import fmin, max_norm, safe_norm
+from harnack.enclosures import Lipschitz, SlopeRange
+from harnack.enclosures.enclosure import PathPiece
+from harnack.enclosures.parabola import ConvexityEnclosure
+from harnack.enclosures.piecewise_taylor import PiecewiseTaylorEnclosure
 from harnack.fields.field import Field
-from harnack.fields.samples import Look, Path, Sample
+from harnack.fields.samples import Ray, RaySample, Sample
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
@@ -42,21 +45,21 @@ if TYPE_CHECKING:
 _RADII, _LARGEST_RADIUS = (0.25, 1.0, 4.0), 1e12
 # At a tie the gradient is taken so many roundings of coordinates and value away, in the direction
 # of the middle gradient, a unit vector or 0, plus this vector, so that it is along no tie.
-_BESIDE, _ASIDE = 64.0, (0.31, 0.19, 0.13)
+_TIE_OFFSET, _TIE_DIRECTION = 64.0, (0.31, 0.19, 0.13)
 # Where the gradient is known up to so many roundings there is no tie.
-_TIE = 1024.0
+_TIE_THRESHOLD = 1024.0
 # Where a formula may jump, or is abrupt, pieces begin so many roundings of t before the point.
 _ROUNDINGS = 8.0
 # A compilation that will take so many seconds is announced by a warning.
-_LONG = 10.0
+_SLOW_COMPILE_SECONDS = 10.0
 
 
 # Whether samples are asked for without promises that are weaker than others.
-_WITHOUT_WEAKER: ContextVar[bool] = ContextVar("without_weaker", default=False)
+_WITHOUT_WEAKER: ContextVar[bool] = ContextVar("without_alternatives", default=False)
 
 
 @contextmanager
-def without_weaker() -> Generator[None]:
+def without_alternatives() -> Generator[None]:
     """Samples of formulas have no weaker promises, which take several times as long to record as
     value and gradient: for callers that use these alone."""
     token = _WITHOUT_WEAKER.set(True)
@@ -77,7 +80,7 @@ class Formula(Field):
     is_convex: bool = False
     is_cheap = True
     has_creases = True  # it may use abs, maximum and minimum
-    overstep = 1.0  # proved steps are long already; trying longer ones takes more samples
+    over_relaxation = 1.0  # proved steps are long already; trying longer ones takes more samples
     lipschitz: Real | None = None
     _prepared_tally: ClassVar[Tally | None] = None
 
@@ -108,12 +111,12 @@ class Formula(Field):
         return self.tally.turns_within(1.0 if self.lipschitz is not None else self.tally.finest)
 
     def evaluate(self, p: Vec3) -> Sample:
-        sample = self._one_sided(p, self.sample_alone(p))
+        sample = self._with_one_sided_gradient(p, self.sample_without_alternatives(p))
         if _WITHOUT_WEAKER.get():
             return sample
-        return dataclasses.replace(sample, weaker=self._lipschitz_near(p, sample))
+        return dataclasses.replace(sample, alternative_promises=self._local_lipschitz(p, sample))
 
-    def _one_sided(self, p: Vec3, sample: Sample) -> Sample:
+    def _with_one_sided_gradient(self, p: Vec3, sample: Sample) -> Sample:
         """The sample with a gradient that f has nearby, where at p the gradient is a range.
 
         At ties of a formula, such as max(x, 0) at x = 0, the range of the gradient contains all
@@ -129,48 +132,48 @@ class Formula(Field):
         is_bounded = dr.isfinite(sample.gradient_error + dr.sum(sample.gradient))
         middle = dr.select(is_bounded, sample.gradient, 0)
         doubt = dr.select(is_bounded, sample.gradient_error, dr.inf)
-        steep = length(middle)
-        way = dr.select(steep > 0, middle / steep, 0) + type(p)(*_ASIDE)
-        size = largest_coordinate(p) + dr.abs(sample.value)
+        steep = safe_norm(middle)
+        way = dr.select(steep > 0, middle / steep, 0) + type(p)(*_TIE_DIRECTION)
+        size = max_norm(p) + dr.abs(sample.value)
         size = dr.select(size > 0, size, 1)
-        away = Dual.at_point(p + way * (_BESIDE * epsilon * size))
+        away = Dual.at_point(p + way * (_TIE_OFFSET * epsilon * size))
         try:
-            beside = away[0].of(self.formula(*away))
+            beside = away[0].coerce(self.formula(*away))
         except TypeError:  # a formula that accepts only ranges, as that of noise
             return sample
-        one_side = type(p)(*(0 * p.x + one for one in beside.first))
-        off = length(one_side - middle)
-        is_tie = (doubt > _TIE * epsilon * steep) & (off <= 2 * doubt) & dr.isfinite(off)
+        one_side = type(p)(*(0 * p.x + one for one in beside.first_derivatives))
+        off = safe_norm(one_side - middle)
+        is_tie = (doubt > _TIE_THRESHOLD * epsilon * steep) & (off <= 2 * doubt) & dr.isfinite(off)
         return dataclasses.replace(
             sample,
             gradient=dr.select(is_tie, one_side, sample.gradient),
             gradient_error=dr.select(is_tie, doubt + off, doubt),
         )
 
-    def sample_alone(self, p: Vec3) -> Sample:
+    def sample_without_alternatives(self, p: Vec3) -> Sample:
         """Value and gradient, without the promises that a look along a path does not use."""
         return self._sample_of(self._jet(Jet.at_point(p), p.x), p)
 
     def _sample_of(self, jet: Jet, p: Vec3) -> Sample:
         zero = 0 * p.x
-        gradient = type(p)(*(zero + one.middle for one in jet.first))
+        gradient = type(p)(*(zero + one.midpoint for one in jet.first_derivatives))
         doubt = zero
-        for one in jet.first:
+        for one in jet.first_derivatives:
             doubt = doubt + one.radius
         known = self.promises(p)
-        value, error = zero + jet.value.middle, zero + jet.value.radius
+        value, error = zero + jet.value.midpoint, zero + jet.value.radius
         return Sample(value, gradient, known, error, doubt)
 
-    def _lipschitz_near(self, p: Vec3, sample: Sample) -> tuple[Lipschitz, ...]:
+    def _local_lipschitz(self, p: Vec3, sample: Sample) -> tuple[Lipschitz, ...]:
         """Lipschitz constants on balls about p: the largest gradient on the box around each. The
         radii are some multiples of Newton's estimate of the distance to level 0."""
-        steps = dr.abs(sample.value) / length(sample.gradient)
+        steps = dr.abs(sample.value) / safe_norm(sample.gradient)
         made: list[Lipschitz] = []
         for multiple in _RADII:
             radius = fmin(multiple * steps, _LARGEST_RADIUS)
-            jet = self._jet(Jet.within(p, radius), p.x)
-            slopes = (0 * p.x + one.largest for one in jet.first)
-            constant = length(type(p)(*slopes)) * (1 + 1e-5)
+            jet = self._jet(Jet.over_ball(p, radius), p.x)
+            slopes = (0 * p.x + one.max_abs for one in jet.first_derivatives)
+            constant = safe_norm(type(p)(*slopes)) * (1 + 1e-5)
             known = dr.isfinite(constant) & (radius > 0)
             made.append(Lipschitz(dr.select(known, constant, dr.inf), dr.select(known, radius, 0)))
         return tuple(made)
@@ -181,7 +184,7 @@ class Formula(Field):
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         jet = self._jet(Jet.at_point(p, order=2), p.x)
-        xx, xy, xz, yy, yz, zz = (0 * p.x + one.middle for one in jet.second)
+        xx, xy, xz, yy, yz, zz = (0 * p.x + one.midpoint for one in jet.second_derivatives)
         vector = cast("Any", type(p))
         return vector(xx, xy, xz), vector(xy, yy, yz), vector(xz, yz, zz)
 
@@ -189,14 +192,14 @@ class Formula(Field):
         """The error of the Hessian is that of its ranges: rounding, and ties of the formula."""
         return sample.gradient_error, hessian_error(self._jet(Jet.at_point(p, order=2), p.x), p.x)
 
-    def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
+    def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
         """The sample, and the enclosures that its ranges prove; looking back nothing is proved.
 
         Proof that no jump of f is passed, given that ranges of f' are all numbers on a piece with a
         jump. A march steps to t + s rounded, which may lie behind the s that was proved, and looks
         on from a point that is rounded again: a jump between would be seen from neither. So where
         f may jump, the piece begins before t, by more than the rounding of t, and is of all paths
-        that lead through the point up to its rounding (`FormulaAlong.rounded`). The exact path up
+        that lead through the point up to its rounding (`FormulaOnRay.rounded`). The exact path up
         to t + s then lies in such pieces altogether, and they have no jump.
 
         Proof that no level is passed where f is abrupt (`is_abrupt`), as max(-1, min(1, 1e9
@@ -212,23 +215,25 @@ class Formula(Field):
         jet = self._jet(Jet.at_point(p), p.x)
         sample = self._sample_of(jet, p)
         slope, slope_error = self._slope(p, path.direction)
-        slopes = Slopes.around(slope, slope_error)
-        function = self.restricted(p, path.direction)
+        slopes = SlopeRange.around(slope, slope_error)
+        function = self.restrict(p, path.direction)
         if self.is_abrupt:
-            slopes = Slopes.around(*self._slope(p, path.direction, is_rounded=True))
+            slopes = SlopeRange.around(*self._slope(p, path.direction, is_rounded=True))
         if self.is_abrupt or self.may_jump:
             function = function.rounded(t)
-        enclosures = path.proofs.along(function, slopes, ahead)
+        enclosures = path.proofs.from_restriction(function, slopes, ahead)
         if not enclosures:
-            return path.look(sample)
-        if self.may_jump and not all(isinstance(one, Pieces) for one in enclosures):
+            return path.enclose(sample)
+        if self.may_jump and not all(
+            isinstance(one, PiecewiseTaylorEnclosure) for one in enclosures
+        ):
             ahead = dr.select(function.is_continuous(ahead), ahead, 0)
-            enclosures = path.proofs.along(function, slopes, ahead)
-        growth = max(one.growth for one in enclosures)
-        if self.is_convex and Tangent in path.proofs.kinds:
-            enclosures = (*enclosures, Tangent(slopes))
-        least = length(type(p)(*(0 * p.x + one.smallest for one in jet.first)))
-        return Look(sample, enclosures, (), slope, growth, slope_error, least)
+            enclosures = path.proofs.from_restriction(function, slopes, ahead)
+        growth = max(one.reach_growth for one in enclosures)
+        if self.is_convex and ConvexityEnclosure in path.proofs.kinds:
+            enclosures = (*enclosures, ConvexityEnclosure(slopes))
+        least = safe_norm(type(p)(*(0 * p.x + one.min_abs for one in jet.first_derivatives)))
+        return RaySample(sample, enclosures, (), slope, growth, slope_error, least)
 
     def _slope(self, p: Vec3, direction: Vec3, *, is_rounded: bool = False) -> tuple[Real, Real]:
         """The derivative along a direction and its error: in a crease, where the gradient is a
@@ -237,13 +242,13 @@ class Formula(Field):
         zero = 0 * p.x
 
         def coordinate(k: int) -> Jet:
-            at = Interval.exactly(p[k])
-            at = at.widened(unit_of(p[k])) if is_rounded else at
-            return Jet(at, (Interval.exactly(direction[k]),), (), width=zero)
+            at = Interval.point(p[k])
+            at = at.widened(machine_epsilon(p[k])) if is_rounded else at
+            return Jet(at, (Interval.point(direction[k]),), (), piece_length=zero)
 
         x, y, z = (coordinate(k) for k in range(3))
-        (slope,) = self._jet((x, y, z), p.x).first
-        return zero + slope.middle, zero + slope.radius
+        (slope,) = self._jet((x, y, z), p.x).first_derivatives
+        return zero + slope.midpoint, zero + slope.radius
 
     @property
     def may_jump(self) -> bool:
@@ -251,14 +256,14 @@ class Formula(Field):
         numbers that would tell."""
         return self.tally.may_jump
 
-    def restricted(self, p: Vec3, direction: Vec3) -> FormulaAlong:
+    def restrict(self, p: Vec3, direction: Vec3) -> FormulaOnRay:
         """The field along the path from p, for enclosures."""
-        return FormulaAlong(self, p, direction)
+        return FormulaOnRay(self, p, direction)
 
     def prepare(self, backend: Backend) -> Field:
         """The same formula with its numbers as kernel parameters, so that other numbers compile no
         other kernel."""
-        other = prepared_numbers(self, backend)
+        other = with_device_numbers(self, backend)
         object.__setattr__(other, "_prepared_tally", self.tally)
         return other
 
@@ -266,7 +271,7 @@ class Formula(Field):
         return as_jet(self.formula(*coordinates), coordinates[0], type(self).__name__)
 
 
-def probe() -> tuple[Jet, Jet, Jet]:
+def probe_jets() -> tuple[Jet, Jet, Jet]:
     """Coordinates of some point, to try a formula on when it is made."""
     return Jet.at_point(choose_backend("double").Array3f(0.1, 0.2, 0.3))
 
@@ -274,17 +279,17 @@ def probe() -> tuple[Jet, Jet, Jet]:
 def hessian_error(jet: Jet, like: Real) -> Real:
     """A bound of the distance of a Hessian from the middles of its ranges at a point: the spectral
     norm of a matrix is at most the sum of the sizes of its entries."""
-    xx, xy, xz, yy, yz, zz = (one.radius for one in jet.second)
+    xx, xy, xz, yy, yz, zz = (one.radius for one in jet.second_derivatives)
     return 0 * like + xx + yy + zz + 2 * (xy + xz + yz)
 
 
-def warn_of_price(field: Formula) -> None:
+def warn_if_slow_to_compile(field: Formula) -> None:
     """Warn if compiling will take long. LLVM took 0.9 s for 11,000 operations on an idle core, 2.7
     s for 32,000, 7.4 s for 53,000 and 30 s for 100,000: the time grows about as their number to the
     power 2.2."""
     operations = tally_of(field.formula).operations
     seconds = 30 * (operations / 1e5) ** 2.2
-    if seconds > _LONG:
+    if seconds > _SLOW_COMPILE_SECONDS:
         warnings.warn(
             f"the ranges of this formula take about {operations:,} operations, which take about "
             f"{seconds:.0f} s to compile on an idle core, once for each precision: a Field of your "
@@ -300,7 +305,7 @@ def is_jet(x: Any, name: str) -> bool:
     Raises:
         TypeError: it is a number of another arithmetic.
     """
-    if isinstance(x, Operators) and not isinstance(x, Jet):
+    if isinstance(x, FormulaNumber) and not isinstance(x, Jet):
         raise TypeError(
             f"{name} gives ranges of derivatives alone, and the bound asked for is made of others: "
             'leave bound=None, or use "pieces", "quadratic-taylor", "linear-taylor" or "segment"'
@@ -325,7 +330,7 @@ def as_jet(value: Any, like: Jet, name: str) -> Jet:
 
 
 @dataclass(frozen=True)
-class FormulaAlong:
+class FormulaOnRay:
     """A formula along the path p + s d.
 
     before: how far before p its first piece begins. If that is not 0.0, its pieces are of all paths
@@ -340,7 +345,7 @@ class FormulaAlong:
     # take two thirds of the samples and twice the time.
     piece_count: int = 1
 
-    def rounded(self, t: Real) -> FormulaAlong:
+    def rounded(self, t: Real) -> FormulaOnRay:
         """The formula along all paths that lead through p up to its rounding, from a little before
         p: by more than the rounding of t, of which p is the point."""
         before = _ROUNDINGS * float(dr.epsilon(type(t))) * dr.abs(t)
@@ -348,55 +353,55 @@ class FormulaAlong:
 
     def is_continuous(self, length: Real) -> Mask:
         """Whether f is known to be continuous for 0 <= s <= length, as its slopes are bounded."""
-        slopes = self._jet(0.0, length).first[0]
-        return dr.isfinite(0 * length + slopes.low) & dr.isfinite(0 * length + slopes.high)
+        slopes = self._jet(0.0, length).first_derivatives[0]
+        return dr.isfinite(0 * length + slopes.lower) & dr.isfinite(0 * length + slopes.upper)
 
-    def pieces(self, knots: Sequence[Real]) -> tuple[Piece, ...]:
-        """See `harnack.enclosures.Restriction`."""
+    def derivative_ranges(self, knots: Sequence[Real]) -> tuple[PathPiece, ...]:
+        """See `harnack.enclosures.PathRestriction`."""
         return tuple(self._piece(start, end) for start, end in itertools.pairwise(knots))
 
-    def through(self, coordinates: Callable[[Vec3, Vec3], tuple[Any, Any, Any]]) -> Any:
-        """See `harnack.enclosures.Evaluable`."""
+    def evaluate_with(self, coordinates: Callable[[Vec3, Vec3], tuple[Any, Any, Any]]) -> Any:
+        """See `harnack.enclosures.EvaluableRestriction`."""
         x, y, z = coordinates(self.p, self.direction)
         value = self.field.formula(x, y, z)
         return x.constant(float(value)) if isinstance(value, int | float) else value
 
-    def _piece(self, start: Real, end: Real) -> Piece:
+    def _piece(self, start: Real, end: Real) -> PathPiece:
         jet = self._jet(start, end)
-        (slopes,), (curvatures,) = jet.first, jet.second
+        (slopes,), (curvatures,) = jet.first_derivatives, jet.second_derivatives
         zero = 0 * self.p.x
-        return Piece(
+        return PathPiece(
             end - start,
-            Slopes(zero + slopes.low, zero + slopes.high),
-            zero + curvatures.low,
-            zero + curvatures.high,
+            SlopeRange(zero + slopes.lower, zero + slopes.upper),
+            zero + curvatures.lower,
+            zero + curvatures.upper,
         )
 
     def _jet(self, start: Real, end: Real) -> Jet:
         is_exact = isinstance(self.before, float) and self.before == 0.0
         if not is_exact and isinstance(start, float):  # the first piece starts at 0.0
             start = -self.before
-        coordinates = Jet.along(self.p, self.direction, start, end, is_rounded=not is_exact)
+        coordinates = Jet.along_ray(self.p, self.direction, start, end, is_rounded=not is_exact)
         return as_jet(self.field.formula(*coordinates), coordinates[0], type(self.field).__name__)
 
 
-def prepared_numbers(field: Any, backend: Backend) -> Any:
+def with_device_numbers(field: Any, backend: Backend) -> Any:
     """A copy of a dataclass whose numbers, and those of fields in it, are kernel parameters of the
     backend."""
     other = copy.copy(field)
     for entry in dataclasses.fields(cast("Any", field)) if dataclasses.is_dataclass(field) else ():
         value = getattr(field, entry.name)
-        if (prepared := as_data(value, backend)) is not value:
+        if (prepared := prepare_value(value, backend)) is not value:
             object.__setattr__(other, entry.name, prepared)
     return other
 
 
-def as_data(value: Any, backend: Backend) -> Any:
+def prepare_value(value: Any, backend: Backend) -> Any:
     """Numbers, also in tuples, as kernel parameters of the backend; fields prepared; all else
     unchanged."""
     if isinstance(value, float):
         return dr.opaque(backend.Float, value)
     if isinstance(value, tuple):
         entries = cast("tuple[Any, ...]", value)
-        return tuple(as_data(one, backend) for one in entries)
+        return tuple(prepare_value(one, backend) for one in entries)
     return value.prepare(backend) if isinstance(value, Field) else value

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
 
 import numpy as np
 
-from harnack.cluster.serialization import Remembered
-from harnack.fields.batched_fields import prepared_once
-from harnack.fields.capabilities import PartEntry
-from harnack.fields.clearance import UnitCoordinates, placed, single
+from harnack.cluster.serialization import TransientCache
+from harnack.fields.batched_fields import cached_prepare
+from harnack.fields.capabilities import PatchEntry
+from harnack.fields.clearance import UnitFrame, frame_parameters, round_to_single
 from harnack.fields.field import Field
 from harnack.geometry import Box
 from harnack.tree.closest_triangles import BoxTree
@@ -25,60 +25,60 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, Mask, Real, Vec3
     from harnack.geometry import Volume
 
-__all__ = ["BoxedField", "BoxedParts"]
+__all__ = ["PatchBoxes", "PatchField"]
 
 
 @dataclass(frozen=True)
-class BoxedParts(UnitCoordinates):
+class PatchBoxes(UnitFrame):
     """A tree of boxes, one for each part, in coordinates in which they have a size of about one."""
 
     tree: BoxTree
 
     @classmethod
-    def upload(cls, backend: Backend, lower: FloatArray, upper: FloatArray) -> BoxedParts:
+    def upload(cls, backend: Backend, lower: FloatArray, upper: FloatArray) -> PatchBoxes:
         """Boxes from their corners (n, 3).
 
         The size is a power of two, so that positions along rays are scaled without rounding, and
         keep their order.
         """
         low, high = lower.min(axis=0), upper.max(axis=0)
-        center = single(0.5 * (low + high))
+        center = round_to_single(0.5 * (low + high))
         size = 2.0 ** math.ceil(math.log2(np.abs(np.stack([low, high]) - center).max()))
-        tree = BoxTree.of(backend, (lower - center) / size, (upper - center) / size)
-        return cls(*placed(backend, center, size), tree)
+        tree = BoxTree.from_corners(backend, (lower - center) / size, (upper - center) / size)
+        return cls(*frame_parameters(backend, center, size), tree)
 
     def next(
-        self, o: Vec3, d: Vec3, after: PartEntry, start: Real, end: Real, active: Mask
-    ) -> PartEntry:
-        """As `Field.next_part`."""
-        behind = after.enter / self.size, after.part
-        enter, leave, box = self.tree.next(
-            self.unit(o), d, behind, start / self.size, end / self.size, active
+        self, o: Vec3, d: Vec3, after: PatchEntry, start: Real, end: Real, active: Mask
+    ) -> PatchEntry:
+        """As `Field.next_patch`."""
+        behind = after.enter / self.size, after.patch
+        enter, leave, box = self.tree.next_box(
+            self.to_unit(o), d, behind, start / self.size, end / self.size, active
         )
-        return PartEntry(enter * self.size, leave * self.size, box)
+        return PatchEntry(enter * self.size, leave * self.size, box)
 
 
-class Buffers(Protocol):
+class HasPatchBoxes(Protocol):
     """The data of a field with parts on a backend: its boxes, and those of its parts."""
 
     @property
-    def boxes(self) -> BoxedParts: ...
+    def boxes(self) -> PatchBoxes: ...
 
 
-_Buffers = TypeVar("_Buffers", bound=Buffers)
+_Buffers = TypeVar("_Buffers", bound=HasPatchBoxes)
 
 
-class BoxedField(Field, Generic[_Buffers]):
+class PatchField(Field, Generic[_Buffers]):
     """A field with parts in boxes, which depend on the levels.
 
     levels: once the field is prepared, its boxes hold the surfaces of these levels.
     """
 
-    has_parts: bool = True
+    has_patches: bool = True
 
     def __init__(self) -> None:
         self.levels: tuple[float, ...] = (self.default_level,)
-        self._for_levels: Remembered[tuple[float, ...], Self] = Remembered()
+        self._for_levels: TransientCache[tuple[float, ...], Self] = TransientCache()
         self._device: _Buffers | None = None
 
     @abc.abstractmethod
@@ -92,7 +92,7 @@ class BoxedField(Field, Generic[_Buffers]):
     def _upload(self, backend: Backend) -> _Buffers:
         """The data on a backend."""
 
-    def for_levels(self, levels: tuple[float, ...]) -> Self:
+    def with_levels(self, levels: tuple[float, ...]) -> Self:
         if levels == self.levels:
             return self
         if levels not in self._for_levels:
@@ -101,7 +101,7 @@ class BoxedField(Field, Generic[_Buffers]):
             self._for_levels[levels] = other
         return self._for_levels[levels]
 
-    @prepared_once
+    @cached_prepare
     def prepare(self, backend: Backend) -> Self:
         if self._device is not None and self._device.boxes.backend is backend:
             return self
@@ -109,15 +109,15 @@ class BoxedField(Field, Generic[_Buffers]):
         prepared._device = self._upload(backend)
         return prepared
 
-    def _on(self) -> _Buffers:
+    def _require_data(self) -> _Buffers:
         if self._device is None:
             raise RuntimeError("prepare(backend) comes first")
         return self._device
 
-    def next_part(
-        self, o: Vec3, d: Vec3, after: PartEntry, start: Real, end: Real, active: Mask
-    ) -> PartEntry:
-        return self._on().boxes.next(o, d, after, start, end, active)
+    def next_patch(
+        self, o: Vec3, d: Vec3, after: PatchEntry, start: Real, end: Real, active: Mask
+    ) -> PatchEntry:
+        return self._require_data().boxes.next(o, d, after, start, end, active)
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
         """The box around the boxes of all parts."""

@@ -1,6 +1,6 @@
 """Sums over edges, dipoles and far nodes of trees at a point, and what follows for f near it.
 
-Every family of such fields accumulates the same record, `FieldSums`, from which come values with
+Every family of such fields accumulates the same record, `SourceSums`, from which come values with
 error bounds, or a sample with promises.
 """
 
@@ -14,52 +14,52 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 
 from harnack.backend.elementary import fmax, fmin
-from harnack.enclosures import Curvature, HarmonicBall, Lipschitz
-from harnack.fields.batched_fields import SymmetricSum, Values
+from harnack.enclosures import HarmonicBall, Lipschitz, TaylorRemainder
+from harnack.fields.batched_fields import PointValues, SymmetricMatrix
 from harnack.fields.field import Sample
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
 
-# Radii of the `Curvature` promises, as fractions of the free distance: a smaller radius has a
+# Radii of the `TaylorRemainder` promises, as fractions of the free distance: a smaller radius has a
 # smaller constant.
 _REACHES = (0.2, 0.4, 0.6)
 # The same as a fraction of the distance to the dipoles of far nodes.
-_WAY = 0.65
+_MAX_STEP_FRACTION = 0.65
 # Sums of rounded terms: bounds are lengthened, and distances shortened, by this fraction of them.
-SUM_ROUNDING = 2e-5
+SUM_MARGIN = 2e-5
 # A singular point within so many roundings of a coordinate counts as near.
-_BESIDE = 256.0
+_NEAR_SINGULARITY = 256.0
 # Rounding of positions and of terms changes the gradient by at most so many times s4, and second
 # derivatives by so many times s5, times the rounding of a coordinate.
 SLOPE_ROUNDINGS, SECOND_ROUNDINGS = 16.0, 320.0
 
 
-def longest_part(rough: float) -> float:
+def max_step_fraction(coarse_ratio: float) -> float:
     """The longest step that promises cover, as a fraction of the distance to a far node's center;
-    rough: far nodes are farther away than this many times their radius."""
-    return _WAY * (1 - 1 / rough)
+    coarse_ratio: far nodes are farther away than this many times their radius."""
+    return _MAX_STEP_FRACTION * (1 - 1 / coarse_ratio)
 
 
-def free_part(rough: float) -> float:
+def free_radius_fraction(coarse_ratio: float) -> float:
     """The radius that counts as free of dipoles, as a fraction of the distance to a far node's
-    center; rough: as for `longest_part`."""
-    return longest_part(rough) / _REACHES[-1]
+    center; rough: as for `max_step_fraction`."""
+    return max_step_fraction(coarse_ratio) / _REACHES[-1]
 
 
 def remainder_factor(q: float) -> float:
-    """phi of `FieldSums.sample`: convex, and 3 at 0."""
+    """phi of `SourceSums.sample`: convex, and 3 at 0."""
     return (3 - 2 * q) / (1 - q) ** 2
 
 
-def last_roundings(backend: Backend, size: float = 1.0) -> Real:
+def final_rounding(backend: Backend, size: float = 1.0) -> Real:
     """A bound of what rounds a sum after its last term: 16 roundings of numbers of this size. What
     the terms lose is counted term by term, and so is what is left of what their addition loses
-    (`FieldSums.plus`). A kernel parameter."""
-    return dr.opaque(backend.Float, backend.epsilon * 16 * size)
+    (`SourceSums.add_term`). A kernel parameter."""
+    return dr.opaque(backend.Float, backend.machine_epsilon * 16 * size)
 
 
-def rounding_of_dipole(area: Real, inverse: Real, unit: Real) -> Real:
+def dipole_rounding(area: Real, inverse: Real, unit: Real) -> Real:
     """A bound of the rounding of the value of a dipole at distance rho = 1/inverse.
 
     unit: the rounding of a coordinate, at least epsilon. It changes the value by at most
@@ -71,84 +71,85 @@ def rounding_of_dipole(area: Real, inverse: Real, unit: Real) -> Real:
 
 
 @dataclass(frozen=True)
-class Terms:
+class SourceTerm:
     """What one dipole, edge or far node adds to f and to its derivatives; None for derivatives that
     were not asked for, and for the value of an edge, whose angle is added later."""
 
     value: Real | None
     gradient: Vec3 | None = None
-    hessian: SymmetricSum | None = None
+    hessian: SymmetricMatrix | None = None
 
 
 @dataclass(frozen=True)
-class FieldSums:
+class SourceSums:
     """Sums of terms of f at points x, and of what bounds them near x.
 
     total, gradient, hessian: of f and its derivatives, None where they were not asked for. `value`
         is better than the total.
-    truncation, slope_truncation, second_truncation: bounds of the truncation of value, gradient and
-        second derivatives along lines; the last is None without a Hessian.
+    truncation, gradient_truncation, hessian_truncation: bounds of the truncation of value, gradient
+        and second derivatives along lines; the last is None without a Hessian.
     rounding: bound of the rounding of the value.
-    free_distance: the distance to the nearest singular point, a dipole or an edge, or `free_part`
-        of the distance to the nearest far node's center if that is less.
+    singularity_distance: the distance to the nearest singular point, a dipole or an edge, or
+        `free_radius_fraction` of the distance to the nearest far node's center if that is less.
     s4, s5: sums of a/rho^4 and a/rho^5 over dipoles of area a at distance rho and, with A + K/r^2
-        of `multipole.bend_columns` for a, over far nodes at r. For edges see `LiftedEdge.bounds`.
-    lost: what the additions to the total have lost: see `plus`.
+        of `multipole.remainder_constants` for a, over far nodes at r. For edges see
+        `LiftedEdge.bounds`.
+    compensation: what the additions to the total have lost: see `add_term`.
     """
 
     total: Real
     gradient: Vec3
-    hessian: SymmetricSum | None
+    hessian: SymmetricMatrix | None
     truncation: Real
-    slope_truncation: Real
-    second_truncation: Real
+    gradient_truncation: Real
+    hessian_truncation: Real
     rounding: Real
-    free_distance: Real
+    singularity_distance: Real
     s4: Real
     s5: Real
-    lost: Real
+    compensation: Real
 
     @property
     def value(self) -> Real:
         """f, with what the additions have lost."""
-        return self.total + self.lost
+        return self.total + self.compensation
 
     @classmethod
-    def zero(cls, backend: Backend, free_distance: Real, derivatives: int) -> FieldSums:
+    def zero(cls, backend: Backend, free_distance: Real, derivatives: int) -> SourceSums:
         """Empty sums. free_distance: its value if there are no terms. derivatives: 0 for the value
         alone, 1 with the gradient, 2 with the Hessian."""
         real, zero = backend.Float, backend.Float(0)
         gradient = backend.Array3f(0) if derivatives >= 1 else None
-        hessian = SymmetricSum.zero(real) if derivatives == 2 else None
+        hessian = SymmetricMatrix.zero(real) if derivatives == 2 else None
         second = None if hessian is None else zero
         bounds = zero, zero, second, zero, real(free_distance), zero, zero, zero
         return cls(zero, gradient, hessian, *bounds)
 
     @classmethod
-    def of(cls, parts: tuple[Any, ...]) -> FieldSums:
-        """The sums with these `parts`."""
+    def from_state(cls, parts: tuple[Any, ...]) -> SourceSums:
+        """The sums with these `to_state`."""
         total, gradient, hessian, *bounds = parts
-        return cls(total, gradient, None if hessian is None else SymmetricSum(*hessian), *bounds)
+        return cls(total, gradient, None if hessian is None else SymmetricMatrix(*hessian), *bounds)
 
-    def parts(self) -> tuple[Any, ...]:
+    def to_state(self) -> tuple[Any, ...]:
         """The attributes in the order of the constructor, for the state of a loop. (Sums that were
         not asked for are None: Dr.Jit records a loop twice if a state in it never changes.)"""
-        hessian = None if self.hessian is None else self.hessian.parts()
-        bounds = self.truncation, self.slope_truncation, self.second_truncation, self.rounding
-        ends = self.free_distance, self.s4, self.s5, self.lost
+        hessian = None if self.hessian is None else self.hessian.components()
+        bounds = self.truncation, self.gradient_truncation, self.hessian_truncation, self.rounding
+        ends = self.singularity_distance, self.s4, self.s5, self.compensation
         return self.total, self.gradient, hessian, *bounds, *ends
 
-    def where(self, mask: Mask, other: FieldSums) -> FieldSums:
+    def select(self, mask: Mask, other: SourceSums) -> SourceSums:
         """The other sums where the mask holds, these elsewhere. Without Hessians."""
-        pairs = zip(other.parts(), self.parts(), strict=True)
-        return FieldSums(*(None if b is None else dr.select(mask, a, b) for a, b in pairs))
+        pairs = zip(other.to_state(), self.to_state(), strict=True)
+        return SourceSums(*(None if b is None else dr.select(mask, a, b) for a, b in pairs))
 
     @property
     def derivatives(self) -> int:
         """The order of derivatives that were asked for: 0, 1 or 2."""
         return 0 if self.gradient is None else 1 if self.hessian is None else 2
 
-    def plus(self, terms: Terms, active: Mask) -> FieldSums:
+    def add_term(self, terms: SourceTerm, active: Mask) -> SourceSums:
         """The sums with terms added where active; what they do not have is 0.
 
         Rounding of the value. Errors of n additions add up like n, if they are all of one sign, as
@@ -163,43 +164,52 @@ class FieldSums:
         if gradient is not None and terms.gradient is not None:
             gradient = gradient + dr.select(active, terms.gradient, 0)
         if hessian is not None and terms.hessian is not None:
-            pairs = zip(hessian.parts(), terms.hessian.parts(), strict=True)
-            hessian = SymmetricSum(*(old + dr.select(active, new, 0) for old, new in pairs))
-        total, lost, rounding = self.total, self.lost, self.rounding
+            pairs = zip(hessian.components(), terms.hessian.components(), strict=True)
+            hessian = SymmetricMatrix(*(old + dr.select(active, new, 0) for old, new in pairs))
+        total, lost, rounding = self.total, self.compensation, self.rounding
         if terms.value is not None:
             term = dr.select(active, terms.value, 0)
             total = self.total + term
             grown = total - self.total
             lost = lost + ((self.total - (total - grown)) + (term - grown))
             rounding = dr.fma(float(dr.epsilon(total)) / 8, dr.abs(total), rounding)
-        new = {"total": total, "lost": lost, "rounding": rounding}
+        new = {"total": total, "compensation": lost, "rounding": rounding}
         return dataclasses.replace(self, gradient=gradient, hessian=hessian, **new)
 
-    def with_far_node(
-        self, terms: Terms, far: Mask, inverse: Real, size: Real, left_out: tuple[Real, Real, Real],
-        free: Real, unit: Real,
-    ) -> FieldSums:  # fmt: skip
+    def add_far_node(
+        self,
+        terms: SourceTerm,
+        far: Mask,
+        inverse: Real,
+        size: Real,
+        left_out: tuple[Real, Real, Real],
+        free: Real,
+        unit: Real,
+    ) -> SourceSums:
         """The sums with a node of a tree added where it is far, at distance 1/inverse.
 
-        size: A + K/r^2 of `multipole.bend_columns`. left_out: truncation of value, gradient and
+        size: A + K/r^2 of `multipole.remainder_constants`. left_out: truncation of value, gradient
+            and
         second derivatives. free: the distance that counts as free of the node's dipoles. unit: the
         rounding of a coordinate. left_out and inverse are 0 where it is not far.
         """
-        fourth, second = size * dr.square(inverse * inverse), self.second_truncation
+        fourth, second = size * dr.square(inverse * inverse), self.hessian_truncation
         second = None if second is None else second + left_out[2]
-        sums = self.plus(terms, far)
+        sums = self.add_term(terms, far)
         return dataclasses.replace(
             sums,
             truncation=self.truncation + left_out[0],
-            slope_truncation=self.slope_truncation + left_out[1],
-            second_truncation=second,
-            rounding=sums.rounding + rounding_of_dipole(size, inverse, unit),
-            free_distance=dr.select(far, fmin(free, self.free_distance), self.free_distance),
+            gradient_truncation=self.gradient_truncation + left_out[1],
+            hessian_truncation=second,
+            rounding=sums.rounding + dipole_rounding(size, inverse, unit),
+            singularity_distance=dr.select(
+                far, fmin(free, self.singularity_distance), self.singularity_distance
+            ),
             s4=self.s4 + fourth,
             s5=dr.fma(fourth, inverse, self.s5),
         )
 
-    def values(self, share: float, unit: Real, rounding: Real, outside: float = 0.0) -> Values:
+    def values(self, share: float, unit: Real, rounding: Real, outside: float = 0.0) -> PointValues:
         """`share` times f and those derivatives that there are, with bounds of their errors.
 
         unit: the rounding of a coordinate, at least epsilon.
@@ -209,16 +219,16 @@ class FieldSums:
         """
         value, error = share * self.value, dr.fma(share, self.truncation + self.rounding, rounding)
         if self.gradient is None:
-            return Values(value, error)
+            return PointValues(value, error)
         rounded = SLOPE_ROUNDINGS * unit
         if outside:
             rounded = rounded + outside * fmax(unit - 2 * float(dr.epsilon(self.value)), 0)
-        slope = share * dr.fma(rounded, self.s4, self.slope_truncation)
+        slope = share * dr.fma(rounded, self.s4, self.gradient_truncation)
         if self.hessian is None:
-            return Values(value, error, share * self.gradient, None, slope)
-        hessian = SymmetricSum(*(share * part for part in self.hessian.parts()))
-        second = share * dr.fma(SECOND_ROUNDINGS * unit, self.s5, self.second_truncation)
-        return Values(value, error, share * self.gradient, hessian, slope, second)
+            return PointValues(value, error, share * self.gradient, None, slope)
+        hessian = SymmetricMatrix(*(share * part for part in self.hessian.components()))
+        second = share * dr.fma(SECOND_ROUNDINGS * unit, self.s5, self.hessian_truncation)
+        return PointValues(value, error, share * self.gradient, hessian, slope, second)
 
     def sample(
         self,
@@ -238,29 +248,35 @@ class FieldSums:
         its largest value on equal vectors), so that Taylor's remainder after the linear term is at
         most a ((rho-t)^-2 - rho^-2 - 2t rho^-3) = a t^2 rho^-4 phi(t/rho), phi(q) =
         (3-2q)/(1-q)^2. That of a far node is at most that of a dipole of area A + K/r^2 in its
-        center, for t/r <= `longest_part` (`multipole.bend_columns`). phi is convex: on [0, b] it
-        lies below 3 + rise q, rise = (phi(b)-3)/b = (4-3b)/(1-b)^2. With t <= r = b free_distance,
-        |f(y) - f(x) - g.(y-x)| <= t^2 (3 s4 + rise r s5).
+        center, for t/r <= `max_step_fraction` (`multipole.remainder_constants`). phi is convex: on
+        [0, b] it lies below 3 + rise q, rise = (phi(b)-3)/b = (4-3b)/(1-b)^2. With t <= r = b
+        free_distance, |f(y) - f(x) - g.(y-x)| <= t^2 (3 s4 + rise r s5).
         On the ball of that radius f changes by at most |g| r more, and is harmonic: dipoles of far
-        nodes are farther away than 1 - 1/rough times the center, and `longest_part` is less.
+        nodes are farther away than 1 - 1/rough times the center, and `max_step_fraction` is less.
         """
         g = share * self.gradient
-        slope_error = share * dr.fma(SLOPE_ROUNDINGS * unit, self.s4, self.slope_truncation)
-        distance = self.free_distance * (1 - SUM_ROUNDING) - 4 * unit
-        scale, radii = (2 + 2 * SUM_ROUNDING) * share, [(b, b * distance) for b in _REACHES]
-        bends = [Curvature(scale * self.remainder(b, r), r) for b, r in radii]
+        slope_error = share * dr.fma(SLOPE_ROUNDINGS * unit, self.s4, self.gradient_truncation)
+        distance = self.singularity_distance * (1 - SUM_MARGIN) - 4 * unit
+        scale, radii = (2 + 2 * SUM_MARGIN) * share, [(b, b * distance) for b in _REACHES]
+        bends = [TaylorRemainder(scale * self.remainder(b, r), r) for b, r in radii]
         slope, widest = dr.norm(g) + slope_error, bends[-1]
         r = widest.radius
-        variation = (1 + SUM_ROUNDING) * r * dr.fma(0.5 * r, widest.constant, slope)
+        variation = (1 + SUM_MARGIN) * r * dr.fma(0.5 * r, widest.constant, slope)
         value = share * self.value
         ball = HarmonicBall(r, value - variation, value + variation)
         # At a singular point f has all values: the sample has a gradient so steep that every level
         # is close to first order, and an error as large as the distance to such a level. Likewise
         # near a singular point, where rounding leaves nothing of the gradient.
         reach, most = 16 * unit, share * 1.6e5 * math.pi
-        apart = (self.free_distance > reach) & dr.isfinite(value) & dr.isfinite(dr.squared_norm(g))
-        lost = ~(slope_error <= dr.norm(g)) & (self.free_distance <= _BESIDE * unit)
-        apart, reach = apart & ~lost, fmax(self.free_distance, reach)
+        apart = (
+            (self.singularity_distance > reach)
+            & dr.isfinite(value)
+            & dr.isfinite(dr.squared_norm(g))
+        )
+        lost = ~(slope_error <= dr.norm(g)) & (
+            self.singularity_distance <= _NEAR_SINGULARITY * unit
+        )
+        apart, reach = apart & ~lost, fmax(self.singularity_distance, reach)
         steep = type(g)(0, 0, most / reach)
         error = dr.fma(share, self.truncation + self.rounding, rounding)
         along = tuple(one.scaled(share) for one in along)
@@ -276,20 +292,20 @@ class FieldSums:
             along,
         )
 
-    def with_rates(
+    def add_line_rates(
         self, v: Vec3, unit: Real, lengths: tuple[Real, ...], rates: tuple[Real, ...], active: Mask
     ) -> tuple[Real, ...]:
-        """The rates K of `edge_trails.rates_along` for some edges, plus those of these sums.
+        """The rates K of `trail_sums.rates_along` for some edges, plus those of these sums.
 
         f changes by at most |s| |g . v| + s^2 (3 s4 + rise r s5) for |s| <= r (`sample`), with |g .
         v| raised by the truncation and rounding of g. Infinite for lengths above r.
 
         v: directions of the lines. unit: the rounding of their points' coordinates.
         """
-        slope = dr.abs(dr.dot(self.gradient, v)) + self.slope_truncation
+        slope = dr.abs(dr.dot(self.gradient, v)) + self.gradient_truncation
         slope = dr.fma(SLOPE_ROUNDINGS * unit, self.s4, slope)
         b = _REACHES[-1]
-        r = b * (self.free_distance * (1 - SUM_ROUNDING) - 4 * unit)
+        r = b * (self.singularity_distance * (1 - SUM_MARGIN) - 4 * unit)
         bend = self.remainder(b, dr.select(self.s5 > 0, r, 0))
         pairs = zip(lengths, rates, strict=True)
         found = (
@@ -304,5 +320,5 @@ class FieldSums:
 
 
 def _rise(b: float) -> float:
-    """The slope of the chord of phi over [0, b]: see `FieldSums.sample`."""
+    """The slope of the chord of phi over [0, b]: see `SourceSums.sample`."""
     return (4 - 3 * b) / (1 - b) ** 2

@@ -28,16 +28,16 @@ class FileFormatError(ValueError):
 
 
 @dataclass(frozen=True)
-class Place:
+class FileLocation:
     """Where in a file something stands: prints as 'model.obj, line 12'."""
 
     path: Path
-    where: str = ""
+    position: str = ""
 
     def __str__(self) -> str:
         # A name may hold line ends and other characters that a terminal would obey.
         name = "".join(c if c.isprintable() else repr(c)[1:-1] for c in str(self.path))
-        return f"{name}, {self.where}" if self.where else name
+        return f"{name}, {self.position}" if self.position else name
 
     def error(self, message: str) -> FileFormatError:
         """An error about this place."""
@@ -45,49 +45,49 @@ class Place:
 
 
 @dataclass(frozen=True, eq=False)
-class Places:
+class FileLocations:
     """Where the members of a list stand in a file. numbers: one a member, of lines or the like."""
 
     path: Path
     noun: str
     numbers: Sequence[int]
 
-    def __getitem__(self, k: int | np.integer[Any]) -> Place:
-        return Place(self.path, f"{self.noun} {self.numbers[int(k)]}")
+    def __getitem__(self, k: int | np.integer[Any]) -> FileLocation:
+        return FileLocation(self.path, f"{self.noun} {self.numbers[int(k)]}")
 
 
 @dataclass(frozen=True, eq=False)
-class Polygons:
+class PolygonList:
     """Polygons or polylines of a file, as indices of vertices.
 
     corners: those of all of them, one polygon after the other. sizes: (m,), how many each has.
-    places: (m,), where each stands in the file.
+    locations: (m,), where each stands in the file.
     """
 
     corners: IntArray
     sizes: IntArray
-    places: Places
+    locations: FileLocations
 
     def __len__(self) -> int:
         return len(self.sizes)
 
-    def place_of(self, k: int | np.integer[Any]) -> Place:
+    def location_of_corner(self, k: int | np.integer[Any]) -> FileLocation:
         """Where the polygon stands in the file that corner k of all belongs to."""
-        return self.places[int(np.searchsorted(np.cumsum(self.sizes), k, side="right"))]
+        return self.locations[int(np.searchsorted(np.cumsum(self.sizes), k, side="right"))]
 
-    def __iter__(self) -> Iterator[tuple[IntArray, Place]]:
+    def __iter__(self) -> Iterator[tuple[IntArray, FileLocation]]:
         """The corners of each, and where it stands."""
         ends = np.cumsum(self.sizes)
         for k, (begin, end) in enumerate(zip(ends - self.sizes, ends, strict=True)):
-            yield self.corners[begin:end], self.places[k]
+            yield self.corners[begin:end], self.locations[k]
 
 
 _NONE = np.zeros(0, dtype=np.int64)
-NO_POLYGONS = Polygons(_NONE, _NONE, Places(Path(), "", ()))
+NO_POLYGONS = PolygonList(_NONE, _NONE, FileLocations(Path(), "", ()))
 
 
 @dataclass(frozen=True, eq=False)
-class Contents:
+class FileGeometry:
     """The geometry in a file.
 
     vertices: (n, 3), finite. normals: (n, 3) or none. faces: closed, last vertex joined to first.
@@ -97,31 +97,31 @@ class Contents:
     path: Path
     vertices: FloatArray
     normals: FloatArray | None = None
-    faces: Polygons = NO_POLYGONS
-    polylines: Polygons = NO_POLYGONS
+    faces: PolygonList = NO_POLYGONS
+    polylines: PolygonList = NO_POLYGONS
 
 
-def positions(sizes: IntArray) -> IntArray:
+def ranks_in_lists(sizes: IntArray) -> IntArray:
     """Positions within lists that stand one after the other: 0 to size - 1 for each of them."""
     found = np.arange(int(sizes.sum()), dtype=np.int64)
     found -= np.repeat(np.cumsum(sizes) - sizes, sizes)
     return found
 
 
-def triangle_list(path: Path, corners: IntArray) -> Polygons:
+def triangles_as_polygons(path: Path, corners: IntArray) -> PolygonList:
     """Triangles (m, 3) as polygons."""
     sizes = np.full(len(corners), 3, dtype=np.int64)
-    return Polygons(corners.ravel(), sizes, Places(path, "triangle", range(len(corners))))
+    return PolygonList(corners.ravel(), sizes, FileLocations(path, "triangle", range(len(corners))))
 
 
-def check_finite(coordinates: FloatArray, places: Places) -> None:
+def check_finite(coordinates: FloatArray, places: FileLocations) -> None:
     """Raise FileFormatError for the first row (n, k) with a number that is not finite."""
     wrong = np.flatnonzero(~np.isfinite(coordinates).all(axis=1))
     if wrong.size:
         raise places[wrong[0]].error("coordinates must be finite")
 
 
-def check_indices(polygons: Polygons, count: int, *, first: int = 0) -> None:
+def check_indices(polygons: PolygonList, count: int, *, first: int = 0) -> None:
     """Raise FileFormatError for the first index outside of [0, count).
 
     first: the index that the file gives its first vertex, for messages.
@@ -129,7 +129,7 @@ def check_indices(polygons: Polygons, count: int, *, first: int = 0) -> None:
     corners = polygons.corners
     wrong = np.flatnonzero((corners < 0) | (corners >= count))
     if wrong.size:
-        raise polygons.place_of(wrong[0]).error(
+        raise polygons.location_of_corner(wrong[0]).error(
             f"vertex {corners[wrong[0]] + first} is out of range: the file has {count:,} vertices"
         )
 
@@ -140,7 +140,7 @@ def read_bytes(path: Path) -> bytes:
     Raises:
         FileFormatError: missing, a directory or a device, unreadable, empty, above 256 MiB.
     """
-    place = Place(path)
+    place = FileLocation(path)
     try:
         if not path.exists():
             if path.is_symlink():
@@ -163,7 +163,7 @@ def read_bytes(path: Path) -> bytes:
     return data
 
 
-def check_element_count(place: Place, count: int) -> None:
+def check_element_count(place: FileLocation, count: int) -> None:
     """Raise FileFormatError for more than MAX_ELEMENTS vertices, faces and lines."""
     if count > MAX_ELEMENTS:
         raise place.error(
@@ -172,7 +172,7 @@ def check_element_count(place: Place, count: int) -> None:
         )
 
 
-def differ_in_size(polygons: Polygons) -> bool:
+def have_mixed_sizes(polygons: PolygonList) -> bool:
     """Whether polygons have different numbers of corners, or fewer than three."""
     sizes = polygons.sizes
     return bool(len(sizes)) and bool((sizes != max(3, int(sizes[0]))).any())
@@ -266,7 +266,7 @@ _ADVICE = {
 
 
 def _name(path: str | os.PathLike[str]) -> str:
-    return str(Place(Path(path)))
+    return str(FileLocation(Path(path)))
 
 
 def _write_error(path: str | os.PathLike[str], error: OSError) -> OSError:

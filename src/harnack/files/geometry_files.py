@@ -12,9 +12,9 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from harnack.backend import FloatArray, IntArray
-from harnack.files.file_geometry import Contents, FileFormatError, Place, read_bytes
+from harnack.files.file_geometry import FileFormatError, FileGeometry, FileLocation, read_bytes
 from harnack.files.gltf import read_gltf
-from harnack.files.molecules import MOLECULE_FILES, Atoms, atoms_in
+from harnack.files.molecules import MOLECULE_FILES, Atoms, parse_molecule
 from harnack.files.ply import read_ply
 from harnack.files.text_formats import (
     Metaballs,
@@ -30,12 +30,12 @@ from harnack.geometry.boundary_edges import (
     Edge,
     OpenChainError,
     boundary_edges,
-    join,
+    join_edges,
     singular_edges,
     singular_loops,
     weld_vertices,
 )
-from harnack.geometry.clouds import CloudError, checked_normals, checked_points
+from harnack.geometry.clouds import CloudError, as_cloud_points, as_unit_normals
 from harnack.geometry.curves import CurveError, validate_loops
 from harnack.geometry.meshes import MeshError, without_zero_area_faces, zero_area_faces
 from harnack.geometry.polygons import triangulate
@@ -43,22 +43,25 @@ from harnack.geometry.welding import Welded
 from harnack.name_suggestions import did_you_mean
 
 __all__ = [
-    "SURFACE_FILES",
-    "ClosedCurves",
-    "Cloud",
-    "Mesh",
-    "PolygonSurface",
+    "GEOMETRY_SUFFIXES",
+    "LoadedCloud",
+    "LoadedCurves",
+    "LoadedMesh",
+    "LoadedPolygons",
     "ReadAs",
-    "loops_in",
+    "closed_curves_of",
+    "read_geometry",
     "read_loops",
-    "read_surface",
 ]
 
 # Closed curves.
 
-PlacedLoop = tuple[FloatArray, Place]
+LocatedLoop = tuple[FloatArray, FileLocation]
 
-_LOOP_READERS: dict[str, Callable[[Path, bytes], Contents]] = {".obj": read_obj, ".ply": read_ply}
+_LOOP_READERS: dict[str, Callable[[Path, bytes], FileGeometry]] = {
+    ".obj": read_obj,
+    ".ply": read_ply,
+}
 
 
 def read_loops(path: str | os.PathLike[str], *, boundary: bool = False) -> list[FloatArray]:
@@ -85,39 +88,39 @@ def read_loops(path: str | os.PathLike[str], *, boundary: bool = False) -> list[
         if boundary:
             raise FileFormatError(f"{path}: a .loops file has no faces to take the boundary of")
         return [_validated(loop, place) for loop, place in read_loops_text(path, data)]
-    return loops_in(_LOOP_READERS[kind](path, data), boundary=boundary)
+    return closed_curves_of(_LOOP_READERS[kind](path, data), boundary=boundary)
 
 
-def loops_in(contents: Contents, *, boundary: bool = False) -> list[FloatArray]:
+def closed_curves_of(contents: FileGeometry, *, boundary: bool = False) -> list[FloatArray]:
     """The closed curves in an .obj or .ply file that was read, as `read_loops` has them."""
     placed = _boundary_loops(contents) if boundary else _all_loops(contents)
     return [_validated(loop, place) for loop, place in placed]
 
 
-def _validated(loop: FloatArray, place: Place) -> FloatArray:
+def _validated(loop: FloatArray, place: FileLocation) -> FloatArray:
     try:
         return validate_loops(loop)[0]
     except CurveError as error:
         raise place.error(str(error)) from error
 
 
-def _all_loops(contents: Contents) -> list[PlacedLoop]:
+def _all_loops(contents: FileGeometry) -> list[LocatedLoop]:
     x = contents.vertices
     loops = [(x[corners], place) for corners, place in contents.faces]
     if len(contents.polylines):
         loops += _joined_polylines(contents)
     if not loops and contents.path.suffix.lower() == ".ply" and len(x):
-        loops.append((x, Place(contents.path)))
+        loops.append((x, FileLocation(contents.path)))
     if not loops:
-        raise Place(contents.path).error("it holds no faces or polylines to make curves of")
+        raise FileLocation(contents.path).error("it holds no faces or polylines to make curves of")
     return loops
 
 
-def _joined_polylines(contents: Contents) -> list[PlacedLoop]:
+def _joined_polylines(contents: FileGeometry) -> list[LocatedLoop]:
     x, same = contents.vertices, weld_vertices(contents.vertices)
-    loops: list[PlacedLoop] = []
+    loops: list[LocatedLoop] = []
     open_edges: list[Edge] = []
-    places: dict[int, Place] = {}
+    places: dict[int, FileLocation] = {}
     for corners, place in contents.polylines:
         ids: list[int] = same[corners].tolist()
         if ids[0] == ids[-1] and len(ids) > 3:
@@ -129,7 +132,7 @@ def _joined_polylines(contents: Contents) -> list[PlacedLoop]:
             open_edges.append(edge)
         places.update(dict.fromkeys(ids, place))
     try:
-        joined = join(open_edges)
+        joined = join_edges(open_edges)
     except OpenChainError as error:
         raise places[error.vertex].error(_open_message(error, x[error.vertex])) from None
     return loops + [(x[ids], places[ids[0]]) for ids in joined]
@@ -148,8 +151,8 @@ def _open_message(error: OpenChainError, position: FloatArray) -> str:
     )
 
 
-def _boundary_loops(contents: Contents) -> list[PlacedLoop]:
-    place = Place(contents.path)
+def _boundary_loops(contents: FileGeometry) -> list[LocatedLoop]:
+    place = FileLocation(contents.path)
     if not len(contents.faces):
         raise place.error("it has no faces to take the boundary of")
     same = weld_vertices(contents.vertices)
@@ -158,7 +161,7 @@ def _boundary_loops(contents: Contents) -> list[PlacedLoop]:
     )
     if not remaining:
         raise place.error("its faces form a closed surface, which has no boundary")
-    return [(contents.vertices[np.array(ids)], place) for ids in join(remaining)]
+    return [(contents.vertices[np.array(ids)], place) for ids in join_edges(remaining)]
 
 
 # All surfaces.
@@ -167,64 +170,66 @@ ReadAs: TypeAlias = Literal["winding", "dipole", "loops", "polygons"]
 
 _READ_AS = ("winding", "dipole", "loops", "polygons")
 
-_READERS: dict[str, Callable[[Path, bytes], Contents]] = {
+_READERS: dict[str, Callable[[Path, bytes], FileGeometry]] = {
     ".obj": read_obj, ".ply": read_ply, ".stl": read_stl, ".off": read_off,
     ".glb": read_gltf, ".gltf": read_gltf, ".3mf": read_3mf, ".xyz": read_xyz,
 }  # fmt: skip
 _LOOP_FILES = (".obj", ".ply", ".loops")
-SURFACE_FILES = (*_READERS, ".loops", ".blobs", *MOLECULE_FILES)
+GEOMETRY_SUFFIXES = (*_READERS, ".loops", ".blobs", *MOLECULE_FILES)
 
 
 @dataclass(frozen=True, eq=False)
-class Mesh:
+class LoadedMesh:
     """Triangles from a file, as `validate_mesh` returns them. said: what was found, and why. flat:
     (k, 3) faces of zero area, left out of `faces`, which may close gaps without a width. rounded:
     how many corners were moved to others, from which they were apart by rounding."""
 
     vertices: FloatArray
     faces: IntArray
-    said: str
-    flat: IntArray
+    summary: str
+    zero_area_faces: IntArray
     rounded: int
 
 
 @dataclass(frozen=True, eq=False)
-class Cloud:
+class LoadedCloud:
     """Points (n, 3) from a file, with unit normals (n, 3) and areas (n,) where it has them.
 
-    said: what was found, and why it counts as a point cloud.
+    summary: what was found, and why it counts as a point cloud.
     """
 
     points: FloatArray
     normals: FloatArray | None
     areas: FloatArray | None
-    said: str
+    summary: str
 
 
 @dataclass(frozen=True, eq=False)
-class ClosedCurves:
+class LoadedCurves:
     """Closed curves from a file, (n, 3) each. said: what was found, and why they are curves."""
 
     loops: tuple[FloatArray, ...]
-    said: str
+    summary: str
 
 
 @dataclass(frozen=True, eq=False)
-class PolygonSurface:
+class LoadedPolygons:
     """Polygons from a file as they are: vertices (n, 3), and for each face its corners (k,).
 
-    said: what was found.
+    summary: what was found.
     """
 
     vertices: FloatArray
     faces: list[IntArray]
-    said: str
+    summary: str
 
 
-Surface: TypeAlias = Mesh | Cloud | ClosedCurves | PolygonSurface | Metaballs | Atoms
+LoadedGeometry: TypeAlias = (
+    LoadedMesh | LoadedCloud | LoadedCurves | LoadedPolygons | Metaballs | Atoms
+)
 
 
-def read_surface(path: str | os.PathLike[str], as_: ReadAs | None = None) -> Surface:
+def read_geometry(path: str | os.PathLike[str], read_as: ReadAs | None = None) -> LoadedGeometry:
     """What a surface file describes: .obj, .ply, .stl, .off, .glb, .gltf, .3mf, .xyz, .loops,
     .blobs, or a molecule's, .pdb, .ent, .cif, .mmcif.
 
@@ -234,7 +239,7 @@ def read_surface(path: str | os.PathLike[str], as_: ReadAs | None = None) -> Sur
     4 to 6 (.xyz). Polygons are cut into triangles, the nodes of a scene put in their places, and
     faces of zero area left out.
 
-    as_: "winding": the faces, as a mesh. "dipole": the points; of a mesh the centers of its
+    read_as: "winding": the faces, as a mesh. "dipole": the points; of a mesh the centers of its
     triangles, with their normals and areas. "loops": what `read_loops` finds; of a mesh its
     boundary, the singular edges joined. "polygons": the faces as they are, not cut into triangles.
     None decides as above.
@@ -245,85 +250,93 @@ def read_surface(path: str | os.PathLike[str], as_: ReadAs | None = None) -> Sur
     """
     path = Path(path)
     kind = path.suffix.lower()
-    if as_ not in (None, *_READ_AS):
+    if read_as not in (None, *_READ_AS):
         raise ValueError(
-            f'as_ must be "winding", "dipole", "loops", "polygons" or None, not {as_!r}'
-            + did_you_mean(as_, _READ_AS)
+            f'read_as must be "winding", "dipole", "loops", "polygons" or None, not {read_as!r}'
+            + did_you_mean(read_as, _READ_AS)
         )
-    if kind not in SURFACE_FILES:
-        raise FileFormatError(f"{path}: surfaces are read from {', '.join(SURFACE_FILES)} files")
+    if kind not in GEOMETRY_SUFFIXES:
+        raise FileFormatError(
+            f"{path}: surfaces are read from {', '.join(GEOMETRY_SUFFIXES)} files"
+        )
     # Wild numbers overflow on the way to the check that refuses them.
     with np.errstate(over="ignore", invalid="ignore"):
-        return _read(path, kind, as_)
+        return _read(path, kind, read_as)
 
 
-def _read(path: Path, kind: str, as_: ReadAs | None) -> Surface:
+def _read(path: Path, kind: str, read_as: ReadAs | None) -> LoadedGeometry:
     if kind == ".blobs":
-        _refuse(path, as_, (), "blobs")
+        _check_convertible(path, read_as, (), "blobs")
         return read_metaballs(path, read_bytes(path))
     if kind in MOLECULE_FILES:
-        _refuse(path, as_, (), "atoms")
-        return atoms_in(path, read_bytes(path))
+        _check_convertible(path, read_as, (), "atoms")
+        return parse_molecule(path, read_bytes(path))
     if kind == ".loops":
-        _refuse(path, as_, ("loops",), "curves")
-        return _loops(read_loops(path), "curves, since the file lists nothing else")
+        _check_convertible(path, read_as, ("loops",), "curves")
+        return _to_curves(read_loops(path), "curves, since the file lists nothing else")
     contents = _READERS[kind](path, read_bytes(path))
     try:
         if (contents.faces.sizes >= 3).any():
-            return _of_faces(contents, as_)
+            return _interpret_faces(contents, read_as)
         if len(contents.polylines):
-            _refuse(path, as_, ("loops",), "polylines")
-            return _loops(loops_in(contents), "polylines without faces: curves")
-        if as_ == "loops" and kind == ".ply":
+            _check_convertible(path, read_as, ("loops",), "polylines")
+            return _to_curves(closed_curves_of(contents), "polylines without faces: curves")
+        if read_as == "loops" and kind == ".ply":
             why = "points joined in their order, as asked: a curve"
-            return _loops(loops_in(contents), why)
-        _refuse(path, as_, ("dipole",), "points")
+            return _to_curves(closed_curves_of(contents), why)
+        _check_convertible(path, read_as, ("dipole",), "points")
         return _cloud(contents)
     except (MeshError, CloudError) as error:
-        raise Place(path).error(str(error)) from error
+        raise FileLocation(path).error(str(error)) from error
 
 
-def _refuse(path: Path, as_: ReadAs | None, possible: tuple[str, ...], held: str) -> None:
-    """Raise unless `as_` can be made of what the file holds."""
+def _check_convertible(
+    path: Path, read_as: ReadAs | None, possible: tuple[str, ...], held: str
+) -> None:
+    """Raise unless `read_as` can be made of what the file holds."""
     needs = {
         "winding": "faces", "dipole": "points or faces", "loops": "polylines or faces",
         "polygons": "faces",
     }  # fmt: skip
-    if as_ is not None and as_ not in possible:
-        raise Place(path).error(
-            f'it holds {held} only: it cannot be taken as "{as_}", which needs {needs[as_]}'
+    if read_as is not None and read_as not in possible:
+        raise FileLocation(path).error(
+            f'it holds {held} only: it cannot be taken as "{read_as}", which needs {needs[read_as]}'
         )
 
 
-def _of_faces(
-    contents: Contents, as_: ReadAs | None
-) -> Mesh | Cloud | ClosedCurves | PolygonSurface:
-    if as_ == "polygons":
+def _interpret_faces(
+    contents: FileGeometry, read_as: ReadAs | None
+) -> LoadedMesh | LoadedCloud | LoadedCurves | LoadedPolygons:
+    if read_as == "polygons":
         return _polygons(contents)
     can_be_loops = contents.path.suffix.lower() in _LOOP_FILES
-    if as_ == "loops" and len(contents.polylines) and can_be_loops:
-        return _loops(loops_in(contents), "polylines and faces, taken as curves as asked")
-    if as_ in (None, "loops") and can_be_loops and _are_curves(contents):
-        return _loops(loops_in(contents), "polygons of which no two share an edge: curves")
+    if read_as == "loops" and len(contents.polylines) and can_be_loops:
+        return _to_curves(
+            closed_curves_of(contents), "polylines and faces, taken as curves as asked"
+        )
+    if read_as in (None, "loops") and can_be_loops and _looks_like_curves(contents):
+        return _to_curves(
+            closed_curves_of(contents), "polygons of which no two share an edge: curves"
+        )
     mesh = _mesh(contents)
-    if as_ == "dipole":
-        return _centers(mesh)
-    if as_ == "loops":
-        return _boundary(contents.path, mesh)
+    if read_as == "dipole":
+        return _mesh_to_cloud(mesh)
+    if read_as == "loops":
+        return _mesh_to_boundary(contents.path, mesh)
     return mesh
 
 
-def _polygons(contents: Contents) -> PolygonSurface:
+def _polygons(contents: FileGeometry) -> LoadedPolygons:
     sizes = contents.faces.sizes
     end, wide = np.cumsum(sizes), np.flatnonzero(sizes >= 3)
     kept = [contents.faces.corners[end[k] - sizes[k] : end[k]] for k in wide]
     few, many = min(map(len, kept)), max(map(len, kept))
     corners = f"{few}" if few == many else f"{few} to {many}"
     said = f"{len(kept):,} polygons of {corners} corners, each spanned by a surface, as asked"
-    return PolygonSurface(contents.vertices, kept, said)
+    return LoadedPolygons(contents.vertices, kept, said)
 
 
-def _are_curves(contents: Contents) -> bool:
+def _looks_like_curves(contents: FileGeometry) -> bool:
     """Whether some polygon has more than four corners, and no two share an edge."""
     faces = contents.faces
     if faces.sizes.max() <= 4:
@@ -339,7 +352,7 @@ def _are_curves(contents: Contents) -> bool:
     return len(np.unique(keys)) == len(keys)
 
 
-def _mesh(contents: Contents) -> Mesh:
+def _mesh(contents: FileGeometry) -> LoadedMesh:
     found = triangulate(contents.vertices, contents.faces.corners, contents.faces.sizes)
     vertices, faces = without_zero_area_faces(contents.vertices, found)
     flat = found[zero_area_faces(vertices, found)]
@@ -366,45 +379,45 @@ def _mesh(contents: Contents) -> Mesh:
         said += f"; {len(faces) - len(net.faces):,} are added to or canceled by others"
     if len(contents.polylines):
         said += "; polylines not used"
-    return Mesh(vertices, faces, said, flat, welded.rounded)
+    return LoadedMesh(vertices, faces, said, flat, welded.rounded)
 
 
-def _centers(mesh: Mesh) -> Cloud:
+def _mesh_to_cloud(mesh: LoadedMesh) -> LoadedCloud:
     corners = mesh.vertices[mesh.faces]
     normal = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(normal, axis=1)
     said = f"{len(area):,} triangles, each taken as a point with its normal and area, as asked"
-    return Cloud(corners.mean(axis=1), normal / area[:, None], area, said)
+    return LoadedCloud(corners.mean(axis=1), normal / area[:, None], area, said)
 
 
-def _boundary(path: Path, mesh: Mesh) -> ClosedCurves:
+def _mesh_to_boundary(path: Path, mesh: LoadedMesh) -> LoadedCurves:
     edges, weights = singular_edges(weld_vertices(mesh.vertices)[mesh.faces])
     if not len(edges):
-        raise Place(path).error(
+        raise FileLocation(path).error(
             'its faces form a closed surface, which has no boundary: it cannot be taken as "loops"'
         )
     try:
         joined = singular_loops(edges, weights)
         loops = validate_loops([mesh.vertices[loop] for loop in joined])
     except CurveError as error:
-        raise Place(path).error(str(error)) from error
+        raise FileLocation(path).error(str(error)) from error
     noun = "loop" if len(loops) == 1 else "loops"
     said = f"{len(loops):,} {noun} of {sum(weights):,} edges: the boundary of the faces, as asked"
-    return ClosedCurves(loops, said)
+    return LoadedCurves(loops, said)
 
 
-def _cloud(contents: Contents) -> Cloud:
-    points = checked_points(contents.vertices)
+def _cloud(contents: FileGeometry) -> LoadedCloud:
+    points = as_cloud_points(contents.vertices)
     count = f"{len(points):,} points"
     if contents.normals is None:
         said = f"{count} without faces, and no normals read: a point cloud"
-        return Cloud(points, None, None, said)
-    normals = checked_normals(contents.normals, len(points))
-    return Cloud(points, normals, None, f"{count} with normals, no faces: a point cloud")
+        return LoadedCloud(points, None, None, said)
+    normals = as_unit_normals(contents.normals, len(points))
+    return LoadedCloud(points, normals, None, f"{count} with normals, no faces: a point cloud")
 
 
-def _loops(loops: list[FloatArray], why: str) -> ClosedCurves:
+def _to_curves(loops: list[FloatArray], why: str) -> LoadedCurves:
     noun = "loop" if len(loops) == 1 else "loops"
-    return ClosedCurves(
+    return LoadedCurves(
         tuple(loops), f"{len(loops):,} {noun} of {sum(map(len, loops)):,} vertices: {why}"
     )

@@ -19,28 +19,28 @@ import numpy as np
 from harnack.backend import FloatArray, IntArray
 from harnack.files.file_geometry import (
     MAX_BYTES,
-    Contents,
     FileFormatError,
-    Place,
+    FileGeometry,
+    FileLocation,
     read_bytes,
-    triangle_list,
+    triangles_as_polygons,
 )
 
 _COMPONENT_BYTES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
 _COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
-_DEEPEST = 1000
+_MAX_NODE_DEPTH = 1000
 # Extensions by which files move or hide what is drawn, or store vertices otherwise.
-_MOVING = (
+_UNSUPPORTED_EXTENSIONS = (
     "EXT_mesh_gpu_instancing", "KHR_mesh_quantization", "KHR_node_visibility",
     "EXT_meshopt_compression", "KHR_meshopt_compression",
 )  # fmt: skip
 # How triangles may be listed: one by one, or in strips.
 _TRIANGLES, _FAN = (4, 5), 6
 # Extensions under which vertices and indices are stored as always.
-_HARMLESS = ("KHR_materials", "KHR_texture", "KHR_lights", "EXT_texture", "KHR_xmp")
+_IGNORED_EXTENSIONS = ("KHR_materials", "KHR_texture", "KHR_lights", "EXT_texture", "KHR_xmp")
 
 
-def read_gltf(path: Path, data: bytes) -> Contents:
+def read_gltf(path: Path, data: bytes) -> FileGeometry:
     """All triangles of a scene, placed by its nodes; if it has none, its points.
 
     Raises:
@@ -49,13 +49,13 @@ def read_gltf(path: Path, data: bytes) -> Contents:
     """
     import trimesh  # here, since it takes half a second
 
-    place = Place(path)
+    place = FileLocation(path)
     header = _header(place, data)
     try:
         files = _buffer_files(path, header)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            _check(place, header, len(data) + sum(map(len, files.values())))
+            _check_header(place, header, len(data) + sum(map(len, files.values())))
             scene: Any = trimesh.load(
                 BytesIO(data),
                 file_type=path.suffix.lower()[1:],
@@ -72,7 +72,7 @@ def read_gltf(path: Path, data: bytes) -> Contents:
         raise place.error(f"it is no sound glTF file ({reason[0][:120]})") from None
 
 
-def _header(place: Place, data: bytes) -> dict[str, Any]:
+def _header(place: FileLocation, data: bytes) -> dict[str, Any]:
     text = data
     if place.path.suffix.lower() == ".glb":
         if len(data) < 20 or data[:4] != b"glTF":
@@ -104,22 +104,24 @@ def _buffer_files(path: Path, header: dict[str, Any]) -> dict[str, bytes]:
             continue
         name = Path(unquote(uri))
         if name.is_absolute() or ".." in name.parts or ":" in uri:
-            raise Place(path).error(f"its buffer {uri[:80]!r} is not a file beside it")
+            raise FileLocation(path).error(f"its buffer {uri[:80]!r} is not a file beside it")
         files[uri] = read_bytes(path.parent / name)
         if sum(map(len, files.values())) > MAX_BYTES:
-            raise Place(path).error(f"its buffers are too large: at most {MAX_BYTES:,} bytes")
+            raise FileLocation(path).error(
+                f"its buffers are too large: at most {MAX_BYTES:,} bytes"
+            )
     return files
 
 
-def _check(place: Place, header: dict[str, Any], size: int) -> None:
+def _check_header(place: FileLocation, header: dict[str, Any], size: int) -> None:
     """Compares what the header asks for with what there is. A malformed header raises anything."""
     for name in header.get("extensionsRequired", []):
-        if not str(name).startswith(_HARMLESS):
+        if not str(name).startswith(_IGNORED_EXTENSIONS):
             raise place.error(f"it needs the extension {name}, which is not read: save it without")
     for name in header.get("extensionsUsed", []):
-        if name in _MOVING:
+        if name in _UNSUPPORTED_EXTENSIONS:
             raise place.error(f"it uses the extension {name}, which is not read: save it without")
-    _check_static(place, header)
+    _check_no_animation(place, header)
     views, accessors = header.get("bufferViews", []), header.get("accessors", [])
     asked = 0
     for view in views:
@@ -134,10 +136,10 @@ def _check(place: Place, header: dict[str, Any], size: int) -> None:
         raise place.error(
             f"its header asks for {asked:,} bytes of data, many times those of the file ({size:,})"
         )
-    _check_nodes(place, header, _drawn(place, header, accessors))
+    _check_nodes(place, header, _corner_counts(place, header, accessors))
 
 
-def _check_static(place: Place, header: dict[str, Any]) -> None:
+def _check_no_animation(place: FileLocation, header: dict[str, Any]) -> None:
     """Refuses scenes whose vertices are moved by more than nodes, triangles in fans, and points or
     lines beside triangles: they are not read."""
     nodes: list[Any] = header.get("nodes", [])
@@ -157,7 +159,7 @@ def _check_static(place: Place, header: dict[str, Any]) -> None:
         raise place.error("it draws points or lines beside triangles: save one kind alone")
 
 
-def _drawn(place: Place, header: dict[str, Any], accessors: list[Any]) -> list[int]:
+def _corner_counts(place: FileLocation, header: dict[str, Any], accessors: list[Any]) -> list[int]:
     """How many corners each mesh draws."""
     drawn: list[int] = []
     for mesh in header.get("meshes", []):
@@ -174,7 +176,7 @@ def _drawn(place: Place, header: dict[str, Any], accessors: list[Any]) -> list[i
     return drawn
 
 
-def _check_nodes(place: Place, header: dict[str, Any], drawn: list[int]) -> None:
+def _check_nodes(place: FileLocation, header: dict[str, Any], drawn: list[int]) -> None:
     """Refuses nodes that do not form trees of modest depth, or that together draw too much."""
     nodes: list[Any] = header.get("nodes", [])
     children = {k: node.get("children", []) for k, node in enumerate(nodes)}
@@ -185,8 +187,8 @@ def _check_nodes(place: Place, header: dict[str, Any], drawn: list[int]) -> None
     level, depth = set(roots), 0
     while level:
         level, depth = {child for node in level for child in children[node]}, depth + 1
-        if depth > _DEEPEST:
-            raise place.error(f"its scene is nested more than {_DEEPEST} nodes deep")
+        if depth > _MAX_NODE_DEPTH:
+            raise place.error(f"its scene is nested more than {_MAX_NODE_DEPTH} nodes deep")
     used: list[int] = [node["mesh"] for node in nodes if "mesh" in node]
     total = sum(drawn[mesh] for mesh in used)
     if total > MAX_BYTES:
@@ -200,7 +202,7 @@ def _count(item: dict[str, Any], key: str, default: int | None = None) -> int:
     return value
 
 
-def _contents(place: Place, scene: Any) -> Contents:
+def _contents(place: FileLocation, scene: Any) -> FileGeometry:
     """The scene's triangles in one frame, or its points if there are none."""
     vertices: list[FloatArray] = []
     faces: list[IntArray] = []
@@ -226,14 +228,14 @@ def _contents(place: Place, scene: Any) -> Contents:
         faces.append(corners + count)
         count += len(placed)
     if sum(map(len, faces)):
-        triangles = triangle_list(place.path, np.concatenate(faces))
-        return Contents(place.path, np.concatenate(vertices), None, triangles)
+        triangles = triangles_as_polygons(place.path, np.concatenate(faces))
+        return FileGeometry(place.path, np.concatenate(vertices), None, triangles)
     if points:
-        return Contents(place.path, np.concatenate(points))
+        return FileGeometry(place.path, np.concatenate(points))
     raise place.error("its scene has neither triangles nor points")
 
 
-def _placed(place: Place, vertices: FloatArray, world_from_node: FloatArray) -> FloatArray:
+def _placed(place: FileLocation, vertices: FloatArray, world_from_node: FloatArray) -> FloatArray:
     x = vertices.astype(np.float64) @ world_from_node[:3, :3].T + world_from_node[:3, 3]
     if not math.isfinite(float(np.abs(x).max(initial=0.0))):
         raise place.error("coordinates must be finite")

@@ -13,25 +13,25 @@ import gemmi
 import numpy as np
 
 from harnack.backend import FloatArray
-from harnack.files.file_geometry import FileFormatError, Place, read_bytes
+from harnack.files.file_geometry import FileFormatError, FileLocation, read_bytes
 
 PDB_FILES, CIF_FILES = (".pdb", ".ent"), (".cif", ".mmcif")
 MOLECULE_FILES = (*PDB_FILES, *CIF_FILES)
 _ATOM_LINES = ("ATOM", "HETA")
-_MOST_NAMED = 6
+_MAX_LISTED_ELEMENTS = 6
 
 
 @dataclass(frozen=True, eq=False)
 class Atoms:
     """Atoms from a file: positions (n, 3) and van der Waals radii (n,) in angstrom, elements (n,).
 
-    said: what was found.
+    summary: what was found.
     """
 
     positions: FloatArray
     radii: FloatArray
     elements: tuple[str, ...]
-    said: str
+    summary: str
 
 
 def read_molecule(path: str | os.PathLike[str]) -> Atoms:
@@ -41,7 +41,7 @@ def read_molecule(path: str | os.PathLike[str]) -> Atoms:
     Alternatives are atoms that the file marks as such (altLoc in .pdb, label_alt_id in .cif): of
     each atom the first counts, and of several residues in one place the first. Atoms without the
     mark all count, whatever their names. Radii are gemmi's van der Waals radii of the elements
-    (C 1.7, N 1.55, O 1.52, S 1.8, H 1.2). `said` tells what was left out: atoms of other models,
+    (C 1.7, N 1.55, O 1.52, S 1.8, H 1.2). `summary` tells what was left out: atoms of other models,
     alternatives, unknown elements, and what follows the line END.
 
     Raises:
@@ -50,12 +50,12 @@ def read_molecule(path: str | os.PathLike[str]) -> Atoms:
     path = Path(path)
     if path.suffix.lower() not in MOLECULE_FILES:
         raise FileFormatError(f"{path}: molecules are read from {', '.join(MOLECULE_FILES)} files")
-    return atoms_in(path, read_bytes(path))
+    return parse_molecule(path, read_bytes(path))
 
 
-def atoms_in(path: Path, data: bytes) -> Atoms:
+def parse_molecule(path: Path, data: bytes) -> Atoms:
     """The atoms of a file with these contents; see `read_molecule`."""
-    place = Place(path)
+    place = FileLocation(path)
     if b"\0" in data:
         raise place.error("this is binary data, not the text that its extension announces")
     is_cif = path.suffix.lower() in CIF_FILES
@@ -72,7 +72,7 @@ def atoms_in(path: Path, data: bytes) -> Atoms:
         first = " ".join(str(error).split())
         raise place.error(f"the molecule cannot be read ({first})") from None
     sizes = [model.count_atom_sites() for model in structure]
-    found = _without_alternatives(structure[0]) if sizes else []
+    found = _drop_alternate_locations(structure[0]) if sizes else []
     known = [atom for atom in found if atom.element.atomic_number > 0]
     if not known:
         raise place.error(
@@ -90,7 +90,7 @@ def atoms_in(path: Path, data: bytes) -> Atoms:
         "of unknown elements": len(found) - len(known),
         "behind the line END": 0 if is_cif else _atom_lines(text) - sum(sizes),
     }
-    return Atoms(positions, radii, elements, _said(elements, left_out, len(structure)))
+    return Atoms(positions, radii, elements, _summarize(elements, left_out, len(structure)))
 
 
 def _text(data: bytes, *, is_cif: bool) -> str:
@@ -107,7 +107,7 @@ def _text(data: bytes, *, is_cif: bool) -> str:
     return text.encode("ascii", "replace").decode("ascii")
 
 
-def _without_alternatives(model: Any) -> list[Any]:
+def _drop_alternate_locations(model: Any) -> list[Any]:
     """The atoms of a model, and of those that are marked as alternatives, by other letters, the
     first of each name in the first residue of each place. A line TER ends a chain: behind it the
     same name and number are another place."""
@@ -142,11 +142,13 @@ def _check_coordinates(path: Path, text: str) -> None:
     for number, line in enumerate(text.split("\n"), start=1):
         if line[:4].upper() not in _ATOM_LINES:
             if line.lstrip()[:6].upper().strip() in ("ATOM", "HETATM"):
-                raise Place(path, f"line {number}").error("ATOM and HETATM begin in column 1")
+                raise FileLocation(path, f"line {number}").error(
+                    "ATOM and HETATM begin in column 1"
+                )
             continue
         points = {line[k : k + 8].find(".") for k in (30, 38, 46)}
         if len(points) > 1 and not any(c.isspace() for c in line[30:54]):
-            raise Place(path, f"line {number}").error(
+            raise FileLocation(path, f"line {number}").error(
                 f"coordinates run out of their columns 31 to 54: {line[30:54]!r}"
             )
         try:
@@ -154,13 +156,13 @@ def _check_coordinates(path: Path, text: str) -> None:
         except ValueError:
             finite = False
         if not finite or "_" in line[30:54]:  # Python reads 1_0 as 10
-            raise Place(path, f"line {number}").error(
+            raise FileLocation(path, f"line {number}").error(
                 f"columns 31 to 54 must be the three coordinates of an atom, not {line[30:54]!r}"
             )
 
 
-def _said(elements: tuple[str, ...], left_out: dict[str, int], models: int) -> str:
-    common = Counter(elements).most_common(_MOST_NAMED)
+def _summarize(elements: tuple[str, ...], left_out: dict[str, int], models: int) -> str:
+    common = Counter(elements).most_common(_MAX_LISTED_ELEMENTS)
     names = ", ".join(f"{count:,} {name}" for name, count in common)
     said = f"{len(elements):,} atoms ({names}{', ...' if len(set(elements)) > len(common) else ''})"
     if models > 1:

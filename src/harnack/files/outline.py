@@ -1,7 +1,8 @@
-"""Outlines for `harnack.Extruded` and `harnack.Revolved`: of text, of SVG files, regular polygons.
+"""Outlines for `harnack.Extrusion` and `harnack.SolidOfRevolution`: of text, of SVG files, regular
+polygons.
 
 Curves are flattened to a stated tolerance. What is returned are loops that do not cross, the region
-on their left, as `harnack.geometry.outline_loops` makes them.
+on their left, as `harnack.geometry.make_outline` makes them.
 """
 
 from __future__ import annotations
@@ -20,34 +21,34 @@ from xml.parsers import expat
 import numpy as np
 
 from harnack.backend import FloatArray
-from harnack.backend.validation import positive, whole
+from harnack.backend.validation import as_integer_in_range, as_positive
 from harnack.files.file_geometry import FileFormatError
-from harnack.geometry.beziers import flattened
-from harnack.geometry.outline_loops import Outline, Rule, outline_loops
+from harnack.geometry.beziers import flatten_bezier
+from harnack.geometry.outline_loops import FillingRule, Outline, make_outline
 
-__all__ = ["regular", "svg", "text"]
+__all__ = ["regular_polygon", "svg", "text"]
 
 # Of the size of letters, or of a picture.
-_FINE = 1e-3
+_RELATIVE_TOLERANCE = 1e-3
 _LINE_HEIGHT = 1.2
 _MOST_LETTERS = 10_000
 _MOST_SIDES = 100_000
 
 
-def regular(sides: int, radius: float) -> Outline:
+def regular_polygon(sides: int, radius: float) -> Outline:
     """The regular polygon with so many sides, 3 at least, its corners at `radius` from the origin,
-    the first on the x axis: `Extruded(regular(6, 5.0), height)` is a prism.
+    the first on the x axis: `Extrusion(regular_polygon(6, 5.0), height)` is a prism.
 
     Raises:
         ValueError: fewer sides, or a radius that is not positive.
     """
-    count = whole(sides, "the number of sides of a polygon", 3, _MOST_SIDES)
+    count = as_integer_in_range(sides, "the number of sides of a polygon", 3, _MOST_SIDES)
     angle = 2 * math.pi * np.arange(count) / count
     corners = np.column_stack([np.cos(angle), np.sin(angle)])
-    return outline_loops(positive(radius, "the radius of a polygon") * corners)
+    return make_outline(as_positive(radius, "the radius of a polygon") * corners)
 
 
-def _library(module: str) -> Any:
+def _import_optional(module: str) -> Any:
     """A module of matplotlib, which sets text, or of svgpathtools, which reads paths."""
     try:
         return importlib.import_module(module)
@@ -83,8 +84,10 @@ def text(
         ValueError: text without anything to see, or with letters that the font lacks; no such font.
         ModuleNotFoundError: without matplotlib.
     """
-    size = positive(size, "the size of text")
-    allowed = _FINE * size if tolerance is None else positive(tolerance, "the tolerance")
+    size = as_positive(size, "the size of text")
+    allowed = (
+        _RELATIVE_TOLERANCE * size if tolerance is None else as_positive(tolerance, "the tolerance")
+    )
     if not isinstance(words, str) or len(words) > _MOST_LETTERS:  # pyright: ignore
         raise ValueError(f"words must be a text of at most {_MOST_LETTERS:,} letters")
     if align not in ("left", "center", "right"):
@@ -100,12 +103,12 @@ def text(
             loops += [one + shift for one in made]
     if not loops:
         raise ValueError(f"there is nothing to see in the text {words!r:.60}")
-    return outline_loops(loops, "nonzero")
+    return make_outline(loops, "nonzero")
 
 
 def _line(line: str, font: Any, size: float, allowed: float) -> list[FloatArray]:
     """Loops of one line of text."""
-    manager = _library("matplotlib.font_manager")
+    manager = _import_optional("matplotlib.font_manager")
     if font is not None and Path(font).suffix.lower() in (".ttf", ".otf", ".ttc"):
         if not Path(font).is_file():
             raise ValueError(f"there is no font file {os.fspath(font)}")
@@ -113,7 +116,7 @@ def _line(line: str, font: Any, size: float, allowed: float) -> list[FloatArray]
     else:
         about = manager.FontProperties(family="DejaVu Sans" if font is None else str(font))
     try:
-        face = _library("matplotlib.ft2font").FT2Font(
+        face = _import_optional("matplotlib.ft2font").FT2Font(
             manager.findfont(about, fallback_to_default=False)
         )
     except ValueError:
@@ -127,11 +130,11 @@ def _line(line: str, font: Any, size: float, allowed: float) -> list[FloatArray]
             raise ValueError(
                 f"the font {face.family_name} has no letter {letter!r}: choose another by font="
             )
-    maker = _library("matplotlib.textpath").TextToPath()
+    maker = _import_optional("matplotlib.textpath").TextToPath()
     points, codes = maker.get_text_path(about, line, ismath=False)
     scale = size / maker.FONT_SCALE
     rows = np.asarray(points, dtype=np.float64).reshape(-1, 2) * scale
-    return _traced(rows, [int(one) for one in codes], allowed)
+    return _path_to_loops(rows, [int(one) for one in codes], allowed)
 
 
 # Codes of matplotlib's paths, and how many points belong to each.
@@ -139,7 +142,7 @@ _MOVE, _CLOSE = 1, 79
 _POINTS = {2: 1, 3: 2, 4: 3}
 
 
-def _traced(points: FloatArray, codes: list[int], allowed: float) -> list[FloatArray]:
+def _path_to_loops(points: FloatArray, codes: list[int], allowed: float) -> list[FloatArray]:
     loops: list[list[FloatArray]] = []
     k = 0
     while k < len(codes):
@@ -151,28 +154,28 @@ def _traced(points: FloatArray, codes: list[int], allowed: float) -> list[FloatA
             continue
         count = _POINTS[code]
         controls = np.concatenate([loops[-1][-1][-1:], points[k : k + count]])
-        loops[-1].append(flattened(controls, allowed)[0] if count > 1 else controls[1:])
+        loops[-1].append(flatten_bezier(controls, allowed)[0] if count > 1 else controls[1:])
         k += count
-    return _with_area([np.concatenate(one) for one in loops])
+    return _drop_degenerate_loops([np.concatenate(one) for one in loops])
 
 
-def _with_area(loops: list[FloatArray]) -> list[FloatArray]:
+def _drop_degenerate_loops(loops: list[FloatArray]) -> list[FloatArray]:
     """The loops that have three points which differ: others fill nothing."""
     return [one for one in loops if len(np.unique(one, axis=0)) > 2]
 
 
 # SVG.
 
-_MOST_BYTES, _MOST_ELEMENTS, _DEEPEST = 32 * 2**20, 200_000, 200
+_MAX_SVG_BYTES, _MAX_SVG_ELEMENTS, _MAX_SVG_DEPTH = 32 * 2**20, 200_000, 200
 # What does not show, with all that is in it; and what shows in ways that are not read.
 _HIDDEN = (
     "defs", "symbol", "clipPath", "mask", "marker", "pattern", "linearGradient", "radialGradient",
     "filter", "metadata", "title", "desc", "script", "namedview", "style",
 )  # fmt: skip
-_UNREAD = ("use", "text", "image", "foreignObject", "switch")
+_UNSUPPORTED_TAGS = ("use", "text", "image", "foreignObject", "switch")
 _SHAPES = ("path", "rect", "circle", "ellipse", "polygon", "polyline")
 # Of rules in a style sheet those that would change what is filled.
-_OF_RULES = re.compile(r"none|evenodd|transform|hidden|@import|clip|mask", re.IGNORECASE)
+_FILL_CHANGING_RULES = re.compile(r"none|evenodd|transform|hidden|@import|clip|mask", re.IGNORECASE)
 
 
 def svg(
@@ -194,21 +197,21 @@ def svg(
             sheets that change what is filled, entities, a size or depth that no drawing has.
         ModuleNotFoundError: without svgpathtools. OSError: it cannot be read.
     """
-    scale = positive(scale, "the scale of an SVG file")
+    scale = as_positive(scale, "the scale of an SVG file")
     if tolerance is not None:
-        tolerance = positive(tolerance, "the tolerance") / scale
+        tolerance = as_positive(tolerance, "the tolerance") / scale
     source = Path(path)
-    if source.stat().st_size > _MOST_BYTES:
-        raise FileFormatError(f"{source}: an SVG file has at most {_MOST_BYTES >> 20} MB")
+    if source.stat().st_size > _MAX_SVG_BYTES:
+        raise FileFormatError(f"{source}: an SVG file has at most {_MAX_SVG_BYTES >> 20} MB")
     try:
-        root = _parsed(source.read_bytes())
-        shapes = [*_filled(root, np.eye(3), {})]
+        root = _parse_svg(source.read_bytes())
+        shapes = [*_filled_shapes(root, np.eye(3), {})]
         return _outline_of(shapes, scale, tolerance)
     except (ValueError, ArithmeticError, LookupError, ParseError, expat.ExpatError) as wrong:
         raise FileFormatError(f"{source}: {wrong}") from None
 
 
-def _parsed(data: bytes) -> Element:
+def _parse_svg(data: bytes) -> Element:
     """The root element. No entity is declared: a few of them can stand for billions of letters."""
     builder = TreeBuilder()
     parser = expat.ParserCreate()
@@ -217,9 +220,9 @@ def _parsed(data: bytes) -> Element:
     def start(name: str, attributes: dict[str, str]) -> None:
         nonlocal count, depth
         count, depth = count + 1, depth + 1
-        if count > _MOST_ELEMENTS or depth > _DEEPEST:
+        if count > _MAX_SVG_ELEMENTS or depth > _MAX_SVG_DEPTH:
             raise ValueError(
-                f"more than {_MOST_ELEMENTS:,} elements, or {_DEEPEST} within each other"
+                f"more than {_MAX_SVG_ELEMENTS:,} elements, or {_MAX_SVG_DEPTH} within each other"
             )
         builder.start(name.rpartition(":")[2], attributes)
 
@@ -241,12 +244,12 @@ def _parsed(data: bytes) -> Element:
     return root
 
 
-def _filled(
+def _filled_shapes(
     element: Element, transform: FloatArray, inherited: dict[str, str]
-) -> Iterator[tuple[str, FloatArray, Rule]]:
+) -> Iterator[tuple[str, FloatArray, FillingRule]]:
     """Path data, transform (3, 3) and fill rule of each shape that is filled."""
     tag = element.tag
-    if tag == "style" and _OF_RULES.search("".join(element.itertext())):
+    if tag == "style" and _FILL_CHANGING_RULES.search("".join(element.itertext())):
         raise ValueError("its style sheet may change what is filled: save it with plain attributes")
     if tag in _HIDDEN:
         yield from ()
@@ -254,7 +257,7 @@ def _filled(
     own = {**inherited, **_styles(element)}
     if own.get("display") == "none":
         return
-    if tag in _UNREAD:
+    if tag in _UNSUPPORTED_TAGS:
         raise ValueError(f"<{tag}> is not read: turn it into paths before the file is saved")
     for name in _CUTTING:
         if own.pop(name, "none") != "none":
@@ -262,21 +265,21 @@ def _filled(
     if own.get("transform", "none") != "none" or "transform-origin" in own:
         raise ValueError("transforms in styles are not read, nor a transform-origin: apply them")
     if "transform" in element.attrib:
-        parse_transform = _library("svgpathtools.parser").parse_transform
+        parse_transform = _import_optional("svgpathtools.parser").parse_transform
         more: FloatArray = parse_transform(element.attrib["transform"], strict=True)
         transform = transform @ more
     is_filled = own.get("fill") not in ("none", "transparent")
     is_filled &= not _NO_OPACITY.fullmatch(own.get("fill-opacity", "1"))
     if tag in _SHAPES and is_filled and own.get("visibility") != "hidden":
         yield (
-            _data(element),
+            _path_data(element),
             transform,
             "even-odd" if own.get("fill-rule") == "evenodd" else "nonzero",
         )
     for one in element:
         if one.tag == "svg" and {"x", "y", "viewBox"} & one.attrib.keys():
             raise ValueError("an <svg> in another with a place of its own is not read: ungroup it")
-        yield from _filled(one, transform, {k: v for k, v in own.items() if k in _INHERITED})
+        yield from _filled_shapes(one, transform, {k: v for k, v in own.items() if k in _INHERITED})
 
 
 _INHERITED = ("fill", "fill-rule", "fill-opacity", "visibility", "display")
@@ -300,9 +303,9 @@ def _styles(element: Element) -> dict[str, str]:
 _LENGTHS = {"x", "y", "cx", "cy", "width", "height", "r", "rx", "ry"}
 
 
-def _data(element: Element) -> str:
+def _path_data(element: Element) -> str:
     """The path data of a shape."""
-    makers = _library("svgpathtools.svg_to_paths")
+    makers = _import_optional("svgpathtools.svg_to_paths")
     about, kind = {k: v.removesuffix("px") for k, v in element.attrib.items()}, element.tag
     if kind == "path":
         return about.get("d", "")
@@ -329,9 +332,9 @@ def _data(element: Element) -> str:
 
 
 def _outline_of(
-    shapes: list[tuple[str, FloatArray, Rule]], scale: float, tolerance: float | None
+    shapes: list[tuple[str, FloatArray, FillingRule]], scale: float, tolerance: float | None
 ) -> Outline:
-    paths: list[tuple[list[Any], FloatArray, Rule]] = [
+    paths: list[tuple[list[Any], FloatArray, FillingRule]] = [
         (_segments(data), matrix, rule) for data, matrix, rule in shapes
     ]
     if tolerance is None:
@@ -342,20 +345,20 @@ def _outline_of(
         size = float(np.ptp(np.array(ends), axis=0).max()) if ends else 0.0
         if not size > 0:
             raise ValueError("it fills nothing")
-        tolerance = _FINE * size
+        tolerance = _RELATIVE_TOLERANCE * size
     loops: list[FloatArray] = []
     flip = np.array([scale, -scale])
     for segments, matrix, rule in paths:
         own = [one * flip for one in _loops(segments, matrix, tolerance)]
         if own:
-            loops += outline_loops(own, rule)
+            loops += make_outline(own, rule)
     if not loops:
         raise ValueError("it fills nothing: strokes have no outline; turn them into paths")
-    return outline_loops(loops, "nonzero")
+    return make_outline(loops, "nonzero")
 
 
 def _segments(data: str) -> list[Any]:
-    parse_path = _library("svgpathtools.parser").parse_path
+    parse_path = _import_optional("svgpathtools.parser").parse_path
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warnings.filterwarnings("ignore", "Replacing degenerate")  # an arc of radius 0 is a line
@@ -378,17 +381,19 @@ def _loops(segments: list[Any], matrix: FloatArray, tolerance: float) -> list[Fl
     last: complex | None = None
     for one in segments:
         if last is None or one.start != last:
-            loops.append([_mapped(matrix, [one.start])])
+            loops.append([_transform_points(matrix, [one.start])])
         last = one.end
         kind = type(one).__name__
         if kind == "Arc":
             loops[-1].append(_arc(one, matrix, tolerance))
             continue
-        controls = _mapped(matrix, [*one.bpoints()])
+        controls = _transform_points(matrix, [*one.bpoints()])
         if not np.isfinite(controls).all():
             raise ValueError("a number in it is not finite")
-        loops[-1].append(flattened(controls, tolerance)[0] if len(controls) > 2 else controls[1:])
-    return _with_area([np.concatenate(one) for one in loops])
+        loops[-1].append(
+            flatten_bezier(controls, tolerance)[0] if len(controls) > 2 else controls[1:]
+        )
+    return _drop_degenerate_loops([np.concatenate(one) for one in loops])
 
 
 def _arc(arc: Any, matrix: FloatArray, tolerance: float) -> FloatArray:
@@ -401,10 +406,10 @@ def _arc(arc: Any, matrix: FloatArray, tolerance: float) -> FloatArray:
         raise ValueError("an arc in it has too many segments: allow a larger tolerance")
     t = np.linspace(0.0, 1.0, math.ceil(count) + 1)[1:]
     points = [arc.point(float(one)) for one in t[:-1]]
-    return _mapped(matrix, [*points, arc.end])
+    return _transform_points(matrix, [*points, arc.end])
 
 
-def _mapped(matrix: FloatArray, points: list[complex]) -> FloatArray:
+def _transform_points(matrix: FloatArray, points: list[complex]) -> FloatArray:
     return np.array([_xy(one) for one in points]) @ matrix[:2, :2].T + matrix[:2, 2]
 
 

@@ -18,18 +18,18 @@ import numpy.typing as npt
 from harnack.backend import IntArray
 from harnack.files.file_geometry import (
     NO_POLYGONS,
-    Contents,
     FileFormatError,
-    Place,
-    Places,
-    Polygons,
+    FileGeometry,
+    FileLocation,
+    FileLocations,
+    PolygonList,
     check_element_count,
     check_finite,
     check_indices,
-    differ_in_size,
-    positions,
+    have_mixed_sizes,
+    ranks_in_lists,
 )
-from harnack.files.text_tables import Lines, content_lines, excerpt, read_floats
+from harnack.files.text_tables import TextLines, excerpt, read_floats, split_content_lines
 
 # PLY name of a type -> its code in `struct`
 _CODES = {
@@ -41,7 +41,15 @@ _CODES = {
 _BYTE_ORDERS = {b"ascii": "", b"binary_little_endian": "<", b"binary_big_endian": ">"}
 _MAX_HEADER = 1 << 16
 # Elements that hold faces in a form that is not read, or under another name.
-_OTHER_FACES = ("tristrips", "strips", "trifans", "faces", "polygon", "polygons", "triangle")
+_UNSUPPORTED_FACE_ELEMENTS = (
+    "tristrips",
+    "strips",
+    "trifans",
+    "faces",
+    "polygon",
+    "polygons",
+    "triangle",
+)
 # What may follow the last row of a binary file.
 _PADDING = b"\0 \t\r\n"
 
@@ -56,7 +64,7 @@ class Property:
 
 
 @dataclass(frozen=True)
-class Section:
+class PlyElement:
     """An element of the header: its name, how many rows follow, and their columns."""
 
     name: str
@@ -65,17 +73,17 @@ class Section:
 
 
 @dataclass(frozen=True)
-class Header:
+class PlyHeader:
     """byte_order: "<" or ">", "" for ascii. size, lines: what comes before the first row."""
 
     byte_order: str
-    sections: tuple[Section, ...]
+    elements: tuple[PlyElement, ...]
     size: int
     lines: int
 
-    def promised(self, size: int) -> int:
+    def declared_rows(self, size: int) -> int:
         """How many rows it declares, of those that a file of this size has room for."""
-        return sum(min(section.count, size) for section in self.sections)
+        return sum(min(section.count, size) for section in self.elements)
 
 
 class BinaryValues:
@@ -86,7 +94,7 @@ class BinaryValues:
         self.data = data
         self.byte_order = byte_order
 
-    def at(self, where: IntArray, code: str) -> npt.NDArray[Any]:
+    def read(self, where: IntArray, code: str) -> npt.NDArray[Any]:
         """Those at these positions; anything at positions that lie outside."""
         kind = np.dtype(self.byte_order + code)
         last = self.size - kind.itemsize  # the header alone is longer than a number
@@ -101,12 +109,12 @@ class BinaryValues:
 class TextValues:
     """The numbers of an element by their positions, which are words. counts: (n,) a row."""
 
-    def __init__(self, rows: Lines) -> None:
+    def __init__(self, rows: TextLines) -> None:
         numbers, self.counts = read_floats(rows, convert=_any_number)
         self._numbers = np.append(numbers, 0.0)
         self.size = len(numbers)
 
-    def at(self, where: IntArray, code: str) -> npt.NDArray[Any]:
+    def read(self, where: IntArray, code: str) -> npt.NDArray[Any]:
         found = self._numbers[np.clip(where, 0, self.size)]
         if code in "fd" or (found != np.rint(found)).any():
             return found
@@ -119,7 +127,7 @@ class TextValues:
 Values: TypeAlias = BinaryValues | TextValues
 
 
-def _any_number(word: bytes, place: Place) -> float:
+def _any_number(word: bytes, place: FileLocation) -> float:
     try:
         return float(word)
     except ValueError as error:
@@ -127,47 +135,49 @@ def _any_number(word: bytes, place: Place) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class Column:
+class PropertyColumn:
     """A property in all rows.
 
-    begins: (n,), positions, and what to add to them. sizes: (n,) if it is a list, else none.
+    positions: (n,), positions, and what to add to them. sizes: (n,) if it is a list, else none.
     """
 
     code: str
-    begins: IntArray
-    added: int
-    sizes: IntArray | None
+    positions: IntArray
+    offset: int
+    list_lengths: IntArray | None
 
 
 @dataclass(frozen=True, eq=False)
-class Table:
+class ElementTable:
     """All rows of an element: its columns by name, and where each row stands in the file."""
 
     values: Values
-    columns: dict[str, Column]
-    places: Places
+    columns: dict[str, PropertyColumn]
+    places: FileLocations
 
-    def has(self, *names: str) -> bool:
+    def has_scalars(self, *names: str) -> bool:
         """Whether there are columns of single numbers by these names."""
-        return all(name in self.columns and self.columns[name].sizes is None for name in names)
+        return all(
+            name in self.columns and self.columns[name].list_lengths is None for name in names
+        )
 
-    def numbers(self, name: str) -> npt.NDArray[Any]:
+    def scalar_column(self, name: str) -> npt.NDArray[Any]:
         """A column of single numbers."""
         column = self._column(name)
-        if column.sizes is not None:
+        if column.list_lengths is not None:
             raise self._is_other_kind()
-        return self.values.at(column.begins + column.added, column.code)
+        return self.values.read(column.positions + column.offset, column.code)
 
-    def lists(self, name: str) -> tuple[npt.NDArray[Any], IntArray]:
+    def list_column(self, name: str) -> tuple[npt.NDArray[Any], IntArray]:
         """A column of lists: the numbers of all, one after the other, and how many each has."""
         column = self._column(name)
-        if column.sizes is None:
+        if column.list_lengths is None:
             raise self._is_other_kind()
-        where = np.repeat(column.begins + column.added, column.sizes)
-        where += positions(column.sizes) * self.values.width(column.code)
-        return self.values.at(where, column.code), column.sizes
+        where = np.repeat(column.positions + column.offset, column.list_lengths)
+        where += ranks_in_lists(column.list_lengths) * self.values.width(column.code)
+        return self.values.read(where, column.code), column.list_lengths
 
-    def _column(self, name: str) -> Column:
+    def _column(self, name: str) -> PropertyColumn:
         if name not in self.columns:
             raise self.places[0].error(f"this element needs a property {name!r}")
         return self.columns[name]
@@ -176,7 +186,7 @@ class Table:
         return self.places[0].error("a list where one number is expected, or the reverse")
 
 
-def read_ply(path: Path, data: bytes) -> Contents:
+def read_ply(path: Path, data: bytes) -> FileGeometry:
     """Vertices, their normals if all have nx, ny and nz, faces, and edges as polylines of two.
 
     Raises:
@@ -187,68 +197,74 @@ def read_ply(path: Path, data: bytes) -> Contents:
     tables = (_binary_tables if header.byte_order else _text_tables)(path, data, header)
     vertices, normals = np.zeros((0, 3)), None
     if table := tables.get("vertex"):
-        vertices = np.stack([table.numbers(name) for name in "xyz"], axis=1).astype(np.float64)
+        vertices = np.stack([table.scalar_column(name) for name in "xyz"], axis=1).astype(
+            np.float64
+        )
         check_finite(vertices, table.places)
-        if table.has("nx", "ny", "nz"):
-            columns = [table.numbers(name) for name in ("nx", "ny", "nz")]
+        if table.has_scalars("nx", "ny", "nz"):
+            columns = [table.scalar_column(name) for name in ("nx", "ny", "nz")]
             normals = np.stack(columns, axis=1).astype(np.float64)
     faces = edges = NO_POLYGONS
     if table := tables.get("face"):
         name = "vertex_index" if "vertex_index" in table.columns else "vertex_indices"
-        faces = _polygons(table, *table.lists(name), len(vertices))
+        faces = _polygons(table, *table.list_column(name), len(vertices))
     table = tables.get("edge")
     # Edges of faces may have names of their own: they are not needed.
-    if table and (table.has("vertex1", "vertex2") or not tables.get("face")):
-        ends = np.stack([table.numbers("vertex1"), table.numbers("vertex2")], axis=1)
+    if table and (table.has_scalars("vertex1", "vertex2") or not tables.get("face")):
+        ends = np.stack([table.scalar_column("vertex1"), table.scalar_column("vertex2")], axis=1)
         edges = _polygons(table, ends.ravel(), np.full(len(ends), 2), len(vertices))
-    if differ_in_size(faces):
-        check_element_count(Place(path), header.promised(len(data)))
-    return Contents(path, vertices, normals, faces, edges)
+    if have_mixed_sizes(faces):
+        check_element_count(FileLocation(path), header.declared_rows(len(data)))
+    return FileGeometry(path, vertices, normals, faces, edges)
 
 
-def _check_elements(path: Path, header: Header) -> None:
+def _check_elements(path: Path, header: PlyHeader) -> None:
     """Refuses elements that hold surface in a form that is not read, or that are there twice."""
-    names = [section.name for section in header.sections]
+    names = [section.name for section in header.elements]
     for name in names:
         is_odd = name.lower() in ("vertex", "face", "edge") and name != name.lower()
-        if name.lower() in _OTHER_FACES or is_odd:
-            raise Place(path).error(
+        if name.lower() in _UNSUPPORTED_FACE_ELEMENTS or is_odd:
+            raise FileLocation(path).error(
                 f"its element {name[:40]!r} is not read: triangles are rows of the element 'face'"
             )
         if names.count(name) > 1:
-            raise Place(path).error(f"its header has the element {name[:40]!r} twice")
+            raise FileLocation(path).error(f"its header has the element {name[:40]!r} twice")
 
 
 def _check_end(path: Path, left: bytes) -> None:
     """Refuses data after the last row."""
     if left.strip(_PADDING):
-        raise Place(path).error(
+        raise FileLocation(path).error(
             "more follows than the rows that its header promises: its counts are too small"
         )
 
 
-def _polygons(table: Table, corners: npt.NDArray[Any], sizes: IntArray, count: int) -> Polygons:
+def _polygons(
+    table: ElementTable, corners: npt.NDArray[Any], sizes: IntArray, count: int
+) -> PolygonList:
     """Polygons of these corners, which must be indices of `count` vertices."""
-    found = Polygons(corners.astype(np.int64), sizes, table.places)
+    found = PolygonList(corners.astype(np.int64), sizes, table.places)
     if corners.dtype.kind == "f" and corners.size:
         k = int(np.argmax(corners != np.rint(corners)))
-        raise found.place_of(k).error(f"indices must be integers, not {float(corners[k])}")
+        raise found.location_of_corner(k).error(
+            f"indices must be integers, not {float(corners[k])}"
+        )
     check_indices(found, count)
     return found
 
 
 def _columns(
-    section: Section, values: Values, begins: IntArray, places: Places
-) -> tuple[dict[str, Column], IntArray]:
+    section: PlyElement, values: Values, begins: IntArray, places: FileLocations
+) -> tuple[dict[str, PropertyColumn], IntArray]:
     """The columns of rows that begin at these positions, and where each row ends."""
-    columns: dict[str, Column] = {}
+    columns: dict[str, PropertyColumn] = {}
     at, added = begins, 0
     for p in section.properties:
         if p.length_code is None:
-            columns[p.name] = Column(p.code, at, added, None)
+            columns[p.name] = PropertyColumn(p.code, at, added, None)
             added += values.width(p.code)
             continue
-        lengths = values.at(at + added, p.length_code)
+        lengths = values.read(at + added, p.length_code)
         if lengths.dtype.kind == "f":
             k = int(np.argmax(lengths != np.rint(lengths)))
             raise places[k].error(f"the length of a list is no integer, but {lengths[k]}")
@@ -256,21 +272,21 @@ def _columns(
         sizes = np.where(lengths < 0, values.size + 1, lengths).astype(np.int64)
         sizes = np.minimum(sizes, values.size + 1)
         added += values.width(p.length_code)
-        columns[p.name] = Column(p.code, at, added, sizes)
+        columns[p.name] = PropertyColumn(p.code, at, added, sizes)
         at, added = at + added + values.width(p.code) * sizes, 0
     return columns, at + added
 
 
-def _text_tables(path: Path, data: bytes, header: Header) -> dict[str, Table]:
-    lines = content_lines(path, data[header.size :], comment=None, first=header.lines + 1)
-    tables: dict[str, Table] = {}
-    for section in header.sections:
+def _text_tables(path: Path, data: bytes, header: PlyHeader) -> dict[str, ElementTable]:
+    lines = split_content_lines(path, data[header.size :], comment=None, first=header.lines + 1)
+    tables: dict[str, ElementTable] = {}
+    for section in header.elements:
         if section.count > len(lines):
             raise _too_short(path, section)
         if not section.count:
             continue
-        places = Places(path, section.name, range(section.count))
-        rows, lines = Lines(lines.text[: section.count], places), lines[section.count :]
+        places = FileLocations(path, section.name, range(section.count))
+        rows, lines = TextLines(lines.text[: section.count], places), lines[section.count :]
         values = TextValues(rows)
         counts = values.counts
         columns, ends = _columns(section, values, np.cumsum(counts) - counts, places)
@@ -278,42 +294,42 @@ def _text_tables(path: Path, data: bytes, header: Header) -> dict[str, Table]:
         if wrong.size:
             how = "few" if ends[wrong[0]] > np.cumsum(counts)[wrong[0]] else "many"
             raise places[wrong[0]].error(f"{counts[wrong[0]]} numbers are too {how}")
-        tables[section.name] = Table(values, columns, places)
+        tables[section.name] = ElementTable(values, columns, places)
     _check_end(path, b"".join(lines.text[:1]))
     return tables
 
 
-def _binary_tables(path: Path, data: bytes, header: Header) -> dict[str, Table]:
+def _binary_tables(path: Path, data: bytes, header: PlyHeader) -> dict[str, ElementTable]:
     values = BinaryValues(data, header.byte_order)
-    tables: dict[str, Table] = {}
+    tables: dict[str, ElementTable] = {}
     begin = header.size
-    for section in header.sections:
+    for section in header.elements:
         least = sum(values.width(p.length_code or p.code) for p in section.properties)
         if section.count * least > values.size - begin:
             raise _too_short(path, section)
         if not section.count:
             continue
-        places = Places(path, section.name, range(section.count))
+        places = FileLocations(path, section.name, range(section.count))
         try:
             # Most often the lists of all rows are as long as those of the first, and not empty.
             stride = next(_row_ends(section, values, begin)) - begin
             if stride == least and any(p.length_code for p in section.properties):
-                check_element_count(Place(path), header.promised(len(data)))
+                check_element_count(FileLocation(path), header.declared_rows(len(data)))
             begins = begin + stride * np.arange(section.count, dtype=np.int64)
             columns, ends = _columns(section, values, begins, places)
             if (ends != begins + stride).any() or ends[-1] > values.size:
-                check_element_count(Place(path), header.promised(len(data)))
+                check_element_count(FileLocation(path), header.declared_rows(len(data)))
                 ends = np.fromiter(_row_ends(section, values, begin), np.int64, section.count)
                 columns, _ = _columns(section, values, np.append(begin, ends[:-1]), places)
         except struct.error:
             raise _too_short(path, section) from None
         begin = int(ends[-1])
-        tables[section.name] = Table(values, columns, places)
+        tables[section.name] = ElementTable(values, columns, places)
     _check_end(path, data[begin:])
     return tables
 
 
-def _row_ends(section: Section, values: BinaryValues, begin: int) -> Iterator[int]:
+def _row_ends(section: PlyElement, values: BinaryValues, begin: int) -> Iterator[int]:
     """Where each row ends; raises struct.error if that is behind the end of the file."""
     skipped = 0
     lists: list[tuple[int, struct.Struct, int]] = []
@@ -337,14 +353,14 @@ def _row_ends(section: Section, values: BinaryValues, begin: int) -> Iterator[in
         yield at
 
 
-def _too_short(path: Path, section: Section) -> FileFormatError:
-    return Place(path).error(
+def _too_short(path: Path, section: PlyElement) -> FileFormatError:
+    return FileLocation(path).error(
         f"the file ends before the {section.count:,} rows of element {section.name!r} that its "
         "header declares"
     )
 
 
-def _header(path: Path, data: bytes) -> Header:
+def _header(path: Path, data: bytes) -> PlyHeader:
     """What the header of a .ply file declares.
 
     Raises:
@@ -352,13 +368,15 @@ def _header(path: Path, data: bytes) -> Header:
     """
     end = data.find(b"end_header", 0, _MAX_HEADER)
     if not data.startswith((b"ply\n", b"ply\r")) or end < 0:
-        raise Place(path).error("this is no .ply file: a header from 'ply' to 'end_header' lacks")
+        raise FileLocation(path).error(
+            "this is no .ply file: a header from 'ply' to 'end_header' lacks"
+        )
     newline = data.find(b"\n", end)
     size = newline + 1 if newline >= 0 else len(data)
     byte_order: str | None = None
-    sections: list[Section] = []
+    sections: list[PlyElement] = []
     for number, line in enumerate(data[:end].splitlines()[1:], 2):
-        place = Place(path, f"line {number}")
+        place = FileLocation(path, f"line {number}")
         words = line.split()
         if not words or words[0] in (b"comment", b"obj_info"):
             continue
@@ -366,28 +384,28 @@ def _header(path: Path, data: bytes) -> Header:
             byte_order = _BYTE_ORDERS[words[1]]
         elif words[0] == b"element" and len(words) == 3 and words[2].isdigit():
             name = words[1].decode("ascii", "backslashreplace")
-            sections.append(Section(name, _count(words[2], place), ()))
+            sections.append(PlyElement(name, _count(words[2], place), ()))
         elif words[0] == b"property" and sections:
             last = sections[-1]
             columns = (*last.properties, _property(words, last, place))
-            sections[-1] = Section(last.name, last.count, columns)
+            sections[-1] = PlyElement(last.name, last.count, columns)
         else:
             raise place.error(f"{excerpt(line)} is no statement of a .ply header")
     if byte_order is None:
-        raise Place(path).error("the header names no format")
+        raise FileLocation(path).error("the header names no format")
     for section in sections:
         if section.count and not section.properties:
-            raise Place(path).error(f"element {section.name!r} has no properties")
-    return Header(byte_order, tuple(sections), size, len(data[:size].splitlines()))
+            raise FileLocation(path).error(f"element {section.name!r} has no properties")
+    return PlyHeader(byte_order, tuple(sections), size, len(data[:size].splitlines()))
 
 
-def _count(word: bytes, place: Place) -> int:
+def _count(word: bytes, place: FileLocation) -> int:
     if len(word) > 18:
         raise place.error(f"{excerpt(word)} is too large a count")
     return int(word)
 
 
-def _property(words: list[bytes], section: Section, place: Place) -> Property:
+def _property(words: list[bytes], section: PlyElement, place: FileLocation) -> Property:
     types = words[2:4] if words[1:2] == [b"list"] else words[1:2]
     if len(words) != (5 if len(types) == 2 else 3) or any(t not in _CODES for t in types):
         raise place.error("a property is 'property TYPE NAME' or 'property list TYPE TYPE NAME'")

@@ -14,31 +14,30 @@ import numpy as np
 
 from harnack.backend import FloatArray, IntArray
 from harnack.files.file_geometry import (
-    Contents,
-    Place,
-    Places,
-    Polygons,
+    FileGeometry,
+    FileLocation,
+    FileLocations,
+    PolygonList,
     check_element_count,
     check_finite,
     check_indices,
-    differ_in_size,
-    positions,
-    triangle_list,
+    have_mixed_sizes,
+    ranks_in_lists,
+    triangles_as_polygons,
 )
 from harnack.files.text_tables import (
-    Lines,
-    as_integer,
-    content_lines,
+    TextLines,
     excerpt,
+    parse_vertex_index,
     read_floats,
     read_integers,
     read_table,
+    split_content_lines,
 )
 from harnack.geometry.boundary_edges import weld_vertices
-from harnack.name_suggestions import renamed
 
 
-def read_xyz(path: Path, data: bytes) -> Contents:
+def read_xyz(path: Path, data: bytes) -> FileGeometry:
     """Points of an .xyz file, one a line, from columns 1 to 3, and normals, from columns 4 to 6 if
     there are six or more.
 
@@ -48,50 +47,50 @@ def read_xyz(path: Path, data: bytes) -> Contents:
         FileFormatError: lines with different numbers of columns or fewer than three, words, numbers
             that are not finite; columns 4 to 6 that hold no normals (lengths far from 1).
     """
-    lines = content_lines(path, data)
+    lines = split_content_lines(path, data)
     if not len(lines):
-        raise Place(path).error("it holds no points: write one a line, x y z")
+        raise FileLocation(path).error("it holds no points: write one a line, x y z")
     numbers, counts = read_floats(lines)
     columns = int(counts[0])
     ragged = np.flatnonzero(counts != columns)
     if ragged.size:
-        raise lines.places[ragged[0]].error(
+        raise lines.locations[ragged[0]].error(
             f"{counts[ragged[0]]} columns, but the lines before have {columns}"
         )
     if columns < 3:
-        raise lines.places[0].error(f"a point needs three coordinates, not {columns}")
+        raise lines.locations[0].error(f"a point needs three coordinates, not {columns}")
     table = numbers.reshape(-1, columns)
     if columns < 6:
-        return Contents(path, table[:, :3])
+        return FileGeometry(path, table[:, :3])
     normals = table[:, 3:6]
     length = np.linalg.norm(normals, axis=1)
     wrong = np.flatnonzero(np.abs(length - 1.0) > 0.1)
     if wrong.size:
-        raise lines.places[wrong[0]].error(
+        raise lines.locations[wrong[0]].error(
             f"columns 4 to 6 should be a unit normal, but their length is {length[wrong[0]]:.3g}: "
             "remove these columns if they are colors or the like"
         )
-    return Contents(path, table[:, :3], normals)
+    return FileGeometry(path, table[:, :3], normals)
 
 
-def read_loops_text(path: Path, data: bytes) -> list[tuple[FloatArray, Place]]:
+def read_loops_text(path: Path, data: bytes) -> list[tuple[FloatArray, FileLocation]]:
     """Loops (n, 3) of a .loops file, one a line, x y z repeated, and where they stand. `#` begins a
     comment.
 
     Raises:
         FileFormatError: something that is no number, or a line whose count is no multiple of 3.
     """
-    lines = content_lines(path, data)
+    lines = split_content_lines(path, data)
     if not len(lines):
-        raise Place(path).error("there are no loops: write one a line, x y z repeated")
+        raise FileLocation(path).error("there are no loops: write one a line, x y z repeated")
     numbers, counts = read_floats(lines)
     wrong = np.flatnonzero(counts % 3)
     if wrong.size:
-        raise lines.places[wrong[0]].error(
+        raise lines.locations[wrong[0]].error(
             f"{counts[wrong[0]]} numbers: a loop is x y z repeated, so a multiple of 3"
         )
     points = np.split(numbers.reshape(-1, 3), np.cumsum(counts // 3)[:-1])
-    return [(loop, lines.places[k]) for k, loop in enumerate(points)]
+    return [(loop, lines.locations[k]) for k, loop in enumerate(points)]
 
 
 # Metaballs.
@@ -99,19 +98,18 @@ def read_loops_text(path: Path, data: bytes) -> list[tuple[FloatArray, Place]]:
 _COLUMNS = "x y z radius [weight [group]]"
 
 
-@renamed(centres="centers")
 @dataclass(frozen=True, eq=False)
 class Metaballs:
     """Blobs from a file: centers (n, 3), radii (n,), weights (n,), and groups (n,) or None.
 
-    said: what was found.
+    summary: what was found.
     """
 
     centers: FloatArray
     radii: FloatArray
     weights: FloatArray
     groups: IntArray | None
-    said: str
+    summary: str
 
 
 def read_metaballs(path: Path, data: bytes) -> Metaballs:
@@ -132,13 +130,13 @@ def read_metaballs(path: Path, data: bytes) -> Metaballs:
             than six columns, a radius that is not positive, a group that is no integer, groups on
             some lines only.
     """
-    lines = content_lines(path, data)
+    lines = split_content_lines(path, data)
     if not len(lines):
-        raise Place(path).error(f"it holds no blobs: write one a line, {_COLUMNS}")
+        raise FileLocation(path).error(f"it holds no blobs: write one a line, {_COLUMNS}")
     numbers, counts = read_floats(lines)
     wrong = np.flatnonzero((counts < 4) | (counts > 6))
     if wrong.size:
-        raise lines.places[wrong[0]].error(
+        raise lines.locations[wrong[0]].error(
             f"a blob has four to six numbers, {_COLUMNS}, not {counts[wrong[0]]}"
         )
     table = np.ones((len(counts), 6))
@@ -146,7 +144,7 @@ def read_metaballs(path: Path, data: bytes) -> Metaballs:
     radii, groups = table[:, 3], table[:, 5]
     wrong = np.flatnonzero(~(radii > 0))
     if wrong.size:
-        raise lines.places[wrong[0]].error(
+        raise lines.locations[wrong[0]].error(
             f"the radius of a blob must be positive, not {radii[wrong[0]]:g}; to carve, give a "
             "negative weight behind it"
         )
@@ -155,12 +153,14 @@ def read_metaballs(path: Path, data: bytes) -> Metaballs:
     if not named.any():
         return Metaballs(table[:, :3], radii, table[:, 4], None, f"{said}, one group")
     if not named.all():
-        raise lines.places[int(np.argmin(named))].error(
+        raise lines.locations[int(np.argmin(named))].error(
             "this line names no group and others do: write the sixth number in all lines or in none"
         )
     wrong = np.flatnonzero((groups != np.rint(groups)) | (np.abs(groups) > 2**31))
     if wrong.size:
-        raise lines.places[wrong[0]].error(f"a group must be an integer, not {groups[wrong[0]]:g}")
+        raise lines.locations[wrong[0]].error(
+            f"a group must be an integer, not {groups[wrong[0]]:g}"
+        )
     whole = groups.astype(np.int64)
     said = f"{said} in {len(np.unique(whole))} groups"
     return Metaballs(table[:, :3], radii, table[:, 4], whole, said)
@@ -169,10 +169,10 @@ def read_metaballs(path: Path, data: bytes) -> Metaballs:
 # Wavefront .obj.
 
 # Statements by which there is more of the surface: free forms, old faces, other files.
-_NOT_READ = (b"curv", b"curv2", b"surf", b"bzp", b"bsp", b"fo", b"call")
+_UNSUPPORTED_OBJ_STATEMENTS = (b"curv", b"curv2", b"surf", b"bzp", b"bsp", b"fo", b"call")
 
 
-def read_obj(path: Path, data: bytes) -> Contents:
+def read_obj(path: Path, data: bytes) -> FileGeometry:
     """Vertices, faces (`f`) and polylines (`l`) of a Wavefront .obj file, normals of a cloud if
     there is one a vertex.
 
@@ -185,63 +185,68 @@ def read_obj(path: Path, data: bytes) -> Contents:
     Raises:
         FileFormatError: a malformed statement, an index out of range.
     """
-    lines = content_lines(path, data)
+    lines = split_content_lines(path, data)
     if b"\\" in data:
-        lines = _joined(lines)
+        lines = _join_continued_lines(lines)
     found: dict[bytes, tuple[list[bytes], list[int]]]
     found = {keyword: ([], []) for keyword in (b"v", b"vn", b"f", b"l", b"p")}
-    for number, line in zip(lines.places.numbers, lines.text, strict=True):
+    for number, line in zip(lines.locations.numbers, lines.text, strict=True):
         keyword = line.split(None, 1)[0]
         if listed := found.get(keyword):
             listed[0].append(line[len(keyword) :])
             listed[1].append(number)
-        elif keyword in _NOT_READ or keyword.lower() in found:
-            raise Place(path, f"line {number}").error(
+        elif keyword in _UNSUPPORTED_OBJ_STATEMENTS or keyword.lower() in found:
+            raise FileLocation(path, f"line {number}").error(
                 f"the statement {excerpt(keyword)} is not read: save the surface as 'v' and 'f'"
             )
         elif keyword.isdigit() or not keyword.replace(b"_", b"").isalnum():
-            raise Place(path, f"line {number}").error(f"{excerpt(keyword)} is no .obj statement")
-    rows = {k: Lines(text, Places(path, "line", numbers)) for k, (text, numbers) in found.items()}
-    vertices = read_table(rows[b"v"], 3, few="a vertex needs three coordinates, not {}")
-    faces = _polygons(rows[b"f"], "'f' needs at least 3 vertices", 3, rows[b"v"])
-    polylines = _polygons(rows[b"l"], "'l' needs at least 2 vertices", 2, rows[b"v"])
-    if differ_in_size(faces):
-        check_element_count(Place(path), len(lines))
+            raise FileLocation(path, f"line {number}").error(
+                f"{excerpt(keyword)} is no .obj statement"
+            )
+    rows = {
+        k: TextLines(text, FileLocations(path, "line", numbers))
+        for k, (text, numbers) in found.items()
+    }
+    vertices = read_table(rows[b"v"], 3, too_few_message="a vertex needs three coordinates, not {}")
+    faces = _parse_obj_polygons(rows[b"f"], "'f' needs at least 3 vertices", 3, rows[b"v"])
+    polylines = _parse_obj_polygons(rows[b"l"], "'l' needs at least 2 vertices", 2, rows[b"v"])
+    if have_mixed_sizes(faces):
+        check_element_count(FileLocation(path), len(lines))
     if len(faces) or len(polylines):
-        return Contents(path, vertices, None, faces, polylines)
+        return FileGeometry(path, vertices, None, faces, polylines)
     normals = read_table(rows[b"vn"], 3) if len(rows[b"vn"]) else None
     if len(rows[b"p"]):
-        return _points(path, vertices, normals, rows)
+        return _parse_obj_points(path, vertices, normals, rows)
     if normals is not None and len(normals) != len(vertices):
         normals = None
-    return Contents(path, vertices, normals, faces, polylines)
+    return FileGeometry(path, vertices, normals, faces, polylines)
 
 
-def _points(
-    path: Path, vertices: FloatArray, normals: FloatArray | None, rows: dict[bytes, Lines]
-) -> Contents:
+def _parse_obj_points(
+    path: Path, vertices: FloatArray, normals: FloatArray | None, rows: dict[bytes, TextLines]
+) -> FileGeometry:
     """The vertices that points name, with normals if all name one."""
-    listed = _polygons(rows[b"p"], "'p' needs a vertex", 1, rows[b"v"])
+    listed = _parse_obj_polygons(rows[b"p"], "'p' needs a vertex", 1, rows[b"v"])
     words = [word.split(b"/") for line in rows[b"p"].text for word in line.split()]
     named = [word[2] for word in words if len(word) == 3 and word[2]]
     if normals is None or not named:
-        return Contents(path, vertices[listed.corners])
-    own = [as_integer(word, rows[b"p"].places[0]) for word in named]
+        return FileGeometry(path, vertices[listed.corners])
+    own = [parse_vertex_index(word, rows[b"p"].locations[0]) for word in named]
     if len(own) != len(words) or not all(1 <= k <= len(normals) for k in own):
         raise (
             rows[b"p"]
-            .places[0]
+            .locations[0]
             .error(f"points need normals from 1 to {len(normals):,} each, or none of them one")
         )
-    return Contents(path, vertices[listed.corners], normals[np.array(own) - 1])
+    return FileGeometry(path, vertices[listed.corners], normals[np.array(own) - 1])
 
 
-def _joined(lines: Lines) -> Lines:
+def _join_continued_lines(lines: TextLines) -> TextLines:
     """A backslash at the end of a line continues it on the next."""
     pieces: list[list[bytes]] = []
     numbers: list[int] = []
     continued = 0  # the number of the line that continues the last
-    for line, number in zip(lines.text, lines.places.numbers, strict=True):
+    for line, number in zip(lines.text, lines.locations.numbers, strict=True):
         if number != continued:
             pieces.append([])
             numbers.append(number)
@@ -249,27 +254,31 @@ def _joined(lines: Lines) -> Lines:
         continued = number + 1 if line.endswith(b"\\") else 0
     joined = [(b" ".join(piece).strip(), k) for piece, k in zip(pieces, numbers, strict=True)]
     joined = [(line, k) for line, k in joined if line]
-    return Lines([x for x, _ in joined], Places(lines.places.path, "line", [k for _, k in joined]))
+    return TextLines(
+        [x for x, _ in joined], FileLocations(lines.locations.path, "line", [k for _, k in joined])
+    )
 
 
-def _polygons(lines: Lines, few: str, least: int, vertices: Lines) -> Polygons:
+def _parse_obj_polygons(lines: TextLines, few: str, least: int, vertices: TextLines) -> PolygonList:
     """Faces or polylines, counted from 0. few: the error of one with fewer corners than `least`."""
     # Texture and normal indices stand behind slashes.
     text = [re.sub(rb"(?<=\S)/\S*", b"", line) if b"/" in line else line for line in lines.text]
-    corners, sizes = read_integers(Lines(text, lines.places))
+    corners, sizes = read_integers(TextLines(text, lines.locations))
     if (short := np.flatnonzero(sizes < least)).size:
-        raise lines.places[short[0]].error(few)
-    listed = Polygons(corners, sizes, lines.places)
+        raise lines.locations[short[0]].error(few)
+    listed = PolygonList(corners, sizes, lines.locations)
     if (zero := np.flatnonzero(corners == 0)).size:
-        raise listed.place_of(zero[0]).error("vertices are counted from 1, there is no vertex 0")
+        raise listed.location_of_corner(zero[0]).error(
+            "vertices are counted from 1, there is no vertex 0"
+        )
     # Negative ones are counted back from the statement.
-    before = np.repeat(np.searchsorted(vertices.places.numbers, lines.places.numbers), sizes)
+    before = np.repeat(np.searchsorted(vertices.locations.numbers, lines.locations.numbers), sizes)
     if (low := np.flatnonzero(corners < -before)).size:
-        raise listed.place_of(low[0]).error(
+        raise listed.location_of_corner(low[0]).error(
             f"vertex {corners[low[0]]} is out of range: {before[low[0]]} vertices precede it"
         )
     corners = np.where(corners > 0, corners - 1, corners + before)
-    polygons = Polygons(corners, sizes, lines.places)
+    polygons = PolygonList(corners, sizes, lines.locations)
     check_indices(polygons, len(vertices), first=1)
     return polygons
 
@@ -277,26 +286,26 @@ def _polygons(lines: Lines, few: str, least: int, vertices: Lines) -> Polygons:
 # .off, vertices and polygons.
 
 
-def read_off(path: Path, data: bytes) -> Contents:
+def read_off(path: Path, data: bytes) -> FileGeometry:
     """Vertices and faces of an .off file. Colors, normals and textures are ignored.
 
     Raises:
         FileFormatError: no .off file of points in space, truncated, malformed, an index out of
             range, a coordinate that is not finite.
     """
-    count, faces_count, lines = _header(path, content_lines(path, data))
+    count, faces_count, lines = _parse_off_header(path, split_content_lines(path, data))
     if len(lines) < count + faces_count:
-        raise Place(path).error(
+        raise FileLocation(path).error(
             f"its header promises {count:,} vertices and {faces_count:,} faces, but "
             f"{len(lines):,} lines follow: the file is truncated"
         )
     if len(lines) > count + faces_count:
-        raise lines.places[count + faces_count].error(
+        raise lines.locations[count + faces_count].error(
             f"more follows than the {count:,} vertices and {faces_count:,} faces that its header "
             "promises, one a line"
         )
     if not count:
-        raise Place(path).error("it holds no vertices")
+        raise FileLocation(path).error("it holds no vertices")
     vertices = read_table(lines[:count], 3)
     rows = lines[count : count + faces_count]
     # Colors may follow the corners: they need be no integers, and not even numbers.
@@ -305,52 +314,54 @@ def read_off(path: Path, data: bytes) -> Contents:
     sizes = _integers(rows, numbers[begins], np.arange(len(rows)), np.zeros_like(begins))
     if (wrong := np.flatnonzero((sizes < 1) | (sizes >= counts))).size:
         k = wrong[0]
-        raise rows.places[k].error(f"a face of '{sizes[k]}' vertices does not fit on this line")
+        raise rows.locations[k].error(f"a face of '{sizes[k]}' vertices does not fit on this line")
     owners = np.repeat(np.arange(len(rows)), sizes)
-    within = 1 + positions(sizes)
+    within = 1 + ranks_in_lists(sizes)
     corners = _integers(rows, numbers[begins[owners] + within], owners, within)
-    faces = Polygons(corners, sizes, rows.places)
+    faces = PolygonList(corners, sizes, rows.locations)
     check_indices(faces, count)
-    return Contents(path, vertices, None, faces)
+    return FileGeometry(path, vertices, None, faces)
 
 
-def _number_or_nan(word: bytes, _: Place) -> float:
+def _number_or_nan(word: bytes, _: FileLocation) -> float:
     try:
         return float(word)
     except ValueError:
         return math.nan
 
 
-def _integers(rows: Lines, numbers: FloatArray, owners: IntArray, within: IntArray) -> IntArray:
+def _integers(rows: TextLines, numbers: FloatArray, owners: IntArray, within: IntArray) -> IntArray:
     """Numbers as integers. owners, within: which word of which row each is."""
     wrong = np.flatnonzero(~((numbers == np.rint(numbers)) & (np.abs(numbers) < 2.0**53)))
     if wrong.size:
         k = int(owners[wrong[0]])
-        as_integer(rows.text[k].split()[int(within[wrong[0]])], rows.places[k])
+        parse_vertex_index(rows.text[k].split()[int(within[wrong[0]])], rows.locations[k])
     return numbers.astype(np.int64)
 
 
-def _header(path: Path, lines: Lines) -> tuple[int, int, Lines]:
+def _parse_off_header(path: Path, lines: TextLines) -> tuple[int, int, TextLines]:
     """Numbers of vertices and faces, and the lines that follow."""
     match = (
         re.match(rb"(ST)?(C)?(N)?(4)?(n)?OFF(?!\S)\s*(.*)", lines.text[0]) if len(lines) else None
     )
     if match is None:
-        raise Place(path).error("this is no .off file: it does not begin with 'OFF'")
+        raise FileLocation(path).error("this is no .off file: it does not begin with 'OFF'")
     if match[4] or match[5]:
-        raise Place(path).error("its vertices have other than three coordinates")
+        raise FileLocation(path).error("its vertices have other than three coordinates")
     rest = match[6]
     if rest.upper().startswith(b"BINARY"):
-        raise Place(path).error("binary .off files are not read: save it as text, or as .ply")
+        raise FileLocation(path).error(
+            "binary .off files are not read: save it as text, or as .ply"
+        )
     at = 0 if rest else 1
     if at == len(lines):
-        raise Place(path).error("the file ends before the numbers of vertices and faces")
+        raise FileLocation(path).error("the file ends before the numbers of vertices and faces")
     words = (rest or lines.text[1]).split()
     if len(words) < 2:
-        raise lines.places[at].error("numbers of vertices and faces are expected here")
-    counts = [as_integer(word, lines.places[at]) for word in words[:2]]
+        raise lines.locations[at].error("numbers of vertices and faces are expected here")
+    counts = [parse_vertex_index(word, lines.locations[at]) for word in words[:2]]
     if min(counts) < 0:
-        raise lines.places[at].error("numbers of vertices and faces cannot be negative")
+        raise lines.locations[at].error("numbers of vertices and faces cannot be negative")
     return counts[0], counts[1], lines[at + 1 :]
 
 
@@ -358,50 +369,52 @@ def _header(path: Path, lines: Lines) -> tuple[int, int, Lines]:
 
 _HEADER = 84
 # The byte order mark of UTF-8, before the text of some programs.
-_MARK = b"\xef\xbb\xbf"
+_BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 _FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 _KEYWORDS = (b"solid", b"facet", b"outer", b"vertex", b"endloop", b"endfacet", b"endsolid")
 
 
-def read_stl(path: Path, data: bytes) -> Contents:
+def read_stl(path: Path, data: bytes) -> FileGeometry:
     """The triangles of an .stl file, corners at the same position made one vertex.
 
     Raises:
         FileFormatError: truncated, malformed, a coordinate that is not finite, no triangles.
     """
-    corners = _binary(path, data) if _is_binary(data) else _text(path, data)
+    corners = _parse_binary_stl(path, data) if _is_binary(data) else _parse_text_stl(path, data)
     if not len(corners):
-        raise Place(path).error("it holds no triangles")
-    check_finite(corners.reshape(-1, 9), Places(path, "triangle", range(len(corners) // 3)))
+        raise FileLocation(path).error("it holds no triangles")
+    check_finite(corners.reshape(-1, 9), FileLocations(path, "triangle", range(len(corners) // 3)))
     distinct, index = np.unique(weld_vertices(corners), return_inverse=True)
-    return Contents(path, corners[distinct], None, triangle_list(path, index.reshape(-1, 3)))
+    return FileGeometry(
+        path, corners[distinct], None, triangles_as_polygons(path, index.reshape(-1, 3))
+    )
 
 
 def _is_binary(data: bytes) -> bool:
     """Many binary files begin with "solid" as well, so their length decides first."""
-    if len(data) >= _HEADER and len(data) == _HEADER + _count(data) * _FACET.itemsize:
+    if len(data) >= _HEADER and len(data) == _HEADER + _stl_facet_count(data) * _FACET.itemsize:
         return True
-    return data.removeprefix(_MARK).lstrip()[:5].lower() != b"solid" or b"\0" in data
+    return data.removeprefix(_BYTE_ORDER_MARK).lstrip()[:5].lower() != b"solid" or b"\0" in data
 
 
-def _count(data: bytes) -> int:
+def _stl_facet_count(data: bytes) -> int:
     return int.from_bytes(data[_HEADER - 4 : _HEADER], "little")
 
 
-def _binary(path: Path, data: bytes) -> FloatArray:
+def _parse_binary_stl(path: Path, data: bytes) -> FloatArray:
     if len(data) < _HEADER:
-        raise Place(path).error(
+        raise FileLocation(path).error(
             f"{len(data)} bytes are too few for an .stl file: it begins with 'solid' or with a "
             f"header of {_HEADER} bytes"
         )
-    count, held = _count(data), (len(data) - _HEADER) // _FACET.itemsize
+    count, held = _stl_facet_count(data), (len(data) - _HEADER) // _FACET.itemsize
     if count > held:
-        raise Place(path).error(
+        raise FileLocation(path).error(
             f"its header promises {count:,} triangles, but there is room for {held:,}: the file is "
             "truncated, or no .stl file"
         )
     if held > count:
-        raise Place(path).error(
+        raise FileLocation(path).error(
             f"its header promises {count:,} triangles, but {held - count:,} more follow: the count "
             "is wrong, or several files were joined"
         )
@@ -409,19 +422,25 @@ def _binary(path: Path, data: bytes) -> FloatArray:
     return facets["corners"].reshape(-1, 3).astype(np.float64)
 
 
-def _text(path: Path, data: bytes) -> FloatArray:
-    lines = content_lines(path, data)
+def _parse_text_stl(path: Path, data: bytes) -> FloatArray:
+    lines = split_content_lines(path, data)
     words = [line.split(None, 1)[0].lower() for line in lines.text]
     for k, word in enumerate(words):
         if word not in _KEYWORDS:
-            raise lines.places[k].error(f"{excerpt(word)} is no .stl statement")
+            raise lines.locations[k].error(f"{excerpt(word)} is no .stl statement")
     if words[-1] != b"endsolid":
-        raise lines.places[len(words) - 1].error("the file ends before 'endsolid': it is truncated")
+        raise lines.locations[len(words) - 1].error(
+            "the file ends before 'endsolid': it is truncated"
+        )
     at = [k for k, word in enumerate(words) if word == b"vertex"]
     facets = words.count(b"facet")
     begins = [k for k, word in enumerate(words) if word == b"facet"]
     of_facets = np.histogram(at, [*begins, len(words)])[0] if begins else np.zeros(0, int)
     if len(at) != 3 * facets or (of_facets != 3).any():
-        raise Place(path).error(f"{len(at):,} vertices in {facets:,} facets: each needs three")
+        raise FileLocation(path).error(
+            f"{len(at):,} vertices in {facets:,} facets: each needs three"
+        )
     rows = [lines.text[k][len("vertex") :] for k in at]
-    return read_table(Lines(rows, Places(path, "line", [lines.places.numbers[k] for k in at])), 3)
+    return read_table(
+        TextLines(rows, FileLocations(path, "line", [lines.locations.numbers[k] for k in at])), 3
+    )

@@ -14,17 +14,17 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import FloatArray, IntArray
-from harnack.files.file_geometry import Place, Places
+from harnack.files.file_geometry import FileLocation, FileLocations
 
 __all__ = [
-    "Lines",
-    "as_integer",
-    "as_number",
-    "content_lines",
+    "TextLines",
     "excerpt",
+    "parse_finite",
+    "parse_vertex_index",
     "read_floats",
     "read_integers",
     "read_table",
+    "split_content_lines",
 ]
 
 MAX_LINE = 1 << 24
@@ -33,23 +33,25 @@ _Number = TypeVar("_Number", int, float)
 
 
 @dataclass(frozen=True, eq=False)
-class Lines:
+class TextLines:
     """Lines of a text file, such as all that say something, and where they stand."""
 
     text: list[bytes]
-    places: Places
+    locations: FileLocations
 
     def __len__(self) -> int:
         return len(self.text)
 
-    def __getitem__(self, part: slice) -> Lines:
-        places = self.places
-        return Lines(self.text[part], Places(places.path, places.noun, places.numbers[part]))
+    def __getitem__(self, part: slice) -> TextLines:
+        places = self.locations
+        return TextLines(
+            self.text[part], FileLocations(places.path, places.noun, places.numbers[part])
+        )
 
 
-def content_lines(
+def split_content_lines(
     path: Path, data: bytes, *, comment: bytes | None = b"#", first: int = 1
-) -> Lines:
+) -> TextLines:
     """The lines of a text file that are not blank, without comments and byte order mark.
 
     first: number of the first line, for messages.
@@ -58,12 +60,14 @@ def content_lines(
         FileFormatError: it holds binary data, or a line above 16 MiB.
     """
     if b"\0" in data:
-        raise Place(path).error("this is binary data, not the text that its extension announces")
+        raise FileLocation(path).error(
+            "this is binary data, not the text that its extension announces"
+        )
     lines = data.removeprefix(b"\xef\xbb\xbf").splitlines()
     longest = max(map(len, lines), default=0)
     if longest > MAX_LINE:
         number = first + next(k for k, line in enumerate(lines) if len(line) > MAX_LINE)
-        raise Place(path, f"line {number}").error(
+        raise FileLocation(path, f"line {number}").error(
             f"a line of {longest:,} bytes is too long: at most {MAX_LINE:,} are read"
         )
     if comment is not None and comment in data:
@@ -73,10 +77,10 @@ def content_lines(
     if not all(lines):
         numbers = [number for number, line in zip(numbers, lines, strict=True) if line]
         lines = [line for line in lines if line]
-    return Lines(lines, Places(path, "line", numbers))
+    return TextLines(lines, FileLocations(path, "line", numbers))
 
 
-def as_number(word: bytes, place: Place) -> float:
+def parse_finite(word: bytes, place: FileLocation) -> float:
     """A finite number.
 
     Raises:
@@ -91,7 +95,7 @@ def as_number(word: bytes, place: Place) -> float:
     return value
 
 
-def as_integer(word: bytes, place: Place) -> int:
+def parse_vertex_index(word: bytes, place: FileLocation) -> int:
     """An integer that can be the index of a vertex.
 
     Raises:
@@ -123,29 +127,32 @@ def excerpt(word: bytes) -> str:
 
 
 def read_table(
-    lines: Lines, columns: int, *, few: str = "{} numbers are too few: {} are expected"
+    lines: TextLines,
+    columns: int,
+    *,
+    too_few_message: str = "{} numbers are too few: {} are expected",
 ) -> FloatArray:
     """The first numbers of each line, all finite: (n, columns). Further words are ignored.
 
-    few: the error of a line with fewer.
+    too_few_message: the error of a line with fewer.
 
     Raises:
         FileFormatError: naming the first line with too few, or with what is no finite number.
     """
-    found = _at_once(lines, range(columns))
+    found = _parse_with_numpy(lines, range(columns))
     if found is not None and np.isfinite(found).all():
         return found
     numbers: list[float] = []
     for k, line in enumerate(lines.text):
-        words, place = line.split()[:columns], lines.places[k]
+        words, place = line.split()[:columns], lines.locations[k]
         if len(words) < columns:
-            raise place.error(few.format(len(words), columns))
-        numbers += [as_number(word, place) for word in words]
+            raise place.error(too_few_message.format(len(words), columns))
+        numbers += [parse_finite(word, place) for word in words]
     return np.array(numbers, dtype=np.float64).reshape(-1, columns)
 
 
 def read_floats(
-    lines: Lines, *, convert: Callable[[bytes, Place], float] = as_number
+    lines: TextLines, *, convert: Callable[[bytes, FileLocation], float] = parse_finite
 ) -> tuple[FloatArray, IntArray]:
     """The numbers of all lines, one after the other, and how many each line has: (n,).
 
@@ -154,25 +161,25 @@ def read_floats(
     Raises:
         FileFormatError: what `convert` raises.
     """
-    found = _at_once(lines)
+    found = _parse_with_numpy(lines)
     if found is not None and np.isfinite(found).all():
         return found.ravel(), _equal(found)
-    return _one_by_one(lines, float, convert)
+    return _parse_words(lines, float, convert)
 
 
-def read_integers(lines: Lines) -> tuple[IntArray, IntArray]:
+def read_integers(lines: TextLines) -> tuple[IntArray, IntArray]:
     """The integers of all lines, one after the other, and how many each line has: (n,).
 
     Raises:
         FileFormatError: naming the line of the first word that is none.
     """
-    found = _at_once(lines)
+    found = _parse_with_numpy(lines)
     if found is not None and (np.abs(found) < 2.0**53).all() and (found == np.rint(found)).all():
         return found.astype(np.int64).ravel(), _equal(found)
-    return _one_by_one(lines, int, as_integer)
+    return _parse_words(lines, int, parse_vertex_index)
 
 
-def _at_once(lines: Lines, columns: Sequence[int] | None = None) -> FloatArray | None:
+def _parse_with_numpy(lines: TextLines, columns: Sequence[int] | None = None) -> FloatArray | None:
     """A table of numbers by NumPy, or None where it does not succeed.
 
     columns: which to read. None: all, if there are as many in each line.
@@ -195,14 +202,14 @@ def _equal(table: FloatArray) -> IntArray:
     return np.full(len(table), table.shape[1], dtype=np.int64)
 
 
-def _one_by_one(
-    lines: Lines, kind: type[_Number], convert: Callable[[bytes, Place], _Number]
+def _parse_words(
+    lines: TextLines, kind: type[_Number], convert: Callable[[bytes, FileLocation], _Number]
 ) -> tuple[npt.NDArray[Any], IntArray]:
     """The words of lines with different numbers of them, or with what is no number."""
 
     def converted() -> Iterator[_Number]:
         for k, line in enumerate(lines.text):
-            place = lines.places[k]
+            place = lines.locations[k]
             for word in line.split():
                 yield convert(word, place)
 

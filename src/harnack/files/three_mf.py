@@ -13,18 +13,18 @@ import numpy as np
 
 from harnack.files.file_geometry import (
     MAX_BYTES,
-    Contents,
     FileFormatError,
-    Place,
-    Places,
+    FileGeometry,
+    FileLocation,
+    FileLocations,
     check_finite,
     check_indices,
-    triangle_list,
+    triangles_as_polygons,
 )
 
-__all__ = ["FOR_3MF", "read_3mf"]
+__all__ = ["REQUIRED_PACKAGES", "read_3mf"]
 
-FOR_3MF = ("lxml", "networkx")
+REQUIRED_PACKAGES = ("lxml", "networkx")
 """What trimesh needs for 3MF."""
 
 # Millimeters in the units of the format, in the singular that it has and trimesh's plural.
@@ -34,7 +34,7 @@ _UNITS = {
 }  # fmt: skip
 
 
-def read_3mf(path: Path, data: bytes) -> Contents:
+def read_3mf(path: Path, data: bytes) -> FileGeometry:
     """All triangles of the parts that a file's build has, where it puts them, in millimeters.
     Colors and settings are ignored, also that a part is not to be printed.
 
@@ -44,8 +44,8 @@ def read_3mf(path: Path, data: bytes) -> Contents:
     """
     import trimesh  # here, since it takes half a second
 
-    place = Place(path)
-    missing = [name for name in FOR_3MF if importlib.util.find_spec(name) is None]
+    place = FileLocation(path)
+    missing = [name for name in REQUIRED_PACKAGES if importlib.util.find_spec(name) is None]
     if missing:
         raise place.error(f"3MF needs {' and '.join(missing)}: pip install 'harnack[3mf]'")
     try:
@@ -67,7 +67,7 @@ def read_3mf(path: Path, data: bytes) -> Contents:
         raise place.error(f"it is no sound 3MF file ({reason[0][:120]})") from None
 
 
-def _contents(place: Place, scene: Any) -> Contents:
+def _contents(place: FileLocation, scene: Any) -> FileGeometry:
     """The triangles of a scene's nodes."""
     unit = str(scene.units or "millimeter").lower().removesuffix("s")
     if unit not in _UNITS:
@@ -77,7 +77,7 @@ def _contents(place: Place, scene: Any) -> Contents:
         matrix, name = scene.graph[node]
         part = scene.geometry[name]
         corners = np.asarray(part.faces, np.int64)
-        own = triangle_list(place.path, corners)
+        own = triangles_as_polygons(place.path, corners)
         check_indices(own, len(part.vertices))
         x = np.asarray(part.vertices, np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
         if np.linalg.det(matrix[:3, :3]) < 0:  # a mirror image
@@ -86,7 +86,7 @@ def _contents(place: Place, scene: Any) -> Contents:
         faces.append(corners + count)
         count += len(x)
     x, triangles = np.concatenate(vertices), np.concatenate(faces)
-    check_finite(x, Places(place.path, "vertex", range(len(x))))
+    check_finite(x, FileLocations(place.path, "vertex", range(len(x))))
     if not len(triangles):
         raise place.error("it holds no triangles")
-    return Contents(place.path, x, faces=triangle_list(place.path, triangles))
+    return FileGeometry(place.path, x, faces=triangles_as_polygons(place.path, triangles))

@@ -20,26 +20,26 @@ from harnack.fields.analytic.periodic import EigenfunctionSum, Gyroid, SchwarzD,
 from harnack.fields.analytic.plane import HeightField, LevelCurves
 from harnack.fields.analytic.polynomial import HarmonicPolynomial, SphericalHarmonic
 from harnack.fields.analytic.riemann_surface import RiemannSurface
-from harnack.fields.analytic.waves import Product, sine
+from harnack.fields.analytic.waves import WaveProduct, sine_factor
 from harnack.fields.solid_angles.solid_angle import SolidAngle
-from harnack.gallery.scene import DRAWN, Scene
+from harnack.gallery.scene import PICTURE_TOLERANCE, Scene
 from harnack.geometry import Ball, Box, HalfSpace, Volume, example_curves
 from harnack.rendering import Camera
-from harnack.tracer import LevelSet, level_set
+from harnack.tracer import Surface, level_set
 
 
-def _curve(loops: Any, level: Any = None, **settings: Any) -> list[LevelSet]:
-    return [level_set(SolidAngle(loops), level, tolerance=DRAWN, **settings)]
+def _curve(loops: Any, level: Any = None, **settings: Any) -> list[Surface]:
+    return [level_set(SolidAngle(loops), level, tolerance=PICTURE_TOLERANCE, **settings)]
 
 
-def _levels() -> list[LevelSet]:
+def _levels() -> list[Surface]:
     """Five levels of one polygon, cut open."""
     cut = HalfSpace((0.5, -0.9, 0.0), 0.0)
     levels = [k * math.pi for k in (1.0, 1.5, 2.0, 2.5, 3.0)]
     return _curve(example_curves.wavy_polygon(48), levels, clip=cut)
 
 
-def _holes() -> list[LevelSet]:
+def _holes() -> list[Surface]:
     """A square with three holes, bent like a sheet in the wind so that no plane contains it."""
     edge, *holes = example_curves.square_with_holes(24)
     s = np.linspace(0, 1, 10, endpoint=False)[:, None]
@@ -52,46 +52,50 @@ def _bent(loop: FloatArray) -> FloatArray:
     return np.column_stack([x, y, 0.25 * np.sin(2.2 * x) + 0.2 * np.cos(2.0 * y)])
 
 
-def _periodic(kind: Any, *, solid: tuple[float, float], box: bool = False) -> list[LevelSet]:
+def _periodic(kind: Any, *, solid: tuple[float, float], box: bool = False) -> list[Surface]:
     domain = Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)) if box else Ball(radius=1.0)
-    return [level_set(kind(1.0, domain=domain), solid=solid, tolerance=DRAWN)]
+    return [level_set(kind(1.0, domain=domain), solid=solid, tolerance=PICTURE_TOLERANCE)]
 
 
-def _eigenfunctions() -> list[LevelSet]:
+def _eigenfunctions() -> list[Surface]:
     """The paper's Fig. 21: the 1/2 level of a sum of two eigenfunctions."""
-    terms = [Product(1.0, x=sine(k), y=sine(k), z=sine(k)) for k in (6.0, 2.0)]
+    terms = [
+        WaveProduct(1.0, x=sine_factor(k), y=sine_factor(k), z=sine_factor(k)) for k in (6.0, 2.0)
+    ]
     side = math.pi / 2
     domain = Box((-side, -side, -side), (side, side, side))
     solid = (0.5, math.inf)
-    return [level_set(EigenfunctionSum(terms, domain=domain), solid=solid, tolerance=DRAWN)]
+    return [
+        level_set(EigenfunctionSum(terms, domain=domain), solid=solid, tolerance=PICTURE_TOLERANCE)
+    ]
 
 
-def _harmonic(field: Field) -> list[LevelSet]:
-    return [level_set(field, tolerance=DRAWN)]
+def _harmonic(field: Field) -> list[Surface]:
+    return [level_set(field, tolerance=PICTURE_TOLERANCE)]
 
 
-def _on_the_sphere(field: HypersphericalHarmonic, level: float) -> list[LevelSet]:
+def _on_the_sphere(field: HypersphericalHarmonic, level: float) -> list[Surface]:
     """Both levels of a function of S^3, whole: nothing is clipped."""
-    return [level_set(field, [-level, level], tolerance=DRAWN)]
+    return [level_set(field, [-level, level], tolerance=PICTURE_TOLERANCE)]
 
 
-def _lobes() -> list[LevelSet]:
+def _lobes() -> list[Surface]:
     """Those where the function is positive, and where it is negative."""
     lobes = Lobes(3, 2)
     return [
-        level_set(part, solid=(-math.inf, 0.0), tolerance=DRAWN)
+        level_set(part, solid=(-math.inf, 0.0), tolerance=PICTURE_TOLERANCE)
         for part in (lobes.positive, lobes.negative)
     ]
 
 
-def _quartic() -> list[LevelSet]:
+def _quartic() -> list[Surface]:
     """x^3 y + x y^3 - 3 x y (w^2 + z^2), the example of Gillespie et al. 2024, Appendix E.2. On the
     sphere it is x y (4 (x^2 + y^2) - 3), hence at most 1/2."""
     terms = {(3, 1, 0, 0): 1.0, (1, 3, 0, 0): 1.0, (1, 1, 0, 2): -3.0, (1, 1, 2, 0): -3.0}
     return _on_the_sphere(HypersphericalHarmonic.from_polynomial(terms), 0.15)
 
 
-def _fitted_knot() -> list[LevelSet]:
+def _fitted_knot() -> list[Surface]:
     """Gaussians along a trefoil knot, by a series of 16 x 16 x 9 cosines."""
     curve = example_curves.torus_knot(2, 3, 150)
     step = np.linalg.norm(np.roll(curve, -1, axis=0) - curve, axis=1)
@@ -107,7 +111,7 @@ def _fitted_knot() -> list[LevelSet]:
     low, high = curve.min(axis=0) - 2.6 * width, curve.max(axis=0) + 2.6 * width
     box = low.tolist(), high.tolist()
     series = FourierSeries.fit(density, box, (16, 16, 9), samples=(48, 48, 28))
-    return [level_set(series, solid=(0.4, math.inf), tolerance=DRAWN)]
+    return [level_set(series, solid=(0.4, math.inf), tolerance=PICTURE_TOLERANCE)]
 
 
 CURVES = (
@@ -248,34 +252,34 @@ SOLIDS = (
 # Over the plane.
 
 
-def _surface(function: Any, part: str = "imag", **settings: Any) -> list[LevelSet]:
-    return [level_set(RiemannSurface(function, part, **settings), tolerance=DRAWN)]
+def _surface(function: Any, part: str = "imag", **settings: Any) -> list[Surface]:
+    return [level_set(RiemannSurface(function, part, **settings), tolerance=PICTURE_TOLERANCE)]
 
 
-def _elliptic(domain: Volume) -> list[LevelSet]:
+def _elliptic(domain: Volume) -> list[Surface]:
     """sqrt(z^3 - z): a torus less its points at infinity."""
-    return _surface("sqrt", of={0: 1, 1: 1, -1: 1}, height=0.6, domain=domain)
+    return _surface("sqrt", argument={0: 1, 1: 1, -1: 1}, height=0.6, domain=domain)
 
 
-def _lemniscates() -> list[LevelSet]:
+def _lemniscates() -> list[Surface]:
     """Level curves of the potential of three line charges."""
     triangle = {complex(math.cos(a), math.sin(a)): 1 for a in (0.5 * math.pi, 3.7, 5.8)}
-    field = LevelCurves("log", of=triangle, domain=Box((-2.2, -2.2, -0.2), (2.2, 2.2, 0.2)))
-    return [level_set(field, [-1.2, -0.6, 0.0, 0.6, 1.2, 1.8], tolerance=DRAWN)]
+    field = LevelCurves("log", argument=triangle, domain=Box((-2.2, -2.2, -0.2), (2.2, 2.2, 0.2)))
+    return [level_set(field, [-1.2, -0.6, 0.0, 0.6, 1.2, 1.8], tolerance=PICTURE_TOLERANCE)]
 
 
-def _field_lines() -> list[LevelSet]:
+def _field_lines() -> list[Surface]:
     """Field lines of a charge and its opposite: level curves of the conjugate function."""
-    field = LevelCurves("log", "imag", of={1: 1, -1: -1})
-    return [level_set(field, [k * math.pi / 6 for k in range(12)], tolerance=DRAWN)]
+    field = LevelCurves("log", "imag", argument={1: 1, -1: -1})
+    return [level_set(field, [k * math.pi / 6 for k in range(12)], tolerance=PICTURE_TOLERANCE)]
 
 
-def _ripples() -> list[LevelSet]:
+def _ripples() -> list[Surface]:
     field = HeightField(
         lambda x, y: exp(-(x**2 + y**2) * 1.5) * sin(x * 5 + cos(y * 4)) * 0.6,
         domain=Box((-1.5, -1.5, -1.0), (1.5, 1.5, 1.0)),
     )
-    return [level_set(field, tolerance=DRAWN)]
+    return [level_set(field, tolerance=PICTURE_TOLERANCE)]
 
 
 PLANE = (

@@ -9,25 +9,25 @@ import numpy as np
 from harnack.backend import FloatArray
 from harnack.fields.solid_angles.dipole import DipolePotential
 from harnack.fields.solid_angles.winding_number import WindingNumber
-from harnack.gallery.scene import DRAWN, Scene
+from harnack.gallery.scene import PICTURE_TOLERANCE, Scene
 from harnack.geometry import example_curves, example_meshes
 from harnack.rendering import Camera
-from harnack.tracer import LevelSet, level_set
+from harnack.tracer import Surface, level_set
 
 # Evenly spread over any range: multiples of it, modulo 1.
 _GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
 
 
-def _cut_mesh() -> list[LevelSet]:
+def _cut_mesh() -> list[Surface]:
     """A bumpy sphere with round holes cut into it."""
     vertices, faces = example_meshes.bumpy_sphere(6)
     middles = vertices[faces].mean(axis=1)
     middles /= np.linalg.norm(middles, axis=1, keepdims=True)
-    whole = (middles @ _spread(14).T < math.cos(0.27)).all(axis=1)
-    return [level_set(WindingNumber(vertices, faces[whole]), tolerance=DRAWN)]
+    whole = (middles @ _spiral_directions(14).T < math.cos(0.27)).all(axis=1)
+    return [level_set(WindingNumber(vertices, faces[whole]), tolerance=PICTURE_TOLERANCE)]
 
 
-def _spread(n: int) -> FloatArray:
+def _spiral_directions(n: int) -> FloatArray:
     """n directions (n, 3), evenly spread."""
     k = np.arange(n)
     z, turn = 1.0 - (2.0 * k + 1.0) / n, 2.0 * math.pi * _GOLDEN * k
@@ -35,7 +35,7 @@ def _spread(n: int) -> FloatArray:
     return np.column_stack([across * np.cos(turn), across * np.sin(turn), z])
 
 
-def _soup() -> list[LevelSet]:
+def _soup() -> list[Surface]:
     """Loose triangles: every one shrunk about its middle, a tenth of them missing."""
     vertices, faces = example_meshes.torus_mesh(1.0, 0.42, 20, 9)
     faces = example_meshes.remove_faces(faces, 0.1, seed=1)
@@ -43,10 +43,10 @@ def _soup() -> list[LevelSet]:
     middle = corners.mean(axis=1, keepdims=True)
     loose = (middle + 0.86 * (corners - middle)).reshape(-1, 3)
     field = WindingNumber(loose, np.arange(len(loose)).reshape(-1, 3))
-    return [level_set(field, tolerance=DRAWN)]
+    return [level_set(field, tolerance=PICTURE_TOLERANCE)]
 
 
-def _cloud() -> list[LevelSet]:
+def _cloud() -> list[Surface]:
     """Random points on a quartic with five handles, with its gradients as normals."""
     points = np.random.default_rng(2).uniform(-2.5, 2.5, (12000, 3))
     for _ in range(40):
@@ -54,7 +54,7 @@ def _cloud() -> list[LevelSet]:
         points = points - 0.7 * (value / (gradient**2).sum(axis=1))[:, None] * gradient
     value, gradient = _tangle(points)
     found = (np.abs(value) < 1e-9) & (np.abs(points) < 2.6).all(axis=1)
-    return [level_set(DipolePotential(points[found], gradient[found]), tolerance=DRAWN)]
+    return [level_set(DipolePotential(points[found], gradient[found]), tolerance=PICTURE_TOLERANCE)]
 
 
 def _tangle(points: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -63,7 +63,7 @@ def _tangle(points: FloatArray) -> tuple[FloatArray, FloatArray]:
     return value, 4.0 * points**3 - 10.0 * points
 
 
-def _knot_cloud() -> list[LevelSet]:
+def _knot_cloud() -> list[Surface]:
     """Points on a tube around a trefoil, like the seeds of a sunflower."""
     n, count = 1200, 8000
     curve = example_curves.torus_knot(2, 3, n)
@@ -76,7 +76,11 @@ def _knot_cloud() -> list[LevelSet]:
     u /= np.linalg.norm(u, axis=1, keepdims=True)
     normals = np.cos(turn) * u + np.sin(turn) * np.cross(along[at], u)
     radius = 0.055 * float(np.ptp(curve))
-    return [level_set(DipolePotential(curve[at] + radius * normals, normals), tolerance=DRAWN)]
+    return [
+        level_set(
+            DipolePotential(curve[at] + radius * normals, normals), tolerance=PICTURE_TOLERANCE
+        )
+    ]
 
 
 MESHES = (

@@ -6,12 +6,12 @@ import math
 
 import numpy as np
 
-from harnack.fields.solids.extrusions import Extruded
-from harnack.fields.solids.thread import thread
+from harnack.fields.solids.extrusions import Extrusion
+from harnack.fields.solids.thread import metric_thread
 from harnack.files import outline
-from harnack.gallery.scene import DRAWN, Scene
+from harnack.gallery.scene import PICTURE_TOLERANCE, Scene
 from harnack.rendering import Camera
-from harnack.tracer import LevelSet, Tolerance, level_set
+from harnack.tracer import HitTolerance, Surface, level_set
 
 # harnack.outline.text("harnack", 1000, tolerance=4): x, y of each loop, so that the scene does
 # without matplotlib. Behind the letters a are their holes.
@@ -46,27 +46,27 @@ _WORD: tuple[tuple[int, ...], ...] = (
 )  # fmt: skip
 
 
-def _nameplate() -> list[LevelSet]:
+def _nameplate() -> list[Surface]:
     """A plate with round ends and a hole, and the word on it."""
     angle = np.linspace(-0.5 * math.pi, 0.5 * math.pi, 90)
     right = np.column_stack([4.2 + 0.75 * np.cos(angle), 0.75 * np.sin(angle)])
     left = np.column_stack([-0.6 - 0.75 * np.cos(angle), -0.75 * np.sin(angle)])
-    (hole,) = outline.regular(120, 0.25)
-    plate = Extruded([np.concatenate([right, left]), hole - (0.65, 0.0)], 0.2)
+    (hole,) = outline.regular_polygon(120, 0.25)
+    plate = Extrusion([np.concatenate([right, left]), hole - (0.65, 0.0)], 0.2)
     letters = [np.reshape(loop, (-1, 2)) / 1000.0 - (0.0, 0.37) for loop in _WORD]
     # A little way into the plate, so that no faces coincide.
-    raised = Extruded(letters, 0.25).moved((0.0, 0.0, 0.15))
-    parts = (plate.moved((-1.8, 0.0, 0.0)), raised.moved((-1.8, 0.0, 0.0)))
-    return [level_set(one, tolerance=DRAWN) for one in parts]
+    raised = Extrusion(letters, 0.25).translated((0.0, 0.0, 0.15))
+    parts = (plate.translated((-1.8, 0.0, 0.0)), raised.translated((-1.8, 0.0, 0.0)))
+    return [level_set(one, tolerance=PICTURE_TOLERANCE) for one in parts]
 
 
-def _bolt() -> list[LevelSet]:
+def _bolt() -> list[Surface]:
     """An M8 bolt, and a nut beside it; in millimeters."""
-    hexagon = outline.regular(6, 13.0 / math.sqrt(3.0))
-    bolt = thread("M8", 22.0) | Extruded(hexagon, 5.3).moved((0.0, 0.0, -5.3))
-    nut = Extruded(hexagon, 6.5) - thread("M8", 8.0, internal=True, clearance=0.05)
-    lying = nut.rotated(20.0).moved((-8.0, -14.0, -5.3))
-    return [level_set(one, tolerance=Tolerance(2e-3)) for one in (bolt, lying)]
+    hexagon = outline.regular_polygon(6, 13.0 / math.sqrt(3.0))
+    bolt = metric_thread("M8", 22.0) | Extrusion(hexagon, 5.3).translated((0.0, 0.0, -5.3))
+    nut = Extrusion(hexagon, 6.5) - metric_thread("M8", 8.0, internal=True, clearance=0.05)
+    lying = nut.rotated(20.0).translated((-8.0, -14.0, -5.3))
+    return [level_set(one, tolerance=HitTolerance(2e-3)) for one in (bolt, lying)]
 
 
 OUTLINES = (

@@ -7,12 +7,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from harnack.rendering import Camera, render
-from harnack.tracer import LevelSet, Tolerance
+from harnack.tracer import HitTolerance, Surface
 
-Surfaces = Callable[[], "list[LevelSet]"]
+SurfaceFactory = Callable[[], "list[Surface]"]
 
 # Fine enough that no pixel of a demo picture shows it, coarse enough for shadow rays to be quick.
-DRAWN = Tolerance(2e-4)
+PICTURE_TOLERANCE = HitTolerance(2e-4)
 
 
 @dataclass(frozen=True)
@@ -25,10 +25,10 @@ class Scene:
 
     name: str
     title: str
-    surfaces: Surfaces
+    surfaces: SurfaceFactory
     materials: tuple[str, ...] = ("two-tone",)
     camera: Camera = field(default_factory=Camera)
-    show: str = "color"
+    show: str = "path"
     demo_spp: int = 0
 
     def render(self, path: Any = None, **settings: Any) -> Any:

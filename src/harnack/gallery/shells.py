@@ -12,33 +12,33 @@ from harnack.backend import FloatArray
 from harnack.distance import Family, curvature_lines
 from harnack.fields.solid_angles.polygon_mesh import PolygonMesh
 from harnack.fields.solid_angles.solid_angle import SolidAngle
-from harnack.fields.solids.tube import Tube, Tubes
-from harnack.gallery.scene import DRAWN, Scene
+from harnack.fields.solids.tube import Tube, TubeNetwork
+from harnack.gallery.scene import PICTURE_TOLERANCE, Scene
 from harnack.geometry import Circle, HalfSpace, example_meshes
-from harnack.geometry.polygon_meshes import polygon_patches
+from harnack.geometry.polygon_meshes import cluster_into_polygons
 from harnack.rendering import Camera
-from harnack.tracer import LevelSet, Tolerance, level_set
+from harnack.tracer import HitTolerance, Surface, level_set
 
 # Edges of faces lie inside the picture: what is met within the tolerance of one has no normal.
-_CLOSE = Tolerance(1e-5)
+_CLOSE = HitTolerance(1e-5)
 
 
-def _exoskeleton() -> list[LevelSet]:
+def _exoskeleton() -> list[Surface]:
     """A wavy torus of some 150 patches, and tubes around their edges."""
     vertices, faces = example_meshes.torus_mesh(1.0, 0.45, 240, 108)
     turn = np.arctan2(vertices[:, 1], vertices[:, 0])
     ring = np.column_stack([np.cos(turn), np.sin(turn), 0.25 * np.sin(3 * turn)])
     across = vertices - np.column_stack([np.cos(turn), np.sin(turn), 0 * turn])
     wavy = ring + across * (1 + 0.25 * np.cos(3 * turn))[:, None]
-    mesh = PolygonMesh(*polygon_patches(wavy, faces, 150, smoothing=12))
-    tubes = Tubes(mesh.vertices, mesh.edges, 0.011)
+    mesh = PolygonMesh(*cluster_into_polygons(wavy, faces, 150, smoothing=12))
+    tubes = TubeNetwork(mesh.vertices, mesh.edges, 0.011)
     return [level_set(mesh, tolerance=_CLOSE), level_set(tubes, tolerance=_CLOSE)]
 
 
-def _patches() -> list[LevelSet]:
+def _patches() -> list[Surface]:
     """A bumpy sphere of 5,200 patches with some eleven corners each."""
     vertices, faces = example_meshes.bumpy_sphere(6)
-    mesh = PolygonMesh(*polygon_patches(vertices, faces, 5200))
+    mesh = PolygonMesh(*cluster_into_polygons(vertices, faces, 5200))
     return [level_set(mesh, tolerance=_CLOSE)]
 
 
@@ -64,7 +64,7 @@ EXOSKELETONS = (
 
 # Grid shells.
 
-_FAMILIES: tuple[Family, Family] = ("largest", "smallest")
+_FAMILIES: tuple[Family, Family] = ("maximum", "minimum")
 
 
 @dataclass(frozen=True)
@@ -118,18 +118,18 @@ class GridShell:
 
         near = 0.3 * self.spacing
         crossing = [
-            max(pair, key=lambda line: _rise_above(line, near))
+            max(pair, key=lambda line: _relative_height(line, near))
             for pair in zip(*lines(ground + near * rise), strict=True)
         ]
-        kept = _apart(crossing, 0.55 * self.spacing)
+        kept = _drop_parallel_lines(crossing, 0.55 * self.spacing)
         # Along some of them, seeds of the other family.
         spines = kept[:: max(1, len(kept) // 6)]
         seeds = np.concatenate([spine[2:-2:2] for spine in spines])
         along = [
-            min(pair, key=lambda line: min(_agreement(line, spine) for spine in spines))
+            min(pair, key=lambda line: min(_crossing_cosine(line, spine) for spine in spines))
             for pair in zip(*lines(seeds), strict=True)
         ]
-        return [*kept, *_apart(along, 0.55 * self.spacing), *self._edges()]
+        return [*kept, *_drop_parallel_lines(along, 0.55 * self.spacing), *self._edges()]
 
     def _rims(self) -> tuple[FloatArray, FloatArray]:
         """Points (n, 2) of the rims, and unit vectors from there into the region."""
@@ -158,12 +158,12 @@ class GridShell:
         return edges
 
 
-def _rise_above(line: FloatArray, reach: float) -> float:
+def _relative_height(line: FloatArray, reach: float) -> float:
     """How far from its start, over the reach, a line gets: lines along a rim stay beside it."""
     return float(line[:, 2].max() - line[:, 2].min()) / reach if len(line) else -1.0
 
 
-def _agreement(line: FloatArray, other: FloatArray) -> float:
+def _crossing_cosine(line: FloatArray, other: FloatArray) -> float:
     """|cos| of the angle at which a line crosses another that passes through its middle."""
     if len(line) < 3:
         return 2.0
@@ -174,7 +174,7 @@ def _agreement(line: FloatArray, other: FloatArray) -> float:
     return float(abs(a @ b) / (np.linalg.norm(a) * np.linalg.norm(b)))
 
 
-def _apart(lines: Sequence[FloatArray], gap: float) -> list[FloatArray]:
+def _drop_parallel_lines(lines: Sequence[FloatArray], gap: float) -> list[FloatArray]:
     """The lines, longest first, that do not run beside one that was kept for most of their way;
     of each, every second point."""
     kept: list[FloatArray] = []
@@ -190,13 +190,13 @@ def _apart(lines: Sequence[FloatArray], gap: float) -> list[FloatArray]:
     return [np.concatenate([line[:-1:2], line[-1:]]) for line in kept]
 
 
-def _drawn(shell: GridShell) -> list[LevelSet]:
+def _grid_shell_surfaces(shell: GridShell) -> list[Surface]:
     field = shell.field()
     ground = HalfSpace((0, 0, -1), 0.0)
-    beams = Tube.around(shell.beams(field), shell.thickness)
+    beams = Tube.from_polylines(shell.beams(field), shell.thickness)
     return [
-        level_set(field, shell.level, clip=ground, tolerance=DRAWN),
-        level_set(beams, solid=(-math.inf, 0.0), tolerance=DRAWN),
+        level_set(field, shell.level, clip=ground, tolerance=PICTURE_TOLERANCE),
+        level_set(beams, solid=(-math.inf, 0.0), tolerance=PICTURE_TOLERANCE),
     ]
 
 
@@ -217,7 +217,7 @@ SHELLS = (
     Scene(
         "shell-ring",
         "a grid shell over a 12-gon with a round hole (after the paper's Fig. 17)",
-        lambda: _drawn(GridShell(_regular(12), ((0.0, 0.0, 0.4),), 1.4, 0.13, 0.006)),
+        lambda: _grid_shell_surfaces(GridShell(_regular(12), ((0.0, 0.0, 0.4),), 1.4, 0.13, 0.006)),
         ("porcelain", "copper"),
         Camera(azimuth=-60, elevation=34),
         show="shaded",
@@ -225,7 +225,9 @@ SHELLS = (
     Scene(
         "shell-court",
         "a grid shell over the Great Court of the British Museum (after the paper's Fig. 17)",
-        lambda: _drawn(GridShell(_COURT / _UNIT, ((0.0, 0.0, 22.245 / _UNIT),), 1.2, 0.15, 0.008)),
+        lambda: _grid_shell_surfaces(
+            GridShell(_COURT / _UNIT, ((0.0, 0.0, 22.245 / _UNIT),), 1.2, 0.15, 0.008)
+        ),
         ("porcelain", "copper"),
         Camera(azimuth=-60, elevation=34),
         show="shaded",
@@ -233,7 +235,7 @@ SHELLS = (
     Scene(
         "shell-columns",
         "a grid shell on five columns (after the paper's Fig. 17)",
-        lambda: _drawn(
+        lambda: _grid_shell_surfaces(
             GridShell(_PAVILION, tuple((x, y, 0.13) for x, y in _COLUMNS), 1.2, 0.16, 0.008)
         ),
         ("porcelain", "copper"),

@@ -16,38 +16,38 @@ from harnack.fields import Field, Solid
 from harnack.fields.analytic.periodic import Gyroid
 from harnack.fields.blobs.blobs import Blobs, Molecule
 from harnack.fields.blobs.hrbf import HRBF
-from harnack.fields.blobs.kernels import Compact
+from harnack.fields.blobs.kernels import CompactKernel
 from harnack.fields.solid_angles.solid_angle import SolidAngle
 from harnack.fields.solids.booleans import union
-from harnack.fields.solids.fractal import Displaced, FractalNoise
+from harnack.fields.solids.fractal import DisplacedSolid, FractalNoise
 from harnack.fields.solids.from_field import solid
 from harnack.fields.solids.julia import Julia
 from harnack.fields.solids.primitives import Sphere, Torus
 from harnack.fields.solids.tube import Tube
 from harnack.files import Atoms
-from harnack.gallery.scene import DRAWN, Scene
+from harnack.gallery.scene import PICTURE_TOLERANCE, Scene
 from harnack.geometry import example_curves
 from harnack.rendering import Camera
-from harnack.tracer import LevelSet, level_set
+from harnack.tracer import Surface, level_set
 
 _VAN_DER_WAALS = {"H": 1.2, "C": 1.7, "N": 1.55, "O": 1.52}
 
 
-def _solid(field: Field, level: float) -> list[LevelSet]:
-    return [level_set(field, solid=(level, math.inf), tolerance=DRAWN)]
+def _solid(field: Field, level: float) -> list[Surface]:
+    return [level_set(field, solid=(level, math.inf), tolerance=PICTURE_TOLERANCE)]
 
 
-def _metaballs() -> list[LevelSet]:
+def _metaballs() -> list[Surface]:
     """Drops around a large one, and a bite taken out of it."""
     angle = np.linspace(0, 2 * math.pi, 9, endpoint=False)
     ring = np.column_stack([np.cos(angle), np.sin(angle), 0.35 * np.sin(3 * angle)])
     centers = np.concatenate([[[0.0, 0.0, 0.0]], 1.15 * ring, [[0.35, -0.55, 0.5]]])
     radii = np.concatenate([[0.72], 0.26 + 0.06 * np.cos(2 * angle), [0.42]])
     weights = np.array([1.0] * 10 + [-1.2])
-    return _solid(Blobs(centers, radii, weights, kernel=Compact(1.8)), 1.0)
+    return _solid(Blobs(centers, radii, weights, kernel=CompactKernel(1.8)), 1.0)
 
 
-def _groups() -> list[LevelSet]:
+def _groups() -> list[Surface]:
     """Two rings of blobs that flow together, each ring by itself, and meet in creases."""
     angle = np.linspace(0, 2 * math.pi, 12, endpoint=False)
     flat = np.column_stack([np.cos(angle) - 0.5, np.sin(angle), 0 * angle])
@@ -56,7 +56,7 @@ def _groups() -> list[LevelSet]:
     return _solid(Blobs(centers, 0.3, groups=[0] * 12 + [1] * 12), 1.0)
 
 
-def _through_points() -> list[LevelSet]:
+def _through_points() -> list[Surface]:
     """A surface through 18 points on a torus, with the torus's normals."""
     points, normals = [], []
     for j in range(6):
@@ -66,7 +66,7 @@ def _through_points() -> list[LevelSet]:
             normal = math.cos(v) * way + math.sin(v) * np.array([0.0, 0.0, 1.0])
             points.append(way + 0.42 * normal)
             normals.append(normal)
-    return [level_set(HRBF(points, normals), solid=(-math.inf, 0.0), tolerance=DRAWN)]
+    return [level_set(HRBF(points, normals), solid=(-math.inf, 0.0), tolerance=PICTURE_TOLERANCE)]
 
 
 def _helix() -> Atoms:
@@ -130,21 +130,21 @@ BLOBS = (
 # Solids.
 
 
-def _drawn(*solids: Solid) -> list[LevelSet]:
-    return [level_set(one, tolerance=DRAWN) for one in solids]
+def _drawn(*solids: Solid) -> list[Surface]:
+    return [level_set(one, tolerance=PICTURE_TOLERANCE) for one in solids]
 
 
-def _carved() -> list[LevelSet]:
+def _carved() -> list[Surface]:
     """A ball with a torus cut out, twisted, and a ring blended to it."""
     ball = (Sphere(1.0) - Torus(0.85, 0.28)).twisted(1.5, "x")
     return _drawn(ball.blended(Torus(1.15, 0.12), 0.15))
 
 
-def _tori() -> list[LevelSet]:
+def _tori() -> list[Surface]:
     """Two tori of radii 1 and 0.1 blended with (power, radius) = (2, 0.5), (8, 0.5), (8, 0.2)."""
     link = Torus(1.0, 0.1).rotated(90, "x")
     pairs = [Torus(1.0, 0.1).blended(link, r, power=p) for p, r in ((2, 0.5), (8, 0.5), (8, 0.2))]
-    return _drawn(*(one.moved((0.0, 2.4 * k, 0.0)) for k, one in enumerate(pairs)))
+    return _drawn(*(one.translated((0.0, 2.4 * k, 0.0)) for k, one in enumerate(pairs)))
 
 
 # Cubic Bezier curves in the plane of the page, letter by letter: "harnack".
@@ -164,7 +164,7 @@ _LETTERS: tuple[tuple[float, tuple[tuple[float, ...], ...]], ...] = (
 )  # fmt: skip
 
 
-def _letters() -> list[LevelSet]:
+def _letters() -> list[Surface]:
     """Tubes around 19 cubic Bezier curves."""
     tubes: list[Solid] = []
     for start, curves in _LETTERS:
@@ -175,26 +175,26 @@ def _letters() -> list[LevelSet]:
     return _drawn(union(*tubes))
 
 
-def _lava() -> list[LevelSet]:
+def _lava() -> list[Surface]:
     noise = FractalNoise(6, beta=1.0, frequency=1.6, amplitude=0.55, seed=4)
-    return _drawn(Displaced(Sphere(1.0), noise))
+    return _drawn(DisplacedSolid(Sphere(1.0), noise))
 
 
-def _lattice() -> list[LevelSet]:
+def _lattice() -> list[Surface]:
     return _drawn(solid(Gyroid(0.5), between=(-0.4, 0.4)) & Torus(0.8, 0.4))
 
 
-def _knot() -> list[LevelSet]:
+def _knot() -> list[Surface]:
     """A thick Seifert surface of the trefoil knot, and a tube around the knot itself."""
     curve: FloatArray = example_curves.torus_knot(2, 3, 120)
     surface = solid(SolidAngle(curve), around=(2 * math.pi, 0.12))
     return _drawn(surface, Tube(np.concatenate([curve, curve[:1]]), 0.09))
 
 
-def _jelly() -> list[LevelSet]:
+def _jelly() -> list[Surface]:
     rng = np.random.default_rng(8)
-    blobs: Any = Blobs(rng.normal(size=(14, 3)) * 0.55, 0.55, kernel=Compact(1.7))
-    return [level_set(blobs, solid=(1.0, math.inf), tolerance=DRAWN)]
+    blobs: Any = Blobs(rng.normal(size=(14, 3)) * 0.55, 0.55, kernel=CompactKernel(1.7))
+    return [level_set(blobs, solid=(1.0, math.inf), tolerance=PICTURE_TOLERANCE)]
 
 
 SHAPES = (

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from harnack.geometry import example_curves, example_meshes
-from harnack.geometry.clip_volumes import Ball, Box, HalfSpace, Intersection
+from harnack.geometry.clip_volumes import Ball, Box, HalfSpace, VolumeIntersection
 from harnack.geometry.clouds import CloudError, estimate_areas, estimate_normals, validate_cloud
 from harnack.geometry.convex_position import ConvexHull
 from harnack.geometry.curves import (
     Circle,
     CurveError,
     bounding_box,
-    edges,
+    edge_endpoints,
     is_convex_position,
     total_length,
     validate_loops,
@@ -32,11 +32,11 @@ __all__ = [
     "ConvexHull",
     "CurveError",
     "HalfSpace",
-    "Intersection",
     "MeshError",
     "Volume",
+    "VolumeIntersection",
     "bounding_box",
-    "edges",
+    "edge_endpoints",
     "estimate_areas",
     "estimate_normals",
     "example_curves",

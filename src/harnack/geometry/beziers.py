@@ -8,12 +8,12 @@ import numpy as np
 
 from harnack.backend import FloatArray
 
-__all__ = ["flattened"]
+__all__ = ["flatten_bezier"]
 
 _MOST_SEGMENTS = 1_000_000
 
 
-def flattened(controls: FloatArray, tolerance: float) -> tuple[FloatArray, float]:
+def flatten_bezier(controls: FloatArray, tolerance: float) -> tuple[FloatArray, float]:
     """Points (k, d) of the curve behind its first one, to be joined by segments; and a bound of how
     far these are from the curve.
 

@@ -25,8 +25,8 @@ S is made of closed loops, and 4 pi w is mod 4 pi the solid angle of these loops
 
 Edges are compared by integer index, after equal positions were given one index (`weld_vertices`),
 never by distance: near edges do not cancel, however near they are. Functions of arrays are linear
-but for one sort, and take about a second for a million triangles; `boundary_edges`, `join` and
-`singular_loops` take one Python step an edge.
+but for one sort, and take about a second for a million triangles; `boundary_edges`, `join_edges`
+and `singular_loops` take one Python step an edge.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def boundary_edges(faces: Iterable[Sequence[int]]) -> list[Edge]:
     return remaining
 
 
-def join(edges: Sequence[Edge]) -> list[list[int]]:
+def join_edges(edges: Sequence[Edge]) -> list[list[int]]:
     """Loops of vertex indices made of all the edges.
 
     If as many edges begin as end at every vertex, their directions are kept, and a loop ends
@@ -95,18 +95,18 @@ def join(edges: Sequence[Edge]) -> list[list[int]]:
         balance[a] += 1
         balance[b] -= 1
     if any(balance.values()):
-        edges = _with_common_direction(edges)
+        edges = _orient_consistently(edges)
     leaving: defaultdict[int, list[int]] = defaultdict(list)
     for a, b in reversed(edges):
         leaving[a].append(b)
     loops: list[list[int]] = []
     for a, _ in edges:
         while leaving[a]:
-            loops += _walk(a, leaving)
+            loops += _trace_loops(a, leaving)
     return loops
 
 
-def _walk(start: int, leaving: dict[int, list[int]]) -> list[list[int]]:
+def _trace_loops(start: int, leaving: dict[int, list[int]]) -> list[list[int]]:
     """Loops met on the way from `start` back to it, using up the edges."""
     loops: list[list[int]] = []
     path = [start]
@@ -126,7 +126,7 @@ def _walk(start: int, leaving: dict[int, list[int]]) -> list[list[int]]:
             path.append(vertex)
 
 
-def _with_common_direction(edges: Sequence[Edge]) -> list[Edge]:
+def _orient_consistently(edges: Sequence[Edge]) -> list[Edge]:
     """The edges, reversed where need be so that each loop runs in the direction of its first
     edge."""
     touching: defaultdict[int, list[int]] = defaultdict(list)
@@ -172,7 +172,7 @@ def weld_vertices(vertices: FloatArray) -> IntArray:
     -0.0 equals 0.0. `weld_vertices(vertices)[faces]` are the faces of the welded mesh.
     """
     bits = (np.ascontiguousarray(vertices, dtype=np.float64) + 0.0).view(np.uint64)
-    order, starts = _equal_rows(bits)
+    order, starts = _group_equal_rows(bits)
     first = np.minimum.reduceat(order, starts) if len(order) else order
     welded = np.empty(len(bits), dtype=np.int64)
     welded[order] = np.repeat(first, _lengths(starts, len(order)))
@@ -196,7 +196,7 @@ def net_faces(faces: IntArray) -> NetFaces:
     if not len(proper):
         none = np.zeros(0, dtype=np.int64)
         return NetFaces(none.reshape(0, 3), none, none)
-    order, starts = _equal_rows(corners.view(np.uint64))
+    order, starts = _group_equal_rows(corners.view(np.uint64))
     net = np.add.reduceat(sign[order], starts)
     group_sign = np.repeat(np.sign(net), _lengths(starts, len(order)))
     agreeing = np.where(sign[order] == group_sign, proper[order], np.iinfo(np.int64).max)
@@ -258,10 +258,10 @@ def singular_loops(edges: IntArray, weights: IntArray) -> list[list[int]]:
         OpenChainError: the edges are not those of `singular_edges`: some loop does not close.
     """
     repeated: list[list[int]] = np.repeat(edges, weights, axis=0).tolist()
-    return join([(begin, end) for begin, end in repeated])
+    return join_edges([(begin, end) for begin, end in repeated])
 
 
-def _equal_rows(rows: npt.NDArray[np.uint64]) -> tuple[IntArray, IntArray]:
+def _group_equal_rows(rows: npt.NDArray[np.uint64]) -> tuple[IntArray, IntArray]:
     """An order (n,) that puts equal rows next to each other, and where each group starts in it.
 
     Rows are ordered by a 64-bit hash, and neighbors then compared in full. Should different rows

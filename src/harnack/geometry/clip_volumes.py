@@ -12,41 +12,50 @@ import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
-from harnack.backend import Backend, BoolArray, FloatArray, Mask, Real, Vec3, aligned, backend_of
+from harnack.backend import (
+    Backend,
+    BoolArray,
+    FloatArray,
+    Mask,
+    Real,
+    Vec3,
+    backend_of,
+    upload_floats,
+)
 from harnack.backend.elementary import fmax, fmin
-from harnack.backend.validation import real
+from harnack.backend.validation import as_real
 from harnack.geometry.volume import (
     Point,
     Volume,
+    as_padding,
+    as_point,
     as_points,
     check_volume,
-    checked_distance,
-    checked_point,
-    emptied,
-    rounding,
+    clip_rounding,
+    normalize_empty_interval,
 )
 
-__all__ = ["Ball", "Box", "HalfSpace", "Intersection"]
+__all__ = ["Ball", "Box", "HalfSpace", "VolumeIntersection"]
 
 MAX_UNROLLED = 32
 """Up to this many planes the loop is unrolled into the kernel."""
 
-_CHUNK = 4
+_PLANES_PER_ITERATION = 4
 _NO_CONSTRAINT = (0.0, 0.0, 0.0, 1e30)
 
-State = TypeVar("State", bound=tuple[Any, ...])
+FoldState = TypeVar("FoldState", bound=tuple[Any, ...])
 Prepared = TypeVar("Prepared", bound="Polytope")
 
 
 @dataclass(frozen=True, eq=False)
-class Planes:
+class PlaneTable:
     """Planes n.x <= h as rows (n, h) of four numbers, for a kernel.
 
     backend: where the kernel runs.
     rows: (m, 4) on the host, of which kernels see the numbers where there is no buffer.
     buffer: the rows on the backend, or None: literal numbers serve volumes that were not prepared.
-    length: the number of rows in the buffer as a kernel parameter.
-    reach: the largest |h|, a kernel parameter too if there is a buffer.
+    plane_count: the number of rows in the buffer as a kernel parameter.
+    max_offset: the largest |h|, a kernel parameter too if there is a buffer.
 
     Unrolled, a scalar gather at a literal index costs no more than a literal number (0.4 ns a
     plane and ray in all); a packet gather in a loop makes that 1.1 ns, four planes a trip.
@@ -55,33 +64,33 @@ class Planes:
     backend: Backend
     rows: FloatArray
     buffer: Any
-    length: Any
-    reach: Real
+    plane_count: Any
+    max_offset: Real
 
     @classmethod
-    def literal(cls, backend: Backend, rows: FloatArray) -> Planes:
+    def literal(cls, backend: Backend, rows: FloatArray) -> PlaneTable:
         """The rows (m, 4) as they are."""
         return cls(backend, rows, None, None, backend.Float(_reach(rows)))
 
     @classmethod
-    def upload(cls, backend: Backend, rows: FloatArray) -> Planes:
+    def upload(cls, backend: Backend, rows: FloatArray) -> PlaneTable:
         """The rows (m, 4) in a buffer; it is filled up to a multiple of eight, if they are more, so
         that volumes with about as many planes share a kernel."""
         count = len(rows) if len(rows) <= 8 else -(-len(rows) // 8) * 8
         filled = np.concatenate([rows, np.tile(_NO_CONSTRAINT, (count - len(rows), 1))])
         length = dr.opaque(backend.UInt32, count)
         reach = dr.opaque(backend.Float, _reach(rows))
-        return cls(backend, filled, aligned(backend, filled.ravel()), length, reach)
+        return cls(backend, filled, upload_floats(backend, filled.ravel()), length, reach)
 
     def fold(
         self,
-        state: State,
-        step: Callable[[State, Vec3, Real], State],
-        goes_on: Callable[..., Mask] | None = None,
-    ) -> State:
+        state: FoldState,
+        step: Callable[[FoldState, Vec3, Real], FoldState],
+        may_change: Callable[..., Mask] | None = None,
+    ) -> FoldState:
         """state = step(state, n, h) for every plane.
 
-        goes_on: whether the planes that are left can still change what is made of a state.
+        may_change: whether the planes that are left can still change what is made of a state.
         """
         index = self.backend.UInt32
         if self.buffer is None or len(self.rows) <= MAX_UNROLLED:
@@ -92,18 +101,18 @@ class Planes:
 
         def body(k: Any, *inner: Any) -> tuple[Any, ...]:
             after: Any = inner
-            for i in range(_CHUNK):
+            for i in range(_PLANES_PER_ITERATION):
                 row: Any = dr.gather(self.backend.Array4f, self.buffer, k + i)
                 after = step(after, self.backend.Array3f(row.x, row.y, row.z), row.w)
-            return (k + _CHUNK, *after)
+            return (k + _PLANES_PER_ITERATION, *after)
 
         def wanted(*inner: Any) -> Mask:
-            return self.backend.Bool(True) if goes_on is None else goes_on(*inner)
+            return self.backend.Bool(True) if may_change is None else may_change(*inner)
 
         loop: Any = dr.while_loop  # its overloads do not know run-time array types
         result: Any = loop(
             state=(index(0), *state),
-            cond=lambda k, *inner: (k < self.length) & wanted(*inner),  # pyright: ignore
+            cond=lambda k, *inner: (k < self.plane_count) & wanted(*inner),  # pyright: ignore
             body=body,
             label="planes",
         )
@@ -115,7 +124,7 @@ class Planes:
         return dr.gather(self.backend.Float, self.buffer, self.backend.UInt32(4 * k + i))
 
 
-Slacks: TypeAlias = tuple[Real, Real]
+RoundingSlacks: TypeAlias = tuple[Real, Real]
 
 
 def _reach(rows: FloatArray) -> float:
@@ -133,31 +142,33 @@ class Polytope(Volume):
     t >= |N / D| if N < 0, and no condition if N >= 0.
     """
 
-    _uploaded: Planes | None = field(default=None, repr=False, compare=False, kw_only=True)
+    _device_planes: PlaneTable | None = field(default=None, repr=False, compare=False, kw_only=True)
 
     @abc.abstractmethod
     def planes(self) -> FloatArray:
         """Rows (nx, ny, nz, h), shape (m, 4), float64, all finite."""
 
     def prepare(self: Prepared, backend: Backend) -> Prepared:
-        return replace(self, _uploaded=Planes.upload(backend, self.planes()))
+        return replace(self, _device_planes=PlaneTable.upload(backend, self.planes()))
 
-    def _table(self, backend: Backend) -> Planes:
-        if self._uploaded is not None and self._uploaded.backend == backend:
-            return self._uploaded
+    def _plane_table(self, backend: Backend) -> PlaneTable:
+        if self._device_planes is not None and self._device_planes.backend == backend:
+            return self._device_planes
         rows = self.planes()
         is_recording = dr.flag(dr.JitFlag.SymbolicScope)  # nothing can be uploaded then
         if len(rows) <= MAX_UNROLLED or is_recording:
-            return Planes.literal(backend, rows)
-        return Planes.upload(backend, rows)
+            return PlaneTable.literal(backend, rows)
+        return PlaneTable.upload(backend, rows)
 
-    def _slacks(self, table: Planes, o: Vec3, d: Vec3) -> Callable[[Vec3, Real], Slacks]:
+    def _slacks(
+        self, table: PlaneTable, o: Vec3, d: Vec3
+    ) -> Callable[[Vec3, Real], RoundingSlacks]:
         """(n, h) -> bounds of the errors of h - n.o and n.d."""
         del table
-        eps = rounding(backend_of(o))
+        eps = clip_rounding(backend_of(o))
         abs_o, abs_d = dr.abs(o), dr.abs(d)
 
-        def slacks(n: Vec3, h: Real) -> Slacks:
+        def slacks(n: Vec3, h: Real) -> RoundingSlacks:
             abs_n = dr.abs(n)
             return eps * (dr.dot(abs_n, abs_o) + dr.abs(h)), eps * dr.dot(abs_n, abs_d)
 
@@ -165,7 +176,7 @@ class Polytope(Volume):
 
     def clip(self, o: Vec3, d: Vec3, t_min: Real, t_max: Real) -> tuple[Real, Real]:
         backend = backend_of(o)
-        table = self._table(backend)
+        table = self._plane_table(backend)
         slacks = self._slacks(table, o, d)
 
         def step(state: tuple[Real, Real], n: Vec3, h: Real) -> tuple[Real, Real]:
@@ -184,11 +195,11 @@ class Polytope(Volume):
         def holds(t0: Real, t1: Real) -> Mask:  # what is empty stays empty
             return t0 < t1
 
-        return emptied(*table.fold((lanes + t_min, lanes + t_max), step, holds))
+        return normalize_empty_interval(*table.fold((lanes + t_min, lanes + t_max), step, holds))
 
     def contains(self, p: Vec3) -> Mask:
         backend = backend_of(p)
-        eps = rounding(backend)
+        eps = clip_rounding(backend)
         abs_p = dr.abs(p)
 
         def step(state: tuple[Mask], n: Vec3, h: Real) -> tuple[Mask]:
@@ -196,7 +207,7 @@ class Polytope(Volume):
             return (state[0] & (dr.dot(n, p) - h <= slack),)
 
         everywhere = dr.full(backend.Bool, True, dr.width(p))
-        return self._table(backend).fold((everywhere,), step)[0]
+        return self._plane_table(backend).fold((everywhere,), step)[0]
 
     def signed_distance(self, p: Vec3) -> Real:
         return self._nearest_plane(p)[0]
@@ -217,7 +228,7 @@ class Polytope(Volume):
             dr.full(backend.Float, -dr.inf, width),
             backend.Array3f(0, 0, 1) + dr.zeros(backend.Array3f, width),
         )
-        return self._table(backend).fold(start, step)
+        return self._plane_table(backend).fold(start, step)
 
     def contains_points(self, points: npt.ArrayLike) -> BoolArray:
         x = as_points(points)
@@ -236,7 +247,7 @@ class Ball(Volume):
 
     center: Point = (0.0, 0.0, 0.0)
     radius: float = 1.0
-    _numbers: Any = field(default=None, repr=False, compare=False)
+    _device_numbers: Any = field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if isinstance(self.center, int | float):
@@ -244,20 +255,20 @@ class Ball(Volume):
                 f"the center of a ball must be three numbers, not {self.center!r}: for one about "
                 f"the origin, write Ball(radius={self.center!r})"
             )
-        object.__setattr__(self, "center", checked_point(self.center, "the center of a ball"))
-        radius = real(self.radius, "the radius of a ball")
+        object.__setattr__(self, "center", as_point(self.center, "the center of a ball"))
+        radius = as_real(self.radius, "the radius of a ball")
         if not 0.0 < radius < np.inf:
             raise ValueError(f"the radius of a ball must be positive, not {self.radius!r}")
         object.__setattr__(self, "radius", radius)
 
-    def _on(self, backend: Backend) -> tuple[Vec3, Real]:
-        if self._numbers is not None and backend_of(self._numbers[0]) == backend:
-            return self._numbers
+    def _center_and_radius(self, backend: Backend) -> tuple[Vec3, Real]:
+        if self._device_numbers is not None and backend_of(self._device_numbers[0]) == backend:
+            return self._device_numbers
         return backend.Array3f(*self.center), backend.Float(self.radius)
 
     def prepare(self, backend: Backend) -> Ball:
         center = backend.Array3f(*(dr.opaque(backend.Float, c) for c in self.center))
-        return replace(self, _numbers=(center, dr.opaque(backend.Float, self.radius)))
+        return replace(self, _device_numbers=(center, dr.opaque(backend.Float, self.radius)))
 
     def clip(self, o: Vec3, d: Vec3, t_min: Real, t_max: Real) -> tuple[Real, Real]:
         """The discriminant r^2 - |perp|^2 is taken from perp, the vector from the center to the
@@ -266,32 +277,32 @@ class Ball(Volume):
         With u the unit roundoff, perp and the parameter of the nearest point are off by a few
         u |o - c|, c and r by u |c| and u r: so much is added to r and to both ends."""
         backend = backend_of(o)
-        c, r = self._on(backend)
+        c, r = self._center_and_radius(backend)
         from_center = o - c
         speed = dr.norm(d)
         along = -dr.dot(from_center, d) / (speed * speed)
         clearance = dr.norm(dr.fma(d, along, from_center))
-        slack = rounding(backend) * (dr.norm(from_center) + dr.norm(c) + r)
+        slack = clip_rounding(backend) * (dr.norm(from_center) + dr.norm(c) + r)
         reach = r + slack
         half = dr.sqrt(fmax((reach - clearance) * (reach + clearance), 0.0))
         half = (half + slack) / speed
         t0 = fmax(along - half, t_min)
         t1 = fmin(along + half, t_max)
-        return emptied(t0, dr.select(clearance <= reach, t1, -dr.inf))
+        return normalize_empty_interval(t0, dr.select(clearance <= reach, t1, -dr.inf))
 
     def contains(self, p: Vec3) -> Mask:
         backend = backend_of(p)
-        c, r = self._on(backend)
+        c, r = self._center_and_radius(backend)
         distance = dr.norm(p - c)
-        return distance - r <= rounding(backend) * (distance + dr.norm(c) + r)
+        return distance - r <= clip_rounding(backend) * (distance + dr.norm(c) + r)
 
     def signed_distance(self, p: Vec3) -> Real:
-        c, r = self._on(backend_of(p))
+        c, r = self._center_and_radius(backend_of(p))
         return dr.norm(p - c) - r
 
     def outward_normal(self, p: Vec3) -> Vec3:
         backend = backend_of(p)
-        from_center = p - self._on(backend)[0]
+        from_center = p - self._center_and_radius(backend)[0]
         length = dr.norm(from_center)
         axis = backend.Array3f(0, 0, 1)
         return dr.select(length > 0, from_center / length, axis)
@@ -306,7 +317,7 @@ class Ball(Volume):
         return distance - self.radius <= 8.0 * sys.float_info.epsilon * size
 
     def padded(self, distance: float) -> Ball:
-        return Ball(self.center, self.radius + checked_distance(distance))
+        return Ball(self.center, self.radius + as_padding(distance))
 
 
 @dataclass(frozen=True)
@@ -317,8 +328,8 @@ class Box(Polytope):
     upper: Point
 
     def __post_init__(self) -> None:
-        lower = checked_point(self.lower, "the lower corner of a box", finite=False)
-        upper = checked_point(self.upper, "the upper corner of a box", finite=False)
+        lower = as_point(self.lower, "the lower corner of a box", finite=False)
+        upper = as_point(self.upper, "the upper corner of a box", finite=False)
         if any(a > b or a == np.inf or b == -np.inf for a, b in zip(lower, upper, strict=True)):
             raise ValueError(
                 f"a box needs lower <= upper in each coordinate, not {lower} and {upper}"
@@ -336,7 +347,7 @@ class Box(Polytope):
         return np.array(self.lower), np.array(self.upper)
 
     def padded(self, distance: float) -> Box:
-        r = checked_distance(distance)
+        r = as_padding(distance)
         x0, y0, z0 = self.lower
         x1, y1, z1 = self.upper
         return Box((x0 - r, y0 - r, z0 - r), (x1 + r, y1 + r, z1 + r))
@@ -350,13 +361,13 @@ class HalfSpace(Polytope):
     offset: float
 
     def __post_init__(self) -> None:
-        normal = np.array(checked_point(self.normal, "the normal of a half-space"))
+        normal = np.array(as_point(self.normal, "the normal of a half-space"))
         size = float(np.abs(normal).max())
         if size == 0.0:
             raise ValueError("the normal of a half-space must not be zero")
         normal /= size  # so that squares neither overflow nor vanish
         length = float(np.linalg.norm(normal))
-        offset = real(self.offset, "the offset of a half-space") / size / length
+        offset = as_real(self.offset, "the offset of a half-space") / size / length
         if not np.isfinite(offset):
             raise ValueError(
                 f"the offset of a half-space must be finite, not {self.offset!r}, and so must its "
@@ -377,11 +388,11 @@ class HalfSpace(Polytope):
         return lower, upper
 
     def padded(self, distance: float) -> HalfSpace:
-        return HalfSpace(self.normal, self.offset + checked_distance(distance))
+        return HalfSpace(self.normal, self.offset + as_padding(distance))
 
 
 @dataclass(frozen=True)
-class Intersection(Volume):
+class VolumeIntersection(Volume):
     """Points that lie in all of several volumes (at least one)."""
 
     volumes: tuple[Volume, ...]
@@ -396,8 +407,8 @@ class Intersection(Volume):
             check_volume(cast("Any", member) or "none", "each part of an intersection")
         object.__setattr__(self, "volumes", members)
 
-    def prepare(self, backend: Backend) -> Intersection:
-        return Intersection(v.prepare(backend) for v in self.volumes)
+    def prepare(self, backend: Backend) -> VolumeIntersection:
+        return VolumeIntersection(v.prepare(backend) for v in self.volumes)
 
     def clip(self, o: Vec3, d: Vec3, t_min: Real, t_max: Real) -> tuple[Real, Real]:
         t0, t1 = t_min, t_max
@@ -434,5 +445,5 @@ class Intersection(Volume):
     def contains_points(self, points: npt.ArrayLike) -> BoolArray:
         return np.all([v.contains_points(points) for v in self.volumes], axis=0)
 
-    def padded(self, distance: float) -> Intersection:
-        return Intersection(v.padded(distance) for v in self.volumes)
+    def padded(self, distance: float) -> VolumeIntersection:
+        return VolumeIntersection(v.padded(distance) for v in self.volumes)

@@ -18,19 +18,18 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend.validation import (
-    TRANSPOSE,
+    TRANSPOSE_ADVICE,
     FloatArray,
     IntArray,
-    and_more,
+    as_real_array,
+    check_coordinate_size,
     check_finite,
-    check_size,
     check_vectors,
-    real_array,
-    vector_text,
+    format_vector,
+    others_suffix,
 )
 from harnack.geometry.boundary_edges import weld_vertices
-from harnack.geometry.voronoi_areas import TangentCells
-from harnack.name_suggestions import renamed
+from harnack.geometry.voronoi_areas import TangentVoronoi
 
 __all__ = ["CloudError", "estimate_areas", "estimate_normals", "validate_cloud"]
 
@@ -38,9 +37,9 @@ MAX_POINTS = 100_000_000
 # Points per step: the temporary arrays of one step then stay in the cache of one core.
 _CHUNK = 4096
 # A cell is at most so many times as wide as those of its neighbors may be.
-_LONELY = 3.0
+_MAX_RADIUS_RATIO = 3.0
 # Points whose cells are computed at once.
-_AT_ONCE = 1 << 18
+_POINTS_PER_BATCH = 1 << 18
 _REMOVE = "its components must be finite; remove the point"
 
 
@@ -60,8 +59,8 @@ def validate_cloud(
         CloudError: not numbers of these shapes, or no points; a value that is not finite; a normal
             of length zero; an area that is not positive; coordinates above 1e100.
     """
-    x = checked_points(points)
-    n = checked_normals(normals, len(x))
+    x = as_cloud_points(points)
+    n = as_unit_normals(normals, len(x))
     a = _as_numbers(areas, "the areas")
     if a.ndim == 0:
         a = np.full(len(x), float(a))
@@ -71,7 +70,7 @@ def validate_cloud(
     bad = np.flatnonzero(~((a > 0.0) & (a < np.inf)))
     if bad.size:
         raise CloudError(
-            f"the area of point {bad[0]} is {a[bad[0]]:g}{and_more(bad.size)}: areas must be "
+            f"the area of point {bad[0]} is {a[bad[0]]:g}{others_suffix(bad.size)}: areas must be "
             "positive and finite; remove points that stand for no area"
         )
     for array in (x, n, a):
@@ -79,7 +78,7 @@ def validate_cloud(
     return x, n, a
 
 
-def checked_points(points: Any) -> FloatArray:
+def as_cloud_points(points: Any) -> FloatArray:
     """A fresh array (n, 3) of finite points, n >= 1.
 
     Raises:
@@ -88,13 +87,13 @@ def checked_points(points: Any) -> FloatArray:
     x = _as_numbers(points, "the points")
     if x.size == 0:
         raise CloudError("there are no points: give an array (n, 3)")
-    check_vectors(x, "the points", CloudError, transposed=TRANSPOSE)
+    check_vectors(x, "the points", CloudError, transposed=TRANSPOSE_ADVICE)
     check_finite(x, "point {}", CloudError, _REMOVE)
-    check_size(x, CloudError)
+    check_coordinate_size(x, CloudError)
     return x
 
 
-def checked_normals(normals: Any, count: int) -> FloatArray:
+def as_unit_normals(normals: Any, count: int) -> FloatArray:
     """A fresh array (count, 3) of normals, scaled to unit length.
 
     Raises:
@@ -106,7 +105,7 @@ def checked_normals(normals: Any, count: int) -> FloatArray:
             "with harnack.geometry.estimate_normals(points) and look at the result"
         )
     n = _as_numbers(normals, "the normals")
-    check_vectors(n, "the normals", CloudError, transposed=TRANSPOSE)
+    check_vectors(n, "the normals", CloudError, transposed=TRANSPOSE_ADVICE)
     if len(n) != count:
         raise CloudError(
             f"there are {count:,} points but {len(n):,} normals: every point needs one normal"
@@ -116,14 +115,14 @@ def checked_normals(normals: Any, count: int) -> FloatArray:
     bad = np.flatnonzero(longest == 0.0)
     if bad.size:
         raise CloudError(
-            f"normal {bad[0]} is zero{and_more(bad.size)}: remove these points, or estimate all "
+            f"normal {bad[0]} is zero{others_suffix(bad.size)}: remove these points, or estimate "
+            "all "
             "normals with harnack.geometry.estimate_normals(points)"
         )
     n = n / longest  # first, so that squares neither overflow nor vanish
     return n / np.linalg.norm(n, axis=1, keepdims=True)
 
 
-@renamed(neighbours="neighbors")
 def estimate_areas(
     points: npt.ArrayLike, normals: npt.ArrayLike, neighbors: int = 20
 ) -> FloatArray:
@@ -148,13 +147,13 @@ def estimate_areas(
     Raises:
         CloudError: as `validate_cloud`; all points are at one position; fewer than 3 neighbors.
     """
-    x = checked_points(points)
-    n = checked_normals(normals, len(x))
+    x = as_cloud_points(points)
+    n = as_unit_normals(normals, len(x))
     check_neighbors(neighbors)
     welded = weld_vertices(x)
     positions, where = np.unique(welded, return_inverse=True)
     sharing = np.bincount(where)[where]
-    tree = point_tree(x[positions])
+    tree = build_point_tree(x[positions])
     rank = np.empty(len(positions), np.int64)
     rank[tree.indices] = np.arange(len(positions))
     order = np.argsort(rank[where])  # neighbors one after the other, which saves half of the time
@@ -163,15 +162,15 @@ def estimate_areas(
 
     def find(part: slice) -> None:
         some = order[part]
-        nearest[some], distance = nearest_others(tree, x[some], neighbors)
+        nearest[some], distance = nearest_neighbors(tree, x[some], neighbors)
         radii[where[some]] = 0.5 * distance[:, -1]
 
-    in_parts(find, len(x))
+    parallel_over_slices(find, len(x))
     areas = np.empty(len(x))
-    cells = TangentCells.of(tree.data)
-    for start in range(0, len(x), _AT_ONCE):
-        some = order[start : start + _AT_ONCE]
-        most = _LONELY * np.median(radii[nearest[some]], axis=1)
+    cells = TangentVoronoi.of(tree.data)
+    for start in range(0, len(x), _POINTS_PER_BATCH):
+        some = order[start : start + _POINTS_PER_BATCH]
+        most = _MAX_RADIUS_RATIO * np.median(radii[nearest[some]], axis=1)
         reach = np.minimum(radii[where[some]], most)
         areas[some] = cells.areas(x[some], n[some], nearest[some], reach)
     return areas / sharing
@@ -179,7 +178,7 @@ def estimate_areas(
 
 def _as_numbers(values: Any, name: str) -> FloatArray:
     ragged = "are ragged: every row needs as many numbers"
-    array = real_array(values, name, CloudError, ragged=ragged, other="must be real numbers")
+    array = as_real_array(values, name, CloudError, ragged=ragged, other="must be real numbers")
     if array.size > 3 * MAX_POINTS:
         raise CloudError(f"{name} have shape {array.shape}: at most {MAX_POINTS:,} are accepted")
     return np.array(array, dtype=np.float64, order="C")
@@ -195,8 +194,8 @@ def check_neighbors(neighbors: int) -> None:
         raise CloudError(f"at least 3 neighbors are needed, not {neighbors}")
 
 
-def point_tree(points: FloatArray) -> Any:
-    """A tree for `nearest_others`. points: (n, 3), all different.
+def build_point_tree(points: FloatArray) -> Any:
+    """A tree for `nearest_neighbors`. points: (n, 3), all different.
 
     Raises:
         CloudError: there is one point only.
@@ -209,7 +208,7 @@ def point_tree(points: FloatArray) -> Any:
     return spatial.cKDTree(points)
 
 
-def nearest_others(tree: Any, points: FloatArray, count: int) -> tuple[IntArray, FloatArray]:
+def nearest_neighbors(tree: Any, points: FloatArray, count: int) -> tuple[IntArray, FloatArray]:
     """Indices and distances (m, k) of the points nearest to some points (m, 3) of a tree.
 
     A point does not count as its own neighbor. Nearest first; k = count, or all there are.
@@ -223,7 +222,7 @@ def nearest_others(tree: Any, points: FloatArray, count: int) -> tuple[IntArray,
     return index[:, 1:], distance[:, 1:]
 
 
-def in_parts(work: Callable[[slice], None], count: int) -> None:
+def parallel_over_slices(work: Callable[[slice], None], count: int) -> None:
     """Calls `work` for slices that make up range(count), on all cores."""
     parts = [slice(k, min(k + _CHUNK, count)) for k in range(0, count, _CHUNK)]
     with ThreadPoolExecutor(os.cpu_count()) as pool:
@@ -236,19 +235,24 @@ def in_parts(work: Callable[[slice], None], count: int) -> None:
 Indices = npt.NDArray[np.int64] | npt.NDArray[np.int32]
 
 # Of the variances of a neighborhood, the second over the first: below it lies on a line.
-_LINE = 1e-9
+_COLLINEAR_RATIO = 1e-9
 # Without `neighbors`, the first of these counts is taken with which half of some points see their
 # neighbors in a layer this flat, one standard deviation to the other; else the largest among a
 # half, a quarter, ... of the points, down to so many. If none is as flat, it is the flattest, where
 # it is flatter by this factor than smaller ones.
-_COUNTS, _FLAT, _PROBES, _FEWEST, _FLATTER = (16, 32, 64), 0.45, 1000, 1000, 0.9
+_NEIGHBOR_COUNTS, _MAX_FLATNESS, _PROBES, _MIN_SUBSET, _FLATNESS_GAIN = (
+    (16, 32, 64),
+    0.45,
+    1000,
+    1000,
+    0.9,
+)
 # A point is turned as so many of the nearest points that have a direction.
-_NEAREST = 8
+_VOTING_NEIGHBORS = 8
 # Where to look for extreme points: towards the faces, edges and corners of a cube.
 _DIRECTIONS = np.array([d for d in itertools.product((-1.0, 0.0, 1.0), repeat=3) if any(d)])
 
 
-@renamed(neighbours="neighbors")
 def estimate_normals(points: npt.ArrayLike, neighbors: int | None = None) -> FloatArray:
     """Unit normals (n, 3), outward, of points (n, 3) that sample a surface.
 
@@ -275,7 +279,7 @@ def estimate_normals(points: npt.ArrayLike, neighbors: int | None = None) -> Flo
         CloudError: as `validate_cloud` for points; fewer than 4 positions; neighborhoods on a
             line, which have no plane; fewer than 3 neighbors.
     """
-    x = checked_points(points)
+    x = as_cloud_points(points)
     if neighbors is not None:
         check_neighbors(neighbors)
     positions, where = np.unique(weld_vertices(x), return_inverse=True)
@@ -284,43 +288,46 @@ def estimate_normals(points: npt.ArrayLike, neighbors: int | None = None) -> Flo
         raise CloudError(f"{len(x)} different points do not show a surface: give at least 4")
     some = np.arange(len(x))
     if neighbors is None:
-        neighbors, some = _neighborhoods(x)
-    tree = point_tree(x[some])
-    planes = _planes(x[some], tree, neighbors)
+        neighbors, some = _choose_neighborhood(x)
+    tree = build_point_tree(x[some])
+    planes = _fit_tangent_planes(x[some], tree, neighbors)
     piece, parent = _spanning_forest(planes)
-    sign = _carried_signs(planes, parent)
+    sign = _propagate_signs(planes, parent)
     normals = planes.normals * sign[:, None]
     normals *= _outward_signs(x[some], normals, piece)[piece, None]
     if len(some) < len(x):
-        normals = _carried_to(x, tree, normals, neighbors)
+        normals = _transfer_normals(x, tree, normals, neighbors)
     return normals[where]
 
 
-def _neighborhoods(x: FloatArray) -> tuple[int, IntArray]:
+def _choose_neighborhood(x: FloatArray) -> tuple[int, IntArray]:
     """How many neighbors show planes, and the points (k,) among which to look for them."""
     rng = np.random.default_rng(0)
     probes = x[rng.choice(len(x), min(len(x), _PROBES), replace=False)]
     some = np.arange(len(x))
-    best, found = np.inf, (_COUNTS[0], some)
-    counts = _COUNTS
+    best, found = np.inf, (_NEIGHBOR_COUNTS[0], some)
+    counts = _NEIGHBOR_COUNTS
     while True:
-        tree = point_tree(x[some])
+        tree = build_point_tree(x[some])
         for count in counts:
-            index, _ = nearest_others(tree, probes, count)
+            index, _ = nearest_neighbors(tree, probes, count)
             spread = tree.data[index]
             spread = spread - spread.mean(axis=1, keepdims=True)
             widths = np.linalg.eigvalsh(np.einsum("mki,mkj->mij", spread, spread))
             flatness = np.median(np.sqrt(np.abs(widths[:, 0]) / np.maximum(widths[:, 1], 1e-300)))
-            if flatness < _FLATTER * best:
+            if flatness < _FLATNESS_GAIN * best:
                 best, found = float(flatness), (count, some)
-            if best < _FLAT:
+            if best < _MAX_FLATNESS:
                 return found
-        if len(some) < _FEWEST:
+        if len(some) < _MIN_SUBSET:
             return found
-        some, counts = np.sort(rng.choice(some, len(some) // 2, replace=False)), _COUNTS[-1:]
+        some, counts = (
+            np.sort(rng.choice(some, len(some) // 2, replace=False)),
+            _NEIGHBOR_COUNTS[-1:],
+        )
 
 
-def _carried_to(x: FloatArray, tree: Any, given: FloatArray, neighbors: int) -> FloatArray:
+def _transfer_normals(x: FloatArray, tree: Any, given: FloatArray, neighbors: int) -> FloatArray:
     """Normals of points (n, 3) by the nearest of some that have one, turned as these are."""
     normals = np.empty_like(x)
 
@@ -329,31 +336,31 @@ def _carried_to(x: FloatArray, tree: Any, given: FloatArray, neighbors: int) -> 
         spread = tree.data[index] - tree.data[index].mean(axis=1, keepdims=True)
         _, axes = np.linalg.eigh(np.einsum("mki,mkj->mij", spread, spread))
         line = axes[:, :, 0]
-        along = np.einsum("mki,mi->mk", given[index[:, :_NEAREST]], line)
+        along = np.einsum("mki,mi->mk", given[index[:, :_VOTING_NEIGHBORS]], line)
         normals[part] = line * np.where(along.sum(axis=1) < 0, -1.0, 1.0)[:, None]
 
-    in_parts(fit, len(x))
+    parallel_over_slices(fit, len(x))
     return normals
 
 
 @dataclass(frozen=True)
-class _Planes:
+class _TangentPlanes:
     """Points (n, 3), moved onto the planes of their neighbors; normals (n, 3) of any sign, and the
     indices of the neighbors (n, k)."""
 
     points: FloatArray
     normals: FloatArray
-    nearest: npt.NDArray[np.int32]
+    neighbors: npt.NDArray[np.int32]
 
 
-def _planes(x: FloatArray, tree: Any, neighbors: int) -> _Planes:
+def _fit_tangent_planes(x: FloatArray, tree: Any, neighbors: int) -> _TangentPlanes:
     """tree: of these points."""
     normals, points = np.empty_like(x), np.empty_like(x)
     nearest = np.empty((len(x), min(neighbors, len(x) - 1)), dtype=np.int32)
     on_line = np.zeros(len(x), dtype=bool)
 
     def fit(part: slice) -> None:
-        index, distance = nearest_others(tree, x[part], neighbors)
+        index, distance = nearest_neighbors(tree, x[part], neighbors)
         nearest[part] = index
         offsets = (x[index] - x[part, None]) / distance[:, -1, None, None]
         offsets = np.concatenate([offsets, np.zeros_like(offsets[:, :1])], axis=1)
@@ -363,20 +370,20 @@ def _planes(x: FloatArray, tree: Any, neighbors: int) -> _Planes:
         normals[part] = axes[:, :, 0]
         height = np.einsum("mi,mi->m", middle[:, 0], axes[:, :, 0]) * distance[:, -1]
         points[part] = x[part] + height[:, None] * axes[:, :, 0]
-        on_line[part] = variances[:, 1] <= _LINE * variances[:, 2]
+        on_line[part] = variances[:, 1] <= _COLLINEAR_RATIO * variances[:, 2]
 
-    in_parts(fit, len(x))
+    parallel_over_slices(fit, len(x))
     if on_line.any():
         first = int(np.flatnonzero(on_line)[0])
         raise CloudError(
             f"the {nearest.shape[1]} nearest neighbors of {on_line.sum():,} points lie on a line, "
-            f"first of {vector_text(x[first])}: they show no surface; ask for more neighbors, or "
+            f"first of {format_vector(x[first])}: they show no surface; ask for more neighbors, or "
             "give normals"
         )
-    return _Planes(points, normals, nearest)
+    return _TangentPlanes(points, normals, nearest)
 
 
-def _agreement(planes: _Planes, i: Indices, j: Indices) -> FloatArray:
+def _agreement(planes: _TangentPlanes, i: Indices, j: Indices) -> FloatArray:
     """The product of each normal i with normal j mirrored in the plane that bisects i and j: (m,).
 
     On a circle, across an edge between two planes and across a thin wall it is 1 if both face
@@ -391,12 +398,12 @@ def _agreement(planes: _Planes, i: Indices, j: Indices) -> FloatArray:
     return np.einsum("ij,ij->i", a, b) - 2.0 * along
 
 
-def _spanning_forest(planes: _Planes) -> tuple[IntArray, IntArray]:
+def _spanning_forest(planes: _TangentPlanes) -> tuple[IntArray, IntArray]:
     """For each point its piece (n,), from 0, and its parent (n,); a root is its own parent."""
     import scipy.sparse  # here: half a second that few need
 
     sparse: Any = scipy.sparse
-    nearest = planes.nearest
+    nearest = planes.neighbors
     n, k = nearest.shape
     weight = np.empty((n, k))
 
@@ -406,7 +413,7 @@ def _spanning_forest(planes: _Planes) -> tuple[IntArray, IntArray]:
         # An edge of weight 0 would be no edge.
         weight[part] = np.maximum(1.0 - agreement, 0.0).reshape(-1, k) + 1e-9
 
-    in_parts(weigh, n)
+    parallel_over_slices(weigh, n)
     first = np.arange(0, n * k + 1, k, dtype=np.int64)
     graph = sparse.csr_array((weight.ravel(), nearest.ravel(), first), shape=(n, n))
     forest = sparse.csgraph.minimum_spanning_tree(graph).tocoo()
@@ -422,7 +429,7 @@ def _spanning_forest(planes: _Planes) -> tuple[IntArray, IntArray]:
     return np.asarray(piece, dtype=np.int64), parent
 
 
-def _carried_signs(planes: _Planes, parent: IntArray) -> FloatArray:
+def _propagate_signs(planes: _TangentPlanes, parent: IntArray) -> FloatArray:
     """The sign (n,) of each normal with which it agrees with its root, along the way to it.
 
     Pointer doubling: after step i, `parent` is the ancestor 2^i levels up, or the root.

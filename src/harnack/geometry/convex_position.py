@@ -19,16 +19,16 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import FloatArray, Real, Vec3, backend_of
-from harnack.backend.elementary import across_rows
+from harnack.backend.elementary import orthonormal_basis_rows
 from harnack.backend.validation import BoolArray
-from harnack.geometry.clip_volumes import Planes, Polytope, Slacks
-from harnack.geometry.volume import as_points, checked_distance, rounding
+from harnack.geometry.clip_volumes import PlaneTable, Polytope, RoundingSlacks
+from harnack.geometry.volume import as_padding, as_points, clip_rounding
 
-MAX_VERTICES = 2048
+MAX_EXAMINED_VERTICES = 2048
 """Longer curves are not examined: the tests take quadratic time."""
 
 # All relative to the curve's size.
-TOLERANCE = 1e-12  # a vertex may lie this far off a supporting plane
+PLANE_TOLERANCE = 1e-12  # a vertex may lie this far off a supporting plane
 ROUNDING = 1e-14  # bound of the rounding errors of a height above a plane
 MIN_SEPARATION = 1e-9  # edges nearer than this count as touching
 MIN_ANGLE = 1e-6  # so do edges that fold back at a smaller angle (radians)
@@ -55,7 +55,7 @@ def is_convex_position(loops: tuple[FloatArray, ...]) -> bool:
     solid angles differ by at most 2 w / r for each edge at distance r: at r = 1e-4 that is less
     than the rounding of the solid angle itself in single precision.
     """
-    if len(loops) != 1 or not 3 <= len(loops[0]) <= MAX_VERTICES:
+    if len(loops) != 1 or not 3 <= len(loops[0]) <= MAX_EXAMINED_VERTICES:
         return False
     lower, upper = loops[0].min(axis=0), loops[0].max(axis=0)
     size = float((upper - lower).max())
@@ -74,7 +74,7 @@ def _edge_lengths(x: FloatArray) -> FloatArray:
 
 def _is_flat(x: FloatArray) -> bool:
     axes: FloatArray = np.linalg.svd(x - x.mean(axis=0), full_matrices=False)[2]
-    return bool(np.ptp(x @ axes[2]) <= TOLERANCE)
+    return bool(np.ptp(x @ axes[2]) <= PLANE_TOLERANCE)
 
 
 def _lies_on_hull(x: FloatArray) -> bool:
@@ -86,7 +86,7 @@ def _lies_on_hull(x: FloatArray) -> bool:
     for begin in range(0, count, rows):
         part = np.arange(begin, min(begin + rows, count))
         normals[part], excess, is_strict[part] = _supporting_planes(x, part)
-        if not excess.max() <= TOLERANCE:
+        if not excess.max() <= PLANE_TOLERANCE:
             return False
     following = np.roll(normals, -1, axis=0)
     is_exact = is_strict & np.roll(is_strict, -1)
@@ -106,11 +106,11 @@ def _supporting_planes(
     start = x[part]
     edge = x[(part + 1) % count] - start
     edge /= np.linalg.norm(edge, axis=1, keepdims=True)
-    across, up = across_rows(edge)
+    across, up = orthonormal_basis_rows(edge)
     offset = x[None, :, :] - start[:, None, :]
     a: FloatArray = np.einsum("kni,ki->kn", offset, across)
     b: FloatArray = np.einsum("kni,ki->kn", offset, up)
-    angle = _free_direction(a, b)
+    angle = _widest_gap_direction(a, b)
     c, s = np.cos(angle), np.sin(angle)
     height = c[:, None] * a + s[:, None] * b
     excess = height.max(axis=1)
@@ -121,7 +121,7 @@ def _supporting_planes(
     return normals, excess, height.max(axis=1) < -ROUNDING
 
 
-def _free_direction(a: FloatArray, b: FloatArray) -> FloatArray:
+def _widest_gap_direction(a: FloatArray, b: FloatArray) -> FloatArray:
     """Middle of the largest angle free of the points (a, b)[k, :] as seen from the origin: (k,).
 
     Points at the origin, where the edge itself is, have no direction and take their farthest
@@ -154,13 +154,13 @@ def is_simple(x: FloatArray) -> bool:
     first, second = np.nonzero(near)
     for begin in range(0, len(first), 100_000):
         i, j = first[begin : begin + 100_000], second[begin : begin + 100_000]
-        clearance = segment_clearance_lower(x[i], ends[i], x[j], ends[j])
+        clearance = segment_distance_lower_bound(x[i], ends[i], x[j], ends[j])
         if not clearance.min() >= MIN_SEPARATION:
             return False
     return True
 
 
-def segment_clearance_lower(
+def segment_distance_lower_bound(
     p1: FloatArray, q1: FloatArray, p2: FloatArray, q2: FloatArray
 ) -> FloatArray:
     """Lower bound of the distance of segments p1 q1 and p2 q2, (k, 3) each: (k,), not above it.
@@ -201,7 +201,7 @@ MAX_PLANES = 2048
 FLATNESS = 1e-6
 """Points thinner than this part of their size get the hull of a flat or straight set."""
 
-_SPREAD = 24
+_LEADING_PLANES = 24
 """Planes that rays are clipped to first."""
 
 THIN_PADDING = 1e-6
@@ -210,7 +210,7 @@ THIN_PADDING = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class ConvexHull(Polytope):
-    """Half-spaces normals[i].x <= offsets[i]; make it with `ConvexHull.of`.
+    """Half-spaces normals[i].x <= offsets[i]; make it with `ConvexHull.from_points`.
 
     normals: (m, 3), of unit length. offsets: (m,). lower, upper: (3,), a box around it.
     """
@@ -221,7 +221,7 @@ class ConvexHull(Polytope):
     upper: FloatArray
 
     @staticmethod
-    def of(points: npt.ArrayLike) -> ConvexHull:
+    def from_points(points: npt.ArrayLike) -> ConvexHull:
         """The convex hull of points (n, 3), enlarged by about 1e-12 of their size.
 
         Each plane is pushed out to the farthest point in its direction, so all points lie
@@ -241,7 +241,7 @@ class ConvexHull(Polytope):
             raise ValueError("a convex hull needs at least two different points")
         centered = (x - 0.5 * (lower + upper)) / size
         normals, is_thin = _hull_normals(centered)
-        normals = _spread_first(normals)
+        normals = _order_by_spread(normals)
         padding = (THIN_PADDING if is_thin else 1e-12) * size
         padding += 4.0 * sys.float_info.epsilon * float(np.abs(x).max())
         offsets = _support(x, normals) + padding
@@ -250,17 +250,19 @@ class ConvexHull(Polytope):
     def planes(self) -> FloatArray:
         return np.column_stack([self.normals, self.offsets])
 
-    def _slacks(self, table: Planes, o: Vec3, d: Vec3) -> Callable[[Vec3, Real], Slacks]:
+    def _slacks(
+        self, table: PlaneTable, o: Vec3, d: Vec3
+    ) -> Callable[[Vec3, Real], RoundingSlacks]:
         """As |n| = 1, |n|.|o| <= |o| serves all planes; in a bounded volume that is enough."""
-        eps = rounding(backend_of(o))
-        room, speed = eps * (dr.norm(o) + table.reach), eps * dr.norm(d)
+        eps = clip_rounding(backend_of(o))
+        room, speed = eps * (dr.norm(o) + table.max_offset), eps * dr.norm(d)
         return lambda _n, _h: (room, speed)
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
         return np.array(self.lower), np.array(self.upper)
 
     def padded(self, distance: float) -> ConvexHull:
-        r = checked_distance(distance)
+        r = as_padding(distance)
         return ConvexHull(self.normals, self.offsets + r, self.lower - r, self.upper + r)
 
 
@@ -289,7 +291,7 @@ def _hull_normals(x: FloatArray) -> tuple[FloatArray, bool]:
     normals = _facet_normals(x)
     if normals is None:
         return both_sides, True
-    return _without_duplicates(normals), False
+    return _distinct_normals(normals), False
 
 
 def _facet_normals(x: FloatArray) -> FloatArray | None:
@@ -304,18 +306,18 @@ def _facet_normals(x: FloatArray) -> FloatArray | None:
     return equations[:, :-1]
 
 
-def _spread_first(normals: FloatArray) -> FloatArray:
+def _order_by_spread(normals: FloatArray) -> FloatArray:
     """The same normals, the first of which lie far from each other: a few of these planes show that
     a ray misses the hull."""
     order, left = [0], np.full(len(normals), np.inf)
-    for _ in range(min(len(normals), _SPREAD) - 1):
+    for _ in range(min(len(normals), _LEADING_PLANES) - 1):
         left = np.minimum(left, 1.0 - normals @ normals[order[-1]])
         order.append(int(np.argmax(left)))
     rest = np.setdiff1d(np.arange(len(normals)), order)
     return normals[np.concatenate([order, rest]).astype(np.intp)]
 
 
-def _without_duplicates(normals: FloatArray) -> FloatArray:
+def _distinct_normals(normals: FloatArray) -> FloatArray:
     """One of each group of nearly equal normals, at most MAX_PLANES, and the six axes if cut."""
     digits = 9
     while True:

@@ -17,17 +17,16 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend.validation import (
-    LARGEST,
-    TRANSPOSE,
+    MAX_COORDINATE,
+    TRANSPOSE_ADVICE,
     FloatArray,
-    and_more,
+    as_real_array,
     check_finite,
     check_vectors,
-    real_array,
-    vector_text,
+    format_vector,
+    others_suffix,
 )
 from harnack.geometry.convex_position import is_convex_position
-from harnack.name_suggestions import renamed
 
 __all__ = [
     "MAX_VERTICES",
@@ -42,18 +41,17 @@ __all__ = [
     "TooFewVerticesError",
     "TooManyVerticesError",
     "bounding_box",
-    "edges",
+    "cancel_opposite_circles",
+    "edge_endpoints",
     "is_convex_position",
-    "net_circles",
     "total_length",
     "validate_curves",
     "validate_loops",
 ]
 
-_SMALLEST = 1 / LARGEST
+_SMALLEST = 1 / MAX_COORDINATE
 
 
-@renamed(centre="center")
 @dataclass(frozen=True)
 class Circle:
     """A circle, run counter-clockwise as seen from where its normal points to.
@@ -69,17 +67,17 @@ class Circle:
 
     def __post_init__(self) -> None:
         radius = _numbers(self.radius, "radius", ())
-        if not _SMALLEST <= radius <= LARGEST:
+        if not _SMALLEST <= radius <= MAX_COORDINATE:
             raise ValueError(
-                f"radius of a circle must lie between {_SMALLEST:g} and {LARGEST:g}, not "
+                f"radius of a circle must lie between {_SMALLEST:g} and {MAX_COORDINATE:g}, not "
                 f"{float(radius):g}"
             )
         center, normal = (
             _numbers(self.center, "center", (3,)),
             _numbers(self.normal, "normal", (3,)),
         )
-        if np.abs(center).max() > LARGEST:
-            raise ValueError(f"center of a circle is {vector_text(center)}: choose smaller units")
+        if np.abs(center).max() > MAX_COORDINATE:
+            raise ValueError(f"center of a circle is {format_vector(center)}: choose smaller units")
         largest = float(np.abs(normal).max())
         if largest == 0.0:
             raise ValueError("normal of a circle is zero: give the direction of its axis")
@@ -105,11 +103,11 @@ class Circle:
         reach = self.radius * np.sqrt(np.maximum(1 - np.square(self.normal), 0))
         return np.array(self.center) - reach, np.array(self.center) + reach
 
-    def polygon(self, sides: int, *, around: bool = False) -> FloatArray:
+    def polygon(self, sides: int, *, circumscribed: bool = False) -> FloatArray:
         """(sides, 3) corners of the regular polygon in the circle, or of that around it."""
         if sides < 3:
             raise ValueError(f"a polygon needs at least three sides, not {sides}")
-        radius = self.radius / math.cos(math.pi / sides) if around else self.radius
+        radius = self.radius / math.cos(math.pi / sides) if circumscribed else self.radius
         axis = np.array(self.normal)
         first = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
         first /= np.linalg.norm(first)
@@ -119,7 +117,7 @@ class Circle:
 
 
 def _numbers(values: Any, name: str, shape: tuple[int, ...]) -> FloatArray:
-    array = real_array(values, f"{name} of a circle", type_error=TypeError).astype(np.float64)
+    array = as_real_array(values, f"{name} of a circle", type_error=TypeError).astype(np.float64)
     if array.shape != shape:
         wanted = "three numbers" if shape else "a number"
         raise ValueError(f"{name} of a circle must be {wanted}, not an array {array.shape}")
@@ -128,8 +126,8 @@ def _numbers(values: Any, name: str, shape: tuple[int, ...]) -> FloatArray:
     return array
 
 
-def net_circles(circles: Iterable[Circle]) -> tuple[Circle, ...]:
-    """The circles without those that are run there and back, as `net_loops` for edges.
+def cancel_opposite_circles(circles: Iterable[Circle]) -> tuple[Circle, ...]:
+    """The circles without those that are run there and back, as `cancel_opposite_edges` for edges.
 
     Only circles with exactly the same center and radius and exactly opposite normals cancel.
     """
@@ -278,9 +276,9 @@ def _validate_loop(loop: Any, name: str, closed: bool = True) -> FloatArray:
 
 def _as_vertices(loop: Any, name: str) -> FloatArray:
     ragged = "is ragged: every vertex needs three coordinates"
-    array = real_array(loop, name, CurveShapeError, ragged=ragged)
+    array = as_real_array(loop, name, CurveShapeError, ragged=ragged)
     planar = "; append a column of zeros to a planar curve"
-    check_vectors(array, name, CurveShapeError, planar=planar, transposed=TRANSPOSE)
+    check_vectors(array, name, CurveShapeError, planar=planar, transposed=TRANSPOSE_ADVICE)
     if len(array) > MAX_VERTICES:
         raise TooManyVerticesError(_too_many(name, len(array)))
     return np.array(array, dtype=np.float64, order="C")
@@ -306,8 +304,8 @@ def _check_edges(vertices: FloatArray, name: str, closed: bool) -> None:
     if same.size:
         first, second = int(same[0]), (int(same[0]) + 1) % len(vertices)
         raise RepeatedVertexError(
-            f"vertices {first} and {second} of {name} are both {vector_text(vertices[first])}"
-            f"{and_more(same.size)}: remove one of them"
+            f"vertices {first} and {second} of {name} are both {format_vector(vertices[first])}"
+            f"{others_suffix(same.size)}: remove one of them"
         )
     size = float(np.abs(vertices).max())
     shortest = float(np.abs(apart).max(axis=1).min())
@@ -322,14 +320,14 @@ def _too_many(name: str, count: int) -> str:
     return f"{name} has {count:,} vertices: at most {MAX_VERTICES:,} are accepted; resample it"
 
 
-def edges(loops: Loops) -> tuple[FloatArray, FloatArray]:
+def edge_endpoints(loops: Loops) -> tuple[FloatArray, FloatArray]:
     """Start and end points of all edges, (m, 3) each, loop by loop in order."""
     return np.concatenate(loops), np.concatenate([np.roll(v, -1, axis=0) for v in loops])
 
 
 def total_length(loops: Loops) -> float:
     """Sum of the lengths of all edges."""
-    start, end = edges(loops)
+    start, end = edge_endpoints(loops)
     return float(np.linalg.norm(end - start, axis=1).sum())
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from harnack.backend.validation import FloatArray
 
-Route = Literal["outside", "axis"]
+ReturnPath = Literal["outside", "axis"]
 
 
 def _check_whole(name: str, number: Any) -> None:
@@ -81,12 +81,12 @@ def coil(
     *,
     radius: float = 1.0,
     height: float = 1.0,
-    route: Route = "outside",
+    return_path: ReturnPath = "outside",
 ) -> FloatArray:
     """A closed coil of n vertices: a helix about the z axis and a way back to its start.
 
     turns: full turns of the helix. height: from its lowest to its highest vertex.
-    route: "outside" returns at 1.5 radii, parallel to the axis; "axis" along the axis.
+    return_path: "outside" returns at 1.5 radii, parallel to the axis; "axis" along the axis.
 
     The solid angle of such a curve spans `turns` times 4 pi, which breaks bounds that hold for
     curves on convex bodies.
@@ -94,14 +94,14 @@ def coil(
     if turns < 1:
         raise ValueError(f"a coil needs at least one turn, not {turns}")
     corners = {"outside": 1.5 * radius, "axis": 0.0}
-    if route not in corners:
-        raise ValueError(f'the route of a coil is "outside" or "axis", not {route!r}')
+    if return_path not in corners:
+        raise ValueError(f'the route of a coil is "outside" or "axis", not {return_path!r}')
     if n < 3 * turns + 3:
         raise ValueError(f"a coil of {turns} turns needs at least {3 * turns + 3} vertices")
     s = np.linspace(0.0, 1.0, n - 2)
     t = 2.0 * np.pi * turns * s
     helix = np.column_stack([radius * np.cos(t), radius * np.sin(t), height * (s - 0.5)])
-    x = corners[route]
+    x = corners[return_path]
     return np.concatenate([helix, [[x, 0.0, 0.5 * height], [x, 0.0, -0.5 * height]]])
 
 

@@ -86,14 +86,14 @@ def flip_faces(faces: IntArray, fraction: float, seed: int) -> IntArray:
 
 
 def duplicate_faces(
-    faces: IntArray, fraction: float, seed: int, *, turned: bool = False
+    faces: IntArray, fraction: float, seed: int, *, flipped: bool = False
 ) -> IntArray:
     """The faces (m, 3), then a random fraction of them once more; turned: reversed.
 
     A duplicate makes w jump by 2 across that face, a turned one by 0: a hole that is not seen.
     """
     copies = faces[_chosen(faces, fraction, seed)]
-    return np.concatenate([faces, copies[:, [0, 2, 1]] if turned else copies])
+    return np.concatenate([faces, copies[:, [0, 2, 1]] if flipped else copies])
 
 
 def _chosen(faces: IntArray, fraction: float, seed: int) -> IntArray:

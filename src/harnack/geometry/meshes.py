@@ -13,15 +13,15 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend.validation import (
-    TRANSPOSE,
+    TRANSPOSE_ADVICE,
     BoolArray,
     FloatArray,
     IntArray,
-    and_more,
+    check_coordinate_size,
     check_finite,
-    check_size,
     check_vectors,
-    vector_text,
+    format_vector,
+    others_suffix,
 )
 
 __all__ = [
@@ -36,7 +36,7 @@ MAX_VERTICES = 100_000_000
 MAX_FACES = 100_000_000
 
 # Twice the area, over the square of the longest edge, up to which a face counts as flat.
-ZERO_AREA = 8.0 * float(np.finfo(np.float64).eps)
+ZERO_AREA_RATIO = 8.0 * float(np.finfo(np.float64).eps)
 
 
 class MeshError(ValueError):
@@ -44,13 +44,13 @@ class MeshError(ValueError):
 
 
 def validate_mesh(
-    vertices: npt.ArrayLike, faces: npt.ArrayLike, *, flat: bool = False
+    vertices: npt.ArrayLike, faces: npt.ArrayLike, *, allow_zero_area: bool = False
 ) -> tuple[FloatArray, IntArray]:
     """Vertices (n, 3) float64 and faces (m, 3) int64 of a mesh: copies that cannot be written to.
 
     Vertices that no face uses are kept, and checked like the rest.
 
-    flat: whether faces may have zero area, as they join others in closed meshes.
+    allow_zero_area: whether faces may have zero area, as they join others in closed meshes.
 
     Raises:
         MeshError: not numbers of these shapes, faces that are not triangles of integers, nothing
@@ -58,9 +58,9 @@ def validate_mesh(
             as `zero_area_faces` has it; sizes whose squares overflow or vanish.
     """
     x, triangles = _checked_arrays(vertices, faces)
-    is_flat, longest = _measure(x, triangles)
-    if is_flat.any() and not flat:
-        raise MeshError(_flat_message(x, triangles, np.flatnonzero(is_flat)))
+    is_flat, longest = _measure_faces(x, triangles)
+    if is_flat.any() and not allow_zero_area:
+        raise MeshError(_zero_area_message(x, triangles, np.flatnonzero(is_flat)))
     _check_size(longest)
     x.setflags(write=False)
     triangles.setflags(write=False)
@@ -78,7 +78,7 @@ def zero_area_faces(vertices: npt.ArrayLike, faces: npt.ArrayLike) -> IntArray:
     Raises:
         MeshError: as `validate_mesh`, but for zero area.
     """
-    return np.flatnonzero(_measure(*_checked_arrays(vertices, faces))[0])
+    return np.flatnonzero(_measure_faces(*_checked_arrays(vertices, faces))[0])
 
 
 def without_zero_area_faces(
@@ -95,7 +95,7 @@ def without_zero_area_faces(
         MeshError: as `validate_mesh`; no face has an area.
     """
     x, triangles = _checked_arrays(vertices, faces)
-    flat, longest = _measure(x, triangles)
+    flat, longest = _measure_faces(x, triangles)
     if flat.all():
         raise MeshError(
             f"all {len(triangles):,} faces have zero area: the vertices of each lie on a line; "
@@ -132,13 +132,13 @@ def _as_vertices(vertices: Any) -> FloatArray:
         raise MeshError("there are no vertices: give an array (n, 3)")
     if array.dtype.kind not in "fiu":
         raise MeshError(f"the vertices must be real numbers, not {array.dtype}")
-    check_vectors(array, "the vertices", MeshError, transposed=TRANSPOSE)
+    check_vectors(array, "the vertices", MeshError, transposed=TRANSPOSE_ADVICE)
     if len(array) > MAX_VERTICES:
         raise MeshError(f"{len(array):,} vertices are too many: at most {MAX_VERTICES:,}")
     x = np.array(array, dtype=np.float64, order="C")
     advice = "coordinates must be finite; remove it and the faces that use it"
     check_finite(x, "vertex {}", MeshError, advice)
-    check_size(x, MeshError)
+    check_coordinate_size(x, MeshError)
     return x
 
 
@@ -173,7 +173,8 @@ def _check_range(faces: npt.NDArray[Any], count: int) -> None:
     if index == count and int(faces.min()) == 1:
         hint = "; these indices seem to count from 1: subtract 1"
     raise MeshError(
-        f"face {bad[0]} is {tuple(map(int, first))}{and_more(bad.size)}, but vertex {index} is "
+        f"face {bad[0]} is {tuple(map(int, first))}{others_suffix(bad.size)}, but vertex {index} "
+        "is "
         f"out of range: there are {count:,} vertices, counted from 0{hint}"
     )
 
@@ -188,7 +189,7 @@ def _as_array(values: Any, name: str, ragged: str) -> npt.NDArray[Any]:
     return array
 
 
-def _measure(x: FloatArray, faces: IntArray) -> tuple[BoolArray, FloatArray]:
+def _measure_faces(x: FloatArray, faces: IntArray) -> tuple[BoolArray, FloatArray]:
     """Whether each face counts as flat, and its longest edge in the maximum norm: (m,) each.
 
     Edges are scaled before they are multiplied, so that nothing overflows or underflows.
@@ -201,7 +202,7 @@ def _measure(x: FloatArray, faces: IntArray) -> tuple[BoolArray, FloatArray]:
     normal = (u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0])
     twice_area = np.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2)
     longest_square = np.max([(edge * edge).sum(axis=0) for edge in (u, v, w)], axis=0)
-    return twice_area <= ZERO_AREA * longest_square, longest
+    return twice_area <= ZERO_AREA_RATIO * longest_square, longest
 
 
 def _check_size(longest: FloatArray) -> None:
@@ -209,14 +210,14 @@ def _check_size(longest: FloatArray) -> None:
     small = np.flatnonzero((longest > 0.0) & (longest < 1e-100))
     if small.size:
         raise MeshError(
-            f"the edges of face {small[0]}{and_more(small.size)} are only "
+            f"the edges of face {small[0]}{others_suffix(small.size)} are only "
             f"{longest[small[0]]:g} long: choose units nearer to 1, or remove it"
         )
 
 
-def _flat_message(x: FloatArray, faces: IntArray, flat: IntArray) -> str:
+def _zero_area_message(x: FloatArray, faces: IntArray, flat: IntArray) -> str:
     a, b, c = (x[k] for k in faces[flat[0]])
-    corners = ", ".join(vector_text(one) for one in (a, b, c))
+    corners = ", ".join(format_vector(one) for one in (a, b, c))
     repeated = bool((a == b).all() or (b == c).all() or (c == a).all())
     why = "two of its vertices are equal" if repeated else "its vertices lie on a line"
     count = f"{flat.size:,} of {len(faces):,} faces have" if flat.size > 1 else "one face has"

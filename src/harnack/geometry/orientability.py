@@ -8,19 +8,19 @@ import numpy as np
 
 from harnack.backend.validation import IntArray
 
-__all__ = ["is_one_sided", "sided_parts"]
+__all__ = ["is_nonorientable", "orientation_components"]
 
 
-def is_one_sided(faces: IntArray) -> bool:
+def is_nonorientable(faces: IntArray) -> bool:
     """Whether a mesh ends in the open and no part of it, of those that edges of two faces hold
     together, has two sides: as a Moebius strip."""
     if not (_edges(faces)[2] == 1).any():
         return False
-    part = sided_parts(faces)
+    part = orientation_components(faces)
     return bool((part[: len(faces)] == part[len(faces) :]).all())
 
 
-def sided_parts(faces: IntArray) -> IntArray:
+def orientation_components(faces: IntArray) -> IntArray:
     """(2m,) the parts that sides of faces belong to, first of all as they are and then of all
     turned over: sides of neighbors that agree are joined. A part of one side only is joined to
     itself turned over."""

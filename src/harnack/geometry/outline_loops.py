@@ -1,6 +1,6 @@
 """Outlines of regions of the plane: closed loops of points, cleaned so that they bound a region.
 
-`outline_loops` accepts loops as people give them, and decides what is inside: by the even-odd rule,
+`make_outline` accepts loops as people give them, and decides what is inside: by the even-odd rule,
 or by winding numbers. What it returns does not cross itself, and has the region on its left.
 """
 
@@ -13,24 +13,24 @@ from typing import Any, Literal, cast
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray, IntArray
-from harnack.backend.validation import check_finite, check_size, real_array
+from harnack.backend.validation import as_real_array, check_coordinate_size, check_finite
 
-__all__ = ["Outline", "Rule", "for_clipper", "outline_loops"]
+__all__ = ["FillingRule", "Outline", "make_outline", "scale_for_clipper"]
 
 Outline = tuple[FloatArray, ...]
 """Loops (n_i, 2) that do not cross, the region on their left: holes run clockwise."""
-Rule = Literal["even-odd", "nonzero"]
+FillingRule = Literal["even-odd", "nonzero"]
 
-MOST_EDGES = 200_000
+MAX_EDGES = 200_000
 # Segments closer than this part of the outline's size count as touching.
-_TOUCHING = 1e-12
+_TOUCH_TOLERANCE = 1e-12
 # Pairs of segments that are compared at once, and in all; with more, crossings are resolved unseen.
 _CHUNK, _MOST_PAIRS = 2_000_000, 100_000_000
 # Coordinates are scaled to about this size for Clipper2, which rounds them to 1e-8.
 _CLIPPER_SIZE = 2.0**17
 
 
-def outline_loops(loops: Any, rule: Rule = "even-odd") -> Outline:
+def make_outline(loops: Any, rule: FillingRule = "even-odd") -> Outline:
     """The loops that bound a region.
 
     loops: one array (n, 2) of the vertices of a closed loop, the last joined to the first, or
@@ -50,10 +50,10 @@ def outline_loops(loops: Any, rule: Rule = "even-odd") -> Outline:
     size = float(np.ptp(points, axis=0).max())
     if not size > 0:
         raise ValueError("an outline encloses no area: all of its points are one")
-    tolerance = _TOUCHING * (size + float(np.abs(points).max()))
-    if rule == "even-odd" and not _meets_itself(given, tolerance):
-        return _with_region_on_the_left(given)
-    made = _resolved(given, rule)
+    tolerance = _TOUCH_TOLERANCE * (size + float(np.abs(points).max()))
+    if rule == "even-odd" and not _self_intersects(given, tolerance):
+        return _orient_loops(given)
+    made = _resolve_crossings(given, rule)
     if not made:
         raise ValueError("an outline encloses no area")
     return made
@@ -67,17 +67,15 @@ def _checked_loops(loops: Any) -> list[FloatArray]:
     total = 0
     for k, one in enumerate(several):
         name = f"loop {k} of an outline"
-        array = real_array(one, name)
+        array = as_real_array(one, name)
         if array.ndim != 2 or array.shape[1] != 2:
             raise ValueError(f"{name} must have shape (n, 2), not {array.shape}")
         points = np.array(array, dtype=np.float64)
         check_finite(points, f"point {{}} of {name}", ValueError)
-        check_size(points, ValueError)
+        check_coordinate_size(points, ValueError)
         total += len(points)
-        if total > MOST_EDGES:
-            raise ValueError(
-                f"an outline has at most {MOST_EDGES:,} points: flatten it less finely"
-            )
+        if total > MAX_EDGES:
+            raise ValueError(f"an outline has at most {MAX_EDGES:,} points: flatten it less finely")
         points = points[np.any(points != np.roll(points, 1, axis=0), axis=1)]
         if len(points) < 3:
             raise ValueError(f"{name} needs three points or more that differ, not {len(points)}")
@@ -100,7 +98,7 @@ def _is_one_loop(loops: Any) -> bool:
         ) from None
 
 
-def _ends(loops: list[FloatArray]) -> tuple[FloatArray, FloatArray, IntArray]:
+def _edges_and_successors(loops: list[FloatArray]) -> tuple[FloatArray, FloatArray, IntArray]:
     """Start, end (m, 2) of all edges, and the index of the edge that follows each."""
     start = np.concatenate(loops)
     end = np.concatenate([np.roll(one, -1, axis=0) for one in loops])
@@ -110,9 +108,9 @@ def _ends(loops: list[FloatArray]) -> tuple[FloatArray, FloatArray, IntArray]:
     return start, end, after
 
 
-def _meets_itself(loops: list[FloatArray], tolerance: float) -> bool:
+def _self_intersects(loops: list[FloatArray], tolerance: float) -> bool:
     """Whether edges touch or cross that are no neighbors, or neighbors run back on each other."""
-    start, end, after = _ends(loops)
+    start, end, after = _edges_and_successors(loops)
     back = end[after] - start[after]
     along = end - start
     turn = along[:, 0] * back[:, 1] - along[:, 1] * back[:, 0]
@@ -136,13 +134,13 @@ def _meets_itself(loops: list[FloatArray], tolerance: float) -> bool:
         near = (low[i, 1] <= high[j, 1]) & (low[j, 1] <= high[i, 1])
         near &= (after[i] != j) & (after[j] != i)
         i, j = i[near], j[near]
-        if _touching(start[i], end[i], start[j], end[j], tolerance).any():
+        if _segments_touch(start[i], end[i], start[j], end[j], tolerance).any():
             return True
         begin = stop
     return False
 
 
-def _touching(
+def _segments_touch(
     a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, tolerance: float
 ) -> BoolArray:
     """Whether segments from a to b and from c to d, (k, 2) each, cross or touch."""
@@ -164,10 +162,10 @@ def _distances(p: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
     return np.linalg.norm(p - a - np.clip(share, 0, 1)[:, None] * along, axis=1)
 
 
-def _with_region_on_the_left(loops: list[FloatArray]) -> Outline:
+def _orient_loops(loops: list[FloatArray]) -> Outline:
     """Simple loops, each reversed where the region would lie on its right: it lies inside of those
     around which there are none or two or any even number of others."""
-    start, end, _ = _ends(loops)
+    start, end, _ = _edges_and_successors(loops)
     owner = np.repeat(np.arange(len(loops)), [len(one) for one in loops])
     made: list[FloatArray] = []
     for k, loop in enumerate(loops):
@@ -178,7 +176,7 @@ def _with_region_on_the_left(loops: list[FloatArray]) -> Outline:
         at = a[:, 0] + (y - a[:, 1]) / (b[:, 1] - a[:, 1]) * (b[:, 0] - a[:, 0])
         is_hole = np.count_nonzero(at > x) % 2 == 1
         made.append(loop[::-1].copy() if (_area(loop) > 0) == is_hole else loop)
-    return _frozen(made)
+    return _make_read_only(made)
 
 
 def _area(loop: FloatArray) -> float:
@@ -187,7 +185,7 @@ def _area(loop: FloatArray) -> float:
     return 0.5 * float((p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]).sum())
 
 
-def _resolved(loops: list[FloatArray], rule: Rule) -> Outline:
+def _resolve_crossings(loops: list[FloatArray], rule: FillingRule) -> Outline:
     """The boundary of the region of loops that cross or touch."""
     from manifold3d import CrossSection, FillRule
 
@@ -197,22 +195,22 @@ def _resolved(loops: list[FloatArray], rule: Rule) -> Outline:
     unit = 2.0 ** (math.frexp(float((high - low).max()))[1] - 10)
     # A multiple of the unit, so that the rounded loops have the same one.
     center: FloatArray = np.rint(0.5 * (low + high) / unit) * unit
-    scaled, scale = for_clipper([one - center for one in loops])
+    scaled, scale = scale_for_clipper([one - center for one in loops])
     found = cast("list[FloatArray]", CrossSection(scaled, fill).to_polygons())
     made = [np.array(one, np.float64) for one in found]
     # In an order of its own, so that the same region always has the same loops.
     made = [np.roll(one, -int(np.lexsort(one.T)[0]), axis=0) for one in made if len(one) > 2]
     made.sort(key=lambda one: (one[0].tolist(), one[1].tolist()))
-    return _frozen([one / scale + center for one in made])
+    return _make_read_only([one / scale + center for one in made])
 
 
-def _frozen(loops: list[FloatArray]) -> Outline:
+def _make_read_only(loops: list[FloatArray]) -> Outline:
     for one in loops:
         one.setflags(write=False)
     return tuple(loops)
 
 
-def for_clipper(outline: Sequence[FloatArray]) -> tuple[list[FloatArray], float]:
+def scale_for_clipper(outline: Sequence[FloatArray]) -> tuple[list[FloatArray], float]:
     """The loops times a power of two, of which Clipper2 rounds next to nothing, and this factor."""
     largest = max(float(np.abs(one).max()) for one in outline)
     scale = 2.0 ** (math.frexp(_CLIPPER_SIZE)[1] - math.frexp(largest)[1])

@@ -16,30 +16,30 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend.validation import (
-    TRANSPOSE,
+    TRANSPOSE_ADVICE,
     BoolArray,
     FloatArray,
     IntArray,
-    and_more,
+    as_real_array,
+    check_coordinate_size,
     check_finite,
-    check_size,
     check_vectors,
-    real_array,
+    others_suffix,
 )
-from harnack.geometry.boundary_edges import boundary_edges, join
+from harnack.geometry.boundary_edges import boundary_edges, join_edges
 from harnack.geometry.convex_position import is_convex_position
 from harnack.geometry.meshes import MAX_FACES, MAX_VERTICES, MeshError
 
-__all__ = ["PolygonFaces", "polygon_patches", "validate_polygons"]
+__all__ = ["PolygonFaces", "cluster_into_polygons", "validate_polygons"]
 
 # A face whose corners lie as close to one line, as a part of its size, has no surface to speak of.
-_ON_A_LINE = 1e-9
+_COLLINEAR_TOLERANCE = 1e-9
 # Of the lengths of two edges, the part that a turn must be at least to count as one.
 _TURN = 1e-6
 # Turns of a convex polygon add up to one revolution, to this many radians.
 _REVOLUTION = 1e-6
 # At most so many faces with projections that are not convex are examined further, at 0.5 ms each.
-_MOST_EXAMINED = 20_000
+_MAX_EXAMINED_FACES = 20_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,66 +52,68 @@ class PolygonFaces:
 
     vertices: FloatArray
     corners: IntArray
-    sizes: IntArray
+    loop_sizes: IntArray
     face_of_loop: IntArray
 
     @property
-    def count(self) -> int:
+    def face_count(self) -> int:
         """How many faces there are."""
         return int(self.face_of_loop[-1]) + 1
 
     @property
     def face_of_corner(self) -> IntArray:
         """(k,) the face of each corner."""
-        return np.repeat(self.face_of_loop, self.sizes)
+        return np.repeat(self.face_of_loop, self.loop_sizes)
 
     @property
-    def starts(self) -> IntArray:
+    def loop_starts(self) -> IntArray:
         """(l,) where each loop starts in `corners`."""
-        return np.cumsum(self.sizes) - self.sizes
+        return np.cumsum(self.loop_sizes) - self.loop_sizes
 
     @property
-    def following(self) -> IntArray:
+    def next_corner(self) -> IntArray:
         """(k,) place in `corners` of the next corner of the same loop."""
         after = np.arange(1, len(self.corners) + 1, dtype=np.int64)
-        after[self.starts + self.sizes - 1] = self.starts
+        after[self.loop_starts + self.loop_sizes - 1] = self.loop_starts
         return after
 
     @property
     def edges(self) -> IntArray:
         """(e, 2) pairs of vertices that some face joins, each once."""
-        ends = np.column_stack([self.corners, self.corners[self.following]])
+        ends = np.column_stack([self.corners, self.corners[self.next_corner]])
         return np.unique(np.sort(ends, axis=1), axis=0)
 
     def loops(self, face: int) -> list[FloatArray]:
         """The closed curves of a face, (n, 3) each."""
         chosen = np.flatnonzero(self.face_of_loop == face)
-        pieces = (slice(self.starts[k], self.starts[k] + self.sizes[k]) for k in chosen)
+        pieces = (
+            slice(self.loop_starts[k], self.loop_starts[k] + self.loop_sizes[k]) for k in chosen
+        )
         return [self.vertices[self.corners[piece]] for piece in pieces]
 
-    def boxes(self) -> tuple[FloatArray, FloatArray]:
+    def face_boxes(self) -> tuple[FloatArray, FloatArray]:
         """Lower and upper corners (m, 3) of the boxes around the vertices of each face."""
         x, first = self.vertices[self.corners], self.first_corners
         return np.minimum.reduceat(x, first), np.maximum.reduceat(x, first)
 
-    def lengths(self) -> FloatArray:
+    def face_perimeters(self) -> FloatArray:
         """(m,) the total length of the edges of each face."""
         x = self.vertices[self.corners]
-        edges = np.linalg.norm(x[self.following] - x, axis=1)
+        edges = np.linalg.norm(x[self.next_corner] - x, axis=1)
         return np.add.reduceat(edges, self.first_corners)
 
     @functools.cached_property
     def in_convex_position(self) -> BoolArray:
         """(m,) whether each face is one loop without self-intersections that is proved to lie on
         the boundary of a convex set; False where no proof was found."""
-        found = self._have_convex_projections()
-        single = np.bincount(self.face_of_loop, minlength=self.count) == 1
-        rest = np.flatnonzero(single & ~found)[:_MOST_EXAMINED]
+        found = self._projects_to_convex_polygon()
+        single = np.bincount(self.face_of_loop, minlength=self.face_count) == 1
+        rest = np.flatnonzero(single & ~found)[:_MAX_EXAMINED_FACES]
         for k in rest:
             found[k] = is_convex_position(tuple(self.loops(int(k))))
         return found
 
-    def _have_convex_projections(self) -> BoolArray:
+    def _projects_to_convex_polygon(self) -> BoolArray:
         """(m,) whether each face is one loop whose projection along its mean normal is a convex
         polygon, run around once.
 
@@ -123,27 +125,27 @@ class PolygonFaces:
         face, first = self.face_of_corner, self.first_corners
         middle = np.add.reduceat(x, first) / np.diff(np.append(first, len(x)))[:, None]
         a = x - middle[face]
-        normal = np.add.reduceat(np.cross(a, a[self.following]), first)
+        normal = np.add.reduceat(np.cross(a, a[self.next_corner]), first)
         length = np.linalg.norm(normal, axis=1)
         normal /= np.where(length > 0, length, 1)[:, None]
-        edge = x[self.following] - x
+        edge = x[self.next_corner] - x
         least = np.linalg.norm(edge, axis=1)
-        least *= _TURN * least[self.following]
+        least *= _TURN * least[self.next_corner]
         edge -= (edge * normal[face]).sum(axis=1)[:, None] * normal[face]
-        after = edge[self.following]
+        after = edge[self.next_corner]
         sine = (np.cross(edge, after) * normal[face]).sum(axis=1)
         cosine = (edge * after).sum(axis=1)
         turns = np.logical_and.reduceat(sine > least, first)
         turned = np.add.reduceat(np.arctan2(sine, cosine), first)
         once = np.abs(turned - 2 * np.pi) < _REVOLUTION
-        single = np.bincount(self.face_of_loop, minlength=self.count) == 1
+        single = np.bincount(self.face_of_loop, minlength=self.face_count) == 1
         return turns & once & single & (length > 0)
 
     @functools.cached_property
     def first_corners(self) -> IntArray:
         """(m,) place in `corners` of the first of each face."""
         new = np.flatnonzero(np.diff(self.face_of_loop, prepend=-1))
-        return self.starts[new]
+        return self.loop_starts[new]
 
 
 def validate_polygons(vertices: Any, faces: Any) -> PolygonFaces:
@@ -157,7 +159,7 @@ def validate_polygons(vertices: Any, faces: Any) -> PolygonFaces:
             vertices lie on a line.
     """
     x = _checked_vertices(vertices)
-    corners, sizes, face_of_loop = _flattened(faces)
+    corners, sizes, face_of_loop = _flatten_faces(faces)
     out = np.flatnonzero((corners < 0) | (corners >= len(x)))
     face = np.repeat(face_of_loop, sizes)
     if out.size:
@@ -166,32 +168,33 @@ def validate_polygons(vertices: Any, faces: Any) -> PolygonFaces:
         if index == len(x) and int(corners.min()) == 1:
             hint = "; these indices seem to count from 1: subtract 1"
         raise MeshError(
-            f"face {face[out[0]]} has vertex {index}{and_more(out.size)}, which is out of range: "
+            f"face {face[out[0]]} has vertex {index}{others_suffix(out.size)}, which is out of "
+            "range: "
             f"there are {len(x):,} vertices, counted from 0{hint}"
         )
     found = PolygonFaces(x, corners, sizes, face_of_loop)
     _check_edges(found)
-    _check_breadth(found)
+    _check_not_collinear(found)
     for array in (x, corners, sizes, face_of_loop):
         array.setflags(write=False)
     return found
 
 
 def _checked_vertices(vertices: Any) -> FloatArray:
-    array = real_array(vertices, "the vertices", MeshError, ragged="must all have 3 coordinates")
+    array = as_real_array(vertices, "the vertices", MeshError, ragged="must all have 3 coordinates")
     if array.size == 0:
         raise MeshError("there are no vertices: give an array (n, 3)")
-    check_vectors(array, "the vertices", MeshError, transposed=TRANSPOSE)
+    check_vectors(array, "the vertices", MeshError, transposed=TRANSPOSE_ADVICE)
     if len(array) > MAX_VERTICES:
         raise MeshError(f"{len(array):,} vertices are too many: at most {MAX_VERTICES:,}")
     x = np.array(array, dtype=np.float64, order="C")
     advice = "coordinates must be finite; remove it and the faces that use it"
     check_finite(x, "vertex {}", MeshError, advice)
-    check_size(x, MeshError)
+    check_coordinate_size(x, MeshError)
     return x
 
 
-def _flattened(faces: Any) -> tuple[IntArray, IntArray, IntArray]:
+def _flatten_faces(faces: Any) -> tuple[IntArray, IntArray, IntArray]:
     """Corners of all loops, the size of each, and the face of each."""
     if not _is_list(faces):
         raise MeshError(f"the faces must be a list of lists of vertex indices, not {faces!r}")
@@ -209,7 +212,7 @@ def _flattened(faces: Any) -> tuple[IntArray, IntArray, IntArray]:
     if (short := np.flatnonzero(sizes < 3)).size:
         raise MeshError(
             f"face {owners[int(short[0])]} has a loop of {sizes[short[0]]} vertices"
-            f"{and_more(short.size)}: a face needs three or more; leave it out"
+            f"{others_suffix(short.size)}: a face needs three or more; leave it out"
         )
     corners = np.concatenate(loops).astype(np.int64)
     return corners, sizes, np.array(owners, dtype=np.int64)
@@ -248,31 +251,31 @@ def _is_list(value: Any) -> bool:
 
 def _check_edges(found: PolygonFaces) -> None:
     n = len(found.vertices)
-    loop = np.repeat(np.arange(len(found.sizes)), found.sizes)
+    loop = np.repeat(np.arange(len(found.loop_sizes)), found.loop_sizes)
     face = found.face_of_corner
-    first = _first_double(loop * n + found.corners)
+    first = _first_repeated_key(loop * n + found.corners)
     if first is not None:
         raise MeshError(
             f"face {face[first]} visits vertex {found.corners[first]} twice: split it there into "
             "two loops of one face, or into two faces"
         )
-    begin, end = found.corners, found.corners[found.following]
+    begin, end = found.corners, found.corners[found.next_corner]
     length = np.abs(found.vertices[begin] - found.vertices[end]).max(axis=1)
     if (none := np.flatnonzero(length < 1e-100)).size:
         k = none[0]
         raise MeshError(
             f"face {face[k]} has an edge without a length, from vertex {begin[k]} to "
-            f"{end[k]}{and_more(none.size)}: join vertices at the same place"
+            f"{end[k]}{others_suffix(none.size)}: join vertices at the same place"
         )
     _, edge = np.unique(np.minimum(begin, end) * n + np.maximum(begin, end), return_inverse=True)
-    if (first := _first_double(face * len(edge) + edge.reshape(-1))) is not None:
+    if (first := _first_repeated_key(face * len(edge) + edge.reshape(-1))) is not None:
         raise MeshError(
             f"face {face[first]} runs along the edge from vertex {begin[first]} to {end[first]} "
             "twice: leave it out of both loops, or join its neighbors"
         )
 
 
-def _first_double(keys: IntArray) -> int | None:
+def _first_repeated_key(keys: IntArray) -> int | None:
     """The index of the first key that came before."""
     _, first = np.unique(keys, return_index=True)
     if len(first) == len(keys):
@@ -280,11 +283,11 @@ def _first_double(keys: IntArray) -> int | None:
     return int(np.setdiff1d(np.arange(len(keys)), first)[0])
 
 
-def _check_breadth(found: PolygonFaces) -> None:
+def _check_not_collinear(found: PolygonFaces) -> None:
     """Raise MeshError for a face whose vertices lie on a line: that from the corner farthest from
     its middle to the corner farthest from there."""
     x, face = found.vertices[found.corners], found.face_of_corner
-    low, high = found.boxes()
+    low, high = found.face_boxes()
     a = x - (0.5 * (low + high))[face]
     a /= np.abs(high - low).max(axis=1)[face][:, None]
     # The direction of the longest row, and how far the others are from it.
@@ -300,9 +303,9 @@ def _check_breadth(found: PolygonFaces) -> None:
     line /= np.linalg.norm(line, axis=1, keepdims=True)
     rest = np.linalg.norm(off - (off * line[face]).sum(axis=1)[:, None] * line[face], axis=1)
     widest = np.maximum.reduceat(rest, found.first_corners)
-    if (flat := np.flatnonzero(widest < _ON_A_LINE)).size:
+    if (flat := np.flatnonzero(widest < _COLLINEAR_TOLERANCE)).size:
         raise MeshError(
-            f"the vertices of face {flat[0]}{and_more(flat.size)} lie on a line: it has no "
+            f"the vertices of face {flat[0]}{others_suffix(flat.size)} lie on a line: it has no "
             "surface; leave it out"
         )
 
@@ -311,7 +314,7 @@ def _check_breadth(found: PolygonFaces) -> None:
 _NORMAL_WEIGHT = 0.25
 
 
-def polygon_patches(
+def cluster_into_polygons(
     vertices: FloatArray,
     faces: IntArray,
     count: int,
@@ -320,8 +323,8 @@ def polygon_patches(
     smoothing: int = 0,
     seed: int = 0,
 ) -> tuple[FloatArray, list[list[list[int]]]]:
-    """A triangle mesh cut into about `count` patches, polygons with many corners that are not flat:
-    vertices, and polygon faces, a list of loops each.
+    """A triangle mesh cut into about `face_count` patches, polygons with many corners that are not
+    flat: vertices, and polygon faces, a list of loops each.
 
     They are made for pictures and tests: each triangle is a point (centroid, weight * normal) in
     six dimensions, patches are the clusters of Lloyd's algorithm, so that they are compact and bend
@@ -340,7 +343,7 @@ def polygon_patches(
     patch = _clusters(vertices, faces, count, iterations, seed)
     order = np.argsort(patch, kind="stable")
     parts = np.split(faces[order], np.flatnonzero(np.diff(patch[order])) + 1)
-    loops = [join(boundary_edges(part.tolist())) for part in parts]
+    loops = [join_edges(boundary_edges(part.tolist())) for part in parts]
     loops = [one for one in loops if one]
     used = np.unique([corner for one in loops for loop in one for corner in loop])
     number = np.full(len(vertices), -1)

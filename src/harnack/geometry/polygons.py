@@ -1,4 +1,8 @@
-"""Closed polygons: without the edges that are run there and back, and cut into triangles."""
+"""Closed polygons: without the edges that are run there and back, and cut into triangles.
+
+Edges run there and back are taken out, by integer index, before a curve is uploaded: what cancels
+on paper leaves its rounding errors on a machine.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +11,7 @@ import numpy as np
 from harnack.backend import BoolArray, FloatArray, IntArray
 from harnack.geometry.boundary_edges import (
     boundary_edges,
-    join,
+    join_edges,
     net_edges,
     singular_loops,
     weld_vertices,
@@ -15,10 +19,10 @@ from harnack.geometry.boundary_edges import (
 from harnack.geometry.curves import Loops
 from harnack.geometry.meshes import MeshError
 
-__all__ = ["net_loops", "triangulate", "uncanceled_edges"]
+__all__ = ["cancel_opposite_edges", "remaining_edges", "triangulate"]
 
 
-def net_loops(loops: Loops) -> Loops:
+def cancel_opposite_edges(loops: Loops) -> Loops:
     """Closed loops with the same solid angle modulo 4 pi, of which no edge runs another back.
 
     Seen from outside of an edge, its part in the solid angle of one loop is minus that in another
@@ -44,8 +48,9 @@ def net_loops(loops: Loops) -> Loops:
     return tuple(points[np.array(loop)] for loop in singular_loops(edges, weights))
 
 
-def uncanceled_edges(loops: Loops) -> tuple[FloatArray, FloatArray]:
-    """Starts and ends (k, 3) of the edges of closed loops that are left (`net_loops`), each once.
+def remaining_edges(loops: Loops) -> tuple[FloatArray, FloatArray]:
+    """Starts and ends (k, 3) of the edges of closed loops that are left (`cancel_opposite_edges`),
+    each once.
 
     Around an edge that is run n times net, the solid angle changes by 4 pi n: unless n = 0 it
     takes every value modulo 4 pi next to each of its points, so that every level set ends there.
@@ -68,7 +73,7 @@ def _welded(loops: Loops, points: FloatArray) -> tuple[IntArray, IntArray]:
 
 # Corners squared, and this constant more a polygon, summed over those of which ears are cut: some
 # ten seconds of work at worst.
-_MOST_WORK = 1_000_000_000
+_MAX_EAR_WORK = 1_000_000_000
 _WORK_A_POLYGON = 1000
 # Twice the area of a triangle, in a polygon of size about 1, up to which it counts as flat.
 _FLAT = 1e-12
@@ -96,18 +101,18 @@ def triangulate(vertices: FloatArray, corners: IntArray, sizes: IntArray) -> Int
     found = [np.zeros((0, 3), dtype=np.int64)]
     owners = [np.zeros(0, dtype=np.int64)]
     work = 0
-    for part in _equal_parts(sizes):
+    for part in _group_by_size(sizes):
         k = int(sizes[part[0]])
         polygons = corners[begins[part][:, None] + np.arange(k)]
         bent = np.zeros(len(part), dtype=bool)
         if k > 3:
-            bent = _has_dents(vertices, polygons)
+            bent = _fan_is_invalid(vertices, polygons)
             # The fan around the second corner is that around the first of the polygon turned on.
             polygons[bent] = np.roll(polygons[bent], -1, axis=1)
             # A quadrilateral can be cut in no other way.
-            bent[bent] = k > 4 and _has_dents(vertices, polygons[bent])
+            bent[bent] = k > 4 and _fan_is_invalid(vertices, polygons[bent])
         work += int(bent.sum()) * (k * k + _WORK_A_POLYGON)
-        if work > _MOST_WORK:
+        if work > _MAX_EAR_WORK:
             raise MeshError(
                 f"{bent.sum():,} polygons with dents and {k:,} corners each take too long to "
                 "triangulate: let the program that made the file triangulate them"
@@ -116,12 +121,12 @@ def triangulate(vertices: FloatArray, corners: IntArray, sizes: IntArray) -> Int
         owners.append(np.repeat(part[~bent], k - 2))
         projections = _projections(vertices, polygons[bent])
         for owner, polygon, projection in zip(part[bent], polygons[bent], projections, strict=True):
-            found.append(_cut_ears(polygon, projection))
+            found.append(_clip_ears(polygon, projection))
             owners.append(np.full(len(found[-1]), owner))
     return np.concatenate(found)[np.argsort(np.concatenate(owners), kind="stable")]
 
 
-def _equal_parts(sizes: IntArray) -> list[IntArray]:
+def _group_by_size(sizes: IntArray) -> list[IntArray]:
     """Numbers of polygons with equally many corners, three or more, not too many at a time."""
     order = np.argsort(sizes, kind="stable")
     order = order[sizes[order] >= 3]
@@ -139,7 +144,7 @@ def _fans(polygons: IntArray) -> IntArray:
     return np.stack([first, polygons[:, 1:-1], polygons[:, 2:]], axis=2).reshape(-1, 3)
 
 
-def _has_dents(vertices: FloatArray, polygons: IntArray) -> BoolArray:
+def _fan_is_invalid(vertices: FloatArray, polygons: IntArray) -> BoolArray:
     """Whether some triangle of the fan around the first corner is turned over or flat: (m,).
 
     Polygons without any area count as without dents.
@@ -167,23 +172,23 @@ def _projections(vertices: FloatArray, polygons: IntArray) -> FloatArray:
     return np.stack([np.einsum("mkj,mj->mk", p, axis) for axis in axes], axis=2)
 
 
-def _cut_ears(polygon: IntArray, projection: FloatArray) -> IntArray:
+def _clip_ears(polygon: IntArray, projection: FloatArray) -> IntArray:
     """Triangles of a polygon (k,) whose projection (k, 2) has dents."""
     import mapbox_earcut  # here, since most files do without
 
     ears = np.zeros((0, 3), dtype=np.int64)
     if np.isfinite(projection).all():
         ends = np.array([len(polygon)], dtype=np.uint32)
-        cut = mapbox_earcut.triangulate_float64(_bent_inward(projection), ends)
+        cut = mapbox_earcut.triangulate_float64(_perturb_straight_corners(projection), ends)
         ears = polygon[cut.reshape(-1, 3)]
     if len(ears) == len(polygon) - 2:
         return ears
     # The polygon crosses or touches itself, and corners were dropped: fans fill what remains.
-    remaining = join(boundary_edges([polygon.tolist(), *ears[:, ::-1].tolist()]))
+    remaining = join_edges(boundary_edges([polygon.tolist(), *ears[:, ::-1].tolist()]))
     return np.concatenate([ears, *(_fans(np.array([loop])) for loop in remaining)])
 
 
-def _bent_inward(projection: FloatArray) -> FloatArray:
+def _perturb_straight_corners(projection: FloatArray) -> FloatArray:
     """The polygon (k, 2), its straight edges with corners in their middle bent by next to nothing.
 
     Such a corner is then no ear, which would be a triangle without area.

@@ -21,13 +21,17 @@ if TYPE_CHECKING:
 
 __all__ = ["smooth_curve"]
 
-Spacing = Literal["centripetal", "chord"]
+Parameterization = Literal["centripetal", "chord"]
 # The parameter grows from point to point by this power of their distance.
 _POWERS = {"centripetal": 0.5, "chord": 1.0}
 
 
 def smooth_curve(
-    points: LoopsLike, samples: int = 16, *, closed: bool = True, spacing: Spacing = "centripetal"
+    points: LoopsLike,
+    samples_per_segment: int = 16,
+    *,
+    closed: bool = True,
+    spacing: Parameterization = "centripetal",
 ) -> Any:
     """A smooth curve through points: a cubic spline, which has continuous second derivatives.
 
@@ -35,7 +39,8 @@ def smooth_curve(
 
     points: (n, 3) in order, n >= 3, or a list of such arrays. A closed curve returns from the last
         point to the first, which need not be repeated.
-    samples: vertices from each point to the next, the first of them the point itself, bit by bit.
+    samples_per_segment: vertices from each point to the next, the first of them the point itself,
+        bit by bit.
     closed: False for a curve that ends at its first and last point. There the third derivative
         is continuous at the second point and the last but one ("not a knot").
     spacing: how the parameter grows from point to point: "centripetal" as the root of their
@@ -43,34 +48,37 @@ def smooth_curve(
         1989); "chord" as the distance, which makes rounder curves of evenly spaced points.
 
     Returns:
-        (n samples, 3) vertices, of an open curve ((n - 1) samples + 1, 3); a list of such arrays
-        for a list. A loop crosses itself where the points make it do so: nothing is checked here.
+        (n k, 3) vertices, of an open curve ((n - 1) k + 1, 3), with k = samples_per_segment; a list
+        of such arrays for a list. A loop crosses itself where the points make it do so: nothing is
+        checked here.
 
     Raises:
         CurveError: fewer than 3 different points, two equal ones in a row, NaN, wrong shapes, or
             too many vertices.
-        TypeError: samples is no whole number.
-        ValueError: samples less than 1, or an unknown spacing.
+        TypeError: samples_per_segment is no whole number.
+        ValueError: samples_per_segment less than 1, or an unknown spacing.
     """
-    samples = _count(samples)
+    samples_per_segment = _count(samples_per_segment)
     if spacing not in _POWERS:
         raise ValueError(f'spacing is "centripetal" or "chord", not {spacing!r}')
     loops = validate_loops(points, closed=closed)
-    total = sum(map(len, loops)) * samples
+    total = sum(map(len, loops)) * samples_per_segment
     if total > MAX_VERTICES:
         raise TooManyVerticesError(
             f"{total:,} vertices are more than {MAX_VERTICES:,}: take fewer samples"
         )
-    made = [_spline(loop, samples, closed, _POWERS[spacing]) for loop in loops]
+    made = [_spline(loop, samples_per_segment, closed, _POWERS[spacing]) for loop in loops]
     return made if _is_list(points) else made[0]
 
 
 def _count(samples: Any) -> int:
     if isinstance(samples, bool) or not hasattr(samples, "__index__"):
-        raise TypeError(f"samples must be a whole number, not {samples!r}")
+        raise TypeError(f"samples_per_segment must be a whole number, not {samples!r}")
     count = operator.index(samples)
     if count < 1:
-        raise ValueError(f"samples must be at least 1 from each point to the next, not {count}")
+        raise ValueError(
+            f"samples_per_segment must be at least 1 from each point to the next, not {count}"
+        )
     return count
 
 

@@ -1,4 +1,10 @@
-"""The interface of a clipping volume: a convex part of space that rays are cut to."""
+"""The interface of a clipping volume: a convex part of space that rays are cut to.
+
+Extents are proved too. The 2π level of a curve in convex position lies in its hull; for other
+curves an isoperimetric box is carved by cells proved empty. It is why rays that miss cost nothing
+and why a ray without an end is a proved miss. Of fields that are dear to evaluate
+(`Field.occupied_cells`) the march jumps across empty cells of a grid as well, where rays are many.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +16,7 @@ import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
-from harnack.backend.validation import check_vectors, real, real_array, refuse_derivatives
+from harnack.backend.validation import as_real, as_real_array, check_no_derivatives, check_vectors
 
 if TYPE_CHECKING:
     from typing import Self
@@ -34,15 +40,15 @@ class Volume(abc.ABC):
 
     def __new__(cls, *given: Any, **named: Any) -> Self:
         """Refuses numbers with derivatives, which would be dropped."""
-        refuse_derivatives(cls.__name__, given, named)
+        check_no_derivatives(cls.__name__, given, named)
         return super().__new__(cls)
 
     def __and__(self, other: object) -> Volume:
-        from harnack.geometry.clip_volumes import Intersection
+        from harnack.geometry.clip_volumes import VolumeIntersection
 
         if not isinstance(other, Volume):
             return NotImplemented
-        return Intersection((*_parts(self), *_parts(other)))
+        return VolumeIntersection((*_parts(self), *_parts(other)))
 
     @abc.abstractmethod
     def clip(self, o: Vec3, d: Vec3, t_min: Real, t_max: Real) -> tuple[Real, Real]:
@@ -91,7 +97,7 @@ def _parts(volume: Volume) -> tuple[Volume, ...]:
     return (volume,) if parts is None else parts
 
 
-def rounding(backend: Backend) -> float:
+def clip_rounding(backend: Backend) -> float:
     """Relative error allowed for one clipping formula: ten roundings of half a unit.
 
     The longest chain of roundings among volumes (a plane: normal rounded to the backend, three
@@ -100,13 +106,13 @@ def rounding(backend: Backend) -> float:
     return 10.0 * float(dr.epsilon(backend.Float))
 
 
-def emptied(t0: Real, t1: Real) -> tuple[Real, Real]:
+def normalize_empty_interval(t0: Real, t1: Real) -> tuple[Real, Real]:
     """The interval, or (inf, -inf) where it holds at most a point."""
     full = t0 < t1
     return dr.select(full, t0, dr.inf), dr.select(full, t1, -dr.inf)
 
 
-def checked_point(value: Iterable[float], name: str, *, finite: bool = True) -> Point:
+def as_point(value: Iterable[float], name: str, *, finite: bool = True) -> Point:
     """Three numbers as a tuple of floats.
 
     Raises:
@@ -115,7 +121,7 @@ def checked_point(value: Iterable[float], name: str, *, finite: bool = True) -> 
     try:
         if isinstance(value, str | bytes):
             raise TypeError
-        numbers = tuple(real(v, name) for v in value)
+        numbers = tuple(as_real(v, name) for v in value)
     except TypeError:
         raise ValueError(f"{name} must be three numbers, not {value!r}") from None
     if len(numbers) != 3:
@@ -134,7 +140,7 @@ def check_volume(given: object, name: str) -> None:
         )
 
 
-def checked_distance(distance: float) -> float:
+def as_padding(distance: float) -> float:
     """A padding distance.
 
     Raises:
@@ -151,6 +157,6 @@ def as_points(points: npt.ArrayLike) -> FloatArray:
     Raises:
         ValueError: no real numbers, or another shape.
     """
-    array = real_array(points, "points")
+    array = as_real_array(points, "points")
     check_vectors(array, "points")
     return np.asarray(array, dtype=np.float64)

@@ -12,47 +12,47 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import BoolArray, FloatArray, choose_backend, to_numpy
-from harnack.backend.arrays import aligned, aligned_integers, upload_vectors
-from harnack.backend.elementary import across_rows, fmax, fmin
+from harnack.backend.arrays import upload_floats, upload_integers, upload_vectors
+from harnack.backend.elementary import fmax, fmin, orthonormal_basis_rows
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real
 
-__all__ = ["TangentCells"]
+__all__ = ["TangentVoronoi"]
 
 # Lines that are cut at once by each of the others.
-_AT_ONCE = 4
+_LINES_PER_ITERATION = 4
 # Sines below which lines are parallel, and distances below which these are equal.
 _PARALLEL = 1e-12
 
 
 @dataclass(frozen=True)
-class _Line:
+class _BisectorLine:
     """The line n . y = h that bounds a cell towards a neighbor, in units of the cell's radius.
 
     x, y: n, of length 1; 0 if the line misses the unit disc. h: 1 if it does.
-    q: from the point to the neighbor, projected to the tangent plane.
+    neighbor: from the point to the neighbor, projected to the tangent plane.
     """
 
     x: Real
     y: Real
     h: Real
-    q: tuple[Real, Real]
+    neighbor: tuple[Real, Real]
 
 
 @dataclass(frozen=True)
-class TangentCells:
+class TangentVoronoi:
     """Positions that may be neighbors, on a backend: each coordinate (n,)."""
 
     backend: Backend
     positions: tuple[Real, ...]
 
     @classmethod
-    def of(cls, positions: FloatArray) -> TangentCells:
+    def of(cls, positions: FloatArray) -> TangentVoronoi:
         """positions: (n, 3)."""
         backend = choose_backend("double")
         columns = np.asarray(positions, np.float64).T
-        return cls(backend, tuple(aligned(backend, one) for one in columns))
+        return cls(backend, tuple(upload_floats(backend, one) for one in columns))
 
     def areas(
         self, points: FloatArray, normals: FloatArray, nearest: npt.NDArray[Any], radii: FloatArray
@@ -63,13 +63,13 @@ class TangentCells:
         nearest: (m, k) the neighbors, as positions. radii: (m,). Where all neighbors lie on one
         side of a line through the point, their mirror images count too.
         """
-        areas, rim = self._cut(points, normals, nearest, radii, mirrored=False)
+        areas, rim = self._cell_areas(points, normals, nearest, radii, mirrored=False)
         if rim.any():
             some = points[rim], normals[rim], nearest[rim], radii[rim]
-            areas[rim], _ = self._cut(*some, mirrored=True)
+            areas[rim], _ = self._cell_areas(*some, mirrored=True)
         return areas * radii * radii
 
-    def _cut(
+    def _cell_areas(
         self, points: FloatArray, normals: FloatArray, nearest: npt.NDArray[Any],
         radii: FloatArray, *, mirrored: bool,
     ) -> tuple[FloatArray, BoolArray]:  # fmt: skip
@@ -81,15 +81,15 @@ class TangentCells:
         remain. All neighbors lie on one side if none is to the left of one of them.
         """
         backend, index = self.backend, self.backend.UInt32
-        u, v = (upload_vectors(backend, axis) for axis in across_rows(normals))
-        center, scale = upload_vectors(backend, points), aligned(backend, 1 / radii)
+        u, v = (upload_vectors(backend, axis) for axis in orthonormal_basis_rows(normals))
+        center, scale = upload_vectors(backend, points), upload_floats(backend, 1 / radii)
         count = nearest.shape[1]
-        table = aligned_integers(backend, np.ascontiguousarray(nearest.T).ravel())
+        table = upload_integers(backend, np.ascontiguousarray(nearest.T).ravel())
         lane, width = dr.arange(index, len(points)), dr.opaque(index, len(points))
         lines = dr.opaque(index, count * (2 if mirrored else 1))
         rows = dr.opaque(index, count)
 
-        def line(i: Any, active: Mask) -> _Line:
+        def line(i: Any, active: Mask) -> _BisectorLine:
             row = dr.select(i < rows, i, i - rows)
             one = dr.gather(index, table, row * width + lane, active)
             there = [dr.gather(backend.Float, part, one, active) for part in self.positions]
@@ -100,11 +100,11 @@ class TangentCells:
             return _crossing(backend, q, 0.5 * dr.squared_norm(offset))
 
         def others(j: Any, *state: Any) -> tuple[Any, ...]:
-            numbers = [j + t for t in range(_AT_ONCE)]
+            numbers = [j + t for t in range(_LINES_PER_ITERATION)]
             own = [line(number, number < lines) for number in numbers]
             area, turned, is_rim = state
             for number, one, found in zip(
-                numbers, own, _cut_by_all(backend, numbers, own, line, lines), strict=True
+                numbers, own, _clip_bisectors(backend, numbers, own, line, lines), strict=True
             ):
                 low, high, has_left = found
                 used, there = low < high, number < lines
@@ -112,8 +112,10 @@ class TangentCells:
                 area = area + dr.select(there, 0.5 * one.h * (high - low), 0)
                 turn = dr.atan2(high, one.h) - dr.atan2(low, one.h)
                 turned = turned + dr.select(there, turn, 0)
-                is_rim = is_rim | (there & ~has_left & ((one.q[0] != 0) | (one.q[1] != 0)))
-            return j + _AT_ONCE, area, turned, is_rim
+                is_rim = is_rim | (
+                    there & ~has_left & ((one.neighbor[0] != 0) | (one.neighbor[1] != 0))
+                )
+            return j + _LINES_PER_ITERATION, area, turned, is_rim
 
         zero = backend.Float(0) + 0 * scale
         start = index(0) + 0 * lane, zero, zero, zero > 1
@@ -133,16 +135,16 @@ def _below(count: Any) -> Callable[..., Mask]:
     return more
 
 
-def _crossing(backend: Backend, q: tuple[Real, Real], b: Real) -> _Line:
+def _crossing(backend: Backend, q: tuple[Real, Real], b: Real) -> _BisectorLine:
     """The line q . y = b in the unit disc."""
     length = dr.sqrt(dr.square(q[0]) + dr.square(q[1]))
     crosses = length > b
     inverse = dr.select(crosses, dr.rcp(length), 0)
-    return _Line(q[0] * inverse, q[1] * inverse, dr.select(crosses, b * inverse, 1), q)
+    return _BisectorLine(q[0] * inverse, q[1] * inverse, dr.select(crosses, b * inverse, 1), q)
 
 
-def _cut_by_all(
-    backend: Backend, numbers: list[Any], own: list[_Line], line: Any, lines: Any
+def _clip_bisectors(
+    backend: Backend, numbers: list[Any], own: list[_BisectorLine], line: Any, lines: Any
 ) -> list[tuple[Real, Real, Mask]]:
     """Of some lines the intervals that all others leave, and whether a neighbor is to the left."""
     start: list[Any] = []
@@ -164,7 +166,9 @@ def _cut_by_all(
             # Of equal lines the first counts.
             hidden = is_parallel & (room < dr.select(number > i, _PARALLEL, -_PARALLEL))
             high = dr.select(hidden, -dr.inf, high)
-            has_left = has_left | (one.q[0] * other.q[1] - one.q[1] * other.q[0] > 0)
+            has_left = has_left | (
+                one.neighbor[0] * other.neighbor[1] - one.neighbor[1] * other.neighbor[0] > 0
+            )
             new += [low, high, has_left]
         return i + 1, *new
 

@@ -4,15 +4,15 @@ from harnack.meshing.checks import MeshingError
 from harnack.meshing.mesh_pipeline import mesh
 from harnack.meshing.print_checks import PrintCheck, PrintProblem, check_print
 from harnack.meshing.repair_stages import repair
-from harnack.meshing.thickness import Thickness, thickness
+from harnack.meshing.thickness import WallThickness, wall_thickness
 
 __all__ = [
     "MeshingError",
     "PrintCheck",
     "PrintProblem",
-    "Thickness",
+    "WallThickness",
     "check_print",
     "mesh",
     "repair",
-    "thickness",
+    "wall_thickness",
 ]

@@ -22,11 +22,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
-from harnack.meshing.checks import MeshingError, TooLargeError
-from harnack.meshing.edges import IntArray, distinct
-from harnack.tree.empty_space import Cells, Clearance, octree
+from harnack.meshing.checks import MeshingError, TriangleLimitError
+from harnack.meshing.edges import IntArray, sorted_unique
+from harnack.tree.empty_space import BoxCells, Clearance, refine_cells
 
-__all__ = ["Lattice", "distinct_rows"]
+__all__ = ["BccLattice", "distinct_rows"]
 
 # More cells than that are refused: about five million triangles.
 MOST_CELLS = 2_000_000
@@ -37,7 +37,7 @@ _MOST_ROOTS = 200_000
 
 
 @dataclass(frozen=True)
-class Lattice:
+class BccLattice:
     """counts: (3,) cells along each side of a box from `lower`, each with edges `size` (3,).
 
     Points have even coordinates (n, 3) in half cells if they are corners, and odd ones if centers;
@@ -49,11 +49,11 @@ class Lattice:
     counts: IntArray
 
     @classmethod
-    def filling(
+    def covering_box(
         cls, lower: FloatArray, upper: FloatArray, spacing: float, layers: int = 0
-    ) -> Lattice:
-        """Cells that fill a box, as nearly cubes of edge `spacing` as possible, and `layers` around
-        it.
+    ) -> BccLattice:
+        """Cells that fill a box, as nearly cubes of edge `cell_size` as possible, and `layers`
+        around it.
 
         Raises:
             MeshingError: a box without volume.
@@ -76,11 +76,11 @@ class Lattice:
         x = np.where(coordinates == 0, self.lower, x)
         return np.where(coordinates == 2 * self.counts, self.upper, x)
 
-    def is_outer(self, coordinates: IntArray) -> BoolArray:
+    def is_on_box(self, coordinates: IntArray) -> BoolArray:
         """(n,) whether points lie on the box."""
         return ((coordinates == 0) | (coordinates == 2 * self.counts)).any(axis=1)
 
-    def cells_not_empty(self, clearance: Clearance, most_faces: int) -> IntArray:
+    def nonempty_cells(self, clearance: Clearance, most_faces: int) -> IntArray:
         """(n, 3) indices of the cells that are not proved empty, by octrees over blocks of them.
 
         most_faces: triangles that may be made; a cell makes about three.
@@ -91,7 +91,7 @@ class Lattice:
         # A surface across the box passes through at least this many cells.
         most = min(MOST_CELLS, most_faces)
         if (least := float(np.prod(np.sort(self.counts)[:2].astype(float)))) > most:
-            raise too_large(least, most)
+            raise triangle_limit_error(least, most)
         halvings = 0
         while halvings < 3 and (self.counts >= 2 ** (halvings + 2)).all():
             halvings += 1
@@ -101,25 +101,25 @@ class Lattice:
             blocks = -(-self.counts // 2**halvings)
         grid = np.stack(np.meshgrid(*map(np.arange, blocks), indexing="ij"), axis=-1)
         edges = self.size * 2**halvings
-        root = Cells(self.lower + grid.reshape(-1, 3) * edges, edges)
-        root = root.some(~root.proved_empty(clearance))
-        leaves = octree(root, clearance, 8 * most, halvings).leaves
+        root = BoxCells(self.lower + grid.reshape(-1, 3) * edges, edges)
+        root = root.subset(~root.is_proved_empty(clearance))
+        leaves = refine_cells(root, clearance, 8 * most, halvings).occupied
         if not len(leaves.corners):
             return np.zeros((0, 3), np.int64)
         rounds = round(math.log2(edges[0] / leaves.size[0]))
         expected = len(leaves.corners) * 4 ** (halvings - rounds)
         if expected > most or rounds < halvings:
-            raise too_large(expected, most)
+            raise triangle_limit_error(expected, most)
         index = np.rint((leaves.corners - self.lower) / self.size).astype(np.int64)
         return index[(index < self.counts).all(axis=1)]
 
-    def cells_that_matter(
+    def relevant_cells(
         self, clearance: Clearance, matter: IntArray, values: Clearance, most_faces: int
     ) -> tuple[IntArray, BoolArray]:
         """(n, 3) indices of the cells that may hold the level set or are negative beside cells that
         do not matter, and of all cells of the lattice which do (counts).
 
-        matter: (k, 3) indices of the cells that may matter (`cells_not_empty`). values: of the
+        matter: (k, 3) indices of the cells that may matter (`nonempty_cells`). values: of the
             function. What does not matter counts as positive: all points of such cells do. As in
             the module's proof, tetrahedra at the chosen cells then have all faces between points
             of two signs: a cell that is not chosen has a center of the sign of its corners that
@@ -133,13 +133,13 @@ class Lattice:
         centers = self.points(2 * matter + 1)
         half_diagonal = 0.5 * float(np.linalg.norm(self.size))
         chosen = clearance(centers) <= half_diagonal * (1 + 1e-9)
-        rim = np.flatnonzero(~chosen & ~self.deep(does)[tuple(matter.T)])
+        rim = np.flatnonzero(~chosen & ~self.interior_cells(does)[tuple(matter.T)])
         chosen[rim[values(centers[rim]) <= 0]] = True
         if int(chosen.sum()) > min(MOST_CELLS, most_faces):
-            raise too_large(float(chosen.sum()), min(MOST_CELLS, most_faces))
+            raise triangle_limit_error(float(chosen.sum()), min(MOST_CELLS, most_faces))
         return matter[chosen], does
 
-    def deep(self, cells: BoolArray) -> BoolArray:
+    def interior_cells(self, cells: BoolArray) -> BoolArray:
         """Those of some cells (counts) of which all neighbors in the lattice belong to them."""
         around = np.pad(cells, 1, constant_values=True)
         inner = cells.copy()
@@ -147,12 +147,12 @@ class Lattice:
             inner &= around[tuple(slice(i, i + n) for i, n in zip(shift, cells.shape, strict=True))]
         return inner
 
-    def cells_of(self, points: FloatArray) -> IntArray:
+    def cell_indices(self, points: FloatArray) -> IntArray:
         """(n, 3) indices of the cells that points lie in, or that are nearest to them."""
         index = np.floor((points - self.lower) / self.size).astype(np.int64)
         return np.clip(index, 0, self.counts - 1)
 
-    def beside(self, coordinates: IntArray, cells: BoolArray) -> BoolArray:
+    def touches_cells(self, coordinates: IntArray, cells: BoolArray) -> BoolArray:
         """(n,) whether points, by coordinates, are corners or centers of some of the cells
         (counts)."""
         padded = np.pad(cells, 1)
@@ -184,7 +184,7 @@ class Lattice:
             lower = 2 * cells
             lower[:, axis] += 2
             face = np.concatenate([2 * cells, lower])
-            face = _key_rows(distinct(_keys(face, shape)), shape)
+            face = _key_rows(sorted_unique(_keys(face, shape)), shape)
             others = [k for k in range(3) if k != axis]
             six: list[IntArray] = []
             for way in (-1, 1):
@@ -197,7 +197,7 @@ class Lattice:
                 six.append(_keys(corner, shape))
             found.append(six)
         keys = [np.concatenate(column) for column in zip(*found, strict=True)]
-        used = distinct(np.concatenate(keys))
+        used = sorted_unique(np.concatenate(keys))
         if math.prod(shape.tolist()) < _MOST_LISTED:
             place = np.zeros(math.prod(shape.tolist()), np.int64)
             place[used] = np.arange(len(used))
@@ -211,15 +211,15 @@ class Lattice:
 def distinct_rows(rows: IntArray) -> IntArray:
     """The rows (n, 3) of numbers that are not negative, each once and in order."""
     shape = rows.max(axis=0, initial=0) + 1
-    return _key_rows(distinct(_keys(rows, shape)), shape)
+    return _key_rows(sorted_unique(_keys(rows, shape)), shape)
 
 
-def too_large(cells: float, most: int) -> TooLargeError:
+def triangle_limit_error(cells: float, most: int) -> TriangleLimitError:
     """The error about too many cells."""
-    return TooLargeError(
+    return TriangleLimitError(
         f"about {cells:.1e} cells hold the surface, which makes some {3 * cells:.0e} triangles; "
         f"at most {most:,} cells are made (max_triangles, and never more than {MOST_CELLS:,}): "
-        "choose a larger `spacing` or `tolerance`, or a smaller `clip`"
+        "choose a larger `cell_size` or `tolerance`, or a smaller `clip`"
     )
 
 

@@ -10,13 +10,13 @@ import numpy as np
 
 from harnack.backend import FloatArray
 from harnack.geometry import MeshError
-from harnack.meshing.checks import CrossingError, check_manifold, intersecting_faces
+from harnack.meshing.checks import SelfIntersectionError, check_manifold, intersecting_faces
 from harnack.meshing.clipping import winding_around
-from harnack.meshing.closed_mesh import grown, manifold_of
+from harnack.meshing.closed_mesh import grown, to_manifold
 from harnack.meshing.csg_meshing import apart_of
-from harnack.meshing.edges import IntArray, crosses, directed_edges, dots, lengths
+from harnack.meshing.edges import IntArray, area_normals, half_edges, row_dots, row_norms
 from harnack.meshing.joined_pieces import boundary_of_solid, neighbors, passes_itself
-from harnack.meshing.lattice_meshing import Surface
+from harnack.meshing.lattice_meshing import TriangleMesh
 
 if TYPE_CHECKING:
     from manifold3d import Manifold
@@ -71,7 +71,7 @@ def _pieces(x: FloatArray, faces: IntArray) -> list[IntArray]:
 
 def _is_closed(faces: IntArray) -> bool:
     """Whether every edge is run as often one way as the other."""
-    pairs = directed_edges(faces)
+    pairs = half_edges(faces)
     count = int(pairs.max()) + 1
     forth, back = (np.sort(pairs @ way) for way in ((count, 1), (1, count)))
     return bool((forth == back).all())
@@ -80,7 +80,9 @@ def _is_closed(faces: IntArray) -> bool:
 def volume_of(x: FloatArray, faces: IntArray) -> float:
     """What a closed mesh holds, negative if it is inside out."""
     corner = x[faces] - x[faces].mean(axis=(0, 1))
-    return float(dots(corner[:, 0], crosses(corner)).sum()) / 6  # the same as of its corners
+    return (
+        float(row_dots(corner[:, 0], area_normals(corner)).sum()) / 6
+    )  # the same as of its corners
 
 
 def nested(x: FloatArray, parts: list[IntArray]) -> list[list[int]]:
@@ -109,7 +111,7 @@ def nested(x: FloatArray, parts: list[IntArray]) -> list[list[int]]:
     return holders
 
 
-def mended_by_cuts(x: FloatArray, faces: IntArray, within: float) -> Surface:
+def mended_by_cuts(x: FloatArray, faces: IntArray, within: float) -> TriangleMesh:
     """The boundary of the points around which a closed mesh winds at least once, by pieces of its
     faces (`boundary_of_solid`).
 
@@ -118,12 +120,14 @@ def mended_by_cuts(x: FloatArray, faces: IntArray, within: float) -> Surface:
     Raises:
         MeshingError: nothing is left, or pieces do not fit together.
     """
-    surface = apart_of(manifold_of(boundary_of_solid(x, faces)), within)
+    surface = apart_of(to_manifold(boundary_of_solid(x, faces)), within)
     check_manifold(surface.faces, surface.vertices)
     return surface
 
 
-def united_parts(x: FloatArray, faces: IntArray, parts: list[IntArray], within: float) -> Surface:
+def united_parts(
+    x: FloatArray, faces: IntArray, parts: list[IntArray], within: float
+) -> TriangleMesh:
     """The boundary of the points around which closed parts wind at least once, in all. They may
     cross, touch and lie in each other, and wind clockwise.
 
@@ -139,11 +143,11 @@ def united_parts(x: FloatArray, faces: IntArray, parts: list[IntArray], within: 
         MeshError: a part passes through itself.
         MeshingError: a part is no manifold; or nothing is left.
     """
-    shells = [Surface.of(x, faces[rows]) for rows in parts]
+    shells = [TriangleMesh.without_unused_vertices(x, faces[rows]) for rows in parts]
     shells = _overlapping(shells)
     try:
         return _united(shells, within)
-    except CrossingError:  # parts touch up to rounding, along an edge
+    except SelfIntersectionError:  # parts touch up to rounding, along an edge
         size = _GROWN * float(np.ptp(x[faces], axis=(0, 1)).max())
         signs = [math.copysign(1, volume_of(shell.vertices, shell.faces)) for shell in shells]
         return _united(
@@ -151,7 +155,7 @@ def united_parts(x: FloatArray, faces: IntArray, parts: list[IntArray], within: 
         )
 
 
-def _overlapping(shells: list[Surface]) -> list[Surface]:
+def _overlapping(shells: list[TriangleMesh]) -> list[TriangleMesh]:
     """Parts whose faces that lie on those of an earlier one, but for rounding, are moved into it by
     next to nothing: where they are in one plane, but not to the last bit, gaps without a width
     would be left."""
@@ -168,23 +172,23 @@ def _overlapping(shells: list[Surface]) -> list[Surface]:
             near = np.flatnonzero(((lows[j] <= high) & (highs[j] >= low)).all(axis=1))
             for face in range(len(faces)) if len(near) else ():
                 normal = planes[k][face]
-                on = near[lengths(planes[j][near] + normal) <= _ON]
+                on = near[row_norms(planes[j][near] + normal) <= _ON]
                 is_met = (lows[j][on] <= highs[k][face]) & (highs[j][on] >= lows[k][face])
                 on = on[is_met.all(axis=1)]
                 height = np.abs((corners[j][on] - corners[k][face, 0]) @ normal)
                 height = height.max(axis=1, initial=0.0)
                 if ((height > 0) & (height <= _ON * size)).any():
                     x[faces[face]] = shells[k].vertices[faces[face]] + _INTO * size * normal
-        moved.append(Surface(x, faces))
+        moved.append(TriangleMesh(x, faces))
     return moved
 
 
 def _unit_normals(corner: FloatArray) -> FloatArray:
-    normal = crosses(corner)
-    return normal / np.maximum(lengths(normal), 1e-300)[:, None]
+    normal = area_normals(corner)
+    return normal / np.maximum(row_norms(normal), 1e-300)[:, None]
 
 
-def _united(shells: list[Surface], within: float) -> Surface:
+def _united(shells: list[TriangleMesh], within: float) -> TriangleMesh:
     """As `united_parts`, of parts that do not lie on each other but for rounding."""
     from manifold3d import Manifold
 
@@ -201,7 +205,7 @@ def _united(shells: list[Surface], within: float) -> Surface:
     return surface
 
 
-def _manifold_of_part(shell: Surface) -> tuple[Manifold, bool]:
+def _manifold_of_part(shell: TriangleMesh) -> tuple[Manifold, bool]:
     """What a closed part bounds, and whether it winds counter-clockwise around that."""
     is_body = volume_of(shell.vertices, shell.faces) > 0
     if len(crossing := intersecting_faces(shell.vertices, shell.faces)):
@@ -209,4 +213,4 @@ def _manifold_of_part(shell: Surface) -> tuple[Manifold, bool]:
     if passes_itself(shell, np.zeros(len(shell.faces), np.int64)):
         raise MeshError("a part passes through itself along edges that lie on faces")
     faces = shell.faces if is_body else shell.faces[:, ::-1]
-    return manifold_of(Surface(shell.vertices, faces)), is_body
+    return to_manifold(TriangleMesh(shell.vertices, faces)), is_body

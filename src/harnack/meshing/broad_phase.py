@@ -16,19 +16,19 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray, choose_backend, to_numpy
-from harnack.backend.record_table import Records
+from harnack.backend.record_table import RecordTable
 from harnack.meshing.edges import IntArray
 from harnack.tree.balanced_tree import (
     NO_PRIMITIVE,
-    Node,
+    LoopValues,
     PackedTree,
-    State,
-    build_hierarchy,
-    for_each,
-    pack,
-    walk,
+    VisitedNode,
+    build_balanced_tree,
+    for_each_primitive,
+    pack_tree,
+    traverse,
 )
-from harnack.tree.triangle_tree import box_levels
+from harnack.tree.triangle_tree import node_boxes
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real, Vec3
@@ -64,7 +64,7 @@ def near_pairs(vertices: FloatArray, faces: IntArray, among: BoolArray | None) -
     largest = float(np.abs(vertices).max(initial=0.0))
     # A power of two, so that nothing is rounded.
     unit = np.ldexp(vertices, -int(np.frexp(largest)[1])) if largest else vertices
-    boxes, pairs = _Boxes.of(unit[faces], chosen), _Pairs.of(unit, faces)
+    boxes, pairs = _FaceBoxTree.of(unit[faces], chosen), _PairTests.of(unit, faces)
     rows = boxes.order[chosen[boxes.order]]
     room = max(_PAIRS_AT_ONCE, len(faces))
     left = [rows[start : start + _ROWS_AT_ONCE] for start in range(0, len(rows), _ROWS_AT_ONCE)]
@@ -74,12 +74,12 @@ def near_pairs(vertices: FloatArray, faces: IntArray, among: BoolArray | None) -
         if listed is None:  # a single triangle always has room
             left += np.array_split(some, 2)
             continue
-        found.append(pairs.not_apart(*listed))
+        found.append(pairs.unseparated(*listed))
     return np.concatenate(found)
 
 
 @dataclass(frozen=True)
-class _Boxes:
+class _FaceBoxTree:
     """Boxes of faces in a tree. records: (m, 8); order: their indices leaf by leaf."""
 
     tree: PackedTree
@@ -87,17 +87,17 @@ class _Boxes:
     order: IntArray
 
     @classmethod
-    def of(cls, corners: FloatArray, chosen: BoolArray) -> _Boxes:
+    def of(cls, corners: FloatArray, chosen: BoolArray) -> _FaceBoxTree:
         a, b, c = (corners[:, k] for k in range(3))
         lower, upper = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
-        hierarchy = build_hierarchy(0.5 * (lower + upper), leaf_size=_LEAF_SIZE)
+        hierarchy = build_balanced_tree(0.5 * (lower + upper), leaf_size=_LEAF_SIZE)
         numbers = np.column_stack([np.arange(len(corners)), chosen]).astype(np.float64)
         records = np.concatenate([lower, upper, numbers], axis=1)
-        placed = hierarchy.gather(records)
-        placed[hierarchy.slots == NO_PRIMITIVE, _NUMBER] = -1.0
-        levels = box_levels(hierarchy, lower, upper)
-        order = hierarchy.slots[hierarchy.slots != NO_PRIMITIVE]
-        return cls(pack(choose_backend("double"), hierarchy, levels, placed), records, order)
+        placed = hierarchy.values_in_slots(records)
+        placed[hierarchy.leaf_slots == NO_PRIMITIVE, _NUMBER] = -1.0
+        levels = node_boxes(hierarchy, lower, upper)
+        order = hierarchy.leaf_slots[hierarchy.leaf_slots != NO_PRIMITIVE]
+        return cls(pack_tree(choose_backend("double"), hierarchy, levels, placed), records, order)
 
     def overlapping(self, rows: IntArray, room: int) -> tuple[Any, Any] | None:
         """Pairs of some faces, and of others, whose boxes overlap, in no order; None if there are
@@ -112,11 +112,11 @@ class _Boxes:
         def overlap(row: Any) -> Mask:
             return dr.all((vector(*row[:3]) <= high) & (vector(*row[3:6]) >= low))
 
-        def visit(node: Node, state: State) -> tuple[Mask, State]:
+        def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
             near = overlap(node.head)
-            return near, for_each(node, near & node.is_leaf, put, state)
+            return near, for_each_primitive(node, near & node.is_leaf, put, state)
 
-        def put(row: list[Real], active: Mask, state: State) -> State:
+        def put(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
             with_number = row[_NUMBER]
             # Two that are chosen meet once.
             once = (with_number > own) | ((row[_CHOSEN] == 0) & (with_number >= 0))
@@ -127,7 +127,7 @@ class _Boxes:
             dr.scatter(other, whole(with_number), place, has_room)
             return state
 
-        walk(self.tree, visit, (real(0),))
+        traverse(self.tree, visit, (real(0),))
         dr.eval(number, one, other)
         count = int(to_numpy(number)[0])
         if count > room:
@@ -137,24 +137,25 @@ class _Boxes:
 
 
 @dataclass(frozen=True)
-class _Pairs:
+class _PairTests:
     """Tests of pairs of faces. points: of vertices. corners: of the faces, three columns."""
 
-    points: Records
+    points: RecordTable
     corners: tuple[Any, Any, Any]
 
     @classmethod
-    def of(cls, vertices: FloatArray, faces: IntArray) -> _Pairs:
+    def of(cls, vertices: FloatArray, faces: IntArray) -> _PairTests:
         backend = choose_backend("double")
         a, b, c = (backend.UInt32(np.ascontiguousarray(one, np.uint32)) for one in faces.T)
-        return cls(Records.upload(backend, vertices), (a, b, c))
+        return cls(RecordTable.upload(backend, vertices), (a, b, c))
 
-    def not_apart(self, one: Any, other: Any) -> IntArray:
+    def unseparated(self, one: Any, other: Any) -> IntArray:
         """Those pairs (k, 2) that are not proved apart, in order."""
         backend = self.points.backend
         names = [[dr.gather(backend.UInt32, k, i) for k in self.corners] for i in (one, other)]
         triangles = [
-            tuple(backend.Array3f(*self.points.row(name)[:3]) for name in three) for three in names
+            tuple(backend.Array3f(*self.points.read_record(name)[:3]) for name in three)
+            for three in names
         ]
         shared = [[name == another for another in names[1]] for name in names[0]]
         a, b = cast("tuple[Corners, Corners]", triangles)
@@ -174,8 +175,8 @@ def _are_apart(a: Corners, b: Corners, shared: list[list[Mask]]) -> Mask:
     - *Edges*, where at most one corner is shared: triangles in different planes meet in a segment
       on the line of both planes, whose ends lie on edges that pass through the other triangle.
       None does: each edge without a shared corner has its ends strictly on one side of the other's
-      plane, or passes two of its edges on different sides (`_passes`). In one plane all these
-      signs are 0, and nothing is proved.
+      plane, or passes two of its edges on different sides (`_edge_may_pierce`). In one plane all
+      these signs are 0, and nothing is proved.
     - *A line*, for triangles in one plane: `_beside`.
     """
     in_a = [shared[i][0] | shared[i][1] | shared[i][2] for i in range(3)]
@@ -189,9 +190,12 @@ def _are_apart(a: Corners, b: Corners, shared: list[list[Mask]]) -> Mask:
     def by_edges_or_line(*numbers: Any) -> Mask:
         one, other = cast("tuple[Corners, Corners]", (numbers[:3], numbers[3:6]))
         in_one, in_other, common = list(numbers[6:9]), list(numbers[9:12]), numbers[12]
-        passes = _passes(one, other, _sides(one, other), in_other)
-        passes |= _passes(other, one, _sides(other, one), in_one)
-        turned = _turned(one, in_one, common), _turned(other, in_other, common)
+        passes = _edge_may_pierce(one, other, _sides(one, other), in_other)
+        passes |= _edge_may_pierce(other, one, _sides(other, one), in_one)
+        turned = (
+            _shared_corners_first(one, in_one, common),
+            _shared_corners_first(other, in_other, common),
+        )
         return ((common < 1.5) & ~passes) | _beside(*turned, common)
 
     def is_open(*numbers: Any) -> Mask:
@@ -223,7 +227,7 @@ def _on_one_side(sides: list[tuple[Mask, Mask]], shared: list[Mask]) -> Mask:
     return above | below
 
 
-def _passes(
+def _edge_may_pierce(
     through: Corners, of: Corners, sides: list[tuple[Mask, Mask]], shared: list[Mask]
 ) -> Mask:
     """Whether an edge of a triangle without shared corners may pass through another: unless both
@@ -244,7 +248,7 @@ def _passes(
     return found
 
 
-def _turned(of: Corners, shared: list[Mask], count: Real) -> Corners:
+def _shared_corners_first(of: Corners, shared: list[Mask], count: Real) -> Corners:
     """The corners in another order: what is shared first."""
     once = count < 1.5
     # One that is shared comes first; of two, the one that is not shared comes last.

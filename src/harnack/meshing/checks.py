@@ -5,6 +5,11 @@ lie. Determinants are computed in floating point, with a bound of what rounding 
 them (Shewchuk, Adaptive Precision Floating-Point Arithmetic and Fast Robust Geometric Predicates,
 1997). Where that leaves the sign open it is found in integers: all coordinates are integers times
 one power of two.
+
+Every mesh that `mesh` returns has passed checks: vertices and middles of triangles by samples of
+the field, faces that pass through each other by exact predicates, the number of triangles by a
+limit. The largest body is found by signed volumes and by which body holds which (`clipping`). Files
+hold single precision, to which vertices are snapped before the last check.
 """
 
 from __future__ import annotations
@@ -21,11 +26,11 @@ from harnack.meshing.broad_phase import ROUNDING, near_pairs
 from harnack.meshing.edges import (
     Edges,
     IntArray,
+    area_normals,
     boundary_edges,
-    crosses,
-    directed_edges,
-    dots,
-    lengths,
+    half_edges,
+    row_dots,
+    row_norms,
 )
 from harnack.meshing.level_function import LevelFunction
 
@@ -33,29 +38,29 @@ if TYPE_CHECKING:
     from harnack.geometry import Volume
 
 __all__ = [
-    "CrossingError",
-    "EmptyError",
-    "FarError",
-    "HopelessError",
-    "LocalError",
+    "EmptySurfaceError",
+    "LocalizedMeshingError",
     "MeshingError",
+    "OffLevelError",
+    "SelfIntersectionError",
     "SignArray",
-    "TooLargeError",
-    "check_apart",
-    "check_count",
+    "TriangleLimitError",
+    "UnrefinableError",
     "check_inside",
     "check_manifold",
     "check_near_level",
+    "check_no_self_intersection",
+    "check_triangle_limit",
     "euler_characteristic",
-    "far_from_level",
     "intersecting_faces",
-    "may_help_again",
+    "is_retry_promising",
+    "misoriented_faces",
+    "nonmanifold_vertices",
+    "orient2d",
+    "orient3d",
     "point_text",
-    "sides_of_lines",
-    "sides_of_planes",
-    "singular_vertices",
+    "points_off_level",
     "touching_pairs",
-    "turned_faces",
 ]
 
 SignArray = npt.NDArray[np.int8]
@@ -64,12 +69,12 @@ SignArray = npt.NDArray[np.int8]
 
 _UNIT = 2.0**-53
 # Shewchuk's bounds of the rounding of both determinants, over the sum of their terms' magnitudes.
-_PLANE, _LINE = (7 + 56 * _UNIT) * _UNIT, (3 + 16 * _UNIT) * _UNIT
+_ORIENT3D_ERROR, _ORIENT2D_ERROR = (7 + 56 * _UNIT) * _UNIT, (3 + 16 * _UNIT) * _UNIT
 # What underflow may add, for coordinates of order one.
 _UNDERFLOW = 1e-290
 
 
-def sides_of_planes(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> SignArray:
+def orient3d(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> SignArray:
     """(n,) signs of det(a - d, b - d, c - d), points (n, 3): 1 where d sees a, b, c run clockwise,
     0 where the four points are in one plane."""
     together = _scaled(np.stack([a, b, c, d], axis=1))
@@ -80,10 +85,12 @@ def sides_of_planes(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) 
     size = sum((np.abs(one) + np.abs(other)) * np.abs(height) for one, other, height in terms)
     # A difference of doubles is 0 where they are equal, and only there.
     flat = (rows == 0).all(axis=1).any(axis=1)
-    return _decided(np.asarray(value), _PLANE * np.asarray(size), flat, together, _exact_sides)
+    return _signs_with_fallback(
+        np.asarray(value), _ORIENT3D_ERROR * np.asarray(size), flat, together, _orient3d_exact
+    )
 
 
-def sides_of_lines(a: FloatArray, b: FloatArray, c: FloatArray) -> SignArray:
+def orient2d(a: FloatArray, b: FloatArray, c: FloatArray) -> SignArray:
     """(n,) signs of det(a - c, b - c), points (n, 2): 1 where a, b, c run counter-clockwise, 0
     where they are in one line."""
     together = _scaled(np.stack([a, b, c], axis=1))
@@ -91,7 +98,7 @@ def sides_of_lines(a: FloatArray, b: FloatArray, c: FloatArray) -> SignArray:
     (ax, ay), (bx, by) = (rows[:, k].T for k in range(2))
     value, size = ax * by - ay * bx, np.abs(ax * by) + np.abs(ay * bx)
     flat = (rows == 0).all(axis=1).any(axis=1)
-    return _decided(value, _LINE * size, flat, together, _exact_turns)
+    return _signs_with_fallback(value, _ORIENT2D_ERROR * size, flat, together, _orient2d_exact)
 
 
 def _scaled(points: FloatArray) -> FloatArray:
@@ -100,7 +107,7 @@ def _scaled(points: FloatArray) -> FloatArray:
     return points if largest == 0 else np.ldexp(points, -int(np.frexp(largest)[1]))
 
 
-def _decided(
+def _signs_with_fallback(
     value: FloatArray, error: FloatArray, zero: BoolArray, points: FloatArray, exact: Any
 ) -> SignArray:
     """Signs of values known up to errors, or to be 0; where that is not enough, by `exact` of the
@@ -122,13 +129,13 @@ def _integers(points: FloatArray) -> Any:
     return whole * 2 ** np.where(used, exponent - least, 0).astype(object)
 
 
-def _exact_sides(points: Any) -> Any:
+def _orient3d_exact(points: Any) -> Any:
     rows = points[:, :3] - points[:, 3:]
     (ax, ay, az), (bx, by, bz), (cx, cy, cz) = (rows[:, k].T for k in range(3))
     return (bx * cy - cx * by) * az + (cx * ay - ax * cy) * bz + (ax * by - bx * ay) * cz
 
 
-def _exact_turns(points: Any) -> Any:
+def _orient2d_exact(points: Any) -> Any:
     rows = points[:, :2] - points[:, 2:]
     (ax, ay), (bx, by) = (rows[:, k].T for k in range(2))
     return ax * by - ay * bx
@@ -139,18 +146,18 @@ def _exact_turns(points: Any) -> Any:
 _EDGES = ((0, 1), (1, 2), (2, 0))
 _PAIRS_AT_ONCE = 1 << 18
 # Of more triangles than this a kernel finds the pairs, which takes 0.05 s to record.
-_MANY = 5_000
+_MIN_FACES_FOR_KERNEL = 5_000
 # So many triangles of a size are compared with each other at once.
 _MOST_AT_ONCE = 1 << 19
 
 
-def turned_faces(function: LevelFunction, vertices: FloatArray, faces: IntArray) -> IntArray:
+def misoriented_faces(function: LevelFunction, vertices: FloatArray, faces: IntArray) -> IntArray:
     """Indices of faces whose normal does not point to where the function grows, judged at their
     center."""
     corner = vertices[faces]
-    normal = crosses(corner)
-    slope = function.at(corner.mean(axis=1)).gradient
-    return np.flatnonzero(dots(normal, slope) <= 0)
+    normal = area_normals(corner)
+    slope = function.sample(corner.mean(axis=1)).gradient
+    return np.flatnonzero(row_dots(normal, slope) <= 0)
 
 
 def intersecting_faces(
@@ -177,8 +184,8 @@ def intersecting_faces(
         meet[rows] = _overlap(vertices[one[rows]], vertices[other[rows]])
         both = np.all([(h.min(axis=1) < 0) & (h.max(axis=1) > 0) for h in heights], axis=0)
         rows = np.flatnonzero(both)
-        meet[rows] = _cross(vertices, one[rows], other[rows], heights[0][rows])
-        meet[rows] |= _cross(vertices, other[rows], one[rows], heights[1][rows])
+        meet[rows] = _edge_pierces(vertices, one[rows], other[rows], heights[0][rows])
+        meet[rows] |= _edge_pierces(vertices, other[rows], one[rows], heights[1][rows])
         found.append(pairs[meet].ravel())
     return np.unique(np.concatenate([*found, np.zeros(0, np.int64)]))
 
@@ -231,12 +238,12 @@ def _pairs_in_doubt(
     """Pairs (k, 2) of faces that are not proved apart, some at a time, and the `_heights` of the
     second over the first and of the first over the second."""
     many = len(faces) if among is None else int(among.sum())
-    by_kernel = many > _MANY
+    by_kernel = many > _MIN_FACES_FOR_KERNEL
     near = near_pairs(vertices, faces, among) if by_kernel else _near_pairs(vertices[faces], among)
     for start in range(0, len(near), _PAIRS_AT_ONCE):
         pairs = near[start : start + _PAIRS_AT_ONCE]
         if not by_kernel:
-            pairs = pairs[~_are_apart(vertices, faces, pairs)]
+            pairs = pairs[~_are_separated(vertices, faces, pairs)]
         first, second = faces[pairs[:, 0]], faces[pairs[:, 1]]
         yield pairs, (_heights(vertices, first, second), _heights(vertices, second, first))
 
@@ -258,7 +265,7 @@ def _near_pairs(corner: FloatArray, among: BoolArray | None) -> IntArray:
     ends = lower[chosen].min(axis=0), upper[chosen].max(axis=0)
     near = (lower <= ends[1]).all(axis=1) & (upper >= ends[0]).all(axis=1)
     center = 0.5 * (lower + upper)
-    radius = 0.5 * lengths(upper - lower)
+    radius = 0.5 * row_norms(upper - lower)
     octave = np.floor(np.log2(np.maximum(radius, 1e-300)))
     groups = [np.flatnonzero(near & (octave == one)) for one in np.unique(octave[near])]
     trees = [searching.cKDTree(center[rows]) for rows in groups]
@@ -287,12 +294,12 @@ def _near_pairs(corner: FloatArray, among: BoolArray | None) -> IntArray:
     return np.concatenate(found).astype(np.int64)
 
 
-def _are_apart(vertices: FloatArray, faces: IntArray, pairs: IntArray) -> BoolArray:
+def _are_separated(vertices: FloatArray, faces: IntArray, pairs: IntArray) -> BoolArray:
     """(k,) whether the plane of one of two faces has all corners of the other that they do not
     share on one side: then they have nothing in common but these. False where rounding leaves it
     open.
 
-    See `near_faces.ROUNDING` for the error of heights.
+    See `broad_phase.ROUNDING` for the error of heights.
     """
     apart = np.zeros(len(pairs), np.bool_)
     for first, second in (pairs.T, pairs.T[::-1]):
@@ -301,11 +308,11 @@ def _are_apart(vertices: FloatArray, faces: IntArray, pairs: IntArray) -> BoolAr
         a = vertices[plane[:, 0]]
         u, v = vertices[plane[:, 1]] - a, vertices[plane[:, 2]] - a
         normal = np.cross(u, v)
-        most = ROUNDING * (lengths(u) * lengths(v))
+        most = ROUNDING * (row_norms(u) * row_norms(v))
         above, below = np.ones(len(rows), np.bool_), np.ones(len(rows), np.bool_)
         for k in range(3):
             way = vertices[of[:, k]] - a
-            height, error = dots(normal, way), most * lengths(way) + _UNDERFLOW
+            height, error = row_dots(normal, way), most * row_norms(way) + _UNDERFLOW
             shared = (of[:, k, None] == plane).any(axis=1)
             above &= shared | (height > error)
             below &= shared | (height < -error)
@@ -321,11 +328,13 @@ def _heights(vertices: FloatArray, plane: IntArray, of: IntArray) -> SignArray:
     signs = np.zeros((len(of), 3), np.int8)
     for i in range(3):
         rows = np.flatnonzero((of[:, i, None] != plane).all(axis=1))
-        signs[rows, i] = sides_of_planes(a[rows], b[rows], c[rows], vertices[of[rows, i]])
+        signs[rows, i] = orient3d(a[rows], b[rows], c[rows], vertices[of[rows, i]])
     return signs
 
 
-def _cross(vertices: FloatArray, through: IntArray, of: IntArray, heights: SignArray) -> BoolArray:
+def _edge_pierces(
+    vertices: FloatArray, through: IntArray, of: IntArray, heights: SignArray
+) -> BoolArray:
     """(k,) whether an edge of faces `of` (k, 3) passes through faces `through`, of whose planes the
     corners are on the sides `heights`: the line of the edge passes all three edges on one side, or
     touches them."""
@@ -334,7 +343,7 @@ def _cross(vertices: FloatArray, through: IntArray, of: IntArray, heights: SignA
         rows = np.flatnonzero((heights[:, i] * heights[:, j] < 0) & ~found)
         p, q = vertices[of[rows, i]], vertices[of[rows, j]]
         x = [vertices[through[rows, k]] for k in range(3)]
-        around = np.stack([sides_of_planes(p, q, x[k], x[m]) for k, m in _EDGES])
+        around = np.stack([orient3d(p, q, x[k], x[m]) for k, m in _EDGES])
         found[rows] = (around >= 0).all(axis=0) | (around <= 0).all(axis=0)
     return found
 
@@ -342,14 +351,14 @@ def _cross(vertices: FloatArray, through: IntArray, of: IntArray, heights: SignA
 def _overlap(one: FloatArray, other: FloatArray) -> BoolArray:
     """(k,) whether triangles (k, 3, 3) in one plane have an area in common; seen along the axis in
     which they are thinnest."""
-    normal = np.abs(crosses(one))
+    normal = np.abs(area_normals(one))
     axes = np.array([[1, 2], [2, 0], [0, 1]])[normal.argmax(axis=1)]
     flat = [np.take_along_axis(t, axes[:, None].repeat(3, axis=1), axis=2) for t in (one, other)]
     found = np.ones(len(one), np.bool_)
     for a, b in (flat, flat[::-1]):
-        turn = sides_of_lines(a[:, 0], a[:, 1], a[:, 2])
+        turn = orient2d(a[:, 0], a[:, 1], a[:, 2])
         for i, j in _EDGES:
-            side = [turn * sides_of_lines(a[:, i], a[:, j], b[:, k]) for k in range(3)]
+            side = [turn * orient2d(a[:, i], a[:, j], b[:, k]) for k in range(3)]
             found &= (np.stack(side) > 0).any(axis=0)
     return found
 
@@ -357,29 +366,29 @@ def _overlap(one: FloatArray, other: FloatArray) -> BoolArray:
 def _is_on(triangle: FloatArray, p: FloatArray, q: FloatArray) -> BoolArray:
     """(k,) whether segments from p to q (k, 3) meet triangles (k, 3, 3) in whose planes they are:
     unless the line of an edge or of the segment has them on its two sides (separating axes)."""
-    normal = np.abs(crosses(triangle))
+    normal = np.abs(area_normals(triangle))
     axes = np.array([[1, 2], [2, 0], [0, 1]])[normal.argmax(axis=1)]
     a = np.take_along_axis(triangle, axes[:, None].repeat(3, axis=1), axis=2)
     p, q = (np.take_along_axis(corner, axes, axis=1) for corner in (p, q))
-    turn = sides_of_lines(a[:, 0], a[:, 1], a[:, 2])
+    turn = orient2d(a[:, 0], a[:, 1], a[:, 2])
     is_on = turn != 0
     for i, j in _EDGES:
-        side = [turn * sides_of_lines(a[:, i], a[:, j], corner) for corner in (p, q)]
+        side = [turn * orient2d(a[:, i], a[:, j], corner) for corner in (p, q)]
         is_on &= (np.stack(side) >= 0).any(axis=0)
-    side = np.stack([sides_of_lines(p, q, a[:, k]) for k in range(3)])
+    side = np.stack([orient2d(p, q, a[:, k]) for k in range(3)])
     return is_on & ~((side > 0).all(axis=0) | (side < 0).all(axis=0))
 
 
 def _is_between(triangle: FloatArray, p: FloatArray) -> BoolArray:
     """(k,) whether the ways from the first corners of triangles (k, 3, 3) to points in their planes
     run between those to the two other corners, or along one of them."""
-    normal = np.abs(crosses(triangle))
+    normal = np.abs(area_normals(triangle))
     axes = np.array([[1, 2], [2, 0], [0, 1]])[normal.argmax(axis=1)]
     a = np.take_along_axis(triangle, axes[:, None].repeat(3, axis=1), axis=2)
     p = np.take_along_axis(p, axes, axis=1)
-    turn = sides_of_lines(a[:, 0], a[:, 1], a[:, 2])
-    left = turn * sides_of_lines(a[:, 0], a[:, 1], p)
-    return (turn != 0) & (left >= 0) & (turn * sides_of_lines(a[:, 2], a[:, 0], p) >= 0)
+    turn = orient2d(a[:, 0], a[:, 1], a[:, 2])
+    left = turn * orient2d(a[:, 0], a[:, 1], p)
+    return (turn != 0) & (left >= 0) & (turn * orient2d(a[:, 2], a[:, 0], p) >= 0)
 
 
 # Checks of whole meshes.
@@ -388,29 +397,29 @@ def _is_between(triangle: FloatArray, p: FloatArray) -> BoolArray:
 class MeshingError(ValueError):
     """A level set that could not be meshed; the message says why and what to do."""
 
-    def is_mended_by(self, smaller: float) -> bool:
+    def may_be_fixed_by(self, smaller: float) -> bool:
         """Whether cells may help that are `smaller` times as large as those that failed."""
         del smaller
         return True
 
 
-class EmptyError(MeshingError):
+class EmptySurfaceError(MeshingError):
     """No cell holds the level."""
 
 
-class LocalError(MeshingError):
+class LocalizedMeshingError(MeshingError):
     """A check that failed in known places (k, 3), so that smaller cells there may be enough."""
 
     def __init__(self, message: str, places: FloatArray) -> None:
         super().__init__(message)
-        self.places = places
+        self.locations = places
 
 
-class FarError(LocalError):
+class OffLevelError(LocalizedMeshingError):
     """Vertices and centers of faces that are too far from the level: the places."""
 
 
-class CrossingError(LocalError):
+class SelfIntersectionError(LocalizedMeshingError):
     """Triangles that pass through each other, by index; places: their centers."""
 
     def __init__(self, message: str, places: FloatArray, faces: IntArray) -> None:
@@ -418,40 +427,44 @@ class CrossingError(LocalError):
         self.faces = faces
 
 
-class HopelessError(MeshingError):
+class UnrefinableError(MeshingError):
     """What smaller cells do not help against."""
 
-    def is_mended_by(self, smaller: float) -> bool:
+    def may_be_fixed_by(self, smaller: float) -> bool:
         del smaller
         return False
 
 
-class TooLargeError(HopelessError):
+class TriangleLimitError(UnrefinableError):
     """A mesh that would be so large that it was not begun."""
 
 
 # So many places may be wrong in smaller cells, or this part of those before.
-_FEW_PLACES, _FEWER = 20, 0.5
+_MAX_FAILURES_FOR_RETRY, _REQUIRED_FAILURE_REDUCTION = 20, 0.5
 
 
-def may_help_again(now: MeshingError, before: MeshingError | None, smallest: float = 1.0) -> bool:
+def is_retry_promising(
+    now: MeshingError, before: MeshingError | None, smallest: float = 1.0
+) -> bool:
     """Whether smaller cells may help, after one or two sizes of them failed: not if nearly as many
     places are wrong, as along a pole or where sheets cross, where cells of no size do.
 
     smallest: how large cells may become, in those that failed now.
     """
-    if not now.is_mended_by(smallest):
+    if not now.may_be_fixed_by(smallest):
         return False
-    if not isinstance(now, LocalError) or not isinstance(before, LocalError):
+    if not isinstance(now, LocalizedMeshingError) or not isinstance(before, LocalizedMeshingError):
         return True
-    return len(now.places) <= max(_FEW_PLACES, _FEWER * len(before.places))
+    return len(now.locations) <= max(
+        _MAX_FAILURES_FOR_RETRY, _REQUIRED_FAILURE_REDUCTION * len(before.locations)
+    )
 
 
 def euler_characteristic(faces: IntArray, edges: Edges | None = None) -> int:
-    """Vertices in use, less edges, and faces. edges: those of `directed_edges`, if known."""
+    """Vertices in use, less edges, and faces. edges: those of `half_edges`, if known."""
     vertices = int(np.count_nonzero(np.bincount(faces.ravel())))
-    edges = edges or Edges.of(directed_edges(faces))
-    return vertices - len(edges.ends) + len(faces)
+    edges = edges or Edges.of(half_edges(faces))
+    return vertices - len(edges.vertices) + len(faces)
 
 
 def check_manifold(faces: IntArray, vertices: FloatArray | None = None) -> None:
@@ -461,64 +474,64 @@ def check_manifold(faces: IntArray, vertices: FloatArray | None = None) -> None:
     vertices: (n, 3), to say where not.
 
     Raises:
-        MeshingError: otherwise; a LocalError, given vertices.
+        MeshingError: otherwise; a LocalizedMeshingError, given vertices.
     """
 
     def fail(message: str, where: IntArray) -> Never:
         if vertices is None:
             raise MeshingError(message)
-        raise LocalError(message, vertices[where])
+        raise LocalizedMeshingError(message, vertices[where])
 
-    pairs = directed_edges(faces)
+    pairs = half_edges(faces)
     edges = Edges.of(pairs)
-    index, uses = edges.index, edges.uses
+    index, uses = edges.edge_of_pair, edges.multiplicity
     if (uses > 2).any():
         fail(
             f"{(uses > 2).sum()} edges of the mesh have more than two faces: the level set crosses "
-            "itself, or cells are too large for it; choose a smaller `spacing`, or another level",
+            "itself, or cells are too large for it; choose a smaller `cell_size`, or another level",
             np.unique(pairs[uses[index] > 2]),
         )
     ways = np.bincount(index, np.where(pairs[:, 0] < pairs[:, 1], 1, -1), minlength=len(uses))
     if ((uses == 2) & (ways != 0)).any():
         fail(
             "neighboring faces of the mesh do not agree on its two sides: cells are too large for "
-            "this level set; choose a smaller `spacing`",
+            "this level set; choose a smaller `cell_size`",
             np.unique(pairs[((uses == 2) & (ways != 0))[index]]),
         )
-    if _fans(faces, edges)[0] > np.count_nonzero(np.bincount(faces.ravel())):
+    if _vertex_fans(faces, edges)[0] > np.count_nonzero(np.bincount(faces.ravel())):
         fail(
             "sheets of the mesh touch in a point: cells are too large for this level set; choose a "
-            "smaller `spacing`, or another level",
-            singular_vertices(faces),
+            "smaller `cell_size`, or another level",
+            nonmanifold_vertices(faces),
         )
 
 
-def check_apart(vertices: FloatArray, faces: IntArray) -> None:
+def check_no_self_intersection(vertices: FloatArray, faces: IntArray) -> None:
     """Raise if a vertex is not finite, or if faces pass through each other or lie on each other;
     decided exactly.
 
     Raises:
-        MeshingError: so; a CrossingError with these faces.
+        MeshingError: so; a SelfIntersectionError with these faces.
     """
     if not np.isfinite(vertices).all():
         raise MeshingError("vertices of the mesh are no numbers: choose another level or `clip`")
     crossing = intersecting_faces(vertices, faces)
     if len(crossing):
         places = vertices[faces[crossing]].mean(axis=1)
-        raise CrossingError(
+        raise SelfIntersectionError(
             f"{len(crossing):,} of {len(faces):,} triangles pass through each other, such as near "
-            f"{point_text(places[0])}: choose a smaller `spacing` or a larger `tolerance`",
+            f"{point_text(places[0])}: choose a smaller `cell_size` or a larger `tolerance`",
             places,
             crossing,
         )
 
 
-def check_count(expected: float, most: int) -> None:
-    """Raise TooLargeError if more triangles are expected than may be made."""
+def check_triangle_limit(expected: float, most: int) -> None:
+    """Raise TriangleLimitError if more triangles are expected than may be made."""
     if expected > most:
-        raise TooLargeError(
+        raise TriangleLimitError(
             f"the mesh takes about {expected:.2g} triangles, and max_triangles is {most:,}: choose "
-            "a larger `tolerance` or `spacing`, a smaller `clip`, or a larger max_triangles"
+            "a larger `tolerance` or `cell_size`, a smaller `clip`, or a larger max_triangles"
         )
 
 
@@ -528,7 +541,7 @@ def check_inside(vertices: FloatArray, volume: Volume, slack: float) -> None:
     if out.any():
         raise MeshingError(
             f"{out.sum():,} vertices of the mesh lie outside of what was asked for, such as "
-            f"{point_text(vertices[out][0])}: choose a smaller `spacing`"
+            f"{point_text(vertices[out][0])}: choose a smaller `cell_size`"
         )
 
 
@@ -553,19 +566,19 @@ def check_near_level(
     their corners.
 
     Raises:
-        FarError: with the points that are not.
+        OffLevelError: with the points that are not.
     """
-    far, count = far_from_level(function, vertices, faces, tolerance, volume)
+    far, count = points_off_level(function, vertices, faces, tolerance, volume)
     if len(far):
-        raise FarError(
+        raise OffLevelError(
             f"{len(far):,} of {count:,} vertices and centers of triangles are farther than "
             f"the tolerance, {tolerance:.3g}, from the level, such as {point_text(far[0])}: "
-            "choose a smaller `spacing` or a larger `tolerance`",
+            "choose a smaller `cell_size` or a larger `tolerance`",
             far,
         )
 
 
-def far_from_level(
+def points_off_level(
     function: LevelFunction,
     vertices: FloatArray,
     faces: IntArray,
@@ -575,8 +588,8 @@ def far_from_level(
     """Those vertices and centers of faces (k, 3) that are not within `tolerance` of the level, as
     `check_near_level` decides it; and how many were looked at."""
     corner = vertices[faces]
-    normal = crosses(corner)
-    longest = np.stack([lengths(corner[:, k] - corner[:, k - 1]) for k in range(3)]).max(axis=0)
+    normal = area_normals(corner)
+    longest = np.stack([row_norms(corner[:, k] - corner[:, k - 1]) for k in range(3)]).max(axis=0)
     large = longest > 0.5 * tolerance
     is_checked = np.ones(len(vertices), np.bool_)
     if function.period is not None:
@@ -586,8 +599,8 @@ def far_from_level(
         np.add.at(mean, faces[:, k], normal)
     points = np.concatenate([vertices[is_checked], corner[large].mean(axis=1)])
     ways = np.concatenate([mean[is_checked], normal[large]])
-    ways /= np.maximum(lengths(ways), 1e-300)[:, None]
-    far = np.flatnonzero(~(function.at(points).distance <= tolerance))
+    ways /= np.maximum(row_norms(ways), 1e-300)[:, None]
+    far = np.flatnonzero(~(function.sample(points).distance <= tolerance))
     # Nearer ones as well: behind a cap there may be little of a solid.
     for share, line in itertools.product((1.0, 0.25, 0.0625), (None, *_askew_lines())):
         if not len(far):
@@ -603,13 +616,13 @@ def _askew_lines() -> FloatArray:
     none of them is near to a plane of coordinates or to one of their diagonals."""
     ways = np.array(list(itertools.product((-1.0, 0.0, 1.0), repeat=3)))[14:]
     frame: FloatArray = np.linalg.qr([[7, 7, -3], [3, -16, -7], [19, 7, -13]])[0]
-    return (ways / lengths(ways)[:, None]) @ frame
+    return (ways / row_norms(ways)[:, None]) @ frame
 
 
 def _is_positive(
     function: LevelFunction, points: FloatArray, volume: Volume | None
 ) -> npt.NDArray[np.bool_]:
-    above = ~(function.at(points).value <= 0)
+    above = ~(function.sample(points).value <= 0)
     return above if volume is None else above | ~volume.contains_points(points)
 
 
@@ -618,13 +631,13 @@ def point_text(x: FloatArray) -> str:
     return "(" + ", ".join(f"{c:.4g}" for c in x) + ")"
 
 
-def singular_vertices(faces: IntArray) -> IntArray:
+def nonmanifold_vertices(faces: IntArray) -> IntArray:
     """Vertices, by index, at which faces (m, 3) are not a manifold: those of edges with more than
     two faces, and those that have more than one fan of faces."""
-    pairs, count = directed_edges(faces), int(faces.max(initial=-1)) + 1
+    pairs, count = half_edges(faces), int(faces.max(initial=-1)) + 1
     edges = Edges.of(pairs)
-    many = np.unique(pairs[edges.uses[edges.index] > 2])
-    _, fan = _fans(faces, edges)
+    many = np.unique(pairs[edges.multiplicity[edges.edge_of_pair] > 2])
+    _, fan = _vertex_fans(faces, edges)
     # Each fan once, at its vertex.
     vertex = np.empty(int(fan.max(initial=-1)) + 1, np.int64)
     vertex[fan] = faces.ravel()
@@ -632,19 +645,19 @@ def singular_vertices(faces: IntArray) -> IntArray:
     return np.union1d(many, np.flatnonzero(fans > 1))
 
 
-def _fans(faces: IntArray, edges: Edges) -> tuple[int, IntArray]:
+def _vertex_fans(faces: IntArray, edges: Edges) -> tuple[int, IntArray]:
     """How many fans of faces, joined by edges, all vertices have together, and of each corner of
-    the faces (3m,) the fan that it belongs to. edges: those of `directed_edges`."""
+    the faces (3m,) the fan that it belongs to. edges: those of `half_edges`."""
     import scipy.sparse  # here: half a second that few need
     import scipy.sparse.csgraph as csgraph_module
 
     sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
     m = len(faces)
     corner = np.arange(3 * m).reshape(m, 3)
-    # Corners at both ends of the edge k of a face, in the order of `directed_edges`.
+    # Corners at both ends of the edge k of a face, in the order of `half_edges`.
     first = np.concatenate([corner[:, 0], corner[:, 1], corner[:, 2]])
     second = np.concatenate([corner[:, 1], corner[:, 2], corner[:, 0]])
-    one, other = edges.twice().T  # run in opposite directions
+    one, other = edges.paired_half_edges().T  # run in opposite directions
     rows = np.concatenate([first[one], second[one]])
     columns = np.concatenate([second[other], first[other]])
     joined = sparse.coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(3 * m, 3 * m))

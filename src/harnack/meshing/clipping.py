@@ -1,6 +1,6 @@
 """Parts of surfaces: the largest part, the largest body with its cavities, and what a volume holds.
 
-Open surfaces are cut by volumes: triangles end at planes and spheres (`cut_by`).
+Open surfaces are cut by volumes: triangles end at planes and spheres (`clip_to_volume`).
 """
 
 from __future__ import annotations
@@ -13,35 +13,37 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import FloatArray
-from harnack.geometry import Ball, Box, ConvexHull, HalfSpace, Intersection, Volume
+from harnack.geometry import Ball, Box, ConvexHull, HalfSpace, Volume, VolumeIntersection
 from harnack.geometry.meshes import solid_angles
 from harnack.meshing.checks import MeshingError
-from harnack.meshing.edges import IntArray, boundary_edges, crosses, dots, edge_keys
-from harnack.meshing.lattice_meshing import Surface
+from harnack.meshing.edges import IntArray, area_normals, boundary_edges, edge_keys, row_dots
+from harnack.meshing.lattice_meshing import TriangleMesh
 
 __all__ = [
     "Shells",
-    "cut_by",
+    "clip_to_volume",
+    "component_facts",
+    "drop_degenerate_components",
+    "faces_to_flip",
     "largest_body",
-    "largest_part",
-    "parts_of",
-    "turned_outwards",
+    "largest_component",
     "winding_around",
-    "without_films",
 ]
 
 # Parts no thicker than this part of their coordinates are made of rounding.
-_FILM = 1e-11
+_DEGENERATE_THICKNESS = 1e-11
 
 
-def largest_part(surface: Surface) -> Surface:
+def largest_component(surface: TriangleMesh) -> TriangleMesh:
     """The connected part with the largest area."""
-    part = _parts(surface)
-    areas = np.bincount(part, np.linalg.norm(crosses(surface.vertices[surface.faces]), axis=1))
-    return Surface.of(surface.vertices, surface.faces[part == areas.argmax()])
+    part = _component_of_faces(surface)
+    areas = np.bincount(part, np.linalg.norm(area_normals(surface.vertices[surface.faces]), axis=1))
+    return TriangleMesh.without_unused_vertices(
+        surface.vertices, surface.faces[part == areas.argmax()]
+    )
 
 
-def largest_body(surface: Surface) -> Surface:
+def largest_body(surface: TriangleMesh) -> TriangleMesh:
     """Of a closed surface the body with the largest volume: an outer shell and the shells of its
     cavities, which are turned inwards, so that their volume is negative.
 
@@ -60,44 +62,46 @@ def largest_body(surface: Surface) -> Surface:
     outer = np.flatnonzero(shells.volumes > 0)
     outer = outer[np.argsort(shells.volumes[outer])]
     for cavity in np.flatnonzero(shells.volumes <= 0):
-        holds = (one for one in outer if shells.turns(one, cavity) > 0.5)
+        holds = (one for one in outer if shells.winding_number(one, cavity) > 0.5)
         if (found := next(holds, None)) is None:
-            raise MeshingError("a part of the mesh is inside out: choose a smaller `spacing`")
+            raise MeshingError("a part of the mesh is inside out: choose a smaller `cell_size`")
         owner[cavity] = found
         bodies[found] += shells.volumes[cavity]
     kept = outer[bodies[outer].argmax()] if len(outer) else -1
-    return Surface.of(surface.vertices, surface.faces[owner[shells.number] == kept])
+    return TriangleMesh.without_unused_vertices(
+        surface.vertices, surface.faces[owner[shells.component_of_face] == kept]
+    )
 
 
-def without_films(surface: Surface) -> Surface:
+def drop_degenerate_components(surface: TriangleMesh) -> TriangleMesh:
     """A closed surface without the connected parts that are nothing but rounding: what is left of
     two parts that cancel each other, such as a solid less itself."""
     x, faces = surface.vertices, surface.faces
     if not len(faces):
         return surface
-    part = _parts(surface)
+    part = _component_of_faces(surface)
     count = np.bincount(part)
     corner = x[faces]
     middle = (
         np.stack([np.bincount(part, c) for c in corner.mean(axis=1).T], axis=1) / count[:, None]
     )
     corner = corner - middle[part][:, None]
-    normal = crosses(corner)
+    normal = area_normals(corner)
     # Six times the volume and twice the area.
     volume = np.abs(np.bincount(part, (corner[:, 0] * normal).sum(axis=1)))
     area = np.bincount(part, np.linalg.norm(normal, axis=1))
-    is_film = 2 * volume <= 3 * _FILM * float(np.abs(x).max()) * area
+    is_film = 2 * volume <= 3 * _DEGENERATE_THICKNESS * float(np.abs(x).max()) * area
     if not is_film.any():
         return surface
     kept = faces[~is_film[part]]
-    return Surface.of(x, kept) if len(kept) else Surface(x[:0], kept)
+    return TriangleMesh.without_unused_vertices(x, kept) if len(kept) else TriangleMesh(x[:0], kept)
 
 
-def parts_of(surface: Surface) -> list[dict[str, Any]]:
+def component_facts(surface: TriangleMesh) -> list[dict[str, Any]]:
     """Of each connected part of a closed surface, largest first, faces: their number; volume: what
     it holds, negative for a cavity; center: of the box around it."""
     shells, found = Shells.of(surface), list[dict[str, Any]]()
-    counts = np.bincount(shells.number)
+    counts = np.bincount(shells.component_of_face)
     for k in np.argsort(-np.abs(shells.volumes), kind="stable"):
         center = 0.5 * (shells.lower[k] + shells.upper[k])
         volume = float(shells.volumes[k])
@@ -105,65 +109,68 @@ def parts_of(surface: Surface) -> list[dict[str, Any]]:
     return found
 
 
-def turned_outwards(surface: Surface) -> npt.NDArray[np.bool_]:
+def faces_to_flip(surface: TriangleMesh) -> npt.NDArray[np.bool_]:
     """(m,) which faces of a closed surface to turn over for no part to be inside out: those of
     parts of negative volume that lie in no other, and so are no cavities."""
     shells = Shells.of(surface)
-    inwards = (shells.volumes < 0) & (shells.depths() == 0)
-    return inwards[shells.number]
+    inwards = (shells.volumes < 0) & (shells.nesting_depths() == 0)
+    return inwards[shells.component_of_face]
 
 
 @dataclass(frozen=True)
 class Shells:
     """The connected parts of a closed surface.
 
-    number: (m,) of the part that each face belongs to. volumes: (k,) what parts hold, negative of
-        those turned inwards. lower, upper: (k, 3) their boxes. corners: (m, 3, 3) of the faces.
+    component_of_face: (m,) of the part that each face belongs to. volumes: (k,) what parts hold,
+        negative of those turned inwards. lower, upper: (k, 3) their boxes. corners: (m, 3, 3) of
+            the faces.
     """
 
-    number: IntArray
+    component_of_face: IntArray
     volumes: FloatArray
     lower: FloatArray
     upper: FloatArray
     corners: FloatArray
 
     @classmethod
-    def of(cls, surface: Surface) -> Shells:
-        number = np.unique(_parts(surface), return_inverse=True)[1]
+    def of(cls, surface: TriangleMesh) -> Shells:
+        number = np.unique(_component_of_faces(surface), return_inverse=True)[1]
         corners = surface.vertices[surface.faces]
         away = corners[:, 0] - surface.vertices[surface.faces].mean(axis=(0, 1))
-        volumes = np.bincount(number, dots(crosses(surface.vertices[surface.faces]), away)) / 6
+        volumes = (
+            np.bincount(number, row_dots(area_normals(surface.vertices[surface.faces]), away)) / 6
+        )
         lower, upper = np.full((len(volumes), 3), np.inf), np.full((len(volumes), 3), -np.inf)
         np.minimum.at(lower, number, corners.min(axis=1))
         np.maximum.at(upper, number, corners.max(axis=1))
         return cls(number, volumes, lower, upper, corners)
 
-    def turns(self, around: Any, part: Any) -> float:
+    def winding_number(self, around: Any, part: Any) -> float:
         """How often a part winds around another one, at a point of it."""
-        point = self.corners[np.argmax(self.number == part)].mean(axis=0)
-        return winding_around(self.corners[self.number == around], point)
+        point = self.corners[np.argmax(self.component_of_face == part)].mean(axis=0)
+        return winding_around(self.corners[self.component_of_face == around], point)
 
-    def depths(self) -> IntArray:
+    def nesting_depths(self) -> IntArray:
         """(k,) how often all other parts wind around each, at a point of it: more than 0 where it
         is in their material, if no two meet."""
         depth = np.zeros(len(self.volumes), np.int64)
         for k in range(len(depth)) if len(depth) > 1 else ():
-            point = self.corners[np.argmax(self.number == k)].mean(axis=0)
+            point = self.corners[np.argmax(self.component_of_face == k)].mean(axis=0)
             around = ((self.lower < point) & (point < self.upper)).all(axis=1)
             around[k] = False
             near = np.flatnonzero(around)
-            depth[k] = round(sum(self.turns(j, k) for j in near))
+            depth[k] = round(sum(self.winding_number(j, k) for j in near))
         return depth
 
     def bound(self) -> npt.NDArray[np.bool_]:
         """(m,) which faces bound the points that all parts together wind around at least once, if
         no two meet: across a part the number changes by one, from that outside of it, so that those
         that do turn outwards with nothing around, or inwards with one."""
-        does = self.depths() == np.where(self.volumes > 0, 0, 1)
-        return does[self.number]
+        does = self.nesting_depths() == np.where(self.volumes > 0, 0, 1)
+        return does[self.component_of_face]
 
 
-def _parts(surface: Surface) -> IntArray:
+def _component_of_faces(surface: TriangleMesh) -> IntArray:
     """(m,) of each face the number of its connected part."""
     import scipy.sparse  # here: half a second that few need
     import scipy.sparse.csgraph as csgraph_module
@@ -189,7 +196,7 @@ _SNAPPED = 0.25
 
 
 @dataclass(frozen=True)
-class _Side:
+class _ClipBoundary:
     """One side of a volume's boundary: a plane normal.x = offset, or a sphere."""
 
     center: FloatArray
@@ -210,25 +217,25 @@ class _Side:
         return away / np.maximum(np.linalg.norm(away, axis=1), 1e-300)[:, None]
 
 
-def cut_by(surface: Surface, volume: Volume) -> Surface:
+def clip_to_volume(surface: TriangleMesh, volume: Volume) -> TriangleMesh:
     """The part of a surface in a volume. Its new ends lie on planes exactly, and between points of
     spheres; vertices that are kept stay in their order and come first.
 
     Raises:
         MeshingError: another kind of volume.
     """
-    if isinstance(volume, Intersection):
+    if isinstance(volume, VolumeIntersection):
         for one in volume.volumes:
-            surface = cut_by(surface, one)
+            surface = clip_to_volume(surface, one)
         return surface
     if isinstance(volume, Ball):
-        return _cut(surface, _Side(np.array(volume.center), np.zeros(3), volume.radius))
+        return _cut(surface, _ClipBoundary(np.array(volume.center), np.zeros(3), volume.radius))
     if not isinstance(volume, Box | HalfSpace | ConvexHull):
         raise MeshingError(f"a {type(volume).__name__} cannot cut a mesh: give a box or a ball")
     for row in volume.planes():
-        surface = _cut(surface, _Side(row[:3] * row[3], row[:3], None))
+        surface = _cut(surface, _ClipBoundary(row[:3] * row[3], row[:3], None))
     if isinstance(volume, Box):
-        return Surface(_onto(surface.vertices, volume), surface.faces)
+        return TriangleMesh(_onto(surface.vertices, volume), surface.faces)
     return surface
 
 
@@ -240,13 +247,13 @@ def _onto(vertices: FloatArray, box: Box) -> FloatArray:
     return vertices
 
 
-def _snapped(surface: Surface, side: _Side) -> tuple[FloatArray, FloatArray]:
+def _snap_to_boundary(surface: TriangleMesh, side: _ClipBoundary) -> tuple[FloatArray, FloatArray]:
     """Vertices, and their heights. Those near the side are moved onto it within the surface's
     tangent plane, except those of the surface's boundary and those that would have to go far."""
     x, faces = surface.vertices, surface.faces
     corner = x[faces]
     edges = np.linalg.norm(corner - np.roll(corner, 1, axis=1), axis=2).min(axis=1)
-    normal = crosses(corner)
+    normal = area_normals(corner)
     shortest, mean = np.full(len(x), np.inf), np.zeros_like(x)
     for k in range(3):
         np.minimum.at(shortest, faces[:, k], edges)
@@ -265,13 +272,13 @@ def _snapped(surface: Surface, side: _Side) -> tuple[FloatArray, FloatArray]:
     return np.where(near[:, None], there, x), np.where(near, 0.0, h)
 
 
-def _cut(surface: Surface, side: _Side) -> Surface:
+def _cut(surface: TriangleMesh, side: _ClipBoundary) -> TriangleMesh:
     """The part where heights are not positive. Heights are linear along edges, or those above a
     sphere."""
     faces = surface.faces
     if not len(faces):
         return surface
-    vertices, h = _snapped(surface, side)
+    vertices, h = _snap_to_boundary(surface, side)
     h = np.where(np.abs(h) <= _NEAR * float(np.ptp(vertices, axis=0).max()), 0.0, h)
     out = (h > 0)[faces]
     # What lies on the boundary with no corner inside is left out.
@@ -304,7 +311,7 @@ def _cut(surface: Surface, side: _Side) -> Surface:
         parts.append(np.stack([two[:, 0], at(two[:, 0], two[:, 1]), at(two[:, 0], two[:, 2])], 1))
     made = np.concatenate(parts)
     whole = (made != np.roll(made, 1, axis=1)).all(axis=1)
-    return Surface.of(np.concatenate([vertices, points]), made[whole])
+    return TriangleMesh.without_unused_vertices(np.concatenate([vertices, points]), made[whole])
 
 
 def _on_sphere(a: FloatArray, b: FloatArray, center: FloatArray, radius: float) -> FloatArray:

@@ -9,18 +9,18 @@ import numpy as np
 import trimesh
 
 from harnack.backend import BoolArray, FloatArray
-from harnack.geometry import Ball, Box, ConvexHull, HalfSpace, Intersection
-from harnack.geometry.outline_loops import Outline, for_clipper
+from harnack.geometry import Ball, Box, ConvexHull, HalfSpace, VolumeIntersection
+from harnack.geometry.outline_loops import Outline, scale_for_clipper
 from harnack.meshing.checks import (
-    CrossingError,
-    LocalError,
+    LocalizedMeshingError,
     MeshingError,
+    SelfIntersectionError,
     check_manifold,
     intersecting_faces,
 )
-from harnack.meshing.edges import IntArray, dots, numbered
-from harnack.meshing.lattice_meshing import Surface
-from harnack.meshing.self_intersection_repair import made_apart
+from harnack.meshing.edges import IntArray, row_dots, unique_with_inverse
+from harnack.meshing.lattice_meshing import TriangleMesh
+from harnack.meshing.self_intersection_repair import resolve_self_intersections
 
 if TYPE_CHECKING:
     from manifold3d import CrossSection, Manifold
@@ -32,11 +32,11 @@ __all__ = [
     "ClosedMesh",
     "box_manifold",
     "extruded_manifold",
+    "from_manifold",
     "grown",
-    "manifold_of",
     "mesh_manifold",
     "revolved_manifold",
-    "surface_of",
+    "to_manifold",
     "volume_manifold",
     "without_short_edges",
 ]
@@ -48,7 +48,7 @@ _SAME_AREA, _GROWN, _LEAST_SLANT = 1e-6, 1e-9, 0.1
 _MOST_CELLS = 1_000_000
 
 
-def manifold_of(surface: Surface) -> Manifold:
+def to_manifold(surface: TriangleMesh) -> Manifold:
     """A closed mesh whose faces are seen counter-clockwise from outside.
 
     Raises:
@@ -63,7 +63,7 @@ def manifold_of(surface: Surface) -> Manifold:
     if made.status() != Error.NoError:
         raise MeshingError(
             f"a surface of the solid is not closed ({made.status().name}): cells are too large for "
-            "it; choose a smaller `spacing`"
+            "it; choose a smaller `cell_size`"
         )
     return made
 
@@ -89,11 +89,11 @@ def mesh_manifold(solid: MeshSolid) -> Manifold | None:
             f"the faces of the mesh do not meet two by two at its edges ({whole.status().name}): "
             "join its parts by trimesh.boolean.union, or move them apart"
         )
-    if surface.pieces is None:
+    if surface.boundary_triangles is None:
         return whole
     parts = whole.decompose()
     for part in parts:
-        boundary = surface_of(part)
+        boundary = from_manifold(part)
         if part.volume() <= 0 or len(intersecting_faces(boundary.vertices, boundary.faces)):
             return None
     first_union: Manifold | None = None
@@ -101,17 +101,17 @@ def mesh_manifold(solid: MeshSolid) -> Manifold | None:
         union = Manifold.batch_boolean([_grown(part, length) for part in parts], OpType.Add)
         if abs(union.surface_area() - surface.area) <= _SAME_AREA * surface.area:
             first_union = first_union or union
-            boundary = surface_of(union)
+            boundary = from_manifold(union)
             if not len(intersecting_faces(boundary.vertices, boundary.faces)):
                 return union
     return first_union
 
 
 def _grown(part: Manifold, length: float) -> Manifold:
-    return part if length == 0 else manifold_of(grown(surface_of(part), length))
+    return part if length == 0 else to_manifold(grown(from_manifold(part), length))
 
 
-def grown(surface: Surface, length: float) -> Surface:
+def grown(surface: TriangleMesh, length: float) -> TriangleMesh:
     """A closed surface whose vertices are moved outwards so that faces are, by about a length.
     Parts that touch, up to rounding, overlap then."""
     x, faces = surface.vertices, surface.faces
@@ -119,8 +119,8 @@ def grown(surface: Surface, length: float) -> Surface:
     way = np.array(mesh.vertex_normals)
     slant = np.ones(len(way))
     for k in range(3):
-        np.minimum.at(slant, faces[:, k], dots(way[faces[:, k]], mesh.face_normals))
-    return Surface(x + way * (length / np.maximum(slant, _LEAST_SLANT))[:, None], faces)
+        np.minimum.at(slant, faces[:, k], row_dots(way[faces[:, k]], mesh.face_normals))
+    return TriangleMesh(x + way * (length / np.maximum(slant, _LEAST_SLANT))[:, None], faces)
 
 
 def without_short_edges(solid: Manifold, length: float) -> Manifold:
@@ -132,11 +132,11 @@ def without_short_edges(solid: Manifold, length: float) -> Manifold:
     return simpler if abs(simpler.volume() - solid.volume()) <= most else solid
 
 
-def surface_of(manifold: Manifold) -> Surface:
+def from_manifold(manifold: Manifold) -> TriangleMesh:
     """The triangles of a solid."""
     mesh = manifold.to_mesh64()
     vertices = np.array(mesh.vert_properties, np.float64)[:, :3]
-    return Surface(vertices, np.array(mesh.tri_verts, np.int64))
+    return TriangleMesh(vertices, np.array(mesh.tri_verts, np.int64))
 
 
 def box_manifold(lower: FloatArray, upper: FloatArray) -> Manifold:
@@ -207,10 +207,10 @@ def revolved_manifold(outline: Outline, tolerance: float) -> Manifold:
 
 
 def _section(outline: Outline) -> tuple[CrossSection, float]:
-    """An outline, times a scale for which it is not rounded (`for_clipper`)."""
+    """An outline, times a scale for which it is not rounded (`scale_for_clipper`)."""
     from manifold3d import CrossSection
 
-    loops, scale = for_clipper(outline)
+    loops, scale = scale_for_clipper(outline)
     return CrossSection(loops), scale
 
 
@@ -226,7 +226,7 @@ def volume_manifold(
     from manifold3d import Manifold
 
     around = box_manifold(lower, upper)
-    if isinstance(volume, Intersection):
+    if isinstance(volume, VolumeIntersection):
         for one in volume.volumes:
             around ^= volume_manifold(one, lower, upper, tolerance)
         return around
@@ -271,9 +271,9 @@ _LARGEST = 2.0**36
 # A part has to be at least this many steps long.
 _MOST_COARSE = 1e4
 # Where the snapped mesh does not pass its checks, it is simplified within these numbers of steps.
-_SIMPLER = (4, 32)
+_SIMPLIFY_STEPS = (4, 32)
 # And mended, where triangles cross, within this number.
-_MENDED = 32
+_REPAIR_STEPS = 32
 
 
 class ClosedMesh(trimesh.Trimesh):
@@ -313,15 +313,15 @@ class ClosedMesh(trimesh.Trimesh):
         if self.units is not None:
             written.units = self.units
         if self.is_watertight:
-            step = _step(np.asarray(self.vertices, np.float64))
-            written = _snapped(written, step)
+            step = _grid_spacing(np.asarray(self.vertices, np.float64))
+            written = _quantize(written, step)
             name = file_type or str(getattr(file_obj, "name", file_obj))
             if name.lower().endswith(("obj", "off")):  # exact decimals of a multiple of 2^-k
                 options.setdefault("digits", max(1, round(-math.log2(step))))
         return cast("Any", written).export(file_obj, file_type, **options)
 
 
-def _step(x: FloatArray) -> float:
+def _grid_spacing(x: FloatArray) -> float:
     """The distance between neighbors of the grid that points are rounded to: a power of two, of
     which single precision, with its 24 bits, holds all multiples as large as the points.
 
@@ -339,18 +339,20 @@ def _step(x: FloatArray) -> float:
     return step
 
 
-def _snapped(mesh: trimesh.Trimesh, step: float) -> trimesh.Trimesh:
+def _quantize(mesh: trimesh.Trimesh, step: float) -> trimesh.Trimesh:
     """The mesh with vertices on the grid; where that does not pass its checks, mended there or
     simplified."""
-    given = Surface(np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64))
-    x, faces, kept = _contracted(given, step)
+    given = TriangleMesh(np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64))
+    x, faces, kept = _merge_on_grid(given, step)
     is_plain = not cast("Any", mesh.visual).defined
     try:
-        mended = _mended(Surface(x, faces[kept]), given, _MENDED * step if is_plain else 0.0)
-    except LocalError as error:
-        mended = _simpler(given, step) if is_plain else None
+        mended = _resolve_after_rounding(
+            TriangleMesh(x, faces[kept]), given, _REPAIR_STEPS * step if is_plain else 0.0
+        )
+    except LocalizedMeshingError as error:
+        mended = _simplify_until_valid(given, step) if is_plain else None
         if mended is None:
-            x, y, z = error.places[0]
+            x, y, z = error.locations[0]
             raise MeshingError(
                 f"in a file, where points are {step:.2g} from each other at the least, parts touch "
                 f"or pass through each other, such as near ({x:.4g}, {y:.4g}, {z:.4g}): move them "
@@ -364,22 +366,22 @@ def _snapped(mesh: trimesh.Trimesh, step: float) -> trimesh.Trimesh:
     return mesh
 
 
-def _simpler(given: Surface, step: float) -> Surface | None:
+def _simplify_until_valid(given: TriangleMesh, step: float) -> TriangleMesh | None:
     """Without slivers, simplified by manifold3d; None if that does not help either."""
-    for steps in _SIMPLER:
-        simpler = surface_of(without_short_edges(manifold_of(given), steps * step))
-        x, faces, kept = _contracted(simpler, step)
+    for steps in _SIMPLIFY_STEPS:
+        simpler = from_manifold(without_short_edges(to_manifold(given), steps * step))
+        x, faces, kept = _merge_on_grid(simpler, step)
         if not kept.any():
             return None
-        made = Surface.of(x, faces[kept])
+        made = TriangleMesh.without_unused_vertices(x, faces[kept])
         try:
-            return _mended(made, given, _MENDED * step) or made
-        except LocalError:
+            return _resolve_after_rounding(made, given, _REPAIR_STEPS * step) or made
+        except LocalizedMeshingError:
             continue
     return None
 
 
-def _contracted(surface: Surface, step: float) -> tuple[FloatArray, IntArray, BoolArray]:
+def _merge_on_grid(surface: TriangleMesh, step: float) -> tuple[FloatArray, IntArray, BoolArray]:
     """Vertices on the grid, faces between the first of those that are one point, and which faces
     are left."""
     grid = np.round(surface.vertices / step)
@@ -387,24 +389,26 @@ def _contracted(surface: Surface, step: float) -> tuple[FloatArray, IntArray, Bo
     # Points that are one, by their coordinates one after the other.
     place = np.zeros(len(x), np.int64)
     for one in (grid - grid.min(axis=0)).astype(np.int64).T:
-        _, place, _, _ = numbered(place * (int(one.max()) + 1) + one)
+        _, place, _, _ = unique_with_inverse(place * (int(one.max()) + 1) + one)
     first = np.empty(len(x), np.int64)
     first[place[::-1]] = np.arange(len(x))[::-1]
     faces = first[place][surface.faces]
     return x, faces, (faces != np.roll(faces, 1, axis=1)).all(axis=1)
 
 
-def _mended(made: Surface, given: Surface, length: float) -> Surface | None:
+def _resolve_after_rounding(
+    made: TriangleMesh, given: TriangleMesh, length: float
+) -> TriangleMesh | None:
     """A surface mended where triangles cross, moved by no more than a length; None if none do, or
     if that does not help and those that were given, such as of a mesh that was repaired, do too.
 
     Raises:
-        LocalError: it is not closed, or triangles cross.
+        LocalizedMeshingError: it is not closed, or triangles cross.
     """
     check_manifold(made.faces, made.vertices)
     try:
-        apart = made_apart(made, length)
-    except CrossingError:
+        apart = resolve_self_intersections(made, length)
+    except SelfIntersectionError:
         if not len(intersecting_faces(given.vertices, given.faces)):
             raise
         return None

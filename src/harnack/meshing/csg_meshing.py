@@ -6,6 +6,10 @@ less {g <= -w}, two smooth surfaces which do not meet, in a box a little larger 
 it is cut by the clip itself. Unions, intersections and complements likewise are those of the parts'
 meshes, so that the creases where parts meet are edges of the mesh. Creases of a single function,
 such as a cylinder's, are chamfered within the tolerance.
+
+Offsets of meshes are left as cells cut them: they have creases everywhere, beside which moved and
+refined triangles passed through each other. Small cells, and manifold3d joins what is flat. The few
+triangles of the whole that are too far off then are cut where they are (`outlier_projection`).
 """
 
 from __future__ import annotations
@@ -19,51 +23,56 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 import numpy as np
 
 from harnack.backend import FloatArray
-from harnack.backend.validation import finite
+from harnack.backend.validation import as_finite
 from harnack.fields import Field, Solid
 from harnack.fields.solid_angles.solid_angle import SolidAngle
-from harnack.fields.solids.booleans import Combined, Complement, Offset
-from harnack.fields.solids.extrusions import Extruded, Revolved
-from harnack.fields.solids.from_field import Near, Region, bounded_side
+from harnack.fields.solids.booleans import BooleanSolid, Complement, OffsetSolid
+from harnack.fields.solids.extrusions import Extrusion, SolidOfRevolution
+from harnack.fields.solids.from_field import BandSolid, SublevelSolid, bounded_side_extent
 from harnack.fields.solids.from_field import solid as solid_of
 from harnack.fields.solids.mesh_solid import MeshSolid
 from harnack.fields.solids.primitives import Cuboid, Plane
 from harnack.fields.solids.thread import Thread
-from harnack.fields.solids.transforms import AffineImage
+from harnack.fields.solids.transforms import TransformedSolid
 from harnack.fields.solids.tube import Tube
-from harnack.geometry import Ball, Box, Intersection, Volume
-from harnack.meshing.bcc_lattice import Lattice
+from harnack.geometry import Ball, Box, Volume, VolumeIntersection
+from harnack.meshing.bcc_lattice import BccLattice
 from harnack.meshing.checks import (
-    CrossingError,
-    FarError,
-    LocalError,
+    LocalizedMeshingError,
     MeshingError,
-    TooLargeError,
+    OffLevelError,
+    SelfIntersectionError,
+    TriangleLimitError,
     check_manifold,
-    may_help_again,
+    is_retry_promising,
 )
-from harnack.meshing.clipping import without_films
+from harnack.meshing.clipping import drop_degenerate_components
 from harnack.meshing.closed_mesh import (
     box_manifold,
     extruded_manifold,
-    manifold_of,
+    from_manifold,
     mesh_manifold,
     revolved_manifold,
-    surface_of,
+    to_manifold,
     volume_manifold,
     without_short_edges,
 )
-from harnack.meshing.csg_rewrite import common_parts_taken_out, flat, without_cut_parts
+from harnack.meshing.csg_rewrite import drop_cancelled_operands, factor_common_operands, flatten_csg
 from harnack.meshing.lattice_meshing import (
-    Elsewhere,
-    MissedError,
-    Surface,
-    closed_surface,
-    cut_where_far,
+    IrrelevantRegion,
+    MissedPartsError,
+    TriangleMesh,
+    mesh_closed_surface,
+    split_faces_off_level,
 )
-from harnack.meshing.level_function import CELLS_PER_WAVE, LevelFunction, Samples, Uploads
-from harnack.meshing.outlier_projection import brought_near
-from harnack.meshing.self_intersection_repair import made_apart
+from harnack.meshing.level_function import (
+    CELLS_PER_WAVE,
+    EvaluatorCache,
+    LevelFunction,
+    LevelSamples,
+)
+from harnack.meshing.outlier_projection import project_outliers
+from harnack.meshing.self_intersection_repair import resolve_self_intersections
 from harnack.meshing.thread_mesh import thread_manifold
 from harnack.meshing.tube_mesh import tube_manifold
 
@@ -72,13 +81,13 @@ if TYPE_CHECKING:
 
 __all__ = [
     "AngleMesher",
-    "RegionMesher",
-    "SolidMesh",
+    "CsgMesher",
+    "SolidMeshResult",
     "apart_of",
-    "ends_of_solid",
-    "is_smooth",
+    "is_single_level_set",
     "mesh_solid",
-    "region_of",
+    "solid_and_level",
+    "solid_value_range",
 ]
 
 # Cells of offsets of meshes, in tolerances; and how many secants find roots on their edges.
@@ -92,10 +101,10 @@ _JOINED_WITHIN, _MENDED_WITHIN = (0.5, 0.25, 0.1), 0.5
 _FAR_OFF, _TIMES_CUT = 1.8, 2
 
 # Meshes the level set of an angle, which ends at its curve: field, level -> vertices and faces.
-AngleMesher = Callable[[SolidAngle, float], Surface]
+AngleMesher = Callable[[SolidAngle, float], TriangleMesh]
 
 
-Others: TypeAlias = tuple[tuple[Solid, float], ...]
+IntersectedOperands: TypeAlias = tuple[tuple[Solid, float], ...]
 """Solids and their levels: what is meshed is intersected with all of them, so that it need not be
 made where one of them is proved to have nothing.
 
@@ -111,17 +120,19 @@ it is a part of the truth: again the intersection is the truth."""
 
 
 @dataclass
-class RegionMesher:
+class CsgMesher:
     """Meshes solids in a box from `lower` to `upper`, (3,) each.
 
     tolerance: a length, of the middles of edges and faces. spacing: of cells, at most.
-    per_wave: cells along a wave (`Field.wavelength`) at the least; None for as many as there are.
+    per_wave: cells along a wave (`Field.min_wavelength`) at the least; None for as many as there
+        are.
     mesh_angle: meshes level sets of angles, which end at a curve. most_faces: of each level set.
-    evaluations, levels, finest: of fields, in points, how many level sets were meshed so far, and
-        the smallest spacing of these.
+    evaluations, levels, smallest_cell: of fields, in points, how many level sets were meshed so
+        far, and the smallest spacing of these.
     uploads: of the fields that were meshed so far.
-    others: parts that everything meshed next is intersected with (see `Others`).
-    last_elsewhere: where others left nothing, when that was asked for last.
+    intersected_with: parts that everything meshed next is intersected with (see
+        `IntersectedOperands`).
+    irrelevant_region_cache: where others left nothing, when that was asked for last.
     """
 
     lower: FloatArray
@@ -134,12 +145,12 @@ class RegionMesher:
     report: Callable[[str], None]
     evaluations: int = 0
     levels: int = 0
-    finest: float = math.inf
-    uploads: Uploads = dataclasses.field(default_factory=Uploads)
-    others: Others = ()
-    last_elsewhere: tuple[Others, Elsewhere] | None = None
+    smallest_cell: float = math.inf
+    uploads: EvaluatorCache = dataclasses.field(default_factory=EvaluatorCache)
+    intersected_with: IntersectedOperands = ()
+    irrelevant_region_cache: tuple[IntersectedOperands, IrrelevantRegion] | None = None
 
-    def below(self, solid: Solid, level: float) -> Manifold:
+    def mesh_sublevel(self, solid: Solid, level: float) -> Manifold:
         """The points of the box where a solid's function is at most `level`; what there is outside
         of the box has no meaning.
 
@@ -148,30 +159,30 @@ class RegionMesher:
         """
         from manifold3d import Manifold
 
-        if isinstance(solid, Combined):
-            apart = common_parts_taken_out(solid, level) if solid.is_union else None
+        if isinstance(solid, BooleanSolid):
+            apart = factor_common_operands(solid, level) if solid.is_union else None
             if apart is not None:
-                return self.below(apart, 0.0)
-            kept = without_cut_parts(flat(solid), level)
+                return self.mesh_sublevel(apart, 0.0)
+            kept = drop_cancelled_operands(flatten_csg(solid), level)
             return Manifold() if kept is None else self._joined(kept, level)
         if isinstance(solid, Complement):  # -f <= c where f >= -c
-            return self._space() - self.below(solid.inner, -level)
-        if isinstance(solid, Offset):
-            return self.below(solid.inner, level + solid.distance)
-        if isinstance(solid, Near):
+            return self._whole_box() - self.mesh_sublevel(solid.field, -level)
+        if isinstance(solid, OffsetSolid):
+            return self.mesh_sublevel(solid.field, level + solid.distance)
+        if isinstance(solid, BandSolid):
             return self._wall(solid, level)
-        if isinstance(solid, Region) and isinstance(solid.inner, Solid):
-            return self.below(solid.inner, level)
-        if isinstance(solid, AffineImage) and not is_smooth(solid.inner):
+        if isinstance(solid, SublevelSolid) and isinstance(solid.field, Solid):
+            return self.mesh_sublevel(solid.field, level)
+        if isinstance(solid, TransformedSolid) and not is_single_level_set(solid.field):
             return self._image(solid, level)
         if isinstance(solid, Cuboid) and solid.radius == 0 and level <= 0:
             half = np.array(solid.half_sides) + level
             return box_manifold(-half, half) if (half > 0).all() else Manifold()
-        if isinstance(solid, Extruded) and level == 0:
+        if isinstance(solid, Extrusion) and level == 0:
             return extruded_manifold(
                 solid.loops, solid.height, solid.twist, solid.taper, self.tolerance
             )
-        if isinstance(solid, Revolved) and level == 0:
+        if isinstance(solid, SolidOfRevolution) and level == 0:
             return revolved_manifold(solid.loops, self.tolerance)
         if isinstance(solid, Thread) and level == 0:
             low, high = float(self.lower[2]), float(self.upper[2])
@@ -182,10 +193,10 @@ class RegionMesher:
             return (mesh_manifold(solid) if level == 0 else None) or self._offset(solid, level)
         if isinstance(solid, Plane):
             x, y, z = solid.normal
-            return self._space().trim_by_plane((-x, -y, -z), -(solid.distance + level))
-        return manifold_of(self.smooth(solid, level)[0])
+            return self._whole_box().trim_by_plane((-x, -y, -z), -(solid.distance + level))
+        return to_manifold(self.mesh_smooth_level(solid, level)[0])
 
-    def _joined(self, solid: Combined, level: float) -> Manifold:
+    def _joined(self, solid: BooleanSolid, level: float) -> Manifold:
         """A union; or an intersection, from which complements are cut away."""
         from manifold3d import Manifold, OpType
 
@@ -196,52 +207,58 @@ class RegionMesher:
             )
         cut = [k for k in numbers if isinstance(solid.parts[k], Complement)]
         kept = [self._part(solid, k, level) for k in numbers if k not in cut]
-        whole = Manifold.batch_boolean(kept, OpType.Intersect) if kept else self._space()
+        whole = Manifold.batch_boolean(kept, OpType.Intersect) if kept else self._whole_box()
         away = [self._part(solid, k, level) for k in cut]
         return Manifold.batch_boolean([whole, *away], OpType.Subtract)
 
-    def _part(self, solid: Combined, number: int, level: float) -> Manifold:
+    def _part(self, solid: BooleanSolid, number: int, level: float) -> Manifold:
         """One part of a union or an intersection, made where the others of an intersection may
-        leave something of it (`Others`); of a complement in an intersection what is cut away."""
-        kept, part = self.others, solid.parts[number]
+        leave something of it (`IntersectedOperands`); of a complement in an intersection what is
+        cut away."""
+        kept, part = self.intersected_with, solid.parts[number]
         if not solid.is_union:
             beside = [one for one in solid.parts if one is not part]
             if isinstance(part, Complement):
-                self.others = tuple((one, level) for one in beside if _is_exact(one))
-                part, level = part.inner, -level
+                self.intersected_with = tuple(
+                    (one, level) for one in beside if _has_no_complement(one)
+                )
+                part, level = part.field, -level
             else:
-                self.others = (*kept, *((one, level) for one in beside))
+                self.intersected_with = (*kept, *((one, level) for one in beside))
         try:
-            return self.below(part, level)
+            return self.mesh_sublevel(part, level)
         finally:
-            self.others = kept
+            self.intersected_with = kept
 
-    def _closed(self, function: LevelFunction, lattice: Lattice) -> Surface:
+    def _closed(self, function: LevelFunction, lattice: BccLattice) -> TriangleMesh:
         """A level set in a box: where the other parts may leave something, if cells are many. Of
         few all are made, so that what is there twice is the same bit by bit; unless that goes
         wrong, as it may where nothing is left: a function of the angle about an axis jumps there,
         and others have no value beyond some surface."""
-        elsewhere: Elsewhere | None = None
+        elsewhere: IrrelevantRegion | None = None
         if math.prod(lattice.counts.tolist()) < _MANY_CELLS:
             try:
-                return closed_surface(function, lattice, self.tolerance, self.report)
+                return mesh_closed_surface(function, lattice, self.tolerance, self.report)
             except MeshingError as wrong:
                 elsewhere = self._elsewhere()
                 if elsewhere is None:
                     raise
                 self.report(f"{wrong}; so only where the other parts leave something")
-        return closed_surface(
+        return mesh_closed_surface(
             function, lattice, self.tolerance, self.report, elsewhere=elsewhere or self._elsewhere()
         )
 
-    def _elsewhere(self) -> Elsewhere | None:
+    def _elsewhere(self) -> IrrelevantRegion | None:
         """How far around points the other parts leave nothing, by proof; None if there are none.
         The two sides of a wall have the same."""
-        if not self.others:
+        if not self.intersected_with:
             return None
-        if self.last_elsewhere is not None and self.last_elsewhere[0] is self.others:
-            return self.last_elsewhere[1]
-        functions = [self.function(one, level) for one, level in self.others]
+        if (
+            self.irrelevant_region_cache is not None
+            and self.irrelevant_region_cache[0] is self.intersected_with
+        ):
+            return self.irrelevant_region_cache[1]
+        functions = [self.function(one, level) for one, level in self.intersected_with]
 
         def clearance(points: FloatArray) -> FloatArray:
             found = np.zeros(len(points))
@@ -250,11 +267,11 @@ class RegionMesher:
                 found[outside] = np.maximum(found[outside], one.clearance(points[outside]))
             return found
 
-        made = Elsewhere(clearance)
-        self.last_elsewhere = self.others, made
+        made = IrrelevantRegion(clearance)
+        self.irrelevant_region_cache = self.intersected_with, made
         return made
 
-    def smooth(self, field: Field, level: float) -> tuple[Surface, bool]:
+    def mesh_smooth_level(self, field: Field, level: float) -> tuple[TriangleMesh, bool]:
         """The boundary of {f <= level} as one level set, and whether it is all of it: if not, it is
         closed outside of the box in a way that has no meaning."""
         hull = _hull(field, level)
@@ -265,15 +282,15 @@ class RegionMesher:
             is_whole = bool((low >= lower).all() and (high <= upper).all())
             lower, upper = np.maximum(lower, low), np.minimum(upper, high)
             if not (lower < upper).all():
-                return Surface(np.zeros((0, 3)), np.zeros((0, 3), np.int64)), is_whole
+                return TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64)), is_whole
         size = float((upper - lower).max())
         spacing = min(self.spacing, size / 8)
-        if self.per_wave is not None and field.wavelength is not None:
-            spacing = min(spacing, field.wavelength / self.per_wave)
-        self.finest = min(self.finest, spacing)
-        function = self.function(_entire(field), level)
+        if self.per_wave is not None and field.min_wavelength is not None:
+            spacing = min(spacing, field.min_wavelength / self.per_wave)
+        self.smallest_cell = min(self.smallest_cell, spacing)
+        function = self.function(_underlying_field(field), level)
         self.report(f"level {level:g} of {type(field).__name__} in cells of {spacing:.3g}")
-        lattice = Lattice.filling(lower, upper, spacing, layers=2)
+        lattice = BccLattice.covering_box(lower, upper, spacing, layers=2)
         made = self._closed(function, lattice)
         self.evaluations += function.evaluations
         self.levels += 1
@@ -281,13 +298,15 @@ class RegionMesher:
 
     def function(self, field: Field, level: float) -> LevelFunction:
         """f - level, continued beyond the field's domain."""
-        return _WithinDomain(field, level, most_faces=self.most_faces, uploads=self.uploads)
+        return _DomainExtendedFunction(
+            field, level, most_faces=self.most_faces, uploads=self.uploads
+        )
 
-    def _space(self) -> Manifold:
+    def _whole_box(self) -> Manifold:
         pad = 1e-3 * (self.upper - self.lower)
         return box_manifold(self.lower - pad, self.upper + pad)
 
-    def _wall(self, wall: Near, level: float) -> Manifold:
+    def _wall(self, wall: BandSolid, level: float) -> Manifold:
         """Where a field is within half_width + level of the wall's level."""
         from manifold3d import Manifold
 
@@ -295,29 +314,29 @@ class RegionMesher:
         if half <= 0:
             return Manifold()
         low, high = wall.level - half, wall.level + half
-        field = wall.inner
+        field = wall.field
         if field.period is None:
-            inside = Region(field)
+            inside = SublevelSolid(field)
             if not isinstance(field, Solid):
                 self._check_wall(field, low, high)
-            return self.below(inside, high) - self.below(inside, low)
+            return self.mesh_sublevel(inside, high) - self.mesh_sublevel(inside, low)
         if 2 * half >= field.period:
-            return self._space()
+            return self._whole_box()
         if not isinstance(field, SolidAngle):
             raise MeshingError(
                 f"a solid around a level of {type(field).__name__}, which is angle-valued, cannot "
                 "be meshed: only those of a SolidAngle"
             )
-        return manifold_of(self._lens(field, low, high))
+        return to_manifold(self._between_angle_levels(field, low, high))
 
     def _check_wall(self, field: Field, low: float, high: float) -> None:
         """Raise if a wall is thinner than both of its sides' tolerance: they would meet."""
-        lattice = Lattice.filling(
+        lattice = BccLattice.covering_box(
             self.lower, self.upper, float((self.upper - self.lower).max()) / 8
         )
         points = lattice.points(2 * np.argwhere(np.ones(lattice.counts)) + 1)
         middle = 0.5 * (low + high)
-        samples = self.function(field, middle).at(points)
+        samples = self.function(field, middle).sample(points)
         # Where the wall may be near.
         near = samples.distance <= np.median(samples.distance)
         steep = float(np.median(np.linalg.norm(samples.gradient[near], axis=1)))
@@ -329,7 +348,7 @@ class RegionMesher:
                 "wall thicker"
             )
 
-    def _lens(self, field: SolidAngle, low: float, high: float) -> Surface:
+    def _between_angle_levels(self, field: SolidAngle, low: float, high: float) -> TriangleMesh:
         """Between two levels of an angle: both end at the same vertices, those of the curve."""
         inner, outer = self.mesh_angle(field, low), self.mesh_angle(field, high)
         count = sum(map(len, field.loops))
@@ -339,7 +358,7 @@ class RegionMesher:
         place[:count] = np.arange(count)
         vertices = np.concatenate([outer.vertices, inner.vertices[count:]])
         self.levels += 2
-        return Surface(vertices, np.concatenate([outer.faces, place[inner.faces][:, ::-1]]))
+        return TriangleMesh(vertices, np.concatenate([outer.faces, place[inner.faces][:, ::-1]]))
 
     def _offset(self, solid: MeshSolid, level: float) -> Manifold:
         """The points within a distance of a mesh, or deeper inside than that.
@@ -353,65 +372,72 @@ class RegionMesher:
         """
         lower, upper = (np.array(end) for end in _finite_hull(solid, level))
         if not (lower < upper).all():
-            return manifold_of(Surface(np.zeros((0, 3)), np.zeros((0, 3), np.int64)))
+            return to_manifold(TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64)))
         cells = min(self.spacing, _CELLS_OF_OFFSET * self.tolerance)
-        self.finest = min(self.finest, cells)
-        function = dataclasses.replace(self.function(solid, level), secants=_SECANTS)
+        self.smallest_cell = min(self.smallest_cell, cells)
+        function = dataclasses.replace(self.function(solid, level), secant_steps=_SECANTS)
         self.report(f"level {level:g} of a mesh in cells of {cells:.3g}")
-        lattice = Lattice.filling(lower - cells, upper + cells, cells, layers=2)
-        made = closed_surface(function, lattice, self.tolerance, self.report, as_cut=True)
-        whole = manifold_of(made)
+        lattice = BccLattice.covering_box(lower - cells, upper + cells, cells, layers=2)
+        made = mesh_closed_surface(function, lattice, self.tolerance, self.report, as_cut=True)
+        whole = to_manifold(made)
         self.levels += 1
         for share in _JOINED_WITHIN:
-            joined = surface_of(without_short_edges(whole, share * self.tolerance))
-            joined = cut_where_far(function, joined, _FAR_OFF * self.tolerance, _TIMES_CUT)
+            joined = from_manifold(without_short_edges(whole, share * self.tolerance))
+            joined = split_faces_off_level(function, joined, _FAR_OFF * self.tolerance, _TIMES_CUT)
             try:
-                made = made_apart(joined, _MENDED_WITHIN * self.tolerance)
-            except CrossingError:
+                made = resolve_self_intersections(joined, _MENDED_WITHIN * self.tolerance)
+            except SelfIntersectionError:
                 continue
             break
         self.evaluations += function.evaluations
-        return manifold_of(made)
+        return to_manifold(made)
 
-    def _image(self, solid: AffineImage, level: float) -> Manifold:
+    def _image(self, solid: TransformedSolid, level: float) -> Manifold:
         """Of a solid under an affine map: the image of its mesh."""
-        matrix, offset = np.array(solid.map.matrix), np.array(solid.map.offset)
+        matrix, offset = np.array(solid.map.matrix), np.array(solid.map.translation_vector)
         ends = np.stack([self.lower, self.upper])
         corners = np.stack(np.meshgrid(*ends.T, indexing="ij"), axis=-1).reshape(-1, 3)
         own = (corners - offset) @ solid.map.inverse.T
         scale = float(np.linalg.norm(matrix, 2))
         local = dataclasses.replace(
-            self, lower=own.min(axis=0), upper=own.max(axis=0), tolerance=self.tolerance / scale,
-            spacing=self.spacing / scale, evaluations=0, levels=0, finest=math.inf, others=(),
-        )  # fmt: skip
-        made = local.below(solid.inner, level / solid.map.factor)
+            self,
+            lower=own.min(axis=0),
+            upper=own.max(axis=0),
+            tolerance=self.tolerance / scale,
+            spacing=self.spacing / scale,
+            evaluations=0,
+            levels=0,
+            smallest_cell=math.inf,
+            intersected_with=(),
+        )
+        made = local.mesh_sublevel(solid.field, level / solid.map.value_factor)
         self.evaluations += local.evaluations
         self.levels += local.levels
-        self.finest = min(self.finest, local.finest * scale)
+        self.smallest_cell = min(self.smallest_cell, local.smallest_cell * scale)
         return made.transform(np.column_stack([matrix, offset]))
 
 
-def _is_exact(solid: Solid) -> bool:
+def _has_no_complement(solid: Solid) -> bool:
     """Whether there is no complement within a solid, as it is meshed."""
-    if isinstance(solid, Combined):
-        return all(_is_exact(one) for one in solid.parts)
-    if isinstance(solid, AffineImage | Offset):
-        return _is_exact(solid.inner)
-    return not isinstance(solid, Complement | Near)
+    if isinstance(solid, BooleanSolid):
+        return all(_has_no_complement(one) for one in solid.parts)
+    if isinstance(solid, TransformedSolid | OffsetSolid):
+        return _has_no_complement(solid.field)
+    return not isinstance(solid, Complement | BandSolid)
 
 
-def is_smooth(solid: Solid) -> bool:
+def is_single_level_set(solid: Solid) -> bool:
     """Whether a solid is meshed as one level set."""
-    if isinstance(solid, Region):
-        return not isinstance(solid.inner, Solid) or is_smooth(solid.inner)
-    if isinstance(solid, AffineImage):
-        return is_smooth(solid.inner)
-    with_edges = Cuboid | Plane | Extruded | Revolved | Thread | Tube | MeshSolid
-    return not isinstance(solid, Combined | Complement | Offset | Near | with_edges)
+    if isinstance(solid, SublevelSolid):
+        return not isinstance(solid.field, Solid) or is_single_level_set(solid.field)
+    if isinstance(solid, TransformedSolid):
+        return is_single_level_set(solid.field)
+    with_edges = Cuboid | Plane | Extrusion | SolidOfRevolution | Thread | Tube | MeshSolid
+    return not isinstance(solid, BooleanSolid | Complement | OffsetSolid | BandSolid | with_edges)
 
 
 def _finite_hull(solid: MeshSolid, level: float) -> tuple[FloatArray, FloatArray]:
-    low, high = cast("Volume", solid.hull(level)).bounds()
+    low, high = cast("Volume", solid.sublevel_extent(level)).bounds()
     return np.array(low), np.array(high)
 
 
@@ -419,32 +445,32 @@ def _hull(field: Field, level: float) -> Volume | None:
     """A volume that holds {f <= level}, if it has bounds. A domain does not count: what ends there
     is cut by it."""
     if isinstance(field, Solid):
-        found = field.hull(level)
+        found = field.sublevel_extent(level)
     else:
-        found = bounded_side(field, (level,), lambda value: value <= level)
+        found = bounded_side_extent(field, (level,), lambda value: value <= level)
     if found is None or found == field.domain:
         return None
-    if isinstance(field, Region) and found == field.inner.domain:
+    if isinstance(field, SublevelSolid) and found == field.field.domain:
         return None
     low, high = found.bounds()
     return found if np.isfinite(low).all() and np.isfinite(high).all() else None
 
 
-def _entire(field: Field) -> Field:
+def _underlying_field(field: Field) -> Field:
     """The field itself, of a region of a field."""
-    return field.inner if isinstance(field, Region) else field
+    return field.field if isinstance(field, SublevelSolid) else field
 
 
 @dataclass
-class _WithinDomain(LevelFunction):
+class _DomainExtendedFunction(LevelFunction):
     """A field continued beyond its domain as it is at the domain's closest point.
 
     The closest points of two points are no farther from each other than the two are, so that the
     clearance of the closest point of p holds around p.
     """
 
-    def at(self, points: FloatArray) -> Samples:
-        return super().at(self._closest(points))
+    def sample(self, points: FloatArray) -> LevelSamples:
+        return super().sample(self._closest(points))
 
     def values(self, points: FloatArray) -> FloatArray:
         return super().values(self._closest(points))
@@ -454,7 +480,7 @@ class _WithinDomain(LevelFunction):
 
     def _closest(self, points: FloatArray) -> FloatArray:
         domain = self.field.domain
-        if domain is None or self.field.is_entire:
+        if domain is None or self.field.is_global:
             return points
         if isinstance(domain, Box):
             return np.clip(points, *domain.bounds())
@@ -487,18 +513,18 @@ _MARGIN = 0.01
 
 
 @dataclass(frozen=True)
-class SolidMesh:
+class SolidMeshResult:
     """A closed surface; the spacing of cells, evaluations of fields in points, and how many level
     sets it was made of. size: of its box, to which tolerances relate."""
 
-    surface: Surface
+    surface: TriangleMesh
     spacing: float
     evaluations: int
     levels: int
     size: float
 
 
-def region_of(field: Field, solid: Any, level: float | None) -> tuple[Solid, float]:
+def solid_and_level(field: Field, solid: Any, level: float | None) -> tuple[Solid, float]:
     """The solid that is asked for by `solid`, (low, high) or True, and its level.
 
     Raises:
@@ -506,9 +532,9 @@ def region_of(field: Field, solid: Any, level: float | None) -> tuple[Solid, flo
         TypeError: neither.
     """
     if solid is True and isinstance(field, Solid):
-        level = field.default_level if level is None else finite(level, "level")
+        level = field.default_level if level is None else as_finite(level, "level")
         return field, level
-    low, high = ends_of_solid(field, solid, level)
+    low, high = solid_value_range(field, solid, level)
     if low == -math.inf:
         return solid_of(field, below=high), 0.0
     if high == math.inf:
@@ -518,11 +544,11 @@ def region_of(field: Field, solid: Any, level: float | None) -> tuple[Solid, flo
     return solid_of(field, between=(low, high)), 0.0
 
 
-def ends_of_solid(field: Field, solid: Any, level: float | None) -> tuple[float, float]:
+def solid_value_range(field: Field, solid: Any, level: float | None) -> tuple[float, float]:
     """The values (low, high) between which a solid is, given as such.
 
     Raises:
-        ValueError, TypeError: as `region_of`.
+        ValueError, TypeError: as `solid_and_level`.
     """
     if solid is True:
         raise ValueError(
@@ -534,7 +560,7 @@ def ends_of_solid(field: Field, solid: Any, level: float | None) -> tuple[float,
     low, high = two_numbers(solid)
     if not low < high or not (math.isfinite(low) or math.isfinite(high)):
         raise ValueError(f"solid must be (low, high) with low < high, one finite, not {solid}")
-    field.check_levels(tuple(end for end in (low, high) if math.isfinite(end)))
+    field.validate_levels(tuple(end for end in (low, high) if math.isfinite(end)))
     return low, high
 
 
@@ -559,16 +585,17 @@ def mesh_solid(
     spacing: float | None,
     angle_mesher: Callable[[float, float], AngleMesher],
     most_faces: int,
-    check: Callable[[Surface, float], None],
+    check: Callable[[TriangleMesh, float], None],
     report: Callable[[str], None],
-) -> SolidMesh:
+) -> SolidMeshResult:
     """The boundary of the points of a volume where a solid's function is at most `level`.
 
     volume: None for all of space. tolerance: a part of the size. most_faces: of a level set.
     angle_mesher: given a tolerance and a spacing, both lengths, how to mesh level sets of angles.
     check: of the surface, of which no triangles pass through each other, given the size, that it is
-        near the level last. Where it is not, in a few places, these are mended (`brought_near`);
-        where another check fails in known places, or that is not enough, smaller cells are tried,
+        near the level last. Where it is not, in a few places, these are mended
+        (`project_outliers`); where another check fails in known places, or that is not enough,
+        smaller cells are tried,
         and half the tolerance: beside a thin part triangles within it may be anywhere.
 
     Raises:
@@ -580,44 +607,46 @@ def mesh_solid(
     error = 0.5 * tolerance * size
     attempts = _MOST_ATTEMPTS if spacing is None else 1
     per_wave = CELLS_PER_WAVE if spacing is None else None
-    uploads = Uploads()
+    uploads = EvaluatorCache()
     first: MeshingError | None = None
     before: MeshingError | None = None
     while True:
-        mesher = RegionMesher(
+        mesher = CsgMesher(
             lower, upper, error, cells, per_wave, angle_mesher(error, cells),
             most_faces, report, uploads=uploads,
         )  # fmt: skip
         try:
-            made = _apart(_put_together(mesher, solid, level, volume), error)
+            made = _apart(_assemble(mesher, solid, level, volume), error)
             report("checking")
             made = _checked(mesher, solid, level, made, size, check)
             break
-        except TooLargeError as large:
+        except TriangleLimitError as large:
             if first is None:
                 raise
             raise first from large  # what smaller cells were for is what went wrong
-        except (MissedError, LocalError) as wrong:
+        except (MissedPartsError, LocalizedMeshingError) as wrong:
             attempts, first = attempts - 1, first or wrong
-            if not attempts or not may_help_again(wrong, before, _SMALLER**attempts):
+            if not attempts or not is_retry_promising(wrong, before, _SMALLER**attempts):
                 raise
             before = wrong
             cells *= _SMALLER
             per_wave = CELLS_PER_WAVE * size / (_ACROSS * cells)
-            if isinstance(wrong, LocalError):
+            if isinstance(wrong, LocalizedMeshingError):
                 error *= 0.5
             report(f"{wrong}; so cells of {cells:.3g}")
-    return SolidMesh(made, min(cells, mesher.finest), mesher.evaluations, mesher.levels, size)
+    return SolidMeshResult(
+        made, min(cells, mesher.smallest_cell), mesher.evaluations, mesher.levels, size
+    )
 
 
 def _checked(
-    mesher: RegionMesher,
+    mesher: CsgMesher,
     solid: Solid,
     level: float,
-    made: Surface,
+    made: TriangleMesh,
     size: float,
-    check: Callable[[Surface, float], None],
-) -> Surface:
+    check: Callable[[TriangleMesh, float], None],
+) -> TriangleMesh:
     """The surface, checked; brought nearer to the level in a few places, if need be.
 
     Raises:
@@ -625,9 +654,9 @@ def _checked(
     """
     try:
         check(made, size)
-    except FarError as far:
-        mended = brought_near(
-            mesher.function(solid, level), made, far.places, 2 * mesher.tolerance,
+    except OffLevelError as far:
+        mended = project_outliers(
+            mesher.function(solid, level), made, far.locations, 2 * mesher.tolerance,
             lambda one: check(one, size),
         )  # fmt: skip
         if mended is None:
@@ -637,68 +666,68 @@ def _checked(
     return made
 
 
-def apart_of(whole: Manifold, tolerance: float) -> Surface:
+def apart_of(whole: Manifold, tolerance: float) -> TriangleMesh:
     """The surface of parts put together, of which no triangles pass through each other.
 
     Raises:
         MeshingError: it is empty, or triangles cross.
     """
-    return _apart(_Joined(whole), tolerance)
+    return _apart(_Assembly(whole), tolerance)
 
 
-def _apart(parts: Surface | _Joined, tolerance: float) -> Surface:
+def _apart(parts: TriangleMesh | _Assembly, tolerance: float) -> TriangleMesh:
     """The surface, of which no triangles pass through each other; of parts put together mended, or
     without slivers.
 
     Raises:
-        MeshingError: it is empty; a CrossingError where that does not help, or hardly any fewer
-            triangles cross where less is left out.
+        MeshingError: it is empty; a SelfIntersectionError where that does not help, or hardly any
+            fewer triangles cross where less is left out.
     """
-    raised: CrossingError | None = None
-    for share in _SLIVERS_WITHIN if isinstance(parts, _Joined) else (0.0,):
-        one = parts.without_slivers(share * tolerance) if isinstance(parts, _Joined) else parts
+    raised: SelfIntersectionError | None = None
+    for share in _SLIVERS_WITHIN if isinstance(parts, _Assembly) else (0.0,):
+        one = parts.without_slivers(share * tolerance) if isinstance(parts, _Assembly) else parts
         if not len(one.faces):
             raise MeshingError("the solid is empty: no point of the box is inside")
         try:
-            return made_apart(one, _MENDED_WITHIN * tolerance)
-        except CrossingError as error:
-            if not may_help_again(error, raised):
+            return resolve_self_intersections(one, _MENDED_WITHIN * tolerance)
+        except SelfIntersectionError as error:
+            if not is_retry_promising(error, raised):
                 raise
             raised = error
-    raise cast("CrossingError", raised)
+    raise cast("SelfIntersectionError", raised)
 
 
 @dataclass(frozen=True)
-class _Joined:
+class _Assembly:
     """Parts put together, in a volume or in all of space."""
 
     whole: Manifold
     volume: Volume | None = None
 
-    def without_slivers(self, length: float) -> Surface:
+    def without_slivers(self, length: float) -> TriangleMesh:
         """The surface, short edges and slivers left out within a length, and bodies that are
         nothing but rounding."""
         simpler = without_short_edges(self.whole, length) if length > 0 else self.whole
-        surface = without_films(surface_of(simpler))
+        surface = drop_degenerate_components(from_manifold(simpler))
         return surface if self.volume is None else _on_box(surface, self.volume)
 
 
-def _put_together(
-    mesher: RegionMesher, solid: Solid, level: float, volume: Volume | None
-) -> Surface | _Joined:
+def _assemble(
+    mesher: CsgMesher, solid: Solid, level: float, volume: Volume | None
+) -> TriangleMesh | _Assembly:
     """The boundary of the solid in the volume."""
-    if volume is None and is_smooth(solid):
-        return mesher.smooth(solid, level)[0]
+    if volume is None and is_single_level_set(solid):
+        return mesher.mesh_smooth_level(solid, level)[0]
     lower, upper = mesher.lower, mesher.upper
-    whole = mesher.below(solid, level)
+    whole = mesher.mesh_sublevel(solid, level)
     mesher.report("putting the parts together")
     if volume is None:
         volume = Box(_point(lower), _point(upper))
         ends = np.array(whole.bounding_box(), np.float64)
         if (ends[:3] > lower).all() and (ends[3:] < upper).all():
-            return _Joined(whole, volume)
+            return _Assembly(whole, volume)
     cut = volume_manifold(volume, lower, upper, mesher.tolerance)
-    return _Joined(whole ^ cut, volume)
+    return _Assembly(whole ^ cut, volume)
 
 
 def _bounds(solid: Solid, level: float, volume: Volume | None) -> tuple[FloatArray, FloatArray]:
@@ -710,7 +739,7 @@ def _bounds(solid: Solid, level: float, volume: Volume | None) -> tuple[FloatArr
     lower, upper = np.full(3, -np.inf), np.full(3, np.inf)
     if volume is not None:
         lower, upper = (np.array(end, np.float64) for end in volume.bounds())
-    hull = solid.hull(level)
+    hull = solid.sublevel_extent(level)
     if hull is not None:
         low, high = (np.array(end, np.float64) for end in hull.bounds())
         pad = _MARGIN * float((high - low).max())
@@ -732,9 +761,9 @@ def _point(x: FloatArray) -> tuple[float, float, float]:
     return float(x[0]), float(x[1]), float(x[2])
 
 
-def _on_box(surface: Surface, volume: Volume) -> Surface:
+def _on_box(surface: TriangleMesh, volume: Volume) -> TriangleMesh:
     """Vertices within rounding of a box's faces, put there."""
-    boxes = volume.volumes if isinstance(volume, Intersection) else (volume,)
+    boxes = volume.volumes if isinstance(volume, VolumeIntersection) else (volume,)
     vertices = surface.vertices
     for box in boxes:
         if isinstance(box, Box):
@@ -742,4 +771,4 @@ def _on_box(surface: Surface, volume: Volume) -> Surface:
             for end in box.bounds():
                 near = np.abs(vertices - end) <= 1e-12 * (1 + np.abs(end))
                 vertices = np.where(near, end, vertices)
-    return Surface(vertices, surface.faces)
+    return TriangleMesh(vertices, surface.faces)

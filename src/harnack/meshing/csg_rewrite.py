@@ -13,17 +13,17 @@ from collections.abc import Hashable, Iterable, Sequence
 from typing import TypeAlias
 
 from harnack.fields import Solid
-from harnack.fields.solids.booleans import Combined, Complement, Offset
-from harnack.fields.solids.from_field import Near, Region
-from harnack.fields.solids.transforms import AffineImage
+from harnack.fields.solids.booleans import BooleanSolid, Complement, OffsetSolid
+from harnack.fields.solids.from_field import BandSolid, SublevelSolid
+from harnack.fields.solids.transforms import TransformedSolid
 
-__all__ = ["common_parts_taken_out", "flat", "without_cut_parts"]
+__all__ = ["drop_cancelled_operands", "factor_common_operands", "flatten_csg"]
 
-Factor: TypeAlias = tuple[Solid, float]
+SolidAtLevel: TypeAlias = tuple[Solid, float]
 """A solid's function and a level: the points where it is at most that."""
 
 
-def common_parts_taken_out(union: Combined, level: float) -> Solid | None:
+def factor_common_operands(union: BooleanSolid, level: float) -> Solid | None:
     """The points where a union is at most `level`, as those where another solid is at most 0:
     (A & B) | (A & C) as A & (B | C); None if no two parts have anything in common."""
     terms = [{_key(*one): one for one in _factors(part, level)} for part in union.parts]
@@ -37,74 +37,74 @@ def common_parts_taken_out(union: Combined, level: float) -> Solid | None:
     rests = [[one for key, one in term.items() if key not in shared] for term in sharing]
     if all(rests):
         common.append(_union([_intersection(rest) for rest in rests]))
-    made = Combined(tuple(common), is_union=False)
+    made = BooleanSolid(tuple(common), is_union=False)
     return _union([made, *others]) if others else made
 
 
-def flat(solid: Combined) -> Combined:
+def flatten_csg(solid: BooleanSolid) -> BooleanSolid:
     """With the parts of unions in a union, or of intersections in an intersection, as its own: all
     that is cut away from a part is cut away at once."""
     parts: list[Solid] = []
     for one in solid.parts:
-        if isinstance(one, Combined) and one.is_union == solid.is_union:
-            parts += flat(one).parts
+        if isinstance(one, BooleanSolid) and one.is_union == solid.is_union:
+            parts += flatten_csg(one).parts
         else:
             parts.append(one)
-    return Combined(tuple(parts), solid.is_union)
+    return BooleanSolid(tuple(parts), solid.is_union)
 
 
-def without_cut_parts(solid: Combined, level: float) -> Combined | None:
+def drop_cancelled_operands(solid: BooleanSolid, level: float) -> BooleanSolid | None:
     """(A | C) less C as A less C, of an intersection's own parts: C has nothing but its boundary in
     common with its complement. None if nothing is left; a union as it is."""
     if solid.is_union:
         return solid
-    cut = {_key(one.inner, -level) for one in solid.parts if isinstance(one, Complement)}
+    cut = {_key(one.field, -level) for one in solid.parts if isinstance(one, Complement)}
     parts: list[Solid] = []
     for one in solid.parts:
-        if isinstance(one, Combined) and one.is_union:
-            kept = [part for part in flat(one).parts if _key(part, level) not in cut]
+        if isinstance(one, BooleanSolid) and one.is_union:
+            kept = [part for part in flatten_csg(one).parts if _key(part, level) not in cut]
             if not kept:
                 return None
-            if len(kept) < len(flat(one).parts):
-                one = kept[0] if len(kept) == 1 else Combined(tuple(kept), is_union=True)
+            if len(kept) < len(flatten_csg(one).parts):
+                one = kept[0] if len(kept) == 1 else BooleanSolid(tuple(kept), is_union=True)
         parts.append(one)
-    return Combined(tuple(parts), is_union=False)
+    return BooleanSolid(tuple(parts), is_union=False)
 
 
-def _factors(solid: Solid, level: float) -> list[Factor]:
+def _factors(solid: Solid, level: float) -> list[SolidAtLevel]:
     """Those whose intersection is where a solid is at most a level."""
-    if isinstance(solid, Combined) and not solid.is_union:
+    if isinstance(solid, BooleanSolid) and not solid.is_union:
         return [one for part in solid.parts for one in _factors(part, level)]
-    if isinstance(solid, Offset):
-        return _factors(solid.inner, level + solid.distance)
-    if isinstance(solid, Region) and isinstance(solid.inner, Solid):
-        return _factors(solid.inner, level)
-    if isinstance(solid, AffineImage):
-        factor = solid.map.factor
-        return [_image(one, solid, at) for one, at in _factors(solid.inner, level / factor)]
-    if isinstance(solid, Near) and isinstance(solid.inner, Solid):
+    if isinstance(solid, OffsetSolid):
+        return _factors(solid.field, level + solid.distance)
+    if isinstance(solid, SublevelSolid) and isinstance(solid.field, Solid):
+        return _factors(solid.field, level)
+    if isinstance(solid, TransformedSolid):
+        factor = solid.map.value_factor
+        return [_image(one, solid, at) for one, at in _factors(solid.field, level / factor)]
+    if isinstance(solid, BandSolid) and isinstance(solid.field, Solid):
         half = solid.half_width + level
         if half > 0:
             low, high = solid.level - half, solid.level + half
-            return [*_factors(solid.inner, high), (Complement(solid.inner), -low)]
+            return [*_factors(solid.field, high), (Complement(solid.field), -low)]
     return [(solid, level)]
 
 
-def _image(solid: Solid, of: AffineImage, level: float) -> Factor:
+def _image(solid: Solid, of: TransformedSolid, level: float) -> SolidAtLevel:
     if isinstance(solid, Complement):
-        return Complement(AffineImage(solid.inner, of.map)), level * of.map.factor
-    return AffineImage(solid, of.map), level * of.map.factor
+        return Complement(TransformedSolid(solid.field, of.map)), level * of.map.value_factor
+    return TransformedSolid(solid, of.map), level * of.map.value_factor
 
 
 def _key(solid: Solid, level: float) -> Hashable:
     """Equal of the same points, of the same field."""
     if isinstance(solid, Complement):
-        return "complement", _key(solid.inner, -level)
-    if isinstance(solid, Offset):
-        return _key(solid.inner, level + solid.distance)
-    if isinstance(solid, AffineImage):
-        own = _key(solid.inner, level / solid.map.factor)
-        return own, solid.map.matrix, solid.map.offset
+        return "complement", _key(solid.field, -level)
+    if isinstance(solid, OffsetSolid):
+        return _key(solid.field, level + solid.distance)
+    if isinstance(solid, TransformedSolid):
+        own = _key(solid.field, level / solid.map.value_factor)
+        return own, solid.map.matrix, solid.map.translation_vector
     return id(solid), level
 
 
@@ -113,18 +113,18 @@ def _placed(solid: Solid, level: float) -> Solid:
     if level == 0:
         return solid
     if isinstance(solid, Complement):
-        return Complement(Offset(solid.inner, -level))
-    return Offset(solid, level)
+        return Complement(OffsetSolid(solid.field, -level))
+    return OffsetSolid(solid, level)
 
 
-def _intersection(factors: Iterable[Factor]) -> Solid:
+def _intersection(factors: Iterable[SolidAtLevel]) -> Solid:
     parts = tuple(_placed(*factor) for factor in factors)
-    return parts[0] if len(parts) == 1 else Combined(parts, is_union=False)
+    return parts[0] if len(parts) == 1 else BooleanSolid(parts, is_union=False)
 
 
 def _union(parts: Sequence[Solid]) -> Solid:
     """If there are complements, that of an intersection: what is cut away need not be made of all
     of space."""
     if any(isinstance(one, Complement) for one in parts):
-        return Complement(Combined(tuple(~one for one in parts), is_union=False))
-    return Combined(tuple(parts), is_union=True)
+        return Complement(BooleanSolid(tuple(~one for one in parts), is_union=False))
+    return BooleanSolid(tuple(parts), is_union=True)

@@ -14,44 +14,44 @@ import numpy as np
 
 from harnack.backend import FloatArray
 from harnack.fields.solid_angles.solid_angle import SolidAngle
-from harnack.geometry.polygons import net_loops
+from harnack.geometry.polygons import cancel_opposite_edges
 from harnack.meshing.checks import (
-    LocalError,
+    LocalizedMeshingError,
     MeshingError,
     check_manifold,
     intersecting_faces,
-    turned_faces,
+    misoriented_faces,
 )
 from harnack.meshing.delaunay_points import (
-    Boundary,
-    Places,
-    PointSet,
+    BoundaryCurve,
+    RefinementBalls,
+    TetrahedronPoints,
     box_cells,
-    newton,
-    place_points,
+    newton_to_level,
+    sample_delaunay_points,
 )
 from harnack.meshing.edges import IntArray, boundary_edges, edge_keys
-from harnack.meshing.isotopy import Isotopy, isotopy_of
-from harnack.meshing.lattice_meshing import check_size
+from harnack.meshing.isotopy import IsotopyCoverage, isotopy_of
+from harnack.meshing.lattice_meshing import check_estimated_triangles
 from harnack.meshing.level_function import LevelFunction
 from harnack.meshing.marching_tetrahedra import (
-    Crossings,
+    EdgeCrossings,
     Tetrahedra,
-    crossings_of,
+    count_crossings,
     delaunay,
+    extract_triangles,
     is_cut,
-    triangles_of,
 )
-from harnack.meshing.refinement import improved, refined, smoothed
-from harnack.tree.empty_space import Cells
+from harnack.meshing.refinement import improve, refine, smooth
+from harnack.tree.empty_space import BoxCells
 
-__all__ = ["Spanned", "spanned_surface", "whole_edges"]
+__all__ = ["SpanningMesh", "mesh_spanning_curve", "restore_curve_edges"]
 
 # How far points are moved, at most, as a part of the edges of triangles beside them.
 _SHALLOW = 0.1
 
 
-def whole_edges(
+def restore_curve_edges(
     function: LevelFunction,
     vertices: FloatArray,
     faces: IntArray,
@@ -90,12 +90,12 @@ def whole_edges(
     owner = np.repeat(np.arange(len(chains)), [len(one) - 2 for one in chains])
     ends = np.array([(one[0], one[-1]) for one in chains], np.int64)
     vertices = vertices.copy()
-    vertices[inner] = _moved_in(function, vertices, faces, inner, owner, ends, height)
+    vertices[inner] = _push_inward(function, vertices, faces, inner, owner, ends, height)
     gaps = [face for chain in chains for face in _filling(chain)]
     return vertices, np.concatenate([faces, np.array(gaps, np.int64)])
 
 
-def _moved_in(
+def _push_inward(
     function: LevelFunction,
     vertices: FloatArray,
     faces: IntArray,
@@ -124,7 +124,7 @@ def _moved_in(
     far = 4 * share * (1 - share) * most[owner]
     way = _across(inward[inner], along)
     start = here + far[:, None] * way
-    there = newton(function, start, function.at(start), 0.3 * far, None)
+    there = newton_to_level(function, start, function.sample(start), 0.3 * far, None)
     # Points keep their place along the edge and their distance from it: they are turned about it.
     turned = _across(there - here, along)
     good = (turned * way).sum(axis=1) > 0.3
@@ -164,7 +164,7 @@ _SMALLER = 0.6
 
 
 @dataclass(frozen=True)
-class Spanned:
+class SpanningMesh:
     """Triangles, and how they were found.
 
     vertices: (n, 3). faces: (m, 3). curve: what they end on, cut as it was. spacing: of cells.
@@ -174,16 +174,16 @@ class Spanned:
 
     vertices: FloatArray
     faces: IntArray
-    curve: Boundary
+    curve: BoundaryCurve
     spacing: float
-    finer: tuple[Places, ...]
-    crossings: Crossings
-    isotopy: Isotopy
+    finer: tuple[RefinementBalls, ...]
+    crossings: EdgeCrossings
+    isotopy: IsotopyCoverage
     turned: int = 0
 
 
 @dataclass(frozen=True)
-class _Task:
+class _SpanningInput:
     """What is to be filled, with what.
 
     lower, upper: (3,) the box.
@@ -198,7 +198,7 @@ class _Task:
     report: Callable[[str], None]
 
 
-def spanned_surface(
+def mesh_spanning_curve(
     function: LevelFunction,
     spacing: float,
     attempts: int,
@@ -207,7 +207,7 @@ def spanned_surface(
     seed: int,
     tolerance: float,
     report: Callable[[str], None],
-) -> Spanned:
+) -> SpanningMesh:
     """Triangles within the tolerance, none of which pass through others; where some do, or are
     turned over, cells are made smaller and all is done again.
 
@@ -217,22 +217,22 @@ def spanned_surface(
     Raises:
         MeshingError: it could not be done.
     """
-    task = _Task(function, *box, box if has_walls else None, seed, report)
+    task = _SpanningInput(function, *box, box if has_walls else None, seed, report)
     walls = task.walls
-    finer: tuple[Places, ...] = ()
-    best: Spanned | None = None
+    finer: tuple[RefinementBalls, ...] = ()
+    best: SpanningMesh | None = None
     crossing = np.zeros(0, np.int64)
     for attempt in range(_MOST_ATTEMPTS):
         first = _first_surface(task, spacing, attempts, finer)
         spacing, finer = first.spacing, first.finer
         faces = first.faces
-        check_size(function, first.vertices, faces, tolerance)
-        vertices = smoothed(function, first.vertices, faces, walls)
-        vertices, faces = refined(function, vertices, faces, tolerance, walls, report)
-        vertices, faces = improved(function, vertices, faces, tolerance, walls, report)
-        turned = turned_faces(function, vertices, faces)
+        check_estimated_triangles(function, first.vertices, faces, tolerance)
+        vertices = smooth(function, first.vertices, faces, walls)
+        vertices, faces = refine(function, vertices, faces, tolerance, walls, report)
+        vertices, faces = improve(function, vertices, faces, tolerance, walls, report)
+        turned = misoriented_faces(function, vertices, faces)
         kept = sum(map(len, _loops(function)))
-        vertices, faces = whole_edges(
+        vertices, faces = restore_curve_edges(
             function, vertices, faces, kept, len(first.curve.points), tolerance
         )
         check_manifold(faces)
@@ -244,23 +244,23 @@ def spanned_surface(
             break
         if attempt < _MOST_ATTEMPTS - 1:
             report(f"{len(bad)} triangles fail: smaller cells there")
-            finer = (*finer, Places(vertices[faces[bad]].mean(axis=1), spacing))
+            finer = (*finer, RefinementBalls(vertices[faces[bad]].mean(axis=1), spacing))
     if best is None:
         raise MeshingError(
             f"{len(crossing)} triangles pass through others, in cells as small as "
-            f"{spacing / 2 ** len(finer):.3g}: choose a smaller `tolerance` or `spacing`"
+            f"{spacing / 2 ** len(finer):.3g}: choose a smaller `tolerance` or `cell_size`"
         )
     return best
 
 
 def _loops(function: LevelFunction) -> tuple[FloatArray, ...]:
     assert isinstance(function.field, SolidAngle)
-    return net_loops(function.field.loops)
+    return cancel_opposite_edges(function.field.loops)
 
 
 def _first_surface(
-    task: _Task, spacing: float, attempts: int, finer: tuple[Places, ...]
-) -> Spanned:
+    task: _SpanningInput, spacing: float, attempts: int, finer: tuple[RefinementBalls, ...]
+) -> SpanningMesh:
     """Triangles in cells of that spacing, smaller where they have to be; or where that fails, in
     smaller ones everywhere."""
     task.report(f"cells of {spacing:.3g}")
@@ -269,9 +269,9 @@ def _first_surface(
         for trial in range(_MOST_LOCAL):
             try:
                 return _in_cells(task, spacing, local)
-            except LocalError as error:
-                task.report(f"{len(error.places)} places fail: smaller cells there")
-                local = (*local, Places(error.places, spacing * 0.5**trial))
+            except LocalizedMeshingError as error:
+                task.report(f"{len(error.locations)} places fail: smaller cells there")
+                local = (*local, RefinementBalls(error.locations, spacing * 0.5**trial))
         return _in_cells(task, spacing, local)
     except MeshingError:
         if attempts == 1:
@@ -279,49 +279,54 @@ def _first_surface(
     return _first_surface(task, _SMALLER * spacing, attempts - 1, finer)
 
 
-def _in_cells(task: _Task, spacing: float, finer: tuple[Places, ...]) -> Spanned:
+def _in_cells(
+    task: _SpanningInput, spacing: float, finer: tuple[RefinementBalls, ...]
+) -> SpanningMesh:
     """Triangles in cells of that spacing, split in some places, with what is proved of them.
 
     Raises:
         MeshingError: checks that fail, or edges of the curve that are in no tetrahedron.
     """
     function, walls = task.function, task.walls
-    curve = Boundary.of(_loops(function), _LONGEST * spacing)
+    curve = BoundaryCurve.of(_loops(function), _LONGEST * spacing)
     for k, places in enumerate(finer):  # balls on long edges leave no room for points
         curve = curve.split_near(places, spacing * 0.5**k)
     margin = 0.5 * spacing if walls is None else 0.0
     root = box_cells(task.lower - margin, task.upper + margin, spacing, exact=walls is not None)
-    curve, points, tets = _filled(task, root, curve, finer)
+    curve, points, tets = _tetrahedralize(task, root, curve, finer)
     task.report(f"{len(points.points):,} points, {len(tets.corners):,} tetrahedra")
-    crossings = crossings_of(function, points, tets)
-    vertices, faces = triangles_of(function, points, tets, crossings)
+    crossings = count_crossings(function, points, tets)
+    vertices, faces = extract_triangles(function, points, tets, crossings)
     if not len(faces):
         raise MeshingError("the level set is empty: no cell of the box holds the level")
     check_manifold(faces, vertices)
     _check_boundary(vertices, faces, curve, walls)
     cut = is_cut(points, tets, crossings)
     isotopy = isotopy_of(function, points, tets.corners, cut, faces, curve, spacing, walls)
-    return Spanned(vertices, faces, curve, spacing, finer, crossings, isotopy)
+    return SpanningMesh(vertices, faces, curve, spacing, finer, crossings, isotopy)
 
 
-def _filled(
-    task: _Task, root: tuple[Cells, int], curve: Boundary, finer: tuple[Places, ...]
-) -> tuple[Boundary, PointSet, Tetrahedra]:
+def _tetrahedralize(
+    task: _SpanningInput,
+    root: tuple[BoxCells, int],
+    curve: BoundaryCurve,
+    finer: tuple[RefinementBalls, ...],
+) -> tuple[BoundaryCurve, TetrahedronPoints, Tetrahedra]:
     """Tetrahedra that have all edges of the curve, which is cut where others are too near."""
     for _ in range(_MOST_CUTS):
-        points = place_points(task.function, root, curve, task.walls, task.seed, finer)
+        points = sample_delaunay_points(task.function, root, curve, task.walls, task.seed, finer)
         tets = delaunay(points.points)
         has_edge = tets.has_edges(curve.edges)
         if has_edge.all():
             return curve, points, tets
         curve = curve.split(~has_edge)
-    raise MeshingError("edges of the curve are too near to others: choose a smaller `spacing`")
+    raise MeshingError("edges of the curve are too near to others: choose a smaller `cell_size`")
 
 
 def _check_boundary(
     vertices: FloatArray,
     faces: IntArray,
-    curve: Boundary,
+    curve: BoundaryCurve,
     walls: tuple[FloatArray, FloatArray] | None,
 ) -> None:
     edges = boundary_edges(faces)
@@ -334,8 +339,8 @@ def _check_boundary(
     wrong = np.setxor1d(edge_keys(edges, count), edge_keys(curve.edges, count))
     if len(wrong):
         ends = np.stack(np.divmod(wrong, count), axis=1)
-        raise LocalError(
+        raise LocalizedMeshingError(
             "the mesh does not end at the curve: cells are too large for it; choose a smaller "
-            "`spacing`",
+            "`cell_size`",
             vertices[ends].mean(axis=1),
         )

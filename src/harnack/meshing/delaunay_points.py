@@ -15,16 +15,22 @@ from typing import Any
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
-from harnack.meshing.edges import IntArray, dots, lengths
-from harnack.meshing.level_function import LevelFunction, Samples
-from harnack.tree.empty_space import Cells, Octree, octree
+from harnack.meshing.edges import IntArray, row_dots, row_norms
+from harnack.meshing.level_function import LevelFunction, LevelSamples
+from harnack.tree.empty_space import BoxCells, RefinedCells, refine_cells
 
-__all__ = ["Boundary", "Places", "PointSet", "box_cells", "place_points"]
+__all__ = [
+    "BoundaryCurve",
+    "RefinementBalls",
+    "TetrahedronPoints",
+    "box_cells",
+    "sample_delaunay_points",
+]
 
 # All in parts of the size of a cell, by experiment.
 _JITTER = 1e-3  # no five points on a sphere
 _SNAPPED = 0.3  # points this near to the level are moved onto it
-_FREE = 0.45  # no other points are so near to the curve
+_MIN_CURVE_DISTANCE = 0.45  # no other points are so near to the curve
 _MOST_CELLS = 4_000_000
 # A step of Newton's method that is shorter is the last: a part of the longest one.
 _CONVERGED = 1e-9
@@ -34,7 +40,7 @@ _CORNERS = np.array(list(itertools.product((0.0, 1.0), repeat=3)))
 
 
 @dataclass(frozen=True)
-class Places:
+class RefinementBalls:
     """Balls about points (n, 3) in which cells are split once more. radius: of all."""
 
     points: FloatArray
@@ -52,7 +58,7 @@ class Places:
 
 
 @dataclass(frozen=True)
-class Boundary:
+class BoundaryCurve:
     """The curve that a level set ends on.
 
     points: (n, 3). edges: (n, 2) indices of points, in the direction in which the curve is run.
@@ -62,7 +68,7 @@ class Boundary:
     edges: IntArray
 
     @classmethod
-    def of(cls, loops: tuple[FloatArray, ...], longest: float) -> Boundary:
+    def of(cls, loops: tuple[FloatArray, ...], longest: float) -> BoundaryCurve:
         """Closed loops, their vertices first and in their order; edges longer than `longest` are
         cut into equal parts."""
         points = [*loops]
@@ -81,20 +87,20 @@ class Boundary:
         pairs = np.array(edges, np.int64).reshape(-1, 2)
         return cls(np.concatenate([*points, *more, np.zeros((0, 3))]), pairs)
 
-    def split(self, which: BoolArray) -> Boundary:
+    def split(self, which: BoolArray) -> BoundaryCurve:
         """With the middles of some edges (k,) as additional points."""
         a, b = self.edges[which].T
         middle = len(self.points) + np.arange(len(a))
         points = np.concatenate([self.points, 0.5 * (self.points[a] + self.points[b])])
         halves = np.concatenate([np.stack([a, middle], axis=1), np.stack([middle, b], axis=1)])
-        return Boundary(points, np.concatenate([self.edges[~which], halves]))
+        return BoundaryCurve(points, np.concatenate([self.edges[~which], halves]))
 
-    def split_near(self, places: Places, longest: float) -> Boundary:
+    def split_near(self, places: RefinementBalls, longest: float) -> BoundaryCurve:
         """With edges in some places cut until they are no longer than `longest`."""
         curve = self
         while True:
             ends = curve.points[curve.edges]
-            half = 0.5 * lengths(ends[:, 1] - ends[:, 0])
+            half = 0.5 * row_norms(ends[:, 1] - ends[:, 0])
             which = (2 * half > longest) & places.meet(ends.mean(axis=1), half)
             if not which.any():
                 return curve
@@ -102,19 +108,19 @@ class Boundary:
 
 
 @dataclass(frozen=True)
-class PointSet:
+class TetrahedronPoints:
     """points: (n, 3), those of the boundary first. is_on: (n,) on the level, the boundary too.
     samples: at all points; those of the boundary are 0."""
 
     points: FloatArray
-    is_on: BoolArray
-    samples: Samples
+    is_on_level: BoolArray
+    samples: LevelSamples
 
 
 def box_cells(
     lower: FloatArray, upper: FloatArray, spacing: float, exact: bool
-) -> tuple[Cells, int]:
-    """Cells that fill a box, and how often they are to be split to be no larger than `spacing`.
+) -> tuple[BoxCells, int]:
+    """Cells that fill a box, and how often they are to be split to be no larger than `cell_size`.
 
     exact: the box itself is filled; else one that may be larger, by cubes.
     """
@@ -131,17 +137,17 @@ def box_cells(
         lower, edges = 0.5 * (lower + upper - counts * edge), np.full(3, edge)
         finest = round(math.log2(edge / spacing))
     grid = np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), axis=-1).reshape(-1, 3)
-    return Cells(lower + grid * edges, edges), finest
+    return BoxCells(lower + grid * edges, edges), finest
 
 
-def place_points(
+def sample_delaunay_points(
     function: LevelFunction,
-    root: tuple[Cells, int],
-    boundary: Boundary,
+    root: tuple[BoxCells, int],
+    boundary: BoundaryCurve,
     walls: tuple[FloatArray, FloatArray] | None,
     seed: int,
-    finer: tuple[Places, ...] = (),
-) -> PointSet:
+    finer: tuple[RefinementBalls, ...] = (),
+) -> TetrahedronPoints:
     """Points for the tetrahedra: see the module's docstring.
 
     walls: a box whose faces points on them do not leave. finer: where leaves of the octree are
@@ -149,48 +155,52 @@ def place_points(
 
     Raises MemoryError for more than four million cells.
     """
-    tree = octree(root[0], function.clearance, _MOST_CELLS, root[1])
-    points, size = _corners_and_centers(tree, _finer_cells(function, tree.leaves, finer))
-    free = _FREE * np.minimum(size, 2 * float(tree.leaves.size.max()))
+    tree = refine_cells(root[0], function.clearance, _MOST_CELLS, root[1])
+    points, size = _corners_and_centers(tree, _finer_cells(function, tree.occupied, finer))
+    free = _MIN_CURVE_DISTANCE * np.minimum(size, 2 * float(tree.occupied.size.max()))
     is_far = _is_far(points, free, boundary)
     points, size = points[is_far], size[is_far]
     rng = np.random.default_rng(seed)
     jitter = rng.uniform(-1, 1, points.shape) * _JITTER * size[:, None]
     points = points + (jitter if walls is None else jitter * _off_walls(points, walls))
-    samples = function.at(points)
+    samples = function.sample(points)
     points, samples, is_on = _snapped(
         function, points, size, free[is_far], samples, boundary, walls
     )
     n = len(boundary.points)
-    zeros = Samples(np.zeros(n), np.zeros((n, 3)), np.zeros(n))
+    zeros = LevelSamples(np.zeros(n), np.zeros((n, 3)), np.zeros(n))
     together = [
         np.concatenate([getattr(one, name) for one in (zeros, samples)])
-        for name in ("value", "gradient", "reach")
+        for name in ("value", "gradient", "quarter_period_radius")
     ]
-    return PointSet(
+    return TetrahedronPoints(
         np.concatenate([boundary.points, points]),
         np.concatenate([np.ones(n, np.bool_), is_on]),
-        Samples(*together),
+        LevelSamples(*together),
     )
 
 
-def _finer_cells(function: LevelFunction, leaves: Cells, finer: tuple[Places, ...]) -> list[Cells]:
+def _finer_cells(
+    function: LevelFunction, leaves: BoxCells, finer: tuple[RefinementBalls, ...]
+) -> list[BoxCells]:
     """Cells that leaves are split into, smallest first; those proved empty are left out."""
     pool = [leaves]
     for places in finer:
-        split: list[Cells] = []
+        split: list[BoxCells] = []
         for cells in pool:
-            halves = cells.some(places.meet(cells.centers, cells.half_diagonal)).split()
-            split.append(halves.some(~halves.proved_empty(function.clearance)))
+            halves = cells.subset(places.meet(cells.centers, cells.half_diagonal)).octants()
+            split.append(halves.subset(~halves.is_proved_empty(function.clearance)))
         pool += split
     found = [cells for cells in pool[1:] if len(cells.corners)]
     return sorted(found, key=lambda cells: float(cells.size.max()))
 
 
-def _corners_and_centers(tree: Octree, finer: list[Cells]) -> tuple[FloatArray, FloatArray]:
+def _corners_and_centers(
+    tree: RefinedCells, finer: list[BoxCells]
+) -> tuple[FloatArray, FloatArray]:
     """Points (n, 3), each once: corners of all cells, and centers of leaves and of `finer` ones;
     and the size (n,) of the smallest cell at each."""
-    leaves = [*finer, tree.leaves]
+    leaves = [*finer, tree.occupied]
     points = [cells.centers for cells in leaves]
     sizes = [np.full(len(cells.corners), float(cells.size.max())) for cells in leaves]
     for some in [*leaves, *reversed(tree.empty)]:
@@ -207,7 +217,7 @@ def _corners_and_centers(tree: Octree, finer: list[Cells]) -> tuple[FloatArray, 
     return x[first], size[first]
 
 
-def _is_far(points: FloatArray, free: FloatArray, boundary: Boundary) -> BoolArray:
+def _is_far(points: FloatArray, free: FloatArray, boundary: BoundaryCurve) -> BoolArray:
     """Whether points are farther from the curve than `free` (n,), and out of the balls on its edges
     as diameters."""
     if not len(boundary.edges):
@@ -216,7 +226,7 @@ def _is_far(points: FloatArray, free: FloatArray, boundary: Boundary) -> BoolArr
 
     searching: Any = scipy.spatial
     a, b = (boundary.points[boundary.edges[:, k]] for k in (0, 1))
-    middle, half = 0.5 * (a + b), 0.5 * lengths(b - a)
+    middle, half = 0.5 * (a + b), 0.5 * row_norms(b - a)
     near = np.full(len(points), np.inf)
     is_far = np.ones(len(points), np.bool_)
     # Curves may have edges of any lengths: those of one size at a time.
@@ -247,28 +257,28 @@ def _snapped(
     points: FloatArray,
     size: FloatArray,
     free: FloatArray,
-    samples: Samples,
-    boundary: Boundary,
+    samples: LevelSamples,
+    boundary: BoundaryCurve,
     walls: tuple[FloatArray, FloatArray] | None,
-) -> tuple[FloatArray, Samples, BoolArray]:
+) -> tuple[FloatArray, LevelSamples, BoolArray]:
     """Points, with those near the level moved onto it, their samples, and which are on it."""
     near = np.flatnonzero(samples.distance < _SNAPPED * size)
-    moved = newton(function, points[near], samples.some(near), 0.25 * size[near], walls)
-    there = function.at(moved)
-    apart = lengths(moved - points[near])
-    steep = lengths(there.gradient)
+    moved = newton_to_level(function, points[near], samples.select(near), 0.25 * size[near], walls)
+    there = function.sample(moved)
+    apart = row_norms(moved - points[near])
+    steep = row_norms(there.gradient)
     good = np.abs(there.value) < 1e-9 * np.maximum(steep * size[near], 1e-300)
     good &= (apart < 1.5 * _SNAPPED * size[near]) & _is_far(moved, free[near], boundary)
     rows = near[good]
     points, is_on = points.copy(), np.zeros(len(points), np.bool_)
     points[rows], is_on[rows] = moved[good], True
-    return points, samples.replaced(rows, there.some(good)), is_on
+    return points, samples.replaced(rows, there.select(good)), is_on
 
 
-def newton(
+def newton_to_level(
     function: LevelFunction,
     points: FloatArray,
-    samples: Samples,
+    samples: LevelSamples,
     longest: FloatArray,
     walls: tuple[FloatArray, FloatArray] | None,
     steps: int = 5,
@@ -281,10 +291,10 @@ def newton(
     for k in range(steps):
         here = x[rows]
         g = samples.gradient if walls is None else samples.gradient * _off_walls(here, walls)
-        square = dots(g, g)
+        square = row_dots(g, g)
         with np.errstate(invalid="ignore", over="ignore"):
             move = -(samples.value / np.maximum(square, 1e-300))[:, None] * g
-            length = lengths(move)
+            length = row_norms(move)
         lost = ~np.isfinite(length)
         move[lost], length[lost] = 0.0, 0.0
         there = here + move * np.minimum(1, longest[rows] / np.maximum(length, 1e-300))[:, None]
@@ -292,20 +302,22 @@ def newton(
         rows = rows[length > _CONVERGED * longest[rows]]
         if k == steps - 1 or not len(rows):
             break
-        samples = function.at(x[rows])
+        samples = function.sample(x[rows])
     return x
 
 
 def to_multiple_roots(
-    function: LevelFunction, points: FloatArray, samples: Samples, longest: FloatArray
+    function: LevelFunction, points: FloatArray, samples: LevelSamples, longest: FloatArray
 ) -> FloatArray:
     """Points (n, 3) after steps towards the level as long as it takes where f - level is a power
     u^m, to which Newton's shrink by 1 - 1/m only: to where a geometric series of two ends."""
     x = points
     for k in range(_SERIES):
-        first = newton(function, x, samples if k == 0 else function.at(x), longest, None, steps=1)
-        second = newton(function, first, function.at(first), longest, None, steps=1)
-        before, after = lengths(first - x), lengths(second - first)
+        first = newton_to_level(
+            function, x, samples if k == 0 else function.sample(x), longest, None, steps=1
+        )
+        second = newton_to_level(function, first, function.sample(first), longest, None, steps=1)
+        before, after = row_norms(first - x), row_norms(second - first)
         ratio = after / np.maximum(before, 1e-300)
         is_slow = (ratio > _RATES[0]) & (ratio < _RATES[1])
         factor = np.where(is_slow, 1 / (1 - np.minimum(ratio, _RATES[1])), 1.0)

@@ -1,7 +1,7 @@
 """Edges of triangles and tetrahedra, each once, by integer keys; products and lengths of rows,
 and normals of triangles.
 
-`dots` and `lengths` are here as numpy's own sums along an axis of three are slow.
+`row_dots` and `row_norms` are here as numpy's own sums along an axis of three are slow.
 """
 
 from __future__ import annotations
@@ -16,33 +16,33 @@ from harnack.backend import FloatArray
 __all__ = [
     "Edges",
     "IntArray",
+    "area_normals",
     "boundary_edges",
-    "crosses",
-    "directed_edges",
     "distance_from_triangles",
     "distances_from_triangles",
-    "distinct",
-    "dots",
     "edge_keys",
-    "lengths",
-    "numbered",
+    "half_edges",
+    "row_dots",
+    "row_norms",
+    "sorted_unique",
+    "unique_with_inverse",
 ]
 
 
-def dots(a: FloatArray, b: FloatArray) -> FloatArray:
+def row_dots(a: FloatArray, b: FloatArray) -> FloatArray:
     """(n,) of rows (n, 3), in a third of the time of (a * b).sum(axis=1)."""
     return np.einsum("ij,ij->i", a, b)
 
 
-def crosses(corners: FloatArray) -> FloatArray:
+def area_normals(corners: FloatArray) -> FloatArray:
     """(m, 3) normals of triangles (m, 3, 3) by the right-hand rule, twice as long as their
     areas."""
     return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 
-def lengths(vectors: FloatArray) -> FloatArray:
+def row_norms(vectors: FloatArray) -> FloatArray:
     """(n,) of rows (n, 3), in a third of the time of np.linalg.norm(vectors, axis=1)."""
-    return np.sqrt(dots(vectors, vectors))
+    return np.sqrt(row_dots(vectors, vectors))
 
 
 IntArray = npt.NDArray[np.int64]
@@ -59,18 +59,18 @@ def distances_from_triangles(points: FloatArray, corner: FloatArray) -> FloatArr
     least = np.full(len(corner), np.inf)
     for k in range(3):
         start, way = corner[:, k], corner[:, k - 1] - corner[:, k]
-        share = dots(points - start, way) / np.maximum(dots(way, way), 1e-300)
+        share = row_dots(points - start, way) / np.maximum(row_dots(way, way), 1e-300)
         foot = start + np.clip(share, 0, 1)[:, None] * way
-        least = np.minimum(least, lengths(points - foot))
-    normal = crosses(corner)
-    size = lengths(normal)
+        least = np.minimum(least, row_norms(points - foot))
+    normal = area_normals(corner)
+    size = row_norms(normal)
     is_within = size > 0  # what has no area has edges alone
     size = np.maximum(size, 1e-300)
-    height = dots(points - corner[:, 0], normal) / size
+    height = row_dots(points - corner[:, 0], normal) / size
     foot = points - (height / size)[:, None] * normal
     for k in range(3):
         side = np.cross(corner[:, (k + 1) % 3] - corner[:, k], foot - corner[:, k])
-        is_within &= dots(side, normal) >= 0
+        is_within &= row_dots(side, normal) >= 0
     return np.where(is_within, np.minimum(least, np.abs(height)), least)
 
 
@@ -79,21 +79,23 @@ class Edges:
     """ends: (k, 2) of all edges, the lower index first, in order. index: (n,) which edge each of
     the pairs given is. uses: (k,) how many of them each is. order: (n,) the pairs, edge by edge."""
 
-    ends: IntArray
-    index: IntArray
-    uses: IntArray
-    order: IntArray
+    vertices: IntArray
+    edge_of_pair: IntArray
+    multiplicity: IntArray
+    pairs_by_edge: IntArray
 
     @classmethod
     def of(cls, pairs: IntArray) -> Edges:
         """The edges that pairs (n, 2) of points are, in either order."""
         count = int(pairs.max(initial=-1)) + 1
-        keys, index, uses, order = numbered(edge_keys(pairs, count))
+        keys, index, uses, order = unique_with_inverse(edge_keys(pairs, count))
         return cls(np.stack(np.divmod(keys, max(count, 1)), axis=1), index, uses, order)
 
-    def twice(self) -> IntArray:
+    def paired_half_edges(self) -> IntArray:
         """(j, 2) the two of the pairs given that each edge is that is exactly two of them."""
-        return self.order[np.repeat(self.uses == 2, self.uses)].reshape(-1, 2)
+        return self.pairs_by_edge[np.repeat(self.multiplicity == 2, self.multiplicity)].reshape(
+            -1, 2
+        )
 
 
 def edge_keys(pairs: IntArray, count: int) -> IntArray:
@@ -102,7 +104,7 @@ def edge_keys(pairs: IntArray, count: int) -> IntArray:
     return np.minimum(one, other) * count + np.maximum(one, other)
 
 
-def directed_edges(faces: IntArray) -> IntArray:
+def half_edges(faces: IntArray) -> IntArray:
     """(3m, 2): the edges of faces (m, 3), in their direction: all first ones (corners 0 and 1),
     then all second and all third ones."""
     return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
@@ -110,18 +112,18 @@ def directed_edges(faces: IntArray) -> IntArray:
 
 def boundary_edges(faces: IntArray) -> IntArray:
     """(k, 2): edges of one face only, in its direction."""
-    pairs = directed_edges(faces)
+    pairs = half_edges(faces)
     edges = Edges.of(pairs)
-    return pairs[edges.uses[edges.index] == 1]
+    return pairs[edges.multiplicity[edges.edge_of_pair] == 1]
 
 
-def distinct(keys: IntArray) -> IntArray:
+def sorted_unique(keys: IntArray) -> IntArray:
     """The numbers (n,), each once and in order: several times as fast as `np.unique`."""
     keys = np.sort(keys)
     return keys[np.flatnonzero(np.diff(keys, prepend=keys[:1] - 1))]
 
 
-def numbered(keys: IntArray) -> tuple[IntArray, IntArray, IntArray, IntArray]:
+def unique_with_inverse(keys: IntArray) -> tuple[IntArray, IntArray, IntArray, IntArray]:
     """Numbers (n,) that are not negative, each once and in order (k,), for each given one its place
     among them (n,), how often each was given (k,), and the order of those given (n,): `np.unique`,
     at a third of its time."""

@@ -8,30 +8,30 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from harnack.backend import FloatArray
-from harnack.backend.validation import real, whole
+from harnack.backend.validation import as_integer_in_range, as_real
 from harnack.meshing.checks import MeshingError, euler_characteristic, intersecting_faces
-from harnack.meshing.closed_mesh import manifold_of, surface_of, without_short_edges
+from harnack.meshing.closed_mesh import from_manifold, to_manifold, without_short_edges
 from harnack.meshing.edges import (
     Edges,
     IntArray,
+    area_normals,
     boundary_edges,
-    crosses,
-    directed_edges,
-    distinct,
-    dots,
     edge_keys,
-    lengths,
+    half_edges,
+    row_dots,
+    row_norms,
+    sorted_unique,
 )
-from harnack.meshing.lattice_meshing import Surface
+from harnack.meshing.lattice_meshing import TriangleMesh
 from harnack.meshing.level_function import LevelFunction
-from harnack.meshing.self_intersection_repair import made_apart
+from harnack.meshing.self_intersection_repair import resolve_self_intersections
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     import trimesh
 
-__all__ = ["check_options", "finished", "normals_of", "simplified", "thickened"]
+__all__ = ["check_options", "simplify_mesh", "thicken", "to_trimesh", "vertex_normals"]
 
 # This part of the area may turn over where the two sides are made: slivers.
 _TURNED = 1e-2
@@ -41,9 +41,9 @@ _MOST_HULLS = 20_000
 _NEAR = 0.98
 
 
-def thickened(
-    surface: Surface, normals: FloatArray, thickness: float, tolerance: float
-) -> tuple[Surface, dict[str, Any]]:
+def thicken(
+    surface: TriangleMesh, normals: FloatArray, thickness: float, tolerance: float
+) -> tuple[TriangleMesh, dict[str, Any]]:
     """A closed part of a given thickness around a surface, and how it was made: `thickened_by` is
     "offset" or "hulls of balls".
 
@@ -61,9 +61,9 @@ def thickened(
     Raises:
         MeshingError: the part is far thicker than triangles are large, of which there are too many.
     """
-    area = 0.5 * float(np.linalg.norm(crosses(surface.vertices[surface.faces]), axis=1).sum())
+    area = 0.5 * float(np.linalg.norm(area_normals(surface.vertices[surface.faces]), axis=1).sum())
     facts: dict[str, Any] = {"thickness": thickness, "area": area}
-    why = _beyond_reach(surface, normals, thickness)
+    why = _reason_beyond_reach(surface, normals, thickness)
     if why is None:
         part = _offset(surface, normals, thickness)
         crossing = intersecting_faces(part.vertices, part.faces)
@@ -75,21 +75,23 @@ def thickened(
     }  # fmt: skip
 
 
-def _offset(surface: Surface, normals: FloatArray, thickness: float) -> Surface:
+def _offset(surface: TriangleMesh, normals: FloatArray, thickness: float) -> TriangleMesh:
     """Both sides, and walls along the boundary."""
     n = len(surface.vertices)
-    move = 0.5 * thickness * normals / _slants(surface, normals)[:, None]
+    move = 0.5 * thickness * normals / _normal_cosines(surface, normals)[:, None]
     a, b = boundary_edges(surface.faces).T
     # A face of the upper side runs the boundary edge from a to b, so the wall runs it from b to a.
     walls = [np.stack([b, a, a + n], axis=1), np.stack([b, a + n, b + n], axis=1)]
     vertices = np.concatenate([surface.vertices + move, surface.vertices - move])
-    return Surface(vertices, np.concatenate([surface.faces, surface.faces[:, ::-1] + n, *walls]))
+    return TriangleMesh(
+        vertices, np.concatenate([surface.faces, surface.faces[:, ::-1] + n, *walls])
+    )
 
 
-def _slants(surface: Surface, normals: FloatArray) -> FloatArray:
+def _normal_cosines(surface: TriangleMesh, normals: FloatArray) -> FloatArray:
     """(n,) cosines between normals at vertices and those of the faces there, means by area:
     vertices are moved farther by that, so that faces are moved by the thickness."""
-    cross = crosses(surface.vertices[surface.faces])
+    cross = area_normals(surface.vertices[surface.faces])
     total, area = np.zeros(len(normals)), np.zeros(len(normals))
     size = np.linalg.norm(cross, axis=1)
     for k in range(3):
@@ -99,35 +101,37 @@ def _slants(surface: Surface, normals: FloatArray) -> FloatArray:
     return np.clip(total / np.maximum(area, 1e-300), 0.7, 1.0)
 
 
-def _beyond_reach(surface: Surface, normals: FloatArray, thickness: float) -> str | None:
+def _reason_beyond_reach(
+    surface: TriangleMesh, normals: FloatArray, thickness: float
+) -> str | None:
     """Why half of the thickness is more than the surface's reach; None if nothing shows that."""
     import scipy.spatial  # here: half a second that few need
 
     searching: Any = scipy.spatial
     half = 0.5 * thickness
-    flat = crosses(surface.vertices[surface.faces])
+    flat = area_normals(surface.vertices[surface.faces])
     areas = np.linalg.norm(flat, axis=1)
     tree = searching.cKDTree(surface.vertices)
     own = np.arange(len(surface.vertices))
     few = min(16, len(own))
-    neighbors = distinct(edge_keys(directed_edges(surface.faces), len(own)))
+    neighbors = sorted_unique(edge_keys(half_edges(surface.faces), len(own)))
     for sign in (1, -1):
         side = surface.vertices + sign * half * normals
-        turned = (crosses(side[surface.faces]) * flat).sum(axis=1) <= 0
+        turned = (area_normals(side[surface.faces]) * flat).sum(axis=1) <= 0
         if areas[turned].sum() > _TURNED * areas.sum():  # less are slivers
             return f"{turned.sum()} triangles turn over: the surface bends more than 1/{half:.3g}"
         # Nearer than the vertex that a point was moved from are at most its neighbors.
         away, other = tree.query(side, k=few)
         pairs = np.stack([np.broadcast_to(own[:, None], other.shape), other], axis=-1)
         near = (away < _NEAR * half) & (pairs[..., 0] != pairs[..., 1])
-        found = distinct(edge_keys(pairs[near], len(own)))
+        found = sorted_unique(edge_keys(pairs[near], len(own)))
         count = int((~np.isin(found, neighbors)).sum())
         if count:
             return f"{count} points of a side are nearer to another place than to their own"
     return None
 
 
-def _hulls(surface: Surface, radius: float, tolerance: float, why: str) -> Surface:
+def _hulls(surface: TriangleMesh, radius: float, tolerance: float, why: str) -> TriangleMesh:
     """The union of the hulls of three balls around the corners of each triangle.
 
     Balls are polyhedra with corners on the sphere, so that the part is inside of what it should be,
@@ -149,7 +153,7 @@ def _hulls(surface: Surface, radius: float, tolerance: float, why: str) -> Surfa
         Manifold.hull_points(np.ascontiguousarray((corners[:, None] + ball).reshape(-1, 3)))
         for corners in surface.vertices[surface.faces]
     ]
-    return surface_of(Manifold.batch_boolean(parts, OpType.Add))
+    return from_manifold(Manifold.batch_boolean(parts, OpType.Add))
 
 
 # Simplification and metadata.
@@ -162,27 +166,27 @@ _SIMPLER, _MENDED = (0.4, 0.2, 0.1), 0.05
 
 def check_options(tolerance: Any, spacing: Any, thickness: Any, seed: Any, most: Any) -> None:
     """Raise ValueError or TypeError for numbers out of range."""
-    if not 0 < real(tolerance, "tolerance") < 0.5:
+    if not 0 < as_real(tolerance, "tolerance") < 0.5:
         raise ValueError(
             f"tolerance is a part of the size: it must lie in (0, 0.5), not {tolerance}"
         )
     for name, value in (("spacing", spacing), ("thickness", thickness)):
-        if value is not None and not 0 < real(value, name) < math.inf:
+        if value is not None and not 0 < as_real(value, name) < math.inf:
             raise ValueError(f"{name} must be a positive length, not {value!r}")
-    whole(seed, "seed", 0, 2**63 - 1)
-    whole(most, "max_triangles", 1, 2**63 - 1)
+    as_integer_in_range(seed, "seed", 0, 2**63 - 1)
+    as_integer_in_range(most, "max_triangles", 1, 2**63 - 1)
 
 
-def normals_of(function: LevelFunction, surface: Surface) -> FloatArray:
+def vertex_normals(function: LevelFunction, surface: TriangleMesh) -> FloatArray:
     """Unit normals (n, 3) at vertices: along the gradient of the field, and where it has none, as
     at the curve that a surface ends on, the mean of the faces there by area."""
     corner = surface.vertices[surface.faces]
-    normal = crosses(corner)
+    normal = area_normals(corner)
     mean = np.zeros_like(surface.vertices)
     for k in range(3):
         np.add.at(mean, surface.faces[:, k], normal)
     mean /= np.maximum(np.linalg.norm(mean, axis=1), 1e-300)[:, None]
-    slope = function.at(surface.vertices).gradient
+    slope = function.sample(surface.vertices).gradient
     steep: FloatArray = np.linalg.norm(slope, axis=1)
     slope = slope / np.maximum(steep, 1e-300)[:, None]
     # Beside the curve slopes turn within a triangle.
@@ -193,9 +197,9 @@ def normals_of(function: LevelFunction, surface: Surface) -> FloatArray:
     return chosen
 
 
-def simplified(
-    surface: Surface, tolerance: float, check: Callable[[Surface], None]
-) -> tuple[Surface, dict[str, Any]]:
+def simplify_mesh(
+    surface: TriangleMesh, tolerance: float, check: Callable[[TriangleMesh], None]
+) -> tuple[TriangleMesh, dict[str, Any]]:
     """A closed surface with fewer triangles, or as it is where that cannot be.
 
     manifold3d's simplification: vertices are a part of those before. It moves the surface by less
@@ -206,13 +210,13 @@ def simplified(
     check: of a surface of which no triangles pass through each other.
     """
     facts = {"triangles_before_simplification": len(surface.faces)}
-    solid = manifold_of(surface)
+    solid = to_manifold(surface)
     for part in _SIMPLER:
-        simpler = surface_of(without_short_edges(solid, part * tolerance))
+        simpler = from_manifold(without_short_edges(solid, part * tolerance))
         if not 0 < len(simpler.faces) < len(surface.faces):
             continue
         try:
-            simpler = made_apart(simpler, _MENDED * tolerance)
+            simpler = resolve_self_intersections(simpler, _MENDED * tolerance)
             check(simpler)
         except MeshingError:
             continue
@@ -220,7 +224,7 @@ def simplified(
     return surface, facts
 
 
-def finished(surface: Surface, facts: dict[str, Any], is_closed: bool) -> trimesh.Trimesh:
+def to_trimesh(surface: TriangleMesh, facts: dict[str, Any], is_closed: bool) -> trimesh.Trimesh:
     """The mesh, which is a manifold (`check_manifold`), with the facts about it in its metadata. A
     mesh without a boundary is turned so that its volume is positive.
 
@@ -230,14 +234,14 @@ def finished(surface: Surface, facts: dict[str, Any], is_closed: bool) -> trimes
     from harnack.meshing.closed_mesh import ClosedMesh
 
     made = ClosedMesh(surface.vertices, surface.faces, process=False, validate=False)
-    pairs = directed_edges(surface.faces)
+    pairs = half_edges(surface.faces)
     edges = Edges.of(pairs)
-    boundary = pairs[edges.uses[edges.index] == 1]
+    boundary = pairs[edges.multiplicity[edges.edge_of_pair] == 1]
     if is_closed:
         volume = float(made.volume)
         if len(boundary) or not volume > 0:
             raise MeshingError(
-                "the part did not close, or is inside out: choose a smaller `spacing`"
+                "the part did not close, or is inside out: choose a smaller `cell_size`"
             )
         facts = {**facts, "volume": volume}
     elif not len(boundary) and made.volume < 0:  # f is larger inside
@@ -253,15 +257,15 @@ def finished(surface: Surface, facts: dict[str, Any], is_closed: bool) -> trimes
     return made
 
 
-def _creases(surface: Surface, edges: Edges) -> int:
+def _creases(surface: TriangleMesh, edges: Edges) -> int:
     """How many edges two faces meet at whose normals are more than 30 degrees apart."""
     normals = _unit_normals(surface.vertices, surface.faces)
-    pairs = edges.twice() % len(surface.faces)
-    return int((dots(normals[pairs[:, 0]], normals[pairs[:, 1]]) < _CREASE).sum())
+    pairs = edges.paired_half_edges() % len(surface.faces)
+    return int((row_dots(normals[pairs[:, 0]], normals[pairs[:, 1]]) < _CREASE).sum())
 
 
 def _unit_normals(vertices: FloatArray, faces: IntArray) -> FloatArray:
     """(m, 3) of faces; 0 for those without an area."""
     corner = vertices[faces]
-    cross = crosses(corner)
-    return cross / np.maximum(lengths(cross), 1e-300)[:, None]
+    cross = area_normals(corner)
+    return cross / np.maximum(row_norms(cross), 1e-300)[:, None]

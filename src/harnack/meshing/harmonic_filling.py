@@ -2,7 +2,7 @@
 
 The 1/2 level of the winding number w modulo 1 is the 2 pi level of the solid angle of the boundary
 edges (`geometry.chains`), a smooth surface that ends at them. It is meshed with these very edges in
-it, and joined to the mesh by index. It joins the rims of a gap, where `hole_patches` closes each.
+it, and joined to the mesh by index. It joins the rims of a gap, where `hole_filling` closes each.
 """
 
 from __future__ import annotations
@@ -21,24 +21,35 @@ from harnack.fields.solid_angles.winding_number import WindingNumber
 from harnack.geometry import MeshError
 from harnack.geometry.boundary_edges import singular_loops
 from harnack.meshing.checks import (
-    LocalError,
+    LocalizedMeshingError,
     MeshingError,
-    TooLargeError,
+    TriangleLimitError,
     check_manifold,
     intersecting_faces,
-    may_help_again,
-    singular_vertices,
+    is_retry_promising,
+    nonmanifold_vertices,
 )
-from harnack.meshing.delaunay_points import Boundary, Places, box_cells, place_points
-from harnack.meshing.edges import Edges, IntArray, crosses, directed_edges
+from harnack.meshing.delaunay_points import (
+    BoundaryCurve,
+    RefinementBalls,
+    box_cells,
+    sample_delaunay_points,
+)
+from harnack.meshing.edges import Edges, IntArray, area_normals, half_edges
 from harnack.meshing.level_function import LevelFunction
-from harnack.meshing.marching_tetrahedra import crossings_of, delaunay, triangles_of
-from harnack.meshing.refinement import far_places, improved, refined, smoothed
+from harnack.meshing.marching_tetrahedra import count_crossings, delaunay, extract_triangles
+from harnack.meshing.refinement import improve, refine, smooth, unrefined_midpoints
 
 if TYPE_CHECKING:
     from harnack.backend import FloatArray
 
-__all__ = ["Asked", "HarmonicPatches", "harmonic_patches", "missing_triangles", "open_edges"]
+__all__ = [
+    "HarmonicFilling",
+    "HoleFillingOptions",
+    "checked_boundary_edges",
+    "harmonic_patches",
+    "triangle_fills",
+]
 
 _LEVEL = 2 * math.pi
 # Cells across the holes at first.
@@ -53,7 +64,7 @@ _NEAR = 1e-6
 
 
 @dataclass(frozen=True)
-class Asked:
+class HoleFillingOptions:
     """How patches are made.
 
     tolerance: how far they may be from the surface, as a part of the size of the box around all
@@ -69,26 +80,26 @@ class Asked:
 
 
 @dataclass(frozen=True)
-class HarmonicPatches:
+class HarmonicFilling:
     """What is added.
 
     vertices: (k, 3).
     faces: (p, 3); indices below the number of given vertices are of these.
-    is_fine: whether they were refined to the tolerance.
-    missing: how many of the faces are triangles that holes of three edges lacked.
+    is_refined: whether they were refined to the tolerance.
+    triangle_fill_count: how many of the faces are triangles that holes of three edges lacked.
     """
 
     vertices: FloatArray
     faces: IntArray
-    is_fine: bool
+    is_refined: bool
     spacing: float
     evaluations: int
-    missing: int = 0
+    triangle_fill_count: int = 0
 
 
 def harmonic_patches(
-    vertices: FloatArray, faces: IntArray, edges: IntArray, asked: Asked
-) -> HarmonicPatches:
+    vertices: FloatArray, faces: IntArray, edges: IntArray, asked: HoleFillingOptions
+) -> HarmonicFilling:
     """Patches that end at the open edges (k, 2) of a mesh, as its faces run them; or, where these
     cannot be made, triangles in holes of three edges, and patches over the rest.
 
@@ -96,40 +107,40 @@ def harmonic_patches(
         MeshingError: they could not be made, or meet the mesh or each other.
     """
     try:
-        return _spanning(vertices, faces, edges, asked)
+        return _fill_all_holes(vertices, faces, edges, asked)
     except MeshingError as error:
-        missing = missing_triangles(vertices, faces, edges)
+        missing = triangle_fills(vertices, faces, edges)
         if not len(missing):
             raise
         first = error
     asked.report(f"once more, with triangles in {len(missing):,} holes of three edges")
     together = np.concatenate([faces, missing])
     try:
-        rest = _spanning(vertices, together, open_edges(together), asked)
+        rest = _fill_all_holes(vertices, together, checked_boundary_edges(together), asked)
     except MeshingError as error:
         raise MeshingError(
             f"{first}; and with triangles in {len(missing):,} holes of three edges: {error}"
         ) from error
     both = np.concatenate([missing, rest.faces])
-    return dataclasses.replace(rest, faces=both, missing=len(missing))
+    return dataclasses.replace(rest, faces=both, triangle_fill_count=len(missing))
 
 
-def _spanning(
-    vertices: FloatArray, faces: IntArray, edges: IntArray, asked: Asked
-) -> HarmonicPatches:
+def _fill_all_holes(
+    vertices: FloatArray, faces: IntArray, edges: IntArray, asked: HoleFillingOptions
+) -> HarmonicFilling:
     """Patches that end at open edges; cells are made smaller where checks fail.
 
     Raises:
-        MeshingError: as `harmonic_patches`.
+        MeshingError: as `harmonic_filling`.
     """
     if not len(edges):
-        return HarmonicPatches(vertices[:0], faces[:0], True, 0.0, 0)
+        return HarmonicFilling(vertices[:0], faces[:0], True, 0.0, 0)
     loops = singular_loops(edges, np.ones(len(edges), np.int64))
     function = LevelFunction(SolidAngle([vertices[loop] for loop in loops]), _LEVEL)
     size = float(np.ptp(vertices[np.unique(edges)], axis=0).max())
     cell = size / _ACROSS if asked.spacing is None else float(asked.spacing)
     report, tolerance = asked.report, asked.tolerance * size
-    finer: tuple[Places, ...] = ()
+    finer: tuple[RefinementBalls, ...] = ()
     times_met, seed, before = 0, asked.seed, None
     for attempt in range(asked.attempts):
         last = attempt == asked.attempts - 1
@@ -139,18 +150,18 @@ def _spanning(
                 function, vertices, edges, cell, finer, tolerance, seed, last, report
             )
             _check(vertices, faces, patches, report)
-        except LocalError as error:
-            times_met += isinstance(error, _MetError)
-            is_hopeless, before = not may_help_again(error, before), error
+        except LocalizedMeshingError as error:
+            times_met += isinstance(error, _MeshIntersectionError)
+            is_hopeless, before = not is_retry_promising(error, before), error
             if last or is_hopeless or times_met > _MOST_MET:
-                place = ", ".join(f"{c:.4g}" for c in error.places[0])
+                place = ", ".join(f"{c:.4g}" for c in error.locations[0])
                 raise MeshingError(
-                    f"{error} (cells were {cell:.3g} wide, and smaller in {len(error.places)} "
+                    f"{error} (cells were {cell:.3g} wide, and smaller in {len(error.locations)} "
                     f"places, such as near ({place}))"
                 ) from None
-            report(f"{error} ({len(error.places)} places)")
-            finer = (*finer, Places(error.places, 2 * cell * 0.5 ** len(finer)))
-        except TooLargeError:
+            report(f"{error} ({len(error.locations)} places)")
+            finer = (*finer, RefinementBalls(error.locations, 2 * cell * 0.5 ** len(finer)))
+        except TriangleLimitError:
             raise
         except MeshingError as error:  # a point lies where the function is too inaccurate
             if last:
@@ -162,22 +173,22 @@ def _spanning(
     raise AssertionError("unreachable: the last attempt returns or raises")
 
 
-class _MetError(LocalError):
+class _MeshIntersectionError(LocalizedMeshingError):
     """Patches intersect the mesh."""
 
 
-def open_edges(faces: IntArray) -> IntArray:
+def checked_boundary_edges(faces: IntArray) -> IntArray:
     """(k, 2): edges of one face, in its direction.
 
     Raises:
         MeshError: an edge of more than two faces, or of two that have it in the same direction.
     """
-    pairs = directed_edges(faces)
+    pairs = half_edges(faces)
     edges = Edges.of(pairs)
-    index, uses = edges.index, edges.uses
+    index, uses = edges.edge_of_pair, edges.multiplicity
     several = np.flatnonzero(uses > 2)
     if len(several):
-        a, b = edges.ends[several[0]].tolist()
+        a, b = edges.vertices[several[0]].tolist()
         raise MeshError(
             f"{len(several):,} edges have more than two faces, the first of them between vertices "
             f"{a} and {b}: such a mesh has no two sides there, and where all faces are kept none "
@@ -186,7 +197,7 @@ def open_edges(faces: IntArray) -> IntArray:
     sign = np.bincount(index, np.where(pairs[:, 0] < pairs[:, 1], 1, -1), minlength=len(uses))
     turned = np.flatnonzero((uses == 2) & (sign != 0))
     if len(turned):
-        a, b = edges.ends[turned[0]].tolist()
+        a, b = edges.vertices[turned[0]].tolist()
         raise MeshError(
             f"the faces at {len(turned):,} edges do not agree which side is outside, the first of "
             f"them between vertices {a} and {b}, and where all faces are kept none are turned over"
@@ -194,7 +205,7 @@ def open_edges(faces: IntArray) -> IntArray:
     return pairs[uses[index] == 1]
 
 
-def missing_triangles(vertices: FloatArray, faces: IntArray, edges: IntArray) -> IntArray:
+def triangle_fills(vertices: FloatArray, faces: IntArray, edges: IntArray) -> IntArray:
     """The triangles (k, 3) that holes of three edges lack, where these pass through no others.
 
     edges: (n, 2) open ones, as the faces run them.
@@ -225,12 +236,12 @@ def _patches(
     vertices: FloatArray,
     edges: IntArray,
     spacing: float,
-    finer: tuple[Places, ...],
+    finer: tuple[RefinementBalls, ...],
     tolerance: float,
     seed: int,
     last: bool,
     report: Callable[[str], None],
-) -> HarmonicPatches:
+) -> HarmonicFilling:
     """The level set, ending at the edges (k, 2) of the mesh.
 
     last: whether patches that cannot be refined will do.
@@ -239,45 +250,47 @@ def _patches(
         MeshingError: as `mesh`; or Delaunay's tetrahedra lack an edge.
     """
     rim, place = np.unique(edges, return_inverse=True)
-    boundary = Boundary(vertices[rim], place.reshape(-1, 2))
+    boundary = BoundaryCurve(vertices[rim], place.reshape(-1, 2))
     hull: Any = function.field.extent((_LEVEL,))
     lower, upper = (np.array(end, np.float64) for end in hull.bounds())
     root = box_cells(lower - 0.5 * spacing, upper + 0.5 * spacing, spacing, exact=False)
     cut, middles = boundary, np.zeros((0, 2), np.int64)
-    points = place_points(function, root, cut, None, seed, finer)
+    points = sample_delaunay_points(function, root, cut, None, seed, finer)
     tets = delaunay(points.points)
     for _ in range(_MOST_CUTS):
         lacks = ~tets.has_edges(cut.edges)
         if not lacks.any():
             break
         if len(cut.edges) > min(_MOST_PIECES, _MOST_PER_EDGE * len(edges)):
-            raise TooLargeError(
+            raise TriangleLimitError(
                 f"{len(edges):,} boundary edges of the mesh lie on others or next to them: cut to "
                 f"{len(cut.edges):,} pieces some are still too near to others for a patch that "
                 "ends at them; join or remove the triangles there"
             )
         middles = np.concatenate([middles, cut.edges[lacks]])
         cut = cut.split(lacks)
-        points = place_points(function, root, cut, None, seed, finer)
+        points = sample_delaunay_points(function, root, cut, None, seed, finer)
         tets = delaunay(points.points)
     lacks = ~tets.has_edges(cut.edges)
     if lacks.any():
-        raise LocalError(
+        raise LocalizedMeshingError(
             f"{int(lacks.sum())} boundary edges of the mesh are too near to others for a patch "
-            "that ends at them: subdivide the mesh there, or choose a smaller `spacing`",
+            "that ends at them: subdivide the mesh there, or choose a smaller `cell_size`",
             cut.points[cut.edges[lacks]].mean(axis=1),
         )
     report(f"{len(points.points):,} points, {len(tets.corners):,} tetrahedra")
-    x, faces = triangles_of(function, points, tets, crossings_of(function, points, tets))
+    x, faces = extract_triangles(function, points, tets, count_crossings(function, points, tets))
     for k, ends in reversed(list(enumerate(middles.tolist(), start=len(rim)))):
-        faces = _collapsed(x, faces, k, ends)
+        faces = _collapse_midpoint(x, faces, k, ends)
     if not len(faces):
-        raise LocalError("no patch was found: choose a smaller `spacing`", boundary.points)
+        raise LocalizedMeshingError(
+            "no patch was found: choose a smaller `cell_size`", boundary.points
+        )
     _check_boundary(x, faces, boundary)
     is_fine = True
     try:
         x, faces = _finished(function, x, faces, tolerance, report)
-    except LocalError:
+    except LocalizedMeshingError:
         if not last or len(intersecting_faces(x, faces)):
             raise
         is_fine = False
@@ -288,7 +301,7 @@ def _patches(
     index = np.full(len(x), -1, np.int64)
     index[: len(rim)] = rim
     index[inner] = len(vertices) + np.arange(len(inner))
-    return HarmonicPatches(x[inner], index[faces], is_fine, spacing, function.evaluations)
+    return HarmonicFilling(x[inner], index[faces], is_fine, spacing, function.evaluations)
 
 
 def _finished(
@@ -307,32 +320,32 @@ def _finished(
     bad = x[:0]
     for way in ("improving", "smoothing", "refining alone"):
         report(way)
-        finer, split = (x if way == "refining alone" else smoothed(function, x, faces, None)), faces
-        finer, split = refined(function, finer, split, 0.5 * tolerance, None, report)
-        far = far_places(function, finer, split, 0.5 * tolerance)
+        finer, split = (x if way == "refining alone" else smooth(function, x, faces, None)), faces
+        finer, split = refine(function, finer, split, 0.5 * tolerance, None, report)
+        far = unrefined_midpoints(function, finer, split, 0.5 * tolerance)
         if len(far):  # the patch takes another way than the surface, or connects two of its sheets
-            raise LocalError(
+            raise LocalizedMeshingError(
                 f"{len(far):,} triangles of patches do not come near the surface, however they are "
-                "cut: subdivide the mesh there, or choose a smaller `spacing`",
+                "cut: subdivide the mesh there, or choose a smaller `cell_size`",
                 far,
             )
         if way == "improving":
-            finer, split = improved(function, finer, split, 0.5 * tolerance, None, report)
+            finer, split = improve(function, finer, split, 0.5 * tolerance, None, report)
         elif way == "smoothing":
-            finer = smoothed(function, finer, split, None)
+            finer = smooth(function, finer, split, None)
         met = finer[split[intersecting_faces(finer, split)]].mean(axis=1)
         bad = np.concatenate([met, finer[_new_singular(faces, split)]])
         if not len(bad):
             return finer, split
-    raise LocalError("the patches meet each other: choose a smaller `spacing`", bad)
+    raise LocalizedMeshingError("the patches meet each other: choose a smaller `cell_size`", bad)
 
 
 def _new_singular(before: IntArray, after: IntArray) -> IntArray:
     """Vertices at which faces are not a manifold any more; holes may touch in others."""
-    return np.setdiff1d(singular_vertices(after), singular_vertices(before))
+    return np.setdiff1d(nonmanifold_vertices(after), nonmanifold_vertices(before))
 
 
-def _collapsed(x: FloatArray, faces: IntArray, middle: int, ends: list[int]) -> IntArray:
+def _collapse_midpoint(x: FloatArray, faces: IntArray, middle: int, ends: list[int]) -> IntArray:
     """The faces with a vertex in the middle of a boundary edge moved to one of its ends: that with
     which fewer faces meet or, if they are as many, the faces around it are turned less.
 
@@ -354,9 +367,9 @@ def _collapsed(x: FloatArray, faces: IntArray, middle: int, ends: list[int]) -> 
         is_moved = np.arange(len(made)) >= len(rest)
         found.append((len(intersecting_faces(x, made, is_moved)), -turned, made))
     if not found:
-        raise LocalError(
+        raise LocalizedMeshingError(
             "boundary edges of the mesh are too near to others for patches that end at them: "
-            "subdivide the mesh there, or choose a smaller `spacing`",
+            "subdivide the mesh there, or choose a smaller `cell_size`",
             x[[middle]],
         )
     return min(found, key=lambda one: one[:2])[2]
@@ -364,20 +377,20 @@ def _collapsed(x: FloatArray, faces: IntArray, middle: int, ends: list[int]) -> 
 
 def _normals(corners: FloatArray) -> FloatArray:
     """Unit normals of triangles (m, 3, 3), 0 of those without an area."""
-    normal = crosses(corners)
+    normal = area_normals(corners)
     return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
 
 
-def _check_boundary(x: FloatArray, faces: IntArray, boundary: Boundary) -> None:
+def _check_boundary(x: FloatArray, faces: IntArray, boundary: BoundaryCurve) -> None:
     """Raise unless patches end at the boundary, and run each of its edges as the mesh does: they
     are reversed afterwards."""
-    directed = {(int(a), int(b)) for a, b in directed_edges(faces)}
+    directed = {(int(a), int(b)) for a, b in half_edges(faces)}
     rim = {(a, b) for a, b in directed if (b, a) not in directed}
     wrong = rim ^ {(int(a), int(b)) for a, b in boundary.edges}
     if wrong:
-        raise LocalError(
+        raise LocalizedMeshingError(
             "the patches do not end at the edges of the holes: cells are too large for them; "
-            "choose a smaller `spacing`",
+            "choose a smaller `cell_size`",
             x[np.array(sorted(wrong))].mean(axis=1),
         )
 
@@ -385,7 +398,7 @@ def _check_boundary(x: FloatArray, faces: IntArray, boundary: Boundary) -> None:
 def _check(
     vertices: FloatArray,
     faces: IntArray,
-    patches: HarmonicPatches,
+    patches: HarmonicFilling,
     report: Callable[[str], None],
 ) -> None:
     """Raise unless the mesh with its patches is what `repair` promises.
@@ -399,14 +412,14 @@ def _check(
     try:
         check_manifold(together)
     except MeshingError as error:
-        raise LocalError(str(error), x[singular_vertices(together)]) from None
+        raise LocalizedMeshingError(str(error), x[nonmanifold_vertices(together)]) from None
     added = patches.vertices
     w = WindingNumber(vertices, faces).value(added, precision="double")
     off = np.abs(w - np.floor(w) - 0.5)
     if not (off <= _NEAR).all():
-        raise LocalError(
+        raise LocalizedMeshingError(
             f"the winding number is off 1/2 by {off.max():.2g} at a vertex of the patches: choose "
-            "a smaller `spacing`",
+            "a smaller `cell_size`",
             added[off > _NEAR],
         )
     is_patch = np.arange(len(together)) >= len(faces)
@@ -415,8 +428,10 @@ def _check(
         return
     places = x[together[met[is_patch[met]]]].mean(axis=1)
     if is_patch[met].all():
-        raise LocalError("the patches meet each other: choose a smaller `spacing`", places)
-    raise _MetError(
+        raise LocalizedMeshingError(
+            "the patches meet each other: choose a smaller `cell_size`", places
+        )
+    raise _MeshIntersectionError(
         f"the patches meet {int((~is_patch[met]).sum()):,} triangles of the mesh, where the "
         "winding number jumps: the hole cannot be closed by its 1/2 level alone; remove the "
         "triangles that stand in it, or draw the mesh with WindingNumber, which needs no repair",

@@ -10,7 +10,7 @@ around it, tangents included. Laplacians are those of the patch before; repeated
 that have become long, this ends at surfaces whose mean curvature is harmonic, such as spheres and
 cylinders.
 
-Nothing is proved of such patches. Those are handed back that pass the checks of `filled`.
+Nothing is proved of such patches. Those are handed back that pass the checks of `fill_holes`.
 """
 
 from __future__ import annotations
@@ -24,10 +24,18 @@ import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
 from harnack.meshing.checks import intersecting_faces
-from harnack.meshing.edges import Edges, IntArray, crosses, directed_edges, dots, edge_keys, lengths
+from harnack.meshing.edges import (
+    Edges,
+    IntArray,
+    area_normals,
+    edge_keys,
+    half_edges,
+    row_dots,
+    row_norms,
+)
 from harnack.meshing.refinement import split_faces
 
-__all__ = ["Filled", "filled", "hole_loops"]
+__all__ = ["HoleFilling", "fill_holes", "hole_loops"]
 
 # Loops of more edges are not filled: the time grows with the cube of their number.
 _MOST_IN_LOOP = 600
@@ -39,38 +47,38 @@ _SAME_TURN = 1e-9
 _LONG, _ROUNDS = 1.4, 10
 _MOST_CUT = 200_000
 # Edges of two triangles are flipped if the cotangents of the angles opposite have a sum below this.
-_FLIP = -1e-3
+_MAX_FLIP_COTANGENT_SUM = -1e-3
 _MOST_FLIPS = 12
 # Cotangents are kept between these, so that every matrix is definite.
 _LEAST_COTANGENT, _MOST_COTANGENT = 0.02, 20.0
 # What is tried in turn: whether loops are triangulated by angles, and how often the patch is made
 # to bend little, by the cotangents of what it was before.
-_TRIES = ((True, 6), (False, 2), (True, 0), (False, 0))
+_STRATEGIES = ((True, 6), (False, 2), (True, 0), (False, 0))
 # On a patch the winding number of what is there may differ from 1/2 modulo 1 by so much.
-_FROM_HALF = 0.36
+_MAX_WINDING_DEVIATION = 0.36
 
 Winding = Callable[[FloatArray], FloatArray]
 
 
 @dataclass(frozen=True)
-class Filled:
+class HoleFilling:
     """What was added to a mesh.
 
     vertices: (k, 3) new ones.
     faces: (p, 3) of patches; indices below the number of given vertices are of these.
-    left: loops that have no patch, each an array of vertices.
-    why: what patches of these failed with, in words.
+    unfilled_loops: loops that have no patch, each an array of vertices.
+    reason: what patches of these failed with, in words.
     """
 
     vertices: FloatArray
     faces: IntArray
-    left: list[IntArray]
-    why: str
+    unfilled_loops: list[IntArray]
+    reason: str
 
 
-def filled(
+def fill_holes(
     vertices: FloatArray, faces: IntArray, loops: list[IntArray], winding: Winding
-) -> Filled:
+) -> HoleFilling:
     """Patches over loops of open edges, as `hole_loops` gives them, that pass these checks: no
     triangle of one meets another triangle or is without an area, and the winding number of what is
     there is near 1/2 modulo 1 at its vertices and centers. It is far from that where a hole is no
@@ -84,7 +92,7 @@ def filled(
     x, together = vertices, faces
     left: list[IntArray] = loops
     reasons = dict[int, str]()
-    for by_angles, fairings in _TRIES:
+    for by_angles, fairings in _STRATEGIES:
         if not left:
             break
         made, new, owner, reasons = _patches(x, together, left, by_angles, fairings)
@@ -94,7 +102,7 @@ def filled(
         left = [left[k] for k in sorted(reasons)]
     counts = Counter(reasons.values())
     why = ", ".join(f"{count:,} {what}" for what, count in counts.items())
-    return Filled(x[len(vertices) :], together[len(faces) :], left, why)
+    return HoleFilling(x[len(vertices) :], together[len(faces) :], left, why)
 
 
 def _used(x: FloatArray, faces: IntArray, given: int) -> tuple[FloatArray, IntArray]:
@@ -121,7 +129,7 @@ def _failures(
     loop_of[new] = owner[:, None]
     loops = np.concatenate([owner, loop_of[given:]])
     w = winding(np.concatenate([x[new].mean(axis=1), x[given:]]))
-    far = ~(np.abs(w - np.floor(w) - 0.5) <= _FROM_HALF)
+    far = ~(np.abs(w - np.floor(w) - 0.5) <= _MAX_WINDING_DEVIATION)
     found |= dict.fromkeys(loops[far].tolist(), "not where the winding number is near 1/2")
     together = np.concatenate([faces, new])
     is_new = np.arange(len(together)) >= len(faces)
@@ -129,7 +137,7 @@ def _failures(
     found |= dict.fromkeys(
         owner[met[is_new[met]] - len(faces)].tolist(), "passing through other triangles"
     )
-    flat = lengths(crosses(x[new])) == 0
+    flat = row_norms(area_normals(x[new])) == 0
     return found | dict.fromkeys(owner[flat].tolist(), "with triangles without an area")
 
 
@@ -149,12 +157,12 @@ def hole_loops(vertices: FloatArray, faces: IntArray, edges: IntArray) -> list[I
         arriving[b].append(a)
     normals = np.zeros_like(vertices)
     for k in range(3):
-        np.add.at(normals, faces[:, k], crosses(vertices[faces]))
+        np.add.at(normals, faces[:, k], area_normals(vertices[faces]))
     following: dict[tuple[int, int], int] = {}
     for v, starts in arriving.items():
         ends = leaving[v]
         if len(ends) > 1:
-            ends = _across_gaps(vertices, v, normals[v], starts, ends)
+            ends = _match_loop_edges(vertices, v, normals[v], starts, ends)
         following |= {(a, v): c for a, c in zip(starts, ends, strict=True)}
     loops: list[IntArray] = []
     while following:
@@ -174,7 +182,7 @@ def hole_loops(vertices: FloatArray, faces: IntArray, edges: IntArray) -> list[I
     return loops
 
 
-def _across_gaps(
+def _match_loop_edges(
     x: FloatArray, v: int, normal: FloatArray, starts: list[int], ends: list[int]
 ) -> list[int]:
     """For each edge that comes from a start to v, the end to which its loop goes on: the next one
@@ -209,7 +217,7 @@ def _patches(
 ) -> tuple[FloatArray, IntArray, IntArray, dict[int, str]]:
     """All vertices with those of patches behind; faces of patches; of which loop each is; and loops
     without a patch, with the reason."""
-    third = _beside(faces, np.unique(np.concatenate(loops)), len(vertices))
+    third = _opposite_corners(faces, np.unique(np.concatenate(loops)), len(vertices))
     taken = {(min(edge), max(edge)) for edge in third}
     there = np.array(sorted(taken), np.int64).reshape(-1, 2)
     found, failed = list[IntArray](), dict[int, str]()
@@ -219,37 +227,37 @@ def _patches(
             continue
         polygon = loop[::-1].copy()
         most = _MOST_BY_ANGLES if by_angles else _ALWAYS_BY_ANGLES
-        plan = _least_turning if len(polygon) <= most else _least_area
+        plan = _min_dihedral_triangulation if len(polygon) <= most else _min_area_triangulation
         made = plan(vertices, polygon, third, taken)
         if made is None:
             failed[k] = "between edges that are joined already"
             continue
-        taken |= {(min(e), max(e)) for e in directed_edges(made).tolist()}
+        taken |= {(min(e), max(e)) for e in half_edges(made).tolist()}
         found.append(made)
     if not found:
         return vertices, faces[:0], np.zeros(0, np.int64), failed
-    sized, new = _finer(vertices, faces, np.concatenate(found), there)
+    sized, new = _refine(vertices, faces, np.concatenate(found), there)
     for left in range(fairings if len(sized) > len(vertices) else 0, 0, -1):
         sized[:, :3] = _fair(sized[:, :3], faces, new, len(vertices))
         new = _flipped(sized[:, :3], new, there)
         if left > 2:
-            sized, new = _cut(sized, new)
+            sized, new = _split_long_edges(sized, new)
             new = _flipped(sized[:, :3], new, there)
-    return sized[:, :3], new, _owners(new, loops, len(sized)), failed
+    return sized[:, :3], new, _loop_of_faces(new, loops, len(sized)), failed
 
 
-def _beside(faces: IntArray, rims: IntArray, count: int) -> dict[tuple[int, int], int]:
+def _opposite_corners(faces: IntArray, rims: IntArray, count: int) -> dict[tuple[int, int], int]:
     """The third corners of faces, by their directed edges between some vertices."""
     is_rim = np.zeros(count, np.bool_)
     is_rim[rims] = True
-    directed = directed_edges(faces)
+    directed = half_edges(faces)
     near = is_rim[directed].all(axis=1)
     third = np.roll(faces, 1, axis=1).T.ravel()[near].tolist()
     ends = directed[near].tolist()
     return {(a, b): c for (a, b), c in zip(ends, third, strict=True)}
 
 
-def _barred(polygon: IntArray, taken: set[tuple[int, int]]) -> BoolArray:
+def _forbidden_diagonals(polygon: IntArray, taken: set[tuple[int, int]]) -> BoolArray:
     """(n, n) which diagonals of a polygon are edges already."""
     n = len(polygon)
     barred = np.zeros((n, n), np.bool_)
@@ -268,7 +276,7 @@ def _pairs(polygon: IntArray, taken: set[tuple[int, int]]) -> list[tuple[int, in
     return [(a, b) for i, a in enumerate(ordered) for b in ordered[i + 1 :] if (a, b) in taken]
 
 
-def _least_area(
+def _min_area_triangulation(
     x: FloatArray,
     polygon: IntArray,
     third: dict[tuple[int, int], int],
@@ -279,12 +287,12 @@ def _least_area(
     n, corner = len(polygon), x[polygon]
     if n == 3:
         return polygon[None]
-    cost = np.where(_barred(polygon, taken), np.inf, 0.0)
+    cost = np.where(_forbidden_diagonals(polygon, taken), np.inf, 0.0)
     middle = np.zeros((n, n), np.int64)
     for d in range(2, n):
         i = np.arange(n - d)[:, None]
         m = i + np.arange(1, d)
-        area = 0.5 * lengths(
+        area = 0.5 * row_norms(
             np.cross(corner[m] - corner[i], corner[i + d] - corner[i]).reshape(-1, 3)
         ).reshape(m.shape)
         total = cost[i, m] + cost[m, i + d] + area
@@ -294,10 +302,10 @@ def _least_area(
         middle[rows, rows + d] = m[rows, best]
     if not np.isfinite(cost[0, n - 1]):
         return None
-    return polygon[_traced(middle, n)]
+    return polygon[_triangles_of_plan(middle, n)]
 
 
-def _traced(middle: IntArray, n: int) -> IntArray:
+def _triangles_of_plan(middle: IntArray, n: int) -> IntArray:
     """The triangles of a plan: middle[i, k] is the third corner of that at the diagonal from i to
     k, on the side of the corners between them."""
     found, todo = list[tuple[int, int, int]](), [(0, n - 1)]
@@ -310,7 +318,7 @@ def _traced(middle: IntArray, n: int) -> IntArray:
     return np.array(found, np.int64)
 
 
-def _least_turning(
+def _min_dihedral_triangulation(
     x: FloatArray,
     polygon: IntArray,
     third: dict[tuple[int, int], int],
@@ -321,13 +329,13 @@ def _least_turning(
     n, corner = len(polygon), x[polygon]
     if n == 3:
         return polygon[None]
-    barred = _barred(polygon, taken)
+    barred = _forbidden_diagonals(polygon, taken)
     beside = np.zeros((n, n, 3))  # 0: there is none, or not yet
     for k in range(n):
         a, b = int(polygon[k]), int(polygon[(k + 1) % n])
         if (b, a) in third:
             face = np.array([[b, a, third[b, a]]])
-            beside[k, (k + 1) % n] = _unit(crosses(x[face]))[0]
+            beside[k, (k + 1) % n] = _unit(area_normals(x[face]))[0]
     turn, area = np.full((n, n), -1.0), np.zeros((n, n))
     middle = np.zeros((n, n), np.int64)
     for d in range(2, n):
@@ -352,7 +360,7 @@ def _least_turning(
         beside[rows, rows + d] = own[rows, best]
     if not np.isfinite(turn[0, n - 1]):
         return None
-    return polygon[_traced(middle, n)]
+    return polygon[_triangles_of_plan(middle, n)]
 
 
 def _unit(vectors: FloatArray) -> FloatArray:
@@ -363,7 +371,7 @@ def _unit(vectors: FloatArray) -> FloatArray:
 # Finer triangles.
 
 
-def _finer(
+def _refine(
     vertices: FloatArray, faces: IntArray, new: IntArray, taken: IntArray
 ) -> tuple[FloatArray, IntArray]:
     """Patches of triangles about as large as those around them, with the least area; all vertices
@@ -372,36 +380,36 @@ def _finer(
     taken: (t, 2) edges that are there already.
     """
     given = len(vertices)
-    x = np.column_stack([vertices, _usual_lengths(vertices, faces, np.unique(new))])
+    x = np.column_stack([vertices, _mean_edge_lengths(vertices, faces, np.unique(new))])
     for _ in range(_ROUNDS):
         new, count = _flipped(x[:, :3], new, taken), len(x)
-        x, new = _cut(x, new)
+        x, new = _split_long_edges(x, new)
         if len(x) == count:
             break
         x = _relaxed(x, new, given)
     return x, _flipped(x[:, :3], new, taken)
 
 
-def _cut(x: FloatArray, new: IntArray) -> tuple[FloatArray, IntArray]:
+def _split_long_edges(x: FloatArray, new: IntArray) -> tuple[FloatArray, IntArray]:
     """Vertices (n, 4) and triangles with edges cut in the middle that are too long."""
-    edges = Edges.of(directed_edges(new))
-    ends = x[edges.ends]
-    long = lengths(ends[:, 0, :3] - ends[:, 1, :3]) > _LONG * ends[:, :, 3].mean(axis=1)
-    rows = np.flatnonzero(long & (edges.uses == 2))
+    edges = Edges.of(half_edges(new))
+    ends = x[edges.vertices]
+    long = row_norms(ends[:, 0, :3] - ends[:, 1, :3]) > _LONG * ends[:, :, 3].mean(axis=1)
+    rows = np.flatnonzero(long & (edges.multiplicity == 2))
     if not len(rows) or len(new) > _MOST_CUT:
         return x, new
-    place = np.full(len(edges.ends), -1, np.int64)
+    place = np.full(len(edges.vertices), -1, np.int64)
     place[rows] = len(x) + np.arange(len(rows))
     x = np.concatenate([x, ends[rows].mean(axis=1)])
-    return x, split_faces(x[:, :3], new, place[edges.index].reshape(3, -1).T)
+    return x, split_faces(x[:, :3], new, place[edges.edge_of_pair].reshape(3, -1).T)
 
 
-def _usual_lengths(x: FloatArray, faces: IntArray, rims: IntArray) -> FloatArray:
+def _mean_edge_lengths(x: FloatArray, faces: IntArray, rims: IntArray) -> FloatArray:
     """(n,) the mean length of a vertex's edges; 0 but at some vertices."""
     is_rim = np.zeros(len(x), np.bool_)
     is_rim[rims] = True
-    edges = Edges.of(directed_edges(faces[is_rim[faces].any(axis=1)])).ends
-    long = lengths(x[edges[:, 0]] - x[edges[:, 1]])
+    edges = Edges.of(half_edges(faces[is_rim[faces].any(axis=1)])).vertices
+    long = row_norms(x[edges[:, 0]] - x[edges[:, 1]])
     total, count = (
         np.bincount(edges.ravel(), np.repeat(one, 2), minlength=len(x))
         for one in (long, np.ones(len(long)))
@@ -411,12 +419,12 @@ def _usual_lengths(x: FloatArray, faces: IntArray, rims: IntArray) -> FloatArray
 
 def _relaxed(x: FloatArray, new: IntArray, given: int) -> FloatArray:
     """Rows of new vertices, in the middle of their neighbors' rows."""
-    ends = Edges.of(directed_edges(new)).ends
-    weights = _symmetric(ends, np.ones(len(ends)), len(x))
-    return _least_change(weights[given:], x, given)
+    ends = Edges.of(half_edges(new)).vertices
+    weights = _graph_laplacian(ends, np.ones(len(ends)), len(x))
+    return _solve_least_squares(weights[given:], x, given)
 
 
-def _least_change(rows: Any, x: FloatArray, given: int) -> FloatArray:
+def _solve_least_squares(rows: Any, x: FloatArray, given: int) -> FloatArray:
     """Rows from `given` on such that a linear map of all is nearest to 0."""
     import scipy.sparse.linalg as linalg  # here: half a second that few need
 
@@ -428,7 +436,7 @@ def _least_change(rows: Any, x: FloatArray, given: int) -> FloatArray:
     return after
 
 
-def _symmetric(ends: IntArray, weight: FloatArray, count: int) -> Any:
+def _graph_laplacian(ends: IntArray, weight: FloatArray, count: int) -> Any:
     """The Laplacian of a graph with these edges (k, 2), as a sparse matrix."""
     import scipy.sparse  # here: half a second that few need
 
@@ -450,24 +458,24 @@ def _fair(x: FloatArray, faces: IntArray, new: IntArray, given: int) -> FloatArr
     is_rim = np.zeros(len(x), np.bool_)
     is_rim[new] = True
     around = np.concatenate([faces[is_rim[faces].any(axis=1)], new])
-    edges = Edges.of(directed_edges(around))
+    edges = Edges.of(half_edges(around))
     corner = x[around]
-    weight = np.zeros(len(edges.ends))
+    weight = np.zeros(len(edges.vertices))
     area = np.zeros(len(x))
-    double = np.maximum(lengths(crosses(x[around])), 1e-300)
+    double = np.maximum(row_norms(area_normals(x[around])), 1e-300)
     for k in range(3):  # the edge from corner k to the next is opposite to the one after
         one, other = (corner[:, j] - corner[:, k - 1] for j in (k, (k + 1) % 3))
-        cotangent = np.clip(dots(one, other) / double, -_MOST_COTANGENT, _MOST_COTANGENT)
+        cotangent = np.clip(row_dots(one, other) / double, -_MOST_COTANGENT, _MOST_COTANGENT)
         m = len(around)
-        np.add.at(weight, edges.index[k * m : (k + 1) * m], 0.5 * cotangent)
+        np.add.at(weight, edges.edge_of_pair[k * m : (k + 1) * m], 0.5 * cotangent)
         np.add.at(area, around[:, k], double / 6)
     weight = np.maximum(weight, _LEAST_COTANGENT)
     # Beside holes that stay open only new vertices count.
-    is_rim[edges.ends[edges.uses != 2]] = False
+    is_rim[edges.vertices[edges.multiplicity != 2]] = False
     rows = np.flatnonzero(is_rim & (area > 0))
-    laplacian = _symmetric(edges.ends, weight, len(x))[rows]
+    laplacian = _graph_laplacian(edges.vertices, weight, len(x))[rows]
     scale = 1 / np.sqrt(np.maximum(area[rows], 1e-300))
-    return _least_change(laplacian.multiply(scale[:, None]).tocsr(), x, given)
+    return _solve_least_squares(laplacian.multiply(scale[:, None]).tocsr(), x, given)
 
 
 def _flipped(x: FloatArray, new: IntArray, taken: IntArray) -> IntArray:
@@ -476,19 +484,19 @@ def _flipped(x: FloatArray, new: IntArray, taken: IntArray) -> IntArray:
     new = new.copy()
     there = edge_keys(taken, len(x))
     for _ in range(_MOST_FLIPS):
-        edges = Edges.of(directed_edges(new))
-        half = edges.twice()
+        edges = Edges.of(half_edges(new))
+        half = edges.paired_half_edges()
         f, g = half.T % len(new)
         k, j = half.T // len(new)
         a, b, c, d = new[f, k], new[f, (k + 1) % 3], new[f, (k + 2) % 3], new[g, (j + 2) % 3]
         key = edge_keys(np.column_stack([c, d]), len(x))
         gain = _cotangents(x[a], x[b], x[c]) + _cotangents(x[a], x[b], x[d])
-        good = (gain < _FLIP) & (c != d)
-        good &= ~np.isin(key, there) & ~np.isin(key, edge_keys(edges.ends, len(x)))
-        before = crosses(x[new])
+        good = (gain < _MAX_FLIP_COTANGENT_SUM) & (c != d)
+        good &= ~np.isin(key, there) & ~np.isin(key, edge_keys(edges.vertices, len(x)))
+        before = area_normals(x[new])
         mean = before[f] + before[g]
         for triangle in ((a, d, c), (d, b, c)):
-            good &= dots(crosses(x[np.column_stack(triangle)]), mean) > 0
+            good &= row_dots(area_normals(x[np.column_stack(triangle)]), mean) > 0
         rows = np.flatnonzero(good)
         rows = rows[np.argsort(gain[rows])]
         rows = rows[np.sort(np.unique(key[rows], return_index=True)[1])]
@@ -507,23 +515,23 @@ def _flipped(x: FloatArray, new: IntArray, taken: IntArray) -> IntArray:
 def _cotangents(a: FloatArray, b: FloatArray, apex: FloatArray) -> FloatArray:
     """(k,) of the angles at `apex` between points."""
     one, other = a - apex, b - apex
-    return dots(one, other) / np.maximum(lengths(np.cross(one, other)), 1e-300)
+    return row_dots(one, other) / np.maximum(row_norms(np.cross(one, other)), 1e-300)
 
 
-def _owners(new: IntArray, loops: list[IntArray], count: int) -> IntArray:
+def _loop_of_faces(new: IntArray, loops: list[IntArray], count: int) -> IntArray:
     """(p,) of which loop each face of patches is: those joined by edges to a face at the loop."""
     import scipy.sparse  # here: half a second that few need
     import scipy.sparse.csgraph as csgraph_module
 
     sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
-    edges = Edges.of(directed_edges(new))
-    one, other = edges.twice().T % len(new)
+    edges = Edges.of(half_edges(new))
+    one, other = edges.paired_half_edges().T % len(new)
     joined = sparse.coo_matrix((np.ones(len(one)), (one, other)), shape=(len(new), len(new)))
     part = np.asarray(csgraph.connected_components(joined, directed=False)[1])
     loop_at = np.full(int(part.max()) + 1, -1, np.int64)
-    keys = edge_keys(edges.ends, count)
+    keys = edge_keys(edges.vertices, count)
     face_at = np.empty(len(keys), np.int64)
-    face_at[edges.index] = np.arange(3 * len(new)) % len(new)
+    face_at[edges.edge_of_pair] = np.arange(3 * len(new)) % len(new)
     firsts = edge_keys(np.array([loop[:2] for loop in loops]), count)
     places = np.minimum(np.searchsorted(keys, firsts), len(keys) - 1)
     found = np.flatnonzero(keys[places] == firsts)

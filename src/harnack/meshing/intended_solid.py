@@ -19,8 +19,14 @@ from harnack.fields.solid_angles.winding_number import WindingNumber
 from harnack.geometry import MeshError, validate_mesh, without_zero_area_faces
 from harnack.geometry.welding import Welded
 from harnack.meshing.bodies import closed_parts, nested, volume_of
-from harnack.meshing.edges import IntArray, crosses, distance_from_triangles, dots, lengths
-from harnack.meshing.lattice_meshing import Surface
+from harnack.meshing.edges import (
+    IntArray,
+    area_normals,
+    distance_from_triangles,
+    row_dots,
+    row_norms,
+)
+from harnack.meshing.lattice_meshing import TriangleMesh
 from harnack.meshing.mesh_cleaning import against_neighbors
 
 __all__ = ["Difference", "IntendedSolid"]
@@ -116,7 +122,9 @@ class IntendedSolid:
         Raises:
             MeshError: as `validate_mesh`.
         """
-        x, faces = validate_mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces), flat=True)
+        x, faces = validate_mesh(
+            np.asarray(mesh.vertices), np.asarray(mesh.faces), allow_zero_area=True
+        )
         welded = Welded.of(x, faces)
         known, raw = welded.index[faces], faces
         if welded.rounded:
@@ -173,9 +181,9 @@ class IntendedSolid:
         if not chosen:
             return np.zeros((0, 3)), np.zeros(0)
         corner = self.vertices[np.concatenate(chosen)]
-        corner = corner[lengths(crosses(corner)) > 0]
-        normal = crosses(corner)
-        away = _BESIDE * self.size * normal / lengths(normal)[:, None]
+        corner = corner[row_norms(area_normals(corner)) > 0]
+        normal = area_normals(corner)
+        away = _BESIDE * self.size * normal / row_norms(normal)[:, None]
         middle = corner.mean(axis=1)
         points = np.concatenate([middle - away, middle + away])
         return points, self.winding(points)
@@ -200,7 +208,7 @@ class IntendedSolid:
                 "program that made it"
             )
 
-    def difference(self, surface: Surface, away: float) -> Difference | None:
+    def difference(self, surface: TriangleMesh, away: float) -> Difference | None:
         """How a closed surface differs from what was given, at points farther than `away` from
         both, and next to closed parts and farther than that from the surface; None if it does not.
         """
@@ -224,11 +232,11 @@ class IntendedSolid:
         share = (missing + added) / (len(points) + len(beside))
         return Difference(share, far[:_LISTED], missing, added, volumes)
 
-    def _volumes(self, surface: Surface, away: float) -> tuple[float, float] | None:
+    def _volumes(self, surface: TriangleMesh, away: float) -> tuple[float, float] | None:
         """Volumes of the surface and the mesh if they differ, of a closed one that winds around no
         point twice or clockwise."""
         _, w = self.samples
-        if self.field is None or len(self.field.mesh.singular):
+        if self.field is None or len(self.field.mesh.singular_edges):
             return None
         if (w > 1.5).any() or (w < -0.5).any():
             return None
@@ -236,7 +244,7 @@ class IntendedSolid:
             volume_of(surface.vertices, surface.faces),
             volume_of(self.vertices, self.oriented),
         )
-        area = 0.5 * float(lengths(crosses(surface.vertices[surface.faces])).sum())
+        area = 0.5 * float(row_norms(area_normals(surface.vertices[surface.faces])).sum())
         allowed = max(_VOLUME * abs(intended), away * area)
         return (new, intended) if abs(new - intended) > allowed else None
 
@@ -286,8 +294,8 @@ def _on_faces(
     corner: FloatArray, count: int, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
     """Points (k, 3) spread over faces (m, 3, 3) by area, and unit normals there."""
-    normal = crosses(corner)
-    area = lengths(normal)
+    normal = area_normals(corner)
+    area = row_norms(normal)
     rows = rng.choice(len(corner), count, p=area / area.sum())
     shares = rng.dirichlet((1.0, 1.0, 1.0), count)
     points = np.einsum("ki,kij->kj", shares, corner[rows])
@@ -347,7 +355,7 @@ def _winds_clockwise(x: FloatArray, faces: IntArray) -> bool:
     corner = x[faces]
     size = float(np.ptp(corner, axis=(0, 1)).max())
     middle: FloatArray = corner.mean(axis=(0, 1))
-    cones = dots(corner[:, 0] - middle, crosses(corner))
+    cones = row_dots(corner[:, 0] - middle, area_normals(corner))
     if float(cones.sum()) > _PLAINLY * float(np.abs(cones).sum()):
         return False  # nearly all faces look away from the middle
     w = _values(_winding_number(x, faces), _near(corner, size, rng))

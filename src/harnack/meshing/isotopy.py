@@ -32,8 +32,9 @@ An angle. Where f's lift stays within half a period of the level on T, which is 
 of (b), the wrapped values at the corners are that lift's, and all is as for a number.
 
 The check. |grad f(y) - grad f(c)| <= D for all y in the ball around T with center c and radius R,
-by the field's own promise (`Field.slope_change`). So (b) holds if grad f(c) . grad F > D |grad F|,
-and f has no zero in T if |f(c)| > (|grad f(c)| + D) R. If neither holds T is halved, across its
+by the field's own promise (`Field.gradient_change_bound`). So (b) holds if grad f(c) . grad F > D
+|grad F|, and f has no zero in T if |f(c)| > (|grad f(c)| + D) R. If neither holds T is halved,
+across its
 longest edge, a few times: grad F is the same in both halves, and (a) or (b) may hold in each.
 
 Near the curve nothing is proved. The proof is about the first triangles, before they are refined.
@@ -50,11 +51,11 @@ from typing import Any
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
-from harnack.meshing.delaunay_points import Boundary, PointSet
+from harnack.meshing.delaunay_points import BoundaryCurve, TetrahedronPoints
 from harnack.meshing.edges import IntArray
 from harnack.meshing.level_function import LevelFunction
 
-__all__ = ["Isotopy", "isotopy_of"]
+__all__ = ["IsotopyCoverage", "isotopy_of"]
 
 Walls = tuple[FloatArray, FloatArray] | None
 _HALVINGS = 5
@@ -67,38 +68,38 @@ _FAR = 1.5
 
 
 @dataclass(frozen=True)
-class Isotopy:
+class IsotopyCoverage:
     """Shares of the tetrahedra that may hold a point of the level set, or hold one of the mesh.
 
     proved: of all, those where (a), (b) or (c) is proved. If it is 1, mesh and level set are
         isotopic.
-    proved_far: of those farther than 1.5 cells from the curve.
+    proved_off_curve: of those farther than 1.5 cells from the curve.
     count: how many there are; of fields that do not bound the changes of their gradient only those
         that hold a point of the mesh.
-    open_far: (k, 4) corners of those farther than 1.5 cells from the curve where nothing is
-        proved.
+    unproved_off_curve: (k, 4) corners of those farther than 1.5 cells from the curve where nothing
+        is proved.
     """
 
     proved: float
-    proved_far: float
+    proved_off_curve: float
     count: int
-    open_far: IntArray
+    unproved_off_curve: IntArray
 
     def shares(self) -> dict[str, float]:
         """For the metadata of a mesh."""
-        return {"isotopy": self.proved, "isotopy_far": self.proved_far}
+        return {"isotopy": self.proved, "isotopy_far": self.proved_off_curve}
 
 
 def isotopy_of(
     function: LevelFunction,
-    points: PointSet,
+    points: TetrahedronPoints,
     tetrahedra: IntArray,
     is_cut: BoolArray,
     faces: IntArray,
-    boundary: Boundary,
+    boundary: BoundaryCurve,
     spacing: float,
     walls: Walls,
-) -> Isotopy:
+) -> IsotopyCoverage:
     """What is proved about the mesh of tetrahedra with those corners (m, 4).
 
     is_cut: (m,) whether a tetrahedron holds a point of the mesh. faces: of the mesh (k, 3); corners
@@ -106,19 +107,19 @@ def isotopy_of(
     """
     corners = points.points[tetrahedra]
     if not _has_bounds(function, corners[is_cut]):
-        return Isotopy(0.0, 0.0, int(is_cut.sum()), tetrahedra[is_cut])
+        return IsotopyCoverage(0.0, 0.0, int(is_cut.sum()), tetrahedra[is_cut])
     rest = np.flatnonzero(~is_cut)
     holds = is_cut.copy()
-    holds[rest[~_free(function, corners[rest])]] = True
+    holds[rest[~_proved_empty(function, corners[rest])]] = True
     index, corners = tetrahedra[holds], corners[holds]
     values = points.samples.value[index]
-    values[points.is_on[index]] = 0.0
+    values[points.is_on_level[index]] = 0.0
     slopes = _slopes_on(function, corners, index, values, faces)
     beside = (index < len(boundary.points)).any(axis=1)
     proved = np.bincount(slopes.owner, minlength=len(index)) > 0
     proved &= ~beside
     rows = np.flatnonzero(proved[slopes.owner])
-    good = _regular(
+    good = _proved_regular(
         function, corners[slopes.owner[rows]], values[slopes.owner[rows], 0],
         slopes.slope[rows], np.ones(3),
     )  # fmt: skip
@@ -132,7 +133,7 @@ def isotopy_of(
     stars = ~proved & ~beside & far
     proved[stars] = _proved_by_stars(function, corners, index, slopes, np.flatnonzero(stars))
     proved &= on_walls
-    return Isotopy(_share(proved), _share(proved[far]), len(index), index[far & ~proved])
+    return IsotopyCoverage(_share(proved), _share(proved[far]), len(index), index[far & ~proved])
 
 
 def _has_bounds(function: LevelFunction, corners: FloatArray) -> bool:
@@ -140,7 +141,7 @@ def _has_bounds(function: LevelFunction, corners: FloatArray) -> bool:
     is cut stays unproved, and no other needs to be examined."""
     some = corners[:: max(1, len(corners) // _FEW)]
     center, radius = _balls(some)
-    return not len(some) or bool((function.slopes(center, radius)[1] < _UNKNOWN).any())
+    return not len(some) or bool((function.gradient_bounds(center, radius)[1] < _UNKNOWN).any())
 
 
 def _share(proved: BoolArray) -> float:
@@ -154,7 +155,7 @@ def _balls(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 @dataclass(frozen=True)
-class _Slopes:
+class _LinearGradients:
     """Gradients of F, slope (k, 3), on the tetrahedra owner (k,): one each, or two, or none."""
 
     owner: IntArray
@@ -167,7 +168,7 @@ def _slopes_on(
     index: IntArray,
     values: FloatArray,
     faces: IntArray,
-) -> _Slopes:
+) -> _LinearGradients:
     """The gradients on tetrahedra with those corners (m, 4, 3), points (m, 4) and values (m, 4);
     none for flat ones, two for those with four corners on the level and two faces in the mesh."""
     sides = corners[:, 1:] - corners[:, :1]
@@ -194,7 +195,7 @@ def _slopes_on(
         inward = ((corners[rows[chosen], k] - a) * normal).sum(axis=1)
         owners.append(rows[chosen])
         slopes.append(normal * (np.sign(inward) * sign[chosen])[:, None])
-    return _Slopes(np.concatenate(owners), np.concatenate(slopes))
+    return _LinearGradients(np.concatenate(owners), np.concatenate(slopes))
 
 
 def _triple_keys(triples: IntArray, count: int) -> IntArray:
@@ -205,7 +206,11 @@ def _triple_keys(triples: IntArray, count: int) -> IntArray:
 
 
 def _proved_by_stars(
-    function: LevelFunction, corners: FloatArray, index: IntArray, slopes: _Slopes, rows: IntArray
+    function: LevelFunction,
+    corners: FloatArray,
+    index: IntArray,
+    slopes: _LinearGradients,
+    rows: IntArray,
 ) -> BoolArray:
     """(k,) whether (c) is proved for tetrahedra `rows` (k,).
 
@@ -235,12 +240,12 @@ def _proved_by_stars(
     good[star[~has_slope[tet]]] = False
     tried = np.flatnonzero(good[star])
     start = np.zeros(len(tried))
-    fine = _regular(function, corners[tet[tried]], start, n[star[tried]], np.ones(3))
+    fine = _proved_regular(function, corners[tet[tried]], start, n[star[tried]], np.ones(3))
     good[star[tried[~fine]]] = False
     return np.asarray(good[place[index[rows]]].all(axis=1), np.bool_)
 
 
-def _free(function: LevelFunction, corners: FloatArray) -> BoolArray:
+def _proved_empty(function: LevelFunction, corners: FloatArray) -> BoolArray:
     """(n,) whether f is proved to have no zero in tetrahedra (n, 4, 3), by halving them. As F has
     none and f crosses no level on their edges, net, both are between the same two levels: (a)."""
     owner, pieces = np.arange(len(corners)), corners
@@ -256,7 +261,7 @@ def _free(function: LevelFunction, corners: FloatArray) -> BoolArray:
     return free
 
 
-def _regular(
+def _proved_regular(
     function: LevelFunction,
     corners: FloatArray,
     start: FloatArray,
@@ -276,7 +281,7 @@ def _regular(
             break
         center, radius = _balls(pieces)
         radius = radius * (1 + 1e-9)
-        samples, change = function.slopes(center, radius)
+        samples, change = function.gradient_bounds(center, radius)
         change = np.minimum(change, _UNKNOWN)
         if (change == _UNKNOWN).all():
             proved[owner] = False
@@ -317,7 +322,7 @@ def _regular_on_walls(
     function: LevelFunction,
     corners: FloatArray,
     values: FloatArray,
-    slopes: _Slopes,
+    slopes: _LinearGradients,
     rows: BoolArray,
     walls: tuple[FloatArray, FloatArray],
 ) -> BoolArray:
@@ -344,12 +349,12 @@ def _regular_on_walls(
                 which = np.argsort(~inside[owner], axis=1, kind="stable")[:, :k]
                 part = np.take_along_axis(corners[owner], which[..., None], axis=1)
                 start = np.take_along_axis(values[owner], which[:, :1], axis=1)[:, 0]
-                good = _regular(function, part, start, slopes.slope[entry], free)
+                good = _proved_regular(function, part, start, slopes.slope[entry], free)
                 proved[owner[~good]] = False
     return proved
 
 
-def _distances(points: FloatArray, boundary: Boundary) -> FloatArray:
+def _distances(points: FloatArray, boundary: BoundaryCurve) -> FloatArray:
     """(n,) from points to the curve, at most by half its longest edge too large."""
     import scipy.spatial  # here: half a second that few need
 

@@ -19,12 +19,12 @@ from harnack.backend import BoolArray, FloatArray, choose_backend
 from harnack.geometry.boundary_edges import singular_edges
 from harnack.geometry.meshes import without_zero_area_faces
 from harnack.meshing.checks import MeshingError, touching_pairs
-from harnack.meshing.edges import Edges, IntArray, crosses, directed_edges, dots, lengths
-from harnack.meshing.lattice_meshing import Surface
-from harnack.tree import build_hierarchy
+from harnack.meshing.edges import Edges, IntArray, area_normals, half_edges, row_dots, row_norms
+from harnack.meshing.lattice_meshing import TriangleMesh
+from harnack.tree import build_balanced_tree
 from harnack.tree.coplanar import overlapping_faces
-from harnack.tree.triangle_splitting import pieces_of_faces, windings_of_sides
-from harnack.tree.triangle_tree import TriangleRays, triangle_records
+from harnack.tree.triangle_splitting import split_intersecting_faces, windings_of_sides
+from harnack.tree.triangle_tree import TriangleTree, triangle_records
 
 __all__ = ["boundary_of_solid", "near_groups", "neighbors", "passes_itself"]
 
@@ -37,7 +37,7 @@ _SAME_TURN = 1e-9
 _MOST_HALVINGS = 200
 
 
-def passes_itself(surface: Surface, number: IntArray) -> bool:
+def passes_itself(surface: TriangleMesh, number: IntArray) -> bool:
     """Whether a closed surface none of whose triangles pass through others does so along edges that
     lie on faces, where nothing passes through a triangle.
 
@@ -57,7 +57,7 @@ def passes_itself(surface: Surface, number: IntArray) -> bool:
     return len(sides) > len(np.unique(sides[:, 0]))
 
 
-def boundary_of_solid(vertices: FloatArray, faces: IntArray) -> Surface:
+def boundary_of_solid(vertices: FloatArray, faces: IntArray) -> TriangleMesh:
     """The boundary of the points around which a closed mesh winds at least once; it may wind around
     others clockwise. Where it touches itself it has corners of its own for each sheet.
 
@@ -82,7 +82,7 @@ def boundary_of_solid(vertices: FloatArray, faces: IntArray) -> Surface:
     joined = joined[(joined != np.roll(joined, 1, axis=1)).all(axis=1)]
     joined = _cut_at_corners(places, joined)
     moved = np.concatenate([x, cut.center + cut.size * places[len(x) :]])
-    return Surface.of(*_apart_at_contacts(moved, joined))
+    return TriangleMesh.without_unused_vertices(*_apart_at_contacts(moved, joined))
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ class _Cut:
     of. front, back: (k,) winding numbers on its sides. is_thick: (k,) whether these are known.
     """
 
-    rays: TriangleRays
+    rays: TriangleTree
     unit: FloatArray
     faces: IntArray
     center: FloatArray
@@ -117,12 +117,12 @@ class _Cut:
         center = 0.5 * (low + high)
         unit = (vertices - center) / size
         rays = _rays(unit, faces[rows])
-        pieces, owner = pieces_of_faces(rays, unit, faces[rows], covered_whole=True)
+        pieces, owner = split_intersecting_faces(rays, unit, faces[rows], covered_whole=True)
         around = _rays(unit, faces if closed is None else closed)
         front, back = windings_of_sides(around, pieces)
         edges = pieces - np.roll(pieces, 1, axis=1)
         longest = np.linalg.norm(edges, axis=2).max(axis=1)
-        is_thick = np.linalg.norm(crosses(pieces), axis=1) > _THIN * longest
+        is_thick = np.linalg.norm(area_normals(pieces), axis=1) > _THIN * longest
         return cls(
             rays, unit, faces[rows], center, size, pieces, rows[owner], front, back, is_thick
         )
@@ -141,18 +141,18 @@ class _Cut:
         past = np.cumsum(count) - count
         rows = order[np.arange(int(count.sum())) + np.repeat(start - past, count)]
         triangle = self.unit[self.faces[np.repeat(covering, count)]]
-        middle, normal = self.pieces[rows].mean(axis=1), crosses(triangle)
+        middle, normal = self.pieces[rows].mean(axis=1), area_normals(triangle)
         within = np.ones(len(rows), np.bool_)
         for i, j in ((0, 1), (1, 2), (2, 0)):
             inward = np.cross(normal, triangle[:, j] - triangle[:, i])
-            within &= dots(inward, middle - triangle[:, i]) > 0
+            within &= row_dots(inward, middle - triangle[:, i]) > 0
         is_there[rows[within]] = True
         return is_there
 
 
-def _rays(unit: FloatArray, faces: IntArray) -> TriangleRays:
-    tree = build_hierarchy(unit[faces].mean(axis=1), leaf_size=_LEAF_SIZE)
-    return TriangleRays.of(choose_backend("double"), tree, triangle_records(unit, faces))
+def _rays(unit: FloatArray, faces: IntArray) -> TriangleTree:
+    tree = build_balanced_tree(unit[faces].mean(axis=1), leaf_size=_LEAF_SIZE)
+    return TriangleTree.of(choose_backend("double"), tree, triangle_records(unit, faces))
 
 
 # Pieces joined.
@@ -213,15 +213,15 @@ def _corners_on(x: FloatArray, edges: IntArray) -> tuple[IntArray, BoolArray]:
     searching: Any = scipy.spatial
     corners = np.unique(edges)
     p, q = x[edges[:, 0]], x[edges[:, 1]]
-    half = 0.5 * lengths(q - p)
+    half = 0.5 * row_norms(q - p)
     near = searching.cKDTree(x[corners]).query_ball_point(0.5 * (p + q), half)
     count = np.array([len(some) for some in near])
     row = np.repeat(np.arange(len(edges)), count)
     corner = corners[np.fromiter(itertools.chain.from_iterable(near), np.int64, int(count.sum()))]
     way = (q - p)[row] / np.maximum(2 * half[row], 1e-300)[:, None]
     to = x[corner] - p[row]
-    along = dots(to, way)
-    is_on = lengths(to - along[:, None] * way) <= _SAME
+    along = row_dots(to, way)
+    is_on = row_norms(to - along[:, None] * way) <= _SAME
     is_on &= (corner != edges[row, 0]) & (corner != edges[row, 1])
     is_on &= (along > 0) & (along < 2 * half[row])
     row, corner, off = row[is_on], corner[is_on], np.abs(along - half[row])[is_on]
@@ -233,17 +233,17 @@ def _corners_on(x: FloatArray, edges: IntArray) -> tuple[IntArray, BoolArray]:
 
 
 def neighbors(x: FloatArray, faces: IntArray) -> IntArray:
-    """(k, 2) pairs of `directed_edges` of faces at which two belong together: at edges of two, and
+    """(k, 2) pairs of `half_edges` of faces at which two belong together: at edges of two, and
     at those of more that have the material between them."""
-    pairs, m = directed_edges(faces), len(faces)
+    pairs, m = half_edges(faces), len(faces)
     edges = Edges.of(pairs)
-    beside = [edges.twice()]
-    start = np.cumsum(edges.uses) - edges.uses
-    for k in np.flatnonzero((edges.uses > 2) & (edges.uses % 2 == 0)):
-        halves = edges.order[start[k] : start[k] + edges.uses[k]]
-        is_along = pairs[halves, 0] == edges.ends[k, 0]
+    beside = [edges.paired_half_edges()]
+    start = np.cumsum(edges.multiplicity) - edges.multiplicity
+    for k in np.flatnonzero((edges.multiplicity > 2) & (edges.multiplicity % 2 == 0)):
+        halves = edges.pairs_by_edge[start[k] : start[k] + edges.multiplicity[k]]
+        is_along = pairs[halves, 0] == edges.vertices[k, 0]
         third = faces[halves % m].sum(axis=1) - pairs[halves].sum(axis=1)
-        beside.append(halves[_wedges(x[edges.ends[k]], x[third], is_along)])
+        beside.append(halves[_wedges(x[edges.vertices[k]], x[third], is_along)])
     return np.concatenate(beside)
 
 

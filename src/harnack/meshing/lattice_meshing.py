@@ -18,41 +18,51 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
-from harnack.meshing.bcc_lattice import Lattice, distinct_rows
-from harnack.meshing.checks import HopelessError, MeshingError, TooLargeError, singular_vertices
-from harnack.meshing.delaunay_points import Boundary, PointSet, newton, to_multiple_roots
-from harnack.meshing.edges import IntArray, distinct, lengths, numbered
-from harnack.meshing.isotopy import Isotopy, isotopy_of
-from harnack.meshing.level_function import LevelFunction, Samples
-from harnack.meshing.marching_tetrahedra import (
-    BEYOND,
-    Tetrahedra,
-    crossings_of,
-    triangles_of,
+from harnack.meshing.bcc_lattice import BccLattice, distinct_rows
+from harnack.meshing.checks import (
+    MeshingError,
+    TriangleLimitError,
+    UnrefinableError,
+    nonmanifold_vertices,
 )
-from harnack.meshing.refinement import refined, smoothed, smoothed_within
+from harnack.meshing.delaunay_points import (
+    BoundaryCurve,
+    TetrahedronPoints,
+    newton_to_level,
+    to_multiple_roots,
+)
+from harnack.meshing.edges import IntArray, row_norms, sorted_unique, unique_with_inverse
+from harnack.meshing.isotopy import IsotopyCoverage, isotopy_of
+from harnack.meshing.level_function import LevelFunction, LevelSamples
+from harnack.meshing.marching_tetrahedra import (
+    OUTSIDE_VALUE,
+    Tetrahedra,
+    count_crossings,
+    extract_triangles,
+)
+from harnack.meshing.refinement import refine, smooth, smooth_within_tolerance
 
 if TYPE_CHECKING:
     from harnack.tree.empty_space import Clearance
 
 __all__ = [
-    "Elsewhere",
-    "MissedError",
-    "Surface",
-    "check_nothing_missed",
-    "check_size",
-    "closed_surface",
-    "cut_where_far",
-    "open_surface",
+    "IrrelevantRegion",
+    "MissedPartsError",
+    "TriangleMesh",
+    "check_estimated_triangles",
+    "check_no_missed_parts",
+    "mesh_closed_surface",
+    "mesh_open_surface",
+    "split_faces_off_level",
 ]
 
 # Lengths in cells, for points of missed parts: how near the level seems to a lattice point; how far
 # the point may be moved to it; how far a point that is found has to be from all triangles, by their
 # corners and centers, which are less than half a cell from all that is on them; and from the faces
 # of the box, beyond which there may be more.
-_NEAR, _FOUND, _APART, _DEEP = 1.0, 1.5, 0.75, 0.5
+_MAX_SEED_DISTANCE, _MAX_SEED_MOVE, _MIN_MESH_DISTANCE, _MIN_WALL_DISTANCE = 1.0, 1.5, 0.75, 0.5
 # Points nearer than the first belong together; parts at least as long as the second are missed.
-_TOGETHER, _LONG = 1.0, 2.0
+_CLUSTER_DISTANCE, _MIN_MISSED_LENGTH = 1.0, 2.0
 # Parts thinner than this many cells are missed nearly everywhere; and the thinnest measured.
 _THIN, _LEAST = 0.25, 2.0**-7
 # How near to the level, in cells, a point has to come by Newton's method.
@@ -71,7 +81,7 @@ _MOST_FLAT, _MOST_PROBES = 0.75, 2000
 _FLAT_AROUND = 0.25
 
 
-class MissedError(MeshingError):
+class MissedPartsError(MeshingError):
     """A level set of which some parts lie between the points of a lattice.
 
     places: (k, 3) of the longest one, on the level; thickness: (k,) of the part there, a multiple
@@ -85,19 +95,19 @@ class MissedError(MeshingError):
         super().__init__(message)
         self.places, self.thickness, self.size = places, thickness, size
 
-    def is_mended_by(self, smaller: float) -> bool:
+    def may_be_fixed_by(self, smaller: float) -> bool:
         """Not if these cells would miss a part of it as well, two of them long and far thinner than
         one: as beside a cusp or a cone's tip, which cells of no size show."""
         thin = self.places[self.thickness < _THIN * smaller * self.size]
-        part = _longest_part(thin, _TOGETHER * self.size)
+        part = _longest_part(thin, _CLUSTER_DISTANCE * self.size)
         reach = float(np.ptp(part, axis=0).max()) if len(part) else 0.0
-        return reach < _LONG * smaller * self.size
+        return reach < _MIN_MISSED_LENGTH * smaller * self.size
 
 
-def check_nothing_missed(
+def check_no_missed_parts(
     function: LevelFunction,
     points: FloatArray,
-    samples: Samples,
+    samples: LevelSamples,
     is_beside: BoolArray,
     surface: tuple[FloatArray, IntArray],
     size: float,
@@ -116,42 +126,43 @@ def check_nothing_missed(
         how far around points it does not.
 
     Raises:
-        MissedError: with one of the places. HopelessError: the function is its level in a volume,
-            or touches it along a surface.
+        MissedPartsError: with one of the places. UnrefinableError: the function is its level in a
+            volume, or touches it along a surface.
     """
     import scipy.spatial  # here: half a second that few need
 
     searching: Any = scipy.spatial
-    rows = np.flatnonzero(~is_beside & (samples.distance < _NEAR * size))
+    rows = np.flatnonzero(~is_beside & (samples.distance < _MAX_SEED_DISTANCE * size))
     if not len(rows):
         return
     start = points[rows]
     step = np.full(len(rows), 0.5 * size)
-    x = newton(function, start, samples.some(rows), step, None)
-    left = function.at(x)
+    x = newton_to_level(function, start, samples.select(rows), step, None)
+    left = function.sample(x)
     found = left.distance < _ON * size
     slow = ~found & (left.distance < _SLOW * samples.distance[rows])
     if slow.any():
-        x[slow] = to_multiple_roots(function, x[slow], left.some(slow), step[slow])
-        found[slow] = function.at(x[slow]).distance < _ON * size
-    found &= lengths(x - start) < _FOUND * size
-    deep = _DEEP * size
+        x[slow] = to_multiple_roots(function, x[slow], left.select(slow), step[slow])
+        found[slow] = function.sample(x[slow]).distance < _ON * size
+    found &= row_norms(x - start) < _MAX_SEED_MOVE * size
+    deep = _MIN_WALL_DISTANCE * size
     found &= ((x >= box[0] + deep) & (x <= box[1] - deep)).all(axis=1)
     x = x[found]
     vertices, faces = surface
     if len(faces) and len(x):
         around = np.concatenate([vertices[np.unique(faces)], vertices[faces].mean(axis=1)])
-        x = x[searching.cKDTree(around).query(x)[0] > _APART * size]
+        x = x[searching.cKDTree(around).query(x)[0] > _MIN_MESH_DISTANCE * size]
     if elsewhere is not None and len(x):
         x = x[elsewhere(x) <= 0]
-    part = _longest_part(x, _TOGETHER * size)
-    if len(part) and np.ptp(part, axis=0).max() >= _LONG * size:
+    part = _longest_part(x, _CLUSTER_DISTANCE * size)
+    if len(part) and np.ptp(part, axis=0).max() >= _MIN_MISSED_LENGTH * size:
         _check_off_level_around(function, part, _FLAT_AROUND * size)
         _check_passes_level(function, part, size)
         a, b, c = part[0]
-        raise MissedError(
+        raise MissedPartsError(
             f"cells of {size:.3g} miss parts of the level set, such as that at ({a:.4g}, {b:.4g}, "
-            f"{c:.4g}), which are thinner or smaller: choose a smaller `spacing`, or for a wall or "
+            f"{c:.4g}), which are thinner or smaller: choose a smaller `cell_size`, or for a wall "
+            "or "
             "an edge make the solid of smooth parts, such as hk.solid(f, between=(low, high)) or "
             "hk.solid(f, below=0) & hk.solid(g, below=0)",
             part,
@@ -163,8 +174,8 @@ def check_nothing_missed(
 def _thickness(function: LevelFunction, x: FloatArray, size: float) -> FloatArray:
     """(k,) how far points (k, 3) on the level are from where the sign changes again along the
     slope, up to `size`: 0 where it does not change at the point itself, inf where not again."""
-    slope = function.at(x).gradient
-    way = slope / np.maximum(lengths(slope), 1e-300)[:, None]
+    slope = function.sample(x).gradient
+    way = slope / np.maximum(row_norms(slope), 1e-300)[:, None]
     far = size * 2.0 ** np.arange(round(math.log2(_LEAST)), 1)
     sides: list[BoolArray] = []
     least = np.full(len(x), np.inf)
@@ -187,7 +198,7 @@ def _check_off_level_around(function: LevelFunction, part: FloatArray, reach: fl
     is_flat = function.is_on_level(around).reshape(len(some), -1).all(axis=1)
     if is_flat.mean() > 0.5:
         a, b, c = some[is_flat][0]
-        raise HopelessError(
+        raise UnrefinableError(
             f"{type(function.field).__name__} is {function.level:g}, up to rounding, at and around "
             f"points such as ({a:.4g}, {b:.4g}, {c:.4g}): its level there is a volume and no "
             "surface; choose another level"
@@ -203,9 +214,11 @@ def _check_passes_level(function: LevelFunction, part: FloatArray, size: float) 
     """
     x = part[:: -(-len(part) // _MOST_TRIED)]
     half = _BESIDE * size
-    beside = function.at((x[:, None] + half * np.eye(3)).reshape(-1, 3)).gradient.reshape(-1, 3, 3)
+    beside = function.sample((x[:, None] + half * np.eye(3)).reshape(-1, 3)).gradient.reshape(
+        -1, 3, 3
+    )
     steepest = beside[np.arange(len(x)), (beside**2).sum(axis=2).argmax(axis=1)]
-    way = steepest / np.maximum(lengths(steepest), 1e-300)[:, None]
+    way = steepest / np.maximum(row_norms(steepest), 1e-300)[:, None]
 
     def along(s: FloatArray) -> FloatArray:
         return function.values(x + s[:, None] * way)
@@ -223,7 +236,7 @@ def _check_passes_level(function: LevelFunction, part: FloatArray, size: float) 
     if touches.mean() > 0.5:
         a, b, c = x[touches][0]
         name, level = type(function.field).__name__, function.level
-        raise HopelessError(
+        raise UnrefinableError(
             f"{name} comes to {level:g} without passing it, as a square does, at points such as "
             f"({a:.4g}, {b:.4g}, {c:.4g}): the surface there has one side only and no mesh finds "
             "it. Give a function that changes its sign there, such as u instead of u^2, or mesh a "
@@ -251,7 +264,7 @@ def _longest_part(x: FloatArray, apart: float) -> FloatArray:
     return x[part == (high - low).max(axis=1).argmax()]
 
 
-def check_size(
+def check_estimated_triangles(
     function: LevelFunction, vertices: FloatArray, faces: IntArray, tolerance: float
 ) -> None:
     """Raise if refinement would make more triangles of these than the function allows: an estimate,
@@ -262,19 +275,19 @@ def check_size(
 
     Raises:
         MeshingError: the function has no slope between the vertices.
-        TooLargeError: with the estimate, and a tolerance that would do.
+        TriangleLimitError: with the estimate, and a tolerance that would do.
     """
     some = faces[:: max(1, len(faces) // 20_000)]
     if not len(some):
         return
     corner = vertices[some]
-    at = function.at(0.5 * (corner + np.roll(corner, 1, axis=1)).reshape(-1, 3))
+    at = function.sample(0.5 * (corner + np.roll(corner, 1, axis=1)).reshape(-1, 3))
     is_flat = (at.value != 0) & ~at.gradient.any(axis=1)
     if is_flat.any():
         raise MeshingError(
             f"{type(function.field).__name__} is constant at {is_flat.sum():,} of "
             f"{len(is_flat):,} middles of edges, so that it does not say how far the surface is: "
-            "choose a smaller `spacing`, or a function with a slope within a cell of its surface"
+            "choose a smaller `cell_size`, or a function with a slope within a cell of its surface"
         )
     middle = at.distance
     ratio = middle.reshape(-1, 3).max(axis=1) / tolerance
@@ -282,7 +295,7 @@ def check_size(
     most = function.most_faces
     if expected > most:
         enough = expected / most
-        raise TooLargeError(
+        raise TriangleLimitError(
             f"the tolerance takes about {expected:.1e} triangles, and max_triangles is {most:,}: "
             f"choose a `tolerance` {enough:.2g} times as large, or a larger max_triangles"
         )
@@ -298,97 +311,97 @@ _MOST_ROUNDS = 20
 
 
 @dataclass(frozen=True)
-class Surface:
+class TriangleMesh:
     """vertices: (n, 3). faces: (m, 3), counter-clockwise as seen from where f is greater."""
 
     vertices: FloatArray
     faces: IntArray
 
     @classmethod
-    def of(cls, vertices: FloatArray, faces: IntArray) -> Surface:
+    def without_unused_vertices(cls, vertices: FloatArray, faces: IntArray) -> TriangleMesh:
         """Without the vertices that are not in use."""
         used = np.flatnonzero(np.bincount(faces.ravel()))
         place = np.full(len(vertices), -1, np.int64)
         place[used] = np.arange(len(used))
         return cls(vertices[used], place[faces])
 
-    def reversed(self) -> Surface:
+    def reversed(self) -> TriangleMesh:
         """With the faces' other side outside."""
-        return Surface(self.vertices, self.faces[:, ::-1])
+        return TriangleMesh(self.vertices, self.faces[:, ::-1])
 
 
 @dataclass(frozen=True)
-class Elsewhere:
+class IrrelevantRegion:
     """Where nothing matters, of one or several surfaces: how far around points (k, 3) nothing does.
 
-    found: the cells of lattices that are not proved to be there, each looked for once.
+    cached_cells: the cells of lattices that are not proved to be there, each looked for once.
     """
 
     clearance: Clearance
-    found: dict[tuple[float, ...], IntArray] = dataclasses.field(
+    cached_cells: dict[tuple[float, ...], IntArray] = dataclasses.field(
         default_factory=dict[tuple[float, ...], IntArray]
     )
 
-    def cells_beside(self, lattice: Lattice, most: int) -> IntArray:
+    def relevant_cells(self, lattice: BccLattice, most: int) -> IntArray:
         """(n, 3) indices of the cells that are not there, and of some around them.
 
         Raises:
             MeshingError: there are more than `most` triangles would take.
         """
         key = (*lattice.lower.tolist(), *lattice.size.tolist(), *lattice.counts.tolist(), most)
-        if key not in self.found:
+        if key not in self.cached_cells:
             border = _BORDER * float(lattice.size.max())
-            self.found[key] = lattice.cells_not_empty(
+            self.cached_cells[key] = lattice.nonempty_cells(
                 lambda points: self.clearance(points) - border, most
             )
-        return self.found[key]
+        return self.cached_cells[key]
 
 
-def open_surface(
-    function: LevelFunction, lattice: Lattice, tolerance: float, report: Callable[[str], None]
-) -> tuple[Surface, Isotopy]:
+def mesh_open_surface(
+    function: LevelFunction, lattice: BccLattice, tolerance: float, report: Callable[[str], None]
+) -> tuple[TriangleMesh, IsotopyCoverage]:
     """The level set in the box of a lattice, which ends on the box's faces; and what is proved of
     it, before it is refined.
 
     tolerance: of the middles of edges and faces, a length.
 
     Raises:
-        MeshingError: no cell is cut, or there are too many; a HopelessError where the function is
-            not finite, or its level is a volume.
+        MeshingError: no cell is cut, or there are too many; a UnrefinableError where the function
+            is not finite, or its level is a volume.
     """
     walls = lattice.lower, lattice.upper
-    cells = lattice.cells_not_empty(function.clearance, function.most_faces)
+    cells = lattice.nonempty_cells(function.clearance, function.most_faces)
     coordinates, corners = lattice.tetrahedra(cells)
     points = lattice.points(coordinates)
     report(f"{len(points):,} points, {len(corners):,} tetrahedra")
     nowhere = np.zeros(len(points), np.bool_)
-    samples = _sampled(function, points, lattice, nowhere)
-    first = _marched(function, points, samples, corners, nowhere, nowhere, lattice, walls)
+    samples = _sample_lattice(function, points, lattice, nowhere)
+    first = _march(function, points, samples, corners, nowhere, nowhere, lattice, walls)
     vertices, faces = first.vertices, first.faces
     _check_nothing_missed(function, points, samples, corners, first, faces, lattice, walls)
     if not len(faces):
         raise MeshingError("the level set is empty: no cell of the box holds the level")
     _check_is_continuous(function, vertices, faces, lattice)
-    check_size(function, vertices, faces, tolerance)
-    none = Boundary(np.zeros((0, 3)), np.zeros((0, 2), np.int64))
+    check_estimated_triangles(function, vertices, faces, tolerance)
+    none = BoundaryCurve(np.zeros((0, 3)), np.zeros((0, 2), np.int64))
     size = float(lattice.size.max())
     cut = first.is_cut(corners)
     isotopy = isotopy_of(function, first.points, corners, cut, faces, none, size, walls)
-    vertices = smoothed(function, vertices, faces, walls)
-    vertices, faces = refined(function, vertices, faces, tolerance, walls, report)
-    vertices = smoothed_within(function, vertices, faces, walls, tolerance)
-    return Surface.of(vertices, faces), isotopy
+    vertices = smooth(function, vertices, faces, walls)
+    vertices, faces = refine(function, vertices, faces, tolerance, walls, report)
+    vertices = smooth_within_tolerance(function, vertices, faces, walls, tolerance)
+    return TriangleMesh.without_unused_vertices(vertices, faces), isotopy
 
 
-def closed_surface(
+def mesh_closed_surface(
     function: LevelFunction,
-    lattice: Lattice,
+    lattice: BccLattice,
     tolerance: float,
     report: Callable[[str], None],
     *,
     as_cut: bool = False,
-    elsewhere: Elsewhere | None = None,
-) -> Surface:
+    elsewhere: IrrelevantRegion | None = None,
+) -> TriangleMesh:
     """The boundary of the points of a lattice's box where the function is negative.
 
     On the box it is made of the faces of the cells whose centers are negative, as if the points of
@@ -407,10 +420,10 @@ def closed_surface(
     """
     most, does_matter = function.most_faces, None
     if elsewhere is None:
-        cells = lattice.cells_not_empty(function.clearance, most)
+        cells = lattice.nonempty_cells(function.clearance, most)
     else:
-        cells, does_matter = lattice.cells_that_matter(
-            function.clearance, elsewhere.cells_beside(lattice, most), function.values, most
+        cells, does_matter = lattice.relevant_cells(
+            function.clearance, elsewhere.relevant_cells(lattice, most), function.values, most
         )
     outer = lattice.outer_cells()
     if does_matter is not None:
@@ -419,22 +432,20 @@ def closed_surface(
     coordinates, corners = lattice.tetrahedra(distinct_rows(np.concatenate([cells, outer])))
     points = lattice.points(coordinates)
     report(f"{len(points):,} points, {len(corners):,} tetrahedra")
-    is_wall = lattice.is_outer(coordinates)
+    is_wall = lattice.is_on_box(coordinates)
     is_fixed = is_wall | ((coordinates == 1) | (coordinates == 2 * lattice.counts - 1)).any(axis=1)
     is_beyond = np.zeros(len(points), np.bool_)
     if does_matter is not None:
-        is_beyond = lattice.beside(coordinates, ~does_matter) & ~is_wall
-    samples = _sampled(function, points, lattice, is_beyond)
-    first = _marched(
-        function, points, samples, corners, is_fixed | is_beyond, is_wall, lattice, None
-    )
+        is_beyond = lattice.touches_cells(coordinates, ~does_matter) & ~is_wall
+    samples = _sample_lattice(function, points, lattice, is_beyond)
+    first = _march(function, points, samples, corners, is_fixed | is_beyond, is_wall, lattice, None)
     vertices, faces = first.vertices, first.faces
     is_coarse = first.is_beside(is_wall | is_beyond)
     is_cap = is_coarse[faces].any(axis=1)
     rest, caps = faces[~is_cap], [faces[is_cap], _wall_faces(points, samples, corners, is_wall)]
     inner = lattice.lower + 2 * lattice.size, lattice.upper - 2 * lattice.size
     if as_cut:
-        return Surface.of(vertices, np.concatenate([rest, *caps]))
+        return TriangleMesh.without_unused_vertices(vertices, np.concatenate([rest, *caps]))
     _check_nothing_missed(
         function, points, samples, corners, first, faces, lattice, inner,
         None if elsewhere is None else elsewhere.clearance,
@@ -442,18 +453,22 @@ def closed_surface(
     # What ends at the outermost cells is moved and cut, its ends are not.
     if len(rest):
         _check_is_continuous(function, vertices, rest, lattice)
-        check_size(function, vertices, rest, tolerance)
-        vertices = smoothed(function, vertices, rest, None)
+        check_estimated_triangles(function, vertices, rest, tolerance)
+        vertices = smooth(function, vertices, rest, None)
         counts = _inside(lattice, does_matter)
-        vertices, rest = refined(function, vertices, rest, tolerance, None, report, counts)
-        vertices = smoothed_within(function, vertices, rest, None, tolerance, counts)
+        vertices, rest = refine(function, vertices, rest, tolerance, None, report, counts)
+        vertices = smooth_within_tolerance(function, vertices, rest, None, tolerance, counts)
     faces = np.concatenate([rest, *caps])
-    return Surface.of(vertices, faces) if len(faces) else Surface(np.zeros((0, 3)), faces)
+    return (
+        TriangleMesh.without_unused_vertices(vertices, faces)
+        if len(faces)
+        else TriangleMesh(np.zeros((0, 3)), faces)
+    )
 
 
-def cut_where_far(
-    function: LevelFunction, surface: Surface, farthest: float, times: int
-) -> Surface:
+def split_faces_off_level(
+    function: LevelFunction, surface: TriangleMesh, farthest: float, times: int
+) -> TriangleMesh:
     """Faces whose center is farther than that from the level, as across a crease, cut into three at
     a point on it; so are the new ones, a few times. All edges stay."""
     vertices, faces = surface.vertices, surface.faces
@@ -461,27 +476,27 @@ def cut_where_far(
     for _ in range(times):
         corner = vertices[faces[asked]]
         center = corner.mean(axis=1)
-        samples = function.at(center)
+        samples = function.sample(center)
         far = np.flatnonzero(samples.distance > farthest)
         if not len(far):
             break
-        span = 0.5 * lengths(corner[far, 1] - corner[far, 0])
-        moved = newton(function, center[far], samples.some(far), span, None)
+        span = 0.5 * row_norms(corner[far, 1] - corner[far, 0])
+        moved = newton_to_level(function, center[far], samples.select(far), span, None)
         rows, inner = asked[far], len(vertices) + np.arange(len(far))
         a, b, c = faces[rows].T
         vertices = np.concatenate([vertices, moved])
         fans = [np.stack([*ends, inner], axis=1) for ends in ((a, b), (b, c), (c, a))]
         faces = np.concatenate([np.delete(faces, rows, axis=0), *fans])
         asked = np.arange(len(faces) - 3 * len(rows), len(faces))
-    return Surface(vertices, faces)
+    return TriangleMesh(vertices, faces)
 
 
-def _are_negative(function: LevelFunction, lattice: Lattice, cells: IntArray) -> BoolArray:
+def _are_negative(function: LevelFunction, lattice: BccLattice, cells: IntArray) -> BoolArray:
     """(k,) whether the centers of cells (k, 3) are negative: as those of blocks of cells, where it
     is proved that the level is not in the block."""
     shape = lattice.counts // _BLOCK + 1
     x, y, z = (cells // _BLOCK).T
-    keys, index, _, _ = numbered((x * shape[1] + y) * shape[2] + z)
+    keys, index, _, _ = unique_with_inverse((x * shape[1] + y) * shape[2] + z)
     rest, z = np.divmod(keys, shape[2])
     blocks = np.stack([*np.divmod(rest, shape[1]), z], axis=1)
     centers = lattice.points(_BLOCK * (2 * blocks + 1))
@@ -496,24 +511,26 @@ def _are_negative(function: LevelFunction, lattice: Lattice, cells: IntArray) ->
 def _check_nothing_missed(
     function: LevelFunction,
     points: FloatArray,
-    samples: Samples,
+    samples: LevelSamples,
     corners: IntArray,
-    first: _First,
+    first: _InitialMesh,
     faces: IntArray,
-    lattice: Lattice,
+    lattice: BccLattice,
     box: tuple[FloatArray, FloatArray],
     elsewhere: Clearance | None = None,
 ) -> None:
     # Tetrahedra with corners on both sides; those with corners on the level may have no face.
-    side = np.where(first.points.is_on, 0.0, np.sign(first.points.samples.value))[corners]
+    side = np.where(first.points.is_on_level, 0.0, np.sign(first.points.samples.value))[corners]
     is_beside = np.zeros(len(points), np.bool_)
     is_beside[corners[(side.min(axis=1) < 0) & (side.max(axis=1) > 0)]] = True
     surface = first.vertices, faces
     size = float(lattice.size.max())
-    check_nothing_missed(function, points, samples, is_beside, surface, size, box, elsewhere)
+    check_no_missed_parts(function, points, samples, is_beside, surface, size, box, elsewhere)
 
 
-def _inside(lattice: Lattice, does_matter: BoolArray | None) -> Callable[[FloatArray], BoolArray]:
+def _inside(
+    lattice: BccLattice, does_matter: BoolArray | None
+) -> Callable[[FloatArray], BoolArray]:
     """Which points are farther than one and a half cells from the box, and neither in nor beside
     cells that do not matter (counts).
 
@@ -521,21 +538,21 @@ def _inside(lattice: Lattice, does_matter: BoolArray | None) -> Callable[[FloatA
     stays as it is, and their centers are no deeper than that.
     """
     lower, upper = lattice.lower + 1.5 * lattice.size, lattice.upper - 1.5 * lattice.size
-    deep = None if does_matter is None else lattice.deep(does_matter)
+    deep = None if does_matter is None else lattice.interior_cells(does_matter)
 
     def counts(points: FloatArray) -> BoolArray:
         found = np.ones(len(points), np.bool_)
         for x, low, high in zip(points.T, lower, upper, strict=True):
             found &= (x >= low) & (x <= high)
         if deep is not None:
-            found &= deep[tuple(lattice.cells_of(points).T)]
+            found &= deep[tuple(lattice.cell_indices(points).T)]
         return found
 
     return counts
 
 
 def _wall_faces(
-    points: FloatArray, samples: Samples, corners: IntArray, is_wall: BoolArray
+    points: FloatArray, samples: LevelSamples, corners: IntArray, is_wall: BoolArray
 ) -> IntArray:
     """Faces (m, 3) on the box of tetrahedra whose fourth corner is negative, seen from outside."""
     on = is_wall[corners]
@@ -550,20 +567,20 @@ def _wall_faces(
     return face
 
 
-def _sampled(
-    function: LevelFunction, points: FloatArray, lattice: Lattice, is_beyond: BoolArray
-) -> Samples:
+def _sample_lattice(
+    function: LevelFunction, points: FloatArray, lattice: BccLattice, is_beyond: BoolArray
+) -> LevelSamples:
     """The function at points of a lattice, far on the positive side at those beyond what matters;
-    raises HopelessError where it is not finite, or is its level nearly everywhere."""
+    raises UnrefinableError where it is not finite, or is its level nearly everywhere."""
     count = len(points)
-    samples = Samples(np.full(count, 10 * BEYOND), np.ones((count, 3)), np.zeros(count))
+    samples = LevelSamples(np.full(count, 10 * OUTSIDE_VALUE), np.ones((count, 3)), np.zeros(count))
     points = points[~is_beyond]
-    samples = samples.replaced(~is_beyond, function.at(points))
+    samples = samples.replaced(~is_beyond, function.sample(points))
     bad = ~np.isfinite(samples.value[~is_beyond])
     if bad.any():
         x, y, z = points[bad][0]
-        nearer = ", or a smaller `spacing`: it is asked for three cells around other parts"
-        raise HopelessError(
+        nearer = ", or a smaller `cell_size`: it is asked for three cells around other parts"
+        raise UnrefinableError(
             f"{type(function.field).__name__} has no finite value at {bad.sum():,} points, such "
             f"as ({x:.4g}, {y:.4g}, {z:.4g}): choose a `clip` where it has"
             + (nearer if is_beyond.any() else "")
@@ -573,15 +590,15 @@ def _sampled(
 
 
 def _check_is_continuous(
-    function: LevelFunction, vertices: FloatArray, faces: IntArray, lattice: Lattice
+    function: LevelFunction, vertices: FloatArray, faces: IntArray, lattice: BccLattice
 ) -> None:
     """Raise if at many vertices the sign of the function changes and the level is not near: it
     jumps there, and refinement would never come to an end."""
     x = vertices[np.unique(faces)]
-    is_far = function.at(x).distance > _FAR * float(lattice.size.max())
+    is_far = function.sample(x).distance > _FAR * float(lattice.size.max())
     if is_far.sum() > _MOST_JUMPS * len(x):
         a, b, c = x[is_far][0]
-        raise HopelessError(
+        raise UnrefinableError(
             f"{type(function.field).__name__} changes its sign without coming to its level at "
             f"{is_far.sum():,} of {len(x):,} places, such as ({a:.4g}, {b:.4g}, {c:.4g}): it jumps "
             "there, as at the cut of atan2 or a pole; choose a `clip` without it, or write it "
@@ -590,7 +607,7 @@ def _check_is_continuous(
 
 
 def _check_off_level_at_most_points(
-    function: LevelFunction, points: FloatArray, lattice: Lattice
+    function: LevelFunction, points: FloatArray, lattice: BccLattice
 ) -> None:
     """Raise if the function is its level nearly everywhere, up to rounding: such as x - x, of which
     no cells are proved empty, however small they are."""
@@ -599,7 +616,7 @@ def _check_off_level_at_most_points(
     some = points[:: -(-len(points) // _MOST_PROBES)]
     share = float(function.is_on_level(some).mean())
     if share > _MOST_FLAT:
-        raise HopelessError(
+        raise UnrefinableError(
             f"{type(function.field).__name__} is {function.level:g}, up to rounding, at "
             f"{share:.0%} of the points looked at: its level there is a volume and no surface; "
             "choose another level"
@@ -607,7 +624,7 @@ def _check_off_level_at_most_points(
 
 
 @dataclass(frozen=True)
-class _First:
+class _InitialMesh:
     """Vertices and faces before they are refined, and the points of the tetrahedra, those near the
     level moved onto it; rows: (k,) the tetrahedra that the level may pass through between points,
     and crossed: (k,) whether it does; ends: (j, 2) points at the ends of the edges on which the
@@ -615,14 +632,14 @@ class _First:
 
     vertices: FloatArray
     faces: IntArray
-    points: PointSet
+    points: TetrahedronPoints
     rows: IntArray
     crossed: BoolArray
     ends: IntArray
 
     def is_cut(self, corners: IntArray) -> BoolArray:
         """(m,) which of all tetrahedra, by their corners (m, 4), hold points of the faces."""
-        cut = _have_any(self.points.is_on, corners)
+        cut = _have_any(self.points.is_on_level, corners)
         cut[self.rows] |= self.crossed
         return cut
 
@@ -631,38 +648,38 @@ class _First:
         return np.concatenate([chosen, chosen[self.ends].any(axis=1)])
 
 
-def _marched(
+def _march(
     function: LevelFunction,
     points: FloatArray,
-    samples: Samples,
+    samples: LevelSamples,
     corners: IntArray,
     is_fixed: BoolArray,
     is_wall: BoolArray,
-    lattice: Lattice,
+    lattice: BccLattice,
     walls: tuple[FloatArray, FloatArray] | None,
-) -> _First:
+) -> _InitialMesh:
     """Vertices and faces of a manifold, with points near the level moved onto it.
 
     is_fixed: (n,) points that are not moved. is_wall: (n,) those that count as on the level.
     """
     at_rest, original = points, samples
-    points, samples, is_on = _snapped(function, points, samples, is_fixed, lattice, walls)
+    points, samples, is_on = _snap_points(function, points, samples, is_fixed, lattice, walls)
     is_on |= is_wall
     wrong, is_asked = np.zeros(0, np.int64), np.ones(len(points), np.bool_)
     rows = found = np.flatnonzero(_may_be_cut(samples.value, is_on, corners))
     for _ in range(_MOST_ROUNDS):
-        some, tets = PointSet(points, is_on, samples), Tetrahedra.of(points, corners[rows])
-        crossings = crossings_of(function, some, tets)
+        some, tets = TetrahedronPoints(points, is_on, samples), Tetrahedra.of(points, corners[rows])
+        crossings = count_crossings(function, some, tets)
         # Where vertices lie on edges does not matter for what touches.
-        _, faces = triangles_of(function, some, tets, crossings, _middles)
-        wrong = singular_vertices(faces)
+        _, faces = extract_triangles(function, some, tets, crossings, _middles)
+        wrong = nonmanifold_vertices(faces)
         wrong = wrong[wrong < len(points)]
         wrong = wrong[(is_asked & ~is_wall)[wrong]]
         if not len(wrong):
             break
         points, is_on = points.copy(), is_on.copy()
         points[wrong], is_on[wrong] = at_rest[wrong], False
-        samples = samples.replaced(wrong, original.some(wrong))
+        samples = samples.replaced(wrong, original.select(wrong))
         # Only points beside these may touch anew: with all of their tetrahedra.
         near, is_asked = np.zeros(len(points), np.bool_), np.zeros(len(points), np.bool_)
         near[wrong] = True
@@ -672,46 +689,46 @@ def _marched(
         found = np.concatenate([found, rows])
     else:
         raise MeshingError(
-            f"sheets of the level set touch at {len(wrong)} places: choose a smaller `spacing`"
+            f"sheets of the level set touch at {len(wrong)} places: choose a smaller `cell_size`"
         )
     # Others have the same points as before.
-    rows = distinct(found)
+    rows = sorted_unique(found)
     rows = rows[_may_be_cut(samples.value, is_on, corners[rows])]
-    some, tets = PointSet(points, is_on, samples), Tetrahedra.of(points, corners[rows])
-    crossings = crossings_of(function, some, tets)
-    vertices, faces = triangles_of(function, some, tets, crossings)
+    some, tets = TetrahedronPoints(points, is_on, samples), Tetrahedra.of(points, corners[rows])
+    crossings = count_crossings(function, some, tets)
+    vertices, faces = extract_triangles(function, some, tets, crossings)
     crossed: BoolArray = np.asarray((crossings.count[tets.edges] != 0).any(axis=1))
     ends = tets.ends[np.flatnonzero(crossings.count)]
-    return _First(vertices, faces, some, rows, crossed, ends)
+    return _InitialMesh(vertices, faces, some, rows, crossed, ends)
 
 
 def _middles(low: FloatArray, high: FloatArray) -> FloatArray:
     return 0.5 * (low + high)
 
 
-def _snapped(
+def _snap_points(
     function: LevelFunction,
     points: FloatArray,
-    samples: Samples,
+    samples: LevelSamples,
     is_fixed: BoolArray,
-    lattice: Lattice,
+    lattice: BccLattice,
     walls: tuple[FloatArray, FloatArray] | None,
-) -> tuple[FloatArray, Samples, BoolArray]:
+) -> tuple[FloatArray, LevelSamples, BoolArray]:
     """Points, those near the level moved onto it; their samples; and which are on it."""
     size = float(lattice.size.min())
     near = np.flatnonzero((samples.distance < _SNAPPED * size) & ~is_fixed)
     longest = np.full(len(near), 0.5 * _SNAPPED * size)
-    moved = newton(function, points[near], samples.some(near), longest, walls, steps=4)
-    there = function.at(moved)
-    apart = lengths(moved - points[near])
-    steep = lengths(there.gradient)
+    moved = newton_to_level(function, points[near], samples.select(near), longest, walls, steps=4)
+    there = function.sample(moved)
+    apart = row_norms(moved - points[near])
+    steep = row_norms(there.gradient)
     good = np.abs(there.value) < 1e-9 * np.maximum(steep * size, 1e-300)
     good &= apart < 1.2 * _SNAPPED * size
     rows = near[good]
     # A value of exactly 0 counts as on the level where it is, so that others have a sign.
     points, is_on = points.copy(), (samples.value == 0) & ~is_fixed
     points[rows], is_on[rows] = moved[good], True
-    return points, samples.replaced(rows, there.some(good)), is_on
+    return points, samples.replaced(rows, there.select(good)), is_on
 
 
 def _have_any(chosen: BoolArray, corners: IntArray) -> BoolArray:

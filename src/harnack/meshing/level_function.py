@@ -11,60 +11,69 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray, choose_backend
-from harnack.backend.elementary import length
-from harnack.enclosures import Gaps, Slopes, TargetLevels, choose_proofs, longest_step
-from harnack.fields.batch_evaluation import in_batches
-from harnack.fields.clearance import distance_below
-from harnack.fields.formula import without_weaker
-from harnack.fields.solids.mesh_solid import shared_samples
-from harnack.meshing.edges import lengths
+from harnack.backend.elementary import safe_norm
+from harnack.enclosures import LevelGaps, Levels, SlopeRange, choose_enclosures, longest_free_length
+from harnack.fields.batch_evaluation import map_batches
+from harnack.fields.clearance import level_distance_lower_bound
+from harnack.fields.formula import without_alternatives
+from harnack.fields.solids.mesh_solid import share_samples
+from harnack.meshing.edges import row_norms
 
 if TYPE_CHECKING:
     from harnack.backend import Real, Vec3
     from harnack.fields import Field
 
-__all__ = ["CELLS_PER_WAVE", "MOST_FACES", "LevelFunction", "Samples", "Uploads"]
+__all__ = ["CELLS_PER_WAVE", "MOST_FACES", "EvaluatorCache", "LevelFunction", "LevelSamples"]
 
 MOST_FACES = 2_000_000
 """Triangles of a level set, unless a person chooses otherwise."""
 
 CELLS_PER_WAVE = 5.0
-"""Cells along a wave (`Field.wavelength`), at the least, unless a spacing is given."""
+"""Cells along a wave (`Field.min_wavelength`), at the least, unless a spacing is given."""
 
-_PROOFS = choose_proofs("curvature")
+_PROOFS = choose_enclosures("curvature")
 
 
 @dataclass(frozen=True)
-class Samples:
+class LevelSamples:
     """The function at points.
 
     value: (n,) f - level; of an angle the nearest to 0, in [-period/2, period/2].
     gradient: (n, 3).
-    reach: (n,) as far as f is proved to move by less than a quarter of its period; 0 without one.
+    quarter_period_radius: (n,) as far as f is proved to move by less than a quarter of its period;
+        0 without one.
     """
 
     value: FloatArray
     gradient: FloatArray
-    reach: FloatArray
+    quarter_period_radius: FloatArray
 
-    def some(self, rows: Any) -> Samples:
+    def select(self, rows: Any) -> LevelSamples:
         """Those at some points, by index or mask."""
-        return Samples(self.value[rows], self.gradient[rows], self.reach[rows])
+        return LevelSamples(self.value[rows], self.gradient[rows], self.quarter_period_radius[rows])
 
-    def replaced(self, rows: Any, others: Samples) -> Samples:
+    def replaced(self, rows: Any, others: LevelSamples) -> LevelSamples:
         """With those at points `rows` replaced."""
-        value, gradient, reach = self.value.copy(), self.gradient.copy(), self.reach.copy()
-        value[rows], gradient[rows], reach[rows] = others.value, others.gradient, others.reach
-        return Samples(value, gradient, reach)
+        value, gradient, reach = (
+            self.value.copy(),
+            self.gradient.copy(),
+            self.quarter_period_radius.copy(),
+        )
+        value[rows], gradient[rows], reach[rows] = (
+            others.value,
+            others.gradient,
+            others.quarter_period_radius,
+        )
+        return LevelSamples(value, gradient, reach)
 
     @property
     def distance(self) -> FloatArray:
         """(n,) to the level, by the slope: |f - level|/|gradient|."""
-        steep = lengths(self.gradient)
+        steep = row_norms(self.gradient)
         return np.abs(self.value) / np.maximum(steep, 1e-300)
 
 
-class Uploads:
+class EvaluatorCache:
     """Fields on the backend of double precision, each prepared once."""
 
     def __init__(self) -> None:
@@ -82,15 +91,15 @@ class LevelFunction:
 
     most_faces: no more triangles may be made of it.
     evaluations: of f so far, in points. uploads: of fields, which functions share.
-    secants: how many find where an edge of a cell meets the level, of functions that are nearly
-        linear along edges, as distances are; 0 for a search.
+    secant_steps: how many find where an edge of a cell meets the level, of functions that are
+        nearly linear along edges, as distances are; 0 for a search.
     """
 
     field: Field
     level: float
     most_faces: int = dataclasses.field(default=MOST_FACES, kw_only=True)
-    uploads: Uploads = dataclasses.field(default_factory=Uploads, kw_only=True)
-    secants: int = dataclasses.field(default=0, kw_only=True)
+    uploads: EvaluatorCache = dataclasses.field(default_factory=EvaluatorCache, kw_only=True)
+    secant_steps: int = dataclasses.field(default=0, kw_only=True)
     evaluations: int = dataclasses.field(default=0, init=False)
 
     def __post_init__(self) -> None:
@@ -98,87 +107,96 @@ class LevelFunction:
         self._prepared = self.uploads.of(self.field)
         # Data, so that other levels compile nothing.
         level = dr.opaque(self._backend.Float, self.level)
-        self._levels = TargetLevels((level,), self.field.period)
+        self._levels = Levels((level,), self.field.period)
 
     @property
     def period(self) -> float | None:
         """Of an angle."""
         return self.field.period
 
-    def wrapped(self, value: FloatArray) -> FloatArray:
+    def relative_to_level(self, value: FloatArray) -> FloatArray:
         """f - level, given f."""
         above = value - self.level
         if self.period is None:
             return above
         return above - self.period * np.round(above / self.period)
 
-    def at(self, points: FloatArray) -> Samples:
+    def sample(self, points: FloatArray) -> LevelSamples:
         """The function at points (n, 3)."""
         value, gradient, reach = self._in_batches(points, self._evaluated)
-        return Samples(self.wrapped(value), gradient, reach)
+        return LevelSamples(self.relative_to_level(value), gradient, reach)
 
     def values(self, points: FloatArray) -> FloatArray:
         """(n,) f - level alone."""
 
         def value(p: Vec3) -> tuple[Real]:
-            with shared_samples(), without_weaker():
+            with share_samples(), without_alternatives():
                 return (self._prepared.evaluate(p).value,)
 
-        return self.wrapped(self._in_batches(points, value)[0])
+        return self.relative_to_level(self._in_batches(points, value)[0])
 
     def is_on_level(self, points: FloatArray) -> BoolArray:
         """(n,) where f is the level up to its error: rounding, and what a sum leaves out."""
 
         def both(p: Vec3) -> tuple[Real, Real]:
-            with without_weaker():
+            with without_alternatives():
                 sample = self._prepared.evaluate(p)
-            return sample.value, self._backend.Float(sample.error)
+            return sample.value, self._backend.Float(sample.value_error)
 
         value, error = self._in_batches(points, both)
-        return np.abs(self.wrapped(value)) <= error
+        return np.abs(self.relative_to_level(value)) <= error
 
-    def slopes(self, points: FloatArray, radius: FloatArray) -> tuple[Samples, FloatArray]:
+    def gradient_bounds(
+        self, points: FloatArray, radius: FloatArray
+    ) -> tuple[LevelSamples, FloatArray]:
         """The function at points (n, 3), its reach left out, and by how much at most its gradient
-        changes within `radius` (n,) of each, rounding included: see `Field.slope_change`."""
+        changes within `radius` (n,) of each, rounding included: see
+        `Field.gradient_change_bound`."""
 
         def compute(p: Vec3, r: Vec3) -> tuple[Real, Vec3, Real]:
             sample = self._prepared.evaluate(p)
-            change = self._prepared.slope_change(p, r.x) + sample.gradient_error
+            change = self._prepared.gradient_change_bound(p, r.x) + sample.gradient_error
             return sample.value, sample.gradient, change
 
         self.evaluations += 2 * len(points)
-        value, gradient, change = in_batches(
+        value, gradient, change = map_batches(
             self._backend, compute, points, np.column_stack([radius] * 3), at_once=1 << 18
         )
-        return Samples(self.wrapped(value), gradient, np.zeros(len(points))), change
+        return LevelSamples(self.relative_to_level(value), gradient, np.zeros(len(points))), change
 
     def clearance(self, points: FloatArray) -> FloatArray:
-        """(n,) no point of the level set is nearer: see `distance_below`."""
+        """(n,) no point of the level set is nearer: see `level_distance_lower_bound`."""
 
         def bound(p: Vec3) -> tuple[Real]:
             sample = self._prepared.evaluate(p)
-            return (distance_below(self._backend, self._prepared, self._levels, p, sample),)
+            return (
+                level_distance_lower_bound(self._backend, self._prepared, self._levels, p, sample),
+            )
 
         return self._in_batches(points, bound)[0]
 
     def _evaluated(self, p: Vec3) -> tuple[Real, Vec3, Real]:
         if self.period is None:
-            with shared_samples(), without_weaker():
+            with share_samples(), without_alternatives():
                 sample = self._prepared.evaluate(p)
             return sample.value, sample.gradient, self._backend.Float(0)
-        with shared_samples():
+        with share_samples():
             sample = self._prepared.evaluate(p)
-        steepest = length(sample.gradient) + sample.gradient_error
-        slopes = Slopes(-steepest, steepest)
-        enclosures = _PROOFS.enclose(
-            sample.known, sample.weaker, sample.value, sample.error, slopes
+        steepest = safe_norm(sample.gradient) + sample.gradient_error
+        slopes = SlopeRange(-steepest, steepest)
+        enclosures = _PROOFS.from_promises(
+            sample.promises, sample.alternative_promises, sample.value, sample.value_error, slopes
         )
         # A quarter above and a quarter below, less what rounding does.
-        quarter = self._backend.Float(0.2499 * self.period) - 2 * sample.error
-        return sample.value, sample.gradient, longest_step(enclosures, Gaps(quarter, quarter))
+        quarter = self._backend.Float(0.2499 * self.period) - 2 * sample.value_error
+        return (
+            sample.value,
+            sample.gradient,
+            longest_free_length(enclosures, LevelGaps(quarter, quarter)),
+        )
 
     def _in_batches(
         self, points: FloatArray, kernel: Callable[[Vec3], tuple[Any, ...]]
     ) -> tuple[FloatArray, ...]:
         self.evaluations += len(points)
-        return in_batches(self._backend, kernel, points, at_once=1 << 18)
+        return map_batches(self._backend, kernel, points, at_once=1 << 18)

@@ -1,9 +1,10 @@
 """Parts of a level set that are missing from its mesh by signs: walls and gaps thinner than a cell.
 
 Signs at the points of a lattice do not show a wall between two of them, nor a gap. What was made of
-the signs is near the level everywhere, which `far_from_level` looks at; here the way back is looked
-at, from points that are known to lie on the level to the mesh. Around a point of the level that is
-farther than d from the mesh the sign of the function changes within d, and that of the mesh does
+the signs is near the level everywhere, which `points_off_level` looks at; here the way back is
+looked at, from points that are known to lie on the level to the mesh. Around a point of the level
+that is farther than d from the mesh the sign of the function changes within d, and that of the mesh
+does
 not: so there is a part of the solid, or of the space around it, which the mesh does not have.
 
 Where points of the level are known: on the triangles of a mesh across which its winding number
@@ -26,8 +27,8 @@ from harnack.fields.solid_angles.dipole import DipolePotential
 from harnack.fields.solid_angles.oriented_points import OrientedPoints
 from harnack.fields.solid_angles.winding_number import WindingNumber
 from harnack.meshing.checks import point_text
-from harnack.meshing.edges import IntArray, crosses, distances_from_triangles, lengths
-from harnack.meshing.lattice_meshing import Surface
+from harnack.meshing.edges import IntArray, area_normals, distances_from_triangles, row_norms
+from harnack.meshing.lattice_meshing import TriangleMesh
 from harnack.meshing.sign_function import SignFunction
 
 if TYPE_CHECKING:
@@ -66,7 +67,7 @@ class PointsOnLevel:
 
         tolerance: a length, that a cloud's points are looked at from.
         """
-        mesh = function.field.mesh_of_sheets()
+        mesh = function.field.jump_mesh()
         if mesh is not None:
             return cls._on_triangles(function, mesh[0][mesh[1]])
         field = function.field
@@ -76,12 +77,12 @@ class PointsOnLevel:
             rows = _spread(len(field.points), _BY_AREA)
             smoothed = field.smoothing if isinstance(field, DipolePotential) else 0.0
             way = max(tolerance, _SMOOTHED * smoothed) * field.normals[rows]
-            way /= np.maximum(lengths(field.normals[rows]), 1e-300)[:, None]
+            way /= np.maximum(row_norms(field.normals[rows]), 1e-300)[:, None]
             low, high = field.points[rows] - way, field.points[rows] + way
         elif isinstance(field, Blobs):
             rows = _spread(len(field.centers), _BY_AREA)
             way = np.random.default_rng(0).normal(size=(len(rows), 3))
-            way *= ((field.radii * field.kernel.support)[rows] / lengths(way))[:, None]
+            way *= ((field.radii * field.kernel.support)[rows] / row_norms(way))[:, None]
             low, high = field.centers[rows], field.centers[rows] + way
         is_low, is_high = function.values(low) > 0, function.values(high) > 0
         low, high = np.where(is_low[:, None], high, low), np.where(is_low[:, None], low, high)
@@ -90,8 +91,8 @@ class PointsOnLevel:
     @classmethod
     def _on_triangles(cls, function: SignFunction, corner: FloatArray) -> PointsOnLevel:
         """On triangles (m, 3, 3) across which the function changes its sign."""
-        normal = crosses(corner)
-        area = lengths(normal)
+        normal = area_normals(corner)
+        area = row_norms(normal)
         rows = np.concatenate([_by_area(area), _spread(len(corner), _MIDDLES)])
         shares = np.random.default_rng(0).dirichlet((1.0, 1.0, 1.0), len(rows))
         shares[-min(len(corner), _MIDDLES) :] = 1 / 3
@@ -100,7 +101,7 @@ class PointsOnLevel:
         size, largest = float(np.ptp(corner, axis=(0, 1)).max()), float(np.abs(corner).max())
         away = max(_BESIDE * size, _ROUNDED * largest) * normal
         beside = np.concatenate([points + away, points - away])
-        value = function.wrapped(function.field.value(beside, precision="double"))
+        value = function.relative_to_level(function.field.value(beside, precision="double"))
         function.evaluations += len(beside)
         ahead, behind = value.reshape(2, -1)
         jumps = (ahead > 0) != (behind > 0)
@@ -149,7 +150,7 @@ class LostParts:
         cls,
         function: SignFunction,
         known: PointsOnLevel,
-        surface: Surface,
+        surface: TriangleMesh,
         tolerance: float,
         spacing: float,
     ) -> LostParts:
@@ -210,7 +211,7 @@ class LostParts:
 
 def _advice(field: Field) -> str:
     """What helps where cells miss parts."""
-    advice = "choose a smaller `spacing`"
+    advice = "choose a smaller `cell_size`"
     if isinstance(field, WindingNumber):
         advice += "; `harnack.repair` keeps thin parts where their triangles are sound"
     if isinstance(field, DipolePotential) and not field.smoothing:
@@ -276,7 +277,7 @@ def _are_farther(points: FloatArray, corner: FloatArray, distance: float) -> Boo
     if not len(points):
         return is_far
     center = corner.mean(axis=1)
-    reach = np.stack([lengths(corner[:, k] - center) for k in range(3)]).max(axis=0)
+    reach = np.stack([row_norms(corner[:, k] - center) for k in range(3)]).max(axis=0)
     octave = np.ceil(np.log2(np.maximum(reach, distance))).astype(np.int64)
     for k in np.unique(octave).tolist():
         left, rows = np.flatnonzero(is_far), np.flatnonzero(octave == k)

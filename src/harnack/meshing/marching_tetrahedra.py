@@ -23,25 +23,25 @@ import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
 from harnack.fields import Field
-from harnack.meshing.checks import LocalError, MeshingError
-from harnack.meshing.delaunay_points import PointSet
-from harnack.meshing.edges import Edges, IntArray, crosses, dots, edge_keys, lengths
+from harnack.meshing.checks import LocalizedMeshingError, MeshingError
+from harnack.meshing.delaunay_points import TetrahedronPoints
+from harnack.meshing.edges import Edges, IntArray, area_normals, edge_keys, row_dots, row_norms
 from harnack.meshing.level_function import LevelFunction
 
 __all__ = [
-    "BEYOND",
-    "Crossings",
-    "Roots",
+    "OUTSIDE_VALUE",
+    "EdgeCrossings",
+    "EdgeRootFinder",
     "Tetrahedra",
-    "crossings_of",
+    "count_crossings",
     "delaunay",
+    "extract_triangles",
     "is_cut",
-    "triangles_of",
 ]
 
 _PAIRS = tuple(itertools.combinations(range(4), 2))
 # Values this large are none: where the other end has one, the edge is crossed in its middle.
-BEYOND = 1e299
+OUTSIDE_VALUE = 1e299
 # Of places where edges meet the level, as a part of the edge; and what secants leave at its ends,
 # so that triangles have an area.
 _ROOT_ERROR, _FROM_ENDS = 1e-10, 1e-4
@@ -63,7 +63,7 @@ class Tetrahedra:
     def of(cls, points: FloatArray, corners: IntArray) -> Tetrahedra:
         """With their edges numbered."""
         edges = Edges.of(np.concatenate([corners[:, pair] for pair in _PAIRS]))
-        return cls(points, corners, edges.ends, edges.index.reshape(len(_PAIRS), -1).T)
+        return cls(points, corners, edges.vertices, edges.edge_of_pair.reshape(len(_PAIRS), -1).T)
 
     def edge_between(self, i: int, j: int, rows: IntArray) -> tuple[IntArray, IntArray]:
         """For tetrahedra `rows`, the edge between corners i and j, and its direction: 1 if it leads
@@ -108,62 +108,64 @@ def delaunay(points: FloatArray) -> Tetrahedra:
 
 
 @dataclass(frozen=True)
-class Crossings:
+class EdgeCrossings:
     """Crossings of all edges of tetrahedra, between points off the level.
 
     count: (k,) how often an edge crosses the level, upwards less downwards.
     change: (k,) of the function along it.
     proved: how many changes are proved to be the difference of wrapped values.
-    integrated: how many were integrated along the edge.
+    integrated_count: how many were integrated along the edge.
     """
 
     count: IntArray
     change: FloatArray
     proved: int
-    integrated: int
+    integrated_count: int
 
 
-def crossings_of(function: LevelFunction, points: PointSet, tets: Tetrahedra) -> Crossings:
+def count_crossings(
+    function: LevelFunction, points: TetrahedronPoints, tets: Tetrahedra
+) -> EdgeCrossings:
     """Count the crossings of every edge.
 
     Wrapping. From p the function moves by less than a quarter of its period within `reach`; if the
     reaches of both ends cover the edge, it moves by less than half a period along it, which is the
-    wrapped difference. Other edges are integrated (`Field.change_along`).
+    wrapped difference. Other edges are integrated (`Field.continuous_change`).
 
     Raises:
         MeshingError: edges that are not covered, of a field that cannot be integrated.
     """
     a, b = tets.ends.T
     value = points.samples.value
-    off = ~points.is_on[a] & ~points.is_on[b]
+    off = ~points.is_on_level[a] & ~points.is_on_level[b]
     change = np.where(off, value[b] - value[a], 0.0)
     if function.period is None:
         count = np.where(off, (value[b] > 0).astype(np.int64) - (value[a] > 0), 0)
-        return Crossings(count, change, int(off.sum()), 0)
+        return EdgeCrossings(count, change, int(off.sum()), 0)
     period = function.period
     change -= period * np.round(change / period)
-    span = lengths(points.points[a] - points.points[b])
-    reach = points.samples.reach
+    span = row_norms(points.points[a] - points.points[b])
+    reach = points.samples.quarter_period_radius
     unsure = np.flatnonzero(off & (reach[a] + reach[b] < span * (1 + 1e-9)))
     if len(unsure):
         p, q = points.points[a[unsure]], points.points[b[unsure]]
-        change[unsure] = _integrated(function.field, p, q, change[unsure], period)
+        change[unsure] = _integrate_change(function.field, p, q, change[unsure], period)
     # Values between levels lie in (0, period).
     level = np.remainder(value, period)
     count = np.where(off, np.round((level[a] + change - level[b]) / period), 0).astype(np.int64)
-    return Crossings(count, change, int(off.sum()) - len(unsure), len(unsure))
+    return EdgeCrossings(count, change, int(off.sum()) - len(unsure), len(unsure))
 
 
-def _integrated(
+def _integrate_change(
     field: Field, p: FloatArray, q: FloatArray, wrapped: FloatArray, period: float
 ) -> FloatArray:
     """The change of f from p to q (n, 3): what the field says, as it differs from the wrapped one
     by whole periods."""
-    exact = field.change_along(p, q)
+    exact = field.continuous_change(p, q)
     if exact is None:
         raise MeshingError(
             f"how {type(field).__name__} changes along {len(p)} edges of the mesh is not proved, "
-            "and it has no `change_along`: choose a smaller `spacing`"
+            "and it has no `change_along`: choose a smaller `cell_size`"
         )
     turns = np.round((exact - wrapped) / period)
     if np.abs(exact - wrapped - period * turns).max(initial=0.0) > 1e-6:
@@ -174,16 +176,16 @@ def _integrated(
     return wrapped + period * turns
 
 
-Roots: TypeAlias = Callable[[FloatArray, FloatArray], FloatArray]
+EdgeRootFinder: TypeAlias = Callable[[FloatArray, FloatArray], FloatArray]
 """From the ends (k, 3) of edges, below the level and above it, to where they meet it (k, 3)."""
 
 
-def triangles_of(
+def extract_triangles(
     function: LevelFunction,
-    points: PointSet,
+    points: TetrahedronPoints,
     tets: Tetrahedra,
-    crossings: Crossings,
-    roots_of: Roots | None = None,
+    crossings: EdgeCrossings,
+    roots_of: EdgeRootFinder | None = None,
 ) -> tuple[FloatArray, IntArray]:
     """Vertices (n, 3) and faces (m, 3), counter-clockwise as seen from where the function is
     greater. The first vertices are `points`, whether they are in use or not; then comes one for
@@ -195,14 +197,14 @@ def triangles_of(
         MeshingError: crossings that do not agree around a face, or two levels between corners.
     """
     side = _sides(points, tets, crossings)
-    on = points.is_on[tets.corners]
+    on = points.is_on_level[tets.corners]
     least = np.where(on, np.iinfo(np.int64).max, side).min(axis=1)
     most = np.where(on, np.iinfo(np.int64).min, side).max(axis=1)
     double = (most - least > 1) & ~on.all(axis=1)
     if double.any():
-        raise LocalError(
+        raise LocalizedMeshingError(
             "two sheets of the level set pass between corners of one tetrahedron: choose a smaller "
-            "`spacing`",
+            "`cell_size`",
             _mean(points.points, tets.corners[double]),
         )
     cut = np.flatnonzero(~on.all(axis=1) & (most > least))
@@ -243,14 +245,16 @@ def triangles_of(
     # As with vertices in the middles of edges: of a plane through any points of these all corners
     # above are on one side, and roots at an end, as where f jumps, leave triangles without an area.
     middles = _mean(points.points, tets.ends[edges])
-    turned = dots(crosses(np.concatenate([points.points, middles])[faces]), rise) < 0
+    turned = row_dots(area_normals(np.concatenate([points.points, middles])[faces]), rise) < 0
     faces[turned] = faces[turned][:, ::-1]
     return vertices, faces
 
 
-def is_cut(points: PointSet, tets: Tetrahedra, crossings: Crossings) -> BoolArray:
+def is_cut(points: TetrahedronPoints, tets: Tetrahedra, crossings: EdgeCrossings) -> BoolArray:
     """(m,) whether a level passes between corners of a tetrahedron, or through one."""
-    return points.is_on[tets.corners].any(axis=1) | (crossings.count[tets.edges] != 0).any(axis=1)
+    return points.is_on_level[tets.corners].any(axis=1) | (crossings.count[tets.edges] != 0).any(
+        axis=1
+    )
 
 
 def _mean(points: FloatArray, index: IntArray) -> FloatArray:
@@ -260,17 +264,17 @@ def _mean(points: FloatArray, index: IntArray) -> FloatArray:
 def _halves(vertices: FloatArray, ring: list[IntArray]) -> tuple[IntArray, IntArray]:
     """A quadrilateral cut along its shorter diagonal."""
     a, b, c, d = ring
-    one, other = (lengths(vertices[x] - vertices[y]) for x, y in ((a, c), (b, d)))
+    one, other = (row_norms(vertices[x] - vertices[y]) for x, y in ((a, c), (b, d)))
     longer = (one > other)[:, None]
     first = np.where(longer, np.stack([a, b, d], axis=1), np.stack([a, b, c], axis=1))
     second = np.where(longer, np.stack([b, c, d], axis=1), np.stack([a, c, d], axis=1))
     return first, second
 
 
-def _sides(points: PointSet, tets: Tetrahedra, crossings: Crossings) -> IntArray:
+def _sides(points: TetrahedronPoints, tets: Tetrahedra, crossings: EdgeCrossings) -> IntArray:
     """(m, 4): how many levels lie between the first corner that is off the level, and each other
     one."""
-    on = points.is_on[tets.corners]
+    on = points.is_on_level[tets.corners]
     rows = np.arange(len(on))
     first = np.argmin(on, axis=1)
     side = np.zeros(on.shape, np.int64)
@@ -287,9 +291,9 @@ def _sides(points: PointSet, tets: Tetrahedra, crossings: Crossings) -> IntArray
         some = rows[~on[:, i] & ~on[:, j]]
         wrong[some] |= side[some, j] - side[some, i] != between(i, j, some)
     if wrong.any():
-        raise LocalError(
+        raise LocalizedMeshingError(
             "crossings of the level set do not agree around a triangle: the curve passes "
-            "through it; choose a smaller `spacing`",
+            "through it; choose a smaller `cell_size`",
             _mean(points.points, tets.corners[wrong]),
         )
     return side
@@ -297,9 +301,9 @@ def _sides(points: PointSet, tets: Tetrahedra, crossings: Crossings) -> IntArray
 
 def _roots(
     function: LevelFunction,
-    points: PointSet,
+    points: TetrahedronPoints,
     tets: Tetrahedra,
-    crossings: Crossings,
+    crossings: EdgeCrossings,
     edges: IntArray,
 ) -> FloatArray:
     """Where some edges meet the level (r, 3), by Chandrupatla's method along the edge."""
@@ -321,15 +325,17 @@ def _roots(
             return found
         return found + function.period * np.rint((start + 0.5 * rise - found) / function.period)
 
-    if function.secants:
-        return p + _secants(function, p, way, value, value + change)[:, None] * way
-    known = np.flatnonzero(np.maximum(np.abs(value), np.abs(value + change)) < BEYOND)
+    if function.secant_steps:
+        return p + _illinois(function, p, way, value, value + change)[:, None] * way
+    known = np.flatnonzero(np.maximum(np.abs(value), np.abs(value + change)) < OUTSIDE_VALUE)
     share = np.full(len(a), 0.5)
-    share[known] = _searched(function, p[known], way[known], value[known], change[known], lifted)
+    share[known] = _chandrupatla(
+        function, p[known], way[known], value[known], change[known], lifted
+    )
     return p + share[:, None] * way
 
 
-def _secants(
+def _illinois(
     function: LevelFunction, p: FloatArray, way: FloatArray, low: FloatArray, high: FloatArray
 ) -> FloatArray:
     """(r,) places along edges by a few secants, given the values at both ends; the end that stays
@@ -339,7 +345,7 @@ def _secants(
     low, high = np.where(up, low, -low), np.where(up, high, -high)
     stayed = np.zeros(len(p), np.int64)
     share = low / (low - high)
-    for _ in range(function.secants):
+    for _ in range(function.secant_steps):
         value = function.values(p + share[:, None] * way)
         value = np.where(up, value, -value)
         above = value > 0
@@ -351,7 +357,7 @@ def _secants(
     return np.clip(share, _FROM_ENDS, 1 - _FROM_ENDS)
 
 
-def _searched(
+def _chandrupatla(
     function: LevelFunction,
     p: FloatArray,
     way: FloatArray,
@@ -378,14 +384,14 @@ def _searched(
 
 
 def _faces_on_the_level(
-    function: LevelFunction, points: PointSet, tets: Tetrahedra
+    function: LevelFunction, points: TetrahedronPoints, tets: Tetrahedra
 ) -> tuple[IntArray, FloatArray]:
     """Faces of tetrahedra with all corners on the level that have another side of it behind than
     before them, and the way up through each.
 
     A side is that of the fourth corner, or if it is on the level too, of the center.
     """
-    on = points.is_on[tets.corners]
+    on = points.is_on_level[tets.corners]
     triples: list[IntArray] = []
     for k in range(4):
         rows = np.flatnonzero(np.delete(on, k, axis=1).all(axis=1))
@@ -398,14 +404,17 @@ def _faces_on_the_level(
     if not len(face):
         return np.zeros((0, 3), np.int64), np.zeros((0, 3))
     middle = _mean(points.points, face)
-    (before, low), (behind, high) = (_beside(function, points, tets, row) for row in (one, other))
+    (before, low), (behind, high) = (
+        _side_sample(function, points, tets, row) for row in (one, other)
+    )
     if function.period is None:
         count = (high > 0).astype(np.int64) - (low > 0)
     else:
         period = function.period
         there = function.values(middle)
         change = sum(
-            sign * _integrated(function.field, side, middle, _wrap(there - start, period), period)
+            sign
+            * _integrate_change(function.field, side, middle, _wrap(there - start, period), period)
             for sign, side, start in ((1, before, low), (-1, behind, high))
         )
         rest = np.remainder(low, period) + change - np.remainder(high, period)
@@ -418,14 +427,14 @@ def _wrap(change: FloatArray, period: float) -> FloatArray:
     return change - period * np.round(change / period)
 
 
-def _beside(
-    function: LevelFunction, points: PointSet, tets: Tetrahedra, rows: IntArray
+def _side_sample(
+    function: LevelFunction, points: TetrahedronPoints, tets: Tetrahedra, rows: IntArray
 ) -> tuple[FloatArray, FloatArray]:
     """Points (n, 3) on one side of faces, and the function there."""
     corners = tets.corners[rows[:, 3]]
     apex = corners[np.arange(len(rows)), rows[:, 4]]
     place, value = points.points[apex], points.samples.value[apex]
-    is_on = np.flatnonzero(points.is_on[apex])
+    is_on = np.flatnonzero(points.is_on_level[apex])
     place[is_on] = points.points[corners[is_on]].mean(axis=1)
     value[is_on] = function.values(place[is_on])
     return place, value

@@ -2,7 +2,7 @@
 
 Triangles that are there twice, that have no area or pass through others are left out; those that
 are turned over against their neighbors are turned back. What stays is oriented and passes through
-nothing, and its holes are filled by `hole_patches`. Where that fails, the triangles around the hole
+nothing, and its holes are filled by `hole_filling`. Where that fails, the triangles around the hole
 are left out too, ring by ring.
 """
 
@@ -17,20 +17,27 @@ import numpy as np
 from harnack.backend import BoolArray, FloatArray
 from harnack.fields.solid_angles.winding_number import WindingNumber
 from harnack.geometry.boundary_edges import weld_vertices
-from harnack.geometry.orientability import sided_parts
+from harnack.geometry.orientability import orientation_components
 from harnack.meshing.checks import (
     MeshingError,
     check_manifold,
     intersecting_faces,
-    singular_vertices,
+    nonmanifold_vertices,
 )
-from harnack.meshing.clipping import Shells, turned_outwards
-from harnack.meshing.edges import Edges, IntArray, boundary_edges, crosses, directed_edges, lengths
-from harnack.meshing.hole_filling import filled, hole_loops
+from harnack.meshing.clipping import Shells, faces_to_flip
+from harnack.meshing.edges import (
+    Edges,
+    IntArray,
+    area_normals,
+    boundary_edges,
+    half_edges,
+    row_norms,
+)
+from harnack.meshing.hole_filling import fill_holes, hole_loops
 from harnack.meshing.joined_pieces import near_groups, passes_itself
-from harnack.meshing.lattice_meshing import Surface
+from harnack.meshing.lattice_meshing import TriangleMesh
 
-__all__ = ["Mended", "against_neighbors", "joined", "mended"]
+__all__ = ["CleanedMesh", "against_neighbors", "clean_and_fill", "weld_near_corners"]
 
 # How often the rings around holes are left out; and what part of all triangles may be.
 _MOST_RINGS, _MOST_LEFT_OUT = 6, 0.5
@@ -41,7 +48,7 @@ _NEAR = (0.01, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3)
 
 
 @dataclass(frozen=True)
-class Mended:
+class CleanedMesh:
     """A closed surface, in which what was sound is bit by bit as given and comes first.
 
     kept: of the first faces, which of the given ones they are, in order. turned: which of these
@@ -49,24 +56,26 @@ class Mended:
     left_out: how many of the given triangles were, by reason. holes: how many were filled.
     """
 
-    surface: Surface
+    surface: TriangleMesh
     kept: IntArray
     turned: IntArray
     left_out: dict[str, int]
     holes: int
 
 
-def mended(vertices: FloatArray, faces: IntArray, report: Callable[[str], None]) -> Mended:
+def clean_and_fill(
+    vertices: FloatArray, faces: IntArray, report: Callable[[str], None]
+) -> CleanedMesh:
     """The sound triangles of a mesh, with patches in place of all others and over holes.
 
     Raises:
         MeshingError: half of the triangles would go, or all, or most of them are loose.
     """
     report("looking for triangles that are sound")
-    state = _State.of(vertices, faces)
+    state = _WorkingMesh.of(vertices, faces)
     holes, why, most = 0, "", _MOST_LEFT_OUT * len(state.faces)
     for ring in range(_MOST_RINGS):
-        state = state.without_branches()
+        state = state.without_nonmanifold_edges()
         if not len(state.faces):
             raise MeshingError("none of its triangles is sound")
         edges = boundary_edges(state.faces)
@@ -76,16 +85,16 @@ def mended(vertices: FloatArray, faces: IntArray, report: Callable[[str], None])
         report(f"{len(loops):,} holes" + f", {ring} rings wider in places" * (ring > 0))
         state, left, why = state.filled(loops)
         holes += len(loops) - len(left)
-        bad = np.concatenate([singular_vertices(state.faces), *left])
+        bad = np.concatenate([nonmanifold_vertices(state.faces), *left])
         if not len(bad):
             return state.result(holes)
         state = state.without_ring(bad)
-        if (state.origin >= 0).sum() < most:
+        if (state.source_face >= 0).sum() < most:
             raise MeshingError(f"half of the triangles would be left out: {why}")
     raise MeshingError(f"holes cannot be filled, even {_MOST_RINGS} rings wider: {why}")
 
 
-def joined(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray, float]:
+def weld_near_corners(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray, float]:
     """Loose triangles with near corners moved to their mean, of several distances that which leaves
     the fewest edges open; faces; and how far the farthest corner went.
 
@@ -97,7 +106,7 @@ def joined(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray,
     if len(boundary_edges(corners)) <= _MOST_OPEN * len(faces):
         raise MeshingError("its triangles are not loose")
     at = places[corners]
-    usual = float(np.median(lengths((at - np.roll(at, 1, axis=1)).reshape(-1, 3))))
+    usual = float(np.median(row_norms((at - np.roll(at, 1, axis=1)).reshape(-1, 3))))
     found: list[tuple[int, FloatArray, IntArray, float]] = []
     for part in _NEAR:
         group = near_groups(places, part * usual)
@@ -106,7 +115,7 @@ def joined(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray,
         made = group[corners]
         whole = made[(made != np.roll(made, 1, axis=1)).all(axis=1)]
         missing = 3 * (len(faces) - len(whole))  # what has lost an edge counts as if all were open
-        moved = float(lengths(mean[group] - places).max())
+        moved = float(row_norms(mean[group] - places).max())
         found.append((len(boundary_edges(whole)) + missing, mean, whole, moved))
     count, mean, whole, moved = min(found, key=lambda one: one[0])
     if count > _MOST_OPEN * len(faces):
@@ -118,23 +127,23 @@ def joined(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray,
 
 
 @dataclass(frozen=True)
-class _State:
+class _WorkingMesh:
     """Vertices, those given first; faces; of each face which of the given ones it is, or -1, and
     whether it runs the other way. counts: of the given ones that were left out, by reason."""
 
     vertices: FloatArray
     faces: IntArray
-    origin: IntArray
+    source_face: IntArray
     is_turned: BoolArray
     counts: dict[str, int]
 
     @classmethod
-    def of(cls, vertices: FloatArray, faces: IntArray) -> _State:
+    def of(cls, vertices: FloatArray, faces: IntArray) -> _WorkingMesh:
         """What passes through nothing, oriented."""
         joined = weld_vertices(vertices)[faces]
         every = np.arange(len(faces))
         corner = vertices[joined]
-        area = lengths(crosses(corner))
+        area = row_norms(area_normals(corner))
         rows = every[area > 0]
         reasons = ("flat", "doubled", "crossing", "branching", "one-sided", "around", "inside")
         counts = dict.fromkeys(reasons, 0) | {"flat": len(faces) - len(rows)}
@@ -146,94 +155,98 @@ class _State:
         rows = np.delete(rows, crossing)
         return cls(vertices, joined[rows], rows, np.zeros(len(rows), np.bool_), counts)
 
-    def chosen(self, rows: BoolArray, reason: str) -> _State:
+    def keep_faces(self, rows: BoolArray, reason: str) -> _WorkingMesh:
         """Without some faces, of which those given are counted."""
-        lost = int((~rows & (self.origin >= 0)).sum())
+        lost = int((~rows & (self.source_face >= 0)).sum())
         counts = self.counts | {reason: self.counts[reason] + lost}
-        return _State(
-            self.vertices, self.faces[rows], self.origin[rows], self.is_turned[rows], counts
+        return _WorkingMesh(
+            self.vertices, self.faces[rows], self.source_face[rows], self.is_turned[rows], counts
         )
 
-    def without_branches(self) -> _State:
+    def without_nonmanifold_edges(self) -> _WorkingMesh:
         """Without faces at edges of more than two; and oriented, without those at edges where that
         is not possible."""
         state = self.without_fins()
-        edges = Edges.of(directed_edges(state.faces))
-        many = np.asarray((edges.uses > 2)[edges.index].reshape(3, -1).any(axis=0))
-        state = state.chosen(~many, "branching")
+        edges = Edges.of(half_edges(state.faces))
+        many = np.asarray((edges.multiplicity > 2)[edges.edge_of_pair].reshape(3, -1).any(axis=0))
+        state = state.keep_faces(~many, "branching")
         turned = against_neighbors(state.vertices, state.faces)
         oriented = np.where(turned[:, None], state.faces[:, ::-1], state.faces)
-        pairs = directed_edges(oriented)
+        pairs = half_edges(oriented)
         edges = Edges.of(pairs)
         way = np.where(pairs[:, 0] < pairs[:, 1], 1, -1)
-        sum_of = np.bincount(edges.index, way, minlength=len(edges.uses))
-        bad = ((edges.uses == 2) & (sum_of != 0))[edges.index].reshape(3, -1).any(axis=0)
-        state = _State(
-            state.vertices, oriented, state.origin, state.is_turned ^ turned, state.counts
+        sum_of = np.bincount(edges.edge_of_pair, way, minlength=len(edges.multiplicity))
+        bad = (
+            ((edges.multiplicity == 2) & (sum_of != 0))[edges.edge_of_pair]
+            .reshape(3, -1)
+            .any(axis=0)
         )
-        return state.chosen(~np.asarray(bad), "one-sided")
+        state = _WorkingMesh(
+            state.vertices, oriented, state.source_face, state.is_turned ^ turned, state.counts
+        )
+        return state.keep_faces(~np.asarray(bad), "one-sided")
 
-    def without_fins(self) -> _State:
+    def without_fins(self) -> _WorkingMesh:
         """Without sheets that hang on a surface: of the pieces between edges of more than two faces
         those that end in the open, the smallest first, as long as there are such edges. The largest
         piece stays."""
         state = self
         while True:
-            edges = Edges.of(directed_edges(state.faces))
-            if not (edges.uses > 2).any():
+            edges = Edges.of(half_edges(state.faces))
+            if not (edges.multiplicity > 2).any():
                 return state
             piece = _pieces(edges, len(state.faces))
-            uses = edges.uses[edges.index].reshape(3, -1)
+            uses = edges.multiplicity[edges.edge_of_pair].reshape(3, -1)
             count = int(piece.max()) + 1
             branches, ends = (
                 np.bincount(piece, has.any(axis=0), minlength=count) > 0
                 for has in (uses > 2, uses == 1)
             )
-            area = np.bincount(piece, lengths(crosses(state.vertices[state.faces])))
+            area = np.bincount(piece, row_norms(area_normals(state.vertices[state.faces])))
             fins = np.flatnonzero(branches & ends & (area < area.max()))
             if not len(fins):
                 return state
-            state = state.chosen(piece != fins[area[fins].argmin()], "branching")
+            state = state.keep_faces(piece != fins[area[fins].argmin()], "branching")
 
-    def filled(self, loops: list[IntArray]) -> tuple[_State, list[IntArray], str]:
+    def filled(self, loops: list[IntArray]) -> tuple[_WorkingMesh, list[IntArray], str]:
         """With patches where they pass the checks; the loops left, and why they are."""
         if not loops:
             return self, [], ""
         field = WindingNumber(self.vertices, self.faces)
-        made = filled(
+        made = fill_holes(
             self.vertices, self.faces, loops, lambda p: field.value(p, precision="double")
         )
         count = len(made.faces)
-        state = _State(
+        state = _WorkingMesh(
             np.concatenate([self.vertices, made.vertices]),
             np.concatenate([self.faces, made.faces]),
-            np.concatenate([self.origin, np.full(count, -1)]),
+            np.concatenate([self.source_face, np.full(count, -1)]),
             np.concatenate([self.is_turned, np.zeros(count, np.bool_)]),
             self.counts,
         )
-        return state, made.left, made.why
+        return state, made.unfilled_loops, made.reason
 
-    def without_ring(self, places: IntArray) -> _State:
+    def without_ring(self, places: IntArray) -> _WorkingMesh:
         """Without the faces at some vertices."""
         is_bad = np.zeros(len(self.vertices), np.bool_)
         is_bad[places] = True
-        return self.chosen(~np.asarray(is_bad[self.faces].any(axis=1)), "around")
+        return self.keep_faces(~np.asarray(is_bad[self.faces].any(axis=1)), "around")
 
-    def result(self, holes: int) -> Mended:
+    def result(self, holes: int) -> CleanedMesh:
         """The surface, with what was given first.
 
         Raises:
             MeshingError: parts pass through each other.
         """
-        last = len(self.vertices) + len(self.origin)  # behind all that were given
-        order = np.argsort(np.where(self.origin < 0, last, self.origin), kind="stable")
-        faces, kept = self.faces[order], self.origin[order]
+        last = len(self.vertices) + len(self.source_face)  # behind all that were given
+        order = np.argsort(np.where(self.source_face < 0, last, self.source_face), kind="stable")
+        faces, kept = self.faces[order], self.source_face[order]
         check_manifold(faces)
-        inwards = turned_outwards(Surface(self.vertices, faces))
+        inwards = faces_to_flip(TriangleMesh(self.vertices, faces))
         faces = np.where(inwards[:, None], faces[:, ::-1], faces)
-        whole = Surface(self.vertices, faces)
+        whole = TriangleMesh(self.vertices, faces)
         shells = Shells.of(whole)
-        if passes_itself(whole, shells.number):
+        if passes_itself(whole, shells.component_of_face):
             raise MeshingError("it passes through itself along edges that lie on faces")
         bounds = shells.bound()
         lost = int((kept[~bounds] >= 0).sum())
@@ -243,19 +256,19 @@ class _State:
             (self.is_turned[order] ^ inwards)[bounds],
         )
         turned = kept[is_turned & (kept >= 0)]
-        surface = Surface.of(self.vertices, faces)
+        surface = TriangleMesh.without_unused_vertices(self.vertices, faces)
         counts = self.counts | {"inside": lost}
-        return Mended(surface, kept[kept >= 0], turned, counts, holes)
+        return CleanedMesh(surface, kept[kept >= 0], turned, counts, holes)
 
 
 def _pieces(edges: Edges, count: int) -> IntArray:
     """(m,) which of the pieces that edges of two faces hold together each of `count` faces belongs
-    to. edges: those of `directed_edges`."""
+    to. edges: those of `half_edges`."""
     import scipy.sparse  # here: half a second that few need
     import scipy.sparse.csgraph as csgraph_module
 
     sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
-    one, other = edges.twice().T % count
+    one, other = edges.paired_half_edges().T % count
     joined = sparse.coo_matrix((np.ones(len(one)), (one, other)), shape=(count, count))
     return np.asarray(csgraph.connected_components(joined, directed=False)[1], np.int64)
 
@@ -263,8 +276,8 @@ def _pieces(edges: Edges, count: int) -> IntArray:
 def against_neighbors(x: FloatArray, faces: IntArray) -> BoolArray:
     """(m,) which faces are to be turned over for all that share an edge of two to agree: of each
     part those with the smaller area. Parts of one side only are left as they are."""
-    m, part = len(faces), sided_parts(faces)
+    m, part = len(faces), orientation_components(faces)
     corner = x[faces]
-    area = lengths(crosses(corner))
+    area = row_norms(area_normals(corner))
     as_is = np.bincount(part[:m], area, minlength=int(part.max(initial=-1)) + 1)
     return as_is[part[:m]] < as_is[part[m:]]

@@ -4,7 +4,7 @@ Flips. Two triangles (a, b, c) and (b, a, d) become (c, d, b) and (d, c, a) wher
 smaller of their least angles larger, where the new edge is as near to the surface as is asked for,
 and where the new triangles face the way the surface does.
 
-Contractions. The ends of a sliver's shortest edge are merged: see `without_slivers`.
+Contractions. The ends of a sliver's shortest edge are merged: see `collapse_slivers`.
 
 Moves. Means of neighbors, to which `smoothed` moves vertices, make thin triangles where lengths of
 edges change quickly, as beside long boundary edges that cannot be cut. Here some places are tried
@@ -20,20 +20,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
-from harnack.meshing.delaunay_points import newton
+from harnack.meshing.delaunay_points import newton_to_level
 from harnack.meshing.edges import (
     IntArray,
+    area_normals,
     boundary_edges,
-    crosses,
-    directed_edges,
-    distinct,
-    dots,
     edge_keys,
-    lengths,
+    half_edges,
+    row_dots,
+    row_norms,
+    sorted_unique,
 )
 from harnack.meshing.level_function import LevelFunction
 
-__all__ = ["flipped", "least_angles", "relaxed", "without_slivers"]
+__all__ = ["collapse_slivers", "flip_edges", "least_angles", "relax_vertices"]
 
 # By how much a least angle has to grow: its cosine in flips, in radians in moves; and the least
 # cosine between normals of a triangle before and after, and between it and the gradient.
@@ -43,10 +43,10 @@ _MOST_ROUNDS_OF_FLIPS = 12
 # Triangles with a smaller angle, in radians, are slivers: 4 degrees.
 _SLIVER = 0.07
 # The least cosine between normals of the triangles around a contracted edge and the gradient.
-_STILL_FACING = 0.3
+_MIN_COLLAPSE_COSINE = 0.3
 
 
-def flipped(
+def flip_edges(
     function: LevelFunction,
     vertices: FloatArray,
     faces: IntArray,
@@ -71,7 +71,7 @@ def flipped(
         key = edge_keys(quads[:, 2:], count)
         good = gain > _GAIN
         good[good] = ~np.isin(key[good], refused)
-        taken = distinct(edge_keys(quads[:, :2], count))
+        taken = sorted_unique(edge_keys(quads[:, :2], count))
         good[good] = ~_holds(taken, key[good]) & ~np.isin(key[good], boundary)
         rows = _independent_flips(np.flatnonzero(good), gain, pairs, key, len(faces))
         if not len(rows):
@@ -87,7 +87,7 @@ def flipped(
 def _quadrilaterals(faces: IntArray) -> tuple[IntArray, IntArray]:
     """Pairs (k, 2) of faces with a common edge, and their corners (k, 4): the edge (a, b) as the
     first runs it, and the third corners of both."""
-    edges, count = directed_edges(faces), int(faces.max()) + 1
+    edges, count = half_edges(faces), int(faces.max()) + 1
     keys = edge_keys(edges, count)
     order = np.argsort(keys, kind="stable")
     same = np.flatnonzero(keys[order[1:]] == keys[order[:-1]])
@@ -120,7 +120,7 @@ def _flips_stay_near(
     normal = np.cross(corner[:, :, 1] - corner[:, :, 0], corner[:, :, 2] - corner[:, :, 0])
     middle = corner[:, 0, :2].mean(axis=1)
     places = np.concatenate([middle, *corner.mean(axis=2).transpose(1, 0, 2)])
-    samples = function.at(places)
+    samples = function.sample(places)
     near = (samples.distance <= tolerance).reshape(3, -1).all(axis=0)
     slope = samples.gradient.reshape(3, -1, 3)[1:].transpose(1, 0, 2)
     size = np.linalg.norm(normal, axis=2) * np.linalg.norm(slope, axis=2)
@@ -139,14 +139,14 @@ def least_angles(vertices: FloatArray, faces: IntArray) -> FloatArray:
     corner = vertices[faces]
     side = np.stack([corner[:, (k + 2) % 3] - corner[:, (k + 1) % 3] for k in range(3)], axis=1)
     square = np.einsum("ijk,ijk->ij", side, side)
-    twice_area = lengths(np.cross(side[:, 0], side[:, 1]))
+    twice_area = row_norms(np.cross(side[:, 0], side[:, 1]))
     # The least angle is opposite the shortest side: tan = 2 area/(b . c).
     shortest = square.argmin(axis=1)
     rest = 0.5 * (square.sum(axis=1) - 2 * square[np.arange(len(faces)), shortest])
     return np.arctan2(twice_area, rest)
 
 
-def without_slivers(
+def collapse_slivers(
     function: LevelFunction,
     vertices: FloatArray,
     faces: IntArray,
@@ -167,7 +167,7 @@ def without_slivers(
         if gone[row]:
             continue
         corner = vertices[faces[row]]
-        sides = lengths(np.roll(corner, -1, axis=0) - corner)
+        sides = row_norms(np.roll(corner, -1, axis=0) - corner)
         k = int(sides.argmin())
         ends = int(faces[row, k]), int(faces[row, (k + 1) % 3])
         for kept, lost in (ends, ends[::-1]):
@@ -197,10 +197,10 @@ def _is_good(
     function: LevelFunction, vertices: FloatArray, new: IntArray, tolerance: float
 ) -> bool:
     corner = vertices[new]
-    normal = crosses(corner)
-    samples = function.at(corner.mean(axis=1))
-    size = lengths(normal) * lengths(samples.gradient)
-    facing = dots(normal, samples.gradient) > _STILL_FACING * size
+    normal = area_normals(corner)
+    samples = function.sample(corner.mean(axis=1))
+    size = row_norms(normal) * row_norms(samples.gradient)
+    facing = row_dots(normal, samples.gradient) > _MIN_COLLAPSE_COSINE * size
     near = samples.distance <= tolerance
     return bool((facing & near & (least_angles(vertices, new) > _SLIVER)).all())
 
@@ -213,7 +213,7 @@ _MOST_ROUNDS_OF_MOVES = 6
 _PARTS = (1.0, 0.5)
 
 
-def relaxed(
+def relax_vertices(
     function: LevelFunction,
     vertices: FloatArray,
     faces: IntArray,
@@ -231,7 +231,7 @@ def relaxed(
     for _ in range(_MOST_ROUNDS_OF_MOVES):
         angles = least_angles(vertices, faces)
         thin = np.unique(faces[angles < _THIN])
-        stars = _Stars.of(faces, thin[~fixed[thin]], len(vertices))
+        stars = _VertexStars.of(faces, thin[~fixed[thin]], len(vertices))
         if not len(stars.centers):
             break
         before = stars.least(angles[stars.face])
@@ -246,7 +246,7 @@ def relaxed(
 
 
 @dataclass(frozen=True)
-class _Stars:
+class _VertexStars:
     """Faces around some vertices: centers (k,), and pairs of one of these, owner (p,), and a face,
     face (p,), with the corners of that face, corners (p, 3), the center first."""
 
@@ -256,7 +256,7 @@ class _Stars:
     corners: IntArray
 
     @classmethod
-    def of(cls, faces: IntArray, centers: IntArray, count: int) -> _Stars:
+    def of(cls, faces: IntArray, centers: IntArray, count: int) -> _VertexStars:
         place = np.full(count, -1, np.int64)
         place[centers] = np.arange(len(centers))
         face, column = np.nonzero(place[faces] >= 0)
@@ -283,13 +283,13 @@ def _best_places(
     function: LevelFunction,
     vertices: FloatArray,
     faces: IntArray,
-    stars: _Stars,
+    stars: _VertexStars,
     walls: Walls,
 ) -> tuple[FloatArray, FloatArray]:
     """Where each vertex is best (k, 3), and the least angle around it there (k,)."""
     here, a, b = (vertices[stars.corners[:, k]] for k in range(3))
     normal = np.cross(a - here, b - here)
-    normal /= np.maximum(lengths(normal), 1e-300)[:, None]
+    normal /= np.maximum(row_norms(normal), 1e-300)[:, None]
     middle = 0.5 * (a + b)
     # Where the triangle over the opposite edge has equal sides.
     apex = middle + np.sqrt(0.75) * np.cross(normal, b - a)
@@ -307,13 +307,13 @@ def _best_places(
             better = least > found
             best[better], found[better] = x[better], least[better]
     # Onto the surface only the best of them, which changes little: the aims are beside it.
-    span = lengths(best - start) + 1e-300
-    best = newton(function, best, function.at(best), 2 * span, walls, steps=4)
+    span = row_norms(best - start) + 1e-300
+    best = newton_to_level(function, best, function.sample(best), 2 * span, walls, steps=4)
     return best, _least_at(best, stars, a, b, normal)
 
 
 def _least_at(
-    x: FloatArray, stars: _Stars, a: FloatArray, b: FloatArray, normal: FloatArray
+    x: FloatArray, stars: _VertexStars, a: FloatArray, b: FloatArray, normal: FloatArray
 ) -> FloatArray:
     """(k,) the least angle around vertices if they are at x (k, 3); -1 where a triangle turns.
 
@@ -321,15 +321,15 @@ def _least_at(
     """
     apex = x[stars.owner]
     cross = np.cross(a - apex, b - apex)
-    size = lengths(cross)
+    size = row_norms(cross)
     corner = np.stack([apex, a, b], axis=1)
     angles = least_angles(corner.reshape(-1, 3), np.arange(3 * len(a)).reshape(-1, 3))
-    facing = dots(cross, normal) > _FACING * size
+    facing = row_dots(cross, normal) > _FACING * size
     return stars.least(np.where(facing, angles, -1.0))
 
 
 def _independent_moves(
-    rows: IntArray, gain: FloatArray, stars: _Stars, faces: IntArray, count: int
+    rows: IntArray, gain: FloatArray, stars: _VertexStars, faces: IntArray, count: int
 ) -> IntArray:
     """Those vertices that gain more than all their neighbors do."""
     rank = np.full(count, len(rows))
@@ -344,7 +344,7 @@ def _moves_stay_near(
     function: LevelFunction,
     vertices: FloatArray,
     faces: IntArray,
-    stars: _Stars,
+    stars: _VertexStars,
     there: FloatArray,
     rows: IntArray,
     tolerance: float,
@@ -356,13 +356,13 @@ def _moves_stay_near(
     pairs = np.flatnonzero(moved[stars.owner])
     corner = vertices[stars.corners[pairs]]
     corner[:, 0] = there[stars.owner[pairs]]
-    samples = function.at(corner.mean(axis=1))
-    normal = crosses(corner)
-    size = lengths(normal) * lengths(samples.gradient)
-    good = dots(normal, samples.gradient) > _FACING * size
+    samples = function.sample(corner.mean(axis=1))
+    normal = area_normals(corner)
+    size = row_norms(normal) * row_norms(samples.gradient)
+    good = row_dots(normal, samples.gradient) > _FACING * size
     good &= samples.distance <= tolerance
     off = np.zeros(len(stars.centers), np.int64)
     np.add.at(off, stars.owner[pairs[~good]], 1)
-    length = lengths(there[rows] - vertices[stars.centers[rows]])
-    on = function.at(there[rows]).distance <= 1e-7 * np.maximum(length, 0.1 * tolerance)
+    length = row_norms(there[rows] - vertices[stars.centers[rows]])
+    on = function.sample(there[rows]).distance <= 1e-7 * np.maximum(length, 0.1 * tolerance)
     return on & (off[rows] == 0)

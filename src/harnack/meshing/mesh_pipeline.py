@@ -15,42 +15,52 @@ from harnack.fields.field import check_is_field
 from harnack.fields.solid_angles.dipole import DipolePotential
 from harnack.fields.solid_angles.solid_angle import SolidAngle
 from harnack.fields.solid_angles.winding_number import WindingNumber
-from harnack.geometry import Box, Intersection, Volume
+from harnack.geometry import Box, Volume, VolumeIntersection
 from harnack.geometry.volume import check_volume
-from harnack.meshing.bcc_lattice import Lattice
+from harnack.meshing.bcc_lattice import BccLattice
 from harnack.meshing.checks import (
-    EmptyError,
+    EmptySurfaceError,
     MeshingError,
-    TooLargeError,
-    check_apart,
+    TriangleLimitError,
     check_inside,
     check_manifold,
     check_near_level,
-    may_help_again,
+    check_no_self_intersection,
+    is_retry_promising,
 )
-from harnack.meshing.clipping import cut_by, largest_body, largest_part
-from harnack.meshing.closed_mesh import box_manifold, manifold_of, surface_of, volume_manifold
+from harnack.meshing.clipping import clip_to_volume, largest_body, largest_component
+from harnack.meshing.closed_mesh import box_manifold, from_manifold, to_manifold, volume_manifold
 from harnack.meshing.csg_meshing import (
     AngleMesher,
-    ends_of_solid,
     mesh_solid,
-    region_of,
+    solid_and_level,
+    solid_value_range,
     two_numbers,
 )
-from harnack.meshing.curve_spanning import spanned_surface
-from harnack.meshing.finishing import check_options, finished, normals_of, simplified, thickened
-from harnack.meshing.lattice_meshing import Surface, open_surface
+from harnack.meshing.curve_spanning import mesh_spanning_curve
+from harnack.meshing.finishing import (
+    check_options,
+    simplify_mesh,
+    thicken,
+    to_trimesh,
+    vertex_normals,
+)
+from harnack.meshing.lattice_meshing import TriangleMesh, mesh_open_surface
 from harnack.meshing.level_function import CELLS_PER_WAVE, MOST_FACES, LevelFunction
 from harnack.meshing.lost_parts import LostParts
 from harnack.meshing.sign_function import (
     SignFunction,
-    cells_for_details,
-    is_meshed_by_signs,
-    why_empty,
+    cell_size_for_smoothing,
+    empty_surface_hint,
+    uses_sign_meshing,
 )
-from harnack.meshing.sign_isosurface import MOST_FAR, SMALLER, signed_surface
+from harnack.meshing.sign_isosurface import (
+    CELL_REFINEMENT_FACTOR,
+    MAX_OFF_LEVEL_FRACTION,
+    mesh_from_signs,
+)
 from harnack.progress import teller
-from harnack.tracer import LevelSet
+from harnack.tracer import Surface
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -72,11 +82,11 @@ _ROOM = 0.05
 
 
 def mesh(
-    field: Field | LevelSet,
+    field: Field | Surface,
     level: float | None = None,
     *,
     tolerance: float = 1e-3,
-    spacing: float | None = None,
+    cell_size: float | None = None,
     clip: Volume | None = None,
     section: Volume | None = None,
     solid: tuple[float, float] | bool | None = None,
@@ -96,22 +106,22 @@ def mesh(
 
     Fields that are sums over meshes, points and blobs (`WindingNumber`, `DipolePotential`,
     `ScreenedWindingNumber`, `Morph`, `HRBF`, `Blobs`) are meshed by the signs of their values alone
-    (`meshing.by_signs`), which gives a closed surface whatever the mesh or the cloud is. Vertices
-    lie where edges of the cells meet the level, so on the very triangles of a sound mesh; parts
-    that are thinner or nearer to each other than a cell may be missed or joined, which is looked
-    for at about three thousand points of the level (`meshing.lost_parts`) and warned of. Of a mesh
-    that is its own spanning surface (`WindingNumber`), such as a file of a `SolidAngle`'s, the
-    triangles are kept as they are, whatever tolerance, spacing and seed are.
+    (`meshing.sign_isosurface`), which gives a closed surface whatever the mesh or the cloud is.
+    Vertices lie where edges of the cells meet the level, so on the very triangles of a sound mesh;
+    parts that are thinner or nearer to each other than a cell may be missed or joined, which is
+    looked for at about three thousand points of the level (`meshing.lost_parts`) and warned of. Of
+    a mesh that is its own spanning surface (`WindingNumber`), such as a file of a `SolidAngle`'s,
+    the triangles are kept as they are, whatever tolerance, spacing and seed are.
 
     field: a `SolidAngle` of polygons, a real-valued field that is continuous, or one of those; or a
-        `LevelSet` of one level or a solid, whose level, clip, section, solid and largest are used
+        `Surface` of one level or a solid, whose level, clip, section, solid and largest are used
         unless others are given here. Its tolerance and other settings of rays are not used.
     level: None for the field's default.
     tolerance: how far triangles may be from the surface, as a part of the size of the level set's
         box (its longest side), sampled and not proved.
-    spacing: of cells before anything is refined, in the field's unit; None chooses a 24th of the
-        longest side (by signs a 48th), and of waves (`Field.wavelength`) a fifth of theirs at the
-        most. Sheets that are nearer to each other are told apart where that is noticed; else a
+    cell_size: of cells before anything is refined, in the field's unit; None chooses a 24th of the
+        longest side (by signs a 48th), and of waves (`Field.min_wavelength`) a fifth of theirs at
+        the most. Sheets that are nearer to each other are told apart where that is noticed; else a
         MeshingError says so.
     clip: a volume, needed where the level set has no extent. The surface ends at its boundary; a
         solid is closed there. None for the field's domain.
@@ -161,7 +171,8 @@ def mesh(
             many: on triangles of a mesh, at points of a cloud, on the way out of blobs;
         undecided: at how many points of the lattice the error of f leaves its sign open;
         flat: how many triangles were not fitted to creases, as they would pass through others;
-        Where the triangles of a mesh were kept, made_by is "faces", and there is none of this.
+        Where the triangles of a mesh were kept, made_by is "faces", and there is none of
+        this.
         cloud: of a `DipolePotential`, what it says of itself (`describe`), such as how many points
             it has, what was estimated, and the smoothing and noise that were chosen and found.
 
@@ -170,17 +181,17 @@ def mesh(
     Raises:
         MeshingError: a ValueError, if it could not be done; the message says why.
         TypeError: a field that has parts; a clip that is no volume.
-        ValueError: options out of range, or that contradict each other; a `LevelSet` of several
+        ValueError: options out of range, or that contradict each other; a `Surface` of several
             levels.
     """
-    if isinstance(field, LevelSet):
+    if isinstance(field, Surface):
         level, solid = _level_and_solid(field, level, solid)
         clip = field.clip if clip is None else clip
         section = field.section if section is None else section
         field, largest = field.field, largest or field.largest > 0
     check_volume(clip, "clip")
     check_volume(section, "section")
-    check_options(tolerance, spacing, thickness, seed, max_triangles)
+    check_options(tolerance, cell_size, thickness, seed, max_triangles)
     simplify, largest = flag(simplify, "simplify"), flag(largest, "largest")
     report = teller(progress)
     if solid is not None and not isinstance(solid, bool):
@@ -194,28 +205,28 @@ def mesh(
     if simplify and not is_closed:
         raise ValueError("simplify is for closed meshes: give solid or thickness as well")
     volume = _volume(field, clip, section)
-    asked = _Asked(volume, tolerance, spacing, seed, max_triangles, report)
-    if is_meshed_by_signs(field):
-        made = _by_signs(field, level, solid, thickness is not None, asked)
+    asked = _MeshOptions(volume, tolerance, cell_size, seed, max_triangles, report)
+    if uses_sign_meshing(field):
+        made = _mesh_from_signs(field, level, solid, thickness is not None, asked)
     elif solid:
-        made = _solid(field, level, solid, asked)
+        made = _mesh_solid(field, level, solid, asked)
     else:
-        made = _surface(field, level, asked)
+        made = _mesh_level_set(field, level, asked)
     surface, facts = made.surface, dict(made.facts)
     if solid:
         facts["solid"] = solid
     else:
-        surface = largest_part(surface) if largest else surface
+        surface = largest_component(surface) if largest else surface
         made.check_level(surface)
     if thickness is not None:
         report("thickening")
-        normals = normals_of(made.function, surface)
-        surface, more = thickened(surface, normals, float(thickness), 0.5 * tolerance * made.size)
+        normals = vertex_normals(made.function, surface)
+        surface, more = thicken(surface, normals, float(thickness), 0.5 * tolerance * made.size)
         facts |= more
     if largest and is_closed:
         surface = largest_body(surface)
 
-    def check(one: Surface) -> None:
+    def check(one: TriangleMesh) -> None:
         if solid:
             made.check_level(one)
         check_manifold(one.faces)
@@ -223,16 +234,16 @@ def mesh(
     if not made.is_checked:
         report("checking")
         check(surface)
-        check_apart(surface.vertices, surface.faces)
+        check_no_self_intersection(surface.vertices, surface.faces)
     if simplify:
         report("simplifying")
-        surface, more = simplified(surface, tolerance * made.size, check)
+        surface, more = simplify_mesh(surface, tolerance * made.size, check)
         facts |= more
-    return finished(surface, facts, is_closed)
+    return to_trimesh(surface, facts, is_closed)
 
 
 @dataclass(frozen=True)
-class _Asked:
+class _MeshOptions:
     """Arguments of `mesh`; volume: what the level set is cut by."""
 
     volume: Volume | None
@@ -244,7 +255,7 @@ class _Asked:
 
 
 @dataclass(frozen=True)
-class _Made:
+class _RawMesh:
     """A surface, its size, what is known of it, and the function that it is a level set of.
 
     check_level: raises a MeshingError unless a surface is within the tolerance of the level.
@@ -252,25 +263,25 @@ class _Made:
         pass through itself.
     """
 
-    surface: Surface
+    surface: TriangleMesh
     size: float
     facts: dict[str, Any]
     function: LevelFunction
-    check_level: Callable[[Surface], None]
+    check_level: Callable[[TriangleMesh], None]
     is_checked: bool
 
 
-def _by_signs(
+def _mesh_from_signs(
     field: Field,
     level: float | None,
     solid: tuple[float, float] | bool | None,
     is_thick: bool,
-    asked: _Asked,
-) -> _Made:
+    asked: _MeshOptions,
+) -> _RawMesh:
     """A level set by the signs of f, or the closed surface of a solid.
 
     Raises:
-        MeshingError: as `signed_surface`; if it is empty, or not near the level at all.
+        MeshingError: as `mesh_from_signs`; if it is empty, or not near the level at all.
     """
     ends = _ends_by_signs(field, level, solid, is_thick)
     levels = tuple(end for end in ends if math.isfinite(end))
@@ -290,10 +301,10 @@ def _by_signs(
 
     is_apart = False
 
-    def signed(one: float, side: float, closed: bool) -> Surface:
+    def signed(one: float, side: float, closed: bool) -> TriangleMesh:
         nonlocal is_apart
         try:
-            made, lost, more = signed_surface(
+            made, lost, more = mesh_from_signs(
                 function(one, side),
                 filled,
                 cells,
@@ -303,40 +314,40 @@ def _by_signs(
                 closed=closed,
                 volume=asked.volume,
             )
-        except EmptyError as error:
-            raise EmptyError(f"{error}{why_empty(field)}") from error
+        except EmptySurfaceError as error:
+            raise EmptySurfaceError(f"{error}{empty_surface_hint(field)}") from error
         facts.append(more)
         losses.append(lost)
-        is_apart = made.is_apart
+        is_apart = made.is_intersection_free
         return made.surface
 
     if not solid:
         made = signed(levels[0], 1.0, False)
         if volume is not None and not (isinstance(volume, Box) and box.has_walls):
-            made, is_apart = cut_by(made, volume), False
+            made, is_apart = clip_to_volume(made, volume), False
     elif volume is None and ends[1] == math.inf:
         made = signed(levels[0], -1.0, False)
     else:
         whole = box_manifold(box.lower, box.upper)
         if math.isfinite(ends[0]):
-            whole = manifold_of(signed(ends[0], -1.0, True))
+            whole = to_manifold(signed(ends[0], -1.0, True))
         if math.isfinite(ends[1]):
-            whole = whole - manifold_of(signed(ends[1], -1.0, True))
-        if field.has_sheets and len(levels) == 2:
+            whole = whole - to_manifold(signed(ends[1], -1.0, True))
+        if field.has_jumps and len(levels) == 2:
             _check_has_thickness(field, whole, ends, asked.tolerance * size)
         cut = volume or Box(tuple(box.lower.tolist()), tuple(box.upper.tolist()))
         whole ^= volume_manifold(cut, box.lower, box.upper, 0.5 * asked.tolerance * size)
-        made, is_apart = surface_of(whole), False
+        made, is_apart = from_manifold(whole), False
     if not len(made.faces):
         raise MeshingError("the level set is empty: it lies outside of the clip")
     if is_apart:
         check_manifold(made.faces)
-    known = {"level": levels[0], **_of_both(facts)}
+    known = {"level": levels[0], **_merge_facts(facts)}
     if isinstance(field, DipolePotential):
         known["cloud"] = field.describe()
-    is_told = _judge_signs(field, known, asked.tolerance * size)
+    is_told = _check_sign_accuracy(field, known, asked.tolerance * size)
     _warn_of_lost(field, losses, is_told)
-    return _Made(made, size, known, function(levels[0], 1.0), _nothing, is_apart)
+    return _RawMesh(made, size, known, function(levels[0], 1.0), _accept, is_apart)
 
 
 def _ends_by_signs(
@@ -352,15 +363,15 @@ def _ends_by_signs(
         TypeError: a surface that jumps is to be thickened.
         ValueError: the field has no such level.
     """
-    if is_thick and field.has_sheets:
+    if is_thick and field.has_jumps:
         raise TypeError(
             f"{type(field).__name__} jumps, and its surface has no normals to thicken it "
             "along: mesh it, and move the mesh's vertices instead"
         )
     if solid:
-        return ends_of_solid(field, solid, level)
+        return solid_value_range(field, solid, level)
     level = field.default_level if level is None else float(level)
-    field.check_levels((level,))
+    field.validate_levels((level,))
     return level, math.inf
 
 
@@ -369,7 +380,9 @@ def _cells_by_signs(field: Field, size: float, spacing: float | None) -> tuple[f
     if spacing is not None:
         return float(spacing), 1
     cells, attempts = size / _ACROSS_BY_SIGNS, _ATTEMPTS_BY_SIGNS
-    detailed = cells_for_details(field, cells, SMALLER, SMALLER**2)
+    detailed = cell_size_for_smoothing(
+        field, cells, CELL_REFINEMENT_FACTOR, CELL_REFINEMENT_FACTOR**2
+    )
     # At once what would be tried next.
     return (detailed, attempts - 1) if detailed < cells else (cells, attempts)
 
@@ -378,8 +391,8 @@ def _faces_alone(
     field: WindingNumber,
     level: float,
     solid: tuple[float, float] | bool | None,
-    asked: _Asked,
-) -> _Made:
+    asked: _MeshOptions,
+) -> _RawMesh:
     """The triangles of a mesh that is its own surface, as they are, but for what the volume cuts.
 
     Raises:
@@ -392,19 +405,19 @@ def _faces_alone(
         )
     vertices, faces = field.mesh.vertices, field.mesh.faces
     size = float(np.ptp(vertices[faces].reshape(-1, 3), axis=0).max())
-    surface = Surface.of(vertices, faces)
+    surface = TriangleMesh.without_unused_vertices(vertices, faces)
     if asked.volume is not None:
-        surface = cut_by(surface, asked.volume)
+        surface = clip_to_volume(surface, asked.volume)
     if not len(surface.faces):
         raise MeshingError("the level set is empty: it lies outside of the clip")
     if len(surface.faces) > asked.most_faces:
-        raise TooLargeError(
+        raise TriangleLimitError(
             f"{len(surface.faces):,} triangles of the mesh are its surface, and max_triangles is "
             f"{asked.most_faces:,}: choose a larger max_triangles, or a smaller `clip`"
         )
     known = {"level": level, "made_by": "faces", "spacing": math.nan, "evaluations": 0}
     function = LevelFunction(field, level, most_faces=asked.most_faces)
-    return _Made(surface, size, known, function, _nothing, False)
+    return _RawMesh(surface, size, known, function, _accept, False)
 
 
 def _check_has_thickness(
@@ -420,14 +433,14 @@ def _check_has_thickness(
         )
 
 
-def _of_both(facts: list[dict[str, Any]]) -> dict[str, Any]:
+def _merge_facts(facts: list[dict[str, Any]]) -> dict[str, Any]:
     """What is known of the surfaces at both ends of a solid."""
     sums = ("evaluations", "undecided", "flat", "far", "looked_at", "lost", "sought")
     larger = {key: max(one[key] for one in facts) for key in ("spacing", "within")}
     return {**facts[0], **larger, **{key: sum(one[key] for one in facts) for key in sums}}
 
 
-def _judge_signs(field: Field, facts: dict[str, Any], tolerance: float) -> bool:
+def _check_sign_accuracy(field: Field, facts: dict[str, Any], tolerance: float) -> bool:
     """Whether more than a few vertices and centers of triangles are beyond the tolerance, which is
     warned of.
 
@@ -440,18 +453,19 @@ def _judge_signs(field: Field, facts: dict[str, Any], tolerance: float) -> bool:
         raise MeshingError(
             f"some of {far:,} vertices and centers of triangles are farther than several cells "
             f"from where the sign of {kind} changes: its values are not what it promises there; "
-            "choose a smaller `spacing`, or a `clip` without these places"
+            "choose a smaller `cell_size`, or a `clip` without these places"
         )
-    if far > MOST_FAR * count:
+    if far > MAX_OFF_LEVEL_FRACTION * count:
         warnings.warn(
             f"{far:,} of {count:,} vertices and centers of triangles are farther from the level of "
             f"this {kind} than the tolerance, which is {tolerance:.3g}; all are within "
             f"{within:.3g}. The level is rough there, or has parts that are nearer to each other "
-            f"than its cells of {facts['spacing']:.3g} are wide: choose a smaller `spacing`, or a "
+            f"than its cells of {facts['spacing']:.3g} are wide: choose a smaller `cell_size`, or "
+            "a "
             "larger `tolerance`",
             stacklevel=4,
         )
-    return far > MOST_FAR * count
+    return far > MAX_OFF_LEVEL_FRACTION * count
 
 
 def _warn_of_lost(field: Field, losses: list[LostParts], is_told: bool) -> None:
@@ -466,30 +480,34 @@ def _warn_of_lost(field: Field, losses: list[LostParts], is_told: bool) -> None:
             )
 
 
-def _nothing(surface: Surface) -> None:
+def _accept(surface: TriangleMesh) -> None:
     """Accepts every surface: by signs distances were measured when it was made."""
 
 
 def _level_and_solid(
-    surface: LevelSet, level: float | None, solid: tuple[float, float] | bool | None
+    surface: Surface, level: float | None, solid: tuple[float, float] | bool | None
 ) -> tuple[float | None, tuple[float, float] | bool | None]:
-    """The level and the solid to mesh: those that are given, else those of a `LevelSet`."""
+    """The level and the solid to mesh: those that are given, else those of a `Surface`."""
     if level is not None or not (solid is None or isinstance(solid, bool)):
         return level, solid
     if surface.solid is not None and solid is not False:
         return None, surface.solid
     if len(surface.levels) > 1:
-        kind, numbers = type(surface.field).__name__, ", ".join(f"{x:g}" for x in surface.numbers)
+        kind, numbers = (
+            type(surface.field).__name__,
+            ", ".join(f"{x:g}" for x in surface.level_values),
+        )
         raise ValueError(
-            f"this LevelSet of a {kind} has {len(surface.levels)} levels ({numbers}) and a mesh is "
-            f"of one: give it beside, as in mesh(surface, level={surface.numbers[0]:g}), one after "
+            f"this Surface of a {kind} has {len(surface.levels)} levels ({numbers}) and a mesh is "
+            f"of one: give it beside, as in mesh(surface, level={surface.level_values[0]:g}), one "
+            "after "
             "the other"
         )
-    return surface.numbers[0], solid
+    return surface.level_values[0], solid
 
 
 def _check_level(
-    function: LevelFunction, made: Surface, tolerance: float, volume: Volume | None
+    function: LevelFunction, made: TriangleMesh, tolerance: float, volume: Volume | None
 ) -> None:
     """Raise unless a surface is within the tolerance of the level, and inside the volume."""
     if volume is not None:
@@ -499,7 +517,7 @@ def _check_level(
 
 def _checked(field: Field) -> Field:
     check_is_field(field)
-    if field.has_parts or (field.has_sheets and not is_meshed_by_signs(field)):
+    if field.has_patches or (field.has_jumps and not uses_sign_meshing(field)):
         raise TypeError(
             f"{type(field).__name__} is not one continuous function: mesh its parts, or the "
             "solid angle of its boundary"
@@ -521,39 +539,41 @@ def _checked(field: Field) -> Field:
 def _volume(field: Field, clip: Volume | None, section: Volume | None) -> Volume | None:
     """What the level sets are cut by: the clip, the domain where the field ends there or there is
     no clip, and the section."""
-    ends = field.domain is not None and not (field.is_entire and clip is not None)
+    ends = field.domain is not None and not (field.is_global and clip is not None)
     parts = dict.fromkeys((clip, field.domain if ends else None, section))
     kept = [one for one in parts if one is not None]
     if len(kept) < 2:
         return kept[0] if kept else None
-    return Intersection(kept)
+    return VolumeIntersection(kept)
 
 
-def _solid(
+def _mesh_solid(
     field: Field,
     level: float | None,
     solid: tuple[float, float] | Literal[True],
-    asked: _Asked,
-) -> _Made:
+    asked: _MeshOptions,
+) -> _RawMesh:
     """The closed surface of a solid that is put together from smooth levels."""
-    region = LevelFunction(*region_of(field, solid, level), most_faces=asked.most_faces)
+    region = LevelFunction(*solid_and_level(field, solid, level), most_faces=asked.most_faces)
     evaluations = [0]
 
     def angle_mesher(error: float, cells: float) -> AngleMesher:
-        def mesh_angle(angle: SolidAngle, value: float) -> Surface:
+        def mesh_angle(angle: SolidAngle, value: float) -> TriangleMesh:
             angle = cast("SolidAngle", _checked(angle))
             box = _box(angle, (value,), None)
             function = LevelFunction(angle, value, most_faces=asked.most_faces)
-            made, facts = _spanned(function, box, error, cells, 1, asked.seed, asked.report)
+            made, facts = _mesh_spanning_curve(
+                function, box, error, cells, 1, asked.seed, asked.report
+            )
             evaluations[0] += facts["evaluations"]
             return made
 
         return mesh_angle
 
-    def check_level(made: Surface, size: float) -> None:
+    def check_level(made: TriangleMesh, size: float) -> None:
         _check_level(region, made, asked.tolerance * size, asked.volume)
 
-    def check(made: Surface, size: float) -> None:
+    def check(made: TriangleMesh, size: float) -> None:
         check_manifold(made.faces, made.vertices)
         check_level(made, size)
 
@@ -572,65 +592,69 @@ def _solid(
         "level": region.level,
         "spacing": made.spacing,
         "evaluations": made.evaluations + evaluations[0],
-        "level_sets": made.levels,
+        "surfaces_with_options": made.levels,
     }
-    return _Made(
+    return _RawMesh(
         made.surface, made.size, facts, region, lambda one: check_level(one, made.size), True
     )
 
 
-def _surface(field: Field, level: float | None, asked: _Asked) -> _Made:
+def _mesh_level_set(field: Field, level: float | None, asked: _MeshOptions) -> _RawMesh:
     """A level set of a function that is smooth nearly everywhere, or of an angle."""
     level = field.default_level if level is None else float(level)
     function = LevelFunction(field, level, most_faces=asked.most_faces)
-    field.check_levels((level,))
+    field.validate_levels((level,))
     volume, report = asked.volume, asked.report
     box = _box(field, (level,), volume)
     size = float((box.upper - box.lower).max())
     error = 0.5 * asked.tolerance * size
     cells = size / _ACROSS if asked.spacing is None else float(asked.spacing)
-    if asked.spacing is None and field.wavelength is not None:
-        cells = min(cells, field.wavelength / CELLS_PER_WAVE)
+    if asked.spacing is None and field.min_wavelength is not None:
+        cells = min(cells, field.min_wavelength / CELLS_PER_WAVE)
     attempts = 1 if asked.spacing is not None else _MOST_ATTEMPTS
     if isinstance(field, SolidAngle):
-        made, facts = _spanned(function, box, error, cells, attempts, asked.seed, report)
+        made, facts = _mesh_spanning_curve(
+            function, box, error, cells, attempts, asked.seed, report
+        )
     else:
-        made, facts = _filling(function, box, error, cells, attempts, report)
+        made, facts = _mesh_in_lattice(function, box, error, cells, attempts, report)
     if volume is not None and not (isinstance(volume, Box) and box.has_walls):
-        made = cut_by(made, volume)
+        made = clip_to_volume(made, volume)
         if not len(made.faces):
             raise MeshingError("the level set is empty: it lies outside of the clip")
 
-    def check_level(one: Surface) -> None:
+    def check_level(one: TriangleMesh) -> None:
         _check_level(function, one, asked.tolerance * size, volume)
 
-    return _Made(made, size, {"level": level, **facts}, function, check_level, False)
+    return _RawMesh(made, size, {"level": level, **facts}, function, check_level, False)
 
 
-def _filling(
+def _mesh_in_lattice(
     function: LevelFunction,
-    box: _Filled,
+    box: _MeshingBox,
     tolerance: float,
     spacing: float,
     attempts: int,
     report: Callable[[str], None],
-) -> tuple[Surface, dict[str, Any]]:
+) -> tuple[TriangleMesh, dict[str, Any]]:
     """The level set of a real-valued field in a box, in cells of a lattice."""
     before: MeshingError | None = None
     while True:
         report(f"cells of {spacing:.3g}")
         try:
-            lattice = Lattice.filling(box.lower, box.upper, spacing)
-            made, isotopy = open_surface(function, lattice, tolerance, report)
+            lattice = BccLattice.covering_box(box.lower, box.upper, spacing)
+            made, isotopy = mesh_open_surface(function, lattice, tolerance, report)
             check_manifold(made.faces, made.vertices)
             check_near_level(function, made.vertices, made.faces, 2 * tolerance, None)
-            check_apart(made.vertices, made.faces)
+            check_no_self_intersection(made.vertices, made.faces)
             break
         except MeshingError as wrong:
             attempts -= 1
-            if not attempts or not may_help_again(wrong, before, SMALLER**attempts):
+            if not attempts or not is_retry_promising(
+                wrong, before, CELL_REFINEMENT_FACTOR**attempts
+            ):
                 raise
-            before, spacing = wrong, SMALLER * spacing
+            before, spacing = wrong, CELL_REFINEMENT_FACTOR * spacing
             report(f"{wrong}; so smaller cells")
     facts = {
         "spacing": spacing,
@@ -642,33 +666,33 @@ def _filling(
     return made, facts
 
 
-def _spanned(
+def _mesh_spanning_curve(
     function: LevelFunction,
-    box: _Filled,
+    box: _MeshingBox,
     tolerance: float,
     spacing: float,
     attempts: int,
     seed: int,
     report: Callable[[str], None],
-) -> tuple[Surface, dict[str, Any]]:
+) -> tuple[TriangleMesh, dict[str, Any]]:
     """The level set of an angle, which ends at its curve."""
     ends = box.lower, box.upper
-    made = spanned_surface(
+    made = mesh_spanning_curve(
         function, spacing, attempts, ends, box.has_walls, seed, tolerance, report
     )
     facts = {
         "spacing": made.spacing,
         "evaluations": function.evaluations,
         "proved": made.crossings.proved,
-        "integrated": made.crossings.integrated,
+        "integrated": made.crossings.integrated_count,
         **made.isotopy.shares(),
         "turned": made.turned,
     }
-    return Surface.of(made.vertices, made.faces), facts
+    return TriangleMesh.without_unused_vertices(made.vertices, made.faces), facts
 
 
 @dataclass(frozen=True)
-class _Filled:
+class _MeshingBox:
     """The box to be filled, from `lower` to `upper`, (3,) each, and whether the surface may end at
     its faces."""
 
@@ -677,7 +701,7 @@ class _Filled:
     has_walls: bool
 
 
-def _box(field: Field, levels: tuple[float, ...], volume: Volume | None) -> _Filled:
+def _box(field: Field, levels: tuple[float, ...], volume: Volume | None) -> _MeshingBox:
     """The box to be filled: around the level sets, if it has an extent, and the volume.
 
     Raises:
@@ -696,10 +720,10 @@ def _box(field: Field, levels: tuple[float, ...], volume: Volume | None) -> _Fil
         )
     if isinstance(field, SolidAngle):
         return _around_curve(field, extent, volume)
-    lower, upper = _common_bounds(extent if volume is None else volume)
+    lower, upper = _bounds_of(extent if volume is None else volume)
     if volume is not None and extent is not None and extent != volume:
         # A little room, so that what touches its extent does not end there.
-        low, high = _common_bounds(extent)
+        low, high = _bounds_of(extent)
         pad = _MARGIN * float((high - low).max())
         if math.isfinite(pad):
             lower, upper = np.maximum(lower, low - pad), np.minimum(upper, high + pad)
@@ -713,25 +737,25 @@ def _box(field: Field, levels: tuple[float, ...], volume: Volume | None) -> _Fil
         )
     if not (lower < upper).all():
         raise MeshingError("the level set is empty: it lies outside of the clip")
-    return _Filled(lower, upper, volume is not None)
+    return _MeshingBox(lower, upper, volume is not None)
 
 
-def _around_curve(field: SolidAngle, extent: Volume | None, volume: Volume | None) -> _Filled:
+def _around_curve(field: SolidAngle, extent: Volume | None, volume: Volume | None) -> _MeshingBox:
     """Around the whole surface that a curve spans, which is cut later; or if that has no extent,
     around the curve and the volume."""
     if extent is not None:
-        return _Filled(*_common_bounds(extent), False)
+        return _MeshingBox(*_bounds_of(extent), False)
     assert volume is not None
     points = np.concatenate(list(field.loops))
-    low, high = _common_bounds(volume)
+    low, high = _bounds_of(volume)
     lower, upper = np.minimum(low, points.min(axis=0)), np.maximum(high, points.max(axis=0))
     if not np.isfinite(upper - lower).all():
         raise MeshingError("the clip has no bounds: give clip=harnack.Box(lower, upper)")
     pad = _ROOM * (upper - lower).max()
-    return _Filled(lower - pad, upper + pad, True)
+    return _MeshingBox(lower - pad, upper + pad, True)
 
 
-def _common_bounds(volume: Volume | None) -> tuple[FloatArray, FloatArray]:
+def _bounds_of(volume: Volume | None) -> tuple[FloatArray, FloatArray]:
     assert volume is not None
     lower, upper = (np.array(end, np.float64) for end in volume.bounds())
     return lower, upper

@@ -13,15 +13,15 @@ from collections.abc import Callable
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
-from harnack.meshing.checks import FarError, MeshingError, intersecting_faces
-from harnack.meshing.delaunay_points import newton
-from harnack.meshing.edges import IntArray, directed_edges, distinct, edge_keys, lengths
-from harnack.meshing.lattice_meshing import Surface
+from harnack.meshing.checks import MeshingError, OffLevelError, intersecting_faces
+from harnack.meshing.delaunay_points import newton_to_level
+from harnack.meshing.edges import IntArray, edge_keys, half_edges, row_norms, sorted_unique
+from harnack.meshing.lattice_meshing import TriangleMesh
 from harnack.meshing.level_function import LevelFunction
 from harnack.meshing.refinement import split_faces
-from harnack.meshing.self_intersection_repair import uncrossed
+from harnack.meshing.self_intersection_repair import resolve_local_intersections
 
-__all__ = ["brought_near"]
+__all__ = ["project_outliers"]
 
 # More places than this are no exceptions; and how often faces may be cut, one after the other.
 _MOST, _TIMES = 100, 4
@@ -31,13 +31,13 @@ _FAR = 0.5
 _MENDED_WITHIN = 0.25
 
 
-def brought_near(
+def project_outliers(
     function: LevelFunction,
-    surface: Surface,
+    surface: TriangleMesh,
     places: FloatArray,
     tolerance: float,
-    check: Callable[[Surface], None],
-) -> Surface | None:
+    check: Callable[[TriangleMesh], None],
+) -> TriangleMesh | None:
     """The surface with vertices that are far from the level moved onto it, and faces with such a
     center cut at the middles of their edges that are far, or at their own, moved onto it; None if
     that cannot be done.
@@ -53,24 +53,26 @@ def brought_near(
     vertices, faces = surface.vertices, surface.faces
     is_new = np.zeros(len(faces), np.bool_)
     for _ in range(_TIMES):
-        changed = _moved(function, Surface(vertices, faces), is_new, places, tolerance)
+        changed = _project_and_split(
+            function, TriangleMesh(vertices, faces), is_new, places, tolerance
+        )
         if changed is None:
             return None
         (vertices, faces), is_new = changed
         try:
-            check(Surface.of(vertices, faces[is_new]))
-        except FarError as far:
-            places = far.places
+            check(TriangleMesh.without_unused_vertices(vertices, faces[is_new]))
+        except OffLevelError as far:
+            places = far.locations
             continue
         except MeshingError:
             return None
-        return _apart(Surface(vertices, faces), is_new, tolerance, check)
+        return _check_new_faces(TriangleMesh(vertices, faces), is_new, tolerance, check)
     return None
 
 
-def _moved(
+def _project_and_split(
     function: LevelFunction,
-    surface: Surface,
+    surface: TriangleMesh,
     is_new: BoolArray,
     places: FloatArray,
     tolerance: float,
@@ -82,16 +84,16 @@ def _moved(
     centers = _rows_at(places, vertices[faces].mean(axis=1))
     if len(corners) + len(centers) < len(places):
         return None
-    pairs = directed_edges(faces[centers])
+    pairs = half_edges(faces[centers])
     middle = vertices[pairs].mean(axis=1)
-    pairs = pairs[function.at(middle).distance > _FAR * tolerance]
+    pairs = pairs[function.sample(middle).distance > _FAR * tolerance]
     count = len(vertices)
-    keys = distinct(edge_keys(pairs, count))
+    keys = sorted_unique(edge_keys(pairs, count))
     ends = np.stack(np.divmod(keys, count), axis=1)
     # Edges of all faces at these ends: which of them is cut.
     place = np.full(faces.shape, -1, np.int64)
     rows = np.flatnonzero(np.isin(faces, ends).any(axis=1))
-    found = np.searchsorted(keys, own := edge_keys(directed_edges(faces[rows]), count))
+    found = np.searchsorted(keys, own := edge_keys(half_edges(faces[rows]), count))
     found = np.minimum(found, max(len(keys) - 1, 0))
     if len(keys):
         is_cut = keys[found] == own
@@ -100,8 +102,10 @@ def _moved(
     start = np.concatenate(
         [vertices[corners], vertices[ends].mean(axis=1), vertices[faces[whole]].mean(axis=1)]
     )
-    moved = newton(function, start, function.at(start), np.full(len(start), tolerance), None)
-    if not (lengths(moved - start) <= 2 * tolerance).all():
+    moved = newton_to_level(
+        function, start, function.sample(start), np.full(len(start), tolerance), None
+    )
+    if not (row_norms(moved - start) <= 2 * tolerance).all():
         return None
     vertices = np.concatenate([vertices, moved[len(corners) :]])
     vertices[corners] = moved[: len(corners)]
@@ -120,9 +124,12 @@ def _moved(
     return (vertices, faces), is_new
 
 
-def _apart(
-    surface: Surface, is_new: BoolArray, tolerance: float, check: Callable[[Surface], None]
-) -> Surface | None:
+def _check_new_faces(
+    surface: TriangleMesh,
+    is_new: BoolArray,
+    tolerance: float,
+    check: Callable[[TriangleMesh], None],
+) -> TriangleMesh | None:
     """The surface if its new faces (m,) pass through no others; mended there if need be, and then
     checked as a whole; None if that does not help."""
     vertices, faces = surface.vertices, surface.faces
@@ -130,7 +137,7 @@ def _apart(
     crossing = around[intersecting_faces(vertices, faces[around])]
     if not len(crossing):
         return surface
-    mended, left = uncrossed(surface, crossing, _MENDED_WITHIN * tolerance)
+    mended, left = resolve_local_intersections(surface, crossing, _MENDED_WITHIN * tolerance)
     if left:
         return None
     try:

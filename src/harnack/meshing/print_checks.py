@@ -12,21 +12,21 @@ from typing import Any, cast
 import numpy as np
 
 from harnack.backend import FloatArray
-from harnack.backend.validation import positive
+from harnack.backend.validation import as_positive
 from harnack.fields.solids.mesh_solid import MeshSolid
-from harnack.files.geometry_files import Mesh, read_surface
+from harnack.files.geometry_files import LoadedMesh, read_geometry
 from harnack.geometry import MeshError, validate_mesh, zero_area_faces
 from harnack.geometry.welding import Welded
 from harnack.meshing.checks import (
     intersecting_faces,
+    nonmanifold_vertices,
     point_text,
-    singular_vertices,
     touching_pairs,
 )
 from harnack.meshing.clipping import Shells
-from harnack.meshing.edges import Edges, IntArray, directed_edges, lengths
-from harnack.meshing.lattice_meshing import Surface
-from harnack.meshing.thickness import thickness
+from harnack.meshing.edges import Edges, IntArray, half_edges, row_norms
+from harnack.meshing.lattice_meshing import TriangleMesh
+from harnack.meshing.thickness import wall_thickness
 
 __all__ = ["PrintCheck", "PrintProblem", "check_print"]
 
@@ -51,9 +51,9 @@ class PrintProblem:
 
     kind: str
     count: int
-    where: FloatArray
+    locations: FloatArray
     message: str
-    is_fatal: bool = True
+    is_error: bool = True
 
 
 @dataclass(frozen=True)
@@ -68,14 +68,14 @@ class PrintCheck:
     parts: int
 
     @property
-    def is_fine(self) -> bool:
+    def is_printable(self) -> bool:
         """Whether nothing is wrong; hints may be left."""
         return not _is_wrong(self.problems)
 
     def as_dict(self, most_places: int = 10) -> dict[str, Any]:
         """Of plain numbers and texts, as JSON holds them."""
         return {
-            "fine": self.is_fine,
+            "fine": self.is_printable,
             "size": list(self.size),
             "volume": self.volume,
             "triangles": self.triangles,
@@ -84,16 +84,18 @@ class PrintCheck:
                 {
                     "kind": one.kind,
                     "count": one.count,
-                    "fatal": one.is_fatal,
+                    "fatal": one.is_error,
                     "message": one.message,
-                    "where": one.where[:most_places].tolist(),
+                    "where": one.locations[:most_places].tolist(),
                 }
                 for one in self.problems
             ],
         }
 
 
-def check_print(part: Any, *, wall: float | None = None, bed: Any = None) -> PrintCheck:
+def check_print(
+    part: Any, *, min_thickness: float | None = None, build_volume: Any = None
+) -> PrintCheck:
     """What a slicer would complain of in a mesh, and where.
 
     Wrong are: open edges, edges of more than two faces, neighbors that do not agree on their two
@@ -107,48 +109,59 @@ def check_print(part: Any, *, wall: float | None = None, bed: Any = None) -> Pri
 
     part: a trimesh.Trimesh, (vertices, faces), or the name of a file. Vertices at the same place
         are one.
-    wall: the least thickness that is fine, a length (see `thickness`); None to leave it out.
-    bed: (x, y, z), the size that fits, turned by right angles about z; None to leave it out.
+    min_thickness: the least thickness that is fine, a length (see `thickness`); None to leave it
+        out.
+    build_volume: (x, y, z), the size that fits, turned by right angles about z; None to leave it
+        out.
 
     Raises:
         MeshError: no mesh. FileFormatError: a file that cannot be read. ValueError: a wall or a bed
             that is no length.
     """
-    if wall is not None:
-        wall = positive(wall, "wall")
-    if bed is not None and np.shape(bed) != (3,):
-        raise ValueError(f"bed must be (x, y, z), three lengths, not {bed!r}")
-    sides = None if bed is None else [positive(one, "bed") for one in bed]
+    if min_thickness is not None:
+        min_thickness = as_positive(min_thickness, "min_thickness")
+    if build_volume is not None and np.shape(build_volume) != (3,):
+        raise ValueError(f"build_volume must be (x, y, z), three lengths, not {build_volume!r}")
+    sides = (
+        None if build_volume is None else [as_positive(one, "build_volume") for one in build_volume]
+    )
     x, faces, rounded = _mesh_of(part)
     found = _topology(x, faces)
     is_closed = not _is_wrong(found)
-    shells = Shells.of(Surface(x, faces))
+    shells = Shells.of(TriangleMesh(x, faces))
     crossings, touching = _contacts(x, faces, shells, is_closed)
     is_clear = is_closed and not crossings.count
-    found += [*_of_parts(shells, is_closed, is_clear), crossings, touching]
-    if wall is not None:
-        found += [_thin(x, faces, wall, not _is_wrong(found)), _coarse(x, faces, wall)]
+    found += [*_component_problems(shells, is_closed, is_clear), crossings, touching]
+    if min_thickness is not None:
+        found += [
+            _thin_walls(x, faces, min_thickness, not _is_wrong(found)),
+            _coarse(x, faces, min_thickness),
+        ]
     low, high = x[faces].min(axis=(0, 1)), x[faces].max(axis=(0, 1))
     size = cast("tuple[float, float, float]", tuple((high - low).tolist()))
     found += _of_size(size, sides)
     found.append(rounded)
-    kept = sorted((one for one in found if one.count), key=lambda one: not one.is_fatal)
+    kept = sorted((one for one in found if one.count), key=lambda one: not one.is_error)
     volume = float(shells.volumes.sum()) if is_closed else None
     return PrintCheck(tuple(kept), size, volume, len(faces), len(shells.volumes))
 
 
 def _is_wrong(problems: Sequence[PrintProblem]) -> bool:
-    return any(one.is_fatal and one.count for one in problems)
+    return any(one.is_error and one.count for one in problems)
 
 
 def _mesh_of(part: Any) -> tuple[FloatArray, IntArray, PrintProblem]:
     """Vertices, and faces between those at one place or apart by rounding, with those of zero area;
     and how many were apart."""
     if isinstance(part, str | os.PathLike):
-        read = read_surface(cast("Any", part), "winding")
-        if not isinstance(read, Mesh):
+        read = read_geometry(cast("Any", part), "winding")
+        if not isinstance(read, LoadedMesh):
             raise MeshError(f"{part}: it holds no faces, so there is nothing to print")
-        x, faces, rounded = read.vertices, np.concatenate([read.faces, read.flat]), read.rounded
+        x, faces, rounded = (
+            read.vertices,
+            np.concatenate([read.faces, read.zero_area_faces]),
+            read.rounded,
+        )
     else:
         pair = (part.vertices, part.faces) if hasattr(part, "faces") else part
         try:
@@ -158,12 +171,12 @@ def _mesh_of(part: Any) -> tuple[FloatArray, IntArray, PrintProblem]:
                 "a mesh is a trimesh.Trimesh, a pair (vertices, faces), or the path of a file, not "
                 f"of type {type(part).__name__}"
             ) from None
-        x, faces = validate_mesh(vertices, given, flat=True)
+        x, faces = validate_mesh(vertices, given, allow_zero_area=True)
         rounded = 0
     welded = Welded.of(x, faces)
     count = rounded + welded.rounded
     text = f"{count:,} {'corner is' if count == 1 else 'corners are'} apart from others by rounding"
-    note = PrintProblem("corners apart by rounding", count, np.zeros((0, 3)), text, is_fatal=False)
+    note = PrintProblem("corners apart by rounding", count, np.zeros((0, 3)), text, is_error=False)
     return x, welded.index[faces], note
 
 
@@ -180,25 +193,29 @@ def _topology(x: FloatArray, faces: IntArray) -> list[PrintProblem]:
     flat = zero_area_faces(x, faces)
     vanished = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
     kept = faces[~vanished]
-    pairs = directed_edges(kept)
+    pairs = half_edges(kept)
     edges = Edges.of(pairs)
-    middle = x[edges.ends].mean(axis=1)
+    middle = x[edges.vertices].mean(axis=1)
     ways = np.bincount(
-        edges.index, np.where(pairs[:, 0] < pairs[:, 1], 1, -1), minlength=len(edges.uses)
+        edges.edge_of_pair,
+        np.where(pairs[:, 0] < pairs[:, 1], 1, -1),
+        minlength=len(edges.multiplicity),
     )
     _, first, uses = np.unique(np.sort(kept, axis=1), axis=0, return_index=True, return_counts=True)
-    touching = singular_vertices(kept)
-    many = np.unique(edges.ends[edges.uses > 2])
+    touching = nonmanifold_vertices(kept)
+    many = np.unique(edges.vertices[edges.multiplicity > 2])
     return [
-        _problem("open edges", middle[edges.uses == 1], "{} {edge has|edges have} one face alone"),
+        _problem(
+            "open edges", middle[edges.multiplicity == 1], "{} {edge has|edges have} one face alone"
+        ),
         _problem(
             "edges of many faces",
-            middle[edges.uses > 2],
+            middle[edges.multiplicity > 2],
             "{} {edge has|edges have} more than two faces",
         ),
         _problem(
             "sides that disagree",
-            middle[(edges.uses == 2) & (ways != 0)],
+            middle[(edges.multiplicity == 2) & (ways != 0)],
             "at {} {edge|edges} neighboring faces do not agree on what is inside",
         ),
         _problem(
@@ -220,13 +237,13 @@ def _topology(x: FloatArray, faces: IntArray) -> list[PrintProblem]:
     ]
 
 
-def _of_parts(shells: Shells, is_closed: bool, is_clear: bool) -> list[PrintProblem]:
+def _component_problems(shells: Shells, is_closed: bool, is_clear: bool) -> list[PrintProblem]:
     """Inside out, inside others, cavities, loose and tiny parts. is_clear: closed, and no faces
     pass through each other, so that a part is inside another as a whole or not at all."""
     volumes, none = shells.volumes, np.zeros(len(shells.volumes), np.bool_)
     middle = 0.5 * (shells.lower + shells.upper)
     length = (shells.upper - shells.lower).max(axis=1)
-    depth = shells.depths() if is_closed else np.zeros(len(volumes), np.int64)
+    depth = shells.nesting_depths() if is_closed else np.zeros(len(volumes), np.int64)
     is_hollow = (volumes < 0) & (depth > 0)
     is_nested = (volumes > 0) & (depth > 0) & is_clear
     inside_out = (volumes < 0) & ~is_hollow if is_closed else none
@@ -268,7 +285,7 @@ def _contacts(
     """
     is_flat = np.zeros(len(faces), np.bool_)
     is_flat[zero_area_faces(x, faces)] = True
-    is_plain = np.isin(shells.number, shells.number[is_flat], invert=True)
+    is_plain = np.isin(shells.component_of_face, shells.component_of_face[is_flat], invert=True)
     rows = np.flatnonzero((faces != np.roll(faces, 1, axis=1)).all(axis=1))
     # Duplicates have been counted.
     rows = rows[np.unique(np.sort(faces[rows], axis=1), axis=0, return_index=True)[1]]
@@ -283,7 +300,9 @@ def _contacts(
     rows = rows[~is_flat[rows]]
     pairs, places = touching_pairs(x, faces[rows])
     first, second = rows[pairs.T]
-    is_contact = is_plain[first] | (shells.number[first] != shells.number[second])
+    is_contact = is_plain[first] | (
+        shells.component_of_face[first] != shells.component_of_face[second]
+    )
     touching = _problem(
         "touching faces",
         np.unique(places[is_contact], axis=0),
@@ -293,13 +312,13 @@ def _contacts(
     return dataclasses.replace(crossings, message=crossings.message + advice), touching
 
 
-def _thin(x: FloatArray, faces: IntArray, wall: float, is_solid: bool) -> PrintProblem:
+def _thin_walls(x: FloatArray, faces: IntArray, wall: float, is_solid: bool) -> PrintProblem:
     if not is_solid:
         # Another name than that of walls that were found thin.
         why = "how thick walls are is not known before the rest is mended"
         return PrintProblem("walls not measured", 1, np.zeros((0, 3)), why)
-    found = thickness(MeshSolid(x, faces))
-    places = found.where(wall - _ROUNDING * float(np.ptp(x, axis=0).max()))
+    found = wall_thickness(MeshSolid(x, faces))
+    places = found.thin_locations(wall - _ROUNDING * float(np.ptp(x, axis=0).max()))
     least = f"; the thinnest is {found.thinnest:.3g}"
     text = f"at {{}} {{triangle|triangles}} the part is thinner than {wall:g}{least}"
     return _problem("thin walls", places, text)
@@ -308,7 +327,7 @@ def _thin(x: FloatArray, faces: IntArray, wall: float, is_solid: bool) -> PrintP
 def _coarse(x: FloatArray, faces: IntArray, wall: float) -> PrintProblem:
     """Faces beside whose centers thin places may be that nobody looked at."""
     corner = x[faces]
-    longest = np.stack([lengths(corner[:, k] - corner[:, k - 1]) for k in range(3)]).max(axis=0)
+    longest = np.stack([row_norms(corner[:, k] - corner[:, k - 1]) for k in range(3)]).max(axis=0)
     places = corner[longest > _COARSE * wall].mean(axis=1)
     text = f"{{}} {{triangle is|triangles are}} longer than {_COARSE:g} walls, and thickness is "
     text += "measured at centers"
@@ -323,10 +342,10 @@ def _of_size(size: tuple[float, float, float], bed: list[float] | None) -> list[
         why = f"it is {text} mm, if files are in millimeters"
         if longest < _SMALLEST:
             why += f"; in meters {longest * 1000:.4g}, in inches {longest * _INCH:.4g} mm long"
-        found.append(PrintProblem("unit", 1, nowhere, why, is_fatal=False))
+        found.append(PrintProblem("unit", 1, nowhere, why, is_error=False))
     elif longest < 10 * _SMALLEST:
         why = f"it is {text} mm; if that is meant in inches, scale it by 25.4"
-        found.append(PrintProblem("unit", 1, nowhere, why, is_fatal=False))
+        found.append(PrintProblem("unit", 1, nowhere, why, is_error=False))
     if bed is not None:
         x, y, z = size
         a, b, c = (side * (1 + _ROUNDING) for side in bed)

@@ -13,21 +13,28 @@ from typing import Any
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
-from harnack.meshing.checks import check_count
-from harnack.meshing.delaunay_points import newton
+from harnack.meshing.checks import check_triangle_limit
+from harnack.meshing.delaunay_points import newton_to_level
 from harnack.meshing.edges import (
     Edges,
     IntArray,
+    area_normals,
     boundary_edges,
-    crosses,
-    directed_edges,
-    dots,
-    lengths,
+    half_edges,
+    row_dots,
+    row_norms,
 )
-from harnack.meshing.level_function import LevelFunction, Samples
-from harnack.meshing.mesh_improvement import flipped, relaxed, without_slivers
+from harnack.meshing.level_function import LevelFunction, LevelSamples
+from harnack.meshing.mesh_improvement import collapse_slivers, flip_edges, relax_vertices
 
-__all__ = ["far_places", "improved", "refined", "smoothed", "smoothed_within", "split_faces"]
+__all__ = [
+    "improve",
+    "refine",
+    "smooth",
+    "smooth_within_tolerance",
+    "split_faces",
+    "unrefined_midpoints",
+]
 
 Walls = tuple[FloatArray, FloatArray] | None
 # Which points (k, 3) count; None for all.
@@ -49,10 +56,10 @@ _MOST_ROUNDS = 12
 # The number of edges and centers to be cut grows at first, and then falls. If it grows to this many
 # times the least before, refinement will not end: the surface bends within any triangle, as around
 # each dipole of a cloud.
-_RUNS_AWAY = 3
+_DIVERGENCE_FACTOR = 3
 
 
-def refined(
+def refine(
     function: LevelFunction,
     vertices: FloatArray,
     faces: IntArray,
@@ -69,49 +76,49 @@ def refined(
         well: else its edges, which end off the surface, would be cut again and again.
 
     Raises:
-        TooLargeError: it takes more triangles than the function allows.
+        TriangleLimitError: it takes more triangles than the function allows.
     """
     least, before = math.inf, 0
     for round_number in range(_MOST_ROUNDS):
         report(f"refining, round {round_number + 1}: {len(faces):,} triangles")
-        far = _Far.of(function, vertices, faces, tolerance, walls, where)
+        far = _RefinementMarks.of(function, vertices, faces, tolerance, walls, where)
         marked = far.marked
-        count = int(marked.sum()) + int(far.cuts_off.sum())
+        count = int(marked.sum()) + int(far.misses_corner.sum())
         if not count:
             break
-        if count > _RUNS_AWAY * least:
+        if count > _DIVERGENCE_FACTOR * least:
             break
         least = min(least, count) if count < before else least
         before = count
         # Every edge that is cut makes one more triangle on each side, and so does every center.
-        check_count(len(faces) + 2 * count, function.most_faces)
-        samples, reach = far.samples.some(marked), 0.5 * far.span[marked]
-        moved = newton(function, far.middle[marked], samples, reach, walls)
+        check_triangle_limit(len(faces) + 2 * count, function.most_faces)
+        samples, reach = far.samples.select(marked), 0.5 * far.span[marked]
+        moved = newton_to_level(function, far.middle[marked], samples, reach, walls)
         if function.field.has_creases:
-            moved = _on_creases(function, vertices, far.ends[marked], moved, walls)
+            moved = _project_to_creases(function, vertices, far.ends[marked], moved, walls)
         place = np.full(len(marked), -1, np.int64)
         place[marked] = len(vertices) + np.arange(int(marked.sum()))
         vertices = np.concatenate([vertices, moved])
-        cut_off = far.cuts_off & ~marked[far.edges].any(axis=1)
+        cut_off = far.misses_corner & ~marked[far.edges].any(axis=1)
         inner = len(vertices) + np.arange(np.count_nonzero(cut_off))
         vertices = np.concatenate(
-            [vertices, _corners_in(function, vertices, faces[cut_off], walls)]
+            [vertices, _crease_corners(function, vertices, faces[cut_off], walls)]
         )
         a, b, c = faces[cut_off].T
         fans = [np.stack([*ends, inner], axis=1) for ends in ((a, b), (b, c), (c, a))]
         whole = split_faces(vertices, faces[~cut_off], place[far.edges[~cut_off]])
         faces = np.concatenate([whole, *fans])
-    if function.field.has_detail:
-        vertices = _settled(function, vertices, faces, tolerance, walls)
+    if function.field.has_variable_accuracy:
+        vertices = _converge_vertices(function, vertices, faces, tolerance, walls)
     return vertices, faces
 
 
-def _settled(
+def _converge_vertices(
     function: LevelFunction, vertices: FloatArray, faces: IntArray, tolerance: float, walls: Walls
 ) -> FloatArray:
     """With more steps for vertices that Newton's method has not yet brought onto the surface, as
     beside the dipoles of a cloud, where slopes change within a step."""
-    samples = function.at(vertices)
+    samples = function.sample(vertices)
     is_off = samples.distance > _ON * tolerance
     if walls is None:
         is_off[boundary_edges(faces)] = False
@@ -119,15 +126,17 @@ def _settled(
     if not len(rows):
         return vertices
     longest = np.full(len(rows), 0.5 * tolerance)
-    there = newton(function, vertices[rows], samples.some(rows), longest, walls, steps=20)
-    good = np.abs(function.at(there).value) < np.abs(samples.value[rows])
-    good &= lengths(there - vertices[rows]) < tolerance
+    there = newton_to_level(
+        function, vertices[rows], samples.select(rows), longest, walls, steps=20
+    )
+    good = np.abs(function.sample(there).value) < np.abs(samples.value[rows])
+    good &= row_norms(there - vertices[rows]) < tolerance
     vertices = vertices.copy()
     vertices[rows[good]] = there[good]
     return vertices
 
 
-def _on_creases(
+def _project_to_creases(
     function: LevelFunction, vertices: FloatArray, ends: IntArray, moved: FloatArray, walls: Walls
 ) -> FloatArray:
     """Middles (k, 3) of edges, given by their vertices (k, 2), that were moved onto the surface;
@@ -141,56 +150,56 @@ def _on_creases(
     surface about half of it.
     """
     used, place = np.unique(ends, return_inverse=True)
-    slope = function.at(vertices[used]).gradient
-    at_ends = (slope / np.maximum(lengths(slope), 1e-300)[:, None])[place.reshape(-1, 2)]
-    here = function.at(moved).gradient
-    here = here / np.maximum(lengths(here), 1e-300)[:, None]
+    slope = function.sample(vertices[used]).gradient
+    at_ends = (slope / np.maximum(row_norms(slope), 1e-300)[:, None])[place.reshape(-1, 2)]
+    here = function.sample(moved).gradient
+    here = here / np.maximum(row_norms(here), 1e-300)[:, None]
     one, other = at_ends[:, 0], at_ends[:, 1]
-    cosine = dots(one, other)
-    turn = np.arccos(np.clip(np.minimum(dots(one, here), dots(other, here)), -1, 1))
+    cosine = row_dots(one, other)
+    turn = np.arccos(np.clip(np.minimum(row_dots(one, here), row_dots(other, here)), -1, 1))
     whole = np.arccos(np.clip(cosine, -1, 1))
     rows = np.flatnonzero((whole > _BENT) & (turn > _AT_ONCE * whole) & (1 - cosine**2 > 0.01))
     if not len(rows):
         return moved
     one, other, cosine = one[rows], other[rows], cosine[rows]
     a, b = (vertices[ends[rows, k]] for k in (0, 1))
-    middle, span = 0.5 * (a + b), lengths(b - a)
-    high, low = dots(one, a - middle), dots(other, b - middle)
+    middle, span = 0.5 * (a + b), row_norms(b - a)
+    high, low = row_dots(one, a - middle), row_dots(other, b - middle)
     share = np.stack([high - cosine * low, low - cosine * high]) / (1 - cosine**2)
     way = share[0][:, None] * one + share[1][:, None] * other
-    there, good = _level_towards(function, middle, way, _BESIDE * span, walls)
-    good &= np.minimum(lengths(there - a), lengths(there - b)) > _FROM_ENDS * span
+    there, good = _level_along(function, middle, way, _BESIDE * span, walls)
+    good &= np.minimum(row_norms(there - a), row_norms(there - b)) > _FROM_ENDS * span
     moved = moved.copy()
     moved[rows[good]] = there[good]
     return moved
 
 
-def _corners_in(
+def _crease_corners(
     function: LevelFunction, vertices: FloatArray, faces: IntArray, walls: Walls
 ) -> FloatArray:
     """A point on the surface within each of some faces (k, 3) that cut off a corner: where the
     tangent planes of its vertices meet, or near the center."""
     corner = vertices[faces]
     center = corner.mean(axis=1)
-    span = np.stack([lengths(corner[:, k] - corner[:, k - 1]) for k in range(3)]).max(axis=0)
-    moved = newton(function, center, function.at(center), 0.5 * span, walls)
-    slope = function.at(corner.reshape(-1, 3)).gradient
-    normal = (slope / np.maximum(lengths(slope), 1e-300)[:, None]).reshape(-1, 3, 3)
+    span = np.stack([row_norms(corner[:, k] - corner[:, k - 1]) for k in range(3)]).max(axis=0)
+    moved = newton_to_level(function, center, function.sample(center), 0.5 * span, walls)
+    slope = function.sample(corner.reshape(-1, 3)).gradient
+    normal = (slope / np.maximum(row_norms(slope), 1e-300)[:, None]).reshape(-1, 3, 3)
     rows = np.flatnonzero(np.abs(np.linalg.det(normal)) > _INDEPENDENT)
     away = (normal * (corner - center[:, None])).sum(axis=2)
     solve: Any = np.linalg.solve
     way: FloatArray = solve(normal[rows], away[rows][:, :, None])[:, :, 0]
-    there, good = _level_towards(function, center[rows], way, _BESIDE * span[rows], walls)
+    there, good = _level_along(function, center[rows], way, _BESIDE * span[rows], walls)
     moved[rows[good]] = there[good]
     return moved
 
 
-def _level_towards(
+def _level_along(
     function: LevelFunction, start: FloatArray, way: FloatArray, most: FloatArray, walls: Walls
 ) -> tuple[FloatArray, BoolArray]:
     """Points on the level from `start` (k, 3) along `way`, a little beyond its end at most and no
     farther than `most`; and whether the level is passed there."""
-    way = way * np.minimum(1, most / np.maximum(lengths(way), 1e-300))[:, None]
+    way = way * np.minimum(1, most / np.maximum(row_norms(way), 1e-300))[:, None]
     low, high = np.zeros(len(start)), np.full(len(start), _BEYOND)
     good = np.ones(len(start), np.bool_)
     parts = np.linspace(0, 1, _SAMPLES)
@@ -198,27 +207,27 @@ def _level_towards(
         t = low[:, None] + (high - low)[:, None] * parts
         x = start[:, None] + t[:, :, None] * way[:, None]
         x = x if walls is None else np.clip(x, *walls)
-        is_above = (function.at(x.reshape(-1, 3)).value > 0).reshape(t.shape)
+        is_above = (function.sample(x.reshape(-1, 3)).value > 0).reshape(t.shape)
         passes = is_above[:, 1:] != is_above[:, :-1]
         good &= passes.any(axis=1)
         first = passes.argmax(axis=1)[:, None]
         low, high = (np.take_along_axis(t, first + k, axis=1)[:, 0] for k in (0, 1))
     there = start + low[:, None] * way
     there = there if walls is None else np.clip(there, *walls)
-    longest = 4 * (high - low) * lengths(way)
-    return newton(function, there, function.at(there), longest, walls), good
+    longest = 4 * (high - low) * row_norms(way)
+    return newton_to_level(function, there, function.sample(there), longest, walls), good
 
 
-def far_places(
+def unrefined_midpoints(
     function: LevelFunction, vertices: FloatArray, faces: IntArray, tolerance: float
 ) -> FloatArray:
-    """Middles (k, 3) of the edges that `refined` would still cut."""
-    far = _Far.of(function, vertices, faces, tolerance, None, None)
+    """Middles (k, 3) of the edges that `refine` would still cut."""
+    far = _RefinementMarks.of(function, vertices, faces, tolerance, None, None)
     return far.middle[far.marked]
 
 
 @dataclass(frozen=True)
-class _Far:
+class _RefinementMarks:
     """Edges and which of them are to be cut.
 
     edges: (m, 3) of the faces. ends: (k, 2) vertices, middle: (k, 3), span: (k,) and marked: (k,)
@@ -231,11 +240,11 @@ class _Far:
     ends: IntArray
     middle: FloatArray
     span: FloatArray
-    samples: Samples
+    samples: LevelSamples
     is_beyond: BoolArray
     is_off: BoolArray
     marked: BoolArray
-    cuts_off: BoolArray
+    misses_corner: BoolArray
 
     @classmethod
     def of(
@@ -246,17 +255,17 @@ class _Far:
         tolerance: float,
         walls: Walls,
         where: Where,
-    ) -> _Far:
+    ) -> _RefinementMarks:
         """Those whose middle, or the center of a face beside them, is beyond the tolerance."""
         ends, edges, is_boundary = _edges(faces)
         if walls is not None:  # the boundary lies in them, and so do the middles of its edges
             is_boundary = np.zeros_like(is_boundary)
         middle = 0.5 * (vertices[ends[:, 0]] + vertices[ends[:, 1]])
-        span = lengths(vertices[ends[:, 0]] - vertices[ends[:, 1]])
+        span = row_norms(vertices[ends[:, 0]] - vertices[ends[:, 1]])
         center = vertices[faces].mean(axis=1)
-        samples = function.at(middle)
+        samples = function.sample(middle)
         is_beyond = samples.distance > tolerance
-        is_off = function.at(center).distance > tolerance
+        is_off = function.sample(center).distance > tolerance
         if where is not None:
             is_beyond &= where(middle)
             is_off &= where(center)
@@ -277,17 +286,17 @@ class _Far:
 
 def _turns(function: LevelFunction, corner: FloatArray) -> BoolArray:
     """Whether normals at the corners (k, 3, 3) of faces turn as across a crease."""
-    slope = function.at(corner.reshape(-1, 3)).gradient
-    normal = (slope / np.maximum(lengths(slope), 1e-300)[:, None]).reshape(-1, 3, 3)
-    between = [dots(normal[:, k], normal[:, k - 1]) for k in range(3)]
+    slope = function.sample(corner.reshape(-1, 3)).gradient
+    normal = (slope / np.maximum(row_norms(slope), 1e-300)[:, None]).reshape(-1, 3, 3)
+    between = [row_dots(normal[:, k], normal[:, k - 1]) for k in range(3)]
     return np.min(between, axis=0) < math.cos(_BENT)
 
 
 def _edges(faces: IntArray) -> tuple[IntArray, IntArray, BoolArray]:
     """All edges (k, 2), those of each face (m, 3) (that of corners 0 and 1 first), and whether they
     belong to one face only."""
-    edges = Edges.of(directed_edges(faces))
-    return edges.ends, edges.index.reshape(3, -1).T, edges.uses == 1
+    edges = Edges.of(half_edges(faces))
+    return edges.vertices, edges.edge_of_pair.reshape(3, -1).T, edges.multiplicity == 1
 
 
 def split_faces(vertices: FloatArray, faces: IntArray, middle: IntArray) -> IntArray:
@@ -306,8 +315,8 @@ def split_faces(vertices: FloatArray, faces: IntArray, middle: IntArray) -> IntA
         two = (number == 2) & ~cut[:, k]
         # The edge from a to b is whole; y and z are the middles of the others.
         (a, b, c), y, z = faces[two][:, order].T, middle[two, order[1]], middle[two, order[2]]
-        first = lengths(vertices[a] - vertices[y])
-        second = lengths(vertices[b] - vertices[z])
+        first = row_norms(vertices[a] - vertices[y])
+        second = row_norms(vertices[b] - vertices[z])
         shorter = (first < second)[:, None]
         parts.append(np.stack([z, y, c], axis=1))
         parts.append(np.where(shorter, np.stack([a, b, y], 1), np.stack([a, b, z], 1)))
@@ -315,7 +324,7 @@ def split_faces(vertices: FloatArray, faces: IntArray, middle: IntArray) -> IntA
     return np.concatenate(parts)
 
 
-def improved(
+def improve(
     function: LevelFunction,
     vertices: FloatArray,
     faces: IntArray,
@@ -326,19 +335,19 @@ def improved(
     """Better angles: edges are flipped and vertices smoothed in turn, slivers are contracted; then
     edges are cut again where triangles are no longer within `tolerance`."""
     for _ in range(2):
-        faces = flipped(function, vertices, faces, tolerance)
-        vertices = smoothed(function, vertices, faces, walls, rounds=2)
+        faces = flip_edges(function, vertices, faces, tolerance)
+        vertices = smooth(function, vertices, faces, walls, rounds=2)
     fixed = np.zeros(len(vertices), np.bool_)
     fixed[boundary_edges(faces)] = True
-    faces = without_slivers(function, vertices, faces, fixed, 2 * tolerance)
-    vertices, faces = refined(function, vertices, faces, tolerance, walls, report)
+    faces = collapse_slivers(function, vertices, faces, fixed, 2 * tolerance)
+    vertices, faces = refine(function, vertices, faces, tolerance, walls, report)
     for _ in range(2):
-        faces = flipped(function, vertices, faces, tolerance)
-        vertices = relaxed(function, vertices, faces, tolerance, walls)
-    return vertices, flipped(function, vertices, faces, tolerance)
+        faces = flip_edges(function, vertices, faces, tolerance)
+        vertices = relax_vertices(function, vertices, faces, tolerance, walls)
+    return vertices, flip_edges(function, vertices, faces, tolerance)
 
 
-def smoothed(
+def smooth(
     function: LevelFunction,
     vertices: FloatArray,
     faces: IntArray,
@@ -363,19 +372,19 @@ def smoothed(
                     ends[:, one], vertices[ends[:, other], axis], minlength=len(vertices)
                 )
         aim = 0.5 * (vertices + sums / count[:, None])
-        start = function.at(aim[rows])
+        start = function.sample(aim[rows])
         # No farther than neighbors are: beside the curve gradients turn.
-        span = lengths(aim[rows] - vertices[rows]) + 1e-300
+        span = row_norms(aim[rows] - vertices[rows]) + 1e-300
         there = vertices.copy()
-        there[rows] = newton(function, aim[rows], start, 2 * span, walls)
-        after = function.at(there[rows])
-        worse = after.distance > 1e-7 * size + 1e-12 * lengths(there[rows])
+        there[rows] = newton_to_level(function, aim[rows], start, 2 * span, walls)
+        after = function.sample(there[rows])
+        worse = after.distance > 1e-7 * size + 1e-12 * row_norms(there[rows])
         there[rows[worse]] = vertices[rows[worse]]
-        vertices = _unfolded(vertices, there, faces)
+        vertices = _undo_flipped(vertices, there, faces)
     return vertices
 
 
-def smoothed_within(
+def smooth_within_tolerance(
     function: LevelFunction,
     vertices: FloatArray,
     faces: IntArray,
@@ -383,14 +392,14 @@ def smoothed_within(
     tolerance: float,
     where: Where = None,
 ) -> FloatArray:
-    """As `smoothed`, but for vertices of faces whose middles of edges or center would get farther
+    """As `smooth`, but for vertices of faces whose middles of edges or center would get farther
     from the surface than `tolerance` by that, as beside a crease.
 
     where: middles and centers count."""
-    after = smoothed(function, vertices, faces, walls)
+    after = smooth(function, vertices, faces, walls)
     rows = np.arange(len(faces))
     for _ in range(8):
-        far = _Far.of(function, after, faces[rows], tolerance, walls, where)
+        far = _RefinementMarks.of(function, after, faces[rows], tolerance, walls, where)
         off = np.zeros(len(faces), np.bool_)
         off[rows] = far.is_beyond[far.edges].any(axis=1) | far.is_off
         back = np.zeros(len(vertices), np.bool_)
@@ -405,14 +414,14 @@ def smoothed_within(
     return vertices
 
 
-def _unfolded(before: FloatArray, after: FloatArray, faces: IntArray) -> FloatArray:
+def _undo_flipped(before: FloatArray, after: FloatArray, faces: IntArray) -> FloatArray:
     """`after`, but for vertices of faces that have turned over, which stay as before."""
     for _ in range(8):
         corner = after[faces]
-        normal = crosses(corner)
+        normal = area_normals(corner)
         old = before[faces]
-        was = crosses(old)
-        turned = dots(normal, was) <= 0.3 * lengths(normal) * lengths(was)
+        was = area_normals(old)
+        turned = row_dots(normal, was) <= 0.3 * row_norms(normal) * row_norms(was)
         if not turned.any():
             return after
         after = after.copy()

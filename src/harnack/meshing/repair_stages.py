@@ -3,6 +3,13 @@
 It goes by stages: all triangles are kept, and holes get patches; or bodies that overlap are united;
 or the triangles that are sound are kept; or the surface on which the winding number is 1/2 is made
 anew.
+
+Repair goes by stages, from what keeps most to what always comes: all triangles, bodies united
+(`bodies`; of a shell that passes through itself the pieces of faces, `joined_pieces`), sound
+triangles (`sound`), loose corners joined, all anew by signs. No result is believed for being
+closed: each is compared with the winding number of what was given (`intended_solid`). Patches bend
+least (`hole_filling`), and nothing is proved of them but that they cross nothing; those on which w
+= 1/2 (`harmonic_filling`) have a proof, and a dent where the surface was round.
 """
 
 from __future__ import annotations
@@ -22,24 +29,29 @@ from harnack.fields.solids.mesh_solid import MeshSolid
 from harnack.geometry import MeshError, validate_mesh, zero_area_faces
 from harnack.geometry.boundary_edges import singular_edges, weld_vertices
 from harnack.geometry.meshes import without_zero_area_faces
-from harnack.geometry.orientability import is_one_sided
+from harnack.geometry.orientability import is_nonorientable
 from harnack.meshing.bodies import mended_by_cuts, united_parts
 from harnack.meshing.checks import (
     MeshingError,
-    TooLargeError,
+    TriangleLimitError,
     euler_characteristic,
     intersecting_faces,
-    singular_vertices,
+    nonmanifold_vertices,
 )
-from harnack.meshing.clipping import Shells, largest_body, parts_of
+from harnack.meshing.clipping import Shells, component_facts, largest_body
 from harnack.meshing.edges import IntArray
 from harnack.meshing.finishing import check_options
-from harnack.meshing.harmonic_filling import Asked, HarmonicPatches, harmonic_patches, open_edges
-from harnack.meshing.hole_filling import filled, hole_loops
+from harnack.meshing.harmonic_filling import (
+    HarmonicFilling,
+    HoleFillingOptions,
+    checked_boundary_edges,
+    harmonic_patches,
+)
+from harnack.meshing.hole_filling import fill_holes, hole_loops
 from harnack.meshing.intended_solid import Difference, IntendedSolid
 from harnack.meshing.joined_pieces import passes_itself
-from harnack.meshing.lattice_meshing import Surface
-from harnack.meshing.mesh_cleaning import Mended, joined, mended
+from harnack.meshing.lattice_meshing import TriangleMesh
+from harnack.meshing.mesh_cleaning import CleanedMesh, clean_and_fill, weld_near_corners
 from harnack.meshing.mesh_pipeline import mesh as mesh_of
 from harnack.name_suggestions import is_one_of
 from harnack.progress import teller
@@ -62,7 +74,7 @@ _MOST_ANEW, _LARGER, _MOST_LARGER = 80_000, 1.4, 3
 # Points lie in a plane if the least of their singular values is this part of the largest.
 _FLAT = 1e-9
 
-Keep = Literal["all", "sound", "none"]
+Keep = Literal["all", "valid", "none"]
 Patches = Literal["smooth", "harmonic"]
 
 
@@ -70,10 +82,10 @@ def repair(
     mesh: trimesh.Trimesh,
     *,
     keep: Keep | None = None,
-    patches: Patches = "smooth",
+    filling: Patches = "smooth",
     largest: bool = False,
     tolerance: float = 1e-3,
-    spacing: float | None = None,
+    cell_size: float | None = None,
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
 ) -> trimesh.Trimesh:
@@ -83,17 +95,19 @@ def repair(
     over: each closed part that does not lie in another, with all that lies in it. Then five stages
     are tried in turn:
 
-    - kept: all triangles stay, and holes get patches;
-    - united: a closed mesh that crosses itself, also along edges that lie on its faces, or parts
+    - filled: all triangles stay, and holes get patches;
+    - boolean_union: a closed mesh that crosses itself, also along edges that lie on its faces, or
+    parts
       that overlap or touch, are cut where they do, exactly, and what is inside is left out, as is
       what it winds around clockwise: cavities stay where it winds around no point;
-    - sound: triangles that are there twice, have no area or pass through others are left out, those
+    - cleaned: triangles that are there twice, have no area or pass through others are left out,
+    those
       turned over against their neighbors are turned back, and holes get patches; where one cannot
       be filled, the triangles around it are left out as well, ring by ring;
-    - joined: corners of loose triangles that lie near each other, as in a mesh full of cracks, are
+    - welded: corners of loose triangles that lie near each other, as in a mesh full of cracks, are
       moved to their mean, and the rest is done as before;
-    - anew: the surface on which the winding number w of the mesh is 1/2 is made by the signs of
-      w - 1/2 in cells (`meshing.by_signs`), closed whatever the mesh is.
+    - remeshed: the surface on which the winding number w of the mesh is 1/2 is made by the signs of
+      w - 1/2 in cells (`meshing.sign_isosurface`), closed whatever the mesh is.
 
     Each result is compared with w at some thousand points, farther from both surfaces than two
     tolerances: where w is above 0.86 the inside has to be, and where it is below 0.14 the outside;
@@ -102,9 +116,9 @@ def repair(
     warning. That is sampled: what differs in less than a thousandth of the box may not be seen.
 
     mesh: anything with `vertices` (n, 3) and `faces` (m, 3).
-    keep: "all" does the first stage or raises an error, "sound" the second one, "none" the last;
+    keep: "all" does the first stage or raises an error, "valid" the second one, "none" the last;
         None does the first that succeeds of all.
-    patches: "smooth" ones continue the surface around each hole, with its tangents, and bend least.
+    filling: "smooth" ones continue the surface around each hole, with its tangents, and bend least.
         They are made hole by hole, and used where w is within 0.36 of 1/2 modulo 1 on them; the
         rest is done by "harmonic" ones, on which w is 1/2 modulo 1: they join the rims of a gap
         between two parts, and have a dent where the surface was round. Only of these is it proved
@@ -113,13 +127,14 @@ def repair(
     tolerance: how far harmonic patches may be from the surface w = 1/2, as a part of the size of
         the box around all holes, and triangles made anew, as a part of the mesh's; sampled and not
         proved.
-    spacing: of cells before anything is refined, in the mesh's unit; None chooses.
+    cell_size: of cells before anything is refined, in the mesh's unit; None chooses.
     seed: of the small random moves that keep points in general position.
     progress: told what is being done.
 
     Returns:
         A closed trimesh.Trimesh: every edge has two faces, which agree. `metadata["harnack"]` has
-        stage: "kept", "united", "sound", "joined" or "anew"; why: what those before failed with, or
+        stage: "filled", "boolean_union", "cleaned", "welded" or "remeshed"; why: what those before
+            failed with, or
         None; kept: how many of the given triangles are there; parts: of each part, largest first, a
         dictionary of its faces, volume and center; dropped: how many parts of these were left out
         for `largest`; welded: how many corners were joined since they were apart by rounding;
@@ -160,18 +175,22 @@ def repair(
             that is an open sheet, most of which has nothing inside, if it would be made anew; with
             keep="all" also for edges of more than two faces, faces that disagree on their sides,
             faces without an area and vertices at one place.
-        MeshingError: a ValueError, with keep="all" or "sound", if patches could not be made, or
+        MeshingError: a ValueError, with keep="all" or "valid", if patches could not be made, or
             meet the mesh or each other; else if the surface w = 1/2 is empty or takes too many
             cells.
     """
     largest = flag(largest, "largest")
-    asked = _checked_settings(keep, patches, tolerance, spacing, seed, teller(progress))
+    asked = _checked_settings(keep, filling, tolerance, cell_size, seed, teller(progress))
     _check_is_mesh(mesh)
     _check_encloses(mesh)
     intended = IntendedSolid.of(mesh, as_it_is=keep == "all")
     stages = {
-        "all": _kept, "united": _united, "sound": _sound, "joined": _joined, "none": _anew,
-    }  # fmt: skip
+        "all": _fill_only,
+        "boolean_union": _unite_bodies,
+        "valid": _keep_valid,
+        "welded": _weld_loose,
+        "none": _remesh,
+    }
     names = list(stages) if keep is None else [keep]
     reasons, results = list[str](), list[_Result]()
     for name in names:
@@ -204,7 +223,7 @@ def repair(
 
 
 @dataclass(frozen=True)
-class _Asked:
+class _RepairOptions:
     """The arguments of `repair`."""
 
     keep: Keep | None
@@ -222,20 +241,20 @@ def _checked_settings(
     spacing: float | None,
     seed: int,
     report: Callable[[str], None],
-) -> _Asked:
-    if keep is not None and not is_one_of(keep, ("all", "sound", "none")):
-        raise ValueError(f'keep is None, "all", "sound" or "none", not {keep!r}')
+) -> _RepairOptions:
+    if keep is not None and not is_one_of(keep, ("all", "valid", "none")):
+        raise ValueError(f'keep is None, "all", "valid" or "none", not {keep!r}')
     if not is_one_of(patches, ("smooth", "harmonic")):
         raise ValueError(f'patches are "smooth" or "harmonic", not {patches!r}')
     check_options(tolerance, spacing, None, seed, 1)
-    return _Asked(keep, patches, tolerance, spacing, seed, report)
+    return _RepairOptions(keep, patches, tolerance, spacing, seed, report)
 
 
 @dataclass(frozen=True)
 class _Result:
     """What a stage made, and how that differs from what was given."""
 
-    surface: Surface
+    surface: TriangleMesh
     facts: dict[str, Any]
     difference: Difference | None
 
@@ -256,11 +275,11 @@ class _Result:
                 f"the repaired mesh is not quite the solid that was given: {self.difference}",
                 stacklevel=3,
             )
-        parts = parts_of(surface)
+        parts = component_facts(surface)
         dropped = 0
         if largest and len(parts) > 1:
             surface = largest_body(surface)
-            dropped = len(parts) - len(parts_of(surface))
+            dropped = len(parts) - len(component_facts(surface))
             facts["kept"] = _count_of(surface, self.surface, facts["kept"])
         repaired = ClosedMesh(surface.vertices, surface.faces, process=False, validate=False)
         repaired.metadata["harnack"] = {
@@ -272,7 +291,7 @@ class _Result:
         return repaired
 
 
-def _count_of(surface: Surface, whole: Surface, first: int) -> int:
+def _count_of(surface: TriangleMesh, whole: TriangleMesh, first: int) -> int:
     """How many of the first faces of a whole are in a surface that is a part of it."""
     corners = [one.vertices[one.faces].reshape(-1, 9) for one in (surface, whole)]
     there = {row.tobytes() for row in corners[0]}
@@ -293,7 +312,9 @@ def _check_encloses(mesh: Any) -> None:
     Raises:
         MeshError: so; or as `validate_mesh`.
     """
-    vertices, faces = validate_mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces), flat=True)
+    vertices, faces = validate_mesh(
+        np.asarray(mesh.vertices), np.asarray(mesh.faces), allow_zero_area=True
+    )
     x = vertices[np.unique(faces)]
     x = x - x.mean(axis=0)
     largest, *_, least = np.linalg.svd(x / np.abs(x).max(), compute_uv=False)
@@ -302,7 +323,7 @@ def _check_encloses(mesh: Any) -> None:
             "all faces of the mesh lie in a plane, or nearly so: they enclose nothing that could "
             "be closed; give it a thickness first, or mesh its boundary with `thickness`"
         )
-    if is_one_sided(weld_vertices(vertices)[faces]):
+    if is_nonorientable(weld_vertices(vertices)[faces]):
         raise MeshError(
             "the mesh has one side only, as a Moebius strip has: nothing is inside of it that "
             "could be closed; give it a thickness first, in the program that made it"
@@ -312,7 +333,9 @@ def _check_encloses(mesh: Any) -> None:
 # Bodies united.
 
 
-def _united(intended: IntendedSolid, asked: _Asked) -> tuple[Surface, dict[str, Any]]:
+def _unite_bodies(
+    intended: IntendedSolid, asked: _RepairOptions
+) -> tuple[TriangleMesh, dict[str, Any]]:
     """The boundary of the solid that a closed mesh bounds which passes through itself, or of parts
     that touch.
 
@@ -324,7 +347,7 @@ def _united(intended: IntendedSolid, asked: _Asked) -> tuple[Surface, dict[str, 
         raise MeshError("the mesh is not closed")
     if _is_fine(vertices, faces):
         raise MeshError("nothing of it passes through or lies in itself")
-    facts = {"stage": "united", "kept": 0}
+    facts = {"stage": "boolean_union", "kept": 0}
     slivers = 0.5 * asked.tolerance * intended.size
     if len(intended.parts) > 1 and sum(map(len, intended.parts)) == len(faces):
         asked.report(f"uniting {len(intended.parts):,} parts")
@@ -338,22 +361,22 @@ def _united(intended: IntendedSolid, asked: _Asked) -> tuple[Surface, dict[str, 
     except MeshingError as error:
         asked.report(f"{error}; so by cells")
     made = mesh_of(MeshSolid(vertices, faces), progress=asked.report)
-    return Surface(np.asarray(made.vertices), np.asarray(made.faces, np.int64)), facts
+    return TriangleMesh(np.asarray(made.vertices), np.asarray(made.faces, np.int64)), facts
 
 
 def _is_fine(vertices: FloatArray, faces: IntArray) -> bool:
     """Whether no triangles meet beyond what they share, and no part is in another's material."""
     try:
-        _check_sides(Surface.of(vertices, faces))
+        _check_sides(TriangleMesh.without_unused_vertices(vertices, faces))
     except MeshError:
         return False
-    return not len(singular_vertices(faces)) and not len(intersecting_faces(vertices, faces))
+    return not len(nonmanifold_vertices(faces)) and not len(intersecting_faces(vertices, faces))
 
 
 # All made anew.
 
 
-def _anew(intended: IntendedSolid, asked: _Asked) -> tuple[Surface, dict[str, Any]]:
+def _remesh(intended: IntendedSolid, asked: _RepairOptions) -> tuple[TriangleMesh, dict[str, Any]]:
     """The surface on which the winding number is 1/2, closed whatever the mesh is."""
     intended.check_encloses()
     corners = without_zero_area_faces(intended.vertices, intended.oriented)
@@ -366,26 +389,28 @@ def _anew(intended: IntendedSolid, asked: _Asked) -> tuple[Surface, dict[str, An
             made = _of_bounded_size(field, spacing, asked)
         except MeshingError:
             made = _by_signs(field, 0.6 * spacing, asked)
-    facts = made.metadata["harnack"] | {"stage": "anew", "kept": 0}
-    return Surface(np.asarray(made.vertices), np.asarray(made.faces, np.int64)), facts
+    facts = made.metadata["harnack"] | {"stage": "remeshed", "kept": 0}
+    return TriangleMesh(np.asarray(made.vertices), np.asarray(made.faces, np.int64)), facts
 
 
-def _of_bounded_size(field: WindingNumber, spacing: float, asked: _Asked) -> trimesh.Trimesh:
+def _of_bounded_size(
+    field: WindingNumber, spacing: float, asked: _RepairOptions
+) -> trimesh.Trimesh:
     """Of larger cells where there would be too many triangles, as of noisy meshes: the time of
     checks grows with their number."""
     for k in range(_MOST_LARGER):
         try:
             return _by_signs(field, spacing * _LARGER**k, asked, _MOST_ANEW)
-        except TooLargeError as error:
+        except TriangleLimitError as error:
             asked.report(f"{error}; so of larger cells")
     return _by_signs(field, spacing * _LARGER**_MOST_LARGER, asked)
 
 
 def _by_signs(
-    field: WindingNumber, spacing: float, asked: _Asked, most: int = 2_000_000
+    field: WindingNumber, spacing: float, asked: _RepairOptions, most: int = 2_000_000
 ) -> trimesh.Trimesh:
     return mesh_of(
-        field, solid=(0.5, math.inf), tolerance=asked.tolerance, spacing=spacing,
+        field, solid=(0.5, math.inf), tolerance=asked.tolerance, cell_size=spacing,
         max_triangles=most, progress=asked.report,
     )  # fmt: skip
 
@@ -393,18 +418,20 @@ def _by_signs(
 # What is sound kept.
 
 
-def _sound(intended: IntendedSolid, asked: _Asked) -> tuple[Surface, dict[str, Any]]:
+def _keep_valid(
+    intended: IntendedSolid, asked: _RepairOptions
+) -> tuple[TriangleMesh, dict[str, Any]]:
     """The triangles that are sound, with patches.
 
     Raises:
         MeshError, MeshingError: as `repair`.
     """
     vertices, faces = without_zero_area_faces(intended.vertices, intended.faces)
-    made = mended(vertices, faces, asked.report)
+    made = clean_and_fill(vertices, faces, asked.report)
     flat = len(intended.faces) - len(faces)
     left_out = {"flat": made.left_out["flat"] + flat}
     return made.surface, {
-        "stage": "sound",
+        "stage": "cleaned",
         "kept": len(made.kept),
         "turned": _count_turned(intended, made),
         "left_out": made.left_out | left_out,
@@ -414,7 +441,7 @@ def _sound(intended: IntendedSolid, asked: _Asked) -> tuple[Surface, dict[str, A
     }
 
 
-def _count_turned(intended: IntendedSolid, sound: Mended) -> int:
+def _count_turned(intended: IntendedSolid, sound: CleanedMesh) -> int:
     """How many of the triangles that were kept run the other way than those that were given."""
     turned_before = np.delete(
         intended.is_turned, zero_area_faces(intended.vertices, intended.faces)
@@ -427,18 +454,20 @@ def _count_turned(intended: IntendedSolid, sound: Mended) -> int:
 # Loose triangles joined.
 
 
-def _joined(intended: IntendedSolid, asked: _Asked) -> tuple[Surface, dict[str, Any]]:
+def _weld_loose(
+    intended: IntendedSolid, asked: _RepairOptions
+) -> tuple[TriangleMesh, dict[str, Any]]:
     """Triangles with near corners joined, with patches; none is kept bit by bit.
 
     Raises:
         MeshError, MeshingError: as `repair`.
     """
     corners = without_zero_area_faces(intended.vertices, intended.faces)
-    vertices, faces, moved = joined(*corners)
-    made = mended(vertices, faces, asked.report)
+    vertices, faces, moved = weld_near_corners(*corners)
+    made = clean_and_fill(vertices, faces, asked.report)
     count = len(made.kept)
     return made.surface, {
-        "stage": "joined",
+        "stage": "welded",
         "kept": 0,
         "joined": count,
         "moved": moved,
@@ -453,7 +482,9 @@ def _joined(intended: IntendedSolid, asked: _Asked) -> tuple[Surface, dict[str, 
 # All kept.
 
 
-def _kept(intended: IntendedSolid, asked: _Asked) -> tuple[Surface, dict[str, Any]]:
+def _fill_only(
+    intended: IntendedSolid, asked: _RepairOptions
+) -> tuple[TriangleMesh, dict[str, Any]]:
     """The mesh with patches; all its triangles stay.
 
     Raises:
@@ -462,7 +493,7 @@ def _kept(intended: IntendedSolid, asked: _Asked) -> tuple[Surface, dict[str, An
     vertices, faces = _checked(intended)
     if intended.is_turned.any():
         raise MeshError("a part of the mesh is inside out")
-    edges = open_edges(faces)
+    edges = checked_boundary_edges(faces)
     if asked.keep is None and len(crossing := intersecting_faces(vertices, faces)):
         raise MeshError(f"{len(crossing):,} triangles of the mesh pass through others")
     loops = hole_loops(vertices, faces, edges)
@@ -492,8 +523,8 @@ def _checked(intended: IntendedSolid) -> tuple[FloatArray, IntArray]:
 
 
 def _kept_with(
-    vertices: FloatArray, faces: IntArray, loops: list[IntArray], asked: _Asked
-) -> tuple[Surface, dict[str, Any]]:
+    vertices: FloatArray, faces: IntArray, loops: list[IntArray], asked: _RepairOptions
+) -> tuple[TriangleMesh, dict[str, Any]]:
     """The mesh with patches over its holes: smooth ones if asked for, and harmonic ones.
 
     Raises:
@@ -503,52 +534,52 @@ def _kept_with(
     if loops and asked.patches == "smooth":
         asked.report(f"filling {len(loops):,} holes")
         field = WindingNumber(vertices, faces)
-        made = filled(vertices, faces, loops, lambda p: field.value(p, precision="double"))
+        made = fill_holes(vertices, faces, loops, lambda p: field.value(p, precision="double"))
         x, together = np.concatenate([x, made.vertices]), np.concatenate([faces, made.faces])
-        left = made.left
-        asked.report(f"{len(left):,} holes are left" + f": {made.why}" * bool(left))
-    rest = HarmonicPatches(vertices[:0], faces[:0], True, 0.0, 0)
+        left = made.unfilled_loops
+        asked.report(f"{len(left):,} holes are left" + f": {made.reason}" * bool(left))
+    rest = HarmonicFilling(vertices[:0], faces[:0], True, 0.0, 0)
     if left:
-        edges = open_edges(together)
+        edges = checked_boundary_edges(together)
         if asked.keep is None and len(edges) > _FEW_EDGES:
             raise MeshingError(f"{len(left):,} holes of {len(edges):,} edges have no smooth patch")
         attempts = _ATTEMPTS if asked.keep == "all" else _FEW_ATTEMPTS
-        how = Asked(asked.tolerance, asked.spacing, asked.seed, attempts, asked.report)
+        how = HoleFillingOptions(asked.tolerance, asked.spacing, asked.seed, attempts, asked.report)
         rest = harmonic_patches(x, together, edges, how)
         x, together = np.concatenate([x, rest.vertices]), np.concatenate([together, rest.faces])
-    surface = Surface.of(x, together)
+    surface = TriangleMesh.without_unused_vertices(x, together)
     if loops or asked.keep is None:
         _check_touching(together)
     if asked.keep is None:
         _check_sides(surface)
     return surface, {
-        "stage": "kept",
+        "stage": "filled",
         "kept": len(faces),
         "holes": len(loops),
         "patches": len(together) - len(faces),
         "harmonic": len(rest.faces),
-        "missing": rest.missing,
-        "refined": rest.is_fine,
+        "missing": rest.triangle_fill_count,
+        "refined": rest.is_refined,
         "spacing": rest.spacing,
         "evaluations": rest.evaluations,
     }
 
 
-def _check_sides(surface: Surface) -> None:
+def _check_sides(surface: TriangleMesh) -> None:
     """Raise if a part is inside out, or inside the material of another one, also in part."""
     shells = Shells.of(surface)
-    depths = shells.depths()
+    depths = shells.nesting_depths()
     if ((shells.volumes < 0) & (depths == 0)).any():
         raise MeshError("a part of the mesh is inside out")
     if ((shells.volumes > 0) & (depths > 0)).any():
         raise MeshError("a part of the mesh is inside the material of another one")
-    if passes_itself(surface, shells.number):
+    if passes_itself(surface, shells.component_of_face):
         raise MeshError("the mesh passes through itself along edges that lie on faces")
 
 
 def _check_touching(faces: IntArray) -> None:
     """Raise unless the faces around each vertex are joined by edges."""
-    if len(places := singular_vertices(faces)):
+    if len(places := nonmanifold_vertices(faces)):
         raise MeshingError(
             f"faces touch in {len(places):,} vertices alone, such as vertex {places[0]}: such a "
             "mesh has no two sides there"

@@ -16,20 +16,24 @@ from typing import Any, cast
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
-from harnack.meshing.checks import CrossingError, check_apart, intersecting_faces
+from harnack.meshing.checks import (
+    SelfIntersectionError,
+    check_no_self_intersection,
+    intersecting_faces,
+)
 from harnack.meshing.edges import (
     IntArray,
-    crosses,
-    directed_edges,
+    area_normals,
     distance_from_triangles,
-    distinct,
-    dots,
     edge_keys,
-    lengths,
+    half_edges,
+    row_dots,
+    row_norms,
+    sorted_unique,
 )
-from harnack.meshing.lattice_meshing import Surface
+from harnack.meshing.lattice_meshing import TriangleMesh
 
-__all__ = ["made_apart", "uncrossed"]
+__all__ = ["resolve_local_intersections", "resolve_self_intersections"]
 
 # More crossing triangles than this, or in a larger neighborhood, are no slivers.
 _MOST, _MOST_AROUND = 400, 5_000
@@ -39,24 +43,27 @@ _MOST_CHANGES, _MOST_TRIED = 40, 80
 _NOTHING = 1e-4
 
 
-def made_apart(surface: Surface, length: float) -> Surface:
-    """A closed surface, mended where its triangles pass through each other (`uncrossed`), so that
-    none do.
+def resolve_self_intersections(surface: TriangleMesh, length: float) -> TriangleMesh:
+    """A closed surface, mended where its triangles pass through each other
+    (`resolve_local_intersections`), so that none do.
 
     Raises:
-        MeshingError: vertices that are not finite; a CrossingError where that is not enough.
+        MeshingError: vertices that are not finite; a SelfIntersectionError where that is not
+            enough.
     """
     try:
-        check_apart(surface.vertices, surface.faces)
-    except CrossingError as error:
-        mended, left = uncrossed(surface, error.faces, length)
+        check_no_self_intersection(surface.vertices, surface.faces)
+    except SelfIntersectionError as error:
+        mended, left = resolve_local_intersections(surface, error.faces, length)
         if left:
             raise
         return mended
     return surface
 
 
-def uncrossed(surface: Surface, crossing: IntArray, length: float) -> tuple[Surface, int]:
+def resolve_local_intersections(
+    surface: TriangleMesh, crossing: IntArray, length: float
+) -> tuple[TriangleMesh, int]:
     """A closed surface with edges contracted and flipped where triangles cross; and how many
     triangles cross still.
 
@@ -73,10 +80,12 @@ def uncrossed(surface: Surface, crossing: IntArray, length: float) -> tuple[Surf
             made.append(faces[rows])
             left += int(np.isin(crossing, rows).sum())
             continue
-        patch, count = _mended(_Patch.of(vertices, faces[rows], movable), length)
+        patch, count = _reduce_crossings(_Neighborhood.of(vertices, faces[rows], movable), length)
         made.append(patch)
         left += count
-    return Surface.of(vertices, np.concatenate([faces[~is_gone], *made])), left
+    return TriangleMesh.without_unused_vertices(
+        vertices, np.concatenate([faces[~is_gone], *made])
+    ), left
 
 
 def _regions(
@@ -96,7 +105,7 @@ def _regions(
     lower, upper = corner.min(axis=1), corner.max(axis=1)
     near = _touching(faces, faces[crossing])
     around = _touching(faces, faces[near])
-    pairs = directed_edges(faces[around])
+    pairs = half_edges(faces[around])
     joined = sparse.coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(vertices),) * 2)
     part = csgraph.connected_components(joined, directed=False)[1]
     boxes: list[IntArray] = []
@@ -120,17 +129,17 @@ def _touching(faces: IntArray, some: IntArray) -> IntArray:
 
 
 @dataclass(frozen=True)
-class _Patch:
+class _Neighborhood:
     """Faces (m, 3) of a neighborhood, between vertices (n, 3) of the mesh; is_movable: (n,) those
     of which all faces are here."""
 
     vertices: FloatArray
     faces: IntArray
     is_movable: BoolArray
-    names: IntArray
+    mesh_vertices: IntArray
 
     @classmethod
-    def of(cls, vertices: FloatArray, faces: IntArray, movable: IntArray) -> _Patch:
+    def of(cls, vertices: FloatArray, faces: IntArray, movable: IntArray) -> _Neighborhood:
         """names: of the vertices, in the mesh."""
         names, place = np.unique(faces, return_inverse=True)
         return cls(vertices[names], place.reshape(-1, 3), np.isin(names, movable), names)
@@ -147,13 +156,13 @@ class _Patch:
         """Vertices that edges join a vertex with."""
         return set(self.faces[self.around(vertex)].ravel().tolist()) - {vertex}
 
-    def with_faces(self, gone: IntArray, new: IntArray) -> _Patch:
+    def with_faces(self, gone: IntArray, new: IntArray) -> _Neighborhood:
         """With faces, by index, replaced."""
         return dataclasses.replace(
             self, faces=np.concatenate([np.delete(self.faces, gone, axis=0), new])
         )
 
-    def contracted(self, a: int, b: int) -> tuple[IntArray, IntArray] | None:
+    def collapse_edge(self, a: int, b: int) -> tuple[IntArray, IntArray] | None:
         """Faces that go and that come if a is moved to b; None where sheets would touch."""
         if not (self.is_movable[a] and self.is_movable[b]):
             return None
@@ -163,7 +172,7 @@ class _Patch:
         new = np.where(self.faces[gone] == a, b, self.faces[gone])
         return gone, new[(new != np.roll(new, 1, axis=1)).all(axis=1)]
 
-    def flipped(self, a: int, b: int) -> tuple[IntArray, IntArray] | None:
+    def flip_edge(self, a: int, b: int) -> tuple[IntArray, IntArray] | None:
         """Faces that go and that come if the edge between a and b joins the corners opposite to it
         instead; None if there is such an edge."""
         if not (self.is_movable[a] and self.is_movable[b]):
@@ -182,18 +191,20 @@ class _Patch:
         return gone, np.array([[a, d, c], [d, b, c]])
 
 
-def _mended(patch: _Patch, length: float) -> tuple[IntArray, int]:
+def _reduce_crossings(patch: _Neighborhood, length: float) -> tuple[IntArray, int]:
     """Faces of a patch, by vertices of the mesh, in which fewer cross; and how many still do."""
     bad = patch.crossing()
     for _ in range(_MOST_CHANGES):
-        better = _better(patch, bad, length) if len(bad) else None
+        better = _best_change(patch, bad, length) if len(bad) else None
         if better is None:
             break
         patch, bad = better
-    return patch.names[patch.faces], len(bad)
+    return patch.mesh_vertices[patch.faces], len(bad)
 
 
-def _better(patch: _Patch, bad: IntArray, length: float) -> tuple[_Patch, IntArray] | None:
+def _best_change(
+    patch: _Neighborhood, bad: IntArray, length: float
+) -> tuple[_Neighborhood, IntArray] | None:
     """The patch after one change, after which fewer faces cross, and these; None if none is known.
 
     Those are tried first that move the surface least: of edges of faces that cross, then of all
@@ -211,40 +222,42 @@ def _better(patch: _Patch, bad: IntArray, length: float) -> tuple[_Patch, IntArr
 
 
 def _changes(
-    patch: _Patch, rows: IntArray, length: float
+    patch: _Neighborhood, rows: IntArray, length: float
 ) -> Iterator[tuple[float, IntArray, IntArray]]:
     """Changes of the edges of some faces: how far they move the surface, and the faces that go and
     that come."""
     count = len(patch.vertices)
-    keys = distinct(edge_keys(directed_edges(patch.faces[rows]), count))
+    keys = sorted_unique(edge_keys(half_edges(patch.faces[rows]), count))
     for a, b in np.stack(np.divmod(keys, count), axis=1).tolist():
         for one, other in ((a, b), (b, a)):
-            change = patch.contracted(one, other)
-            if change is not None and _looks_onward(patch, *change, length):
+            change = patch.collapse_edge(one, other)
+            if change is not None and _keeps_orientation(patch, *change, length):
                 moved = distance_from_triangles(patch.vertices[one], patch.vertices[change[1]])
                 if moved <= length:
                     yield moved, *change
-        change = patch.flipped(a, b)
-        if change is not None and _looks_onward(patch, *change, length):
+        change = patch.flip_edge(a, b)
+        if change is not None and _keeps_orientation(patch, *change, length):
             c, d = (patch.vertices[change[1][0, k]] for k in (2, 1))
             moved = _between(patch.vertices[a], patch.vertices[b], c, d)
             if moved <= length:
                 yield moved, *change
 
 
-def _looks_onward(patch: _Patch, gone: IntArray, new: IntArray, length: float) -> bool:
+def _keeps_orientation(patch: _Neighborhood, gone: IntArray, new: IntArray, length: float) -> bool:
     """Whether no new face, but for slivers, looks backwards from where the old ones look in the
     mean, and the volume between new and old ones is no more than if these moved by a length: a
     vertex on the new faces says nothing of old ones that are folded, as at a thin spike."""
     corner, replaced = patch.vertices[patch.faces[gone]], patch.vertices[new]
-    old, made = crosses(corner), crosses(replaced)
+    old, made = area_normals(corner), area_normals(replaced)
     mean = old.sum(axis=0)
-    most = float(lengths(old).sum())
+    most = float(row_norms(old).sum())
     origin = corner[0, 0]
-    between = dots(replaced[:, 0] - origin, made).sum() - dots(corner[:, 0] - origin, old).sum()
+    between = (
+        row_dots(replaced[:, 0] - origin, made).sum() - row_dots(corner[:, 0] - origin, old).sum()
+    )
     if abs(float(between)) / 6 > length * most / 2:
         return False
-    return bool(((made @ mean > 0) | (lengths(made) <= _NOTHING * most)).all())
+    return bool(((made @ mean > 0) | (row_norms(made) <= _NOTHING * most)).all())
 
 
 def _between(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> float:

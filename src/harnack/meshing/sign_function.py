@@ -17,27 +17,27 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray, choose_backend
-from harnack.backend.validation import vector_text
-from harnack.enclosures import TargetLevels
-from harnack.fields.batch_evaluation import in_batches
+from harnack.backend.validation import format_vector
+from harnack.enclosures import Levels
+from harnack.fields.batch_evaluation import map_batches
 from harnack.fields.batched_fields import BatchedField
 from harnack.fields.blobs.blobs import Blobs
 from harnack.fields.blobs.hrbf import HRBF
-from harnack.fields.capabilities import NO_SHEET, Crossing
-from harnack.fields.clearance import distance_below
+from harnack.fields.capabilities import NO_FACET, JumpCrossing
+from harnack.fields.clearance import level_distance_lower_bound
 from harnack.fields.solid_angles.dipole import DipolePotential
 from harnack.fields.solid_angles.winding_number import WindingModuloOne, WindingNumber
-from harnack.geometry.clouds import point_tree
-from harnack.geometry.denoising import lonely_points
+from harnack.geometry.clouds import build_point_tree
+from harnack.geometry.denoising import outlier_indices
 from harnack.meshing.checks import MeshingError
-from harnack.meshing.edges import dots, lengths
-from harnack.meshing.level_function import LevelFunction, Samples
+from harnack.meshing.edges import row_dots, row_norms
+from harnack.meshing.level_function import LevelFunction, LevelSamples
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Precision, Real, Vec3
     from harnack.fields import Field
 
-__all__ = ["SignFunction", "cells_for_details", "is_meshed_by_signs", "why_empty"]
+__all__ = ["SignFunction", "cell_size_for_smoothing", "empty_surface_hint", "uses_sign_meshing"]
 
 # How often a segment is halved before it is intersected with sheets; and how often a smooth
 # function is evaluated along it, in turn where the secant meets the level and in the middle.
@@ -52,36 +52,39 @@ _STEPS_IN_CELL = 1000
 # five meshes, cells up to 2.8 smoothing lengths were enough, and those above 3.9 were not. Cells of
 # so many smoothing lengths show them, but for noise: by experiment cells of 7 lose thin edges, and
 # those below 4 show bubbles around single points.
-_DETAILS, _SHOWN = 0.3, 4.8
+_UNRESOLVED_SMOOTHING, _RESOLVED_SMOOTHING_LENGTHS = 0.3, 4.8
 # Points of a cloud at which its value is looked at, and the part of the level that it must have.
 _MOST_PROBES, _LEAST_PART = 2000, 0.1
 
 
-def is_meshed_by_signs(field: Field) -> bool:
+def uses_sign_meshing(field: Field) -> bool:
     """Whether a field is meshed by its signs: sums over meshes, points and blobs, whose values cost
     little and whose promises reach no farther than to the next point."""
     return isinstance(field, BatchedField | Blobs | HRBF)
 
 
-def cells_for_details(field: Field, spacing: float, most: float, least: float) -> float:
-    """The size of cells: `spacing`, or where the surface of a cloud with noise is likely to have
+def cell_size_for_smoothing(field: Field, spacing: float, most: float, least: float) -> float:
+    """The size of cells: `cell_size`, or where the surface of a cloud with noise is likely to have
     details that these do not show, smaller by factors between `least` and `most`."""
-    if not isinstance(field, DipolePotential) or not 0 < field.smoothing < _DETAILS * spacing:
+    if (
+        not isinstance(field, DipolePotential)
+        or not 0 < field.smoothing < _UNRESOLVED_SMOOTHING * spacing
+    ):
         return spacing
-    return min(max(_SHOWN * field.smoothing, least * spacing), most * spacing)
+    return min(max(_RESOLVED_SMOOTHING_LENGTHS * field.smoothing, least * spacing), most * spacing)
 
 
-def why_empty(field: Field) -> str:
+def empty_surface_hint(field: Field) -> str:
     """What is known of why there is no surface among cells, to be added to an error."""
     if not isinstance(field, DipolePotential) or len(field.points) < 2:
         return ""
-    alone = lonely_points(field.points, point_tree(field.points))
+    alone = outlier_indices(field.points, build_point_tree(field.points))
     if not len(alone):
         return ""
     return (
         f"; {len(alone):,} of {len(field.points):,} points are far from all others, such as "
-        f"{vector_text(field.points[alone[0]])}, and make cells too large: leave them out, as "
-        'smoothing="auto" does, or give a `spacing`'
+        f"{format_vector(field.points[alone[0]])}, and make cells too large: leave them out, as "
+        'smoothing="auto" does, or give a `cell_size`'
     )
 
 
@@ -122,19 +125,19 @@ class SignFunction(LevelFunction):
         precision: Precision = "single" if is_near else "double"
         return cls(field, level, side=side, precision=precision, most_faces=most_faces)
 
-    def wrapped(self, value: FloatArray) -> FloatArray:
+    def relative_to_level(self, value: FloatArray) -> FloatArray:
         return self.side * (np.asarray(value, np.float64) - self.level)
 
     def values(self, points: FloatArray) -> FloatArray:
         self.evaluations += len(points)
-        return self.wrapped(self.field.value(points, precision=self.precision))
+        return self.relative_to_level(self.field.value(points, precision=self.precision))
 
-    def at(self, points: FloatArray) -> Samples:
+    def sample(self, points: FloatArray) -> LevelSamples:
         """The function at points (n, 3). Of a field with sheets the gradient is given as 0, since
         it does not say how far the level is."""
         none = np.zeros(len(points))
-        if self.field.has_sheets:
-            return Samples(self.values(points), np.zeros((len(points), 3)), none)
+        if self.field.has_jumps:
+            return LevelSamples(self.values(points), np.zeros((len(points), 3)), none)
         self.evaluations += len(points)
         if isinstance(self.field, BatchedField):
             value, gradient = self.field.rough_value_and_gradient(points, precision=self.precision)
@@ -146,10 +149,12 @@ class SignFunction(LevelFunction):
                 sample = prepared.evaluate(p)
                 return sample.value, sample.gradient
 
-            value, gradient = in_batches(backend, both, points)
-        return Samples(self.wrapped(value), self.side * np.asarray(gradient, np.float64), none)
+            value, gradient = map_batches(backend, both, points)
+        return LevelSamples(
+            self.relative_to_level(value), self.side * np.asarray(gradient, np.float64), none
+        )
 
-    def undecided(self, points: FloatArray, value: FloatArray) -> int:
+    def count_undecided(self, points: FloatArray, value: FloatArray) -> int:
         """At how many of some points, with the function's values, its error leaves the sign
         open."""
         if not isinstance(self.field, BatchedField):
@@ -162,8 +167,9 @@ class SignFunction(LevelFunction):
         return int((np.abs(value[near]) <= error).sum())
 
     def clearance(self, points: FloatArray) -> FloatArray:
-        """(n,) no point of the level set is nearer: see `distance_below`. Of a winding number
-        modulo 1, which has no jumps and needs coarse samples alone, and from its triangles."""
+        """(n,) no point of the level set is nearer: see `level_distance_lower_bound`. Of a winding
+        number modulo 1, which has no jumps and needs coarse samples alone, and from its
+        triangles."""
         self.evaluations += len(points)
         if not self._clearances:
             self._clearances = _clearances(self.field, self.level, self.precision)
@@ -181,8 +187,8 @@ class SignFunction(LevelFunction):
         way = high - low
         t = np.zeros(len(low))
         normal, is_on_sheet = np.zeros_like(low), np.zeros(len(low), np.bool_)
-        if self.field.has_sheets:
-            first, last = self._halved(low, way)
+        if self.field.has_jumps:
+            first, last = self._bisect(low, way)
             t, normal, is_on_sheet = self._on_sheets(low, way, first, last)
             rows = np.flatnonzero(~is_on_sheet)
             t[rows] = self._roots(low[rows], way[rows], first[rows], last[rows], 2)
@@ -191,16 +197,16 @@ class SignFunction(LevelFunction):
         x = low + t[:, None] * way
         smooth = np.flatnonzero(~is_on_sheet)
         normal[smooth] = self._slopes(x[smooth], way[smooth])
-        down = is_on_sheet & (dots(normal, way) < 0)
+        down = is_on_sheet & (row_dots(normal, way) < 0)
         normal[down] *= -1
-        return x, normal / np.maximum(lengths(normal), 1e-300)[:, None]
+        return x, normal / np.maximum(row_norms(normal), 1e-300)[:, None]
 
     def _slopes(self, x: FloatArray, way: FloatArray) -> FloatArray:
         """(n, 3) gradients at points; where there is none, the way that leads up."""
         if not len(x):
             return x
         self.evaluations += len(x)
-        if isinstance(self.field, BatchedField) and not self.field.has_sheets:
+        if isinstance(self.field, BatchedField) and not self.field.has_jumps:
             slopes = self.field.rough_value_and_gradient(x, precision=self.precision)[1]
         else:
             slopes = self.field.gradient(x, precision=self.precision)
@@ -209,7 +215,7 @@ class SignFunction(LevelFunction):
         slope[flat] = way[flat]
         return slope
 
-    def _halved(self, start: FloatArray, way: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _bisect(self, start: FloatArray, way: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Ends (n,) of parts of segments, in which the function changes its sign as well."""
         first, last = np.zeros(len(start)), np.ones(len(start))
         for _ in range(_HALVINGS):
@@ -250,7 +256,7 @@ class SignFunction(LevelFunction):
         (n, 3), and whether there is one."""
         backend = choose_backend("double")
         field = self.field.prepare(backend)
-        length = lengths(way)
+        length = row_norms(way)
         ray = way / np.maximum(length, 1e-300)[:, None]
         room = _BEYOND * (last - first)
         origin = start + (first - room)[:, None] * way
@@ -258,11 +264,11 @@ class SignFunction(LevelFunction):
 
         def crossed(o: Vec3, d: Vec3, limit: Vec3) -> tuple[Real, Vec3]:
             none = backend.Array3f(0)
-            after = Crossing(backend.Float(0), backend.UInt32(NO_SHEET), backend.Float(0), none)
-            found = field.next_crossing(o, d, after, limit.x, backend.Bool(True))
+            after = JumpCrossing(backend.Float(0), backend.UInt32(NO_FACET), backend.Float(0), none)
+            found = field.next_jump(o, d, after, limit.x, backend.Bool(True))
             return found.t, found.normal
 
-        t, normal = in_batches(backend, crossed, origin, ray, np.column_stack([reach] * 3))
+        t, normal = map_batches(backend, crossed, origin, ray, np.column_stack([reach] * 3))
         is_crossed = np.isfinite(t) & (t <= reach)
         along = first - room + np.where(is_crossed, t, 0.0) / np.maximum(length, 1e-300)
         normal = np.where(is_crossed[:, None], normal, 0.0)
@@ -275,7 +281,7 @@ def _check_encloses(field: DipolePotential, level: float) -> None:
 
     Where areas are given, points need not stand for a surface.
     """
-    if field.smoothing or not field.estimated[1] or not level > 0:
+    if field.smoothing or not field.is_estimated[1] or not level > 0:
         return
     step = -(-len(field.points) // _MOST_PROBES)
     value = float(np.median(field.value(field.points[::step], precision="double")))
@@ -308,10 +314,10 @@ def _clearances(
 
     def bound(smooth: Field) -> Callable[[FloatArray], FloatArray]:
         prepared = smooth.prepare(backend)
-        levels = TargetLevels((dr.opaque(backend.Float, level),), smooth.period)
+        levels = Levels((dr.opaque(backend.Float, level),), smooth.period)
 
         def kernel(p: Vec3) -> tuple[Real]:
-            return (distance_below(backend, prepared, levels, p, prepared.evaluate(p)),)
+            return (level_distance_lower_bound(backend, prepared, levels, p, prepared.evaluate(p)),)
 
         return lambda points: _numbers(backend, kernel, points)
 
@@ -320,7 +326,7 @@ def _clearances(
     sheets = field.prepare(backend)
 
     def distance(p: Vec3) -> tuple[Real]:
-        return (sheets.distance_to_sheets(p),)
+        return (sheets.distance_to_jumps(p),)
 
     return [bound(WindingModuloOne(field)), lambda points: _numbers(backend, distance, points)]
 
@@ -328,4 +334,4 @@ def _clearances(
 def _numbers(
     backend: Backend, kernel: Callable[[Vec3], tuple[Any, ...]], points: FloatArray
 ) -> FloatArray:
-    return np.asarray(in_batches(backend, kernel, points, at_once=1 << 18)[0], np.float64)
+    return np.asarray(map_batches(backend, kernel, points, at_once=1 << 18)[0], np.float64)

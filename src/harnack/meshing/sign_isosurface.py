@@ -22,55 +22,61 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
-from harnack.meshing.bcc_lattice import Lattice, distinct_rows
+from harnack.meshing.bcc_lattice import BccLattice, distinct_rows
 from harnack.meshing.checks import (
-    EmptyError,
-    LocalError,
+    EmptySurfaceError,
+    LocalizedMeshingError,
     MeshingError,
-    check_count,
-    far_from_level,
+    check_triangle_limit,
     intersecting_faces,
+    points_off_level,
 )
-from harnack.meshing.closed_mesh import manifold_of, surface_of, without_short_edges
-from harnack.meshing.delaunay_points import PointSet
+from harnack.meshing.closed_mesh import from_manifold, to_manifold, without_short_edges
+from harnack.meshing.delaunay_points import TetrahedronPoints
 from harnack.meshing.edges import (
     Edges,
     IntArray,
+    area_normals,
     boundary_edges,
-    crosses,
-    directed_edges,
-    dots,
-    lengths,
+    half_edges,
+    row_dots,
+    row_norms,
 )
-from harnack.meshing.lattice_meshing import Surface
-from harnack.meshing.level_function import Samples
+from harnack.meshing.lattice_meshing import TriangleMesh
+from harnack.meshing.level_function import LevelSamples
 from harnack.meshing.lost_parts import LostParts, PointsOnLevel
-from harnack.meshing.marching_tetrahedra import Tetrahedra, crossings_of, triangles_of
+from harnack.meshing.marching_tetrahedra import Tetrahedra, count_crossings, extract_triangles
 from harnack.meshing.refinement import split_faces
 from harnack.meshing.sign_function import SignFunction
 
 if TYPE_CHECKING:
     from harnack.geometry import Volume
 
-__all__ = ["MOST_FAR", "SMALLER", "SignSurface", "sign_surface", "signed_surface"]
+__all__ = [
+    "CELL_REFINEMENT_FACTOR",
+    "MAX_OFF_LEVEL_FRACTION",
+    "SignIsosurface",
+    "extract_from_signs",
+    "mesh_from_signs",
+]
 
 # Vertices keep this part of an edge from its ends, so that all triangles have an area.
-_FROM_ENDS = 1e-4
+_EDGE_END_MARGIN = 1e-4
 # How often edges are cut; and how often triangles that pass through others are made flat again.
 _ROUNDS, _MOST_REPAIRS = 2, 12
 # A round that would cut more than this part of the edges that the last one cut, or of the faces, is
 # not made: the surface is rough at every scale.
-_ENDS = 0.5
+_MAX_CUT_FRACTION = 0.5
 # Neighbors lie on each other if the cosine between their normals is less than this.
 _FOLDED = -0.99999
 # Slivers and flat places are left out within this part of the tolerance, and this one of a cell.
-_SLIVERS, _SMALL = 0.5, 0.05
+_SIMPLIFY_TOLERANCE, _SIMPLIFY_CELL_FRACTION = 0.5, 0.05
 # Edges shorter than this, in tolerances, stay whole.
 _SHORTEST = 4.0
 # An edge is cut no nearer to its ends than this part of it.
 _FROM_CORNERS = 0.1
 # Across a crease normals turn by at least this angle, and by this part of it between two points.
-_BENT, _AT_ONCE = math.radians(2), 0.75
+_MIN_CREASE_ANGLE, _CREASE_ANGLE_SHARE = math.radians(2), 0.75
 # The level is looked for from before the middle of an edge to behind the place where tangent planes
 # meet, in parts of that way; which counts up to so many lengths of the edge.
 _BEFORE, _BEHIND, _BESIDE = 0.3, 1.3, 1.0
@@ -78,32 +84,32 @@ _BEFORE, _BEHIND, _BESIDE = 0.3, 1.3, 1.0
 # the determinant of their normals is larger than the last.
 _PARALLEL, _INDEPENDENT = 1e-4, 0.1
 # So large a part of vertices and centers may be beyond the tolerance before cells are made smaller.
-MOST_FAR, SMALLER = 0.01, 0.6
+MAX_OFF_LEVEL_FRACTION, CELL_REFINEMENT_FACTOR = 0.01, 0.6
 # What is farther from the level than this many cells is nowhere near.
-_NOWHERE = 4.0
+_MAX_DISTANCE_CELLS = 4.0
 # At the corners and centers of so many triangles distances are measured.
 _MOST_MEASURED = 20_000
 # What has more triangles is not made again.
 _MOST_REMADE = 100_000
 # Points at which the function is no number are moved by this part of a cell.
-_ASIDE = 1e-3
-_MOST_ADDED = 20
+_SINGULAR_POINT_SHIFT = 1e-3
+_MAX_GROWTH_ROUNDS = 20
 
 
 @dataclass(frozen=True)
-class SignSurface:
+class SignIsosurface:
     """A surface; of the points of the lattice how many there are, and at how many the error of the
     function leaves the sign open; flat: how many triangles were made flat again; is_apart: whether
     it was checked, exactly, that no triangles pass through each other."""
 
-    surface: Surface
+    surface: TriangleMesh
     points: int
     undecided: int
-    flat: int
-    is_apart: bool
+    unfitted: int
+    is_intersection_free: bool
 
 
-def signed_surface(
+def mesh_from_signs(
     function: SignFunction,
     box: tuple[FloatArray, FloatArray],
     spacing: float,
@@ -113,42 +119,44 @@ def signed_surface(
     *,
     closed: bool = False,
     volume: Volume | None = None,
-) -> tuple[SignSurface, LostParts, dict[str, Any]]:
-    """`sign_surface` in cells of a box, parts of the level that it lost, and facts about it. Where
-    more than a few vertices and centers of triangles are beyond the tolerance, a length, or lost
-    parts may be found so, it is made once more of smaller cells; how many are at last, and within
-    what distance all are, is among the facts.
+) -> tuple[SignIsosurface, LostParts, dict[str, Any]]:
+    """`extract_from_signs` in cells of a box, parts of the level that it lost, and facts about it.
+    Where more than a few vertices and centers of triangles are beyond the tolerance, a length, or
+    lost parts may be found so, it is made once more of smaller cells; how many are at last, and
+    within what distance all are, is among the facts.
 
     volume: only what is lost within it counts.
 
     Raises:
-        MeshingError: as `sign_surface`.
+        MeshingError: as `extract_from_signs`.
     """
     known = PointsOnLevel.of(function, tolerance).within(*box, volume)
     while True:
         report(f"cells of {spacing:.3g}")
         layers = 2 if closed else 0
-        lattice = Lattice.filling(*box, spacing, layers=layers)
+        lattice = BccLattice.covering_box(*box, spacing, layers=layers)
         try:
-            made = sign_surface(function, lattice, 0.8 * tolerance, report, closed=closed)
-        except EmptyError as error:
-            nothing = Surface(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
+            made = extract_from_signs(function, lattice, 0.8 * tolerance, report, closed=closed)
+        except EmptySurfaceError as error:
+            nothing = TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
             lost = LostParts.of(function, known, nothing, tolerance, spacing)
             if not lost.far:
                 raise
-            raise EmptyError(f"the mesh is empty: {lost}; {lost.advice}") from error
+            raise EmptySurfaceError(f"the mesh is empty: {lost}; {lost.advice}") from error
         report("measuring distances to the level")
         far, count, within = _distances(function, made.surface, tolerance, lattice, closed)
         report("looking for parts that were lost")
         lost = LostParts.of(function, known, made.surface, tolerance, spacing)
         attempts -= 1
-        may_help = far > MOST_FAR * count or (lost.matter and lost.are_mended_by(SMALLER))
+        may_help = far > MAX_OFF_LEVEL_FRACTION * count or (
+            lost.matter and lost.are_mended_by(CELL_REFINEMENT_FACTOR)
+        )
         if attempts <= 0 or not may_help or len(made.surface.faces) > _MOST_REMADE:
             break
         report(f"{far:,} of {count:,} vertices and centers are beyond the tolerance")
         if lost.matter:
             report(str(lost))
-        spacing *= SMALLER
+        spacing *= CELL_REFINEMENT_FACTOR
     facts = {
         "made_by": "signs",
         "spacing": spacing,
@@ -156,7 +164,7 @@ def signed_surface(
         "isotopy": 0.0,
         "isotopy_far": 0.0,
         "undecided": made.undecided,
-        "flat": made.flat,
+        "flat": made.unfitted,
         "far": far,
         "looked_at": count,
         "within": within,
@@ -167,7 +175,11 @@ def signed_surface(
 
 
 def _distances(
-    function: SignFunction, surface: Surface, tolerance: float, lattice: Lattice, closed: bool
+    function: SignFunction,
+    surface: TriangleMesh,
+    tolerance: float,
+    lattice: BccLattice,
+    closed: bool,
 ) -> tuple[int, int, float]:
     """How many vertices and centers of faces are farther from the level than the tolerance, of how
     many, and the distance within which all of these are, up to a factor of 2. Of large meshes every
@@ -177,25 +189,27 @@ def _distances(
     if closed:
         lower, upper = lattice.lower + 2 * lattice.size, lattice.upper - 2 * lattice.size
         faces = faces[((x[faces] > lower) & (x[faces] < upper)).all(axis=(1, 2))]
-    surface = Surface.of(x, faces[:: -(-len(faces) // _MOST_MEASURED) or 1])
+    surface = TriangleMesh.without_unused_vertices(
+        x, faces[:: -(-len(faces) // _MOST_MEASURED) or 1]
+    )
     x, faces = surface.vertices, surface.faces
-    far, count = far_from_level(function, x, faces, tolerance, None)
+    far, count = points_off_level(function, x, faces, tolerance, None)
     within, left = tolerance, far
-    while len(left) and within < _NOWHERE * float(lattice.size.max()):
+    while len(left) and within < _MAX_DISTANCE_CELLS * float(lattice.size.max()):
         within *= 2
         alone = np.zeros((0, 3), np.int64)
-        left, _ = far_from_level(function, left, alone, within, None)
+        left, _ = points_off_level(function, left, alone, within, None)
     return len(far), count, within if not len(left) else math.inf
 
 
-def sign_surface(
+def extract_from_signs(
     function: SignFunction,
-    lattice: Lattice,
+    lattice: BccLattice,
     tolerance: float,
     report: Callable[[str], None],
     *,
     closed: bool = False,
-) -> SignSurface:
+) -> SignIsosurface:
     """The boundary of the points of a lattice's box at which a function is not positive.
 
     tolerance: how far edges may be from the surface, by the normals at their ends, before they are
@@ -205,40 +219,41 @@ def sign_surface(
     Raises:
         MeshingError: there is none, too many cells, or values that are no numbers.
     """
-    first = _marched(function, lattice, closed, report)
-    x, faces, normals, is_apart = _without_slivers(
-        first, min(_SLIVERS * tolerance, _SMALL * float(lattice.size.min()))
+    first = _march(function, lattice, closed, report)
+    x, faces, normals, is_apart = _collapse_slivers(
+        first,
+        min(_SIMPLIFY_TOLERANCE * tolerance, _SIMPLIFY_CELL_FRACTION * float(lattice.size.min())),
     )
     report(f"{len(first.faces):,} triangles, {len(faces):,} without slivers")
-    check_count(len(faces), function.most_faces)
+    check_triangle_limit(len(faces), function.most_faces)
     flat = x
     bent = np.zeros(len(x), np.bool_)
     before = len(faces)
     for round_number in range(_ROUNDS):
         report(f"refining, round {round_number + 1}: {len(faces):,} triangles")
-        cut = _Cut.of(function, x, normals, bent, faces, tolerance)
-        if not len(cut.points) or len(cut.points) > _ENDS * before:
+        cut = _CreaseRefinement.of(function, x, normals, bent, faces, tolerance)
+        if not len(cut.points) or len(cut.points) > _MAX_CUT_FRACTION * before:
             break
         before = len(cut.points)
-        check_count(len(faces) + 2 * len(cut.points), function.most_faces)
+        check_triangle_limit(len(faces) + 2 * len(cut.points), function.most_faces)
         one, other = (flat[cut.ends[:, k]] for k in (0, 1))
         feet = one + cut.share[:, None] * (other - one)
-        around = feet[cut.place[cut.edges[cut.rows]] - len(x)]
+        around = feet[cut.vertex_of_edge[cut.edges[cut.rows]] - len(x)]
         flat = np.concatenate([flat, feet, around.mean(axis=1)])
         x, faces = cut.applied(x, faces)
         normals = np.concatenate([normals, cut.normals])
-        bent = np.concatenate([bent, cut.bent])
+        bent = np.concatenate([bent, cut.is_on_crease])
     report("looking for triangles that pass through each other")
     try:
-        x, count = _untangled(x, flat, faces)
-    except LocalError:  # as the tetrahedra cut it
+        x, count = _undo_until_valid(x, flat, faces)
+    except LocalizedMeshingError:  # as the tetrahedra cut it
         x, faces, count = first.vertices, first.faces, len(first.faces)
         is_apart = False
-    return SignSurface(Surface(x, faces), first.points, first.undecided, count, is_apart)
+    return SignIsosurface(TriangleMesh(x, faces), first.points, first.undecided, count, is_apart)
 
 
 @dataclass(frozen=True)
-class _Marched:
+class _RawIsosurface:
     """Vertices (n, 3) on the level, normals there, and faces (m, 3); the points of the lattice, and
     how many of these are undecided."""
 
@@ -249,29 +264,29 @@ class _Marched:
     undecided: int
 
 
-def _marched(
-    function: SignFunction, lattice: Lattice, closed: bool, report: Callable[[str], None]
-) -> _Marched:
+def _march(
+    function: SignFunction, lattice: BccLattice, closed: bool, report: Callable[[str], None]
+) -> _RawIsosurface:
     """The triangles of all tetrahedra whose corners differ.
 
     Cells are left out that are proved empty. Where values are known up to an error, or proofs rest
     on rounding, signs may differ at the corner of such a cell, and the surface would end there:
     then its neighbors are looked at as well, until it does not.
     """
-    cells = lattice.cells_not_empty(function.clearance, function.most_faces)
+    cells = lattice.nonempty_cells(function.clearance, function.most_faces)
     if closed:
         outer = lattice.outer_cells()
         outer = outer[function.values(lattice.points(2 * outer + 1)) <= 0]
         cells = distinct_rows(np.concatenate([cells, outer]))
     places = np.zeros((0, 3))
-    for _ in range(_MOST_ADDED):
+    for _ in range(_MAX_GROWTH_ROUNDS):
         if not len(cells):
-            raise EmptyError("the level set is empty: no cell of the box holds the level")
+            raise EmptySurfaceError("the level set is empty: no cell of the box holds the level")
         coordinates, corners = lattice.tetrahedra(cells)
         points = lattice.points(coordinates)
         report(f"{len(points):,} points, {len(corners):,} tetrahedra")
-        value = _values(function, points, lattice.size)
-        is_wall = lattice.is_outer(coordinates)
+        value = _finite_values(function, points, lattice.size)
+        is_wall = lattice.is_on_box(coordinates)
         if closed:
             value[is_wall] = np.abs(value).max(initial=1.0)
         normals: list[FloatArray] = []
@@ -280,33 +295,35 @@ def _marched(
             x, normal = function.crossings(low, high)
             normals.append(normal)
             way = high - low
-            square = dots(way, way)
-            t = np.clip(dots(x - low, way) / square, _FROM_ENDS, 1 - _FROM_ENDS)
+            square = row_dots(way, way)
+            t = np.clip(row_dots(x - low, way) / square, _EDGE_END_MARGIN, 1 - _EDGE_END_MARGIN)
             return low + t[:, None] * way
 
         x, faces = _triangles(function, points, value, corners, roots)
         if not len(faces):
-            raise EmptyError("the level set is empty: no cell of the box holds the level")
+            raise EmptySurfaceError("the level set is empty: no cell of the box holds the level")
         ends = boundary_edges(faces)
         middle = x[ends].mean(axis=1)
         slack = 1e-9 * lattice.size
         inner = (middle > lattice.lower + slack) & (middle < lattice.upper - slack)
         places = middle[inner.all(axis=1)]
         if not len(places):
-            return _Marched(x, normals[0], faces, len(points), function.undecided(points, value))
+            return _RawIsosurface(
+                x, normals[0], faces, len(points), function.count_undecided(points, value)
+            )
         index = np.floor((places - lattice.lower) / lattice.size).astype(np.int64)
         around = np.array(list(itertools.product((-1, 0, 1), repeat=3)))
         more = np.clip((index[:, None] + around).reshape(-1, 3), 0, lattice.counts - 1)
         cells = distinct_rows(np.concatenate([cells, more]))
-    raise LocalError(
+    raise LocalizedMeshingError(
         "signs differ at the corners of ever more cells that are proved empty: values of "
-        f"{type(function.field).__name__} are not what it promises; choose a smaller `spacing`",
+        f"{type(function.field).__name__} are not what it promises; choose a smaller `cell_size`",
         places,
     )
 
 
-def _without_slivers(
-    marched: _Marched, tolerance: float
+def _collapse_slivers(
+    marched: _RawIsosurface, tolerance: float
 ) -> tuple[FloatArray, IntArray, FloatArray, bool]:
     """Vertices, faces and normals with short edges contracted, and vertices left out where faces
     around them lie in a plane, within a tolerance (manifold3d); all as they were if the surface is
@@ -318,7 +335,7 @@ def _without_slivers(
     x, faces = marched.vertices, marched.faces
     if len(boundary_edges(faces)):
         return x, faces, marched.normals, False
-    simpler = surface_of(without_short_edges(manifold_of(Surface(x, faces)), tolerance))
+    simpler = from_manifold(without_short_edges(to_manifold(TriangleMesh(x, faces)), tolerance))
     away, place = searching.cKDTree(x).query(simpler.vertices)
     if not len(simpler.faces) or away.any():
         return x, faces, marched.normals, False
@@ -327,14 +344,14 @@ def _without_slivers(
     return simpler.vertices, simpler.faces, marched.normals[place], True
 
 
-def _values(function: SignFunction, points: FloatArray, size: FloatArray) -> FloatArray:
+def _finite_values(function: SignFunction, points: FloatArray, size: FloatArray) -> FloatArray:
     """The function at points, or a little beside them where it is no number, as at a dipole."""
     value = function.values(points)
     for k in (1, 2):
         bad = np.flatnonzero(~np.isfinite(value))
         if not len(bad):
             return value
-        value[bad] = function.values(points[bad] + k * _ASIDE * size)
+        value[bad] = function.values(points[bad] + k * _SINGULAR_POINT_SHIFT * size)
     bad = ~np.isfinite(value)
     if bad.any():
         x, y, z = points[bad][0]
@@ -360,30 +377,32 @@ def _triangles(
         return points[:0], np.zeros((0, 3), np.int64)
     # A value of 0 counts as below; no point is on the level.
     nowhere = np.zeros(len(points), np.bool_)
-    some = PointSet(points, nowhere, Samples(value, np.zeros_like(points), value))
-    vertices, faces = triangles_of(function, some, tets, crossings_of(function, some, tets), roots)
+    some = TetrahedronPoints(points, nowhere, LevelSamples(value, np.zeros_like(points), value))
+    vertices, faces = extract_triangles(
+        function, some, tets, count_crossings(function, some, tets), roots
+    )
     return vertices[len(points) :], faces - len(points)
 
 
 @dataclass(frozen=True)
-class _Cut:
+class _CreaseRefinement:
     """Where edges and faces are cut.
 
     edges: (m, 3) of all faces. place: (k,) of edges, the index of the new vertex, or -1. ends:
         (c, 2) of the edges that are cut, and share: (c,) where along them. cornered: (d, 3) faces
         with a new vertex within, and their rows (d,).
-    points, normals, bent: the new vertices, those of edges first; bent: on a crease.
+    points, normals, is_on_crease: the new vertices, those of edges first; bent: on a crease.
     """
 
     edges: IntArray
-    place: IntArray
+    vertex_of_edge: IntArray
     ends: IntArray
     share: FloatArray
-    cornered: IntArray
+    corner_faces: IntArray
     rows: IntArray
     points: FloatArray
     normals: FloatArray
-    bent: BoolArray
+    is_on_crease: BoolArray
 
     @classmethod
     def of(
@@ -394,37 +413,37 @@ class _Cut:
         bent: BoolArray,
         faces: IntArray,
         tolerance: float,
-    ) -> _Cut:
+    ) -> _CreaseRefinement:
         """Edges that are farther from the surface than the tolerance, by where the tangent planes
         of their ends meet; those on a crease have two, and stay."""
-        every = Edges.of(directed_edges(faces))
-        edges = every.index.reshape(3, -1).T
-        rows = np.flatnonzero((every.uses == 2) & ~bent[every.ends].any(axis=1))
-        ends = every.ends[rows]
+        every = Edges.of(half_edges(faces))
+        edges = every.edge_of_pair.reshape(3, -1).T
+        rows = np.flatnonzero((every.multiplicity == 2) & ~bent[every.vertices].any(axis=1))
+        ends = every.vertices[rows]
         one, other = normals[ends[:, 0]], normals[ends[:, 1]]
         a, b = x[ends[:, 0]], x[ends[:, 1]]
-        share, way, turned = _upright(a, b, one, other)
-        long = lengths(b - a)
-        far = (turned > _PARALLEL) & (lengths(way) > tolerance) & (long > _SHORTEST * tolerance)
+        share, way, turned = _toward_tangent_planes(a, b, one, other)
+        long = row_norms(b - a)
+        far = (turned > _PARALLEL) & (row_norms(way) > tolerance) & (long > _SHORTEST * tolerance)
         rows, way, share = rows[far], way[far], share[far]
         foot, span = a[far] + share[:, None] * (b - a)[far], long[far]
-        there, normal, good = _towards(function, foot, way, _BESIDE * span)
+        there, normal, good = _level_along(function, foot, way, _BESIDE * span)
         rows, there, normal, share = rows[good], there[good], normal[good], share[good]
-        ends = every.ends[rows]
-        place = np.full(len(every.ends), -1, np.int64)
+        ends = every.vertices[rows]
+        place = np.full(len(every.vertices), -1, np.int64)
         place[rows] = len(x) + np.arange(len(rows))
         whole, turn = (
             np.arccos(np.clip(one, -1, 1))
             for one in (
-                dots(normals[ends[:, 0]], normals[ends[:, 1]]),
-                np.minimum(*(dots(normals[ends[:, k]], normal) for k in (0, 1))),
+                row_dots(normals[ends[:, 0]], normals[ends[:, 1]]),
+                np.minimum(*(row_dots(normals[ends[:, k]], normal) for k in (0, 1))),
             )
         )
-        on_crease = (whole > _BENT) & (turn > _AT_ONCE * whole)
+        on_crease = (whole > _MIN_CREASE_ANGLE) & (turn > _CREASE_ANGLE_SHARE * whole)
         is_bent = np.concatenate([bent, on_crease])
         new = place[edges]
         corner = np.flatnonzero((new >= 0).all(axis=1) & is_bent[np.maximum(new, 0)].all(axis=1))
-        inner, inner_normal, corner = _corners(function, x, normals, faces, corner)
+        inner, inner_normal, corner = _crease_corners(function, x, normals, faces, corner)
         return cls(
             edges, place, ends, share, faces[corner], corner, np.concatenate([there, inner]),
             np.concatenate([normal, inner_normal]),
@@ -434,11 +453,11 @@ class _Cut:
     def applied(self, x: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray]:
         """The finer mesh."""
         vertices = np.concatenate([x, self.points])
-        middle = self.place[self.edges]
+        middle = self.vertex_of_edge[self.edges]
         rest = np.ones(len(faces), np.bool_)
         rest[self.rows] = False
         made = [split_faces(vertices, faces[rest], middle[rest])]
-        a, b, c = self.cornered.T
+        a, b, c = self.corner_faces.T
         u, v, w = middle[self.rows].T  # on the edges ab, bc and ca
         inner = len(vertices) - len(self.rows) + np.arange(len(self.rows))
         made += [np.stack(t, axis=1) for t in ((a, u, w), (u, b, v), (w, v, c))]
@@ -446,7 +465,7 @@ class _Cut:
         return vertices, np.concatenate(made)
 
 
-def _upright(
+def _toward_tangent_planes(
     a: FloatArray, b: FloatArray, one: FloatArray, other: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Where edges from a to b (k, 3) come nearest to the line in which the planes through their
@@ -456,28 +475,28 @@ def _upright(
     Edges of a plane triangulation pass over such a line in order, and so do these places.
     """
     edge, line = b - a, np.cross(one, other)
-    cosine, turned = dots(one, other), dots(line, line)
+    cosine, turned = row_dots(one, other), row_dots(line, line)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         # A point of the line, from a: p.one = 0 and p.other = edge.other.
-        height = dots(edge, other) / turned
+        height = row_dots(edge, other) / turned
         point = height[:, None] * (other - cosine[:, None] * one)
         along = line / np.sqrt(turned)[:, None]
-        across = edge - dots(edge, along)[:, None] * along
-        share = dots(point, across) / dots(across, across)
+        across = edge - row_dots(edge, along)[:, None] * along
+        share = row_dots(point, across) / row_dots(across, across)
         share = np.clip(share, _FROM_CORNERS, 1 - _FROM_CORNERS)
         foot = share[:, None] * edge
-        way = point + dots(foot - point, along)[:, None] * along - foot
+        way = point + row_dots(foot - point, along)[:, None] * along - foot
     good = np.isfinite(share) & np.isfinite(way).all(axis=1)
     return np.where(good, share, 0.5), np.where(good[:, None], way, 0.0), turned
 
 
-def _towards(
+def _level_along(
     function: SignFunction, start: FloatArray, way: FloatArray, most: FloatArray
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Points of the level from a little before `start` (k, 3) to a little behind start + way, no
     farther than `most`; normals there; and whether the function has different signs at both
     ends."""
-    way = way * np.minimum(1, most / np.maximum(lengths(way), 1e-300))[:, None]
+    way = way * np.minimum(1, most / np.maximum(row_norms(way), 1e-300))[:, None]
     near, far = start - _BEFORE * way, start + _BEHIND * way
     above = function.values(near) > 0
     good = above != (function.values(far) > 0)
@@ -489,7 +508,7 @@ def _towards(
     return there, normal, good
 
 
-def _corners(
+def _crease_corners(
     function: SignFunction, x: FloatArray, normals: FloatArray, faces: IntArray, rows: IntArray
 ) -> tuple[FloatArray, FloatArray, IntArray]:
     """Points where the tangent planes at the corners of some faces meet, on the level; normals; and
@@ -499,15 +518,15 @@ def _corners(
     some = np.flatnonzero(np.abs(det(normal)) > _INDEPENDENT)
     rows, corner, normal = rows[some], corner[some], normal[some]
     center = corner.mean(axis=1)
-    span = np.stack([lengths(corner[:, k] - corner[:, k - 1]) for k in range(3)]).max(axis=0)
+    span = np.stack([row_norms(corner[:, k] - corner[:, k - 1]) for k in range(3)]).max(axis=0)
     away = np.einsum("kij,kij->ki", normal, corner - center[:, None])
     solve: Any = np.linalg.solve
     way: FloatArray = solve(normal, away[:, :, None])[:, :, 0]
-    there, normal, good = _towards(function, center, way, _BESIDE * span)
+    there, normal, good = _level_along(function, center, way, _BESIDE * span)
     return there[good], normal[good], rows[good]
 
 
-def _untangled(x: FloatArray, flat: FloatArray, faces: IntArray) -> tuple[FloatArray, int]:
+def _undo_until_valid(x: FloatArray, flat: FloatArray, faces: IntArray) -> tuple[FloatArray, int]:
     """Vertices moved back to where they were made, within the triangles of the tetrahedra, of faces
     that turn over or pass through others; and how many faces did. Faces none of whose vertices were
     moved are not compared with each other.
@@ -515,15 +534,15 @@ def _untangled(x: FloatArray, flat: FloatArray, faces: IntArray) -> tuple[FloatA
     flat: (n, 3) these places.
 
     Raises:
-        LocalError: triangles pass through each other still.
+        LocalizedMeshingError: triangles pass through each other still.
     """
     x = x.copy()
     total = 0
-    upright = crosses(flat[faces])
+    upright = area_normals(flat[faces])
     for _ in range(_MOST_REPAIRS):
         moved = (x != flat).any(axis=1)
         turned = moved[faces].any(axis=1)
-        turned[turned] = dots(crosses(x[faces[turned]]), upright[turned]) <= 0
+        turned[turned] = row_dots(area_normals(x[faces[turned]]), upright[turned]) <= 0
         if not turned.any():
             break
         x[faces[turned]] = flat[faces[turned]]
@@ -531,7 +550,7 @@ def _untangled(x: FloatArray, flat: FloatArray, faces: IntArray) -> tuple[FloatA
     among: BoolArray = np.asarray((x != flat).any(axis=1)[faces].any(axis=1))
     bad = faces[:0, 0]
     for _ in range(_MOST_REPAIRS):
-        bad = np.union1d(intersecting_faces(x, faces, among), _folded(x, faces, among))
+        bad = np.union1d(intersecting_faces(x, faces, among), _folded_faces(x, faces, among))
         if not len(bad):
             return x, total
         total += len(bad)
@@ -542,16 +561,16 @@ def _untangled(x: FloatArray, flat: FloatArray, faces: IntArray) -> tuple[FloatA
             near[faces[among]] = True
             among = np.asarray(near[faces].any(axis=1))
         x[near] = flat[near]
-    raise LocalError(
+    raise LocalizedMeshingError(
         f"{len(bad):,} triangles pass through each other still", x[faces[bad]].mean(axis=1)
     )
 
 
-def _folded(x: FloatArray, faces: IntArray, among: BoolArray) -> IntArray:
+def _folded_faces(x: FloatArray, faces: IntArray, among: BoolArray) -> IntArray:
     """Faces, by index, that lie on a neighbor but for rounding, of which one is chosen."""
-    normal = crosses(x[faces])
-    normal /= np.maximum(lengths(normal), 1e-300)[:, None]
-    pairs = Edges.of(directed_edges(faces)).twice() % len(faces)
+    normal = area_normals(x[faces])
+    normal /= np.maximum(row_norms(normal), 1e-300)[:, None]
+    pairs = Edges.of(half_edges(faces)).paired_half_edges() % len(faces)
     one, other = pairs.T
-    on_other = (dots(normal[one], normal[other]) < _FOLDED) & (among[one] | among[other])
+    on_other = (row_dots(normal[one], normal[other]) < _FOLDED) & (among[one] | among[other])
     return np.unique(pairs[on_other])

@@ -10,14 +10,14 @@ import numpy as np
 from harnack.backend import BoolArray, FloatArray, choose_backend, to_numpy, to_vector3
 from harnack.fields import Solid
 from harnack.fields.solids.mesh_solid import MeshSolid, solid_of_mesh
-from harnack.meshing.edges import IntArray, crosses, dots, lengths
+from harnack.meshing.edges import IntArray, area_normals, row_dots, row_norms
 from harnack.meshing.mesh_pipeline import mesh
 from harnack.tracer import trace
 
 if TYPE_CHECKING:
     import trimesh
 
-__all__ = ["Thickness", "thickness"]
+__all__ = ["WallThickness", "wall_thickness"]
 
 # Rays start this far below a face, in parts of the mesh's size.
 _BELOW = 1e-6
@@ -29,8 +29,8 @@ _OPPOSITE = -0.5
 
 
 @dataclass(frozen=True, eq=False)
-class Thickness:
-    """What `thickness` found.
+class WallThickness:
+    """What `wall_thickness` found.
 
     vertices: (n, 3) and faces: (m, 3), of the mesh.
     values: (m,) thickness at the centers of faces, a length; nan for faces without an area.
@@ -48,7 +48,7 @@ class Thickness:
         """The least of the values."""
         return float(np.nanmin(self.values))
 
-    def where(self, less_than: float) -> FloatArray:
+    def thin_locations(self, less_than: float) -> FloatArray:
         """Centers (k, 3) of the faces at which the part is thinner, the thinnest first."""
         rows = np.flatnonzero(self.is_thinner(less_than))
         rows = rows[np.argsort(self.values[rows])]
@@ -58,7 +58,7 @@ class Thickness:
         """(m,) faces at which the part is thinner."""
         return np.asarray(np.nan_to_num(self.values, nan=np.inf) < than)
 
-    def colored(self, low: float, high: float) -> trimesh.Trimesh:
+    def to_colored_mesh(self, low: float, high: float) -> trimesh.Trimesh:
         """The mesh with colors of faces: red up to `low`, through yellow, to gray from `high` on.
         PLY and GLB files hold them."""
         import trimesh  # here: half a second that few need
@@ -74,7 +74,7 @@ class Thickness:
         )
 
 
-def thickness(part: Any, **options: Any) -> Thickness:
+def wall_thickness(part: Any, **options: Any) -> WallThickness:
     """How thick a part is behind each of its faces.
 
     At the center of a face a ray goes into the part, along the normal, and ends at the other side:
@@ -104,15 +104,17 @@ def thickness(part: Any, **options: Any) -> Thickness:
     solid = part if isinstance(part, MeshSolid) else solid_of_mesh(part)
     x, faces = np.asarray(solid.vertices), np.asarray(solid.faces)
     corner = x[faces]
-    normal = crosses(corner)
-    length = lengths(normal)
+    normal = area_normals(corner)
+    length = row_norms(normal)
     rows = np.flatnonzero(length > 0)
     values = np.full(len(faces), np.nan)
-    values[rows] = _behind(solid, corner[rows].mean(axis=1), normal[rows] / length[rows, None])
-    return Thickness(x, faces, values)
+    values[rows] = _medial_diameters(
+        solid, corner[rows].mean(axis=1), normal[rows] / length[rows, None]
+    )
+    return WallThickness(x, faces, values)
 
 
-def _behind(solid: MeshSolid, start: FloatArray, normal: FloatArray) -> FloatArray:
+def _medial_diameters(solid: MeshSolid, start: FloatArray, normal: FloatArray) -> FloatArray:
     """(k,) thickness at points of the surface with normals (k, 3)."""
     size = solid.surface.size
     below = _BELOW * size
@@ -134,11 +136,11 @@ def _behind(solid: MeshSolid, start: FloatArray, normal: FloatArray) -> FloatArr
         distance, foot, towards = _nearest(solid, center)
         # The ball is free, or touches what does not face the center.
         inside = distance < r * (1 - _TOUCHING)
-        shrinks = inside & (dots(towards, n) < _OPPOSITE)
+        shrinks = inside & (row_dots(towards, n) < _OPPOSITE)
         away = p - foot
-        along = dots(away, n)
+        along = row_dots(away, n)
         shrinks &= along > 0
-        smaller = dots(away, away)[shrinks] / (2 * along[shrinks])
+        smaller = row_dots(away, away)[shrinks] / (2 * along[shrinks])
         width[moving[shrinks]] = np.minimum(width[moving[shrinks]], 2 * smaller)
         moving = moving[shrinks]
     return width

@@ -10,8 +10,8 @@ import numpy as np
 from harnack.backend import FloatArray, IntArray
 from harnack.fields.solids.thread import Thread
 from harnack.meshing.checks import MeshingError
-from harnack.meshing.closed_mesh import manifold_of
-from harnack.meshing.lattice_meshing import Surface
+from harnack.meshing.closed_mesh import to_manifold
+from harnack.meshing.lattice_meshing import TriangleMesh
 
 if TYPE_CHECKING:
     from manifold3d import Manifold
@@ -60,7 +60,7 @@ def thread_manifold(thread: Thread, lower: float, upper: float, tolerance: float
     if thread.left_handed:
         vertices[:, 1] *= -1
         faces = faces[:, ::-1]
-    return manifold_of(Surface(vertices, faces))
+    return to_manifold(TriangleMesh(vertices, faces))
 
 
 def _vertices(

@@ -12,9 +12,9 @@ import numpy as np
 from harnack.backend import FloatArray, IntArray
 from harnack.fields.solids.tube import Tube
 from harnack.meshing.checks import MeshingError, intersecting_faces
-from harnack.meshing.closed_mesh import manifold_of
-from harnack.meshing.edges import lengths
-from harnack.meshing.lattice_meshing import Surface
+from harnack.meshing.closed_mesh import to_manifold
+from harnack.meshing.edges import row_norms
+from harnack.meshing.lattice_meshing import TriangleMesh
 
 if TYPE_CHECKING:
     from manifold3d import Manifold
@@ -71,7 +71,7 @@ def tube_manifold(tube: Tube, level: float, tolerance: float) -> Manifold:
         points = waiting.pop()
         swept = _Sweep(radius, around, points).surface()
         if swept is not None and (len(points) == 2 or _is_apart(swept)):
-            parts.append(manifold_of(swept))
+            parts.append(to_manifold(swept))
             vertices += len(swept.vertices)
         else:
             middle = len(points) // 2
@@ -79,7 +79,7 @@ def tube_manifold(tube: Tube, level: float, tolerance: float) -> Manifold:
     return Manifold.batch_boolean(parts, OpType.Add)
 
 
-def _is_apart(surface: Surface) -> bool:
+def _is_apart(surface: TriangleMesh) -> bool:
     """Whether no faces pass through each other."""
     return not len(intersecting_faces(surface.vertices, surface.faces))
 
@@ -96,7 +96,7 @@ def _simpler(points: FloatArray, length: float) -> FloatArray:
         side, away = points[last] - points[first], points[first + 1 : last] - points[first]
         square = float(side @ side)
         share = (away @ side / square if square > 0 else np.zeros(len(away))).clip(0, 1)
-        off = lengths(away - share[:, None] * side)
+        off = row_norms(away - share[:, None] * side)
         if not len(off) or (square > 0 and off.max() <= length):
             continue
         middle = first + 1 + int(off.argmax())
@@ -113,12 +113,12 @@ class _Sweep:
     around: int
     points: FloatArray
 
-    def surface(self) -> Surface | None:
+    def surface(self) -> TriangleMesh | None:
         """Rings of points one after the other; None where a line along an edge would end before it
         begins."""
         points, sides = self.points, np.diff(self.points, axis=0)
         ways = sides / np.abs(sides).max(axis=1)[:, None]  # squares of small ones underflow
-        ways /= lengths(ways)[:, None]
+        ways /= row_norms(ways)[:, None]
         is_closed = len(ways) > 2 and bool((points[0] == points[-1]).all())
         swung = self._transported(ways, is_closed=is_closed)
         if swung is None:
@@ -174,7 +174,7 @@ class _Sweep:
         rings = np.cos(angle) * self._directions(frame) + sign * np.sin(angle) * way
         return point + self.radius * (rings if sign > 0 else rings[::-1])
 
-    def _joined(self, rings: FloatArray, shift: int | None) -> Surface:
+    def _joined(self, rings: FloatArray, shift: int | None) -> TriangleMesh:
         """Faces between neighbors of rings (k, around, 3), those of points that are the same left
         out. shift: by which the numbers around grow from the last to the first; None for poles
         there."""
@@ -193,7 +193,7 @@ class _Sweep:
         corners = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
         faces: IntArray = place.ravel()[corners]
         is_triangle = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
-        return Surface.of(rings.reshape(-1, 3), faces[is_triangle])
+        return TriangleMesh.without_unused_vertices(rings.reshape(-1, 3), faces[is_triangle])
 
     def _transported(
         self, ways: FloatArray, *, is_closed: bool

@@ -17,18 +17,23 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import FloatArray
-from harnack.backend.validation import finite
-from harnack.cluster.executor import Arrays, crew
+from harnack.backend.validation import as_finite
+from harnack.cluster.executor import TaskResult, open_executor
 from harnack.files.file_geometry import check_writable, write_atomically
 from harnack.geometry import Box
 from harnack.progress import progress_bar
 from harnack.rendering.camera import Camera
-from harnack.rendering.framing import UnboundedSurfaceError, upright, visible_points
-from harnack.rendering.mitsuba import mitsuba_backend, take_variant
+from harnack.rendering.framing import UnboundedSurfaceError, rotation_to_z_up, visible_points
+from harnack.rendering.mitsuba import mitsuba_backend, set_variant
 from harnack.rendering.mitsuba_plugins import register
 from harnack.rendering.picture import render
-from harnack.rendering.render_options import OF_PICTURES, check_camera, check_integer, check_size
-from harnack.rendering.studio_surfaces import surfaces_of
+from harnack.rendering.render_options import (
+    APPEARANCE_OPTIONS,
+    check_camera,
+    check_image_size,
+    check_integer,
+)
+from harnack.rendering.studio_surfaces import drawn_surfaces
 
 FILM_FILES = (".gif", ".mp4")
 _SIZE = (320, 240)
@@ -39,7 +44,7 @@ Pixels = npt.NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
-class Film:
+class Animation:
     """A film that was written. path: of its file. size: (width, height) of its pictures."""
 
     path: Path
@@ -71,7 +76,7 @@ def animate(
     client: Any = None,
     checkpoint: str | os.PathLike[str] | None = None,
     **settings: Any,
-) -> Film:
+) -> Animation:
     """Draw a film and write it to `path`; notebooks show what is returned.
 
         hk.animate(field, "turntable.gif", turn=360)
@@ -97,7 +102,7 @@ def animate(
     count = check_integer("frames", frames)
     if not 1 <= count <= _MOST_FRAMES:
         raise ValueError(f"frames must be from 1 to {_MOST_FRAMES:,}, not {count}")
-    fps, turn = finite(fps, "fps"), finite(turn, "turn")
+    fps, turn = as_finite(fps, "fps"), as_finite(turn, "turn")
     if not 0 < fps <= 240:
         raise ValueError(f"fps must be more than 0 and at most 240, not {fps}")
     for name, value in (("size", size), ("show", show)):
@@ -106,22 +111,27 @@ def animate(
                 f"{name} is the same for all pictures of a film, and no function of s: give it as "
                 "render takes it"
             )
-    size = check_size(size)
+    size = check_image_size(size)
     with write_atomically(target) as partial, _encoder(partial, size, fps) as add:
         repeats = turn != 0 and turn % 360 == 0
         steps = np.arange(count) / max(count if repeats else count - 1, 1)
         given = {"what": what, "camera": camera, **settings}
-        moments = [{name: _at(value, s) for name, value in given.items()} for s in steps.tolist()]
+        moments = [
+            {name: _value_at(value, s) for name, value in given.items()} for s in steps.tolist()
+        ]
         cameras = _cameras(moments, steps, turn, size)
         frames_of = [
             {**moment, "camera": one} for moment, one in zip(moments, cameras, strict=True)
         ]
         job, parts = _job(frames_of, {"size": size, "show": show, "progress": False})
-        with progress_bar("film", progress) as advance, crew(client, checkpoint) as workers:
-            for found in workers.each(job, "frame", parts):
+        with (
+            progress_bar("film", progress) as advance,
+            open_executor(client, checkpoint) as workers,
+        ):
+            for found in workers.run_tasks(job, "frame", parts):
                 add(found["shown"])
                 advance(1 / count)
-    return Film(target, size)
+    return Animation(target, size)
 
 
 @dataclass(frozen=True)
@@ -131,11 +141,11 @@ class _FilmJob:
     arguments: dict[str, Any]
     variant: str
 
-    def frame(self, others: dict[str, Any]) -> Arrays:
+    def frame(self, others: dict[str, Any]) -> TaskResult:
         """The pixels of one picture. others: its other arguments."""
-        take_variant(self.variant)
+        set_variant(self.variant)
         given = {**self.arguments, **others}
-        return {"shown": render(given.pop("what"), **given).shown}
+        return {"shown": render(given.pop("what"), **given).srgb}
 
 
 def _job(
@@ -164,7 +174,7 @@ def check_film_path(path: str | os.PathLike[str]) -> Path:
     return target
 
 
-def _at(value: Any, s: float) -> Any:
+def _value_at(value: Any, s: float) -> Any:
     """A setting at the time s: functions of s are called, all else is constant."""
     return value(s) if callable(value) and not isinstance(value, type) else value
 
@@ -177,15 +187,15 @@ def _cameras(
     asked = [moment.get("camera") for moment in moments]
     cameras = [Camera() if one is None else check_camera(one) for one in asked]
     ups = [moment.get("up") for moment in moments]
-    stand = [upright("z" if up is None else up) for up in ups]
+    stand = [rotation_to_z_up("z" if up is None else up) for up in ups]
     boxes = [np.array(one.box.bounds()) for one in cameras if one.box is not None]
     points = np.concatenate(boxes or [_points(moments, steps)])
     ends = np.array([points.min(axis=0), points.max(axis=0)])
     if boxes:
         points = np.array(np.meshgrid(*ends.T)).reshape(3, -1).T
-    box, middle = Box(*map(_three, ends)), _three(ends.mean(axis=0))
+    box, middle = Box(*map(_as_point, ends)), _as_point(ends.mean(axis=0))
     framed = [
-        _turned(replace(one, box=box, target=one.target or middle), turn * s, way)
+        _orbited(replace(one, box=box, target=one.target or middle), turn * s, way)
         for one, s, way in zip(cameras, steps.tolist(), stand, strict=True)
     ]
     free = [one.position is None and one.distance is None for one in framed]
@@ -199,21 +209,21 @@ def _cameras(
         (p.fov for p, is_free in zip(poses, free, strict=True) if not is_free), default=1.0
     )
     return [
-        replace(one, distance=farthest / one.zoom, fov=one.angle, zoom=1.0) if is_free
+        replace(one, distance=farthest / one.zoom, fov=one.fov_or_default, zoom=1.0) if is_free
         else replace(one, fov=widest if one.fov is None else one.fov)
         for one, is_free in zip(framed, free, strict=True)
     ]  # fmt: skip
 
 
-def _turned(camera: Camera, turn: float, stand: FloatArray) -> Camera:
+def _orbited(camera: Camera, turn: float, stand: FloatArray) -> Camera:
     """The camera after it has gone around its target. stand: (3, 3), rotates up to z."""
     if camera.position is None:
-        return replace(camera, azimuth=camera.angles[0] + turn)
+        return replace(camera, azimuth=camera.azimuth_elevation[0] + turn)
     c, s = math.cos(math.radians(turn)), math.sin(math.radians(turn))
     around = stand.T @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ stand
     target = np.array(camera.target)
     place = target + around @ (np.array(camera.position) - target)
-    return replace(camera, position=_three(place))
+    return replace(camera, position=_as_point(place))
 
 
 def _points(moments: list[dict[str, Any]], steps: FloatArray) -> FloatArray:
@@ -222,18 +232,18 @@ def _points(moments: list[dict[str, Any]], steps: FloatArray) -> FloatArray:
     seen: list[FloatArray] = []
     last: Any = None
     for moment, s in zip(moments, steps.tolist(), strict=True):
-        rest = {name: value for name, value in moment.items() if name not in OF_PICTURES}
+        rest = {name: value for name, value in moment.items() if name not in APPEARANCE_OPTIONS}
         if last is not None and all(rest[name] is last[name] for name in rest):
             continue  # the same surfaces
         last = rest
         try:
-            seen += [visible_points(one, backend) for one in surfaces_of(**rest)]
+            seen += [visible_points(one, backend) for one in drawn_surfaces(**rest)]
         except UnboundedSurfaceError as error:
             raise ValueError(f"at s = {s:g} of the film, {error}") from None
     return np.concatenate(seen)
 
 
-def _three(point: FloatArray) -> tuple[float, float, float]:
+def _as_point(point: FloatArray) -> tuple[float, float, float]:
     x, y, z = (float(c) for c in point)
     return x, y, z
 

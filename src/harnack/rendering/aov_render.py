@@ -16,50 +16,50 @@ import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
-from harnack.backend import FloatArray, IntArray, aligned, to_numpy
+from harnack.backend import FloatArray, IntArray, to_numpy, upload_floats
 from harnack.fields import Field
-from harnack.rendering.hybrid_scene import World
-from harnack.rendering.images import as_bytes, linear_of, transferred
-from harnack.rendering.integrator import LOST_COLOR
-from harnack.rendering.isolines import defined_in
+from harnack.rendering.hybrid_scene import HybridScene
+from harnack.rendering.images import linear_to_srgb, srgb_to_linear, to_uint8
+from harnack.rendering.integrator import OUT_OF_STEPS_COLOR
+from harnack.rendering.isolines import padded_domain
 from harnack.rendering.mitsuba import mitsuba_backend
 from harnack.rendering.placed_surface import Placement
-from harnack.rendering.scales import Color, Scale, grays, viridis, with_bar
+from harnack.rendering.scales import Color, ColorScale, add_color_bar, gray_colormap, viridis
 from harnack.rendering.shading import (
-    Hands,
-    OwnHands,
-    edges_of,
-    film_places,
-    grid_offsets,
-    in_tiles,
-    uploaded,
+    LocalRenderExecutor,
+    RenderExecutor,
+    edge_pixels,
+    film_positions,
+    multijitter_offsets,
+    tiled_pixel_order,
+    upload_indices,
 )
-from harnack.tracer import Status
+from harnack.tracer import RayStatus
 
 # Ctrl-C works between bands.
 _RAYS_A_BAND = 2**20
 _BACKGROUND = (0.10, 0.10, 0.11)
-GROUND_OF_VIEWS = {"dark": _BACKGROUND, "light": (0.90, 0.90, 0.89)}
+AOV_BACKGROUNDS = {"dark": _BACKGROUND, "light": (0.90, 0.90, 0.89)}
 """One color for each of the studio's backdrops, to be behind views."""
 _UNKNOWN = (0.45, 0.45, 0.45)
 _IDENTITY = Placement.identity()
 _STATUS_COLORS = {
-    Status.HIT: (0.93, 0.93, 0.90),
-    Status.OUT_OF_STEPS: LOST_COLOR,
+    RayStatus.HIT: (0.93, 0.93, 0.90),
+    RayStatus.OUT_OF_STEPS: OUT_OF_STEPS_COLOR,
 }
 
 
 @dataclass(frozen=True)
-class View:
+class AovBuffers:
     """First hits of the rays through the middles of all pixels.
 
     depth: (h, w) distance from the camera in the unit of the viewer's placement, inf without a hit.
         Where the ray ran out of steps, how far it is proved free.
     normal: (h, w, 3) unit, zero without a hit; of a level set it points to larger values.
     evaluations: (h, w) of all the scene's fields.
-    status: (h, w) a `Status`; shapes of Mitsuba count as hits.
-    line: (h, w, 3) color in sRGB of the isoline that is hit; NaN where none is.
-    lined: (h, w) whether the edge of an isoline may pass through the pixel.
+    status: (h, w) a `RayStatus`; shapes of Mitsuba count as hits.
+    isoline_color: (h, w, 3) color in sRGB of the isoline that is hit; NaN where none is.
+    is_near_isoline: (h, w) whether the edge of an isoline may pass through the pixel.
     value: (h, w) of a function at hits, NaN elsewhere; None without a function.
     period: of that function, if it is angle-valued.
     background: sRGB in [0, 1], of pictures without a hit.
@@ -69,15 +69,15 @@ class View:
     normal: FloatArray
     evaluations: npt.NDArray[np.int64]
     status: npt.NDArray[np.int64]
-    line: FloatArray
-    lined: npt.NDArray[np.bool_]
+    isoline_color: FloatArray
+    is_near_isoline: npt.NDArray[np.bool_]
     value: FloatArray | None = None
     period: float | None = None
     background: Color = _BACKGROUND
 
 
 @dataclass(frozen=True)
-class Viewer:
+class AovTask:
     """A sensor in a world.
 
     placement: of the surfaces, in whose coordinates depths are given.
@@ -85,7 +85,7 @@ class Viewer:
     """
 
     mi: Any
-    world: World
+    world: HybridScene
     sensor: Any
     placement: Placement
     function: Field | None
@@ -100,9 +100,9 @@ class Viewer:
         placement: Placement = _IDENTITY,
         function: Field | None = None,
         background: Color = _BACKGROUND,
-    ) -> Viewer:
+    ) -> AovTask:
         """Of a loaded scene."""
-        return cls(mi, World.of(mi, scene), sensor, placement, function, background)
+        return cls(mi, HybridScene.of(mi, scene), sensor, placement, function, background)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -112,26 +112,26 @@ class Viewer:
 
     @functools.cached_property
     def order(self) -> IntArray:
-        """All pixels, as `in_tiles` visits them."""
-        return in_tiles(self.size)
+        """All pixels, as `tiled_pixel_order` visits them."""
+        return tiled_pixel_order(self.size)
 
-    def view(self, start: int, stop: int) -> View:
+    def render_range(self, start: int, stop: int) -> AovBuffers:
         """The first hits of the rays through the middles of some pixels, (n,); `order` counts."""
-        return self._look_at(uploaded(self.mi, self.order[start:stop]), self.mi.Vector2f(0.5))
+        return self._look_at(upload_indices(self.mi, self.order[start:stop]), self.mi.Vector2f(0.5))
 
     def look(
-        self, hands: Hands | None = None, advance: Callable[[float], None] | None = None
-    ) -> View:
+        self, hands: RenderExecutor | None = None, advance: Callable[[float], None] | None = None
+    ) -> AovBuffers:
         """The first hits of the rays through the middles of all pixels.
 
         hands: call methods of a viewer like this one, in the place of this one's. advance: told
         what part has been finished since the last call.
         """
-        hands = OwnHands(self) if hands is None else hands
+        hands = LocalRenderExecutor(self) if hands is None else hands
         width, height = self.size
         order = self.order
-        cut, parts = hands.cut(width * height, _RAYS_A_BAND), list[View]()
-        for (start, stop), part in zip(cut, hands.each("view", cut), strict=True):
+        cut, parts = hands.split_range(width * height, _RAYS_A_BAND), list[AovBuffers]()
+        for (start, stop), part in zip(cut, hands.run_tasks("render_range", cut), strict=True):
             parts.append(part)
             if advance is not None:
                 advance((stop - start) / (width * height))
@@ -141,25 +141,25 @@ class Viewer:
             image.reshape(height * width, *column[0].shape[1:])[order] = np.concatenate(column)
             return image
 
-        return _each(by_rows, *parts)
+        return _map_arrays(by_rows, *parts)
 
-    def look_again(self, pixels: IntArray, offsets: FloatArray) -> View:
+    def render_samples(self, pixels: IntArray, offsets: FloatArray) -> AovBuffers:
         """The first hits of rays through places (m, 2) in each of n pixels, counted by rows: arrays
         (n, m)."""
         mi, count = self.mi, len(offsets)
-        pixel = uploaded(mi, np.repeat(pixels, count))
+        pixel = upload_indices(mi, np.repeat(pixels, count))
         table = np.tile(offsets, (len(pixels), 1)).T
-        places = mi.Vector2f(*(aligned(mitsuba_backend(mi), one) for one in table))
+        places = mi.Vector2f(*(upload_floats(mitsuba_backend(mi), one) for one in table))
 
         def by_pixels(one: Any) -> Any:
             return one.reshape(len(pixels), count, *one.shape[1:])
 
-        return _each(by_pixels, self._look_at(pixel, places))
+        return _map_arrays(by_pixels, self._look_at(pixel, places))
 
-    def _look_at(self, pixel: Any, offset: Any) -> View:
+    def _look_at(self, pixel: Any, offset: Any) -> AovBuffers:
         """The first hits of rays through places in pixels, counted by rows: arrays (n,)."""
         mi, count = self.mi, dr.width(pixel)
-        place = film_places(mi, pixel, offset, self.size)
+        place = film_positions(mi, pixel, offset, self.size)
         ray, _ = self.sensor.sample_ray_differential(
             self.sensor.shutter_open(), 0.5, place, mi.Point2f(0.5)
         )
@@ -167,7 +167,7 @@ class Viewer:
         si, first = self.world.intersect(mi.Ray3f(ray), none, mi.Bool(True))
         lined, line = mi.Bool(False), mi.Vector3f(dr.nan)
         if self.function is not None:
-            lined = first.met & self.world.has_line_near(si, ray, ray.d, first.t)
+            lined = first.is_hit & self.world.has_line_near(si, ray, ray.d, first.t)
             line = self._line_color(si, first)
         dr.eval(first, lined, line)
 
@@ -175,38 +175,40 @@ class Viewer:
             flat = to_numpy(values)
             return np.broadcast_to(flat, (count, *flat.shape[1:]))
 
-        met, lost = numbers(first.met), numbers(first.lost)
-        status = np.where(met, int(Status.HIT), int(Status.MISS))
-        view = View(
+        met, lost = numbers(first.is_hit), numbers(first.is_out_of_steps)
+        status = np.where(met, int(RayStatus.HIT), int(RayStatus.MISS))
+        view = AovBuffers(
             depth=numbers(first.t) / self.placement.scale,
             normal=np.where(met[:, None], numbers(first.normal), 0),
             evaluations=numbers(first.evaluations).astype(np.int64),
-            status=np.where(lost, int(Status.OUT_OF_STEPS), status),
-            line=numbers(line),
-            lined=numbers(lined),
+            status=np.where(lost, int(RayStatus.OUT_OF_STEPS), status),
+            isoline_color=numbers(line),
+            is_near_isoline=numbers(lined),
             background=self.background,
         )
         if self.function is None:
             return view
         value = np.full(count, np.nan, dtype=np.float32)
         if met.any():
-            value[met] = _values(self.function, self.placement.undo(numbers(first.position)[met]))
+            value[met] = _values(
+                self.function, self.placement.apply_inverse(numbers(first.position)[met])
+            )
         return replace(view, value=value, period=self.function.period)
 
     def _line_color(self, si: Any, first: Any) -> Any:
         """sRGB of the line that is met; NaN where none is."""
         mi = self.mi
         found = mi.Vector3f(dr.nan)
-        for carrier in self.world.carriers:
-            own = first.met & (si.shape == mi.ShapePtr(carrier))
-            if carrier.cut_face is not None:
-                own |= first.met & (si.shape == mi.ShapePtr(carrier.cut_face))
+        for carrier in self.world.proxies:
+            own = first.is_hit & (si.shape == mi.ShapePtr(carrier))
+            if carrier.section_proxy is not None:
+                own |= first.is_hit & (si.shape == mi.ShapePtr(carrier.section_proxy))
             for number, color in enumerate(carrier.line_colors, start=1):
-                found = dr.select(own & (first.line == number), mi.Vector3f(*color), found)
+                found = dr.select(own & (first.isoline_index == number), mi.Vector3f(*color), found)
         return found
 
 
-def _each(change: Callable[..., Any], *views: View) -> View:
+def _map_arrays(change: Callable[..., Any], *views: AovBuffers) -> AovBuffers:
     """A view whose arrays are made of those of the same name in others."""
     arrays = {
         name: change(*(getattr(view, name) for view in views))
@@ -219,168 +221,168 @@ def _each(change: Callable[..., Any], *views: View) -> View:
 def _values(function: Field, points: FloatArray) -> FloatArray:
     """Values at points (n, 3), NaN where the function is not defined."""
     values: FloatArray = function.value(points)
-    volume = defined_in(function, float(np.ptp(points, axis=0).max()))
+    volume = padded_domain(function, float(np.ptp(points, axis=0).max()))
     return values if volume is None else np.where(volume.contains_points(points), values, np.nan)
 
 
-def normal_picture(view: View) -> npt.NDArray[np.uint8]:
+def normal_picture(view: AovBuffers) -> npt.NDArray[np.uint8]:
     """x, y, z from [-1, 1] as red, green, blue."""
     return _of_surfaces(view, 0.5 + 0.5 * view.normal)
 
 
-def status_picture(view: View) -> npt.NDArray[np.uint8]:
+def status_picture(view: AovBuffers) -> npt.NDArray[np.uint8]:
     """Misses dark, hits white, out of steps magenta."""
     picture = np.zeros((*view.status.shape, 3))
-    for status, color in {Status.MISS: view.background, **_STATUS_COLORS}.items():
+    for status, color in {RayStatus.MISS: view.background, **_STATUS_COLORS}.items():
         picture[view.status == int(status)] = color
-    return as_bytes(picture)
+    return to_uint8(picture)
 
 
-def depth_picture(view: View, scale: Scale) -> npt.NDArray[np.uint8]:
+def depth_picture(view: AovBuffers, scale: ColorScale) -> npt.NDArray[np.uint8]:
     """Depths of what is met as the colors of a scale."""
     return _of_surfaces(view, scale.colors(view.depth))
 
 
-def value_picture(view: View, scale: Scale) -> npt.NDArray[np.uint8]:
+def value_picture(view: AovBuffers, scale: ColorScale) -> npt.NDArray[np.uint8]:
     """Values on what is met as the colors of a scale, gray where there is none; isolines on it."""
     value = value_of(view)
     picture = np.where(np.isnan(value)[..., None], _UNKNOWN, scale.colors(value))
-    return _of_surfaces(view, np.where(np.isnan(view.line), picture, view.line))
+    return _of_surfaces(view, np.where(np.isnan(view.isoline_color), picture, view.isoline_color))
 
 
-def evaluations_picture(view: View, scale: Scale) -> npt.NDArray[np.uint8]:
+def evaluations_picture(view: AovBuffers, scale: ColorScale) -> npt.NDArray[np.uint8]:
     """Evaluations as the colors of a scale, of rays that miss as well."""
     return _with_lost(view, scale.colors(view.evaluations.astype(np.float64)))
 
 
-def depth_scale(view: View) -> Scale:
+def depth_scale(view: AovBuffers) -> ColorScale:
     """Near is bright, far is dark."""
-    return Scale(*_range(view, view.depth), "depth", grays)
+    return ColorScale(*_range(view, view.depth), "depth", gray_colormap)
 
 
-def evaluations_scale(view: View) -> Scale:
+def evaluations_scale(view: AovBuffers) -> ColorScale:
     """Zero is dark blue; the 99.5th percentile, and all above it, is yellow."""
     top = max(float(np.percentile(view.evaluations, 99.5)), 1.0)
-    return Scale(0.0, top, "evaluations")
+    return ColorScale(0.0, top, "evaluations")
 
 
-def value_scale(view: View) -> Scale:
+def value_scale(view: AovBuffers) -> ColorScale:
     """From the least value that is seen, dark blue, to the greatest, yellow; angles as hues."""
     if view.period is not None:
-        return Scale.cyclic(view.period, "value")
-    return Scale(*_range(view, value_of(view)), "value")
+        return ColorScale.cyclic(view.period, "value")
+    return ColorScale(*_range(view, value_of(view)), "value")
 
 
-def value_of(view: View) -> FloatArray:
+def value_of(view: AovBuffers) -> FloatArray:
     """Values of the function that was asked for."""
     if view.value is None:
         raise ValueError("values of no function were looked at")
     return view.value
 
 
-def _range(view: View, numbers: FloatArray) -> tuple[float, float]:
+def _range(view: AovBuffers, numbers: FloatArray) -> tuple[float, float]:
     """The least and the greatest finite number of what is met; (0, 1) where there is none."""
-    found = numbers[(view.status == int(Status.HIT)) & np.isfinite(numbers)]
+    found = numbers[(view.status == int(RayStatus.HIT)) & np.isfinite(numbers)]
     return (float(found.min()), float(found.max())) if found.size else (0.0, 1.0)
 
 
-def _of_surfaces(view: View, picture: FloatArray) -> npt.NDArray[np.uint8]:
+def _of_surfaces(view: AovBuffers, picture: FloatArray) -> npt.NDArray[np.uint8]:
     """Colors where something is hit, over the background."""
-    met = (view.status == int(Status.HIT))[..., None]
+    met = (view.status == int(RayStatus.HIT))[..., None]
     return _with_lost(view, np.where(met, picture, view.background))
 
 
-def _with_lost(view: View, picture: FloatArray) -> npt.NDArray[np.uint8]:
-    lost = (view.status == int(Status.OUT_OF_STEPS))[..., None]
-    return as_bytes(np.where(lost, LOST_COLOR, picture))
+def _with_lost(view: AovBuffers, picture: FloatArray) -> npt.NDArray[np.uint8]:
+    lost = (view.status == int(RayStatus.OUT_OF_STEPS))[..., None]
+    return to_uint8(np.where(lost, OUT_OF_STEPS_COLOR, picture))
 
 
 @dataclass(frozen=True)
-class Show:
+class AovMode:
     """What to take from a view as numbers, and how to draw it.
 
     scale: of numbers that have one, which `picture` draws them by; None for others.
     is_averaged: whether the picture, not the numbers, averages several rays where it has edges.
     """
 
-    numbers: Callable[[View], Any]
-    picture: Callable[[View, Any], npt.NDArray[np.uint8]]
-    scale: Callable[[View], Scale] | None = None
+    numbers: Callable[[AovBuffers], Any]
+    picture: Callable[[AovBuffers, Any], npt.NDArray[np.uint8]]
+    scale: Callable[[AovBuffers], ColorScale] | None = None
     is_averaged: bool = False
 
 
-VIEWS = {
-    "normal": Show(lambda view: view.normal, lambda view, _: normal_picture(view)),
-    "evaluations": Show(lambda view: view.evaluations, evaluations_picture, evaluations_scale),
-    "status": Show(lambda view: view.status, lambda view, _: status_picture(view)),
-    "depth": Show(
+AOV_MODES = {
+    "normal": AovMode(lambda view: view.normal, lambda view, _: normal_picture(view)),
+    "evaluations": AovMode(lambda view: view.evaluations, evaluations_picture, evaluations_scale),
+    "status": AovMode(lambda view: view.status, lambda view, _: status_picture(view)),
+    "depth": AovMode(
         lambda view: view.depth,
         depth_picture,
         depth_scale,
     ),
-    "value": Show(
+    "value": AovMode(
         value_of,
         value_picture,
         value_scale,
         is_averaged=True,
     ),
 }
-SCALED = tuple(name for name, show in VIEWS.items() if show.scale is not None)
+MODES_WITH_SCALE = tuple(name for name, show in AOV_MODES.items() if show.scale is not None)
 """Pictures of numbers that have a scale."""
 
 
-def drawn(
+def aov_picture(
     show: str,
-    viewer: Viewer,
-    view: View,
+    viewer: AovTask,
+    view: AovBuffers,
     value_range: tuple[float, float] | None,
     bar: str | bool,
     spp: int,
-    hands: Hands | None = None,
+    hands: RenderExecutor | None = None,
 ) -> npt.NDArray[np.uint8]:
     """The pixels of what a viewer has seen.
 
     value_range: of the scale, in place of what is seen. bar: whether to put a color bar beside
     it, or what to write over that. spp: rays of a pixel on an edge, of pictures that are averaged.
-    hands: as for `Viewer.look`.
+    hands: as for `AovTask.look`.
     """
-    one = VIEWS[show]
+    one = AOV_MODES[show]
     scale = None if one.scale is None else one.scale(view)
     if scale is None:
         return one.picture(view, None)
     if value_range is not None:
         map_of = viridis if scale.period is not None else scale.colors_of
-        scale = Scale(*value_range, scale.name, map_of)
+        scale = ColorScale(*value_range, scale.name, map_of)
     if isinstance(bar, str):
         scale = replace(scale, name=bar)
     picture = one.picture(view, scale)
     if one.is_averaged and spp > 1:
-        _average(viewer, view, picture, lambda part: one.picture(part, scale), spp, hands)
+        _antialias(viewer, view, picture, lambda part: one.picture(part, scale), spp, hands)
     if not bar:
         return picture
     numbers = np.asarray(one.numbers(view), dtype=np.float64)
     if show != "evaluations":  # which rays that miss have, too
-        numbers = numbers[view.status == int(Status.HIT)]
-    scale = scale.passed_by(numbers[np.isfinite(numbers)])
-    return with_bar(picture, scale, view.background)
+        numbers = numbers[view.status == int(RayStatus.HIT)]
+    scale = scale.with_exceeded(numbers[np.isfinite(numbers)])
+    return add_color_bar(picture, scale, view.background)
 
 
-def _average(
-    viewer: Viewer,
-    view: View,
+def _antialias(
+    viewer: AovTask,
+    view: AovBuffers,
     picture: npt.NDArray[np.uint8],
-    colors: Callable[[View], npt.NDArray[np.uint8]],
+    colors: Callable[[AovBuffers], npt.NDArray[np.uint8]],
     spp: int,
-    hands: Hands | None,
+    hands: RenderExecutor | None,
 ) -> None:
     """Make pixels that differ visibly from a neighbor, or that the edge of an isoline may pass
     through, the mean light of a grid of rays."""
-    order = in_tiles(viewer.size)
-    again = order[(edges_of(picture) | view.lined).ravel()[order]]
-    offsets = grid_offsets(spp)
-    hands = OwnHands(viewer) if hands is None else hands
-    cut = hands.cut(len(again), max(1, _RAYS_A_BAND // len(offsets)))
+    order = tiled_pixel_order(viewer.size)
+    again = order[(edge_pixels(picture) | view.is_near_isoline).ravel()[order]]
+    offsets = multijitter_offsets(spp)
+    hands = LocalRenderExecutor(viewer) if hands is None else hands
+    cut = hands.split_range(len(again), max(1, _RAYS_A_BAND // len(offsets)))
     parts = [(again[start:stop], offsets) for start, stop in cut]
-    for (chosen, _), seen in zip(parts, hands.each("look_again", parts), strict=True):
-        light = linear_of(colors(seen) / 255)
-        picture.reshape(-1, 3)[chosen] = as_bytes(transferred(light.mean(axis=1)))
+    for (chosen, _), seen in zip(parts, hands.run_tasks("render_samples", parts), strict=True):
+        light = srgb_to_linear(colors(seen) / 255)
+        picture.reshape(-1, 3)[chosen] = to_uint8(linear_to_srgb(light.mean(axis=1)))

@@ -2,6 +2,9 @@
 
 Ground and lights are placed around the camera's view of the stage. A color or an image takes the
 place of the studio's wall behind the surfaces.
+
+The camera does not see the environment of the studio but a backdrop: alpha comes with it, and no
+horizon.
 """
 
 from __future__ import annotations
@@ -17,10 +20,10 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import FloatArray
-from harnack.files.file_geometry import Place, read_bytes
+from harnack.files.file_geometry import FileLocation, read_bytes
 from harnack.name_suggestions import did_you_mean
 from harnack.rendering.mitsuba import load_mitsuba
-from harnack.rendering.scales import NAMED_COLORS, Color, color_of
+from harnack.rendering.scales import NAMED_COLORS, Color, parse_color
 
 # Radiances of the environment, linear sRGB: at the horizon, overhead, and of a soft strip of
 # light behind the stage that draws edges and gives metal something to reflect.
@@ -29,7 +32,7 @@ _ZENITH = np.array([0.36, 0.40, 0.46])
 _STRIP = np.array([0.70, 0.66, 0.60])
 _KEY = (4.7, 4.5, 4.25)
 # The height of the floor, just below what stands on it.
-FLOOR = -0.002
+FLOOR_HEIGHT = -0.002
 # Reflectance of the ground, by the backdrop's name. With other backdrops there is no ground, and
 # the surfaces alone are laid over them.
 GROUNDS = {"light": (0.74, 0.73, 0.715), "dark": (0.055, 0.058, 0.065)}
@@ -42,7 +45,7 @@ def reflectance_of(backdrop: str) -> FloatArray:
     return np.array(GROUNDS[backdrop])
 
 
-def far_ground(backdrop: str, azimuth: float) -> FloatArray:
+def distant_ground_radiance(backdrop: str, azimuth: float) -> FloatArray:
     """Radiance (3,) of the ground far from the stage, which the environment alone lights."""
     image = environment(azimuth)
     z = np.cos(math.pi * (np.arange(len(image)) + 0.5) / len(image))
@@ -53,7 +56,7 @@ def far_ground(backdrop: str, azimuth: float) -> FloatArray:
 
 def ground(mi: Any, backdrop: str) -> dict[str, Any]:
     """A wide floor."""
-    floor = mi.ScalarTransform4f().translate([0, 0, FLOOR]).scale(100)
+    floor = mi.ScalarTransform4f().translate([0, 0, FLOOR_HEIGHT]).scale(100)
     color = {"type": "rgb", "value": list(GROUNDS[backdrop])}
     return {
         "ground": {
@@ -122,14 +125,14 @@ IMAGE_FILES = (".png", ".jpg", ".jpeg", ".exr")
 
 
 @dataclass(frozen=True)
-class Ground:
+class GroundBackdrop:
     """The studio's floor, which turns into a wall far away. name: in GROUNDS."""
 
     name: str
 
 
 @dataclass(frozen=True)
-class Gradient:
+class GradientBackdrop:
     """From a color at the bottom of a picture to one at its top, both in sRGB."""
 
     bottom: Color
@@ -137,17 +140,17 @@ class Gradient:
 
 
 @dataclass(frozen=True, eq=False)
-class Photo:
+class ImageBackdrop:
     """An image, pixels (h, w, 3) of linear sRGB, first row at the top, that fills a picture."""
 
     pixels: FloatImage
 
 
-Backdrop = Ground | Gradient | Photo | None
+Backdrop = GroundBackdrop | GradientBackdrop | ImageBackdrop | None
 """None for a transparent picture."""
 
 
-def checked_backdrop(given: Any) -> Backdrop:
+def parse_backdrop(given: Any) -> Backdrop:
     """What is to be behind the surfaces.
 
     Raises:
@@ -155,21 +158,21 @@ def checked_backdrop(given: Any) -> Backdrop:
         FileFormatError: an image file that cannot be read.
     """
     if isinstance(given, os.PathLike):
-        return Photo(_read(Path(cast("os.PathLike[str]", given))))
+        return ImageBackdrop(_read(Path(cast("os.PathLike[str]", given))))
     if isinstance(given, np.ndarray) and given.ndim != 1:
-        return Photo(_pixels(cast("npt.NDArray[Any]", given)))
+        return ImageBackdrop(_pixels(cast("npt.NDArray[Any]", given)))
     if isinstance(given, str):
         return _named(given)
     if isinstance(given, list | tuple) and len(pair := cast("list[Any]", given)) == 2:
-        return Gradient(*(color_of(one, "a color of the backdrop") for one in pair))
+        return GradientBackdrop(*(parse_color(one, "a color of the backdrop") for one in pair))
     try:
-        color = color_of(given, "backdrop")
+        color = parse_color(given, "backdrop")
     except TypeError:
-        raise TypeError(f"backdrop must be one of {_KNOWN}, not {given!r}") from None
-    return Gradient(color, color)
+        raise TypeError(f"backdrop must be one of {_BACKDROP_HELP}, not {given!r}") from None
+    return GradientBackdrop(color, color)
 
 
-_KNOWN = (
+_BACKDROP_HELP = (
     f"{', '.join(BACKDROPS)}, a color, (bottom, top) with two colors, an image (h, w, 3) or its "
     f"file ({', '.join(IMAGE_FILES)})"
 )
@@ -177,19 +180,19 @@ _KNOWN = (
 
 def _named(given: str) -> Backdrop:
     if given in GROUNDS:
-        return Ground(given)
+        return GroundBackdrop(given)
     if given == TRANSPARENT:
         return None
     if Path(given).suffix.lower() in IMAGE_FILES:
-        return Photo(_read(Path(given)))
+        return ImageBackdrop(_read(Path(given)))
     try:
-        color = color_of(given, "backdrop")
+        color = parse_color(given, "backdrop")
     except ValueError:
         known = (*BACKDROPS, *NAMED_COLORS)
         raise ValueError(
-            f"backdrop must be one of {_KNOWN}, not {given!r}{did_you_mean(given, known)}"
+            f"backdrop must be one of {_BACKDROP_HELP}, not {given!r}{did_you_mean(given, known)}"
         ) from None
-    return Gradient(color, color)
+    return GradientBackdrop(color, color)
 
 
 def _pixels(image: npt.NDArray[Any]) -> FloatImage:
@@ -212,17 +215,17 @@ def _pixels(image: npt.NDArray[Any]) -> FloatImage:
 def _read(path: Path) -> FloatImage:
     """The image in a file, over white where it is transparent."""
     if path.suffix.lower() not in IMAGE_FILES:
-        raise Place(path).error(f"a backdrop is an image: {', '.join(IMAGE_FILES)}")
+        raise FileLocation(path).error(f"a backdrop is an image: {', '.join(IMAGE_FILES)}")
     data = read_bytes(path)
     try:
-        return _of_exr(data) if path.suffix.lower() == ".exr" else _of_bytes(data)
+        return _read_exr(data) if path.suffix.lower() == ".exr" else _read_bitmap(data)
     except (RuntimeError, ValueError, KeyError, OSError) as error:
-        raise Place(path).error(
+        raise FileLocation(path).error(
             f"this is no image that can be read as {path.suffix.lower()}"
         ) from error
 
 
-def _of_bytes(data: bytes) -> FloatImage:
+def _read_bitmap(data: bytes) -> FloatImage:
     mi = load_mitsuba()
     stream = mi.MemoryStream()
     stream.write(data)
@@ -241,7 +244,7 @@ def _decoded(bitmap: Any) -> FloatImage:
     return np.ascontiguousarray(pixels)
 
 
-def _of_exr(data: bytes) -> FloatImage:
+def _read_exr(data: bytes) -> FloatImage:
     """Read by OpenEXR: Mitsuba never returns where Dr.Jit has one thread."""
     import OpenEXR  # here, since most pictures do without
 

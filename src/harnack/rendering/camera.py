@@ -11,15 +11,15 @@ import numpy as np
 
 from harnack.backend import FloatArray
 from harnack.geometry import Box
-from harnack.geometry.volume import checked_point
+from harnack.geometry.volume import as_point
 
 # The part of the picture that the surface fills at zoom 1.
-_FILLED = 0.86
+_FILL_FRACTION = 0.86
 
 
 # Angles of view in degrees: of a camera that chooses its distance, of one with points to be framed
 # beside or behind it, and the widest that is chosen to frame everything from a given position.
-_USUAL, _AMONG, _WIDEST = 26.0, 60.0, 120.0
+_DEFAULT_FOV, _FOV_INSIDE, _WIDEST = 26.0, 60.0, 120.0
 _AZIMUTH, _ELEVATION = -50.0, 28.0
 
 Point = tuple[float, float, float]
@@ -77,7 +77,7 @@ class Camera:
             raise ValueError(f"box must be larger than a point, and this one is not: {self.box}")
         for name in ("position", "target"):
             if getattr(self, name) is not None:
-                object.__setattr__(self, name, checked_point(getattr(self, name), name))
+                object.__setattr__(self, name, as_point(getattr(self, name), name))
         if self.distance is not None and not 0 < self.distance < math.inf:
             raise ValueError(f"distance must be positive, not {self.distance}")
         for name in ("azimuth", "elevation", "distance"):
@@ -87,27 +87,29 @@ class Camera:
             raise ValueError(f"position and target are the same point, {self.position}")
 
     @property
-    def angles(self) -> tuple[float, float]:
+    def azimuth_elevation(self) -> tuple[float, float]:
         """Azimuth and elevation, in degrees, of a camera without a position."""
         return (
             _AZIMUTH if self.azimuth is None else self.azimuth,
             _ELEVATION if self.elevation is None else self.elevation,
         )
 
-    def frame(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def axes(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Unit vectors of the world: to the right, up, and back to the camera."""
-        a, e = map(math.radians, self.angles)
+        a, e = map(math.radians, self.azimuth_elevation)
         back = np.array([math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)])
         right = np.array([-math.sin(a), math.cos(a), 0.0])
         return right, np.cross(back, right), back
 
-    def fit(self, points: FloatArray, size: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
+    def frame_points(
+        self, points: FloatArray, size: tuple[int, int]
+    ) -> tuple[FloatArray, FloatArray]:
         """Origin and target such that all points (n, 3) are in the picture of (width, height).
 
         Along each image axis the picture's edges are planes through the origin; the points'
         supports in the directions of these planes' normals give origin and distance.
         """
-        right, up, back = self.frame()
+        right, up, back = self.axes()
         x, y, z = points @ right, points @ up, points @ back
         origin = np.zeros(3)
         distance = -math.inf
@@ -125,14 +127,16 @@ class Camera:
         points: FloatArray,
         size: tuple[int, int],
         to_world: Callable[[FloatArray], FloatArray],
-    ) -> Pose:
+    ) -> CameraPose:
         """Where the camera is in the world, to see points (n, 3) of the world.
 
         to_world: from the coordinates of the surfaces, a map of one scale for all axes.
         """
         if self.position is None and self.target is None and self.distance is None:
-            origin, target = self.fit(points, size)
-            return Pose(origin, target, self.frame()[1], self.angle, self.angles[0])
+            origin, target = self.frame_points(points, size)
+            return CameraPose(
+                origin, target, self.axes()[1], self.fov_or_default, self.azimuth_elevation[0]
+            )
         middle = (points.min(axis=0) + points.max(axis=0)) / 2
         target = middle if self.target is None else to_world(np.array([self.target]))[0]
         if self.position is not None:
@@ -152,38 +156,38 @@ class Camera:
             if self.distance is not None:
                 unit = np.diff(to_world(np.array([[0.0, 0, 0], [1, 0, 0]])), axis=0)
                 length = self.distance * float(np.linalg.norm(unit))
-        right, up, back = turned.frame()
+        right, up, back = turned.axes()
         seen = points - target
         x, y, z = np.abs(seen @ right), np.abs(seen @ up), seen @ back
-        fov = self.angle
+        fov = self.fov_or_default
         if length is None:  # |across| <= slope (length - z) for all points
             slopes = self._slopes(size)
             length = max(float((a / s + z).max()) for a, s in zip((x, y), slopes, strict=True))
             length = max(length / self.zoom, 1e-3)
         elif self.fov is None:
-            fov = self._framing(np.array([x, y]), length - z, size)
+            fov = self._fov_to_frame(np.array([x, y]), length - z, size)
         else:
             fov = 2 * math.degrees(math.atan(math.tan(math.radians(fov) / 2) / self.zoom))
-        return Pose(target + length * back, target, up, fov, turned.angles[0])
+        return CameraPose(target + length * back, target, up, fov, turned.azimuth_elevation[0])
 
-    def _framing(self, across: FloatArray, depth: FloatArray, size: tuple[int, int]) -> float:
+    def _fov_to_frame(self, across: FloatArray, depth: FloatArray, size: tuple[int, int]) -> float:
         """The angle of view, in degrees, that frames points as far as `across` (2, n) from the
         middle, to the right and upwards, and `depth` (n,) in front of the camera."""
         if depth.min() <= 0:
-            return _AMONG
+            return _FOV_INSIDE
         shape = max(size) / np.array(size)
         wide = (across / depth).max(axis=1) * shape
-        fov = 2 * math.degrees(math.atan(max(float(wide.max()), 1e-4) / _FILLED / self.zoom))
+        fov = 2 * math.degrees(math.atan(max(float(wide.max()), 1e-4) / _FILL_FRACTION / self.zoom))
         return min(fov, _WIDEST)
 
     @property
-    def angle(self) -> float:
+    def fov_or_default(self) -> float:
         """The angle of view of a camera that chooses its distance, in degrees."""
-        return _USUAL if self.fov is None else self.fov
+        return _DEFAULT_FOV if self.fov is None else self.fov
 
     def _slopes(self, size: tuple[int, int]) -> tuple[float, float]:
         """Slopes of the edges of the part of the picture to fill, to the right and upwards."""
-        slope = math.tan(math.radians(self.angle) / 2) * _FILLED / max(size)
+        slope = math.tan(math.radians(self.fov_or_default) / 2) * _FILL_FRACTION / max(size)
         return slope * size[0], slope * size[1]
 
 
@@ -196,7 +200,7 @@ def _is_number(value: Any) -> bool:
 
 
 @dataclass(frozen=True)
-class Pose:
+class CameraPose:
     """A camera in the world.
 
     origin, target, up: (3,). fov: degrees. azimuth: of the direction it looks from, in degrees.

@@ -17,14 +17,14 @@ import numpy as np
 from harnack.backend import FloatArray, to_float, to_numpy, to_vector3
 from harnack.fields import Solid
 from harnack.fields.batched_fields import FieldCache
-from harnack.geometry.volume import checked_point
+from harnack.geometry.volume import as_point
 from harnack.name_suggestions import did_you_mean
 from harnack.rendering.placed_surface import PlacedSurface, Placement
-from harnack.tracer import Tolerance
+from harnack.tracer import HitTolerance
 
 if TYPE_CHECKING:
     from harnack.backend import Backend
-    from harnack.tracer import LevelSet
+    from harnack.tracer import Surface
 
 # Rotations that turn the named axis to z. From y, the front of a glTF model (z) turns to -y,
 # which is where the studio's camera stands.
@@ -36,7 +36,7 @@ _UPRIGHT: dict[str, FloatArray] = {
 UP_AXES: tuple[str, ...] = (*_UPRIGHT, *("-" + axis for axis in _UPRIGHT))
 
 
-def upright(up: Any) -> FloatArray:
+def rotation_to_z_up(up: Any) -> FloatArray:
     """The rotation (3, 3) that turns an axis ("x", "-y", ...) or a vector to z.
 
     Raises:
@@ -51,7 +51,7 @@ def upright(up: Any) -> FloatArray:
         axis = up.removeprefix("-")
         over = np.diag([1.0, -1.0, -1.0]) if up.startswith("-") else np.eye(3)
         return over @ _UPRIGHT[axis]
-    way = np.array(checked_point(up, "up"))
+    way = np.array(as_point(up, "up"))
     if not way.any():
         raise ValueError("up must be a vector that is not zero")
     way, z = way / float(np.abs(way).max()), np.array([0.0, 0.0, 1.0])
@@ -59,7 +59,7 @@ def upright(up: Any) -> FloatArray:
     # Turned the shortest way, about the axis at right angles to both.
     across = np.cross(way, z)
     if float(np.linalg.norm(across)) < 1e-12:
-        return upright("z" if way[2] > 0 else "-z")
+        return rotation_to_z_up("z" if way[2] > 0 else "-z")
     u = across / np.linalg.norm(across)
     before, after = np.stack([u, np.cross(way, u), way]), np.stack([u, np.cross(z, u), z])
     return after.T @ before
@@ -77,14 +77,14 @@ class UnboundedSurfaceError(ValueError):
             f"{reason}: give it a clip, such as clip=harnack.Ball((0, 0, 0), 1){other}"
         )
         self.reason = reason
-        self.usual = usual
+        self.bounded_level = usual
 
 
 class NothingVisibleError(ValueError):
     """A surface of which no ray hits anything: there is nothing to frame."""
 
 
-def box_of(surface: LevelSet) -> FloatArray:
+def bounding_box(surface: Surface) -> FloatArray:
     """Lower and upper corner (2, 3) of a box that holds the surface.
 
     Raises:
@@ -97,9 +97,9 @@ def box_of(surface: LevelSet) -> FloatArray:
     return ends
 
 
-def _unbounded(surface: LevelSet) -> UnboundedSurfaceError:
+def _unbounded(surface: Surface) -> UnboundedSurfaceError:
     field = surface.field
-    levels = surface.numbers
+    levels = surface.level_values
     shown = ", ".join(f"{level:g}" for level in levels)
     reason = f"the surface of level {shown} reaches to infinity, as far as is known"
     if field.period is not None and any(
@@ -117,7 +117,7 @@ def _unbounded(surface: LevelSet) -> UnboundedSurfaceError:
 
 
 # Rays along a side of the grid on each of the six faces: of the box, then of the box of the hits.
-_GRID, _CLOSER = 48, 32
+_GRID, _FINE_GRID = 48, 32
 # Rays of one tile are followed together.
 _TILE = 8
 # Squares of lengths, divided by tolerances, stay far from the ends of single precision.
@@ -125,10 +125,10 @@ _SMALLEST, _LARGEST = 1e-15, 1e16
 # The distance of surfaces from the origin, in lengths of them, beyond which pixels at edges are
 # off, and that beyond which a third of all pixels may be (measured: boxes, curves, meshes, clouds).
 _BLURRED, _NOTHING_LEFT = 5e3, 1e5
-_POINTS: FieldCache[FloatArray] = FieldCache()
+_VISIBLE_POINTS_CACHE: FieldCache[FloatArray] = FieldCache()
 
 
-def visible_points(surface: LevelSet, backend: Backend) -> FloatArray:
+def visible_points(surface: Surface, backend: Backend) -> FloatArray:
     """Points (n, 3) of the surface, as seen from the six sides of the box it lies in.
 
     They are cached for a field that is uploaded once, as long as the settings are the same: when
@@ -138,20 +138,26 @@ def visible_points(surface: LevelSet, backend: Backend) -> FloatArray:
         ValueError: it has no bounds, or a size that single precision cannot draw; a
             NothingVisibleError where no ray hits it.
     """
-    ends = box_of(surface)
-    check_size(ends)
-    prepared = surface.field_on(backend)
+    ends = bounding_box(surface)
+    check_drawable_size(ends)
+    prepared = surface.evaluator(backend)
 
     def found() -> FloatArray:
-        return _found(surface, backend, ends)
+        return _find_visible_points(surface, backend, ends)
 
     if prepared is surface.field:  # it may have changed in place
         return found()
-    settings = (surface.numbers, surface.cut, surface.solid, surface.largest, surface.max_steps)
-    return _POINTS.get(prepared, (*settings, surface.bound, surface.overstep), found)
+    settings = (
+        surface.level_values,
+        surface.clip_volume,
+        surface.solid,
+        surface.largest,
+        surface.max_steps,
+    )
+    return _VISIBLE_POINTS_CACHE.get(prepared, (*settings, surface.bound, surface.overstep), found)
 
 
-def check_size(ends: FloatArray) -> None:
+def check_drawable_size(ends: FloatArray) -> None:
     """Raise ValueError for a box (2, 3) that single precision cannot draw."""
     if 0.0 < (ends[1] - ends[0]).max() < _SMALLEST or np.abs(ends).max() > _LARGEST:
         raise ValueError(
@@ -177,7 +183,7 @@ def check_offset(points: FloatArray) -> None:
     warnings.warn(said.format("its edges are blurred"), stacklevel=4)
 
 
-def _found(surface: LevelSet, backend: Backend, ends: FloatArray) -> FloatArray:
+def _find_visible_points(surface: Surface, backend: Backend, ends: FloatArray) -> FloatArray:
     """Points found on a coarse grid, and on one around them."""
     lower, upper = ends
     points = _probe(surface, backend, lower, upper, _GRID)
@@ -196,7 +202,7 @@ def _found(surface: LevelSet, backend: Backend, ends: FloatArray) -> FloatArray:
     margin = 0.6 * float((ends[1] - ends[0]).max()) / _GRID
     lower = np.maximum(points.min(axis=0) - margin, ends[0])
     upper = np.minimum(points.max(axis=0) + margin, ends[1])
-    closer = _probe(surface, backend, lower, upper, _CLOSER)
+    closer = _probe(surface, backend, lower, upper, _FINE_GRID)
     return np.concatenate([points, closer])
 
 
@@ -205,22 +211,22 @@ def _point(corner: FloatArray) -> str:
 
 
 def _probe(
-    surface: LevelSet, backend: Backend, lower: FloatArray, upper: FloatArray, grid: int
+    surface: Surface, backend: Backend, lower: FloatArray, upper: FloatArray, grid: int
 ) -> FloatArray:
     """First hits of parallel rays, grid x grid from each of the six sides of a box."""
     size = float(np.linalg.norm(upper - lower))
     # A twentieth of the distance between rays; smaller tolerances are slow for sums over trees.
-    coarse = replace(surface, tolerance=Tolerance(1e-3 * size))
+    coarse = replace(surface, tolerance=HitTolerance(1e-3 * size))
     placed = PlacedSurface.of(coarse, Placement.identity(), backend)
     o, d, length = _rays(lower, upper, 0.01 * size, grid)
-    met = placed.meet(
+    met = placed.intersect(
         to_vector3(backend, o),
         to_vector3(backend, d),
         to_float(backend, length),
         backend.Bool(True),
     )
-    dr.eval(met.position, met.met)  # separately, each would trace the rays again
-    points: FloatArray = to_numpy(met.position)[to_numpy(met.met)]
+    dr.eval(met.position, met.is_hit)  # separately, each would trace the rays again
+    points: FloatArray = to_numpy(met.position)[to_numpy(met.is_hit)]
     return points.astype(np.float64)
 
 

@@ -1,4 +1,8 @@
-"""Mitsuba scenes with level sets in them: rays through both, and hits as surface interactions."""
+"""Mitsuba scenes with level sets in them: rays through both, and hits as surface interactions.
+
+Mitsuba's integrators cannot see our surfaces: those that ask for light that our path tracer finds
+are followed, scenes without our surfaces are left to them, all else is refused by name.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +13,7 @@ import drjit as dr
 
 from harnack.backend import Mask
 from harnack.rendering.mitsuba import mitsuba_backend
-from harnack.rendering.mitsuba_proxy import is_carrier
+from harnack.rendering.mitsuba_proxy import is_proxy
 from harnack.rendering.placed_surface import PlacedSurface
 from harnack.rendering.surface_hits import SurfaceHit
 
@@ -18,29 +22,29 @@ if TYPE_CHECKING:
 
 
 def surface_interaction(mi: Any, met: SurfaceHit, ray: Any, shape: Any) -> Any:
-    """The SurfaceInteraction3f of a ray with one of our surfaces, valid where `met.met`.
+    """The SurfaceInteraction3f of a ray with one of our surfaces, valid where `met.is_hit`.
 
     shape: ShapePtr of the carrier, whose BSDF is asked. Texture coordinates are x and y of the
     position in the world: a level set has no parametrization of its own. The index of the primitive
     is the number of the isoline that is drawn there, by which a BSDF chooses
-    (`carrier.with_lines`).
+    (`mitsuba_proxy.isoline_bsdf`).
     """
     si = dr.zeros(mi.SurfaceInteraction3f)
-    si.t = dr.select(met.met, met.t, dr.inf)
+    si.t = dr.select(met.is_hit, met.t, dr.inf)
     si.p = mi.Point3f(met.position)
     si.n = mi.Normal3f(met.normal)
     si.sh_frame = mi.Frame3f(mi.Vector3f(met.normal))
     si.dp_du, si.dp_dv = si.sh_frame.s, si.sh_frame.t
     si.uv = mi.Point2f(si.p.x, si.p.y)
-    si.prim_index = met.line
+    si.prim_index = met.isoline_index
     si.time = ray.time
     si.wavelengths = ray.wavelengths
-    si.shape = dr.select(met.met, shape, dr.zeros(mi.ShapePtr))
+    si.shape = dr.select(met.is_hit, shape, dr.zeros(mi.ShapePtr))
     si.wi = si.to_local(-ray.d)
     return si
 
 
-def leaving_from(mi: Any, si: Any, clearance: Real, d: Vec3) -> Any:
+def offset_origin(mi: Any, si: Any, clearance: Real, d: Vec3) -> Any:
     """Where a ray in direction d starts so as not to meet the surface of `si` again.
 
     Off the surface along its normal on the side that the ray leaves to, as far as Mitsuba's own
@@ -51,39 +55,39 @@ def leaving_from(mi: Any, si: Any, clearance: Real, d: Vec3) -> Any:
     return dr.fma(dr.mulsign(distance, dr.dot(si.n, d)), mi.Vector3f(si.n), si.p)
 
 
-def leaving_ray(mi: Any, si: Any, clearance: Real, d: Vec3) -> Any:
+def spawn_ray(mi: Any, si: Any, clearance: Real, d: Vec3) -> Any:
     """The ray from `si` in direction d."""
     return mi.Ray3f(
-        leaving_from(mi, si, clearance, d), d, dr.largest(mi.Float), si.time, si.wavelengths
+        offset_origin(mi, si, clearance, d), d, dr.largest(mi.Float), si.time, si.wavelengths
     )
 
 
-def connecting_ray(mi: Any, si: Any, clearance: Real, target: Vec3) -> Any:
+def spawn_ray_to(mi: Any, si: Any, clearance: Real, target: Vec3) -> Any:
     """The ray from `si` to a target point, ending just before it."""
-    o = leaving_from(mi, si, clearance, target - si.p)
+    o = offset_origin(mi, si, clearance, target - si.p)
     way = target - o
     length = dr.norm(way)
     return mi.Ray3f(o, way / length, length * (1 - mi.math.ShadowEpsilon), si.time, si.wavelengths)
 
 
 @dataclass(frozen=True)
-class World:
+class HybridScene:
     """What rays are traced in: all of a scene's shapes, ours and Mitsuba's."""
 
     mi: Any
     scene: Any
-    carriers: tuple[Any, ...]
+    proxies: tuple[Any, ...]
 
     queued: bool = False
 
     @classmethod
-    def of(cls, mi: Any, scene: Any, *, queued: bool = False) -> World:
+    def of(cls, mi: Any, scene: Any, *, queued: bool = False) -> HybridScene:
         """Finds the carriers in a scene.
 
         queued: whether rays are traced without delay, from a queue, which is faster where they
             differ in length, and cannot be done while a kernel is being recorded.
         """
-        return cls(mi, scene, tuple(s for s in scene.shapes() if is_carrier(s)), queued)
+        return cls(mi, scene, tuple(s for s in scene.shapes() if is_proxy(s)), queued)
 
     def _placed(self, carrier: Any) -> PlacedSurface:
         return carrier.placed.queued() if self.queued else carrier.placed
@@ -102,34 +106,36 @@ class World:
         mi = self.mi
         preliminary = self.scene.ray_intersect_preliminary(ray, active=active)
         if hidden is not None:
-            preliminary = self._behind_lights(ray, preliminary, active & hidden)
+            preliminary = self._skip_emitters(ray, preliminary, active & hidden)
         limit = dr.minimum(preliminary.t, ray.maxt)
         if self.queued:
             dr.eval(preliminary, limit)
-        ours, whose = self.nothing(dr.zeros(mi.SurfaceInteraction3f)), dr.zeros(mi.ShapePtr)
-        for carrier in self.carriers:
+        ours, whose = self.no_hit(dr.zeros(mi.SurfaceInteraction3f)), dr.zeros(mi.ShapePtr)
+        for carrier in self.proxies:
             shape = mi.ShapePtr(carrier)
             side = dr.sign(dr.dot(start.n, ray.d))
             own = start.shape == shape
-            if carrier.cut_face is not None:
-                own |= start.shape == mi.ShapePtr(carrier.cut_face)
+            if carrier.section_proxy is not None:
+                own |= start.shape == mi.ShapePtr(carrier.section_proxy)
             leaves = dr.select(start.is_valid() & own, side, 0)
-            met = self._placed(carrier).meet(ray.o, ray.d, limit, active, leaves)
+            met = self._placed(carrier).intersect(ray.o, ray.d, limit, active, leaves)
             evaluations = ours.evaluations + met.evaluations
-            event = met.met | met.lost
+            event = met.is_hit | met.is_out_of_steps
             ours = replace(dr.select(event, met, ours), evaluations=evaluations)
             whose = dr.select(event, shape, whose)
-            if carrier.cut_face is not None:
-                whose = dr.select(event & met.cut, mi.ShapePtr(carrier.cut_face), whose)
+            if carrier.section_proxy is not None:
+                whose = dr.select(
+                    event & met.is_on_section, mi.ShapePtr(carrier.section_proxy), whose
+                )
             limit = dr.select(event, met.t, limit)
-        event: Mask = ours.met | ours.lost
+        event: Mask = ours.is_hit | ours.is_out_of_steps
         others = active & ~event
         si = preliminary.compute_surface_interaction(ray, mi.RayFlags.All, others)
         first = replace(self._of_scene(si, active), evaluations=ours.evaluations)
         si = dr.select(event, surface_interaction(mi, ours, ray, whose), si)
         return si, dr.select(event, ours, first)
 
-    def _behind_lights(self, ray: Any, first: Any, active: Mask) -> Any:
+    def _skip_emitters(self, ray: Any, first: Any, active: Mask) -> Any:
         """What rays hit of the scene behind the shapes that shine."""
         mi = self.mi
 
@@ -153,7 +159,7 @@ class World:
         found, _ = loop((first, shines(first, active)), running, on, label="behind lights")
         return found
 
-    def nothing(self, si: Any) -> SurfaceHit:
+    def no_hit(self, si: Any) -> SurfaceHit:
         """The `SurfaceHit` of rays that hit nothing, given as many invalid interactions."""
         return self._of_scene(si, self.mi.Bool(False))
 
@@ -161,16 +167,16 @@ class World:
         mi, vector = self.mi, mitsuba_backend(self.mi).Array3f
         return SurfaceHit(
             t=si.t,
-            met=active & si.is_valid(),
-            lost=mi.Bool(False),
+            is_hit=active & si.is_valid(),
+            is_out_of_steps=mi.Bool(False),
             position=vector(si.p),
             normal=vector(si.n),
-            clearance=mi.Float(0),
+            ray_offset=mi.Float(0),
             value=mi.Float(0),
             evaluations=mi.UInt32(0),
-            mended=mi.Bool(False),
-            cut=mi.Bool(False),
-            line=mi.UInt32(0),
+            is_hole_filling=mi.Bool(False),
+            is_on_section=mi.Bool(False),
+            isoline_index=mi.UInt32(0),
         )
 
     def has_line_near(self, si: Any, ray: Any, d: Any, t: Any) -> Mask:
@@ -188,8 +194,8 @@ class World:
             return way - d * (dr.dot(way, normal) / facing)
 
         across, down = to_neighbor(ray.o_x, ray.d_x), to_neighbor(ray.o_y, ray.d_y)
-        for carrier in self.carriers:
-            if carrier.placed.lines:
+        for carrier in self.proxies:
+            if carrier.placed.isolines:
                 found = carrier.placed.has_line_near(si.p, normal, across, down)
                 near |= (si.shape == mi.ShapePtr(carrier)) & found
         return near
@@ -197,6 +203,6 @@ class World:
     def occluded(self, ray: Any, active: Mask) -> Mask:
         """Whether rays hit anything; those not proved to hit nothing count as hitting."""
         blocked = self.scene.ray_test(ray, active)
-        for carrier in self.carriers:
+        for carrier in self.proxies:
             blocked |= self._placed(carrier).occludes(ray.o, ray.d, ray.maxt, active & ~blocked)
         return blocked

@@ -18,7 +18,7 @@ from harnack.rendering.mitsuba import load_mitsuba
 FloatImage = npt.NDArray[np.float32]
 
 # Radiances up to here are shown as they are; brighter ones approach white smoothly.
-SHOULDER = 0.8
+SHOULDER_START = 0.8
 _ROWS_AT_ONCE = 64
 
 
@@ -41,7 +41,7 @@ def check_picture_path(path: Any) -> Path:
     return path
 
 
-def tone_mapped(image: FloatImage, behind: FloatImage | None = None) -> npt.NDArray[np.uint8]:
+def tone_map(image: FloatImage, behind: FloatImage | None = None) -> npt.NDArray[np.uint8]:
     """Linear sRGB radiance as 8-bit sRGB: a smooth shoulder, then the transfer function.
 
     The last channel of an image (h, w, 4) is alpha, by which the others are multiplied. It stays,
@@ -60,31 +60,31 @@ def tone_mapped(image: FloatImage, behind: FloatImage | None = None) -> npt.NDAr
 
 def _tone_mapped(image: FloatArray, behind: FloatImage | None) -> npt.NDArray[np.uint8]:
     if image.ndim < 3 or image.shape[-1] < 4:
-        return as_bytes(transferred(_shouldered(image)))
+        return to_uint8(linear_to_srgb(_apply_shoulder(image)))
     alpha = np.clip(image[..., 3:], 0.0, 1.0)
-    light = _shouldered(image[..., :3] / np.where(alpha > 0, alpha, 1.0))
+    light = _apply_shoulder(image[..., :3] / np.where(alpha > 0, alpha, 1.0))
     if behind is not None:
-        return as_bytes(transferred(alpha * light + (1.0 - alpha) * behind))
-    return as_bytes(np.concatenate([transferred(light), alpha], axis=-1))
+        return to_uint8(linear_to_srgb(alpha * light + (1.0 - alpha) * behind))
+    return to_uint8(np.concatenate([linear_to_srgb(light), alpha], axis=-1))
 
 
-def _shouldered(radiance: FloatArray) -> FloatArray:
+def _apply_shoulder(radiance: FloatArray) -> FloatArray:
     x = np.clip(np.nan_to_num(radiance, nan=0.0, posinf=1e6), 0.0, None)
-    room = 1.0 - SHOULDER
-    return np.where(x <= SHOULDER, x, 1.0 - room * np.exp(-(x - SHOULDER) / room))
+    room = 1.0 - SHOULDER_START
+    return np.where(x <= SHOULDER_START, x, 1.0 - room * np.exp(-(x - SHOULDER_START) / room))
 
 
-def transferred(x: FloatArray) -> FloatArray:
+def linear_to_srgb(x: FloatArray) -> FloatArray:
     """Linear sRGB in [0, 1] as sRGB."""
     return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
 
 
-def linear_of(x: FloatArray) -> FloatArray:
-    """sRGB in [0, 1] as linear sRGB: the inverse of `transferred`."""
+def srgb_to_linear(x: FloatArray) -> FloatArray:
+    """sRGB in [0, 1] as linear sRGB: the inverse of `linear_to_srgb`."""
     return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
 
 
-def as_bytes(image: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.uint8]:
+def to_uint8(image: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.uint8]:
     """Numbers in [0, 1] as bytes."""
     return (np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
 
@@ -137,21 +137,21 @@ class Picture(np.ndarray[Any, np.dtype[Any]]):
     Arrays that are computed from it are ordinary ones and have no image.
     """
 
-    _shown: npt.NDArray[np.uint8] | None = None
+    _srgb: npt.NDArray[np.uint8] | None = None
 
     @classmethod
     def of(cls, numbers: npt.NDArray[Any], shown: npt.NDArray[np.uint8]) -> Picture:
         """Numbers, and the pixels (h, w), (h, w, 3) or (h, w, 4) that they are shown as."""
         picture = numbers.view(cls)
-        picture._shown = shown
+        picture._srgb = shown
         return picture
 
     def __array_finalize__(self, array: Any) -> None:
         if isinstance(array, Picture) and array.shape == self.shape:  # a copy
-            self._shown = array._shown
+            self._srgb = array._srgb
 
     def __reduce__(self) -> Any:
-        return _restored, (np.asarray(self), self._shown)
+        return _restored, (np.asarray(self), self._srgb)
 
     def __deepcopy__(self, memo: Any) -> Picture:
         return self.copy()
@@ -163,17 +163,17 @@ class Picture(np.ndarray[Any, np.dtype[Any]]):
         return np.asarray(self)[key]
 
     @property
-    def shown(self) -> npt.NDArray[np.uint8]:
+    def srgb(self) -> npt.NDArray[np.uint8]:
         """The pixels that are shown: sRGB in bytes, (h, w, 3), or (h, w, 4) with alpha.
 
         Raises:
             AttributeError: this array was computed from that of a picture.
         """
-        if self._shown is None:
+        if self._srgb is None:
             raise AttributeError(
-                "this array was computed from a picture: only what `render` returned has `.shown`"
+                "this array was computed from a picture: only what `render` returned has `.srgb`"
             )
-        return self._shown
+        return self._srgb
 
     def to_pil(self) -> Any:
         """As an image of Pillow's.
@@ -185,13 +185,13 @@ class Picture(np.ndarray[Any, np.dtype[Any]]):
             from PIL import Image
         except ModuleNotFoundError:
             raise ModuleNotFoundError(
-                "to_pil needs Pillow: pip install pillow, or take the bytes in `.shown`"
+                "to_pil needs Pillow: pip install pillow, or take the bytes in `.srgb`"
             ) from None
-        return Image.fromarray(self.shown)
+        return Image.fromarray(self.srgb)
 
     def _repr_png_(self) -> bytes | None:
         """For notebooks."""
-        return None if self._shown is None else png_bytes(load_mitsuba(), self._shown)
+        return None if self._srgb is None else png_bytes(load_mitsuba(), self._srgb)
 
 
 def _restored(numbers: npt.NDArray[Any], shown: npt.NDArray[np.uint8] | None) -> Picture:

@@ -1,4 +1,15 @@
-"""A path tracer that sees Mitsuba's shapes and ours, and the sampler of its light paths."""
+"""A path tracer that sees Mitsuba's shapes and ours, and the sampler of its light paths.
+
+Light paths go in waves, rays by a queue. A recorded loop over whole paths waits for the slowest ray
+of each packet, at each vertex: three quarters of the lanes were idle. Paths that have ended are
+left out between vertices, and a lane that has followed a ray fetches the next. Any walk can be
+queued (`surface_tracer`), as its state is a record; `trace` does so with many rays whose neighbors
+differ, and nobody with fields whose samples take less time than fetching a ray (`Field.is_cheap`).
+Nothing differs but the order of lanes. What is evaluated lies in memory of its own, so that kernels
+do not depend on how many paths are left.
+
+Samples are computed from their index, since paths change lanes.
+"""
 
 from __future__ import annotations
 
@@ -9,8 +20,8 @@ from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 
-from harnack.backend.loops import gathered, leaves_of, rows_of, wide
-from harnack.rendering.hybrid_scene import World, connecting_ray, leaving_ray
+from harnack.backend.loops import active_lanes, array_leaves, broadcast_copy, gather_record
+from harnack.rendering.hybrid_scene import HybridScene, spawn_ray, spawn_ray_to
 from harnack.rendering.mitsuba import load_mitsuba, transmittance
 
 if TYPE_CHECKING:
@@ -94,7 +105,7 @@ def _owen(uint: Any, x: Any, seed: Any) -> Any:
 PLUGIN = "harnack_path"
 INTEGRATOR = "HarnackPath"
 # What a ray that ran out of steps is drawn in: nothing in nature is this color.
-LOST_COLOR = (1.0, 0.0, 1.0)
+OUT_OF_STEPS_COLOR = (1.0, 0.0, 1.0)
 
 _UNLIMITED = 2**32 - 1
 
@@ -129,15 +140,15 @@ class _Vertex:
 
 
 @dataclass(frozen=True)
-class _Paths:
+class _PathState:
     """The state of paths.
 
     number: of the path among all.
     previous, pdf, delta: the last vertex and how it sampled the ray, for the weights of lights that
         the ray finds.
     eta: product of relative refractive indices; keeps Russian roulette from ending paths in glass.
-    spread, spread_before: whether a rough surface has scattered the path up to the last vertex, and
-        up to the one before that.
+    is_diffused, was_diffused: whether a rough surface has scattered the path up to the last vertex,
+        and up to the one before that.
     """
 
     number: Any
@@ -147,12 +158,12 @@ class _Paths:
     previous: _Vertex
     pdf: Real
     delta: Mask
-    spread: Mask
-    spread_before: Mask
+    is_diffused: Mask
+    was_diffused: Mask
 
 
 @dataclass(frozen=True)
-class _Connection:
+class _LightConnection:
     """Light that a vertex scatters along the path, if nothing lies on the ray to its emitter."""
 
     ray: Any
@@ -161,14 +172,14 @@ class _Connection:
 
 
 @dataclass
-class Features:
+class DenoisingFeatures:
     """Features of what paths hit first, for denoising: albedo, in (0, 1), and unit normal. Both are
     0 where paths hit nothing."""
 
     albedo: Any
     normal: Any
 
-    def note(self, mi: Any, si: Any, numbers: Any, active: Mask) -> None:
+    def record(self, mi: Any, si: Any, numbers: Any, active: Mask) -> None:
         """Stores those of interactions, at the numbers of their paths."""
         bsdf, straight = si.bsdf(), mi.SurfaceInteraction3f(si)
         straight.wi = mi.Vector3f(0, 0, dr.mulsign(mi.Float(1), si.wi.z))
@@ -181,14 +192,14 @@ class Features:
 
 
 @dataclass
-class Radiance:
+class PathResults:
     """What paths have found: radiance, whether they hit a surface, whether a ray ran out of steps;
     and features of what they hit first, if asked for."""
 
     light: Any
     valid: Mask
     lost: Mask
-    features: Features | None = None
+    features: DenoisingFeatures | None = None
 
 
 class PathTracer:
@@ -223,7 +234,9 @@ class PathTracer:
         self._deepest = dr.opaque(mi.UInt32, self.max_depth)
         self._first_roulette = dr.opaque(mi.UInt32, rr_depth)
         self._brightest = dr.opaque(mi.Float, clamp)
-        self.lost_color = mi.load_dict({"type": "srgb", "color": list(LOST_COLOR)}, parallel=False)
+        self.lost_color = mi.load_dict(
+            {"type": "srgb", "color": list(OUT_OF_STEPS_COLOR)}, parallel=False
+        )
 
     def with_depth(self, max_depth: int) -> PathTracer:
         """The same path tracer with another maximum depth."""
@@ -231,21 +244,23 @@ class PathTracer:
 
     def trace(
         self, scene: Any, sampler: SobolSampler, ray: Any, active: Mask, features: bool = False
-    ) -> Radiance:
+    ) -> PathResults:
         """What paths find that begin with camera rays, one for each of the sampler's lanes.
 
         Paths go on vertex by vertex, all together, and those that have ended are left out: what
         each part of a vertex needs is evaluated for the paths that need it (`backend.loops`).
         """
-        mi, world = self.mi, World.of(self.mi, scene, queued=True)
+        mi, world = self.mi, HybridScene.of(self.mi, scene, queued=True)
         width = dr.width(sampler.index)
-        found = Radiance(
+        found = PathResults(
             dr.zeros(mi.Spectrum, width), dr.zeros(mi.Bool, width), dr.zeros(mi.Bool, width)
         )
         if features:
-            found.features = Features(dr.zeros(mi.Spectrum, width), dr.zeros(mi.Vector3f, width))
+            found.features = DenoisingFeatures(
+                dr.zeros(mi.Spectrum, width), dr.zeros(mi.Vector3f, width)
+            )
             dr.make_opaque(found.features.albedo, found.features.normal)
-        paths = _Paths(
+        paths = _PathState(
             number=dr.arange(mi.UInt32, width),
             ray=mi.Ray3f(dr.detach(ray)),
             throughput=mi.Spectrum(1),
@@ -253,27 +268,27 @@ class PathTracer:
             previous=_Vertex.none(mi),
             pdf=mi.Float(1),
             delta=mi.Bool(True),
-            spread=mi.Bool(False),
-            spread_before=mi.Bool(False),
+            is_diffused=mi.Bool(False),
+            was_diffused=mi.Bool(False),
         )
-        paths = wide(paths, width, mi.UInt32)
+        paths = broadcast_copy(paths, width, mi.UInt32)
         dr.make_opaque(found.light, found.valid, found.lost)
         going_on, depth = mi.Bool(active) & dr.full(mi.Bool, True, width), 0
         while True:
-            rows, count = rows_of(going_on)
+            rows, count = active_lanes(going_on)
             if not count:
                 return found
-            paths = gathered(paths, rows)
+            paths = gather_record(paths, rows)
             active = dr.arange(mi.UInt32, len(rows)) < dr.opaque(mi.UInt32, count)
             # No number is a literal, so that all vertices run the same kernels.
-            dr.make_opaque(active, *leaves_of(paths))
+            dr.make_opaque(active, *array_leaves(paths))
             paths, going_on = self._vertex(world, paths, active, sampler, depth, found)
             depth += 1
 
     def _vertex(
-        self, world: World, paths: _Paths, exist: Mask, sampler: SobolSampler, depth: int,
-        found: Radiance,
-    ) -> tuple[_Paths, Mask]:  # fmt: skip
+        self, world: HybridScene, paths: _PathState, exist: Mask, sampler: SobolSampler, depth: int,
+        found: PathResults,
+    ) -> tuple[_PathState, Mask]:  # fmt: skip
         """Finds the next vertex of paths, collects its light, and samples where to go on. Returns
         the paths after it, and which of them go on."""
         mi, here = self.mi, dr.opaque(self.mi.UInt32, depth)
@@ -281,17 +296,17 @@ class PathTracer:
         hidden = (here == 0) if self.hide_emitters else None
         si, met = world.intersect(paths.ray, before, exist, hidden)
         numbers = sampler.at_vertex(here, paths.number)
-        left = transmittance(mi, world.carriers, before, si, paths.ray.d)
+        left = transmittance(mi, world.proxies, before, si, paths.ray.d)
         paths = replace(paths, throughput=paths.throughput * left)
-        shows = exist & ~met.lost & (here < self._deepest)
+        shows = exist & ~met.is_out_of_steps & (here < self._deepest)
         if hidden is not None:
             shows &= ~hidden
         light = self._emitted(world.scene, paths, si, shows)
-        shown = paths.throughput * mi.Spectrum(self.lost_color.eval(si, met.lost))
-        light += dr.select(met.lost, shown, 0)
+        shown = paths.throughput * mi.Spectrum(self.lost_color.eval(si, met.is_out_of_steps))
+        light += dr.select(met.is_out_of_steps, shown, 0)
         active = si.is_valid() & (here + 1 < self._deepest)
         bsdf = si.bsdf()
-        connection = self._connection(world, paths, si, met.clearance, numbers, active)
+        connection = self._connection(world, paths, si, met.ray_offset, numbers, active)
 
         sample, weight = bsdf.sample(
             mi.BSDFContext(), si, numbers.next_1d(), numbers.next_2d(), active
@@ -305,25 +320,25 @@ class PathTracer:
         keep = dr.minimum(brightest * eta * eta, 0.95)
         in_roulette = here + 1 >= self._first_roulette
         active &= ~in_roulette | (numbers.next_1d() < keep)
-        onward = _Paths(
+        onward = _PathState(
             number=paths.number,
-            ray=leaving_ray(mi, si, met.clearance, si.to_world(sample.wo)),
+            ray=spawn_ray(mi, si, met.ray_offset, si.to_world(sample.wo)),
             throughput=dr.select(in_roulette, throughput / keep, throughput),
             eta=eta,
             previous=_Vertex.of(si),
             pdf=sample.pdf,
             delta=delta,
-            spread=paths.spread | ~delta,
-            spread_before=paths.spread,
+            is_diffused=paths.is_diffused | ~delta,
+            was_diffused=paths.is_diffused,
         )
-        first = (here == 0) & (si.is_valid() | met.lost)
+        first = (here == 0) & (si.is_valid() | met.is_out_of_steps)
         dr.scatter(found.valid, mi.Bool(True), paths.number, first)
-        dr.scatter(found.lost, mi.Bool(True), paths.number, met.lost)
+        dr.scatter(found.lost, mi.Bool(True), paths.number, met.is_out_of_steps)
         if found.features is not None:
-            found.features.note(mi, si, paths.number, first & si.is_valid())
+            found.features.record(mi, si, paths.number, first & si.is_valid())
         # In one kernel, so that nothing about vertices is computed twice.
         noted = (found.valid, found.lost, found.features)
-        dr.eval(active, light, noted, *leaves_of(onward), *leaves_of(connection))
+        dr.eval(active, light, noted, *array_leaves(onward), *array_leaves(connection))
         blocked = world.occluded(connection.ray, connection.active)
         light += dr.select(connection.active & ~blocked, connection.light, 0)
         # Each path has a place of its own, so that the order of sums is fixed.
@@ -331,16 +346,16 @@ class PathTracer:
         dr.eval(found.light)
         return onward, active
 
-    def _emitted(self, scene: Any, paths: _Paths, si: Any, active: Mask) -> Any:
+    def _emitted(self, scene: Any, paths: _PathState, si: Any, active: Mask) -> Any:
         """Light that a vertex, or the environment behind no vertex, sends along the ray."""
         mi, before = self.mi, paths.previous.interaction(self.mi)
         found = mi.DirectionSample3f(scene, si, before)
         other = scene.pdf_emitter_direction(before, found, active & ~paths.delta)
         weight = _power_heuristic(paths.pdf, other)
         light = paths.throughput * weight * found.emitter.eval(si, active)
-        return dr.select(active, self._limited(light, paths.spread_before), 0)
+        return dr.select(active, self._clamped(light, paths.was_diffused), 0)
 
-    def _limited(self, light: Any, indirect: Mask) -> Any:
+    def _clamped(self, light: Any, indirect: Mask) -> Any:
         """Light, dimmed to at most `clamp` in every channel where it is indirect."""
         if self.clamp == math.inf:
             return light
@@ -348,9 +363,14 @@ class PathTracer:
         return dr.select(indirect & (excess > 1), light / excess, light)
 
     def _connection(
-        self, world: World, paths: _Paths, si: Any, clearance: Real, numbers: SobolSampler,
+        self,
+        world: HybridScene,
+        paths: _PathState,
+        si: Any,
+        clearance: Real,
+        numbers: SobolSampler,
         active: Mask,
-    ) -> _Connection:  # fmt: skip
+    ) -> _LightConnection:
         """To a sampled point of an emitter, with the light scattered if nothing is between."""
         mi, bsdf = self.mi, si.bsdf()
         active = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
@@ -359,8 +379,8 @@ class PathTracer:
         scattered, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(light.d), active)
         active &= dr.max(scattered) > 0
         share = dr.select(light.delta, 1, _power_heuristic(light.pdf, pdf))
-        found = self._limited(paths.throughput * scattered * weight * share, paths.spread)
-        return _Connection(connecting_ray(mi, si, clearance, light.p), found, active)
+        found = self._clamped(paths.throughput * scattered * weight * share, paths.is_diffused)
+        return _LightConnection(spawn_ray_to(mi, si, clearance, light.p), found, active)
 
 
 def _power_heuristic(a: Real, b: Real) -> Real:
@@ -370,7 +390,7 @@ def _power_heuristic(a: Real, b: Real) -> Real:
     return dr.select(dr.isfinite(weight), weight, 0)
 
 
-def _own_sampler(mi: Any, sampler: Any) -> SobolSampler:
+def _sobol_from(mi: Any, sampler: Any) -> SobolSampler:
     """Our sampler, seeded by one of Mitsuba's, whose lanes are the samples of pixel after pixel."""
     width, spp = sampler.wavefront_size(), max(int(sampler.sample_count()), 1)
     lane = dr.arange(mi.UInt32, width)
@@ -404,7 +424,7 @@ def integrator_class(variant: str) -> Any:
             self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Mask = True
         ) -> tuple[Any, Mask, list[Any]]:
             del medium
-            found = self.tracer.trace(scene, _own_sampler(mi, sampler), ray, active)
+            found = self.tracer.trace(scene, _sobol_from(mi, sampler), ray, active)
             self.lost = self.lost + dr.count(found.lost)
             return found.light, found.valid, []
 

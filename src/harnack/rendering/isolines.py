@@ -16,7 +16,11 @@ that is a little higher, with g - level = (R^2 - r^2)/2 at the distance r, the l
 |r^2 - R^2| < width r, which is r < width/2 + sqrt(width^2/4 + R^2) <= R + width: at most half a
 width too far.
 
-`function_of` and `defined_in` serve pictures of values as well.
+`as_field` and `padded_domain` serve pictures of values as well.
+
+Lines are found with the hit, once, and their number travels in the interaction's index of the
+primitive, by which the BSDF chooses (`mitsuba_proxy`): the other function is not evaluated again by
+every question that a BSDF is asked.
 """
 
 from __future__ import annotations
@@ -28,12 +32,12 @@ from typing import TYPE_CHECKING, Any, cast
 import drjit as dr
 import numpy as np
 
-from harnack.backend import aligned
-from harnack.backend.elementary import length as norm
-from harnack.backend.validation import positive
+from harnack.backend import upload_floats
+from harnack.backend.elementary import safe_norm as norm
+from harnack.backend.validation import as_positive
 from harnack.fields import Field
 from harnack.fields.expressions import expression
-from harnack.rendering.scales import Color, color_of
+from harnack.rendering.scales import Color, parse_color
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, Index, Mask, Real, Vec3
@@ -44,7 +48,7 @@ if TYPE_CHECKING:
 _PADDING = 1e-5
 
 
-def function_of(given: Any, what: str = "of") -> Field:
+def as_field(given: Any, what: str = "of") -> Field:
     """A function on space: a field, or what `harnack.expression` takes: a function of three
     coordinates, or a text such as "z".
 
@@ -57,7 +61,7 @@ def function_of(given: Any, what: str = "of") -> Field:
         except ValueError as error:
             raise ValueError(f"{what.rstrip(',')}: {error}") from None
     if isinstance(given, Field):
-        if given.has_parts:
+        if given.has_patches:
             raise ValueError(
                 f"{what} must be one function on space, and this {type(given).__name__} has one "
                 "for each part"
@@ -71,12 +75,12 @@ def function_of(given: Any, what: str = "of") -> Field:
     return expression(cast("Callable[[Any, Any, Any], Any]", given))
 
 
-def defined_in(function: Field, size: float) -> Volume | None:
+def padded_domain(function: Field, size: float) -> Volume | None:
     """Where a function is defined, with room for rounding; None for all of space.
 
     size: of the surface on which it is evaluated.
     """
-    if function.domain is None or function.is_entire:
+    if function.domain is None or function.is_global:
         return None
     return function.domain.padded(_PADDING * size)
 
@@ -89,80 +93,81 @@ _ROUNDING = 1e-4
 # How many lines an angle-valued function has unless asked otherwise.
 _USUAL_LINES = 12
 # Tables of levels have at least so many entries, as kernels depend on the length's logarithm.
-_ENTRIES = 64
+_MIN_TABLE_LENGTH = 64
 
 
 @dataclass(frozen=True, eq=False)
 class Isolines:
     """Lines on a surface where a function takes given values.
 
-        hk.render(field, "a.png", isolines=hk.Isolines("z", spacing=0.1))
+        hk.render(field, "a.png", isolines=hk.Isolines("z", interval=0.1))
         hk.render(field, "b.png", isolines=[hk.Isolines(other, [0, 1], color="white"), ...])
 
-    of: the function: "x", "y" or "z", which gives contour lines of height; a `Field`; or a Python
-        function of x, y and z as `harnack.expression` takes it. All are in the coordinates of the
-        surface, wherever it stands. There are no lines where the field is not defined: outside of
-        its `domain`, unless it `is_entire`.
+    function: the function: "x", "y" or "z", which gives contour lines of height; a `Field`; or a
+        Python function of x, y and z as `harnack.expression` takes it. All are in the coordinates
+        of the surface, wherever it stands. There are no lines where the field is not defined:
+        outside of its `domain`, unless it `is_global`.
     levels: the values, or one; those of angle-valued fields count up to their period.
-    spacing: in place of levels, lines at all whole multiples of it. It must divide the period of an
-        angle-valued field, which has 12 lines if neither is given.
+    interval: in place of levels, lines at all whole multiples of it. It must divide the period of
+        an angle-valued field, which has 12 lines if neither is given.
     width: of the lines, along the surface, in the unit of its coordinates; by default 0.4 percent
         of the diagonal of the surface's box.
     color: a name of CSS, "#rrggbb", or three numbers of sRGB.
     """
 
-    of: Any
+    function: Any
     levels: Any = None
-    spacing: float | None = None
+    interval: float | None = None
     width: float | None = None
     color: Any = "black"
-    function: Field = field(init=False, repr=False)
-    rgb: Color = field(init=False, repr=False)
+    function_field: Field = field(init=False, repr=False)
+    srgb: Color = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         put: dict[str, Any] = {
-            "function": function_of(self.of, "of, whose isolines are drawn,"),
-            "rgb": color_of(self.color, "color of isolines"),
+            "function_field": as_field(self.function, "function, whose isolines are drawn,"),
+            "srgb": parse_color(self.color, "color of isolines"),
         }
-        for name in ("spacing", "width"):
+        for name in ("interval", "width"):
             if getattr(self, name) is not None:
-                put[name] = positive(getattr(self, name), f"{name} of isolines")
+                put[name] = as_positive(getattr(self, name), f"{name} of isolines")
         if self.levels is not None:
-            if self.spacing is not None:
-                raise ValueError("isolines have either levels or a spacing, not both")
+            if self.interval is not None:
+                raise ValueError("isolines have either levels or an interval, not both")
             put["levels"] = _numbers(self.levels)
-        elif self.spacing is None and put["function"].period is None:
+        elif self.interval is None and put["function_field"].period is None:
             raise ValueError(
-                "say which isolines: levels=[...], or spacing= for all whole multiples of it"
+                "say which isolines: levels=[...], or interval= for all whole multiples of it"
             )
         for name, value in put.items():
             object.__setattr__(self, name, value)
-        self._step()
+        self._exact_interval()
 
-    def _step(self) -> float | None:
-        """The spacing, exactly a part of the period if there is one; None for lines at levels."""
-        period = self.function.period
+    def _exact_interval(self) -> float | None:
+        """The interval, exactly a part of the period if there is one; None for lines at levels."""
+        period = self.function_field.period
         if self.levels is not None or period is None:
-            return self.spacing
-        count = _USUAL_LINES if self.spacing is None else round(period / self.spacing)
-        if self.spacing is not None and abs(count * self.spacing - period) > 1e-4 * period:
+            return self.interval
+        count = _USUAL_LINES if self.interval is None else round(period / self.interval)
+        if self.interval is not None and abs(count * self.interval - period) > 1e-4 * period:
             raise ValueError(
-                f"the function has the period {period:.6g}, and a spacing of {self.spacing:g} does "
-                "not divide it: lines would end where it is passed. Give period / n, or levels"
+                f"the function has the period {period:.6g}, and an interval of {self.interval:g} "
+                "does not divide it: lines would end where it is passed. "
+                "Give period / n, or levels"
             )
         return period / count
 
     def prepare(self, backend: Backend, size: float) -> PreparedIsolines:
         """Everything uploaded. size: diagonal of the surface's box, for the usual width."""
         width = _USUAL_WIDTH * size if self.width is None else self.width
-        step, period = self._step(), self.function.period
-        volume = defined_in(self.function, size)
+        step, period = self._exact_interval(), self.function_field.period
+        volume = padded_domain(self.function_field, size)
         return PreparedIsolines(
-            self.function.prepare(backend),
+            self.function_field.prepare(backend),
             None if volume is None else volume.prepare(backend),
             dr.opaque(backend.Float, 0.5 * width),
             None if step is None else dr.opaque(backend.Float, step),
-            None if step is not None else aligned(backend, _table(self.levels, period)),
+            None if step is not None else upload_floats(backend, _table(self.levels, period)),
             None if period is None else dr.opaque(backend.Float, period),
         )
 
@@ -176,7 +181,7 @@ def _table(levels: tuple[float, ...], period: float | None) -> FloatArray:
     ordered = np.unique(np.array(levels) if period is None else np.mod(levels, period))
     if period is not None:
         ordered = np.array([ordered[-1] - period, *ordered, ordered[0] + period])
-    entries = max(_ENTRIES, 2 ** len(ordered).bit_length()) - 1
+    entries = max(_MIN_TABLE_LENGTH, 2 ** len(ordered).bit_length()) - 1
     return np.concatenate([ordered, np.full(entries - len(ordered), np.inf)])
 
 
@@ -190,7 +195,7 @@ def _numbers(levels: Any) -> tuple[float, ...]:
     return tuple(given.tolist())
 
 
-def checked_isolines(given: Any) -> tuple[Isolines, ...]:
+def parse_isolines(given: Any) -> tuple[Isolines, ...]:
     """`Isolines`, or several, as a tuple; empty for None.
 
     Raises:
@@ -204,7 +209,7 @@ def checked_isolines(given: Any) -> tuple[Isolines, ...]:
         if not isinstance(one, Isolines):
             raise TypeError(
                 "isolines must be harnack.Isolines, or a list of them, such as "
-                f'hk.Isolines("z", spacing=0.1), not {one!r}'
+                f'hk.Isolines("z", interval=0.1), not {one!r}'
             )
     return tuple(several)
 
@@ -224,21 +229,21 @@ class PreparedIsolines:
     levels: Real | None
     period: Real | None
 
-    def cover(self, p: Vec3, normal: Vec3) -> Mask:
+    def contains(self, p: Vec3, normal: Vec3) -> Mask:
         """Whether points of a surface, with unit normals, are on a line."""
-        gap, along = self._rise(p, normal)
+        gap, along = self._gap_and_gradient(p, normal)
         return gap < self.half_width * norm(along)
 
-    def pass_near(self, p: Vec3, normal: Vec3, across: Vec3, down: Vec3) -> Mask:
+    def edge_is_near(self, p: Vec3, normal: Vec3, across: Vec3, down: Vec3) -> Mask:
         """Whether the edge of a line passes through a pixel, to first order, or near it.
 
         across, down: from a pixel's middle on the surface to those of its neighbors.
         """
-        gap, along = self._rise(p, normal)
+        gap, along = self._gap_and_gradient(p, normal)
         reach = dr.abs(dr.dot(along, across)) + dr.abs(dr.dot(along, down))
         return dr.abs(gap - self.half_width * norm(along)) < reach
 
-    def _rise(self, p: Vec3, normal: Vec3) -> tuple[Real, Vec3]:
+    def _gap_and_gradient(self, p: Vec3, normal: Vec3) -> tuple[Real, Vec3]:
         """How far g is from the nearest level, and its gradient along the surface."""
         sample = self.function.evaluate(p)
         gradient = sample.gradient
@@ -265,12 +270,14 @@ class PreparedIsolines:
         return dr.minimum(dr.abs(g - before), dr.abs(g - after))
 
 
-def line_at(lines: tuple[PreparedIsolines, ...], p: Vec3, normal: Vec3, index: Any) -> Index:
+def isoline_index_at(
+    lines: tuple[PreparedIsolines, ...], p: Vec3, normal: Vec3, index: Any
+) -> Index:
     """The number of the line that points are on, counted from 1, the last of several; else 0.
 
     index: the type of the numbers.
     """
     found = index(0)
     for number, one in enumerate(lines, start=1):
-        found = dr.select(one.cover(p, normal), index(number), found)
+        found = dr.select(one.contains(p, normal), index(number), found)
     return found

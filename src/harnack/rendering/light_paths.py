@@ -1,6 +1,8 @@
 """Light on its way to a sensor: path-traced pixels, and rays through clear matter.
 
 How long a picture will take is told before it is begun; noise can be taken out of it.
+
+Going in and out of a solid alternates, so that absorption in glass needs only the last encounter.
 """
 
 from __future__ import annotations
@@ -16,13 +18,20 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import Mask, Real, to_numpy
-from harnack.rendering.hybrid_scene import World, leaving_ray
-from harnack.rendering.integrator import PathTracer, Radiance, SobolSampler
-from harnack.rendering.mitsuba import index_of, refracted, transmittance
-from harnack.rendering.shading import Hands, Light, OwnHands, bands, film_places, uploaded
+from harnack.rendering.hybrid_scene import HybridScene, spawn_ray
+from harnack.rendering.integrator import PathResults, PathTracer, SobolSampler
+from harnack.rendering.mitsuba import refract, refractive_index, transmittance
+from harnack.rendering.shading import (
+    LocalRenderExecutor,
+    RenderExecutor,
+    StudioLight,
+    film_positions,
+    pixel_ranges,
+    upload_indices,
+)
 
 # Paths of one band at most: about two seconds on a CPU. Ctrl-C works between bands.
-PATHS_A_BAND = 2**21
+MAX_PATHS_PER_BATCH = 2**21
 # The pixel's filter: samples are drawn from a Gaussian of this standard deviation, in pixels,
 # cut at two pixels from its middle (Ernst et al. 2006, filter importance sampling).
 _FILTER_DEVIATION = 0.45
@@ -30,7 +39,7 @@ _FILTER_REACH = 2.0
 
 
 @dataclass(frozen=True)
-class Exposure:
+class PathRender:
     """Radiance of all pixels of a sensor.
 
     image: linear sRGB and, last, the part that something covers (h, w, 4).
@@ -45,7 +54,7 @@ class Exposure:
 
 
 @dataclass(frozen=True)
-class Exposing:
+class PathRenderTask:
     """A sensor, and who follows light paths for it: what is done pixel by pixel.
 
     features: whether to find albedos and normals too. paths_a_band: at once, at most.
@@ -58,7 +67,7 @@ class Exposing:
     spp: int
     seed: int
     features: bool = False
-    paths_a_band: int = PATHS_A_BAND
+    paths_a_band: int = MAX_PATHS_PER_BATCH
 
     @property
     def size(self) -> tuple[int, int]:
@@ -66,9 +75,9 @@ class Exposing:
         width, height = (int(n) for n in self.sensor.film().crop_size())
         return width, height
 
-    def pixels(self, start: int, stop: int) -> tuple[npt.NDArray[np.float32], int]:
+    def render_range(self, start: int, stop: int) -> tuple[npt.NDArray[np.float32], int]:
         """Means (n, 4) of the paths of pixels from `start` to `stop`, counted by rows, as in an
-        `Exposure`, with features (n, 10); and how many paths ran out of steps.
+        `PathRender`, with features (n, 10); and how many paths ran out of steps.
 
         Each band of pixels gets all its samples at once, so that samplers can stratify them, and
         every pixel averages its own samples only. So there are no sums whose order threads could
@@ -77,11 +86,11 @@ class Exposing:
         mi, spp = self.mi, self.spp
         rows: list[npt.NDArray[np.float32]] = []
         lost = 0
-        for first, last in bands(stop - start, max(1, self.paths_a_band // spp)):
+        for first, last in pixel_ranges(stop - start, max(1, self.paths_a_band // spp)):
             lane = dr.arange(mi.UInt32, (last - first) * spp)
             samples = dr.opaque(mi.UInt32, spp)
             pixel = lane // samples + dr.opaque(mi.UInt32, start + first)
-            found, waves = follow(
+            found, waves = trace_samples(
                 mi, self.scene, self.sensor, self.tracer, pixel, lane % samples, self.seed,
                 self.features,
             )  # fmt: skip
@@ -95,39 +104,41 @@ class Exposing:
         return np.concatenate(rows), lost
 
 
-def expose(
-    exposing: Exposing, advance: Callable[[float], None], hands: Hands | None = None
-) -> Exposure:
+def render_paths(
+    exposing: PathRenderTask, advance: Callable[[float], None], hands: RenderExecutor | None = None
+) -> PathRender:
     """Radiance of all pixels.
 
     advance: told what part of the picture has been finished since the last call.
-    hands: call the method `pixels`, in the place of `exposing` itself.
+    hands: call the method `render_range`, in the place of `exposing` itself.
     """
-    hands = OwnHands(exposing) if hands is None else hands
+    hands = LocalRenderExecutor(exposing) if hands is None else hands
     width, height = exposing.size
     features = exposing.features
     image = np.empty((width * height, 10 if features else 4), dtype=np.float32)
     lost = 0
-    parts = hands.cut(width * height, max(1, exposing.paths_a_band // exposing.spp))
-    for (start, stop), (means, gone) in zip(parts, hands.each("pixels", parts), strict=True):
+    parts = hands.split_range(width * height, max(1, exposing.paths_a_band // exposing.spp))
+    for (start, stop), (means, gone) in zip(
+        parts, hands.run_tasks("render_range", parts), strict=True
+    ):
         image[start:stop] = means
         lost += int(gone)
         advance((stop - start) / (width * height))
     image = image.reshape(height, width, -1)
     if not features:
-        return Exposure(image, lost)
-    return Exposure(image[..., :4], lost, image[..., 4:7], image[..., 7:])
+        return PathRender(image, lost)
+    return PathRender(image[..., :4], lost, image[..., 4:7], image[..., 7:])
 
 
-def follow(
+def trace_samples(
     mi: Any, scene: Any, sensor: Any, tracer: PathTracer, pixel: Any, sample: Any, seed: int,
     features: bool,
-) -> tuple[Radiance, Any]:  # fmt: skip
+) -> tuple[PathResults, Any]:  # fmt: skip
     """What paths through samples of pixels find, as the sensor weighs it, and its wavelengths."""
     width, height = (int(n) for n in sensor.film().crop_size())
     zero, own = dr.opaque(mi.UInt32, 0), dr.opaque(mi.UInt32, _mixed(seed))
     sampler = SobolSampler(mi, pixel, sample, own, zero)
-    place = film_places(mi, pixel, _in_pixel(mi, sampler.next_2d()), (width, height))
+    place = film_positions(mi, pixel, _in_pixel(mi, sampler.next_2d()), (width, height))
     ray, weight = _camera_ray(mi, sensor, sampler, place)
     dr.eval(ray, weight)
     found = tracer.trace(scene, sampler, ray, mi.Bool(True), features)
@@ -176,13 +187,13 @@ _FIRST, _MORE, _PART = 2**12, 4, 1 / 16
 # Runs that take this many times as long as the first are long enough to be measured.
 _ENOUGH = 3.0
 # Seconds; of a picture that takes no longer the time is not told.
-SHORT = 15.0
+MIN_REPORTED_SECONDS = 15.0
 # Seconds between two moves of the progress bar, and the fewest paths of a band.
 _BAND, _FEWEST = 4.0, 2**14
 
 
 @dataclass(frozen=True)
-class Pace:
+class TimeEstimate:
     """Seconds for one path, and for all of a picture."""
 
     path: float
@@ -191,7 +202,7 @@ class Pace:
     @property
     def paths_a_band(self) -> int:
         """Paths that take as long as a progress bar may stand still."""
-        return round(min(max(_BAND / max(self.path, 1e-9), _FEWEST), PATHS_A_BAND))
+        return round(min(max(_BAND / max(self.path, 1e-9), _FEWEST), MAX_PATHS_PER_BATCH))
 
     def __str__(self) -> str:
         seconds = round(self.picture)
@@ -204,9 +215,9 @@ class Pace:
         return f"{hours} h {left} min"
 
 
-def pace_of(
+def estimate_time(
     mi: Any, scene: Any, sensor: Any, tracer: PathTracer, *, spp: int, features: bool
-) -> Pace:
+) -> TimeEstimate:
     """The pace of a picture, measured on a few paths all over it.
 
     Starting costs the same however many paths there are, so what counts is how much longer four
@@ -219,10 +230,10 @@ def pace_of(
     def seconds(count: int) -> float:
         # The golden ratio spreads any number of pixels evenly.
         chosen = (np.arange(count) * 0.6180339887498949 % 1 * pixels).astype(np.int64)
-        pixel = uploaded(mi, np.minimum(chosen, pixels - 1))
+        pixel = upload_indices(mi, np.minimum(chosen, pixels - 1))
         sample = dr.opaque(mi.UInt32, 0, count)
         began = time.perf_counter()
-        found, _ = follow(mi, scene, sensor, tracer, pixel, sample, 0, features)
+        found, _ = trace_samples(mi, scene, sensor, tracer, pixel, sample, 0, features)
         dr.eval(found.light)
         dr.sync_thread()
         return time.perf_counter() - began
@@ -235,7 +246,7 @@ def pace_of(
             after = seconds(_MORE * count)
             path = max(after - before, 0.0) / ((_MORE - 1) * count)
             count, before = _MORE * count, after
-    return Pace(path, whole * path)
+    return TimeEstimate(path, whole * path)
 
 
 def load_denoiser() -> Any:
@@ -254,7 +265,7 @@ def load_denoiser() -> Any:
         raise ModuleNotFoundError(f"Open Image Denoise cannot be loaded: {wrong}") from None
 
 
-def denoised(found: Exposure) -> npt.NDArray[np.float32]:
+def denoise_image(found: PathRender) -> npt.NDArray[np.float32]:
     """The image of an exposure with features, (h, w, 4), without noise.
 
     Open Image Denoise, a neural network that runs on CPUs, takes the noise out. It guesses: the
@@ -273,34 +284,34 @@ def denoised(found: Exposure) -> npt.NDArray[np.float32]:
 # Rays through clear matter.
 
 # Boundaries that a ray goes through; the next one is opaque.
-_MOST = 32
+_MAX_INTERFACES = 32
 # The highlight of matter with this reflectance straight on is that of other glossy materials.
-_USUAL = 0.04
+_DEFAULT_REFLECTANCE = 0.04
 
 
 @dataclass
-class Sight:
+class RefractedHits:
     """What rays see: the first thing that light does not pass through.
 
     ray: the last part of their way.
     si, first: what it hits, as an interaction and as a `SurfaceHit`.
     throughput: what is left of the light from there.
-    gathered: the light that boundaries on the way reflect to the eye.
-    traveled: the length of the way before the last part.
-    boundaries: how many boundaries they have met.
+    reflected_light: the light that boundaries on the way reflect to the eye.
+    path_length: the length of the way before the last part.
+    interface_count: how many boundaries they have met.
     """
 
     ray: Any
     si: Any
     first: Any
     throughput: Any
-    gathered: Any
-    traveled: Real
-    boundaries: Any
+    reflected_light: Any
+    path_length: Real
+    interface_count: Any
     active: Mask
 
 
-class Through:
+class RefractionTracer:
     """What shaded pictures show behind clear matter: rays go on through it, bent and tinted.
 
     Of the two ways that light takes at a boundary only the one through it is followed, and the one
@@ -311,19 +322,21 @@ class Through:
     hides_lights: whether shapes that shine are not seen.
     """
 
-    def __init__(self, world: World, light: Light, *, hides_lights: bool = False) -> None:
+    def __init__(
+        self, world: HybridScene, light: StudioLight, *, hides_lights: bool = False
+    ) -> None:
         self.world, self.light = world, light
         self.hidden = world.mi.Bool(True) if hides_lights else None
         mi = world.mi
-        found = ((carrier, index_of(mi, carrier)) for carrier in world.carriers)
+        found = ((carrier, refractive_index(mi, carrier)) for carrier in world.proxies)
         self.indices = tuple((carrier, index) for carrier, index in found if index is not None)
 
-    def look(self, ray: Any) -> Sight:
+    def trace(self, ray: Any) -> RefractedHits:
         """What camera rays see."""
         mi, world = self.world.mi, self.world
         nothing = dr.zeros(mi.SurfaceInteraction3f, dr.width(ray.d))
-        sight = Sight(
-            ray, nothing, world.nothing(nothing), mi.Spectrum(1), mi.Spectrum(0), mi.Float(0),
+        sight = RefractedHits(
+            ray, nothing, world.no_hit(nothing), mi.Spectrum(1), mi.Spectrum(0), mi.Float(0),
             mi.UInt32(0), dr.full(mi.Bool, True, dr.width(ray.d)),
         )  # fmt: skip
         if not self.indices:
@@ -331,10 +344,10 @@ class Through:
             sight.si, sight.first = world.intersect(ray, start, mi.Bool(True), self.hidden)
             return sight
 
-        def running(sight: Sight) -> Mask:
+        def running(sight: RefractedHits) -> Mask:
             return sight.active
 
-        def on(sight: Sight) -> tuple[Sight]:
+        def on(sight: RefractedHits) -> tuple[RefractedHits]:
             return (self._through_boundary(sight),)
 
         (sight,) = dr.while_loop((sight,), running, on, label="clear")
@@ -346,30 +359,35 @@ class Through:
             clear |= si.shape == self.world.mi.ShapePtr(carrier)
         return clear
 
-    def _through_boundary(self, sight: Sight) -> Sight:
+    def _through_boundary(self, sight: RefractedHits) -> RefractedHits:
         """The next thing that rays hit and, where it is clear, the way behind it."""
         mi, world, d = self.world.mi, self.world, sight.ray.d
         si, first = world.intersect(sight.ray, sight.si, sight.active, self.hidden)
-        throughput = sight.throughput * transmittance(mi, world.carriers, sight.si, si, d)
-        boundaries = sight.boundaries + 1
-        clear = self._is_clear(si) & (first.line == 0) & first.met & (boundaries <= _MOST)
+        throughput = sight.throughput * transmittance(mi, world.proxies, sight.si, si, d)
+        boundaries = sight.interface_count + 1
+        clear = (
+            self._is_clear(si)
+            & (first.isoline_index == 0)
+            & first.is_hit
+            & (boundaries <= _MAX_INTERFACES)
+        )
         index = mi.Float(1)
         for carrier, own in self.indices:
             index = dr.select(si.shape == mi.ShapePtr(carrier), own, index)
         normal = mi.Vector3f(si.n)
-        onward, reflected = refracted(normal, d, index)
+        onward, reflected = refract(normal, d, index)
         outside = clear & (dr.dot(normal, d) < 0)
         gathered = dr.select(outside, throughput * self._reflected(si, d, index, reflected), 0)
         part = dr.select(clear & (reflected < 1), 1 - reflected, 1)
-        way = leaving_ray(mi, si, first.clearance, onward)
-        return Sight(
+        way = spawn_ray(mi, si, first.ray_offset, onward)
+        return RefractedHits(
             ray=dr.select(clear, way, sight.ray),
             si=si,
             first=first,
             throughput=throughput * part,
-            gathered=sight.gathered + gathered,
-            traveled=sight.traveled + dr.select(clear, first.t, 0),
-            boundaries=boundaries,
+            reflected_light=sight.reflected_light + gathered,
+            path_length=sight.path_length + dr.select(clear, first.t, 0),
+            interface_count=boundaries,
             active=sight.active & clear,
         )
 
@@ -380,7 +398,9 @@ class Through:
         back = d - 2 * dr.dot(normal, d) * normal
         straight = dr.square((index - 1) / (index + 1))
         black, one = dr.zeros(mi.Color3f), mi.Float(1)
-        gloss = self.light.on(black, normal, -d, mi.Bool(True), one) * (straight / _USUAL)
+        gloss = self.light.shade(black, normal, -d, mi.Bool(True), one) * (
+            straight / _DEFAULT_REFLECTANCE
+        )
         light = mi.Spectrum(gloss) if not mi.is_monochromatic else mi.Spectrum(mi.luminance(gloss))
         sky = self.world.scene.environment()
         if sky is not None:

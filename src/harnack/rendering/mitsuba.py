@@ -18,8 +18,8 @@ import numpy as np
 
 from harnack.backend import Backend, backend_of, choose_backend
 from harnack.fields.expressions import looks_like_formula
-from harnack.files.file_geometry import MAX_BYTES, Place, read_bytes
-from harnack.files.geometry_files import SURFACE_FILES
+from harnack.files.file_geometry import MAX_BYTES, FileLocation, read_bytes
+from harnack.files.geometry_files import GEOMETRY_SUFFIXES
 
 _USABLE = re.compile(r"(llvm|cuda|metal)_ad_(mono|rgb|spectral)(_double)?")
 
@@ -53,7 +53,7 @@ def load_mitsuba() -> Any:
     return mi
 
 
-def take_variant(variant: str) -> None:
+def set_variant(variant: str) -> None:
     """Set a Mitsuba variant, if another or none is set: that of the process for which this one
     works.
 
@@ -102,7 +102,7 @@ def load_scene_file(mi: Any, path: str | os.PathLike[str]) -> Any:
         raise RuntimeError(without_traceback(str(error))) from error
 
 
-def load_dictionary(mi: Any, description: Mapping[str, Any]) -> Any:
+def load_dict(mi: Any, description: Mapping[str, Any]) -> Any:
     """The scene, or another object of Mitsuba's, that a dictionary describes.
 
     Raises:
@@ -120,17 +120,17 @@ def check_scene_file(path: Path) -> None:
     Mitsuba's parser looks at neither kind nor size of a file: it waits forever at a pipe, and takes
     all memory for a file of many gigabytes.
     """
-    if path.suffix.lower() in SURFACE_FILES:
-        raise Place(path).error(
+    if path.suffix.lower() in GEOMETRY_SUFFIXES:
+        raise FileLocation(path).error(
             "this is a surface file, not a Mitsuba scene (.xml): draw its field, "
             "open_surface(path).field, with `from harnack.field_from_file import open_surface`"
         )
     if looks_like_formula(str(path)) and not path.exists():
-        raise Place(path).error(
+        raise FileLocation(path).error(
             "there is no such file; of a formula, take the field harnack.expression(text)"
         )
     if not path.suffix and not path.exists():
-        raise Place(path).error(
+        raise FileLocation(path).error(
             "there is no such file; Mitsuba scenes are .xml files, and scenes of the gallery are "
             "drawn by harnack.gallery.SCENES[name].render()"
         )
@@ -141,7 +141,9 @@ def check_scene_file(path: Path) -> None:
         text = _scene_text(waiting.pop())
         total += len(text)
         if total > MAX_BYTES:
-            raise Place(path).error(f"with what it includes it has more than {MAX_BYTES:,} bytes")
+            raise FileLocation(path).error(
+                f"with what it includes it has more than {MAX_BYTES:,} bytes"
+            )
         for element, name in _files_named(text):
             file = path.parent / name
             # What is not found here may lie where the scene tells Mitsuba to look.
@@ -151,7 +153,7 @@ def check_scene_file(path: Path) -> None:
             if element == "include":
                 waiting.append(file)
             elif not file.is_file() and not file.is_dir():
-                raise Place(file).error("this is not an ordinary file")
+                raise FileLocation(file).error("this is not an ordinary file")
 
 
 def _scene_text(path: Path) -> str:
@@ -160,9 +162,11 @@ def _scene_text(path: Path) -> str:
     mark = next((mark for mark in _BYTE_ORDER_MARKS if data.startswith(mark)), b"")
     text = data.decode(_BYTE_ORDER_MARKS.get(mark, "latin-1"), "replace")
     if not text.lstrip("\ufeff \t\r\n").startswith("<"):
-        raise Place(path).error("this is no XML file: it does not begin with '<'")
+        raise FileLocation(path).error("this is no XML file: it does not begin with '<'")
     if "\0" in text:
-        raise Place(path).error("this is binary data, not the text that its extension announces")
+        raise FileLocation(path).error(
+            "this is binary data, not the text that its extension announces"
+        )
     return text
 
 
@@ -195,7 +199,7 @@ def without_traceback(message: str) -> str:
 _SAME = 1e-6
 
 
-def tint_of(mi: Any, tint: Any) -> Any:
+def transmittance_texture(mi: Any, tint: Any) -> Any:
     """A texture of what is left of light after one unit of length; None where all of it is.
 
     Raises:
@@ -215,7 +219,7 @@ def tint_of(mi: Any, tint: Any) -> Any:
     return mi.load_dict({"type": "srgb", "color": color}, parallel=False)
 
 
-def index_of(mi: Any, carrier: Any) -> Any:
+def refractive_index(mi: Any, carrier: Any) -> Any:
     """The index of refraction of a solid that light passes through, relative to what is around it,
     as a kernel parameter; None for what is opaque, or no solid."""
     bsdf = carrier.bsdf()
@@ -239,8 +243,8 @@ def transmittance(mi: Any, carriers: Any, start: Any, si: Any, d: Any) -> Any:
     """What is left of light between interactions, along rays from `start` in directions d.
 
     By Beer and Lambert's law the part tint^t is left of light that travels a length t in a solid.
-    As going in and out of a solid alternate (`CappedSolid.meet`), a ray that leaves a point of its
-    boundary against the outward normal is inside up to the next thing that it hits.
+    As going in and out of a solid alternate (`CappedSolid.intersect`), a ray that leaves a point of
+    its boundary against the outward normal is inside up to the next thing that it hits.
     """
     left = mi.Spectrum(1)
     for carrier in carriers:
@@ -253,7 +257,7 @@ def transmittance(mi: Any, carriers: Any, start: Any, si: Any, d: Any) -> Any:
     return left
 
 
-def refracted(normal: Any, d: Any, index: Any) -> tuple[Any, Any]:
+def refract(normal: Any, d: Any, index: Any) -> tuple[Any, Any]:
     """Where rays in unit directions d go through a boundary with an outward unit normal, and how
     much of unpolarized light is reflected there (Fresnel). All of it is where it is 1: then the
     direction is that of the mirror.

@@ -1,7 +1,7 @@
 """Plug-ins for Mitsuba: a shape, an integrator, and what stands in for Mitsuba's own integrators.
 
-Scene files can name them once they are registered (`register`); `shape` makes surfaces for scenes
-that are put together in Python.
+Scene files can name them once they are registered (`register`); `mitsuba_shape` makes surfaces for
+scenes that are put together in Python.
 
 <shape type="harnack">
     <string name="file" value="curve.loops"/>      curves of an .obj, .ply or .loops file, or
@@ -21,6 +21,10 @@ Mitsuba's own integrators ask Mitsuba's shapes alone, for which a carrier is two
 draw nothing, and say nothing. No method of a shape is called while they render, so `mitsuba.render`
 looks first and warns. `harnack.render` follows paths itself where the integrator asks for the same
 light, leaves scenes without our surfaces to Mitsuba, and refuses the rest.
+
+Mitsuba surfaces are zero-area carrier meshes with a path integrator that meets both worlds; finding
+a hit and describing it (`SurfaceInteraction`) are separate, since Mitsuba's next release lets
+Python define shapes.
 """
 
 from __future__ import annotations
@@ -36,14 +40,14 @@ from harnack.fields.analytic.periodic import Gyroid, SchwarzD, SchwarzP
 from harnack.fields.analytic.polynomial import SphericalHarmonic
 from harnack.fields.solid_angles.solid_angle import SolidAngle
 from harnack.files import read_loops
-from harnack.geometry import Ball, Box, Intersection
+from harnack.geometry import Ball, Box, VolumeIntersection
 from harnack.name_suggestions import did_you_mean
 from harnack.rendering import integrator, mitsuba_proxy
 from harnack.rendering.integrator import INTEGRATOR, PLUGIN, PathTracer
-from harnack.rendering.isolines import Isolines, checked_isolines
-from harnack.rendering.mitsuba import load_dictionary, load_mitsuba
-from harnack.rendering.mitsuba_proxy import as_matrix, from_properties, is_carrier
-from harnack.tracer import LevelSet, level_set
+from harnack.rendering.isolines import Isolines, parse_isolines
+from harnack.rendering.mitsuba import load_dict, load_mitsuba
+from harnack.rendering.mitsuba_proxy import as_matrix, from_properties, is_proxy
+from harnack.tracer import Surface, level_set
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -57,7 +61,7 @@ _PATHS, _IN_MEDIA = "PathIntegrator", ("VolumetricSimplePath", "VolumetricMisPat
 _DIRECT, _CHANNELS = "DirectIntegrator", "AOVIntegrator"
 
 
-def watch(mi: Any) -> None:
+def patch_mitsuba_render(mi: Any) -> None:
     """Have `mitsuba.render` warn of surfaces that it will not draw; it renders as before."""
     original = mi.render
     if _MARK in vars(original):
@@ -67,18 +71,18 @@ def watch(mi: Any) -> None:
     def render(scene: Any, *args: Any, **settings: Any) -> Any:
         chosen = settings.get("integrator") or (args[2] if len(args) > 2 else None)
         if isinstance(scene, mi.Scene):
-            warn_of_unseen(scene, chosen or scene.integrator())
+            warn_unsupported_integrator(scene, chosen or scene.integrator())
         return original(scene, *args, **settings)
 
     vars(render)[_MARK] = True
     mi.render = render
 
 
-def warn_of_unseen(scene: Any, integrator: Any) -> None:
+def warn_unsupported_integrator(scene: Any, integrator: Any) -> None:
     """Warn if the integrator is Mitsuba's own, and the scene holds surfaces of ours."""
     if not type(integrator).__module__.startswith("mitsuba") or _sees_ours(integrator):
         return
-    unseen = sum(is_carrier(shape) for shape in scene.shapes())
+    unseen = sum(is_proxy(shape) for shape in scene.shapes())
     if unseen:
         kind = _kind(integrator)
         if INTEGRATOR in str(integrator):
@@ -91,7 +95,7 @@ def warn_of_unseen(scene: Any, integrator: Any) -> None:
         )
 
 
-def stand_in(mi: Any, scene: Any) -> PathTracer | None:
+def equivalent_path_tracer(mi: Any, scene: Any) -> PathTracer | None:
     """The path tracer that finds the light that the scene's integrator asks for; None for scenes
     without surfaces of ours that Mitsuba has to draw itself.
 
@@ -103,7 +107,7 @@ def stand_in(mi: Any, scene: Any) -> PathTracer | None:
     if integrator is None:
         return PathTracer(mi)
     own = getattr(integrator, "tracer", None)
-    ours = sum(is_carrier(shape) for shape in scene.shapes())
+    ours = sum(is_proxy(shape) for shape in scene.shapes())
     has_medium = any(shape.is_medium_transition() for shape in scene.shapes())
     has_medium |= any(sensor.get_medium() is not None for sensor in scene.sensors())
     if isinstance(own, PathTracer):
@@ -158,16 +162,16 @@ def register() -> Any:
     """Make `harnack` (shape) and `harnack_path` (integrator) known, and return `mitsuba`.
 
     Needed once in each variant, before a scene that names them is loaded with Mitsuba's own
-    functions; `render` and `shape` do it by themselves. From then on `mitsuba.render` warns of
-    surfaces that another integrator would leave out.
+    functions; `render` and `mitsuba_shape` do it by themselves. From then on `mitsuba.render` warns
+    of surfaces that another integrator would leave out.
     """
-    mi = register_surfaces(mitsuba_proxy.PLUGIN, surface_of)
+    mi = register_surfaces(mitsuba_proxy.PLUGIN, surface_from_properties)
     mi.register_integrator(integrator.PLUGIN, integrator.integrator_class(mi.variant()))
-    watch(mi)
+    patch_mitsuba_render(mi)
     return mi
 
 
-def register_surfaces(plugin: str, surface: Callable[[Any], LevelSet]) -> Any:
+def register_surfaces(plugin: str, surface: Callable[[Any], Surface]) -> Any:
     """Make a shape known whose surfaces come from a function of `mitsuba.Properties`.
 
     The function reads what it understands; `to_world` and BSDF are taken care of.
@@ -175,13 +179,13 @@ def register_surfaces(plugin: str, surface: Callable[[Any], LevelSet]) -> Any:
     mi = load_mitsuba()
 
     def made(props: Any) -> Any:
-        return mitsuba_proxy.from_properties(mi, props, surface(props).in_one_call())
+        return mitsuba_proxy.from_properties(mi, props, surface(props).with_call_cache())
 
     mi.register_shape(plugin, made)
     return mi
 
 
-def surface_of(props: Any) -> LevelSet:
+def surface_from_properties(props: Any) -> Surface:
     """The surface that the properties of a `harnack` shape describe.
 
     Raises:
@@ -224,7 +228,7 @@ def _clip(props: Any) -> Volume | None:
     if "clip_lower" in props:
         volumes.append(Box(_point(props["clip_lower"]), _point(props["clip_upper"])))
     if len(volumes) > 1:
-        return Intersection(volumes)
+        return VolumeIntersection(volumes)
     return volumes[0] if volumes else None
 
 
@@ -233,8 +237,8 @@ def _point(value: Any) -> tuple[float, float, float]:
     return x, y, z
 
 
-def shape(
-    surface: Field | LevelSet,
+def mitsuba_shape(
+    surface: Field | Surface,
     *,
     bsdf: Mapping[str, Any] | Any = None,
     to_world: npt.ArrayLike | Any = None,
@@ -266,25 +270,25 @@ def shape(
         ValueError: the surface has no bounds and no `clip`, or `to_world` is no similarity.
     """
     mi = register()
-    if isinstance(surface, LevelSet):
+    if isinstance(surface, Surface):
         if settings:
-            raise ValueError(f"{', '.join(settings)}: a LevelSet holds its settings already")
+            raise ValueError(f"{', '.join(settings)}: a Surface holds its settings already")
     else:
         if "material" in settings:
             raise TypeError(
                 "a shape takes bsdf=..., not material=...: that is an argument of harnack.render"
             )
         surface = level_set(surface, **settings)
-    surface = surface.in_one_call()
+    surface = surface.with_call_cache()
     props = mi.Properties()
     props["bsdf"] = as_bsdf(mi, bsdf)
     if to_world is not None:
         props["to_world"] = mi.ScalarTransform4f(as_matrix(to_world))
-    of_cut = _of_cut(mi, surface, props["bsdf"], cut_bsdf)
-    return from_properties(mi, props, surface, tint, of_cut, checked_isolines(isolines))
+    of_cut = _section_bsdf(mi, surface, props["bsdf"], cut_bsdf)
+    return from_properties(mi, props, surface, tint, of_cut, parse_isolines(isolines))
 
 
-def _of_cut(mi: Any, surface: LevelSet, bsdf: Any, cut_bsdf: Any) -> Any:
+def _section_bsdf(mi: Any, surface: Surface, bsdf: Any, cut_bsdf: Any) -> Any:
     """The BSDF of the faces at which a section cuts a solid; None for that of the rest."""
     if cut_bsdf is None:
         return None
@@ -308,7 +312,7 @@ def as_bsdf(mi: Any, bsdf: Any) -> Any:
         bsdf = {"type": "twosided", "nested": {"type": "diffuse"}}
     made: Any = bsdf
     if isinstance(bsdf, Mapping):
-        made = load_dictionary(mi, cast("Mapping[str, Any]", bsdf))
+        made = load_dict(mi, cast("Mapping[str, Any]", bsdf))
     if not isinstance(made, mi.BSDF):
         raise TypeError(
             "bsdf must be a BSDF or its dictionary, such as harnack.rendering.MATERIALS['gold']"

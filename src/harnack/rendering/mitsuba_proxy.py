@@ -2,10 +2,10 @@
 
 Mitsuba 3.9 has no shapes written in Python, except meshes. So a level set travels in a *carrier*, a
 mesh of two triangles that are each a point, at opposite corners of its bounding box: no ray hits
-them, but the scene's bounding box is right, and the mesh holds the BSDF. `world.World` finds the
-carriers in a scene and traces their level sets.
+them, but the scene's bounding box is right, and the mesh holds the BSDF. `world.HybridScene` finds
+the carriers in a scene and traces their level sets.
 
-On isolines the BSDF is another one, chosen by the number of the isoline (`with_lines`).
+On isolines the BSDF is another one, chosen by the number of the isoline (`isoline_bsdf`).
 """
 
 from __future__ import annotations
@@ -17,29 +17,34 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 import numpy as np
 
-from harnack.backend import aligned
-from harnack.rendering.framing import box_of
+from harnack.backend import upload_floats
+from harnack.rendering.framing import bounding_box
 from harnack.rendering.isolines import Isolines
-from harnack.rendering.mitsuba import load_dictionary, load_mitsuba, mitsuba_backend, tint_of
+from harnack.rendering.mitsuba import (
+    load_dict,
+    load_mitsuba,
+    mitsuba_backend,
+    transmittance_texture,
+)
 from harnack.rendering.placed_surface import PlacedSurface, Placement
-from harnack.rendering.scales import Color, linear
-from harnack.tracer import LevelSet
+from harnack.rendering.scales import Color, linear_from_srgb
+from harnack.tracer import Surface
 
 if TYPE_CHECKING:
     from harnack.backend import FloatArray, Mask
 
 
-def with_lines(mi: Any, bsdf: Any, colors: Sequence[Color]) -> Any:
+def isoline_bsdf(mi: Any, bsdf: Any, colors: Sequence[Color]) -> Any:
     """A BSDF that is the given one off the isolines, and diffuse on both sides on them.
 
     colors: of the isolines, in sRGB.
     """
-    paints = [load_dictionary(mi, _matt(color)) for color in colors]
+    paints = [load_dict(mi, _matte_bsdf(color)) for color in colors]
     return _lined_class(mi.variant())(bsdf, paints)
 
 
-def _matt(color: Color) -> dict[str, Any]:
-    reflectance = {"type": "rgb", "value": list(linear(color))}
+def _matte_bsdf(color: Color) -> dict[str, Any]:
+    reflectance = {"type": "rgb", "value": list(linear_from_srgb(color))}
     return {"type": "twosided", "nested": {"type": "diffuse", "reflectance": reflectance}}
 
 
@@ -118,15 +123,15 @@ PLUGIN = "harnack"
 def from_properties(
     mi: Any,
     props: Any,
-    surface: LevelSet,
+    surface: Surface,
     tint: Any = None,
-    cut_bsdf: Any = None,
+    section_bsdf: Any = None,
     isolines: Sequence[Isolines] = (),
 ) -> Any:
     """The shape of a surface with the `to_world` and the BSDF that a plug-in's properties hold.
 
     tint: of a solid, what is left of light after one unit of length in it, in the world.
-    cut_bsdf: of the faces at which a section cuts a solid; None for the BSDF of the rest.
+    section_bsdf: of the faces at which a section cuts a solid; None for the BSDF of the rest.
     isolines: to be drawn on the surface.
 
     Raises:
@@ -141,27 +146,27 @@ def from_properties(
     if "to_world" in props:
         placement = Placement.of(as_matrix(props["to_world"]))
     for one in isolines:
-        if one.function is surface.field and surface.solid is None:
+        if one.function_field is surface.field and surface.solid is None:
             raise ValueError(
                 f"isolines of {surface.field!r} on its own level set: it is constant there. Draw "
                 "those of another function, or a solid, whose caps show them"
             )
     if isolines:
-        colors = [one.rgb for one in isolines]
-        props["bsdf"] = with_lines(mi, props["bsdf"], colors)
-        cut_bsdf = None if cut_bsdf is None else with_lines(mi, cut_bsdf, colors)
-    if any("MeshAttribute" in _words(one) for one in (props.get("bsdf", None), cut_bsdf)):
+        colors = [one.srgb for one in isolines]
+        props["bsdf"] = isoline_bsdf(mi, props["bsdf"], colors)
+        section_bsdf = None if section_bsdf is None else isoline_bsdf(mi, section_bsdf, colors)
+    if any("MeshAttribute" in _bsdf_text(one) for one in (props.get("bsdf", None), section_bsdf)):
         raise ValueError(
             "a mesh_attribute belongs to vertices or faces, which a level set has not: take a "
             "texture of uv, which are x and y in the world, or draw the mesh of harnack.mesh(field)"
         )
-    made = _carrier_class(mi.variant())(props, surface, placement, tint, cut_bsdf, isolines)
+    made = _carrier_class(mi.variant())(props, surface, placement, tint, section_bsdf, isolines)
     if made.emitter() is not None or made.is_medium_transition():
         raise ValueError("surfaces that are traced can neither emit light nor bound a medium")
     return made
 
 
-def _words(bsdf: Any) -> str:
+def _bsdf_text(bsdf: Any) -> str:
     """The text of a BSDF; empty if it was written in Python without `to_string`."""
     try:
         return str(bsdf)
@@ -185,22 +190,22 @@ def _carrier_class(variant: str) -> Any:
         """A mesh that no ray hits, with the surface that it stands for."""
 
         def __init__(
-            self, props: Any, surface: LevelSet, placement: Placement, tint: Any, cut_bsdf: Any,
+            self, props: Any, surface: Surface, placement: Placement, tint: Any, cut_bsdf: Any,
             isolines: Sequence[Isolines],
         ) -> None:  # fmt: skip
-            ends = box_of(surface)
+            ends = bounding_box(surface)
             mi.Mesh.__init__(self, PLUGIN, 2, 2, props=props)
             self.surface = surface
             self.placement = placement
-            self.tint = tint_of(mi, tint)
+            self.tint = transmittance_texture(mi, tint)
             # Hits on the section belong to a shape of their own, which no ray hits either.
-            self.cut_face = None if cut_bsdf is None else _bsdf_holder(mi, cut_bsdf)
+            self.section_proxy = None if cut_bsdf is None else _bsdf_holder(mi, cut_bsdf)
             backend, size = mitsuba_backend(mi), float(np.linalg.norm(np.diff(ends, axis=0)))
             self.placed = PlacedSurface.of(surface, placement, backend, isolines, size)
-            self.line_colors = tuple(one.rgb for one in isolines)
+            self.line_colors = tuple(one.srgb for one in isolines)
             params = mi.traverse(self)
             corners = np.concatenate(placement.world_bounds(ends))
-            params["vertex_positions"] = aligned(backend, corners)
+            params["vertex_positions"] = upload_floats(backend, corners)
             params["faces"] = mi.UInt32([0, 0, 0, 1, 1, 1])
             params.update()
 
@@ -217,6 +222,6 @@ def _bsdf_holder(mi: Any, bsdf: Any) -> Any:
     return mi.Mesh(PLUGIN, 1, 1, props=props)
 
 
-def is_carrier(shape: Any) -> bool:
+def is_proxy(shape: Any) -> bool:
     """Whether a Mitsuba shape carries one of our surfaces."""
     return isinstance(getattr(shape, "placed", None), PlacedSurface)

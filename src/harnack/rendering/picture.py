@@ -12,34 +12,44 @@ import numpy as np
 import numpy.typing as npt
 from rich.console import Console
 
-from harnack.cluster.executor import crew
+from harnack.cluster.executor import open_executor
 from harnack.fields import Field
 from harnack.progress import Advance, progress_bar
-from harnack.rendering.aov_render import VIEWS, Viewer, drawn
-from harnack.rendering.backdrops import Ground
+from harnack.rendering.aov_render import AOV_MODES, AovTask, aov_picture
+from harnack.rendering.backdrops import GroundBackdrop
 from harnack.rendering.camera import Camera
-from harnack.rendering.images import Picture, check_picture_path, tone_mapped, write_image
+from harnack.rendering.images import Picture, check_picture_path, tone_map, write_image
 from harnack.rendering.isolines import Isolines
 from harnack.rendering.light_paths import (
-    SHORT,
-    Exposing,
-    denoised,
-    expose,
+    MIN_REPORTED_SECONDS,
+    PathRenderTask,
+    denoise_image,
+    estimate_time,
     load_denoiser,
-    pace_of,
+    render_paths,
 )
 from harnack.rendering.mitsuba_plugins import register
-from harnack.rendering.render_job import EDGE_SPP, Elsewhere, PictureJob
-from harnack.rendering.render_options import OF_STUDIO, Request, check_tiles, refuse_studio_settings
-from harnack.rendering.shaded_render import Shading, shaded
-from harnack.rendering.shading import Hands, OwnHands, flat, wall
-from harnack.rendering.stage import Studio
+from harnack.rendering.render_job import EDGE_SPP, ClusterRenderExecutor, RenderJob
+from harnack.rendering.render_options import (
+    STUDIO_OPTIONS,
+    RenderOptions,
+    check_tiles,
+    refuse_studio_settings,
+)
+from harnack.rendering.shaded_render import ShadedTask, render_shaded
+from harnack.rendering.shading import (
+    LocalRenderExecutor,
+    RenderExecutor,
+    backdrop_image,
+    studio_wall,
+)
+from harnack.rendering.stage import StudioScene
 from harnack.rendering.studio_surfaces import MaterialLike
-from harnack.tracer import LevelSet
+from harnack.tracer import Surface
 
-ShowMode = Literal["color", "shaded", "normal", "evaluations", "status", "depth", "value"]
+ShowMode = Literal["path", "shaded", "normal", "evaluations", "status", "depth", "value"]
 # Modes with ground and lights, and what they trace.
-_LIT = {"color": "light paths", "shaded": "rays"}
+_LIT = {"path": "light paths", "shaded": "rays"}
 _IN_AOV = (".R", ".G", ".B", ".A")
 Image = npt.NDArray[Any]
 
@@ -48,7 +58,7 @@ def render(
     what: Any,
     path: str | os.PathLike[str] | None = None,
     *,
-    show: ShowMode | str = "color",
+    show: ShowMode | str = "path",
     size: tuple[int, int] | None = None,
     spp: int | None = None,
     antialias: str | None = None,
@@ -75,10 +85,10 @@ def render(
 ) -> Picture:
     """Draw fields or a Mitsuba scene, and write the picture to `path` if there is one.
 
-    what: a field, a `LevelSet` or a list of them, drawn in the studio; or a Mitsuba scene, its
+    what: a field, a `Surface` or a list of them, drawn in the studio; or a Mitsuba scene, its
         dictionary, or the path of its XML file.
     path: .png (8-bit sRGB, tone mapped) or .exr (the numbers).
-    show: "color" follows light paths; "shaded" lights first hits by a formula, in seconds and
+    show: "path" follows light paths; "shaded" lights first hits by a formula, in seconds and
         without noise; or what one ray a pixel found: "normal", "evaluations" (of the fields),
         "status" and "depth", or "value", which colors the surface by the function `of`. Edges of
         pictures of values are antialiased, the numbers that are returned are not.
@@ -129,12 +139,12 @@ def render(
     boundary: the radius, in the surfaces' coordinates, of a tube around the curves at which
         surfaces end (`Field.boundary_curves`). boundary_material: its material, by default "gold".
     cut_material: what the faces of opaque solids on their `section` are made of.
-    isolines: lines on the surfaces, of heights or of another function, where `show` is "color",
+    isolines: lines on the surfaces, of heights or of another function, where `show` is "path",
         "shaded" or "value": an `Isolines` or several.
     thickness: draws surfaces as sheets so thick, in their own coordinates: the closed meshes that
         `harnack.mesh` makes with this thickness, whose triangles are seen from close by.
     settings: of the surfaces, as `harnack.level_set` takes them: level, clip, section, solid, ...;
-        those of a `LevelSet` are replaced. A `Solid` with a section is drawn as one, with faces
+        those of a `Surface` are replaced. A `Solid` with a section is drawn as one, with faces
         where it is cut. Without a tolerance, a field gets one that suits its size.
 
     In shaded pictures, the side of larger values of an open surface in one color is darker, and
@@ -157,65 +167,69 @@ def render(
     """
     arguments = locals()  # the settings by name
     target = None if path is None else check_picture_path(path)
-    asked = Request.checked(arguments)
+    asked = RenderOptions.from_arguments(arguments)
     tiles = check_tiles(tiles, divided=client is not None or checkpoint is not None)
     if asked.denoise:
         load_denoiser()
     if target is not None and asked.colorbar and target.suffix.lower() == ".exr":
         raise ValueError(f"{target}: EXR files hold the numbers; a color bar is drawn in .png")
     if not _is_of_studio(what):
-        refuse_studio_settings({name: arguments[name] for name in OF_STUDIO} | settings)
-    job = PictureJob(what, replace(asked, progress=None), settings, register().variant())
-    drawing = job.drawing
+        refuse_studio_settings({name: arguments[name] for name in STUDIO_OPTIONS} | settings)
+    job = RenderJob(what, replace(asked, progress=None), settings, register().variant())
+    drawing = job.task
     if client is not None or checkpoint is not None:
         _check_can_be_sent(what, drawing)
-    with crew(client, checkpoint, tiles) as workers:
-        own = workers.client is None and workers.folder is None
-        hands = OwnHands(drawing) if own else Elsewhere(workers, job)
-        image, shown, names = _drawn(job, hands, of, progress, alone=client is None)
+    with open_executor(client, checkpoint, tiles) as workers:
+        own = workers.client is None and workers.checkpoint is None
+        hands = LocalRenderExecutor(drawing) if own else ClusterRenderExecutor(workers, job)
+        image, shown, names = _render_job(job, hands, of, progress, alone=client is None)
     if target is not None:
         exact = target.suffix.lower() == ".exr"
         write_image(job.mi, target, image if exact else shown, names)
     return Picture.of(image, shown)
 
 
-def _drawn(
-    job: PictureJob, hands: Hands, of: Any, progress: bool | Advance, *, alone: bool
+def _render_job(
+    job: RenderJob, hands: RenderExecutor, of: Any, progress: bool | Advance, *, alone: bool
 ) -> tuple[Image, npt.NDArray[np.uint8], list[str] | None]:
     """The numbers of a picture, its pixels, and the names of its channels if it has its own.
 
     of: as it was given, the title of a color bar. alone: whether this process draws everything.
     """
-    mi, asked, drawing, sensor = job.mi, job.asked, job.drawing, job.scene.sensors()[0]
+    mi, asked, drawing, sensor = job.mi, job.options, job.task, job.scene.sensors()[0]
     if drawing is None:
-        return _by_mitsuba(mi, job.scene, asked)
-    if isinstance(drawing, Viewer):
-        with progress_bar("rendering", progress and not isinstance(hands, OwnHands)) as advance:
+        return _render_by_mitsuba(mi, job.scene, asked)
+    if isinstance(drawing, AovTask):
+        with progress_bar(
+            "rendering", progress and not isinstance(hands, LocalRenderExecutor)
+        ) as advance:
             view = drawing.look(hands, advance)
         bar = str(of) if asked.colorbar is True and isinstance(of, str) else asked.colorbar
         samples = asked.spp or EDGE_SPP
-        shown = drawn(asked.show, drawing, view, asked.value_range, bar, samples, hands)
-        return VIEWS[asked.show].numbers(view), shown, None
-    if isinstance(drawing, Exposing) and alone and progress:
-        drawing = _paced(job, drawing, progress)
-        hands = OwnHands(drawing) if isinstance(hands, OwnHands) else hands
+        shown = aov_picture(asked.show, drawing, view, asked.value_range, bar, samples, hands)
+        return AOV_MODES[asked.show].numbers(view), shown, None
+    if isinstance(drawing, PathRenderTask) and alone and progress:
+        drawing = _with_time_estimate(job, drawing, progress)
+        hands = LocalRenderExecutor(drawing) if isinstance(hands, LocalRenderExecutor) else hands
     with progress_bar("rendering", progress) as advance:
-        if isinstance(drawing, Shading):
-            image, lost = shaded(drawing, hands, advance)
+        if isinstance(drawing, ShadedTask):
+            image, lost = render_shaded(drawing, hands, advance)
         else:
-            found = expose(drawing, advance, hands)
-            image, lost = denoised(found) if asked.denoise else found.image, found.lost
+            found = render_paths(drawing, advance, hands)
+            image, lost = denoise_image(found) if asked.denoise else found.image, found.lost
     _warn_of(lost, _LIT[asked.show])
-    return *_before_backdrop(mi, sensor, image, job.stage, asked.show), None
+    return *_composite_over_backdrop(mi, sensor, image, job.stage, asked.show), None
 
 
-def _paced(job: PictureJob, drawing: Exposing, progress: bool | Advance) -> Exposing:
+def _with_time_estimate(
+    job: RenderJob, drawing: PathRenderTask, progress: bool | Advance
+) -> PathRenderTask:
     """The same in bands after which a progress bar can move; says how long a long picture takes."""
-    pace = pace_of(
+    pace = estimate_time(
         job.mi, job.scene, drawing.sensor, drawing.tracer, spp=drawing.spp,
         features=drawing.features,
     )  # fmt: skip
-    if progress is True and pace.picture > SHORT:
+    if progress is True and pace.picture > MIN_REPORTED_SECONDS:
         Console(stderr=True, highlight=False).print(
             f"this picture will take about {pace}, with {drawing.spp} samples a pixel"
         )
@@ -223,7 +237,7 @@ def _paced(job: PictureJob, drawing: Exposing, progress: bool | Advance) -> Expo
 
 
 def _is_of_studio(what: Any) -> bool:
-    return isinstance(what, Field | LevelSet | list | tuple)
+    return isinstance(what, Field | Surface | list | tuple)
 
 
 def _check_can_be_sent(what: Any, drawing: Any) -> None:
@@ -238,8 +252,8 @@ def _check_can_be_sent(what: Any, drawing: Any) -> None:
         )
 
 
-def _by_mitsuba(
-    mi: Any, scene: Any, asked: Request
+def _render_by_mitsuba(
+    mi: Any, scene: Any, asked: RenderOptions
 ) -> tuple[Image, npt.NDArray[np.uint8], list[str]]:
     """The numbers (h, w, n) of a scene without our surfaces, with all channels of its own
     integrator, the pixels of the first of them, and the names of all."""
@@ -251,7 +265,7 @@ def _by_mitsuba(
     names = [name for name in scene.integrator().aov_names() if name[-2:] not in _IN_AOV]
     basic = image.shape[-1] - len(names)
     names = [*{1: "Y", 2: "YA"}.get(basic, "RGBA"[:basic]), *names]
-    return image, tone_mapped(image[..., :basic] if basic >= 3 else image[..., 0]), names
+    return image, tone_map(image[..., :basic] if basic >= 3 else image[..., 0]), names
 
 
 def _warn_of(lost: int, what: str) -> None:
@@ -261,19 +275,19 @@ def _warn_of(lost: int, what: str) -> None:
         )
 
 
-def _before_backdrop(
-    mi: Any, sensor: Any, image: Image, stage: Studio | None, show: str
+def _composite_over_backdrop(
+    mi: Any, sensor: Any, image: Image, stage: StudioScene | None, show: str
 ) -> tuple[Image, npt.NDArray[np.uint8]]:
     """The numbers of a picture, given as light and the part that is covered, and its pixels."""
     if stage is None:
         has_alpha = mi.has_flag(sensor.film().flags(), mi.FilmFlags.Alpha)
         image = image if has_alpha else np.ascontiguousarray(image[..., :3])
-        return image, tone_mapped(image)
+        return image, tone_map(image)
     if stage.backdrop is None:
-        return image, tone_mapped(image)
+        return image, tone_map(image)
     light, free = image[..., :3], 1 - image[..., 3:]
-    if isinstance(stage.backdrop, Ground):
-        image = light + free * wall(mi, sensor, stage.backdrop, stage.azimuth, show)
-        return image, tone_mapped(image)
-    behind = flat(mi, stage.backdrop, (image.shape[1], image.shape[0]))
-    return light + free * behind, tone_mapped(image, behind)
+    if isinstance(stage.backdrop, GroundBackdrop):
+        image = light + free * studio_wall(mi, sensor, stage.backdrop, stage.azimuth, show)
+        return image, tone_map(image)
+    behind = backdrop_image(mi, stage.backdrop, (image.shape[1], image.shape[0]))
+    return light + free * behind, tone_map(image, behind)

@@ -12,14 +12,14 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import FloatArray
-from harnack.backend.loops import on_some
-from harnack.rendering.isolines import Isolines, PreparedIsolines, line_at
-from harnack.rendering.surface_hits import CappedSolid, SurfaceHit, meet_surface
-from harnack.tracer.pixel_cones import Cones
+from harnack.backend.loops import compute_on_active
+from harnack.rendering.isolines import Isolines, PreparedIsolines, isoline_index_at
+from harnack.rendering.surface_hits import CappedSolid, SurfaceHit, intersect_surface
+from harnack.tracer.pixel_cones import PixelCones
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Index, Mask, Real, Vec3
-    from harnack.tracer import LevelSet, PreparedLevelSet
+    from harnack.tracer import Surface, SurfaceTracer
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class Placement:
         turned: FloatArray = np.matmul(local, np.transpose(self.rotation))
         return self.scale * turned + self.translation
 
-    def undo(self, points: npt.ArrayLike) -> FloatArray:
+    def apply_inverse(self, points: npt.ArrayLike) -> FloatArray:
         """Points (n, 3) of the world, in the surface's coordinates."""
         world: FloatArray = np.asarray(points, dtype=np.float64)
         local: FloatArray = np.matmul(world - self.translation, self.rotation)
@@ -86,7 +86,7 @@ class Placement:
 
 
 @dataclass(frozen=True)
-class _Spot:
+class _HitPoint:
     """Where a surface is hit, and its normal there."""
 
     position: Vec3
@@ -94,29 +94,29 @@ class _Spot:
 
 
 @dataclass(frozen=True)
-class _Number:
+class _IsolineIndex:
     """The number of an isoline."""
 
-    line: Index
+    isoline_index: Index
 
 
 @dataclass(frozen=True)
 class PlacedSurface:
     """A level set or solid on a backend, to be hit by rays of the world.
 
-    rows: of the rotation; all numbers are kernel parameters. lines: isolines drawn on it.
+    rotation_rows: of the rotation; all numbers are kernel parameters. lines: isolines drawn on it.
     """
 
-    prepared: PreparedLevelSet
+    prepared: SurfaceTracer
     solid: CappedSolid | None
     scale: Real
-    rows: tuple[Vec3, Vec3, Vec3]
+    rotation_rows: tuple[Vec3, Vec3, Vec3]
     translation: Vec3
-    lines: tuple[PreparedIsolines, ...] = ()
+    isolines: tuple[PreparedIsolines, ...] = ()
 
     @classmethod
     def of(
-        cls, surface: LevelSet, placement: Placement, backend: Backend,
+        cls, surface: Surface, placement: Placement, backend: Backend,
         isolines: Sequence[Isolines] = (), size: float = 1.0,
     ) -> PlacedSurface:  # fmt: skip
         """Everything uploaded. size: diagonal of the surface's box, for the width of lines."""
@@ -132,12 +132,14 @@ class PlacedSurface:
         return cls(prepared, solid, scale, rows, vector(placement.translation), lines)
 
     def queued(self) -> PlacedSurface:
-        """The same, whose rays are traced without delay (`PreparedLevelSet.queued`)."""
-        prepared = replace(self.prepared, queued=True)
+        """The same, whose rays are traced without delay (`SurfaceTracer.uses_ray_queue`)."""
+        prepared = replace(self.prepared, uses_ray_queue=True)
         solid = None if self.solid is None else replace(self.solid, prepared=prepared)
         return replace(self, prepared=prepared, solid=solid)
 
-    def meet(self, o: Vec3, d: Vec3, t_max: Real, active: Mask, leaves: Real = 0.0) -> SurfaceHit:
+    def intersect(
+        self, o: Vec3, d: Vec3, t_max: Real, active: Mask, leaves: Real = 0.0
+    ) -> SurfaceHit:
         """Where rays of the world, |d| = 1, first hit it, in coordinates of the world.
 
         leaves: of a ray that starts on this very surface, 1 or -1 for the side of the normal that
@@ -145,31 +147,31 @@ class PlacedSurface:
         """
         o, d, t_max = self._local_ray(o, d, t_max)
         if self.solid is not None:
-            met = self.solid.meet(o, d, t_max, active, leaves)
+            met = self.solid.intersect(o, d, t_max, active, leaves)
         else:
-            met = meet_surface(self.prepared, o, d, t_max, active)
-        if self.lines:
-            met = replace(met, line=self._line(met))
+            met = intersect_surface(self.prepared, o, d, t_max, active)
+        if self.isolines:
+            met = replace(met, isoline_index=self._line(met))
         position = self.scale * self._to_world(met.position) + self.translation
         return replace(
             met,
             t=self.scale * met.t,
             position=position,
             normal=self._to_world(met.normal),
-            clearance=self.scale * met.clearance,
+            ray_offset=self.scale * met.ray_offset,
         )
 
     def _line(self, met: SurfaceHit) -> Index:
         """The number of the isoline at hits in the surface's coordinates."""
         index = self.prepared.backend.UInt32
 
-        def numbers(spot: _Spot) -> _Number:
-            return _Number(line_at(self.lines, spot.position, spot.normal, index))
+        def numbers(spot: _HitPoint) -> _IsolineIndex:
+            return _IsolineIndex(isoline_index_at(self.isolines, spot.position, spot.normal, index))
 
-        spot, none = _Spot(met.position, met.normal), _Number(index(0))
-        if self.prepared.queued:
-            return on_some(met.met, numbers, spot, none).line
-        return dr.select(met.met, numbers(spot).line, 0)
+        spot, none = _HitPoint(met.position, met.normal), _IsolineIndex(index(0))
+        if self.prepared.uses_ray_queue:
+            return compute_on_active(met.is_hit, numbers, spot, none).isoline_index
+        return dr.select(met.is_hit, numbers(spot).isoline_index, 0)
 
     def has_line_near(self, position: Vec3, normal: Vec3, across: Vec3, down: Vec3) -> Mask:
         """Whether the edge of an isoline passes near points of the surface, in the world.
@@ -181,8 +183,8 @@ class PlacedSurface:
         n = self._to_local(vector(normal))
         u, v = (self._to_local(vector(one)) / self.scale for one in (across, down))
         near = self.prepared.backend.Bool(False)
-        for one in self.lines:
-            near |= one.pass_near(p, n, u, v)
+        for one in self.isolines:
+            near |= one.edge_is_near(p, n, u, v)
         return near
 
     def occludes(self, o: Vec3, d: Vec3, t_max: Real, active: Mask) -> Mask:
@@ -193,16 +195,23 @@ class PlacedSurface:
         return self.prepared.occluded(o, d, 0, t_max, active)
 
     def covers_in_part(
-        self, o: Vec3, d: Vec3, radius: Real, t_max: Real, around: tuple[Vec3, Real, Real] | None
+        self,
+        o: Vec3,
+        d: Vec3,
+        radius: Real,
+        t_max: Real,
+        bounding_balls: tuple[Vec3, Real, Real] | None,
     ) -> Mask:
         """Which cones around rays of the world it covers in part, before t_max or anything else.
 
-        radius: per unit of t. around: see `Cones`. The surface must be prepared for crossings.
+        radius: per unit of t. around: see `PixelCones`. The surface must be prepared for crossings.
         """
         o, d, t_max = self._local_ray(o, d, t_max)
         solid = None if self.solid is None else (self.solid.low, self.solid.high)
-        cones = Cones(self.prepared, o, d, self.prepared.backend.Float(radius), around, solid)
-        return cones.are_covered_in_part(t_max, True)[0]
+        cones = PixelCones(
+            self.prepared, o, d, self.prepared.backend.Float(radius), bounding_balls, solid
+        )
+        return cones.partially_covered(t_max, True)[0]
 
     def _local_ray(self, o: Vec3, d: Vec3, t_max: Real) -> tuple[Vec3, Vec3, Real]:
         backend = self.prepared.backend
@@ -210,8 +219,8 @@ class PlacedSurface:
         return local, self._to_local(backend.Array3f(d)), backend.Float(t_max) / self.scale
 
     def _to_world(self, v: Vec3) -> Vec3:
-        return self.prepared.backend.Array3f(*(dr.dot(row, v) for row in self.rows))
+        return self.prepared.backend.Array3f(*(dr.dot(row, v) for row in self.rotation_rows))
 
     def _to_local(self, v: Vec3) -> Vec3:
         x, y, z = v
-        return self.rows[0] * x + self.rows[1] * y + self.rows[2] * z
+        return self.rotation_rows[0] * x + self.rotation_rows[1] * y + self.rotation_rows[2] * z

@@ -10,20 +10,20 @@ from typing import Any, cast
 
 import numpy as np
 
-from harnack.cluster.executor import Arrays, Crew
+from harnack.cluster.executor import Executor, TaskResult
 from harnack.fields import Field
-from harnack.fields.field import instead_of_field
-from harnack.rendering.aov_render import VIEWS, View, Viewer
-from harnack.rendering.backdrops import Gradient
-from harnack.rendering.light_paths import Exposing
-from harnack.rendering.mitsuba import load_dictionary, load_scene_file, take_variant
-from harnack.rendering.mitsuba_plugins import register, stand_in
+from harnack.fields.field import suggest_field
+from harnack.rendering.aov_render import AOV_MODES, AovBuffers, AovTask
+from harnack.rendering.backdrops import GradientBackdrop
+from harnack.rendering.light_paths import PathRenderTask
+from harnack.rendering.mitsuba import load_dict, load_scene_file, set_variant
+from harnack.rendering.mitsuba_plugins import equivalent_path_tracer, register
 from harnack.rendering.placed_surface import Placement
-from harnack.rendering.render_options import Request, check_memory, check_spp
-from harnack.rendering.shaded_render import Seen, Shading
-from harnack.rendering.stage import STUDIO_SPP, Studio, studio
+from harnack.rendering.render_options import RenderOptions, check_memory, check_spp
+from harnack.rendering.shaded_render import GBuffer, ShadedTask
+from harnack.rendering.stage import STUDIO_SPP, StudioScene, build_studio
 from harnack.rendering.studio_surfaces import studio_objects
-from harnack.tracer import LevelSet
+from harnack.tracer import Surface
 
 EDGE_SPP = 9
 # Light paths that a worker follows at a time: some hundred bytes each, of what may be a small
@@ -35,7 +35,7 @@ _RAYS_A_PATH = 3
 
 
 @dataclass(frozen=True)
-class PictureJob:
+class RenderJob:
     """All that decides what is in a picture.
 
     what: fields or a Mitsuba scene, as `render` takes them. asked: how to draw them. settings: of
@@ -45,22 +45,22 @@ class PictureJob:
     """
 
     what: Any
-    asked: Request
+    options: RenderOptions
     settings: Mapping[str, Any]
     variant: str
 
     @property
     def mi(self) -> Any:
         """Mitsuba, in the variant and with our plug-ins."""
-        take_variant(self.variant)
+        set_variant(self.variant)
         return register()
 
     @functools.cached_property
-    def stage(self) -> Studio | None:
+    def stage(self) -> StudioScene | None:
         """The studio in which surfaces are drawn; None for a Mitsuba scene."""
-        if not isinstance(self.what, Field | LevelSet | list | tuple):
+        if not isinstance(self.what, Field | Surface | list | tuple):
             return None
-        asked, size = self.asked, self.asked.size or _SIZE
+        asked, size = self.options, self.options.size or _SIZE
         check_memory(asked.show, *size)
         on_stage = studio_objects(
             self.what, asked.material, self.settings, boundary=asked.boundary,
@@ -68,13 +68,13 @@ class PictureJob:
             isolines=asked.isolines, thickness=asked.thickness,
         )  # fmt: skip
         rays = size[0] * size[1]
-        if asked.show not in (*VIEWS, "shaded"):
+        if asked.show not in (*AOV_MODES, "shaded"):
             rays *= _RAYS_A_PATH * (asked.spp or STUDIO_SPP)
         on_stage = [replace(one, surface=one.surface.for_rays(rays)) for one in on_stage]
-        return studio(
+        return build_studio(
             self.mi, on_stage, size=size, camera=asked.camera,
             backdrop=asked.backdrop, up="z" if asked.up is None else asked.up,
-            bare=asked.show in VIEWS, traced_light=asked.show == "color",
+            bare=asked.show in AOV_MODES, traced_light=asked.show == "path",
         )  # fmt: skip
 
     @functools.cached_property
@@ -82,28 +82,28 @@ class PictureJob:
         """The Mitsuba scene that is drawn."""
         if self.stage is not None:
             return self.mi.load_dict(self.stage.scene, parallel=False)
-        scene = _loaded(self.mi, self.what, self.asked.size)
-        check_memory(self.asked.show, *map(int, scene.sensors()[0].film().crop_size()))
+        scene = _loaded(self.mi, self.what, self.options.size)
+        check_memory(self.options.show, *map(int, scene.sensors()[0].film().crop_size()))
         return scene
 
     @functools.cached_property
-    def drawing(self) -> Viewer | Exposing | Shading | None:
+    def task(self) -> AovTask | PathRenderTask | ShadedTask | None:
         """What can be drawn pixel by pixel; None for a scene that Mitsuba draws."""
-        mi, asked, stage = self.mi, self.asked, self.stage
+        mi, asked, stage = self.mi, self.options, self.stage
         scene = self.scene
         sensor = scene.sensors()[0]
-        if asked.show in VIEWS:
+        if asked.show in AOV_MODES:
             placement = Placement.identity() if stage is None else stage.placement
-            viewer = Viewer.of(mi, scene, sensor, placement, asked.of)
-            if isinstance(asked.backdrop, Gradient):
+            viewer = AovTask.of(mi, scene, sensor, placement, asked.of)
+            if isinstance(asked.backdrop, GradientBackdrop):
                 viewer = replace(viewer, background=asked.backdrop.bottom)
             return viewer
         if asked.show == "shaded":
-            return Shading(
+            return ShadedTask(
                 mi, scene, sensor, spp=asked.spp or EDGE_SPP, cut_out=stage is not None,
                 on_floor=stage is not None and stage.has_ground, cones=asked.antialias == "cones",
             )  # fmt: skip
-        tracer = stand_in(mi, scene)
+        tracer = equivalent_path_tracer(mi, scene)
         if tracer is None:
             return None
         if asked.max_depth is not None:
@@ -111,64 +111,63 @@ class PictureJob:
         spp = asked.spp or check_spp(
             int(sensor.sampler().sample_count()), source=", which the scene's sampler asks for"
         )
-        return Exposing(mi, scene, sensor, tracer, spp, asked.seed, asked.denoise)
+        return PathRenderTask(mi, scene, sensor, tracer, spp, asked.seed, asked.denoise)
 
-    def _drawing_here(self) -> Any:
-        """The drawing, after a worker may have worked in another variant."""
-        take_variant(self.variant)
-        return self.drawing
+    def _task_here(self) -> Any:
+        """The task, after a worker may have worked in another variant."""
+        set_variant(self.variant)
+        return self.task
 
-    def pixels(self, start: int, stop: int) -> Arrays:
-        """As of `Exposing`."""
-        drawing = replace(cast("Exposing", self._drawing_here()), paths_a_band=_PATHS_A_BAND)
-        return _with_lost(drawing.pixels(start, stop))
+    def render_range(self, start: int, stop: int) -> TaskResult:
+        """As of the task: an `AovTask` or a `PathRenderTask`."""
+        task = self._task_here()
+        if isinstance(task, AovTask):
+            return _arrays_of(task.render_range(start, stop))
+        task = replace(cast("PathRenderTask", task), paths_a_band=_PATHS_A_BAND)
+        return _with_lost(task.render_range(start, stop))
 
-    def look(self, start: int, stop: int) -> Arrays:
-        """As of `Shading`."""
-        return cast("Shading", self._drawing_here()).look(start, stop).numbers()
+    def render_samples(self, *part: Any) -> TaskResult:
+        """As of `AovTask`."""
+        return _arrays_of(cast("AovTask", self._task_here()).render_samples(*part))
 
-    def refine(self, *part: Any) -> Arrays:
-        """As of `Shading`."""
-        return _with_lost(cast("Shading", self._drawing_here()).refine(*part))
+    def render_gbuffer(self, start: int, stop: int) -> TaskResult:
+        """As of `ShadedTask`."""
+        return cast("ShadedTask", self._task_here()).render_gbuffer(start, stop).to_numpy()
 
-    def view(self, start: int, stop: int) -> Arrays:
-        """As of `Viewer`."""
-        return _arrays_of(cast("Viewer", self._drawing_here()).view(start, stop))
-
-    def look_again(self, *part: Any) -> Arrays:
-        """As of `Viewer`."""
-        return _arrays_of(cast("Viewer", self._drawing_here()).look_again(*part))
+    def refine_pixels(self, *part: Any) -> TaskResult:
+        """As of `ShadedTask`."""
+        return _with_lost(cast("ShadedTask", self._task_here()).refine_pixels(*part))
 
 
 @dataclass(frozen=True)
-class Elsewhere:
+class ClusterRenderExecutor:
     """Hands that are a crew's: they call methods of a job and give what its drawing would."""
 
-    crew: Crew
-    job: PictureJob
+    crew: Executor
+    job: RenderJob
 
-    def cut(self, count: int, most: int) -> list[tuple[int, int]]:
+    def split_range(self, count: int, most: int) -> list[tuple[int, int]]:
         """As suits the crew."""
-        return self.crew.cut(count, most)
+        return self.crew.split_range(count, most)
 
-    def each(self, step: str, parts: Sequence[tuple[Any, ...]]) -> Iterator[Any]:
+    def run_tasks(self, step: str, parts: Sequence[tuple[Any, ...]]) -> Iterator[Any]:
         """In order, several at the same time."""
-        drawing = self.job.drawing
-        for found in self.crew.each(self.job, step, parts):
-            if isinstance(drawing, Viewer):
+        drawing = self.job.task
+        for found in self.crew.run_tasks(self.job, step, parts):
+            if isinstance(drawing, AovTask):
                 period = None if drawing.function is None else drawing.function.period
-                yield View(**found, period=period, background=drawing.background)
-            elif step == "look":
-                yield Seen.from_numbers(self.job.mi, found)
+                yield AovBuffers(**found, period=period, background=drawing.background)
+            elif step == "render_gbuffer":
+                yield GBuffer.from_numbers(self.job.mi, found)
             else:
                 yield found["means"], int(found["lost"])
 
 
-def _with_lost(found: tuple[Any, int]) -> Arrays:
+def _with_lost(found: tuple[Any, int]) -> TaskResult:
     return {"means": found[0], "lost": np.array(found[1])}
 
 
-def _arrays_of(view: View) -> Arrays:
+def _arrays_of(view: AovBuffers) -> TaskResult:
     return {name: one for name, one in vars(view).items() if isinstance(one, np.ndarray)}
 
 
@@ -178,13 +177,13 @@ def _loaded(mi: Any, what: Any, size: tuple[int, int] | None) -> Any:
             raise ValueError("size: a loaded scene has its own; set film.size of its sensor")
         scene = what
     elif isinstance(what, Mapping):
-        scene = load_dictionary(mi, cast("Mapping[str, Any]", what))
+        scene = load_dict(mi, cast("Mapping[str, Any]", what))
     elif isinstance(what, str | os.PathLike):
         scene = load_scene_file(mi, cast("str | os.PathLike[str]", what))
     else:
         raise TypeError(
-            "draw a field, a LevelSet, a list of them, or a Mitsuba scene, its dictionary or the "
-            f"path of its file, not what is {instead_of_field(what)}"
+            "draw a field, a Surface, a list of them, or a Mitsuba scene, its dictionary or the "
+            f"path of its file, not what is {suggest_field(what)}"
         )
     if not scene.sensors():
         raise ValueError("the scene has no sensor to look through")

@@ -12,19 +12,19 @@ from typing import Any
 
 import numpy as np
 
-from harnack.backend.validation import whole
+from harnack.backend.validation import as_integer_in_range
 from harnack.fields import Field
 from harnack.name_suggestions import did_you_mean
-from harnack.rendering.aov_render import GROUND_OF_VIEWS, SCALED, VIEWS
-from harnack.rendering.backdrops import Backdrop, Gradient, Ground, checked_backdrop
+from harnack.rendering.aov_render import AOV_BACKGROUNDS, AOV_MODES, MODES_WITH_SCALE
+from harnack.rendering.backdrops import Backdrop, GradientBackdrop, GroundBackdrop, parse_backdrop
 from harnack.rendering.camera import Camera
-from harnack.rendering.isolines import Isolines, checked_isolines, function_of
+from harnack.rendering.isolines import Isolines, as_field, parse_isolines
 from harnack.rendering.scales import require_pillow, typeface_for
 from harnack.tracer import level_set
 
-SHOW_MODES: tuple[str, ...] = ("color", "shaded", *VIEWS)
+SHOW_MODES: tuple[str, ...] = ("path", "shaded", *AOV_MODES)
 # Pictures that may have isolines.
-LINED = ("color", "shaded", "value")
+MODES_WITH_ISOLINES = ("path", "shaded", "value")
 ANTIALIASING = ("edges", "cones")
 MAX_SIDE = 32768
 MAX_SPP = 1_000_000
@@ -32,7 +32,7 @@ _MOST_TILES = 1_000_000
 # The largest number that the path tracer's counters hold.
 _MAX_INTEGER = 2**31 - 1
 # Names of settings in other programs, and what they are called here.
-_CALLED_ELSEWHERE = {
+_OTHER_PROGRAMS_NAMES = {
     "color": '"material"', "colour": '"material"', "bsdf": '"material"', "samples": '"spp"',
     "resolution": '"size"', "width": '"size"', "height": '"size"',
     "filename": '"path", the second argument', "output": '"path", the second argument',
@@ -43,7 +43,7 @@ _CALLED_ELSEWHERE = {
     ),
 }  # fmt: skip
 # Peak memory in bytes per pixel, measured at 2048 x 2048 and 4096 x 4096, rounded up.
-_BYTES = {"color": 50, "shaded": 280, "value": 240}
+_BYTES = {"path": 50, "shaded": 280, "value": 240}
 _BYTES_OF_VIEWS = 130
 
 
@@ -65,19 +65,21 @@ def check_denoise(denoise: Any, show: str) -> bool:
 
 
 def _check_has_paths(setting: str, show: str) -> None:
-    if show != "color":
-        raise ValueError(f'{setting} needs a picture with show="color", not show="{show}"')
+    if show != "path":
+        raise ValueError(f'{setting} needs a picture with show="path", not show="{show}"')
 
 
 def check_isolines(isolines: Any, show: str) -> tuple[Isolines, ...]:
     """Isolines as a tuple; ValueError for pictures that cannot have any."""
-    lines = checked_isolines(isolines)
-    if lines and show not in LINED:
-        raise ValueError(f'isolines need a picture with show={_either(LINED)}, not "{show}"')
+    lines = parse_isolines(isolines)
+    if lines and show not in MODES_WITH_ISOLINES:
+        raise ValueError(
+            f'isolines need a picture with show={_join_or(MODES_WITH_ISOLINES)}, not "{show}"'
+        )
     return lines
 
 
-def check_function(of: Any, show: str) -> Field | None:
+def check_color_by(of: Any, show: str) -> Field | None:
     """The function whose values are shown; ValueError if it is missing, or given for another kind
     of picture."""
     if show != "value":
@@ -89,7 +91,7 @@ def check_function(of: Any, show: str) -> Field | None:
             'show="value" needs the function whose values are shown on the surface, such as '
             'of="z", another field, or a function of x, y and z'
         )
-    return function_of(of)
+    return as_field(of)
 
 
 def check_value_range(value_range: Any, show: str) -> tuple[float, float] | None:
@@ -121,18 +123,21 @@ def check_colorbar(colorbar: Any, show: str) -> bool | str:
     return colorbar
 
 
-def check_behind(backdrop: Any, show: str) -> Backdrop:
-    """What is behind the surfaces: any backdrop, or one color for pictures of numbers (`VIEWS`).
+def check_backdrop(backdrop: Any, show: str) -> Backdrop:
+    """What is behind the surfaces: any backdrop, or one color for pictures of numbers
+    (`AOV_MODES`).
 
     Raises:
         TypeError, ValueError: it is no backdrop, or not one color where that is required.
     """
     if backdrop is None:
-        return Ground("light")
-    behind = checked_backdrop(backdrop)
-    if show in VIEWS and isinstance(behind, Ground):
-        return Gradient(*(GROUND_OF_VIEWS[behind.name],) * 2)
-    if show in VIEWS and not (isinstance(behind, Gradient) and behind.bottom == behind.top):
+        return GroundBackdrop("light")
+    behind = parse_backdrop(backdrop)
+    if show in AOV_MODES and isinstance(behind, GroundBackdrop):
+        return GradientBackdrop(*(AOV_BACKGROUNDS[behind.name],) * 2)
+    if show in AOV_MODES and not (
+        isinstance(behind, GradientBackdrop) and behind.bottom == behind.top
+    ):
         raise ValueError(
             f'with show="{show}", backdrop must be one color, such as backdrop="white", '
             f"not {backdrop!r}"
@@ -141,11 +146,13 @@ def check_behind(backdrop: Any, show: str) -> Backdrop:
 
 
 def _check_scaled(setting: str, show: str) -> None:
-    if show not in SCALED:
-        raise ValueError(f'{setting} needs a picture with show={_either(SCALED)}, not "{show}"')
+    if show not in MODES_WITH_SCALE:
+        raise ValueError(
+            f'{setting} needs a picture with show={_join_or(MODES_WITH_SCALE)}, not "{show}"'
+        )
 
 
-def _either(names: Sequence[str]) -> str:
+def _join_or(names: Sequence[str]) -> str:
     return " or ".join(f'"{name}"' for name in names)
 
 
@@ -174,7 +181,7 @@ def check_antialias(antialias: Any, show: str) -> str | None:
     return antialias
 
 
-def check_size(size: Any) -> tuple[int, int]:
+def check_image_size(size: Any) -> tuple[int, int]:
     """A size in pixels.
 
     Raises:
@@ -219,7 +226,7 @@ def check_tiles(tiles: Any, *, divided: bool) -> int | None:
     """How many parts a task is cut into, or None; divided: whether it is cut at all."""
     if tiles is not None and not divided:
         raise ValueError("tiles: parts are drawn one by one with a client or a checkpoint only")
-    return None if tiles is None else whole(tiles, "tiles", 1, _MOST_TILES)
+    return None if tiles is None else as_integer_in_range(tiles, "tiles", 1, _MOST_TILES)
 
 
 def _index(number: Any) -> int:
@@ -248,7 +255,7 @@ def check_camera(camera: Any) -> Camera:
 Check = Callable[[Any, str], Any]
 
 
-def _by(check: Callable[[Any], Any]) -> Check:
+def _ignoring_mode(check: Callable[[Any], Any]) -> Check:
     """A check that does not depend on what is shown."""
     return lambda given, show: check(given)
 
@@ -272,30 +279,30 @@ def _setting(check: Check = _as_given, **marks: bool) -> Mapping[str, Any]:
     """The metadata of a setting: its check, which gets the setting and `show`, and marks.
 
     of_studio: it is for the studio alone; a Mitsuba scene does not take it.
-    of_surfaces: it changes where surfaces are.
+    surface_options: it changes where surfaces are.
     """
     return {"check": check, **marks}
 
 
 @dataclass(frozen=True)
-class Request:
+class RenderOptions:
     """The settings of `render`, checked: sizes and counts are integers, None means not set. Each
     field holds its check; films read this table too."""
 
-    show: str = field(metadata=_setting(_by(check_show)))
-    size: tuple[int, int] | None = field(metadata=_setting(_if_given(check_size)))
+    show: str = field(metadata=_setting(_ignoring_mode(check_show)))
+    size: tuple[int, int] | None = field(metadata=_setting(_if_given(check_image_size)))
     spp: int | None = field(metadata=_setting(_if_given(check_spp)))
     antialias: str | None = field(metadata=_setting(check_antialias))
     material: Any = field(metadata=_setting(of_studio=True))
-    camera: Camera = field(metadata=_setting(_by(check_camera), of_studio=True))
-    backdrop: Backdrop = field(metadata=_setting(check_behind, of_studio=True))
+    camera: Camera = field(metadata=_setting(_ignoring_mode(check_camera), of_studio=True))
+    backdrop: Backdrop = field(metadata=_setting(check_backdrop, of_studio=True))
     up: Any = field(metadata=_setting(of_studio=True))
-    boundary: float | None = field(metadata=_setting(of_studio=True, of_surfaces=True))
+    boundary: float | None = field(metadata=_setting(of_studio=True, surface_options=True))
     boundary_material: Any = field(metadata=_setting(of_studio=True))
     cut_material: Any = field(metadata=_setting(of_studio=True))
     isolines: tuple[Isolines, ...] = field(metadata=_setting(check_isolines, of_studio=True))
-    thickness: float | None = field(metadata=_setting(of_studio=True, of_surfaces=True))
-    of: Field | None = field(metadata=_setting(check_function))
+    thickness: float | None = field(metadata=_setting(of_studio=True, surface_options=True))
+    of: Field | None = field(metadata=_setting(check_color_by))
     value_range: tuple[float, float] | None = field(metadata=_setting(check_value_range))
     colorbar: bool | str = field(metadata=_setting(check_colorbar))
     max_depth: int | None = field(metadata=_setting(check_max_depth))
@@ -311,7 +318,7 @@ class Request:
             )
 
     @classmethod
-    def checked(cls, given: Mapping[str, Any]) -> Request:
+    def from_arguments(cls, given: Mapping[str, Any]) -> RenderOptions:
         """The settings, from the arguments of `render` by name.
 
         Raises:
@@ -323,10 +330,12 @@ class Request:
         )
 
 
-SETTINGS = tuple(one.name for one in fields(Request))
-OF_STUDIO = tuple(one.name for one in fields(Request) if "of_studio" in one.metadata)
+OPTION_NAMES = tuple(one.name for one in fields(RenderOptions))
+STUDIO_OPTIONS = tuple(one.name for one in fields(RenderOptions) if "of_studio" in one.metadata)
 # Those that do not change where surfaces are.
-OF_PICTURES = tuple(one.name for one in fields(Request) if "of_surfaces" not in one.metadata)
+APPEARANCE_OPTIONS = tuple(
+    one.name for one in fields(RenderOptions) if "surface_options" not in one.metadata
+)
 
 
 def check_settings(settings: Mapping[str, Any]) -> None:
@@ -334,10 +343,11 @@ def check_settings(settings: Mapping[str, Any]) -> None:
     of_surface = [name for name in inspect.signature(level_set).parameters if name != "field"]
     for name in settings:
         if name not in of_surface:
-            ours = _CALLED_ELSEWHERE.get(name.lower())
-            hint = did_you_mean(name, (*SETTINGS, *of_surface))
+            ours = _OTHER_PROGRAMS_NAMES.get(name.lower())
+            hint = did_you_mean(name, (*OPTION_NAMES, *of_surface))
             raise TypeError(
-                f"there is no setting {name!r}; there are {', '.join(SETTINGS)} and, of surfaces, "
+                f"there is no setting {name!r}; there are {', '.join(OPTION_NAMES)} and, of "
+                "surfaces, "
                 f"{', '.join(of_surface)}{hint if ours is None else f'; did you mean {ours}?'}"
             )
 

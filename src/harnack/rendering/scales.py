@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.name_suggestions import did_you_mean
-from harnack.rendering.images import transferred
+from harnack.rendering.images import linear_to_srgb
 
 Color = tuple[float, float, float]
 
@@ -57,10 +57,10 @@ NAMED_COLORS: Mapping[str, str] = MappingProxyType(
 )
 """Hexadecimal numbers by name."""
 
-_HOW = 'a name of CSS such as "steelblue", "#4682b4", or three numbers from 0 to 1'
+_COLOR_HELP = 'a name of CSS such as "steelblue", "#4682b4", or three numbers from 0 to 1'
 
 
-def color_of(given: Any, what: str) -> Color:
+def parse_color(given: Any, what: str) -> Color:
     """A color in sRGB, three numbers in [0, 1], as screens show them.
 
     what: the color is of, for messages.
@@ -74,11 +74,11 @@ def color_of(given: Any, what: str) -> Color:
     try:
         numbers = [float("" if isinstance(one, str | bool) else one) for one in given]
     except (TypeError, ValueError):
-        raise TypeError(f"{what} must be {_HOW}, not {given!r}") from None
+        raise TypeError(f"{what} must be {_COLOR_HELP}, not {given!r}") from None
     if len(numbers) != 3:
-        raise TypeError(f"{what} must be {_HOW}, not {given!r}")
+        raise TypeError(f"{what} must be {_COLOR_HELP}, not {given!r}")
     if not all(0 <= one <= 1 for one in numbers):
-        raise ValueError(f"{what} must be {_HOW}, not {given!r}")
+        raise ValueError(f"{what} must be {_COLOR_HELP}, not {given!r}")
     return cast("Color", tuple(numbers))
 
 
@@ -88,14 +88,14 @@ def _from_text(text: str, what: str) -> Color:
         found = re.fullmatch(r"#([0-9a-fA-F]{3}|[0-9a-fA-F]{6})", text.strip())
         if found is None:
             raise ValueError(
-                f"{what} must be {_HOW}, not {text!r}{did_you_mean(text, NAMED_COLORS)}"
+                f"{what} must be {_COLOR_HELP}, not {text!r}{did_you_mean(text, NAMED_COLORS)}"
             )
         digits = found[1] if len(found[1]) == 6 else "".join(2 * digit for digit in found[1])
     red, green, blue = (int(digits[k : k + 2], 16) / 255 for k in (0, 2, 4))
     return red, green, blue
 
 
-def linear(color: Color) -> Color:
+def linear_from_srgb(color: Color) -> Color:
     """A color in sRGB as linear sRGB, which light adds up in (IEC 61966-2-1)."""
     red, green, blue = (_linear(part) for part in color)
     return red, green, blue
@@ -153,7 +153,7 @@ _FROM_CONES = np.array(
 _LIGHTNESS, _CHROMA = 0.72, 0.11
 
 
-def hues(x: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.float64]:
+def cyclic_colormap(x: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.float64]:
     """Colors (..., 3) in sRGB of numbers (...) of which 0 and 1 are the same: all hues, equally
     light and equally far from gray."""
     angle = 2 * np.pi * np.nan_to_num(x).astype(np.float64)
@@ -161,10 +161,10 @@ def hues(x: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.float64]:
         [np.full_like(angle, _LIGHTNESS), _CHROMA * np.cos(angle), _CHROMA * np.sin(angle)], axis=-1
     )
     light = (lab @ _TO_CONES.T) ** 3 @ _FROM_CONES.T
-    return np.clip(transferred(light), 0.0, 1.0)
+    return np.clip(linear_to_srgb(light), 0.0, 1.0)
 
 
-def grays(x: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.float64]:
+def gray_colormap(x: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.float64]:
     """Grays (..., 3) of numbers (...) in [0, 1]: 0 is white, 1 is dark."""
     gray = 0.25 + 0.75 * (1 - np.clip(np.nan_to_num(x), 0.0, 1.0).astype(np.float64))
     return np.repeat(gray[..., None], 3, axis=-1)
@@ -182,12 +182,12 @@ _MOST_PI = 16
 
 
 @dataclass(frozen=True)
-class Scale:
+class ColorScale:
     """Colors of numbers from `low` to `high`; numbers beyond an end have its color.
 
     name: of what is shown, on color bars.
     period: of numbers that count modulo `high` - `low` = period; None for others.
-    passed: whether numbers that are shown lie below `low`, and above `high`.
+    exceeded: whether numbers that are shown lie below `low`, and above `high`.
     """
 
     low: float
@@ -195,20 +195,20 @@ class Scale:
     name: str
     colors_of: Callable[[Numbers], npt.NDArray[np.float64]] = viridis
     period: float | None = None
-    passed: tuple[bool, bool] = (False, False)
+    exceeded: tuple[bool, bool] = (False, False)
 
     @classmethod
-    def cyclic(cls, period: float, name: str) -> Scale:
+    def cyclic(cls, period: float, name: str) -> ColorScale:
         """Of numbers that count modulo a period: its ends have one color."""
-        return cls(0.0, period, name, hues, period)
+        return cls(0.0, period, name, cyclic_colormap, period)
 
-    def passed_by(self, numbers: Numbers) -> Scale:
+    def with_exceeded(self, numbers: Numbers) -> ColorScale:
         """The same, for the bar of a picture that shows these."""
         if self.period is not None or not numbers.size:
             return self
         slack = 1e-6 * max(abs(self.low), abs(self.high))
         below, above = numbers.min() < self.low - slack, numbers.max() > self.high + slack
-        return replace(self, passed=(bool(below), bool(above)))
+        return replace(self, exceeded=(bool(below), bool(above)))
 
     def colors(self, numbers: Numbers) -> npt.NDArray[np.float64]:
         """Colors (..., 3) in sRGB, in [0, 1]."""
@@ -337,7 +337,7 @@ def typeface_for(text: str, size: int) -> Any:
     )
 
 
-def with_bar(pixels: Pixels, scale: Scale, background: Color) -> Pixels:
+def add_color_bar(pixels: Pixels, scale: ColorScale, background: Color) -> Pixels:
     """A picture (h, w, 3) with the bar of its scale to the right: (h, w + more, 3).
 
     An end of the bar is pointed where the picture has numbers beyond it.
@@ -357,7 +357,7 @@ def with_bar(pixels: Pixels, scale: Scale, background: Color) -> Pixels:
     strip = images.new("RGB", (math.ceil(wide) + 2 * letters, height), behind)
     top = (height - length + letters) // 2
     draw = drawings.Draw(strip)
-    point = gap if any(scale.passed) else 0  # its height
+    point = gap if any(scale.exceeded) else 0  # its height
     title = max(0, top - gap - point)
     draw.text((letters, title), scale.name, font=font, fill=ink, anchor="ls")
     values = scale.high - (np.arange(length) + 0.5) / length * (scale.high - scale.low)
@@ -367,7 +367,11 @@ def with_bar(pixels: Pixels, scale: Scale, background: Color) -> Pixels:
     for row, color in enumerate(column):
         draw.line([(letters, top + row), (letters + thick - 1, top + row)], fill=tuple(color))
     for is_passed, row, away, color in zip(
-        scale.passed, (top + length, top - 1), (point, -point), (column[-1], column[0]), strict=True
+        scale.exceeded,
+        (top + length, top - 1),
+        (point, -point),
+        (column[-1], column[0]),
+        strict=True,
     ):
         if is_passed:
             ends = [(letters, row), (letters + thick - 1, row), (letters + thick // 2, row + away)]

@@ -17,34 +17,34 @@ import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
-from harnack.backend import FloatArray, IntArray, aligned, choose_backend, to_numpy
+from harnack.backend import FloatArray, IntArray, choose_backend, to_numpy, upload_floats
 from harnack.fields import Solid
-from harnack.rendering.hybrid_scene import World
-from harnack.rendering.images import tone_mapped
-from harnack.rendering.integrator import LOST_COLOR
-from harnack.rendering.light_paths import Through, as_rgb, mean_of_blocks
+from harnack.rendering.hybrid_scene import HybridScene
+from harnack.rendering.images import tone_map
+from harnack.rendering.integrator import OUT_OF_STEPS_COLOR
+from harnack.rendering.light_paths import RefractionTracer, as_rgb, mean_of_blocks
 from harnack.rendering.mitsuba import mitsuba_backend
 from harnack.rendering.placed_surface import PlacedSurface
 from harnack.rendering.shading import (
-    Floor,
-    Light,
-    edges_of,
-    film_places,
-    grid_offsets,
-    in_tiles,
-    of_mended,
-    of_side,
+    FloorShadow,
+    StudioLight,
+    edge_pixels,
+    film_positions,
+    hole_filling_tint,
+    multijitter_offsets,
     reflectance,
-    uploaded,
+    tiled_pixel_order,
+    two_sided_color,
+    upload_indices,
 )
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
     from harnack.geometry import Volume
-    from harnack.rendering.shading import Hands
+    from harnack.rendering.shading import RenderExecutor
 
 
-class Finder:
+class ConeCoverage:
     """Finds pixels that surfaces may cover in part, by cones, so that no thin part is overlooked.
 
     The ray through the middle of a pixel misses what is thinner than the pixel more often than not,
@@ -55,11 +55,11 @@ class Finder:
             sides of the surface, so that its values tell no distance.
     """
 
-    def __init__(self, mi: Any, world: World) -> None:
+    def __init__(self, mi: Any, world: HybridScene) -> None:
         self.mi = mi
-        self.placed = tuple(_prepared(mi, carrier) for carrier in world.carriers)
+        self.placed = tuple(_prepared(mi, carrier) for carrier in world.proxies)
 
-    def find(self, ray: Any, position: Any) -> Any:
+    def partly_covered(self, ray: Any, position: Any) -> Any:
         """Whether the cones of pixels are covered in part before the points that rays see.
 
         ray: through the middles, with differentials. position: seen; NaN where nothing is.
@@ -79,21 +79,21 @@ def _prepared(mi: Any, carrier: Any) -> tuple[PlacedSurface, Any]:
     """A surface that cones can be tested against outside its extent, and balls in and around the
     extent."""
     surface, backend = carrier.surface, mitsuba_backend(mi)
-    if surface.field.has_parts:
+    if surface.field.has_patches:
         raise ValueError(
             f'antialias="cones" takes a level set of one function, and {surface.field!r} has one '
             'for each part. Leave antialias at "edges"'
         )
-    if surface.field.has_sheets:
+    if surface.field.has_jumps:
         raise ValueError(
             f'antialias="cones" takes fields without jumps, and {surface.field!r} jumps: its '
             'values tell no distance. Leave antialias at "edges"'
         )
     placed = replace(carrier.placed, prepared=surface.prepare(backend, crosses=True))
-    return placed, balls_of(surface.volume, backend)
+    return placed, inner_and_outer_ball(surface.volume, backend)
 
 
-def balls_of(volume: Volume | None, backend: Backend) -> tuple[Vec3, Real, Real] | None:
+def inner_and_outer_ball(volume: Volume | None, backend: Backend) -> tuple[Vec3, Real, Real] | None:
     """The middle of a volume, and the radii about it of a ball in it and of one around it; None
     where it has no end or no such ball was found."""
     if volume is None:
@@ -118,7 +118,9 @@ _TAPS = 8
 _REACH = 0.16
 
 
-def visible_sky(mi: Any, position: Any, normal: Any, width: Any, size: tuple[int, int]) -> Any:
+def ambient_visibility(
+    mi: Any, position: Any, normal: Any, width: Any, size: tuple[int, int]
+) -> Any:
     """The part of the hemisphere over each pixel's point that nothing near it hides, in [0, 1].
 
     position: points seen by the pixels, counted by rows; NaN where nothing is seen. normal: unit,
@@ -169,11 +171,11 @@ _RAYS_A_BAND = 2**17
 # Where in its pixel the first ray goes through.
 _MIDDLE = 0.5
 # The share of the time that is spent on the first rays, as the progress bar guesses.
-_FIRST = 0.6
+_FIRST_PASS_FRACTION = 0.6
 
 
 @dataclass
-class Seen:
+class GBuffer:
     """What rays hit first, or first behind clear matter.
 
     position, normal, eye: the point, its unit normal towards the eye, and the direction to the eye.
@@ -181,12 +183,12 @@ class Seen:
     color: reflectance.
     light: shone by an emitter or the environment and reflected by clear matter, or magenta for
         lost.
-    through: what clear matter leaves of the light from what is hit.
+    transmittance: what clear matter leaves of the light from what is hit.
     glossy: whether the material is glossy. met, lost: whether there is a hit; and whether the ray
         ran out of steps.
     covered: whether there is anything at all, and not the environment alone.
-    marked: whether to draw the pixel again, as the edge of an isoline may pass through it, or a
-        cone found that a surface covers a part of it.
+    needs_refinement: whether to draw the pixel again, as the edge of an isoline may pass through
+        it, or a cone found that a surface covers a part of it.
     """
 
     position: Any
@@ -195,27 +197,27 @@ class Seen:
     width: Any
     color: Any
     light: Any
-    through: Any
+    transmittance: Any
     glossy: Any
     met: Any
     lost: Any
     covered: Any
-    marked: Any
+    needs_refinement: Any
 
     @classmethod
-    def nothing(cls, mi: Any, count: int) -> Seen:
+    def nothing(cls, mi: Any, count: int) -> GBuffer:
         """Empty arrays for `count` pixels, to scatter to."""
         vectors, colors, masks = (mi.Vector3f,) * 3, (mi.Color3f,) * 3, (mi.Bool,) * 5
         kinds = (*vectors, mi.Float, *colors, *masks)
         return cls(*(dr.zeros(kind, count) for kind in kinds))
 
-    def numbers(self) -> dict[str, npt.NDArray[Any]]:
+    def to_numpy(self) -> dict[str, npt.NDArray[Any]]:
         """As arrays of NumPy, by name."""
         return {name: to_numpy(value) for name, value in vars(self).items()}
 
     @classmethod
-    def from_numbers(cls, mi: Any, numbers: Mapping[str, npt.NDArray[Any]]) -> Seen:
-        """From what `numbers` gave, here or in another process."""
+    def from_numbers(cls, mi: Any, numbers: Mapping[str, npt.NDArray[Any]]) -> GBuffer:
+        """From what `to_numpy` gave, here or in another process."""
         empty = vars(cls.nothing(mi, 0))
         return cls(
             **{name: _of_numbers(mi, type(kind), numbers[name]) for name, kind in empty.items()}
@@ -227,10 +229,10 @@ def _of_numbers(mi: Any, kind: Any, numbers: npt.NDArray[Any]) -> Any:
     if dr.is_mask_v(kind):
         return kind(np.ascontiguousarray(numbers))
     columns = numbers.reshape(len(numbers), -1).T
-    return kind(*(aligned(mitsuba_backend(mi), one) for one in columns))
+    return kind(*(upload_floats(mitsuba_backend(mi), one) for one in columns))
 
 
-class Shading:
+class ShadedTask:
     """A sensor in a world, its light, and what of a shaded picture can be done pixel by pixel.
 
     spp: rays of a pixel on an edge, at least; 1 for one ray a pixel everywhere.
@@ -252,73 +254,75 @@ class Shading:
                 "shaded pictures know red, green and blue, and the Mitsuba variant is "
                 f'{mi.variant()}: set one such as "llvm_ad_rgb", or draw in color'
             )
-        world = World.of(mi, scene)
+        world = HybridScene.of(mi, scene)
         self.mi, self.world, self.sensor, self.cut_out = mi, world, sensor, cut_out
         width, height = (int(n) for n in sensor.film().crop_size())
         self.size = (width, height)
-        self.order = in_tiles(self.size)
-        self.finder = Finder(mi, world) if cones else None
-        offsets = grid_offsets(spp)
+        self.order = tiled_pixel_order(self.size)
+        self.finder = ConeCoverage(mi, world) if cones else None
+        offsets = multijitter_offsets(spp)
         traced = (offsets == _MIDDLE).all(axis=1)  # what a pixel's first ray has seen
         self.offsets, self.share_of_first = offsets[~traced], float(traced.mean())
         self.refines = spp > 1
         matrix = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
-        self.light = Light.of(matrix)
-        self.through = Through(world, self.light, hides_lights=cut_out)
-        self.floor = Floor.of(world, self.light) if on_floor else None
+        self.light = StudioLight.of(matrix)
+        self.evaluate_with = RefractionTracer(world, self.light, hides_lights=cut_out)
+        self.floor = FloorShadow.of(world, self.light) if on_floor else None
 
-    def look(self, start: int, stop: int) -> Seen:
+    def render_gbuffer(self, start: int, stop: int) -> GBuffer:
         """What the rays through the middles of some pixels hit first; `order` counts pixels."""
         mi = self.mi
-        pixel = uploaded(mi, self.order[start:stop])
+        pixel = upload_indices(mi, self.order[start:stop])
         seen = self._look(pixel, mi.Vector2f(_MIDDLE))
         dr.eval(seen)
         if self.finder is not None:
             ray, _ = self.ray(pixel, mi.Vector2f(_MIDDLE))
-            seen.marked |= self.finder.find(ray, seen.position)
+            seen.needs_refinement |= self.finder.partly_covered(ray, seen.position)
             dr.eval(seen)
         return seen
 
-    def _look(self, pixel: Any, offset: Any) -> Seen:
+    def _look(self, pixel: Any, offset: Any) -> GBuffer:
         """What rays through places in pixels hit first."""
         mi, scene = self.mi, self.world.scene
         ray, weight = self.ray(pixel, offset)
-        sight = self.through.look(mi.Ray3f(ray))
+        sight = self.evaluate_with.trace(mi.Ray3f(ray))
         si, first = sight.si, sight.first
-        lost = first.lost | dr.zeros(mi.Bool, dr.width(pixel))
-        met = first.met & ~lost
+        lost = first.is_out_of_steps | dr.zeros(mi.Bool, dr.width(pixel))
+        met = first.is_hit & ~lost
         inside, open_surface = si.wi.z > 0, self._is_open(si)
         color, other = (self._reflectance(si, side) * weight for side in (1, -1))
         color, other = (as_rgb(mi, c, ray.wavelengths) for c in (color, other))
-        painted = first.line > 0
+        painted = first.isoline_index > 0
         color, other = reflectance(color, painted), reflectance(other, painted)
         plain = ~painted  # lines have their own color
-        color = of_side(color, other, inside & open_surface & plain)
-        color = of_mended(color, first.mended & plain)
+        color = two_sided_color(color, other, inside & open_surface & plain)
+        color = hole_filling_tint(color, first.is_hole_filling & plain)
         shone = si.emitter(scene).eval(si, ~lost) * weight
-        light = as_rgb(mi, sight.throughput * shone + weight * sight.gathered, ray.wavelengths)
-        light = dr.select(lost, mi.Color3f(LOST_COLOR), light)
-        covered = met | lost | (sight.boundaries > 1)  # what is clear covers, too
+        light = as_rgb(
+            mi, sight.throughput * shone + weight * sight.reflected_light, ray.wavelengths
+        )
+        light = dr.select(lost, mi.Color3f(OUT_OF_STEPS_COLOR), light)
+        covered = met | lost | (sight.interface_count > 1)  # what is clear covers, too
         if self.cut_out:
             light = dr.select(covered, light, 0)
         through = as_rgb(mi, sight.throughput, ray.wavelengths)
         d = sight.ray.d
         normal = mi.Vector3f(dr.mulsign(mi.Vector3f(si.n), -dr.dot(si.n, d)))
-        t = dr.select(met, sight.traveled + first.t, 0)
+        t = dr.select(met, sight.path_length + first.t, 0)
         width = dr.norm(ray.o_x + t * ray.d_x - ray.o - t * ray.d)
         flags = si.bsdf().flags()
         glossy = mi.has_flag(flags, mi.BSDFFlags.Glossy) | mi.has_flag(flags, mi.BSDFFlags.Delta)
         glossy &= plain
         lined = met & self.world.has_line_near(si, ray, d, t)
         position = dr.select(met, mi.Vector3f(si.p), dr.nan)
-        return Seen(
+        return GBuffer(
             position, normal, -d, width, color, light, through, glossy, met, lost, covered, lined
         )
 
     def ray(self, pixel: Any, offset: Any) -> tuple[Any, Any]:
         """Rays with differentials through places in pixels, and what their light is weighted by."""
         mi = self.mi
-        place = film_places(mi, pixel, offset, self.size)
+        place = film_positions(mi, pixel, offset, self.size)
         return self.sensor.sample_ray_differential(
             self.sensor.shutter_open(), 0.5, place, mi.Point2f(0.5)
         )
@@ -333,52 +337,53 @@ class Shading:
     def _is_open(self, si: Any) -> Any:
         """Whether it is one of our surfaces, and an open one, of which both sides can be seen."""
         found = self.mi.Bool(False)
-        for carrier in self.world.carriers:
+        for carrier in self.world.proxies:
             surface = carrier.surface
             if surface.solid is None and not isinstance(surface.field, Solid):
                 found |= si.shape == self.mi.ShapePtr(carrier)
         return found
 
-    def paint(self, seen: Seen, sky: Any) -> Any:
+    def shade(self, seen: GBuffer, sky: Any) -> Any:
         """Radiance towards the eye, and whether there is anything."""
         key = 1.0
         if self.floor is not None:
             key, above = self.floor.at(seen.position)
             sky = dr.minimum(sky, above)
-        lit = self.light.on(seen.color, seen.normal, seen.eye, seen.glossy, sky, key)
-        light = dr.select(seen.met, seen.through * lit, 0) + seen.light
+        lit = self.light.shade(seen.color, seen.normal, seen.eye, seen.glossy, sky, key)
+        light = dr.select(seen.met, seen.transmittance * lit, 0) + seen.light
         return self.mi.Vector4f(*light, dr.select(seen.covered, self.mi.Float(1), 0))
 
-    def refine(
+    def refine_pixels(
         self, chosen: IntArray, position: FloatArray, sky: FloatArray
     ) -> tuple[npt.NDArray[np.float32], int]:
         """Means (n, 4) of samples in chosen pixels, and how many of them were lost.
 
-        position, sky: seen by the pixels and their neighbors, (n, 5, 3) and (n, 5) (`around`).
+        position, sky: seen by the pixels and their neighbors, (n, 5, 3) and (n, 5)
+            (`neighborhood`).
         """
         mi, spp = self.mi, len(self.offsets)
         lane = dr.arange(mi.UInt32, len(chosen) * spp)
         many = dr.opaque(mi.UInt32, spp)
-        pixel = dr.gather(mi.UInt32, uploaded(mi, chosen), lane // many)
-        table = mi.Vector2f(*(aligned(mitsuba_backend(mi), one) for one in self.offsets.T))
+        pixel = dr.gather(mi.UInt32, upload_indices(mi, chosen), lane // many)
+        table = mi.Vector2f(*(upload_floats(mitsuba_backend(mi), one) for one in self.offsets.T))
         seen = self._look(pixel, dr.gather(mi.Vector2f, table, lane % many))
-        color = self.paint(seen, _nearest_sky(mi, seen, lane // many, position, sky))
+        color = self.shade(seen, _nearest_sky(mi, seen, lane // many, position, sky))
         dr.eval(color, seen.lost)
         return to_numpy(mean_of_blocks(color, spp)), int(dr.count(seen.lost)[0])
 
-    def around(self, chosen: IntArray, *arrays: Any) -> tuple[npt.NDArray[Any], ...]:
+    def neighborhood(self, chosen: IntArray, *arrays: Any) -> tuple[npt.NDArray[Any], ...]:
         """Entries (n, 5, ...) of arrays of all pixels, counted by rows, at chosen pixels and their
         four neighbors; at the picture's border some are there twice."""
         columns, rows = self.size
         x, y = chosen % columns, chosen // columns
         u = np.clip(x[:, None] + np.array([0, 1, -1, 0, 0]), 0, columns - 1)
         v = np.clip(y[:, None] + np.array([0, 0, 0, 1, -1]), 0, rows - 1)
-        other = uploaded(self.mi, (v * columns + u).ravel())
+        other = upload_indices(self.mi, (v * columns + u).ravel())
         found = [to_numpy(dr.gather(type(one), one, other)) for one in arrays]
         return tuple(one.reshape(len(chosen), 5, *one.shape[1:]) for one in found)
 
 
-def _nearest_sky(mi: Any, seen: Seen, row: Any, position: FloatArray, sky: FloatArray) -> Any:
+def _nearest_sky(mi: Any, seen: GBuffer, row: Any, position: FloatArray, sky: FloatArray) -> Any:
     """The visible sky of the pixel around whose point lies nearest to the sample; row: of the
     sample's pixel among those that were chosen."""
     nearest, found = mi.Float(dr.inf), mi.Float(1)
@@ -393,8 +398,8 @@ def _nearest_sky(mi: Any, seen: Seen, row: Any, position: FloatArray, sky: Float
     return found
 
 
-def shaded(
-    shading: Shading, hands: Hands, advance: Callable[[float], None]
+def render_shaded(
+    shading: ShadedTask, hands: RenderExecutor, advance: Callable[[float], None]
 ) -> tuple[npt.NDArray[np.float32], int]:
     """Linear sRGB radiance and, last, the part that something covers (h, w, 4); and how many rays
     ran out of steps.
@@ -404,26 +409,28 @@ def shaded(
     """
     mi, order, size = shading.mi, shading.order, shading.size
     count = len(order)
-    seen = Seen.nothing(mi, count)
-    parts = hands.cut(count, _RAYS_A_BAND)
-    for (start, stop), part in zip(parts, hands.each("look", parts), strict=True):
-        dr.scatter(seen, part, uploaded(mi, order[start:stop]))
+    seen = GBuffer.nothing(mi, count)
+    parts = hands.split_range(count, _RAYS_A_BAND)
+    for (start, stop), part in zip(parts, hands.run_tasks("render_gbuffer", parts), strict=True):
+        dr.scatter(seen, part, upload_indices(mi, order[start:stop]))
         dr.eval(seen)
         dr.sync_thread()
-        advance(_FIRST * (stop - start) / count)
-    sky = visible_sky(mi, seen.position, seen.normal, seen.width, size)
+        advance(_FIRST_PASS_FRACTION * (stop - start) / count)
+    sky = ambient_visibility(mi, seen.position, seen.normal, seen.width, size)
     dr.eval(sky)
-    image = to_numpy(shading.paint(seen, sky)).reshape(*size[::-1], 4)
+    image = to_numpy(shading.shade(seen, sky)).reshape(*size[::-1], 4)
     lost = int(dr.count(seen.lost)[0])
-    again = edges_of(tone_mapped(image[..., :3] + (1 - image[..., 3:]))).ravel()
-    again |= to_numpy(seen.marked)
+    again = edge_pixels(tone_map(image[..., :3] + (1 - image[..., 3:]))).ravel()
+    again |= to_numpy(seen.needs_refinement)
     edges = order[again[order]] if shading.refines else order[:0]
     pixels = image.reshape(-1, 4)
     at_once = max(1, _RAYS_A_BAND // max(1, len(shading.offsets)))
-    chosen = [edges[start:stop] for start, stop in hands.cut(len(edges), at_once)]
-    around = ((one, *shading.around(one, seen.position, sky)) for one in chosen)
-    for one, (color, gone) in zip(chosen, hands.each("refine", list(around)), strict=True):
+    chosen = [edges[start:stop] for start, stop in hands.split_range(len(edges), at_once)]
+    around = ((one, *shading.neighborhood(one, seen.position, sky)) for one in chosen)
+    for one, (color, gone) in zip(
+        chosen, hands.run_tasks("refine_pixels", list(around)), strict=True
+    ):
         pixels[one] = color + shading.share_of_first * (pixels[one] - color)
         lost += int(gone)
-        advance((1 - _FIRST) * len(one) / len(edges))
+        advance((1 - _FIRST_PASS_FRACTION) * len(one) / len(edges))
     return image, lost

@@ -12,10 +12,17 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import BoolArray, FloatArray, IntArray, to_numpy
-from harnack.backend.arrays import aligned, aligned_integers
-from harnack.rendering.backdrops import FLOOR, Gradient, Ground, Photo, far_ground, reflectance_of
+from harnack.backend.arrays import upload_floats, upload_integers
+from harnack.rendering.backdrops import (
+    FLOOR_HEIGHT,
+    GradientBackdrop,
+    GroundBackdrop,
+    ImageBackdrop,
+    distant_ground_radiance,
+    reflectance_of,
+)
 from harnack.rendering.mitsuba import mitsuba_backend
-from harnack.rendering.scales import linear
+from harnack.rendering.scales import linear_from_srgb
 
 # Pixels in tiles and bands, and places within them.
 
@@ -24,41 +31,41 @@ _TILE = 4
 _EDGE = 16
 
 
-def bands(pixels: int, step: int) -> Iterator[tuple[int, int]]:
+def pixel_ranges(pixels: int, step: int) -> Iterator[tuple[int, int]]:
     """(start, stop) of runs of at most `step` pixels: Ctrl-C works between them."""
     for start in range(0, pixels, step):
         yield start, min(start + step, pixels)
 
 
-class Hands(Protocol):
+class RenderExecutor(Protocol):
     """Those who do the parts of a picture."""
 
-    def cut(self, count: int, most: int) -> list[tuple[int, int]]:
+    def split_range(self, count: int, most: int) -> list[tuple[int, int]]:
         """(start, stop) of runs of things that are counted from 0, at most `most` a run."""
         ...
 
-    def each(self, step: str, parts: Sequence[tuple[Any, ...]]) -> Iterator[Any]:
+    def run_tasks(self, step: str, parts: Sequence[tuple[Any, ...]]) -> Iterator[Any]:
         """What a method, given by its name, returns for the arguments of each part, in order."""
         ...
 
 
 @dataclass(frozen=True)
-class OwnHands:
+class LocalRenderExecutor:
     """This process, which calls the methods of an object."""
 
     drawing: Any
 
-    def cut(self, count: int, most: int) -> list[tuple[int, int]]:
+    def split_range(self, count: int, most: int) -> list[tuple[int, int]]:
         """As few runs as there may be."""
-        return list(bands(count, most))
+        return list(pixel_ranges(count, most))
 
-    def each(self, step: str, parts: Sequence[tuple[Any, ...]]) -> Iterator[Any]:
+    def run_tasks(self, step: str, parts: Sequence[tuple[Any, ...]]) -> Iterator[Any]:
         """One after the other."""
         method = getattr(self.drawing, step)
         return (method(*part) for part in parts)
 
 
-def in_tiles(size: tuple[int, int]) -> IntArray:
+def tiled_pixel_order(size: tuple[int, int]) -> IntArray:
     """All pixels of a picture, counted by rows, one square of 4 x 4 after the other.
 
     Rays that a processor follows together then have about the same length, whatever the size.
@@ -72,30 +79,30 @@ def in_tiles(size: tuple[int, int]) -> IntArray:
     return order[order >= 0]
 
 
-def uploaded(mi: Any, pixels: IntArray) -> Any:
+def upload_indices(mi: Any, pixels: IntArray) -> Any:
     """Pixels as one of Mitsuba's arrays."""
-    return aligned_integers(mitsuba_backend(mi), pixels)
+    return upload_integers(mitsuba_backend(mi), pixels)
 
 
-def film_places(mi: Any, pixel: Any, offset: Any, size: tuple[int, int]) -> Any:
+def film_positions(mi: Any, pixel: Any, offset: Any, size: tuple[int, int]) -> Any:
     """Places on the film, in [0, 1]^2, of offsets in [0, 1]^2 within pixels counted by rows."""
     place = mi.Vector2f(pixel % size[0], pixel // size[0]) + offset
     return mi.Point2f(place / mi.ScalarVector2f(*size))
 
 
-def stratified(spp: int) -> int:
+def grid_sample_count(spp: int) -> int:
     """The samples a pixel, at least `spp`, that can be arranged in a nearly square grid."""
     rows = max(1, math.isqrt(spp))
     return rows * -(-spp // rows)
 
 
-def grid_offsets(count: int) -> FloatArray:
+def multijitter_offsets(count: int) -> FloatArray:
     """At least `count` places (n, 2) in the unit square, always the same.
 
     The canonical arrangement of multi-jittering (Kensler 2013): one in each cell of a grid, and
     no two in the same row or column of the n x n grid, so that edges of any slope look smooth.
     """
-    total = stratified(count)
+    total = grid_sample_count(count)
     rows = max(r for r in range(1, total + 1) if total % r == 0 and r * r <= total)
     columns = total // rows
     j, i = (index.ravel() for index in np.mgrid[:rows, :columns])
@@ -104,7 +111,7 @@ def grid_offsets(count: int) -> FloatArray:
     return np.column_stack([x, y])
 
 
-def edges_of(picture: npt.NDArray[np.uint8]) -> BoolArray:
+def edge_pixels(picture: npt.NDArray[np.uint8]) -> BoolArray:
     """Pixels (h, w) of a picture (h, w, 3) that differ visibly from one of four neighbors."""
     shown = picture.astype(np.int64)
     edge = np.zeros(shown.shape[:2], dtype=np.bool_)
@@ -146,12 +153,12 @@ _TEAL: Color = (0.05, 0.40, 0.46)
 
 
 @dataclass(frozen=True)
-class Light:
+class StudioLight:
     """The light of shaded pictures: a formula, so that one ray a sample is all they need.
 
     A soft key light from the upper left of the camera, a hemisphere of light that is cooler above
-    than below, and a gloss on what is glossy. `shaded.visible_sky` says how much of the hemisphere
-    is hidden by what is near, `Floor` where the studio's floor lies in shadow.
+    than below, and a gloss on what is glossy. `shaded.ambient_visibility` says how much of the
+    hemisphere is hidden by what is near, `FloorShadow` where the studio's floor lies in shadow.
 
     key, up: unit vectors, as lists of three numbers, to the key light and to the brighter
     hemisphere.
@@ -161,13 +168,13 @@ class Light:
     up: Sequence[float]
 
     @classmethod
-    def of(cls, world_from_camera: FloatArray) -> Light:
+    def of(cls, world_from_camera: FloatArray) -> StudioLight:
         """The light that goes with a camera, from its matrix (4, 4): x left, y up, z forward."""
         left, up, forward = (axis / np.linalg.norm(axis) for axis in world_from_camera[:3, :3].T)
         key = np.stack([-left, up, -forward], axis=1) @ _TO_KEY
         return cls(key.tolist(), up.tolist())
 
-    def on(
+    def shade(
         self, color: Any, normal: Any, eye: Any, glossy: Any, visible: Any, reached: Any = 1.0
     ) -> Any:
         """Radiance towards the eye; all are Dr.Jit arrays.
@@ -202,7 +209,7 @@ def reflectance(color: Any, painted: Any) -> Any:
     return dr.select(painted, own, dr.select(top > 0, color, _like(color, _CLEAR)))
 
 
-def of_side(color: Any, other: Any, inside: Any) -> Any:
+def two_sided_color(color: Any, other: Any, inside: Any) -> Any:
     """The color of a side: the side of larger values is darker and cooler if both have one color.
 
     inside: mask of what is seen from the side of larger values.
@@ -211,7 +218,7 @@ def of_side(color: Any, other: Any, inside: Any) -> Any:
     return dr.select(inside & same, color * _like(color, _INSIDE), color)
 
 
-def of_mended(color: Any, mended: Any) -> Any:
+def hole_filling_tint(color: Any, mended: Any) -> Any:
     """The color, tinted where a level set closes a hole of a mesh."""
     tint = dr.select(color[0] > 1.6 * color[2], _like(color, _TEAL), _like(color, _AMBER))
     return dr.select(mended, dr.lerp(color, tint, _MENDED), color)
@@ -244,8 +251,8 @@ _FAR = 3.5
 _BLUR = (0.05, 0.2, 0.25, 0.25, 0.2, 0.05)
 
 
-class Casting(Protocol):
-    """What casts shadows, such as a `World`."""
+class ShadowCaster(Protocol):
+    """What casts shadows, such as a `HybridScene`."""
 
     @property
     def mi(self) -> Any: ...
@@ -256,7 +263,7 @@ class Casting(Protocol):
 
 
 @dataclass(frozen=True)
-class Floor:
+class FloorShadow:
     """The soft shadow on the studio's floor, traced on a coarse grid and blurred: what of the key
     light and of the sky reaches the floor, a texture of two channels."""
 
@@ -264,27 +271,29 @@ class Floor:
     texture: Any
 
     @classmethod
-    def of(cls, world: Casting, light: Light) -> Floor:
+    def of(cls, world: ShadowCaster, light: StudioLight) -> FloorShadow:
         """Traced in a studio."""
         mi = world.mi
         cell = (np.arange(_CELLS) + 0.5) / _CELLS * 2 * _REACH - _REACH
         y, x = np.meshgrid(cell, cell, indexing="ij")
-        seen = _parts_seen(world, x, y, np.stack([_to_key(light.key), _to_sky()]))
+        seen = _visible_fractions(world, x, y, np.stack([_to_key(light.key), _to_sky()]))
         image = np.stack([_blurred(part) for part in seen], axis=-1)
-        numbers = mi.Float(aligned(mitsuba_backend(mi), image.ravel()))
+        numbers = mi.Float(upload_floats(mitsuba_backend(mi), image.ravel()))
         tensor = mi.TensorXf(numbers, image.shape)
         return cls(mi, mi.Texture2f(tensor, wrap_mode=dr.WrapMode.Clamp))
 
     def at(self, position: Any) -> tuple[Any, Any]:
         """The parts of key light and sky that reach points of the floor; 1 for other points."""
         mi = self.mi
-        on_floor = position.z < 0.5 * FLOOR
+        on_floor = position.z < 0.5 * FLOOR_HEIGHT
         place = mi.Point2f(position.x, position.y) / (2 * _REACH) + 0.5
         key, sky = self.texture.eval(dr.select(on_floor, place, 0))
         return dr.select(on_floor, key, 1), dr.select(on_floor, sky, 1)
 
 
-def _parts_seen(world: Casting, x: FloatArray, y: FloatArray, towards: FloatArray) -> FloatArray:
+def _visible_fractions(
+    world: ShadowCaster, x: FloatArray, y: FloatArray, towards: FloatArray
+) -> FloatArray:
     """What parts (k, n, n) of directions (k, 16, rays, 3) are free, seen from points of the
     floor."""
     mi = world.mi
@@ -350,48 +359,54 @@ _DARKER = 0.45
 FloatImage = npt.NDArray[np.float32]
 
 
-def wall(mi: Any, sensor: Any, ground: Ground, azimuth: float, show: str) -> FloatImage:
+def studio_wall(
+    mi: Any, sensor: Any, ground: GroundBackdrop, azimuth: float, show: str
+) -> FloatImage:
     """Radiance (h, w, 3) of a ground and the wall behind it, in the middle of each pixel.
 
     The camera does not see the environment that lights the stage, but the ground going on to the
     horizon, and above it a wall of the same color that is darker higher up. So there is no edge at
     the horizon, however low the camera stands.
 
-    azimuth: of the camera, in degrees. show: "color" or "shaded".
+    azimuth: of the camera, in degrees. show: "path" or "shaded".
     """
     width, height = (int(n) for n in sensor.film().crop_size())
     pixel = dr.arange(mi.UInt32, width * height)
-    place = film_places(mi, pixel, mi.Vector2f(0.5), (width, height))
+    place = film_positions(mi, pixel, mi.Vector2f(0.5), (width, height))
     ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, place, mi.Point2f(0.5))
     rise = np.clip(to_numpy(ray.d)[:, 2], 0, 1) ** 0.7
-    far = far_ground(ground.name, azimuth)
+    far = distant_ground_radiance(ground.name, azimuth)
     if show == "shaded":
         far = _far_shaded(mi, sensor, ground)
     image = far * (1 - _DARKER * rise[:, None])
     return image.astype(np.float32).reshape(height, width, 3)
 
 
-def _far_shaded(mi: Any, sensor: Any, ground: Ground) -> FloatArray:
+def _far_shaded(mi: Any, sensor: Any, ground: GroundBackdrop) -> FloatArray:
     """Radiance (3,) of the ground far away, in the light of shaded pictures."""
     matrix = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
     color = mi.Color3f(*reflectance_of(ground.name).tolist())
     up, one = mi.Vector3f(0, 0, 1), mi.Float(1)
-    lit = Light.of(matrix).on(color, up, up, mi.Bool(False), one)
+    lit = StudioLight.of(matrix).shade(color, up, up, mi.Bool(False), one)
     return to_numpy(lit).reshape(3).astype(np.float64)
 
 
-def flat(mi: Any, backdrop: Gradient | Photo, size: tuple[int, int]) -> FloatImage:
+def backdrop_image(
+    mi: Any, backdrop: GradientBackdrop | ImageBackdrop, size: tuple[int, int]
+) -> FloatImage:
     """Linear sRGB (h, w, 3) of colors or an image, as they are, in a picture of (width, height)
     pixels."""
-    if isinstance(backdrop, Photo):
+    if isinstance(backdrop, ImageBackdrop):
         return _covering(mi, backdrop.pixels, size)
     width, height = size
     if backdrop.bottom == backdrop.top:
-        rows = np.array([[linear(backdrop.top)]], dtype=np.float32)
+        rows = np.array([[linear_from_srgb(backdrop.top)]], dtype=np.float32)
     else:  # even steps in sRGB look even
         rise = (height - 0.5 - np.arange(height)[:, None]) / height
         shown = (1 - rise) * np.array(backdrop.bottom) + rise * np.array(backdrop.top)
-        rows = np.array([[linear(tuple(row))] for row in shown.tolist()], dtype=np.float32)
+        rows = np.array(
+            [[linear_from_srgb(tuple(row))] for row in shown.tolist()], dtype=np.float32
+        )
     return np.broadcast_to(rows, (height, width, 3))
 
 

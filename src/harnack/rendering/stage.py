@@ -15,15 +15,20 @@ import numpy as np
 
 from harnack.backend import FloatArray
 from harnack.name_suggestions import did_you_mean
-from harnack.rendering.backdrops import FLOOR, Backdrop, Ground, ground, lights
-from harnack.rendering.camera import Camera, Pose
-from harnack.rendering.framing import check_offset, check_size, upright, visible_points
+from harnack.rendering.backdrops import FLOOR_HEIGHT, Backdrop, GroundBackdrop, ground, lights
+from harnack.rendering.camera import Camera, CameraPose
+from harnack.rendering.framing import (
+    check_drawable_size,
+    check_offset,
+    rotation_to_z_up,
+    visible_points,
+)
 from harnack.rendering.isolines import Isolines
 from harnack.rendering.mitsuba import mitsuba_backend
-from harnack.rendering.mitsuba_plugins import shape
+from harnack.rendering.mitsuba_plugins import mitsuba_shape
 from harnack.rendering.placed_surface import Placement
-from harnack.rendering.scales import NAMED_COLORS, Color, color_of, linear
-from harnack.tracer import LevelSet, Tolerance
+from harnack.rendering.scales import NAMED_COLORS, Color, linear_from_srgb, parse_color
+from harnack.tracer import HitTolerance, Surface
 
 Dictionary = dict[str, Any]
 
@@ -37,7 +42,7 @@ def _rgb(color: Color) -> Dictionary:
     return {"type": "rgb", "value": list(color)}
 
 
-def _glazed(color: Color, roughness: float) -> Dictionary:
+def _coated(color: Color, roughness: float) -> Dictionary:
     """A colored base under a clear coat."""
     return {
         "type": "roughplastic",
@@ -104,7 +109,7 @@ class Material:
 def _without_table(bsdf: Dictionary) -> Dictionary:
     """A BSDF with the same diffuse reflectance, which is made without the table of a rough coat's
     transmittance (0.07 s)."""
-    if bsdf.keys() != _glazed((0, 0, 0), 0).keys() or bsdf["type"] != "roughplastic":
+    if bsdf.keys() != _coated((0, 0, 0), 0).keys() or bsdf["type"] != "roughplastic":
         return bsdf
     return {**{key: bsdf[key] for key in bsdf if key != "alpha"}, "type": "plastic"}
 
@@ -117,15 +122,15 @@ def _tinted(tint: Color, index: float = 1.5) -> Material:
 
 def _painted(color: Color) -> Material:
     red, green, blue = (max(_WHITE * part, _BLACK) for part in color)
-    return Material(_glazed((red, green, blue), _PAINT))
+    return Material(_coated((red, green, blue), _PAINT))
 
 
 MATERIALS: Mapping[str, Material] = {
-    "two-tone": Material(_glazed((0.80, 0.255, 0.11), 0.22), _glazed((0.07, 0.25, 0.40), 0.22)),
-    "eggshell": Material(_glazed((0.66, 0.13, 0.06), 0.3), _glazed((0.80, 0.74, 0.64), 0.3)),
+    "two-tone": Material(_coated((0.80, 0.255, 0.11), 0.22), _coated((0.07, 0.25, 0.40), 0.22)),
+    "eggshell": Material(_coated((0.66, 0.13, 0.06), 0.3), _coated((0.80, 0.74, 0.64), 0.3)),
     "clay": Material({"type": "diffuse", "reflectance": _rgb((0.72, 0.62, 0.53))}),
-    "porcelain": Material(_glazed((0.84, 0.83, 0.80), 0.06)),
-    "plastic": Material(_glazed((0.62, 0.05, 0.07), 0.10)),
+    "porcelain": Material(_coated((0.84, 0.83, 0.80), 0.06)),
+    "plastic": Material(_coated((0.62, 0.05, 0.07), 0.10)),
     "gold": Material(_metal("Au", 0.10)),
     "copper": Material(_metal("Cu", 0.12)),
     "silver": Material(_metal("Ag", 0.12)),
@@ -140,7 +145,7 @@ MATERIALS: Mapping[str, Material] = {
 """Materials by name, that look well in the studio."""
 
 
-def material_of(wanted: Any) -> Material:
+def parse_material(wanted: Any) -> Material:
     """A material from its name, from a color, or from a BSDF dictionary used as it stands.
 
     Raises:
@@ -156,7 +161,7 @@ def material_of(wanted: Any) -> Material:
     if isinstance(wanted, str) and wanted.strip().lower() in MATERIALS:
         return MATERIALS[wanted.strip().lower()]
     try:
-        return _painted(linear(color_of(wanted, "material")))
+        return _painted(linear_from_srgb(parse_color(wanted, "material")))
     except TypeError:
         raise TypeError(
             f"a material is a name, a color, a Material or a BSDF dictionary, not {wanted!r}; "
@@ -174,34 +179,35 @@ def material_of(wanted: Any) -> Material:
 STUDIO_SPP = 64
 # Tolerances of fitted surfaces, on the stage. Surfaces of many parts have edges inside the picture,
 # where two parts meet: hits within the tolerance of such an edge have the normal of neither.
-_TOLERANCE, _OF_PARTS = 1e-4, 1e-5
+_TOLERANCE, _PATCH_TOLERANCE = 1e-4, 1e-5
 # The most light of one path, where white is 1.
 _CLAMP = 2.0
 # Rays begin at most twice _NEAR before the stage. Clip distances are literals of kernels: as whole
 # multiples they are the same for almost all cameras, whose pictures so share their kernels.
 _NEAR, _FAR = 60.0, 2e4
 _FARTHEST = 5e3
-_LIGHT = Ground("light")
+_LIGHT = GroundBackdrop("light")
 
 
 @dataclass(frozen=True)
 class StudioObject:
     """A surface on the stage.
 
-    fitted: whether to give it a tolerance that suits its size in place of its own.
-    cut: the material of the faces at which a section cuts a solid; None for that of the rest.
+    has_default_tolerance: whether to give it a tolerance that suits its size in place of its own.
+    section_material: the material of the faces at which a section cuts a solid; None for that of
+        the rest.
     isolines: drawn on it.
     """
 
-    surface: LevelSet
+    surface: Surface
     material: Material
-    fitted: bool = False
-    cut: Material | None = None
+    has_default_tolerance: bool = False
+    section_material: Material | None = None
     isolines: tuple[Isolines, ...] = ()
 
 
 @dataclass(frozen=True)
-class Studio:
+class StudioScene:
     """A scene dictionary, and what a picture of it needs besides.
 
     placement: of the surfaces in it. backdrop: as given. azimuth: of the camera. has_ground:
@@ -215,7 +221,7 @@ class Studio:
     has_ground: bool
 
 
-def studio(
+def build_studio(
     mi: Any,
     studio_objects: Sequence[StudioObject],
     *,
@@ -225,7 +231,7 @@ def studio(
     up: Any = "z",
     bare: bool = False,
     traced_light: bool = True,
-) -> Studio:
+) -> StudioScene:
     """Surfaces on the stage, seen in a picture of (width, height) pixels.
 
     up: the direction of the surfaces' coordinates that is up on the stage, as `upright` takes it.
@@ -237,7 +243,7 @@ def studio(
         points = np.concatenate([visible_points(one.surface, backend) for one in studio_objects])
     else:
         points = corners_of(np.array(camera.box.bounds()))
-    placement = on_ground(points, upright(up))
+    placement = stage_placement(points, rotation_to_z_up(up))
     pose = camera.pose(placement.apply(points), size, placement.apply)
     scene: dict[str, Any] = {
         "type": "scene",
@@ -250,31 +256,35 @@ def studio(
     }
     for k, one in enumerate(studio_objects):
         surface = one.surface
-        if one.fitted:
-            close = _OF_PARTS if surface.field.has_parts else _TOLERANCE
-            surface = replace(surface, tolerance=Tolerance(close / placement.scale))
+        if one.has_default_tolerance:
+            close = _PATCH_TOLERANCE if surface.field.has_patches else _TOLERANCE
+            surface = replace(surface, tolerance=HitTolerance(close / placement.scale))
         bsdf = one.material.bsdf(solid=surface.solid is not None, traced_light=traced_light)
-        cut = None if one.cut is None else one.cut.bsdf(solid=True, traced_light=traced_light)
-        scene[f"surface{k}"] = shape(
+        cut = (
+            None
+            if one.section_material is None
+            else one.section_material.bsdf(solid=True, traced_light=traced_light)
+        )
+        scene[f"surface{k}"] = mitsuba_shape(
             surface, bsdf=bsdf, to_world=placement.matrix, tint=one.material.tint, cut_bsdf=cut,
             isolines=one.isolines,
         )  # fmt: skip
     has_ground = False
     if not bare:
         scene |= lights(mi, pose.azimuth)
-        if isinstance(backdrop, Ground) and pose.origin[2] > FLOOR:
+        if isinstance(backdrop, GroundBackdrop) and pose.origin[2] > FLOOR_HEIGHT:
             has_ground = True  # from below, it would hide everything
             scene |= ground(mi, backdrop.name)
-    return Studio(scene, placement, backdrop, pose.azimuth, has_ground)
+    return StudioScene(scene, placement, backdrop, pose.azimuth, has_ground)
 
 
 def corners_of(ends: FloatArray) -> FloatArray:
     """Corners (8, 3) of a box (2, 3) of a size that can be drawn."""
-    check_size(ends)
+    check_drawable_size(ends)
     return np.array(list(itertools.product(*ends.T)))
 
 
-def on_ground(points: FloatArray, turned: FloatArray | None = None) -> Placement:
+def stage_placement(points: FloatArray, turned: FloatArray | None = None) -> Placement:
     """Turns points (n, 3), scales them to half a diagonal of 1 and puts them on the ground.
 
     Raises:
@@ -289,7 +299,7 @@ def on_ground(points: FloatArray, turned: FloatArray | None = None) -> Placement
     return Placement(scale, turned, -scale * foot)
 
 
-def _sensor(mi: Any, pose: Pose, size: tuple[int, int]) -> dict[str, Any]:
+def _sensor(mi: Any, pose: CameraPose, size: tuple[int, int]) -> dict[str, Any]:
     # Rays begin near the stage, however far the camera is: their origins are rounded.
     away = float(np.linalg.norm(pose.origin))
     if away > _FARTHEST:

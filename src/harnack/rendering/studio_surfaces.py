@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from harnack.fields import Field, Solid
-from harnack.fields.field import instead_of_field
+from harnack.fields.field import suggest_field
 from harnack.fields.solid_angles.winding_number import WindingNumber
 from harnack.fields.solids.tube import Tube
 from harnack.geometry.meshes import MeshError, without_zero_area_faces
@@ -20,8 +20,8 @@ from harnack.meshing.checks import MeshingError
 from harnack.rendering.isolines import Isolines
 from harnack.rendering.render_options import check_settings
 from harnack.rendering.scales import Color
-from harnack.rendering.stage import Material, StudioObject, material_of
-from harnack.tracer import LevelSet, level_set
+from harnack.rendering.stage import Material, StudioObject, parse_material
+from harnack.tracer import Surface, level_set
 
 # The material of tubes around the curves at which surfaces end.
 _TUBE_MATERIAL = "gold"
@@ -34,9 +34,9 @@ def _is_color(given: Any) -> bool:
     return len(given) == 3 and all(isinstance(one, Real) for one in given)
 
 
-def surfaces_of(
+def drawn_surfaces(
     what: Any, boundary: float | None = None, thickness: float | None = None, **settings: Any
-) -> list[LevelSet]:
+) -> list[Surface]:
     """The surfaces that `render` draws of fields and level sets, with settings of surfaces."""
     drawn = studio_objects(what, None, settings, boundary=boundary, thickness=thickness)
     return [one.surface for one in drawn]
@@ -68,9 +68,9 @@ def studio_objects(
     if not given:
         raise ValueError("there is nothing to draw: give at least one field")
     for one in given:
-        if not isinstance(one, Field | LevelSet):
+        if not isinstance(one, Field | Surface):
             raise TypeError(
-                f"what is drawn are fields and level sets, not what is {instead_of_field(one)}"
+                f"what is drawn are fields and level sets, not what is {suggest_field(one)}"
             )
     listed = isinstance(materials, list | tuple) and not _is_color(materials)
     names: list[Any] = [*materials] if listed else [materials] * len(given)
@@ -86,29 +86,33 @@ def studio_objects(
     fitted = "tolerance" not in settings
     made: list[StudioObject] = []
     for (one, own_settings), name in zip(drawn, names, strict=True):
-        material = material_of(name)
+        material = parse_material(name)
         surface = _surface(one, own_settings, material.transparent)
         own = surface.solid is None and len(given) > 1  # then its isolines are meant for the others
-        lines = tuple(line for line in isolines if not (own and line.function is surface.field))
+        lines = tuple(
+            line for line in isolines if not (own and line.function_field is surface.field)
+        )
         fits = fitted and isinstance(one, Field)
         made.append(StudioObject(surface, material, fits, isolines=lines))
-    _refuse_doubles([one.surface for one in made])
+    _check_no_duplicates([one.surface for one in made])
     if boundary is None and boundary_material is not None:
         raise ValueError(
             "boundary_material needs the radius of the tubes as well, such as boundary=0.03"
         )
-    tube_material = material_of(_TUBE_MATERIAL if boundary_material is None else boundary_material)
+    tube_material = parse_material(
+        _TUBE_MATERIAL if boundary_material is None else boundary_material
+    )
     if tube_material.transparent:
         raise ValueError("boundary_material: tubes have no inside, so light cannot pass through")
-    tubes = [] if boundary is None else _end_tubes(made, boundary, tube_material)
+    tubes = [] if boundary is None else _boundary_tubes(made, boundary, tube_material)
     if thickness is not None:
-        made = [replace(one, surface=_thick(one.surface, thickness)) for one in made]
+        made = [replace(one, surface=_thickened(one.surface, thickness)) for one in made]
     if cut is not None:
-        made = _with_faces(made, material_of(cut))
+        made = _with_section_material(made, parse_material(cut))
     return made + tubes
 
 
-def _thick(surface: LevelSet, thickness: float) -> LevelSet:
+def _thickened(surface: Surface, thickness: float) -> Surface:
     """The closed mesh that `mesh` makes of a surface with a thickness, as a surface."""
     if surface.solid is not None or len(surface.levels) != 1:
         raise ValueError("thickness needs a surface of one level; a solid has an inside already")
@@ -116,7 +120,7 @@ def _thick(surface: LevelSet, thickness: float) -> LevelSet:
         raise ValueError("thickness and largest: mesh the surface by hk.mesh(..., largest=True)")
     try:
         made = mesh(
-            surface.field, surface.numbers[0], clip=surface.clip, section=surface.section,
+            surface.field, surface.level_values[0], clip=surface.clip, section=surface.section,
             thickness=thickness,
         )  # fmt: skip
         # Slivers whose area is lost in rounding say nothing of the inside.
@@ -125,12 +129,12 @@ def _thick(surface: LevelSet, thickness: float) -> LevelSet:
         raise ValueError(
             f"no closed mesh could be made of this surface with thickness={thickness!r}: {wrong}; "
             "give another thickness (a smaller one where sheets meet), or mesh it by "
-            "hk.mesh(..., thickness=..., spacing=...) and draw hk.WindingNumber of that"
+            "hk.mesh(..., thickness=..., cell_size=...) and draw hk.WindingNumber of that"
         ) from wrong
     return level_set(field, tolerance=surface.tolerance, max_steps=surface.max_steps)
 
 
-def _with_faces(made: list[StudioObject], material: Material) -> list[StudioObject]:
+def _with_section_material(made: list[StudioObject], material: Material) -> list[StudioObject]:
     """The same, with a material for the faces at which sections cut solids."""
     if not any(one.surface.section and one.surface.solid for one in made):
         raise ValueError(
@@ -139,12 +143,14 @@ def _with_faces(made: list[StudioObject], material: Material) -> list[StudioObje
             "solid=(low, high)"
         )
     return [
-        replace(one, cut=material) if one.surface.section and one.surface.solid else one
+        replace(one, section_material=material)
+        if one.surface.section and one.surface.solid
+        else one
         for one in made
     ]
 
 
-def _refuse_doubles(surfaces: list[LevelSet]) -> None:
+def _check_no_duplicates(surfaces: list[Surface]) -> None:
     """Raise ValueError for one surface that is there twice: which is seen would be an accident."""
     for k, one in enumerate(surfaces):
         for other in surfaces[:k]:
@@ -158,23 +164,25 @@ def _refuse_doubles(surfaces: list[LevelSet]) -> None:
                 )
 
 
-def _shared_levels(one: LevelSet, other: LevelSet) -> bool:
+def _shared_levels(one: Surface, other: Surface) -> bool:
     """Whether two level sets of a field share a level, modulo its period."""
     period = one.field.period
-    apart = np.subtract.outer(one.numbers, other.numbers)
+    apart = np.subtract.outer(one.level_values, other.level_values)
     if period is not None:
         apart -= period * np.round(apart / period)
-    largest = max(1.0, *(abs(level) for level in (*one.numbers, *other.numbers)))
+    largest = max(1.0, *(abs(level) for level in (*one.level_values, *other.level_values)))
     return bool((np.abs(apart) <= 1e-9 * largest).any())
 
 
-def _is_cut_alike(one: LevelSet, other: LevelSet) -> bool:
+def _is_cut_alike(one: Surface, other: Surface) -> bool:
     """Whether both are of the same field, in the same volume."""
     same = one.field is other.field
     return same and one.clip == other.clip and one.section == other.section
 
 
-def _end_tubes(made: list[StudioObject], radius: Any, material: Material) -> list[StudioObject]:
+def _boundary_tubes(
+    made: list[StudioObject], radius: Any, material: Material
+) -> list[StudioObject]:
     """Tubes around the curves at which surfaces end."""
     if isinstance(radius, bool) or not isinstance(radius, Real) or not 0 < float(radius) < math.inf:
         raise ValueError(f"boundary is the radius of a tube, such as 0.03, not {radius!r}")
@@ -185,25 +193,27 @@ def _end_tubes(made: list[StudioObject], radius: Any, material: Material) -> lis
             continue  # another level of the same
         if curves:
             closed = [np.vstack([curve, curve[:1]]) for curve in curves]
-            tube = level_set(Tube.around(closed, float(radius)), clip=one.surface.cut)
-            tubes.append(StudioObject(tube, material, fitted=True))
+            tube = level_set(
+                Tube.from_polylines(closed, float(radius)), clip=one.surface.clip_volume
+            )
+            tubes.append(StudioObject(tube, material, has_default_tolerance=True))
     if not tubes:
         raise ValueError("boundary: none of these surfaces ends at a curve")
     return tubes
 
 
-def _surface(one: Field | LevelSet, settings: Mapping[str, Any], clear: bool) -> LevelSet:
+def _surface(one: Field | Surface, settings: Mapping[str, Any], clear: bool) -> Surface:
     """A surface with settings. A `Solid` is drawn as a solid where its inside can be seen: where a
     section opens it, or it is clear."""
-    made = with_settings(one, settings).in_one_call(begins=True)
+    made = with_options(one, settings).with_call_cache(begins=True)
     opened = isinstance(made.field, Solid) and made.solid is None
     opened &= clear or made.section is not None
     if not opened or len(made.levels) != 1:
         return made
-    return replace(made, solid=(-math.inf, made.numbers[0]))
+    return replace(made, solid=(-math.inf, made.level_values[0]))
 
 
-def with_settings(one: Field | LevelSet, settings: Mapping[str, Any]) -> LevelSet:
+def with_options(one: Field | Surface, settings: Mapping[str, Any]) -> Surface:
     """A surface with settings of `level_set` in the place of its own."""
     if isinstance(one, Field):
         return level_set(one, **settings)

@@ -13,57 +13,58 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 
 from harnack.backend import Mask, Real, Vec3
-from harnack.backend.elementary import length as norm
-from harnack.backend.loops import changed_where, on_some
+from harnack.backend.elementary import safe_norm as norm
+from harnack.backend.loops import compute_on_active, update_where_active
 from harnack.fields.samples import Sample
-from harnack.tracer import Status
+from harnack.tracer import RayStatus
 
 if TYPE_CHECKING:
-    from harnack.tracer import LevelSet, MarchResult, PreparedLevelSet
+    from harnack.tracer import MarchResult, Surface, SurfaceTracer
 
 # A hit is refined by at most this many tolerances: along a ray that only grazes the surface there
 # is no crossing to converge to.
-_POLISH = 2.0
+_MAX_REFINEMENT = 2.0
 # A ray leaves a surface this many tolerances away from it, so as not to meet it again there.
-CLEARANCE = 4.0
+RAY_OFFSET = 4.0
 # Normals of grazing hits are tilted until their cosine with the ray is at least this.
 _GRAZING = 1e-3
 
 
 @dataclass
 class SurfaceHit:
-    """What rays hit first. Lanes that hit nothing have met = lost = False and t = inf.
+    """What rays hit first. Lanes that hit nothing have t = inf, and neither is_hit nor
+    is_out_of_steps.
 
     t: ray parameter; of a lost ray, how far it is proved free.
-    met: there is a surface at t.
-    lost: the ray ran out of steps behind t.
+    is_hit: there is a surface at t.
+    is_out_of_steps: the ray ran out of steps behind t.
     position, normal: of the surface. The normal is unit and points to the side of larger values or,
         of a solid, out of it.
-    clearance: how far off the surface the next ray has to start.
+    ray_offset: how far off the surface the next ray has to start.
     value: of the field, close to the surface or, of a sheet (where a field jumps), just before it;
         undefined where nothing is hit.
     evaluations: of the field.
-    cut: the hit is on a face at which the section cuts a solid.
-    mended: of a field with sheets, the hit is on none: the surface closes a hole between them
-        there.
-    line: the number of the isoline drawn there, counted from 1; 0 for none.
+    is_on_section: the hit is on a face at which the section cuts a solid.
+    is_hole_filling: of a field with sheets, the hit is on none: the surface closes a hole between
+        them there.
+    isoline_index: the number of the isoline drawn there, counted from 1; 0 for none.
     """
 
     t: Real
-    met: Mask
-    lost: Mask
+    is_hit: Mask
+    is_out_of_steps: Mask
     position: Vec3
     normal: Vec3
-    clearance: Real
+    ray_offset: Real
     value: Real
     evaluations: Any
-    mended: Mask
-    cut: Mask
-    line: Any
+    is_hole_filling: Mask
+    is_on_section: Mask
+    isoline_index: Any
 
 
-def meet_surface(
-    prepared: PreparedLevelSet, o: Vec3, d: Vec3, t_max: Real, active: Mask
+def intersect_surface(
+    prepared: SurfaceTracer, o: Vec3, d: Vec3, t_max: Real, active: Mask
 ) -> SurfaceHit:
     """Where rays o + t d, |d| = 1, 0 <= t <= t_max, first hit the level set.
 
@@ -77,18 +78,18 @@ def meet_surface(
     A hit on a sheet is not moved; the normal points to the side of larger values.
     """
     trace = prepared.first_hit(o, d, 0, t_max, active)
-    if not prepared.queued:
-        return _described(prepared, _Ended(o, d, trace))
-    return on_some(
-        trace.status == int(Status.HIT),
-        lambda ended: _described(prepared, ended),
-        _Ended(o, d, trace),
+    if not prepared.uses_ray_queue:
+        return _refine_hits(prepared, _MarchedRays(o, d, trace))
+    return compute_on_active(
+        trace.status == int(RayStatus.HIT),
+        lambda ended: _refine_hits(prepared, ended),
+        _MarchedRays(o, d, trace),
         _no_hit(prepared, trace),
     )
 
 
 @dataclass(frozen=True)
-class _Ended:
+class _MarchedRays:
     """Rays, and where they ended."""
 
     o: Vec3
@@ -96,34 +97,34 @@ class _Ended:
     trace: MarchResult
 
 
-def _no_hit(prepared: PreparedLevelSet, trace: MarchResult) -> SurfaceHit:
+def _no_hit(prepared: SurfaceTracer, trace: MarchResult) -> SurfaceHit:
     """The `SurfaceHit` of rays that hit nothing."""
     backend = prepared.backend
     zero, vector, none = backend.Float(0), backend.Array3f(0), backend.Bool(False)
     return SurfaceHit(
         t=trace.t,
-        met=none,
-        lost=trace.status == int(Status.OUT_OF_STEPS),
+        is_hit=none,
+        is_out_of_steps=trace.status == int(RayStatus.OUT_OF_STEPS),
         position=vector,
         normal=vector,
-        clearance=zero,
+        ray_offset=zero,
         value=zero,
         evaluations=trace.evaluations,
-        mended=none,
-        cut=none,
-        line=backend.UInt32(0),
+        is_hole_filling=none,
+        is_on_section=none,
+        isoline_index=backend.UInt32(0),
     )
 
 
-def _described(prepared: PreparedLevelSet, ended: _Ended) -> SurfaceHit:
+def _refine_hits(prepared: SurfaceTracer, ended: _MarchedRays) -> SurfaceHit:
     """The `SurfaceHit` of rays, with hits refined."""
     vector, o, d, trace = prepared.backend.Array3f, ended.o, ended.d, ended.trace
-    prepared = prepared.of_hit(trace)
-    met = trace.status == int(Status.HIT)
-    smooth = met & ~trace.on_sheet if prepared.field.has_sheets else met
-    gap = prepared.levels.to_nearest(trace.value)
+    prepared = prepared.hit_surface(trace)
+    met = trace.status == int(RayStatus.HIT)
+    smooth = met & ~trace.at_jump if prepared.field.has_jumps else met
+    gap = prepared.levels.offset_to_nearest(trace.value)
     slope = dr.dot(trace.gradient, d)
-    reach = _POLISH * _uncertainty(prepared, trace.gradient, trace.t, trace.value)
+    reach = _MAX_REFINEMENT * _uncertainty(prepared, trace.gradient, trace.t, trace.value)
     step = dr.select(smooth & (slope != 0), dr.clip(gap / slope, -reach, reach), 0)
     # gap > 0: the level is above, so the ray comes from the side of smaller values.
     side = dr.select(gap > 0, prepared.backend.Float(1), -1)
@@ -131,39 +132,37 @@ def _described(prepared: PreparedLevelSet, ended: _Ended) -> SurfaceHit:
         step, side = dr.zeros(type(step)), trace.side
     t = dr.maximum(dr.select(met, trace.t, 0) + step, 0)
     p = dr.fma(vector(t), d, o)
-    if prepared.field.has_sheets:
+    if prepared.field.has_jumps:
         sample = _sample_where(prepared, p, trace.value, d, smooth)
     else:
         sample = prepared.sample(p)
     length = norm(sample.gradient)
     normal = dr.select(length > 0, sample.gradient / length, -d)
-    shading = normal if sample.normal is None else sample.normal
-    uncertainty = _uncertainty(prepared, sample.gradient, t, sample.value, sample.error)
-    rest = prepared.levels.to_nearest(sample.value) / length
+    shading = normal if sample.shading_normal is None else sample.shading_normal
+    uncertainty = _uncertainty(prepared, sample.gradient, t, sample.value, sample.value_error)
+    rest = prepared.levels.offset_to_nearest(sample.value) / length
     rest = dr.select(length > 0, dr.clip(rest, -reach, reach), 0)
-    if prepared.field.has_sheets:  # behind a sheet, the value says nothing about this surface
+    if prepared.field.has_jumps:  # behind a sheet, the value says nothing about this surface
         rest = dr.select(dr.abs(rest) * length <= dr.abs(gap), rest, 0)
     hit = SurfaceHit(
         t=dr.select(met, t, trace.t),
-        met=met,
-        lost=trace.status == int(Status.OUT_OF_STEPS),
+        is_hit=met,
+        is_out_of_steps=trace.status == int(RayStatus.OUT_OF_STEPS),
         position=dr.fma(vector(rest), normal, p),
-        normal=facing(shading, d, side),
-        clearance=CLEARANCE * uncertainty,
+        normal=orient_normal(shading, d, side),
+        ray_offset=RAY_OFFSET * uncertainty,
         value=sample.value,
         evaluations=trace.evaluations + dr.select(smooth, prepared.backend.UInt32(1), 0),
-        mended=smooth & prepared.field.has_sheets,
-        cut=prepared.backend.Bool(False),
-        line=prepared.backend.UInt32(0),
+        is_hole_filling=smooth & prepared.field.has_jumps,
+        is_on_section=prepared.backend.Bool(False),
+        isoline_index=prepared.backend.UInt32(0),
     )
-    if not prepared.field.has_sheets:
+    if not prepared.field.has_jumps:
         return hit
-    return dr.select(trace.on_sheet, _on_sheet(prepared, o, d, trace, hit), hit)
+    return dr.select(trace.at_jump, _on_sheet(prepared, o, d, trace, hit), hit)
 
 
-def _sample_where(
-    prepared: PreparedLevelSet, p: Vec3, value: Real, d: Vec3, active: Mask
-) -> Sample:
+def _sample_where(prepared: SurfaceTracer, p: Vec3, value: Real, d: Vec3, active: Mask) -> Sample:
     """Value, error, gradient and normal at p where active, zeros elsewhere, and no promises.
 
     value: f near p. d: of the ray; a point with a zero gradient has the normal -d.
@@ -174,57 +173,57 @@ def _sample_where(
     real, vector = prepared.backend.Float, prepared.backend.Array3f
 
     def sampled(_: tuple[Any, ...]) -> tuple[Any, ...]:
-        sample = prepared.sample_near(p, value)
+        sample = prepared.sample_with_branch(p, value)
         length = norm(sample.gradient)
         normal = dr.select(length > 0, sample.gradient / length, -d)
-        shading = vector(normal if sample.normal is None else sample.normal)
-        return real(sample.value), real(sample.error), vector(sample.gradient), shading
+        shading = vector(normal if sample.shading_normal is None else sample.shading_normal)
+        return real(sample.value), real(sample.value_error), vector(sample.gradient), shading
 
     start = real(0), real(0), vector(0), vector(0)
-    value, error, gradient, normal = changed_where(active, sampled, start, "at hits")
-    return Sample(value, gradient, (), error, normal=normal)
+    value, error, gradient, normal = update_where_active(active, sampled, start, "at hits")
+    return Sample(value, gradient, (), error, shading_normal=normal)
 
 
 def _on_sheet(
-    prepared: PreparedLevelSet, o: Vec3, d: Vec3, trace: MarchResult, hit: SurfaceHit
+    prepared: SurfaceTracer, o: Vec3, d: Vec3, trace: MarchResult, hit: SurfaceHit
 ) -> SurfaceHit:
     """Hits on sheets: t is exact to rounding, and so is the plane of the normal.
 
     The ray comes from the side of smaller values if it runs along the normal. The next ray keeps as
     far away as from a level set, and no less than several roundings of the position.
     """
-    t = dr.select(trace.on_sheet, trace.t, 0)
+    t = dr.select(trace.at_jump, trace.t, 0)
     p = dr.fma(prepared.backend.Array3f(t), d, o)
     side = dr.mulsign(prepared.backend.Float(1), dr.dot(trace.gradient, d))
-    rounding = 4 * prepared.backend.epsilon * (dr.max(dr.abs(o)) + t)
-    tolerance = prepared.tolerance.in_value(prepared.backend.Float(1), t)
+    rounding = 4 * prepared.backend.machine_epsilon * (dr.max(dr.abs(o)) + t)
+    tolerance = prepared.tolerance.value_tolerance(prepared.backend.Float(1), t)
     return replace(
         hit,
         t=t,
         position=p,
-        normal=facing(trace.gradient, d, side),
-        clearance=CLEARANCE * dr.maximum(tolerance, rounding),
+        normal=orient_normal(trace.gradient, d, side),
+        ray_offset=RAY_OFFSET * dr.maximum(tolerance, rounding),
         value=trace.value,
-        mended=prepared.backend.Bool(False),
+        is_hole_filling=prepared.backend.Bool(False),
     )
 
 
 def _uncertainty(
-    prepared: PreparedLevelSet, gradient: Vec3, t: Real, f: Real, error: Real = 0.0
+    prepared: SurfaceTracer, gradient: Vec3, t: Real, f: Real, error: Real = 0.0
 ) -> Real:
     """How far from the level a point may lie and still be a hit, to first order.
 
-    That is the tolerance, or what rounding of f (`Sample.error`) amounts to if that is more; the
-    rounding of positions is far below what Mitsuba's rays keep off surfaces anyway.
+    That is the tolerance, or what rounding of f (`Sample.value_error`) amounts to if that is more;
+    the rounding of positions is far below what Mitsuba's rays keep off surfaces anyway.
     """
     gradient_norm = norm(gradient)
     t = dr.select(dr.isfinite(t), t, 0)
-    rounding = 2 * (error + 8 * prepared.backend.epsilon * dr.abs(f))
-    close = dr.maximum(prepared.tolerance.in_value(gradient_norm, t), rounding)
+    rounding = 2 * (error + 8 * prepared.backend.machine_epsilon * dr.abs(f))
+    close = dr.maximum(prepared.tolerance.value_tolerance(gradient_norm, t), rounding)
     return dr.select(gradient_norm > 0, close / gradient_norm, prepared.tolerance.distance)
 
 
-def facing(normal: Vec3, d: Vec3, side: Real) -> Vec3:
+def orient_normal(normal: Vec3, d: Vec3, side: Real) -> Vec3:
     """The normal, turned if need be such that side * (normal . d) > 0."""
     along = dr.dot(normal, d)
     turned = dr.normalize(normal + (side * _GRAZING - along) * d)
@@ -243,12 +242,12 @@ class CappedSolid:
     prepared: a level set whose levels are the finite ones of `low` and `high`.
     """
 
-    prepared: PreparedLevelSet
+    prepared: SurfaceTracer
     low: Real
     high: Real
 
     @classmethod
-    def of(cls, surface: LevelSet, prepared: PreparedLevelSet) -> CappedSolid:
+    def of(cls, surface: Surface, prepared: SurfaceTracer) -> CappedSolid:
         """The solid that `surface.solid` describes."""
         if surface.solid is None:
             raise ValueError("this level set is not a solid: make it with solid=(low, high)")
@@ -256,15 +255,17 @@ class CappedSolid:
         low, high = (next(finite) if math.isfinite(end) else end for end in surface.solid)
         return cls(prepared, low, high)
 
-    def _holds(self, p: Vec3) -> Mask:
+    def _contains(self, p: Vec3) -> Mask:
         """Whether points of the volume belong to the solid."""
         f = self.prepared.sample(p).value
-        return (f >= self.low) & (f <= self.high) & self.prepared.counts(p)
+        return (f >= self.low) & (f <= self.high) & self.prepared.level_counts(p)
 
-    def meet(self, o: Vec3, d: Vec3, t_max: Real, active: Mask, leaves: Real = 0.0) -> SurfaceHit:
+    def intersect(
+        self, o: Vec3, d: Vec3, t_max: Real, active: Mask, side: Real = 0.0
+    ) -> SurfaceHit:
         """Where rays o + t d, |d| = 1, 0 <= t <= t_max, first cross the boundary of the solid.
 
-        leaves: of a ray that starts at the boundary, 1 if it goes out of the solid there, -1 if it
+        side: of a ray that starts at the boundary, 1 if it goes out of the solid there, -1 if it
             goes in; else 0. Such a ray starts off the boundary by a clearance. Where the solid or a
             gap in it is thinner than that, it starts on the wrong side: then it crosses back at
             once, straight on. So going in and going out always alternate, and no light is lost at
@@ -274,31 +275,37 @@ class CappedSolid:
         start, end = self.prepared.clip(o, d, zero, t_max)
         through = active & (start < end)
         start = dr.select(through, start, 0)
-        known = self.prepared.resolves(o, end)  # others run out of steps in `_meet_levels`
-        within = through & known & self._holds(self._at(o, d, start))
+        known = self.prepared.is_resolved(o, end)  # others run out of steps in `_meet_levels`
+        within = through & known & self._contains(self._at(o, d, start))
         inside = within & (start <= 0)
-        slipped = active & known & (((leaves < 0) & ~inside) | ((leaves > 0) & inside))
+        slipped = active & known & (((side < 0) & ~inside) | ((side > 0) & inside))
         entering = within & ~inside & ~slipped
         met = self._meet_levels(o, d, t_max, active & ~entering & ~slipped)
         met = replace(
             met, evaluations=met.evaluations + type(met.evaluations)(dr.select(through, 1, 0))
         )
-        leaving = inside & ~slipped & ~met.met & ~met.lost & (end < t_max)
+        leaving = inside & ~slipped & ~met.is_hit & ~met.is_out_of_steps & (end < t_max)
         capped = entering | leaving | slipped
         t = dr.select(capped & ~slipped, dr.select(leaving, end, start), 0)
         position = self._at(o, d, t)
-        outwards = dr.select(leaving | (leaves < 0), zero + 1, -1)
+        outwards = dr.select(leaving | (side < 0), zero + 1, -1)
         normal = outwards * d
         if self.prepared.volume is not None:
-            cap = facing(self.prepared.volume.outward_normal(position), d, outwards)
+            cap = orient_normal(self.prepared.volume.outward_normal(position), d, outwards)
             normal = dr.select(slipped, normal, cap)
-        clearance = zero + CLEARANCE * self.prepared.tolerance.distance
-        cut = met.cut
+        clearance = zero + RAY_OFFSET * self.prepared.tolerance.distance
+        cut = met.is_on_section
         if self.prepared.section is not None:
             first, last = self.prepared.section.clip(o, d, zero, t_max)
             cut = dr.select(leaving, last <= end, entering & (first >= start))
         crossed = replace(
-            met, t=t, met=capped, position=position, normal=normal, clearance=clearance, cut=cut
+            met,
+            t=t,
+            is_hit=capped,
+            position=position,
+            normal=normal,
+            ray_offset=clearance,
+            is_on_section=cut,
         )
         return dr.select(capped, crossed, met)
 
@@ -307,14 +314,14 @@ class CappedSolid:
         start, end = self.prepared.clip(o, d, self.prepared.backend.Float(0), t_max)
         through = active & (start < end)
         start = dr.select(through, start, 0)
-        known = self.prepared.resolves(o, end)
-        within = through & known & self._holds(self._at(o, d, start))
+        known = self.prepared.is_resolved(o, end)
+        within = through & known & self._contains(self._at(o, d, start))
         capped = within & ((start > 0) | (end < t_max))
         return capped | self.prepared.occluded(o, d, 0, t_max, active & ~capped)
 
     def _meet_levels(self, o: Vec3, d: Vec3, t_max: Real, active: Mask) -> SurfaceHit:
         """The first level set inside the volume, its normal turned out of the solid."""
-        met = meet_surface(self.prepared, o, d, t_max, active)
+        met = intersect_surface(self.prepared, o, d, t_max, active)
         at_low = dr.abs(met.value - self.low) < dr.abs(met.value - self.high)
         normal = dr.select(at_low, -met.normal, met.normal)
         return replace(met, normal=normal)

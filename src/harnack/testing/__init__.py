@@ -1,13 +1,20 @@
 """Tests of fields and bounds, for the library's own and for those that users write.
 
-`check_field(MyField())` samples every promise of a field, `check_bound(MyBound())` tries a bound
-on random functions of every kind, among them the extremal ones. Both raise `BrokenPromiseError`.
+`check_field(MyField())` samples every promise of a field, `check_enclosure(MyBound())` tries a
+bound on random functions of every kind, among them the extremal ones. Both raise
+`BrokenPromiseError`.
 """
 
 from __future__ import annotations
 
-from harnack.testing.enclosure_contracts import check_bound
-from harnack.testing.field_contracts import check_field, check_looks
-from harnack.testing.violation_search import BrokenPromiseError, scaled
+from harnack.testing.enclosure_contracts import check_enclosure
+from harnack.testing.field_contracts import check_field, check_ray_samples
+from harnack.testing.violation_search import BrokenPromiseError, mutated_enclosure
 
-__all__ = ["BrokenPromiseError", "check_bound", "check_field", "check_looks", "scaled"]
+__all__ = [
+    "BrokenPromiseError",
+    "check_enclosure",
+    "check_field",
+    "check_ray_samples",
+    "mutated_enclosure",
+]

@@ -33,7 +33,7 @@ def check_branch_points(field: RiemannSurface, size: float, rng: np.random.Gener
     Raises:
         BrokenPromiseError: naming the branch point, and the place where it does not hold.
     """
-    for point in field.branches.points:
+    for point in field.branches.branch_points:
         if point.power is not None:
             _check_branch_point(field, point, min(point.radius, size), rng)
 
@@ -50,24 +50,26 @@ def _check_branch_point(
         np.sqrt(rng.random(_PLACES)) * (1 - 1e-9),
     )
     angle = rng.uniform(-math.pi, math.pi, _PLACES)
-    x, y = point.at.real + away * np.cos(angle), point.at.imag + away * np.sin(angle)
-    away = np.hypot(x - point.at.real, y - point.at.imag)  # of the places as rounded
+    x, y = point.location.real + away * np.cos(angle), point.location.imag + away * np.sin(angle)
+    away = np.hypot(x - point.location.real, y - point.location.imag)  # of the places as rounded
     branches: Any = field.branches.prepare(backend)
     imaginary = field.part == "imag"
     period: float | None = branches.period(imaginary)
     value = point.value.imag if imaginary else point.value.real
     allowed = point.constant * away**point.power
     worst = np.zeros(_PLACES)
-    for branch in branches.at(complex_type(backend)(backend.Float(x), backend.Float(y))):
+    for branch in branches.evaluate(complex_type(backend)(backend.Float(x), backend.Float(y))):
         part = branch.value.imag if imaginary else branch.value.real
         off: FloatArray = to_numpy(part) - value
         if period is not None:
             off = off - period * np.round(off / period)
         worst = np.fmax(worst, np.abs(off))
-    rounding = _SLACK * (allowed + 1e-6 * abs(value)) + 2.0**-48 * (abs(value) + np.abs(point.at))
+    rounding = _SLACK * (allowed + 1e-6 * abs(value)) + 2.0**-48 * (
+        abs(value) + np.abs(point.location)
+    )
     require(
         worst <= allowed + rounding,
-        f"BranchPoint({point.at}): a branch is farther from the value {point.value} than "
+        f"BranchPoint({point.location}): a branch is farther from the value {point.value} than "
         f"{point.constant:g} |z - at|^{point.power:g}: the constant must be at least "
         f"{(worst / away**point.power).max():.6g}",
         np.column_stack([x, y, np.full(_PLACES, field.height * value)]),

@@ -15,10 +15,10 @@ from harnack.enclosures import BoundedLaplacian, HarmonicBall
 from harnack.fields.batched_fields import BatchedField
 from harnack.testing.violation_search import (
     BrokenPromiseError,
-    FieldValues,
-    jumps,
-    look_at,
+    FieldSamples,
+    accumulated_jumps,
     require,
+    sample_field,
 )
 
 if TYPE_CHECKING:
@@ -32,18 +32,18 @@ __all__ = ["check_derivatives"]
 _NODES = (-4.0, -2.0, -1.0, 1.0, 2.0, 4.0)
 _WEIGHTS = (0.0, 1 / 12, -8 / 12, 8 / 12, -1 / 12, 0.0)
 _WIDE_WEIGHTS = (1 / 24, -8 / 24, 0.0, 0.0, 8 / 24, -1 / 24)
-_SHARE = 0.2
+_RICHARDSON_SHARE = 0.2
 # Where no promise says over which length f is smooth, spacings of these shares of the points' own
 # size are tried.
-_TRIED = (1.0, 0.1, 0.01, 1e-3, 1e-4)
+_SPACING_FACTORS = (1.0, 0.1, 0.01, 1e-3, 1e-4)
 # Of a field with an error the differences must agree at this share of the points even without it:
 # between neighboring points an approximation mostly is a smooth function itself.
-_SMOOTH = 0.5
+_MIN_SMOOTH_FRACTION = 0.5
 # Of a field with creases they must agree at this share.
-_OFF_CREASES = 0.9
+_MIN_FRACTION_OFF_CREASES = 0.9
 
 
-def check_derivatives(field: Field, points: FloatArray, look: FieldValues) -> None:
+def check_derivatives(field: Field, points: FloatArray, look: FieldSamples) -> None:
     """Gradient, Laplacian and Hessian at points (n, 3), where `look` has the field's values.
 
     Differences are taken within the field's domain; points too close to its border for that are
@@ -55,21 +55,22 @@ def check_derivatives(field: Field, points: FloatArray, look: FieldValues) -> No
     h, fits = _spacing_within(field, points, _spacing(points, look))
     if not fits.any():
         return
-    points, look, h = points[fits], look.at(fits), h[fits]
-    has_ball = any(isinstance(one, HarmonicBall) for one in look.known)
+    points, look, h = points[fits], look.subset(fits), h[fits]
+    has_ball = any(isinstance(one, HarmonicBall) for one in look.promises)
     trials = [
-        list(_around(field, points, look, q * h)) for q in (_TRIED[:1] if has_ball else _TRIED)
+        list(_stencil_samples(field, points, look, q * h))
+        for q in (_SPACING_FACTORS[:1] if has_ball else _SPACING_FACTORS)
     ]
     limits = [np.add(*_limits(field, points, look, nearby)) for nearby in trials]
-    nearby = _chosen(trials, np.argmin(limits, axis=0))
+    nearby = _pick_spacing(trials, np.argmin(limits, axis=0))
     _check_gradient(field, points, look, nearby)
     _check_laplacian(points, look, trials)
     try:
         _check_hessian(field, points, look, trials)
     except BrokenPromiseError:
-        if not field.has_detail:
+        if not field.has_variable_accuracy:
             raise
-        closely = [_closely(field, points, one) for one in trials]
+        closely = [_without_truncation(field, points, one) for one in trials]
         _check_hessian(field, points, look, closely)
 
 
@@ -92,7 +93,7 @@ def _spacing_within(
 
 
 @dataclass(frozen=True)
-class _Nearby:
+class _StencilSample:
     """The field at points + node h along an axis, for a node of the differences.
 
     h: (n,). weight: (n,) of the node, over h; wide: the same with twice the spacing. move: (n,) of
@@ -111,46 +112,50 @@ class _Nearby:
     gradient_error: FloatArray
 
 
-def _around(
-    field: Field, points: FloatArray, look: FieldValues, h: FloatArray
-) -> Iterator[_Nearby]:
+def _stencil_samples(
+    field: Field, points: FloatArray, look: FieldSamples, h: FloatArray
+) -> Iterator[_StencilSample]:
     for axis in range(3):
         for node, weight, wide in zip(_NODES, _WEIGHTS, _WIDE_WEIGHTS, strict=True):
             way = np.sign(node) * np.eye(3)[axis] + 0 * points
             length = np.abs(node) * h
-            other = look_at(field, points + length[:, None] * way)
+            other = sample_field(field, points + length[:, None] * way)
             move = other.value - look.value
             if field.period is not None:
                 move -= field.period * np.round(move / field.period)
             ends = np.column_stack([0 * length, length])
-            move -= jumps(field, points, way, ends)[:, 1]
+            move -= accumulated_jumps(field, points, way, ends)[:, 1]
             error = look.error + other.error
-            yield _Nearby(
+            yield _StencilSample(
                 axis, node, h, weight / h, wide / h, move, other.gradient, error,
                 look.gradient_error + other.gradient_error,
             )  # fmt: skip
 
 
-def _closely(field: Field, points: FloatArray, nearby: list[_Nearby]) -> list[_Nearby]:
-    """The same places with gradients without truncation (`Field.without_truncation`), whose
+def _without_truncation(
+    field: Field, points: FloatArray, nearby: list[_StencilSample]
+) -> list[_StencilSample]:
+    """The same places with gradients without truncation (`Field.exact`), whose
     derivative the Hessian of a field with a choice of detail may be as well."""
-    error = look_at(field, points, closely=True).gradient_error
-    found: list[_Nearby] = []
+    error = sample_field(field, points, closely=True).gradient_error
+    found: list[_StencilSample] = []
     for neighbor in nearby:
         there = points + (neighbor.node * neighbor.h)[:, None] * np.eye(3)[neighbor.axis]
-        look = look_at(field, there, closely=True)
+        look = sample_field(field, there, closely=True)
         errors = error + look.gradient_error
         found.append(dataclasses.replace(neighbor, gradient=look.gradient, gradient_error=errors))
     return found
 
 
-def _chosen(trials: list[list[_Nearby]], choice: npt.NDArray[np.intp]) -> list[_Nearby]:
+def _pick_spacing(
+    trials: list[list[_StencilSample]], choice: npt.NDArray[np.intp]
+) -> list[_StencilSample]:
     """Of several spacings the one chosen at each point."""
     if len(trials) == 1:
         return trials[0]
     rows = np.arange(len(choice))
 
-    def pick(nodes: tuple[_Nearby, ...]) -> _Nearby:
+    def pick(nodes: tuple[_StencilSample, ...]) -> _StencilSample:
         arrays: dict[str, Any] = {
             name: np.stack([getattr(one, name) for one in nodes])[choice, rows]
             for name in ("h", "weight", "wide", "move", "gradient", "error", "gradient_error")
@@ -160,14 +165,14 @@ def _chosen(trials: list[list[_Nearby]], choice: npt.NDArray[np.intp]) -> list[_
     return [pick(nodes) for nodes in zip(*trials, strict=True)]
 
 
-def _spacing(points: FloatArray, look: FieldValues) -> FloatArray:
+def _spacing(points: FloatArray, look: FieldSamples) -> FloatArray:
     return 2e-3 * _scale(points, look)
 
 
-def _scale(points: FloatArray, look: FieldValues) -> FloatArray:
+def _scale(points: FloatArray, look: FieldSamples) -> FloatArray:
     """A length (n,) over which the field is smooth: the smallest radius that is promised."""
     size = float(np.ptp(points, axis=0).max()) or 1.0
-    radii = [known.radius for known in look.known if isinstance(known, HarmonicBall)]
+    radii = [known.radius for known in look.promises if isinstance(known, HarmonicBall)]
     smooth = np.min([np.full(len(points), size), *radii], axis=0)
     return np.maximum(smooth, 1e-9 * size)
 
@@ -177,16 +182,16 @@ def _size(points: FloatArray) -> FloatArray:
 
 
 def _check_gradient(
-    field: Field, points: FloatArray, look: FieldValues, nearby: list[_Nearby]
+    field: Field, points: FloatArray, look: FieldSamples, nearby: list[_StencilSample]
 ) -> None:
     """By central differences of the value."""
     tolerance, allowance = _limits(field, points, look, nearby)
     off = np.linalg.norm(_difference(nearby)[0] - look.gradient, axis=1)
     message = "the gradient is not that of the value"
-    _agree(off, tolerance, allowance, message, points, has_creases=field.has_creases)
+    _require_agreement(off, tolerance, allowance, message, points, has_creases=field.has_creases)
 
 
-def _difference(nearby: list[_Nearby]) -> tuple[FloatArray, FloatArray]:
+def _difference(nearby: list[_StencilSample]) -> tuple[FloatArray, FloatArray]:
     """The gradient (n, 3) by differences of the value, with both spacings."""
     fine, wide = (np.zeros((len(nearby[0].h), 3)) for _ in range(2))
     for neighbor in nearby:
@@ -196,7 +201,7 @@ def _difference(nearby: list[_Nearby]) -> tuple[FloatArray, FloatArray]:
 
 
 def _limits(
-    field: Field, points: FloatArray, look: FieldValues, nearby: list[_Nearby]
+    field: Field, points: FloatArray, look: FieldSamples, nearby: list[_StencilSample]
 ) -> tuple[FloatArray, FloatArray]:
     """How far differences of the value may be from the gradient (n,): what they leave out and
     rounding, and besides what errors of value and gradient allow."""
@@ -208,8 +213,8 @@ def _limits(
     magnitude = np.abs(look.value) + (field.period or 0)
     tolerance = 1e-6 * length + (1e-12 * magnitude + 1e-12 * length * _size(points)) / h
     fine, wide = _difference(nearby)
-    tolerance += _SHARE * np.linalg.norm(fine - wide, axis=1)
-    if not any(one.is_smooth for one in look.known):
+    tolerance += _RICHARDSON_SHARE * np.linalg.norm(fine - wide, axis=1)
+    if not any(one.implies_smooth for one in look.promises):
         # There may be a kink between the points: as much as the gradient changes there.
         changes = [np.linalg.norm(neighbor.gradient - look.gradient, axis=1) for neighbor in nearby]
         tolerance += 2 * np.max(changes, axis=0)
@@ -218,7 +223,7 @@ def _limits(
     return tolerance, allowance
 
 
-def _second_derivatives(nearby: list[_Nearby]) -> FloatArray:
+def _second_derivatives(nearby: list[_StencilSample]) -> FloatArray:
     """(n,) sums of the sizes of the second derivatives along the axes."""
     return np.sum(
         [np.abs(neighbor.weight * neighbor.gradient[:, neighbor.axis]) for neighbor in nearby],
@@ -226,14 +231,16 @@ def _second_derivatives(nearby: list[_Nearby]) -> FloatArray:
     )
 
 
-def _check_laplacian(points: FloatArray, look: FieldValues, trials: list[list[_Nearby]]) -> None:
+def _check_laplacian(
+    points: FloatArray, look: FieldSamples, trials: list[list[_StencilSample]]
+) -> None:
     """By central differences of the gradient."""
-    bounds = [one for one in look.known if isinstance(one, BoundedLaplacian)]
+    bounds = [one for one in look.promises if isinstance(one, BoundedLaplacian)]
     if not _is_harmonic(look) and not bounds:
         return
     length = np.linalg.norm(look.gradient, axis=1)
 
-    def differences(nearby: list[_Nearby]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def differences(nearby: list[_StencilSample]) -> tuple[FloatArray, FloatArray, FloatArray]:
         h = nearby[0].h
         laplacian = np.sum(
             [neighbor.weight * neighbor.gradient[:, neighbor.axis] for neighbor in nearby], axis=0
@@ -244,14 +251,16 @@ def _check_laplacian(points: FloatArray, look: FieldValues, trials: list[list[_N
         wide = np.sum(
             [neighbor.wide * neighbor.gradient[:, neighbor.axis] for neighbor in nearby], axis=0
         )
-        tolerance = 1e-6 * _second_derivatives(nearby) + _SHARE * np.abs(laplacian - wide)
+        tolerance = 1e-6 * _second_derivatives(nearby) + _RICHARDSON_SHARE * np.abs(
+            laplacian - wide
+        )
         tolerance += 1e-11 * length * (1 + _size(points) / h) / h
         return laplacian, tolerance, allowance
 
     tried = [differences(nearby) for nearby in trials]
     if _is_harmonic(look):
         message = "HarmonicBall: f is not harmonic, its Laplacian is not 0"
-        _agree(
+        _require_agreement(
             *_likeliest([(np.abs(laplacian), *rest) for laplacian, *rest in tried]), message, points
         )
     for bound in bounds:
@@ -261,7 +270,7 @@ def _check_laplacian(points: FloatArray, look: FieldValues, trials: list[list[_N
             for laplacian, *rest in tried
         ]
         message = "BoundedLaplacian: the Laplacian is not between its ends"
-        _agree(*_likeliest(beyond), message, points)
+        _require_agreement(*_likeliest(beyond), message, points)
 
 
 def _likeliest(
@@ -283,11 +292,11 @@ def _likeliest(
     return off, tolerance, allowance
 
 
-def _is_harmonic(look: FieldValues) -> bool:
-    return any(isinstance(one, HarmonicBall) and one.dimension < 4 for one in look.known)
+def _is_harmonic(look: FieldSamples) -> bool:
+    return any(isinstance(one, HarmonicBall) and one.dimension < 4 for one in look.promises)
 
 
-def _agree(
+def _require_agreement(
     off: FloatArray,
     tolerance: FloatArray,
     allowance: FloatArray,
@@ -302,15 +311,15 @@ def _agree(
     has_creases: differences may cross one, at few points.
     """
     good = off <= tolerance + allowance
-    if has_creases and good.mean() >= _OFF_CREASES:
+    if has_creases and good.mean() >= _MIN_FRACTION_OFF_CREASES:
         return
     require(good, message, points, off)
-    if np.mean(off <= tolerance) < _SMOOTH:
+    if np.mean(off <= tolerance) < _MIN_SMOOTH_FRACTION:
         raise BrokenPromiseError(f"{message} at more than half of the {len(points)} points")
 
 
 def _check_hessian(
-    field: Field, points: FloatArray, look: FieldValues, trials: list[list[_Nearby]]
+    field: Field, points: FloatArray, look: FieldSamples, trials: list[list[_StencilSample]]
 ) -> None:
     """By central differences of the gradient, of two orders: they tell how far to trust them. The
     spacing at which the gradient is compared with values is far too small for that where f may have
@@ -335,7 +344,7 @@ def _check_hessian(
     if isinstance(field, BatchedField):
         own = field.hessian_error_bound(points, precision="double")
 
-    def differences(nearby: list[_Nearby]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def differences(nearby: list[_StencilSample]) -> tuple[FloatArray, FloatArray, FloatArray]:
         h = nearby[0].h
         fine, coarse = np.zeros_like(hessian), np.zeros_like(hessian)
         for neighbor in nearby:
@@ -351,4 +360,4 @@ def _check_hessian(
 
     likeliest = _likeliest([differences(nearby) for nearby in trials])
     message = "the Hessian is not the derivative of the gradient"
-    _agree(*likeliest, message, points, has_creases=field.has_creases)
+    _require_agreement(*likeliest, message, points, has_creases=field.has_creases)

@@ -1,9 +1,9 @@
-"""`check_bound`: proofs tried on functions that keep a promise, with levels put where they go.
+"""`check_enclosure`: proofs tried on functions that keep a promise, with levels put where they go.
 
 A proof is right if no function that the promise allows meets a level within its step. The functions
 drawn here include the extremal ones of the proofs in `harnack.enclosures`, so a proof that is a
-thousandth too long is found out. A `Case` is a promise with the levels asked for, on which every
-proof can be tried.
+thousandth too long is found out. A `PromiseCase` is a promise with the levels asked for, on which
+every proof can be tried.
 """
 
 from __future__ import annotations
@@ -19,82 +19,82 @@ import numpy as np
 from harnack.backend import BoolArray, FloatArray, choose_backend, to_numpy
 from harnack.enclosures import (
     BoundedLaplacian,
-    Curvature,
     Enclosure,
-    Gaps,
     HarmonicBall,
+    LevelGaps,
     Lipschitz,
     Promise,
-    Slopes,
+    SlopeRange,
+    TaylorRemainder,
 )
-from harnack.enclosures.bounded_laplacian import GreenBall
-from harnack.enclosures.free_radius import Ball
-from harnack.testing.poisson import AxialFunctions, GreenPotentials, cap_mass, kernel_movement
+from harnack.enclosures.bounded_laplacian import BoundedLaplacianEnclosure
+from harnack.enclosures.free_radius import HarmonicBallEnclosure
+from harnack.testing.poisson import AxialFunctions, GreenPotentials, cap_mass, kernel_difference
 from harnack.testing.violation_search import BrokenPromiseError
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Precision, Real
 
 __all__ = [
-    "Case",
-    "Trial",
-    "check_bound",
-    "trials",
+    "PromiseCase",
+    "RandomFunctions",
+    "check_enclosure",
+    "random_functions",
 ]
 
 
 @dataclass(frozen=True)
-class Case:
-    """promise: what is known near p of a function with f(p) = 0. gap_down, gap_up: how far in value
-    the levels below and above are."""
+class PromiseCase:
+    """promise: what is known near p of a function with f(p) = 0. gap_below, gap_above: how far in
+    value the levels below and above are."""
 
     promise: Promise
-    gap_down: Real
-    gap_up: Real
+    gap_below: Real
+    gap_above: Real
 
-    def each(self, change: Callable[[Any], Any]) -> Case:
+    def map_numbers(self, change: Callable[[Any], Any]) -> PromiseCase:
         """The case with all its numbers changed, of Python, NumPy or Dr.Jit."""
-        promise = self.promise.each(lambda number, _, __: change(number))
-        return Case(promise, change(self.gap_down), change(self.gap_up))
+        promise = self.promise.map_numbers(lambda number, _, __: change(number))
+        return PromiseCase(promise, change(self.gap_below), change(self.gap_above))
 
-    def enclosure(self, kind: type[Enclosure], slopes: Slopes) -> Enclosure | None:
+    def enclosure(self, kind: type[Enclosure], slopes: SlopeRange) -> Enclosure | None:
         """The enclosure that a proof makes of this; None if it makes none."""
         promise: Any = self.promise
         # Without what `of` takes off for rounding, so that steps can be compared exactly.
-        if isinstance(promise, HarmonicBall) and issubclass(kind, Ball):
+        if isinstance(promise, HarmonicBall) and issubclass(kind, HarmonicBallEnclosure):
             ends = -promise.lower, promise.upper
             below, above = (None if _is_open(end) else end for end in ends)
-            if not kind.applies(promise.dimension, below is not None, above is not None):
+            if not kind.applies_to(promise.dimension, below is not None, above is not None):
                 return None
             return kind(promise.radius, below, above, promise.dimension, slopes)
-        if isinstance(promise, BoundedLaplacian) and issubclass(kind, GreenBall):
+        if isinstance(promise, BoundedLaplacian) and issubclass(kind, BoundedLaplacianEnclosure):
             ranges = -promise.lower, promise.upper
             ends = promise.laplacian_lower, promise.laplacian_upper
-            return kind.of_ranges(promise.radius, ranges, ends, slopes)
-        return kind.of(promise, type(slopes.low)(0), 0.0, slopes)
+            return kind.from_ranges(promise.radius, ranges, ends, slopes)
+        return kind.from_promise(promise, type(slopes.lower)(0), 0.0, slopes)
 
     def accepts(self, kind: type[Enclosure]) -> bool:
         """Whether a proof applies to this."""
-        lows = [low for low, _ in self.promise.ends]
+        lows = [low for low, _ in self.promise.interval_pairs]
         plain = {
             name: -1.0 if name in lows else 1.0
             for name, *_ in self.promise.units
             if not _is_open(getattr(self.promise, name))
         }
-        case = Case(dataclasses.replace(self.promise, **plain), 1.0, 1.0)
-        return case.enclosure(kind, Slopes(0.0, 0.0)) is not None
+        case = PromiseCase(dataclasses.replace(self.promise, **plain), 1.0, 1.0)
+        return case.enclosure(kind, SlopeRange(0.0, 0.0)) is not None
 
     def step(self, kind: type[Enclosure], slope: Real, error: Real = 0.0) -> Real:
         """The step along a direction with a slope known up to an error."""
-        enclosure = self.enclosure(kind, Slopes.around(slope, error))
+        enclosure = self.enclosure(kind, SlopeRange.around(slope, error))
         assert enclosure is not None
-        return enclosure.step(Gaps(self.gap_down, self.gap_up))
+        return enclosure.free_length(LevelGaps(self.gap_below, self.gap_above))
 
     def covers(self, kind: type[Enclosure], slope: Real, length: Real, error: Real = 0.0) -> Mask:
         """Whether a length along such a direction is proved free."""
-        enclosure = self.enclosure(kind, Slopes.around(slope, error))
+        enclosure = self.enclosure(kind, SlopeRange.around(slope, error))
         assert enclosure is not None
-        return enclosure.covers(Gaps(self.gap_down, self.gap_up), length)
+        return enclosure.is_free(LevelGaps(self.gap_below, self.gap_above), length)
 
 
 def _is_open(end: Any) -> bool:
@@ -108,7 +108,7 @@ _SAMPLES = 48
 
 
 @dataclass(frozen=True)
-class Trial:
+class RandomFunctions:
     """Functions along rays, (rows,), and cases at t = 0 whose promise they keep.
 
     movement: f(t) - f(0) for t (rows, m) with 0 <= t < reach, the distance of the promise.
@@ -116,13 +116,13 @@ class Trial:
     """
 
     name: str
-    case: Case
+    case: PromiseCase
     slope: FloatArray
     reach: FloatArray
     movement: Callable[[FloatArray], FloatArray]
 
 
-def check_bound(
+def check_enclosure(
     kind: type[Enclosure],
     *,
     rng: np.random.Generator | int = 0,
@@ -142,7 +142,7 @@ def check_bound(
     """
     accepted = 0
     generator = np.random.default_rng(rng)
-    for trial in trials(generator, rows):
+    for trial in random_functions(generator, rows):
         on_device, slope = _upload(trial, precision)
         if on_device.accepts(kind):
             accepted += 1
@@ -154,7 +154,7 @@ def check_bound(
         )
 
 
-def trials(rng: np.random.Generator, rows: int) -> Iterator[Trial]:
+def random_functions(rng: np.random.Generator, rows: int) -> Iterator[RandomFunctions]:
     """One trial of each kind: harmonic in 2, 3, 4 dimensions, of bounded Laplacian, Lipschitz,
     of bounded curvature."""
     with np.errstate(all="ignore"):
@@ -168,7 +168,7 @@ def trials(rng: np.random.Generator, rows: int) -> Iterator[Trial]:
         yield _curved(rng, rows)
 
 
-def _positive(rng: np.random.Generator, rows: int, n: int, *, mirrored: bool) -> Trial:
+def _positive(rng: np.random.Generator, rows: int, n: int, *, mirrored: bool) -> RandomFunctions:
     """f - lower (mirrored: upper - f) is the Poisson integral of one, two or three rings."""
     radius, mass = _log_uniform(rng, rows, -3, 3), _log_uniform(rng, rows, -3, 3)
     places = rng.uniform(-1, 1, (rows, 3))
@@ -195,7 +195,7 @@ def _positive(rng: np.random.Generator, rows: int, n: int, *, mirrored: bool) ->
     )
 
 
-def _bounded(rng: np.random.Generator, rows: int, n: int) -> Trial:
+def _bounded(rng: np.random.Generator, rows: int, n: int) -> RandomFunctions:
     """Boundary values in [lower, upper]: steps at random heights, among them two caps."""
     radius, span = _log_uniform(rng, rows, -3, 3), _log_uniform(rng, rows, -3, 3)
     heights = np.sort(rng.uniform(0, 2, (rows, 3)), axis=1)
@@ -220,7 +220,7 @@ def _bounded(rng: np.random.Generator, rows: int, n: int) -> Trial:
     )
 
 
-def _sourced(rng: np.random.Generator, rows: int, *, mirrored: bool) -> Trial:
+def _sourced(rng: np.random.Generator, rows: int, *, mirrored: bool) -> RandomFunctions:
     """Poisson integrals of rings of mass with sources: the Laplacian jumps and varies.
 
     It is that of an even density, two balls of even density and a multiple of the Legendre
@@ -272,7 +272,7 @@ def _sourced(rng: np.random.Generator, rows: int, *, mirrored: bool) -> Trial:
     )
 
 
-def _lipschitz(rng: np.random.Generator, rows: int) -> Trial:
+def _lipschitz(rng: np.random.Generator, rows: int) -> RandomFunctions:
     """Straight and zigzag lines of slope at most the constant."""
     radius, constant = _log_uniform(rng, rows, -3, 3), _log_uniform(rng, rows, -3, 3)
     knots = np.sort(rng.uniform(0, 1, (rows, 2)), axis=1) * radius[:, None]
@@ -295,7 +295,7 @@ def _lipschitz(rng: np.random.Generator, rows: int) -> Trial:
     )
 
 
-def _curved(rng: np.random.Generator, rows: int) -> Trial:
+def _curved(rng: np.random.Generator, rows: int) -> RandomFunctions:
     """Parabolas whose second derivative jumps once, at most the constant in size."""
     radius, constant = _log_uniform(rng, rows, -3, 3), _log_uniform(rng, rows, -3, 3)
     bends = rng.uniform(-1, 1, (rows, 2)) * constant[:, None]
@@ -316,7 +316,7 @@ def _curved(rng: np.random.Generator, rows: int) -> Trial:
         radius,
         slope,
         movement,
-        Curvature(constant, radius),
+        TaylorRemainder(constant, radius),
     )
 
 
@@ -328,7 +328,7 @@ def _with_gaps(
     slope: FloatArray,
     movement: Callable[[FloatArray], FloatArray],
     promise: Promise,
-) -> Trial:
+) -> RandomFunctions:
     """Levels where the function is at a random place, and others at random."""
     rows = len(scale)
     down, up = scale * _log_uniform(rng, rows, -9, 2), scale * _log_uniform(rng, rows, -9, 2)
@@ -340,24 +340,24 @@ def _with_gaps(
     far = rng.random(rows) < 0.5  # else the other level is often met first
     up = np.where(is_met & far & (met < 0), np.inf, up)
     down = np.where(is_met & far & (met > 0), np.inf, down)
-    return Trial(name, Case(promise, down, up), slope, reach, movement)
+    return RandomFunctions(name, PromiseCase(promise, down, up), slope, reach, movement)
 
 
 def _log_uniform(rng: np.random.Generator, rows: int, low: float, high: float) -> FloatArray:
     return 10 ** rng.uniform(low, high, rows)
 
 
-def _upload(trial: Trial, precision: Precision) -> tuple[Case, Any]:
+def _upload(trial: RandomFunctions, precision: Precision) -> tuple[PromiseCase, Any]:
     """The cases and slopes as Dr.Jit arrays."""
     real = choose_backend(precision).Float
-    upload = trial.case.each(lambda one: real(one) if isinstance(one, np.ndarray) else one)
+    upload = trial.case.map_numbers(lambda one: real(one) if isinstance(one, np.ndarray) else one)
     return upload, real(trial.slope)
 
 
 def _check_trial(
     kind: type[Enclosure],
-    trial: Trial,
-    case: Case,
+    trial: RandomFunctions,
+    case: PromiseCase,
     slope: Any,
     rng: np.random.Generator,
     precision: Precision,
@@ -365,7 +365,7 @@ def _check_trial(
     rows = len(trial.slope)
     real = cast("Any", type(slope))
     step = to_numpy(case.step(kind, slope)).astype(np.float64)
-    met = _meets(trial, np.minimum(step, trial.reach), precision)
+    met = _meets_level(trial, np.minimum(step, trial.reach), precision)
     _require(trial, ~met, kind, "a level is met within the step {length}", step)
     good = (step >= 0) & (step <= trial.reach * (1 + 1e-6))
     beyond = "the step {length} is no length up to {reach}, where the promise ends"
@@ -380,11 +380,13 @@ def _check_trial(
     for length in lengths:
         covered = to_numpy(case.covers(kind, slope, real(length)))
         inside = np.minimum(length, trial.reach)
-        wrong = covered & (_meets(trial, inside, precision) | (length > trial.reach * (1 + 1e-6)))
+        wrong = covered & (
+            _meets_level(trial, inside, precision) | (length > trial.reach * (1 + 1e-6))
+        )
         _require(trial, ~wrong, kind, "a level is met within {length}, which is covered", length)
 
 
-def _meets(trial: Trial, length: FloatArray, precision: Precision) -> BoolArray:
+def _meets_level(trial: RandomFunctions, length: FloatArray, precision: Precision) -> BoolArray:
     """Whether the functions are seen to meet a level strictly within the length, (rows,)."""
     tolerance = 1e-9 if precision == "double" else 1e-5
     shares = np.concatenate([np.linspace(0, 1, _SAMPLES // 2), 1 - np.geomspace(1e-7, 0.5, 24)])
@@ -393,31 +395,31 @@ def _meets(trial: Trial, length: FloatArray, precision: Precision) -> BoolArray:
         moved = trial.movement(t)
         # Rounding of the inputs moves a function by so much at most.
         q = np.minimum(t / trial.reach[:, None], 1 - 1e-12)
-        growth = kernel_movement(q, 1.0, 4) + 1
+        growth = kernel_difference(q, 1.0, 4) + 1
     slack = 0.0
     if precision == "single":
         slack = 2e-6 * _size(trial)[:, None] * growth
     c = trial.case
-    over = moved > c.gap_up[:, None] * (1 + tolerance) + slack
-    under = -moved > c.gap_down[:, None] * (1 + tolerance) + slack
+    over = moved > c.gap_above[:, None] * (1 + tolerance) + slack
+    under = -moved > c.gap_below[:, None] * (1 + tolerance) + slack
     return (over | under).any(axis=1)
 
 
-def _size(trial: Trial) -> FloatArray:
+def _size(trial: RandomFunctions) -> FloatArray:
     promise, size = trial.case.promise, np.abs(trial.slope) * trial.reach
-    for low, high in promise.ends[:1]:  # the nearer one: the other may be as good as open
+    for low, high in promise.interval_pairs[:1]:  # the nearer one: the other may be as good as open
         size = size + np.minimum(np.abs(getattr(promise, low)), np.abs(getattr(promise, high)))
     return size
 
 
 def _require(
-    trial: Trial, good: Any, kind: type[Enclosure], promise: str, length: FloatArray
+    trial: RandomFunctions, good: Any, kind: type[Enclosure], promise: str, length: FloatArray
 ) -> None:
     bad = np.flatnonzero(~good)
     if not bad.size:
         return
     row = bad[0]
-    numbers = trial.case.each(lambda one: float(one[row]) if np.ndim(one) else one)
+    numbers = trial.case.map_numbers(lambda one: float(one[row]) if np.ndim(one) else one)
     what = promise.format(reach=float(trial.reach[row]), length=float(length[row]))
     raise BrokenPromiseError(
         f"{kind.__name__} does not keep its promise ({trial.name}): {what}. Wrong in "

@@ -1,4 +1,4 @@
-"""`check_field` and `check_looks`: what a field promises, and proves along paths, sampled."""
+"""`check_field` and `check_ray_samples`: what a field promises, and proves along paths, sampled."""
 
 from __future__ import annotations
 
@@ -9,39 +9,39 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import FloatArray, choose_backend, to_numpy, to_vector3
-from harnack.backend.arrays import finite_vectors
-from harnack.backend.validation import real, whole
+from harnack.backend.arrays import as_finite_vectors
+from harnack.backend.validation import as_integer_in_range, as_real
 from harnack.enclosures import (
-    Choice,
-    Curvature,
-    Gaps,
+    EnclosureChoice,
     HarmonicBall,
-    Slopes,
-    choose_proofs,
-    longest_step,
+    LevelGaps,
+    SlopeRange,
+    TaylorRemainder,
+    choose_enclosures,
+    longest_free_length,
 )
 from harnack.fields.analytic.riemann_surface import RiemannSurface
 from harnack.fields.batched_fields import BatchedField
 from harnack.fields.field import Field, check_is_field
-from harnack.fields.samples import Path
+from harnack.fields.samples import Ray
 from harnack.testing.branch_contracts import check_branch_points
 from harnack.testing.derivative_contracts import check_derivatives
 from harnack.testing.violation_search import (
     BrokenPromiseError,
-    FieldValues,
-    look_at,
-    movements,
+    FieldSamples,
+    lift_along_rays,
     random_directions,
     random_points,
     require,
-    search_worst_places,
+    sample_field,
+    search_violations,
 )
 
 if TYPE_CHECKING:
     from harnack.backend import Precision
     from harnack.enclosures import Promise
 
-__all__ = ["check_field", "check_looks", "free_lengths"]
+__all__ = ["check_field", "check_ray_samples", "proved_free_lengths"]
 
 # Places at which the movement along a step is sampled.
 _SAMPLES = 33
@@ -50,19 +50,19 @@ _SAMPLES = 33
 # Enclosures along paths.
 
 
-def check_looks(
+def check_ray_samples(
     field: Field,
     points: FloatArray,
     *,
     rng: np.random.Generator | int = 0,
-    bound: Choice = None,
+    bound: EnclosureChoice = None,
     precision: Precision = "double",
 ) -> None:
     """Test the enclosures that a field gives along random directions from points (n, 3).
 
     For lengths from a thousandth of the extent of the points to twice of it, and gaps from far
     below to far above what f moves by on the way, f must not pass a gap within the step proved for
-    it, but by `Sample.error` and the rounding of value and position.
+    it, but by `Sample.value_error` and the rounding of value and position.
 
     Raises:
         BrokenPromiseError: naming the point, and where f is too large or too small.
@@ -72,18 +72,18 @@ def check_looks(
     directions = random_directions(generator, n)
     size = float(np.ptp(points, axis=0).max()) or 1.0
     ahead = size * 2.0 ** generator.uniform(-10, 1, n)
-    rough = movements(field, points, directions, ahead[:, None] * np.linspace(0, 1, 9))
+    rough = lift_along_rays(field, points, directions, ahead[:, None] * np.linspace(0, 1, 9))
     scale = np.abs(rough.moved).max(axis=1) + 1e-6
     for forwards in (True, False):
         gaps = scale[:, None] * 10.0 ** generator.uniform(-3, 0.5, (n, 2))
         without = generator.integers(0, 3, n)  # a level below, above, or on both sides
         gaps[without < 2, without[without < 2]] = np.inf
-        steps = free_lengths(
+        steps = proved_free_lengths(
             field, points, directions if forwards else -directions, ahead, gaps,
             bound=bound, precision=precision, forwards=forwards,
         )  # fmt: skip
         lengths = np.minimum(steps, 2 * ahead)[:, None] * np.linspace(0, 1, _SAMPLES)
-        path = movements(field, points, directions, lengths)
+        path = lift_along_rays(field, points, directions, lengths)
         # What rounding leaves of the values compared, and of the points in this precision.
         unit = 2.0**-52 if precision == "double" else 2.0**-23
         position = unit * (np.abs(points).max(axis=1)[:, None] + lengths) * path.gradient_norm
@@ -95,14 +95,14 @@ def check_looks(
         require(worst <= 0, f"an enclosure looking {side} is left", points, worst, where)
 
 
-def free_lengths(
+def proved_free_lengths(
     field: Field,
     points: FloatArray,
     directions: FloatArray,
     ahead: FloatArray,
     gaps: FloatArray,
     *,
-    bound: Choice = None,
+    bound: EnclosureChoice = None,
     precision: Precision = "double",
     forwards: bool = True,
 ) -> FloatArray:
@@ -112,12 +112,14 @@ def free_lengths(
     forwards=False those that look back from points on paths along `directions`.
     """
     backend = choose_backend(precision)
-    path = Path(to_vector3(backend, points), to_vector3(backend, directions), choose_proofs(bound))
+    path = Ray(
+        to_vector3(backend, points), to_vector3(backend, directions), choose_enclosures(bound)
+    )
     length = backend.Float(np.ascontiguousarray(ahead))
     down, up = (backend.Float(np.ascontiguousarray(gaps[:, k])) for k in (0, 1))
-    look = field.prepare(backend).look(path, backend.Float(0), length, length)
-    enclosures = look.ahead if forwards else look.back
-    steps = to_numpy(longest_step(enclosures, Gaps(down, up)) + 0 * down)
+    look = field.prepare(backend).sample_ray(path, backend.Float(0), length, length)
+    enclosures = look.forward if forwards else look.backward
+    steps = to_numpy(longest_free_length(enclosures, LevelGaps(down, up)) + 0 * down)
     return np.broadcast_to(steps, len(points)).astype(np.float64)
 
 
@@ -140,16 +142,16 @@ def check_field(
     levels: whose `extent` to test; by default the default level.
     directions: how many ways to walk from each point within each promise.
 
-    Checked: values and gradients are numbers, alike in both precisions within `Sample.error`;
+    Checked: values and gradients are numbers, alike in both precisions within `Sample.value_error`;
     the gradient is that of the value; f is harmonic where a ball of dimension 2 or 3 says so;
     `differentiable_value` is the value and has this gradient; `hessian`, where there is one, is
     symmetric, the derivative of the gradient and, of a harmonic f, without trace; the lift of f
-    keeps each promise (`HarmonicBall`, `Lipschitz`, `Curvature`) on the way to random points of its
-    ball, or for the last two to where that leaves the domain, and where a search for the worst
-    points and places in these balls ends (`search_worst_places`: some 14,000 places for each
-    promise); enclosures along paths, of a field that gives its own (`check_looks`), hold; some step
-    is possible at most points; no level set leaves its `extent`. Jumps across sheets
-    are taken out on the way, and values may move between neighboring points by `Sample.error`
+    keeps each promise (`HarmonicBall`, `Lipschitz`, `TaylorRemainder`) on the way to random points
+    of its ball, or for the last two to where that leaves the domain, and where a search for the
+    worst points and places in these balls ends (`search_violations`: some 14,000 places for each
+    promise); enclosures along paths, of a field that gives its own (`check_ray_samples`), hold;
+    some step is possible at most points; no level set leaves its `extent`. Jumps across sheets
+    are taken out on the way, and values may move between neighboring points by `Sample.value_error`
     besides, as they do where a tree takes other clusters as wholes. Near the branch points of a
     Riemann surface all branches are within what these say.
 
@@ -165,10 +167,10 @@ def check_field(
     check_is_field(field)
     generator = np.random.default_rng(rng)
     count, directions = (
-        whole(number, name, 1, 2**31 - 1)
+        as_integer_in_range(number, name, 1, 2**31 - 1)
         for number, name in ((count, "count"), (directions, "directions"))
     )
-    points = None if points is None else finite_vectors(points, "points")
+    points = None if points is None else as_finite_vectors(points, "points")
     if points is None:
         points = random_points(field, generator, count)
     elif field.domain is not None:
@@ -180,60 +182,62 @@ def check_field(
             )
         points = points[inside]
     several = levels if isinstance(levels, Sequence | np.ndarray) else (levels,)
-    levels = [real(field.default_level if level is None else level, "levels") for level in several]
-    look = look_at(field, points)
+    levels = [
+        as_real(field.default_level if level is None else level, "levels") for level in several
+    ]
+    look = sample_field(field, points)
     _check_numbers(field, points, look)
     check_derivatives(field, points, look)
     _check_rounding(field, points)
     _check_differentiable_value(field, points, look)
-    for number, known in enumerate(look.known):
+    for number, known in enumerate(look.promises):
         _check_promise(field, points, look, known, generator, directions)
-        search_worst_places(field, points, look, number, generator)
+        search_violations(field, points, look, number, generator)
     if isinstance(field, RiemannSurface):
         check_branch_points(field, float(np.ptp(points, axis=0).max()), generator)
-    if _proves_looks(field):
+    if _overrides_sample_ray(field):
         for precision in ("double", "single"):
-            check_looks(field, points, rng=generator, precision=precision)
+            check_ray_samples(field, points, rng=generator, precision=precision)
     for level in levels:
         _check_extent(field, level, generator, count)
 
 
-def _proves_looks(field: Field) -> bool:
+def _overrides_sample_ray(field: Field) -> bool:
     """Whether the field proves more along a path than its promises say."""
-    return type(field).look is not Field.look and not field.has_sheets
+    return type(field).sample_ray is not Field.sample_ray and not field.has_jumps
 
 
-def _check_numbers(field: Field, points: FloatArray, look: FieldValues) -> None:
+def _check_numbers(field: Field, points: FloatArray, look: FieldSamples) -> None:
     if field.period is not None and not 0 < field.period < np.inf:
         raise BrokenPromiseError(f"period must be None or a positive number, not {field.period!r}")
     require(np.isfinite(look.value), "the value is not a finite number", points)
     require(np.isfinite(look.gradient).all(axis=1), "the gradient is not finite", points)
-    if not look.known:
-        if _proves_looks(field):
+    if not look.promises:
+        if _overrides_sample_ray(field):
             return
         raise BrokenPromiseError("nothing is known: without a promise no step is possible")
-    for known in look.known:
+    for known in look.promises:
         numbers = [vars(known)[name] for name, *_ in known.units]
         name = type(known).__name__
         require(~np.isnan(numbers).any(axis=0), f"{name} has a NaN", points)
-        for low, high in known.ends[:1]:
+        for low, high in known.interval_pairs[:1]:
             inside = (vars(known)[low] <= look.value) & (look.value <= vars(known)[high])
             require(inside, f"{name}: the value is not within [{low}, {high}]", points)
-        for low, high in known.ends:
+        for low, high in known.interval_pairs:
             ordered = vars(known)[low] <= vars(known)[high]
             require(ordered, f"{name}: {low} exceeds {high}", points)
         if "constant" in vars(known):
             require(vars(known)["constant"] >= 0, f"{name}: the constant is negative", points)
-        if isinstance(known, Curvature) and np.isinf(known.radius).all():
+        if isinstance(known, TaylorRemainder) and np.isinf(known.radius).all():
             varies = np.ptp(known.constant) > 1e-6 * np.max(known.constant)
-            message = "a Curvature without a radius has the same constant at every point"
+            message = "a TaylorRemainder without a radius has the same constant at every point"
             require(np.full(len(points), not varies), message, points)
         if isinstance(known, HarmonicBall):
             if known.dimension not in (2, 3, 4):
                 raise BrokenPromiseError(f"HarmonicBall has dimension {known.dimension!r}")
             bounded = np.isfinite(known.lower) | np.isfinite(known.upper)
             require(bounded, "HarmonicBall: both ends are infinite", points)
-    usable = np.any([known.radius > 0 for known in look.known], axis=0)
+    usable = np.any([known.radius > 0 for known in look.promises], axis=0)
     if usable.mean() < 0.5:
         raise BrokenPromiseError(
             "the radius of every promise is 0 at most points: no step is possible there"
@@ -248,7 +252,7 @@ def _check_rounding(field: Field, points: FloatArray) -> None:
         single = single[field.domain.contains_points(single)]
     if not len(single):
         return
-    exact, rounded = look_at(field, single), look_at(field, single, "single")
+    exact, rounded = sample_field(field, single), sample_field(field, single, "single")
     off = rounded.value - exact.value
     if field.period is not None:
         off -= field.period * np.round(off / field.period)
@@ -257,13 +261,13 @@ def _check_rounding(field: Field, points: FloatArray) -> None:
     size = np.abs(single).max(axis=1)
     allowed = rounded.error + exact.error + 8 * unit * (np.abs(exact.value) + length * size)
     allowed += 8 * 2.0**-126  # numbers below the smallest normal one are lost
-    radii = [one.radius for one in exact.known] or [np.full(len(single), np.inf)]
+    radii = [one.radius for one in exact.promises] or [np.full(len(single), np.inf)]
     singular = np.min(radii, axis=0) < 1e-4 * np.ptp(points)
     good = (np.abs(off) <= allowed) | singular
     require(good, "Sample.error: in single precision the value is off by more", single, off)
 
 
-def _check_differentiable_value(field: Field, points: FloatArray, look: FieldValues) -> None:
+def _check_differentiable_value(field: Field, points: FloatArray, look: FieldSamples) -> None:
     backend = choose_backend("double")
     prepared = field.prepare(backend)
     x = to_vector3(backend, points, "points")
@@ -290,7 +294,7 @@ def _check_differentiable_value(field: Field, points: FloatArray, look: FieldVal
 def _check_promise(
     field: Field,
     points: FloatArray,
-    look: FieldValues,
+    look: FieldSamples,
     known: Promise,
     rng: np.random.Generator,
     directions: int,
@@ -311,20 +315,20 @@ def _check_promise(
         ways = (steepest, -steepest, random_directions(rng, len(points)))
         d = ways[min(k, 2)]
         t = reach[:, None] * share
-        if not known.of_all_space:
-            t = np.minimum(reach, _way_out(field, points, d))[:, None] * share
-        walk = movements(field, points, d, t)
+        if not known.holds_outside_domain:
+            t = np.minimum(reach, _distance_to_exit(field, points, d))[:, None] * share
+        walk = lift_along_rays(field, points, d, t)
         moved = walk.moved
         rounding = 1e-9 * (np.abs(look.value)[:, None] + (field.period or 0) + np.abs(moved))
         rounding += look.error[:, None] + walk.error  # of both ends, also of approximations
         slope = np.einsum("nk,nk->n", look.gradient, d)
-        slopes = Slopes(*((slope + sign * look.gradient_error)[:, None] for sign in (-1, 1)))
-        each = known.each(lambda number, _, __: number[:, None])
+        slopes = SlopeRange(*((slope + sign * look.gradient_error)[:, None] for sign in (-1, 1)))
+        each = known.map_numbers(lambda number, _, __: number[:, None])
         with np.errstate(invalid="ignore"):  # 0 * inf, at the point itself
-            low, high = each.movement(look.value[:, None], slopes, t)
+            low, high = each.movement_bounds(look.value[:, None], slopes, t)
             excess = np.maximum(moved - high, low - moved)
         if isinstance(known, HarmonicBall):
-            excess = np.fmax(excess, _beyond_ball(known, look.value, moved, share))
+            excess = np.fmax(excess, _harnack_excess(known, look.value, moved, share))
         excess = np.where(t > 0, excess, 0.0) - rounding
         worst = excess.argmax(axis=1)
         rows = np.arange(len(points))
@@ -333,7 +337,7 @@ def _check_promise(
         require(excess.max(axis=1) <= 0, message, points, excess.max(axis=1), there)
 
 
-def _way_out(field: Field, points: FloatArray, d: FloatArray) -> FloatArray:
+def _distance_to_exit(field: Field, points: FloatArray, d: FloatArray) -> FloatArray:
     """Lengths (n,) within the domain, which is convex, of rays from points in it."""
     if field.domain is None:
         return np.full(len(points), np.inf)
@@ -344,7 +348,7 @@ def _way_out(field: Field, points: FloatArray, d: FloatArray) -> FloatArray:
     return np.maximum(end * (1 - 1e-9) - 1e-12 * np.abs(points).max(axis=1), 0)
 
 
-def _beyond_ball(
+def _harnack_excess(
     ball: HarmonicBall, value: FloatArray, moved: FloatArray, share: FloatArray
 ) -> FloatArray:
     """By how much f is outside [lower, upper], or moves by more than Harnack's inequality allows
@@ -374,22 +378,29 @@ def _check_extent(field: Field, level: float, rng: np.random.Generator, count: i
         start = np.concatenate([start, random_points(field, rng, count)])
         start = start[field.domain.contains_points(start)]
     d = random_directions(rng, len(start))
-    length = np.minimum(3 * float(half.max()), _way_out(field, start, d))
+    length = np.minimum(3 * float(half.max()), _distance_to_exit(field, start, d))
     t = np.linspace(0, 1, 160) * length[:, None]
-    walk = movements(field, start, d, t)
-    above = look_at(field, start).value[:, None] + walk.moved + walk.jumped - level
+    walk = lift_along_rays(field, start, d, t)
+    above = sample_field(field, start).value[:, None] + walk.moved + walk.jumped - level
     # To first order, farther from the level than a thousandth of the extent: no grazing.
-    clear = _gap(field, above) > 1e-3 * float(half.max()) * walk.gradient_norm + walk.error
-    crossed = (_cell(field, above[:, 1:]) != _cell(field, above[:, :-1])) & clear[:, 1:]
+    clear = (
+        _distance_to_level(field, above)
+        > 1e-3 * float(half.max()) * walk.gradient_norm + walk.error
+    )
+    crossed = (
+        _level_interval(field, above[:, 1:]) != _level_interval(field, above[:, :-1])
+    ) & clear[:, 1:]
     row, column = np.nonzero(crossed & clear[:, :-1])
     if not row.size:
         return
     low, high, offset = t[row, column], t[row, column + 1], above[row, column]
     for _ in range(4):  # to 1e-6 of the interval
         part = low[:, None] + (high - low)[:, None] * np.linspace(0, 1, 33)
-        walk = movements(field, start[row], d[row], part)
+        walk = lift_along_rays(field, start[row], d[row], part)
         there = offset[:, None] + walk.moved + walk.jumped
-        first = (_cell(field, there) != _cell(field, there[:, :1])).argmax(axis=1)
+        first = (_level_interval(field, there) != _level_interval(field, there[:, :1])).argmax(
+            axis=1
+        )
         some = np.arange(len(row))
         low, high = part[some, first - 1], part[some, first]
         offset = there[some, first - 1]
@@ -398,10 +409,10 @@ def _check_extent(field: Field, level: float, rng: np.random.Generator, count: i
     require(inside, f"extent: the surface of level {level:g} leaves {volume} here", at)
 
 
-def _cell(field: Field, above: FloatArray) -> FloatArray:
+def _level_interval(field: Field, above: FloatArray) -> FloatArray:
     return np.sign(above) if field.period is None else np.floor(above / field.period)
 
 
-def _gap(field: Field, above: FloatArray) -> FloatArray:
+def _distance_to_level(field: Field, above: FloatArray) -> FloatArray:
     whole = 0.0 if field.period is None else field.period * np.round(above / field.period)
     return np.abs(above - whole)

@@ -21,7 +21,7 @@ _SERIES_BELOW = 0.25
 _TERMS = 30
 
 
-def kernel_movement(q: npt.ArrayLike, s: npt.ArrayLike, dimension: int) -> FloatArray:
+def kernel_difference(q: npt.ArrayLike, s: npt.ArrayLike, dimension: int) -> FloatArray:
     """P(q, s) - 1 with P = (1-q^2)/(1+q^2-2qs)^(n/2), for 0 <= q < 1 and -1 <= s <= 1."""
     q, s = np.asarray(q, np.float64), np.asarray(s, np.float64)
     near = (1 - q) ** 2 + 2 * q * (1 - s)  # accurate where q and s are near 1
@@ -109,14 +109,14 @@ def _cap_closed(q: FloatArray, b: FloatArray, dimension: int) -> FloatArray:
 class AxialFunctions:
     """Harmonic functions u on balls of R^n along an axis, one a row.
 
-    kind: "points" for rings of point masses at latitudes `places`, "caps" for boundary values
-        that are sums of indicators of caps of heights `places`.
-    places, weights: (rows, k). In kind "points" the weights are masses, >= 0.
+    measure: "points" for rings of point masses at latitudes `latitudes_or_heights`, "caps" for
+        boundary values that are sums of indicators of caps of heights `latitudes_or_heights`.
+    latitudes_or_heights, weights: (rows, k). In kind "points" the weights are masses, >= 0.
     radius: (rows,) of the balls.
     """
 
-    kind: str
-    places: FloatArray
+    measure: str
+    latitudes_or_heights: FloatArray
     weights: FloatArray
     radius: FloatArray
     dimension: int
@@ -124,19 +124,19 @@ class AxialFunctions:
     @property
     def slope(self) -> FloatArray:
         """(rows,) derivative along the axis at the center."""
-        if self.kind == "points":
-            each = self.dimension * self.places
+        if self.measure == "points":
+            each = self.dimension * self.latitudes_or_heights
         else:
-            each = cap_slope(self.places, self.dimension)
+            each = cap_slope(self.latitudes_or_heights, self.dimension)
         return (self.weights * each).sum(axis=1) / self.radius
 
     def movement(self, t: FloatArray) -> FloatArray:
         """u(t) - u(0) at distances t (rows, m) along the axis, 0 <= t < radius: (rows, m)."""
         q = t / self.radius[:, None]
         total = np.zeros_like(q)
-        for j in range(self.places.shape[1]):
-            place, weight = self.places[:, j, None], self.weights[:, j, None]
-            each = kernel_movement if self.kind == "points" else cap_movement
+        for j in range(self.latitudes_or_heights.shape[1]):
+            place, weight = self.latitudes_or_heights[:, j, None], self.weights[:, j, None]
+            each = kernel_difference if self.measure == "points" else cap_movement
             total += weight * each(q, place, self.dimension)
         return total
 

@@ -9,8 +9,8 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray, choose_backend, to_numpy, to_vector3
-from harnack.enclosures import BoundedLaplacian, Enclosure, Gaps, HarmonicBall, Slopes
-from harnack.fields.capabilities import NO_SHEET, Crossing
+from harnack.enclosures import BoundedLaplacian, Enclosure, HarmonicBall, LevelGaps, SlopeRange
+from harnack.fields.capabilities import NO_FACET, JumpCrossing
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Precision, Real
@@ -19,17 +19,17 @@ if TYPE_CHECKING:
 
 __all__ = [
     "BrokenPromiseError",
-    "FieldValues",
-    "LiftAlongRays",
-    "jumps",
-    "look_at",
-    "movements",
+    "FieldSamples",
+    "RayLift",
+    "accumulated_jumps",
+    "lift_along_rays",
+    "mutated_enclosure",
+    "original_enclosure",
     "random_directions",
     "random_points",
     "require",
-    "scaled",
-    "search_worst_places",
-    "unscaled",
+    "sample_field",
+    "search_violations",
 ]
 
 
@@ -61,7 +61,7 @@ def require(
     )
 
 
-def scaled(kind: type[Enclosure], factor: float, *, covers: float | None = None) -> Any:
+def mutated_enclosure(kind: type[Enclosure], factor: float, *, covers: float | None = None) -> Any:
     """A proof made wrong on purpose, as a test suite that accepts it is worth nothing: with every
     step multiplied by `factor`, and every length that it covers by `covers` (None: by the same)."""
     loose = factor if covers is None else covers
@@ -70,20 +70,20 @@ def scaled(kind: type[Enclosure], factor: float, *, covers: float | None = None)
     class Scaled(base):
         original = kind
 
-        def step(self, gaps: Gaps) -> Real:
+        def free_length(self, gaps: LevelGaps) -> Real:
             inner: Any = super()
-            return factor * inner.step(gaps)
+            return factor * inner.free_length(gaps)
 
-        def covers(self, gaps: Gaps, length: Real) -> Mask:
+        def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
             inner: Any = super()
-            return inner.covers(gaps, length / loose)
+            return inner.is_free(gaps, length / loose)
 
     Scaled.__name__ = f"Scaled{kind.__name__}"
     return Scaled
 
 
-def unscaled(kind: type[Enclosure]) -> type[Enclosure]:
-    """The proof that `scaled` was given; any other as it is."""
+def original_enclosure(kind: type[Enclosure]) -> type[Enclosure]:
+    """The proof that `mutated_enclosure` was given; any other as it is."""
     return getattr(kind, "original", kind)
 
 
@@ -91,57 +91,59 @@ def unscaled(kind: type[Enclosure]) -> type[Enclosure]:
 
 
 @dataclass(frozen=True)
-class FieldValues:
+class FieldSamples:
     """A field at n points: value (n,), gradient (n, 3), their errors and promises (n,) each."""
 
     value: FloatArray
     gradient: FloatArray
     error: FloatArray
     gradient_error: FloatArray
-    known: tuple[Promise, ...]
+    promises: tuple[Promise, ...]
 
-    def at(self, rows: BoolArray) -> FieldValues:
+    def subset(self, rows: BoolArray) -> FieldSamples:
         """The same at some of the points."""
-        return FieldValues(
+        return FieldSamples(
             self.value[rows],
             self.gradient[rows],
             self.error[rows],
             self.gradient_error[rows],
-            tuple(one.each(lambda number, _, __: number[rows]) for one in self.known),
+            tuple(one.map_numbers(lambda number, _, __: number[rows]) for one in self.promises),
         )
 
 
-def look_at(
+def sample_field(
     field: Field, points: FloatArray, precision: Precision = "double", *, closely: bool = False
-) -> FieldValues:
+) -> FieldSamples:
     """The field at points (n, 3), all numbers of its promises as float64 arrays (n,).
 
     closely: without truncation.
     """
     n = len(points)
     sample = _sample(field, points, precision, closely)
-    numbers_known = [list(vars(one).values()) for one in sample.promises]
+    numbers_known = [list(vars(one).values()) for one in sample.all_promises]
     # At once, or each would be computed by a kernel of its own.
-    dr.eval(sample.value, sample.gradient, sample.error, sample.gradient_error, numbers_known)
+    dr.eval(sample.value, sample.gradient, sample.value_error, sample.gradient_error, numbers_known)
 
-    known = tuple(one.each(lambda number, _, __: _spread(number, n)) for one in sample.promises)
-    return FieldValues(
+    known = tuple(
+        one.map_numbers(lambda number, _, __: _spread(number, n)) for one in sample.all_promises
+    )
+    return FieldSamples(
         _spread(sample.value, n),
         np.broadcast_to(to_numpy(sample.gradient), (n, 3)).astype(np.float64),
-        _spread(sample.error, n),
+        _spread(sample.value_error, n),
         _spread(sample.gradient_error, n),
         known,
     )
 
 
 @dataclass(frozen=True)
-class LiftAlongRays:
+class RayLift:
     """The continuous lift of f at m points along each of n rays, all arrays (n, m).
 
     moved: how far the lift has moved since the ray's first point.
     jumped: by how much f has jumped besides, across sheets.
     gradient_norm: |grad f| at the points.
-    error: `Sample.error` at the points.
+    error: `Sample.value_error` at the points.
     """
 
     moved: FloatArray
@@ -150,9 +152,9 @@ class LiftAlongRays:
     error: FloatArray
 
 
-def movements(
+def lift_along_rays(
     field: Field, start: FloatArray, direction: FloatArray, lengths: FloatArray
-) -> LiftAlongRays:
+) -> RayLift:
     """How far the continuous lift of f moves along rays: f(start + t direction) - f(start).
 
     start, direction: (n, 3), unit directions. lengths: t (n, m), each row rising from 0. A value
@@ -161,7 +163,7 @@ def movements(
     """
     n, m = lengths.shape
     points = start[:, None] + lengths[..., None] * direction[:, None]
-    look = look_at(field, points.reshape(-1, 3))
+    look = sample_field(field, points.reshape(-1, 3))
     value, gradient = look.value.reshape(n, m), look.gradient.reshape(n, m, 3)
     slope = np.einsum("nmk,nk->nm", gradient, direction)
     move = np.diff(value, axis=1)
@@ -172,27 +174,27 @@ def movements(
         expected = np.clip(expected, -0.5 * field.period, 0.5 * field.period)
         move -= field.period * np.round((move - expected) / field.period)
     total = np.concatenate([np.zeros((n, 1)), np.cumsum(move, axis=1)], axis=1)
-    jumped = jumps(field, start, direction, lengths)
-    return LiftAlongRays(
+    jumped = accumulated_jumps(field, start, direction, lengths)
+    return RayLift(
         total - jumped, jumped, np.linalg.norm(gradient, axis=2), look.error.reshape(n, m)
     )
 
 
-def jumps(
+def accumulated_jumps(
     field: Field, start: FloatArray, direction: FloatArray, lengths: FloatArray
 ) -> FloatArray:
     """By how much f has jumped (n, m) since the first of the lengths (n, m) along rays, as
-    `next_crossing` says."""
+    `next_jump` says."""
     total = np.zeros_like(lengths)
-    if not field.has_sheets:
+    if not field.has_jumps:
         return total
     backend = choose_backend("double")
     prepared = field.prepare(backend)
     o, d = to_vector3(backend, start), to_vector3(backend, direction)
     first, far = (backend.Float(np.ascontiguousarray(lengths[:, k])) for k in (0, -1))
-    behind = Crossing(first, backend.UInt32(NO_SHEET), backend.Float(0), d)
+    behind = JumpCrossing(first, backend.UInt32(NO_FACET), backend.Float(0), d)
     while True:
-        behind = prepared.next_crossing(o, d, behind, far, backend.Bool(True))
+        behind = prepared.next_jump(o, d, behind, far, backend.Bool(True))
         t, jump = (_spread(one, len(start)) for one in (behind.t, behind.jump))
         ahead = np.isfinite(t)
         if not ahead.any():
@@ -226,7 +228,7 @@ def random_directions(rng: np.random.Generator, n: int) -> FloatArray:
 def _sample(field: Field, points: FloatArray, precision: Precision, closely: bool) -> Sample:
     backend = choose_backend(precision)
     prepared = field.prepare(backend)
-    seen = prepared.without_truncation(backend) if closely else prepared
+    seen = prepared.exact(backend) if closely else prepared
     return seen.evaluate(to_vector3(backend, points, "points"))
 
 
@@ -240,15 +242,15 @@ def _spread(value: object, n: int) -> FloatArray:
 # Pairs that climb: at most, and of the points given; how many moves each tries in a round, and
 # rounds. Where f is known along a path only, which costs one evaluation a sample, fewer.
 _MOST_PAIRS, _PAIRS_OF_POINTS = 48, 0.25
-_MOVES, _ROUNDS, _WALKED = 8, 36, 2
+_MOVES, _ROUNDS, _PATH_COST_DIVISOR = 8, 36, 2
 # Of the radius: how near places come to the border of the ball.
 _BORDER = 1 - 1e-6
 # Sizes of moves, in radii: the first, the least, and what success and failure make of them.
-_FIRST, _LEAST, _FARTHER, _SHORTER = 0.25, 1e-9, 1.6, 0.6
+_FIRST_STEP, _MIN_STEP, _STEP_GROWTH, _STEP_SHRINKAGE = 0.25, 1e-9, 1.6, 0.6
 # Of the coordinates: radii below this are left out, for rounding moves places in them.
 _SMALLEST = 1e-6
 # Samples on the path to a place, where f is known along it only: searching, and to be sure.
-_ON_THE_WAY, _SURE = 24, 600
+_PATH_SAMPLES, _FINAL_PATH_SAMPLES = 24, 600
 # What a ratio may be above one for rounding, and rounding of the values.
 _ALLOWED, _ROUNDING = 1e-6, 1e-9
 # Of the radius: the spacing of differences of gradients.
@@ -256,34 +258,34 @@ _SPACING = 1e-3
 
 
 @dataclass(frozen=True)
-class _Pairs:
+class _Candidates:
     """Points p (n, 3) and places p + reach * w, |w| < 1, and how near the promise is to being
     broken there, (n,): above one it is."""
 
     p: FloatArray
     w: FloatArray
     reach: FloatArray
-    ratio: FloatArray
+    violation_ratio: FloatArray
 
-    def best_of(self, others: _Pairs) -> tuple[_Pairs, BoolArray]:
+    def best_of(self, others: _Candidates) -> tuple[_Candidates, BoolArray]:
         """Each of these n, or the best of its m others of n * m; and whether that is another."""
         n = len(self.p)
         m = len(others.p) // n
-        which = np.arange(n) * m + others.ratio.reshape(n, m).argmax(axis=1)
-        better = others.ratio[which] > self.ratio
+        which = np.arange(n) * m + others.violation_ratio.reshape(n, m).argmax(axis=1)
+        better = others.violation_ratio[which] > self.violation_ratio
         rows = better[:, None]
-        return _Pairs(
+        return _Candidates(
             np.where(rows, others.p[which], self.p),
             np.where(rows, others.w[which], self.w),
             np.where(better, others.reach[which], self.reach),
-            np.where(better, others.ratio[which], self.ratio),
+            np.where(better, others.violation_ratio[which], self.violation_ratio),
         ), better
 
 
-def search_worst_places(
-    field: Field, points: FloatArray, look: FieldValues, number: int, rng: np.random.Generator
+def search_violations(
+    field: Field, points: FloatArray, look: FieldSamples, number: int, rng: np.random.Generator
 ) -> None:
-    """Search for places that break a promise, the one of that number in `Sample.promises`.
+    """Search for places that break a promise, the one of that number in `Sample.all_promises`.
 
     A promise that is wrong by a few percent is broken only near what makes it: beside a singularity
     that lies just inside the ball, or in the one direction in which a range is attained. Random
@@ -297,11 +299,11 @@ def search_worst_places(
     Raises:
         BrokenPromiseError: naming the point and the place of the worst pair.
     """
-    search = _Search(field, number, 2 * float(np.ptp(points, axis=0).max()) + 1e-300)
-    part = _WALKED if search.is_walked else 1
+    search = _ViolationSearch(field, number, 2 * float(np.ptp(points, axis=0).max()) + 1e-300)
+    part = _PATH_COST_DIVISOR if search.needs_path else 1
     pairs = min(max(int(_PAIRS_OF_POINTS * len(points)), 6), _MOST_PAIRS) // part
     moves_each = _MOVES // part
-    order = np.argsort(np.broadcast_to(look.known[number].radius, len(points)), kind="stable")
+    order = np.argsort(np.broadcast_to(look.promises[number].radius, len(points)), kind="stable")
     rows = np.concatenate([order[: pairs // 3], rng.choice(len(points), pairs)])[:pairs]
     steepest = look.gradient[rows]
     length = np.linalg.norm(steepest, axis=1, keepdims=True)
@@ -310,7 +312,7 @@ def search_worst_places(
     along = np.where(turn == 1, -1, 1) * steepest
     ways = np.where(turn == 2, random_directions(rng, pairs), along)
     found = search.pairs(points[rows], ways * rng.uniform(0.3, 1, (pairs, 1)))
-    size = np.full(pairs, _FIRST)
+    size = np.full(pairs, _FIRST_STEP)
     for _ in range(_ROUNDS // part):
         step = np.repeat(size, moves_each)[:, None]
         p, w = (np.repeat(one, moves_each, axis=0) for one in (found.p, found.w))
@@ -328,53 +330,53 @@ def search_worst_places(
         near = np.where(np.arange(len(p))[:, None] % 8 == 1, turned, near)
         near = np.where(np.arange(len(p))[:, None] % 8 == 2, w + length * way, near)
         found, better = found.best_of(search.pairs(p + reach * shift, near))
-        size = np.where(better, np.minimum(_FARTHER * size, 1), _SHORTER * size)
-        size = np.where(size < _LEAST, _FIRST, size)
-    worst = found.ratio > 1 + _ALLOWED
+        size = np.where(better, np.minimum(_STEP_GROWTH * size, 1), _STEP_SHRINKAGE * size)
+        size = np.where(size < _MIN_STEP, _FIRST_STEP, size)
+    worst = found.violation_ratio > 1 + _ALLOWED
     if worst.any():
-        found = search.pairs(found.p[worst], found.w[worst], samples=_SURE)
+        found = search.pairs(found.p[worst], found.w[worst], samples=_FINAL_PATH_SAMPLES)
         there = found.p + found.reach[:, None] * found.w
-        good = ~(found.ratio > 1 + _ALLOWED)
-        name = type(look.known[number]).__name__
+        good = ~(found.violation_ratio > 1 + _ALLOWED)
+        name = type(look.promises[number]).__name__
         message = f"{name}: f leaves what is promised here, by this factor"
-        require(good, message, found.p, found.ratio, there)
+        require(good, message, found.p, found.violation_ratio, there)
 
 
 @dataclass(frozen=True)
-class _Search:
+class _ViolationSearch:
     """The promise that pairs are to break.
 
-    number: of the promise in `Sample.promises`.
+    promise_index: of the promise in `Sample.all_promises`.
     longest: the length that stands for a radius without an end.
     """
 
     field: Field
-    number: int
+    promise_index: int
     longest: float
 
     @property
-    def is_walked(self) -> bool:
+    def needs_path(self) -> bool:
         """Whether how f moves is known along a path only, jumps taken out."""
-        return self.field.period is not None or self.field.has_sheets
+        return self.field.period is not None or self.field.has_jumps
 
-    def pairs(self, p: FloatArray, w: FloatArray, samples: int = _ON_THE_WAY) -> _Pairs:
+    def pairs(self, p: FloatArray, w: FloatArray, samples: int = _PATH_SAMPLES) -> _Candidates:
         """The pairs of points (n, 3) and shares of their radii, cut to the ball."""
         length = np.linalg.norm(w, axis=1, keepdims=True)
         w = w * np.minimum(1, _BORDER / np.maximum(length, 1e-300))
         ratio, reach = np.full(len(p), -np.inf), np.full(len(p), 1.0)
         rows = np.flatnonzero(self._within(p))
         if len(rows):
-            look = look_at(self.field, p[rows])
-            known = look.known[self.number]
+            look = sample_field(self.field, p[rows])
+            known = look.promises[self.promise_index]
             reach[rows] = np.minimum(known.radius, self.longest)
             y = p + reach[:, None] * w
             usable = reach[rows] > _SMALLEST * np.abs(p[rows]).max(axis=1)
-            if not known.of_all_space:
+            if not known.holds_outside_domain:
                 usable &= self._within(y[rows])
-            rows, look = rows[usable], look.at(usable)
+            rows, look = rows[usable], look.subset(usable)
             if len(rows):
                 ratio[rows] = self._ratio(look, p[rows], w[rows], reach[rows], samples)
-        return _Pairs(p, w, reach, np.where(np.isnan(ratio), -np.inf, ratio))
+        return _Candidates(p, w, reach, np.where(np.isnan(ratio), -np.inf, ratio))
 
     def _within(self, p: FloatArray) -> BoolArray:
         inside = np.asarray(np.isfinite(p).all(axis=1))
@@ -383,20 +385,20 @@ class _Search:
         return inside
 
     def _ratio(
-        self, look: FieldValues, p: FloatArray, w: FloatArray, reach: FloatArray, samples: int
+        self, look: FieldSamples, p: FloatArray, w: FloatArray, reach: FloatArray, samples: int
     ) -> FloatArray:
-        known, y = look.known[self.number], p + reach[:, None] * w
-        there = look_at(self.field, y)
+        known, y = look.promises[self.promise_index], p + reach[:, None] * w
+        there = sample_field(self.field, y)
         moved = there.value - look.value
-        if self.is_walked:
+        if self.needs_path:
             moved = self._lift(p, y, samples)
         error = look.error + there.error
         error = error + _ROUNDING * (np.abs(look.value) + (self.field.period or 0) + np.abs(moved))
         distance = reach * np.linalg.norm(w, axis=1)
         with np.errstate(all="ignore"):
             slope = np.einsum("nk,nk->n", look.gradient, y - p) / distance
-            low, high = known.movement(look.value, Slopes(slope, slope), distance)
-            if not known.of_all_space:
+            low, high = known.movement_bounds(look.value, SlopeRange(slope, slope), distance)
+            if not known.holds_outside_domain:
                 middle, half = 0.5 * (low + high), 0.5 * (high - low)
                 error = error + look.gradient_error * distance * (middle != 0)
                 return (np.abs(moved - middle) - error) / half
@@ -417,10 +419,10 @@ class _Search:
         d = way / np.maximum(length, 1e-300)[:, None]
         # Denser towards the border, where singularities may lie.
         share = 1 - np.linspace(1, 0, samples) ** 2
-        return movements(self.field, p, d, length[:, None] * share).moved[:, -1]
+        return lift_along_rays(self.field, p, d, length[:, None] * share).moved[:, -1]
 
     def _laplacian_ratio(
-        self, known: BoundedLaplacian, y: FloatArray, there: FieldValues, h: FloatArray
+        self, known: BoundedLaplacian, y: FloatArray, there: FieldSamples, h: FloatArray
     ) -> FloatArray:
         """One more than by how much the Laplacian at y (n, 3) leaves its ends, in their size."""
         fine, wide = np.zeros(len(y)), np.zeros(len(y))
@@ -428,7 +430,10 @@ class _Search:
         for axis in range(3):
             for node, weight, wider in ((1, 1.0, 0.0), (2, 0.0, 0.5)):
                 way = (node * h)[:, None] * np.eye(3)[axis]
-                rate = look_at(self.field, y + way).gradient - look_at(self.field, y - way).gradient
+                rate = (
+                    sample_field(self.field, y + way).gradient
+                    - sample_field(self.field, y - way).gradient
+                )
                 fine += weight * rate[:, axis] / (2 * h)
                 wide += wider * rate[:, axis] / (2 * h)
         size = np.linalg.norm(there.gradient, axis=1)
@@ -439,7 +444,7 @@ class _Search:
 
 
 def _slope_ratio(
-    known: HarmonicBall, there: FieldValues, free: FloatArray, gap: FloatArray
+    known: HarmonicBall, there: FieldSamples, free: FloatArray, gap: FloatArray
 ) -> FloatArray:
     """|grad f| at places of a ball, as a share of what a harmonic function allows there that is
     `gap` away from the nearer end of its range.

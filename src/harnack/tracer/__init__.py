@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from harnack.tracer.crossings import AllHits
+from harnack.tracer.crossings import RayCrossings
 from harnack.tracer.hits import Hits, trace
-from harnack.tracer.level_contact import Status, Tolerance
-from harnack.tracer.surface import LevelSet, level_set
-from harnack.tracer.surface_tracer import MarchResult, PreparedLevelSet
+from harnack.tracer.level_contact import HitTolerance, RayStatus
+from harnack.tracer.surface import Surface, level_set
+from harnack.tracer.surface_tracer import MarchResult, SurfaceTracer
 
 __all__ = [
-    "AllHits",
+    "HitTolerance",
     "Hits",
-    "LevelSet",
     "MarchResult",
-    "PreparedLevelSet",
-    "Status",
-    "Tolerance",
+    "RayCrossings",
+    "RayStatus",
+    "Surface",
+    "SurfaceTracer",
     "level_set",
     "trace",
 ]

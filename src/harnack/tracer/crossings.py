@@ -1,6 +1,7 @@
 """All crossings of rays with level sets: `trace(..., all_hits=k)`.
 
-`find_crossings` finds them one after the other while a kernel is recorded; `AllHits` is what users
+`find_crossings` finds them one after the other while a kernel is recorded; `RayCrossings` is what
+users
 get: NumPy in, NumPy out; Dr.Jit stays Dr.Jit.
 """
 
@@ -16,28 +17,28 @@ import numpy as np
 
 from harnack.backend import to_numpy
 from harnack.backend.arrays import gather_vectors
-from harnack.backend.elementary import length as norm
-from harnack.backend.loops import while_active
-from harnack.fields.capabilities import NO_SHEET
-from harnack.tracer.derivatives import attach, refuse_derivative, wants_derivatives
-from harnack.tracer.level_contact import Contact, Status
+from harnack.backend.elementary import safe_norm as norm
+from harnack.backend.loops import loop_while_active
+from harnack.fields.capabilities import NO_FACET
+from harnack.tracer.derivatives import attach_derivatives, needs_derivatives, refuse_derivative
+from harnack.tracer.level_contact import Contact, RayStatus
 from harnack.tracer.surface_tracer import MarchResult
-from harnack.tracer.walks import SheetTracer, SheetWalk
+from harnack.tracer.walks import JumpTracer, JumpTraceState
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.tracer.march import MarchState
-    from harnack.tracer.surface import LevelSet
-    from harnack.tracer.surface_tracer import PreparedLevelSet
+    from harnack.tracer.surface import Surface
+    from harnack.tracer.surface_tracer import SurfaceTracer
 
 
 @dataclass(frozen=True)
-class CrossingsFound:
+class CrossingArrays:
     """The first k crossings of n rays, as Dr.Jit arrays.
 
     t: (n k) of crossing j of ray i at i k + j; inf where there are fewer.
     gradient: (n k, 3) of f there, or the normal of the sheet; 0 where there is no crossing.
-    sheet: (n k) index of the sheet that was crossed, NO_SHEET for none.
+    sheet: (n k) index of the sheet that was crossed, NO_FACET for none.
     side: (n k) 1 where f rises through the level along the ray, -1 where it falls, 0 for none.
     count: (n) how many there are, at most k.
     end: (n) how far the ray was followed; inf if it was to its end.
@@ -56,16 +57,16 @@ class CrossingsFound:
 
 
 @dataclass(frozen=True)
-class _Walk:
+class _SearchState:
     """Where rays are, and how many crossings they have found.
 
     march: the state of the march; None for a field with sheets.
-    sheets: for a field with sheets the state of `SheetTracer`, which includes that of the march.
+    sheets: for a field with sheets the state of `JumpTracer`, which includes that of the march.
     count: of the crossings.
     """
 
     march: MarchState | None
-    sheets: SheetWalk | None
+    sheets: JumpTraceState | None
     count: Any
 
     @property
@@ -79,15 +80,15 @@ class _Walk:
         assert state is not None
         return state
 
-    def with_march(self, now: MarchState, count: Any) -> _Walk:
+    def with_march(self, now: MarchState, count: Any) -> _SearchState:
         if self.sheets is None:
-            return _Walk(now, None, count)
-        return _Walk(None, dataclasses.replace(self.sheets, march=now), count)
+            return _SearchState(now, None, count)
+        return _SearchState(None, dataclasses.replace(self.sheets, march=now), count)
 
 
 def find_crossings(
-    prepared: PreparedLevelSet, o: Vec3, d: Vec3, t_min: Real, t_max: Real, k: int
-) -> CrossingsFound:
+    prepared: SurfaceTracer, o: Vec3, d: Vec3, t_min: Real, t_max: Real, k: int
+) -> CrossingArrays:
     """The first k crossings of rays o + t d, |d| = 1, for t_min <= t <= t_max.
 
     `Hysteresis` says what is guaranteed, and why: between two crossings the ray is one march, in
@@ -95,66 +96,68 @@ def find_crossings(
     """
     backend = prepared.backend
     real, vector, count = backend.Float, backend.Array3f, backend.UInt32
-    march, path, start, end, state = prepared.ready(o, d, t_min, t_max, True, crosses=True)
+    march, path, start, end, state = prepared.begin_march(o, d, t_min, t_max, True, crosses=True)
     n = max(dr.width(array) for array in (path.origin, path.direction, start, end))
     place = dr.arange(count, n) * k
     # The loop scatters into these arrays, so they must lie in memory before it is recorded.
     t, side = dr.full(real, dr.inf, n * k), dr.zeros(real, n * k)
     before, behind = dr.zeros(real, n * k), dr.zeros(real, n * k)
-    gradient, sheets = dr.zeros(vector, n * k), dr.full(count, NO_SHEET, n * k)
+    gradient, sheets = dr.zeros(vector, n * k), dr.full(count, NO_FACET, n * k)
     dr.make_opaque(t, side, before, behind, gradient, sheets)
-    tracer = SheetTracer(march, prepared.field, path, start, end)
+    tracer = JumpTracer(march, prepared.field, path, start, end)
 
-    def one(now: _Walk) -> _Walk:
+    def one(now: _SearchState) -> _SearchState:
         there, sheet = now, None
         if now.sheets is None:
             after = march.advance(prepared.field, path, end, now.now)
         else:
-            walk = tracer.next(now.sheets)
-            there = _Walk(None, walk, now.count)
-            after, sheet = tracer.end_of(walk)
+            walk = tracer.advance(now.sheets)
+            there = _SearchState(None, walk, now.count)
+            after, sheet = tracer.finish(walk)
         contact = after.contact
         assert contact is not None
-        ended = now.active & (after.status == int(Status.HIT))
+        ended = now.active & (after.status == int(RayStatus.HIT))
         is_crossing = ended
         if sheet is not None and prepared.field.only_sheets:
-            is_crossing = ended & (sheet != NO_SHEET)
+            is_crossing = ended & (sheet != NO_FACET)
         slot = place + now.count
         dr.scatter(t, contact.root, slot, is_crossing)
         dr.scatter(side, contact.side, slot, is_crossing)
         dr.scatter(before, contact.before, slot, is_crossing)
-        dr.scatter(behind, contact.behind, slot, is_crossing)
+        dr.scatter(behind, contact.after, slot, is_crossing)
         dr.scatter(gradient, contact.gradient, slot, is_crossing)
         if sheet is not None:
             dr.scatter(sheets, sheet, slot, is_crossing)
         crossings = now.count + dr.select(is_crossing, count(1), 0)
         more = ended & (crossings < k)
-        status = dr.select(more, count(int(Status.MISS)), after.status)
+        status = dr.select(more, count(int(RayStatus.MISS)), after.status)
         if now.sheets is None:
             undecided = after.proved_to + after.proved_step < end
             if march.hysteresis is not None:
-                undecided |= march.hysteresis.samples_end(contact, end) & (after.proved_to < end)
+                undecided |= march.hysteresis.must_sample_end(contact, end) & (
+                    after.proved_to < end
+                )
             more &= undecided
         else:
             more |= after.active
         return there.with_march(dataclasses.replace(after, status=status, active=more), crossings)
 
-    begun = _Walk(state, None, dr.zeros(count, n))
-    if prepared.field.has_sheets:
-        begun = _Walk(None, tracer.begin(state), dr.zeros(count, n))
-    walk = while_active(begun, one, "harnack crossings")
+    begun = _SearchState(state, None, dr.zeros(count, n))
+    if prepared.field.has_jumps:
+        begun = _SearchState(None, tracer.begin(state), dr.zeros(count, n))
+    walk = loop_while_active(begun, one, "harnack crossings")
     last = walk.now
     ray, none = dr.arange(count, n * k) // k, real(0)
     roots = Contact(side, backend.Bool(False), t, gradient, none, before, behind, none)
     origins, directions = gather_vectors(backend, o, ray), gather_vectors(backend, d, ray)
-    t, gradient, looks = prepared.settled(origins, directions, roots, dr.isfinite(t))
+    t, gradient, looks = prepared.refined_crossings(origins, directions, roots, dr.isfinite(t))
     evaluations = last.evaluations + dr.block_reduce(dr.ReduceOp.Add, looks, k)
-    followed = dr.select(last.status == int(Status.MISS), dr.inf, last.proved_to)
-    return CrossingsFound(t, gradient, sheets, side, walk.count, followed, evaluations, last.status)
+    followed = dr.select(last.status == int(RayStatus.MISS), dr.inf, last.proved_to)
+    return CrossingArrays(t, gradient, sheets, side, walk.count, followed, evaluations, last.status)
 
 
 @dataclass(frozen=True)
-class AllHits:
+class RayCrossings:
     """The first k crossings of n rays with the level set, in order: `trace(..., all_hits=k)`.
 
     As NumPy arrays, or as tensors if the rays were; if they were Dr.Jit arrays, as Dr.Jit arrays,
@@ -166,30 +169,31 @@ class AllHits:
     position: (n, k, 3) point at t, NaN where there is none.
     normal: (n, k, 3) unit normal grad f/|grad f|, to the side of larger f; zero where there is
         none.
-    sheet: (n, k) index of the sheet, such as a triangle, that was crossed; -1 where none was.
+    primitive_index: (n, k) index of the sheet, such as a triangle, that was crossed; -1 where none
+        was.
     side: (n, k) integers: 1 where f rises through the level along the ray, -1 where it falls
         through it, 0 where there is no crossing.
     count: (n,) how many crossings there are, at most k.
-    end: (n,) how far the ray was followed: inf if to its end; else up to where the last crossing
-        was noticed, just behind it, or to where the ray ran out of steps.
-    status: (n,) a `Status`, of the end of the ray. MISS: it is proved that there are no other
+    traced_to: (n,) how far the ray was followed: inf if to its end; else up to where the last
+        crossing was noticed, just behind it, or to where the ray ran out of steps.
+    status: (n,) a `RayStatus`, of the end of the ray. MISS: it is proved that there are no other
         crossings. HIT: there are k, and what follows was not examined. OUT_OF_STEPS: what follows
-        `end` is not known.
+        `traced_to` is not known.
     evaluations: (n,) how many times the field was evaluated.
     """
 
     t: Any
     position: Any
     normal: Any
-    sheet: Any
+    primitive_index: Any
     side: Any
     count: Any
-    end: Any
+    traced_to: Any
     status: Any
     evaluations: Any
 
 
-def check_all_hits(all_hits: Any, surface: LevelSet) -> int:
+def check_all_hits(all_hits: Any, surface: Surface) -> int:
     """How many crossings to look for.
 
     Raises:
@@ -205,12 +209,12 @@ def check_all_hits(all_hits: Any, surface: LevelSet) -> int:
         ) from None
     if k < 1 or isinstance(all_hits, bool):
         raise ValueError(f"all_hits must be at least 1, such as 8, not {all_hits}")
-    surface.check_crossings("all_hits")
+    surface.validate_crossings("all_hits")
     return k
 
 
-def trace_all(
-    surface: LevelSet,
+def trace_crossings(
+    surface: Surface,
     backend: Backend,
     o: Vec3,
     d: Vec3,
@@ -219,8 +223,8 @@ def trace_all(
     k: int,
     *,
     differentiable: bool,
-) -> AllHits:
-    """The first k crossings as `AllHits` of Dr.Jit arrays."""
+) -> RayCrossings:
+    """The first k crossings as `RayCrossings` of Dr.Jit arrays."""
     prepared = surface.prepare(backend, crosses=True)
     with dr.suspend_grad():
         found = find_crossings(
@@ -233,31 +237,31 @@ def trace_all(
     ray = dr.arange(backend.UInt32, dr.width(found.t)) // k
     o, d = gather_vectors(backend, o, ray), gather_vectors(backend, d, ray)
     t, end = found.t, found.end
-    if differentiable and wants_derivatives(prepared, o, d):
+    if differentiable and needs_derivatives(prepared, o, d):
         with dr.suspend_grad():
-            status = dr.select(is_found, backend.UInt32(int(Status.HIT)), int(Status.MISS))
+            status = dr.select(is_found, backend.UInt32(int(RayStatus.HIT)), int(RayStatus.MISS))
             none = dr.zeros(backend.Float, dr.width(t))
             ends = MarchResult(t, none, found.gradient, none, none, status, found.sheet, found.side)
-        t, normal = attach(prepared, o, d, ends, normal)
+        t, normal = attach_derivatives(prepared, o, d, ends, normal)
         normal = refuse_derivative(prepared, o, d, "normal", normal)
-        end = refuse_derivative(prepared, o, d, "end", end)
+        end = refuse_derivative(prepared, o, d, "traced_to", end)
     position = dr.select(dr.isfinite(t), dr.fma(backend.Array3f(t), d, o), dr.nan)
     side = backend.Int32(found.side)
-    sheet = dr.reinterpret_array(backend.Int32, found.sheet)  # NO_SHEET becomes -1
+    sheet = dr.reinterpret_array(backend.Int32, found.sheet)  # NO_FACET becomes -1
     of_rays = found.count, end, found.status, found.evaluations
-    hits = AllHits(t, position, normal, sheet, side, *of_rays)
+    hits = RayCrossings(t, position, normal, sheet, side, *of_rays)
     dr.eval(*vars(hits).values())
     return hits
 
 
-def no_crossings(backend: Backend) -> AllHits:
+def empty_crossings(backend: Backend) -> RayCrossings:
     """The crossings of no rays."""
     number, vector = dr.zeros(backend.Float, 0), dr.zeros(backend.Array3f, 0)
     count, side = dr.zeros(backend.UInt32, 0), dr.zeros(backend.Int32, 0)
-    return AllHits(number, vector, vector, side, side, count, number, count, count)
+    return RayCrossings(number, vector, vector, side, side, count, number, count, count)
 
 
-def crossings_as_numpy(hits: AllHits, n: int, k: int) -> AllHits:
+def crossings_to_numpy(hits: RayCrossings, n: int, k: int) -> RayCrossings:
     """Crossings of n rays as NumPy arrays."""
 
     def each(array: Any) -> Any:
@@ -267,14 +271,14 @@ def crossings_as_numpy(hits: AllHits, n: int, k: int) -> AllHits:
     def of_ray(array: Any) -> Any:
         return np.broadcast_to(to_numpy(array), (n,)).copy()
 
-    return AllHits(
+    return RayCrossings(
         each(hits.t),
         each(hits.position),
         each(hits.normal),
-        each(hits.sheet).astype(np.int64),
+        each(hits.primitive_index).astype(np.int64),
         each(hits.side).astype(np.int64),
         of_ray(hits.count).astype(np.int64),
-        of_ray(hits.end),
+        of_ray(hits.traced_to),
         of_ray(hits.status).astype(np.int64),
         of_ray(hits.evaluations).astype(np.int64),
     )

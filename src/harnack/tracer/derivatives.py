@@ -7,6 +7,12 @@ stopped. The hit, f(o + t d; theta) = level, defines t(theta), and
 
 which is what these functions attach to a detached t. A hit on a sheet of a field that jumps lies
 on a plane, n . (o + t d) = const, whatever the level: dt = -(n . (do + t dd))/(n . d).
+
+Derivatives are implicit: the trace runs without them and t is re-attached at the hit, by the
+gradient that the field states there: no derivative passes an evaluation, which may be a recorded
+loop. What would be dropped is refused where numbers come in (`validation`, `Field.__new__`) and
+where results go out. At ties of formulas, where ranges of gradients have all slopes beside, dual
+numbers a few roundings away choose one (`Formula.evaluate`).
 """
 
 from __future__ import annotations
@@ -16,27 +22,27 @@ from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 
-from harnack.backend.elementary import length as norm
-from harnack.backend.validation import holds_numbers_alone
-from harnack.enclosures import TargetLevels
+from harnack.backend.elementary import safe_norm as norm
+from harnack.backend.validation import is_plain_data
+from harnack.enclosures import Levels
 from harnack.fields.batched_fields import FieldCache
-from harnack.fields.capabilities import NO_TRUNCATION
-from harnack.tracer.level_contact import Status
+from harnack.fields.capabilities import EXACT
+from harnack.tracer.level_contact import RayStatus
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real, Vec3
-    from harnack.tracer.surface_tracer import MarchResult, PreparedLevelSet
+    from harnack.tracer.surface_tracer import MarchResult, SurfaceTracer
 
 # Newton steps that bring a hit from the tolerance to rounding before the derivative is taken; and
 # for sums over trees, which are then evaluated without truncation.
-_POLISH, _POLISH_OF_SUMS = 4, 3
+_NEWTON_STEPS, _POLISH_OF_SUMS = 4, 3
 
 
 # Fields without Dr.Jit numbers, which are checked only once (until an attribute is set).
-_FIXED: FieldCache[bool] = FieldCache()
+_PARAMETER_FREE: FieldCache[bool] = FieldCache()
 
 
-def wants_derivatives(prepared: PreparedLevelSet, o: Vec3, d: Vec3) -> bool:
+def needs_derivatives(prepared: SurfaceTracer, o: Vec3, d: Vec3) -> bool:
     """Whether rays, levels or the field's parameters have derivatives enabled.
 
     Raises:
@@ -44,11 +50,11 @@ def wants_derivatives(prepared: PreparedLevelSet, o: Vec3, d: Vec3) -> bool:
             the derivative of that is not known here; zero would be wrong.
     """
     field = prepared.field
-    if not _FIXED.get(field, None, lambda: holds_numbers_alone(vars(field))):
-        field.check_parameters()
+    if not _PARAMETER_FREE.get(field, None, lambda: is_plain_data(vars(field))):
+        field.refuse_hidden_parameters()
     parameters = prepared.field.parameters()
     of_field = any(dr.grad_enabled(p) for p in parameters)
-    if of_field and prepared.field.has_sheets:
+    if of_field and prepared.field.has_jumps:
         name = type(prepared.field).__name__
         raise NotImplementedError(
             f"hits of a field with sheets cannot be differentiated by its parameters: detach "
@@ -58,7 +64,7 @@ def wants_derivatives(prepared: PreparedLevelSet, o: Vec3, d: Vec3) -> bool:
     return of_field or any(dr.grad_enabled(p) for p in rest)
 
 
-class _Undifferentiated(dr.CustomOp):
+class _NoDerivative(dr.CustomOp):
     """The identity, whose derivative is not known: reverse mode raises. Forward mode, which goes
     from parameters to all that depends on them, wanted or not, gives NaN."""
 
@@ -78,39 +84,39 @@ class _Undifferentiated(dr.CustomOp):
             )
 
 
-def refuse_derivative(prepared: PreparedLevelSet, o: Vec3, d: Vec3, what: str, value: Any) -> Any:
+def refuse_derivative(prepared: SurfaceTracer, o: Vec3, d: Vec3, what: str, value: Any) -> Any:
     """A result of a trace whose derivative is not known: asking for it is an error
-    (`_Undifferentiated`), since zero would be wrong."""
+    (`_NoDerivative`), since zero would be wrong."""
     sources = [o, d, *prepared.levels.values, *prepared.field.parameters()]
-    return dr.custom(_Undifferentiated, value, what, sources)
+    return dr.custom(_NoDerivative, value, what, sources)
 
 
-def attach(
-    prepared: PreparedLevelSet, o: Vec3, d: Vec3, end: MarchResult, normal: Vec3
+def attach_derivatives(
+    prepared: SurfaceTracer, o: Vec3, d: Vec3, end: MarchResult, normal: Vec3
 ) -> tuple[Real, Vec3]:
     """t, refined up to rounding, with its derivative attached, and the normal at that point.
 
     normal: unit, as traced. Normals carry no derivative (they would need the Hessian). At hits
     on sheets t is exact already, and does not depend on the level.
     """
-    t, hit, prepared = end.t, end.status == int(Status.HIT), prepared.of_hit(end)
-    if prepared.field.has_sheets:
+    t, hit, prepared = end.t, end.status == int(RayStatus.HIT), prepared.hit_surface(end)
+    if prepared.field.has_jumps:
         t = _on_plane(prepared, o, d, end)
-        hit &= ~end.on_sheet
+        hit &= ~end.at_jump
     backend = prepared.backend
     with dr.suspend_grad():
         at = dr.select(hit, t, 0)
         here, along = dr.detach(o), dr.detach(d)
-        steps = _POLISH
-        if prepared.field.has_detail:
+        steps = _NEWTON_STEPS
+        if prepared.field.has_variable_accuracy:
             # Truncation is as large as the tolerance, and its derivative may be much larger.
             steps = _POLISH_OF_SUMS
-            detail = dr.select(hit, backend.Float(NO_TRUNCATION), 0)
-            prepared = replace(prepared, field=prepared.field.at_detail(detail))
+            detail = dr.select(hit, backend.Float(EXACT), 0)
+            prepared = replace(prepared, field=prepared.field.at_accuracy(detail))
         for _ in range(steps):
             x = dr.fma(backend.Array3f(at), along, here)
             sample = prepared.sample(x)
-            miss = prepared.levels.to_nearest(sample.value)
+            miss = prepared.levels.offset_to_nearest(sample.value)
             slope = dr.dot(sample.gradient, along)
             step = dr.select(hit & (slope != 0), miss / slope, 0)
             # A grazing ray may have no root to converge to; stay near the proved point.
@@ -128,31 +134,31 @@ def attach(
         value = prepared.field.differentiable_value(moving)
         change = value - dr.detach(value)
     change = change - _change_of_nearest(prepared, sample.value)
-    return dr.select(hit, _moved(at, change, slope, hit), t), normal
+    return dr.select(hit, _with_derivative(at, change, slope, hit), t), normal
 
 
-def _on_plane(prepared: PreparedLevelSet, o: Vec3, d: Vec3, end: MarchResult) -> Real:
+def _on_plane(prepared: SurfaceTracer, o: Vec3, d: Vec3, end: MarchResult) -> Real:
     """t with the derivative of the intersection with a plane at hits on sheets."""
     with dr.suspend_grad():
-        at = dr.select(end.on_sheet, end.t, 0)
+        at = dr.select(end.at_jump, end.t, 0)
         slope = dr.dot(end.gradient, dr.detach(d))
     x = dr.fma(prepared.backend.Array3f(at), d, o)
     change = dr.dot(end.gradient, x - dr.detach(x))
-    return _moved(end.t, change, slope, end.on_sheet)
+    return _with_derivative(end.t, change, slope, end.at_jump)
 
 
-def _moved(t: Real, change: Real, slope: Real, where: Mask) -> Real:
+def _with_derivative(t: Real, change: Real, slope: Real, where: Mask) -> Real:
     """t with the derivative of -change/slope, infinite or NaN where the slope is 0."""
     return dr.replace_grad(t, -change * dr.select(where, 1 / slope, 0))
 
 
-def _change_of_nearest(prepared: PreparedLevelSet, f: Real) -> Real:
+def _change_of_nearest(prepared: SurfaceTracer, f: Real) -> Real:
     """level - detach(level), a zero with a derivative, of the level nearest to f in each lane."""
     nearest, change = dr.inf, prepared.backend.Float(0)
     for level in prepared.levels.values:
         with dr.suspend_grad():
-            one = TargetLevels((dr.detach(level),), prepared.levels.period)
-            gap = one.gaps(f).smaller
+            one = Levels((dr.detach(level),), prepared.levels.period)
+            gap = one.gaps(f).nearest
             closer = gap < nearest
             nearest = dr.select(closer, gap, nearest)
         change = dr.select(closer, level - dr.detach(level), change)

@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 
-from harnack.backend.elementary import fmax, length, unit
-from harnack.backend.loops import while_active
-from harnack.fields.samples import value_error
+from harnack.backend.elementary import fmax, safe_norm, safe_normalize
+from harnack.backend.loops import loop_while_active
+from harnack.fields.samples import value_error_bound
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
-    from harnack.enclosures import TargetLevels
+    from harnack.enclosures import Levels
     from harnack.fields.field import Field
 
 # The surface is looked for so many times as far each time, up to this fraction of the size of
@@ -68,7 +68,7 @@ class _Looking:
     active: Mask
 
 
-def seen_distance(backend: Backend, field: Field, levels: TargetLevels, hits: Doubtful) -> Real:
+def seen_distance(backend: Backend, field: Field, levels: Levels, hits: Doubtful) -> Real:
     """Within what distance of hits the surface was seen, at least `hits.distance`; infinite where
     it was not seen within a sixteenth of the size of coordinates.
 
@@ -80,14 +80,17 @@ def seen_distance(backend: Backend, field: Field, levels: TargetLevels, hits: Do
     level up to its error. No look in this precision can tell such a place from the surface.
     """
     at_hit = field.evaluate(hits.position)
-    level = at_hit.value + levels.to_nearest(at_hit.value)
+    level = at_hit.value + levels.offset_to_nearest(at_hit.value)
     period = levels.period
     farthest = fmax(_FARTHEST * hits.size, hits.distance)
-    smallest = 4 * backend.epsilon * hits.size
+    smallest = 4 * backend.machine_epsilon * hits.size
 
     def beside(sample: Any) -> tuple[Real, Real, Mask]:
         """f less the level, the bound of its error, and whether its side is sure."""
-        x, error = sample.value - level, value_error(sample, length(sample.gradient), hits.size)
+        x, error = (
+            sample.value - level,
+            value_error_bound(sample, safe_norm(sample.gradient), hits.size),
+        )
         if period is None:
             return x, error, dr.abs(x) > error
         x = x - period * dr.round(x / period)
@@ -95,7 +98,7 @@ def seen_distance(backend: Backend, field: Field, levels: TargetLevels, hits: Do
 
     normal, vector = hits.normal, backend.Array3f
     axis = dr.select(dr.abs(normal.x) < 0.6, vector(1, 0, 0), vector(0, 1, 0))
-    across = unit(dr.cross(normal, axis))
+    across = safe_normalize(dr.cross(normal, axis))
     other = dr.cross(normal, across)
     x, _, is_sure = beside(at_hit)
     side = dr.select(x > 0, backend.Float(1), -1)
@@ -143,7 +146,7 @@ def seen_distance(backend: Backend, field: Field, levels: TargetLevels, hits: Do
         hits.distance, backend.UInt32(0), is_sure & (x > 0), is_sure & (x < 0), zero, zero, zero,
         zero, no, yes, backend.UInt32(0), no, yes,
     )  # fmt: skip
-    end = while_active(begin, body, "harnack doubtful hits")
+    end = loop_while_active(begin, body, "harnack doubtful hits")
     return dr.select(end.seen, end.distance, dr.inf)
 
 

@@ -13,39 +13,39 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import backend_of, choose_backend, to_float, to_numpy, to_vector3
-from harnack.backend.arrays import as_data
-from harnack.backend.elementary import fmax, largest_coordinate, unit
-from harnack.backend.elementary import length as norm
-from harnack.backend.loops import on_some
-from harnack.backend.tensors import is_tensor, numbers_of, tensor_of, vectors_of
-from harnack.cluster.dask_arrays import takes_blocks
+from harnack.backend.arrays import as_kernel_parameters
+from harnack.backend.elementary import fmax, max_norm, safe_normalize
+from harnack.backend.elementary import safe_norm as norm
+from harnack.backend.loops import compute_on_active
+from harnack.backend.tensors import array_to_tensor, is_tensor, tensor_to_array, tensor_to_vectors
+from harnack.cluster.dask_arrays import accepts_dask_arrays
 from harnack.name_suggestions import is_one_of
 from harnack.tracer.crossings import (
-    AllHits,
+    RayCrossings,
     check_all_hits,
-    crossings_as_numpy,
-    no_crossings,
-    trace_all,
+    crossings_to_numpy,
+    empty_crossings,
+    trace_crossings,
 )
-from harnack.tracer.derivatives import attach, refuse_derivative, wants_derivatives
+from harnack.tracer.derivatives import attach_derivatives, needs_derivatives, refuse_derivative
 from harnack.tracer.doubtful import Doubtful, seen_distance
-from harnack.tracer.level_contact import Status, Tolerance
-from harnack.tracer.surface import LevelSet, level_set
-from harnack.webgpu import evaluate, find_device
+from harnack.tracer.level_contact import HitTolerance, RayStatus
+from harnack.tracer.surface import Surface, level_set
+from harnack.webgpu import evaluate_on_device, find_device
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, IntArray, Mask, Precision, Real, Vec3
-    from harnack.enclosures import Choice
+    from harnack.enclosures import EnclosureChoice
     from harnack.fields.field import Field
     from harnack.geometry import Volume
-    from harnack.tracer.surface_tracer import MarchResult, PreparedLevelSet
+    from harnack.tracer.surface_tracer import MarchResult, SurfaceTracer
     from harnack.webgpu import Arrays
 
 # From so many rays on it pays to look for empty cells first.
-_MANY = 4096
+_MIN_RAYS_FOR_CELLS = 4096
 # Rays are scattered where the directions of neighbors are farther apart than this, or their origins
 # than this fraction of the spread of all (both as roots of mean squares), by so many of them.
-_TURN, _STRAY, _ASKED = 0.15, 0.7, 4096
+_MAX_TURN, _MAX_STRAY, _SAMPLED_RAYS = 0.15, 0.7, 4096
 # A hit is doubtful where rounding adds more than this part of the tolerance to how far the surface
 # may be to first order, and more than so many roundings of the point: it is taken for so many times
 # as far, as where so many sheets meet. Where it is farther than so many tolerances to first order
@@ -57,7 +57,7 @@ _PART, _OF_POINTS, _SHEETS, _LARGE = 0.5, 64, 3, 8
 class Hits:
     """The ends of n rays, as NumPy arrays or, if the rays were Dr.Jit arrays or tensors, as these.
 
-    hit: (n,) mask of rays that hit. Rays that ran out of steps have a finite t as well, so that
+    is_hit: (n,) mask of rays that hit. Rays that ran out of steps have a finite t as well, so that
         `isfinite(t)` is no such mask.
     t: (n,) ray parameter of the hit, inf for a miss; for a ray that ran out of steps, how far
         it is proved free. A hit is within tolerance of the first root, mostly before it. One that
@@ -70,10 +70,10 @@ class Hits:
     value: (n,) f at the last accepted point; for an angle-valued field up to a multiple of its
         period. Where a sheet was hit, f just before it.
     evaluations: (n,) how many times the field was evaluated.
-    status: (n,) a `Status`.
-    sheet: (n,) index of the sheet, such as a triangle, or of the part, such as a face of a
-        `PolygonMesh`, that was hit; -1 where none was: misses, hits of a smooth level set, and all
-        rays of fields that have neither.
+    status: (n,) a `RayStatus`.
+    primitive_index: (n,) index of the sheet, such as a triangle, or of the part, such as a face of
+        a `PolygonMesh`, that was hit; -1 where none was: misses, hits of a smooth level set, and
+        all rays of fields that have neither.
     uncertainty: (n,) a length: at a hit of a smooth level set, |f - level| is proved to be at most
         (tolerance + uncertainty) |grad f|. It is 0 unless rounding leaves f less certain than the
         tolerance asks; 0 for all other rays. Where |grad f| may have no bound the surface is proved
@@ -96,27 +96,27 @@ class Hits:
     value: Any
     evaluations: Any
     status: Any
-    sheet: Any
+    primitive_index: Any
     uncertainty: Any
 
     @property
-    def hit(self) -> Any:
+    def is_hit(self) -> Any:
         """(n,) mask of rays that hit."""
-        return self.status == int(Status.HIT)
+        return self.status == int(RayStatus.HIT)
 
 
 @overload
 def trace(
-    field: Field | LevelSet,
+    field: Field | Surface,
     origins: Any,
     directions: Any,
     *,
     level: Any = None,
     t_min: Any = 0.0,
     t_max: Any = math.inf,
-    tolerance: float | Tolerance = 1e-4,
+    tolerance: float | HitTolerance = 1e-4,
     max_steps: int = 2000,
-    bound: Choice = None,
+    bound: EnclosureChoice = None,
     clip: Volume | None = None,
     section: Volume | None = None,
     largest: bool | int = False,
@@ -130,16 +130,16 @@ def trace(
 
 @overload
 def trace(
-    field: Field | LevelSet,
+    field: Field | Surface,
     origins: Any,
     directions: Any,
     *,
     level: Any = None,
     t_min: Any = 0.0,
     t_max: Any = math.inf,
-    tolerance: float | Tolerance = 1e-4,
+    tolerance: float | HitTolerance = 1e-4,
     max_steps: int = 2000,
-    bound: Choice = None,
+    bound: EnclosureChoice = None,
     clip: Volume | None = None,
     section: Volume | None = None,
     largest: bool | int = False,
@@ -148,21 +148,21 @@ def trace(
     confirm: bool = False,
     all_hits: int,
     backend: None = None,
-) -> AllHits: ...
+) -> RayCrossings: ...
 
 
-@takes_blocks("origins", "directions", "t_min", "t_max")
+@accepts_dask_arrays("origins", "directions", "t_min", "t_max")
 def trace(
-    field: Field | LevelSet,
+    field: Field | Surface,
     origins: Any,
     directions: Any,
     *,
     level: Any = None,
     t_min: Any = 0.0,
     t_max: Any = math.inf,
-    tolerance: float | Tolerance = 1e-4,
+    tolerance: float | HitTolerance = 1e-4,
     max_steps: int = 2000,
-    bound: Choice = None,
+    bound: EnclosureChoice = None,
     clip: Volume | None = None,
     section: Volume | None = None,
     largest: bool | int = False,
@@ -171,10 +171,10 @@ def trace(
     confirm: bool = False,
     all_hits: int | None = None,
     backend: Literal["webgpu"] | None = None,
-) -> Hits | AllHits:
+) -> Hits | RayCrossings:
     """First hits of rays with a level set of a field; no hit is ever missed.
 
-    field: what to trace; or a `LevelSet`, which then holds all the settings.
+    field: what to trace; or a `Surface`, which then holds all the settings.
     origins, directions: (n, 3) array-likes or Dr.Jit tensors (one of them may be (1, 3)), or
         Dr.Jit 3-vectors.
         Directions need not be unit; t counts multiples of the *unit* direction, so it is a
@@ -185,7 +185,8 @@ def trace(
     tolerance: a length, or a `Tolerance`. In single precision not below about 1e-6 of the
         size of the coordinates.
     bound: which proofs to use: None for all that pay; "classic" for the published rule, "slope",
-        "caps", "curvature", "lipschitz"; or classes of enclosures, such as `harnack.Caps`.
+        "caps", "curvature", "lipschitz"; or classes of enclosures, such as
+        `harnack.SphericalCapEnclosure`.
     clip, section: volumes that the surface is cut by; what lies outside of one is not there.
     largest: of the surface in the domain and the clip, only its largest component, as far as
         components are separated by cells proved empty: 128 along the longest side, or so many. Rays
@@ -195,14 +196,14 @@ def trace(
     confirm: a hit counts only where f really changes sign: a ray that comes within the tolerance
         of a level and turns back does not hit it. The hit is then at a root. What is guaranteed is
         that of `all_hits`.
-    all_hits: how many crossings of each ray to return, in order, as an `AllHits`. No crossing is
-        missed whose function swings farther than the tolerance to both sides of the level, and none
-        is counted twice; touching a level without passing to its other side is no crossing, and
-        neither is starting on it. Where levels are closer in value than four tolerances, a quarter
-        of their distance is the tolerance; rays run out of steps where that is below rounding.
-        Where it is not, the tolerance is at least eight times what rounding does to f, in single
-        precision about 1e-5 of the size of the coordinates: whatever swings less than that to one
-        side may be no crossing. `max_steps` is for all of the ray.
+    all_hits: how many crossings of each ray to return, in order, as an `RayCrossings`. No crossing
+        is missed whose function swings farther than the tolerance to both sides of the level, and
+        none is counted twice; touching a level without passing to its other side is no crossing,
+        and neither is starting on it. Where levels are closer in value than four tolerances, a
+        quarter of their distance is the tolerance; rays run out of steps where that is below
+        rounding. Where it is not, the tolerance is at least eight times what rounding does to f, in
+        single precision about 1e-5 of the size of the coordinates: whatever swings less than that
+        to one side may be no crossing. `max_steps` is for all of the ray.
 
     backend: "webgpu" traces NumPy rays in single precision on whatever GPU the system has, by the
         package `wgpu` (`pip install harnack[webgpu]`): the kernel that Dr.Jit records, translated.
@@ -227,7 +228,7 @@ def trace(
         _check_backend(backend, (origins, directions, t_min, t_max), precision, all_hits)
     surface = (
         field
-        if isinstance(field, LevelSet)
+        if isinstance(field, Surface)
         else level_set(
             field, level, clip=clip, section=section, largest=largest,
             tolerance=tolerance, max_steps=max_steps, bound=bound, overstep=overstep,
@@ -236,7 +237,7 @@ def trace(
     )  # fmt: skip
     k = None if all_hits is None else check_all_hits(all_hits, surface)
     if any(is_tensor(a) for a in (origins, directions)):
-        return _of_tensors(surface, origins, directions, t_min, t_max, precision, k)
+        return _trace_tensors(surface, origins, directions, t_min, t_max, precision, k)
     given = [a for a in (origins, directions) if dr.is_array_v(type(a))]
     if given and precision is not None:
         raise ValueError("precision follows Dr.Jit rays; give it only with NumPy ones")
@@ -250,10 +251,12 @@ def trace(
     if min(dr.width(array) for array in (o, d, near, far)) == 0:
         n = 0
     if k is not None:
-        all_of_them = no_crossings(own)
+        all_of_them = empty_crossings(own)
         if n > 0:
-            all_of_them = trace_all(surface, own, o, d, near, far, k, differentiable=bool(given))
-        return all_of_them if given else crossings_as_numpy(all_of_them, n, k)
+            all_of_them = trace_crossings(
+                surface, own, o, d, near, far, k, differentiable=bool(given)
+            )
+        return all_of_them if given else crossings_to_numpy(all_of_them, n, k)
     if n == 0:
         return _no_hits(own, as_numpy=not given)
     if backend is not None:
@@ -262,8 +265,8 @@ def trace(
     return hits if given else _as_numpy(hits, max(dr.width(o), dr.width(d), dr.width(near)))
 
 
-def _of_tensors(
-    surface: LevelSet,
+def _trace_tensors(
+    surface: Surface,
     origins: Any,
     directions: Any,
     t_min: Any,
@@ -272,27 +275,29 @@ def _of_tensors(
     k: int | None,
 ) -> Any:
     """The result of `trace` for rays that are tensors, or some of which are: tensors of the shapes
-    of `Hits`, or of `AllHits` for k crossings a ray."""
+    of `Hits`, or of `RayCrossings` for k crossings a ray."""
     rays = {"origins": origins, "directions": directions}
-    vectors = [vectors_of(a, name) if is_tensor(a) else a for name, a in rays.items()]
+    vectors = [tensor_to_vectors(a, name) if is_tensor(a) else a for name, a in rays.items()]
     ends = {"t_min": t_min, "t_max": t_max}
-    near, far = (numbers_of(a, name) if is_tensor(a) else a for name, a in ends.items())
+    near, far = (tensor_to_array(a, name) if is_tensor(a) else a for name, a in ends.items())
     hits = trace(
         surface, *vectors, t_min=near, t_max=far, precision=precision, all_hits=cast("int", k)
     )
     n = dr.width(hits.status)
     if k is None:
-        return Hits(*(tensor_of(value, (n,)) for value in vars(hits).values()))
-    of_rays = {"count", "end", "status", "evaluations"}
+        return Hits(*(array_to_tensor(value, (n,)) for value in vars(hits).values()))
+    of_rays = {"count", "traced_to", "status", "evaluations"}
     shapes = {name: (n,) if name in of_rays else (n, k) for name in vars(hits)}
-    return AllHits(*(tensor_of(getattr(hits, name), shape) for name, shape in shapes.items()))
+    return RayCrossings(
+        *(array_to_tensor(getattr(hits, name), shape) for name, shape in shapes.items())
+    )
 
 
 def _rays(
     backend: Backend, origins: Any, directions: Any, t_min: Any, t_max: Any
 ) -> tuple[Vec3, Vec3, Real, Real]:
-    o = as_data(to_vector3(backend, origins, "origins"))
-    d = as_data(to_vector3(backend, directions, "directions"))
+    o = as_kernel_parameters(to_vector3(backend, origins, "origins"))
+    d = as_kernel_parameters(to_vector3(backend, directions, "directions"))
     near, far = to_float(backend, t_min, "t_min"), to_float(backend, t_max, "t_max")
     widths = {"origins": o, "directions": d, "t_min": near, "t_max": far}
     lengths = {name: dr.width(array) for name, array in widths.items()}
@@ -303,8 +308,8 @@ def _rays(
     if not n:
         return o, d, near, far
     if not dr.is_array_v(type(directions)):
-        _check_numpy_rays(to_numpy(largest_coordinate(d)), to_numpy(near), to_numpy(far))
-    return o, unit(d), near, far
+        _check_numpy_rays(to_numpy(max_norm(d)), to_numpy(near), to_numpy(far))
+    return o, safe_normalize(d), near, far
 
 
 def _check_numpy_rays(largest: Any, near: Any, far: Any) -> None:
@@ -322,7 +327,7 @@ def _check_numpy_rays(largest: Any, near: Any, far: Any) -> None:
 
 
 def _trace(
-    surface: LevelSet,
+    surface: Surface,
     backend: Backend,
     o: Vec3,
     d: Vec3,
@@ -332,24 +337,24 @@ def _trace(
     differentiable: bool,
 ) -> Hits:
     count = dr.width(o, d)
-    prepared = surface.for_rays(count).prepare(backend, many=count >= _MANY)
+    prepared = surface.for_rays(count).prepare(backend, many=count >= _MIN_RAYS_FOR_CELLS)
     if not prepared.field.is_cheap and _are_scattered(backend, dr.detach(o), dr.detach(d)):
-        prepared = replace(prepared, queued=True)
+        prepared = replace(prepared, uses_ray_queue=True)
     with dr.suspend_grad():
         origin, direction = dr.detach(o), dr.detach(d)
         rays = origin, direction, dr.detach(near), dr.detach(far)
-        end, hits, doubt = _ends(prepared, *rays)
+        end, hits, doubt = _first_hits(prepared, *rays)
         if doubt is not None:
             hits = _with_seen_distances(prepared, hits, doubt)
-    if differentiable and wants_derivatives(prepared, o, d):
-        t, normal = attach(prepared, o, d, end, hits.normal)
+    if differentiable and needs_derivatives(prepared, o, d):
+        t, normal = attach_derivatives(prepared, o, d, end, hits.normal)
         normal, value, uncertainty = (
             refuse_derivative(prepared, o, d, name, one)
             for name, one in (
                 ("normal", normal), ("value", hits.value), ("uncertainty", hits.uncertainty),
             )
         )  # fmt: skip
-        position = _along(o, d, t)
+        position = _positions(o, d, t)
         hits = replace(
             hits, t=t, position=position, normal=normal, value=value, uncertainty=uncertainty
         )
@@ -363,9 +368,9 @@ def _are_scattered(backend: Backend, o: Vec3, d: Vec3) -> bool:
     through curves, clouds and unions of shapes take half the time by a queue, and a camera's rays a
     fifth more (measured)."""
     count = dr.width(o, d)
-    if count < _MANY or dr.backend_v(d) != dr.JitBackend.LLVM:
+    if count < _MIN_RAYS_FOR_CELLS or dr.backend_v(d) != dr.JitBackend.LLVM:
         return False
-    step = (count - 1) // min(count - 1, _ASKED)
+    step = (count - 1) // min(count - 1, _SAMPLED_RAYS)
     first = dr.arange(backend.UInt32, (count - 1) // step) * dr.opaque(backend.UInt32, step)
 
     def seen(rays: Vec3, row: Any) -> FloatArray:
@@ -375,36 +380,36 @@ def _are_scattered(backend: Backend, o: Vec3, d: Vec3) -> bool:
     with np.errstate(over="ignore", invalid="ignore"):  # of rays that are no rays
         begin, stray = seen(o, first), seen(o, first) - seen(o, first + 1)
         turned = seen(d, first) - seen(d, first + 1)
-        turns = np.square(turned).sum(axis=1).mean() > _TURN**2
+        turns = np.square(turned).sum(axis=1).mean() > _MAX_TURN**2
         spread = 2 * begin.var(axis=0).sum()
-        return bool(turns or np.square(stray).sum(axis=1).mean() > _STRAY**2 * spread > 0)
+        return bool(turns or np.square(stray).sum(axis=1).mean() > _MAX_STRAY**2 * spread > 0)
 
 
-def _ends(
-    prepared: PreparedLevelSet, o: Vec3, d: Vec3, near: Real, far: Real
+def _first_hits(
+    prepared: SurfaceTracer, o: Vec3, d: Vec3, near: Real, far: Real
 ) -> tuple[MarchResult, Hits, _Doubt | None]:
     """Ends of rays, the same as `Hits`, without derivatives, and how sure hits are; None where
     no hit leaves a doubt."""
     backend = prepared.backend
     end = prepared.first_hit(o, d, near, far)
-    hit = end.status == int(Status.HIT)
+    hit = end.status == int(RayStatus.HIT)
     length = norm(end.gradient)
     normal = dr.select(hit & (length > 0), end.gradient / length, 0)
     sheet = dr.full(backend.Int32, -1, dr.width(end.status))
-    if prepared.field.has_sheets:
-        sheet = dr.reinterpret_array(backend.Int32, end.sheet)  # NO_SHEET becomes -1
-    if end.part is not None:
-        sheet = dr.reinterpret_array(backend.Int32, end.part)
-    smooth = hit & ~end.on_sheet
+    if prepared.field.has_jumps:
+        sheet = dr.reinterpret_array(backend.Int32, end.facet)  # NO_FACET becomes -1
+    if end.patch is not None:
+        sheet = dr.reinterpret_array(backend.Int32, end.patch)
+    smooth = hit & ~end.at_jump
     # Where the gradient is no number its size has no bound (`tracer.steep`).
-    uncertain = smooth & (end.excess > 0) & (length == length)
-    uncertainty = dr.select(uncertain, end.excess / length, 0)
+    uncertain = smooth & (end.tolerance_excess > 0) & (length == length)
+    uncertainty = dr.select(uncertain, end.tolerance_excess / length, 0)
     doubt = None
     if end.side is None and not prepared.field.is_steep:  # others are at a root, or looked at
         doubt = _Doubt.of(prepared, o, end.t, length, uncertainty)
         farther = _SHEETS * doubt.distance - doubt.tolerance
         uncertainty = dr.select(doubt.is_doubtful, farther, uncertainty)
-    position = _along(o, d, end.t)
+    position = _positions(o, d, end.t)
     hits = Hits(end.t, position, normal, end.value, end.evaluations, end.status, sheet, uncertainty)
     return end, hits, doubt
 
@@ -427,13 +432,13 @@ class _Doubt:
 
     @classmethod
     def of(
-        cls, prepared: PreparedLevelSet, o: Vec3, t: Real, steepness: Real, uncertainty: Real
+        cls, prepared: SurfaceTracer, o: Vec3, t: Real, steepness: Real, uncertainty: Real
     ) -> _Doubt:
         """That of hits where |grad f| is the steepness; uncertainty: to first order."""
         t = dr.select(dr.isfinite(t), t, 0)
-        size = largest_coordinate(o) + t
-        tolerance = prepared.tolerance.in_value(steepness, t) / steepness
-        least = fmax(_PART * tolerance, _OF_POINTS * prepared.backend.epsilon * size)
+        size = max_norm(o) + t
+        tolerance = prepared.tolerance.value_tolerance(steepness, t) / steepness
+        least = fmax(_PART * tolerance, _OF_POINTS * prepared.backend.machine_epsilon * size)
         return cls(size, tolerance, tolerance + uncertainty, uncertainty > least)
 
 
@@ -452,7 +457,7 @@ class _Lengths:
     length: Real
 
 
-def _with_seen_distances(prepared: PreparedLevelSet, hits: Hits, doubt: _Doubt) -> Hits:
+def _with_seen_distances(prepared: SurfaceTracer, hits: Hits, doubt: _Doubt) -> Hits:
     """The hits, with uncertainties within which the surface was seen where these are large. All are
     evaluated; nothing else is where there is no such hit."""
     backend, field = prepared.backend, prepared.field
@@ -465,17 +470,19 @@ def _with_seen_distances(prepared: PreparedLevelSet, hits: Hits, doubt: _Doubt) 
 
     def seen(rays: _Around) -> _Lengths:
         one = field
-        if field.has_parts:
-            one = field.part_at(dr.reinterpret_array(backend.UInt32, rays.part))
+        if field.has_patches:
+            one = field.patch(dr.reinterpret_array(backend.UInt32, rays.part))
         return _Lengths(seen_distance(backend, one, prepared.levels, rays.around))
 
     around = Doubtful(hits.position, hits.normal, doubt.size, doubt.distance)
-    far = on_some(is_far, seen, _Around(around, hits.sheet), _Lengths(doubt.distance))
+    far = compute_on_active(
+        is_far, seen, _Around(around, hits.primitive_index), _Lengths(doubt.distance)
+    )
     uncertainty = dr.select(is_far, far.length - doubt.tolerance, hits.uncertainty)
     return replace(hits, uncertainty=uncertainty)
 
 
-def _along(o: Vec3, d: Vec3, t: Real) -> Vec3:
+def _positions(o: Vec3, d: Vec3, t: Real) -> Vec3:
     return dr.select(dr.isfinite(t), dr.fma(type(o)(t), d, o), dr.nan)
 
 
@@ -497,10 +504,8 @@ def _check_backend(
         raise NotImplementedError('backend="webgpu" finds first hits alone: leave out all_hits')
 
 
-def _trace_on_device(
-    surface: LevelSet, backend: Backend, rays: tuple[Any, ...], count: int
-) -> Hits:
-    prepared = surface.prepare(backend, many=count >= _MANY)
+def _trace_on_device(surface: Surface, backend: Backend, rays: tuple[Any, ...], count: int) -> Hits:
+    prepared = surface.prepare(backend, many=count >= _MIN_RAYS_FOR_CELLS)
     lanes = {
         name: one + dr.zeros(type(one), count)
         for name, one in zip(("o", "d", "near", "far"), rays, strict=True)
@@ -508,15 +513,15 @@ def _trace_on_device(
     dr.eval(lanes)
 
     def compute(o: Vec3, d: Vec3, near: Real, far: Real) -> dict[str, Any]:
-        return vars(_ends(prepared, o, d, near, far)[1])
+        return vars(_first_hits(prepared, o, d, near, far)[1])
 
     directions = to_numpy(lanes["d"])
 
     def differences(rows: IntArray, expected: Arrays, found: Arrays) -> str:
         given = Hits(**expected), Hits(**found)
-        return _differences(*given, directions[rows], surface.tolerance)
+        return _compare_hits(*given, directions[rows], surface.tolerance)
 
-    found = evaluate(find_device(), compute, lanes, prepared, differences)
+    found = evaluate_on_device(find_device(), compute, lanes, prepared, differences)
     return _as_numpy(Hits(**found), count)
 
 
@@ -526,47 +531,49 @@ _GRAZING = 0.1
 # What is asked of a device (in brackets: the worst of one that computes as it should, Mesa's on a
 # CPU, over 110 surfaces). At most this share of rays has another status, or hits farther off than
 # the tolerance, as at an apex (0);
-_OTHERWISE = 1e-3
+_MAX_OUTLIERS = 1e-3
 # nine in ten hits lie within this fraction of the tolerance (0.03), and their normals differ by no
 # more than this (2e-5);
-_APART, _TURNED = 0.1, 2e-4
+_MAX_OFFSET, _MAX_NORMAL_CHANGE = 0.1, 2e-4
 # the numbers of evaluations differ, summed over all rays, by no more than this fraction of their
 # sum and one for each ray (0.020).
-_RECOUNTED = 0.03
+_MAX_COUNT_CHANGE = 0.03
 
 
-def _differences(expected: Hits, found: Hits, directions: FloatArray, tolerance: Tolerance) -> str:
+def _compare_hits(
+    expected: Hits, found: Hits, directions: FloatArray, tolerance: HitTolerance
+) -> str:
     """What differs in a device's hits by more than rounding explains; "" if nothing does.
 
     A ray that runs along the surface, within the tolerance, may hit it anywhere there or not at
     all, and may run out of steps.
     """
-    hit, both = expected.hit | found.hit, expected.hit & found.hit
-    normal = cast("FloatArray", np.where(expected.hit[:, None], expected.normal, found.normal))
+    hit, both = expected.is_hit | found.is_hit, expected.is_hit & found.is_hit
+    normal = cast("FloatArray", np.where(expected.is_hit[:, None], expected.normal, found.normal))
     climb = np.abs((normal * directions).sum(axis=1))
     other = expected.status != found.status
-    lost = np.maximum(expected.status, found.status) == int(Status.OUT_OF_STEPS)
+    lost = np.maximum(expected.status, found.status) == int(RayStatus.OUT_OF_STEPS)
     graze = lost | (hit & (climb < _GRAZING))
-    if (other & ~graze).any() or other.sum() > _OTHERWISE * len(other):
+    if (other & ~graze).any() or other.sum() > _MAX_OUTLIERS * len(other):
         k = int(np.flatnonzero(other)[0])
         return (
             f"{other.sum()} of {len(other)} rays end otherwise, such as ray {k} of the sample: "
-            f"{Status(expected.status[k]).name} here, {Status(found.status[k]).name} there"
+            f"{RayStatus(expected.status[k]).name} here, {RayStatus(found.status[k]).name} there"
         )
     t = expected.t
     allowed = tolerance.distance + tolerance.per_length * np.where(both, t, 0)
     with np.errstate(invalid="ignore"):
         off = np.where(both, np.abs(found.t - t), 0) * np.maximum(climb, _GRAZING)
     rounding = 64 * np.finfo(np.float32).eps * np.where(both, 1 + np.abs(t), 1)
-    if (off > 2 * allowed + rounding).mean() > _OTHERWISE:
+    if (off > 2 * allowed + rounding).mean() > _MAX_OUTLIERS:
         return f"hits lie up to {off.max():.2g} off the surface, and {allowed.max():.2g} is asked"
-    if both.any() and np.quantile((off - rounding)[both] / allowed[both], 0.9) > _APART:
+    if both.any() and np.quantile((off - rounding)[both] / allowed[both], 0.9) > _MAX_OFFSET:
         return "hits lie elsewhere, if within the tolerance"
     turned = np.linalg.norm(found.normal - expected.normal, axis=1)[both & (climb >= _GRAZING)]
-    if turned.size and np.quantile(turned, 0.9) > _TURNED:
+    if turned.size and np.quantile(turned, 0.9) > _MAX_NORMAL_CHANGE:
         return "normals differ"
     many, others = (one.evaluations.astype(np.float64) for one in (expected, found))
-    if np.abs(others - many).sum() > _RECOUNTED * (many + 1).sum() + 2:
+    if np.abs(others - many).sum() > _MAX_COUNT_CHANGE * (many + 1).sum() + 2:
         return "rays take another number of evaluations"
     return ""
 
@@ -591,6 +598,6 @@ def _as_numpy(hits: Hits, n: int) -> Hits:
         flat(hits.value),
         flat(hits.evaluations).astype(np.int64),
         flat(hits.status).astype(np.int64),
-        flat(hits.sheet).astype(np.int64),
+        flat(hits.primitive_index).astype(np.int64),
         flat(hits.uncertainty),
     )

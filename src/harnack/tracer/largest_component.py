@@ -10,18 +10,18 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import FloatArray, choose_backend, to_numpy, to_vector3
-from harnack.backend.elementary import length
-from harnack.enclosures import TargetLevels
+from harnack.backend.elementary import safe_norm
+from harnack.enclosures import Levels
 from harnack.fields.batched_fields import FieldCache
-from harnack.fields.clearance import clearance_of
-from harnack.tree.empty_space import OccupiedCells, largest_connected_component
+from harnack.fields.clearance import clearance_function
+from harnack.tree.empty_space import OccupancyGrid, largest_connected_component
 
 if TYPE_CHECKING:
     from harnack.backend import BoolArray
     from harnack.fields.field import Field
     from harnack.geometry import Volume
 
-__all__ = ["CELLS_ACROSS", "largest_cells"]
+__all__ = ["CELLS_ACROSS", "largest_component_cells"]
 
 # Cells along the longest side of the box around a surface, unless users ask for another number.
 CELLS_ACROSS = 128
@@ -30,12 +30,12 @@ CELLS_ACROSS = 128
 _FAR, _MOST_FAR = 4.0, 0.5
 
 _Ends: TypeAlias = tuple[float, float]
-_CELLS: FieldCache[OccupiedCells] = FieldCache()
+_CELLS: FieldCache[OccupancyGrid] = FieldCache()
 
 
-def largest_cells(
+def largest_component_cells(
     field: Field, levels: tuple[float, ...], volume: Volume | None, solid: _Ends | None, across: int
-) -> OccupiedCells:
+) -> OccupancyGrid:
     """Cells that hold the component of a level set in a volume, or of a solid {low <= f <= high},
     with the largest sum of projected areas along x, y and z, and all that is not separated from it
     by cells proved empty (see `largest_connected_component`).
@@ -57,21 +57,21 @@ def largest_cells(
             "clip=harnack.Ball((0, 0, 0), 1)"
         )
 
-    def made() -> OccupiedCells:
-        return _made(field.for_levels(levels), levels, volume, solid, across)
+    def made() -> OccupancyGrid:
+        return _build_cells(field.with_levels(levels), levels, volume, solid, across)
 
     if field.parameters():  # they may change in place
         return made()
     return _CELLS.get(field, (levels, volume, solid, across), made)
 
 
-def _made(
+def _build_cells(
     field: Field, levels: tuple[float, ...], volume: Volume, solid: _Ends | None, across: int
-) -> OccupiedCells:
+) -> OccupancyGrid:
     beyond = _distance_beyond(volume)
-    into_domain = _into_domain(field)
-    within = None if solid is None else _within(field, solid)
-    to_levels = clearance_of(field, levels, "double")
+    into_domain = _projection_to_domain(field)
+    within = None if solid is None else _inside_solid(field, solid)
+    to_levels = clearance_function(field, levels, "double")
 
     def clearance(points: FloatArray) -> FloatArray:
         free = np.maximum(beyond(points), 0.0)
@@ -87,23 +87,23 @@ def _made(
 
     lower, upper = (np.array(end, np.float64) for end in volume.bounds())
     if (lower > upper).any() or (lower == upper).all():  # rays do not meet a single point
-        return OccupiedCells.none()
-    cells = OccupiedCells.of(lower, upper, clearance, across).thinned(clearance)
-    _check_proved(field, levels, solid, cells)
+        return OccupancyGrid.empty()
+    cells = OccupancyGrid.from_clearance(lower, upper, clearance, across).refined(clearance)
+    _refuse_if_unproved(field, levels, solid, cells)
     return largest_connected_component(cells)
 
 
-def _check_proved(
-    field: Field, levels: tuple[float, ...], solid: _Ends | None, cells: OccupiedCells
+def _refuse_if_unproved(
+    field: Field, levels: tuple[float, ...], solid: _Ends | None, cells: OccupancyGrid
 ) -> None:
     """Raise ValueError if most cells that are left are far from the surface."""
-    centers = cells.centers()
+    centers = cells.occupied_centers()
     if field.domain is not None:
         centers = centers[field.domain.contains_points(centers)]
     if not len(centers):
         return
     gap, slope, value = _samples(field, levels)(centers)
-    far = gap > _FAR * cells.cell * slope
+    far = gap > _FAR * cells.cell_size * slope
     if solid is not None:
         far &= ~((value >= solid[0]) & (value <= solid[1]))
     if far.sum() > _MOST_FAR * len(far):
@@ -114,13 +114,13 @@ def _check_proved(
         )
 
 
-def _into_domain(field: Field) -> Callable[[FloatArray], tuple[FloatArray, FloatArray]]:
+def _projection_to_domain(field: Field) -> Callable[[FloatArray], tuple[FloatArray, FloatArray]]:
     """For points (n, 3), points nearby in the field's domain, outside of which its promises need
     not hold, and the distances between the two, (n,), infinite where none was found. If the point
     found is at least c away from a set, the point given is at least c minus that distance away from
     it.
     """
-    domain = None if field.is_entire else field.domain
+    domain = None if field.is_global else field.domain
     backend = choose_backend("double")
     prepared = None if domain is None else domain.prepare(backend)
 
@@ -163,18 +163,18 @@ def _samples(
     """For points (n, 3): how far values are from a level, the lengths of gradients, and values."""
     backend = choose_backend("double")
     prepared = field.prepare(backend)
-    targets = TargetLevels(tuple(dr.opaque(backend.Float, level) for level in levels), field.period)
+    targets = Levels(tuple(dr.opaque(backend.Float, level) for level in levels), field.period)
 
     def samples(points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         seen = prepared.evaluate(to_vector3(backend, points))
-        found = (targets.gaps(seen.value).smaller, length(seen.gradient), seen.value)
+        found = (targets.gaps(seen.value).nearest, safe_norm(seen.gradient), seen.value)
         gap, slope, value = (np.broadcast_to(to_numpy(one), len(points)) for one in found)
         return gap, slope, value
 
     return samples
 
 
-def _within(field: Field, solid: _Ends) -> Callable[[FloatArray], BoolArray]:
+def _inside_solid(field: Field, solid: _Ends) -> Callable[[FloatArray], BoolArray]:
     """For points (n, 3), whether low <= f <= high."""
     backend = choose_backend("double")
     prepared = field.prepare(backend)
@@ -186,7 +186,7 @@ def _within(field: Field, solid: _Ends) -> Callable[[FloatArray], BoolArray]:
     return within
 
 
-def checked_largest(largest: object) -> int:
+def validate_component_cells(largest: object) -> int:
     """Cells across, 0 for all components.
 
     Raises:

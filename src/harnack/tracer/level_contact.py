@@ -1,9 +1,14 @@
 """When a point of a ray counts as a hit or as a crossing, and how a ray can end.
 
-- First hits: a ray ends where f is within the `Tolerance` of a level, or at a sheet across which f
-  jumps past a level (`compare_with_sheet`).
+- First hits: a ray ends where f is within the `HitTolerance` of a level, or at a sheet across which
+  f
+  jumps past a level (`test_jump`).
 - Crossings: a ray goes on behind the level. `Contact` is its state near the level that it reached,
   `Hysteresis` the rule by which each crossing is counted once.
+
+A level that was reached counts as lying the tolerance beyond until f has left the tolerance: all
+crossings of a ray and hits confirmed by a change of sign are one mechanism. Rays that must cross
+start a little outside the extent, which the surface may touch.
 """
 
 from __future__ import annotations
@@ -15,20 +20,20 @@ from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 
-from harnack.backend.elementary import fmax, fmin, largest_coordinate, length
-from harnack.backend.loops import while_active
-from harnack.backend.validation import real
-from harnack.enclosures import Gaps, TargetLevels
-from harnack.fields.capabilities import NO_SHEET, Crossing
-from harnack.fields.samples import value_error
+from harnack.backend.elementary import fmax, fmin, max_norm, safe_norm
+from harnack.backend.loops import loop_while_active
+from harnack.backend.validation import as_real
+from harnack.enclosures import LevelGaps, Levels
+from harnack.fields.capabilities import NO_FACET, JumpCrossing
+from harnack.fields.samples import value_error_bound
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.fields.field import Field
-    from harnack.fields.samples import Path
+    from harnack.fields.samples import Ray
 
 
-class Status(enum.IntEnum):
+class RayStatus(enum.IntEnum):
     """How a ray ended."""
 
     MISS = 0
@@ -40,7 +45,7 @@ class Status(enum.IntEnum):
 
 
 @dataclass(frozen=True)
-class Tolerance:
+class HitTolerance:
     """When a point is close enough to a level to be a hit.
 
     distance: |f - level| <= distance * |grad f|, a length to first order (paper, Sec. 3.1.2); see
@@ -69,37 +74,37 @@ class Tolerance:
 
     def __post_init__(self) -> None:
         for name in ("distance", "per_length", "value"):
-            number = real(getattr(self, name), f"tolerance: {name}")
+            number = as_real(getattr(self, name), f"tolerance: {name}")
             if not 0 <= number < math.inf:
                 raise ValueError(f"tolerance: {name} must be finite and >= 0, not {number!r}")
         if self.distance == 0 and self.value == 0 and self.per_length == 0:
             raise ValueError("tolerance must be positive: a level set is never met exactly")
 
-    def prepare(self, backend: Backend) -> PreparedTolerance:
+    def prepare(self, backend: Backend) -> PreparedHitTolerance:
         """As kernel parameters of a backend: another tolerance compiles no new kernel."""
         numbers = (self.distance, self.per_length, self.value)
-        return PreparedTolerance(*(dr.opaque(backend.Float, number) for number in numbers))
+        return PreparedHitTolerance(*(dr.opaque(backend.Float, number) for number in numbers))
 
 
 @dataclass(frozen=True)
-class PreparedTolerance:
-    """A `Tolerance` on a backend."""
+class PreparedHitTolerance:
+    """A `HitTolerance` on a backend."""
 
     distance: Real
     per_length: Real
     value: Real
 
-    def in_value(self, gradient_norm: Real, t: Real) -> Real:
+    def value_tolerance(self, gradient_norm: Real, t: Real) -> Real:
         """By how much f may differ from a level at a hit, where |grad f| = gradient_norm."""
         return fmax(gradient_norm * dr.fma(t, self.per_length, self.distance), self.value)
 
 
-ON_SHEET = max(Status) + 1
-"""Status of a ray that hit a sheet, until `SheetTracer` turns it into a plain HIT."""
+HIT_AT_JUMP = max(RayStatus) + 1
+"""Status of a ray that hit a sheet, until `JumpTracer` turns it into a plain HIT."""
 
 
 @dataclass(frozen=True)
-class SheetComparison:
+class JumpTest:
     """Result of comparing a sample with the sheet at the end of its ray interval.
 
     has_crossing: the interval ends at a sheet.
@@ -112,18 +117,18 @@ class SheetComparison:
     has_crossing: Mask
     at_crossing: Mask
     is_hit: Mask
-    gaps: Gaps
+    gaps: LevelGaps
     normal: Vec3
 
     def mark(self, status: Any, gradient: Vec3) -> tuple[Any, Vec3]:
         """Status and gradient, replaced by those of the sheet where it was hit."""
-        marked = type(status)(dr.select(self.is_hit, ON_SHEET, status))
+        marked = type(status)(dr.select(self.is_hit, HIT_AT_JUMP, status))
         return marked, dr.select(self.is_hit, self.normal, gradient)
 
 
-def compare_with_sheet(
-    ahead: Crossing, there: Mask, value: Real, total_error: Real, levels: TargetLevels
-) -> SheetComparison:
+def test_jump(
+    ahead: JumpCrossing, there: Mask, value: Real, total_error: Real, levels: Levels
+) -> JumpTest:
     """Compare the values on the two sides of a sheet with the levels.
 
     ahead: the crossing at the end of the ray interval.
@@ -135,33 +140,33 @@ def compare_with_sheet(
     surface or just fails to be, and its points are no farther than rounding from the level. To
     decide the other way could lose a surface, for the march has proved that the level is not met
     *before* the sheet, which rounding may contradict by as much. Sheets at the same t count as one,
-    with the sum of their jumps (`SheetTracer._together`).
+    with the sum of their jumps (`JumpTracer._merge_coincident`).
     """
-    has_crossing = ahead.sheet != NO_SHEET
+    has_crossing = ahead.facet != NO_FACET
     at_crossing = has_crossing & there
     behind = value + dr.select(at_crossing, ahead.jump, 0)
     low, high = fmin(value, behind) - total_error, fmax(value, behind) + total_error
-    is_hit = at_crossing & (levels.gaps(low).up <= high - low)
-    return SheetComparison(has_crossing, at_crossing, is_hit, levels.gaps(behind), ahead.normal)
+    is_hit = at_crossing & (levels.gaps(low).above <= high - low)
+    return JumpTest(has_crossing, at_crossing, is_hit, levels.gaps(behind), ahead.normal)
 
 
 # The band around a level is at least so many roundings of f, and at most this fraction of the
 # difference between two levels, so that there is no doubt which of them was reached.
-_ROUNDINGS = 8.0
-_OF_SPACING = 0.25
+_MIN_BAND_ROUNDINGS = 8.0
+_MAX_BAND_OF_SPACING = 0.25
 # In contact, f may come as near to the next level as this fraction of that difference.
-_HALFWAY = 0.5
+_MAX_APPROACH = 0.5
 # A crossing is complete where f is beyond the level by this fraction of the band. The rest is the
 # gap that a ray in contact always has.
-_PASSED = 0.5
+_CROSSED = 0.5
 # In contact, trials aim at where f is beyond the level by this fraction of the band: there the
 # crossing is complete, and it is clear on which side of the level f is.
-AIM = 0.75
+CONTACT_AIM = 0.75
 # In contact, truncation is judged by this fraction of the tolerance.
-CLOSER = 0.5
+CONTACT_TOLERANCE = 0.5
 # In contact, a step must not lead to where the band is less than this fraction of what it was,
 # unless it is at most so many tolerances long.
-_MUCH_SMALLER, _SHORT = 0.25, 4.0
+_MIN_BAND_RATIO, _SHORT_STEP = 0.25, 4.0
 # Rounds of the search for the root of a cubic.
 _ROUNDS = 4
 
@@ -177,9 +182,10 @@ class Contact:
     root: where f took the level last, between two samples on different sides of it; where the
         contact began if it began beyond the level.
     gradient: of f at the root.
-    excess: by how much f at the root may be farther from the level than the tolerance allows, where
-        rounding leaves f less certain than that: the root lies between the two samples.
-    before, behind: the places of the two samples, or the root itself.
+    tolerance_excess: by how much f at the root may be farther from the level than the tolerance
+        allows, where rounding leaves f less certain than that: the root lies between the two
+            samples.
+    before, after: the places of the two samples, or the root itself.
     band: that of the last sample.
     """
 
@@ -187,9 +193,9 @@ class Contact:
     is_touching: Mask
     root: Real
     gradient: Vec3
-    excess: Real
+    tolerance_excess: Real
     before: Real
-    behind: Real
+    after: Real
     band: Real
 
     @classmethod
@@ -200,7 +206,7 @@ class Contact:
 
 
 @dataclass(frozen=True)
-class Accepted:
+class AcceptedPoint:
     """A sample at an accepted point of a ray.
 
     t, value, gradient, slope: there.
@@ -245,9 +251,9 @@ class Hysteresis:
        (`March.advance`). So f > level - W as long as no crossing was noticed. Before the contact,
        f was proved not to take the level at all. Beside a pole the band is as large as f is steep,
        and may be larger than f gets anywhere behind it. So the band of a sample counts up to the
-       next sample only if the band there is not much smaller (`_MUCH_SMALLER`), or if both are at
-       most `_SHORT` tolerances apart (`may_reach`): a step that fails this is made shorter. So is
-       one to a sample of which nothing is known, as where an exponential overflows.
+       next sample only if the band there is not much smaller (`_MIN_BAND_RATIO`), or if both are at
+       most `_SHORT_STEP` tolerances apart (`may_reach`): a step that fails this is made shorter. So
+       is one to a sample of which nothing is known, as where an exponential overflows.
     2. *Nothing is counted twice.* A crossing is noticed at a point where f is proved to be on the
        other side of the level, `band/2` being more than its error; the next one only where it is
        proved to be on the first side again. So crossings of a level alternate, and between two that
@@ -271,7 +277,7 @@ class Hysteresis:
         that starts on it.
     """
 
-    levels: TargetLevels
+    levels: Levels
     spacing: Real
     is_free_before: Mask
     is_free_after: Mask
@@ -281,7 +287,7 @@ class Hysteresis:
     @classmethod
     def of(
         cls,
-        levels: TargetLevels,
+        levels: Levels,
         free: tuple[Mask, Mask],
         start: Real,
         rounding: Real,
@@ -298,68 +304,71 @@ class Hysteresis:
                 spacing = fmin(spacing, dr.select(apart > 0, apart, dr.inf))
         return cls(levels, spacing, *free, start, rounding)
 
-    def within(self, within: Real) -> Real:
-        """How near in value a level must be for contact: `within`, which the tolerance asks for,
-        or less where levels are close together."""
-        return fmin(within, _OF_SPACING * self.spacing)
+    def contact_tolerance(self, within: Real) -> Real:
+        """How near in value a level must be for contact: `contact_tolerance`, which the tolerance
+        asks for, or less where levels are close together."""
+        return fmin(within, _MAX_BAND_OF_SPACING * self.spacing)
 
     def band(self, within: Real, rounding: Real) -> Real:
-        """The tolerance in value around a level: `within`, or more where rounding asks for it."""
-        return fmin(fmax(within, _ROUNDINGS * rounding), _OF_SPACING * self.spacing)
+        """The tolerance in value around a level: `contact_tolerance`, or more where rounding asks
+        for it."""
+        return fmin(
+            fmax(within, _MIN_BAND_ROUNDINGS * rounding), _MAX_BAND_OF_SPACING * self.spacing
+        )
 
     def may_reach(self, now: Contact, band: Real, step: Real, tolerance: Real) -> Mask:
         """Whether the band of the last sample may count for a step to a point with this band.
 
         tolerance: a length, at that point.
         """
-        holds = now.band * _MUCH_SMALLER <= band
-        return ~now.is_touching | holds | (step <= _SHORT * tolerance)
+        holds = now.band * _MIN_BAND_RATIO <= band
+        return ~now.is_touching | holds | (step <= _SHORT_STEP * tolerance)
 
-    def samples_end(self, now: Contact, end: Real) -> Mask:
+    def must_sample_end(self, now: Contact, end: Real) -> Mask:
         """Whether a ray that is proved free to its end has to sample it: in contact it is proved
         free of levels that lie a band beyond."""
         return now.is_touching & (self.is_free_after | (end < dr.inf))
 
     def gaps(
-        self, contact: Contact, value: Real, gaps: Gaps, band: Real, part: float = 1.0
-    ) -> Gaps:
+        self, contact: Contact, value: Real, gaps: LevelGaps, band: Real, part: float = 1.0
+    ) -> LevelGaps:
         """How far f may move, given the gaps to the true levels.
 
         In contact the level counts as lying `part` of the band beyond, and steps end within that
         part of half the way to the next level.
         """
-        x, far = -self.levels.to_nearest(value), part * _HALFWAY * self.spacing
+        x, far = -self.levels.offset_to_nearest(value), part * _MAX_APPROACH * self.spacing
         band = part * band
         below = dr.select(contact.side < 0, far, band)
         above = dr.select(contact.side > 0, far, band)
-        return Gaps(
-            dr.select(contact.is_touching, fmax(below + x, 0), gaps.down),
-            dr.select(contact.is_touching, fmax(above - x, 0), gaps.up),
+        return LevelGaps(
+            dr.select(contact.is_touching, fmax(below + x, 0), gaps.below),
+            dr.select(contact.is_touching, fmax(above - x, 0), gaps.above),
         )
 
-    def update(self, now: Contact, active: Mask, seen: Accepted) -> tuple[Contact, Mask]:
+    def update(self, now: Contact, active: Mask, seen: AcceptedPoint) -> tuple[Contact, Mask]:
         """The contact behind an accepted point, and whether the ray has crossed the level."""
-        x = -self.levels.to_nearest(seen.value)
+        x = -self.levels.offset_to_nearest(seen.value)
         touching = now.is_touching
         side = dr.select(touching, now.side, self._side(now, seen, x))
 
         # The root, if f has changed sides since the last point.
         t, value, slope, gradient = seen.before
-        x_before = -self.levels.to_nearest(value)
+        x_before = -self.levels.offset_to_nearest(value)
         passes = active & touching & (side * x_before > 0) & (side * x <= 0)
-        share = root_between(x_before, x, (seen.t - t) * slope, (seen.t - t) * seen.slope)
+        share = cubic_root(x_before, x, (seen.t - t) * slope, (seen.t - t) * seen.slope)
         begins = active & ~touching & seen.is_near
         root = dr.select(passes, t + share * (seen.t - t), dr.select(begins, seen.t, now.root))
         at_root = dr.select(begins, seen.gradient, now.gradient)
         at_root = dr.select(passes, dr.lerp(gradient, seen.gradient, share), at_root)
-        excess = dr.select(passes | begins, seen.excess, now.excess)
+        excess = dr.select(passes | begins, seen.excess, now.tolerance_excess)
         before = dr.select(passes, t, dr.select(begins, seen.t, now.before))
-        behind = dr.select(passes | begins, seen.t, now.behind)
+        behind = dr.select(passes | begins, seen.t, now.after)
 
         # Is f far enough beyond the level to have crossed it, or has it left the band?
         is_first = (now.side == 0) & ~touching
         stays = (is_first & self.is_free_before) | (seen.is_end & self.is_free_after)
-        enough = dr.select(stays, 0, _PASSED * seen.band)
+        enough = dr.select(stays, 0, _CROSSED * seen.band)
         is_off = dr.abs(x) > fmax(enough, seen.total_error)
         crosses = active & touching & is_off & (side * x < 0)
         settles = active & is_off & (side == 0)
@@ -376,15 +385,15 @@ class Hysteresis:
             dr.select(active, seen.band, now.band),
         ), crosses
 
-    def jump(
-        self, now: Contact, active: Mask, seen: Accepted, ahead: Crossing, d: Vec3
+    def update_at_jump(
+        self, now: Contact, active: Mask, seen: AcceptedPoint, ahead: JumpCrossing, d: Vec3
     ) -> tuple[Contact, Mask]:
         """The contact behind the sheet `ahead`, and whether the jump of f there crosses the level.
 
         now: the contact at an accepted point just before the sheet. d: the direction of the ray.
         A field with sheets has one level here. A ray that starts on a sheet is on neither side.
         """
-        x = -self.levels.to_nearest(seen.value)
+        x = -self.levels.offset_to_nearest(seen.value)
         one = type(x)(1)
         side = dr.select(now.is_touching, now.side, dr.select(x > 0, one, -1))
         starts = dr.abs(dr.dot(ahead.normal, d)) * (seen.t - self.start) <= self.rounding
@@ -392,7 +401,7 @@ class Hysteresis:
         behind = x + ahead.jump
         passes = active & (side * x > 0) & (side * behind <= 0)
         begins = active & ~now.is_touching & (dr.abs(behind) <= seen.band)
-        is_off = dr.abs(behind) > fmax(_PASSED * seen.band, seen.total_error)
+        is_off = dr.abs(behind) > fmax(_CROSSED * seen.band, seen.total_error)
         crosses = active & is_off & (side * behind < 0)
         side = dr.select(is_off, dr.select(behind > 0, one, -1), side)
         at_sheet = passes | begins
@@ -401,13 +410,13 @@ class Hysteresis:
             dr.select(active, dr.abs(behind) <= seen.band, now.is_touching),
             dr.select(at_sheet, seen.t, now.root),
             dr.select(at_sheet, ahead.normal, now.gradient),
-            dr.select(at_sheet, 0, now.excess),
+            dr.select(at_sheet, 0, now.tolerance_excess),
             dr.select(at_sheet, seen.t, now.before),
-            dr.select(at_sheet, seen.t, now.behind),
+            dr.select(at_sheet, seen.t, now.after),
             dr.select(active, seen.band, now.band),
         ), crosses
 
-    def _side(self, now: Contact, seen: Accepted, x: Real) -> Real:
+    def _side(self, now: Contact, seen: AcceptedPoint, x: Real) -> Real:
         """From which side of the nearest level a ray comes that was not in contact with it.
 
         x: f less that level. The ray was proved free, so a real-valued f is on the side of the last
@@ -424,7 +433,7 @@ class Hysteresis:
 
 
 @dataclass(frozen=True)
-class _Settling:
+class _Bisection:
     """The state of bisection: f takes the level between before and behind."""
 
     before: Real
@@ -435,8 +444,8 @@ class _Settling:
     active: Mask
 
 
-def settled(
-    field: Field, levels: TargetLevels, tolerance: PreparedTolerance, path: Path, found: Contact,
+def refine_crossing(
+    field: Field, levels: Levels, tolerance: PreparedHitTolerance, path: Ray, found: Contact,
     active: Mask,
 ) -> tuple[Real, Vec3, Any]:  # fmt: skip
     """The root of a crossing, the gradient of f there, and how many evaluations of f that took.
@@ -449,18 +458,18 @@ def settled(
     count = dr.uint32_array_t(type(found.root))
     smallest = 4 * float(dr.epsilon(type(found.root)))
 
-    def body(now: _Settling) -> _Settling:
-        sample, size = field.evaluate(path.point(now.t)), largest_coordinate(path.origin) + now.t
-        x, steepness = -levels.to_nearest(sample.value), length(sample.gradient)
+    def body(now: _Bisection) -> _Bisection:
+        sample, size = field.evaluate(path.point(now.t)), max_norm(path.origin) + now.t
+        x, steepness = -levels.offset_to_nearest(sample.value), safe_norm(sample.gradient)
         near = dr.abs(x) <= fmax(
-            tolerance.in_value(steepness, now.t), value_error(sample, steepness, size)
+            tolerance.value_tolerance(steepness, now.t), value_error_bound(sample, steepness, size)
         )
         is_before = side * x > 0
         before = dr.select(is_before, now.t, now.before)
         behind = dr.select(is_before, now.behind, now.t)
         goes_on = ~near & (behind - before > smallest * size)
         is_first = near & (now.looks == 0)
-        return _Settling(
+        return _Bisection(
             before,
             behind,
             dr.select(goes_on, 0.5 * (before + behind), now.t),
@@ -469,12 +478,12 @@ def settled(
             now.active & goes_on,
         )
 
-    begin = _Settling(found.before, found.behind, found.root, found.gradient, count(0), active)
-    end = while_active(begin, body, "harnack roots")
+    begin = _Bisection(found.before, found.after, found.root, found.gradient, count(0), active)
+    end = loop_while_active(begin, body, "harnack roots")
     return end.t, end.gradient, end.looks
 
 
-def root_between(start: Real, end: Real, slope: Real, end_slope: Real) -> Any:
+def cubic_root(start: Real, end: Real, slope: Real, end_slope: Real) -> Any:
     """A root in [0, 1] of the cubic with these values at 0 and 1, of different signs, and these
     slopes: Newton's method, and bisection where it leaves the bracket."""
     # start + slope u + b u^2 + c u^3

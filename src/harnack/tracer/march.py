@@ -2,6 +2,14 @@
 
 It knows neither fields nor proofs. It samples a field along the ray, and the enclosures that come
 with each sample say how far the ray is free.
+
+Trials are aimed. Over-relaxed steps end just short of where f is predicted to reach a level.
+Without this, half of the samples near the surface were rejected. Smooth fields are predicted by the
+cubic through the last two values and slopes, approximate ones by the slope.
+
+The state of the march is a record, which `loops` takes apart and puts together for Dr.Jit's loop.
+The march compares samples with a sheet; the walk from sheet to sheet (`walks`) calls the march, and
+not the other way round.
 """
 
 from __future__ import annotations
@@ -11,57 +19,57 @@ from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 
-from harnack.backend.elementary import clamp, fmax, fmin, largest_coordinate, length
-from harnack.backend.loops import while_active
-from harnack.enclosures import any_covers, longest_step
-from harnack.fields.capabilities import NO_SHEET, Crossing
-from harnack.fields.samples import value_error
+from harnack.backend.elementary import clamp, fmax, fmin, max_norm, safe_norm
+from harnack.backend.loops import loop_while_active
+from harnack.enclosures import any_is_free, longest_free_length
+from harnack.fields.capabilities import NO_FACET, JumpCrossing
+from harnack.fields.samples import value_error_bound
 from harnack.tracer.level_contact import (
-    AIM,
-    CLOSER,
-    Accepted,
+    CONTACT_AIM,
+    CONTACT_TOLERANCE,
+    AcceptedPoint,
     Contact,
     Hysteresis,
-    PreparedTolerance,
-    SheetComparison,
-    Status,
-    compare_with_sheet,
+    JumpTest,
+    PreparedHitTolerance,
+    RayStatus,
+    test_jump,
 )
 from harnack.tracer.steep import SteepPlace, beyond, down_or_up, largest_change
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
-    from harnack.enclosures import Gaps, TargetLevels
+    from harnack.enclosures import LevelGaps, Levels
     from harnack.fields.field import Field
-    from harnack.fields.samples import Look, Path
-    from harnack.tracer.branch_tracker import WholeNumbers
-    from harnack.tree.empty_space import UniformGrid
+    from harnack.fields.samples import Ray, RaySample
+    from harnack.tracer.branch_tracker import BranchTracker
+    from harnack.tree.empty_space import EmptySpaceGrid
 
 # A coarse sample is repeated at higher detail where a level is closer in value than this many times
 # its total error. The detail is chosen to make truncation this fraction of that distance, or of
-# what truncation may be, whichever is larger (`_finer`).
-_REFINE_BELOW, _OF_GAP, _OF_ALLOWED = 2.0, 0.25, 0.85
+# what truncation may be, whichever is larger (`_refined_accuracy`).
+_REFINE_BELOW, _TRUNCATION_OF_GAP, _TRUNCATION_OF_ALLOWED = 2.0, 0.25, 0.85
 # What truncation may be at a hit: this fraction of the tolerance, less this many times the
 # rounding; or this many times the rounding if that is larger.
-_OF_TOLERANCE, _LESS, _OF_ROUNDING = 0.4, 0.55, 0.6
+_TRUNCATION_OF_TOLERANCE, _LESS_ROUNDINGS, _TRUNCATION_OF_ROUNDING = 0.4, 0.55, 0.6
 # The next sample may be so coarse that its truncation is this fraction of the distance to a level.
 _COARSEN = 0.2
 # Trials stop short of where f is predicted to reach a level by this factor: by a parabola, or where
 # there is only a slope.
-_AIM, _AIM_BY_SLOPE = 0.999, 0.99
+_TRIAL_AIM, _AIM_BY_SLOPE = 0.999, 0.99
 # How far from the surface rounding may leave a point that is a hit: see `March._is_near`.
 _LARGEST_UNCERTAINTY = 1 / 16
 # Rays without an end that get as far as this power of the largest number end as misses: squares of
 # larger numbers overflow.
-_FARTHEST = 0.47
+_MISS_EXPONENT = 0.47
 # The fraction of the gap to the cover of a cone by which the cone may widen in a step.
 _WIDENING = 0.1
 # The detail of a repeated sample is larger by these factors at least and at most.
-_CLOSER = 1.25, 16.0
+_REFINEMENT_LIMITS = 1.25, 16.0
 # Truncation falls like this power of detail; beyond the largest detail there is none.
-_POWER, _MOST_DETAIL = 3.2, 1e6
+_TRUNCATION_ORDER, _MAX_ACCURACY = 3.2, 1e6
 # In contact, a step that leads to where the band is much smaller is tried again so much shorter.
-_SHORTER = 0.125
+_RETRY_FRACTION = 0.125
 
 
 @dataclass(frozen=True)
@@ -71,13 +79,13 @@ class MarchState:
     proved_to: the ray is proved free up to here; the last accepted point.
     proved_step: a length from there that is proved free too.
     trial_step: from there to the next trial point.
-    look_ahead: how far enclosures are asked to reach next.
+    enclosure_reach: how far enclosures are asked to reach next.
     value, gradient: f at `proved_to`; the value is that behind the sheet if one was passed there.
-    excess: by how much f there may be farther from a level than the tolerance allows.
+    tolerance_excess: by how much f there may be farther from a level than the tolerance allows.
     evaluations: of f, so far.
-    detail: of the next sample (`Field.at_detail`); None for fields without a choice of detail
-        (Dr.Jit records a loop twice if a state in it never changes).
-    status: a `Status` once the ray has ended.
+    accuracy_scale: of the next sample (`Field.at_detail`); None for fields without a choice of
+        detail (Dr.Jit records a loop twice if a state in it never changes).
+    status: a `RayStatus` once the ray has ended.
     active: whether it goes on.
     contact: what is known of the level reached last; None for rays that end where they reach one.
     """
@@ -85,12 +93,12 @@ class MarchState:
     proved_to: Real
     trial_step: Real
     proved_step: Real
-    look_ahead: Real
+    enclosure_reach: Real
     value: Real
     gradient: Vec3
-    excess: Real
+    tolerance_excess: Real
     evaluations: Any
-    detail: Real | None
+    accuracy_scale: Real | None
     status: Any
     active: Mask
     contact: Contact | None = None
@@ -112,55 +120,56 @@ class MarchState:
             proved_to=real(start),
             trial_step=real(0),
             proved_step=real(0),
-            look_ahead=real(end - start),
+            enclosure_reach=real(end - start),
             value=real(0),
             gradient=vector(0),
-            excess=real(0),
+            tolerance_excess=real(0),
             evaluations=count(0),
-            detail=real(0) if has_detail else None,
-            status=count(int(Status.MISS)),
+            accuracy_scale=real(0) if has_detail else None,
+            status=count(int(RayStatus.MISS)),
             active=backend.Bool(active) & (start < end),
             contact=Contact.none(backend) if crosses else None,
         )
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _TrialSample:
     """What is known of f at the trial points of rays.
 
     t: of the points. at_end: whether the ray ends there. size: of coordinates there.
-    unproved: the length before the point that no step has proved yet.
+    unproved_length: the length before the point that no step has proved yet.
     look: the field's answer there. gradient_norm: the length of its gradient.
     gaps: from f to the levels on both sides; in contact, to where the hysteresis puts them.
     total_error: what rounding and truncation may have done to f.
-    within: how near in value a level makes a hit; in contact, a crossing.
+    value_tolerance: how near in value a level makes a hit; in contact, a crossing.
     band: in contact that of `Hysteresis.band`.
     is_near: whether a level is near enough for a hit.
-    may_pass: whether a point may be accepted although it is not known on which side of a level
-        it lies.
+    accepts_unknown_side: whether a point may be accepted although it is not known on which side of
+        a level it lies.
     excess: as that of `MarchState`.
     is_smooth: whether value and slope predict f.
-    passes, is_doubtful: see `WholeNumbers.gaps`; None for fields that know their values.
+    passes_branch_level, needs_branch: see `BranchTracker.gaps`; None for fields that know their
+        values.
     steep: what values prove there; None for fields whose slopes are bounded.
     looks: evaluations of f beyond the points.
     """
 
     t: Real
     at_end: Mask
-    size: Real
-    unproved: Real
-    look: Look
+    coordinate_size: Real
+    unproved_length: Real
+    look: RaySample
     gradient_norm: Real
-    gaps: Gaps
+    gaps: LevelGaps
     total_error: Real
-    within: Real
+    value_tolerance: Real
     band: Real
     is_near: Mask
-    may_pass: Mask
+    accepts_unknown_side: Mask
     excess: Real
     is_smooth: bool
-    passes: Mask | None = None
-    is_doubtful: Mask | None = None
+    passes_branch_level: Mask | None = None
+    needs_branch: Mask | None = None
     steep: SteepPlace | None = None
     looks: Any = 0
 
@@ -169,10 +178,14 @@ class _Seen:
         """f at the points."""
         return self.look.sample.value
 
-    def rungs_or(self, behind: Gaps) -> Gaps:
+    def gaps_after_jump(self, behind: LevelGaps) -> LevelGaps:
         """The gaps to rungs, which a sheet does not change; behind it where these are passed."""
-        down = dr.select(self.passes, behind.down, self.gaps.down)
-        return replace(self.gaps, down=down, up=dr.select(self.passes, behind.up, self.gaps.up))
+        down = dr.select(self.passes_branch_level, behind.below, self.gaps.below)
+        return replace(
+            self.gaps,
+            below=down,
+            above=dr.select(self.passes_branch_level, behind.above, self.gaps.above),
+        )
 
 
 @dataclass(frozen=True)
@@ -181,35 +194,35 @@ class March:
 
     overstep: trial steps are at most this many times as long as the proved ones.
     hysteresis: for rays that end where they have crossed a level, and not where they reach one.
-    cover: for cones that end where they come near a level (`pixel_cones`): their radius per unit
-        of t.
+    cone_radius: for cones that end where they come near a level (`pixel_cones`): their radius per
+        unit of t.
     occupied: for rays that end where they reach a level, cells outside of which there is no level,
         not even behind a sheet.
-    last: where these rays end.
-    is_part: whether there may be levels outside of these cells, which do not count.
-    whole_numbers: for fields whose coarse samples know f but for a whole number, how rays find it;
+    ray_end: where these rays end.
+    only_component: whether there may be levels outside of these cells, which do not count.
+    branch_tracker: for fields whose coarse samples know f but for a whole number, how rays find it;
         None for no such samples.
     """
 
     backend: Backend
-    levels: TargetLevels
-    tolerance: PreparedTolerance
+    levels: Levels
+    tolerance: PreparedHitTolerance
     max_steps: Any
     overstep: float
     hysteresis: Hysteresis | None = None
-    cover: Real | None = None
-    occupied: UniformGrid | None = None
-    last: Real = 0.0
-    is_part: bool = False
-    whole_numbers: WholeNumbers | None = None
+    cone_radius: Real | None = None
+    occupied: EmptySpaceGrid | None = None
+    ray_end: Real = 0.0
+    only_component: bool = False
+    branch_tracker: BranchTracker | None = None
 
     def advance(
         self,
         field: Field,
-        path: Path,
+        path: Ray,
         end: Real,
         state: MarchState,
-        ahead: Crossing | None = None,
+        ahead: JumpCrossing | None = None,
     ) -> MarchState:
         """March to the first level, or to the end.
 
@@ -219,33 +232,37 @@ class March:
         looking back, covers the difference; then all up to it is free. Otherwise the ray goes back
         to proved_to + proved_step, which needs no such test. A ray ends as a miss when proved_to +
         proved_step passes its end, as a hit only at an accepted point. A point is not accepted on a
-        sample that is too coarse (`_finer`), but sampled again.
+        sample that is too coarse (`_refined_accuracy`), but sampled again.
 
         A hit is a point where f is within the tolerance of a level *after* the truncation error of
         f is taken off; where rounding leaves f less certain than that, within twice what it leaves.
         A trial point at which the level is nearer than the error of f may lie behind the root, by
-        less than the tolerance: it is a hit (`_finer`), so nothing is passed there. If it is no
+        less than the tolerance: it is a hit (`_refined_accuracy`), so nothing is passed there. If
+            it is no
         hit, because the error is large, it is not accepted by looking back, and no step from it is
         proved: on which side of the point the level lies is not known.
 
         In rounded arithmetic a surface could be missed between the enclosure that reaches ahead
         from one point and the one that looks back from the next, so for both the levels are nearer
-        by the rounding of value and position together (`value_error`).
+        by the rounding of value and position together (`value_error_bound`).
 
         With `hysteresis` a level that is reached is not the end: the ray goes on, towards levels
         that lie where the hysteresis puts them, and ends as a hit where it has crossed one. It may
         be made active again there, to go on to the next.
 
-        With `cover` the levels lie nearer by |grad f| times the radius of a cone, which grows with
+        With `cone_radius` the levels lie nearer by |grad f| times the radius of a cone, which grows
+        with
         t: a tenth of the gap is set aside for that growth, and no step is longer than the cone
             takes
         to widen by so much, unless the level is never met and f leaves it faster than the cone
         widens.
 
         With `occupied` what follows a proved step is passed as well, as far as it lies in cells
-        that hold no level (`UniformGrid.run` has the proof): a union of free intervals is free.
+        that hold no level (`EmptySpaceGrid.empty_run` has the proof): a union of free intervals is
+        free.
 
-        With `is_part` levels outside of `occupied` belong to other components of the surface.
+        With `only_component` levels outside of `occupied` belong to other components of the
+        surface.
         Proved steps end in occupied cells, and so do trials: one that would not is not made. So no
         hit lies outside of them, and levels that are passed there do not count.
 
@@ -258,54 +275,61 @@ class March:
         def body(now: MarchState) -> MarchState:
             return self.next_trial(field, path, end, now, ahead)
 
-        return while_active(state, body, "harnack")
+        return loop_while_active(state, body, "harnack")
 
     def next_trial(
         self,
         field: Field,
-        path: Path,
+        path: Ray,
         end: Real,
         now: MarchState,
-        ahead: Crossing | None = None,
+        ahead: JumpCrossing | None = None,
     ) -> MarchState:
         """The state after one more trial point of each ray; `advance` has the proof."""
-        seen = self._look(field, path, end, now, ahead)
+        seen = self._sample_trial(field, path, end, now, ahead)
         if self.hysteresis is not None and now.contact is not None:
-            seen = self._in_contact(seen, self.hysteresis, now.contact)
+            seen = self._apply_hysteresis(seen, self.hysteresis, now.contact)
         accepted, detail, too_coarse = self._accept(field, seen, now, ahead)
         fallback = now.proved_step
         if self.hysteresis is not None and now.contact is not None:
             tolerance = dr.fma(seen.t, self.tolerance.per_length, self.tolerance.distance)
             reaches = self.hysteresis.may_reach(now.contact, seen.band, now.trial_step, tolerance)
             reaches &= ~now.contact.is_touching | dr.isfinite(seen.total_error)
-            shorter = fmin(now.proved_step, _SHORTER * now.trial_step)
+            shorter = fmin(now.proved_step, _RETRY_FRACTION * now.trial_step)
             fallback = dr.select(reaches | too_coarse, now.proved_step, shorter)
             accepted &= reaches
 
         # Is it a hit, a sheet, or a crossing?
         hit, gaps_ahead, sheet = accepted & seen.is_near, seen.gaps, None
         if ahead is not None:
-            sheet = compare_with_sheet(
+            sheet = test_jump(
                 ahead, accepted & seen.at_end, seen.value, seen.total_error, self.levels
             )
-            gaps_ahead = sheet.gaps if seen.passes is None else seen.rungs_or(sheet.gaps)
+            gaps_ahead = (
+                sheet.gaps if seen.passes_branch_level is None else seen.gaps_after_jump(sheet.gaps)
+            )
         aims, contact, value = gaps_ahead, now.contact, seen.value
         if self.hysteresis is not None and now.contact is not None:
-            contact, hit, sheet, value = self._cross(
+            contact, hit, sheet, value = self._update_contact(
                 seen, self.hysteresis, now.contact, path, now, accepted, ahead, sheet
             )
             after = contact, value, self.levels.gaps(value), seen.band
-            gaps_ahead, aims = self.hysteresis.gaps(*after), self.hysteresis.gaps(*after, AIM)
+            gaps_ahead, aims = (
+                self.hysteresis.gaps(*after),
+                self.hysteresis.gaps(*after, CONTACT_AIM),
+            )
         elif sheet is not None and ahead is not None:
             value = value + dr.select(sheet.at_crossing & ~sheet.is_hit, ahead.jump, 0)
 
         # How far to go from there.
-        proved = self._proved(seen, gaps_ahead, contact)
-        trial = self._trial(proved, seen.look, aims, now, path, seen.is_smooth)
+        proved = self._proved_step(seen, gaps_ahead, contact)
+        trial = self._next_trial_step(proved, seen.look, aims, now, path, seen.is_smooth)
         forward = proved
         if self.occupied is not None:
-            forward, trial = self._jump(self.occupied, path, end, seen, accepted, forward, trial)
-        look_ahead = self._look_ahead(now, seen, end, proved, contact, hit)
+            forward, trial = self._skip_empty_cells(
+                self.occupied, path, end, seen, accepted, forward, trial
+            )
+        look_ahead = self._next_reach(now, seen, end, proved, contact, hit)
         proved_step = dr.select(accepted, forward, fallback)
         free = self._is_free(now, seen, end, accepted, proved_step, contact)
         if sheet is not None:
@@ -321,90 +345,90 @@ class March:
             proved_to=proved_to,
             trial_step=fmin(step, end - proved_to),
             proved_step=proved_step,
-            look_ahead=dr.select(accepted, look_ahead, now.look_ahead),
+            enclosure_reach=dr.select(accepted, look_ahead, now.enclosure_reach),
             value=dr.select(accepted, value, now.value),
             gradient=gradient,
-            excess=dr.select(accepted, seen.excess, now.excess),
+            tolerance_excess=dr.select(accepted, seen.excess, now.tolerance_excess),
             evaluations=evaluations,
-            detail=detail,
+            accuracy_scale=detail,
             status=status,
             active=now.active & ~(hit | free | (evaluations >= self.max_steps)),
             contact=contact,
         )
 
-    def _look(
-        self, field: Field, path: Path, end: Real, now: MarchState, ahead: Crossing | None
-    ) -> _Seen:
+    def _sample_trial(
+        self, field: Field, path: Ray, end: Real, now: MarchState, ahead: JumpCrossing | None
+    ) -> _TrialSample:
         """Sample f at the trial points of rays."""
         real = self.backend.Float
         t = now.proved_to + now.trial_step
         if ahead is not None or now.contact is not None:  # the end exactly
             t = dr.select(now.trial_step >= end - now.proved_to, end, t)
-        seen, whole, is_modulo = field, self.whole_numbers, None
-        if now.detail is not None and field.has_detail:
-            knows = field.is_modulo and whole is None
-            seen = field.at_detail(fmax(now.detail, 1) if knows else now.detail)
-        unproved, size = now.trial_step - now.proved_step, largest_coordinate(path.origin) + t
-        look = seen.look(path, t, fmin(now.look_ahead, end - t), fmax(unproved, real(0)))
+        seen, whole, is_modulo = field, self.branch_tracker, None
+        if now.accuracy_scale is not None and field.has_variable_accuracy:
+            knows = field.has_unknown_branch and whole is None
+            seen = field.at_accuracy(fmax(now.accuracy_scale, 1) if knows else now.accuracy_scale)
+        unproved, size = now.trial_step - now.proved_step, max_norm(path.origin) + t
+        look = seen.sample_ray(path, t, fmin(now.enclosure_reach, end - t), fmax(unproved, real(0)))
         passes, is_doubtful, is_sure = None, None, None
-        gradient_norm = length(look.sample.gradient)
-        if whole is not None and look.sample.is_modulo is not None:
-            is_modulo = look.sample.is_modulo
-            error = value_error(look.sample, gradient_norm, size)
-            look, is_sure = whole.continued(look, now.value, now.trial_step, error)
+        gradient_norm = safe_norm(look.sample.gradient)
+        if whole is not None and look.sample.branch_unknown is not None:
+            is_modulo = look.sample.branch_unknown
+            error = value_error_bound(look.sample, gradient_norm, size)
+            look, is_sure = whole.resolve(look, now.value, now.trial_step, error)
         sample = look.sample
         gaps = self.levels.gaps(sample.value)
-        gap, total_error = gaps.smaller, value_error(sample, gradient_norm, size)
+        gap, total_error = gaps.nearest, value_error_bound(sample, gradient_norm, size)
         if whole is not None and is_modulo is not None and is_sure is not None:
             gaps, passes, is_doubtful = whole.gaps(sample, is_modulo, is_sure, total_error)
-        if self.cover is not None:
-            gaps = gaps.less(self.cover * t * gradient_norm)
-            gap = gaps.smaller
+        if self.cone_radius is not None:
+            gaps = gaps.reduced_by(self.cone_radius * t * gradient_norm)
+            gap = gaps.nearest
         steep = None
         if field.is_steep:
-            look_ahead = fmin(now.look_ahead, end - t)
+            look_ahead = fmin(now.enclosure_reach, end - t)
             steep = SteepPlace.at(field, self.levels, path, t, look_ahead, sample)
             total_error = total_error if steep.error is None else steep.error
         steepness = fmax(gradient_norm - sample.gradient_error, real(0))
         if look.slope_error is not None:  # the gradient is at least as long as its projection
             steepness = fmax(dr.abs(look.slope) - look.slope_error, steepness)
-        if look.least_gradient is not None:
-            steepness = fmax(look.least_gradient, steepness)
+        if look.min_gradient_norm is not None:
+            steepness = fmax(look.min_gradient_norm, steepness)
         if steep is not None:  # the gradient is no number where only slopes along the path are
             gradient_norm = fmax(gradient_norm, steepness)
-        within = self.tolerance.in_value(steepness, t)
+        within = self.tolerance.value_tolerance(steepness, t)
         knows_gradient = (sample.gradient_error <= gradient_norm) | (steepness > 0)
         if self.hysteresis is not None:
             if field.is_steep:  # or what f has to swing is more than it does
                 reach = dr.fma(t, self.tolerance.per_length, self.tolerance.distance)
                 change = largest_change(field, path.point(t), sample.value, reach)
                 within = fmax(fmin(within, change), self.tolerance.value)
-            within = self.hysteresis.within(within)
+            within = self.hysteresis.contact_tolerance(within)
         # Where not even the gradient is known, no hit is due to rounding.
-        rounding = dr.select(knows_gradient, total_error - sample.truncation, 0)
+        rounding = dr.select(knows_gradient, total_error - sample.truncation_error, 0)
         is_near = self._is_near(gap, within, total_error, rounding, look, gradient_norm, size, end)
         looks: Any = 0
         if steep is not None:
             may_be = steep.is_level
             is_near = (is_near | may_be) & now.active & dr.isfinite(total_error)
             is_near, looks = self._is_there(field, path, t, look, gaps, size, is_near, may_be)
-        return _Seen(
+        return _TrialSample(
             t=t,
             at_end=t == end,
-            size=size,
-            unproved=unproved,
+            coordinate_size=size,
+            unproved_length=unproved,
             look=look,
             gradient_norm=gradient_norm,
             gaps=gaps,
             total_error=total_error,
-            within=within,
+            value_tolerance=within,
             band=within,
             is_near=is_near,
-            may_pass=is_near,
+            accepts_unknown_side=is_near,
             excess=fmax(gap + total_error - within, real(0)),
-            is_smooth=ahead is None and not field.has_detail,
-            passes=passes,
-            is_doubtful=is_doubtful,
+            is_smooth=ahead is None and not field.has_variable_accuracy,
+            passes_branch_level=passes,
+            needs_branch=is_doubtful,
             steep=steep,
             looks=looks,
         )
@@ -412,10 +436,10 @@ class March:
     def _is_there(
         self,
         field: Field,
-        path: Path,
+        path: Ray,
         t: Real,
-        look: Look,
-        gaps: Gaps,
+        look: RaySample,
+        gaps: LevelGaps,
         size: Real,
         is_near: Mask,
         may_be: Mask,
@@ -429,74 +453,92 @@ class March:
         """
         sample, p = look.sample, path.point(t)
         tolerance = dr.fma(t, self.tolerance.per_length, self.tolerance.distance)
-        slack = 8 * self.backend.epsilon * size
+        slack = 8 * self.backend.machine_epsilon * size
         reach = fmax(tolerance, 2 * slack)
-        sure = gaps.smaller <= self.tolerance.value
-        for enclosure in look.ahead:
+        sure = gaps.nearest <= self.tolerance.value
+        for enclosure in look.forward:
             sure |= enclosure.arrives(gaps, reach)
         along = down_or_up(sample.gradient, gaps, path.direction)
-        ways = (along, length(sample.gradient)), (path.direction, look.slope)
+        ways = (along, safe_norm(sample.gradient)), (path.direction, look.slope)
         unsure = is_near & ~sure
         passed, looks = beyond(
             self.backend, field, self.levels, gaps, p, ways, sample.value, reach, may_be, unsure
         )
         return is_near & (sure | passed), looks
 
-    def _in_contact(self, seen: _Seen, hysteresis: Hysteresis, contact: Contact) -> _Seen:
+    def _apply_hysteresis(
+        self, seen: _TrialSample, hysteresis: Hysteresis, contact: Contact
+    ) -> _TrialSample:
         """The same, with levels where the hysteresis puts them. The band takes all rounding of f
         into account, or a ray would stick in a crease."""
-        band = hysteresis.band(seen.within, seen.total_error - seen.look.sample.truncation)
-        may_pass = seen.may_pass & ~contact.is_touching
+        band = hysteresis.band(
+            seen.value_tolerance, seen.total_error - seen.look.sample.truncation_error
+        )
+        may_pass = seen.accepts_unknown_side & ~contact.is_touching
         if self.levels.period is not None:  # here only the value tells the side of a level
             may_pass = self.backend.Bool(False)
         gaps = hysteresis.gaps(contact, seen.value, seen.gaps, band)
-        return replace(seen, gaps=gaps, within=CLOSER * seen.within, band=band, may_pass=may_pass)
+        return replace(
+            seen,
+            gaps=gaps,
+            value_tolerance=CONTACT_TOLERANCE * seen.value_tolerance,
+            band=band,
+            accepts_unknown_side=may_pass,
+        )
 
     def _accept(
-        self, field: Field, seen: _Seen, now: MarchState, ahead: Crossing | None
+        self, field: Field, seen: _TrialSample, now: MarchState, ahead: JumpCrossing | None
     ) -> tuple[Mask, Real | None, Mask]:
         """Whether all up to the trial point is proved free, by a sample that is not too coarse; the
         detail of the next sample; and whether this one was too coarse."""
         accepted = now.trial_step <= now.proved_step
         if self.overstep > 1:
-            knows_side = seen.may_pass | (seen.gaps.smaller > seen.total_error)
-            covered = any_covers(seen.look.back, seen.gaps.less(seen.total_error), seen.unproved)
+            knows_side = seen.accepts_unknown_side | (seen.gaps.nearest > seen.total_error)
+            covered = any_is_free(
+                seen.look.backward, seen.gaps.reduced_by(seen.total_error), seen.unproved_length
+            )
             accepted |= knows_side & covered
         is_known = dr.isfinite(seen.total_error)  # what is not known is not free
         if seen.steep is not None:  # values prove the next step
             is_known = is_known | (now.trial_step <= now.proved_step)
-        if now.detail is None or not field.has_detail:
-            return accepted & is_known, now.detail, self.backend.Bool(False)
-        truncation, coarsest = seen.look.sample.truncation, field.coarsest_detail
+        if now.accuracy_scale is None or not field.has_variable_accuracy:
+            return accepted & is_known, now.accuracy_scale, self.backend.Bool(False)
+        truncation, coarsest = seen.look.sample.truncation_error, field.coarsest_accuracy
         deciding = self._deciding_gap(seen.value, ahead, seen.at_end)
-        at = fmax(now.detail, coarsest)
-        finer, too_coarse = _finer(at, deciding, seen.total_error, truncation, seen.within)
-        coarser = _coarser(at, seen.gaps.smaller, truncation, coarsest)
-        if seen.passes is not None and seen.is_doubtful is not None:
-            too_coarse |= seen.is_doubtful & accepted  # others go back in any case
-            coarser = dr.select(seen.passes, fmax(at, 1), coarser)  # the next knows it too
+        at = fmax(now.accuracy_scale, coarsest)
+        finer, too_coarse = _refined_accuracy(
+            at, deciding, seen.total_error, truncation, seen.value_tolerance
+        )
+        coarser = _next_accuracy(at, seen.gaps.nearest, truncation, coarsest)
+        if seen.passes_branch_level is not None and seen.needs_branch is not None:
+            too_coarse |= seen.needs_branch & accepted  # others go back in any case
+            coarser = dr.select(
+                seen.passes_branch_level, fmax(at, 1), coarser
+            )  # the next knows it too
         accepted &= ~too_coarse & is_known
-        detail = dr.select(too_coarse, finer, dr.select(accepted, coarser, now.detail))
+        detail = dr.select(too_coarse, finer, dr.select(accepted, coarser, now.accuracy_scale))
         return accepted, detail, too_coarse
 
-    def _cross(
+    def _update_contact(
         self,
-        seen: _Seen,
+        seen: _TrialSample,
         hysteresis: Hysteresis,
         contact: Contact,
-        path: Path,
+        path: Ray,
         now: MarchState,
         accepted: Mask,
-        ahead: Crossing | None,
-        sheet: SheetComparison | None,
-    ) -> tuple[Contact, Mask, SheetComparison | None, Real]:
+        ahead: JumpCrossing | None,
+        sheet: JumpTest | None,
+    ) -> tuple[Contact, Mask, JumpTest | None, Real]:
         """The contact behind the trial point, whether rays have crossed the level, the comparison
         with the sheet, and f behind it."""
         value = seen.value
         before = now.proved_to, now.value, dr.dot(now.gradient, path.direction), now.gradient
         last = seen.at_end if sheet is None else seen.at_end & ~sheet.has_crossing
-        doubt = dr.select(seen.total_error > seen.within, fmax(seen.excess, now.excess), 0)
-        there = Accepted(
+        doubt = dr.select(
+            seen.total_error > seen.value_tolerance, fmax(seen.excess, now.tolerance_excess), 0
+        )
+        there = AcceptedPoint(
             seen.t, value, seen.look.sample.gradient, seen.look.slope, before, doubt,
             seen.total_error, seen.is_near, seen.band, last,
         )  # fmt: skip
@@ -504,55 +546,57 @@ class March:
         if ahead is not None and sheet is not None:
             # A crossing before the sheet comes first: the sheet will be sampled again.
             passed = sheet.at_crossing & ~hit
-            contact, jumps = hysteresis.jump(contact, passed, there, ahead, path.direction)
+            contact, jumps = hysteresis.update_at_jump(
+                contact, passed, there, ahead, path.direction
+            )
             sheet = replace(sheet, at_crossing=passed, is_hit=jumps)
             value = value + dr.select(passed, ahead.jump, 0)
         return contact, hit, sheet, value
 
-    def _proved(self, seen: _Seen, gaps: Gaps, contact: Contact | None) -> Real:
+    def _proved_step(self, seen: _TrialSample, gaps: LevelGaps, contact: Contact | None) -> Real:
         """How far from the trial point rays are proved free of levels that far away in value."""
-        spent = _WIDENING * seen.gaps.smaller
-        if self.cover is not None:
-            gaps = gaps.less(spent)
-        forward = longest_step(seen.look.ahead, gaps.less(seen.total_error))
-        if self.cover is not None:
+        spent = _WIDENING * seen.gaps.nearest
+        if self.cone_radius is not None:
+            gaps = gaps.reduced_by(spent)
+        forward = longest_free_length(seen.look.forward, gaps.reduced_by(seen.total_error))
+        if self.cone_radius is not None:
             slope, smallest = seen.look.slope, float(dr.smallest(self.backend.Float))
-            widening = fmax(self.cover * seen.gradient_norm, smallest)
-            away = dr.select(seen.gaps.down <= seen.gaps.up, slope, -slope)
+            widening = fmax(self.cone_radius * seen.gradient_norm, smallest)
+            away = dr.select(seen.gaps.below <= seen.gaps.above, slope, -slope)
             for_ever = (forward == dr.inf) & (away >= widening)
             forward = dr.select(for_ever, forward, fmin(forward, spent / widening))
-        forward = dr.select(gaps.smaller > seen.total_error, forward, 0)
-        if seen.steep is not None and self.cover is None:
+        forward = dr.select(gaps.nearest > seen.total_error, forward, 0)
+        if seen.steep is not None and self.cone_radius is None:
             free = seen.steep.free
             if contact is not None:  # in contact, levels lie elsewhere
                 free = dr.select(contact.is_touching, seen.steep.free_of(gaps), free)
             forward = fmax(free, forward)
         return forward
 
-    def _jump(
+    def _skip_empty_cells(
         self,
-        occupied: UniformGrid,
-        path: Path,
+        occupied: EmptySpaceGrid,
+        path: Ray,
         end: Real,
-        seen: _Seen,
+        seen: _TrialSample,
         accepted: Mask,
         forward: Real,
         trial: Real,
     ) -> tuple[Real, Real]:
         """The proved and the trial step, made longer by cells without a level behind the proof."""
-        free_to = dr.select(accepted, seen.t + forward, self.last)
-        free_to = occupied.free_until(path.origin, path.direction, free_to, self.last)
-        forward = fmax(forward, dr.select(free_to >= self.last, dr.inf, free_to - seen.t))
+        free_to = dr.select(accepted, seen.t + forward, self.ray_end)
+        free_to = occupied.end_of_empty_run(path.origin, path.direction, free_to, self.ray_end)
+        forward = fmax(forward, dr.select(free_to >= self.ray_end, dr.inf, free_to - seen.t))
         trial = fmax(trial, forward)
-        if self.is_part:
+        if self.only_component:
             there = path.point(seen.t + fmin(trial, end - seen.t))
-            trial = dr.select(occupied.cell(there).free > 0, forward, trial)
+            trial = dr.select(occupied.cell(there).empty_distance > 0, forward, trial)
         return forward, trial
 
-    def _look_ahead(
+    def _next_reach(
         self,
         now: MarchState,
-        seen: _Seen,
+        seen: _TrialSample,
         end: Real,
         proved: Real,
         contact: Contact | None,
@@ -560,9 +604,9 @@ class March:
     ) -> Real:
         """How far ahead enclosures are asked to reach next."""
         # After a step of zero, enclosures are asked to reach a third as far: bisection.
-        candidate = fmin(now.look_ahead, end - seen.t)
-        shorter = dr.select(dr.isfinite(candidate), candidate / 3, 1 + 16 * seen.size)
-        tried = dr.select(proved > 0, seen.look.growth * proved, shorter)
+        candidate = fmin(now.enclosure_reach, end - seen.t)
+        shorter = dr.select(dr.isfinite(candidate), candidate / 3, 1 + 16 * seen.coordinate_size)
+        tried = dr.select(proved > 0, seen.look.reach_growth * proved, shorter)
         if now.contact is not None and contact is not None:  # off the surface: the whole ray again
             leaves = now.contact.is_touching & ~contact.is_touching
             tried = dr.select(leaves | hit, end - seen.t, tried)
@@ -571,18 +615,18 @@ class March:
     def _is_free(
         self,
         now: MarchState,
-        seen: _Seen,
+        seen: _TrialSample,
         end: Real,
         accepted: Mask,
         proved_step: Real,
         contact: Contact | None,
     ) -> Mask:
         """Whether rays are proved free to their end."""
-        farthest = float(dr.largest(self.backend.Float)) ** _FARTHEST
+        farthest = float(dr.largest(self.backend.Float)) ** _MISS_EXPONENT
         proved_to = dr.select(accepted, seen.t, now.proved_to)
         free = proved_to + proved_step >= dr.select(end == dr.inf, farthest, end)
         if self.hysteresis is not None and contact is not None:
-            free &= ~(accepted & self.hysteresis.samples_end(contact, end) & (seen.t < end))
+            free &= ~(accepted & self.hysteresis.must_sample_end(contact, end) & (seen.t < end))
         return free
 
     def _is_near(
@@ -591,7 +635,7 @@ class March:
         within: Real,
         total_error: Real,
         rounding: Real,
-        look: Look,
+        look: RaySample,
         gradient_norm: Real,
         size: Real,
         end: Real,
@@ -607,17 +651,23 @@ class March:
         that is parallel to the surface.
         """
         sample = look.sample
-        near = gap <= fmax(within - sample.truncation, 2 * rounding)
-        for promise in sample.known:
+        near = gap <= fmax(within - sample.truncation_error, 2 * rounding)
+        for promise in sample.promises:
             radius = promise.radius
             size = fmax(dr.select(dr.isfinite(radius), radius, 0), size)
         excess = gap + total_error - within
-        crosses = (gap <= within - sample.truncation) | (end < dr.inf)
+        crosses = (gap <= within - sample.truncation_error) | (end < dr.inf)
         crosses |= excess <= dr.abs(look.slope) * size
         return near & crosses & (excess <= _LARGEST_UNCERTAINTY * gradient_norm * size)
 
-    def _trial(
-        self, forward: Real, look: Look, gaps: Gaps, now: MarchState, path: Path, is_smooth: bool
+    def _next_trial_step(
+        self,
+        forward: Real,
+        look: RaySample,
+        gaps: LevelGaps,
+        now: MarchState,
+        path: Ray,
+        is_smooth: bool,
     ) -> Real:
         """The next trial step, where `forward` is proved: longer, but not past where f is predicted
         to reach a level. The prediction need not be right: a trial must still be proved, looking
@@ -627,16 +677,16 @@ class March:
         approximate field, whose truncation differs from point to point, do not.
         """
         slope = look.slope
-        rate, gap = dr.abs(slope), dr.select(slope > 0, gaps.up, gaps.down)
+        rate, gap = dr.abs(slope), dr.select(slope > 0, gaps.above, gaps.below)
         if is_smooth:
-            bend = dr.mulsign(self._bend(look, now, path), slope)
+            bend = dr.mulsign(self._second_derivative(look, now, path), slope)
             root = dr.fma(rate, rate, 2 * bend * gap)
-            target = _AIM * dr.select(root >= 0, 2 * gap / (rate + dr.sqrt(root)), dr.inf)
+            target = _TRIAL_AIM * dr.select(root >= 0, 2 * gap / (rate + dr.sqrt(root)), dr.inf)
         else:
             target = _AIM_BY_SLOPE * dr.select(rate > 0, gap / rate, dr.inf)
         return fmin(self.overstep * forward, fmax(target, forward))
 
-    def _bend(self, look: Look, now: MarchState, path: Path) -> Real:
+    def _second_derivative(self, look: RaySample, now: MarchState, path: Ray) -> Real:
         """The second derivative here of the cubic with the values and slopes of f here and at the
         last accepted point, a length h before; 0 where nothing was accepted before.
 
@@ -652,41 +702,45 @@ class March:
 
     def _status(self, hit: Mask, free: Mask) -> Any:
         """The status of a ray that goes no farther."""
-        ended = dr.select(free, int(Status.MISS), int(Status.OUT_OF_STEPS))
-        return self.backend.UInt32(dr.select(hit, int(Status.HIT), ended))
+        ended = dr.select(free, int(RayStatus.MISS), int(RayStatus.OUT_OF_STEPS))
+        return self.backend.UInt32(dr.select(hit, int(RayStatus.HIT), ended))
 
-    def _deciding_gap(self, value: Real, ahead: Crossing | None, at_end: Mask | None) -> Real:
+    def _deciding_gap(self, value: Real, ahead: JumpCrossing | None, at_end: Mask | None) -> Real:
         """The distance in value from f to the nearest level; where the sample lies at a sheet, the
         smaller of those of f before and behind the sheet."""
-        gap = self.levels.gaps(value).smaller
+        gap = self.levels.gaps(value).nearest
         if ahead is not None:
-            behind = self.levels.gaps(value + ahead.jump).smaller
-            gap = dr.select(at_end & (ahead.sheet != NO_SHEET), fmin(gap, behind), gap)
+            behind = self.levels.gaps(value + ahead.jump).nearest
+            gap = dr.select(at_end & (ahead.facet != NO_FACET), fmin(gap, behind), gap)
         return gap
 
 
-def _finer(
+def _refined_accuracy(
     detail: Real, gap: Real, total_error: Real, truncation: Real, within: Real
 ) -> tuple[Real, Mask]:
     """The detail to sample a point at again, and whether the sample at this detail is too coarse.
 
     It is too coarse where its error shortens the step by much or decides about a hit, unless
-    truncation is a small part of `within`, by which a hit may be off, or of rounding, which more
-    detail does not reduce. With the truncation that is allowed the march still arrives at hits: its
-    steps end where a level is as near as `total_error`, and 1.25 times that is less than what makes
+    truncation is a small part of `value_tolerance`, by which a hit may be off, or of rounding,
+    which more detail does not reduce. With the truncation that is allowed the march still arrives
+    at hits: its steps end where a level is as near as `total_error`, and 1.25 times that is less
+        than what makes
     a hit, within - truncation or twice the rounding.
     """
     rounding = total_error - truncation
-    allowed = fmax(_OF_TOLERANCE * within - _LESS * rounding, _OF_ROUNDING * rounding)
-    again = (gap < _REFINE_BELOW * total_error) & (truncation > allowed) & (detail < _MOST_DETAIL)
-    wanted = fmax(_OF_GAP * gap, _OF_ALLOWED * allowed)
-    closer = clamp(dr.power(truncation / wanted, 1 / _POWER), *_CLOSER)
-    return fmin(fmax(detail * closer, 1), _MOST_DETAIL), again
+    allowed = fmax(
+        _TRUNCATION_OF_TOLERANCE * within - _LESS_ROUNDINGS * rounding,
+        _TRUNCATION_OF_ROUNDING * rounding,
+    )
+    again = (gap < _REFINE_BELOW * total_error) & (truncation > allowed) & (detail < _MAX_ACCURACY)
+    wanted = fmax(_TRUNCATION_OF_GAP * gap, _TRUNCATION_OF_ALLOWED * allowed)
+    closer = clamp(dr.power(truncation / wanted, 1 / _TRUNCATION_ORDER), *_REFINEMENT_LIMITS)
+    return fmin(fmax(detail * closer, 1), _MAX_ACCURACY), again
 
 
-def _coarser(detail: Real, gap: Real, truncation: Real, coarsest: float) -> Real:
+def _next_accuracy(detail: Real, gap: Real, truncation: Real, coarsest: float) -> Real:
     """The detail for the next sample, at most that of this one, given the truncation of this one
     and
     its gap to the next level: 0 for the coarsest, or at least 1."""
-    wanted = detail * dr.power(truncation / (_COARSEN * gap), 1 / _POWER)
+    wanted = detail * dr.power(truncation / (_COARSEN * gap), 1 / _TRUNCATION_ORDER)
     return dr.select(wanted > coarsest, fmin(fmax(wanted, 1), detail), 0)

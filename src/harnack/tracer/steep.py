@@ -18,15 +18,15 @@ from typing import TYPE_CHECKING, Any, cast
 import drjit as dr
 
 from harnack.arithmetic import Values
-from harnack.backend.elementary import fmax, fmin, largest_coordinate, unit
-from harnack.backend.loops import while_active
-from harnack.fields.formula import without_weaker
+from harnack.backend.elementary import fmax, fmin, max_norm, safe_normalize
+from harnack.backend.loops import loop_while_active
+from harnack.fields.formula import without_alternatives
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
-    from harnack.enclosures import Gaps, TargetLevels
+    from harnack.enclosures import LevelGaps, Levels
     from harnack.fields.field import Field
-    from harnack.fields.samples import Path, Sample
+    from harnack.fields.samples import Ray, Sample
 
 # A level may be the value of f up to rounding where it is farther than f changes by rounding by no
 # more than this factor, if f changes on the other side by no more than so many times as much.
@@ -50,7 +50,7 @@ def values_between(field: Field, p: Vec3, q: Vec3, slack: Real | None = None) ->
         value = formula(*coordinates)
     except TypeError:  # it takes ranges of derivatives alone
         return None
-    return coordinates[0].of(value).checked()
+    return coordinates[0].coerce(value).checked()
 
 
 def largest_change(field: Field, p: Vec3, value: Real, reach: Real) -> Real:
@@ -62,7 +62,7 @@ def largest_change(field: Field, p: Vec3, value: Real, reach: Real) -> Real:
     around = values_between(field, p, p, reach)
     if around is None:
         return cast("Any", type(value))(dr.inf)
-    change = fmax(around.value.high - value, value - around.value.low)
+    change = fmax(around.value.upper - value, value - around.value.lower)
     return dr.select(dr.isfinite(change), change, dr.inf)
 
 
@@ -91,7 +91,7 @@ class SteepPlace:
 
     @classmethod
     def at(
-        cls, field: Field, levels: TargetLevels, path: Path, t: Real, ahead: Real, sample: Sample
+        cls, field: Field, levels: Levels, path: Ray, t: Real, ahead: Real, sample: Sample
     ) -> SteepPlace:
         """The place at the parameter t, with the sample there. ahead: how far values are asked for.
 
@@ -103,21 +103,21 @@ class SteepPlace:
         """
         p, value = path.point(t), sample.value
         kind = cast("Any", type(t))
-        slack = 8 * float(dr.epsilon(kind)) * (largest_coordinate(path.origin) + t)
+        slack = 8 * float(dr.epsilon(kind)) * (max_norm(path.origin) + t)
         ahead = dr.select(dr.isfinite(ahead), ahead, 0)
         at_point = values_between(field, p, p, slack)
         on_path = values_between(field, p, path.point(t + ahead), slack)
         if at_point is None or on_path is None:
             return cls(None, t < t, kind(0), kind(0), kind(dr.inf), kind(dr.inf))
-        below, above = value - at_point.value.low, at_point.value.high - value
+        below, above = value - at_point.value.lower, at_point.value.upper - value
         known = (below >= 0) & (above >= 0) & ~at_point.jumps
         gaps = levels.gaps(value)
-        is_below = gaps.down < gaps.up
+        is_below = gaps.below < gaps.above
         near = dr.select(is_below, below, above)
         far = dr.select(is_below, above, below)
         # Steps that are shorter than a rounding of t lead nowhere. Beside a pole f changes far more
         # on the other side.
-        is_level = (gaps.smaller <= near) | ((gaps.smaller <= _SLACK * near) & (far <= _FAR * near))
+        is_level = (gaps.nearest <= near) | ((gaps.nearest <= _SLACK * near) & (far <= _FAR * near))
         error = near if gaps.is_one_sided else fmax(near, far)
         error = dr.select(known & dr.isfinite(error), error, dr.inf)
         off = on_path.nowhere
@@ -125,16 +125,16 @@ class SteepPlace:
             # An end that is NaN stands for an infinite one.
             misses = t == t
             for level in levels.values:
-                misses &= (on_path.value.low > level) | (on_path.value.high < level)
+                misses &= (on_path.value.lower > level) | (on_path.value.upper < level)
             off = off | misses
         free = dr.select(off, ahead, 0)
-        fall, rise = value - on_path.value.low, on_path.value.high - value
+        fall, rise = value - on_path.value.lower, on_path.value.upper - value
         return cls(error, is_level & known, free, ahead, fall, rise)
 
-    def free_of(self, gaps: Gaps) -> Real:
+    def free_of(self, gaps: LevelGaps) -> Real:
         """A length of the path on which f moves by less than these gaps; 0 where none is proved.
         For levels that lie elsewhere, as those of a ray in contact do (`Hysteresis`)."""
-        return dr.select((self.fall < gaps.down) & (self.rise < gaps.up), self.ahead, 0)
+        return dr.select((self.fall < gaps.below) & (self.rise < gaps.above), self.ahead, 0)
 
 
 @dataclass(frozen=True)
@@ -153,25 +153,25 @@ class _Looking:
     least: Real
 
 
-def passes(levels: TargetLevels, value: Real, low: Real, high: Real, gaps: Gaps) -> Mask:
+def passes(levels: Levels, value: Real, low: Real, high: Real, gaps: LevelGaps) -> Mask:
     """Whether all numbers of a range are on the other side of a level than a value, or at it.
 
     Compared with the level itself: beside a pole differences of values round it away, as 1e28 + 1.
     gaps: from the value to the levels; they tell those of a ladder.
     """
     if levels.period is not None:
-        return (high - value <= -gaps.down) | (low - value >= gaps.up)
+        return (high - value <= -gaps.below) | (low - value >= gaps.above)
     passed: Mask = value < value
     for level in levels.values:
         passed |= ((value < level) & (low >= level)) | ((value > level) & (high <= level))
     return passed
 
 
-def holds(levels: TargetLevels, value: Real, low: Real, high: Real, gaps: Gaps) -> Mask:
+def holds(levels: Levels, value: Real, low: Real, high: Real, gaps: LevelGaps) -> Mask:
     """Whether a level lies in a range; see `passes`."""
     if levels.period is not None:
-        held = (low - value <= -gaps.down) & (high - value >= -gaps.down)
-        return held | ((low - value <= gaps.up) & (high - value >= gaps.up))
+        held = (low - value <= -gaps.below) & (high - value >= -gaps.below)
+        return held | ((low - value <= gaps.above) & (high - value >= gaps.above))
     held: Mask = value < value
     for level in levels.values:
         held |= (low <= level) & (high >= level)
@@ -181,8 +181,8 @@ def holds(levels: TargetLevels, value: Real, low: Real, high: Real, gaps: Gaps) 
 def beyond(
     backend: Backend,
     field: Field,
-    levels: TargetLevels,
-    gaps: Gaps,
+    levels: Levels,
+    gaps: LevelGaps,
     p: Vec3,
     ways: tuple[tuple[Vec3, Real], tuple[Vec3, Real]],
     value: Real,
@@ -219,7 +219,7 @@ def beyond(
         way = dr.select(is_first | (is_search & ~is_behind), ways[0][0], ways[1][0])
         rate = dr.abs(dr.select(is_first, ways[0][1], ways[1][1]))
         times = dr.select(now.looks == 0, backend.Float(1), 2)
-        distance = dr.select(is_far, reach, fmin(times * gaps.smaller / rate, reach))
+        distance = dr.select(is_far, reach, fmin(times * gaps.nearest / rate, reach))
         behind, ahead = now.inner - now.low, now.high - now.inner
         section = now.inner + _SECTION * dr.select(ahead >= behind, ahead, -behind)
         section = dr.select(is_behind, -reach, dr.select(is_side, now.inner, section))
@@ -234,15 +234,17 @@ def beyond(
         between = values_between(field, p, q)
         clear = values_between(field, q - _CLEAR * size, q + _CLEAR * size)
         if around is None or between is None or clear is None:
-            with without_weaker():
+            with without_alternatives():
                 low = high = field.evaluate(q).value
             passed = passes(levels, value, low, high, gaps)
         else:
-            low, high = around.value.low, around.value.high
+            low, high = around.value.lower, around.value.upper
             passed = passes(levels, value, low, high, gaps)
             passed &= ~(between.jumps | between.gaps | between.nowhere)
             passed |= holds(levels, value, low, high, gaps) & ~(clear.jumps | around.nowhere)
-        nearest = dr.select(gaps.down < gaps.up, gaps.down + low - value, gaps.up + value - high)
+        nearest = dr.select(
+            gaps.below < gaps.above, gaps.below + low - value, gaps.above + value - high
+        )
         left = dr.select(dr.isfinite(nearest), nearest, dr.inf)
         now = _narrowed(now, distance, left, is_search & ~is_side)
         passed |= now.passed
@@ -252,9 +254,9 @@ def beyond(
 
     begin = _Looking(
         backend.UInt32(0), backend.UInt32(0), backend.Bool(False), backend.Bool(active),
-        backend.Float(0), backend.Float(reach), backend.Float(0), backend.Float(gaps.smaller),
+        backend.Float(0), backend.Float(reach), backend.Float(0), backend.Float(gaps.nearest),
     )  # fmt: skip
-    end = while_active(begin, body, "harnack beyond")
+    end = loop_while_active(begin, body, "harnack beyond")
     return end.passed, end.looks
 
 
@@ -271,10 +273,10 @@ def _narrowed(now: _Looking, at: Real, left: Real, is_search: Mask) -> _Looking:
     )
 
 
-def down_or_up(gradient: Vec3, gaps: Gaps, otherwise: Vec3) -> Vec3:
+def down_or_up(gradient: Vec3, gaps: LevelGaps, otherwise: Vec3) -> Vec3:
     """The unit vector along which f goes to the nearer level; another one where the gradient has no
     direction."""
-    way = unit(gradient)
-    way = dr.select(gaps.down < gaps.up, -way, way)
+    way = safe_normalize(gradient)
+    way = dr.select(gaps.below < gaps.above, -way, way)
     known = dr.isfinite(way.x + way.y + way.z)
     return dr.select(known, way, otherwise)

@@ -12,51 +12,52 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import backend_of, to_float
-from harnack.backend.arrays import as_data
-from harnack.backend.tensors import is_tensor, numbers_of
-from harnack.backend.validation import flag, refuse_derivatives, whole
-from harnack.enclosures import Choice, Proofs, TargetLevels, choose_proofs
+from harnack.backend.arrays import as_kernel_parameters
+from harnack.backend.tensors import is_tensor, tensor_to_array
+from harnack.backend.validation import as_integer_in_range, check_no_derivatives, flag
+from harnack.enclosures import EnclosureChoice, EnclosureKinds, Levels, choose_enclosures
 from harnack.fields.field import check_is_field
-from harnack.geometry import Intersection
+from harnack.geometry import VolumeIntersection
 from harnack.geometry.volume import check_volume
-from harnack.tracer.largest_component import checked_largest, largest_cells
-from harnack.tracer.level_contact import Tolerance
-from harnack.tracer.surface_tracer import PreparedLevelSet
+from harnack.tracer.largest_component import largest_component_cells, validate_component_cells
+from harnack.tracer.level_contact import HitTolerance
+from harnack.tracer.surface_tracer import SurfaceTracer
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real
     from harnack.fields.field import Field
     from harnack.geometry import Volume
-    from harnack.tree.empty_space import OccupiedCells
+    from harnack.tree.empty_space import OccupancyGrid
 
 _T = TypeVar("_T")
 
 # Levels nearer than this to a whole number are traced by samples that know f itself: far away a
 # winding number comes as near to such a level as one likes.
-_WHOLE = 1e-3
+_INTEGER_MARGIN = 1e-3
 
-_FIRST_HITS = (
+_FIRST_HITS_ONLY = (
     "largest=... works for first hits alone: it cannot be combined with all_hits, confirm or "
     'antialias="cones"'
 )
 
 
 @dataclass(frozen=True)
-class LevelSet:
+class Surface:
     """A surface: where a field takes one of some levels, and how to trace it.
 
     field: the function.
     levels: one or more numbers, or Dr.Jit numbers; `level_set` fills in the field's default.
     tolerance: see `Tolerance`.
     max_steps: evaluations of the field that a ray may take.
-    bound: the proofs by which steps are made (`choose_proofs`).
+    bound: the proofs by which steps are made (`choose_enclosures`).
     clip: a volume to cut the surface with, besides the field's own domain.
     section: another one, that cuts the surface open: the faces of a solid on it may have a material
         of their own.
     largest: 0 for all of the surface. Else only one component of what the domain and the clip leave
         is there: the one with the largest sum of projected areas along x, y and z
-        (`largest_cells`). Components are told apart by so many cells along the longest side of the
-        box, True for 128; those that are not separated by cells proved empty count as one.
+        (`largest_component_cells`). Components are told apart by so many cells along the longest
+        side of the box, True for 128; those that are not separated by cells proved empty count as
+        one.
     confirm: whether a ray hits only where f really changes sign about the level: where it passes
         to the other side, by at least half the tolerance. One that comes within the tolerance and
         turns back (a graze) goes on.
@@ -69,16 +70,16 @@ class LevelSet:
     field: Field
     levels: tuple[Real, ...] = ()
     clip: Volume | None = None
-    tolerance: Tolerance = dataclasses.field(default_factory=Tolerance)
+    tolerance: HitTolerance = dataclasses.field(default_factory=HitTolerance)
     max_steps: int = 2000
-    bound: Proofs = dataclasses.field(default_factory=choose_proofs)
+    bound: EnclosureKinds = dataclasses.field(default_factory=choose_enclosures)
     overstep: float = 1.4
     solid: tuple[float, float] | None = None
     confirm: bool = False
     section: Volume | None = None
     largest: int = 0
-    # Results of `once`; None outside of a call of the library.
-    _made: dict[Any, Any] | None = dataclasses.field(
+    # Results of `memoize`; None outside of a call of the library.
+    _call_cache: dict[Any, Any] | None = dataclasses.field(
         default=None, repr=False, compare=False, kw_only=True
     )
 
@@ -87,142 +88,155 @@ class LevelSet:
         if not isinstance(cast("Any", self.levels), tuple):
             raise TypeError(
                 f"levels must be a tuple of numbers, not {self.levels!r:.60}; harnack.level_set "
-                "makes a LevelSet of one number, or of several"
+                "makes a Surface of one number, or of several"
             )
         for level in self.levels:
             if not dr.is_array_v(type(level)):
                 _number(level)
         if self.solid is not None:
             _ends(self.solid)
-        if not isinstance(cast("Any", self.tolerance), Tolerance):
+        if not isinstance(cast("Any", self.tolerance), HitTolerance):
             raise TypeError(f"tolerance must be a Tolerance, not {self.tolerance!r:.60}")
-        if not isinstance(cast("Any", self.bound), Proofs):
+        if not isinstance(cast("Any", self.bound), EnclosureKinds):
             raise TypeError(
                 f"bound must be the Proofs that harnack.level_set makes, not {self.bound!r:.60}"
             )
-        object.__setattr__(self, "largest", checked_largest(self.largest))
+        object.__setattr__(self, "largest", validate_component_cells(self.largest))
         for name in ("clip", "section"):
             check_volume(getattr(self, name), name)
-        object.__setattr__(self, "max_steps", whole(self.max_steps, "max_steps", 1, 2**31 - 1))
+        object.__setattr__(
+            self, "max_steps", as_integer_in_range(self.max_steps, "max_steps", 1, 2**31 - 1)
+        )
         flag(self.confirm, "confirm")
         overstep = _as_number(self.overstep, "overstep must be a number in [1, 2)")
         if not 1 <= overstep < 2:
             raise ValueError(f"overstep must lie in [1, 2), not {self.overstep}")
         object.__setattr__(self, "overstep", overstep)  # NumPy's would ask Dr.Jit for numbers
-        if self.field.has_sheets and self.field.period is not None:
+        if self.field.has_jumps and self.field.period is not None:
             raise ValueError("a field with sheets must be real-valued: its period must be None")
         if self.confirm:
-            self.check_crossings("confirm")
-        if self.largest and (self.field.has_sheets or self.field.has_parts):
+            self.validate_crossings("confirm")
+        if self.largest and (self.field.has_jumps or self.field.has_patches):
             raise ValueError(
                 f"largest=... needs one continuous function, and this {type(self.field).__name__} "
                 "jumps or has parts"
             )
         if self.largest and self.confirm:
-            raise ValueError(_FIRST_HITS)
+            raise ValueError(_FIRST_HITS_ONLY)
 
-    def check_crossings(self, setting: str) -> None:
+    def validate_crossings(self, setting: str) -> None:
         """Raise ValueError for several levels of a field with sheets: a jump may cross more than
         one of them at once; NotImplementedError for a field with parts.
 
         setting: what asks for crossings.
         """
-        if self.field.has_parts:
+        if self.field.has_patches:
             raise NotImplementedError(
                 f"{setting} takes one function, and this {type(self.field).__name__} has one for "
                 "each part: trace a part by itself, such as mesh.face(0) of a polygon mesh"
             )
-        if self.field.has_sheets and len(self.levels) > 1:
+        if self.field.has_jumps and len(self.levels) > 1:
             raise ValueError(
                 f"{setting} takes one level of a field with sheets, such as this "
                 f"{type(self.field).__name__}, not {len(self.levels)}: trace each level by itself"
             )
 
     @property
-    def numbers(self) -> tuple[float, ...]:
+    def level_values(self) -> tuple[float, ...]:
         """The levels as Python numbers."""
         return tuple(_number(level) for level in self.levels)
 
     @property
-    def cut(self) -> Volume | None:
+    def clip_volume(self) -> Volume | None:
         """The intersection of clip and section; None for neither."""
-        return _common([self.clip, self.section])
+        return _intersection([self.clip, self.section])
 
-    def in_one_call(self, *, begins: bool = False) -> LevelSet:
+    def with_call_cache(self, *, begins: bool = False) -> Surface:
         """The same surface, which prepares its field, and asks for its extent and its cells, at
         most once; copies made by `dataclasses.replace` share these results.
 
         begins: whether this is the first use in a call of the library, so that earlier results do
             not hold: between two calls, users may have changed a field in place.
         """
-        return self if self._made is not None and not begins else replace(self, _made={})
+        return (
+            self if self._call_cache is not None and not begins else replace(self, _call_cache={})
+        )
 
-    def once(self, what: Any, make: Callable[[], _T]) -> _T:
+    def memoize(self, what: Any, make: Callable[[], _T]) -> _T:
         """The result of `make()`, which is called once for this field, these levels and `what`."""
-        if self._made is None:
+        if self._call_cache is None:
             return make()
-        key = what, id(self.field), self.numbers
-        if key not in self._made:
-            self._made[key] = make(), self.field  # a reference, so that no other field gets its id
-        return self._made[key][0]
+        key = what, id(self.field), self.level_values
+        if key not in self._call_cache:
+            self._call_cache[key] = (
+                make(),
+                self.field,
+            )  # a reference, so that no other field gets its id
+        return self._call_cache[key][0]
 
     @property
     def extent(self) -> Volume | None:
         """The volume in which the field proves its levels to lie; None where it knows of none."""
-        return self.once("extent", lambda: self.field.extent(self.numbers))
+        return self.memoize("extent", lambda: self.field.extent(self.level_values))
 
     @property
     def volume(self) -> Volume | None:
         """What rays are clipped to: the intersection of domain, proved extent, clip and section;
         None for all of space."""
-        return _common([self.field.domain, self.extent, self.clip, self.section])
+        return _intersection([self.field.domain, self.extent, self.clip, self.section])
 
-    def for_rays(self, count: int) -> LevelSet:
-        """The same surface, to be traced by so many rays (`Field.for_rays`)."""
-        return replace(self, field=self.field.for_rays(count))
+    def for_rays(self, count: int) -> Surface:
+        """The same surface, to be traced by so many rays (`Field.for_ray_count`)."""
+        return replace(self, field=self.field.for_ray_count(count))
 
-    def field_on(self, backend: Backend) -> Field:
+    def evaluator(self, backend: Backend) -> Field:
         """The field on a backend, one for uses with and one for uses without derivatives."""
         is_followed = any(dr.grad_enabled(one) for one in self.field.parameters())
         what = "field", backend, is_followed
-        return self.once(what, lambda: self.field.for_levels(self.numbers).prepare(backend))
+        return self.memoize(
+            what, lambda: self.field.with_levels(self.level_values).prepare(backend)
+        )
 
-    def levels_on(self, backend: Backend) -> TargetLevels:
+    def target_levels(self, backend: Backend) -> Levels:
         """The levels on a backend."""
-        levels = tuple(as_data(to_float(backend, level, "level")) for level in self.levels)
-        return TargetLevels(levels, self.field.period)
+        levels = tuple(
+            as_kernel_parameters(to_float(backend, level, "level")) for level in self.levels
+        )
+        return Levels(levels, self.field.period)
 
-    def _occupied(self) -> OccupiedCells | None:
+    def _occupied(self) -> OccupancyGrid | None:
         """The cells that can hold a level that counts; None where none are known."""
         if not self.largest:
-            return self.once("cells", lambda: self.field.occupied(self.numbers))
-        whole = _common([self.field.domain, self.extent, self.clip])
-        given = self.field, self.numbers, whole, self.solid, self.largest
+            return self.memoize("cells", lambda: self.field.occupied_cells(self.level_values))
+        whole = _intersection([self.field.domain, self.extent, self.clip])
+        given = self.field, self.level_values, whole, self.solid, self.largest
         what = "largest", self.clip, self.solid, self.largest
-        return self.once(what, lambda: largest_cells(*given))
+        return self.memoize(what, lambda: largest_component_cells(*given))
 
     def prepare(
         self, backend: Backend, *, crosses: bool = False, many: bool = True
-    ) -> PreparedLevelSet:
+    ) -> SurfaceTracer:
         """Everything uploaded to a backend, ready to be traced in a recorded kernel.
 
         crosses: whether rays will look for crossings. many: whether there will be so many rays that
             it pays to look for cells without the level first.
         """
         if self.largest and crosses:
-            raise ValueError(_FIRST_HITS)
+            raise ValueError(_FIRST_HITS_ONLY)
         volume, region = self.volume, None
         occupied = self._occupied() if self.largest or (many and not crosses) else None
         if crosses or self.confirm:
-            region = _common([self.field.domain, self.clip, self.section])
-        field, around = self.field_on(backend), None
-        if field.is_modulo and all(abs(math.remainder(one, 1)) > _WHOLE for one in self.numbers):
-            extent = self.field.extent(_with_rungs_at_zero(self.numbers))
+            region = _intersection([self.field.domain, self.clip, self.section])
+        field, around = self.evaluator(backend), None
+        if field.has_unknown_branch and all(
+            abs(math.remainder(one, 1)) > _INTEGER_MARGIN for one in self.level_values
+        ):
+            extent = self.field.extent(_with_reduced_levels(self.level_values))
             around = None if extent is None else extent.prepare(backend)
-        return PreparedLevelSet(
+        return SurfaceTracer(
             backend,
             field,
-            self.levels_on(backend),
+            self.target_levels(backend),
             None if volume is None else volume.prepare(backend),
             self.bound,
             self.tolerance.prepare(backend),
@@ -231,9 +245,9 @@ class LevelSet:
             self.confirm,
             None if region is None else region.prepare(backend),
             None if occupied is None else occupied.upload(backend),
-            is_part=self.largest > 0,
+            only_component=self.largest > 0,
             section=None if self.section is None else self.section.prepare(backend),
-            around=around,
+            known_branch_volume=around,
         )
 
 
@@ -242,18 +256,18 @@ def level_set(
     level: Any = None,
     *,
     clip: Volume | None = None,
-    tolerance: float | Tolerance = 1e-4,
+    tolerance: float | HitTolerance = 1e-4,
     max_steps: int = 2000,
-    bound: Choice = None,
+    bound: EnclosureChoice = None,
     overstep: float | None = None,
     solid: tuple[float, float] | None = None,
     confirm: bool = False,
     section: Volume | None = None,
     largest: bool | int = False,
-) -> LevelSet:
-    """A `LevelSet` from what users write: a level or several, a tolerance, a bound's name.
+) -> Surface:
+    """A `Surface` from what users write: a level or several, a tolerance, a bound's name.
 
-    largest: True or a number of cells for the largest component alone, as in `LevelSet`.
+    largest: True or a number of cells for the largest component alone, as in `Surface`.
 
     Raises ValueError for a level that is not a finite number or that the field cannot have, and
     TypeError for what is no field.
@@ -267,12 +281,12 @@ def level_set(
             raise ValueError(f"solid must be (low, high) with low < high, one finite, not {solid}")
         if field.period is not None:
             raise ValueError("an angle-valued field has no inside: solid needs a real-valued one")
-        if field.has_parts:
+        if field.has_patches:
             raise ValueError(
                 f"a {type(field).__name__} is many surfaces and no closed solid: draw it without "
                 "solid"
             )
-        if field.has_sheets:
+        if field.has_jumps:
             raise ValueError(
                 "a field that jumps across sheets has no closed solid: values between low and "
                 "high may end at a sheet, with no level there; draw its level set without solid"
@@ -282,34 +296,43 @@ def level_set(
     for one in asked:
         if not math.isfinite(_number(one)):
             raise ValueError(f"level must be finite, not {_number(one)}")
-    field.check_levels(tuple(_number(one) for one in asked))
-    if not isinstance(tolerance, Tolerance):
-        tolerance = Tolerance(_as_number(tolerance, "tolerance must be a length or a Tolerance"))
-    overstep = field.overstep if overstep is None else overstep
-    return LevelSet(
-        field, asked, clip, tolerance, max_steps, choose_proofs(bound), overstep, solid, confirm,
-        section, largest,
-    )  # fmt: skip
+    field.validate_levels(tuple(_number(one) for one in asked))
+    if not isinstance(tolerance, HitTolerance):
+        tolerance = HitTolerance(_as_number(tolerance, "tolerance must be a length or a Tolerance"))
+    overstep = field.over_relaxation if overstep is None else overstep
+    return Surface(
+        field,
+        asked,
+        clip,
+        tolerance,
+        max_steps,
+        choose_enclosures(bound),
+        overstep,
+        solid,
+        confirm,
+        section,
+        largest,
+    )
 
 
-def _with_rungs_at_zero(levels: tuple[float, ...]) -> tuple[float, ...]:
+def _with_reduced_levels(levels: tuple[float, ...]) -> tuple[float, ...]:
     """The levels, and for those farther from 0 than a half the nearest ones of the same ladder,
     which |f| reaches sooner."""
     rungs = dict.fromkeys(math.remainder(level, 1) for level in levels if abs(level) > 0.5)
     return levels + tuple(rung for rung in rungs if rung not in levels)
 
 
-def _common(parts: Sequence[Volume | None]) -> Volume | None:
+def _intersection(parts: Sequence[Volume | None]) -> Volume | None:
     """The intersection of some volumes; None, for all of space, if there are none."""
     kept = list(dict.fromkeys(part for part in parts if part is not None))
     if not kept:
         return None
-    return kept[0] if len(kept) == 1 else Intersection(tuple(kept))
+    return kept[0] if len(kept) == 1 else VolumeIntersection(tuple(kept))
 
 
 def _as_levels(level: Any) -> tuple[Any, ...]:
     if is_tensor(level):
-        numbers = numbers_of(level, "level")
+        numbers = tensor_to_array(level, "level")
         backend = backend_of(numbers)
         each = map(backend.UInt32, range(dr.width(numbers)))
         return tuple(dr.gather(backend.Float, numbers, k) for k in each)
@@ -333,7 +356,7 @@ def _ends(solid: Any) -> tuple[float, float]:
 
 
 def _as_number(number: Any, wrong: str) -> float:
-    refuse_derivatives("a level or setting that is no Dr.Jit number", number)
+    check_no_derivatives("a level or setting that is no Dr.Jit number", number)
     try:
         return float("nothing" if isinstance(number, str | bool | np.bool_) else number)
     except (TypeError, ValueError):

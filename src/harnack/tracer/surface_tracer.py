@@ -1,6 +1,6 @@
 """A level set uploaded to a backend, and the ways in which its rays are advanced.
 
-`PreparedLevelSet` is what renderers and `trace` call: first hits, occlusion and clipping, most of
+`SurfaceTracer` is what renderers and `trace` call: first hits, occlusion and clipping, most of
 it while a kernel is being recorded. `trace_queued` traces many rays by few lanes.
 """
 
@@ -13,77 +13,83 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeVar
 
 import drjit as dr
 
-from harnack.backend.elementary import fmax, fmin, largest_coordinate
-from harnack.backend.loops import while_queued
-from harnack.fields.capabilities import NO_PART, NO_SHEET
-from harnack.fields.samples import Path
-from harnack.tracer.branch_tracker import WholeNumbers
-from harnack.tracer.level_contact import Contact, Hysteresis, PreparedTolerance, Status, settled
+from harnack.backend.elementary import fmax, fmin, max_norm
+from harnack.backend.loops import loop_with_queue
+from harnack.fields.capabilities import NO_FACET, NO_PATCH
+from harnack.fields.samples import Ray
+from harnack.tracer.branch_tracker import BranchTracker
+from harnack.tracer.level_contact import (
+    Contact,
+    Hysteresis,
+    PreparedHitTolerance,
+    RayStatus,
+    refine_crossing,
+)
 from harnack.tracer.march import March, MarchState
-from harnack.tracer.walks import PartTracer, SheetTracer
+from harnack.tracer.walks import JumpTracer, PatchTracer
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
-    from harnack.enclosures import Proofs, TargetLevels
+    from harnack.enclosures import EnclosureKinds, Levels
     from harnack.fields.field import Field, Sample
     from harnack.geometry import Volume
-    from harnack.tree.empty_space import UniformGrid
+    from harnack.tree.empty_space import EmptySpaceGrid
 
-__all__ = ["PlainTracer", "RayTracer", "TracerOf", "trace_queued"]
+__all__ = ["RayTracer", "SmoothTracer", "TracerFactory", "trace_queued"]
 
 
 class RayTracer(Protocol):
-    """Advances rays, each call of `next` by one item: a trial point, a sheet, or a part."""
+    """Advances rays, each call of `advance` by one item: a trial point, a sheet, or a part."""
 
     def begin(self, state: MarchState) -> Any:
         """Rays at their start."""
         ...
 
-    def next(self, walk: Any, /) -> Any:
+    def advance(self, walk: Any, /) -> Any:
         """Rays one item further."""
         ...
 
-    def end_of(self, walk: Any, /) -> tuple[MarchState, Any]:
+    def finish(self, walk: Any, /) -> tuple[MarchState, Any]:
         """The state of rays, and the index of the sheet or part that each hit."""
         ...
 
     def run(self, state: MarchState) -> tuple[MarchState, Any]:
-        """What `end_of` returns for rays followed to their end."""
+        """What `finish` returns for rays followed to their end."""
         ...
 
 
 # From a path, its start and its end.
-TracerOf: TypeAlias = "Callable[[Path, Real, Real], RayTracer]"
+TracerFactory: TypeAlias = "Callable[[Ray, Real, Real], RayTracer]"
 
 
 @dataclass(frozen=True)
-class PlainTracer:
+class SmoothTracer:
     """Rays through a field that has neither sheets nor parts."""
 
     march: March
     field: Field
-    path: Path
+    path: Ray
     end: Real
 
     def begin(self, state: MarchState) -> MarchState:
         """Rays at their start."""
         return state
 
-    def next(self, walk: MarchState) -> MarchState:
+    def advance(self, walk: MarchState) -> MarchState:
         """Rays after one more trial point."""
         return self.march.next_trial(self.field, self.path, self.end, walk)
 
-    def end_of(self, walk: MarchState) -> tuple[MarchState, Any]:
+    def finish(self, walk: MarchState) -> tuple[MarchState, Any]:
         """The state of rays; none hit a sheet."""
-        return walk, self.march.backend.UInt32(NO_SHEET)
+        return walk, self.march.backend.UInt32(NO_FACET)
 
     def run(self, state: MarchState) -> tuple[MarchState, Any]:
         """The end state of rays (`March.advance` has the proof)."""
-        return self.end_of(self.march.advance(self.field, self.path, self.end, state))
+        return self.finish(self.march.advance(self.field, self.path, self.end, state))
 
 
 @dataclass(frozen=True)
-class _Ray:
+class _QueuedRay:
     """A ray from start to end, and how far it has got: all the state of a lane."""
 
     origin: Vec3
@@ -101,41 +107,41 @@ Ends = TypeVar("Ends")
 
 
 def trace_queued(
-    tracer_of: TracerOf, path: Path, start: Real, end: Real, state: MarchState,
-    wanted: Callable[[MarchState, Any], Ends],
+    tracer_of: TracerFactory, path: Ray, start: Real, end: Real, state: MarchState,
+    collect: Callable[[MarchState, Any], Ends],
 ) -> Ends:  # fmt: skip
     """What is wanted of what `RayTracer.run` finds, evaluated, by few lanes: one that has followed
     a ray to its end fetches the next.
 
-    wanted: a record of some arrays of the end state and the index. Each is written by itself, which
-        takes a good part of the time of a step.
+    collect: a record of some arrays of the end state and the index. Each is written by itself,
+        which takes a good part of the time of a step.
 
     Rays differ in length, and a packet of a processor waits for its longest. Bounces of light paths
     go in all directions: there the longest ray of a packet took three to six times as many samples
     as the mean one (measured).
     """
-    proofs: Proofs = path.proofs
+    proofs: EnclosureKinds = path.proofs
 
-    def tracer(ray: _Ray) -> RayTracer:
-        return tracer_of(Path(ray.origin, ray.direction, proofs), ray.start, ray.end)
+    def tracer(ray: _QueuedRay) -> RayTracer:
+        return tracer_of(Ray(ray.origin, ray.direction, proofs), ray.start, ray.end)
 
-    def one(ray: _Ray) -> _Ray:
-        return dataclasses.replace(ray, walk=tracer(ray).next(ray.walk))
+    def one(ray: _QueuedRay) -> _QueuedRay:
+        return dataclasses.replace(ray, walk=tracer(ray).advance(ray.walk))
 
     begun = tracer_of(path, start, end).begin(state)
-    rays = _Ray(path.origin, path.direction, start, end, begun)
-    return while_queued(
-        rays, one, lambda ray: wanted(*tracer(ray).end_of(ray.walk)), "harnack queue"
+    rays = _QueuedRay(path.origin, path.direction, start, end, begun)
+    return loop_with_queue(
+        rays, one, lambda ray: collect(*tracer(ray).finish(ray.walk)), "harnack queue"
     )
 
 
 # Rays that look for crossings begin before the proved extent of the surface and end behind it, so
 # that f is sampled on one side of the level there: by this fraction of the size of coordinates,
-_AROUND = 1 / 64
+_MARGIN_OF_SIZE = 1 / 64
 # or by this fraction of the length within the extent, for rays that leave it at small angles.
-_ALONG = 1 / 7
+_MARGIN_OF_LENGTH = 1 / 7
 # A ray that starts no farther than so many roundings from a sheet counts as starting on it.
-_ON_SHEET = 8.0
+_AT_JUMP_ROUNDINGS = 8.0
 
 
 @dataclass(frozen=True)
@@ -145,127 +151,127 @@ class MarchResult:
     t: up to where the ray is proved free of levels; inf for a miss.
     value, gradient: f at t. Where a sheet was hit, f just before it, and the sheet's unit normal,
         to the side of larger f.
-    excess: by how much f at t may be farther from the level than the tolerance allows.
-    sheet: index of the sheet (see `harnack.fields.capabilities`) that was hit, at t; NO_SHEET
+    tolerance_excess: by how much f at t may be farther from the level than the tolerance allows.
+    facet: index of the sheet (see `harnack.fields.capabilities`) that was hit, at t; NO_FACET
         elsewhere.
     side: where hits are confirmed, 1 where f rises through the level along the ray, -1 where it
         falls through it; else None. Then t and gradient are those of the root, and `value` is f a
         little behind it.
-    part: of a field with parts, the index of the one that was hit, NO_PART elsewhere; else None.
+    patch: of a field with parts, the index of the one that was hit, NO_PATCH elsewhere; else None.
     """
 
     t: Real
     value: Real
     gradient: Vec3
-    excess: Real
+    tolerance_excess: Real
     evaluations: Any
     status: Any
-    sheet: Any
+    facet: Any
     side: Real | None = None
-    part: Any | None = None
+    patch: Any | None = None
 
     @property
-    def on_sheet(self) -> Mask:
+    def at_jump(self) -> Mask:
         """Mask of the rays that hit a sheet."""
-        return self.sheet != NO_SHEET
+        return self.facet != NO_FACET
 
 
 @dataclass(frozen=True)
-class _Ends:
+class _EndState:
     """What `MarchResult` is made of: some of a `MarchState`, and the index of the sheet or part."""
 
     proved_to: Real
     value: Real
     gradient: Vec3
-    excess: Real
+    tolerance_excess: Real
     evaluations: Any
     status: Any
     contact: Contact | None
     sheet: Any
 
     @classmethod
-    def of(cls, end: MarchState, sheet: Any) -> _Ends:
+    def of(cls, end: MarchState, sheet: Any) -> _EndState:
         """Those of an end state."""
         names = (field.name for field in dataclasses.fields(cls) if field.name != "sheet")
         return cls(**{name: getattr(end, name) for name in names}, sheet=sheet)
 
 
 @dataclass(frozen=True)
-class _Status:
+class _EndStatus:
     """How rays ended, alone."""
 
     status: Any
 
     @classmethod
-    def of(cls, end: MarchState, sheet: Any) -> _Status:
+    def of(cls, end: MarchState, sheet: Any) -> _EndStatus:
         """That of an end state."""
         del sheet
         return cls(end.status)
 
 
 @dataclass(frozen=True)
-class PreparedLevelSet:
+class SurfaceTracer:
     """A level set on a backend. Its methods can be called while a kernel is being recorded.
 
     volume: a volume that contains the surface; None for all of space.
     region: where the field may be evaluated, for rays that look for crossings; it contains
         `volume`. None for all of space.
     occupied: cells outside of which there is no level; None where none are known.
-    is_part: whether only the surface within `occupied` is traced: there may be levels outside,
-        which do not count.
+    only_component: whether only the surface within `occupied` is traced: there may be levels
+        outside, which do not count.
     section: the volume, one of those that `volume` is the intersection of, that cuts the surface
         open; None for none.
-    queued: whether rays are traced at once, and where a sample is not cheap by few lanes that share
-        a queue. Then its methods cannot be called while a kernel is being recorded.
-    around: for a field whose coarse samples know f but for a whole number, the volume outside of
-        which that number is the one of f = 0; None for no such samples.
+    uses_ray_queue: whether rays are traced at once, and where a sample is not cheap by few lanes
+        that share a queue. Then its methods cannot be called while a kernel is being recorded.
+    known_branch_volume: for a field whose coarse samples know f but for a whole number, the volume
+        outside of which that number is the one of f = 0; None for no such samples.
     """
 
     backend: Backend
     field: Field
-    levels: TargetLevels
+    levels: Levels
     volume: Volume | None
-    proofs: Proofs
-    tolerance: PreparedTolerance
+    proofs: EnclosureKinds
+    tolerance: PreparedHitTolerance
     max_steps: Any
     overstep: float
-    confirm: bool = False
+    require_crossing: bool = False
     region: Volume | None = None
-    occupied: UniformGrid | None = None
-    is_part: bool = False
+    occupied: EmptySpaceGrid | None = None
+    only_component: bool = False
     section: Volume | None = None
-    queued: bool = False
-    around: Volume | None = None
+    uses_ray_queue: bool = False
+    known_branch_volume: Volume | None = None
 
     def sample(self, p: Vec3) -> Sample:
         """The field at p."""
         return self.field.evaluate(p)
 
-    def sample_near(self, p: Vec3, value: Real) -> Sample:
+    def sample_with_branch(self, p: Vec3, value: Real) -> Sample:
         """The field at p, where f is known to differ from a value by less than a half."""
-        if self.around is None:
+        if self.known_branch_volume is None:
             return self.sample(p)
         sample = self.field.evaluate_modulo_one(p)
         return sample.shifted(dr.round(value - sample.value))
 
-    def of_hit(self, hit: MarchResult) -> PreparedLevelSet:
+    def hit_surface(self, hit: MarchResult) -> SurfaceTracer:
         """The level set that was hit: for a field with parts that of the part, else this one."""
-        if hit.part is None:
+        if hit.patch is None:
             return self
-        part = dr.select(hit.part == NO_PART, self.backend.UInt32(0), hit.part)
-        return replace(self, field=self.field.part_at(part))
+        part = dr.select(hit.patch == NO_PATCH, self.backend.UInt32(0), hit.patch)
+        return replace(self, field=self.field.patch(part))
 
-    def counts(self, p: Vec3) -> Mask:
-        """Whether levels count at points p (see `is_part`)."""
-        if self.occupied is None or not self.is_part:
+    def level_counts(self, p: Vec3) -> Mask:
+        """Whether levels count at points p (see `only_component`)."""
+        if self.occupied is None or not self.only_component:
             return self.backend.Bool(True)
-        return self.occupied.cell(p).free == 0
+        return self.occupied.cell(p).empty_distance == 0
 
-    def resolves(self, o: Vec3, end: Real) -> Mask:
+    def is_resolved(self, o: Vec3, end: Real) -> Mask:
         """Whether rounding leaves no doubt, anywhere on rays up to `end`, if levels count there."""
-        if self.occupied is None or not self.is_part:
+        if self.occupied is None or not self.only_component:
             return self.backend.Bool(True)
-        return self.occupied.resolves(o, end)
+        return self.occupied.is_resolved(o, end)
 
     def clip(self, o: Vec3, d: Vec3, t_min: Real, t_max: Real) -> tuple[Real, Real]:
         """The part of [t_min, t_max] that can hold the surface; empty unless start < end."""
@@ -276,83 +282,93 @@ class PreparedLevelSet:
     def occluded(self, o: Vec3, d: Vec3, t_min: Real, t_max: Real, active: Mask = True) -> Mask:
         """Whether the surface lies between t_min and t_max. Out of steps counts as occluded:
         what is not proved free must not let light through."""
-        end = self._march(o, d, t_min, t_max, active, _Status.of, any_hit=True)
-        return end.status != int(Status.MISS)
+        end = self._march(o, d, t_min, t_max, active, _EndStatus.of, any_hit=True)
+        return end.status != int(RayStatus.MISS)
 
     def first_hit(
         self, o: Vec3, d: Vec3, t_min: Real, t_max: Real, active: Mask = True
     ) -> MarchResult:
         """The first hit of rays o + t d, |d| = 1, for t_min <= t <= t_max. Inactive rays miss."""
-        end = self._march(o, d, t_min, t_max, active, _Ends.of)
-        sheet, t, gradient, excess, side = end.sheet, end.proved_to, end.gradient, end.excess, None
+        end = self._march(o, d, t_min, t_max, active, _EndState.of)
+        sheet, t, gradient, excess, side = (
+            end.sheet,
+            end.proved_to,
+            end.gradient,
+            end.tolerance_excess,
+            None,
+        )
         contact, evaluations = end.contact, end.evaluations
         if contact is not None:
-            crossed = end.status == int(Status.HIT)
-            root, at_root, looks = self.settled(o, d, contact, crossed)
+            crossed = end.status == int(RayStatus.HIT)
+            root, at_root, looks = self.refined_crossings(o, d, contact, crossed)
             t = dr.select(crossed, root, t)
             gradient = dr.select(crossed, at_root, gradient)
             evaluations = evaluations + looks
-            excess, side = dr.select(crossed, contact.excess, 0), contact.side
-        t = dr.select(end.status == int(Status.MISS), dr.inf, t)
+            excess, side = dr.select(crossed, contact.tolerance_excess, 0), contact.side
+        t = dr.select(end.status == int(RayStatus.MISS), dr.inf, t)
         part = None
-        if self.field.has_parts:
-            sheet, part = self.backend.UInt32(NO_SHEET), sheet
+        if self.field.has_patches:
+            sheet, part = self.backend.UInt32(NO_FACET), sheet
         return MarchResult(
             t, end.value, gradient, excess, evaluations, end.status, sheet, side, part
         )
 
-    def settled(self, o: Vec3, d: Vec3, found: Contact, active: Mask) -> tuple[Real, Vec3, Any]:
+    def refined_crossings(
+        self, o: Vec3, d: Vec3, found: Contact, active: Mask
+    ) -> tuple[Real, Vec3, Any]:
         """Roots of crossings, the gradients there, and how many evaluations of f that took. Those
         that were found are kept where f has no creases."""
-        if self.field.has_sheets or not self.field.has_creases:
+        if self.field.has_jumps or not self.field.has_creases:
             return found.root, found.gradient, dr.zeros(self.backend.UInt32, dr.width(found.root))
-        path = Path(self.backend.Array3f(o), self.backend.Array3f(d), self.proofs)
-        return settled(self.field, self.levels, self.tolerance, path, found, active)
+        path = Ray(self.backend.Array3f(o), self.backend.Array3f(d), self.proofs)
+        return refine_crossing(self.field, self.levels, self.tolerance, path, found, active)
 
-    def ready(
+    def begin_march(
         self, o: Vec3, d: Vec3, t_min: Real, t_max: Real, active: Mask, *, crosses: bool
-    ) -> tuple[March, Path, Real, Real, MarchState]:
+    ) -> tuple[March, Ray, Real, Real, MarchState]:
         """The march, its path, where that starts and ends, and the state at the start.
 
         crosses: whether rays end where they have crossed a level, and not where they reach one.
         """
         backend, real = self.backend, self.backend.Float
-        path = Path(backend.Array3f(o), backend.Array3f(d), self.proofs)
+        path = Ray(backend.Array3f(o), backend.Array3f(d), self.proofs)
         t_min, t_max = real(t_min), dr.select(active, real(t_max), real(t_min))
         start, end = self.clip(path.origin, path.direction, t_min, t_max)
-        has_detail = self.field.has_detail or self.field.has_sheets
+        has_detail = self.field.has_variable_accuracy or self.field.has_jumps
         hysteresis = None
         if crosses:
-            start, end, hysteresis = self._around(path, real(t_min), real(t_max), start, end)
+            start, end, hysteresis = self._crossing_interval(
+                path, real(t_min), real(t_max), start, end
+            )
         occupied, free_to = None if crosses else self.occupied, start
         if occupied is not None:
             holds = backend.Bool(active) & (start < end)
             start, end = dr.select(holds, start, 0), dr.select(holds, end, 0)
-            free_to = occupied.free_until(path.origin, path.direction, start, end)
-            if not self.field.has_sheets:
+            free_to = occupied.end_of_empty_run(path.origin, path.direction, start, end)
+            if not self.field.has_jumps:
                 start = free_to
         state = MarchState.at(backend, start, end, active, has_detail=has_detail, crosses=crosses)
-        if occupied is not None and self.field.has_sheets and not self.is_part:
+        if occupied is not None and self.field.has_jumps and not self.only_component:
             # Sheets in empty cells are still compared with the level.
             state = replace(state, proved_step=free_to - start)
-        if occupied is not None and self.is_part:
+        if occupied is not None and self.only_component:
             # Where rounding leaves it open in which cell a point is, nothing can be proved.
-            lost = state.active & ~self.resolves(path.origin, end)
-            out = backend.UInt32(int(Status.OUT_OF_STEPS))
+            lost = state.active & ~self.is_resolved(path.origin, end)
+            out = backend.UInt32(int(RayStatus.OUT_OF_STEPS))
             status = dr.select(lost, out, state.status)
             state = replace(state, active=state.active & ~lost, status=status)
         whole_numbers = None
-        if self.around is not None and not crosses:
-            whole_numbers = WholeNumbers(self.levels)
-            entry, _ = self.around.clip(path.origin, path.direction, t_min, t_max)
+        if self.known_branch_volume is not None and not crosses:
+            whole_numbers = BranchTracker(self.levels)
+            entry, _ = self.known_branch_volume.clip(path.origin, path.direction, t_min, t_max)
             outside = (entry > t_min) & (start <= entry)
             begins = state.active & ~outside
-            rounding = backend.epsilon * (largest_coordinate(path.origin) + start)
-            value = self.field.value_where_known(path.point(start), rounding, begins)
+            rounding = backend.machine_epsilon * (max_norm(path.origin) + start)
+            value = self.field.value_if_cheap(path.point(start), rounding, begins)
             knows = outside | dr.isfinite(value)
-            detail = dr.select(knows, 0, real(self.field.coarsest_detail))
+            detail = dr.select(knows, 0, real(self.field.coarsest_accuracy))
             value = dr.select(dr.isfinite(value), value, 0)
-            state = replace(state, detail=detail, value=real(value))
+            state = replace(state, accuracy_scale=detail, value=real(value))
         march = March(
             backend,
             self.levels,
@@ -361,14 +377,14 @@ class PreparedLevelSet:
             self.overstep,
             hysteresis,
             occupied=occupied,
-            last=end,
-            is_part=self.is_part,
-            whole_numbers=whole_numbers,
+            ray_end=end,
+            only_component=self.only_component,
+            branch_tracker=whole_numbers,
         )
         return march, path, real(start), real(end), state
 
-    def _around(
-        self, path: Path, t_min: Real, t_max: Real, start: Real, end: Real
+    def _crossing_interval(
+        self, path: Ray, t_min: Real, t_max: Real, start: Real, end: Real
     ) -> tuple[Real, Real, Hysteresis]:
         """The interval of rays to search for crossings, given the one that can hold the surface.
 
@@ -382,8 +398,8 @@ class PreparedLevelSet:
         is no longer than end - start: a seventh of that behind the end it is 8/7 e above the level,
         which a sample there shows.
         """
-        none, size = self.backend.Bool(False), largest_coordinate(path.origin)
-        rounding = _ON_SHEET * self.backend.epsilon * (size + t_min)
+        none, size = self.backend.Bool(False), max_norm(path.origin)
+        rounding = _AT_JUMP_ROUNDINGS * self.backend.machine_epsilon * (size + t_min)
         if self.volume is None:
             return start, end, Hysteresis.of(self.levels, (none, none), start, rounding)
         first, last = t_min, t_max
@@ -391,9 +407,9 @@ class PreparedLevelSet:
             first, last = self.region.clip(path.origin, path.direction, t_min, t_max)
         holds = start < end
         length = dr.select(dr.isfinite(start) & dr.isfinite(end), end - start, 0)
-        around = _ALONG * length
-        before = fmax(start - fmax(_AROUND * (size + dr.abs(start)), around), first)
-        after = fmin(end + fmax(_AROUND * (size + dr.abs(end)), around), last)
+        around = _MARGIN_OF_LENGTH * length
+        before = fmax(start - fmax(_MARGIN_OF_SIZE * (size + dr.abs(start)), around), first)
+        after = fmin(end + fmax(_MARGIN_OF_SIZE * (size + dr.abs(end)), around), last)
         free_before, free_after = before > first, after < last
         start, end = dr.select(holds, before, start), dr.select(holds, after, end)
         free = holds & free_before, holds & free_after
@@ -406,7 +422,7 @@ class PreparedLevelSet:
         t_min: Real,
         t_max: Real,
         active: Mask,
-        wanted: Callable[[MarchState, Any], Ends],
+        collect: Callable[[MarchState, Any], Ends],
         *,
         any_hit: bool = False,
     ) -> Ends:
@@ -414,18 +430,18 @@ class PreparedLevelSet:
 
         any_hit: whether any hit will do if it is found with less work than the first.
         """
-        march, path, start, end, state = self.ready(
-            o, d, t_min, t_max, active, crosses=self.confirm
+        march, path, start, end, state = self.begin_march(
+            o, d, t_min, t_max, active, crosses=self.require_crossing
         )
 
-        def tracer(path: Path, start: Real, end: Real) -> RayTracer:
-            here = replace(march, last=end)
-            if self.field.has_sheets:
-                return SheetTracer(here, self.field, path, start, end)
-            if self.field.has_parts:
-                return PartTracer(here, self.field, path, start, end, any_hit)
-            return PlainTracer(here, self.field, path, end)
+        def tracer(path: Ray, start: Real, end: Real) -> RayTracer:
+            here = replace(march, ray_end=end)
+            if self.field.has_jumps:
+                return JumpTracer(here, self.field, path, start, end)
+            if self.field.has_patches:
+                return PatchTracer(here, self.field, path, start, end, any_hit)
+            return SmoothTracer(here, self.field, path, end)
 
-        if self.queued and march.hysteresis is None and not self.field.is_cheap:
-            return trace_queued(tracer, path, start, end, state, wanted)
-        return wanted(*tracer(path, start, end).run(state))
+        if self.uses_ray_queue and march.hysteresis is None and not self.field.is_cheap:
+            return trace_queued(tracer, path, start, end, state, collect)
+        return collect(*tracer(path, start, end).run(state))

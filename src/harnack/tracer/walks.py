@@ -1,8 +1,19 @@
 """Rays through fields with sheets or parts (see `harnack.fields.capabilities`), by the loop of
 `March`.
 
-- `SheetTracer`: fields that jump. A ray goes from one crossing of a sheet to the next.
-- `PartTracer`: surfaces made of many level sets, each in a box. A ray finds the first hit of all.
+- `JumpTracer`: fields that jump. A ray goes from one crossing of a sheet to the next.
+- `PatchTracer`: surfaces made of many level sets, each in a box. A ray finds the first hit of all.
+
+Meshes jump, and the jumps are exact. A ray is cut into stretches at the triangles that it crosses;
+on each the winding number is an ordinary smooth field, and at each crossing the values on both
+sides are compared with the level. Triangles are crossed by our own query and not by Embree's:
+whether a ray passes an edge must be decided by the same bits for both its triangles *and* for the
+boundary sum, or w is wrong by one behind it; and it must work in double precision.
+
+Parts are marched one by one. Many level sets, each of a function of its own, are no level set of
+one: a union of the faces of a polygon mesh would pay all faces at each step. Rays enter proved
+boxes in order, by a tree, and each lane marches a part of its own: a view of one table of edges
+(`RecordTable.view`), so that no kernel depends on the mesh.
 """
 
 from __future__ import annotations
@@ -13,40 +24,41 @@ from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 
-from harnack.backend.elementary import fmax, fmin, largest_coordinate
-from harnack.backend.loops import while_active
-from harnack.fields.capabilities import NO_PART, NO_SHEET, Crossing, PartEntry
-from harnack.tracer.level_contact import ON_SHEET, Status
+from harnack.backend.elementary import fmax, fmin, max_norm
+from harnack.backend.loops import loop_while_active
+from harnack.fields.capabilities import NO_FACET, NO_PATCH, JumpCrossing, PatchEntry
+from harnack.tracer.level_contact import HIT_AT_JUMP, RayStatus
 from harnack.tracer.march import March, MarchState
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.fields.field import Field
-    from harnack.fields.samples import Path
+    from harnack.fields.samples import Ray
 
 # Two sheets count as crossed at the same point if they are no farther apart than so many roundings
 # of coordinates, and the cosine of the angle between them is larger than the second number. The
 # sine of a ray's angle to a sheet counts as at least the third.
-_SAME, _PARALLEL, _STEEP = 2.0, 0.999, 1 / 64
+_COINCIDENT_ROUNDINGS, _MIN_COSINE, _MIN_SINE = 2.0, 0.999, 1 / 64
 # Where that distance is more than this share of the ray, sheets that face each other at one point
 # may be the two sides of a wall.
 _COARSE = 1e-4
 
 
 @dataclass(frozen=True)
-class SheetWalk:
+class JumpTraceState:
     """State of rays through a field with sheets.
 
     offset: the field's offset (`Field.offset`).
     behind: the crossing passed last.
     march: the state of the march.
-    named: for rays that look for crossings, index of the sheet to be named for the last crossing.
+    reported_facet: for rays that look for crossings, index of the sheet to be named for the last
+        crossing.
     """
 
     offset: Real
-    behind: Crossing
+    behind: JumpCrossing
     march: MarchState
-    named: Any | None = None
+    reported_facet: Any | None = None
 
     @property
     def active(self) -> Mask:
@@ -54,7 +66,7 @@ class SheetWalk:
 
 
 @dataclass(frozen=True)
-class _Together:
+class _CoincidentJumps:
     """Crossings at the same point of a ray.
 
     jump: the sum of their jumps. t, last: of the last of them.
@@ -74,7 +86,7 @@ class _Together:
 
 
 @dataclass(frozen=True)
-class SheetTracer:
+class JumpTracer:
     """Rays through a field with sheets, from `start` to `end`.
 
     Between two crossings of sheets the field is continuous, and `March` proves that ray interval as
@@ -88,7 +100,7 @@ class SheetTracer:
 
     march: March
     field: Field
-    path: Path
+    path: Ray
     start: Real
     end: Real
 
@@ -97,7 +109,7 @@ class SheetTracer:
         return self.march.backend
 
     def run(self, state: MarchState) -> tuple[MarchState, Any]:
-        """The end state of rays, and the index of the sheet that each hit (NO_SHEET: none).
+        """The end state of rays, and the index of the sheet that each hit (NO_FACET: none).
 
         Proof that no hit is missed: crossings come in order, so the intervals cover the ray. On
         each of them the field is the continuous one that `march` sees, up to and including its
@@ -108,95 +120,99 @@ class SheetTracer:
 
         Rays begin just before `start`, so that a sheet at the very start is not skipped.
         """
-        return self.end_of(while_active(self.begin(state), self.next, "harnack intervals"))
+        return self.finish(loop_while_active(self.begin(state), self.advance, "harnack intervals"))
 
-    def begin(self, state: MarchState) -> SheetWalk:
+    def begin(self, state: MarchState) -> JumpTraceState:
         """Rays at their start."""
         real, vector, count = self.backend.Float, self.backend.Array3f, self.backend.UInt32
         o, d = self.path.origin, self.path.direction
-        before = real(self.start * (1 - self.backend.epsilon) - 1e-30)
-        offset = real(self.field.offset(o, d, before, state.active))
-        start = Crossing(before, count(NO_SHEET), real(0), vector(0))
-        named = None if state.contact is None else count(NO_SHEET)
-        return SheetWalk(offset, start, state, named)
+        before = real(self.start * (1 - self.backend.machine_epsilon) - 1e-30)
+        offset = real(self.field.initial_offset(o, d, before, state.active))
+        start = JumpCrossing(before, count(NO_FACET), real(0), vector(0))
+        named = None if state.contact is None else count(NO_FACET)
+        return JumpTraceState(offset, start, state, named)
 
-    def end_of(self, outer: SheetWalk) -> tuple[MarchState, Any]:
-        """The state of rays, and the index of the sheet that each is on, NO_SHEET for none."""
+    def finish(self, outer: JumpTraceState) -> tuple[MarchState, Any]:
+        """The state of rays, and the index of the sheet that each is on, NO_FACET for none."""
         count, end = self.backend.UInt32, outer.march
-        on_sheet = end.status == ON_SHEET
-        status = dr.select(on_sheet, count(int(Status.HIT)), end.status)
-        named = outer.behind.sheet if outer.named is None else outer.named
-        sheet = dr.select(on_sheet, named, count(NO_SHEET))
+        on_sheet = end.status == HIT_AT_JUMP
+        status = dr.select(on_sheet, count(int(RayStatus.HIT)), end.status)
+        named = outer.behind.facet if outer.reported_facet is None else outer.reported_facet
+        sheet = dr.select(on_sheet, named, count(NO_FACET))
         return dataclasses.replace(end, status=status), sheet
 
-    def next(self, outer: SheetWalk) -> SheetWalk:
+    def advance(self, outer: JumpTraceState) -> JumpTraceState:
         """Rays after one interval: at the next crossing, the end of the ray, or a hit."""
         count = self.backend.UInt32
         o, d = self.path.origin, self.path.direction
         behind, now = outer.behind, outer.march
-        ahead, last, lost = self._together(self._next(behind, self.end, now.active), now.active)
-        out = count(int(Status.OUT_OF_STEPS))
+        ahead, last, lost = self._merge_coincident(
+            self._next(behind, self.end, now.active), now.active
+        )
+        out = count(int(RayStatus.OUT_OF_STEPS))
         now = dataclasses.replace(
             now, status=dr.select(lost, out, now.status), active=now.active & ~lost
         )
-        stops = ahead.sheet != NO_SHEET
+        stops = ahead.facet != NO_FACET
         stop = dr.select(stops, ahead.t, self.end)
         # The last step may already have proved the rest of the ray.
         goes_on = now.proved_to + now.proved_step < stop
         if now.contact is not None and self.march.hysteresis is not None:
-            samples_end = self.march.hysteresis.samples_end(now.contact, stop)
+            samples_end = self.march.hysteresis.must_sample_end(now.contact, stop)
             goes_on |= samples_end & (now.proved_to < stop)
         active = now.active & (stops | goes_on)
         step = fmin(self.march.overstep * now.proved_step, stop - now.proved_to)
         now = dataclasses.replace(now, trial_step=step, active=active)
-        field = self.field.between(o, d, behind, ahead, outer.offset)
+        field = self.field.continuation(o, d, behind, ahead, outer.offset)
         now = self.march.advance(field, self.path, stop, now, ahead)
-        passed = active & stops & (now.status == int(Status.MISS))
+        passed = active & stops & (now.status == int(RayStatus.MISS))
         if now.contact is not None:
-            return self._passed(outer, now, ahead, last, passed, active & stops)
+            return self._after_jump(outer, now, ahead, last, passed, active & stops)
         spent = passed & (now.evaluations >= self.march.max_steps)
         status = dr.select(spent, out, now.status)
         # Of several sheets at a point, a hit names `ahead`; a ray that passes goes on from `last`.
-        crossing = Crossing(
+        crossing = JumpCrossing(
             dr.select(passed, last.t, ahead.t),
-            dr.select(passed, last.sheet, ahead.sheet),
+            dr.select(passed, last.facet, ahead.facet),
             ahead.jump,
             ahead.normal,
         )
-        return SheetWalk(
+        return JumpTraceState(
             dr.select(passed, outer.offset + ahead.jump, outer.offset),
             crossing,
             dataclasses.replace(now, status=status, active=passed & ~spent),
         )
 
-    def _passed(
+    def _after_jump(
         self,
-        outer: SheetWalk,
+        outer: JumpTraceState,
         now: MarchState,
-        ahead: Crossing,
-        last: Crossing,
+        ahead: JumpCrossing,
+        last: JumpCrossing,
         passed: Mask,
         stopped: Mask,
-    ) -> SheetWalk:
+    ) -> JumpTraceState:
         """The state of rays that look for crossings. One that has crossed the level at a sheet has
         passed that sheet; it may be made active again."""
         spent = passed & (now.evaluations >= self.march.max_steps)
-        status = dr.select(spent, self.backend.UInt32(int(Status.OUT_OF_STEPS)), now.status)
-        through = passed | (stopped & (now.status == ON_SHEET))
-        behind = Crossing(
+        status = dr.select(spent, self.backend.UInt32(int(RayStatus.OUT_OF_STEPS)), now.status)
+        through = passed | (stopped & (now.status == HIT_AT_JUMP))
+        behind = JumpCrossing(
             dr.select(through, last.t, outer.behind.t),
-            dr.select(through, last.sheet, outer.behind.sheet),
+            dr.select(through, last.facet, outer.behind.facet),
             dr.select(through, ahead.jump, outer.behind.jump),
             dr.select(through, ahead.normal, outer.behind.normal),
         )
-        return SheetWalk(
+        return JumpTraceState(
             dr.select(through, outer.offset + ahead.jump, outer.offset),
             behind,
             dataclasses.replace(now, status=status, active=passed & ~spent),
-            dr.select(through, ahead.sheet, outer.named),
+            dr.select(through, ahead.facet, outer.reported_facet),
         )
 
-    def _together(self, first: Crossing, active: Mask) -> tuple[Crossing, Crossing, Mask]:
+    def _merge_coincident(
+        self, first: JumpCrossing, active: Mask
+    ) -> tuple[JumpCrossing, JumpCrossing, Mask]:
         """All crossings at the t of the first as one, the last of them, and where it is open if
         they are at one point.
 
@@ -211,76 +227,76 @@ class SheetTracer:
         whose jumps cancel leave it open what is there.
         """
         real, count = self.backend.Float, self.backend.UInt32
-        size = largest_coordinate(self.path.origin)
-        close = _SAME * self.backend.epsilon * (size + first.t)
-        steep = fmax(dr.abs(dr.dot(first.normal, self.path.direction)), real(_STEEP))
+        size = max_norm(self.path.origin)
+        close = _COINCIDENT_ROUNDINGS * self.backend.machine_epsilon * (size + first.t)
+        steep = fmax(dr.abs(dr.dot(first.normal, self.path.direction)), real(_MIN_SINE))
         furthest = fmax(fmin(first.t + close / steep, self.end), first.t)
 
-        def body(now: _Together) -> _Together:
-            one = self._next(Crossing(now.t, now.last, 0.0, first.normal), furthest, now.active)
+        def body(now: _CoincidentJumps) -> _CoincidentJumps:
+            one = self._next(JumpCrossing(now.t, now.last, 0.0, first.normal), furthest, now.active)
             # Sheets at an angle to each other count as one only at exactly the same t.
-            level = dr.abs(dr.dot(one.normal, first.normal)) > _PARALLEL
-            found = now.active & (one.sheet != NO_SHEET) & ((one.t == first.t) | level)
-            new_up = found & (one.jump > 0) & (now.up == NO_SHEET)
-            new_down = found & (one.jump < 0) & (now.down == NO_SHEET)
-            return _Together(
+            level = dr.abs(dr.dot(one.normal, first.normal)) > _MIN_COSINE
+            found = now.active & (one.facet != NO_FACET) & ((one.t == first.t) | level)
+            new_up = found & (one.jump > 0) & (now.up == NO_FACET)
+            new_down = found & (one.jump < 0) & (now.down == NO_FACET)
+            return _CoincidentJumps(
                 jump=now.jump + dr.select(found, one.jump, 0),
                 t=dr.select(found, one.t, now.t),
-                last=dr.select(found, one.sheet, now.last),
-                up=dr.select(new_up, one.sheet, now.up),
-                down=dr.select(new_down, one.sheet, now.down),
+                last=dr.select(found, one.facet, now.last),
+                up=dr.select(new_up, one.facet, now.up),
+                down=dr.select(new_down, one.facet, now.down),
                 normal_up=dr.select(new_up, one.normal, now.normal_up),
                 normal_down=dr.select(new_down, one.normal, now.normal_down),
                 folded=now.folded | (found & level & (one.jump * first.jump < 0)),
                 active=found,
             )
 
-        none = count(NO_SHEET)
-        start = _Together(
+        none = count(NO_FACET)
+        start = _CoincidentJumps(
             jump=first.jump,
             t=first.t,
-            last=first.sheet,
-            up=dr.select(first.jump > 0, first.sheet, none),
-            down=dr.select(first.jump < 0, first.sheet, none),
+            last=first.facet,
+            up=dr.select(first.jump > 0, first.facet, none),
+            down=dr.select(first.jump < 0, first.facet, none),
             normal_up=first.normal,
             normal_down=first.normal,
             folded=self.backend.Bool(False),
-            active=self.backend.Bool(active) & (first.sheet != NO_SHEET),
+            active=self.backend.Bool(active) & (first.facet != NO_FACET),
         )
-        all_there = while_active(start, body, "together")
+        all_there = loop_while_active(start, body, "together")
         up, down = all_there.jump > 0, all_there.jump < 0
-        sheet = dr.select(up, all_there.up, dr.select(down, all_there.down, first.sheet))
+        sheet = dr.select(up, all_there.up, dr.select(down, all_there.down, first.facet))
         normal = dr.select(
             up, all_there.normal_up, dr.select(down, all_there.normal_down, first.normal)
         )
-        behind = Crossing(all_there.t, all_there.last, first.jump, first.normal)
+        behind = JumpCrossing(all_there.t, all_there.last, first.jump, first.normal)
         lost = all_there.folded & (all_there.jump == 0)
         lost &= close > _COARSE * (self.end - self.start)
-        return Crossing(first.t, sheet, real(all_there.jump), normal), behind, lost
+        return JumpCrossing(first.t, sheet, real(all_there.jump), normal), behind, lost
 
-    def _next(self, behind: Crossing, end: Real, active: Mask) -> Crossing:
+    def _next(self, behind: JumpCrossing, end: Real, active: Mask) -> JumpCrossing:
         """The next crossing, as arrays of this backend; none if it lies beyond the end."""
         real, vector, count = self.backend.Float, self.backend.Array3f, self.backend.UInt32
-        ahead = self.field.next_crossing(self.path.origin, self.path.direction, behind, end, active)
+        ahead = self.field.next_jump(self.path.origin, self.path.direction, behind, end, active)
         there = real(ahead.t) <= end
-        there &= count(ahead.sheet) != NO_SHEET
-        return Crossing(
+        there &= count(ahead.facet) != NO_FACET
+        return JumpCrossing(
             dr.select(there, real(ahead.t), dr.inf),
-            dr.select(there, count(ahead.sheet), count(NO_SHEET)),
+            dr.select(there, count(ahead.facet), count(NO_FACET)),
             dr.select(there, real(ahead.jump), 0),
             vector(*ahead.normal),
         )
 
 
 @dataclass(frozen=True)
-class PartWalk:
+class PatchTraceState:
     """State of rays through a field with parts: the box entered last, and the nearest hit so far.
 
     enter, box: where the ray entered the last box, and its index.
     t: of the nearest hit so far, or the end of the ray; of a ray out of steps, up to where it is
         free.
     value, gradient, excess, status: of the march that ended there.
-    part: that of the hit, NO_PART for none.
+    part: that of the hit, NO_PATCH for none.
     active: whether there may be more parts.
     """
 
@@ -297,7 +313,7 @@ class PartWalk:
 
 
 @dataclass(frozen=True)
-class PartTracer:
+class PatchTracer:
     """Rays through a field with parts, from `start` to `end`.
 
     Each part is marched as any field is. What is added here is which part comes next, and how far
@@ -308,13 +324,13 @@ class PartTracer:
 
     march: March
     field: Field
-    path: Path
+    path: Ray
     start: Real
     end: Real
     any_hit: bool = False
 
     def run(self, state: MarchState) -> tuple[MarchState, Any]:
-        """The end state of rays, and the index of the part that each hit (NO_PART: none).
+        """The end state of rays, and the index of the part that each hit (NO_PATCH: none).
 
         Proof that no hit is missed: a part's level set lies in its box, and boxes come in the order
         in which the ray enters them, all that it meets. Each is marched from where the ray enters
@@ -322,27 +338,27 @@ class PartTracer:
         the ray is free of every part whose box it entered before the hit, and all others come
         behind. A ray that is out of steps in a part is proved free up to where it entered that box.
         """
-        walk = while_active(self.begin(state), self.next, "harnack parts")
-        return self.end_of(walk)
+        walk = loop_while_active(self.begin(state), self.advance, "harnack parts")
+        return self.finish(walk)
 
-    def begin(self, state: MarchState) -> PartWalk:
+    def begin(self, state: MarchState) -> PatchTraceState:
         """Rays before the first box."""
         real, count = self.march.backend.Float, self.march.backend.UInt32
-        return PartWalk(
+        return PatchTraceState(
             enter=real(-1),
-            box=count(NO_PART),
+            box=count(NO_PATCH),
             t=real(self.end),
             value=state.value,
             gradient=state.gradient,
-            excess=state.excess,
+            excess=state.tolerance_excess,
             evaluations=state.evaluations,
             status=state.status,
-            part=count(NO_PART),
+            part=count(NO_PATCH),
             active=state.active,
         )
 
-    def end_of(self, walk: PartWalk) -> tuple[MarchState, Any]:
-        """The state of rays, and the index of the part that each hit, NO_PART for none."""
+    def finish(self, walk: PatchTraceState) -> tuple[MarchState, Any]:
+        """The state of rays, and the index of the part that each hit, NO_PATCH for none."""
         backend = self.march.backend
         before = MarchState.at(backend, self.start, self.end, walk.active, has_detail=False)
         end = dataclasses.replace(
@@ -350,42 +366,42 @@ class PartTracer:
             proved_to=walk.t,
             value=walk.value,
             gradient=walk.gradient,
-            excess=walk.excess,
+            tolerance_excess=walk.excess,
             evaluations=walk.evaluations,
             status=walk.status,
             active=walk.active,
         )
         return end, walk.part
 
-    def next(self, walk: PartWalk) -> PartWalk:
+    def advance(self, walk: PatchTraceState) -> PatchTraceState:
         """Rays after one more part: the next whose box is entered before the first hit so far."""
         backend, path = self.march.backend, self.path
-        after = PartEntry(walk.enter, walk.enter, walk.box)
-        entry = self.field.next_part(
+        after = PatchEntry(walk.enter, walk.enter, walk.box)
+        entry = self.field.next_patch(
             path.origin, path.direction, after, self.start, walk.t, walk.active
         )
-        active = walk.active & (entry.part != NO_PART)
+        active = walk.active & (entry.patch != NO_PATCH)
         near, far = fmax(entry.enter, self.start), fmin(entry.leave, walk.t)
-        part = self.field.part_at(dr.select(active, entry.part, 0))
+        part = self.field.patch(dr.select(active, entry.patch, 0))
         spent = active & (walk.evaluations >= self.march.max_steps)
         now = MarchState.at(backend, near, far, active & ~spent, has_detail=False)
         now = dataclasses.replace(now, evaluations=backend.UInt32(walk.evaluations))
         now = self.march.advance(part, path, backend.Float(far), now)
-        out = backend.UInt32(int(Status.OUT_OF_STEPS))
-        hit = active & (now.status == int(Status.HIT))
-        lost = spent | (active & (now.status == int(Status.OUT_OF_STEPS)))
+        out = backend.UInt32(int(RayStatus.OUT_OF_STEPS))
+        hit = active & (now.status == int(RayStatus.HIT))
+        lost = spent | (active & (now.status == int(RayStatus.OUT_OF_STEPS)))
         ended = hit | lost
-        looked = active & (ended | (walk.part == NO_PART))
+        looked = active & (ended | (walk.part == NO_PATCH))
         goes_on = active & ~ended if self.any_hit else active & ~lost
-        return PartWalk(
+        return PatchTraceState(
             enter=entry.enter,
-            box=entry.part,
+            box=entry.patch,
             t=dr.select(hit, now.proved_to, dr.select(lost, near, walk.t)),
             value=dr.select(looked, now.value, walk.value),
             gradient=dr.select(ended, now.gradient, walk.gradient),
-            excess=dr.select(ended, now.excess, walk.excess),
+            excess=dr.select(ended, now.tolerance_excess, walk.excess),
             evaluations=dr.select(active, now.evaluations, walk.evaluations),
             status=dr.select(hit, now.status, dr.select(lost, out, walk.status)),
-            part=dr.select(hit, entry.part, dr.select(lost, NO_PART, walk.part)),
+            part=dr.select(hit, entry.patch, dr.select(lost, NO_PATCH, walk.part)),
             active=goes_on,
         )

@@ -7,22 +7,22 @@ from __future__ import annotations
 
 from harnack.tree.balanced_tree import (
     NO_PRIMITIVE,
-    Hierarchy,
-    Node,
+    BalancedTree,
     PackedTree,
-    build_hierarchy,
-    for_each,
-    pack,
-    walk,
+    VisitedNode,
+    build_balanced_tree,
+    for_each_primitive,
+    pack_tree,
+    traverse,
 )
 
 __all__ = [
     "NO_PRIMITIVE",
-    "Hierarchy",
-    "Node",
+    "BalancedTree",
     "PackedTree",
-    "build_hierarchy",
-    "for_each",
-    "pack",
-    "walk",
+    "VisitedNode",
+    "build_balanced_tree",
+    "for_each_primitive",
+    "pack_tree",
+    "traverse",
 ]

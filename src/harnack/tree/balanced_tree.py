@@ -1,10 +1,17 @@
 """Balanced trees: built by median splits, stored as records, traversed without a stack.
 
-- `Hierarchy`: which primitive lies in which leaf, from `build_hierarchy`, in vectorized NumPy.
-- `PackedTree`: nodes and primitives as records on a backend, from `pack`.
-- `walk`: visits nodes depth first, into a subtree or past it; `for_each`: the primitives of a leaf.
+- `BalancedTree`: which primitive lies in which leaf, from `build_balanced_tree`, in vectorized
+  NumPy.
+- `PackedTree`: nodes and primitives as records on a backend, from `pack_tree`.
+- `traverse`: visits nodes depth first, into a subtree or past it; `for_each_primitive`: the
+  primitives of a leaf.
 
 What a node means, and when to go past it, is up to the caller.
+
+Trees are balanced and complete: a level is a reshape of arrays, sums over nodes are sums along an
+axis, and a walk needs one link a node and no stack. Nodes are records of eight-float packets,
+siblings side by side. Moved vertices keep the tree's shape: bounds are computed
+from where things are.
 """
 
 from __future__ import annotations
@@ -19,42 +26,42 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import FloatArray, IntArray
-from harnack.backend.record_table import PACKET, Records
+from harnack.backend.record_table import PACKET, RecordTable
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real
 
 NO_PRIMITIVE = -1
 # So many points and their indices fit into the cache.
-_POINTS_AT_ONCE = 1 << 17
+_POINTS_IN_CACHE = 1 << 17
 # Rows up to this length are reduced faster by a loop over columns than by NumPy's reductions.
 _LONG_ROW = 48
 
 
 @dataclass(frozen=True)
-class Hierarchy:
+class BalancedTree:
     """A balanced tree: primitives in leaves, and levels of nodes above them.
 
     Every leaf holds w or w - 1 primitives and every level is complete, so that a level is a reshape
     and every sum over nodes a sum along an axis.
 
-    slots: (leaves, leaf_size) index of the primitive in each slot, NO_PRIMITIVE for an empty one
-        (the last of a leaf, if any).
+    leaf_slots: (leaves, leaf_size) index of the primitive in each slot, NO_PRIMITIVE for an empty
+        one (the last of a leaf, if any).
     arities: children of every inner node, level by level from the leaves' parents to the root.
     """
 
-    slots: IntArray
+    leaf_slots: IntArray
     arities: tuple[int, ...]
 
     @property
     def leaf_size(self) -> int:
         """Slots of a leaf."""
-        return self.slots.shape[1]
+        return self.leaf_slots.shape[1]
 
     @property
     def counts(self) -> tuple[int, ...]:
         """Nodes of each level, from the leaves to the root."""
-        counts = [len(self.slots)]
+        counts = [len(self.leaf_slots)]
         for arity in self.arities:
             counts.append(counts[-1] // arity)
         return tuple(counts)
@@ -64,7 +71,7 @@ class Hierarchy:
         """Nodes of all levels."""
         return sum(self.counts)
 
-    def links(self) -> tuple[tuple[IntArray, ...], tuple[IntArray, ...], tuple[IntArray, ...]]:
+    def node_links(self) -> tuple[tuple[IntArray, ...], tuple[IntArray, ...], tuple[IntArray, ...]]:
         """Number of each node, of its first child, and of the node that follows its subtree when
         all are visited depth first (`node_count` for the last); each level by level, leaves first.
 
@@ -88,16 +95,16 @@ class Hierarchy:
         first[0] = np.zeros_like(first[0])
         return tuple(number), tuple(first), tuple(after)
 
-    def gather(self, values: FloatArray, empty: float = 0.0) -> FloatArray:
+    def values_in_slots(self, values: FloatArray, empty: float = 0.0) -> FloatArray:
         """Values of primitives (n, ...) in slots (leaves, leaf_size, ...); `empty` in empty
         ones."""
-        out = values.take(self.slots, axis=0, mode="clip")
-        leaf, slot = np.nonzero(self.slots == NO_PRIMITIVE)
+        out = values.take(self.leaf_slots, axis=0, mode="clip")
+        leaf, slot = np.nonzero(self.leaf_slots == NO_PRIMITIVE)
         out[leaf, slot] = empty
         return out
 
 
-def build_hierarchy(points: FloatArray, *, leaf_size: int = 8, arity: int = 4) -> Hierarchy:
+def build_balanced_tree(points: FloatArray, *, leaf_size: int = 8, arity: int = 4) -> BalancedTree:
     """A tree over finite points (n, 3), n >= 1: each split halves a node along its longest side.
 
     arity: 2 or 4 (two splits at once; the root may have 2 children).
@@ -111,10 +118,10 @@ def build_hierarchy(points: FloatArray, *, leaf_size: int = 8, arity: int = 4) -
     x = np.array(points.T, dtype=np.float64, order="C")[:, None]
     depth = max(0, math.ceil(math.log2(len(points) / leaf_size)))
     left = depth
-    while left and rows.shape[1] > _POINTS_AT_ONCE:
+    while left and rows.shape[1] > _POINTS_IN_CACHE:
         rows, x = _split(rows, x)
         left -= 1
-    at_once = max(1, _POINTS_AT_ONCE // rows.shape[1])
+    at_once = max(1, _POINTS_IN_CACHE // rows.shape[1])
     leaves: list[IntArray] = []
     for start in range(0, len(rows), at_once):
         some, places = rows[start : start + at_once], x[:, start : start + at_once]
@@ -123,8 +130,8 @@ def build_hierarchy(points: FloatArray, *, leaf_size: int = 8, arity: int = 4) -
         leaves.append(some)
     slots = np.concatenate(leaves)
     if arity == 2:
-        return Hierarchy(slots, (2,) * depth)
-    return Hierarchy(slots, (4,) * (depth // 2) + (2,) * (depth % 2))
+        return BalancedTree(slots, (2,) * depth)
+    return BalancedTree(slots, (4,) * (depth // 2) + (2,) * (depth % 2))
 
 
 def _split(rows: IntArray, x: FloatArray) -> tuple[IntArray, FloatArray]:
@@ -173,42 +180,42 @@ def _halves(values: npt.NDArray[Any], order: IntArray, half: int, empty: float) 
 
 _HEAD = 6  # numbers in the first packet of a node that are the caller's; two links follow
 # Links are stored as floats, and single precision holds no larger integers without gaps.
-_MOST_NODES = 2**24
+_MAX_NODES = 2**24
 
 
 @dataclass(frozen=True)
 class PackedTree:
-    """Nodes with links, siblings side by side (`Hierarchy.links`); primitives leaf by leaf.
+    """Nodes with links, siblings side by side (`BalancedTree.node_links`); primitives leaf by leaf.
 
-    heads: of each node six numbers of the caller's, the node that follows its subtree, and the
+    node_heads: of each node six numbers of the caller's, the node that follows its subtree, and the
         number of its leaf or, for an inner node, minus that of its first child.
-    payloads: the caller's other numbers of each node, kept apart because a walk reads many heads in
-        a row and few of these; None for none.
+    node_payloads: the caller's other numbers of each node, kept apart because a walk reads many
+        heads in a row and few of these; None for none.
     primitives: `leaf_size` rows for each leaf.
     """
 
     backend: Backend
-    heads: Records
-    payloads: Records | None
+    node_heads: RecordTable
+    node_payloads: RecordTable | None
     node_count: Any
-    primitives: Records
+    primitives: RecordTable
     leaf_size: Any
 
     def head(self, i: Any) -> list[Real]:
         """The eight numbers of node i that a walk needs."""
-        return self.heads.row(i)
+        return self.node_heads.read_record(i)
 
     def payload(self, i: Any, active: Mask) -> list[Real]:
         """The other numbers of node i."""
-        return [] if self.payloads is None else self.payloads.row(i, active)
+        return [] if self.node_payloads is None else self.node_payloads.read_record(i, active)
 
     def primitive(self, leaf: Any, slot: Any, active: Mask) -> list[Real]:
         """All numbers of a primitive."""
-        return self.primitives.row(leaf * self.leaf_size + slot, active)
+        return self.primitives.read_record(leaf * self.leaf_size + slot, active)
 
 
-def pack(
-    backend: Backend, tree: Hierarchy, levels: Sequence[FloatArray], primitives: FloatArray
+def pack_tree(
+    backend: Backend, tree: BalancedTree, levels: Sequence[FloatArray], primitives: FloatArray
 ) -> PackedTree:
     """A tree with the numbers of its nodes (k, 6 or more), level by level from the leaves, and of
     its primitives in their slots (leaves, leaf_size, c).
@@ -216,12 +223,12 @@ def pack(
     Raises:
         ValueError: more nodes than links in single precision can count.
     """
-    if tree.node_count >= _MOST_NODES:
+    if tree.node_count >= _MAX_NODES:
         raise ValueError(f"a tree of {tree.node_count} nodes is too large: cut the input in parts")
     extra = levels[0].shape[1] - _HEAD
     heads = np.zeros((tree.node_count, PACKET), backend.dtype)
     payloads = np.zeros((tree.node_count, extra), backend.dtype)
-    links = tree.links()
+    links = tree.node_links()
     for number, first, after, values in zip(*links, levels, strict=True):
         heads[number, :_HEAD] = values[:, :_HEAD]
         heads[number, _HEAD] = after
@@ -231,19 +238,19 @@ def pack(
     heads[leaves, _HEAD + 1] = np.arange(len(leaves))
     return PackedTree(
         backend,
-        Records.upload(backend, heads),
-        Records.upload(backend, payloads) if extra else None,
+        RecordTable.upload(backend, heads),
+        RecordTable.upload(backend, payloads) if extra else None,
         dr.opaque(backend.UInt32, tree.node_count),
-        Records.upload(backend, primitives.reshape(-1, primitives.shape[2])),
+        RecordTable.upload(backend, primitives.reshape(-1, primitives.shape[2])),
         dr.opaque(backend.UInt32, tree.leaf_size),
     )
 
 
-State: TypeAlias = "tuple[Any, ...]"
+LoopValues: TypeAlias = "tuple[Any, ...]"
 
 
 @dataclass(frozen=True)
-class Node:
+class VisitedNode:
     """The node that a walk visits; each lane may be at a different one.
 
     index: number of the node.
@@ -262,11 +269,11 @@ class Node:
         return self.tree.payload(self.index, active)
 
 
-Visit: TypeAlias = "Callable[[Node, State], tuple[Mask, State]]"
-EachPrimitive: TypeAlias = "Callable[[list[Real], Mask, State], State]"
+Visit: TypeAlias = "Callable[[VisitedNode, LoopValues], tuple[Mask, LoopValues]]"
+PrimitiveBody: TypeAlias = "Callable[[list[Real], Mask, LoopValues], LoopValues]"
 
 
-def walk(tree: PackedTree, visit: Visit, state: State, active: Mask = True) -> State:
+def traverse(tree: PackedTree, visit: Visit, state: LoopValues, active: Mask = True) -> LoopValues:
     """The state after visiting nodes from the root on.
 
     visit: from a node and the state, whether to go into the node's children, and the new state.
@@ -276,10 +283,10 @@ def walk(tree: PackedTree, visit: Visit, state: State, active: Mask = True) -> S
     """
     index, mask = tree.backend.UInt32, tree.backend.Bool
 
-    def body(i: Any, *state: Any) -> State:
+    def body(i: Any, *state: Any) -> LoopValues:
         head = tree.head(i)
         is_leaf, number = head[7] >= 0, index(dr.abs(head[7]))
-        node = Node(tree, i, tuple(head[:6]), number, is_leaf)
+        node = VisitedNode(tree, i, tuple(head[:6]), number, is_leaf)
         descend, state = visit(node, state)
         i = dr.select(descend & ~is_leaf, number, index(head[6]))
         return i, *state
@@ -291,10 +298,13 @@ def walk(tree: PackedTree, visit: Visit, state: State, active: Mask = True) -> S
     return dr.while_loop((start, *state), more, body, label="walk")[1:]
 
 
-def for_each(node: Node, active: Mask, body: EachPrimitive, state: State) -> State:
+def for_each_primitive(
+    node: VisitedNode, active: Mask, body: PrimitiveBody, state: LoopValues
+) -> LoopValues:
     """The state after visiting the primitives of a leaf, where active; costs nothing elsewhere.
 
-    Empty slots are visited as well: the caller of `pack` has filled them with harmless numbers.
+    Empty slots are visited as well: the caller of `pack_tree` has filled them with harmless
+        numbers.
     """
     tree = node.tree
     index = tree.backend.UInt32
@@ -302,7 +312,7 @@ def for_each(node: Node, active: Mask, body: EachPrimitive, state: State) -> Sta
     def more(slot: Any, *_: Any) -> Mask:
         return active & (slot < tree.leaf_size)
 
-    def step(slot: Any, *state: Any) -> State:
+    def step(slot: Any, *state: Any) -> LoopValues:
         return slot + 1, *body(tree.primitive(node.leaf, slot, active), active, state)
 
     return dr.while_loop((index(0), *state), more, step, label="leaf")[1:]

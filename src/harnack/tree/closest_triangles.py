@@ -9,34 +9,34 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import FloatArray
-from harnack.backend.elementary import clamp, fmax, fmin, largest_coordinate
+from harnack.backend.elementary import clamp, fmax, fmin, max_norm
 from harnack.tree.balanced_tree import (
-    Node,
+    LoopValues,
     PackedTree,
-    State,
-    build_hierarchy,
-    for_each,
-    pack,
-    walk,
+    VisitedNode,
+    build_balanced_tree,
+    for_each_primitive,
+    pack_tree,
+    traverse,
 )
 from harnack.tree.triangle_tree import (
-    EDGES,
-    INDEX,
+    INVERSE_SQUARES_COLUMN,
     NO_TRIANGLE,
-    PARITY,
-    TriangleRays,
-    box_levels,
+    NUMBER_COLUMN,
+    PARITY_COLUMN,
+    TriangleTree,
     corners_of,
+    node_boxes,
     normal_of,
 )
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
 
-__all__ = ["MOST_BOXES", "NO_BOX", "BoxTree"]
+__all__ = ["MAX_BOXES", "NO_BOX", "BoxTree"]
 
 # Boxes are numbered in floats; single precision holds no larger integers without gaps.
-MOST_BOXES = 2**24
+MAX_BOXES = 2**24
 NO_BOX = 0xFFFFFFFF
 # Column of a record behind its box.
 _NUMBER = 6
@@ -50,15 +50,15 @@ class BoxTree:
     tree: PackedTree
 
     @classmethod
-    def of(cls, backend: Backend, lower: FloatArray, upper: FloatArray) -> BoxTree:
+    def from_corners(cls, backend: Backend, lower: FloatArray, upper: FloatArray) -> BoxTree:
         """Boxes from their corners (n, 3)."""
-        hierarchy = build_hierarchy(0.5 * (lower + upper), leaf_size=_LEAF_SIZE)
+        hierarchy = build_balanced_tree(0.5 * (lower + upper), leaf_size=_LEAF_SIZE)
         number = np.arange(len(lower), dtype=np.float64)[:, None]
-        records = hierarchy.gather(np.concatenate([lower, upper, number], axis=1))
-        records[hierarchy.slots < 0] = [np.inf] * 3 + [-np.inf] * 3 + [-1.0]
-        return cls(pack(backend, hierarchy, box_levels(hierarchy, lower, upper), records))
+        records = hierarchy.values_in_slots(np.concatenate([lower, upper, number], axis=1))
+        records[hierarchy.leaf_slots < 0] = [np.inf] * 3 + [-np.inf] * 3 + [-1.0]
+        return cls(pack_tree(backend, hierarchy, node_boxes(hierarchy, lower, upper), records))
 
-    def next(
+    def next_box(
         self, o: Vec3, d: Vec3, after: tuple[Real, Any], start: Real, end: Real, active: Mask
     ) -> tuple[Real, Real, Any]:
         """The first box behind `after` = (t, number) that rays o + t d, |d| = 1, enter by t <= end.
@@ -74,14 +74,14 @@ class BoxTree:
         """
         real, index = self.tree.backend.Float, self.tree.backend.UInt32
         t_after, n_after = real(after[0]), index(after[1])
-        span = self._spans(o, d)
+        span = self._slab_test(o, d)
 
-        def visit(node: Node, state: State) -> tuple[Mask, State]:
+        def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
             near, far = span(node.head)
             open_ = (near <= far) & (far >= start) & (near <= fmin(state[0], end))
-            return open_, for_each(node, open_ & node.is_leaf, nearer, state)
+            return open_, for_each_primitive(node, open_ & node.is_leaf, nearer, state)
 
-        def nearer(row: list[Real], active: Mask, state: State) -> State:
+        def nearer(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
             best, leave, number = state
             near, far = span(row)
             t, n = fmax(near, start), index(fmax(row[_NUMBER], real(0)))
@@ -96,10 +96,10 @@ class BoxTree:
             )
 
         begun = (real(dr.inf), real(dr.inf), index(NO_BOX))
-        near, far, number = walk(self.tree, visit, begun, active)
+        near, far, number = traverse(self.tree, visit, begun, active)
         return near, far, number
 
-    def _spans(self, o: Vec3, d: Vec3) -> Any:
+    def _slab_test(self, o: Vec3, d: Vec3) -> Any:
         """Where rays enter and leave a box, a little earlier and later to cover rounding.
 
         Each plane of the box is moved outwards by 16 roundings of the size of coordinates, and t is
@@ -111,14 +111,14 @@ class BoxTree:
         # Never zero: 1e-18 of the boxes' size is far below their padding.
         steep = dr.select(dr.abs(d) < 1e-18, dr.select(d < 0, vector(-1e-18), vector(1e-18)), d)
         inverse = dr.rcp(steep)
-        pad = 16 * backend.epsilon * (1 + largest_coordinate(o))
+        pad = 16 * backend.machine_epsilon * (1 + max_norm(o))
 
         def span(box: Any) -> tuple[Real, Real]:
             low, high = vector(*box[:3]) - pad, vector(*box[3:6]) + pad
             a, b = (low - o) * inverse, (high - o) * inverse
             near = fmax(fmax(fmin(a.x, b.x), fmin(a.y, b.y)), fmin(a.z, b.z))
             far = fmin(fmin(fmax(a.x, b.x), fmax(a.y, b.y)), fmax(a.z, b.z))
-            slack = 8 * backend.epsilon
+            slack = 8 * backend.machine_epsilon
             return near - slack * dr.abs(near), far + slack * dr.abs(far)
 
         return span
@@ -129,56 +129,56 @@ _ROUNDING = 16.0
 
 
 @dataclass(frozen=True)
-class NearestTriangle:
+class ClosestTriangle:
     """The nearest triangle to points x, of those that a query considers.
 
-    square: squared distance; inf where there is no triangle.
-    number: of the triangle; NO_TRIANGLE where there is none.
+    squared_distance: squared distance; inf where there is no triangle.
+    triangle: of the triangle; NO_TRIANGLE where there is none.
     offset: (3,) from x to the nearest point of the triangle.
     normal: (3,) of the triangle by the right-hand rule, of any length; zero without an area.
     is_inner: whether the nearest point lies inside the triangle, not on its edges.
     """
 
-    square: Real
-    number: Any
+    squared_distance: Real
+    triangle: Any
     offset: Vec3
     normal: Vec3
     is_inner: Mask
 
 
-def distance_to_triangles(rays: TriangleRays, x: Vec3) -> Real:
+def distance_lower_bound(rays: TriangleTree, x: Vec3) -> Real:
     """A proved lower bound of the distance from x to the triangles, exact up to rounding; the
     triangles have coordinates of at most about one.
 
-    Proof. `NearestPoint` is off by a few epsilons of |x| + 1, by its docstring; boxes are skipped
-    only if they are farther than the best so far by that much. 16 epsilons of |x| + 1 are
+    Proof. `ClosestPointOnTriangle` is off by a few epsilons of |x| + 1, by its docstring; boxes are
+    skipped only if they are farther than the best so far by that much. 16 epsilons of |x| + 1 are
     subtracted, several times the largest error found with random needles and random triangles.
     """
     real, vector = rays.tree.backend.Float, rays.tree.backend.Array3f
     x = vector(x)
     pad = _pad(rays, x)
-    inside = _boxes(rays, x, pad)
+    inside = _distance_test(rays, x, pad)
 
-    def visit(node: Node, state: State) -> tuple[Mask, State]:
+    def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
         closer = inside(node, state[0])
-        return closer, for_each(node, closer & node.is_leaf, nearer, state)
+        return closer, for_each_primitive(node, closer & node.is_leaf, nearer, state)
 
-    def nearer(row: list[Real], active: Mask, state: State) -> State:
-        square = NearestPoint.of(row, x).square
+    def nearer(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
+        square = ClosestPointOnTriangle.of(row, x).squared_distance
         return (dr.select(active, fmin(square, state[0]), state[0]),)
 
-    start = (square_to_some_vertex(rays, x),)
-    return fmax(dr.sqrt(walk(rays.tree, visit, start)[0]) - pad, real(0))
+    start = (initial_squared_distance(rays, x),)
+    return fmax(dr.sqrt(traverse(rays.tree, visit, start)[0]) - pad, real(0))
 
 
-def square_to_some_vertex(rays: TriangleRays, x: Vec3) -> Real:
+def initial_squared_distance(rays: TriangleTree, x: Vec3) -> Real:
     """The squared distance from x to a vertex of a triangle nearby, rounded up: walks that begin
     with it skip most boxes."""
-    square, pad = square_to_some_point(rays.tree, x, 0), _pad(rays, x)
+    square, pad = squared_distance_in_nearby_leaf(rays.tree, x, 0), _pad(rays, x)
     return square + 2 * pad * (dr.sqrt(square) + pad)
 
 
-def square_to_some_point(tree: PackedTree, x: Vec3, column: int) -> Real:
+def squared_distance_in_nearby_leaf(tree: PackedTree, x: Vec3, column: int) -> Real:
     """The least squared distance from x to the points of a leaf nearby.
 
     The leaf is found from the root on by the child whose box has the nearest center.
@@ -189,7 +189,7 @@ def square_to_some_point(tree: PackedTree, x: Vec3, column: int) -> Real:
     real, index, vector = backend.Float, backend.UInt32, backend.Array3f
     x = vector(x)
 
-    def body(i: Any, end: Any, best: Real, first: Any, after: Any, found: Any) -> State:
+    def body(i: Any, end: Any, best: Real, first: Any, after: Any, found: Any) -> LoopValues:
         head = tree.head(i)
         middle = 0.5 * (vector(*head[:3]) + vector(*head[3:6]))
         square = dr.squared_norm(middle - x)
@@ -214,7 +214,7 @@ def square_to_some_point(tree: PackedTree, x: Vec3, column: int) -> Real:
     )  # fmt: skip
     leaf = dr.while_loop(start, more, body, label="to a leaf")[5]
 
-    def add(slot: Any, square: Real) -> State:
+    def add(slot: Any, square: Real) -> LoopValues:
         row = tree.primitive(leaf, slot, backend.Bool(True))
         point = vector(*row[column : column + 3])
         return slot + 1, fmin(square, dr.squared_norm(point - x))
@@ -226,9 +226,9 @@ def square_to_some_point(tree: PackedTree, x: Vec3, column: int) -> Real:
     return dr.while_loop((index(0), real(dr.inf)), left, add, label="points of a leaf")[1]
 
 
-def nearest_triangle(
-    rays: TriangleRays, x: Vec3, after: tuple[Real, Any], limit: Real, active: Mask
-) -> NearestTriangle:
+def next_closest_triangle(
+    rays: TriangleTree, x: Vec3, after: tuple[Real, Any], limit: Real, active: Mask
+) -> ClosestTriangle:
     """The first triangle behind `after` = (squared distance, number), nearer than `limit`.
 
     Triangles are ordered by (squared distance, number), so that each comes up once; from
@@ -238,19 +238,19 @@ def nearest_triangle(
     real, index, vector = backend.Float, backend.UInt32, backend.Array3f
     x, limit = vector(x), real(limit)
     square_after, number_after = real(after[0]), index(after[1])
-    inside = _boxes(rays, x, _pad(rays, x))
+    inside = _distance_test(rays, x, _pad(rays, x))
 
-    def visit(node: Node, state: State) -> tuple[Mask, State]:
+    def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
         closer = inside(node, state[0])
-        return closer, for_each(node, closer & node.is_leaf, nearer, state)
+        return closer, for_each_primitive(node, closer & node.is_leaf, nearer, state)
 
-    def nearer(row: list[Real], active: Mask, state: State) -> State:
+    def nearer(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
         best, number, offset, normal, is_inner = state
-        point = NearestPoint.of(row, x)
-        square, n = point.square, index(fmax(row[INDEX], real(0)))
+        point = ClosestPointOnTriangle.of(row, x)
+        square, n = point.squared_distance, index(fmax(row[NUMBER_COLUMN], real(0)))
         later = (square > square_after) | ((square == square_after) & (n > number_after))
         first = (square < best) | ((square == best) & (n < number))
-        taken = active & later & first & (row[INDEX] >= 0)
+        taken = active & later & first & (row[NUMBER_COLUMN] >= 0)
         return (
             dr.select(taken, square, best),
             dr.select(taken, n, number),
@@ -260,21 +260,21 @@ def nearest_triangle(
         )
 
     start = (limit, index(NO_TRIANGLE), vector(0), vector(0), backend.Bool(False))
-    square, number, offset, normal, is_inner = walk(rays.tree, visit, start, active)
+    square, number, offset, normal, is_inner = traverse(rays.tree, visit, start, active)
     found = number != NO_TRIANGLE
-    return NearestTriangle(dr.select(found, square, dr.inf), number, offset, normal, is_inner)
+    return ClosestTriangle(dr.select(found, square, dr.inf), number, offset, normal, is_inner)
 
 
-def _pad(rays: TriangleRays, x: Vec3) -> Real:
-    return _ROUNDING * rays.tree.backend.epsilon * (1 + dr.max(dr.abs(x)))
+def _pad(rays: TriangleTree, x: Vec3) -> Real:
+    return _ROUNDING * rays.tree.backend.machine_epsilon * (1 + dr.max(dr.abs(x)))
 
 
-def _boxes(rays: TriangleRays, x: Vec3, pad: Real) -> Any:
+def _distance_test(rays: TriangleTree, x: Vec3, pad: Real) -> Any:
     """A test whether a node comes within a squared distance of x: its box widened by `pad` and,
-    if the tree has them, its slab (`slab_levels`) as well."""
+    if the tree has them, its slab (`node_slabs`) as well."""
     vector = rays.tree.backend.Array3f
 
-    def within(node: Node, square: Real) -> Mask:
+    def within(node: VisitedNode, square: Real) -> Mask:
         low, high = vector(*node.head[:3]) - pad, vector(*node.head[3:]) + pad
         away = dr.select(x < low, low - x, dr.select(x > high, x - high, 0))
         close = dr.squared_norm(away) <= square
@@ -293,10 +293,10 @@ def _boxes(rays: TriangleRays, x: Vec3, pad: Real) -> Any:
 
 
 @dataclass(frozen=True)
-class NearestPoint:
+class ClosestPointOnTriangle:
     """The nearest point of a record's triangle to x.
 
-    square: the squared distance.
+    squared_distance: the squared distance.
     offset: (3,) from x to the point.
     is_inner: whether the point lies inside the triangle, not on its edges.
 
@@ -316,18 +316,20 @@ class NearestPoint:
     the plane's is off by as much.
     """
 
-    square: Real
+    squared_distance: Real
     offset: Vec3
     is_inner: Mask
 
     @classmethod
-    def of(cls, row: list[Real], x: Vec3) -> NearestPoint:
+    def of(cls, row: list[Real], x: Vec3) -> ClosestPointOnTriangle:
         vector = cast("Any", type(x))
         p, q, r = (corner - x for corner in corners_of(row, vector))
-        first, second, third = row[EDGES : EDGES + 3]
+        first, second, third = row[INVERSE_SQUARES_COLUMN : INVERSE_SQUARES_COLUMN + 3]
         pq, qr, pr = q - p, r - q, r - p
-        best, offset = _smaller(
-            _on_segment(p, pq, first), _on_segment(q, qr, second), _on_segment(p, pr, third)
+        best, offset = _shortest_vector(
+            _closest_on_segment(p, pq, first),
+            _closest_on_segment(q, qr, second),
+            _closest_on_segment(p, pr, third),
         )
         squares = [dr.squared_norm(edge) for edge in (pq, qr, pr)]
         by_pr = (squares[2] > squares[0]) & (squares[2] >= squares[1])
@@ -338,8 +340,8 @@ class NearestPoint:
             return dr.select(by_pr, three, dr.select(by_qr, two, one))
 
         a, e, inverse = chosen(p, q, p), chosen(pq, qr, pr), chosen(first, second, third)
-        alpha, away = _split(-a, e, inverse)
-        beta, h = _split(chosen(r, p, q) - a, e, inverse)
+        alpha, away = _project_on_edge(-a, e, inverse)
+        beta, h = _project_on_edge(chosen(r, p, q) - a, e, inverse)
         s = dr.dot(away, h) / dr.squared_norm(h)  # NaN for a triangle without an area: not inside
         inside = (s >= 0) & (s <= 1) & (alpha >= s * beta) & (1 - alpha >= s * (1 - beta))
         across = dr.fma(vector(s), h, -away)
@@ -348,7 +350,7 @@ class NearestPoint:
         return cls(dr.select(inside, square, best), dr.select(inside, across, offset), inside)
 
 
-def _split(v: Vec3, e: Vec3, inverse: Real) -> tuple[Real, Vec3]:
+def _project_on_edge(v: Vec3, e: Vec3, inverse: Real) -> tuple[Real, Vec3]:
     """share and rest of v = share e + rest, with the rest orthogonal to e, even if it is short;
     inverse = 1/|e|^2."""
     vector = cast("Any", type(v))
@@ -358,13 +360,13 @@ def _split(v: Vec3, e: Vec3, inverse: Real) -> tuple[Real, Vec3]:
     return share + more, dr.fma(vector(-more), e, rest)
 
 
-def _on_segment(a: Vec3, e: Vec3, inverse: Real) -> Vec3:
+def _closest_on_segment(a: Vec3, e: Vec3, inverse: Real) -> Vec3:
     """The nearest point to the origin of the segment from a to a + e."""
     real, vector = cast("Any", type(inverse)), cast("Any", type(a))
     return dr.fma(vector(clamp(-dr.dot(a, e) * inverse, real(0), real(1))), e, a)
 
 
-def _smaller(*vectors: Vec3) -> tuple[Real, Vec3]:
+def _shortest_vector(*vectors: Vec3) -> tuple[Real, Vec3]:
     """The smallest of them, its squared length first."""
     best, *others = vectors
     square = dr.squared_norm(best)
@@ -377,22 +379,26 @@ def _smaller(*vectors: Vec3) -> tuple[Real, Vec3]:
 def squared_distance_to_segment(a: Vec3, e: Vec3, inverse: Real) -> Real:
     """From the origin to the segment from a to a + e; inverse: 1/|e|^2, any finite number if e =
     0."""
-    return dr.squared_norm(_on_segment(a, e, inverse))
+    return dr.squared_norm(_closest_on_segment(a, e, inverse))
 
 
-def jumps_within(rays: TriangleRays, x: Vec3, distance: Real, active: Mask = True) -> Real:
+def jump_sum_within(rays: TriangleTree, x: Vec3, distance: Real, active: Mask = True) -> Real:
     """The sum of the sizes of the winding number's jumps across triangles within a distance of
     x."""
     real, vector = rays.tree.backend.Float, rays.tree.backend.Array3f
     x, distance = vector(x), real(distance)
-    reach, inside = distance * distance, _boxes(rays, x, distance)
+    reach, inside = distance * distance, _distance_test(rays, x, distance)
 
-    def visit(node: Node, state: State) -> tuple[Mask, State]:
+    def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
         close = inside(node, reach)
-        return close, for_each(node, close & node.is_leaf, add, state)
+        return close, for_each_primitive(node, close & node.is_leaf, add, state)
 
-    def add(row: list[Real], active: Mask, state: State) -> State:
-        within = active & (row[INDEX] >= 0) & (NearestPoint.of(row, x).square <= reach)
-        return (state[0] + dr.select(within, dr.abs(row[PARITY]), 0),)
+    def add(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
+        within = (
+            active
+            & (row[NUMBER_COLUMN] >= 0)
+            & (ClosestPointOnTriangle.of(row, x).squared_distance <= reach)
+        )
+        return (state[0] + dr.select(within, dr.abs(row[PARITY_COLUMN]), 0),)
 
-    return walk(rays.tree, visit, (real(0),), active)[0]
+    return traverse(rays.tree, visit, (real(0),), active)[0]

@@ -12,10 +12,10 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import FloatArray, IntArray, to_numpy, to_vector3
-from harnack.backend.arrays import aligned_integers
+from harnack.backend.arrays import upload_integers
 from harnack.backend.elementary import fmax, fmin
-from harnack.tree.balanced_tree import Node, State, for_each, walk
-from harnack.tree.triangle_tree import INDEX, NO_TRIANGLE, TriangleRays, corners_of
+from harnack.tree.balanced_tree import LoopValues, VisitedNode, for_each_primitive, traverse
+from harnack.tree.triangle_tree import NO_TRIANGLE, NUMBER_COLUMN, TriangleTree, corners_of
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real, Vec3
@@ -35,7 +35,7 @@ _MIXED = np.array(
 
 
 def borders_of_overlaps(
-    rays: TriangleRays, vertices: FloatArray, faces: IntArray, *, at_every_edge: bool = False
+    rays: TriangleTree, vertices: FloatArray, faces: IntArray, *, at_every_edge: bool = False
 ) -> tuple[IntArray, FloatArray]:
     """Which faces (k,) have parts covered by others in their plane, and knives (k, 3, 3): triangles
     that meet that plane in one edge of the covered part's border.
@@ -111,7 +111,7 @@ def _candidates(corners: FloatArray, normal: FloatArray, height: FloatArray) -> 
 
 
 def overlapping_faces(
-    rays: TriangleRays, vertices: FloatArray, faces: IntArray
+    rays: TriangleTree, vertices: FloatArray, faces: IntArray
 ) -> tuple[IntArray, IntArray]:
     """Pairs of faces (k,), (k,) that overlap in a plane, each both ways round.
 
@@ -125,7 +125,7 @@ def overlapping_faces(
     batches: list[IntArray] = []
     while len(rows):
         ends = tuple(to_vector3(backend, corner) for corner in np.moveaxis(corners[rows], 1, 0))
-        own = aligned_integers(backend, rows)
+        own = upload_integers(backend, rows)
         partners = _next_in_plane(rays, ends, own, sizes, backend.Float(after))
         number = to_numpy(partners).astype(np.int64)
         hit = number != NO_TRIANGLE
@@ -139,7 +139,7 @@ def overlapping_faces(
 
 
 def _next_in_plane(
-    rays: TriangleRays, corners: tuple[Vec3, ...], own: Any, sizes: Real, after: Real
+    rays: TriangleTree, corners: tuple[Vec3, ...], own: Any, sizes: Real, after: Real
 ) -> Any:
     """The first face with a number above `after` that overlaps the face `own`, one in each lane, in
     its plane, and is no smaller. sizes: of all faces; of two alike the latter counts as larger."""
@@ -149,21 +149,21 @@ def _next_in_plane(
     size = dr.gather(real, sizes, own)
     low, high = fmin(fmin(a, b), c) - _SAME, fmax(fmax(a, b), c) + _SAME
 
-    def visit(node: Node, state: State) -> tuple[Mask, State]:
+    def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
         below, above = vector(*node.head[:3]), vector(*node.head[3:6])
         open_ = dr.all((below <= high) & (above >= low))
-        return open_, for_each(node, open_ & node.is_leaf, nearer, state)
+        return open_, for_each_primitive(node, open_ & node.is_leaf, nearer, state)
 
-    def nearer(row: list[Real], active: Mask, state: State) -> State:
-        number = index(fmax(row[INDEX], real(0)))
+    def nearer(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
+        number = index(fmax(row[NUMBER_COLUMN], real(0)))
         theirs = corners_of(row, vector)
         their_size = dr.gather(real, sizes, number, active)
         larger = (their_size > size) | ((their_size == size) & (number > own))
-        taken = active & (row[INDEX] > after) & (number < state[0]) & larger
+        taken = active & (row[NUMBER_COLUMN] > after) & (number < state[0]) & larger
         taken &= _in_plane(corners, theirs) & _overlap(corners, theirs)
         return (dr.select(taken, number, state[0]),)
 
-    return walk(rays.tree, visit, (index(NO_TRIANGLE),))[0]
+    return traverse(rays.tree, visit, (index(NO_TRIANGLE),))[0]
 
 
 def _unit(vector: Vec3) -> Vec3:

@@ -1,10 +1,15 @@
 """Cells of a box that are proved empty or not: octrees, uniform grids, and components of cells.
 
-- `Octree`, from `octree` and `carve`: a box split where it is not proved empty.
-- `UniformGrid`: equal cubes on a backend, and how far a ray stays among the empty ones.
-- `OccupiedCells`: such a grid of the cells that may hold a set of points, made by an octree.
+- `RefinedCells`, from `refine_cells` and `nonempty_cells`: a box split where it is not proved
+  empty.
+- `EmptySpaceGrid`: equal cubes on a backend, and how far a ray stays among the empty ones.
+- `OccupancyGrid`: such a grid of the cells that may hold a set of points, made by an octree.
 - `largest_connected_component`: the largest group of cells that cells proved empty separate from
   the others.
+
+Components are groups of cells: cells that are not proved empty, joined by faces, edges and corners,
+and those of all groups but one count as empty for the march. A trial point that lies in one of them
+is not looked at, so that nothing else is hit.
 """
 
 from __future__ import annotations
@@ -19,28 +24,28 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
-from harnack.backend.arrays import aligned_integers
-from harnack.backend.elementary import clamp, fmin, largest_coordinate
+from harnack.backend.arrays import upload_integers
+from harnack.backend.elementary import clamp, fmin, max_norm
 from harnack.geometry import ConvexHull
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, IntArray, Mask, Real, Vec3
 
 __all__ = [
-    "Cells",
+    "BoxCells",
     "Clearance",
+    "EmptySpaceGrid",
     "GridCell",
-    "GridLayout",
-    "OccupiedCells",
-    "Octree",
-    "UniformGrid",
-    "carve",
-    "distances_to_full",
+    "GridData",
+    "OccupancyGrid",
+    "RefinedCells",
+    "distance_to_occupied",
+    "kdop_of_points",
     "largest_connected_component",
-    "octree",
-    "short_length",
-    "union",
-    "wrapped_points",
+    "merge_kdops",
+    "nonempty_cells",
+    "refine_cells",
+    "round_to_short_float",
 ]
 
 Clearance: TypeAlias = Callable[[FloatArray], FloatArray]
@@ -50,7 +55,7 @@ _OCTANTS = np.array(list(itertools.product((0.0, 1.0), repeat=3)))
 
 
 @dataclass(frozen=True)
-class Cells:
+class BoxCells:
     """Equal boxes: lower corners (n, 3), and the size (3,) of all."""
 
     corners: FloatArray
@@ -70,21 +75,21 @@ class Cells:
         """The least and the largest coordinates (3,) of all boxes."""
         return self.corners.min(axis=0), self.corners.max(axis=0) + self.size
 
-    def wrapped(self, slack: float) -> ConvexHull:
+    def bounding_kdop(self, slack: float) -> ConvexHull:
         """A polytope around all boxes, `slack` thicker, whose normals are the 26 directions of a
         cube's faces, edges and corners."""
-        return _wrapped(self.centers, 0.5 * self.size + slack)
+        return _kdop_of_boxes(self.centers, 0.5 * self.size + slack)
 
-    def split(self) -> Cells:
+    def octants(self) -> BoxCells:
         """The eight octants of each box."""
         half = 0.5 * self.size
-        return Cells((self.corners[:, None] + _OCTANTS * half).reshape(-1, 3), half)
+        return BoxCells((self.corners[:, None] + _OCTANTS * half).reshape(-1, 3), half)
 
-    def some(self, which: BoolArray) -> Cells:
+    def subset(self, which: BoolArray) -> BoxCells:
         """Those chosen by a mask (n,)."""
-        return Cells(self.corners[which], self.size)
+        return BoxCells(self.corners[which], self.size)
 
-    def proved_empty(self, clearance: Clearance, margin: float = 0.0) -> BoolArray:
+    def is_proved_empty(self, clearance: Clearance, margin: float = 0.0) -> BoolArray:
         """(n,) whether the ball around each cell, enlarged on all sides by `margin` times its size,
         is within the clearance of its center."""
         if not len(self.corners):
@@ -92,13 +97,14 @@ class Cells:
         return clearance(self.centers) > self.half_diagonal * (1 + 2 * margin + 1e-9)
 
 
-def wrapped_points(points: FloatArray, slack: float) -> ConvexHull:
-    """A polytope around points (n, 3), `slack` thicker, with the normals of `Cells.wrapped`."""
-    return _wrapped(points, np.full(3, slack))
+def kdop_of_points(points: FloatArray, slack: float) -> ConvexHull:
+    """A polytope around points (n, 3), `slack` thicker, with the normals of
+    `BoxCells.bounding_kdop`."""
+    return _kdop_of_boxes(points, np.full(3, slack))
 
 
-def union(one: ConvexHull, other: ConvexHull) -> ConvexHull:
-    """The smallest polytope with the normals of `Cells.wrapped` around two such."""
+def merge_kdops(one: ConvexHull, other: ConvexHull) -> ConvexHull:
+    """The smallest polytope with the normals of `BoxCells.bounding_kdop` around two such."""
     return ConvexHull(
         one.normals,
         np.maximum(one.offsets, other.offsets),
@@ -107,7 +113,7 @@ def union(one: ConvexHull, other: ConvexHull) -> ConvexHull:
     )
 
 
-def _wrapped(centers: FloatArray, half: FloatArray) -> ConvexHull:
+def _kdop_of_boxes(centers: FloatArray, half: FloatArray) -> ConvexHull:
     """The polytope around boxes of half sizes (3,)."""
     normals = np.array([v for v in itertools.product((-1, 0, 1), repeat=3) if any(v)], float)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -116,71 +122,76 @@ def _wrapped(centers: FloatArray, half: FloatArray) -> ConvexHull:
 
 
 @dataclass(frozen=True)
-class Octree:
+class RefinedCells:
     """Cells that fill a box.
 
-    leaves: those of the finest size, which may hold the set.
+    occupied: those of the finest size, which may hold the set.
     empty: those proved empty, coarsest first.
     """
 
-    leaves: Cells
-    empty: tuple[Cells, ...]
+    occupied: BoxCells
+    empty: tuple[BoxCells, ...]
 
 
-def octree(
-    cells: Cells, clearance: Clearance, most: int, finest: int, margin: float = 0.0
-) -> Octree:
+def refine_cells(
+    cells: BoxCells,
+    clearance: Clearance,
+    max_cells_per_round: int,
+    max_rounds: int,
+    margin: float = 0.0,
+) -> RefinedCells:
     """Split `cells`, again and again, where they are not proved empty.
 
-    most: cells tested in one round; a round that would test more is not made.
-    finest: rounds at most; each halves the edges.
-    margin: as for `Cells.proved_empty`.
+    max_cells_per_round: cells tested in one round; a round that would test more is not made.
+    max_rounds: rounds at most; each halves the edges.
+    margin: as for `BoxCells.is_proved_empty`.
     """
-    empty: list[Cells] = []
-    for _ in range(finest):
-        if 8 * len(cells.corners) > most:
+    empty: list[BoxCells] = []
+    for _ in range(max_rounds):
+        if 8 * len(cells.corners) > max_cells_per_round:
             break
-        split = cells.split()
-        free = split.proved_empty(clearance, margin)
-        cells = split.some(~free)
-        empty.append(split.some(free))
-    return Octree(cells, tuple(empty))
+        split = cells.octants()
+        free = split.is_proved_empty(clearance, margin)
+        cells = split.subset(~free)
+        empty.append(split.subset(free))
+    return RefinedCells(cells, tuple(empty))
 
 
-def carve(
+def nonempty_cells(
     lower: FloatArray, upper: FloatArray, clearance: Clearance, most: int, finest: int
-) -> Cells:
+) -> BoxCells:
     """The leaves of the octree of one box; none if all of it is proved empty."""
-    root = Cells(np.array(lower)[None], np.array(upper) - np.array(lower))
-    return octree(root, clearance, most, finest).leaves
+    root = BoxCells(np.array(lower)[None], np.array(upper) - np.array(lower))
+    return refine_cells(root, clearance, most, finest).occupied
 
 
 # So much of the margin around an empty cell, in cells, is left to the rounding of positions.
 _ROUNDING = 1 / 64
 
 
-Layout = TypeVar("Layout", bound="GridLayout")
+Layout = TypeVar("Layout", bound="GridData")
 
 
 @dataclass(frozen=True)
-class GridLayout:
+class GridData:
     """A grid of cells, in NumPy.
 
     origin: (3,) its lower corner, numbers of single precision.
-    cell: the side of a cell (`short_length`).
+    cell_size: the side of a cell (`round_to_short_float`).
     shape: cells along x, y and z.
-    free: (cells,), x fastest: 0 where a cell is not empty, else the distance to the nearest that is
-        not, in cells, in the largest of the three coordinates (chessboard distance).
+    empty_distance: (cells,), x fastest: 0 where a cell is not empty, else the distance to the
+        nearest that is not, in cells, in the largest of the three coordinates (chessboard
+        distance).
     """
 
     origin: FloatArray
-    cell: float
+    cell_size: float
     shape: tuple[int, int, int]
-    free: IntArray
+    empty_distance: IntArray
 
 
 @dataclass(frozen=True)
-class UniformGrid:
+class EmptySpaceGrid:
     """A grid on a backend, all numbers of it as kernel parameters.
 
     Outside of the grid the same holds as in its nearest cell.
@@ -190,13 +201,13 @@ class UniformGrid:
 
     backend: Backend
     origin: Vec3
-    size: Real
+    cell_size: Real
     shape: Vec3
-    free: Any
+    empty_distance: Any
     margin: float
 
     @staticmethod
-    def placed(backend: Backend, layout: GridLayout) -> tuple[Backend, Vec3, Real, Vec3, Any]:
+    def upload_layout(backend: Backend, layout: GridData) -> tuple[Backend, Vec3, Real, Vec3, Any]:
         """The first five attributes of a grid."""
 
         def vector(numbers: Any) -> Vec3:
@@ -205,24 +216,24 @@ class UniformGrid:
         return (
             backend,
             vector(layout.origin),
-            dr.opaque(backend.Float, layout.cell),
+            dr.opaque(backend.Float, layout.cell_size),
             vector(layout.shape),
-            aligned_integers(backend, layout.free),
+            upload_integers(backend, layout.empty_distance),
         )
 
     def cell(self, p: Vec3) -> GridCell:
         """The cell in which p lies, or the nearest one."""
-        place = (p - self.origin) / self.size
+        place = (p - self.origin) / self.cell_size
         corner = type(p)(*(clamp(dr.floor(place[k]), 0, self.shape[k] - 1) for k in range(3)))
         x, y, z = (self.backend.UInt32(corner[k]) for k in range(3))
         row, layer = self.backend.UInt32(self.shape.x), self.backend.UInt32(self.shape.y)
         return GridCell(self, place, corner, x + row * (y + layer * z))
 
-    def run(self, p: Vec3, d: Vec3, length: Real) -> Real:
+    def empty_run(self, p: Vec3, d: Vec3, length: Real) -> Real:
         """A length s for which p + s d is proved to stay in empty cells; it may exceed `length`.
 
-        Proof. The cell of a point and all that are fewer than `free` cells away are empty, and so
-        is
+        Proof. The cell of a point and all that are fewer than `empty_distance` cells away are
+        empty, and so is
         the margin around each: together a cube, wider by the margin than these cells. A step leaves
         the cells by at most `margin` less `_ROUNDING`, so that all of it is empty; the rest of the
         margin is for the rounding of positions. Steps end where a cell is not empty.
@@ -230,8 +241,10 @@ class UniformGrid:
 
         def state_of(s: Real) -> tuple[Real, Mask]:
             cell = self.cell(dr.fma(type(p)(s), d, p))
-            free = cell.free
-            return dr.select(free > 0, s + cell.exit(d, self.backend.Float(free)), s), free > 0
+            free = cell.empty_distance
+            return dr.select(
+                free > 0, s + cell.exit_distance(d, self.backend.Float(free)), s
+            ), free > 0
 
         def body(s: Real, active: Mask) -> tuple[Real, Mask]:
             further, empty = state_of(s)
@@ -246,19 +259,19 @@ class UniformGrid:
 
         return dr.while_loop((start, active), running, body, label="empty cells")[0]
 
-    def resolves(self, o: Vec3, end: Real) -> Mask:
+    def is_resolved(self, o: Vec3, end: Real) -> Mask:
         """Whether rounding leaves points of rays up to `end` in their cells or close to them."""
-        rounding = 4 * self.backend.epsilon * (largest_coordinate(o) + end)
-        return (rounding < _ROUNDING * self.size) & dr.all(dr.isfinite(o))
+        rounding = 4 * self.backend.machine_epsilon * (max_norm(o) + end)
+        return (rounding < _ROUNDING * self.cell_size) & dr.all(dr.isfinite(o))
 
-    def free_until(self, o: Vec3, d: Vec3, t: Real, end: Real) -> Real:
+    def end_of_empty_run(self, o: Vec3, d: Vec3, t: Real, end: Real) -> Real:
         """A t, at most `end`, up to which rays o + t d, |d| = 1, stay in empty cells from `t` on.
 
         It is `t` itself where coordinates are so large that rounding might lead into another cell:
         a point is off by at most four roundings of the largest number in it.
         """
-        length = dr.select(self.resolves(o, end), end - t, 0)
-        run = self.run(dr.fma(type(o)(t), d, o), d, length)
+        length = dr.select(self.is_resolved(o, end), end - t, 0)
+        run = self.empty_run(dr.fma(type(o)(t), d, o), d, length)
         return dr.select(length > 0, fmin(t + run, end), t)
 
 
@@ -266,22 +279,22 @@ class UniformGrid:
 class GridCell:
     """The cells in which points lie.
 
-    place: the coordinates of the points, in cells.
+    cell_coordinates: the coordinates of the points, in cells.
     corner: the lower corner of the cell, in cells.
     index: of the cell.
     """
 
-    grid: UniformGrid
-    place: Vec3
+    grid: EmptySpaceGrid
+    cell_coordinates: Vec3
     corner: Vec3
     index: Any
 
     @property
-    def free(self) -> Any:
-        """See `GridLayout`."""
-        return dr.gather(self.grid.backend.UInt32, self.grid.free, self.index)
+    def empty_distance(self) -> Any:
+        """See `GridData`."""
+        return dr.gather(self.grid.backend.UInt32, self.grid.empty_distance, self.index)
 
-    def exit(self, d: Vec3, around: Real = 1.0) -> Real:
+    def exit_distance(self, d: Vec3, around: Real = 1.0) -> Real:
         """How far the path with direction d stays among the cells fewer than `around` away, or in
         the margin around them; infinite where the grid ends there."""
         length: Real = self.grid.backend.Float(dr.inf)
@@ -289,15 +302,17 @@ class GridCell:
         for k in range(3):
             upper, lower = self.corner[k] + around, self.corner[k] + 1 - around
             rising = d[k] > 0
-            gap = dr.select(rising, upper - self.place[k], self.place[k] - lower)
+            gap = dr.select(
+                rising, upper - self.cell_coordinates[k], self.cell_coordinates[k] - lower
+            )
             ends = dr.select(rising, upper >= self.grid.shape[k], lower <= 0)
             reach = (gap + beyond) / dr.abs(d[k])
             length = fmin(dr.select(ends | (d[k] == 0), dr.inf, reach), length)
-        return length * self.grid.size
+        return length * self.grid.cell_size
 
 
-def distances_to_full(empty: BoolArray) -> IntArray:
-    """`GridLayout.free` of cells (nz, ny, nx)."""
+def distance_to_occupied(empty: BoolArray) -> IntArray:
+    """`GridData.empty_distance` of cells (nz, ny, nx)."""
     if empty.all():
         return np.full(empty.size, max(empty.shape), np.int64)
     from scipy import ndimage  # here: a third of a second that few need
@@ -306,26 +321,27 @@ def distances_to_full(empty: BoolArray) -> IntArray:
     return np.asarray(chessboard(empty), dtype=np.int64).ravel()
 
 
-def short_length(size: float) -> float:
-    """A length near `size`, off by at most one part in 4,096, that is a power of two times an
+def round_to_short_float(size: float) -> float:
+    """A length near `cell_size`, off by at most one part in 4,096, that is a power of two times an
     integer below 2^13, so that single precision holds its multiples exactly."""
     mantissa, exponent = math.frexp(size)
     return math.ldexp(round(mantissa * 4096), exponent - 12)
 
 
-# The margin of `UniformGrid`; and the rounds of the octree, whose roots are 2^_ROUNDS cells wide.
+# The margin of `EmptySpaceGrid`; and the rounds of the octree, whose roots are 2^_ROUNDS cells
+# wide.
 _MARGIN, _ROUNDS = 1 / 16, 3
 
 
 @dataclass(frozen=True)
-class OccupiedCells(GridLayout):
-    """A grid whose empty cells, and the margins around them (`UniformGrid`), hold no point of a
+class OccupancyGrid(GridData):
+    """A grid whose empty cells, and the margins around them (`EmptySpaceGrid`), hold no point of a
     set."""
 
     @classmethod
-    def of(
+    def from_clearance(
         cls, lower: FloatArray, upper: FloatArray, clearance: Clearance, across: int
-    ) -> OccupiedCells:
+    ) -> OccupancyGrid:
         """A grid over a box that holds the set, with about `across` cells along its longest side.
 
         Outside of the box the set has no points, so an empty cell at the box's faces is empty
@@ -334,7 +350,7 @@ class OccupiedCells(GridLayout):
         """
         reach = np.abs([lower, upper]).max().astype(np.float32)
         cell = max(float((upper - lower).max()) / across, float(np.spacing(reach)))
-        cell = short_length(cell)
+        cell = round_to_short_float(cell)
         # For rounding the corner down, and for the margin beyond the box.
         room = (_MARGIN + 1e-3) * cell
         origin = np.nextafter((lower - room).astype(np.float32), np.float32(-np.inf))
@@ -342,46 +358,48 @@ class OccupiedCells(GridLayout):
         side = cell * 2**_ROUNDS
         nx, ny, nz = (int(count) for count in np.ceil((upper + room - origin) / side))
         places = np.indices((nx, ny, nz)).reshape(3, -1).T
-        roots = Cells(origin + side * places, np.full(3, side))
-        roots = roots.some(~roots.proved_empty(clearance, _MARGIN))
-        cells = octree(roots, clearance, np.iinfo(np.int64).max, _ROUNDS, _MARGIN).leaves
+        roots = BoxCells(origin + side * places, np.full(3, side))
+        roots = roots.subset(~roots.is_proved_empty(clearance, _MARGIN))
+        cells = refine_cells(roots, clearance, np.iinfo(np.int64).max, _ROUNDS, _MARGIN).occupied
         nx, ny, nz = (count << _ROUNDS for count in (nx, ny, nz))
         empty = np.ones((nz, ny, nx), np.bool_)
         x, y, z = np.round((cells.corners - origin) / cell).astype(np.int64).T
         empty[z, y, x] = False
-        return cls(origin, cell, (nx, ny, nz), distances_to_full(empty))
+        return cls(origin, cell, (nx, ny, nz), distance_to_occupied(empty))
 
     @classmethod
-    def none(cls) -> OccupiedCells:
+    def empty(cls) -> OccupancyGrid:
         """A grid around the empty set: one cell, and all is empty."""
-        return cls(np.zeros(3), 1.0, (1, 1, 1), distances_to_full(np.ones((1, 1, 1), np.bool_)))
+        return cls(np.zeros(3), 1.0, (1, 1, 1), distance_to_occupied(np.ones((1, 1, 1), np.bool_)))
 
-    def centers(self) -> FloatArray:
+    def occupied_centers(self) -> FloatArray:
         """The centers (n, 3) of the cells that are not empty."""
         x, y, z = self.shape
-        places = np.argwhere((self.free == 0).reshape(z, y, x))[:, ::-1]
-        return self.origin + self.cell * (places + 0.5)
+        places = np.argwhere((self.empty_distance == 0).reshape(z, y, x))[:, ::-1]
+        return self.origin + self.cell_size * (places + 0.5)
 
-    def thinned(self, clearance: Clearance) -> OccupiedCells:
+    def refined(self, clearance: Clearance) -> OccupancyGrid:
         """The same grid in which cells count as empty as well if their eight octants are proved
         empty, with the same margin around the cell."""
         x, y, z = self.shape
-        full = (self.free == 0).reshape(z, y, x)
+        full = (self.empty_distance == 0).reshape(z, y, x)
         places = np.argwhere(full)[:, ::-1]
-        halves = Cells(self.origin + self.cell * places, np.full(3, self.cell)).split()
-        full[full] = ~halves.proved_empty(clearance, 2 * _MARGIN).reshape(-1, 8).all(axis=1)
-        return replace(self, free=distances_to_full(~full))
+        halves = BoxCells(
+            self.origin + self.cell_size * places, np.full(3, self.cell_size)
+        ).octants()
+        full[full] = ~halves.is_proved_empty(clearance, 2 * _MARGIN).reshape(-1, 8).all(axis=1)
+        return replace(self, empty_distance=distance_to_occupied(~full))
 
-    def upload(self, backend: Backend) -> UniformGrid:
+    def upload(self, backend: Backend) -> EmptySpaceGrid:
         """The grid on a backend."""
-        return UniformGrid(*UniformGrid.placed(backend, self), _MARGIN)
+        return EmptySpaceGrid(*EmptySpaceGrid.upload_layout(backend, self), _MARGIN)
 
 
 # Cells that share a face, an edge or a corner are neighbors.
-_AROUND = np.ones((3, 3, 3), np.bool_)
+_NEIGHBOR_STENCIL = np.ones((3, 3, 3), np.bool_)
 
 
-def largest_connected_component(cells: OccupiedCells) -> OccupiedCells:
+def largest_connected_component(cells: OccupancyGrid) -> OccupancyGrid:
     """The grid in which only the cells of one connected group are not empty: that with the largest
     projections, in all, along the three axes.
 
@@ -399,25 +417,26 @@ def largest_connected_component(cells: OccupiedCells) -> OccupiedCells:
     that are closed and have no point in common; cubes have a point in common if they share at least
     a corner, that is, if they are neighbors. So it lies in the cells of one group.
 
-    Proof that rays may jump across the other groups, with the margin that `UniformGrid.run` goes
-    beyond the cells that it jumps across. A neighbor of a cell of another group belongs to that
-    group or was empty before, and the margin is less than a cell, so the margin holds nothing of
-    this group; the margin of a cell that was empty before holds nothing of the set at all.
+    Proof that rays may jump across the other groups, with the margin that
+    `EmptySpaceGrid.empty_run` goes beyond the cells that it jumps across. A neighbor of a cell of
+    another group belongs to that group or was empty before, and the margin is less than a cell, so
+    the margin holds nothing of this group; the margin of a cell that was empty before holds nothing
+    of the set at all.
     """
     x, y, z = cells.shape
-    full = (cells.free == 0).reshape(z, y, x)
+    full = (cells.empty_distance == 0).reshape(z, y, x)
     if not full.any():
         return cells
     from scipy import ndimage  # here: a third of a second that few need
 
-    groups, count = cast("Any", ndimage).label(full, _AROUND)
+    groups, count = cast("Any", ndimage).label(full, _NEIGHBOR_STENCIL)
     group, places = groups[full], np.argwhere(full)
-    sizes = sum(_shadows(group, np.delete(places, axis, 1), count) for axis in range(3))
+    sizes = sum(_projection_sizes(group, np.delete(places, axis, 1), count) for axis in range(3))
     wanted = groups == 1 + int(np.argmax(sizes))
-    return replace(cells, free=distances_to_full(~wanted))
+    return replace(cells, empty_distance=distance_to_occupied(~wanted))
 
 
-def _shadows(group: IntArray, places: IntArray, count: int) -> IntArray:
+def _projection_sizes(group: IntArray, places: IntArray, count: int) -> IntArray:
     """(count,) the number of different places (n, 2) of each group from 1 to count."""
     width = 1 + places.max(axis=0)
     index = (group * width[0] + places[:, 0]) * width[1] + places[:, 1]

@@ -1,8 +1,9 @@
 """Lists of nodes and primitives of a tree, one for each lane, made and visited in Dr.Jit.
 
-- `Lists`: many lists of numbers, one after the other in memory.
-- `make_lists`: from a walk that counts entries and one that writes them.
-- `walk_lists`: visits the subtrees of the listed nodes; `each_entry`: a loop over the entries.
+- `LaneLists`: many lists of numbers, one after the other in memory.
+- `build_lists`: from a walk that counts entries and one that writes them.
+- `traverse_subtrees`: visits the subtrees of the listed nodes; `for_each_entry`: a loop over the
+  entries.
 """
 
 from __future__ import annotations
@@ -15,13 +16,13 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import IntArray, to_numpy
-from harnack.backend.arrays import aligned_integers
-from harnack.tree.balanced_tree import Node, PackedTree, State, Visit
+from harnack.backend.arrays import upload_integers
+from harnack.tree.balanced_tree import LoopValues, PackedTree, Visit, VisitedNode
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask
 
-Put: TypeAlias = "Callable[[Any, Any, Mask], None]"
+WriteEntry: TypeAlias = "Callable[[Any, Any, Mask], None]"
 """Writes an entry, where active, at a place in the list of its lane."""
 
 
@@ -29,7 +30,7 @@ _TOO_LONG = "more than 2^31 entries of lists: cut the input in parts"
 
 
 @dataclass(frozen=True)
-class Lists:
+class LaneLists:
     """A list for each lane: where it begins in `entries`, how long it is, all entries."""
 
     first: Any
@@ -37,19 +38,19 @@ class Lists:
     entries: Any
 
     @classmethod
-    def of_root(cls, backend: Backend) -> Lists:
+    def of_root(cls, backend: Backend) -> LaneLists:
         """One list, of the root of a tree."""
         index = backend.UInt32
         return cls(index(0), index(1), index(0))
 
     @classmethod
-    def none(cls, backend: Backend) -> Lists:
+    def empty(cls, backend: Backend) -> LaneLists:
         """One list, which is empty."""
         index = backend.UInt32
         return cls(index(0), index(0), index(0))
 
     @classmethod
-    def joined(cls, backend: Backend, parts: list[Lists]) -> Lists:
+    def concatenate(cls, backend: Backend, parts: list[LaneLists]) -> LaneLists:
         """The lists of all lanes, part by part; each part begins with its first entry."""
         counts = np.concatenate([to_numpy(one.count) for one in parts])
         entries = [to_numpy(one.entries)[: int(to_numpy(one.count).sum())] for one in parts]
@@ -57,46 +58,48 @@ class Lists:
         if first[-1] + counts[-1] >= 2**31:
             raise ValueError(_TOO_LONG)
         arrays = first, counts, np.append(np.concatenate(entries), 0)
-        return cls(*(aligned_integers(backend, one) for one in arrays))
+        return cls(*(upload_integers(backend, one) for one in arrays))
 
-    def some(self, backend: Backend, lanes: IntArray) -> Lists:
+    def subset(self, backend: Backend, lanes: IntArray) -> LaneLists:
         """The lists of these lanes; a lane may occur several times."""
         index = backend.UInt32
-        place = aligned_integers(backend, lanes)
+        place = upload_integers(backend, lanes)
         first, count = (dr.gather(index, one, place) for one in (self.first, self.count))
-        return Lists(first, count, self.entries)
+        return LaneLists(first, count, self.entries)
 
 
-def make_lists(backend: Backend, walk: Callable[[Put | None], Any]) -> Lists:
+def build_lists(backend: Backend, walk: Callable[[WriteEntry | None], Any]) -> LaneLists:
     """Lists of what a walk finds. walk: gives the number of entries of each lane, and puts each of
-    them if it is given a `Put`."""
+    them if it is given a `WriteEntry`."""
     index = backend.UInt32
     count = walk(None)
     dr.eval(count)
     start = np.concatenate([[0], np.cumsum(to_numpy(count).astype(np.int64))])
     if start[-1] >= 2**31:
         raise ValueError(_TOO_LONG)
-    first, entries = aligned_integers(backend, start[:-1]), dr.zeros(index, max(1, int(start[-1])))
+    first, entries = upload_integers(backend, start[:-1]), dr.zeros(index, max(1, int(start[-1])))
 
     def put(place: Any, entry: Any, active: Mask) -> None:
         dr.scatter(entries, index(entry), first + place, active)
 
     dr.eval(walk(put), entries)
-    return Lists(first, count, entries)
+    return LaneLists(first, count, entries)
 
 
-def walk_lists(tree: PackedTree, lists: Lists, visit: Visit, state: State) -> State:
+def traverse_subtrees(
+    tree: PackedTree, lists: LaneLists, visit: Visit, state: LoopValues
+) -> LoopValues:
     """The state after a walk (`hierarchy.walk`) over the subtrees of the listed nodes."""
     index = tree.backend.UInt32
 
-    def body(place: Any, i: Any, end: Any, *state: Any) -> State:
+    def body(place: Any, i: Any, end: Any, *state: Any) -> LoopValues:
         begins = i == end
         entry = dr.gather(index, lists.entries, lists.first + place, begins & (place < lists.count))
         i = dr.select(begins, entry, i)
         head = tree.head(i)
         after, is_leaf, number = index(head[6]), head[7] >= 0, index(dr.abs(head[7]))
         end = dr.select(begins, after, end)
-        descend, state = visit(Node(tree, i, tuple(head[:6]), number, is_leaf), state)
+        descend, state = visit(VisitedNode(tree, i, tuple(head[:6]), number, is_leaf), state)
         i = dr.select(descend & ~is_leaf, number, after)
         return place + dr.select(i == end, index(1), index(0)), i, end, *state
 
@@ -107,13 +110,16 @@ def walk_lists(tree: PackedTree, lists: Lists, visit: Visit, state: State) -> St
     return dr.while_loop(start, more, body, label="subtrees")[3:]
 
 
-def each_entry(
-    backend: Backend, lists: Lists, body: Callable[[Any, Mask, State], State], state: State
-) -> State:
+def for_each_entry(
+    backend: Backend,
+    lists: LaneLists,
+    body: Callable[[Any, Mask, LoopValues], LoopValues],
+    state: LoopValues,
+) -> LoopValues:
     """The state after `body` of each entry of the lists, where active."""
     index = backend.UInt32
 
-    def step(place: Any, *state: Any) -> State:
+    def step(place: Any, *state: Any) -> LoopValues:
         active = place < lists.count
         entry = dr.gather(index, lists.entries, lists.first + place, active)
         return place + 1, *body(entry, active, state)

@@ -12,21 +12,26 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray, IntArray, to_numpy, to_vector3
-from harnack.backend.arrays import aligned_integers
+from harnack.backend.arrays import upload_integers
 from harnack.tree.coplanar import borders_of_overlaps
-from harnack.tree.triangle_tree import NO_TRIANGLE, Frame, TriangleRays
+from harnack.tree.triangle_tree import NO_TRIANGLE, RayFrame, TriangleTree
 
-__all__ = ["on_level", "pieces_of_faces", "windings_beside", "windings_of_sides"]
+__all__ = [
+    "separates_levels",
+    "split_intersecting_faces",
+    "winding_numbers_of_sides",
+    "windings_of_sides",
+]
 
 # In units of the mesh's size. Nearer than that two places are the same.
-_SAME = 1e-12
+_COINCIDENT = 1e-12
 # Pieces thinner than that are left out: others that touch them stand for them.
-_THINNEST = 1e-11
-_MIDDLE = (1 / 3, 1 / 3, 1 / 3)
+_MIN_THICKNESS = 1e-11
+_CENTROID = (1 / 3, 1 / 3, 1 / 3)
 
 
-def pieces_of_faces(
-    rays: TriangleRays, vertices: FloatArray, faces: IntArray, *, covered_whole: bool = False
+def split_intersecting_faces(
+    rays: TriangleTree, vertices: FloatArray, faces: IntArray, *, covered_whole: bool = False
 ) -> tuple[FloatArray, IntArray]:
     """Triangles (k, 3, 3) that fill the faces (m, 3), none of which passes through another or is
     covered by another in part; and (k,) which face each is of, and turns as.
@@ -54,30 +59,32 @@ def pieces_of_faces(
     pieces, owner = _cut_up(corners[~whole], number[cut], knives)
     edges = pieces - np.roll(pieces, 1, axis=1)
     longest = np.linalg.norm(edges, axis=2).max(axis=1)
-    thick = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) > _THINNEST * longest
+    thick = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) > _MIN_THICKNESS * longest
     owner = np.concatenate([np.flatnonzero(whole), np.flatnonzero(~whole)[owner[thick]]])
     return np.concatenate([corners[whole], pieces[thick]]), owner
 
 
-def on_level(rays: TriangleRays, pieces: FloatArray, levels: tuple[float, ...]) -> BoolArray:
+def separates_levels(
+    rays: TriangleTree, pieces: FloatArray, levels: tuple[float, ...]
+) -> BoolArray:
     """(k,) whether the winding number passes a level from one side of a triangle to the other."""
-    low, high = windings_beside(rays, pieces)
+    low, high = winding_numbers_of_sides(rays, pieces)
     return np.any([(low < level) & (level < high) for level in levels], axis=0)
 
 
-def windings_beside(
-    rays: TriangleRays, pieces: FloatArray, shares: tuple[float, float, float] = _MIDDLE
+def winding_numbers_of_sides(
+    rays: TriangleTree, pieces: FloatArray, barycentric: tuple[float, float, float] = _CENTROID
 ) -> tuple[FloatArray, FloatArray]:
     """(k,), (k,): the smaller and the larger of the winding numbers on both sides of triangles.
 
-    shares: barycentric coordinates of the place; by default the center.
+    barycentric: barycentric coordinates of the place; by default the center.
     """
-    front, back = windings_of_sides(rays, pieces, shares)
+    front, back = windings_of_sides(rays, pieces, barycentric)
     return np.minimum(front, back), np.maximum(front, back)
 
 
 def windings_of_sides(
-    rays: TriangleRays, pieces: FloatArray, shares: tuple[float, float, float] = _MIDDLE
+    rays: TriangleTree, pieces: FloatArray, shares: tuple[float, float, float] = _CENTROID
 ) -> tuple[FloatArray, FloatArray]:
     """(k,), (k,): the winding numbers in front of triangles, whence they are seen to run
     counter-clockwise, and behind them.
@@ -91,16 +98,16 @@ def windings_of_sides(
     length = np.linalg.norm(normal, axis=1, keepdims=True)
     normal = np.where(length > 0, normal / np.where(length > 0, length, 1), [0.0, 0.0, 1.0])
     place = shares[0] * a + shares[1] * b + shares[2] * c
-    frame = Frame.along(backend, to_vector3(backend, place), to_vector3(backend, normal))
+    frame = RayFrame.along(backend, to_vector3(backend, place), to_vector3(backend, normal))
     front, back = (
-        to_numpy(rays.turns_ahead(frame, backend.Float(dr.opaque(backend.Float, t))))
-        for t in (_SAME, -_SAME)
+        to_numpy(rays.signed_crossings_ahead(frame, backend.Float(dr.opaque(backend.Float, t))))
+        for t in (_COINCIDENT, -_COINCIDENT)
     )
     return front, back
 
 
 def _crossing_faces(
-    rays: TriangleRays, vertices: FloatArray, faces: IntArray
+    rays: TriangleTree, vertices: FloatArray, faces: IntArray
 ) -> tuple[IntArray, IntArray]:
     """Pairs of faces (k,), (k,) that pass through one another, each both ways round."""
     ends = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
@@ -110,40 +117,40 @@ def _crossing_faces(
     first = np.searchsorted(np.sort(edge), np.arange(len(edges) + 1))
     crossed, crossing = _crossings_of_edges(rays, vertices, faces, edges)
     count = first[crossed + 1] - first[crossed]
-    rows = np.repeat(first[crossed], count) + _counted(count)
+    rows = np.repeat(first[crossed], count) + _ranks_in_groups(count)
     one, other = beside[rows], np.repeat(crossing, count)
     pairs = np.concatenate([np.column_stack([one, other]), np.column_stack([other, one])])
     pairs = np.unique(pairs[pairs[:, 0] != pairs[:, 1]], axis=0)
     return pairs[:, 0], pairs[:, 1]
 
 
-def _counted(count: IntArray) -> IntArray:
+def _ranks_in_groups(count: IntArray) -> IntArray:
     """0, 1, .. for each of the counts in turn."""
     first = np.cumsum(count) - count
     return cast("IntArray", np.arange(int(count.sum())) - np.repeat(first, count))
 
 
 def _crossings_of_edges(
-    rays: TriangleRays, vertices: FloatArray, faces: IntArray, edges: IntArray
+    rays: TriangleTree, vertices: FloatArray, faces: IntArray, edges: IntArray
 ) -> tuple[IntArray, IntArray]:
     """Which edges (m, 2) cross which faces that have neither end, or meet their borders: indices of
     both."""
     backend = rays.tree.backend
-    corner = [aligned_integers(backend, one) for one in faces.T]
+    corner = [upload_integers(backend, one) for one in faces.T]
     way = vertices[edges[:, 1]] - vertices[edges[:, 0]]
     length = np.linalg.norm(way, axis=1)
     rows = np.flatnonzero(length > 0)
-    after_t, after_n = np.full(len(edges), -_SAME), np.full(len(edges), NO_TRIANGLE, np.int64)
+    after_t, after_n = np.full(len(edges), -_COINCIDENT), np.full(len(edges), NO_TRIANGLE, np.int64)
     found: list[tuple[IntArray, IntArray]] = []
     while len(rows):
         o = to_vector3(backend, vertices[edges[rows, 0]])
         d = to_vector3(backend, way[rows] / length[rows, None])
-        frame = Frame.along(backend, o, d)
-        end = backend.Float(length[rows] + _SAME)
-        p, q = (aligned_integers(backend, one) for one in edges[rows].T)
+        frame = RayFrame.along(backend, o, d)
+        end = backend.Float(length[rows] + _COINCIDENT)
+        p, q = (upload_integers(backend, one) for one in edges[rows].T)
 
-        after = backend.Float(after_t[rows]), aligned_integers(backend, after_n[rows])
-        t, n = _next_of_others(rays, corner, frame, (p, q), end, after)
+        after = backend.Float(after_t[rows]), upload_integers(backend, after_n[rows])
+        t, n = _next_foreign_crossing(rays, corner, frame, (p, q), end, after)
         number = to_numpy(n).astype(np.int64)
         hit = number != NO_TRIANGLE
         after_t[rows], after_n[rows] = to_numpy(t), number
@@ -152,8 +159,8 @@ def _crossings_of_edges(
     return np.concatenate([one for one, _ in found]), np.concatenate([one for _, one in found])
 
 
-def _next_of_others(
-    rays: TriangleRays, corner: list[Any], frame: Frame, ends: tuple[Any, Any], end: Any,
+def _next_foreign_crossing(
+    rays: TriangleTree, corner: list[Any], frame: RayFrame, ends: tuple[Any, Any], end: Any,
     after: tuple[Any, Any],
 ) -> tuple[Any, Any]:  # fmt: skip
     """The first crossing of rays behind another one with a face that has neither of two vertices;
@@ -161,7 +168,7 @@ def _next_of_others(
     index = rays.tree.backend.UInt32
 
     def body(t: Any, n: Any, active: Any) -> tuple[Any, ...]:
-        t, n, _, _ = rays.next(frame, (t, n), end, active, _SAME)
+        t, n, _, _ = rays.next_crossing(frame, (t, n), end, active, _COINCIDENT)
         known = active & (n != NO_TRIANGLE)
         ours = [dr.gather(index, one, n, known) for one in corner]
         return t, n, known & dr.any([(one == ends[0]) | (one == ends[1]) for one in ours])
@@ -186,9 +193,9 @@ def _cut_up(pieces: FloatArray, rows: IntArray, knives: FloatArray) -> tuple[Flo
     by, whole = np.arange(len(knives)), np.arange(len(pieces))
     while True:
         height = _heights(pieces[rows], knives[by])
-        height[np.abs(height) < _SAME] = 0
+        height[np.abs(height) < _COINCIDENT] = 0
         meets = (height.max(axis=1) > 0) & (height.min(axis=1) < 0)
-        meets[meets] = _meets(pieces[rows[meets]], height[meets], knives[by[meets]])
+        meets[meets] = _cut_meets_triangle(pieces[rows[meets]], height[meets], knives[by[meets]])
         rows, by, height = rows[meets], by[meets], height[meets]
         is_cut = np.zeros(len(pieces), np.bool_)
         is_cut[rows] = True
@@ -232,7 +239,7 @@ def _heights(pieces: FloatArray, knives: FloatArray) -> FloatArray:
     return np.einsum("nij,nj->ni", pieces - a[:, None], normal)
 
 
-def _meets(pieces: FloatArray, height: FloatArray, knives: FloatArray) -> BoolArray:
+def _cut_meets_triangle(pieces: FloatArray, height: FloatArray, knives: FloatArray) -> BoolArray:
     """(k,) whether the segment in which a plane cuts a triangle meets the plane's triangle."""
     a, b, c = np.moveaxis(knives, 1, 0)
     normal = np.cross(b - a, c - a)

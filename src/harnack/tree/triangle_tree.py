@@ -15,23 +15,31 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import FloatArray, IntArray
-from harnack.backend.elementary import across, clamp, fmax, fmin, largest_coordinate
-from harnack.tree.balanced_tree import Hierarchy, Node, PackedTree, State, for_each, pack, walk
+from harnack.backend.elementary import clamp, fmax, fmin, max_norm, orthonormal_basis
+from harnack.tree.balanced_tree import (
+    BalancedTree,
+    LoopValues,
+    PackedTree,
+    VisitedNode,
+    for_each_primitive,
+    pack_tree,
+    traverse,
+)
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
 
     # A point across a ray (u, v) and along it.
-    Seen: TypeAlias = tuple[Real, Real, Real]
+    RayCoordinates: TypeAlias = tuple[Real, Real, Real]
 
 # Columns of a record; 0 to 8 are the corners.
-PARITY, INDEX, EDGES = 9, 10, 11
+PARITY_COLUMN, NUMBER_COLUMN, INVERSE_SQUARES_COLUMN = 9, 10, 11
 # A ray that is so many roundings of a coordinate from an edge counts as passing through the edge.
-_CLOSE = 4.0
+_EDGE_ROUNDINGS = 4.0
 # A crossing so many roundings of a coordinate from the end of a line may be on either side of it.
-_UNSURE = 64.0
+_UNCERTAIN_ROUNDINGS = 64.0
 # Triangles are numbered in floats; single precision holds no larger integers without gaps.
-MOST_TRIANGLES = 2**24
+MAX_TRIANGLES = 2**24
 NO_TRIANGLE = 0xFFFFFFFF
 
 
@@ -49,20 +57,23 @@ def triangle_records(vertices: FloatArray, faces: IntArray) -> FloatArray:
     return np.concatenate([corners.reshape(-1, 9), parity, number, inverse], axis=1)
 
 
-def in_slots(tree: Hierarchy, records: FloatArray) -> FloatArray:
+def records_in_slots(tree: BalancedTree, records: FloatArray) -> FloatArray:
     """Records (leaves, leaf_size, c); empty slots are points at the leaf's first corner."""
-    placed = tree.gather(records)
-    empty = tree.slots < 0
+    placed = tree.values_in_slots(records)
+    empty = tree.leaf_slots < 0
     first = np.tile(placed[:, 0, :3], 3)
     placed[empty, :9] = np.broadcast_to(first[:, None], (*empty.shape, 9))[empty]
-    placed[empty, PARITY], placed[empty, INDEX] = 1.0, -1.0
-    placed[empty, EDGES : EDGES + 3] = 0.0
+    placed[empty, PARITY_COLUMN], placed[empty, NUMBER_COLUMN] = 1.0, -1.0
+    placed[empty, INVERSE_SQUARES_COLUMN : INVERSE_SQUARES_COLUMN + 3] = 0.0
     return placed
 
 
-def box_levels(tree: Hierarchy, low: FloatArray, high: FloatArray) -> list[FloatArray]:
+def node_boxes(tree: BalancedTree, low: FloatArray, high: FloatArray) -> list[FloatArray]:
     """Boxes (k, 6) of the nodes of all levels, from those of primitives (n, 3)."""
-    low, high = tree.gather(low, np.inf).min(axis=1), tree.gather(high, -np.inf).max(axis=1)
+    low, high = (
+        tree.values_in_slots(low, np.inf).min(axis=1),
+        tree.values_in_slots(high, -np.inf).max(axis=1),
+    )
     levels = [np.concatenate([low, high], axis=1)]
     for arity in tree.arities:
         low = low.reshape(-1, arity, 3).min(axis=1)
@@ -71,7 +82,9 @@ def box_levels(tree: Hierarchy, low: FloatArray, high: FloatArray) -> list[Float
     return levels
 
 
-def slab_levels(tree: Hierarchy, corners: FloatArray, boxes: list[FloatArray]) -> list[FloatArray]:
+def node_slabs(
+    tree: BalancedTree, corners: FloatArray, boxes: list[FloatArray]
+) -> list[FloatArray]:
     """Slabs (k, 6) of the nodes of all levels: a unit normal n, an offset, half a thickness and a
     radius. With c the center of a node's box, the triangles' points are c + h n + r, r at right
     angles to n, with |h - offset| <= thickness and |r| <= radius.
@@ -80,9 +93,9 @@ def slab_levels(tree: Hierarchy, corners: FloatArray, boxes: list[FloatArray]) -
     with boxes alone, a walk visits the whole cap of the surface whose bulge is less than a box is
     wide.
     """
-    points = tree.gather(corners, np.nan).reshape(len(tree.slots), -1, 3)
+    points = tree.values_in_slots(corners, np.nan).reshape(len(tree.leaf_slots), -1, 3)
     edges = corners - corners[:, :1]
-    normals = tree.gather(np.cross(edges[:, 1], edges[:, 2])).sum(axis=1)
+    normals = tree.values_in_slots(np.cross(edges[:, 1], edges[:, 2])).sum(axis=1)
     levels: list[FloatArray] = []
     for box, arity in zip(boxes, (*tree.arities, 1), strict=True):
         n = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
@@ -98,7 +111,7 @@ def slab_levels(tree: Hierarchy, corners: FloatArray, boxes: list[FloatArray]) -
 
 
 @dataclass(frozen=True)
-class Frame:
+class RayFrame:
     """Coordinates along and across rays o + t d: right-handed unit vectors u, v and d."""
 
     o: Vec3
@@ -107,17 +120,17 @@ class Frame:
     d: Vec3
 
     @classmethod
-    def along(cls, backend: Backend, o: Vec3, d: Vec3) -> Frame:
+    def along(cls, backend: Backend, o: Vec3, d: Vec3) -> RayFrame:
         """The frame of rays o + t d, |d| = 1."""
         vector = backend.Array3f
         o, d = vector(o), vector(d)
-        u, v = across(d)
+        u, v = orthonormal_basis(d)
         return cls(o, u, v, d)
 
-    def across(self, p: Vec3) -> tuple[Real, Real]:
+    def transverse(self, p: Vec3) -> tuple[Real, Real]:
         """The coordinates of p in the plane normal to the rays."""
         a = p - self.o
-        return _plain(dr.dot(a, self.u)), _plain(dr.dot(a, self.v))
+        return _flush_tiny(dr.dot(a, self.u)), _flush_tiny(dr.dot(a, self.v))
 
     def depth(self, p: Vec3) -> Real:
         """The coordinate of p along the rays."""
@@ -129,25 +142,25 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class Upwards:
+class VerticalRayFrame:
     """The frame of rays from points o along the z axis, which takes no computation."""
 
     o: Vec3
 
-    def across(self, p: Vec3) -> tuple[Real, Real]:
-        """As `Frame.across`."""
-        return _plain(p.x - self.o.x), _plain(p.y - self.o.y)
+    def transverse(self, p: Vec3) -> tuple[Real, Real]:
+        """As `RayFrame.transverse`."""
+        return _flush_tiny(p.x - self.o.x), _flush_tiny(p.y - self.o.y)
 
     def depth(self, p: Vec3) -> Real:
-        """As `Frame.depth`."""
+        """As `RayFrame.depth`."""
         return p.z - self.o.z
 
     def component(self, a: Vec3) -> Real:
-        """As `Frame.component`."""
+        """As `RayFrame.component`."""
         return a.z
 
 
-def _plain(u: Real) -> Real:
+def _flush_tiny(u: Real) -> Real:
     """A coordinate across a ray, with 0 for one so small that a product of two could underflow.
 
     Such a coordinate is far smaller than the rounding error of a vertex.
@@ -156,7 +169,7 @@ def _plain(u: Real) -> Real:
     return dr.select(dr.abs(u) < (1e-140 if is_double else 1e-16), 0, u)
 
 
-def side(a: tuple[Real, Real], b: tuple[Real, Real]) -> Real:
+def edge_function(a: tuple[Real, Real], b: tuple[Real, Real]) -> Real:
     """Twice the area of (0, a, b): its sign says on which side of the edge ab a ray passes.
 
     The same bits for every triangle at the edge, if a and b come in the same order.
@@ -165,29 +178,29 @@ def side(a: tuple[Real, Real], b: tuple[Real, Real]) -> Real:
 
 
 @dataclass(frozen=True)
-class TriangleRays:
+class TriangleTree:
     """Crossings of rays with triangles, by a tree of boxes."""
 
     tree: PackedTree
 
     @classmethod
     def of(
-        cls, backend: Backend, tree: Hierarchy, records: FloatArray, *, slabs: bool = False
-    ) -> TriangleRays:
+        cls, backend: Backend, tree: BalancedTree, records: FloatArray, *, slabs: bool = False
+    ) -> TriangleTree:
         """From the records of `triangle_records`.
 
         slabs: whether nodes have slabs besides boxes, for nearest points from far away.
         """
         corners = records[:, :9].reshape(-1, 3, 3)
-        levels = box_levels(tree, corners.min(axis=1), corners.max(axis=1))
+        levels = node_boxes(tree, corners.min(axis=1), corners.max(axis=1))
         if slabs:
-            pairs = zip(levels, slab_levels(tree, corners, levels), strict=True)
+            pairs = zip(levels, node_slabs(tree, corners, levels), strict=True)
             levels = [np.concatenate(pair, axis=1) for pair in pairs]
-        return cls(pack(backend, tree, levels, in_slots(tree, records)))
+        return cls(pack_tree(backend, tree, levels, records_in_slots(tree, records)))
 
-    def next(
+    def next_crossing(
         self,
-        frame: Frame,
+        frame: RayFrame,
         after: tuple[Real, Any],
         t_max: Real,
         active: Mask,
@@ -209,17 +222,17 @@ class TriangleRays:
             self.tree.backend.Array3f,
         )
         t_after, n_after = real(after[0]), index(after[1])
-        inside = self._boxes(frame, reach)
+        inside = self._slab_test(frame, reach)
 
-        def visit(node: Node, state: State) -> tuple[Mask, State]:
+        def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
             limit = fmin(state[0], t_max)
             open_ = inside(node, t_after, limit)
-            return open_, for_each(node, open_ & node.is_leaf, nearer, state)
+            return open_, for_each_primitive(node, open_ & node.is_leaf, nearer, state)
 
-        def nearer(row: list[Real], active: Mask, state: State) -> State:
+        def nearer(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
             best, number, turn, normal = state
-            t, here = crossing(row, frame)
-            n = index(fmax(row[INDEX], real(0)))
+            t, here = signed_crossing(row, frame)
+            n = index(fmax(row[NUMBER_COLUMN], real(0)))
             later = (t > t_after) | ((t == t_after) & (n > n_after) & (n_after != NO_TRIANGLE))
             first = (t < best) | ((t == best) & (n < number))
             passed = here != 0
@@ -235,24 +248,26 @@ class TriangleRays:
             )
 
         start = (real(dr.inf), index(NO_TRIANGLE), real(0), vector(0))
-        best, number, turn, normal = walk(self.tree, visit, start, active)
+        best, number, turn, normal = traverse(self.tree, visit, start, active)
         return best, number, turn, normal * dr.rsqrt(fmax(dr.squared_norm(normal), real(1e-37)))
 
-    def turns_ahead(self, frame: Frame, t_min: Real, active: Mask = True) -> Real:
+    def signed_crossings_ahead(self, frame: RayFrame, t_min: Real, active: Mask = True) -> Real:
         """The sum of the signs of all crossings with t > t_min."""
-        real, inside = self.tree.backend.Float, self._boxes(frame)
+        real, inside = self.tree.backend.Float, self._slab_test(frame)
 
-        def visit(node: Node, state: State) -> tuple[Mask, State]:
+        def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
             open_ = inside(node, real(t_min), real(dr.inf))
-            return open_, for_each(node, open_ & node.is_leaf, add, state)
+            return open_, for_each_primitive(node, open_ & node.is_leaf, add, state)
 
-        def add(row: list[Real], active: Mask, state: State) -> State:
-            t, turn = crossing(row, frame)
+        def add(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
+            t, turn = signed_crossing(row, frame)
             return (state[0] + dr.select(active & (t > t_min), turn, 0),)
 
-        return walk(self.tree, visit, (real(0),), active)[0]
+        return traverse(self.tree, visit, (real(0),), active)[0]
 
-    def turns_between(self, frame: Frame, end: Real, unit: Real, active: Mask) -> tuple[Real, Mask]:
+    def signed_crossings_between(
+        self, frame: RayFrame, end: Real, unit: Real, active: Mask
+    ) -> tuple[Real, Mask]:
         """The sum of the signs of all crossings with 0 < t < end, and where that is sure.
 
         unit: the rounding of a coordinate.
@@ -261,26 +276,29 @@ class TriangleRays:
         off by that over the cosine between ray and normal. Where this leaves it open whether t is
         between the ends, nothing is sure.
         """
-        real, inside = self.tree.backend.Float, self._boxes(frame)
+        real, inside = self.tree.backend.Float, self._slab_test(frame)
 
-        def visit(node: Node, state: State) -> tuple[Mask, State]:
+        def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
             open_ = inside(node, real(0), real(end))
-            return open_, for_each(node, open_ & node.is_leaf, add, state)
+            return open_, for_each_primitive(node, open_ & node.is_leaf, add, state)
 
-        def add(row: list[Real], active: Mask, state: State) -> State:
+        def add(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
             turns, sure = state
-            t, turn = crossing(row, frame)
+            t, turn = signed_crossing(row, frame)
             normal = normal_of(row, self.tree.backend.Array3f)
-            steep, off = dr.abs(dr.dot(normal, frame.d)), _UNSURE * unit * dr.norm(normal)
+            steep, off = (
+                dr.abs(dr.dot(normal, frame.d)),
+                _UNCERTAIN_ROUNDINGS * unit * dr.norm(normal),
+            )
             clear = (dr.abs(t) * steep > off) & (dr.abs(t - end) * steep > off)
             between = active & (t > 0) & (t < end)
             return turns + dr.select(between, turn, 0), sure & (clear | (turn == 0) | ~active)
 
         start = real(0), self.tree.backend.Bool(active)
-        turns, sure = walk(self.tree, visit, start, active)
+        turns, sure = traverse(self.tree, visit, start, active)
         return turns, sure
 
-    def turns_along(self, x: Vec3, way: Real, active: Mask = True) -> Real:
+    def signed_crossings_vertical(self, x: Vec3, way: Real, active: Mask = True) -> Real:
         """The sum of the signs of all crossings of rays from x up (way 1) or down (-1) the z axis.
 
         For both the signs are those with respect to the upward direction. Testing boxes costs less
@@ -288,24 +306,24 @@ class TriangleRays:
         """
         real = self.tree.backend.Float
         up, height = way > 0, way * x.z
-        pad = 4 * self.tree.backend.epsilon * (1 + dr.max(dr.abs(x)))
+        pad = 4 * self.tree.backend.machine_epsilon * (1 + dr.max(dr.abs(x)))
         low_x, high_x, low_y, high_y = x.x - pad, x.x + pad, x.y - pad, x.y + pad
 
-        def visit(node: Node, state: State) -> tuple[Mask, State]:
+        def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
             x0, y0, z0, x1, y1, z1 = node.head
             open_ = (
                 (high_x >= x0) & (low_x <= x1) & (high_y >= y0) & (low_y <= y1)
                 & (height - pad <= dr.select(up, z1, -z0))
             )  # fmt: skip
-            return open_, for_each(node, open_ & node.is_leaf, add, state)
+            return open_, for_each_primitive(node, open_ & node.is_leaf, add, state)
 
-        def add(row: list[Real], active: Mask, state: State) -> State:
-            t, turn = crossing(row, Upwards(x))
+        def add(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
+            t, turn = signed_crossing(row, VerticalRayFrame(x))
             return (state[0] + dr.select(active & (way * t > 0), turn, 0),)
 
-        return walk(self.tree, visit, (real(0),), active)[0]
+        return traverse(self.tree, visit, (real(0),), active)[0]
 
-    def _boxes(self, frame: Frame, reach: float = 0.0) -> Any:
+    def _slab_test(self, frame: RayFrame, reach: float = 0.0) -> Any:
         """A test whether rays come as near as `reach` to a node's box between two t. Rounding may
         turn a no into a yes, never a yes into a no."""
         backend = self.tree.backend
@@ -315,15 +333,15 @@ class TriangleRays:
         steep = dr.select(dr.abs(d) < 1e-18, dr.select(d < 0, vector(-1e-18), vector(1e-18)), d)
         inverse = dr.rcp(steep)
         o = frame.o
-        size = largest_coordinate(o)
-        pad = 16 * backend.epsilon * (1 + size) + reach
+        size = max_norm(o)
+        pad = 16 * backend.machine_epsilon * (1 + size) + reach
 
-        def inside(node: Node, t_min: Real, t_max: Real) -> Mask:
+        def inside(node: VisitedNode, t_min: Real, t_max: Real) -> Mask:
             low, high = vector(*node.head[:3]) - pad, vector(*node.head[3:]) + pad
             a, b = (low - o) * inverse, (high - o) * inverse
             near = fmax(fmax(fmin(a.x, b.x), fmin(a.y, b.y)), fmin(a.z, b.z))
             far = fmin(fmin(fmax(a.x, b.x), fmax(a.y, b.y)), fmax(a.z, b.z))
-            slack = 8 * backend.epsilon * dr.abs(far) + pad
+            slack = 8 * backend.machine_epsilon * dr.abs(far) + pad
             return (near <= far + slack) & (far + slack >= t_min) & (near - slack <= t_max)
 
         return inside
@@ -337,26 +355,27 @@ def corners_of(row: list[Real], vector: Any) -> tuple[Vec3, Vec3, Vec3]:
 def normal_of(row: list[Real], vector: Any) -> Vec3:
     """The normal of a record's triangle by the right-hand rule, of any length."""
     p, q, r = corners_of(row, vector)
-    return row[PARITY] * dr.cross(q - p, r - p)
+    return row[PARITY_COLUMN] * dr.cross(q - p, r - p)
 
 
-def crossing(row: list[Real], frame: Frame | Upwards) -> tuple[Real, Real]:
+def signed_crossing(row: list[Real], frame: RayFrame | VerticalRayFrame) -> tuple[Real, Real]:
     """t and the sign of the crossing of a ray with the triangle of a record; 0 where there is none.
 
     In the plane across the ray, the sign is the winding number of the triangle about the ray:
     over its edges, +1 for each that crosses the half-line v = 0, u > 0 upwards and -1 downwards.
     Upwards means from v <= 0 to v > 0, which v alone decides; that u > 0 there is the sign of
-    `side`. Both are the same for all triangles around a vertex or an edge, so that a rounding error
-    that adds a crossing to one of them takes it from its neighbor: the sum over a closed surface is
-    right whatever the rounding did, and rays through edges and vertices need no special case.
+    `edge_function`. Both are the same for all triangles around a vertex or an edge, so that a
+    rounding error that adds a crossing to one of them takes it from its neighbor: the sum over a
+    closed surface is right whatever the rounding did, and rays through edges and vertices need no
+    special case.
 
     t is the depth of a point of the triangle within a few roundings of coordinates of the ray,
-    however thin the triangle is (`_depth`).
+    however thin the triangle is (`_crossing_depth`).
     """
     vector = cast("Any", type(frame.o))
     p, q, r = corners_of(row, vector)
-    a, b, c = frame.across(p), frame.across(q), frame.across(r)
-    ab, bc, ac = side(a, b), side(b, c), side(a, c)
+    a, b, c = frame.transverse(p), frame.transverse(q), frame.transverse(r)
+    ab, bc, ac = edge_function(a, b), edge_function(b, c), edge_function(a, c)
     up_a, up_b, up_c = a[1] > 0, b[1] > 0, c[1] > 0
 
     def upwards(from_up: Mask, to_up: Mask, left: Real) -> Real:
@@ -365,23 +384,23 @@ def crossing(row: list[Real], frame: Frame | Upwards) -> tuple[Real, Real]:
             from_up & ~to_up & (left < 0), one, 0
         )
 
-    turn = row[PARITY] * (
+    turn = row[PARITY_COLUMN] * (
         upwards(up_a, up_b, ab) + upwards(up_b, up_c, bc) - upwards(up_a, up_c, ac)
     )
     a, b, c = (*a, frame.depth(p)), (*b, frame.depth(q)), (*c, frame.depth(r))
-    close = _CLOSE * float(dr.epsilon(frame.o)) * (1 + dr.max(dr.abs(frame.o)))
-    return _depth((a, b, c), (ab, bc, ac), close), turn
+    close = _EDGE_ROUNDINGS * float(dr.epsilon(frame.o)) * (1 + dr.max(dr.abs(frame.o)))
+    return _crossing_depth((a, b, c), (ab, bc, ac), close), turn
 
 
-def _is_beside(row: list[Real], frame: Frame, reach: float) -> Mask:
+def _is_beside(row: list[Real], frame: RayFrame, reach: float) -> Mask:
     """Whether the line of a ray is as near as `reach` to the border of a record's triangle. (What
-    `crossing` computes as well is computed once.)"""
+    `signed_crossing` computes as well is computed once.)"""
     p, q, r = corners_of(row, type(frame.o))
-    a, b, c = frame.across(p), frame.across(q), frame.across(r)
+    a, b, c = frame.transverse(p), frame.transverse(q), frame.transverse(r)
     near: Mask = False
     zero = type(a[0])(0)
     for one, other in ((a, b), (b, c), (a, c)):
-        left, square = side(one, other), _square((*one, zero), (*other, zero))
+        left, square = edge_function(one, other), _square((*one, zero), (*other, zero))
         share = -dr.fma(one[0], other[0] - one[0], one[1] * (other[1] - one[1])) / square
         near |= (left * left <= reach * reach * square) & (share > 0) & (share < 1)
     for u, v in (a, b, c):
@@ -389,10 +408,14 @@ def _is_beside(row: list[Real], frame: Frame, reach: float) -> Mask:
     return near
 
 
-def _depth(corners: tuple[Seen, Seen, Seen], sides: tuple[Real, Real, Real], close: Real) -> Real:
+def _crossing_depth(
+    corners: tuple[RayCoordinates, RayCoordinates, RayCoordinates],
+    sides: tuple[Real, Real, Real],
+    close: Real,
+) -> Real:
     """The t at which a ray passes through a triangle.
 
-    corners: (u, v, depth) of each, in the frame of the ray. sides: `side` of the edges.
+    corners: (u, v, depth) of each, in the frame of the ray. sides: `edge_function` of the edges.
 
     The barycentric weight of a corner is an area divided by that of the triangle, which is all
     rounding where the triangle is thin. So the weight w of the corner off the longest edge is cut
@@ -440,6 +463,6 @@ def _depth(corners: tuple[Seen, Seen, Seen], sides: tuple[Real, Real, Real], clo
     return t
 
 
-def _square(a: Seen, b: Seen) -> Real:
+def _square(a: RayCoordinates, b: RayCoordinates) -> Real:
     u, v = b[0] - a[0], b[1] - a[1]
     return dr.fma(u, u, v * v)

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from harnack.rendering.images import as_bytes
-from harnack.rendering.integrator import LOST_COLOR
+from harnack.rendering.images import to_uint8
+from harnack.rendering.integrator import OUT_OF_STEPS_COLOR
 from harnack.rendering.scales import viridis
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ def legends() -> dict[str, Any]:
     ticks: where numbers stand on a scale, from 0 to 1, and how they are written; None for the least
         and the greatest number that is seen, which are lengths in the unit of the surfaces.
     """
-    lost = ["out of steps", _css(LOST_COLOR)]
+    lost = ["out of steps", _css(OUT_OF_STEPS_COLOR)]
     ticks = [[float(evaluations_share(n)), str(n)] for n in _EVALUATIONS[:-1]] + [
         [1.0, f"{EVALUATIONS_TOP}+"]
     ]
@@ -73,4 +73,4 @@ def legends() -> dict[str, Any]:
 
 
 def _css(color: Sequence[float] | Any) -> str:
-    return "#" + bytes(as_bytes(np.array(color, np.float64))).hex()
+    return "#" + bytes(to_uint8(np.array(color, np.float64))).hex()

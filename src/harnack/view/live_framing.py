@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from harnack.geometry import Box
-from harnack.rendering.framing import upright
-from harnack.rendering.stage import corners_of, on_ground
+from harnack.rendering.framing import rotation_to_z_up
+from harnack.rendering.stage import corners_of, stage_placement
 
 if TYPE_CHECKING:
     from harnack.backend import FloatArray
@@ -52,7 +52,7 @@ class Framing:
         elif not is_whole:
             box = Box(*(_three(end) for end in (points.min(axis=0), points.max(axis=0))))
         standing = points if box is None else corners_of(np.array(box.bounds()))
-        placement = on_ground(standing, upright(up))
+        placement = stage_placement(standing, rotation_to_z_up(up))
         return cls(placement, _orbit(camera, placement, points), box)
 
     def with_box(self, camera: Camera) -> Camera:

@@ -21,49 +21,49 @@ import numpy as np
 from harnack.backend import choose_backend, to_vector3
 from harnack.fields import Solid
 from harnack.fields.solid_angles.solid_angle import SolidAngle
-from harnack.geometry import HalfSpace, Intersection, Volume
+from harnack.geometry import HalfSpace, Volume, VolumeIntersection
 from harnack.rendering import render
-from harnack.rendering.backdrops import FLOOR, Ground, checked_backdrop, reflectance_of
+from harnack.rendering.backdrops import FLOOR_HEIGHT, GroundBackdrop, parse_backdrop, reflectance_of
 from harnack.rendering.camera import Camera
-from harnack.rendering.framing import NothingVisibleError, box_of, visible_points
-from harnack.rendering.isolines import checked_isolines
+from harnack.rendering.framing import NothingVisibleError, bounding_box, visible_points
+from harnack.rendering.isolines import parse_isolines
 from harnack.rendering.mitsuba_plugins import register
 from harnack.rendering.placed_surface import PlacedSurface
-from harnack.rendering.render_options import OF_STUDIO, SETTINGS, check_camera
-from harnack.rendering.scales import linear
-from harnack.rendering.shading import of_mended, of_side, reflectance
+from harnack.rendering.render_options import OPTION_NAMES, STUDIO_OPTIONS, check_camera
+from harnack.rendering.scales import linear_from_srgb
+from harnack.rendering.shading import hole_filling_tint, reflectance, two_sided_color
 from harnack.rendering.stage import MATERIALS, Material, StudioObject
 from harnack.rendering.studio_surfaces import studio_objects
-from harnack.tracer import LevelSet, Status, Tolerance
+from harnack.tracer import HitTolerance, RayStatus, Surface
 from harnack.view.legend_data import EVALUATIONS_TOP, legends
 from harnack.view.live_framing import Framing, extreme_points
-from harnack.view.scene_file import STILL_SETTINGS, Origins, of_surfaces, text_of
-from harnack.view.sliders import PlaceError, Subject, at_place
-from harnack.webgpu import bits_of, data_of, leaves, record
+from harnack.view.scene_file import STILL_OPTIONS, FieldSources, surface_options, to_scene_text
+from harnack.view.sliders import SliderValueError, SlidingContent, slider_values_in_errors
+from harnack.webgpu import as_words, labeled_leaves, pack_shader_data, record_kernel
 
 if TYPE_CHECKING:
     from harnack.backend import FloatArray, Real, Vec3
     from harnack.rendering.images import Picture
     from harnack.rendering.placed_surface import Placement
     from harnack.rendering.surface_hits import SurfaceHit
-    from harnack.webgpu import Recording
+    from harnack.webgpu import RecordedKernel
 
 __all__ = [
-    "CONTROLLED",
-    "SHOWS",
-    "Controls",
-    "Live",
-    "Plain",
+    "LIVE_MODES",
+    "LIVE_OPTIONS",
+    "ControlState",
+    "JsonDict",
+    "LiveScene",
     "check_opaque",
-    "difference",
-    "live_settings",
-    "packed",
-    "paint_of",
-    "paints_of",
+    "color_index",
+    "encode_arrays",
+    "live_options",
+    "state_delta",
     "status_of",
+    "surface_colors",
 ]
 
-Plain = dict[str, Any]
+JsonDict = dict[str, Any]
 # Rays that travel with a surface, and are traced first on the visitor's device.
 _RAYS = 2048
 # Of surfaces without a tolerance of their own, on the stage.
@@ -80,33 +80,34 @@ _MOST_PAINTS = 2048
 _OF_STUDIO = ("boundary", "boundary_material", "thickness")
 # Of gzip: more takes longer, and gains little.
 _LEVEL = 5
-_OF_STAGE = ("camera", "backdrop", "up", "show")
-SHOWS = ("shaded", "normal", "depth", "evaluations", "status")
+_STAGE_OPTIONS = ("camera", "backdrop", "up", "show")
+LIVE_MODES = ("shaded", "normal", "depth", "evaluations", "status")
 """The values of `show` that pages and views have."""
 
 
-CONTROLLED = ("material", "boundary")
+LIVE_OPTIONS = ("material", "boundary")
 """Settings of `render` that can be changed in a view: what surfaces are made of, and the radius of
 tubes around the curves at which they end (None for no tubes)."""
 
 
 @dataclass(frozen=True)
-class Controls:
+class ControlState:
     """What the controls of a live scene say: its sliders, its edited curve, its cut and settings.
 
     values: of all sliders. loops: vertices (n, 3) in the place of those of the field's curve.
-    cut: a volume that cuts all surfaces; a half-space opens them, as `section` of `level_set` does.
-    settings: some of `CONTROLLED`, in the place of those that the scene was opened with.
+    cut_volume: a volume that cuts all surfaces; a half-space opens them, as `section` of
+        `level_set` does.
+    settings: some of `LIVE_OPTIONS`, in the place of those that the scene was opened with.
     """
 
     values: Mapping[str, float]
-    loops: Sequence[FloatArray] | None = None
-    cut: Volume | None = None
+    curves: Sequence[FloatArray] | None = None
+    cut_volume: Volume | None = None
     settings: Mapping[str, Any] = field(default_factory=dict[str, Any])
 
 
 @dataclass(frozen=True)
-class Live:
+class LiveScene:
     """A live scene: what is drawn as a function of sliders, where it stands on the stage, and the
     rays by which devices are checked.
 
@@ -114,20 +115,20 @@ class Live:
     editable: whether the vertices of its curve can be moved. show: what is shown at first.
     """
 
-    subject: Subject
+    content: SlidingContent
     points: tuple[FloatArray, ...]
     camera: Camera
     up: Any
     framing: Framing
-    ground: str
+    backdrop: str
     editable: bool
     show: str
-    origins: Origins = ()
+    origins: FieldSources = ()
 
     @classmethod
     def of(
-        cls, what: Any, given: Mapping[str, Any], *, edits: bool = False, origins: Origins = ()
-    ) -> Live:
+        cls, what: Any, given: Mapping[str, Any], *, edits: bool = False, origins: FieldSources = ()
+    ) -> LiveScene:
         """From what users give `page` and `view`.
 
         edits: whether vertices of curves are to be moved, so that they must not decide what is
@@ -135,25 +136,29 @@ class Live:
 
         Raises:
             TypeError, ValueError: as `render` does; also for a transparent material, a `show` that
-                is not in `SHOWS`, and a backdrop that is not "light" or "dark".
+                is not in `LIVE_MODES`, and a backdrop that is not "light" or "dark".
         """
-        still = [name for name in given if name in SETTINGS and name not in (*OF_STUDIO, "show")]
+        still = [
+            name for name in given if name in OPTION_NAMES and name not in (*STUDIO_OPTIONS, "show")
+        ]
         if still:
             raise TypeError(
                 f"{', '.join(still)}: for still pictures only, as `harnack.render` draws them; "
                 "pages and views have no such setting"
             )
         given = dict(given)
-        camera, backdrop, up, show = (given.pop(name, None) for name in _OF_STAGE)
+        camera, backdrop, up, show = (given.pop(name, None) for name in _STAGE_OPTIONS)
         show = "shaded" if show is None else show
-        if show not in SHOWS:
-            raise ValueError(f"show must be one of {', '.join(SHOWS)} where it moves, not {show!r}")
-        ground = Ground("light") if backdrop is None else checked_backdrop(backdrop)
-        if not isinstance(ground, Ground):
+        if show not in LIVE_MODES:
+            raise ValueError(
+                f"show must be one of {', '.join(LIVE_MODES)} where it moves, not {show!r}"
+            )
+        ground = GroundBackdrop("light") if backdrop is None else parse_backdrop(backdrop)
+        if not isinstance(ground, GroundBackdrop):
             raise ValueError('backdrop: what is drawn live stands on a ground: "light" or "dark"')
-        subject = Subject.of(what, given)
+        subject = SlidingContent.of(what, given)
         start = subject.starts
-        with at_place(start):
+        with slider_values_in_errors(start):
             drawn = _objects_at(subject, start)
             backend = choose_backend("single")
             points = tuple(visible_points(one.surface, backend) for one in drawn)
@@ -164,20 +169,20 @@ class Live:
             subject, points, camera, up, framing, ground.name, curve is not None, show, origins
         )
 
-    def framed(self, places: Iterable[Mapping[str, float]]) -> Live:
+    def framed(self, places: Iterable[Mapping[str, float]]) -> LiveScene:
         """The same, framed such that nothing leaves the picture at these places of its sliders; a
         box of the camera stays what is framed.
 
         Places at which nothing can be drawn are left out: what is wrong there is said where they
         are drawn.
         """
-        if not self.subject.sliders or self.camera.box is not None:
+        if not self.content.sliders or self.camera.box is not None:
             return self
         backend = choose_backend("single")
         points = [*self.points]
         for values in places:
-            with suppress(PlaceError), at_place(values):
-                for one in _objects_at(self.subject, values):
+            with suppress(SliderValueError), slider_values_in_errors(values):
+                for one in _objects_at(self.content, values):
                     with suppress(NothingVisibleError):
                         points.append(extreme_points(visible_points(one.surface, backend)))
         framing = Framing.of(self.camera, self.up, np.concatenate(points), is_whole=False)
@@ -193,10 +198,10 @@ class Live:
         """Rays on the stage by which devices are checked, of each surface."""
         return tuple(_rays(self.placement.apply(one)) for one in self.points)
 
-    def scene(self, title: str) -> Plain:
+    def scene(self, title: str) -> JsonDict:
         """All that a page is given when it opens, as plain data for `drawing.js`."""
         place, points = self.placement, np.concatenate(self.points)
-        _, settings = self._at(self.start)
+        _, settings = self._at(self.initial_controls)
         material = settings.get("material")
         # The ball around what is seen at first, by which cuts are measured.
         middle: FloatArray = 0.5 * (points.min(axis=0) + points.max(axis=0))
@@ -205,13 +210,13 @@ class Live:
             "placement": [*place.rotation.ravel().tolist(), *place.translation.tolist(),
                           place.scale],
             "camera": self.framing.camera,
-            "floor": FLOOR,
+            "floor": FLOOR_HEIGHT,
             "show": self.show,
-            "ground": reflectance_of(self.ground).tolist(),
+            "ground": reflectance_of(self.backdrop).tolist(),
             "sliders": [
                 {"name": name, "low": one.low, "high": one.high, "start": one.start,
                  "step": one.step}
-                for name, one in self.subject.sliders.items()
+                for name, one in self.content.sliders.items()
             ],
             "editable": self.editable,
             "materials": [name for name, one in MATERIALS.items() if not one.transparent],
@@ -221,37 +226,37 @@ class Live:
             "reach": float(np.linalg.norm(points - middle, axis=1).max()),
             "legends": legends(),
             "evaluations_top": EVALUATIONS_TOP,
-            "state": packed(self.first),
+            "state": encode_arrays(self.initial_state),
         }  # fmt: skip
 
     @cached_property
-    def first(self) -> Plain:
+    def initial_state(self) -> JsonDict:
         """The state at the start. Later states are sent as differences from it."""
-        return self.state(self.start)
+        return self.state(self.initial_controls)
 
     @property
-    def pose(self) -> Plain:
+    def pose(self) -> JsonDict:
         """The camera's position, target and field of view, in the surfaces' coordinates."""
         seen, place = self.framing.camera, self.placement
         azimuth, elevation = np.radians([seen["azimuth"], seen["elevation"]])
         back = np.array([np.cos(azimuth), np.sin(azimuth), np.tan(elevation)]) * np.cos(elevation)
         target = np.array(seen["target"])
-        eye, at = place.undo(np.stack([target + seen["distance"] * back, target]))
+        eye, at = place.apply_inverse(np.stack([target + seen["distance"] * back, target]))
         return {"position": eye.tolist(), "target": at.tolist(), "fov": seen["fov"]}
 
     @property
-    def start(self) -> Controls:
+    def initial_controls(self) -> ControlState:
         """The state in which nothing has been moved yet."""
-        return Controls(self.subject.starts)
+        return ControlState(self.content.starts)
 
-    def state(self, controls: Controls) -> Plain:
+    def state(self, controls: ControlState) -> JsonDict:
         """The surfaces of a state as plain data, and the curves at which they end. Its arrays are
-        NumPy's; `packed` makes them text."""
-        drawn = self.drawn(controls)
-        with at_place(controls.values):
-            placed = [self.placed(one) for one in drawn]
+        NumPy's; `encode_arrays` makes them text."""
+        drawn = self.surfaces_at(controls)
+        with slider_values_in_errors(controls.values):
+            placed = [self.place(one) for one in drawn]
         surfaces = [
-            _traced(one, where, *self.rays[min(k, len(self.rays) - 1)])
+            _kernel_data(one, where, *self.rays[min(k, len(self.rays) - 1)])
             for k, (one, where) in enumerate(zip(drawn, placed, strict=True))
         ]
         colors = sum(len(one["paints"]) for one in surfaces)
@@ -266,61 +271,63 @@ class Live:
                 curves += one.surface.field.boundary_curves
         return {"surfaces": surfaces, "curves": [np.asarray(one).tolist() for one in curves]}
 
-    def drawn(self, controls: Controls) -> list[StudioObject]:
+    def surfaces_at(self, controls: ControlState) -> list[StudioObject]:
         """The surfaces of a state as objects of the studio."""
-        with at_place(controls.values):
+        with slider_values_in_errors(controls.values):
             return self._drawn(controls)
 
-    def _at(self, controls: Controls) -> tuple[Any, dict[str, Any]]:
+    def _at(self, controls: ControlState) -> tuple[Any, dict[str, Any]]:
         """What is drawn, and its settings."""
-        what, settings = self.subject.at(controls.values)
+        what, settings = self.content.at(controls.values)
         settings |= controls.settings
         if "boundary" in controls.settings and settings["boundary"] is None:
             settings.pop("boundary_material", None)
         return what, settings
 
-    def _drawn(self, controls: Controls) -> list[StudioObject]:
+    def _drawn(self, controls: ControlState) -> list[StudioObject]:
         what, settings = self._at(controls)
-        drawn = _objects(what, settings)
+        drawn = _studio_objects(what, settings)
         curve = _curve_of(drawn) if self.editable else None
         if (
             curve is not None
-            and controls.loops is not None
+            and controls.curves is not None
             and settings.get("boundary") is not None
         ):
             # The tube around the curve is that of the moved one.
-            drawn = _objects(_with_loops(what, curve, controls.loops), settings)
+            drawn = _studio_objects(_with_loops(what, curve, controls.curves), settings)
             curve = _curve_of(drawn)
         drawn = [self._fitted(one) for one in drawn]
-        if controls.cut is not None:
-            drawn = [replace(one, surface=cut_by(one.surface, controls.cut)) for one in drawn]
+        if controls.cut_volume is not None:
+            drawn = [
+                replace(one, surface=with_cut(one.surface, controls.cut_volume)) for one in drawn
+            ]
         if curve is None:
             return drawn
         # As Dr.Jit's arrays: those of NumPy decide which proof is taken.
         backend = choose_backend("single")
-        loops = curve.loops if controls.loops is None else controls.loops
+        loops = curve.loops if controls.curves is None else controls.curves
         field = SolidAngle([to_vector3(backend, one) for one in loops])
         return [
-            replace(one, surface=replace(one.surface, field=field).in_one_call(begins=True))
+            replace(one, surface=replace(one.surface, field=field).with_call_cache(begins=True))
             if one.surface.field is curve
             else one
             for one in drawn
         ]
 
-    def rendered(self, controls: Controls, **others: Any) -> Picture:
+    def render_still(self, controls: ControlState, **others: Any) -> Picture:
         """A still picture of a state by `render`. others: settings of `render`."""
         _, settings = self._at(controls)
         own = {name: settings[name] for name in ("isolines", "cut_material") if name in settings}
-        drawn = self.drawn(controls)
+        drawn = self.surfaces_at(controls)
         if isinstance(others.get("camera"), Camera):
             others["camera"] = self.framing.with_box(others["camera"])
-        usual: dict[str, Any] = {"backdrop": self.ground, "up": self.up, "progress": False}
+        usual: dict[str, Any] = {"backdrop": self.backdrop, "up": self.up, "progress": False}
         materials = [one.material for one in drawn]
         return render(
             [one.surface for one in drawn], material=materials, **{**usual, **own, **others}
         )
 
-    def saved(self, controls: Controls, **others: Any) -> tuple[str, list[str]]:
+    def to_scene_text(self, controls: ControlState, **others: Any) -> tuple[str, list[str]]:
         """It as the text of a scene file, and the names of the sliders that are not in it, because
         their functions are Python's: what they make of it is. others: settings of `render` besides
         those of what is drawn.
@@ -332,55 +339,55 @@ class Live:
             others["camera"] = self.framing.with_box(others["camera"])
         what, settings = self._at(controls)
         several: list[Any] = [*what] if isinstance(what, list | tuple) else [what]
-        curve = _curve_of(_objects(what, settings)) if controls.loops else None
+        curve = _curve_of(_studio_objects(what, settings)) if controls.curves else None
         if curve is not None:
-            several = _with_loops(what, curve, controls.loops)
-        if controls.cut is not None:
-            own = of_surfaces(settings)
+            several = _with_loops(what, curve, controls.curves)
+        if controls.cut_volume is not None:
+            own = surface_options(settings)
             settings = {name: one for name, one in settings.items() if name not in own}
             made = studio_objects(several, settings.get("material"), own)
-            several = [cut_by(one.surface, controls.cut) for one in made]
+            several = [with_cut(one.surface, controls.cut_volume) for one in made]
         lost: list[str] = []
-        for name, one in self.subject.sliders.items():
+        for name, one in self.content.sliders.items():
             if (
-                self.subject.settings.get(name) is one and name not in controls.settings
+                self.content.settings.get(name) is one and name not in controls.settings
             ):  # in the place of what surfaces have
                 settings[name] = replace(one, start=controls.values[name])
             else:
                 lost.append(name)
-        return text_of(several, {**settings, **others}, self.origins), lost
+        return to_scene_text(several, {**settings, **others}, self.origins), lost
 
     def _fitted(self, one: StudioObject) -> StudioObject:
         """The same, with a tolerance that suits its size on the stage if it has none."""
-        if not one.fitted:
+        if not one.has_default_tolerance:
             return one
-        tolerance = Tolerance(_TOLERANCE / self.placement.scale)
+        tolerance = HitTolerance(_TOLERANCE / self.placement.scale)
         return replace(one, surface=replace(one.surface, tolerance=tolerance))
 
-    def placed(self, one: StudioObject) -> PlacedSurface:
+    def place(self, one: StudioObject) -> PlacedSurface:
         """A surface on the stage, with its data on the backend."""
-        size = float(np.linalg.norm(np.diff(box_of(one.surface), axis=0)))
+        size = float(np.linalg.norm(np.diff(bounding_box(one.surface), axis=0)))
         backend = choose_backend("single")
         return PlacedSurface.of(one.surface, self.placement, backend, one.isolines, size)
 
 
-def live_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
+def live_options(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Those of a picture that pages and views take: without what only still pictures have, such as
     a size, and with "shaded" in the place of a `show` that cannot follow a mouse."""
-    taken = {name: one for name, one in settings.items() if name not in STILL_SETTINGS}
-    return {**taken, "show": taken["show"] if taken.get("show") in SHOWS else "shaded"}
+    taken = {name: one for name, one in settings.items() if name not in STILL_OPTIONS}
+    return {**taken, "show": taken["show"] if taken.get("show") in LIVE_MODES else "shaded"}
 
 
-def cut_by(surface: LevelSet, volume: Volume) -> LevelSet:
+def with_cut(surface: Surface, volume: Volume) -> Surface:
     """A surface cut by one more volume; by a half-space, it is opened to be looked into."""
     name = "section" if isinstance(volume, HalfSpace) else "clip"
     own = getattr(surface, name)
-    both = volume if own is None else Intersection((own, volume))
-    made = replace(surface, **cast("Any", {name: both})).in_one_call(begins=True)
+    both = volume if own is None else VolumeIntersection((own, volume))
+    made = replace(surface, **cast("Any", {name: both})).with_call_cache(begins=True)
     is_whole = isinstance(made.field, Solid) and made.solid is None and len(made.levels) == 1
     if name == "clip" or not is_whole:
         return made
-    return replace(made, solid=(-math.inf, made.numbers[0]))
+    return replace(made, solid=(-math.inf, made.level_values[0]))
 
 
 def _with_loops(what: Any, curve: SolidAngle, loops: Any) -> list[Any]:
@@ -388,7 +395,7 @@ def _with_loops(what: Any, curve: SolidAngle, loops: Any) -> list[Any]:
     moved = SolidAngle([*loops])
 
     def edited(one: Any) -> Any:
-        if isinstance(one, LevelSet) and one.field is curve:
+        if isinstance(one, Surface) and one.field is curve:
             return replace(one, field=moved)
         return moved if one is curve else one
 
@@ -396,15 +403,15 @@ def _with_loops(what: Any, curve: SolidAngle, loops: Any) -> list[Any]:
     return [edited(one) for one in several]
 
 
-def _objects_at(subject: Subject, values: Mapping[str, float]) -> list[StudioObject]:
-    return _objects(*subject.at(values))
+def _objects_at(subject: SlidingContent, values: Mapping[str, float]) -> list[StudioObject]:
+    return _studio_objects(*subject.at(values))
 
 
-def _objects(what: Any, given: Mapping[str, Any]) -> list[StudioObject]:
+def _studio_objects(what: Any, given: Mapping[str, Any]) -> list[StudioObject]:
     settings = dict(given)
     studio = {name: settings.pop(name) for name in _OF_STUDIO if name in settings}
     material, cut = (settings.pop(name, None) for name in ("material", "cut_material"))
-    isolines = checked_isolines(settings.pop("isolines", None))
+    isolines = parse_isolines(settings.pop("isolines", None))
     drawn = studio_objects(what, material, settings, cut=cut, isolines=isolines, **studio)
     for one in drawn:
         check_opaque(one.material)
@@ -426,7 +433,9 @@ def _curve_of(drawn: Sequence[StudioObject]) -> SolidAngle | None:
     return curves[0] if len(curves) == 1 else None
 
 
-def _traced(one: StudioObject, placed: PlacedSurface, o: FloatArray, d: FloatArray) -> Plain:
+def _kernel_data(
+    one: StudioObject, placed: PlacedSurface, o: FloatArray, d: FloatArray
+) -> JsonDict:
     """A surface as plain data: its shader, the words that the shader reads, its colors, and rays
     with Dr.Jit's answers."""
     backend = choose_backend("single")
@@ -436,29 +445,29 @@ def _traced(one: StudioObject, placed: PlacedSurface, o: FloatArray, d: FloatArr
         "far": backend.Float(np.full(len(o), np.inf, np.float32)),
     }
 
-    def compute(o: Vec3, d: Vec3, far: Real) -> Plain:
-        met = placed.meet(o, d, far, backend.Bool(True))
+    def compute(o: Vec3, d: Vec3, far: Real) -> JsonDict:
+        met = placed.intersect(o, d, far, backend.Bool(True))
         return {
             "status": status_of(met), "t": met.t, "normal": met.normal,
-            "evaluations": met.evaluations, "paint": paint_of(met),
+            "evaluations": met.evaluations, "paint": color_index(met),
         }  # fmt: skip
 
-    made = record(compute, lanes, placed)
-    given = dict(leaves("lane", lanes))
+    made = record_kernel(compute, lanes, placed)
+    given = dict(labeled_leaves("lane", lanes))
     results = {name: made.results.get(f"result {name}") for name in _RESULTS}
     if any(results[name] is None for name in _RESULTS[:-1]):
         raise ValueError("what rays meet is the same for all of them: there is nothing to draw")
-    answers = [np.zeros(len(o), np.uint32) if x is None else bits_of(x) for x in results.values()]
+    answers = [np.zeros(len(o), np.uint32) if x is None else as_words(x) for x in results.values()]
     return {
         "key": hashlib.sha256(made.shader.code.encode()).hexdigest()[:16],
         "code": made.shader.code,
-        "data": data_of(made.shader, made.data),
+        "data": pack_shader_data(made.shader, made.data),
         "lanes": [_LANES.index(label.removeprefix("lane ")) for label in made.shader.lanes],
         "results": [_place(made, f"result {name}") for name in _RESULTS],
-        "paints": paints_of(one),
+        "paints": surface_colors(one),
         "tolerance": placed_tolerance(one, placed),
         "check": {
-            "lanes": np.stack([bits_of(given[label]) for label in made.shader.lanes]),
+            "lanes": np.stack([as_words(given[label]) for label in made.shader.lanes]),
             "results": np.stack(answers),
             "count": len(o),
         },
@@ -466,18 +475,21 @@ def _traced(one: StudioObject, placed: PlacedSurface, o: FloatArray, d: FloatArr
 
 
 def status_of(met: SurfaceHit) -> Any:
-    """The `Status` of each ray."""
+    """The `RayStatus` of each ray."""
     hit, out, miss = (
-        type(met.evaluations)(int(one)) for one in (Status.HIT, Status.OUT_OF_STEPS, Status.MISS)
+        type(met.evaluations)(int(one))
+        for one in (RayStatus.HIT, RayStatus.OUT_OF_STEPS, RayStatus.MISS)
     )
-    return dr.select(met.lost, out, dr.select(met.met, hit, miss))
+    return dr.select(met.is_out_of_steps, out, dr.select(met.is_hit, hit, miss))
 
 
-def paint_of(met: SurfaceHit) -> Any:
-    """The index in `paints_of` of the color that each ray meets."""
+def color_index(met: SurfaceHit) -> Any:
+    """The index in `surface_colors` of the color that each ray meets."""
     index = cast("Any", type(met.evaluations))
-    plain = dr.select(met.cut, index(_CUT), dr.select(met.mended, index(_MENDED), index(0)))
-    return dr.select(met.line > 0, index(met.line) + _CUT, plain)
+    plain = dr.select(
+        met.is_on_section, index(_CUT), dr.select(met.is_hole_filling, index(_MENDED), index(0))
+    )
+    return dr.select(met.isoline_index > 0, index(met.isoline_index) + _CUT, plain)
 
 
 def placed_tolerance(one: StudioObject, placed: PlacedSurface) -> float:
@@ -485,7 +497,7 @@ def placed_tolerance(one: StudioObject, placed: PlacedSurface) -> float:
     return one.surface.tolerance.distance * float(placed.scale[0])
 
 
-def _place(made: Recording, label: str) -> int:
+def _place(made: RecordedKernel, label: str) -> int:
     """The place of a result in the shader's output, or `_NO_OUTPUT` if it is 0 for all rays."""
     if label in made.constants:
         return _NO_OUTPUT
@@ -504,24 +516,24 @@ def _rays(points: FloatArray) -> tuple[FloatArray, FloatArray]:
     return o, direction / np.linalg.norm(direction, axis=1, keepdims=True)
 
 
-def paints_of(one: StudioObject) -> list[Plain]:
+def surface_colors(one: StudioObject) -> list[JsonDict]:
     """Linear sRGB of the sides of larger and of smaller values in shaded pictures, and whether they
     are glossy: of each paint."""
     surface, mi = one.surface, register()
     is_solid = surface.solid is not None
     front, back, glossy = _reflectances(one.material.bsdf(solid=is_solid, traced_light=False))
     inside = mi.Bool(not is_solid and not isinstance(surface.field, Solid))
-    sides = of_side(front, back, inside), back
-    mended = [of_mended(side, mi.Bool(True)) for side in sides]
+    sides = two_sided_color(front, back, inside), back
+    mended = [hole_filling_tint(side, mi.Bool(True)) for side in sides]
     paints = [_paint(sides[0], sides[1], glossy), _paint(mended[0], mended[1], glossy)]
-    cut = one.material if one.cut is None else one.cut
+    cut = one.material if one.section_material is None else one.section_material
     front, back, glossy = _reflectances(cut.bsdf(solid=is_solid, traced_light=False))
     paints.append(_paint(front, back, glossy))
-    lines = [mi.Color3f(*linear(line.rgb)) for line in one.isolines]
+    lines = [mi.Color3f(*linear_from_srgb(line.srgb)) for line in one.isolines]
     return [*paints, *(_paint(line, line, False) for line in lines)]
 
 
-def _paint(front: Any, back: Any, glossy: bool) -> Plain:
+def _paint(front: Any, back: Any, glossy: bool) -> JsonDict:
     sides = {"front": front, "back": back}
     return {
         "glossy": glossy,
@@ -545,19 +557,19 @@ def _reflectances(bsdf: Mapping[str, Any]) -> tuple[Any, Any, bool]:
     return colors[0], colors[1], bool(glossy)
 
 
-def packed(value: Any) -> Any:
+def encode_arrays(value: Any) -> Any:
     """The same with arrays of 32-bit words as text, which `words` in drawing.js reads: base64 of
     what gzip makes of them. The tables of meshes repeat themselves, and become a tenth."""
     if isinstance(value, np.ndarray):
         return base64.b64encode(gzip.compress(value.tobytes(), _LEVEL, mtime=0)).decode()
     if isinstance(value, dict):
-        return {name: packed(one) for name, one in cast("Plain", value).items()}
+        return {name: encode_arrays(one) for name, one in cast("JsonDict", value).items()}
     if isinstance(value, list):
-        return [packed(one) for one in cast("list[Any]", value)]
+        return [encode_arrays(one) for one in cast("list[Any]", value)]
     return value
 
 
-def difference(first: Plain, state: Plain, *, checks: bool = True) -> Plain:
+def state_delta(first: JsonDict, state: JsonDict, *, checks: bool = True) -> JsonDict:
     """What a state changes of the first: words of the data of its surfaces, and whatever else
     differs; or all of it where there are other kernels. `changed` in frames.js is the way back.
 
@@ -570,13 +582,13 @@ def difference(first: Plain, state: Plain, *, checks: bool = True) -> Plain:
     )
     if not alike:
         return state
-    surfaces: list[Plain] = []
+    surfaces: list[JsonDict] = []
     for old, new in pairs:
         own = {k: one for k, one in new.items() if k not in ("data", "check") and one != old[k]}
         at = np.flatnonzero(old["data"] != new["data"]).astype(np.uint32)
         own |= {"at": at, "to": new["data"][at]}
         surfaces.append(own | ({"check": new["check"]} if checks else {}))
-    made: Plain = {"surfaces": surfaces}
+    made: JsonDict = {"surfaces": surfaces}
     if state["curves"] != first["curves"]:
         made["curves"] = state["curves"]
     return made

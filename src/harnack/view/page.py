@@ -20,33 +20,33 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from harnack.cluster.executor import Arrays, Crew, crew
+from harnack.cluster.executor import Executor, TaskResult, open_executor
 from harnack.files.file_geometry import write_atomically
 from harnack.progress import progress_bar
 from harnack.rendering.camera import Camera
-from harnack.rendering.mitsuba import take_variant
+from harnack.rendering.mitsuba import set_variant
 from harnack.rendering.mitsuba_plugins import register
-from harnack.view.live_scene import Controls, Live, difference, packed
-from harnack.view.sliders import at_place
+from harnack.view.live_scene import ControlState, LiveScene, encode_arrays, state_delta
+from harnack.view.sliders import slider_values_in_errors
 
 if TYPE_CHECKING:
-    from harnack.view.live_scene import Plain
+    from harnack.view.live_scene import JsonDict
 
-__all__ = ["MODULES", "check_title", "document", "page", "resource", "script", "still_of"]
+__all__ = ["MODULES", "check_title", "document", "page", "resource", "script", "still_png"]
 
-_STILL = (640, 480)
+_STILL_SIZE = (640, 480)
 # Places of a slider without a step, at most; choices of places of several; and of all.
-_PLACES, _CHOICES, _MOST_CHOICES = 33, 300, 1000
+_MAX_SLIDER_VALUES, _CHOICES, _MOST_CHOICES = 33, 300, 1000
 # Choices up to which all are framed; of more, every other place of each slider, and its ends.
 _FRAMED = 100
 # Bytes that all frames together have at most, where sliders have no step, and the fewest places of
 # one slider and of each of several; bytes of a page that are many.
-_USUAL_BYTES, _FEWEST, _MANY_BYTES = 4e6, (9, 5), 8e6
+_TARGET_BYTES, _FEWEST, _MANY_BYTES = 4e6, (9, 5), 8e6
 MODULES = (
     "camera.js", "drawing.js", "elements.js", "frames.js", "legend.js", "link.js", "panel.js",
 )  # fmt: skip
 # What brings other states: those in the page, or Python's answers.
-_LINKS = {
+_CHANNEL_SCRIPTS = {
     "frames": "scene.sliders.length ? new Frames(scene.frames) : null",
     "server": "new Server(`ws://${location.host}/questions${location.search}`)",
 }
@@ -75,7 +75,7 @@ def page(
     They are traced first, and if the visitor's device does not agree, nothing of what it says is
     drawn.
 
-    what: a field, a `LevelSet`, or a list of them, as `render` draws them in its studio; or a
+    what: a field, a `Surface`, or a list of them, as `render` draws them in its studio; or a
         function of sliders that gives them.
     path: ends in .html. title: of the page; by default what the field is.
     settings: as `render` takes them in its studio: level, clip, tolerance, material, camera, up,
@@ -97,16 +97,16 @@ def page(
     check_title(title)
     if not target.lower().endswith((".html", ".htm")):
         raise ValueError(f"{target}: a page is written as .html")
-    job = _PageJob(what, settings, register().variant())
+    job = PageJob(what, settings, register().variant())
     with progress_bar("page", progress) as advance:
         live = job.live
-        scene = live.scene(title or live.subject.name)
-        with crew(client, checkpoint) as workers:
-            scene["frames"] = _frames(job, workers, advance)
-    text = document(scene, still_of(live)).encode()
+        scene = live.scene(title or live.content.name)
+        with open_executor(client, checkpoint) as workers:
+            scene["frames"] = _slider_states(job, workers, advance)
+    text = document(scene, still_png(live)).encode()
     with write_atomically(target) as partial:
         partial.write_bytes(text)
-    if len(text) > _MANY_BYTES and live.subject.sliders:
+    if len(text) > _MANY_BYTES and live.content.sliders:
         count = len(scene["frames"]["frames"])
         warnings.warn(
             f"{target} has {len(text) / 1e6:.1f} MB, because it holds what is drawn at {count:,} "
@@ -122,23 +122,25 @@ def check_title(title: Any) -> None:
         raise TypeError(f"title must be text, not {title!r:.60}")
 
 
-def still_of(live: Live) -> str:
+def still_png(live: LiveScene) -> str:
     """A picture of what is drawn at first, as base64 of a PNG file."""
     camera = Camera(**live.pose)
-    still: Any = live.rendered(live.start, show=live.show, size=_STILL, camera=camera)
+    still: Any = live.render_still(
+        live.initial_controls, show=live.show, size=_STILL_SIZE, camera=camera
+    )
     return base64.b64encode(still._repr_png_()).decode()
 
 
-def _places(live: Live) -> dict[str, list[float]]:
+def _places(live: LiveScene) -> dict[str, list[float]]:
     """The places of the sliders that a page holds: those of their steps, and of sliders without a
     step as many as make no large file, where what is drawn changes much from place to place.
 
     Raises:
         ValueError: there are too many choices of them.
     """
-    sliders = live.subject.sliders
-    several = max(2, min(_PLACES, int(_CHOICES ** (1 / max(1, len(sliders))))))
-    places = {name: one.places(several) for name, one in sliders.items()}
+    sliders = live.content.sliders
+    several = max(2, min(_MAX_SLIDER_VALUES, int(_CHOICES ** (1 / max(1, len(sliders))))))
+    places = {name: one.values(several) for name, one in sliders.items()}
     total = math.prod(map(len, places.values()))
     if total > _MOST_CHOICES:
         raise ValueError(
@@ -149,35 +151,35 @@ def _places(live: Live) -> dict[str, list[float]]:
     if all(one.step is not None for one in sliders.values()):
         return places
     ends = ({name: one[k] for name, one in places.items()} for k in (0, -1))
-    largest = max(len(json.dumps(_frame(live, place))) for place in ends)
+    largest = max(len(json.dumps(_slider_state(live, place))) for place in ends)
     fewest = min(several, _FEWEST[len(sliders) > 1])
-    while several > fewest and largest * math.prod(map(len, places.values())) > _USUAL_BYTES:
+    while several > fewest and largest * math.prod(map(len, places.values())) > _TARGET_BYTES:
         several = max(fewest, (several + 1) // 2)
-        places = {name: one.places(several) for name, one in sliders.items()}
+        places = {name: one.values(several) for name, one in sliders.items()}
     return places
 
 
-def _framed(places: Mapping[str, list[float]]) -> Mapping[str, list[float]]:
+def _framing_values(places: Mapping[str, list[float]]) -> Mapping[str, list[float]]:
     """The places that are framed: all, or of many every other one and the last."""
     if math.prod(map(len, places.values())) <= _FRAMED:
         return places
     return {name: sorted({*one[::2], one[-1]}) for name, one in places.items()}
 
 
-def _choices(places: Mapping[str, list[float]]) -> list[dict[str, float]]:
+def _slider_combinations(places: Mapping[str, list[float]]) -> list[dict[str, float]]:
     """One place of each slider, in all combinations, the last slider's going fastest."""
     return [dict(zip(places, one, strict=True)) for one in itertools.product(*places.values())]
 
 
-def _frame(live: Live, values: Mapping[str, float]) -> Plain:
+def _slider_state(live: LiveScene, values: Mapping[str, float]) -> JsonDict:
     """What a place of the sliders changes of the first state."""
-    with at_place(values):
-        state = live.state(Controls(values))
-    return packed(difference(live.first, state, checks=False))
+    with slider_values_in_errors(values):
+        state = live.state(ControlState(values))
+    return encode_arrays(state_delta(live.initial_state, state, checks=False))
 
 
 @dataclass(frozen=True)
-class _PageJob:
+class PageJob:
     """What the states of a page are made of: as `page` was given it, and Mitsuba's variant."""
 
     what: Any
@@ -185,10 +187,10 @@ class _PageJob:
     variant: str
 
     @functools.cached_property
-    def given(self) -> Live:
+    def given(self) -> LiveScene:
         """What moves."""
-        take_variant(self.variant)
-        return Live.of(self.what, dict(self.settings))
+        set_variant(self.variant)
+        return LiveScene.of(self.what, dict(self.settings))
 
     @functools.cached_property
     def places(self) -> dict[str, list[float]]:
@@ -196,16 +198,18 @@ class _PageJob:
         return _places(self.given)
 
     @functools.cached_property
-    def live(self) -> Live:
+    def live(self) -> LiveScene:
         """What moves, framed over these places."""
-        return self.given.framed(_choices(_framed(self.places)))
+        return self.given.framed(_slider_combinations(_framing_values(self.places)))
 
     @functools.cached_property
     def digest(self) -> str:
         """A number of the first state, from which the others are told by differences."""
-        return hashlib.blake2b(json.dumps(packed(self.live.first)).encode()).hexdigest()
+        return hashlib.blake2b(
+            json.dumps(encode_arrays(self.live.initial_state)).encode()
+        ).hexdigest()
 
-    def state(self, values: Mapping[str, float], digest: str) -> Arrays:
+    def state(self, values: Mapping[str, float], digest: str) -> TaskResult:
         """What a place of the sliders changes of the first state, as text in bytes.
 
         digest: of the first state that is in the page.
@@ -218,15 +222,15 @@ class _PageJob:
                 "a worker prepares this surface with other numbers than this process does: write "
                 "the page without client and checkpoint"
             )
-        text = json.dumps(_frame(self.live, values)).encode()
+        text = json.dumps(_slider_state(self.live, values)).encode()
         return {"text": np.frombuffer(text, np.uint8)}
 
 
-def _frames(job: _PageJob, workers: Crew, advance: Any) -> Plain:
+def _slider_states(job: PageJob, workers: Executor, advance: Any) -> JsonDict:
     """The places of the sliders, and what is drawn at each choice of them."""
-    frames: list[Plain] = []
-    parts = [(values, job.digest) for values in _choices(job.places)]
-    for found in workers.each(job, "state", parts):
+    frames: list[JsonDict] = []
+    parts = [(values, job.digest) for values in _slider_combinations(job.places)]
+    for found in workers.run_tasks(job, "state", parts):
         frames.append(json.loads(found["text"].tobytes()))
         advance(1 / len(parts))
     return {"places": job.places, "frames": frames}
@@ -249,7 +253,7 @@ def document(scene: Mapping[str, Any], still: str, link: str = "frames") -> str:
         passes=passes.replace("</", "<\\/"),
         scene=json.dumps(scene).replace("<", "\\u003c"),
         still=still,
-        link=_LINKS[link],
+        link=_CHANNEL_SCRIPTS[link],
     )
 
 

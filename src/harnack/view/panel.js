@@ -144,7 +144,7 @@ export class Panel {
       rows.push(...this.material_controls(), ...this.cut_controls());
       const width = element("input", { type: "number", min: "16", max: "8192", value: "1600", name: "width" });
       const quality = element("select", { name: "quality" },
-        ...["shaded", "color"].map((name) => element("option", { value: name }, name)));
+        ...["shaded", "path"].map((name) => element("option", { value: name }, name)));
       rows.push(element("label", {}, "Render, pixels wide ", width, quality));
       const file = element("input", { type: "file", accept: ".json", hidden: true, name: "scene",
         onchange: () => { if (file.files?.[0]) this.load(file.files[0]); file.value = ""; } });
@@ -538,7 +538,7 @@ export class Panel {
   /** A picture by Python of what is seen. @param {number} width @param {string} [quality] */
   async picture(width, quality = "shaded") {
     const request = this.render_request(width);
-    const show = quality === "color" && request.show === "shaded" ? "color" : request.show;
+    const show = quality === "path" && request.show === "shaded" ? "path" : request.show;
     const bar = element("progress", { max: 1, value: 0 });
     const { png } = await /** @type {Link} */ (this.link).ask?.("picture", { ...request, show },
       (done, stop) => {

@@ -16,22 +16,22 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import to_numpy
-from harnack.rendering.backdrops import FLOOR, reflectance_of
-from harnack.rendering.images import SHOULDER, as_bytes, transferred
-from harnack.rendering.integrator import LOST_COLOR
+from harnack.rendering.backdrops import FLOOR_HEIGHT, reflectance_of
+from harnack.rendering.images import SHOULDER_START, linear_to_srgb, to_uint8
+from harnack.rendering.integrator import OUT_OF_STEPS_COLOR
 from harnack.rendering.mitsuba import mitsuba_backend
 from harnack.rendering.mitsuba_plugins import register
 from harnack.rendering.scales import viridis
-from harnack.rendering.shaded_render import visible_sky
-from harnack.rendering.shading import Floor, Light
+from harnack.rendering.shaded_render import ambient_visibility
+from harnack.rendering.shading import FloorShadow, StudioLight
 from harnack.view.legend_data import FAR_GRAY, HIT_COLOR, NEAR_GRAY, evaluations_share
-from harnack.view.live_scene import paint_of
+from harnack.view.live_scene import color_index
 
 if TYPE_CHECKING:
     from harnack.backend import FloatArray
     from harnack.rendering.placed_surface import PlacedSurface
 
-__all__ = ["Eye", "Painted", "Painter", "Painting", "Pixels"]
+__all__ = ["CameraAxes", "Pixels", "Preview", "PreviewRenderer", "PreviewSurface"]
 
 Pixels = npt.NDArray[np.uint8]
 _BEHIND = {"light": (0.90, 0.90, 0.89), "dark": (0.10, 0.10, 0.11)}
@@ -40,7 +40,7 @@ _DARKER = 0.45
 
 
 @dataclass(frozen=True)
-class Eye:
+class CameraAxes:
     """A camera on the stage: where it is, unit vectors to the right, up and forwards (3,), and how
     wide a pixel of a picture one unit away is."""
 
@@ -52,7 +52,7 @@ class Eye:
 
 
 @dataclass(frozen=True)
-class Painting:
+class Preview:
     """A picture.
 
     pixels: (h, w, 4) of sRGB and 255. depths: the least and the greatest distance that is seen in a
@@ -64,43 +64,53 @@ class Painting:
 
 
 @dataclass(frozen=True)
-class Painted:
-    """A surface on the stage, and its paints (`scene.paints_of`)."""
+class PreviewSurface:
+    """A surface on the stage, and its paints (`scene.surface_colors`)."""
 
     placed: PlacedSurface
     paints: Sequence[Mapping[str, Any]]
 
 
 @dataclass
-class Painter:
+class PreviewRenderer:
     """Draws surfaces where they stand. Keeps the shadow on the floor while things move, and what
     the rays of the last picture met, so that only its light is computed again."""
 
-    floor: Floor | None = None
-    _met: tuple[Any, dict[str, Any]] | None = None
+    floor: FloorShadow | None = None
+    _hit_cache: tuple[Any, dict[str, Any]] | None = None
 
     def paint(
-        self, painted: Sequence[Painted], eye: Eye, size: tuple[int, int], *, show: str,
-        ground: str, is_idle: bool,
-    ) -> Painting:  # fmt: skip
+        self,
+        painted: Sequence[PreviewSurface],
+        eye: CameraAxes,
+        size: tuple[int, int],
+        *,
+        show: str,
+        ground: str,
+        is_idle: bool,
+    ) -> Preview:
         """A picture. is_idle: whether nothing moves, so that it pays to trace the shadow on the
         floor anew."""
         mi = register()
-        light = Light.of(_matrix(eye))
-        has_floor = show == "shaded" and eye.origin[2] > FLOOR
+        light = StudioLight.of(_matrix(eye))
+        has_floor = show == "shaded" and eye.origin[2] > FLOOR_HEIGHT
         numbers = [eye.origin, eye.right, eye.up, eye.forward]
         key = painted, np.ravel(numbers).tolist(), eye.pixel, size, has_floor
-        if self._met is None or self._met[0][0] is not painted or self._met[0][1:] != key[1:]:
-            self._met = key, self._trace(mi, painted, eye, size, has_floor=has_floor)
-            dr.eval(self._met[1])
-        hits = self._met[1]
+        if (
+            self._hit_cache is None
+            or self._hit_cache[0][0] is not painted
+            or self._hit_cache[0][1:] != key[1:]
+        ):
+            self._hit_cache = key, self._trace(mi, painted, eye, size, has_floor=has_floor)
+            dr.eval(self._hit_cache[1])
+        hits = self._hit_cache[1]
         if show != "shaded":
-            return _numbers(hits, show, _BEHIND[ground], size)
+            return _aov_preview(hits, show, _BEHIND[ground], size)
         # First: it evaluates, and what is recorded before that makes another kernel of the rest.
         if has_floor and (is_idle or self.floor is None):
-            self.floor = Floor.of(_Casting(mi, painted), light)
+            self.floor = FloorShadow.of(_Casting(mi, painted), light)
         width = hits["t"] * eye.pixel * dr.dot(hits["d"], _vector(mi, eye.forward))
-        sky = visible_sky(mi, hits["position"], hits["normal"], width, size)
+        sky = ambient_visibility(mi, hits["position"], hits["normal"], width, size)
         reflectance = reflectance_of(ground)
         color = hits["color"]
         sun: Any = mi.Float(1)
@@ -109,23 +119,23 @@ class Painter:
             sun, above = dr.select(hits["ground"], sun, 1), dr.select(hits["ground"], above, 1)
             sky = dr.minimum(sky, above)
             color = dr.select(hits["ground"], _vector(mi, reflectance, mi.Color3f), color)
-        lit = light.on(color, hits["normal"], -hits["d"], hits["glossy"], sky, sun)
+        lit = light.shade(color, hits["normal"], -hits["d"], hits["glossy"], sky, sun)
         far, z = _vector(mi, reflectance, mi.Color3f), mi.Vector3f(0, 0, 1)
-        wall = light.on(far, z, z, mi.Bool(False), mi.Float(1))
+        wall = light.shade(far, z, z, mi.Bool(False), mi.Float(1))
         wall = wall * (1 - _DARKER * dr.power(dr.clip(hits["d"].z, 0, 1), 0.7))
-        room = 1 - SHOULDER
-        bright = 1 - room * dr.exp((SHOULDER - lit) / room)
-        shown = dr.select(hits["met"], dr.select(lit > SHOULDER, bright, lit), wall)
-        shown = dr.clip(dr.select(hits["lost"], mi.Color3f(LOST_COLOR), shown), 0, 1)
+        room = 1 - SHOULDER_START
+        bright = 1 - room * dr.exp((SHOULDER_START - lit) / room)
+        shown = dr.select(hits["met"], dr.select(lit > SHOULDER_START, bright, lit), wall)
+        shown = dr.clip(dr.select(hits["lost"], mi.Color3f(OUT_OF_STEPS_COLOR), shown), 0, 1)
         srgb = dr.select(
             shown <= 0.0031308, 12.92 * shown, 1.055 * dr.power(shown, 1 / 2.4) - 0.055
         )
         red, green, blue = (mi.UInt32(255 * part + 0.5) for part in srgb)
         packed = red | (green << 8) | (blue << 16) | (255 << 24)
-        return Painting(to_numpy(packed).astype("<u4").view(np.uint8).reshape(size[1], size[0], 4))
+        return Preview(to_numpy(packed).astype("<u4").view(np.uint8).reshape(size[1], size[0], 4))
 
     def _trace(
-        self, mi: Any, painted: Sequence[Painted], eye: Eye, size: tuple[int, int], *,
+        self, mi: Any, painted: Sequence[PreviewSurface], eye: CameraAxes, size: tuple[int, int], *,
         has_floor: bool,
     ) -> dict[str, Any]:  # fmt: skip
         """What the rays through the middles of the pixels meet first."""
@@ -143,18 +153,18 @@ class Painter:
         t, normal, color = mi.Float(dr.inf), mi.Vector3f(0, 0, 1), mi.Color3f(0)
         glossy, lost, ground = mi.Bool(False), mi.Bool(False), mi.Bool(False)
         if has_floor:
-            far = (FLOOR - origin.z) / dr.minimum(d.z, -1e-9)
+            far = (FLOOR_HEIGHT - origin.z) / dr.minimum(d.z, -1e-9)
             ground = (d.z < 0) & (dr.norm(origin + far * d) < 100.0)
             t = dr.select(ground, far, t)
         evaluations = mi.UInt32(0)
         for one in painted:
-            met = one.placed.meet(o, vector(d), mi.Float(dr.inf), mi.Bool(True))
+            met = one.placed.intersect(o, vector(d), mi.Float(dr.inf), mi.Bool(True))
             evaluations += met.evaluations
-            lost |= met.lost
+            lost |= met.is_out_of_steps
             # The floor stands below what was drawn at first: it hides nothing that has moved below.
-            nearer = met.met & ~met.lost & (ground | (met.t < t))
+            nearer = met.is_hit & ~met.is_out_of_steps & (ground | (met.t < t))
             n = mi.Vector3f(met.normal)
-            own, shines = _color(mi, one.paints, paint_of(met), dr.dot(n, d) < 0)
+            own, shines = _color(mi, one.paints, color_index(met), dr.dot(n, d) < 0)
             t = dr.select(nearer, met.t, t)
             normal = dr.select(nearer, n, normal)
             color = dr.select(nearer, own, color)
@@ -174,7 +184,7 @@ class _Casting:
     """Surfaces that cast shadows on the floor."""
 
     mi: Any
-    painted: Sequence[Painted]
+    painted: Sequence[PreviewSurface]
 
     def occluded(self, ray: Any, active: Any) -> Any:
         vector = mitsuba_backend(self.mi).Array3f
@@ -203,16 +213,16 @@ def _vector(mi: Any, numbers: Any, kind: Any = None) -> Any:
     )
 
 
-def _matrix(eye: Eye) -> FloatArray:
+def _matrix(eye: CameraAxes) -> FloatArray:
     """The camera's axes to the left, up and forwards as columns."""
     matrix = np.eye(4)
     matrix[:3, :3] = np.stack([-eye.right, eye.up, eye.forward], axis=1)
     return matrix
 
 
-def _numbers(
+def _aov_preview(
     hits: dict[str, Any], show: str, behind: Sequence[float], size: tuple[int, int]
-) -> Painting:
+) -> Preview:
     """A picture of normals, depths, evaluations or outcomes, as colors."""
     met, lost = to_numpy(hits["met"]), to_numpy(hits["lost"])
     picture, depths = np.empty((len(met), 3)), (0.0, 0.0)
@@ -228,6 +238,6 @@ def _numbers(
         picture[:] = viridis(evaluations_share(to_numpy(hits["evaluations"])))
     elif show == "status":
         picture[met] = HIT_COLOR
-    picture[lost] = transferred(np.array(LOST_COLOR))
+    picture[lost] = linear_to_srgb(np.array(OUT_OF_STEPS_COLOR))
     opaque = np.column_stack([picture, np.ones(len(picture))])
-    return Painting(as_bytes(opaque).reshape(size[1], size[0], 4), depths)
+    return Preview(to_uint8(opaque).reshape(size[1], size[0], 4), depths)

@@ -13,22 +13,22 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, cast
 
-from harnack.backend.validation import whole
-from harnack.view.live_scene import Live
-from harnack.view.page import check_title, document, still_of
-from harnack.view.scene_file import Origins
-from harnack.view.session import Client, QuestionError
-from harnack.view.sliders import ends_of
+from harnack.backend.validation import as_integer_in_range
+from harnack.view.live_scene import LiveScene
+from harnack.view.page import check_title, document, still_png
+from harnack.view.scene_file import FieldSources
+from harnack.view.session import MessageHandler, RequestError
+from harnack.view.sliders import extreme_slider_values
 
 if TYPE_CHECKING:
     from typing import Self
 
     from aiohttp import web
 
-    from harnack.view.live_scene import Plain
+    from harnack.view.live_scene import JsonDict
     from harnack.view.widget import Widget
 
-__all__ = ["View", "check_height", "view"]
+__all__ = ["LiveView", "check_height", "view"]
 
 _LOCAL = ("127.0.0.1", "::1", "localhost")
 # The longest message in bytes, and the most questions of a client that may wait.
@@ -37,7 +37,7 @@ _WAITING = 8
 
 
 @dataclass(frozen=True)
-class View:
+class LiveView:
     """A page that is being served. address: to open in a browser."""
 
     address: str
@@ -83,10 +83,10 @@ def view(
     port: int = 0,
     opens: bool = True,
     waits: bool | None = None,
-    origins: Origins = (),
+    origins: FieldSources = (),
     height: int = 480,
     **settings: Any,
-) -> View | Widget:
+) -> LiveView | Widget:
     """Show surfaces live in the browser: turned, moved by sliders, their curves dragged.
 
         hk.view(hk.SolidAngle(vertices))
@@ -110,19 +110,19 @@ def view(
         interactively.
 
     origins: fields that come from files or the gallery, and where from, for scene files that are
-        saved in the view; as `SavedScene` has them.
+        saved in the view; as `SceneFile` has them.
 
     Raises what `page` raises; ModuleNotFoundError without aiohttp (`pip install harnack[view]`);
     OSError for an address that cannot be served at.
     """
-    port = whole(port, "port", least=0, most=65535)
+    port = as_integer_in_range(port, "port", minimum=0, maximum=65535)
     height = check_height(height)
     check_title(title)
     if not isinstance(cast("Any", host), str):
         raise TypeError(f'host must be an address, such as "127.0.0.1", not {host!r:.60}')
-    live = Live.of(what, settings, edits=True, origins=origins)
-    live = live.framed(ends_of(live.subject.sliders))
-    title = title or live.subject.name
+    live = LiveScene.of(what, settings, edits=True, origins=origins)
+    live = live.framed(extreme_slider_values(live.content.sliders))
+    title = title or live.content.name
     if opens and port == 0 and host == _LOCAL[0] and waits is None and in_notebook():
         try:
             from harnack.view.widget import Widget
@@ -135,7 +135,7 @@ def view(
             return Widget(live, title, height)
     scene = live.scene(title)
     token = "" if host in _LOCAL else secrets.token_urlsafe(16)
-    served = _Server(live, document(scene, still_of(live), link="server"), token)
+    served = _PageServer(live, document(scene, still_png(live), link="server"), token)
     made = served.start(host, port)
     print(f"{scene['title']}: {made.address}", file=sys.stderr)
     if token:
@@ -155,7 +155,7 @@ def check_height(height: Any) -> int:
     Raises:
         ValueError: it is none.
     """
-    return whole(height, "height", least=16, most=10_000)
+    return as_integer_in_range(height, "height", minimum=16, maximum=10_000)
 
 
 def in_notebook() -> bool:
@@ -165,14 +165,14 @@ def in_notebook() -> bool:
     return hasattr(shell, "kernel") or (marimo is not None and marimo.running_in_notebook())
 
 
-class _Server:
-    def __init__(self, live: Live, page: str, token: str) -> None:
+class _PageServer:
+    def __init__(self, live: LiveScene, page: str, token: str) -> None:
         self.live, self.page, self.token = live, page, token
         # Dr.Jit works on all cores for one question at a time.
         self.worker = ThreadPoolExecutor(1, thread_name_prefix="harnack-view")
-        self.clients: set[Client] = set()
+        self.clients: set[MessageHandler] = set()
 
-    def start(self, host: str, port: int) -> View:
+    def start(self, host: str, port: int) -> LiveView:
         """Serves in a thread of its own."""
         try:
             from aiohttp import web
@@ -211,11 +211,11 @@ class _Server:
         try:
             bound = asyncio.run_coroutine_threadsafe(begin(), loop).result()
         except OSError as wrong:
-            View("", loop, ended).close()
+            LiveView("", loop, ended).close()
             raise OSError(f"a view cannot be served at {host}, port {port}: {wrong}") from None
         shown = f"[{host}]" if ":" in host else host
         query = f"?token={self.token}" if self.token else ""
-        return View(f"http://{shown}:{bound}/{query}", loop, ended)
+        return LiveView(f"http://{shown}:{bound}/{query}", loop, ended)
 
     def _reason_to_refuse(self, request: web.Request) -> str:
         """The reason to refuse a request, or "" to answer it. Pages of other servers must not
@@ -261,7 +261,7 @@ class _Server:
             await socket.prepare(request)
         except ConnectionError:  # the page was closed before it was answered
             return web.Response()
-        client, waiting = Client(self.live), set[asyncio.Task[None]]()
+        client, waiting = MessageHandler(self.live), set[asyncio.Task[None]]()
         self.clients.add(client)
         try:
             async for message in socket:
@@ -269,7 +269,7 @@ class _Server:
                     continue
                 try:
                     question = client.read(message.data)
-                except QuestionError as wrong:
+                except RequestError as wrong:
                     await _send(socket, {"id": None, "error": str(wrong)})
                     continue
                 if question is None:
@@ -288,16 +288,18 @@ class _Server:
             self.clients.discard(client)
         return socket
 
-    async def _answer(self, socket: web.WebSocketResponse, client: Client, asked: Plain) -> None:
+    async def _answer(
+        self, socket: web.WebSocketResponse, client: MessageHandler, asked: JsonDict
+    ) -> None:
         loop = asyncio.get_running_loop()
 
-        def send(part: Plain) -> None:
+        def send(part: JsonDict) -> None:
             asyncio.run_coroutine_threadsafe(_send(socket, part), loop)
 
         await _send(socket, await loop.run_in_executor(self.worker, client.answer, asked, send))
 
 
-async def _send(socket: web.WebSocketResponse, answer: Plain | bytes) -> None:
+async def _send(socket: web.WebSocketResponse, answer: JsonDict | bytes) -> None:
     if socket.closed:
         return
     with suppress(ConnectionError):  # it is being closed

@@ -14,38 +14,38 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from harnack.backend.validation import finite
+from harnack.backend.validation import as_finite
 from harnack.distance import curvature
 from harnack.geometry import Ball, Box, HalfSpace
 from harnack.name_suggestions import did_you_mean
 from harnack.rendering import Camera
 from harnack.rendering.backdrops import GROUNDS
-from harnack.rendering.render_options import check_size
-from harnack.rendering.stage import material_of
-from harnack.tracer import Status, trace
+from harnack.rendering.render_options import check_image_size
+from harnack.rendering.stage import parse_material
+from harnack.tracer import RayStatus, trace
 from harnack.view.live_scene import (
-    CONTROLLED,
-    SHOWS,
-    Controls,
-    Live,
+    LIVE_MODES,
+    LIVE_OPTIONS,
+    ControlState,
+    LiveScene,
     check_opaque,
-    difference,
-    live_settings,
-    packed,
-    paints_of,
+    encode_arrays,
+    live_options,
+    state_delta,
+    surface_colors,
 )
-from harnack.view.preview_renderer import Eye, Painted, Painter
-from harnack.view.scene_file import scene_of
-from harnack.view.sliders import ends_of
+from harnack.view.preview_renderer import CameraAxes, PreviewRenderer, PreviewSurface
+from harnack.view.scene_file import parse_scene
+from harnack.view.sliders import extreme_slider_values
 
 if TYPE_CHECKING:
     from harnack.backend import FloatArray
     from harnack.geometry import Volume
     from harnack.rendering.stage import StudioObject
-    from harnack.view.live_scene import Plain
-    from harnack.view.preview_renderer import Painting
+    from harnack.view.live_scene import JsonDict
+    from harnack.view.preview_renderer import Preview
 
-__all__ = ["Client", "QuestionError", "Session", "pose_of"]
+__all__ = ["MessageHandler", "RequestError", "Session", "parse_camera"]
 
 # Points of all curves of one message, so that no message fills the memory.
 _MOST_POINTS = 20_000
@@ -63,7 +63,7 @@ def _ignore_progress(part: float) -> None:
     """Progress that nobody asked for."""
 
 
-class QuestionError(ValueError):
+class RequestError(ValueError):
     """A question that is malformed or asks for something impossible."""
 
 
@@ -72,46 +72,46 @@ class Cancelled(Exception):
 
 
 @dataclass
-class _PaintedState:
+class _PreviewCache:
     """What is painted: what it was made of, its surfaces, the same prepared, and how many rays were
     traced."""
 
     key: Any
     drawn: list[StudioObject]
-    made: list[Painted] = field(default_factory=list[Painted])
+    made: list[PreviewSurface] = field(default_factory=list[PreviewSurface])
     rays: int = 0
 
 
-class Client:
+class MessageHandler:
     """Translates between one client's messages and the questions and answers of a `Session`."""
 
-    def __init__(self, live: Live) -> None:
+    def __init__(self, live: LiveScene) -> None:
         self.session = Session(live)
         self.is_gone = False
         self._cancelled: set[int] = set()
 
-    def read(self, text: str) -> Plain | None:
+    def read(self, text: str) -> JsonDict | None:
         """The question in a text; None for a "cancel", which is carried out here.
 
         Raises:
-            QuestionError: it holds none.
+            RequestError: it holds none.
         """
         try:
             given = json.loads(text)
         except (ValueError, RecursionError):
-            raise QuestionError("a question is an object in JSON") from None
+            raise RequestError("a question is an object in JSON") from None
         if not isinstance(given, dict):
-            raise QuestionError("a question is an object")
-        question = cast("Plain", given)
+            raise RequestError("a question is an object")
+        question = cast("JsonDict", given)
         if question.get("kind") == "cancel" and type(question.get("which")) is int:
             self._cancelled.add(question["which"])
             return None
         number = question.get("id")
         if type(number) is not int or not 0 <= number < 2**32:
-            raise QuestionError("id must be a whole number, by which the answer is known")
+            raise RequestError("id must be a whole number, by which the answer is known")
         return question
 
-    def answer(self, question: Plain, send: Callable[[Plain], None]) -> Plain | bytes:
+    def answer(self, question: JsonDict, send: Callable[[JsonDict], None]) -> JsonDict | bytes:
         """What to send back: an object, or of a picture its number, height, width and the ends of
         its depths (single precision), four bytes each, the last byte first, and then its pixels:
         red, green, blue and alpha, row by row.
@@ -146,57 +146,57 @@ class Client:
 class Session:
     """Answers questions about a live scene, as one client sees it."""
 
-    def __init__(self, live: Live) -> None:
+    def __init__(self, live: LiveScene) -> None:
         self.live = live
-        self._painter = Painter()
-        self._painted: _PaintedState | None = None
+        self._painter = PreviewRenderer()
+        self._painted: _PreviewCache | None = None
 
     def answer(
         self, question: Mapping[str, Any], report: Progress = _ignore_progress
-    ) -> Plain | Painting:
+    ) -> JsonDict | Preview:
         """The answer to a question; a picture to "draw".
 
         report: called during long work with the fraction of it, from 0 to 1, that was finished
             since the last call; an exception that it raises ends the work.
 
         Raises:
-            QuestionError: it makes no sense; the message says what does.
+            RequestError: it makes no sense; the message says what does.
             ValueError, TypeError, ...: what the library says of numbers that make no surface.
         """
         kinds = {
-            "change": self._change,
+            "change": self._delta_response,
             "probe": self._probe,
-            "picture": self._picture,
-            "draw": self._draw,
+            "picture": self._picture_response,
+            "draw": self._preview_response,
             "save": self._save,
             "load": self._load,
         }
         kind = question.get("kind")
         if kind not in kinds:
-            raise QuestionError(f"kind must be one of {', '.join(kinds)}, not {kind!r}")
+            raise RequestError(f"kind must be one of {', '.join(kinds)}, not {kind!r}")
         return kinds[kind](question, self.controls(question), report)
 
-    def controls(self, question: Mapping[str, Any]) -> Controls:
+    def controls(self, question: Mapping[str, Any]) -> ControlState:
         """The state that a question asks about.
 
         Raises:
-            QuestionError: it makes no sense.
+            RequestError: it makes no sense.
         """
         values = self._values(question.get("sliders", {}))
         loops, cut = self._loops(question.get("loops")), _volume(question.get("cut"))
-        return Controls(values, loops, cut, _settings(question.get("settings", {})))
+        return ControlState(values, loops, cut, _settings(question.get("settings", {})))
 
     def _values(self, given: Any) -> dict[str, float]:
-        sliders = self.live.subject.sliders
+        sliders = self.live.content.sliders
         if not isinstance(given, dict):
-            raise QuestionError("sliders must be numbers by name")
-        values = dict(self.live.subject.starts)
+            raise RequestError("sliders must be numbers by name")
+        values = dict(self.live.content.starts)
         for name, value in cast("dict[str, Any]", given).items():
             if name not in sliders:
-                raise QuestionError(f"there is no slider {name!r}{did_you_mean(name, sliders)}")
+                raise RequestError(f"there is no slider {name!r}{did_you_mean(name, sliders)}")
             one = sliders[name]
             if not _is_number(value) or not one.low <= value <= one.high:
-                raise QuestionError(
+                raise RequestError(
                     f"{name} must be a number from {one.low:g} to {one.high:g}, not {value!r}"
                 )
             values[name] = float(value) if one.step is None else one.nearest(value)
@@ -206,24 +206,28 @@ class Session:
         if given is None:
             return None
         if not self.live.editable:
-            raise QuestionError("loops: this surface has no curve whose points can be moved")
+            raise RequestError("loops: this surface has no curve whose points can be moved")
         if not isinstance(given, list) or not given:
-            raise QuestionError("loops must be a list of curves")
+            raise RequestError("loops must be a list of curves")
         loops = [_points(one, "loops") for one in cast("list[Any]", given)]
         if sum(map(len, loops)) > _MOST_POINTS:
-            raise QuestionError(f"loops: at most {_MOST_POINTS:,} points")
+            raise RequestError(f"loops: at most {_MOST_POINTS:,} points")
         return loops
 
-    def _change(self, question: Mapping[str, Any], controls: Controls, report: Progress) -> Plain:
+    def _delta_response(
+        self, question: Mapping[str, Any], controls: ControlState, report: Progress
+    ) -> JsonDict:
         state = self.live.state(controls)
         checks = question.get("checks") is True
-        return packed(difference(self.live.first, state, checks=checks))
+        return encode_arrays(state_delta(self.live.initial_state, state, checks=checks))
 
-    def _probe(self, question: Mapping[str, Any], controls: Controls, report: Progress) -> Plain:
+    def _probe(
+        self, question: Mapping[str, Any], controls: ControlState, report: Progress
+    ) -> JsonDict:
         """The first hit of a ray of the surfaces' coordinates, and how far each step was proved."""
         origin = _points([question.get("origin")], "origin")
         direction = _points([question.get("direction")], "direction")
-        surfaces = [one.surface for one in self.live.drawn(controls)]
+        surfaces = [one.surface for one in self.live.surfaces_at(controls)]
         every = [trace(one, origin, direction) for one in surfaces]
         nearest = min(range(len(every)), key=lambda k: float(every[k].t[0]))
         hits, surface = every[nearest], surfaces[nearest]
@@ -232,12 +236,12 @@ class Session:
             reached = trace(replace(surface, max_steps=most), origin, direction).t[0]
             if steps[-1] < reached < hits.t[0]:
                 steps.append(float(reached))
-        there: Plain = {
-            "status": Status(int(hits.status[0])).name,
+        there: JsonDict = {
+            "status": RayStatus(int(hits.status[0])).name,
             "evaluations": int(hits.evaluations[0]),
             "steps": steps,
         }
-        if not hits.hit[0]:
+        if not hits.is_hit[0]:
             return there
         point = hits.position
         there |= {
@@ -245,12 +249,12 @@ class Session:
             "position": point[0].tolist(),
             "normal": hits.normal[0].tolist(),
         }
-        if hits.sheet[0] >= 0:  # f jumps there, and has no derivatives
-            return there | {"triangle": int(hits.sheet[0])}
+        if hits.primitive_index[0] >= 0:  # f jumps there, and has no derivatives
+            return there | {"triangle": int(hits.primitive_index[0])}
         value, period = float(surface.field.value(point)[0]), surface.field.period
-        if period is not None and len(surface.numbers):
+        if period is not None and len(surface.level_values):
             # The one of its values that is nearest to a level.
-            levels = np.asarray(surface.numbers, np.float64)
+            levels = np.asarray(surface.level_values, np.float64)
             away = np.round((levels - value) / period) * period
             value += float(away[np.argmin(np.abs(value + away - levels))])
         there["value"] = value
@@ -260,114 +264,124 @@ class Session:
             return there
         return there | {"mean": float(bent.mean[0]), "gaussian": float(bent.gaussian[0])}
 
-    def _draw(self, question: Mapping[str, Any], controls: Controls, report: Progress) -> Painting:
+    def _preview_response(
+        self, question: Mapping[str, Any], controls: ControlState, report: Progress
+    ) -> Preview:
         """A picture of one ray a pixel."""
         size = _size(question)
-        show, ground = question.get("show", "shaded"), question.get("ground", self.live.ground)
-        if show not in SHOWS or ground not in GROUNDS:
-            raise QuestionError(
-                f"show is one of {', '.join(SHOWS)}, ground of {', '.join(GROUNDS)}"
+        show, ground = question.get("show", "shaded"), question.get("ground", self.live.backdrop)
+        if show not in LIVE_MODES or ground not in GROUNDS:
+            raise RequestError(
+                f"show is one of {', '.join(LIVE_MODES)}, ground of {', '.join(GROUNDS)}"
             )
         eye = question.get("eye")
         if not isinstance(eye, dict):
-            raise QuestionError("eye must be an object of origin, right, up, forward and pixel")
-        given = cast("Plain", eye)
+            raise RequestError("eye must be an object of origin, right, up, forward and pixel")
+        given = cast("JsonDict", eye)
         origin, right, up, forward = (
             _points([given.get(name)], f"eye: {name}")[0]
             for name in ("origin", "right", "up", "forward")
         )
         pixel: Any = given.get("pixel")
         if not _is_number(pixel) or not pixel > 0:
-            raise QuestionError("eye: pixel must be a positive number")
-        seen = Eye(origin, right, up, forward, pixel)
+            raise RequestError("eye: pixel must be a positive number")
+        seen = CameraAxes(origin, right, up, forward, pixel)
         return self._painter.paint(
             self._surfaces(controls, size[0] * size[1]), seen, size, show=show, ground=ground,
             is_idle=question.get("is_idle") is True,
         )  # fmt: skip
 
-    def _surfaces(self, controls: Controls, rays: int) -> list[Painted]:
+    def _surfaces(self, controls: ControlState, rays: int) -> list[PreviewSurface]:
         """The surfaces, prepared once as long as only the camera moves, and once more where all
         rays so far pay for cells."""
-        loops = None if controls.loops is None else [one.tobytes() for one in controls.loops]
-        key = controls.values, loops, controls.cut, controls.settings
+        loops = None if controls.curves is None else [one.tobytes() for one in controls.curves]
+        key = controls.values, loops, controls.cut_volume, controls.settings
         state = self._painted
         if state is None or state.key != key:
-            state = self._painted = _PaintedState(key, self.live.drawn(controls))
+            state = self._painted = _PreviewCache(key, self.live.surfaces_at(controls))
         state.rays += rays
         drawn = [replace(one, surface=one.surface.for_rays(state.rays)) for one in state.drawn]
         pairs = zip(drawn, state.drawn, strict=True)
         if not state.made or any(a.surface.field is not b.surface.field for a, b in pairs):
             state.drawn = drawn
-            state.made = [Painted(self.live.placed(one), paints_of(one)) for one in drawn]
+            state.made = [
+                PreviewSurface(self.live.place(one), surface_colors(one)) for one in drawn
+            ]
         return state.made
 
-    def _picture(self, question: Mapping[str, Any], controls: Controls, report: Progress) -> Plain:
+    def _picture_response(
+        self, question: Mapping[str, Any], controls: ControlState, report: Progress
+    ) -> JsonDict:
         """A picture of what is seen, as base64 of a PNG file."""
         size = _size(question)
-        made: Any = self.live.rendered(
+        made: Any = self.live.render_still(
             controls, show=question.get("show", "shaded"), size=size, progress=report,
             camera=self._camera(question), spp=question.get("spp"),
-            backdrop=question.get("ground", self.live.ground),
+            backdrop=question.get("ground", self.live.backdrop),
         )  # fmt: skip
         return {"png": base64.b64encode(made._repr_png_()).decode()}
 
     def _camera(self, question: Mapping[str, Any]) -> Camera:
         """The camera of a question, in the surfaces' coordinates."""
         place = self.live.placement
-        eye, target, fov = pose_of(question.get("camera"))
-        eye, target = (place.undo(one[None])[0] for one in (eye, target))
+        eye, target, fov = parse_camera(question.get("camera"))
+        eye, target = (place.apply_inverse(one[None])[0] for one in (eye, target))
         return Camera(position=tuple(eye.tolist()), target=tuple(target.tolist()), fov=fov)
 
-    def _save(self, question: Mapping[str, Any], controls: Controls, report: Progress) -> Plain:
+    def _save(
+        self, question: Mapping[str, Any], controls: ControlState, report: Progress
+    ) -> JsonDict:
         """The text of a scene file, and the names of sliders that it cannot hold."""
-        text, lost = self.live.saved(
+        text, lost = self.live.to_scene_text(
             controls, camera=self._camera(question), show=question.get("show", "shaded"),
-            backdrop=question.get("ground", self.live.ground), up=self.live.up,
+            backdrop=question.get("ground", self.live.backdrop), up=self.live.up,
         )  # fmt: skip
         return {"text": text, "lost": lost}
 
-    def _load(self, question: Mapping[str, Any], controls: Controls, report: Progress) -> Plain:
-        """Replaces the scene by that of a scene file, and returns it as `Live.scene` does.
+    def _load(
+        self, question: Mapping[str, Any], controls: ControlState, report: Progress
+    ) -> JsonDict:
+        """Replaces the scene by that of a scene file, and returns it as `LiveScene.scene` does.
 
-        See `live_settings` for what of its settings is taken.
+        See `live_options` for what of its settings is taken.
         """
         text = question.get("text")
         if not isinstance(text, str):
-            raise QuestionError("text must be that of a scene file")
-        saved = scene_of(text)
-        settings = {**live_settings(saved.settings), **saved.sliders}
-        live = Live.of([*saved.surfaces], settings, edits=True, origins=saved.origins)
-        self.live = live.framed(ends_of(live.subject.sliders))
-        self._painter, self._painted = Painter(), None
-        return self.live.scene(self.live.subject.name)
+            raise RequestError("text must be that of a scene file")
+        saved = parse_scene(text)
+        settings = {**live_options(saved.settings), **saved.sliders}
+        live = LiveScene.of([*saved.surfaces], settings, edits=True, origins=saved.sources)
+        self.live = live.framed(extreme_slider_values(live.content.sliders))
+        self._painter, self._painted = PreviewRenderer(), None
+        return self.live.scene(self.live.content.name)
 
 
-def pose_of(given: Any) -> tuple[FloatArray, FloatArray, float]:
+def parse_camera(given: Any) -> tuple[FloatArray, FloatArray, float]:
     """Position (3,), target (3,) and field of view, in degrees, of an object that holds them.
 
     Raises:
-        QuestionError: it does not.
+        RequestError: it does not.
     """
     if not isinstance(given, dict):
-        raise QuestionError("camera must be an object of position, target and fov")
-    pose = cast("Plain", given)
+        raise RequestError("camera must be an object of position, target and fov")
+    pose = cast("JsonDict", given)
     eye, target = (
         _points([pose.get(name)], f"camera: {name}")[0] for name in ("position", "target")
     )
     fov: Any = pose.get("fov")
     if not _is_number(fov):
-        raise QuestionError("camera: fov must be a number of degrees")
+        raise RequestError("camera: fov must be a number of degrees")
     try:
         Camera(position=tuple(eye.tolist()), target=tuple(target.tolist()), fov=fov)
     except ValueError as wrong:
-        raise QuestionError(f"camera: {wrong}") from None
+        raise RequestError(f"camera: {wrong}") from None
     return eye, target, fov
 
 
 def _size(question: Mapping[str, Any]) -> tuple[int, int]:
-    size = check_size(question.get("size"))
+    size = check_image_size(question.get("size"))
     if max(size) > _LARGEST_PICTURE:
-        raise QuestionError(f"size: at most {_LARGEST_PICTURE} pixels a side")
+        raise RequestError(f"size: at most {_LARGEST_PICTURE} pixels a side")
     return size
 
 
@@ -376,13 +390,13 @@ def _volume(given: Any) -> Volume | None:
     if given is None:
         return None
     kinds = {"ball": 4, "box": 6, "plane": 4}
-    about = cast("Plain", given) if isinstance(given, dict) else {}
+    about = cast("JsonDict", given) if isinstance(given, dict) else {}
     if len(about) != 1 or not set(about) <= set(kinds):
-        raise QuestionError(f"cut is one of {', '.join(kinds)} and its numbers")
+        raise RequestError(f"cut is one of {', '.join(kinds)} and its numbers")
     ((kind, numbers),) = about.items()
     listed = cast("list[Any]", numbers) if isinstance(numbers, list) else []
     if len(listed) != kinds[kind] or not all(map(_is_number, listed)):
-        raise QuestionError(f"cut: a {kind} has {kinds[kind]} finite numbers")
+        raise RequestError(f"cut: a {kind} has {kinds[kind]} finite numbers")
     if kind == "ball":
         return Ball(tuple(listed[:3]), listed[3])
     if kind == "box":
@@ -391,22 +405,24 @@ def _volume(given: Any) -> Volume | None:
 
 
 def _settings(given: Any) -> dict[str, Any]:
-    """Settings that a person has changed: see `CONTROLLED`."""
+    """Settings that a person has changed: see `LIVE_OPTIONS`."""
     if not isinstance(given, dict):
-        raise QuestionError("settings must be an object with names")
-    settings = cast("Plain", given)
+        raise RequestError("settings must be an object with names")
+    settings = cast("JsonDict", given)
     for name, value in settings.items():
-        if name not in CONTROLLED:
-            raise QuestionError(f"there is no setting {name!r:.60}{did_you_mean(name, CONTROLLED)}")
+        if name not in LIVE_OPTIONS:
+            raise RequestError(
+                f"there is no setting {name!r:.60}{did_you_mean(name, LIVE_OPTIONS)}"
+            )
         if name == "material":
             if not isinstance(value, str):
-                raise QuestionError(f"material must be a name or a color, not {value!r:.60}")
+                raise RequestError(f"material must be a name or a color, not {value!r:.60}")
             try:
-                check_opaque(material_of(value))
+                check_opaque(parse_material(value))
             except ValueError as wrong:
-                raise QuestionError(str(wrong)) from None
+                raise RequestError(str(wrong)) from None
         elif value is not None and not (_is_number(value) and value > 0):
-            raise QuestionError(f"boundary must be a positive number or null, not {value!r:.60}")
+            raise RequestError(f"boundary must be a positive number or null, not {value!r:.60}")
     return settings
 
 
@@ -416,15 +432,15 @@ def _points(given: Any, name: str) -> FloatArray:
     try:
         points: FloatArray = np.array(given, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
-        raise QuestionError(wrong) from None
+        raise RequestError(wrong) from None
     if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
-        raise QuestionError(wrong)
+        raise RequestError(wrong)
     return points
 
 
 def _is_number(value: Any) -> bool:
     try:
-        finite(value, "it")
+        as_finite(value, "it")
     except (TypeError, ValueError):
         return False
     return isinstance(value, int | float)

@@ -10,14 +10,21 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, cast
 
-from harnack.backend.validation import finite
+from harnack.backend.validation import as_finite
 from harnack.fields import Field
 from harnack.name_suggestions import did_you_mean
-from harnack.tracer import LevelSet, level_set
+from harnack.tracer import Surface, level_set
 
-__all__ = ["NUMBERS", "PlaceError", "Slider", "Subject", "at_place", "ends_of"]
+__all__ = [
+    "NUMERIC_RENDER_OPTIONS",
+    "Slider",
+    "SliderValueError",
+    "SlidingContent",
+    "extreme_slider_values",
+    "slider_values_in_errors",
+]
 
-NUMBERS = ("boundary", "thickness")
+NUMERIC_RENDER_OPTIONS = ("boundary", "thickness")
 """Settings of `render` that are numbers of surfaces, besides those of `level_set`."""
 # Sliders of which all combinations of ends are few.
 _COMBINED = 3
@@ -43,7 +50,7 @@ class Slider:
     def __post_init__(self) -> None:
         for name in ("low", "high", "start", "step"):
             if name in ("low", "high") or getattr(self, name) is not None:
-                object.__setattr__(self, name, finite(getattr(self, name), name))
+                object.__setattr__(self, name, as_finite(getattr(self, name), name))
         if not self.low < self.high:
             raise ValueError(f"a slider goes from low to high, not from {self.low} to {self.high}")
         if self.step is not None and not 0 < self.step <= self.high - self.low:
@@ -65,7 +72,7 @@ class Slider:
         place = min(self.low + self.step * steps, self.high)
         return number if abs(number - place) <= 1e-9 * self.step else place
 
-    def places(self, count: int) -> list[float]:
+    def values(self, count: int) -> list[float]:
         """All its places, or `count` places evenly spread where it has no step."""
         if self.step is None:
             return [self.low + (self.high - self.low) * k / (count - 1) for k in range(count)]
@@ -74,26 +81,27 @@ class Slider:
 
 
 @dataclass(frozen=True)
-class Subject:
+class SlidingContent:
     """Fields and settings, of which some are functions of sliders.
 
-    what: what `hk.render` draws in its studio, or a function of sliders that gives it. settings: of
+    content: what `hk.render` draws in its studio, or a function of sliders that gives it. settings:
+        of
     `render` and `level_set`; functions likewise. sliders: by their names.
     """
 
-    what: Any
+    content: Any
     settings: Mapping[str, Any]
     sliders: Mapping[str, Slider]
 
     @classmethod
-    def of(cls, what: Any, given: Mapping[str, Any]) -> Subject:
+    def of(cls, what: Any, given: Mapping[str, Any]) -> SlidingContent:
         """What users give: sliders stand in the place of numbers, or are arguments of functions.
 
         Raises:
             TypeError: a function of what is no slider, or a slider that nothing depends on.
         """
         sliders = {name: one for name, one in given.items() if isinstance(one, Slider)}
-        known = (*inspect.signature(level_set).parameters, *NUMBERS)
+        known = (*inspect.signature(level_set).parameters, *NUMERIC_RENDER_OPTIONS)
         settings = {name: one for name, one in given.items() if name not in sliders}
         settings |= {name: sliders[name] for name in sliders if name in known}
         asked: set[str] = set(settings) & set(sliders)
@@ -131,7 +139,7 @@ class Subject:
     def at(self, values: Mapping[str, float]) -> tuple[Any, dict[str, Any]]:
         """What is drawn, and its settings, for values of all sliders."""
         settings = {name: self._at(name, one, values) for name, one in self.settings.items()}
-        return self._at("", self.what, values), settings
+        return self._at("", self.content, values), settings
 
     def _at(self, name: str, one: Any, values: Mapping[str, float]) -> Any:
         if isinstance(one, Slider):
@@ -148,33 +156,33 @@ class Subject:
         return one(*by_place, **by_name)
 
 
-class PlaceError(ValueError):
+class SliderValueError(ValueError):
     """Something wrong with what is drawn at one place of the sliders, which the message names."""
 
 
 @contextmanager
-def at_place(values: Mapping[str, float]) -> Generator[None]:
+def slider_values_in_errors(values: Mapping[str, float]) -> Generator[None]:
     """Has errors within it say for which values of the sliders they were raised; without sliders
     they stay what they are.
 
     Raises:
-        PlaceError: in their place.
+        SliderValueError: in their place.
     """
     try:
         yield
-    except PlaceError:
+    except SliderValueError:
         raise
     except Exception as wrong:
         if not values:
             raise
         place = ", ".join(f"{name}={value:g}" for name, value in values.items())
-        raise PlaceError(
+        raise SliderValueError(
             f"at the place {place} of the sliders: {type(wrong).__name__}: {wrong} (a slider needs "
             "ends low and high between which there is something to draw)"
         ) from wrong
 
 
-def ends_of(sliders: Mapping[str, Slider]) -> list[dict[str, float]]:
+def extreme_slider_values(sliders: Mapping[str, Slider]) -> list[dict[str, float]]:
     """All sliders at their ends, in all combinations of up to three sliders; of more, one after the
     other at its ends while the others stand where they start."""
     ends = {name: (one.low, one.high) for name, one in sliders.items()}
@@ -192,4 +200,4 @@ def _arguments(function: Any) -> dict[str, inspect.Parameter]:
 
 
 def _is_function(one: Any) -> bool:
-    return callable(one) and not isinstance(one, type | Field | LevelSet)
+    return callable(one) and not isinstance(one, type | Field | Surface)

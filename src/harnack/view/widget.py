@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any, cast
 import anywidget
 import traitlets
 
-from harnack.view.live_scene import SHOWS
-from harnack.view.page import MODULES, resource, script, still_of
+from harnack.view.live_scene import LIVE_MODES
+from harnack.view.page import MODULES, resource, script, still_png
 from harnack.view.server import check_height
-from harnack.view.session import Client, QuestionError, pose_of
+from harnack.view.session import MessageHandler, RequestError, parse_camera
 
 if TYPE_CHECKING:
-    from harnack.view.live_scene import Live, Plain
+    from harnack.view.live_scene import JsonDict, LiveScene
 
 __all__ = ["Widget"]
 
@@ -42,21 +42,21 @@ class Widget(anywidget.AnyWidget):
     camera: Any = traitlets.Dict().tag(sync=True)
     sliders: Any = traitlets.Dict().tag(sync=True)
     points: Any = cast("Any", traitlets.List)().tag(sync=True)
-    show: Any = traitlets.Enum(SHOWS).tag(sync=True)
+    show: Any = traitlets.Enum(LIVE_MODES).tag(sync=True)
     height: Any = traitlets.Int(480).tag(sync=True)
     _scene: Any = traitlets.Dict().tag(sync=True)
     _passes: Any = traitlets.Unicode().tag(sync=True)
     _still: Any = traitlets.Unicode().tag(sync=True)
 
-    def __init__(self, live: Live, title: str, height: int) -> None:
-        self._client = Client(live)
+    def __init__(self, live: LiveScene, title: str, height: int) -> None:
+        self._client = MessageHandler(live)
         # Beside the notebook's own thread, so that a picture can be called off.
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="harnack-widget")
         scene = live.scene(title)
         super().__init__(
             _scene=scene, _passes=resource("passes.wgsl"), height=height, show=live.show,
-            _still=f"data:image/png;base64,{still_of(live)}", points=scene["state"]["curves"],
-            sliders=dict(live.start.values), camera=live.pose,
+            _still=f"data:image/png;base64,{still_png(live)}", points=scene["state"]["curves"],
+            sliders=dict(live.initial_controls.values), camera=live.pose,
         )  # fmt: skip
         self.on_msg(self._receive)
 
@@ -71,20 +71,20 @@ class Widget(anywidget.AnyWidget):
             return
         try:
             question = self._client.read(str(text))
-        except QuestionError as wrong:
+        except RequestError as wrong:
             self._send_answer({"id": None, "error": str(wrong)})
             return
         if question is not None:
             self._worker.submit(self._answer, question)
 
-    def _answer(self, question: Plain) -> None:
+    def _answer(self, question: JsonDict) -> None:
         answer = self._client.answer(question, self._send_answer)
         if isinstance(answer, bytes):
             self.send({"id": question["id"]}, buffers=[answer])
         else:
             self._send_answer(answer)
 
-    def _send_answer(self, answer: Plain) -> None:
+    def _send_answer(self, answer: JsonDict) -> None:
         self.send(answer)
 
     @traitlets.validate("height")
@@ -101,12 +101,12 @@ class Widget(anywidget.AnyWidget):
         try:
             value = json.loads(json.dumps(value, default=_listed, allow_nan=False))
             if name == "camera":
-                pose_of(value)
+                parse_camera(value)
             elif name == "sliders":
                 value = dict(session.controls({"sliders": {**self.sliders, **value}}).values)
             elif session.live.editable:
                 session.controls({"loops": value})
-        except (QuestionError, TypeError, ValueError, OverflowError) as wrong:
+        except (RequestError, TypeError, ValueError, OverflowError) as wrong:
             raise traitlets.TraitError(f"{name}: {wrong}") from None
         return value
 

@@ -16,31 +16,31 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import IntArray, backend_of, to_numpy
-from harnack.backend.arrays import aligned_integers
-from harnack.webgpu.recording import leaves, record
+from harnack.backend.arrays import upload_integers
+from harnack.webgpu.recording import labeled_leaves, record_kernel
 from harnack.webgpu.wgsl import WORKGROUP, Shader
 
 __all__ = [
     "Arrays",
-    "Bits",
+    "CompiledShader",
     "Device",
-    "DeviceDisagreesError",
+    "DeviceMismatchError",
     "NoDeviceError",
-    "Program",
-    "bits_of",
-    "data_of",
-    "evaluate",
+    "Words",
+    "as_words",
+    "evaluate_on_device",
     "find_device",
+    "pack_shader_data",
 ]
 
-Bits = npt.NDArray[np.uint32]
+Words = npt.NDArray[np.uint32]
 # Seconds that one dispatch should take: a system kills what keeps its display waiting.
-_SHORT, _LONG = 0.1, 0.4
-_FIRST, _MOST = 1 << 15, 1 << 21
+_MIN_DISPATCH_SECONDS, _MAX_DISPATCH_SECONDS = 0.1, 0.4
+_INITIAL_BATCH, _MAX_BATCH = 1 << 15, 1 << 21
 # Workgroups along an axis, at most, on every device.
-_ACROSS = 65535
+_MAX_WORKGROUPS_PER_AXIS = 65535
 # Shaders that stay compiled.
-_KEPT = 64
+_SHADER_CACHE_SIZE = 64
 
 
 class NoDeviceError(RuntimeError):
@@ -54,14 +54,14 @@ class Device:
     handle: Any
     name: str
 
-    @functools.lru_cache(maxsize=_KEPT)  # noqa: B019  # devices last as long as the process
-    def compile(self, shader: Shader) -> Program:
+    @functools.lru_cache(maxsize=_SHADER_CACHE_SIZE)  # noqa: B019  # devices last as long as the process
+    def compile(self, shader: Shader) -> CompiledShader:
         """The shader, ready to run; compiled once."""
         module = self.handle.create_shader_module(code=shader.code)
         pipeline = self.handle.create_compute_pipeline(
             layout="auto", compute={"module": module, "entry_point": "main"}
         )
-        return Program(self, shader, pipeline)
+        return CompiledShader(self, shader, pipeline)
 
 
 @functools.cache
@@ -89,35 +89,37 @@ def find_device() -> Device:
 
 
 @dataclass(frozen=True)
-class Program:
+class CompiledShader:
     """A shader on a device."""
 
     device: Device
     shader: Shader
     pipeline: Any
 
-    def run(self, data: Mapping[str, Any], lanes: Mapping[str, Any], count: int) -> dict[str, Bits]:
+    def run(
+        self, data: Mapping[str, Any], lanes: Mapping[str, Any], count: int
+    ) -> dict[str, Words]:
         """The bits of the results, (count,) each, by their labels.
 
         data: the arrays of numbers and tables. lanes: (count,) each.
         """
-        made = data_of(self.shader, data)
-        given = np.stack([bits_of(lanes[label]) for label in self.shader.lanes])
+        made = pack_shader_data(self.shader, data)
+        given = np.stack([as_words(lanes[label]) for label in self.shader.lanes])
         results = np.empty((len(self.shader.results), count), np.uint32)
-        first, size = 0, _FIRST
+        first, size = 0, _INITIAL_BATCH
         while first < count:
             last = min(first + size, count)
             start = time.perf_counter()
             results[:, first:last] = self._dispatch(made, given[:, first:last])
             took = time.perf_counter() - start
-            if took < _SHORT and size < _MOST:
+            if took < _MIN_DISPATCH_SECONDS and size < _MAX_BATCH:
                 size *= 2
-            elif took > _LONG and size > WORKGROUP:
+            elif took > _MAX_DISPATCH_SECONDS and size > WORKGROUP:
                 size //= 2
             first = last
         return dict(zip(self.shader.results, results, strict=True))
 
-    def _dispatch(self, data: Bits, lanes: Bits) -> Bits:
+    def _dispatch(self, data: Words, lanes: Words) -> Words:
         import wgpu
 
         handle, usage = self.device.handle, wgpu.BufferUsage
@@ -137,27 +139,27 @@ class Program:
         work.set_pipeline(self.pipeline)
         work.set_bind_group(0, handle.create_bind_group(layout=layout, entries=entries))
         groups = -(-count // WORKGROUP)
-        across = min(groups, _ACROSS)
+        across = min(groups, _MAX_WORKGROUPS_PER_AXIS)
         work.dispatch_workgroups(across, -(-groups // across))
         work.end()
         handle.queue.submit([encoder.finish()])
-        found: Bits = np.frombuffer(handle.queue.read_buffer(buffers[2]), dtype=np.uint32)
+        found: Words = np.frombuffer(handle.queue.read_buffer(buffers[2]), dtype=np.uint32)
         for one in buffers:
             one.destroy()
         return found.reshape(-1, count)
 
 
-def data_of(shader: Shader, data: Mapping[str, Any]) -> Bits:
+def pack_shader_data(shader: Shader, data: Mapping[str, Any]) -> Words:
     """The buffer of numbers and tables that a shader reads (`Shader`), for no lanes as yet."""
-    tables = [bits_of(data[label]) for label in shader.tables]
-    numbers = [bits_of(data[label])[:1] for label in shader.numbers]
+    tables = [as_words(data[label]) for label in shader.tables]
+    numbers = [as_words(data[label])[:1] for label in shader.numbers]
     begin = 2 + len(tables) + len(numbers)
     places = begin + np.cumsum([0, *map(len, tables)])[:-1].astype(np.uint32)
     head = np.zeros(2, np.uint32)
     return np.concatenate([head, places, *numbers, *tables]).astype(np.uint32)
 
 
-def bits_of(array: Any) -> Bits:
+def as_words(array: Any) -> Words:
     """The 32 bits of each entry."""
     values: npt.NDArray[Any] = np.atleast_1d(
         to_numpy(array) if dr.is_array_v(type(array)) else array
@@ -171,38 +173,40 @@ def bits_of(array: Any) -> Bits:
 
 Arrays: TypeAlias = "dict[str, npt.NDArray[Any]]"
 # Lanes that Dr.Jit computes as well: spread evenly over all.
-_SAMPLE = 4096
+_CHECKED_LANES = 4096
 
 
-class DeviceDisagreesError(RuntimeError):
+class DeviceMismatchError(RuntimeError):
     """A device does not compute what Dr.Jit does."""
 
 
-def evaluate(
+def evaluate_on_device(
     device: Device,
     compute: Callable[..., Mapping[str, Any]],
     lanes: Mapping[str, Any],
     data: Any,
-    differences: Callable[[IntArray, Arrays, Arrays], str],
+    find_mismatch: Callable[[IntArray, Arrays, Arrays], str],
 ) -> Arrays:
     """What `compute(**lanes)` gives, as NumPy arrays by name, computed on a device.
 
     compute, data: as `recording.record` takes them.
     lanes: Dr.Jit arrays of n entries each.
-    differences: a function of some lanes, Dr.Jit's answers there and the device's, which says what
-        is wrong with the latter; nothing if they agree.
+    find_mismatch: a function of some lanes, Dr.Jit's answers there and the device's, which says
+        what is wrong with the latter; nothing if they agree.
 
     Raises:
         UntranslatableError: the kernel holds what is not known.
-        DeviceDisagreesError: the answers differ.
+        DeviceMismatchError: the answers differ.
     """
     count = max(dr.width(one) for one in lanes.values())
     # Two at least: a single lane would be a number.
-    some = max(2, min(count, _SAMPLE))
+    some = max(2, min(count, _CHECKED_LANES))
     rows: IntArray = np.arange(some) * (count - 1) // (some - 1)
-    recording = record(compute, {name: _some(one, rows) for name, one in lanes.items()}, data)
+    recording = record_kernel(
+        compute, {name: _gather_lanes(one, rows) for name, one in lanes.items()}, data
+    )
     program = device.compile(recording.shader)
-    given = {label: to_numpy(one) for label, one in leaves("lane", dict(lanes))}
+    given = {label: to_numpy(one) for label, one in labeled_leaves("lane", dict(lanes))}
     bits = program.run(recording.data, given, count)
     expected: Arrays = {}
     found: Arrays = {}
@@ -213,23 +217,23 @@ def evaluate(
         expected[label] = np.full(len(rows), to_numpy(one)[0])
         found[label] = np.full(count, to_numpy(one)[0])
     sample = {label: one[rows] for label, one in found.items()}
-    wrong = differences(rows, _named(expected), _named(sample))
+    wrong = find_mismatch(rows, _columns_to_arrays(expected), _columns_to_arrays(sample))
     if wrong:
-        raise DeviceDisagreesError(
+        raise DeviceMismatchError(
             f"{device.name} does not compute what Dr.Jit does: {wrong}. Nothing that it says is "
             "used: leave out backend"
         )
-    return _named(found)
+    return _columns_to_arrays(found)
 
 
-def _some(array: Any, rows: npt.NDArray[np.int64]) -> Any:
-    index = aligned_integers(backend_of(array), rows.astype(np.uint32))
+def _gather_lanes(array: Any, rows: npt.NDArray[np.int64]) -> Any:
+    index = upload_integers(backend_of(array), rows.astype(np.uint32))
     some = dr.gather(type(array), array, index)
     dr.make_opaque(some)
     return some
 
 
-def _named(columns: Arrays) -> Arrays:
+def _columns_to_arrays(columns: Arrays) -> Arrays:
     """Columns "result name" and "result name k" as arrays (n,) and (n, 3) by name."""
     parts: dict[str, list[npt.NDArray[Any]]] = {}
     for label, column in columns.items():

@@ -13,7 +13,16 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Literal, TypeAlias
 
-__all__ = ["Kernel", "Kind", "Load", "Loop", "Operation", "Store", "UntranslatableError", "parse"]
+__all__ = [
+    "ComputeKernel",
+    "Kind",
+    "Load",
+    "Loop",
+    "Operation",
+    "Store",
+    "UntranslatableError",
+    "parse",
+]
 
 Kind: TypeAlias = Literal["f32", "u32", "bool"]
 _KINDS: dict[str, Kind] = {"float": "f32", "i32": "u32", "i1": "bool", "i8": "u32"}
@@ -31,7 +40,7 @@ class Constant:
     bits: int
 
 
-Value: TypeAlias = "str | Constant"
+Operand: TypeAlias = "str | Constant"
 
 
 @dataclass(frozen=True)
@@ -41,7 +50,7 @@ class Operation:
     result: str
     kind: Kind
     name: str
-    operands: tuple[Value, ...]
+    operands: tuple[Operand, ...]
 
 
 @dataclass(frozen=True)
@@ -56,10 +65,10 @@ class Load:
     kind: Kind
     source: Literal["lane", "number", "table"]
     parameter: int
-    index: Value | None = None
+    index: Operand | None = None
     stride: int = 1
     offset: int = 0
-    mask: Value | None = None
+    mask: Operand | None = None
 
 
 @dataclass(frozen=True)
@@ -68,26 +77,26 @@ class Store:
 
     parameter: int
     kind: Kind
-    value: Value
+    value: Operand
 
 
 @dataclass(frozen=True)
-class Variable:
+class LoopVariable:
     """A variable of a loop: its value before the first iteration, and after each."""
 
     name: str
     kind: Kind
-    before: Value
-    after: Value
+    before: Operand
+    after: Operand
 
 
 @dataclass
 class Loop:
     """Iterations of `test` and `body` while `condition`, which `test` computes, holds."""
 
-    variables: list[Variable] = field(default_factory=list[Variable])
+    variables: list[LoopVariable] = field(default_factory=list[LoopVariable])
     test: list[Statement] = field(default_factory=list["Statement"])
-    condition: Value = ""
+    condition: Operand = ""
     body: list[Statement] = field(default_factory=list["Statement"])
 
 
@@ -95,7 +104,7 @@ Statement: TypeAlias = "Operation | Load | Store | Loop"
 
 
 @dataclass(frozen=True)
-class Kernel:
+class ComputeKernel:
     """What a lane does.
 
     labels: of parameters, as far as they are known: of those that lanes read at places which they
@@ -115,7 +124,7 @@ class Kernel:
                 waiting += [*one.test, *one.body]
 
 
-def parse(text: str) -> Kernel:
+def parse(text: str) -> ComputeKernel:
     """The kernel of a text in LLVM's language, as `drjit.kernel_history` gives it.
 
     Raises:
@@ -125,10 +134,10 @@ def parse(text: str) -> Kernel:
     if start < 0:
         raise UntranslatableError("this text holds no kernel of Dr.Jit for LLVM")
     body = text[start : text.index("\n}", start)]
-    reader = _Reader()
+    reader = _LLVMParser()
     for line in body.split("\n")[1:]:
-        reader.read(line)
-    return Kernel(reader.statements, reader.labels)
+        reader.parse_line(line)
+    return ComputeKernel(reader.statements, reader.labels)
 
 
 @dataclass
@@ -136,15 +145,15 @@ class _Address:
     """Where lanes read: a parameter's array, at an index, in records of `stride` numbers."""
 
     parameter: int
-    index: Value | None = None
+    index: Operand | None = None
     stride: int = 1
-    mask: Value | None = None
+    mask: Operand | None = None
 
 
 _VECTOR = r"<\d+ x (\w+)>"
 _NAME = r"%[\w.]+"
 # A result, a constant of a packet, or a number.
-_V = r"(%[\w.]+|<[^>]*>|[^,<>]+)"
+_OPERAND = r"(%[\w.]+|<[^>]*>|[^,<>]+)"
 # Flags of instructions that only say how LLVM may compile them.
 _FLAGS = re.compile(r"\b(?:fast|nnan|ninf|nsz|arcp|contract|afn|reassoc|nuw|nsw|exact)\b ?")
 _BINARY = [
@@ -178,20 +187,20 @@ _CALLS = {
 }  # fmt: skip
 
 
-def _nothing(*groups: str) -> None:
+def _ignore(*groups: str) -> None:
     del groups
 
 
-class _Reader:
+class _LLVMParser:
     """Reads a kernel line by line."""
 
     def __init__(self) -> None:
         self.statements: list[Statement] = []
         self.labels: dict[int, str] = {}
         self._tables: dict[str, int] = {}  # which parameter a result was read from
-        self._into = self.statements
+        self._current_block = self.statements
         self._loops: list[Loop] = []
-        self._known: dict[str, Value] = {}  # names for other values
+        self._aliases: dict[str, Operand] = {}  # names for other values
         self._addresses: dict[str, _Address] = {}
         self._records: dict[str, _Address] = {}  # of results that are several numbers
         self._label: str | None = None
@@ -202,13 +211,13 @@ class _Reader:
             for word, several in self._grammar().items()
         }
 
-    def read(self, line: str) -> None:
+    def parse_line(self, line: str) -> None:
         """One line more."""
         text = line.partition(", !")[0].strip()
         if text.startswith(";"):
             self._label, self._labeled = text[1:].strip(), ""
         elif text.endswith(":"):
-            self._begin(text[:-1])
+            self._enter_block(text[:-1])
         elif text:
             result, _, said = text.rpartition(" = ")
             variable = result.partition("_")[0]
@@ -224,28 +233,28 @@ class _Reader:
                 f"a kernel of this field holds what is not translated for other GPUs: {text[:160]}"
             )
 
-    def _begin(self, block: str) -> None:
+    def _enter_block(self, block: str) -> None:
         """A block of the kernel: of a loop, what is before it, its test, its body, its end."""
         self._block = block
         if re.fullmatch(r"l_\d+_cond", block):
             loop = Loop()
-            self._into.append(loop)
+            self._current_block.append(loop)
             self._loops.append(loop)
-            self._into = loop.test
+            self._current_block = loop.test
         elif re.fullmatch(r"l_\d+_body", block):
-            self._into = self._loops[-1].body
+            self._current_block = self._loops[-1].body
         elif re.fullmatch(r"l_\d+_done", block):
             loop = self._loops.pop()
             loop.variables = [
                 replace(one, after=self._value(str(one.after), one.kind)) for one in loop.variables
             ]
             outer = self._loops[-1] if self._loops else None
-            self._into = outer.body if outer else self.statements
+            self._current_block = outer.body if outer else self.statements
 
-    def _value(self, text: str, kind: Kind) -> Value:
+    def _value(self, text: str, kind: Kind) -> Operand:
         text = text.strip()
         if text.startswith("%"):
-            return self._known.get(text, text)
+            return self._aliases.get(text, text)
         if text in ("zeroinitializer", "undef", "poison", "false"):
             return Constant(kind, 0)
         if text == "true":
@@ -261,10 +270,10 @@ class _Reader:
             return Constant(kind, struct.unpack("<I", struct.pack("<f", double))[0])
         return Constant(kind, int(text) & 0xFFFFFFFF)
 
-    def _put(self, result: str, kind: Kind, name: str, *operands: Value) -> None:
-        self._into.append(Operation(result, kind, name, operands))
+    def _emit(self, result: str, kind: Kind, name: str, *operands: Operand) -> None:
+        self._current_block.append(Operation(result, kind, name, operands))
 
-    def _of_parameter(self, parameter: int) -> None:
+    def _label_parameter(self, parameter: int) -> None:
         if self._label is not None:
             self.labels.setdefault(parameter, self._label)
 
@@ -272,31 +281,31 @@ class _Reader:
         """By the word for what is done: what lines look like, and what is to do for each."""
         place = rf"ptr ({_NAME}), <\d+ x i32> (\S+)"
         binary: list[tuple[str, Callable[..., None]]]
-        binary = [(rf"(\w+) {_VECTOR} {_V}, {_V}", self._arithmetic)]
+        binary = [(rf"(\w+) {_VECTOR} {_OPERAND}, {_OPERAND}", self._arithmetic)]
         convert: list[tuple[str, Callable[..., None]]]
-        convert = [(rf"(\w+) {_VECTOR} {_V} to {_VECTOR}", self._convert)]
+        convert = [(rf"(\w+) {_VECTOR} {_OPERAND} to {_VECTOR}", self._convert)]
         return {
             # Of packets and branches; results under another name.
             "br": [
                 (rf"br i1 ({_NAME}), label %l_\d+_body, label %l_\d+_done", self._test),
-                (r"br .*", _nothing),
+                (r"br .*", _ignore),
             ],
-            "ret": [(r"ret void", _nothing)],
+            "ret": [(r"ret void", _ignore)],
             "phi": [
                 (rf"phi {_VECTOR} \[ (\S+), %\w+ \], \[ (\S+), %\w+ \]", self._phi),
-                (r"phi i64 .*", _nothing),
+                (r"phi i64 .*", _ignore),
             ],
             "insertelement": [
-                (rf"insertelement {_VECTOR} (?:undef|poison), \w+ (\S+), i32 0", self._same)
+                (rf"insertelement {_VECTOR} (?:undef|poison), \w+ (\S+), i32 0", self._alias)
             ],
             "shufflevector": [
-                (rf"shufflevector {_VECTOR} ({_NAME}), .* zeroinitializer", self._same)
+                (rf"shufflevector {_VECTOR} ({_NAME}), .* zeroinitializer", self._alias)
             ],
             # Arrays.
             "getelementptr": [
                 (r"getelementptr inbounds ptr, ptr %params, i32 (\d+)", self._parameter),
                 (rf"getelementptr inbounds \w+, ptr ({_NAME}), i64 %index", self._pointer),
-                (r"getelementptr \[\d+ x \w+\], ptr @\w+, .*", _nothing),  # zeros
+                (r"getelementptr \[\d+ x \w+\], ptr @\w+, .*", _ignore),  # zeros
                 (rf"getelementptr (?:inbounds )?\[(\d+) x \w+\], {place}", self._record),
                 (rf"getelementptr (?:inbounds )?(?:float|i32|i8), {place}", self._entry),
             ],
@@ -312,8 +321,8 @@ class _Reader:
             # Arithmetic.
             **dict.fromkeys(_BINARY, binary),
             "add": [
-                (rf"add {_VECTOR} ({_NAME}), <i32 0, i32 1, .*>", self._same),  # the lane's index
-                (r"add i64 .*", _nothing),
+                (rf"add {_VECTOR} ({_NAME}), <i32 0, i32 1, .*>", self._alias),  # the lane's index
+                (r"add i64 .*", _ignore),
                 *binary,
             ],
             **dict.fromkeys(_CONVERSIONS, convert),
@@ -323,21 +332,23 @@ class _Reader:
                 *convert,
             ],
             "fneg": [(rf"(fneg) {_VECTOR} (\S+)", self._unary)],
-            "fcmp": [(rf"(fcmp \w+) {_VECTOR} {_V}, {_V}", self._compare)],
+            "fcmp": [(rf"(fcmp \w+) {_VECTOR} {_OPERAND}, {_OPERAND}", self._compare)],
             "icmp": [
-                (rf"(icmp \w+) {_VECTOR} {_V}, {_V}", self._compare),
-                (r"icmp uge i64 .*", _nothing),
+                (rf"(icmp \w+) {_VECTOR} {_OPERAND}, {_OPERAND}", self._compare),
+                (r"icmp uge i64 .*", _ignore),
             ],
             "select": [
-                (rf"select <\d+ x i1> {_V}, <\d+ x ptr> ({_NAME}), .*", self._masked),
-                (rf"select <\d+ x i1> {_V}, {_VECTOR} {_V}, <\d+ x \w+> {_V}", self._select),
+                (rf"select <\d+ x i1> {_OPERAND}, <\d+ x ptr> ({_NAME}), .*",
+                self._set_address_mask),
+                (rf"select <\d+ x i1> {_OPERAND}, {_VECTOR} {_OPERAND}, <\d+ x \w+> {_OPERAND}",
+                self._select),
             ],
             "call": [
-                (r"call i1 @llvm\.vector\.reduce\.or\.v\d+i1\(<\d+ x (i1)> (\S+)\)", self._same),
+                (r"call i1 @llvm\.vector\.reduce\.or\.v\d+i1\(<\d+ x (i1)> (\S+)\)", self._alias),
                 (r"call (?:fastcc )?\[\d+ x <\d+ x \w+>\] @gather_\d+x\w+\(<\d+ x ptr> "
                  rf"({_NAME})\)", self._gather_record),
                 (rf"call {_VECTOR} @llvm\.masked\.gather\S*\(<\d+ x ptr> ({_NAME}), i32 \d+, "
-                 rf"<\d+ x i1> {_V}, <\d+ x \w+> \S+\)", self._gather),
+                 rf"<\d+ x i1> {_OPERAND}, <\d+ x \w+> \S+\)", self._gather),
                 (r"call <\d+ x i1> @llvm\.x86\.avx512\.(fpclass)\S*\(<\d+ x (float)> (\S+), "
                  r"i32 (\d+)\)", self._class),
                 (rf"call {_VECTOR} @llvm\.([\w.]+)\((.*)\)", self._call),
@@ -351,40 +362,42 @@ class _Reader:
 
     def _phi(self, result: str, element: str, before: str, after: str) -> None:
         kind = self._kind(element)
-        variable = Variable(result, kind, self._value(before, kind), after)
+        variable = LoopVariable(result, kind, self._value(before, kind), after)
         self._loops[-1].variables.append(variable)
 
-    def _same(self, result: str, element: str, value: str) -> None:
+    def _alias(self, result: str, element: str, value: str) -> None:
         if element != "ptr":
-            self._known[result] = self._value(value, self._kind(element))
+            self._aliases[result] = self._value(value, self._kind(element))
 
     def _lane(self, result: str, which: str) -> None:
-        self._known[result] = "lane" if which == "index" else "count"
+        self._aliases[result] = "lane" if which == "index" else "count"
 
     def _parameter(self, result: str, number: str) -> None:
         self._addresses[result] = _Address(int(number))
-        self._of_parameter(int(number))
+        self._label_parameter(int(number))
 
     def _pointer(self, result: str, pointer: str) -> None:
         self._addresses[result] = self._addresses[pointer]
 
     def _load_number(self, result: str, element: str, pointer: str) -> None:
         at = self._addresses[pointer]
-        self._into.append(Load(result, self._kind(element), "number", at.parameter))
+        self._current_block.append(Load(result, self._kind(element), "number", at.parameter))
 
     def _load_lane(self, result: str, element: str, pointer: str) -> None:
         at = self._addresses[pointer]
-        self._into.append(Load(result, self._kind(element), "lane", at.parameter))
+        self._current_block.append(Load(result, self._kind(element), "lane", at.parameter))
 
     def _store(self, element: str, value: str, pointer: str) -> None:
         kind = self._kind(element)
-        self._into.append(Store(self._addresses[pointer].parameter, kind, self._value(value, kind)))
+        self._current_block.append(
+            Store(self._addresses[pointer].parameter, kind, self._value(value, kind))
+        )
 
     def _record(self, result: str, stride: str, pointer: str, index: str) -> None:
         at = self._addresses[pointer]
         self._addresses[result] = _Address(at.parameter, self._value(index, "u32"), int(stride))
 
-    def _masked(self, result: str, mask: str, pointer: str) -> None:
+    def _set_address_mask(self, result: str, mask: str, pointer: str) -> None:
         at = self._addresses[pointer]
         self._addresses[result] = _Address(
             at.parameter, at.index, at.stride, self._value(mask, "bool")
@@ -403,55 +416,55 @@ class _Reader:
     def _gather(self, result: str, element: str, pointer: str, mask: str) -> None:
         at = self._addresses[pointer]
         self._read_table(result, element, at, 0, self._value(mask, "bool"))
-        self._of_parameter(at.parameter)
+        self._label_parameter(at.parameter)
 
     def _read_table(
-        self, result: str, element: str, at: _Address, entry: int, mask: Value | None
+        self, result: str, element: str, at: _Address, entry: int, mask: Operand | None
     ) -> None:
         kind = self._kind(element)
         load = Load(result, kind, "table", at.parameter, at.index, at.stride, entry, mask)
-        self._into.append(load)
+        self._current_block.append(load)
         self._tables[result] = at.parameter
 
     def _arithmetic(self, result: str, name: str, element: str, a: str, b: str) -> None:
         kind = self._kind(element)
-        self._put(result, kind, name, self._value(a, kind), self._value(b, kind))
+        self._emit(result, kind, name, self._value(a, kind), self._value(b, kind))
 
     def _unary(self, result: str, name: str, element: str, a: str) -> None:
         kind = self._kind(element)
-        self._put(result, kind, name, self._value(a, kind))
+        self._emit(result, kind, name, self._value(a, kind))
 
     def _compare(self, result: str, name: str, element: str, a: str, b: str) -> None:
         kind = self._kind(element)
-        self._put(result, "bool", name, self._value(a, kind), self._value(b, kind))
+        self._emit(result, "bool", name, self._value(a, kind), self._value(b, kind))
 
     def _select(self, result: str, mask: str, element: str, a: str, b: str) -> None:
         kind = self._kind(element)
         values = self._value(mask, "bool"), self._value(a, kind), self._value(b, kind)
-        self._put(result, kind, "select", *values)
+        self._emit(result, kind, "select", *values)
 
     def _convert(self, result: str, name: str, given: str, a: str, wanted: str) -> None:
         kind, own = self._kind(wanted), self._kind(given)
         value = self._value(a, own)
         if name == "bitcast" and isinstance(value, str):  # of what was read from a table
             if value in self._tables:
-                self._of_parameter(self._tables[value])
+                self._label_parameter(self._tables[value])
             if kind == own:
-                self._known[result] = value
+                self._aliases[result] = value
                 return
-        self._put(result, kind, f"{name} {own}", value)
+        self._emit(result, kind, f"{name} {own}", value)
 
     def _class(self, result: str, name: str, element: str, value: str, mask: str) -> None:
-        self._put(result, "bool", f"{name} {mask}", self._value(value, self._kind(element)))
+        self._emit(result, "bool", f"{name} {mask}", self._value(value, self._kind(element)))
 
     def _call(self, result: str, element: str, function: str, arguments: str) -> None:
         kind = self._kind(element)
         given = re.findall(r"<\d+ x \w+> (<[^>]*>|[^,\s]+)", arguments)
         stem = re.sub(r"\.(?:v\d+\w*|ps|f32|i32|ss)\b.*", "", function)
         if stem in _UNARY_CALLS:
-            self._put(result, kind, _UNARY_CALLS[stem], self._value(given[0], kind))
+            self._emit(result, kind, _UNARY_CALLS[stem], self._value(given[0], kind))
         elif len(given) == _CALLS.get(stem, -1):
-            self._put(result, kind, stem, *(self._value(one, kind) for one in given))
+            self._emit(result, kind, stem, *(self._value(one, kind) for one in given))
         else:
             raise UntranslatableError(
                 f"a kernel of this field calls {function}, which is not translated for other GPUs"

@@ -20,16 +20,16 @@ from typing import Any, cast
 import drjit as dr
 
 from harnack.webgpu.llvm_parser import parse
-from harnack.webgpu.wgsl import Shader, shader_of
+from harnack.webgpu.wgsl import Shader, to_shader
 
-__all__ = ["Recording", "leaves", "record"]
+__all__ = ["RecordedKernel", "labeled_leaves", "record_kernel"]
 
 # A flag of Dr.Jit and its function `gather` are changed for all threads while one records.
-_ALONE = threading.Lock()
+_RECORDING_LOCK = threading.Lock()
 
 
 @dataclass(frozen=True)
-class Recording:
+class RecordedKernel:
     """A kernel as a shader, and the arrays that it reads and writes, by their labels.
 
     data: of numbers and tables. results: what Dr.Jit made of the lanes. constants: of results that
@@ -42,9 +42,9 @@ class Recording:
     constants: dict[str, Any]
 
 
-def record(
+def record_kernel(
     compute: Callable[..., Mapping[str, Any]], lanes: Mapping[str, Any], data: Any
-) -> Recording:
+) -> RecordedKernel:
     """What `compute(**lanes)` records, run on Dr.Jit's own backend for these lanes.
 
     compute: gives arrays by name, none of them evaluated, from one kernel.
@@ -55,36 +55,36 @@ def record(
         UntranslatableError: the kernel holds what is not known.
         RuntimeError: it is more than one kernel.
     """
-    with _ALONE:
-        naming = _Naming()
-        for label, array in leaves("lane", dict(lanes)):
+    with _RECORDING_LOCK:
+        naming = _ArrayLabels()
+        for label, array in labeled_leaves("lane", dict(lanes)):
             dr.set_label(array, label)
-        for array in _arrays_in(data):
-            naming.number(array)
-        with dr.suspend_grad(), naming.gathers():
+        for array in _find_arrays(data):
+            naming.label_array(array)
+        with dr.suspend_grad(), naming.label_gathers():
             given = compute(**lanes)
-        results = dict(leaves("result", dict(given)))
+        results = dict(labeled_leaves("result", dict(given)))
         computed = {k: one for k, one in results.items() if not _is_constant(one)}
         for label, array in computed.items():
             dr.set_label(array, label)
-        text = _evaluated(list(computed.values()))
+        text = _evaluate_and_get_ir(list(computed.values()))
     constants = {label: one for label, one in results.items() if label not in computed}
-    return Recording(_shader(text), naming.known, computed, constants)
+    return RecordedKernel(_shader(text), naming.labeled_arrays, computed, constants)
 
 
 @functools.lru_cache(maxsize=64)
 def _shader(text: str) -> Shader:
-    return shader_of(parse(text))
+    return to_shader(parse(text))
 
 
 def _is_constant(array: Any) -> bool:
     return array.state == dr.VarState.Literal
 
 
-def _evaluated(arrays: list[Any]) -> str:
+def _evaluate_and_get_ir(arrays: list[Any]) -> str:
     """Evaluates arrays, and gives the text of the kernel."""
     with (
-        _no_garbage_collected(),
+        _garbage_collection_paused(),
         dr.scoped_set_flag(dr.JitFlag.KernelHistory, True),
         dr.scoped_set_flag(dr.JitFlag.PrintIR, True),
         contextlib.redirect_stdout(io.StringIO()),  # the flag also has it printed
@@ -98,7 +98,7 @@ def _evaluated(arrays: list[Any]) -> str:
 
 
 @contextlib.contextmanager
-def _no_garbage_collected() -> Generator[None]:
+def _garbage_collection_paused() -> Generator[None]:
     """While it lasts, no thread collects garbage.
 
     To print a kernel, Dr.Jit waits for Python's lock while it holds its own. A thread that collects
@@ -113,23 +113,23 @@ def _no_garbage_collected() -> Generator[None]:
             gc.enable()
 
 
-class _Naming:
+class _ArrayLabels:
     """Labels of arrays, in the order in which they are met, so that they are the same for data of
     the same shape: they are a part of the kernel, which is compiled anew for others."""
 
     def __init__(self) -> None:
-        self.known: dict[str, Any] = {}
+        self.labeled_arrays: dict[str, Any] = {}
         self._tables: dict[int, str] = {}
 
-    def number(self, array: Any) -> None:
+    def label_array(self, array: Any) -> None:
         """Gives an evaluated array a name."""
         if array.state == dr.VarState.Evaluated:
-            label = f"data {len(self.known)}"
+            label = f"data {len(self.labeled_arrays)}"
             dr.set_label(array, label)
-            self.known[label] = array
+            self.labeled_arrays[label] = array
 
     @contextlib.contextmanager
-    def gathers(self) -> Generator[None]:
+    def label_gathers(self) -> Generator[None]:
         """While it lasts, what `drjit.gather` returns is named after the array it is from."""
         module = cast("Any", dr)
         original = module.gather
@@ -147,9 +147,9 @@ class _Naming:
             module.gather = original
 
     def _name_parts(self, found: Any, source: Any) -> None:
-        for _, part in leaves("", found):
+        for _, part in labeled_leaves("", found):
             if part.state == dr.VarState.Evaluated:  # at a place that is known already
-                self.number(part)
+                self.label_array(part)
             elif source.state == dr.VarState.Evaluated:
                 dr.set_label(part, self._table(source))
 
@@ -157,11 +157,13 @@ class _Naming:
         if source.index not in self._tables:
             label = f"table {len(self._tables)}"
             self._tables[source.index] = label
-            self.known[label] = type(source)(source)  # kept, so that no other has its index
+            self.labeled_arrays[label] = type(source)(
+                source
+            )  # kept, so that no other has its index
         return self._tables[source.index]
 
 
-def leaves(name: str, value: Any) -> list[tuple[str, Any]]:
+def labeled_leaves(name: str, value: Any) -> list[tuple[str, Any]]:
     """The flat arrays in a record, dictionary, sequence or nested array, with their names."""
     if dr.is_array_v(type(value)):
         if (
@@ -170,14 +172,14 @@ def leaves(name: str, value: Any) -> list[tuple[str, Any]]:
             and dr.is_jit_v(value)
         ):
             return [(name, value)]
-        return [leaf for k in range(len(value)) for leaf in leaves(f"{name} {k}", value[k])]
+        return [leaf for k in range(len(value)) for leaf in labeled_leaves(f"{name} {k}", value[k])]
     if isinstance(value, dict):
         items = cast("dict[str, Any]", value).items()
-        return [leaf for key, one in items for leaf in leaves(f"{name} {key}", one)]
+        return [leaf for key, one in items for leaf in labeled_leaves(f"{name} {key}", one)]
     return []
 
 
-def _arrays_in(data: Any) -> Iterator[Any]:
+def _find_arrays(data: Any) -> Iterator[Any]:
     """The flat arrays that an object holds, once each, in a fixed order."""
     seen: set[int] = set()
     waiting: list[Any] = [data]
@@ -187,7 +189,7 @@ def _arrays_in(data: Any) -> Iterator[Any]:
             continue
         seen.add(id(one))
         if dr.is_array_v(type(one)):
-            for _, leaf in leaves("", one):
+            for _, leaf in labeled_leaves("", one):
                 yield leaf
         elif isinstance(one, dict):
             waiting += one.values()

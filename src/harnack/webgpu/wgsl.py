@@ -12,20 +12,20 @@ import struct
 from dataclasses import dataclass
 
 from harnack.webgpu.llvm_parser import (
+    ComputeKernel,
     Constant,
-    Kernel,
     Load,
     Loop,
+    Operand,
     Operation,
     Statement,
     Store,
     UntranslatableError,
-    Value,
 )
 
 WORKGROUP = 64
 
-_HEAD = """\
+_PRELUDE = """\
 @group(0) @binding(0) var<storage, read> data: array<u32>;
 @group(0) @binding(1) var<storage, read> lanes: array<u32>;
 @group(0) @binding(2) var<storage, read_write> results: array<u32>;
@@ -63,7 +63,7 @@ _FUNCTIONS = {
     "maximum": "max_or_nan", "umin": "min", "umax": "max", "popcount": "countOneBits",
 }  # fmt: skip
 _ORDER = {"eq": "==", "ne": "!=", "gt": ">", "ge": ">=", "lt": "<", "le": "<="}
-_OPPOSITE = {"gt": "le", "ge": "lt", "lt": "ge", "le": "gt"}
+_NEGATED_COMPARISONS = {"gt": "le", "ge": "lt", "lt": "ge", "le": "gt"}
 
 
 @dataclass(frozen=True)
@@ -82,17 +82,17 @@ class Shader:
     results: tuple[str, ...]
 
 
-def shader_of(kernel: Kernel) -> Shader:
+def to_shader(kernel: ComputeKernel) -> Shader:
     """The shader of a kernel.
 
     Raises:
         UntranslatableError: an operation is not known, or nothing says what an array is.
     """
-    return _Writer(kernel).shader()
+    return _WGSLWriter(kernel).shader()
 
 
-class _Writer:
-    def __init__(self, kernel: Kernel) -> None:
+class _WGSLWriter:
+    def __init__(self, kernel: ComputeKernel) -> None:
         self._kernel = kernel
         places: dict[str, list[int]] = {"number": [], "table": [], "lane": []}
         self._stores: list[Store] = []
@@ -101,7 +101,7 @@ class _Writer:
                 places[one.source].append(one.parameter)
             elif isinstance(one, Store):
                 self._stores.append(one)
-        self._places = {source: sorted(found) for source, found in places.items()}
+        self._buffer_slots = {source: sorted(found) for source, found in places.items()}
         self._stores.sort(key=lambda one: one.parameter)
         self._lines: list[str] = []
         self._depth = 1
@@ -111,12 +111,12 @@ class _Writer:
             self._write(one)
         names = {
             source: tuple(self._label(parameter) for parameter in found)
-            for source, found in self._places.items()
+            for source, found in self._buffer_slots.items()
         }
         results = tuple(self._label(one.parameter) for one in self._stores)
         code = "\n".join(
             [
-                _HEAD,
+                _PRELUDE,
                 f"@compute @workgroup_size({WORKGROUP})",
                 "fn main(",
                 "  @builtin(global_invocation_id) id: vec3<u32>,",
@@ -139,7 +139,7 @@ class _Writer:
             raise UntranslatableError(f"parameter {parameter} of a kernel has no name")
         return label
 
-    def _put(self, line: str) -> None:
+    def _emit(self, line: str) -> None:
         self._lines.append("  " * self._depth + line)
 
     def _write(self, one: Statement) -> None:
@@ -149,37 +149,37 @@ class _Writer:
             place = self._stores.index(one)
             value = self._text(one.value)
             bits = value if one.kind == "u32" else f"bitcast<u32>({value})"
-            self._put(f"results[{place}u * count + lane] = {bits};")
+            self._emit(f"results[{place}u * count + lane] = {bits};")
         elif isinstance(one, Load):
-            self._put(f"let {_name(one.result)} = {self._load(one)};")
+            self._emit(f"let {_name(one.result)} = {self._load(one)};")
         else:
-            self._put(f"let {_name(one.result)} = {self._operation(one)};")
+            self._emit(f"let {_name(one.result)} = {self._operation(one)};")
 
     def _loop(self, loop: Loop) -> None:
         for one in loop.variables:
-            self._put(f"var {_name(one.name)}: {one.kind} = {self._text(one.before)};")
-        self._put("loop {")
+            self._emit(f"var {_name(one.name)}: {one.kind} = {self._text(one.before)};")
+        self._emit("loop {")
         self._depth += 1
         for one in loop.test:
             self._write(one)
-        self._put(f"if (!{self._text(loop.condition)}) {{ break; }}")
+        self._emit(f"if (!{self._text(loop.condition)}) {{ break; }}")
         for one in loop.body:
             self._write(one)
         changed = [one for one in loop.variables if one.after != one.name]
         # At once: what one becomes may be what another was.
         for one in changed:
-            self._put(f"let next_{_name(one.name)} = {self._text(one.after)};")
+            self._emit(f"let next_{_name(one.name)} = {self._text(one.after)};")
         for one in changed:
-            self._put(f"{_name(one.name)} = next_{_name(one.name)};")
+            self._emit(f"{_name(one.name)} = next_{_name(one.name)};")
         self._depth -= 1
-        self._put("}")
+        self._emit("}")
 
     def _load(self, load: Load) -> str:
-        place = self._places[load.source].index(load.parameter)
+        place = self._buffer_slots[load.source].index(load.parameter)
         if load.source == "lane":
             bits = f"lanes[{place}u * count + lane]"
         elif load.source == "number":
-            bits = f"data[{2 + len(self._places['table']) + place}]"
+            bits = f"data[{2 + len(self._buffer_slots['table']) + place}]"
         else:
             assert load.index is not None
             index = self._text(load.index)
@@ -225,18 +225,18 @@ class _Writer:
             case "select":
                 return f"select({a[2]}, {a[1]}, {a[0]})"
             case "fpclass":
-                return _classified(int(how), a[0])
+                return _float_class_test(int(how), a[0])
             case "fcmp":
-                return _compared(how, a[0], a[1])
+                return _float_comparison(how, a[0], a[1])
             case "icmp":
                 if how in ("eq", "ne"):
                     return f"{a[0]} {_ORDER[how]} {a[1]}"
                 x, y = (_signed(v) for v in a) if how[0] == "s" else a
                 return f"{x} {_ORDER[how[1:]]} {y}"
             case _:
-                return _converted(one, name, how, a[0])
+                return _conversion(one, name, how, a[0])
 
-    def _text(self, value: Value) -> str:
+    def _text(self, value: Operand) -> str:
         if isinstance(value, str):
             return _name(value)
         if value.kind == "bool":
@@ -260,7 +260,7 @@ def _signed(text: str) -> str:
     return f"bitcast<i32>({text})"
 
 
-def _compared(how: str, x: str, y: str) -> str:
+def _float_comparison(how: str, x: str, y: str) -> str:
     """Of numbers; "o.." are false of NaN, "u.." true."""
     if how in ("ord", "uno"):
         either = f"is_nan({x}) | is_nan({y})"
@@ -276,10 +276,10 @@ def _compared(how: str, x: str, y: str) -> str:
         return f"({x} != {y}) | is_nan({x}) | is_nan({y})"
     if family == "o":
         return f"{x} {_ORDER[order]} {y}"
-    return f"!({x} {_ORDER[_OPPOSITE[order]]} {y})"
+    return f"!({x} {_ORDER[_NEGATED_COMPARISONS[order]]} {y})"
 
 
-def _classified(classes: int, x: str) -> str:
+def _float_class_test(classes: int, x: str) -> str:
     """Whether a number is of one of the classes of AVX-512's `fpclass`."""
     bits = f"bitcast<u32>({x})"
     tests = {
@@ -295,7 +295,7 @@ def _classified(classes: int, x: str) -> str:
     return " | ".join(test for mask, test in tests.items() if classes & mask)
 
 
-def _converted(one: Operation, name: str, own: str, x: str) -> str:
+def _conversion(one: Operation, name: str, own: str, x: str) -> str:
     match name, own, one.kind:
         case "bitcast", _, kind:
             return x if own == kind else f"bitcast<{kind}>({x})"

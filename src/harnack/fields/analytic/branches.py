@@ -12,7 +12,7 @@ import drjit as dr
 
 from harnack.backend import backend_of
 from harnack.backend.elementary import fmax, fmin, sincos
-from harnack.backend.validation import real, refuse_derivatives
+from harnack.backend.validation import as_real, check_no_derivatives
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -24,13 +24,13 @@ Complex = Any
 
 # Points nearer than this to a singular point are moved away from it: squares of such distances do
 # not underflow.
-_LEAST = 1e-12
+_MIN_DISTANCE = 1e-12
 # About the least number whose square, and the inverse of that, exist in single precision.
 _LEAST_SQUARED = 1e-18
 # The distance to the nearest singular point, if there is none.
 _NO_POINT = 2.0
 # Bounds of second derivatives are multiplied by this, for the rounding of logarithms and powers.
-_WIDENED = 1 + 2e-4
+_BOUND_MARGIN = 1 + 2e-4
 
 
 def complex_type(backend: Backend) -> Any:
@@ -55,33 +55,33 @@ def derivatives(number: Complex, part: str) -> tuple[Real, Real]:
 class BranchPoint:
     """A point of the plane where branches are not analytic.
 
-    at: the point.
+    location: the point.
     power, constant, radius, value: within the radius of the point, all branches g have |g - value|
         <= constant |z - at|^power, with a power > 0 (up to the period of the part that is drawn).
         The power is None where no such bound is known, as at poles and logarithms.
     """
 
-    at: complex
+    location: complex
     power: float | None = None
     constant: float = 1.0
     radius: float = math.inf
     value: complex = 0.0
 
     def __post_init__(self) -> None:
-        refuse_derivatives("a BranchPoint", vars(self))
-        object.__setattr__(self, "at", _finite(self.at, "the place of a branch point"))
+        check_no_derivatives("a BranchPoint", vars(self))
+        object.__setattr__(self, "location", _finite(self.location, "the place of a branch point"))
         object.__setattr__(self, "value", _finite(self.value, "the value at a branch point"))
         for name in ("power", "constant", "radius"):
             if name == "power" and self.power is None:
                 continue
-            number = real(getattr(self, name), f"the {name} of a branch point")
+            number = as_real(getattr(self, name), f"the {name} of a branch point")
             if not number > 0 or (name != "radius" and number == math.inf):
                 raise ValueError(f"the {name} of a branch point must be positive, not {number!r}")
             object.__setattr__(self, name, number)
 
 
 @dataclass(frozen=True)
-class PreparedPoint:
+class PreparedBranchPoint:
     """A `BranchPoint` as kernel parameters of a backend."""
 
     at: Complex
@@ -91,9 +91,13 @@ class PreparedPoint:
     value: Complex
 
     @classmethod
-    def of(cls, point: BranchPoint, number: Callable[[float], Real], made: Any) -> PreparedPoint:
+    def of(
+        cls, point: BranchPoint, number: Callable[[float], Real], made: Any
+    ) -> PreparedBranchPoint:
         """number: makes a number of the backend. made: makes a complex one of two."""
-        at, value = (made(number(one.real), number(one.imag)) for one in (point.at, point.value))
+        at, value = (
+            made(number(one.real), number(one.imag)) for one in (point.location, point.value)
+        )
         return cls(at, point.power, number(point.constant), number(point.radius), value)
 
 
@@ -106,7 +110,7 @@ class Branch:
     second: Complex | None = None
 
 
-class Part(abc.ABC):
+class PlaneRegion(abc.ABC):
     """A region of the plane on which second derivatives are bounded. All its numbers are rounded
     outwards."""
 
@@ -120,7 +124,7 @@ class Part(abc.ABC):
 
 
 @dataclass(frozen=True)
-class Stretch(Part):
+class PlaneSegment(PlaneRegion):
     """The segment from z to z + length w, w a Dr.Jit complex number.
 
     rounding: of z.
@@ -151,7 +155,7 @@ class Stretch(Part):
 
 
 @dataclass(frozen=True)
-class Disk(Part):
+class Disk(PlaneRegion):
     """The disk of a radius about z; rounding: of z."""
 
     z: Complex
@@ -171,13 +175,13 @@ class Disk(Part):
 class Branches(abc.ABC):
     """All branches of an analytic function, with what is proved about them."""
 
-    _prepared: tuple[PreparedPoint, ...] = field(
+    _prepared: tuple[PreparedBranchPoint, ...] = field(
         default=(), kw_only=True, repr=False, compare=False
     )
 
     @property
     @abc.abstractmethod
-    def points(self) -> tuple[BranchPoint, ...]:
+    def branch_points(self) -> tuple[BranchPoint, ...]:
         """The points where branches are not analytic; everywhere else each can be continued."""
 
     def period(self, imaginary: bool) -> float | None:
@@ -199,27 +203,30 @@ class Branches(abc.ABC):
 
         made = complex_type(backend)
         return replace(
-            self, _prepared=tuple(PreparedPoint.of(one, number, made) for one in self.points)
+            self,
+            _prepared=tuple(
+                PreparedBranchPoint.of(one, number, made) for one in self.branch_points
+            ),
         )
 
-    def points_on(self, z: Complex) -> tuple[PreparedPoint, ...]:
+    def points_on(self, z: Complex) -> tuple[PreparedBranchPoint, ...]:
         """The points as numbers of the type of z."""
         if self._prepared:
             return self._prepared
         real, made = cast("Any", type(z.real)), cast("Any", type(z))
-        return tuple(PreparedPoint.of(one, real, made) for one in self.points)
+        return tuple(PreparedBranchPoint.of(one, real, made) for one in self.branch_points)
 
     @abc.abstractmethod
-    def at(self, z: Complex) -> tuple[Branch, ...]:
+    def evaluate(self, z: Complex) -> tuple[Branch, ...]:
         """All branches at z, up to the period, in any order."""
 
     @abc.abstractmethod
-    def bend(self, part: Part) -> Real:
+    def second_derivative_bound(self, part: PlaneRegion) -> Real:
         """A bound of |g''| for all branches on a region of the plane."""
 
-    def moved_off(self, z: Complex, rounding: Real) -> Complex:
+    def move_off_singularities(self, z: Complex, rounding: Real) -> Complex:
         """z, moved by its rounding away from singular points, where derivatives are NaN."""
-        least = rounding + _LEAST
+        least = rounding + _MIN_DISTANCE
         for point in self.points_on(z):
             beside = type(z)(point.at.real + least, point.at.imag)
             z = dr.select(abs(z - point.at) < least, beside, z)
@@ -227,17 +234,17 @@ class Branches(abc.ABC):
 
     def clearance(self, z: Complex) -> Real:
         """The distance to the nearest singular point."""
-        nearest = 0 * z.real + (dr.inf if self.points else _NO_POINT)
+        nearest = 0 * z.real + (dr.inf if self.branch_points else _NO_POINT)
         for point in self.points_on(z):
             nearest = fmin(abs(z - point.at), nearest)
         return nearest
 
-    def largest(self, middle: complex, reach: float) -> float:
+    def max_abs(self, middle: complex, reach: float) -> float:
         """A bound of |g| on the disk of that radius about a point; inf where none is known."""
         del middle, reach
         return math.inf
 
-    def roundings(self, z: Complex, branches: tuple[Branch, ...]) -> Real:
+    def value_rounding(self, z: Complex, branches: tuple[Branch, ...]) -> Real:
         """A bound of the rounding of values, in units (2^-23 in single precision) of the number
         1."""
         del z
@@ -264,7 +271,7 @@ class PowerProduct(Branches):
     single factor.
     """
 
-    places: tuple[complex, ...]
+    centers: tuple[complex, ...]
     exponents: tuple[float, ...]
     denominator: int
     _on: tuple[Complex, ...] = field(default=(), repr=False, compare=False)
@@ -274,9 +281,9 @@ class PowerProduct(Branches):
         return self.denominator
 
     @property
-    def points(self) -> tuple[BranchPoint, ...]:
+    def branch_points(self) -> tuple[BranchPoint, ...]:
         made: list[BranchPoint] = []
-        for i, (a, alpha) in enumerate(zip(self.places, self.exponents, strict=True)):
+        for i, (a, alpha) in enumerate(zip(self.centers, self.exponents, strict=True)):
             if alpha > 0 and alpha.is_integer():
                 continue
             if alpha < 0:
@@ -284,7 +291,7 @@ class PowerProduct(Branches):
                 continue
             others = [
                 (abs(a - b), beta)
-                for j, (b, beta) in enumerate(zip(self.places, self.exponents, strict=True))
+                for j, (b, beta) in enumerate(zip(self.centers, self.exponents, strict=True))
                 if j != i
             ]
             radius = 0.5 * min((d for d, _ in others), default=math.inf)
@@ -293,14 +300,14 @@ class PowerProduct(Branches):
         return tuple(made)
 
     def prepare(self, backend: Backend) -> Branches:
-        return replace(super().prepare(backend), _on=_uploaded(self.places, backend))
+        return replace(super().prepare(backend), _on=_uploaded(self.centers, backend))
 
     def _centers(self, z: Complex) -> tuple[Complex, ...]:
-        return self._on or tuple(type(z)(a.real, a.imag) for a in self.places)
+        return self._on or tuple(type(z)(a.real, a.imag) for a in self.centers)
 
-    def moved_off(self, z: Complex, rounding: Real) -> Complex:
+    def move_off_singularities(self, z: Complex, rounding: Real) -> Complex:
         """Also away from zeros, where the logarithm of the product is infinite, by one rounding."""
-        z = super().moved_off(z, rounding)
+        z = super().move_off_singularities(z, rounding)
         unit = 4 * float(dr.epsilon(z.real))
         for a, alpha in zip(self._centers(z), self.exponents, strict=True):
             if alpha > 0 and alpha.is_integer():
@@ -309,7 +316,7 @@ class PowerProduct(Branches):
                 z = dr.select(abs(z - a) < least, beside, z)
         return z
 
-    def at(self, z: Complex) -> tuple[Branch, ...]:
+    def evaluate(self, z: Complex) -> tuple[Branch, ...]:
         scale, angle = 0 * z.real, 0 * z.real
         slope = type(z)(scale, scale)
         other = slope
@@ -331,7 +338,7 @@ class PowerProduct(Branches):
             made.append(Branch(value, value * slope, value * bent))
         return tuple(made)
 
-    def bend(self, part: Part) -> Real:
+    def second_derivative_bound(self, part: PlaneRegion) -> Real:
         nearest: list[Real] = []
         farthest: list[Real] = []
         for a in self._centers(part.disk()[0]):
@@ -351,18 +358,18 @@ class PowerProduct(Branches):
                     if power != 0
                 ]
                 total = total + factor * dr.exp(sum(sizes)) if sizes else factor
-        return total * _WIDENED
+        return total * _BOUND_MARGIN
 
-    def largest(self, middle: complex, reach: float) -> float:
+    def max_abs(self, middle: complex, reach: float) -> float:
         most = 1.0
-        for a, alpha in zip(self.places, self.exponents, strict=True):
+        for a, alpha in zip(self.centers, self.exponents, strict=True):
             away = abs(a - middle)
             if alpha < 0 and away <= reach:
                 return math.inf
             most *= (away + math.copysign(reach, alpha)) ** alpha
         return most
 
-    def roundings(self, z: Complex, branches: tuple[Branch, ...]) -> Real:
+    def value_rounding(self, z: Complex, branches: tuple[Branch, ...]) -> Real:
         """That of exp and of the angle: a few units of their arguments."""
         most = 12 + 4 * math.pi * sum(abs(alpha) for alpha in self.exponents)
         for a, alpha in zip(self._centers(z), self.exponents, strict=True):
@@ -378,24 +385,24 @@ class Logarithm(Branches):
     |g''| = |sum n_i/(z - a_i)^2| <= sum |n_i|/d_i^2, with the smallest distances of the region.
     """
 
-    places: tuple[complex, ...] = (0j,)
+    centers: tuple[complex, ...] = (0j,)
     multiplicities: tuple[int, ...] = (1,)
     _on: tuple[Complex, ...] = field(default=(), repr=False, compare=False)
 
     @property
-    def points(self) -> tuple[BranchPoint, ...]:
-        return tuple(BranchPoint(a) for a in self.places)
+    def branch_points(self) -> tuple[BranchPoint, ...]:
+        return tuple(BranchPoint(a) for a in self.centers)
 
     def period(self, imaginary: bool) -> float | None:
         return 2 * math.pi * math.gcd(*self.multiplicities) if imaginary else None
 
     def prepare(self, backend: Backend) -> Branches:
-        return replace(super().prepare(backend), _on=_uploaded(self.places, backend))
+        return replace(super().prepare(backend), _on=_uploaded(self.centers, backend))
 
     def _centers(self, z: Complex) -> tuple[Complex, ...]:
-        return self._on or tuple(type(z)(a.real, a.imag) for a in self.places)
+        return self._on or tuple(type(z)(a.real, a.imag) for a in self.centers)
 
-    def at(self, z: Complex) -> tuple[Branch, ...]:
+    def evaluate(self, z: Complex) -> tuple[Branch, ...]:
         zero = type(z)(0 * z.real, 0 * z.real)
         value, first, second = zero, zero, zero
         for a, n in zip(self._centers(z), self.multiplicities, strict=True):
@@ -406,13 +413,13 @@ class Logarithm(Branches):
             second = second - n * (inverse * inverse)
         return (Branch(value, first, second),)
 
-    def bend(self, part: Part) -> Real:
+    def second_derivative_bound(self, part: PlaneRegion) -> Real:
         total = 0 * part.disk()[1]
         for a, n in zip(self._centers(part.disk()[0]), self.multiplicities, strict=True):
             total = total + abs(n) / dr.square(part.distances(a)[0])
-        return total * _WIDENED
+        return total * _BOUND_MARGIN
 
-    def roundings(self, z: Complex, branches: tuple[Branch, ...]) -> Real:
+    def value_rounding(self, z: Complex, branches: tuple[Branch, ...]) -> Real:
         del branches
         most = 0 * z.real
         for a, n in zip(self._centers(z), self.multiplicities, strict=True):
@@ -435,7 +442,7 @@ class ArcSine(Branches):
         return 2
 
     @property
-    def points(self) -> tuple[BranchPoint, ...]:
+    def branch_points(self) -> tuple[BranchPoint, ...]:
         constant = math.pi / 3 * math.sqrt(2.0) * (1 + 1e-6)
         half = 0.5 * math.pi
         return BranchPoint(1, 0.5, constant, 0.5, half), BranchPoint(-1, 0.5, constant, 0.5, -half)
@@ -443,7 +450,7 @@ class ArcSine(Branches):
     def period(self, imaginary: bool) -> float | None:
         return None if imaginary else 2 * math.pi
 
-    def at(self, z: Complex) -> tuple[Branch, ...]:
+    def evaluate(self, z: Complex) -> tuple[Branch, ...]:
         """By Kahan's formulas (1987), in which nothing cancels."""
         below, above = dr.sqrt(1 - z), dr.sqrt(1 + z)
         product = below * above
@@ -453,17 +460,17 @@ class ArcSine(Branches):
         second = z * (first * first * first)
         return Branch(g, first, second), Branch(math.pi - g, -first, -second)
 
-    def bend(self, part: Part) -> Real:
+    def second_derivative_bound(self, part: PlaneRegion) -> Real:
         complex_number = cast("Any", type(part.disk()[0]))
         low1, _ = part.distances(complex_number(1, 0))
         low2, _ = part.distances(complex_number(-1, 0))
         _, most = part.distances(complex_number(0, 0))
         inverse = 1 / (low1 * low2)
-        return most * inverse * dr.sqrt(inverse) * _WIDENED
+        return most * inverse * dr.sqrt(inverse) * _BOUND_MARGIN
 
 
 @dataclass(frozen=True)
-class OwnBranches(Branches):
+class UserBranches(Branches):
     """Branches that a user gives: see `RiemannSurface`.
 
     On a region g'' is bounded by the user's bound on a disk around it, if no singular point lies in
@@ -472,35 +479,35 @@ class OwnBranches(Branches):
 
     function: Callable[[Any], Any]
     singular: tuple[BranchPoint, ...]
-    second: Callable[[Any, Any], Any]
-    number: int
+    second_bound: Callable[[Any, Any], Any]
+    branch_count: int
     shift: float | None = None
 
     @property
     def count(self) -> int:
-        return self.number
+        return self.branch_count
 
     @property
-    def points(self) -> tuple[BranchPoint, ...]:
+    def branch_points(self) -> tuple[BranchPoint, ...]:
         return self.singular
 
     def period(self, imaginary: bool) -> float | None:
         del imaginary
         return self.shift
 
-    def at(self, z: Complex) -> tuple[Branch, ...]:
+    def evaluate(self, z: Complex) -> tuple[Branch, ...]:
         made: list[Branch] = []
         for one in self.function(z):
             given = [part if dr.is_array_v(type(part)) else type(z)(part) for part in one]
             made.append(Branch(*given))
         return tuple(made)
 
-    def bend(self, part: Part) -> Real:
+    def second_derivative_bound(self, part: PlaneRegion) -> Real:
         middle, radius = part.disk()
         free = radius == radius
         for point in self.points_on(middle):
             free = free & (abs(middle - point.at) > radius)
-        bound = 0 * radius + self.second(middle, radius)
+        bound = 0 * radius + self.second_bound(middle, radius)
         return dr.select(free & (bound >= 0), bound, dr.inf)
 
 

@@ -16,22 +16,22 @@ from typing import TYPE_CHECKING, Any, cast
 import drjit as dr
 import numpy as np
 
-from harnack.backend import aligned
+from harnack.backend import upload_floats
 from harnack.backend.elementary import clamp, fmin, sincos
-from harnack.backend.record_table import Records
-from harnack.enclosures import Curvature
+from harnack.backend.record_table import RecordTable
+from harnack.enclosures import TaylorRemainder
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, Real, Vec3
 
-__all__ = ["CellBounds", "CosineBounds", "fit_cosines", "midpoints", "on_nodes"]
+__all__ = ["CellBounds", "CosineBounds", "evaluate_on_grid", "fit_cosines", "midpoints"]
 
 # Nodes for each half wave of the highest frequency: at least the first number, at most the last,
 # and between them as many as make about the second number along an axis.
-_FINE, _ALONG_AXIS, _FINEST = 8, 112, 32
+_MIN_NODES, _ALONG_AXIS, _FINEST = 8, 112, 32
 # Sides, in cells, of the grids of local bounds. A grid is used if its bounds are on average below
 # this fraction of the global one, so that they are worth the time of a lookup.
-_CELLS, _PAYS = (16, 8, 4), 0.9
+_CELLS, _MAX_RATIO = (16, 8, 4), 0.9
 # Cells along a side of the grid by which the extent of a level is bounded.
 _EXTENT_CELLS = 32
 # Bounds are moved outwards by this fraction for the rounding of double precision.
@@ -65,7 +65,7 @@ def fit_cosines(grid: FloatArray, terms: tuple[int, int, int]) -> FloatArray:
     return kept
 
 
-def on_nodes(
+def evaluate_on_grid(
     coefficients: FloatArray, angles: tuple[FloatArray, FloatArray, FloatArray],
     orders: tuple[int, int, int] = (0, 0, 0),
 ) -> FloatArray:  # fmt: skip
@@ -120,7 +120,7 @@ class CosineBounds:
     def of(cls, coefficients: FloatArray, size: FloatArray) -> CosineBounds:
         """size: (3,) of the box."""
         degrees: list[int] = [n - 1 for n in coefficients.shape]
-        fine = [min(max(_FINE, _ALONG_AXIS // max(n, 1)), _FINEST) for n in degrees]
+        fine = [min(max(_MIN_NODES, _ALONG_AXIS // max(n, 1)), _FINEST) for n in degrees]
         angles: list[FloatArray] = [
             math.pi * np.arange(n * m + 1) / max(n * m, 1) if n else np.zeros(1)
             for n, m in zip(degrees, fine, strict=True)
@@ -133,7 +133,7 @@ class CosineBounds:
             math.pi**2 / (8 * m * m) if n else 0.0 for n, m in zip(degrees, fine, strict=True)
         )
         nodes = angles[0], angles[1], angles[2]
-        values = on_nodes(coefficients, nodes)
+        values = evaluate_on_grid(coefficients, nodes)
         middle = 0.5 * float(values.min() + values.max())
         half = 0.5 * float(values.max() - values.min()) * factor * (1 + _ROUNDING)
         half += _ROUNDING * abs(middle)
@@ -141,10 +141,10 @@ class CosineBounds:
         curvature = float(bent.max()) * factor * (1 + _ROUNDING)
         cells: list[CellBounds] = []
         for count in _CELLS:
-            local = _over_cells(bent, angles, count, 1, np.maximum) + off * curvature
+            local = _cell_extremes(bent, angles, count, 1, np.maximum) + off * curvature
             local = np.minimum(local * (1 + _ROUNDING), curvature)
-            if float(local.mean()) <= _PAYS * curvature:
-                # x is the first index in `_over_cells` and runs fastest on the device.
+            if float(local.mean()) <= _MAX_RATIO * curvature:
+                # x is the first index in `_cell_extremes` and runs fastest on the device.
                 cells.append(CellBounds(count, np.ascontiguousarray(local.T).ravel()))
         margin = off * half + _ROUNDING * (abs(middle) + half)
         return cls(
@@ -152,8 +152,8 @@ class CosineBounds:
             middle + half,
             curvature,
             tuple(cells),
-            _over_cells(values, angles, _EXTENT_CELLS, 0, np.minimum) - margin,
-            _over_cells(values, angles, _EXTENT_CELLS, 0, np.maximum) + margin,
+            _cell_extremes(values, angles, _EXTENT_CELLS, 0, np.minimum) - margin,
+            _cell_extremes(values, angles, _EXTENT_CELLS, 0, np.maximum) + margin,
         )
 
     def extent(self, levels: tuple[float, ...]) -> tuple[FloatArray, FloatArray] | None:
@@ -188,7 +188,7 @@ def _spectral_norms(
             orders = [0, 0, 0]
             orders[a] += 1
             orders[b] += 1
-            here = on_nodes(coefficients, part, (orders[0], orders[1], orders[2]))
+            here = evaluate_on_grid(coefficients, part, (orders[0], orders[1], orders[2]))
             second[a, b] = rates[a] * rates[b] * here
         xx, yy, zz = second[0, 0], second[1, 1], second[2, 2]
         xy, xz, yz = second[0, 1], second[0, 2], second[1, 2]
@@ -206,7 +206,7 @@ def _spectral_norms(
     return norms
 
 
-def _over_cells(
+def _cell_extremes(
     values: FloatArray, angles: list[FloatArray], count: int, around: int, best: Any
 ) -> FloatArray:
     """The extremes over the nodes on and next to each of count^3 cells, with `around` neighbors
@@ -247,10 +247,10 @@ class CosineSums:
     shape: tuple[int, int, int]
     lower: Vec3
     rate: Vec3
-    rows: Records
+    rows: RecordTable
     rounding: tuple[Real, Real]
     curvature: Real
-    cells: tuple[_Cells, ...]
+    cells: tuple[_CellCurvatures, ...]
 
     @classmethod
     def upload(
@@ -269,12 +269,12 @@ class CosineSums:
         return cls(
             backend,
             (count, along_y, along_z),
-            _data(backend, lower),
-            _data(backend, np.pi / size),
-            Records.upload(backend, table),
+            _vector_parameters(backend, lower),
+            _vector_parameters(backend, np.pi / size),
+            RecordTable.upload(backend, table),
             (dr.opaque(backend.Float, rounding[0]), dr.opaque(backend.Float, rounding[1])),
             dr.opaque(backend.Float, bounds.curvature * (1 + _KERNEL_ROUNDING)),
-            tuple(_Cells.upload(backend, one, size) for one in bounds.cells),
+            tuple(_CellCurvatures.upload(backend, one, size) for one in bounds.cells),
         )
 
     def angles(self, p: Vec3) -> Vec3:
@@ -322,10 +322,10 @@ class CosineSums:
             r.z * r * vector(xz, yz, zz),
         )
 
-    def curvatures(self, p: Vec3) -> tuple[Curvature, ...]:
+    def curvatures(self, p: Vec3) -> tuple[TaylorRemainder, ...]:
         """Bounds of second derivatives around p, that on the smallest ball first; the last one
         holds everywhere."""
-        everywhere = Curvature(self.curvature + 0 * p.x, dr.inf)
+        everywhere = TaylorRemainder(self.curvature + 0 * p.x, dr.inf)
         if not self.cells:
             return (everywhere,)
         share = self.angles(p) * float(1 / np.pi)
@@ -333,7 +333,7 @@ class CosineSums:
 
 
 @dataclass(frozen=True)
-class _Cells:
+class _CellCurvatures:
     """Local bounds of second derivatives on a backend; sides: those of a cell."""
 
     backend: Backend
@@ -342,11 +342,11 @@ class _Cells:
     bounds: Real
 
     @classmethod
-    def upload(cls, backend: Backend, cells: CellBounds, size: FloatArray) -> _Cells:
-        bounds = aligned(backend, cells.bounds * (1 + _KERNEL_ROUNDING))
-        return cls(backend, cells.count, _data(backend, size / cells.count), bounds)
+    def upload(cls, backend: Backend, cells: CellBounds, size: FloatArray) -> _CellCurvatures:
+        bounds = upload_floats(backend, cells.bounds * (1 + _KERNEL_ROUNDING))
+        return cls(backend, cells.count, _vector_parameters(backend, size / cells.count), bounds)
 
-    def curvature(self, share: Vec3) -> Curvature:
+    def curvature(self, share: Vec3) -> TaylorRemainder:
         """The bound of the cell in which a point lies, on a ball within the cell's neighbors."""
         place, index = share * float(self.count), self.backend.UInt32(0)
         free: Real = dr.inf
@@ -356,10 +356,10 @@ class _Cells:
             rest = place[axis] - cell
             free = fmin((1 + fmin(rest, 1 - rest)) * self.sides[axis], free)
         constant = dr.gather(self.backend.Float, self.bounds, index)
-        return Curvature(constant, free * (1 - _KERNEL_ROUNDING * self.count))
+        return TaylorRemainder(constant, free * (1 - _KERNEL_ROUNDING * self.count))
 
 
-def _data(backend: Backend, numbers: FloatArray) -> Vec3:
+def _vector_parameters(backend: Backend, numbers: FloatArray) -> Vec3:
     return backend.Array3f(*(dr.opaque(backend.Float, float(one)) for one in numbers))
 
 

@@ -13,11 +13,11 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import backend_of
-from harnack.backend.validation import real_array
+from harnack.backend.validation import as_real_array
 from harnack.fields.analytic.cosine_series import CosineBounds, CosineSums, fit_cosines, midpoints
 from harnack.fields.analytic.waves import mean_wavelength
-from harnack.fields.batched_fields import prepared_once
-from harnack.fields.field import Field, Sample, check_in_range
+from harnack.fields.batched_fields import cached_prepare
+from harnack.fields.field import Field, Sample, validate_levels_in_range
 from harnack.geometry.clip_volumes import Box
 
 if TYPE_CHECKING:
@@ -26,16 +26,16 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, Vec3
     from harnack.geometry.volume import Volume
 
-__all__ = ["Displacement", "FourierSeries"]
+__all__ = ["FourierSeries", "SurfaceDisplacement"]
 
 _MOST_TERMS = 24
 # Samples along a side by default: for each term, and at least; and the most samples in all.
 _SAMPLES, _LEAST_SAMPLES, _MOST_SAMPLES = 4, 64, 1 << 25
 # Points at which the error of a fit is measured; the Newton steps that bring them to the surface,
 # and the tolerance of these.
-_CHECKED, _NEWTON_STEPS, _CONVERGED = 20_000, 12, 1e-9
+_CHECK_POINTS, _NEWTON_STEPS, _CONVERGED = 20_000, 12, 1e-9
 # Coefficients that are so small against the values fitted are rounding.
-_NOTHING = 1e-13
+_MIN_COEFFICIENT = 1e-13
 # Covers terms of second order in the unit roundoff.
 _SECOND_ORDER = 1.05
 
@@ -44,7 +44,7 @@ Function: TypeAlias = Callable[["FloatArray"], Any]
 
 
 @dataclass(frozen=True)
-class Displacement:
+class SurfaceDisplacement:
     """The distance of the surface of a series from that of the function it was fitted to: sampled,
     and to first order, |function - level|/|gradient of the series| at points of its surface.
 
@@ -80,14 +80,14 @@ class FourierSeries(Field):
             without size.
     """
 
-    overstep = 1.5
+    over_relaxation = 1.5
 
     fit_error: float | None = None
     """The largest sampled difference of values between series and function; None for a series made
     from coefficients."""
 
     def __init__(self, coefficients: Any, box: Box | tuple[Any, Any]) -> None:
-        a = real_array(coefficients, "coefficients").astype(np.float64)
+        a = as_real_array(coefficients, "coefficients").astype(np.float64)
         if a.ndim != 3 or 0 in a.shape:
             raise ValueError(f"coefficients must have shape (K_x, K_y, K_z), not {a.shape}")
         _check_terms(a.shape)
@@ -101,7 +101,7 @@ class FourierSeries(Field):
         self._size = upper - self._lower
         self._bounds = CosineBounds.of(a, self._size)
         waves = np.indices(a.shape).reshape(3, -1)[:, 1:].T * (math.pi / self._size)
-        self.wavelength = mean_wavelength(a.ravel()[1:], np.linalg.norm(waves, axis=1))
+        self.min_wavelength = mean_wavelength(a.ravel()[1:], np.linalg.norm(waves, axis=1))
         self._rounding = _rounding(a, self._size)
         self._source: Function | FloatArray | None = None
         self._device: CosineSums | None = None
@@ -127,13 +127,13 @@ class FourierSeries(Field):
                 than samples; a function that is constant; a box without size.
             TypeError: neither a function nor numbers; terms that are no whole numbers.
         """
-        numbers = _three(terms, "terms")
+        numbers = _as_triple(terms, "terms")
         _check_terms(numbers)
         space = _finite_box(box)
         lower, upper = space.bounds()
         if callable(function):
             chosen = tuple(max(_SAMPLES * n, _LEAST_SAMPLES) for n in numbers)
-            shape = _three(chosen if samples is None else samples, "samples")
+            shape = _as_triple(chosen if samples is None else samples, "samples")
             if math.prod(shape) > _MOST_SAMPLES:
                 raise ValueError(f"{shape} samples are too many: at most {_MOST_SAMPLES} in all")
             _check_samples(numbers, shape)
@@ -141,7 +141,7 @@ class FourierSeries(Field):
         else:
             if samples is not None:
                 raise TypeError("samples says where a function is evaluated: a grid has its own")
-            grid = real_array(function, "a grid", type_error=TypeError).astype(np.float64)
+            grid = as_real_array(function, "a grid", type_error=TypeError).astype(np.float64)
             if grid.ndim != 3 or 0 in grid.shape:
                 raise ValueError(f"a grid must have shape (n_x, n_y, n_z), not {grid.shape}")
             _check_samples(numbers, cast("tuple[int, int, int]", grid.shape))
@@ -154,7 +154,7 @@ class FourierSeries(Field):
         if float(np.ptp(grid)) == 0.0:
             raise ValueError("the function is constant: it has no level sets")
         fitted = fit_cosines(grid, numbers)
-        if np.abs(fitted).sum() - abs(fitted[0, 0, 0]) < _NOTHING * np.abs(grid).max():
+        if np.abs(fitted).sum() - abs(fitted[0, 0, 0]) < _MIN_COEFFICIENT * np.abs(grid).max():
             raise ValueError(
                 f"the series of {numbers} terms is constant, though the function is not: take more "
                 "terms"
@@ -174,7 +174,7 @@ class FourierSeries(Field):
         """Proved: no directional second derivative of the series exceeds it in size."""
         return self._bounds.curvature
 
-    def displacement(self, level: float | None = None, *, rng: int = 0) -> Displacement:
+    def displacement(self, level: float | None = None, *, rng: int = 0) -> SurfaceDisplacement:
         """An estimate of the distance of the surface at a level from that of the function fitted.
 
         For a function, at random points of the surface; for a grid, at its points next to the
@@ -191,7 +191,7 @@ class FourierSeries(Field):
             raise ValueError(f"no point with level {chosen:g} was found in the box")
         slope = np.linalg.norm(self.gradient(points, precision="double"), axis=1)
         away = np.abs(values) / np.maximum(slope, 1e-300)
-        return Displacement(float(away.mean()), float(away.max()), len(points))
+        return SurfaceDisplacement(float(away.mean()), float(away.max()), len(points))
 
     def _near(self, level: float, rng: int) -> tuple[FloatArray, FloatArray]:
         """Points of the surface, or next to it, and the function less the series there."""
@@ -203,7 +203,7 @@ class FourierSeries(Field):
             cell = float((self._size / grid.shape).max())
             near = np.abs(value - level) <= slope * cell
             return points[near], (grid.ravel() - value)[near]
-        x = self._lower + self._size * np.random.default_rng(rng).random((_CHECKED, 3))
+        x = self._lower + self._size * np.random.default_rng(rng).random((_CHECK_POINTS, 3))
         for _ in range(_NEWTON_STEPS):
             gradient = self.gradient(x, precision="double")
             square = np.maximum((gradient**2).sum(axis=1), 1e-300)
@@ -220,7 +220,7 @@ class FourierSeries(Field):
     def _largest_difference(self) -> float:
         """The largest difference between series and function at random points, or all of a grid."""
         if callable(self._source):
-            x = self._lower + self._size * np.random.default_rng(0).random((_CHECKED, 3))
+            x = self._lower + self._size * np.random.default_rng(0).random((_CHECK_POINTS, 3))
             given = _values(self._source, x)
         else:
             grid = cast("FloatArray", self._source)
@@ -228,7 +228,7 @@ class FourierSeries(Field):
             given = grid.ravel()
         return float(np.abs(self.value(x, precision="double") - given).max())
 
-    @prepared_once
+    @cached_prepare
     def prepare(self, backend: Backend) -> Self:
         if self._device is not None and self._device.backend is backend:
             return self
@@ -269,8 +269,8 @@ class FourierSeries(Field):
         corners = self._lower + low * self._size, self._lower + high * self._size
         return Box(cast("Any", tuple(corners[0].tolist())), cast("Any", tuple(corners[1].tolist())))
 
-    def check_levels(self, levels: tuple[float, ...]) -> None:
-        check_in_range(levels, self.value_range, "in its box the series")
+    def validate_levels(self, levels: tuple[float, ...]) -> None:
+        validate_levels_in_range(levels, self.value_range, "in its box the series")
 
     def describe(self) -> dict[str, Any]:
         return {
@@ -282,7 +282,7 @@ class FourierSeries(Field):
         }
 
 
-def _three(numbers: Any, name: str) -> tuple[int, int, int]:
+def _as_triple(numbers: Any, name: str) -> tuple[int, int, int]:
     try:
         one = operator.index(numbers)
     except TypeError:
@@ -327,7 +327,7 @@ def _finite_box(box: Any) -> Box:
 
 def _values(function: Function, points: FloatArray) -> FloatArray:
     """The function's values (n,) at points (n, 3), checked."""
-    values = real_array(function(points), "values of the function", type_error=TypeError)
+    values = as_real_array(function(points), "values of the function", type_error=TypeError)
     if values.shape != (len(points),):
         raise ValueError(
             f"the function must give one value for each point (n, 3): for {len(points)} points it "

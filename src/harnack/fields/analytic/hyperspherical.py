@@ -11,9 +11,9 @@ import drjit as dr
 
 from harnack.backend.elementary import fmax, fmin
 from harnack.backend.validation import integer
-from harnack.enclosures import Curvature, Lipschitz, Slopes
-from harnack.enclosures.parabola import Arc, Parabola
-from harnack.enclosures.piecewise_taylor import Pieces
+from harnack.enclosures import Lipschitz, SlopeRange, TaylorRemainder
+from harnack.enclosures.parabola import ParabolaEnclosure, SphereArcEnclosure
+from harnack.enclosures.piecewise_taylor import PiecewiseTaylorEnclosure
 from harnack.fields.analytic.hyperspherical_basis import (
     LARGEST_DEGREE,
     HypersphereRange,
@@ -32,8 +32,8 @@ from harnack.fields.analytic.sphere_bounds import (
     hessian_bound,
     value_bound,
 )
-from harnack.fields.field import Field, check_in_range
-from harnack.fields.samples import Look, Path, Sample
+from harnack.fields.field import Field, validate_levels_in_range
+from harnack.fields.samples import Ray, RaySample, Sample
 from harnack.geometry.clip_volumes import Ball
 from harnack.geometry.volume import check_volume
 
@@ -58,7 +58,7 @@ _OF_SCALE, _OF_HEIGHT = 6.0, 13.0
 
 
 @dataclass(frozen=True)
-class _Order:
+class _OrderTerm:
     """The terms of one j: a sum of solid harmonics times C_n^k(w), with bounds of both."""
 
     j: int
@@ -71,7 +71,7 @@ class _Order:
     rounding: HarmonicRounding
 
     @classmethod
-    def of(cls, l: int, j: int, weights: Weights) -> _Order:  # noqa: E741
+    def of(cls, l: int, j: int, weights: Weights) -> _OrderTerm:  # noqa: E741
         bounds = value_bound(weights), gradient_bound(weights), hessian_bound(weights)
         rounding = HarmonicRounding.of(weights, is_divided=True)
         return cls(j, l - j, j + 1, weights, *bounds, rounding)
@@ -107,17 +107,19 @@ class HypersphericalHarmonic(Field):
     P is harmonic and homogeneous, so |grad P| <= l M there and |v.H v| <= l (l-1) M for unit
     vectors v (`BallRange.curvature` has the proof). Let S = 1 + |p|^2.
 
-    - `Curvature`. A line runs on S^3 at speed 2/S, and its second derivative in t has the length
-      4/S^1.5 (`Arc` has the circle: it is sqrt(c^2 + t^2) 4/S^2). By the chain rule
+    - `TaylorRemainder`. A line runs on S^3 at speed 2/S, and its second derivative in t has the
+      length
+      4/S^1.5 (`SphereArcEnclosure` has the circle: it is sqrt(c^2 + t^2) 4/S^2). By the chain rule
       |f''| <= M l (4 (l-1)/S^2 + 4/S^1.5) with the least S on the ball, and |grad f| <= 2 l A/S
       (Bernstein on the great circle along the line).
     - Where f vanishes to an order above 2, at y = 0 or for |m| > 2 on the circle y_1 = y_2 = 0,
-      another `Curvature`, on a ball whose radius is a fraction of the distance to that zero. With
-      bounds of S_jm, its gradient and its Hessian at such distances (`AxialBound`), and 2ab <= 1
-      for the components (a, b) of unit vectors, it is the same chain rule for S_jm(y) C(w). The
+      another `TaylorRemainder`, on a ball whose radius is a fraction of the distance to that zero.
+      With bounds of S_jm, its gradient and its Hessian at such distances (`AxialBound`), and 2ab <=
+      1 for the components (a, b) of unit vectors, it is the same chain rule for S_jm(y) C(w). The
       ball: R <= 0.3 sqrt(S) leaves 1 + |q|^2 >= 0.49 S at q, so that on the sphere it is within the
       chord 2R/(0.7 S).
-    - Along a ray: `Arc`. On the circle of radius 1/c, in its angle, the first derivative of the
+    - Along a ray: `SphereArcEnclosure`. On the circle of radius 1/c, in its angle, the first
+      derivative of the
       point has length 1/c and the second too, so |f_aa| <= M l ((l-1)/c^2 + 1/c); and f is a
       trigonometric polynomial of degree l of the angle, so |f_aa| <= l^2 A (Bernstein).
 
@@ -127,8 +129,8 @@ class HypersphericalHarmonic(Field):
     """
 
     is_cheap = True
-    overstep = 1.6
-    is_entire = True
+    over_relaxation = 1.6
+    is_global = True
 
     def __init__(self, l: int, j: int, m: int, *, domain: Volume | None = None) -> None:  # noqa: E741
         l, j, m = integer(l, "the degree l"), integer(j, "j"), integer(m, "the order m")  # noqa: E741
@@ -139,7 +141,7 @@ class HypersphericalHarmonic(Field):
             raise ValueError(f"j must be 0 to l = {l}, not {j}")
         if not -j <= m <= j:
             raise ValueError(f"the order m must be -{j} to {j}, not {m}")
-        self._set(l, {(j, m): 1.0}, domain)
+        self._initialize(l, {(j, m): 1.0}, domain)
 
     @classmethod
     def from_polynomial(
@@ -166,13 +168,15 @@ class HypersphericalHarmonic(Field):
             a, b, c, d = powers
             terms[a, b, c, d] = terms.get((a, b, c, d), 0.0) + float(value)
         made = cls.__new__(cls)
-        made._set(*from_monomials(terms), domain)
+        made._initialize(*from_monomials(terms), domain)
         return made
 
-    def _set(self, l: int, weights: SphereWeights, domain: Volume | None) -> None:  # noqa: E741
+    def _initialize(self, l: int, weights: SphereWeights, domain: Volume | None) -> None:  # noqa: E741
         self.domain = domain
         self.degree = l
-        self._orders = [_Order.of(l, j, sums) for j, sums in weights_by_order(l, weights).items()]
+        self._orders = [
+            _OrderTerm.of(l, j, sums) for j, sums in weights_by_order(l, weights).items()
+        ]
         self._known = HypersphereRange.of(l, weights)
 
     @property
@@ -183,10 +187,12 @@ class HypersphericalHarmonic(Field):
     def evaluate(self, p: Vec3) -> Sample:
         square = dr.squared_norm(p)
         value, gradient, error, gradient_error = self._values(p, 1 + square)
-        known = (*self._beside(p, square), *self._curvatures(square))
+        known = (*self._remainder_near_zero(p, square), *self._curvatures(square))
         steep = self.degree * (self._known.high - self._known.low) * (1 + _ROUNDING)
-        lipschitz = Lipschitz(steep / self._least(square, _WIDE), self._reach(square, _WIDE))
-        return Sample(value, gradient, known, error, gradient_error, weaker=(lipschitz,))
+        lipschitz = Lipschitz(steep / self._min_square(square, _WIDE), self._reach(square, _WIDE))
+        return Sample(
+            value, gradient, known, error, gradient_error, alternative_promises=(lipschitz,)
+        )
 
     def _values(self, p: Vec3, total: Real) -> tuple[Real, Vec3, Real, Real]:
         """Value, gradient, and the rounding of both, total = 1 + |p|^2.
@@ -228,7 +234,7 @@ class HypersphericalHarmonic(Field):
         lost = 64 * float(dr.smallest(type(zero)))
         return value, gradient, dr.fma(error, unit, lost), 2 * s * unit * slope
 
-    def _least(self, square: Real, share: float) -> Real:
+    def _min_square(self, square: Real, share: float) -> Real:
         """A lower bound of 1 + |y|^2 on the ball of radius share sqrt(1 + |p|^2) about p."""
         inner = fmax(dr.sqrt(square) - share * dr.sqrt(1 + square), 0)
         return dr.fma(inner, inner, 1) * (1 - _ROUNDING)
@@ -236,18 +242,18 @@ class HypersphericalHarmonic(Field):
     def _reach(self, square: Real, share: float) -> Real:
         return share * dr.sqrt(1 + square)
 
-    def _curvatures(self, square: Real) -> list[Curvature]:
+    def _curvatures(self, square: Real) -> list[TaylorRemainder]:
         """Bounds of the Hessian on three balls, the last one all of space."""
         l = self.degree  # noqa: E741
         size = l * self._known.largest * (1 + _ROUNDING)
-        made: list[Curvature] = []
+        made: list[TaylorRemainder] = []
         for share in _SHARES:
-            least = self._least(square, share)
+            least = self._min_square(square, share)
             bent = (4 * (l - 1) / least + 4 / dr.sqrt(least)) / least
-            made.append(Curvature(fmax(size * bent, 0), self._reach(square, share)))
-        return [*made, Curvature(0 * square + max(size * 4.0 * l, 0.0), dr.inf)]
+            made.append(TaylorRemainder(fmax(size * bent, 0), self._reach(square, share)))
+        return [*made, TaylorRemainder(0 * square + max(size * 4.0 * l, 0.0), dr.inf)]
 
-    def _beside(self, p: Vec3, square: Real) -> tuple[Curvature, ...]:
+    def _remainder_near_zero(self, p: Vec3, square: Real) -> tuple[TaylorRemainder, ...]:
         """The bound of the Hessian near a zero of high order; empty if there is no such zero."""
         by_axis = min(abs(m) for one in self._orders for _, m in one.weights)
         by_center = min(one.j for one in self._orders)
@@ -258,24 +264,24 @@ class HypersphericalHarmonic(Field):
         chord = _BESIDE / (by_center - 2) * r
         if by_axis > 2:
             chord = fmin(chord, _BESIDE / (by_axis - 2) * rho)
-        least = self._least(square, _MOST_BESIDE)
+        least = self._min_square(square, _MOST_BESIDE)
         root = dr.rcp(dr.sqrt(least))
         bent = 0 * square
         for one in self._orders:
             first, second = one.largest(rho + chord, r + chord)
             bent = bent + 4 * root * root * root * dr.fma(root, second, first)
         radius = fmin(_OF_CHORD * chord * (1 + square), _MOST_BESIDE * dr.sqrt(1 + square))
-        return (Curvature(bent * (1 + _ROUNDING), radius),)
+        return (TaylorRemainder(bent * (1 + _ROUNDING), radius),)
 
-    def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
-        """The sample, with `Arc` enclosures if the sharpest proofs are asked for."""
+    def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
+        """The sample, with `SphereArcEnclosure` enclosures if the sharpest proofs are asked for."""
         del ahead, back
         p = path.point(t)
         sample = self.evaluate(p)
-        if Pieces not in path.proofs.kinds:
-            return path.look(sample)
+        if PiecewiseTaylorEnclosure not in path.proofs.kinds:
+            return path.enclose(sample)
         slope = dr.dot(sample.gradient, path.direction)
-        slopes = Slopes.around(slope, sample.gradient_error)
+        slopes = SlopeRange.around(slope, sample.gradient_error)
         # The point of the line closest to the origin, from one end or the other without
         # cancellation: the origin of the ray may be far away.
         start = dr.dot(path.origin, path.direction)
@@ -286,15 +292,18 @@ class HypersphericalHarmonic(Field):
         known = self._known
         most = l * l * 0.5 * (known.high - known.low)
         bent = fmin(known.largest * l * ((l - 1) / square + 1 / c), most) * (1 + _ROUNDING)
-        forward = Arc(slopes, bent, along, square)
-        backward = Arc(slopes.negated(), bent, -along, square)
-        curvatures = [one for one in sample.known if isinstance(one, Curvature)]
+        forward = SphereArcEnclosure(slopes, bent, along, square)
+        backward = SphereArcEnclosure(slopes.negated(), bent, -along, square)
+        curvatures = [one for one in sample.promises if isinstance(one, TaylorRemainder)]
         beside = curvatures[: -len(_SHARES) - 1]
-        around = [Parabola(slopes, -one.constant, one.constant, one.radius) for one in beside]
-        behind = [
-            Parabola(slopes.negated(), -one.constant, one.constant, one.radius) for one in beside
+        around = [
+            ParabolaEnclosure(slopes, -one.constant, one.constant, one.radius) for one in beside
         ]
-        return Look(sample, (forward, *around), (backward, *behind), slope)
+        behind = [
+            ParabolaEnclosure(slopes.negated(), -one.constant, one.constant, one.radius)
+            for one in beside
+        ]
+        return RaySample(sample, (forward, *around), (backward, *behind), slope)
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         """Rows of the Hessian, whose trace is not 0: f is harmonic on S^3 and not in space.
@@ -349,12 +358,12 @@ class HypersphericalHarmonic(Field):
         radius = max((self._known.radius(level) for level in levels), default=0.0)
         return Ball(radius=radius) if 0 < radius < math.inf else None
 
-    def check_levels(self, levels: tuple[float, ...]) -> None:
+    def validate_levels(self, levels: tuple[float, ...]) -> None:
         if self.degree == 0:
             raise ValueError(
                 "a hyperspherical harmonic of degree 0 is constant: it has no level sets"
             )
-        check_in_range(levels, self.value_range)
+        validate_levels_in_range(levels, self.value_range)
 
     def describe(self) -> dict[str, Any]:
         return {

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 
 import drjit as dr
 
-from harnack.backend.elementary import fmax, fmin, length
-from harnack.backend.validation import finite, integer, positive
-from harnack.enclosures import Curvature, Slopes
-from harnack.enclosures.parabola import Parabola
+from harnack.backend.elementary import fmax, fmin, safe_norm
+from harnack.backend.validation import as_finite, as_positive, integer
+from harnack.enclosures import SlopeRange, TaylorRemainder
+from harnack.enclosures.parabola import ParabolaEnclosure
 from harnack.fields.analytic.rounding import HarmonicRounding
 from harnack.fields.analytic.solid_harmonics import (
     LARGEST_DEGREE,
@@ -22,19 +22,19 @@ from harnack.fields.analytic.solid_harmonics import (
 )
 from harnack.fields.analytic.sphere_bounds import BallRange, range_of_harmonic
 from harnack.fields.field import Field, Sample
-from harnack.fields.samples import Look, lengthened
+from harnack.fields.samples import RaySample, space_scaled
 from harnack.geometry.clip_volumes import Ball
 from harnack.name_suggestions import is_one_of
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
-    from harnack.fields.samples import Path
+    from harnack.fields.samples import Ray
     from harnack.geometry.volume import Volume
 
 __all__ = ["Lobes"]
 
-Part = Literal["both", "positive", "negative"]
-_PARTS: tuple[Part, ...] = ("both", "positive", "negative")
+LobeSign = Literal["both", "positive", "negative"]
+_PARTS: tuple[LobeSign, ...] = ("both", "positive", "negative")
 # Promised ends are moved outwards by this fraction for the roundings of float32.
 _ROUNDING = 1e-5
 # Fourth powers of scales and harmonics from 1/this to this stay in the range of a precision.
@@ -60,7 +60,7 @@ class Lobes(Field):
 
     l, m: degree 0 <= l <= 12 and order -l <= m <= l.
     scale: more than 0, the length of a lobe in which Y reaches 1.
-    part: "both", "positive" or "negative".
+    sign: "both", "positive" or "negative".
 
     Second derivatives. The sum of the harmonics is W = Y^2, Y or -Y, and f = r^4 - r^2 W or
     r^3 - r^2 W. Along a great circle W is a trigonometric polynomial T of degree N (2 L or L),
@@ -80,27 +80,31 @@ class Lobes(Field):
         TypeError: l or m is no whole number.
     """
 
-    overstep = 1.6
+    over_relaxation = 1.6
 
-    def __init__(self, l: int, m: int, *, scale: float = 1.0, part: Part = "both") -> None:  # noqa: E741
-        self._fill({(integer(l, "l"), integer(m, "m")): 1.0}, scale, part)
+    def __init__(self, l: int, m: int, *, scale: float = 1.0, sign: LobeSign = "both") -> None:  # noqa: E741
+        self._initialize({(integer(l, "l"), integer(m, "m")): 1.0}, scale, sign)
 
     @classmethod
     def combined(
-        cls, weights: Mapping[tuple[int, int], float], *, scale: float = 1.0, part: Part = "both"
+        cls,
+        weights: Mapping[tuple[int, int], float],
+        *,
+        scale: float = 1.0,
+        sign: LobeSign = "both",
     ) -> Lobes:
         """The lobes of a sum of real spherical harmonics, {(l, m): c} for the sum of c Y_lm."""
         made = cls.__new__(cls)
-        made._fill(weights, scale, part)
+        made._initialize(weights, scale, sign)
         return made
 
-    def _fill(self, weights: Any, scale: Any, part: Part) -> None:
+    def _initialize(self, weights: Any, scale: Any, sign: LobeSign) -> None:
         self.weights = _checked(weights)
-        scale = positive(scale, "the scale of lobes")
-        if not is_one_of(part, _PARTS):
-            raise ValueError(f"part must be one of {', '.join(_PARTS)}, not {part!r}")
-        self.scale, self.part = scale, part
-        self._s: Any = self.scale
+        scale = as_positive(scale, "the scale of lobes")
+        if not is_one_of(sign, _PARTS):
+            raise ValueError(f"part must be one of {', '.join(_PARTS)}, not {sign!r}")
+        self.scale, self.part = scale, sign
+        self._size: Any = self.scale
         (first, *others) = self.weights
         if others:
             ends = BallRange.of(self.weights).with_spheres(self.weights, 1.0).on_ball(1.0)
@@ -111,7 +115,7 @@ class Lobes(Field):
         self.value_range = ends
         self._rounding = HarmonicRounding.of(self.weights, is_divided=False)
         if self.extent_radius() <= 0:
-            raise ValueError(f"there is no direction in which the function is {part}")
+            raise ValueError(f"there is no direction in which the function is {sign}")
 
     @property
     def positive(self) -> Lobes:
@@ -123,8 +127,8 @@ class Lobes(Field):
         """The lobes where Y is negative."""
         return self._only("negative")
 
-    def _only(self, part: Part) -> Lobes:
-        return Lobes.combined(self.weights, scale=self.scale, part=part)
+    def _only(self, sign: LobeSign) -> Lobes:
+        return Lobes.combined(self.weights, scale=self.scale, sign=sign)
 
     @property
     def degree(self) -> int:
@@ -146,7 +150,7 @@ class Lobes(Field):
                 "another unit of length"
             )
         other = copy.copy(self)
-        other._s = dr.opaque(backend.Float, self.scale)
+        other._size = dr.opaque(backend.Float, self.scale)
         return other
 
     def extent(self, levels: tuple[float, ...]) -> Volume:
@@ -157,11 +161,11 @@ class Lobes(Field):
         return Ball(radius=(self.extent_radius() + self.scale * beyond) * (1 + 1e-6))
 
     def evaluate(self, p: Vec3) -> Sample:
-        return lengthened(self._unscaled(p / self._s), self._s)
+        return space_scaled(self._unscaled(p / self._size), self._size)
 
     def _unscaled(self, x: Vec3) -> Sample:
         """The sample at a point of lobes of scale 1."""
-        r = length(x)
+        r = safe_norm(x)
         at_origin = r <= float(dr.smallest(type(r))) ** 0.25  # f is 0 to rounding
         u = dr.select(at_origin, type(x)(0, 0, 1), x / dr.select(at_origin, 1, r))
         r = dr.select(at_origin, 0, r)
@@ -175,15 +179,15 @@ class Lobes(Field):
             y, across = (y, across) if self.part == "positive" else (-y, -across)
             value = r * r * (r - y)
             gradient = r * ((3 * r - 2 * y) * u - across)
-        steep = length(across)
+        steep = safe_norm(across)
         error, gradient_error = self._errors(r, y, steep, dr.sqrt(u.x * u.x + u.y * u.y))
         least, most = self._second_derivatives(1.5 * r + 0.5)
-        known = [Curvature(fmax(-least, most), 0.5 * (r + 1))]
+        known = [TaylorRemainder(fmax(-least, most), 0.5 * (r + 1))]
         if self.part == "both" and self.degree > 0:
-            known.append(self._close_by(r, y, steep))
+            known.append(self._local_remainder(r, y, steep))
         return Sample(value, gradient, tuple(known), error, gradient_error)
 
-    def _close_by(self, r: Real, y: Real, slope: Real) -> Curvature:
+    def _local_remainder(self, r: Real, y: Real, slope: Real) -> TaylorRemainder:
         """A bound of second derivatives on a small ball, on which Y and its slope may be far
         smaller
         than elsewhere: between lobes that come close to each other.
@@ -203,25 +207,25 @@ class Lobes(Field):
         turned = bend if degree > 1 else 2 / math.sqrt(3) * most
         constant = 2 * (highest * (highest + turned) + steepest * steepest)
         constant = fmax(constant, 12 * dr.square(r * (1 + q)) + 2 * highest * turned)
-        return Curvature(constant * (1 + _ROUNDING) + _SMALLEST, q * r)
+        return TaylorRemainder(constant * (1 + _ROUNDING) + _SMALLEST, q * r)
 
-    def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
+    def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
         """The sample, with parabolas from ranges of second derivatives as far as is asked."""
         p = path.point(t)
         sample = self.evaluate(p)
-        look = path.look(sample)
-        slopes = Slopes.around(look.slope, sample.gradient_error)
+        look = path.enclose(sample)
+        slopes = SlopeRange.around(look.slope, sample.gradient_error)
 
-        def enclosure(reach: Real, sign: int, along: Slopes) -> Parabola:
-            reach = dr.select(dr.isfinite(reach), reach, 4 * (length(p) + self._s))
+        def enclosure(reach: Real, sign: int, along: SlopeRange) -> ParabolaEnclosure:
+            reach = dr.select(dr.isfinite(reach), reach, 4 * (safe_norm(p) + self._size))
             end = dr.fma(type(p)(sign * reach), path.direction, p)
-            farthest = fmax(length(p), length(end)) * ((1 + _ROUNDING) / self._s)
-            share = 1 / dr.square(self._s)
+            farthest = fmax(safe_norm(p), safe_norm(end)) * ((1 + _ROUNDING) / self._size)
+            share = 1 / dr.square(self._size)
             least, most = self._second_derivatives(farthest)
-            return Parabola(along, share * least, share * most, reach)
+            return ParabolaEnclosure(along, share * least, share * most, reach)
 
         forward, backward = enclosure(ahead, 1, slopes), enclosure(back, -1, slopes.negated())
-        return Look(sample, (*look.ahead, forward), (*look.back, backward), look.slope)
+        return RaySample(sample, (*look.forward, forward), (*look.backward, backward), look.slope)
 
     def _second_derivatives(self, farthest: Real) -> tuple[Real, Real]:
         """The least and the largest second derivative along any line within r <= farthest, for
@@ -262,11 +266,14 @@ class Lobes(Field):
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         """Rows of the Hessian of f; see `_of_power`. At the origin its limit depends on the
         direction of approach: it is that along z."""
-        distance = length(p)
+        distance = safe_norm(p)
         at_origin = distance == 0
         u = dr.select(at_origin, type(p)(0, 0, 1), p / dr.select(at_origin, 1, distance))
-        r = distance / self._s
-        sign, share = -1.0 if self.part == "negative" else 1.0, 1 / dr.square(self._s)
+        r = distance / self._size
+        sign, share = (
+            -1.0 if self.part == "negative" else 1.0,
+            1 / dr.square(self._size),
+        )
         rows: list[Any] = []
         if self.part == "both":
             y, slope, second = self._of_power(u, 1)  # r^2 Y^2 is the square of r Y
@@ -322,7 +329,7 @@ def _checked(weights: Any) -> dict[tuple[int, int], float]:
             raise ValueError(f"the degree l must be 0 to {LARGEST_DEGREE}, not {l}")
         if abs(m) > l:
             raise ValueError(f"the order m must be -l to l, here -{l} to {l}, not {m}")
-        number = finite(weight, f"the coefficient of Y_{l},{m}")
+        number = as_finite(weight, f"the coefficient of Y_{l},{m}")
         if number != 0:
             kept[l, m] = number
     if not kept:

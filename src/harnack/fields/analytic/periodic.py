@@ -1,6 +1,6 @@
 """Sums of Laplacian eigenfunctions, periodic minimal surfaces among them (paper, section 4.7).
 
-`EigenfunctionSum` is the field; `ExtensionRange` bounds the harmonic extension of such a sum to
+`EigenfunctionSum` is the field; `ExtensionBounds` bounds the harmonic extension of such a sum to
 four dimensions (paper, section 4.7.1).
 """
 
@@ -18,21 +18,21 @@ import numpy.typing as npt
 
 from harnack.backend import backend_of
 from harnack.backend.elementary import fmax, fmin
-from harnack.enclosures import Curvature, HarmonicBall, Lipschitz
+from harnack.enclosures import HarmonicBall, Lipschitz, TaylorRemainder
 from harnack.fields.analytic.rounding import WaveRounding
 from harnack.fields.analytic.waves import (
     PlaneWave,
-    Product,
     Term,
     WaveBounds,
+    WaveProduct,
     checked_terms,
-    cosine,
+    cosine_factor,
     evaluate_terms,
     hessian_of_terms,
     mean_wavelength,
-    sine,
+    sine_factor,
 )
-from harnack.fields.field import Field, Sample, check_in_range
+from harnack.fields.field import Field, Sample, validate_levels_in_range
 from harnack.geometry.clip_volumes import Ball
 
 if TYPE_CHECKING:
@@ -43,11 +43,11 @@ __all__ = [
     "EigenfunctionSum",
     "Gyroid",
     "PlaneWave",
-    "Product",
     "SchwarzD",
     "SchwarzP",
-    "cosine",
-    "sine",
+    "WaveProduct",
+    "cosine_factor",
+    "sine_factor",
 ]
 
 # Promised ends are moved outwards by this fraction for the roundings of float32.
@@ -55,7 +55,7 @@ _ROUNDING_EXTENSION = 1e-5
 
 
 @dataclass(frozen=True)
-class ExtensionRange:
+class ExtensionBounds:
     """Bounds of the harmonic extension of a sum of waves on B(p, R) of R^4.
 
     With f = sum f_i, Laplacian f_i = -kappa_i^2 f_i and |f_i| <= A_i, the extension is
@@ -89,7 +89,7 @@ class ExtensionRange:
     curvature: float
 
     @classmethod
-    def best(cls, waves: WaveBounds) -> ExtensionRange:
+    def with_best_radius(cls, waves: WaveBounds) -> ExtensionBounds:
         """The radius that is best where it matters, near level 0 at a gradient of mean size.
 
         There a step loses to the second-order term of the bound, which is proportional to
@@ -106,7 +106,7 @@ class ExtensionRange:
         return min(trials, key=lambda trial: trial._below_host(typical) / trial.radius**2)
 
     @classmethod
-    def at(cls, waves: WaveBounds, radius: float) -> ExtensionRange:
+    def at(cls, waves: WaveBounds, radius: float) -> ExtensionBounds:
         """The numbers of one radius; kappa is the weighted median, which makes E smallest."""
         growth: npt.NDArray[np.float64] = np.cosh(radius * np.array(waves.wavenumbers))
         amplitudes = np.array(waves.amplitudes)
@@ -132,11 +132,11 @@ class ExtensionRange:
         out = 1 + _ROUNDING_EXTENSION
         real = backend_of(f).Float
         f = f - self.constant
-        lower = self.constant - out * self._below(f, rise)
-        upper = self.constant + out * self._below(-f, rise)
+        lower = self.constant - out * self._lower_bound(f, rise)
+        upper = self.constant + out * self._lower_bound(-f, rise)
         return HarmonicBall(real(r), lower, upper, dimension=4)
 
-    def _below(self, f: Real, rise: Real) -> Real:
+    def _lower_bound(self, f: Real, rise: Real) -> Real:
         """A bound of -F on the ball where |f(y) - f| <= rise |y-p|/R."""
         alpha, e = self.alpha, self.spread
         b = alpha * f - e
@@ -167,18 +167,18 @@ _SLOPE_SHARE = 1e-5
 class EigenfunctionSum(Field):
     """A sum of products of sines and cosines, and of plane waves: any truncated Fourier series.
 
-    terms: `Product` and `PlaneWave` terms; frequencies in radians per unit length.
+    terms: `WaveProduct` and `PlaneWave` terms; frequencies in radians per unit length.
     domain: the volume it is drawn in; by default the ball about the origin whose radius is the
         longest wavelength.
 
     Each term is an eigenfunction of the Laplacian, so cosh(kappa w) f with kappa^2 = -eigenvalue
-    is harmonic in R^4 and equals f at w = 0: see `ExtensionRange` for its bounds. The Lipschitz
+    is harmonic in R^4 and equals f at w = 0: see `ExtensionBounds` for its bounds. The Lipschitz
     constant is local, |grad f(p)| + H r / 2 on the ball of radius r (Taylor), where `curvature` H
-    bounds the Hessian, and never above `steepness`.
+    bounds the Hessian, and never above `max_gradient`.
 
     The rounding of the value is bounded at the point (`WaveRounding`). The rounding of the
-    gradient, E, is included in `Sample.error`. `Curvature` is promised as (1 + h) H, h =
-    `_SLOPE_SHARE`, and for all t
+    gradient, E, is included in `Sample.value_error`. `TaylorRemainder` is promised as (1 + h) H, h
+    = `_SLOPE_SHARE`, and for all t
 
         E t <= E^2/(2 h H) + h H t^2/2   (2 a b <= a^2 + b^2):
 
@@ -191,19 +191,21 @@ class EigenfunctionSum(Field):
         ValueError: terms that are not finite, or a sum that is constant.
     """
 
-    is_entire = True
+    is_global = True
     is_cheap = True
 
     def __init__(self, terms: Iterable[Term], *, domain: Volume | None = None) -> None:
         self.terms = checked_terms(terms)
         self.waves = self._bounds()
         longest = 2 * math.pi / min(self.waves.wavenumbers)
-        self.wavelength = mean_wavelength(self.waves.amplitudes, self.waves.wavenumbers)
+        self.min_wavelength = mean_wavelength(self.waves.amplitudes, self.waves.wavenumbers)
         self.domain = Ball(radius=longest) if domain is None else domain
-        self._extension = ExtensionRange.best(self.waves)
+        self._extension = ExtensionBounds.with_best_radius(self.waves)
         self._rounding = WaveRounding.of(self.terms)
         radius = self._extension.radius
-        self._slack = 32 * min(0.5 * self.curvature * radius**2, self.steepness * radius)
+        self._rounding_bound = 32 * min(
+            0.5 * self.curvature * radius**2, self.max_gradient * radius
+        )
 
     def _bounds(self) -> WaveBounds:
         return WaveBounds.of(self.terms)
@@ -215,7 +217,7 @@ class EigenfunctionSum(Field):
         return middle - most, middle + most
 
     @property
-    def steepness(self) -> float:
+    def max_gradient(self) -> float:
         """Proved: |grad f| never exceeds it."""
         return self.waves.largest_gradient
 
@@ -230,15 +232,17 @@ class EigenfunctionSum(Field):
         epsilon = float(dr.epsilon(type(value)))
         error, slope_error = self._rounding.errors(p, gradient)
         slope = dr.norm(gradient) + slope_error
-        reach = 0.9 * self.steepness / self.curvature  # the best by experiment, gyroid and P
+        reach = 0.9 * self.max_gradient / self.curvature  # the best by experiment, gyroid and P
         local = (slope + 0.5 * self.curvature * reach) * (1 + _ROUNDING)
-        lipschitz = Lipschitz(fmin(local, self.steepness * (1 + _ROUNDING)), reach)
-        change = self.waves.largest_change * (1 + _ROUNDING)
-        known = (Curvature(self.curvature * (1 + _ROUNDING + _SLOPE_SHARE), change=change),)
+        lipschitz = Lipschitz(fmin(local, self.max_gradient * (1 + _ROUNDING)), reach)
+        change = self.waves.max_third_derivative * (1 + _ROUNDING)
+        known = (
+            TaylorRemainder(self.curvature * (1 + _ROUNDING + _SLOPE_SHARE), cubic_constant=change),
+        )
         weaker = (self._extension.ball(value, slope), lipschitz)
         error += slope_error * (slope_error * (0.5 / (_SLOPE_SHARE * self.curvature)))
-        error += fmax(slope_error * self._extension.radius - self._slack * epsilon, 0)
-        return Sample(value, gradient, known, error, weaker=weaker)
+        error += fmax(slope_error * self._extension.radius - self._rounding_bound * epsilon, 0)
+        return Sample(value, gradient, known, error, alternative_promises=weaker)
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         """Rows of the Hessian; its trace is that of the sum's Laplacian, not zero."""
@@ -249,12 +253,12 @@ class EigenfunctionSum(Field):
         del sample
         return self._rounding.derivative_errors(p)
 
-    def slope_change(self, p: Vec3, radius: Real) -> Real:
+    def gradient_change_bound(self, p: Vec3, radius: Real) -> Real:
         """radius * `curvature`, which bounds the norm of the Hessian."""
         return 0 * p.x + radius * (self.curvature * (1 + _ROUNDING))
 
-    def check_levels(self, levels: tuple[float, ...]) -> None:
-        check_in_range(levels, self.value_range)
+    def validate_levels(self, levels: tuple[float, ...]) -> None:
+        validate_levels_in_range(levels, self.value_range)
 
     def wall_levels(self, half_width: float, *, level: float | None = None) -> tuple[float, float]:
         """The two levels of the wall |f - level| <= half_width, to be given as `solid=`.
@@ -280,16 +284,16 @@ class EigenfunctionSum(Field):
         """The two levels of a wall about `level` that is proved to be at least this thick.
 
         thickness is a length. The wall holds every point within thickness/2 of the middle
-        surface, since there |f - level| <= `steepness` * thickness/2; where f is less steep than
+        surface, since there |f - level| <= `max_gradient` * thickness/2; where f is less steep than
         at its steepest the wall is thicker.
         """
-        return self.wall_levels(0.5 * self.steepness * float(thickness), level=level)
+        return self.wall_levels(0.5 * self.max_gradient * float(thickness), level=level)
 
     def describe(self) -> dict[str, Any]:
         return {
             "terms": len(self.terms),
             "range": self.value_range,
-            "steepness": self.steepness,
+            "max_gradient": self.max_gradient,
             "radius of the harmonic ball": self._extension.radius,
         }
 
@@ -338,8 +342,8 @@ class Gyroid(_CubicSurface):
 
     def __init__(self, cell: float = 2 * math.pi, *, domain: Volume | None = None) -> None:
         k = _wavenumber(cell)
-        s, c = sine(k), cosine(k)
-        terms = (Product(1.0, x=s, y=c), Product(1.0, y=s, z=c), Product(1.0, z=s, x=c))
+        s, c = sine_factor(k), cosine_factor(k)
+        terms = (WaveProduct(1.0, x=s, y=c), WaveProduct(1.0, y=s, z=c), WaveProduct(1.0, z=s, x=c))
         super().__init__(cell, terms, domain)
 
 
@@ -354,8 +358,10 @@ class SchwarzP(_CubicSurface):
     _steepness = math.sqrt(3.0)
 
     def __init__(self, cell: float = 2 * math.pi, *, domain: Volume | None = None) -> None:
-        c = cosine(_wavenumber(cell))
-        super().__init__(cell, (Product(1.0, x=c), Product(1.0, y=c), Product(1.0, z=c)), domain)
+        c = cosine_factor(_wavenumber(cell))
+        super().__init__(
+            cell, (WaveProduct(1.0, x=c), WaveProduct(1.0, y=c), WaveProduct(1.0, z=c)), domain
+        )
 
 
 class SchwarzD(_CubicSurface):
@@ -376,11 +382,11 @@ class SchwarzD(_CubicSurface):
 
     def __init__(self, cell: float = 2 * math.pi, *, domain: Volume | None = None) -> None:
         k = _wavenumber(cell)
-        s, c = sine(k), cosine(k)
+        s, c = sine_factor(k), cosine_factor(k)
         terms = (
-            Product(1.0, s, s, s),
-            Product(1.0, s, c, c),
-            Product(1.0, c, s, c),
-            Product(1.0, c, c, s),
+            WaveProduct(1.0, s, s, s),
+            WaveProduct(1.0, s, c, c),
+            WaveProduct(1.0, c, s, c),
+            WaveProduct(1.0, c, c, s),
         )
         super().__init__(cell, terms, domain)

@@ -1,6 +1,6 @@
 """Functions of the plane: level curves of analytic functions, height fields, and functions by name.
 
-- `branches_of`: the `Branches` that a name, a mapping or a user's function stands for.
+- `make_branches`: the `Branches` that a name, a mapping or a user's function stands for.
 - `LevelCurves`: level curves of harmonic functions of the plane, extended to walls: Harnack tracing
   in two dimensions.
 - `HeightField`: the graph of a formula over the plane.
@@ -21,25 +21,25 @@ import numpy as np
 
 from harnack.arithmetic import Jet
 from harnack.backend import backend_of, choose_backend, to_numpy, to_vector3
-from harnack.backend.elementary import largest_coordinate
-from harnack.backend.validation import finite
-from harnack.enclosures import Curvature, HarmonicBall
+from harnack.backend.elementary import max_norm
+from harnack.backend.validation import as_finite
+from harnack.enclosures import HarmonicBall, TaylorRemainder
 from harnack.fields.analytic.branches import (
     ArcSine,
     Branches,
     BranchPoint,
     Disk,
     Logarithm,
-    OwnBranches,
     PowerProduct,
+    UserBranches,
     complex_of,
     complex_type,
     derivatives,
 )
 from harnack.fields.field import Field
-from harnack.fields.formula import Formula, as_jet, probe, warn_of_price
+from harnack.fields.formula import Formula, as_jet, probe_jets, warn_if_slow_to_compile
 from harnack.fields.samples import Sample
-from harnack.geometry.clip_volumes import Box, Intersection
+from harnack.geometry.clip_volumes import Box, VolumeIntersection
 from harnack.geometry.volume import check_volume
 from harnack.name_suggestions import did_you_mean
 
@@ -48,24 +48,24 @@ if TYPE_CHECKING:
     from harnack.fields.analytic.branches import Branch, Complex
     from harnack.geometry import Volume
 
-__all__ = ["branches_of", "power_product"]
+__all__ = ["make_branches", "power_product"]
 
 _NAMES = ("log", "sqrt", "cbrt", "power", "asin")
 # The largest denominator of an exponent, which is the number of sheets: more cannot be told apart.
-_MOST_SHEETS = 24
+_MAX_BRANCHES = 24
 # The largest exponent.
-_LARGEST = 6
+_MAX_EXPONENT = 6
 # A point at which a user's function is tried.
 _PROBE = 0.31, 0.17
 
 
-def branches_of(
+def make_branches(
     function: Any,
     *,
     exponent: Any = None,
-    of: Mapping[complex, int] | None = None,
-    singular: Iterable[Any] | None = None,
-    second: Callable[[Any, Any], Any] | None = None,
+    argument: Mapping[complex, int] | None = None,
+    singular_points: Iterable[Any] | None = None,
+    second_bound: Callable[[Any, Any], Any] | None = None,
     period: float | None = None,
 ) -> Branches:
     """The branches of what a user names: see `RiemannSurface`.
@@ -73,13 +73,13 @@ def branches_of(
     Raises:
         TypeError, ValueError: settings that do not belong together, or that are no such function.
     """
-    own = {"singular": singular, "second": second, "period": period}
+    own = {"singular": singular_points, "second": second_bound, "period": period}
     if callable(function):
-        _refuse("a function of your own", exponent=exponent, of=of)
-        return _own(function, singular, second, period)
-    _refuse("a function that is named; only one of your own has them", **own)
+        _refuse_settings("a function of your own", exponent=exponent, argument=argument)
+        return _user_branches(function, singular_points, second_bound, period)
+    _refuse_settings("a function that is named; only one of your own has them", **own)
     if isinstance(function, Mapping):
-        _refuse("a mapping of exponents", exponent=exponent, of=of)
+        _refuse_settings("a mapping of exponents", exponent=exponent, argument=argument)
         return power_product(cast("Mapping[complex, Any]", function))
     if not isinstance(function, str):
         raise TypeError(
@@ -95,14 +95,14 @@ def branches_of(
         if exponent is None:
             raise ValueError('"power" needs its exponent, such as exponent=2 / 3')
     else:
-        _refuse(f'"{function}"; use "power"', exponent=exponent)
+        _refuse_settings(f'"{function}"; use "power"', exponent=exponent)
     if function == "asin":
-        _refuse('"asin"', of=of)
+        _refuse_settings('"asin"', argument=argument)
         return ArcSine()
-    inner = {complex(a): _whole(n) for a, n in ({0: 1} if of is None else of).items()}
+    inner = {complex(a): _whole(n) for a, n in ({0: 1} if argument is None else argument).items()}
     if function == "log":
         if not inner:
-            raise ValueError("of: give at least one zero or pole, such as {1: 1, -1: -1}")
+            raise ValueError("argument: give at least one zero or pole, such as {1: 1, -1: -1}")
         return Logarithm(tuple(inner), tuple(inner.values()))
     power = {"sqrt": Fraction(1, 2), "cbrt": Fraction(1, 3)}.get(function)
     power = _fraction(exponent) if power is None else power
@@ -125,9 +125,10 @@ def power_product(exponents: Mapping[complex, Any]) -> PowerProduct:
     if not chosen:
         raise ValueError("a product of powers needs at least one exponent other than 0")
     count = math.lcm(*(power.denominator for power in chosen.values()))
-    if count > _MOST_SHEETS:
+    if count > _MAX_BRANCHES:
         raise ValueError(
-            f"these exponents make {count} sheets, and no more than {_MOST_SHEETS} are drawn: take "
+            f"these exponents make {count} sheets, and no more than {_MAX_BRANCHES} are drawn: "
+            "take "
             "fractions with a smaller common denominator"
         )
     return PowerProduct(tuple(chosen), tuple(float(power) for power in chosen.values()), count)
@@ -143,40 +144,44 @@ def _fraction(value: Any) -> Fraction:
         exact = Fraction(value)
     except (TypeError, ValueError, OverflowError):
         raise TypeError(f"an exponent must be a rational number, not {value!r}") from None
-    near = exact.limit_denominator(_MOST_SHEETS)
+    near = exact.limit_denominator(_MAX_BRANCHES)
     if abs(near - exact) > Fraction(1, 10**12):
         raise ValueError(
-            f"the exponent {value!r} is no fraction with a denominator up to {_MOST_SHEETS}: its "
+            f"the exponent {value!r} is no fraction with a denominator up to {_MAX_BRANCHES}: its "
             "function has too many sheets to be drawn, infinitely many if it is irrational; write "
             "Fraction(2, 3) for two thirds"
         )
-    if not abs(near) <= _LARGEST:
-        raise ValueError(f"exponents must be at most {_LARGEST} in size, not {value!r}")
+    if not abs(near) <= _MAX_EXPONENT:
+        raise ValueError(f"exponents must be at most {_MAX_EXPONENT} in size, not {value!r}")
     return near
 
 
 def _whole(value: Any) -> int:
     number = _fraction(value)
     if number.denominator != 1 or number == 0:
-        raise ValueError(f"of: multiplicities must be whole numbers other than 0, not {value!r}")
+        raise ValueError(
+            f"argument: multiplicities must be whole numbers other than 0, not {value!r}"
+        )
     return int(number)
 
 
-def _own(function: Any, singular: Any, second: Any, period: Any) -> OwnBranches:
-    if singular is None or second is None:
+def _user_branches(
+    function: Any, singular_points: Any, second_bound: Any, period: Any
+) -> UserBranches:
+    if singular_points is None or second_bound is None:
         raise ValueError(
-            "a function of your own needs singular=, where it is not analytic, such as [0], "
-            "and second=, a bound of |g''| on disks, such as lambda z, r: 2.0"
+            "a function of your own needs singular_points=, where it is not analytic, such as [0], "
+            "and second_bound=, a bound of |g''| on disks, such as lambda z, r: 2.0"
         )
-    if not callable(second):
-        raise TypeError(f"second must be a function of z and a radius, not {second!r}")
+    if not callable(second_bound):
+        raise TypeError(f"second_bound must be a function of z and a radius, not {second_bound!r}")
     try:
         points = tuple(
-            one if isinstance(one, BranchPoint) else BranchPoint(one) for one in singular
+            one if isinstance(one, BranchPoint) else BranchPoint(one) for one in singular_points
         )
     except TypeError:
         raise TypeError(
-            f"singular must be complex numbers or BranchPoints, not {singular!r}"
+            f"singular_points must be complex numbers or BranchPoints, not {singular_points!r}"
         ) from None
     if period is not None and not (
         isinstance(period, numbers.Real) and 0 < float(period) < math.inf
@@ -199,23 +204,27 @@ def _own(function: Any, singular: Any, second: Any, period: Any) -> OwnBranches:
             "a function with a period must have one branch up to it: of several, no side of the "
             "surface is told from the other in general; draw each by itself"
         )
-    bound = _tried(second, z, backend.Float(_PROBE[1]))
+    bound = _try_bound(second_bound, z, backend.Float(_PROBE[1]))
     if not isinstance(bound, backend.Float | int | float):
-        raise TypeError(f"second must return a real number, the bound of |g''|, not {bound!r}")
+        raise TypeError(
+            f"second_bound must return a real number, the bound of |g''|, not {bound!r}"
+        )
     shift = None if period is None else float(period)
-    made = OwnBranches(function, points, second, len(branches), shift)
-    made.at(z)
+    made = UserBranches(function, points, second_bound, len(branches), shift)
+    made.evaluate(z)
     return made
 
 
-def _tried(second: Callable[[Any, Any], Any], z: Any, radius: Any) -> Any:
+def _try_bound(second_bound: Callable[[Any, Any], Any], z: Any, radius: Any) -> Any:
     try:
-        return second(z, radius)
+        return second_bound(z, radius)
     except TypeError as error:
-        raise TypeError(f"second must take z and a radius, as Dr.Jit numbers: {error}") from error
+        raise TypeError(
+            f"second_bound must take z and a radius, as Dr.Jit numbers: {error}"
+        ) from error
 
 
-def _refuse(what: str, **settings: Any) -> None:
+def _refuse_settings(what: str, **settings: Any) -> None:
     given = [name for name, value in settings.items() if value is not None]
     if given:
         raise ValueError(f"{' and '.join(given)} cannot be given for {what}")
@@ -223,30 +232,31 @@ def _refuse(what: str, **settings: Any) -> None:
 
 # Radii of the disks on which the function is bounded, as fractions of the distance to the nearest
 # singular point, and the longest of them.
-_PARTS = (0.4, 0.8)
+_DISK_FRACTIONS = (0.4, 0.8)
 _LONGEST = 1e6
 
 
 class LevelCurves(Field):
     """f(x, y, z) = Re g(x + i y), or Im: its level sets are walls over level curves of the plane.
 
-    function, exponent, of, singular, second, period: an analytic function with one branch, up to a
+    function, exponent, argument, singular_points, second_bound, period: an analytic function with
+    one branch, up to a
         period, as for `RiemannSurface`: {a_i: n_i} with whole n_i for a rational function, "log"
-        with of={a_i: n_i} for charges n_i at a_i.
+        with argument={a_i: n_i} for charges n_i at a_i.
     part: "real" or "imag".
     level: the one drawn when none is asked for.
     domain: the volume it is drawn in; by default the box |x|, |y| <= 2, |z| <= 1/4.
 
     Re g is harmonic in the plane: Harnack's inequality of dimension 2 holds in disks up to the
-    nearest singular point, and as |g''| is bounded there (`Branches.bend`) f changes by at most
-    |g'| r + |g''| r^2/2 on a disk of radius r. The promises are that, as a ball of dimension 2, and
-    the bound of second derivatives.
+    nearest singular point, and as |g''| is bounded there (`Branches.second_derivative_bound`) f
+    changes by at most |g'| r + |g''| r^2/2 on a disk of radius r. The promises are that, as a ball
+    of dimension 2, and the bound of second derivatives.
 
     Raises:
         TypeError, ValueError: no such function, or one with several branches.
     """
 
-    is_entire = True
+    is_global = True
 
     def __init__(
         self,
@@ -254,9 +264,9 @@ class LevelCurves(Field):
         part: str = "real",
         *,
         exponent: Any = None,
-        of: Mapping[complex, int] | None = None,
-        singular: Iterable[Any] | None = None,
-        second: Callable[[Any, Any], Any] | None = None,
+        argument: Mapping[complex, int] | None = None,
+        singular_points: Iterable[Any] | None = None,
+        second_bound: Callable[[Any, Any], Any] | None = None,
         period: float | None = None,
         level: float = 0.0,
         domain: Volume | None = None,
@@ -264,8 +274,13 @@ class LevelCurves(Field):
         if part not in ("imag", "real"):
             raise ValueError(f'part must be "real" or "imag", not {part!r}')
         self.part = part
-        self.branches: Branches = branches_of(
-            function, exponent=exponent, of=of, singular=singular, second=second, period=period
+        self.branches: Branches = make_branches(
+            function,
+            exponent=exponent,
+            argument=argument,
+            singular_points=singular_points,
+            second_bound=second_bound,
+            period=period,
         )
         if self.branches.count > 1:
             raise ValueError(
@@ -273,7 +288,7 @@ class LevelCurves(Field):
                 f"{self.branches.count}: draw its Riemann surface, whose plane cuts they are"
             )
         self.domain = Box((-2.0, -2.0, -0.25), (2.0, 2.0, 0.25)) if domain is None else domain
-        self.default_level = finite(level, "level")
+        self.default_level = as_finite(level, "level")
         shift = self.branches.period(part == "imag")
         self.period = shift  # pyright: ignore[reportAttributeAccessIssue]
 
@@ -287,18 +302,19 @@ class LevelCurves(Field):
         x, y = derivatives(branch.first, self.part)
         vector = cast("Any", type(p))
         gradient = vector(x, y, 0 * x)
-        slope, error = dr.norm(gradient), self.branches.roundings(z, (branch,))
+        slope, error = dr.norm(gradient), self.branches.value_rounding(z, (branch,))
         reach = self.branches.clearance(z)
-        known: list[Curvature | HarmonicBall] = []
+        known: list[TaylorRemainder | HarmonicBall] = []
         value = branch.value.imag if self.part == "imag" else branch.value.real
-        for part in _PARTS:
+        for part in _DISK_FRACTIONS:
             radius = part * dr.minimum(reach, _LONGEST)
-            bend = self.branches.bend(Disk(z, radius, rounding)) * (1 + 1e-4)
+            bend = self.branches.second_derivative_bound(Disk(z, radius, rounding)) * (1 + 1e-4)
             moves = (slope * radius + 0.5 * bend * radius * radius) * (1 + 1e-5)
             known += [
-                Curvature(bend, radius), HarmonicBall(radius, value - moves, value + moves, 2),
-            ]  # fmt: skip
-        return Sample(value, gradient, tuple(known), backend_of(p).epsilon * error)
+                TaylorRemainder(bend, radius),
+                HarmonicBall(radius, value - moves, value + moves, 2),
+            ]
+        return Sample(value, gradient, tuple(known), backend_of(p).machine_epsilon * error)
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         """Rows of the Hessian, free of trace.
@@ -317,9 +333,9 @@ class LevelCurves(Field):
 
     def _at(self, p: Vec3) -> tuple[Real, Complex, Branch]:
         """The rounding of the point, the point in the plane, and the function there."""
-        rounding = 4 * backend_of(p).epsilon * largest_coordinate(p)
-        z = self.branches.moved_off(complex_of(p.x, p.y), rounding)
-        return rounding, z, self.branches.at(z)[0]
+        rounding = 4 * backend_of(p).machine_epsilon * max_norm(p)
+        z = self.branches.move_off_singularities(complex_of(p.x, p.y), rounding)
+        return rounding, z, self.branches.evaluate(z)[0]
 
 
 # Cells along a side of the grid on which the heights over the domain are bounded.
@@ -359,9 +375,9 @@ class HeightField(Formula):
                 "a height field needs a bounded domain, such as harnack.Ball() or "
                 "harnack.Box((-1, -1, -1), (1, 1, 1))"
             )
-        point = probe()
+        point = probe_jets()
         as_jet(self.formula(*point), point[0], "HeightField")
-        warn_of_price(self)
+        warn_if_slow_to_compile(self)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         return z - self.function(x, y)
@@ -385,7 +401,7 @@ class HeightField(Formula):
         x, y = (float(one) for one in lower[:2])
         far_x, far_y = (float(one) for one in upper[:2])
         slab = Box((x - slack, y - slack, bottom), (far_x + slack, far_y + slack, top))
-        return Intersection((self.domain, slab))
+        return VolumeIntersection((self.domain, slab))
 
     def _heights(self, lower: FloatArray, upper: FloatArray) -> tuple[float, float]:
         """Proved bounds of u over the domain's box."""
@@ -394,7 +410,7 @@ class HeightField(Formula):
         cells = np.indices((_CELLS, _CELLS)).reshape(2, -1).T + 0.5
         centers = np.column_stack([cells * size + lower[:2], np.zeros(len(cells))])
         half = backend.Float(0.5 * float(size.max()) * (1 + 1e-9))
-        jets = Jet.within(to_vector3(backend, centers, "points"), half)
+        jets = Jet.over_ball(to_vector3(backend, centers, "points"), half)
         heights = as_jet(self.function(*jets[:2]), jets[0], "HeightField").value
-        low = to_numpy(0 * half + dr.min(heights.low)).min()
-        return float(low), float(to_numpy(0 * half + dr.max(heights.high)).max())
+        low = to_numpy(0 * half + dr.min(heights.lower)).min()
+        return float(low), float(to_numpy(0 * half + dr.max(heights.upper)).max())

@@ -17,7 +17,7 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend.elementary import fmax, fmin
-from harnack.enclosures import Curvature, HarmonicBall, Lipschitz, Promise
+from harnack.enclosures import HarmonicBall, Lipschitz, Promise, TaylorRemainder
 from harnack.fields.analytic.rounding import HarmonicRounding
 from harnack.fields.analytic.solid_harmonics import (
     LARGEST_DEGREE,
@@ -37,7 +37,7 @@ from harnack.fields.analytic.sphere_bounds import (
     range_of_harmonic,
     value_bound,
 )
-from harnack.fields.field import Field, Sample, check_in_range
+from harnack.fields.field import Field, Sample, validate_levels_in_range
 from harnack.geometry.clip_volumes import Ball
 
 if TYPE_CHECKING:
@@ -75,25 +75,25 @@ class HarmonicPromises:
     distance from there, and the range on the ball as f does: every step is then a fraction of that
     distance. With any other radius or range, steps would become smaller than such a fraction, and
     rays that pass by would never arrive. Levels other than that at the origin need a wide ball
-    there: one promise (`Curvature`, or `Lipschitz` for proofs that do not use it) has a least
+    there: one promise (`TaylorRemainder`, or `Lipschitz` for proofs that do not use it) has a least
     radius.
 
-    known: ranges on balls about the origin.
-    degree, lowest: the largest degree of a term, and the smallest above 0.
+    ball_range: ranges on balls about the origin.
+    degree, lowest_degree: the largest degree of a term, and the smallest above 0.
     order: to which the sum, less its constant, vanishes along the z axis.
-    inner, outer: radii of harmonic balls at r = 0 and r = 1.
+    center_radius, boundary_radius: radii of harmonic balls at r = 0 and r = 1.
     axis_share: where rho is less than this fraction of r, rho decides how large a ball is.
     axial: bounds of value, gradient and Hessian near an axis of order 3 or more; None if the order
         is less.
     rounding: of value and gradient as they are evaluated.
     """
 
-    known: BallRange
+    ball_range: BallRange
     degree: int
-    lowest: int
+    lowest_degree: int
     order: int
-    inner: float
-    outer: float
+    center_radius: float
+    boundary_radius: float
     axis_share: float
     axial: tuple[AxialBound, AxialBound, AxialBound] | None
     rounding: HarmonicRounding
@@ -125,15 +125,15 @@ class HarmonicPromises:
     def ball(self, rho: Real, r: Real) -> HarmonicBall:
         """The harmonic ball."""
         radius = self._radius(rho, r)
-        lower, upper = self.known.at(r + radius)
+        lower, upper = self.ball_range.at(r + radius)
         if self.axial is not None:
             most = self.axial[0](rho + radius, r + radius) * (1 + _ROUNDING)
-            lower = fmax(lower, self.known.constant - most)
-            upper = fmin(upper, self.known.constant + most)
+            lower = fmax(lower, self.ball_range.constant - most)
+            upper = fmin(upper, self.ball_range.constant + most)
         margin = dr.fma(upper - lower, _ROUNDING, self._smallest(r))
         return HarmonicBall(radius, lower - margin, upper + margin)
 
-    def curvatures(self, rho: Real, r: Real) -> list[Curvature]:
+    def curvatures(self, rho: Real, r: Real) -> list[TaylorRemainder]:
         """Bounds of the Hessian H, the one of the smallest ball first."""
         radii = [dr.inf]  # where the Hessian is constant
         if self.degree > 2:
@@ -141,28 +141,28 @@ class HarmonicPromises:
             radii = [_NEAR * share, fmax(_WIDE * share, _LEAST)]
             if self.axial is not None:
                 radii.insert(0, fmin(rho * (_BESIDE_AXIS / (self.order - 2)), radii[0]))
-        return [Curvature(self._curvature(rho, r, radius), radius) for radius in radii]
+        return [TaylorRemainder(self._curvature(rho, r, radius), radius) for radius in radii]
 
     def _curvature(self, rho: Real, r: Real, radius: Real) -> Real:
         if self.degree < 3:
-            constant = self.known.curvature(0.0 * r)
+            constant = self.ball_range.curvature(0.0 * r)
         else:
-            constant = self.known.curvature(r + radius)
+            constant = self.ball_range.curvature(r + radius)
         if self.axial is not None:
             constant = fmin(constant, self.axial[2](rho + radius, r + radius))
         return dr.fma(constant, 1 + _ROUNDING + _SLOPE_SHARE, self._smallest(r))
 
     def lipschitz(self, rho: Real, r: Real) -> Lipschitz | None:
         """A Lipschitz constant on a ball with a least radius, where the harmonic ball has none."""
-        if self.lowest < 3:
+        if self.lowest_degree < 3:
             return None
         radius = fmax(r * (_WIDE / (self.degree - 2)), _LEAST)
-        constant = self.known.gradient(r + radius)
+        constant = self.ball_range.gradient(r + radius)
         if self.axial is not None:
             constant = fmin(constant, self.axial[1](rho + radius, r + radius))
         return Lipschitz(dr.fma(constant, 1 + _ROUNDING, self._smallest(r)), radius)
 
-    def error(self, rho: Real, r: Real, curvature: Curvature) -> Real:
+    def error(self, rho: Real, r: Real, curvature: TaylorRemainder) -> Real:
         """A bound of the rounding of the value, with the effect of the rounding of the gradient.
 
         curvature: the promise of the smallest ball. With E, a bound of the rounding of the
@@ -189,20 +189,23 @@ class HarmonicPromises:
         Near an axis of order m, with (range on the ball) ~ (rho + R)^m (r + R)^(l-m), the best R
         is 2/((m-2)/rho + (l-m)/r) where rho is a small part of r, and where it is r.
         """
-        if self.lowest < 3:
-            if self.inner < self.outer:
-                return fmax(self.outer * r, self.inner)
-            return fmax(dr.fma(r, self.outer - self.inner, self.inner), self.outer)
-        radius = self.outer * r
+        if self.lowest_degree < 3:
+            if self.center_radius < self.boundary_radius:
+                return fmax(self.boundary_radius * r, self.center_radius)
+            return fmax(
+                dr.fma(r, self.boundary_radius - self.center_radius, self.center_radius),
+                self.boundary_radius,
+            )
+        radius = self.boundary_radius * r
         if self.axial is not None:
             order, rest = self.order - 2.0, float(self.degree - self.order)
             by_axis = 2 / (order / rho + rest / fmax(r, _ORIGIN))
             radius = dr.select(rho < self.axis_share * r, fmin(by_axis, radius), radius)
-        return fmax(radius, _ORIGIN * self.outer)
+        return fmax(radius, _ORIGIN * self.boundary_radius)
 
     def _smallest(self, r: Real) -> float:
         """A bound of what underflow may have cost any sum here."""
-        return self.rounding.lost * max(1, self.degree) ** 2 * float(dr.smallest(type(r)))
+        return self.rounding.underflow * max(1, self.degree) ** 2 * float(dr.smallest(type(r)))
 
 
 def _best_radius(known: BallRange, distance: float) -> float:
@@ -215,7 +218,7 @@ class _SolidHarmonics(Field):
     """A sum of solid harmonics of p/size, for |p| <= size; see `HarmonicPromises`."""
 
     is_cheap = True
-    overstep = 1.6
+    over_relaxation = 1.6
 
     def __init__(
         self, weights: Weights, known: BallRange, size: float, domain: Volume, axis: int = 2
@@ -240,27 +243,29 @@ class _SolidHarmonics(Field):
         rho, r = dr.norm(type(s)(s.x, s.y, 0)), dr.norm(s)
         ball, lipschitz = self._promises.ball(rho, r), self._promises.lipschitz(rho, r)
         curvatures = self._promises.curvatures(rho, r)
-        known = tuple(Curvature(one.constant / size**2, one.radius * size) for one in curvatures)
+        known = tuple(
+            TaylorRemainder(one.constant / size**2, one.radius * size) for one in curvatures
+        )
         weaker: list[Promise] = [HarmonicBall(ball.radius * size, ball.lower, ball.upper)]
         if lipschitz is not None:
             weaker.append(Lipschitz(lipschitz.constant / size, lipschitz.radius * size))
         error = self._promises.error(rho, r, curvatures[0])
-        slope = type(p)(*_turned(gradient, -self._axis - 1)) / size
-        return Sample(value, slope, known, error, weaker=tuple(weaker))
+        slope = type(p)(*_rotate_axes(gradient, -self._axis - 1)) / size
+        return Sample(value, slope, known, error, alternative_promises=tuple(weaker))
 
     def _local(self, p: Vec3) -> Vec3:
-        return type(p)(*_turned((p.x, p.y, p.z), self._axis + 1)) / self._size
+        return type(p)(*_rotate_axes((p.x, p.y, p.z), self._axis + 1)) / self._size
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         """Rows of the Hessian, whose trace is 0 up to rounding."""
         s, share, k = self._local(p), 1 / self._size**2, -self._axis - 1
         xx, yy, zz, xy, xz, yz = (share * one for one in hessian(self._weights, s.x, s.y, s.z))
         rows = ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
-        x, y, z = _turned([type(p)(*_turned(row, k)) for row in rows], k)
+        x, y, z = _rotate_axes([type(p)(*_rotate_axes(row, k)) for row in rows], k)
         return x, y, z
 
-    def check_levels(self, levels: tuple[float, ...]) -> None:
-        check_in_range(levels, self.value_range, "in its domain the function")
+    def validate_levels(self, levels: tuple[float, ...]) -> None:
+        validate_levels_in_range(levels, self.value_range, "in its domain the function")
 
     def describe(self) -> dict[str, Any]:
         return {
@@ -324,7 +329,7 @@ class HarmonicPolynomial(_SolidHarmonics):
         scaled = {powers: c * size ** sum(powers) for powers, c in self.coefficients.items()}
         # The z axis of the solid harmonics is the one along which it vanishes to the highest order.
         along = [
-            from_monomials({_turned(k, axis + 1): c for k, c in scaled.items()})
+            from_monomials({_rotate_axes(k, axis + 1): c for k, c in scaled.items()})
             for axis in range(3)
         ]
         axis = max((2, 0, 1), key=lambda axis: order_on_axis(along[axis]))
@@ -332,7 +337,7 @@ class HarmonicPolynomial(_SolidHarmonics):
         super().__init__(weights, BallRange.of(weights), size, domain, axis)
 
 
-def _turned(three: Sequence[Any], n: int) -> tuple[Any, Any, Any]:
+def _rotate_axes(three: Sequence[Any], n: int) -> tuple[Any, Any, Any]:
     """Three things rotated by n places: (x, y, z) becomes (y, z, x) for n = 1."""
     return three[n % 3], three[(n + 1) % 3], three[(n + 2) % 3]
 

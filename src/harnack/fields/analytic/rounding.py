@@ -29,7 +29,7 @@ from harnack.fields.analytic.sphere_bounds import (
     largest_hessian,
     polar_samples,
 )
-from harnack.fields.analytic.waves import Factor, PlaneWave, Term
+from harnack.fields.analytic.waves import PlaneWave, Term, WaveFactor
 
 if TYPE_CHECKING:
     from harnack.backend import Real, Vec3
@@ -49,7 +49,7 @@ class HarmonicRounding:
     value_bounds, gradient_bounds: two bounds each, the smaller of which is used: one that is sharp
         near the axis, in powers of rho and r, and one in powers of r alone (the largest of c rho^m
         on the sphere, and not the largest c).
-    lost: what underflow adds to the value, in smallest normal numbers.
+    underflow: what underflow adds to the value, in smallest normal numbers.
 
     With z = r c:
 
@@ -74,7 +74,7 @@ class HarmonicRounding:
 
     value_bounds: tuple[AxialBound, AxialBound]
     gradient_bounds: tuple[AxialBound, AxialBound]
-    lost: float
+    underflow: float
 
     @classmethod
     def of(cls, weights: Weights, *, is_divided: bool) -> HarmonicRounding:
@@ -98,7 +98,7 @@ class HarmonicRounding:
             ):
                 if degree >= i:
                     table[i, degree - i] = table.get((i, degree - i), 0.0) + size * constant
-            lost += 2.0 + size * _lost(l, m)
+            lost += 2.0 + size * _underflow(l, m)
         a, b, c, d = (AxialBound.of(table) for table in tables)
         return cls((a, b), (c, d), lost)
 
@@ -187,7 +187,7 @@ def _largest(sampled: FloatArray) -> float:
     return float(sampled.max()) * _SECOND_ORDER
 
 
-def _lost(l: int, m: int) -> float:  # noqa: E741
+def _underflow(l: int, m: int) -> float:  # noqa: E741
     q, _, spread = _recurrence(l, m)
     return spread + (2 * m + 2) * float(q.max()) + 2
 
@@ -317,6 +317,6 @@ def _of_term(term: Term, common: Sequence[float | None]) -> tuple[float, list[fl
     return angle, per_axis, n * _SINE + max(n - 1, 0) + (0 if term.amplitude == 1.0 else 2)
 
 
-def _of_angle(factor: Factor, is_common: bool) -> float:
+def _of_angle(factor: WaveFactor, is_common: bool) -> float:
     total = 0.0 if is_common else _rounded(factor.frequency)
     return total + 1.0 if factor.phase else total

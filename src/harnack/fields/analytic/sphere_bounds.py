@@ -150,7 +150,7 @@ def polar_samples(count: int = _ANGLES) -> tuple[FloatArray, FloatArray]:
     return np.cos(a), np.sin(a)
 
 
-def _proved(sampled: FloatArray, degree: int) -> float:
+def _proved_maximum(sampled: FloatArray, degree: int) -> float:
     """The largest size of a trigonometric polynomial in a, from its samples at `polar_samples`.
 
     At its maximum A its slope is 0 and its second derivative at most degree^2 A (Bernstein), and a
@@ -164,7 +164,9 @@ def _proved(sampled: FloatArray, degree: int) -> float:
 def largest_value(l: int, m: int) -> float:  # noqa: E741
     """The largest N |Q(cos a)|."""
     z, _ = polar_samples()
-    return legendre_weight(l, m) * _proved(np.broadcast_to(Legendre(z, 1.0)(l, m), z.shape), l)
+    return legendre_weight(l, m) * _proved_maximum(
+        np.broadcast_to(Legendre(z, 1.0)(l, m), z.shape), l
+    )
 
 
 @functools.cache
@@ -187,7 +189,7 @@ def largest_gradient(l: int, m: int) -> float:  # noqa: E741
         axial, around = rho * ((l + m) * (q(l - 1, m) if l > m else 0.0)), m * at_m
     # The square of a directional derivative is of degree 2 l, and so is their sum.
     steep = np.maximum(radial**2 + axial**2, around**2)
-    return legendre_weight(l, m) * math.sqrt(_proved(steep, 2 * l))
+    return legendre_weight(l, m) * math.sqrt(_proved_maximum(steep, 2 * l))
 
 
 @functools.cache
@@ -205,7 +207,7 @@ def largest_hessian(l: int, m: int) -> float:  # noqa: E741
         b = turn / max(m, 1)
         rows = unit_hessian(l, m, rho, z, float(b), drop=max(m - 2, 0))
         sizes = np.abs(np.linalg.eigvalsh(rows)).max(axis=1)
-        worst = max(worst, _proved(sizes, l))
+        worst = max(worst, _proved_maximum(sizes, l))
         if m == 0:
             break
     return worst / math.cos(0.5 * math.pi / _TURNS)

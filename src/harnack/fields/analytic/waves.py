@@ -16,44 +16,54 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend.elementary import sincos
-from harnack.backend.validation import finite, refuse_derivatives, refuses_derivatives, triple
+from harnack.backend.validation import as_finite, as_triple, check_no_derivatives, no_derivatives
 
 if TYPE_CHECKING:
     from harnack.backend import Real, Vec3
 
-__all__ = ["Factor", "PlaneWave", "Product", "Term", "WaveBounds", "cosine", "sine"]
+__all__ = [
+    "PlaneWave",
+    "Term",
+    "WaveBounds",
+    "WaveFactor",
+    "WaveProduct",
+    "cosine_factor",
+    "sine_factor",
+]
 
 
 @dataclass(frozen=True)
-class Factor:
-    """sin or cos of (frequency * coordinate + phase); made by `sine` and `cosine`."""
+class WaveFactor:
+    """sin or cos of (frequency * coordinate + phase); made by `sine_factor` and `cosine_factor`."""
 
     frequency: float
     phase: float
     is_cosine: bool
 
     def __post_init__(self) -> None:
-        refuse_derivatives("a factor of a wave", vars(self))
+        check_no_derivatives("a factor of a wave", vars(self))
         for name in ("frequency", "phase"):
-            object.__setattr__(self, name, finite(getattr(self, name), f"the {name} of a factor"))
+            object.__setattr__(
+                self, name, as_finite(getattr(self, name), f"the {name} of a factor")
+            )
         if self.frequency == 0:
             raise ValueError("a factor of frequency 0 is a constant: multiply the amplitude by it")
 
 
-@refuses_derivatives
-def sine(frequency: float = 1.0, phase: float = 0.0) -> Factor:
+@no_derivatives
+def sine_factor(frequency: float = 1.0, phase: float = 0.0) -> WaveFactor:
     """sin(frequency * coordinate + phase); frequency in radians per unit length."""
-    return Factor(frequency, phase, False)
+    return WaveFactor(frequency, phase, False)
 
 
-@refuses_derivatives
-def cosine(frequency: float = 1.0, phase: float = 0.0) -> Factor:
+@no_derivatives
+def cosine_factor(frequency: float = 1.0, phase: float = 0.0) -> WaveFactor:
     """cos(frequency * coordinate + phase); frequency in radians per unit length."""
-    return Factor(frequency, phase, True)
+    return WaveFactor(frequency, phase, True)
 
 
 @dataclass(frozen=True)
-class Product:
+class WaveProduct:
     """amplitude times a factor of each coordinate; a coordinate left out does not enter.
 
     Product(2.0, x=sine(3.0), y=cosine(4.0)) is 2 sin(3x) cos(4y), an eigenfunction of the
@@ -61,22 +71,22 @@ class Product:
     """
 
     amplitude: float
-    x: Factor | None = None
-    y: Factor | None = None
-    z: Factor | None = None
+    x: WaveFactor | None = None
+    y: WaveFactor | None = None
+    z: WaveFactor | None = None
 
     def __post_init__(self) -> None:
-        refuse_derivatives("a Product", vars(self))
-        finite(self.amplitude, "the amplitude of a product")
+        check_no_derivatives("a Product", vars(self))
+        as_finite(self.amplitude, "the amplitude of a product")
         for name in "xyz":
             factor = getattr(self, name)
-            if factor is not None and not isinstance(factor, Factor):
+            if factor is not None and not isinstance(factor, WaveFactor):
                 raise TypeError(
                     f"{name} of a product is made by sine or cosine, not {factor!r:.60}"
                 )
 
     @property
-    def factors(self) -> tuple[tuple[int, Factor], ...]:
+    def factors(self) -> tuple[tuple[int, WaveFactor], ...]:
         """(axis, factor) of each coordinate that enters."""
         named = enumerate((self.x, self.y, self.z))
         return tuple((axis, factor) for axis, factor in named if factor is not None)
@@ -91,14 +101,14 @@ class PlaneWave:
     phase: float = 0.0
 
     def __post_init__(self) -> None:
-        refuse_derivatives("a PlaneWave", vars(self))
-        finite(self.amplitude, "the amplitude of a plane wave")
-        finite(self.phase, "the phase of a plane wave")
-        vector = triple(self.wave_vector, "the wave vector")
+        check_no_derivatives("a PlaneWave", vars(self))
+        as_finite(self.amplitude, "the amplitude of a plane wave")
+        as_finite(self.phase, "the phase of a plane wave")
+        vector = as_triple(self.wave_vector, "the wave vector")
         object.__setattr__(self, "wave_vector", vector)
 
 
-Term = Product | PlaneWave
+Term = WaveProduct | PlaneWave
 
 
 def checked_terms(terms: Iterable[Term]) -> tuple[Term, ...]:
@@ -114,7 +124,7 @@ def checked_terms(terms: Iterable[Term]) -> tuple[Term, ...]:
         if isinstance(term, PlaneWave):
             amplitude, phase = float(term.amplitude), float(term.phase)
             checked.append(replace(term, amplitude=amplitude, phase=phase))
-        elif isinstance(term, Product):  # pyright: ignore[reportUnnecessaryIsInstance]
+        elif isinstance(term, WaveProduct):  # pyright: ignore[reportUnnecessaryIsInstance]
             checked.append(replace(term, amplitude=float(term.amplitude)))
         else:
             raise TypeError(f"term {n} must be a Product or a PlaneWave, not {term!r}")
@@ -128,7 +138,7 @@ class _FactorRates:
         self._p = p
         self._known: dict[Any, tuple[Real, Real]] = {}
 
-    def __call__(self, axis: int, factor: Factor) -> tuple[Real, Real]:
+    def __call__(self, axis: int, factor: WaveFactor) -> tuple[Real, Real]:
         """The factor and its derivative along the axis."""
         key = (axis, factor.frequency, factor.phase)
         if key not in self._known:
@@ -209,8 +219,8 @@ class WaveBounds:
         the largest eigenvalue of the matrix sum A_i k_i k_i^T.
     largest_gradient: |v . grad f| <= sum A_i |k_i . v|, at most sum A_i |k_i|, and by
         Cauchy-Schwarz at most sqrt(sum A_i) sqrt(sum A_i (k_i . v)^2).
-    largest_change: |third derivative along v| <= sum A_i |k_i . v|^3, at most the largest |k_i|
-        times largest_curvature.
+    max_third_derivative: |third derivative along v| <= sum A_i |k_i . v|^3, at most the largest
+        |k_i| times largest_curvature.
     The gyroid's three terms give 3, 2, sqrt 6 and 2 sqrt 2 (true: 3/2, 2, sqrt 3, no more than
     2.31).
     """
@@ -221,7 +231,7 @@ class WaveBounds:
     largest_value: float
     largest_gradient: float
     largest_curvature: float
-    largest_change: float
+    max_third_derivative: float
 
     @classmethod
     def of(cls, terms: Iterable[Term]) -> WaveBounds:

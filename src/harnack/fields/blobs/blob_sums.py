@@ -8,10 +8,11 @@ support, t = v.d. Centers are stored as the sum of two numbers, so that v is rig
 then so are t, the distance h of the line from the center (as a length), and the positions
 x = s - t, within 8u(2 + |t|) where they matter: that is a displacement of the blob relative to the
 path, which also covers that |d| is 1 only up to 2u. A displacement by e changes f' by at most
-`Steepness.slope` times e, and f'' by `Steepness.bend` times e (its jumps at the end of the support
-are searched for within a margin), or by `Kernel.share` of that. A sum of n terms adds n u times the
-sum of their largest absolute values. Both are added to the ranges, outwards. The value at the point
-is right within 8u |dk/dq|, by the rounding of q, and (16 + n)u m, with m as in `Kernel.profile`.
+`KernelLipschitz.slope` times e, and f'' by `KernelLipschitz.bend` times e (its jumps at the end of
+the support are searched for within a margin), or by `Kernel.lipschitz_fraction` of that. A sum of n
+terms adds n u times the sum of their largest absolute values. Both are added to the ranges,
+outwards. The value at the point is right within 8u |dk/dq|, by the rounding of q, and (16 + n)u m,
+with m as in `Kernel.profile`.
 """
 
 from __future__ import annotations
@@ -25,13 +26,13 @@ import drjit as dr
 
 from harnack.arithmetic import Interval, Jet
 from harnack.backend.elementary import clamp, fmax, fmin
-from harnack.enclosures import Slopes
-from harnack.enclosures.enclosure import Piece
+from harnack.enclosures import SlopeRange
+from harnack.enclosures.enclosure import PathPiece
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
-    from harnack.backend.record_table import Records
-    from harnack.fields.blobs.kernels import Chord, Kernel
+    from harnack.backend.record_table import RecordTable
+    from harnack.fields.blobs.kernels import BlobKernel, ChordProfile
 
 State: TypeAlias = "tuple[Any, ...]"
 # From the record of a blob and a state: the state with that blob added.
@@ -41,7 +42,7 @@ ForEach: TypeAlias = "Callable[[EachBlob, State], State]"
 
 
 @dataclass(frozen=True)
-class BlobValue:
+class SumValue:
     """A sum at points: value and gradient, and bounds of their rounding."""
 
     value: Real
@@ -56,38 +57,38 @@ PIECES, PIECES_IN_CELL = 4, 3
 
 
 @dataclass(frozen=True)
-class Along:
-    """A sum along the path from p: its value at p, and ranges on pieces (a `Restriction`)."""
+class SumOnRay:
+    """A sum along the path from p: its value at p, and ranges on pieces (a `PathRestriction`)."""
 
-    start: BlobValue
-    parts: tuple[Piece, ...]
+    start: SumValue
+    parts: tuple[PathPiece, ...]
 
     @property
     def piece_count(self) -> int:
         """The number of pieces."""
         return len(self.parts)
 
-    def pieces(self, knots: Sequence[Real]) -> tuple[Piece, ...]:
+    def derivative_ranges(self, knots: Sequence[Real]) -> tuple[PathPiece, ...]:
         """The ranges, for the same knots that they were computed with."""
         assert len(knots) == len(self.parts) + 1
         return self.parts
 
 
-class Knots:
-    """A stand-in for a `Restriction` that records which knots a proof asks for."""
+class KnotRecorder:
+    """A stand-in for a `PathRestriction` that records which knots a proof asks for."""
 
     def __init__(self, piece_count: int = PIECES) -> None:
         self.piece_count = piece_count
         self.knots: tuple[Real, ...] | None = None
 
-    def pieces(self, knots: Sequence[Real]) -> tuple[Piece, ...]:
+    def derivative_ranges(self, knots: Sequence[Real]) -> tuple[PathPiece, ...]:
         """Record the knots; the ranges returned have no meaning."""
         self.knots = tuple(knots)
         ends = itertools.pairwise(knots)
-        return tuple(Piece(b - a, Slopes(0.0, 0.0), 0.0, 0.0) for a, b in ends)
+        return tuple(PathPiece(b - a, SlopeRange(0.0, 0.0), 0.0, 0.0) for a, b in ends)
 
 
-def value_at(kernel: Kernel, backend: Backend, p: Vec3, for_each: ForEach) -> BlobValue:
+def value_at(kernel: BlobKernel, backend: Backend, p: Vec3, for_each: ForEach) -> SumValue:
     """The sum at points p."""
     real = backend.Float
 
@@ -96,12 +97,12 @@ def value_at(kernel: Kernel, backend: Backend, p: Vec3, for_each: ForEach) -> Bl
         v = _from(p, row) * inverse
         return _add_value(kernel, v, inverse, amplitude, state)
 
-    state = for_each(body, tuple(real(0) for _ in range(_VALUE)))
+    state = for_each(body, tuple(real(0) for _ in range(_VALUE_STATE_SIZE)))
     return _value(kernel, backend, state)
 
 
 def sum_along(
-    kernel: Kernel,
+    kernel: BlobKernel,
     backend: Backend,
     p: Vec3,
     d: Vec3,
@@ -109,15 +110,15 @@ def sum_along(
     for_each: ForEach,
     *,
     signed: bool = True,
-) -> Along:
+) -> SumOnRay:
     """The sum along p + s d. signed: whether amplitudes may be negative."""
     real = backend.Float
     count = len(knots) - 1
-    unit = 0.5 * backend.epsilon
-    jumps = kernel.jumps
+    unit = 0.5 * backend.machine_epsilon
+    jumps = kernel.second_derivative_jumps
 
     def body(row: list[Real], state: State) -> State:
-        start, sums = state[:_VALUE], list(state[_VALUE:])
+        start, sums = state[:_VALUE_STATE_SIZE], list(state[_VALUE_STATE_SIZE:])
         inverse, amplitude = row[6], row[7]
         v = _from(p, row) * inverse
         start = _add_value(kernel, v, inverse, amplitude, start)
@@ -135,10 +136,10 @@ def sum_along(
         slope_scale = amplitude * inverse
         bend_scale = slope_scale * inverse
 
-        a = clamp(places[0], -chord.half, chord.half)
+        a = clamp(places[0], -chord.half_length, chord.half_length)
         first_a, second_a = kernel.derivatives(height, inside, a)
         for k in range(count):
-            b = clamp(places[k + 1], -chord.half, chord.half)
+            b = clamp(places[k + 1], -chord.half_length, chord.half_length)
             first_b, second_b = kernel.derivatives(height, inside, b)
             slopes = _slopes(chord, a, b, first_a, first_b)
             bends = _bends(chord, a, b, second_a, second_b)
@@ -153,28 +154,28 @@ def sum_along(
             a, first_a, second_a = b, first_b, second_b
 
         nearest = fmax(fmax(places[0], -places[-1]), 0)
-        share = kernel.share(inside, nearest * nearest)
+        share = kernel.lipschitz_fraction(inside, nearest * nearest)
         weight = dr.select(near, (size + 1) * share, 0)
         sums[-3] = dr.fma(dr.abs(slope_scale), weight, sums[-3])
         sums[-2] = dr.fma(dr.abs(bend_scale), weight, sums[-2])
         sums[-1] = sums[-1] + dr.select(near, real(1), 0)
         return (*start, *sums)
 
-    state = for_each(body, tuple(real(0) for _ in range(_VALUE + 4 * count + 3)))
+    state = for_each(body, tuple(real(0) for _ in range(_VALUE_STATE_SIZE + 4 * count + 3)))
     steepness = kernel.steepness
     slope_size, bend_size, terms = state[-3:]
     rounding = unit * (16 + terms)
     slope_error = rounding * steepness.slope * slope_size
     bend_error = rounding * steepness.bend * bend_size
-    parts: list[Piece] = []
+    parts: list[PathPiece] = []
     for k, (begin, end) in enumerate(itertools.pairwise(knots)):
-        low, high, least, most = state[_VALUE + 4 * k : _VALUE + 4 * k + 4]
-        slopes = Slopes(low - slope_error, high + slope_error)
-        parts.append(Piece(end - begin, slopes, least - bend_error, most + bend_error))
-    return Along(_value(kernel, backend, state[:_VALUE]), tuple(parts))
+        low, high, least, most = state[_VALUE_STATE_SIZE + 4 * k : _VALUE_STATE_SIZE + 4 * k + 4]
+        slopes = SlopeRange(low - slope_error, high + slope_error)
+        parts.append(PathPiece(end - begin, slopes, least - bend_error, most + bend_error))
+    return SumOnRay(_value(kernel, backend, state[:_VALUE_STATE_SIZE]), tuple(parts))
 
 
-def hessian_at(kernel: Kernel, backend: Backend, p: Vec3, for_each: ForEach) -> State:
+def hessian_at(kernel: BlobKernel, backend: Backend, p: Vec3, for_each: ForEach) -> State:
     """The second derivatives of the sum at points p: rows of the upper triangle."""
 
     def body(row: list[Real], state: State) -> State:
@@ -183,7 +184,7 @@ def hessian_at(kernel: Kernel, backend: Backend, p: Vec3, for_each: ForEach) -> 
         q = dr.dot(v, v)
         scale = amplitude * inverse * inverse
         even = 2 * scale * kernel.profile(q)[1]
-        bend = 4 * scale * kernel.second(q)
+        bend = 4 * scale * kernel.second_derivative(q)
         pairs = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
         return tuple(
             total + dr.select(q < 1, bend * v[i] * v[j] + (even if i == j else 0), 0)
@@ -195,10 +196,10 @@ def hessian_at(kernel: Kernel, backend: Backend, p: Vec3, for_each: ForEach) -> 
 
 # The length of the part of the state for the value at the point: the value, the gradient, the sums
 # for the errors, and the number of terms.
-_VALUE = 8
+_VALUE_STATE_SIZE = 8
 
 
-def _add_value(kernel: Kernel, v: Vec3, inverse: Real, amplitude: Real, state: State) -> State:
+def _add_value(kernel: BlobKernel, v: Vec3, inverse: Real, amplitude: Real, state: State) -> State:
     value, x, y, z, moved, noise, slope_size, terms = state
     q = dr.dot(v, v)
     k, slope, scale = kernel.profile(q)
@@ -213,17 +214,17 @@ def _add_value(kernel: Kernel, v: Vec3, inverse: Real, amplitude: Real, state: S
         dr.fma(pull, v.z, z),
         moved + dr.abs(steep),
         dr.fma(size, scale, noise),
-        slope_size + dr.select(here, size * inverse * kernel.share(1.0, q), 0),
+        slope_size + dr.select(here, size * inverse * kernel.lipschitz_fraction(1.0, q), 0),
         terms + dr.select(here, type(q)(1), 0),
     )
 
 
-def _value(kernel: Kernel, backend: Backend, state: State) -> BlobValue:
+def _value(kernel: BlobKernel, backend: Backend, state: State) -> SumValue:
     value, x, y, z, moved, noise, slope_size, terms = state
-    unit = 0.5 * backend.epsilon
+    unit = 0.5 * backend.machine_epsilon
     error = unit * dr.fma(16 + terms, noise, 8 * moved)
     gradient_error = unit * (32 + terms) * kernel.steepness.slope * slope_size
-    return BlobValue(value, backend.Array3f(x, y, z), error, gradient_error)
+    return SumValue(value, backend.Array3f(x, y, z), error, gradient_error)
 
 
 def _from(p: Vec3, row: list[Real]) -> Vec3:
@@ -231,21 +232,21 @@ def _from(p: Vec3, row: list[Real]) -> Vec3:
     return type(p)(*((row[k] - p[k]) + row[3 + k] for k in range(3)))
 
 
-def _slopes(chord: Chord, a: Real, b: Real, at_a: Real, at_b: Real) -> tuple[Real, Real]:
+def _slopes(chord: ChordProfile, a: Real, b: Real, at_a: Real, at_b: Real) -> tuple[Real, Real]:
     """The range of the first derivative between a and b."""
-    falls = (a <= chord.turn) & (b >= chord.turn)
-    rises = (a <= -chord.turn) & (b >= -chord.turn)
+    falls = (a <= chord.steepest_position) & (b >= chord.steepest_position)
+    rises = (a <= -chord.steepest_position) & (b >= -chord.steepest_position)
     low = dr.select(falls, -chord.steepest, fmin(at_a, at_b))
     return low, dr.select(rises, chord.steepest, fmax(at_a, at_b))
 
 
-def _bends(chord: Chord, a: Real, b: Real, at_a: Real, at_b: Real) -> tuple[Real, Real]:
+def _bends(chord: ChordProfile, a: Real, b: Real, at_a: Real, at_b: Real) -> tuple[Real, Real]:
     """The range of the second derivative between a and b."""
     center = (a <= 0) & (b >= 0)
-    right = (a <= chord.bend) & (b >= chord.bend)
-    left = (a <= -chord.bend) & (b >= -chord.bend)
-    low = dr.select(center, chord.least, fmin(at_a, at_b))
-    return low, dr.select(left | right, chord.most, fmax(at_a, at_b))
+    right = (a <= chord.max_curvature_position) & (b >= chord.max_curvature_position)
+    left = (a <= -chord.max_curvature_position) & (b >= -chord.max_curvature_position)
+    low = dr.select(center, chord.min_second, fmin(at_a, at_b))
+    return low, dr.select(left | right, chord.max_second, fmax(at_a, at_b))
 
 
 def _with_jumps(
@@ -262,7 +263,7 @@ def _with_jumps(
     return dr.select(meets, low, 0), dr.select(meets, high, 0)
 
 
-def over(records: Records, *, active: Mask = True) -> ForEach:
+def for_each_record(records: RecordTable, *, active: Mask = True) -> ForEach:
     """A loop over all records."""
 
     def for_each(body: EachBlob, state: State) -> State:
@@ -271,13 +272,13 @@ def over(records: Records, *, active: Mask = True) -> ForEach:
     return for_each
 
 
-def over_list(records: Records, entries: Any, begin: Any, end: Any) -> ForEach:
+def for_each_listed(records: RecordTable, entries: Any, begin: Any, end: Any) -> ForEach:
     """A loop over the records of a list: `entries` from begin to end."""
     kind = records.backend.UInt32
 
     def for_each(body: EachBlob, state: State) -> State:
         def step(i: Any, *state: Any) -> State:
-            return i + 1, *body(records.row(dr.gather(kind, entries, i)), state)
+            return i + 1, *body(records.read_record(dr.gather(kind, entries, i)), state)
 
         def more(i: Any, *_: Any) -> Mask:
             return i < end
@@ -291,21 +292,21 @@ Coordinates: TypeAlias = tuple[Jet, Jet, Jet]
 Term: TypeAlias = "Callable[[list[Real]], Jet]"
 
 
-def summed(term: Term, like: Jet, zero: Real, for_each: ForEach) -> Jet:
+def sum_jets(term: Term, like: Jet, zero: Real, for_each: ForEach) -> Jet:
     """The sum of a jet for each record, in a loop whose state is the ends of all intervals.
 
     like: a jet of the same variables. zero: the number 0 on each lane.
     """
 
     def body(row: list[Real], state: State) -> State:
-        total = jet_of(like, iter(state)) + term(row)
-        return tuple(leaves(total, zero))
+        total = jet_from_bounds(like, iter(state)) + term(row)
+        return tuple(jet_bounds(total, zero))
 
-    start = tuple(leaves(like.constant(0.0), zero))
-    return jet_of(like, iter(for_each(body, start)))
+    start = tuple(jet_bounds(like.constant(0.0), zero))
+    return jet_from_bounds(like, iter(for_each(body, start)))
 
 
-def blob_term(kernel: Kernel, coordinates: Coordinates) -> Term:
+def blob_term(kernel: BlobKernel, coordinates: Coordinates) -> Term:
     """The jet of one blob at jets of the coordinates."""
     function = kernel.function()
 
@@ -317,19 +318,19 @@ def blob_term(kernel: Kernel, coordinates: Coordinates) -> Term:
     return term
 
 
-def leaves(jet: Jet, zero: Real) -> Iterator[Any]:
+def jet_bounds(jet: Jet, zero: Real) -> Iterator[Any]:
     """The ends of all intervals of a jet, as numbers of the backend."""
-    for one in (jet.value, *jet.first, *jet.second):
-        yield zero + one.low
-        yield zero + one.high
-    if jet.start is not None:
-        yield from leaves(jet.start, zero)
+    for one in (jet.value, *jet.first_derivatives, *jet.second_derivatives):
+        yield zero + one.lower
+        yield zero + one.upper
+    if jet.jet_at_start is not None:
+        yield from jet_bounds(jet.jet_at_start, zero)
 
 
-def jet_of(like: Jet, ends: Iterator[Any]) -> Jet:
+def jet_from_bounds(like: Jet, ends: Iterator[Any]) -> Jet:
     """A jet of the same variables as another one, with these ends."""
     value = Interval(next(ends), next(ends))
-    first = tuple(Interval(next(ends), next(ends)) for _ in like.first)
-    second = tuple(Interval(next(ends), next(ends)) for _ in like.second)
-    start = None if like.start is None else jet_of(like.start, ends)
-    return Jet(value, first, second, start, like.width)
+    first = tuple(Interval(next(ends), next(ends)) for _ in like.first_derivatives)
+    second = tuple(Interval(next(ends), next(ends)) for _ in like.second_derivatives)
+    start = None if like.jet_at_start is None else jet_from_bounds(like.jet_at_start, ends)
+    return Jet(value, first, second, start, like.piece_length)

@@ -16,54 +16,57 @@ import numpy as np
 
 from harnack.arithmetic import Jet
 from harnack.backend import FloatArray, IntArray, backend_of
-from harnack.backend.arrays import aligned_integers
+from harnack.backend.arrays import upload_integers
 from harnack.backend.elementary import fmin
-from harnack.backend.record_table import Records
+from harnack.backend.record_table import RecordTable
 from harnack.backend.validation import (
+    as_real_array,
+    check_coordinate_size,
     check_finite,
-    check_size,
     check_vectors,
-    real_array,
-    vector_text,
+    format_vector,
 )
-from harnack.enclosures import Enclosure, Gaps, Lipschitz, Slopes
-from harnack.fields.batched_fields import prepared_once
+from harnack.enclosures import Enclosure, LevelGaps, Lipschitz, SlopeRange
+from harnack.fields.batched_fields import cached_prepare
 from harnack.fields.blobs.blob_sums import (
     PIECES,
     PIECES_IN_CELL,
-    BlobValue,
     ForEach,
-    Knots,
+    KnotRecorder,
+    SumValue,
     blob_term,
+    for_each_listed,
+    for_each_record,
     hessian_at,
-    over,
-    over_list,
     sum_along,
-    summed,
+    sum_jets,
     value_at,
 )
-from harnack.fields.blobs.grid import CellLists, Grid
-from harnack.fields.blobs.group_maximum import GroupedList, LargestAlong, largest_at, largest_jet
-from harnack.fields.blobs.kernels import Gaussian, Kernel, choose_kernel
+from harnack.fields.blobs.grid import BlobGrid, CellLists
+from harnack.fields.blobs.group_maximum import (
+    GroupedList,
+    GroupMaximumEnclosure,
+    group_maximum_at,
+    group_maximum_jet,
+)
+from harnack.fields.blobs.kernels import BlobKernel, GaussianKernel, choose_kernel
 from harnack.fields.formula import Formula, is_jet
-from harnack.fields.samples import Look, Path, Sample
+from harnack.fields.samples import Ray, RaySample, Sample
 from harnack.files.molecules import Atoms, read_molecule
 from harnack.geometry import Box
-from harnack.name_suggestions import renamed
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
     from harnack.geometry import Volume
 
 # From so many blobs on, a grid is faster than a sum over all, by experiment.
-_MANY = 64
+_MIN_BLOBS_FOR_GRID = 64
 
 
 class BlobError(ValueError):
     """Blobs that cannot be; the message says which and why."""
 
 
-@renamed(centres="centers")
 class Blobs(Formula):
     """f(x) = sum of w_i A k(|x - c_i|^2 / R_i^2): metaballs, whose surface is f = 1.
 
@@ -74,8 +77,8 @@ class Blobs(Formula):
     radii: (n,) or one number, > 0.
     weights: (n,), or None for 1; negative ones carve.
     kernel: "compact" (a polynomial of the sixth degree), "gaussian", or the soft objects "cubic"
-        and "sextic"; or one with other parameters, such as `Gaussian(sharpness=2.0)`. Each ends at
-        `Kernel.support` times the radius.
+        and "sextic"; or one with other parameters, such as `GaussianKernel(sharpness=2.0)`. Each
+        ends at `Kernel.support` times the radius.
     groups: (n,) integers: f is then the largest of the sums of each group, so that groups meet in
         creases; None for one sum.
 
@@ -94,14 +97,14 @@ class Blobs(Formula):
         radii: Any,
         weights: Any = None,
         *,
-        kernel: str | Kernel = "compact",
+        kernel: str | BlobKernel = "compact",
         groups: Any = None,
     ) -> None:
         self.centers, self.radii, self.weights, self.groups = _checked(
             centers, radii, weights, groups
         )
         self.kernel = choose_kernel(kernel)
-        self._on: _BlobData | None = None
+        self._on: _BlobDeviceData | None = None
 
     def __len__(self) -> int:
         return len(self.centers)
@@ -113,13 +116,15 @@ class Blobs(Formula):
     @functools.cached_property
     def cell_lists(self) -> CellLists | None:
         """The lists of blobs near each cell of a grid; None for few blobs."""
-        return CellLists.of(self.centers, self._supports) if len(self) >= _MANY else None
+        return (
+            CellLists.of(self.centers, self._supports) if len(self) >= _MIN_BLOBS_FOR_GRID else None
+        )
 
-    @prepared_once
+    @cached_prepare
     def prepare(self, backend: Backend) -> Blobs:
         """The blobs as records of the backend; other blobs compile no other kernel."""
         prepared = copy.copy(self)
-        prepared._on = _BlobData.upload(backend, self)
+        prepared._on = _BlobDeviceData.upload(backend, self)
         prepared.kernel = self.kernel.prepare(backend)
         prepared.lipschitz = dr.opaque(backend.Float, self.largest_gradient())
         return prepared
@@ -140,7 +145,7 @@ class Blobs(Formula):
         reach = self._supports[:, None] * (1 + 1e-6)
         return Box((self.centers - reach).min(axis=0), (self.centers + reach).max(axis=0))
 
-    def check_levels(self, levels: tuple[float, ...]) -> None:
+    def validate_levels(self, levels: tuple[float, ...]) -> None:
         for level in levels:
             if level == 0.0:
                 raise ValueError(
@@ -152,11 +157,11 @@ class Blobs(Formula):
         on = self._prepared(p)
         return self._sample(on.value_at(self.kernel, p))
 
-    def _sample(self, found: BlobValue) -> Sample:
+    def _sample(self, found: SumValue) -> Sample:
         known = () if self.lipschitz is None else (Lipschitz(0 * found.value + self.lipschitz),)
         return Sample(found.value, found.gradient, known, found.error, found.gradient_error)
 
-    def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
+    def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
         """Value and ranges by one loop over the blobs nearby; looking back nothing is proved.
 
         In a grid, enclosures reach to the end of the point's cell. From an empty cell, f is 0 until
@@ -167,52 +172,58 @@ class Blobs(Formula):
         p, d = path.point(t), path.direction
         on = self._prepared(p)
         count = PIECES if on.grid is None else PIECES_IN_CELL
-        asked = Knots(count)
-        nothing = Slopes(0.0, 0.0)
-        path.proofs.along(asked, nothing, ahead)
+        asked = KnotRecorder(count)
+        nothing = SlopeRange(0.0, 0.0)
+        path.proofs.from_restriction(asked, nothing, ahead)
         if asked.knots is None:
-            return path.look(self.evaluate(p))
+            return path.enclose(self.evaluate(p))
         on = self._prepared(p)
         run: Real | None = None
-        there, length = p, fmin(ahead, on.across)
+        there, length = p, fmin(ahead, on.max_path_length)
         if on.grid is not None:
-            run = empty = on.grid.run(p, d, ahead)
+            run = empty = on.grid.empty_run(p, d, ahead)
             there = dr.fma(type(p)(empty), d, p)
-            reach = on.grid.cell(there).exit(d)
-            length = fmin(dr.select(empty > 0, reach, fmin(ahead, reach)), on.across)
-        path.proofs.along(asked, nothing, length)
+            reach = on.grid.cell(there).exit_distance(d)
+            length = fmin(dr.select(empty > 0, reach, fmin(ahead, reach)), on.max_path_length)
+        path.proofs.from_restriction(asked, nothing, length)
         enclosures: tuple[Enclosure, ...]
         if on.groups is None:
             found = sum_along(
-                self.kernel, on.backend, there, d, asked.knots, on.near(there), signed=on.signed
+                self.kernel,
+                on.backend,
+                there,
+                d,
+                asked.knots,
+                on.near(there),
+                signed=on.has_negative_weights,
             )
             start = found.start if run is None else _zero_where(run > 0, found.start)
             slope = dr.dot(start.gradient, d)
-            slopes = Slopes.around(slope, start.gradient_error)
-            enclosures = path.proofs.along(found, slopes, length)
+            slopes = SlopeRange.around(slope, start.gradient_error)
+            enclosures = path.proofs.from_restriction(found, slopes, length)
         else:
             start = on.value_at(self.kernel, p)
             slope = dr.dot(start.gradient, d)
             enclosures = (
-                LargestAlong(
+                GroupMaximumEnclosure(
                     self.kernel, on.grouped(there), path, there, start.value, asked.knots, length,
-                    on.signed,
+                    on.has_negative_weights,
                 ),
             )  # fmt: skip
         if run is not None:
-            enclosures = tuple(_After(run, one) for one in enclosures)
-        return Look(self._sample(start), enclosures, (), slope, float(count))
+            enclosures = tuple(DelayedEnclosure(run, one) for one in enclosures)
+        return RaySample(self._sample(start), enclosures, (), slope, float(count))
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         """f of jets of the coordinates, or of Dr.Jit numbers: a sum over all blobs."""
         if not is_jet(x, type(self).__name__):
             return self.differentiable_value(backend_of(x).Array3f(x, y, z))
-        on = self._prepared_for(backend_of(_number_of(x, y, z)))
+        on = self._prepared_for(backend_of(_backend_number(x, y, z)))
         zero = on.backend.Float(0)
         term = blob_term(self.kernel, (x, y, z))
         if on.groups is None:
-            return summed(term, x, zero, over(on.records))
-        return largest_jet(term, x, zero, on.grouped(None))
+            return sum_jets(term, x, zero, for_each_record(on.records))
+        return group_maximum_jet(term, x, zero, on.grouped(None))
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         """Rows of the Hessian of the sum, or of the largest sum."""
@@ -223,12 +234,12 @@ class Blobs(Formula):
         vector = on.backend.Array3f
         return vector(xx, xy, xz), vector(xy, yy, yz), vector(xz, yz, zz)
 
-    def _prepared(self, p: Vec3) -> _BlobData:
+    def _prepared(self, p: Vec3) -> _BlobDeviceData:
         return self._prepared_for(backend_of(p))
 
-    def _prepared_for(self, backend: Backend) -> _BlobData:
+    def _prepared_for(self, backend: Backend) -> _BlobDeviceData:
         if self._on is None:
-            return _BlobData.upload(backend, self)
+            return _BlobDeviceData.upload(backend, self)
         return self._on
 
     def describe(self) -> dict[str, Any]:
@@ -236,39 +247,39 @@ class Blobs(Formula):
         lists = self.cell_lists
         if lists is not None:
             nx, ny, nz = lists.shape
-            facts["grid"] = f"{nx} x {ny} x {nz} cells of {lists.cell:.3g}"
+            facts["grid"] = f"{nx} x {ny} x {nz} cells of {lists.cell_size:.3g}"
         return facts
 
 
 @dataclass(frozen=True)
-class _BlobData:
+class _BlobDeviceData:
     """The data of blobs on a backend.
 
     groups: the group of each blob, and the number of groups; None if all are one sum.
-    signed: whether amplitudes may be negative.
-    across: longer than any path through all supports.
+    has_negative_weights: whether amplitudes may be negative.
+    max_path_length: longer than any path through all supports.
     """
 
     backend: Backend
-    records: Records
-    grid: Grid | None
+    records: RecordTable
+    grid: BlobGrid | None
     groups: tuple[Any, Any] | None
-    signed: bool
-    across: Real
+    has_negative_weights: bool
+    max_path_length: Real
 
     @classmethod
-    def upload(cls, backend: Backend, blobs: Blobs) -> _BlobData:
+    def upload(cls, backend: Backend, blobs: Blobs) -> _BlobDeviceData:
         """The blobs on a backend."""
         lists = blobs.cell_lists
         groups = None
         if blobs.groups is not None:
             count = dr.opaque(backend.UInt32, int(blobs.groups.max()) + 1)
-            groups = aligned_integers(backend, blobs.groups), count
+            groups = upload_integers(backend, blobs.groups), count
         low, high = blobs.extent(()).bounds()
         return cls(
             backend,
-            Records.upload(backend, _rows(backend, blobs)),
-            None if lists is None else Grid.upload(backend, lists),
+            RecordTable.upload(backend, _rows(backend, blobs)),
+            None if lists is None else BlobGrid.upload(backend, lists),
             groups,
             bool((blobs.weights < 0).any()),
             dr.opaque(backend.Float, 2 * float(np.linalg.norm(high - low))),
@@ -277,8 +288,8 @@ class _BlobData:
     def near(self, p: Vec3) -> ForEach:
         """The blobs whose supports may contain p: those of its cell."""
         if self.grid is None:
-            return over(self.records)
-        return over_list(self.records, self.grid.entries, *self.grid.list_at(p))
+            return for_each_record(self.records)
+        return for_each_listed(self.records, self.grid.entries, *self.grid.list_at(p))
 
     def grouped(self, p: Vec3 | None) -> GroupedList:
         """The same, by groups; all blobs if p is None."""
@@ -286,15 +297,15 @@ class _BlobData:
         of, count = self.groups
         if self.grid is None or p is None:
             zero = self.backend.UInt32(0)
-            return GroupedList(self.records, of, None, zero, self.records.trips, count)
+            return GroupedList(self.records, of, None, zero, self.records.iteration_count, count)
         begin, end = self.grid.list_at(p)
         return GroupedList(self.records, of, self.grid.entries, begin, end, count)
 
-    def value_at(self, kernel: Kernel, p: Vec3) -> BlobValue:
+    def value_at(self, kernel: BlobKernel, p: Vec3) -> SumValue:
         """The sum, or the largest sum, at points p."""
         if self.groups is None:
             return value_at(kernel, self.backend, p, self.near(p))
-        return largest_at(kernel, self.backend, p, self.grouped(p))
+        return group_maximum_at(kernel, self.backend, p, self.grouped(p))
 
 
 def _rows(backend: Backend, blobs: Blobs) -> FloatArray:
@@ -316,7 +327,7 @@ def _rows(backend: Backend, blobs: Blobs) -> FloatArray:
         help_ = 'use precision="double" or ' if precision == "single" else ""
         raise BlobError(
             f"blob {worst}, with a radius of {blobs.radii[worst]:g}, a weight of "
-            f"{blobs.weights[worst]:g} and its center at {vector_text(blobs.centers[worst])}, is "
+            f"{blobs.weights[worst]:g} and its center at {format_vector(blobs.centers[worst])}, is "
             f"too small, too large or too far away for {precision} precision: "
             f"{help_}choose units nearer to 1"
         )
@@ -325,20 +336,20 @@ def _rows(backend: Backend, blobs: Blobs) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class _After(Enclosure):
+class DelayedEnclosure(Enclosure):
     """F = 0 for 0 <= s <= run; from there on the path is that of another enclosure."""
 
     run: Real
     then: Enclosure
 
-    def step(self, gaps: Gaps) -> Real:
-        return self.run + self.then.step(gaps)
+    def free_length(self, gaps: LevelGaps) -> Real:
+        return self.run + self.then.free_length(gaps)
 
 
-def _zero_where(mask: Any, found: BlobValue) -> BlobValue:
+def _zero_where(mask: Any, found: SumValue) -> SumValue:
     """The sum, replaced by 0 where the mask holds."""
     zero = 0 * found.value
-    return BlobValue(
+    return SumValue(
         dr.select(mask, zero, found.value),
         dr.select(mask, type(found.gradient)(0), found.gradient),
         dr.select(mask, zero, found.error),
@@ -346,15 +357,15 @@ def _zero_where(mask: Any, found: BlobValue) -> BlobValue:
     )
 
 
-def _number_of(*jets: Jet) -> Any:
+def _backend_number(*jets: Jet) -> Any:
     """Some number of the backend from the ranges of jets.
 
     Raises:
         TypeError: they are all constants.
     """
     for jet in jets:
-        for one in (jet.value, *jet.first):
-            for end in (one.low, one.high):
+        for one in (jet.value, *jet.first_derivatives):
+            for end in (one.lower, one.upper):
                 if dr.is_array_v(cast("Any", type(end))):
                     return end
     raise TypeError("blobs need a point of the backend: the coordinates are constants")
@@ -368,21 +379,21 @@ def _checked(
     Raises:
         BlobError: wrong shapes, or numbers that no blob can have.
     """
-    c = real_array(centers, "centers", BlobError).astype(np.float64)
+    c = as_real_array(centers, "centers", BlobError).astype(np.float64)
     check_vectors(c, "centers", BlobError)
     if not len(c):
         raise BlobError("centers: there are none; give at least one blob")
     check_finite(c, "center {}", BlobError)
-    check_size(c, BlobError)
+    check_coordinate_size(c, BlobError)
     r = _numbers(radii, "radii", len(c))
     bad = np.flatnonzero(~(r > 0))
     if bad.size:
         raise BlobError(f"radius {bad[0]} is {r[bad[0]]:g}: radii must be positive")
-    check_size(r, BlobError)
+    check_coordinate_size(r, BlobError)
     w = np.ones(len(c)) if weights is None else _numbers(weights, "weights", len(c))
     if groups is None:
         return c, r, w, None
-    g = real_array(groups, "groups", BlobError)
+    g = as_real_array(groups, "groups", BlobError)
     if g.shape != (len(c),) or g.dtype.kind not in "iu":
         raise BlobError(
             f"groups must be {len(c)} integers, one for each blob, not {g.dtype} of shape {g.shape}"
@@ -392,7 +403,7 @@ def _checked(
 
 
 def _numbers(values: Any, name: str, count: int) -> FloatArray:
-    array = real_array(values, name, BlobError).astype(np.float64)
+    array = as_real_array(values, name, BlobError).astype(np.float64)
     if array.ndim == 0:
         array = np.full(count, float(array))
     if array.shape != (count,):
@@ -408,7 +419,8 @@ def _numbers(values: Any, name: str, count: int) -> FloatArray:
 
 class Molecule(Blobs):
     """The surface of a molecule: the level 1 of a sum of A exp(-s (d/r)^2) over its atoms, each
-    less a tangent that makes it end (see `Gaussian`); r is the van der Waals radius of the atom.
+    less a tangent that makes it end (see `GaussianKernel`); r is the van der Waals radius of the
+    atom.
 
     source: a .pdb, .ent, .cif or .mmcif file, or `Atoms`.
     sharpness: s; the larger, the closer the surface follows the single atoms.
@@ -430,7 +442,9 @@ class Molecule(Blobs):
         tail: float = 1 / 32,
     ) -> None:
         self.atoms = source if isinstance(source, Atoms) else read_molecule(source)
-        super().__init__(self.atoms.positions, self.atoms.radii, kernel=Gaussian(sharpness, tail))
+        super().__init__(
+            self.atoms.positions, self.atoms.radii, kernel=GaussianKernel(sharpness, tail)
+        )
 
     def describe(self) -> dict[str, Any]:
         facts = super().describe()

@@ -13,8 +13,13 @@ from typing import TYPE_CHECKING, Any, cast
 import drjit as dr
 import numpy as np
 
-from harnack.backend.arrays import aligned_integers
-from harnack.tree.empty_space import GridLayout, UniformGrid, distances_to_full, short_length
+from harnack.backend.arrays import upload_integers
+from harnack.tree.empty_space import (
+    EmptySpaceGrid,
+    GridData,
+    distance_to_occupied,
+    round_to_short_float,
+)
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, IntArray, Vec3
@@ -28,7 +33,7 @@ _MOST_CELLS, _MOST_ENTRIES = 1 << 24, 200.0
 
 
 @dataclass(frozen=True)
-class CellLists(GridLayout):
+class CellLists(GridData):
     """A grid in NumPy, in which a cell is empty if its list is.
 
     starts: (cells + 1,) where each cell's list begins among `entries`.
@@ -47,7 +52,7 @@ class CellLists(GridLayout):
         size = float(np.median(supports)) * 0.6 if cell is None else cell
         low, high = (centers - supports[:, None]).min(0), (centers + supports[:, None]).max(0)
         while True:
-            size = short_length(size)
+            size = round_to_short_float(size)
             margin = _MARGIN * size
             origin = np.nextafter((low - 2 * margin).astype(np.float32), np.float32(-np.inf))
             origin = origin.astype(np.float64)
@@ -64,7 +69,7 @@ class CellLists(GridLayout):
         starts = np.zeros(total + 1, dtype=np.int64)
         starts[1:] = np.cumsum(np.bincount(cells, minlength=total))
         empty = (np.diff(starts) == 0).reshape(shape[::-1])
-        return cls(origin, size, shape, distances_to_full(empty), starts, blobs[order])
+        return cls(origin, size, shape, distance_to_occupied(empty), starts, blobs[order])
 
 
 def _pairs(
@@ -103,20 +108,20 @@ def _pairs(
 
 
 @dataclass(frozen=True)
-class Grid(UniformGrid):
+class BlobGrid(EmptySpaceGrid):
     """Cell lists on a backend."""
 
     starts: Any
     entries: Any
 
     @classmethod
-    def upload(cls, backend: Backend, lists: CellLists) -> Grid:
+    def upload(cls, backend: Backend, lists: CellLists) -> BlobGrid:
         """The lists on a backend."""
         return cls(
-            *cls.placed(backend, lists),
+            *cls.upload_layout(backend, lists),
             _MARGIN,
-            aligned_integers(backend, lists.starts),
-            aligned_integers(backend, lists.entries),
+            upload_integers(backend, lists.starts),
+            upload_integers(backend, lists.entries),
         )
 
     def list_at(self, p: Vec3) -> tuple[Any, Any]:

@@ -12,26 +12,26 @@ from typing import TYPE_CHECKING, Any, cast
 import drjit as dr
 
 from harnack.backend.elementary import fmax, fmin
-from harnack.enclosures import Enclosure, Gaps, Slopes, longest_step
+from harnack.enclosures import Enclosure, LevelGaps, SlopeRange, longest_free_length
 from harnack.fields.blobs.blob_sums import (
-    BlobValue,
     EachBlob,
     ForEach,
     State,
-    jet_of,
-    leaves,
+    SumValue,
+    jet_bounds,
+    jet_from_bounds,
     sum_along,
-    summed,
+    sum_jets,
     value_at,
 )
 
 if TYPE_CHECKING:
     from harnack.arithmetic import Jet
     from harnack.backend import Backend, Mask, Real, Vec3
-    from harnack.backend.record_table import Records
+    from harnack.backend.record_table import RecordTable
     from harnack.fields.blobs.blob_sums import Term
-    from harnack.fields.blobs.kernels import Kernel
-    from harnack.fields.samples import Path
+    from harnack.fields.blobs.kernels import BlobKernel
+    from harnack.fields.samples import Ray
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class GroupedList:
     count: the number of groups in all.
     """
 
-    records: Records
+    records: RecordTable
     of: Any
     entries: Any
     begin: Any
@@ -94,7 +94,7 @@ class _OneGroup:
         group = blobs.group(self._begin)
 
         def step(i: Any, *state: Any) -> State:
-            return i + 1, *body(blobs.records.row(blobs.record(i)), state)
+            return i + 1, *body(blobs.records.read_record(blobs.record(i)), state)
 
         def more(i: Any, *_: Any) -> Mask:
             return (i < blobs.end) & (blobs.group(i) == group)
@@ -106,7 +106,7 @@ class _OneGroup:
         return tuple(after)
 
 
-def largest_at(kernel: Kernel, backend: Backend, p: Vec3, blobs: GroupedList) -> BlobValue:
+def group_maximum_at(kernel: BlobKernel, backend: Backend, p: Vec3, blobs: GroupedList) -> SumValue:
     """The largest sum at points p, with its gradient. The errors are the largest of all groups'."""
     real = backend.Float
 
@@ -128,32 +128,32 @@ def largest_at(kernel: Kernel, backend: Backend, p: Vec3, blobs: GroupedList) ->
     value, x, y, z, error, gradient_error = found
     flat = (groups < blobs.count) & ~(value > 0)  # the largest is 0, that of a group that is far
     gradient = dr.select(flat, backend.Array3f(0), backend.Array3f(x, y, z))
-    return BlobValue(dr.select(flat, 0, value), gradient, error, gradient_error)
+    return SumValue(dr.select(flat, 0, value), gradient, error, gradient_error)
 
 
-def largest_jet(term: Term, like: Jet, zero: Real, blobs: GroupedList) -> Jet:
+def group_maximum_jet(term: Term, like: Jet, zero: Real, blobs: GroupedList) -> Jet:
     """The largest sum as a jet; the list is that of all blobs."""
 
     def body(for_each: ForEach, state: State) -> State:
-        one = summed(term, like, zero, for_each)
-        before = jet_of(like, iter(state[1:]))
+        one = sum_jets(term, like, zero, for_each)
+        before = jet_from_bounds(like, iter(state[1:]))
         both = before.maximum(one)
         first = state[0] > 0  # the first group
         return (
             real(0) + 0 * zero,
             *(dr.select(first, a, b) for a, b in zip(
-                leaves(one, zero), leaves(both, zero), strict=True
+                jet_bounds(one, zero), jet_bounds(both, zero), strict=True
             )),
         )  # fmt: skip
 
     real = cast("Any", type(zero))
-    start = (real(1) + 0 * zero, *leaves(like.constant(0.0), zero))
+    start = (real(1) + 0 * zero, *jet_bounds(like.constant(0.0), zero))
     _, found = blobs.each_group(body, start, "groups")
-    return jet_of(like, iter(found[1:]))
+    return jet_from_bounds(like, iter(found[1:]))
 
 
 @dataclass(frozen=True)
-class LargestAlong(Enclosure):
+class GroupMaximumEnclosure(Enclosure):
     """The largest sum along the path from p, for a length.
 
     value: at p.
@@ -166,19 +166,20 @@ class LargestAlong(Enclosure):
     take the maximum of two inclusion functions).
     """
 
-    kernel: Kernel
+    kernel: BlobKernel
     blobs: GroupedList
-    path: Path
+    path: Ray
     p: Vec3
     value: Real
     knots: Sequence[Real]
     length: Real
     signed: bool
 
-    def step(self, gaps: Gaps) -> Real:
-        """Proof. See `LargestAlong`. For a group whose sum is lower by g, the level above is
-        farther by g and the level below nearer by g; g is known up to the errors of both sums, the
-        larger of which the tracer has subtracted from the gaps already (`look.value_error`)."""
+    def free_length(self, gaps: LevelGaps) -> Real:
+        """Proof. See `GroupMaximumEnclosure`. For a group whose sum is lower by g, the level above
+        is farther by g and the level below nearer by g; g is known up to the errors of both sums,
+        the larger of which the tracer has subtracted from the gaps already
+        (`look.value_error_bound`)."""
         backend = self.blobs.records.backend
         real = backend.Float
 
@@ -189,19 +190,23 @@ class LargestAlong(Enclosure):
                 signed=self.signed,
             )  # fmt: skip
             slope = dr.dot(one.start.gradient, self.path.direction)
-            slopes = Slopes.around(slope, one.start.gradient_error)
-            enclosures = self.path.proofs.along(one, slopes, self.length)
+            slopes = SlopeRange.around(slope, one.start.gradient_error)
+            enclosures = self.path.proofs.from_restriction(one, slopes, self.length)
             lower = self.value - one.start.value
             none = real(dr.inf)
-            rising = longest_step(enclosures, Gaps(none, gaps.up + lower, is_one_sided=True))
-            falling = longest_step(enclosures, Gaps(gaps.down - lower, none, is_one_sided=True))
-            clear = gaps.down > lower
+            rising = longest_free_length(
+                enclosures, LevelGaps(none, gaps.above + lower, is_one_sided=True)
+            )
+            falling = longest_free_length(
+                enclosures, LevelGaps(gaps.below - lower, none, is_one_sided=True)
+            )
+            clear = gaps.below > lower
             return fmin(rising, up), fmax(dr.select(clear, falling, 0), down)
 
         start = (real(0) + self.length, real(0))
         groups, (up, down) = self.blobs.each_group(body, start, "steps of groups")
         # Groups that are far stay 0.
-        stays = (groups < self.blobs.count) & (gaps.down > self.value)
+        stays = (groups < self.blobs.count) & (gaps.below > self.value)
         down = dr.select(stays, self.length, down)
-        down = dr.select(gaps.down == dr.inf, self.length, down)
-        return fmin(dr.select(gaps.up == dr.inf, self.length, up), down)
+        down = dr.select(gaps.below == dr.inf, self.length, down)
+        return fmin(dr.select(gaps.above == dr.inf, self.length, up), down)

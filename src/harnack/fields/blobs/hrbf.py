@@ -13,14 +13,27 @@ import numpy as np
 from harnack.arithmetic import Jet, sqrt
 from harnack.backend import FloatArray, backend_of
 from harnack.backend.elementary import fmax, fmin
-from harnack.backend.record_table import Records
-from harnack.backend.validation import check_finite, check_size, check_vectors, real_array
-from harnack.enclosures import Lipschitz, Slopes
-from harnack.enclosures.enclosure import Piece
-from harnack.fields.batched_fields import prepared_once
-from harnack.fields.blobs.blob_sums import PIECES, Along, BlobValue, Knots, State, over, summed
+from harnack.backend.record_table import RecordTable
+from harnack.backend.validation import (
+    as_real_array,
+    check_coordinate_size,
+    check_finite,
+    check_vectors,
+)
+from harnack.enclosures import Lipschitz, SlopeRange
+from harnack.enclosures.enclosure import PathPiece
+from harnack.fields.batched_fields import cached_prepare
+from harnack.fields.blobs.blob_sums import (
+    PIECES,
+    KnotRecorder,
+    State,
+    SumOnRay,
+    SumValue,
+    for_each_record,
+    sum_jets,
+)
 from harnack.fields.formula import Formula, is_jet
-from harnack.fields.samples import Look, Path, Sample
+from harnack.fields.samples import Ray, RaySample, Sample
 from harnack.geometry import Box
 from harnack.geometry.volume import check_volume
 
@@ -57,14 +70,16 @@ class HRBF(Formula):
     def __init__(self, points: Any, normals: Any, *, domain: Volume | None = None) -> None:
         check_volume(domain, "domain")
         self.points, self.normals = _checked(points, normals)
-        self.factors, self.vectors = _solved(self.points, self.normals)
+        self.value_coefficients, self.gradient_coefficients = _solve_coefficients(
+            self.points, self.normals
+        )
         low, high = self.points.min(axis=0), self.points.max(axis=0)
         more = _MARGIN * float((high - low).max())
         self.domain = Box(low - more, high + more) if domain is None else domain
         self.lipschitz = self._largest_gradient()
-        self._on: tuple[Backend, Records] | None = None
+        self._on: tuple[Backend, RecordTable] | None = None
 
-    @prepared_once
+    @cached_prepare
     def prepare(self, backend: Backend) -> HRBF:
         """The points as records of the backend; other points compile no other kernel."""
         prepared = copy.copy(self)
@@ -79,48 +94,56 @@ class HRBF(Formula):
             return None
         far = np.abs(corners[:, None] - self.points).max(axis=0)
         r = np.linalg.norm(far, axis=1)
-        strong = np.linalg.norm(self.vectors, axis=1)
-        return float((3 * np.abs(self.factors) * r * r + 6 * strong * r).sum()) * (1 + 1e-6)
+        strong = np.linalg.norm(self.gradient_coefficients, axis=1)
+        return float((3 * np.abs(self.value_coefficients) * r * r + 6 * strong * r).sum()) * (
+            1 + 1e-6
+        )
 
-    def _uploaded(self, backend: Backend) -> tuple[Backend, Records]:
+    def _uploaded(self, backend: Backend) -> tuple[Backend, RecordTable]:
         near = self.points.astype(backend.dtype).astype(np.float64)
         rows = np.column_stack(
-            [near, self.points - near, self.factors, 3 * self.vectors, np.zeros((len(near), 6))]
+            [
+                near,
+                self.points - near,
+                self.value_coefficients,
+                3 * self.gradient_coefficients,
+                np.zeros((len(near), 6)),
+            ]
         )
-        return backend, Records.upload(backend, rows)
+        return backend, RecordTable.upload(backend, rows)
 
-    def _prepared_for(self, backend: Backend) -> tuple[Backend, Records]:
+    def _prepared_for(self, backend: Backend) -> tuple[Backend, RecordTable]:
         return self._uploaded(backend) if self._on is None else self._on
 
     def evaluate(self, p: Vec3) -> Sample:
         d = type(p)(1, 0, 0)
         return self._sample(self._along(p, d, (0.0,)).start)
 
-    def _sample(self, found: BlobValue) -> Sample:
+    def _sample(self, found: SumValue) -> Sample:
         known = () if self.lipschitz is None else (Lipschitz(0 * found.value + self.lipschitz),)
         return Sample(found.value, found.gradient, known, found.error, found.gradient_error)
 
-    def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
+    def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
         """Value and ranges by one loop over the points; looking back nothing is proved."""
         del back
         p, d = path.point(t), path.direction
-        asked = Knots()
+        asked = KnotRecorder()
         length = ahead
-        path.proofs.along(asked, Slopes(0.0, 0.0), length)
+        path.proofs.from_restriction(asked, SlopeRange(0.0, 0.0), length)
         if asked.knots is None:
-            return path.look(self.evaluate(p))
+            return path.enclose(self.evaluate(p))
         found = self._along(p, d, asked.knots)
         slope = dr.dot(found.start.gradient, d)
-        slopes = Slopes.around(slope, found.start.gradient_error)
-        enclosures = path.proofs.along(found, slopes, length)
-        return Look(self._sample(found.start), enclosures, (), slope, PIECES)
+        slopes = SlopeRange.around(slope, found.start.gradient_error)
+        enclosures = path.proofs.from_restriction(found, slopes, length)
+        return RaySample(self._sample(found.start), enclosures, (), slope, PIECES)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         """f of jets of the coordinates, or of Dr.Jit numbers."""
         if not is_jet(x, type(self).__name__):
             return self.differentiable_value(backend_of(x).Array3f(x, y, z))
-        numbers = (end for jet in (x, y, z) for one in (jet.value, *jet.first)
-                   for end in (one.low, one.high) if dr.is_array_v(type(end)))  # fmt: skip
+        numbers = (end for jet in (x, y, z) for one in (jet.value, *jet.first_derivatives)
+                   for end in (one.lower, one.upper) if dr.is_array_v(type(end)))  # fmt: skip
         backend, records = self._prepared_for(backend_of(next(numbers)))
 
         def term(row: list[Real]) -> Jet:
@@ -128,7 +151,7 @@ class HRBF(Formula):
             r = (u**2 + v**2 + w**2).apply(sqrt)
             return r**3 * row[6] + r * (u * row[7] + v * row[8] + w * row[9])
 
-        return summed(term, x, backend.Float(0), over(records))
+        return sum_jets(term, x, backend.Float(0), for_each_record(records))
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         backend, records = self._prepared_for(backend_of(p))
@@ -151,7 +174,7 @@ class HRBF(Formula):
         vector = backend.Array3f
         return vector(xx, xy, xz), vector(xy, yy, yz), vector(xz, yz, zz)
 
-    def _along(self, p: Vec3, d: Vec3, knots: Sequence[Real]) -> Along:
+    def _along(self, p: Vec3, d: Vec3, knots: Sequence[Real]) -> SumOnRay:
         """The sum along p + s d.
 
         With b_i three times the vector of the point, h the distance of the line from it, c = b.w
@@ -174,7 +197,7 @@ class HRBF(Formula):
         backend, records = self._prepared_for(backend_of(p))
         real = backend.Float
         count = len(knots) - 1
-        unit = 0.5 * backend.epsilon
+        unit = 0.5 * backend.machine_epsilon
         tiny = float(dr.smallest(real))
 
         def body(row: list[Real], state: State) -> State:
@@ -236,27 +259,27 @@ class HRBF(Formula):
         size = 7 + (4 * count + 2 if count else 0)
         state = records.for_each(body, tuple(real(0) for _ in range(size)), "points")
         value, gx, gy, gz, value_size, gradient_size, terms, *sums = state
-        start = BlobValue(
+        start = SumValue(
             value,
             backend.Array3f(gx, gy, gz),
             unit * (24 + terms) * value_size,
             unit * (64 + 3 * terms) * gradient_size,
         )
-        parts: list[Piece] = []
+        parts: list[PathPiece] = []
         for k, (a, b) in enumerate(itertools.pairwise(knots)):
             low, high, least, most = sums[4 * k : 4 * k + 4]
             slope_error = unit * (64 + 3 * terms) * sums[-2]
             bend_error = unit * (100 + 6 * terms) * sums[-1]
-            slopes = Slopes(low - slope_error, high + slope_error)
-            parts.append(Piece(b - a, slopes, least - bend_error, most + bend_error))
-        return Along(start, tuple(parts))
+            slopes = SlopeRange(low - slope_error, high + slope_error)
+            parts.append(PathPiece(b - a, slopes, least - bend_error, most + bend_error))
+        return SumOnRay(start, tuple(parts))
 
     def describe(self) -> dict[str, Any]:
         return {"points": len(self.points)}
 
 
 @dataclass(frozen=True)
-class _Shapes:
+class _TermFunctions:
     """The functions for one point along a line: see `HRBF._along`."""
 
     lift: Real  # r x
@@ -266,13 +289,13 @@ class _Shapes:
     turn: Real  # 3u - u^3
 
 
-def _shapes(h2: Real, x: Real, tiny: float) -> _Shapes:
+def _shapes(h2: Real, x: Real, tiny: float) -> _TermFunctions:
     square = x * x
     r2 = h2 + square
     r = dr.sqrt(r2)
     inverse = 1 / fmax(r, tiny)
     u = x * inverse
-    return _Shapes(
+    return _TermFunctions(
         r * x, u, (r2 + square) * inverse, h2 * inverse * inverse * inverse, u * (3 - u * u)
     )
 
@@ -285,7 +308,7 @@ def _term(p: Vec3, row: list[Real]) -> tuple[Vec3, Vec3, Real, Real]:
     return v, b, r, 1 / fmax(r, float(dr.smallest(type(r))))
 
 
-def _solved(points: FloatArray, normals: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _solve_coefficients(points: FloatArray, normals: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Factors a (n,) and vectors b (n, 3) of the function: see `HRBF`.
 
     Raises:
@@ -332,13 +355,13 @@ def _checked(points: Any, normals: Any) -> tuple[FloatArray, FloatArray]:
     Raises:
         ValueError: wrong shapes or numbers, points that are given twice.
     """
-    x = real_array(points, "points").astype(np.float64)
+    x = as_real_array(points, "points").astype(np.float64)
     check_vectors(x, "points")
     if not 2 <= len(x) <= _MOST_POINTS:
         raise ValueError(f"points: {len(x):,} given, but 2 to {_MOST_POINTS:,} can be used")
     check_finite(x, "point {}", ValueError)
-    check_size(x, ValueError)
-    n = real_array(normals, "normals").astype(np.float64)
+    check_coordinate_size(x, ValueError)
+    n = as_real_array(normals, "normals").astype(np.float64)
     check_vectors(n, "normals")
     if len(n) != len(x):
         raise ValueError(f"{len(x)} points and {len(n)} normals: there must be one for each point")

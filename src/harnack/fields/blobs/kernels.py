@@ -9,7 +9,8 @@ S^2 = 1 - h^2. Its derivatives in x all have the same shape, and that is what pr
 - the second is even and rises from a minimum at 0 to one maximum at c2, then falls until S.
 
 So their ranges on any piece of the line are found among the values at its two ends and three
-numbers of the chord. At S the second derivative of some kernels jumps to 0 (`jumps`).
+numbers of the chord. At S the second derivative of some kernels jumps to 0
+(`second_derivative_jumps`).
 """
 
 from __future__ import annotations
@@ -22,10 +23,10 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import drjit as dr
 import numpy as np
 
-from harnack.arithmetic import Function, Interval
-from harnack.arithmetic.interval import unit_of
+from harnack.arithmetic import ElementaryFunction, Interval
+from harnack.arithmetic.interval import machine_epsilon
 from harnack.backend.elementary import fmax, fmin
-from harnack.backend.validation import real
+from harnack.backend.validation import as_real
 from harnack.name_suggestions import did_you_mean
 
 if TYPE_CHECKING:
@@ -33,26 +34,26 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Chord:
+class ChordProfile:
     """A kernel along a line.
 
-    half: S, half the length of the chord; 0 where the line misses the support.
-    turn: c1.
+    half_length: S, half the length of the chord; 0 where the line misses the support.
+    steepest_position: c1.
     steepest: the first derivative at -c1, its largest.
-    bend: c2.
-    most, least: the second derivative at c2 and at 0.
+    max_curvature_position: c2.
+    max_second, min_second: the second derivative at c2 and at 0.
     """
 
-    half: Real
-    turn: Real
+    half_length: Real
+    steepest_position: Real
     steepest: Real
-    bend: Real
-    most: Real
-    least: Real
+    max_curvature_position: Real
+    max_second: Real
+    min_second: Real
 
 
 @dataclass(frozen=True)
-class Steepness:
+class KernelLipschitz:
     """Lipschitz constants of k and of its first two derivatives along a line, with respect to the
     positions of the line and of the point on it, in units of the support (`slope` also bounds
     |grad k|). They bound the effect of rounding. The jump of the second derivative at S is not
@@ -63,12 +64,12 @@ class Steepness:
     bend: float
 
 
-class Kernel(abc.ABC):
+class BlobKernel(abc.ABC):
     """A kernel. Amplitudes are chosen so that a single blob of weight 1 has the value 1 at its
     radius."""
 
     name: ClassVar[str]
-    jumps: ClassVar[bool] = True
+    second_derivative_jumps: ClassVar[bool] = True
     """Whether the second derivative along a line jumps where the support ends."""
 
     @property
@@ -78,8 +79,8 @@ class Kernel(abc.ABC):
 
     @property
     @abc.abstractmethod
-    def steepness(self) -> Steepness:
-        """See `Steepness`."""
+    def steepness(self) -> KernelLipschitz:
+        """See `KernelLipschitz`."""
 
     @abc.abstractmethod
     def height(self, q: FloatArray) -> FloatArray:
@@ -90,28 +91,28 @@ class Kernel(abc.ABC):
         """k, dk/dq, and a number m with which k is right within 16 roundings of m and of dk/dq."""
 
     @abc.abstractmethod
-    def second(self, q: Real) -> Real:
+    def second_derivative(self, q: Real) -> Real:
         """d2k/dq2."""
 
     @abc.abstractmethod
-    def chord(self, height: Real, inside: Real) -> Chord:
+    def chord(self, height: Real, inside: Real) -> ChordProfile:
         """The kernel along lines with h^2 = `height` <= 1 and S^2 = `inside` = 1 - h^2 >= 0."""
 
     @abc.abstractmethod
     def derivatives(self, height: Real, inside: Real, x: Real) -> tuple[Real, Real]:
         """The first two derivatives along such lines at |x| <= S."""
 
-    def share(self, inside: Real, nearest: Real) -> Real:
+    def lipschitz_fraction(self, inside: Real, nearest: Real) -> Real:
         """The fraction of `steepness` that is enough on lines with S^2 = `inside`, for
         x^2 >= `nearest`."""
         del inside, nearest
         return 1.0
 
     @abc.abstractmethod
-    def ranges(self, q: Interval) -> tuple[Interval, Interval, Interval]:
+    def derivative_ranges(self, q: Interval) -> tuple[Interval, Interval, Interval]:
         """Ranges of k and of its first two derivatives in q, on an interval of q >= 0."""
 
-    def prepare(self, backend: Backend) -> Kernel:
+    def prepare(self, backend: Backend) -> BlobKernel:
         """The same with its numbers as kernel parameters of the backend."""
         del backend
         return self
@@ -121,13 +122,15 @@ class Kernel(abc.ABC):
         """1 / k at the radius of a blob."""
         return 1.0 / float(self.height(np.array([self.support**-2.0]))[0])
 
-    def function(self) -> Function:
+    def function(self) -> ElementaryFunction:
         """The kernel as a function of jets of q."""
-        return Function(self.name, self.ranges, lambda q: self.profile(q)[0], self.height)
+        return ElementaryFunction(
+            self.name, self.derivative_ranges, lambda q: self.profile(q)[0], self.height
+        )
 
 
 @dataclass(frozen=True)
-class Compact(Kernel):
+class CompactKernel(BlobKernel):
     """(1 - q)^3: polynomial, with a continuous second derivative (Aydinlilar and Zanni 2023, eq. 7
     with n = 6).
 
@@ -137,14 +140,14 @@ class Compact(Kernel):
 
     support: float = 1.6  # pyright: ignore[reportIncompatibleMethodOverride]
     name = "compact"
-    jumps = False
+    second_derivative_jumps = False
 
     def __post_init__(self) -> None:
         _check_support(self.support)
 
     @property
-    def steepness(self) -> Steepness:
-        return Steepness(5.0, 12.0, 90.0)
+    def steepness(self) -> KernelLipschitz:
+        return KernelLipschitz(5.0, 12.0, 90.0)
 
     def height(self, q: FloatArray) -> FloatArray:
         return np.maximum(1 - q, 0) ** 3
@@ -155,13 +158,13 @@ class Compact(Kernel):
         k = squared * w
         return k, -3 * squared, k
 
-    def second(self, q: Real) -> Real:
+    def second_derivative(self, q: Real) -> Real:
         return 6 * fmax(1 - q, 0)
 
-    def chord(self, height: Real, inside: Real) -> Chord:
+    def chord(self, height: Real, inside: Real) -> ChordProfile:
         half, squared = dr.sqrt(inside), inside * inside
         turn = math.sqrt(0.2) * half
-        return Chord(
+        return ChordProfile(
             half, turn, 3.84 * squared * turn, math.sqrt(0.6) * half, 4.8 * squared, -6 * squared
         )
 
@@ -170,18 +173,18 @@ class Compact(Kernel):
         w = inside - square
         return -6 * x * (w * w), 6 * w * dr.fma(4, square, -w)
 
-    def ranges(self, q: Interval) -> tuple[Interval, Interval, Interval]:
-        w = _rest(q)
-        unit = unit_of(w.low)
+    def derivative_ranges(self, q: Interval) -> tuple[Interval, Interval, Interval]:
+        w = _one_minus(q)
+        unit = machine_epsilon(w.lower)
         return (
-            _rising(w.low * w.low * w.low, w.high * w.high * w.high, 4 * unit),
-            _rising(-3 * w.high * w.high, -3 * w.low * w.low, 4 * unit),
-            _rising(6 * w.low, 6 * w.high, 2 * unit),
+            _rising(w.lower * w.lower * w.lower, w.upper * w.upper * w.upper, 4 * unit),
+            _rising(-3 * w.upper * w.upper, -3 * w.lower * w.lower, 4 * unit),
+            _rising(6 * w.lower, 6 * w.upper, 2 * unit),
         )
 
 
 @dataclass(frozen=True)
-class Sextic(Kernel):
+class SexticKernel(BlobKernel):
     """1 - 22/9 q + 17/9 q^2 - 4/9 q^3 = w^2 (5 + 4w)/9 with w = 1 - q: soft objects (Wyvill,
     McPheeters and Wyvill 1986; Hart 1996, appendix D).
 
@@ -198,8 +201,8 @@ class Sextic(Kernel):
         _check_support(self.support)
 
     @property
-    def steepness(self) -> Steepness:
-        return Steepness(4.0, 10.0, 60.0)
+    def steepness(self) -> KernelLipschitz:
+        return KernelLipschitz(4.0, 10.0, 60.0)
 
     def height(self, q: FloatArray) -> FloatArray:
         w = np.maximum(1 - q, 0)
@@ -210,17 +213,17 @@ class Sextic(Kernel):
         k = w * w * dr.fma(4 / 9, w, 5 / 9)
         return k, -w * dr.fma(4 / 3, w, 10 / 9), k
 
-    def second(self, q: Real) -> Real:
+    def second_derivative(self, q: Real) -> Real:
         return dr.select(q < 1, dr.fma(8 / 3, 1 - q, 10 / 9), 0)
 
-    def chord(self, height: Real, inside: Real) -> Chord:
+    def chord(self, height: Real, inside: Real) -> ChordProfile:
         total = dr.fma(1.2, inside, 0.5)
         product = inside * dr.fma(0.2, inside, 1 / 6)
         turn = dr.sqrt(2 * product / (total + dr.sqrt(fmax(total * total - 4 * product, 0))))
         bend = dr.sqrt(fmin(dr.fma(0.6, inside, 0.25), inside))
         first, _ = self.derivatives(height, inside, turn)
         _, most = self.derivatives(height, inside, bend)
-        return Chord(
+        return ChordProfile(
             dr.sqrt(inside), turn, -first, bend, most, -inside * dr.fma(8 / 3, inside, 20 / 9)
         )
 
@@ -230,9 +233,9 @@ class Sextic(Kernel):
         part = w * dr.fma(8 / 3, w, 20 / 9)
         return -x * part, dr.fma(square, dr.fma(32 / 3, w, 40 / 9), -part)
 
-    def ranges(self, q: Interval) -> tuple[Interval, Interval, Interval]:
-        w = _rest(q)
-        unit = unit_of(w.low)
+    def derivative_ranges(self, q: Interval) -> tuple[Interval, Interval, Interval]:
+        w = _one_minus(q)
+        unit = machine_epsilon(w.lower)
 
         def k(w: Real) -> Real:
             return w * w * (4 / 9 * w + 5 / 9)
@@ -240,16 +243,16 @@ class Sextic(Kernel):
         def slope(w: Real) -> Real:
             return -w * (4 / 3 * w + 10 / 9)
 
-        bend = _rising(8 / 3 * w.low + 10 / 9, 8 / 3 * w.high + 10 / 9, 4 * unit)
+        bend = _rising(8 / 3 * w.lower + 10 / 9, 8 / 3 * w.upper + 10 / 9, 4 * unit)
         return (
-            _rising(k(w.low), k(w.high), 6 * unit),
-            _rising(slope(w.high), slope(w.low), 6 * unit),
-            _ended(bend, q),
+            _rising(k(w.lower), k(w.upper), 6 * unit),
+            _rising(slope(w.upper), slope(w.lower), 6 * unit),
+            _zero_outside(bend, q),
         )
 
 
 @dataclass(frozen=True)
-class Cubic(Kernel):
+class CubicKernel(BlobKernel):
     """1 - 3 r^2 + 2 r^3 = (1 - r)^2 (1 + 2r) with r^2 = q: soft objects (Hart 1996, eq. 36).
 
     Along a line r^2 = h^2 + x^2 and f' = -6 x (1 - r), f'' = -6 (1 - r - x^2/r), f''' =
@@ -264,8 +267,8 @@ class Cubic(Kernel):
         _check_support(self.support)
 
     @property
-    def steepness(self) -> Steepness:
-        return Steepness(5.0, 12.0, 40.0)
+    def steepness(self) -> KernelLipschitz:
+        return KernelLipschitz(5.0, 12.0, 40.0)
 
     def height(self, q: FloatArray) -> FloatArray:
         r = np.sqrt(np.clip(q, 0, 1))
@@ -277,24 +280,24 @@ class Cubic(Kernel):
         k = w * w * dr.fma(2, r, 1)
         return k, -3 * w, k
 
-    def second(self, q: Real) -> Real:
+    def second_derivative(self, q: Real) -> Real:
         return dr.select(q < 1, 1.5 / dr.sqrt(fmax(q, float(dr.smallest(type(q))))), 0)
 
-    def chord(self, height: Real, inside: Real) -> Chord:
+    def chord(self, height: Real, inside: Real) -> ChordProfile:
         half = dr.sqrt(inside)
         turn = dr.sqrt(fmax(1 + dr.sqrt(dr.fma(8, height, 1)) - 4 * height, 0) * 0.125)
         turn = fmin(turn, half)
         first, _ = self.derivatives(height, inside, turn)
-        return Chord(half, turn, -first, half, 6 * inside, 6 * dr.sqrt(height) - 6)
+        return ChordProfile(half, turn, -first, half, 6 * inside, 6 * dr.sqrt(height) - 6)
 
     def derivatives(self, height: Real, inside: Real, x: Real) -> tuple[Real, Real]:
         square = x * x
         r = dr.sqrt(fmax(height + square, float(dr.smallest(type(x)))))
         return -6 * x * (1 - r), 6 * (square / r - (1 - r))
 
-    def ranges(self, q: Interval) -> tuple[Interval, Interval, Interval]:
-        low, high = dr.sqrt(fmin(fmax(q.low, 0), 1)), dr.sqrt(fmin(q.high, 1))
-        unit = unit_of(low)
+    def derivative_ranges(self, q: Interval) -> tuple[Interval, Interval, Interval]:
+        low, high = dr.sqrt(fmin(fmax(q.lower, 0), 1)), dr.sqrt(fmin(q.upper, 1))
+        unit = machine_epsilon(low)
 
         def k(r: Real) -> Real:
             return (1 - r) * (1 - r) * (1 + 2 * r)
@@ -303,7 +306,7 @@ class Cubic(Kernel):
         slope = Interval(-3 * (1 - low) - 8 * unit, fmin(-3 * (1 - high) + 8 * unit, 0))
         value = Interval(fmax(k(high) - 8 * unit, 0), k(low) + 8 * unit)
         bend = Interval(1.5 / high, dr.select(low > 0, 1.5 / low, dr.inf)).widened(8 * unit)
-        return value, slope, _ended(bend, q)
+        return value, slope, _zero_outside(bend, q)
 
 
 # A polynomial P with y = (1 - u) P(u), e^-y (1 - 2y) = u, within 3e-5 for 0 <= u <= 1.
@@ -314,7 +317,7 @@ _TURN = (
 
 
 @dataclass(frozen=True)
-class Gaussian(Kernel):
+class GaussianKernel(BlobKernel):
     """exp(z) - 1 - z with z = b (1 - q): a Gaussian, less its tangent in q where the blob ends
     (Aydinlilar and Zanni 2023, eq. 6, has no end).
 
@@ -337,9 +340,9 @@ class Gaussian(Kernel):
     name = "gaussian"
 
     def __post_init__(self) -> None:
-        if not 0 < real(self.sharpness, "sharpness") <= 12:
+        if not 0 < as_real(self.sharpness, "sharpness") <= 12:
             raise ValueError(f"sharpness must be in (0, 12], not {self.sharpness!r}")
-        if not 1e-6 <= real(self.tail, "tail") <= 0.5:
+        if not 1e-6 <= as_real(self.tail, "tail") <= 0.5:
             raise ValueError(
                 f"tail must lie between 1e-6 and 0.5, not {self.tail!r}: it is what is left of a "
                 "Gaussian where the blob ends"
@@ -354,13 +357,17 @@ class Gaussian(Kernel):
         return self.sharpness * self.support**2 if self.rate is None else self.rate
 
     @property
-    def steepness(self) -> Steepness:
+    def steepness(self) -> KernelLipschitz:
         b = self.sharpness * self.support**2
         top = math.exp(b)
-        return Steepness(4 * b * top, 8 * b * (1 + math.sqrt(b)) * top, 16 * b * (1 + b) * top)
+        return KernelLipschitz(
+            4 * b * top, 8 * b * (1 + math.sqrt(b)) * top, 16 * b * (1 + b) * top
+        )
 
-    def prepare(self, backend: Backend) -> Kernel:
-        return Gaussian(self.sharpness, self.tail, dr.opaque(backend.Float, float(self._rate)))
+    def prepare(self, backend: Backend) -> BlobKernel:
+        return GaussianKernel(
+            self.sharpness, self.tail, dr.opaque(backend.Float, float(self._rate))
+        )
 
     def height(self, q: FloatArray) -> FloatArray:
         z = self.sharpness * self.support**2 * np.maximum(1 - q, 0)
@@ -371,10 +378,10 @@ class Gaussian(Kernel):
         e = dr.exp(z)
         return e - 1 - z, -self._rate * (e - 1), dr.select(z > 0, e, 0)
 
-    def second(self, q: Real) -> Real:
+    def second_derivative(self, q: Real) -> Real:
         return dr.select(q < 1, self._rate * self._rate * dr.exp(self._rate * (1 - q)), 0)
 
-    def chord(self, height: Real, inside: Real) -> Chord:
+    def chord(self, height: Real, inside: Real) -> ChordProfile:
         b = self._rate
         z = b * inside
         top = dr.exp(z)
@@ -386,7 +393,7 @@ class Gaussian(Kernel):
         turn = dr.sqrt(y / b)
         late = z < 1.5
         most = 2 * b * (2 * dr.select(late, z, top * math.exp(-1.5)) + dr.select(late, 0, 1))
-        return Chord(
+        return ChordProfile(
             dr.sqrt(inside),
             turn,
             2 * b * turn * (dr.exp(z - y) - 1),
@@ -401,7 +408,7 @@ class Gaussian(Kernel):
         e = dr.exp(b * inside - y)
         return -2 * b * x * (e - 1), 2 * b * dr.fma(e, dr.fma(2, y, -1), 1)
 
-    def share(self, inside: Real, nearest: Real) -> Real:
+    def lipschitz_fraction(self, inside: Real, nearest: Real) -> Real:
         """All constants are multiples of the largest e^z, and e^y >= (1 + y/32)^32."""
         b = self._rate
         power = dr.fma(b / 32, nearest, 1)
@@ -410,30 +417,33 @@ class Gaussian(Kernel):
         most = 1.01 if isinstance(inside, float) else 1.01 * dr.exp(b * (inside - 1))
         return fmin(most / power, 1)
 
-    def ranges(self, q: Interval) -> tuple[Interval, Interval, Interval]:
-        w = _rest(q)
-        b, unit = self._rate, unit_of(w.low)
+    def derivative_ranges(self, q: Interval) -> tuple[Interval, Interval, Interval]:
+        w = _one_minus(q)
+        b, unit = self._rate, machine_epsilon(w.lower)
         # The product with b is off by half a unit, the exponential by eight.
         off = 16 * unit
-        z = Interval(b * w.low, b * w.high).widened(2 * unit)
-        low, high = dr.exp(z.low), dr.exp(z.high)
-        value = Interval(fmax(low - 1 - z.low - off * low, 0), high - 1 - z.high + off * high)
+        z = Interval(b * w.lower, b * w.upper).widened(2 * unit)
+        low, high = dr.exp(z.lower), dr.exp(z.upper)
+        value = Interval(fmax(low - 1 - z.lower - off * low, 0), high - 1 - z.upper + off * high)
         slope = Interval(-b * (high - 1) - off * b * high, fmin(-b * (low - 1) + off * b * low, 0))
         bend = Interval(b * b * low, b * b * high).widened(off)
-        return value, slope, _ended(bend, q)
+        return value, slope, _zero_outside(bend, q)
 
 
-KERNELS: dict[str, type[Kernel]] = {
-    "compact": Compact, "gaussian": Gaussian, "cubic": Cubic, "sextic": Sextic,
-}  # fmt: skip
+KERNELS: dict[str, type[BlobKernel]] = {
+    "compact": CompactKernel,
+    "gaussian": GaussianKernel,
+    "cubic": CubicKernel,
+    "sextic": SexticKernel,
+}
 
 
-def choose_kernel(kernel: str | Kernel) -> Kernel:
+def choose_kernel(kernel: str | BlobKernel) -> BlobKernel:
     """A kernel by its name, with its default parameters, or as it is given.
 
     Raises ValueError for another name, TypeError for what is neither.
     """
-    if isinstance(kernel, Kernel):
+    if isinstance(kernel, BlobKernel):
         return kernel
     if not isinstance(kernel, str):  # pyright: ignore[reportUnnecessaryIsInstance]
         raise TypeError(f"kernel must be a name or a kernel such as Compact(1.6), not {kernel!r}")
@@ -446,25 +456,25 @@ def choose_kernel(kernel: str | Kernel) -> Kernel:
 
 
 def _check_support(support: float) -> None:
-    if not 1.0 < real(support, "support") <= 100.0:
+    if not 1.0 < as_real(support, "support") <= 100.0:
         raise ValueError(
             f"support must lie between 1 and 100, not {support!r}: it is where a blob ends, in "
             "parts of its radius"
         )
 
 
-def _rest(q: Interval) -> Interval:
+def _one_minus(q: Interval) -> Interval:
     """1 - q where it is not negative."""
     w = Interval(1.0, 1.0) - q
-    return Interval(fmax(w.low, 0), fmax(w.high, 0))
+    return Interval(fmax(w.lower, 0), fmax(w.upper, 0))
 
 
 def _rising(low: Real, high: Real, unit: float) -> Interval:
     return Interval(low, high).widened(unit)
 
 
-def _ended(bend: Interval, q: Interval) -> Interval:
+def _zero_outside(bend: Interval, q: Interval) -> Interval:
     """The range of a positive second derivative on an interval, 0 beyond the support."""
     return Interval(
-        dr.select(q.high < 1, fmax(bend.low, 0), 0), dr.select(q.low <= 1, bend.high, 0)
+        dr.select(q.upper < 1, fmax(bend.lower, 0), 0), dr.select(q.lower <= 1, bend.upper, 0)
     )

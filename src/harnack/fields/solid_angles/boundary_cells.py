@@ -4,7 +4,17 @@ Modulo 1 the winding number of a mesh is the solid angle of its singular edges o
 closed curves. In cells (`curve_cells`) that costs about the same however many of them there are,
 and no ray has to be followed. What is left open is a whole number: between two sheets w does not
 pass a level, modulo 1, unless a ray meets it, so the march knows that number from one sample to the
-next (`tracer.whole_numbers`).
+next (`tracer.branch_tracker`).
+
+Winding numbers have the cells of their boundary: modulo one w is the solid angle of the edges at
+which triangles do not cancel, so that a sample needs no ray and few edges. The whole number is the
+ray's business (`branch_tracker`): the levels, repeated with period one, are rungs; proved steps
+stay between two of them, sheets move w by whole rungs, and a ray that comes from outside of the
+field's extent begins where w is about 0. Those that begin inside know w from the middle of the
+cell, where it was computed once: on the line from there the near loops are lifted, the polynomial
+is continuous, and crossings are counted. Only where rounding leaves one of these open, and to pass
+a rung that is no level, do they take samples that know the number. It replaced a tree of chains of
+edges along rays, which had to open all chains that a ray passes through.
 """
 
 from __future__ import annotations
@@ -20,12 +30,12 @@ from harnack.backend import to_numpy, to_vector3
 from harnack.fields.samples import Sample
 from harnack.fields.solid_angles.curve_cell_builder import build_curve_cells
 from harnack.fields.solid_angles.curve_cells import CurveCells
-from harnack.fields.solid_angles.curve_queries import bends, swept_ball
-from harnack.fields.solid_angles.edges import near_rounding
-from harnack.fields.solid_angles.trail_sums import Line, closed_trails, known_along
-from harnack.fields.source_sums import SLOPE_ROUNDINGS, SUM_ROUNDING
-from harnack.tree.closest_triangles import distance_to_triangles, jumps_within
-from harnack.tree.triangle_tree import Frame
+from harnack.fields.solid_angles.curve_queries import lift_ball, remainder_promises
+from harnack.fields.solid_angles.edges import vertex_rounding
+from harnack.fields.solid_angles.trail_sums import RayLine, closed_trails, lipschitz_along
+from harnack.fields.source_sums import SLOPE_ROUNDINGS, SUM_MARGIN
+from harnack.tree.closest_triangles import distance_lower_bound, jump_sum_within
+from harnack.tree.triangle_tree import RayFrame
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -33,7 +43,7 @@ if TYPE_CHECKING:
     from harnack.backend import FloatArray, Mask, Real, Vec3
     from harnack.enclosures import Lipschitz
     from harnack.fields.solid_angles.winding_mesh import WindingMesh
-    from harnack.tree.triangle_tree import TriangleRays
+    from harnack.tree.triangle_tree import TriangleTree
 
 __all__ = ["BoundaryCells"]
 
@@ -41,31 +51,31 @@ _SHARE = 1 / (4 * math.pi)
 # The boundary of a broken mesh is many small loops, and its cells must be built soon: they have so
 # many times as many near edges as those of one curve, and split ones share what is beyond so many
 # radii.
-_NEAR, _SHARED = 4.0, 3.5
+_NEAR_FACTOR, _SHARED = 4.0, 3.5
 # Of the bytes, for all but w at the centers: a cell has at least 64 numbers besides.
-_OF_BYTES = 64 / 65
+_CELL_BYTES_FRACTION = 64 / 65
 # Roundings of a coordinate: of a point, and within which of an edge nothing is known.
-_PLACE, _MET = 8.0, 16.0
+_POINT_ROUNDINGS, _EDGE_ROUNDINGS = 8.0, 16.0
 # In roundings: points are that far off triangles where w is known from a cell's center, and so are
 # the centers. By how much w may then be off.
-_OFF, _SURE = 64.0, 0.125
+_TRIANGLE_ROUNDINGS, _MAX_BRANCH_ERROR = 64.0, 0.125
 
 
 @dataclass(frozen=True)
 class BoundaryCells:
     """Cells of the singular edges of a mesh on a backend, in its unit coordinates.
 
-    rays: the triangles. at_centers: w at the center of each cell; NaN where a triangle is near, and
-        where it is not known up to an eighth.
+    rays: the triangles. center_values: w at the center of each cell; NaN where a triangle is near,
+        and where it is not known up to an eighth.
     """
 
     cells: CurveCells
-    rays: TriangleRays
-    at_centers: Real
+    rays: TriangleTree
+    center_values: Real
 
     @classmethod
     def build(
-        cls, rays: TriangleRays, mesh: WindingMesh, low: FloatArray, high: FloatArray,
+        cls, rays: TriangleTree, mesh: WindingMesh, low: FloatArray, high: FloatArray,
         most_bytes: int, value: Callable[[FloatArray], tuple[FloatArray, FloatArray]],
     ) -> BoundaryCells | None:  # fmt: skip
         """Cells of a cube around the mesh and the box from low (3,) to high (3,), of at most so
@@ -74,7 +84,7 @@ class BoundaryCells:
         value: w at points (n, 3), and bounds of its error.
         """
         backend = rays.tree.backend
-        trails = closed_trails(mesh.singular)
+        trails = closed_trails(mesh.singular_edges)
         loops = tuple(mesh.unit_vertices[trail[:-1]] for trail in trails)
         ends = (np.array(end) for end in (low, high))
         points = np.concatenate(
@@ -85,16 +95,19 @@ class BoundaryCells:
             loops,
             points.min(axis=0),
             points.max(axis=0),
-            int(_OF_BYTES * most_bytes),
-            near=_NEAR,
+            int(_CELL_BYTES_FRACTION * most_bytes),
+            near=_NEAR_FACTOR,
             shared=_SHARED,
         )
         if cells is None:
             return None
         centers = cells.centers()
-        near = distance_to_triangles(rays, to_vector3(backend, centers))
+        near = distance_lower_bound(rays, to_vector3(backend, centers))
         w, error = value(centers * mesh.size + mesh.center)
-        w[(to_numpy(near) < _OFF * backend.epsilon) | ~(error < _SURE)] = np.nan
+        w[
+            (to_numpy(near) < _TRIANGLE_ROUNDINGS * backend.machine_epsilon)
+            | ~(error < _MAX_BRANCH_ERROR)
+        ] = np.nan
         return cls(cells, rays, backend.Float(w.astype(backend.dtype)))
 
     @property
@@ -116,7 +129,7 @@ class BoundaryCells:
         the boundary over 4 pi, and where the line crosses a triangle along its normal, by -1
         (`edge_lift`). So w is known at x with the errors of w(c) and of the cell; it is the number
         nearest to that of those that are what the cell knows modulo 1, as all errors together are
-        below three eighths. On a triangle nothing is known, nor where `turns_between` or
+        below three eighths. On a triangle nothing is known, nor where `signed_crossings_between` or
         `change_from_center` are not sure. Off all triangles it is the number of the side on which
         the ray has x, too: the t of a crossing is the depth of a point of the triangle that is a
         few roundings off the ray, and so is the true one. If x were between these two, a point of
@@ -126,19 +139,19 @@ class BoundaryCells:
         found, inside = self.cells.sums(x, active)
         way = x - found.center
         end = dr.norm(way)
-        inside &= end > _OFF * unit
+        inside &= end > _TRIANGLE_ROUNDINGS * unit
         d = dr.select(inside, way / end, backend.Array3f(0, 0, 1))
-        frame = Frame.along(backend, found.center, d)
+        frame = RayFrame.along(backend, found.center, d)
         change, sure = self.cells.change_from_center(found, frame, x, unit, inside)
-        turns, clear = self.rays.turns_between(frame, end, unit, inside)
-        on_triangle = jumps_within(self.rays, x, _OFF * unit, inside)
-        estimate = dr.gather(real, self.at_centers, found.cell, inside) - turns + _SHARE * change
+        turns, clear = self.rays.signed_crossings_between(frame, end, unit, inside)
+        on_triangle = jump_sum_within(self.rays, x, _TRIANGLE_ROUNDINGS * unit, inside)
+        estimate = dr.gather(real, self.center_values, found.cell, inside) - turns + _SHARE * change
         value = _SHARE * found.sums.angle
         rest = estimate - value
         number = dr.round(rest)
         error = found.error + found.rounding
         known = inside & sure & clear & (on_triangle == 0)
-        known &= (dr.abs(rest - number) < _SURE) & (_SHARE * error < _SURE)
+        known &= (dr.abs(rest - number) < _MAX_BRANCH_ERROR) & (_SHARE * error < _MAX_BRANCH_ERROR)
         return dr.select(known, value + number, dr.nan)
 
     def sample(
@@ -152,26 +165,28 @@ class BoundaryCells:
         """
         backend = self.cells.backend
         found, inside = self.cells.sums(x, active)
-        sums, rounding = found.sums, _PLACE * unit
-        known = bends(sums.cubes, sums.fourths, sums.distance * (1 - SUM_ROUNDING) - rounding)
-        ball = swept_ball(sums.angle, sums.gradient, sums.squares, known, found.slope_error)
-        rounded = found.rounding + near_rounding(backend.epsilon, x, sums.squares)
+        sums, rounding = found.sums, _POINT_ROUNDINGS * unit
+        known = remainder_promises(
+            sums.cubes, sums.fourths, sums.distance * (1 - SUM_MARGIN) - rounding
+        )
+        ball = lift_ball(sums.angle, sums.gradient, sums.squares, known, found.slope_error)
+        rounded = found.rounding + vertex_rounding(backend.machine_epsilon, x, sums.squares)
         along: tuple[Lipschitz, ...] = ()
         if direction is not None:
-            line = Line(x, direction, rounding)
+            line = RayLine(x, direction, rounding)
 
             def rates(lengths: tuple[Real, ...], wanted: Mask) -> tuple[Real, ...]:
                 return self.cells.rates_along(found, line, lengths, wanted & inside)
 
-            along = known_along(line, sums.gradient, sums.distance, rates)
+            along = lipschitz_along(line, sums.gradient, sums.distance, rates)
         sample = Sample(
             _SHARE * sums.angle,
             _SHARE * sums.gradient,
             tuple(one.scaled(_SHARE) for one in known),
             _SHARE * (found.error + rounded),
             _SHARE * dr.fma(SLOPE_ROUNDINGS / 3 * unit, sums.cubes, found.slope_error),
-            truncation=_SHARE * found.error,
-            weaker=(ball.scaled(_SHARE),),
-            along=tuple(one.scaled(_SHARE) for one in along),
+            truncation_error=_SHARE * found.error,
+            alternative_promises=(ball.scaled(_SHARE),),
+            ray_promises=tuple(one.scaled(_SHARE) for one in along),
         )
-        return sample, inside & (sums.distance > _MET * unit)
+        return sample, inside & (sums.distance > _EDGE_ROUNDINGS * unit)

@@ -1,7 +1,10 @@
 """Circles: the solid angle of one at a point, and sums over many with what bounds them.
 
-`UnitCircle` has the formulas, by complete elliptic integrals; `Circles` are circles on a backend
+`UnitCircle` has the formulas, by complete elliptic integrals; `CircleSet` are circles on a backend
 and the sums over them.
+
+Circles are one expression: Bulirsch's loop for complete elliptic integrals, unrolled, gives value,
+gradient and Hessian; their forms are chosen so that nothing cancels.
 """
 
 from __future__ import annotations
@@ -15,17 +18,17 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend.elementary import clamp, fmax, fmin
-from harnack.backend.record_table import Records
-from harnack.fields.batched_fields import SymmetricSum
+from harnack.backend.record_table import RecordTable
+from harnack.fields.batched_fields import SymmetricMatrix
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, Mask, Real, Vec3
-    from harnack.fields.solid_angles.trail_sums import Line
+    from harnack.fields.solid_angles.trail_sums import RayLine
     from harnack.geometry.curves import Circle
 
-__all__ = ["CircleSums", "Circles", "UnitCircle"]
+__all__ = ["CircleSet", "CircleSums", "UnitCircle"]
 
-_ROUNDS = {"single": 6, "double": 8}
+_AGM_ROUNDS = {"single": 6, "double": 8}
 
 
 @dataclass(frozen=True)
@@ -93,7 +96,7 @@ class UnitCircle:
     def at(cls, r: Real, z: Real) -> UnitCircle:
         """r >= 0 and z: Dr.Jit numbers."""
         real: Any = cast("Any", type(r))
-        rounds = _ROUNDS["double" if float(dr.epsilon(r)) < 1e-10 else "single"]
+        rounds = _AGM_ROUNDS["double" if float(dr.epsilon(r)) < 1e-10 else "single"]
         gap = 1 - r
         square = dr.fma(gap, gap, z * z)
         nearest, farthest = dr.sqrt(square), dr.sqrt(dr.fma(1 + r, 1 + r, z * z))
@@ -169,7 +172,7 @@ class CircleSums:
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _RelativeCircle:
     """A circle of radius a relative to x: outward is the component of x - center in its plane, of
     length r a, and x is z a above it."""
 
@@ -188,21 +191,21 @@ class _Seen:
 
 
 @dataclass(frozen=True)
-class Circles:
+class CircleSet:
     """Circles on a backend, as records of center, radius and normal, with lengths of order one."""
 
-    records: Records
+    records: RecordTable
 
     @classmethod
     def upload(
         cls, backend: Backend, circles: Sequence[Circle], center: FloatArray, size: float
-    ) -> Circles:
+    ) -> CircleSet:
         """Circles in unit coordinates: relative to a center, divided by a size."""
         rows = [
             [*(np.array(one.center) - center) / size, one.radius / size, *one.normal, 0.0]
             for one in circles
         ]
-        return cls(Records.upload(backend, np.array(rows)))
+        return cls(RecordTable.upload(backend, np.array(rows)))
 
     def sums(self, x: Vec3) -> CircleSums:
         """All sums at x in one loop."""
@@ -211,7 +214,7 @@ class Circles:
 
         def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
             angle, gradient, distance, squares, cubes, fourths, lower = state
-            seen = self._seen(row, x)
+            seen = self._relative(row, x)
             circle, a = seen.circle, seen.a
             # In units of the circle's radius, so that all numbers are of order one.
             gradient = dr.fma(vector(circle.across / (a * a)), seen.outward, gradient)
@@ -235,32 +238,37 @@ class Circles:
         angle, gradient, distance, squares, cubes, fourths, lower = self.records.for_each(
             add, start, "circles"
         )
-        upper = lower + 4 * math.pi * real(self.records.trips)
+        upper = lower + 4 * math.pi * real(self.records.iteration_count)
         return CircleSums(angle, gradient, distance, squares, cubes, fourths, lower, upper)
 
-    def hessian(self, x: Vec3) -> SymmetricSum:
+    def hessian(self, x: Vec3) -> SymmetricMatrix:
         """The Hessian of the sum of solid angles."""
         real, vector = self._types
         x = vector(x)
 
         def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-            seen = self._seen(row, x)
+            seen = self._relative(row, x)
             a, n, e = seen.a, seen.normal, seen.outward
             along, mixed, around = seen.circle.second_derivatives()
             share = dr.rcp(a * a)
             length = dr.norm(e)
             out = dr.select(length > 0, e / length, 0)
             # f_tt (I - n n - out out) + f_rr out out + f_zz n n + f_rz (n out + out n)
-            total = SymmetricSum(*state)
-            total = total.plus(n, ((along - around) * share) * n)
-            total = total.plus(out, ((-along - 2 * around) * share) * out)
-            total = total.plus(n, (2 * mixed * share / a) * e)
-            return (*(one + around * share for one in total.parts()[:3]), *total.parts()[3:])
+            total = SymmetricMatrix(*state)
+            total = total.add_outer_product(n, ((along - around) * share) * n)
+            total = total.add_outer_product(out, ((-along - 2 * around) * share) * out)
+            total = total.add_outer_product(n, (2 * mixed * share / a) * e)
+            return (
+                *(one + around * share for one in total.components()[:3]),
+                *total.components()[3:],
+            )
 
-        start = SymmetricSum.zero(real).parts()
-        return SymmetricSum(*self.records.for_each(add, start, "circle hessian"))
+        start = SymmetricMatrix.zero(real).components()
+        return SymmetricMatrix(*self.records.for_each(add, start, "circle hessian"))
 
-    def rates_along(self, line: Line, lengths: tuple[Real, ...], active: Mask) -> tuple[Real, ...]:
+    def line_rates(
+        self, line: RayLine, lengths: tuple[Real, ...], active: Mask
+    ) -> tuple[Real, ...]:
         """For each length T, a bound of the derivative along the line up to T to both sides; inf
         where a circle may be as near as that, and on lanes that are not active.
 
@@ -284,7 +292,7 @@ class Circles:
         real, vector = self._types
 
         def add(row: list[Real], rates: tuple[Any, ...]) -> tuple[Any, ...]:
-            seen = self._seen(row, line.x)
+            seen = self._relative(row, line.x)
             slack, up = line.slack, fmin(dr.abs(dr.dot(seen.normal, line.v)), 1)
             across = dr.sqrt(fmax(1 - up * up, 0))
             # `up` is a sum of numbers of order one, whose rounding need not be small against it.
@@ -320,7 +328,7 @@ class Circles:
 
         def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
             best, nearest = state
-            seen = self._seen(row, x)
+            seen = self._relative(row, x)
             # From the axis all points are equally far: any direction in the plane will do.
             length = dr.norm(seen.outward)
             aside = dr.normalize(_across(vector, seen.normal))
@@ -336,7 +344,7 @@ class Circles:
     def _types(self) -> tuple[Any, Any]:
         return self.records.backend.Float, self.records.backend.Array3f
 
-    def _seen(self, row: list[Real], x: Vec3) -> _Seen:
+    def _relative(self, row: list[Real], x: Vec3) -> _RelativeCircle:
         vector = self.records.backend.Array3f
         center, a, normal = vector(*row[:3]), row[3], vector(*row[4:7])
         away = x - center
@@ -344,7 +352,7 @@ class Circles:
         # A second projection removes the error of the first, which the rounded normal has caused.
         outward = dr.fma(vector(-height), normal, away)
         outward = dr.fma(vector(-dr.dot(normal, outward)), normal, outward)
-        return _Seen(a, normal, outward, UnitCircle.at(dr.norm(outward) / a, height / a))
+        return _RelativeCircle(a, normal, outward, UnitCircle.at(dr.norm(outward) / a, height / a))
 
 
 def _across(vector: Any, n: Vec3) -> Vec3:

@@ -17,16 +17,22 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray, IntArray, choose_backend, to_numpy, to_vector3
-from harnack.backend.arrays import aligned_integers
+from harnack.backend.arrays import upload_integers
 from harnack.backend.elementary import fmax, fmin
-from harnack.backend.record_table import Records
-from harnack.fields.solid_angles.curve_cells import HEAD, VERTICES, CurveCells
-from harnack.fields.solid_angles.edge_expansion import COEFFICIENTS, DEGREE, FarEdges
-from harnack.fields.solid_angles.edge_runs import Runs, VertexTable, left_over
+from harnack.backend.record_table import RecordTable
+from harnack.fields.solid_angles.curve_cells import HEADER_SIZE, VERTICES_PER_RECORD, CurveCells
+from harnack.fields.solid_angles.edge_expansion import COEFFICIENTS, DEGREE, EdgeExpansions
+from harnack.fields.solid_angles.edge_runs import EdgeRuns, VertexTable, subtract_runs
 from harnack.fields.solid_angles.edges import Edge, LoopEdges, inverse_squares
-from harnack.fields.solid_angles.local_expansion import rounding_tables, shift_matrices
+from harnack.fields.solid_angles.local_expansion import local_to_local_matrices, rounding_tables
 from harnack.tree.closest_triangles import squared_distance_to_segment
-from harnack.tree.octree_lookup import DEEPEST, MARGIN, OCTANTS, CellLookup, numbered_nodes
+from harnack.tree.octree_lookup import (
+    BALL_MARGIN,
+    MAX_DEPTH,
+    OCTANT_DIRECTIONS,
+    OctreeLookup,
+    encode_nodes,
+)
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
@@ -37,13 +43,13 @@ _PERIOD = 4 * math.pi
 _NEAR, _SHARED = 3.0, 4.5
 # Cells are split that have more near edges than this many times the cube root of all, or where
 # about this part of the integral of |dp|/D^2, a bound of the gradient, is left out: by experiment.
-_MOST_NEAR, _FEWEST, _FINE = 2.0, 6.0, 1e-5
+_MAX_NEAR_FACTOR, _MIN_NEAR, _MAX_TAIL_RATIO = 2.0, 6.0, 1e-5
 # Where memory is short, cells have twice as many near edges and leave out four times as much, up to
 # so many times.
 _ATTEMPTS = 4
 # Corners and centers of all cells are multiples of this over 2^DEEPEST, in unit coordinates: single
 # precision holds them exactly.
-_STEP = 2.0**-8
+_GRID_STEP = 2.0**-8
 # Sums in single precision, as bounds; edges that are near up to this part count as far as well.
 _SLACK = 1e-3
 # The most records of near edges, whose numbers single precision holds.
@@ -63,18 +69,21 @@ def build_curve_cells(
 
     Proof. The cell of the cube begins with all loops as near runs and nothing else. Each cell keeps
     those edges of the runs of the cell around it that are near, closed again; the cycle of what is
-    left over (`near_runs.left_over`) is far from its ball and goes to the polynomial. So near loops
-    and polynomial have in each cell the solid angle of the curve, modulo 4 pi.
+    left over (`edge_runs.subtract_runs`) is far from its ball and goes to the polynomial. So near
+    loops and polynomial have in each cell the solid angle of the curve, modulo 4 pi.
     """
     loops = tuple(loop.astype(backend.dtype).astype(np.float64) for loop in loops)
-    middle = np.round(0.5 * (low + high) / _STEP) * _STEP
+    middle = np.round(0.5 * (low + high) / _GRID_STEP) * _GRID_STEP
     half = float(np.maximum(high - middle, middle - low).max())
-    half = (math.ceil(half / _STEP) + 1) * _STEP
+    half = (math.ceil(half / _GRID_STEP) + 1) * _GRID_STEP
     edges = LoopEdges.upload(backend, loops)
-    most_near, fine = max(_FEWEST, _MOST_NEAR * sum(map(len, loops)) ** (1 / 3)), _FINE
+    most_near, fine = (
+        max(_MIN_NEAR, _MAX_NEAR_FACTOR * sum(map(len, loops)) ** (1 / 3)),
+        _MAX_TAIL_RATIO,
+    )
     most_near, fine = near * most_near, near * fine
     for _ in range(_ATTEMPTS):
-        octree = _Octree(
+        octree = _CurveCellBuilder(
             backend, VertexTable.of(loops), edges, middle, half, most_near, fine, shared
         )
         if octree.grow(most_bytes):
@@ -84,11 +93,11 @@ def build_curve_cells(
 
 
 @dataclass
-class _Octree:
-    """Cells while they are made. most_near, fine, shared: see `_MOST_NEAR` and `_SHARED`.
+class _CurveCellBuilder:
+    """Cells while they are made. most_near, fine, shared: see `_MAX_NEAR_FACTOR` and `_SHARED`.
 
-    nodes: of each level, for `CellLookup.of`. tables, near: records of `CurveCells`.
-    leaves, packets: the number of cells that are not split, and of records of near edges.
+    nodes: of each level, for `OctreeLookup.from_levels`. tables, near: records of `CurveCells`.
+    leaves, near_record_count: the number of cells that are not split, and of records of near edges.
     """
 
     backend: Backend
@@ -97,37 +106,47 @@ class _Octree:
     middle: FloatArray
     half: float
     most_near: float
-    fine: float
-    shared: float
+    max_tail_ratio: float
+    parent_ratio: float
     nodes: list[IntArray] = field(default_factory=list[IntArray])
     tables: list[FloatArray] = field(default_factory=list[FloatArray])
     near: list[FloatArray] = field(default_factory=list[FloatArray])
     leaves: int = 0
-    packets: int = 0
+    near_record_count: int = 0
 
     def grow(self, most_bytes: int) -> bool:
         """Make all cells, level by level; False as soon as they take too many bytes."""
-        shifts = shift_matrices(DEGREE, 0.5 / (math.sqrt(3) * MARGIN))
-        centers, runs, far = self.middle[None], Runs.of_loops(self.vertices), FarEdges.none(1)
+        shifts = local_to_local_matrices(DEGREE, 0.5 / (math.sqrt(3) * BALL_MARGIN))
+        centers, runs, far = (
+            self.middle[None],
+            EdgeRuns.of_loops(self.vertices),
+            EdgeExpansions.zero(1),
+        )
         splits = 0
-        for level in range(DEEPEST + 1):
+        for level in range(MAX_DEPTH + 1):
             side = self.half / 2**level
-            radius = math.sqrt(3) * side * MARGIN
-            is_leaf, runs, far = self._level(centers, radius, runs, far, is_last=level == DEEPEST)
+            radius = math.sqrt(3) * side * BALL_MARGIN
+            is_leaf, runs, far = self._level(centers, radius, runs, far, is_last=level == MAX_DEPTH)
             split = np.flatnonzero(~is_leaf)
-            self.nodes.append(numbered_nodes(is_leaf, self.leaves - int(is_leaf.sum()), splits))
+            self.nodes.append(encode_nodes(is_leaf, self.leaves - int(is_leaf.sum()), splits))
             splits += len(split)
-            if self.size > most_bytes or self.packets >= _MOST_RECORDS:
+            if self.size > most_bytes or self.near_record_count >= _MOST_RECORDS:
                 return False
             if not len(split):
                 break
-            runs, far = runs.of_children(~is_leaf), far.of_children(~is_leaf, shifts, radius)
-            centers = (centers[split][:, None] + 0.5 * side * OCTANTS).reshape(-1, 3)
+            runs, far = runs.to_octants(~is_leaf), far.to_octants(~is_leaf, shifts, radius)
+            centers = (centers[split][:, None] + 0.5 * side * OCTANT_DIRECTIONS).reshape(-1, 3)
         return True
 
     def _level(
-        self, centers: FloatArray, radius: float, runs: Runs, far: FarEdges, *, is_last: bool
-    ) -> tuple[BoolArray, Runs, FarEdges]:
+        self,
+        centers: FloatArray,
+        radius: float,
+        runs: EdgeRuns,
+        far: EdgeExpansions,
+        *,
+        is_last: bool,
+    ) -> tuple[BoolArray, EdgeRuns, EdgeExpansions]:
         """Which cells of a level are not split, and the runs and sums of all; records of the former
         are made."""
         double, n = choose_backend("double"), len(centers)
@@ -135,48 +154,60 @@ class _Octree:
         cell = runs.cell[run]
         distance = _distances(self.vertices, centers, cell, place, double)
         count = np.bincount(cell, distance <= _NEAR * radius, n)
-        around = _Around.of(self.edges, centers, radius)
-        is_leaf = (count <= self.most_near) & (around.tail <= self.fine * around.total) | is_last
-        inner = np.where(is_leaf, _NEAR, self.shared) * radius
-        chosen, kept = runs.narrowed(run, distance <= inner[cell])
-        chosen = chosen.closed(self.vertices, centers, inner, np.dtype(self.backend.dtype))
-        left = left_over(runs, (run, place), kept, chosen, len(self.vertices.points))
+        around = _FarBounds.of(self.edges, centers, radius)
+        is_leaf = (count <= self.most_near) & (
+            around.tail <= self.max_tail_ratio * around.total
+        ) | is_last
+        inner = np.where(is_leaf, _NEAR, self.parent_ratio) * radius
+        chosen, kept = runs.restrict_to_near(run, distance <= inner[cell])
+        chosen = chosen.with_apexes(self.vertices, centers, inner, np.dtype(self.backend.dtype))
+        left = subtract_runs(runs, (run, place), kept, chosen, len(self.vertices.points))
         points = np.concatenate([self.vertices.points, runs.apex, chosen.apex])
-        rows = Records.upload(double, np.column_stack([points, np.zeros((len(points), 5))]))
+        rows = RecordTable.upload(double, np.column_stack([points, np.zeros((len(points), 5))]))
         far = far.plus(
-            FarEdges.of(rows, left, to_vector3(double, centers), dr.opaque(double.Float, radius), n)
+            EdgeExpansions.of(
+                rows, left, to_vector3(double, centers), dr.opaque(double.Float, radius), n
+            )
         )
         if is_leaf.any():
             table, first, packets = near_records(self.vertices, chosen, is_leaf)
             self.near.append(table)
-            factor = _factor(self.vertices, chosen, centers, radius)[is_leaf]
-            given = far.some(is_leaf), around.some(is_leaf), factor
-            where = self.packets + first, packets
-            own = _table(self.backend, centers[is_leaf], radius, *given, *where)
+            factor = _rounding_factor(self.vertices, chosen, centers, radius)[is_leaf]
+            given = far.subset(is_leaf), around.subset(is_leaf), factor
+            where = self.near_record_count + first, packets
+            own = _cell_records(self.backend, centers[is_leaf], radius, *given, *where)
             self.tables.append(own)
-            self.leaves, self.packets = self.leaves + len(own), self.packets + len(table)
+            self.leaves, self.near_record_count = (
+                self.leaves + len(own),
+                self.near_record_count + len(table),
+            )
         return is_leaf, chosen, far
 
     @property
     def size(self) -> int:
         """Bytes of records, near edges, nodes, and the grid on top."""
         number = np.dtype(self.backend.dtype).itemsize
-        record = 8 * -(-(HEAD + COEFFICIENTS) // 8)
-        lookup = CellLookup.size(sum(len(one) for one in self.nodes))
-        return number * (record * self.leaves + 4 * VERTICES * self.packets) + lookup
+        record = 8 * -(-(HEADER_SIZE + COEFFICIENTS) // 8)
+        lookup = OctreeLookup.memory_bytes(sum(len(one) for one in self.nodes))
+        return (
+            number * (record * self.leaves + 4 * VERTICES_PER_RECORD * self.near_record_count)
+            + lookup
+        )
 
     def cells(self) -> CurveCells:
         """The cells on the backend."""
         backend = self.backend
-        lookup = CellLookup.of(backend, self.middle - self.half, 2 * self.half, self.nodes)
-        near = np.concatenate([*self.near, np.zeros((1, 4 * VERTICES))])
-        records = Records.upload(backend, np.concatenate(self.tables))
-        near_edges = Records.upload(backend, near)
+        lookup = OctreeLookup.from_levels(
+            backend, self.middle - self.half, 2 * self.half, self.nodes
+        )
+        near = np.concatenate([*self.near, np.zeros((1, 4 * VERTICES_PER_RECORD))])
+        records = RecordTable.upload(backend, np.concatenate(self.tables))
+        near_edges = RecordTable.upload(backend, near)
         return CurveCells(backend, lookup, records, near_edges, self.leaves, self.size)
 
 
 @dataclass(frozen=True)
-class _Around:
+class _FarBounds:
     """Sums over edges at n centers, with distances D from these.
 
     least, cubes, slope: see `CurveCells.records`.
@@ -191,7 +222,7 @@ class _Around:
     total: FloatArray
 
     @classmethod
-    def of(cls, edges: LoopEdges, centers: FloatArray, radius: float) -> _Around:
+    def of(cls, edges: LoopEdges, centers: FloatArray, radius: float) -> _FarBounds:
         """The sums over edges that are not near; some near edges may count as well."""
         backend, c = edges.backend, to_vector3(edges.backend, centers)
         rho = dr.opaque(backend.Float, radius)
@@ -200,13 +231,13 @@ class _Around:
         def add(p: Vec3, q: Vec3, inverse: Real, state: tuple[Any, ...]) -> tuple[Any, ...]:
             least, cubes, slope, tail, total = state
             edge = Edge.between(p, q, inverse, c)
-            square, length = edge.square, dr.rsqrt(inverse)
-            share, near = edge.field()[0] * length, dr.rsqrt(square)
+            square, length = edge.squared_distance, dr.rsqrt(inverse)
+            share, near = edge.biot_savart()[0] * length, dr.rsqrt(square)
             is_far, ratio = square > inner * inner, rho * near
             left_out = share * square
             for _ in range(DEGREE + 1):
                 left_out = left_out * ratio
-            rate = dr.fma(type(slope)(length), edge.rates()[1], slope)
+            rate = dr.fma(type(slope)(length), edge.hessian_factors()[1], slope)
             return (
                 dr.select(is_far, fmin(least, square), least),
                 cubes + dr.select(is_far, share, 0),
@@ -223,9 +254,9 @@ class _Around:
         least, cubes, slope, tail, total = numbers
         return cls(np.sqrt(least) * (1 - _SLACK), cubes * (1 + _SLACK), slope, tail, total)
 
-    def some(self, which: BoolArray) -> _Around:
+    def subset(self, which: BoolArray) -> _FarBounds:
         """Those chosen by a mask."""
-        return _Around(*(one[which] for one in vars(self).values()))
+        return _FarBounds(*(one[which] for one in vars(self).values()))
 
 
 def _distances(
@@ -236,15 +267,15 @@ def _distances(
         return np.zeros(0)
     vector = backend.Array3f
     points, middles = to_vector3(backend, vertices.points), to_vector3(backend, centers)
-    at = aligned_integers(backend, place)
-    c = dr.gather(vector, middles, aligned_integers(backend, cell))
+    at = upload_integers(backend, place)
+    c = dr.gather(vector, middles, upload_integers(backend, cell))
     p, q = dr.gather(vector, points, at), dr.gather(vector, points, at + 1)
     inverse = dr.rcp(fmax(dr.squared_norm(q - p), backend.Float(1e-30)))
     return to_numpy(dr.sqrt(squared_distance_to_segment(p - c, q - p, inverse)))
 
 
 def near_records(
-    vertices: VertexTable, runs: Runs, is_leaf: BoolArray
+    vertices: VertexTable, runs: EdgeRuns, is_leaf: BoolArray
 ) -> tuple[FloatArray, IntArray, IntArray]:
     """Records of near edges (`CurveCells.near`) of cells that are not split; and of each of these
     the first record and the number of records."""
@@ -253,12 +284,12 @@ def near_records(
     owner = (np.cumsum(is_leaf) - 1)[runs.cell[rows]]
     length = count + np.where(is_open, 3, 1)
     total = np.bincount(owner, length, int(is_leaf.sum())).astype(np.int64)
-    packets = -(-total // VERTICES)
+    packets = -(-total // VERTICES_PER_RECORD)
     start = np.cumsum(packets) - packets
     # The places of runs one after the other, and how much of that lies in cells before.
     position = np.cumsum(length) - length - (np.cumsum(total) - total)[owner]
-    position += start[owner] * VERTICES
-    table = np.zeros((int(packets.sum()) * VERTICES, 4))
+    position += start[owner] * VERTICES_PER_RECORD
+    table = np.zeros((int(packets.sum()) * VERTICES_PER_RECORD, 4))
     run = np.repeat(np.arange(len(rows)), count + 1)
     k = np.arange(len(run)) - (np.cumsum(count + 1) - count - 1)[run]
     place, source = position[run] + k, first[run] + k
@@ -271,11 +302,13 @@ def near_records(
     table[last + 1, :3], table[last + 2, :3] = apex, begin
     table[last + 1, 3] = -inverse_squares(apex - table[last, :3])
     table[last + 2, 3] = -inverse_squares(apex - begin)
-    return table.reshape(-1, 4 * VERTICES), start, packets
+    return table.reshape(-1, 4 * VERTICES_PER_RECORD), start, packets
 
 
-def _factor(vertices: VertexTable, runs: Runs, centers: FloatArray, radius: float) -> FloatArray:
-    """(n,) factors with which `edges.near_rounding` holds for the near loops of n cells.
+def _rounding_factor(
+    vertices: VertexTable, runs: EdgeRuns, centers: FloatArray, radius: float
+) -> FloatArray:
+    """(n,) factors with which `edges.vertex_rounding` holds for the near loops of n cells.
 
     It assumes edges of half length h <= 1 and vertices no farther than 1 + |x| from x. In h and in
     that distance it is linear, so that a factor of at least 1, h, and the distance of apexes, which
@@ -291,8 +324,8 @@ def _factor(vertices: VertexTable, runs: Runs, centers: FloatArray, radius: floa
     return out
 
 
-def _table(
-    backend: Backend, centers: FloatArray, radius: float, far: FarEdges, around: _Around,
+def _cell_records(
+    backend: Backend, centers: FloatArray, radius: float, far: EdgeExpansions, around: _FarBounds,
     factor: FloatArray, first: IntArray, count: IntArray,
 ) -> FloatArray:  # fmt: skip
     """Records of cells (`CurveCells.records`).
@@ -302,11 +335,11 @@ def _table(
     of two sums, at most 6 pi and the polynomial each: 32 epsilon and what the tables count for it.
     That of the gradient, over the radius, counts as left out.
     """
-    tables = rounding_tables(DEGREE, MARGIN / math.sqrt(3))
+    tables = rounding_tables(DEGREE, BALL_MARGIN / math.sqrt(3))
     coefficients, up = far.coefficients.copy(), 1 + _SLACK
     coefficients[:, 0] -= _PERIOD * np.round(coefficients[:, 0] / _PERIOD)
-    rounding = backend.epsilon * np.abs(coefficients[:, 1:]) @ tables[1:]
-    value = rounding[:, 0] + backend.epsilon * (48 + 7.25 * VERTICES * count)
+    rounding = backend.machine_epsilon * np.abs(coefficients[:, 1:]) @ tables[1:]
+    value = rounding[:, 0] + backend.machine_epsilon * (48 + 7.25 * VERTICES_PER_RECORD * count)
     slope = far.slope + rounding[:, 1:].sum(axis=1) / radius
     inverse, least = np.full(len(first), 1 / radius), np.minimum(around.least, 1e3)
     bounds = [far.error * up, slope * up, value * up, least, factor, around.cubes]

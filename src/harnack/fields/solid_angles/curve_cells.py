@@ -2,8 +2,20 @@
 
 A cube around the curve is an octree of cells. In each cell that is not split, the edges within
 three radii of its ball from its center are in runs that one more vertex closes to loops
-(`near_runs`), and the solid angle of all that is left is one harmonic polynomial (`far_edges`). So
-a sample costs what is near, whatever the number of edges. `curve_octree` makes the cells.
+(`edge_runs`), and the solid angle of all that is left is one harmonic polynomial
+(`edge_expansion`). So a sample costs what is near, whatever the number of edges.
+`curve_cell_builder` makes the cells.
+
+Near edges are in runs, each
+closed to a loop by one vertex beyond them (`edge_runs`), since an open run has no solid angle; what
+is left is a cycle far away, whose solid angle is single-valued in the cell, and one harmonic
+polynomial. Each far edge gives a harmonic function by itself, the part of Biot and Savart's field
+along the line to the center (`edge_expansion`), so that remainders are proved edge by edge and no
+fit aliases. A cell adds what was near to the cell around it and is far from its own ball. Closing
+edges count in values and not in promises, which are about the curve. Detail 1 is the cells', more
+is the sum over all edges: cells are so small that fewer than one sample in a hundred needs it, as
+one lane that sums up all edges holds up its packet. Extents of curves with cells have few planes:
+with 1,024 vertices, clipping at the hull took three times as long as the march.
 """
 
 from __future__ import annotations
@@ -17,39 +29,39 @@ import numpy as np
 from harnack.backend import to_numpy
 from harnack.backend.elementary import fmin
 from harnack.fields.solid_angles.edge_expansion import COEFFICIENTS, DEGREE
-from harnack.fields.solid_angles.edge_lift import LiftedProduct, ends_factor, sight_of
+from harnack.fields.solid_angles.edge_lift import LiftedProduct, ends_factor, view_vertex
 from harnack.fields.solid_angles.edges import Edge, EdgeSums, inner_product, spinor
-from harnack.fields.solid_angles.local_expansion import value_and_gradient
-from harnack.fields.solid_angles.trail_sums import with_edge_rates
-from harnack.fields.source_sums import SUM_ROUNDING
+from harnack.fields.solid_angles.local_expansion import evaluate_expansion
+from harnack.fields.solid_angles.trail_sums import add_edge_rates
+from harnack.fields.source_sums import SUM_MARGIN
 from harnack.tree.closest_triangles import squared_distance_to_segment
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, Mask, Real, Vec3
-    from harnack.backend.record_table import Records
-    from harnack.fields.solid_angles.edge_lift import Sight
-    from harnack.fields.solid_angles.trail_sums import Line
-    from harnack.tree.octree_lookup import CellLookup
-    from harnack.tree.triangle_tree import Frame
+    from harnack.backend.record_table import RecordTable
+    from harnack.fields.solid_angles.edge_lift import VertexView
+    from harnack.fields.solid_angles.trail_sums import RayLine
+    from harnack.tree.octree_lookup import OctreeLookup
+    from harnack.tree.triangle_tree import RayFrame
 
 # Numbers of a record before the coefficients, and vertices in a record of near edges.
-HEAD, VERTICES = 15, 2
+HEADER_SIZE, VERTICES_PER_RECORD = 15, 2
 # Areas of so many roundings do not tell on which side of a line an edge passes.
-_UNSURE = 64.0
+_SIDE_ROUNDINGS = 64.0
 # Lengths up to this part of the distance to far edges are used along lines.
-_ALONG = 0.5
+_LINE_FRACTION = 0.5
 
 
 @dataclass(frozen=True)
-class CellSums:
+class CurveCellSums:
     """Sums over all edges at x, in a cell.
 
     sums: those of `edges.sum_over_edges`; integrals and the distance are bounds.
     error, slope_error: bounds of what the polynomial leaves out of value and gradient.
-    rounding: a bound of the rounding of the value, to which `edges.near_rounding` is to be added.
-    rest: the gradient of the polynomial. cubes, free: of far edges, an upper bound of the integral
-        of |dp|/D^3, and a lower bound of the distance.
-    first, count: of the records of near edges.
+    rounding: a bound of the rounding of the value, to which `edges.vertex_rounding` is to be added.
+    expansion_gradient: the gradient of the polynomial. cubes, free: of far edges, an upper bound of
+        the integral of |dp|/D^3, and a lower bound of the distance.
+    near_first, count: of the records of near edges.
     cell, center: the number of the cell, and where it is. change: the value of the polynomial
         less that at the center.
     """
@@ -58,14 +70,14 @@ class CellSums:
     error: Real
     slope_error: Real
     rounding: Real
-    rest: Vec3
-    cubes: Real
-    free: Real
-    first: Any
+    expansion_gradient: Vec3
+    far_i3: Real
+    far_distance: Real
+    near_first: Any
     count: Any
     cell: Any
     center: Vec3
-    change: Real
+    expansion_change: Real
 
 
 @dataclass(frozen=True)
@@ -84,18 +96,18 @@ class CurveCells:
     """
 
     backend: Backend
-    lookup: CellLookup
-    records: Records
-    near: Records
+    lookup: OctreeLookup
+    records: RecordTable
+    near: RecordTable
     count: int
     size: int
 
     def centers(self) -> FloatArray:
         """(count, 3), which the backend's numbers hold exactly."""
-        row = self.records.row(dr.arange(self.backend.UInt32, self.count))
+        row = self.records.read_record(dr.arange(self.backend.UInt32, self.count))
         return to_numpy(self.backend.Array3f(*row[:3])).astype(np.float64)
 
-    def sums(self, x: Vec3, active: Mask) -> tuple[CellSums, Mask]:
+    def sums(self, x: Vec3, active: Mask) -> tuple[CurveCellSums, Mask]:
         """The sums over all edges at x, and the mask of points for which they hold: those that are
         active and lie in the cube.
 
@@ -107,24 +119,24 @@ class CurveCells:
         psi = (6 - 8q + 3q^2)/(1-q)^3, which grows with q.
 
         Rounding moves x by less than 2.25 epsilon (1 + |x|), which changes the polynomial by at
-        most its gradient times that; for near edges `edges.near_rounding` counts it.
+        most its gradient times that; for near edges `edges.vertex_rounding` counts it.
         """
         vector, index = self.backend.Array3f, self.backend.UInt32
-        number, inside = self.lookup.leaf(x)
+        number, inside = self.lookup.find_leaf(x)
         active = active & inside
-        row = self.records.row(number, active)
+        row = self.records.read_record(number, active)
         inverse, error, slope_error, rounding, least, factor, cubes = row[3:10]
         center = vector(*row[:3])
         u = x - center
-        constant, *others = row[HEAD : HEAD + COEFFICIENTS]
+        constant, *others = row[HEADER_SIZE : HEADER_SIZE + COEFFICIENTS]
         polynomial = [self.backend.Float(0), *others]
-        value, *slopes = value_and_gradient(polynomial, [*(u * inverse)], DEGREE)
+        value, *slopes = evaluate_expansion(polynomial, [*(u * inverse)], DEGREE)
         rest = inverse * vector(*slopes)
         steep = dr.norm(rest) + slope_error
-        rounding = dr.fma(2.25 * self.backend.epsilon * (1 + dr.norm(x)), steep, rounding)
+        rounding = dr.fma(2.25 * self.backend.machine_epsilon * (1 + dr.norm(x)), steep, rounding)
         first, count = index(row[13]), dr.select(active, index(row[14]), 0)
-        near = self._near(x, first, count)
-        away = dr.norm(u) * (1 + SUM_ROUNDING)
+        near = self._sum_near(x, first, count)
+        away = dr.norm(u) * (1 + SUM_MARGIN)
         q, free = away / least, least - away
         share = least / free
         psi = dr.fma(q, dr.fma(3, q, -8), 6) * share * share * share
@@ -138,10 +150,10 @@ class CurveCells:
             near.fourths + far / free,
         )
         parts = error, slope_error, rounding, rest, far, free, first, count, number, center, value
-        return CellSums(sums, *parts), active
+        return CurveCellSums(sums, *parts), active
 
     def change_from_center(
-        self, found: CellSums, frame: Frame, x: Vec3, unit: Real, active: Mask
+        self, found: CurveCellSums, frame: RayFrame, x: Vec3, unit: Real, active: Mask
     ) -> tuple[Real, Mask]:
         """How much the solid angle, continued along the line from the cell's center, is larger at
         x; and where that is known.
@@ -162,37 +174,37 @@ class CurveCells:
             return i < count
 
         def body(i: Any, p: Vec3, sure: Mask, *products: Real) -> tuple[Any, ...]:
-            row = self.near.row(found.first + i, i < count)
+            row = self.near.read_record(found.near_first + i, i < count)
             there, here = LiftedProduct(*products[:3]), LiftedProduct(*products[3:])
-            a, a_here = sight_of(p, frame, x), sight_of(p, frame, center)
-            for k in range(VERTICES):
+            a, a_here = view_vertex(p, frame, x), view_vertex(p, frame, center)
+            for k in range(VERTICES_PER_RECORD):
                 q, inverse = vector(*row[4 * k : 4 * k + 3]), row[4 * k + 3]
-                b, b_here = sight_of(q, frame, x), sight_of(q, frame, center)
+                b, b_here = view_vertex(q, frame, x), view_vertex(q, frame, center)
                 size = dr.abs(b.u) + dr.abs(b.v)
-                sure &= size > _UNSURE * unit  # off the vertex
-                slack = _UNSURE * unit * (size + dr.abs(a.u) + dr.abs(a.v))
+                sure &= size > _SIDE_ROUNDINGS * unit  # off the vertex
+                slack = _SIDE_ROUNDINGS * unit * (size + dr.abs(a.u) + dr.abs(a.v))
                 there, is_sure = _with_edge(there, a, b, inverse != 0, slack)
                 here, is_sure_here = _with_edge(here, a_here, b_here, inverse != 0, slack)
                 sure &= is_sure & is_sure_here
                 a, a_here, p = b, b_here, q
             return i + 1, p, sure, *there.parts(), *here.parts()
 
-        one = LiftedProduct.one(real).parts()
+        one = LiftedProduct.identity(real).parts()
         start = index(0), vector(0), self.backend.Bool(active), *one, *one
         _, _, sure, *products = dr.while_loop(start, more, body, label="from the center")
         there, here = LiftedProduct(*products[:3]), LiftedProduct(*products[3:])
-        return there.angle() - here.angle() + found.change, sure
+        return there.angle() - here.angle() + found.expansion_change, sure
 
     def rates_along(
-        self, found: CellSums, line: Line, lengths: tuple[Real, ...], active: Mask
+        self, found: CurveCellSums, line: RayLine, lengths: tuple[Real, ...], active: Mask
     ) -> tuple[Real, ...]:
-        """As `edge_trails.rates_along`, at the points of these sums.
+        """As `trail_sums.rates_along`, at the points of these sums.
 
         Proof. f changes along a line by the sum of what the fields of all edges add up to along it.
-        For near edges that is bounded by `with_edge_rates`. The field H of all others at x is the
+        For near edges that is bounded by `add_edge_rates`. The field H of all others at x is the
         gradient of the polynomial, up to `slope_error`, with the fields of closing edges, which are
         in the near loops. Along v it adds to f at x + sv at most |s||H . v| + s^2/2 K for |s| <= r,
-        with r half the distance d of far edges, and K the constant of `edge_angles.bends` for
+        with r half the distance d of far edges, and K the constant of `curve_queries.bends` for
         q = 1/2, which is 3/2 (I3 + d I4), at most 3 I3.
         """
         vector, x = self.backend.Array3f, line.x
@@ -202,31 +214,31 @@ class CurveCells:
             return i < count
 
         def body(i: Any, p: Vec3, rest: Vec3, *rates: Real) -> tuple[Any, ...]:
-            row = self.near.row(found.first + i, i < count)
-            for k in range(VERTICES):
+            row = self.near.read_record(found.near_first + i, i < count)
+            for k in range(VERTICES_PER_RECORD):
                 q, inverse = vector(*row[4 * k : 4 * k + 3]), row[4 * k + 3]
                 edge = Edge.between(p, q, dr.select(inverse > 0, inverse, 1), x)
-                grown = with_edge_rates(line, edge, lengths, rates)
+                grown = add_edge_rates(line, edge, lengths, rates)
                 pairs = zip(grown, rates, strict=True)
                 rates = tuple(dr.select(inverse > 0, new, old) for new, old in pairs)
-                w, c = edge.field()
+                w, c = edge.biot_savart()
                 rest = rest + dr.select(inverse < 0, w * c, 0)
                 p = q
             return i + 1, p, rest, *rates
 
-        start = (self.backend.UInt32(0), vector(0), found.rest)
+        start = (self.backend.UInt32(0), vector(0), found.expansion_gradient)
         start = (*start, *(self.backend.Float(0) for _ in lengths))
         _, _, rest, *rates = dr.while_loop(start, more, body, label="near edges along")
         slope = dr.abs(dr.dot(rest, line.v)) + found.slope_error
-        slope = slope + SUM_ROUNDING * found.sums.squares
-        bend = (1 + SUM_ROUNDING) * 1.5 * found.cubes  # K/2
-        reach = _ALONG * found.free
+        slope = slope + SUM_MARGIN * found.sums.squares
+        bend = (1 + SUM_MARGIN) * 1.5 * found.far_i3  # K/2
+        reach = _LINE_FRACTION * found.far_distance
         return tuple(
             dr.select(active & (length <= reach), rate + dr.fma(length, bend, slope), dr.inf)
             for rate, length in zip(rates, lengths, strict=True)
         )
 
-    def _near(self, x: Vec3, first: Any, count: Any) -> EdgeSums:
+    def _sum_near(self, x: Vec3, first: Any, count: Any) -> EdgeSums:
         """As `sum_over_edges`, over the near loops. Edges that close runs do not count for the
         distance, for cubes and for fourths, which are of the curve."""
         real, index, vector = self.backend.Float, self.backend.UInt32, self.backend.Array3f
@@ -236,8 +248,8 @@ class CurveCells:
 
         def body(i: Any, *state: Any) -> tuple[Any, ...]:
             zr, zi, g, d2, squares, cubes, fourths, p, a, la, sa, *ca = state
-            row = self.near.row(first + i, i < count)
-            for k in range(VERTICES):
+            row = self.near.read_record(first + i, i < count)
+            for k in range(VERTICES_PER_RECORD):
                 q, inverse = vector(*row[4 * k : 4 * k + 3]), row[4 * k + 3]
                 b = q - x
                 lb, sb, cb = spinor(b)
@@ -270,7 +282,7 @@ class CurveCells:
 
 
 def _with_edge(
-    product: LiftedProduct, a: Sight, b: Sight, is_edge: Mask, slack: Real
+    product: LiftedProduct, a: VertexView, b: VertexView, is_edge: Mask, slack: Real
 ) -> tuple[LiftedProduct, Mask]:
     """The product with the factor of an edge, if it is one, and where that is not within the slack
     of the negative axis."""

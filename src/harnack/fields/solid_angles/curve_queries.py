@@ -2,8 +2,13 @@
 
 - `differentiable_angle`: the solid angle as an expression that Dr.Jit differentiates.
 - `closest_on_segments`: the closest point of the curve, at which the level sets end.
-- `change_along_segments`: the change of the solid angle along a straight segment.
-- `bends`, `slope_change`, `swept_ball`: what the solid angle promises near a point.
+- `continuous_change`: the change of the solid angle along a straight segment.
+- `remainder_promises`, `gradient_change_bound`, `lift_ball`: what the solid angle promises near a
+  point.
+
+Curves promise how they bend: the integral of |dp|/|p - x|^3 is the weight that Biot and Savart's
+law has already, and bounds second derivatives. Ranges on balls, which caps and the published rule
+need, take 1.4 to 2 times as many evaluations on polygons and knots.
 """
 
 from __future__ import annotations
@@ -16,22 +21,22 @@ import numpy as np
 from harnack.backend import FloatArray, to_vector3
 from harnack.backend.arrays import gather_vectors
 from harnack.backend.elementary import clamp
-from harnack.backend.record_table import Records
-from harnack.enclosures import Curvature, HarmonicBall
+from harnack.backend.record_table import RecordTable
+from harnack.enclosures import HarmonicBall, TaylorRemainder
 from harnack.fields.solid_angles.edges import inner_product, single_edges, spinor
-from harnack.fields.source_sums import SUM_ROUNDING
+from harnack.fields.source_sums import SUM_MARGIN
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
     from harnack.fields.solid_angles.edges import LoopEdges
 
 __all__ = [
-    "bends",
-    "change_along_segments",
     "closest_on_segments",
-    "segments",
-    "slope_change",
-    "swept_ball",
+    "continuous_change",
+    "gradient_change_bound",
+    "lift_ball",
+    "remainder_promises",
+    "segment_records",
 ]
 
 
@@ -65,14 +70,14 @@ def _loop_angle(backend: Backend, vertices: Vec3, x: Vec3) -> Real:
     return dr.block_sum(2 * dr.atan2(im, re), edges)
 
 
-def segments(backend: Backend, start: FloatArray, end: FloatArray) -> Records:
+def segment_records(backend: Backend, start: FloatArray, end: FloatArray) -> RecordTable:
     """Records of segments from (k, 3) to (k, 3), k >= 1, of a size of about one. One whose ends are
     the same in the backend's precision is a point."""
     start, end = (q.astype(backend.dtype).astype(np.float64) for q in (start, end))
-    return Records.upload(backend, single_edges(start, end))
+    return RecordTable.upload(backend, single_edges(start, end))
 
 
-def closest_on_segments(segments: Records, x: Vec3) -> Vec3:
+def closest_on_segments(segments: RecordTable, x: Vec3) -> Vec3:
     """The point of the segments that is closest to x."""
     vector = segments.backend.Array3f
     x = vector(x)
@@ -90,7 +95,7 @@ def closest_on_segments(segments: Records, x: Vec3) -> Vec3:
     return segments.for_each(add, start, "nearest edge")[1]
 
 
-def change_along_segments(edges: LoopEdges, p: Vec3, q: Vec3) -> Real:
+def continuous_change(edges: LoopEdges, p: Vec3, q: Vec3) -> Real:
     """The change of the solid angle, followed continuously from p to q, which differ.
 
     Biot and Savart's field, integrated along the segment from p to q, gives for each edge from a to
@@ -122,7 +127,7 @@ def _angle(a: Vec3, b: Vec3, c: Vec3) -> Real:
 _REACHES = (0.3, 0.6, 0.85)
 
 
-def bends(cubes: Real, fourths: Real, distance: Real) -> tuple[Curvature, ...]:
+def remainder_promises(cubes: Real, fourths: Real, distance: Real) -> tuple[TaylorRemainder, ...]:
     """Promises of the second derivatives of the solid angle, by integrals over the curve.
 
     cubes, fourths: I3 and I4, the integrals of |dp|/|D|^3 and |dp|/|D|^4. distance: d, or less.
@@ -137,22 +142,24 @@ def bends(cubes: Real, fourths: Real, distance: Real) -> tuple[Curvature, ...]:
         3/2 integral of |dp| integral over [0, t] of (t-s)/(|D|-s)^3 ds
             = 3/4 t^2 integral of |dp|/(|D|^3 (1 - t/|D|)),
 
-    and 1/(1 - u) <= 1 + u/(1 - q) for 0 <= u <= q. On the ball of radius q d that is `Curvature`
-    with the constant 3/2 (I3 + q d I4/(1 - q)). It holds for any piece of a curve, and adds up.
+    and 1/(1 - u) <= 1 + u/(1 - q) for 0 <= u <= q. On the ball of radius q d that is
+    `TaylorRemainder` with the constant 3/2 (I3 + q d I4/(1 - q)). It holds for any piece of a
+    curve, and adds up.
     """
-    scale = 1.5 * (1 + SUM_ROUNDING)
+    scale = 1.5 * (1 + SUM_MARGIN)
     return tuple(
-        Curvature(scale * dr.fma(q / (1 - q) * distance, fourths, cubes), q * distance)
+        TaylorRemainder(scale * dr.fma(q / (1 - q) * distance, fourths, cubes), q * distance)
         for q in _REACHES
     )
 
 
-def slope_change(cubes: Real, fourths: Real, distance: Real, radius: Real) -> Real:
+def gradient_change_bound(cubes: Real, fourths: Real, distance: Real, radius: Real) -> Real:
     """A bound of the change of the gradient within `radius`; infinite unless that is less than the
     distance.
 
     Proof. The second derivative in every direction is at most 3/2 times the integral of |dp|/|D|^3
-    (`bends`). So is the norm of the Hessian, and from x to x + t v the gradient changes by at most
+    (`remainder_promises`). So is the norm of the Hessian, and from x to x + t v the gradient
+    changes by at most
 
         3/2 integral of |dp| integral over [0, t] of ds/(|D|-s)^3
             = 3/4 t integral of |dp|/|D|^3 (2 - u)/(1 - u)^2,    u = t/|D|.
@@ -163,14 +170,14 @@ def slope_change(cubes: Real, fourths: Real, distance: Real, radius: Real) -> Re
     q = radius / distance
     growth = (3 - 2 * q) / dr.square(1 - q)
     change = radius * (1.5 * cubes + 0.75 * radius * growth * fourths)
-    return dr.select(radius < distance, (1 + SUM_ROUNDING) * change, dr.inf)
+    return dr.select(radius < distance, (1 + SUM_MARGIN) * change, dr.inf)
 
 
-def swept_ball(
+def lift_ball(
     value: Real,
     gradient: Vec3,
     squares: Real,
-    bends: tuple[Curvature, ...],
+    bends: tuple[TaylorRemainder, ...],
     slope_error: Real = 0.0,
 ) -> HarmonicBall:
     """The range of the lift on the ball of one of the promises, which themselves prove longer
@@ -180,6 +187,6 @@ def swept_ball(
     slope_error: a bound of other errors of the gradient.
     """
     bend = bends[1]
-    slope = dr.norm(gradient) + SUM_ROUNDING * squares + slope_error
-    moved = (1 + SUM_ROUNDING) * bend.radius * dr.fma(0.5 * bend.radius, bend.constant, slope)
+    slope = dr.norm(gradient) + SUM_MARGIN * squares + slope_error
+    moved = (1 + SUM_MARGIN) * bend.radius * dr.fma(0.5 * bend.radius, bend.constant, slope)
     return HarmonicBall(bend.radius, value - moved, value + moved)

@@ -1,6 +1,9 @@
 """The dipole potential of oriented point clouds: Poisson reconstruction without a grid.
 
 `DipolePotential` is the field, `DipoleTree` its sum by a tree, with far dipoles as multipoles.
+
+The points of a field stay as they are (attributes such as `points` cannot be set): trees, cells and
+extents are made of them once. `with_points` makes another field.
 """
 
 from __future__ import annotations
@@ -17,24 +20,30 @@ import numpy as np
 
 from harnack.backend import backend_of
 from harnack.backend.elementary import fmax
-from harnack.backend.validation import positive, real, refuses_derivatives
-from harnack.fields.batched_fields import SymmetricSum, Values, sharpened
-from harnack.fields.clearance import DetailedField, UnitCoordinates, epsilon_at, placed, single
-from harnack.fields.field import Sample, lengthened
-from harnack.fields.solid_angles.cell_options import HasCells
-from harnack.fields.solid_angles.denoised_cloud import FittedCloud
-from harnack.fields.solid_angles.dipole_cells import NearFarCells, build_cells
-from harnack.fields.solid_angles.multipole import all_levels
+from harnack.backend.validation import as_positive, as_real, no_derivatives
+from harnack.fields.batched_fields import PointValues, SymmetricMatrix, sharpened
+from harnack.fields.clearance import (
+    UnitFrame,
+    VariableAccuracyField,
+    coordinate_rounding,
+    frame_parameters,
+    round_to_single,
+)
+from harnack.fields.field import Sample, space_scaled
+from harnack.fields.solid_angles.cell_options import FieldWithCells
+from harnack.fields.solid_angles.denoised_cloud import DenoisedCloud
+from harnack.fields.solid_angles.dipole_cells import DipoleCells, build_cells
+from harnack.fields.solid_angles.multipole import dipole_tree_moments
 from harnack.fields.solid_angles.oriented_points import OrientedPoints
 from harnack.fields.solid_angles.smoothed import SmoothedSum
 from harnack.fields.solid_angles.treecode import (
     AddPrimitive,
     Treecode,
-    dipole_rows,
-    hierarchy_of,
-    in_slots,
+    dipole_hierarchy,
+    dipole_records,
+    records_in_slots,
 )
-from harnack.fields.source_sums import FieldSums, Terms, last_roundings, rounding_of_dipole
+from harnack.fields.source_sums import SourceSums, SourceTerm, dipole_rounding, final_rounding
 from harnack.geometry import Box, CloudError, estimate_areas, estimate_normals, validate_cloud
 
 if TYPE_CHECKING:
@@ -42,10 +51,10 @@ if TYPE_CHECKING:
     from typing import Self
 
     from harnack.backend import Backend, FloatArray, Mask, Real, Vec3
-    from harnack.backend.record_table import Records
+    from harnack.backend.record_table import RecordTable
     from harnack.fields.solid_angles.multipole import NodeMoments
     from harnack.geometry import Volume
-    from harnack.tree import Hierarchy
+    from harnack.tree import BalancedTree
 
 # Cells are built by themselves from so many rays a point, and so many rays, on, and up to so many
 # points. To build them takes as long as to trace about 6 rays a point without them; smaller ones,
@@ -53,10 +62,10 @@ if TYPE_CHECKING:
 _PAYS, _LEAST_RAYS, _MOST_POINTS = 7, 100_000, 200_000
 _FINER_PAYS = 60
 # A point counts as near if the squared distance is less than this fraction of its area.
-_BESIDE = 0.04
+_SINGLE_POINT = 0.04
 
 
-BuildCells: TypeAlias = "Callable[[list[NodeMoments], FloatArray, Records], NearFarCells | None]"
+BuildCells: TypeAlias = "Callable[[list[NodeMoments], FloatArray, RecordTable], DipoleCells | None]"
 """Makes cells from the moments of a tree, and its dipoles as rows and on the backend."""
 
 
@@ -69,7 +78,7 @@ class DipoleTree:
 
     clusters: Treecode
     rounding: Real
-    cells: NearFarCells | None = None
+    cells: DipoleCells | None = None
 
     @property
     def backend(self) -> Backend:
@@ -77,71 +86,76 @@ class DipoleTree:
 
     @classmethod
     def of(
-        cls, backend: Backend, tree: Hierarchy, points: FloatArray, moments: FloatArray,
+        cls, backend: Backend, tree: BalancedTree, points: FloatArray, moments: FloatArray,
         accuracy: float, build: BuildCells | None = None,
     ) -> DipoleTree:  # fmt: skip
         """From points (n, 3) of size about one and moments (n, 3), area times normal.
 
-        tree: `hierarchy_of` these points, or of the same points at earlier positions.
+        tree: `dipole_hierarchy` these points, or of the same points at earlier positions.
         build: makes cells.
         """
-        levels = all_levels(tree, points[:, None], moments[:, None], points, points)
-        rows = dipole_rows(points, moments)
-        rounding = last_roundings(backend, size=max(1.0, float(rows[:, 6].sum())))
-        slots = in_slots(tree, rows)
+        levels = dipole_tree_moments(tree, points[:, None], moments[:, None], points, points)
+        rows = dipole_records(points, moments)
+        rounding = final_rounding(backend, size=max(1.0, float(rows[:, 6].sum())))
+        slots = records_in_slots(tree, rows)
         clusters = Treecode.of(backend, tree, levels, slots, accuracy)
         cells = None if build is None else build(levels, slots, clusters.tree.primitives)
         return cls(clusters, rounding, cells)
 
     @property
-    def coarsest(self) -> float:
+    def coarsest_accuracy(self) -> float:
         """The detail of coarse samples (`Field.coarsest_detail`)."""
-        return self.clusters.coarsest if self.cells is None else 1.0
+        return self.clusters.coarsest_accuracy if self.cells is None else 1.0
 
-    def at(self, x: Vec3, derivatives: int, closer: Real) -> Values:
+    def values(self, x: Vec3, derivatives: int, closer: Real) -> PointValues:
         """Value and the derivatives asked for at x; closer: the detail, at least 1."""
-        unit, detail = epsilon_at(x), fmax(self.backend.Float(closer), self.backend.Float(1))
+        unit, detail = (
+            coordinate_rounding(x),
+            fmax(self.backend.Float(closer), self.backend.Float(1)),
+        )
         sums, _ = self._near_sums(x, detail, unit, derivatives)
         return self.clusters.values(sums, 1.0, unit, self.rounding)
 
-    def _sums(self, x: Vec3, detail: Real, unit: Real, derivatives: int) -> tuple[FieldSums, Vec3]:
+    def _sums(self, x: Vec3, detail: Real, unit: Real, derivatives: int) -> tuple[SourceSums, Vec3]:
         """All sums, and the moment of the nearest dipole of a near leaf."""
-        add, vector = _adder(x, unit, derivatives), self.backend.Array3f
+        add, vector = _dipole_adder(x, unit, derivatives), self.backend.Array3f
         sums, own = self.clusters.sums(x, detail, add, (vector(0),), derivatives=derivatives)
         return sums, own[0]
 
     def _near_sums(
         self, x: Vec3, detail: Real, unit: Real, derivatives: int = 1
-    ) -> tuple[FieldSums, Vec3]:
+    ) -> tuple[SourceSums, Vec3]:
         """As `_sums`, by the cells where there are any and derivatives are not second ones."""
         if self.cells is None or derivatives == 2:
             return self._sums(x, detail, unit, derivatives)
-        add, none = _adder(x, unit, 1), (self.backend.Array3f(0),)
-        sums, own = self.cells.sums_or_tree(self.clusters, x, detail, (add, add), none)
+        add, none = _dipole_adder(x, unit, 1), (self.backend.Array3f(0),)
+        sums, own = self.cells.sums_with_tree(self.clusters, x, detail, (add, add), none)
         return sums, own[0]
 
     def sample(self, x: Vec3, detail: Real) -> Sample:
-        """Value, gradient and promises at x: see `FieldSums.sample`.
+        """Value, gradient and promises at x: see `SourceSums.sample`.
 
         With cells, details up to 1 are what their expansions give, and larger ones the tree's.
         """
-        unit = epsilon_at(x)
+        unit = coordinate_rounding(x)
         found, nearest = self._near_sums(x, detail, unit)
         # Where the field of one point dominates, shade with that point's normal, reversed, as f
         # is larger inside.
         weight = dr.norm(nearest)
-        beside = (found.free_distance * found.free_distance < _BESIDE * weight) & (weight > 0)
+        beside = (
+            found.singularity_distance * found.singularity_distance < _SINGLE_POINT * weight
+        ) & (weight > 0)
         normal = dr.select(beside, -nearest / weight, dr.normalize(found.gradient))
         return found.sample(1.0, unit, self.rounding, normal)
 
 
-def _adder(x: Vec3, unit: Real, derivatives: int) -> AddPrimitive:
+def _dipole_adder(x: Vec3, unit: Real, derivatives: int) -> AddPrimitive:
     """A function that adds a dipole to sums at x, and keeps the moment of the nearest one."""
     vector = cast("Any", type(x))
 
     def add(
-        row: list[Real], active: Mask, sums: FieldSums, own: tuple[Any, ...]
-    ) -> tuple[FieldSums, tuple[Any, ...]]:
+        row: list[Real], active: Mask, sums: SourceSums, own: tuple[Any, ...]
+    ) -> tuple[SourceSums, tuple[Any, ...]]:
         inverse, terms = _dipole(row, x, derivatives)
         distance, some = dr.rcp(inverse), active & (row[6] > 0)
         # An upper bound of 1/(distance - 2 unit), 2 unit being the rounding of the distance:
@@ -151,12 +165,12 @@ def _adder(x: Vec3, unit: Real, derivatives: int) -> AddPrimitive:
         closer = dr.select(z <= 0.5, dr.fma(2 * z, inverse, inverse), dr.inf)
         closer = dr.select(some, closer, 0)
         fourth = row[6] * dr.square(closer * closer)
-        nearer = some & (distance <= sums.free_distance)
-        added = sums.plus(terms, active & (inverse < dr.inf))
+        nearer = some & (distance <= sums.singularity_distance)
+        added = sums.add_term(terms, active & (inverse < dr.inf))
         new = dataclasses.replace(
             added,
-            rounding=added.rounding + rounding_of_dipole(row[6], closer, unit),
-            free_distance=dr.select(nearer, distance, sums.free_distance),
+            rounding=added.rounding + dipole_rounding(row[6], closer, unit),
+            singularity_distance=dr.select(nearer, distance, sums.singularity_distance),
             s4=sums.s4 + fourth,
             s5=dr.fma(fourth, closer, sums.s5),
         )
@@ -165,7 +179,7 @@ def _adder(x: Vec3, unit: Real, derivatives: int) -> AddPrimitive:
     return add
 
 
-def _dipole(row: list[Real], x: Vec3, derivatives: int) -> tuple[Real, Terms]:
+def _dipole(row: list[Real], x: Vec3, derivatives: int) -> tuple[Real, SourceTerm]:
     """One over the distance to a dipole, and its value and, if asked for, gradient (paper, Eq. 12
     and 15) and Hessian.
 
@@ -179,10 +193,10 @@ def _dipole(row: list[Real], x: Vec3, derivatives: int) -> tuple[Real, Terms]:
     along = dr.dot(m, z)
     value = along * u * u2
     if derivatives == 0:
-        return u, Terms(value)
+        return u, SourceTerm(value)
     gradient = (u * u2) * dr.fma(vector(3 * along * u2), z, -m)
     if derivatives == 1:
-        return u, Terms(value, gradient)
+        return u, SourceTerm(value, gradient)
     # In terms of the unit vector n = u z, so that no power of u overflows unless the result does.
     n, four = u * z, 3 * (u2 * u2)
     along = dr.dot(m, n)
@@ -191,19 +205,19 @@ def _dipole(row: list[Real], x: Vec3, derivatives: int) -> tuple[Real, Terms]:
         four * (5 * along * n[i] * n[j] - m[i] * n[j] - n[i] * m[j] - (along if i == j else 0))
         for i, j in pairs
     )
-    return u, Terms(value, gradient, SymmetricSum(*hessian))
+    return u, SourceTerm(value, gradient, SymmetricMatrix(*hessian))
 
 
 _VALUES, _TRACED = 2.0, 4.0
 # The least smoothing length, as a part of half the size of the cloud; the most points at which its
 # level is looked for; the least level that is one, as a part of 2 pi if areas are estimated.
-_LEAST_SMOOTHING, _PROBES = 1e-5, 10_000
+_LEAST_SMOOTHING, _MAX_LEVEL_SAMPLES = 1e-5, 10_000
 _LEAST_PART, _LEAST_LEVEL = 0.1, 1e-3
 # A tenth of the points may be off a smoothed surface by this part of the cloud's longest side.
-_FAR = 0.04
+_FAR_OF_SIZE = 0.04
 
 
-class DipolePotential(OrientedPoints, HasCells, DetailedField["_DipoleBuffers"]):
+class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_DipoleData"]):
     """f(x) = sum a_i n_i.(p_i - x)/|p_i - x|^3 of oriented points (paper, Eq. 12).
 
     With a_i the areas that the points stand for, f is about 4 pi inside and 0 outside: the
@@ -249,7 +263,7 @@ class DipolePotential(OrientedPoints, HasCells, DetailedField["_DipoleBuffers"])
         for each precision, at the first trace, and several times the memory. All bounds are proved,
         whatever is given.
 
-    `moved` gives the field of points that have moved.
+    `with_points` gives the field of points that have moved.
 
     Raises CloudError (a ValueError) for what is no oriented point cloud; ValueError for a
     smoothing or an accuracy that cannot be.
@@ -274,38 +288,41 @@ class DipolePotential(OrientedPoints, HasCells, DetailedField["_DipoleBuffers"])
                 "normals are missing, and without them inside and outside are not known: give "
                 'them, or normals="estimate" to estimate them from neighboring points'
             )
-        if accuracy is not None and not 1.5 <= real(accuracy, "accuracy") <= 100:
+        if accuracy is not None and not 1.5 <= as_real(accuracy, "accuracy") <= 100:
             raise ValueError(f"accuracy must lie between 1.5 and 100, not {accuracy}")
-        self.estimated = [isinstance(normals, str), areas is None]
+        self.is_estimated = [isinstance(normals, str), areas is None]
         if isinstance(normals, str) and normals != "estimate":
             raise CloudError(f'normals must be (n, 3) or "estimate", not {normals!r}')
-        self.fitted: dict[str, Any] = {}
+        self.fit_report: dict[str, Any] = {}
         if isinstance(smoothing, str):
             points, normals, smoothing = self._fitted(points, normals, areas, smoothing)
         if isinstance(normals, str):
             normals = estimate_normals(points)
         some = 1.0 if areas is None else areas
         points, normals, some = validate_cloud(points, normals, some)
-        self._keep(points, normals, estimate_areas(points, normals) if areas is None else some)
+        self._set_points(
+            points, normals, estimate_areas(points, normals) if areas is None else some
+        )
         self.accuracy = accuracy
-        self.set_cells(cells)
+        self.configure_cells(cells)
         self._box = low, high = self.points.min(axis=0), self.points.max(axis=0)
-        self._center = single(0.5 * (low + high))
+        self._center = round_to_single(0.5 * (low + high))
         extent = max(0.5 * float((high - low).max()), math.sqrt(float(self.areas.sum())) / 4)
         self._size = 2.0 ** math.ceil(math.log2(extent))
-        self._given_hierarchy: Hierarchy | None = None
+        self._given_hierarchy: BalancedTree | None = None
         self._smoothing = (
-            0.0 if real(smoothing, "smoothing") == 0 else positive(smoothing, "smoothing")
+            0.0 if as_real(smoothing, "smoothing") == 0 else as_positive(smoothing, "smoothing")
         )
         if self.smoothing and self.cells:
             raise ValueError("cells are of sums without smoothing: give one of the two")
         if self.smoothing:
-            self.default_level = self._level_at_points()
+            self.default_level = self._median_level()
 
     def _fitted(
         self, points: Any, normals: Any, areas: Any, smoothing: str
     ) -> tuple[FloatArray, FloatArray, float]:
-        """Points, normals and the length of `smoothing="auto"`; `fitted` says what was found."""
+        """Points, normals and the length of `smoothing="auto"`; `fit_report` says what was
+        found."""
         if smoothing != "auto":
             raise ValueError(f'smoothing must be a length or "auto", not {smoothing!r}')
         if areas is not None:
@@ -319,11 +336,11 @@ class DipolePotential(OrientedPoints, HasCells, DetailedField["_DipoleBuffers"])
             return np.asarray(field.rough_value_and_gradient(x)[1], np.float64)
 
         given = None if isinstance(normals, str) else normals
-        found = FittedCloud.of(points, given, gradients)
-        self.fitted = found.facts
+        found = DenoisedCloud.of(points, given, gradients)
+        self.fit_report = found.report
         return found.points, found.normals, found.smoothing
 
-    def _level_at_points(self) -> float:
+    def _median_level(self) -> float:
         """The median of the smoothed sum at (some of) the points."""
         if not _LEAST_SMOOTHING <= self.smoothing / self._size <= 1:
             raise ValueError(
@@ -332,18 +349,18 @@ class DipolePotential(OrientedPoints, HasCells, DetailedField["_DipoleBuffers"])
                 f"{_LEAST_SMOOTHING * self._size:.2g} and {self._size:.2g}, such as the length of "
                 "the noise"
             )
-        some = self.points[:: -(-len(self.points) // _PROBES)]
+        some = self.points[:: -(-len(self.points) // _MAX_LEVEL_SAMPLES)]
         values = np.asarray(self.value(some, precision="double"))
         level = float(np.median(values))
         # Areas that are given may stand for other things than a surface.
-        least = _LEAST_PART * 2 * math.pi if self.estimated[1] else _LEAST_LEVEL
+        least = _LEAST_PART * 2 * math.pi if self.is_estimated[1] else _LEAST_LEVEL
         if not abs(level) >= least:
             raise CloudError(
                 f"the smoothed sum is {level:.2g} at the points, where it should be about 2 pi: "
                 "normals cancel each other, or the points lie in a plane or on a line and enclose "
                 "nothing, or what they enclose is thinner than the smoothing"
             )
-        if not self.fitted and self.estimated[1]:
+        if not self.fit_report and self.is_estimated[1]:
             self._warn_if_far(some, values - level)
         return level
 
@@ -354,7 +371,7 @@ class DipolePotential(OrientedPoints, HasCells, DetailedField["_DipoleBuffers"])
         steep = np.linalg.norm(slopes, axis=1)
         far = float(np.quantile(np.abs(values) / np.maximum(steep, 1e-300), 0.9))
         longest = float((self._box[1] - self._box[0]).max())
-        if far > _FAR * longest:
+        if far > _FAR_OF_SIZE * longest:
             warnings.warn(
                 f"smoothing={self.smoothing:g} may be too long: a tenth of the points are farther "
                 f"than {far:.2g} from the smoothed surface, and the cloud is {longest:.3g} long. "
@@ -362,8 +379,8 @@ class DipolePotential(OrientedPoints, HasCells, DetailedField["_DipoleBuffers"])
                 stacklevel=4,
             )
 
-    @refuses_derivatives
-    def moved(
+    @no_derivatives
+    def with_points(
         self, points: Any, normals: Any | Literal["estimate"] = None, areas: Any = None
     ) -> DipolePotential:
         """The potential of the same points at other positions (n, 3); normals and areas as for a
@@ -389,76 +406,80 @@ class DipolePotential(OrientedPoints, HasCells, DetailedField["_DipoleBuffers"])
         field._given_hierarchy = vars(self).get("_hierarchy", self._given_hierarchy)
         return field
 
-    def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> Values:
-        on = self._batch(backend_of(x))
-        x = on.unit(x)
+    def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> PointValues:
+        on = self._batch_data(backend_of(x))
+        x = on.to_unit(x)
         weight = float(self.areas.sum()) / self._size**2
-        return on.tree.at(x, derivatives, closer).far_away(x, 64, weight).rescaled(on.size)
+        return (
+            on.tree.values(x, derivatives, closer)
+            .with_far_field_errors(x, 64, weight)
+            .rescaled(on.size)
+        )
 
-    def sharp_values_at(self, x: Vec3) -> Values:
+    def sharp_values_at(self, x: Vec3) -> PointValues:
         if self.accuracy is not None:
             return self.values_at(x, 1)
         return sharpened(lambda place, closer: self.values_at(place, 1, closer), x)
 
     @functools.cached_property
-    def _hierarchy(self) -> Hierarchy:
+    def _hierarchy(self) -> BalancedTree:
         """The tree's shape, from these points or, of moved ones, from where they were."""
-        return self._given_hierarchy or hierarchy_of((self.points - self._center) / self._size)
+        return self._given_hierarchy or dipole_hierarchy((self.points - self._center) / self._size)
 
-    def _upload(self, backend: Backend, *, traced: bool) -> _DipoleBuffers:
+    def _upload(self, backend: Backend, *, traced: bool) -> _DipoleData:
         accuracy = self.accuracy or (_TRACED if traced else _VALUES)
         unit = (self.points - self._center) / self._size
         # Areas scale with the square of lengths; the potential is invariant under scaling.
         moments = (self.areas / self._size**2)[:, None] * self.normals
         if self.smoothing:
-            height, rows = self.smoothing / self._size, dipole_rows(unit, moments)
+            height, rows = self.smoothing / self._size, dipole_records(unit, moments)
             tree = SmoothedSum.of(backend, self._hierarchy, rows, height, accuracy)
         else:
             build = None
-            if self.cells and (traced or self.for_values):
-                build = self._builder(backend, self._half(unit))
+            if self.cells and (traced or self.cells_for_values):
+                build = self._cell_builder(backend, self._half_side(unit))
             tree = DipoleTree.of(backend, self._hierarchy, unit, moments, accuracy, build)
-        return _DipoleBuffers(*placed(backend, self._center, self._size), tree)
+        return _DipoleData(*frame_parameters(backend, self._center, self._size), tree)
 
-    def _builder(self, backend: Backend, half: float) -> BuildCells:
+    def _cell_builder(self, backend: Backend, half: float) -> BuildCells:
         """What makes cells of the cube [-half, half]^3, once for a backend."""
 
         def build(
-            levels: list[NodeMoments], rows: FloatArray, dipoles: Records
-        ) -> NearFarCells | None:
-            return self.built_once(
+            levels: list[NodeMoments], rows: FloatArray, dipoles: RecordTable
+        ) -> DipoleCells | None:
+            return self.build_cached(
                 backend,
                 lambda: build_cells(
-                    backend, self._hierarchy, levels, rows, dipoles, half, self.most_bytes(),
-                    finer=self.finer,
+                    backend, self._hierarchy, levels, rows, dipoles, half, self.max_bytes(),
+                    finer=self.finer_cells,
                 ),
             )  # fmt: skip
 
         return build
 
-    def _half(self, unit: FloatArray) -> float:
+    def _half_side(self, unit: FloatArray) -> float:
         """Half the side of the cube of cells, which holds the `extent` of the default level: rays
         begin at the faces of that."""
         reach = math.sqrt(float(self.areas.sum()) / self.default_level) / self._size
         return 1.001 * (float(np.abs(unit).max()) + reach)
 
-    def least_rays(self) -> float:
+    def cells_pay_from(self) -> float:
         few = len(self.points) <= _MOST_POINTS and not self.smoothing
         return max(_LEAST_RAYS, _PAYS * len(self.points)) if few else math.inf
 
-    def least_rays_of_finer(self) -> float:
+    def finer_cells_pay_from(self) -> float:
         return _FINER_PAYS * len(self.points)
 
     def prepare(self, backend: Backend) -> Self:
         prepared = super().prepare(backend)
         if prepared._device is not None:
-            prepared.coarsest_detail = prepared._device.tree.coarsest
+            prepared.coarsest_accuracy = prepared._device.tree.coarsest_accuracy
         return prepared
 
-    def _sample(self, on: _DipoleBuffers, p: Vec3, detail: Real) -> Sample:
+    def _sample(self, on: _DipoleData, p: Vec3, detail: Real) -> Sample:
         return on.sample(p, detail)
 
-    def check_levels(self, levels: tuple[float, ...]) -> None:
+    def validate_levels(self, levels: tuple[float, ...]) -> None:
         for level in levels:
             if abs(level) < 1e-6:
                 raise ValueError(
@@ -482,21 +503,21 @@ class DipolePotential(OrientedPoints, HasCells, DetailedField["_DipoleBuffers"])
         return self._smoothing
 
     def describe(self) -> dict[str, Any]:
-        said = ("estimated" if one else "given" for one in self.estimated)
+        said = ("estimated" if one else "given" for one in self.is_estimated)
         named = dict(zip(("normals", "areas"), said, strict=True))
         tree = None if self._device is None else self._device.tree
-        cells = self.said_of_cells(tree.cells if isinstance(tree, DipoleTree) else None)
-        about = {"points": len(self.points), **named, **self.fitted, **cells}
+        cells = self.describe_cells(tree.cells if isinstance(tree, DipoleTree) else None)
+        about = {"points": len(self.points), **named, **self.fit_report, **cells}
         if self.smoothing:
             about |= {"smoothing": self.smoothing, "level": self.default_level}
         return about
 
 
 @dataclass(frozen=True)
-class _DipoleBuffers(UnitCoordinates):
+class _DipoleData(UnitFrame):
     """The data of a potential on a backend."""
 
     tree: DipoleTree | SmoothedSum
 
     def sample(self, p: Vec3, detail: Real) -> Sample:
-        return lengthened(self.tree.sample(self.unit(p), detail), self.size)
+        return space_scaled(self.tree.sample(self.to_unit(p), detail), self.size)

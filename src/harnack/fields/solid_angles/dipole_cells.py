@@ -1,12 +1,23 @@
 """Cells in which a sum over dipoles or triangles is a few near ones and one polynomial.
 
 A cube around these primitives is an octree of cells. In each cell that is not split, those within
-`_NEAR` times the radius of its ball from its center (`far_sums`) are listed, and all the rest are
-one harmonic polynomial (`local_expansion`), so that a sample costs what is near, whatever their
-number.
+`_NEAR` times the radius of its ball from its center (`dipole_expansion`) are listed, and all the
+rest are one harmonic polynomial (`local_expansion`), so that a sample costs what is near, whatever
+their number.
 
-- `NearFarCells`: the cells on a backend. `build_cells` makes them, a level at a time, from the
+- `DipoleCells`: the cells on a backend. `build_cells` makes them, a level at a time, from the
   moments of the tree; what cells share with others is gathered once, for their parent.
+
+Clouds may have cells: an octree whose cells have a list of near dipoles (or triangles) and one
+harmonic polynomial of degree 6 for all others, made from the tree's moments. What cells share is
+gathered once, for their parent, in lists of nodes and dipoles that no cell above has taken
+(`dipole_expansion`, `lane_lists`); small leaves of the tree are taken apart into dipoles, as the
+moments of a node cost as much as seven of them. The remainder, bounded node by node, is the
+truncation of detail 1; finer details are the tree's. A promise is about f and not about the
+polynomial, so that steps lead from cell to cell. What a polynomial of degree p leaves out falls
+with the power p + 1 of the distance from the cell's center, which the bound follows: so dipoles
+within 2.5 radii of a cell are near and not within 3, with half as many cells and a third of the
+samples that the tree had to repeat.
 """
 
 from __future__ import annotations
@@ -21,25 +32,31 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import BoolArray, FloatArray, to_numpy, to_vector3
-from harnack.backend.arrays import aligned_integers
+from harnack.backend.arrays import upload_integers
 from harnack.backend.elementary import fmax
-from harnack.backend.record_table import Records
-from harnack.fields.clearance import epsilon_at
+from harnack.backend.record_table import RecordTable
+from harnack.fields.clearance import coordinate_rounding
 from harnack.fields.solid_angles.dipole_expansion import (
     COEFFICIENTS,
     DEGREE,
-    FarSums,
-    Sources,
+    DipoleExpansions,
+    PendingSources,
     source_tree,
 )
 from harnack.fields.solid_angles.local_expansion import (
+    evaluate_expansion,
+    local_to_local_matrices,
     rounding_tables,
-    shift_matrices,
-    value_and_gradient,
 )
-from harnack.fields.source_sums import SUM_ROUNDING, FieldSums
+from harnack.fields.source_sums import SUM_MARGIN, SourceSums
 from harnack.tree import NO_PRIMITIVE
-from harnack.tree.octree_lookup import DEEPEST, MARGIN, OCTANTS, CellLookup, numbered_nodes
+from harnack.tree.octree_lookup import (
+    BALL_MARGIN,
+    MAX_DEPTH,
+    OCTANT_DIRECTIONS,
+    OctreeLookup,
+    encode_nodes,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -47,34 +64,34 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, IntArray, Mask, Real, Vec3
     from harnack.fields.solid_angles.multipole import NodeMoments
     from harnack.fields.solid_angles.treecode import AddPrimitive, Treecode
-    from harnack.tree import Hierarchy, PackedTree
+    from harnack.tree import BalancedTree, PackedTree
 
-# Factors k of `far_sums`, by experiment: for a cell's own primitives, and for those that it gathers
-# for all cells in it. The second is larger, as each level of cells adds to the truncation.
+# Factors k of `dipole_expansion`, by experiment: for a cell's own primitives, and for those that it
+# gathers for all cells in it. The second is larger, as each level of cells adds to the truncation.
 _NEAR, _SHARED = 2.5, 4.0
 # Nodes of the tree are left to the cells in a cell up to this share of the radius of its ball.
-_SMALL = 0.35
+_SMALL_NODE_RATIO = 0.35
 # Cells are split that have more near primitives, by experiment; where memory is short, twice as
 # many, again and again, up to a number, or this part of all triangles, with which the tree, or
 # cells of edges, are faster. Cells of points for very many rays have this part as many.
-_MOST_NEAR, _TOO_MANY, _PART = 64, 512, 1 / 8
-_FINER = 3 / 8
+_MOST_NEAR, _MAX_NEAR, _MAX_NEAR_FRACTION = 64, 512, 1 / 8
+_FINER_FRACTION = 3 / 8
 # So many cells are made at once.
-_AT_ONCE = 1 << 14
+_CHUNK_SIZE = 1 << 14
 # Numbers of a record before the coefficients, and the base in which the first index is stored:
 # single precision holds no integers above 2^24.
-_HEAD, _BASE = 14, 4096
-_ANY = 2**31 - 1
+_HEADER_SIZE, _INDEX_BASE = 14, 4096
+_NO_LIMIT = 2**31 - 1
 
 
 @dataclass(frozen=True)
-class NearFarCells:
+class DipoleCells:
     """Cells on a backend.
 
     lookup: of cells, which are its leaves.
     records: center and one over the radius; bounds of truncation of value and gradient, everywhere
-        and in powers of the distance (`FarSums`), and of the rounding of the value;
-        `FarSums.fourth` and `least`; first index (two numbers) and number of near primitives |
+        and in powers of the distance (`DipoleExpansions`), and of the rounding of the value;
+        `DipoleExpansions.s4` and `least`; first index (two numbers) and number of near primitives |
         coefficients.
     near: the near primitives, as rows of `primitives`.
     primitives: records of all of them, in the slots of their tree.
@@ -82,16 +99,16 @@ class NearFarCells:
     """
 
     backend: Backend
-    lookup: CellLookup
-    records: Records
+    lookup: OctreeLookup
+    records: RecordTable
     near: Any
-    primitives: Records
+    primitives: RecordTable
     count: int
     size: int
 
     def sums(
         self, x: Vec3, active: Mask, add: AddPrimitive, own: tuple[Any, ...]
-    ) -> tuple[FieldSums, tuple[Any, ...], Mask]:
+    ) -> tuple[SourceSums, tuple[Any, ...], Mask]:
         """The sums over all primitives at x, with gradients, a state of the caller's own, and the
         mask of points for which they hold: those that are active and lie in the cube.
 
@@ -102,49 +119,55 @@ class NearFarCells:
         most `fourth` (1 - a/least)^-4, and that of area/distance^5 at most that over least - a.
 
         Rounding: x was rounded, by less than 2 units as a length; the center is exact. f changes by
-        at most the gradient times that, and by that squared times 4 `s4` (`FieldSums.sample`).
+        at most the gradient times that, and by that squared times 4 `s4` (`SourceSums.sample`).
         """
         vector, index = self.backend.Array3f, self.backend.UInt32
-        number, inside = self.lookup.leaf(x)
+        number, inside = self.lookup.find_leaf(x)
         active = active & inside
-        row = self.records.row(number, active)
+        row = self.records.read_record(number, active)
         u, inverse = x - vector(*row[:3]), row[3]
         y = u * inverse
-        value, *slopes = value_and_gradient(row[_HEAD : _HEAD + COEFFICIENTS], [*y], DEGREE)
+        value, *slopes = evaluate_expansion(
+            row[_HEADER_SIZE : _HEADER_SIZE + COEFFICIENTS], [*y], DEGREE
+        )
         error, slope_error, tail, tail_slope, rounding, fourth, least, low, high, count = row[
-            4:_HEAD
+            4:_HEADER_SIZE
         ]
-        away = dr.norm(u) * (1 + SUM_ROUNDING)
+        away = dr.norm(u) * (1 + SUM_MARGIN)
         error, slope_error = _with_tail(away * inverse, error, slope_error, tail, tail_slope)
         free = least - away
         s4 = fourth * dr.square(dr.square(least / free))
-        zero, gradient, moved = self.backend.Float(0), inverse * vector(*slopes), 2 * epsilon_at(x)
+        zero, gradient, moved = (
+            self.backend.Float(0),
+            inverse * vector(*slopes),
+            2 * coordinate_rounding(x),
+        )
         rounding = dr.fma(moved, dr.norm(gradient) + slope_error + 4 * moved * s4, rounding)
-        far = FieldSums(
+        far = SourceSums(
             value, gradient, None, error, slope_error, None, rounding, free, s4, s4 / free, zero
         )
-        first, count = index(low) + index(high) * _BASE, dr.select(active, index(count), 0)
+        first, count = index(low) + index(high) * _INDEX_BASE, dr.select(active, index(count), 0)
 
         def more(i: Any, *_: Any) -> Mask:
             return i < count
 
         def step(i: Any, sums: Any, own: Any) -> tuple[Any, ...]:
             go = i < count
-            primitive = self.primitives.row(dr.gather(index, self.near, first + i, go), go)
-            new, own = add(primitive, go, FieldSums.of(sums), own)
-            return i + 1, new.parts(), own
+            primitive = self.primitives.read_record(dr.gather(index, self.near, first + i, go), go)
+            new, own = add(primitive, go, SourceSums.from_state(sums), own)
+            return i + 1, new.to_state(), own
 
-        start = (index(0), far.parts(), own)
+        start = (index(0), far.to_state(), own)
         _, parts, own = dr.while_loop(start, more, step, label="near primitives")
-        sums, n = FieldSums.of(parts), self.backend.Float(count)
-        added = (_NEAR + 1) * self.backend.epsilon * n * sums.s4 / inverse
-        sums = dataclasses.replace(sums, slope_truncation=sums.slope_truncation + added)
+        sums, n = SourceSums.from_state(parts), self.backend.Float(count)
+        added = (_NEAR + 1) * self.backend.machine_epsilon * n * sums.s4 / inverse
+        sums = dataclasses.replace(sums, gradient_truncation=sums.gradient_truncation + added)
         return sums, own, active
 
-    def sums_or_tree(
+    def sums_with_tree(
         self, tree: Treecode, x: Vec3, detail: Real, add: tuple[AddPrimitive, AddPrimitive],
         own: tuple[Any, ...], where: Mask = True,
-    ) -> tuple[FieldSums, tuple[Any, ...]]:  # fmt: skip
+    ) -> tuple[SourceSums, tuple[Any, ...]]:  # fmt: skip
         """The sums at x, with gradients, and a state of the caller's own: of details up to 1 by the
         cells, and of larger ones or outside of the cube by the tree of the same primitives.
 
@@ -156,22 +179,22 @@ class NearFarCells:
         others, theirs = tree.sums(x, finer, in_tree, own, here & ~known)
         pairs = zip(state, theirs, strict=True)
         state = tuple(dr.select(known, one, other) for one, other in pairs)
-        return found.where(~known, others), state
+        return found.select(~known, others), state
 
 
 def _with_tail(
     q: Real, error: Real, slope: Real, tail: Real, tail_slope: Real
 ) -> tuple[Real, Real]:
-    """Bounds of truncation of value and gradient at q times the radius: see `FarSums`."""
+    """Bounds of truncation of value and gradient at q times the radius: see `DipoleExpansions`."""
     power = 1.0 + 0 * q
     for _ in range(DEGREE):
         power = power * q
-    up = 1 + SUM_ROUNDING
+    up = 1 + SUM_MARGIN
     return dr.fma(tail * up, power * q, error), dr.fma(tail_slope * up, power, slope)
 
 
 @dataclass(frozen=True)
-class _Level:
+class _CellLevel:
     """The cells of one size: centers (n, 3), the radius of their balls, which are not split, and
     the number of near primitives of those."""
 
@@ -182,9 +205,9 @@ class _Level:
 
 
 def build_cells(
-    backend: Backend, tree: Hierarchy, levels: list[NodeMoments], rows: FloatArray,
-    primitives: Records, half: float, most_bytes: int, *, finer: bool = False,
-) -> NearFarCells | None:  # fmt: skip
+    backend: Backend, tree: BalancedTree, levels: list[NodeMoments], rows: FloatArray,
+    primitives: RecordTable, half: float, most_bytes: int, *, finer: bool = False,
+) -> DipoleCells | None:  # fmt: skip
     """Cells of a cube [-h, h]^3, h at least `half`, of at most so many bytes, not counting what it
     takes to build them, which is several times as much; None where those would be too large to be
     of use. h has so few digits that single precision holds the centers of all cells exactly.
@@ -197,22 +220,28 @@ def build_cells(
     Proof that each primitive counts once in each cell that is not split. The root of the octree
     begins with the root of the tree. A cell that is split adds what is far from it to the
     expansions of all cells in it, and leaves the rest, nodes and primitives, to each of its octants
-    (`Sources.parted`). In a cell that is not split nothing but near primitives is left.
+    (`PendingSources.split_far`). In a cell that is not split nothing but near primitives is left.
     """
     packed = source_tree(tree, levels, rows)
     step = 2.0 ** (math.ceil(math.log2(half)) - 8)
     half = math.ceil(half / step) * step
-    few, most_near = _MOST_NEAR, _TOO_MANY
+    few, most_near = _MOST_NEAR, _MAX_NEAR
     if finer:
-        few = int(_FINER * few)
-    if packed.primitives.packets > 1:
-        part = int(_PART * (tree.slots != NO_PRIMITIVE).sum())
-        most_near = max(_MOST_NEAR, min(_TOO_MANY, part))
-    octree = _fitting(packed, half, backend, (few, most_near), most_bytes)
+        few = int(_FINER_FRACTION * few)
+    if packed.primitives.packets_per_record > 1:
+        part = int(_MAX_NEAR_FRACTION * (tree.leaf_slots != NO_PRIMITIVE).sum())
+        most_near = max(_MOST_NEAR, min(_MAX_NEAR, part))
+    octree = _octree_within_memory(packed, half, backend, (few, most_near), most_bytes)
     if octree is None:
         return None
-    double, shifts = packed.backend, shift_matrices(DEGREE, 0.5 / (math.sqrt(3) * MARGIN))
-    sources, above = Sources.of_root(double), _Above(FarSums.none(1), shifts, 0.0)
+    double, shifts = (
+        packed.backend,
+        local_to_local_matrices(DEGREE, 0.5 / (math.sqrt(3) * BALL_MARGIN)),
+    )
+    sources, above = (
+        PendingSources.of_root(double),
+        _ParentExpansions(DipoleExpansions.zero(1), shifts, 0.0),
+    )
     nodes: list[IntArray] = []
     tables: list[npt.NDArray[Any]] = []
     near: list[npt.NDArray[Any]] = []
@@ -220,86 +249,88 @@ def build_cells(
     for level in octree:
         leaves, split = np.flatnonzero(level.is_leaf), np.flatnonzero(~level.is_leaf)
         radius, none_stay = (dr.opaque(double.Float, one) for one in (level.radius, -1.0))
-        for some in _parts(leaves):
-            own, c = sources.some(double, some), to_vector3(double, level.centers[some])
-            sums, close = own.parted(packed, c, radius, _NEAR, none_stay)
+        for some in _chunks(leaves):
+            own, c = sources.subset(double, some), to_vector3(double, level.centers[some])
+            sums, close = own.split_far(packed, c, radius, _NEAR, none_stay)
             lengths = to_numpy(close.primitives.count).astype(np.int64)
             first = total + np.cumsum(lengths) - lengths
             placed = level.centers[some], level.radius
-            table = _table(backend, *placed, sums.plus(above.of(some)), first, lengths)
+            table = _cell_records(backend, *placed, sums.plus(above.of(some)), first, lengths)
             tables.append(table.astype(backend.dtype))
             near.append(to_numpy(close.primitives.entries)[: int(lengths.sum())])
             total += int(lengths.sum())
-        nodes.append(numbered_nodes(level.is_leaf, count, splits))
+        nodes.append(encode_nodes(level.is_leaf, count, splits))
         count, splits = count + len(leaves), splits + len(split)
-        found: list[FarSums] = []
-        left: list[Sources] = []
-        for some in _parts(split):
-            ours, c = sources.some(double, some), to_vector3(double, level.centers[some])
-            sums, rest = ours.parted(packed, c, radius, _SHARED, _SMALL * radius)
+        found: list[DipoleExpansions] = []
+        left: list[PendingSources] = []
+        for some in _chunks(split):
+            ours, c = sources.subset(double, some), to_vector3(double, level.centers[some])
+            sums, rest = ours.split_far(packed, c, radius, _SHARED, _SMALL_NODE_RATIO * radius)
             found.append(sums.plus(above.of(some)))
             left.append(rest)
         if len(split):
-            above = _Above(FarSums.joined(found), shifts, level.radius)
-            sources = Sources.joined(double, left).some(double, np.repeat(np.arange(len(split)), 8))
+            above = _ParentExpansions(DipoleExpansions.concatenate(found), shifts, level.radius)
+            sources = PendingSources.concatenate(double, left).subset(
+                double, np.repeat(np.arange(len(split)), 8)
+            )
     table, entries = np.concatenate(tables), np.concatenate(near)
-    return NearFarCells(
-        backend, CellLookup.of(backend, np.full(3, -half), 2 * half, nodes),
-        Records.upload(backend, table),
-        aligned_integers(backend, entries if len(entries) else np.zeros(1, np.uint32)), primitives,
+    return DipoleCells(
+        backend, OctreeLookup.from_levels(backend, np.full(3, -half), 2 * half, nodes),
+        RecordTable.upload(backend, table),
+        upload_integers(backend, entries if len(entries) else np.zeros(1, np.uint32)), primitives,
         count, _bytes(backend, octree),
     )  # fmt: skip
 
 
-def _parts(cells: IntArray) -> list[IntArray]:
+def _chunks(cells: IntArray) -> list[IntArray]:
     """Cells by so many at once that lists of what is far from them take little memory."""
-    return [cells[start : start + _AT_ONCE] for start in range(0, len(cells), _AT_ONCE)]
+    return [cells[start : start + _CHUNK_SIZE] for start in range(0, len(cells), _CHUNK_SIZE)]
 
 
 @dataclass(frozen=True)
-class _Above:
+class _ParentExpansions:
     """The sums that cells of a level take over from those around them, `sums` with this radius, in
-    whose order their octants come. shifts: `local_expansion.shift_matrices`."""
+    whose order their octants come. shifts: `local_expansion.local_to_local_matrices`."""
 
-    sums: FarSums
+    sums: DipoleExpansions
     shifts: FloatArray
     radius: float
 
-    def of(self, cells: IntArray) -> FarSums:
+    def of(self, cells: IntArray) -> DipoleExpansions:
         """Those of some cells of the level, by their numbers."""
         if not self.radius:  # the first level has nothing above
             return self.sums
         parents, which = np.unique(cells // 8, return_inverse=True)
-        octants = self.sums.some(parents).of_octants(self.shifts, self.radius)
-        return octants.some(8 * which + cells % 8)
+        octants = self.sums.subset(parents).to_octants(self.shifts, self.radius)
+        return octants.subset(8 * which + cells % 8)
 
 
-def _table(
-    backend: Backend, centers: FloatArray, radius: float, sums: FarSums, first: IntArray,
+def _cell_records(
+    backend: Backend, centers: FloatArray, radius: float, sums: DipoleExpansions, first: IntArray,
     lengths: IntArray,
 ) -> FloatArray:  # fmt: skip
     """Records of cells. Rounding is that of `rounding_tables`, for coordinates within a cell; that
     of positions is counted where they are known, and that of the gradient, over the radius, counts
     as truncation."""
-    tables = rounding_tables(DEGREE, MARGIN / math.sqrt(3))
-    rounding = backend.epsilon * np.abs(sums.coefficients) @ tables
+    tables = rounding_tables(DEGREE, BALL_MARGIN / math.sqrt(3))
+    rounding = backend.machine_epsilon * np.abs(sums.coefficients) @ tables
     slope = sums.slope + rounding[:, 1:].sum(axis=1) / radius
-    up, inverse = 1 + SUM_ROUNDING, np.full(len(first), 1 / radius)
-    least = np.minimum(sums.least, 1e3) / up
-    bounds = (sums.error, slope, sums.tail, sums.tail_slope, rounding[:, 0], sums.fourth)
-    numbered = first % _BASE, first // _BASE, lengths
+    up, inverse = 1 + SUM_MARGIN, np.full(len(first), 1 / radius)
+    least = np.minimum(sums.min_distance, 1e3) / up
+    bounds = (sums.error, slope, sums.tail, sums.tail_slope, rounding[:, 0], sums.s4)
+    numbered = first % _INDEX_BASE, first // _INDEX_BASE, lengths
     head = [centers, inverse, *(one * up for one in bounds), least, *numbered]
     return np.column_stack([*head, sums.coefficients])
 
 
-def _fitting(
+def _octree_within_memory(
     packed: PackedTree, half: float, backend: Backend, near: tuple[int, int], most_bytes: int
-) -> list[_Level] | None:
+) -> list[_CellLevel] | None:
     """The octree, with as few near primitives in a cell as memory allows, from the first number on;
     None where it takes more than the second: lists of near ones take nearly as much memory,
     whatever the size of the cells."""
 
-    def is_too_large(levels: list[_Level]) -> bool:
+    def is_too_large(levels: list[_CellLevel]) -> bool:
         return _bytes(backend, levels) > most_bytes
 
     some, most_near = near
@@ -309,32 +340,35 @@ def _fitting(
 
 
 def _octree(
-    packed: PackedTree, half: float, most_near: int, too_large: Callable[[list[_Level]], bool]
-) -> list[_Level] | None:
+    packed: PackedTree, half: float, most_near: int, too_large: Callable[[list[_CellLevel]], bool]
+) -> list[_CellLevel] | None:
     """The cells of a cube, level by level, split where more primitives are near; None where they
     are too large."""
     backend = packed.backend
-    root = Sources.of_root(backend)
-    levels: list[_Level] = []
+    root = PendingSources.of_root(backend)
+    levels: list[_CellLevel] = []
     centers = np.zeros((1, 3))
     while len(centers):
         side = half / 2 ** len(levels)
-        radius = math.sqrt(3) * side * MARGIN
-        is_last = len(levels) == DEEPEST
-        most = dr.opaque(backend.UInt32, _ANY if is_last else most_near)
+        radius = math.sqrt(3) * side * BALL_MARGIN
+        is_last = len(levels) == MAX_DEPTH
+        most = dr.opaque(backend.UInt32, _NO_LIMIT if is_last else most_near)
         near, none_stay = dr.opaque(backend.Float, _NEAR * radius), dr.opaque(backend.Float, -1.0)
-        ours, c = root.some(backend, np.zeros(len(centers), np.int64)), to_vector3(backend, centers)
+        ours, c = (
+            root.subset(backend, np.zeros(len(centers), np.int64)),
+            to_vector3(backend, centers),
+        )
         found = ours.primitives_of(packed, c, near, none_stay, None, far=False, most=most)
         count = to_numpy(found).astype(np.int64)
         is_leaf = np.broadcast_to(count <= most_near, len(centers)) | is_last
-        levels.append(_Level(centers, radius, is_leaf, count))
+        levels.append(_CellLevel(centers, radius, is_leaf, count))
         if too_large(levels):
             return None
-        centers = (centers[~is_leaf][:, None] + 0.5 * side * OCTANTS).reshape(-1, 3)
+        centers = (centers[~is_leaf][:, None] + 0.5 * side * OCTANT_DIRECTIONS).reshape(-1, 3)
     return levels
 
 
-def _bytes(backend: Backend, levels: list[_Level]) -> int:
+def _bytes(backend: Backend, levels: list[_CellLevel]) -> int:
     """Bytes of cells: records, lists of near primitives, and nodes; of cells that are still to be
     split, no less than eight records each."""
     leaves, near = 8 * int((~levels[-1].is_leaf).sum()), 0
@@ -342,5 +376,5 @@ def _bytes(backend: Backend, levels: list[_Level]) -> int:
         leaves += int(one.is_leaf.sum())
         near += int(one.near[one.is_leaf].sum())
     nodes = sum(len(one.is_leaf) for one in levels)
-    record = 8 * -(-(_HEAD + COEFFICIENTS) // 8) * np.dtype(backend.dtype).itemsize
-    return record * leaves + 4 * near + CellLookup.size(nodes)
+    record = 8 * -(-(_HEADER_SIZE + COEFFICIENTS) // 8) * np.dtype(backend.dtype).itemsize
+    return record * leaves + 4 * near + OctreeLookup.memory_bytes(nodes)

@@ -2,13 +2,14 @@
 
 - `source_tree`: a tree of primitives, dipoles or triangles, in double precision, with all that
   expansions need; `triangle_sources`: triangles as records.
-- `FarSums`: sums over far nodes and far primitives.
-- `Sources`: the primitives of balls, parted into such sums and what is left to smaller balls.
+- `DipoleExpansions`: sums over far nodes and far primitives.
+- `PendingSources`: the primitives of balls, parted into such sums and what is left to smaller
+  balls.
 
 A node of radius R is far from a ball of radius rho if their centers are farther apart than k rho +
-`_SPREAD` R, a triangle if they are farther apart than k rho + `TRIANGLE_SPREAD` R, a dipole if it
-is farther from the ball's center than k rho, for a factor k > 1: then all points of it are farther
-from the center than k rho. A triangle is a sheet of dipoles, along its normal.
+`_NODE_RATIO` R, a triangle if they are farther apart than k rho + `TRIANGLE_RATIO` R, a dipole if
+it is farther from the ball's center than k rho, for a factor k > 1: then all points of it are
+farther from the center than k rho. A triangle is a sheet of dipoles, along its normal.
 """
 
 from __future__ import annotations
@@ -22,15 +23,26 @@ import numpy as np
 
 from harnack.backend import FloatArray, IntArray, choose_backend, to_numpy
 from harnack.backend.elementary import fmin
-from harnack.fields.solid_angles.local_expansion import irregular, of_cluster, parts, tail_factors
+from harnack.fields.solid_angles.local_expansion import (
+    coefficient_keys,
+    irregular_harmonics,
+    multipole_to_local,
+    tail_factors,
+)
 from harnack.fields.solid_angles.multipole import (
     NodeMoments,
     sup_norm,
-    triangle_levels,
-    truncation,
+    triangle_tree_moments,
+    truncation_bounds,
 )
-from harnack.tree import Hierarchy, Node, PackedTree, pack
-from harnack.tree.lane_lists import Lists, Put, each_entry, make_lists, walk_lists
+from harnack.tree import BalancedTree, PackedTree, VisitedNode, pack_tree
+from harnack.tree.lane_lists import (
+    LaneLists,
+    WriteEntry,
+    build_lists,
+    for_each_entry,
+    traverse_subtrees,
+)
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
@@ -39,35 +51,35 @@ if TYPE_CHECKING:
 # ruff: noqa: E741
 
 # The degree of local expansions, and the largest of the multipoles that they are made of.
-DEGREE, _POLES = 6, 4
+DEGREE, _MULTIPOLE_DEGREE = 6, 4
 COEFFICIENTS = (DEGREE + 1) ** 2
-_SPREAD = 4.0
+_NODE_RATIO = 4.0
 # The same factor of triangles, by experiment; and the moments in their records, besides the first.
-TRIANGLE_SPREAD = 1.5
-_TRIANGLE_MOMENTS = tuple(key for key in parts(_POLES) if key[0] > 2)
+TRIANGLE_RATIO = 1.5
+_TRIANGLE_MOMENTS = tuple(key for key in coefficient_keys(_MULTIPOLE_DEGREE) if key[0] > 2)
 # Numbers of a record of a dipole, and of a triangle before its moments.
-_DIPOLE, _TRIANGLE = 8, 14
-# See `_Expanded.of`.
+_DIPOLE_SIZE, _TRIANGLE_HEADER_SIZE = 8, 14
+# See `_ClusterExpansion.of`.
 _ROUNDING = 2.0**-20
 # Moments of a node, in order.
-_MOMENTS = tuple(key for key in parts(_POLES) if key[0])
+_MOMENTS = tuple(key for key in coefficient_keys(_MULTIPOLE_DEGREE) if key[0])
 # Sums of many positive numbers in double precision, as bounds.
 _ROUNDED_UP = 1 + 1e-9
 
 
-def source_tree(tree: Hierarchy, levels: list[NodeMoments], rows: FloatArray) -> PackedTree:
-    """Nodes: center, `_SPREAD` times the radius, radius, area | moments up to `_POLES`, (E, G) of
-    `multipole.truncation`, and the sup norms of the moments. rows: of primitives in slots, dipoles
-    (`far_clusters.dipole_rows`) or `triangle_sources`."""
+def source_tree(tree: BalancedTree, levels: list[NodeMoments], rows: FloatArray) -> PackedTree:
+    """Nodes: center, `_NODE_RATIO` times the radius, radius, area | moments up to
+    `_MULTIPOLE_DEGREE`, (E, G) of `multipole.truncation`, and the sup norms of the moments. rows:
+    of primitives in slots, dipoles (`treecode.dipole_records`) or `triangle_sources`."""
     numbers: list[FloatArray] = []
     for level in levels:
-        reach = _SPREAD * level.radius
-        left_out, slope, _ = truncation(level, reach, _POLES - 1)
+        reach = _NODE_RATIO * level.radius
+        left_out, slope, _ = truncation_bounds(level, reach, _MULTIPOLE_DEGREE - 1)
         moments = _columns(level, _MOMENTS)
-        norms = [sup_norm(level.moments, l) for l in range(1, _POLES + 1)]
+        norms = [sup_norm(level.moments, l) for l in range(1, _MULTIPOLE_DEGREE + 1)]
         head = [level.center, reach, level.radius, level.area]
         numbers.append(np.column_stack([*head, *moments, left_out, slope, *norms]))
-    return pack(choose_backend("double"), tree, numbers, rows)
+    return pack_tree(choose_backend("double"), tree, numbers, rows)
 
 
 def _columns(level: NodeMoments, keys: Iterable[tuple[int, int, int]]) -> list[FloatArray]:
@@ -76,7 +88,7 @@ def _columns(level: NodeMoments, keys: Iterable[tuple[int, int, int]]) -> list[F
 
 
 def triangle_sources(corners: FloatArray) -> FloatArray:
-    """(n, 30) records of triangles (n, 3, 3): centroid, area times normal, area, `TRIANGLE_SPREAD`
+    """(n, 30) records of triangles (n, 3, 3): centroid, area times normal, area, `TRIANGLE_RATIO`
     times the radius | radius, (E, G) of `multipole.truncation`, the sup norms of the moments 1, 3
     and 4, and the moments 3 and 4.
 
@@ -84,10 +96,10 @@ def triangle_sources(corners: FloatArray) -> FloatArray:
     whose area is rounded to 0 is given one of 1e-30: records without an area are empty slots, and
     its edges count.
     """
-    alone = Hierarchy(np.arange(len(corners), dtype=np.int64)[:, None], ())
-    level = triangle_levels(alone, corners)[0]
-    moments, reach = level.moments, TRIANGLE_SPREAD * level.radius
-    left_out, slope, _ = truncation(level, reach, _POLES - 1)
+    alone = BalancedTree(np.arange(len(corners), dtype=np.int64)[:, None], ())
+    level = triangle_tree_moments(alone, corners)[0]
+    moments, reach = level.moments, TRIANGLE_RATIO * level.radius
+    left_out, slope, _ = truncation_bounds(level, reach, _MULTIPOLE_DEGREE - 1)
     normal = 2 * moments[1, 1].real, 2 * moments[1, 1].imag, moments[1, 0].real
     higher = _columns(level, _TRIANGLE_MOMENTS)
     norms = [sup_norm(moments, l) for l in (1, 3, 4)]
@@ -96,16 +108,16 @@ def triangle_sources(corners: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class FarSums:
+class DipoleExpansions:
     """Sums over far primitives of n balls.
 
     coefficients: (n, COEFFICIENTS) of the local expansion (`local_expansion.parts`).
     error, slope: (n,) bounds of what it leaves out of value and gradient, anywhere in the ball.
     tail, tail_slope: (n,) of what it leaves out besides: at a distance a from the center at most
         q^(p+1) and q^p times these, with q = a/radius and p = `DEGREE`.
-    fourth: (n,) bounds of the sums of area/D^4, D the least distance of a primitive from the
+    s4: (n,) bounds of the sums of area/D^4, D the least distance of a primitive from the
         center.
-    least: (n,) a distance from the center within which there are none of these primitives.
+    min_distance: (n,) a distance from the center within which there are none of these primitives.
     """
 
     coefficients: FloatArray
@@ -113,33 +125,33 @@ class FarSums:
     slope: FloatArray
     tail: FloatArray
     tail_slope: FloatArray
-    fourth: FloatArray
-    least: FloatArray
+    s4: FloatArray
+    min_distance: FloatArray
 
     @classmethod
-    def none(cls, n: int) -> FarSums:
+    def zero(cls, n: int) -> DipoleExpansions:
         """Sums over nothing."""
         zero = np.zeros(n)
-        return cls(np.zeros((n, COEFFICIENTS)), *(5 * [zero]), least=np.full(n, np.inf))
+        return cls(np.zeros((n, COEFFICIENTS)), *(5 * [zero]), min_distance=np.full(n, np.inf))
 
-    def plus(self, other: FarSums) -> FarSums:
+    def plus(self, other: DipoleExpansions) -> DipoleExpansions:
         """The sums over the primitives of both."""
-        bounds = "error", "slope", "tail", "tail_slope", "fourth"
+        bounds = "error", "slope", "tail", "tail_slope", "s4"
         sums = (_ROUNDED_UP * (getattr(self, one) + getattr(other, one)) for one in bounds)
-        least = np.minimum(self.least, other.least)
-        return FarSums(self.coefficients + other.coefficients, *sums, least=least)
+        least = np.minimum(self.min_distance, other.min_distance)
+        return DipoleExpansions(self.coefficients + other.coefficients, *sums, min_distance=least)
 
-    def some(self, which: IntArray) -> FarSums:
+    def subset(self, which: IntArray) -> DipoleExpansions:
         """Those of these balls; a ball may occur several times."""
-        return FarSums(*(one[which] for one in vars(self).values()))
+        return DipoleExpansions(*(one[which] for one in vars(self).values()))
 
     @classmethod
-    def joined(cls, parts: list[FarSums]) -> FarSums:
+    def concatenate(cls, parts: list[DipoleExpansions]) -> DipoleExpansions:
         """The sums of all balls, part by part."""
         columns = zip(*(vars(one).values() for one in parts), strict=True)
         return cls(*(np.concatenate(column) for column in columns))
 
-    def of_octants(self, shifts: FloatArray, radius: float) -> FarSums:
+    def to_octants(self, shifts: FloatArray, radius: float) -> DipoleExpansions:
         """The same sums seen from the eight octants of cells with balls of this radius, octant
         by octant of each cell.
 
@@ -149,52 +161,56 @@ class FarSums:
         shrink by at most that, and 1/D^4 grows by at most (1 - radius/(2 least))^-4, D >= least.
         """
         shifted = np.einsum("oab,kb->koa", shifts, self.coefficients)
-        share = 0.5 * radius / self.least  # 0 where there is nothing
+        share = 0.5 * radius / self.min_distance  # 0 where there is nothing
         error, slope = self.error + self.tail, self.slope + self.tail_slope
-        far = self.fourth / (1 - share) ** 4, self.least - 0.5 * radius
+        far = self.s4 / (1 - share) ** 4, self.min_distance - 0.5 * radius
         bounds = _ROUNDED_UP * error, _ROUNDED_UP * slope, 0 * error, 0 * slope, *far
         others = (np.repeat(one, 8) for one in bounds)
-        return FarSums(shifted.reshape(-1, COEFFICIENTS), *others)
+        return DipoleExpansions(shifted.reshape(-1, COEFFICIENTS), *others)
 
     @classmethod
-    def over_nodes(cls, tree: PackedTree, lists: Lists, c: Vec3, radius: Real) -> FarSums:
+    def over_nodes(
+        cls, tree: PackedTree, lists: LaneLists, c: Vec3, radius: Real
+    ) -> DipoleExpansions:
         """Sums over listed far nodes, for balls around c."""
 
         def term(i: Any, active: Mask) -> list[Any]:
-            head, payload = tree.heads.row(i, active), tree.payload(i, active)
+            head, payload = tree.node_heads.read_record(i, active), tree.payload(i, active)
             numbers = dict(zip(_MOMENTS, payload, strict=False))
             left_out, slope_left_out, *norms = payload[len(_MOMENTS) :]
             r = c - tree.backend.Array3f(*head[:3])
-            found = _Expanded.of(r, _pairs(numbers), norms, radius)
+            found = _ClusterExpansion.of(r, _pairs(numbers), norms, radius)
             return found.of_cluster(left_out, slope_left_out, head[4], head[5], radius)
 
         return cls._accumulated(tree.backend, lists, term)
 
     @classmethod
-    def over_primitives(cls, tree: PackedTree, lists: Lists, c: Vec3, radius: Real) -> FarSums:
+    def over_primitives(
+        cls, tree: PackedTree, lists: LaneLists, c: Vec3, radius: Real
+    ) -> DipoleExpansions:
         """Sums over listed far primitives, for balls around c."""
 
         def term(i: Any, active: Mask) -> list[Any]:
-            row = tree.primitives.row(i, active)
+            row = tree.primitives.read_record(i, active)
             first = {(1, 0): (row[5], 0.0), (1, 1): (0.5 * row[3], 0.5 * row[4])}
             r = c - tree.backend.Array3f(*row[:3])
-            if tree.primitives.packets == 1:
-                found = _Expanded.of(r, first, [row[6]], radius)
+            if tree.primitives.packets_per_record == 1:
+                found = _ClusterExpansion.of(r, first, [row[6]], radius)
                 bounds = found.rounding, found.rounding / radius, found.tail, found.tail_slope
                 rest = row[6] * _fourth(found.inverse), dr.rcp(found.inverse)
                 return [*found.coefficients, *bounds, *rest]
-            size, left_out, slope_left_out, *norms = row[_DIPOLE:_TRIANGLE]
-            higher = dict(zip(_TRIANGLE_MOMENTS, row[_TRIANGLE:], strict=False))
+            size, left_out, slope_left_out, *norms = row[_DIPOLE_SIZE:_TRIANGLE_HEADER_SIZE]
+            higher = dict(zip(_TRIANGLE_MOMENTS, row[_TRIANGLE_HEADER_SIZE:], strict=False))
             norms.insert(1, 0 * size)
-            found = _Expanded.of(r, first | _pairs(higher), norms, radius)
+            found = _ClusterExpansion.of(r, first | _pairs(higher), norms, radius)
             return found.of_cluster(left_out, slope_left_out, size, row[6], radius)
 
         return cls._accumulated(tree.backend, lists, term)
 
     @classmethod
     def _accumulated(
-        cls, backend: Backend, lists: Lists, term: Callable[[Any, Mask], list[Any]]
-    ) -> FarSums:
+        cls, backend: Backend, lists: LaneLists, term: Callable[[Any, Mask], list[Any]]
+    ) -> DipoleExpansions:
         """term: from an entry of a list, all numbers, the last of which is a minimum."""
         zero = backend.Float(0)
 
@@ -206,13 +222,13 @@ class FarSums:
             return *new, dr.select(active, fmin(least, nearest), least)
 
         start = (*([zero] * (COEFFICIENTS + 5)), zero + dr.inf)
-        found = each_entry(backend, lists, add, start)
+        found = for_each_entry(backend, lists, add, start)
         dr.eval(*found)
         n = dr.width(lists.count)
         columns = [np.broadcast_to(to_numpy(one), n) for one in found]
         coefficients = np.stack(columns[:COEFFICIENTS], axis=1)
         bounds = (one * _ROUNDED_UP for one in columns[COEFFICIENTS:-1])
-        return cls(coefficients, *bounds, least=columns[-1] / _ROUNDED_UP)
+        return cls(coefficients, *bounds, min_distance=columns[-1] / _ROUNDED_UP)
 
 
 def _fourth(number: Any) -> Any:
@@ -229,7 +245,7 @@ def _pairs(numbers: dict[Any, Any]) -> dict[tuple[int, int], tuple[Any, Any]]:
 
 
 @dataclass(frozen=True)
-class _Expanded:
+class _ClusterExpansion:
     """The local expansion of multipole terms: coefficients times powers of the ball's radius,
     bounds of what it leaves out of value and gradient on the ball's sphere, of the rounding of the
     value, and one over the distance."""
@@ -241,7 +257,7 @@ class _Expanded:
     inverse: Any
 
     @classmethod
-    def of(cls, r: Vec3, moments: Any, norms: list[Any], radius: Real) -> _Expanded:
+    def of(cls, r: Vec3, moments: Any, norms: list[Any], radius: Real) -> _ClusterExpansion:
         """r: from the multipoles to the ball's center. norms: of the terms l = 1, 2, ...: term l is
         at most norms[l-1]/r^(l+1). The bounds are those of `tail_factors`, whose c grows with l:
         they bound all terms of degree j > p, so that at q times the radius, q <= 1, q^(p+1) times
@@ -253,13 +269,15 @@ class _Expanded:
         compute it). So value, and gradient times the radius, are off by at most 2^-20 of that.
         """
         inverse = dr.rsqrt(dr.squared_norm(r))
-        seen = irregular(r.x, r.y, r.z, inverse, DEGREE + len(norms))
+        seen = irregular_harmonics(r.x, r.y, r.z, inverse, DEGREE + len(norms))
         powers, q = [1.0], radius * inverse
         total, largest, u, power = 0.0, 0.0, inverse, q
         for _ in range(DEGREE):
             powers.append(powers[-1] * radius)
             power = power * q
-        found = zip(parts(DEGREE), of_cluster(moments, seen, DEGREE), strict=True)
+        found = zip(
+            coefficient_keys(DEGREE), multipole_to_local(moments, seen, DEGREE), strict=True
+        )
         coefficients = [one * powers[j] for (j, _, _), one in found]
         ratio = 1.0
         for l, norm in enumerate(norms, start=1):
@@ -274,7 +292,8 @@ class _Expanded:
     def of_cluster(
         self, left_out: Real, slope_left_out: Real, size: Real, area: Real, radius: Real
     ) -> list[Any]:
-        """The numbers of `FarSums` of a cluster of dipoles with moments up to `_POLES`.
+        """The numbers of `DipoleExpansions` of a cluster of dipoles with moments up to
+        `_MULTIPOLE_DEGREE`.
 
         left_out, slope_left_out: (E, G) of `multipole.truncation`, for points that are no nearer
         than the ball. size: the cluster's radius. area: that of its dipoles.
@@ -282,7 +301,7 @@ class _Expanded:
         distance = dr.rcp(self.inverse)
         near = dr.rcp(distance - radius)
         power = near
-        for _ in range(_POLES + 1):
+        for _ in range(_MULTIPOLE_DEGREE + 1):
             power = power * near
         error = self.rounding + left_out * power
         slope = self.rounding / radius + slope_left_out * power * near
@@ -292,31 +311,33 @@ class _Expanded:
 
 
 @dataclass(frozen=True)
-class Sources:
+class PendingSources:
     """Primitives that balls have still to take into account: those of the nodes of one list for
     each ball, and those of another list, rows of the tree's primitives."""
 
-    nodes: Lists
-    primitives: Lists
+    nodes: LaneLists
+    primitives: LaneLists
 
     @classmethod
-    def of_root(cls, backend: Backend) -> Sources:
+    def of_root(cls, backend: Backend) -> PendingSources:
         """All primitives of a tree, for one ball."""
-        return cls(Lists.of_root(backend), Lists.none(backend))
+        return cls(LaneLists.of_root(backend), LaneLists.empty(backend))
 
-    def some(self, backend: Backend, lanes: IntArray) -> Sources:
+    def subset(self, backend: Backend, lanes: IntArray) -> PendingSources:
         """Those of these balls; a ball may occur several times."""
-        return Sources(self.nodes.some(backend, lanes), self.primitives.some(backend, lanes))
+        return PendingSources(
+            self.nodes.subset(backend, lanes), self.primitives.subset(backend, lanes)
+        )
 
     @classmethod
-    def joined(cls, backend: Backend, parts: list[Sources]) -> Sources:
+    def concatenate(cls, backend: Backend, parts: list[PendingSources]) -> PendingSources:
         """Those of all balls, part by part."""
-        nodes = Lists.joined(backend, [one.nodes for one in parts])
-        return cls(nodes, Lists.joined(backend, [one.primitives for one in parts]))
+        nodes = LaneLists.concatenate(backend, [one.nodes for one in parts])
+        return cls(nodes, LaneLists.concatenate(backend, [one.primitives for one in parts]))
 
-    def parted(
+    def split_far(
         self, tree: PackedTree, c: Vec3, radius: Real, factor: float, smallest: Real
-    ) -> tuple[FarSums, Sources]:
+    ) -> tuple[DipoleExpansions, PendingSources]:
         """Sums over what is farther than `factor` radii from the centers c of balls, and the rest.
 
         smallest: inner nodes up to this radius stay nodes where they are not far. Others are
@@ -326,29 +347,36 @@ class Sources:
         """
         backend, inner = tree.backend, factor * radius
         far, left = (
-            make_lists(
+            build_lists(
                 backend,
                 lambda put, far=far: _nodes(tree, self.nodes, c, inner, smallest, put, far=far),
             )
             for far in (True, False)
         )
         far_primitives, near = (
-            make_lists(
+            build_lists(
                 backend,
                 lambda put, far=far: self.primitives_of(tree, c, inner, smallest, put, far=far),
             )
             for far in (True, False)
         )
-        sums = FarSums.over_nodes(tree, far, c, radius)
-        sums = sums.plus(FarSums.over_primitives(tree, far_primitives, c, radius))
-        return sums, Sources(left, near)
+        sums = DipoleExpansions.over_nodes(tree, far, c, radius)
+        sums = sums.plus(DipoleExpansions.over_primitives(tree, far_primitives, c, radius))
+        return sums, PendingSources(left, near)
 
     def primitives_of(
-        self, tree: PackedTree, c: Vec3, inner: Real, smallest: Real, put: Put | None, *, far: bool,
+        self,
+        tree: PackedTree,
+        c: Vec3,
+        inner: Real,
+        smallest: Real,
+        put: WriteEntry | None,
+        *,
+        far: bool,
         most: Any = None,
-    ) -> Any:  # fmt: skip
+    ) -> Any:
         """The number of primitives, of the second list and of leaves that are not far, that are
-        farther from c than `inner` and their reach, or of the others; for `make_lists`. Once it is
+        farther from c than `inner` and their reach, or of the others; for `build_lists`. Once it is
         more than `most`, not all may be counted.
 
         A leaf that is far has no near primitives. A triangle's box lies in the ball of its node, so
@@ -356,14 +384,14 @@ class Sources:
         than inner + 4 R - R, and the reach is at most 1.5 * 2 R.
         """
         index, vector = tree.backend.UInt32, tree.backend.Array3f
-        are_points = tree.primitives.packets == 1
+        are_points = tree.primitives.packets_per_record == 1
 
         def is_chosen(row: list[Real], active: Mask) -> Mask:
             reach = inner if are_points else inner + row[7]
             is_far = dr.squared_norm(c - vector(*row[:3])) > dr.square(reach)
             return (is_far if far else ~is_far) & (row[6] > 0) & active
 
-        def visit(node: Node, state: tuple[Any, ...]) -> tuple[Mask, tuple[Any, ...]]:
+        def visit(node: VisitedNode, state: tuple[Any, ...]) -> tuple[Mask, tuple[Any, ...]]:
             square = dr.squared_norm(c - vector(*node.head[:3]))
             down = square <= dr.square(inner + node.head[3])
             if are_points and not far:  # only nodes that come near have near points
@@ -384,25 +412,31 @@ class Sources:
             return down, (dr.while_loop((index(0), state[0]), more, step, label="primitives")[1],)
 
         def listed(i: Any, active: Mask, state: tuple[Any, ...]) -> tuple[Any, ...]:
-            chosen = is_chosen(tree.primitives.row(i, active), active)
+            chosen = is_chosen(tree.primitives.read_record(i, active), active)
             if put is not None:
                 put(state[0], i, chosen)
             return (state[0] + dr.select(chosen, index(1), index(0)),)
 
-        found = walk_lists(tree, self.nodes, visit, (index(0),))
-        return each_entry(tree.backend, self.primitives, listed, found)[0]
+        found = traverse_subtrees(tree, self.nodes, visit, (index(0),))
+        return for_each_entry(tree.backend, self.primitives, listed, found)[0]
 
 
 def _nodes(
-    tree: PackedTree, lists: Lists, c: Vec3, inner: Real, smallest: Real, put: Put | None, *,
+    tree: PackedTree,
+    lists: LaneLists,
+    c: Vec3,
+    inner: Real,
+    smallest: Real,
+    put: WriteEntry | None,
+    *,
     far: bool,
-) -> Any:  # fmt: skip
+) -> Any:
     """The number of nodes in listed subtrees that are far from c, or of the inner ones that are
-    left: not far, with a radius of at most `smallest`; for `make_lists`. Others are replaced by
+    left: not far, with a radius of at most `smallest`; for `build_lists`. Others are replaced by
     their children; leaves that are not far are in neither."""
     index, vector = tree.backend.UInt32, tree.backend.Array3f
 
-    def visit(node: Node, state: tuple[Any, ...]) -> tuple[Mask, tuple[Any, ...]]:
+    def visit(node: VisitedNode, state: tuple[Any, ...]) -> tuple[Mask, tuple[Any, ...]]:
         is_far = dr.squared_norm(c - vector(*node.head[:3])) > dr.square(inner + node.head[3])
         is_left = ~is_far & ~node.is_leaf & (node.head[4] <= smallest)
         chosen = is_far if far else is_left
@@ -410,4 +444,4 @@ def _nodes(
             put(state[0], node.index, chosen)
         return ~(is_far | is_left), (state[0] + dr.select(chosen, index(1), index(0)),)
 
-    return walk_lists(tree, lists, visit, (index(0),))[0]
+    return traverse_subtrees(tree, lists, visit, (index(0),))[0]

@@ -13,8 +13,8 @@ Each g is harmonic in the ball by itself: u . h(u) = e . (u x grad) phi(u), with
 of dt/|a + te - u|, and u x grad maps harmonic functions to harmonic ones, degree by degree; the
 integral over s divides the part of degree l by l.
 
-- `FarEdges.of`: the sum over the edges of cycles, for many balls at once.
-- `tail`: the bound of the terms of higher degree.
+- `EdgeExpansions.of`: the sum over the edges of cycles, for many balls at once.
+- `tail_bounds`: the bound of the terms of higher degree.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import FloatArray, to_numpy
-from harnack.backend.arrays import aligned_integers
+from harnack.backend.arrays import upload_integers
 from harnack.backend.elementary import fmin
 from harnack.fields.solid_angles.edges import inner_product, spinor
-from harnack.fields.solid_angles.local_expansion import irregular, parts
+from harnack.fields.solid_angles.local_expansion import coefficient_keys, irregular_harmonics
 
 if TYPE_CHECKING:
     from harnack.backend import BoolArray, Mask, Real, Vec3
-    from harnack.backend.record_table import Records
-    from harnack.fields.solid_angles.edge_runs import Edges
+    from harnack.backend.record_table import RecordTable
+    from harnack.fields.solid_angles.edge_runs import CellEdges
 
 # Harmonics have degree j.
 
@@ -43,16 +43,16 @@ DEGREE = 6
 COEFFICIENTS = (DEGREE + 1) ** 2
 # Edges are cut into pieces with half lengths of at most this part of their distance from the ball;
 # on each, Gauss's rule has so many nodes.
-_PIECE, _NODES = 1 / 6, 4
+_MAX_PIECE, _NODES = 1 / 6, 4
 # What rounding does to an edge's share of the angle at the center, and to its polynomial: see
-# `FarEdges.of` and `_Piece.sums`.
-_OF_ANGLE, _OF_TERMS = 2.0**-36, 2.0**-28
+# `EdgeExpansions.of` and `_EdgePiece.sums`.
+_ANGLE_ROUNDING, _TERM_ROUNDING = 2.0**-36, 2.0**-28
 # Sums of many positive numbers in double precision, as bounds.
 _ROUNDED_UP = 1 + 1e-9
 
 
 @dataclass(frozen=True)
-class FarEdges:
+class EdgeExpansions:
     """Sums over cycles of edges for n balls.
 
     coefficients: (n, COEFFICIENTS) of the polynomial (`local_expansion.parts`); its value at the
@@ -65,24 +65,24 @@ class FarEdges:
     slope: FloatArray
 
     @classmethod
-    def none(cls, n: int) -> FarEdges:
+    def zero(cls, n: int) -> EdgeExpansions:
         """Sums over no edges."""
         return cls(np.zeros((n, COEFFICIENTS)), np.zeros(n), np.zeros(n))
 
-    def plus(self, other: FarEdges) -> FarEdges:
+    def plus(self, other: EdgeExpansions) -> EdgeExpansions:
         """The sums over the edges of both."""
         error, slope = self.error + other.error, self.slope + other.slope
         total = self.coefficients + other.coefficients
-        return FarEdges(total, error * _ROUNDED_UP, slope * _ROUNDED_UP)
+        return EdgeExpansions(total, error * _ROUNDED_UP, slope * _ROUNDED_UP)
 
-    def some(self, which: Any) -> FarEdges:
+    def subset(self, which: Any) -> EdgeExpansions:
         """Those chosen by a mask or by numbers."""
-        return FarEdges(*(one[which] for one in vars(self).values()))
+        return EdgeExpansions(*(one[which] for one in vars(self).values()))
 
-    def of_children(self, is_split: BoolArray, shifts: FloatArray, radius: float) -> FarEdges:
+    def to_octants(self, is_split: BoolArray, shifts: FloatArray, radius: float) -> EdgeExpansions:
         """The same cycles seen from the octants of cells with balls of this radius that are split;
         the balls of the octants lie in those of the cells. shifts:
-        `local_expansion.shift_matrices`.
+        `local_expansion.local_to_local_matrices`.
 
         In double precision sums of 49 products lose less than 2^-46 of the sum of absolute values;
         harmonics R_jk are at most 1 in the ball, and count twice at most.
@@ -92,10 +92,12 @@ class FarEdges:
         sizes = np.abs(shifts).sum(axis=1)
         lost = 2.0**-44 * (np.abs(given) @ sizes.T).ravel()
         error, slope = (np.repeat(one[is_split], 8) for one in (self.error, self.slope))
-        return FarEdges(shifted, error + lost, slope + 2 * DEGREE / radius * lost)
+        return EdgeExpansions(shifted, error + lost, slope + 2 * DEGREE / radius * lost)
 
     @classmethod
-    def of(cls, points: Records, edges: Edges, c: Vec3, radius: Real, n: int) -> FarEdges:
+    def of(
+        cls, points: RecordTable, edges: CellEdges, c: Vec3, radius: Real, n: int
+    ) -> EdgeExpansions:
         """The sums over edges, for balls around c, n lanes. points: rows (x, y, z).
 
         Rounding of the angle at the center, as in `LoopEdges.rounding`: each edge is off by less
@@ -103,21 +105,21 @@ class FarEdges:
         than 2^-46 over the distance; all are farther than 2^-9, the radius of the finest cells.
         """
         if not len(edges.cell):
-            return cls.none(n)
+            return cls.zero(n)
         backend = points.backend
         count = np.bincount(edges.cell, minlength=n)
-        first = aligned_integers(backend, np.cumsum(count) - count)
-        lengths = aligned_integers(backend, count)
-        start, end = (aligned_integers(backend, one) for one in (edges.start, edges.end))
+        first = upload_integers(backend, np.cumsum(count) - count)
+        lengths = upload_integers(backend, count)
+        start, end = (upload_integers(backend, one) for one in (edges.start, edges.end))
         sums = _over_pieces(points, start, end, first, lengths, c, radius)
         dr.eval(*sums)
         zr, zi, error, slope, *coefficients = (np.broadcast_to(to_numpy(one), n) for one in sums)
         table = np.stack([2 * np.arctan2(zi, zr), *coefficients], axis=1)
-        return cls(table, error * _ROUNDED_UP + _OF_ANGLE * count, slope * _ROUNDED_UP)
+        return cls(table, error * _ROUNDED_UP + _ANGLE_ROUNDING * count, slope * _ROUNDED_UP)
 
 
 def _over_pieces(
-    points: Records, start: Any, end: Any, first: Any, count: Any, c: Vec3, radius: Real
+    points: RecordTable, start: Any, end: Any, first: Any, count: Any, c: Vec3, radius: Real
 ) -> tuple[Any, ...]:
     """The product of spinors of edges, bounds of errors, and the coefficients after the first."""
     backend = points.backend
@@ -129,9 +131,9 @@ def _over_pieces(
     def body(j: Any, t: Real, zr: Real, zi: Real, *sums: Real) -> tuple[Any, ...]:
         active = j < count
         places = (dr.gather(index, one, first + j, active) for one in (start, end))
-        rows = (points.row(place, active) for place in places)
+        rows = (points.read_record(place, active) for place in places)
         a, b = (vector(*row[:3]) - c for row in rows)
-        piece = _Piece.of(a, b, t, radius)
+        piece = _EdgePiece.of(a, b, t, radius)
         re, im = inner_product(spinor(a)[2], spinor(b)[2])
         re, im = dr.fma(zr, re, -(zi * im)), dr.fma(zr, im, zi * re)
         scale = dr.rcp(dr.abs(re) + dr.abs(im))
@@ -149,7 +151,7 @@ def _over_pieces(
 
 
 @dataclass(frozen=True)
-class _Piece:
+class _EdgePiece:
     """A piece of an edge: its middle, relative to the center of the ball, the vector from its start
     to its end, and the place on the edge, from 0 to 1, where it ends."""
 
@@ -158,11 +160,11 @@ class _Piece:
     stop: Real
 
     @classmethod
-    def of(cls, a: Vec3, b: Vec3, t: Real, radius: Real) -> _Piece:
+    def of(cls, a: Vec3, b: Vec3, t: Real, radius: Real) -> _EdgePiece:
         """The piece from t on of the edge from a to b."""
         vector, e = cast("Any", type(a)), b - a
         begin = dr.fma(vector(t), e, a)
-        longest = (2 * _PIECE / (1 + _PIECE)) * (dr.norm(begin) - radius)
+        longest = (2 * _MAX_PIECE / (1 + _MAX_PIECE)) * (dr.norm(begin) - radius)
         step = longest * dr.rsqrt(dr.squared_norm(e))
         stop = dr.select(step > 0, fmin(t + step, type(t)(1)), 1)
         stop = dr.select(1 - stop < 0.3 * (stop - t), 1, stop)
@@ -178,24 +180,24 @@ class _Piece:
         """
         half = 0.5 * dr.norm(self.e)
         area = dr.norm(dr.cross(self.middle, self.e))
-        error, slope = _of_rule(dr.norm(self.middle) - radius, half, area, radius)
+        error, slope = _quadrature_errors(dr.norm(self.middle) - radius, half, area, radius)
         nodes, weights = np.polynomial.legendre.leggauss(_NODES)
         total: dict[Any, list[Any]] = {}
         for node, weight in zip(nodes.tolist(), (0.5 * weights).tolist(), strict=True):
             d = dr.fma(type(self.e)(0.5 * node), self.e, self.middle)
             inverse = dr.rcp(dr.norm(d))
-            value_left, slope_left = tail(radius * inverse)
+            value_left, slope_left = tail_bounds(radius * inverse)
             strength = weight * area * dr.square(inverse)
-            rounding = _OF_TERMS * weight * 2 * half * inverse
+            rounding = _TERM_ROUNDING * weight * 2 * half * inverse
             error = error + rounding + strength * value_left
             slope = slope + (rounding + strength * slope_left) / radius
-            for key, pair in irregular(d.x, d.y, d.z, inverse, DEGREE).items():
+            for key, pair in irregular_harmonics(d.x, d.y, d.z, inverse, DEGREE).items():
                 old = total.get(key, [0.0, 0.0])
                 total[key] = [one + weight * new for one, new in zip(old, pair, strict=True)]
-        return [error, slope, *_turned(total, self.e, radius)]
+        return [error, slope, *_rotated_coefficients(total, self.e, radius)]
 
 
-def tail(q: Any) -> tuple[Any, Any]:
+def tail_bounds(q: Any) -> tuple[Any, Any]:
     """Bounds of all terms of degree above p = DEGREE of one point of an edge, and of their gradient
     times rho, as multiples of |d x dp|/|d|^2; q = rho/|d|.
 
@@ -218,7 +220,7 @@ def tail(q: Any) -> tuple[Any, Any]:
     return value, value * rest * (DEGREE + 1 - DEGREE * q)
 
 
-def _of_rule(distance: Real, half: Real, area: Real, radius: Real) -> tuple[Real, Real]:
+def _quadrature_errors(distance: Real, half: Real, area: Real, radius: Real) -> tuple[Real, Real]:
     """Bounds of the error of Gauss's rule on a piece, for value and gradient.
 
     distance: D of the middle of the piece from the ball. half: h, half its length. area:
@@ -249,7 +251,7 @@ def _of_rule(distance: Real, half: Real, area: Real, radius: Real) -> tuple[Real
     return error, dr.select(good, off * (1 + radius * steep), error)
 
 
-def _turned(phi: dict[Any, list[Any]], e: Vec3, radius: Real) -> list[Real]:
+def _rotated_coefficients(phi: dict[Any, list[Any]], e: Vec3, radius: Real) -> list[Real]:
     """The coefficients of the integral over s of e . (u x grad) phi(su)/s, after the first.
 
     d/d(angle) about the z axis of conj R_jk is -ik conj R_jk, and with (d/dx +- i d/dy) of
@@ -261,7 +263,7 @@ def _turned(phi: dict[Any, list[Any]], e: Vec3, radius: Real) -> list[Real]:
     for _ in range(DEGREE):
         powers.append(powers[-1] * radius)
     out: list[Real] = []
-    for j, k, part in parts(DEGREE):
+    for j, k, part in coefficient_keys(DEGREE):
         if j == 0:
             continue
         re, im = phi[j, k]

@@ -23,20 +23,20 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend.elementary import fmax, fmin
-from harnack.backend.record_table import Records
-from harnack.fields.batched_fields import SymmetricSum
-from harnack.fields.clearance import epsilon_at
+from harnack.backend.record_table import RecordTable
+from harnack.fields.batched_fields import SymmetricMatrix
+from harnack.fields.clearance import coordinate_rounding
 from harnack.fields.solid_angles.edges import Edge, edge_variation, single_edges
-from harnack.fields.source_sums import FieldSums, Terms
-from harnack.tree.triangle_tree import Upwards, side
+from harnack.fields.source_sums import SourceSums, SourceTerm
+from harnack.tree.triangle_tree import VerticalRayFrame, edge_function
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.tree.balanced_tree import FloatArray, IntArray
-    from harnack.tree.triangle_tree import Frame
+    from harnack.tree.triangle_tree import RayFrame
 
 # Edges in a trip of the loop; those that pad the last one have no length and no direction.
-_CHUNK = 4
+_EDGES_PER_TRIP = 4
 # The size of the imaginary part of a factor where it would be zero.
 _TINY = 1e-36
 # A bound of the rounding of a product's angle Omega = 2 arg, in units u of half the distance from 1
@@ -60,14 +60,14 @@ FACTOR_ROUNDINGS, STEEP_ROUNDINGS = 16.5, 7.5
 class LiftedEdges:
     """Directed edges on a backend, one packet each: see `edge_records`."""
 
-    records: Records
+    records: RecordTable
 
     @classmethod
     def upload(cls, backend: Backend, vertices: FloatArray, edges: IntArray) -> LiftedEdges:
         """Edges (k, 2) between vertices (n, 3); an edge of weight w is repeated w times."""
         table = edge_records(vertices, edges)
         nothing = np.concatenate([table[0, :3], [0.0], table[0, :3], table[0, 7:]])
-        return cls(Records.upload(backend, table, nothing, _CHUNK))
+        return cls(RecordTable.upload(backend, table, nothing, _EDGES_PER_TRIP))
 
 
 def edge_records(vertices: FloatArray, edges: IntArray) -> FloatArray:
@@ -95,12 +95,18 @@ class LiftedEdge:
 
     edge: Edge
     ends: tuple[Vec3, Vec3]
-    frame: Frame | Upwards
+    frame: RayFrame | VerticalRayFrame
     direction: Real
 
     @classmethod
     def between(
-        cls, p: Vec3, q: Vec3, direction: Real, inverse: Real, frame: Frame | Upwards, x: Vec3
+        cls,
+        p: Vec3,
+        q: Vec3,
+        direction: Real,
+        inverse: Real,
+        frame: RayFrame | VerticalRayFrame,
+        x: Vec3,
     ) -> LiftedEdge:
         """The edge from p to q, inverse = 1/|q-p|^2, relative to x on a ray of the frame."""
         return cls(Edge.between(p, q, inverse, x), (p, q), frame, direction)
@@ -109,28 +115,31 @@ class LiftedEdge:
         """F_e: real and imaginary part."""
         vector, frame, edge = cast("Any", type(self.edge.a)), self.frame, self.edge
         pairs = zip(self.ends, (edge.a, edge.b), strict=True)
-        a, b = (vector(*frame.across(p), frame.component(a)) for p, a in pairs)
+        a, b = (vector(*frame.transverse(p), frame.component(a)) for p, a in pairs)
         re, im = edge_factor(a, b, *edge.lengths)
         return re, self.direction * im
 
-    def terms(self, derivatives: int, active: Mask) -> Terms:
+    def terms(self, derivatives: int, active: Mask) -> SourceTerm:
         """What the edge adds to the derivatives of the sum of angles that are asked for; 0 where it
         is not active."""
         if derivatives == 0:
-            return Terms(None)
-        weight, c = self.edge.field()
+            return SourceTerm(None)
+        weight, c = self.edge.biot_savart()
         gradient = dr.select(active, self.direction * weight, 0) * c
         if derivatives == 1:
-            return Terms(None, gradient)
-        c, rate = self.edge.rates()
+            return SourceTerm(None, gradient)
+        c, rate = self.edge.hessian_factors()
         c, rate = dr.select(active, self.direction * c, 0), dr.select(active, rate, 0)
-        return Terms(None, gradient, SymmetricSum.zero(type(c.x)).plus(c, rate))
+        return SourceTerm(
+            None, gradient, SymmetricMatrix.zero(type(c.x)).add_outer_product(c, rate)
+        )
 
     def bounds(self, unit: Real) -> tuple[Real, Real, Real]:
         """A bound of the rounding of Omega_e and of its factor in the product, and what the edge
-        adds to s4 and s5 of `FieldSums`.
+        adds to s4 and s5 of `SourceSums`.
 
-        unit: the rounding of a coordinate, `epsilon_at`, which is twice that of correct rounding.
+        unit: the rounding of a coordinate, `coordinate_rounding`, which is twice that of correct
+            rounding.
 
         Rounding. The ends of the edge, x and their differences are off by half a unit together, and
         the angle by that times Biot and Savart's field, which is at most twice the first number e'
@@ -140,15 +149,17 @@ class LiftedEdge:
         length L, subtends more than a right angle. It is less than 4 pi in any case.
 
         Variation. Taylor's remainder after the linear term is at most 3/4 t^2 times the integral of
-        |dp|/(rho^3 (1-t/rho)) (`edge_angles.bends`). With a = L/2 and distance d an edge has
+        |dp|/(rho^3 (1-t/rho)) (`curve_queries.bends`). With a = L/2 and distance d an edge has
         int rho^-3 <= 2a/(d^2 sqrt(d^2+a^2)) =: 2e, int rho^-4 <= 2e/d; and 1/(1-q) <= 1 + q/(1-b)
-        <= 1 + q rise/4 on [0, b] (`FieldSums.sample`). So an edge adds to the remainder what
+        <= 1 + q rise/4 on [0, b] (`SourceSums.sample`). So an edge adds to the remainder what
         s4 += e/2 and s5 += 3e/(8d) do. d is reduced by its rounding.
         """
-        distance = fmax(dr.sqrt(self.edge.square) - 2 * unit, 0)
-        first, e = edge_variation(distance * distance, self.edge.inverse)
+        distance = fmax(dr.sqrt(self.edge.squared_distance) - 2 * unit, 0)
+        first, e = edge_variation(distance * distance, self.edge.inverse_square_length)
         own = FACTOR_ROUNDINGS * float(dr.epsilon(first))
-        steep = STEEP_ROUNDINGS * float(dr.epsilon(first)) * dr.rsqrt(self.edge.inverse)
+        steep = (
+            STEEP_ROUNDINGS * float(dr.epsilon(first)) * dr.rsqrt(self.edge.inverse_square_length)
+        )
         rounding = fmin(dr.fma(dr.fma(2.0, unit, steep), first, own), 4 * dr.pi)
         return rounding, 0.5 * e, 0.375 * dr.rcp(distance) * e
 
@@ -157,35 +168,37 @@ class LiftedEdge:
 class LiftedSums:
     """Sums over terms and edges, in which the edges' angles are still a product of factors."""
 
-    sums: FieldSums
+    sums: SourceSums
     product: LiftedProduct
 
     @classmethod
     def zero(cls, backend: Backend, derivatives: int) -> LiftedSums:
-        """Empty sums; derivatives: as for `FieldSums.zero`."""
-        return cls(FieldSums.zero(backend, dr.inf, derivatives), LiftedProduct.one(backend.Float))
+        """Empty sums; derivatives: as for `SourceSums.zero`."""
+        return cls(
+            SourceSums.zero(backend, dr.inf, derivatives), LiftedProduct.identity(backend.Float)
+        )
 
     @classmethod
     def of(cls, parts: tuple[Any, ...]) -> LiftedSums:
         """The sums with these `parts`."""
-        return cls(FieldSums.of(parts[0]), LiftedProduct(*parts[1]))
+        return cls(SourceSums.from_state(parts[0]), LiftedProduct(*parts[1]))
 
     def parts(self) -> tuple[Any, ...]:
         """The parts of the sums and those of the product, for the state of a loop."""
-        return self.sums.parts(), self.product.parts()
+        return self.sums.to_state(), self.product.parts()
 
-    def plus(self, edge: LiftedEdge, unit: Real, active: Mask) -> LiftedSums:
+    def add_edge(self, edge: LiftedEdge, unit: Real, active: Mask) -> LiftedSums:
         """The sums with an edge added where active; unit: as for `LiftedEdge.bounds`."""
         (re, im), terms = edge.factor(), edge.terms(self.sums.derivatives, active)
-        sums = self.sums.plus(terms, True)
+        sums = self.sums.add_term(terms, True)
         rounding, s4, s5 = edge.bounds(unit)
         # A factor of 1 scales the product, too.
         rounding = dr.select(active, rounding, 2 * float(dr.epsilon(rounding)))
-        free = fmin(dr.sqrt(edge.edge.square), sums.free_distance)
+        free = fmin(dr.sqrt(edge.edge.squared_distance), sums.singularity_distance)
         sums = dataclasses.replace(
             sums,
             rounding=sums.rounding + rounding,
-            free_distance=dr.select(active, free, sums.free_distance),
+            singularity_distance=dr.select(active, free, sums.singularity_distance),
             s4=sums.s4 + dr.select(active, s4, 0),
             s5=sums.s5 + dr.select(active, s5, 0),
         )
@@ -197,9 +210,9 @@ class LiftedSums:
         """The sum of Omega_e."""
         return self.product.angle()
 
-    def whole(self) -> FieldSums:
+    def total(self) -> SourceSums:
         """The sums with the edges' angles added to the value."""
-        return self.sums.plus(Terms(self.angle), True)
+        return self.sums.add_term(SourceTerm(self.angle), True)
 
 
 def lifted_sums(edges: LiftedEdges, x: Vec3, derivatives: int) -> LiftedSums:
@@ -208,38 +221,38 @@ def lifted_sums(edges: LiftedEdges, x: Vec3, derivatives: int) -> LiftedSums:
     derivatives: 0 for the angle alone, 1 with the gradient, 2 with the Hessian. Results that are
         not used are not computed.
     """
-    backend, unit = edges.records.backend, epsilon_at(x)
+    backend, unit = edges.records.backend, coordinate_rounding(x)
     vector = backend.Array3f
 
     def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
         p, q = vector(*row[:3]), vector(*row[4:7])
-        edge = LiftedEdge.between(p, q, row[3], row[7], Upwards(x), x)
-        return LiftedSums.of(state).plus(edge, unit, row[3] != 0).parts()
+        edge = LiftedEdge.between(p, q, row[3], row[7], VerticalRayFrame(x), x)
+        return LiftedSums.of(state).add_edge(edge, unit, row[3] != 0).parts()
 
     start = LiftedSums.zero(backend, derivatives).parts()
     return LiftedSums.of(edges.records.for_each(add, start, "lift"))
 
 
-def edge_rates(edges: LiftedEdges, x: Vec3, derivatives: int) -> FieldSums:
+def edge_rates(edges: LiftedEdges, x: Vec3, derivatives: int) -> SourceSums:
     """The sums of `lifted_sums` without the value: gradient and, for derivatives = 2, Hessian of
     the solid angle of closed edges, by Biot and Savart's law."""
-    backend, unit = edges.records.backend, epsilon_at(x)
+    backend, unit = edges.records.backend, coordinate_rounding(x)
     vector = backend.Array3f
 
     def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
         p, q, active = vector(*row[:3]), vector(*row[4:7]), row[3] != 0
-        edge = LiftedEdge.between(p, q, row[3], row[7], Upwards(x), x)
-        sums = FieldSums.of(state).plus(edge.terms(derivatives, active), True)
+        edge = LiftedEdge.between(p, q, row[3], row[7], VerticalRayFrame(x), x)
+        sums = SourceSums.from_state(state).add_term(edge.terms(derivatives, active), True)
         _, s4, s5 = edge.bounds(unit)
         s4, s5 = (dr.select(active, one, 0) for one in (s4, s5))
-        return dataclasses.replace(sums, s4=sums.s4 + s4, s5=sums.s5 + s5).parts()
+        return dataclasses.replace(sums, s4=sums.s4 + s4, s5=sums.s5 + s5).to_state()
 
-    start = FieldSums.zero(backend, dr.inf, derivatives).parts()
-    return FieldSums.of(edges.records.for_each(add, start, "rates of edges"))
+    start = SourceSums.zero(backend, dr.inf, derivatives).to_state()
+    return SourceSums.from_state(edges.records.for_each(add, start, "rates of edges"))
 
 
 @dataclass(frozen=True)
-class Sight:
+class VertexView:
     """A vertex relative to x and to rays.
 
     offset: from x to the vertex.
@@ -255,16 +268,16 @@ class Sight:
     s: Real
 
 
-def sight_of(p: Vec3, frame: Frame, x: Vec3) -> Sight:
+def view_vertex(p: Vec3, frame: RayFrame, x: Vec3) -> VertexView:
     """A vertex p relative to x and to rays of a frame."""
     offset = p - x
     length = dr.norm(offset)
-    u, v = frame.across(p)
+    u, v = frame.transverse(p)
     a = cast("Any", type(x))(u, v, frame.component(offset))
-    return Sight(offset, length, u, v, _s(a, length))
+    return VertexView(offset, length, u, v, _length_less_axial(a, length))
 
 
-def ends_factor(a: Sight, b: Sight, direction: Real) -> tuple[Real, Real]:
+def ends_factor(a: VertexView, b: VertexView, direction: Real) -> tuple[Real, Real]:
     """F_e of the edge from a to b; direction: positive if a has the lower index, else negative.
 
     `side` is given the ends in the order of their indices, as everywhere.
@@ -282,7 +295,7 @@ def edge_factor(a: Vec3, b: Vec3, la: Real, lb: Real) -> tuple[Real, Real]:
 
     s_a is computed as |a'|^2/(|a| + a.d) where a.d > 0, so that nothing cancels.
     """
-    return _factor((a.x, a.y), (b.x, b.y), _s(a, la), _s(b, lb))
+    return _factor((a.x, a.y), (b.x, b.y), _length_less_axial(a, la), _length_less_axial(b, lb))
 
 
 def _factor(a: tuple[Real, Real], b: tuple[Real, Real], sa: Real, sb: Real) -> tuple[Real, Real]:
@@ -294,7 +307,7 @@ def _factor(a: tuple[Real, Real], b: tuple[Real, Real], sa: Real, sb: Real) -> t
     real, (au, av), (bu, bv) = cast("Any", type(sa)), a, b
     in_line = (au == 0) & (av == 0), (bu == 0) & (bv == 0)
     ax, bx = dr.select(in_line[0], real(-1e-18), au), dr.select(in_line[1], real(-1e-18), bu)
-    im = -side((ax, av), (bx, bv))
+    im = -edge_function((ax, av), (bx, bv))
     re = dr.fma(sa, sb, dr.fma(ax, bx, av * bv))
     tie = dr.select(av == bv, ax - bx, bv - av)
     # Only the sign of a real factor matters. It may be so small that it would be no longer than the
@@ -304,7 +317,7 @@ def _factor(a: tuple[Real, Real], b: tuple[Real, Real], sa: Real, sb: Real) -> t
     return re, dr.select(straight, dr.mulsign(real(_TINY), tie), im)
 
 
-def _s(a: Vec3, length: Real) -> Real:
+def _length_less_axial(a: Vec3, length: Real) -> Real:
     across = dr.fma(a.x, a.x, a.y * a.y)
     return dr.select(a.z > 0, across / (length + a.z), length - a.z)
 
@@ -319,7 +332,7 @@ class LiftedProduct:
     turns: Real
 
     @classmethod
-    def one(cls, real: Any) -> LiftedProduct:
+    def identity(cls, real: Any) -> LiftedProduct:
         """The product of no factors; real: the type of its numbers."""
         return cls(real(1), real(0), real(0))
 

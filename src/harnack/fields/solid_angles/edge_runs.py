@@ -6,7 +6,8 @@ is left: far edges and the closing edges, reversed. These are a cycle, too: each
 as often as it is left.
 
 - `VertexTable`: the vertices of loops, such that every run is consecutive.
-- `Runs`: the runs of many cells. `Runs.narrowed` gives those of smaller cells, and what is left.
+- `EdgeRuns`: the runs of many cells. `EdgeRuns.restrict_to_near` gives those of smaller cells, and
+  what is left.
 """
 
 from __future__ import annotations
@@ -21,9 +22,9 @@ if TYPE_CHECKING:
 
 # Runs with so few far edges in between are one: closing a run takes two edges and begins another
 # one.
-_GAP = 3
+_MAX_GAP = 3
 # The distance of an apex from the center, in units of the radius beyond which edges are far.
-_APEX = 2.5
+_APEX_RATIO = 2.5
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,7 @@ class VertexTable:
 
 
 @dataclass(frozen=True)
-class Edges:
+class CellEdges:
     """Directed edges of n cells, in the order of these, between rows of a table of points.
 
     start, end: (k,) rows. cell: (k,) numbers of cells.
@@ -60,7 +61,7 @@ class Edges:
 
 
 @dataclass(frozen=True)
-class Runs:
+class EdgeRuns:
     """Runs of the edges of loops, in the order of n cells.
 
     cell: (m,) the cell that a run belongs to.
@@ -76,13 +77,13 @@ class Runs:
     apex: FloatArray
 
     @classmethod
-    def of_loops(cls, table: VertexTable) -> Runs:
+    def of_loops(cls, table: VertexTable) -> EdgeRuns:
         """All loops, whole, as the runs of one cell."""
         n = len(table.sizes)
         whole = np.ones(n, np.bool_)
         return cls(np.zeros(n, np.int64), table.first, table.sizes, whole, np.zeros((n, 3)))
 
-    def of_children(self, is_split: BoolArray) -> Runs:
+    def to_octants(self, is_split: BoolArray) -> EdgeRuns:
         """The runs of cells that are split, for each of their eight children."""
         chosen = is_split[self.cell]
         number = np.cumsum(is_split) - 1
@@ -93,8 +94,10 @@ class Runs:
         chosen_rows = np.flatnonzero(chosen)[again[order]]
         return self._some(chosen_rows, cell[order])
 
-    def _some(self, rows: IntArray, cell: IntArray) -> Runs:
-        return Runs(cell, self.first[rows], self.count[rows], self.is_whole[rows], self.apex[rows])
+    def _some(self, rows: IntArray, cell: IntArray) -> EdgeRuns:
+        return EdgeRuns(
+            cell, self.first[rows], self.count[rows], self.is_whole[rows], self.apex[rows]
+        )
 
     def edges(self) -> tuple[IntArray, IntArray]:
         """For each edge of all runs its run, and the place of its first vertex."""
@@ -102,17 +105,17 @@ class Runs:
         begin = np.cumsum(self.count) - self.count
         return run, np.arange(len(run)) - begin[run] + self.first[run]
 
-    def narrowed(self, run: IntArray, is_near: BoolArray) -> tuple[Runs, BoolArray]:
+    def restrict_to_near(self, run: IntArray, is_near: BoolArray) -> tuple[EdgeRuns, BoolArray]:
         """The runs of near edges, and for each edge whether it is in one of them.
 
         run, is_near: (k,) for each of `edges`, its run, and whether it is near. Apexes are to be
-            chosen (`closed`).
+            chosen (`with_apexes`).
         """
         begin = np.cumsum(self.count) - self.count
         near = np.flatnonzero(is_near)
         owner = run[near]
         breaks = np.ones(len(near), np.bool_)
-        breaks[1:] = (owner[1:] != owner[:-1]) | (np.diff(near) > _GAP + 1)
+        breaks[1:] = (owner[1:] != owner[:-1]) | (np.diff(near) > _MAX_GAP + 1)
         starts = np.flatnonzero(breaks)
         ends = np.append(starts[1:], len(near))[: len(starts)] - 1
         low, high, owner = near[starts], near[ends], owner[starts]
@@ -123,7 +126,7 @@ class Runs:
         first_of = np.maximum.accumulate(np.where(is_first, np.arange(len(owner)), 0))
         size = self.count[owner]
         between = offset[first_of] + size - (offset + count)
-        joins = is_last & self.is_whole[owner] & (between <= _GAP)
+        joins = is_last & self.is_whole[owner] & (between <= _MAX_GAP)
         alone = joins & is_first
         joined = joins & ~is_first
         longer = count + np.where(joined, between + count[first_of], 0)
@@ -142,11 +145,11 @@ class Runs:
         kept = np.cumsum(marks[:-1]) > 0
         cell, first = self.cell[owner][keep], (self.first[owner] + offset)[keep]
         none = np.zeros((int(keep.sum()), 3))
-        return Runs(cell, first, longer[keep], whole[keep], none), kept
+        return EdgeRuns(cell, first, longer[keep], whole[keep], none), kept
 
-    def closed(
+    def with_apexes(
         self, table: VertexTable, centers: FloatArray, radius: FloatArray, number: np.dtype[Any]
-    ) -> Runs:
+    ) -> EdgeRuns:
         """The same runs with apexes; radius: beyond which edges are far.
 
         With unit vectors to both ends, the apex lies in the direction of their sum, or where that
@@ -163,17 +166,17 @@ class Runs:
         across = _unit(axis - (axis * between).sum(axis=1, keepdims=True) * between)
         across *= np.where((across * mean).sum(axis=1, keepdims=True) < 0, -1.0, 1.0)
         short = np.linalg.norm(mean, axis=1, keepdims=True) < 0.1
-        apex = center + _APEX * radius[self.cell, None] * np.where(short, across, _unit(mean))
+        apex = center + _APEX_RATIO * radius[self.cell, None] * np.where(short, across, _unit(mean))
         apex = apex.astype(number).astype(np.float64)
-        return Runs(self.cell, self.first, self.count, self.is_whole, apex)
+        return EdgeRuns(self.cell, self.first, self.count, self.is_whole, apex)
 
-    def closing(self, apexes: int) -> tuple[Edges, Edges]:
+    def closing_edges(self, apexes: int) -> tuple[CellEdges, CellEdges]:
         """The edges from the ends of runs to apexes, and those from apexes to their beginnings;
         apexes: the row of the first apex in the table of points."""
         rows = np.flatnonzero(~self.is_whole)
         first, last = self.first[rows], self.first[rows] + self.count[rows]
         cell = self.cell[rows]
-        return Edges(last, apexes + rows, cell), Edges(apexes + rows, first, cell)
+        return CellEdges(last, apexes + rows, cell), CellEdges(apexes + rows, first, cell)
 
 
 def _unit(vectors: FloatArray) -> FloatArray:
@@ -181,28 +184,33 @@ def _unit(vectors: FloatArray) -> FloatArray:
     return vectors / np.maximum(length, 1e-300)
 
 
-def left_over(
-    before: Runs, edges: tuple[IntArray, IntArray], kept: BoolArray, after: Runs, vertices: int
-) -> Edges:
+def subtract_runs(
+    before: EdgeRuns,
+    edges: tuple[IntArray, IntArray],
+    kept: BoolArray,
+    after: EdgeRuns,
+    vertices: int,
+) -> CellEdges:
     """What is left of the closed runs before if the closed runs after are taken out, in the order
     of cells.
 
-    edges: of the runs before (`Runs.edges`). kept: for each of them, whether it is in a run after.
+    edges: of the runs before (`EdgeRuns.edges`). kept: for each of them, whether it is in a run
+        after.
     The rows of points are the vertices, so many, the apexes before, and the apexes after.
     """
     left = np.flatnonzero(~kept)
     run, place = (one[left] for one in edges)
-    inner = after.closing(vertices + len(before.cell))
+    inner = after.closing_edges(vertices + len(before.cell))
     return _merged(
         [
-            Edges(place, place + 1, before.cell[run]),
-            *before.closing(vertices),
-            *(Edges(one.end, one.start, one.cell) for one in inner),
+            CellEdges(place, place + 1, before.cell[run]),
+            *before.closing_edges(vertices),
+            *(CellEdges(one.end, one.start, one.cell) for one in inner),
         ]
     )
 
 
-def _merged(groups: list[Edges]) -> Edges:
+def _merged(groups: list[CellEdges]) -> CellEdges:
     """All edges in the order of cells; those of each group are in that order."""
     cells = 1 + max((int(one.cell[-1]) for one in groups if len(one.cell)), default=0)
     counts = [np.bincount(one.cell, minlength=cells) for one in groups]
@@ -214,4 +222,4 @@ def _merged(groups: list[Edges]) -> Edges:
         place = np.repeat(at, count) + rank
         start[place], end[place], cell[place] = one.start, one.end, one.cell
         at = at + count
-    return Edges(start, end, cell)
+    return CellEdges(start, end, cell)

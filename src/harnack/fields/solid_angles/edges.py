@@ -4,6 +4,9 @@
   edge each.
 - `Edge`: distance, field and derivatives of one edge at a point.
 - `sum_over_edges`: solid angle, gradient, distance and integrals in one pass.
+
+The solid angle is a product of spinors, not a fan of triangles: a fan is 0/0 along the lines from
+its apex, the product only on the curve itself.
 """
 
 from __future__ import annotations
@@ -18,8 +21,8 @@ import numpy as np
 
 from harnack.backend import FloatArray
 from harnack.backend.elementary import fmin
-from harnack.backend.record_table import Records
-from harnack.fields.batched_fields import SymmetricSum
+from harnack.backend.record_table import RecordTable
+from harnack.fields.batched_fields import SymmetricMatrix
 from harnack.tree.closest_triangles import squared_distance_to_segment
 
 if TYPE_CHECKING:
@@ -33,7 +36,7 @@ EachEdge: TypeAlias = "Callable[[Vec3, Vec3, Real, tuple[Any, ...]], tuple[Any, 
 # The largest 1/length^2 of a record, within the range of float32. Edges without a length, used as
 # padding or made so by rounding, have it too: they have no angle, no gradient, hardly any
 # variation.
-_SHARPEST = 1e30
+_MAX_INVERSE_SQUARE = 1e30
 
 
 def inverse_squares(edges: FloatArray) -> FloatArray:
@@ -44,7 +47,7 @@ def inverse_squares(edges: FloatArray) -> FloatArray:
     variation, as 1/sqrt(d^2 (1 + 4 d^2/length^2)) grows.
     """
     squared = (edges * edges).sum(axis=1)
-    return 1 / np.maximum(squared, 1 / _SHARPEST)
+    return 1 / np.maximum(squared, 1 / _MAX_INVERSE_SQUARE)
 
 
 def single_edges(start: FloatArray, end: FloatArray, direction: Any = 1.0) -> FloatArray:
@@ -58,31 +61,31 @@ def single_edges(start: FloatArray, end: FloatArray, direction: Any = 1.0) -> Fl
 
 @dataclass(frozen=True)
 class LoopEdges:
-    """Records of `run` consecutive edges each, of closed loops.
+    """Records of `edges_per_record` consecutive edges each, of closed loops.
 
     A record holds run + 1 vertices as (x, y, z, 1/|edge to the next|^2). Records do not depend on
     each other, so several loops need no special case.
     """
 
-    records: Records
-    run: int
+    records: RecordTable
+    edges_per_record: int
 
     @classmethod
     def upload(
         cls, backend: Backend, loops: tuple[FloatArray, ...], run: int | None = None
     ) -> LoopEdges:
         """The edges of closed loops, each of shape (n, 3); run: None to choose it by the loops."""
-        run, number = run or _run_for(loops), backend.dtype
+        run, number = run or _edges_per_record(loops), backend.dtype
         rounded = (loop.astype(number).astype(np.float64) for loop in loops)
         table = np.concatenate([_runs(loop, run) for loop in rounded])
-        return cls(Records.upload(backend, table), run)
+        return cls(RecordTable.upload(backend, table), run)
 
     @property
     def backend(self) -> Backend:
         return self.records.backend
 
     def rounding(self, records: Any) -> Any:
-        """A bound of the rounding of the angle of so many records, to which `near_rounding` is to
+        """A bound of the rounding of the angle of so many records, to which `vertex_rounding` is to
         be added.
 
         Proof, with u = epsilon/2. Omega = 2 arg of a product of n factors, those of padding among
@@ -104,11 +107,11 @@ class LoopEdges:
         moved by at most 2.25 epsilon |a|, and off by that times the integral of |dp|/D^2. In unit
         coordinates |a| <= 1 + |x|. (4) The arc tangent and the last operations: 16 epsilon.
         """
-        return self.backend.epsilon * (16 + 7.25 * self.run * records)
+        return self.backend.machine_epsilon * (16 + 7.25 * self.edges_per_record * records)
 
-    def part(self, first: Any, trips: Any) -> LoopEdges:
+    def records_of(self, first: Any, trips: Any) -> LoopEdges:
         """The edges of `trips` records from `first` on, which may differ from lane to lane."""
-        return replace(self, records=self.records.part(first, trips))
+        return replace(self, records=self.records.view(first, trips))
 
     def vertex(self, row: list[Real], k: int) -> Vec3:
         """Vertex k of a record, at which its edge k starts."""
@@ -117,10 +120,10 @@ class LoopEdges:
     def for_each(
         self, body: EachEdge, state: tuple[Any, ...], label: str, active: Mask = True
     ) -> tuple[Any, ...]:
-        """The state after `body` has been applied to all edges: see `Records.for_each`."""
+        """The state after `body` has been applied to all edges: see `RecordTable.for_each`."""
 
         def of_record(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-            for k in range(self.run):
+            for k in range(self.edges_per_record):
                 p, q = self.vertex(row, k), self.vertex(row, k + 1)
                 state = body(p, q, row[4 * k + 3], state)
             return state
@@ -128,12 +131,12 @@ class LoopEdges:
         return self.records.for_each(of_record, state, label, active)
 
 
-def near_rounding(epsilon: float, x: Vec3, squares: Real) -> Real:
+def vertex_rounding(epsilon: float, x: Vec3, squares: Real) -> Real:
     """What rounding adds to `LoopEdges.rounding` near the curve; squares: `EdgeSums.squares`."""
     return epsilon * dr.fma(2.25, dr.norm(x), 2.9 + 2.25) * squares
 
 
-def _run_for(loops: tuple[FloatArray, ...]) -> int:
+def _edges_per_record(loops: tuple[FloatArray, ...]) -> int:
     """Eight edges a record, or four where eight would be mostly padding."""
     edges = sum(len(loop) for loop in loops)
     padded = sum(-(-len(loop) // 8) * 8 for loop in loops)
@@ -155,7 +158,8 @@ class Edge:
     """The edge from p to q, relative to a point x: a = p - x and b = q - x.
 
     e: q - p, which has no rounding of x.
-    inverse: 1/|e|^2; any finite number for an edge without a length, which has no field.
+    inverse_square_length: 1/|e|^2; any finite number for an edge without a length, which has no
+        field.
 
     With c = a x e, the edge adds to the gradient of a solid angle Biot and Savart's field w c
     (paper, Eq. 11),
@@ -193,7 +197,7 @@ class Edge:
     a: Vec3
     b: Vec3
     e: Vec3
-    inverse: Real
+    inverse_square_length: Real
 
     @classmethod
     def between(cls, p: Vec3, q: Vec3, inverse: Real, x: Vec3) -> Edge:
@@ -206,43 +210,43 @@ class Edge:
         return dr.norm(self.a), dr.norm(self.b)
 
     @functools.cached_property
-    def square(self) -> Real:
+    def squared_distance(self) -> Real:
         """The square of the distance from x to the edge."""
-        return squared_distance_to_segment(self.a, self.e, self.inverse)
+        return squared_distance_to_segment(self.a, self.e, self.inverse_square_length)
 
-    def field(self) -> tuple[Real, Vec3]:
+    def biot_savart(self) -> tuple[Real, Vec3]:
         """w and c of Biot and Savart's field w c, which the edge adds to the gradient; w = 0 at
         points in line with the edge."""
         (la, lb), c = self.lengths, dr.cross(self.a, self.e)
         square = dr.squared_norm(c)
-        return dr.select(square > 0, (la + lb) / (la * lb * self._bracket(square)), 0), c
+        return dr.select(square > 0, (la + lb) / (la * lb * self._denominator(square)), 0), c
 
-    def field_of_lengths(self, la: Real, lb: Real) -> tuple[Real, Vec3]:
-        """The same as `field`, for given |a| and |b|, with one division."""
+    def biot_savart_of_lengths(self, la: Real, lb: Real) -> tuple[Real, Vec3]:
+        """The same as `biot_savart`, for given |a| and |b|, with one division."""
         c, both, dot = dr.cross(self.a, self.e), la * lb, dr.dot(self.a, self.b)
         square, beside = dr.squared_norm(c), dot < 0
         above = (la + lb) * dr.select(beside, both - dot, 1)
         below = both * dr.select(beside, square, both + dot)
         return dr.select(square > 0, above / below, 0), c
 
-    def rates(self) -> tuple[Vec3, Vec3]:
+    def hessian_factors(self) -> tuple[Vec3, Vec3]:
         """c and grad w: the edge's share of the Hessian is (c grad w^T + grad w c^T)/2.
 
         Lengths should be of order one, to stay far from overflow: the terms fall like distance^-5
         and grow like distance^-3.
         """
         a, e, vector = self.a, self.e, cast("Any", type(self.a))
-        h = dr.fma(vector(-dr.dot(a, e) * self.inverse), e, a)
-        h = dr.fma(vector(-dr.dot(h, e) * self.inverse), e, h)
+        h = dr.fma(vector(-dr.dot(a, e) * self.inverse_square_length), e, a)
+        h = dr.fma(vector(-dr.dot(h, e) * self.inverse_square_length), e, h)
         c, (la, lb) = dr.cross(h, e), self.lengths
         alpha, beta, total, apart = 1 / la, 1 / lb, la + lb, la - lb
-        both, share = alpha * beta, total / self._bracket(dr.squared_norm(c))
+        both, share = alpha * beta, total / self._denominator(dr.squared_norm(c))
         across = both * both * share * (dr.fma(apart * apart, both, 1) + total * share)
         cubes = both * dr.fma(alpha, alpha, dr.fma(beta, beta, both))
-        along = dr.dot(e, a + self.b) / total * cubes * self.inverse
+        along = dr.dot(e, a + self.b) / total * cubes * self.inverse_square_length
         return c, across * h + along * e
 
-    def _bracket(self, square: Real) -> Real:
+    def _denominator(self, square: Real) -> Real:
         """D; square: |c|^2."""
         (la, lb), dot = self.lengths, dr.dot(self.a, self.b)
         return dr.select(dot < 0, square / (la * lb - dot), la * lb + dot)
@@ -316,7 +320,7 @@ def sum_over_edges(edges: LoopEdges, x: Vec3, active: Mask = True) -> EdgeSums:
         p = edges.vertex(row, 0)
         a = p - x
         la, sa, ca = spinor(a)
-        for k in range(edges.run):
+        for k in range(edges.edges_per_record):
             q, inverse = edges.vertex(row, k + 1), row[4 * k + 3]
             b = q - x
             lb, sb, cb = spinor(b)
@@ -349,10 +353,14 @@ def hessian_over_edges(edges: LoopEdges, x: Vec3) -> tuple[Vec3, Vec3, Vec3]:
     x = edges.backend.Array3f(x)
 
     def add(p: Vec3, q: Vec3, inverse: Real, state: tuple[Any, ...]) -> tuple[Any, ...]:
-        return SymmetricSum(*state).plus(*Edge.between(p, q, inverse, x).rates()).parts()
+        return (
+            SymmetricMatrix(*state)
+            .add_outer_product(*Edge.between(p, q, inverse, x).hessian_factors())
+            .components()
+        )
 
-    start = SymmetricSum.zero(edges.backend.Float).parts()
-    return SymmetricSum(*edges.for_each(add, start, "edge hessian")).rows(type(x))
+    start = SymmetricMatrix.zero(edges.backend.Float).components()
+    return SymmetricMatrix(*edges.for_each(add, start, "edge hessian")).rows(type(x))
 
 
 def inner_product(a: Spinor, b: Spinor) -> tuple[Real, Real]:

@@ -5,13 +5,13 @@ every f that is harmonic there is
 
     f(c + u) = sum_{j>=0} sum_k conj(R_jk(u)) L_jk,      L_j,-k = (-1)^k conj L_jk.
 
-- `of_cluster`: L_jk of dipoles given by their moments about a point outside of the ball.
-- `shift_matrices`: L_jk about the centers of the eight octants of a cell.
-- `value_and_gradient`: the polynomial, of coefficients that a record holds.
+- `multipole_to_local`: L_jk of dipoles given by their moments about a point outside of the ball.
+- `local_to_local_matrices`: L_jk about the centers of the eight octants of a cell.
+- `evaluate_expansion`: the polynomial, of coefficients that a record holds.
 - `tail_factors`: a bound of the terms of higher degree; `rounding_tables`: of all rounding.
 
-Coefficients are stored as real and imaginary parts for k >= 0 in the order of `parts`, times rho^j,
-so that u is taken in units of rho.
+Coefficients are stored as real and imaginary parts for k >= 0 in the order of `coefficient_keys`,
+times rho^j, so that u is taken in units of rho.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from harnack.backend import FloatArray
-from harnack.fields.solid_angles.multipole import Pairs, regular
+from harnack.fields.solid_angles.multipole import Pairs, regular_harmonics
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 # ruff: noqa: E741
 
 
-def parts(degree: int) -> list[tuple[int, int, int]]:
+def coefficient_keys(degree: int) -> list[tuple[int, int, int]]:
     """(j, k, 0 for the real or 1 for the imaginary part) of the (degree + 1)^2 coefficients."""
     return [
         (j, k, part)
@@ -42,14 +42,14 @@ def parts(degree: int) -> list[tuple[int, int, int]]:
     ]
 
 
-def irregular(x: Any, y: Any, z: Any, inverse: Any, degree: int) -> Pairs:
+def irregular_harmonics(x: Any, y: Any, z: Any, inverse: Any, degree: int) -> Pairs:
     """I_lm at (x, y, z) for l <= degree and 0 <= m <= l; inverse: one over the length.
 
     By definition I_lm = (l+m)! (l-m)! R_lm / r^(2l+1), and R_lm(v / r^2) = R_lm(v) / r^(2l).
     """
     square = inverse * inverse
     out: Pairs = {}
-    for (l, m), (re, im) in regular(x * square, y * square, z * square, degree).items():
+    for (l, m), (re, im) in regular_harmonics(x * square, y * square, z * square, degree).items():
         scale = float(math.factorial(l + m) * math.factorial(l - m)) * inverse
         out[l, m] = scale * re, scale * im if m else 0.0
     return out
@@ -63,11 +63,12 @@ def _signed(values: Pairs, l: int, m: int) -> tuple[Any, Any]:
     return (re, -im) if m % 2 == 0 else (-re, im)
 
 
-def of_cluster(moments: Pairs, seen: Pairs, degree: int) -> list[Any]:
-    """L_jk, in the order of `parts`, of dipoles with these moments about a point y; those of
-    degrees l that are not given are 0.
+def multipole_to_local(moments: Pairs, seen: Pairs, degree: int) -> list[Any]:
+    """L_jk, in the order of `coefficient_keys`, of dipoles with these moments about a point y;
+    those of degrees l that are not given are 0.
 
-    seen: I_lm (`irregular`) at c - y, of degree `degree` and the largest of the moments together.
+    seen: I_lm (`irregular_harmonics`) at c - y, of degree `degree` and the largest of the moments
+        together.
 
     Proof. f(x) = -sum conj(M_lm) I_lm(x - y). The addition theorem of R, applied to both arguments
     of 1/|r + u - y| = sum conj(R_lm(y)) I_lm(r + u) = sum conj(R_lm(y - u)) I_lm(r), gives
@@ -91,7 +92,7 @@ def of_cluster(moments: Pairs, seen: Pairs, degree: int) -> list[Any]:
     return out
 
 
-def shift_matrices(degree: int, offset: float) -> FloatArray:
+def local_to_local_matrices(degree: int, offset: float) -> FloatArray:
     """(8, n, n) matrices T, one for each octant of a cube in the order of its corners, z fastest:
     T @ L are the coefficients about the octant's center, in units of its own radius, which is half
     that of the cube.
@@ -101,12 +102,12 @@ def shift_matrices(degree: int, offset: float) -> FloatArray:
     R_jk(s + v) = sum R_ab(v) R_(j-a),(k-b)(s), so that L'_ab = sum_jk L_jk conj(R_(j-a),(k-b)(s)):
     exact, as all are polynomials.
     """
-    order = parts(degree)
+    order = coefficient_keys(degree)
     place = {key: i for i, key in enumerate(order)}
     out = np.zeros((8, len(order), len(order)))
     for octant, corner in enumerate(itertools.product((-offset, offset), repeat=3)):
         x, y, z = corner
-        shifted = regular(x, y, z, degree)
+        shifted = regular_harmonics(x, y, z, degree)
         for (j, k, part), column in place.items():
             for sign in (1, -1) if k else (1,):  # L_j,-k = (-1)^k conj L_jk counts too
                 given = 1j if part else 1.0
@@ -123,7 +124,7 @@ def shift_matrices(degree: int, offset: float) -> FloatArray:
     return out
 
 
-def value_and_gradient(coefficients: Sequence[Any], y: Sequence[Any], degree: int) -> list[Any]:
+def evaluate_expansion(coefficients: Sequence[Any], y: Sequence[Any], degree: int) -> list[Any]:
     """The polynomial and its three derivatives at y, all in units of the radius.
 
     With A_jk = w_k conj L_jk, w_0 = 1 and w_k = 2 otherwise, f = Re sum A_jk R_jk over k >= 0.
@@ -131,7 +132,10 @@ def value_and_gradient(coefficients: Sequence[Any], y: Sequence[Any], degree: in
     Re sum B_jk R_jk, with B^z_jk = A_j+1,k and, up to factors 2 where k + 1 or k - 1 is 0,
     B^x_jk = (A_j+1,k+1 - A_j+1,k-1)/2, B^y_jk = i (A_j+1,k+1 + A_j+1,k-1)/2.
     """
-    r, a = regular(y[0], y[1], y[2], degree), dict(zip(parts(degree), coefficients, strict=True))
+    r, a = (
+        regular_harmonics(y[0], y[1], y[2], degree),
+        dict(zip(coefficient_keys(degree), coefficients, strict=True)),
+    )
     total: list[Any] = [0.0] * 4
     for j, k in sorted(r):
         re, im = r[j, k]
@@ -151,19 +155,23 @@ def value_and_gradient(coefficients: Sequence[Any], y: Sequence[Any], degree: in
     return total
 
 
-class _Sizes:
+class _AbsoluteValues:
     """Absolute values: differences are sums."""
 
     def __init__(self, number: Any) -> None:
         self.number = number
 
-    def __add__(self, other: Any) -> _Sizes:
-        return _Sizes(self.number + np.abs(other.number if isinstance(other, _Sizes) else other))
+    def __add__(self, other: Any) -> _AbsoluteValues:
+        return _AbsoluteValues(
+            self.number + np.abs(other.number if isinstance(other, _AbsoluteValues) else other)
+        )
 
-    def __mul__(self, other: Any) -> _Sizes:
-        return _Sizes(self.number * np.abs(other.number if isinstance(other, _Sizes) else other))
+    def __mul__(self, other: Any) -> _AbsoluteValues:
+        return _AbsoluteValues(
+            self.number * np.abs(other.number if isinstance(other, _AbsoluteValues) else other)
+        )
 
-    def __neg__(self) -> _Sizes:
+    def __neg__(self) -> _AbsoluteValues:
         return self
 
     __radd__ = __sub__ = __rsub__ = __add__
@@ -172,7 +180,7 @@ class _Sizes:
 
 def rounding_tables(degree: int, largest: float) -> FloatArray:
     """(n, 4) numbers whose products with |L_jk|, summed up, and with the backend's epsilon bound
-    the rounding of `value_and_gradient` for coordinates up to `largest`.
+    the rounding of `evaluate_expansion` for coordinates up to `largest`.
 
     Proof. Value and derivatives are sums of products of coefficients, coordinates and constants,
     each of which passes through at most n = 9 degree + 2 (degree + 1)^2 roundings: 6 a degree in
@@ -181,9 +189,9 @@ def rounding_tables(degree: int, largest: float) -> FloatArray:
     the same expression with all signs positive, at the largest coordinates.
     """
     count = (degree + 1) ** 2
-    one = _Sizes(np.full(count, largest))
-    rows = [_Sizes(row) for row in np.eye(count)]
-    sums = value_and_gradient(rows, (one, one, one), degree)
+    one = _AbsoluteValues(np.full(count, largest))
+    rows = [_AbsoluteValues(row) for row in np.eye(count)]
+    sums = evaluate_expansion(rows, (one, one, one), degree)
     roundings = 0.51 * (9 * degree + 2 * count)
     return roundings * np.stack([part.number for part in sums], axis=1)
 

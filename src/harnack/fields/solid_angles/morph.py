@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from harnack.backend import FloatArray, IntArray
-from harnack.backend.validation import positive, real
-from harnack.fields.batched_fields import BatchedField, Values
+from harnack.backend.validation import as_positive, as_real
+from harnack.fields.batched_fields import BatchedField, PointValues
 from harnack.fields.field import Field, Sample
 from harnack.fields.solid_angles.morph_slice import MorphSlice
 from harnack.fields.solid_angles.winding_number import WindingNumber
@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from harnack.backend import Backend, Mask, Precision, Real, Vec3
-    from harnack.fields.capabilities import Crossing, NearestSheet
+    from harnack.fields.capabilities import JumpCrossing, NearestFacet
     from harnack.geometry import Volume
-    from harnack.tree.empty_space import OccupiedCells
+    from harnack.tree.empty_space import OccupancyGrid
 
 
 class Morph(BatchedField):
@@ -72,12 +72,12 @@ class Morph(BatchedField):
         spacing: float = 1.0,
         accuracy: float = 6.0,
     ) -> None:
-        gap = positive(gap, "gap")
-        if not 0 <= real(w, "w") <= gap:
+        gap = as_positive(gap, "gap")
+        if not 0 <= as_real(w, "w") <= gap:
             raise ValueError(f"w must lie between 0 and the gap {gap!r}, not {w!r}")
-        if not 0 < real(spacing, "spacing") <= 2:
+        if not 0 < as_real(spacing, "spacing") <= 2:
             raise ValueError(f"spacing must be above 0 and at most 2, not {spacing!r}")
-        if not 2 <= real(accuracy, "accuracy") <= 100:
+        if not 2 <= as_real(accuracy, "accuracy") <= 100:
             raise ValueError(f"accuracy must lie between 2 and 100, not {accuracy!r}")
         self.w, self.gap = float(w), float(gap)
         meshes = [_checked(mesh_a, "mesh_a"), _checked(mesh_b, "mesh_b")]
@@ -89,7 +89,10 @@ class Morph(BatchedField):
             )
         else:
             self._slice = WindingNumber(*meshes[int(w > 0)])
-        self.has_sheets, self.has_detail = self._slice.has_sheets, self._slice.has_detail
+        self.has_jumps, self.has_variable_accuracy = (
+            self._slice.has_jumps,
+            self._slice.has_variable_accuracy,
+        )
 
     def quadrature_displacement(
         self, points: Any, *, precision: Precision = "single"
@@ -119,42 +122,44 @@ class Morph(BatchedField):
     def evaluate(self, p: Vec3) -> Sample:
         return self._slice.evaluate(p)
 
-    def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> Values:
+    def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> PointValues:
         return self._slice.values_at(x, derivatives, closer)
 
-    def at_detail(self, detail: Real) -> Field:
-        return self._slice.at_detail(detail)
+    def at_accuracy(self, detail: Real) -> Field:
+        return self._slice.at_accuracy(detail)
 
-    def check_levels(self, levels: tuple[float, ...]) -> None:
-        self._slice.check_levels(levels)
+    def validate_levels(self, levels: tuple[float, ...]) -> None:
+        self._slice.validate_levels(levels)
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
         return self._slice.extent(levels)
 
-    def occupied(self, levels: tuple[float, ...]) -> OccupiedCells | None:
-        return self._slice.occupied(levels)
+    def occupied_cells(self, levels: tuple[float, ...]) -> OccupancyGrid | None:
+        return self._slice.occupied_cells(levels)
 
-    def mesh_of_sheets(self) -> tuple[FloatArray, IntArray, bool] | None:
-        return self._slice.mesh_of_sheets()
+    def jump_mesh(self) -> tuple[FloatArray, IntArray, bool] | None:
+        return self._slice.jump_mesh()
 
-    def next_crossing(
-        self, o: Vec3, d: Vec3, after: Crossing, t_max: Real, active: Mask
-    ) -> Crossing:
-        return self._slice.next_crossing(o, d, after, t_max, active)
+    def next_jump(
+        self, o: Vec3, d: Vec3, after: JumpCrossing, t_max: Real, active: Mask
+    ) -> JumpCrossing:
+        return self._slice.next_jump(o, d, after, t_max, active)
 
-    def offset(self, o: Vec3, d: Vec3, t_min: Real, active: Mask) -> Real:
-        return self._slice.offset(o, d, t_min, active)
+    def initial_offset(self, o: Vec3, d: Vec3, t_min: Real, active: Mask) -> Real:
+        return self._slice.initial_offset(o, d, t_min, active)
 
-    def between(self, o: Vec3, d: Vec3, behind: Crossing, ahead: Crossing, offset: Real) -> Field:
-        return self._slice.between(o, d, behind, ahead, offset)
+    def continuation(
+        self, o: Vec3, d: Vec3, behind: JumpCrossing, ahead: JumpCrossing, offset: Real
+    ) -> Field:
+        return self._slice.continuation(o, d, behind, ahead, offset)
 
-    def distance_to_sheets(self, p: Vec3) -> Real:
-        return self._slice.distance_to_sheets(p)
+    def distance_to_jumps(self, p: Vec3) -> Real:
+        return self._slice.distance_to_jumps(p)
 
-    def nearest_sheet(
+    def nearest_facet(
         self, p: Vec3, after: tuple[Real, Any], limit: Real, active: Mask
-    ) -> NearestSheet | None:
-        return self._slice.nearest_sheet(p, after, limit, active)
+    ) -> NearestFacet | None:
+        return self._slice.nearest_facet(p, after, limit, active)
 
 
 def _checked(mesh: Any, name: str) -> tuple[FloatArray, IntArray]:

@@ -2,7 +2,8 @@
 
 - `MorphSlice`: the field.
 - `SlicedKernel`: its kernel, with the proof of its bounds.
-- `centroids`: triangle meshes as oriented points; large triangles are cut, small ones merged.
+- `quadrature_points`: triangle meshes as oriented points; large triangles are cut, small ones
+  merged.
 """
 
 from __future__ import annotations
@@ -18,33 +19,38 @@ from numpy.polynomial import chebyshev, legendre
 
 from harnack.backend import backend_of
 from harnack.backend.elementary import fmax
-from harnack.cluster.serialization import Remembered
+from harnack.cluster.serialization import TransientCache
 from harnack.enclosures import HarmonicBall
-from harnack.fields.batch_evaluation import at_points
-from harnack.fields.batched_fields import Values
+from harnack.fields.batch_evaluation import evaluate_points
+from harnack.fields.batched_fields import PointValues
 from harnack.fields.clearance import (
-    DetailedField,
-    UnitCoordinates,
-    epsilon_at,
+    UnitFrame,
+    VariableAccuracyField,
+    coordinate_rounding,
+    frame_parameters,
     occupied_cells,
-    placed,
-    single,
+    round_to_single,
     tight_extent,
 )
 from harnack.fields.field import Sample
-from harnack.fields.solid_angles.radial_kernel import BALL, Radial, RadialKernel, RadialSums
-from harnack.fields.solid_angles.radial_tree import ClusteredDipoles, TreeSum
-from harnack.fields.solid_angles.treecode import dipole_rows
-from harnack.fields.source_sums import SLOPE_ROUNDINGS, SUM_ROUNDING
+from harnack.fields.solid_angles.radial_kernel import (
+    BALL_FRACTION,
+    KernelValues,
+    RadialKernel,
+    RadialSums,
+)
+from harnack.fields.solid_angles.radial_tree import ClusteredDipoles, RadialTreecode
+from harnack.fields.solid_angles.treecode import dipole_records
+from harnack.fields.source_sums import SLOPE_ROUNDINGS, SUM_MARGIN
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from harnack.backend import Backend, FloatArray, IntArray, Precision, Real, Vec3
     from harnack.geometry import Volume
-    from harnack.tree.empty_space import OccupiedCells
+    from harnack.tree.empty_space import OccupancyGrid
 
-GRADIENT = 1.1855
+GRADIENT_BOUND = 1.1855
 """Half the largest gradient of a dipole in four dimensions, times D^3, used as Q_2."""
 
 # Degrees of the polynomial for the last i_n in single and double precision: the singularity at
@@ -97,20 +103,20 @@ class SlicedKernel(RadialKernel):
         self.height_square = dr.opaque(backend.Float, height * height)
         self._degree = _DEGREES[np.dtype(backend.dtype).itemsize]
 
-    def at(self, distance: Real, inverse: Real, last: int) -> Radial:
+    def at(self, distance: Real, inverse: Real, last: int) -> KernelValues:
         del distance
         c = self.height * inverse
         s2 = dr.fma(-c, c, 1)
-        moment = _horner(dr.fma(2, c, -1), last_moment(last + 1, self._degree))
+        moment = _horner(dr.fma(2, c, -1), moment_polynomial(last + 1, self._degree))
         thetas = [_factor(last) * moment]
         for k in range(last, 0, -1):
             moment = dr.fma(2 * k * s2, moment, c) * (1 / (2 * k - 1))
             thetas.insert(0, _factor(k - 1) * moment)
-        return Radial(inverse, thetas)
+        return KernelValues(inverse, thetas)
 
     def bounds(self, distance: Real, last: int) -> list[Real]:
         del distance
-        return [GRADIENT, *(1.0 for _ in range(3, last + 1))]
+        return [GRADIENT_BOUND, *(1.0 for _ in range(3, last + 1))]
 
     def growth(self, r: Real) -> Real:
         del r
@@ -121,7 +127,7 @@ class SlicedKernel(RadialKernel):
 
 
 @functools.cache
-def last_moment(n: int, degree: int) -> tuple[float, ...]:
+def moment_polynomial(n: int, degree: int) -> tuple[float, ...]:
     """i_n as a polynomial in 2c - 1 on [-1, 1], coefficients from the constant on."""
     t, weight = legendre.leggauss(48)
     t, weight = 0.5 * (t + 1), 0.5 * weight
@@ -154,22 +160,22 @@ _CELL = 0.54
 
 
 @dataclass(frozen=True)
-class Centroids:
+class QuadraturePoints:
     """Points that stand for pieces of triangles, or for several small ones.
 
     points: (n, 3) centroids.
     moments: (n, 3) area times normal, summed up.
     farthest: the largest distance of a point of a triangle from the point that stands for it.
-    spread: the largest ratio, over all points, of the integral of |d|^2 over what the point stands
-        for, d the offset from the point, to the length of its moment.
-    slant: the same for the Frobenius norm of the sum of moment times d.
+    second_moment_ratio: the largest ratio, over all points, of the integral of |d|^2 over what the
+        point stands for, d the offset from the point, to the length of its moment.
+    first_moment_ratio: the same for the Frobenius norm of the sum of moment times d.
     """
 
     points: FloatArray
     moments: FloatArray
     farthest: float
-    spread: float
-    slant: float
+    second_moment_ratio: float
+    first_moment_ratio: float
 
 
 def piece_counts(corners: FloatArray, longest: float) -> IntArray:
@@ -178,21 +184,21 @@ def piece_counts(corners: FloatArray, longest: float) -> IntArray:
     return np.maximum(np.ceil(_longest_edges(corners) / longest), 1).astype(np.int64)
 
 
-def centroids(corners: FloatArray, longest: float) -> Centroids:
+def quadrature_points(corners: FloatArray, longest: float) -> QuadraturePoints:
     """Centroids of triangles (m, 3, 3), cut into similar pieces with edges of at most `longest`;
     for those much smaller, one point for all in a cell that face the same way."""
     small = _longest_edges(corners) <= _CELL * longest
     parts = [
         make(some, longest)
-        for make, some in ((_cut, corners[~small]), (_merged, corners[small]))
+        for make, some in ((_subdivide, corners[~small]), (_merge_small, corners[small]))
         if len(some)
     ]
-    return Centroids(
+    return QuadraturePoints(
         np.concatenate([one.points for one in parts]),
         np.concatenate([one.moments for one in parts]),
         max(one.farthest for one in parts),
-        max(one.spread for one in parts),
-        max(one.slant for one in parts),
+        max(one.second_moment_ratio for one in parts),
+        max(one.first_moment_ratio for one in parts),
     )
 
 
@@ -216,7 +222,7 @@ def _mean_squares(corners: FloatArray) -> FloatArray:
     return ((corners - np.roll(corners, 1, axis=1)) ** 2).sum(axis=(1, 2)) / 36
 
 
-def _cut(corners: FloatArray, longest: float) -> Centroids:
+def _subdivide(corners: FloatArray, longest: float) -> QuadraturePoints:
     """Triangles cut into counts^2 similar pieces each, whose first moments vanish."""
     counts = piece_counts(corners, longest)
     points: list[FloatArray] = []
@@ -233,10 +239,10 @@ def _cut(corners: FloatArray, longest: float) -> Centroids:
         moments.append(np.repeat(_areas(some) / count**2, count**2, axis=0))
     spread = float((_mean_squares(corners) / counts**2).max())
     farthest = float((_farthest(corners, corners.mean(axis=1)) / counts).max())
-    return Centroids(np.concatenate(points), np.concatenate(moments), farthest, spread, 0.0)
+    return QuadraturePoints(np.concatenate(points), np.concatenate(moments), farthest, spread, 0.0)
 
 
-def _merged(corners: FloatArray, longest: float) -> Centroids:
+def _merge_small(corners: FloatArray, longest: float) -> QuadraturePoints:
     """One point for all triangles whose centroids are in a cell and whose normals have the same
     largest component: their moments add up to at least 1/sqrt(3) of their area."""
     moments, middles = _areas(corners), corners.mean(axis=1)
@@ -256,7 +262,7 @@ def _merged(corners: FloatArray, longest: float) -> Centroids:
     slant = np.linalg.norm(_sums(group, outer), axis=1)
     spread = float((_sums(group, square[:, None])[:, 0] / length).max())
     farthest = float(_farthest(corners, points[group]).max())
-    return Centroids(points, total, farthest, spread, float((slant / length).max()))
+    return QuadraturePoints(points, total, farthest, spread, float((slant / length).max()))
 
 
 def _sums(group: IntArray, values: FloatArray) -> FloatArray:
@@ -275,19 +281,19 @@ _MOST_CELLS = 40_000
 _ACROSS = 128
 
 
-class MorphSlice(DetailedField["_SliceBuffers"]):
+class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
     """f(x) = (U_a(x, w) + U_b(x, gap - w))/(2 pi^2), 0 < w < gap: see `Morph`.
 
     corners: two arrays (m, 3, 3) of triangles. w, gap, spacing, accuracy: as for `Morph`.
 
     Promises, with the 4D distances D of all points, d the least of them (`SlicedKernel` has the
-    proof that second derivatives are no larger than those of dipoles at a distance D): `Curvature`
-    within 0.45 d, and a `HarmonicBall` of dimension 4 and radius 0.35 d, which proves shorter
-    steps.
+    proof that second derivatives are no larger than those of dipoles at a distance D):
+    `TaylorRemainder` within 0.45 d, and a `HarmonicBall` of dimension 4 and radius 0.35 d, which
+    proves shorter steps.
     """
 
     default_level = 0.5
-    values_take_more = False
+    has_separate_batch_data = False
 
     def __init__(
         self, corners: Sequence[FloatArray], *, w: float, gap: float, spacing: float,
@@ -299,35 +305,35 @@ class MorphSlice(DetailedField["_SliceBuffers"]):
         low = np.min([one.min(axis=(0, 1)) for one in corners], axis=0)
         high = np.max([one.max(axis=(0, 1)) for one in corners], axis=0)
         self._box = low, high
-        self._center = single(0.5 * (low + high))
+        self._center = round_to_single(0.5 * (low + high))
         # A power of two, so that lengths are scaled without rounding.
         self._size = 2.0 ** math.ceil(math.log2(0.5 * float((high - low).max())))
         longest = [spacing * height for height in self.heights]
         _check_count([piece_counts(*one) for one in zip(corners, longest, strict=True)], w, gap)
-        self._pieces = tuple(centroids(*one) for one in zip(corners, longest, strict=True))
+        self._pieces = tuple(quadrature_points(*one) for one in zip(corners, longest, strict=True))
         self._dipoles = tuple(self._clustered(one) for one in self._pieces)
-        self._extents: Remembered[tuple[float, ...], Volume] = Remembered()
-        self._occupied: Remembered[tuple[float, ...], OccupiedCells] = Remembered()
+        self._extents: TransientCache[tuple[float, ...], Volume] = TransientCache()
+        self._occupied: TransientCache[tuple[float, ...], OccupancyGrid] = TransientCache()
 
-    def _clustered(self, pieces: Centroids) -> ClusteredDipoles:
+    def _clustered(self, pieces: QuadraturePoints) -> ClusteredDipoles:
         """The pieces in unit coordinates, scaled so that f is the sum of both."""
         share = 1 / (8 * math.pi * self._size**2)
         points = (pieces.points - self._center) / self._size
-        return ClusteredDipoles.of(dipole_rows(points, share * pieces.moments))
+        return ClusteredDipoles.of(dipole_records(points, share * pieces.moments))
 
     @property
     def point_counts(self) -> tuple[int, ...]:
         """Points of the quadrature of each mesh."""
         return tuple(len(one.rows) for one in self._dipoles)
 
-    def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> Values:
-        on = self._batch(backend_of(x))
-        x = on.unit(x)
+    def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> PointValues:
+        on = self._batch_data(backend_of(x))
+        x = on.to_unit(x)
         sums = on.sums(x, closer, derivatives).sums
-        rounding = 8 * on.backend.epsilon * dr.abs(sums.value)
-        values = sums.values(1.0, epsilon_at(x), rounding)
+        rounding = 8 * on.backend.machine_epsilon * dr.abs(sums.value)
+        values = sums.values(1.0, coordinate_rounding(x), rounding)
         weight = sum(float(one.rows[:, 6].sum()) for one in self._dipoles)
-        return values.far_away(x, 64, weight).rescaled(on.size)
+        return values.with_far_field_errors(x, 64, weight).rescaled(on.size)
 
     def quadrature_displacement(self, points: Any, precision: Precision = "single") -> FloatArray:
         """As `Morph.quadrature_displacement`.
@@ -340,8 +346,8 @@ class MorphSlice(DetailedField["_SliceBuffers"]):
         """
 
         def kernel(backend: Backend, x: Vec3) -> tuple[Real]:
-            on = self._batch(backend)
-            x = on.unit(x)
+            on = self._batch_data(backend)
+            x = on.to_unit(x)
             error, gradient = backend.Float(0), backend.Array3f(0)
             for cloud, piece, height in zip(on.clouds, self._pieces, self.heights, strict=True):
                 sums = cloud.sums(x, 1.0, 1)
@@ -349,25 +355,29 @@ class MorphSlice(DetailedField["_SliceBuffers"]):
                 bend = dr.inf
                 if share < 1:
                     bend = sums.remainder(share, piece.farthest / self._size, 1.0)
-                error = dr.fma(piece.spread / self._size**2, bend, error)
-                error = dr.fma(2 * math.sqrt(3) * piece.slant / self._size, sums.steep, error)
+                error = dr.fma(piece.second_moment_ratio / self._size**2, bend, error)
+                error = dr.fma(
+                    2 * math.sqrt(3) * piece.first_moment_ratio / self._size, sums.q2_d3, error
+                )
                 gradient = gradient + sums.sums.gradient
             return (error / dr.norm(gradient) * on.size,)
 
-        return at_points(points, kernel, precision)[0]
+        return evaluate_points(points, kernel, precision)[0]
 
     def _upload(self, backend: Backend, *, traced: bool) -> _SliceBuffers:
         del traced
         clouds = tuple(
-            TreeSum(backend, dipoles, SlicedKernel(backend, height / self._size), self.accuracy)
+            RadialTreecode(
+                backend, dipoles, SlicedKernel(backend, height / self._size), self.accuracy
+            )
             for dipoles, height in zip(self._dipoles, self.heights, strict=True)
         )
-        return _SliceBuffers(*placed(backend, self._center, self._size), clouds)
+        return _SliceBuffers(*frame_parameters(backend, self._center, self._size), clouds)
 
     def _sample(self, on: _SliceBuffers, p: Vec3, detail: Real) -> Sample:
         return on.sample(p, detail)
 
-    def check_levels(self, levels: tuple[float, ...]) -> None:
+    def validate_levels(self, levels: tuple[float, ...]) -> None:
         for level in levels:
             if abs(level) < _SMALLEST_LEVEL:
                 raise ValueError("level 0 of a morph reaches to infinity; the surface is at 0.5")
@@ -384,34 +394,36 @@ class MorphSlice(DetailedField["_SliceBuffers"]):
             )
         return self._extents[levels]
 
-    def occupied(self, levels: tuple[float, ...]) -> OccupiedCells:
+    def occupied_cells(self, levels: tuple[float, ...]) -> OccupancyGrid:
         if levels not in self._occupied:
             self._occupied[levels] = occupied_cells(self, levels, self.extent(levels), _ACROSS)
         return self._occupied[levels]
 
 
 @dataclass(frozen=True)
-class _SliceBuffers(UnitCoordinates):
+class _SliceBuffers(UnitFrame):
     """The points of both meshes on a backend, each mesh with a height of its own."""
 
-    clouds: tuple[TreeSum, ...]
+    clouds: tuple[RadialTreecode, ...]
 
     def sums(self, x: Vec3, closer: Real, derivatives: int) -> RadialSums:
         """The sums over the points of both meshes."""
         sums = RadialSums.zero(self.backend, derivatives)
         for cloud in self.clouds:
-            sums = cloud.added(sums, x, closer)
+            sums = cloud.accumulate(sums, x, closer)
         return sums
 
     def sample(self, p: Vec3, detail: Real) -> Sample:
         """f at points p, in units of `size`."""
-        x = self.unit(p)
+        x = self.to_unit(p)
         radial = self.sums(x, detail, 1)
         sums = radial.sums
-        slope_error = dr.fma(SLOPE_ROUNDINGS * epsilon_at(x), sums.s4, sums.slope_truncation)
-        nearest = sums.free_distance * (1 - SUM_ROUNDING) - 8 * self.backend.epsilon
+        slope_error = dr.fma(
+            SLOPE_ROUNDINGS * coordinate_rounding(x), sums.s4, sums.gradient_truncation
+        )
+        nearest = sums.singularity_distance * (1 - SUM_MARGIN) - 8 * self.backend.machine_epsilon
         nearest = fmax(nearest, 0)
-        r = BALL * nearest
+        r = BALL_FRACTION * nearest
         moved = radial.variation(r, 1.0)
         ball = HarmonicBall(r * self.size, sums.value - moved, sums.value + moved, dimension=4)
         return Sample(
@@ -420,8 +432,8 @@ class _SliceBuffers(UnitCoordinates):
             radial.curvatures(lambda r: 1.0, nearest, self.size),
             sums.truncation + sums.rounding,
             slope_error / self.size,
-            truncation=sums.truncation,
-            weaker=(ball,),
+            truncation_error=sums.truncation,
+            alternative_promises=(ball,),
         )
 
 

@@ -10,9 +10,12 @@ with solid harmonics R_lm = r^l P_lm(cos t) e^(im p)/(l+m)! and I_lm = (l-m)! P_
 R_lm(a+b) = sum R_l'm'(a) R_l-l',m-m'(b), d/dz R_lm = R_l-1,m, (d/dx + i d/dy) R_lm = -R_l-1,m+1,
 (d/dx - i d/dy) R_lm = R_l-1,m-1. Tests check all of these.
 
-- `regular`, `of_dipole`, `moved`: harmonics, moments of a dipole, and moments about another point.
-- `NodeMoments`, from `all_levels` or `triangle_levels`: the moments of all nodes of a tree.
-- `truncation`, `bend_columns`: bounds of the terms that are left out, and of those that are not.
+- `regular_harmonics`, `dipole_moments`, `multipole_to_multipole`: harmonics, moments of a dipole,
+  and moments about another point.
+- `NodeMoments`, from `dipole_tree_moments` or `triangle_tree_moments`: the moments of all nodes of
+  a tree.
+- `truncation_bounds`, `remainder_constants`: bounds of the terms that are left out, and of those
+  that are not.
 
 A complex number is a pair here, of numbers or arrays of any kind, NumPy's and Dr.Jit's alike.
 """
@@ -29,10 +32,10 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import FloatArray, choose_backend, to_numpy
-from harnack.backend.arrays import aligned, aligned_integers
+from harnack.backend.arrays import upload_floats, upload_integers
 from harnack.backend.elementary import fmax, fmin
-from harnack.fields.source_sums import longest_part, remainder_factor
-from harnack.tree import NO_PRIMITIVE, Hierarchy
+from harnack.fields.source_sums import max_step_fraction, remainder_factor
+from harnack.tree import NO_PRIMITIVE, BalancedTree
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
@@ -45,12 +48,12 @@ Pair = tuple[Any, Any]
 Pairs = dict[tuple[int, int], Pair]
 
 # The largest l for which moments are computed.
-KNOWN = 5
+MAX_DEGREE = 5
 # The (l, m) for which moments are stored: 1 <= l <= KNOWN and 0 <= m <= l.
-KEYS = tuple((l, m) for l in range(1, KNOWN + 1) for m in range(l + 1))
+MOMENT_KEYS = tuple((l, m) for l in range(1, MAX_DEGREE + 1) for m in range(l + 1))
 
 
-def regular(x: Any, y: Any, z: Any, order: int) -> Pairs:
+def regular_harmonics(x: Any, y: Any, z: Any, order: int) -> Pairs:
     """R_lm for l <= order and 0 <= m <= l; the imaginary part is the number 0 if m = 0."""
     r2 = x * x + y * y + z * z
     out: Pairs = {(0, 0): (0 * x + 1, 0.0)}
@@ -71,12 +74,12 @@ def regular(x: Any, y: Any, z: Any, order: int) -> Pairs:
     return out
 
 
-def of_dipole(harmonics: Pairs, nx: Any, ny: Any, nz: Any) -> Pairs:
+def dipole_moments(harmonics: Pairs, nx: Any, ny: Any, nz: Any) -> Pairs:
     """M_lm of a dipole n, whose length is its area, at d, from R_lm(d) for l < KNOWN; or those of
     one that is spread out, from the means of R_lm."""
-    r, x, y = _either_sign(harmonics), 0.5 * nx, 0.5 * ny
+    r, x, y = _with_negative_orders(harmonics), 0.5 * nx, 0.5 * ny
     out: Pairs = {}
-    for l, m in KEYS:
+    for l, m in MOMENT_KEYS:
         re, im = (nz * part for part in r[l - 1, m]) if m < l else (0.0, 0.0)
         if abs(m + 1) < l:  # less (x - iy) R_l-1,m+1
             a, b = r[l - 1, m + 1]
@@ -88,11 +91,14 @@ def of_dipole(harmonics: Pairs, nx: Any, ny: Any, nz: Any) -> Pairs:
     return out
 
 
-def moved(moments: Pairs, x: Any, y: Any, z: Any) -> Pairs:
+def multipole_to_multipole(moments: Pairs, x: Any, y: Any, z: Any) -> Pairs:
     """Moments about c, from the moments of the same dipoles about c + (x, y, z)."""
-    r, given = _either_sign(regular(x, y, z, KNOWN - 1)), _either_sign(moments)
+    r, given = (
+        _with_negative_orders(regular_harmonics(x, y, z, MAX_DEGREE - 1)),
+        _with_negative_orders(moments),
+    )
     out: Pairs = {}
-    for l, m in KEYS:
+    for l, m in MOMENT_KEYS:
         re, im = moments[l, m]
         for k in range(1, l):
             for j in range(max(-k, m - l + k), min(k, m + l - k) + 1):
@@ -104,7 +110,7 @@ def moved(moments: Pairs, x: Any, y: Any, z: Any) -> Pairs:
     return out
 
 
-def _either_sign(values: Pairs) -> Pairs:
+def _with_negative_orders(values: Pairs) -> Pairs:
     """R_lm or M_lm with those for m < 0 added."""
     turned = {
         (l, -m): (re, -im) if m % 2 == 0 else (-re, im) for (l, m), (re, im) in values.items() if m
@@ -117,7 +123,7 @@ def _either_sign(values: Pairs) -> Pairs:
 
 Moments = dict[tuple[int, int], npt.NDArray[np.complex128]]
 # Degree, order, and 0 for the real or 1 for the imaginary part.
-_PARTS = tuple((l, m, part) for l, m in KEYS for part in range(2 if m else 1))
+_PARTS = tuple((l, m, part) for l, m in MOMENT_KEYS for part in range(2 if m else 1))
 # How many numbers `_powers` gives.
 _POWERS = 10
 
@@ -130,22 +136,22 @@ class NodeMoments:
         area.
     radius: (k,) of a ball around it that contains all the dipoles.
     area: (k,) sum of a_i = |a_i n_i|.
-    second, third, fourth: (k, 3, 3), (k, 3) and (k,) sums of a_i d_i d_i^T, of a_i |d_i|^2 d_i and
-        of a_i |d_i|^4.
+    second_moment, third_moment, fourth_moment: (k, 3, 3), (k, 3) and (k,) sums of a_i d_i d_i^T, of
+        a_i |d_i|^2 d_i and of a_i |d_i|^4.
     moments: M_lm, (k,) each, for 1 <= l <= 5 and m >= 0.
     """
 
     center: FloatArray
     radius: FloatArray
     area: FloatArray
-    second: FloatArray
-    third: FloatArray
-    fourth: FloatArray
+    second_moment: FloatArray
+    third_moment: FloatArray
+    fourth_moment: FloatArray
     moments: Moments
 
 
-def all_levels(
-    tree: Hierarchy, points: FloatArray, normals: FloatArray, low: FloatArray, high: FloatArray
+def dipole_tree_moments(
+    tree: BalancedTree, points: FloatArray, normals: FloatArray, low: FloatArray, high: FloatArray
 ) -> list[NodeMoments]:
     """Moments of the nodes of all levels, from the leaves to the root.
 
@@ -153,29 +159,29 @@ def all_levels(
     low, high: (n, 3) boxes that hold the primitives.
     """
     backend, each = choose_backend("double"), points.shape[1]
-    p, n, lows, highs = (aligned(backend, x.ravel()) for x in (points, normals, low, high))
+    p, n, lows, highs = (upload_floats(backend, x.ravel()) for x in (points, normals, low, high))
 
-    def primitive(i: Any) -> _Primitive:
+    def primitive(i: Any) -> _DipolePrimitive:
         dipoles = [
             _Dipole(_row(backend, n, i * each + k), ((1.0, _row(backend, p, i * each + k)),))
             for k in range(each)
         ]
-        return _Primitive(dipoles, _row(backend, lows, i), _row(backend, highs, i))
+        return _DipolePrimitive(dipoles, _row(backend, lows, i), _row(backend, highs, i))
 
     return _levels(backend, tree, primitive)
 
 
-def triangle_levels(tree: Hierarchy, corners: FloatArray) -> list[NodeMoments]:
+def triangle_tree_moments(tree: BalancedTree, corners: FloatArray) -> list[NodeMoments]:
     """Moments of the nodes of all levels, for triangles (n, 3, 3): exact up to rounding."""
     backend = choose_backend("double")
-    buffer = aligned(backend, corners.ravel())
+    buffer = upload_floats(backend, corners.ravel())
     rule = tuple(zip(*(part.tolist() for part in triangle_rule()), strict=True))
 
-    def primitive(i: Any) -> _Primitive:
+    def primitive(i: Any) -> _DipolePrimitive:
         a, b, c = (_row(backend, buffer, 3 * i + k) for k in range(3))
         points = [(weight, a * u + b * v + c * w) for (u, v, w), weight in rule]
         dipole = _Dipole(0.5 * dr.cross(b - a, c - a), points)
-        return _Primitive([dipole], fmin(fmin(a, b), c), fmax(fmax(a, b), c))
+        return _DipolePrimitive([dipole], fmin(fmin(a, b), c), fmax(fmax(a, b), c))
 
     return _levels(backend, tree, primitive)
 
@@ -189,7 +195,7 @@ class _Dipole:
 
 
 @dataclass(frozen=True)
-class _Primitive:
+class _DipolePrimitive:
     """The dipoles of a primitive, and a box that contains it."""
 
     dipoles: Sequence[_Dipole]
@@ -202,7 +208,7 @@ def _row(backend: Backend, buffer: Real, i: Any) -> Vec3:
 
 
 def _levels(
-    backend: Backend, tree: Hierarchy, primitive: Callable[[Any], _Primitive]
+    backend: Backend, tree: BalancedTree, primitive: Callable[[Any], _DipolePrimitive]
 ) -> list[NodeMoments]:
     level, parts, low, high = _leaves(backend, tree, primitive)
     levels = [level]
@@ -215,7 +221,7 @@ def _levels(
 
 
 def _leaves(
-    backend: Backend, tree: Hierarchy, primitive: Callable[[Any], _Primitive]
+    backend: Backend, tree: BalancedTree, primitive: Callable[[Any], _DipolePrimitive]
 ) -> tuple[NodeMoments, list[Real], FloatArray, FloatArray]:
     """The leaves, their `_PARTS` on the backend, and boxes around them.
 
@@ -223,11 +229,11 @@ def _leaves(
     about it.
     """
     index, real, vector = backend.UInt32, backend.Float, backend.Array3f
-    filled = tree.slots != NO_PRIMITIVE
-    slots = aligned_integers(backend, np.where(filled, tree.slots, 0).ravel())
+    filled = tree.leaf_slots != NO_PRIMITIVE
+    slots = upload_integers(backend, np.where(filled, tree.leaf_slots, 0).ravel())
     leaf = dr.arange(index, len(filled))
     first = leaf * dr.opaque(index, tree.leaf_size)
-    end = first + dr.gather(index, aligned_integers(backend, filled.sum(axis=1)), leaf)
+    end = first + dr.gather(index, upload_integers(backend, filled.sum(axis=1)), leaf)
 
     def visit(body: Callable[..., tuple[Any, ...]], state: tuple[Any, ...]) -> tuple[Any, ...]:
         def step(slot: Any, *state: Any) -> tuple[Any, ...]:
@@ -238,13 +244,13 @@ def _leaves(
 
         return dr.while_loop((first, *state), more, step, label="slots")[1:]
 
-    def measured(of: _Primitive, low: Vec3, high: Vec3, area: Real, weighted: Vec3) -> Any:
+    def measured(of: _DipolePrimitive, low: Vec3, high: Vec3, area: Real, weighted: Vec3) -> Any:
         for one in of.dipoles:
             size = dr.norm(one.normal)
             area, weighted = area + size, weighted + size * sum(w * p for w, p in one.points)
         return fmin(low, of.low), fmax(high, of.high), area, weighted
 
-    def summed(of: _Primitive, *parts: Real) -> tuple[Any, ...]:
+    def summed(of: _DipolePrimitive, *parts: Real) -> tuple[Any, ...]:
         for one in of.dipoles:
             away = [(weight, point - center) for weight, point in one.points]
             more = _powers(dr.norm(one.normal), away) + _flat(_spread_out(one.normal, away))
@@ -262,11 +268,16 @@ def _leaves(
     at, (xx, yy, zz, xy, xz, yz, *third, fourth) = to_numpy(center), map(to_numpy, powers)
     second = np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=1).reshape(-1, 3, 3)
     sizes = to_numpy(area), second, np.stack(third, axis=1), fourth
-    return NodeMoments(at, _reach(at, *boxes), *sizes, _moments_of(parts)), list(parts), *boxes
+    return (
+        NodeMoments(at, _bounding_radius(at, *boxes), *sizes, _moments_of(parts)),
+        list(parts),
+        *boxes,
+    )
 
 
 def _powers(area: Real, points: Sequence[tuple[float, Vec3]]) -> list[Real]:
-    """What a dipole adds to `second` (xx, yy, zz, xy, xz, yz), `third` and `fourth`."""
+    """What a dipole adds to `second_moment` (xx, yy, zz, xy, xz, yz), `third_moment` and
+    `fourth_moment`."""
     total: list[Real] = [area * 0] * _POWERS
     for weight, d in points:
         square, share = dr.squared_norm(d), weight * area
@@ -279,10 +290,10 @@ def _powers(area: Real, points: Sequence[tuple[float, Vec3]]) -> list[Real]:
 def _spread_out(normal: Vec3, points: Sequence[tuple[float, Vec3]]) -> Pairs:
     means: Pairs = {}
     for weight, d in points:
-        for key, (re, im) in regular(d.x, d.y, d.z, KNOWN - 1).items():
+        for key, (re, im) in regular_harmonics(d.x, d.y, d.z, MAX_DEGREE - 1).items():
             a, b = means.get(key, (0.0, 0.0))
             means[key] = a + weight * re, b + weight * im
-    return of_dipole(means, normal.x, normal.y, normal.z)
+    return dipole_moments(means, normal.x, normal.y, normal.z)
 
 
 def _flat(moments: Pairs) -> list[Any]:
@@ -291,7 +302,7 @@ def _flat(moments: Pairs) -> list[Any]:
 
 
 def _moments_of(parts: Sequence[Real]) -> Moments:
-    out = {key: np.zeros(dr.width(parts[0]), np.complex128) for key in KEYS}
+    out = {key: np.zeros(dr.width(parts[0]), np.complex128) for key in MOMENT_KEYS}
     for (l, m, part), values in zip(_PARTS, parts, strict=True):
         if part:
             out[l, m].imag = to_numpy(values)
@@ -310,10 +321,10 @@ def _parents(
     some = (area > 0)[:, None]
     center = np.where(some, weighted / np.where(some, area[:, None], 1), 0.5 * (low + high))
     shift = below.center - np.repeat(center, arity, axis=0)
-    given: Pairs = dict.fromkeys(KEYS, (0.0, 0.0))
+    given: Pairs = dict.fromkeys(MOMENT_KEYS, (0.0, 0.0))
     for (l, m, part), values in zip(_PARTS, parts, strict=True):
         given[l, m] = (given[l, m][0], values) if part else (values, 0.0)
-    found = _flat(moved(given, *(aligned(backend, one) for one in shift.T)))
+    found = _flat(multipole_to_multipole(given, *(upload_floats(backend, one) for one in shift.T)))
     dr.eval(*found)
     first = arity * dr.arange(backend.UInt32, count)
     sums = [sum(dr.gather(backend.Float, one, first + k) for k in range(arity)) for one in found]
@@ -321,7 +332,7 @@ def _parents(
     second, third, fourth = (
         one.reshape(count, arity, *one.shape[1:]).sum(axis=1) for one in _moved(below, shift)
     )
-    reach, moments = _reach(center, low, high), _moments_of(sums)
+    reach, moments = _bounding_radius(center, low, high), _moments_of(sums)
     return NodeMoments(center, reach, area, second, third, fourth, moments), sums
 
 
@@ -329,20 +340,24 @@ def _moved(level: NodeMoments, s: FloatArray) -> tuple[FloatArray, FloatArray, F
     """Second, third and fourth about center - s, that is, with d + s for d. About its own center a
     node's first moment is 0."""
     a, square = level.area[:, None], (s * s).sum(axis=1)
-    trace, bent = np.einsum("kii->k", level.second), np.einsum("kij,kj->ki", level.second, s)
-    second = level.second + a[:, None] * s[:, :, None] * s[:, None]
-    third = level.third + trace[:, None] * s + 2 * bent + a * square[:, None] * s
-    fourth = level.fourth + 2 * trace * square + level.area * square * square
-    return second, third, fourth + 4 * ((level.third + bent) * s).sum(axis=1)
+    trace, bent = (
+        np.einsum("kii->k", level.second_moment),
+        np.einsum("kij,kj->ki", level.second_moment, s),
+    )
+    second = level.second_moment + a[:, None] * s[:, :, None] * s[:, None]
+    third = level.third_moment + trace[:, None] * s + 2 * bent + a * square[:, None] * s
+    fourth = level.fourth_moment + 2 * trace * square + level.area * square * square
+    return second, third, fourth + 4 * ((level.third_moment + bent) * s).sum(axis=1)
 
 
-def _reach(center: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
+def _bounding_radius(center: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
     """Distance from the center to the farthest corner of the box."""
     return np.linalg.norm(np.maximum(high - center, center - low), axis=1)
 
 
-def cartesian(moments: Moments, order: int = 2) -> FloatArray:
-    """(k, 15) coefficients of the terms l <= order + 1, as `far_clusters.far_terms` reads them.
+def cartesian_coefficients(moments: Moments, order: int = 2) -> FloatArray:
+    """(k, 15) coefficients of the terms l <= order + 1, as `treecode.multipole_terms` reads
+    them.
 
     Term l is P_l(r)/r^(2l+1) with harmonic polynomials P_1 = D.r; P_2 with the coefficients of
     xx, yy, 2xy, 2xz, 2yz (zz follows: the trace is zero); P_3 with those of xyy, xzz, xxy, yzz,
@@ -388,7 +403,7 @@ def triangle_rule() -> tuple[FloatArray, FloatArray]:
 # Bounds of the terms.
 
 # A bound times this is still a bound after it was rounded down to single precision a few times.
-_ROOM = 1 + 2.0**-20
+_ROUND_UP = 1 + 2.0**-20
 
 
 def sup_norm(moments: Moments, l: int) -> FloatArray:
@@ -404,7 +419,7 @@ def sup_norm(moments: Moments, l: int) -> FloatArray:
     return np.sqrt(np.asarray(total))
 
 
-def truncation(
+def truncation_bounds(
     level: NodeMoments, nearest: FloatArray, order: int = 2
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """(E, G, H): at distances r >= nearest, the terms l >= order + 2 =: k add to f at most
@@ -426,40 +441,42 @@ def truncation(
     r = np.maximum(nearest, 1e-50)  # so that powers do not underflow
     q = np.minimum(level.radius / r, 0.99)
     k = order + 2
-    rest = level.fourth * level.radius / r ** (6 - k)
+    rest = level.fourth_moment * level.radius / r ** (6 - k)
     value = rest * (6 - 5 * q) / (1 - q) ** 2
     slope = rest * (42 - 70 * q + 30 * q * q) / (1 - q) ** 3
     second = rest * (336 - 840 * q + 720 * q * q - 210 * q**3) / (1 - q) ** 4
-    for l in range(k, KNOWN + 1):
+    for l in range(k, MAX_DEGREE + 1):
         term = sup_norm(level.moments, l) / r ** (l - k)
         value, slope, second = (
             value + term,
             slope + (l + 1) * term,
             second + (l + 1) * (l + 2) * term,
         )
-    return _ROOM * value, _ROOM * slope, _ROOM * second
+    return _ROUND_UP * value, _ROUND_UP * slope, _ROUND_UP * second
 
 
-def bend_columns(level: NodeMoments, rough: float) -> tuple[FloatArray, FloatArray]:
+def remainder_constants(level: NodeMoments, rough: float) -> tuple[FloatArray, FloatArray]:
     """A and K (k,) of nodes for points beyond r0 = `rough` times their radius R.
 
-    At such points, over a step of length t = q r, q <= Q = `longest_part(rough)`, a node's field
-    differs from its linear part by at most
+    At such points, over a step of length t = q r, q <= Q = `max_step_fraction(rough)`, a node's
+    field differs from its linear part by at most
 
         (A + K/r^2) t^2/r^4 Phi_1(q),   Phi_l(q) = ((1-q)^-(l+1) - 1 - (l+1)q)/q^2.
 
     The term l, a harmonic function of degree -(l+1), is at most B_l/r^(l+1), and its k-th
-    derivative along a line (l+k)!/l! B_l/r^(l+1+k) (the argument of `truncation`, k times). So
-    Taylor's remainder is at most B_l Phi_l(q) t^2/r^(l+3). In Phi_l/Phi_1 the ratio of
+    derivative along a line (l+k)!/l! B_l/r^(l+1+k) (the argument of `truncation_bounds`, k times).
+    So Taylor's remainder is at most B_l Phi_l(q) t^2/r^(l+3). In Phi_l/Phi_1 the ratio of
     coefficients, (l+k)!/(l! (k+1)!), grows with k, so that the quotient grows with q: W_l =
     Phi_l(Q)/Phi_1(Q) serves. With r >= r0: A = B_1 + W_2 B_2/r0 and K = sum_{l>=3} W_l
     B_l/r0^(l-3), for l >= 6 of B_l <= l R^(l-5) sum a |d|^4, with Phi_l(Q) < (1-Q)^-(l+1)/Q^2.
     """
-    r0, q = np.maximum(rough * level.radius, 1e-50), longest_part(rough)
+    r0, q = np.maximum(rough * level.radius, 1e-50), max_step_fraction(rough)
     first = q * q * remainder_factor(q)
-    ratio = [((1 - q) ** -(n + 1) - 1 - (n + 1) * q) / first for n in range(KNOWN + 1)]
-    terms = [ratio[n] * sup_norm(level.moments, n) for n in range(1, KNOWN + 1)]
+    ratio = [((1 - q) ** -(n + 1) - 1 - (n + 1) * q) / first for n in range(MAX_DEGREE + 1)]
+    terms = [ratio[n] * sup_norm(level.moments, n) for n in range(1, MAX_DEGREE + 1)]
     x = 1 / (rough * (1 - q))
     rest = x * (6 - 5 * x) / (1 - x) ** 2 / ((1 - q) ** 6 * first)
-    wide = rest * level.fourth / r0**2 + sum(term / r0**n for n, term in enumerate(terms[2:]))
+    wide = rest * level.fourth_moment / r0**2 + sum(
+        term / r0**n for n, term in enumerate(terms[2:])
+    )
     return terms[0] + terms[1] / r0, wide

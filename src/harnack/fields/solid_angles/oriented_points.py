@@ -10,9 +10,10 @@ if TYPE_CHECKING:
 
 class OrientedPoints:
     """Points (n, 3), unit normals (n, 3) and areas (n,). They stay as they are, since all else is
-    computed from them once: other points make another field. Subclasses set them by `_keep`."""
+    computed from them once: other points make another field. Subclasses set them by
+        `_set_points`."""
 
-    def _keep(self, points: FloatArray, normals: FloatArray, areas: FloatArray) -> None:
+    def _set_points(self, points: FloatArray, normals: FloatArray, areas: FloatArray) -> None:
         for one in (points, normals, areas):
             one.setflags(write=False)
         self._points, self._normals, self._areas = points, normals, areas

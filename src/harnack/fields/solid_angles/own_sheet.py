@@ -55,13 +55,13 @@ def lies_on_own_level(mesh: WindingMesh, level: float) -> bool:
     of it begins, and every part of it ends there (a harmonic function has no closed level set but
     about its poles).
     """
-    if not len(mesh.singular) or (mesh.multiplicity != 1).any():
+    if not len(mesh.singular_edges) or (mesh.multiplicity != 1).any():
         return False
     inner = np.zeros(len(mesh.vertices), np.bool_)
     inner[mesh.faces] = True
-    inner[mesh.singular] = False
+    inner[mesh.singular_edges] = False
     x = mesh.unit_vertices
-    edges = x[mesh.singular]
+    edges = x[mesh.singular_edges]
     corners = mesh.corners
     is_filled = inner.any()
     points = _some(x[inner] if is_filled else corners.mean(axis=1), _MOST)

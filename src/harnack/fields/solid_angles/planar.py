@@ -34,7 +34,7 @@ import numpy as np
 
 from harnack.backend.elementary import fmax, fmin
 from harnack.enclosures import HarmonicBall
-from harnack.geometry.convex_position import is_simple, segment_clearance_lower
+from harnack.geometry.convex_position import is_simple, segment_distance_lower_bound
 
 if TYPE_CHECKING:
     from harnack.backend import FloatArray, Real
@@ -56,7 +56,7 @@ class PlanarRegion:
     normal: FloatArray
     offset: float
 
-    def window(
+    def lift_range(
         self, angle: Real, height: Real, distance: Real, slack: Real, error: Real = 0.0
     ) -> HarmonicBall:
         """A ball and a range of the lift on it: see the module.
@@ -91,7 +91,7 @@ class PlanarRegion:
 
 
 @dataclass(frozen=True)
-class _Loop:
+class _PlanarLoop:
     """A simple loop in a plane.
 
     points: (k, 2) of a polygon, or the center of a circle.
@@ -131,7 +131,7 @@ def planar_region(loops: Loops, circles: Sequence[Circle]) -> PlanarRegion | Non
     if plane is None:
         return None
     normal, origin, size, axes = plane
-    flat: list[_Loop] = []
+    flat: list[_PlanarLoop] = []
     for loop in loops:
         centered = (loop - origin) / size
         edges = np.roll(centered, -1, axis=0) - centered
@@ -140,12 +140,12 @@ def planar_region(loops: Loops, circles: Sequence[Circle]) -> PlanarRegion | Non
         points = centered @ axes.T
         following = np.roll(points, -1, axis=0)
         area = float((points[:, 0] * following[:, 1] - points[:, 1] * following[:, 0]).sum())
-        flat.append(_Loop(points, 0.0, 1 if area > 0 else -1))
+        flat.append(_PlanarLoop(points, 0.0, 1 if area > 0 else -1))
     for one in circles:
         center = ((np.array(one.center) - origin) / size) @ axes.T
         sign = 1 if float(np.dot(one.normal, normal)) > 0 else -1
-        flat.append(_Loop(center[None], one.radius / size, sign))
-    if not all(_apart(one, other) for one, other in itertools.combinations(flat, 2)):
+        flat.append(_PlanarLoop(center[None], one.radius / size, sign))
+    if not all(_are_separated(one, other) for one, other in itertools.combinations(flat, 2)):
         return None
     # The winding number just inside each loop: the sum of the signs of all loops around it.
     inside = [
@@ -192,7 +192,7 @@ def _plane_of(
     return normal, origin, size, np.stack([first, np.cross(normal, first)])
 
 
-def _apart(one: _Loop, other: _Loop) -> bool:
+def _are_separated(one: _PlanarLoop, other: _PlanarLoop) -> bool:
     """Whether two loops are at least _APART from each other."""
     if one.radius > 0 and other.radius > 0:
         between = float(np.linalg.norm(one.points[0] - other.points[0]))
@@ -207,14 +207,14 @@ def _apart(one: _Loop, other: _Loop) -> bool:
         nearest = float(np.linalg.norm(away - share[:, None] * e, axis=1).min())
         farthest = float(np.linalg.norm(away, axis=1).max())
         return nearest - one.radius >= _APART or one.radius - farthest >= _APART
-    first, second = (_deep(x.points, np.roll(x.points, -1, axis=0)) for x in (one, other))
+    first, second = (_embed_in_space(x.points, np.roll(x.points, -1, axis=0)) for x in (one, other))
     for a, b in zip(*first, strict=True):
         many = (np.broadcast_to(end, second[0].shape) for end in (a, b))
-        if not segment_clearance_lower(*many, *second).min() >= _APART:
+        if not segment_distance_lower_bound(*many, *second).min() >= _APART:
             return False
     return True
 
 
-def _deep(*ends: FloatArray) -> tuple[Any, ...]:
+def _embed_in_space(*ends: FloatArray) -> tuple[Any, ...]:
     """Points (k, 2) of the plane as points (k, 3) of space, with z = 0."""
     return tuple(np.column_stack([end, np.zeros(len(end))]) for end in ends)

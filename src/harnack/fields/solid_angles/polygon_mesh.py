@@ -1,7 +1,7 @@
 """Meshes of polygons that need not be flat, each spanned by a level set of its solid angle.
 
 - `PolygonMesh`: the field, with a part for each face.
-- `FaceCurves`: the boundary curves of all faces on a backend; `FaceCurve`: the solid angle of a
+- `FaceLoops`: the boundary curves of all faces on a backend; `FaceSolidAngle`: the solid angle of a
   face, in each lane another.
 - `face_boxes`: boxes proved to hold the surface of each face.
 """
@@ -17,43 +17,43 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray, IntArray, choose_backend, to_numpy, to_vector3
-from harnack.backend.arrays import aligned, aligned_integers
+from harnack.backend.arrays import upload_floats, upload_integers
 from harnack.backend.elementary import fmin
-from harnack.backend.record_table import Records
-from harnack.cluster.serialization import Remembered
+from harnack.backend.record_table import RecordTable
+from harnack.cluster.serialization import TransientCache
 from harnack.enclosures import HarmonicBall, Lipschitz
-from harnack.fields.clearance import UnitCoordinates
-from harnack.fields.field import Field, Look, Path, Sample, lengthened
-from harnack.fields.patch_boxes import BoxedField, BoxedParts
-from harnack.fields.solid_angles.curve_queries import bends, swept_ball
+from harnack.fields.clearance import UnitFrame
+from harnack.fields.field import Field, Ray, RaySample, Sample, space_scaled
+from harnack.fields.patch_boxes import PatchBoxes, PatchField
+from harnack.fields.solid_angles.curve_queries import lift_ball, remainder_promises
 from harnack.fields.solid_angles.edges import (
     Edge,
     LoopEdges,
     inner_product,
-    near_rounding,
     spinor,
     sum_over_edges,
+    vertex_rounding,
 )
 from harnack.fields.solid_angles.solid_angle import SolidAngle
-from harnack.fields.solid_angles.trail_sums import Line, known_along, rates_along
-from harnack.fields.source_sums import SUM_ROUNDING
+from harnack.fields.solid_angles.trail_sums import RayLine, line_rates, lipschitz_along
+from harnack.fields.source_sums import SUM_MARGIN
 from harnack.geometry.polygon_meshes import PolygonFaces, validate_polygons
-from harnack.tree.closest_triangles import MOST_BOXES
+from harnack.tree.closest_triangles import MAX_BOXES
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
 
-__all__ = ["PERIOD", "FaceCurve", "FaceCurves", "FaceHead", "PolygonMesh", "face_boxes"]
+__all__ = ["PERIOD", "FaceData", "FaceLoops", "FaceSolidAngle", "PolygonMesh", "face_boxes"]
 
 PERIOD = 4 * math.pi
 # Edges of a record; a fixed number, so that all meshes share kernels.
-RUN = 4
+EDGES_PER_RECORD = 4
 # Records are counted in floats; single precision holds no larger integers without gaps.
 _MOST_RECORDS = 2**24
 
 
 @dataclass(frozen=True)
-class FaceCurves:
+class FaceLoops:
     """Records of all faces of a mesh, and of their edges.
 
     heads: for each face its center and size, the first record of its edges, the number of these
@@ -62,17 +62,17 @@ class FaceCurves:
     edges: of all faces, each in its own unit coordinates.
     """
 
-    heads: Records
+    heads: RecordTable
     edges: LoopEdges
 
     @classmethod
-    def upload(cls, backend: Backend, faces: PolygonFaces) -> FaceCurves:
+    def upload(cls, backend: Backend, faces: PolygonFaces) -> FaceLoops:
         """All faces, each centered and scaled to unit size.
 
         Centers are numbers that the backend's precision holds exactly, so that subtracting them
         near a face is exact.
         """
-        low, high = faces.boxes()
+        low, high = faces.face_boxes()
         center = (0.5 * (low + high)).astype(backend.dtype).astype(np.float64)
         face = faces.face_of_corner
         x = faces.vertices[faces.corners] - center[face]
@@ -80,35 +80,37 @@ class FaceCurves:
         size = np.maximum.reduceat(np.linalg.norm(x, axis=1), first)
         magnitude = np.maximum(np.abs(low), np.abs(high)).max(axis=1) / size
         x /= size[face][:, None]
-        loops = tuple(np.split(x, faces.starts[1:]))
-        trips = np.bincount(faces.face_of_loop, -(-faces.sizes // RUN)).astype(np.int64)
+        loops = tuple(np.split(x, faces.loop_starts[1:]))
+        trips = np.bincount(faces.face_of_loop, -(-faces.loop_sizes // EDGES_PER_RECORD)).astype(
+            np.int64
+        )
         if trips.sum() >= _MOST_RECORDS:
             raise ValueError(
                 f"{len(x):,} corners of faces are too many: cut the mesh into parts, and give "
                 "them as a list to draw"
             )
         signed = np.where(faces.in_convex_position, -trips, trips)
-        edges = LoopEdges.upload(backend, loops, RUN)
+        edges = LoopEdges.upload(backend, loops, EDGES_PER_RECORD)
         heads = np.column_stack(
             [
                 center, size, np.cumsum(trips) - trips, signed,
-                backend.epsilon * (6 + 2 * magnitude),
+                backend.machine_epsilon * (6 + 2 * magnitude),
                 edges.rounding(trips),
             ]
         )  # fmt: skip
-        return cls(Records.upload(backend, heads), edges)
+        return cls(RecordTable.upload(backend, heads), edges)
 
-    def face(self, index: Any) -> FaceCurve:
+    def face(self, index: Any) -> FaceSolidAngle:
         """The solid angle of the face with that index, which may differ from lane to lane."""
-        row = self.heads.row(index)
+        row = self.heads.read_record(index)
         backend = self.heads.backend
         count = backend.UInt32
-        edges = self.edges.part(count(row[4]), count(dr.abs(row[5])))
-        return FaceCurve(FaceHead(backend, backend.Array3f(*row[:3]), row[3], edges, *row[5:]))
+        edges = self.edges.records_of(count(row[4]), count(dr.abs(row[5])))
+        return FaceSolidAngle(FaceData(backend, backend.Array3f(*row[:3]), row[3], edges, *row[5:]))
 
 
 @dataclass(frozen=True)
-class FaceHead(UnitCoordinates):
+class FaceData(UnitFrame):
     """The head of a face, in each lane another, with its edges."""
 
     edges: LoopEdges
@@ -117,7 +119,7 @@ class FaceHead(UnitCoordinates):
     value_rounding: Real
 
 
-class FaceCurve(Field):
+class FaceSolidAngle(Field):
     """The solid angle of a face, in each lane another.
 
     Its promises are those of `SolidAngle`, which proves them. The ball is that of "convex" if the
@@ -127,23 +129,23 @@ class FaceCurve(Field):
     period: ClassVar[float | None] = PERIOD
     default_level: float = 2 * math.pi
 
-    def __init__(self, face: FaceHead) -> None:
+    def __init__(self, face: FaceData) -> None:
         self.face = face
 
     def evaluate(self, p: Vec3) -> Sample:
         return self._sample(p, None)
 
-    def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
+    def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
         del ahead, back
-        return path.look(self._sample(path.point(t), path.direction))
+        return path.enclose(self._sample(path.point(t), path.direction))
 
     def _sample(self, p: Vec3, direction: Vec3 | None) -> Sample:
         face = self.face
-        backend, x, rounding = face.backend, face.unit(p), face.rounding
+        backend, x, rounding = face.backend, face.to_unit(p), face.rounding
         sums = sum_over_edges(face.edges, x)
-        distance = sums.distance * (1 - SUM_ROUNDING) - rounding
-        known = bends(sums.cubes, sums.fourths, distance)
-        swept = swept_ball(sums.angle, sums.gradient, sums.squares, known)
+        distance = sums.distance * (1 - SUM_MARGIN) - rounding
+        known = remainder_promises(sums.cubes, sums.fourths, distance)
+        swept = lift_ball(sums.angle, sums.gradient, sums.squares, known)
         convex = face.trips < 0
         ball = HarmonicBall(
             dr.select(convex, distance, swept.radius),
@@ -154,25 +156,27 @@ class FaceCurve(Field):
         met = sums.distance <= 2 * rounding
         steep = backend.Array3f(0, 0, 4 * PERIOD / rounding)
         gradient = dr.select(met, steep, sums.gradient)
-        error = near_rounding(backend.epsilon, x, sums.squares)
+        error = vertex_rounding(backend.machine_epsilon, x, sums.squares)
         error = dr.select(met, 0, error) + face.value_rounding
         error = dr.select(met, 8 * PERIOD, error)
         along: tuple[Lipschitz, ...] = ()
         if direction is not None:
-            line = Line(x, backend.Array3f(direction), rounding)
+            line = RayLine(x, backend.Array3f(direction), rounding)
 
             def rates(lengths: tuple[Real, ...], active: Mask) -> tuple[Real, ...]:
-                return rates_along(face.edges, line, lengths, active)
+                return line_rates(face.edges, line, lengths, active)
 
-            along = known_along(line, sums.gradient, sums.distance, rates)
+            along = lipschitz_along(line, sums.gradient, sums.distance, rates)
         value = dr.select(met, 0, sums.angle)
-        sample = Sample(value, gradient, known, error, weaker=(ball,), along=along)
-        return lengthened(sample, face.size)
+        sample = Sample(
+            value, gradient, known, error, alternative_promises=(ball,), ray_promises=along
+        )
+        return space_scaled(sample, face.size)
 
 
 # All cells are split so many times, those at the sides of a box up to this many times; in at most
 # so many rounds, and for at most so many pairs of an edge and a cell.
-_COARSE, _FINEST, _ROUNDS, _MOST_PAIRS = 2, 7, 24, 30_000_000
+_MIN_DEPTH, _MAX_DEPTH, _ROUNDS, _MOST_PAIRS = 2, 7, 24, 30_000_000
 # Boxes are wider than proved by this fraction of the size of a face.
 _SLACK = 1e-4
 _CORNERS = np.array(list(itertools.product((0, 1), repeat=3)), dtype=np.float64)
@@ -188,20 +192,20 @@ def face_boxes(faces: PolygonFaces, levels: tuple[float, ...]) -> tuple[FloatArr
     `SolidAngle.extent`; of its cells those that are proved empty are removed (`_are_empty`), and
     the box is that around the others.
     """
-    low, high = faces.boxes()
+    low, high = faces.face_boxes()
     nearest = min(abs(math.remainder(level, PERIOD)) for level in levels)
     size = 0.5 * np.linalg.norm(high - low, axis=1)[:, None]
     in_hull = faces.in_convex_position & (nearest > 2 * math.pi * (1 - 1e-9))
-    reach = 1.0001 * faces.lengths()[:, None] / math.sqrt(nearest * (PERIOD - nearest))
+    reach = 1.0001 * faces.face_perimeters()[:, None] / math.sqrt(nearest * (PERIOD - nearest))
     lower = np.where(in_hull[:, None], low, low - reach)
     upper = np.where(in_hull[:, None], high, high + reach)
     carved = np.flatnonzero(~in_hull)
     if carved.size:
-        lower[carved], upper[carved] = _carved(faces, carved, lower, upper, levels)
+        lower[carved], upper[carved] = _carve_boxes(faces, carved, lower, upper, levels)
     return lower - _SLACK * size, upper + _SLACK * size
 
 
-def _carved(
+def _carve_boxes(
     faces: PolygonFaces, carved: IntArray, lower: FloatArray, upper: FloatArray,
     levels: tuple[float, ...],
 ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
@@ -209,30 +213,30 @@ def _carved(
 
     Only the cells at the sides of a box can make it smaller, so only these are split further.
     """
-    curves = FaceCurves.upload(choose_backend("double"), faces)
+    curves = FaceLoops.upload(choose_backend("double"), faces)
     sides, pairs = upper - lower, 0
     corners = np.bincount(faces.face_of_corner)
-    cells = _Cells(carved, lower[carved], np.zeros(len(carved), dtype=np.int64))
+    cells = _FaceCells(carved, lower[carved], np.zeros(len(carved), dtype=np.int64))
     low, high = cells.boxes(sides)
     for turn in range(_ROUNDS):
-        ends = cells.depth < _COARSE
-        if turn >= _COARSE:
+        ends = cells.depth < _MIN_DEPTH
+        if turn >= _MIN_DEPTH:
             place = np.searchsorted(carved, cells.face)
-            ends = cells.touch(low[place], high[place], sides) & (cells.depth < _FINEST)
+            ends = cells.touch(low[place], high[place], sides) & (cells.depth < _MAX_DEPTH)
         pairs += 8 * int(corners[cells.face[ends]].sum())
         if not ends.any() or pairs > _MOST_PAIRS:
             break
-        parts = cells.taken(ends).split(sides)
+        parts = cells.subset(ends).split(sides)
         size = parts.sizes(sides)
         half = 0.5 * np.linalg.norm(size, axis=1)
         empty = _are_empty(curves, parts.face, parts.corner + 0.5 * size, half, levels)
-        cells = cells.taken(~ends).joined(parts.taken(~empty))
+        cells = cells.subset(~ends).joined(parts.subset(~empty))
         low, high = cells.boxes(sides)
     return low, high
 
 
 @dataclass(frozen=True)
-class _Cells:
+class _FaceCells:
     """Cells of the boxes of faces.
 
     face: (k,) the face of each cell, increasing; every face has at least one.
@@ -262,28 +266,28 @@ class _Cells:
         at_high: BoolArray = self.corner > high - 1.25 * size
         return np.logical_or.reduce(at_low | at_high, axis=1)
 
-    def taken(self, chosen: BoolArray) -> _Cells:
+    def subset(self, chosen: BoolArray) -> _FaceCells:
         """The cells chosen by a mask (k,)."""
-        return _Cells(self.face[chosen], self.corner[chosen], self.depth[chosen])
+        return _FaceCells(self.face[chosen], self.corner[chosen], self.depth[chosen])
 
-    def split(self, sides: FloatArray) -> _Cells:
+    def split(self, sides: FloatArray) -> _FaceCells:
         """The eight octants of each cell."""
         depth = np.repeat(self.depth + 1, 8)
         face = np.repeat(self.face, 8)
         half = sides[face] * (0.5**depth)[:, None]
         steps = np.tile(_CORNERS, (len(self.face), 1))
-        return _Cells(face, np.repeat(self.corner, 8, axis=0) + steps * half, depth)
+        return _FaceCells(face, np.repeat(self.corner, 8, axis=0) + steps * half, depth)
 
-    def joined(self, others: _Cells) -> _Cells:
+    def joined(self, others: _FaceCells) -> _FaceCells:
         """These cells and others."""
         face = np.concatenate([self.face, others.face])
         order = np.argsort(face, kind="stable")
         corner = np.concatenate([self.corner, others.corner])
-        return _Cells(face[order], corner[order], np.append(self.depth, others.depth)[order])
+        return _FaceCells(face[order], corner[order], np.append(self.depth, others.depth)[order])
 
 
 def _are_empty(
-    curves: FaceCurves, face: IntArray, centers: FloatArray, half: FloatArray,
+    curves: FaceLoops, face: IntArray, centers: FloatArray, half: FloatArray,
     levels: tuple[float, ...],
 ) -> BoolArray:  # fmt: skip
     """Whether no level set of a face comes within `half` of points: faces (k,), centers (k, 3),
@@ -304,10 +308,10 @@ def _are_empty(
     """
     backend = curves.heads.backend
     real = backend.Float
-    index = aligned_integers(backend, face)
+    index = upload_integers(backend, face)
     on = curves.face(index).face
     x = (to_vector3(backend, centers) - on.center) / on.size
-    h = aligned(backend, half) / on.size
+    h = upload_floats(backend, half) / on.size
 
     def add(p: Vec3, q: Vec3, inverse: Real, state: tuple[Any, ...]) -> tuple[Any, ...]:
         zr, zi, slope, nearest, moved, bend = state
@@ -315,8 +319,8 @@ def _are_empty(
         re, im = inner_product(spinor(edge.a)[2], spinor(edge.b)[2])
         zr, zi = dr.fma(zr, re, -(zi * im)), dr.fma(zr, im, zi * re)
         scale = dr.rcp(dr.abs(zr) + dr.abs(zi))
-        weight, c = edge.field()
-        distance, a = dr.sqrt(edge.square), 0.5 * dr.rsqrt(inverse)
+        weight, c = edge.biot_savart()
+        distance, a = dr.sqrt(edge.squared_distance), 0.5 * dr.rsqrt(inverse)
         rest = distance - h
         moved = moved + 2 * (dr.asinh(a / rest) - dr.asinh(a / distance))
         bend = bend + 2 * a / (rest * rest * dr.sqrt(rest * rest + a * a))
@@ -338,7 +342,7 @@ def _are_empty(
 _NARROW = 1e-9 * PERIOD
 
 
-class PolygonMesh(BoxedField["_MeshBuffers"]):
+class PolygonMesh(PatchField["_MeshBuffers"]):
     """Faces of any number of corners, flat or not, each spanned by a smooth surface: the level set
     of the solid angle of its boundary curve (paper, Sections 4.2.1 and 4.2.4).
 
@@ -348,10 +352,11 @@ class PolygonMesh(BoxedField["_MeshBuffers"]):
         different numbers of corners, and need not be joined.
 
     The surface of a face is where its solid angle is 2 pi, modulo 4 pi; another `level` bulges it
-    to one side. The faces are separate surfaces that meet in their common edges: `Hits.sheet` is
-    the index of the face that was hit, the normal is that of its surface, to the positive side.
-    Each is traced alone, with the proofs of `SolidAngle`, so that a ray pays only for faces whose
-    boxes it enters (`harnack.fields.capabilities`). `face(k)` gives the solid angle of one.
+    to one side. The faces are separate surfaces that meet in their common edges:
+    `Hits.primitive_index` is the index of the face that was hit, the normal is that of its surface,
+    to the positive side. Each is traced alone, with the proofs of `SolidAngle`, so that a ray pays
+    only for faces whose boxes it enters (`harnack.fields.capabilities`). `face(k)` gives the solid
+    angle of one.
 
     Raises:
         MeshError: a ValueError, for what `geometry.validate_polygons` refuses.
@@ -359,17 +364,20 @@ class PolygonMesh(BoxedField["_MeshBuffers"]):
 
     period: ClassVar[float | None] = PERIOD
     default_level: float = 2 * math.pi
-    overstep: float = 1.3  # that of `SolidAngle`
+    over_relaxation: float = 1.3  # that of `SolidAngle`
 
     def __init__(self, vertices: Any, faces: Any) -> None:
         super().__init__()
         self.faces: PolygonFaces = validate_polygons(vertices, faces)
-        if self.faces.count >= MOST_BOXES:
+        if self.faces.face_count >= MAX_BOXES:
             raise ValueError(
-                f"{self.faces.count:,} faces are too many: at most {MOST_BOXES:,}; cut the mesh "
+                f"{self.faces.face_count:,} faces are too many: at most {MAX_BOXES:,}; cut the "
+                "mesh "
                 "into parts"
             )
-        self._boxes: Remembered[tuple[float, ...], tuple[FloatArray, FloatArray]] = Remembered()
+        self._boxes: TransientCache[tuple[float, ...], tuple[FloatArray, FloatArray]] = (
+            TransientCache()
+        )
 
     @property
     def vertices(self) -> FloatArray:
@@ -383,8 +391,8 @@ class PolygonMesh(BoxedField["_MeshBuffers"]):
 
     def face(self, index: int) -> SolidAngle:
         """The solid angle of the boundary of one face."""
-        if not 0 <= index < self.faces.count:
-            last = self.faces.count - 1
+        if not 0 <= index < self.faces.face_count:
+            last = self.faces.face_count - 1
             raise IndexError(f"there is no face {index}: they are counted from 0 to {last}")
         return SolidAngle(self.faces.loops(index))
 
@@ -407,13 +415,13 @@ class PolygonMesh(BoxedField["_MeshBuffers"]):
         )
 
     def _upload(self, backend: Backend) -> _MeshBuffers:
-        boxes = BoxedParts.upload(backend, *self.boxes())
-        return _MeshBuffers(boxes, FaceCurves.upload(backend, self.faces))
+        boxes = PatchBoxes.upload(backend, *self.boxes())
+        return _MeshBuffers(boxes, FaceLoops.upload(backend, self.faces))
 
-    def part_at(self, index: Any) -> Field:
-        return self._on().curves.face(index)
+    def patch(self, index: Any) -> Field:
+        return self._require_data().curves.face(index)
 
-    def check_levels(self, levels: tuple[float, ...]) -> None:
+    def validate_levels(self, levels: tuple[float, ...]) -> None:
         for level in levels:
             if abs(math.remainder(float(level), PERIOD)) < _NARROW:
                 raise ValueError(
@@ -424,7 +432,7 @@ class PolygonMesh(BoxedField["_MeshBuffers"]):
 
     def describe(self) -> dict[str, Any]:
         return {
-            "faces": self.faces.count,
+            "faces": self.faces.face_count,
             "vertices": len(self.vertices),
             "corners": len(self.faces.corners),
             "in convex position": int(self.faces.in_convex_position.sum()),
@@ -435,5 +443,5 @@ class PolygonMesh(BoxedField["_MeshBuffers"]):
 class _MeshBuffers:
     """The faces' boxes and curves on a backend."""
 
-    boxes: BoxedParts
-    curves: FaceCurves
+    boxes: PatchBoxes
+    curves: FaceLoops

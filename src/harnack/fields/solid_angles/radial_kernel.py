@@ -23,9 +23,9 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 
 from harnack.backend.elementary import fmin
-from harnack.enclosures import Curvature
-from harnack.fields.batched_fields import SymmetricSum
-from harnack.fields.source_sums import SUM_ROUNDING, FieldSums, Terms
+from harnack.enclosures import TaylorRemainder
+from harnack.fields.batched_fields import SymmetricMatrix
+from harnack.fields.source_sums import SUM_MARGIN, SourceSums, SourceTerm
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -33,14 +33,15 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, Mask, Real, Vec3
 
 
-# Radii of the `Curvature` promises, in distances to the nearest dipole: each is the best somewhere.
+# Radii of the `TaylorRemainder` promises, in distances to the nearest dipole: each is the best
+# somewhere.
 _REACHES = (0.1, 0.25, 0.45)
 # `RadialSums.variation` holds within this fraction of the distance to the nearest dipole.
-BALL = 0.35
+BALL_FRACTION = 0.35
 
 
 @dataclass(frozen=True)
-class Radial:
+class KernelValues:
     """A kernel at a distance D: psi_k = scale thetas[k]/D^(2k), for as many k as were asked for."""
 
     scale: Real
@@ -57,7 +58,7 @@ class RadialKernel(abc.ABC):
     height_square: Real = 0.0
 
     @abc.abstractmethod
-    def at(self, distance: Real, inverse: Real, last: int) -> Radial:
+    def at(self, distance: Real, inverse: Real, last: int) -> KernelValues:
         """psi_0 to psi_last at a distance D; inverse: 1/D."""
 
     @abc.abstractmethod
@@ -74,7 +75,7 @@ class RadialKernel(abc.ABC):
 
 
 @dataclass(frozen=True)
-class Part:
+class PolynomialTerm:
     """A term P(z) psi_k: P, its gradient and Hessian, all times D^(-2k); k = 1, 2, 3 is its
     position in a list."""
 
@@ -89,37 +90,37 @@ class RadialSums:
     bounds of the sums over their dipoles.
 
     sums: value, derivatives and bounds; s4 and s5 are the sums of w Q_3/d^4 and w Q_3/d^5, which
-        for Q_3 = 1 are those of `FieldSums`.
-    steep, steeper: sums of w Q_2/d^3 and w Q_2/d^4.
+        for Q_3 = 1 are those of `SourceSums`.
+    q2_d3, q2_d4: sums of w Q_2/d^3 and w Q_2/d^4.
     """
 
-    sums: FieldSums
-    steep: Real
-    steeper: Real
+    sums: SourceSums
+    q2_d3: Real
+    q2_d4: Real
 
     @classmethod
     def zero(cls, backend: Backend, derivatives: int) -> RadialSums:
-        """The sums over no dipoles; derivatives: as for `FieldSums.zero`."""
+        """The sums over no dipoles; derivatives: as for `SourceSums.zero`."""
         zero = backend.Float(0)
-        return cls(FieldSums.zero(backend, dr.inf, derivatives), zero, zero)
+        return cls(SourceSums.zero(backend, dr.inf, derivatives), zero, zero)
 
     @classmethod
     def of(cls, parts: tuple[Any, ...]) -> RadialSums:
         """The sums with these `parts`."""
-        return cls(FieldSums.of(parts[0]), *parts[1:])
+        return cls(SourceSums.from_state(parts[0]), *parts[1:])
 
     def parts(self) -> tuple[Any, ...]:
         """The attributes in the order of the constructor, for the state of a loop."""
-        return self.sums.parts(), self.steep, self.steeper
+        return self.sums.to_state(), self.q2_d3, self.q2_d4
 
-    def plus(self, source: Source, rounding: Real, active: Mask) -> RadialSums:
+    def plus(self, source: SourceAtPoint, rounding: Real, active: Mask) -> RadialSums:
         """The sums with one more dipole or cluster, where active.
 
         rounding: of the term, as a fraction of w Q_2/d^2, which is at least its absolute value; the
             rounding of positions adds 6 epsilon w Q_2/d^3, and that of the sum is counted by
-            `FieldSums.plus`.
+            `SourceSums.add_term`.
         """
-        tail, sums = source.tail, self.sums.plus(source.terms, active)
+        tail, sums = source.tail, self.sums.add_term(source.terms, active)
         steep = source.weight * tail.second * tail.cube
         bent = source.weight * tail.third * tail.cube * tail.inverse
         bounds = steep, steep * tail.inverse, bent, bent * tail.inverse
@@ -127,21 +128,21 @@ class RadialSums:
         steep, steeper, bent, more_bent, error, slope, second = (
             dr.select(active, one, 0) for one in (*bounds, *errors)
         )
-        nearer, old = fmin(tail.distance, sums.free_distance), sums.second_truncation
+        nearer, old = fmin(tail.distance, sums.singularity_distance), sums.hessian_truncation
         # Dr.Jit's epsilon is half the distance from 1 to the next number, that of the bounds is
         # all.
         positions = 6 * 2 * float(dr.epsilon(steep))
         sums = dataclasses.replace(
             sums,
             truncation=sums.truncation + error,
-            slope_truncation=sums.slope_truncation + slope,
-            second_truncation=None if old is None else old + second,
+            gradient_truncation=sums.gradient_truncation + slope,
+            hessian_truncation=None if old is None else old + second,
             rounding=dr.fma(steep, dr.fma(rounding, tail.distance, positions), sums.rounding),
-            free_distance=dr.select(active, nearer, sums.free_distance),
+            singularity_distance=dr.select(active, nearer, sums.singularity_distance),
             s4=sums.s4 + bent,
             s5=sums.s5 + more_bent,
         )
-        return RadialSums(sums, self.steep + steep, self.steeper + steeper)
+        return RadialSums(sums, self.q2_d3 + steep, self.q2_d4 + steeper)
 
     def remainder(self, share: float, r: Real, growth: Real) -> Real:
         """A bound of |f(y) - f(x) - grad f.(y-x)|/|y-x|^2 for |y-x| <= r, r being `share` times the
@@ -152,30 +153,30 @@ class RadialSums:
         t/d_i = q it is at most growth Q_3 (3-2q)/(1-q)^2 t^2/d_i^4; (3-2q)/(1-q)^2 is convex, hence
         below its chord on [0, share].
         """
-        return (1 + SUM_ROUNDING) * growth * self.sums.remainder(share, r)
+        return (1 + SUM_MARGIN) * growth * self.sums.remainder(share, r)
 
     def curvatures(
         self, growth: Callable[[Real], Real], most: Real, size: Real
-    ) -> tuple[Curvature, ...]:
+    ) -> tuple[TaylorRemainder, ...]:
         """`remainder` as promises, in units of `size`; most: the distance to the nearest dipole, or
         less."""
         radii = [(share, share * most) for share in _REACHES]
         return tuple(
-            Curvature(2 * self.remainder(share, r, growth(r)) / (size * size), r * size)
+            TaylorRemainder(2 * self.remainder(share, r, growth(r)) / (size * size), r * size)
             for share, r in radii
         )
 
     def variation(self, r: Real, growth: Real) -> Real:
-        """A bound of |f(y) - f(x)| on B(x, r); r: `BALL` times the distance to the nearest dipole,
-        or less. It is the integral of |K^(2)| = 2 Q_2/(d_i-s)^3, where 1/(1-q)^2 - 1 = 2q + ... is
-        convex as well."""
-        chord = (1 / (1 - BALL) ** 2 - 1 - 2 * BALL) / BALL**2
-        moved = dr.fma(chord * r, self.steeper, 2 * self.steep)
-        return (1 + SUM_ROUNDING) * growth * r * moved
+        """A bound of |f(y) - f(x)| on B(x, r); r: `BALL_FRACTION` times the distance to the nearest
+        dipole, or less. It is the integral of |K^(2)| = 2 Q_2/(d_i-s)^3, where 1/(1-q)^2 - 1 = 2q +
+        ... is convex as well."""
+        chord = (1 / (1 - BALL_FRACTION) ** 2 - 1 - 2 * BALL_FRACTION) / BALL_FRACTION**2
+        moved = dr.fma(chord * r, self.q2_d4, 2 * self.q2_d3)
+        return (1 + SUM_MARGIN) * growth * r * moved
 
 
 @dataclass(frozen=True)
-class Tail:
+class KernelBounds:
     """Q_2 and Q_3 at a distance and beyond, and powers of that distance."""
 
     distance: Real
@@ -185,7 +186,7 @@ class Tail:
     third: Real
 
     @classmethod
-    def of(cls, distance: Real, inverse: Real, bounds: Sequence[Real]) -> Tail:
+    def of(cls, distance: Real, inverse: Real, bounds: Sequence[Real]) -> KernelBounds:
         """bounds: Q_2, Q_3, ... there."""
         return cls(distance, inverse, inverse * inverse * inverse, bounds[0], bounds[1])
 
@@ -194,9 +195,9 @@ def _type_of(vector: object) -> Any:
     return type(vector)
 
 
-def combine(
-    parts: Sequence[Part], z: Vec3, inverse: Real, radial: Radial, derivatives: int
-) -> Terms:
+def combine_terms(
+    parts: Sequence[PolynomialTerm], z: Vec3, inverse: Real, radial: KernelValues, derivatives: int
+) -> SourceTerm:
     """The sum of terms at z, inverse = 1/D, with psi_0 to psi_(len(parts) + derivatives).
 
     derivatives: 0 for the value, 1 with the gradient, 2 with the Hessian. Powers of 1/D are spread
@@ -218,21 +219,21 @@ def combine(
             if part.hessian is not None:
                 matrix = [dr.fma(theta[k], h, m) for h, m in zip(part.hessian, matrix, strict=True)]
     if derivatives == 0:
-        return Terms(scale * value)
+        return SourceTerm(scale * value)
     along = along * u2
     first = scale * dr.fma(vector(along), z, -gradient)
     if derivatives < 2:
-        return Terms(scale * value, first, None)
-    rest = SymmetricSum(*(scale * m for m in matrix))
+        return SourceTerm(scale * value, first, None)
+    rest = SymmetricMatrix(*(scale * m for m in matrix))
     across = dr.fma(vector(twice * u2), z, -2 * slopes)
-    rest = rest.plus((scale * u2) * across, z)
+    rest = rest.add_outer_product((scale * u2) * across, z)
     along = scale * along
     whole = dataclasses.replace(rest, xx=rest.xx - along, yy=rest.yy - along, zz=rest.zz - along)
-    return Terms(scale * value, first, whole)
+    return SourceTerm(scale * value, first, whole)
 
 
 @dataclass(frozen=True)
-class Source:
+class SourceAtPoint:
     """What a dipole or a cluster adds at x, and what bounds its derivatives near x.
 
     weight: of all its dipoles.
@@ -240,15 +241,17 @@ class Source:
     error, gradient_error, hessian_error: the truncation, for a cluster.
     """
 
-    terms: Terms
+    terms: SourceTerm
     weight: Real
-    tail: Tail
+    tail: KernelBounds
     error: Real = 0.0
     gradient_error: Real = 0.0
     hessian_error: Real = 0.0
 
 
-def seen_dipole(row: Sequence[Real], x: Vec3, kernel: RadialKernel, derivatives: int) -> Source:
+def dipole_source(
+    row: Sequence[Real], x: Vec3, kernel: RadialKernel, derivatives: int
+) -> SourceAtPoint:
     """A dipole, given as eight numbers (position, moment, weight = |moment|, 0), at x."""
     vector = _type_of(x)
     z, m = vector(row[0], row[1], row[2]) - x, vector(row[3], row[4], row[5])
@@ -256,12 +259,16 @@ def seen_dipole(row: Sequence[Real], x: Vec3, kernel: RadialKernel, derivatives:
     inverse = dr.rsqrt(squared)
     distance = squared * inverse
     u2 = inverse * inverse
-    part = Part(dr.dot(m, z) * u2, m * u2)
-    terms = combine([part], z, inverse, kernel.at(distance, inverse, 1 + derivatives), derivatives)
-    return Source(terms, row[6], Tail.of(distance, inverse, kernel.bounds(distance, 3)))
+    part = PolynomialTerm(dr.dot(m, z) * u2, m * u2)
+    terms = combine_terms(
+        [part], z, inverse, kernel.at(distance, inverse, 1 + derivatives), derivatives
+    )
+    return SourceAtPoint(
+        terms, row[6], KernelBounds.of(distance, inverse, kernel.bounds(distance, 3))
+    )
 
 
-def cluster_parts(c: Sequence[Real], z: Vec3, inverse: Real) -> list[Part]:
+def cluster_parts(c: Sequence[Real], z: Vec3, inverse: Real) -> list[PolynomialTerm]:
     """The terms of a cluster with coefficients c (`radial_tree.coefficients`) and center x + z;
     inverse = 1/D.
 
@@ -284,13 +291,13 @@ def cluster_parts(c: Sequence[Real], z: Vec3, inverse: Real) -> list[Part]:
     )  # fmt: skip
     czz = _times(cz, z)
     return [
-        Part((dr.dot(dipole, z) + c[3]) * u2, dipole * u2),
-        Part(
+        PolynomialTerm((dr.dot(dipole, z) + c[3]) * u2, dipole * u2),
+        PolynomialTerm(
             dr.dot(az + b, z) * u4,
             dr.fma(2, az, b) * u4,
             tuple(2 * u4 * a for a in (axx, ayy, azz, axy, axz, ayz)),
         ),
-        Part(dr.dot(czz, z) * u6, 3 * u6 * czz, tuple(6 * u6 * a for a in cz)),
+        PolynomialTerm(dr.dot(czz, z) * u6, 3 * u6 * czz, tuple(6 * u6 * a for a in cz)),
     ]
 
 

@@ -37,24 +37,24 @@ import numpy as np
 
 from harnack.backend import FloatArray
 from harnack.backend.elementary import fmax
-from harnack.backend.record_table import Records
+from harnack.backend.record_table import RecordTable
 from harnack.fields.solid_angles.radial_kernel import (
+    KernelBounds,
     RadialKernel,
     RadialSums,
-    Source,
-    Tail,
+    SourceAtPoint,
     cluster_parts,
-    combine,
-    seen_dipole,
+    combine_terms,
+    dipole_source,
 )
 from harnack.fields.solid_angles.treecode import (
-    SeenCluster,
-    hierarchy_of,
-    in_slots,
-    padding_row,
-    walk_clusters,
+    ClusterView,
+    dipole_hierarchy,
+    empty_record,
+    records_in_slots,
+    traverse_clusters,
 )
-from harnack.tree import Hierarchy, PackedTree, pack
+from harnack.tree import BalancedTree, PackedTree, pack_tree
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -63,10 +63,10 @@ if TYPE_CHECKING:
 
 
 # Dipoles in a trip of the direct sum, by experiment.
-_CHUNK = 4
+_DIPOLES_PER_TRIP = 4
 
 
-class RadialDipoles(abc.ABC):
+class RadialSum(abc.ABC):
     """Dipoles on a backend, and sums over them.
 
     rounding: of a dipole's term, as `RadialSums.plus` takes it.
@@ -74,32 +74,32 @@ class RadialDipoles(abc.ABC):
 
     def __init__(self, backend: Backend, rows: FloatArray, kernel: RadialKernel) -> None:
         self.backend, self.kernel = backend, kernel
-        self.rounding = dr.opaque(backend.Float, 12 * backend.epsilon)
+        self.rounding = dr.opaque(backend.Float, 12 * backend.machine_epsilon)
 
     def sums(self, x: Vec3, closer: Real, derivatives: int) -> RadialSums:
         """Value, derivatives and bounds at x; clusters are taken as a whole from `closer` times
-        the `accepting_distance` on. derivatives: as for `FieldSums.zero`."""
-        return self.added(RadialSums.zero(self.backend, derivatives), x, closer)
+        the `accepting_distance` on. derivatives: as for `SourceSums.zero`."""
+        return self.accumulate(RadialSums.zero(self.backend, derivatives), x, closer)
 
     @abc.abstractmethod
-    def added(self, sums: RadialSums, x: Vec3, closer: Real) -> RadialSums:
+    def accumulate(self, sums: RadialSums, x: Vec3, closer: Real) -> RadialSums:
         """Sums over other dipoles, with those over these at x added; `closer` as for `sums`."""
 
     def _with_dipole(
         self, row: list[Real], x: Vec3, derivatives: int, state: tuple[Any, ...]
     ) -> tuple[Any, ...]:
-        dipole = seen_dipole(row, x, self.kernel, derivatives)
+        dipole = dipole_source(row, x, self.kernel, derivatives)
         return RadialSums.of(state).plus(dipole, self.rounding, True).parts()
 
 
-class DirectSum(RadialDipoles):
+class DirectSum(RadialSum):
     """All dipoles one by one, without truncation."""
 
     def __init__(self, backend: Backend, rows: FloatArray, kernel: RadialKernel) -> None:
         super().__init__(backend, rows, kernel)
-        self._records = Records.upload(backend, rows, padding_row(rows[0]), _CHUNK)
+        self._records = RecordTable.upload(backend, rows, empty_record(rows[0]), _DIPOLES_PER_TRIP)
 
-    def added(self, sums: RadialSums, x: Vec3, closer: Real) -> RadialSums:
+    def accumulate(self, sums: RadialSums, x: Vec3, closer: Real) -> RadialSums:
         del closer
         derivatives = sums.sums.derivatives
 
@@ -109,7 +109,7 @@ class DirectSum(RadialDipoles):
         return RadialSums.of(self._records.for_each(add, sums.parts(), "radial dipoles"))
 
 
-class TreeSum(RadialDipoles):
+class RadialTreecode(RadialSum):
     """Near dipoles one by one, far ones in clusters from the kernel's `accepting_distance` on."""
 
     def __init__(
@@ -118,7 +118,7 @@ class TreeSum(RadialDipoles):
         super().__init__(backend, dipoles.rows, kernel)
         self._tree = dipoles.packed(backend, kernel, accuracy)
 
-    def added(self, sums: RadialSums, x: Vec3, closer: Real) -> RadialSums:
+    def accumulate(self, sums: RadialSums, x: Vec3, closer: Real) -> RadialSums:
         closer = fmax(self.backend.Float(closer), self.backend.Float(1))
         derivatives = sums.sums.derivatives
 
@@ -126,32 +126,35 @@ class TreeSum(RadialDipoles):
             del active
             return self._with_dipole(row, x, derivatives, state)
 
-        def far(node: SeenCluster, state: tuple[Any, ...]) -> tuple[Any, ...]:
+        def far(node: ClusterView, state: tuple[Any, ...]) -> tuple[Any, ...]:
             length = dr.sqrt(node.square)
-            cluster = seen_cluster(
+            cluster = cluster_source(
                 node.head, node.payload, -node.r, length, self.kernel, derivatives
             )
             return RadialSums.of(state).plus(cluster, self.rounding, node.far).parts()
 
         height = self.kernel.height_square
-        walked = walk_clusters(self._tree, x, closer, far, near, sums.parts(), height_square=height)
+        walked = traverse_clusters(
+            self._tree, x, closer, far, near, sums.parts(), height_square=height
+        )
         return RadialSums.of(walked)
 
 
-def seen_cluster(
+def cluster_source(
     head: Sequence[Real], c: Sequence[Real], z: Vec3, length: Real, kernel: RadialKernel,
     derivatives: int,
-) -> Source:  # fmt: skip
-    """A node with the numbers of `columns`, its center at z, D = length, with its truncation."""
+) -> SourceAtPoint:  # fmt: skip
+    """A node with the numbers of `node_records`, its center at z, D = length, with its
+    truncation."""
     radius, weight = head[4], head[5]
     inverse = dr.rcp(length)
     parts = cluster_parts(c, z, inverse)
     radial = kernel.at(length, inverse, len(parts) + derivatives)
-    terms = combine(parts, z, inverse, radial, derivatives)
+    terms = combine_terms(parts, z, inverse, radial, derivatives)
     nearest = length - radius
     share = dr.rcp(nearest)
     bounds = kernel.bounds(nearest, 6)
-    tail = Tail.of(nearest, share, bounds)
+    tail = KernelBounds.of(nearest, share, bounds)
     fourth, fifth, sixth = bounds[2:]
     q = radius * inverse
     common = c[23] * inverse * inverse * inverse * share * share
@@ -159,36 +162,37 @@ def seen_cluster(
     slope = common * share * fifth * dr.fma(q, dr.fma(12, q, -30), 20)
     rest = dr.fma(q, dr.fma(q, dr.fma(-60, q, 216), -270), 120)
     second = common * share * share * sixth * rest
-    return Source(terms, weight, tail, error, slope, second)
+    return SourceAtPoint(terms, weight, tail, error, slope, second)
 
 
 @dataclass(frozen=True)
 class ClusteredDipoles:
-    """Dipoles (n, 8), the rows of `dipole_rows`, in the leaves of a tree, with the moments of its
+    """Dipoles (n, 8), the rows of `dipole_records`, in the leaves of a tree, with the moments of
+    its
     levels: all that does not depend on the kernel."""
 
     rows: FloatArray
-    tree: Hierarchy
-    levels: list[ClusterMoments]
+    tree: BalancedTree
+    levels: list[TaylorMoments]
 
     @classmethod
     def of(cls, rows: FloatArray) -> ClusteredDipoles:
         """A tree over the dipoles."""
-        tree = hierarchy_of(rows[:, :3])
-        return cls(rows, tree, clusters(tree, rows))
+        tree = dipole_hierarchy(rows[:, :3])
+        return cls(rows, tree, taylor_tree_moments(tree, rows))
 
     def packed(self, backend: Backend, kernel: RadialKernel, accuracy: float) -> PackedTree:
         """The tree on a backend; the kernel decides from which distance on clusters are taken as a
         whole."""
         numbers = [
-            columns(level, kernel.accepting_distance(level.radius, accuracy))
+            node_records(level, kernel.accepting_distance(level.radius, accuracy))
             for level in self.levels
         ]
-        return pack(backend, self.tree, numbers, in_slots(self.tree, self.rows))
+        return pack_tree(backend, self.tree, numbers, records_in_slots(self.tree, self.rows))
 
 
 @dataclass(frozen=True)
-class ClusterMoments:
+class TaylorMoments:
     """The nodes of one level: center (k, 3), radius, weight, third = sum w |d|^3 (k,) each, and
     T1 (k, 3), T2 (k, 3, 3), T3 (k, 3, 3, 3), symmetric."""
 
@@ -201,14 +205,14 @@ class ClusterMoments:
     t3: FloatArray
 
 
-def clusters(tree: Hierarchy, rows: FloatArray) -> list[ClusterMoments]:
+def taylor_tree_moments(tree: BalancedTree, rows: FloatArray) -> list[TaylorMoments]:
     """Moments of all levels, from the leaves to the root.
 
     T1, T2, T3 are translated from a child's center to its parent's, d -> d + s: T2 gains sym(T1 s)
     and T3 sym(2 T2 s + T1 s s). All else is computed from the dipoles themselves.
     """
-    slots = in_slots(tree, rows)
-    levels: list[ClusterMoments] = []
+    slots = records_in_slots(tree, rows)
+    levels: list[TaylorMoments] = []
     for count, arity in zip(tree.counts, (0, *tree.arities), strict=True):
         p, m, w = np.split(slots.reshape(count, -1, slots.shape[2])[..., :7], [3, 6], axis=2)
         weight = w.sum(axis=(1, 2))
@@ -225,12 +229,12 @@ def clusters(tree: Hierarchy, rows: FloatArray) -> list[ClusterMoments]:
             )
         else:
             moments = _moved(levels[-1], center, arity)
-        levels.append(ClusterMoments(center, length.max(axis=1), weight, third, *moments))
+        levels.append(TaylorMoments(center, length.max(axis=1), weight, third, *moments))
     return levels
 
 
 def _moved(
-    children: ClusterMoments, center: FloatArray, arity: int
+    children: TaylorMoments, center: FloatArray, arity: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     s = children.center - np.repeat(center, arity, axis=0)
     t1, t2, t3 = children.t1, children.t2, children.t3
@@ -248,7 +252,7 @@ def _symmetric(
     return t1, 0.5 * (t2 + t2.transpose(0, 2, 1)), total / 6
 
 
-def coefficients(level: ClusterMoments) -> FloatArray:
+def coefficients(level: TaylorMoments) -> FloatArray:
     """(k, 23) numbers as `cluster_parts` reads them: T1; tr T2; -T2; -3/2 tr T3; T3/2."""
     t2, t3 = -level.t2, 0.5 * level.t3
     i, j = np.array([(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]).T
@@ -261,7 +265,7 @@ def coefficients(level: ClusterMoments) -> FloatArray:
     return np.concatenate([level.t1, trace2, t2[:, i, j], trace3, t3[:, a, b, c]], axis=1)
 
 
-def columns(level: ClusterMoments, accept: FloatArray) -> FloatArray:
+def node_records(level: TaylorMoments, accept: FloatArray) -> FloatArray:
     """(k, 30): center, accepting distance, radius, weight | coefficients, third."""
     # The ball must contain all dipoles in spite of the rounding of center and radius.
     head = np.stack([accept, level.radius * (1 + 1e-5) + 1e-6, level.weight], axis=1)

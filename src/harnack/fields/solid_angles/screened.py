@@ -15,29 +15,34 @@ import numpy as np
 
 from harnack.backend import FloatArray, backend_of
 from harnack.backend.elementary import fmax, fmin
-from harnack.backend.validation import positive
-from harnack.cluster.serialization import Remembered
-from harnack.enclosures import Curvature, HarmonicBall
-from harnack.fields.batched_fields import Values
+from harnack.backend.validation import as_positive
+from harnack.cluster.serialization import TransientCache
+from harnack.enclosures import HarmonicBall, TaylorRemainder
+from harnack.fields.batched_fields import PointValues
 from harnack.fields.clearance import (
-    DetailedField,
-    UnitCoordinates,
-    epsilon_at,
-    placed,
-    single,
+    UnitFrame,
+    VariableAccuracyField,
+    coordinate_rounding,
+    frame_parameters,
+    round_to_single,
     tight_extent,
 )
 from harnack.fields.field import Sample
 from harnack.fields.solid_angles.oriented_points import OrientedPoints
-from harnack.fields.solid_angles.radial_kernel import BALL, Radial, RadialKernel, RadialSums
+from harnack.fields.solid_angles.radial_kernel import (
+    BALL_FRACTION,
+    KernelValues,
+    RadialKernel,
+    RadialSums,
+)
 from harnack.fields.solid_angles.radial_tree import (
     ClusteredDipoles,
     DirectSum,
-    RadialDipoles,
-    TreeSum,
+    RadialSum,
+    RadialTreecode,
 )
-from harnack.fields.solid_angles.treecode import dipole_rows
-from harnack.fields.source_sums import SECOND_ROUNDINGS, SLOPE_ROUNDINGS, SUM_ROUNDING, FieldSums
+from harnack.fields.solid_angles.treecode import dipole_records
+from harnack.fields.source_sums import SECOND_ROUNDINGS, SLOPE_ROUNDINGS, SUM_MARGIN, SourceSums
 from harnack.geometry.clouds import estimate_areas, validate_cloud
 from harnack.geometry.meshes import validate_mesh
 from harnack.name_suggestions import did_you_mean
@@ -46,15 +51,15 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
     from harnack.geometry import Volume
 
-LONGEST = 80.0
+MAX_LENGTHS = 80.0
 """Beyond this many screening lengths exponentials are held at exp(-80) = 2e-35, near the end of the
 range of single precision: bounds are then too large, and values off by less than
 1e-33 area/(4 pi rho^2)."""
 
 # By how much the harmonic ball is smaller where the kernel falls fast.
-_SHRINK = 0.1
+_BALL_SHRINKAGE = 0.1
 # A cluster is never taken as a whole nearer than this many radii.
-_LEAST = 1.5
+_MIN_ACCEPTANCE = 1.5
 # For the default level: the number of pairs of a point and a dipole, and the most and the fewest
 # points.
 _PAIRS, _MOST_PROBES, _LEAST_PROBES = 8_000_000, 512, 24
@@ -89,12 +94,12 @@ class YukawaKernel(RadialKernel):
         self._number = kappa
         self.kappa = dr.opaque(backend.Float, kappa)
 
-    def at(self, distance: Real, inverse: Real, last: int) -> Radial:
-        t = fmin(self.kappa * distance, LONGEST)
-        return Radial(dr.exp(-t) * inverse, thetas(t, last))
+    def at(self, distance: Real, inverse: Real, last: int) -> KernelValues:
+        t = fmin(self.kappa * distance, MAX_LENGTHS)
+        return KernelValues(dr.exp(-t) * inverse, thetas(t, last))
 
     def bounds(self, distance: Real, last: int) -> list[Real]:
-        t = fmin(self.kappa * distance, LONGEST)
+        t = fmin(self.kappa * distance, MAX_LENGTHS)
         decay = dr.exp(-t)
         sum2 = dr.fma(t, dr.fma(t, 0.5, 1), 1)
         sum3 = dr.fma(t * t * t, 1 / 6, sum2)
@@ -121,9 +126,9 @@ def thetas(t: Real, last: int) -> list[Real]:
     return out
 
 
-def promises(
+def screened_promises(
     radial: RadialSums, f: Real, gradient: Vec3, kernel: YukawaKernel, size: Real, epsilon: float
-) -> tuple[tuple[Curvature, ...], HarmonicBall]:
+) -> tuple[tuple[TaylorRemainder, ...], HarmonicBall]:
     """What `ScreenedWindingNumber` promises: second derivatives, and a ball, which proves shorter
     steps. f, gradient: at the point, in units of `size`.
 
@@ -131,13 +136,13 @@ def promises(
     exp(-80) neither overflows nor grows.
     """
     sums, kappa = radial.sums, kernel.kappa
-    nearest = fmax(sums.free_distance * (1 - SUM_ROUNDING) - 8 * epsilon, 0)
-    most = fmin(nearest, LONGEST / kappa)
+    nearest = fmax(sums.singularity_distance * (1 - SUM_MARGIN) - 8 * epsilon, 0)
+    most = fmin(nearest, MAX_LENGTHS / kappa)
     known = radial.curvatures(kernel.growth, most, size)
-    r = BALL * most / dr.fma(_SHRINK * kappa, most, 1)
+    r = BALL_FRACTION * most / dr.fma(_BALL_SHRINKAGE * kappa, most, 1)
     growth = kernel.growth(r)
-    slope = dr.norm(gradient) + sums.slope_truncation
-    bent = (1 + SUM_ROUNDING) * r * dr.fma(r, radial.remainder(BALL, r, growth), slope)
+    slope = dr.norm(gradient) + sums.gradient_truncation
+    bent = (1 + SUM_MARGIN) * r * dr.fma(r, radial.remainder(BALL_FRACTION, r, growth), slope)
     moved = fmin(radial.variation(r, growth), bent)
     least = dr.cos(fmin(kappa * r, math.pi))
     ends = (f - moved, f + moved)
@@ -156,7 +161,7 @@ def accepting_distance(radius: FloatArray, kappa: float, accuracy: float) -> Flo
     R^3/r^5 Q_4; the sum of errors is smallest at a given cost if R is proportional to
     r Q_4^(-1/5). Found by bisection, from the safe side.
     """
-    low, high = _LEAST * radius, accuracy * radius
+    low, high = _MIN_ACCEPTANCE * radius, accuracy * radius
     for _ in range(40):
         r = 0.5 * (low + high)
         t = kappa * (r - radius)
@@ -196,7 +201,7 @@ _SMALLEST_LEVEL = 1e-20
 _ON_DIPOLE, _ANY_LEVEL = 32, 1e5
 
 
-class ScreenedWindingNumber(OrientedPoints, DetailedField["_ScreenedBuffers"]):
+class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuffers"]):
     """w(x) = (1/4 pi) sum_i a_i n_i.(y_i - x) (1 + rho_i/l) exp(-rho_i/l)/rho_i^3, rho_i = |y_i-x|.
 
     Minus the derivative of the Yukawa kernel exp(-rho/l)/rho along n_i at y_i; as l grows, the
@@ -224,7 +229,8 @@ class ScreenedWindingNumber(OrientedPoints, DetailedField["_ScreenedBuffers"]):
         small as that of an unscreened one at distance accuracy * R. The error is bounded and part
         of every promise. Tracing uses more detail where the tolerance asks for it.
 
-    Promises (`promises` has the formulas), for d_i the distances from x, d the least of them:
+    Promises (`screened_promises` has the formulas), for d_i the distances from x, d the least of
+    them:
 
     - Curvature. On B(x, r), r < d, each term's second derivatives are at most |K'''|(d_i - s) =
       6 Q_3(kappa (d_i-s))/(d_i-s)^4 at distance s from x (`YukawaKernel`, kappa = 1/l). By
@@ -245,7 +251,7 @@ class ScreenedWindingNumber(OrientedPoints, DetailedField["_ScreenedBuffers"]):
     accuracy that cannot be.
     """
 
-    values_take_more = False
+    has_separate_batch_data = False
 
     def __init__(
         self,
@@ -258,7 +264,7 @@ class ScreenedWindingNumber(OrientedPoints, DetailedField["_ScreenedBuffers"]):
         accuracy: float = 6.0,
     ) -> None:
         super().__init__()
-        length = positive(length, "length")
+        length = as_positive(length, "length")
         if method not in ("auto", "sum", "tree"):
             hint = did_you_mean(method, ("auto", "sum", "tree"))
             raise ValueError(f'method is "auto", "sum" or "tree", not {method!r}{hint}')
@@ -266,23 +272,23 @@ class ScreenedWindingNumber(OrientedPoints, DetailedField["_ScreenedBuffers"]):
             raise ValueError(f"accuracy must lie between 2 and 100, not {accuracy!r}")
         if areas is None:
             areas = estimate_areas(points, normals)
-        self._keep(*validate_cloud(points, normals, areas))
+        self._set_points(*validate_cloud(points, normals, areas))
         self.length, self.accuracy = float(length), float(accuracy)
         few = len(self.points) <= _MOST_SUMMED
         self.method: Literal["sum", "tree"] = (
             ("sum" if few else "tree") if method == "auto" else method
         )
-        self.has_detail = self.method == "tree"
+        self.has_variable_accuracy = self.method == "tree"
         low, high = self.points.min(axis=0), self.points.max(axis=0)
         extent = max(0.5 * float((high - low).max()), math.sqrt(float(self.areas.max())))
-        self._center = single(0.5 * (low + high))
+        self._center = round_to_single(0.5 * (low + high))
         # A power of two, so that lengths are scaled without rounding.
         self._size = 2.0 ** math.ceil(math.log2(extent))
         share = self.areas[:, None] / (4 * math.pi * self._size**2)
-        self._rows = dipole_rows((self.points - self._center) / self._size, share * self.normals)
+        self._rows = dipole_records((self.points - self._center) / self._size, share * self.normals)
         self._kappa = self._size / self.length
         self.default_level = mean_at_dipoles(self._rows, self._kappa)
-        self._extents: Remembered[tuple[float, ...], Volume | None] = Remembered()
+        self._extents: TransientCache[tuple[float, ...], Volume | None] = TransientCache()
 
     @classmethod
     def of_mesh(
@@ -323,12 +329,12 @@ class ScreenedWindingNumber(OrientedPoints, DetailedField["_ScreenedBuffers"]):
             corners.mean(axis=1), normals, areas, length=length, method=method, accuracy=accuracy
         )
 
-    def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> Values:
-        on = self._batch(backend_of(x))
-        x = on.unit(x)
-        sums, epsilon = on.dipoles.sums(x, closer, derivatives).sums, on.backend.epsilon
-        values = sums.values(1.0, epsilon_at(x), 8 * epsilon * dr.abs(sums.value))
-        held, slope, second = self._held(on, sums, epsilon_at(x))
+    def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> PointValues:
+        on = self._batch_data(backend_of(x))
+        x = on.to_unit(x)
+        sums, epsilon = on.dipoles.sums(x, closer, derivatives).sums, on.backend.machine_epsilon
+        values = sums.values(1.0, coordinate_rounding(x), 8 * epsilon * dr.abs(sums.value))
+        held, slope, second = self._cutoff_errors(on, sums, coordinate_rounding(x))
         values = dataclasses.replace(
             values,
             error=values.error + held,
@@ -336,16 +342,18 @@ class ScreenedWindingNumber(OrientedPoints, DetailedField["_ScreenedBuffers"]):
             hessian_error=values.hessian_error + second,
         )
         weight = float(self.areas.sum()) / (4 * math.pi * self._size**2)
-        return values.far_away(x, 64, weight).rescaled(on.size)
+        return values.with_far_field_errors(x, 64, weight).rescaled(on.size)
 
-    def _held(self, on: _ScreenedBuffers, sums: FieldSums, unit: Real) -> tuple[Real, Real, Real]:
+    def _cutoff_errors(
+        self, on: _ScreenedBuffers, sums: SourceSums, unit: Real
+    ) -> tuple[Real, Real, Real]:
         """What screening adds to the rounding of value, gradient and second derivatives.
 
-        Exponentials are held at exp(-80) = 2e-35 (`LONGEST`), times at most
+        Exponentials are held at exp(-80) = 2e-35 (`MAX_LENGTHS`), times at most
         Q_3(80) exp(80) = 9e4. Fourth derivatives of the kernel have Q_4(t) <= (1 + t/4) Q_3(t), and
         a coordinate is off by `unit`.
         """
-        share = dr.rcp(sums.free_distance)
+        share = dr.rcp(sums.singularity_distance)
         held = 2e-30 * float(self._rows[:, 6].sum()) * share * share
         fourth = 0.25 * on.kernel.kappa * sums.s4
         second = dr.fma(SECOND_ROUNDINGS * unit, fourth, 6 * held * share * share)
@@ -357,34 +365,38 @@ class ScreenedWindingNumber(OrientedPoints, DetailedField["_ScreenedBuffers"]):
         if self.method == "sum":
             dipoles = DirectSum(backend, self._rows, kernel)
         else:
-            dipoles = TreeSum(backend, ClusteredDipoles.of(self._rows), kernel, self.accuracy)
-        return _ScreenedBuffers(*placed(backend, self._center, self._size), kernel, dipoles)
+            dipoles = RadialTreecode(
+                backend, ClusteredDipoles.of(self._rows), kernel, self.accuracy
+            )
+        return _ScreenedBuffers(
+            *frame_parameters(backend, self._center, self._size), kernel, dipoles
+        )
 
     def _sample(self, on: _ScreenedBuffers, p: Vec3, detail: Real) -> Sample:
-        x = on.unit(p)
-        screened, epsilon = on.dipoles.sums(x, detail, 1), on.backend.epsilon
-        sums, unit = screened.sums, epsilon_at(x)
-        held, slope, _ = self._held(on, sums, unit)
+        x = on.to_unit(p)
+        screened, epsilon = on.dipoles.sums(x, detail, 1), on.backend.machine_epsilon
+        sums, unit = screened.sums, coordinate_rounding(x)
+        held, slope, _ = self._cutoff_errors(on, sums, unit)
         error = sums.truncation + sums.rounding + held
-        slope_error = sums.slope_truncation + dr.fma(SLOPE_ROUNDINGS * unit, sums.s4, slope)
+        slope_error = sums.gradient_truncation + dr.fma(SLOPE_ROUNDINGS * unit, sums.s4, slope)
         # At a dipole, up to rounding, f has all values: the sample has a gradient so steep that
         # every level is close, and an error as large as the distance to such a level.
-        apart = (sums.free_distance > _ON_DIPOLE * epsilon) & dr.isfinite(sums.value)
+        apart = (sums.singularity_distance > _ON_DIPOLE * epsilon) & dr.isfinite(sums.value)
         steep = on.backend.Array3f(0, 0, _ANY_LEVEL / (_ON_DIPOLE * epsilon))
         value = dr.select(apart, sums.value, 0)
         gradient = dr.select(apart, sums.gradient, steep)
-        known, ball = promises(screened, value, gradient, on.kernel, on.size, epsilon)
+        known, ball = screened_promises(screened, value, gradient, on.kernel, on.size, epsilon)
         return Sample(
             value,
             gradient / on.size,
             known,
             dr.select(apart, error, _ANY_LEVEL),
             dr.select(apart, slope_error / on.size, 0),
-            truncation=dr.select(apart, sums.truncation, 0),
-            weaker=(ball,),
+            truncation_error=dr.select(apart, sums.truncation, 0),
+            alternative_promises=(ball,),
         )
 
-    def check_levels(self, levels: tuple[float, ...]) -> None:
+    def validate_levels(self, levels: tuple[float, ...]) -> None:
         """ValueError for a level too small for rounding. All others occur next to every dipole."""
         for level in levels:
             if 0 < abs(level) < _SMALLEST_LEVEL:
@@ -426,8 +438,8 @@ class ScreenedWindingNumber(OrientedPoints, DetailedField["_ScreenedBuffers"]):
 
 
 @dataclass(frozen=True)
-class _ScreenedBuffers(UnitCoordinates):
+class _ScreenedBuffers(UnitFrame):
     """The kernel and the dipoles on a backend."""
 
     kernel: YukawaKernel
-    dipoles: RadialDipoles
+    dipoles: RadialSum

@@ -11,19 +11,23 @@ from typing import TYPE_CHECKING
 import drjit as dr
 
 from harnack.backend.elementary import fmax, fmin
-from harnack.fields.batched_fields import Values
-from harnack.fields.clearance import epsilon_at
+from harnack.fields.batched_fields import PointValues
+from harnack.fields.clearance import coordinate_rounding
 from harnack.fields.field import Sample
-from harnack.fields.solid_angles.radial_kernel import Radial, RadialKernel
-from harnack.fields.solid_angles.radial_tree import ClusteredDipoles, TreeSum, clusters
-from harnack.fields.source_sums import SLOPE_ROUNDINGS, SUM_ROUNDING
+from harnack.fields.solid_angles.radial_kernel import KernelValues, RadialKernel
+from harnack.fields.solid_angles.radial_tree import (
+    ClusteredDipoles,
+    RadialTreecode,
+    taylor_tree_moments,
+)
+from harnack.fields.source_sums import SLOPE_ROUNDINGS, SUM_MARGIN
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, Real, Vec3
-    from harnack.tree import Hierarchy
+    from harnack.tree import BalancedTree
 
 # Bounds of the kernel hold from this part of a distance on: promises reach `_REACHES` = 0.45 of it.
-_FROM = 0.55
+_BOUND_FRACTION = 0.55
 
 
 class SmoothedKernel(RadialKernel):
@@ -52,7 +56,7 @@ class SmoothedKernel(RadialKernel):
     def __init__(self, backend: Backend, height: float) -> None:
         self.height_square = dr.opaque(backend.Float, height * height)
 
-    def at(self, distance: Real, inverse: Real, last: int) -> Radial:
+    def at(self, distance: Real, inverse: Real, last: int) -> KernelValues:
         del distance
         half = 0.5 * self.height_square * inverse * inverse
         thetas: list[Real] = []
@@ -60,10 +64,10 @@ class SmoothedKernel(RadialKernel):
         for k in range(last + 1):
             thetas.append(dr.fma((2 * k + 1) * factor, half, factor))
             factor *= 2 * k + 1
-        return Radial(inverse, thetas)
+        return KernelValues(inverse, thetas)
 
     def bounds(self, distance: Real, last: int) -> list[Real]:
-        share = dr.sqrt(self.height_square) / (_FROM * fmax(distance, 1e-30))
+        share = dr.sqrt(self.height_square) / (_BOUND_FRACTION * fmax(distance, 1e-30))
         q = fmin(share * share, 1)
         return [dr.fma(0.25 * (m + 1) * (m + 2), q, 1) for m in range(2, last + 1)]
 
@@ -79,40 +83,42 @@ class SmoothedKernel(RadialKernel):
 class SmoothedSum:
     """sum_i m_i.z_i (rho_i^2 + 5 h^2/2)/(rho_i^2 + h^2)^(5/2), z_i = y_i - x, rho_i = |z_i|."""
 
-    dipoles: TreeSum
+    dipoles: RadialTreecode
 
     @classmethod
     def of(
-        cls, backend: Backend, tree: Hierarchy, rows: FloatArray, height: float, accuracy: float
+        cls, backend: Backend, tree: BalancedTree, rows: FloatArray, height: float, accuracy: float
     ) -> SmoothedSum:
-        """rows: (n, 8) of `dipole_rows`. tree: `hierarchy_of` their points, or of the same points
-        at earlier positions. height: the smoothing length, in the units of the dipoles."""
-        clustered = ClusteredDipoles(rows, tree, clusters(tree, rows))
-        return cls(TreeSum(backend, clustered, SmoothedKernel(backend, height), accuracy))
+        """rows: (n, 8) of `dipole_records`. tree: `dipole_hierarchy` their points, or of the same
+        points at earlier positions. height: the smoothing length, in the units of the dipoles."""
+        clustered = ClusteredDipoles(rows, tree, taylor_tree_moments(tree, rows))
+        return cls(RadialTreecode(backend, clustered, SmoothedKernel(backend, height), accuracy))
 
     @property
-    def coarsest(self) -> float:
+    def coarsest_accuracy(self) -> float:
         """The detail of coarse evaluations (`Field.coarsest_detail`): there are none."""
         return 1.0
 
-    def at(self, x: Vec3, derivatives: int, closer: Real) -> Values:
+    def values(self, x: Vec3, derivatives: int, closer: Real) -> PointValues:
         """Value and the derivatives asked for at x; closer: the detail, at least 1."""
         sums = self.dipoles.sums(x, closer, derivatives).sums
-        rounding = 8 * self.dipoles.backend.epsilon * dr.abs(sums.value)
-        return sums.values(1.0, epsilon_at(x), rounding)
+        rounding = 8 * self.dipoles.backend.machine_epsilon * dr.abs(sums.value)
+        return sums.values(1.0, coordinate_rounding(x), rounding)
 
     def sample(self, x: Vec3, detail: Real) -> Sample:
         """Value, gradient and promises at x."""
         radial = self.dipoles.sums(x, detail, 1)
         sums = radial.sums
-        slope_error = dr.fma(SLOPE_ROUNDINGS * epsilon_at(x), sums.s4, sums.slope_truncation)
-        epsilon = self.dipoles.backend.epsilon
-        nearest = fmax(sums.free_distance * (1 - SUM_ROUNDING) - 8 * epsilon, 0)
+        slope_error = dr.fma(
+            SLOPE_ROUNDINGS * coordinate_rounding(x), sums.s4, sums.gradient_truncation
+        )
+        epsilon = self.dipoles.backend.machine_epsilon
+        nearest = fmax(sums.singularity_distance * (1 - SUM_MARGIN) - 8 * epsilon, 0)
         return Sample(
             sums.value,
             sums.gradient,
             radial.curvatures(lambda r: 1.0, nearest, 1.0),
             sums.truncation + sums.rounding + 8 * epsilon * dr.abs(sums.value),
             slope_error,
-            truncation=sums.truncation,
+            truncation_error=sums.truncation,
         )

@@ -14,45 +14,45 @@ import numpy as np
 
 from harnack.backend import FloatArray, backend_of, choose_backend, to_numpy
 from harnack.backend.elementary import fmin
-from harnack.backend.tensors import is_tensor, vectors_of
-from harnack.cluster.serialization import Remembered
+from harnack.backend.tensors import is_tensor, tensor_to_vectors
+from harnack.cluster.serialization import TransientCache
 from harnack.enclosures import HarmonicBall, Lipschitz
-from harnack.fields.batch_evaluation import in_batches
-from harnack.fields.capabilities import NO_TRUNCATION
+from harnack.fields.batch_evaluation import map_batches
+from harnack.fields.capabilities import EXACT
 from harnack.fields.clearance import (
-    UnitCoordinates,
-    UploadedField,
-    epsilon_at,
-    placed,
+    DeviceField,
+    UnitFrame,
+    coordinate_rounding,
+    frame_parameters,
     tight_extent,
 )
-from harnack.fields.field import Look, Path, Sample, lengthened
-from harnack.fields.solid_angles.cell_options import HasCells
-from harnack.fields.solid_angles.circle_sums import Circles, CircleSums
+from harnack.fields.field import Ray, RaySample, Sample, space_scaled
+from harnack.fields.solid_angles.cell_options import FieldWithCells
+from harnack.fields.solid_angles.circle_sums import CircleSet, CircleSums
 from harnack.fields.solid_angles.curve_cell_builder import build_curve_cells
-from harnack.fields.solid_angles.curve_cells import CellSums, CurveCells
+from harnack.fields.solid_angles.curve_cells import CurveCells, CurveCellSums
 from harnack.fields.solid_angles.curve_queries import (
-    bends,
-    change_along_segments,
     closest_on_segments,
+    continuous_change,
     differentiable_angle,
-    segments,
-    slope_change,
-    swept_ball,
+    gradient_change_bound,
+    lift_ball,
+    remainder_promises,
+    segment_records,
 )
 from harnack.fields.solid_angles.edges import (
     EdgeSums,
     LoopEdges,
     hessian_over_edges,
-    near_rounding,
     sum_over_edges,
+    vertex_rounding,
 )
 from harnack.fields.solid_angles.planar import PlanarRegion, planar_region
-from harnack.fields.solid_angles.trail_sums import Line, known_along, rates_along
-from harnack.fields.source_sums import SECOND_ROUNDINGS, SLOPE_ROUNDINGS, SUM_ROUNDING
+from harnack.fields.solid_angles.trail_sums import RayLine, line_rates, lipschitz_along
+from harnack.fields.source_sums import SECOND_ROUNDINGS, SLOPE_ROUNDINGS, SUM_MARGIN
 from harnack.geometry import Circle, ConvexHull, is_convex_position, total_length
-from harnack.geometry.curves import CurveShapeError, Loops, net_circles, validate_curves
-from harnack.geometry.polygons import net_loops, uncanceled_edges
+from harnack.geometry.curves import CurveShapeError, Loops, cancel_opposite_circles, validate_curves
+from harnack.geometry.polygons import cancel_opposite_edges, remaining_edges
 from harnack.name_suggestions import did_you_mean
 
 if TYPE_CHECKING:
@@ -65,11 +65,11 @@ if TYPE_CHECKING:
     from harnack.fields.field import Field
     from harnack.geometry import Volume
 
-CertificateName = Literal["auto", "planar", "edges", "convex", "paper"]
+LiftBoundName = Literal["auto", "planar", "edges", "convex", "paper"]
 
 _PERIOD = 4 * math.pi
 # Levels nearer than this to a multiple of 4 pi count as one.
-_NARROW = 1e-9 * _PERIOD
+_LEVEL_MARGIN = 1e-9 * _PERIOD
 # The most pairs of a cell and a vertex in one round for an extent.
 _MOST_PAIRS = 3_000_000
 # Sides of the polygons that stand for circles where a boundary is drawn.
@@ -80,10 +80,10 @@ _SIDES = 256
 _PAYS, _LEAST_RAYS, _LEAST_EDGES = 2.5e8, 1e6, 48
 # The most planes of the extent of a curve in convex position with cells, by experiment: with
 # hundreds, clipping rays takes longer than the march.
-_PLANES = 48
+_MAX_PLANES = 48
 
 
-class SolidAngle(HasCells, UploadedField["_CurveBuffers"]):
+class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
     """The signed solid angle of closed curves, in steradians, with period 4 pi (paper, Eq. 10).
 
     loops: one (n, 3) array-like of vertices, n >= 3, a `Circle`, or a list of these. Every loop is
@@ -92,19 +92,19 @@ class SolidAngle(HasCells, UploadedField["_CurveBuffers"]):
         vertices. Circles are exact, and cost about as much as nine vertices.
 
     Edges that are traversed in both directions, by one loop or by two neighbors, are removed before
-    anything is computed (`net_loops`): they do not contribute to f. If none is left, f is 0
-    everywhere, every ray a proved miss, and levels that are multiples of 4 pi are refused.
+    anything is computed (`cancel_opposite_edges`): they do not contribute to f. If none is left, f
+    is 0 everywhere, every ray a proved miss, and levels that are multiples of 4 pi are refused.
 
-    Promises. Second derivatives are bounded near every curve (`edge_angles.bends`), and steps rest
-    on that. The other proofs, chosen by `bound=`, need the range of the lift on a ball:
+    Promises. Second derivatives are bounded near every curve (`curve_queries.bends`), and steps
+    rest on that. The other proofs, chosen by `bound=`, need the range of the lift on a ball:
     on wavy polygons and knots they take 1.4 to 2 times as many evaluations.
 
-    certificate: how the lift is bounded on a ball. "auto" takes "planar" where its hypothesis is
+    lift_bound: how the lift is bounded on a ball. "auto" takes "planar" where its hypothesis is
     checked to hold, "convex" where that does, else "edges"; if loops are Dr.Jit arrays it takes
     "edges" in any case, so that curves that are moved step by step do not change kernels.
 
     - "edges" holds for **every** curve: |grad f| and the bound of second derivatives bound the
-      change of f (`swept_ball`).
+      change of f (`lift_ball`).
     - "planar": on B(x, d), d the distance to the curve, the lift stays in a range 4 pi wide if all
       loops together bound a region of a plane (`planar`); else, for circles alone, in the sum of
       one such range for each circle.
@@ -130,42 +130,42 @@ class SolidAngle(HasCells, UploadedField["_CurveBuffers"]):
 
     period: ClassVar[float | None] = _PERIOD
     default_level: float = 2 * math.pi
-    overstep: float = 1.3  # by experiment
+    over_relaxation: float = 1.3  # by experiment
 
     def __init__(
         self,
         loops: Any,
         *,
-        certificate: CertificateName = "auto",
+        lift_bound: LiftBoundName = "auto",
         cells: bool | float | None = None,
     ) -> None:
         super().__init__()
         self.circles: tuple[Circle, ...]
-        curves, self._movable = _movable_loops(loops)
+        curves, self._differentiable_loops = _movable_loops(loops)
         found, self.circles = validate_curves(curves)
         self._loops: Loops = tuple(_read_only(loop) for loop in found)
-        self._net: Loops = net_loops(self.loops) if self.loops else ()
-        self._net_circles = net_circles(self.circles)
-        is_circle = not self._net and len(self._net_circles) == 1
+        self._net_loops: Loops = cancel_opposite_edges(self.loops) if self.loops else ()
+        self._net_circles = cancel_opposite_circles(self.circles)
+        is_circle = not self._net_loops and len(self._net_circles) == 1
         self.convex_position = is_circle or (
-            not self._net_circles and is_convex_position(self._net)
+            not self._net_circles and is_convex_position(self._net_loops)
         )
         self._region: PlanarRegion | None = None
-        if not self._is_empty:
-            self._region = planar_region(self._net, self._net_circles)
-        self.asked_certificate: CertificateName = certificate
-        self.certificate = self._choose(certificate)
+        if not self._all_cancel:
+            self._region = planar_region(self._net_loops, self._net_circles)
+        self.lift_bound_option: LiftBoundName = lift_bound
+        self.lift_bound = self._choose(lift_bound)
         points = self._points_around()
         self._center = 0.5 * (points.min(axis=0) + points.max(axis=0))
         self._size = float(np.linalg.norm(points - self._center, axis=1).max())
-        self._extents: Remembered[tuple[float, ...], Volume | None] = Remembered()
-        self.set_cells(cells)
-        if cells and self._movable:
+        self._extents: TransientCache[tuple[float, ...], Volume | None] = TransientCache()
+        self.configure_cells(cells)
+        if cells and self._differentiable_loops:
             raise ValueError(
                 "cells are of curves that stay as they are, and a loop is a Dr.Jit array: give "
                 "NumPy arrays, or no cells"
             )
-        self.has_detail = bool(cells) and bool(self._net)
+        self.has_variable_accuracy = bool(cells) and bool(self._net_loops)
         self._detail: Real = 1.0
 
     @property
@@ -175,50 +175,50 @@ class SolidAngle(HasCells, UploadedField["_CurveBuffers"]):
         return self._loops
 
     @property
-    def _is_empty(self) -> bool:
+    def _all_cancel(self) -> bool:
         """Whether all edges and circles cancel."""
-        return not self._net and not self._net_circles
+        return not self._net_loops and not self._net_circles
 
     @property
     def boundary_curves(self) -> tuple[FloatArray, ...]:
-        return (*self._net, *(one.polygon(_SIDES) for one in self._net_circles))
+        return (*self._net_loops, *(one.polygon(_SIDES) for one in self._net_circles))
 
     def _points_around(self) -> FloatArray:
         """Points (n, 3) whose convex hull contains the curves: vertices, and polygons around
         circles. If all curves cancel, those of the curves as given."""
-        loops, circles = self._net, self._net_circles
-        if self._is_empty:
+        loops, circles = self._net_loops, self._net_circles
+        if self._all_cancel:
             loops, circles = self.loops, self.circles
-        return np.concatenate([*loops, *(one.polygon(64, around=True) for one in circles)])
+        return np.concatenate([*loops, *(one.polygon(64, circumscribed=True) for one in circles)])
 
-    def _choose(self, asked: CertificateName) -> Literal["edges", "planar", "range"]:
+    def _choose(self, asked: LiftBoundName) -> Literal["edges", "planar", "range"]:
         if asked == "auto":
-            if self._movable:
+            if self._differentiable_loops:
                 return "edges"
-            if self._region is not None or (self._net_circles and not self._net):
+            if self._region is not None or (self._net_circles and not self._net_loops):
                 return "planar"
             return "range" if self.convex_position else "edges"
         if asked == "convex" and not self.convex_position:
             raise ValueError(
-                'certificate="convex" needs one loop without self-intersections on the boundary '
-                'of its convex hull, and this is not one; use certificate="auto"'
+                'lift_bound="convex" needs one loop without self-intersections on the boundary '
+                'of its convex hull, and this is not one; use lift_bound="auto"'
             )
         if asked == "planar":
-            if self._region is None and (self._net or not self._net_circles):
+            if self._region is None and (self._net_loops or not self._net_circles):
                 raise ValueError(
-                    'certificate="planar" needs disjoint loops that bound a region of a plane, or '
-                    'circles alone, and this is neither; use certificate="auto"'
+                    'lift_bound="planar" needs disjoint loops that bound a region of a plane, or '
+                    'circles alone, and this is neither; use lift_bound="auto"'
                 )
             return "planar"
         if asked not in ("edges", "convex", "paper"):
             names = ("auto", "planar", "edges", "convex", "paper")
             raise ValueError(
-                f"unknown certificate {asked!r}; use auto, planar, edges, convex or paper"
+                f"unknown lift_bound {asked!r}; use auto, planar, edges, convex or paper"
                 f"{did_you_mean(asked, names)}"
             )
         return "edges" if asked == "edges" else "range"
 
-    def _upload(self, backend: Backend, *, traced: bool) -> _CurveBuffers:
+    def _upload(self, backend: Backend, *, traced: bool) -> _CurveData:
         # Centered and scaled to unit size: products of eight lengths stay far from overflow. The
         # backend's precision holds the center exactly, so that subtracting it near the curve is
         # exact.
@@ -231,29 +231,31 @@ class SolidAngle(HasCells, UploadedField["_CurveBuffers"]):
                 "choose units nearer to 1"
             )
         center = self._center.astype(cast).astype(np.float64)
-        unit = tuple((loop - center) / self._size for loop in self._net)
+        unit = tuple((loop - center) / self._size for loop in self._net_loops)
         edges = LoopEdges.upload(backend, unit) if unit else None
         circles = None
         if self._net_circles:
-            circles = Circles.upload(backend, self._net_circles, center, self._size)
+            circles = CircleSet.upload(backend, self._net_circles, center, self._size)
         plane = None
         if self._region is not None:
             height = (self._region.offset - float(self._region.normal @ center)) / self._size
             numbers = (*self._region.normal.tolist(), height)
             plane = tuple(dr.opaque(backend.Float, number) for number in numbers)
         magnitude = float(np.abs(self._points_around()).max() / self._size)
-        records = 0 if edges is None else sum(-(-len(loop) // edges.run) for loop in unit)
-        value_rounding = 16 * backend.epsilon if edges is None else edges.rounding(records)
+        records = (
+            0 if edges is None else sum(-(-len(loop) // edges.edges_per_record) for loop in unit)
+        )
+        value_rounding = 16 * backend.machine_epsilon if edges is None else edges.rounding(records)
         cells = None
-        if self.has_detail and traced:
+        if self.has_variable_accuracy and traced:
             low, high = self._box(center)
-            cells = build_curve_cells(backend, unit, low, high, self.most_bytes())
-        return _CurveBuffers(
-            *placed(backend, center, self._size),
+            cells = build_curve_cells(backend, unit, low, high, self.max_bytes())
+        return _CurveData(
+            *frame_parameters(backend, center, self._size),
             edges,
             circles,
             plane,
-            dr.opaque(backend.Float, backend.epsilon * (6 + 2 * magnitude)),
+            dr.opaque(backend.Float, backend.machine_epsilon * (6 + 2 * magnitude)),
             dr.opaque(backend.Float, value_rounding),
             cells,
         )
@@ -262,33 +264,33 @@ class SolidAngle(HasCells, UploadedField["_CurveBuffers"]):
         """The corners of a box that holds the curve and the default level, in unit coordinates."""
         volume = self.extent((self.default_level,))
         corners = [] if volume is None else [np.stack(volume.bounds())]
-        points = np.concatenate([*self._net, *corners]) - center
+        points = np.concatenate([*self._net_loops, *corners]) - center
         return points.min(axis=0) / self._size, points.max(axis=0) / self._size
 
     @functools.cached_property
     def _without_cells(self) -> SolidAngle:
         """The same field without cells."""
-        if not self.has_detail:
+        if not self.has_variable_accuracy:
             return self
-        return SolidAngle([*self.loops, *self.circles], certificate=self.asked_certificate)
+        return SolidAngle([*self.loops, *self.circles], lift_bound=self.lift_bound_option)
 
-    def _on(self, p: Vec3) -> _CurveBuffers:
+    def _data_for(self, p: Vec3) -> _CurveData:
         """The data; without cells if `prepare` was not called."""
         if self._device is None:
             return self._upload(backend_of(p), traced=False)
         return self._device
 
-    def _samples_at(
+    def _evaluate_points(
         self, points: Any, precision: Precision, wanted: Callable[[Sample], Any]
     ) -> npt.NDArray[Any]:
-        if self.has_detail:
-            return self._without_cells._samples_at(points, precision, wanted)
-        return super()._samples_at(points, precision, wanted)
+        if self.has_variable_accuracy:
+            return self._without_cells._evaluate_points(points, precision, wanted)
+        return super()._evaluate_points(points, precision, wanted)
 
-    def without_truncation(self, backend: Backend) -> Field:
-        return self.at_detail(backend.Float(NO_TRUNCATION)) if self.has_detail else self
+    def exact(self, backend: Backend) -> Field:
+        return self.at_accuracy(backend.Float(EXACT)) if self.has_variable_accuracy else self
 
-    def at_detail(self, detail: Real) -> Field:
+    def at_accuracy(self, detail: Real) -> Field:
         closer = copy.copy(self)
         closer._detail = detail
         return closer
@@ -296,33 +298,33 @@ class SolidAngle(HasCells, UploadedField["_CurveBuffers"]):
     def evaluate(self, p: Vec3) -> Sample:
         return self._sample(p, None)
 
-    def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
+    def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
         """The look with promises along the ray, which prove long steps where it runs along an
         edge."""
         del ahead, back
-        knows_lines = not self._is_empty and self.asked_certificate != "paper"
+        knows_lines = not self._all_cancel and self.lift_bound_option != "paper"
         direction = path.direction if knows_lines else None
-        return path.look(self._sample(path.point(t), direction))
+        return path.enclose(self._sample(path.point(t), direction))
 
     def _sample(self, p: Vec3, direction: Vec3 | None) -> Sample:
         """The sample at p; with promises along a unit direction, if one is given."""
-        on = self._on(p)
-        if self._is_empty:
-            return self._constant(on, p)
-        x = on.unit(p)
+        on = self._data_for(p)
+        if self._all_cancel:
+            return self._zero_sample(on, p)
+        x = on.to_unit(p)
         sums, left_out = on.at_detail(x, self._detail)
-        epsilon = on.backend.epsilon
+        epsilon = on.backend.machine_epsilon
         rounding = on.rounding
-        distance = sums.distance * (1 - SUM_ROUNDING) - rounding
-        known = bends(sums.cubes, sums.fourths, distance)
-        rounded = left_out.rounding + near_rounding(epsilon, x, sums.squares)
-        if self.certificate == "edges":
-            ball = swept_ball(sums.angle, sums.gradient, sums.squares, known, left_out.slope)
-        elif self.certificate == "planar":
+        distance = sums.distance * (1 - SUM_MARGIN) - rounding
+        known = remainder_promises(sums.cubes, sums.fourths, distance)
+        rounded = left_out.rounding + vertex_rounding(epsilon, x, sums.squares)
+        if self.lift_bound == "edges":
+            ball = lift_ball(sums.angle, sums.gradient, sums.squares, known, left_out.slope)
+        elif self.lift_bound == "planar":
             ball = self._planar_ball(on, x, sums, distance, left_out.value)
         else:
-            ball = _in_range(sums.angle, distance, left_out.value + rounded)
-        # At the curve itself, up to rounding, f has all values (`uncanceled_edges`) and no
+            ball = _convex_ball(sums.angle, distance, left_out.value + rounded)
+        # At the curve itself, up to rounding, f has all values (`remaining_edges`) and no
         # gradient: give one so steep that the point counts as close to any level. Anywhere else NaN
         # stays NaN, and the tracer accepts no such point.
         met = sums.distance <= 2 * rounding
@@ -343,42 +345,48 @@ class SolidAngle(HasCells, UploadedField["_CurveBuffers"]):
         gradient_error = dr.select(met, 0, gradient_error)
         error = dr.select(met, 8 * _PERIOD, error)  # the steep gradient times 2 rounding
         along = _along_curves(on, x, sums, left_out, direction)
-        if self.asked_certificate == "paper":
+        if self.lift_bound_option == "paper":
             known = (ball,)
         value = dr.select(met, 0, sums.angle)
         sample = Sample(
-            value, gradient, known, error, gradient_error, truncation=truncation, weaker=(ball,),
-            along=along,
-        )  # fmt: skip
-        return lengthened(sample, on.size)
+            value,
+            gradient,
+            known,
+            error,
+            gradient_error,
+            truncation_error=truncation,
+            alternative_promises=(ball,),
+            ray_promises=along,
+        )
+        return space_scaled(sample, on.size)
 
     def _planar_ball(
-        self, on: _CurveBuffers, x: Vec3, sums: CurveSums, distance: Real, error: Real
+        self, on: _CurveData, x: Vec3, sums: CurveSums, distance: Real, error: Real
     ) -> HarmonicBall:
         if self._region is None:
             own = sums.circles
             assert own is not None
             return HarmonicBall(distance, own.lower, own.upper)
-        slack = on.rounding + on.backend.epsilon * 4 * dr.max(dr.abs(x))
-        return self._region.window(sums.angle, on.height(x), distance, slack, error)
+        slack = on.rounding + on.backend.machine_epsilon * 4 * dr.max(dr.abs(x))
+        return self._region.lift_range(sums.angle, on.height(x), distance, slack, error)
 
-    def _constant(self, on: _CurveBuffers, p: Vec3) -> Sample:
+    def _zero_sample(self, on: _CurveData, p: Vec3) -> Sample:
         """The sample of f = 0, if all edges cancel: it holds on any ball. The range has a positive
-        width, as bounds divide by it; no level lies in it (`check_levels`)."""
-        x = on.unit(p)
+        width, as bounds divide by it; no level lies in it (`validate_levels`)."""
+        x = on.to_unit(p)
         radius = 1e6 * (1 + dr.norm(x)) * on.size
         zero = dr.zeros(on.backend.Float, dr.width(p))
-        ball = HarmonicBall(radius, zero - _NARROW, zero + _NARROW)
+        ball = HarmonicBall(radius, zero - _LEVEL_MARGIN, zero + _LEVEL_MARGIN)
         return Sample(zero, on.backend.Array3f(zero), (ball,))
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         """Rows of the Hessian, whose trace is 0 up to rounding. It grows without limit at the
         curve."""
-        on = self._on(p)
-        if self._is_empty:
+        on = self._data_for(p)
+        if self._all_cancel:
             zero = dr.zeros(on.backend.Array3f, dr.width(p))
             return zero, zero, zero
-        x, share = on.unit(p), 1 / (on.size * on.size)
+        x, share = on.to_unit(p), 1 / (on.size * on.size)
         rows = on.backend.Array3f(0), on.backend.Array3f(0), on.backend.Array3f(0)
         if on.edges is not None:
             rows = hessian_over_edges(on.edges, x)
@@ -393,11 +401,11 @@ class SolidAngle(HasCells, UploadedField["_CurveBuffers"]):
         (`sums.SLOPE_ROUNDINGS`), with distances reduced by their rounding. Infinite at the
         curve."""
         del sample
-        on = self._on(p)
-        if self._is_empty:
+        on = self._data_for(p)
+        if self._all_cancel:
             return 0.0, 0.0
-        x = on.unit(p)
-        sums, unit = on.sums(x), epsilon_at(x)
+        x = on.to_unit(p)
+        sums, unit = on.sums(x), coordinate_rounding(x)
         distance = sums.distance - 4 * unit
         known = (distance > 0) & (sums.distance > 2 * on.rounding)  # see `evaluate`
         share = dr.select(known, dr.square(dr.square(sums.distance / distance)), dr.inf)
@@ -405,27 +413,27 @@ class SolidAngle(HasCells, UploadedField["_CurveBuffers"]):
         second = 0.25 * SECOND_ROUNDINGS * unit * sums.cubes / sums.distance * share
         return slope, second / (on.size * on.size)
 
-    def slope_change(self, p: Vec3, radius: Real) -> Real:
-        """See `edge_angles.slope_change`; the rounding of positions is included."""
-        on = self._on(p)
-        if self._is_empty:
+    def gradient_change_bound(self, p: Vec3, radius: Real) -> Real:
+        """See `curve_queries.gradient_change_bound`; the rounding of positions is included."""
+        on = self._data_for(p)
+        if self._all_cancel:
             return 0 * p.x
-        x, reach = on.unit(p), radius / on.size + on.rounding
+        x, reach = on.to_unit(p), radius / on.size + on.rounding
         sums = on.sums(x)
-        distance = sums.distance * (1 - SUM_ROUNDING) - on.rounding
-        return slope_change(sums.cubes, sums.fourths, distance, reach) / on.size
+        distance = sums.distance * (1 - SUM_MARGIN) - on.rounding
+        return gradient_change_bound(sums.cubes, sums.fourths, distance, reach) / on.size
 
-    def closest_on_boundary(self, p: Vec3) -> Vec3 | None:
-        """The closest point of the curve, without edges that cancel (`uncanceled_edges`)."""
-        if self._is_empty:
+    def closest_boundary_point(self, p: Vec3) -> Vec3 | None:
+        """The closest point of the curve, without edges that cancel (`remaining_edges`)."""
+        if self._all_cancel:
             return None
-        on = self._on(p)
-        x = on.unit(p)
+        on = self._data_for(p)
+        x = on.to_unit(p)
         nearest, square = on.backend.Array3f(0), on.backend.Float(dr.inf)
-        if self._net:
+        if self._net_loops:
             center = to_numpy(on.center).reshape(3).astype(np.float64)
-            start, end = ((q - center) / self._size for q in uncanceled_edges(self._net))
-            nearest = closest_on_segments(segments(on.backend, start, end), x)
+            start, end = ((q - center) / self._size for q in remaining_edges(self._net_loops))
+            nearest = closest_on_segments(segment_records(on.backend, start, end), x)
             square = dr.squared_norm(x - nearest)
         if on.circles is not None:
             other, apart = on.circles.closest(x)
@@ -433,39 +441,39 @@ class SolidAngle(HasCells, UploadedField["_CurveBuffers"]):
         return nearest * on.size + on.center
 
     def parameters(self) -> tuple[Any, ...]:
-        return tuple(one for one in self._movable if _is_drjit(one))
+        return tuple(one for one in self._differentiable_loops if _is_drjit(one))
 
     def differentiable_value(self, p: Vec3) -> Real:
         backend = backend_of(p)
         # If vertices can move one by one, all edges are summed: after a move they may not cancel.
-        loops = self._movable or self._net
+        loops = self._differentiable_loops or self._net_loops
         angle = differentiable_angle(backend, loops, p)
-        on = self._on(p)
+        on = self._data_for(p)
         if on.circles is None:
             return angle
         # To first order in p, as reverse mode cannot pass a recorded loop.
         with dr.suspend_grad():
             q = dr.detach(p)
-            own = on.circles.sums(on.unit(q))
+            own = on.circles.sums(on.to_unit(q))
         return angle + own.angle + dr.dot(own.gradient / on.size, p - q)
 
-    def change_along(self, p: FloatArray, q: FloatArray) -> FloatArray | None:
+    def continuous_change(self, p: FloatArray, q: FloatArray) -> FloatArray | None:
         if self._net_circles:
             return None
         backend = choose_backend("double")
-        on = self._without_cells.prepare(backend)._on(backend.Array3f(0))
+        on = self._without_cells.prepare(backend)._data_for(backend.Array3f(0))
         if on.edges is None:
             return np.zeros(len(p))
         edges = on.edges
 
         def between(start: Vec3, end: Vec3) -> tuple[Real]:
-            return (change_along_segments(edges, on.unit(start), on.unit(end)),)
+            return (continuous_change(edges, on.to_unit(start), on.to_unit(end)),)
 
-        return in_batches(backend, between, p, q)[0]
+        return map_batches(backend, between, p, q)[0]
 
-    def check_levels(self, levels: tuple[float, ...]) -> None:
+    def validate_levels(self, levels: tuple[float, ...]) -> None:
         for level in levels:
-            if self._is_empty and abs(math.remainder(float(level), _PERIOD)) < _NARROW:
+            if self._all_cancel and abs(math.remainder(float(level), _PERIOD)) < _LEVEL_MARGIN:
                 raise ValueError(
                     f"level {level:g}: all edges of this curve cancel each other, so that its "
                     "solid angle is 0 everywhere modulo 4 pi, and no surface is where it takes "
@@ -492,35 +500,37 @@ class SolidAngle(HasCells, UploadedField["_CurveBuffers"]):
         points = self._points_around()
         away = [abs(math.remainder(float(level), _PERIOD)) for level in levels]
         nearest = min(away)
-        if nearest < _NARROW:
+        if nearest < _LEVEL_MARGIN:
             return None
-        if self._is_empty:
-            return ConvexHull.of(points)  # there is no surface: any volume will do
+        if self._all_cancel:
+            return ConvexHull.from_points(points)  # there is no surface: any volume will do
         # Curves whose vertices may move share kernels: their extent is always found the same way.
         in_hull = self.convex_position and nearest > 2 * math.pi * (1 - 1e-9)
-        if in_hull and self.has_detail:  # some half-spaces of the hull: all of it lies in them
-            hull = ConvexHull.of(points).padded(1e-4 * self._size)
-            few = slice(_PLANES)
+        if (
+            in_hull and self.has_variable_accuracy
+        ):  # some half-spaces of the hull: all of it lies in them
+            hull = ConvexHull.from_points(points).padded(1e-4 * self._size)
+            few = slice(_MAX_PLANES)
             return ConvexHull(hull.normals[few], hull.offsets[few], hull.lower, hull.upper)
-        if in_hull and not self._movable:
-            return ConvexHull.of(points).padded(1e-4 * self._size)
+        if in_hull and not self._differentiable_loops:
+            return ConvexHull.from_points(points).padded(1e-4 * self._size)
         length = sum(one.length for one in self._net_circles)
-        length += total_length(self._net) if self._net else 0.0
+        length += total_length(self._net_loops) if self._net_loops else 0.0
         reach = 1.0001 * length / math.sqrt(nearest * (_PERIOD - nearest))
         lower, upper = points.min(axis=0) - reach, points.max(axis=0) + reach
-        loops = [*self._net, *self._net_circles]
-        proved = self._without_cells if self.asked_certificate != "paper" else SolidAngle(loops)
-        vertices = sum(map(len, self._net)) + 3 * len(self._net_circles)
+        loops = [*self._net_loops, *self._net_circles]
+        proved = self._without_cells if self.lift_bound_option != "paper" else SolidAngle(loops)
+        vertices = sum(map(len, self._net_loops)) + 3 * len(self._net_circles)
         return tight_extent(proved, levels, lower, upper, max(8, _MOST_PAIRS // vertices))
 
-    def having_cells(self, cells: bool = True) -> Self:
-        other = super().having_cells(cells)
-        other.has_detail, other._extents = cells, Remembered()
+    def with_cells(self, cells: bool = True) -> Self:
+        other = super().with_cells(cells)
+        other.has_variable_accuracy, other._extents = cells, TransientCache()
         return other
 
-    def least_rays(self) -> float:
-        edges = sum(map(len, self._net))
-        is_fixed = not self._movable and self.asked_certificate != "paper"
+    def cells_pay_from(self) -> float:
+        edges = sum(map(len, self._net_loops))
+        is_fixed = not self._differentiable_loops and self.lift_bound_option != "paper"
         few = not is_fixed or edges < _LEAST_EDGES
         return math.inf if few else max(_LEAST_RAYS, _PAYS / edges)
 
@@ -529,15 +539,15 @@ class SolidAngle(HasCells, UploadedField["_CurveBuffers"]):
             "loops": len(self.loops) + len(self.circles),
             **({"circles": len(self.circles)} if self.circles else {}),
             "vertices": sum(len(loop) for loop in self.loops),
-            "canceled edges": sum(map(len, self.loops)) - sum(map(len, self._net)),
+            "canceled edges": sum(map(len, self.loops)) - sum(map(len, self._net_loops)),
             "convex position": self.convex_position,
-            "certificate": self.certificate,
-            **self.said_of_cells(None if self._device is None else self._device.cells),
+            "lift_bound": self.lift_bound,
+            **self.describe_cells(None if self._device is None else self._device.cells),
         }
 
 
 @dataclass(frozen=True)
-class _CurveBuffers(UnitCoordinates):
+class _CurveData(UnitFrame):
     """The data of curves on a backend.
 
     edges, circles: None if there are none.
@@ -549,21 +559,21 @@ class _CurveBuffers(UnitCoordinates):
     """
 
     edges: LoopEdges | None
-    circles: Circles | None
+    circles: CircleSet | None
     plane: tuple[Real, ...] | None
     rounding: Real
     value_rounding: Real
     cells: CurveCells | None = None
 
-    def at_detail(self, x: Vec3, detail: Real) -> tuple[CurveSums, LeftOut]:
+    def at_detail(self, x: Vec3, detail: Real) -> tuple[CurveSums, CellErrors]:
         """All sums at x, by the cells where there are any and the detail is at most 1."""
         if self.cells is None or self.edges is None:
-            return self.sums(x), LeftOut(0.0, 0.0, self.value_rounding)
+            return self.sums(x), CellErrors(0.0, 0.0, self.value_rounding)
         found, in_cells = self.cells.sums(x, detail <= 1)
         others = sum_over_edges(self.edges, x, ~in_cells)
         pairs = zip(vars(found.sums).values(), vars(others).values(), strict=True)
         sums = CurveSums(*(dr.select(in_cells, one, other) for one, other in pairs))
-        left_out = LeftOut(
+        left_out = CellErrors(
             dr.select(in_cells, found.error, 0),
             dr.select(in_cells, found.slope_error, 0),
             dr.select(in_cells, found.rounding, self.value_rounding),
@@ -576,14 +586,14 @@ class _CurveBuffers(UnitCoordinates):
         return sums, left_out
 
     def edge_rates(
-        self, left_out: LeftOut, line: Line, lengths: tuple[Real, ...], active: Mask
+        self, left_out: CellErrors, line: RayLine, lengths: tuple[Real, ...], active: Mask
     ) -> tuple[Real, ...]:
         """Those of `rates_along`, by the cells where the sums are theirs."""
         assert self.edges is not None
         if self.cells is None or left_out.cell is None:
-            return rates_along(self.edges, line, lengths, active)
+            return line_rates(self.edges, line, lengths, active)
         inside = left_out.in_cells
-        others = rates_along(self.edges, line, lengths, active & ~inside)
+        others = line_rates(self.edges, line, lengths, active & ~inside)
         own = self.cells.rates_along(left_out.cell, line, lengths, active & inside)
         return tuple(fmin(one, other) for one, other in zip(own, others, strict=True))
 
@@ -604,7 +614,7 @@ class _CurveBuffers(UnitCoordinates):
 
 
 @dataclass(frozen=True)
-class LeftOut:
+class CellErrors:
     """Bounds of what cells leave out of the value and the gradient, and of the rounding of the
     value.
 
@@ -614,7 +624,7 @@ class LeftOut:
     value: Real
     slope: Real
     rounding: Real
-    cell: CellSums | None = None
+    cell: CurveCellSums | None = None
     in_cells: Mask = False
 
 
@@ -650,7 +660,7 @@ class CurveSums:
         )
 
 
-def _in_range(angle: Real, distance: Real, error: Real) -> HarmonicBall:
+def _convex_ball(angle: Real, distance: Real, error: Real) -> HarmonicBall:
     """The ball for curves in convex position, whose lift stays in (-6 pi, 6 pi) if its value at the
     center is the principal one, in (-2 pi, 2 pi).
 
@@ -665,22 +675,22 @@ def _in_range(angle: Real, distance: Real, error: Real) -> HarmonicBall:
 
 
 def _along_curves(
-    on: _CurveBuffers, x: Vec3, sums: CurveSums, left_out: LeftOut, direction: Vec3 | None
+    on: _CurveData, x: Vec3, sums: CurveSums, left_out: CellErrors, direction: Vec3 | None
 ) -> tuple[Lipschitz, ...]:
     """Promises at x, in unit coordinates, along a direction, if one is given."""
     if direction is None:
         return ()
-    line = Line(x, on.backend.Array3f(direction), on.rounding)
+    line = RayLine(x, on.backend.Array3f(direction), on.rounding)
 
     def rates(lengths: tuple[Real, ...], active: Mask) -> tuple[Real, ...]:
         found: list[tuple[Real, ...]] = []
         if on.edges is not None:
             found.append(on.edge_rates(left_out, line, lengths, active))
         if on.circles is not None:
-            found.append(on.circles.rates_along(line, lengths, active))
+            found.append(on.circles.line_rates(line, lengths, active))
         return tuple(sum(several) for several in zip(*found, strict=True))
 
-    return known_along(line, sums.gradient, sums.distance, rates)
+    return lipschitz_along(line, sums.gradient, sums.distance, rates)
 
 
 def _read_only(loop: FloatArray) -> FloatArray:
@@ -697,7 +707,10 @@ def _movable_loops(loops: Any) -> tuple[Any, tuple[Any, ...]]:
     parts: list[Any] = [*loops] if several else [loops]
     if not any(map(_is_drjit, parts)):
         return loops, ()
-    parts = [vectors_of(one, "a loop", CurveShapeError) if is_tensor(one) else one for one in parts]
+    parts = [
+        tensor_to_vectors(one, "a loop", CurveShapeError) if is_tensor(one) else one
+        for one in parts
+    ]
     curves = [to_numpy(one) if _is_drjit(one) else one for one in parts]
     movable = tuple(one for one in parts if not isinstance(one, Circle))
     return curves if several else curves[0], movable

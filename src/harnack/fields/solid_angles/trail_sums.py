@@ -1,8 +1,13 @@
 """Sums over the edges of closed curves, for rays that run along edges and for many points.
 
-- `rates_along`: how little a solid angle changes along a line that runs along an edge.
-- `EdgeTrails`: boundary parts of winding numbers at many points; values alone, fast.
+- `line_rates`: how little a solid angle changes along a line that runs along an edge.
+- `TrailValues`: boundary parts of winding numbers at many points; values alone, fast.
 - `LiftedTrails`: the same along rays, with derivatives and bounds.
+
+Rays know their line. Balls beside a long edge are small, and a ray that runs along it would need
+thousands. An edge's share of the slope along a given line is of constant sign and vanishes where
+they are in one plane; the sums it takes, over curves and over the trees of meshes alike, are made
+only near the curve, on rays that hardly climb.
 """
 
 from __future__ import annotations
@@ -16,32 +21,32 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 import drjit as dr
 import numpy as np
 
-from harnack.backend.elementary import clamp, fmax, fmin, largest_coordinate
-from harnack.backend.record_table import Records
+from harnack.backend.elementary import clamp, fmax, fmin, max_norm
+from harnack.backend.record_table import RecordTable
 from harnack.enclosures import Lipschitz
-from harnack.fields.clearance import epsilon_at
+from harnack.fields.clearance import coordinate_rounding
 from harnack.fields.solid_angles.edge_lift import (
     FACTOR_ROUNDINGS,
     STEEP_ROUNDINGS,
     LiftedProduct,
     ends_factor,
-    sight_of,
+    view_vertex,
 )
 from harnack.fields.solid_angles.edges import Edge, inverse_squares
-from harnack.fields.source_sums import SUM_ROUNDING, FieldSums
+from harnack.fields.source_sums import SUM_MARGIN, SourceSums
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, IntArray, Mask, Real, Vec3
     from harnack.fields.solid_angles.edges import LoopEdges
-    from harnack.tree.triangle_tree import Frame
+    from harnack.tree.triangle_tree import RayFrame
 
-__all__ = ["LiftedTrails", "Line", "known_along", "rates_along", "with_edge_rates"]
+__all__ = ["LiftedTrails", "RayLine", "add_edge_rates", "line_rates", "lipschitz_along"]
 
 # Bounds along the line of a ray are computed where the ray may run along the curve: where it is
 # nearer to it than the first fraction of the curve's size, and its slope is below the second
 # fraction of the gradient. Elsewhere only where the ray may run along a flat part of the surface:
 # where the slope is below the third fraction of the gradient.
-_BESIDE, _FLAT, _GRAZING = 0.001, 0.25, 1e-3
+_NEAR_CURVE, _NEAR_SLOPE, _FAR_SLOPE = 0.001, 0.25, 1e-3
 # The number of lengths for which bounds are computed: in geometric progression from half the
 # distance to the curve towards the size of the curve.
 _LENGTHS = 6
@@ -51,7 +56,7 @@ Rates: TypeAlias = "Callable[[tuple[Real, ...], Mask], tuple[Real, ...]]"
 
 
 @dataclass(frozen=True)
-class Line:
+class RayLine:
     """Lines x + s v, with lengths of order one; rounding: that of their points."""
 
     x: Vec3
@@ -64,7 +69,9 @@ class Line:
         return dr.fma(8 * float(dr.epsilon(self.x)), dr.norm(self.x), self.rounding)
 
 
-def known_along(line: Line, gradient: Vec3, distance: Real, rates: Rates) -> tuple[Lipschitz, ...]:
+def lipschitz_along(
+    line: RayLine, gradient: Vec3, distance: Real, rates: Rates
+) -> tuple[Lipschitz, ...]:
     """Lipschitz constants of f along lines, for lengths from half the distance to the curve towards
     its size; finite only on lanes where they may be worth their cost.
 
@@ -72,18 +79,18 @@ def known_along(line: Line, gradient: Vec3, distance: Real, rates: Rates) -> tup
     surface, bounded by a plane curve, the shortest.
     """
     slope, steepness = dr.dot(gradient, line.v), dr.norm(gradient)
-    flat = dr.select(distance < _BESIDE, _FLAT, _GRAZING) * steepness
+    flat = dr.select(distance < _NEAR_CURVE, _NEAR_SLOPE, _FAR_SLOPE) * steepness
     first = 0.5 * fmax(distance, type(distance)(1e-30))
     longer, lengths = dr.power(first, -1 / _LENGTHS), [first]
     for _ in range(_LENGTHS - 1):
         lengths.append(lengths[-1] * longer)
     found = rates(tuple(lengths), dr.abs(slope) < flat)
     pairs = zip(found, lengths, strict=True)
-    return tuple(Lipschitz(rate * (1 + SUM_ROUNDING), length) for rate, length in pairs)
+    return tuple(Lipschitz(rate * (1 + SUM_MARGIN), length) for rate, length in pairs)
 
 
-def rates_along(
-    edges: LoopEdges, line: Line, lengths: tuple[Real, ...], active: Mask
+def line_rates(
+    edges: LoopEdges, line: RayLine, lengths: tuple[Real, ...], active: Mask
 ) -> tuple[Real, ...]:
     """For each length T a constant K with |f(x + s v) - f(x)| <= |s| K for |s| <= T.
 
@@ -114,15 +121,15 @@ def rates_along(
     """
 
     def add(p: Vec3, q: Vec3, inverse: Real, rates: tuple[Real, ...]) -> tuple[Real, ...]:
-        return with_edge_rates(line, Edge.between(p, q, inverse, line.x), lengths, rates)
+        return add_edge_rates(line, Edge.between(p, q, inverse, line.x), lengths, rates)
 
     start = tuple(edges.backend.Float(0) for _ in lengths)
     rates = edges.for_each(add, start, "edges along", active)
     return tuple(dr.select(active, rate, dr.inf) for rate in rates)
 
 
-def with_edge_rates(
-    line: Line, edge: Edge, lengths: tuple[Real, ...], rates: tuple[Real, ...]
+def add_edge_rates(
+    line: RayLine, edge: Edge, lengths: tuple[Real, ...], rates: tuple[Real, ...]
 ) -> tuple[Real, ...]:
     """The rates with an edge added, relative to the line's x.
 
@@ -131,7 +138,7 @@ def with_edge_rates(
     then small where both are, whatever the lengths of a and e: its error is at most 8 epsilon |m|
     |e| and slack |n|.
     """
-    a, e, inverse, slack = edge.a, edge.e, edge.inverse, line.slack
+    a, e, inverse, slack = edge.a, edge.e, edge.inverse_square_length, line.slack
     epsilon = float(dr.epsilon(type(inverse)))
     m, n = dr.cross(a, line.v), dr.cross(e, line.v)
     c = dr.abs(dr.dot(line.v, dr.cross(m, n)))
@@ -140,7 +147,7 @@ def with_edge_rates(
     square = dr.squared_norm(n)
     foot = dr.select(square > 0, clamp(-dr.dot(m, n) / square, 0, 1), 0)
     passing = dr.norm(dr.fma(type(a)(foot), n, m)) - slack
-    distance = dr.sqrt(edge.square) - slack
+    distance = dr.sqrt(edge.squared_distance) - slack
     # (a - s v) x e = area + s n, of length |e| times the distance from the line through the edge.
     area, per_length = dr.cross(a, e), dr.sqrt(inverse)
     nearest = dr.select(square > 0, -dr.dot(area, n) / square, 0)
@@ -159,12 +166,12 @@ def with_edge_rates(
 # Values at many points.
 
 # Edges of a record: its five vertices and the number of its edges fill two packets of eight.
-_EDGES = 4
+_EDGES_PER_RECORD = 4
 # Points of a lane: as many as registers hold, by experiment.
-_POINTS = 3
+_POINTS_PER_LANE = 3
 # Signs of `side` are not trusted where it is closer to zero than this many rounding errors of its
 # products; its own are six at most, those of `tree.triangles.side` one.
-_UNSURE = 16
+_SIDE_ROUNDINGS = 16
 # Beyond this distance, in sizes of the mesh, the products of lengths could leave float32.
 _FAR = 1024.0
 
@@ -176,7 +183,7 @@ Seen: TypeAlias = "tuple[Real, Real, Real]"
 
 
 @dataclass(frozen=True)
-class _Bits:
+class _FloatFormat:
     """The parameters of a floating-point format, for operations on its bits."""
 
     integer: Any
@@ -184,7 +191,7 @@ class _Bits:
     bias: int
 
     @classmethod
-    def of(cls, backend: Backend) -> _Bits:
+    def of(cls, backend: Backend) -> _FloatFormat:
         mantissa, bias = (23, 127) if backend.precision == "single" else (52, 1023)
         return cls(dr.int_array_t(backend.Float), mantissa, bias)
 
@@ -193,14 +200,14 @@ class _Bits:
         bits = dr.reinterpret_array(self.integer, x)
         return bits >> (self.mantissa + self.bias.bit_length() + 1)
 
-    def about_one_over(self, x: Real) -> Real:
+    def reciprocal_power_of_two(self, x: Real) -> Real:
         """The power of two that brings x > 0 between one and two."""
         exponent = dr.reinterpret_array(self.integer, x) & ((2 * self.bias + 1) << self.mantissa)
         return dr.reinterpret_array(type(x), (2 * self.bias << self.mantissa) - exponent)
 
 
 @dataclass(frozen=True)
-class _Product:
+class _AngleProduct:
     """A product z = x + iy of complex factors, of any length, with the sum of their arguments.
 
     half: the number of half turns: the sum theta of the factors' principal arguments lies in
@@ -212,10 +219,10 @@ class _Product:
     half: Any
 
     @classmethod
-    def of(cls, bits: _Bits, factor: Complex) -> _Product:
+    def of(cls, bits: _FloatFormat, factor: Complex) -> _AngleProduct:
         return cls(*factor, bits.sign(factor[1]))
 
-    def times(self, bits: _Bits, factor: Complex) -> _Product:
+    def times(self, bits: _FloatFormat, factor: Complex) -> _AngleProduct:
         """The product with one factor more.
 
         The factor's argument, in [-pi, pi], takes theta at most one half plane forward, or one back
@@ -229,19 +236,19 @@ class _Product:
         x = dr.fma(self.x, factor[0], -(self.y * factor[1]))
         y = dr.fma(self.x, factor[1], self.y * factor[0])
         changes = bits.sign(self.y) ^ bits.sign(y)
-        return _Product(x, y, self.half + (changes & (bits.sign(factor[1]) | 1)))
+        return _AngleProduct(x, y, self.half + (changes & (bits.sign(factor[1]) | 1)))
 
-    def times_product(self, bits: _Bits, other: _Product) -> _Product:
+    def times_product(self, bits: _FloatFormat, other: _AngleProduct) -> _AngleProduct:
         """The product with another one, whose half turns are added."""
         z = self.times(bits, (other.x, other.y))
-        return _Product(z.x, z.y, z.half + ((other.half + 1) & -2))
+        return _AngleProduct(z.x, z.y, z.half + ((other.half + 1) & -2))
 
-    def scaled(self, bits: _Bits) -> tuple[_Product, Real]:
+    def scaled(self, bits: _FloatFormat) -> tuple[_AngleProduct, Real]:
         """The same with length about one, and the length it had. Scaling by a power of two is
         exact."""
         length = dr.abs(self.x) + dr.abs(self.y)
-        scale = bits.about_one_over(length)
-        return _Product(self.x * scale, self.y * scale, self.half), length
+        scale = bits.reciprocal_power_of_two(length)
+        return _AngleProduct(self.x * scale, self.y * scale, self.half), length
 
     def turns(self) -> Real:
         """theta/(2 pi)."""
@@ -252,7 +259,7 @@ class _Product:
 
 
 @dataclass(frozen=True)
-class EdgeTrails:
+class TrailValues:
     """Directed edges on a backend, as records of consecutive edges of closed trails.
 
     For values of `edge_lift`'s sum at many points. The formula is the same, arranged so that little
@@ -264,39 +271,40 @@ class EdgeTrails:
     for `edge_lift` to compute again.
     """
 
-    records: Records
+    records: RecordTable
 
     @classmethod
-    def upload(cls, backend: Backend, vertices: FloatArray, edges: IntArray) -> EdgeTrails:
+    def upload(cls, backend: Backend, vertices: FloatArray, edges: IntArray) -> TrailValues:
         """Edges (k, 2) between vertices (n, 3), as often out of a vertex as into it."""
         rows: list[FloatArray] = []
         for trail in closed_trails(edges):
             count = len(trail) - 1
-            trips = -(-count // _EDGES)
-            first = _EDGES * np.arange(trips)[:, None]
-            index = np.minimum(first + np.arange(_EDGES + 1), count)
-            filled = np.minimum(count - first, _EDGES)
+            trips = -(-count // _EDGES_PER_RECORD)
+            first = _EDGES_PER_RECORD * np.arange(trips)[:, None]
+            index = np.minimum(first + np.arange(_EDGES_PER_RECORD + 1), count)
+            filled = np.minimum(count - first, _EDGES_PER_RECORD)
             rows.append(np.concatenate([vertices[trail[index]].reshape(trips, -1), filled], 1))
-        return cls(Records.upload(backend, np.concatenate(rows)))
+        return cls(RecordTable.upload(backend, np.concatenate(rows)))
 
-    def turns(self, x: Vec3, way: Real) -> tuple[Real, Mask]:
+    def turns(self, x: Vec3, ray_sign: Real) -> tuple[Real, Mask]:
         """1/(4 pi) times the sum of Omega_e at points x, and a mask of points to compute again.
 
-        way: 1 for the direction d = z; -1 for x and the edges mirrored in a plane z = const.
+        ray_sign: 1 for the direction d = z; -1 for x and the edges mirrored in a plane z = const.
 
         Each lane of the kernel takes several points. The mask holds where rounding could have
         changed the sign of a `side`, where a product of factors nearly underflows (near an edge or
         a short one), and farther than 1024 mesh sizes away along any axis.
         """
-        dr.eval(x, way)
+        dr.eval(x, ray_sign)
         backend, n = self.records.backend, dr.width(x)
         real, index = backend.Float, backend.UInt32
-        lanes = -(-n // _POINTS)
+        lanes = -(-n // _POINTS_PER_LANE)
         lane = dr.arange(index, lanes)
         apart, last = dr.opaque(index, lanes), dr.opaque(index, n - 1)  # for any n one kernel
-        places = [dr.minimum(lane + k * apart, last) for k in range(_POINTS)]
+        places = [dr.minimum(lane + k * apart, last) for k in range(_POINTS_PER_LANE)]
         points = [
-            (dr.gather(backend.Array3f, x, place), dr.gather(real, way, place)) for place in places
+            (dr.gather(backend.Array3f, x, place), dr.gather(real, ray_sign, place))
+            for place in places
         ]
         products, doubts = self._over_records(points)
         turns = [-one.turns() for one in products]  # of conjugate factors
@@ -305,53 +313,53 @@ class EdgeTrails:
         for place, turn, doubt in zip(places, turns, doubts, strict=True):
             dr.scatter(all_turns, turn, place)
             dr.scatter(all_doubts, doubt, place)
-        far = largest_coordinate(x) > _FAR
+        far = max_norm(x) > _FAR
         return all_turns, (all_doubts <= 0) | far
 
-    def _over_records(self, points: list[Point]) -> tuple[list[_Product], list[Real]]:
+    def _over_records(self, points: list[Point]) -> tuple[list[_AngleProduct], list[Real]]:
         """For each point the product of all factors, and a number that is at most 0 where it is
         uncertain."""
         backend = self.records.backend
-        real, bits = backend.Float, _Bits.of(backend)
-        slack = real(-_UNSURE * 0.5 * backend.epsilon)
+        real, bits = backend.Float, _FloatFormat.of(backend)
+        slack = real(-_SIDE_ROUNDINGS * 0.5 * backend.machine_epsilon)
 
         def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
             # Edges that pad a record lead from a vertex to itself: they are never uncertain.
-            slacks = [dr.select(row[15] > k, slack, 1) for k in range(_EDGES)]
+            slacks = [dr.select(row[15] > k, slack, 1) for k in range(_EDGES_PER_RECORD)]
             pairs = zip(points, state, strict=True)
             return tuple(_with_record(bits, row, slacks, x, old) for x, old in pairs)
 
         one = (real(1), real(0), bits.integer(0), real(1))
         out = self.records.for_each(add, tuple(one for _ in points), "trails")
-        return [_Product(*one[:3]) for one in out], [one[3] for one in out]
+        return [_AngleProduct(*one[:3]) for one in out], [one[3] for one in out]
 
 
 def _with_record(
-    bits: _Bits, row: list[Real], slacks: list[Real], x: Point, state: tuple[Any, ...]
+    bits: _FloatFormat, row: list[Real], slacks: list[Real], x: Point, state: tuple[Any, ...]
 ) -> tuple[Any, ...]:
     """The product (x, y, half) and the number of `_over_records` with the four edges of a record.
 
     The four are multiplied among themselves first: that product has an argument of nearly zero,
     where rounding has the least effect.
     """
-    z, doubt = _Product(*state[:3]), state[3]
+    z, doubt = _AngleProduct(*state[:3]), state[3]
     smallest = 2.0**-100 if bits.mantissa < 50 else 2.0**-800
-    a = _seen(bits, row[0:3], x)
-    part: _Product | None = None
-    for k in range(_EDGES):
-        b = _seen(bits, row[3 * k + 3 : 3 * k + 6], x)
+    a = _relative_vertex(bits, row[0:3], x)
+    part: _AngleProduct | None = None
+    for k in range(_EDGES_PER_RECORD):
+        b = _relative_vertex(bits, row[3 * k + 3 : 3 * k + 6], x)
         factor, sure = _factor(a, b, slacks[k])
         doubt = fmin(sure, doubt)
-        part = _Product.of(bits, factor) if part is None else part.times(bits, factor)
+        part = _AngleProduct.of(bits, factor) if part is None else part.times(bits, factor)
         if k == 1:
             part, length = part.scaled(bits)
             doubt = fmin(length - smallest, doubt)
         a = b
-    z, length = z.times_product(bits, cast("_Product", part)).scaled(bits)
+    z, length = z.times_product(bits, cast("_AngleProduct", part)).scaled(bits)
     return z.x, z.y, z.half, fmin(length - smallest, doubt)
 
 
-def _seen(bits: _Bits, vertex: list[Real], point: Point) -> Seen:
+def _relative_vertex(bits: _FloatFormat, vertex: list[Real], point: Point) -> Seen:
     """A vertex relative to a point: (u t, v t, s t) with t = |a| + |z| and s = |a| - way z.
 
     s t is (|a| + |z|)^2 or u^2 + v^2, so that no difference cancels.
@@ -398,12 +406,12 @@ def closed_trails(edges: IntArray) -> list[IntArray]:
 # Sums along rays.
 
 # Edges of a record: of these two, that which wastes less memory for padding.
-_RUNS = 3, 4
+_RECORD_SIZES = 3, 4
 
 
 @dataclass(frozen=True)
 class LiftedTrails:
-    """Closed trails of edges on a backend, as records of `run` consecutive edges.
+    """Closed trails of edges on a backend, as records of `edges_per_record` consecutive edges.
 
     For `edge_lift`'s sum along rays, edge by edge, with decisions made by the same bits. The part
     of a factor that belongs to a vertex is computed once and not for each of its edges, and roots
@@ -413,18 +421,21 @@ class LiftedTrails:
     edge runs from a higher to a lower index, 0 where there is no edge.
     """
 
-    records: Records
-    run: int
+    records: RecordTable
+    edges_per_record: int
 
     @classmethod
     def upload(cls, backend: Backend, vertices: FloatArray, trails: list[IntArray]) -> LiftedTrails:
         """Trails of vertices (n, 3), each ending where it begins."""
-        run = min(_RUNS, key=lambda run: sum(-(-(len(t) - 1) // run) for t in trails) * (run + 0.5))
+        run = min(
+            _RECORD_SIZES,
+            key=lambda run: sum(-(-(len(t) - 1) // run) for t in trails) * (run + 0.5),
+        )
         rounded = vertices.astype(backend.dtype).astype(np.float64)
         rows = [_rows(rounded, trail, run) for trail in trails]
-        return cls(Records.upload(backend, np.concatenate(rows)), run)
+        return cls(RecordTable.upload(backend, np.concatenate(rows)), run)
 
-    def near(self, frame: Frame, x: Vec3, active: Mask = True) -> FieldSums:
+    def sum(self, frame: RayFrame, x: Vec3, active: Mask = True) -> SourceSums:
         """The sum of Omega_e at points x of rays, where active, and what promises are made of.
 
         Derivatives. With w of `Edge`, L w is the integral of |dp|/rho^3 over an edge, and 1/d times
@@ -438,27 +449,27 @@ class LiftedTrails:
         bounds d is reduced by its rounding.
         """
         backend = self.records.backend
-        real, unit = backend.Float, fmax(epsilon_at(frame.o), epsilon_at(x))
-        own = 0.5 * backend.epsilon * FACTOR_ROUNDINGS * self.run
-        steep = 0.5 * backend.epsilon * STEEP_ROUNDINGS
+        real, unit = backend.Float, fmax(coordinate_rounding(frame.o), coordinate_rounding(x))
+        own = 0.5 * backend.machine_epsilon * FACTOR_ROUNDINGS * self.edges_per_record
+        steep = 0.5 * backend.machine_epsilon * STEEP_ROUNDINGS
 
         def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
             product, g, least, rounding, s4, s5 = state
             product = LiftedProduct(*product)
-            a = sight_of(self._vertex(row, 0), frame, x)
+            a = view_vertex(self._vertex(row, 0), frame, x)
             total, spread, nearest, longest = real(0), real(0), real(dr.inf), real(0)
-            for k in range(self.run):
+            for k in range(self.edges_per_record):
                 p, q = self._vertex(row, k), self._vertex(row, k + 1)
                 inverse, signed = self._edge(row, k)
-                b = sight_of(q, frame, x)
+                b = view_vertex(q, frame, x)
                 re, im = ends_factor(a, b, signed)
                 is_edge = signed != 0
                 product = product.times(dr.select(is_edge, re, 1), dr.select(is_edge, im, 0))
                 edge = Edge(a.offset, b.offset, q - p, inverse)
-                w, c = edge.field_of_lengths(a.length, b.length)
+                w, c = edge.biot_savart_of_lengths(a.length, b.length)
                 g = dr.fma(type(g)(w), c, g)
                 integral = dr.abs(signed) * w
-                square = dr.select(is_edge, edge.square, dr.inf)
+                square = dr.select(is_edge, edge.squared_distance, dr.inf)
                 total, nearest = total + integral, fmin(nearest, square)
                 longest = fmax(longest, dr.abs(signed))
                 spread = spread + dr.select(is_edge, integral * square, 0)
@@ -469,18 +480,18 @@ class LiftedTrails:
             s5 = dr.fma(0.1875 * total, dr.rcp(distance), s5)
             return product.parts(), g, fmin(nearest, least), rounding, s4 + 0.25 * total, s5
 
-        one = LiftedProduct.one(real).parts()
+        one = LiftedProduct.identity(real).parts()
         start = (one, backend.Array3f(0), real(dr.inf), real(0), real(0), real(0))
         product, g, least, rounding, s4, s5 = self.records.for_each(
             add, start, "trails along", active
         )
-        sums = FieldSums.zero(backend, dr.inf, 1)
+        sums = SourceSums.zero(backend, dr.inf, 1)
         return dataclasses.replace(
             sums,
             total=LiftedProduct(*product).angle(),
             gradient=g,
             rounding=rounding,
-            free_distance=dr.sqrt(least),
+            singularity_distance=dr.sqrt(least),
             s4=s4,
             s5=s5,
         )
@@ -490,8 +501,8 @@ class LiftedTrails:
 
     def _edge(self, row: list[Real], k: int) -> tuple[Real, Real]:
         """1/length^2 and the signed length of edge k of a record."""
-        first = 3 * (self.run + 1)
-        return row[first + k], row[first + self.run + k]
+        first = 3 * (self.edges_per_record + 1)
+        return row[first + k], row[first + self.edges_per_record + k]
 
 
 def _rows(vertices: FloatArray, trail: IntArray, run: int) -> FloatArray:

@@ -1,10 +1,10 @@
 """Sums over a tree of dipoles: far clusters as multipoles, near primitives one by one.
 
-- `walk_clusters`: visits a tree so that far clusters are taken as a whole.
+- `traverse_clusters`: visits a tree so that far clusters are taken as a whole.
 - `Treecode`: the sums over such a tree; what triangles and points share. The caller adds the
   primitives of near leaves.
-- `far_terms`: what a far node adds to value, gradient and Hessian.
-- `dipole_rows`, `in_slots`: oriented points as records, also in the leaves of a tree.
+- `multipole_terms`: what a far node adds to value, gradient and Hessian.
+- `dipole_records`, `records_in_slots`: oriented points as records, also in the leaves of a tree.
 """
 
 from __future__ import annotations
@@ -18,25 +18,38 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend.elementary import fmax
-from harnack.fields.batched_fields import SymmetricSum
-from harnack.fields.clearance import epsilon_at
-from harnack.fields.solid_angles.multipole import NodeMoments, bend_columns, cartesian, truncation
-from harnack.fields.source_sums import FieldSums, Terms, free_part
-from harnack.tree import NO_PRIMITIVE, Node, PackedTree, build_hierarchy, for_each, pack, walk
+from harnack.fields.batched_fields import SymmetricMatrix
+from harnack.fields.clearance import coordinate_rounding
+from harnack.fields.solid_angles.multipole import (
+    NodeMoments,
+    cartesian_coefficients,
+    remainder_constants,
+    truncation_bounds,
+)
+from harnack.fields.source_sums import SourceSums, SourceTerm, free_radius_fraction
+from harnack.tree import (
+    NO_PRIMITIVE,
+    PackedTree,
+    VisitedNode,
+    build_balanced_tree,
+    for_each_primitive,
+    pack_tree,
+    traverse,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from harnack.backend import Backend, Mask, Real, Vec3
-    from harnack.fields.batched_fields import Values
-    from harnack.tree import Hierarchy
-    from harnack.tree.balanced_tree import EachPrimitive, FloatArray
+    from harnack.fields.batched_fields import PointValues
+    from harnack.tree import BalancedTree
+    from harnack.tree.balanced_tree import FloatArray, PrimitiveBody
 
 State: TypeAlias = "tuple[Any, ...]"
 
 
 @dataclass(frozen=True)
-class SeenCluster:
+class ClusterView:
     """A node of the tree relative to points x.
 
     head: its numbers that every visit reads.
@@ -55,12 +68,12 @@ class SeenCluster:
     far: Mask
 
 
-EachCluster: TypeAlias = "Callable[[SeenCluster, State], State]"
+EachCluster: TypeAlias = "Callable[[ClusterView, State], State]"
 
 
-def walk_clusters(
+def traverse_clusters(
     tree: PackedTree, x: Vec3, closer: Real, add_cluster: EachCluster,
-    add_primitive: EachPrimitive, state: State, active: Mask = True, height_square: Real = 0.0,
+    add_primitive: PrimitiveBody, state: State, active: Mask = True, height_square: Real = 0.0,
 ) -> State:  # fmt: skip
     """The state after a walk over a tree whose nodes begin with their center and the distance from
     which on they may be taken as a whole.
@@ -73,51 +86,51 @@ def walk_clusters(
     """
     vector = tree.backend.Array3f
 
-    def visit(node: Node, state: State) -> tuple[Mask, State]:
+    def visit(node: VisitedNode, state: State) -> tuple[Mask, State]:
         r = x - vector(*node.head[:3])
         square = dr.squared_norm(r) + height_square
         far = square > dr.square(node.head[3] * closer)
         inverse = dr.select(far, dr.rsqrt(square), 0)
-        cluster = SeenCluster(node.head, node.payload(far), r, square, inverse, far)
+        cluster = ClusterView(node.head, node.payload(far), r, square, inverse, far)
         state = add_cluster(cluster, state)
-        return ~far, for_each(node, ~far & node.is_leaf, add_primitive, state)
+        return ~far, for_each_primitive(node, ~far & node.is_leaf, add_primitive, state)
 
-    return walk(tree, visit, state, active)
+    return traverse(tree, visit, state, active)
 
 
 # The most dipoles in a leaf, and the children of a node: by experiment.
 _LEAF_SIZE, _ARITY = 8, 4
 
 
-def hierarchy_of(points: FloatArray) -> Hierarchy:
+def dipole_hierarchy(points: FloatArray) -> BalancedTree:
     """The tree over points (n, 3)."""
-    return build_hierarchy(points, leaf_size=_LEAF_SIZE, arity=_ARITY)
+    return build_balanced_tree(points, leaf_size=_LEAF_SIZE, arity=_ARITY)
 
 
-def dipole_rows(points: FloatArray, moments: FloatArray) -> FloatArray:
+def dipole_records(points: FloatArray, moments: FloatArray) -> FloatArray:
     """(n, 8) records: position, moment, its length, 0. moments: (n, 3) area times normal."""
     weight = np.linalg.norm(moments, axis=1, keepdims=True)
     return np.concatenate([points, moments, weight, np.zeros_like(weight)], axis=1)
 
 
-def padding_row(row: FloatArray) -> FloatArray:
+def empty_record(row: FloatArray) -> FloatArray:
     """Records (..., 8) at the places of dipoles (..., 8), without a moment, which add nothing."""
     empty = np.zeros_like(row)
     empty[..., :3] = row[..., :3]
     return empty
 
 
-def in_slots(tree: Hierarchy, rows: FloatArray) -> FloatArray:
+def records_in_slots(tree: BalancedTree, rows: FloatArray) -> FloatArray:
     """Records (leaves, leaf_size, 8); in empty slots the padding of the leaf's first record."""
-    slots = tree.gather(rows)
-    empty = tree.slots == NO_PRIMITIVE
-    slots[empty] = np.broadcast_to(padding_row(slots[:, :1]), slots.shape)[empty]
+    slots = tree.values_in_slots(rows)
+    empty = tree.leaf_slots == NO_PRIMITIVE
+    slots[empty] = np.broadcast_to(empty_record(slots[:, :1]), slots.shape)[empty]
     return slots
 
 
-def far_terms(c: Sequence[Real], r: Vec3, inverse: Real, derivatives: int) -> Terms:
+def multipole_terms(c: Sequence[Real], r: Vec3, inverse: Real, derivatives: int) -> SourceTerm:
     """sum_l P_l(r)/r^(2l+1) for l = 1, 2, 3, and its derivatives, with the coefficients c that
-    `multipole.cartesian` lays out; inverse = 1/|r|.
+    `multipole.cartesian_coefficients` lays out; inverse = 1/|r|.
 
     derivatives: 0 for the value, 1 with the gradient, 2 with the Hessian too. With u = 1/|r|,
     G_l = grad P_l (so that l P_l = G_l.r by Euler) and H_l the Hessian of P_l,
@@ -152,20 +165,20 @@ def far_terms(c: Sequence[Real], r: Vec3, inverse: Real, derivatives: int) -> Te
     p3 = dr.dot(g3, r) * (u4 * (1 / 3))
     value = (p1 + p2 + p3) * u3
     if derivatives == 0:
-        return Terms(value)
+        return SourceTerm(value)
     g2, g3 = half * (2 * u2), g3 * u4
     s = dr.fma(3, p1, dr.fma(5, p2, 7 * p3)) * u2
     gradient = dr.fma(vector(-s), r, g1 + g2 + g3) * u3
     if derivatives == 1:
-        return Terms(value, gradient)
-    return Terms(value, gradient, _hessian(c, r, (g1, g2, g3), (p1, p2, p3), (u2, u3)))
+        return SourceTerm(value, gradient)
+    return SourceTerm(value, gradient, _hessian(c, r, (g1, g2, g3), (p1, p2, p3), (u2, u3)))
 
 
 def _hessian(
     c: Sequence[Real], r: Vec3, g: tuple[Vec3, ...], p: tuple[Real, ...], u: tuple[Real, Real]
-) -> SymmetricSum:
-    """The Hessian of `far_terms`; g and p are scaled by powers of u to the size of those of l =
-    1."""
+) -> SymmetricMatrix:
+    """The Hessian of `multipole_terms`; g and p are scaled by powers of u to the size of those of l
+    = 1."""
     x, y, z = r
     (g1, g2, g3), (p1, p2, p3), (u2, u3) = g, p, u
     u4 = u2 * u2
@@ -194,60 +207,64 @@ def _hessian(
             zip(squares, cubes, crossed, pairs, strict=True)
         )
     ]
-    return SymmetricSum(*parts)
+    return SymmetricMatrix(*parts)
 
 
-Own: TypeAlias = "tuple[Any, ...]"
+ExtraState: TypeAlias = "tuple[Any, ...]"
 
 # Coarse evaluations take nodes as a whole beyond this many times their radius.
-_ROUGH = 2.5
+_COARSE_RATIO = 2.5
 # Roundings of a far node's gradient itself.
-_OUTSIDE = 64.0
+_FAR_GRADIENT_ROUNDINGS = 64.0
 # The free distance, in units of coordinates, if no term bounds it.
-_FAR = 1e4
+_NO_SOURCE_DISTANCE = 1e4
 
 # From a record, a mask, the sums, and a state of the caller's own: the latter two with the record's
 # primitive added where the mask holds.
-AddPrimitive: TypeAlias = "Callable[[list[Real], Mask, FieldSums, Own], tuple[FieldSums, Own]]"
+AddPrimitive: TypeAlias = (
+    "Callable[[list[Real], Mask, SourceSums, ExtraState], tuple[SourceSums, ExtraState]]"
+)
 
 
-def node_columns(level: NodeMoments, order: int, rough: float, error: FloatArray) -> FloatArray:
-    """Numbers of nodes that may be taken as a whole beyond `rough` times their radius, as
+def node_records(level: NodeMoments, order: int, rough: float, error: FloatArray) -> FloatArray:
+    """Numbers of nodes that may be taken as a whole beyond `coarse_ratio` times their radius, as
     `Treecode`
-    reads them: center, accepting distance, A and K of `bend_columns`, 15 coefficients, and the
-        value
+    reads them: center, accepting distance, A and K of `remainder_constants`, 15 coefficients, and
+        the value
     error E (k,)."""
-    head = [rough * level.radius, *bend_columns(level, rough)]
-    parts = (level.center, *head, cartesian(level.moments, order), error)
+    head = [rough * level.radius, *remainder_constants(level, rough)]
+    parts = (level.center, *head, cartesian_coefficients(level.moments, order), error)
     return np.column_stack(parts)
 
 
 @dataclass(frozen=True)
 class Treecode:
-    """Sums over a tree of nodes as `node_columns` lays them out.
+    """Sums over a tree of nodes as `node_records` lays them out.
 
     accuracy: at detail 1 nodes are taken as a whole beyond this many times their radius.
-    rough: the same in a coarse evaluation.
+    coarse_ratio: the same in a coarse evaluation.
     order: of the multipoles.
-    looser: the truncation of a coarse evaluation is at most this many times the stored bound.
-    steeper, bent: the truncation of the gradient is at most `steeper` times that of the value over
-        r, that of second derivatives `bent` times it over r^2.
+    coarse_error_ratio: the truncation of a coarse evaluation is at most this many times the stored
+        bound.
+    gradient_error_ratio, hessian_error_ratio: the truncation of the gradient is at most
+        `gradient_error_ratio` times that of the value over r, that of second derivatives
+        `hessian_error_ratio` times it over r^2.
     """
 
     backend: Backend
     tree: PackedTree
     accuracy: float
-    rough: float
+    coarse_ratio: float
     order: int
-    looser: Real
-    steeper: Real
-    bent: Real
+    coarse_error_ratio: Real
+    gradient_error_ratio: Real
+    hessian_error_ratio: Real
 
     @classmethod
     def of(
         cls,
         backend: Backend,
-        tree: Hierarchy,
+        tree: BalancedTree,
         levels: list[NodeMoments],
         primitives: FloatArray,
         accuracy: float,
@@ -256,12 +273,13 @@ class Treecode:
         """Everything uploaded. primitives: records in their slots, as `tree.pack` takes them.
 
         One E is stored for both kinds of evaluation: as large as that at detail 1 needs, and at
-        least what the coarse one needs divided by `looser`, the median of the ratio of both.
+        least what the coarse one needs divided by `coarse_error_ratio`, the median of the ratio of
+        both.
         """
-        rough = min(accuracy, _ROUGH)
-        close = [truncation(level, accuracy * level.radius, order) for level in levels]
-        roughly = [truncation(level, rough * level.radius, order) for level in levels]
-        looser = _middle(roughly[0][0], close[0][0])
+        rough = min(accuracy, _COARSE_RATIO)
+        close = [truncation_bounds(level, accuracy * level.radius, order) for level in levels]
+        roughly = [truncation_bounds(level, rough * level.radius, order) for level in levels]
+        looser = _median_ratio(roughly[0][0], close[0][0])
         nodes: list[FloatArray] = []
         steeper = bent = 0.0
         for level, *bounds in zip(levels, close, roughly, strict=True):
@@ -271,40 +289,43 @@ class Treecode:
             some = error > 0
             steeper = max(steeper, float((slope[some] / error[some]).max(initial=0.0)))
             bent = max(bent, float((second[some] / error[some]).max(initial=0.0)))
-            nodes.append(node_columns(level, order, rough, error))
-        packed = pack(backend, tree, nodes, primitives)
+            nodes.append(node_records(level, order, rough, error))
+        packed = pack_tree(backend, tree, nodes, primitives)
         ratios = looser, steeper * (1 + 1e-6), bent * (1 + 1e-6)
         on_device = (dr.opaque(backend.Float, ratio) for ratio in ratios)
         return cls(backend, packed, accuracy, rough, order, *on_device)
 
     @property
-    def coarsest(self) -> float:
+    def coarsest_accuracy(self) -> float:
         """The detail of coarse evaluations (`Field.coarsest_detail`)."""
-        return self.rough / self.accuracy
+        return self.coarse_ratio / self.accuracy
 
-    def ratio(self, detail: Real) -> Real:
+    def acceptance_ratio(self, detail: Real) -> Real:
         """The distance from which on nodes are taken as a whole, in radii of the node."""
-        return fmax(self.accuracy * detail, self.backend.Float(self.rough))
+        return fmax(self.accuracy * detail, self.backend.Float(self.coarse_ratio))
 
     def sums(
-        self, x: Vec3, detail: Real, add: AddPrimitive, own: Own = (), active: Mask = True,
+        self, x: Vec3, detail: Real, add: AddPrimitive, own: ExtraState = (), active: Mask = True,
         derivatives: int = 1,
-    ) -> tuple[FieldSums, Own]:  # fmt: skip
+    ) -> tuple[SourceSums, ExtraState]:  # fmt: skip
         """All sums at points x, and the caller's own state.
 
         detail: `Field.at_detail`; infinity adds up all terms one by one.
         add: adds a primitive of a near leaf (`AddPrimitive`).
         derivatives: 0 for the value alone, 1 with the gradient, 2 with the Hessian.
         """
-        free, closer = free_part(self.rough), self.ratio(detail) / self.rough
-        unit = epsilon_at(x)
+        free, closer = (
+            free_radius_fraction(self.coarse_ratio),
+            self.acceptance_ratio(detail) / self.coarse_ratio,
+        )
+        unit = coordinate_rounding(x)
 
-        def add_cluster(node: SeenCluster, state: Own) -> Own:
+        def add_cluster(node: ClusterView, state: ExtraState) -> ExtraState:
             c, inverse = node.payload, node.inverse
             left_out = c[15] * self._decay(inverse)
             slope = left_out * inverse
-            sums = FieldSums.of(state[0]).with_far_node(
-                far_terms(c, node.r, inverse, derivatives),
+            sums = SourceSums.from_state(state[0]).add_far_node(
+                multipole_terms(c, node.r, inverse, derivatives),
                 node.far,
                 inverse,
                 dr.fma(node.head[5], inverse * inverse, node.head[4]),
@@ -312,28 +333,33 @@ class Treecode:
                 free * (node.square * inverse),
                 unit,
             )
-            return sums.parts(), state[1]
+            return sums.to_state(), state[1]
 
-        def add_primitive(row: list[Real], active: Mask, state: Own) -> Own:
-            sums, own = add(row, active, FieldSums.of(state[0]), state[1])
-            return sums.parts(), own
+        def add_primitive(row: list[Real], active: Mask, state: ExtraState) -> ExtraState:
+            sums, own = add(row, active, SourceSums.from_state(state[0]), state[1])
+            return sums.to_state(), own
 
-        far_off = _FAR * (1 + dr.max(dr.abs(x)))
-        start = (FieldSums.zero(self.backend, far_off, derivatives).parts(), own)
-        state = walk_clusters(self.tree, x, closer, add_cluster, add_primitive, start, active)
-        sums, looser = FieldSums.of(state[0]), dr.select(detail < 1, self.looser, 1)
-        second = sums.second_truncation
+        far_off = _NO_SOURCE_DISTANCE * (1 + dr.max(dr.abs(x)))
+        start = (SourceSums.zero(self.backend, far_off, derivatives).to_state(), own)
+        state = traverse_clusters(self.tree, x, closer, add_cluster, add_primitive, start, active)
+        sums, looser = (
+            SourceSums.from_state(state[0]),
+            dr.select(detail < 1, self.coarse_error_ratio, 1),
+        )
+        second = sums.hessian_truncation
         sums = dataclasses.replace(
             sums,
             truncation=looser * sums.truncation,
-            slope_truncation=looser * self.steeper * sums.slope_truncation,
-            second_truncation=None if second is None else looser * self.bent * second,
+            gradient_truncation=looser * self.gradient_error_ratio * sums.gradient_truncation,
+            hessian_truncation=None
+            if second is None
+            else looser * self.hessian_error_ratio * second,
         )
         return sums, state[1]
 
-    def values(self, sums: FieldSums, share: float, unit: Real, rounding: Real) -> Values:
-        """`FieldSums.values` of sums over the tree."""
-        return sums.values(share, unit, rounding, _OUTSIDE)
+    def values(self, sums: SourceSums, share: float, unit: Real, rounding: Real) -> PointValues:
+        """`SourceSums.values` of sums over the tree."""
+        return sums.values(share, unit, rounding, _FAR_GRADIENT_ROUNDINGS)
 
     def _decay(self, inverse: Real) -> Real:
         """r^-(order + 3), which the first term left out is proportional to."""
@@ -343,7 +369,7 @@ class Treecode:
         return power
 
 
-def _middle(larger: FloatArray, smaller: FloatArray) -> float:
+def _median_ratio(larger: FloatArray, smaller: FloatArray) -> float:
     """The median of the ratio larger/smaller, at least 1."""
     some = smaller > 0
     return max(1.0, float(np.median(larger[some] / smaller[some]))) if some.any() else 1.0

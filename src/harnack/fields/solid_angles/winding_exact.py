@@ -4,6 +4,11 @@ See `edge_lift` for the formula. At points the cost is that of one ray through a
 one pass over the edges at which the triangles do not cancel, however many triangles there are.
 
 `ExactWinding` is the winding number of a mesh, at points and along rays.
+
+Winding numbers have two evaluators. `winding_exact`: crossings of one ray plus the boundary edges
+(the antipodal method), no truncation. `winding_tree`: multipoles, for soups. The tree's truncation
+is bounded by the next two moments, measured, and an absolute rest; the bound is part of
+`Sample.value_error` and `gradient_error`, by which the tracer shortens its steps.
 """
 
 from __future__ import annotations
@@ -16,25 +21,25 @@ import drjit as dr
 
 from harnack.backend.elementary import fmax
 from harnack.enclosures import Lipschitz
-from harnack.fields.batched_fields import SymmetricSum, Values
-from harnack.fields.clearance import epsilon_at
+from harnack.fields.batched_fields import PointValues, SymmetricMatrix
+from harnack.fields.clearance import coordinate_rounding
 from harnack.fields.field import Sample
 from harnack.fields.solid_angles.edge_lift import LiftedEdges, lifted_sums
 from harnack.fields.solid_angles.edges import LoopEdges
 from harnack.fields.solid_angles.trail_sums import (
-    EdgeTrails,
     LiftedTrails,
-    Line,
+    RayLine,
+    TrailValues,
     closed_trails,
-    known_along,
-    rates_along,
+    line_rates,
+    lipschitz_along,
 )
-from harnack.fields.source_sums import Terms, last_roundings
-from harnack.tree.triangle_tree import Frame, TriangleRays
+from harnack.fields.source_sums import SourceTerm, final_rounding
+from harnack.tree.triangle_tree import RayFrame, TriangleTree
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
-    from harnack.fields.capabilities import Crossing
+    from harnack.fields.capabilities import JumpCrossing
     from harnack.fields.solid_angles.winding_mesh import WindingMesh
 
 _SHARE = 1 / (4 * math.pi)
@@ -48,21 +53,21 @@ class ExactWinding:
     """
 
     backend: Backend
-    rays: TriangleRays
+    rays: TriangleTree
     edges: LiftedEdges | None
-    trails: EdgeTrails | None
-    along: LiftedTrails | None
+    trails: TrailValues | None
+    ray_trails: LiftedTrails | None
     loops: LoopEdges | None
     rounding: Real
 
     @classmethod
     def of(
-        cls, backend: Backend, mesh: WindingMesh, rays: TriangleRays, traced: bool
+        cls, backend: Backend, mesh: WindingMesh, rays: TriangleTree, traced: bool
     ) -> ExactWinding:
-        """Everything uploaded; traced: also what `on_stretch` needs."""
-        if not len(mesh.singular):
-            return cls(backend, rays, None, None, None, None, last_roundings(backend))
-        vertices, edges = mesh.unit_vertices, mesh.singular
+        """Everything uploaded; traced: also what `sample_interval` needs."""
+        if not len(mesh.singular_edges):
+            return cls(backend, rays, None, None, None, None, final_rounding(backend))
+        vertices, edges = mesh.unit_vertices, mesh.singular_edges
         along, loops = None, None
         if traced:
             trails = closed_trails(edges)
@@ -72,10 +77,10 @@ class ExactWinding:
             backend,
             rays,
             LiftedEdges.upload(backend, vertices, edges),
-            EdgeTrails.upload(backend, vertices, edges),
+            TrailValues.upload(backend, vertices, edges),
             along,
             loops,
-            last_roundings(backend),
+            final_rounding(backend),
         )
 
     has_detail: ClassVar[bool] = False
@@ -84,17 +89,17 @@ class ExactWinding:
     coarsest_detail: ClassVar[float] = 0.5
     """`Field.coarsest_detail` of the boundary's cells: any number below 1 (`boundary_cells`)."""
 
-    def values(self, x: Vec3) -> Real:
-        """w at points, as by `at`, for a third of the work; not while a loop is being recorded.
+    def fast_values(self, x: Vec3) -> Real:
+        """w at points, as by `values`, for a third of the work; not while a loop is being recorded.
 
-        Crossings are decided by `tree.triangles.crossing`. Wherever `EdgeTrails` is uncertain about
-        an edge, the sum over edges is computed again by `lifted_sums`, which decides by the same
-        bits.
+        Crossings are decided by `tree.triangles.crossing`. Wherever `TrailValues` is uncertain
+        about an edge, the sum over edges is computed again by `lifted_sums`, which decides by the
+        same bits.
         """
         # Rays lead away from the middle of the mesh, so that less of it lies ahead. For a mirrored
         # mesh the winding number changes its sign.
         way = dr.select(x.z >= 0, self.backend.Float(1), -1)
-        turns = self.rays.turns_along(x, way)
+        turns = self.rays.signed_crossings_vertical(x, way)
         if self.trails is None or self.edges is None:
             return dr.select(way > 0, turns, 0 - turns)  # no zero with a sign
         dr.eval(x, way, turns)
@@ -103,43 +108,43 @@ class ExactWinding:
         dr.eval(value, doubt)
         again = dr.compress(doubt)
         if len(again):
-            dr.scatter(value, self.at(dr.gather(type(x), x, again), 0).value, again)
+            dr.scatter(value, self.values(dr.gather(type(x), x, again), 0).value, again)
         return value
 
-    def at(self, x: Vec3, derivatives: int) -> Values:
+    def values(self, x: Vec3, derivatives: int) -> PointValues:
         """w and the derivatives asked for at points."""
         real = self.backend.Float
-        turns = self.rays.turns_along(x, real(1))
+        turns = self.rays.signed_crossings_vertical(x, real(1))
         if self.edges is None:
-            nothing = self.backend.Array3f(0), SymmetricSum.zero(real)
-            return Values(turns, real(self.rounding), *nothing, real(0), real(0))
-        sums, unit = lifted_sums(self.edges, x, derivatives).whole(), epsilon_at(x)
-        sums = sums.plus(Terms(4 * math.pi * turns), True)
+            nothing = self.backend.Array3f(0), SymmetricMatrix.zero(real)
+            return PointValues(turns, real(self.rounding), *nothing, real(0), real(0))
+        sums, unit = lifted_sums(self.edges, x, derivatives).total(), coordinate_rounding(x)
+        sums = sums.add_term(SourceTerm(4 * math.pi * turns), True)
         return sums.values(_SHARE, unit, self.rounding)
 
-    def start(self, frame: Frame, t: Real, active: Mask) -> Real:
+    def crossings_ahead(self, frame: RayFrame, t: Real, active: Mask) -> Real:
         """The part of w that counts crossings, at the start t of a ray."""
-        return self.rays.turns_ahead(frame, t, active)
+        return self.rays.signed_crossings_ahead(frame, t, active)
 
-    def on_stretch(
-        self, frame: Frame, x: Vec3, behind: Crossing, turns: Real, detail: Real,
+    def sample_interval(
+        self, frame: RayFrame, x: Vec3, behind: JumpCrossing, turns: Real, detail: Real,
         active: Mask = True,
     ) -> Sample:  # fmt: skip
         """w continued along a ray interval, where active, with the promises of
-        `FieldSums.sample`."""
+        `SourceSums.sample`."""
         del behind, detail
         if self.edges is None:
             nothing = self.backend.Array3f(0)
             return Sample(self.backend.Float(turns), nothing, (Lipschitz(0.0),), 0.0)
-        if self.along is None or self.loops is None:
+        if self.ray_trails is None or self.loops is None:
             raise RuntimeError("uploaded for points and not for rays")
-        found = self.along.near(frame, x, active)
-        found = found.plus(Terms(4 * math.pi * turns), True)
-        unit = fmax(epsilon_at(frame.o), epsilon_at(x))
-        line, loops = Line(x, frame.d, 8 * unit), self.loops
+        found = self.ray_trails.sum(frame, x, active)
+        found = found.add_term(SourceTerm(4 * math.pi * turns), True)
+        unit = fmax(coordinate_rounding(frame.o), coordinate_rounding(x))
+        line, loops = RayLine(x, frame.d, 8 * unit), self.loops
 
         def rates(lengths: tuple[Real, ...], wanted: Mask) -> tuple[Real, ...]:
-            return rates_along(loops, line, lengths, wanted & active)
+            return line_rates(loops, line, lengths, wanted & active)
 
-        known = known_along(line, found.gradient, found.free_distance, rates)
+        known = lipschitz_along(line, found.gradient, found.singularity_distance, rates)
         return found.sample(_SHARE, unit, self.rounding, along=known)

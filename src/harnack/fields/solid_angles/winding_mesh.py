@@ -11,18 +11,18 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import FloatArray, IntArray
-from harnack.fields.clearance import single
-from harnack.fields.solid_angles.multipole import NodeMoments, triangle_levels
+from harnack.fields.clearance import round_to_single
+from harnack.fields.solid_angles.multipole import NodeMoments, triangle_tree_moments
 from harnack.geometry import MeshError, validate_mesh
 from harnack.geometry.welding import Welded, rounding_of
-from harnack.tree import Hierarchy, build_hierarchy
-from harnack.tree.triangle_tree import MOST_TRIANGLES, PARITY, triangle_records
+from harnack.tree import BalancedTree, build_balanced_tree
+from harnack.tree.triangle_tree import MAX_TRIANGLES, PARITY_COLUMN, triangle_records
 
 # The most triangles in a leaf, and the children of a node: by experiment.
 _LEAF_SIZE, _ARITY = 8, 4
 # Properties that stay valid when vertices move: they depend on faces alone, or need not be the
 # best.
-_SHARED = ("triangles", "tree", "ray_tree", "singular_flags")
+_VERTEX_INDEPENDENT = ("triangles", "tree", "ray_tree", "singular_flags")
 
 
 @dataclass(frozen=True)
@@ -32,11 +32,12 @@ class WindingMesh:
     vertices: (n, 3), as given.
     faces: (m, 3) indices of welded vertices, no two alike.
     multiplicity: (m,) how often each face is given, less how often it is given reversed.
-    source: (m,) the face, as given, that each comes from.
-    singular: (k, 2) directed edges at which triangles do not cancel, an edge of weight 2 twice.
-    given: (g, 3) all faces, as given.
-    welded: (n,) the vertex that stands for each. rounded: how many places were joined with others,
-        from which they were apart by rounding (`geometry.welding`).
+    input_face: (m,) the face, as given, that each comes from.
+    singular_edges: (k, 2) directed edges at which triangles do not cancel, an edge of weight 2
+        twice.
+    input_faces: (g, 3) all faces, as given.
+    weld_map: (n,) the vertex that stands for each. rounded: how many places were joined with
+        others, from which they were apart by rounding (`geometry.welding`).
     center, size: `unit_vertices` = (vertices - center)/size; the size is a power of two, so that
         scaling lengths is exact.
     """
@@ -44,10 +45,10 @@ class WindingMesh:
     vertices: FloatArray
     faces: IntArray
     multiplicity: IntArray
-    source: IntArray
-    singular: IntArray
-    given: IntArray
-    welded: IntArray
+    input_face: IntArray
+    singular_edges: IntArray
+    input_faces: IntArray
+    weld_map: IntArray
     rounded: int
     center: FloatArray
     size: float
@@ -64,9 +65,9 @@ class WindingMesh:
         net = welded.net
         if len(net.faces) == 0:
             raise MeshError("faces: every face is canceled by its own copy turned round")
-        if net.multiplicity.sum() >= MOST_TRIANGLES:
+        if net.multiplicity.sum() >= MAX_TRIANGLES:
             raise MeshError(
-                f"faces: at most {MOST_TRIANGLES - 1} are possible; cut the mesh in parts"
+                f"faces: at most {MAX_TRIANGLES - 1} are possible; cut the mesh in parts"
             )
         return cls(
             x,
@@ -80,7 +81,7 @@ class WindingMesh:
             *_center_and_size(x, net.faces),
         )
 
-    def moved(self, vertices: npt.ArrayLike) -> WindingMesh:
+    def with_vertices(self, vertices: npt.ArrayLike) -> WindingMesh:
         """The mesh with other positions of its vertices (n, 3). It shares what follows from the
         faces alone, and the shape of trees that have been built; positions, boxes and moments are
         new.
@@ -89,27 +90,28 @@ class WindingMesh:
             MeshError: as `validate_mesh`; another number of vertices; vertices that coincided, so
                 that faces were joined there, come apart.
         """
-        x, given = validate_mesh(vertices, self.given)
+        x, given = validate_mesh(vertices, self.input_faces)
         if len(x) != len(self.vertices):
             raise MeshError(
                 f"vertices: {len(x)} of them, where {len(self.vertices)} were before: moving "
                 "vertices keeps their number and their order"
             )
-        apart = (x != x[self.welded]).any(axis=1)
+        apart = (x != x[self.weld_map]).any(axis=1)
         if self.rounded and apart.any():
-            apart = np.abs(x - x[self.welded]).max(axis=1) > rounding_of(x)
+            apart = np.abs(x - x[self.weld_map]).max(axis=1) > rounding_of(x)
         if apart.any():
             torn = given[apart[given]]
             if len(torn):
                 i = int(torn[0])
                 raise MeshError(
-                    f"vertices: {i} and {self.welded[i]} were at the same place, where faces were "
+                    f"vertices: {i} and {self.weld_map[i]} were at the same place, where faces "
+                    "were "
                     "joined, and now are not: make a new winding number of this mesh"
                 )
         center, size = _center_and_size(x, self.faces)
         mesh = dataclasses.replace(self, vertices=x, center=center, size=size)
         made = vars(self)
-        vars(mesh).update({name: made[name] for name in _SHARED if name in made})
+        vars(mesh).update({name: made[name] for name in _VERTEX_INDEPENDENT if name in made})
         return mesh
 
     @functools.cached_property
@@ -128,26 +130,26 @@ class WindingMesh:
         return self.unit_vertices[self.triangles]
 
     @functools.cached_property
-    def tree(self) -> Hierarchy:
+    def tree(self) -> BalancedTree:
         """The tree over the triangles' centroids."""
         a, b, c = np.moveaxis(self.corners, 1, 0)
-        return build_hierarchy((a + b + c) / 3, leaf_size=_LEAF_SIZE, arity=_ARITY)
+        return build_balanced_tree((a + b + c) / 3, leaf_size=_LEAF_SIZE, arity=_ARITY)
 
     @functools.cached_property
-    def ray_tree(self) -> Hierarchy:
+    def ray_tree(self) -> BalancedTree:
         """The tree over the centroids of faces, each once: a ray crosses all copies of a face at
         once."""
         if len(self.faces) == len(self.triangles):
             return self.tree
         centroids = self.unit_vertices[self.faces].mean(axis=1)
-        return build_hierarchy(centroids, leaf_size=_LEAF_SIZE, arity=_ARITY)
+        return build_balanced_tree(centroids, leaf_size=_LEAF_SIZE, arity=_ARITY)
 
     @functools.cached_property
     def ray_records(self) -> FloatArray:
         """(m, 14) records of the faces (`tree.triangles`), with the sign of crossings times the
         multiplicity."""
         records = triangle_records(self.unit_vertices, self.faces)
-        records[:, PARITY] *= self.multiplicity
+        records[:, PARITY_COLUMN] *= self.multiplicity
         return records
 
     @functools.cached_property
@@ -162,15 +164,15 @@ class WindingMesh:
     @functools.cached_property
     def levels(self) -> list[NodeMoments]:
         """Moments of the nodes."""
-        return triangle_levels(self.tree, self.corners)
+        return triangle_tree_moments(self.tree, self.corners)
 
     @functools.cached_property
     def singular_flags(self) -> FloatArray:
         """(m, 3): 1 for each edge 01, 12 and 02 of a record that is singular, else 0."""
         count = len(self.vertices)
-        keys = np.sort(self.singular.min(axis=1) * count + self.singular.max(axis=1))
+        keys = np.sort(self.singular_edges.min(axis=1) * count + self.singular_edges.max(axis=1))
         at_ends = np.zeros(count, np.bool_)
-        at_ends[self.singular] = True
+        at_ends[self.singular_edges] = True
         flags = np.zeros((len(self.triangles), 3))
         ends = np.sort(self.triangles, axis=1)
         for k, (i, j) in enumerate(((0, 1), (1, 2), (0, 2))):
@@ -194,7 +196,7 @@ class WindingMesh:
     @functools.cached_property
     def boundary_length(self) -> float:
         """The length of all singular edges."""
-        ends = self.vertices[self.singular]
+        ends = self.vertices[self.singular_edges]
         return float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).sum())
 
 
@@ -207,4 +209,4 @@ def _box(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, FloatArray]
 def _center_and_size(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, float]:
     low, high = _box(vertices, faces)
     size = 2.0 ** np.ceil(np.log2(0.5 * float((high - low).max())))
-    return single(0.5 * (low + high)), float(size)
+    return round_to_single(0.5 * (low + high)), float(size)

@@ -21,22 +21,22 @@ import numpy.typing as npt
 
 from harnack.backend import FloatArray, IntArray, backend_of
 from harnack.backend.elementary import fmax
-from harnack.backend.validation import real, refuses_derivatives, whole
-from harnack.cluster.serialization import Remembered
+from harnack.backend.validation import as_integer_in_range, as_real, no_derivatives
+from harnack.cluster.serialization import TransientCache
 from harnack.enclosures import Lipschitz
-from harnack.fields.batched_fields import BatchedField, Values
-from harnack.fields.capabilities import NO_SHEET, Crossing, NearestSheet
+from harnack.fields.batched_fields import BatchedField, PointValues
+from harnack.fields.capabilities import NO_FACET, JumpCrossing, NearestFacet
 from harnack.fields.clearance import (
-    UnitCoordinates,
-    UploadedField,
-    epsilon_at,
+    DeviceField,
+    UnitFrame,
+    coordinate_rounding,
+    frame_parameters,
     occupied_cells,
-    placed,
     tight_extent,
 )
-from harnack.fields.field import AtDetail, Field, Sample, lengthened
+from harnack.fields.field import EvaluateOnly, Field, Sample, space_scaled
 from harnack.fields.solid_angles.boundary_cells import BoundaryCells
-from harnack.fields.solid_angles.cell_options import Cells, HasCells
+from harnack.fields.solid_angles.cell_options import BuiltCells, FieldWithCells
 from harnack.fields.solid_angles.own_sheet import lies_on_own_level
 from harnack.fields.solid_angles.winding_exact import ExactWinding
 from harnack.fields.solid_angles.winding_mesh import WindingMesh
@@ -44,15 +44,19 @@ from harnack.fields.solid_angles.winding_rates import BoundaryRates, with_rates
 from harnack.fields.solid_angles.winding_tree import TreeWinding
 from harnack.geometry import Box
 from harnack.name_suggestions import did_you_mean, is_one_of
-from harnack.tree.closest_triangles import distance_to_triangles, jumps_within, nearest_triangle
-from harnack.tree.triangle_tree import Frame, TriangleRays
+from harnack.tree.closest_triangles import (
+    distance_lower_bound,
+    jump_sum_within,
+    next_closest_triangle,
+)
+from harnack.tree.triangle_tree import RayFrame, TriangleTree
 
 if TYPE_CHECKING:
     from typing import Self
 
     from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.geometry import Volume
-    from harnack.tree.empty_space import OccupiedCells
+    from harnack.tree.empty_space import OccupancyGrid
 
 __all__ = ["WindingModuloOne", "winding_box", "winding_cells", "winding_extent"]
 
@@ -60,13 +64,13 @@ __all__ = ["WindingModuloOne", "winding_box", "winding_cells", "winding_extent"]
 _MOST_CELLS = 20_000
 _FINEST = 6
 # Cells of the grid along its longest side, by experiment.
-_ACROSS = 192
+_CELLS_ACROSS = 192
 
 
-class WindingField(Protocol):
+class ModuloOneEvaluable(Protocol):
     """The methods of `WindingNumber` that proofs about its level sets use."""
 
-    def prepare(self, backend: Backend) -> WindingField:
+    def prepare(self, backend: Backend) -> ModuloOneEvaluable:
         """See `Field.prepare`."""
         ...
 
@@ -90,9 +94,9 @@ class WindingModuloOne(Field):
     """
 
     period: ClassVar[float | None] = 1.0
-    has_detail = True
+    has_variable_accuracy = True
 
-    def __init__(self, winding: WindingField) -> None:
+    def __init__(self, winding: ModuloOneEvaluable) -> None:
         self._winding = winding
 
     def prepare(self, backend: Backend) -> Self:
@@ -103,22 +107,22 @@ class WindingModuloOne(Field):
     def evaluate(self, p: Vec3) -> Sample:
         return self._winding.evaluate_modulo_one(p)
 
-    def at_detail(self, detail: Real) -> Field:
-        return AtDetail(lambda p: self._winding.evaluate_modulo_one(p, detail))
+    def at_accuracy(self, detail: Real) -> Field:
+        return EvaluateOnly(lambda p: self._winding.evaluate_modulo_one(p, detail))
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
         return self._winding.extent(levels)
 
 
 def winding_cells(
-    winding: WindingField, extent: Volume, levels: tuple[float, ...]
-) -> OccupiedCells:
+    winding: ModuloOneEvaluable, extent: Volume, levels: tuple[float, ...]
+) -> OccupancyGrid:
     """Cells over an extent, empty where w modulo 1 is proved to stay off the levels."""
-    return occupied_cells(WindingModuloOne(winding), levels, extent, _ACROSS)
+    return occupied_cells(WindingModuloOne(winding), levels, extent, _CELLS_ACROSS)
 
 
 def winding_extent(
-    winding: WindingField, mesh: WindingMesh, levels: tuple[float, ...]
+    winding: ModuloOneEvaluable, mesh: WindingMesh, levels: tuple[float, ...]
 ) -> Volume | None:
     """A polytope that holds the level sets of the winding number of a mesh; for a closed mesh a
     box.
@@ -129,7 +133,7 @@ def winding_extent(
     the level.
     """
     box = winding_box(mesh, levels)
-    if not len(mesh.singular):
+    if not len(mesh.singular_edges):
         return box
     corners = mesh.vertices[mesh.faces].reshape(-1, 3)
     lower, upper = box.bounds()
@@ -153,8 +157,8 @@ def winding_box(mesh: WindingMesh, levels: tuple[float, ...]) -> Box:
     away = min(abs(math.remainder(level, 1.0)) for level in levels) * 4 * math.pi
     narrow = mesh.boundary_length / math.sqrt(max(away * (4 * math.pi - away), 1e-12))
     reach = low, high
-    if len(mesh.singular):
-        ends = mesh.vertices[mesh.singular].reshape(-1, 3)
+    if len(mesh.singular_edges):
+        ends = mesh.vertices[mesh.singular_edges].reshape(-1, 3)
         near = np.minimum(low, ends.min(axis=0) - narrow)
         reach = near, np.maximum(high, ends.max(axis=0) + narrow)
     return Box(np.maximum(reach[0], low - wide) - slack, np.minimum(reach[1], high + wide) + slack)
@@ -171,20 +175,20 @@ _FEW_EDGES = 64
 _PAYS, _LEAST_RAYS, _MOST_IN_CELLS = 3.0, 5e3, 100_000
 # With more edges than this many times the triangles the mesh is a soup, whose cells add up near
 # triangles, not edges; they are built from so many rays a triangle on, for no more triangles.
-_SOUP, _SOUP_PAYS, _MOST_OF_SOUP = 1.5, 12.0, 50_000
+_SOUP_RATIO, _SOUP_PAYS, _MOST_OF_SOUP = 1.5, 12.0, 50_000
 # Their cube is wider than the extent, where all rays begin, by this factor, for values at points:
 # some large cells more.
-_WIDER = 2.002
+_CUBE_FACTOR = 2.002
 # The accuracy of values at points, and of traces, by experiment.
 _VALUES, _TRACED = 2.0, 4.0
-# See `WindingNumber._at_centers`: 16.5 roundings of each of 100,000 edges, and as much of the steep
-# ones near a point, are less than 1e-6 (`edge_lift.FACTOR_ROUNDINGS`).
-_ROUNDED = 1e-6
+# See `WindingNumber._center_values`: 16.5 roundings of each of 100,000 edges, and as much of the
+# steep ones near a point, are less than 1e-6 (`edge_lift.FACTOR_ROUNDINGS`).
+_EXACT_ERROR = 1e-6
 # A point within so many roundings of a coordinate of a triangle may be on either side of it.
 _ON_TRIANGLE = 8.0
 
 
-class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
+class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
     """w of a triangle mesh: how often it winds around a point (Jacobson et al. 2013).
 
     For a closed mesh 1 inside and 0 outside; for a mesh with holes, cracks, duplicated or flipped
@@ -207,7 +211,7 @@ class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
         near edges and one polynomial for all others, with a proved remainder (`boundary_cells`), so
         that a sample costs the same however many edges there are. In a soup, where triangles have
         hardly an edge in common, near triangles take the place of edges, with the tree as method
-        (`near_far`). None builds them where they pay (`for_rays`), True always, False never; at
+        (`dipole_cells`). None builds them where they pay (`for_rays`), True always, False never; at
         most the megabytes that are given (True: 256), and several times as much while they are
         built. Those of soups, where they were asked for, give values and gradients at points too,
         which pays from some 2,000 points a triangle on; all other values and derivatives at points
@@ -220,15 +224,15 @@ class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
     open sheets have the level where they lie before the surface that spans their boundary, and not
     where they lie behind it.
 
-    Hits on triangles have `Hits.sheet`; `faces_of_sheets` gives the face of each. `moved` gives the
-    field for the same faces when vertices have moved.
+    Hits on triangles have `Hits.primitive_index`; `facet_faces` gives the face of each.
+    `with_vertices` gives the field for the same faces when vertices have moved.
 
     Raises MeshError (a ValueError) for meshes that `validate_mesh` rejects.
     """
 
     period: ClassVar[float | None] = None
     default_level: float = 0.5
-    has_sheets: bool = True
+    has_jumps: bool = True
 
     def __init__(
         self,
@@ -244,24 +248,24 @@ class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
         if not is_one_of(method, ("auto", "exact", "tree")):
             hint = did_you_mean(method, ("auto", "exact", "tree"))
             raise ValueError(f'method is "auto", "exact" or "tree", not {method!r}{hint}')
-        if accuracy is not None and not 1.5 <= real(accuracy, "accuracy") <= 100:
+        if accuracy is not None and not 1.5 <= as_real(accuracy, "accuracy") <= 100:
             raise ValueError(f"accuracy must lie between 1.5 and 100, not {accuracy}")
-        order = whole(order, "order", 0, 2)
+        order = as_integer_in_range(order, "order", 0, 2)
         self._mesh = WindingMesh.of(vertices, faces)
-        few = len(self.mesh.singular) <= _MOST_EDGES
+        few = len(self.mesh.singular_edges) <= _MOST_EDGES
         self._method: Literal["exact", "tree"] = (
             ("exact" if few else "tree") if method == "auto" else method
         )
         self.accuracy, self.order = accuracy, order
-        self.set_cells(cells)
-        self._extents: Remembered[tuple[float, ...], Volume | None] = Remembered()
-        self._occupied: Remembered[tuple[float, ...], OccupiedCells] = Remembered()
-        self._own_levels: Remembered[tuple[float, ...], bool] = Remembered()
+        self.configure_cells(cells)
+        self._extents: TransientCache[tuple[float, ...], Volume | None] = TransientCache()
+        self._occupied: TransientCache[tuple[float, ...], OccupancyGrid] = TransientCache()
+        self._own_levels: TransientCache[tuple[float, ...], bool] = TransientCache()
         self._level_of_sheets = 0.0
-        self._rates: Remembered[Backend, BoundaryRates] = Remembered()
+        self._rates: TransientCache[Backend, BoundaryRates] = TransientCache()
 
-    @refuses_derivatives
-    def moved(self, vertices: Any) -> WindingNumber:
+    @no_derivatives
+    def with_vertices(self, vertices: Any) -> WindingNumber:
         """The winding number of the same faces with other positions of their vertices (n, 3), for
         less work than a new one.
 
@@ -272,11 +276,11 @@ class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
         Raises MeshError as for a new mesh, and for vertices that coincided and come apart.
         """
         field = copy.copy(self)
-        field._mesh = self.mesh.moved(vertices)
-        field._batches, field._device, field._rates = Remembered(), None, Remembered()
-        field._extents, field._occupied = Remembered(), Remembered()
-        field._own_levels = Remembered()
-        field.set_cells(self.cells)
+        field._mesh = self.mesh.with_vertices(vertices)
+        field._batches, field._device, field._rates = TransientCache(), None, TransientCache()
+        field._extents, field._occupied = TransientCache(), TransientCache()
+        field._own_levels = TransientCache()
+        field.configure_cells(self.cells)
         return field
 
     @property
@@ -286,121 +290,123 @@ class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
 
     @property
     def mesh(self) -> WindingMesh:
-        """The triangles. They stay as they are: see `moved`."""
+        """The triangles. They stay as they are: see `with_vertices`."""
         return self._mesh
 
     @property
-    def faces_of_sheets(self) -> npt.NDArray[np.int64]:
+    def facet_faces(self) -> npt.NDArray[np.int64]:
         """The face, as given, of each sheet."""
-        return self.mesh.source
+        return self.mesh.input_face
 
     def prepare(self, backend: Backend) -> Self:
         prepared = super().prepare(backend)
-        prepared.coarsest_detail = prepared._prepared().winding.coarsest_detail
+        prepared.coarsest_accuracy = prepared._require_data().winding.coarsest_detail
         return prepared
 
-    def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> Values:
-        on = self._batch(backend_of(x))
-        winding, x = on.winding, on.unit(x)
+    def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> PointValues:
+        on = self._batch_data(backend_of(x))
+        winding, x = on.winding, on.to_unit(x)
         if isinstance(winding, TreeWinding):
             if derivatives == 2 and self.accuracy is None:
                 rates = self._boundary_rates(on, winding).at(x, 2, closer)
-                values = with_rates(winding.at(x, 0, closer), rates)
+                values = with_rates(winding.values(x, 0, closer), rates)
             else:
-                values = winding.at(x, derivatives, closer)
+                values = winding.values(x, derivatives, closer)
         else:
-            values = winding.at(x, derivatives)
+            values = winding.values(x, derivatives)
             if derivatives == 0:
-                values = dataclasses.replace(values, value=winding.values(x))
+                values = dataclasses.replace(values, value=winding.fast_values(x))
         return self._stated(on, x, values)
 
-    def sharp_values_at(self, x: Vec3) -> Values:
-        on = self._batch(backend_of(x))
+    def sharp_values_at(self, x: Vec3) -> PointValues:
+        on = self._batch_data(backend_of(x))
         winding = on.winding
         if not isinstance(winding, TreeWinding) or self.accuracy is not None:
             return self.values_at(x, 1)
-        x = on.unit(x)
+        x = on.to_unit(x)
         dr.eval(x)
         rates = self._boundary_rates(on, winding)
         values = rates.sharp(x)
         if rates.summed is not winding:
-            values = with_rates(winding.at(x, 0, on.backend.Float(1)), values)
+            values = with_rates(winding.values(x, 0, on.backend.Float(1)), values)
         return self._stated(on, x, values)
 
-    def _boundary_rates(self, on: _MeshBuffers, winding: TreeWinding) -> BoundaryRates:
+    def _boundary_rates(self, on: _WindingData, winding: TreeWinding) -> BoundaryRates:
         if on.backend not in self._rates:
             self._rates[on.backend] = BoundaryRates.of(on.backend, self.mesh, self.order, winding)
         return self._rates[on.backend]
 
-    def _stated(self, on: _MeshBuffers, x: Vec3, values: Values) -> Values:
+    def _stated(self, on: _WindingData, x: Vec3, values: PointValues) -> PointValues:
         """Values at unit coordinates x, with all that their errors are made of."""
         # Within rounding of a triangle, it is not known on which side of it x is.
-        on_triangle = jumps_within(on.rays, x, _ON_TRIANGLE * epsilon_at(x))
+        on_triangle = jump_sum_within(on.rays, x, _ON_TRIANGLE * coordinate_rounding(x))
         values = dataclasses.replace(values, error=values.error + on_triangle)
         weight = self.mesh.area / (4 * math.pi * self.mesh.size**2)
-        return values.far_away(x, 64 + len(self.mesh.singular), weight).rescaled(on.size)
+        return values.with_far_field_errors(x, 64 + len(self.mesh.singular_edges), weight).rescaled(
+            on.size
+        )
 
-    def _upload(self, backend: Backend, *, traced: bool) -> _MeshBuffers:
+    def _upload(self, backend: Backend, *, traced: bool) -> _WindingData:
         accuracy = self.accuracy or (_TRACED if traced else _VALUES)
         mesh = self.mesh
-        rays = TriangleRays.of(backend, mesh.ray_tree, mesh.ray_records)
+        rays = TriangleTree.of(backend, mesh.ray_tree, mesh.ray_records)
         if self.method == "exact":
             winding = ExactWinding.of(backend, mesh, rays, traced)
         else:
             winding = TreeWinding.of(backend, mesh, accuracy, self.order)
-        on = _MeshBuffers(*placed(backend, mesh.center, mesh.size), winding, rays)
-        if not self.cells or not len(mesh.singular) or not (traced or self.for_values):
+        on = _WindingData(*frame_parameters(backend, mesh.center, mesh.size), winding, rays)
+        if not self.cells or not len(mesh.singular_edges) or not (traced or self.cells_for_values):
             return on
-        return self._having(on, traced=traced)
+        return self._add_cells(on, traced=traced)
 
-    def _having(self, on: _MeshBuffers, *, traced: bool) -> _MeshBuffers:
+    def _add_cells(self, on: _WindingData, *, traced: bool) -> _WindingData:
         """The data with cells: those of triangles, or for tracing those of edges."""
-        mesh, most_bytes, winding = self.mesh, self.most_bytes(), on.winding
+        mesh, most_bytes, winding = self.mesh, self.max_bytes(), on.winding
         extent = self.extent((self.default_level,))
         assert extent is not None
         low, high = extent.bounds()
         if self._is_soup and isinstance(winding, TreeWinding):
             reach = float(np.maximum(high - mesh.center, mesh.center - low).max()) / mesh.size
-            cells = self.built_once(
-                on.backend, lambda: winding.build_cells(mesh, _WIDER * reach, most_bytes)
+            cells = self.build_cached(
+                on.backend, lambda: winding.build_cells(mesh, _CUBE_FACTOR * reach, most_bytes)
             )
             if cells is not None:
                 return dataclasses.replace(on, winding=dataclasses.replace(winding, cells=cells))
         if not traced:
             return on
-        cells = BoundaryCells.build(on.rays, mesh, low, high, most_bytes, self._at_centers)
+        cells = BoundaryCells.build(on.rays, mesh, low, high, most_bytes, self._center_values)
         return dataclasses.replace(on, cells=cells)
 
     @property
     def _is_soup(self) -> bool:
         """Whether triangles have so few edges in common that cells add up triangles."""
-        edges, triangles = len(self.mesh.singular), len(self.mesh.triangles)
-        return self.method == "tree" and edges > _SOUP * triangles
+        edges, triangles = len(self.mesh.singular_edges), len(self.mesh.triangles)
+        return self.method == "tree" and edges > _SOUP_RATIO * triangles
 
-    def _at_centers(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _center_values(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """w at points (n, 3), and bounds of its error; those of the rounding of an exact sum, in
         double precision and off triangles by many roundings in single precision, are far below."""
-        plain = self.having_cells(False)  # else this would be asked for itself
+        plain = self.with_cells(False)  # else this would be asked for itself
         value = np.array(plain.value(points, precision="double"))
         if self.method == "exact":
-            return value, np.full(len(value), _ROUNDED)
+            return value, np.full(len(value), _EXACT_ERROR)
         return value, plain.error_bound(points, precision="double")
 
     @property
-    def is_modulo(self) -> bool:
+    def has_unknown_branch(self) -> bool:
         return self._device is not None and self._device.cells is not None
 
-    def least_rays(self) -> float:
-        edges, triangles = len(self.mesh.singular), len(self.mesh.triangles)
+    def cells_pay_from(self) -> float:
+        edges, triangles = len(self.mesh.singular_edges), len(self.mesh.triangles)
         if self._is_soup:
             few = triangles <= _MOST_OF_SOUP
             return max(_LEAST_RAYS, _SOUP_PAYS * triangles) if few else math.inf
         pays = _FEW_EDGES <= edges <= _MOST_IN_CELLS
         return max(_LEAST_RAYS, _PAYS * edges) if pays else math.inf
 
-    def occupied(self, levels: tuple[float, ...]) -> OccupiedCells | None:
+    def occupied_cells(self, levels: tuple[float, ...]) -> OccupancyGrid | None:
         """Cells by `winding_cells`, if edges are not few, for the exact method or by cells."""
-        few = len(self.mesh.singular) < _FEW_EDGES
+        few = len(self.mesh.singular_edges) < _FEW_EDGES
         if few or self.is_of_sheets_alone(levels) or (self.method != "exact" and not self.cells):
             return None
         extent = self.extent(levels)
@@ -412,51 +418,53 @@ class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
 
     def evaluate(self, p: Vec3) -> Sample:
         """w itself, jumps included, with promises of its lift."""
-        on, frame = self._upward(p)
-        return _at_start(on, frame, on.winding.start(frame, 0, True), 1.0)
+        on, frame = self._upward_rays(p)
+        return _sample_at_start(on, frame, on.winding.crossings_ahead(frame, 0, True), 1.0)
 
-    def smooth_part(self) -> Field | None:
+    def without_jumps(self) -> Field | None:
         return WindingModuloOne(self)
 
     def evaluate_modulo_one(self, p: Vec3, detail: Real = 0.0) -> Sample:
         """w less a whole number, which differs from point to point; by default the coarsest
         sample."""
-        on, frame = self._upward(p)
+        on, frame = self._upward_rays(p)
         detail = on.backend.Float(detail)
         if on.cells is None:
-            return _at_start(on, frame, on.backend.Float(0), detail)
-        in_cells, inside = on.cells.sample(frame.o, None, epsilon_at(frame.o), detail <= 0)
-        other = _at_start(on, frame, on.backend.Float(0), detail, ~inside)
-        return other.where(inside, lengthened(in_cells, on.size))
+            return _sample_at_start(on, frame, on.backend.Float(0), detail)
+        in_cells, inside = on.cells.sample(frame.o, None, coordinate_rounding(frame.o), detail <= 0)
+        other = _sample_at_start(on, frame, on.backend.Float(0), detail, ~inside)
+        return other.select(inside, space_scaled(in_cells, on.size))
 
-    def value_where_known(self, p: Vec3, rounding: Real, active: Mask) -> Real:
-        on = self._on(p)
+    def value_if_cheap(self, p: Vec3, rounding: Real, active: Mask) -> Real:
+        on = self._data_for(p)
         if on.cells is None:
             return on.backend.Float(dr.nan)
-        x = on.unit(p)
-        return on.cells.value_where_known(x, fmax(epsilon_at(x), rounding / on.size), active)
+        x = on.to_unit(p)
+        return on.cells.value_where_known(
+            x, fmax(coordinate_rounding(x), rounding / on.size), active
+        )
 
-    def _upward(self, p: Vec3) -> tuple[_MeshBuffers, Frame]:
+    def _upward_rays(self, p: Vec3) -> tuple[_WindingData, RayFrame]:
         """The data, and rays from p, on which all triangles lie ahead."""
-        on = self._on(p)
-        return on, Frame.along(on.backend, on.unit(p), on.backend.Array3f(0, 0, 1))
+        on = self._data_for(p)
+        return on, RayFrame.along(on.backend, on.to_unit(p), on.backend.Array3f(0, 0, 1))
 
-    def next_crossing(
-        self, o: Vec3, d: Vec3, after: Crossing, t_max: Real, active: Mask
-    ) -> Crossing:
-        on = self._on(o)
-        frame = Frame.along(on.backend, on.unit(o), d)
-        behind = (after.t / on.size, after.sheet)
-        t, sheet, turn, normal = on.rays.next(frame, behind, t_max / on.size, active)
+    def next_jump(
+        self, o: Vec3, d: Vec3, after: JumpCrossing, t_max: Real, active: Mask
+    ) -> JumpCrossing:
+        on = self._data_for(o)
+        frame = RayFrame.along(on.backend, on.to_unit(o), d)
+        behind = (after.t / on.size, after.facet)
+        t, sheet, turn, normal = on.rays.next_crossing(frame, behind, t_max / on.size, active)
         # w is larger on the side opposite to the normal.
-        return Crossing(t * on.size, sheet, -turn, -normal)
+        return JumpCrossing(t * on.size, sheet, -turn, -normal)
 
-    def offset(self, o: Vec3, d: Vec3, t_min: Real, active: Mask) -> Real:
-        on = self._on(o)
+    def initial_offset(self, o: Vec3, d: Vec3, t_min: Real, active: Mask) -> Real:
+        on = self._data_for(o)
         if self.only_sheets:
             return on.backend.Float(0)
-        frame = Frame.along(on.backend, on.unit(o), d)
-        return on.winding.start(frame, t_min / on.size, active)
+        frame = RayFrame.along(on.backend, on.to_unit(o), d)
+        return on.winding.crossings_ahead(frame, t_min / on.size, active)
 
     def is_of_sheets_alone(self, levels: tuple[float, ...]) -> bool:
         if len(levels) != 1:
@@ -465,40 +473,46 @@ class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
             self._own_levels[levels] = lies_on_own_level(self.mesh, levels[0])
         return self._own_levels[levels]
 
-    def for_levels(self, levels: tuple[float, ...]) -> WindingNumber:
+    def with_levels(self, levels: tuple[float, ...]) -> WindingNumber:
         if not self.is_of_sheets_alone(levels):
             return self
-        field = self.having_cells(False)
+        field = self.with_cells(False)
         field.only_sheets, field._level_of_sheets = True, levels[0]
         return field
 
-    def between(self, o: Vec3, d: Vec3, behind: Crossing, ahead: Crossing, offset: Real) -> Field:
+    def continuation(
+        self, o: Vec3, d: Vec3, behind: JumpCrossing, ahead: JumpCrossing, offset: Real
+    ) -> Field:
         if self.only_sheets:
-            return _BesideSheets(self._on(o).backend, self._level_of_sheets, behind, ahead)
-        on = self._on(o)
-        frame = Frame.along(on.backend, on.unit(o), d)
-        start = Crossing(behind.t / on.size, behind.sheet, behind.jump, behind.normal)
-        return _Stretch(on, frame, start, offset)
+            return _BesideSheets(self._data_for(o).backend, self._level_of_sheets, behind, ahead)
+        on = self._data_for(o)
+        frame = RayFrame.along(on.backend, on.to_unit(o), d)
+        start = JumpCrossing(behind.t / on.size, behind.facet, behind.jump, behind.normal)
+        return _WindingOnInterval(on, frame, start, offset)
 
-    def distance_to_sheets(self, p: Vec3) -> Real:
-        on = self._on(p)
-        return distance_to_triangles(on.rays, on.unit(p)) * on.size
+    def distance_to_jumps(self, p: Vec3) -> Real:
+        on = self._data_for(p)
+        return distance_lower_bound(on.rays, on.to_unit(p)) * on.size
 
-    def nearest_sheet(
+    def nearest_facet(
         self, p: Vec3, after: tuple[Real, Any], limit: Real, active: Mask
-    ) -> NearestSheet:
-        on = self._on(p)
-        found = nearest_triangle(on.rays, on.unit(p), after, dr.square(limit / on.size), active)
+    ) -> NearestFacet:
+        on = self._data_for(p)
+        found = next_closest_triangle(
+            on.rays, on.to_unit(p), after, dr.square(limit / on.size), active
+        )
         length = dr.norm(found.normal)
         up = on.backend.Array3f(0, 0, 1)
         normal = dr.select(length > 0, found.normal / length, up)
         is_inner = found.is_inner & (length > 0)
-        return NearestSheet(found.square, found.number, found.offset * on.size, normal, is_inner)
+        return NearestFacet(
+            found.squared_distance, found.triangle, found.offset * on.size, normal, is_inner
+        )
 
-    def mesh_of_sheets(self) -> tuple[FloatArray, IntArray, bool] | None:
-        return self.mesh.vertices, self.mesh.triangles, not len(self.mesh.singular)
+    def jump_mesh(self) -> tuple[FloatArray, IntArray, bool] | None:
+        return self.mesh.vertices, self.mesh.triangles, not len(self.mesh.singular_edges)
 
-    def check_levels(self, levels: tuple[float, ...]) -> None:
+    def validate_levels(self, levels: tuple[float, ...]) -> None:
         for level in levels:
             if abs(level) < 1e-6:
                 raise ValueError("level 0 of a winding number is no surface; try 0.5")
@@ -506,77 +520,82 @@ class WindingNumber(HasCells, UploadedField["_MeshBuffers"], BatchedField):
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
         """All triangles, and cells around them that are not proved empty (`winding_extent`)."""
         if levels not in self._extents:
-            self._extents[levels] = winding_extent(self.having_cells(False), self.mesh, levels)
+            self._extents[levels] = winding_extent(self.with_cells(False), self.mesh, levels)
         return self._extents[levels]
 
     def describe(self) -> dict[str, Any]:
         mesh = self.mesh
         return {
             "triangles": len(mesh.triangles),
-            "singular edges": len(mesh.singular),
+            "singular edges": len(mesh.singular_edges),
             "method": self.method,
             **({"corners joined by rounding": mesh.rounded} if mesh.rounded else {}),
-            **self.said_of_cells(None if self._device is None else self._device.built),
+            **self.describe_cells(None if self._device is None else self._device.built),
         }
 
 
 @dataclass(frozen=True)
-class _MeshBuffers(UnitCoordinates):
+class _WindingData(UnitFrame):
     """The data of a winding number on a backend."""
 
     winding: ExactWinding | TreeWinding
-    rays: TriangleRays
+    rays: TriangleTree
     cells: BoundaryCells | None = None
 
     @property
-    def built(self) -> Cells | None:
+    def built(self) -> BuiltCells | None:
         """The cells, those of edges or of triangles."""
         if self.cells is None and isinstance(self.winding, TreeWinding):
             return self.winding.cells
         return self.cells
 
 
-def _at_start(
-    on: _MeshBuffers, frame: Frame, turns: Real, detail: Real, active: Mask = True
+def _sample_at_start(
+    on: _WindingData, frame: RayFrame, turns: Real, detail: Real, active: Mask = True
 ) -> Sample:
     """The sample where rays begin, where active; turns: the sum of the signs of all crossings
     ahead."""
-    nowhere = Crossing(0.0, on.backend.UInt32(NO_SHEET), 0.0, on.backend.Array3f(0, 0, 1))
+    nowhere = JumpCrossing(0.0, on.backend.UInt32(NO_FACET), 0.0, on.backend.Array3f(0, 0, 1))
     detail = on.backend.Float(detail)
-    sample = on.winding.on_stretch(frame, frame.o, nowhere, turns, detail, active)
-    return lengthened(dataclasses.replace(sample, along=()), on.size)
+    sample = on.winding.sample_interval(frame, frame.o, nowhere, turns, detail, active)
+    return space_scaled(dataclasses.replace(sample, ray_promises=()), on.size)
 
 
-class _Stretch(Field):
+class _WindingOnInterval(Field):
     """A winding number on a ray interval; behind: the crossing where it starts, in unit lengths."""
 
     def __init__(
-        self, on: _MeshBuffers, frame: Frame, behind: Crossing, offset: Real, detail: Real = 1.0
+        self,
+        on: _WindingData,
+        frame: RayFrame,
+        behind: JumpCrossing,
+        offset: Real,
+        detail: Real = 1.0,
     ) -> None:
-        self.has_detail = on.winding.has_detail or on.cells is not None
-        self.coarsest_detail = on.winding.coarsest_detail
+        self.has_variable_accuracy = on.winding.has_detail or on.cells is not None
+        self.coarsest_accuracy = on.winding.coarsest_detail
         self._on, self._frame, self._detail = on, frame, on.backend.Float(detail)
         self._behind, self._offset = behind, offset
 
     @property
-    def is_modulo(self) -> bool:
+    def has_unknown_branch(self) -> bool:
         return self._on.cells is not None
 
-    def at_detail(self, detail: Real) -> Field:
-        return _Stretch(self._on, self._frame, self._behind, self._offset, detail)
+    def at_accuracy(self, detail: Real) -> Field:
+        return _WindingOnInterval(self._on, self._frame, self._behind, self._offset, detail)
 
     def evaluate(self, p: Vec3) -> Sample:
         on, frame = self._on, self._frame
-        x, detail = on.unit(p), self._detail
+        x, detail = on.to_unit(p), self._detail
         if on.cells is None:
-            sample = on.winding.on_stretch(frame, x, self._behind, self._offset, detail)
-            return lengthened(sample, on.size)
-        unit = fmax(epsilon_at(frame.o), epsilon_at(x))
+            sample = on.winding.sample_interval(frame, x, self._behind, self._offset, detail)
+            return space_scaled(sample, on.size)
+        unit = fmax(coordinate_rounding(frame.o), coordinate_rounding(x))
         # Cells are coarser than the coarsest samples that know the number.
-        in_cells, inside = on.cells.sample(x, frame.d, unit, detail < self.coarsest_detail)
-        sample = on.winding.on_stretch(frame, x, self._behind, self._offset, detail, ~inside)
-        sample = dataclasses.replace(sample.where(inside, in_cells), is_modulo=inside)
-        return lengthened(sample, on.size)
+        in_cells, inside = on.cells.sample(x, frame.d, unit, detail < self.coarsest_accuracy)
+        sample = on.winding.sample_interval(frame, x, self._behind, self._offset, detail, ~inside)
+        sample = dataclasses.replace(sample.select(inside, in_cells), branch_unknown=inside)
+        return space_scaled(sample, on.size)
 
 
 class _BesideSheets(Field):
@@ -584,7 +603,9 @@ class _BesideSheets(Field):
     level that it passes it where it jumps at the sheet ahead; or where none is ahead, as the sheet
     behind has left it."""
 
-    def __init__(self, backend: Backend, level: float, behind: Crossing, ahead: Crossing) -> None:
+    def __init__(
+        self, backend: Backend, level: float, behind: JumpCrossing, ahead: JumpCrossing
+    ) -> None:
         real = backend.Float
         jump = dr.select(real(ahead.jump) != 0, -real(ahead.jump), real(behind.jump))
         self._value = dr.select(jump > 0, real(level + 0.5), level - 0.5)

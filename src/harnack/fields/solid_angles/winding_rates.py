@@ -19,8 +19,8 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import IntArray
-from harnack.fields.batched_fields import SymmetricSum, Values, sharpened
-from harnack.fields.clearance import epsilon_at
+from harnack.fields.batched_fields import PointValues, SymmetricMatrix, sharpened
+from harnack.fields.clearance import coordinate_rounding
 from harnack.fields.solid_angles.edge_lift import LiftedEdges, edge_rates
 from harnack.fields.solid_angles.trail_sums import closed_trails
 from harnack.fields.solid_angles.winding_mesh import WindingMesh
@@ -55,37 +55,39 @@ class BoundaryRates:
     ) -> BoundaryRates:
         """Of a mesh with a tree over its triangles, which is used where it has cells, and where
         caps would be no smaller, as those of a soup."""
-        if not len(mesh.singular):
+        if not len(mesh.singular_edges):
             return cls(None)
         if whole.cells is not None:
             return cls(whole)
-        if len(mesh.singular) <= _FEW:
-            return cls(LiftedEdges.upload(backend, mesh.unit_vertices, mesh.singular))
-        if len(mesh.singular) > len(mesh.triangles):
+        if len(mesh.singular_edges) <= _FEW:
+            return cls(LiftedEdges.upload(backend, mesh.unit_vertices, mesh.singular_edges))
+        if len(mesh.singular_edges) > len(mesh.triangles):
             return cls(whole)
         caps = caps_of(mesh)
         if caps.area > _SMALLER * mesh.area:
             return cls(whole)
         return cls(TreeWinding.of(backend, caps, _ACCURACY, order))
 
-    def at(self, x: Vec3, derivatives: int, closer: Real) -> Values:
+    def at(self, x: Vec3, derivatives: int, closer: Real) -> PointValues:
         """The derivatives asked for, at one detail, with a value of no meaning."""
         if isinstance(self.summed, TreeWinding):
-            return self.summed.at(x, derivatives, closer)
+            return self.summed.values(x, derivatives, closer)
         real = cast("Any", type(x.x))
         if self.summed is None:
-            return Values(real(0), real(0), dr.zeros(type(x), dr.width(x)), SymmetricSum.zero(real))
+            return PointValues(
+                real(0), real(0), dr.zeros(type(x), dr.width(x)), SymmetricMatrix.zero(real)
+            )
         sums = edge_rates(self.summed, x, derivatives)
-        return sums.values(1 / (4 * math.pi), epsilon_at(x), real(0))
+        return sums.values(1 / (4 * math.pi), coordinate_rounding(x), real(0))
 
-    def sharp(self, x: Vec3) -> Values:
+    def sharp(self, x: Vec3) -> PointValues:
         """Those of `at` with the gradient to about 1 % of its length (`sharpened`)."""
         if isinstance(self.summed, TreeWinding):
             return sharpened(lambda place, closer: self.at(place, 1, closer), x)
         return self.at(x, 1, 1.0)
 
 
-def with_rates(value: Values, rates: Values) -> Values:
+def with_rates(value: PointValues, rates: PointValues) -> PointValues:
     """The value of one evaluation with the derivatives of another."""
     return dataclasses.replace(rates, value=value.value, error=value.error)
 
@@ -93,7 +95,7 @@ def with_rates(value: Values, rates: Values) -> Values:
 def caps_of(mesh: WindingMesh) -> WindingMesh:
     """Triangles with the same boundary as a mesh, in the same unit coordinates: a fan over each of
     the loops that its singular edges make, about the middle of the loop's vertices."""
-    loops = simple_loops(mesh.singular)
+    loops = simple_loops(mesh.singular_edges)
     middles = [mesh.vertices[loop].mean(axis=0) for loop in loops]
     vertices = np.concatenate([mesh.vertices, middles])
     fans = [
@@ -106,7 +108,7 @@ def caps_of(mesh: WindingMesh) -> WindingMesh:
     once, own = np.ones(len(faces), np.int64), np.arange(len(faces))
     welded = np.arange(len(vertices))
     return WindingMesh(
-        vertices, faces, once, own, mesh.singular, faces, welded, 0, mesh.center, mesh.size
+        vertices, faces, once, own, mesh.singular_edges, faces, welded, 0, mesh.center, mesh.size
     )
 
 

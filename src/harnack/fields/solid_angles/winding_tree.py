@@ -7,6 +7,12 @@ Near triangles. By Stokes' theorem the field of a set of triangles is that of th
 union, so only edges at which they do not cancel are summed up. `edge_lift` says how crossings and
 edges together make the winding number: both are decided by the same bits, so that an edge that two
 triangles share contributes no rounding error.
+
+Soups have the cells of clouds: where triangles have hardly an edge in common, three edges each
+would have to be near. Near triangles are added as the tree adds those of its leaves, and far ones
+are sheets of dipoles with two more moments, so that a cell's sample knows all of w and needs no
+whole number. They are built in a quarter of the time of cells of edges. Soups of few triangles,
+each as large as all of it, have those of edges.
 """
 
 from __future__ import annotations
@@ -20,30 +26,30 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend.elementary import fmax
-from harnack.fields.clearance import epsilon_at
-from harnack.fields.solid_angles.dipole_cells import NearFarCells, build_cells
-from harnack.fields.solid_angles.dipole_expansion import TRIANGLE_SPREAD, triangle_sources
+from harnack.fields.clearance import coordinate_rounding
+from harnack.fields.solid_angles.dipole_cells import DipoleCells, build_cells
+from harnack.fields.solid_angles.dipole_expansion import TRIANGLE_RATIO, triangle_sources
 from harnack.fields.solid_angles.edge_lift import LiftedEdge, LiftedProduct, LiftedSums
-from harnack.fields.solid_angles.trail_sums import Line, known_along, with_edge_rates
+from harnack.fields.solid_angles.trail_sums import RayLine, add_edge_rates, lipschitz_along
 from harnack.fields.solid_angles.treecode import Treecode
-from harnack.fields.source_sums import FieldSums, last_roundings
+from harnack.fields.source_sums import SourceSums, final_rounding
 from harnack.tree.triangle_tree import (
-    EDGES,
-    INDEX,
-    PARITY,
-    Frame,
-    Upwards,
+    INVERSE_SQUARES_COLUMN,
+    NUMBER_COLUMN,
+    PARITY_COLUMN,
+    RayFrame,
+    VerticalRayFrame,
     corners_of,
-    crossing,
-    in_slots,
+    records_in_slots,
+    signed_crossing,
 )
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from harnack.backend import Backend, Mask, Real, Vec3
-    from harnack.fields.batched_fields import Values
-    from harnack.fields.capabilities import Crossing
+    from harnack.fields.batched_fields import PointValues
+    from harnack.fields.capabilities import JumpCrossing
     from harnack.fields.field import Sample
     from harnack.fields.solid_angles.trail_sums import Rates
     from harnack.fields.solid_angles.treecode import AddPrimitive
@@ -51,7 +57,7 @@ if TYPE_CHECKING:
 
 # The first of three columns of a record after those of `tree.triangles`: 1 where an edge is
 # singular.
-SINGULAR = EDGES + 3
+SINGULAR = INVERSE_SQUARES_COLUMN + 3
 # The corners that edges join, and 1 or -1 for whether they run in the triangle's direction.
 _EDGES = ((0, 1, 1.0), (1, 2, 1.0), (0, 2, -1.0))
 
@@ -70,22 +76,22 @@ class NearEdge:
         node with a triangle at it has radius R >= L/2 and is farther than reach R, hence the edge
         farther than (reach - 1) R. So all triangles at it are near, and they cancel there.
 
-        In a cell the same holds of a triangle that is far from it, with `TRIANGLE_SPREAD` for the
-        reach: the point is nearer to the center by less than the k > 1 radii of `far_sums`. Far
-        nodes are farther.
+        In a cell the same holds of a triangle that is far from it, with `TRIANGLE_RATIO` for the
+        reach: the point is nearer to the center by less than the k > 1 radii of `dipole_expansion`.
+        Far nodes are farther.
         """
-        square, inverse = self.edge.edge.square, self.edge.edge.inverse
+        square, inverse = self.edge.edge.squared_distance, self.edge.edge.inverse_square_length
         closed = ~self.is_singular & (square * inverse < dr.square(0.5 * (reach - 1)))
         return (inverse > 0) & ~closed
 
 
-def edges_of(row: list[Real], x: Vec3, frame: Frame | Upwards) -> Iterator[NearEdge]:
+def edges_of(row: list[Real], x: Vec3, frame: RayFrame | VerticalRayFrame) -> Iterator[NearEdge]:
     """The edges of the triangle of a record, relative to x; they have no length in an empty
     slot."""
     ends = corners_of(row, cast("Any", type(x)))
     for k, (i, j, sign) in enumerate(_EDGES):
-        inverse = dr.select(row[INDEX] >= 0, row[EDGES + k], 0)
-        edge = LiftedEdge.between(ends[i], ends[j], sign * row[PARITY], inverse, frame, x)
+        inverse = dr.select(row[NUMBER_COLUMN] >= 0, row[INVERSE_SQUARES_COLUMN + k], 0)
+        edge = LiftedEdge.between(ends[i], ends[j], sign * row[PARITY_COLUMN], inverse, frame, x)
         yield NearEdge(edge, row[SINGULAR + k] > 0)
 
 
@@ -101,7 +107,7 @@ class TreeWinding:
 
     clusters: Treecode
     rounding: Real
-    cells: NearFarCells | None = None
+    cells: DipoleCells | None = None
 
     @classmethod
     def of(
@@ -109,15 +115,18 @@ class TreeWinding:
     ) -> TreeWinding:  # fmt: skip
         """Everything but cells, uploaded."""
         records = np.concatenate([mesh.records, mesh.singular_flags], axis=1)
-        slots = in_slots(mesh.tree, records)
-        rounding = last_roundings(backend)
+        slots = records_in_slots(mesh.tree, records)
+        rounding = final_rounding(backend)
         levels = list(mesh.levels)
         clusters = Treecode.of(backend, mesh.tree, levels, slots, accuracy, order)
         return cls(clusters, rounding)
 
-    def build_cells(self, mesh: WindingMesh, half: float, most_bytes: int) -> NearFarCells | None:
-        """Cells of the cube [-half, half]^3, of at most so many bytes: see `near_far`."""
-        sources, triangles = mesh.tree.gather(triangle_sources(mesh.corners)), self.clusters.tree
+    def build_cells(self, mesh: WindingMesh, half: float, most_bytes: int) -> DipoleCells | None:
+        """Cells of the cube [-half, half]^3, of at most so many bytes: see `dipole_cells`."""
+        sources, triangles = (
+            mesh.tree.values_in_slots(triangle_sources(mesh.corners)),
+            self.clusters.tree,
+        )
         return build_cells(
             self.backend, mesh.tree, list(mesh.levels), sources, triangles.primitives, half,
             most_bytes,
@@ -135,74 +144,83 @@ class TreeWinding:
     @property
     def coarsest_detail(self) -> float:
         """`Field.coarsest_detail`."""
-        return self.clusters.coarsest if self.cells is None else 1.0
+        return self.clusters.coarsest_accuracy if self.cells is None else 1.0
 
-    def at(self, x: Vec3, derivatives: int, closer: Real) -> Values:
+    def values(self, x: Vec3, derivatives: int, closer: Real) -> PointValues:
         """w and the derivatives asked for at points; closer: the detail, at least 1.
 
         Near triangles add their crossings with the rays from x along z, and their open edges.
         """
-        unit, detail = epsilon_at(x), fmax(self.backend.Float(closer), self.backend.Float(1))
+        unit, detail = (
+            coordinate_rounding(x),
+            fmax(self.backend.Float(closer), self.backend.Float(1)),
+        )
 
         def is_ahead(row: list[Real], t: Real) -> Mask:
             del row
             return t > 0
 
-        sums = self._sums(Upwards(x), x, detail, unit, is_ahead, derivatives)
+        sums = self._sums(VerticalRayFrame(x), x, detail, unit, is_ahead, derivatives)
         return self.clusters.values(sums, _SHARE, unit, self.rounding)
 
     def _sums(
-        self, frame: Frame | Upwards, x: Vec3, detail: Real, unit: Real, is_ahead: IsAhead,
-        derivatives: int, where: Mask = True,
-    ) -> FieldSums:  # fmt: skip
+        self,
+        frame: RayFrame | VerticalRayFrame,
+        x: Vec3,
+        detail: Real,
+        unit: Real,
+        is_ahead: IsAhead,
+        derivatives: int,
+        where: Mask = True,
+    ) -> SourceSums:
         """4 pi w: far clusters, the crossings of near triangles that are ahead of x on rays of the
         frame, and the open edges of near triangles (`NearEdge.is_open`).
 
         is_ahead(row, t): whether a crossing at t with the triangle of a record is ahead.
         """
-        one = LiftedProduct.one(self.backend.Float).parts()
+        one = LiftedProduct.identity(self.backend.Float).parts()
 
         def adder(reach: Real) -> AddPrimitive:
             def add(
-                row: list[Real], active: Mask, sums: FieldSums, own: tuple[Any, ...]
-            ) -> tuple[FieldSums, tuple[Any, ...]]:
-                t, turn = crossing(row, frame)
+                row: list[Real], active: Mask, sums: SourceSums, own: tuple[Any, ...]
+            ) -> tuple[SourceSums, tuple[Any, ...]]:
+                t, turn = signed_crossing(row, frame)
                 # A crossing is a full turn of the product, which counts them without rounding.
                 re, im, turns = own
                 turns = turns + dr.select(active & is_ahead(row, t), turn, 0)
                 lifted = LiftedSums(sums, LiftedProduct(re, im, turns))
                 for near in edges_of(row, x, frame):
-                    lifted = lifted.plus(near.edge, unit, active & near.is_open(reach))
+                    lifted = lifted.add_edge(near.edge, unit, active & near.is_open(reach))
                 return lifted.sums, lifted.product.parts()
 
             return add
 
         sums, product = self._near_sums(x, detail, adder, one, where, derivatives)
-        return LiftedSums(sums, LiftedProduct(*product)).whole()
+        return LiftedSums(sums, LiftedProduct(*product)).total()
 
     def _near_sums(
         self, x: Vec3, detail: Real, adder: Callable[[Real], AddPrimitive], own: tuple[Any, ...],
         where: Mask, derivatives: int = 1,
-    ) -> tuple[FieldSums, tuple[Any, ...]]:  # fmt: skip
+    ) -> tuple[SourceSums, tuple[Any, ...]]:  # fmt: skip
         """The sums, and a state of the caller's own, by the cells where there are any, the detail
         is at most 1 and derivatives are not second ones.
 
         adder: from the reach of `NearEdge.is_open`, what adds a near triangle.
         """
         if self.cells is None or derivatives == 2:
-            add = adder(self.clusters.ratio(detail))
+            add = adder(self.clusters.acceptance_ratio(detail))
             return self.clusters.sums(x, detail, add, own, where, derivatives=derivatives)
-        beyond = self.clusters.ratio(fmax(detail, self.backend.Float(1)))
-        adders = adder(self.backend.Float(TRIANGLE_SPREAD)), adder(beyond)
-        return self.cells.sums_or_tree(self.clusters, x, detail, adders, own, where)
+        beyond = self.clusters.acceptance_ratio(fmax(detail, self.backend.Float(1)))
+        adders = adder(self.backend.Float(TRIANGLE_RATIO)), adder(beyond)
+        return self.cells.sums_with_tree(self.clusters, x, detail, adders, own, where)
 
-    def start(self, frame: Frame, t: Real, active: Mask) -> Real:
+    def crossings_ahead(self, frame: RayFrame, t: Real, active: Mask) -> Real:
         """0: this method does not count crossings along rays, as every sum gives all of w."""
         del frame, t, active
         return self.backend.Float(0)
 
-    def on_stretch(
-        self, frame: Frame, x: Vec3, behind: Crossing, turns: Real, detail: Real,
+    def sample_interval(
+        self, frame: RayFrame, x: Vec3, behind: JumpCrossing, turns: Real, detail: Real,
         active: Mask = True,
     ) -> Sample:  # fmt: skip
         """w on a ray interval, where active, with promises.
@@ -212,35 +230,40 @@ class TreeWinding:
         count as behind x, all others as ahead: so it does not matter on which side of a triangle
         rounding puts x.
 
-        Promises. For far dipoles see `FieldSums.sample`. The near triangles' field is that of
+        Promises. For far dipoles see `SourceSums.sample`. The near triangles' field is that of
         their open edges, and f is harmonic up to the nearest of them; what they add to the
         remainder is in `LiftedEdge.bounds`.
         """
         del turns
-        index, unit = self.backend.UInt32, fmax(epsilon_at(frame.o), epsilon_at(x))
+        index, unit = (
+            self.backend.UInt32,
+            fmax(coordinate_rounding(frame.o), coordinate_rounding(x)),
+        )
 
         def is_ahead(row: list[Real], t: Real) -> Mask:
-            number = index(fmax(row[INDEX], self.backend.Float(0)))
-            return ~((t < behind.t) | ((t == behind.t) & (number <= behind.sheet)))
+            number = index(fmax(row[NUMBER_COLUMN], self.backend.Float(0)))
+            return ~((t < behind.t) | ((t == behind.t) & (number <= behind.facet)))
 
         found = self._sums(frame, x, detail, unit, is_ahead, 1, active)
-        line = Line(x, frame.d, 8 * unit)
-        known = known_along(line, found.gradient, found.free_distance, self._rates(line, active))
+        line = RayLine(x, frame.d, 8 * unit)
+        known = lipschitz_along(
+            line, found.gradient, found.singularity_distance, self._rates(line, active)
+        )
         return found.sample(_SHARE, unit, self.rounding, along=known)
 
-    def _rates(self, line: Line, where: Mask) -> Rates:
-        """The rates of `edge_trails.rates_along` for 4 pi w on a line."""
+    def _rates(self, line: RayLine, where: Mask) -> Rates:
+        """The rates of `trail_sums.rates_along` for 4 pi w on a line."""
 
         def rates(lengths: tuple[Real, ...], active: Mask) -> tuple[Real, ...]:
             active = active & where
 
             def adder(reach: Real) -> AddPrimitive:
                 def add(
-                    row: list[Real], active: Mask, sums: FieldSums, own: tuple[Any, ...]
-                ) -> tuple[FieldSums, tuple[Any, ...]]:
-                    for near in edges_of(row, line.x, Upwards(line.x)):
+                    row: list[Real], active: Mask, sums: SourceSums, own: tuple[Any, ...]
+                ) -> tuple[SourceSums, tuple[Any, ...]]:
+                    for near in edges_of(row, line.x, VerticalRayFrame(line.x)):
                         open_ = active & near.is_open(reach)
-                        new = with_edge_rates(line, near.edge.edge, lengths, own)
+                        new = add_edge_rates(line, near.edge.edge, lengths, own)
                         own = tuple(dr.select(open_, a, b) for a, b in zip(new, own, strict=True))
                     return sums, own
 
@@ -248,6 +271,6 @@ class TreeWinding:
 
             start = tuple(self.backend.Float(0) for _ in lengths)
             far, near = self._near_sums(line.x, self.backend.Float(0), adder, start, active)
-            return far.with_rates(line.v, line.slack, lengths, near, active)
+            return far.add_line_rates(line.v, line.slack, lengths, near, active)
 
         return rates

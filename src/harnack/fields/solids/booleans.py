@@ -14,15 +14,15 @@ import numpy as np
 
 from harnack.arithmetic import maximum, minimum
 from harnack.arithmetic.norms import blend_intersection, blend_union
-from harnack.backend.elementary import fmax, fmin, largest_coordinate, length
-from harnack.backend.validation import finite
+from harnack.backend.elementary import fmax, fmin, max_norm, safe_norm
+from harnack.backend.validation import as_finite
 from harnack.enclosures import Enclosure, Lipschitz
-from harnack.enclosures.extremum import Greatest, Negated, Part
+from harnack.enclosures.extremum import MaximumEnclosure, MaximumOperand, NegatedEnclosure
 from harnack.fields.field import Field
-from harnack.fields.formula import as_data, probe
-from harnack.fields.samples import Look, Path, Sample, value_error
-from harnack.fields.solids.solid import Derived, Shape, Solid, not_a_solid
-from harnack.geometry import Box, Intersection
+from harnack.fields.formula import prepare_value, probe_jets
+from harnack.fields.samples import Ray, RaySample, Sample, value_error_bound
+from harnack.fields.solids.solid import FormulaSolid, Solid, SolidOfField, not_a_solid
+from harnack.geometry import Box, VolumeIntersection
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
@@ -30,27 +30,27 @@ if TYPE_CHECKING:
 
 # Other parts are used to narrow the range of the value if that shifts it by more than this fraction
 # of its error; at creases the shift is nearly always smaller.
-_WORTH = 0.25
+_MIN_SHIFT = 0.25
 
 
 def union(*solids: Solid) -> Solid:
     """All points of any of the solids. Raises ValueError for none, TypeError for no solids."""
-    return Combined(_parts(solids, is_union=True), is_union=True)
+    return BooleanSolid(_flatten_operands(solids, is_union=True), is_union=True)
 
 
 def intersection(*solids: Solid) -> Solid:
     """The points that are in all of the solids. Raises as `union`."""
-    return Combined(_parts(solids, is_union=False), is_union=False)
+    return BooleanSolid(_flatten_operands(solids, is_union=False), is_union=False)
 
 
-def _parts(solids: tuple[Solid, ...], *, is_union: bool) -> tuple[Solid, ...]:
+def _flatten_operands(solids: tuple[Solid, ...], *, is_union: bool) -> tuple[Solid, ...]:
     if not solids:
         raise ValueError("give at least one solid")
     flat: list[Solid] = []
     for solid in solids:
         if not isinstance(solid, Solid):  # pyright: ignore[reportUnnecessaryIsInstance]
             raise TypeError(not_a_solid(solid))
-        if isinstance(solid, Combined) and solid.is_union == is_union:
+        if isinstance(solid, BooleanSolid) and solid.is_union == is_union:
             flat.extend(solid.parts)
         else:
             flat.append(solid)
@@ -58,7 +58,7 @@ def _parts(solids: tuple[Solid, ...], *, is_union: bool) -> tuple[Solid, ...]:
 
 
 @dataclass(frozen=True, eq=False)
-class Combined(Solid):
+class BooleanSolid(Solid):
     """The union, min f_i, or the intersection, max f_i, of solids.
 
     If the f_i are distances, the minimum is exact outside and only a bound inside, and the maximum
@@ -73,26 +73,28 @@ class Combined(Solid):
         domains = list(dict.fromkeys(one.domain for one in self.parts if one.domain is not None))
         domain = None
         if domains:
-            domain = domains[0] if len(domains) == 1 else Intersection(domains)
+            domain = domains[0] if len(domains) == 1 else VolumeIntersection(domains)
         object.__setattr__(self, "domain", domain)
-        object.__setattr__(self, "has_detail", any(one.has_detail for one in self.parts))
-        coarsest = min((one.coarsest_detail for one in self.parts), default=1.0)
-        object.__setattr__(self, "coarsest_detail", coarsest)
+        object.__setattr__(
+            self, "has_variable_accuracy", any(one.has_variable_accuracy for one in self.parts)
+        )
+        coarsest = min((one.coarsest_accuracy for one in self.parts), default=1.0)
+        object.__setattr__(self, "coarsest_accuracy", coarsest)
         # A part that proves nothing looking back would refuse all longer steps.
-        object.__setattr__(self, "overstep", min(one.overstep for one in self.parts))
-        object.__setattr__(self, "wavelength", shortest_wave(self.parts))
+        object.__setattr__(self, "over_relaxation", min(one.over_relaxation for one in self.parts))
+        object.__setattr__(self, "min_wavelength", min_wavelength(self.parts))
         constants = [one.lipschitz for one in self.parts]
         known = all(one is not None for one in constants)
         object.__setattr__(self, "lipschitz", max(constants) if known else None)
 
-    def leaves(self, change: Callable[[Solid], Solid]) -> Solid:
-        return Combined(tuple(one.leaves(change) for one in self.parts), self.is_union)
+    def map_operands(self, change: Callable[[Solid], Solid]) -> Solid:
+        return BooleanSolid(tuple(one.map_operands(change) for one in self.parts), self.is_union)
 
-    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
-        hulls = [one.hull(level, above=above) for one in self.parts]
+    def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        hulls = [one.sublevel_extent(level, above=above) for one in self.parts]
         known = [one for one in hulls if one is not None]
         if self.is_union == above:
-            return Intersection(known) if len(known) > 1 else next(iter(known), None)
+            return VolumeIntersection(known) if len(known) > 1 else next(iter(known), None)
         if len(known) < len(hulls):
             return None
         return _around(known)
@@ -104,12 +106,12 @@ class Combined(Solid):
     def prepare(self, backend: Backend) -> Solid:
         return self._of([one.prepare(backend) for one in self.parts])
 
-    def at_detail(self, detail: Real) -> Field:
-        return self._of([one.at_detail(detail) for one in self.parts])
+    def at_accuracy(self, detail: Real) -> Field:
+        return self._of([one.at_accuracy(detail) for one in self.parts])
 
-    def for_rays(self, count: int) -> Field:
+    def for_ray_count(self, count: int) -> Field:
         def make(parts: list[Any]) -> Solid:
-            return Combined(tuple(parts), self.is_union)
+            return BooleanSolid(tuple(parts), self.is_union)
 
         return self._for_rays(self.parts, count, make)
 
@@ -127,7 +129,7 @@ class Combined(Solid):
 
     def evaluate(self, p: Vec3) -> Sample:
         samples = [one.evaluate(p) for one in self.parts]
-        return self._joined(samples, largest_coordinate(p))[0]
+        return self._combine_samples(samples, max_norm(p))[0]
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         best: Any = None
@@ -146,13 +148,13 @@ class Combined(Solid):
         """The largest errors of the parts that may be the extreme one. Infinite where rounding
         leaves
         it open which of two parts that is: derivatives jump there."""
-        size = largest_coordinate(p)
+        size = max_norm(p)
         sign = -1.0 if self.is_union else 1.0
-        whole = value_error(sample, length(sample.gradient), size)
+        whole = value_error_bound(sample, safe_norm(sample.gradient), size)
         near, slopes, bends = 0 * p.x, 0 * p.x, 0 * p.x
         for one in self.parts:
             own = one.evaluate(p)
-            doubt = value_error(own, length(own.gradient), size)
+            doubt = value_error_bound(own, safe_norm(own.gradient), size)
             is_open = ~(sign * (sample.value - own.value) > doubt + whole)
             near = near + dr.select(is_open, 1.0, 0.0)
             slope, bend = one.derivative_errors(p, own)
@@ -162,20 +164,20 @@ class Combined(Solid):
         is_one = near <= 1
         return dr.select(is_one, slopes, dr.inf), dr.select(is_one, bends, dr.inf)
 
-    def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
-        """The look made of the looks of all parts, by `Greatest`."""
-        looks = [one.look(path, t, ahead, back) for one in self.parts]
-        size = largest_coordinate(path.origin) + t
-        sample, below, extreme = self._joined([one.sample for one in looks], size)
-        slope, slope_error = looks[-1].slope, looks[-1].slope_doubt
+    def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
+        """The look made of the looks of all parts, by `MaximumEnclosure`."""
+        looks = [one.sample_ray(path, t, ahead, back) for one in self.parts]
+        size = max_norm(path.origin) + t
+        sample, below, extreme = self._combine_samples([one.sample for one in looks], size)
+        slope, slope_error = looks[-1].slope, looks[-1].slope_error_bound
         for look in looks[:-1]:
             is_chosen = look.sample.value == extreme
             slope = dr.select(is_chosen, look.slope, slope)
-            slope_error = dr.select(is_chosen, look.slope_doubt, slope_error)
-        front = self._enclosures([one.ahead for one in looks], below)
-        behind = self._enclosures([one.back for one in looks], below)
-        growth = max(one.growth for one in looks)
-        return Look(sample, front, behind, slope, growth, slope_error)
+            slope_error = dr.select(is_chosen, look.slope_error_bound, slope_error)
+        front = self._enclosures([one.forward for one in looks], below)
+        behind = self._enclosures([one.backward for one in looks], below)
+        growth = max(one.reach_growth for one in looks)
+        return RaySample(sample, front, behind, slope, growth, slope_error)
 
     def _enclosures(
         self, parts: list[tuple[Enclosure, ...]], below: list[tuple[Real, Real]]
@@ -183,22 +185,24 @@ class Combined(Solid):
         if not all(parts):
             return ()
         if self.is_union:
-            parts = [tuple(Negated(one) for one in part) for part in parts]
-        greatest = Greatest(
-            tuple(Part(*lengths, part) for lengths, part in zip(below, parts, strict=True))
+            parts = [tuple(NegatedEnclosure(one) for one in part) for part in parts]
+        greatest = MaximumEnclosure(
+            tuple(
+                MaximumOperand(*lengths, part) for lengths, part in zip(below, parts, strict=True)
+            )
         )
-        return (Negated(greatest),) if self.is_union else (greatest,)
+        return (NegatedEnclosure(greatest),) if self.is_union else (greatest,)
 
-    def _joined(
+    def _combine_samples(
         self, samples: list[Sample], size: Real
     ) -> tuple[Sample, list[tuple[Real, Real]], Real]:
         """The sample of the combination; for each part the least and the most that it is below the
         greatest; and the greatest (for a union, the least) of the values.
 
-        Proof of the errors. Let v_i be values with errors e_i (all rounding, `value_error`), v =
-        v_k the greatest. max f_i <= max(v_i + e_i) = v + max(e_i - (v - v_i)), and max f_i >= v_k -
-        e_k. So max(e_i - (v - v_i)) is the error of the combination. As max f_i >= v_j - e_j for
-        every j,
+        Proof of the errors. Let v_i be values with errors e_i (all rounding, `value_error_bound`),
+        v = v_k the greatest. max f_i <= max(v_i + e_i) = v + max(e_i - (v - v_i)), and max f_i >=
+        v_k - e_k. So max(e_i - (v - v_i)) is the error of the combination. As max f_i >= v_j - e_j
+        for every j,
         a part that is known better may exclude most of that range: then the value is the middle of
         the rest, for else a ray would hit, by the rounding of one part, a surface that lies inside
         of another part. The tracer subtracts the error of the combination from its gaps; where that
@@ -217,27 +221,27 @@ class Combined(Solid):
             value = dr.select(is_greatest, sample.value, value)
             gradient = dr.select(is_greatest, sample.gradient, gradient)
             slope_error = dr.select(is_greatest, sample.gradient_error, slope_error)
-        errors = [value_error(one, length(one.gradient), size) for one in samples]
+        errors = [value_error_bound(one, safe_norm(one.gradient), size) for one in samples]
         error, truncation = 0 * greatest, 0 * greatest
         for sample, own, off in zip(samples, values, errors, strict=True):
             gap = greatest - own
-            error = fmax(fmax(off - gap, sample.error - gap), error)
-            truncation = fmax(sample.truncation - gap, truncation)
+            error = fmax(fmax(off - gap, sample.value_error - gap), error)
+            truncation = fmax(sample.truncation_error - gap, truncation)
         least = values[0] - errors[0]
         for own, off in zip(values[1:], errors[1:], strict=True):
             least = fmax(own - off, least)
         shift = 0.5 * (least - (greatest - error))
-        shift = dr.select(shift > _WORTH * error, shift, 0)
+        shift = dr.select(shift > _MIN_SHIFT * error, shift, 0)
         extreme, value = value, value + sign * shift
         greatest, error = greatest + shift, error - shift
-        # `Sample.error` leaves out the rounding that follows from value and gradient.
+        # `Sample.value_error` leaves out the rounding that follows from value and gradient.
         plain = Sample(value, gradient, ())
-        stated = value_error(plain, length(gradient), size)
+        stated = value_error_bound(plain, safe_norm(gradient), size)
         joined = Sample(
-            value, gradient, self._known(samples), fmax(error - stated, 0), slope_error,
-            truncation=truncation,
+            value, gradient, self._common_lipschitz(samples), fmax(error - stated, 0), slope_error,
+            truncation_error=truncation,
         )  # fmt: skip
-        whole = value_error(joined, length(gradient), size)
+        whole = value_error_bound(joined, safe_norm(gradient), size)
         return (
             joined,
             [
@@ -250,7 +254,7 @@ class Combined(Solid):
             extreme,
         )
 
-    def _known(self, samples: list[Sample]) -> tuple[Lipschitz, ...]:
+    def _common_lipschitz(self, samples: list[Sample]) -> tuple[Lipschitz, ...]:
         """The largest of the Lipschitz constants of the parts, which is one of the combination."""
         constant: Any = 0.0
         radius: Any = math.inf
@@ -263,15 +267,17 @@ class Combined(Solid):
         return (Lipschitz(constant, radius),)
 
 
-def shortest_wave(parts: Iterable[Solid]) -> float | None:
-    """The least `Field.wavelength` of several."""
-    return min((one.wavelength for one in parts if one.wavelength is not None), default=None)
+def min_wavelength(parts: Iterable[Solid]) -> float | None:
+    """The least `Field.min_wavelength` of several."""
+    return min(
+        (one.min_wavelength for one in parts if one.min_wavelength is not None), default=None
+    )
 
 
 def lipschitz_of(sample: Sample) -> Lipschitz | None:
     """A Lipschitz constant that a sample promises, or one that follows from another promise."""
-    found = [one.lipschitz(sample.value) for one in sample.promises]
-    stated = (one for one in sample.promises if isinstance(one, Lipschitz))
+    found = [one.implied_lipschitz(sample.value) for one in sample.all_promises]
+    stated = (one for one in sample.all_promises if isinstance(one, Lipschitz))
     return next(stated, None) or next((one for one in found if one is not None), None)
 
 
@@ -288,106 +294,106 @@ def _around(volumes: list[Volume]) -> Volume | None:
 
 
 @dataclass(frozen=True, eq=False)
-class Complement(Derived):
+class Complement(SolidOfField):
     """All points that are not inside a solid: -f."""
 
-    inner: Solid
+    field: Solid
 
     def __post_init__(self) -> None:
-        self._take_over("domain", "lipschitz")
+        self._copy_settings("domain", "lipschitz")
 
     def __invert__(self) -> Solid:
-        return self.inner
+        return self.field
 
-    def leaves(self, change: Callable[[Solid], Solid]) -> Solid:
-        return Complement(self.inner.leaves(change))
+    def map_operands(self, change: Callable[[Solid], Solid]) -> Solid:
+        return Complement(self.field.map_operands(change))
 
-    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
-        return self.inner.hull(-level, above=not above)
+    def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        return self.field.sublevel_extent(-level, above=not above)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        return -self.inner.formula(x, y, z)
+        return -self.field.formula(x, y, z)
 
     def evaluate(self, p: Vec3) -> Sample:
-        return negated_sample(self.inner.evaluate(p))
+        return negated_sample(self.field.evaluate(p))
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        x, y, z = self.inner.hessian(p)
+        x, y, z = self.field.hessian(p)
         return -x, -y, -z
 
-    def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
-        return negated_look(self.inner.look(path, t, ahead, back))
+    def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
+        return negated_look(self.field.sample_ray(path, t, ahead, back))
 
 
-def negated_look(look: Look) -> Look:
+def negated_look(look: RaySample) -> RaySample:
     """The look at -f."""
-    return Look(
+    return RaySample(
         negated_sample(look.sample),
-        tuple(Negated(one) for one in look.ahead),
-        tuple(Negated(one) for one in look.back),
+        tuple(NegatedEnclosure(one) for one in look.forward),
+        tuple(NegatedEnclosure(one) for one in look.backward),
         -look.slope,
-        look.growth,
+        look.reach_growth,
         look.slope_error,
     )
 
 
 def negated_sample(sample: Sample) -> Sample:
     """The sample of -f."""
-    return sample.with_promises(
+    return sample.map_promises(
         lambda one: one.negated(),
         value=-sample.value,
         gradient=-sample.gradient,
-        normal=None if sample.normal is None else -sample.normal,
+        shading_normal=None if sample.shading_normal is None else -sample.shading_normal,
     )
 
 
 @dataclass(frozen=True, eq=False)
-class Offset(Derived):
+class OffsetSolid(SolidOfField):
     """The points where f <= distance.
 
     Proof. f - distance has the enclosures of f, and its Lipschitz constant.
     """
 
-    inner: Solid
+    field: Solid
     distance: float
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "distance", finite(self.distance, "distance"))
-        self._take_over("domain", "lipschitz")
+        object.__setattr__(self, "distance", as_finite(self.distance, "distance"))
+        self._copy_settings("domain", "lipschitz")
 
-    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
-        return self.inner.hull(level + self.distance, above=above)
+    def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        return self.field.sublevel_extent(level + self.distance, above=above)
 
     def prepare(self, backend: Backend) -> Solid:
         other = super().prepare(backend)
-        object.__setattr__(other, "distance", as_data(self.distance, backend))
+        object.__setattr__(other, "distance", prepare_value(self.distance, backend))
         return other
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        return self.inner.formula(x, y, z) - self.distance
+        return self.field.formula(x, y, z) - self.distance
 
     def evaluate(self, p: Vec3) -> Sample:
-        return self._shifted(self.inner.evaluate(p))
+        return self._shifted(self.field.evaluate(p))
 
     def _shifted(self, sample: Sample) -> Sample:
         """The sample of f - distance, with the rounding of the difference."""
         size = dr.abs(sample.value) + abs(self.distance)
-        return sample.with_promises(
+        return sample.map_promises(
             lambda one: one.shifted(-self.distance),
             value=sample.value - self.distance,
-            error=sample.error + 8 * float(dr.epsilon(type(sample.value))) * size,
+            value_error=sample.value_error + 8 * float(dr.epsilon(type(sample.value))) * size,
         )
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        return self.inner.hessian(p)
+        return self.field.hessian(p)
 
-    def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
-        look = self.inner.look(path, t, ahead, back)
+    def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
+        look = self.field.sample_ray(path, t, ahead, back)
         return replace(look, sample=self._shifted(look.sample))
 
 
 @dataclass(frozen=True, eq=False)
-class Blend(Shape):
+class BlendedSolid(FormulaSolid):
     """The union or intersection of two solids with a fillet: see `arithmetic.norms.blend_union`.
 
     Its Lipschitz constant is 2^(1/p) times the larger of the solids' own. A union's fillet lies
@@ -411,21 +417,29 @@ class Blend(Shape):
         for one in self.parts:
             if not isinstance(one, Solid):  # pyright: ignore[reportUnnecessaryIsInstance]
                 raise TypeError(not_a_solid(one))
-            one.formula(*probe())  # raises TypeError for a solid without a formula
+            one.formula(*probe_jets())  # raises TypeError for a solid without a formula
         constants = [one.lipschitz for one in self.parts]
         known = all(one is not None for one in constants)
         lipschitz = 2 ** (1 / self.power) * max(constants) * (1 + 1e-6) if known else None
         object.__setattr__(self, "lipschitz", lipschitz)
-        object.__setattr__(self, "wavelength", shortest_wave(self.parts))
+        object.__setattr__(self, "min_wavelength", min_wavelength(self.parts))
         object.__setattr__(self, "domain", union(*self.parts).domain)
 
-    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+    def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         whole = union(*self.parts) if self.is_union else self.parts[0] & self.parts[1]
         if self.is_union:
-            return whole.hull(level, above=True) if above else whole.hull(self._reached(level))
-        return whole.hull(-self._reached(-level), above=True) if above else whole.hull(level)
+            return (
+                whole.sublevel_extent(level, above=True)
+                if above
+                else whole.sublevel_extent(self._min_operand_bound(level))
+            )
+        return (
+            whole.sublevel_extent(-self._min_operand_bound(-level), above=True)
+            if above
+            else whole.sublevel_extent(level)
+        )
 
-    def _reached(self, level: float) -> float:
+    def _min_operand_bound(self, level: float) -> float:
         """A bound of the smaller of both functions where their blended union is at most `level`.
 
         Proof. The blend grows with both, so it is at least that of the lesser value m taken twice:
@@ -445,5 +459,5 @@ class Blend(Shape):
         parts = tuple(one.prepare(backend) for one in self.parts)
         object.__setattr__(other, "parts", parts)
         # The power stays a literal: the ranges of x^p depend on the kind of number that p is.
-        object.__setattr__(other, "radius", as_data(self.radius, backend))
+        object.__setattr__(other, "radius", prepare_value(self.radius, backend))
         return other

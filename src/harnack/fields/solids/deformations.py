@@ -17,36 +17,36 @@ from harnack.arithmetic.operators import tally_of
 from harnack.backend.elementary import fmax, fmin
 from harnack.enclosures import Lipschitz, Promise
 from harnack.fields.field import Field
-from harnack.fields.formula import prepared_numbers, probe
-from harnack.fields.solids.solid import Shape, Solid
+from harnack.fields.formula import probe_jets, with_device_numbers
+from harnack.fields.solids.solid import FormulaSolid, Solid
 from harnack.geometry import Ball, Box
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
     from harnack.geometry import Volume
 
-from harnack.fields.solids.solid import AXES, Map, axis_index
+from harnack.fields.solids.solid import AXES, SpaceMap, axis_index
 
 
-class Bend(Map):
+class Deformation(SpaceMap):
     """A map that does not keep lines straight, for solids with a formula.
 
     axis: the coordinate along which it changes.
     """
 
-    def of(self, solid: Solid) -> Solid:
-        solid.formula(*probe())  # raises TypeError for a solid without a formula
-        return Bent(solid, self)
+    def apply(self, solid: Solid) -> Solid:
+        solid.formula(*probe_jets())  # raises TypeError for a solid without a formula
+        return DeformedSolid(solid, self)
 
     @property
-    def least(self) -> float:
+    def min_scale(self) -> float:
         """The least factor by which lengths are multiplied, by which wavelengths shrink; 1 where it
         depends on the point, as for a twist, which compresses waves the more the farther they are
         from its axis."""
         return 1.0
 
     @abc.abstractmethod
-    def local(self, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
+    def preimage(self, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
         """The point that is mapped to (x, y, z)."""
 
     @abc.abstractmethod
@@ -54,16 +54,16 @@ class Bend(Map):
         """A volume that contains the image of another one; None if none is known."""
 
     @abc.abstractmethod
-    def stretch(self, p: Vec3) -> tuple[Real, Real]:
-        """A Lipschitz constant of `local` on a ball about p, and its radius."""
+    def preimage_lipschitz(self, p: Vec3) -> tuple[Real, Real]:
+        """A Lipschitz constant of `preimage` on a ball about p, and its radius."""
 
     @abc.abstractmethod
-    def prepare(self, backend: Backend) -> Bend:
+    def prepare(self, backend: Backend) -> Deformation:
         """The same with its numbers as kernel parameters of the backend."""
 
 
 @dataclass(frozen=True, eq=False)
-class Bent(Shape):
+class DeformedSolid(FormulaSolid):
     """A solid under a map that bends lines: its formula at the points that are mapped to p.
 
     No Lipschitz constant of the map is needed for a step: ranges of the local coordinates and of
@@ -71,14 +71,16 @@ class Bent(Shape):
     """
 
     inner: Solid
-    map: Bend
+    map: Deformation
 
     def __post_init__(self) -> None:
         if self.inner.domain is not None:
             domain = self.map.volume(self.inner.domain)
             object.__setattr__(self, "domain", domain)
-        waves = self.inner.wavelength
-        object.__setattr__(self, "wavelength", None if waves is None else waves * self.map.least)
+        waves = self.inner.min_wavelength
+        object.__setattr__(
+            self, "min_wavelength", None if waves is None else waves * self.map.min_scale
+        )
 
     @property
     def may_jump(self) -> bool:
@@ -90,14 +92,14 @@ class Bent(Shape):
         inner = self.inner.lipschitz
         if inner is None:
             return ()
-        stretch, radius = self.map.stretch(p)
+        stretch, radius = self.map.preimage_lipschitz(p)
         return (Lipschitz(inner * stretch, radius),)
 
-    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
-        return self.map.volume(self.inner.hull(level, above=above))
+    def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        return self.map.volume(self.inner.sublevel_extent(level, above=above))
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        return self.inner.formula(*self.map.local(x, y, z))
+        return self.inner.formula(*self.map.preimage(x, y, z))
 
     def prepare(self, backend: Backend) -> Field:
         other = copy.copy(self)
@@ -108,13 +110,13 @@ class Bent(Shape):
 
 
 @dataclass(frozen=True)
-class Twist(Bend):
+class Twist(Deformation):
     """Rotates cross sections by `rate` radians for each unit of length along an axis (Hart 1996,
     equation 50).
 
-    Proof of `stretch`. The derivative of the inverse is a rotation times [[1, 0, -y a], [0, 1, x
-    a], [0, 0, 1]], whose largest singular value is (m + sqrt(m^2 + 4))/2, m = |a| times the
-    distance from the axis. (Hart's equation 51 is too small where a is large.)
+    Proof of `preimage_lipschitz`. The derivative of the inverse is a rotation times [[1, 0, -y a],
+    [0, 1, x a], [0, 0, 1]], whose largest singular value is (m + sqrt(m^2 + 4))/2, m = |a| times
+    the distance from the axis. (Hart's equation 51 is too small where a is large.)
     """
 
     rate: Any
@@ -125,8 +127,8 @@ class Twist(Bend):
         if isinstance(self.rate, float) and not math.isfinite(self.rate):
             raise ValueError(f"rate must be finite, in radians a unit of length, not {self.rate!r}")
 
-    def local(self, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
-        u, v, w = _turned((x, y, z), self.axis)
+    def preimage(self, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
+        u, v, w = _axis_last((x, y, z), self.axis)
         angle = w * self.rate
         c, s = cos(angle), sin(angle)
         return _turned_back((u * c + v * s, v * c - u * s, w), self.axis)
@@ -135,7 +137,7 @@ class Twist(Bend):
         found = _cylinder(volume, self.axis)
         return None if found is None else _box(found[0], found[1], self.axis)
 
-    def stretch(self, p: Vec3) -> tuple[Real, Real]:
+    def preimage_lipschitz(self, p: Vec3) -> tuple[Real, Real]:
         rate = dr.abs(0 * p.x + self.rate)
         rho = _from_axis(p, self.axis)
         radius = 0.25 * rho + 0.25 / rate
@@ -145,16 +147,17 @@ class Twist(Bend):
         return dr.select(rate > 0, constant, 1), dr.select(rate > 0, radius, dr.inf)
 
     def prepare(self, backend: Backend) -> Twist:
-        return prepared_numbers(self, backend)
+        return with_device_numbers(self, backend)
 
 
 @dataclass(frozen=True)
-class Taper(Bend):
+class Taper(Deformation):
     """Scales cross sections by r, linear along an axis between two positions and constant beyond.
 
-    Proof of `stretch`. The derivative of the inverse acts on the radial and the axial direction as
-    [[k, m], [0, 1]], k = 1/r, m = rho |r'|/r^2 at the distance rho from the axis, and on the third
-    as k. Its largest singular value has sigma^2 = (S + sqrt(S^2 - 4 k^2))/2, S = k^2 + m^2 + 1,
+    Proof of `preimage_lipschitz`. The derivative of the inverse acts on the radial and the axial
+    direction as [[k, m], [0, 1]], k = 1/r, m = rho |r'|/r^2 at the distance rho from the axis, and
+    on the third as k. Its largest singular value has sigma^2 = (S + sqrt(S^2 - 4 k^2))/2, S = k^2 +
+    m^2 + 1,
     which grows with k and m: here their largest values. (Hart's equation 49 has min 1/r.)
     """
 
@@ -183,11 +186,11 @@ class Taper(Bend):
             object.__setattr__(self, name, tuple(float(one) for one in getattr(self, name)))
 
     @property
-    def least(self) -> float:
+    def min_scale(self) -> float:
         return min(1.0, self.start[1], self.end[1])
 
-    def local(self, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
-        u, v, w = _turned((x, y, z), self.axis)
+    def preimage(self, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
+        u, v, w = _axis_last((x, y, z), self.axis)
         (a, r), (b, s) = self.start, self.end
         inside = minimum(maximum((w - a) * (1.0 / (b - a)), 0.0), 1.0)
         shrink = 1.0 / (inside * (s - r) + r)
@@ -199,7 +202,7 @@ class Taper(Bend):
             return None
         return _box(found[0] * max(self.start[1], self.end[1]), found[1], self.axis)
 
-    def stretch(self, p: Vec3) -> tuple[Real, Real]:
+    def preimage_lipschitz(self, p: Vec3) -> tuple[Real, Real]:
         (a, r), (b, s) = ((0 * p.x + u, 0 * p.x + v) for u, v in (self.start, self.end))
         rho = _from_axis(p, self.axis)
         radius = 0.25 * rho + 0.25 * (b - a)
@@ -210,15 +213,15 @@ class Taper(Bend):
         return dr.sqrt(0.5 * (total + root)) * (1 + 1e-5), radius
 
     def prepare(self, backend: Backend) -> Taper:
-        return prepared_numbers(self, backend)
+        return with_device_numbers(self, backend)
 
 
 def _from_axis(p: Vec3, axis: str) -> Real:
-    u, v, _ = _turned((p.x, p.y, p.z), axis)
+    u, v, _ = _axis_last((p.x, p.y, p.z), axis)
     return dr.sqrt(u * u + v * v)
 
 
-def _turned(p: tuple[Any, Any, Any], axis: str) -> tuple[Any, Any, Any]:
+def _axis_last(p: tuple[Any, Any, Any], axis: str) -> tuple[Any, Any, Any]:
     """The coordinates in cyclic order, the axis last."""
     k = AXES[axis]
     return p[(k + 1) % 3], p[(k + 2) % 3], p[k]

@@ -15,10 +15,10 @@ import drjit as dr
 from harnack.arithmetic import Interval, Jet
 from harnack.backend import backend_of
 from harnack.backend.elementary import fmax
-from harnack.backend.validation import finite, positive, whole
-from harnack.enclosures import Curvature, Lipschitz
-from harnack.fields.formula import Formula, is_jet, prepared_numbers
-from harnack.fields.solids.solid import Shape
+from harnack.backend.validation import as_finite, as_integer_in_range, as_positive
+from harnack.enclosures import Lipschitz, TaylorRemainder
+from harnack.fields.formula import Formula, is_jet, with_device_numbers
+from harnack.fields.solids.solid import FormulaSolid
 from harnack.name_suggestions import is_one_of
 
 if TYPE_CHECKING:
@@ -36,9 +36,9 @@ CORNERS = tuple(itertools.product((0, 1), repeat=3))
 class NoiseConstants:
     """Bounds of noise on a lattice of unit length, with any unit vectors at its points.
 
-    largest: of |noise|.
-    slope: of |grad noise|.
-    curvature: of all second derivatives.
+    max_abs: of |noise|.
+    max_gradient: of |grad noise|.
+    max_second_derivative: of all second derivatives.
 
     Proof. With weights w_c of the corners c of a cell and r_c = x - c, noise is sum w_c g_c.r_c.
     |noise| <= sum w_c |r_c| <= sqrt(sum w_c |r_c|^2), which is the root of three terms of at most
@@ -59,9 +59,9 @@ class NoiseConstants:
     of the Hessian: 17.64 and 24.35 on a grid.
     """
 
-    largest: float
-    slope: float
-    curvature: float
+    max_abs: float
+    max_gradient: float
+    max_second_derivative: float
 
 
 CONSTANTS: dict[Fade, NoiseConstants] = {
@@ -130,7 +130,7 @@ def lattice_vector(x: Any, y: Any, z: Any, seed: Any, like: Real) -> list[Any]:
 
 
 @dataclass(frozen=True)
-class FractalNoise(Shape):
+class FractalNoise(FormulaSolid):
     """The sum of a_i noise(2^i k p), a_i = amplitude 2^(-beta i), over a number of octaves.
 
     octaves: their number.
@@ -153,13 +153,13 @@ class FractalNoise(Shape):
     fade: Fade = "quintic"
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "octaves", whole(self.octaves, "octaves", 1, 24))
-        object.__setattr__(self, "seed", whole(self.seed, "the seed", 0, 2**32 - 1))
+        object.__setattr__(self, "octaves", as_integer_in_range(self.octaves, "octaves", 1, 24))
+        object.__setattr__(self, "seed", as_integer_in_range(self.seed, "the seed", 0, 2**32 - 1))
         if not is_one_of(self.fade, CONSTANTS):
             raise ValueError(f'the fade must be "quintic" or "cubic", not {self.fade!r}')
-        object.__setattr__(self, "beta", finite(self.beta, "beta of noise"))
+        object.__setattr__(self, "beta", as_finite(self.beta, "beta of noise"))
         for name in ("frequency", "amplitude"):
-            value = positive(getattr(self, name), f"the {name} of noise")
+            value = as_positive(getattr(self, name), f"the {name} of noise")
             object.__setattr__(self, name, value)
 
     def _sum(self, power: float) -> float:
@@ -168,22 +168,22 @@ class FractalNoise(Shape):
         return self.amplitude * self.frequency**power * sum(terms) * (1.0 + 1e-5)
 
     @property
-    def largest(self) -> float:
+    def max_abs(self) -> float:
         """A bound of |f|."""
-        return self._sum(0.0) * CONSTANTS[self.fade].largest
+        return self._sum(0.0) * CONSTANTS[self.fade].max_abs
 
     @property
     def lipschitz(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self._sum(1.0) * CONSTANTS[self.fade].slope
+        return self._sum(1.0) * CONSTANTS[self.fade].max_gradient
 
     @property
-    def most_curvature(self) -> float:
+    def max_second_derivative(self) -> float:
         """A bound of all second derivatives."""
-        return self._sum(2.0) * CONSTANTS[self.fade].curvature
+        return self._sum(2.0) * CONSTANTS[self.fade].max_second_derivative
 
     def prepare(self, backend: Backend) -> Field:
-        made = prepared_numbers(self, backend)
-        constants = (self._sum(1.0) * CONSTANTS[self.fade].slope, self.most_curvature)
+        made = with_device_numbers(self, backend)
+        constants = (self._sum(1.0) * CONSTANTS[self.fade].max_gradient, self.max_second_derivative)
         numbers = {
             "_constants": tuple(dr.opaque(backend.Float, one) for one in constants),
             "_falls": dr.opaque(backend.Float, 2.0**-self.beta),
@@ -195,7 +195,7 @@ class FractalNoise(Shape):
 
     def promises(self, p: Vec3) -> tuple[Promise, ...]:
         slope, bend = self._data(p.x)["_constants"]
-        return Lipschitz(0 * p.x + slope), Curvature(0 * p.x + bend)
+        return Lipschitz(0 * p.x + slope), TaylorRemainder(0 * p.x + bend)
 
     def _data(self, like: Real) -> dict[str, Any]:
         made = self if hasattr(self, "_falls") else self.prepare(backend_of(like))
@@ -206,14 +206,14 @@ class FractalNoise(Shape):
         """Noise is continuous."""
         return False
 
-    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+    def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         del level, above
         return None
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         jets = [one for one in (x, y, z) if is_jet(one, type(self).__name__)]
         if jets:
-            made = [one if isinstance(one, Jet) else jets[0].of(one) for one in (x, y, z)]
+            made = [one if isinstance(one, Jet) else jets[0].coerce(one) for one in (x, y, z)]
             return self._ranges(made)
         return self._octaves([x, y, z])[0][0]
 
@@ -257,11 +257,11 @@ class FractalNoise(Shape):
 
     def _ranges(self, coordinates: list[Jet]) -> Jet:
         """The jet of the sum for jets of the coordinates: the sum of the octaves' jets."""
-        like = coordinates[0].kind()
-        like = like if coordinates[0].start is None else coordinates[0].width
-        starts = [one if one.start is None else one.start for one in coordinates]
-        at = [0 * like + one.dynamic_value(like).middle for one in starts]
-        off = [0 * like + one.dynamic_value(like).radius for one in starts]
+        like = coordinates[0].backend_number()
+        like = like if coordinates[0].jet_at_start is None else coordinates[0].piece_length
+        starts = [one if one.jet_at_start is None else one.jet_at_start for one in coordinates]
+        at = [0 * like + one.value_on_backend(like).midpoint for one in starts]
+        off = [0 * like + one.value_on_backend(like).radius for one in starts]
         data, constants = self._data(at[0]), CONSTANTS[self.fade]
         unit = 2 * float(dr.epsilon(cast("Any", type(at[0]))))
         scale, amplitude = data["frequency"], data["amplitude"]
@@ -276,10 +276,12 @@ class FractalNoise(Shape):
                 value=value,
                 gradient=gradient,
                 hessian=hessian,
-                slope=amplitude * scale * constants.slope * (1 + 1e-5),
-                bend=amplitude * scale * scale * constants.curvature * (1 + 1e-5),
-                error=amplitude * (32 * unit + constants.slope * 2 * lost),
-                slope_error=amplitude * scale * (64 * unit + constants.curvature * 2 * lost),
+                slope=amplitude * scale * constants.max_gradient * (1 + 1e-5),
+                bend=amplitude * scale * scale * constants.max_second_derivative * (1 + 1e-5),
+                error=amplitude * (32 * unit + constants.max_gradient * 2 * lost),
+                slope_error=amplitude
+                * scale
+                * (64 * unit + constants.max_second_derivative * 2 * lost),
             )
             jet = octave.jet(coordinates, starts, _length(off))
             total = jet if total is None else total + jet
@@ -302,10 +304,10 @@ class Noise(FractalNoise):
 
 
 @dataclass(frozen=True)
-class Displaced(Shape):
+class DisplacedSolid(FormulaSolid):
     """A shape with noise added to its function (Hart 1996, appendix F): f + noise <= 0.
 
-    Its Lipschitz constant is the sum of both; its surface is where f is within `largest` of 0.
+    Its Lipschitz constant is the sum of both; its surface is where f is within `max_abs` of 0.
     """
 
     solid: Formula
@@ -329,11 +331,11 @@ class Displaced(Shape):
         """Whether the shape's function may: noise is continuous."""
         return self.solid.may_jump
 
-    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
-        if not isinstance(self.solid, Shape):
+    def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        if not isinstance(self.solid, FormulaSolid):
             return None
-        moved = level - self.noise.largest if above else level + self.noise.largest
-        return self.solid.hull(moved, above=above)
+        moved = level - self.noise.max_abs if above else level + self.noise.max_abs
+        return self.solid.sublevel_extent(moved, above=above)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         return self.solid.formula(x, y, z) + self.noise.formula(x, y, z)
@@ -368,20 +370,20 @@ class _Octave:
         """
         wide = self.error + self.slope * off * (1 + 1e-5)
         value = Interval(self.value - wide, self.value + wide)
-        if coordinates[0].start is None:
+        if coordinates[0].jet_at_start is None:
             # At points of space, not on pieces of length 0: the Hessian is known.
-            is_point = len(coordinates[0].first) > 1
+            is_point = len(coordinates[0].first_derivatives) > 1
             return self._derivatives(coordinates, off, value, is_point=is_point)
         start = self._derivatives(starts, off, value, is_point=False)
         far = [
-            fmax(dr.abs(one.value.high - q), dr.abs(one.value.low - q))
+            fmax(dr.abs(one.value.upper - q), dr.abs(one.value.lower - q))
             for one, q in zip(coordinates, self.at, strict=True)
         ]
         distance = _length(far) * (1 + 1e-5)
         wide = wide + self.slope * distance
         wider = Interval(self.value - wide, self.value + wide)
         piece = self._derivatives(coordinates, distance, wider, is_point=False)
-        return piece.anchored(start, coordinates[0].width)
+        return piece.narrowed_from_start(start, coordinates[0].piece_length)
 
     def _derivatives(self, jets: list[Jet], reach: Real, value: Interval, *, is_point: bool) -> Jet:
         change = self.bend * reach + self.slope_error
@@ -391,23 +393,23 @@ class _Octave:
         ]
         first: list[Interval] = []
         speeds: list[Real] = []
-        for i in range(len(jets[0].first)):
-            rates = [one.first[i] for one in jets]
-            speed = _length([0 * self.value + r.largest for r in rates]) * (1 + 1e-5)
+        for i in range(len(jets[0].first_derivatives)):
+            rates = [one.first_derivatives[i] for one in jets]
+            speed = _length([0 * self.value + r.max_abs for r in rates]) * (1 + 1e-5)
             along = _sum([g * r for g, r in zip(parts, rates, strict=True)])
             most = self.slope * speed
-            first.append(Interval(fmax(along.low, -most), -fmax(-along.high, -most)))
+            first.append(Interval(fmax(along.lower, -most), -fmax(-along.upper, -most)))
             speeds.append(speed)
         rounded = 64 * 2 * float(dr.epsilon(cast("Any", type(self.value)))) * self.bend
         second: list[Interval] = []
-        for k, (i, j) in enumerate(jets[0].pairs()):
+        for k, (i, j) in enumerate(jets[0].hessian_indices()):
             bent = self.bend * speeds[i] * speeds[j]
             own = Interval(-bent, bent)
             if is_point:
                 own = _quadratic(
                     [Interval(h - rounded, h + rounded) for h in self.hessian], jets, i, j
                 )
-            along = [g * one.second[k] for g, one in zip(parts, jets, strict=True)]
+            along = [g * one.second_derivatives[k] for g, one in zip(parts, jets, strict=True)]
             second.append(_sum([own, *along]))
         return Jet(value, tuple(first), tuple(second))
 
@@ -423,9 +425,9 @@ def _quadratic(hessian: list[Interval], jets: list[Jet], i: int, j: int) -> Inte
     """x_i^T H x_j."""
     terms: list[Interval] = []
     for m, (a, b) in enumerate(itertools.combinations_with_replacement(range(3), 2)):
-        across = jets[a].first[i] * jets[b].first[j]
+        across = jets[a].first_derivatives[i] * jets[b].first_derivatives[j]
         if a != b:
-            across = across + jets[b].first[i] * jets[a].first[j]
+            across = across + jets[b].first_derivatives[i] * jets[a].first_derivatives[j]
         terms.append(hessian[m] * across)
     return _sum(terms)
 

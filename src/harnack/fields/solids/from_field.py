@@ -12,22 +12,22 @@ import numpy as np
 
 from harnack.arithmetic import Interval, Jet
 from harnack.backend import backend_of
-from harnack.backend.elementary import fmax, fmin, largest_coordinate, length
-from harnack.backend.validation import refuses_derivatives
-from harnack.enclosures import Enclosure, Gaps
+from harnack.backend.elementary import fmax, fmin, max_norm, safe_norm
+from harnack.backend.validation import no_derivatives
+from harnack.enclosures import Enclosure, LevelGaps
 from harnack.fields.field import Field, check_is_field
-from harnack.fields.formula import Formula, as_data, is_jet
-from harnack.fields.samples import Look, Path, Sample, value_error
-from harnack.fields.solids.booleans import Complement, Offset, lipschitz_of, negated_sample
-from harnack.fields.solids.mesh_solid import is_mesh, solid_of_mesh
-from harnack.fields.solids.solid import Derived, Solid
+from harnack.fields.formula import Formula, is_jet, prepare_value
+from harnack.fields.samples import Ray, RaySample, Sample, value_error_bound
+from harnack.fields.solids.booleans import Complement, OffsetSolid, lipschitz_of, negated_sample
+from harnack.fields.solids.mesh_solid import looks_like_mesh, solid_of_mesh
+from harnack.fields.solids.solid import Solid, SolidOfField
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.geometry import Volume
 
 
-@refuses_derivatives
+@no_derivatives
 def solid(
     field: Any,
     *,
@@ -55,17 +55,17 @@ def solid(
             or an angle-valued one without `around`; a mesh that bounds no solid (`MeshError`).
     """
     given = [one for one in (below, above, between, around) if one is not None]
-    if is_mesh(field):
+    if looks_like_mesh(field):
         if given:
             raise ValueError(
                 "a mesh is solid by itself: below=, above=, between= and around= are for fields; "
-                "solid(mesh).grown(d) moves its surface by d, and solid(mesh).shell(t) hollows it"
+                "solid(mesh).offset(d) moves its surface by d, and solid(mesh).shell(t) hollows it"
             )
         return solid_of_mesh(field)
     if len(given) != 1:
         raise ValueError("give exactly one of below=, above=, between=, around=")
     check_is_field(field)
-    if field.has_sheets:
+    if field.has_jumps:
         raise ValueError(
             f"{type(field).__name__} jumps across sheets: values on both sides of a level may meet "
             "without any in between, so it bounds no solid"
@@ -80,21 +80,21 @@ def solid(
             f"{type(field).__name__} is angle-valued: no value is below another. Use "
             "around=(level, half_width) for the solid near a level"
         )
-    inside = Region(field)
+    inside = SublevelSolid(field)
     if below is not None:
-        return Offset(inside, numbers[0])
+        return OffsetSolid(inside, numbers[0])
     if above is not None:
-        return Complement(Offset(inside, numbers[0]))
+        return Complement(OffsetSolid(inside, numbers[0]))
     low, high = numbers
     if around is not None:
         if not high > 0:
             raise ValueError(f"half_width must be positive, not {high:g}")
         if field.period is not None and not 2 * high < field.period:
             raise ValueError(f"half_width must be below {field.period / 2:g}, half of the period")
-        return Near(field, low, high)
+        return BandSolid(field, low, high)
     if not low < high:
         raise ValueError(f"between must be (low, high) with low < high, not {between}")
-    return Near(field, 0.5 * (low + high), 0.5 * (high - low))
+    return BandSolid(field, 0.5 * (low + high), 0.5 * (high - low))
 
 
 def _levels(given: Any, count: int) -> tuple[float, ...] | None:
@@ -107,43 +107,43 @@ def _levels(given: Any, count: int) -> tuple[float, ...] | None:
 
 
 @dataclass(frozen=True, eq=False)
-class Region(Derived):
+class SublevelSolid(SolidOfField):
     """The points where a field is at most 0."""
 
-    inner: Field
+    field: Field
 
     def __post_init__(self) -> None:
-        self._take_over()
-        domain = None if self.inner.is_entire else self.inner.domain
+        self._copy_settings()
+        domain = None if self.field.is_global else self.field.domain
         object.__setattr__(self, "domain", domain)
 
-    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
-        if self.inner.is_entire:
+    def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        if self.field.is_global:
             return None
 
         def is_inside(value: float) -> bool:
             return value >= level if above else value <= level
 
-        return bounded_side(self.inner, (level,), is_inside)
+        return bounded_side_extent(self.field, (level,), is_inside)
 
     def evaluate(self, p: Vec3) -> Sample:
-        return self.inner.evaluate(p)
+        return self.field.evaluate(p)
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        return self.inner.hessian(p)
+        return self.field.hessian(p)
 
-    def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
-        return self.inner.look(path, t, ahead, back)
+    def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
+        return self.field.sample_ray(path, t, ahead, back)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        if isinstance(self.inner, Formula):
-            return self.inner.formula(x, y, z)
-        if not is_jet(x, type(self.inner).__name__):
+        if isinstance(self.field, Formula):
+            return self.field.formula(x, y, z)
+        if not is_jet(x, type(self.field).__name__):
             return self.differentiable_value(_vector(x, y, z))
-        return jet_of_field(self.inner, x, y, z)
+        return field_jet(self.field, x, y, z)
 
 
-def bounded_side(
+def bounded_side_extent(
     field: Field, levels: tuple[float, ...], is_inside: Callable[[float], bool]
 ) -> Volume | None:
     """A volume that contains all points inside, if one is proved; else the domain, outside of which
@@ -153,9 +153,9 @@ def bounded_side(
     connected and meets no level, so that one point tells on which side of the levels all of it is.
     """
     extent = field.extent(levels)
-    if field.is_entire and extent is field.domain:  # only where it is drawn: it bounds no level set
+    if field.is_global and extent is field.domain:  # only where it is drawn: it bounds no level set
         return None
-    if extent is None or (field.domain is not None and not field.is_entire):
+    if extent is None or (field.domain is not None and not field.is_global):
         return field.domain
     low, high = extent.bounds()
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
@@ -169,7 +169,7 @@ def _vector(x: Real, y: Real, z: Real) -> Vec3:
     return backend_of(x).Array3f(x, y, z)
 
 
-def jet_of_field(field: Field, x: Jet, y: Jet, z: Jet) -> Jet:
+def field_jet(field: Field, x: Jet, y: Jet, z: Jet) -> Jet:
     """The jet of a field whose second derivatives are bounded near a point.
 
     Proof. Let |f''| <= H within r of q, the point where the piece starts (or the point itself), and
@@ -184,15 +184,15 @@ def jet_of_field(field: Field, x: Jet, y: Jet, z: Jet) -> Jet:
         TypeError: the field promises no bound of its second derivatives.
     """
     coordinates = (x, y, z)
-    starts = [one if one.start is None else one.start for one in coordinates]
-    q = _vector(*(0 * x.width + one.value.middle for one in starts))
+    starts = [one if one.jet_at_start is None else one.jet_at_start for one in coordinates]
+    q = _vector(*(0 * x.piece_length + one.value.midpoint for one in starts))
     sample = field.evaluate(q)
     bound, radius = _second_derivatives(field, sample)
-    off = length(type(q)(*(0 * x.width + one.value.radius for one in starts)))
-    rows = _second_derivatives_at(field, q) if len(x.second) == _ALL_PAIRS else None
+    off = safe_norm(type(q)(*(0 * x.piece_length + one.value.radius for one in starts)))
+    rows = _second_derivatives_at(field, q) if len(x.second_derivatives) == _ALL_PAIRS else None
     doubt = 2 * bound
     if rows is not None:
-        is_point = off <= _AT_POINT * float(dr.epsilon(type(q.x))) * largest_coordinate(q)
+        is_point = off <= _AT_POINT * float(dr.epsilon(type(q.x))) * max_norm(q)
         doubt = dr.select(is_point, fmin(doubt, field.derivative_errors(q, sample)[1]), doubt)
 
     def derivatives(
@@ -202,48 +202,52 @@ def jet_of_field(field: Field, x: Jet, y: Jet, z: Jet) -> Jet:
         change = most * distance * (1 + 1e-5) + sample.gradient_error
         slopes = [Interval(one - change, one + change) for one in sample.gradient]
         first = tuple(
-            _sum(g * one.first[i] for g, one in zip(slopes, jets, strict=True))
-            for i in range(len(x.first))
+            _interval_sum(g * one.first_derivatives[i] for g, one in zip(slopes, jets, strict=True))
+            for i in range(len(x.first_derivatives))
         )
         speeds = [
-            length(type(q)(*(0 * x.width + one.first[i].largest for one in jets)))
-            for i in range(len(x.first))
+            safe_norm(
+                type(q)(*(0 * x.piece_length + one.first_derivatives[i].max_abs for one in jets))
+            )
+            for i in range(len(x.first_derivatives))
         ]
         second: list[Interval] = []
-        for k, (i, j) in enumerate(_pairs(len(x.first), len(x.second))):
-            along = _sum(g * one.second[k] for g, one in zip(slopes, jets, strict=True))
+        for k, (i, j) in enumerate(_pairs(len(x.first_derivatives), len(x.second_derivatives))):
+            along = _interval_sum(
+                g * one.second_derivatives[k] for g, one in zip(slopes, jets, strict=True)
+            )
             if rows is None:
                 bent = most * speeds[i] * speeds[j] * (1 + 1e-5)
             else:
                 bent = doubt * speeds[i] * speeds[j] * (1 + 1e-5)
                 own = (
-                    row[n] * (jet.first[i] * column.first[j])
+                    row[n] * (jet.first_derivatives[i] * column.first_derivatives[j])
                     for row, jet in zip(rows, jets, strict=True)
                     for n, column in enumerate(jets)
                 )
-                along = along + _sum(own)
+                along = along + _interval_sum(own)
             second.append(along + Interval(-bent, bent))
         return first, tuple(second)
 
-    steep = length(sample.gradient) + sample.gradient_error
+    steep = safe_norm(sample.gradient) + sample.gradient_error
     unit = 2 * float(dr.epsilon(type(q.x)))
-    wide = sample.error + 8 * unit * dr.abs(sample.value)
+    wide = sample.value_error + 8 * unit * dr.abs(sample.value)
     wide = (wide + off * (steep + dr.select(off <= radius, bound, dr.inf) * off)) * (1 + 1e-5)
     value = Interval(sample.value - wide, sample.value + wide)
     first, second = derivatives(starts, off)
-    start = Jet(value, first, second, width=starts[0].width)
-    if x.start is None:
+    start = Jet(value, first, second, piece_length=starts[0].piece_length)
+    if x.jet_at_start is None:
         return start
     moves = (
-        fmax(dr.abs(one.value.high - m), dr.abs(one.value.low - m))
+        fmax(dr.abs(one.value.upper - m), dr.abs(one.value.lower - m))
         for one, m in zip(coordinates, q, strict=True)
     )
-    first, second = derivatives(list(coordinates), length(type(q)(*moves)) * (1 + 1e-5))
-    span = Interval(0 * x.width, 0 * value.low + x.width)
-    return Jet(value + first[0] * span, first, second, start, x.width)
+    first, second = derivatives(list(coordinates), safe_norm(type(q)(*moves)) * (1 + 1e-5))
+    span = Interval(0 * x.piece_length, 0 * value.lower + x.piece_length)
+    return Jet(value + first[0] * span, first, second, start, x.piece_length)
 
 
-def _sum(terms: Iterable[Interval]) -> Interval:
+def _interval_sum(terms: Iterable[Interval]) -> Interval:
     total = Interval(0.0, 0.0)
     for one in terms:
         total = total + one
@@ -251,7 +255,7 @@ def _sum(terms: Iterable[Interval]) -> Interval:
 
 
 def _pairs(n: int, count: int) -> list[tuple[int, int]]:
-    """The pairs of variables of the entries of `Jet.second`."""
+    """The pairs of variables of the entries of `Jet.second_derivatives`."""
     return [(i, j) for i in range(n) for j in range(i, n)][:count]
 
 
@@ -265,13 +269,13 @@ def _second_derivatives_at(field: Field, q: Vec3) -> list[list[Interval]] | None
         rows = field.hessian(q)
     except NotImplementedError:
         return None
-    return [[Interval.exactly(number) for number in row] for row in rows]
+    return [[Interval.point(number) for number in row] for row in rows]
 
 
 def _second_derivatives(field: Field, sample: Sample) -> tuple[Real, Real]:
     """A bound of all second derivatives, and the radius within which it holds."""
-    for promise in sample.promises:
-        found = promise.second_derivatives(sample.value)
+    for promise in sample.all_promises:
+        found = promise.implied_second_derivative_bound(sample.value)
         if found is not None:
             return found
     raise TypeError(
@@ -282,87 +286,87 @@ def _second_derivatives(field: Field, sample: Sample) -> tuple[Real, Real]:
 
 
 @dataclass(frozen=True, eq=False)
-class Near(Derived):
+class BandSolid(SolidOfField):
     """The points where a field is at most half_width from a level: |f - level| - half_width.
 
     For an angle-valued field, from the level plus any multiple of the period.
 
     Proof. It changes as f does, up to the sign, so it does not reach a value v as long as f stays
     away from level + v + half_width and level - v - half_width, and from these plus multiples of
-    the period (`Folded`).
+    the period (`FoldedEnclosure`).
     """
 
-    inner: Field
+    field: Field
     level: float
     half_width: float
 
     def __post_init__(self) -> None:
-        self._take_over()
-        domain = None if self.inner.is_entire else self.inner.domain
+        self._copy_settings()
+        domain = None if self.field.is_global else self.field.domain
         object.__setattr__(self, "domain", domain)
 
     def prepare(self, backend: Backend) -> Solid:
         other = super().prepare(backend)
         for name in ("level", "half_width"):
-            object.__setattr__(other, name, as_data(getattr(self, name), backend))
+            object.__setattr__(other, name, prepare_value(getattr(self, name), backend))
         return other
 
-    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+    def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         ends = tuple(self.level + sign * (self.half_width + level) for sign in (-1, 1))
-        if above or (self.inner.is_entire and self.inner.period is None):
+        if above or (self.field.is_global and self.field.period is None):
             return self.domain
 
         def is_inside(value: float) -> bool:
-            offset, period = value - self.level, self.inner.period
+            offset, period = value - self.level, self.field.period
             if period is not None:
                 offset -= period * round(offset / period)
             return abs(offset) <= self.half_width + level
 
-        return bounded_side(self.inner, ends, is_inside)
+        return bounded_side_extent(self.field, ends, is_inside)
 
     def evaluate(self, p: Vec3) -> Sample:
-        return self._folded(self.inner.evaluate(p))[0]
+        return self._fold_sample(self.field.evaluate(p))[0]
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        below = self._offset(self.inner.evaluate(p).value) < 0
-        x, y, z = (dr.select(below, -row, row) for row in self.inner.hessian(p))
+        below = self._level_difference(self.field.evaluate(p).value) < 0
+        x, y, z = (dr.select(below, -row, row) for row in self.field.hessian(p))
         return x, y, z
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
         """Those of the inner field; infinite where rounding leaves it open on which side of a fold
         the point is: derivatives jump there."""
-        own = self.inner.evaluate(p)
-        slope, bend = self.inner.derivative_errors(p, own)
-        doubt = value_error(own, length(own.gradient), largest_coordinate(p))
-        away = dr.abs(self._offset(own.value))
-        if self.inner.period is not None:
-            away = fmin(away, 0.5 * self.inner.period - away)
+        own = self.field.evaluate(p)
+        slope, bend = self.field.derivative_errors(p, own)
+        doubt = value_error_bound(own, safe_norm(own.gradient), max_norm(p))
+        away = dr.abs(self._level_difference(own.value))
+        if self.field.period is not None:
+            away = fmin(away, 0.5 * self.field.period - away)
         is_clear = away > doubt
         return dr.select(is_clear, slope, dr.inf), dr.select(is_clear, bend, dr.inf)
 
-    def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
-        look = self.inner.look(path, t, ahead, back)
-        sample, offset = self._folded(look.sample)
+    def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
+        look = self.field.sample_ray(path, t, ahead, back)
+        sample, offset = self._fold_sample(look.sample)
 
         def folded(enclosures: tuple[Enclosure, ...]) -> tuple[Enclosure, ...]:
-            return tuple(Folded(one, offset, self.inner.period) for one in enclosures)
+            return tuple(FoldedEnclosure(one, offset, self.field.period) for one in enclosures)
 
         slope = dr.mulsign(look.slope, offset)
-        ahead_, back_ = folded(look.ahead), folded(look.back)
-        return Look(sample, ahead_, back_, slope, look.growth, look.slope_error)
+        ahead_, back_ = folded(look.forward), folded(look.backward)
+        return RaySample(sample, ahead_, back_, slope, look.reach_growth, look.slope_error)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        if not isinstance(self.inner, Formula | Solid):
+        if not isinstance(self.field, Formula | Solid):
             return super().formula(x, y, z)
-        return abs(self.inner.formula(x, y, z) - self.level) - self.half_width
+        return abs(self.field.formula(x, y, z) - self.level) - self.half_width
 
-    def _offset(self, value: Real) -> Real:
+    def _level_difference(self, value: Real) -> Real:
         """f - level, reduced to half a period on either side."""
-        offset, period = value - self.level, self.inner.period
+        offset, period = value - self.level, self.field.period
         return offset if period is None else offset - period * dr.round(offset / period)
 
-    def _folded(self, sample: Sample) -> tuple[Sample, Real]:
-        offset = self._offset(sample.value)
+    def _fold_sample(self, sample: Sample) -> tuple[Sample, Real]:
+        offset = self._level_difference(sample.value)
         turned = negated_sample(sample)
         below = offset < 0
         unit = 2 * float(dr.epsilon(type(offset)))
@@ -372,16 +376,16 @@ class Near(Derived):
             sample,
             value=dr.abs(offset) - self.half_width,
             gradient=dr.select(below, turned.gradient, sample.gradient),
-            error=sample.error + rounding,
-            normal=None,
-            known=() if lipschitz is None else (lipschitz,),
-            weaker=(),
-            along=(),
+            value_error=sample.value_error + rounding,
+            shading_normal=None,
+            promises=() if lipschitz is None else (lipschitz,),
+            alternative_promises=(),
+            ray_promises=(),
         ), offset
 
 
 @dataclass(frozen=True)
-class Folded(Enclosure):
+class FoldedEnclosure(Enclosure):
     """The movement of |r| from that of r, r known modulo a period and reduced to within half of it
     around 0.
 
@@ -395,29 +399,29 @@ class Folded(Enclosure):
     offset: Real
     period: float | None
 
-    def step(self, gaps: Gaps) -> Real:
-        return self.inner.step(self._gaps(gaps))
+    def free_length(self, gaps: LevelGaps) -> Real:
+        return self.inner.free_length(self._gaps(gaps))
 
-    def covers(self, gaps: Gaps, length: Real) -> Mask:
-        return self.inner.covers(self._gaps(gaps), length)
+    def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
+        return self.inner.is_free(self._gaps(gaps), length)
 
-    def _gaps(self, gaps: Gaps) -> Gaps:
+    def _gaps(self, gaps: LevelGaps) -> LevelGaps:
         """How far r must move, for r >= 0 with s = |r| (else mirrored), for |r| to reach A = s + up
         or B = s - down: upwards to A or P - B, downwards to B or -A, P the period."""
         size, none = dr.abs(self.offset), type(self.offset)(dr.inf)
-        has_below = gaps.down <= size * _SLACK
-        upwards, downwards = gaps.up, 2 * size + gaps.up
+        has_below = gaps.below <= size * _SLACK
+        upwards, downwards = gaps.above, 2 * size + gaps.above
         if self.period is not None:
-            has_above = size + gaps.up <= 0.5 * self.period * _SLACK
+            has_above = size + gaps.above <= 0.5 * self.period * _SLACK
             upwards, downwards = (dr.select(has_above, one, none) for one in (upwards, downwards))
-            around = self.period - 2 * size + gaps.down
+            around = self.period - 2 * size + gaps.below
             upwards = dr.select(has_below, fmin(around, upwards), upwards)
-        downwards = dr.select(has_below, fmin(gaps.down, downwards), downwards)
+        downwards = dr.select(has_below, fmin(gaps.below, downwards), downwards)
         # NaN proves nothing.
-        known = (gaps.down >= 0) & (gaps.up >= 0) & (size >= 0)
+        known = (gaps.below >= 0) & (gaps.above >= 0) & (size >= 0)
         upwards, downwards = (dr.select(known, one, dr.nan) for one in (upwards, downwards))
         positive = self.offset >= 0
-        return Gaps(
+        return LevelGaps(
             dr.select(positive, downwards, upwards), dr.select(positive, upwards, downwards)
         )
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, cast
 import drjit as dr
 
 from harnack.backend.elementary import clamp, fmax, fmin
-from harnack.backend.validation import finite, whole
+from harnack.backend.validation import as_finite, as_integer_in_range
 from harnack.enclosures import Lipschitz
 from harnack.fields.samples import Sample
 from harnack.fields.solids.solid import Solid, ball_around
@@ -35,7 +35,7 @@ class Julia(Solid):
 
     c: the constant, four numbers; the real part comes first.
     iterations: N. More of them show finer parts, and the solid shrinks to the Julia set.
-    slice: the fourth coordinate; points of space are q = x + y i + z j + slice k.
+    fourth_coordinate: the fourth coordinate; points of space are q = x + y i + z j + slice k.
 
     f = 2^-N max(log(|q_N|/B), -1), with B = (1 + sqrt(1 + 4 |c|))/2: from |q| > B on an orbit
     escapes, for |q|^2 - |c| > |q| there. So f <= 0 on the filled Julia set, for any N.
@@ -59,7 +59,7 @@ class Julia(Solid):
 
     c: Quaternion = (-0.2, 0.8, 0.0, 0.0)
     iterations: int = 10
-    slice: float = 0.0
+    fourth_coordinate: float = 0.0
 
     def __post_init__(self) -> None:
         try:
@@ -68,20 +68,22 @@ class Julia(Solid):
             numbers = ()
         if len(numbers) != 4:
             raise ValueError(f"c of a Julia set must be four numbers, not {self.c!r}")
-        c = tuple(finite(one, "each part of c of a Julia set") for one in numbers)
+        c = tuple(as_finite(one, "each part of c of a Julia set") for one in numbers)
         if not math.hypot(*c) <= 10.0:
             raise ValueError(f"c of a Julia set must be no longer than 10, not {self.c!r}")
         object.__setattr__(self, "c", c)
-        count = whole(self.iterations, "the iterations of a Julia set", 1, 60)
+        count = as_integer_in_range(self.iterations, "the iterations of a Julia set", 1, 60)
         object.__setattr__(self, "iterations", count)
-        object.__setattr__(self, "slice", finite(self.slice, "the slice of a Julia set"))
+        object.__setattr__(
+            self, "fourth_coordinate", as_finite(self.fourth_coordinate, "the slice of a Julia set")
+        )
 
     @property
     def escape_radius(self) -> float:
         """B: an orbit that has left this radius never returns."""
         return 0.5 + math.sqrt(0.25 + math.hypot(*self.c))
 
-    def leaves(self, change: Callable[[Solid], Solid]) -> Solid:
+    def map_operands(self, change: Callable[[Solid], Solid]) -> Solid:
         return change(self)
 
     def prepare(self, backend: Backend) -> Julia:
@@ -89,12 +91,15 @@ class Julia(Solid):
         made = copy.copy(self)
         size = math.hypot(*self.c)
         for name, value in (
-            ("_c", self.c), ("_slice", self.slice), ("_size", size), ("_b", self.escape_radius),
-        ):  # fmt: skip
+            ("_c", self.c),
+            ("_slice", self.fourth_coordinate),
+            ("_size", size),
+            ("_b", self.escape_radius),
+        ):
             object.__setattr__(made, name, _data(backend, value))
         return made
 
-    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+    def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         """Proof. Where |q_0| = B (1 + t), t > 0, |q_n| >= B (1 + (2B)^n t) by induction, for B^2 -
         |c| = B; so f <= level needs (2B)^N t <= exp(2^N level) - 1."""
         b, scaled = self.escape_radius, 2.0**self.iterations * level
@@ -102,7 +107,7 @@ class Julia(Solid):
             return None
         beyond = math.expm1(max(scaled, 0.0)) / (2.0 * b) ** self.iterations
         reach = b * (1.0 + beyond)
-        across = reach * reach - self.slice * self.slice
+        across = reach * reach - self.fourth_coordinate * self.fourth_coordinate
         return ball_around((0.0, 0.0, 0.0), math.sqrt(max(across, 0.0)))
 
     def evaluate(self, p: Vec3) -> Sample:
@@ -114,7 +119,7 @@ class Julia(Solid):
         value, gradient, error, (steepest,) = self._orbit(p, (zero,))
         # No step is longer than this, as the constant of a ball is at least that at its center.
         longest = dr.abs(value) / steepest
-        longest = clamp(dr.select(dr.isfinite(longest), longest, 1), 1e-6, self._number("_b"))
+        longest = clamp(dr.select(dr.isfinite(longest), longest, 1), 1e-6, self._parameter("_b"))
         radii = tuple(longest * one for one in _RADII)
         constants = self._orbit(p, radii)[3]
         known: list[Lipschitz] = []
@@ -123,36 +128,36 @@ class Julia(Solid):
             known.append(Lipschitz(dr.select(proved, most, 0), dr.select(proved, radius, 0)))
         return Sample(value, gradient, tuple(known), error)
 
-    def _number(self, name: str) -> Any:
+    def _parameter(self, name: str) -> Any:
         return getattr(self, name)
 
     def _orbit(self, p: Vec3, radii: tuple[Real, ...]) -> tuple[Any, ...]:
         """f, its gradient, how far f is off, and bounds of |grad f| in balls; for the error
         to be that of rounding alone, the first radius is 0."""
-        c, size, b = self._number("_c"), self._number("_size"), self._number("_b")
+        c, size, b = self._parameter("_c"), self._parameter("_size"), self._parameter("_b")
         real = cast("Any", type(p.x))
         single = dr.type_v(real) == dr.VarType.Float32
         far = _FAR["single" if single else "double"]
         unit = 2 * float(dr.epsilon(real))
         zero, one = 0 * p.x, 0 * p.x + 1
-        q = [p.x, p.y, p.z, zero + self._number("_slice")]
+        q = [p.x, p.y, p.z, zero + self._parameter("_slice")]
         slopes = [one, zero, zero, zero, one, zero, zero, zero, one, zero, zero, zero]
         moved = [zero + r for r in radii]
         steep = [one for _ in radii]
-        start = dr.sqrt(_square(q))
+        start = dr.sqrt(_squared_norm(q))
         least = [fmax(start * (1 - 4 * unit) - r, 0) for r in moved]
         rates = [1 / low for low in least]
 
         def body(n: Any, *state: Any) -> tuple[Any, ...]:
             q, slopes = list(state[:4]), state[4:16]
-            moved, steep, least, rates = _quarters(state[16:])
+            moved, steep, least, rates = _split_in_four(state[16:])
             bent: list[Any] = [None] * 12
             for k in range(3):
                 a, *v = (slopes[3 * i + k] for i in range(4))
                 bent[k] = 2 * (q[0] * a - (q[1] * v[0] + q[2] * v[1] + q[3] * v[2]))
                 for i in range(3):
                     bent[3 * (i + 1) + k] = 2 * (q[0] * v[i] + q[i + 1] * a)
-            square = _square(q)
+            square = _squared_norm(q)
             norm = dr.sqrt(square) * (1 + 4 * unit)
             # Each part of q^2 + c is off by a few roundings of |q|^2 + |c|.
             rounded = 8 * unit * (square + size)
@@ -162,7 +167,7 @@ class Julia(Solid):
             steeper = [
                 2 * (norm + e) * d * (1 + 8 * unit) for e, d in zip(moved, steep, strict=True)
             ]
-            after = dr.sqrt(_square(new)) * (1 - 4 * unit)
+            after = dr.sqrt(_squared_norm(new)) * (1 - 4 * unit)
             lows: list[Real] = []
             slower: list[Real] = []
             for e, d, low, rate in zip(farther, steeper, least, rates, strict=True):
@@ -174,14 +179,14 @@ class Julia(Solid):
             return n + 1, *new, *bent, *farther, *steeper, *lows, *slower
 
         def goes_on(n: Any, *state: Any) -> Any:
-            return (n < self.iterations) & (_square(state[:4]) <= far * far)
+            return (n < self.iterations) & (_squared_norm(state[:4]) <= far * far)
 
         index = dr.uint32_array_t(real)
         begin = (dr.zeros(index, dr.width(p)), *q, *slopes, *moved, *steep, *least, *rates)
         n, *state = dr.while_loop(begin, goes_on, body, label="quaternion Julia set")
         q, slopes = state[:4], state[4:16]
-        moved, steep, least, rates = _quarters(state[16:])
-        square = _square(q)
+        moved, steep, least, rates = _split_in_four(state[16:])
+        square = _squared_norm(q)
         norm = dr.sqrt(square)
         share = dr.exp2(-real(n)) * (1 + 4 * unit)
         all_made = n >= self.iterations
@@ -206,7 +211,7 @@ class Julia(Solid):
         return value, gradient, off + spread, constants
 
 
-def _quarters(state: Any) -> tuple[Any, Any, Any, Any]:
+def _split_in_four(state: Any) -> tuple[Any, Any, Any, Any]:
     k = len(state) // 4
     return state[:k], state[k : 2 * k], state[2 * k : 3 * k], state[3 * k :]
 
@@ -217,5 +222,5 @@ def _data(backend: Backend, value: Any) -> Any:
     return dr.opaque(backend.Float, float(value))
 
 
-def _square(q: Any) -> Any:
+def _squared_norm(q: Any) -> Any:
     return q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]

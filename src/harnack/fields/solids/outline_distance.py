@@ -1,7 +1,7 @@
 """The signed distance from an outline in the plane, and what it does along a line of the plane.
 
 Edges are read in a loop. Where there are many, chains of consecutive edges are skipped by their
-boxes, so that an outline of 1,000 edges costs about as much as one of 100 (`OutlineBuffers`).
+boxes, so that an outline of 1,000 edges costs about as much as one of 100 (`OutlineEdges`).
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ import numpy as np
 
 from harnack.backend import FloatArray, IntArray
 from harnack.backend.elementary import clamp, fmax, fmin
-from harnack.backend.record_table import Records
-from harnack.enclosures import Enclosure, Gaps
-from harnack.fields.solids.tube import TubeAhead, lowered
+from harnack.backend.record_table import RecordTable
+from harnack.enclosures import Enclosure, LevelGaps
+from harnack.fields.solids.tube import TangentEnclosure, min_with_tangent
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real
@@ -34,24 +34,24 @@ _ROUNDINGS = 4.0
 
 
 @dataclass(frozen=True)
-class Nearest:
+class OutlineSample:
     """What is known of the signed distance d at points of the plane.
 
     value: d, negative inside. gradient: (d_x, d_y), a unit vector. error, gradient_error: of them.
-    bend: the second derivative across the gradient: 1/d beside a vertex, else 0.
-    lows: lower bounds of |d| along the line at knots, less |d| here, rounding included.
+    second_derivative: the second derivative across the gradient: 1/d beside a vertex, else 0.
+    lower_bounds: lower bounds of |d| along the line at knots, less |d| here, rounding included.
     """
 
     value: Real
     gradient: tuple[Real, Real]
     error: Real
     gradient_error: Real
-    bend: Real = 0.0
-    lows: tuple[Real, ...] = ()
+    second_derivative: Real = 0.0
+    lower_bounds: tuple[Real, ...] = ()
 
 
 @dataclass(frozen=True)
-class OutlineBuffers:
+class OutlineEdges:
     """The edges of an outline on a backend.
 
     edges: (ax, ay, bx, by, 1/length^2) from a to b, relative to `center`, the region on the left.
@@ -72,13 +72,13 @@ class OutlineBuffers:
     it, never; and a box that holds the point is at distance 0, so that its edges are read.
     """
 
-    edges: Records
-    chains: Records | None
+    edges: RecordTable
+    chains: RecordTable | None
     center: tuple[Real, Real]
     size: Real
 
     @classmethod
-    def upload(cls, backend: Backend, outline: Outline, *, axis: bool = False) -> OutlineBuffers:
+    def upload(cls, backend: Backend, outline: Outline, *, axis: bool = False) -> OutlineEdges:
         """axis: leave out edges on the line x = 0, beyond which nothing is asked."""
         points = np.concatenate(outline)
         center = 0.5 * (points.min(axis=0) + points.max(axis=0))
@@ -98,10 +98,10 @@ class OutlineBuffers:
         rows = np.column_stack([start, end, 1.0 / square])
         chains = None
         if len(rows) >= _MANY:
-            chains = Records.upload(backend, _chains(start, end, owner))
+            chains = RecordTable.upload(backend, _chains(start, end, owner))
         size = float(np.linalg.norm(start, axis=1).max())
         x, y, size = (dr.opaque(backend.Float, v) for v in (*map(float, center), size))
-        return cls(Records.upload(backend, rows), chains, (x, y), size)
+        return cls(RecordTable.upload(backend, rows), chains, (x, y), size)
 
     def knots(self, x: Real, y: Real, ahead: Real) -> tuple[Real, ...]:
         """Lengths at which the distance along a line is bounded, the last that asked for."""
@@ -109,24 +109,24 @@ class OutlineBuffers:
         length = dr.select(dr.isfinite(ahead), ahead, far)
         return (*(one * length for one in _KNOTS), ahead)
 
-    def nearest(
+    def sample(
         self,
         x: Real,
         y: Real,
         velocity: tuple[Real, Real] | None = None,
         knots: tuple[Real, ...] = (),
-    ) -> Nearest:
+    ) -> OutlineSample:
         """The signed distance of points (x, y), and along lines from there with a velocity of
         length 1 at most.
 
         Proof of the lows: the distance from an edge, or from the box of a chain, is a convex
-        function along a line, so that it stays above its tangent (`TubeAhead`).
+        function along a line, so that it stays above its tangent (`TangentEnclosure`).
         """
         real = cast("Any", type(x))
         unit = 2 * float(dr.epsilon(real))
         x, y = x - self.center[0], y - self.center[1]
         size = dr.abs(x) + dr.abs(y)
-        query = _Query(x, y, velocity, knots, _ROUNDINGS * unit * (size + self.size), unit)
+        query = _OutlineQuery(x, y, velocity, knots, _ROUNDINGS * unit * (size + self.size), unit)
         zero = 0 * x
         start = zero + dr.inf, zero, zero, zero, zero, zero, zero > 1, zero > 1
         state = (*start, *(zero + dr.inf for _ in knots))
@@ -149,20 +149,22 @@ class OutlineBuffers:
         doubt = dr.select(on_edge, 8 * unit, fmin(2 * error / distance, 2))
         lower = tuple(low - distance - error for low in lows)
         bend = dr.select(on_edge, 0, sign / distance)
-        return Nearest(sign * distance, (gradient[0], gradient[1]), error, doubt, bend, lower)
+        return OutlineSample(sign * distance, (gradient[0], gradient[1]), error, doubt, bend, lower)
 
-    def _by_chains(self, chains: Records, query: _Query, state: tuple[Any, ...]) -> tuple[Any, ...]:
-        (most,) = chains.for_each(query.bounded, (query.x + dr.inf,), "outline chains")
+    def _by_chains(
+        self, chains: RecordTable, query: _OutlineQuery, state: tuple[Any, ...]
+    ) -> tuple[Any, ...]:
+        (most,) = chains.for_each(query.chain_upper_bound, (query.x + dr.inf,), "outline chains")
         limit = dr.sqrt(most) * (1 + 1e-5) + query.error
-        index = type(chains.trips)(0)
+        index = type(chains.iteration_count)(0)
 
         def visit(i: Any, *state: Any) -> tuple[Any, ...]:
-            row = chains.row(i)
+            row = chains.read_record(i)
             count, state = query.with_chain(row, limit, state)
             first, count = type(i)(row[6]), type(i)(count)
 
             def each(j: Any, *inner: Any) -> tuple[Any, ...]:
-                return j + 1, *query.with_edge(self.edges.row(first + j), inner)
+                return j + 1, *query.with_edge(self.edges.read_record(first + j), inner)
 
             def more(j: Any, *_: Any) -> Mask:
                 return j < count
@@ -170,14 +172,14 @@ class OutlineBuffers:
             return i + 1, *dr.while_loop((type(i)(0), *state), more, each, label="outline")[1:]
 
         def more_chains(i: Any, *_: Any) -> Mask:
-            return i < chains.trips
+            return i < chains.iteration_count
 
         start = (index, *state)
         return dr.while_loop(start, more_chains, visit, label="outline by chains")[1:]
 
 
 @dataclass(frozen=True)
-class _Query:
+class _OutlineQuery:
     """Points of the plane, relative to the outline's center, and lines from them.
 
     error: a bound of the rounding of distances from boxes.
@@ -225,7 +227,7 @@ class _Query:
             *lows,
         )
 
-    def bounded(self, row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
+    def chain_upper_bound(self, row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
         """The square of a distance within which a chain has a point."""
         (least,) = state
         near_x, far_x = self._sides(self.x, row[0], row[2])
@@ -259,7 +261,7 @@ class _Query:
             return lows
         slope = (x * self.velocity[0] + y * self.velocity[1]) / distance - 2 * off / distance
         rounding = 4 * self.unit * distance
-        return lowered(lows, self.knots, distance - off, slope, rounding, self.unit)
+        return min_with_tangent(lows, self.knots, distance - off, slope, rounding, self.unit)
 
 
 def _chains(start: FloatArray, end: FloatArray, owner: IntArray) -> FloatArray:
@@ -279,7 +281,7 @@ def _chains(start: FloatArray, end: FloatArray, owner: IntArray) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class SignedAhead(Enclosure):
+class SignedDistanceEnclosure(Enclosure):
     """A signed distance d of constant 1 along a path, from a bound of |d|.
 
     Proof. As long as |d| > 0, d keeps its sign: for d > 0 it falls as |d| does, down to 0, and
@@ -288,19 +290,21 @@ class SignedAhead(Enclosure):
     """
 
     value: Real
-    size: TubeAhead
+    size: TangentEnclosure
 
     @classmethod
-    def around(cls, nearest: Nearest, slope: Real, knots: tuple[Real, ...]) -> SignedAhead:
+    def around(
+        cls, nearest: OutlineSample, slope: Real, knots: tuple[Real, ...]
+    ) -> SignedDistanceEnclosure:
         """slope: of d along the path."""
         distance = dr.abs(nearest.value)
         most = fmin(dr.mulsign(slope, nearest.value) + nearest.gradient_error, 1.0)
-        return cls(nearest.value, TubeAhead(distance, most, knots, nearest.lows))
+        return cls(nearest.value, TangentEnclosure(distance, most, knots, nearest.lower_bounds))
 
-    def step(self, gaps: Gaps) -> Real:
+    def free_length(self, gaps: LevelGaps) -> Real:
         positive = self.value > 0
-        nearer = dr.select(positive, gaps.down, gaps.up)
-        farther = dr.select(positive, gaps.up, gaps.down)
-        own = self.size.step(Gaps(fmin(nearer, dr.abs(self.value)), farther))
-        known = (gaps.down >= 0) & (gaps.up >= 0)
-        return dr.select(known, fmax(own, fmin(gaps.down, gaps.up) * (1 - 1e-6)), 0)
+        nearer = dr.select(positive, gaps.below, gaps.above)
+        farther = dr.select(positive, gaps.above, gaps.below)
+        own = self.size.free_length(LevelGaps(fmin(nearer, dr.abs(self.value)), farther))
+        known = (gaps.below >= 0) & (gaps.above >= 0)
+        return dr.select(known, fmax(own, fmin(gaps.below, gaps.above) * (1 - 1e-6)), 0)

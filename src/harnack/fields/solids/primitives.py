@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from harnack.arithmetic import cos, maximum, minimum, norm, sin
-from harnack.arithmetic.norms import corner
-from harnack.backend.validation import finite, positive, triple
-from harnack.fields.formula import prepared_numbers
-from harnack.fields.solids.solid import Point, Shape, ball_around, box_around, set_checked
+from harnack.arithmetic.norms import orthogonal_intersection
+from harnack.backend.validation import as_finite, as_positive, as_triple
+from harnack.fields.formula import with_device_numbers
+from harnack.fields.solids.solid import FormulaSolid, Point, ball_around, box_around, set_frozen
 
 if TYPE_CHECKING:
     from harnack.backend import Backend
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Plane(Shape):
+class Plane(FormulaSolid):
     """The half-space n.x <= distance, n the normal made a unit vector.
 
     The signed distance (Hart, equation 23): its gradient is n, so that its Lipschitz constant is 1.
@@ -39,24 +39,24 @@ class Plane(Shape):
     distance: float = 0.0
 
     def __post_init__(self) -> None:
-        normal = triple(self.normal, "the normal of a plane")
+        normal = as_triple(self.normal, "the normal of a plane")
         length = math.hypot(*normal)
         if length == 0.0:
             raise ValueError("the normal of a plane must not be zero")
-        set_checked(self, "normal", tuple(v / length for v in normal))
-        set_checked(self, "distance", finite(self.distance, "the distance of a plane"))
+        set_frozen(self, "normal", tuple(v / length for v in normal))
+        set_frozen(self, "distance", as_finite(self.distance, "the distance of a plane"))
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         a, b, c = self.normal
         return x * a + y * b + z * c - self.distance
 
-    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+    def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         del level, above
         return None
 
 
 @dataclass(frozen=True)
-class Sphere(Shape):
+class Sphere(FormulaSolid):
     """The ball |x - center| <= radius.
 
     The signed distance (Hart, equation 24): by the triangle inequality the constant is 1.
@@ -70,14 +70,14 @@ class Sphere(Shape):
     lipschitz = 1.0
 
     def __post_init__(self) -> None:
-        set_checked(self, "radius", positive(self.radius, "the radius of a sphere"))
-        set_checked(self, "center", triple(self.center, "the center of a sphere"))
+        set_frozen(self, "radius", as_positive(self.radius, "the radius of a sphere"))
+        set_frozen(self, "center", as_triple(self.center, "the center of a sphere"))
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         a, b, c = self.center
         return norm(x - a, y - b, z - c) - self.radius
 
-    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+    def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         if above:
             return None
         return ball_around(self.center, self.radius + level)
@@ -92,7 +92,7 @@ def _box_of_radii(radii: tuple[float, float, float], level: float) -> Volume:
 
 
 @dataclass(frozen=True)
-class Ellipsoid(Shape):
+class Ellipsoid(FormulaSolid):
     """The points with |(x/a, y/b, z/c)| <= 1, radii = (a, b, c).
 
     f = m (|(x/a, y/b, z/c)| - 1) with m the least radius. Proof of the constant 1: the norm has the
@@ -107,19 +107,19 @@ class Ellipsoid(Shape):
     lipschitz = 1.0 + 1e-6  # quotients of radii are rounded
 
     def __post_init__(self) -> None:
-        radii = triple(self.radii, "the radii of an ellipsoid", all_positive=True)
-        set_checked(self, "radii", radii)
+        radii = as_triple(self.radii, "the radii of an ellipsoid", all_positive=True)
+        set_frozen(self, "radii", radii)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         a, b, c = self.radii
         return (norm(x / a, y / b, z / c) - 1.0) * minimum(a, b, c)
 
-    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+    def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         return None if above else _box_of_radii(self.radii, level)
 
 
 @dataclass(frozen=True)
-class Cylinder(Shape):
+class Cylinder(FormulaSolid):
     """The points within `radius` of the z axis, and of |z| <= half_height if that is given.
 
     Without ends the signed distance |(x, y)| - r (Hart, equation 25). With ends the distances to
@@ -135,16 +135,20 @@ class Cylinder(Shape):
     lipschitz = 1.0
 
     def __post_init__(self) -> None:
-        set_checked(self, "radius", positive(self.radius, "the radius of a cylinder"))
+        set_frozen(self, "radius", as_positive(self.radius, "the radius of a cylinder"))
         if self.half_height is not None:
-            height = positive(self.half_height, "half the height of a cylinder")
-            set_checked(self, "half_height", height)
+            height = as_positive(self.half_height, "half the height of a cylinder")
+            set_frozen(self, "half_height", height)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         side = norm(x, y) - self.radius
-        return side if self.half_height is None else corner(side, abs(z) - self.half_height)
+        return (
+            side
+            if self.half_height is None
+            else orthogonal_intersection(side, abs(z) - self.half_height)
+        )
 
-    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+    def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         if above:
             return None
         if self.half_height is None:
@@ -154,7 +158,7 @@ class Cylinder(Shape):
 
 
 @dataclass(frozen=True)
-class DoubleCone(Shape):
+class DoubleCone(FormulaSolid):
     """The double cone around the z axis whose sides make an angle with it, in radians.
 
     f = |(x, y)| cos(angle) - |z| sin(angle) (Hart, equation 26). Its gradient is a unit vector off
@@ -167,24 +171,24 @@ class DoubleCone(Shape):
     lipschitz = 1.0 + 1e-6  # sine and cosine are rounded
 
     def __post_init__(self) -> None:
-        angle = finite(self.angle, "the angle of a cone")
+        angle = as_finite(self.angle, "the angle of a cone")
         if not 0.0 < angle < math.pi / 2:
             raise ValueError(
                 "the angle of a cone between axis and side must be between 0 and pi/2, "
                 f"not {self.angle!r}"
             )
-        set_checked(self, "angle", angle)
+        set_frozen(self, "angle", angle)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         return norm(x, y) * cos(self.angle) - abs(z) * sin(self.angle)
 
-    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+    def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         del level, above
         return None
 
 
 @dataclass(frozen=True)
-class Capsule(Shape):
+class Capsule(FormulaSolid):
     """The points within `radius` of the segment from start to end.
 
     The signed distance |q - max(0, min(1, t)) (end - start)| - r, q = x - start, t the parameter of
@@ -200,13 +204,13 @@ class Capsule(Shape):
     lipschitz = 1.0
 
     def __post_init__(self) -> None:
-        start = triple(self.start, "the start of a capsule")
-        end = triple(self.end, "the end of a capsule")
+        start = as_triple(self.start, "the start of a capsule")
+        end = as_triple(self.end, "the end of a capsule")
         if start == end:
             raise ValueError(f"a capsule from {start} to the same point is a sphere: use Sphere")
-        set_checked(self, "start", start)
-        set_checked(self, "end", end)
-        set_checked(self, "radius", positive(self.radius, "the radius of a capsule"))
+        set_frozen(self, "start", start)
+        set_frozen(self, "end", end)
+        set_frozen(self, "radius", as_positive(self.radius, "the radius of a capsule"))
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         axis = [b - a for a, b in zip(self.start, self.end, strict=True)]
@@ -219,7 +223,7 @@ class Capsule(Shape):
         across = norm(*(v - t * a for v, a in zip(q, axis, strict=True)))
         return norm(across, beyond) - self.radius
 
-    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+    def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         if above:
             return None
         r = self.radius + level
@@ -230,7 +234,7 @@ class Capsule(Shape):
 
 
 @dataclass(frozen=True)
-class Torus(Shape):
+class Torus(FormulaSolid):
     """The points within `minor` of the circle of radius `major` around the z axis.
 
     The signed distance | (|(x, y)| - R, z) | - r (Hart, equation 27); a distance of a set, so its
@@ -243,13 +247,13 @@ class Torus(Shape):
     lipschitz = 1.0
 
     def __post_init__(self) -> None:
-        set_checked(self, "major", positive(self.major, "the major radius of a torus"))
-        set_checked(self, "minor", positive(self.minor, "the minor radius of a torus"))
+        set_frozen(self, "major", as_positive(self.major, "the major radius of a torus"))
+        set_frozen(self, "minor", as_positive(self.minor, "the minor radius of a torus"))
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         return norm(norm(x, y) - self.major, z) - self.minor
 
-    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+    def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         if above:
             return None
         r = self.minor + level
@@ -257,7 +261,7 @@ class Torus(Shape):
 
 
 @dataclass(frozen=True)
-class Cuboid(Shape):
+class Cuboid(FormulaSolid):
     """The box |x| <= a, |y| <= b, |z| <= c of half sides (a, b, c), its edges rounded by `radius`.
 
     The signed distance: that of the box smaller by the radius (`corner`), less the radius.
@@ -271,23 +275,23 @@ class Cuboid(Shape):
     lipschitz = 1.0
 
     def __post_init__(self) -> None:
-        sides = triple(self.half_sides, "the half sides of a box", all_positive=True)
-        set_checked(self, "half_sides", sides)
-        radius = finite(self.radius, "the radius of the edges of a box")
+        sides = as_triple(self.half_sides, "the half sides of a box", all_positive=True)
+        set_frozen(self, "half_sides", sides)
+        radius = as_finite(self.radius, "the radius of the edges of a box")
         if not 0.0 <= radius <= min(sides):
             raise ValueError(
                 "the radius of the edges of a box must be between 0 and its least half side "
                 f"{min(sides):g}, not {self.radius!r}"
             )
-        set_checked(self, "radius", radius)
+        set_frozen(self, "radius", radius)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         sides = (
             abs(v) - (a - self.radius) for v, a in zip((x, y, z), self.half_sides, strict=True)
         )
-        return corner(*sides) - self.radius
+        return orthogonal_intersection(*sides) - self.radius
 
-    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+    def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         if above:
             return None
         a, b, c = (one + level for one in self.half_sides)
@@ -325,14 +329,14 @@ def _checked_powers(powers: Any, name: str) -> tuple[float, float]:
     return p, q
 
 
-class _Powered(Shape):
+class _Powered(FormulaSolid):
     """A shape with powers, which are literals of its kernel and no kernel parameters."""
 
     powers: tuple[float, float]
 
     def prepare(self, backend: Backend) -> Field:
-        made = prepared_numbers(self, backend)
-        set_checked(made, "powers", self.powers)
+        made = with_device_numbers(self, backend)
+        set_frozen(made, "powers", self.powers)
         return made
 
 
@@ -350,9 +354,9 @@ class Superellipsoid(_Powered):
     radii: Point = (1.0, 1.0, 1.0)
 
     def __post_init__(self) -> None:
-        set_checked(self, "powers", _checked_powers(self.powers, "superellipsoid"))
-        radii = triple(self.radii, "the radii of a superellipsoid", all_positive=True)
-        set_checked(self, "radii", radii)
+        set_frozen(self, "powers", _checked_powers(self.powers, "superellipsoid"))
+        radii = as_triple(self.radii, "the radii of a superellipsoid", all_positive=True)
+        set_frozen(self, "radii", radii)
 
     @property
     def lipschitz(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -362,7 +366,7 @@ class Superellipsoid(_Powered):
         (p, q), (a, b, c) = self.powers, self.radii
         return (norm(norm(x / a, y / b, p=p), z / c, p=q) - 1.0) * minimum(a, b, c)
 
-    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+    def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         return None if above else _box_of_radii(self.radii, level)
 
 
@@ -378,9 +382,9 @@ class Supertorus(_Powered):
     minor: float = 0.25
 
     def __post_init__(self) -> None:
-        set_checked(self, "powers", _checked_powers(self.powers, "supertorus"))
-        set_checked(self, "major", positive(self.major, "the major radius of a supertorus"))
-        set_checked(self, "minor", positive(self.minor, "the minor radius of a supertorus"))
+        set_frozen(self, "powers", _checked_powers(self.powers, "supertorus"))
+        set_frozen(self, "major", as_positive(self.major, "the major radius of a supertorus"))
+        set_frozen(self, "minor", as_positive(self.minor, "the minor radius of a supertorus"))
 
     @property
     def lipschitz(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -390,7 +394,7 @@ class Supertorus(_Powered):
         p, q = self.powers
         return norm(norm(x, y, p=p) - self.major, z, p=q) - self.minor
 
-    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+    def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         if above:
             return None
         r = self.minor + level

@@ -1,7 +1,7 @@
 """What a solid is: the points where a function is not positive; and how solids are combined.
 
-`Solid` is the base of all, `Shape` of those with a formula, `Derived` of those made of another
-field, `Map` of maps of space.
+`Solid` is the base of all, `FormulaSolid` of those with a formula, `SolidOfField` of those made of
+another field, `SpaceMap` of maps of space.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ import dataclasses
 import functools
 from typing import TYPE_CHECKING, Any, cast
 
-from harnack.backend.validation import positive, refuses_derivatives
-from harnack.cluster.serialization import Remembered
+from harnack.backend.validation import as_positive, no_derivatives
+from harnack.cluster.serialization import TransientCache
 from harnack.fields.field import Field
 from harnack.fields.formula import Formula
 from harnack.geometry import Ball, Box, Volume
@@ -28,14 +28,16 @@ if TYPE_CHECKING:
 
 # Extents are widened by this fraction of the coordinates, as the numbers of a shape are rounded to
 # the precision in which it is traced.
-_ROUNDED = 1e-6
+_EXTENT_MARGIN = 1e-6
 
 Point = tuple[float, float, float]
 
 
 def box_around(half: tuple[float, float, float], center: Any = (0.0, 0.0, 0.0)) -> Volume:
     """The box with these half sides, which count as 0 if they are negative."""
-    sizes = [max(h, 0.0) + _ROUNDED * (abs(h) + abs(c)) for h, c in zip(half, center, strict=True)]
+    sizes = [
+        max(h, 0.0) + _EXTENT_MARGIN * (abs(h) + abs(c)) for h, c in zip(half, center, strict=True)
+    ]
     lower = [c - s for c, s in zip(center, sizes, strict=True)]
     upper = [c + s for c, s in zip(center, sizes, strict=True)]
     return Box((lower[0], lower[1], lower[2]), (upper[0], upper[1], upper[2]))
@@ -43,11 +45,11 @@ def box_around(half: tuple[float, float, float], center: Any = (0.0, 0.0, 0.0)) 
 
 def ball_around(center: tuple[float, float, float], radius: float) -> Volume:
     """The ball with this radius, which counts as 0 if it is negative."""
-    slack = _ROUNDED * (abs(radius) + sum(abs(c) for c in center)) + 1e-30
+    slack = _EXTENT_MARGIN * (abs(radius) + sum(abs(c) for c in center)) + 1e-30
     return Ball(center, max(radius, 0.0) + slack)
 
 
-def set_checked(shape: Any, name: str, value: Any) -> None:
+def set_frozen(shape: Any, name: str, value: Any) -> None:
     """Set an attribute of a frozen shape to a value that was checked."""
     object.__setattr__(shape, name, value)
 
@@ -55,11 +57,11 @@ def set_checked(shape: Any, name: str, value: Any) -> None:
 AXES = {"x": 0, "y": 1, "z": 2}
 
 
-class Map(abc.ABC):
+class SpaceMap(abc.ABC):
     """A map of space, one to one."""
 
     @abc.abstractmethod
-    def of(self, solid: Solid) -> Solid:
+    def apply(self, solid: Solid) -> Solid:
         """The image of a solid that is no combination of others."""
 
 
@@ -80,7 +82,7 @@ def not_a_solid(other: Any) -> str:
     return f"only solids, such as harnack.Sphere(1.0), are combined, not {kind}"
 
 
-def _remembering(prepare: Callable[[Any, Backend], Field]) -> Callable[[Any, Backend], Field]:
+def _with_source(prepare: Callable[[Any, Backend], Field]) -> Callable[[Any, Backend], Field]:
     @functools.wraps(prepare)
     def remembering(self: Any, backend: Backend) -> Field:
         prepared = prepare(self, backend)
@@ -102,11 +104,11 @@ class Solid(Field):
         of the distance (Hart 1996, definition 3); None where none is known.
     """
 
-    overstep = 1.0
+    over_relaxation = 1.0
     has_creases = True
     lipschitz: Any = None
 
-    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+    def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         """A volume proved to hold all points where f <= level, or f >= level if `above`; None where
         none is known."""
         del level, above
@@ -114,14 +116,14 @@ class Solid(Field):
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
         own: Solid = vars(self).get("_source", self)
-        return own.hull(max(levels)) or own.hull(min(levels), above=True)
+        return own.sublevel_extent(max(levels)) or own.sublevel_extent(min(levels), above=True)
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         """Wrap `prepare`: a prepared solid, whose numbers lie on a backend, keeps a reference to
         the original."""
         super().__init_subclass__(**kwargs)
         if "prepare" in vars(cls):
-            cls.prepare = _remembering(cls.prepare)  # type: ignore[method-assign]
+            cls.prepare = _with_source(cls.prepare)  # type: ignore[method-assign]
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         """f of coordinates that are jets; see `Formula`.
@@ -136,7 +138,7 @@ class Solid(Field):
         )
 
     @abc.abstractmethod
-    def leaves(self, change: Callable[[Solid], Solid]) -> Solid:
+    def map_operands(self, change: Callable[[Solid], Solid]) -> Solid:
         """The same combination with each part changed, as a map of space maps each part."""
 
     # Combinations. Operands that are no solids are refused.
@@ -166,7 +168,7 @@ class Solid(Field):
 
         return Complement(self)
 
-    @refuses_derivatives
+    @no_derivatives
     def blended(
         self, other: Solid, radius: float, *, power: float = 2.0, intersect: bool = False
     ) -> Solid:
@@ -188,19 +190,19 @@ class Solid(Field):
         Raises:
             ValueError: radius or power out of range. TypeError: a solid without a formula.
         """
-        from harnack.fields.solids.booleans import Blend
+        from harnack.fields.solids.booleans import BlendedSolid
 
-        return Blend((self, other), radius, power, not intersect)
+        return BlendedSolid((self, other), radius, power, not intersect)
 
-    @refuses_derivatives
-    def grown(self, distance: float) -> Solid:
+    @no_derivatives
+    def offset(self, distance: float) -> Solid:
         """The points where f <= distance: larger by that length, or smaller if it is negative,
         where f is a distance."""
-        from harnack.fields.solids.booleans import Offset
+        from harnack.fields.solids.booleans import OffsetSolid
 
-        return Offset(self, distance)
+        return OffsetSolid(self, distance)
 
-    @refuses_derivatives
+    @no_derivatives
     def shell(self, thickness: float) -> Solid:
         """The solid, hollow: the points where -thickness <= f <= 0, a wall of that thickness inside
         of the surface where f is a distance, as of a mesh, a sphere or an outline.
@@ -208,72 +210,72 @@ class Solid(Field):
         Raises:
             ValueError: a thickness that is not positive.
         """
-        from harnack.fields.solids.from_field import Near
+        from harnack.fields.solids.from_field import BandSolid
 
-        half = 0.5 * positive(thickness, "the thickness of a shell")
-        return Near(self, -half, half)
+        half = 0.5 * as_positive(thickness, "the thickness of a shell")
+        return BandSolid(self, -half, half)
 
     # Maps of space. Those that bend lines need a formula.
 
-    @refuses_derivatives
-    def moved(self, offset: Sequence[float]) -> Solid:
+    @no_derivatives
+    def translated(self, offset: Sequence[float]) -> Solid:
         """The solid, moved by a vector (x, y, z)."""
-        from harnack.fields.solids.transforms import Affine
+        from harnack.fields.solids.transforms import AffineMap
 
-        return self._mapped(Affine.translation(offset))
+        return self._apply_map(AffineMap.translation(offset))
 
-    @refuses_derivatives
+    @no_derivatives
     def rotated(self, degrees: float, axis: str | Sequence[float] = "z") -> Solid:
         """The solid, rotated by so many degrees about an axis through the origin, counter-clockwise
         as seen from the end of the axis.
 
         axis: "x", "y", "z" or a vector (3,)."""
-        from harnack.fields.solids.transforms import Affine
+        from harnack.fields.solids.transforms import AffineMap
 
-        return self._mapped(Affine.rotation(degrees, axis))
+        return self._apply_map(AffineMap.rotation(degrees, axis))
 
     @functools.cached_property
-    def _made(self) -> Remembered[tuple[int, ...], Solid]:
-        return Remembered()
+    def _ray_count_variants(self) -> TransientCache[tuple[int, ...], Solid]:
+        return TransientCache()
 
     def _for_rays(
         self, parts: Sequence[Field], count: int, make: Callable[[list[Field]], Solid]
     ) -> Field:
         """This solid, or the same one made of its parts as they are for so many rays: once, so that
-        nothing is prepared twice. `Field.for_rays` of solids that have parts."""
-        others = [one.for_rays(count) for one in parts]
+        nothing is prepared twice. `Field.for_ray_count` of solids that have parts."""
+        others = [one.for_ray_count(count) for one in parts]
         key = tuple(map(id, others))  # of objects that the solid holds
         if key == tuple(map(id, parts)):
             return self
-        if key not in self._made:
-            self._made[key] = make(others)
-        return self._made[key]
+        if key not in self._ray_count_variants:
+            self._ray_count_variants[key] = make(others)
+        return self._ray_count_variants[key]
 
-    @refuses_derivatives
+    @no_derivatives
     def scaled(self, factors: float | Sequence[float]) -> Solid:
         """The solid, scaled about the origin, by one factor or by one for each axis.
 
         If all factors are equal f is multiplied by them, so that a distance stays a distance; else
         it is left as it is."""
-        from harnack.fields.solids.transforms import Affine
+        from harnack.fields.solids.transforms import AffineMap
 
-        return self._mapped(Affine.scaling(factors))
+        return self._apply_map(AffineMap.scaling(factors))
 
-    @refuses_derivatives
+    @no_derivatives
     def transformed(self, matrix: npt.ArrayLike) -> Solid:
         """The solid under a linear or an affine map: matrix (3, 3), (3, 4) or (4, 4)."""
-        from harnack.fields.solids.transforms import Affine
+        from harnack.fields.solids.transforms import AffineMap
 
-        return self._mapped(Affine.of_matrix(matrix))
+        return self._apply_map(AffineMap.of_matrix(matrix))
 
-    @refuses_derivatives
+    @no_derivatives
     def twisted(self, rate: float, axis: str = "z") -> Solid:
         """The solid, twisted about an axis by `rate` radians for each unit of length along it."""
         from harnack.fields.solids.deformations import Twist
 
-        return self._mapped(Twist(float(rate), axis))
+        return self._apply_map(Twist(float(rate), axis))
 
-    @refuses_derivatives
+    @no_derivatives
     def tapered(
         self, start: tuple[float, float], end: tuple[float, float], axis: str = "z"
     ) -> Solid:
@@ -283,58 +285,64 @@ class Solid(Field):
         them and constant beyond. Scales are positive."""
         from harnack.fields.solids.deformations import Taper
 
-        return self._mapped(Taper(start, end, axis))
+        return self._apply_map(Taper(start, end, axis))
 
-    def _mapped(self, change: Map) -> Solid:
-        return self.leaves(change.of)
+    def _apply_map(self, change: SpaceMap) -> Solid:
+        return self.map_operands(change.apply)
 
 
-class Derived(Solid):
-    """A solid made of another field, `inner`, whose settings for the tracer it takes over."""
+class SolidOfField(Solid):
+    """A solid made of another field, `field`, whose settings for the tracer it takes over."""
 
-    inner: Any
+    field: Any
 
-    def _take_over(self, *names: str) -> None:
+    def _copy_settings(self, *names: str) -> None:
         """Copy the inner field's settings for the tracer, and these attributes."""
-        settings = "has_detail", "coarsest_detail", "overstep", "wavelength", "is_cheap"
+        settings = (
+            "has_variable_accuracy",
+            "coarsest_accuracy",
+            "over_relaxation",
+            "min_wavelength",
+            "is_cheap",
+        )
         for name in (*settings, *names):
-            object.__setattr__(self, name, getattr(self.inner, name))
+            object.__setattr__(self, name, getattr(self.field, name))
 
-    def leaves(self, change: Callable[[Solid], Solid]) -> Solid:
+    def map_operands(self, change: Callable[[Solid], Solid]) -> Solid:
         return change(self)
 
     @property
     def is_steep(self) -> bool:
-        return self.inner.is_steep
+        return self.field.is_steep
 
     def prepare(self, backend: Backend) -> Solid:
-        return self._of(self.inner.prepare(backend))
+        return self._with_inner(self.field.prepare(backend))
 
-    def at_detail(self, detail: Real) -> Field:
-        return self._of(self.inner.at_detail(detail))
+    def at_accuracy(self, detail: Real) -> Field:
+        return self._with_inner(self.field.at_accuracy(detail))
 
-    def _of(self, inner: Field) -> Solid:
+    def _with_inner(self, inner: Field) -> Solid:
         other = copy.copy(self)
-        object.__setattr__(other, "inner", inner)
+        object.__setattr__(other, "field", inner)
         return other
 
-    def for_rays(self, count: int) -> Field:
+    def for_ray_count(self, count: int) -> Field:
         def make(parts: list[Field]) -> Solid:
-            return dataclasses.replace(cast("Any", self), inner=parts[0])
+            return dataclasses.replace(cast("Any", self), field=parts[0])
 
-        return self._for_rays([self.inner], count, make)
+        return self._for_rays([self.field], count, make)
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
         """Those of the inner field, which has the same derivatives up to their sign."""
         del sample
-        return self.inner.derivative_errors(p, self.inner.evaluate(p))
+        return self.field.derivative_errors(p, self.field.evaluate(p))
 
 
-class Shape(Formula, Solid):
+class FormulaSolid(Formula, Solid):
     """A solid given by a formula of the coordinates."""
 
     def prepare(self, backend: Backend) -> Field:
         return super().prepare(backend)
 
-    def leaves(self, change: Callable[[Solid], Solid]) -> Solid:
+    def map_operands(self, change: Callable[[Solid], Solid]) -> Solid:
         return change(self)

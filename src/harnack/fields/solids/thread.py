@@ -1,4 +1,5 @@
-"""Screw threads: `Thread`, any profile wound along a helix; `thread`, the metric ones of ISO."""
+"""Screw threads: `Thread`, any profile wound along a helix; `metric_thread`, the metric ones of
+ISO."""
 
 from __future__ import annotations
 
@@ -15,20 +16,20 @@ import numpy as np
 
 from harnack.backend.elementary import clamp, fmax, fmin
 from harnack.backend.validation import (
+    as_finite,
+    as_integer_in_range,
+    as_positive,
+    as_real_array,
     check_finite,
-    finite,
     flag,
-    positive,
-    real_array,
-    refuses_derivatives,
-    whole,
+    no_derivatives,
 )
-from harnack.enclosures import Enclosure, Gaps, Lipschitz
-from harnack.enclosures.piecewise_taylor import Pieces
-from harnack.fields.formula import prepared_numbers
-from harnack.fields.samples import Look, Path, Sample
-from harnack.fields.solids.extrusions import Revolved
-from harnack.fields.solids.solid import Solid, set_checked
+from harnack.enclosures import Enclosure, LevelGaps, Lipschitz
+from harnack.enclosures.piecewise_taylor import PiecewiseTaylorEnclosure
+from harnack.fields.formula import with_device_numbers
+from harnack.fields.samples import Ray, RaySample, Sample
+from harnack.fields.solids.extrusions import SolidOfRevolution
+from harnack.fields.solids.solid import Solid, set_frozen
 from harnack.name_suggestions import did_you_mean
 
 if TYPE_CHECKING:
@@ -71,11 +72,15 @@ class Thread(Solid):
     left_handed: bool = False
 
     def __post_init__(self) -> None:
-        set_checked(self, "pitch", positive(self.pitch, "the pitch of a thread"))
-        set_checked(self, "starts", whole(self.starts, "the starts of a thread", 1, _MOST_STARTS))
+        set_frozen(self, "pitch", as_positive(self.pitch, "the pitch of a thread"))
+        set_frozen(
+            self,
+            "starts",
+            as_integer_in_range(self.starts, "the starts of a thread", 1, _MOST_STARTS),
+        )
         if not isinstance(self.left_handed, bool):  # pyright: ignore[reportUnnecessaryIsInstance]
             raise TypeError(f"left_handed must be True or False, not {self.left_handed!r}")
-        array = real_array(self.profile, "the profile of a thread")
+        array = as_real_array(self.profile, "the profile of a thread")
         if array.ndim != 2 or array.shape[1] != 2 or not 1 <= len(array) <= _MOST_POINTS:
             raise ValueError(
                 f"the profile of a thread has shape (n, 2), n from 1 to {_MOST_POINTS}, "
@@ -93,38 +98,38 @@ class Thread(Solid):
         if not (points[:, 1] > 0).all():
             raise ValueError("r of the profile of a thread must be positive")
         rows = tuple((float(a), float(b)) for a, b in points)
-        set_checked(self, "profile", rows)
+        set_frozen(self, "profile", rows)
         # Three periods: a nearest point is at most half a period away along the axis, and these
         # reach so far beyond the one from 0 to the pitch.
         shifted = [(a + k * self.pitch, b) for k in (-1, 0, 1) for a, b in rows]
         shifted.append((rows[0][0] + 2 * self.pitch, rows[0][1]))
-        set_checked(self, "_points", tuple(shifted))
+        set_frozen(self, "_points", tuple(shifted))
         lead = self.starts * self.pitch * (-1 if self.left_handed else 1)
-        set_checked(self, "_lead", lead / (2 * math.pi))
+        set_frozen(self, "_lead", lead / (2 * math.pi))
         least = min(b for _, b in rows)
-        set_checked(self, "_least", 0.5 * least)
+        set_frozen(self, "_least", 0.5 * least)
         most = max(b for _, b in rows)
-        set_checked(self, "_most", most)
-        set_checked(self, "_size", most + 2 * self.pitch * self.starts)
+        set_frozen(self, "_most", most)
+        set_frozen(self, "_size", most + 2 * self.pitch * self.starts)
         slope = self.starts * self.pitch / (math.pi * least)
-        set_checked(self, "lipschitz", math.hypot(1.0, slope) * (1 + 1e-6))
+        set_frozen(self, "lipschitz", math.hypot(1.0, slope) * (1 + 1e-6))
 
-    def leaves(self, change: Callable[[Solid], Solid]) -> Solid:
+    def map_operands(self, change: Callable[[Solid], Solid]) -> Solid:
         return change(self)
 
-    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+    def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         del level, above
         return None
 
     def prepare(self, backend: Backend) -> Thread:
-        made = prepared_numbers(self, backend)
+        made = with_device_numbers(self, backend)
         numbers: Any = cast("Any", self)
         points = tuple(
             tuple(dr.opaque(backend.Float, one) for one in row) for row in numbers._points
         )
-        set_checked(made, "_points", points)
+        set_frozen(made, "_points", points)
         for name in ("_lead", "_least", "_most", "_size", "lipschitz"):
-            set_checked(made, name, dr.opaque(backend.Float, getattr(self, name)))
+            set_frozen(made, name, dr.opaque(backend.Float, getattr(self, name)))
         return made
 
     def evaluate(self, p: Vec3) -> Sample:
@@ -149,19 +154,19 @@ class Thread(Solid):
         doubt = dr.select(is_core, 0, doubt * constant + 16 * unit)
         return Sample(value, gradient, (Lipschitz(constant),), error, doubt)
 
-    def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
+    def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
         del ahead, back
         p, d = path.point(t), path.direction
-        look = path.look(self.evaluate(p))
-        if Pieces not in path.proofs.kinds:
+        look = path.enclose(self.evaluate(p))
+        if PiecewiseTaylorEnclosure not in path.proofs.kinds:
             return look
         numbers = cast("Any", self)
-        beside = Beside(
-            look.sample.value, look.sample.error, dr.sqrt(dr.fma(p.x, p.x, p.y * p.y)),
+        beside = OutsideCylinderEnclosure(
+            look.sample.value, look.sample.value_error, dr.sqrt(dr.fma(p.x, p.x, p.y * p.y)),
             dr.fma(p.x, d.x, p.y * d.y), dr.fma(d.x, d.x, d.y * d.y), 0 * p.x + numbers._most,
             0 * p.x + self.lipschitz,
         )  # fmt: skip
-        return replace(look, ahead=(*look.ahead, beside))
+        return replace(look, forward=(*look.forward, beside))
 
     def _height(self, z: Real) -> Real:
         """The polyline's r at z."""
@@ -202,7 +207,7 @@ class Thread(Solid):
 
 
 @dataclass(frozen=True)
-class Beside(Enclosure):
+class OutsideCylinderEnclosure(Enclosure):
     """A function f, along a path, that is at least the distance from an endless cylinder outside of
     it.
 
@@ -218,27 +223,27 @@ class Beside(Enclosure):
     value: Real
     error: Real
     r: Real
-    slope: Real
+    radial_slope: Real
     square: Real
     radius: Real
     constant: Real
 
-    def step(self, gaps: Gaps) -> Real:
-        level = self.value - gaps.down + self.error
+    def free_length(self, gaps: LevelGaps) -> Real:
+        level = self.value - gaps.below + self.error
         target = self.radius + level
         left = (self.r - target) * (self.r + target)
-        squared, product = self.slope * self.slope, self.square * left
+        squared, product = self.radial_slope * self.radial_slope, self.square * left
         room = squared - product + 1e-5 * (squared + dr.abs(product))
-        root = left / (dr.sqrt(fmax(room, 0)) - self.slope)
-        free = dr.select((self.slope >= 0) | (room < 0), dr.inf, root)
-        known = (gaps.down <= self.value) & (left > 1e-5 * target * target) & (gaps.up >= 0)
+        root = left / (dr.sqrt(fmax(room, 0)) - self.radial_slope)
+        free = dr.select((self.radial_slope >= 0) | (room < 0), dr.inf, root)
+        known = (gaps.below <= self.value) & (left > 1e-5 * target * target) & (gaps.above >= 0)
         known &= (free >= 0) & dr.isfinite(left + squared + product)
-        free = dr.select(gaps.down == dr.inf, dr.inf, dr.select(known, free, 0))
-        return fmax(fmin(free, gaps.up / self.constant), 0) * (1 - 1e-5)
+        free = dr.select(gaps.below == dr.inf, dr.inf, dr.select(known, free, 0))
+        return fmax(fmin(free, gaps.above / self.constant), 0) * (1 - 1e-5)
 
 
 # ISO 261 and 262: nominal diameters and coarse pitches, in millimeters.
-COARSE: Mapping[str, float] = MappingProxyType(
+COARSE_PITCHES: Mapping[str, float] = MappingProxyType(
     {
         "M1": 0.25, "M1.1": 0.25, "M1.2": 0.25, "M1.4": 0.3, "M1.6": 0.35, "M1.8": 0.35, "M2": 0.4,
         "M2.2": 0.45, "M2.5": 0.45, "M3": 0.5, "M3.5": 0.6, "M4": 0.7, "M4.5": 0.75, "M5": 0.8,
@@ -253,8 +258,8 @@ _NAME = re.compile(r"M(\d{1,4}(?:\.\d{1,3})?)(?:\s*[xX]\s*(\d{1,3}(?:\.\d{1,3})?
 _MOST_CLEARANCE = 0.1
 
 
-@refuses_derivatives
-def thread(
+@no_derivatives
+def metric_thread(
     name: str,
     length: float,
     *,
@@ -285,8 +290,8 @@ def thread(
             clearance.
     """
     diameter, pitch = _sizes(name)
-    length = positive(length, "the length of a thread")
-    clearance = finite(clearance, "the clearance of a thread")
+    length = as_positive(length, "the length of a thread")
+    clearance = as_finite(clearance, "the clearance of a thread")
     internal = flag(internal, "internal")
     left_handed = flag(left_handed, "left_handed")
     if not 0 <= clearance <= _MOST_CLEARANCE * pitch:
@@ -306,14 +311,14 @@ def thread(
     bevel = over - root
     if internal:
         opening = [(over, -pitch), (over, 0.0), (root, bevel)]
-        around = Revolved([(0.0, -pitch), (over, -pitch), (over, length), (0.0, length)])
-        return (made & around) | Revolved([(0.0, -pitch), *opening, (0.0, bevel)])
+        around = SolidOfRevolution([(0.0, -pitch), (over, -pitch), (over, length), (0.0, length)])
+        return (made & around) | SolidOfRevolution([(0.0, -pitch), *opening, (0.0, bevel)])
     if not length > 2 * bevel:
         raise ValueError(
             f"a thread {name} must be longer than {2 * bevel:.3g}, for its bevels, not {length:g}"
         )
     ends = [(root, 0.0), (over, bevel), (over, length - bevel), (root, length)]
-    return made & Revolved([(0.0, 0.0), *ends, (0.0, length)])
+    return made & SolidOfRevolution([(0.0, 0.0), *ends, (0.0, length)])
 
 
 def _sizes(name: Any) -> tuple[float, float]:
@@ -324,12 +329,13 @@ def _sizes(name: Any) -> tuple[float, float]:
     diameter = float(found[1])
     if found[2] is None:
         key = f"M{diameter:g}"
-        if key not in COARSE:
+        if key not in COARSE_PITCHES:
             raise ValueError(
-                f"there is no coarse thread {key}{did_you_mean(key, COARSE)}: write its pitch, as "
+                f"there is no coarse thread {key}{did_you_mean(key, COARSE_PITCHES)}: write its "
+                "pitch, as "
                 f"in {key}x1"
             )
-        return diameter, COARSE[key]
+        return diameter, COARSE_PITCHES[key]
     pitch = float(found[2])
     # Four depths, so that a core is left.
     if not (pitch > 0 and diameter > 4 * pitch * math.sqrt(0.75) * 0.625):

@@ -12,37 +12,37 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.arithmetic import Jet
-from harnack.backend.elementary import largest_coordinate, length
+from harnack.backend.elementary import max_norm, safe_norm
 from harnack.enclosures import Promise
-from harnack.enclosures.extremum import Stretched
-from harnack.fields.formula import as_jet, hessian_error, prepared_numbers
-from harnack.fields.samples import Look, Path, Sample
-from harnack.fields.solids.solid import Derived, Shape, Solid
+from harnack.enclosures.extremum import ScaledEnclosure
+from harnack.fields.formula import as_jet, hessian_error, with_device_numbers
+from harnack.fields.samples import Ray, RaySample, Sample
+from harnack.fields.solids.solid import FormulaSolid, Solid, SolidOfField
 from harnack.geometry import Ball, ConvexHull
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, Real, Vec3
     from harnack.geometry import Volume
 
-from harnack.fields.solids.solid import Map, axis_index
+from harnack.fields.solids.solid import SpaceMap, axis_index
 
 
 @dataclass(frozen=True)
-class Affine(Map):
+class AffineMap(SpaceMap):
     """u -> matrix u + offset, in double precision.
 
     matrix: (3, 3), rows, not singular.
-    offset: (3,).
-    factor: f is multiplied by it. For a similarity it is the factor by which lengths grow, for
-        other maps 1; for several maps in turn it is the product of theirs.
+    translation_vector: (3,).
+    value_factor: f is multiplied by it. For a similarity it is the factor by which lengths grow,
+        for other maps 1; for several maps in turn it is the product of theirs.
     """
 
     matrix: tuple[tuple[float, ...], ...]
-    offset: tuple[float, ...]
-    factor: float
+    translation_vector: tuple[float, ...]
+    value_factor: float
 
     @classmethod
-    def of_arrays(cls, matrix: npt.ArrayLike, offset: npt.ArrayLike = (0.0, 0.0, 0.0)) -> Affine:
+    def of_arrays(cls, matrix: npt.ArrayLike, offset: npt.ArrayLike = (0.0, 0.0, 0.0)) -> AffineMap:
         """Raises ValueError for other shapes, what is not finite, and a singular matrix."""
         m, b = np.asarray(matrix, dtype=np.float64), np.asarray(offset, dtype=np.float64)
         if m.shape != (3, 3) or b.shape != (3,):
@@ -61,7 +61,7 @@ class Affine(Map):
         return cls(rows, tuple(float(v) for v in b), _similarity(m) or 1.0)
 
     @classmethod
-    def of_matrix(cls, matrix: npt.ArrayLike) -> Affine:
+    def of_matrix(cls, matrix: npt.ArrayLike) -> AffineMap:
         """A linear map (3, 3), or an affine one (3, 4) or (4, 4) whose last row is (0, 0, 0, 1)."""
         m = np.asarray(matrix, dtype=np.float64)
         if m.shape == (4, 4):
@@ -73,14 +73,14 @@ class Affine(Map):
         return cls.of_arrays(m)
 
     @classmethod
-    def translation(cls, offset: Sequence[float]) -> Affine:
+    def translation(cls, offset: Sequence[float]) -> AffineMap:
         """u -> u + offset."""
         if np.shape(offset) != (3,):
             raise ValueError(f"offset (3,): give a vector (x, y, z), not {offset!r}")
         return cls.of_arrays(np.eye(3), np.asarray(offset, dtype=np.float64))
 
     @classmethod
-    def rotation(cls, degrees: float, axis: str | Sequence[float]) -> Affine:
+    def rotation(cls, degrees: float, axis: str | Sequence[float]) -> AffineMap:
         """The rotation about an axis through the origin (Rodrigues' formula)."""
         if isinstance(axis, str):
             unit = np.eye(3)[axis_index(axis)]
@@ -99,7 +99,7 @@ class Affine(Map):
         return cls.of_arrays(turn)
 
     @classmethod
-    def scaling(cls, factors: float | Sequence[float]) -> Affine:
+    def scaling(cls, factors: float | Sequence[float]) -> AffineMap:
         """u -> factors u."""
         sizes = np.asarray(factors, dtype=np.float64)
         sizes = np.broadcast_to(sizes if sizes.shape in ((), (3,)) else np.nan, (3,))
@@ -107,13 +107,17 @@ class Affine(Map):
             raise ValueError(f"factors must be positive numbers, one or three, not {factors!r}")
         return cls.of_arrays(np.diag(sizes))
 
-    def of(self, solid: Solid) -> Solid:
-        if isinstance(solid, AffineImage):
-            m, b = np.array(self.matrix), np.array(self.offset)
+    def apply(self, solid: Solid) -> Solid:
+        if isinstance(solid, TransformedSolid):
+            m, b = np.array(self.matrix), np.array(self.translation_vector)
             inner = solid.map
-            total = Affine.of_arrays(m @ np.array(inner.matrix), m @ np.array(inner.offset) + b)
-            return AffineImage(solid.inner, replace(total, factor=self.factor * inner.factor))
-        return AffineImage(solid, self)
+            total = AffineMap.of_arrays(
+                m @ np.array(inner.matrix), m @ np.array(inner.translation_vector) + b
+            )
+            return TransformedSolid(
+                solid.field, replace(total, value_factor=self.value_factor * inner.value_factor)
+            )
+        return TransformedSolid(solid, self)
 
     @property
     def inverse(self) -> FloatArray:
@@ -129,7 +133,7 @@ class Affine(Map):
         """A volume that contains the image of another one; None if that has no bounds."""
         if volume is None:
             return None
-        m, b = np.array(self.matrix), np.array(self.offset)
+        m, b = np.array(self.matrix), np.array(self.translation_vector)
         factor = self.similarity
         if isinstance(volume, Ball) and factor is not None:
             center = m @ np.array(volume.center) + b
@@ -142,7 +146,7 @@ class Affine(Map):
             return None
         corners = np.stack(np.meshgrid(*zip(low, high, strict=True)), axis=-1).reshape(-1, 3)
         image = corners @ m.T + b
-        return ConvexHull.of(image).padded(1e-12 * float(np.abs(image).max()))
+        return ConvexHull.from_points(image).padded(1e-12 * float(np.abs(image).max()))
 
 
 def _similarity(m: FloatArray) -> float | None:
@@ -153,43 +157,43 @@ def _similarity(m: FloatArray) -> float | None:
 
 
 @dataclass(frozen=True, eq=False)
-class AffineImage(Derived):
+class TransformedSolid(SolidOfField):
     """A solid under an affine map.
 
     Proof. A ray o + t d is the image of the straight path M^-1 (o - b) + t M^-1 d, along which the
-    solid is sampled; lengths on it are |M^-1 d| times as large (`Stretched`). The rounding of
+    solid is sampled; lengths on it are |M^-1 d| times as large (`ScaledEnclosure`). The rounding of
     coordinates there is a few units of the sum of the sizes of their terms, which enters the error
     of the value. f is multiplied by the factor of the map.
     """
 
-    inner: Solid
-    map: Affine
+    field: Solid
+    map: AffineMap
 
     def __post_init__(self) -> None:
-        self._take_over()
-        domain = self.map.volume(self.inner.domain)
-        if self.inner.domain is not None and domain is None:
+        self._copy_settings()
+        domain = self.map.volume(self.field.domain)
+        if self.field.domain is not None and domain is None:
             raise ValueError(
-                f"the domain {self.inner.domain} of the solid has no bounds and cannot be mapped: "
+                f"the domain {self.field.domain} of the solid has no bounds and cannot be mapped: "
                 "cut the field by a volume that has"
             )
         object.__setattr__(self, "domain", domain)
-        numbers = _AffineNumbers.of(self.map)
+        numbers = _InverseMap.of(self.map)
         object.__setattr__(self, "_numbers", numbers)
-        inner = self.inner.lipschitz
+        inner = self.field.lipschitz
         lipschitz = None if inner is None else inner * numbers.stretch * numbers.factor
         object.__setattr__(self, "lipschitz", lipschitz)
-        own = self.inner.wavelength
-        object.__setattr__(self, "wavelength", None if own is None else own / numbers.stretch)
+        own = self.field.min_wavelength
+        object.__setattr__(self, "min_wavelength", None if own is None else own / numbers.stretch)
 
     @property
-    def numbers(self) -> _AffineNumbers:
+    def numbers(self) -> _InverseMap:
         """The inverse map, as numbers of the backend once prepared."""
         return cast("Any", self)._numbers
 
-    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
-        own = level / self.map.factor
-        return self.map.volume(self.inner.hull(own, above=above))
+    def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        own = level / self.map.value_factor
+        return self.map.volume(self.field.sublevel_extent(own, above=above))
 
     def prepare(self, backend: Backend) -> Solid:
         other = super().prepare(backend)
@@ -197,17 +201,17 @@ class AffineImage(Derived):
         return other
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        return self.inner.formula(*self.numbers.local(x, y, z)) * self.numbers.factor
+        return self.field.formula(*self.numbers.local(x, y, z)) * self.numbers.factor
 
     def evaluate(self, p: Vec3) -> Sample:
         local = type(p)(*self.numbers.local(p.x, p.y, p.z))
-        return self._image(self.inner.evaluate(local), self._size(p, 0.0))
+        return self._image(self.field.evaluate(local), self._size(p, 0.0))
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         numbers = self.numbers
-        rows = self.inner.hessian(type(p)(*numbers.local(p.x, p.y, p.z)))
-        columns = [numbers.pulled(row) for row in rows]  # H M^-1
-        own = [numbers.pulled(type(p)(*(columns[j][k] for j in range(3)))) for k in range(3)]
+        rows = self.field.hessian(type(p)(*numbers.local(p.x, p.y, p.z)))
+        columns = [numbers.pull_back(row) for row in rows]  # H M^-1
+        own = [numbers.pull_back(type(p)(*(columns[j][k] for j in range(3)))) for k in range(3)]
         x, y, z = (one * numbers.factor for one in own)
         return x, y, z
 
@@ -217,105 +221,108 @@ class AffineImage(Derived):
         del sample
         numbers = self.numbers
         local = type(p)(*numbers.local(p.x, p.y, p.z))
-        slope, bend = self.inner.derivative_errors(local, self.inner.evaluate(local))
+        slope, bend = self.field.derivative_errors(local, self.field.evaluate(local))
         slope = slope * numbers.stretch * numbers.factor
-        if not isinstance(self.inner, Shape):
+        if not isinstance(self.field, FormulaSolid):
             return slope, bend * numbers.stretch * numbers.stretch * numbers.factor
         coordinates = Jet.at_point(p, order=2)
-        jet = as_jet(self.formula(*coordinates), coordinates[0], type(self.inner).__name__)
-        # The gradient need not be the middle of its range (`Formula._one_sided`): both are added.
-        return slope + sum(one.radius for one in jet.first), hessian_error(jet, p.x)
+        jet = as_jet(self.formula(*coordinates), coordinates[0], type(self.field).__name__)
+        # The gradient need not be the middle of its range (`Formula._with_one_sided_gradient`):
+        # both are added.
+        return slope + sum(one.radius for one in jet.first_derivatives), hessian_error(jet, p.x)
 
-    def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
+    def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
         numbers, vector = self.numbers, cast("Any", type(path.origin))
         o, d = path.origin, path.direction
         direction = vector(*numbers.local_direction(d.x, d.y, d.z))
-        speed = length(direction)
-        own = Path(vector(*numbers.local(o.x, o.y, o.z)), direction / speed, path.proofs)
-        look = self.inner.look(own, t * speed, ahead * speed, back * speed)
+        speed = safe_norm(direction)
+        own = Ray(vector(*numbers.local(o.x, o.y, o.z)), direction / speed, path.proofs)
+        look = self.field.sample_ray(own, t * speed, ahead * speed, back * speed)
         sample = self._image(look.sample, self._size(o, t))
 
         def stretched(enclosures: tuple[Any, ...]) -> tuple[Any, ...]:
-            return tuple(Stretched(one, speed, numbers.factor) for one in enclosures)
+            return tuple(ScaledEnclosure(one, speed, numbers.factor) for one in enclosures)
 
         slope = look.slope * speed * numbers.factor
-        ahead_, back_ = stretched(look.ahead), stretched(look.back)
+        ahead_, back_ = stretched(look.forward), stretched(look.backward)
         error = None if look.slope_error is None else look.slope_error * speed * numbers.factor
-        return Look(sample, ahead_, back_, slope, look.growth, error)
+        return RaySample(sample, ahead_, back_, slope, look.reach_growth, error)
 
     def _size(self, p: Vec3, t: Real) -> Real:
         """A bound of the terms that the local coordinates of p + t d are sums of."""
         numbers = self.numbers
-        return numbers.stretch * (largest_coordinate(p) + numbers.offset_size + t) * math.sqrt(3)
+        return numbers.stretch * (max_norm(p) + numbers.offset_size + t) * math.sqrt(3)
 
     def _image(self, sample: Sample, size: Real) -> Sample:
         numbers = self.numbers
         unit = 2 * float(dr.epsilon(type(sample.value)))
-        moved = 8 * unit * size * length(sample.gradient)
+        moved = 8 * unit * size * safe_norm(sample.gradient)
         factor, stretch = numbers.factor, numbers.stretch
 
         def image(one: Promise) -> Promise:
             if self.map.similarity is None:
-                one = one.of_any_map(sample.value)
-            return one.scaled(factor).shortened(stretch)
+                one = one.weakened_for_linear_maps(sample.value)
+            return one.scaled(factor).linearly_mapped(stretch)
 
-        return sample.with_promises(
+        return sample.map_promises(
             image,
             value=sample.value * factor,
-            gradient=numbers.pulled(sample.gradient) * factor,
-            error=(sample.error + moved) * factor,
+            gradient=numbers.pull_back(sample.gradient) * factor,
+            value_error=(sample.value_error + moved) * factor,
             gradient_error=sample.gradient_error * factor * stretch,
-            normal=None,
-            truncation=sample.truncation * factor,
-            along=(),
+            shading_normal=None,
+            truncation_error=sample.truncation_error * factor,
+            ray_promises=(),
         )
 
 
 @dataclass(frozen=True)
-class _AffineNumbers:
+class _InverseMap:
     """The inverse of an affine map as a kernel uses it.
 
     rows: of M^-1.
-    offset: b.
+    translation_vector: b.
     stretch: the largest singular value of M^-1.
     factor: that of f.
     offset_size: the largest component of b.
     """
 
     rows: tuple[tuple[Any, ...], ...]
-    offset: tuple[Any, ...]
+    translation_vector: tuple[Any, ...]
     stretch: Any
     factor: Any
     offset_size: Any
 
     @classmethod
-    def of(cls, change: Affine) -> _AffineNumbers:
+    def of(cls, change: AffineMap) -> _InverseMap:
         inverse = change.inverse
         stretch = float(np.linalg.svd(inverse, compute_uv=False)[0]) * (1 + 1e-6)
         return cls(
             tuple(tuple(float(v) for v in row) for row in inverse),
-            change.offset,
+            change.translation_vector,
             stretch,
-            change.factor,
-            float(np.abs(change.offset).max()),
+            change.value_factor,
+            float(np.abs(change.translation_vector).max()),
         )
 
-    def prepare(self, backend: Backend) -> _AffineNumbers:
+    def prepare(self, backend: Backend) -> _InverseMap:
         """The numbers as kernel parameters, except 0 and 1, which save most of the work."""
-        prepared = prepared_numbers(self, backend)
+        prepared = with_device_numbers(self, backend)
         rows = tuple(
             tuple(a if a in (0.0, 1.0) else b for a, b in zip(old, new, strict=True))
             for old, new in zip(
-                (*self.rows, self.offset), (*prepared.rows, prepared.offset), strict=True
+                (*self.rows, self.translation_vector),
+                (*prepared.rows, prepared.translation_vector),
+                strict=True,
             )
         )
-        return replace(prepared, rows=rows[:3], offset=rows[3])
+        return replace(prepared, rows=rows[:3], translation_vector=rows[3])
 
     def local(self, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
         """M^-1 (p - b), for coordinates of any kind."""
         a, b, c = (
             one if _is(shift, 0.0) else one - shift
-            for one, shift in zip((x, y, z), self.offset, strict=True)
+            for one, shift in zip((x, y, z), self.translation_vector, strict=True)
         )
         return self.local_direction(a, b, c)
 
@@ -324,7 +331,7 @@ class _AffineNumbers:
         u, v, w = (_combined(row, (x, y, z)) for row in self.rows)
         return u, v, w
 
-    def pulled(self, g: Vec3) -> Vec3:
+    def pull_back(self, g: Vec3) -> Vec3:
         """M^-T g, the gradient of f(M^-1 p) if g is that of f."""
         columns = (tuple(row[i] for row in self.rows) for i in range(3))
         return type(g)(*(_combined(column, (g.x, g.y, g.z)) for column in columns))

@@ -1,4 +1,5 @@
-"""Tubes: `Tube` around polylines and cubic Bezier curves, `Tubes` around many separate segments."""
+"""Tubes: `Tube` around polylines and cubic Bezier curves, `TubeNetwork` around many separate
+segments."""
 
 from __future__ import annotations
 
@@ -13,32 +14,32 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import FloatArray, IntArray, backend_of
-from harnack.backend.elementary import clamp, fmax, fmin, largest_coordinate
-from harnack.backend.record_table import Records
+from harnack.backend.elementary import clamp, fmax, fmin, max_norm
+from harnack.backend.record_table import RecordTable
 from harnack.backend.validation import (
+    as_integer_in_range,
+    as_positive,
+    as_real,
+    as_real_array,
+    check_coordinate_size,
     check_finite,
-    check_size,
     check_vectors,
-    positive,
-    real,
-    real_array,
-    whole,
 )
-from harnack.enclosures import Curvature, Enclosure, Gaps, Lipschitz, Promise
-from harnack.enclosures.piecewise_taylor import Pieces
-from harnack.fields.batched_fields import prepared_once
+from harnack.enclosures import Enclosure, LevelGaps, Lipschitz, Promise, TaylorRemainder
+from harnack.enclosures.piecewise_taylor import PiecewiseTaylorEnclosure
+from harnack.fields.batched_fields import cached_prepare
 from harnack.fields.field import Field
-from harnack.fields.patch_boxes import BoxedField, BoxedParts
-from harnack.fields.samples import Look, Path, Sample
+from harnack.fields.patch_boxes import PatchBoxes, PatchField
+from harnack.fields.samples import Ray, RaySample, Sample
 from harnack.fields.solids.solid import Solid, box_around
-from harnack.geometry.beziers import flattened
-from harnack.tree.closest_triangles import MOST_BOXES
+from harnack.geometry.beziers import flatten_bezier
+from harnack.tree.closest_triangles import MAX_BOXES
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
     from harnack.geometry import Volume
 
-__all__ = ["Tubes"]
+__all__ = ["TubeNetwork"]
 
 _MOST_SEGMENTS = 1_000_000
 # Segments in a group, and the number of segments from which on they are grouped.
@@ -55,33 +56,33 @@ class Tube(Solid):
 
     points: (n, 3) its vertices, one after the other; repeat the first to close it.
     starts: indices of vertices at which another polyline starts, not joined to the one before: see
-        `around`.
-    flattening: a bound of the distance of the polyline from the curve that it stands for, and so of
-        the distance between the surfaces: see `bezier`.
+        `from_polylines`.
+    flattening_error: a bound of the distance of the polyline from the curve that it stands for, and
+        so of the distance between the surfaces: see `bezier`.
 
     f is the signed distance, whose Lipschitz constant is 1 (Hart 1996, equations 32 to 35, for
-    cubic Bezier curves). Along a path more is proved: see `TubeAhead`.
+    cubic Bezier curves). Along a path more is proved: see `TangentEnclosure`.
     """
 
     points: FloatArray
     radius: float
     starts: tuple[int, ...] = field(default=(), kw_only=True)
-    flattening: float = field(default=0.0, kw_only=True)
+    flattening_error: float = field(default=0.0, kw_only=True)
 
     lipschitz = 1.0
 
     def __post_init__(self) -> None:
-        array = real_array(self.points, "the points of a tube")
+        array = as_real_array(self.points, "the points of a tube")
         check_vectors(array, "the points of a tube")
         points = np.array(array, dtype=np.float64)
         check_finite(points, "point {} of a tube", ValueError)
-        check_size(points, ValueError)
+        check_coordinate_size(points, ValueError)
         parts: list[FloatArray] = []
         if not isinstance(cast("Any", self.starts), tuple | list | np.ndarray):
             raise TypeError(f"starts must be indices of vertices, not {self.starts!r:.60}")
-        starts = [whole(start, "each start", 0, len(points)) for start in self.starts]
-        if not 0 <= real(self.flattening, "flattening") < math.inf:
-            raise ValueError(f"flattening must be a length, not {self.flattening!r}")
+        starts = [as_integer_in_range(start, "each start", 0, len(points)) for start in self.starts]
+        if not 0 <= as_real(self.flattening_error, "flattening_error") < math.inf:
+            raise ValueError(f"flattening_error must be a length, not {self.flattening_error!r}")
         for part in np.split(points, starts):
             if len(part):
                 moves = np.any(part[1:] != part[:-1], axis=1)
@@ -94,10 +95,10 @@ class Tube(Solid):
         object.__setattr__(self, "starts", tuple(int(one) for one in ends))
         points.setflags(write=False)
         object.__setattr__(self, "points", points)
-        object.__setattr__(self, "radius", positive(self.radius, "the radius of a tube"))
+        object.__setattr__(self, "radius", as_positive(self.radius, "the radius of a tube"))
 
     @classmethod
-    def around(cls, polylines: Iterable[npt.ArrayLike], radius: float) -> Tube:
+    def from_polylines(cls, polylines: Iterable[npt.ArrayLike], radius: float) -> Tube:
         """The points within `radius` of any of several polylines (n_i, 3): one distance for all.
 
         Raises:
@@ -105,7 +106,7 @@ class Tube(Solid):
         """
         parts: list[FloatArray] = []
         for k, one in enumerate(polylines):
-            array = real_array(one, f"polyline {k} of a tube")
+            array = as_real_array(one, f"polyline {k} of a tube")
             check_vectors(array, f"polyline {k} of a tube")
             parts.append(np.array(array, dtype=np.float64))
         if not parts:
@@ -123,12 +124,12 @@ class Tube(Solid):
         tolerance: how far the surface may be from the exact one, in units of length; by default a
             thousandth of the radius. The number of segments grows like its square root.
 
-        Proof: `harnack.geometry.beziers.flattened`.
+        Proof: `harnack.geometry.beziers.flatten_bezier`.
 
         Raises:
             ValueError: another number of points, or numbers that are not finite.
         """
-        array = real_array(controls, "the control points")
+        array = as_real_array(controls, "the control points")
         check_vectors(array, "the control points")
         points = np.asarray(array, dtype=np.float64)
         if len(points) < 4 or len(points) % 3 != 1:
@@ -137,15 +138,15 @@ class Tube(Solid):
                 f"not {len(points)}"
             )
         check_finite(points, "control point {}", ValueError)
-        radius = positive(radius, "the radius of a tube")
-        allowed = 1e-3 * radius if tolerance is None else positive(tolerance, "the tolerance")
+        radius = as_positive(radius, "the radius of a tube")
+        allowed = 1e-3 * radius if tolerance is None else as_positive(tolerance, "the tolerance")
         made = [points[:1]]
         off = 0.0
         for start in range(0, len(points) - 1, 3):
-            more, error = flattened(points[start : start + 4], allowed)
+            more, error = flatten_bezier(points[start : start + 4], allowed)
             made.append(more)
             off = max(off, error)
-        return cls(np.concatenate(made), radius, flattening=off)
+        return cls(np.concatenate(made), radius, flattening_error=off)
 
     @classmethod
     def helix(
@@ -166,9 +167,9 @@ class Tube(Solid):
         Raises:
             ValueError: numbers that are not positive, or more than a million segments.
         """
-        radius, wire = positive(radius, "the radius of a helix"), positive(wire, "the wire")
-        pitch, turns = positive(pitch, "the pitch of a helix"), positive(turns, "its turns")
-        allowed = 1e-3 * wire if tolerance is None else positive(tolerance, "the tolerance")
+        radius, wire = as_positive(radius, "the radius of a helix"), as_positive(wire, "the wire")
+        pitch, turns = as_positive(pitch, "the pitch of a helix"), as_positive(turns, "its turns")
+        allowed = 1e-3 * wire if tolerance is None else as_positive(tolerance, "the tolerance")
         angle = 2 * math.pi * turns
         count = max(1.0, angle * math.sqrt(radius / (8.0 * allowed)))
         if not count <= _MOST_SEGMENTS:
@@ -177,16 +178,16 @@ class Tube(Solid):
         y = np.sin(t) * (-radius if left_handed else radius)
         points = np.column_stack([radius * np.cos(t), y, pitch * t / (2 * math.pi)])
         off = radius * (angle / math.ceil(count)) ** 2 / 8.0
-        return cls(points, wire, flattening=off)
+        return cls(points, wire, flattening_error=off)
 
-    def leaves(self, change: Callable[[Solid], Solid]) -> Solid:
+    def map_operands(self, change: Callable[[Solid], Solid]) -> Solid:
         return change(self)
 
     def describe(self) -> dict[str, Any]:
         segments = len(self.points) - 1 - len(self.starts)
-        return {"segments": segments, "flattening": self.flattening}
+        return {"segments": segments, "flattening_error": self.flattening_error}
 
-    def hull(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+    def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         if above:
             return None
         low, high = self.points.min(axis=0), self.points.max(axis=0)
@@ -194,7 +195,7 @@ class Tube(Solid):
         x, y, z = (float(v) for v in 0.5 * (high - low) + reach)
         return box_around((x, y, z), tuple(float(v) for v in 0.5 * (low + high)))
 
-    @prepared_once
+    @cached_prepare
     def prepare(self, backend: Backend) -> Tube:
         made = copy.copy(self)
         joined = np.ones(len(self.points) - 1, dtype=np.bool_)
@@ -204,8 +205,8 @@ class Tube(Solid):
         groups = None
         if len(rows) >= _MANY:
             rows, balls = _grouped(rows)
-            groups = Records.upload(backend, balls)
-        object.__setattr__(made, "_records", Records.upload(backend, rows))
+            groups = RecordTable.upload(backend, balls)
+        object.__setattr__(made, "_records", RecordTable.upload(backend, rows))
         object.__setattr__(made, "_groups", groups)
         object.__setattr__(made, "_radius", dr.opaque(backend.Float, self.radius))
         size = float(np.abs(self.points).max()) + self.radius
@@ -213,32 +214,32 @@ class Tube(Solid):
         return made
 
     def evaluate(self, p: Vec3) -> Sample:
-        return self._seen(p, None, ())[0]
+        return self._sample_with_bounds(p, None, ())[0]
 
-    def look(self, path: Path, t: Real, ahead: Real, back: Real) -> Look:
+    def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
         del back
         p = path.point(t)
-        if Pieces not in path.proofs.kinds:
-            return path.look(self.evaluate(p))
+        if PiecewiseTaylorEnclosure not in path.proofs.kinds:
+            return path.enclose(self.evaluate(p))
         if not hasattr(self, "_records"):
-            return self.prepare(backend_of(p)).look(path, t, ahead, ahead)
-        far = _FAR * (largest_coordinate(p) + self._number("_size"))
+            return self.prepare(backend_of(p)).sample_ray(path, t, ahead, ahead)
+        far = _FAR * (max_norm(p) + self._parameter("_size"))
         length = dr.select(dr.isfinite(ahead), ahead, far)
         knots = (*(one * length for one in _KNOTS), ahead)
-        sample, distance, lows = self._seen(p, path.direction, knots)
+        sample, distance, lows = self._sample_with_bounds(p, path.direction, knots)
         slope = dr.dot(sample.gradient, path.direction)
         most = fmin(slope + sample.gradient_error, 1.0)
-        return Look(sample, (TubeAhead(distance, most, knots, lows),), (), slope, 4.0)
+        return RaySample(sample, (TangentEnclosure(distance, most, knots, lows),), (), slope, 4.0)
 
-    def _seen(
+    def _sample_with_bounds(
         self, p: Vec3, direction: Vec3 | None, knots: tuple[Real, ...]
     ) -> tuple[Sample, Real, tuple[Real, ...]]:
         """The sample, the distance from the polyline, and bounds of the movement at the knots."""
         if not hasattr(self, "_records"):
-            return self.prepare(backend_of(p))._seen(p, direction, knots)
+            return self.prepare(backend_of(p))._sample_with_bounds(p, direction, knots)
         real, vector = cast("Any", type(p.x)), cast("Any", type(p))
         unit = 2 * float(dr.epsilon(real))
-        records: Records = cast("Any", self)._records
+        records: RecordTable = cast("Any", self)._records
 
         def body(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
             nearest, x, y, z, size, *lows = state
@@ -250,7 +251,9 @@ class Tube(Solid):
             off = 8 * unit * (dr.norm(from_start) + dr.norm(side))
             if direction is not None:
                 slope = dr.dot(away, direction) / distance - off / distance * 2
-                lows = lowered(lows, knots, distance - off, slope, 4 * unit * distance, unit)
+                lows = min_with_tangent(
+                    lows, knots, distance - off, slope, 4 * unit * distance, unit
+                )
             nearer = distance < nearest
             return (
                 dr.select(nearer, distance, nearest),
@@ -261,21 +264,21 @@ class Tube(Solid):
 
         zero = 0 * p.x
         start = (zero + dr.inf, zero, zero, zero, zero, *(zero + dr.inf for _ in knots))
-        groups: Records | None = cast("Any", self)._groups
+        groups: RecordTable | None = cast("Any", self)._groups
         if groups is None:
             found = records.for_each(body, start, "tube")
         else:
-            found = _by_groups(p, direction, knots, records, groups, body, start)
+            found = _visit_by_groups(p, direction, knots, records, groups, body, start)
         distance, error = found[0], found[4]
         away = vector(*found[1:4])
         gradient = dr.select(distance > 0, away / distance, vector(0))
-        value = distance - self._number("_radius")
-        error = error + 4 * unit * (distance + self._number("_radius"))
+        value = distance - self._parameter("_radius")
+        error = error + 4 * unit * (distance + self._parameter("_radius"))
         doubt = dr.select(distance > 0, fmin(4 * error / distance, 2), 2)
         sample = Sample(value, gradient, (Lipschitz(zero + 1),), error, doubt)
         return sample, distance, tuple(low - distance - error for low in found[5:])
 
-    def _number(self, name: str) -> Any:
+    def _parameter(self, name: str) -> Any:
         return getattr(self, name)
 
 
@@ -291,12 +294,12 @@ def _grouped(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
     return rows, np.column_stack([centers, radii * (1 + 1e-5)])
 
 
-def _by_groups(
+def _visit_by_groups(
     p: Vec3,
     direction: Vec3 | None,
     knots: tuple[Real, ...],
-    records: Records,
-    groups: Records,
+    records: RecordTable,
+    groups: RecordTable,
     body: Callable[[list[Real], tuple[Any, ...]], tuple[Any, ...]],
     start: tuple[Any, ...],
 ) -> tuple[Any, ...]:
@@ -317,7 +320,7 @@ def _by_groups(
     limit = most * (1 + 16 * unit) + 16 * unit * dr.norm(p)
 
     def visit(i: Any, *state: Any) -> tuple[Any, ...]:
-        row = groups.row(i)
+        row = groups.read_record(i)
         away = p - vector(*row[:3])
         distance = dr.norm(away)
         is_near = distance - row[3] <= limit
@@ -326,10 +329,10 @@ def _by_groups(
             off = 8 * unit * (dr.norm(p) + distance + row[3])
             slope = dr.dot(away, direction) / distance - 2 * off / distance
             start = dr.select(is_near, dr.inf, distance - row[3] - off)
-            found[5:] = lowered(found[5:], knots, start, slope, 4 * unit * distance, unit)
+            found[5:] = min_with_tangent(found[5:], knots, start, slope, 4 * unit * distance, unit)
 
         def each(j: Any, *inner: Any) -> tuple[Any, ...]:
-            return j + 1, *body(records.row(i * _GROUP + j), inner)
+            return j + 1, *body(records.read_record(i * _GROUP + j), inner)
 
         def more(j: Any, *_: Any) -> Any:
             return j < last
@@ -339,13 +342,13 @@ def _by_groups(
         return i + 1, *inside[1:]
 
     def more_groups(i: Any, *_: Any) -> Any:
-        return i < groups.trips
+        return i < groups.iteration_count
 
     index = groups.backend.UInt32(0)
     return dr.while_loop((index, *start), more_groups, visit, label="tube by groups")[1:]
 
 
-def lowered(
+def min_with_tangent(
     lows: Sequence[Real],
     knots: tuple[Real, ...],
     start: Real,
@@ -353,8 +356,8 @@ def lowered(
     rounding: Real,
     unit: float,
 ) -> list[Real]:
-    """The smaller of `lows` and of the values of a tangent at the knots, the last of which may be
-    infinite.
+    """The smaller of `lower_bounds` and of the values of a tangent at the knots, the last of which
+    may be infinite.
 
     start: the tangent's value at 0, known up to `rounding`.
     slope: of the tangent, at least -1; NaN, as on the segment itself, counts as -1.
@@ -369,13 +372,13 @@ def lowered(
 
 
 @dataclass(frozen=True)
-class TubeAhead(Enclosure):
+class TangentEnclosure(Enclosure):
     """The distance from a set of segments along a path.
 
     distance: from the nearest segment.
     slope: a bound of the rate at which that grows.
     knots: increasing lengths s.
-    lows: lower bounds of F at these, by the tangents of the distances.
+    lower_bounds: lower bounds of F at these, by the tangents of the distances.
 
     Proof. The distance from one segment is a convex function of s, so it lies above its tangent at
     s = 0 (Hart 1996, theorem 4). The smallest of all tangents is a concave function, which lies
@@ -392,20 +395,20 @@ class TubeAhead(Enclosure):
     distance: Real
     slope: Real
     knots: tuple[Real, ...]
-    lows: tuple[Real, ...]
+    lower_bounds: tuple[Real, ...]
 
-    def step(self, gaps: Gaps) -> Real:
+    def free_length(self, gaps: LevelGaps) -> Real:
         across = self.distance * self.slope
-        right = gaps.up * (gaps.up + 2 * self.distance)
+        right = gaps.above * (gaps.above + 2 * self.distance)
         root = dr.sqrt(fmax(dr.fma(across, across, right), 0))
         up = dr.select(across > 0, right / (across + root), root - across)
         # Squares of large numbers overflow: a distance rises by 1 per unit of length at most.
-        up = dr.select(dr.isfinite(right) & dr.isfinite(root), up, gaps.up)
+        up = dr.select(dr.isfinite(right) & dr.isfinite(root), up, gaps.above)
         total, start, low = 0 * self.distance, 0 * self.distance, 0 * self.distance
-        free = gaps.down >= 0  # and not NaN
-        for knot, next_low in zip(self.knots, self.lows, strict=True):
-            is_clear = next_low >= -gaps.down
-            part = fmax((gaps.down + low) / (low - next_low) * (knot - start), 0)
+        free = gaps.below >= 0  # and not NaN
+        for knot, next_low in zip(self.knots, self.lower_bounds, strict=True):
+            is_clear = next_low >= -gaps.below
+            part = fmax((gaps.below + low) / (low - next_low) * (knot - start), 0)
             reached = dr.select(is_clear, knot, fmin(start + part, knot))
             total = dr.select(free, reached, total)
             free &= is_clear
@@ -420,7 +423,7 @@ _SLACK = 1e-5
 _REACH = 0.5
 
 
-class Tubes(BoxedField["_TubeBuffers"]):
+class TubeNetwork(PatchField["_TubeBuffers"]):
     """The surfaces at distance `radius` from many segments: edges of meshes, wires, struts.
 
     points: (n, 3).
@@ -428,9 +431,9 @@ class Tubes(BoxedField["_TubeBuffers"]):
     radius: a number, or (m,).
 
     Each segment is a part with rounded ends (`harnack.fields.capabilities`): a ray pays only for
-    those whose boxes it enters, so that thousands cost little more than one, and `Hits.sheet` is
-    the index of the segment. `level` makes all tubes thicker by so much. For one polyline, and for
-    combinations with other solids, there is `Tube`.
+    those whose boxes it enters, so that thousands cost little more than one, and
+    `Hits.primitive_index` is the index of the segment. `level` makes all tubes thicker by so much.
+    For one polyline, and for combinations with other solids, there is `Tube`.
 
     Raises ValueError for arrays of other shapes, numbers that are not finite, an index without a
     point, a segment without a length, a radius that is not positive.
@@ -440,11 +443,11 @@ class Tubes(BoxedField["_TubeBuffers"]):
 
     def __init__(self, points: Any, segments: Any, radius: Any) -> None:
         super().__init__()
-        array = real_array(points, "the points of tubes")
+        array = as_real_array(points, "the points of tubes")
         check_vectors(array, "the points of tubes")
         self.points: FloatArray = np.array(array, dtype=np.float64)
         check_finite(self.points, "point {} of tubes", ValueError)
-        check_size(self.points, ValueError)
+        check_coordinate_size(self.points, ValueError)
         self.segments: IntArray = _checked_segments(segments, self.points)
         self.radius: FloatArray = _checked_radius(radius, len(self.segments))
 
@@ -466,19 +469,19 @@ class Tubes(BoxedField["_TubeBuffers"]):
         )
 
     def _upload(self, backend: Backend) -> _TubeBuffers:
-        boxes = BoxedParts.upload(backend, *self.boxes())
+        boxes = PatchBoxes.upload(backend, *self.boxes())
         center = np.array(boxes.center, dtype=np.float64).reshape(3)
         start, end = ((self.points[ends] - center) for ends in self.segments.T)
         side = end - start
         inverse = 1.0 / (side * side).sum(axis=1)
         rows = np.column_stack([start, self.radius, side, inverse])
-        return _TubeBuffers(boxes, Records.upload(backend, rows))
+        return _TubeBuffers(boxes, RecordTable.upload(backend, rows))
 
-    def part_at(self, index: Any) -> Field:
-        on = self._on()
-        return _Segment(on.boxes, on.segments.row(index))
+    def patch(self, index: Any) -> Field:
+        on = self._require_data()
+        return _Segment(on.boxes, on.segments.read_record(index))
 
-    def check_levels(self, levels: tuple[float, ...]) -> None:
+    def validate_levels(self, levels: tuple[float, ...]) -> None:
         least = float(self.radius.min())
         for level in levels:
             if not level > -least:
@@ -494,8 +497,8 @@ class Tubes(BoxedField["_TubeBuffers"]):
 class _TubeBuffers:
     """The tubes' boxes and segments on a backend; segments relative to the center of the boxes."""
 
-    boxes: BoxedParts
-    segments: Records
+    boxes: PatchBoxes
+    segments: RecordTable
 
 
 class _Segment(Field):
@@ -507,12 +510,12 @@ class _Segment(Field):
     1/(D - r) within r.
     """
 
-    def __init__(self, boxes: BoxedParts, row: list[Real]) -> None:
+    def __init__(self, boxes: PatchBoxes, row: list[Real]) -> None:
         self._boxes, self._row = boxes, row
 
     def evaluate(self, p: Vec3) -> Sample:
         backend, row = self._boxes.backend, self._row
-        vector, unit = backend.Array3f, 2 * backend.epsilon
+        vector, unit = backend.Array3f, 2 * backend.machine_epsilon
         from_start = vector(p) - self._boxes.center - vector(*row[:3])
         side = vector(*row[4:7])
         along = clamp(dr.dot(from_start, side) * row[7], 0, 1)
@@ -524,18 +527,18 @@ class _Segment(Field):
         gradient = dr.select(distance > 0, away / distance, vector(0))
         doubt = dr.select(distance > 0, dr.minimum(4 * error / distance, 2), 2)
         r = _REACH * fmax(distance - error, 0)
-        known: tuple[Promise, ...] = (Lipschitz(backend.Float(1)), Curvature(1 / r, r))
+        known: tuple[Promise, ...] = (Lipschitz(backend.Float(1)), TaylorRemainder(1 / r, r))
         return Sample(distance - row[3], gradient, known, error, doubt)
 
 
 def _checked_segments(segments: Any, points: FloatArray) -> IntArray:
-    array = real_array(segments, "the segments of tubes")
+    array = as_real_array(segments, "the segments of tubes")
     if array.ndim != 2 or array.shape[1] != 2 or not len(array):
         raise ValueError(f"the segments of tubes must have shape (m, 2), not {array.shape}")
     if array.dtype.kind not in "iu":
         raise ValueError(f"the segments of tubes must be integer indices, not {array.dtype}")
-    if len(array) >= MOST_BOXES:
-        raise ValueError(f"{len(array):,} segments are too many: at most {MOST_BOXES:,}")
+    if len(array) >= MAX_BOXES:
+        raise ValueError(f"{len(array):,} segments are too many: at most {MAX_BOXES:,}")
     pairs = np.array(array, dtype=np.int64)
     if (out := np.flatnonzero(((pairs < 0) | (pairs >= len(points))).any(axis=1))).size:
         raise ValueError(
@@ -550,13 +553,13 @@ def _checked_segments(segments: Any, points: FloatArray) -> IntArray:
 
 
 def _checked_radius(radius: Any, count: int) -> FloatArray:
-    array = real_array(radius, "the radius of tubes")
+    array = as_real_array(radius, "the radius of tubes")
     if array.ndim == 0:
-        return np.full(count, positive(radius, "the radius of tubes"))
+        return np.full(count, as_positive(radius, "the radius of tubes"))
     if array.shape != (count,):
         raise ValueError(
             f"the radius of tubes is a number or has shape ({count},), not {array.shape}"
         )
     for one in (array.min(), array.max()):
-        positive(float(one), "the radius of tubes")
+        as_positive(float(one), "the radius of tubes")
     return np.array(array, dtype=np.float64)
