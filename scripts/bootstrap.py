@@ -24,7 +24,7 @@ LLVM_FOLDER = ROOT / "src" / "harnack" / "backend"
 PIP = (str(VENV_PYTHON), "-m", "pip", "--disable-pip-version-check")
 DOCTOR = (
     "import sys; from rich.console import Console; from harnack.backend import doctor; "
-    "sys.exit(not doctor.render_report(Console()))"
+    "sys.exit(not doctor.print_report(Console()))"
 )
 
 if sys.version_info < (3, 10):  # noqa: UP036  # Python reads no pyproject.toml
@@ -212,7 +212,7 @@ class Apt:
             run(command, DEBIAN_FRONTEND="noninteractive")
 
     def missing_dependencies(self, packages: Sequence[str]) -> list[str]:
-        """What `package_versions` need, directly or not, that this system does not have."""
+        """What `packages` need, directly or not, that this system does not have."""
         kinds = ("recommends", "suggests", "conflicts", "breaks", "replaces", "enhances")
         switches = [f"--no-{kind}" for kind in kinds]
         tree = run(["apt-cache", *self.options, "depends", "--recurse", *switches, *packages])
