@@ -1,7 +1,8 @@
-"""What is known of a level set in cells: that it is absent, or a slab that it lies in, and points.
+"""Classifies the cells that may hold a level set: each is proved empty, or gets a slab (two
+parallel planes) that contains the surface, and a point of the surface.
 
-Some points are on the *rim*, the curve at which the field's domain cuts the level set:
-`ClipCurveDescent` searches for the closest.
+Some of these points lie on the *clip curve*, where the boundary of the field's domain cuts the
+level set; `ClipCurveDescent` finds its closest point.
 """
 
 from __future__ import annotations

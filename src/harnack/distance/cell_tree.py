@@ -100,11 +100,12 @@ class SurfaceCells:
 
 @dataclass(frozen=True)
 class BestCandidate:
-    """The nearest point of the surface so far.
+    """The closest surface point found so far.
 
-    point: its place. distance: how far it is.
-    exclusion_radius: a radius about it within which no point is nearer.
-    separation_factor: how many times farther from it than from others feet have to be to be tried.
+    distance: of `point` from the query.
+    exclusion_radius: no surface point within it of `point` is nearer to the query.
+    separation_factor: multiplies the distance from `point` below which another cell's point is
+        skipped, as leading to the same closest point.
     """
 
     point: Vec3
@@ -176,13 +177,14 @@ class CellTree:
     def closer_candidates(
         self, x: Vec3, best: BestCandidate, others: tuple[Vec3, ...], tolerance: Real, marks: Any
     ) -> tuple[Real, list[Vec3]]:
-        """What cells say about points of the surface that are nearer to x than the best.
+        """Find cells that may hold a point nearer to x than `best`.
 
-        Returns a length that the surface is no nearer than, at most the distance of the best; and
-        the feet (else FAR) of the few cells where it seems to come nearest, of those in which it
-        may be nearer than the best by more than `tolerance`. Feet that are not apart from the best,
-        from `others` and from one another (`_SEPARATION`) are left out. In `marks`, if given, a
-        Bool is set for each of those cells, wherever their feet are.
+        Returns a lower bound of the distance from x to the surface, at most best.distance; and the
+        surface points (`FAR_SENTINEL` for none) of the few cells with the smallest estimated
+        distance, among those whose lower bound is below best.distance - tolerance. Points that are
+        not separated from `best`, from `others` or from each other (`_SEPARATION`) are skipped. In
+        `marks`, if it is not None, a Bool is set for every cell with such a lower bound, whether
+        its point is skipped or not.
         """
         backend = self.tree.backend
         vector, index = backend.Array3f, backend.UInt32

@@ -94,15 +94,17 @@ class ClosestPointDescent:
         return cls(backend, field, levels, has_hessian(backend, field))
 
     def newton(self, x: Vec3, start: Vec3, limit: Real) -> tuple[Vec3, Real, Mask, Mask]:
-        """A place from which Newton's method for f(y) = level and (x - y) parallel to grad f(y),
-        begun at a point of the surface nearby, ends with one more step (`finish`); how far `start`
-        is off the level; and whether the search was given up, as it goes on to where f is singular,
-        or to a point that is farther from x than `limit`.
+        """Newton's method for the closest-point equations f(y) = level and (x - y) parallel to grad
+        f(y), in one kernel, from a point `start` near the surface.
 
-        Each step is that of `descend` along the surface, which follows its curvature, and one to
-        the level, both from derivatives at one place: errors are squared by each of both. So the
-        step after the next is about its length times the square of its ratio to the last one.
-        Where steps become shorter the end is within twice the next.
+        Returns y, to which `finish` adds the last step; the first-order distance of `start` from
+        the level; whether a step was longer than half the radius in which f is smooth; and whether
+        y will be farther from x than `limit`. After the latter two the search was given up.
+
+        Each step combines the step of `descend` along the surface, which follows its curvature,
+        with a Newton step to the level; both are from derivatives at the same point. Convergence is
+        quadratic: a step of length s after one of length s0 is followed by one of about s (s/s0)^2.
+        While steps at least halve, the limit is within twice the current step.
         """
         real, vector, count = self.backend.Float, self.backend.Array3f, self.backend.UInt32
         x, mask = vector(x), self.backend.Bool

@@ -152,14 +152,17 @@ def _search_smooth_part(
     tolerance: StoppingRule,
     progress: Callable[[str], None],
 ) -> SearchResult:
-    """What is found of a surface with sheets: on its smooth part, or what is known on sheets.
+    """Search the smooth part of a surface that has jumps, and merge the result with closest points
+    already known on its jump surfaces.
 
-    smooth: `JumpSurface.without_jumps` of the surface's field. known: feet on sheets.
+    smooth: `JumpSurface.without_jumps` of the surface's field.
+    known: closest points on jump surfaces.
 
-    Proof of the lower bounds: the surface lies on level sets of `smooth` and on sheets, and is no
-    nearer than the nearest of either. Feet on the former are of the surface where f has the level
-    too. Where f has not, and where a sheet is nearer than all feet, which may be of the surface
-    elsewhere than at its nearest point, rays look further.
+    Proof of the lower bounds: the surface lies in the union of the level sets of `smooth` and the
+    jump surfaces, so it is no nearer than the nearer of the two. A point found on a level set of
+    `smooth` is accepted only if f has the level there. Queries are searched again, with rays, where
+    it does not, and where a jump surface is nearer than all accepted points: its nearest point need
+    not belong to the surface.
     """
     backend, surface = job.backend, job.surface
     alone = replace(surface, field=smooth).with_call_cache(begins=True)
@@ -234,7 +237,8 @@ def _with_mesh_points(points: FloatArray, start: FloatArray, mesh: LevelTriangle
 
 @dataclass(frozen=True)
 class _QueryEvaluator:
-    """What is computed at points of a surface that is searched in cells."""
+    """Evaluates one surface's field on a backend and runs the closest-point descents, for arrays of
+    query points."""
 
     backend: Backend
     surface: Surface

@@ -27,10 +27,11 @@ x - y is at right angles to the surface up to the square root of epsilon only.""
 
 
 def exclusion_radius(sample: Sample, rows: Rows | None, x: Vec3, y: Vec3) -> Real:
-    """A radius about y, the foot of x at right angles to the surface, in which no point of the
-    surface is nearer to x; 0 where none is proved.
+    """Radius of a ball about y in which no surface point is nearer to x than y; 0 if none is
+    proved. x - y is normal to the surface at y.
 
-    sample: f at y, rounding left out. rows: of its Hessian there, if it is known.
+    sample: f at y, without rounding errors.
+    rows: of the Hessian of f at y; None if it is not known.
 
     Proof. Let y + w be a point of the surface, |w| <= r, n = grad f/|g| and x = y + d n, where f
     is taken with the other sign if x is on the other side. With |f(y + w) - f(y) - g . w| <=

@@ -154,13 +154,12 @@ class JumpSurfaceSearch:
 
 
 def straddles_level(surface: SurfaceTracer, y: Vec3, radius: Real, active: Mask) -> Mask:
-    """Whether f is on both sides of a level about y, no farther than 1.74 radii away.
+    """Whether f takes values on both sides of a level within 1.74 radii of y.
 
-    f is evaluated in the corners of a tetrahedron and, on its edges, just before a sheet. Where two
-    of these places are on different sides of a level, the surface lies on the way between them: f
-    passes the level on it steadily, or by a jump. That needs no gradient, which has no bound at the
-    edges of sheets: f takes all values between those on both sides of the sheet there, and no
-    others.
+    It is evaluated at the corners of a tetrahedron and, on its edges, just before a jump surface.
+    Two values on different sides prove that the surface crosses the path between them, where f
+    passes the level continuously or by a jump. No gradient is needed: it is unbounded at the edge
+    of a jump surface, where f takes exactly the values between those on both sides.
     """
     backend, field = surface.backend, surface.field.exact(surface.backend)
     real, index, vector = backend.Float, backend.UInt32, backend.Array3f
@@ -338,17 +337,17 @@ class _HitPlanes:
 
 
 def compass_search(surface: SurfaceTracer, x: Vec3, foot: Vec3) -> Vec3:
-    """Points of the surface no farther from x than `foot`: a compass search over directions.
+    """Compass search over ray directions from x, starting at the surface point `foot`. Returns
+    points of the surface that are no farther from x.
 
-    What other searches cannot follow, a ray sees: the crease in which two sheets meet, the curve at
-    which a smooth part of the surface ends in a sheet, the edge along which a volume cuts it.
+    It reaches closest points on creases of two jump surfaces, on curves where a smooth part ends at
+    a jump surface, and on edges cut by a volume, which no other search here can follow.
 
-    Rays leave x at an angle to the best direction; the first that hits the surface nearer than the
-    best becomes the best. If all of a turn fail, the next turns are narrower, down to an angle of
-    sqrt(epsilon). A compass alone is slow along creases; so each hit adds the plane that touches
-    the surface there, and a turn begins with rays to the nearest points where these planes meet.
-    Every point taken is a first hit that f takes the level about (`straddles_level`), hence one of
-    the surface, whatever led there.
+    Rays leave x at an angle to the best direction; a nearer first hit becomes the best. If no
+    direction improves it, the angle is reduced, down to sqrt(epsilon). To be fast along creases,
+    each hit adds its tangent plane, and a round starts with rays to the nearest points of the
+    planes' intersections. Every accepted point is a first hit about which f straddles the level
+    (`straddles_level`), hence on the surface.
     """
     backend = surface.backend
     real, vector, count = backend.Float, backend.Array3f, backend.UInt32

@@ -116,17 +116,19 @@ class BccLattice:
     def relevant_cells(
         self, clearance: Clearance, matter: IntArray, values: Clearance, most_faces: int
     ) -> tuple[IntArray, BoolArray]:
-        """(n, 3) indices of the cells that may hold the level set or are negative beside cells that
-        do not matter, and of all cells of the lattice which do (counts).
+        """Indices (n, 3) of the relevant cells to mesh, and a mask (counts) of all relevant cells.
 
-        matter: (k, 3) indices of the cells that may matter (`nonempty_cells`). values: of the
-            function. What does not matter counts as positive: all points of such cells do. As in
-            the module's proof, tetrahedra at the chosen cells then have all faces between points
-            of two signs: a cell that is not chosen has a center of the sign of its corners that
-            matter, and if one of them does not, all of them are positive.
+        Chosen are cells that may hold the level set, and cells with a nonpositive center next to an
+        irrelevant cell. Irrelevant cells count as positive, with all of their points. Then every
+        tetrahedron with corners of both signs belongs to a chosen cell: the center of a cell not
+        chosen has the sign of its relevant corners, and if one corner is irrelevant all are
+        positive.
+
+        matter: (k, 3) indices of the relevant cells (`nonempty_cells`).
+        values: of the function.
 
         Raises:
-            MeshingError: there are too many.
+            MeshingError: too many cells are chosen.
         """
         does = np.zeros(tuple(self.counts.tolist()), np.bool_)
         does[tuple(matter.T)] = True

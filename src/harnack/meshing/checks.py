@@ -295,9 +295,8 @@ def _near_pairs(corner: FloatArray, among: BoolArray | None) -> IntArray:
 
 
 def _are_separated(vertices: FloatArray, faces: IntArray, pairs: IntArray) -> BoolArray:
-    """(k,) whether the plane of one of two faces has all corners of the other that they do not
-    share on one side: then they have nothing in common but these. False where rounding leaves it
-    open.
+    """(k,) whether two faces are proved to share nothing but common vertices: the plane of one has
+    all other vertices of the other strictly on one side. False where rounding leaves it undecided.
 
     See `broad_phase.ROUNDING` for the error of heights.
     """
@@ -446,10 +445,11 @@ _MAX_FAILURES_FOR_RETRY, _REQUIRED_FAILURE_REDUCTION = 20, 0.5
 def is_retry_promising(
     now: MeshingError, before: MeshingError | None, smallest: float = 1.0
 ) -> bool:
-    """Whether smaller cells may help, after one or two sizes of them failed: not if nearly as many
-    places are wrong, as along a pole or where sheets cross, where cells of no size do.
+    """Whether another attempt with smaller cells is promising, after one or two sizes of cells
+    failed. It is not if the number of failures hardly decreased since the previous attempt: along a
+    pole, or where jump surfaces cross, cells of every size fail.
 
-    smallest: how large cells may become, in those that failed now.
+    smallest: the smallest cell allowed, relative to those that failed now.
     """
     if not now.may_be_fixed_by(smallest):
         return False

@@ -74,8 +74,8 @@ def largest_body(surface: TriangleMesh) -> TriangleMesh:
 
 
 def drop_degenerate_components(surface: TriangleMesh) -> TriangleMesh:
-    """A closed surface without the connected parts that are nothing but rounding: what is left of
-    two parts that cancel each other, such as a solid less itself."""
+    """Remove the connected components of a closed surface that are only rounding error, such as the
+    remainder of a solid minus itself."""
     x, faces = surface.vertices, surface.faces
     if not len(faces):
         return surface

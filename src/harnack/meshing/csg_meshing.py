@@ -105,18 +105,18 @@ AngleMesher = Callable[[SolidAngle, float], TriangleMesh]
 
 
 IntersectedOperands: TypeAlias = tuple[tuple[Solid, float], ...]
-"""Solids and their levels: what is meshed is intersected with all of them, so that it need not be
-made where one of them is proved to have nothing.
+"""Solids, with levels, that the meshed solid will be intersected with; where one is proved empty,
+nothing need be meshed.
 
-Proof that parts of a tree of unions, intersections and complements may be left out there. Inside
-of a complement, only parts that are not one are taken, of the intersection that the complement is
-itself a part of; elsewhere those of all intersections above. First let nothing be left out within
-complements. Then all that is made of a tree is a part of the truth, since unions and intersections
-grow with their parts. If something is left out at a point, some part of an intersection above has
-nothing there in truth, so neither has what is made of it, nor the intersection: which is the truth.
-Now let something be left out within complements. At such a point a part of the intersection that
-the complement is in, without complements within, has nothing there, and as before what is made of
-it is a part of the truth: again the intersection is the truth."""
+Proof for a tree of unions, intersections and complements. Inside a complement, only operands
+without complements are passed on, from the intersection that has the complement as an operand;
+elsewhere, the operands of all enclosing intersections. (1) Omit nothing inside complements. Unions
+and intersections are monotone, so every meshed node is a subset of its true solid. At a point where
+something is omitted, an operand of an enclosing intersection is truly empty, so is its mesh, so is
+the intersection: correct. (2) Omit inside complements too. At such a point, a complement-free
+operand of the intersection that contains the complement is truly empty, and by (1) its mesh is;
+again the intersection is correctly empty.
+"""
 
 
 @dataclass

@@ -1,9 +1,8 @@
-"""Unions whose parts have parts in common: these are taken out, so that none is made twice.
+"""Factors common operands out of unions of solids.
 
-A hollow part with a lattice inside is (P less Q) | (P & W): the surface of P would be that of both
-operands. Cut by the lattice its triangles have corners that are rounded, so they would lie in the
-other operand's triangles but for rounding, and pass through them. As P less (Q less W) it is the
-same solid, P is there once, and what is put together has no surfaces in common.
+In (P - Q) | (P & W), a hollow part with a lattice inside, the surface of P occurs twice, once with
+rounded vertices where W cuts it, and the two copies would intersect. The equivalent P - (Q - W)
+contains P once, and its operands share no surface.
 """
 
 from __future__ import annotations

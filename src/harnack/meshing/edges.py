@@ -92,7 +92,7 @@ class Edges:
         return cls(np.stack(np.divmod(keys, max(count, 1)), axis=1), index, uses, order)
 
     def paired_half_edges(self) -> IntArray:
-        """(j, 2) the two of the pairs given that each edge is that is exactly two of them."""
+        """(j, 2) for each edge that occurs exactly twice, the indices of its two occurrences."""
         return self.pairs_by_edge[np.repeat(self.multiplicity == 2, self.multiplicity)].reshape(
             -1, 2
         )
@@ -124,9 +124,8 @@ def sorted_unique(keys: IntArray) -> IntArray:
 
 
 def unique_with_inverse(keys: IntArray) -> tuple[IntArray, IntArray, IntArray, IntArray]:
-    """Numbers (n,) that are not negative, each once and in order (k,), for each given one its place
-    among them (n,), how often each was given (k,), and the order of those given (n,): `np.unique`,
-    at a third of its time."""
+    """Sorted unique values (k,) of nonnegative integers (n,), the inverse (n,), the counts (k,) and
+    the sorting permutation (n,): `np.unique`, in a third of the time."""
     bits = len(keys).bit_length()
     if int(keys.max(initial=0)) >> (62 - bits):
         order = np.argsort(keys, kind="stable")

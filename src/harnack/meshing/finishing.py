@@ -89,8 +89,8 @@ def _offset(surface: TriangleMesh, normals: FloatArray, thickness: float) -> Tri
 
 
 def _normal_cosines(surface: TriangleMesh, normals: FloatArray) -> FloatArray:
-    """(n,) cosines between normals at vertices and those of the faces there, means by area:
-    vertices are moved farther by that, so that faces are moved by the thickness."""
+    """(n,) area-weighted mean cosine between a vertex normal and the adjacent face normals, clipped
+    to [0.7, 1]. A vertex offset of thickness / cosine moves the faces by the thickness."""
     cross = area_normals(surface.vertices[surface.faces])
     total, area = np.zeros(len(normals)), np.zeros(len(normals))
     size = np.linalg.norm(cross, axis=1)

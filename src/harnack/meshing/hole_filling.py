@@ -79,13 +79,12 @@ class HoleFilling:
 def fill_holes(
     vertices: FloatArray, faces: IntArray, loops: list[IntArray], winding: Winding
 ) -> HoleFilling:
-    """Patches over loops of open edges, as `hole_loops` gives them, that pass these checks: no
-    triangle of one meets another triangle or is without an area, and the winding number of what is
-    there is near 1/2 modulo 1 at its vertices and centers. It is far from that where a hole is no
-    hole of its own: where two rims belong to one gap, or a part stands in it.
+    """Fill holes, each bounded by a loop of boundary edges (`hole_loops`).
 
-    What fails is tried once more from the triangulation of least area, then without making it bend
-    little.
+    A filling is accepted if its triangles have positive area and intersect no other triangle, and
+    if the mesh's winding number at its vertices and centers is near 1/2 modulo 1. The latter fails
+    where a loop bounds no hole of its own: two loops bound one gap, or another component stands in
+    it. Failed loops are tried again with the minimum-area triangulation, then without fairing.
 
     winding: the winding number of the mesh at points.
     """

@@ -332,9 +332,10 @@ class TriangleMesh:
 
 @dataclass(frozen=True)
 class IrrelevantRegion:
-    """Where nothing matters, of one or several surfaces: how far around points (k, 3) nothing does.
+    """The region where a surface need not be meshed, because other operands remove it.
 
-    cached_cells: the cells of lattices that are not proved to be there, each looked for once.
+    clearance: radii of balls about points (k, 3) that lie in the region.
+    cached_cells: per lattice, the cells not proved to lie in it.
     """
 
     clearance: Clearance
@@ -343,10 +344,11 @@ class IrrelevantRegion:
     )
 
     def relevant_cells(self, lattice: BccLattice, most: int) -> IntArray:
-        """(n, 3) indices of the cells that are not there, and of some around them.
+        """Indices (n, 3) of the cells that are not proved to lie in the region, and of a border of
+        cells around them.
 
         Raises:
-            MeshingError: there are more than `most` triangles would take.
+            MeshingError: there are more cells than `most` triangles would take.
         """
         key = (*lattice.lower.tolist(), *lattice.size.tolist(), *lattice.counts.tolist(), most)
         if key not in self.cached_cells:

@@ -1,13 +1,12 @@
 """Triangles of a level set in tetrahedra, when its function may be an angle; and the tetrahedra.
 
-Between two points the function moves from one value to another along the edge: its *lift*. The
-edge crosses the level as often as the lift does, with the sign of the way up, n = 0 or +-1 if cells
-are small enough: of a real-valued function where the signs at the ends differ, of an angle where
-the lift, which may differ from the difference of the two wrapped values by whole periods, passes
-from one interval between levels to the next. In a tetrahedron the crossings on edges between
-corners off the level say on which side of the level each corner is, if they agree around every
-face; that is checked, and so is that no more than one level is between corners. A corner on the
-level, a vertex of the curve among them, is a vertex of the triangles as it is.
+The continuous change of the function along an edge is its *lift*. The signed number of level
+crossings is that of the lift: 0 or +-1 if cells are small enough. For a real-valued function it
+follows from the signs at the ends. For an angle, the lift may differ from the difference of the
+wrapped values by whole periods. The crossings of a tetrahedron's edges between corners off the
+level determine on which side of the level each corner lies, if they are consistent around every
+face; that is checked, and that at most one level passes between the corners. A corner on the level,
+such as a vertex of the curve, becomes a mesh vertex.
 
 Tetrahedra between points are Delaunay's, by Qhull (`delaunay`).
 """

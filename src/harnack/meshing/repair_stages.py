@@ -95,19 +95,18 @@ def repair(
     over: each closed part that does not lie in another, with all that lies in it. Then five stages
     are tried in turn:
 
-    - filled: all triangles stay, and holes get patches;
-    - boolean_union: a closed mesh that crosses itself, also along edges that lie on its faces, or
-    parts
-      that overlap or touch, are cut where they do, exactly, and what is inside is left out, as is
-      what it winds around clockwise: cavities stay where it winds around no point;
-    - cleaned: triangles that are there twice, have no area or pass through others are left out,
-    those
-      turned over against their neighbors are turned back, and holes get patches; where one cannot
-      be filled, the triangles around it are left out as well, ring by ring;
-    - welded: corners of loose triangles that lie near each other, as in a mesh full of cracks, are
-      moved to their mean, and the rest is done as before;
-    - remeshed: the surface on which the winding number w of the mesh is 1/2 is made by the signs of
-      w - 1/2 in cells (`meshing.sign_isosurface`), closed whatever the mesh is.
+    - filled: all triangles stay, and holes are filled;
+    - boolean_union: a closed mesh that intersects itself, also along edges that lie on its faces,
+      or components that overlap or touch, are cut exactly along the intersections; interior faces
+      are removed, and those that wind around a point clockwise: cavities stay where the mesh winds
+      around no point;
+    - cleaned: duplicate, degenerate and intersecting triangles are removed, those turned over
+      against their neighbors are flipped, and holes are filled; around a hole that cannot be
+      filled, triangles are removed ring by ring;
+    - welded: nearby corners of loose triangles, as in a mesh full of cracks, are merged at their
+      mean, and the mesh is then cleaned;
+    - remeshed: the surface on which the winding number w of the mesh is 1/2 is extracted from the
+      signs of w - 1/2 in cells (`meshing.sign_isosurface`); it is closed whatever the mesh is.
 
     Each result is compared with w at some thousand points, farther from both surfaces than two
     tolerances: where w is above 0.86 the inside has to be, and where it is below 0.14 the outside;

@@ -312,14 +312,14 @@ class RefractedHits:
 
 
 class RefractionTracer:
-    """What shaded pictures show behind clear matter: rays go on through it, bent and tinted.
+    """Traces refracted rays through transparent solids for shaded pictures.
 
-    Of the two ways that light takes at a boundary only the one through it is followed, and the one
-    back where all of it is reflected; what else is reflected is the sky's light and a highlight. So
-    a picture has no noise, and no caustics.
+    At an interface only the transmitted ray is followed (the reflected one for total reflection);
+    the other contributes sky light and a highlight. So there is no noise, and there are no
+    caustics.
 
-    indices: of refraction, of each carrier that is clear.
-    hides_lights: whether shapes that shine are not seen.
+    indices: of refraction, of each proxy shape that is transparent.
+    hides_lights: whether shapes that emit light are not seen.
     """
 
     def __init__(
@@ -332,7 +332,7 @@ class RefractionTracer:
         self.indices = tuple((carrier, index) for carrier, index in found if index is not None)
 
     def trace(self, ray: Any) -> RefractedHits:
-        """What camera rays see."""
+        """The first opaque hits of camera rays, behind transparent solids."""
         mi, world = self.world.mi, self.world
         nothing = dr.zeros(mi.SurfaceInteraction3f, dr.width(ray.d))
         sight = RefractedHits(

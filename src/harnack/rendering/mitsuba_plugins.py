@@ -96,12 +96,13 @@ def warn_unsupported_integrator(scene: Any, integrator: Any) -> None:
 
 
 def equivalent_path_tracer(mi: Any, scene: Any) -> PathTracer | None:
-    """The path tracer that finds the light that the scene's integrator asks for; None for scenes
-    without surfaces of ours that Mitsuba has to draw itself.
+    """Return a path tracer equivalent to the scene's integrator; None where Mitsuba has to draw the
+    scene itself: its integrator follows no paths, and the scene has no surfaces of harnack, or the
+    integrator sees them.
 
     Raises:
-        ValueError: the scene holds surfaces of ours, and its integrator asks for what no path
-            tracer without media finds, such as light in a medium or channels of its own.
+        ValueError: the scene has surfaces of harnack, and its integrator asks for something that no
+            path tracer without media computes, such as light in a medium or channels of its own.
     """
     integrator = scene.integrator()
     if integrator is None:

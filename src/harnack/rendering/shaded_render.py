@@ -176,19 +176,19 @@ _FIRST_PASS_FRACTION = 0.6
 
 @dataclass
 class GBuffer:
-    """What rays hit first, or first behind clear matter.
+    """G-buffer: per pixel, the first opaque hit, seen through transparent solids.
 
-    position, normal, eye: the point, its unit normal towards the eye, and the direction to the eye.
-    width: of a pixel, there.
+    position, normal, eye: the point, its unit normal toward the eye, and the direction to the eye.
+    width: pixel size there.
     color: reflectance.
-    light: shone by an emitter or the environment and reflected by clear matter, or magenta for
-        lost.
-    transmittance: what clear matter leaves of the light from what is hit.
-    glossy: whether the material is glossy. met, lost: whether there is a hit; and whether the ray
-        ran out of steps.
-    covered: whether there is anything at all, and not the environment alone.
-    needs_refinement: whether to draw the pixel again, as the edge of an isoline may pass through
-        it, or a cone found that a surface covers a part of it.
+    light: emitted, from the environment, or reflected by transparent solids; magenta for rays out
+        of steps.
+    transmittance: of the transparent solids in front.
+    glossy: whether the material is glossy.
+    met, lost: whether there is a hit; whether the ray ran out of steps.
+    covered: whether anything but the environment is visible.
+    needs_refinement: whether the pixel is to be drawn again, as an isoline's edge may cross it, or
+        a cone found it partly covered.
     """
 
     position: Any

@@ -32,35 +32,39 @@ _EDGE = 16
 
 
 def pixel_ranges(pixels: int, step: int) -> Iterator[tuple[int, int]]:
-    """(start, stop) of runs of at most `step` pixels: Ctrl-C works between them."""
+    """Ranges (start, stop) of at most `step` pixels that cover range(pixels).
+
+    Ctrl-C works between the ranges.
+    """
     for start in range(0, pixels, step):
         yield start, min(start + step, pixels)
 
 
 class RenderExecutor(Protocol):
-    """Those who do the parts of a picture."""
+    """Interface to what executes the tasks of a render: this process, or a Dask cluster."""
 
     def split_range(self, count: int, most: int) -> list[tuple[int, int]]:
-        """(start, stop) of runs of things that are counted from 0, at most `most` a run."""
+        """Ranges (start, stop) that cover range(count), each of at most `most` elements."""
         ...
 
     def run_tasks(self, step: str, parts: Sequence[tuple[Any, ...]]) -> Iterator[Any]:
-        """What a method, given by its name, returns for the arguments of each part, in order."""
+        """Results of the method named `step`, called with the arguments of each of `parts`, in
+        order."""
         ...
 
 
 @dataclass(frozen=True)
 class LocalRenderExecutor:
-    """This process, which calls the methods of an object."""
+    """Executes tasks in this process: calls the methods of the object `drawing`."""
 
     drawing: Any
 
     def split_range(self, count: int, most: int) -> list[tuple[int, int]]:
-        """As few runs as there may be."""
+        """The fewest ranges possible."""
         return list(pixel_ranges(count, most))
 
     def run_tasks(self, step: str, parts: Sequence[tuple[Any, ...]]) -> Iterator[Any]:
-        """One after the other."""
+        """Results of the tasks, which are run one after the other."""
         method = getattr(self.drawing, step)
         return (method(*part) for part in parts)
 

@@ -32,22 +32,20 @@ _GRAZING = 1e-3
 
 @dataclass
 class SurfaceHit:
-    """What rays hit first. Lanes that hit nothing have t = inf, and neither is_hit nor
-    is_out_of_steps.
+    """First hits of rays. Rays without a hit have is_hit = is_out_of_steps = False and t = inf.
 
-    t: ray parameter; of a lost ray, how far it is proved free.
+    t: ray parameter of the hit; of a ray out of steps, up to where it is proved free.
     is_hit: there is a surface at t.
     is_out_of_steps: the ray ran out of steps behind t.
-    position, normal: of the surface. The normal is unit and points to the side of larger values or,
-        of a solid, out of it.
-    ray_offset: how far off the surface the next ray has to start.
-    value: of the field, close to the surface or, of a sheet (where a field jumps), just before it;
-        undefined where nothing is hit.
-    evaluations: of the field.
-    is_on_section: the hit is on a face at which the section cuts a solid.
-    is_hole_filling: of a field with sheets, the hit is on none: the surface closes a hole between
-        them there.
-    isoline_index: the number of the isoline drawn there, counted from 1; 0 for none.
+    position, normal: of the surface. The normal is unit and points toward larger values or, of a
+        solid, outward.
+    ray_offset: how far off the surface the next ray must start.
+    value: of the field, close to the surface or just before a jump; undefined without a hit.
+    evaluations: number of evaluations of the field.
+    is_hole_filling: the field has jumps but the hit is on none; the surface closes a hole between
+        jump surfaces there.
+    is_on_section: the hit is on a face where the section cuts a solid.
+    isoline_index: of the isoline drawn there, from 1; 0 for none.
     """
 
     t: Real

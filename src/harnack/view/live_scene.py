@@ -570,11 +570,11 @@ def encode_arrays(value: Any) -> Any:
 
 
 def state_delta(first: JsonDict, state: JsonDict, *, checks: bool = True) -> JsonDict:
-    """What a state changes of the first: words of the data of its surfaces, and whatever else
-    differs; or all of it where there are other kernels. `changed` in frames.js is the way back.
+    """Difference between a state and the initial one: changed data words per surface and all other
+    changed entries; or the whole state if its kernels differ. Inverse: `changed` in frames.js.
 
-    checks: whether rays with answers go along; with other kernels they always do, as no device has
-        been asked about these.
+    checks: whether check rays with their answers are included. With other kernels they always are,
+        as no device has checked these yet.
     """
     pairs = [*zip(first["surfaces"], state["surfaces"], strict=False)]
     alike = len(first["surfaces"]) == len(state["surfaces"]) and all(

@@ -82,11 +82,11 @@ class Slider:
 
 @dataclass(frozen=True)
 class SlidingContent:
-    """Fields and settings, of which some are functions of sliders.
+    """Content of a live view as a function of sliders.
 
-    content: what `hk.render` draws in its studio, or a function of sliders that gives it. settings:
-        of
-    `render` and `level_set`; functions likewise. sliders: by their names.
+    content: an argument that `hk.render` accepts, or a function of sliders that returns it.
+    settings: options of `render` and `level_set`, constant or functions of sliders.
+    sliders: by name.
     """
 
     content: Any

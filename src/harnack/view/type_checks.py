@@ -1,5 +1,5 @@
-"""Whether values of a scene file are of the types that a class or a function asks for, so that
-what is something else is refused when the file is read, and not when it is drawn."""
+"""Checks values of a scene file against the type annotations of the constructor they are passed to,
+so that errors appear on reading and not on drawing."""
 
 from __future__ import annotations
 
