@@ -62,17 +62,19 @@ class Interval:
 
     @property
     def is_literal(self) -> bool:
-        """Whether it is known while a kernel is being recorded."""
+        """Whether both ends are Python numbers, which are known while a kernel is being
+        recorded."""
         return isinstance(self.lower, float) and isinstance(self.upper, float)
 
     @property
     def is_zero(self) -> bool:
-        """Whether it is known, while a kernel is being recorded, to be 0 alone."""
+        """Whether it is [0, 0] in Python numbers, which is known while a kernel is being
+        recorded."""
         return self.is_literal and self.lower == 0.0 == self.upper
 
     @property
     def midpoint(self) -> Real:
-        """A number of the interval, half way."""
+        """A number about half way between the ends."""
         if self.lower is self.upper:
             return self.lower
         return 0.5 * self.lower + 0.5 * self.upper
@@ -105,8 +107,8 @@ class Interval:
         return Interval(low, high, self.is_single or other.is_single)
 
     def intersect(self, other: Interval) -> Interval:
-        """The intersection of two that are known to have a common number; where an end is NaN, that
-        of the other."""
+        """The intersection with an interval that is known to overlap this one. An end that is NaN
+        is unknown: the other interval's end is taken."""
         return Interval(
             _maximum_ignoring_nan(self.lower, other.lower),
             _minimum_ignoring_nan(self.upper, other.upper),

@@ -336,11 +336,12 @@ class ParabolaBounds(FormulaNumber):
         return self._made(value, below, above)
 
     def polar_angle(self, x: Any) -> ParabolaBounds:
-        """The angle of a point, which moves as it does seen from any direction.
+        """The polar angle atan2(y, x) of z = (x, y): at the start of the path, and its change
+        relative to a fixed direction c.
 
-        Proof. For any vector c = (a, b) the angle of z = (x, y) differs from that of
-        (x a + y b, y a - x b) by a constant along a path that does not meet the cut, and where
-        x a + y b > 0 the latter is an arc tangent. Elsewhere nothing is known beyond the start.
+        Proof. For any vector c = (a, b) the angle of z = (x, y) differs from that of (x a + y b, y
+        a - x b) by a constant along a path that does not meet the cut, and where x a + y b > 0 the
+        latter is an arc tangent. Elsewhere nothing is known beyond the start.
         """
         h = self.piece_length
         v, u = (_dynamic(one.value, h) for one in (self, x))

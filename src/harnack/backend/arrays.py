@@ -94,12 +94,15 @@ def _backend(name: BackendName, precision: Precision) -> Backend:
 
 
 def _check_ieee_arithmetic(backend: Backend) -> None:
-    """Metal's compiler may, by default, treat infinities and NaN as if there were none, and round
-    otherwise; proofs rest on both. So a device is asked before it is believed. It may flush
-    subnormal numbers to zero, which none of the questions leads to.
+    """Check that a device computes as IEEE 754 prescribes.
+
+    Metal's compiler may by default assume that no number is infinite or NaN, and may round
+    differently; the proofs rely on both. So a few operations are run on the device and compared
+    with NumPy. The device may flush subnormal numbers to zero: no operation of the comparison leads
+    to them.
 
     Raises:
-        RuntimeError: it computes otherwise than IEEE 754 says.
+        RuntimeError: a result differs from NumPy's.
     """
     given = np.array([1, 3, 0, -0.0, 1e-30, 8e37, np.inf, np.nan, 0.1, 16777216], np.float32)
     x, one = upload_floats(backend, given), dr.opaque(backend.Float, 1)
@@ -238,8 +241,8 @@ def as_finite_vectors(vectors: Any, name: str) -> FloatArray:
 
 
 def upload_vectors(backend: Backend, rows: npt.NDArray[Any], name: str = "vectors") -> Vec3:
-    """An array (n, 3) as backend.Array3f, whatever its values, as `upload_floats` uploads
-    numbers."""
+    """An array (n, 3) as backend.Array3f, each column uploaded by `upload_floats`. Infinite values
+    and NaN are allowed."""
     return backend.Array3f(*(upload_floats(backend, one) for one in _cast(backend, rows, name).T))
 
 
@@ -269,8 +272,9 @@ def to_float(backend: Backend, values: Any, name: str = "values") -> Real:
 
 
 def gather_vectors(backend: Backend, vectors: Vec3, index: Index) -> Vec3:
-    """The vectors, of any precision, at an index in each lane. A component that is one number for
-    all lanes stays one: of a gather from it, Dr.Jit would write derivatives beyond its end."""
+    """Gather the vector at an index in each lane, in the backend's precision; the vectors may have
+    any precision. A component of width 1, which all lanes share, is not gathered: Dr.Jit would
+    write the derivatives of such a gather beyond the end of the array."""
     return backend.Array3f(
         *(
             one if dr.width(one) == 1 else dr.gather(backend.Float, one, index)
@@ -280,8 +284,8 @@ def gather_vectors(backend: Backend, vectors: Vec3, index: Index) -> Vec3:
 
 
 def as_kernel_parameters(array: Any) -> Any:
-    """The same numbers, with their derivatives; literals as kernel parameters, so that others in
-    their place do not compile another kernel."""
+    """The same array with literals turned into kernel parameters (`dr.make_opaque`), so that
+    another value uses the compiled kernel again. Derivatives are kept."""
     kind = _type_of(array)
     if dr.depth_v(kind) > 1:
         return kind(*map(as_kernel_parameters, array))

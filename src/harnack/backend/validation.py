@@ -161,8 +161,9 @@ def has_derivatives(value: Any) -> bool:
 
 
 def is_plain_data(value: Any) -> bool:
-    """Whether a value holds numbers of Python and NumPy, in tuples, dictionaries and dataclasses of
-    this package, and nothing that may get derivatives later: no Dr.Jit array, no function."""
+    """Whether a value is plain data: Python's and NumPy's numbers, strings and arrays, in tuples,
+    dictionaries and dataclasses of this package. Plain data can never carry derivatives; Dr.Jit
+    arrays and functions can."""
     left: list[Any] = [value]
     for one in left:  # which grows
         kind = cast("Any", type(one))
@@ -180,8 +181,8 @@ def is_plain_data(value: Any) -> bool:
 
 
 def make_read_only(value: Any) -> None:
-    """Let nobody write to the arrays of NumPy that a value holds, in tuples, lists, dictionaries
-    and dataclasses of this package."""
+    """Make the NumPy arrays in a value read-only: those in its tuples, lists, dictionaries and
+    dataclasses of this package."""
     if isinstance(value, np.ndarray):
         cast("npt.NDArray[Any]", value).setflags(write=False)
     elif isinstance(value, tuple | list):

@@ -68,11 +68,12 @@ def connect_client(client: Any) -> Generator[Any]:
 
 @contextmanager
 def exclusive_compute() -> Generator[str]:
-    """Lets one task at a time compute in this process, as Dr.Jit itself uses all threads that a
-    worker has. Yields the address of the worker that this is, "" for none.
+    """Context manager: within it no other task of this process computes, as Dr.Jit already uses all
+    threads of a worker. Yields the address of the Dask worker that this process is, "" if it is
+    none.
 
     Raises:
-        RuntimeError: it is a worker that cannot work.
+        RuntimeError: Dr.Jit has no backend that it can use here.
     """
     distributed = sys.modules.get("distributed")
     worker = None
@@ -90,7 +91,7 @@ def exclusive_compute() -> Generator[str]:
 
 
 def worker_threads(client: Any) -> dict[str, int]:
-    """The threads of each worker, by its address.
+    """The number of threads of each worker, by its address.
 
     Raises:
         RuntimeError: the scheduler is gone.

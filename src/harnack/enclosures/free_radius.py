@@ -1,14 +1,14 @@
-"""What proofs on balls share: the solver for the proved length, and `HarmonicBallEnclosure`, for
-harmonic functions.
+"""The longest length proved by a proof on a ball: the solver that all such proofs share, and
+`HarmonicBallEnclosure`, for harmonic functions.
 
-Every proof on a ball B(p, R) shows that f meets no level at distance q R as long as
+A proof on a ball B(p, R) shows that all lengths up to q R are free of levels if
 
     q k(q) <= gap,
 
 with a k that has no poles on [0, 1] and a dimensionless gap. `largest_free_fraction` finds the
-largest
-such q from the safe side: nothing large is ever subtracted, and q is accurate relative to itself.
-Near a surface the gap is tiny, and a q found to an absolute accuracy would stall the march.
+largest such q from the safe side: large numbers are never subtracted, and the error of q is small
+relative to q. Near a surface the gap is tiny, and with a q of a small absolute error only, the
+march would stall.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ if TYPE_CHECKING:
 
 # Lengths are multiplied by this, to cover the roundings of the two sides of the comparison.
 CONDITION_SAFETY = 1.0 - 2e-6
-# k is the difference of numbers of order one: so many roundings, halves of a unit in the last
-# place, are added to it, which covers their rounding and that of the given slope.
+# k is the difference of numbers of order one. This number of unit roundoffs is added to it, which
+# covers their rounding and that of the slope.
 _ROUNDINGS = 16.0
 
 
 class FreeRadiusCondition(Protocol):
-    """A condition q k(q) <= gap under which distance q is proved free; q k(q) crosses the gap
-    upwards at most once on [0, 1]."""
+    """A condition q k(q) <= gap which proves that all of [0, q] is free of levels, q a fraction of
+    the radius. q k(q) crosses the gap upwards at most once on [0, 1]."""
 
     @property
     def gap(self) -> Real: ...
@@ -47,12 +47,12 @@ class FreeRadiusCondition(Protocol):
         ...
 
     def expansion_at_zero(self) -> tuple[Real, Real]:
-        """k(0) and k'(0), for a first guess: no proof rests on them."""
+        """k(0) and k'(0), for a first guess; no proof relies on them."""
         ...
 
 
 def condition_rounding(real: Any) -> float:
-    """What is added to k in the precision of `real`."""
+    """The number that is added to k to cover rounding, in the precision of `real`."""
     return _ROUNDINGS * float(dr.epsilon(real))
 
 

@@ -61,29 +61,38 @@ class Promise(abc.ABC):
 
     @abc.abstractmethod
     def movement_bounds(self, value: Any, slopes: SlopeRange, length: Any) -> tuple[Any, Any]:
-        """Lower and upper bound of f(y) - f(p), for y at that length, less than the radius, from p
-        along a direction with these slopes; value: f(p). For NumPy and Dr.Jit arrays alike."""
+        """Lower and upper bound of f(y) - f(p), for y at a length, less than the radius, from p
+        along a direction in which f has these slopes at p.
+
+        value: f(p). For NumPy and Dr.Jit arrays alike.
+        """
 
     def taylor_remainder_bound(self, value: Real, length: Real, degree: int = 1) -> Real:
-        """A bound of what Taylor's polynomial of a degree (1 or 2) about p leaves out of f(y), for
-        |y - p| <= length, which decreases at least as the power degree + 1 of the length; infinite
-        where none follows."""
+        """A bound of |f(y) - T(y)| for |y - p| <= length, T the Taylor polynomial of f about p of a
+        degree (1 or 2); infinite if none follows. As the length decreases, it decreases at least as
+        length^(degree + 1)."""
         del value, length, degree
         return dr.inf
 
     def implied_lipschitz(self, value: Real) -> Lipschitz | None:
-        """A Lipschitz constant that follows from it; None where none does."""
+        """A Lipschitz promise that follows from this one; None if none does."""
         del value
         return None
 
     def implied_second_derivative_bound(self, value: Real) -> tuple[Real, Real] | None:
-        """A bound of |f_vv| for all unit vectors v, and the distance within which it holds at every
-        point; None where none follows. A remainder is less: it is seen from one point alone."""
+        """A bound of |f_vv| for all unit vectors v, and the radius of the ball about p in which it
+        holds at every point; None if none follows. (`taylor_remainder_bound` is smaller: it is
+        about the Taylor polynomial at p alone.)"""
         del value
 
     def weakened_for_linear_maps(self, value: Real) -> Promise:
-        """A promise that follows from this one and holds, transformed, for f(A x) with any linear
-        map A. Laplacians do not survive a map that is no similarity; other kinds do."""
+        """A weaker promise of a kind that survives every linear map A of space: if f makes it, f(A
+        x) makes it in a transformed form.
+
+        Harmonic functions and bounds of the Laplacian survive similarities only: HarmonicBall
+        returns a TaylorRemainder, and BoundedLaplacian a Lipschitz promise. Other kinds return
+        themselves.
+        """
         del value
         return self
 

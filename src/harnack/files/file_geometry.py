@@ -60,8 +60,9 @@ class FileLocations:
 class PolygonList:
     """Polygons or polylines of a file, as indices of vertices.
 
-    corners: those of all of them, one polygon after the other. sizes: (m,), how many each has.
-    locations: (m,), where each stands in the file.
+    corners: the vertex indices of all polygons, one polygon after the other.
+    sizes: (m,) the number of corners of each polygon.
+    locations: (m,) the location of each polygon in the file.
     """
 
     corners: IntArray
@@ -72,11 +73,11 @@ class PolygonList:
         return len(self.sizes)
 
     def location_of_corner(self, k: int | np.integer[Any]) -> FileLocation:
-        """Where the polygon stands in the file that corner k of all belongs to."""
+        """The location in the file of the polygon that contains `corners[k]`."""
         return self.locations[int(np.searchsorted(np.cumsum(self.sizes), k, side="right"))]
 
     def __iter__(self) -> Iterator[tuple[IntArray, FileLocation]]:
-        """The corners of each, and where it stands."""
+        """The corners and the location of each polygon."""
         ends = np.cumsum(self.sizes)
         for k, (begin, end) in enumerate(zip(ends - self.sizes, ends, strict=True)):
             yield self.corners[begin:end], self.locations[k]
@@ -102,7 +103,8 @@ class FileGeometry:
 
 
 def ranks_in_lists(sizes: IntArray) -> IntArray:
-    """Positions within lists that stand one after the other: 0 to size - 1 for each of them."""
+    """The position of each entry within its list, for lists of these sizes stored one after the
+    other: 0 to size - 1 for each list."""
     found = np.arange(int(sizes.sum()), dtype=np.int64)
     found -= np.repeat(np.cumsum(sizes) - sizes, sizes)
     return found

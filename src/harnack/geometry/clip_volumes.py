@@ -69,13 +69,13 @@ class PlaneTable:
 
     @classmethod
     def literal(cls, backend: Backend, rows: FloatArray) -> PlaneTable:
-        """The rows (m, 4) as they are."""
+        """The planes (m, 4) as literals of the kernel."""
         return cls(backend, rows, None, None, backend.Float(_reach(rows)))
 
     @classmethod
     def upload(cls, backend: Backend, rows: FloatArray) -> PlaneTable:
-        """The rows (m, 4) in a buffer; it is filled up to a multiple of eight, if they are more, so
-        that volumes with about as many planes share a kernel."""
+        """The planes (m, 4) in a buffer. If there are more than eight, planes without effect fill
+        it up to a multiple of eight, so that volumes with about as many planes share a kernel."""
         count = len(rows) if len(rows) <= 8 else -(-len(rows) // 8) * 8
         filled = np.concatenate([rows, np.tile(_NO_CONSTRAINT, (count - len(rows), 1))])
         length = dr.opaque(backend.UInt32, count)
@@ -88,9 +88,11 @@ class PlaneTable:
         step: Callable[[FoldState, Vec3, Real], FoldState],
         may_change: Callable[..., Mask] | None = None,
     ) -> FoldState:
-        """state = step(state, n, h) for every plane.
+        """Apply state = step(state, n, h) to one plane n . x <= h after the other, and return the
+        last state.
 
-        may_change: whether the planes that are left can still change what is made of a state.
+        may_change: may_change(*state) is false where no further plane can change the result; a loop
+            over planes stops there. Unrolled planes are all applied.
         """
         index = self.backend.UInt32
         if self.buffer is None or len(self.rows) <= MAX_UNROLLED:

@@ -223,7 +223,7 @@ def nearest_neighbors(tree: Any, points: FloatArray, count: int) -> tuple[IntArr
 
 
 def parallel_over_slices(work: Callable[[slice], None], count: int) -> None:
-    """Calls `work` for slices that make up range(count), on all cores."""
+    """Call `work` for slices that make up range(count), on all cores."""
     parts = [slice(k, min(k + _CHUNK, count)) for k in range(0, count, _CHUNK)]
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for _ in pool.map(work, parts):
@@ -234,12 +234,14 @@ def parallel_over_slices(work: Callable[[slice], None], count: int) -> None:
 
 Indices = npt.NDArray[np.int64] | npt.NDArray[np.int32]
 
-# Of the variances of a neighborhood, the second over the first: below it lies on a line.
+# A neighborhood lies on a line if its second variance over its first is below this.
 _COLLINEAR_RATIO = 1e-9
-# Without `neighbors`, the first of these counts is taken with which half of some points see their
-# neighbors in a layer this flat, one standard deviation to the other; else the largest among a
-# half, a quarter, ... of the points, down to so many. If none is as flat, it is the flattest, where
-# it is flatter by this factor than smaller ones.
+# Choice of the number of neighbors if none is prescribed. Flatness is the median, over at most
+# _PROBES points, of the ratio of the smallest to the middle standard deviation of a neighborhood.
+# The first of _NEIGHBOR_COUNTS whose flatness is below _MAX_FLATNESS is taken. If there is none,
+# the largest count is tried among random halves, quarters, ... of the points, until they are fewer
+# than _MIN_SUBSET. If none qualifies, the flattest choice is taken; a choice counts as flatter than
+# the best before it if it improves its flatness by the factor _FLATNESS_GAIN.
 _NEIGHBOR_COUNTS, _MAX_FLATNESS, _PROBES, _MIN_SUBSET, _FLATNESS_GAIN = (
     (16, 32, 64),
     0.45,
@@ -247,7 +249,7 @@ _NEIGHBOR_COUNTS, _MAX_FLATNESS, _PROBES, _MIN_SUBSET, _FLATNESS_GAIN = (
     1000,
     0.9,
 )
-# A point is turned as so many of the nearest points that have a direction.
+# How many of the nearest points that have a normal vote on the sign of a point's normal.
 _VOTING_NEIGHBORS = 8
 # Where to look for extreme points: towards the faces, edges and corners of a cube.
 _DIRECTIONS = np.array([d for d in itertools.product((-1.0, 0.0, 1.0), repeat=3) if any(d)])
@@ -301,7 +303,8 @@ def estimate_normals(points: npt.ArrayLike, neighbors: int | None = None) -> Flo
 
 
 def _choose_neighborhood(x: FloatArray) -> tuple[int, IntArray]:
-    """How many neighbors show planes, and the points (k,) among which to look for them."""
+    """The number of neighbors with which tangent planes are fitted, and the indices (k,) of the
+    points among which the neighbors are sought."""
     rng = np.random.default_rng(0)
     probes = x[rng.choice(len(x), min(len(x), _PROBES), replace=False)]
     some = np.arange(len(x))

@@ -122,10 +122,11 @@ def _supporting_planes(
 
 
 def _widest_gap_direction(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Middle of the largest angle free of the points (a, b)[k, :] as seen from the origin: (k,).
+    """(k,) the direction, as an angle, in the middle of the largest angular gap between the points
+    (a, b)[k, :] as seen from the origin.
 
-    Points at the origin, where the edge itself is, have no direction and take their farthest
-    companion's.
+    Points at the origin, where the edge itself is, have no direction: they take that of the
+    farthest point.
     """
     distance = np.hypot(a, b)
     angle = np.arctan2(b, a)

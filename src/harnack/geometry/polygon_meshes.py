@@ -284,8 +284,9 @@ def _first_repeated_key(keys: IntArray) -> int | None:
 
 
 def _check_not_collinear(found: PolygonFaces) -> None:
-    """Raise MeshError for a face whose vertices lie on a line: that from the corner farthest from
-    its middle to the corner farthest from there."""
+    """Raise MeshError for a face whose corners are collinear: all within 1e-9 of its size from the
+    line that joins the corner farthest from the center of its box to the corner farthest from that
+    corner."""
     x, face = found.vertices[found.corners], found.face_of_corner
     low, high = found.face_boxes()
     a = x - (0.5 * (low + high))[face]

@@ -1,7 +1,7 @@
-"""Closed polygons: without the edges that are run there and back, and cut into triangles.
+"""Closed polygons: removal of edges that are run both ways, and cutting into triangles.
 
-Edges run there and back are taken out, by integer index, before a curve is uploaded: what cancels
-on paper leaves its rounding errors on a machine.
+Edges that are run both ways are removed by integer index, before a curve is uploaded: in floating
+point, two opposite contributions would leave their rounding errors.
 """
 
 from __future__ import annotations
@@ -23,22 +23,22 @@ __all__ = ["cancel_opposite_edges", "remaining_edges", "triangulate"]
 
 
 def cancel_opposite_edges(loops: Loops) -> Loops:
-    """Closed loops with the same solid angle modulo 4 pi, of which no edge runs another back.
+    """Remove pairs of opposite edges from closed loops; the solid angle stays the same modulo 4 pi.
 
-    Seen from outside of an edge, its part in the solid angle of one loop is minus that in another
-    which runs it the other way, so that the two drop out of the sum. Computed one by one they leave
-    their rounding errors, and distances and convexity count a curve that is not there.
+    Seen from a point, an edge contributes minus what the reversed edge contributes, so both drop
+    out of the sum. If they were kept, they would leave rounding errors, and would count in
+    distances and in tests of convexity as a curve that is not there.
 
-    Vertices at exactly the same position are one. Of edges that run both ways between two of them
-    the surplus is left, once for each time that it counts. Where nothing cancels, the loops are
-    returned as they are, and none where everything does. Edges are compared as wholes: of two that
-    overlap in part and run opposite ways, both stay.
+    Vertices at exactly the same position are the same. If edges run both ways between two vertices,
+    the surplus of one direction is left, as often as it counts. If no edges cancel, the loops are
+    returned as they are; if all cancel, no loop is returned. Edges are compared as wholes: of two
+    edges that overlap in part and run opposite ways, both stay.
 
-    Proof that the rest is closed: around a loop as many edges begin at a vertex as end there, and
-    so they do after one of each was taken away from both ends of an edge. The gradient of the solid
-    angle is the sum of the edges' fields, which cancel (Biot and Savart), and the integral along
-    closed paths is still a multiple of 4 pi, so that values change by a constant at most; far away
-    both vanish, modulo 4 pi.
+    Proof that the rest is closed: in loops as many edges begin at a vertex as end there, and this
+    stays true when an edge and its reverse are removed. The gradient of the solid angle is the sum
+    of the edges' fields, which cancel (Biot and Savart), and the integral along closed paths is
+    still a multiple of 4 pi, so that values change by a constant at most; far away both vanish,
+    modulo 4 pi.
     """
     points = np.concatenate(loops)
     begin, end = _welded(loops, points)

@@ -1,4 +1,5 @@
-"""Derivatives that a field gives, compared with differences of what they are derivatives of."""
+"""Contracts of derivatives: the derivatives that a field returns, compared with finite
+differences."""
 
 from __future__ import annotations
 
@@ -26,25 +27,26 @@ if TYPE_CHECKING:
 
 __all__ = ["check_derivatives"]
 
-# Nodes of central differences in units of h, and the weights over h of two derivatives of fourth
-# order: with spacing h, and with 2h. They differ by 15 times the error of the former, to its first
-# order, so this share of the difference allows for three times that error (Richardson).
+# Fourth-order central differences with spacing h and with 2h: nodes in units of h, weights in units
+# of 1/h. Their difference is 15 times the leading error of the finer one, so a fifth of it
+# (_RICHARDSON_SHARE) allows three times that error (Richardson extrapolation).
 _NODES = (-4.0, -2.0, -1.0, 1.0, 2.0, 4.0)
 _WEIGHTS = (0.0, 1 / 12, -8 / 12, 8 / 12, -1 / 12, 0.0)
 _WIDE_WEIGHTS = (1 / 24, -8 / 24, 0.0, 0.0, 8 / 24, -1 / 24)
 _RICHARDSON_SHARE = 0.2
-# Where no promise says over which length f is smooth, spacings of these shares of the points' own
-# size are tried.
+# Where no promise says over which length f is smooth, spacings of these fractions of `_scale`
+# are tried, too.
 _SPACING_FACTORS = (1.0, 0.1, 0.01, 1e-3, 1e-4)
-# Of a field with an error the differences must agree at this share of the points even without it:
-# between neighboring points an approximation mostly is a smooth function itself.
+# For a field with an error bound, the differences must agree at this fraction of the points even
+# without allowance for it: between neighboring points an approximation mostly is smooth itself.
 _MIN_SMOOTH_FRACTION = 0.5
-# Of a field with creases they must agree at this share.
+# For a field with creases they must agree at this fraction of the points.
 _MIN_FRACTION_OFF_CREASES = 0.9
 
 
 def check_derivatives(field: Field, points: FloatArray, look: FieldSamples) -> None:
-    """Gradient, Laplacian and Hessian at points (n, 3), where `look` has the field's values.
+    """Check gradient, Laplacian and Hessian at points (n, 3), where `look` has the samples of the
+    field.
 
     Differences are taken within the field's domain; points too close to its border for that are
     left out.

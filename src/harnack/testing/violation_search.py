@@ -259,8 +259,8 @@ _SPACING = 1e-3
 
 @dataclass(frozen=True)
 class _Candidates:
-    """Points p (n, 3) and places p + reach * w, |w| < 1, and how near the promise is to being
-    broken there, (n,): above one it is."""
+    """Pairs of points p (n, 3) and y = p + reach * w, |w| < 1, with their violation ratios (n,): a
+    promise is violated where the ratio is above 1."""
 
     p: FloatArray
     w: FloatArray
@@ -268,7 +268,8 @@ class _Candidates:
     violation_ratio: FloatArray
 
     def best_of(self, others: _Candidates) -> tuple[_Candidates, BoolArray]:
-        """Each of these n, or the best of its m others of n * m; and whether that is another."""
+        """For each of these n pairs, the best of itself and its m of the n * m `others`; and (n,)
+        whether that is another."""
         n = len(self.p)
         m = len(others.p) // n
         which = np.arange(n) * m + others.violation_ratio.reshape(n, m).argmax(axis=1)
@@ -285,19 +286,22 @@ class _Candidates:
 def search_violations(
     field: Field, points: FloatArray, look: FieldSamples, number: int, rng: np.random.Generator
 ) -> None:
-    """Search for places that break a promise, the one of that number in `Sample.all_promises`.
+    """Search for points that violate a promise, the one with index `number` in
+    `Sample.all_promises`.
 
-    A promise that is wrong by a few percent is broken only near what makes it: beside a singularity
-    that lies just inside the ball, or in the one direction in which a range is attained. Random
-    places miss that. So places climb: pairs of a point p and a place y that the promise made at p
-    speaks of move at random, farther as long as they succeed, to where the promise is closer to
-    being broken.
+    A promise that is wrong by a few percent is violated only in special places: beside a
+    singularity that lies just inside of the ball, or in the one direction in which a range is
+    attained. Random points miss these. So this is a random local search over pairs: a point p,
+    where the promise is made, and a point y in its ball, where it is tested. Both are moved at
+    random, and a move is kept if it raises the violation ratio. The step length grows after success
+    and shrinks after failure.
 
-    points: (n, 3), and `look` the field there. The climb begins at those with the smallest radius
-    and at others, towards the border along the gradient, against it, and in random directions.
+    points: (n, 3), and `look` the samples of the field there. The search starts from the points
+        with the smallest radius and from others chosen at random, with y towards the border of the
+        ball: along the gradient, against it, and in random directions.
 
     Raises:
-        BrokenPromiseError: naming the point and the place of the worst pair.
+        BrokenPromiseError: naming both points of the worst pair.
     """
     search = _ViolationSearch(field, number, 2 * float(np.ptp(points, axis=0).max()) + 1e-300)
     part = _PATH_COST_DIVISOR if search.needs_path else 1
@@ -344,10 +348,10 @@ def search_violations(
 
 @dataclass(frozen=True)
 class _ViolationSearch:
-    """The promise that pairs are to break.
+    """The search for pairs that violate a promise.
 
     promise_index: of the promise in `Sample.all_promises`.
-    longest: the length that stands for a radius without an end.
+    longest: the length that stands for an infinite radius.
     """
 
     field: Field
@@ -356,11 +360,13 @@ class _ViolationSearch:
 
     @property
     def needs_path(self) -> bool:
-        """Whether how f moves is known along a path only, jumps taken out."""
+        """Whether the movement of f between two points must be added up along a path, without its
+        jumps."""
         return self.field.period is not None or self.field.has_jumps
 
     def pairs(self, p: FloatArray, w: FloatArray, samples: int = _PATH_SAMPLES) -> _Candidates:
-        """The pairs of points (n, 3) and shares of their radii, cut to the ball."""
+        """The pairs of points p (n, 3) and vectors w (n, 3), fractions of the radius, which are
+        shortened to stay in the ball."""
         length = np.linalg.norm(w, axis=1, keepdims=True)
         w = w * np.minimum(1, _BORDER / np.maximum(length, 1e-300))
         ratio, reach = np.full(len(p), -np.inf), np.full(len(p), 1.0)

@@ -45,7 +45,7 @@ _LEAF_SIZE = 4
 
 @dataclass(frozen=True)
 class BoxTree:
-    """Boxes with coordinates of at most about one, which may overlap."""
+    """A tree of boxes, which may overlap, with coordinates of at most about 1."""
 
     tree: PackedTree
 
@@ -61,16 +61,16 @@ class BoxTree:
     def next_box(
         self, o: Vec3, d: Vec3, after: tuple[Real, Any], start: Real, end: Real, active: Mask
     ) -> tuple[Real, Real, Any]:
-        """The first box behind `after` = (t, number) that rays o + t d, |d| = 1, enter by t <= end.
+        """Return the next box along each ray o + t d, |d| = 1, after `after` = (t, number).
 
-        Boxes are ordered by (t, number), where t is where a ray enters the box, at least `start`;
-        boxes that it has left by then are not entered. From after = (t, NO_BOX) with t < start on,
-        each comes up once. A box is a little wider than given, so that rounding lets no ray pass by
-        a box that it meets.
+        A box is entered at t = max(entry, start); boxes are ordered by (t, number). Boxes that a
+        ray has left before `start` are not entered. Starting with after = (t, NO_BOX), t < start,
+        repeated calls visit every box that the ray meets for start <= t <= end exactly once. Boxes
+        are padded a little, so that rounding never skips a box that the ray meets.
 
         Returns:
             The t where the ray enters, the t where it leaves, and the box's number (NO_BOX for
-            none).
+                none).
         """
         real, index = self.tree.backend.Float, self.tree.backend.UInt32
         t_after, n_after = real(after[0]), index(after[1])
@@ -100,7 +100,8 @@ class BoxTree:
         return near, far, number
 
     def _slab_test(self, o: Vec3, d: Vec3) -> Any:
-        """Where rays enter and leave a box, a little earlier and later to cover rounding.
+        """A function that computes where rays enter and leave a box, a little too early and too
+        late to cover rounding.
 
         Each plane of the box is moved outwards by 16 roundings of the size of coordinates, and t is
         widened by 8 roundings of itself: (x - o)/d has three roundings, of which that of x - o is

@@ -165,7 +165,7 @@ def nonempty_cells(
     return refine_cells(root, clearance, most, finest).occupied
 
 
-# So much of the margin around an empty cell, in cells, is left to the rounding of positions.
+# The part of the margin around an empty cell, in cells, that covers the rounding of positions.
 _ROUNDING = 1 / 64
 
 
@@ -174,14 +174,13 @@ Layout = TypeVar("Layout", bound="GridData")
 
 @dataclass(frozen=True)
 class GridData:
-    """A grid of cells, in NumPy.
+    """A grid of cells, some of them proved empty; in NumPy.
 
-    origin: (3,) its lower corner, numbers of single precision.
+    origin: (3,) its lower corner, in numbers of single precision.
     cell_size: the side of a cell (`round_to_short_float`).
-    shape: cells along x, y and z.
-    empty_distance: (cells,), x fastest: 0 where a cell is not empty, else the distance to the
-        nearest that is not, in cells, in the largest of the three coordinates (chessboard
-        distance).
+    shape: the number of cells along x, y and z.
+    empty_distance: (cells,), x fastest: the chessboard distance, in cells, to the nearest occupied
+        cell; 0 for an occupied cell.
     """
 
     origin: FloatArray
@@ -192,11 +191,12 @@ class GridData:
 
 @dataclass(frozen=True)
 class EmptySpaceGrid:
-    """A grid on a backend, all numbers of it as kernel parameters.
+    """A grid of cells, some of them proved empty; on a backend, with all numbers as kernel
+    parameters.
 
-    Outside of the grid the same holds as in its nearest cell.
+    A point outside of the grid is treated like its nearest cell.
 
-    margin: in cells; an empty cell enlarged by so much on all sides is empty too.
+    margin: in cells; an empty cell enlarged by the margin on all sides is empty too.
     """
 
     backend: Backend
@@ -208,7 +208,8 @@ class EmptySpaceGrid:
 
     @staticmethod
     def upload_layout(backend: Backend, layout: GridData) -> tuple[Backend, Vec3, Real, Vec3, Any]:
-        """The first five attributes of a grid."""
+        """The attributes backend, origin, cell_size, shape and empty_distance of a grid,
+        uploaded."""
 
         def vector(numbers: Any) -> Vec3:
             return backend.Array3f(*(dr.opaque(backend.Float, float(one)) for one in numbers))
@@ -232,11 +233,11 @@ class EmptySpaceGrid:
     def empty_run(self, p: Vec3, d: Vec3, length: Real) -> Real:
         """A length s for which p + s d is proved to stay in empty cells; it may exceed `length`.
 
-        Proof. The cell of a point and all that are fewer than `empty_distance` cells away are
-        empty, and so is
-        the margin around each: together a cube, wider by the margin than these cells. A step leaves
-        the cells by at most `margin` less `_ROUNDING`, so that all of it is empty; the rest of the
-        margin is for the rounding of positions. Steps end where a cell is not empty.
+        Proof. All cells less than empty_distance cells from a point's cell are empty, and so are
+        the margins around them. Together they form a cube, larger than these cells by the margin. A
+        step leaves the cells by at most `margin` less `_ROUNDING`, so that it stays inside of the
+        cube; the rest of the margin is for the rounding of positions. Steps end where a cell is
+        occupied.
         """
 
         def state_of(s: Real) -> tuple[Real, Mask]:
@@ -260,7 +261,8 @@ class EmptySpaceGrid:
         return dr.while_loop((start, active), running, body, label="empty cells")[0]
 
     def is_resolved(self, o: Vec3, end: Real) -> Mask:
-        """Whether rounding leaves points of rays up to `end` in their cells or close to them."""
+        """Whether rounding moves points of rays from o up to `end` by less than `_ROUNDING` of a
+        cell. False if o is not finite."""
         rounding = 4 * self.backend.machine_epsilon * (max_norm(o) + end)
         return (rounding < _ROUNDING * self.cell_size) & dr.all(dr.isfinite(o))
 
@@ -277,11 +279,11 @@ class EmptySpaceGrid:
 
 @dataclass(frozen=True)
 class GridCell:
-    """The cells in which points lie.
+    """The cell of a grid in which a point lies, in each lane.
 
-    cell_coordinates: the coordinates of the points, in cells.
-    corner: the lower corner of the cell, in cells.
-    index: of the cell.
+    cell_coordinates: the point, in units of cells from the origin of the grid.
+    corner: the lower corner of its cell, in the same units.
+    index: of the cell in `EmptySpaceGrid.empty_distance`.
     """
 
     grid: EmptySpaceGrid
@@ -291,12 +293,13 @@ class GridCell:
 
     @property
     def empty_distance(self) -> Any:
-        """See `GridData`."""
+        """The chessboard distance, in cells, to the nearest occupied cell (`GridData`)."""
         return dr.gather(self.grid.backend.UInt32, self.grid.empty_distance, self.index)
 
     def exit_distance(self, d: Vec3, around: Real = 1.0) -> Real:
-        """How far the path with direction d stays among the cells fewer than `around` away, or in
-        the margin around them; infinite where the grid ends there."""
+        """The length for which the path with direction d stays among the cells less than `around`
+        cells away, or in the margin around them; infinite in a direction in which the grid ends
+        there."""
         length: Real = self.grid.backend.Float(dr.inf)
         beyond = self.grid.margin - _ROUNDING
         for k in range(3):

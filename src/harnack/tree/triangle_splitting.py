@@ -23,9 +23,9 @@ __all__ = [
     "windings_of_sides",
 ]
 
-# In units of the mesh's size. Nearer than that two places are the same.
+# In units of the mesh's size: points closer than this are the same.
 _COINCIDENT = 1e-12
-# Pieces thinner than that are left out: others that touch them stand for them.
+# Pieces thinner than this are left out: their neighbors stand for them.
 _MIN_THICKNESS = 1e-11
 _CENTROID = (1 / 3, 1 / 3, 1 / 3)
 
@@ -34,18 +34,19 @@ def split_intersecting_faces(
     rays: TriangleTree, vertices: FloatArray, faces: IntArray, *, covered_whole: bool = False
 ) -> tuple[FloatArray, IntArray]:
     """Triangles (k, 3, 3) that fill the faces (m, 3), none of which passes through another or is
-    covered by another in part; and (k,) which face each is of, and turns as.
+    covered by another in part; and (k,) the face that each is a piece of and has the orientation
+    of.
 
-    rays: the same faces, with coordinates of at most about one.
+    rays: a tree of the same faces, with coordinates of at most about 1.
     covered_whole: whether faces are also cut where others in their plane meet, so that each of
         these covers all of a piece or nothing.
 
-    Where two triangles meet in a segment, at either end of it an edge of one of them meets the
-    other. So all edges are followed as rays, and each of the two faces beside an edge is cut by
-    the plane of every triangle that the edge crosses, and these by the planes of the two: as far
-    as the cut would not pass the other triangle by. An edge that meets another edge, but for
-    rounding, meets all faces beside that. Faces in one plane are cut along the borders of
-    what covers them. A cut too many does no harm.
+    Where two triangles intersect in a segment, each end of the segment lies on an edge of either of
+    them. So every edge is traced as a ray. If it crosses a triangle T, the faces at the edge are
+    cut by the plane of T, and T by their planes, but only where the cut meets the other triangle.
+    An edge that meets another edge, up to rounding, counts as meeting all faces at that edge. Faces
+    in the same plane are cut along the borders of the faces that cover them. Superfluous cuts are
+    harmless.
     """
     corners = vertices[faces]
     cut, by = _crossing_faces(rays, vertices, faces)
@@ -67,7 +68,8 @@ def split_intersecting_faces(
 def separates_levels(
     rays: TriangleTree, pieces: FloatArray, levels: tuple[float, ...]
 ) -> BoolArray:
-    """(k,) whether the winding number passes a level from one side of a triangle to the other."""
+    """(k,) whether a level lies strictly between the winding numbers on the two sides of a
+    triangle."""
     low, high = winding_numbers_of_sides(rays, pieces)
     return np.any([(low < level) & (level < high) for level in levels], axis=0)
 

@@ -105,10 +105,10 @@ Statement: TypeAlias = "Operation | Load | Store | Loop"
 
 @dataclass(frozen=True)
 class ComputeKernel:
-    """What a lane does.
+    """The program that each lane of a kernel runs.
 
-    labels: of parameters, as far as they are known: of those that lanes read at places which they
-        compute, the label of what was read.
+    labels: index of a kernel parameter -> label of its array, where a label is known. An array from
+        which lanes gather at computed indices has the label of the gathered value.
     """
 
     statements: list[Statement]

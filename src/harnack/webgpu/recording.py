@@ -99,7 +99,7 @@ def _evaluate_and_get_ir(arrays: list[Any]) -> str:
 
 @contextlib.contextmanager
 def _garbage_collection_paused() -> Generator[None]:
-    """While it lasts, no thread collects garbage.
+    """Context manager: within it, no thread collects garbage.
 
     To print a kernel, Dr.Jit waits for Python's lock while it holds its own. A thread that collects
     garbage holds Python's lock, and would wait for Dr.Jit's to free an array, for ever.
@@ -114,15 +114,18 @@ def _garbage_collection_paused() -> Generator[None]:
 
 
 class _ArrayLabels:
-    """Labels of arrays, in the order in which they are met, so that they are the same for data of
-    the same shape: they are a part of the kernel, which is compiled anew for others."""
+    """Labels arrays in the order in which they are met.
+
+    Labels are part of the text of a kernel. Data of the same structure get the same labels, so that
+    the kernel is neither translated nor compiled again.
+    """
 
     def __init__(self) -> None:
         self.labeled_arrays: dict[str, Any] = {}
         self._tables: dict[int, str] = {}
 
     def label_array(self, array: Any) -> None:
-        """Gives an evaluated array a name."""
+        """Give an evaluated array the next label; an array of another state is left as it is."""
         if array.state == dr.VarState.Evaluated:
             label = f"data {len(self.labeled_arrays)}"
             dr.set_label(array, label)
@@ -130,7 +133,8 @@ class _ArrayLabels:
 
     @contextlib.contextmanager
     def label_gathers(self) -> Generator[None]:
-        """While it lasts, what `drjit.gather` returns is named after the array it is from."""
+        """Context manager: within it, the result of `drjit.gather` is labeled after the array that
+        it was gathered from."""
         module = cast("Any", dr)
         original = module.gather
 
