@@ -49,8 +49,8 @@ _CORNERS = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1
 
 @dataclass
 class SearchResult:
-    """The nearest points found: feet (n, 3), NaN where none was, and proved lower bounds (n,) of
-    the distance."""
+    """Result of a search: the closest points (n, 3) of the surface, NaN where none was found, and
+    proved lower bounds (n,) of the distance."""
 
     closest: FloatArray
     lower_bounds: FloatArray

@@ -1,7 +1,8 @@
-"""A tree over cells that may hold a surface: which of them are near a point, and how near.
+"""A tree over cells that may hold a surface, to find those near a point and bounds of their
+distance.
 
-Of the surface in a cell either nothing is known, or that it lies in a slab. Besides, some cells
-have a *foot*: a known point of the surface.
+For each cell the surface in it is either unknown or proved to lie in a slab (two parallel planes).
+Some cells also have a known point of the surface, their *foot*.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ _CLIP_CURVE_RADIUS = 4.0
 
 @dataclass(frozen=True)
 class SurfaceCells:
-    """Cubes and what is known of the surface in them.
+    """Cubes, with a slab and a point of the surface in each where these are known.
 
     center: (n, 3). half: (n,) half the length of an edge.
     surface_point: (n, 3) a point of the surface, no farther from the center than the cell is wide,
@@ -71,7 +72,7 @@ class SurfaceCells:
 
     @classmethod
     def unknown(cls, center: FloatArray, half: FloatArray) -> SurfaceCells:
-        """Cubes of which nothing is known."""
+        """Cubes without slabs and surface points."""
         n = len(half)
         far, zero = np.full((n, 3), FAR_SENTINEL), np.zeros(n)
         return cls(
@@ -83,7 +84,7 @@ class SurfaceCells:
         return len(self.half)
 
     def select(self, which: BoolArray) -> SurfaceCells:
-        """Those chosen by a mask (n,)."""
+        """The cells that a mask (n,) selects."""
         return SurfaceCells(*(part[which] for part in vars(self).values()))
 
     @property
@@ -93,7 +94,7 @@ class SurfaceCells:
 
     @classmethod
     def concatenate(cls, parts: list[SurfaceCells]) -> SurfaceCells:
-        """All of several."""
+        """The cells of all parts, in order."""
         columns = zip(*(vars(part).values() for part in parts), strict=True)
         return cls(*(np.concatenate(column) for column in columns))
 
@@ -116,7 +117,7 @@ class BestCandidate:
 
 @dataclass(frozen=True)
 class CellTree:
-    """Cells on a backend; there is at least one."""
+    """A tree of at least one cell, on a backend."""
 
     tree: PackedTree
 
@@ -159,8 +160,8 @@ class CellTree:
         return cls(pack_tree(backend, hierarchy, levels, placed))
 
     def best_start(self, x: Vec3, limit: Real) -> Vec3:
-        """The foot of the cell in which the surface seems to come nearest to x
-        (`_CellRecord.estimate`), and nearer than `limit`; FAR where it does not."""
+        """The surface point of the cell in which the surface has the smallest estimated distance
+        from x (`_CellRecord.estimate`); `FAR_SENTINEL` where no estimate is below `limit`."""
         vector = self.tree.backend.Array3f
 
         def each(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:

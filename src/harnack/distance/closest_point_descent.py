@@ -1,8 +1,8 @@
-"""The closest point of a level set, by descent: onto the level, then along it.
+"""Finds closest points of a level set by descent: onto the level, then along it.
 
-What is found is a point of the level set, to rounding, with x - y at right angles to the surface
-and no way to come nearer in its neighborhood. It is a *local* minimum of the distance: another
-part of the surface may be nearer still, so the distance is an upper bound of the true one.
+The result is a point of the level set, to rounding, at which x - y is normal to the surface and no
+neighbor is nearer to x. It is a *local* minimum of the distance: another part of the surface may be
+nearer still, so the distance is an upper bound of the true one.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ class _DescentState:
 
 @dataclass(frozen=True)
 class ClosestPointDescent:
-    """The search for closest points of the level set of a prepared field."""
+    """Descents to closest points of the level set of a field that is prepared for a backend."""
 
     backend: Backend
     field: Field
@@ -218,7 +218,8 @@ class ClosestPointDescent:
         return y, found, on_level
 
     def newton_to_level(self, start: Vec3) -> Vec3:
-        """The point of a level that Newton's method along the gradient leads to; NaN for none."""
+        """The point of a level to which Newton's method along the gradient converges; NaN where it
+        does not."""
         place, found = self._to_level(start, self.backend.Bool(True))
         return dr.select(found, place.y, dr.nan)
 

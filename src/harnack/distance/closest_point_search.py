@@ -1,16 +1,20 @@
-"""The closest points of a surface: of the triangles of a closed mesh, or by search in cells.
+"""Searches the closest points of a surface: among the triangles of a closed mesh, or by branch and
+bound over cells.
 
-Closest points are points of the surface: every search ends at a root of f, at a first hit or on a
-triangle, so that distances are upper bounds whatever led there, and what is nearer than the proved
-lower bound is refused. Cells that are proved empty are left out; a point of the surface in each of
-the others is where descents begin (`cell_search`): in one kernel from a few coarse cells, and where
-finer ones may be nearer from four of their points. The ball about a foot that holds no nearer point
-(`exclusion_ball`) closes most points; boxes within it are left out. What is left bounds the
-distance from below, and for proofs is split. Closed meshes are
-triangles and a tree (`level_triangles`). Of a mesh with holes the part off its triangles is a
-smooth surface of w modulo one (`JumpSurface.without_jumps`), whose feet count where w itself has
-the level: rays that closed in on each point took 18 times as long, and a tenth of them ended too
-far.
+Every search ends at a root of f, at the first hit of a ray or on a triangle. So closest points are
+points of the surface, and distances are upper bounds whatever path led there; a point that is
+nearer than the proved lower bound is refused.
+
+Cells that are proved empty are left out; descents begin at a known surface point of each of the
+other cells (`cell_search`): first, in one kernel, from a few coarse cells, then, where finer cells
+may hold a nearer point, from four of their points. The ball about a closest point that holds no
+nearer point (`exclusion_ball`) settles most queries, as boxes within it are left out. The remaining
+cells bound the distance from below, and are subdivided for proofs.
+
+Closed meshes are triangles and a tree (`level_triangles`). For a mesh with holes the part of the
+surface off its triangles is a smooth surface of w modulo 1 (`JumpSurface.without_jumps`), whose
+closest points count where w itself has the level: rays that closed in on each point took 18 times
+as long, and a tenth of them ended too far away.
 """
 
 from __future__ import annotations
@@ -72,13 +76,13 @@ _MAX_JUMPS_EXAMINED = 16
 
 @dataclass(frozen=True)
 class ClosestPoints:
-    """The closest points found.
+    """The closest points of a surface to n query points, and bounds of the distances.
 
-    points: (n, 3), rounded to the precision in use.
+    points: (n, 3) the query points, rounded to the precision in use.
     closest: (n, 3) the closest points of the surface, NaN where none was found.
     distance: (n,) to these, NaN likewise.
     signed_value: (n,) f - level, of the level nearest in value.
-    lower: (n,) proved: no point of the surface is nearer.
+    lower: (n,) proved lower bounds of the distance.
     violates_promises: (n,) whether a point was found that is nearer than the field's promises
         allow.
     """
@@ -97,7 +101,7 @@ def find_closest(
 ) -> ClosestPoints:  # fmt: skip
     """The closest point of a surface to each of the points (n, 3).
 
-    is_proved: whether `lower` is wanted as close as cells can prove it.
+    is_proved: whether cells are subdivided to make `lower` as large as they can prove.
 
     Points are sorted along a Morton curve, so that neighboring lanes traverse a tree together.
     """
@@ -272,8 +276,9 @@ class _QueryEvaluator:
     _prepared: Any = dataclasses.field(init=False)
 
     def evaluate(self, points: Any) -> tuple[FloatArray, ...]:
-        """The points as rounded, what is known of the surface near them, f - level, proved lower
-        bounds of the distance, and what it is to first order."""
+        """First estimates at query points. Returns the points as rounded to the precision in use,
+        points of the surface near them (NaN for none), f - level, proved lower bounds of the
+        distance, and the first-order distance."""
 
         def compute(p: Vec3) -> tuple[Real | Vec3, ...]:
             sample = self._field.evaluate(p)

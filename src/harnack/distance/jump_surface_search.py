@@ -1,8 +1,9 @@
-"""Closest points of surfaces of fields with sheets, such as meshes: on sheets, and by rays.
+"""Closest points of surfaces of fields with jump surfaces, such as meshes: on the jump surfaces,
+and by rays.
 
-A *sheet* is where a field jumps, such as a triangle of a mesh. It is part of the level set where f
-passes a level from one side of it to the other. Whether it does at a point is what a short ray
-through the point tells, in the same arithmetic in which rays meet the surface anywhere else.
+A *jump surface* consists of facets across which the field jumps, such as the triangles of a mesh. A
+point of it is part of the level set where f passes a level from one side to the other. A short ray
+through the point decides that, in the same arithmetic in which rays meet the surface anywhere else.
 """
 
 from __future__ import annotations
@@ -46,10 +47,10 @@ NextJump: TypeAlias = "Callable[[tuple[Any, Any], Any, Any], NearestFacet]"
 
 @dataclass(frozen=True)
 class JumpSurfaceSearch:
-    """The search for the closest point of a prepared surface that lies on a sheet.
+    """Search for the closest point of a prepared surface that lies on a jump surface.
 
-    scale: at least the coordinates that the field computes with, for what rounding does.
-    most: sheets that are examined for each point.
+    scale: at least the coordinates that the field computes with, for bounds of rounding errors.
+    most: the largest number of facets that are examined for each point.
     """
 
     surface: SurfaceTracer
@@ -57,18 +58,18 @@ class JumpSurfaceSearch:
     most: int
 
     def closest(self, x: Vec3, limit: Real) -> tuple[Vec3, Vec3]:
-        """A point of the surface on a sheet, nearer to x than `limit` (NaN where none is found),
-        and the way from x to the nearest sheet, part of the surface or not, if that is nearer than
-        `limit` (else infinite).
+        """A point of the surface on a facet, nearer to x than `limit` (NaN where none is found),
+        and the vector from x to the nearest facet, part of the surface or not, if that is nearer
+        than `limit` (else infinite).
 
-        Sheets are examined in the order of their distance, each at its nearest point y to x. A
-        short ray through y along the sheet's normal hits the surface there, or the sheet is not
-        part of it at y. Where y lies on the sheet's edge that ray may slip past, and the six edges
-        of a small tetrahedron about y follow: a surface through y separates its corners, and one
+        Facets are examined in the order of their distance, each at its nearest point y to x. A
+        short ray through y along the facet's normal hits the surface there, or the facet is not
+        part of it at y. Where y lies on the facet's edge that ray may miss it, and the six edges of
+        a small tetrahedron about y follow: a surface through y separates its corners, and a surface
         that ends in a curve through y leaves it through two faces, so that either crosses an edge.
 
-        The first sheet that is hit is the closest point on sheets, unless a sheet nearer than that
-        belongs to the surface elsewhere than at y: the point is one of the surface in any case.
+        The first facet that is hit holds the closest point on facets, unless a nearer facet belongs
+        to the surface elsewhere than at y: the result is a point of the surface in any case.
         """
         backend = self.surface.backend
         real, index, vector = backend.Float, backend.UInt32, backend.Array3f
@@ -400,9 +401,9 @@ def compass_search(surface: SurfaceTracer, x: Vec3, foot: Vec3) -> Vec3:
 
 
 def is_on_surface(surface: SurfaceTracer, y: Vec3, hit: MarchResult, active: Mask) -> Mask:
-    """Whether f takes the level about hits y: beside the edge of a sheet, where its gradient has no
-    bound, rays are within the tolerance of any level to first order, and a ray that begins there
-    may hit the sheet at once, whatever f is."""
+    """Whether f takes the level about hits y. Beside the edge of a jump surface the gradient is
+    unbounded, so that to first order rays are within the tolerance of any level, and a ray that
+    begins there may hit the facet at once, whatever f is."""
     radius = _HIT_TEST_RADIUS * surface.backend.machine_epsilon * fmax(max_norm(y), hit.t)
     return straddles_level(surface, y, radius, active)
 

@@ -1,4 +1,4 @@
-"""Curvature of level sets: mean and Gaussian, from first and second derivatives; and its lines."""
+"""Curvature of level sets from first and second derivatives, and lines of curvature."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ _ROUNDING = 16.0
 
 @dataclass(frozen=True)
 class CurvatureSamples:
-    """Of the level sets through n points. NaN where the gradient is zero, so that there is no
-    surface, and where its error is not less than the gradient: nothing is known of the surface.
+    """Curvatures of the level sets through n points. NaN where the gradient is zero, so that there
+    is no surface, and where the error of the gradient is not less than its length.
 
     mean: (n,) half the divergence of the normal, 1/length. Its sign is the normal's: a sphere of
         radius r has 1/r if f grows outward, -1/r if f grows inward.

@@ -394,10 +394,10 @@ def _is_between(triangle: FloatArray, p: FloatArray) -> BoolArray:
 
 
 class MeshingError(ValueError):
-    """A level set that could not be meshed; the message says why and what to do."""
+    """A level set could not be meshed; the message says why, and a remedy."""
 
     def may_be_fixed_by(self, smaller: float) -> bool:
-        """Whether cells may help that are `smaller` times as large as those that failed."""
+        """Whether cells `smaller` times as large as those that failed may help."""
         del smaller
         return True
 
@@ -407,7 +407,7 @@ class EmptySurfaceError(MeshingError):
 
 
 class LocalizedMeshingError(MeshingError):
-    """A check that failed in known places (k, 3), so that smaller cells there may be enough."""
+    """A check failed at known locations (k, 3), so that smaller cells there may be enough."""
 
     def __init__(self, message: str, places: FloatArray) -> None:
         super().__init__(message)
@@ -415,7 +415,7 @@ class LocalizedMeshingError(MeshingError):
 
 
 class OffLevelError(LocalizedMeshingError):
-    """Vertices and centers of faces that are too far from the level: the places."""
+    """Vertices and centers of faces are too far from the level; the locations are these points."""
 
 
 class SelfIntersectionError(LocalizedMeshingError):
@@ -427,7 +427,7 @@ class SelfIntersectionError(LocalizedMeshingError):
 
 
 class UnrefinableError(MeshingError):
-    """What smaller cells do not help against."""
+    """An error against which smaller cells do not help."""
 
     def may_be_fixed_by(self, smaller: float) -> bool:
         del smaller
@@ -435,7 +435,7 @@ class UnrefinableError(MeshingError):
 
 
 class TriangleLimitError(UnrefinableError):
-    """A mesh that would be so large that it was not begun."""
+    """The mesh would have more triangles than allowed, and was not begun."""
 
 
 # So many places may be wrong in smaller cells, or this part of those before.

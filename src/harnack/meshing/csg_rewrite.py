@@ -23,8 +23,8 @@ SolidAtLevel: TypeAlias = tuple[Solid, float]
 
 
 def factor_common_operands(union: BooleanSolid, level: float) -> Solid | None:
-    """The points where a union is at most `level`, as those where another solid is at most 0:
-    (A & B) | (A & C) as A & (B | C); None if no two parts have anything in common."""
+    """Rewrite the solid {union <= level} as {another solid <= 0} with common operands factored out:
+    (A & B) | (A & C) as A & (B | C). None if no two operands have anything in common."""
     terms = [{_key(*one): one for one in _factors(part, level)} for part in union.parts]
     most, times = Counter(key for term in terms for key in term).most_common(1)[0]
     if times < 2:
@@ -41,8 +41,8 @@ def factor_common_operands(union: BooleanSolid, level: float) -> Solid | None:
 
 
 def flatten_csg(solid: BooleanSolid) -> BooleanSolid:
-    """With the parts of unions in a union, or of intersections in an intersection, as its own: all
-    that is cut away from a part is cut away at once."""
+    """Flatten nested operations of the same kind, unions in a union or intersections in an
+    intersection: everything that is cut away from an operand is then cut away at once."""
     parts: list[Solid] = []
     for one in solid.parts:
         if isinstance(one, BooleanSolid) and one.is_union == solid.is_union:
@@ -53,8 +53,9 @@ def flatten_csg(solid: BooleanSolid) -> BooleanSolid:
 
 
 def drop_cancelled_operands(solid: BooleanSolid, level: float) -> BooleanSolid | None:
-    """(A | C) less C as A less C, of an intersection's own parts: C has nothing but its boundary in
-    common with its complement. None if nothing is left; a union as it is."""
+    """Rewrite (A | C) - C as A - C among the operands of an intersection: C has nothing but its
+    boundary in common with its complement. Returns None if nothing is left; a union is returned as
+    it is."""
     if solid.is_union:
         return solid
     cut = {_key(one.field, -level) for one in solid.parts if isinstance(one, Complement)}

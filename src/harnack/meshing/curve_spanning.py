@@ -165,10 +165,15 @@ _SMALLER = 0.6
 
 @dataclass(frozen=True)
 class SpanningMesh:
-    """Triangles, and how they were found.
+    """A mesh that ends at a boundary curve, and facts about how it was computed.
 
-    vertices: (n, 3). faces: (m, 3). curve: what they end on, cut as it was. spacing: of cells.
-    finer: where cells were smaller. crossings: of the edges of tetrahedra. isotopy: what is proved.
+    vertices: (n, 3).
+    faces: (m, 3).
+    curve: the boundary curve, with its edges as subdivided.
+    spacing: of cells.
+    finer: where cells were smaller.
+    crossings: of the edges of tetrahedra.
+    isotopy: on how many tetrahedra the topology is proved.
     turned: how many faces are turned over.
     """
 

@@ -65,11 +65,13 @@ _NEAR = 1e-6
 
 @dataclass(frozen=True)
 class HoleFillingOptions:
-    """How patches are made.
+    """Options of harmonic hole fillings.
 
-    tolerance: how far they may be from the surface, as a part of the size of the box around all
-        holes. spacing: of cells at first, or None. seed: of random moves. attempts: how many sizes
-        of cells are tried.
+    tolerance: how far they may be from the surface, relative to the size of the box around all
+        holes.
+    spacing: of cells at first, or None.
+    seed: of random moves.
+    attempts: how many sizes of cells are tried.
     """
 
     tolerance: float
@@ -81,12 +83,12 @@ class HoleFillingOptions:
 
 @dataclass(frozen=True)
 class HarmonicFilling:
-    """What is added.
+    """The vertices and faces that harmonic filling adds to a mesh.
 
     vertices: (k, 3).
-    faces: (p, 3); indices below the number of given vertices are of these.
-    is_refined: whether they were refined to the tolerance.
-    triangle_fill_count: how many of the faces are triangles that holes of three edges lacked.
+    faces: (p, 3); indices below the number of the mesh's vertices are of these.
+    is_refined: whether the faces were refined to the tolerance.
+    triangle_fill_count: how many of the faces are single triangles that fill holes of three edges.
     """
 
     vertices: FloatArray

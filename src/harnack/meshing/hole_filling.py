@@ -62,12 +62,12 @@ Winding = Callable[[FloatArray], FloatArray]
 
 @dataclass(frozen=True)
 class HoleFilling:
-    """What was added to a mesh.
+    """The vertices and faces added to a mesh by filling its holes.
 
-    vertices: (k, 3) new ones.
-    faces: (p, 3) of patches; indices below the number of given vertices are of these.
-    unfilled_loops: loops that have no patch, each an array of vertices.
-    reason: what patches of these failed with, in words.
+    vertices: (k, 3) new vertices.
+    faces: (p, 3) of the fillings; indices below the number of the mesh's vertices are of these.
+    unfilled_loops: loops whose fillings failed, each an array of vertices.
+    reason: why these failed, in words.
     """
 
     vertices: FloatArray

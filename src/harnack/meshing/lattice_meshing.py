@@ -312,21 +312,25 @@ _MOST_ROUNDS = 20
 
 @dataclass(frozen=True)
 class TriangleMesh:
-    """vertices: (n, 3). faces: (m, 3), counter-clockwise as seen from where f is greater."""
+    """A triangle mesh.
+
+    vertices: (n, 3).
+    faces: (m, 3), counter-clockwise as seen from where f is greater.
+    """
 
     vertices: FloatArray
     faces: IntArray
 
     @classmethod
     def without_unused_vertices(cls, vertices: FloatArray, faces: IntArray) -> TriangleMesh:
-        """Without the vertices that are not in use."""
+        """A mesh of these faces, without the vertices that no face uses."""
         used = np.flatnonzero(np.bincount(faces.ravel()))
         place = np.full(len(vertices), -1, np.int64)
         place[used] = np.arange(len(used))
         return cls(vertices[used], place[faces])
 
     def reversed(self) -> TriangleMesh:
-        """With the faces' other side outside."""
+        """The same mesh with the orientation of all faces reversed."""
         return TriangleMesh(self.vertices, self.faces[:, ::-1])
 
 

@@ -48,9 +48,13 @@ _ROOT_ERROR, _FROM_ENDS = 1e-10, 1e-4
 
 @dataclass(frozen=True)
 class Tetrahedra:
-    """points: (n, 3). corners: (m, 4) indices of points.
-    ends: (k, 2) of all edges, the lower index first. edges: (m, 6) indices of edges, for the pairs
-    of corners (0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3).
+    """Tetrahedra and their edges.
+
+    points: (n, 3).
+    corners: (m, 4) indices of points.
+    ends: (k, 2) endpoints of all edges, the lower index first.
+    edges: (m, 6) indices of edges, for the pairs of corners (0, 1), (0, 2), (0, 3), (1, 2), (1, 3),
+        (2, 3).
     """
 
     points: FloatArray
@@ -60,7 +64,7 @@ class Tetrahedra:
 
     @classmethod
     def of(cls, points: FloatArray, corners: IntArray) -> Tetrahedra:
-        """With their edges numbered."""
+        """Tetrahedra with these corners; their edges are numbered."""
         edges = Edges.of(np.concatenate([corners[:, pair] for pair in _PAIRS]))
         return cls(points, corners, edges.vertices, edges.edge_of_pair.reshape(len(_PAIRS), -1).T)
 

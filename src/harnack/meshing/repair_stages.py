@@ -1,15 +1,16 @@
-"""Repair of triangle meshes: a closed mesh of a damaged one, in which what was sound stays.
+"""Repairs triangle meshes: computes a closed mesh from a damaged one, and keeps its valid triangles
+where possible.
 
-It goes by stages: all triangles are kept, and holes get patches; or bodies that overlap are united;
-or the triangles that are sound are kept; or the surface on which the winding number is 1/2 is made
-anew.
+Stages are tried in turn, from the one that keeps most to the one that always gives a result: all
+triangles stay and holes are filled; bodies that overlap are united (`bodies`; for a surface that
+passes through itself, pieces of its faces, `joined_pieces`); only valid triangles stay
+(`mesh_cleaning`); corners of loose triangles are merged; everything is remeshed from signs, on the
+surface where the winding number is 1/2.
 
-Repair goes by stages, from what keeps most to what always comes: all triangles, bodies united
-(`bodies`; of a shell that passes through itself the pieces of faces, `joined_pieces`), sound
-triangles (`sound`), loose corners joined, all anew by signs. No result is believed for being
-closed: each is compared with the winding number of what was given (`intended_solid`). Patches bend
-least (`hole_filling`), and nothing is proved of them but that they cross nothing; those on which w
-= 1/2 (`harmonic_filling`) have a proof, and a dent where the surface was round.
+A result is not accepted for being closed: each is compared with the winding number of the input
+(`intended_solid`). Smooth hole fillings have minimal bending (`hole_filling`), and nothing is
+proved of them but that they intersect nothing; those on which w = 1/2 (`harmonic_filling`) have a
+proof, and a dent where the surface was round.
 """
 
 from __future__ import annotations
@@ -132,14 +133,13 @@ def repair(
 
     Returns:
         A closed trimesh.Trimesh: every edge has two faces, which agree. `metadata["harnack"]` has
-        stage: "filled", "boolean_union", "cleaned", "welded" or "remeshed"; why: what those before
-            failed with, or
-        None; kept: how many of the given triangles are there; parts: of each part, largest first, a
-        dictionary of its faces, volume and center; dropped: how many parts of these were left out
-        for `largest`; welded: how many corners were joined since they were apart by rounding;
-        differs: None, or a dictionary of what differs from what was given (share of the points on
-        the wrong side, some places, how many are missing and added, and volumes of both); and the
-        Euler characteristic.
+        stage: "filled", "boolean_union", "cleaned", "welded" or "remeshed"; why: the failures of
+        the stages before, or None; kept: how many of the input triangles are there; parts: for
+        each component, largest first, a dictionary of its faces, volume and center; dropped: how
+        many components were removed for `largest`; welded: how many corners were merged because
+        they differed by rounding only; differs: None, or a dictionary of the differences from the
+        input (share of the points on the wrong side, places of some, how many are missing and
+        added, and volumes of both); and the Euler characteristic.
 
         Unless all was made anew there are also holes (loops of edges that were open), patches
         (triangles added) and harmonic (how many of these are harmonic). Vertices and faces that

@@ -1,9 +1,11 @@
-"""Functions of which only the signs count: values at points, and where segments meet the level.
+"""Functions of which only the signs count: values at points, and crossings of the level on
+segments.
 
-What is real-valued has a sign at every point, whether or not it is continuous: winding numbers
-jump at triangles and are known up to an error, potentials of dipoles are infinite at points, and
-Newton's method is at a loss with both. Here a segment whose ends have different signs is halved, by
-values alone, and what is left of it is intersected with the sheets of the field, such as triangles.
+Every real-valued function has a sign at every point, whether or not it is continuous: winding
+numbers jump at triangles and are known up to an error, and potentials of dipoles are infinite at
+points. Newton's method fails for both. Here a segment whose ends have different signs is bisected,
+by values alone, and the last interval is intersected with the jump surfaces of the field, such as
+triangles.
 """
 
 from __future__ import annotations
@@ -64,8 +66,8 @@ def uses_sign_meshing(field: Field) -> bool:
 
 
 def cell_size_for_smoothing(field: Field, spacing: float, most: float, least: float) -> float:
-    """The size of cells: `cell_size`, or where the surface of a cloud with noise is likely to have
-    details that these do not show, smaller by factors between `least` and `most`."""
+    """The size of cells: `spacing`; or, where the surface of a cloud with noise is likely to have
+    details too small for these cells, smaller by factors between `least` and `most`."""
     if (
         not isinstance(field, DipolePotential)
         or not 0 < field.smoothing < _UNRESOLVED_SMOOTHING * spacing
@@ -75,7 +77,7 @@ def cell_size_for_smoothing(field: Field, spacing: float, most: float, least: fl
 
 
 def empty_surface_hint(field: Field) -> str:
-    """What is known of why there is no surface among cells, to be added to an error."""
+    """A likely reason why there is no surface among the cells, to be added to an error message."""
     if not isinstance(field, DipolePotential) or len(field.points) < 2:
         return ""
     alone = outlier_indices(field.points, build_point_tree(field.points))

@@ -30,9 +30,10 @@ _OPPOSITE = -0.5
 
 @dataclass(frozen=True, eq=False)
 class WallThickness:
-    """What `wall_thickness` found.
+    """The thickness of a closed mesh at its faces, from `wall_thickness`.
 
-    vertices: (n, 3) and faces: (m, 3), of the mesh.
+    vertices: (n, 3).
+    faces: (m, 3).
     values: (m,) thickness at the centers of faces, a length; nan for faces without an area.
     """
 
