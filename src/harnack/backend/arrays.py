@@ -1,4 +1,4 @@
-"""The Dr.Jit array types in use, and the way from NumPy to Dr.Jit and back.
+"""The Dr.Jit array types in use, and conversions between NumPy and Dr.Jit.
 
 Nothing here changes a Dr.Jit flag, the number of threads or the Mitsuba variant.
 """
@@ -130,13 +130,14 @@ def choose_backend(precision: Precision = "single") -> Backend:
     """The backend to compute on: CUDA if there is a usable device, Metal for single precision if
     there is one, else LLVM.
 
-    The environment variable HARNACK_BACKEND ("llvm", "cuda" or "metal") forces one. Metal knows no
+    The environment variable HARNACK_BACKEND ("llvm", "cuda" or "metal") forces one. Metal has no
     double precision, which stays on LLVM.
 
     Raises:
         ValueError: unknown precision, or unknown name in HARNACK_BACKEND.
-        LLVMNotFoundError: LLVM is wanted and there is none that Dr.Jit can work with.
-        RuntimeError: CUDA or Metal is forced and no device is usable, or Metal's computes wrongly.
+        LLVMNotFoundError: LLVM is needed, and there is none that Dr.Jit can work with.
+        RuntimeError: CUDA or Metal is forced and no device is usable, or Metal computes
+            incorrectly.
     """
     if not is_one_of(precision, ("single", "double")):
         raise ValueError(f'precision is "single" or "double", not {precision!r}')
@@ -313,7 +314,7 @@ def _check_rows(is_bad: Any, what: str, name: str) -> None:
 
 
 def _cast(backend: Backend, values: npt.NDArray[Any], name: str) -> npt.NDArray[Any]:
-    """Values in the backend's precision; none may overflow on the way."""
+    """The values in the backend's precision. Raises ValueError if a finite value overflows."""
     if backend.precision == "double" or values.dtype == backend.dtype:
         return values
     with np.errstate(over="ignore"):
@@ -337,7 +338,8 @@ def upload_floats(backend: Backend, values: npt.NDArray[Any]) -> Real:
 
 
 def upload_integers(backend: Backend, values: npt.NDArray[Any]) -> Index:
-    """A copy of a one-dimensional NumPy array of integers >= 0 as backend.UInt32, likewise."""
+    """A copy of a one-dimensional NumPy array of integers >= 0 as an evaluated backend.UInt32 in
+    aligned memory."""
     return backend.UInt32(_aligned(values, np.dtype(np.uint32)))
 
 
@@ -345,8 +347,8 @@ def _aligned(values: npt.NDArray[Any], dtype: np.dtype[Any]) -> npt.NDArray[Any]
     """A copy that begins at a multiple of _ALIGNMENT bytes, with as many unused bytes after it.
 
     Dr.Jit maps a NumPy array in place. NumPy's memory is aligned to the vector width by chance
-    only; if it is not, packet gathers silently fall apart into scalar ones, and since a kernel
-    knows whether it is, the same work would compile a kernel again.
+    only. If it is not, packet gathers silently fall apart into scalar gathers; and since a kernel
+    depends on the alignment, the same work would compile another kernel.
     """
     size = values.size * dtype.itemsize
     memory = np.empty(size + 2 * _ALIGNMENT, np.uint8)

@@ -21,11 +21,12 @@ if TYPE_CHECKING:
 
 
 class LoopState(Protocol):
-    """A frozen dataclass of Dr.Jit arrays, such dataclasses, and None where there is nothing."""
+    """The state of a loop: a frozen dataclass whose fields are Dr.Jit arrays, further such
+    dataclasses, or None."""
 
     @property
     def active(self) -> Mask:
-        """Which lanes go on."""
+        """The lanes on which the loop continues."""
         ...
 
 
@@ -33,9 +34,10 @@ State = TypeVar("State", bound=LoopState)
 
 
 def loop_while_active(state: State, body: Callable[[State], State], label: str) -> State:
-    """Runs `body` on the lanes of the state that are active, until none is.
+    """Run `body` on the active lanes of the state until no lane is active, and return the final
+    state.
 
-    Errors that the body raises while it is recorded come out as they are.
+    Errors that the body raises while it is recorded are raised unchanged.
     """
 
     def running(*leaves: Any) -> Mask:
@@ -69,7 +71,7 @@ def update_where_active(
 
 
 def array_leaves(record: Any) -> Iterator[Any]:
-    """The arrays of a record of arrays and records, in order; None is left out."""
+    """The arrays of a record, those of nested records included, in order; None is left out."""
     for value in _entries(record):
         if dataclasses.is_dataclass(value):
             yield from array_leaves(value)
@@ -78,7 +80,8 @@ def array_leaves(record: Any) -> Iterator[Any]:
 
 
 def rebuild_record(like: Any, leaves: Iterator[Any]) -> Any:
-    """The leaves as a record like another one."""
+    """A record with the structure of `like`, whose arrays are the leaves, in the order of
+    `array_leaves`."""
     values: list[Any] = []
     for value in _entries(like):
         if dataclasses.is_dataclass(value):
@@ -116,7 +119,8 @@ def active_lanes(mask: Mask) -> tuple[Any, int]:
 
 
 def broadcast_copy(record: Lanes, width: int, index: Any) -> Lanes:
-    """A copy of a record in which all lanes may differ, evaluated. index: the type of lanes."""
+    """An evaluated copy of a record in which every array has `width` lanes. index: the type of lane
+    indices."""
     copies = _evaluate_unshared(
         lambda: [_broadcast(leaf, width, index) for leaf in array_leaves(record)]
     )

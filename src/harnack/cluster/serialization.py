@@ -66,7 +66,7 @@ _MISSING = (
 
 
 def import_optional(name: str, what: str) -> Any:
-    """A module that the extra `cluster` brings.
+    """Import a module that the extra `cluster` installs.
 
     Raises:
         ModuleNotFoundError: it is not installed. The message says that `what` needs it.
@@ -124,12 +124,12 @@ class SerializedObject:
         return cls(name, data, tuple(files), package_versions(), tuple(others))
 
     def deserialize(self) -> Any:
-        """The object. The same one as long as it is among the last that were opened here, so that
-        what it has prepared is not prepared again.
+        """The object. It is the same object as at the last call, as long as it is among the objects
+        opened last in this process, so that its prepared data is used again.
 
         Raises:
-            RuntimeError: it was packed by other versions of packages than there are here.
-            ValueError: a file that it names is another one here.
+            RuntimeError: it was pickled with other versions of packages than are installed here.
+            ValueError: a file that it names has other contents here.
         """
         return _deserialize_cached(self)
 
@@ -157,11 +157,11 @@ def _deserialize_cached(packed: SerializedObject) -> Any:
 
 
 def content_hash(thing: Any, what: str) -> str:
-    """32 hexadecimal digits that depend on all that is in an object and in the files that it names,
-    and on the versions of `package_versions`.
+    """32 hexadecimal digits that depend on everything an object contains, on the contents of the
+    files that it names, and on `package_versions`.
 
-    Each object is written out wherever it occurs, so that it does not matter which of several equal
-    ones are the same object.
+    Each object is written out wherever it occurs, so that the digest does not depend on which of
+    several equal objects are the same object.
 
     Raises:
         ModuleNotFoundError, TypeError: as `SerializedObject.serialize`.
@@ -170,7 +170,8 @@ def content_hash(thing: Any, what: str) -> str:
 
 
 def _hash_and_files(thing: Any, what: str, words: frozenset[str] = frozenset()) -> tuple[str, Any]:
-    """The name of an object, and the pickler that wrote down what it is made of."""
+    """The content hash of an object, and the pickler that wrote it, which has noted files and
+    packages."""
     try:
         pickler = _written(_hashing_pickler, thing, what, words, fast=True)
     except (RecursionError, TypeError, ValueError):  # an object that holds itself
@@ -185,10 +186,10 @@ def _written(
     kind: Callable[[Any], Any], thing: Any, what: str, words: frozenset[str] = frozenset(), *,
     fast: bool = False,
 ) -> Any:  # fmt: skip
-    """The pickler of a kind, after it has written an object into its `file`.
+    """A pickler of a kind, after it has written an object into its `file`.
 
-    What is named of modules is known when all code was written. So it writes again until nothing
-    is missing, which ends, since there are so many names in the code.
+    Which attributes of modules are needed is known only when all code was written. So the object is
+    written again until no name is missing; this ends, since the code has finitely many names.
     """
     cloudpickle = import_optional("cloudpickle", what)
     while True:

@@ -1,8 +1,8 @@
-"""The kernel that Dr.Jit records for a computation, and which of its arrays is which.
+"""The kernel that Dr.Jit records for a computation, and which of its parameters is which array.
 
-A kernel tells its arrays apart by the places of their pointers. Names come with it as comments:
-`drjit.set_label` gives a variable one, and `JitFlag.PrintIR` has them written. An array that a
-kernel reads at places which lanes compute is named by what `drjit.gather` returns of it.
+A kernel distinguishes its arrays only by the positions of their pointers. Labels come with it as
+comments: `drjit.set_label` labels a variable, and `JitFlag.PrintIR` prints labels. An array that a
+kernel reads at computed indices is identified by the label of the result of `drjit.gather`.
 """
 
 from __future__ import annotations
@@ -32,8 +32,9 @@ _RECORDING_LOCK = threading.Lock()
 class RecordedKernel:
     """A kernel as a shader, and the arrays that it reads and writes, by their labels.
 
-    data: of numbers and tables. results: what Dr.Jit made of the lanes. constants: of results that
-    no lane computes.
+    data: the numbers and tables that it reads.
+    results: Dr.Jit's own results for the lanes.
+    constants: results that are constants, which no lane computes.
     """
 
     shader: Shader
@@ -45,15 +46,16 @@ class RecordedKernel:
 def record_kernel(
     compute: Callable[..., Mapping[str, Any]], lanes: Mapping[str, Any], data: Any
 ) -> RecordedKernel:
-    """What `compute(**lanes)` records, run on Dr.Jit's own backend for these lanes.
+    """Record the kernel of `compute(**lanes)`, which also runs on Dr.Jit's own backend for these
+    lanes.
 
-    compute: gives arrays by name, none of them evaluated, from one kernel.
-    lanes: arrays by name, of the same length, of two entries at least.
-    data: whatever else `compute` reads: all arrays in it are looked for.
+    compute: returns arrays by name, none of them evaluated, from a single kernel.
+    lanes: arrays by name, of the same length, with two entries at least.
+    data: an object that contains all other arrays which `compute` reads; it is searched for them.
 
     Raises:
-        UntranslatableError: the kernel holds what is not known.
-        RuntimeError: it is more than one kernel.
+        UntranslatableError: the kernel contains an unknown operation.
+        RuntimeError: the computation is more than one kernel.
     """
     with _RECORDING_LOCK:
         naming = _ArrayLabels()
