@@ -366,7 +366,7 @@ class _QueryEvaluator:
     def descend(
         self, points: FloatArray, start: FloatArray, limit: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """`search.DescentMethods`: by descent, or with sheets by rays."""
+        """`cell_search.DescentMethods`: by descent, or for fields with jumps by rays."""
         if self.surface.field.has_jumps:
 
             def close(p: Vec3, start: Vec3) -> tuple[Vec3]:
@@ -405,7 +405,7 @@ class _QueryEvaluator:
     def descend_from_boundary(
         self, points: FloatArray, boundary: FloatArray, aside: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """`search.DescentMethods`."""
+        """`cell_search.DescentMethods`."""
 
         def level_away(p: Vec3, b: Vec3, length_: Vec3) -> tuple[Real]:
             way = p - b
@@ -436,7 +436,7 @@ class _QueryEvaluator:
         return self._inside_domain_or_nan(feet), free
 
     def newton_in_kernel(self, x: Vec3, start: Vec3, limit: Real) -> tuple[Vec3, Real, Mask]:
-        """`search.DescentMethods`."""
+        """`cell_search.DescentMethods`."""
         p, vector = self.backend.Array3f(x), cast("Any", type(x))
         foot, _, free, goes_on, _ = self._newton(p, self.backend.Array3f(start), limit)
         if self._domain is not None:

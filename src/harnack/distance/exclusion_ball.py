@@ -35,8 +35,8 @@ def exclusion_radius(sample: Sample, rows: Rows | None, x: Vec3, y: Vec3) -> Rea
 
     Proof. Let y + w be a point of the surface, |w| <= r, n = grad f/|g| and x = y + d n, where f
     is taken with the other sign if x is on the other side. With |f(y + w) - f(y) - g . w| <=
-    R1 |w|^2/r^2 (`remainder` falls at least as the square), |n . w| <= c |w|^2, c = R1/(|g| r^2).
-    So |x - y - w|^2 = d^2 - 2 d n . w + |w|^2 >= d^2 + |w|^2 (1 - 2 d c).
+    R1 |w|^2/r^2 (`taylor_remainder` falls at least as the square), |n . w| <= c |w|^2,
+    c = R1/(|g| r^2). So |x - y - w|^2 = d^2 - 2 d n . w + |w|^2 >= d^2 + |w|^2 (1 - 2 d c).
 
     With second derivatives H: -n . w |g| is w.Hw/2 and a rest of at most R2 |w|^3/r^3. Let t be
     the part of w along the tangent plane, k the least of the eigenvalues of H in that plane and 0,

@@ -131,9 +131,10 @@ def count_crossings(
 ) -> EdgeCrossings:
     """Count the crossings of every edge.
 
-    Wrapping. From p the function moves by less than a quarter of its period within `reach`; if the
-    reaches of both ends cover the edge, it moves by less than half a period along it, which is the
-    wrapped difference. Other edges are integrated (`Field.continuous_change`).
+    Wrapping. Within `LevelSamples.quarter_period_radius` of a point the function changes by less
+    than a quarter of its period. If these radii at both ends cover the edge, it changes by less
+    than half a period along it, so that the change is the wrapped difference. Along other edges
+    the change is integrated (`Field.continuous_change`).
 
     Raises:
         MeshingError: edges that are not covered, of a field that cannot be integrated.

@@ -1,4 +1,5 @@
-"""Finer meshes: edges cut where the surface bulges from them, vertices moved onto it, and smoothed.
+"""Refines meshes: edges are split where the surface is too far from them, vertices are moved onto
+the surface and smoothed.
 
 Vertices and edges of the boundary stay as they are.
 """
@@ -221,7 +222,7 @@ def _level_along(
 def unrefined_midpoints(
     function: LevelFunction, vertices: FloatArray, faces: IntArray, tolerance: float
 ) -> FloatArray:
-    """Middles (k, 3) of the edges that `refine` would still cut."""
+    """Midpoints (k, 3) of the edges that `refine` would still split."""
     far = _RefinementMarks.of(function, vertices, faces, tolerance, None, None)
     return far.middle[far.marked]
 
@@ -300,7 +301,10 @@ def _edges(faces: IntArray) -> tuple[IntArray, IntArray, BoolArray]:
 
 
 def split_faces(vertices: FloatArray, faces: IntArray, middle: IntArray) -> IntArray:
-    """Faces cut at the middles (m, 3) of their edges, -1 for those that are not cut."""
+    """Faces, split at the midpoints of their edges.
+
+    middle: (m, 3) vertices at the midpoints, -1 for edges that are not split.
+    """
     cut = middle >= 0
     number = cut.sum(axis=1)
     parts = [faces[number == 0]]

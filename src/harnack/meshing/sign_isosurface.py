@@ -124,12 +124,14 @@ def mesh_from_signs(
     closed: bool = False,
     volume: Volume | None = None,
 ) -> tuple[SignIsosurface, LostParts, dict[str, Any]]:
-    """`extract_from_signs` in cells of a box, parts of the level that it lost, and facts about it.
-    Where more than a few vertices and centers of triangles are beyond the tolerance, a length, or
-    lost parts may be found so, it is made once more of smaller cells; how many are at last, and
-    within what distance all are, is among the facts.
+    """Extract a mesh from signs in the cells of a box (`extract_from_signs`). Returns it with the
+    parts of the level set that it lost, and facts about it.
 
-    volume: only what is lost within it counts.
+    Where more than a few vertices and centers of triangles are beyond the tolerance, a length, or
+    where smaller cells may show lost parts, it is extracted again from smaller cells. The facts say
+    how many points are beyond the tolerance at last, and within what distance all of them are.
+
+    volume: only parts lost within it count.
 
     Raises:
         MeshingError: as `extract_from_signs`.
@@ -390,12 +392,16 @@ def _triangles(
 
 @dataclass(frozen=True)
 class _CreaseRefinement:
-    """Where edges and faces are cut.
+    """The places at which edges and faces are split to follow creases.
 
-    edges: (m, 3) of all faces. place: (k,) of edges, the index of the new vertex, or -1. ends:
-        (c, 2) of the edges that are cut, and share: (c,) where along them. cornered: (d, 3) faces
-        with a new vertex within, and their rows (d,).
-    points, normals, is_on_crease: the new vertices, those of edges first; bent: on a crease.
+    edges: (m, 3) of all faces.
+    vertex_of_edge: (k,) of edges, the index of the new vertex, or -1.
+    ends: (c, 2) of the edges that are split.
+    share: (c,) where along these edges, as a fraction.
+    corner_faces: (d, 3) faces with a new vertex within.
+    rows: (d,) the indices of these faces.
+    points, normals: of the new vertices, those of edges first.
+    is_on_crease: which new vertices are on a crease.
     """
 
     edges: IntArray

@@ -1,4 +1,4 @@
-"""`render`: a field in, a picture out."""
+"""`render`: draws a picture of fields, surfaces or Mitsuba scenes."""
 
 from __future__ import annotations
 

@@ -212,12 +212,12 @@ class GBuffer:
         return cls(*(dr.zeros(kind, count) for kind in kinds))
 
     def to_numpy(self) -> dict[str, npt.NDArray[Any]]:
-        """As arrays of NumPy, by name."""
+        """The arrays as NumPy arrays, by name."""
         return {name: to_numpy(value) for name, value in vars(self).items()}
 
     @classmethod
     def from_numbers(cls, mi: Any, numbers: Mapping[str, npt.NDArray[Any]]) -> GBuffer:
-        """From what `to_numpy` gave, here or in another process."""
+        """The G-buffer from the result of `to_numpy`, of this process or another."""
         empty = vars(cls.nothing(mi, 0))
         return cls(
             **{name: _of_numbers(mi, type(kind), numbers[name]) for name, kind in empty.items()}
@@ -233,16 +233,16 @@ def _of_numbers(mi: Any, kind: Any, numbers: npt.NDArray[Any]) -> Any:
 
 
 class ShadedTask:
-    """A sensor in a world, its light, and what of a shaded picture can be done pixel by pixel.
+    """The rendering of a shaded picture for a sensor and a light, by ranges of pixels.
 
-    spp: rays of a pixel on an edge, at least; 1 for one ray a pixel everywhere.
+    spp: rays of a pixel at an edge, at least; 1 for a single ray in every pixel.
     on_floor: whether the scene is a studio's, whose floor shows shadows.
-    cut_out: whether to leave out the light of what is behind everything.
+    cut_out: whether to leave out the light of the backdrop behind all objects.
     cones: whether cones find pixels to draw again, besides the edges in the picture.
 
     Raises:
-        ValueError: the Mitsuba variant is spectral, whose four wavelengths a ray are no color;
-            or cones are asked to find a field that jumps.
+        ValueError: the Mitsuba variant is spectral, whose four wavelengths a ray are no color; or
+            cones are requested for a field that jumps.
     """
 
     def __init__(
@@ -270,7 +270,8 @@ class ShadedTask:
         self.floor = FloorShadow.of(world, self.light) if on_floor else None
 
     def render_gbuffer(self, start: int, stop: int) -> GBuffer:
-        """What the rays through the middles of some pixels hit first; `order` counts pixels."""
+        """The first hits of the rays through the middles of a range of pixels; `order` counts
+        pixels."""
         mi = self.mi
         pixel = upload_indices(mi, self.order[start:stop])
         seen = self._look(pixel, mi.Vector2f(_MIDDLE))

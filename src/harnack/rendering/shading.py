@@ -161,8 +161,9 @@ class StudioLight:
     """The light of shaded pictures: a formula, so that one ray a sample is all they need.
 
     A soft key light from the upper left of the camera, a hemisphere of light that is cooler above
-    than below, and a gloss on what is glossy. `shaded.ambient_visibility` says how much of the
-    hemisphere is hidden by what is near, `FloorShadow` where the studio's floor lies in shadow.
+    than below, and highlights on glossy materials. `shaded_render.ambient_visibility` computes how
+    much of the hemisphere is hidden by nearby surfaces, `FloorShadow` where the studio's floor
+    lies in shadow.
 
     key, up: unit vectors, as lists of three numbers, to the key light and to the brighter
     hemisphere.
@@ -256,7 +257,7 @@ _BLUR = (0.05, 0.2, 0.25, 0.25, 0.2, 0.05)
 
 
 class ShadowCaster(Protocol):
-    """What casts shadows, such as a `HybridScene`."""
+    """Interface to objects that cast shadows, such as a `HybridScene`."""
 
     @property
     def mi(self) -> Any: ...
@@ -268,15 +269,15 @@ class ShadowCaster(Protocol):
 
 @dataclass(frozen=True)
 class FloorShadow:
-    """The soft shadow on the studio's floor, traced on a coarse grid and blurred: what of the key
-    light and of the sky reaches the floor, a texture of two channels."""
+    """The soft shadow on the studio's floor, traced on a coarse grid and blurred: a texture of two
+    channels, the fractions of the key light and of the sky's light that reach the floor."""
 
     mi: Any
     texture: Any
 
     @classmethod
     def of(cls, world: ShadowCaster, light: StudioLight) -> FloorShadow:
-        """Traced in a studio."""
+        """The shadow of a studio scene, by tracing rays."""
         mi = world.mi
         cell = (np.arange(_CELLS) + 0.5) / _CELLS * 2 * _REACH - _REACH
         y, x = np.meshgrid(cell, cell, indexing="ij")

@@ -1,7 +1,7 @@
 """First hits of rays with level sets and closed solids: refined positions, oriented normals.
 
 Everything here is in the surface's own coordinates and knows no Mitsuba;
-`world.surface_interaction` turns a hit into what a BSDF takes.
+`hybrid_scene.surface_interaction` turns a hit into what a BSDF takes.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def intersect_surface(
 
     A confirmed hit is at a root already, and its side is known.
 
-    A hit on a sheet is not moved; the normal points to the side of larger values.
+    A hit on a jump surface is not moved; the normal points to the side of larger values.
     """
     trace = prepared.first_hit(o, d, 0, t_max, active)
     if not prepared.uses_ray_queue:
