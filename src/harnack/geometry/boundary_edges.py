@@ -53,7 +53,8 @@ Edge = tuple[int, int]
 
 
 class OpenChainError(ValueError):
-    """Edges that do not join to closed loops. vertex: where they end, or meet in too many."""
+    """Edges that do not join to closed loops. vertex: where a chain of them ends, or where too many
+    meet."""
 
     def __init__(self, vertex: int, count: int) -> None:
         super().__init__(f"{count} edges meet at vertex {vertex}")
@@ -62,10 +63,11 @@ class OpenChainError(ValueError):
 
 
 def boundary_edges(faces: Iterable[Sequence[int]]) -> list[Edge]:
-    """Directed edges of faces that do not cancel against the same edge run the other way.
+    """The directed edges of faces that remain when each edge cancels against the same edge run the
+    other way.
 
-    An edge is listed as often as it remains. At every vertex as many of them begin as end,
-    because that is so for each face.
+    An edge is listed as often as it remains. At every vertex as many of them begin as end, because
+    that is so for each face.
     """
     net: Counter[Edge] = Counter()
     for face in faces:
@@ -81,11 +83,11 @@ def boundary_edges(faces: Iterable[Sequence[int]]) -> list[Edge]:
 
 
 def join_edges(edges: Sequence[Edge]) -> list[list[int]]:
-    """Loops of vertex indices made of all the edges.
+    """Join all edges to closed loops of vertex indices.
 
-    If as many edges begin as end at every vertex, their directions are kept, and a loop ends
-    where it first meets itself. Otherwise exactly two edges must meet at every vertex, and each
-    loop runs in the direction of its first edge.
+    If as many edges begin as end at every vertex, their directions are kept, and a loop ends where
+    it first meets itself. Otherwise exactly two edges must meet at every vertex, and each loop runs
+    in the direction of its first edge.
 
     Raises:
         OpenChainError: neither is the case.
@@ -155,9 +157,10 @@ _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 
 
 class NetFaces(NamedTuple):
-    """Faces after duplicates were counted.
+    """The faces of a mesh after duplicates were added up.
 
-    faces: (k, 3), no two with the same three vertices. multiplicity: (k,), positive.
+    faces: (k, 3), no two with the same three vertices.
+    multiplicity: (k,), positive.
     source: (k,), ascending; `faces[i]` is original face `source[i]`, the first of its orientation.
     """
 
@@ -224,11 +227,12 @@ def singular_edges(faces: IntArray, multiplicity: npt.ArrayLike = 1) -> tuple[In
 def net_edges(
     begin: IntArray, end: IntArray, weight: npt.ArrayLike = 1
 ) -> tuple[IntArray, IntArray]:
-    """Directed edges (k, 2) that are left, and their weights (k,) > 0, of edges begin -> end (m,).
+    """The directed edges (k, 2) that remain of edges begin -> end (m,) after opposite edges were
+    cancelled, and their weights (k,) > 0.
 
-    An edge counts `weight` times, (m,) or one integer of any sign for all, and against the same
-    edge run the other way; one from a vertex to itself does not count. The order is by the lower,
-    then the higher index.
+    An edge counts `weight` times, (m,) or an integer of any sign for all, and minus that for the
+    reversed edge. An edge from a vertex to itself does not count. The order is by the lower, then
+    the higher index.
     """
     if not len(begin):
         return np.zeros((0, 2), dtype=np.int64), np.zeros(0, dtype=np.int64)

@@ -1,4 +1,4 @@
-"""Clipping volumes: ball, box, half-space and their intersections; polytopes and their planes."""
+"""Clip volumes: ball, box, half-space and their intersections; polytopes and their planes."""
 
 from __future__ import annotations
 
@@ -52,13 +52,13 @@ class PlaneTable:
     """Planes n.x <= h as rows (n, h) of four numbers, for a kernel.
 
     backend: where the kernel runs.
-    rows: (m, 4) on the host, of which kernels see the numbers where there is no buffer.
-    buffer: the rows on the backend, or None: literal numbers serve volumes that were not prepared.
+    rows: (m, 4) on the host. Without a buffer, kernels contain these numbers.
+    buffer: the rows on the backend, or None: literals serve volumes that were not prepared.
     plane_count: the number of rows in the buffer as a kernel parameter.
     max_offset: the largest |h|, a kernel parameter too if there is a buffer.
 
-    Unrolled, a scalar gather at a literal index costs no more than a literal number (0.4 ns a
-    plane and ray in all); a packet gather in a loop makes that 1.1 ns, four planes a trip.
+    Unrolled, a scalar gather at a literal index costs no more than a literal number (0.4 ns a plane
+    and ray in all); a packet gather in a loop makes that 1.1 ns, four planes an iteration.
     """
 
     backend: Backend
@@ -395,7 +395,7 @@ class HalfSpace(Polytope):
 
 @dataclass(frozen=True)
 class VolumeIntersection(Volume):
-    """Points that lie in all of several volumes (at least one)."""
+    """The intersection of several volumes (at least one)."""
 
     volumes: tuple[Volume, ...]
 
@@ -440,7 +440,8 @@ class VolumeIntersection(Volume):
         return normal
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper corner; lower > upper somewhere if the volumes are seen not to meet."""
+        """Lower and upper corner; lower > upper for some coordinate if the boxes of the volumes do
+        not meet."""
         boxes = [v.bounds() for v in self.volumes]
         return np.max([b[0] for b in boxes], axis=0), np.min([b[1] for b in boxes], axis=0)
 

@@ -1,27 +1,27 @@
-"""Clouds with noise: how much of it there is, and points moved to where the surface is.
+"""Clouds with noise: an estimate of the noise, and points moved onto the surface.
 
 A point of a cloud with noise lies off the surface by some distance, with a standard deviation that
-`estimate_noise` estimates. `CloudDenoiser` moves points along their normals to where their
-neighbors say that the surface is, so that sums over them need less smoothing, and edges stay
+`estimate_noise` estimates. `CloudDenoiser` moves points along their normals to the height of the
+surface that their neighbors predict, so that sums over them need less smoothing, and edges stay
 sharper.
 
-A neighbor j, at p_j with the normal n_j, says that the surface at x is
+A neighbor j, at p_j with the normal n_j, predicts that the surface near x is
 
     t_j = (n + n_j)/2 . (p_j - x)
 
 farther along the normal n of x. On a sphere, and to second order on every surface, t_j is 0 at a
 point of the surface, however far the neighbor is: the plane of j lies as far outside of the surface
-as j itself is inside of the plane of x. So the mean of t_j does not shrink what is curved, as the
-mean of the positions would. Neighbors count by distance and by the angle between n and n_j, so that
-what lies around an edge or on the other side of a wall does not count.
+as j itself is inside of the plane of x. So the mean of t_j does not shrink curved surfaces, as the
+mean of the positions would. Neighbors are weighted by distance and by the angle between n and n_j,
+so that neighbors around an edge or on the other side of a wall do not count.
 
-Noise is taken from the points, not from the field. A kernel wide enough for noise rounds all
-edges and shrinks what is round. Points moved along their normals, by planes of their own and of
-their neighbors together, leave a spacing to smooth over: the mean error of surfaces was a tenth to
-a third less than by smoothing over 1.4 sqrt(noise * spacing) alone, and areas were right, which had
-been twice as large. Correcting a smoothed surface by how much a second smoothing moves it was no
-better than one smoothing. The field stays a sum of dipoles, with all its bounds, so that what was
-chosen is in the data alone (`denoised_cloud`).
+The noise is removed from the points, not from the field. A kernel wide enough for the noise rounds
+all edges and shrinks curved parts. Points moved along their normals, by planes of their own and of
+their neighbors together, need to be smoothed over a spacing only: the mean error of surfaces was a
+tenth to a third less than by smoothing over 1.4 sqrt(noise * spacing) alone, and areas were right,
+which had been twice as large. Correcting a smoothed surface by the distance by which a second
+smoothing moves it was no better than a single smoothing. The field stays a sum of dipoles, with all
+its bounds: only its data change (`denoised_cloud`).
 """
 
 from __future__ import annotations
@@ -236,8 +236,8 @@ class CloudDenoiser:
 
 
 def _neighbors(tree: Any, points: FloatArray, count: int) -> Indices:
-    """(m, k) the indices of the points of a tree that are nearest to points (m, 3), these included
-    where they are among them."""
+    """(m, k) the indices of the points of a tree that are nearest to points (m, 3), which count
+    themselves if they belong to the tree."""
     count = min(count, tree.n)
     index = np.empty((len(points), count), np.int32)
 
@@ -258,9 +258,9 @@ def _move_along_normals(
 ) -> FloatArray:
     """Points (m, 3), moved along their `own` normals (m, 3) to where the mean of t_j is 0.
 
-    near: (m, k) their neighbors among points (n, 3) with normals (n, 3), which count by their
-        distance along the plane of the point: else those on its side of the surface would hold it
-        there.
+    near: (m, k) their neighbors among points (n, 3) with normals (n, 3). Weights depend on the
+        distance along the plane of the point only: with the distance in space, neighbors on the
+        point's side of the surface would hold it there.
     """
     moved = np.empty_like(start)
 
@@ -290,10 +290,10 @@ def _agreeing_weight(
     normals: FloatArray,
     chord: float,
 ) -> FloatArray:
-    """(m,) the part of the neighbors of points that have a normal like theirs, by weight.
+    """(m,) the fraction, by weight, of the neighbors of points that have a normal like theirs.
 
-    is_own: (m, k) which of them are the points themselves, and do not count. The others: as for
-        `_move_along_normals`.
+    is_own: (m, k) which of the neighbors are the points themselves, and do not count. The other
+        arguments: as for `_move_along_normals`.
     """
     alike = np.empty(len(start))
 
