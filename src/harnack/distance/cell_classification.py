@@ -205,7 +205,7 @@ _MORE_STEPS, _SHRINKS = 14, (0.4, 0.97)
 _CUBE_CIRCUMRADIUS = 3**0.5 * (1 + 1e-9)
 # A foot is on the level up to this share of its cell.
 _CLOSE = 1e-7
-# Rays through a cell of a field with sheets.
+# Rays through a cell of a field that jumps.
 _DIAGONALS = ((1.0, 1.0, 1.0), (1.0, 1.0, -1.0), (1.0, -1.0, 1.0), (-1.0, 1.0, 1.0))
 
 

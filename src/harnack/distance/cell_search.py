@@ -287,8 +287,8 @@ class _CellSearch:
         else:
             self.lower[:] = np.inf
         if not has_sheets:
-            # Where sheets meet or cross within a cell, one may have no foot there; and a promise
-            # that does not hold may have left out cells.
+            # Where two parts of the surface meet or cross within a cell, descents may not have
+            # begun on both of them; and a promise that does not hold may have left out cells.
             rows = np.flatnonzero(self._is_unproved() | np.isnan(self.feet[:, 0]))
             rows = rows[self.known.estimate[rows] < _MIN_GAIN * self._distance(rows)]
             self._descend(rows, self.points[rows])

@@ -39,7 +39,7 @@ _CANDIDATES_PER_WALK = 4
 _SEPARATION, _SEPARATION_IN_PIECES = 4.0, 3.0
 # In half cells: the surface is in one piece in a slab that is thinner.
 _SINGLE_PIECE_THICKNESS = 0.5
-# In half cells: within this distance of its point in a cell the rim is nearly a line.
+# In half cells: within this distance of its point the clip curve is nearly a line.
 _CLIP_CURVE_RADIUS = 4.0
 
 
@@ -55,8 +55,8 @@ class SurfaceCells:
         zero where no plane is known that is nearly the surface.
     plane_radius: (n,) within this radius about its foot the surface is nearly that plane.
     curvature: (n,) how much it is curved there, at most; FAR where that is not known.
-    clip_point: (n, 3) a point of the rim, the curve at which a domain cuts the surface, or FAR.
-    clip_curvature: (n,) of the rim there.
+    clip_point: (n, 3) a point of the clip curve, at which a domain cuts the surface, or FAR.
+    clip_curvature: (n,) of the clip curve there.
     """
 
     center: FloatArray
@@ -123,7 +123,7 @@ class CellTree:
 
     @classmethod
     def of(cls, backend: Backend, cells: SurfaceCells) -> CellTree:
-        # Points of the rim are feet of cells of their own.
+        # Points of the clip curve are surface points of cells of their own.
         cut = np.flatnonzero(cells.clip_point[:, 0] < FAR_SENTINEL)
         n, both = len(cells), np.concatenate([np.arange(len(cells)), cut])
         is_plain = cells.is_single_piece & (cells.clip_point[:, 0] == FAR_SENTINEL)

@@ -62,8 +62,8 @@ def signed_distance(
         "lower_bound": never longer in size than the true distance, with proof: no level lies in the
             ball of that radius about the point, not even outside the field's domain. Of first
             order too: the nearer the surface, the smaller the share that it falls short by.
-        Of a field that jumps across sheets, "first_order" and "second_order" see the smooth part of
-        the surface, and the nearest sheet if that is nearer and the surface lies there.
+        For a field that jumps across facets, "first_order" and "second_order" see the smooth part
+        of the surface, and the nearest facet if that is nearer and the surface lies there.
     precision: of the computation; "lower_bound" allows for rounding in both. The search of
         "closest_point" is done in double precision in any case.
     progress: told what is being done.

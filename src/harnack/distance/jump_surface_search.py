@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 __all__ = ["JumpSurfaceSearch", "compass_search", "is_on_surface", "straddles_level"]
 
-# Half the length of a ray through a point of a sheet, in epsilons of coordinates.
+# Half the length of a ray through a point of a facet, in epsilons of coordinates.
 _PROBE_HALF_LENGTH = 32.0
 # A regular tetrahedron about the origin, turned so that none of its edges lies in a plane that
 # triangles of meshes often lie in; and its six edges.
@@ -39,7 +39,7 @@ _CORNERS = (
 _EDGES = ((0, 1), (1, 2), (2, 3), (3, 0), (0, 2), (1, 3))
 # In these lengths: the distance from y at which f is evaluated, where rounding of y hardly counts.
 _SIGN_TEST_SCALE = 64.0
-# Before a sheet f is evaluated at this part of the way to it.
+# Before a facet f is evaluated at this part of the way to it.
 _BEFORE = 0.98
 
 NextJump: TypeAlias = "Callable[[tuple[Any, Any], Any, Any], NearestFacet]"
@@ -115,21 +115,21 @@ class JumpSurfaceSearch:
     def _probe_hits(
         self, y: Vec3, short: Real, start: Vec3, end: Vec3, active: Mask
     ) -> tuple[Mask, Any, Vec3]:
-        """Whether the way between two points about y, in lengths of `short`, meets the surface; the
-        sheet that it meets, and where."""
+        """Whether the segment between two points about y, in units of `short`, meets the surface;
+        the facet that it meets, and where."""
         backend = self.surface.backend
         real, vector = backend.Float, backend.Array3f
         o = dr.fma(vector(short), start, y)
         way, length = (end - start) / dr.norm(end - start), dr.norm(end - start)
         seen = self.surface.first_hit(o, way, real(0), short * length, active)
         met = active & (seen.status == int(RayStatus.HIT))
-        # To first order any level is near where the gradient has no bound, as at the sheet's edge.
+        # To first order any level is near where the gradient has no bound, as at the facet's edge.
         met &= straddles_level(self.surface, y, _SIGN_TEST_SCALE * short, met)
         return met, seen.facet, dr.fma(vector(seen.t), way, o)
 
     def _next_jump(self, x: Vec3) -> NextJump:
-        """The sheets of the field in turn; of a field that does not tell them, the nearest
-        alone."""
+        """The facets of the field in turn; for a field that does not list them, the nearest facet
+        only."""
         field, backend = self.surface.field, self.surface.backend
         real, index = backend.Float, backend.UInt32
         probe = field.nearest_facet(x, (real(-1), index(NO_FACET)), real(0), backend.Bool(False))

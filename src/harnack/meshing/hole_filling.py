@@ -1,16 +1,16 @@
-"""Smooth patches over the holes of a mesh, each bounded by one loop of open edges.
+"""Fills the holes of a mesh smoothly, each bounded by a loop of boundary edges.
 
-A patch begins as the triangulation of its loop that turns least against the faces around it (Liepa,
-Filling Holes in Meshes, 2003) or, for long loops, that has the least area (Barequet and Sharir
-1995), which may cut through a tube where the other goes around it. Edges are cut and flipped until
-triangles are as large as those around the hole. Then the patch is made to bend as little as it can:
-the sum of squared Laplacians of positions is least, over the new vertices and those of the loop,
-while all vertices that were there stay (Botsch and Kobbelt 2004). So it continues the surface
-around it, tangents included. Laplacians are those of the patch before; repeated, with edges cut
-that have become long, this ends at surfaces whose mean curvature is harmonic, such as spheres and
-cylinders.
+A filling begins as the triangulation of its loop that has the smallest dihedral angles with the
+faces around it (Liepa, Filling Holes in Meshes, 2003) or, for long loops, the smallest area
+(Barequet and Sharir 1995), which may cut through a tube where the other goes around it. Edges are
+split and flipped until triangles are as large as those around the hole. Then the filling is faired,
+to bend as little as possible: the sum of squared Laplacians of positions, over the new vertices and
+those of the loop, is minimized, while all vertices of the mesh stay (Botsch and Kobbelt 2004). So
+it continues the surface around it, tangents included. Laplacians are those of the filling before;
+repeated, with long edges split, this converges to surfaces whose mean curvature is harmonic, such
+as spheres and cylinders.
 
-Nothing is proved of such patches. Those are handed back that pass the checks of `fill_holes`.
+Nothing is proved of such fillings. Those that pass the checks of `fill_holes` are returned.
 """
 
 from __future__ import annotations

@@ -96,8 +96,9 @@ class MissedPartsError(MeshingError):
         self.places, self.thickness, self.size = places, thickness, size
 
     def may_be_fixed_by(self, smaller: float) -> bool:
-        """Not if these cells would miss a part of it as well, two of them long and far thinner than
-        one: as beside a cusp or a cone's tip, which cells of no size show."""
+        """Whether such cells may help: not if they would miss a part as well that is two of these
+        cells long and far thinner than a cell, as beside a cusp or the tip of a cone, which no size
+        of cells resolves."""
         thin = self.places[self.thickness < _THIN * smaller * self.size]
         part = _longest_part(thin, _CLUSTER_DISTANCE * self.size)
         reach = float(np.ptp(part, axis=0).max()) if len(part) else 0.0

@@ -154,7 +154,11 @@ class LostParts:
         tolerance: float,
         spacing: float,
     ) -> LostParts:
-        """Of a mesh of the level in cells of a spacing; known: where it should be."""
+        """The lost parts of a mesh of the level set.
+
+        known: points on the level, near which the mesh should be.
+        spacing: of the cells of the mesh.
+        """
         corner = surface.vertices[surface.faces]
         far = known.some(_are_farther(known.points, corner, tolerance))
         beyond = _are_farther(far.points, corner, max(tolerance, _CELLS * spacing))
@@ -179,7 +183,8 @@ class LostParts:
 
     @property
     def matter(self) -> bool:
-        """Whether there are more than what creases and corners leave at all meshes."""
+        """Whether there are more points off the mesh than creases and corners leave for all
+        meshes."""
         return self.beyond > 0 or self.far > _SHARE * self.looked_at
 
     @property

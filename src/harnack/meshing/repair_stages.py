@@ -90,11 +90,11 @@ def repair(
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
 ) -> trimesh.Trimesh:
-    """A closed mesh of a damaged one: with patches over its holes, or made anew.
+    """Return a closed mesh for a damaged one: with its holes filled, or remeshed.
 
-    Corners that are apart by rounding are joined first, and what is inside out as a whole is turned
-    over: each closed part that does not lie in another, with all that lies in it. Then five stages
-    are tried in turn:
+    First, vertices that differ by rounding only are merged, and components that are inside out as a
+    whole are reversed: each closed component that lies in no other, with all that lies in it. Then
+    five stages are tried in turn:
 
     - filled: all triangles stay, and holes are filled;
     - boolean_union: a closed mesh that intersects itself, also along edges that lie on its faces,
@@ -117,16 +117,16 @@ def repair(
 
     mesh: anything with `vertices` (n, 3) and `faces` (m, 3).
     keep: "all" does the first stage or raises an error, "valid" the second one, "none" the last;
-        None does the first that succeeds of all.
-    filling: "smooth" ones continue the surface around each hole, with its tangents, and bend least.
-        They are made hole by hole, and used where w is within 0.36 of 1/2 modulo 1 on them; the
-        rest is done by "harmonic" ones, on which w is 1/2 modulo 1: they join the rims of a gap
-        between two parts, and have a dent where the surface was round. Only of these is it proved
-        what they are.
-    largest: keep the body of the largest volume alone, with its cavities.
-    tolerance: how far harmonic patches may be from the surface w = 1/2, as a part of the size of
-        the box around all holes, and triangles made anew, as a part of the mesh's; sampled and not
-        proved.
+        None tries all of them, up to the first that succeeds.
+    filling: "smooth" hole fillings continue the surface around each hole, with its tangents, and
+        bend least. They are computed hole by hole, and used where w is within 0.36 of 1/2 modulo 1
+        on them; other holes get "harmonic" fillings, on which w is 1/2 modulo 1: these join the
+        boundary loops of a gap between two components, and have a dent where the surface was
+        round. Only for harmonic fillings is it proved which surface they approximate.
+    largest: keep only the body of the largest volume, with its cavities.
+    tolerance: how far harmonic fillings may be from the surface w = 1/2, relative to the size of
+        the box around all holes, and remeshed triangles, relative to the size of the mesh; sampled
+        and not proved.
     cell_size: of cells before anything is refined, in the mesh's unit; None chooses.
     seed: of the small random moves that keep points in general position.
     progress: told what is being done.

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 __all__ = ["SignFunction", "cell_size_for_smoothing", "empty_surface_hint", "uses_sign_meshing"]
 
-# How often a segment is halved before it is intersected with sheets; and how often a smooth
+# How often a segment is halved before it is intersected with facets; and how often a smooth
 # function is evaluated along it, in turn where the secant meets the level and in the middle.
 _HALVINGS, _STEPS = 4, 8
 # Values that are so small, as a part of those at the ends, need no further steps.
@@ -95,7 +95,7 @@ class SignFunction(LevelFunction):
     """side (f - level), of a real-valued field, by its values at points.
 
     side: 1, or -1 for a function that is negative where f is above the level.
-    precision: of values. Crossings of sheets are found in double precision.
+    precision: of values. Crossings of facets are found in double precision.
     """
 
     side: float = dataclasses.field(default=1.0, kw_only=True)
@@ -135,8 +135,8 @@ class SignFunction(LevelFunction):
         return self.relative_to_level(self.field.value(points, precision=self.precision))
 
     def sample(self, points: FloatArray) -> LevelSamples:
-        """The function at points (n, 3). Of a field with sheets the gradient is given as 0, since
-        it does not say how far the level is."""
+        """The function at points (n, 3). For a field that jumps the gradient is given as 0, since
+        it does not tell how far the level is."""
         none = np.zeros(len(points))
         if self.field.has_jumps:
             return LevelSamples(self.values(points), np.zeros((len(points), 3)), none)
@@ -182,7 +182,7 @@ class SignFunction(LevelFunction):
         """Where segments between points (n, 3), at which the function is not positive and positive,
         meet the level: points (n, 3), and unit normals there towards where the function grows.
 
-        They lie on sheets where the function changes its sign by a jump, to rounding.
+        They lie on facets where the function changes its sign by a jump, to rounding.
         """
         if not len(low):
             return low.copy(), low.copy()

@@ -144,8 +144,8 @@ class AovTask:
         return _map_arrays(by_rows, *parts)
 
     def render_samples(self, pixels: IntArray, offsets: FloatArray) -> AovBuffers:
-        """The first hits of rays through places (m, 2) in each of n pixels, counted by rows: arrays
-        (n, m)."""
+        """The first hits of rays through points (m, 2) in each of n pixels, which are counted by
+        rows: arrays (n, m)."""
         mi, count = self.mi, len(offsets)
         pixel = upload_indices(mi, np.repeat(pixels, count))
         table = np.tile(offsets, (len(pixels), 1)).T

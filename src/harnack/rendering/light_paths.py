@@ -283,7 +283,7 @@ def denoise_image(found: PathRender) -> npt.NDArray[np.float32]:
     return np.concatenate([clean, found.image[..., 3:]], axis=-1)
 
 
-# Rays through clear matter.
+# Rays through transparent solids.
 
 # Boundaries that a ray goes through; the next one is opaque.
 _MAX_INTERFACES = 32

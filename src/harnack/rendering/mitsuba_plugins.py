@@ -17,12 +17,12 @@ scenes that are put together in Python.
 </shape>
 <integrator type="harnack_path"/>                  max_depth, rr_depth, hide_emitters, clamp
 
-Mitsuba's own integrators ask Mitsuba's shapes alone, for which a carrier is two points: they would
+Mitsuba's own integrators ask Mitsuba's shapes alone, for which a proxy is two points: they would
 draw nothing, and say nothing. No method of a shape is called while they render, so `mitsuba.render`
 looks first and warns. `harnack.render` follows paths itself where the integrator asks for the same
 light, leaves scenes without our surfaces to Mitsuba, and refuses the rest.
 
-Mitsuba surfaces are zero-area carrier meshes with a path integrator that meets both worlds; finding
+Mitsuba surfaces are zero-area proxy meshes with a path integrator that meets both worlds; finding
 a hit and describing it (`SurfaceInteraction`) are separate, since Mitsuba's next release lets
 Python define shapes.
 """

@@ -194,7 +194,7 @@ class PageJob:
 
     @functools.cached_property
     def places(self) -> dict[str, list[float]]:
-        """The places of the sliders that the page holds."""
+        """The slider values that the page holds, by slider."""
         return _places(self.given)
 
     @functools.cached_property
@@ -210,12 +210,13 @@ class PageJob:
         ).hexdigest()
 
     def state(self, values: Mapping[str, float], digest: str) -> TaskResult:
-        """What a place of the sliders changes of the first state, as text in bytes.
+        """The delta of a state, for a combination of slider values, relative to the initial state;
+        as text in bytes.
 
-        digest: of the first state that is in the page.
+        digest: of the initial state that is in the page.
 
         Raises:
-            RuntimeError: the first state is another one here.
+            RuntimeError: the initial state of this process is another one.
         """
         if self.digest != digest:
             raise RuntimeError(
