@@ -116,7 +116,7 @@ class BooleanSolid(Solid):
         return self._for_rays(self.parts, count, make)
 
     def _of(self, parts: list[Field]) -> Solid:
-        """The same combination of other parts, which need not be solids."""
+        """The same combination of other operands, which need not be solids."""
         other = copy.copy(self)
         object.__setattr__(other, "parts", tuple(parts))
         return other
@@ -145,9 +145,8 @@ class BooleanSolid(Solid):
         return rows
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
-        """The largest errors of the parts that may be the extreme one. Infinite where rounding
-        leaves
-        it open which of two parts that is: derivatives jump there."""
+        """The largest derivative errors of the operands that may be the extreme one. Infinite where
+        rounding leaves open which one is, since derivatives jump there."""
         size = max_norm(p)
         sign = -1.0 if self.is_union else 1.0
         whole = value_error_bound(sample, safe_norm(sample.gradient), size)

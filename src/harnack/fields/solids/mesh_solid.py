@@ -226,10 +226,10 @@ _SAMPLE_CACHE: ContextVar[dict[tuple[int, ...], tuple[Vec3, Sample]] | None] = C
 
 @contextmanager
 def share_samples() -> Generator[None]:
-    """Samples of a mesh at the same points are recorded once: parts of a solid that are made of the
-    same mesh, such as its shell and a lattice in it, look for the nearest triangle once.
+    """Within this context, a mesh is sampled only once at the same Dr.Jit points, so that a shell
+    and a lattice made from one mesh share one nearest-triangle search.
 
-    Not while loops are recorded, whose numbers are known within them alone.
+    Inactive while loops are recorded, as their values are defined inside the loop only.
     """
     token = _SAMPLE_CACHE.set({})
     try:
