@@ -1,7 +1,8 @@
-"""Reading Stanford .ply, ascii and binary: vertices, faces and edges; all else is ignored.
+"""Reading Stanford .ply, ascii and binary: vertices, faces and edges; all other elements are
+ignored.
 
-All rows of an element are read at once, property by property: where a property begins in each row
-follows from the properties before it and the lengths of the lists among them.
+All rows of an element are read at once, property by property: the position of a property in each
+row follows from the properties before it and the lengths of the lists among them.
 """
 
 from __future__ import annotations
@@ -56,7 +57,8 @@ _PADDING = b"\0 \t\r\n"
 
 @dataclass(frozen=True)
 class Property:
-    """One column. code: type of the value, length_code: type of the length if it is a list."""
+    """A property of an element. code: the type of its values; length_code: the type of the length,
+    for a list."""
 
     name: str
     code: str
@@ -65,7 +67,8 @@ class Property:
 
 @dataclass(frozen=True)
 class PlyElement:
-    """An element of the header: its name, how many rows follow, and their columns."""
+    """An element of the header: its name, the number of rows that follow, and the properties of a
+    row."""
 
     name: str
     count: int
@@ -226,7 +229,8 @@ def read_ply(path: Path, data: bytes) -> FileGeometry:
 
 
 def _check_elements(path: Path, header: PlyHeader) -> None:
-    """Refuses elements that hold surface in a form that is not read, or that are there twice."""
+    """Refuse elements that contain faces in a form that is not read, and elements that occur
+    twice."""
     names = [section.name for section in header.elements]
     for name in names:
         is_odd = name.lower() in ("vertex", "face", "edge") and name != name.lower()
@@ -337,7 +341,7 @@ def _binary_tables(path: Path, data: bytes, header: PlyHeader) -> dict[str, Elem
 
 
 def _row_ends(section: PlyElement, values: BinaryValues, begin: int) -> Iterator[int]:
-    """Where each row ends; raises struct.error if that is behind the end of the file."""
+    """The end of each row. Raises struct.error if that is behind the end of the file."""
     skipped = 0
     lists: list[tuple[int, struct.Struct, int]] = []
     for p in section.properties:

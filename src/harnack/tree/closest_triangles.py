@@ -131,12 +131,13 @@ _ROUNDING = 16.0
 
 @dataclass(frozen=True)
 class ClosestTriangle:
-    """The nearest triangle to points x, of those that a query considers.
+    """The triangle nearest to points x, among the triangles that a query considers.
 
-    squared_distance: squared distance; inf where there is no triangle.
-    triangle: of the triangle; NO_TRIANGLE where there is none.
+    squared_distance: inf where there is no triangle.
+    triangle: the index of the triangle; NO_TRIANGLE where there is none.
     offset: (3,) from x to the nearest point of the triangle.
-    normal: (3,) of the triangle by the right-hand rule, of any length; zero without an area.
+    normal: (3,) of the triangle by the right-hand rule, of any length; zero for a triangle of zero
+        area.
     is_inner: whether the nearest point lies inside the triangle, not on its edges.
     """
 
@@ -173,18 +174,17 @@ def distance_lower_bound(rays: TriangleTree, x: Vec3) -> Real:
 
 
 def initial_squared_distance(rays: TriangleTree, x: Vec3) -> Real:
-    """The squared distance from x to a vertex of a triangle nearby, rounded up: walks that begin
-    with it skip most boxes."""
+    """The squared distance from x to a vertex of a triangle nearby, rounded up: an upper bound that
+    lets a walk skip most boxes from its start."""
     square, pad = squared_distance_in_nearby_leaf(rays.tree, x, 0), _pad(rays, x)
     return square + 2 * pad * (dr.sqrt(square) + pad)
 
 
 def squared_distance_in_nearby_leaf(tree: PackedTree, x: Vec3, column: int) -> Real:
-    """The least squared distance from x to the points of a leaf nearby.
+    """The smallest squared distance from x to the points of a leaf nearby: the leaf that is reached
+    from the root by always entering the child whose box has the nearest center.
 
-    The leaf is found from the root on by the child whose box has the nearest center.
-
-    column: where in a record the coordinates of its point begin.
+    column: the column of a record at which the coordinates of its point begin.
     """
     backend = tree.backend
     real, index, vector = backend.Float, backend.UInt32, backend.Array3f
@@ -230,10 +230,10 @@ def squared_distance_in_nearby_leaf(tree: PackedTree, x: Vec3, column: int) -> R
 def next_closest_triangle(
     rays: TriangleTree, x: Vec3, after: tuple[Real, Any], limit: Real, active: Mask
 ) -> ClosestTriangle:
-    """The first triangle behind `after` = (squared distance, number), nearer than `limit`.
+    """The next triangle after `after` = (squared distance, number) that is nearer than `limit`.
 
-    Triangles are ordered by (squared distance, number), so that each comes up once; from
-    (-1, NO_TRIANGLE) on, all do. limit: a squared distance.
+    Triangles are ordered by (squared distance, number). Starting with (-1, NO_TRIANGLE), repeated
+    calls visit each triangle once. limit: a squared distance.
     """
     backend = rays.tree.backend
     real, index, vector = backend.Float, backend.UInt32, backend.Array3f
@@ -352,7 +352,7 @@ class ClosestPointOnTriangle:
 
 
 def _project_on_edge(v: Vec3, e: Vec3, inverse: Real) -> tuple[Real, Vec3]:
-    """share and rest of v = share e + rest, with the rest orthogonal to e, even if it is short;
+    """The coefficient t and the rest r of v = t e + r, with r orthogonal to e, even if e is short;
     inverse = 1/|e|^2."""
     vector = cast("Any", type(v))
     share = dr.dot(v, e) * inverse
@@ -384,8 +384,8 @@ def squared_distance_to_segment(a: Vec3, e: Vec3, inverse: Real) -> Real:
 
 
 def jump_sum_within(rays: TriangleTree, x: Vec3, distance: Real, active: Mask = True) -> Real:
-    """The sum of the sizes of the winding number's jumps across triangles within a distance of
-    x."""
+    """The sum of the absolute values of the jumps of the winding number across triangles within a
+    distance of x."""
     real, vector = rays.tree.backend.Float, rays.tree.backend.Array3f
     x, distance = vector(x), real(distance)
     reach, inside = distance * distance, _distance_test(rays, x, distance)

@@ -1,15 +1,16 @@
-"""Cells of a box that are proved empty or not: octrees, uniform grids, and components of cells.
+"""Cells of a box that are proved empty, and the others: octrees, uniform grids, and connected
+components of cells.
 
 - `RefinedCells`, from `refine_cells` and `nonempty_cells`: a box split where it is not proved
   empty.
-- `EmptySpaceGrid`: equal cubes on a backend, and how far a ray stays among the empty ones.
-- `OccupancyGrid`: such a grid of the cells that may hold a set of points, made by an octree.
+- `EmptySpaceGrid`: equal cubes on a backend, and the length for which a ray stays in empty cubes.
+- `OccupancyGrid`: such a grid of the cells that may contain a set of points, computed by an octree.
 - `largest_connected_component`: the largest group of cells that cells proved empty separate from
   the others.
 
-Components are groups of cells: cells that are not proved empty, joined by faces, edges and corners,
-and those of all groups but one count as empty for the march. A trial point that lies in one of them
-is not looked at, so that nothing else is hit.
+A component is a group of cells that are not proved empty, connected by faces, edges and corners. If
+a single group is chosen, the march treats the cells of all others as empty. A trial point in such a
+cell is not sampled, so that nothing else is hit.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ _OCTANTS = np.array(list(itertools.product((0.0, 1.0), repeat=3)))
 
 @dataclass(frozen=True)
 class BoxCells:
-    """Equal boxes: lower corners (n, 3), and the size (3,) of all."""
+    """Boxes of equal size: their lower corners (n, 3), and the size (3,) of each."""
 
     corners: FloatArray
     size: FloatArray
@@ -72,12 +73,12 @@ class BoxCells:
         return 0.5 * float(np.linalg.norm(self.size))
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
-        """The least and the largest coordinates (3,) of all boxes."""
+        """The lower and the upper corner (3,) of the box around all boxes."""
         return self.corners.min(axis=0), self.corners.max(axis=0) + self.size
 
     def bounding_kdop(self, slack: float) -> ConvexHull:
-        """A polytope around all boxes, `slack` thicker, whose normals are the 26 directions of a
-        cube's faces, edges and corners."""
+        """The polytope around all boxes, enlarged by `slack`, whose normals are the 26 directions
+        of a cube's faces, edges and corners (a k-DOP)."""
         return _kdop_of_boxes(self.centers, 0.5 * self.size + slack)
 
     def octants(self) -> BoxCells:
@@ -86,7 +87,7 @@ class BoxCells:
         return BoxCells((self.corners[:, None] + _OCTANTS * half).reshape(-1, 3), half)
 
     def subset(self, which: BoolArray) -> BoxCells:
-        """Those chosen by a mask (n,)."""
+        """The boxes where a mask (n,) is set."""
         return BoxCells(self.corners[which], self.size)
 
     def is_proved_empty(self, clearance: Clearance, margin: float = 0.0) -> BoolArray:
@@ -98,13 +99,14 @@ class BoxCells:
 
 
 def kdop_of_points(points: FloatArray, slack: float) -> ConvexHull:
-    """A polytope around points (n, 3), `slack` thicker, with the normals of
+    """The polytope around points (n, 3), enlarged by `slack`, with the normals of
     `BoxCells.bounding_kdop`."""
     return _kdop_of_boxes(points, np.full(3, slack))
 
 
 def merge_kdops(one: ConvexHull, other: ConvexHull) -> ConvexHull:
-    """The smallest polytope with the normals of `BoxCells.bounding_kdop` around two such."""
+    """The smallest polytope with the normals of `BoxCells.bounding_kdop` that contains two such
+    polytopes."""
     return ConvexHull(
         one.normals,
         np.maximum(one.offsets, other.offsets),
@@ -125,8 +127,9 @@ def _kdop_of_boxes(centers: FloatArray, half: FloatArray) -> ConvexHull:
 class RefinedCells:
     """Cells that fill a box.
 
-    occupied: those of the finest size, which may hold the set.
-    empty: those proved empty, coarsest first.
+    occupied: the cells of the finest size that are not proved empty: they may contain points of the
+        set.
+    empty: the cells that are proved empty, coarsest first.
     """
 
     occupied: BoxCells
@@ -140,10 +143,11 @@ def refine_cells(
     max_rounds: int,
     margin: float = 0.0,
 ) -> RefinedCells:
-    """Split `cells`, again and again, where they are not proved empty.
+    """Split `cells` repeatedly into octants where they are not proved empty.
 
-    max_cells_per_round: cells tested in one round; a round that would test more is not made.
-    max_rounds: rounds at most; each halves the edges.
+    max_cells_per_round: the largest number of cells tested in a round; refinement stops before a
+        round that would test more.
+    max_rounds: the largest number of rounds; each halves the edges.
     margin: as for `BoxCells.is_proved_empty`.
     """
     empty: list[BoxCells] = []
@@ -160,7 +164,11 @@ def refine_cells(
 def nonempty_cells(
     lower: FloatArray, upper: FloatArray, clearance: Clearance, most: int, finest: int
 ) -> BoxCells:
-    """The leaves of the octree of one box; none if all of it is proved empty."""
+    """The leaves of the octree of a box that are not proved empty; there are none if all of the box
+    is proved empty.
+
+    most: the largest number of cells tested in a round. finest: the largest number of rounds.
+    """
     root = BoxCells(np.array(lower)[None], np.array(upper) - np.array(lower))
     return refine_cells(root, clearance, most, finest).occupied
 
@@ -269,8 +277,8 @@ class EmptySpaceGrid:
     def end_of_empty_run(self, o: Vec3, d: Vec3, t: Real, end: Real) -> Real:
         """A t, at most `end`, up to which rays o + t d, |d| = 1, stay in empty cells from `t` on.
 
-        It is `t` itself where coordinates are so large that rounding might lead into another cell:
-        a point is off by at most four roundings of the largest number in it.
+        It is `t` itself where coordinates are so large that rounding might move a point into
+        another cell: a point is off by at most four roundings of its largest coordinate.
         """
         length = dr.select(self.is_resolved(o, end), end - t, 0)
         run = self.empty_run(dr.fma(type(o)(t), d, o), d, length)
@@ -325,8 +333,8 @@ def distance_to_occupied(empty: BoolArray) -> IntArray:
 
 
 def round_to_short_float(size: float) -> float:
-    """A length near `cell_size`, off by at most one part in 4,096, that is a power of two times an
-    integer below 2^13, so that single precision holds its multiples exactly."""
+    """A length near `size`, off by at most one part in 4,096, that is a power of two times an
+    integer below 2^13, so that single precision represents its multiples exactly."""
     mantissa, exponent = math.frexp(size)
     return math.ldexp(round(mantissa * 4096), exponent - 12)
 
@@ -372,7 +380,7 @@ class OccupancyGrid(GridData):
 
     @classmethod
     def empty(cls) -> OccupancyGrid:
-        """A grid around the empty set: one cell, and all is empty."""
+        """The grid of the empty set: a single cell, which is empty."""
         return cls(np.zeros(3), 1.0, (1, 1, 1), distance_to_occupied(np.ones((1, 1, 1), np.bool_)))
 
     def occupied_centers(self) -> FloatArray:
@@ -382,7 +390,7 @@ class OccupancyGrid(GridData):
         return self.origin + self.cell_size * (places + 0.5)
 
     def refined(self, clearance: Clearance) -> OccupancyGrid:
-        """The same grid in which cells count as empty as well if their eight octants are proved
+        """The same grid, in which a cell also counts as empty if its eight octants are proved
         empty, with the same margin around the cell."""
         x, y, z = self.shape
         full = (self.empty_distance == 0).reshape(z, y, x)
@@ -403,28 +411,27 @@ _NEIGHBOR_STENCIL = np.ones((3, 3, 3), np.bool_)
 
 
 def largest_connected_component(cells: OccupancyGrid) -> OccupancyGrid:
-    """The grid in which only the cells of one connected group are not empty: that with the largest
-    projections, in all, along the three axes.
+    """The grid in which only the cells of a single connected group are occupied: the group with the
+    largest sum of its projections along the three axes.
 
-    A projection counts the rows of cells, along one axis, that have a cell of the group. The number
-    of cells would measure areas, or volumes, only if as many cells were left around each piece of a
-    surface: but more are left where its function vanishes to a higher order, and around the two
-    sides of a plate thinner than a cell no more than around one. Projections do not depend on that,
-    but for the cells at their outlines: there are several more where a function vanishes to a
-        higher
-    order, so that with coarse cells a smaller component may be chosen for it. Of equal groups the
-    first along z, y and x is chosen.
+    A projection counts the rows of cells, along an axis, that contain a cell of the group. The
+    number of cells would measure areas, or volumes, only if each piece of a surface was surrounded
+    by as many occupied cells: but there are more where its function vanishes to a higher order, and
+    around the two sides of a plate thinner than a cell no more than around a single side.
+    Projections do not depend on that, but for the cells at their outlines: there are several more
+    where a function vanishes to a higher order, so that with coarse cells a smaller component may
+    be chosen for it. Of equal groups the first along z, y and x is chosen.
 
-    Proof that no component of the set is cut in two. All of the set lies in cells that are not
-    empty, as closed cubes. A connected part of it cannot be covered by two unions of such cubes
-    that are closed and have no point in common; cubes have a point in common if they share at least
-    a corner, that is, if they are neighbors. So it lies in the cells of one group.
+    Proof that no component of the set is cut in two. All of the set lies in occupied cells, as
+    closed cubes. A connected part of it cannot be covered by two unions of such cubes that are
+    closed and have no point in common; cubes have a point in common if they share at least a
+    corner, that is, if they are neighbors. So it lies in the cells of a single group.
 
     Proof that rays may jump across the other groups, with the margin that
     `EmptySpaceGrid.empty_run` goes beyond the cells that it jumps across. A neighbor of a cell of
     another group belongs to that group or was empty before, and the margin is less than a cell, so
-    the margin holds nothing of this group; the margin of a cell that was empty before holds nothing
-    of the set at all.
+    the margin contains nothing of the chosen group; the margin of a cell that was empty before
+    contains nothing of the set at all.
     """
     x, y, z = cells.shape
     full = (cells.empty_distance == 0).reshape(z, y, x)

@@ -1,7 +1,9 @@
-"""Triangles cut where they pass through each other, and the jumps of the winding number at them.
+"""Triangles cut where they pass through each other, and the jumps of the winding number across
+them.
 
-A closed mesh that crosses itself bounds the points of a winding number above 1/2 by parts of its
-triangles: each triangle is inside or on the boundary as a whole once it is cut along the others.
+The set of points whose winding number is above 1/2, for a closed mesh that crosses itself, is
+bounded by parts of the mesh's triangles. If each triangle is cut along the others, every piece is
+inside of the set or on its boundary as a whole.
 """
 
 from __future__ import annotations
@@ -77,9 +79,9 @@ def separates_levels(
 def winding_numbers_of_sides(
     rays: TriangleTree, pieces: FloatArray, barycentric: tuple[float, float, float] = _CENTROID
 ) -> tuple[FloatArray, FloatArray]:
-    """(k,), (k,): the smaller and the larger of the winding numbers on both sides of triangles.
+    """(k,), (k,): the smaller and the larger of the winding numbers on the two sides of triangles.
 
-    barycentric: barycentric coordinates of the place; by default the center.
+    barycentric: the barycentric coordinates of the point of the triangle; by default its center.
     """
     front, back = windings_of_sides(rays, pieces, barycentric)
     return np.minimum(front, back), np.maximum(front, back)
@@ -88,11 +90,11 @@ def winding_numbers_of_sides(
 def windings_of_sides(
     rays: TriangleTree, pieces: FloatArray, shares: tuple[float, float, float] = _CENTROID
 ) -> tuple[FloatArray, FloatArray]:
-    """(k,), (k,): the winding numbers in front of triangles, whence they are seen to run
+    """(k,), (k,): the winding numbers in front of triangles, the side from which they run
     counter-clockwise, and behind them.
 
-    A ray along the normal of each counts the crossings ahead of a place in it, and those ahead of a
-    place just behind it: with that, triangles in the same place are passed all at once.
+    A ray along the normal of each counts the crossings ahead of a point of the triangle, and those
+    ahead of a point just behind it: so the triangles in the same place are passed all at once.
     """
     backend = rays.tree.backend
     a, b, c = np.moveaxis(pieces, 1, 0)
@@ -184,11 +186,11 @@ def _next_foreign_crossing(
 
 
 def _cut_up(pieces: FloatArray, rows: IntArray, knives: FloatArray) -> tuple[FloatArray, IntArray]:
-    """The parts of triangles (n, 3, 3) whose entries `rows` (k,) are cut by the planes of knives
-    (k, 3, 3); and the triangle that each is of.
+    """The pieces of triangles (n, 3, 3) whose entries `rows` (k,) are cut by the planes of knives
+    (k, 3, 3); and the triangle that each is a piece of.
 
-    In each round every piece is cut by one of those knives that meet it, in the middle of its list,
-    and its parts share the rest: so their number falls by about half.
+    In each round every piece is cut by a knife that meets it, the middle of its list, and its parts
+    share the remaining knives: so their number falls by about half.
     """
     done: list[FloatArray] = []
     owners: list[IntArray] = []
