@@ -98,8 +98,9 @@ class ClosestPointDescent:
         f(y), in one kernel, from a point `start` near the surface.
 
         Returns y, to which `finish` adds the last step; the first-order distance of `start` from
-        the level; whether a step was longer than half the radius in which f is smooth; and whether
-        y will be farther from x than `limit`. After the latter two the search was given up.
+        the level; whether the last step was longer than half the radius in which f is smooth, so
+        that y is no result; and whether y will be farther from x than `limit`, where the iteration
+        stops.
 
         Each step combines the step of `descend` along the surface, which follows its curvature,
         with a Newton step to the level; both are from derivatives at the same point. Convergence is

@@ -145,7 +145,7 @@ class Shells:
         return cls(number, volumes, lower, upper, corners)
 
     def winding_number(self, around: Any, part: Any) -> float:
-        """The winding number of the component `part` at a point of the component `around`."""
+        """The winding number of the component `around` at a point of the component `part`."""
         point = self.corners[np.argmax(self.component_of_face == part)].mean(axis=0)
         return winding_around(self.corners[self.component_of_face == around], point)
 

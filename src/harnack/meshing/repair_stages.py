@@ -116,8 +116,8 @@ def repair(
     warning. That is sampled: what differs in less than a thousandth of the box may not be seen.
 
     mesh: anything with `vertices` (n, 3) and `faces` (m, 3).
-    keep: "all" does the first stage or raises an error, "valid" the second one, "none" the last;
-        None tries all of them, up to the first that succeeds.
+    keep: "all" does only the stage "filled", "valid" only "cleaned", and "none" only "remeshed",
+        or raises an error; None tries all five, up to the first that succeeds.
     filling: "smooth" hole fillings continue the surface around each hole, with its tangents, and
         bend least. They are computed hole by hole, and used where w is within 0.36 of 1/2 modulo 1
         on them; other holes get "harmonic" fillings, on which w is 1/2 modulo 1: these join the
@@ -141,33 +141,35 @@ def repair(
         input (share of the points on the wrong side, places of some, how many are missing and
         added, and volumes of both); and the Euler characteristic.
 
-        Unless all was made anew there are also holes (loops of edges that were open), patches
-        (triangles added) and harmonic (how many of these are harmonic). Vertices and faces that
-        were given come first, bit by bit and in their order: all of them if all was kept and
-        nothing dropped, else those that are in use. Patches meet no other triangle but at the edges
-        and corners that they share, decided exactly.
+        After "filled", "cleaned" and "welded" there are also holes (how many loops of boundary
+        edges there were), patches (how many triangles were added) and harmonic (how many of these
+        are harmonic). After "filled" and "cleaned" the input's vertices and faces come first, bit
+        by bit and in their order: all of them if all were kept and nothing was dropped, else those
+        that are in use. Fillings meet other triangles only at shared edges and vertices, decided
+        exactly.
 
-        If all was kept: missing (how many patches are the triangles of holes of three edges),
-        refined (whether harmonic patches are within the tolerance: they stay as the cells cut them
-        if finer ones would pass through each other), spacing and evaluations of these. A closed
-        mesh gets nothing added; unless keep is "all", it is only returned if no triangles pass
-        through each other.
+        After "filled": missing (how many patches are single triangles that fill holes of three
+        edges), refined (whether harmonic fillings are within the tolerance: they stay as the cells
+        cut them if finer ones would intersect each other), spacing and evaluations of these.
+        Nothing is added to a closed mesh; unless keep is "all", it is only returned if it does not
+        intersect itself.
 
-        If it was united, kept is 0: triangles that were not cut lie where they were, but may be
-        divided otherwise.
+        After "boolean_union", kept is 0: triangles that were not cut lie where they were, but may
+        be divided otherwise.
 
-        If what was sound was kept: turned (how many triangles were turned over) and left_out, a
-        dictionary: how many were "flat" (without an area), "doubled", "crossing", "branching" (at
-        edges of more than two), "one-sided" (at edges where no two sides can be told), "around"
-        holes that could not be filled or "inside" the material of other parts. Vertices at one
-        place are joined. No triangles pass through each other, and no part is inside out.
+        After "cleaned": turned (how many triangles were flipped) and left_out, a dictionary of how
+        many were removed because they were "flat" (without an area), "doubled", "crossing",
+        "branching" (at edges of more than two), "one-sided" (at edges where the surface has no two
+        sides), "around" holes that could not be filled or "inside" the material of other
+        components. Vertices at the same position are merged. No triangles intersect, and no
+        component is inside out.
 
-        If corners were joined: the same, and joined (how many of the given triangles are there,
-        with moved corners) and moved (how far the farthest corner went, a length); kept is 0. A
-        warning says so where that is more than two tolerances.
+        After "welded": the same, and joined (how many of the input triangles are there, with moved
+        vertices) and moved (how far the farthest vertex was moved, a length); kept is 0. A warning
+        says so where that is more than two tolerances.
 
-        If all was made anew, no triangles pass through each other, and there is what `mesh` says of
-        meshes by signs, such as far and within; kept is 0.
+        After "remeshed", no triangles intersect, and there are the facts of `mesh` about meshes by
+        signs, such as far and within; kept is 0.
 
     Raises:
         MeshError: a ValueError, for a mesh that has no triangles, or numbers that are none; one

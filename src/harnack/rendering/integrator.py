@@ -4,7 +4,7 @@ Light paths are traced in waves (vertex by vertex), and their rays from a queue.
 over whole paths, each packet of lanes would wait for its slowest ray at each vertex: three quarters
 of the lanes were idle. Paths that have ended are left out between vertices, and a lane that has
 finished a ray fetches the next. Any ray march can be queued (`surface_tracer`), as its state is a
-record; `trace` does so with many rays whose neighbors differ, and neither does with fields whose
+record; `trace` does so with many rays whose neighbors differ. No rays are queued for fields whose
 samples take less time than fetching a ray (`Field.is_cheap`). Only the order of lanes changes.
 Intermediate results lie in memory of their own, so that kernels do not depend on how many paths are
 left.

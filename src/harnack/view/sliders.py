@@ -64,8 +64,8 @@ class Slider:
             raise ValueError(f"start must lie between {self.low} and {self.high}: {self.start}")
 
     def nearest(self, number: float) -> float:
-        """The place that is nearest to a number, and not above it between two steps; the number as
-        it is where only rounding lies between."""
+        """The value of the slider at or below a number, within its ends; the number as it is where
+        only rounding lies between, or where the slider has no step."""
         number = min(max(number, self.low), self.high)
         if self.step is None:
             return number
