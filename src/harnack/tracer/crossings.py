@@ -1,8 +1,7 @@
 """All crossings of rays with level sets: `trace(..., all_hits=k)`.
 
-`find_crossings` finds them one after the other while a kernel is recorded; `RayCrossings` is what
-users
-get: NumPy in, NumPy out; Dr.Jit stays Dr.Jit.
+`find_crossings` finds them one after the other while a kernel is recorded. `RayCrossings` is the
+result for users: NumPy arrays for NumPy rays, Dr.Jit arrays for Dr.Jit rays.
 """
 
 from __future__ import annotations

@@ -205,8 +205,8 @@ def beyond(
     may have put p behind the level, and from the nearest place half of `reach` along each axis.
     Ranges around p are no proof: they hold numbers that are no values of f, and so do those beside
     a jump: f is at the level up to rounding only where it is continuous on a box that is many times
-    as large as this rounding. Where the level is not
-    found nothing is proved: the ray goes on, and comes nearer if it meets the surface.
+    as large as this rounding. If the level is not found, nothing is proved: the ray goes on, and
+    comes nearer if it meets the surface.
     """
     epsilon = float(dr.epsilon(backend.Float))
     finest = 4 * epsilon * reach

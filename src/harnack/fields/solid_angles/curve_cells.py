@@ -1,21 +1,22 @@
-"""Cells in which the solid angle of a curve is that of a few near edges and one polynomial.
+"""FMM cells of curves: in each cell, the solid angle of a curve is the sum over a few near edges
+and a local expansion, a harmonic polynomial, of all other edges.
 
-A cube around the curve is an octree of cells. In each cell that is not split, the edges within
-three radii of its ball from its center are in runs that one more vertex closes to loops
-(`edge_runs`), and the solid angle of all that is left is one harmonic polynomial
-(`edge_expansion`). So a sample costs what is near, whatever the number of edges.
-`curve_cell_builder` makes the cells.
+The cells are the leaves of an octree over a cube around the curve. The near edges of a cell are the
+edges within three radii of its ball from its center. So the cost of a sample depends on the near
+edges only, and not on the number of all edges. `curve_cell_builder` builds the cells.
 
-Near edges are in runs, each
-closed to a loop by one vertex beyond them (`edge_runs`), since an open run has no solid angle; what
-is left is a cycle far away, whose solid angle is single-valued in the cell, and one harmonic
-polynomial. Each far edge gives a harmonic function by itself, the part of Biot and Savart's field
-along the line to the center (`edge_expansion`), so that remainders are proved edge by edge and no
-fit aliases. A cell adds what was near to the cell around it and is far from its own ball. Closing
-edges count in values and not in promises, which are about the curve. Detail 1 is the cells', more
-is the sum over all edges: cells are so small that fewer than one sample in a hundred needs it, as
-one lane that sums up all edges holds up its packet. Extents of curves with cells have few planes:
-with 1,024 vertices, clipping at the hull took three times as long as the march.
+An open run of near edges has no solid angle, so each run is closed to a loop by a further vertex
+beyond its ends (`edge_runs`). The remaining edges then form a cycle far away, whose solid angle is
+single-valued in the cell. Each far edge by itself gives a harmonic function, the part of Biot and
+Savart's field along the line to the center (`edge_expansion`), so that remainders are proved edge
+by edge and no fit aliases. A cell adds, to the expansion of its parent, the edges that were near to
+the parent and are far from its own ball. Closing edges count in values and not in promises, which
+are about the curve.
+
+Accuracy scale 1 is that of the cells; above it all edges are summed. Cells are so small that fewer
+than one sample in a hundred needs that sum, because a lane that sums over all edges delays its
+packet. Extents of curves with cells have few planes: with 1,024 vertices, clipping at the hull took
+three times as long as the march.
 """
 
 from __future__ import annotations

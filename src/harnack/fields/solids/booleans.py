@@ -195,17 +195,17 @@ class BooleanSolid(Solid):
     def _combine_samples(
         self, samples: list[Sample], size: Real
     ) -> tuple[Sample, list[tuple[Real, Real]], Real]:
-        """The sample of the combination; for each part the least and the most that it is below the
-        greatest; and the greatest (for a union, the least) of the values.
+        """The sample of the combination; for each operand bounds (lower, upper) of the difference
+        by which it is below the greatest operand; and the greatest (for a union, the least) value.
 
         Proof of the errors. Let v_i be values with errors e_i (all rounding, `value_error_bound`),
         v = v_k the greatest. max f_i <= max(v_i + e_i) = v + max(e_i - (v - v_i)), and max f_i >=
         v_k - e_k. So max(e_i - (v - v_i)) is the error of the combination. As max f_i >= v_j - e_j
-        for every j,
-        a part that is known better may exclude most of that range: then the value is the middle of
-        the rest, for else a ray would hit, by the rounding of one part, a surface that lies inside
-        of another part. The tracer subtracts the error of the combination from its gaps; where that
-        of a part is larger, the difference is subtracted from how far the part is below.
+        for every j, an operand with a smaller error may exclude most of that range. Then the value
+        is the middle of the remaining range, for otherwise a ray would hit, by the rounding of an
+        operand, a surface that lies inside of another operand. The tracer subtracts the error of
+        the combination from its gaps. If the error of an operand is larger, the excess is
+        subtracted from the difference by which the operand is below.
         """
         sign = -1.0 if self.is_union else 1.0
         values = [sign * one.value for one in samples]

@@ -157,8 +157,8 @@ class Taper(Deformation):
     Proof of `preimage_lipschitz`. The derivative of the inverse acts on the radial and the axial
     direction as [[k, m], [0, 1]], k = 1/r, m = rho |r'|/r^2 at the distance rho from the axis, and
     on the third as k. Its largest singular value has sigma^2 = (S + sqrt(S^2 - 4 k^2))/2, S = k^2 +
-    m^2 + 1,
-    which grows with k and m: here their largest values. (Hart's equation 49 has min 1/r.)
+    m^2 + 1, which grows with k and m: here k and m have their largest values. (Hart's equation 49
+    has min 1/r.)
     """
 
     start: tuple[Any, Any]
