@@ -1,4 +1,4 @@
-"""The bound for functions that are not harmonic but have a bounded Laplacian.
+"""An enclosure of functions that are not harmonic but have a bounded Laplacian.
 
 The talk on Gillespie, Yang, Botsch, Crane 2024 names it as future work; the proof below and its
 constant are new in harnack.
@@ -100,8 +100,8 @@ class BoundedLaplacianEnclosure(Enclosure):
         laplacian: tuple[Real, Real],
         slopes: SlopeRange,
     ) -> Self:
-        """The enclosure of an f that may move so far, down and up, with these ends of its
-        Laplacian."""
+        """The enclosure of a function that may fall and rise by the two `ranges` in the ball, with
+        these bounds (lower, upper) of its Laplacian."""
         half = 0.5 * radius * radius
         low, high = half * laplacian[0], half * laplacian[1]
         mean, spread = low + high, high - low

@@ -147,10 +147,11 @@ class Enclosure(abc.ABC):
     def from_promise(
         cls, promise: Promise, value: Real, error: Real, slopes: SlopeRange
     ) -> Self | None:
-        """The enclosure that this proof makes of a promise; None if it uses no promise of that
-        kind.
+        """The enclosure that this class proves from a promise; None if it does not use promises of
+        that kind.
 
-        value: f at the sample, known up to `error`. slopes: of f along the path.
+        value: f at the sample, known up to `error`.
+        slopes: of f along the path, at the sample.
         """
         del promise, value, error, slopes
         return None
@@ -159,9 +160,11 @@ class Enclosure(abc.ABC):
     def from_restriction(
         cls, function: PathRestriction, slopes: SlopeRange, length: Real
     ) -> Self | None:
-        """The enclosure that this proof makes of ranges of f along the path; None if it uses none.
+        """The enclosure that this class proves from ranges of the derivatives of f along the path;
+        None if it does not use ranges.
 
-        length: how far it should reach. slopes: of f along the path, where it starts.
+        length: the reach that is asked for.
+        slopes: of f along the path, at its start.
         """
         del function, slopes, length
         return None
@@ -182,11 +185,11 @@ class Enclosure(abc.ABC):
 
 @dataclass(frozen=True)
 class Levels:
-    """A finite set of target levels, repeated with `period` if there is one.
+    """A finite set of levels, repeated with `period` if there is one.
 
-    An angle-valued function is known modulo its period, so its levels form a ladder: every level
-    that was asked for plus every multiple of the period (paper, Alg. 2, with the reduction that the
-    printed algorithm leaves out: both bracketing levels are found from the reduced difference).
+    An angle-valued function is known modulo its period. Its levels are then periodic: each of the
+    values plus every multiple of the period (paper, Alg. 2, with the reduction that the printed
+    algorithm omits: both neighboring levels are computed from the reduced difference).
 
     values: Python floats, or Dr.Jit arrays of size 1 of the backend in use (so that a level can
         change without a kernel being compiled again, or carry derivatives).
@@ -196,10 +199,11 @@ class Levels:
     period: float | None = None
 
     def gaps(self, f: Real) -> LevelGaps:
-        """Distances in value from f to the next level below and above.
+        """The differences in value between f and the next level below and above.
 
-        Either is infinite when there is no such level. A value on a level has a gap of zero on one
-        side and, for a ladder, one of at most a period on the other. Gaps of NaN are NaN.
+        Either is infinite if there is no such level. If f is a level, the gap on one side is zero,
+        and with a period the gap on the other is at most the period. Where f is NaN, the gaps are
+        NaN.
         """
         down: Real = math.inf
         up: Real = math.inf

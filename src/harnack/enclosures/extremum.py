@@ -71,7 +71,7 @@ class MaximumEnclosure(Enclosure):
         return (up | (gaps.above == dr.inf)) & down
 
     def _reach(self, none: Real) -> Real:
-        """How far the enclosures of all parts reach, if there is no level."""
+        """The reach of the enclosures of all operands, if there is no level."""
         reach = none
         for part in self.operands:
             reach = fmin(longest_free_length(part.enclosures, LevelGaps(none, none)), reach)
@@ -79,7 +79,8 @@ class MaximumEnclosure(Enclosure):
 
     @staticmethod
     def _gaps(gaps: LevelGaps, part: MaximumOperand) -> tuple[LevelGaps, LevelGaps]:
-        """How far the part must rise, or fall, for the greatest to meet a level."""
+        """How far an operand must rise, and how far it must fall, for the maximum to meet a
+        level."""
         none = type(gaps.above)(dr.inf)
         return (
             LevelGaps(none, gaps.above + part.min_deficit, is_one_sided=True),

@@ -119,10 +119,11 @@ _RADIUS_SAFETY = 1.0 - 1e-6
 
 @dataclass(frozen=True)
 class HarmonicBallEnclosure(Enclosure):
-    """f is harmonic on B(p, radius) of R^dimension and moves there by less than the two ranges.
+    """Base of enclosures of a harmonic f on B(p, radius) of R^dimension that falls and rises there
+    by less than two bounds.
 
-    max_fall, max_rise: f - lower and upper - f, how far the promise lets f move, so that
-        bounds never subtract two large numbers. None for a side that is not bounded.
+    max_fall, max_rise: f - lower and upper - f at p, so that two large numbers are never
+        subtracted. None for a side that is not bounded.
     """
 
     radius: Real
@@ -160,11 +161,12 @@ class HarmonicBallEnclosure(Enclosure):
 def allowed_movement(
     promise: HarmonicBall | BoundedLaplacian, value: Real, error: Real
 ) -> tuple[Real, Real | None, Real | None]:
-    """Radius, and how far the promise lets f move down and up (None: that side is not bounded).
+    """The radius of a promise, and how far it lets f fall and rise (None: that side is not
+    bounded).
 
-    The ends of the promise are moved outwards by the error and eight units in the last place of f:
-    a promise that leaves f no range, but for rounding, would otherwise prove f constant. A radius
-    that is not a positive number, or a NaN anywhere, proves nothing (radius 0).
+    The ends of the promise are moved outwards by the error and by eight units in the last place of
+    f: if the two ends are equal up to rounding, the promise would otherwise prove f constant. A
+    radius that is not a positive number, or a NaN anywhere, proves nothing (radius 0).
     """
     unit = 2 * float(dr.epsilon(type(value)))  # Dr.Jit's is half the distance to the next number
     total_error = dr.fma(8 * unit, dr.abs(value), error)

@@ -1,4 +1,4 @@
-"""What is promised of the branches of a Riemann surface, sampled."""
+"""Contracts of the branches of a Riemann surface, tested by sampling."""
 
 from __future__ import annotations
 

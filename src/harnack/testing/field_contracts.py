@@ -245,8 +245,8 @@ def _check_numbers(field: Field, points: FloatArray, look: FieldSamples) -> None
 
 
 def _check_rounding(field: Field, points: FloatArray) -> None:
-    """In single precision the value is off by at most `error`, eight units in its last place, and
-    what the rounding of the point does."""
+    """Check that in single precision the value is off by at most `error`, eight units in its last
+    place, and the effect of rounding the point."""
     single = points.astype(np.float32).astype(np.float64)
     if field.domain is not None:
         single = single[field.domain.contains_points(single)]

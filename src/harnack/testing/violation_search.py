@@ -1,4 +1,5 @@
-"""Fields sampled as NumPy arrays, the worst places of promises, and reports of broken ones."""
+"""Fields sampled as NumPy arrays, the search for violations of promises, and the errors that report
+them."""
 
 from __future__ import annotations
 
@@ -34,7 +35,8 @@ __all__ = [
 
 
 class BrokenPromiseError(AssertionError):
-    """A field or a bound promised something that is not true; the message says what and where."""
+    """A field or an enclosure promised something that is not true; the message says which promise,
+    and where."""
 
 
 def require(
@@ -44,10 +46,10 @@ def require(
     amount: FloatArray | None = None,
     there: FloatArray | None = None,
 ) -> None:
-    """Raise BrokenPromiseError for the worst of the points (n, 3) that are not good (n,).
+    """Raise BrokenPromiseError for the worst of the points (n, 3) at which `good` (n,) is false.
 
-    amount: (n,) how wrong.
-    there: (n, 3) where it shows, if not at the point.
+    amount: (n,) the size of the violation.
+    there: (n, 3) the points where it shows, if not at the points themselves.
     """
     broken: BoolArray = ~np.asarray(good, dtype=np.bool_)
     bad = np.flatnonzero(broken)
@@ -62,8 +64,9 @@ def require(
 
 
 def mutated_enclosure(kind: type[Enclosure], factor: float, *, covers: float | None = None) -> Any:
-    """A proof made wrong on purpose, as a test suite that accepts it is worth nothing: with every
-    step multiplied by `factor`, and every length that it covers by `covers` (None: by the same)."""
+    """A class of enclosures that is wrong on purpose, to test that the tests detect it: every free
+    length is multiplied by `factor`, and every length that `is_free` accepts by `covers` (None: by
+    the same factor)."""
     loose = factor if covers is None else covers
     base: Any = kind
 
@@ -83,7 +86,7 @@ def mutated_enclosure(kind: type[Enclosure], factor: float, *, covers: float | N
 
 
 def original_enclosure(kind: type[Enclosure]) -> type[Enclosure]:
-    """The proof that `mutated_enclosure` was given; any other as it is."""
+    """The class from which `mutated_enclosure` derived a class; any other class itself."""
     return getattr(kind, "original", kind)
 
 
@@ -101,7 +104,7 @@ class FieldSamples:
     promises: tuple[Promise, ...]
 
     def subset(self, rows: BoolArray) -> FieldSamples:
-        """The same at some of the points."""
+        """The samples at the rows given by indices or by a mask."""
         return FieldSamples(
             self.value[rows],
             self.gradient[rows],
@@ -114,9 +117,9 @@ class FieldSamples:
 def sample_field(
     field: Field, points: FloatArray, precision: Precision = "double", *, closely: bool = False
 ) -> FieldSamples:
-    """The field at points (n, 3), all numbers of its promises as float64 arrays (n,).
+    """Sample the field at points (n, 3); all numbers of its promises are float64 arrays (n,).
 
-    closely: without truncation.
+    closely: whether to sample without truncation error.
     """
     n = len(points)
     sample = _sample(field, points, precision, closely)
