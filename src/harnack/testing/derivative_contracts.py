@@ -172,8 +172,8 @@ def _spacing(points: FloatArray, look: FieldSamples) -> FloatArray:
 
 
 def _scale(points: FloatArray, look: FieldSamples) -> FloatArray:
-    """A length (n,) over which the field is smooth: the smallest radius of a promise, else the size
-    of the points."""
+    """A length (n,) over which the field is smooth: the smallest radius of its `HarmonicBall`
+    promises, at most the extent of the points."""
     size = float(np.ptp(points, axis=0).max()) or 1.0
     radii = [known.radius for known in look.promises if isinstance(known, HarmonicBall)]
     smooth = np.min([np.full(len(points), size), *radii], axis=0)

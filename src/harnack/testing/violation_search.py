@@ -95,7 +95,8 @@ def original_enclosure(kind: type[Enclosure]) -> type[Enclosure]:
 
 @dataclass(frozen=True)
 class FieldSamples:
-    """A field at n points: value (n,), gradient (n, 3), their errors and promises (n,) each."""
+    """Samples of a field at n points: values (n,), gradients (n, 3), their error bounds and the
+    promises, (n,) each."""
 
     value: FloatArray
     gradient: FloatArray
@@ -141,10 +142,10 @@ def sample_field(
 
 @dataclass(frozen=True)
 class RayLift:
-    """The continuous lift of f at m points along each of n rays, all arrays (n, m).
+    """The continuous lift of f at m points along each of n rays; all arrays are (n, m).
 
-    moved: how far the lift has moved since the ray's first point.
-    jumped: by how much f has jumped besides, across sheets.
+    moved: the movement of the lift since the ray's first point.
+    jumped: the sum of the jumps of f since then, across jump surfaces.
     gradient_norm: |grad f| at the points.
     error: `Sample.value_error` at the points.
     """
@@ -158,11 +159,12 @@ class RayLift:
 def lift_along_rays(
     field: Field, start: FloatArray, direction: FloatArray, lengths: FloatArray
 ) -> RayLift:
-    """How far the continuous lift of f moves along rays: f(start + t direction) - f(start).
+    """The movement of the continuous lift of f along rays: f(start + t direction) - f(start).
 
-    start, direction: (n, 3), unit directions. lengths: t (n, m), each row rising from 0. A value
-    known modulo the period is continued to the one that the mean of the gradients at both ends of
-    an interval predicts; jumps across sheets are taken out.
+    start, direction: (n, 3), unit directions. lengths: t (n, m), each row ascending from 0.
+
+    A value that is known modulo the period is continued to the value that the mean of the gradients
+    at both ends of an interval predicts; jumps are taken out.
     """
     n, m = lengths.shape
     points = start[:, None] + lengths[..., None] * direction[:, None]
@@ -186,8 +188,8 @@ def lift_along_rays(
 def accumulated_jumps(
     field: Field, start: FloatArray, direction: FloatArray, lengths: FloatArray
 ) -> FloatArray:
-    """By how much f has jumped (n, m) since the first of the lengths (n, m) along rays, as
-    `next_jump` says."""
+    """The sum (n, m) of the jumps of f since the first of the lengths (n, m) along rays, as
+    `next_jump` reports them."""
     total = np.zeros_like(lengths)
     if not field.has_jumps:
         return total
