@@ -104,9 +104,9 @@ def _exp(x: Interval) -> DerivativeRanges:
 
 
 def _exponential_range(f: Callable[[Any], Any], x: Interval) -> Interval:
-    """The range of an increasing function computed from 2^y, whose exponent is rounded: on CUDA it
-    is off by |x| units more. What overflows is large, so that 1/(1 + exp(x)) is known to be small.
-    """
+    """The range of an increasing function computed from 2^y, whose exponent is rounded: on CUDA the
+    result is off by |x| further units in the last place. A result that overflows is known to be
+    large, so that 1/(1 + exp(x)) is known to be small."""
     large = _OVERFLOWS * float(dr.largest(type(x.lower)))
 
     def end(v: Real, sign: int) -> Real:

@@ -1,4 +1,5 @@
-"""Edges by integer index: closed loops of them, and those at which faces of a mesh do not cancel.
+"""Edges by integer index: closed loops of edges, and the edges at which faces of a mesh do not
+cancel.
 
 At the latter the winding number is singular. Let T be the triangles of a mesh, m_T integers, and
 Omega_T(x) the signed solid angle of T seen from x. Then
@@ -6,7 +7,7 @@ Omega_T(x) the signed solid angle of T seen from x. Then
     w = 1/(4 pi) sum_T m_T Omega_T
 
 jumps by m_T across T. With its jumps removed along a ray it is smooth everywhere but on the
-*singular edges*: those whose weights, summed over the triangles around them, do not cancel.
+*singular edges*: edges whose weights, summed over the triangles around them, do not cancel.
 
 Proof. Off T, Omega_T is harmonic, and by Stokes its gradient is the integral of Biot and Savart
 along the boundary of T alone (Gillespie et al. 2024, Eq. 11, edge by edge): grad Omega_T(x) is the
@@ -16,17 +17,17 @@ with the sign with which e runs around T. Edges with n_e = 0 drop out, so G exte
 field on R^3 minus S, S the union of the others. G is curl and divergence free there by continuity,
 so around every point off S it has a local potential, and this is harmonic. The integral of G along
 a closed path off S is a multiple of 4 pi: move the path slightly so that it meets triangles in
-their interiors only; between these crossings it follows 4 pi w, and each crossing of T takes
-+-4 pi m_T. So 4 pi w mod 4 pi extends to a function on R^3 minus S that is harmonic in the
-neighborhood of each point, with values mod 4 pi. QED.
+their interiors only; between these crossings it follows 4 pi w, and each crossing of T takes +-4 pi
+m_T. So 4 pi w mod 4 pi extends to a function on R^3 minus S that is harmonic in the neighborhood of
+each point, with values mod 4 pi. QED.
 
-The n_e are the boundary of an integral chain, so at each vertex as much weight begins as ends:
-S is made of closed loops, and 4 pi w is mod 4 pi the solid angle of these loops.
+The n_e are the boundary of an integral chain, so at each vertex as much weight begins as ends: S
+consists of closed loops, and 4 pi w is mod 4 pi the solid angle of these loops.
 
-Edges are compared by integer index, after equal positions were given one index (`weld_vertices`),
-never by distance: near edges do not cancel, however near they are. Functions of arrays are linear
-but for one sort, and take about a second for a million triangles; `boundary_edges`, `join_edges`
-and `singular_loops` take one Python step an edge.
+Edges are compared by integer index, after equal positions were assigned the same index
+(`weld_vertices`), never by distance: near edges do not cancel, however near they are. Functions of
+arrays take linear time but for a sort, about a second for a million triangles; `boundary_edges`,
+`join_edges` and `singular_loops` take a Python step per edge.
 """
 
 from __future__ import annotations

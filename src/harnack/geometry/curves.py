@@ -1,8 +1,8 @@
 """Closed curves in space, polygonal loops and circles: validation and simple measures.
 
 A loop is an array (n, 3) of vertices; its last vertex is joined to its first. A curve is a tuple of
-loops, which may be knotted, linked, nested or cross each other. A circle is a closed curve that is
-stored by its center, radius and normal, not as a polygon.
+loops, which may be knotted, linked, nested or cross each other. A circle is a closed curve, too,
+given by its center, radius and normal.
 """
 
 from __future__ import annotations

@@ -79,7 +79,8 @@ def check_derivatives(field: Field, points: FloatArray, look: FieldSamples) -> N
 def _spacing_within(
     field: Field, points: FloatArray, h: FloatArray
 ) -> tuple[FloatArray, BoolArray]:
-    """Spacings with all nodes in the domain, and at which points there are such."""
+    """Spacings such that all nodes lie in the domain, and at which points there is such a
+    spacing."""
     fits = np.ones(len(points), dtype=np.bool_)
     if field.domain is None:
         return h, fits
@@ -96,11 +97,12 @@ def _spacing_within(
 
 @dataclass(frozen=True)
 class _StencilSample:
-    """The field at points + node h along an axis, for a node of the differences.
+    """The samples of the field at points + node h along an axis, for a node of the differences.
 
-    h: (n,). weight: (n,) of the node, over h; wide: the same with twice the spacing. move: (n,) of
-    the value since the points, jumps and periods taken out. error: (n,) what errors at both ends
-    may have added to it, gradient_error likewise.
+    h: (n,) the spacing.
+    weight: (n,) of the node, divided by h; wide: the same with twice the spacing.
+    move: (n,) the difference of the value to that at the points, without jumps and periods.
+    error: (n,) a bound of the errors of both values in it, gradient_error likewise.
     """
 
     axis: int
@@ -152,7 +154,7 @@ def _without_truncation(
 def _pick_spacing(
     trials: list[list[_StencilSample]], choice: npt.NDArray[np.intp]
 ) -> list[_StencilSample]:
-    """Of several spacings the one chosen at each point."""
+    """The samples at the spacing that `choice` selects for each point."""
     if len(trials) == 1:
         return trials[0]
     rows = np.arange(len(choice))
@@ -206,8 +208,8 @@ def _difference(nearby: list[_StencilSample]) -> tuple[FloatArray, FloatArray]:
 def _limits(
     field: Field, points: FloatArray, look: FieldSamples, nearby: list[_StencilSample]
 ) -> tuple[FloatArray, FloatArray]:
-    """How far differences of the value may be from the gradient (n,): what they leave out and
-    rounding, and besides what errors of value and gradient allow."""
+    """Two bounds (n,) of the difference between differences of the value and the gradient: their
+    truncation and rounding error, and the errors of value and gradient."""
     h = nearby[0].h
     allowance = look.gradient_error.copy()
     for neighbor in nearby:
@@ -279,8 +281,8 @@ def _check_laplacian(
 def _likeliest(
     tried: list[tuple[FloatArray, ...]],
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """At each point, of the two spacings at which differences tell most, the one at which they
-    agree better: how far off they are, the tolerance and the allowance, (n,) each.
+    """At each point, of the two spacings with the smallest bounds, the spacing at which they agree
+    better: the difference, the tolerance and the allowance, (n,) each.
 
     Differences across a crease may be close at one spacing by accident, and wrong.
     """

@@ -457,8 +457,8 @@ class _ViolationSearch:
 def _slope_ratio(
     known: HarmonicBall, there: FieldSamples, free: FloatArray, gap: FloatArray
 ) -> FloatArray:
-    """|grad f| at places of a ball, as a share of what a harmonic function allows there that is
-    `gap` away from the nearer end of its range.
+    """The ratio of |grad f|, at points of a ball, to the largest gradient of a harmonic function
+    whose value there is `gap` away from the nearer end of its range.
 
     Proof. At y, `free` from the border, f - lower is positive and harmonic on B(y, free), so that
     by Harnack's inequality |grad f(y)| <= n (f(y) - lower)/free; likewise upper - f. Where a

@@ -1,4 +1,4 @@
-"""Queries of trees: the boxes that a ray enters, in order, and the triangles nearest to a point."""
+"""Queries of trees: the boxes that a ray enters, in order, and the triangles closest to a point."""
 
 from __future__ import annotations
 
@@ -295,26 +295,25 @@ def _distance_test(rays: TriangleTree, x: Vec3, pad: Real) -> Any:
 
 @dataclass(frozen=True)
 class ClosestPointOnTriangle:
-    """The nearest point of a record's triangle to x.
+    """The closest point to x of a record's triangle.
 
-    squared_distance: the squared distance.
+    squared_distance: from x.
     offset: (3,) from x to the point.
     is_inner: whether the point lies inside the triangle, not on its edges.
 
-    It is the nearest point of the plane where that lies in the triangle, else that of the edges.
-    That of the plane is found along the longest edge e, from a and of length L, and along the
-    altitude h on it, made orthogonal to e twice.
+    It is the closest point of the plane if that lies in the triangle, else the closest point of the
+    edges. The closest point of the plane is computed along the longest edge e, from a and of length
+    L, and along the altitude h on it, made orthogonal to e twice.
 
     Proof that the distance is off by only a few epsilons of l = L + |x - a|, however thin the
     triangle (a cross product's direction is off by epsilon L/|h|, which for a needle is an error of
-    any size): x - a less its part along e, done twice, is right up to
-    epsilon l and orthogonal to e up to epsilon^2 l, and so is h, whose direction within the plane
-    normal to e is off by d <= epsilon L/|h|. So the point a + alpha e + s h lies off the plane by
-    at most s|h| d <= epsilon L, and off the nearest point within it by k <= epsilon l + min(d H,
-    |h|), H the distance from the plane. That lengthens H by at most k^2/(2H), where k >= epsilon l
-    counts as min(d H, |h|)^2/(2H) <= d |h|/2 <= epsilon L/2, and by k <= 3 epsilon l for H <
-    epsilon l. If the same k puts the point on the wrong side of an edge, the edges' distance or
-    the plane's is off by as much.
+    any size): x - a less its part along e, done twice, is right up to epsilon l and orthogonal to e
+    up to epsilon^2 l, and so is h, whose direction within the plane normal to e is off by d <=
+    epsilon L/|h|. So the point a + alpha e + s h lies off the plane by at most s|h| d <= epsilon L,
+    and off the closest point within it by k <= epsilon l + min(d H, |h|), H the distance from the
+    plane. That lengthens H by at most k^2/(2H), where k >= epsilon l counts as min(d H, |h|)^2/(2H)
+    <= d |h|/2 <= epsilon L/2, and by k <= 3 epsilon l for H < epsilon l. If the same k puts the
+    point on the wrong side of an edge, the edges' distance or the plane's is off by as much.
     """
 
     squared_distance: Real
