@@ -280,7 +280,7 @@ class _DaskTasks:
         not fetched."""
         ready = [one for one in self.names if one.status == "finished"]
         found: list[tuple[str, TaskResult]] = []
-        # Without a scheduler there is nobody to ask; what is raised already says so.
+        # Without a scheduler there are no results to fetch; the error that is raised says so.
         with suppress(OSError, TimeoutError, asyncio.CancelledError, self.scheduler_lost):
             self.client.cancel([one for one in self.names if one.status != "finished"])
             for one in ready:

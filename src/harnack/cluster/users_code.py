@@ -35,7 +35,7 @@ _IMPORTERS = frozenset(("import_module", "__import__"))
 _OF_EACH = ("__package__", "__name__", "__path__", "__file__")
 # What belongs to the process that imported a module.
 _OF_IMPORT = frozenset(("__builtins__", "__spec__", "__loader__", "__cached__"))
-# The attribute of a module that was sent with the names of those that it lacks.
+# The attribute of a sent module that lists the names of the attributes that were not sent.
 _LEFT_OUT = "__left_out__"
 
 

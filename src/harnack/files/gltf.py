@@ -30,7 +30,7 @@ from harnack.files.file_geometry import (
 _COMPONENT_BYTES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
 _COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 _MAX_NODE_DEPTH = 1000
-# Extensions by which files move or hide what is drawn, or store vertices otherwise.
+# Extensions by which files move or hide geometry, or store vertices otherwise.
 _UNSUPPORTED_EXTENSIONS = (
     "EXT_mesh_gpu_instancing", "KHR_mesh_quantization", "KHR_node_visibility",
     "EXT_meshopt_compression", "KHR_meshopt_compression",

@@ -175,7 +175,7 @@ _HIDDEN = (
 )  # fmt: skip
 _UNSUPPORTED_TAGS = ("use", "text", "image", "foreignObject", "switch")
 _SHAPES = ("path", "rect", "circle", "ellipse", "polygon", "polyline")
-# Of rules in a style sheet those that would change what is filled.
+# Rules of a style sheet that would change fills.
 _FILL_CHANGING_RULES = re.compile(r"none|evenodd|transform|hidden|@import|clip|mask", re.IGNORECASE)
 
 

@@ -37,7 +37,7 @@ __all__ = ["CloudError", "estimate_areas", "estimate_normals", "validate_cloud"]
 MAX_POINTS = 100_000_000
 # Points per step: the temporary arrays of one step then stay in the cache of one core.
 _CHUNK = 4096
-# A cell is at most so many times as wide as those of its neighbors may be.
+# The radius of a cell over the median radius of its neighbors' cells, at most.
 _MAX_RADIUS_RATIO = 3.0
 # Points whose cells are computed at once.
 _POINTS_PER_BATCH = 1 << 18

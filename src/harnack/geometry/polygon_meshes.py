@@ -32,13 +32,13 @@ from harnack.geometry.meshes import MAX_FACES, MAX_VERTICES, MeshError
 
 __all__ = ["PolygonFaces", "cluster_into_polygons", "validate_polygons"]
 
-# A face whose corners lie as close to one line, as a part of its size, has no surface to speak of.
+# A face whose corners are closer to a line than this fraction of its size counts as collinear.
 _COLLINEAR_TOLERANCE = 1e-9
-# Of the lengths of two edges, the part that a turn must be at least to count as one.
+# A turn between two edges counts from this fraction of their lengths on.
 _TURN = 1e-6
 # Turns of a convex polygon add up to one revolution, to this many radians.
 _REVOLUTION = 1e-6
-# At most so many faces with projections that are not convex are examined further, at 0.5 ms each.
+# The largest number of faces with non-convex projections that are examined further, 0.5 ms each.
 _MAX_EXAMINED_FACES = 20_000
 
 

@@ -34,9 +34,9 @@ if TYPE_CHECKING:
 
 # Columns of a record; 0 to 8 are the corners.
 PARITY_COLUMN, NUMBER_COLUMN, INVERSE_SQUARES_COLUMN = 9, 10, 11
-# A ray that is so many roundings of a coordinate from an edge counts as passing through the edge.
+# A ray within this number of roundings of a coordinate from an edge passes through the edge.
 _EDGE_ROUNDINGS = 4.0
-# A crossing so many roundings of a coordinate from the end of a line may be on either side of it.
+# A crossing within this number of roundings of a line's end may be on either side of the end.
 _UNCERTAIN_ROUNDINGS = 64.0
 # Triangles are numbered in floats; single precision holds no larger integers without gaps.
 MAX_TRIANGLES = 2**24
