@@ -209,7 +209,7 @@ class DeviceField(Field, Generic[Uploaded]):
 
 
 class VariableAccuracyField(DeviceField[Uploaded], BatchedField):
-    """An uploaded sum with a choice of detail (`Field.at_detail`). Subclasses define
+    """An uploaded sum with a choice of detail (`Field.at_accuracy`). Subclasses define
     `_sample`."""
 
     has_variable_accuracy = True
@@ -219,7 +219,7 @@ class VariableAccuracyField(DeviceField[Uploaded], BatchedField):
 
     @abc.abstractmethod
     def _sample(self, on: Uploaded, p: Vec3, detail: Real) -> Sample:
-        """f at p from the data, at a detail (`Field.at_detail`)."""
+        """f at p from the data, at a detail (`Field.at_accuracy`)."""
 
     def evaluate(self, p: Vec3) -> Sample:
         on = self._data_for(p)

@@ -306,7 +306,7 @@ class SourceSums:
     def add_line_rates(
         self, v: Vec3, unit: Real, lengths: tuple[Real, ...], rates: tuple[Real, ...], active: Mask
     ) -> tuple[Real, ...]:
-        """The rates K of `trail_sums.rates_along` for some edges, plus those of these sums.
+        """The rates K of `trail_sums.line_rates` for some edges, plus those of these sums.
 
         f changes by at most |s| |g . v| + s^2 (3 s4 + rise r s5) for |s| <= r (`sample`), with |g .
         v| raised by the truncation and rounding of g. Infinite for lengths above r.

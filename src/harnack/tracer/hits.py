@@ -77,7 +77,8 @@ class Hits:
     uncertainty: (n,) a length: at a hit of a smooth level set, |f - level| is proved to be at most
         (tolerance + uncertainty) |grad f|. It is 0 unless rounding leaves f less certain than the
         tolerance asks; 0 for all other rays. Where |grad f| may have no bound the surface is proved
-        to be within the tolerance, or within the rounding of the point (see `Tolerance`). Elsewhere
+        to be within the tolerance, or within the rounding of the point (see `HitTolerance`).
+        Elsewhere
         that is a length to first order: along lines and at points where grad f is 0 and f - level a
         power u^m, as where m sheets meet, the surface may be m times as far (beside the edge of a
         cusp, as of y^2 = x^3, farther: 0.002 for a tolerance of 1e-4, and 0.02 with x^5). Rounding
@@ -182,7 +183,7 @@ def trace(
     level: level or levels; None for the field's default. May be a Dr.Jit number.
     t_min, t_max: (n,) or a number. An infinite t_max ends in a proved miss wherever the
         field knows how far its surface reaches.
-    tolerance: a length, or a `Tolerance`. In single precision not below about 1e-6 of the
+    tolerance: a length, or a `HitTolerance`. In single precision not below about 1e-6 of the
         size of the coordinates.
     bound: which proofs to use: None for all that pay; "classic" for the published rule, "slope",
         "caps", "curvature", "lipschitz"; or classes of enclosures, such as

@@ -199,14 +199,14 @@ class CurveCells:
     def rates_along(
         self, found: CurveCellSums, line: RayLine, lengths: tuple[Real, ...], active: Mask
     ) -> tuple[Real, ...]:
-        """As `trail_sums.rates_along`, at the points of these sums.
+        """As `trail_sums.line_rates`, at the points of these sums.
 
         Proof. f changes along a line by the sum of what the fields of all edges add up to along it.
         For near edges that is bounded by `add_edge_rates`. The field H of all others at x is the
         gradient of the polynomial, up to `slope_error`, with the fields of closing edges, which are
         in the near loops. Along v it adds to f at x + sv at most |s||H . v| + s^2/2 K for |s| <= r,
-        with r half the distance d of far edges, and K the constant of `curve_queries.bends` for
-        q = 1/2, which is 3/2 (I3 + d I4), at most 3 I3.
+        with r half the distance d of far edges, and K the constant of
+        `curve_queries.remainder_promises` for q = 1/2, which is 3/2 (I3 + d I4), at most 3 I3.
         """
         vector, x = self.backend.Array3f, line.x
         count = dr.select(active, found.count, 0)

@@ -170,7 +170,7 @@ _EDGES_PER_RECORD = 4
 # Points of a lane: as many as registers hold, by experiment.
 _POINTS_PER_LANE = 3
 # Signs of `side` are not trusted where it is closer to zero than this many rounding errors of its
-# products; its own are six at most, those of `tree.triangles.side` one.
+# products; its own are six at most, those of `tree.triangle_tree.edge_function` one.
 _SIDE_ROUNDINGS = 16
 # Beyond this distance, in sizes of the mesh, the products of lengths could leave float32.
 _FAR = 1024.0

@@ -80,7 +80,7 @@ def traverse_clusters(
 
     closer: nodes are taken as a whole from so many times that distance on.
     add_cluster: from a cluster and the state, the state with the node added where it is far.
-    add_primitive: as for `tree.for_each`, for the leaves that are not far.
+    add_primitive: as for `tree.for_each_primitive`, for the leaves that are not far.
     height_square: added to the squares of all distances: in four dimensions, the square of the
         distance of the point from the space of the tree.
     """
@@ -273,7 +273,7 @@ class Treecode:
     ) -> Treecode:
         """Upload a tree with its moments and sources.
 
-        primitives: the records of the sources in their slots, as `tree.pack` takes them.
+        primitives: the records of the sources in their slots, as `tree.pack_tree` takes them.
 
         Each node has a single E for both kinds of evaluation: at least the bound at accuracy scale
         1, and at least the bound of the coarse evaluation divided by `coarse_error_ratio`, which is
@@ -300,7 +300,7 @@ class Treecode:
 
     @property
     def coarsest_accuracy(self) -> float:
-        """The detail of coarse evaluations (`Field.coarsest_detail`)."""
+        """The detail of coarse evaluations (`Field.coarsest_accuracy`)."""
         return self.coarse_ratio / self.accuracy
 
     def acceptance_ratio(self, detail: Real) -> Real:
@@ -313,7 +313,7 @@ class Treecode:
     ) -> tuple[SourceSums, ExtraState]:  # fmt: skip
         """All sums at points x, and the caller's own state.
 
-        detail: `Field.at_detail`; infinity adds up all terms one by one.
+        detail: `Field.at_accuracy`; infinity adds up all terms one by one.
         add: adds a primitive of a near leaf (`AddPrimitive`).
         derivatives: 0 for the value alone, 1 with the gradient, 2 with the Hessian.
         """

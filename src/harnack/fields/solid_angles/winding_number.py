@@ -211,11 +211,11 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         near edges and one polynomial for all others, with a proved remainder (`boundary_cells`), so
         that a sample costs the same however many edges there are. In a soup, where triangles have
         hardly an edge in common, near triangles take the place of edges, with the tree as method
-        (`dipole_cells`). None builds them where they pay (`for_rays`), True always, False never; at
-        most the megabytes that are given (True: 256), and several times as much while they are
-        built. Those of soups, where they were asked for, give values and gradients at points too,
-        which pays from some 2,000 points a triangle on; all other values and derivatives at points
-        are those of `method`.
+        (`dipole_cells`). None builds them where they pay (`for_ray_count`), True always, False
+        never; at most the megabytes that are given (True: 256), and several times as much while
+        they are built. Those of soups, where they were asked for, give values and gradients at
+        points too, which pays from some 2,000 points a triangle on; all other values and
+        derivatives at points are those of `method`.
 
     A mesh that lies on its own spanning surface, such as a file that `mesh` wrote of a
     `SolidAngle`, or any that is flat, has the level right beside all of its triangles, where
