@@ -179,21 +179,21 @@ class Surface:
 
     @property
     def extent(self) -> Volume | None:
-        """The volume in which the field proves its levels to lie; None where it knows of none."""
+        """The volume that is proved to contain the level sets; None if none is known."""
         return self.memoize("extent", lambda: self.field.extent(self.level_values))
 
     @property
     def volume(self) -> Volume | None:
-        """What rays are clipped to: the intersection of domain, proved extent, clip and section;
-        None for all of space."""
+        """The volume to which rays are clipped: the intersection of domain, proved extent, clip and
+        section; None for all of space."""
         return _intersection([self.field.domain, self.extent, self.clip, self.section])
 
     def for_rays(self, count: int) -> Surface:
-        """The same surface, to be traced by so many rays (`Field.for_ray_count`)."""
+        """The same surface, prepared for this many rays (`Field.for_ray_count`)."""
         return replace(self, field=self.field.for_ray_count(count))
 
     def evaluator(self, backend: Backend) -> Field:
-        """The field on a backend, one for uses with and one for uses without derivatives."""
+        """The field, prepared for a backend and cached, with and without derivatives apart."""
         is_followed = any(dr.grad_enabled(one) for one in self.field.parameters())
         what = "field", backend, is_followed
         return self.memoize(
@@ -208,7 +208,7 @@ class Surface:
         return Levels(levels, self.field.period)
 
     def _occupied(self) -> OccupancyGrid | None:
-        """The cells that can hold a level that counts; None where none are known."""
+        """The cells that may contain a level that counts; None if no cells are known."""
         if not self.largest:
             return self.memoize("cells", lambda: self.field.occupied_cells(self.level_values))
         whole = _intersection([self.field.domain, self.extent, self.clip])
@@ -219,10 +219,10 @@ class Surface:
     def prepare(
         self, backend: Backend, *, crosses: bool = False, many: bool = True
     ) -> SurfaceTracer:
-        """Everything uploaded to a backend, ready to be traced in a recorded kernel.
+        """The tracer of this surface, with all data on a backend, for use in a recorded kernel.
 
-        crosses: whether rays will look for crossings. many: whether there will be so many rays that
-            it pays to look for cells without the level first.
+        crosses: whether rays will look for crossings.
+        many: whether there will be so many rays that it pays to search for empty cells first.
         """
         if self.largest and crosses:
             raise ValueError(_FIRST_HITS_ONLY)
@@ -268,12 +268,13 @@ def level_set(
     section: Volume | None = None,
     largest: bool | int = False,
 ) -> Surface:
-    """A `Surface` from what users write: a level or several, a tolerance, a bound's name.
+    """A `Surface` from user arguments: a level or several levels, a tolerance, the name of a bound.
 
-    largest: True or a number of cells for the largest component alone, as in `Surface`.
+    level: None for the default level of the field.
+    largest: True or a number of cells for the largest component only, as in `Surface`.
 
     Raises ValueError for a level that is not a finite number or that the field cannot have, and
-    TypeError for what is no field.
+    TypeError if `field` is no field.
     """
     check_is_field(field)
     if solid is not None:

@@ -148,18 +148,21 @@ _AT_JUMP_ROUNDINGS = 8.0
 
 @dataclass(frozen=True)
 class MarchResult:
-    """Ends of rays, as Dr.Jit arrays.
+    """The ends of rays, as Dr.Jit arrays.
 
-    t: up to where the ray is proved free of levels; inf for a miss.
-    value, gradient: f at t. Where a sheet was hit, f just before it, and the sheet's unit normal,
-        to the side of larger f.
+    t: ray parameter up to which the ray is proved free of levels; inf for a miss.
+    value, gradient: f and its gradient (3,) at t. If a facet was hit, f just before it, and the
+        facet's unit normal, to the side of larger f.
     tolerance_excess: by how much f at t may be farther from the level than the tolerance allows.
-    facet: index of the sheet (see `harnack.fields.capabilities`) that was hit, at t; NO_FACET
-        elsewhere.
-    side: where hits are confirmed, 1 where f rises through the level along the ray, -1 where it
-        falls through it; else None. Then t and gradient are those of the root, and `value` is f a
-        little behind it.
-    patch: of a field with parts, the index of the one that was hit, NO_PATCH elsewhere; else None.
+    evaluations: the number of evaluations of f.
+    status: a `RayStatus`.
+    facet: index of the facet (see `harnack.fields.capabilities`) that was hit, at t; NO_FACET for
+        other rays.
+    side: if hits are confirmed, 1 if f rises through the level along the ray, -1 if it falls
+        through it; else None. If hits are confirmed, t and gradient are those of the root, and
+        `value` is f a little behind it.
+    patch: for a union of patches, the index of the patch that was hit, NO_PATCH for other rays; for
+        other fields None.
     """
 
     t: Real
@@ -174,7 +177,7 @@ class MarchResult:
 
     @property
     def at_jump(self) -> Mask:
-        """Mask of the rays that hit a sheet."""
+        """Mask of the rays that hit a facet."""
         return self.facet != NO_FACET
 
 
@@ -320,8 +323,8 @@ class SurfaceTracer:
     def refined_crossings(
         self, o: Vec3, d: Vec3, found: Contact, active: Mask
     ) -> tuple[Real, Vec3, Any]:
-        """Roots of crossings, the gradients there, and how many evaluations of f that took. Those
-        that were found are kept where f has no creases."""
+        """Roots of crossings, the gradients there, and the number of evaluations of f for them. The
+        roots of `found` are kept if f has jumps or no creases."""
         if self.field.has_jumps or not self.field.has_creases:
             return found.root, found.gradient, dr.zeros(self.backend.UInt32, dr.width(found.root))
         path = Ray(self.backend.Array3f(o), self.backend.Array3f(d), self.proofs)
@@ -330,9 +333,9 @@ class SurfaceTracer:
     def begin_march(
         self, o: Vec3, d: Vec3, t_min: Real, t_max: Real, active: Mask, *, crosses: bool
     ) -> tuple[March, Ray, Real, Real, MarchState]:
-        """The march, its path, where that starts and ends, and the state at the start.
+        """The march, its rays, their start and end (ray parameters), and the state at the start.
 
-        crosses: whether rays end where they have crossed a level, and not where they reach one.
+        crosses: whether rays end where they have crossed a level, and not where they reach it.
         """
         backend, real = self.backend, self.backend.Float
         path = Ray(backend.Array3f(o), backend.Array3f(d), self.proofs)
