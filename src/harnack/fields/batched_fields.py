@@ -1,7 +1,7 @@
 """Fields that can be evaluated at many points at once, and caches that live as long as a field.
 
-- `BatchedField`: values, derivatives and error bounds at points: NumPy in, NumPy out.
-- `FieldCache`, `cached_prepare`: what is computed or uploaded only once for a field.
+- `BatchedField`: values, derivatives and error bounds at NumPy points, as NumPy arrays.
+- `FieldCache`, `cached_prepare`: caches for results that are computed or uploaded once per field.
 """
 
 from __future__ import annotations
@@ -77,8 +77,8 @@ class SymmetricMatrix:
 
 @dataclass(frozen=True)
 class PointValues:
-    """Value and, if they were asked for, gradient and Hessian of a field at points, in the field's
-    own units, with bounds of their errors by truncation and rounding.
+    """Value and, if requested, gradient and Hessian of a field at points, in the units of the
+    field, with bounds of their truncation and rounding errors.
 
     error: of the value.
     gradient_error: of the gradient, as a length.
@@ -140,22 +140,23 @@ class BatchedField(Field):
 
     @abc.abstractmethod
     def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> PointValues:
-        """Everything at points x, a Dr.Jit 3-vector of any backend and precision.
+        """Values and derivatives at points x, a Dr.Jit 3-vector of any backend and precision.
 
-        Not called while a loop is being recorded, unless derivatives is 2.
+        Not called while a loop is being recorded, unless `derivatives` is 2.
 
-        derivatives: 0 for the value alone, 1 with the gradient, 2 with the Hessian.
-        closer: clusters of far terms are approximated only beyond so many times the usual distance,
-            at least 1; infinity approximates nothing.
+        derivatives: 0 for values only, 1 for gradients too, 2 for Hessians too.
+        closer: clusters of far terms are approximated only beyond this multiple of the usual
+            distance, at least 1; with infinity nothing is approximated.
         """
 
     def sharp_values_at(self, x: Vec3) -> PointValues:
-        """`values_at` with the gradient, which may be looked at more closely: what users are given
-        as the gradient at points. Not called while a loop is being recorded."""
+        """`values_at` with the gradient, which subclasses may refine: `gradient` returns it to
+        users. Not called while a loop is being recorded."""
         return self.values_at(x, 1)
 
     def differentiable_value(self, p: Vec3) -> Real:
-        """f to first order about p: its value and, in reverse and forward mode, its gradient."""
+        """f at p as an expression whose first derivative is the gradient of f, in reverse and in
+        forward mode."""
         with dr.suspend_grad():
             at = self.sharp_values_at(dr.detach(p))
         # A literal 0, the gradient of a closed mesh, would have no derivative in Dr.Jit.
@@ -184,15 +185,16 @@ class BatchedField(Field):
     def value_and_gradient(
         self, points: Any, *, precision: Precision = "single"
     ) -> tuple[FloatArray, FloatArray]:
-        """Values (n,) and gradients (n, 3) together, at hardly more cost than the latter."""
+        """Values (n,) and gradients (n, 3) together, at hardly more cost than gradients alone."""
         value, gradient = self._at(points, precision, 1, lambda at: (at.value, at.gradient))
         return value, gradient
 
     def rough_value_and_gradient(
         self, points: Any, *, precision: Precision = "single"
     ) -> tuple[FloatArray, FloatArray]:
-        """Values (n,) and gradients (n, 3) of one pass over a tree, the latter perhaps far off: for
-        guesses, and where f is steep."""
+        """Values (n,) and gradients (n, 3) of a single pass over a tree. The gradients may have
+        large
+        errors: they are for estimates, and for points at which f is steep."""
 
         def kernel(backend: Backend, x: Vec3) -> tuple[Any, ...]:
             del backend

@@ -55,16 +55,17 @@ _LINE_FRACTION = 0.5
 
 @dataclass(frozen=True)
 class CurveCellSums:
-    """Sums over all edges at x, in a cell.
+    """Sums over all edges at a point x in a cell.
 
-    sums: those of `edges.sum_over_edges`; integrals and the distance are bounds.
-    error, slope_error: bounds of what the polynomial leaves out of value and gradient.
+    sums: as `edges.sum_over_edges` gives them; the integrals and the distance are bounds.
+    error, slope_error: bounds of the truncation errors of value and gradient by the expansion.
     rounding: a bound of the rounding of the value, to which `edges.vertex_rounding` is to be added.
-    expansion_gradient: the gradient of the polynomial. cubes, free: of far edges, an upper bound of
-        the integral of |dp|/D^3, and a lower bound of the distance.
-    near_first, count: of the records of near edges.
-    cell, center: the number of the cell, and where it is. change: the value of the polynomial
-        less that at the center.
+    expansion_gradient: the gradient of the expansion.
+    far_i3: an upper bound of the integral of |dp|/D^3 over the far edges.
+    far_distance: a lower bound of the distance to the far edges.
+    near_first, count: index of the first record of near edges, and the number of these records.
+    cell, center: the index of the cell, and its center (3,).
+    expansion_change: the value of the expansion at x minus its value at the center.
     """
 
     sums: EdgeSums
@@ -156,10 +157,11 @@ class CurveCells:
     def change_from_center(
         self, found: CurveCellSums, frame: RayFrame, x: Vec3, unit: Real, active: Mask
     ) -> tuple[Real, Mask]:
-        """How much the solid angle, continued along the line from the cell's center, is larger at
-        x; and where that is known.
+        """The change of the solid angle from the cell's center to x, followed continuously along
+        the line, and the lanes on which the change is certain.
 
-        frame: of rays from the center to x. unit: the rounding of a coordinate.
+        frame: of the rays from the center to x.
+        unit: the rounding of a coordinate.
 
         Proof. What the far edges add is the polynomial in all of the ball. The near loops are
         closed, so that the lifted sum of their edges (`edge_lift`) is their solid angle; it has no

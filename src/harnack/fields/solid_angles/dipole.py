@@ -104,7 +104,7 @@ class DipoleTree:
 
     @property
     def coarsest_accuracy(self) -> float:
-        """The detail of coarse samples (`Field.coarsest_accuracy`)."""
+        """The accuracy scale of coarse samples (`Field.coarsest_accuracy`)."""
         return self.clusters.coarsest_accuracy if self.cells is None else 1.0
 
     def values(self, x: Vec3, derivatives: int, closer: Real) -> PointValues:

@@ -299,7 +299,7 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         return self._sample(p, None)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        """The look with promises along the ray, which prove long steps where it runs along an
+        """The sample with promises along the ray, which prove long steps if the ray runs along an
         edge."""
         del ahead, back
         knows_lines = not self._all_cancel and self.lift_bound_option != "paper"
@@ -615,10 +615,10 @@ class _CurveData(UnitFrame):
 
 @dataclass(frozen=True)
 class CellErrors:
-    """Bounds of what cells leave out of the value and the gradient, and of the rounding of the
-    value.
+    """Bounds of the truncation errors of value and gradient in FMM cells, and of the rounding of
+    the value.
 
-    cell, in_cells: the sums in cells, and where these were taken.
+    cell, in_cells: the sums in cells, and the lanes on which they were used.
     """
 
     value: Real

@@ -300,7 +300,7 @@ class Treecode:
 
     @property
     def coarsest_accuracy(self) -> float:
-        """The detail of coarse evaluations (`Field.coarsest_accuracy`)."""
+        """The accuracy scale of coarse evaluations (`Field.coarsest_accuracy`)."""
         return self.coarse_ratio / self.accuracy
 
     def acceptance_ratio(self, detail: Real) -> Real:
@@ -313,7 +313,7 @@ class Treecode:
     ) -> tuple[SourceSums, ExtraState]:  # fmt: skip
         """All sums at points x, and the caller's own state.
 
-        detail: `Field.at_accuracy`; infinity adds up all terms one by one.
+        detail: the accuracy scale of `Field.at_accuracy`; infinity gives the direct sum.
         add: adds a primitive of a near leaf (`AddPrimitive`).
         derivatives: 0 for the value alone, 1 with the gradient, 2 with the Hessian.
         """

@@ -164,7 +164,7 @@ class BooleanSolid(Solid):
         return dr.select(is_one, slopes, dr.inf), dr.select(is_one, bends, dr.inf)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        """The look made of the looks of all parts, by `MaximumEnclosure`."""
+        """The ray sample of the combination, from those of all operands, by `MaximumEnclosure`."""
         looks = [one.sample_ray(path, t, ahead, back) for one in self.parts]
         size = max_norm(path.origin) + t
         sample, below, extreme = self._combine_samples([one.sample for one in looks], size)
@@ -267,7 +267,7 @@ class BooleanSolid(Solid):
 
 
 def min_wavelength(parts: Iterable[Solid]) -> float | None:
-    """The least `Field.min_wavelength` of several."""
+    """The smallest `Field.min_wavelength` of several fields."""
     return min(
         (one.min_wavelength for one in parts if one.min_wavelength is not None), default=None
     )
@@ -325,7 +325,7 @@ class Complement(SolidOfField):
 
 
 def negated_look(look: RaySample) -> RaySample:
-    """The look at -f."""
+    """The ray sample of -f from that of f."""
     return RaySample(
         negated_sample(look.sample),
         tuple(NegatedEnclosure(one) for one in look.forward),
@@ -337,7 +337,7 @@ def negated_look(look: RaySample) -> RaySample:
 
 
 def negated_sample(sample: Sample) -> Sample:
-    """The sample of -f."""
+    """The sample of -f from that of f."""
     return sample.map_promises(
         lambda one: one.negated(),
         value=-sample.value,
