@@ -58,8 +58,8 @@ class CrossingArrays:
 class _SearchState:
     """Where rays are, and how many crossings they have found.
 
-    march: the state of the march; None for a field with sheets.
-    sheets: for a field with sheets the state of `JumpTracer`, which includes that of the march.
+    march: the state of the march; None for a field with jumps.
+    sheets: for a field with jumps the state of `JumpTracer`, which includes that of the march.
     count: of the crossings.
     """
 

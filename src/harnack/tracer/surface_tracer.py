@@ -183,7 +183,8 @@ class MarchResult:
 
 @dataclass(frozen=True)
 class _EndState:
-    """What `MarchResult` is made of: some of a `MarchState`, and the index of the sheet or part."""
+    """The data of a `MarchResult`: attributes of a `MarchState`, and the index of the facet or
+    patch."""
 
     proved_to: Real
     value: Real
@@ -433,7 +434,7 @@ class SurfaceTracer:
         *,
         any_hit: bool = False,
     ) -> Ends:
-        """What is wanted of the end state of rays and the index of the sheet or part that each hit.
+        """A record of the end state of rays and the index of the facet or patch that each ray hit.
 
         any_hit: whether any hit will do if it is found with less work than the first.
         """

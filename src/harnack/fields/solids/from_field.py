@@ -51,7 +51,7 @@ def solid(
         hk.solid("part.stl") - hk.Cylinder(2.0, 50.0)
 
     Raises:
-        ValueError: none, or several, of these given; bad numbers; a field that jumps across sheets,
+        ValueError: none, or several, of these given; bad numbers; a field with jumps,
             or an angle-valued one without `around`; a mesh that bounds no solid (`MeshError`).
     """
     given = [one for one in (below, above, between, around) if one is not None]
