@@ -192,9 +192,8 @@ class BatchedField(Field):
     def rough_value_and_gradient(
         self, points: Any, *, precision: Precision = "single"
     ) -> tuple[FloatArray, FloatArray]:
-        """Values (n,) and gradients (n, 3) of a single pass over a tree. The gradients may have
-        large
-        errors: they are for estimates, and for points at which f is steep."""
+        """Values (n,) and gradients (n, 3) of a single pass over a tree. Errors of the gradients
+        may be large: they are for estimates, and for points at which f is steep."""
 
         def kernel(backend: Backend, x: Vec3) -> tuple[Any, ...]:
             del backend
