@@ -132,10 +132,9 @@ class BoundaryCells:
         w(x) is the number nearest to the estimate among those that are congruent modulo 1 to the
         value of the cell, as all errors together are below three eighths. The result is NaN on a
         triangle, and where `signed_crossings_between` or `change_from_center` are not sure. Off all
-        triangles it is the number of the side on which
-        the ray has x, too: the t of a crossing is the depth of a point of the triangle that is a
-        few roundings off the ray, and so is the true one. If x were between these two, a point of
-        the triangle would be as near to x.
+        triangles it is the number of the side on which the ray has x, too: the t of a crossing is
+        the depth of a point of the triangle that is a few roundings off the ray, and so is the true
+        one. If x were between these two, a point of the triangle would be as near to x.
         """
         backend, real = self.cells.backend, self.cells.backend.Float
         found, inside = self.cells.sums(x, active)
