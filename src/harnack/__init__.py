@@ -3,8 +3,8 @@
 import harnack as hk
 hits = hk.trace(hk.SolidAngle(vertices), origins, directions)
 
-Names are imported where they are first used, as `__init__.pyi` lists them: what is not used takes
-no time to start.
+Names are imported when they are first used, as `__init__.pyi` lists them: unused names take no time
+to start.
 """
 
 from __future__ import annotations

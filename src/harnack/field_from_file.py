@@ -1,4 +1,4 @@
-"""From a surface file to a field: which field, which way is up, and how to draw it."""
+"""Fields of surface files: the kind of field, the axis that is up, and how to draw it."""
 
 from __future__ import annotations
 
@@ -40,12 +40,11 @@ _LOOP_FILES = (".obj", ".ply", ".loops")
 
 @dataclass(frozen=True, eq=False)
 class FieldFromFile:
-    """A field made of a file.
+    """The field of a file.
 
-    summary: what was decided and why, in one line.
-    show, material: how it is drawn unless asked for otherwise. Surfaces of meshes and clouds are
-        shaded, with one ray a pixel, as their rays cost many times what rays of a curve's surface
-        do.
+    summary: the decisions made and their reasons, in a line.
+    show, material: how it is drawn by default. Surfaces of meshes and clouds are shaded, with a
+        single ray a pixel, as their rays cost many times the rays of a curve's surface.
     """
 
     field: Field
@@ -64,16 +63,16 @@ def field_from_file(
     up: Axis | None = None,
 ) -> FieldFromFile:
     """The field of a surface file: of a mesh a `WindingNumber`, of a cloud with normals a
-    `DipolePotential`, of closed curves a `SolidAngle`, of polygons, if asked for, a `PolygonMesh`,
-    of metaballs and molecules `Blobs`.
+    `DipolePotential`, of closed curves a `SolidAngle`, of polygons, on request, a `PolygonMesh`, of
+    metaballs and molecules `Blobs`.
 
-    read_as: "winding", "dipole", "loops" or "polygons" instead of what `read_geometry` decides.
-    take_boundary: the curves that bound the faces. normals: "estimate" finds those of a point
-        cloud,
-    and replaces those of the file. smoothing: for clouds with noise, a length in the file's unit
-    or "auto", as for `DipolePotential`. up: the file's axis that turns to z, by default y for glTF,
-    whose standard says so, and for meshes and clouds of .obj files, most of which have it so;
-    else z.
+    read_as: "winding", "dipole", "loops" or "polygons", instead of the decision of `read_geometry`.
+    take_boundary: whether to take the curves that bound the faces, instead of the faces.
+    normals: "estimate" estimates the normals of a point cloud, and replaces normals of the file.
+    smoothing: for clouds with noise, a length in the file's unit or "auto", as for
+        `DipolePotential`.
+    up: the file's axis that is turned to z. By default y for glTF, whose standard says so, and for
+        meshes and clouds of .obj files, most of which have y up; else z.
 
     Raises:
         FileFormatError: as `read_geometry`; a point cloud without normals.

@@ -1,4 +1,4 @@
-"""Names that users write: messages about names that do not exist."""
+"""Suggestions of names in messages about names that do not exist."""
 
 from __future__ import annotations
 
@@ -6,18 +6,19 @@ import difflib
 import itertools
 from collections.abc import Iterable
 
-# Of likeness, from 0 to 1: below it, names are unlike. Names that begin alike are more so.
+# Names are similar from this similarity on (0 to 1); each letter of a common prefix adds a bonus.
 _MIN_SIMILARITY = 0.6
 _COMMON_PREFIX_BONUS = 0.02
 
 
 def is_one_of(name: object, known: Iterable[str]) -> bool:
-    """Whether something is one of the known names; nothing but a text is."""
+    """Whether a value is a string and one of the known names."""
     return isinstance(name, str) and name in known
 
 
 def did_you_mean(misspelled: object, candidates: Iterable[str]) -> str:
-    """'; did you mean "gold"?' for the known name most like the given one, '' if none is."""
+    """'; did you mean "gold"?' for the candidate most similar to the misspelled name, '' if none is
+    similar."""
     if not isinstance(misspelled, str):
         return ""
     word = misspelled[:100].lower()

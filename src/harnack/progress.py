@@ -12,17 +12,18 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
 Advance = Callable[[float], None]
-# Seconds between lines. What is done sooner writes none.
+# Seconds between lines. A task that is done sooner writes none.
 _SECONDS_BETWEEN_LINES = 5.0
-# Seconds: what was done before is no measure of what takes time.
+# Seconds: parts that were done within them are no measure of the time of the others.
 _INSTANT_SECONDS = 0.5
 
 
 def teller(progress: Callable[[str], None] | None) -> Callable[[str], None]:
-    """What to tell what is being done: the function of a caller, or nobody.
+    """The function to which messages about progress are passed: `progress`, or one that ignores
+    them if `progress` is None.
 
     Raises:
-        TypeError: it is neither a function nor None.
+        TypeError: progress is neither a function nor None.
     """
     if progress is None:
         return lambda message: None
@@ -36,14 +37,17 @@ def teller(progress: Callable[[str], None] | None) -> Callable[[str], None]:
 
 @contextmanager
 def progress_bar(name: str, progress: bool | Advance) -> Generator[Advance]:
-    """Progress of `name` on stderr; what it yields is told each part, of 1, that has been finished.
+    """Context manager that shows the progress of `name` on stderr. It yields a function, to be
+    called with each fraction (of 1 in all) that has been finished.
 
-    progress: whether to show it; or a function that is told in its place, and may raise an
-        exception
-    to stop the task.
+    progress: whether to show it; or a function that is called instead, and may raise an exception
+        to stop the task.
 
     It is a bar in a terminal, and lines of text in notebooks and log files: in a notebook a bar
     would need ipywidgets, and control codes of terminals are shown as they are.
+
+    Raises:
+        TypeError: progress is neither a bool nor a function.
     """
     if not callable(progress) and not isinstance(cast("Any", progress), bool):
         raise TypeError(f"progress must be True, False or a function, not {progress!r:.60}")

@@ -154,13 +154,14 @@ class AffineForm(FormulaNumber):
         )
 
     def polar_angle(self, x: Any) -> AffineForm:
-        """The angle of a point c in the middle, and of all others as seen from there.
+        """The polar angle atan2(y, x) of z = (x, y): the angle of the middle c of z's range, plus
+        the angle of z relative to c.
 
-        Proof. With c = (a, b) any vector, the angle of z = (x, y) is that of c plus that of
-        (x a + y b, y a - x b), up to a multiple of 2 pi. Where the box of z does not meet the cut,
-        z and c lie in one of the half-planes x > 0, y > 0, y < 0, so that their angles differ by at
-        most pi; and where x a + y b > 0 that of the second vector is an arc tangent, less than
-        pi/2 in size: so there is no such multiple. Elsewhere only [-pi, pi] is known.
+        Proof. With c = (a, b) any vector, the angle of z = (x, y) is that of c plus that of (x a +
+        y b, y a - x b), up to a multiple of 2 pi. Where the box of z does not meet the cut, z and c
+        lie in one of the half-planes x > 0, y > 0, y < 0, so that their angles differ by at most
+        pi; and where x a + y b > 0 that of the second vector is an arc tangent, less than pi/2 in
+        size: so there is no such multiple. Elsewhere only [-pi, pi] is known.
         """
         a, b = approximate_direction(x.center, self.center)
         ahead, aside = x * a + self * b, self * a - x * b

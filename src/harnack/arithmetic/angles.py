@@ -1,9 +1,10 @@
-"""The angle of a point of the plane, `atan2`: in (-pi, pi], with a cut along the negative x axis.
+"""The polar angle of a point of the plane, `atan2`: in (-pi, pi], with a cut along the negative x
+axis.
 
 On the cut, {y = 0, x <= 0}, the angle jumps by 2 pi, and at the origin it has no value at all
-(there it counts as 0). A range that meets the cut is [-pi, pi], with
-derivatives that are all numbers: so no arithmetic takes the angle for a continuous function there,
-and no step leads across the cut.
+(there it counts as 0). On a box that meets the cut, the range is [-pi, pi], and the ranges of
+derivatives are all numbers: so no arithmetic takes the angle for a continuous function there, and
+no step leads across the cut.
 """
 
 from __future__ import annotations
@@ -104,7 +105,7 @@ def _nan_to_infinite(x: Interval) -> Interval:
 
 
 def approximate_direction(x: Real, y: Real) -> tuple[Real, Real]:
-    """A vector about along (x, y), of a length between 1/2 and 2; (1, 0) for what has no
+    """A vector about along (x, y), of a length between 1/2 and 2; (1, 0) if (x, y) has no
     direction."""
     size = dr.maximum(dr.abs(x), dr.abs(y))
     known = (size > 0) & dr.isfinite(size)

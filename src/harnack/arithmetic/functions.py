@@ -1,9 +1,8 @@
 """Elementary functions: their ranges, and those of their first two derivatives, on intervals.
 
-One `ElementaryFunction` serves every arithmetic: it knows the function for plain numbers, and the
-    ranges of
-it and of its first two derivatives on an interval. `sin(x)` and its like take numbers of any
-arithmetic, Dr.Jit and NumPy arrays, and Python numbers.
+An `ElementaryFunction` serves every arithmetic: it evaluates the function for plain numbers, and
+bounds the ranges of the function and of its first two derivatives on an interval. `sin(x)` and the
+like take numbers of any arithmetic, Dr.Jit and NumPy arrays, and Python numbers.
 """
 
 from __future__ import annotations
@@ -34,16 +33,16 @@ _MAX_ULP_ERROR = 8.0
 
 @dataclass(frozen=True)
 class ElementaryFunction:
-    """A function of one number.
+    """A function of a single variable.
 
-    ranges: of it, its derivative and its second derivative on an interval. Where the interval
-        contains a pole, or a point at which the function is not defined, the ranges of derivatives
-        are all numbers: f(s) = f(0) + s f'(r) does not hold across such a point.
+    ranges: of the function, its derivative and its second derivative on an interval. Where the
+        interval contains a pole, or a point at which the function is not defined, the ranges of
+        derivatives are all numbers: f(s) = f(0) + s f'(r) does not hold across such a point.
     on_drjit: the function of Dr.Jit numbers.
     on_numpy: the function of NumPy arrays and Python numbers.
-    domain: the least and the largest number of which it has a value.
-    is_steep: whether its slope has no bound near a number: a pole, or a vertical tangent.
-    has_pole: whether there is a point across which it is not continuous.
+    domain: the smallest and the largest number at which it has a value.
+    is_steep: whether its slope is unbounded near a point: a pole, or a vertical tangent.
+    has_pole: whether there is a point at which it is not continuous.
     """
 
     name: str
@@ -85,7 +84,8 @@ def _two(x: Interval) -> Interval:
 
 
 def _unbounded_where_undefined(defined: Mask, ranges: DerivativeRanges) -> DerivativeRanges:
-    """The ranges; where the function is not defined, those of derivatives are all numbers."""
+    """The ranges; on lanes where the function is not defined, the ranges of its derivatives are all
+    numbers."""
     value, *rest = ranges
     slope, second = (
         Interval(
@@ -104,9 +104,9 @@ def _exp(x: Interval) -> DerivativeRanges:
 
 
 def _exponential_range(f: Callable[[Any], Any], x: Interval) -> Interval:
-    """The range of an increasing function computed from 2^y, whose exponent is rounded: on CUDA it
-    is off by |x| units more. What overflows is large, so that 1/(1 + exp(x)) is known to be small.
-    """
+    """The range of an increasing function computed from 2^y, whose exponent is rounded: on CUDA the
+    result is off by |x| further units in the last place. A result that overflows is known to be
+    large, so that 1/(1 + exp(x)) is known to be small."""
     large = _OVERFLOWS * float(dr.largest(type(x.lower)))
 
     def end(v: Real, sign: int) -> Real:
@@ -173,12 +173,11 @@ def _sine_and_cosine(x: Interval) -> tuple[Interval, Interval]:
     """Ranges of sin and cos.
 
     Proof. Both are monotone between the multiples of pi/2 at which they are 1 or -1: the range is
-    given by the ends, and by such points inside. Whether one is inside is tested for an interval
-    widened by the rounding of the test; if one is counted wrongly, it is that near to an end.
-    Beyond `max_sincos_argument` sines are not known: on pieces the range is [-1, 1] there; at a
-        point it
-    is all numbers, as the value at a point is taken half way between the ends, and 0 would look
-    like one.
+    given by the ends, and by such points inside. Whether such a point is inside is tested for an
+    interval widened by the rounding of the test; a point that is counted wrongly is that near to an
+    end. Beyond `max_sincos_argument` sines are not known: on pieces the range is [-1, 1] there; at
+    a point it is all numbers, as the value at a point is taken half way between the ends, and 0
+    would look like a value.
     """
     unit, most = machine_epsilon(x.lower), max_sincos_argument(type(x.lower))
     s0, c0 = sincos(x.lower)
@@ -384,7 +383,7 @@ def _numpy_power(n: float) -> Callable[[Any], Any]:
 def _real_power(x: Interval, n: float) -> Interval:
     """The range of x^n for x >= 0 and any n: exp2(n log2 x), so off by n log2(x) units and a few.
 
-    An x below the smallest normal number may be any number from 0 to that.
+    An x below the smallest normal number may stand for any number from 0 to that.
     """
     least = fmax(x.lower, 0)
     most = (

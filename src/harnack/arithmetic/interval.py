@@ -1,12 +1,12 @@
 """Intervals: ranges of real numbers, rounded outwards.
 
-Every operation gives an interval that contains the result for all numbers of its operands, in the
+The result of every operation contains the exact result for all numbers of its operands, in the
 rounded arithmetic of the backend too. So the ranges of a function and of its derivatives are proved
 (Moore 1966).
 
-Ranges are rounded outwards: an enclosure violated by one rounding in float32 is a missed hit. One
-piece of the path is the fastest for formulas, four for blobs, whose ranges share the work of
-finding what is near (measured; `PathRestriction.piece_count`).
+Ranges are rounded outwards since an enclosure that is violated by a single rounding in float32 is a
+missed hit. A single piece of the path is the fastest choice for formulas, and four pieces for
+blobs, whose ranges share the search for nearby blobs (measured; `PathRestriction.piece_count`).
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ Number: TypeAlias = "Interval | float"
 
 @dataclass(frozen=True)
 class Interval:
-    """All numbers from `lower` to `upper`, Dr.Jit numbers of one kind or Python floats.
+    """All numbers from `lower` to `upper`, Dr.Jit numbers of the same type or Python floats.
 
-    An end that is NaN stands for an infinite one: nothing is known on that side. Python floats are
+    An end that is NaN stands for an infinite end: nothing is known on that side. Python floats are
     constants known while a kernel is recorded, so that some operations with them can be left out.
 
     is_single: whether Python floats must be numbers of single precision, as they will meet arrays
-        of such numbers: they would be rounded there, perhaps inwards.
+        of such numbers: there they would be rounded, perhaps inwards.
 
     Proof of the rounding. An operation of the backend is off by half a unit in the last place, or
     by less than the smallest normal number where the result is no normal number. Each end is moved
@@ -49,7 +49,7 @@ class Interval:
 
     @classmethod
     def point(cls, x: Real) -> Interval:
-        """The number x alone."""
+        """The interval [x, x]."""
         return cls(x, x)
 
     @classmethod
@@ -62,17 +62,19 @@ class Interval:
 
     @property
     def is_literal(self) -> bool:
-        """Whether it is known while a kernel is being recorded."""
+        """Whether both ends are Python numbers, which are known while a kernel is being
+        recorded."""
         return isinstance(self.lower, float) and isinstance(self.upper, float)
 
     @property
     def is_zero(self) -> bool:
-        """Whether it is known, while a kernel is being recorded, to be 0 alone."""
+        """Whether it is [0, 0] in Python numbers, which is known while a kernel is being
+        recorded."""
         return self.is_literal and self.lower == 0.0 == self.upper
 
     @property
     def midpoint(self) -> Real:
-        """A number of the interval, half way."""
+        """A number about half way between the ends."""
         if self.lower is self.upper:
             return self.lower
         return 0.5 * self.lower + 0.5 * self.upper
@@ -105,8 +107,8 @@ class Interval:
         return Interval(low, high, self.is_single or other.is_single)
 
     def intersect(self, other: Interval) -> Interval:
-        """The intersection of two that are known to have a common number; where an end is NaN, that
-        of the other."""
+        """The intersection with an interval that is known to overlap this one. An end that is NaN
+        is unknown: the other interval's end is taken."""
         return Interval(
             _maximum_ignoring_nan(self.lower, other.lower),
             _minimum_ignoring_nan(self.upper, other.upper),
@@ -114,7 +116,7 @@ class Interval:
         )
 
     def shifted(self, x: Real) -> Interval:
-        """The interval plus one exact number."""
+        """The interval plus an exact number x."""
         return self + Interval(x, x)
 
     def __neg__(self) -> Interval:
@@ -210,7 +212,7 @@ class Interval:
 
     def widened(self, relative: float, absolute: float = 0.0) -> Interval:
         """The interval with each end moved outwards by a fraction of itself and by an absolute
-        length: for functions of the backend that are accurate to so much."""
+        length: the range of a function of the backend with these relative and absolute errors."""
         low, high = self.lower, self.upper
         return Interval(
             _round_down(low - relative * _absolute(low) - absolute),
@@ -228,24 +230,24 @@ def machine_epsilon(x: Real) -> float:
 
 
 def typed_select(condition: Mask, a: Real, b: Real, like: Real) -> Real:
-    """a or b as numbers of the type of `like`: from two Python numbers Dr.Jit would make integers
+    """a or b as numbers of the type of `like`: from two Python numbers, Dr.Jit would make integers
     or numbers of single precision."""
     kind = cast("Any", type(like))
     return dr.select(condition, kind(a) if dr.is_array_v(kind) else a, b)
 
 
 def _round_down(x: Real, units: float = 1.0) -> Real:
-    """A number below x by at least so many units in the last place."""
+    """A number below x by at least `units` units in the last place."""
     return dr.fma(dr.abs(x), -units * machine_epsilon(x), x)
 
 
 def _round_up(x: Real, units: float = 1.0) -> Real:
-    """A number above x by at least so many units in the last place."""
+    """A number above x by at least `units` units in the last place."""
     return dr.fma(dr.abs(x), units * machine_epsilon(x), x)
 
 
 def _pad_underflow(x: Real, sign: int) -> Real:
-    """A product x, moved outwards by what underflow may have cost it."""
+    """A product x, moved outwards by the largest error that underflow causes."""
     kind = cast("Any", type(x))
     return x + sign * float(dr.smallest(kind)) if dr.is_array_v(kind) else x
 

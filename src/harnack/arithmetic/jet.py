@@ -1,8 +1,9 @@
-"""A function with its derivatives, as one number: `Jet`, with proved ranges, and `Dual`, without.
+"""A function with its derivatives as a single number: `Jet`, with proved ranges, and `Dual`,
+without.
 
-A formula that is given jets as its coordinates returns the jet of its value. So one formula serves
-for values, gradients and Hessians at a point, with proved bounds of rounding, and for the ranges
-that steps are proved from.
+A formula that is evaluated with jets as its coordinates returns the jet of its value. So the same
+formula serves for values, gradients and Hessians at a point, with proved bounds of rounding, and
+for the ranges from which steps are proved.
 """
 
 from __future__ import annotations
@@ -34,19 +35,18 @@ class Jet(FormulaNumber):
     Interval arithmetic of value, first and second derivatives at once (Moore 1966; the Taylor forms
     of Aydinlilar and Zanni 2023, section 6.1, are made of it).
 
-    value: of the function.
-    first_derivatives: (n,) of the partial derivatives.
-    second_derivatives: (n (n+1) / 2,) of the second derivatives, rows of the upper triangle; empty
-        if they are not asked for. In the sense of distributions: at a kink, where the first
-            derivative jumps,
-        the range has no upper or no lower end.
+    value: the range of the function.
+    first_derivatives: (n,) the ranges of the partial derivatives.
+    second_derivatives: (n (n+1) / 2,) the ranges of the second derivatives, rows of the upper
+        triangle; empty if they are not needed. In the sense of distributions: at a kink, where the
+        first derivative jumps, the range has no upper or no lower end.
     jet_at_start: with n = 1, the jet at the start of the piece, from which ranges are narrowed;
         None for the jet at a point.
     piece_length: the length of the piece; 0 at a point. A number of the backend, which tells the
         precision where all ranges are Python numbers.
-    roots: the functions of whose squares it is known to be the sum; empty if it is not known to be
-        one. The root of a sum of squares is a norm, whose slopes are bounded; by the chain rule
-        they would not be where all squares are 0.
+    roots: the functions of whose squares the function is known to be the sum; empty if it is not
+        known to be such a sum. The root of a sum of squares is a norm, whose slopes are bounded; by
+        the chain rule they would not be where all squares are 0.
     """
 
     value: Interval
@@ -58,7 +58,8 @@ class Jet(FormulaNumber):
 
     @classmethod
     def at_point(cls, p: Vec3, *, order: int = 1) -> tuple[Jet, Jet, Jet]:
-        """The coordinates as functions of themselves, at points p: for gradients and Hessians."""
+        """The coordinates as functions of themselves, at points p, up to derivatives of an order:
+        for gradients and Hessians."""
         second = (ZERO,) * 6 if order > 1 else ()
         units = [tuple(ONE if i == k else ZERO for i in range(3)) for k in range(3)]
         zero = 0 * p.x
@@ -86,8 +87,8 @@ class Jet(FormulaNumber):
     ) -> tuple[Jet, Jet, Jet]:
         """The coordinates of p + s d as functions of s, start <= s <= end.
 
-        is_rounded: whether the path leads through p up to the rounding of its coordinates alone:
-            ranges then hold for all paths that do, each along d.
+        is_rounded: whether the path passes p only up to the rounding of p's coordinates: ranges
+            then hold for all such paths, each along d.
         """
 
         def coordinate(x: Real, slope: Real) -> Jet:
@@ -211,7 +212,7 @@ class Jet(FormulaNumber):
     # Functions.
 
     def apply(self, function: ElementaryFunction) -> Jet:
-        """A function of this one: f(g)'' = f'' g' g' + f' g''."""
+        """The composition f(g) with this function g: f(g)'' = f'' g' g' + f' g''."""
         if function is sqrt and self.roots:
             from harnack.arithmetic.norms import norm
 
@@ -239,9 +240,8 @@ class Jet(FormulaNumber):
         """The larger of two functions at each point.
 
         Proof. If one is larger everywhere, it is the maximum. Else each derivative is that of one
-        of
-        the two, except where they cross: there the first derivative jumps up, so that the second
-        one has no upper bound.
+        of the two, except where they cross: there the first derivative jumps up, so that the second
+        derivative has no upper bound.
         """
         x, y = self.value_on_backend(), other.value_on_backend(self.backend_number())
         left, right = x.lower > y.upper, y.lower > x.upper
@@ -278,12 +278,13 @@ class Jet(FormulaNumber):
         )
 
     def polar_angle(self, x: Jet) -> Jet:
-        """The angle of the point (x, y), y this one.
+        """The polar angle of the point (x, y), y this function.
 
         Proof. The angle is the imaginary part of log z, z = x + i y, whose derivatives are z_i/z
         and z_ij/z - (z_i/z)(z_j/z). With z_i/z = rho_i + i theta_i these are
-        theta_i = (x y_i - y x_i)/r^2, rho_i = (x x_i + y y_i)/r^2 and
-        theta_ij = (x y_ij - y x_ij)/r^2 - theta_i rho_j - theta_j rho_i.
+
+            theta_i = (x y_i - y x_i)/r^2,   rho_i = (x x_i + y y_i)/r^2,
+            theta_ij = (x y_ij - y x_ij)/r^2 - theta_i rho_j - theta_j rho_i.
         """
         like = x.backend_number() if self.value.is_literal else self.backend_number()
         v, u = self.value_on_backend(like), x.value_on_backend(like)
@@ -362,7 +363,7 @@ class Jet(FormulaNumber):
         return [(i, j) for i in range(n) for j in range(i, n)][: len(self.second_derivatives)]
 
     def narrowed_from_start(self, start: Jet | None, width: Real) -> Jet:
-        """The same, narrowed by what is known at the start of the piece.
+        """The same jet, narrowed by the ranges at the start of the piece.
 
         Proof. f(s) = f(0) + s f'(r) for some r in between, so f stays within f(0) + [0, w] f'; the
         same holds for f' and f'', also where f' jumps, by at most what f'' allows.
@@ -420,11 +421,11 @@ _Partials = tuple[Any, Any, Any]
 
 @dataclass(frozen=True, eq=False)
 class Dual(FormulaNumber):
-    """A function at a point: its value and partial derivatives, as plain numbers. No ranges, so
-    nothing is proved.
+    """A function at a point: its value and partial derivatives, as plain numbers. There are no
+    ranges, so nothing is proved.
 
-    Where a formula has ties, as max(x, 0) has at x = 0, ranges of derivatives contain all slopes
-    nearby. A dual number has the slopes of one side, as each comparison is decided by the values.
+    At a tie, such as in max(x, 0) at x = 0, ranges of derivatives contain all slopes nearby. A dual
+    number has the slope on one side, as each comparison is decided by the values.
     """
 
     value: Real
@@ -456,8 +457,8 @@ class Dual(FormulaNumber):
         return Dual(-self.value, _map_partials(operator.neg, self.first_derivatives))
 
     def apply(self, function: ElementaryFunction) -> Dual:
-        """A function of this one. Where this one is constant, so is the result, also where the
-        function's slope is infinite, as that of the root in a norm of zeros."""
+        """A function f of this number. Where this number is constant, so is the result, even where
+        the slope of f is infinite, as that of the root in a norm of zeros."""
         slope = function.ranges(Interval.point(self.value))[1].midpoint
         real = cast("Any", type(self.value))
 

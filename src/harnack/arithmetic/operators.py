@@ -60,8 +60,9 @@ _NAMES = (
 
 
 class FormulaNumber(abc.ABC):
-    """`+ - * / **`, abs, NumPy's functions, maximum, minimum and atan2, from the sums, products,
-    functions of one number, the larger of two and the angle that a subclass defines.
+    """Base of the numbers of all arithmetics: the operators + - * / **, abs, NumPy's functions,
+    maximum, minimum and atan2. A subclass defines sums, products, functions of a single number, the
+    larger of two numbers, and the angle.
 
     A formula is written once and evaluated with numbers of any subclass, such as `Jet`.
     """
@@ -91,7 +92,7 @@ class FormulaNumber(abc.ABC):
         """The angle of the point (x, y) with this y: see `harnack.arithmetic.angles`."""
 
     def norm_of_powers(self, p: float) -> Self:
-        """The p-norm of some numbers, of which this is the sum of the p-th powers."""
+        """The p-norm of some numbers; this number is the sum of their p-th powers."""
         return self.apply(sqrt if p == 2.0 else power(1 / p))
 
     def _coerce_or_none(self, other: Any) -> Self | None:
@@ -190,11 +191,11 @@ class FormulaNumber(abc.ABC):
         return self.apply(absolute)
 
     def maximum(self, other: Any) -> Self:
-        """The larger of two functions at each place."""
+        """The larger of two functions at each point."""
         return self.pointwise_maximum(self.coerce(other))
 
     def minimum(self, other: Any) -> Self:
-        """The smaller of two functions at each place."""
+        """The smaller of two functions at each point."""
         return -((-self).pointwise_maximum(-self.coerce(other)))
 
     def atan2(self, x: Any) -> Self:
@@ -247,10 +248,10 @@ class FormulaNumber(abc.ABC):
 
 
 def exponent_of(n: Any) -> float:
-    """An exponent that is the same everywhere.
+    """A constant exponent as a Python number.
 
     Raises:
-        TypeError: it is no number.
+        TypeError: it is not a number.
     """
     try:
         return float(n)

@@ -1,18 +1,19 @@
-"""Parabolas through a function's value: the bottom-up linear and quadratic arithmetic of a path.
+"""Parabolas through a function's value: the bottom-up linear and quadratic arithmetic along a path.
 
-A number is a function f of the length s along a path, 0 <= s <= h, known by its value at 0 and by
+A number of this arithmetic is a function f of the length s along a path, 0 <= s <= h, known by its
+value at 0 and by
 
     a- s + b- s^2  <=  f(s) - f(0)  <=  a+ s + b+ s^2.
 
-Sums, products, functions and maxima of such numbers are such numbers again, so that a formula given
-the coordinates as such numbers proves its own parabolas (Aydinlilar and Zanni 2023, sections 5.2
-and 6.2, appendices B and C). Two things improve on the published method: functions are bounded by
-chords through the value itself, which need no validity interval; and the tighter of chords and
-Taylor's formula is used.
+Sums, products, functions and maxima of such numbers are such numbers again, so that a formula
+evaluated with such numbers as its coordinates proves its own parabolas (Aydinlilar and Zanni 2023,
+sections 5.2 and 6.2, appendices B and C). Two details improve on the published method: functions
+are bounded by chords through the value itself, which need no validity interval; and the tighter of
+chords and Taylor's formula is used.
 
 Rounding. Coefficients are computed in rounded arithmetic; each result is moved outwards by
-`_ROUNDINGS` units in the last place of the sum of the absolute values of everything added up in
-it, which is more than the number of operations done.
+`_ROUNDINGS` units in the last place of the sum of the absolute values of all terms, which is more
+than the number of operations done.
 """
 
 from __future__ import annotations
@@ -336,11 +337,12 @@ class ParabolaBounds(FormulaNumber):
         return self._made(value, below, above)
 
     def polar_angle(self, x: Any) -> ParabolaBounds:
-        """The angle of a point, which moves as it does seen from any direction.
+        """The polar angle atan2(y, x) of z = (x, y): at the start of the path, and its change
+        relative to a fixed direction c.
 
-        Proof. For any vector c = (a, b) the angle of z = (x, y) differs from that of
-        (x a + y b, y a - x b) by a constant along a path that does not meet the cut, and where
-        x a + y b > 0 the latter is an arc tangent. Elsewhere nothing is known beyond the start.
+        Proof. For any vector c = (a, b) the angle of z = (x, y) differs from that of (x a + y b, y
+        a - x b) by a constant along a path that does not meet the cut, and where x a + y b > 0 the
+        latter is an arc tangent. Elsewhere nothing is known beyond the start.
         """
         h = self.piece_length
         v, u = (_dynamic(one.value, h) for one in (self, x))

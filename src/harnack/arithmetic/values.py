@@ -1,10 +1,11 @@
 """`Values`: the range of a formula on a box, and whether the formula is continuous there.
 
 Ranges of derivatives prove long steps where a formula is smooth. Beside a vertical tangent, as that
-of sqrt(|x|) at x = 0, they have no ends, and where the formula has no value at all they prove
-nothing. The values themselves do: sqrt(|x|) + 0.5 is at least 0.5, whatever its slope.
+of sqrt(|x|) at x = 0, they are unbounded, and where the formula has no value at all they prove
+nothing. The range of values does prove steps there: sqrt(|x|) + 0.5 is at least 0.5, whatever its
+slope.
 
-`tally_of` says of which formulas this may be needed, before anything is recorded.
+`tally_of` determines the formulas for which this may be needed, before anything is recorded.
 """
 
 from __future__ import annotations
@@ -36,8 +37,8 @@ class Values(FormulaNumber):
     value: its range, over the points of the box at which it has a value.
     nowhere: whether it has a value at no point of the box.
     jumps: whether it may jump, or have a pole, in the box: it is not proved to be continuous where
-        it has a value. So it counts where numbers overflowed on the way to the value, unless they
-        are known to be large: its range may then be far larger than its values.
+        it has a value. It also counts as jumping where numbers overflowed on the way to the value,
+        unless they are known to be large: its range may then be far larger than its values.
     gaps: whether there may be points of the box at which it has no value.
     """
 

@@ -1,4 +1,5 @@
-"""Dr.Jit backend and precision, and the check that its LLVM will do. No mathematics.
+"""Dr.Jit backends and precisions, and the check that the loaded LLVM is one that works. No
+mathematics.
 
 Importing this package decides which LLVM Dr.Jit loads (see `harnack.backend.llvm`), so it has to
 come before any other import of drjit: `harnack/__init__.py` imports it first.

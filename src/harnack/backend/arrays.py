@@ -1,4 +1,4 @@
-"""The Dr.Jit array types in use, and the way from NumPy to Dr.Jit and back.
+"""The Dr.Jit array types in use, and conversions between NumPy and Dr.Jit.
 
 Nothing here changes a Dr.Jit flag, the number of threads or the Mitsuba variant.
 """
@@ -94,12 +94,15 @@ def _backend(name: BackendName, precision: Precision) -> Backend:
 
 
 def _check_ieee_arithmetic(backend: Backend) -> None:
-    """Metal's compiler may, by default, treat infinities and NaN as if there were none, and round
-    otherwise; proofs rest on both. So a device is asked before it is believed. It may flush
-    subnormal numbers to zero, which none of the questions leads to.
+    """Check that a device computes as IEEE 754 prescribes.
+
+    Metal's compiler may by default assume that no number is infinite or NaN, and may round
+    differently; the proofs rely on both. So a few operations are run on the device and compared
+    with NumPy. The device may flush subnormal numbers to zero: no operation of the comparison leads
+    to them.
 
     Raises:
-        RuntimeError: it computes otherwise than IEEE 754 says.
+        RuntimeError: a result differs from NumPy's.
     """
     given = np.array([1, 3, 0, -0.0, 1e-30, 8e37, np.inf, np.nan, 0.1, 16777216], np.float32)
     x, one = upload_floats(backend, given), dr.opaque(backend.Float, 1)
@@ -127,13 +130,14 @@ def choose_backend(precision: Precision = "single") -> Backend:
     """The backend to compute on: CUDA if there is a usable device, Metal for single precision if
     there is one, else LLVM.
 
-    The environment variable HARNACK_BACKEND ("llvm", "cuda" or "metal") forces one. Metal knows no
+    The environment variable HARNACK_BACKEND ("llvm", "cuda" or "metal") forces one. Metal has no
     double precision, which stays on LLVM.
 
     Raises:
         ValueError: unknown precision, or unknown name in HARNACK_BACKEND.
-        LLVMNotFoundError: LLVM is wanted and there is none that Dr.Jit can work with.
-        RuntimeError: CUDA or Metal is forced and no device is usable, or Metal's computes wrongly.
+        LLVMNotFoundError: LLVM is needed, and there is none that Dr.Jit can work with.
+        RuntimeError: CUDA or Metal is forced and no device is usable, or Metal computes
+            incorrectly.
     """
     if not is_one_of(precision, ("single", "double")):
         raise ValueError(f'precision is "single" or "double", not {precision!r}')
@@ -238,8 +242,8 @@ def as_finite_vectors(vectors: Any, name: str) -> FloatArray:
 
 
 def upload_vectors(backend: Backend, rows: npt.NDArray[Any], name: str = "vectors") -> Vec3:
-    """An array (n, 3) as backend.Array3f, whatever its values, as `upload_floats` uploads
-    numbers."""
+    """An array (n, 3) as backend.Array3f, each column uploaded by `upload_floats`. Infinite values
+    and NaN are allowed."""
     return backend.Array3f(*(upload_floats(backend, one) for one in _cast(backend, rows, name).T))
 
 
@@ -269,8 +273,9 @@ def to_float(backend: Backend, values: Any, name: str = "values") -> Real:
 
 
 def gather_vectors(backend: Backend, vectors: Vec3, index: Index) -> Vec3:
-    """The vectors, of any precision, at an index in each lane. A component that is one number for
-    all lanes stays one: of a gather from it, Dr.Jit would write derivatives beyond its end."""
+    """Gather the vector at an index in each lane, in the backend's precision; the vectors may have
+    any precision. A component of width 1, which all lanes share, is not gathered: Dr.Jit would
+    write the derivatives of such a gather beyond the end of the array."""
     return backend.Array3f(
         *(
             one if dr.width(one) == 1 else dr.gather(backend.Float, one, index)
@@ -280,8 +285,8 @@ def gather_vectors(backend: Backend, vectors: Vec3, index: Index) -> Vec3:
 
 
 def as_kernel_parameters(array: Any) -> Any:
-    """The same numbers, with their derivatives; literals as kernel parameters, so that others in
-    their place do not compile another kernel."""
+    """The same array with literals turned into kernel parameters (`dr.make_opaque`), so that
+    another value uses the compiled kernel again. Derivatives are kept."""
     kind = _type_of(array)
     if dr.depth_v(kind) > 1:
         return kind(*map(as_kernel_parameters, array))
@@ -309,7 +314,7 @@ def _check_rows(is_bad: Any, what: str, name: str) -> None:
 
 
 def _cast(backend: Backend, values: npt.NDArray[Any], name: str) -> npt.NDArray[Any]:
-    """Values in the backend's precision; none may overflow on the way."""
+    """The values in the backend's precision. Raises ValueError if a finite value overflows."""
     if backend.precision == "double" or values.dtype == backend.dtype:
         return values
     with np.errstate(over="ignore"):
@@ -333,7 +338,8 @@ def upload_floats(backend: Backend, values: npt.NDArray[Any]) -> Real:
 
 
 def upload_integers(backend: Backend, values: npt.NDArray[Any]) -> Index:
-    """A copy of a one-dimensional NumPy array of integers >= 0 as backend.UInt32, likewise."""
+    """A copy of a one-dimensional NumPy array of integers >= 0 as an evaluated backend.UInt32 in
+    aligned memory."""
     return backend.UInt32(_aligned(values, np.dtype(np.uint32)))
 
 
@@ -341,8 +347,8 @@ def _aligned(values: npt.NDArray[Any], dtype: np.dtype[Any]) -> npt.NDArray[Any]
     """A copy that begins at a multiple of _ALIGNMENT bytes, with as many unused bytes after it.
 
     Dr.Jit maps a NumPy array in place. NumPy's memory is aligned to the vector width by chance
-    only; if it is not, packet gathers silently fall apart into scalar ones, and since a kernel
-    knows whether it is, the same work would compile a kernel again.
+    only. If it is not, packet gathers silently fall apart into scalar gathers; and since a kernel
+    depends on the alignment, the same work would compile another kernel.
     """
     size = values.size * dtype.itemsize
     memory = np.empty(size + 2 * _ALIGNMENT, np.uint8)

@@ -1,4 +1,4 @@
-"""What `harnack doctor` reports: versions, backend, LLVM, and what to do if something is amiss."""
+"""The report of `harnack doctor`: versions, backend, LLVM, and what to do if something is amiss."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ _KERNEL_SECONDS = 120
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of the report.
+    """A line of the report.
 
-    subject: what was looked at.
-    detail: what was found.
+    subject: the thing that was examined.
+    detail: the result.
     ok: False if harnack cannot work like this.
     advice: what to do about it; empty if nothing.
     """
@@ -99,7 +99,8 @@ def _backend() -> Finding:
 
 
 def _kernel(precision: str) -> Finding:
-    """Run `try_kernel` in a process of its own: a wrong LLVM would end this one."""
+    """Run `try_kernel` in a separate process, since a wrong LLVM may end the process that uses
+    it."""
     subject = f"kernel, {precision} precision"
     code = f"import harnack.backend.doctor as d; d.try_kernel({precision!r})"
     try:
@@ -124,10 +125,11 @@ def _kernel(precision: str) -> Finding:
 
 
 def try_kernel(precision: str) -> None:
-    """Compile and run a small kernel of what the tracer uses, and check the result.
+    """Compile and run a small kernel with the operations that the tracer uses, and check the
+    result.
 
     Raises:
-        RuntimeError: the kernel ran and computed something else.
+        RuntimeError: the kernel ran and its result is wrong.
     """
     backend = choose_backend("double" if precision == "double" else "single")
     table = dr.arange(backend.Float, 8) + 1

@@ -121,8 +121,8 @@ def sincos(x: Any) -> tuple[Any, Any]:
 
 
 def max_sincos_argument(real: Any) -> float:
-    """The largest angle whose sine is known in the precision of `real`: an angle that is itself
-    rounded is off by 0.06 there in single precision, and by 0.01 in double."""
+    """The largest angle whose sine is known in the precision of `real`. The rounding of such an
+    angle is up to 0.06 in single precision, and 0.01 in double precision."""
     return 2.0**47 if dr.type_v(real) == dr.VarType.Float64 else 1e6
 
 

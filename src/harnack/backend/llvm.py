@@ -1,9 +1,9 @@
-"""Which LLVM the CPU backend runs on, decided before Dr.Jit can load a wrong one.
+"""The choice of the LLVM on which the CPU backend runs, made before Dr.Jit can load a wrong one.
 
-Dr.Jit compiles CPU kernels with an LLVM library that it finds and loads while `import drjit`
-runs; `DRJIT_LIBLLVM_PATH` in the environment names one. It accepts nearly any version, but the
-version decides whether anything works. Tried with Dr.Jit 1.5.0 on x86-64 (loops, packet gathers,
-elementary functions, gradients, scatters, a Mitsuba render):
+Dr.Jit compiles CPU kernels with an LLVM library that it finds and loads while `import drjit` runs;
+`DRJIT_LIBLLVM_PATH` in the environment names one. It accepts nearly any version, but the version
+decides whether anything works. Tried with Dr.Jit 1.5.0 on x86-64 (loops, packet gathers, elementary
+functions, gradients, scatters, a Mitsuba render):
 
     up to 14   refused by Dr.Jit, which then has no CPU backend
     15, 16     abort the whole process at the first `dr.minimum` ("Cannot select ... fmaximum")
@@ -11,7 +11,8 @@ elementary functions, gradients, scatters, a Mitsuba render):
     20         not tried (no package at hand); its neighbors work
     21 to 23   work; 22 and 23 made the tracing kernels 10 to 15 % slower than 19
 
-So 17 is the minimum, 19 the favorite, and a version newer than those tried is the last choice.
+So 17 is the minimum and 19 the preferred version; versions newer than those tried are the last
+choice.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ class LLVMNotFoundError(RuntimeError):
 class LLVMLibrary:
     """A shared LLVM library on this machine.
 
-    path: where it lies, as found (links not resolved).
+    path: its path, with links not resolved.
     major: its major version, None if it could not be told without loading it.
     """
 
@@ -117,7 +118,7 @@ def _search_folders() -> Iterator[Path]:
 def find_libraries(folders: Iterable[Path] | None = None) -> tuple[LLVMLibrary, ...]:
     """Every LLVM library in `folders` (default: wherever this platform keeps them), best first.
 
-    One entry a file, however many links lead to it. Nothing is loaded.
+    Each file is listed once, however many links lead to it. Nothing is loaded.
     """
     found: dict[str, LLVMLibrary] = {}
     for folder in _search_folders() if folders is None else folders:
@@ -150,11 +151,12 @@ def best_library() -> LLVMLibrary | None:
 
 
 def import_drjit() -> None:
-    """Import Dr.Jit and have it load the best acceptable LLVM. Does not judge what it loaded.
+    """Import Dr.Jit and have it load the best acceptable LLVM. Does not check the LLVM that was
+    loaded.
 
-    Dr.Jit loads LLVM while it is imported, so this has to come before any other `import drjit`.
-    If Dr.Jit was imported already, or the user set DRJIT_LIBLLVM_PATH, that choice stands, and
-    `ensure_llvm` says whether it will do. The environment is left as it was found.
+    Dr.Jit loads LLVM while it is imported, so this has to come before any other `import drjit`. If
+    Dr.Jit was imported already, or the user set DRJIT_LIBLLVM_PATH, that choice stands, and
+    `ensure_llvm` checks it. The environment is left unchanged.
     """
     if "drjit" in sys.modules:
         return
@@ -206,9 +208,10 @@ def _mapped_libraries() -> tuple[Path, ...]:
 
 
 def ensure_llvm() -> int:
-    """Return the major version of the LLVM that Dr.Jit runs on; raise if it will not do.
+    """Return the major version of the LLVM that Dr.Jit runs on; raise if Dr.Jit cannot work with
+    it.
 
-    Call it before the first CPU kernel: with a wrong version the first one may end the process.
+    Call it before the first CPU kernel: with a wrong version the first kernel may end the process.
 
     Raises:
         LLVMNotFoundError: Dr.Jit has no LLVM, or one that it cannot work with.

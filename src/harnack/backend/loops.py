@@ -1,10 +1,10 @@
 """Recorded loops whose state is a record with names, and work on only the lanes that need it.
 
-A recorded loop follows the rays of one packet until the last of them has ended, and lanes that are
-masked cost as much as the others. Where arrays may be evaluated, outside of any recording,
-`compute_on_active` gathers the lanes of a mask, and in `loop_with_queue` a lane that has finished a
-ray fetches the next. Both evaluate what they compute, and give what would be computed for each lane
-by itself, in any order of lanes.
+A recorded loop follows the rays of one packet until the last of them has ended, and masked lanes
+cost as much as the others. Where arrays may be evaluated, outside of any recording, there are two
+remedies: `compute_on_active` gathers the lanes of a mask into shorter arrays, and in
+`loop_with_queue` a lane that has finished a ray fetches the next ray. Both evaluate their results,
+and give each lane the result that it would have alone, in any order of lanes.
 """
 
 from __future__ import annotations
@@ -21,11 +21,12 @@ if TYPE_CHECKING:
 
 
 class LoopState(Protocol):
-    """A frozen dataclass of Dr.Jit arrays, such dataclasses, and None where there is nothing."""
+    """The state of a loop: a frozen dataclass whose fields are Dr.Jit arrays, further such
+    dataclasses, or None."""
 
     @property
     def active(self) -> Mask:
-        """Which lanes go on."""
+        """The lanes on which the loop continues."""
         ...
 
 
@@ -33,9 +34,10 @@ State = TypeVar("State", bound=LoopState)
 
 
 def loop_while_active(state: State, body: Callable[[State], State], label: str) -> State:
-    """Runs `body` on the lanes of the state that are active, until none is.
+    """Run `body` on the active lanes of the state until no lane is active, and return the final
+    state.
 
-    Errors that the body raises while it is recorded come out as they are.
+    Errors that the body raises while it is recorded are raised unchanged.
     """
 
     def running(*leaves: Any) -> Mask:
@@ -55,8 +57,8 @@ def update_where_active(
     active: Mask, change: Callable[[tuple[Any, ...]], tuple[Any, ...]], state: tuple[Any, ...],
     label: str,
 ) -> tuple[Any, ...]:  # fmt: skip
-    """The state, changed where active: by a loop of at most one trip, so that packets without such
-    lanes skip what it costs."""
+    """Apply `change` to the state on active lanes. It runs in a loop of at most one iteration, so
+    that a packet without active lanes skips the work."""
     index = dr.uint32_array_t(active)
 
     def step(trip: Any, *state: Any) -> tuple[Any, ...]:
@@ -69,7 +71,7 @@ def update_where_active(
 
 
 def array_leaves(record: Any) -> Iterator[Any]:
-    """The arrays of a record of arrays and records, in order; None is left out."""
+    """The arrays of a record, those of nested records included, in order; None is left out."""
     for value in _entries(record):
         if dataclasses.is_dataclass(value):
             yield from array_leaves(value)
@@ -78,7 +80,8 @@ def array_leaves(record: Any) -> Iterator[Any]:
 
 
 def rebuild_record(like: Any, leaves: Iterator[Any]) -> Any:
-    """The leaves as a record like another one."""
+    """A record with the structure of `like`, whose arrays are the leaves, in the order of
+    `array_leaves`."""
     values: list[Any] = []
     for value in _entries(like):
         if dataclasses.is_dataclass(value):
@@ -93,19 +96,20 @@ def _entries(record: Any) -> list[Any]:
     return [getattr(record, field.name) for field in dataclasses.fields(record)]
 
 
-# Some lanes.
+# Work on a subset of the lanes.
 
 Lanes = TypeVar("Lanes")
 Result = TypeVar("Result")
 
-# Lanes that share a queue: so many for each thread of a processor, and on a GPU in all.
+# Lanes that share a queue: their number for each thread of a processor, and in all on a GPU.
 _LANES_PER_THREAD, _LANES_ON_GPU = 1024, 1 << 17
 
 
 def active_lanes(mask: Mask) -> tuple[Any, int]:
-    """Indices of the lanes where a mask is set, and how many these are.
+    """Indices of the lanes where the mask is set, and their number.
 
-    A single one is named twice: Dr.Jit compiles kernels of their own for arrays of one number.
+    If there is only one such lane, its index is listed twice: Dr.Jit compiles separate kernels for
+    arrays of length 1.
     """
     rows = dr.compress(mask)
     count = len(rows)
@@ -115,7 +119,8 @@ def active_lanes(mask: Mask) -> tuple[Any, int]:
 
 
 def broadcast_copy(record: Lanes, width: int, index: Any) -> Lanes:
-    """A copy of a record in which all lanes may differ, evaluated. index: the type of lanes."""
+    """An evaluated copy of a record in which every array has `width` lanes. index: the type of lane
+    indices."""
     copies = _evaluate_unshared(
         lambda: [_broadcast(leaf, width, index) for leaf in array_leaves(record)]
     )
@@ -123,7 +128,8 @@ def broadcast_copy(record: Lanes, width: int, index: Any) -> Lanes:
 
 
 def gather_record(record: Lanes, rows: Any) -> Lanes:
-    """Some lanes of a record. What is the same in all lanes stays one number."""
+    """The lanes of a record at the indices `rows`. A value that all lanes share stays an array of
+    width 1."""
 
     def some(leaf: Any) -> Any:
         return leaf if dr.width(leaf) == 1 else dr.gather(type(leaf), leaf, rows)
@@ -134,11 +140,12 @@ def gather_record(record: Lanes, rows: Any) -> Lanes:
 def compute_on_active(
     mask: Mask, compute: Callable[[Lanes], Result], lanes: Lanes, inactive_result: Result
 ) -> Result:
-    """What `compute` makes of a record's lanes where `mask` is set, `inactive_result` on the
-    others.
+    """Run `compute` on the lanes where `mask` is set, and use `inactive_result` on all others.
 
-    All lanes are evaluated first and last, so that kernels do not depend on how many there are.
-    `inactive_result` is a record like the result.
+    The active lanes are gathered into shorter arrays, and the results are scattered back. Inputs
+    and outputs are evaluated, so that kernels do not depend on the number of active lanes.
+
+    inactive_result: a record with the structure of the result.
     """
     width = dr.width(mask)
     dr.eval(mask, *array_leaves(lanes), *array_leaves(inactive_result))
@@ -159,12 +166,15 @@ def compute_on_active(
 def loop_with_queue(
     start: State, body: Callable[[State], State], result: Callable[[State], Result], label: str
 ) -> Result:
-    """What `result` makes of each lane after `loop_while_active(start, body, label)`, evaluated.
+    """Run `loop_while_active(start, body, label)` for every lane, and return `result` of the final
+    states, evaluated.
 
-    Far fewer lanes run the loop than `start` has: one whose ray has ended writes the result and
-    fetches the next ray from a queue, so that none waits for the slowest ray of its packet.
+    Only a fixed number of lanes run at a time, far fewer than `start` has. A lane whose ray has
+    ended stores its result and takes the next ray from a queue, so that no lane waits for the
+    slowest ray of its packet.
 
-    body: must know of its lane by the state alone, and hold nothing that differs between lanes.
+    body: may depend on the state of its own lane only, and must hold no array that differs between
+        lanes.
     """
     dr.eval(*array_leaves(start))
     width = max(dr.width(leaf) for leaf in array_leaves(start))
@@ -179,7 +189,8 @@ def loop_with_queue(
 
 @dataclass(frozen=True)
 class _QueueLane:
-    """row: in the queue, of the ray that the lane follows. ray: its state."""
+    """A lane that follows rays from the queue. queue_index: of the ray that it follows now. state:
+    the state of that ray."""
 
     queue_index: Any
     state: Any
@@ -193,7 +204,8 @@ def _run_queue(
     start: Any, body: Callable[[Any], Any], result: Callable[[Any], Any],
     rows: Any, total: int, done: list[Any], label: str,
 ) -> None:  # fmt: skip
-    """rows: of the `total` rays in `start` that are to be run. done: where their results go."""
+    """Run the loop of `loop_with_queue`. rows: indices in `start` of the `total` rays to be run.
+    done: arrays into which their results are written."""
     index = cast("Any", type(rows))
     count = dr.opaque(index, total)
     threads = dr.thread_count() if dr.backend_v(rows) == dr.JitBackend.LLVM else 0
@@ -226,16 +238,17 @@ def _run_queue(
 
 
 def _begin_new_scope(array: Any) -> None:
-    """Begin a new scope, as loops do: Dr.Jit looks for equal numbers in one scope only, so that
-    what follows would be another kernel where there was nothing to do."""
+    """Begin a new Dr.Jit scope, as a recorded loop does. Dr.Jit merges equal expressions within a
+    scope only; without this call, the code that follows would compile to another kernel if the loop
+    was skipped."""
     dr.detail.new_scope(dr.backend_v(array))
 
 
 def _evaluate_unshared(make: Callable[[], Any]) -> Any:
-    """What is made, evaluated, in memory of its own.
+    """Evaluate the arrays that `make` returns, in memory that they share with no other array.
 
-    Dr.Jit keeps equal arrays once, and kernels differ by what they share: those for as many lanes
-    as another array has by chance would be compiled anew.
+    Dr.Jit stores equal arrays once, and a kernel depends on which of its inputs are the same array:
+    an accidental match, such as two arrays of the same length, would compile another kernel.
     """
     with dr.scoped_set_flag(dr.JitFlag.ValueNumbering, False):
         made = make()

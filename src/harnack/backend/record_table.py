@@ -1,9 +1,8 @@
 """Tables of numbers on a backend, as records that a kernel reads in packets of eight.
 
-A packet gather fetches eight numbers in one go, which is several times faster than eight gathers,
-if the memory is aligned (`upload_floats` in `backend.arrays` says why that needs care). A loop over
-all
-records is recorded once, whatever their number: another table does not compile another kernel.
+A packet gather fetches eight numbers at once, which is several times faster than eight gathers, if
+the memory is aligned (`upload_floats` in `backend.arrays` says why that needs care). A loop over
+all records is recorded once, whatever their number: another table does not compile another kernel.
 """
 
 from __future__ import annotations
@@ -24,17 +23,19 @@ if TYPE_CHECKING:
 PACKET = 8
 
 LoopValues: TypeAlias = "tuple[Any, ...]"
-# Gives the state with one record, of 8 * packets numbers, taken into account.
+# Takes the 8 * packets_per_record numbers of a record and a state, and returns the next state.
 RecordBody: TypeAlias = "Callable[[list[Real], LoopValues], LoopValues]"
 
 
 @dataclass(frozen=True)
 class RecordTable:
-    """Rows of a table, each filled up with zeros to whole packets.
+    """A table on a backend, each row (record) padded with zeros to a multiple of eight numbers
+    (packets).
 
-    packets_per_record: of a record. at_once: records a trip of the loop over all of them. trips: of
-        that loop.
-    first_record: the record that counts as the first; None for that of the table.
+    packets_per_record: how many packets a record has.
+    records_per_iteration: how many records an iteration of `for_each` reads.
+    iteration_count: the number of iterations of that loop.
+    first_record: the index, per lane, of the record to start at; None for the first of the table.
     """
 
     backend: Backend
@@ -49,11 +50,16 @@ class RecordTable:
         cls, backend: Backend, table: npt.NDArray[Any], padding_row: npt.NDArray[Any] | None = None,
         at_once: int = 1,
     ) -> RecordTable:  # fmt: skip
-        """The rows (n, c) of a table, rounded to the backend's precision.
+        """Upload a table (n, c), rounded to the backend's precision.
 
-        empty_record: (c,) a row that does no harm, which makes the last trip whole: needed where
-            at_once is more than 1.
-        Rows are filled up by Dr.Jit, on many threads and without another copy in NumPy.
+        padding_row: (c,) a row without effect, repeated until `at_once` divides the number of rows.
+            Needed only if it does not.
+        at_once: how many records an iteration of `for_each` reads.
+
+        Rows are padded with zeros by Dr.Jit, on many threads and without another copy in NumPy.
+
+        Raises:
+            ValueError: padding_row is needed and is None.
         """
         trips = -(-len(table) // at_once)
         missing = trips * at_once - len(table)
@@ -73,8 +79,12 @@ class RecordTable:
         return cls(backend, copy, padded // PACKET, at_once, dr.opaque(backend.UInt32, trips))
 
     def view(self, first: Any, trips: Any) -> RecordTable:
-        """So many records from `first_record` on, others in each lane, of a table read one at a
-        time."""
+        """A view of `trips` consecutive records that begins at record `first`; both may differ
+        between lanes. Only for tables with a single record per iteration.
+
+        Raises:
+            ValueError: an iteration reads several records.
+        """
         if self.records_per_iteration != 1:
             raise ValueError(
                 f"records are read {self.records_per_iteration} at once: no part can be taken"
@@ -82,7 +92,7 @@ class RecordTable:
         return replace(self, first_record=first, iteration_count=trips)
 
     def read_record(self, i: Any, active: Mask = True) -> list[Real]:
-        """The numbers of record i, fetched where active."""
+        """The numbers of record i, padding included, fetched on active lanes only."""
         numbers: list[Real] = []
         i = i if self.first_record is None else i + self.first_record
         for k in range(self.packets_per_record):
@@ -94,9 +104,9 @@ class RecordTable:
     def for_each(
         self, body: RecordBody, state: LoopValues, label: str, active: Mask = True
     ) -> LoopValues:
-        """The state after `body` of all records, one after the other, on lanes that are active.
+        """The state after `body` was applied to all records in turn, on active lanes only.
 
-        Lanes that are not cost nothing where their neighbors are not either.
+        Inactive lanes cost nothing where all lanes of their packet are inactive.
         """
         trips = (
             self.iteration_count if active is True else dr.select(active, self.iteration_count, 0)

@@ -1,16 +1,14 @@
-"""Tensors (n, 3) and (n,), in which arrays of other frameworks reach Dr.Jit; functions for PyTorch
-and JAX.
+"""Conversions between tensors (n, 3) or (n,), in which arrays of other frameworks reach Dr.Jit, and
+vectors; functions for PyTorch and JAX.
 
-`drjit.wrap` gives a function tensors and takes back tensors, while what is computed here runs on
-vectors, a lane a row. All conversions pass derivatives on, in both directions. `wrap_for_jax` is
-the direction of `drjit.wrap` that Dr.Jit lacks. `wrap_for_torch` is one that it has, without its
-silent zeros: derivatives that are not there raise, and a graph can be gone back through again.
+`drjit.wrap` gives a function tensors and takes back tensors, while this package computes with
+vectors, a lane for each row. All conversions pass derivatives on, in both directions.
+`wrap_for_jax` is the direction of `drjit.wrap` that Dr.Jit lacks. `wrap_for_torch` is a direction
+that Dr.Jit has, without its silent zeros: missing derivatives raise an error, and the backward pass
+may be repeated. Neither framework is imported before it is used.
 
-Other frameworks come in as tensors, the shape in which `drjit.wrap` hands arrays over, and
-`wrap_for_jax` there is the one direction that it lacks; `wrap_for_torch` is one that it has,
-without its zeros for derivatives that are not there. Neither framework is imported before it is
-used. What moves from step to step of an optimization is data too: literals with derivatives are
-made kernel parameters, and curves whose vertices are Dr.Jit arrays do not choose proofs or hulls by
+Numbers that change from step to step of an optimization are data: literals with derivatives become
+kernel parameters, and curves whose vertices are Dr.Jit arrays do not choose proofs or hulls by
 their shape.
 """
 
@@ -58,7 +56,8 @@ def tensor_to_vectors(
 
 
 def tensor_to_array(tensor: Any, name: str = "values") -> Real:
-    """All numbers of a tensor, row by row; a TypeError if these are no 32- or 64-bit floats."""
+    """All numbers of a tensor, row by row. Raises TypeError if they are not 32- or 64-bit
+    floats."""
     array = tensor.array
     try:
         return backend_of(array).Float(array)
@@ -67,9 +66,10 @@ def tensor_to_array(tensor: Any, name: str = "values") -> Real:
 
 
 def array_to_tensor(array: Any, shape: tuple[int, ...]) -> Any:
-    """A Dr.Jit array as a tensor of a shape, a 3-vector as one of shape (*shape, 3).
+    """A Dr.Jit array as a tensor of a shape, or a 3-vector as a tensor of shape (*shape, 3).
 
-    What is the same in all lanes is repeated. Counts become signed, as PyTorch has no others.
+    A value that all lanes share is repeated. Unsigned integers become signed, since PyTorch has no
+    unsigned ones.
     """
     kind = cast("Any", type(array))
     count = math.prod(shape)
@@ -84,7 +84,7 @@ def array_to_tensor(array: Any, shape: tuple[int, ...]) -> Any:
 
 
 def accepts_tensors(method: Method) -> Method:
-    """The same method of points, which also takes a tensor of points and then gives tensors."""
+    """Extend a method of points: it also takes a tensor of points, and then returns tensors."""
 
     @functools.wraps(method)
     def general(self: Any, points: Any, **settings: Any) -> Any:
@@ -277,8 +277,8 @@ def wrap_for_jax(
 
 
 def _run(jax: Any, function: Callable[..., Any], *args: Any) -> Any:
-    """The result of `function` as JAX arrays. Derivatives are enabled in any case, since hits are
-    polished to rounding where they are: so the result is the same with `jax.grad` and without."""
+    """The result of `function` as JAX arrays. Derivatives are always enabled: hits are polished to
+    rounding where they are enabled, so that the result is the same with `jax.grad` and without."""
     outputs = function(*jax.tree.map(_differentiable_tensor, args))
     return jax.tree.map(_as_jax, outputs)
 

@@ -1,7 +1,7 @@
-"""Numbers that a caller gives, alone or in NumPy arrays: the checks that all of them pass.
+"""Checks of the numbers that a caller passes, alone or in NumPy arrays.
 
-Checks of arrays raise the error class of whoever asks, in one wording. Counts and units, which
-differ between curves, meshes and clouds, are checked where those are.
+Checks of arrays raise the error class of the calling code, in the same wording everywhere. Limits
+that differ between curves, meshes and clouds are checked by their own modules.
 """
 
 from __future__ import annotations
@@ -43,11 +43,11 @@ def as_real_array(
     ragged: str = "must be a rectangular array of numbers, not ragged",
     other: str = "must hold real numbers",
 ) -> npt.NDArray[Any]:
-    """The values as an array of integers or floats, which may be the array given itself.
+    """The values as an array of integers or floats; it may be the same array, not a copy.
 
-    type_error: raised for what is no real number, if not `error`.
-    ragged, other: what messages say, behind `name`, of rows of different lengths and of what is no
-        real number.
+    type_error: the class raised for values that are no real numbers, if it is not `error`.
+    ragged, other: the text of messages, behind `name`, about rows of different lengths and about
+        values that are no real numbers.
     """
     check_no_derivatives(name, values)
     try:
@@ -84,8 +84,8 @@ def check_vectors(
 def check_finite(
     rows: FloatArray, name: str, error: type[Exception], advice: str = "coordinates must be finite"
 ) -> None:
-    """Check that all numbers of an array (n, k) are finite. name: of a row, with {} for its
-    index."""
+    """Check that all numbers of an array (n, k) are finite. name: the name of a row, with {} for
+    its index."""
     bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
     if bad.size:
         raise error(
@@ -106,15 +106,15 @@ def format_vector(row: FloatArray) -> str:
 
 
 def others_suffix(count: int) -> str:
-    """What a message about the first of `count` entries says of the others."""
+    """The end of a message about the first of `count` entries: how many others there are."""
     return f" (and {count - 1:,} more)" if count > 1 else ""
 
 
 def check_no_derivatives(name: str, *values: Any) -> None:
-    """Check that nothing carries derivatives, where they would be dropped.
+    """Check that no value carries derivatives, for code that would drop them.
 
     Raises:
-        NotImplementedError: something does (`has_derivatives`). The message starts with `name`.
+        NotImplementedError: a value does (`has_derivatives`). The message starts with `name`.
     """
     if has_derivatives(values):
         raise NotImplementedError(
@@ -126,8 +126,8 @@ def check_no_derivatives(name: str, *values: Any) -> None:
 
 
 def no_derivatives(function: Function) -> Function:
-    """The same function, which refuses arguments that carry derivatives (`check_no_derivatives`):
-    for those that make other numbers of them."""
+    """Decorate a function that would drop derivatives: the decorated function refuses arguments
+    that carry them (`check_no_derivatives`)."""
 
     @functools.wraps(function)
     def checked(*given: Any, **named: Any) -> Any:
@@ -138,8 +138,8 @@ def no_derivatives(function: Function) -> Function:
 
 
 def has_derivatives(value: Any) -> bool:
-    """Whether a value is, or holds, an array with derivatives enabled: one of Dr.Jit or of PyTorch,
-    in containers, in what functions refer to, and in attributes of fields, of what can be called,
+    """Whether a value is, or contains, a Dr.Jit or PyTorch array with derivatives enabled.
+    Containers are searched, objects that functions refer to, and attributes of fields, of callables
     and of dataclasses."""
     seen: set[int] = set()
     left: list[Any] = [value]
@@ -161,8 +161,9 @@ def has_derivatives(value: Any) -> bool:
 
 
 def is_plain_data(value: Any) -> bool:
-    """Whether a value holds numbers of Python and NumPy, in tuples, dictionaries and dataclasses of
-    this package, and nothing that may get derivatives later: no Dr.Jit array, no function."""
+    """Whether a value is plain data: Python's and NumPy's numbers, strings and arrays, in tuples,
+    dictionaries and dataclasses of this package. Plain data can never carry derivatives; Dr.Jit
+    arrays and functions can."""
     left: list[Any] = [value]
     for one in left:  # which grows
         kind = cast("Any", type(one))
@@ -180,8 +181,8 @@ def is_plain_data(value: Any) -> bool:
 
 
 def make_read_only(value: Any) -> None:
-    """Let nobody write to the arrays of NumPy that a value holds, in tuples, lists, dictionaries
-    and dataclasses of this package."""
+    """Make the NumPy arrays in a value read-only: those in its tuples, lists, dictionaries and
+    dataclasses of this package."""
     if isinstance(value, np.ndarray):
         cast("npt.NDArray[Any]", value).setflags(write=False)
     elif isinstance(value, tuple | list):
@@ -220,7 +221,8 @@ def _contained_values(value: Any) -> list[Any]:
 
 
 def format_short(value: Any) -> str:
-    """A value as a line has room for it: arrays by their shapes, long lists by their lengths."""
+    """A short text for a value in a message: arrays by their shapes, long lists by their
+    lengths."""
     if isinstance(value, float):  # of NumPy too
         return f"{value:.6g}"
     if isinstance(value, np.ndarray):
@@ -241,16 +243,16 @@ def format_short(value: Any) -> str:
 
 
 def is_same_or_equal(a: Any, b: Any) -> bool:
-    """Whether two values are one, or equal numbers, texts or tuples of these."""
+    """Whether two values are the same object, or equal numbers, texts or tuples of these."""
     plain = (int, float, str, tuple)
     return a is b or (isinstance(a, plain) and isinstance(b, plain) and bool(np.all(a == b)))
 
 
 def as_real(value: Any, name: str) -> float:
-    """A number of Python or NumPy, as a float; infinities and NaN too.
+    """A number of Python or NumPy as a float; infinities and NaN are allowed.
 
     Raises:
-        TypeError: it is none.
+        TypeError: it is not a number.
     """
     try:
         return float("none" if isinstance(value, str | bytes | bool | np.bool_) else value)
@@ -259,10 +261,10 @@ def as_real(value: Any, name: str) -> float:
 
 
 def as_positive(value: Any, name: str) -> float:
-    """A positive finite number.
+    """A positive finite number as a float.
 
     Raises:
-        TypeError: it is no number. ValueError: it is another one.
+        TypeError: it is not a number. ValueError: it is not positive and finite.
     """
     number = as_real(value, name)
     if not 0.0 < number < math.inf:
@@ -271,10 +273,10 @@ def as_positive(value: Any, name: str) -> float:
 
 
 def as_finite(value: Any, name: str) -> float:
-    """A finite number.
+    """A finite number as a float.
 
     Raises:
-        TypeError: it is no number. ValueError: it is another one.
+        TypeError: it is not a number. ValueError: it is not finite.
     """
     number = as_real(value, name)
     if not math.isfinite(number):
@@ -286,7 +288,7 @@ def as_integer_in_range(value: Any, name: str, minimum: int, maximum: int) -> in
     """An integer from `minimum` to `maximum`.
 
     Raises:
-        ValueError: it is none.
+        ValueError: it is not an integer in that range.
     """
     try:
         number = minimum - 1 if isinstance(value, bool | np.bool_) else operator.index(value)
@@ -310,10 +312,10 @@ def flag(value: Any, name: str) -> bool:
 
 
 def integer(value: Any, name: str) -> int:
-    """A whole number of any size.
+    """An integer of any size.
 
     Raises:
-        TypeError: it is none.
+        TypeError: it is not an integer.
     """
     try:
         return operator.index(cast("Any", None if isinstance(value, bool | np.bool_) else value))

@@ -1,4 +1,4 @@
-"""The arguments of the command `harnack`: how they are read, and the messages about wrong ones."""
+"""The argument parser of the command `harnack`, and its messages about wrong arguments."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
 
 
 def parsers() -> tuple[_Parser, dict[str, _Parser]]:
-    """The parser of the whole line, and those of what follows each command."""
+    """The parser of the whole command line, and the parsers of the commands by name."""
     whole = _Parser(
         prog="harnack", description="Guaranteed ray tracing of harmonic and other surfaces."
     )

@@ -20,7 +20,8 @@ MESH_FILES = (".stl", ".ply", ".obj", ".glb", ".3mf")
 
 
 def check_mesh_path(path: str | os.PathLike[str]) -> Path:
-    """The path of a mesh that is to be written, with all that can be said early.
+    """The path of a mesh to be written, with every check that is possible before the mesh is
+    computed.
 
     Raises:
         ValueError: an extension that is none of a mesh.

@@ -1,6 +1,6 @@
-"""What a command prints of errors and names, and Ctrl-C while it runs.
+"""The messages of the command line: errors, names, and the handling of Ctrl-C while a command runs.
 
-Errors and names are printed on one line, in the words of the command line.
+Errors and names are printed on a single line, in the terms of the command line.
 """
 
 from __future__ import annotations
@@ -45,7 +45,8 @@ class Interrupts:
 
 @contextmanager
 def track_interrupts() -> Generator[Interrupts]:
-    """Keeps account of Ctrl-C within the block, where signals can be handled (the main thread)."""
+    """Context manager that records Ctrl-C within the block, where signals can be handled (the main
+    thread)."""
     interrupts = Interrupts()
     if threading.current_thread() is not threading.main_thread():
         yield interrupts
@@ -62,7 +63,8 @@ def track_interrupts() -> Generator[Interrupts]:
 
 @contextmanager
 def print_warnings() -> Generator[None]:
-    """What is warned of within the block is printed on a line, in the words of the command line."""
+    """Context manager that prints each warning of the block on a single line, in the terms of the
+    command line."""
     with warnings.catch_warnings():
         shown = warnings.showwarning
 
@@ -135,7 +137,8 @@ def _explanation(error: Exception) -> str:
 
 
 def python_to_cli_terms(text: str) -> str:
-    """A message of the library, with options of the command line for arguments of Python."""
+    """A message of the library, reworded: options of the command line in place of arguments of
+    Python."""
     for written, option in _CLI_PHRASES.items():
         text = text.replace(written, option)
     text = _PARAMETER.sub(r"--set \1=1", text)

@@ -1,7 +1,7 @@
-"""Work in parts: on the workers of a Dask cluster, with finished parts kept in a folder.
+"""Jobs split into tasks that run on the workers of a Dask cluster; results are kept in a folder.
 
-`packing` makes bytes of an object, and a name from what is in it; `parts` has parts of a task done
-and keeps them; `workers` checks that a cluster's workers can do them; `lazy` evaluates fields at
-the points of Dask arrays, and `zarr_files` writes what comes of it. Nothing here knows a field or a
-picture. Dask is imported only by those who ask for it: `pip install harnack[cluster]`.
+`serialization` turns an object into bytes and computes a digest of its contents; `executor` runs
+tasks and keeps their results; `workers` checks that a cluster's workers can run them; `dask_arrays`
+evaluates fields at the points of Dask arrays, and `zarr_files` writes the results. Nothing here
+knows a field or a picture. Dask is imported only on demand: `pip install harnack[cluster]`.
 """

@@ -1,4 +1,4 @@
-"""Dask arrays of points and rays: what is asked of them is computed block by block, when it is
+"""Functions of points and rays applied to Dask arrays, computed block by block when the result is
 needed."""
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def is_dask_array(value: Any) -> bool:
-    """Whether a value is a Dask array; Dask is not imported to tell."""
+    """Whether a value is a Dask array; this does not import Dask."""
     return type(value).__module__.startswith("dask.array") and hasattr(value, "dask")
 
 
 def accepts_dask_arrays(*names: str) -> Callable[[Function], Function]:
-    """A decorator of a function or method of points or rays: where one of the named arguments is a
-    Dask array, the results are Dask arrays, whose blocks are the function's results for the blocks
-    of the arguments. What else it is given, such as a field, is sent to each worker once.
+    """Return a decorator of a function or method of points or rays: if one of the named arguments
+    is a Dask array, the results are Dask arrays, whose blocks are the function's results for the
+    blocks of the arguments. Other arguments, such as a field, are sent to each worker once.
 
-    It is the outermost decorator, since workers find the function by its name.
+    It must be the outermost decorator, since workers look the function up by its name.
     """
 
     def decorate(function: Function) -> Function:
@@ -49,7 +49,7 @@ def accepts_dask_arrays(*names: str) -> Callable[[Function], Function]:
 
 
 def _map_blocks(call: Callable[..., Any], names: tuple[str, ...], arguments: dict[str, Any]) -> Any:
-    """What `call` gives for arguments, some of which are Dask arrays."""
+    """The Dask arrays that result from `call` for arguments that contain Dask arrays."""
     what = "Dask arrays"
     delayed = import_optional("dask", what).delayed
     array = import_optional("dask.array", what)
@@ -87,7 +87,8 @@ def _map_blocks(call: Callable[..., Any], names: tuple[str, ...], arguments: dic
 
 
 def _align_blocks(array: Any, lazy: dict[str, Any], others: Mapping[str, Any]) -> dict[str, Any]:
-    """Dask arrays, and what else has an entry for each of their rows, in the same blocks of rows.
+    """Dask arrays, and other arrays with an entry for each of their rows, cut into the same blocks
+    of rows.
 
     Raises:
         ValueError: their lengths differ or are not known.

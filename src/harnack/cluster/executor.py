@@ -1,16 +1,16 @@
-"""A task in parts, done here or by a cluster; finished parts are kept in a folder if one is named.
+"""Jobs as tasks that run in this process or on a Dask cluster; results may be kept in a checkpoint
+folder.
 
-Parts are named by what they are made of, so that a folder can be used again after a crash, with
-other workers, or for a film with more frames: what is there is not done again, and what belongs to
-something else is not touched.
+Each task is named by a hash of its contents, files and users' code included, without cached values
+(`serialization`, `users_code`). So a checkpoint folder needs no book-keeping: it can be used again
+after a crash, with other workers, or for a film with more frames. Finished tasks are not repeated,
+and files of other jobs are not touched.
 
-Work in parts has one path. Pictures were drawn band by band already; who does a band, this
-process or Dask's workers, is all that differs (`shading`, `RenderExecutor`), so that the result is
-the same bit for bit. What needs the whole picture (hidden sky, outlines) is done where the picture
-is put together. Parts are named by a hash of what they are made of, files and users' code included,
-without what objects only remember (`serialization`, `users_code`): a folder of parts needs no
-book-keeping. A surface is sent as a task and not as data in a worker's memory, which would be lost
-with it.
+There is a single path for all jobs. A picture is computed band by band in any case; only the place
+where a band is computed, this process or Dask's workers, differs (`shading`, `RenderExecutor`), so
+that the result is the same bit for bit. Steps that need the whole picture (hidden sky, outlines)
+run where the picture is put together. A surface is sent as a Dask task, and not as data in a
+worker's memory, which would be lost with the worker.
 """
 
 from __future__ import annotations
@@ -42,30 +42,30 @@ from harnack.cluster.workers import (
 from harnack.files.file_geometry import check_writable, write_atomically
 
 TaskResult = dict[str, npt.NDArray[Any]]
-"""What a part gives, by name, and all of it: it is sent and kept as plain numbers."""
+"""The result of a task: arrays by name, and nothing else. They are sent and stored as they are."""
 TaskFunction = Callable[..., TaskResult]
 
-# Parts in the hands of the cluster for each of its threads. More hide the time that messages take;
-# results wait in the memory of workers.
+# Tasks that the cluster holds at a time for each of its threads. More of them hide the time that
+# messages take, but results wait in the memory of workers.
 _PENDING_PER_THREAD = 3
-# Parts that a task is cut into for each thread, so that all end at about the same time.
+# Tasks that a job is split into for each thread, so that all threads end at about the same time.
 _TASKS_PER_THREAD = 6
-# Seconds between two looks at what is done, and without a worker until a warning says so.
+# Seconds between two queries for finished tasks; and without a worker, until a warning says so.
 _POLL_SECONDS, _NO_WORKER_SECONDS = 0.005, 20.0
 
 
 @dataclass(frozen=True)
 class CheckpointFolder:
-    """Finished parts, a file of arrays for each."""
+    """A folder of the results of finished tasks, a file of arrays for each."""
 
     path: Path
 
     @classmethod
     def open(cls, path: str | os.PathLike[str]) -> CheckpointFolder:
-        """A folder, made if it is not there.
+        """Open a folder; it is created if it does not exist.
 
         Raises:
-            OSError: it cannot be made, or no file can be created in it.
+            OSError: it cannot be created, or no file can be created in it.
         """
         folder = Path(path)
         try:
@@ -76,7 +76,7 @@ class CheckpointFolder:
         return cls(folder)
 
     def load(self, name: str) -> TaskResult | None:
-        """The arrays of a part, None if it is not there.
+        """The result of the task with this name, None if it is not in the folder.
 
         Raises:
             ValueError: the file is damaged.
@@ -93,11 +93,11 @@ class CheckpointFolder:
             ) from None
 
     def has(self, name: str) -> bool:
-        """Whether a part is there."""
+        """Whether the result of the task with this name is in the folder."""
         return self._file(name).exists()
 
     def save(self, name: str, arrays: TaskResult) -> None:
-        """Write the arrays of a part."""
+        """Write the result of the task with this name."""
         with write_atomically(self._file(name)) as partial:
             np.savez(partial, allow_pickle=False, **arrays)
 
@@ -107,10 +107,11 @@ class CheckpointFolder:
 
 @dataclass(frozen=True)
 class Executor:
-    """Who does the parts of tasks (`open_executor`).
+    """Runs the tasks of jobs (`open_executor`).
 
-    client: a Dask client, None for this process. folder: where finished parts are kept, None for
-    nowhere. tiles: how many parts a task is cut into, None for as many as suit the workers.
+    client: a Dask client, None for this process.
+    checkpoint: the folder in which results are kept, None for none.
+    chunks: the number of tasks that a job is split into, None for a number that suits the workers.
     """
 
     client: Any = None
@@ -118,7 +119,8 @@ class Executor:
     chunks: int | None = None
 
     def split_range(self, count: int, most: int) -> list[tuple[int, int]]:
-        """(start, stop) of runs of things that are counted from 0, at most `most` a run."""
+        """Split range(count) into runs (start, stop) of at most `most` items. The runs are shorter
+        if `chunks`, or else the number of the client's threads, asks for more tasks."""
         size = max(1, min(most, count))
         if self.chunks is not None:
             size = max(1, min(size, -(-count // self.chunks)))
@@ -129,10 +131,13 @@ class Executor:
     def run_tasks(
         self, job: Any, step: str, parts: Sequence[tuple[Any, ...]]
     ) -> Iterator[TaskResult]:
-        """What the method `step` of a job gives for the arguments of each part, in their order.
+        """Call the method named `step` of a job with the arguments of each part, and yield the
+        results in the order of the parts.
 
         job: what `SerializedObject.serialize` takes. It is sent to each worker once, and opened
             there once.
+
+        Raises what the method raises.
         """
         if self.client is None and self.checkpoint is None:
             do: TaskFunction = getattr(job, step)
@@ -164,7 +169,9 @@ class Executor:
 def open_executor(
     client: Any = None, checkpoint: Any = None, tiles: int | None = None
 ) -> Generator[Executor]:
-    """A crew, from the arguments of those who have something done.
+    """Context manager that yields an Executor. client: a Dask client, the address of a scheduler,
+    or None for this process. checkpoint: the path of a folder, or None. tiles: the number of tasks
+    of a job, or None.
 
     Raises:
         ModuleNotFoundError, TypeError, OSError, RuntimeError: as `connect_client` and
@@ -179,28 +186,29 @@ def open_executor(
 
 
 class _LocalTasks:
-    """Parts that this process does, one after the other."""
+    """Runs tasks in this process, one after the other."""
 
     def __init__(self, packed: SerializedObject, step: str) -> None:
         self.do: TaskFunction = getattr(packed.deserialize(), step)
         self.waiting: list[tuple[str, tuple[Any, ...]]] = []
 
     def submit(self, name: str, part: tuple[Any, ...]) -> None:
-        """Have a part done."""
+        """Add a task to those to be run."""
         self.waiting.append((name, part))
 
     def next_completed(self) -> tuple[str, TaskResult]:
-        """The name and the arrays of a part that is done."""
+        """Run the next task, and return its name and its result."""
         name, part = self.waiting.pop(0)
         return name, self.do(*part)
 
     def cancel(self) -> list[tuple[str, TaskResult]]:
-        """Forget what is not done; what is done and nobody asked for."""
+        """Return (name, result) of tasks that are finished but were not fetched: none."""
         return []
 
 
 class _DaskTasks:
-    """Parts that workers do. A lost worker's parts go to others: Dask sees to that."""
+    """Runs tasks on the workers of a Dask cluster. Dask gives the tasks of a lost worker to
+    others."""
 
     def __init__(self, client: Any, packed: SerializedObject, step: str) -> None:
         distributed = import_optional("distributed", "client")
@@ -216,16 +224,19 @@ class _DaskTasks:
             self.packed = client.submit(_identity, packed, key=f"harnack-{packed.content_hash}")
 
     def submit(self, name: str, part: tuple[Any, ...]) -> None:
-        """Have a part done."""
+        """Send a task to the cluster."""
         future = self.client.submit(_run_task, self.packed, self.step, part, key=name)
         self.names[future] = name
         self.completed.add(future)
 
     def next_completed(self) -> tuple[str, TaskResult]:
-        """The name and the arrays of a part that is done.
+        """Wait for a finished task, and return its name and its result.
 
-        Raises what the part raised; RuntimeError: it took several workers with it, or the scheduler
-        is gone.
+        Raises what the task raised.
+
+        Raises:
+            RuntimeError: several workers were lost while they ran the task, or the scheduler is
+                gone.
         """
         self._wait()
         future = next(self.completed)
@@ -247,7 +258,7 @@ class _DaskTasks:
         return name, arrays
 
     def _wait(self) -> None:
-        """Until a part is done. A warning says if nobody is there to do one."""
+        """Wait until a task is finished. Warns if there is no worker to run any."""
         alone_since, warned = None, False
         look_again = time.monotonic() + 1
         while not self.completed.has_ready():
@@ -265,10 +276,11 @@ class _DaskTasks:
                 warnings.warn("the cluster has no worker: this waits for one", stacklevel=2)
 
     def cancel(self) -> list[tuple[str, TaskResult]]:
-        """Forget what is not done; what is done and nobody asked for."""
+        """Cancel unfinished tasks, and return (name, result) of tasks that are finished but were
+        not fetched."""
         ready = [one for one in self.names if one.status == "finished"]
         found: list[tuple[str, TaskResult]] = []
-        # Without a scheduler there is nobody to ask; what is raised already says so.
+        # Without a scheduler there are no results to fetch; the error that is raised says so.
         with suppress(OSError, TimeoutError, asyncio.CancelledError, self.scheduler_lost):
             self.client.cancel([one for one in self.names if one.status != "finished"])
             for one in ready:
@@ -285,9 +297,10 @@ def _ordered_results(
     doing: _LocalTasks | _DaskTasks,
     ahead: Callable[[], int],
 ) -> Iterator[TaskResult]:
-    """The arrays of parts in their order, several of which are done at the same time.
+    """The results of tasks in their order, while several of them run at the same time.
 
-    A part that occurs several times is done once.
+    A task that occurs several times is run once. ahead: gives the largest number of tasks that may
+    be submitted or waiting to be yielded.
     """
     found: dict[str, TaskResult] = {}
     waiting: set[str] = set()
@@ -332,7 +345,8 @@ def _identity(packed: SerializedObject) -> SerializedObject:
 def _run_task(
     packed: SerializedObject, step: str, part: tuple[Any, ...]
 ) -> tuple[TaskResult, str, str]:
-    """A part, done by this worker; the worker's address, and its `rounding_fingerprint`."""
+    """Run a task on this worker. Returns its result, the worker's address, and its
+    `rounding_fingerprint`."""
     with exclusive_compute() as address:
         do: TaskFunction = getattr(packed.deserialize(), step)
         return do(*part), address, rounding_fingerprint()

@@ -1,14 +1,15 @@
-"""Objects as bytes to send, and names that say what is in them.
+"""Objects as bytes to be sent, and digests of their contents.
 
-What an object has only computed and remembers is left out: it would be sent for nothing, and two
-equal objects would differ. It is what `functools.cached_property` and a `TransientCache` keep, and
-private fields of dataclasses that are not compared.
+Cached values are left out: they would be sent for nothing, and would make equal objects differ.
+These are the values of `functools.cached_property` and of a `TransientCache`, and private fields of
+dataclasses that are not compared.
 
-Functions and classes are sent by name if they are part of Python or of an installed package. Those
-of users are sent themselves, with what they name of users' modules (`users_code.py`). They are
-named by what they do, so that the same program, started again, finds what it did: not by the lines
-on which they stand, nor by the numbers that cloudpickle gives them. Nor are these numbers sent: by
-them, what is opened here would replace the methods of the classes of this process.
+Functions and classes of Python and of installed packages are sent by name. Those of users are sent
+by value, with the attributes of users' modules that they use (`users_code.py`). Their digest
+depends on what they do, and neither on their line numbers nor on the ids that cloudpickle
+generates, so that the same program, started again, finds its earlier results. These ids are not
+sent either: with them, an object that is opened in the same process would replace the methods of
+its classes.
 """
 
 from __future__ import annotations
@@ -65,7 +66,7 @@ _MISSING = (
 
 
 def import_optional(name: str, what: str) -> Any:
-    """A module that the extra `cluster` brings.
+    """Import a module that the extra `cluster` installs.
 
     Raises:
         ModuleNotFoundError: it is not installed. The message says that `what` needs it.
@@ -84,7 +85,8 @@ def package_versions() -> str:
 
 
 class TransientCache(dict[Key, Value]):
-    """Results that an object keeps by what they were asked for; it is packed and copied empty."""
+    """A cache that an object keeps for itself: a dictionary that is empty in copies and pickles of
+    the object."""
 
     def __reduce__(self) -> Any:
         return TransientCache, ()
@@ -92,11 +94,15 @@ class TransientCache(dict[Key, Value]):
 
 @dataclass(frozen=True)
 class SerializedObject:
-    """An object as bytes. name: 32 hexadecimal digits, the same for what is made of the same
-    numbers by the same versions of this library, of `package_versions` and of `others`. files:
-    which it names, and what is in them. package_versions: `package_versions` where it was packed.
-        others: installed packages
-    that it uses, and their versions there."""
+    """A pickled object.
+
+    content_hash: 32 hexadecimal digits, equal for equal contents and equal versions of this
+        library, of `package_versions` and of `others`.
+    data: the pickle.
+    file_digests: (path, digest) of each file that the object names.
+    package_versions: the versions where it was pickled; `deserialize` refuses others.
+    others: (name, version) of other installed packages that it uses.
+    """
 
     content_hash: str
     data: bytes
@@ -106,11 +112,11 @@ class SerializedObject:
 
     @classmethod
     def serialize(cls, thing: Any, what: str) -> SerializedObject:
-        """Pack an object.
+        """Pickle an object.
 
         Raises:
             ModuleNotFoundError: the extra `cluster` is not installed.
-            TypeError: it cannot be packed. The messages begin with `what`.
+            TypeError: the object cannot be pickled. The messages begin with `what`.
         """
         name, naming = _hash_and_files(thing, what)
         data = _written(_cacheless_pickler, thing, what).file.getvalue()
@@ -118,12 +124,12 @@ class SerializedObject:
         return cls(name, data, tuple(files), package_versions(), tuple(others))
 
     def deserialize(self) -> Any:
-        """The object. The same one as long as it is among the last that were opened here, so that
-        what it has prepared is not prepared again.
+        """The object. It is the same object as at the last call, as long as it is among the objects
+        opened last in this process, so that its prepared data is used again.
 
         Raises:
-            RuntimeError: it was packed by other versions of packages than there are here.
-            ValueError: a file that it names is another one here.
+            RuntimeError: it was pickled with other versions of packages than are installed here.
+            ValueError: a file that it names has other contents here.
         """
         return _deserialize_cached(self)
 
@@ -151,11 +157,11 @@ def _deserialize_cached(packed: SerializedObject) -> Any:
 
 
 def content_hash(thing: Any, what: str) -> str:
-    """32 hexadecimal digits that depend on all that is in an object and in the files that it names,
-    and on the versions of `package_versions`.
+    """32 hexadecimal digits that depend on everything an object contains, on the contents of the
+    files that it names, and on `package_versions`.
 
-    Each object is written out wherever it occurs, so that it does not matter which of several equal
-    ones are the same object.
+    Each object is written out wherever it occurs, so that the digest does not depend on which of
+    several equal objects are the same object.
 
     Raises:
         ModuleNotFoundError, TypeError: as `SerializedObject.serialize`.
@@ -164,7 +170,8 @@ def content_hash(thing: Any, what: str) -> str:
 
 
 def _hash_and_files(thing: Any, what: str, words: frozenset[str] = frozenset()) -> tuple[str, Any]:
-    """The name of an object, and the pickler that wrote down what it is made of."""
+    """The content hash of an object, and the pickler that wrote it, which has noted files and
+    packages."""
     try:
         pickler = _written(_hashing_pickler, thing, what, words, fast=True)
     except (RecursionError, TypeError, ValueError):  # an object that holds itself
@@ -179,10 +186,10 @@ def _written(
     kind: Callable[[Any], Any], thing: Any, what: str, words: frozenset[str] = frozenset(), *,
     fast: bool = False,
 ) -> Any:  # fmt: skip
-    """The pickler of a kind, after it has written an object into its `file`.
+    """A pickler of a kind, after it has written an object into its `file`.
 
-    What is named of modules is known when all code was written. So it writes again until nothing
-    is missing, which ends, since there are so many names in the code.
+    Which attributes of modules are needed is known only when all code was written. So the object is
+    written again until no name is missing; this ends, since the code has finitely many names.
     """
     cloudpickle = import_optional("cloudpickle", what)
     while True:
@@ -247,10 +254,12 @@ _CachedFunction = type(functools.cache(_cached_property))
 
 @functools.cache
 def _cacheless_pickler(base: Any) -> Callable[..., Any]:
-    """cloudpickle's class, which knows functions too, without what objects remember.
+    """Return a class derived from cloudpickle's Pickler that leaves out cached values (module
+    docstring) and sends functions of users.
 
-    words: names in the code of users. modules: those of users that were met, with the words of
-    then. spaces: where functions of a module look for names.
+    Attributes of its objects: words, names that occur in users' code. modules: the users' modules
+    that were met, with the words known at that time. spaces: where the functions of a module look
+    up names.
     """
 
     class Lean(base):
@@ -309,8 +318,8 @@ def _cacheless_pickler(base: Any) -> Callable[..., Any]:
 
 
 def _without_number(reduced: Any) -> Any:
-    """How a class is made anew, without the number by which cloudpickle finds what it made of it
-    before: it would set the methods of that."""
+    """The recipe of a class without the id by which cloudpickle finds a class that it made before:
+    it would replace the methods of that class."""
     if not isinstance(reduced, tuple):
         return reduced
     make, arguments, *rest = cast("tuple[Any, ...]", reduced)
@@ -343,10 +352,12 @@ def _not_by_name(obj: Any) -> Any:
 
 @functools.cache
 def _hashing_pickler(base: Any) -> Callable[..., Any]:
-    """The same without all that differs when a program is started again, and with what is in the
-    files that are named.
+    """Return a pickler class whose output is only hashed. It omits what changes from run to run
+    (line numbers, ids that cloudpickle generates, the order of sets), and adds a digest of each
+    file that a string or a path names.
 
-    files: a digest of each. others: versions of installed packages that are used.
+    Attributes of its objects: files, the digest of each file. others: the versions of the installed
+    packages that are used.
     """
     lean: Any = _cacheless_pickler(base)
 

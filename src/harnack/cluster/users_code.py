@@ -1,11 +1,12 @@
-"""Code of users: which it is, what is used of their modules, and modules as they are sent.
+"""Code of users: which code it is, which attributes of users' modules it uses, and modules as they
+are sent.
 
-Code of Python itself and of installed packages is sent by name. A user's module is sent itself, as
-it is here and now: a worker may lack it, or have imported it before it was changed, and a folder of
-finished parts must tell two states of it apart. All of it would be too much, since modules hold
-locks, clients and pictures too. What is sent is what the code that is sent names: attributes of
-these names. A module that was sent refuses all others by name, so that nothing is left out in
-silence.
+Code of Python itself and of installed packages is sent by name. A user's module is sent by value,
+in its present state: a worker may lack it, or have imported it before it was changed, and a
+checkpoint folder must distinguish two states of it. The whole module would be too much, since
+modules also hold locks, clients and pictures. So only the attributes are sent whose names occur in
+the code that is sent. A module that was sent refuses all other attributes by name, so that nothing
+is missing silently.
 """
 
 from __future__ import annotations
@@ -34,13 +35,13 @@ _IMPORTERS = frozenset(("import_module", "__import__"))
 _OF_EACH = ("__package__", "__name__", "__path__", "__file__")
 # What belongs to the process that imported a module.
 _OF_IMPORT = frozenset(("__builtins__", "__spec__", "__loader__", "__cached__"))
-# The attribute of a module that was sent with the names of those that it lacks.
+# The attribute of a sent module that lists the names of the attributes that were not sent.
 _LEFT_OUT = "__left_out__"
 
 
 class SentModule(ModuleType):
-    """A user's module with what was sent of it. It is in no list of modules: what is imported here
-    under its name is another one."""
+    """A user's module with the attributes that were sent. It is not in sys.modules: a module that
+    is imported here under its name is another one."""
 
     def __getattr__(self, name: str) -> Any:
         if name in vars(self).get(
@@ -57,7 +58,7 @@ class SentModule(ModuleType):
 class Namespace:
     """The module in which functions look for names; it is opened as a `SentModule`.
 
-    known: what it holds whatever functions name.
+    known: the attributes that it has whatever names functions use.
     """
 
     known: Mapping[str, Any]
@@ -95,7 +96,7 @@ def function_in(module: SentModule, code: CodeType, closure: Any) -> FunctionTyp
 
 
 def attributes_named(module: ModuleType, words: frozenset[str] | set[str]) -> dict[str, Any]:
-    """What code that has these words may use of a module, in the order of names."""
+    """The attributes of a module that code with these words may use, in the order of names."""
     every = bool(words & _FINDERS)
     return {
         name: value
@@ -113,7 +114,8 @@ def codes_within(code: CodeType) -> Iterator[CodeType]:
 
 
 def words_of(function: FunctionType) -> set[str]:
-    """All names in the code of a function, and its texts, which may be names of attributes."""
+    """All names in the code of a function, and its string constants, which may be names of
+    attributes."""
     return {
         word
         for code in codes_within(function.__code__)
@@ -130,11 +132,11 @@ def _texts(constants: Iterable[Any]) -> Iterator[str]:
 
 
 def refuse_imports_within(function: FunctionType) -> None:
-    """Refuse a function that imports modules of users when it is called: which these are then, and
-    what is used of them, cannot be told.
+    """Refuse a function that imports users' modules when it is called: it cannot be told which
+    these will be, and which of their attributes are used.
 
     Raises:
-        TypeError: it does.
+        TypeError: the function does.
     """
     package = function.__globals__.get("__package__") or ""
     for code in codes_within(function.__code__):

@@ -25,11 +25,12 @@ _INSTALL = "install the same there as here, such as by pip install 'harnack[clus
 
 @contextmanager
 def connect_client(client: Any) -> Generator[Any]:
-    """A Dask client, given as one or by the address of a scheduler, all of whose workers can work;
-    None for None. What was opened here is closed when the block ends.
+    """Context manager that yields a Dask client whose workers have all been checked; None for None.
+    client: a Dask client, or the address of a scheduler; a client that was opened here is closed at
+    the end.
 
-    Workers that come later are looked at when they get a task: by `exclusive_compute` and
-        `SerializedObject.deserialize`.
+    Workers that come later are checked when they get a task: by `exclusive_compute` and
+    `SerializedObject.deserialize`.
 
     Raises:
         ModuleNotFoundError: Dask is not installed.
@@ -68,11 +69,12 @@ def connect_client(client: Any) -> Generator[Any]:
 
 @contextmanager
 def exclusive_compute() -> Generator[str]:
-    """Lets one task at a time compute in this process, as Dr.Jit itself uses all threads that a
-    worker has. Yields the address of the worker that this is, "" for none.
+    """Context manager: within it no other task of this process computes, as Dr.Jit already uses all
+    threads of a worker. Yields the address of the Dask worker that this process is, "" if it is
+    none.
 
     Raises:
-        RuntimeError: it is a worker that cannot work.
+        RuntimeError: Dr.Jit has no backend that it can use here.
     """
     distributed = sys.modules.get("distributed")
     worker = None
@@ -90,7 +92,7 @@ def exclusive_compute() -> Generator[str]:
 
 
 def worker_threads(client: Any) -> dict[str, int]:
-    """The threads of each worker, by its address.
+    """The number of threads of each worker, by its address.
 
     Raises:
         RuntimeError: the scheduler is gone.
@@ -128,7 +130,7 @@ def _check_workers(client: Any) -> None:
 
 
 def warn_rounding_differs(workers: Iterable[str]) -> None:
-    """Say that the processors of workers, given by their addresses, round differently."""
+    """Warn that the processors of workers, given by their addresses, round differently."""
     warnings.warn(
         f"the processors of {', '.join(sorted(workers))} round differently from this one: "
         "results are right, but not the same bit for bit as without them",
@@ -146,16 +148,18 @@ def _worker_state(dask_worker: Any = None) -> tuple[str, str]:
 
 @functools.cache
 def adopt_worker_threads(has_nanny: bool, threads: int) -> None:
-    """Let Dr.Jit have the threads that Dask gave this worker.
+    """Set Dr.Jit's number of threads to the number that Dask gave this worker.
 
-    has_nanny: whether a process watches over this one, which so is the worker's alone.
+    has_nanny: whether a nanny process watches over this process, which then belongs to the worker
+        alone.
     """
     if has_nanny:
         dr.set_thread_count(threads)
 
 
 def rounding_fingerprint() -> str:
-    """What this machine makes of some numbers, the same where kernels give the same bits."""
+    """A digest of computed numbers on this machine, equal on machines where kernels give the same
+    bits."""
     name = choose_backend().name
     return f"{name} {_rounding(name)}"
 

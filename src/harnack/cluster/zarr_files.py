@@ -29,19 +29,20 @@ def to_zarr(
 ) -> Any:
     """Write a Dask array to a Zarr file, chunk by chunk, and return the Zarr array.
 
-    A chunk of the file is a block of the array. Chunks that are there already, of the same array,
-    are not computed again, so that what was stopped goes on.
+    A chunk of the file is a block of the array. Chunks of the same array that are already in the
+    file are not computed again, so that an interrupted call can be continued.
 
-    array: a Dask array; that it is the same is known by its name, which says what it is made of.
+    array: a Dask array; it is recognized by its name, which Dask derives from its contents.
     path: of a folder, by custom with the ending .zarr, that workers see under the same name.
     client: a `dask.distributed.Client` or the address of a scheduler; by default as Dask chooses.
-    progress: whether to show it, or a function that is told each part, of 1, that is done.
+    progress: whether to show it, or a function that is called with each fraction (of 1 in all) that
+        is done.
 
     Raises:
         ModuleNotFoundError: Dask or Zarr is not installed.
         TypeError: not a Dask array.
         ValueError: there is another array at the path, or its blocks have unequal lengths.
-        OSError: it cannot be written there, or workers did not write there.
+        OSError: the file cannot be written, or workers did not write it.
     """
     zarr = import_optional("zarr", "to_zarr")
     dask = import_optional("dask", "to_zarr")

@@ -1,7 +1,8 @@
-"""What is known of a level set in cells: that it is absent, or a slab that it lies in, and points.
+"""Classifies the cells that may hold a level set: each is proved empty, or gets a slab (two
+parallel planes) that contains the surface, and a point of the surface.
 
-Some points are on the *rim*, the curve at which the field's domain cuts the level set:
-`ClipCurveDescent` searches for the closest.
+Some of these points lie on the *clip curve*, where the boundary of the field's domain cuts the
+level set; `ClipCurveDescent` finds its closest point.
 """
 
 from __future__ import annotations
@@ -48,8 +49,8 @@ _LEAST_STEP = 1e-8  # of the distance: what is left is half its square
 
 @dataclass(frozen=True)
 class ClipCurveDescent:
-    """The search for a closest point with f = level and h = 0, h the distance from the domain's
-    boundary; all prepared for one backend."""
+    """Descent to the closest point of the clip curve, on which f = level and h = 0, where h is the
+    distance from the domain's boundary; all prepared for one backend."""
 
     backend: Backend
     field: Field
@@ -57,8 +58,8 @@ class ClipCurveDescent:
     domain: Volume
 
     def closest(self, x: Vec3, start: Vec3) -> tuple[Vec3, Real]:
-        """A point y of the curve that is no farther from x than those nearby, met on the way from
-        `start`, and the curve's curvature there; NaN where the curve is not met.
+        """A point y of the curve at which the distance from x has a local minimum, by descent from
+        `start`, and the curve's curvature there; NaN where the curve is not reached.
 
         Let the curve have the tangent t and the second derivative y'', which follows from those of
         f and h along t (differences of their gradients). Half the squared distance has the
@@ -204,14 +205,14 @@ _MORE_STEPS, _SHRINKS = 14, (0.4, 0.97)
 _CUBE_CIRCUMRADIUS = 3**0.5 * (1 + 1e-9)
 # A foot is on the level up to this share of its cell.
 _CLOSE = 1e-7
-# Rays through a cell of a field with sheets.
+# Rays through a cell of a field that jumps.
 _DIAGONALS = ((1.0, 1.0, 1.0), (1.0, 1.0, -1.0), (1.0, -1.0, 1.0), (-1.0, 1.0, 1.0))
 
 
 def taylor_remainder(sample: Sample, radius: Real, degree: int = 1) -> Real:
-    """A bound of what Taylor's polynomial of degree 1 or 2 leaves out of f(y) for |y - p| <=
-    radius; infinite where the field promises none. It falls at least as the power degree + 1 of the
-    radius."""
+    """A bound of the Taylor remainder: by how much the Taylor polynomial of f about p, of degree 1
+    or 2, differs from f(y) for |y - p| <= radius. Infinite where the field promises no bound. As a
+    function of the radius it falls at least as the power degree + 1."""
     best: Real = dr.inf
     for known in sample.all_promises:
         best = fmin(best, known.taylor_remainder_bound(sample.value, radius, degree))
@@ -219,8 +220,9 @@ def taylor_remainder(sample: Sample, radius: Real, degree: int = 1) -> Real:
 
 
 def multiplicity(step: Real, last: Real) -> Real:
-    """How many times as long as Newton's the step to a root has to be, by the length of the last
-    one: m, if steps shrink by 1 - 1/m, as for u^m. 1 where they shrink faster, or hardly."""
+    """The multiplicity m of the root to which Newton's steps lead, by the lengths of the last two
+    steps: at a root like that of u^m steps shrink by the factor 1 - 1/m, and a step m times as long
+    as Newton's leads to the root. It is 1 where steps shrink faster, or hardly."""
     ratio = dr.abs(step) / last
     is_slow = (ratio > _SHRINKS[0]) & (ratio < _SHRINKS[1])
     return dr.select(is_slow, 1 / (1 - ratio), 1)
@@ -228,7 +230,7 @@ def multiplicity(step: Real, last: Real) -> Real:
 
 @dataclass
 class CellClassifier:
-    """Cells of a level set, evaluated in double precision."""
+    """Classifies the cells of a level set, in double precision."""
 
     surface: Surface
 
@@ -248,8 +250,11 @@ class CellClassifier:
         return self._prepared.field
 
     def nonempty_cells(self, center: FloatArray, half: FloatArray) -> SurfaceCells:
-        """Of cubes (n, 3), half the length of an edge (n,), those that are not proved empty, with
-        the slabs that the surface lies in."""
+        """The cubes that are not proved empty, with the slabs that the surface lies in.
+
+        center: (n, 3) of cubes.
+        half: (n,) half the length of their edges.
+        """
         inside = np.ones(len(center), np.bool_)
         if self._volume is not None and len(center):
             inside = self._volume.contains_points(center)
@@ -268,7 +273,7 @@ class CellClassifier:
         return cells.select(not_empty)
 
     def with_surface_points(self, cells: SurfaceCells) -> SurfaceCells:
-        """The cells with points of the surface and of the rim."""
+        """The cells, completed by points of the surface and of the clip curve."""
         if not len(cells):
             return cells
         radius, start = _CUBE_CIRCUMRADIUS * cells.half, cells.center

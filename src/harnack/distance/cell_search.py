@@ -49,42 +49,47 @@ _CORNERS = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1
 
 @dataclass
 class SearchResult:
-    """The nearest points found: feet (n, 3), NaN where none was, and proved lower bounds (n,) of
-    the distance."""
+    """Result of a search: the closest points (n, 3) of the surface, NaN where none was found, and
+    proved lower bounds (n,) of the distance."""
 
     closest: FloatArray
     lower_bounds: FloatArray
 
 
 class DescentMethods(Protocol):
-    """Ways to nearer points of the surface from points x (n, 3). They return feet, NaN where none
-    was found, and radii about these within which none is nearer."""
+    """Interface to the closest-point iterations. For query points x (n, 3), each method returns
+    points of the surface (n, 3), NaN where it finds none, and for each a radius about it in which
+    no point of the surface is nearer to x."""
 
     def newton_in_kernel(self, x: Vec3, start: Vec3, limit: Real) -> tuple[Vec3, Real, Mask]:
-        """From places near the surface, in a kernel: feet, radii, and where `descend` is to be
-        asked."""
+        """Iterate inside a kernel, from points `start` near the surface. Returns closest points,
+        radii, and the lanes for which `descend` is to be called. Points farther from x than `limit`
+        need not be found."""
         ...
 
     def descend(
         self, points: FloatArray, start: FloatArray, limit: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """From places (n, 3) near the surface; feet farther than `limit` (n,) need not be found."""
+        """Iterate from points `start` (n, 3) near the surface; points farther from the query than
+        `limit` (n,) need not be found."""
         ...
 
     def descend_from_boundary(
         self, points: FloatArray, boundary: FloatArray, aside: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """From points (n, 3) of the curve that the surface ends in, along the surface if it begins
-        towards x. aside: (n,) how far from the curve it is looked for."""
+        """Iterate from points `boundary` (n, 3) of the curve at which the surface ends, along the
+        surface where it begins in the direction of x. aside: (n,) how far from the curve the
+        surface is looked for."""
         ...
 
 
 @dataclass(frozen=True)
 class InitialGuess:
-    """What is known of the surface from the points alone.
+    """Initial guess for the cell search.
 
-    feet: (n, 3) points of the surface, or NaN. near: (n,) what the distance is to first order.
-    on_boundary: whether the feet lie on the curve that the surface ends in.
+    feet: (n, 3) points of the surface, or NaN.
+    estimate: (n,) first-order distance.
+    on_boundary: whether `feet` lie on the curve at which the surface ends.
     """
 
     feet: FloatArray
@@ -92,7 +97,7 @@ class InitialGuess:
     on_boundary: bool = True
 
     def some(self, rows: IntArray | slice) -> InitialGuess:
-        """Of some points."""
+        """The initial guess for the queries `rows`."""
         return replace(self, feet=self.feet[rows], estimate=self.estimate[rows])
 
 
@@ -100,9 +105,9 @@ class InitialGuess:
 class StoppingRule:
     """When a search ends.
 
-    length: points that are nearer by less do not matter.
-    prove: whether cells are split until none may hold a point that is nearer than the best by
-        more than that, or there are too many.
+    length: an improvement of the distance by less than this length is not pursued.
+    prove: whether cells are subdivided until none of them may hold a point that is nearer than the
+        best one by more than `length`, or until there are too many cells.
     """
 
     length: float
@@ -244,12 +249,14 @@ def _subdivide(proofs: CellClassifier, cells: SurfaceCells, which: BoolArray) ->
 
 
 class _CellSearch:
-    """The search for some points, from cells that hold all of the surface, and first from coarse
-    ones.
+    """Branch-and-bound search for the points closest to a batch of queries, over cells that cover
+    the surface; coarse cells are searched first.
 
     trees: of the coarse cells and of `cells`; None if there are none.
-    feet: (n, 3) the nearest points so far, or NaN. free: (n,) within these radii about them none is
-    nearer. lower: (n,) proved bounds of distances. most: cells are split while they are not more.
+    feet: (n, 3) best points so far, or NaN.
+    free: (n,) no surface point within this radius of the best point is nearer.
+    lower: (n,) proved lower bounds of the distances.
+    most: cells are subdivided while there are no more than these.
     """
 
     def __init__(
@@ -271,7 +278,7 @@ class _CellSearch:
         self.max_cells = most
 
     def run(self, progress: Callable[[str], None]) -> SearchResult:
-        """What is found."""
+        """The closest points and the lower bounds of the distances."""
         if not len(self.points):
             return SearchResult(self.feet, self.lower)
         has_sheets = self.proofs.surface.field.has_jumps
@@ -280,8 +287,8 @@ class _CellSearch:
         else:
             self.lower[:] = np.inf
         if not has_sheets:
-            # Where sheets meet or cross within a cell, one may have no foot there; and a promise
-            # that does not hold may have left out cells.
+            # Where two parts of the surface meet or cross within a cell, descents may not have
+            # begun on both of them; and a promise that does not hold may have left out cells.
             rows = np.flatnonzero(self._is_unproved() | np.isnan(self.feet[:, 0]))
             rows = rows[self.known.estimate[rows] < _MIN_GAIN * self._distance(rows)]
             self._descend(rows, self.points[rows])
@@ -395,11 +402,13 @@ class _CellSearch:
     def _improve(
         self, tree: CellTree, rows: IntArray, tried: Sequence[FloatArray], marks: Any
     ) -> None:
-        """Descend from the feet of other parts of the surface that may be nearer, and from further
-        ones where that led nearer; with sheets, of which cells know no planes, wherever there are,
-        and where evaluations are expensive one by one.
+        """Improve the best points by descents from candidates in other cells, in rounds. A query
+        continues to the next round if the last one helped; it also continues, as long as it has
+        candidates, if the field has jump surfaces (their cells have no tangent planes) or is
+        expensive to evaluate. Expensive fields try one candidate per round.
 
-        tried: feet (k, 3) that need not be tried. marks: `CellTree.closer_candidates`.
+        tried: arrays (k, 3) of candidates to skip.
+        marks: see `CellTree.closer_candidates`.
         """
         for _ in range(_MAX_CANDIDATE_ROUNDS):
             if not len(rows):

@@ -1,7 +1,8 @@
-"""A tree over cells that may hold a surface: which of them are near a point, and how near.
+"""A tree over cells that may hold a surface, to find those near a point and bounds of their
+distance.
 
-Of the surface in a cell either nothing is known, or that it lies in a slab. Besides, some cells
-have a *foot*: a known point of the surface.
+For each cell the surface in it is either unknown or proved to lie in a slab (two parallel planes).
+Some cells also have a known point of the surface, their *foot*.
 """
 
 from __future__ import annotations
@@ -38,13 +39,13 @@ _CANDIDATES_PER_WALK = 4
 _SEPARATION, _SEPARATION_IN_PIECES = 4.0, 3.0
 # In half cells: the surface is in one piece in a slab that is thinner.
 _SINGLE_PIECE_THICKNESS = 0.5
-# In half cells: within this distance of its point in a cell the rim is nearly a line.
+# In half cells: within this distance of its point the clip curve is nearly a line.
 _CLIP_CURVE_RADIUS = 4.0
 
 
 @dataclass(frozen=True)
 class SurfaceCells:
-    """Cubes and what is known of the surface in them.
+    """Cubes, with a slab and a point of the surface in each where these are known.
 
     center: (n, 3). half: (n,) half the length of an edge.
     surface_point: (n, 3) a point of the surface, no farther from the center than the cell is wide,
@@ -54,8 +55,8 @@ class SurfaceCells:
         zero where no plane is known that is nearly the surface.
     plane_radius: (n,) within this radius about its foot the surface is nearly that plane.
     curvature: (n,) how much it is curved there, at most; FAR where that is not known.
-    clip_point: (n, 3) a point of the rim, the curve at which a domain cuts the surface, or FAR.
-    clip_curvature: (n,) of the rim there.
+    clip_point: (n, 3) a point of the clip curve, at which a domain cuts the surface, or FAR.
+    clip_curvature: (n,) of the clip curve there.
     """
 
     center: FloatArray
@@ -71,7 +72,7 @@ class SurfaceCells:
 
     @classmethod
     def unknown(cls, center: FloatArray, half: FloatArray) -> SurfaceCells:
-        """Cubes of which nothing is known."""
+        """Cubes without slabs and surface points."""
         n = len(half)
         far, zero = np.full((n, 3), FAR_SENTINEL), np.zeros(n)
         return cls(
@@ -83,7 +84,7 @@ class SurfaceCells:
         return len(self.half)
 
     def select(self, which: BoolArray) -> SurfaceCells:
-        """Those chosen by a mask (n,)."""
+        """The cells that a mask (n,) selects."""
         return SurfaceCells(*(part[which] for part in vars(self).values()))
 
     @property
@@ -93,18 +94,19 @@ class SurfaceCells:
 
     @classmethod
     def concatenate(cls, parts: list[SurfaceCells]) -> SurfaceCells:
-        """All of several."""
+        """The cells of all parts, in order."""
         columns = zip(*(vars(part).values() for part in parts), strict=True)
         return cls(*(np.concatenate(column) for column in columns))
 
 
 @dataclass(frozen=True)
 class BestCandidate:
-    """The nearest point of the surface so far.
+    """The closest surface point found so far.
 
-    point: its place. distance: how far it is.
-    exclusion_radius: a radius about it within which no point is nearer.
-    separation_factor: how many times farther from it than from others feet have to be to be tried.
+    distance: of `point` from the query.
+    exclusion_radius: no surface point within it of `point` is nearer to the query.
+    separation_factor: multiplies the distance from `point` below which another cell's point is
+        skipped, as leading to the same closest point.
     """
 
     point: Vec3
@@ -115,13 +117,13 @@ class BestCandidate:
 
 @dataclass(frozen=True)
 class CellTree:
-    """Cells on a backend; there is at least one."""
+    """A tree of at least one cell, on a backend."""
 
     tree: PackedTree
 
     @classmethod
     def of(cls, backend: Backend, cells: SurfaceCells) -> CellTree:
-        # Points of the rim are feet of cells of their own.
+        # Points of the clip curve are surface points of cells of their own.
         cut = np.flatnonzero(cells.clip_point[:, 0] < FAR_SENTINEL)
         n, both = len(cells), np.concatenate([np.arange(len(cells)), cut])
         is_plain = cells.is_single_piece & (cells.clip_point[:, 0] == FAR_SENTINEL)
@@ -158,8 +160,8 @@ class CellTree:
         return cls(pack_tree(backend, hierarchy, levels, placed))
 
     def best_start(self, x: Vec3, limit: Real) -> Vec3:
-        """The foot of the cell in which the surface seems to come nearest to x
-        (`_CellRecord.estimate`), and nearer than `limit`; FAR where it does not."""
+        """The surface point of the cell in which the surface has the smallest estimated distance
+        from x (`_CellRecord.estimate`); `FAR_SENTINEL` where no estimate is below `limit`."""
         vector = self.tree.backend.Array3f
 
         def each(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
@@ -176,13 +178,14 @@ class CellTree:
     def closer_candidates(
         self, x: Vec3, best: BestCandidate, others: tuple[Vec3, ...], tolerance: Real, marks: Any
     ) -> tuple[Real, list[Vec3]]:
-        """What cells say about points of the surface that are nearer to x than the best.
+        """Find cells that may hold a point nearer to x than `best`.
 
-        Returns a length that the surface is no nearer than, at most the distance of the best; and
-        the feet (else FAR) of the few cells where it seems to come nearest, of those in which it
-        may be nearer than the best by more than `tolerance`. Feet that are not apart from the best,
-        from `others` and from one another (`_SEPARATION`) are left out. In `marks`, if given, a
-        Bool is set for each of those cells, wherever their feet are.
+        Returns a lower bound of the distance from x to the surface, at most best.distance; and the
+        surface points (`FAR_SENTINEL` for none) of the few cells with the smallest estimated
+        distance, among those whose lower bound is below best.distance - tolerance. Points that are
+        not separated from `best`, from `others` or from each other (`_SEPARATION`) are skipped. In
+        `marks`, if it is not None, a Bool is set for every cell with such a lower bound, whether
+        its point is skipped or not.
         """
         backend = self.tree.backend
         vector, index = backend.Array3f, backend.UInt32

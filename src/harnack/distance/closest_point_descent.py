@@ -1,8 +1,8 @@
-"""The closest point of a level set, by descent: onto the level, then along it.
+"""Finds closest points of a level set by descent: onto the level, then along it.
 
-What is found is a point of the level set, to rounding, with x - y at right angles to the surface
-and no way to come nearer in its neighborhood. It is a *local* minimum of the distance: another
-part of the surface may be nearer still, so the distance is an upper bound of the true one.
+The result is a point of the level set, to rounding, at which x - y is normal to the surface and no
+neighbor is nearer to x. It is a *local* minimum of the distance: another part of the surface may be
+nearer still, so the distance is an upper bound of the true one.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ class _DescentState:
 
 @dataclass(frozen=True)
 class ClosestPointDescent:
-    """The search for closest points of the level set of a prepared field."""
+    """Descents to closest points of the level set of a field that is prepared for a backend."""
 
     backend: Backend
     field: Field
@@ -94,15 +94,18 @@ class ClosestPointDescent:
         return cls(backend, field, levels, has_hessian(backend, field))
 
     def newton(self, x: Vec3, start: Vec3, limit: Real) -> tuple[Vec3, Real, Mask, Mask]:
-        """A place from which Newton's method for f(y) = level and (x - y) parallel to grad f(y),
-        begun at a point of the surface nearby, ends with one more step (`finish`); how far `start`
-        is off the level; and whether the search was given up, as it goes on to where f is singular,
-        or to a point that is farther from x than `limit`.
+        """Newton's method for the closest-point equations f(y) = level and (x - y) parallel to grad
+        f(y), in one kernel, from a point `start` near the surface.
 
-        Each step is that of `descend` along the surface, which follows its curvature, and one to
-        the level, both from derivatives at one place: errors are squared by each of both. So the
-        step after the next is about its length times the square of its ratio to the last one.
-        Where steps become shorter the end is within twice the next.
+        Returns y, to which `finish` adds the last step; the first-order distance of `start` from
+        the level; whether the last step was longer than half the radius in which f is smooth, so
+        that y is no result; and whether y will be farther from x than `limit`, where the iteration
+        stops.
+
+        Each step combines the step of `descend` along the surface, which follows its curvature,
+        with a Newton step to the level; both are from derivatives at the same point. Convergence is
+        quadratic: a step of length s after one of length s0 is followed by one of about s (s/s0)^2.
+        While steps at least halve, the limit is within twice the current step.
         """
         real, vector, count = self.backend.Float, self.backend.Array3f, self.backend.UInt32
         x, mask = vector(x), self.backend.Bool
@@ -216,7 +219,8 @@ class ClosestPointDescent:
         return y, found, on_level
 
     def newton_to_level(self, start: Vec3) -> Vec3:
-        """The point of a level that Newton's method along the gradient leads to; NaN for none."""
+        """The point of a level to which Newton's method along the gradient converges; NaN where it
+        does not."""
         place, found = self._to_level(start, self.backend.Bool(True))
         return dr.select(found, place.y, dr.nan)
 

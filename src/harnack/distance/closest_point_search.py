@@ -1,16 +1,20 @@
-"""The closest points of a surface: of the triangles of a closed mesh, or by search in cells.
+"""Searches the closest points of a surface: among the triangles of a closed mesh, or by branch and
+bound over cells.
 
-Closest points are points of the surface: every search ends at a root of f, at a first hit or on a
-triangle, so that distances are upper bounds whatever led there, and what is nearer than the proved
-lower bound is refused. Cells that are proved empty are left out; a point of the surface in each of
-the others is where descents begin (`cell_search`): in one kernel from a few coarse cells, and where
-finer ones may be nearer from four of their points. The ball about a foot that holds no nearer point
-(`exclusion_ball`) closes most points; boxes within it are left out. What is left bounds the
-distance from below, and for proofs is split. Closed meshes are
-triangles and a tree (`level_triangles`). Of a mesh with holes the part off its triangles is a
-smooth surface of w modulo one (`JumpSurface.without_jumps`), whose feet count where w itself has
-the level: rays that closed in on each point took 18 times as long, and a tenth of them ended too
-far.
+Every search ends at a root of f, at the first hit of a ray or on a triangle. So closest points are
+points of the surface, and distances are upper bounds whatever path led there; a point that is
+nearer than the proved lower bound is refused.
+
+Cells that are proved empty are left out; descents begin at a known surface point of each of the
+other cells (`cell_search`): first, in one kernel, from a few coarse cells, then, where finer cells
+may hold a nearer point, from four of their points. The ball about a closest point that holds no
+nearer point (`exclusion_ball`) settles most queries, as boxes within it are left out. The remaining
+cells bound the distance from below, and are subdivided for proofs.
+
+Closed meshes are triangles and a tree (`level_triangles`). For a mesh with holes the part of the
+surface off its triangles is a smooth surface of w modulo 1 (`JumpSurface.without_jumps`), whose
+closest points count where w itself has the level: rays that closed in on each point took 18 times
+as long, and a tenth of them ended too far away.
 """
 
 from __future__ import annotations
@@ -72,13 +76,13 @@ _MAX_JUMPS_EXAMINED = 16
 
 @dataclass(frozen=True)
 class ClosestPoints:
-    """The closest points found.
+    """The closest points of a surface to n query points, and bounds of the distances.
 
-    points: (n, 3), rounded to the precision in use.
+    points: (n, 3) the query points, rounded to the precision in use.
     closest: (n, 3) the closest points of the surface, NaN where none was found.
     distance: (n,) to these, NaN likewise.
     signed_value: (n,) f - level, of the level nearest in value.
-    lower: (n,) proved: no point of the surface is nearer.
+    lower: (n,) proved lower bounds of the distance.
     violates_promises: (n,) whether a point was found that is nearer than the field's promises
         allow.
     """
@@ -97,7 +101,7 @@ def find_closest(
 ) -> ClosestPoints:  # fmt: skip
     """The closest point of a surface to each of the points (n, 3).
 
-    is_proved: whether `lower` is wanted as close as cells can prove it.
+    is_proved: whether cells are subdivided to make `lower` as large as they can prove.
 
     Points are sorted along a Morton curve, so that neighboring lanes traverse a tree together.
     """
@@ -152,14 +156,17 @@ def _search_smooth_part(
     tolerance: StoppingRule,
     progress: Callable[[str], None],
 ) -> SearchResult:
-    """What is found of a surface with sheets: on its smooth part, or what is known on sheets.
+    """Search the smooth part of a surface that has jumps, and merge the result with closest points
+    already known on its jump surfaces.
 
-    smooth: `JumpSurface.without_jumps` of the surface's field. known: feet on sheets.
+    smooth: `JumpSurface.without_jumps` of the surface's field.
+    known: closest points on jump surfaces.
 
-    Proof of the lower bounds: the surface lies on level sets of `smooth` and on sheets, and is no
-    nearer than the nearest of either. Feet on the former are of the surface where f has the level
-    too. Where f has not, and where a sheet is nearer than all feet, which may be of the surface
-    elsewhere than at its nearest point, rays look further.
+    Proof of the lower bounds: the surface lies in the union of the level sets of `smooth` and the
+    jump surfaces, so it is no nearer than the nearer of the two. A point found on a level set of
+    `smooth` is accepted only if f has the level there. Queries are searched again, with rays, where
+    it does not, and where a jump surface is nearer than all accepted points: its nearest point need
+    not belong to the surface.
     """
     backend, surface = job.backend, job.surface
     alone = replace(surface, field=smooth).with_call_cache(begins=True)
@@ -234,7 +241,8 @@ def _with_mesh_points(points: FloatArray, start: FloatArray, mesh: LevelTriangle
 
 @dataclass(frozen=True)
 class _QueryEvaluator:
-    """What is computed at points of a surface that is searched in cells."""
+    """Evaluates one surface's field on a backend and runs the closest-point descents, for arrays of
+    query points."""
 
     backend: Backend
     surface: Surface
@@ -268,8 +276,9 @@ class _QueryEvaluator:
     _prepared: Any = dataclasses.field(init=False)
 
     def evaluate(self, points: Any) -> tuple[FloatArray, ...]:
-        """The points as rounded, what is known of the surface near them, f - level, proved lower
-        bounds of the distance, and what it is to first order."""
+        """First estimates at query points. Returns the points as rounded to the precision in use,
+        points of the surface near them (NaN for none), f - level, proved lower bounds of the
+        distance, and the first-order distance."""
 
         def compute(p: Vec3) -> tuple[Real | Vec3, ...]:
             sample = self._field.evaluate(p)
@@ -357,7 +366,7 @@ class _QueryEvaluator:
     def descend(
         self, points: FloatArray, start: FloatArray, limit: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """`search.DescentMethods`: by descent, or with sheets by rays."""
+        """`cell_search.DescentMethods`: by descent, or for fields with jumps by rays."""
         if self.surface.field.has_jumps:
 
             def close(p: Vec3, start: Vec3) -> tuple[Vec3]:
@@ -396,7 +405,7 @@ class _QueryEvaluator:
     def descend_from_boundary(
         self, points: FloatArray, boundary: FloatArray, aside: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """`search.DescentMethods`."""
+        """`cell_search.DescentMethods`."""
 
         def level_away(p: Vec3, b: Vec3, length_: Vec3) -> tuple[Real]:
             way = p - b
@@ -427,7 +436,7 @@ class _QueryEvaluator:
         return self._inside_domain_or_nan(feet), free
 
     def newton_in_kernel(self, x: Vec3, start: Vec3, limit: Real) -> tuple[Vec3, Real, Mask]:
-        """`search.DescentMethods`."""
+        """`cell_search.DescentMethods`."""
         p, vector = self.backend.Array3f(x), cast("Any", type(x))
         foot, _, free, goes_on, _ = self._newton(p, self.backend.Array3f(start), limit)
         if self._domain is not None:

@@ -52,20 +52,18 @@ def signed_distance(
     method:
         "first_order": (f - level)/|grad f|. Off by O(d^2) at distance d; infinite where grad f = 0.
         "second_order": the same with the curvature of f along its gradient. Off by O(d^3); needs
-        the
-            field's `hessian`.
+            the field's `hessian`.
         "closest_point": to the nearest point of the surface that a search finds (`closest_points`
-        says
-            how): an upper bound of the distance, exact to rounding if that is the nearest of all.
-            `distance_bounds` says what is proved about it. Of a closed triangle mesh, and of the
-            boundary of the solid of one, it is exact to rounding. NaN, with a RuntimeWarning that
-            counts them, where no surface is found at all, as where there is none, or only within a
-            radius that the field promises to be free.
+            says how): an upper bound of the distance, exact to rounding if that is the nearest
+            point of all. `distance_bounds` says what is proved about it. For a closed triangle
+            mesh, and for the boundary of the solid of a closed mesh, it is exact to rounding. NaN,
+            with a RuntimeWarning that counts these points, where no surface is found: there is
+            none, or it was found only within a radius that the field promises to be free.
         "lower_bound": never longer in size than the true distance, with proof: no level lies in the
             ball of that radius about the point, not even outside the field's domain. Of first
             order too: the nearer the surface, the smaller the share that it falls short by.
-        Of a field that jumps across sheets, "first_order" and "second_order" see the smooth part of
-        the surface, and the nearest sheet if that is nearer and the surface lies there.
+        For a field that jumps across facets, "first_order" and "second_order" see the smooth part
+        of the surface, and the nearest facet if that is nearer and the surface lies there.
     precision: of the computation; "lower_bound" allows for rounding in both. The search of
         "closest_point" is done in double precision in any case.
     progress: told what is being done.
@@ -112,13 +110,13 @@ def closest_points(
 ) -> FloatArray:
     """The closest points (n, 3) of a level set to `points` (n, 3), as far as a search finds them.
 
-    Of the winding number of a closed mesh, and of its solid, they are exact: the nearest of the
-    triangles that are the level, cut where others pass through them. Of other fields the surface is
-    enclosed in cells, and descents from the points of the surface that cells know lead to places
-    where no neighbor is nearer; `distance_bounds` also splits cells where a nearer point may be.
-    The curve in which the level sets of a field end counts as part of them, such as the vertices
-    and edges of a solid angle, and so does the rim at which the field's domain cuts them. NaN, with
-    a RuntimeWarning that counts them, where no surface is found.
+    For the winding number of a closed mesh, and for its solid, they are exact: the level set
+    consists of triangles, cut where others pass through them, and the nearest is taken. For other
+    fields the surface is enclosed in cells, and descents from the known surface points of cells
+    lead to local minima of the distance; `distance_bounds` also subdivides cells where a nearer
+    point may be. The curve at which the level sets of a field end counts as part of them, such as
+    the vertices and edges of a solid angle, and so does the clip curve at which the field's domain
+    cuts them. NaN, with a RuntimeWarning that counts these points, where no surface is found.
 
     Raises:
         TypeError, ValueError: as `signed_distance`.
@@ -129,11 +127,12 @@ def closest_points(
 
 @dataclass(frozen=True)
 class DistanceBounds:
-    """What is known about distances to a surface. The true distance d has lower <= d <= upper.
+    """Proved bounds of the distances of points from a surface. The true distance d has lower <= d
+    <= upper.
 
     closest_points: (n, 3) points of the surface, NaN where none was found.
-    upper: (n,) distances to these; NaN likewise. lower: (n,) proved; infinite where there is proved
-        to be no surface.
+    upper: (n,) distances to these points; NaN likewise.
+    lower: (n,) proved lower bounds; infinite where it is proved that there is no surface.
     """
 
     closest_points: FloatArray
@@ -154,14 +153,15 @@ def distance_bounds(
     """Distances of points (n, 3) from a level set, with proved lower bounds.
 
     `lower` is proved. Cells that hold no surface by the field's promises are left out; in each of
-    the others the surface lies in a slab, where the promises say so; and around every foot there
-    is a ball that holds no nearer point of the surface. `lower` is the least distance to what is
-    left. Cells are split where it is less than `upper` by more than 1e-6 of the size of the
-    surface, up to about half as many cells as there are points, but at least 60,000: so a few
-    points are proved to that tolerance, and of many points those for which the balls suffice.
+    the other cells the surface lies in a slab, where the promises imply that; and around every
+    closest point there is a ball that holds no nearer point of the surface. `lower` is the
+    distance to the nearest slab or cell outside of that ball. Cells are subdivided where `lower`
+    is less than `upper` by more than 1e-6 of the size of the surface, up to about half as many
+    cells as there are points, but at least 60,000: so a few points are proved to that tolerance,
+    and of many points those for which the balls suffice.
 
     `upper` is the distance to a point of the surface, found by several descents. Where `lower` is
-    less, the true distance may lie anywhere between the two.
+    less than `upper`, the true distance may lie anywhere between the two.
 
     Raises:
         TypeError, ValueError: as `signed_distance`.

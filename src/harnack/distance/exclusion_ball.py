@@ -27,15 +27,16 @@ x - y is at right angles to the surface up to the square root of epsilon only.""
 
 
 def exclusion_radius(sample: Sample, rows: Rows | None, x: Vec3, y: Vec3) -> Real:
-    """A radius about y, the foot of x at right angles to the surface, in which no point of the
-    surface is nearer to x; 0 where none is proved.
+    """Radius of a ball about y in which no surface point is nearer to x than y; 0 if none is
+    proved. x - y is normal to the surface at y.
 
-    sample: f at y, rounding left out. rows: of its Hessian there, if it is known.
+    sample: f at y, without rounding errors.
+    rows: of the Hessian of f at y; None if it is not known.
 
     Proof. Let y + w be a point of the surface, |w| <= r, n = grad f/|g| and x = y + d n, where f
     is taken with the other sign if x is on the other side. With |f(y + w) - f(y) - g . w| <=
-    R1 |w|^2/r^2 (`remainder` falls at least as the square), |n . w| <= c |w|^2, c = R1/(|g| r^2).
-    So |x - y - w|^2 = d^2 - 2 d n . w + |w|^2 >= d^2 + |w|^2 (1 - 2 d c).
+    R1 |w|^2/r^2 (`taylor_remainder` falls at least as the square), |n . w| <= c |w|^2,
+    c = R1/(|g| r^2). So |x - y - w|^2 = d^2 - 2 d n . w + |w|^2 >= d^2 + |w|^2 (1 - 2 d c).
 
     With second derivatives H: -n . w |g| is w.Hw/2 and a rest of at most R2 |w|^3/r^3. Let t be
     the part of w along the tangent plane, k the least of the eigenvalues of H in that plane and 0,

@@ -1,8 +1,9 @@
-"""Closest points of surfaces of fields with sheets, such as meshes: on sheets, and by rays.
+"""Closest points of surfaces of fields with jump surfaces, such as meshes: on the jump surfaces,
+and by rays.
 
-A *sheet* is where a field jumps, such as a triangle of a mesh. It is part of the level set where f
-passes a level from one side of it to the other. Whether it does at a point is what a short ray
-through the point tells, in the same arithmetic in which rays meet the surface anywhere else.
+A *jump surface* consists of facets across which the field jumps, such as the triangles of a mesh. A
+point of it is part of the level set where f passes a level from one side to the other. A short ray
+through the point decides that, in the same arithmetic in which rays meet the surface anywhere else.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 
 __all__ = ["JumpSurfaceSearch", "compass_search", "is_on_surface", "straddles_level"]
 
-# Half the length of a ray through a point of a sheet, in epsilons of coordinates.
+# Half the length of a ray through a point of a facet, in epsilons of coordinates.
 _PROBE_HALF_LENGTH = 32.0
 # A regular tetrahedron about the origin, turned so that none of its edges lies in a plane that
 # triangles of meshes often lie in; and its six edges.
@@ -38,7 +39,7 @@ _CORNERS = (
 _EDGES = ((0, 1), (1, 2), (2, 3), (3, 0), (0, 2), (1, 3))
 # In these lengths: the distance from y at which f is evaluated, where rounding of y hardly counts.
 _SIGN_TEST_SCALE = 64.0
-# Before a sheet f is evaluated at this part of the way to it.
+# Before a facet f is evaluated at this part of the way to it.
 _BEFORE = 0.98
 
 NextJump: TypeAlias = "Callable[[tuple[Any, Any], Any, Any], NearestFacet]"
@@ -46,10 +47,10 @@ NextJump: TypeAlias = "Callable[[tuple[Any, Any], Any, Any], NearestFacet]"
 
 @dataclass(frozen=True)
 class JumpSurfaceSearch:
-    """The search for the closest point of a prepared surface that lies on a sheet.
+    """Search for the closest point of a prepared surface that lies on a jump surface.
 
-    scale: at least the coordinates that the field computes with, for what rounding does.
-    most: sheets that are examined for each point.
+    scale: at least the coordinates that the field computes with, for bounds of rounding errors.
+    most: the largest number of facets that are examined for each point.
     """
 
     surface: SurfaceTracer
@@ -57,18 +58,18 @@ class JumpSurfaceSearch:
     most: int
 
     def closest(self, x: Vec3, limit: Real) -> tuple[Vec3, Vec3]:
-        """A point of the surface on a sheet, nearer to x than `limit` (NaN where none is found),
-        and the way from x to the nearest sheet, part of the surface or not, if that is nearer than
-        `limit` (else infinite).
+        """A point of the surface on a facet, nearer to x than `limit` (NaN where none is found),
+        and the vector from x to the nearest facet, part of the surface or not, if that is nearer
+        than `limit` (else infinite).
 
-        Sheets are examined in the order of their distance, each at its nearest point y to x. A
-        short ray through y along the sheet's normal hits the surface there, or the sheet is not
-        part of it at y. Where y lies on the sheet's edge that ray may slip past, and the six edges
-        of a small tetrahedron about y follow: a surface through y separates its corners, and one
+        Facets are examined in the order of their distance, each at its nearest point y to x. A
+        short ray through y along the facet's normal hits the surface there, or the facet is not
+        part of it at y. Where y lies on the facet's edge that ray may miss it, and the six edges of
+        a small tetrahedron about y follow: a surface through y separates its corners, and a surface
         that ends in a curve through y leaves it through two faces, so that either crosses an edge.
 
-        The first sheet that is hit is the closest point on sheets, unless a sheet nearer than that
-        belongs to the surface elsewhere than at y: the point is one of the surface in any case.
+        The first facet that is hit holds the closest point on facets, unless a nearer facet belongs
+        to the surface elsewhere than at y: the result is a point of the surface in any case.
         """
         backend = self.surface.backend
         real, index, vector = backend.Float, backend.UInt32, backend.Array3f
@@ -114,21 +115,21 @@ class JumpSurfaceSearch:
     def _probe_hits(
         self, y: Vec3, short: Real, start: Vec3, end: Vec3, active: Mask
     ) -> tuple[Mask, Any, Vec3]:
-        """Whether the way between two points about y, in lengths of `short`, meets the surface; the
-        sheet that it meets, and where."""
+        """Whether the segment between two points about y, in units of `short`, meets the surface;
+        the facet that it meets, and where."""
         backend = self.surface.backend
         real, vector = backend.Float, backend.Array3f
         o = dr.fma(vector(short), start, y)
         way, length = (end - start) / dr.norm(end - start), dr.norm(end - start)
         seen = self.surface.first_hit(o, way, real(0), short * length, active)
         met = active & (seen.status == int(RayStatus.HIT))
-        # To first order any level is near where the gradient has no bound, as at the sheet's edge.
+        # To first order any level is near where the gradient has no bound, as at the facet's edge.
         met &= straddles_level(self.surface, y, _SIGN_TEST_SCALE * short, met)
         return met, seen.facet, dr.fma(vector(seen.t), way, o)
 
     def _next_jump(self, x: Vec3) -> NextJump:
-        """The sheets of the field in turn; of a field that does not tell them, the nearest
-        alone."""
+        """The facets of the field in turn; for a field that does not list them, the nearest facet
+        only."""
         field, backend = self.surface.field, self.surface.backend
         real, index = backend.Float, backend.UInt32
         probe = field.nearest_facet(x, (real(-1), index(NO_FACET)), real(0), backend.Bool(False))
@@ -154,13 +155,12 @@ class JumpSurfaceSearch:
 
 
 def straddles_level(surface: SurfaceTracer, y: Vec3, radius: Real, active: Mask) -> Mask:
-    """Whether f is on both sides of a level about y, no farther than 1.74 radii away.
+    """Whether f takes values on both sides of a level within 1.74 radii of y.
 
-    f is evaluated in the corners of a tetrahedron and, on its edges, just before a sheet. Where two
-    of these places are on different sides of a level, the surface lies on the way between them: f
-    passes the level on it steadily, or by a jump. That needs no gradient, which has no bound at the
-    edges of sheets: f takes all values between those on both sides of the sheet there, and no
-    others.
+    It is evaluated at the corners of a tetrahedron and, on its edges, just before a jump surface.
+    Two values on different sides prove that the surface crosses the path between them, where f
+    passes the level continuously or by a jump. No gradient is needed: it is unbounded at the edge
+    of a jump surface, where f takes exactly the values between those on both sides.
     """
     backend, field = surface.backend, surface.field.exact(surface.backend)
     real, index, vector = backend.Float, backend.UInt32, backend.Array3f
@@ -338,17 +338,17 @@ class _HitPlanes:
 
 
 def compass_search(surface: SurfaceTracer, x: Vec3, foot: Vec3) -> Vec3:
-    """Points of the surface no farther from x than `foot`: a compass search over directions.
+    """Compass search over ray directions from x, starting at the surface point `foot`. Returns
+    points of the surface that are no farther from x.
 
-    What other searches cannot follow, a ray sees: the crease in which two sheets meet, the curve at
-    which a smooth part of the surface ends in a sheet, the edge along which a volume cuts it.
+    It reaches closest points on creases of two jump surfaces, on curves where a smooth part ends at
+    a jump surface, and on edges cut by a volume, which no other search here can follow.
 
-    Rays leave x at an angle to the best direction; the first that hits the surface nearer than the
-    best becomes the best. If all of a turn fail, the next turns are narrower, down to an angle of
-    sqrt(epsilon). A compass alone is slow along creases; so each hit adds the plane that touches
-    the surface there, and a turn begins with rays to the nearest points where these planes meet.
-    Every point taken is a first hit that f takes the level about (`straddles_level`), hence one of
-    the surface, whatever led there.
+    Rays leave x at an angle to the best direction; a nearer first hit becomes the best. If no
+    direction improves it, the angle is reduced, down to sqrt(epsilon). To be fast along creases,
+    each hit adds its tangent plane, and a round starts with rays to the nearest points of the
+    planes' intersections. Every accepted point is a first hit about which f straddles the level
+    (`straddles_level`), hence on the surface.
     """
     backend = surface.backend
     real, vector, count = backend.Float, backend.Array3f, backend.UInt32
@@ -401,9 +401,9 @@ def compass_search(surface: SurfaceTracer, x: Vec3, foot: Vec3) -> Vec3:
 
 
 def is_on_surface(surface: SurfaceTracer, y: Vec3, hit: MarchResult, active: Mask) -> Mask:
-    """Whether f takes the level about hits y: beside the edge of a sheet, where its gradient has no
-    bound, rays are within the tolerance of any level to first order, and a ray that begins there
-    may hit the sheet at once, whatever f is."""
+    """Whether f takes the level about hits y. Beside the edge of a jump surface the gradient is
+    unbounded, so that to first order rays are within the tolerance of any level, and a ray that
+    begins there may hit the facet at once, whatever f is."""
     radius = _HIT_TEST_RADIUS * surface.backend.machine_epsilon * fmax(max_norm(y), hit.t)
     return straddles_level(surface, y, radius, active)
 

@@ -1,8 +1,8 @@
-"""The level sets of a closed mesh's winding number, as triangles, the nearest found by a tree.
+"""The level sets of a closed mesh's winding number as triangles, of which a tree finds the nearest.
 
 Off its triangles the winding number of a closed mesh is a whole number; so its level sets consist
-of triangles. One of them belongs to a level as a whole unless others pass through it: then it is
-cut along these first.
+of triangles. A triangle belongs to a level as a whole unless others pass through it: then it is cut
+along these first.
 """
 
 from __future__ import annotations
@@ -38,8 +38,12 @@ _BESIDE = 1e-9
 
 @dataclass(frozen=True)
 class LevelTriangles:
-    """Triangles: corners (k, 3, 3) in coordinates of at most about one, center + size times which
-    are the real ones. is_all: whether the surface is nothing else."""
+    """The triangles of a level set, scaled.
+
+    corners: (k, 3, 3) in coordinates of at most about 1; the real ones are center + size times
+        these.
+    is_complete: whether the surface consists of these triangles only.
+    """
 
     corners: FloatArray
     center: FloatArray
@@ -48,9 +52,10 @@ class LevelTriangles:
 
     @classmethod
     def of(cls, surface: Surface) -> LevelTriangles | None:
-        """Of the winding number of a mesh that nothing clips, and of the boundary of a `MeshSolid`;
-        else None. Of a mesh that is not closed, those triangles that are proved to belong to the
-        surface as a whole; or all, if the surface is nothing else."""
+        """The triangles of a surface: the level set of the winding number of a mesh without a clip,
+        or the boundary of a `MeshSolid`; None for other surfaces. For a mesh that is not closed,
+        the triangles that are proved to belong to the surface as a whole; or all, if the surface
+        consists of triangles only."""
         if isinstance(surface.field, MeshSolid) and surface.clip_volume is None:
             if surface.field.domain is not None or any(surface.level_values):
                 return None
@@ -76,7 +81,8 @@ class LevelTriangles:
         return cls(pieces[on], center, size, is_all)
 
     def upload(self, backend: Backend) -> Callable[[Vec3], Vec3]:
-        """A function that gives the way from points to the nearest; NaN if there are none."""
+        """Upload the triangles. Returns a function of points that gives the vector from each to the
+        nearest triangle point; NaN if there are no triangles."""
         vector, real = backend.Array3f, backend.Float
         if not len(self.corners):
             return lambda p: vector(dr.nan) + 0 * p

@@ -1,4 +1,4 @@
-"""Curvature of level sets: mean and Gaussian, from first and second derivatives; and its lines."""
+"""Curvature of level sets from first and second derivatives, and lines of curvature."""
 
 from __future__ import annotations
 
@@ -31,8 +31,9 @@ __all__ = ["CurvatureSamples", "Family", "curvature", "curvature_lines"]
 # The error of a mean curvature that is good enough: this share of it, or of one over the size of
 # the surface where that is more.
 _ACCURACY = 1e-3
-# How many times farther than usual clusters have to be to count as a whole, in turn, until the
-# error is small enough; at infinity all terms of a sum are taken one by one.
+# Acceptance factors of the multipole expansions, tried in turn until the error is small enough: a
+# cluster is expanded only if it is this many times farther away than usual; with infinity every
+# term is summed directly.
 _ACCEPTANCE_FACTORS = (1.0, 2.0, 4.0, 8.0, 16.0, math.inf)
 # In epsilons, of gradient and Hessian: what the arithmetic here may do.
 _ROUNDING = 16.0
@@ -40,8 +41,8 @@ _ROUNDING = 16.0
 
 @dataclass(frozen=True)
 class CurvatureSamples:
-    """Of the level sets through n points. NaN where the gradient is zero, so that there is no
-    surface, and where its error is not less than the gradient: nothing is known of the surface.
+    """Curvatures of the level sets through n points. NaN where the gradient is zero, so that there
+    is no surface, and where the error of the gradient is not less than its length.
 
     mean: (n,) half the divergence of the normal, 1/length. Its sign is the normal's: a sphere of
         radius r has 1/r if f grows outward, -1/r if f grows inward.

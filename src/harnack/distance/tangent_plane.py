@@ -1,4 +1,5 @@
-"""Level sets near a point: tangent plane, second derivatives along it, and distances."""
+"""The geometry of a level set near a point: tangent plane, second derivatives along it, and first-
+and second-order distances."""
 
 from __future__ import annotations
 
@@ -64,14 +65,15 @@ class SymmetricEigen2:
 
     @classmethod
     def of(cls, uu: Real, vv: Real, uv: Real) -> SymmetricEigen2:
-        """Of the matrix ((uu, uv), (uv, vv))."""
+        """The eigenvalues and the angle of the matrix ((uu, uv), (uv, vv))."""
         middle, half = 0.5 * (uu + vv), 0.5 * (uu - vv)
         spread = dr.sqrt(dr.fma(half, half, uv * uv))
         s, c = dr.sincos(0.5 * dr.atan2(uv, half))
         return cls(middle + spread, middle - spread, c, s)
 
     def coordinates(self, u: Real, v: Real) -> tuple[Real, Real]:
-        """Of the vector (u, v) along the two eigenvectors, the larger one's first."""
+        """Coordinates of the vector (u, v) along the two eigenvectors, that of the larger
+        eigenvalue first."""
         return (
             dr.fma(self.cosine, u, self.sine * v),
             dr.fma(self.cosine, v, -self.sine * u),

@@ -1,7 +1,7 @@
-"""Enclosures: what is proved about f along a path. None of them knows a field by name.
+"""Enclosures: proofs of how far f moves along a path. None of them depends on a kind of field.
 
-This package exports what all proofs share. The proofs themselves are names of `harnack`, which
-`harnack/__init__.pyi` lists.
+This package exports the parts that all proofs share. The proofs themselves are names of `harnack`,
+which `harnack/__init__.pyi` lists.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The bound for functions that are not harmonic but have a bounded Laplacian.
+"""An enclosure of functions that are not harmonic but have a bounded Laplacian.
 
 The talk on Gillespie, Yang, Botsch, Crane 2024 names it as future work; the proof below and its
 constant are new in harnack.
@@ -40,7 +40,7 @@ _UNREACHABLE_GAP = 1e18
 
 @dataclass(frozen=True)
 class BoundedLaplacianEnclosure(Enclosure):
-    """c <= f <= C and a <= Laplacian f <= b on B(p, R) of space.
+    """An enclosure of f with c <= f <= C and a <= Laplacian f <= b on B(p, R) of space.
 
     Proof, R = 1, x = p + q v. With G the Green function of the ball, f = h - integral of G Lap f,
     where h is harmonic with the boundary values of f, so c <= h <= C. As in `HarnackSlopeEnclosure`
@@ -51,23 +51,23 @@ class BoundedLaplacianEnclosure(Enclosure):
         f(x) <= c + (f(p)-c) A + (f_v(p)/3) B + integral of K Lap f,
         K = -G(x,.) + A G(p,.) + (B/3) d_v G(p,.).
 
-    With m = (a+b)/2 and l = (b-a)/2 the integral is at most m (A-1+q^2)/6 + l kappa(q), for that of
-    G(x,.) is (1-q^2)/6 and that of d_v G(p,.) is 0; kappa is the integral of |K|, and
+    With m = (a+b)/2 and l = (b-a)/2 the integral is at most m (A-1+q^2)/6 + l kappa(q), since the
+    integral of G(x,.) is (1-q^2)/6 and that of d_v G(p,.) is 0; kappa is the integral of |K|, and
 
         kappa(q) <= 0.394 q^2 (2 + ln(1/q))/(1-q^2)^2  for all 0 < q < 1,
 
-    proved by a quadrature with an error bound (`tests/oracles/green_kernel.py`); numerically
-    no constant below 0.391 would do, and the logarithm is needed. From below the same holds of -f,
+    proved by a quadrature with an error bound (`tests/oracles/green_kernel.py`); numerically no
+    constant below 0.391 would do, and the logarithm is needed. From below the same holds of -f,
     with -C, -b and -a.
 
     The first crossing is unique. Let w = f(p)-c + m/6 be at least 0 and m q^2/6 at most 0 left out,
-    both of which only raise the bound. As h-c is positive, |h_v(p)|/3 <= h(p)-c, that
-    is |f_v(p)|/3 <= w + 0.1907 l (the norm of G(p,.) + d_v G(p,.)/3); what exceeds it is cut off.
-    Then the bound, w (A-1) + (f_v/3) B + l kappa + m q^2/6, is convex in q, since A'' >= |B''| and
-    kappa'' >= 0.1907 B'' (checked in the same place), and it is 0 at q = 0.
+    both of which only raise the bound. As h-c is positive, |h_v(p)|/3 <= h(p)-c, that is |f_v(p)|/3
+    <= w + 0.1907 l (the norm of G(p,.) + d_v G(p,.)/3); a larger slope is clamped to it. Then the
+    bound, w (A-1) + (f_v/3) B + l kappa + m q^2/6, is convex in q, since A'' >= |B''| and kappa''
+    >= 0.1907 B'' (checked in the same place), and it is 0 at q = 0.
 
-    Neither end falls as the slope grows: it enters the upper one as +f_v B/3 with B >= 0, and the
-    lower one, that of -f negated, in the same way.
+    Neither end falls as the slope grows: it enters the upper end as +f_v B/3 with B >= 0, and the
+    lower end, that of -f negated, in the same way.
     """
 
     radius: Real
@@ -100,8 +100,8 @@ class BoundedLaplacianEnclosure(Enclosure):
         laplacian: tuple[Real, Real],
         slopes: SlopeRange,
     ) -> Self:
-        """The enclosure of an f that may move so far, down and up, with these ends of its
-        Laplacian."""
+        """The enclosure of a function that may fall and rise by the two `ranges` in the ball, with
+        these bounds (lower, upper) of its Laplacian."""
         half = 0.5 * radius * radius
         low, high = half * laplacian[0], half * laplacian[1]
         mean, spread = low + high, high - low

@@ -1,9 +1,9 @@
-"""What an enclosure is: a proof of how far f can move along a path. And what it is given.
+"""Enclosures, which prove how far f can move along a path, and their inputs.
 
-- `Enclosure`: the base of all proofs. A new proof is a class derived from it, in this package.
-- `PathRestriction`: f along a path, for proofs that use ranges of its derivatives on `PathPiece`s
-  of it.
-- `Levels`: the levels to find, and their distances from a value (`LevelGaps`).
+- `Enclosure`: the base of all enclosures. A new proof is a class derived from it, in this package.
+- `PathRestriction`: f along a path, for enclosures that use ranges of its derivatives on pieces of
+  the path (`PathPiece`).
+- `Levels`: the levels that rays look for, and their distances from a value (`LevelGaps`).
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PathPiece:
-    """Ranges of F' and F'' on one piece of the path.
+    """Ranges of F' and F'' on a piece of the path, for the function F along the path.
 
     length: of the piece.
-    slope_range: the range of F' on it.
+    slope_range: the range of F' on the piece.
     min_second_derivative, max_second_derivative: the range of F''; an end may be infinite, for
         functions with kinks.
     """
@@ -42,16 +42,16 @@ class PathPiece:
 
 
 class PathRestriction(Protocol):
-    """A function along a path, of which ranges can be computed.
+    """The restriction of f to a path, with computable ranges of its derivatives.
 
-    piece_count: into how many pieces to cut the path for the least time, by experiment.
+    piece_count: the number of pieces into which to cut the path for the least time, by experiment.
     """
 
     @property
     def piece_count(self) -> int: ...
 
     def derivative_ranges(self, knots: Sequence[Real]) -> tuple[PathPiece, ...]:
-        """Ranges of the derivatives of f(path(t+s)) between each knot and the next.
+        """Ranges of the derivatives of F(s) = f(path(t+s)) between each knot and the next.
 
         knots: increasing lengths s, the first of them 0.
         """
@@ -63,8 +63,8 @@ class EvaluableRestriction(Protocol):
     """A restriction given by a formula, which can be evaluated in any arithmetic."""
 
     def evaluate_with(self, coordinates: Callable[[Vec3, Vec3], tuple[Any, Any, Any]]) -> Any:
-        """The formula applied to the x, y and z that `coordinates` makes from a point p and the
-        direction d of the path."""
+        """Evaluate the formula at x, y and z = coordinates(p, d), for a point p and the direction d
+        of the path. The type of the coordinates chooses the arithmetic."""
         ...
 
 
@@ -75,13 +75,12 @@ STEP_SAFETY = 1.0 - 1e-6
 
 @dataclass(frozen=True)
 class LevelGaps:
-    """How far f must move, down or up, to reach a level: differences of values, >= 0.
+    """The differences in value, >= 0, between f and the next level below and above.
 
-    Infinite where there is no level on that side.
+    A difference is infinite where there is no level on that side.
 
-    is_one_sided: whether at most one of the two is finite on every lane, as there is one level
-        alone. As this is known while a kernel is being recorded, it saves the proof of the other
-        side.
+    is_one_sided: whether at most one of the two is finite on every lane, as with a single level.
+        This is known while a kernel is being recorded, and saves the proof of the other side.
     """
 
     below: Real
@@ -94,7 +93,7 @@ class LevelGaps:
         return fmin(self.below, self.above)
 
     def reduced_by(self, error: Real) -> LevelGaps:
-        """The gaps that surely remain if the value is known up to `error`."""
+        """The gaps that remain at least if the value may be wrong by `error`."""
         down, up = fmax(self.below - error, 0), fmax(self.above - error, 0)
         return LevelGaps(down, up, self.is_one_sided)
 
@@ -112,7 +111,8 @@ class SlopeRange:
 
     @classmethod
     def around(cls, slope: Real, error: Real) -> SlopeRange:
-        """The slopes within `error` of one; an error that is the Python float 0.0 costs nothing."""
+        """The slopes within `error` of a slope. An error that is the Python float 0.0 costs
+        nothing."""
         if isinstance(error, float) and error == 0.0:
             return cls(slope, slope)
         return cls(slope - error, slope + error)
@@ -123,35 +123,35 @@ class SlopeRange:
 
 
 class Enclosure(abc.ABC):
-    """A proof that F stays within a range for 0 <= s < reach.
+    """A proof that F stays within an interval for 0 <= s < reach.
 
     F(s) = f(path(t+s)) - f(path(t)) is the movement of f relative to its value at a sample, so that
     two large numbers are never subtracted: in float32 that is the difference between a march and a
-    stall. Given how far levels are in value (`LevelGaps`), an enclosure proves a length free of
-    them (`free_length`), or says whether a given length is free (`is_free`), which takes one
-    evaluation of the
-    proof and no solver: the tracer uses it looking back.
+    stall. From the differences in value to the next levels (`LevelGaps`), an enclosure proves a
+    length free of levels (`free_length`), or decides whether a given length is free (`is_free`),
+    which takes one evaluation of the proof and no solver: the tracer uses it looking back.
 
-    Neither end of the range may fall as the slope grows, and every proof says why: then the range
-    for the upper end of `SlopeRange` bounds F from above and that for the lower end bounds it from
-    below, whatever the slope in between is. In particular slopes in [-|grad f|, |grad f|] bound F
-    in every direction.
+    Neither end of the interval may fall as the slope grows, and every proof says why: then the
+    interval for the upper end of `SlopeRange` bounds F from above and that for the lower end bounds
+    it from below, whatever the slope in between is. In particular slopes in [-|grad f|, |grad f|]
+    bound F in every direction.
     """
 
     @property
     def reach_growth(self) -> float:
-        """How far an enclosure should reach at the next sample, as a multiple of the step that this
-        one proved; by experiment."""
+        """The reach to ask for at the next sample, as a multiple of the length proved at this one;
+        by experiment."""
         return 2.0
 
     @classmethod
     def from_promise(
         cls, promise: Promise, value: Real, error: Real, slopes: SlopeRange
     ) -> Self | None:
-        """The enclosure that this proof makes of a promise; None if it uses no promise of that
-        kind.
+        """The enclosure that this class proves from a promise; None if it does not use promises of
+        that kind.
 
-        value: f at the sample, known up to `error`. slopes: of f along the path.
+        value: f at the sample, known up to `error`.
+        slopes: of f along the path, at the sample.
         """
         del promise, value, error, slopes
         return None
@@ -160,9 +160,11 @@ class Enclosure(abc.ABC):
     def from_restriction(
         cls, function: PathRestriction, slopes: SlopeRange, length: Real
     ) -> Self | None:
-        """The enclosure that this proof makes of ranges of f along the path; None if it uses none.
+        """The enclosure that this class proves from ranges of the derivatives of f along the path;
+        None if it does not use ranges.
 
-        length: how far it should reach. slopes: of f along the path, where it starts.
+        length: the reach that is asked for.
+        slopes: of f along the path, at its start.
         """
         del function, slopes, length
         return None
@@ -183,11 +185,11 @@ class Enclosure(abc.ABC):
 
 @dataclass(frozen=True)
 class Levels:
-    """A finite set of target levels, repeated with `period` if there is one.
+    """A finite set of levels, repeated with `period` if there is one.
 
-    An angle-valued function is known modulo its period, so its levels form a ladder: every level
-    that was asked for plus every multiple of the period (paper, Alg. 2, with the reduction that the
-    printed algorithm leaves out: both bracketing levels are found from the reduced difference).
+    An angle-valued function is known modulo its period. Its levels are then periodic: each of the
+    values plus every multiple of the period (paper, Alg. 2, with the reduction that the printed
+    algorithm omits: both neighboring levels are computed from the reduced difference).
 
     values: Python floats, or Dr.Jit arrays of size 1 of the backend in use (so that a level can
         change without a kernel being compiled again, or carry derivatives).
@@ -197,10 +199,11 @@ class Levels:
     period: float | None = None
 
     def gaps(self, f: Real) -> LevelGaps:
-        """Distances in value from f to the next level below and above.
+        """The differences in value between f and the next level below and above.
 
-        Either is infinite when there is no such level. A value on a level has a gap of zero on one
-        side and, for a ladder, one of at most a period on the other. Gaps of NaN are NaN.
+        Either is infinite if there is no such level. If f is a level, the gap on one side is zero,
+        and with a period the gap on the other is at most the period. Where f is NaN, the gaps are
+        NaN.
         """
         down: Real = math.inf
         up: Real = math.inf

@@ -1,8 +1,7 @@
 """Enclosures of functions that are the greatest or the nearest of several, and of maps of others.
 
 - `MaximumEnclosure`, with `NegatedEnclosure` and `ScaledEnclosure`: unions, intersections and
-  differences of solids, and
-  solids that were moved and scaled.
+  differences of solids, and solids that were moved and scaled.
 - `NearestBranchEnclosure`: the surfaces of all branches of a multivalued function.
 - `BranchPointEnclosure`: the same near a branch point, where all branches are close to one value.
 """
@@ -25,10 +24,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class MaximumOperand:
-    """One of several functions, at a sample.
+    """An operand f_i of max f_i, at a sample.
 
-    min_deficit, max_deficit: bounds, by rounding, of how far its value is below the greatest.
-    enclosures: of its movement along the path.
+    min_deficit, max_deficit: bounds, with rounding, of the difference max f_j - f_i at the sample.
+    enclosures: of the movement of f_i along the path.
     """
 
     min_deficit: Real
@@ -40,10 +39,11 @@ class MaximumOperand:
 class MaximumEnclosure(Enclosure):
     """The movement of max f_i, from enclosures of the movements of all f_i.
 
-    Proof. The greatest rises by a gap g only where some f_i rises by g plus its distance below the
-    greatest: as far as none of them does, each by its own proof, the greatest does not. It falls by
-    g only where all f_i are that low: as far as one of them is proved not to have fallen so far,
-    the greatest has not. The proofs of the parts may be of any kind, and of different kinds.
+    Proof. The maximum rises by a gap g only where some f_i rises by g plus its deficit, the
+    difference between the maximum and f_i at the start: as long as no f_i does, each by its own
+    proof, the maximum does not. It falls by g only where all f_i are that low: as long as one of
+    them is proved not to have fallen so far, the maximum has not. The proofs of the operands may be
+    of any kind, and of different kinds.
     """
 
     operands: tuple[MaximumOperand, ...]
@@ -71,7 +71,7 @@ class MaximumEnclosure(Enclosure):
         return (up | (gaps.above == dr.inf)) & down
 
     def _reach(self, none: Real) -> Real:
-        """How far the enclosures of all parts reach, if there is no level."""
+        """The reach of the enclosures of all operands, if there is no level."""
         reach = none
         for part in self.operands:
             reach = fmin(longest_free_length(part.enclosures, LevelGaps(none, none)), reach)
@@ -79,7 +79,8 @@ class MaximumEnclosure(Enclosure):
 
     @staticmethod
     def _gaps(gaps: LevelGaps, part: MaximumOperand) -> tuple[LevelGaps, LevelGaps]:
-        """How far the part must rise, or fall, for the greatest to meet a level."""
+        """How far an operand must rise, and how far it must fall, for the maximum to meet a
+        level."""
         none = type(gaps.above)(dr.inf)
         return (
             LevelGaps(none, gaps.above + part.min_deficit, is_one_sided=True),
@@ -102,11 +103,11 @@ class NegatedEnclosure(Enclosure):
 
 @dataclass(frozen=True)
 class ScaledEnclosure(Enclosure):
-    """The movement of factor * f(map(path)), where the map stretches the path by `speed`.
+    """The movement of value_factor * f(map(path)), where the map stretches the path by `speed`.
 
     Proof. A length s of the path is a length speed s of the path that `inner` is about, and a gap g
-    of factor f is a gap g/factor of f. speed and factor, positive, are known to within a few
-    roundings, by which steps are shortened.
+    of value_factor f is a gap g/value_factor of f. speed and value_factor, positive, are known to
+    within a few roundings, by which steps are shortened.
     """
 
     inner: Enclosure
@@ -133,10 +134,10 @@ def _scaled(gap: Real, share: Real) -> Real:
 
 @dataclass(frozen=True)
 class BranchSample:
-    """One of several functions phi_j, continued along the path from a sample.
+    """A branch phi_j of a multivalued function at a sample, continued along the path.
 
-    slopes: slopes of |phi_j| there.
-    excess: by how much |phi_j| exceeds the smallest of them, less what rounding may have added.
+    slopes: the range of the slope of |phi_j| at the sample.
+    excess: |phi_j| minus the smallest |phi_i| at the sample, less a bound of its rounding error.
     """
 
     slopes: SlopeRange
@@ -148,23 +149,24 @@ class NearestBranchEnclosure(Enclosure):
     """The movement of f = s min_j |phi_j|, s the sign of the product of all phi_j.
 
     Such an f is continuous and single-valued wherever the set of all phi_j is, however the branches
-    are numbered, for s changes only where the minimum is 0. It is zero where one of them is.
+    are numbered, for s changes only where the minimum is 0. It is zero where one of the phi_j is.
 
-    Let |phi_j''| <= bend along the path for 0 <= s < reach, for continuations without a jump; and
-    g_j = phi_j with the sign for which it has that of f here.
+    Let |phi_j''| <= second_derivative_bound along the path for 0 <= s < reach, for continuations
+    without a jump; and let g_j be phi_j or -phi_j, whichever has the sign of f at the start.
 
     Proof towards zero, from f > 0 to a level f - d; downwards is upwards for -f. As long as no g_j
     has fallen by |phi_j| - f + d, to f - d, f stays above that: if all g_j are positive, no sign
     has changed and f is the smallest g_j. Otherwise f - d < 0, and where f is negative an odd
-    number of the g_j is, so one of them, and f >= -|g_j| > f - d. A g_j falls along its parabola at
-    most.
-    Away from zero, to a level f + a: f stays below f + a as long as the phi_i that is nearest at
-    the start has |g_i| below f + a: as long as g_i has not risen by a, nor fallen by 2 f + a. So a
-    step is free of all sheets, not of the nearest alone, and another one may become the nearest on
-    the way.
+    number of the g_j is, so at least one g_j is, and f >= -|g_j| > f - d. A g_j falls along its
+    parabola at most.
 
-    branches: one for each phi_j.
-    nearest: that with the smallest |phi_j|.
+    Proof away from zero, to a level f + a: f stays below f + a as long as |g_i| does, for the phi_i
+    that is nearest at the start: as long as g_i has neither risen by a nor fallen by 2 f + a. So a
+    step is free of all branches, not of the nearest alone, and another branch may become the
+    nearest on the way.
+
+    branches: a sample of each phi_j.
+    nearest: the sample of the phi_j with the smallest |phi_j|.
     distance: |f|.
     is_positive: whether f is positive.
     """
@@ -196,7 +198,7 @@ class NearestBranchEnclosure(Enclosure):
         return fmax(dr.select(known, fmin(length, self.reach), 0) * STEP_SAFETY, 0)
 
 
-# What powers may round by is more than `STEP_SAFETY` takes off.
+# Powers may have larger rounding errors than `STEP_SAFETY` covers.
 _POWER_SAFETY = 1.0 - 1e-5
 # The values of q in the proof of `BranchPointEnclosure` that are tried.
 _TRIED_FRACTIONS = (0.5, 0.95)
@@ -208,19 +210,19 @@ class BranchPointEnclosure(Enclosure):
     branches u_j pass into each other.
 
     Within the radius R of that line |u_j - c| <= C r^alpha, alpha > 0, for all branches (up to a
-    period), r the distance from the line. No parabola reaches far there, for second derivatives
-    grow without bound, though the branches hardly move.
+    period), r the distance from the line. A parabola proves only short lengths there, for second
+    derivatives grow without bound, though the branches hardly move.
 
-    Proof. Let y = |h - c|, and v the most by which it falls per unit of the path. On a disk of
-    radius r <= R about the line and for a length L of the path, all |h - u_j| are at least
-    y - v L - C r^alpha. For any 0 < q < 1 and w = y - (|f| - gap), r = (q w/C)^(1/alpha) and L =
-    (1 - q) w/v make that |f| - gap: so f, whose sign changes only where one of them is 0, does not
-    fall by the gap up to L, or up to where the path leaves the disk if that is earlier.
+    Proof. Let y = |h - c|, and v its largest rate of decrease along the path. On a disk of radius r
+    <= R about the line and for a length L of the path, all |h - u_j| are at least y - v L - C
+    r^alpha. For any 0 < q < 1 and w = y - (|f| - gap), r = (q w/C)^(1/alpha) and L = (1 - q) w/v
+    make that |f| - gap: so f, whose sign changes only where one of them is 0, does not fall by the
+    gap up to L, or up to where the path leaves the disk if that is earlier.
 
     distance_to_limit: y.
     max_fall_rate: v.
-    closest_parameter, closest_distance: how far ahead the path's closest point to the line is, and
-        how far from it, both as lengths in the plane.
+    closest_parameter, closest_distance: how far ahead the path is closest to the branch line, and
+        its distance from the line there; both are lengths in the plane.
     speed: of the path in the plane.
     exponent, constant: alpha and C.
     max_radius: the largest r that may be used, R less rounding.

@@ -1,14 +1,14 @@
-"""What proofs on balls share: the solver for the proved length, and `HarmonicBallEnclosure`, for
-harmonic functions.
+"""The longest length proved by a proof on a ball: the solver that all such proofs share, and
+`HarmonicBallEnclosure`, for harmonic functions.
 
-Every proof on a ball B(p, R) shows that f meets no level at distance q R as long as
+A proof on a ball B(p, R) shows that all lengths up to q R are free of levels if
 
     q k(q) <= gap,
 
 with a k that has no poles on [0, 1] and a dimensionless gap. `largest_free_fraction` finds the
-largest
-such q from the safe side: nothing large is ever subtracted, and q is accurate relative to itself.
-Near a surface the gap is tiny, and a q found to an absolute accuracy would stall the march.
+largest such q from the safe side: large numbers are never subtracted, and the error of q is small
+relative to q. Near a surface the gap is tiny, and with a q of a small absolute error only, the
+march would stall.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ if TYPE_CHECKING:
 
 # Lengths are multiplied by this, to cover the roundings of the two sides of the comparison.
 CONDITION_SAFETY = 1.0 - 2e-6
-# k is the difference of numbers of order one: so many roundings, halves of a unit in the last
-# place, are added to it, which covers their rounding and that of the given slope.
+# k is the difference of numbers of order one. This number of unit roundoffs is added to it, which
+# covers their rounding and that of the slope.
 _ROUNDINGS = 16.0
 
 
 class FreeRadiusCondition(Protocol):
-    """A condition q k(q) <= gap under which distance q is proved free; q k(q) crosses the gap
-    upwards at most once on [0, 1]."""
+    """A condition q k(q) <= gap which proves that all of [0, q] is free of levels, q a fraction of
+    the radius. q k(q) crosses the gap upwards at most once on [0, 1]."""
 
     @property
     def gap(self) -> Real: ...
@@ -47,12 +47,12 @@ class FreeRadiusCondition(Protocol):
         ...
 
     def expansion_at_zero(self) -> tuple[Real, Real]:
-        """k(0) and k'(0), for a first guess: no proof rests on them."""
+        """k(0) and k'(0), for a first guess; no proof relies on them."""
         ...
 
 
 def condition_rounding(real: Any) -> float:
-    """What is added to k in the precision of `real`."""
+    """The number that is added to k to cover rounding, in the precision of `real`."""
     return _ROUNDINGS * float(dr.epsilon(real))
 
 
@@ -119,10 +119,11 @@ _RADIUS_SAFETY = 1.0 - 1e-6
 
 @dataclass(frozen=True)
 class HarmonicBallEnclosure(Enclosure):
-    """f is harmonic on B(p, radius) of R^dimension and moves there by less than the two ranges.
+    """Base of enclosures of a harmonic f on B(p, radius) of R^dimension that falls and rises there
+    by less than two bounds.
 
-    max_fall, max_rise: f - lower and upper - f, how far the promise lets f move, so that
-        bounds never subtract two large numbers. None for a side that is not bounded.
+    max_fall, max_rise: f - lower and upper - f at p, so that two large numbers are never
+        subtracted. None for a side that is not bounded.
     """
 
     radius: Real
@@ -160,11 +161,12 @@ class HarmonicBallEnclosure(Enclosure):
 def allowed_movement(
     promise: HarmonicBall | BoundedLaplacian, value: Real, error: Real
 ) -> tuple[Real, Real | None, Real | None]:
-    """Radius, and how far the promise lets f move down and up (None: that side is not bounded).
+    """The radius of a promise, and how far it lets f fall and rise (None: that side is not
+    bounded).
 
-    The ends of the promise are moved outwards by the error and eight units in the last place of f:
-    a promise that leaves f no range, but for rounding, would otherwise prove f constant. A radius
-    that is not a positive number, or a NaN anywhere, proves nothing (radius 0).
+    The ends of the promise are moved outwards by the error and by eight units in the last place of
+    f: if the two ends are equal up to rounding, the promise would otherwise prove f constant. A
+    radius that is not a positive number, or a NaN anywhere, proves nothing (radius 0).
     """
     unit = 2 * float(dr.epsilon(type(value)))  # Dr.Jit's is half the distance to the next number
     total_error = dr.fma(8 * unit, dr.abs(value), error)

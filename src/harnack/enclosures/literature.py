@@ -1,8 +1,9 @@
-"""Proofs of the literature for fields given by a formula, for comparison with
+"""Enclosures of the literature for fields that are formulas, for comparison with
 `PiecewiseTaylorEnclosure`.
 
 Parabolas come from the bottom-up arithmetic of `harnack.arithmetic.ParabolaBounds`, bands from
-affine forms and from intervals. All of them prove steps; benchmarks measure how many a ray takes.
+affine forms and from intervals. All of them prove steps; benchmarks measure how many steps a ray
+takes.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ class BottomUpQuadraticEnclosure(ParabolaEnclosure):
     """The parabolas that a formula's arithmetic proves.
 
     Source: Aydinlilar and Zanni 2023, section 6.2. Proof: that of `ParabolaBounds`, then of
-        `ParabolaEnclosure`.
+    `ParabolaEnclosure`.
     """
 
     degree: ClassVar[int] = 2
@@ -74,7 +75,7 @@ class BottomUpLinearEnclosure(BottomUpQuadraticEnclosure):
 
 @dataclass(frozen=True)
 class LongestOfEnclosure(Enclosure):
-    """The longest step that one of several proofs gives for one function.
+    """The longest step that one of several enclosures of the same function proves.
 
     Source: Aydinlilar and Zanni 2023, section 4 ("mixed"): bounds of derivatives where they are
     tight, bottom-up arithmetic where they are not.

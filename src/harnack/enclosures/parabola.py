@@ -1,4 +1,4 @@
-"""Proofs by lines and parabolas: `ParabolaEnclosure` and those derived from it,
+"""Enclosures by lines and parabolas: `ParabolaEnclosure`, enclosures derived from it,
 `ConvexityEnclosure` and `SphereArcEnclosure`.
 
 - `LipschitzEnclosure`: from a Lipschitz constant. `TaylorEnclosure`: from a bound of the second
@@ -29,18 +29,17 @@ _ROOT_OF_TWO = math.sqrt(2.0)
 
 @dataclass(frozen=True)
 class ParabolaEnclosure(Enclosure):
-    """slopes.lower s + min_second_derivative s^2/2 <= F(s)
-    <= slopes.upper s + max_second_derivative s^2/2.
+    """slopes.lower s + min_second_derivative s^2/2 <= F(s) <= slopes.upper s +
+    max_second_derivative s^2/2, for 0 <= s < reach.
 
-    For 0 <= s < reach. Curvatures are second derivatives, of either sign.
+    The second derivatives may have either sign.
 
     Proof of the step. The upper parabola starts a gap g > 0 below the level above and first reaches
-    it at the smallest positive root of a s + c s^2/2 = g, which is, without cancellation,
-    2g/(a + r) where a > 0 and (r - a)/c where a <= 0 < c, with r = sqrt(a^2 + 2 c g); there is none
-    where a <= 0 and c <= 0, or where r is not real. For the level below the same holds of -F.
-    If the curvatures are exact the step is exact to second order, so that steps converge
-    quadratically at the surface. The upper end rises with the largest slope, the lower one with the
-    least.
+    it at the smallest positive root of a s + c s^2/2 = g, which is, without cancellation, 2g/(a +
+    r) where a > 0 and (r - a)/c where a <= 0 < c, with r = sqrt(a^2 + 2 c g); there is none where a
+    <= 0 and c <= 0, or where r is not real. For the level below the same holds of -F. If the second
+    derivatives are exact the step is exact to second order, so that steps converge quadratically at
+    the surface. The upper end rises with the largest slope, the lower end with the smallest.
     """
 
     slopes: SlopeRange
@@ -64,8 +63,8 @@ class ParabolaEnclosure(Enclosure):
 class LipschitzEnclosure(ParabolaEnclosure):
     """The Lipschitz cone: the step of sphere tracing.
 
-    Proof. |F(s)| <= K s for s < radius by the promise: a parabola without curvature, whose step is
-    min(gap)/K. Source: Hart 1996, Theorem 1.
+    Proof. |F(s)| <= K s for s < radius by the promise: a parabola without second-order term, whose
+    step is min(gap)/K. Source: Hart 1996, Theorem 1.
     """
 
     @classmethod

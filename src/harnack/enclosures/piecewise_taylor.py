@@ -1,4 +1,5 @@
-"""Pieces: the path cut at a few lengths, with ranges of the first two derivatives on each piece."""
+"""Piecewise Taylor enclosures: the path cut at a few lengths, with ranges of the first two
+derivatives on each piece."""
 
 from __future__ import annotations
 
@@ -79,8 +80,8 @@ class PiecewiseTaylorEnclosure(Enclosure):
         return falls | (first.slope_range.lower * reach >= gaps.above)
 
     def _free_on_pieces(self, gap: Real, rises: Mask | bool) -> tuple[Real, Mask]:
-        """The first s at which F, or -F, may reach the gap, or the whole length if it cannot; and
-        whether it cannot."""
+        """The first s at which F, or -F, may reach the gap, or the whole length if it is proved not
+        to; and whether it is proved not to."""
 
         def chosen(upper: Real, lower: Real) -> Real:
             return dr.select(rises, upper, -lower)
@@ -103,7 +104,8 @@ class PiecewiseTaylorEnclosure(Enclosure):
     def _advance_piece(
         cls, left: Real, slope: Real, most: Real, bend: Real, length: Real
     ) -> tuple[Real, Real, Real]:
-        """The slope at the end of a piece, how far it is free, and the rest of the gap there."""
+        """The slope at the end of a piece, the length of the piece that is proved free, and the gap
+        that remains at its end."""
         # A range that is NaN is not known.
         slope = dr.select((slope <= most) | dr.isnan(most), slope, most)
         by_line = dr.select(most > 0, left / most, dr.select(most <= 0, dr.inf, 0))
@@ -120,7 +122,7 @@ class PiecewiseTaylorEnclosure(Enclosure):
 
 
 class SinglePieceEnclosure(PiecewiseTaylorEnclosure, abc.ABC):
-    """Base of proofs from ranges on the whole length at once: those of the literature."""
+    """Base of the enclosures of the literature that use ranges on the whole length at once."""
 
     @classmethod
     def _count(cls, function: PathRestriction) -> int:
@@ -132,7 +134,7 @@ class QuadraticTaylorEnclosure(SinglePieceEnclosure):
     """The parabola from the slope at the start and the range of F''.
 
     Source: Aydinlilar and Zanni 2023, section 6.1. Proof: that of `PiecewiseTaylorEnclosure`,
-        without the line.
+    without the line.
     """
 
     @classmethod
@@ -147,8 +149,7 @@ class LinearTaylorEnclosure(SinglePieceEnclosure):
     """The line from the range of F'.
 
     Source: Aydinlilar and Zanni 2023, section 4.1, with the exact range. Proof: that of
-        `PiecewiseTaylorEnclosure`,
-    without the parabola.
+    `PiecewiseTaylorEnclosure`, without the parabola.
     """
 
     @classmethod

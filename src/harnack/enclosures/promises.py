@@ -1,11 +1,12 @@
-"""Promises: what a field knows about itself near a point, whatever the direction.
+"""Promises: what a field guarantees near a point, in every direction.
 
 A promise is stated in the field's own units and must be *true*: every step that the tracer takes
-rests on it. Enclosures are made of promises, once the slope along a direction is known.
+relies on it. Enclosures are derived from promises, once the slope along a direction is known.
 
-What a promise of f says of other functions is derived here and nowhere else. For f scaled, shifted,
-negated and stretched in space it follows from the units of the promise's numbers. A new kind of
-promise states those units, what it says of f (`movement_bounds`), and what else follows from it.
+This module alone derives promises of other functions from a promise of f. For f scaled, shifted,
+negated and stretched in space they follow from the units of the promise's numbers. A new kind of
+promise defines those units, the bounds of f that it implies (`movement_bounds`), and further
+consequences.
 """
 
 from __future__ import annotations
@@ -39,8 +40,8 @@ _SECOND_DERIVATIVE_BOUND, _SECOND_DERIVATIVE_BOUND_4D, _FIRST_DERIVATIVE_BOUND =
 
 @dataclass(frozen=True)
 class Promise(abc.ABC):
-    """Base of all kinds of promises. Subclasses are frozen dataclasses of their numbers, one of
-    which is `radius`: how far from the point the promise holds."""
+    """Base of all kinds of promises. A subclass is a frozen dataclass of its numbers; `radius` is
+    the distance from the point within which the promise holds."""
 
     units: ClassVar[tuple[tuple[str, int, int], ...]]
     """The names of its numbers, and the powers of the units of f and of length that each is in."""
@@ -61,29 +62,38 @@ class Promise(abc.ABC):
 
     @abc.abstractmethod
     def movement_bounds(self, value: Any, slopes: SlopeRange, length: Any) -> tuple[Any, Any]:
-        """Lower and upper bound of f(y) - f(p), for y at that length, less than the radius, from p
-        along a direction with these slopes; value: f(p). For NumPy and Dr.Jit arrays alike."""
+        """Lower and upper bound of f(y) - f(p), for y at a length, less than the radius, from p
+        along a direction in which f has these slopes at p.
+
+        value: f(p). For NumPy and Dr.Jit arrays alike.
+        """
 
     def taylor_remainder_bound(self, value: Real, length: Real, degree: int = 1) -> Real:
-        """A bound of what Taylor's polynomial of a degree (1 or 2) about p leaves out of f(y), for
-        |y - p| <= length, which decreases at least as the power degree + 1 of the length; infinite
-        where none follows."""
+        """A bound of |f(y) - T(y)| for |y - p| <= length, T the Taylor polynomial of f about p of a
+        degree (1 or 2); infinite if none follows. As the length decreases, it decreases at least as
+        length^(degree + 1)."""
         del value, length, degree
         return dr.inf
 
     def implied_lipschitz(self, value: Real) -> Lipschitz | None:
-        """A Lipschitz constant that follows from it; None where none does."""
+        """A Lipschitz promise that follows from this one; None if none does."""
         del value
         return None
 
     def implied_second_derivative_bound(self, value: Real) -> tuple[Real, Real] | None:
-        """A bound of |f_vv| for all unit vectors v, and the distance within which it holds at every
-        point; None where none follows. A remainder is less: it is seen from one point alone."""
+        """A bound of |f_vv| for all unit vectors v, and the radius of the ball about p in which it
+        holds at every point; None if none follows. (`taylor_remainder_bound` is smaller: it is
+        about the Taylor polynomial at p alone.)"""
         del value
 
     def weakened_for_linear_maps(self, value: Real) -> Promise:
-        """A promise that follows from this one and holds, transformed, for f(A x) with any linear
-        map A. Laplacians do not survive a map that is no similarity; other kinds do."""
+        """A weaker promise of a kind that survives every linear map A of space: if f makes it, f(A
+        x) makes it in a transformed form.
+
+        Harmonic functions and bounds of the Laplacian survive similarities only: HarmonicBall
+        returns a TaylorRemainder, and BoundedLaplacian a Lipschitz promise. Other kinds return
+        themselves.
+        """
         del value
         return self
 
@@ -118,8 +128,8 @@ class Promise(abc.ABC):
         return self.map_numbers(lambda number, _, power: longer(number, power))
 
     def linearly_mapped(self, stretch: Real) -> Self:
-        """The promise of x -> f(A x) for a linear map A that makes no length more than `stretch`
-        times as long."""
+        """The promise of x -> f(A x) for a linear map A that stretches no length by more than the
+        factor `stretch`."""
 
         def shorter(number: Real, power: int) -> Real:
             if power > 0:
@@ -131,12 +141,14 @@ class Promise(abc.ABC):
         return self.map_numbers(lambda number, _, power: shorter(number, power))
 
     def map_numbers(self, change: Callable[[Any, int, int], Any]) -> Self:
-        """The promise with other numbers; change: from a number and the powers of its unit."""
+        """The promise with other numbers. change: a function of a number and the powers of its
+        unit, which returns the new number."""
         numbers = {name: change(getattr(self, name), *powers) for name, *powers in self.units}
         return dataclasses.replace(self, **numbers)
 
     def select(self, mask: Mask, other: Self) -> Self:
-        """The other promise, of the same kind, where the mask holds, this one elsewhere."""
+        """The other promise, of the same kind, on lanes where the mask is set; this promise
+        elsewhere."""
         numbers: dict[str, Any] = {}
         for name, *_ in self.units:
             one, own = getattr(other, name), getattr(self, name)

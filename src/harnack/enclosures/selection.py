@@ -1,4 +1,5 @@
-"""The choice of proofs, by name or by class; the longest step that several enclosures prove."""
+"""The choice of enclosures, by name or by class; the longest length that several enclosures
+prove."""
 
 from __future__ import annotations
 
@@ -69,12 +70,12 @@ _NAMES_USING_RANGES = [
 
 @dataclass(frozen=True)
 class EnclosureKinds:
-    """Kinds of enclosures. For each promise the first kind that can be made of it is used.
+    """Ordered classes of enclosures. For each promise the first class that can use it is chosen.
 
-    kinds: from the sharpest to the weakest: a later one would only prove less from the same
+    kinds: from the sharpest to the weakest: a later class would only prove less from the same
         promise.
-    uses_alternative_promises: whether to use promises that the field calls weaker than its others
-        (`Sample.alternative_promises`).
+    uses_alternative_promises: whether to use promises that the field declares weaker than its
+        others (`Sample.alternative_promises`).
     """
 
     kinds: tuple[type[Enclosure], ...]
@@ -83,8 +84,8 @@ class EnclosureKinds:
     def from_restriction(
         self, function: PathRestriction, slopes: SlopeRange, length: Real
     ) -> tuple[Enclosure, ...]:
-        """The enclosures of a function whose ranges along the path are known; empty if none of the
-        proofs uses ranges."""
+        """The enclosures of a function whose ranges along the path are known; empty if no class
+        uses ranges."""
         for kind in self.kinds:
             enclosure = kind.from_restriction(function, slopes, length)
             if enclosure is not None:
@@ -102,9 +103,10 @@ class EnclosureKinds:
     ) -> tuple[Enclosure, ...]:
         """The enclosures of f along a direction in which it has these slopes.
 
-        promises, alternative_promises, value, error, ray_promises: as in `Sample`. Raises
-            ValueError if no proof applies to
-        a promise.
+        promises, alternative_promises, value, error, ray_promises: as in `Sample`.
+
+        Raises:
+            ValueError: no class of enclosures applies to a promise.
         """
         promises = promises + alternative_promises if self.uses_alternative_promises else promises
         made = [self._enclosure(one, value, error, slopes) for one in (*promises, *ray_promises)]
@@ -165,18 +167,20 @@ EnclosureChoice: TypeAlias = (
 
 
 def choose_enclosures(bound: EnclosureChoice = None) -> EnclosureKinds:
-    """The proofs asked for: a name, one or several classes of enclosures, or None for all that pay.
+    """The classes of enclosures for an argument `bound`: a name, one or several classes, or None
+    for all that are worth their time.
 
     Names: "classic" (the published rule), "slope", "caps" (caps where both ends are known, the
     slope bound elsewhere), "laplacian" (where the Laplacian is bounded), "lipschitz", and
     "curvature" (Taylor's formula where second derivatives are bounded, else as "caps"); for fields
     with a formula "pieces", and for comparison "quadratic-taylor", "linear-taylor" and "segment",
     and by the formula's own arithmetic "bottom-up-linear", "bottom-up-quadratic", "mixed", "affine"
-    and "interval".
-    None means "pieces", which for fields without a formula means "curvature", but without the
-    promises that a field itself calls weaker than its others.
+    and "interval". None means "pieces", which for fields without a formula means "curvature", but
+    without the promises that a field declares weaker than its others.
 
-    Raises ValueError for another name, TypeError for what is no class of enclosures.
+    Raises:
+        ValueError: another name.
+        TypeError: a value that is not a class of enclosures.
     """
     if isinstance(bound, EnclosureKinds):
         return bound
@@ -206,9 +210,10 @@ def _is_proof(kind: Any) -> bool:
 
 
 def longest_free_length(enclosures: tuple[Enclosure, ...], gaps: LevelGaps) -> Real:
-    """The longest step that one of the enclosures proves: every one is safe, so their maximum is.
+    """The longest length that any of the enclosures proves free. Each is proved, so their maximum
+    is.
 
-    At least 0, also where an enclosure gives NaN.
+    It is at least 0, also where an enclosure gives NaN.
     """
     best: Real = type(gaps.above)(0)
     for one in enclosures:
@@ -217,7 +222,7 @@ def longest_free_length(enclosures: tuple[Enclosure, ...], gaps: LevelGaps) -> R
 
 
 def any_is_free(enclosures: tuple[Enclosure, ...], gaps: LevelGaps, length: Real) -> Mask:
-    """Whether one of the enclosures proves the length free."""
+    """Whether any of the enclosures proves the length free."""
     free = length <= 0
     for one in enclosures:
         free |= one.is_free(gaps, length)

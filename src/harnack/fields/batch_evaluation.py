@@ -1,4 +1,4 @@
-"""Running Dr.Jit kernels at many points, batch by batch: NumPy in, NumPy out."""
+"""Runs Dr.Jit kernels at many NumPy points, in batches; the results are NumPy arrays."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ def evaluate_points(
     kernel: Callable[[Backend, Vec3], tuple[Any, ...]],
     precision: Precision,
 ) -> tuple[npt.NDArray[Any], ...]:
-    """The arrays that `kernel` gives at points (n, 3), in their order; for a single point (3,) the
-    only entries.
+    """The arrays that `kernel` gives at points (n, 3), in the order of the points; for a single
+    point (3,) without the first axis.
 
     The points are visited cell by cell along a Morton curve, so that neighboring lanes visit the
     same nodes of a tree, which halves the time.
@@ -56,7 +56,7 @@ def evaluate_points(
 
 
 def accepts_numpy_points(hessian: Callable[[Any, Vec3], Any]) -> Callable[..., Any]:
-    """A decorator of a field's method `hessian`: it also takes NumPy points and gives NumPy
+    """Decorator of a field's method `hessian`, which then also takes NumPy points and gives NumPy
     matrices."""
 
     @accepts_dask_arrays("p")
@@ -84,8 +84,8 @@ def map_batches(
     """The results of `compute` for points (n, 3), as arrays (n,) or (n, 3) in its precision.
 
     points: an array-like, or a Dr.Jit 3-vector.
-    others: more vectors (n, 3) that `compute` is given, one in each lane; they may have any values.
-    at_once: how many points make a batch.
+    others: further arguments of `compute`, vectors (n, 3) of any values, one row for each point.
+    at_once: the number of points of a batch.
 
     Raises:
         TypeError, ValueError: points that are no (n, 3) array of finite numbers.

@@ -1,7 +1,7 @@
 """Fields that can be evaluated at many points at once, and caches that live as long as a field.
 
-- `BatchedField`: values, derivatives and error bounds at points: NumPy in, NumPy out.
-- `FieldCache`, `cached_prepare`: what is computed or uploaded only once for a field.
+- `BatchedField`: values, derivatives and error bounds at NumPy points, as NumPy arrays.
+- `FieldCache`, `cached_prepare`: caches for results that are computed or uploaded once per field.
 """
 
 from __future__ import annotations
@@ -77,8 +77,8 @@ class SymmetricMatrix:
 
 @dataclass(frozen=True)
 class PointValues:
-    """Value and, if they were asked for, gradient and Hessian of a field at points, in the field's
-    own units, with bounds of their errors by truncation and rounding.
+    """Value and, if requested, gradient and Hessian of a field at points, in the units of the
+    field, with bounds of their truncation and rounding errors.
 
     error: of the value.
     gradient_error: of the gradient, as a length.
@@ -140,22 +140,23 @@ class BatchedField(Field):
 
     @abc.abstractmethod
     def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> PointValues:
-        """Everything at points x, a Dr.Jit 3-vector of any backend and precision.
+        """Values and derivatives at points x, a Dr.Jit 3-vector of any backend and precision.
 
-        Not called while a loop is being recorded, unless derivatives is 2.
+        Not called while a loop is being recorded, unless `derivatives` is 2.
 
-        derivatives: 0 for the value alone, 1 with the gradient, 2 with the Hessian.
-        closer: clusters of far terms are approximated only beyond so many times the usual distance,
-            at least 1; infinity approximates nothing.
+        derivatives: 0 for values only, 1 for gradients too, 2 for Hessians too.
+        closer: clusters of far terms are approximated only beyond this multiple of the usual
+            distance, at least 1; with infinity nothing is approximated.
         """
 
     def sharp_values_at(self, x: Vec3) -> PointValues:
-        """`values_at` with the gradient, which may be looked at more closely: what users are given
-        as the gradient at points. Not called while a loop is being recorded."""
+        """`values_at` with the gradient, which subclasses may refine: `gradient` returns it to
+        users. Not called while a loop is being recorded."""
         return self.values_at(x, 1)
 
     def differentiable_value(self, p: Vec3) -> Real:
-        """f to first order about p: its value and, in reverse and forward mode, its gradient."""
+        """f at p as an expression whose first derivative is the gradient of f, in reverse and in
+        forward mode."""
         with dr.suspend_grad():
             at = self.sharp_values_at(dr.detach(p))
         # A literal 0, the gradient of a closed mesh, would have no derivative in Dr.Jit.
@@ -184,15 +185,15 @@ class BatchedField(Field):
     def value_and_gradient(
         self, points: Any, *, precision: Precision = "single"
     ) -> tuple[FloatArray, FloatArray]:
-        """Values (n,) and gradients (n, 3) together, at hardly more cost than the latter."""
+        """Values (n,) and gradients (n, 3) together, at hardly more cost than gradients alone."""
         value, gradient = self._at(points, precision, 1, lambda at: (at.value, at.gradient))
         return value, gradient
 
     def rough_value_and_gradient(
         self, points: Any, *, precision: Precision = "single"
     ) -> tuple[FloatArray, FloatArray]:
-        """Values (n,) and gradients (n, 3) of one pass over a tree, the latter perhaps far off: for
-        guesses, and where f is steep."""
+        """Values (n,) and gradients (n, 3) of a single pass over a tree. Errors of the gradients
+        may be large: they are for estimates, and for points at which f is steep."""
 
         def kernel(backend: Backend, x: Vec3) -> tuple[Any, ...]:
             del backend
@@ -212,16 +213,16 @@ class BatchedField(Field):
     def error_bound(self, points: Any, *, precision: Precision = "single") -> FloatArray:
         """Bounds (n,) of the error of `value` at points (n, 3).
 
-        Proved truncation, and rounding. The rounding of the points themselves, in single precision,
-        is not included.
+        They include the proved truncation error and the rounding error of f. The rounding of the
+        points themselves, in single precision, is not included.
         """
         return self._at(points, precision, 0, lambda at: (at.error,))[0]
 
     @accepts_dask_arrays("points")
     def gradient_error_bound(self, points: Any, *, precision: Precision = "single") -> FloatArray:
         """Bounds (n,) of the error of `gradient`, as a length, at points (n, 3): see
-        `error_bound`. Of a sum over a tree it is some hundred times the error itself: the tree
-        decides by estimates how closely it looks (`sharpened`)."""
+        `error_bound`. For a sum over a tree the bound is about a hundred times the error itself:
+        the accuracy of the sum is chosen by estimates (`sharpened`)."""
         return self._at(points, precision, 1, lambda at: (at.gradient_error,))[0]
 
     @accepts_dask_arrays("points")
@@ -246,8 +247,10 @@ class BatchedField(Field):
 
 
 class SumAtDetail(EvaluateOnly):
-    """A sum as evaluated at one detail, with second derivatives; values: `values_at` for these, at
-    that detail."""
+    """A sum over sources at one accuracy scale, with second derivatives.
+
+    values: gives `PointValues` with the Hessian at that accuracy scale.
+    """
 
     def __init__(
         self, evaluate: Callable[[Vec3], Sample], values: Callable[[Vec3], PointValues]
@@ -262,24 +265,27 @@ class SumAtDetail(EvaluateOnly):
         return sample.gradient_error, self._values(p).hessian_error
 
 
-# Gradients by a tree are looked at more closely, with clusters so many times farther away in turn,
-# where they moved by more than this part of their length when that was last done. (Twice the
-# distance leaves a sixteenth of the error or less, measured: that is 1 % with a reserve of four.)
+# Gradients by a tree are computed again with these multiples of the distance at which clusters are
+# taken as a whole, in turn, as long as the last repetition changed them by more than the fraction
+# `_MOVED` of their length. (Measured: twice the distance leaves a sixteenth of the error or less.
+# So the error is 1 % of the length, with a reserve of a factor of four.)
 _CLOSELY, _MOVED = (2.0, 4.0, 8.0), 0.04
-# A gradient proved to that part of its length is good enough.
+# A gradient whose error is proved to be at most this fraction of its length is not refined.
 _PROVED = 0.01
 
 
 def sharpened(at: Callable[[Vec3, Real], PointValues], x: Vec3) -> PointValues:
-    """Value and gradient at points x by a tree, the gradient to about 1 % of its length.
+    """Value and gradient at points x by a sum over a tree, the gradient with an error of about 1 %
+    of its length.
 
-    at: the values and gradients of points, with clusters taken as a whole beyond so many times the
-        usual distance.
+    at: gives values and gradients at points, with clusters taken as a whole beyond this multiple of
+        the usual distance.
 
-    Far terms that nearly cancel, as those of the triangles of a mesh with small holes, leave a
-    gradient that is far smaller than what clusters leave out. Bounds of that add up absolute values
-    and would ask for all terms nearly everywhere, so what a closer look changed decides; the bounds
-    of the errors stay proved.
+    Far terms may nearly cancel, as the triangles of a mesh with small holes do. Then the gradient
+    is far smaller than the truncation error of its clusters. Bounds of the truncation error add up
+    absolute values and would demand all terms nearly everywhere. So the change of the gradient from
+    one distance to the next decides about refinement; the error bounds that are returned stay
+    proved.
     """
     real = cast("Any", type(x.x))
     dr.eval(x)
@@ -316,9 +322,9 @@ Value = TypeVar("Value")
 
 
 class FieldCache(Generic[Value]):
-    """One value for each field, the one that was asked for last, deleted with the field.
+    """A cache with one value per field: the value for the last key. It is dropped with the field.
 
-    A value must not refer to its field, or neither would ever be deleted.
+    A value must not refer to its field, or neither of them would ever be deleted.
     """
 
     def __init__(self) -> None:
@@ -326,10 +332,8 @@ class FieldCache(Generic[Value]):
         self._kept: dict[int, tuple[Any, dict[str, Any], Value]] = {}
 
     def get(self, field: Field, key: Any, make: Callable[[], Value]) -> Value:
-        """The value of a field for a key: the last one if that had the same key, else `make()`.
-
-        It is made again if an attribute of the field has been set since.
-        """
+        """The cached value of a field if it belongs to this key and no attribute of the field was
+        set since it was computed; else `make()`, which is then cached."""
         if id(field) in self._kept:
             kept_key, attributes, value = self._kept[id(field)]
             now = vars(field)
@@ -345,10 +349,11 @@ class FieldCache(Generic[Value]):
 
 
 def cached_prepare(prepare: Prepare) -> Prepare:
-    """A decorator of a field's method `prepare`: the field is uploaded to each backend only once.
+    """Decorator of a field's method `prepare`, by which a field is uploaded to each backend only
+    once.
 
-    Fields with parameters are uploaded each time: a parameter may change in place, and its
-    derivatives belong to one trace.
+    Fields with parameters are uploaded at each call: a parameter may change in place, and its
+    derivatives belong to a single trace.
     """
     kept: defaultdict[Backend, FieldCache[Field]] = defaultdict(FieldCache)
 

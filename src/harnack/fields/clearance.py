@@ -1,9 +1,8 @@
-"""Clearances: proved lower bounds of the distance to a level set, and the extents they prove.
+"""Clearances (proved lower bounds of the distance to a level set) and the extents they prove.
 
-`clearance_function` gives them at points, `tight_extent` and `occupied_cells` prove where level
-sets are.
-Also here: `DeviceField`, the base of fields whose data lie on a backend, in coordinates in which
-they have a size of about one.
+`clearance_function` gives clearances at points. `tight_extent` and `occupied_cells` prove in which
+volume, and in which cells, the level sets lie. Also here: `DeviceField`, the base of fields whose
+data lie on a backend, in coordinates in which they have a size of about 1.
 """
 
 from __future__ import annotations
@@ -75,7 +74,7 @@ def tight_extent(
     """A polytope of few planes that contains every point of the level sets inside a box.
 
     Cells of the box are left out if the ball around them is within the clearance of its center; the
-    polytope is around those that are left.
+    polytope contains the remaining cells.
 
     max_cells, finest: as for `nonempty_cells`.
     points: (n, 3) that the polytope is to contain in any case. The polytope around them need not be
@@ -126,11 +125,11 @@ def level_distance_lower_bound(
 
     All slopes lie in [-G, G], G = |grad f(p)| and its error: one enclosure with that interval of
     slopes holds in every direction. The distances to the level above and to that below are proved
-    separately, each by the promise that proves most.
+    separately, each by the promise that gives the larger distance.
 
-    As in the tracer the levels count as nearer by the rounding of value and position, and the
-    result is shortened by the rounding of p itself. Where f jumps, all this is about f with the
-    jumps taken out, which is f up to the nearest sheet.
+    As in the tracer, the level gaps are reduced by the rounding of value and position, and the
+    result is reduced by the rounding of p itself. If f jumps, the bound is about f continued
+    smoothly through all facets, which is f itself as far as the nearest facet.
     """
     steepest = safe_norm(sample.gradient) + sample.gradient_error
     size = max_norm(p)
@@ -155,8 +154,8 @@ def level_distance_lower_bound(
 
 @dataclass(frozen=True)
 class UnitFrame:
-    """Data on a backend in unit coordinates x: the point is center + size * x. Subclasses add the
-    data."""
+    """Unit coordinates x of a field's data on a backend: the point is p = center + size * x.
+    Subclasses add the data."""
 
     backend: Backend
     center: Vec3
@@ -209,7 +208,7 @@ class DeviceField(Field, Generic[Uploaded]):
 
 
 class VariableAccuracyField(DeviceField[Uploaded], BatchedField):
-    """An uploaded sum with a choice of detail (`Field.at_detail`). Subclasses define
+    """An uploaded sum with a choice of detail (`Field.at_accuracy`). Subclasses define
     `_sample`."""
 
     has_variable_accuracy = True
@@ -219,7 +218,7 @@ class VariableAccuracyField(DeviceField[Uploaded], BatchedField):
 
     @abc.abstractmethod
     def _sample(self, on: Uploaded, p: Vec3, detail: Real) -> Sample:
-        """f at p from the data, at a detail (`Field.at_detail`)."""
+        """f at p from the data, at a detail (`Field.at_accuracy`)."""
 
     def evaluate(self, p: Vec3) -> Sample:
         on = self._data_for(p)
@@ -240,8 +239,8 @@ class VariableAccuracyField(DeviceField[Uploaded], BatchedField):
 
 
 def round_to_single(center: FloatArray) -> FloatArray:
-    """The nearest center that single precision holds exactly: subtracting it from points nearby is
-    then exact, however far the origin is."""
+    """The center, rounded to numbers that single precision holds exactly: subtracting it from
+    nearby points is then exact, however far the origin is."""
     with np.errstate(over="ignore"):
         rounded = center.astype(np.float32).astype(np.float64)
     return np.where(np.isfinite(rounded), rounded, center)

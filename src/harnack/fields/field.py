@@ -1,8 +1,8 @@
-"""What a field is: the interface between functions and the rest of the library.
+"""The class `Field`: the interface between functions of space and the rest of the library.
 
-A field gives, in one evaluation, its value, its gradient and what it promises near the point
-(`harnack.enclosures.promises`). Promises must be *true*: every step that the tracer takes rests on
-them. `harnack.testing.check_field` tests whether a field fulfills this interface.
+One evaluation of a field gives its value, its gradient and its promises near the point
+(`harnack.enclosures.promises`). Promises must be *true*: every step of the tracer rests on them.
+`harnack.testing.check_field` tests whether a field fulfills this interface.
 """
 
 from __future__ import annotations
@@ -74,39 +74,39 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
     """A scalar function on R^3 whose level sets can be traced with a proof.
 
     Subclasses define `evaluate`; the class attributes are defaults that an instance may override.
-    The base classes have what only some fields can do (jumps across sheets, parts, detail, curves
-    at which level sets end); their defaults are those of a field that cannot.
+    The base classes declare optional capabilities (jumps, patches, variable accuracy, curves at
+    which level sets end); their defaults describe a field that has none of them.
     """
 
     period: ClassVar[float | None] = None
-    """None for a real-valued function, else f is continuous modulo this number (angle-valued)."""
+    """None if f is real-valued; else f is angle-valued, continuous modulo this number."""
 
     default_level: float = 0.0
-    """The level drawn when none is asked for."""
+    """The level that is drawn if the user names none."""
 
     over_relaxation: float = 1.4
-    """The over-stepping factor (`Surface.overstep`) that needs the fewest evaluations, by
-    experiment; at least 1."""
+    """The over-relaxation factor (`Surface.overstep`) with the fewest evaluations, by experiment;
+    at least 1."""
 
     domain: Volume | None = None
-    """Where the field may be evaluated and is drawn; None for all of space. Rays are clipped to
-    it, and what a sample promises need only hold for p in it. As it is convex, a ray from p stays
-    in it up to where it is clipped; `Lipschitz` and `TaylorRemainder` need not hold beyond."""
+    """The convex volume in which the field may be evaluated and is drawn; None for all of space.
+    Rays are clipped to it, and promises of a sample need only hold for p in it. As it is convex, a
+    ray from p stays in it up to where it is clipped; `Lipschitz` and `TaylorRemainder` need not
+    hold beyond."""
 
     is_global: bool = False
-    """Whether f and its promises are right in all of space, so that `domain` is only where it is
-    drawn."""
+    """Whether f and its promises hold in all of space. `domain` then only limits what is drawn."""
 
     min_wavelength: float | None = None
-    """The shortest wavelength of f that matters, where it is known: code that samples f in cells
-    makes them smaller than this."""
+    """The shortest wavelength of f that matters; None if it is not known. Code that samples f in
+    cells makes them smaller than this."""
 
     is_cheap: bool = False
-    """Whether a sample takes so little time that a lane needs longer to fetch another ray from a
-    queue (`tracer.prepared.trace_queued`), by experiment."""
+    """Whether a sample costs less than fetching the next ray from a queue
+    (`tracer.surface_tracer.trace_queued`), by measurement."""
 
     has_creases: bool = False
-    """Whether the gradient jumps somewhere, as it does where the surfaces of a union meet."""
+    """Whether the gradient may jump, as it does where the surfaces of a union meet."""
 
     def __new__(cls, *given: Any, **named: Any) -> Self:
         """Refuse arguments with derivatives enabled, unless the class defines `parameters`."""
@@ -115,8 +115,8 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         return super().__new__(cls)
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
-        """Wrap methods of the subclass: the result of `evaluate` is checked, `hessian` takes NumPy
-        arrays too, and class methods that make a field refuse derivatives as the constructor
+        """Wrap methods of the subclass: the result of `evaluate` is checked, `hessian` also takes
+        NumPy arrays, and public class methods refuse arguments with derivatives as the constructor
         does."""
         super().__init_subclass__(**kwargs)
         if "__repr__" not in vars(cls):  # a dataclass would write out all numbers
@@ -140,13 +140,15 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         return other
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Of a deep copy, or of a field that was pickled. NumPy forgets that arrays are not to be
-        written to, which would change nothing of what was computed from them."""
+        """Restore a deep copy or a pickled field, and make its arrays read-only again. NumPy
+        forgets that arrays were read-only, and writing to them would not change the values computed
+        from them."""
         vars(self).update(state)
         make_read_only(state)
 
     def __repr__(self) -> str:
-        """The call that makes the field, of arguments it still has, with arrays by their shapes."""
+        """The constructor call, with those arguments that the field still stores and that differ
+        from their defaults; arrays are written as their shapes."""
         given = inspect.signature(type(self).__init__).parameters
         own = {key.removeprefix("_"): value for key, value in vars(self).items()}
         said = [
@@ -157,7 +159,8 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         return f"{type(self).__name__}({', '.join(said)})"
 
     def __getattr__(self, name: str) -> Any:
-        """For methods that only solids have, the error says how to make a solid of the field."""
+        """Raise AttributeError; for methods that only solids have, the message says how to make a
+        solid of the field."""
         own = f"{type(self).__name__!r} object has no attribute {name!r}"
         if name in _SOLID_METHODS:
             own += ": make a solid of the field first, by harnack.solid(field, below=level)"
@@ -185,16 +188,16 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         """
 
     def prepare(self, backend: Backend) -> Field:
-        """A field equal to this one whose data lie on the backend. Each call of the library asks
-        for it once.
+        """A field equal to this field whose data lie on the backend. Each call of the library calls
+        this method once.
 
-        The default suits fields that hold only Python numbers.
+        The default returns the field itself, which suits fields that hold only Python numbers.
         """
         del backend
         return self
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
-        """A volume proved to hold every point of the level sets; None where none is known.
+        """A volume that is proved to contain every point of the level sets; None if none is known.
 
         It may be smaller than `domain`. With it a ray without an end can be a proved miss.
         """
@@ -202,54 +205,56 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         return self.domain
 
     def occupied_cells(self, levels: tuple[float, ...]) -> OccupancyGrid | None:
-        """A grid of cells outside of which there are proved to be no points of the level sets; None
-        where none is known. First hits jump across empty cells: for fields that are expensive to
-        evaluate.
+        """A grid of cells. Cells not marked occupied are proved to contain no point of the level
+        sets, and first hits skip them, which pays for fields that are expensive to evaluate. None
+        if no grid is known.
 
-        For a field with sheets, no lift has a level in the empty cells, whatever its jumps.
+        For a field with jumps, no continuation of f takes a level in those cells either.
         """
         del levels
         return None
 
     def for_ray_count(self, count: int) -> Field:
-        """This field, to be traced by so many rays: a field may take longer to prepare where that
-        pays for them. The same object for the same count, so that nothing is prepared twice. The
-        default is the field itself."""
+        """The field to use for this many rays; it may spend more on preparation if that pays. Equal
+        counts return the same object, so that nothing is prepared twice. The default is the field
+        itself."""
         del count
         return self
 
     @property
     def is_steep(self) -> bool:
-        """Whether |grad f| may have no bound in a bounded box, or none that says how much f changes
-        within the rounding of coordinates, so that f may bend by any amount within the tolerance of
-        a hit. The tracer then looks at f beyond the hit."""
+        """Whether |grad f| may be unbounded in a bounded box, or has no bound that limits the
+        change of f within the rounding of coordinates, so that f may bend by any amount within the
+        tolerance of a hit. The tracer then also samples f beyond the hit."""
         return False
 
     def gradient_change_bound(self, p: Vec3, radius: Real) -> Real:
-        """A proved bound of |grad f(y) - grad f(p)| for all y with |y - p| <= radius; infinite, the
-        default, where none is known. Proofs that a mesh has the surface's topology use it."""
+        """A proved bound of |grad f(y) - grad f(p)| for all y with |y - p| <= radius; infinite (the
+        default) if none is known. Proofs that a mesh has the topology of the surface use it."""
         return 0 * p.x + radius + dr.inf
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
-        """Raise ValueError if a level is one that no surface can have. The default accepts all."""
+        """Raise ValueError if f is proved never to take one of the levels. The default accepts all
+        levels."""
         del levels
 
     def parameters(self) -> tuple[Any, ...]:
         """Dr.Jit arrays that the value depends on and that may carry derivatives.
 
-        A class that does not define this method has none: its constructor refuses them.
+        A class that does not define this method has no such parameters, and its constructor refuses
+        arguments with derivatives enabled.
         """
         return ()
 
     @classmethod
     def has_no_parameters(cls) -> bool:
-        """Whether the class names no `parameters`, so that derivatives by any would be dropped."""
+        """Whether the class does not define `parameters`, so that derivatives with respect to its
+        numbers would be lost."""
         return cls.parameters is Field.parameters
 
     def refuse_hidden_parameters(self) -> None:
-        """Raise NotImplementedError if numbers that the field does not name in `parameters`, such
-        as
-        those that its formula refers to, have derivatives enabled: they would be dropped."""
+        """Raise NotImplementedError if a class without `parameters` holds numbers with derivatives
+        enabled, for example in its formula: these derivatives would be lost."""
         if self.has_no_parameters():
             kind = type(self)
             is_own = not kind.__module__.startswith("harnack.")
@@ -258,10 +263,10 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
     def differentiable_value(self, p: Vec3) -> Real:
         """f(p) as an expression that Dr.Jit can differentiate in p and in the field's parameters.
 
-        In p it is of first order: the value, with the stated gradient as its derivative. So no
-        derivative passes through `evaluate`, which may run a recorded loop, and at ties of f's
-        formula the derivative is the stated gradient. A field with parameters overrides it if
-        `evaluate` cannot be differentiated in both modes.
+        In p it can be differentiated once: the derivative of the value is the gradient of the
+        sample. So no derivative passes through `evaluate`, which may run a recorded loop, and at
+        ties of f's formula the derivative is the gradient of the sample, too. A field with
+        parameters overrides this method if `evaluate` cannot be differentiated in both modes.
         """
         if any(dr.grad_enabled(one) for one in self.parameters()):
             return self.evaluate(p).value
@@ -277,11 +282,12 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
     @accepts_dask_arrays("points")
     @accepts_tensors
     def value(self, points: Any, *, precision: Precision = "single") -> Any:
-        """f at points (n, 3): (n,); at a single point (3,): a number.
+        """The values (n,) of f at points (n, 3); a number for a single point (3,).
 
-        A Dr.Jit 3-vector gives a Dr.Jit array, and a tensor (n, 3) one of shape (n,), with
-        derivatives with respect to whatever has them enabled: the points and the field's
-        parameters. Values of an angle-valued field are up to a multiple of its period.
+        A Dr.Jit 3-vector gives a Dr.Jit array, and a tensor (n, 3) gives a tensor (n,). Both have
+        derivatives with respect to the points and the field's parameters where these have
+        derivatives enabled. Values of an angle-valued field are determined up to a multiple of its
+        period.
 
         Raises TypeError or ValueError for other shapes, NaN or infinity.
         """
@@ -295,12 +301,12 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
     @accepts_dask_arrays("points")
     @accepts_tensors
     def gradient(self, points: Any, *, precision: Precision = "single") -> Any:
-        """The gradients of f at points (n, 3): (n, 3); at a single point (3,): (3,).
+        """The gradients (n, 3) of f at points (n, 3); (3,) for a single point (3,).
 
-        A Dr.Jit 3-vector gives a Dr.Jit 3-vector, and a tensor (n, 3) one of this shape, with
-        derivatives with respect to the points if they have them enabled and the field defines
-        `hessian`. Raises as `value`, and NotImplementedError if parameters of the field have
-        derivatives enabled.
+        A Dr.Jit 3-vector gives a Dr.Jit 3-vector, and a tensor (n, 3) gives a tensor (n, 3). Both
+        have derivatives with respect to the points if these have derivatives enabled and the field
+        defines `hessian`. Raises the errors of `value`, and NotImplementedError if parameters of
+        the field have derivatives enabled.
         """
         if not dr.is_array_v(type(points)):
             return self._evaluate_points(points, precision, lambda sample: sample.gradient)
@@ -324,11 +330,12 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
 
     @accepts_numpy_points
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        """Rows of the symmetric matrix of second derivatives at p, in f per length squared.
+        """The rows of the symmetric matrix of second derivatives at p, in units of f per length
+        squared.
 
-        Curvatures and second-order distances use it; tracing does not. Fields define it for Dr.Jit
-        3-vectors; called with points (n, 3) or (3,), and `precision`, as for `value`, it then gives
-        (n, 3, 3) or (3, 3).
+        Curvatures and second-order distances use it; tracing does not. Subclasses define it for
+        Dr.Jit 3-vectors. It can then also be called with points (n, 3) or (3,), and with
+        `precision` as for `value`, and gives (n, 3, 3) or (3, 3).
         """
         del p
         raise NotImplementedError(
@@ -338,30 +345,31 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
         """Bounds of the errors of the gradient, as a length, and of `hessian`, in the spectral
-        norm, at the point p of a sample. The default: what the sample states, and infinite for the
-        Hessian, of which nothing is known."""
+        norm, at the point p of a sample. The default is the sample's `gradient_error`, and infinity
+        for the Hessian, whose error is not known."""
         del p
         return sample.gradient_error, math.inf
 
     def describe(self) -> dict[str, Any]:
-        """Names and values of what a user may want to know about choices that the field made."""
+        """Names and values of choices that the field made by itself, for users who want to know
+        them."""
         return {}
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        """What is proved about f along a path from its point at t, in both directions.
+        """A sample at parameter t of a ray, with enclosures of f ahead and behind.
 
-        The default evaluates the field there and applies its promises to the slope along the path.
-        A field that knows more about one direction than about all overrides this.
+        The default evaluates the field at that point and applies its promises to the slope along
+        the ray. A field that knows more about f along a ray than in all directions overrides this.
 
-        ahead, back: the lengths up to which an enclosure can be of use; one that is sharper on a
-            shorter length need reach no farther.
+        ahead, back: the lengths up to which enclosures are of use; an enclosure that is sharper on
+            a shorter length need reach no farther.
         """
         del ahead, back
         return path.enclose(self.evaluate(path.point(t)))
 
 
 class EvaluateOnly(Field):
-    """A field as evaluated at one detail: what `Field.at_detail` returns."""
+    """A field that is given by its `evaluate` alone, such as the result of `Field.at_accuracy`."""
 
     def __init__(self, evaluate: Callable[[Vec3], Sample]) -> None:
         self._evaluate = evaluate
@@ -373,7 +381,7 @@ class EvaluateOnly(Field):
 def validate_levels_in_range(
     levels: tuple[float, ...], value_range: tuple[float, float], what: str = "the function"
 ) -> None:
-    """Raise ValueError for a level outside the range in which values are proved to lie.
+    """Raise ValueError if a level lies outside the range that is proved to contain all values of f.
 
     what: the name of the function, for the message.
     """
@@ -386,7 +394,7 @@ def validate_levels_in_range(
 
 
 def check_is_field(given: Any) -> None:
-    """Raise TypeError for what is no field, or one whose domain is no volume."""
+    """Raise TypeError unless the argument is a field whose domain is a volume or None."""
     if not isinstance(given, Field):
         raise TypeError(
             f"a harnack field is needed, such as harnack.Gyroid(1.0), not {suggest_field(given)}"
@@ -395,7 +403,8 @@ def check_is_field(given: Any) -> None:
 
 
 def suggest_field(given: Any) -> str:
-    """For a message: what a thing is that is no field, and how to make a field of it."""
+    """Text for an error message: the kind of an object that is no field, and how to make a field of
+    it."""
     kind, name = type(given).__name__, getattr(given, "__name__", "")
     if isinstance(getattr(given, "field", None), Field):
         return f"a {kind}: take its .field, and what else this takes of it, such as its level"

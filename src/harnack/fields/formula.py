@@ -43,25 +43,26 @@ if TYPE_CHECKING:
 
 # Radii of the balls on which a Lipschitz constant is promised, in multiples of |f|/|grad f|.
 _RADII, _LARGEST_RADIUS = (0.25, 1.0, 4.0), 1e12
-# At a tie the gradient is taken so many roundings of coordinates and value away, in the direction
-# of the middle gradient, a unit vector or 0, plus this vector, so that it is along no tie.
+# At a tie the gradient is taken at a point this many roundings of coordinates and value away. The
+# direction to that point is the direction of the middle gradient (a unit vector or 0) plus the
+# vector `_TIE_DIRECTION`, so that it runs along no tie.
 _TIE_OFFSET, _TIE_DIRECTION = 64.0, (0.31, 0.19, 0.13)
-# Where the gradient is known up to so many roundings there is no tie.
+# Where the error of the gradient is at most this many roundings, there is no tie.
 _TIE_THRESHOLD = 1024.0
-# Where a formula may jump, or is abrupt, pieces begin so many roundings of t before the point.
+# Where a formula may jump, or is abrupt, pieces begin this many roundings of t before the point.
 _ROUNDINGS = 8.0
-# A compilation that will take so many seconds is announced by a warning.
+# A warning announces a compilation that is expected to take longer than this many seconds.
 _SLOW_COMPILE_SECONDS = 10.0
 
 
-# Whether samples are asked for without promises that are weaker than others.
+# Whether samples of formulas omit alternative promises (`without_alternatives`).
 _WITHOUT_WEAKER: ContextVar[bool] = ContextVar("without_alternatives", default=False)
 
 
 @contextmanager
 def without_alternatives() -> Generator[None]:
-    """Samples of formulas have no weaker promises, which take several times as long to record as
-    value and gradient: for callers that use these alone."""
+    """Within this context, samples of formulas carry no alternative promises, which take several
+    times as long to record as value and gradient. For callers that use value and gradient only."""
     token = _WITHOUT_WEAKER.set(True)
     try:
         yield
@@ -70,11 +71,14 @@ def without_alternatives() -> Generator[None]:
 
 
 class Formula(Field):
-    """A field given by `formula`.
+    """A field that is defined by a formula of the coordinates, the method `formula`.
+
+    Value, gradient, rounding errors and enclosures along rays follow from the formula by automatic
+    differentiation in interval arithmetic.
 
     lipschitz: a proved bound of |grad f| everywhere, for sphere tracing (bound="lipschitz"); None
-        where none is known.
-    is_convex: whether f, as a function, is convex: it then stays above its tangents.
+        if none is known.
+    is_convex: whether f is a convex function, which stays above its tangents.
     """
 
     is_convex: bool = False
@@ -117,12 +121,13 @@ class Formula(Field):
         return dataclasses.replace(sample, alternative_promises=self._local_lipschitz(p, sample))
 
     def _with_one_sided_gradient(self, p: Vec3, sample: Sample) -> Sample:
-        """The sample with a gradient that f has nearby, where at p the gradient is a range.
+        """Replace the gradient by a one-sided gradient where p lies on a tie of the formula.
 
-        At ties of a formula, such as max(x, 0) at x = 0, the range of the gradient contains all
-        slopes nearby, and more where terms of several ties are added, as on the faces of `corner`.
-        Its middle is the gradient at no point, though its direction mostly leads across the tie. A
-        few roundings away in about this direction, values decide which slope holds (`Dual`).
+        At a tie, such as max(x, 0) at x = 0, the jet gives a range of gradients. The range contains
+        all gradients nearby, and others where terms of several ties are added, as on the faces of
+        `corner`. Its middle is the gradient at no point, though its direction mostly leads across
+        the tie. A second sample (`Dual`), a few roundings away in about this direction, decides
+        which side to use.
 
         Proof of the error. The gradient at p lies within `gradient_error` of the middle. A gradient
         that is farther from it does not come from a tie at p: the gradient of f changes that much
@@ -151,7 +156,8 @@ class Formula(Field):
         )
 
     def sample_without_alternatives(self, p: Vec3) -> Sample:
-        """Value and gradient, without the promises that a look along a path does not use."""
+        """The sample with the promises of `promises`, without alternative promises, which samples
+        on rays do not use."""
         return self._sample_of(self._jet(Jet.at_point(p), p.x), p)
 
     def _sample_of(self, jet: Jet, p: Vec3) -> Sample:
@@ -165,8 +171,9 @@ class Formula(Field):
         return Sample(value, gradient, known, error, doubt)
 
     def _local_lipschitz(self, p: Vec3, sample: Sample) -> tuple[Lipschitz, ...]:
-        """Lipschitz constants on balls about p: the largest gradient on the box around each. The
-        radii are some multiples of Newton's estimate of the distance to level 0."""
+        """Lipschitz constants on balls around p, each a bound of |grad f| on the box around the
+        ball. The radii are the multiples `_RADII` of Newton's estimate of the distance to level
+        0."""
         steps = dr.abs(sample.value) / safe_norm(sample.gradient)
         made: list[Lipschitz] = []
         for multiple in _RADII:
@@ -179,7 +186,7 @@ class Formula(Field):
         return tuple(made)
 
     def promises(self, p: Vec3) -> tuple[Promise, ...]:
-        """What holds in every direction from p: a Lipschitz constant, where one is known."""
+        """Promises that hold in every direction from p: the Lipschitz constant, if one is known."""
         return () if self.lipschitz is None else (Lipschitz(0 * p.x + self.lipschitz),)
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
@@ -189,11 +196,13 @@ class Formula(Field):
         return vector(xx, xy, xz), vector(xy, yy, yz), vector(xz, yz, zz)
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
-        """The error of the Hessian is that of its ranges: rounding, and ties of the formula."""
+        """The error of the gradient is that of the sample; the error of the Hessian follows from
+        its ranges, which include rounding and ties of the formula."""
         return sample.gradient_error, hessian_error(self._jet(Jet.at_point(p, order=2), p.x), p.x)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        """The sample, and the enclosures that its ranges prove; looking back nothing is proved.
+        """The sample, with the enclosures ahead that the ranges of the formula prove, and with no
+        enclosures behind. Without such enclosures, those of the sample's promises are used.
 
         Proof that no jump of f is passed, given that ranges of f' are all numbers on a piece with a
         jump. A march steps to t + s rounded, which may lie behind the s that was proved, and looks

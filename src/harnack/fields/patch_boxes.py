@@ -1,4 +1,4 @@
-"""Fields whose parts lie in boxes, and these boxes on a backend (see
+"""Fields whose patches lie in boxes, and these boxes on a backend (see
 `harnack.fields.capabilities`)."""
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ __all__ = ["PatchBoxes", "PatchField"]
 
 @dataclass(frozen=True)
 class PatchBoxes(UnitFrame):
-    """A tree of boxes, one for each part, in coordinates in which they have a size of about one."""
+    """A tree of boxes, one for each patch, in coordinates in which they have a size of about 1."""
 
     tree: BoxTree
 
@@ -59,7 +59,7 @@ class PatchBoxes(UnitFrame):
 
 
 class HasPatchBoxes(Protocol):
-    """The data of a field with parts on a backend: its boxes, and those of its parts."""
+    """The data of a union of patches on a backend: the boxes, and the data of the patches."""
 
     @property
     def boxes(self) -> PatchBoxes: ...
@@ -69,9 +69,9 @@ _Buffers = TypeVar("_Buffers", bound=HasPatchBoxes)
 
 
 class PatchField(Field, Generic[_Buffers]):
-    """A field with parts in boxes, which depend on the levels.
+    """A union of patches in boxes that depend on the levels.
 
-    levels: once the field is prepared, its boxes hold the surfaces of these levels.
+    levels: once the field is prepared, its boxes contain the patches of these levels.
     """
 
     has_patches: bool = True
@@ -83,9 +83,9 @@ class PatchField(Field, Generic[_Buffers]):
 
     @abc.abstractmethod
     def boxes(self, levels: tuple[float, ...] | None = None) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper corners (m, 3) of boxes proved to hold the surface of each part.
+        """Lower and upper corners (m, 3) of boxes that are proved to contain each patch.
 
-        levels: of the surfaces; None for `levels`.
+        levels: of the patches; None for the attribute `levels`.
         """
 
     @abc.abstractmethod
@@ -120,6 +120,6 @@ class PatchField(Field, Generic[_Buffers]):
         return self._require_data().boxes.next(o, d, after, start, end, active)
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
-        """The box around the boxes of all parts."""
+        """The box around the boxes of all patches."""
         lower, upper = self.boxes(levels)
         return Box(lower.min(axis=0), upper.max(axis=0))

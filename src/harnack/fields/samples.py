@@ -1,8 +1,10 @@
-"""What a field returns: a `Sample` at a point, or a `RaySample`, a sample with enclosures.
+"""The records that fields return: a `Sample` at a point, and a `RaySample`, a sample on a ray with
+enclosures of f ahead and behind.
 
-Rounding is part of the proof. Two looks, forward and back, that are exact to first order meet right
-at a surface; with rounded arithmetic one ray in ten slipped through at tight tolerances. Every gap
-is narrowed by what rounding may have done, and a tolerance below that is raised to it.
+Rounding is part of the proof. The enclosure ahead of a point and the enclosure behind the next
+point may be exact to first order, and then they meet right at a surface: with rounded arithmetic
+one ray in ten slipped through at tight tolerances. So every level gap is narrowed by the rounding
+error of f, and a tolerance below that error is raised to it.
 """
 
 from __future__ import annotations
@@ -27,26 +29,26 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Sample:
-    """One evaluation at a point p.
+    """Value, gradient and promises of a field f at a point p.
 
     value: f(p).
-    gradient: (3,) of f at p.
-    promises: promises that hold near p.
-    value_error_bound: a bound of the error of `value` by an approximation, and by rounding as far
-        as that is more than eight units in its last place or eight times the smallest normal number
-        (and more than |gradient| times the rounding of the point itself, which the tracer adds).
-        Steps are shortened by it.
-    gradient_error: a bound of the error of `gradient` by rounding and an approximation, as a
-        length; 0 where it is only the rounding of a few operations.
+    gradient: (3,) the gradient of f at p.
+    promises: what f guarantees near p.
+    value_error: a bound of the error of `value`: the truncation error, and the part of the rounding
+        error beyond eight units in the last place or eight times the smallest normal number (and
+        beyond |gradient| times the rounding of the point itself, which the tracer adds). Steps are
+        shortened by it.
+    gradient_error: a bound of the truncation and rounding error of `gradient`, as a length; 0 where
+        the error is only the rounding of a few operations.
     shading_normal: (3,) unit normal to shade with, where the gradient is of no use (near a singular
-        point of the surface); None for the gradient's own direction. Steps do not depend on it.
-    truncation_error: the part of `value_error_bound` that an evaluation at more detail reduces
-        (`Field.at_detail`).
-    alternative_promises: promises that are as true as `all_promises`, but proved shorter steps
-        wherever that was measured. Only a bound that is asked for by name uses them.
-    ray_promises: more promises, which hold only for points of the path of a `Field.sample_ray`.
-    branch_unknown: where f is known but for a whole number (`JumpSurface.has_unknown_branch`); None
-        for nowhere.
+        point of the surface); None for the direction of the gradient. Steps do not depend on it.
+    truncation_error: the part of `value_error` that a sample of higher accuracy reduces
+        (`Field.at_accuracy`).
+    alternative_promises: promises that are also valid, but gave shorter steps than `promises` in
+        every measurement. Used only if the caller names a bound.
+    ray_promises: further promises, which hold only for points of the ray of a `Field.sample_ray`.
+    branch_unknown: lanes on which f is known only modulo 1 (`JumpSurface.has_unknown_branch`); None
+        if on none.
     """
 
     value: Real
@@ -62,23 +64,24 @@ class Sample:
 
     @property
     def all_promises(self) -> tuple[Promise, ...]:
-        """All promises, the weaker ones last."""
+        """All promises, the alternative ones last."""
         return self.promises + self.alternative_promises
 
     def map_promises(self, change: Callable[[Promise], Promise], **numbers: Any) -> Sample:
-        """The sample with each promise changed, and with other attributes replaced."""
+        """This sample with `change` applied to each promise, the alternative ones included, and
+        with the named attributes replaced. `ray_promises` stay as they are."""
         known, weaker = (
             tuple(map(change, group)) for group in (self.promises, self.alternative_promises)
         )
         return dataclasses.replace(self, promises=known, alternative_promises=weaker, **numbers)
 
     def shifted(self, offset: Real) -> Sample:
-        """The sample of f + offset, a number that adds no error."""
+        """The sample of f + offset at the same point. The sum is taken to add no error."""
         return self.map_promises(lambda one: one.shifted(offset), value=self.value + offset)
 
     def select(self, mask: Mask, other: Sample) -> Sample:
-        """The other sample, with promises of the same kinds, where the mask holds, this one
-        elsewhere. Without normals."""
+        """The other sample on the lanes of the mask, this sample on all others. The two must have
+        promises of the same kinds, in the same order. The result has no shading normal."""
         names = "value", "gradient", "value_error", "gradient_error", "truncation_error"
         numbers = {k: dr.select(mask, getattr(other, k), getattr(self, k)) for k in names}
         groups: dict[str, Any] = {}
@@ -98,8 +101,12 @@ _SAMPLE_HELP = (
 def validate_samples(
     evaluate: Callable[[Any, Vec3], Sample],
 ) -> Callable[[Any, Vec3], Sample]:
-    """The method `evaluate` of a field, which raises TypeError if it returns anything but a proper
-    `Sample`, and NotImplementedError if the value has derivatives that the field would drop."""
+    """Wrap the method `evaluate` of a field so that its result is checked.
+
+    The wrapped method raises TypeError if `evaluate` returns anything but a valid `Sample`, and
+    NotImplementedError if the value has derivatives that the field would drop. It also turns NumPy
+    scalars in the sample into Python numbers, as Dr.Jit takes no NumPy scalars.
+    """
 
     @functools.wraps(evaluate)
     def checked(self: Any, p: Vec3) -> Sample:
@@ -137,7 +144,7 @@ def validate_samples(
 
 
 def _unbox_numpy(record: _R) -> _R:
-    """A record whose scalars of NumPy are Python's: Dr.Jit takes no others."""
+    """The record with its NumPy scalars as Python numbers: Dr.Jit takes no NumPy scalars."""
     scalars: dict[str, Any] = {
         key: one.item() for key, one in vars(record).items() if isinstance(one, np.generic)
     }
@@ -149,10 +156,10 @@ def _describe_type(value: Any) -> str:
 
 
 def space_scaled(sample: Sample, size: Real) -> Sample:
-    """Convert a sample of f at p to one of x -> f(x / size) at size * p.
+    """Convert a sample of f at p to the sample of x -> f(x / size) at size * p.
 
-    Values stay; radii are multiplied by the size, gradients and Lipschitz constants divided by it,
-    curvatures and Laplacians by its square.
+    Values stay the same. Radii are multiplied by the size. Gradients and Lipschitz constants are
+    divided by it; bounds of second derivatives and of Laplacians are divided by its square.
     """
     return sample.map_promises(
         lambda one: one.space_scaled(size),
@@ -163,8 +170,12 @@ def space_scaled(sample: Sample, size: Real) -> Sample:
 
 
 def value_error_bound(sample: Sample, gradient_norm: Real, size: Real) -> Real:
-    """A bound of the error of f by rounding and truncation, at a point whose coordinates are at
-    most `size`; gradient_norm: |gradient|."""
+    """A bound of the rounding and truncation error of the value of a sample, the rounding of the
+    point included.
+
+    gradient_norm: |gradient| of the sample.
+    size: a bound of the absolute values of the point's coordinates.
+    """
     kind = cast("Any", type(sample.value))
     epsilon = 2 * float(dr.epsilon(kind))
     # Numbers below the smallest normal one may underflow to 0.
@@ -175,18 +186,21 @@ def value_error_bound(sample: Sample, gradient_norm: Real, size: Real) -> Real:
 
 @dataclass(frozen=True)
 class RaySample:
-    """A sample at a point of a path, and what is proved along the path in both directions.
+    """A sample on a ray, with enclosures of f in both directions.
 
-    forward: enclosures of f(path(t+s)) - f(path(t)).
-    backward: enclosures of f(path(t-s)) - f(path(t)), from the same evaluation.
-    slope: the derivative of f along the path, known up to `slope_error`.
-    reach_growth: how far the enclosures of the next look should reach, as a multiple of the step
-        that this one proves.
-    slope_error: a bound of the error of `slope`, where one is known that is less than
-        `Sample.gradient_error`: on a crease the gradient is a range, and the derivative along a ray
-        that runs in the crease may still be a number. Else None.
-    min_gradient_norm: a lower bound of |grad f|, where one is known that may be more than
-        |gradient| less `Sample.gradient_error`, as on a crease. Else None.
+    Below, x(t) = o + t d is the ray and s >= 0 a length along it.
+
+    sample: the sample at x(t).
+    forward: enclosures of f(x(t + s)) - f(x(t)).
+    backward: enclosures of f(x(t - s)) - f(x(t)), from the same evaluation.
+    slope: the derivative of f along the ray at x(t), known up to `slope_error_bound`.
+    reach_growth: how far the enclosures of the next sample should reach, as a multiple of the step
+        that this sample proves.
+    slope_error: a bound of the error of `slope` that is smaller than `Sample.gradient_error`; None
+        if no such bound is known. On a crease the gradient is a range, and the derivative along a
+        ray that runs in the crease may still be a number.
+    min_gradient_norm: a lower bound of |grad f| that may be larger than |gradient| minus
+        `Sample.gradient_error`, as on a crease; None if no such bound is known.
     """
 
     sample: Sample
@@ -199,13 +213,17 @@ class RaySample:
 
     @property
     def slope_error_bound(self) -> Real:
-        """The bound of the error of `slope`."""
+        """A bound of the error of `slope`: `slope_error`, else the error of the gradient."""
         return self.sample.gradient_error if self.slope_error is None else self.slope_error
 
 
 @dataclass(frozen=True)
 class Ray:
-    """The rays o + t d, |d| = 1, along which a field is sampled, and the proofs to use."""
+    """Rays o + t d, |d| = 1, and the proofs that turn a sample on them into enclosures.
+
+    origin, direction: (3,) o and d, one ray per lane.
+    proofs: the kinds of enclosures to use.
+    """
 
     origin: Vec3
     direction: Vec3
@@ -216,9 +234,10 @@ class Ray:
         return dr.fma(type(self.origin)(t), self.direction, self.origin)
 
     def enclose(self, sample: Sample) -> RaySample:
-        """What the promises of a sample prove along the path, with the slope of f along it.
+        """The sample with the enclosures that its promises prove along the ray.
 
-        A slope known up to an error enters as an interval: see `Enclosure`.
+        The slope of f along the ray is known up to the error of the gradient, and enters the proofs
+        as an interval: see `Enclosure`.
         """
         slope = dr.dot(sample.gradient, self.direction)
         slopes = SlopeRange.around(slope, sample.gradient_error)

@@ -1,7 +1,7 @@
-"""Sums over edges, dipoles and far nodes of trees at a point, and what follows for f near it.
+"""Sums over sources (edges, dipoles and far nodes of trees) at a point, and bounds of f near it.
 
-Every family of such fields accumulates the same record, `SourceSums`, from which come values with
-error bounds, or a sample with promises.
+All fields that are such sums accumulate the same record, `SourceSums`. It gives values with error
+bounds, or a sample with promises.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ _REACHES = (0.2, 0.4, 0.6)
 _MAX_STEP_FRACTION = 0.65
 # Sums of rounded terms: bounds are lengthened, and distances shortened, by this fraction of them.
 SUM_MARGIN = 2e-5
-# A singular point within so many roundings of a coordinate counts as near.
+# A singular point within this many roundings of a coordinate counts as near.
 _NEAR_SINGULARITY = 256.0
-# Rounding of positions and of terms changes the gradient by at most so many times s4, and second
-# derivatives by so many times s5, times the rounding of a coordinate.
+# Rounding of positions and of terms changes the gradient by at most the first number times s4, and
+# second derivatives by at most the second number times s5, times the rounding of a coordinate.
 SLOPE_ROUNDINGS, SECOND_ROUNDINGS = 16.0, 320.0
 
 
@@ -42,8 +42,8 @@ def max_step_fraction(coarse_ratio: float) -> float:
 
 
 def free_radius_fraction(coarse_ratio: float) -> float:
-    """The radius that counts as free of dipoles, as a fraction of the distance to a far node's
-    center; rough: as for `max_step_fraction`."""
+    """The radius around x that counts as free of sources, as a fraction of the distance to the
+    center of a far node; coarse_ratio: as for `max_step_fraction`."""
     return max_step_fraction(coarse_ratio) / _REACHES[-1]
 
 
@@ -53,9 +53,9 @@ def remainder_factor(q: float) -> float:
 
 
 def final_rounding(backend: Backend, size: float = 1.0) -> Real:
-    """A bound of what rounds a sum after its last term: 16 roundings of numbers of this size. What
-    the terms lose is counted term by term, and so is what is left of what their addition loses
-    (`SourceSums.add_term`). A kernel parameter."""
+    """A bound of the rounding after the last term of a sum, as a kernel parameter: 16 roundings of
+    numbers of this size. The rounding of terms and of additions is counted by
+    `SourceSums.add_term`."""
     return dr.opaque(backend.Float, backend.machine_epsilon * 16 * size)
 
 
@@ -72,8 +72,11 @@ def dipole_rounding(area: Real, inverse: Real, unit: Real) -> Real:
 
 @dataclass(frozen=True)
 class SourceTerm:
-    """What one dipole, edge or far node adds to f and to its derivatives; None for derivatives that
-    were not asked for, and for the value of an edge, whose angle is added later."""
+    """The term of one dipole, edge or far node in the sums of f and of its derivatives.
+
+    Derivatives that were not requested are None. The value of an edge is None, too: its angle is
+    added later.
+    """
 
     value: Real | None
     gradient: Vec3 | None = None
@@ -82,19 +85,21 @@ class SourceTerm:
 
 @dataclass(frozen=True)
 class SourceSums:
-    """Sums of terms of f at points x, and of what bounds them near x.
+    """Sums over all sources at points x: f and its derivatives, error bounds, and bounds of higher
+    derivatives near x.
 
-    total, gradient, hessian: of f and its derivatives, None where they were not asked for. `value`
-        is better than the total.
-    truncation, gradient_truncation, hessian_truncation: bounds of the truncation of value, gradient
-        and second derivatives along lines; the last is None without a Hessian.
-    rounding: bound of the rounding of the value.
+    total: the plain sum of the values; `value` adds `compensation`, the rounding errors of the
+        additions.
+    gradient, hessian: of f; the Hessian is None if it was not requested.
+    truncation, gradient_truncation, hessian_truncation: bounds of the truncation errors of value,
+        gradient and second derivatives along lines; the last is None without a Hessian.
+    rounding: a bound of the rounding error of the value.
     singularity_distance: the distance to the nearest singular point, a dipole or an edge, or
         `free_radius_fraction` of the distance to the nearest far node's center if that is less.
     s4, s5: sums of a/rho^4 and a/rho^5 over dipoles of area a at distance rho and, with A + K/r^2
         of `multipole.remainder_constants` for a, over far nodes at r. For edges see
         `LiftedEdge.bounds`.
-    compensation: what the additions to the total have lost: see `add_term`.
+    compensation: the rounding errors of the additions to `total`: see `add_term`.
     """
 
     total: Real
@@ -111,13 +116,16 @@ class SourceSums:
 
     @property
     def value(self) -> Real:
-        """f, with what the additions have lost."""
+        """f: the plain sum plus the rounding errors of its additions."""
         return self.total + self.compensation
 
     @classmethod
     def zero(cls, backend: Backend, free_distance: Real, derivatives: int) -> SourceSums:
-        """Empty sums. free_distance: its value if there are no terms. derivatives: 0 for the value
-        alone, 1 with the gradient, 2 with the Hessian."""
+        """Sums without terms.
+
+        free_distance: the `singularity_distance` if no terms are added.
+        derivatives: 0 for values only, 1 for gradients too, 2 for Hessians too.
+        """
         real, zero = backend.Float, backend.Float(0)
         gradient = backend.Array3f(0) if derivatives >= 1 else None
         hessian = SymmetricMatrix.zero(real) if derivatives == 2 else None
@@ -127,13 +135,13 @@ class SourceSums:
 
     @classmethod
     def from_state(cls, parts: tuple[Any, ...]) -> SourceSums:
-        """The sums with these `to_state`."""
+        """The sums whose `to_state` is this tuple."""
         total, gradient, hessian, *bounds = parts
         return cls(total, gradient, None if hessian is None else SymmetricMatrix(*hessian), *bounds)
 
     def to_state(self) -> tuple[Any, ...]:
         """The attributes in the order of the constructor, for the state of a loop. (Sums that were
-        not asked for are None: Dr.Jit records a loop twice if a state in it never changes.)"""
+        not requested are None: Dr.Jit records a loop twice if a state in it never changes.)"""
         hessian = None if self.hessian is None else self.hessian.components()
         bounds = self.truncation, self.gradient_truncation, self.hessian_truncation, self.rounding
         ends = self.singularity_distance, self.s4, self.s5, self.compensation
@@ -186,12 +194,15 @@ class SourceSums:
         free: Real,
         unit: Real,
     ) -> SourceSums:
-        """The sums with a node of a tree added where it is far, at distance 1/inverse.
+        """The sums with a tree node added on the lanes of `far`; its center is at distance
+        1/inverse.
 
-        size: A + K/r^2 of `multipole.remainder_constants`. left_out: truncation of value, gradient
-            and
-        second derivatives. free: the distance that counts as free of the node's dipoles. unit: the
-        rounding of a coordinate. left_out and inverse are 0 where it is not far.
+        size: A + K/r^2 of `multipole.remainder_constants`.
+        left_out: bounds of the truncation errors of value, gradient and second derivatives.
+        free: the distance that counts as free of the node's dipoles.
+        unit: the rounding of a coordinate.
+
+        left_out and inverse are 0 on lanes on which the node is not far.
         """
         fourth, second = size * dr.square(inverse * inverse), self.hessian_truncation
         second = None if second is None else second + left_out[2]
@@ -210,12 +221,12 @@ class SourceSums:
         )
 
     def values(self, share: float, unit: Real, rounding: Real, outside: float = 0.0) -> PointValues:
-        """`share` times f and those derivatives that there are, with bounds of their errors.
+        """`share` times f and its derivatives, as far as they were summed, with error bounds.
 
         unit: the rounding of a coordinate, at least epsilon.
-        rounding: of the value, from other sources.
-        outside: more roundings of gradients far from all terms, where distances are as long as
-            coordinates: those of powers of the distance and of sums of moments.
+        rounding: a bound of the rounding of the value that these sums do not count.
+        outside: the number of further roundings of gradients far from all terms, where distances
+            are as long as coordinates: roundings of powers of the distance and of sums of moments.
         """
         value, error = share * self.value, dr.fma(share, self.truncation + self.rounding, rounding)
         if self.gradient is None:
@@ -295,7 +306,7 @@ class SourceSums:
     def add_line_rates(
         self, v: Vec3, unit: Real, lengths: tuple[Real, ...], rates: tuple[Real, ...], active: Mask
     ) -> tuple[Real, ...]:
-        """The rates K of `trail_sums.rates_along` for some edges, plus those of these sums.
+        """The rates K of `trail_sums.line_rates` for some edges, plus those of these sums.
 
         f changes by at most |s| |g . v| + s^2 (3 s4 + rise r s5) for |s| <= r (`sample`), with |g .
         v| raised by the truncation and rounding of g. Infinite for lengths above r.

@@ -1,4 +1,4 @@
-"""Curves, meshes, clouds, blobs and molecules from files, and files that are never half written."""
+"""Readers of curves, meshes, clouds, blobs and molecules, and atomic writing of files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""What all readers and writers of files share: the error, limits, contents, and atomic writing."""
+"""The parts that all readers and writers of files share: errors and locations, limits, the geometry
+of a file, and atomic writing."""
 
 from __future__ import annotations
 
@@ -24,12 +25,13 @@ MAX_ELEMENTS = 10_000_000
 
 
 class FileFormatError(ValueError):
-    """A file that cannot be read; the message names the file, the place and what to do."""
+    """A file cannot be read; the message names the file, the location of the fault and what to
+    do."""
 
 
 @dataclass(frozen=True)
 class FileLocation:
-    """Where in a file something stands: prints as 'model.obj, line 12'."""
+    """A location in a file, which prints as 'model.obj, line 12'."""
 
     path: Path
     position: str = ""
@@ -40,13 +42,14 @@ class FileLocation:
         return f"{name}, {self.position}" if self.position else name
 
     def error(self, message: str) -> FileFormatError:
-        """An error about this place."""
+        """An error whose message begins with this location."""
         return FileFormatError(f"{self}: {message}")
 
 
 @dataclass(frozen=True, eq=False)
 class FileLocations:
-    """Where the members of a list stand in a file. numbers: one a member, of lines or the like."""
+    """The locations of the members of a list in a file. numbers: the number of each member, such as
+    its line."""
 
     path: Path
     noun: str
@@ -60,8 +63,9 @@ class FileLocations:
 class PolygonList:
     """Polygons or polylines of a file, as indices of vertices.
 
-    corners: those of all of them, one polygon after the other. sizes: (m,), how many each has.
-    locations: (m,), where each stands in the file.
+    corners: the vertex indices of all polygons, one polygon after the other.
+    sizes: (m,) the number of corners of each polygon.
+    locations: (m,) the location of each polygon in the file.
     """
 
     corners: IntArray
@@ -72,11 +76,11 @@ class PolygonList:
         return len(self.sizes)
 
     def location_of_corner(self, k: int | np.integer[Any]) -> FileLocation:
-        """Where the polygon stands in the file that corner k of all belongs to."""
+        """The location in the file of the polygon that contains `corners[k]`."""
         return self.locations[int(np.searchsorted(np.cumsum(self.sizes), k, side="right"))]
 
     def __iter__(self) -> Iterator[tuple[IntArray, FileLocation]]:
-        """The corners of each, and where it stands."""
+        """The corners and the location of each polygon."""
         ends = np.cumsum(self.sizes)
         for k, (begin, end) in enumerate(zip(ends - self.sizes, ends, strict=True)):
             yield self.corners[begin:end], self.locations[k]
@@ -102,7 +106,8 @@ class FileGeometry:
 
 
 def ranks_in_lists(sizes: IntArray) -> IntArray:
-    """Positions within lists that stand one after the other: 0 to size - 1 for each of them."""
+    """The position of each entry within its list, for lists of these sizes stored one after the
+    other: 0 to size - 1 for each list."""
     found = np.arange(int(sizes.sum()), dtype=np.int64)
     found -= np.repeat(np.cumsum(sizes) - sizes, sizes)
     return found
@@ -183,16 +188,17 @@ def have_mixed_sizes(polygons: PolygonList) -> bool:
 
 @contextlib.contextmanager
 def write_atomically(path: str | os.PathLike[str]) -> Generator[Path, None, None]:
-    """A name to write to, in the folder of `path`, that becomes `path` when the block ends.
+    """Context manager that yields a name to write to, in the folder of `path`; the file is renamed
+    to `path` at the end of the block.
 
     If the block raises, nothing is left and an existing file stays as it was. The name has the
-    extension of `path`, from which many writers tell the format.
+    extension of `path`, from which many writers derive the format.
 
     Raises:
         FileNotFoundError: the folder does not exist, or the block wrote no file.
         IsADirectoryError: `path` is a directory.
-        OSError: `path` is a device or a pipe; or the system refuses to write, as where the disk
-            is full. The message names the file, why, and what to do.
+        OSError: `path` is a device or a pipe; or the system refuses to write, as when the disk is
+            full. The message names the file, why, and what to do.
     """
     target = _writable_target(path)
     partial = _partial_name(target)
@@ -212,7 +218,8 @@ def write_atomically(path: str | os.PathLike[str]) -> Generator[Path, None, None
 
 
 def check_writable(path: str | os.PathLike[str]) -> None:
-    """Raise what `write_atomically` would raise at once, and try to create a file there."""
+    """Raise the errors that `write_atomically` would raise before the block runs, and try to create
+    a file there."""
     target = _writable_target(path)
     try:
         # Where the system can, this file has no name that an interrupt could leave behind.

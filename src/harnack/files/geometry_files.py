@@ -1,4 +1,5 @@
-"""Reading surface files: meshes, clouds, closed curves, blobs and molecules, and which it was."""
+"""Readers of geometry files, meshes, clouds, closed curves, blobs and molecules, by the extension
+of the file, with a summary of the contents."""
 
 from __future__ import annotations
 
@@ -92,7 +93,7 @@ def read_loops(path: str | os.PathLike[str], *, boundary: bool = False) -> list[
 
 
 def closed_curves_of(contents: FileGeometry, *, boundary: bool = False) -> list[FloatArray]:
-    """The closed curves in an .obj or .ply file that was read, as `read_loops` has them."""
+    """The closed curves of an .obj or .ply file whose contents were read; see `read_loops`."""
     placed = _boundary_loops(contents) if boundary else _all_loops(contents)
     return [_validated(loop, place) for loop, place in placed]
 
@@ -180,9 +181,13 @@ GEOMETRY_SUFFIXES = (*_READERS, ".loops", ".blobs", *MOLECULE_FILES)
 
 @dataclass(frozen=True, eq=False)
 class LoadedMesh:
-    """Triangles from a file, as `validate_mesh` returns them. said: what was found, and why. flat:
-    (k, 3) faces of zero area, left out of `faces`, which may close gaps without a width. rounded:
-    how many corners were moved to others, from which they were apart by rounding."""
+    """Triangles from a file, as `validate_mesh` returns them.
+
+    summary: the contents of the file, and why they are read as a mesh.
+    zero_area_faces: (k, 3) faces of zero area, left out of `faces`; they may close gaps without a
+        width.
+    rounded: how many corners were joined with others from which rounding separated them.
+    """
 
     vertices: FloatArray
     faces: IntArray
@@ -193,9 +198,9 @@ class LoadedMesh:
 
 @dataclass(frozen=True, eq=False)
 class LoadedCloud:
-    """Points (n, 3) from a file, with unit normals (n, 3) and areas (n,) where it has them.
+    """Points (n, 3) from a file, with unit normals (n, 3) and areas (n,) if the file has them.
 
-    summary: what was found, and why it counts as a point cloud.
+    summary: the contents of the file, and why they are read as a point cloud.
     """
 
     points: FloatArray
@@ -206,7 +211,8 @@ class LoadedCloud:
 
 @dataclass(frozen=True, eq=False)
 class LoadedCurves:
-    """Closed curves from a file, (n, 3) each. said: what was found, and why they are curves."""
+    """Closed curves from a file, (n, 3) each. summary: the contents of the file, and why they are
+    read as curves."""
 
     loops: tuple[FloatArray, ...]
     summary: str
@@ -214,9 +220,9 @@ class LoadedCurves:
 
 @dataclass(frozen=True, eq=False)
 class LoadedPolygons:
-    """Polygons from a file as they are: vertices (n, 3), and for each face its corners (k,).
+    """Polygons from a file, not triangulated: vertices (n, 3), and for each face its corners (k,).
 
-    summary: what was found.
+    summary: the contents of the file.
     """
 
     vertices: FloatArray
@@ -230,23 +236,23 @@ LoadedGeometry: TypeAlias = (
 
 
 def read_geometry(path: str | os.PathLike[str], read_as: ReadAs | None = None) -> LoadedGeometry:
-    """What a surface file describes: .obj, .ply, .stl, .off, .glb, .gltf, .3mf, .xyz, .loops,
-    .blobs, or a molecule's, .pdb, .ent, .cif, .mmcif.
+    """Read the surface, cloud, curves, blobs or molecule in a file: .obj, .ply, .stl, .off, .glb,
+    .gltf, .3mf, .xyz, .loops, .blobs; molecules .pdb, .ent, .cif, .mmcif.
 
     Faces make a mesh, except polygons of an .obj or .ply file of which some have more than four
     corners and none share an edge: these are curves, as are polylines without faces. Points alone
     make a cloud, with normals from nx ny nz (.ply), from as many `vn` as `v` (.obj) or from columns
-    4 to 6 (.xyz). Polygons are cut into triangles, the nodes of a scene put in their places, and
-    faces of zero area left out.
+    4 to 6 (.xyz). Polygons are triangulated, the nodes of a scene are transformed to their
+    positions, and faces of zero area are left out.
 
     read_as: "winding": the faces, as a mesh. "dipole": the points; of a mesh the centers of its
-    triangles, with their normals and areas. "loops": what `read_loops` finds; of a mesh its
-    boundary, the singular edges joined. "polygons": the faces as they are, not cut into triangles.
-    None decides as above.
+        triangles, with their normals and areas. "loops": the result of `read_loops`; of a mesh its
+        boundary, the singular edges joined. "polygons": the faces, not triangulated. None decides
+        as above.
 
     Raises:
-        FileFormatError: unreadable, malformed, truncated or hostile; of another format; nothing in
-            it that can be taken as asked.
+        FileFormatError: unreadable, malformed, truncated or hostile; of another format; it contains
+            nothing that can be read in this way.
     """
     path = Path(path)
     kind = path.suffix.lower()

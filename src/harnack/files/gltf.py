@@ -1,7 +1,8 @@
 """Reading .glb and .gltf scenes through trimesh, after their headers were checked.
 
-A glTF file is a JSON header and buffers of bytes. The header says what to read where, and a hostile
-one can ask for more memory than there is; so it is compared with the bytes first.
+A glTF file is a JSON header and buffers of bytes. The header says which bytes to read, and a
+hostile header can ask for more memory than there is; so it is compared with the sizes of the
+buffers first.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from harnack.files.file_geometry import (
 _COMPONENT_BYTES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
 _COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 _MAX_NODE_DEPTH = 1000
-# Extensions by which files move or hide what is drawn, or store vertices otherwise.
+# Extensions by which files move or hide geometry, or store vertices otherwise.
 _UNSUPPORTED_EXTENSIONS = (
     "EXT_mesh_gpu_instancing", "KHR_mesh_quantization", "KHR_node_visibility",
     "EXT_meshopt_compression", "KHR_meshopt_compression",
@@ -96,7 +97,7 @@ def _header(place: FileLocation, data: bytes) -> dict[str, Any]:
 
 
 def _buffer_files(path: Path, header: dict[str, Any]) -> dict[str, bytes]:
-    """The contents of the files beside it that a scene keeps its buffers in."""
+    """The contents of the separate files in which a scene stores its buffers."""
     files: dict[str, bytes] = {}
     for buffer in header.get("buffers", []):
         uri: Any = buffer.get("uri")
@@ -114,7 +115,8 @@ def _buffer_files(path: Path, header: dict[str, Any]) -> dict[str, bytes]:
 
 
 def _check_header(place: FileLocation, header: dict[str, Any], size: int) -> None:
-    """Compares what the header asks for with what there is. A malformed header raises anything."""
+    """Compare the sizes that the header asks for with the data in the file. A malformed header may
+    raise any error."""
     for name in header.get("extensionsRequired", []):
         if not str(name).startswith(_IGNORED_EXTENSIONS):
             raise place.error(f"it needs the extension {name}, which is not read: save it without")
@@ -140,8 +142,8 @@ def _check_header(place: FileLocation, header: dict[str, Any], size: int) -> Non
 
 
 def _check_no_animation(place: FileLocation, header: dict[str, Any]) -> None:
-    """Refuses scenes whose vertices are moved by more than nodes, triangles in fans, and points or
-    lines beside triangles: they are not read."""
+    """Refuse scenes with features that are not read: vertices moved otherwise than by nodes, fans
+    of triangles, and points or lines beside triangles."""
     nodes: list[Any] = header.get("nodes", [])
     meshes: list[Any] = header.get("meshes", [])
     if any("skin" in node for node in nodes):

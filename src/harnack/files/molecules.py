@@ -25,7 +25,7 @@ _MAX_LISTED_ELEMENTS = 6
 class Atoms:
     """Atoms from a file: positions (n, 3) and van der Waals radii (n,) in angstrom, elements (n,).
 
-    summary: what was found.
+    summary: the contents of the file, and which of its atoms were left out.
     """
 
     positions: FloatArray
@@ -35,14 +35,14 @@ class Atoms:
 
 
 def read_molecule(path: str | os.PathLike[str]) -> Atoms:
-    """The atoms of a molecule's file (.pdb, .ent, .cif, .mmcif): of its first model, all but
-    alternatives, water and hydrogen as far as the file has them.
+    """Read the atoms of a molecule (.pdb, .ent, .cif, .mmcif): those of the first model, without
+    alternatives, water and hydrogen.
 
     Alternatives are atoms that the file marks as such (altLoc in .pdb, label_alt_id in .cif): of
-    each atom the first counts, and of several residues in one place the first. Atoms without the
-    mark all count, whatever their names. Radii are gemmi's van der Waals radii of the elements
+    each atom the first counts, and of several residues in the same place the first. Atoms without
+    the mark all count, whatever their names. Radii are gemmi's van der Waals radii of the elements
     (C 1.7, N 1.55, O 1.52, S 1.8, H 1.2). `summary` tells what was left out: atoms of other models,
-    alternatives, unknown elements, and what follows the line END.
+    alternatives, unknown elements, and the text after the line END.
 
     Raises:
         FileFormatError: unreadable, malformed, another format, no atoms in it.
@@ -94,8 +94,9 @@ def parse_molecule(path: Path, data: bytes) -> Atoms:
 
 
 def _text(data: bytes, *, is_cif: bool) -> str:
-    """The text of a file, without byte order mark, its lines ended alike. In .pdb files, where
-    columns count and gemmi counts bytes, other letters than those of ASCII become one byte."""
+    """The text of a file, without byte order mark and with uniform line ends. In .pdb files, whose
+    format counts columns and in which gemmi counts bytes, each non-ASCII letter becomes a single
+    byte."""
     data = data.removeprefix(b"\xef\xbb\xbf")
     if is_cif:
         return data.decode("utf-8", "replace")
@@ -108,7 +109,7 @@ def _text(data: bytes, *, is_cif: bool) -> str:
 
 
 def _drop_alternate_locations(model: Any) -> list[Any]:
-    """The atoms of a model, and of those that are marked as alternatives, by other letters, the
+    """The atoms of a model; of atoms that are marked as alternatives by different letters, the
     first of each name in the first residue of each place. A line TER ends a chain: behind it the
     same name and number are another place."""
     residues: dict[tuple[int, str], tuple[str, str]] = {}
@@ -132,9 +133,9 @@ def _atom_lines(text: str) -> int:
 
 
 def _check_coordinates(path: Path, text: str) -> None:
-    """Check that columns 31 to 54 of all atoms are three numbers: gemmi takes what is none for 0,
-    and the digits before what is none for the number. It knows atoms by the first four letters of a
-    line, small or capital: serial numbers above 99,999 may begin right behind them.
+    """Check that columns 31 to 54 of all atoms are three numbers: gemmi would take a word for 0,
+    and digits before a letter for the number. Like gemmi, this recognizes atoms by the first four
+    letters of a line, upper or lower case: serial numbers above 99,999 may follow directly.
 
     Raises:
         FileFormatError: naming the first line where they are not.

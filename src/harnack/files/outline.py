@@ -1,8 +1,8 @@
-"""Outlines for `harnack.Extrusion` and `harnack.SolidOfRevolution`: of text, of SVG files, regular
-polygons.
+"""Outlines for `harnack.Extrusion` and `harnack.SolidOfRevolution`: of text, of SVG files, and
+regular polygons.
 
-Curves are flattened to a stated tolerance. What is returned are loops that do not cross, the region
-on their left, as `harnack.geometry.make_outline` makes them.
+Curves are flattened to a stated tolerance. The results are loops that do not cross, with the region
+on their left, as `harnack.geometry.make_outline` returns them.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ _MOST_SIDES = 100_000
 
 
 def regular_polygon(sides: int, radius: float) -> Outline:
-    """The regular polygon with so many sides, 3 at least, its corners at `radius` from the origin,
-    the first on the x axis: `Extrusion(regular_polygon(6, 5.0), height)` is a prism.
+    """The regular polygon with this number of sides, at least 3, its corners at `radius` from the
+    origin, the first on the x axis: `Extrusion(regular_polygon(6, 5.0), height)` is a prism.
 
     Raises:
         ValueError: fewer sides, or a radius that is not positive.
@@ -72,16 +72,17 @@ def text(
 ) -> Outline:
     """The outline of text, which starts at the origin and runs along x, y upwards.
 
-    words: one line or several, set by matplotlib (`pip install harnack[outlines]`).
+    words: a line or several lines, set by matplotlib (`pip install harnack[outlines]`).
     size: of the font, in units of length: about from the lowest to the highest point of a line.
     font: a file (.ttf, .otf), or the name of a family that is installed; None for DejaVu Sans,
         which matplotlib brings.
     align: of lines to each other, and to the y axis.
-    tolerance: how far polygons may be from the letters' curves; by default a thousandth of the
-        size.
+    tolerance: the largest distance between the polygons and the letters' curves; by default a
+        thousandth of the size.
 
     Raises:
-        ValueError: text without anything to see, or with letters that the font lacks; no such font.
+        ValueError: text without a visible letter, or with letters that the font lacks; no such
+            font.
         ModuleNotFoundError: without matplotlib.
     """
     size = as_positive(size, "the size of text")
@@ -160,7 +161,7 @@ def _path_to_loops(points: FloatArray, codes: list[int], allowed: float) -> list
 
 
 def _drop_degenerate_loops(loops: list[FloatArray]) -> list[FloatArray]:
-    """The loops that have three points which differ: others fill nothing."""
+    """The loops with at least three different points; other loops enclose nothing."""
     return [one for one in loops if len(np.unique(one, axis=0)) > 2]
 
 
@@ -174,27 +175,27 @@ _HIDDEN = (
 )  # fmt: skip
 _UNSUPPORTED_TAGS = ("use", "text", "image", "foreignObject", "switch")
 _SHAPES = ("path", "rect", "circle", "ellipse", "polygon", "polyline")
-# Of rules in a style sheet those that would change what is filled.
+# Rules of a style sheet that would change fills.
 _FILL_CHANGING_RULES = re.compile(r"none|evenodd|transform|hidden|@import|clip|mask", re.IGNORECASE)
 
 
 def svg(
     path: str | os.PathLike[str], *, scale: float = 1.0, tolerance: float | None = None
 ) -> Outline:
-    """The outline of what an SVG file fills, y upwards, by svgpathtools
-    (`pip install harnack[outlines]`).
+    """The outline of the filled shapes of an SVG file, y upwards, by svgpathtools (`pip install
+    harnack[outlines]`).
 
     path: of a file with paths, rectangles, circles, ellipses and polygons, in groups and with
-        transforms. All that is filled is joined. Strokes have no outline here: a shape with
-        fill="none" is left out.
-    scale: the length of the file's unit (one of its `viewBox`).
-    tolerance: how far polygons may be from curves, in units of length; by default a thousandth of
-        the picture's size.
+        transforms. The outline is that of the union of all filled shapes. Strokes have no outline
+        here: a shape with fill="none" is left out.
+    scale: the length of the file's unit (a unit of its `viewBox`).
+    tolerance: the largest distance between the polygons and the curves, in units of length; by
+        default a thousandth of the picture's size.
 
     Raises:
-        FileFormatError (a ValueError): what is no such file, or holds what would be lost: text
-            (turn it into paths), images, copies of other elements (`use`), clips and masks, style
-            sheets that change what is filled, entities, a size or depth that no drawing has.
+        FileFormatError (a ValueError): not an SVG file, or a file with contents that would be lost:
+            text (turn it into paths), images, copies of other elements (`use`), clips and masks,
+            style sheets that change fills, entities, a size or depth that no drawing has.
         ModuleNotFoundError: without svgpathtools. OSError: it cannot be read.
     """
     scale = as_positive(scale, "the scale of an SVG file")
@@ -212,7 +213,8 @@ def svg(
 
 
 def _parse_svg(data: bytes) -> Element:
-    """The root element. No entity is declared: a few of them can stand for billions of letters."""
+    """The root element. The declaration of entities is refused: a few entities can stand for
+    billions of letters."""
     builder = TreeBuilder()
     parser = expat.ParserCreate()
     count = depth = 0

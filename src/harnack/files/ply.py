@@ -1,7 +1,8 @@
-"""Reading Stanford .ply, ascii and binary: vertices, faces and edges; all else is ignored.
+"""Reading Stanford .ply, ascii and binary: vertices, faces and edges; all other elements are
+ignored.
 
-All rows of an element are read at once, property by property: where a property begins in each row
-follows from the properties before it and the lengths of the lists among them.
+All rows of an element are read at once, property by property: the position of a property in each
+row follows from the properties before it and the lengths of the lists among them.
 """
 
 from __future__ import annotations
@@ -56,7 +57,8 @@ _PADDING = b"\0 \t\r\n"
 
 @dataclass(frozen=True)
 class Property:
-    """One column. code: type of the value, length_code: type of the length if it is a list."""
+    """A property of an element. code: the type of its values; length_code: the type of the length,
+    for a list."""
 
     name: str
     code: str
@@ -65,7 +67,8 @@ class Property:
 
 @dataclass(frozen=True)
 class PlyElement:
-    """An element of the header: its name, how many rows follow, and their columns."""
+    """An element of the header: its name, the number of rows that follow, and the properties of a
+    row."""
 
     name: str
     count: int
@@ -74,7 +77,8 @@ class PlyElement:
 
 @dataclass(frozen=True)
 class PlyHeader:
-    """byte_order: "<" or ">", "" for ascii. size, lines: what comes before the first row."""
+    """The header of a PLY file. byte_order: "<" or ">", "" for ascii. size, lines: the bytes and
+    the lines before the first row."""
 
     byte_order: str
     elements: tuple[PlyElement, ...]
@@ -82,12 +86,13 @@ class PlyHeader:
     lines: int
 
     def declared_rows(self, size: int) -> int:
-        """How many rows it declares, of those that a file of this size has room for."""
+        """The number of rows that the header declares. `size`, of the file, limits the count of
+        each element: a file has no room for more."""
         return sum(min(section.count, size) for section in self.elements)
 
 
 class BinaryValues:
-    """The numbers of a file by their positions, which are bytes."""
+    """The numbers in the bytes of a file, read at byte positions."""
 
     def __init__(self, data: bytes, byte_order: str) -> None:
         self.size = len(data)
@@ -95,19 +100,21 @@ class BinaryValues:
         self.byte_order = byte_order
 
     def read(self, where: IntArray, code: str) -> npt.NDArray[Any]:
-        """Those at these positions; anything at positions that lie outside."""
+        """The numbers at byte positions. Positions outside of the file give arbitrary numbers:
+        `_columns` and its callers detect them by the ends of the rows."""
         kind = np.dtype(self.byte_order + code)
         last = self.size - kind.itemsize  # the header alone is longer than a number
         every = np.ndarray((last + 1,), kind, self.data, strides=(1,))
         return every[np.clip(where, 0, last)].astype(kind.newbyteorder("="))
 
     def width(self, code: str) -> int:
-        """How many positions a number takes."""
+        """The number of bytes that a number takes."""
         return struct.calcsize("=" + code)
 
 
 class TextValues:
-    """The numbers of an element by their positions, which are words. counts: (n,) a row."""
+    """The numbers of an element in a text file, read at positions counted in words. counts: (n,)
+    the number of words of each row."""
 
     def __init__(self, rows: TextLines) -> None:
         numbers, self.counts = read_floats(rows, convert=_any_number)
@@ -136,9 +143,11 @@ def _any_number(word: bytes, place: FileLocation) -> float:
 
 @dataclass(frozen=True, eq=False)
 class PropertyColumn:
-    """A property in all rows.
+    """A property in all rows of an element: row k begins it at positions[k] + offset.
 
-    positions: (n,), positions, and what to add to them. sizes: (n,) if it is a list, else none.
+    code: its type, as for the module `struct`.
+    positions: (n,).
+    list_lengths: (n,) for a list property, None for a single number.
     """
 
     code: str
@@ -149,14 +158,14 @@ class PropertyColumn:
 
 @dataclass(frozen=True, eq=False)
 class ElementTable:
-    """All rows of an element: its columns by name, and where each row stands in the file."""
+    """All rows of an element: its columns by name, and the location of each row in the file."""
 
     values: Values
     columns: dict[str, PropertyColumn]
     places: FileLocations
 
     def has_scalars(self, *names: str) -> bool:
-        """Whether there are columns of single numbers by these names."""
+        """Whether there are columns with these names that hold single numbers."""
         return all(
             name in self.columns and self.columns[name].list_lengths is None for name in names
         )
@@ -169,7 +178,8 @@ class ElementTable:
         return self.values.read(column.positions + column.offset, column.code)
 
     def list_column(self, name: str) -> tuple[npt.NDArray[Any], IntArray]:
-        """A column of lists: the numbers of all, one after the other, and how many each has."""
+        """A column of lists: the numbers of all lists, one list after the other, and the length of
+        each."""
         column = self._column(name)
         if column.list_lengths is None:
             raise self._is_other_kind()
@@ -219,7 +229,8 @@ def read_ply(path: Path, data: bytes) -> FileGeometry:
 
 
 def _check_elements(path: Path, header: PlyHeader) -> None:
-    """Refuses elements that hold surface in a form that is not read, or that are there twice."""
+    """Refuse elements that contain faces in a form that is not read, and elements that occur
+    twice."""
     names = [section.name for section in header.elements]
     for name in names:
         is_odd = name.lower() in ("vertex", "face", "edge") and name != name.lower()
@@ -330,7 +341,7 @@ def _binary_tables(path: Path, data: bytes, header: PlyHeader) -> dict[str, Elem
 
 
 def _row_ends(section: PlyElement, values: BinaryValues, begin: int) -> Iterator[int]:
-    """Where each row ends; raises struct.error if that is behind the end of the file."""
+    """The end of each row. Raises struct.error if that is behind the end of the file."""
     skipped = 0
     lists: list[tuple[int, struct.Struct, int]] = []
     for p in section.properties:

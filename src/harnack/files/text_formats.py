@@ -1,7 +1,5 @@
-"""Reading surface files that are text: .xyz, .loops, .blobs, .obj, .off and .stl.
-
-Files .stl may be binary, too.
-"""
+"""Reading geometry files in text formats: .xyz, .loops, .blobs, .obj, .off and .stl (.stl may also
+be binary)."""
 
 from __future__ import annotations
 
@@ -38,14 +36,14 @@ from harnack.geometry.boundary_edges import weld_vertices
 
 
 def read_xyz(path: Path, data: bytes) -> FileGeometry:
-    """Points of an .xyz file, one a line, from columns 1 to 3, and normals, from columns 4 to 6 if
-    there are six or more.
+    """Read an .xyz file, a point a line: positions from columns 1 to 3, and normals from columns 4
+    to 6 if there are six columns or more.
 
     Further columns are ignored. `#` begins a comment.
 
     Raises:
         FileFormatError: lines with different numbers of columns or fewer than three, words, numbers
-            that are not finite; columns 4 to 6 that hold no normals (lengths far from 1).
+            that are not finite; columns 4 to 6 that are no normals (lengths far from 1).
     """
     lines = split_content_lines(path, data)
     if not len(lines):
@@ -74,11 +72,11 @@ def read_xyz(path: Path, data: bytes) -> FileGeometry:
 
 
 def read_loops_text(path: Path, data: bytes) -> list[tuple[FloatArray, FileLocation]]:
-    """Loops (n, 3) of a .loops file, one a line, x y z repeated, and where they stand. `#` begins a
-    comment.
+    """Read a .loops file: a loop (n, 3) a line, as x y z repeated. Returns the loops and their
+    locations. `#` begins a comment.
 
     Raises:
-        FileFormatError: something that is no number, or a line whose count is no multiple of 3.
+        FileFormatError: a word that is not a number, or a line whose count is not a multiple of 3.
     """
     lines = split_content_lines(path, data)
     if not len(lines):
@@ -102,7 +100,7 @@ _COLUMNS = "x y z radius [weight [group]]"
 class Metaballs:
     """Blobs from a file: centers (n, 3), radii (n,), weights (n,), and groups (n,) or None.
 
-    summary: what was found.
+    summary: the contents of the file.
     """
 
     centers: FloatArray

@@ -1,6 +1,7 @@
 """Scenes of curves, harmonic polynomials, periodic surfaces, and functions over the plane.
 
-Those over the plane are Riemann surfaces (the paper's Fig. 19), level curves and height fields.
+Functions over the plane give Riemann surfaces (the paper's Fig. 19), level curves and height
+fields.
 """
 
 from __future__ import annotations

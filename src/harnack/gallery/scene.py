@@ -1,4 +1,4 @@
-"""A named scene: what it shows, and how to draw it."""
+"""A named scene of the gallery: its contents, and how to draw it."""
 
 from __future__ import annotations
 
@@ -17,10 +17,12 @@ PICTURE_TOLERANCE = HitTolerance(2e-4)
 
 @dataclass(frozen=True)
 class Scene:
-    """A picture by name, and how to make it.
+    """A named picture, and how to draw it.
 
-    surfaces: makes the level sets; materials: one name for each of them (or one for all).
-    demo_spp: samples a pixel in `make demo`, 0 for not in it; few, to keep it to a few minutes.
+    surfaces: a function that returns the surfaces.
+    materials: a name for each of them (or a single name for all).
+    demo_spp: samples a pixel in `make demo`, few, to keep that to a few minutes; 0 to leave the
+        scene out of it.
     """
 
     name: str
@@ -32,11 +34,11 @@ class Scene:
     demo_spp: int = 0
 
     def render(self, path: Any = None, **settings: Any) -> Any:
-        """The picture, as `harnack.rendering` makes it; settings override the scene's own."""
+        """Render the picture by `harnack.rendering`; settings override the scene's own."""
         surfaces = self.surfaces()
         return render(surfaces, path, **{**self.settings(len(surfaces)), **settings})
 
     def settings(self, count: int) -> dict[str, Any]:
-        """How `count` surfaces are drawn, as `render` takes it."""
+        """The options of `render` by which `count` surfaces are drawn."""
         names = self.materials * count if len(self.materials) == 1 else self.materials
         return {"material": list(names), "camera": self.camera, "show": self.show}

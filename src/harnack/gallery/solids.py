@@ -1,7 +1,7 @@
 """Scenes of blobs and of solids.
 
 Blobs are metaballs, a surface through points with normals, and molecules. Solids are distance
-surfaces, what is made of them, noise, and blobs to look through.
+surfaces, Boolean combinations of these, noise, and transparent blobs.
 """
 
 from __future__ import annotations

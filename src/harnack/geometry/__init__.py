@@ -1,4 +1,4 @@
-"""Curves, meshes, clouds and volumes: what is accepted, and their measures. No files, no search."""
+"""Curves, meshes, clouds and clip volumes: validation and measures. No files, no trees."""
 
 from __future__ import annotations
 

@@ -14,8 +14,8 @@ _MOST_SEGMENTS = 1_000_000
 
 
 def flatten_bezier(controls: FloatArray, tolerance: float) -> tuple[FloatArray, float]:
-    """Points (k, d) of the curve behind its first one, to be joined by segments; and a bound of how
-    far these are from the curve.
+    """Flatten a Bezier curve. Returns the points (k, d) of a polyline that starts at the curve's
+    first point, which is not among them, and a bound of the distance between curve and polyline.
 
     controls: (3, d) or (4, d), of a quadratic or a cubic curve.
 

@@ -1,4 +1,5 @@
-"""Edges by integer index: closed loops of them, and those at which faces of a mesh do not cancel.
+"""Edges by integer index: closed loops of edges, and the edges at which faces of a mesh do not
+cancel.
 
 At the latter the winding number is singular. Let T be the triangles of a mesh, m_T integers, and
 Omega_T(x) the signed solid angle of T seen from x. Then
@@ -6,7 +7,7 @@ Omega_T(x) the signed solid angle of T seen from x. Then
     w = 1/(4 pi) sum_T m_T Omega_T
 
 jumps by m_T across T. With its jumps removed along a ray it is smooth everywhere but on the
-*singular edges*: those whose weights, summed over the triangles around them, do not cancel.
+*singular edges*: edges whose weights, summed over the triangles around them, do not cancel.
 
 Proof. Off T, Omega_T is harmonic, and by Stokes its gradient is the integral of Biot and Savart
 along the boundary of T alone (Gillespie et al. 2024, Eq. 11, edge by edge): grad Omega_T(x) is the
@@ -16,17 +17,17 @@ with the sign with which e runs around T. Edges with n_e = 0 drop out, so G exte
 field on R^3 minus S, S the union of the others. G is curl and divergence free there by continuity,
 so around every point off S it has a local potential, and this is harmonic. The integral of G along
 a closed path off S is a multiple of 4 pi: move the path slightly so that it meets triangles in
-their interiors only; between these crossings it follows 4 pi w, and each crossing of T takes
-+-4 pi m_T. So 4 pi w mod 4 pi extends to a function on R^3 minus S that is harmonic in the
-neighborhood of each point, with values mod 4 pi. QED.
+their interiors only; between these crossings it follows 4 pi w, and each crossing of T takes +-4 pi
+m_T. So 4 pi w mod 4 pi extends to a function on R^3 minus S that is harmonic in the neighborhood of
+each point, with values mod 4 pi. QED.
 
-The n_e are the boundary of an integral chain, so at each vertex as much weight begins as ends:
-S is made of closed loops, and 4 pi w is mod 4 pi the solid angle of these loops.
+The n_e are the boundary of an integral chain, so at each vertex as much weight begins as ends: S
+consists of closed loops, and 4 pi w is mod 4 pi the solid angle of these loops.
 
-Edges are compared by integer index, after equal positions were given one index (`weld_vertices`),
-never by distance: near edges do not cancel, however near they are. Functions of arrays are linear
-but for one sort, and take about a second for a million triangles; `boundary_edges`, `join_edges`
-and `singular_loops` take one Python step an edge.
+Edges are compared by integer index, after equal positions were assigned the same index
+(`weld_vertices`), never by distance: near edges do not cancel, however near they are. Functions of
+arrays take linear time but for a sort, about a second for a million triangles; `boundary_edges`,
+`join_edges` and `singular_loops` take a Python step per edge.
 """
 
 from __future__ import annotations
@@ -53,7 +54,8 @@ Edge = tuple[int, int]
 
 
 class OpenChainError(ValueError):
-    """Edges that do not join to closed loops. vertex: where they end, or meet in too many."""
+    """Edges that do not join to closed loops. vertex: where a chain of them ends, or where too many
+    meet."""
 
     def __init__(self, vertex: int, count: int) -> None:
         super().__init__(f"{count} edges meet at vertex {vertex}")
@@ -62,10 +64,11 @@ class OpenChainError(ValueError):
 
 
 def boundary_edges(faces: Iterable[Sequence[int]]) -> list[Edge]:
-    """Directed edges of faces that do not cancel against the same edge run the other way.
+    """The directed edges of faces that remain when each edge cancels against the same edge run the
+    other way.
 
-    An edge is listed as often as it remains. At every vertex as many of them begin as end,
-    because that is so for each face.
+    An edge is listed as often as it remains. At every vertex as many of them begin as end, because
+    that is so for each face.
     """
     net: Counter[Edge] = Counter()
     for face in faces:
@@ -81,11 +84,11 @@ def boundary_edges(faces: Iterable[Sequence[int]]) -> list[Edge]:
 
 
 def join_edges(edges: Sequence[Edge]) -> list[list[int]]:
-    """Loops of vertex indices made of all the edges.
+    """Join all edges to closed loops of vertex indices.
 
-    If as many edges begin as end at every vertex, their directions are kept, and a loop ends
-    where it first meets itself. Otherwise exactly two edges must meet at every vertex, and each
-    loop runs in the direction of its first edge.
+    If as many edges begin as end at every vertex, their directions are kept, and a loop ends where
+    it first meets itself. Otherwise exactly two edges must meet at every vertex, and each loop runs
+    in the direction of its first edge.
 
     Raises:
         OpenChainError: neither is the case.
@@ -155,9 +158,10 @@ _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 
 
 class NetFaces(NamedTuple):
-    """Faces after duplicates were counted.
+    """The faces of a mesh after duplicates were added up.
 
-    faces: (k, 3), no two with the same three vertices. multiplicity: (k,), positive.
+    faces: (k, 3), no two with the same three vertices.
+    multiplicity: (k,), positive.
     source: (k,), ascending; `faces[i]` is original face `source[i]`, the first of its orientation.
     """
 
@@ -224,11 +228,12 @@ def singular_edges(faces: IntArray, multiplicity: npt.ArrayLike = 1) -> tuple[In
 def net_edges(
     begin: IntArray, end: IntArray, weight: npt.ArrayLike = 1
 ) -> tuple[IntArray, IntArray]:
-    """Directed edges (k, 2) that are left, and their weights (k,) > 0, of edges begin -> end (m,).
+    """The directed edges (k, 2) that remain of edges begin -> end (m,) after opposite edges were
+    cancelled, and their weights (k,) > 0.
 
-    An edge counts `weight` times, (m,) or one integer of any sign for all, and against the same
-    edge run the other way; one from a vertex to itself does not count. The order is by the lower,
-    then the higher index.
+    An edge counts `weight` times, (m,) or an integer of any sign for all, and minus that for the
+    reversed edge. An edge from a vertex to itself does not count. The order is by the lower, then
+    the higher index.
     """
     if not len(begin):
         return np.zeros((0, 2), dtype=np.int64), np.zeros(0, dtype=np.int64)

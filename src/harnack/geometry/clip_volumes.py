@@ -1,4 +1,4 @@
-"""Clipping volumes: ball, box, half-space and their intersections; polytopes and their planes."""
+"""Clip volumes: ball, box, half-space and their intersections; polytopes and their planes."""
 
 from __future__ import annotations
 
@@ -52,13 +52,13 @@ class PlaneTable:
     """Planes n.x <= h as rows (n, h) of four numbers, for a kernel.
 
     backend: where the kernel runs.
-    rows: (m, 4) on the host, of which kernels see the numbers where there is no buffer.
-    buffer: the rows on the backend, or None: literal numbers serve volumes that were not prepared.
+    rows: (m, 4) on the host. Without a buffer, kernels contain these numbers.
+    buffer: the rows on the backend, or None: literals serve volumes that were not prepared.
     plane_count: the number of rows in the buffer as a kernel parameter.
     max_offset: the largest |h|, a kernel parameter too if there is a buffer.
 
-    Unrolled, a scalar gather at a literal index costs no more than a literal number (0.4 ns a
-    plane and ray in all); a packet gather in a loop makes that 1.1 ns, four planes a trip.
+    Unrolled, a scalar gather at a literal index costs no more than a literal number (0.4 ns a plane
+    and ray in all); a packet gather in a loop makes that 1.1 ns, four planes an iteration.
     """
 
     backend: Backend
@@ -69,13 +69,13 @@ class PlaneTable:
 
     @classmethod
     def literal(cls, backend: Backend, rows: FloatArray) -> PlaneTable:
-        """The rows (m, 4) as they are."""
+        """The planes (m, 4) as literals of the kernel."""
         return cls(backend, rows, None, None, backend.Float(_reach(rows)))
 
     @classmethod
     def upload(cls, backend: Backend, rows: FloatArray) -> PlaneTable:
-        """The rows (m, 4) in a buffer; it is filled up to a multiple of eight, if they are more, so
-        that volumes with about as many planes share a kernel."""
+        """The planes (m, 4) in a buffer. If there are more than eight, planes without effect fill
+        it up to a multiple of eight, so that volumes with about as many planes share a kernel."""
         count = len(rows) if len(rows) <= 8 else -(-len(rows) // 8) * 8
         filled = np.concatenate([rows, np.tile(_NO_CONSTRAINT, (count - len(rows), 1))])
         length = dr.opaque(backend.UInt32, count)
@@ -88,9 +88,11 @@ class PlaneTable:
         step: Callable[[FoldState, Vec3, Real], FoldState],
         may_change: Callable[..., Mask] | None = None,
     ) -> FoldState:
-        """state = step(state, n, h) for every plane.
+        """Apply state = step(state, n, h) to one plane n . x <= h after the other, and return the
+        last state.
 
-        may_change: whether the planes that are left can still change what is made of a state.
+        may_change: may_change(*state) is false where no further plane can change the result; a loop
+            over planes stops there. Unrolled planes are all applied.
         """
         index = self.backend.UInt32
         if self.buffer is None or len(self.rows) <= MAX_UNROLLED:
@@ -393,7 +395,7 @@ class HalfSpace(Polytope):
 
 @dataclass(frozen=True)
 class VolumeIntersection(Volume):
-    """Points that lie in all of several volumes (at least one)."""
+    """The intersection of several volumes (at least one)."""
 
     volumes: tuple[Volume, ...]
 
@@ -438,7 +440,8 @@ class VolumeIntersection(Volume):
         return normal
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper corner; lower > upper somewhere if the volumes are seen not to meet."""
+        """Lower and upper corner; lower > upper for some coordinate if the boxes of the volumes do
+        not meet."""
         boxes = [v.bounds() for v in self.volumes]
         return np.max([b[0] for b in boxes], axis=0), np.min([b[1] for b in boxes], axis=0)
 

@@ -1,8 +1,9 @@
-"""Point clouds with normals: validation, the area of each point, and normals where there are none.
+"""Point clouds with normals: validation, the area that each point stands for, and estimated
+normals.
 
 A cloud is a sample of a surface: points (n, 3), unit normals (n, 3) to the positive (outer) side,
 and areas (n,) whose sum is about the area of the surface. Points at the same position are allowed:
-their dipoles add, which is what two layers of a surface that touch there should do.
+their dipoles add, which is right where two layers of a surface touch.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ __all__ = ["CloudError", "estimate_areas", "estimate_normals", "validate_cloud"]
 MAX_POINTS = 100_000_000
 # Points per step: the temporary arrays of one step then stay in the cache of one core.
 _CHUNK = 4096
-# A cell is at most so many times as wide as those of its neighbors may be.
+# The radius of a cell over the median radius of its neighbors' cells, at most.
 _MAX_RADIUS_RATIO = 3.0
 # Points whose cells are computed at once.
 _POINTS_PER_BATCH = 1 << 18
@@ -50,10 +51,13 @@ class CloudError(ValueError):
 def validate_cloud(
     points: npt.ArrayLike, normals: npt.ArrayLike | None, areas: npt.ArrayLike
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Points (n, 3), unit normals (n, 3) and areas (n,), float64 copies that cannot be written to.
+    """Validate a cloud. Returns points (n, 3), unit normals (n, 3) and areas (n,): float64 copies
+    that cannot be written to.
 
-    normals: of any length but zero. areas: positive, in the square of the points' unit; one number
-    stands for all. `estimate_areas` and `estimate_normals` find what is missing.
+    normals: of any length but zero.
+    areas: positive, in the square of the points' unit; a single number stands for all.
+
+    `estimate_areas` and `estimate_normals` compute missing areas and normals.
 
     Raises:
         CloudError: not numbers of these shapes, or no points; a value that is not finite; a normal
@@ -79,10 +83,10 @@ def validate_cloud(
 
 
 def as_cloud_points(points: Any) -> FloatArray:
-    """A fresh array (n, 3) of finite points, n >= 1.
+    """A new array (n, 3) of finite points, n >= 1.
 
     Raises:
-        CloudError: it is not one, or holds coordinates above 1e100.
+        CloudError: points are not numbers of that shape, or have coordinates above 1e100.
     """
     x = _as_numbers(points, "the points")
     if x.size == 0:
@@ -94,10 +98,10 @@ def as_cloud_points(points: Any) -> FloatArray:
 
 
 def as_unit_normals(normals: Any, count: int) -> FloatArray:
-    """A fresh array (count, 3) of normals, scaled to unit length.
+    """A new array (count, 3) of normals, scaled to unit length.
 
     Raises:
-        CloudError: it is missing or not one, or a normal is zero or not finite.
+        CloudError: normals are missing or not of that shape, or a normal is zero or not finite.
     """
     if normals is None:
         raise CloudError(
@@ -126,23 +130,24 @@ def as_unit_normals(normals: Any, count: int) -> FloatArray:
 def estimate_areas(
     points: npt.ArrayLike, normals: npt.ArrayLike, neighbors: int = 20
 ) -> FloatArray:
-    """The area (n,) that each point of a cloud stands for: its Voronoi cell in the tangent plane.
+    """The area (n,) that each point of a cloud stands for: the area of its Voronoi cell in the
+    tangent plane.
 
     After Barill et al. 2018, section 3.1, who project the nearest neighbors to the tangent plane
-    and take the area of the point's Voronoi cell among them. Here the tangent plane is cut out of
-    the point's cell in space instead: the same for points in a plane, but a point on the other
-    side of a thin wall takes nothing away, since its bisecting plane is parallel to the tangent
-    plane. Points at the same position share the cell.
+    and take the area of the point's Voronoi cell among them. Here the point's cell in space is
+    intersected with the tangent plane instead. For points in a plane that is the same; but a point
+    on the other side of a thin wall does not shrink the cell, since its bisecting plane is parallel
+    to the tangent plane. Points at the same position share the cell.
 
-    Points beyond the farthest neighbor, at distance R, can cut the cell only beyond R/2; so within
-    the disc of that radius the cell is exact, and there it ends. At the rim of an open surface a
-    cell may reach out without end: where all neighbors lie on one side (of a line through the
-    point), their mirror images bound the cell too, so that it reaches out as far as in.
+    Points beyond the farthest neighbor, at distance R, can cut the cell only beyond R/2; so the
+    cell is exact within the disc of that radius, and is cut off there. At the rim of an open
+    surface a cell may be unbounded: where all neighbors lie on one side (of a line through the
+    point), their mirror images bound the cell too, so that it extends as far outwards as inwards.
 
-    Outliers: a cell ends at three times the median of such radii of its neighbors as well, so that
-    a point far from the others stands for no more than they do.
+    Outliers: a cell is also cut off at three times the median of such radii of its neighbors, so
+    that a point far from the others stands for no more area than they do.
 
-    neighbors: how many; more cost time, fewer cut large cells of uneven samples.
+    neighbors: the number of neighbors; more cost time, fewer cut large cells of uneven samples.
 
     Raises:
         CloudError: as `validate_cloud`; all points are at one position; fewer than 3 neighbors.
@@ -185,10 +190,10 @@ def _as_numbers(values: Any, name: str) -> FloatArray:
 
 
 def check_neighbors(neighbors: int) -> None:
-    """Check that there are enough neighbors to show a surface.
+    """Check that the number of neighbors is large enough to fit a plane.
 
     Raises:
-        CloudError: there are fewer than 3.
+        CloudError: it is less than 3.
     """
     if neighbors < 3:
         raise CloudError(f"at least 3 neighbors are needed, not {neighbors}")
@@ -198,7 +203,7 @@ def build_point_tree(points: FloatArray) -> Any:
     """A tree for `nearest_neighbors`. points: (n, 3), all different.
 
     Raises:
-        CloudError: there is one point only.
+        CloudError: there is only a single point.
     """
     if len(points) < 2:
         raise CloudError("all points are at one position: a surface needs points beside each other")
@@ -209,12 +214,13 @@ def build_point_tree(points: FloatArray) -> Any:
 
 
 def nearest_neighbors(tree: Any, points: FloatArray, count: int) -> tuple[IntArray, FloatArray]:
-    """Indices and distances (m, k) of the points nearest to some points (m, 3) of a tree.
+    """Indices and distances (m, k) of the nearest neighbors of points (m, 3) of a tree, nearest
+    first.
 
-    A point does not count as its own neighbor. Nearest first; k = count, or all there are.
+    A point is not its own neighbor. k = count, or less if the tree has fewer points.
 
     Raises:
-        CloudError: they lie so close that squared distances vanish.
+        CloudError: points lie so close that squared distances vanish.
     """
     distance, index = tree.query(points, k=min(count + 1, tree.n))
     if distance[:, -1].min() < 1e-100:
@@ -223,7 +229,7 @@ def nearest_neighbors(tree: Any, points: FloatArray, count: int) -> tuple[IntArr
 
 
 def parallel_over_slices(work: Callable[[slice], None], count: int) -> None:
-    """Calls `work` for slices that make up range(count), on all cores."""
+    """Call `work` for slices that make up range(count), on all cores."""
     parts = [slice(k, min(k + _CHUNK, count)) for k in range(0, count, _CHUNK)]
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for _ in pool.map(work, parts):
@@ -234,12 +240,14 @@ def parallel_over_slices(work: Callable[[slice], None], count: int) -> None:
 
 Indices = npt.NDArray[np.int64] | npt.NDArray[np.int32]
 
-# Of the variances of a neighborhood, the second over the first: below it lies on a line.
+# A neighborhood lies on a line if its second variance over its first is below this.
 _COLLINEAR_RATIO = 1e-9
-# Without `neighbors`, the first of these counts is taken with which half of some points see their
-# neighbors in a layer this flat, one standard deviation to the other; else the largest among a
-# half, a quarter, ... of the points, down to so many. If none is as flat, it is the flattest, where
-# it is flatter by this factor than smaller ones.
+# Choice of the number of neighbors if none is prescribed. Flatness is the median, over at most
+# _PROBES points, of the ratio of the smallest to the middle standard deviation of a neighborhood.
+# The first of _NEIGHBOR_COUNTS whose flatness is below _MAX_FLATNESS is taken. If there is none,
+# the largest count is tried among random halves, quarters, ... of the points, until they are fewer
+# than _MIN_SUBSET. If none qualifies, the flattest choice is taken; a choice counts as flatter than
+# the best before it if it improves its flatness by the factor _FLATNESS_GAIN.
 _NEIGHBOR_COUNTS, _MAX_FLATNESS, _PROBES, _MIN_SUBSET, _FLATNESS_GAIN = (
     (16, 32, 64),
     0.45,
@@ -247,37 +255,38 @@ _NEIGHBOR_COUNTS, _MAX_FLATNESS, _PROBES, _MIN_SUBSET, _FLATNESS_GAIN = (
     1000,
     0.9,
 )
-# A point is turned as so many of the nearest points that have a direction.
+# How many of the nearest points that have a normal vote on the sign of a point's normal.
 _VOTING_NEIGHBORS = 8
 # Where to look for extreme points: towards the faces, edges and corners of a cube.
 _DIRECTIONS = np.array([d for d in itertools.product((-1.0, 0.0, 1.0), repeat=3) if any(d)])
 
 
 def estimate_normals(points: npt.ArrayLike, neighbors: int | None = None) -> FloatArray:
-    """Unit normals (n, 3), outward, of points (n, 3) that sample a surface.
+    """Estimate unit normals (n, 3), outward, of points (n, 3) that sample a surface.
 
-    Hoppe et al. 1992. The line of a normal is that in which a point and its nearest neighbors
-    vary least. Its direction is carried from point to point along the tree that spans the graph of
-    neighbors and in which normals agree best, mirrored as Xie et al. 2003 propose, which carries
-    it around edges and thin walls; between points moved onto the planes of their neighbors, as
-    noise would mirror normals otherwise. What then remains is one sign for each connected piece of
-    the graph: the one with which the piece's extreme points in 26 directions face outward, added
-    up. That sign is right for a closed surface, however unevenly sampled.
+    After Hoppe et al. 1992. The line of a normal is the direction in which a point and its nearest
+    neighbors vary least. The signs are propagated from point to point along the spanning tree of
+    the graph of neighbors in which normals agree best. Normals are compared after mirroring, as Xie
+    et al. 2003 propose, which carries the sign around edges and thin walls; points are first moved
+    onto the planes of their neighbors, as noise would disturb the mirroring. A single sign then
+    remains for each connected component of the graph. It is chosen such that the component's
+    extreme points in 26 directions face outward, summed over the directions; for a closed surface
+    that is right, however unevenly sampled.
 
-    neighbors: how many; None for 16, and where there is noise, so many that planes through them
-        are known to some degrees: up to 64 and, where that is not enough, 64 among a part of the
-        points, chosen by chance (with a seed), which are then as far apart as the noise asks for.
+    neighbors: the number of neighbors. None for 16; in noise, up to 64, so that the planes through
+        them are known to a few degrees; and where that is not enough, 64 among a random subset of
+        the points (with a seed), which is as sparse as the noise requires.
 
-    So each piece faces outward by itself: the inner wall of a hollow body does not face its cavity,
-    and how an open surface faces is a convention (a flat one: to the positive side of the axis
-    nearest to its normal). Where details are smaller than neighborhoods, normals may be turned
-    wrongly. Look at the result.
+    So each component faces outward by itself: the inner wall of a hollow body does not face its
+    cavity, and the side that an open surface faces is a convention (a flat surface: the positive
+    side of the axis nearest to its normal). Where details are smaller than neighborhoods, normals
+    may have the wrong sign. Look at the result.
 
     Points at the same position get the same normal.
 
     Raises:
-        CloudError: as `validate_cloud` for points; fewer than 4 positions; neighborhoods on a
-            line, which have no plane; fewer than 3 neighbors.
+        CloudError: as `validate_cloud` for points; fewer than 4 positions; neighborhoods on a line,
+            which have no plane; fewer than 3 neighbors.
     """
     x = as_cloud_points(points)
     if neighbors is not None:
@@ -301,7 +310,8 @@ def estimate_normals(points: npt.ArrayLike, neighbors: int | None = None) -> Flo
 
 
 def _choose_neighborhood(x: FloatArray) -> tuple[int, IntArray]:
-    """How many neighbors show planes, and the points (k,) among which to look for them."""
+    """The number of neighbors with which tangent planes are fitted, and the indices (k,) of the
+    points among which the neighbors are sought."""
     rng = np.random.default_rng(0)
     probes = x[rng.choice(len(x), min(len(x), _PROBES), replace=False)]
     some = np.arange(len(x))
@@ -328,7 +338,8 @@ def _choose_neighborhood(x: FloatArray) -> tuple[int, IntArray]:
 
 
 def _transfer_normals(x: FloatArray, tree: Any, given: FloatArray, neighbors: int) -> FloatArray:
-    """Normals of points (n, 3) by the nearest of some that have one, turned as these are."""
+    """Normals of points (n, 3) from the nearest points that have a normal, with the signs of
+    these."""
     normals = np.empty_like(x)
 
     def fit(part: slice) -> None:
@@ -399,7 +410,8 @@ def _agreement(planes: _TangentPlanes, i: Indices, j: Indices) -> FloatArray:
 
 
 def _spanning_forest(planes: _TangentPlanes) -> tuple[IntArray, IntArray]:
-    """For each point its piece (n,), from 0, and its parent (n,); a root is its own parent."""
+    """The component (n,) of each point, counted from 0, and its parent (n,); a root is its own
+    parent."""
     import scipy.sparse  # here: half a second that few need
 
     sparse: Any = scipy.sparse

@@ -1,4 +1,4 @@
-"""Curves in convex position, and convex hulls as clipping volumes.
+"""Curves in convex position, and convex hulls as clip volumes.
 
 `is_convex_position` says whether a closed curve provably lies on the boundary of a convex body.
 That is the hypothesis of Theorems B.1 and C.1 of Gillespie, Yang, Botsch and Crane, 'Ray Tracing
@@ -122,10 +122,11 @@ def _supporting_planes(
 
 
 def _widest_gap_direction(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Middle of the largest angle free of the points (a, b)[k, :] as seen from the origin: (k,).
+    """(k,) the direction, as an angle, in the middle of the largest angular gap between the points
+    (a, b)[k, :] as seen from the origin.
 
-    Points at the origin, where the edge itself is, have no direction and take their farthest
-    companion's.
+    Points at the origin, where the edge itself is, have no direction: they take that of the
+    farthest point.
     """
     distance = np.hypot(a, b)
     angle = np.arctan2(b, a)
@@ -210,9 +211,11 @@ THIN_PADDING = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class ConvexHull(Polytope):
-    """Half-spaces normals[i].x <= offsets[i]; make it with `ConvexHull.from_points`.
+    """A convex polytope: the half-spaces normals[i].x <= offsets[i]. `ConvexHull.from_points`
+    builds it.
 
-    normals: (m, 3), of unit length. offsets: (m,). lower, upper: (3,), a box around it.
+    normals: (m, 3), of unit length. offsets: (m,). lower, upper: (3,), the corners of a box around
+        it.
     """
 
     normals: FloatArray
@@ -307,8 +310,8 @@ def _facet_normals(x: FloatArray) -> FloatArray | None:
 
 
 def _order_by_spread(normals: FloatArray) -> FloatArray:
-    """The same normals, the first of which lie far from each other: a few of these planes show that
-    a ray misses the hull."""
+    """The same normals in another order, the first ones far from each other: most rays that miss
+    the hull are recognized by a few planes."""
     order, left = [0], np.full(len(normals), np.inf)
     for _ in range(min(len(normals), _LEADING_PLANES) - 1):
         left = np.minimum(left, 1.0 - normals @ normals[order[-1]])

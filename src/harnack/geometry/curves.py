@@ -1,8 +1,8 @@
-"""Closed curves in space, polygonal loops and circles: what is accepted, and simple measures.
+"""Closed curves in space, polygonal loops and circles: validation and simple measures.
 
 A loop is an array (n, 3) of vertices; its last vertex is joined to its first. A curve is a tuple of
-loops, which may be knotted, linked, nested or cross each other. Circles are closed curves that are
-no polygons.
+loops, which may be knotted, linked, nested or cross each other. A circle is a closed curve, too,
+given by its center, radius and normal.
 """
 
 from __future__ import annotations
@@ -54,11 +54,15 @@ _SMALLEST = 1 / MAX_COORDINATE
 
 @dataclass(frozen=True)
 class Circle:
-    """A circle, run counter-clockwise as seen from where its normal points to.
+    """A circle, run counter-clockwise as seen from the side that its normal points to.
 
-    radius: a positive length. center: (3,). normal: (3,), not zero; kept with length one.
+    radius: a positive length.
+    center: (3,).
+    normal: (3,), not zero; it is scaled to length one.
 
-    Raises ValueError, or TypeError for what is no number.
+    Raises:
+        ValueError: a number is not finite, the radius not positive, or the normal zero.
+        TypeError: a value is not a number.
     """
 
     radius: float
@@ -94,7 +98,8 @@ class Circle:
         return 2 * math.pi * self.radius
 
     def reversed(self) -> Circle:
-        """The same circle, run the other way: a hole in what another curve bounds."""
+        """The same circle, run the other way, such as for a hole in the region that another curve
+        bounds."""
         x, y, z = self.normal
         return Circle(self.radius, self.center, (-x, -y, -z))
 
@@ -104,7 +109,8 @@ class Circle:
         return np.array(self.center) - reach, np.array(self.center) + reach
 
     def polygon(self, sides: int, *, circumscribed: bool = False) -> FloatArray:
-        """(sides, 3) corners of the regular polygon in the circle, or of that around it."""
+        """(sides, 3) corners of the regular polygon inscribed in the circle, or circumscribed about
+        it."""
         if sides < 3:
             raise ValueError(f"a polygon needs at least three sides, not {sides}")
         radius = self.radius / math.cos(math.pi / sides) if circumscribed else self.radius
@@ -127,7 +133,7 @@ def _numbers(values: Any, name: str, shape: tuple[int, ...]) -> FloatArray:
 
 
 def cancel_opposite_circles(circles: Iterable[Circle]) -> tuple[Circle, ...]:
-    """The circles without those that are run there and back, as `cancel_opposite_edges` for edges.
+    """Remove pairs of opposite circles, as `cancel_opposite_edges` does for edges.
 
     Only circles with exactly the same center and radius and exactly opposite normals cancel.
     """
@@ -154,7 +160,7 @@ class CurveError(ValueError):
 
 
 class CurveShapeError(CurveError):
-    """Not numbers of shape (n, 3), or a list of such arrays."""
+    """A curve is not an array of numbers of shape (n, 3), or a list of such arrays."""
 
 
 class NonFiniteVertexError(CurveError):
@@ -174,19 +180,19 @@ class RepeatedVertexError(CurveError):
 
 
 class CurveScaleError(CurveError):
-    """So large or small that lengths overflow or vanish."""
+    """A curve is so large or so small that lengths overflow or vanish."""
 
 
 def validate_loops(loops: LoopsLike, *, closed: bool = True) -> Loops:
-    """One array-like (n, 3), or a list of them, as a tuple of float64 arrays of their own.
+    """Validate an array-like (n, 3), or a list of them. Returns a tuple of new float64 arrays.
 
-    A loop closes by itself. If its last vertex repeats its first, that one is dropped; any other
+    A loop closes by itself. If its last vertex repeats its first, the last is dropped; any other
     vertex equal to the one before it is an error. Edges that fold back on themselves are allowed.
 
     closed: False for curves that end at their first and last vertex, which then may be equal.
 
     Raises:
-        CurveError: one of its subclasses above, by what is wrong.
+        CurveError: the subclass above that names the fault.
     """
     parts = _as_list(loops)
     if not parts:
@@ -203,8 +209,8 @@ def validate_loops(loops: LoopsLike, *, closed: bool = True) -> Loops:
 
 
 def validate_curves(curves: Any) -> tuple[Loops, tuple[Circle, ...]]:
-    """Closed curves as loops of vertices and circles: what `validate_loops` accepts, a `Circle`, or
-    a list in which each entry is one of the two.
+    """Validate closed curves, loops of vertices and circles: any input of `validate_loops`, a
+    `Circle`, or a list in which each entry is a loop or a circle.
 
     Raises:
         CurveError: as `validate_loops`.

@@ -1,27 +1,27 @@
-"""Clouds with noise: how much of it there is, and points moved to where the surface is.
+"""Clouds with noise: an estimate of the noise, and points moved onto the surface.
 
 A point of a cloud with noise lies off the surface by some distance, with a standard deviation that
-`estimate_noise` estimates. `CloudDenoiser` moves points along their normals to where their
-neighbors say that the surface is, so that sums over them need less smoothing, and edges stay
+`estimate_noise` estimates. `CloudDenoiser` moves points along their normals to the height of the
+surface that their neighbors predict, so that sums over them need less smoothing, and edges stay
 sharper.
 
-A neighbor j, at p_j with the normal n_j, says that the surface at x is
+A neighbor j, at p_j with the normal n_j, predicts that the surface near x is
 
     t_j = (n + n_j)/2 . (p_j - x)
 
 farther along the normal n of x. On a sphere, and to second order on every surface, t_j is 0 at a
 point of the surface, however far the neighbor is: the plane of j lies as far outside of the surface
-as j itself is inside of the plane of x. So the mean of t_j does not shrink what is curved, as the
-mean of the positions would. Neighbors count by distance and by the angle between n and n_j, so that
-what lies around an edge or on the other side of a wall does not count.
+as j itself is inside of the plane of x. So the mean of t_j does not shrink curved surfaces, as the
+mean of the positions would. Neighbors are weighted by distance and by the angle between n and n_j,
+so that neighbors around an edge or on the other side of a wall do not count.
 
-Noise is taken from the points, not from the field. A kernel wide enough for noise rounds all
-edges and shrinks what is round. Points moved along their normals, by planes of their own and of
-their neighbors together, leave a spacing to smooth over: the mean error of surfaces was a tenth to
-a third less than by smoothing over 1.4 sqrt(noise * spacing) alone, and areas were right, which had
-been twice as large. Correcting a smoothed surface by how much a second smoothing moves it was no
-better than one smoothing. The field stays a sum of dipoles, with all its bounds, so that what was
-chosen is in the data alone (`denoised_cloud`).
+The noise is removed from the points, not from the field. A kernel wide enough for the noise rounds
+all edges and shrinks curved parts. Points moved along their normals, by planes of their own and of
+their neighbors together, need to be smoothed over a spacing only: the mean error of surfaces was a
+tenth to a third less than by smoothing over 1.4 sqrt(noise * spacing) alone, and areas were right,
+which had been twice as large. Correcting a smoothed surface by the distance by which a second
+smoothing moves it was no better than a single smoothing. The field stays a sum of dipoles, with all
+its bounds: only its data change (`denoised_cloud`).
 """
 
 from __future__ import annotations
@@ -42,53 +42,60 @@ from harnack.geometry.clouds import (
 
 __all__ = ["CloudDenoiser", "NoiseEstimate", "estimate_noise", "outlier_indices"]
 
-# A point is alone if its fourth neighbor is so many times as far as those of its neighbors are.
+# A point is an outlier if its fourth neighbor is _OUTLIER_RATIO times as far from it as the fourth
+# neighbors of its neighbors are from these (median).
 _OUTLIER_RATIO, _OUTLIER_NEIGHBORS = 6.0, 4
-# Noise is measured at so many points, among the first of these counts of neighbors that reaches so
-# many standard deviations; neighbors whose normals turn by more than 60 degrees do not count.
+# Noise is measured at _PROBES points, among the first of _COUNTS neighbors that reach _MIN_REACH
+# standard deviations far; neighbors whose normals turn by more than 60 degrees do not count.
 _PROBES, _COUNTS, _MIN_REACH, _MIN_NORMAL_COSINE = 1000, (16, 64, 256, 1024), 4.5, 0.5
-# So many neighbors are used, times noise over spacing, but at least and at most these: half of them
-# within 3.1 sqrt(noise * spacing), by experiment as a compromise of noise and detail.
+# _NEIGHBORS_PER_NOISE * noise / spacing neighbors are used, within the two limits: half of them lie
+# within 3.1 sqrt(noise * spacing), by experiment a compromise of noise and detail.
 _NEIGHBORS_PER_NOISE, _MIN_NEIGHBORS, _MAX_NEIGHBORS = 62.0, 16, 256
-# Of a cloud in which noise is larger than so many spacings, a part of the points is moved: that
-# many spacings over the noise, but not less than the last number.
+# If noise / spacing exceeds _MAX_NOISE_PER_SPACING, only a random fraction
+# _MAX_NOISE_PER_SPACING * spacing / noise of the points (at least _MIN_KEPT_FRACTION) is selected
+# and moved. All points still count as neighbors.
 _MAX_NOISE_PER_SPACING, _MIN_KEPT_FRACTION = 1.2, 0.1
 # Weights of neighbors fall to exp(-3) at the last of them, and to 1/e where normals differ by this
 # chord, given and estimated.
 _DISTANCE_DECAY, _NORMAL_CHORD, _CHORD_OF_ESTIMATES = 3.0, 0.8, 0.4
-# Normals are estimated anew from moved points so often, each from this many of them. Where only
-# some points are moved, they are moved at first by so many of each other.
+# Normals are estimated again from moved points _NORMAL_ITERATIONS times, each from
+# _PLANE_NEIGHBORS points. Where only a fraction of the points is moved, these are first moved by
+# _INITIAL_NEIGHBORS of each other.
 _NORMAL_ITERATIONS, _PLANE_NEIGHBORS, _INITIAL_NEIGHBORS = 2, 32, 32
-# Of neighbors that face the other way, half of the sum of weights is less than this.
+# Half of the sum of weights is less than this where neighbors face the other way.
 _MIN_SLOPE = 0.25
-# A point whose estimated normal so small a part of its neighbors has, by weight, is nowhere on the
-# surface: such points lie in the middle of thin parts. At edges and corners more of them have it.
+# A point is dropped if less than this fraction of its neighbors, by weight, has a normal like its
+# estimated one: such points lie in the middle of thin parts. At edges and corners more have it.
 _MIN_AGREEING_WEIGHT = 0.1
 
 
 @dataclass(frozen=True)
 class NoiseEstimate:
-    """deviation: the standard deviation of the points from the surface, along its normal; spacing:
-    the root of the area that a point stands for, in the median."""
+    """The noise of a cloud, in the units of its points.
+
+    deviation: the standard deviation of the points from the surface, along its normal.
+    spacing: the square root of the area that a point stands for (median).
+    """
 
     deviation: float
     spacing: float
 
     @property
     def neighbor_count(self) -> int:
-        """How many neighbors show where the surface is."""
+        """The number of neighbors from which the height of the surface is averaged."""
         count = round(_NEIGHBORS_PER_NOISE * self.deviation / self.spacing)
         return min(max(count, _MIN_NEIGHBORS), _MAX_NEIGHBORS)
 
     def kept_fraction(self) -> float:
-        """The part of the points that is worth to be kept, at most 1."""
+        """The fraction of the points that are worth moving, at most 1."""
         share = _MAX_NOISE_PER_SPACING * self.spacing / max(self.deviation, 1e-300)
         return min(max(share, _MIN_KEPT_FRACTION), 1.0)
 
 
 def outlier_indices(points: FloatArray, tree: Any) -> IntArray:
-    """The indices of points far from all others: the fourth neighbor of each is more than six times
-    as far as those of its neighbors, and of all points, are in the median. tree: of these."""
+    """The indices of outliers: points whose fourth neighbor is more than six times as far away as
+    the fourth neighbors of its neighbors are in the median, and as those of all points are in the
+    median. tree: of these points."""
     count = min(_OUTLIER_NEIGHBORS, len(points) - 1)
     nearest = np.empty((len(points), count), np.int64)
     reach = np.empty(len(points))
@@ -103,10 +110,18 @@ def outlier_indices(points: FloatArray, tree: Any) -> IntArray:
 
 
 def estimate_noise(points: FloatArray, normals: FloatArray | None, tree: Any) -> NoiseEstimate:
-    """The noise of a cloud, by how different the distances from the surface are that the neighbors
-    of some points say. Without normals, by how far neighbors lie from their plane: then what is
-    curved counts as noise. Among too few neighbors, which reach no farther than the noise, there is
-    no surface to be seen. tree: of these points."""
+    """Estimate the noise and the spacing of a cloud.
+
+    Each of up to 1000 probe points has neighbors, and each neighbor j predicts the height t_j of
+    the surface above the probe (module docstring). The noise is the median, over probes, of the
+    standard deviation of t_j. Without normals, deviations from the plane that fits the neighbors
+    best are used, so that curvature counts as noise.
+
+    The number of neighbors grows from 16 to 1024, until the farthest is (in the median) 4.5
+    standard deviations away: fewer reach no farther than the noise, and show no surface.
+
+    tree: of these points.
+    """
     rng = np.random.default_rng(0)
     probes = np.sort(rng.choice(len(points), min(len(points), _PROBES), replace=False))
     noise = NoiseEstimate(0.0, 1.0)
@@ -141,7 +156,8 @@ def _min_variance_axes(offsets: FloatArray, weights: FloatArray | None) -> Float
 
 
 def _deviations_by_normals(offsets: FloatArray, own: FloatArray, theirs: FloatArray) -> FloatArray:
-    """Standard deviations (m,) of t_j among neighbors with a normal like one's own."""
+    """Standard deviations (m,) of t_j among the neighbors whose normals are like those of the
+    points."""
     like = np.einsum("mi,mki->mk", own, theirs) > _MIN_NORMAL_COSINE
     said = np.einsum("mki,mki->mk", 0.5 * (own[:, None] + theirs), offsets)
     count = np.maximum(like.sum(axis=1), 2)
@@ -150,11 +166,11 @@ def _deviations_by_normals(offsets: FloatArray, own: FloatArray, theirs: FloatAr
 
 
 class CloudDenoiser:
-    """Points of a cloud, of which some are moved onto the surface by all.
+    """Moves points of a cloud onto the surface that all of its points show.
 
-    points: (n, 3), and `tree` of them. noise: theirs.
-    chosen: (m,) indices of the points to be moved; all, unless there is so much noise that a part
-        is as good.
+    points: (n, 3), and `tree` of them. noise: the noise of the cloud.
+    selected: (m,) indices of the points to be moved: all, unless the noise is so large that a
+        random fraction is as good.
     """
 
     def __init__(self, points: FloatArray, noise: NoiseEstimate, tree: Any | None = None) -> None:
@@ -172,12 +188,12 @@ class CloudDenoiser:
 
     @property
     def spacing(self) -> float:
-        """The spacing of the chosen points."""
+        """The spacing of the selected points."""
         return self.noise.spacing * math.sqrt(len(self.points) / len(self.selected))
 
     def denoise_points(self, normals: FloatArray) -> FloatArray:
-        """The chosen points (m, 3), moved along the normals (n, 3) of all points, which are known
-        and stay."""
+        """The selected points (m, 3), moved along their normals. normals: (n, 3), of all points;
+        they are known and are not changed."""
         some, own = self.points[self.selected], normals[self.selected]
         if len(some) < len(self.points):
             some = _move_along_normals(
@@ -192,10 +208,10 @@ class CloudDenoiser:
         return _move_along_normals(some, own, near, self.points, normals, _NORMAL_CHORD)
 
     def denoise_points_and_normals(self, normals: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The chosen points, moved, and their normals, improved in turn with the points: (k, 3)
-        each, k <= m, without points whose normals hardly any neighbor has.
+        """The selected points, moved, and their normals, improved in turn with the points: (k, 3)
+        each. k <= m, as points whose normals hardly any neighbor has are left out.
 
-        normals: (m, 3) of these, as they are estimated.
+        normals: (m, 3), estimates for the selected points.
         """
         start, chord = self.points[self.selected], _CHORD_OF_ESTIMATES
         if len(start) == len(self.points):
@@ -220,8 +236,8 @@ class CloudDenoiser:
 
 
 def _neighbors(tree: Any, points: FloatArray, count: int) -> Indices:
-    """(m, k) the indices of the points of a tree that are nearest to points (m, 3), these included
-    where they are among them."""
+    """(m, k) the indices of the points of a tree that are nearest to points (m, 3), which count
+    themselves if they belong to the tree."""
     count = min(count, tree.n)
     index = np.empty((len(points), count), np.int32)
 
@@ -242,9 +258,9 @@ def _move_along_normals(
 ) -> FloatArray:
     """Points (m, 3), moved along their `own` normals (m, 3) to where the mean of t_j is 0.
 
-    near: (m, k) their neighbors among points (n, 3) with normals (n, 3), which count by their
-        distance along the plane of the point: else those on its side of the surface would hold it
-        there.
+    near: (m, k) their neighbors among points (n, 3) with normals (n, 3). Weights depend on the
+        distance along the plane of the point only: with the distance in space, neighbors on the
+        point's side of the surface would hold it there.
     """
     moved = np.empty_like(start)
 
@@ -274,10 +290,10 @@ def _agreeing_weight(
     normals: FloatArray,
     chord: float,
 ) -> FloatArray:
-    """(m,) the part of the neighbors of points that have a normal like theirs, by weight.
+    """(m,) the fraction, by weight, of the neighbors of points that have a normal like theirs.
 
-    is_own: (m, k) which of them are the points themselves, and do not count. The others: as for
-        `_move_along_normals`.
+    is_own: (m, k) which of the neighbors are the points themselves, and do not count. The other
+        arguments: as for `_move_along_normals`.
     """
     alike = np.empty(len(start))
 

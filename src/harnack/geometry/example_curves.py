@@ -1,7 +1,7 @@
-"""Closed curves to draw, to test with and to write about. Arrays are (n, 3) float64.
+"""Closed curves for pictures, tests and examples. Arrays are (n, 3) float64.
 
-Loops are not closed by a repeated vertex. All are counter-clockwise seen from +z where that
-means something.
+Loops are not closed by a repeated vertex. All are counter-clockwise seen from +z where that has a
+meaning.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Meshes to draw, to test with and to write about, and ways to damage them.
+"""Meshes for pictures, tests and examples, and functions that damage meshes.
 
 Shapes are (vertices (n, 3) float64, faces (m, 3) int64), closed, counter-clockwise from outside.
-Damage takes faces and returns faces; `seed` makes it repeatable.
+Functions that damage take faces and return faces; `seed` makes them repeatable.
 """
 
 from __future__ import annotations
@@ -88,9 +88,11 @@ def flip_faces(faces: IntArray, fraction: float, seed: int) -> IntArray:
 def duplicate_faces(
     faces: IntArray, fraction: float, seed: int, *, flipped: bool = False
 ) -> IntArray:
-    """The faces (m, 3), then a random fraction of them once more; turned: reversed.
+    """The faces (m, 3), followed by a second copy of a random fraction of them; flipped: a reversed
+    copy.
 
-    A duplicate makes w jump by 2 across that face, a turned one by 0: a hole that is not seen.
+    A duplicate makes w jump by 2 across that face, and a reversed duplicate by 0: a hole that is
+    not seen.
     """
     copies = faces[_chosen(faces, fraction, seed)]
     return np.concatenate([faces, copies[:, [0, 2, 1]] if flipped else copies])

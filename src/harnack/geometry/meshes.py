@@ -1,4 +1,4 @@
-"""Triangle meshes: what is accepted, faces without an area, and solid angles of triangles.
+"""Triangle meshes: validation, faces of zero area, and solid angles of triangles.
 
 A mesh is an array (n, 3) of vertices and an array (m, 3) of faces, indices of vertices counted from
 0. The positive side of a face is the one from which its vertices run counter-clockwise. A mesh may
@@ -46,16 +46,18 @@ class MeshError(ValueError):
 def validate_mesh(
     vertices: npt.ArrayLike, faces: npt.ArrayLike, *, allow_zero_area: bool = False
 ) -> tuple[FloatArray, IntArray]:
-    """Vertices (n, 3) float64 and faces (m, 3) int64 of a mesh: copies that cannot be written to.
+    """Validate a mesh. Returns vertices (n, 3) float64 and faces (m, 3) int64: copies that cannot
+    be written to.
 
-    Vertices that no face uses are kept, and checked like the rest.
+    Vertices that no face uses are kept, and checked like all others.
 
-    allow_zero_area: whether faces may have zero area, as they join others in closed meshes.
+    allow_zero_area: whether faces may have zero area, as faces of closed meshes that only join
+        others.
 
     Raises:
-        MeshError: not numbers of these shapes, faces that are not triangles of integers, nothing
-            at all; a coordinate that is not finite; an index without a vertex; a face of zero area
-            as `zero_area_faces` has it; sizes whose squares overflow or vanish.
+        MeshError: not numbers of these shapes, faces that are not triangles of integers, an empty
+            mesh; a coordinate that is not finite; an index without a vertex; a face of zero area as
+            `zero_area_faces` defines it; sizes whose squares overflow or vanish.
     """
     x, triangles = _checked_arrays(vertices, faces)
     is_flat, longest = _measure_faces(x, triangles)
@@ -68,12 +70,12 @@ def validate_mesh(
 
 
 def zero_area_faces(vertices: npt.ArrayLike, faces: npt.ArrayLike) -> IntArray:
-    """Indices of the faces that count as without area: (k,).
+    """Indices (k,) of the faces that count as faces of zero area.
 
-    A face does if twice its area is at most 8 units in the last place (2^-49) of the square of its
-    longest edge: if its vertices lie on a line, or two of them are equal, up to the rounding of a
-    cross product. So it does not depend on the scale of the mesh, and not on where it lies. Such a
-    face has no normal to speak of.
+    Twice the area of such a face is at most 8 units in the last place (2^-49) of the square of its
+    longest edge: its vertices lie on a line, or two of them are equal, up to the rounding of a
+    cross product. So it depends neither on the scale nor on the position of the mesh. Such a face
+    has no reliable normal.
 
     Raises:
         MeshError: as `validate_mesh`, but for zero area.
@@ -86,10 +88,10 @@ def without_zero_area_faces(
 ) -> tuple[FloatArray, IntArray]:
     """The mesh without the faces of `zero_area_faces`, as `validate_mesh` returns it.
 
-    All vertices stay, so indices keep their meaning. A face without area adds nothing to a winding
-    number. Where one filled a gap of no width (a vertex in the middle of its neighbor's edge), the
+    All vertices stay, so indices keep their meaning. A face of zero area adds nothing to a winding
+    number. If it filled a gap of zero width (a vertex in the middle of its neighbor's edge), the
     edges at that gap become boundary edges on top of each other: they still cancel in every sum,
-    they only make what counts distances to boundary edges more careful than need be.
+    and only make distances to boundary edges smaller than need be.
 
     Raises:
         MeshError: as `validate_mesh`; no face has an area.

@@ -1,4 +1,5 @@
-"""The two sides of meshes, and strips that have one alone."""
+"""Orientability of triangle meshes: whether a mesh has two sides, or a single one as a Moebius
+strip."""
 
 from __future__ import annotations
 
@@ -12,8 +13,8 @@ __all__ = ["is_nonorientable", "orientation_components"]
 
 
 def is_nonorientable(faces: IntArray) -> bool:
-    """Whether a mesh ends in the open and no part of it, of those that edges of two faces hold
-    together, has two sides: as a Moebius strip."""
+    """Whether the mesh has a boundary and all of its components are non-orientable, like a Moebius
+    strip. Components are connected across edges with exactly two faces."""
     if not (_edges(faces)[2] == 1).any():
         return False
     part = orientation_components(faces)
@@ -21,9 +22,12 @@ def is_nonorientable(faces: IntArray) -> bool:
 
 
 def orientation_components(faces: IntArray) -> IntArray:
-    """(2m,) the parts that sides of faces belong to, first of all as they are and then of all
-    turned over: sides of neighbors that agree are joined. A part of one side only is joined to
-    itself turned over."""
+    """(2m,) component labels in the orientation double cover of m faces: entry k is for face k as
+    given, entry m + k for face k reversed.
+
+    Neighbors with consistent orientation share a label. A face and its reverse have the same label
+    if and only if their component is non-orientable.
+    """
     import scipy.sparse  # here: half a second that few need
     import scipy.sparse.csgraph as csgraph_module
 
@@ -42,8 +46,9 @@ def orientation_components(faces: IntArray) -> IntArray:
 
 
 def _edges(faces: IntArray) -> tuple[IntArray, IntArray, IntArray]:
-    """Edges (3m, 2) as faces run them, the first of all faces first; the number of each, whichever
-    way it is run; and how often each number is run."""
+    """Edges (3m, 2) in the direction in which faces run them, the first edges of all faces first;
+    the index (3m,) of each as an undirected edge; and for each undirected edge how many faces run
+    it."""
     pairs = np.concatenate([faces[:, [k, (k + 1) % 3]] for k in range(3)]).astype(np.int64)
     keys = pairs.min(axis=1) * (int(pairs.max(initial=0)) + 1) + pairs.max(axis=1)
     _, index, uses = np.unique(keys, return_inverse=True, return_counts=True)

@@ -1,7 +1,7 @@
 """Outlines of regions of the plane: closed loops of points, cleaned so that they bound a region.
 
-`make_outline` accepts loops as people give them, and decides what is inside: by the even-odd rule,
-or by winding numbers. What it returns does not cross itself, and has the region on its left.
+`make_outline` accepts any loops, and determines the region inside by the even-odd rule or by
+winding numbers. The loops that it returns do not cross, and have the region on their left.
 """
 
 from __future__ import annotations
@@ -31,19 +31,21 @@ _CLIPPER_SIZE = 2.0**17
 
 
 def make_outline(loops: Any, rule: FillingRule = "even-odd") -> Outline:
-    """The loops that bound a region.
+    """The loops that bound the region inside of loops.
 
-    loops: one array (n, 2) of the vertices of a closed loop, the last joined to the first, or
-        several of different lengths. They may be nested to any depth, and may run either way.
-    rule: what is inside. "even-odd": points around which an odd number of loops runs, so that a
-        loop in another is a hole, whichever way it runs. "nonzero": points around which loops run
-        more often one way than the other, as the letters of fonts mean it.
+    loops: an array (n, 2) of the vertices of a closed loop, the last joined to the first, or
+        several such arrays of different lengths. Loops may be nested to any depth, and may run
+        either way.
+    rule: which points are inside. "even-odd": points around which an odd number of loops runs, so
+        that a loop in another is a hole, whichever way it runs. "nonzero": points around which
+        loops run more often one way than the other; the letters of fonts use this rule.
 
     Loops that neither touch nor cross keep their vertices exactly. Others are cut where they cross
     (by Clipper2, through manifold3d), with vertices rounded to about 1e-13 of the outline's size.
 
     Raises:
-        ValueError: what is no loop, or too large; no area inside. TypeError: not numbers.
+        ValueError: a loop is malformed or too large; there is no area inside.
+        TypeError: not numbers.
     """
     given = _checked_loops(loops)
     points = np.concatenate(given)
@@ -163,8 +165,8 @@ def _distances(p: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def _orient_loops(loops: list[FloatArray]) -> Outline:
-    """Simple loops, each reversed where the region would lie on its right: it lies inside of those
-    around which there are none or two or any even number of others."""
+    """Simple loops, with the region on the left of each. The region lies inside of a loop if an
+    even number of other loops runs around it, else outside."""
     start, end, _ = _edges_and_successors(loops)
     owner = np.repeat(np.arange(len(loops)), [len(one) for one in loops])
     made: list[FloatArray] = []
@@ -211,7 +213,8 @@ def _make_read_only(loops: list[FloatArray]) -> Outline:
 
 
 def scale_for_clipper(outline: Sequence[FloatArray]) -> tuple[list[FloatArray], float]:
-    """The loops times a power of two, of which Clipper2 rounds next to nothing, and this factor."""
+    """The loops times a power of two, so large that Clipper2's rounding hardly matters; and that
+    factor."""
     largest = max(float(np.abs(one).max()) for one in outline)
     scale = 2.0 ** (math.frexp(_CLIPPER_SIZE)[1] - math.frexp(largest)[1])
     return [np.ascontiguousarray(one * scale) for one in outline], scale

@@ -1,8 +1,8 @@
-"""Meshes of polygons that need not be flat: what is accepted, their measures, and how to make some.
+"""Meshes of polygons that need not be planar: validation, measures, and a generator of examples.
 
-A face is a closed curve through vertices, or several, such as an outline and holes: it is given by
-the indices of its vertices, counted from 0. Its positive side is the one from which the outline
-runs counter-clockwise and holes clockwise. Faces need not be joined, and may cross each other.
+A face is a closed curve through vertices, or several, such as an outline and holes: a list of loops
+of vertex indices, counted from 0. Its positive side is the one from which the outline runs
+counter-clockwise and holes clockwise. Faces need not be joined, and may cross each other.
 """
 
 from __future__ import annotations
@@ -32,22 +32,24 @@ from harnack.geometry.meshes import MAX_FACES, MAX_VERTICES, MeshError
 
 __all__ = ["PolygonFaces", "cluster_into_polygons", "validate_polygons"]
 
-# A face whose corners lie as close to one line, as a part of its size, has no surface to speak of.
+# A face whose corners are closer to a line than this fraction of its size counts as collinear.
 _COLLINEAR_TOLERANCE = 1e-9
-# Of the lengths of two edges, the part that a turn must be at least to count as one.
+# A turn between two edges counts from this fraction of their lengths on.
 _TURN = 1e-6
 # Turns of a convex polygon add up to one revolution, to this many radians.
 _REVOLUTION = 1e-6
-# At most so many faces with projections that are not convex are examined further, at 0.5 ms each.
+# The largest number of faces with non-convex projections that are examined further, 0.5 ms each.
 _MAX_EXAMINED_FACES = 20_000
 
 
 @dataclass(frozen=True, eq=False)
 class PolygonFaces:
-    """Faces with any number of corners.
+    """Faces with any number of corners, in flat arrays.
 
-    vertices: (n, 3). corners: (k,) indices of them, loop after loop. sizes: (l,) corners of each
-    loop. face_of_loop: (l,) rising; every face has a loop.
+    vertices: (n, 3).
+    corners: (k,) vertex indices, loop after loop.
+    sizes: (l,) the number of corners of each loop.
+    face_of_loop: (l,) ascending; every face has a loop.
     """
 
     vertices: FloatArray
@@ -57,7 +59,7 @@ class PolygonFaces:
 
     @property
     def face_count(self) -> int:
-        """How many faces there are."""
+        """The number of faces."""
         return int(self.face_of_loop[-1]) + 1
 
     @property
@@ -67,19 +69,19 @@ class PolygonFaces:
 
     @property
     def loop_starts(self) -> IntArray:
-        """(l,) where each loop starts in `corners`."""
+        """(l,) the index in `corners` of the first corner of each loop."""
         return np.cumsum(self.loop_sizes) - self.loop_sizes
 
     @property
     def next_corner(self) -> IntArray:
-        """(k,) place in `corners` of the next corner of the same loop."""
+        """(k,) the index in `corners` of the next corner of the same loop."""
         after = np.arange(1, len(self.corners) + 1, dtype=np.int64)
         after[self.loop_starts + self.loop_sizes - 1] = self.loop_starts
         return after
 
     @property
     def edges(self) -> IntArray:
-        """(e, 2) pairs of vertices that some face joins, each once."""
+        """(e, 2) the pairs of vertices that an edge of a face joins, each pair once."""
         ends = np.column_stack([self.corners, self.corners[self.next_corner]])
         return np.unique(np.sort(ends, axis=1), axis=0)
 
@@ -104,8 +106,8 @@ class PolygonFaces:
 
     @functools.cached_property
     def in_convex_position(self) -> BoolArray:
-        """(m,) whether each face is one loop without self-intersections that is proved to lie on
-        the boundary of a convex set; False where no proof was found."""
+        """(m,) whether each face is a single loop without self-intersections that is proved to lie
+        on the boundary of a convex set; False where there is no proof."""
         found = self._projects_to_convex_polygon()
         single = np.bincount(self.face_of_loop, minlength=self.face_count) == 1
         rest = np.flatnonzero(single & ~found)[:_MAX_EXAMINED_FACES]
@@ -114,12 +116,13 @@ class PolygonFaces:
         return found
 
     def _projects_to_convex_polygon(self) -> BoolArray:
-        """(m,) whether each face is one loop whose projection along its mean normal is a convex
-        polygon, run around once.
+        """(m,) whether each face is a single loop whose projection along its mean normal is a
+        convex polygon, run around once.
 
         Such a loop has no self-intersection, for its projection has none, and it lies on the
-        boundary of a convex set, the cylinder over the projection. A turn counts from a millionth
-        of the lengths of the edges on, far above rounding: a face that is called convex is.
+        boundary of a convex set, the cylinder over the projection. A turn counts only from a
+        millionth of the lengths of the edges on, far above rounding: a face that is called convex
+        is convex.
         """
         x = self.vertices[self.corners]
         face, first = self.face_of_corner, self.first_corners
@@ -143,20 +146,20 @@ class PolygonFaces:
 
     @functools.cached_property
     def first_corners(self) -> IntArray:
-        """(m,) place in `corners` of the first of each face."""
+        """(m,) the index in `corners` of the first corner of each face."""
         new = np.flatnonzero(np.diff(self.face_of_loop, prepend=-1))
         return self.loop_starts[new]
 
 
 def validate_polygons(vertices: Any, faces: Any) -> PolygonFaces:
-    """Vertices (n, 3), and faces: a sequence of faces of any lengths, each a sequence of at least
-    three indices or a sequence of such loops; or an integer array (m, k).
+    """Validate polygons. vertices: (n, 3). faces: a sequence of faces of any lengths, each a
+    sequence of at least three indices or a sequence of such loops; or an integer array (m, k).
 
     Raises:
-        MeshError: not numbers of these shapes, nothing at all; a coordinate that is not finite; an
-            index that is no integer or has no vertex; a loop of fewer than three vertices, or that
-            visits one twice; an edge without a length, or run twice by its face; a face whose
-            vertices lie on a line.
+        MeshError: not numbers of these shapes, an empty mesh; a coordinate that is not finite; an
+            index that is not an integer or has no vertex; a loop of fewer than three vertices, or
+            that visits a vertex twice; an edge of length zero, or run twice by its face; a face
+            whose vertices lie on a line.
     """
     x = _checked_vertices(vertices)
     corners, sizes, face_of_loop = _flatten_faces(faces)
@@ -284,8 +287,9 @@ def _first_repeated_key(keys: IntArray) -> int | None:
 
 
 def _check_not_collinear(found: PolygonFaces) -> None:
-    """Raise MeshError for a face whose vertices lie on a line: that from the corner farthest from
-    its middle to the corner farthest from there."""
+    """Raise MeshError for a face whose corners are collinear: all within 1e-9 of its size from the
+    line that joins the corner farthest from the center of its box to the corner farthest from that
+    corner."""
     x, face = found.vertices[found.corners], found.face_of_corner
     low, high = found.face_boxes()
     a = x - (0.5 * (low + high))[face]
@@ -323,20 +327,19 @@ def cluster_into_polygons(
     smoothing: int = 0,
     seed: int = 0,
 ) -> tuple[FloatArray, list[list[list[int]]]]:
-    """A triangle mesh cut into about `face_count` patches, polygons with many corners that are not
-    flat: vertices, and polygon faces, a list of loops each.
+    """Cut a triangle mesh into about `count` clusters, whose boundaries are polygons with many
+    corners that are not planar. Returns vertices, and polygon faces, a list of loops each.
 
-    They are made for pictures and tests: each triangle is a point (centroid, weight * normal) in
-    six dimensions, patches are the clusters of Lloyd's algorithm, so that they are compact and bend
-    little, and their boundaries are the polygons (Cohen-Steiner, Alliez and Desbrun 2004 do so with
-    planes).
+    For pictures and tests. Each triangle is a point (centroid, weight * normal) in six dimensions,
+    and Lloyd's algorithm finds the clusters, so that they are compact and bend little
+    (Cohen-Steiner, Alliez and Desbrun 2004 do so with planes).
 
-    Corners of a patch are vertices of the mesh; vertices within patches are left out. smoothing:
-    how often corners of just two edges are moved to the middle between where they are and the mean
-    of their neighbors, since boundaries along triangles run in zigzags.
+    Corners of the polygons are vertices of the mesh; vertices inside of clusters are left out.
+    smoothing: how many times corners of just two edges are moved to the middle between their
+    position and the mean of their neighbors, since boundaries along triangles are zigzags.
 
     Raises:
-        ValueError: fewer than two patches, or more than triangles.
+        ValueError: fewer than two clusters, or more than triangles.
     """
     if not 2 <= count <= len(faces):
         raise ValueError(f"a mesh of {len(faces):,} faces has 2 to as many patches, not {count}")
@@ -361,7 +364,8 @@ def _edges(loop: list[int]) -> list[tuple[int, int]]:
 
 
 def _smoothed(points: FloatArray, edges: IntArray, times: int) -> FloatArray:
-    """Points, of which those that just two edges (e, 2) meet at were moved along."""
+    """The points, with those of exactly two edges (e, 2) smoothed along the polygon, `times`
+    times."""
     both = np.concatenate([edges, edges[:, ::-1]])
     inner = np.bincount(both[:, 0], minlength=len(points)) == 2
     both = both[np.argsort(both[:, 0], kind="stable")]

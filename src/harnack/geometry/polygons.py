@@ -1,7 +1,7 @@
-"""Closed polygons: without the edges that are run there and back, and cut into triangles.
+"""Closed polygons: removal of edges that are run both ways, and cutting into triangles.
 
-Edges run there and back are taken out, by integer index, before a curve is uploaded: what cancels
-on paper leaves its rounding errors on a machine.
+Edges that are run both ways are removed by integer index, before a curve is uploaded: in floating
+point, two opposite contributions would leave their rounding errors.
 """
 
 from __future__ import annotations
@@ -23,22 +23,22 @@ __all__ = ["cancel_opposite_edges", "remaining_edges", "triangulate"]
 
 
 def cancel_opposite_edges(loops: Loops) -> Loops:
-    """Closed loops with the same solid angle modulo 4 pi, of which no edge runs another back.
+    """Remove pairs of opposite edges from closed loops; the solid angle stays the same modulo 4 pi.
 
-    Seen from outside of an edge, its part in the solid angle of one loop is minus that in another
-    which runs it the other way, so that the two drop out of the sum. Computed one by one they leave
-    their rounding errors, and distances and convexity count a curve that is not there.
+    Seen from a point, an edge contributes minus what the reversed edge contributes, so both drop
+    out of the sum. If they were kept, they would leave rounding errors, and would count in
+    distances and in tests of convexity as a curve that is not there.
 
-    Vertices at exactly the same position are one. Of edges that run both ways between two of them
-    the surplus is left, once for each time that it counts. Where nothing cancels, the loops are
-    returned as they are, and none where everything does. Edges are compared as wholes: of two that
-    overlap in part and run opposite ways, both stay.
+    Vertices at exactly the same position are the same. If edges run both ways between two vertices,
+    the surplus of one direction is left, as often as it counts. If no edges cancel, the loops are
+    returned as they are; if all cancel, no loop is returned. Edges are compared as wholes: of two
+    edges that overlap in part and run opposite ways, both stay.
 
-    Proof that the rest is closed: around a loop as many edges begin at a vertex as end there, and
-    so they do after one of each was taken away from both ends of an edge. The gradient of the solid
-    angle is the sum of the edges' fields, which cancel (Biot and Savart), and the integral along
-    closed paths is still a multiple of 4 pi, so that values change by a constant at most; far away
-    both vanish, modulo 4 pi.
+    Proof that the rest is closed: in loops as many edges begin at a vertex as end there, and this
+    stays true when an edge and its reverse are removed. The gradient of the solid angle is the sum
+    of the edges' fields, which cancel (Biot and Savart), and the integral along closed paths is
+    still a multiple of 4 pi, so that values change by a constant at most; far away both vanish,
+    modulo 4 pi.
     """
     points = np.concatenate(loops)
     begin, end = _welded(loops, points)
@@ -49,11 +49,11 @@ def cancel_opposite_edges(loops: Loops) -> Loops:
 
 
 def remaining_edges(loops: Loops) -> tuple[FloatArray, FloatArray]:
-    """Starts and ends (k, 3) of the edges of closed loops that are left (`cancel_opposite_edges`),
-    each once.
+    """Starts and ends (k, 3) of the edges of closed loops that remain after
+    `cancel_opposite_edges`, each edge once.
 
-    Around an edge that is run n times net, the solid angle changes by 4 pi n: unless n = 0 it
-    takes every value modulo 4 pi next to each of its points, so that every level set ends there.
+    Around an edge that is run n times net, the solid angle changes by 4 pi n: unless n = 0 it takes
+    every value modulo 4 pi next to each of its points, so that every level set ends there.
     """
     if not loops:
         return np.zeros((0, 3)), np.zeros((0, 3))
@@ -83,17 +83,20 @@ _CHUNK = 2_000_000
 
 
 def triangulate(vertices: FloatArray, corners: IntArray, sizes: IntArray) -> IntArray:
-    """Triangles (k, 3) of polygons, in their order.
+    """Triangulate polygons. Returns triangles (k, 3), in the order of the polygons.
 
-    vertices: (n, 3). corners: of all polygons, one after the other. sizes: (m,), how many corners
-    each has; those with fewer than three give no triangles. A polygon need not be quite flat: it is
-    judged by its projection along its mean normal. Where the fans around its first two corners are
-    not proper triangulations, because the polygon has dents, ears are cut off it (Meisters 1975).
-    The edges of the triangles always cancel to those of the polygon: polygons that cross themselves
-    get triangles that overlap, and in a winding number these still add up to the polygon.
+    vertices: (n, 3).
+    corners: the vertex indices of all polygons, one polygon after the other.
+    sizes: (m,) the number of corners of each; polygons with fewer than three give no triangles.
+
+    A polygon need not be exactly planar: it is judged by its projection along its mean normal. If
+    the fans around its first two corners are not valid triangulations, because the polygon is not
+    convex, ears are cut off it (Meisters 1975). The edges of the triangles always cancel to those
+    of the polygon: polygons that cross themselves get triangles that overlap, and in a winding
+    number these still add up to the polygon.
 
     Raises:
-        MeshError: so many polygons with dents and so many corners that it would take long.
+        MeshError: so many non-convex polygons with so many corners that it would take long.
     """
     if (sizes == 3).all():
         return corners.reshape(-1, 3)
@@ -145,9 +148,9 @@ def _fans(polygons: IntArray) -> IntArray:
 
 
 def _fan_is_invalid(vertices: FloatArray, polygons: IntArray) -> BoolArray:
-    """Whether some triangle of the fan around the first corner is turned over or flat: (m,).
+    """(m,) whether a triangle of the fan around the first corner is reversed or flat.
 
-    Polygons without any area count as without dents.
+    Polygons of zero area count as convex.
     """
     p = vertices[polygons]
     spokes = p[:, 1:] - p[:, :1]
@@ -173,7 +176,7 @@ def _projections(vertices: FloatArray, polygons: IntArray) -> FloatArray:
 
 
 def _clip_ears(polygon: IntArray, projection: FloatArray) -> IntArray:
-    """Triangles of a polygon (k,) whose projection (k, 2) has dents."""
+    """Triangles of a polygon (k,) whose projection (k, 2) is not convex."""
     import mapbox_earcut  # here, since most files do without
 
     ears = np.zeros((0, 3), dtype=np.int64)
@@ -189,9 +192,9 @@ def _clip_ears(polygon: IntArray, projection: FloatArray) -> IntArray:
 
 
 def _perturb_straight_corners(projection: FloatArray) -> FloatArray:
-    """The polygon (k, 2), its straight edges with corners in their middle bent by next to nothing.
+    """The polygon (k, 2), with corners in the middle of straight edges moved by a tiny amount.
 
-    Such a corner is then no ear, which would be a triangle without area.
+    Such a corner is then not an ear, which would be a triangle of zero area.
     """
     arriving, leaving = (
         projection - np.roll(projection, 1, axis=0),

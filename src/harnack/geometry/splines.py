@@ -39,23 +39,22 @@ def smooth_curve(
 
     points: (n, 3) in order, n >= 3, or a list of such arrays. A closed curve returns from the last
         point to the first, which need not be repeated.
-    samples_per_segment: vertices from each point to the next, the first of them the point itself,
-        bit by bit.
-    closed: False for a curve that ends at its first and last point. There the third derivative
-        is continuous at the second point and the last but one ("not a knot").
-    spacing: how the parameter grows from point to point: "centripetal" as the root of their
-        distance, by which curves hardly swing out or loop where points are spaced unevenly (Lee
-        1989); "chord" as the distance, which makes rounder curves of evenly spaced points.
+    samples_per_segment: the number of vertices from each point to the next; the first of them is
+        the point itself, bit for bit.
+    closed: False for a curve that ends at its first and last point. There the third derivative is
+        continuous at the second point and the last but one ("not a knot").
+    spacing: the growth of the parameter from point to point. "centripetal": the square root of
+        their distance; curves then hardly swing out or loop where points are spaced unevenly (Lee
+        1989). "chord": the distance, which makes rounder curves of evenly spaced points.
 
     Returns:
         (n k, 3) vertices, of an open curve ((n - 1) k + 1, 3), with k = samples_per_segment; a list
-        of such arrays for a list. A loop crosses itself where the points make it do so: nothing is
-        checked here.
+            of such arrays for a list. The result is not checked for self-intersections.
 
     Raises:
-        CurveError: fewer than 3 different points, two equal ones in a row, NaN, wrong shapes, or
+        CurveError: fewer than 3 different points, two equal points in a row, NaN, wrong shapes, or
             too many vertices.
-        TypeError: samples_per_segment is no whole number.
+        TypeError: samples_per_segment is not an integer.
         ValueError: samples_per_segment less than 1, or an unknown spacing.
     """
     samples_per_segment = _count(samples_per_segment)

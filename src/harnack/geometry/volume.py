@@ -1,9 +1,10 @@
-"""The interface of a clipping volume: a convex part of space that rays are cut to.
+"""The interface of a clip volume: a convex set to which rays are cut.
 
-Extents are proved too. The 2π level of a curve in convex position lies in its hull; for other
-curves an isoperimetric box is carved by cells proved empty. It is why rays that miss cost nothing
-and why a ray without an end is a proved miss. Of fields that are dear to evaluate
-(`Field.occupied_cells`) the march jumps across empty cells of a grid as well, where rays are many.
+Extents are clip volumes, too, and are proved to contain the level set. The 2π level of a curve in
+convex position lies in its hull; for other curves, empty cells are removed from an isoperimetric
+box. So rays that miss the extent cost nothing, and for a ray without an end a miss can be proved.
+If a field is expensive to evaluate (`Field.occupied_cells`) and there are many rays, the march also
+jumps across the empty cells of a grid.
 """
 
 from __future__ import annotations
@@ -29,13 +30,13 @@ Point: TypeAlias = tuple[float, float, float]
 class Volume(abc.ABC):
     """A closed convex set of R^3, not empty.
 
-    What is cut away is certain to be outside: in any precision, `clip` and `contains` lose no
-    point of the volume. They may admit points that lie outside by a few roundings of the
+    Only points that are certainly outside are cut away: in any precision, `clip` and `contains`
+    lose no point of the volume. They may admit points that lie outside by a few roundings of the
     coordinates involved (about 1e-6 of the distance to the ray's origin in single precision).
 
     Methods that take Dr.Jit arrays can be called while a loop is being recorded.
 
-    `a & b` is what two volumes have in common, which is convex as well.
+    `a & b` is the intersection of two volumes, which is convex as well.
     """
 
     def __new__(cls, *given: Any, **named: Any) -> Self:
@@ -52,10 +53,10 @@ class Volume(abc.ABC):
 
     @abc.abstractmethod
     def clip(self, o: Vec3, d: Vec3, t_min: Real, t_max: Real) -> tuple[Real, Real]:
-        """The part [t0, t1] of the rays o + t d, 0 <= t_min <= t <= t_max, inside the volume.
+        """The interval [t0, t1] of the rays o + t d, 0 <= t_min <= t <= t_max, inside the volume.
 
-        d need not have unit length, but neither be zero. Where a ray misses the volume
-        t0 = inf and t1 = -inf; everywhere else t0 < t1.
+        d need not have unit length, but must not be zero. Where a ray misses the volume t0 = inf
+        and t1 = -inf; everywhere else t0 < t1.
         """
 
     @abc.abstractmethod
@@ -68,7 +69,7 @@ class Volume(abc.ABC):
 
     @abc.abstractmethod
     def outward_normal(self, p: Vec3) -> Vec3:
-        """Unit outward normal of the boundary piece nearest to p, for p near the boundary."""
+        """Unit outward normal of the part of the boundary nearest to p, for p near the boundary."""
 
     @abc.abstractmethod
     def bounds(self) -> tuple[FloatArray, FloatArray]:
@@ -92,7 +93,7 @@ class Volume(abc.ABC):
 
 
 def _parts(volume: Volume) -> tuple[Volume, ...]:
-    """The volumes that an intersection is made of; of another volume, itself."""
+    """The operands of an intersection; a volume of another kind itself."""
     parts: tuple[Volume, ...] | None = getattr(volume, "volumes", None)
     return (volume,) if parts is None else parts
 
@@ -107,7 +108,7 @@ def clip_rounding(backend: Backend) -> float:
 
 
 def normalize_empty_interval(t0: Real, t1: Real) -> tuple[Real, Real]:
-    """The interval, or (inf, -inf) where it holds at most a point."""
+    """The interval [t0, t1], or (inf, -inf) where it is empty or a single point."""
     full = t0 < t1
     return dr.select(full, t0, dr.inf), dr.select(full, t1, -dr.inf)
 
@@ -132,7 +133,7 @@ def as_point(value: Iterable[float], name: str, *, finite: bool = True) -> Point
 
 
 def check_volume(given: object, name: str) -> None:
-    """Raise TypeError for what is neither a volume nor None."""
+    """Raise TypeError for a value that is neither a volume nor None."""
     if given is not None and not isinstance(given, Volume):
         raise TypeError(
             f"{name} must be a volume, such as harnack.Ball((0, 0, 0), 1), harnack.Box(lower, "

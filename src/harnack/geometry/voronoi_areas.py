@@ -1,4 +1,4 @@
-"""Areas of the cells of points in their tangent planes, each cut by what neighbors leave it."""
+"""Areas of the Voronoi cells of points in their tangent planes."""
 
 from __future__ import annotations
 
@@ -28,10 +28,12 @@ _PARALLEL = 1e-12
 
 @dataclass(frozen=True)
 class _BisectorLine:
-    """The line n . y = h that bounds a cell towards a neighbor, in units of the cell's radius.
+    """The bisector line n . y = h that bounds a cell towards a neighbor, in units of the cell's
+    radius.
 
-    x, y: n, of length 1; 0 if the line misses the unit disc. h: 1 if it does.
-    neighbor: from the point to the neighbor, projected to the tangent plane.
+    x, y: the components of n, of length 1; both are 0, and h is 1, if the line misses the unit
+        disc.
+    neighbor: the vector from the point to the neighbor, projected to the tangent plane.
     """
 
     x: Real
@@ -42,14 +44,15 @@ class _BisectorLine:
 
 @dataclass(frozen=True)
 class TangentVoronoi:
-    """Positions that may be neighbors, on a backend: each coordinate (n,)."""
+    """Computes Voronoi areas of points in their tangent planes. positions: of all possible
+    neighbors, on a backend; each coordinate (n,)."""
 
     backend: Backend
     positions: tuple[Real, ...]
 
     @classmethod
     def of(cls, positions: FloatArray) -> TangentVoronoi:
-        """positions: (n, 3)."""
+        """Upload the positions (n, 3) of all possible neighbors."""
         backend = choose_backend("double")
         columns = np.asarray(positions, np.float64).T
         return cls(backend, tuple(upload_floats(backend, one) for one in columns))
@@ -57,11 +60,15 @@ class TangentVoronoi:
     def areas(
         self, points: FloatArray, normals: FloatArray, nearest: npt.NDArray[Any], radii: FloatArray
     ) -> FloatArray:
-        """(m,): of { y : |y| <= R, y nearer to the point than to each neighbor } in the plane
-        through each of the points (m, 3) across its normal.
+        """(m,) the areas of the cells of points (m, 3). The cell of a point is { y : |y| <= R, y
+        nearer to the point than to each neighbor }, in the plane through the point normal to its
+        normal.
 
-        nearest: (m, k) the neighbors, as positions. radii: (m,). Where all neighbors lie on one
-        side of a line through the point, their mirror images count too.
+        nearest: (m, k) the indices of the neighbors among the positions.
+        radii: (m,) R of each point.
+
+        Where all neighbors lie on one side of a line through the point, their mirror images count
+        too.
         """
         areas, rim = self._cell_areas(points, normals, nearest, radii, mirrored=False)
         if rim.any():
@@ -146,7 +153,8 @@ def _crossing(backend: Backend, q: tuple[Real, Real], b: Real) -> _BisectorLine:
 def _clip_bisectors(
     backend: Backend, numbers: list[Any], own: list[_BisectorLine], line: Any, lines: Any
 ) -> list[tuple[Real, Real, Mask]]:
-    """Of some lines the intervals that all others leave, and whether a neighbor is to the left."""
+    """The intervals of some lines that all other lines leave, and whether a neighbor is to the
+    left."""
     start: list[Any] = []
     for one in own:
         half_chord = dr.sqrt(fmax(1 - dr.square(one.h), 0))

@@ -1,8 +1,9 @@
-"""Meshes whose corners are joined: those at one place, and those apart by rounding alone.
+"""Welding of meshes: vertices at the same position, up to rounding, are joined.
 
-Programs compute a corner once for each face around it, and get 0 in one and 2.7e-16 in another.
-Where edges are compared by index, as everywhere here, such faces are no neighbors. So corners at
-open edges are joined that rounding explains; all others stay as they are, and a closed mesh does.
+Programs compute a corner once for each face around it, and may get 0 for one face and 2.7e-16 for
+another. As edges are compared by index, such faces would not be neighbors. So corners at open edges
+are joined if rounding explains their distance; all others stay as they are, and so does a closed
+mesh.
 """
 
 from __future__ import annotations
@@ -25,8 +26,9 @@ _OF_EDGES = 1e-3
 
 
 def rounding_of(vertices: FloatArray) -> float:
-    """How far corners at one place may be apart by rounding: four units in the last place of the
-    largest coordinate, of single precision if it holds all of them."""
+    """The distance by which rounding may separate corners at the same position: four units in the
+    last place of the largest coordinate, of single precision if all coordinates are numbers of
+    single precision."""
     single = vertices.astype(np.float32)
     precision = np.float32 if (single == vertices).all() else np.float64
     return _UNITS * float(np.finfo(precision).eps) * float(np.abs(vertices).max(initial=0.0))
@@ -34,12 +36,13 @@ def rounding_of(vertices: FloatArray) -> float:
 
 @dataclass(frozen=True)
 class Welded:
-    """The faces of a mesh between corners that stand for all at their place.
+    """A mesh after welding.
 
-    index: (n,) the vertex that stands for each: the first at exactly its place, or the first of
-        those that are apart by rounding. net: the faces between these, duplicates added up
-        (`net_faces`). edges, weights: at which these do not cancel (`singular_edges`).
-    rounded: how many places were joined with others, apart by rounding.
+    index: (n,) the vertex that each vertex was joined to: the first at exactly its position, or the
+        first of those that rounding separates.
+    net: the faces between these vertices, duplicates added up (`net_faces`).
+    edges, weights: at which these faces do not cancel (`singular_edges`).
+    rounded: how many positions were joined with others from which rounding separates them.
     """
 
     index: IntArray
@@ -50,13 +53,14 @@ class Welded:
 
     @classmethod
     def of(cls, vertices: FloatArray, faces: IntArray) -> Welded:
-        """Of vertices (n, 3) and faces (m, 3).
+        """Weld vertices (n, 3) of faces (m, 3).
 
-        Corners are joined that are nearer than `rounding_of` and a thousandth of the edges there,
-        and at which edges do not cancel, if fewer of these are left. No face loses two of its
-        corners to one place, or its area: where one would, what it touches stays apart. So there
-        are as many faces as before, but for those that cancel, and a gap that is wider than that
-        stays: two such corners are as near as two results of one computation.
+        Corners are joined if they are nearer to each other than `rounding_of` and than a thousandth
+        of the edges there, if edges at them do not cancel, and if joining leaves fewer such edges.
+        No face loses its area, or two of its corners to the same position: where a face would, the
+        corners that it touches stay apart. So there are as many faces as before, but for those that
+        cancel; and a wider gap stays, as two corners are joined only if they are as near as two
+        results of one computation.
         """
         welded = cls._by(weld_vertices(vertices), vertices, faces, 0)
         if not len(welded.edges):

@@ -38,10 +38,14 @@ _MOST_ROOTS = 200_000
 
 @dataclass(frozen=True)
 class BccLattice:
-    """counts: (3,) cells along each side of a box from `lower`, each with edges `size` (3,).
+    """A body-centered lattice that fills a box.
 
-    Points have even coordinates (n, 3) in half cells if they are corners, and odd ones if centers;
-    centers of faces on the box have one even coordinate.
+    lower: (3,) the corner of the box.
+    size: (3,) the edges of each cell.
+    counts: (3,) the number of cells along each side of the box.
+
+    Points are given by integer coordinates (n, 3) in units of half a cell: even if they are corners
+    of cells, odd if they are centers; centers of faces on the box have one even coordinate.
     """
 
     lower: FloatArray
@@ -52,8 +56,8 @@ class BccLattice:
     def covering_box(
         cls, lower: FloatArray, upper: FloatArray, spacing: float, layers: int = 0
     ) -> BccLattice:
-        """Cells that fill a box, as nearly cubes of edge `cell_size` as possible, and `layers`
-        around it.
+        """A lattice whose cells fill a box and are as nearly cubes of edge `spacing` as possible,
+        with `layers` more cells around it.
 
         Raises:
             MeshingError: a box without volume.
@@ -71,7 +75,8 @@ class BccLattice:
         return self.lower + self.counts * self.size
 
     def points(self, coordinates: IntArray) -> FloatArray:
-        """(n, 3), given their coordinates; those on the box exactly there."""
+        """Points (n, 3) in space, from their lattice coordinates; those on the box lie exactly on
+        it."""
         x = self.lower + 0.5 * self.size * coordinates
         x = np.where(coordinates == 0, self.lower, x)
         return np.where(coordinates == 2 * self.counts, self.upper, x)
@@ -116,17 +121,19 @@ class BccLattice:
     def relevant_cells(
         self, clearance: Clearance, matter: IntArray, values: Clearance, most_faces: int
     ) -> tuple[IntArray, BoolArray]:
-        """(n, 3) indices of the cells that may hold the level set or are negative beside cells that
-        do not matter, and of all cells of the lattice which do (counts).
+        """Indices (n, 3) of the relevant cells to mesh, and a mask (counts) of all relevant cells.
 
-        matter: (k, 3) indices of the cells that may matter (`nonempty_cells`). values: of the
-            function. What does not matter counts as positive: all points of such cells do. As in
-            the module's proof, tetrahedra at the chosen cells then have all faces between points
-            of two signs: a cell that is not chosen has a center of the sign of its corners that
-            matter, and if one of them does not, all of them are positive.
+        Chosen are cells that may hold the level set, and cells with a nonpositive center next to an
+        irrelevant cell. Irrelevant cells count as positive, with all of their points. Then every
+        tetrahedron with corners of both signs belongs to a chosen cell: the center of a cell not
+        chosen has the sign of its relevant corners, and if one corner is irrelevant all are
+        positive.
+
+        matter: (k, 3) indices of the relevant cells (`nonempty_cells`).
+        values: of the function.
 
         Raises:
-            MeshingError: there are too many.
+            MeshingError: too many cells are chosen.
         """
         does = np.zeros(tuple(self.counts.tolist()), np.bool_)
         does[tuple(matter.T)] = True
@@ -140,7 +147,8 @@ class BccLattice:
         return matter[chosen], does
 
     def interior_cells(self, cells: BoolArray) -> BoolArray:
-        """Those of some cells (counts) of which all neighbors in the lattice belong to them."""
+        """Mask (counts) of the given cells of which all neighbors in the lattice are given cells,
+        too."""
         around = np.pad(cells, 1, constant_values=True)
         inner = cells.copy()
         for shift in itertools.product((0, 1, 2), repeat=3):
@@ -153,8 +161,8 @@ class BccLattice:
         return np.clip(index, 0, self.counts - 1)
 
     def touches_cells(self, coordinates: IntArray, cells: BoolArray) -> BoolArray:
-        """(n,) whether points, by coordinates, are corners or centers of some of the cells
-        (counts)."""
+        """(n,) whether points, given by lattice coordinates, are corners or centers of the given
+        cells (counts)."""
         padded = np.pad(cells, 1)
         found = np.zeros(len(coordinates), np.bool_)
         for ways in itertools.product((-1, 0), repeat=3):
@@ -209,7 +217,7 @@ class BccLattice:
 
 
 def distinct_rows(rows: IntArray) -> IntArray:
-    """The rows (n, 3) of numbers that are not negative, each once and in order."""
+    """The unique rows of nonnegative integers (n, 3), sorted."""
     shape = rows.max(axis=0, initial=0) + 1
     return _key_rows(sorted_unique(_keys(rows, shape)), shape)
 

@@ -1,4 +1,5 @@
-"""Closed parts of meshes: which there are, which lie in which, and the solid that they bound."""
+"""Closed components of meshes: finds them, which of them lie in which, and the solid that they
+bound."""
 
 from __future__ import annotations
 
@@ -36,12 +37,13 @@ _GROWN = 1e-9
 
 
 def closed_parts(x: FloatArray, raw: IntArray, joined: IntArray) -> list[IntArray]:
-    """Faces, by index, of the parts of a mesh that are closed: that run every edge as often one way
-    as the other.
+    """The closed components of a mesh, as indices of faces: those that run along every edge as
+    often in one direction as in the other.
 
-    raw: (m, 3) faces as they were given: parts that touch are told apart if they have corners of
-        their own. joined: (m, 3) of the corners that stand for all at their place. Here faces at an
-        edge of two belong together, and at edges of more those with the material between them.
+    raw: (m, 3) faces as in the input: components that touch are told apart if they have vertices of
+        their own.
+    joined: (m, 3) the same faces, with one vertex for all at the same position. In these, faces at
+        an edge of two belong together, and at an edge of more those with the material between them.
     """
     parts: list[IntArray] = []
     is_left = np.ones(len(raw), np.bool_)
@@ -78,7 +80,7 @@ def _is_closed(faces: IntArray) -> bool:
 
 
 def volume_of(x: FloatArray, faces: IntArray) -> float:
-    """What a closed mesh holds, negative if it is inside out."""
+    """The signed volume of a closed mesh, negative if it is inside out."""
     corner = x[faces] - x[faces].mean(axis=(0, 1))
     return (
         float(row_dots(corner[:, 0], area_normals(corner)).sum()) / 6
@@ -86,8 +88,8 @@ def volume_of(x: FloatArray, faces: IntArray) -> float:
 
 
 def nested(x: FloatArray, parts: list[IntArray]) -> list[list[int]]:
-    """For each of some closed parts, faces (k, 3), the numbers of those that it lies in as a whole,
-    the smallest first. Parts may touch: places of each are looked at a little within it."""
+    """For each closed component, faces (k, 3), the indices of the components that it lies in as a
+    whole, the smallest first. Components may touch: each is tested at points a little within it."""
     corners = [x[part] for part in parts]
     boxes = [(corner.min(axis=(0, 1)), corner.max(axis=(0, 1))) for corner in corners]
     volumes = [volume_of(x, part) for part in parts]
@@ -128,20 +130,22 @@ def mended_by_cuts(x: FloatArray, faces: IntArray, within: float) -> TriangleMes
 def united_parts(
     x: FloatArray, faces: IntArray, parts: list[IntArray], within: float
 ) -> TriangleMesh:
-    """The boundary of the points around which closed parts wind at least once, in all. They may
-    cross, touch and lie in each other, and wind clockwise.
+    """The boundary of the points around which closed components wind at least once, in all. They
+    may intersect, touch and contain each other, and wind clockwise.
 
-    Proof. Let L_k be the points around which the parts so far wind at least k times. With one more
-    these are, if it winds counter-clockwise around the points of P, those of L_k and those of both
-    L_(k-1) and P, and if it winds clockwise those of L_(k+1), and those of L_k outside of P. Those
-    that wind clockwise come last, so that all sets but L_0, which is all of space, have bounds.
+    Proof. Let L_k be the points around which the components so far wind at least k times. With
+    another component P, L_k becomes the union of L_k and of the intersection of L_(k-1) with P if P
+    winds counter-clockwise around its points; if P winds clockwise, it becomes the union of L_(k+1)
+    and of the points of L_k outside of P. The components that wind clockwise come last, so that all
+    sets but L_0, which is all of space, are bounded.
 
-    faces: (m, 3). parts: indices of those of each part. within: a length by which slivers that are
-        made where parts cross may be moved.
+    faces: (m, 3).
+    parts: indices of the faces of each component.
+    within: a length by which slivers at intersections may be moved.
 
     Raises:
-        MeshError: a part passes through itself.
-        MeshingError: a part is no manifold; or nothing is left.
+        MeshError: a component intersects itself.
+        MeshingError: a component is no manifold; or nothing is left.
     """
     shells = [TriangleMesh.without_unused_vertices(x, faces[rows]) for rows in parts]
     shells = _overlapping(shells)

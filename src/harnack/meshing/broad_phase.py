@@ -1,9 +1,10 @@
-"""Pairs of triangles that may meet: all others are proved apart, in floating point.
+"""Broad phase of the intersection test: the pairs of triangles that may meet. All others are proved
+apart, in floating point.
 
 Each triangle walks a tree of boxes, and the pairs whose boxes overlap are listed: about eight for
 each triangle. They are then tested side by side, since tests within the walk would wait for each
-other. Nearly all are apart by a sign that rounding cannot change; what is left is for exact
-arithmetic (`checks.intersecting_faces`).
+other. Nearly all are separated by a sign that rounding cannot change; the remaining pairs are for
+exact arithmetic (`checks.intersecting_faces`).
 """
 
 from __future__ import annotations

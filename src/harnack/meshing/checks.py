@@ -295,9 +295,8 @@ def _near_pairs(corner: FloatArray, among: BoolArray | None) -> IntArray:
 
 
 def _are_separated(vertices: FloatArray, faces: IntArray, pairs: IntArray) -> BoolArray:
-    """(k,) whether the plane of one of two faces has all corners of the other that they do not
-    share on one side: then they have nothing in common but these. False where rounding leaves it
-    open.
+    """(k,) whether two faces are proved to share nothing but common vertices: the plane of one has
+    all other vertices of the other strictly on one side. False where rounding leaves it undecided.
 
     See `broad_phase.ROUNDING` for the error of heights.
     """
@@ -395,10 +394,10 @@ def _is_between(triangle: FloatArray, p: FloatArray) -> BoolArray:
 
 
 class MeshingError(ValueError):
-    """A level set that could not be meshed; the message says why and what to do."""
+    """A level set could not be meshed; the message says why, and a remedy."""
 
     def may_be_fixed_by(self, smaller: float) -> bool:
-        """Whether cells may help that are `smaller` times as large as those that failed."""
+        """Whether cells `smaller` times as large as those that failed may help."""
         del smaller
         return True
 
@@ -408,7 +407,7 @@ class EmptySurfaceError(MeshingError):
 
 
 class LocalizedMeshingError(MeshingError):
-    """A check that failed in known places (k, 3), so that smaller cells there may be enough."""
+    """A check failed at known locations (k, 3), so that smaller cells there may be enough."""
 
     def __init__(self, message: str, places: FloatArray) -> None:
         super().__init__(message)
@@ -416,7 +415,7 @@ class LocalizedMeshingError(MeshingError):
 
 
 class OffLevelError(LocalizedMeshingError):
-    """Vertices and centers of faces that are too far from the level: the places."""
+    """Vertices and centers of faces are too far from the level; the locations are these points."""
 
 
 class SelfIntersectionError(LocalizedMeshingError):
@@ -428,7 +427,7 @@ class SelfIntersectionError(LocalizedMeshingError):
 
 
 class UnrefinableError(MeshingError):
-    """What smaller cells do not help against."""
+    """An error against which smaller cells do not help."""
 
     def may_be_fixed_by(self, smaller: float) -> bool:
         del smaller
@@ -436,7 +435,7 @@ class UnrefinableError(MeshingError):
 
 
 class TriangleLimitError(UnrefinableError):
-    """A mesh that would be so large that it was not begun."""
+    """The mesh would have more triangles than allowed, and was not begun."""
 
 
 # So many places may be wrong in smaller cells, or this part of those before.
@@ -446,10 +445,11 @@ _MAX_FAILURES_FOR_RETRY, _REQUIRED_FAILURE_REDUCTION = 20, 0.5
 def is_retry_promising(
     now: MeshingError, before: MeshingError | None, smallest: float = 1.0
 ) -> bool:
-    """Whether smaller cells may help, after one or two sizes of them failed: not if nearly as many
-    places are wrong, as along a pole or where sheets cross, where cells of no size do.
+    """Whether another attempt with smaller cells is promising, after one or two sizes of cells
+    failed. It is not if the number of failures hardly decreased since the previous attempt: along a
+    pole, or where jump surfaces cross, cells of every size fail.
 
-    smallest: how large cells may become, in those that failed now.
+    smallest: the smallest cell allowed, relative to those that failed now.
     """
     if not now.may_be_fixed_by(smallest):
         return False

@@ -1,7 +1,5 @@
-"""Parts of surfaces: the largest part, the largest body with its cavities, and what a volume holds.
-
-Open surfaces are cut by volumes: triangles end at planes and spheres (`clip_to_volume`).
-"""
+"""Selects components of meshes (the largest one, or the largest body with its cavities), and cuts
+open surfaces at planes and spheres (`clip_to_volume`)."""
 
 from __future__ import annotations
 
@@ -74,8 +72,8 @@ def largest_body(surface: TriangleMesh) -> TriangleMesh:
 
 
 def drop_degenerate_components(surface: TriangleMesh) -> TriangleMesh:
-    """A closed surface without the connected parts that are nothing but rounding: what is left of
-    two parts that cancel each other, such as a solid less itself."""
+    """Remove the connected components of a closed surface that are only rounding error, such as the
+    remainder of a solid minus itself."""
     x, faces = surface.vertices, surface.faces
     if not len(faces):
         return surface
@@ -98,8 +96,8 @@ def drop_degenerate_components(surface: TriangleMesh) -> TriangleMesh:
 
 
 def component_facts(surface: TriangleMesh) -> list[dict[str, Any]]:
-    """Of each connected part of a closed surface, largest first, faces: their number; volume: what
-    it holds, negative for a cavity; center: of the box around it."""
+    """A dictionary for each connected component of a closed surface, largest first: faces, the
+    number of its faces; volume, which is negative for a cavity; center, of its bounding box."""
     shells, found = Shells.of(surface), list[dict[str, Any]]()
     counts = np.bincount(shells.component_of_face)
     for k in np.argsort(-np.abs(shells.volumes), kind="stable"):
@@ -119,11 +117,12 @@ def faces_to_flip(surface: TriangleMesh) -> npt.NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class Shells:
-    """The connected parts of a closed surface.
+    """The connected components of a closed surface.
 
-    component_of_face: (m,) of the part that each face belongs to. volumes: (k,) what parts hold,
-        negative of those turned inwards. lower, upper: (k, 3) their boxes. corners: (m, 3, 3) of
-            the faces.
+    component_of_face: (m,) the component that each face belongs to.
+    volumes: (k,) signed volumes of components, negative for those turned inwards.
+    lower, upper: (k, 3) their bounding boxes.
+    corners: (m, 3, 3) of the faces.
     """
 
     component_of_face: IntArray
@@ -146,7 +145,7 @@ class Shells:
         return cls(number, volumes, lower, upper, corners)
 
     def winding_number(self, around: Any, part: Any) -> float:
-        """How often a part winds around another one, at a point of it."""
+        """The winding number of the component `around` at a point of the component `part`."""
         point = self.corners[np.argmax(self.component_of_face == part)].mean(axis=0)
         return winding_around(self.corners[self.component_of_face == around], point)
 

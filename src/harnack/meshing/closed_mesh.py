@@ -1,4 +1,5 @@
-"""Closed meshes: manifold3d's solids, clip volumes as such, and files that are closed as well."""
+"""Closed meshes: conversion to and from manifold3d's solids, clip volumes as such solids, and
+export to files that are closed as well."""
 
 from __future__ import annotations
 
@@ -112,8 +113,8 @@ def _grown(part: Manifold, length: float) -> Manifold:
 
 
 def grown(surface: TriangleMesh, length: float) -> TriangleMesh:
-    """A closed surface whose vertices are moved outwards so that faces are, by about a length.
-    Parts that touch, up to rounding, overlap then."""
+    """A closed surface offset outwards: vertices are moved so that faces move by about a length.
+    Components that touch, up to rounding, then overlap."""
     x, faces = surface.vertices, surface.faces
     mesh = trimesh.Trimesh(x, faces, process=False)
     way = np.array(mesh.vertex_normals)
@@ -277,13 +278,14 @@ _REPAIR_STEPS = 32
 
 
 class ClosedMesh(trimesh.Trimesh):
-    """A mesh of which `export` writes a closed file, or raises a MeshingError.
+    """A trimesh.Trimesh whose `export` writes a closed file if the mesh is closed, or raises a
+    MeshingError.
 
-    Files hold single precision, in which the ends of short edges are one point and slivers turn
-    over. Vertices are rounded to a grid that single precision holds, edges without a length are
-    contracted, and it is checked that what is left is closed and does not pass through itself. The
-    mesh itself stays as it is, in double precision; and what is not closed is written as trimesh
-    does. It is shown as the trimesh.Trimesh that it is, since it may be open.
+    Files hold single precision, in which the ends of short edges coincide and slivers flip.
+    Vertices are rounded to a grid that single precision holds, edges without a length are
+    contracted, and it is checked that the result is closed and does not intersect itself. The mesh
+    itself stays as it is, in double precision; meshes that are not closed are written by trimesh as
+    they are. It is displayed as the trimesh.Trimesh that it is, since it may be open.
     """
 
     def __repr__(self) -> str:
@@ -302,11 +304,12 @@ class ClosedMesh(trimesh.Trimesh):
         return made
 
     def export(self, file_obj: Any = None, file_type: str | None = None, **options: Any) -> Any:
-        """As of a trimesh.Trimesh. Metadata stays behind: its arrays fit in no file.
+        """Write the mesh as trimesh.Trimesh.export does. Metadata is not written: its arrays fit in
+        no file.
 
         Raises:
-            MeshingError: the mesh is closed, and would not be in the file: parts that touch, or
-                that are too small or too far from the origin for single precision.
+            MeshingError: the mesh is closed, and would not be in the file: components that touch,
+                or that are too small or too far from the origin for single precision.
         """
         written = trimesh.Trimesh.copy(self)
         written.metadata.clear()

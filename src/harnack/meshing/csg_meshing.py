@@ -1,15 +1,17 @@
-"""Closed meshes of solids, cut by volumes: the meshes of smooth level sets, put together.
+"""Meshes solids: closed meshes of smooth level sets, cut by volumes and combined by Boolean
+operations.
 
-A solid is where a function is at most a level. A wall |g| <= w is not meshed as {|g| - w = 0}, of
-which marching cubes makes hundreds of pieces where cells are thicker than the wall. It is {g <= w}
-less {g <= -w}, two smooth surfaces which do not meet, in a box a little larger than the clip; and
-it is cut by the clip itself. Unions, intersections and complements likewise are those of the parts'
-meshes, so that the creases where parts meet are edges of the mesh. Creases of a single function,
-such as a cylinder's, are chamfered within the tolerance.
+A solid is the set of points where a function is at most a level. A wall |g| <= w is not meshed as
+{|g| - w = 0}, of which marching cubes makes hundreds of pieces where cells are thicker than the
+wall. It is {g <= w} minus {g <= -w}, two smooth surfaces which do not meet, in a box a little
+larger than the clip; and it is cut by the clip itself. Unions, intersections and complements
+likewise are those of the operands' meshes, so that the creases where operands meet are edges of the
+mesh. Creases of a single function, such as a cylinder's, are chamfered within the tolerance.
 
 Offsets of meshes are left as cells cut them: they have creases everywhere, beside which moved and
-refined triangles passed through each other. Small cells, and manifold3d joins what is flat. The few
-triangles of the whole that are too far off then are cut where they are (`outlier_projection`).
+refined triangles intersected each other. They get small cells, and manifold3d merges coplanar
+triangles. The few triangles of the whole mesh that are then too far off the level are cut there
+(`outlier_projection`).
 """
 
 from __future__ import annotations
@@ -105,34 +107,37 @@ AngleMesher = Callable[[SolidAngle, float], TriangleMesh]
 
 
 IntersectedOperands: TypeAlias = tuple[tuple[Solid, float], ...]
-"""Solids and their levels: what is meshed is intersected with all of them, so that it need not be
-made where one of them is proved to have nothing.
+"""Solids, with levels, that the meshed solid will be intersected with; where one is proved empty,
+nothing need be meshed.
 
-Proof that parts of a tree of unions, intersections and complements may be left out there. Inside
-of a complement, only parts that are not one are taken, of the intersection that the complement is
-itself a part of; elsewhere those of all intersections above. First let nothing be left out within
-complements. Then all that is made of a tree is a part of the truth, since unions and intersections
-grow with their parts. If something is left out at a point, some part of an intersection above has
-nothing there in truth, so neither has what is made of it, nor the intersection: which is the truth.
-Now let something be left out within complements. At such a point a part of the intersection that
-the complement is in, without complements within, has nothing there, and as before what is made of
-it is a part of the truth: again the intersection is the truth."""
+Proof for a tree of unions, intersections and complements. Inside a complement, only operands
+without complements are passed on, from the intersection that has the complement as an operand;
+elsewhere, the operands of all enclosing intersections. (1) Omit nothing inside complements. Unions
+and intersections are monotone, so every meshed node is a subset of its true solid. At a point where
+something is omitted, an operand of an enclosing intersection is truly empty, so is its mesh, so is
+the intersection: correct. (2) Omit inside complements too. At such a point, a complement-free
+operand of the intersection that contains the complement is truly empty, and by (1) its mesh is;
+again the intersection is correctly empty.
+"""
 
 
 @dataclass
 class CsgMesher:
     """Meshes solids in a box from `lower` to `upper`, (3,) each.
 
-    tolerance: a length, of the middles of edges and faces. spacing: of cells, at most.
-    per_wave: cells along a wave (`Field.min_wavelength`) at the least; None for as many as there
-        are.
-    mesh_angle: meshes level sets of angles, which end at a curve. most_faces: of each level set.
-    evaluations, levels, smallest_cell: of fields, in points, how many level sets were meshed so
-        far, and the smallest spacing of these.
+    tolerance: a length, at the midpoints of edges and the centers of faces.
+    spacing: of cells, at most.
+    per_wave: cells along a wave (`Field.min_wavelength`) at the least; None for no such limit.
+    mesh_angle: meshes level sets of angles, which end at a curve.
+    most_faces: of each level set.
+    evaluations: of fields so far, in points.
+    levels: number of level sets meshed so far.
+    smallest_cell: the smallest spacing of these.
     uploads: of the fields that were meshed so far.
-    intersected_with: parts that everything meshed next is intersected with (see
+    intersected_with: solids that everything meshed next is intersected with (see
         `IntersectedOperands`).
-    irrelevant_region_cache: where others left nothing, when that was asked for last.
+    irrelevant_region_cache: the operands and the region of the last call that asked where other
+        operands leave nothing.
     """
 
     lower: FloatArray
@@ -514,8 +519,13 @@ _MARGIN = 0.01
 
 @dataclass(frozen=True)
 class SolidMeshResult:
-    """A closed surface; the spacing of cells, evaluations of fields in points, and how many level
-    sets it was made of. size: of its box, to which tolerances relate."""
+    """The closed mesh of a solid.
+
+    spacing: of cells.
+    evaluations: of fields, in points.
+    levels: number of level sets it was made of.
+    size: of its box, to which tolerances relate.
+    """
 
     surface: TriangleMesh
     spacing: float

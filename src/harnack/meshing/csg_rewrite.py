@@ -1,9 +1,8 @@
-"""Unions whose parts have parts in common: these are taken out, so that none is made twice.
+"""Factors common operands out of unions of solids.
 
-A hollow part with a lattice inside is (P less Q) | (P & W): the surface of P would be that of both
-operands. Cut by the lattice its triangles have corners that are rounded, so they would lie in the
-other operand's triangles but for rounding, and pass through them. As P less (Q less W) it is the
-same solid, P is there once, and what is put together has no surfaces in common.
+In (P - Q) | (P & W), a hollow part with a lattice inside, the surface of P occurs twice, once with
+rounded vertices where W cuts it, and the two copies would intersect. The equivalent P - (Q - W)
+contains P once, and its operands share no surface.
 """
 
 from __future__ import annotations
@@ -24,8 +23,8 @@ SolidAtLevel: TypeAlias = tuple[Solid, float]
 
 
 def factor_common_operands(union: BooleanSolid, level: float) -> Solid | None:
-    """The points where a union is at most `level`, as those where another solid is at most 0:
-    (A & B) | (A & C) as A & (B | C); None if no two parts have anything in common."""
+    """Rewrite the solid {union <= level} as {another solid <= 0} with common operands factored out:
+    (A & B) | (A & C) as A & (B | C). None if no two operands have anything in common."""
     terms = [{_key(*one): one for one in _factors(part, level)} for part in union.parts]
     most, times = Counter(key for term in terms for key in term).most_common(1)[0]
     if times < 2:
@@ -42,8 +41,8 @@ def factor_common_operands(union: BooleanSolid, level: float) -> Solid | None:
 
 
 def flatten_csg(solid: BooleanSolid) -> BooleanSolid:
-    """With the parts of unions in a union, or of intersections in an intersection, as its own: all
-    that is cut away from a part is cut away at once."""
+    """Flatten nested operations of the same kind, unions in a union or intersections in an
+    intersection: everything that is cut away from an operand is then cut away at once."""
     parts: list[Solid] = []
     for one in solid.parts:
         if isinstance(one, BooleanSolid) and one.is_union == solid.is_union:
@@ -54,8 +53,9 @@ def flatten_csg(solid: BooleanSolid) -> BooleanSolid:
 
 
 def drop_cancelled_operands(solid: BooleanSolid, level: float) -> BooleanSolid | None:
-    """(A | C) less C as A less C, of an intersection's own parts: C has nothing but its boundary in
-    common with its complement. None if nothing is left; a union as it is."""
+    """Rewrite (A | C) - C as A - C among the operands of an intersection: C has nothing but its
+    boundary in common with its complement. Returns None if nothing is left; a union is returned as
+    it is."""
     if solid.is_union:
         return solid
     cut = {_key(one.field, -level) for one in solid.parts if isinstance(one, Complement)}

@@ -59,18 +59,18 @@ def restore_curve_edges(
     cut: int,
     height: float,
 ) -> tuple[FloatArray, IntArray]:
-    """Vertices and faces whose boundary runs through the first `kept` vertices alone: edges of a
-    curve in one piece again, where they were cut for the tetrahedra.
+    """Restore edges of the boundary curve that were subdivided for the tetrahedra, so that only the
+    first `kept` vertices, those of the curve, are on the boundary. Returns vertices and faces.
 
-    A long edge of a curve is cut by points on it, so that cells near it need not be as large as it
-    is. In the triangles these points are moved off the edge, into the surface, by no more than the
-    tolerance, and the gap to the edge is filled: the mesh then ends at the curve as it was given.
-    The triangles in the gap are thin. That cannot be helped: the surface winds about the edge, and
-    a triangle on all of it is within the tolerance only if it is about as low as that.
+    Long edges of a curve are subdivided so that cells near them need not be as large. The extra
+    points are moved off the edge into the surface, by at most the tolerance, and the gap is filled:
+    the mesh then ends at the given curve. The filling triangles are thin, unavoidably: the surface
+    twists about the edge, and a triangle along all of it is within the tolerance only if it is
+    about that low.
 
-    kept, cut: vertices before `kept` are those of the curve, those from there to `cut` lie on its
-        edges.
-    height: how far these are moved, at most.
+    kept, cut: vertices before `kept` are those of the curve, those from there to `cut` are the
+        extra points on its edges.
+    height: how far the extra points are moved, at most.
     """
     if cut == kept:
         return vertices, faces
@@ -165,10 +165,15 @@ _SMALLER = 0.6
 
 @dataclass(frozen=True)
 class SpanningMesh:
-    """Triangles, and how they were found.
+    """A mesh that ends at a boundary curve, and facts about how it was computed.
 
-    vertices: (n, 3). faces: (m, 3). curve: what they end on, cut as it was. spacing: of cells.
-    finer: where cells were smaller. crossings: of the edges of tetrahedra. isotopy: what is proved.
+    vertices: (n, 3).
+    faces: (m, 3).
+    curve: the boundary curve, with its edges as subdivided.
+    spacing: of cells.
+    finer: where cells were smaller.
+    crossings: of the edges of tetrahedra.
+    isotopy: on how many tetrahedra the topology is proved.
     turned: how many faces are turned over.
     """
 

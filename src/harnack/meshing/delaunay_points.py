@@ -1,8 +1,10 @@
-"""Points for the tetrahedra: those of an octree around the level set, and the curve it ends on.
+"""Chooses the points of a Delaunay triangulation around a level set: those of an octree around it,
+and the boundary curve it ends on.
 
-Vertices of the curve are points as they are. Others keep so far from it that no point lies in the
-ball on an edge as diameter, so that every edge of the curve is one of Delaunay's tetrahedra
-(Gabriel's condition). Points near the level set are moved onto it: most slivers go.
+Vertices of the curve are points as they are. Other points keep so far from it that no point lies in
+the ball with an edge of the curve as diameter, so that every edge of the curve is an edge of the
+Delaunay triangulation (Gabriel's condition). Points near the level set are moved onto it: most
+slivers go.
 """
 
 from __future__ import annotations
@@ -41,13 +43,17 @@ _CORNERS = np.array(list(itertools.product((0.0, 1.0), repeat=3)))
 
 @dataclass(frozen=True)
 class RefinementBalls:
-    """Balls about points (n, 3) in which cells are split once more. radius: of all."""
+    """Balls in which cells are subdivided once more.
+
+    points: (n, 3) their centers.
+    radius: of all of them.
+    """
 
     points: FloatArray
     radius: float
 
     def meet(self, centers: FloatArray, radii: FloatArray | float) -> BoolArray:
-        """(k,) whether balls about points (k, 3) meet one of these."""
+        """(k,) whether balls about points (k, 3) meet any of these balls."""
         if not len(centers):
             return np.zeros(0, np.bool_)
         import scipy.spatial  # here: half a second that few need
@@ -69,8 +75,8 @@ class BoundaryCurve:
 
     @classmethod
     def of(cls, loops: tuple[FloatArray, ...], longest: float) -> BoundaryCurve:
-        """Closed loops, their vertices first and in their order; edges longer than `longest` are
-        cut into equal parts."""
+        """A curve of closed loops, their vertices first and in their order; edges longer than
+        `longest` are divided into equal parts."""
         points = [*loops]
         more: list[FloatArray] = []
         edges: list[tuple[int, int]] = []
@@ -88,7 +94,8 @@ class BoundaryCurve:
         return cls(np.concatenate([*points, *more, np.zeros((0, 3))]), pairs)
 
     def split(self, which: BoolArray) -> BoundaryCurve:
-        """With the middles of some edges (k,) as additional points."""
+        """The curve with the midpoints of the edges that the mask `which` (k,) selects as
+        additional points."""
         a, b = self.edges[which].T
         middle = len(self.points) + np.arange(len(a))
         points = np.concatenate([self.points, 0.5 * (self.points[a] + self.points[b])])
@@ -96,7 +103,8 @@ class BoundaryCurve:
         return BoundaryCurve(points, np.concatenate([self.edges[~which], halves]))
 
     def split_near(self, places: RefinementBalls, longest: float) -> BoundaryCurve:
-        """With edges in some places cut until they are no longer than `longest`."""
+        """The curve with edges that meet the balls `places` divided until they are no longer than
+        `longest`."""
         curve = self
         while True:
             ends = curve.points[curve.edges]
@@ -109,8 +117,12 @@ class BoundaryCurve:
 
 @dataclass(frozen=True)
 class TetrahedronPoints:
-    """points: (n, 3), those of the boundary first. is_on: (n,) on the level, the boundary too.
-    samples: at all points; those of the boundary are 0."""
+    """The points of a triangulation, with the function's samples.
+
+    points: (n, 3), those of the boundary curve first.
+    is_on_level: (n,) whether they are on the level; those of the curve are.
+    samples: at all points; those of the curve are 0.
+    """
 
     points: FloatArray
     is_on_level: BoolArray
@@ -120,9 +132,10 @@ class TetrahedronPoints:
 def box_cells(
     lower: FloatArray, upper: FloatArray, spacing: float, exact: bool
 ) -> tuple[BoxCells, int]:
-    """Cells that fill a box, and how often they are to be split to be no larger than `cell_size`.
+    """Cells that fill a box, and how many times they are to be subdivided to be no larger than
+    `spacing`.
 
-    exact: the box itself is filled; else one that may be larger, by cubes.
+    exact: whether the box itself is filled; else cubes fill a box that may be larger.
     """
     size = upper - lower
     finest = max(1, math.ceil(math.log2(float(size.max()) / spacing)))

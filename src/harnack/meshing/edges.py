@@ -1,7 +1,7 @@
-"""Edges of triangles and tetrahedra, each once, by integer keys; products and lengths of rows,
-and normals of triangles.
+"""Unique edges of triangles and tetrahedra, by integer keys; row-wise products and norms; normals
+and distances of triangles.
 
-`row_dots` and `row_norms` are here as numpy's own sums along an axis of three are slow.
+`row_dots` and `row_norms` are here because numpy's own sums along an axis of length three are slow.
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ __all__ = [
 
 
 def row_dots(a: FloatArray, b: FloatArray) -> FloatArray:
-    """(n,) of rows (n, 3), in a third of the time of (a * b).sum(axis=1)."""
+    """(n,) dot products of the rows (n, 3) of a and b, in a third of the time of (a *
+    b).sum(axis=1)."""
     return np.einsum("ij,ij->i", a, b)
 
 
@@ -41,7 +42,7 @@ def area_normals(corners: FloatArray) -> FloatArray:
 
 
 def row_norms(vectors: FloatArray) -> FloatArray:
-    """(n,) of rows (n, 3), in a third of the time of np.linalg.norm(vectors, axis=1)."""
+    """(n,) lengths of rows (n, 3), in a third of the time of np.linalg.norm(vectors, axis=1)."""
     return np.sqrt(row_dots(vectors, vectors))
 
 
@@ -54,8 +55,9 @@ def distance_from_triangles(point: FloatArray, corner: FloatArray) -> float:
 
 
 def distances_from_triangles(points: FloatArray, corner: FloatArray) -> FloatArray:
-    """(k,) the distances (at most) of points (k, 3), or of one (3,), each from its triangle (k, 3,
-    3): from the plane where its foot is within the triangle, and from edges."""
+    """(k,) the distance (at most) of each of k points (k, 3), or of a single point (3,), from the
+    triangle of the same index (k, 3, 3): from its plane where the projection of the point is within
+    the triangle, and from its edges."""
     least = np.full(len(corner), np.inf)
     for k in range(3):
         start, way = corner[:, k], corner[:, k - 1] - corner[:, k]
@@ -76,8 +78,13 @@ def distances_from_triangles(points: FloatArray, corner: FloatArray) -> FloatArr
 
 @dataclass(frozen=True)
 class Edges:
-    """ends: (k, 2) of all edges, the lower index first, in order. index: (n,) which edge each of
-    the pairs given is. uses: (k,) how many of them each is. order: (n,) the pairs, edge by edge."""
+    """The unique edges among n pairs of points.
+
+    vertices: (k, 2) the endpoints of the k edges, the lower index first, in sorted order.
+    edge_of_pair: (n,) the edge that each pair is.
+    multiplicity: (k,) the number of pairs that are the edge.
+    pairs_by_edge: (n,) indices of the pairs, edge by edge.
+    """
 
     vertices: IntArray
     edge_of_pair: IntArray
@@ -86,47 +93,46 @@ class Edges:
 
     @classmethod
     def of(cls, pairs: IntArray) -> Edges:
-        """The edges that pairs (n, 2) of points are, in either order."""
+        """The unique edges among pairs (n, 2) of points, of either direction."""
         count = int(pairs.max(initial=-1)) + 1
         keys, index, uses, order = unique_with_inverse(edge_keys(pairs, count))
         return cls(np.stack(np.divmod(keys, max(count, 1)), axis=1), index, uses, order)
 
     def paired_half_edges(self) -> IntArray:
-        """(j, 2) the two of the pairs given that each edge is that is exactly two of them."""
+        """(j, 2) for each edge that occurs exactly twice, the indices of its two occurrences."""
         return self.pairs_by_edge[np.repeat(self.multiplicity == 2, self.multiplicity)].reshape(
             -1, 2
         )
 
 
 def edge_keys(pairs: IntArray, count: int) -> IntArray:
-    """One number for each pair (k, 2) of `count` points, the same in either order."""
+    """(k,) a key for each pair (k, 2) of `count` points, the same in either order."""
     one, other = pairs.T
     return np.minimum(one, other) * count + np.maximum(one, other)
 
 
 def half_edges(faces: IntArray) -> IntArray:
-    """(3m, 2): the edges of faces (m, 3), in their direction: all first ones (corners 0 and 1),
-    then all second and all third ones."""
+    """(3m, 2) the directed edges of faces (m, 3): first all edges from corner 0 to corner 1, then
+    those from 1 to 2, then those from 2 to 0."""
     return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
 
 
 def boundary_edges(faces: IntArray) -> IntArray:
-    """(k, 2): edges of one face only, in its direction."""
+    """(k, 2) boundary edges, which have a single face, in the direction of that face."""
     pairs = half_edges(faces)
     edges = Edges.of(pairs)
     return pairs[edges.multiplicity[edges.edge_of_pair] == 1]
 
 
 def sorted_unique(keys: IntArray) -> IntArray:
-    """The numbers (n,), each once and in order: several times as fast as `np.unique`."""
+    """The sorted unique values of integers (n,): several times as fast as `np.unique`."""
     keys = np.sort(keys)
     return keys[np.flatnonzero(np.diff(keys, prepend=keys[:1] - 1))]
 
 
 def unique_with_inverse(keys: IntArray) -> tuple[IntArray, IntArray, IntArray, IntArray]:
-    """Numbers (n,) that are not negative, each once and in order (k,), for each given one its place
-    among them (n,), how often each was given (k,), and the order of those given (n,): `np.unique`,
-    at a third of its time."""
+    """Sorted unique values (k,) of nonnegative integers (n,), the inverse (n,), the counts (k,) and
+    the sorting permutation (n,): `np.unique`, in a third of the time."""
     bits = len(keys).bit_length()
     if int(keys.max(initial=0)) >> (62 - bits):
         order = np.argsort(keys, kind="stable")

@@ -1,4 +1,4 @@
-"""The last steps of a mesh: thickening, simplification, and the facts in its metadata."""
+"""Finishes meshes: thickening, simplification, and facts in their metadata."""
 
 from __future__ import annotations
 
@@ -89,8 +89,8 @@ def _offset(surface: TriangleMesh, normals: FloatArray, thickness: float) -> Tri
 
 
 def _normal_cosines(surface: TriangleMesh, normals: FloatArray) -> FloatArray:
-    """(n,) cosines between normals at vertices and those of the faces there, means by area:
-    vertices are moved farther by that, so that faces are moved by the thickness."""
+    """(n,) area-weighted mean cosine between a vertex normal and the adjacent face normals, clipped
+    to [0.7, 1]. A vertex offset of thickness / cosine moves the faces by the thickness."""
     cross = area_normals(surface.vertices[surface.faces])
     total, area = np.zeros(len(normals)), np.zeros(len(normals))
     size = np.linalg.norm(cross, axis=1)
@@ -225,11 +225,11 @@ def simplify_mesh(
 
 
 def to_trimesh(surface: TriangleMesh, facts: dict[str, Any], is_closed: bool) -> trimesh.Trimesh:
-    """The mesh, which is a manifold (`check_manifold`), with the facts about it in its metadata. A
-    mesh without a boundary is turned so that its volume is positive.
+    """Convert a manifold surface (`check_manifold`) to a trimesh.Trimesh with facts about it in its
+    metadata. A mesh without a boundary is oriented so that its volume is positive.
 
     Raises:
-        MeshingError: it ought to be closed and to have a positive volume, and is not.
+        MeshingError: `is_closed`, but the mesh is not closed or has no positive volume.
     """
     from harnack.meshing.closed_mesh import ClosedMesh
 
@@ -258,14 +258,14 @@ def to_trimesh(surface: TriangleMesh, facts: dict[str, Any], is_closed: bool) ->
 
 
 def _creases(surface: TriangleMesh, edges: Edges) -> int:
-    """How many edges two faces meet at whose normals are more than 30 degrees apart."""
+    """The number of edges whose two faces have normals more than 30 degrees apart."""
     normals = _unit_normals(surface.vertices, surface.faces)
     pairs = edges.paired_half_edges() % len(surface.faces)
     return int((row_dots(normals[pairs[:, 0]], normals[pairs[:, 1]]) < _CREASE).sum())
 
 
 def _unit_normals(vertices: FloatArray, faces: IntArray) -> FloatArray:
-    """(m, 3) of faces; 0 for those without an area."""
+    """(m, 3) unit normals of faces; 0 for faces without an area."""
     corner = vertices[faces]
     cross = area_normals(corner)
     return cross / np.maximum(row_norms(cross), 1e-300)[:, None]

@@ -1,8 +1,10 @@
-"""Patches over the holes of a mesh, on which its winding number is 1/2: spanning all holes at once.
+"""Harmonic hole fillings: surfaces on which the winding number of a mesh is 1/2, which fill all
+holes at once.
 
 The 1/2 level of the winding number w modulo 1 is the 2 pi level of the solid angle of the boundary
 edges (`geometry.chains`), a smooth surface that ends at them. It is meshed with these very edges in
-it, and joined to the mesh by index. It joins the rims of a gap, where `hole_filling` closes each.
+it, and joined to the mesh by index. It joins the boundary loops of a gap, where `hole_filling`
+closes each loop by itself.
 """
 
 from __future__ import annotations
@@ -65,11 +67,13 @@ _NEAR = 1e-6
 
 @dataclass(frozen=True)
 class HoleFillingOptions:
-    """How patches are made.
+    """Options of harmonic hole fillings.
 
-    tolerance: how far they may be from the surface, as a part of the size of the box around all
-        holes. spacing: of cells at first, or None. seed: of random moves. attempts: how many sizes
-        of cells are tried.
+    tolerance: how far they may be from the surface, relative to the size of the box around all
+        holes.
+    spacing: of cells at first, or None.
+    seed: of random moves.
+    attempts: how many sizes of cells are tried.
     """
 
     tolerance: float
@@ -81,12 +85,12 @@ class HoleFillingOptions:
 
 @dataclass(frozen=True)
 class HarmonicFilling:
-    """What is added.
+    """The vertices and faces that harmonic filling adds to a mesh.
 
     vertices: (k, 3).
-    faces: (p, 3); indices below the number of given vertices are of these.
-    is_refined: whether they were refined to the tolerance.
-    triangle_fill_count: how many of the faces are triangles that holes of three edges lacked.
+    faces: (p, 3); indices below the number of the mesh's vertices are of these.
+    is_refined: whether the faces were refined to the tolerance.
+    triangle_fill_count: how many of the faces are single triangles that fill holes of three edges.
     """
 
     vertices: FloatArray
@@ -100,11 +104,12 @@ class HarmonicFilling:
 def harmonic_patches(
     vertices: FloatArray, faces: IntArray, edges: IntArray, asked: HoleFillingOptions
 ) -> HarmonicFilling:
-    """Patches that end at the open edges (k, 2) of a mesh, as its faces run them; or, where these
-    cannot be made, triangles in holes of three edges, and patches over the rest.
+    """Fill the holes of a mesh by harmonic fillings that end at its boundary edges (k, 2), in the
+    direction of its faces; or, where that fails, by triangles in holes of three edges, and harmonic
+    fillings of the other holes.
 
     Raises:
-        MeshingError: they could not be made, or meet the mesh or each other.
+        MeshingError: they could not be computed, or intersect the mesh or each other.
     """
     try:
         return _fill_all_holes(vertices, faces, edges, asked)
@@ -206,9 +211,9 @@ def checked_boundary_edges(faces: IntArray) -> IntArray:
 
 
 def triangle_fills(vertices: FloatArray, faces: IntArray, edges: IntArray) -> IntArray:
-    """The triangles (k, 3) that holes of three edges lack, where these pass through no others.
+    """The triangles (k, 3) that fill holes of three edges, where they intersect no others.
 
-    edges: (n, 2) open ones, as the faces run them.
+    edges: (n, 2) boundary edges, in the direction of the faces.
     """
     leads: dict[int, set[int]] = defaultdict(set)
     for a, b in edges.tolist():

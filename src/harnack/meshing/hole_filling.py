@@ -1,16 +1,16 @@
-"""Smooth patches over the holes of a mesh, each bounded by one loop of open edges.
+"""Fills the holes of a mesh smoothly, each bounded by a loop of boundary edges.
 
-A patch begins as the triangulation of its loop that turns least against the faces around it (Liepa,
-Filling Holes in Meshes, 2003) or, for long loops, that has the least area (Barequet and Sharir
-1995), which may cut through a tube where the other goes around it. Edges are cut and flipped until
-triangles are as large as those around the hole. Then the patch is made to bend as little as it can:
-the sum of squared Laplacians of positions is least, over the new vertices and those of the loop,
-while all vertices that were there stay (Botsch and Kobbelt 2004). So it continues the surface
-around it, tangents included. Laplacians are those of the patch before; repeated, with edges cut
-that have become long, this ends at surfaces whose mean curvature is harmonic, such as spheres and
-cylinders.
+A filling begins as the triangulation of its loop that has the smallest dihedral angles with the
+faces around it (Liepa, Filling Holes in Meshes, 2003) or, for long loops, the smallest area
+(Barequet and Sharir 1995), which may cut through a tube where the other goes around it. Edges are
+split and flipped until triangles are as large as those around the hole. Then the filling is faired,
+to bend as little as possible: the sum of squared Laplacians of positions, over the new vertices and
+those of the loop, is minimized, while all vertices of the mesh stay (Botsch and Kobbelt 2004). So
+it continues the surface around it, tangents included. Laplacians are those of the filling before;
+repeated, with long edges split, this converges to surfaces whose mean curvature is harmonic, such
+as spheres and cylinders.
 
-Nothing is proved of such patches. Those are handed back that pass the checks of `fill_holes`.
+Nothing is proved of such fillings. Those that pass the checks of `fill_holes` are returned.
 """
 
 from __future__ import annotations
@@ -62,12 +62,12 @@ Winding = Callable[[FloatArray], FloatArray]
 
 @dataclass(frozen=True)
 class HoleFilling:
-    """What was added to a mesh.
+    """The vertices and faces added to a mesh by filling its holes.
 
-    vertices: (k, 3) new ones.
-    faces: (p, 3) of patches; indices below the number of given vertices are of these.
-    unfilled_loops: loops that have no patch, each an array of vertices.
-    reason: what patches of these failed with, in words.
+    vertices: (k, 3) new vertices.
+    faces: (p, 3) of the fillings; indices below the number of the mesh's vertices are of these.
+    unfilled_loops: loops whose fillings failed, each an array of vertices.
+    reason: why these failed, in words.
     """
 
     vertices: FloatArray
@@ -79,13 +79,12 @@ class HoleFilling:
 def fill_holes(
     vertices: FloatArray, faces: IntArray, loops: list[IntArray], winding: Winding
 ) -> HoleFilling:
-    """Patches over loops of open edges, as `hole_loops` gives them, that pass these checks: no
-    triangle of one meets another triangle or is without an area, and the winding number of what is
-    there is near 1/2 modulo 1 at its vertices and centers. It is far from that where a hole is no
-    hole of its own: where two rims belong to one gap, or a part stands in it.
+    """Fill holes, each bounded by a loop of boundary edges (`hole_loops`).
 
-    What fails is tried once more from the triangulation of least area, then without making it bend
-    little.
+    A filling is accepted if its triangles have positive area and intersect no other triangle, and
+    if the mesh's winding number at its vertices and centers is near 1/2 modulo 1. The latter fails
+    where a loop bounds no hole of its own: two loops bound one gap, or another component stands in
+    it. Failed loops are tried again with the minimum-area triangulation, then without fairing.
 
     winding: the winding number of the mesh at points.
     """

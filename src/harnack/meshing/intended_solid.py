@@ -1,8 +1,9 @@
-"""The solid that a damaged mesh means, by its winding number, and how another surface differs.
+"""The solid that a damaged mesh is meant to bound, by its winding number, and how another surface
+differs from it.
 
-What is closed need not be right: a patch may cut off half of a solid. So each result of `repair` is
-compared with the winding number w of what was given, at points away from both surfaces: where w is
-clearly above 1/2 the result has to have its inside, and where it is clearly below its outside.
+A closed mesh need not be right: a filling may cut off half of a solid. So each result of `repair`
+is compared with the winding number w of the input, at points away from both surfaces: where w is
+clearly above 1/2 the result must have its inside, and where it is clearly below its outside.
 """
 
 from __future__ import annotations
@@ -53,12 +54,13 @@ _OPEN = 0.4
 
 @dataclass(frozen=True)
 class Difference:
-    """How a surface differs from what was given.
+    """How a surface differs from the input of the repair.
 
-    share: of the points that were compared those that are on the wrong side. places: (k, 3), some
-        of them. missing: how many of them should be inside, and are not; added: the reverse.
-    volumes: of the surface and of the closed mesh that bounds its solid once; None if they are the
-        same, or it does not.
+    share: the fraction of the compared points that are on the wrong side.
+    places: (k, 3), a selection of these.
+    missing: how many of them should be inside, and are not; added: the reverse.
+    volumes: of the surface and of the closed mesh that bounds its solid once; None if they are
+        equal, or if the mesh does not bound its solid once.
     """
 
     share: float
@@ -69,7 +71,7 @@ class Difference:
 
     @property
     def badness(self) -> float:
-        """Of two surfaces that which has less of it is nearer to what was given."""
+        """A number to compare surfaces by: the one with less of it is nearer to the input."""
         off = 0.0
         if self.volumes is not None:
             new, intended = self.volumes

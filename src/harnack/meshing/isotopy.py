@@ -34,8 +34,8 @@ of (b), the wrapped values at the corners are that lift's, and all is as for a n
 The check. |grad f(y) - grad f(c)| <= D for all y in the ball around T with center c and radius R,
 by the field's own promise (`Field.gradient_change_bound`). So (b) holds if grad f(c) . grad F > D
 |grad F|, and f has no zero in T if |f(c)| > (|grad f(c)| + D) R. If neither holds T is halved,
-across its
-longest edge, a few times: grad F is the same in both halves, and (a) or (b) may hold in each.
+across its longest edge, a few times: grad F is the same in both halves, and (a) or (b) may hold in
+each.
 
 Near the curve nothing is proved. The proof is about the first triangles, before they are refined.
 Of the refined ones it is checked that they do not meet (`checks.intersecting_faces`) and face along
@@ -69,12 +69,13 @@ _FAR = 1.5
 
 @dataclass(frozen=True)
 class IsotopyCoverage:
-    """Shares of the tetrahedra that may hold a point of the level set, or hold one of the mesh.
+    """The fractions of tetrahedra, among those that may hold a point of the level set or hold a
+    point of the mesh, on which the topology is proved.
 
-    proved: of all, those where (a), (b) or (c) is proved. If it is 1, mesh and level set are
+    proved: of all, the fraction where (a), (b) or (c) is proved. If it is 1, mesh and level set are
         isotopic.
-    proved_off_curve: of those farther than 1.5 cells from the curve.
-    count: how many there are; of fields that do not bound the changes of their gradient only those
+    proved_off_curve: the same, of those farther than 1.5 cells from the curve.
+    count: how many there are; for fields that do not bound the changes of their gradient only those
         that hold a point of the mesh.
     unproved_off_curve: (k, 4) corners of those farther than 1.5 cells from the curve where nothing
         is proved.

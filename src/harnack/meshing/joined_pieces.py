@@ -1,10 +1,10 @@
-"""The boundary of the solid of a closed mesh that passes through itself: its faces are cut along
-each other, and those pieces that bound the solid are joined.
+"""Computes the boundary of the solid of a closed mesh that intersects itself: its faces are cut
+along each other, and those pieces that bound the solid are joined.
 
-Of the winding number on both sides of each piece it is known whether the piece bounds the points
-around which the mesh winds at least once. Pieces of two faces that meet are cut by each of them,
-with corners apart by rounding, and one may have corners in the middle of an edge of the other. So
-corners are joined first, and then edges are cut at the corners on them.
+The winding numbers on both sides of each piece tell whether the piece bounds the points around
+which the mesh winds at least once. Where two faces meet, the pieces of each have vertices that
+differ by rounding from those of the other, and a piece may have vertices in the middle of an edge
+of another. So vertices are merged first, and then edges are split at the vertices on them.
 """
 
 from __future__ import annotations

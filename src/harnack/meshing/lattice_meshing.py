@@ -96,8 +96,9 @@ class MissedPartsError(MeshingError):
         self.places, self.thickness, self.size = places, thickness, size
 
     def may_be_fixed_by(self, smaller: float) -> bool:
-        """Not if these cells would miss a part of it as well, two of them long and far thinner than
-        one: as beside a cusp or a cone's tip, which cells of no size show."""
+        """Whether such cells may help: not if they would miss a part as well that is two of these
+        cells long and far thinner than a cell, as beside a cusp or the tip of a cone, which no size
+        of cells resolves."""
         thin = self.places[self.thickness < _THIN * smaller * self.size]
         part = _longest_part(thin, _CLUSTER_DISTANCE * self.size)
         reach = float(np.ptp(part, axis=0).max()) if len(part) else 0.0
@@ -312,29 +313,34 @@ _MOST_ROUNDS = 20
 
 @dataclass(frozen=True)
 class TriangleMesh:
-    """vertices: (n, 3). faces: (m, 3), counter-clockwise as seen from where f is greater."""
+    """A triangle mesh.
+
+    vertices: (n, 3).
+    faces: (m, 3), counter-clockwise as seen from where f is greater.
+    """
 
     vertices: FloatArray
     faces: IntArray
 
     @classmethod
     def without_unused_vertices(cls, vertices: FloatArray, faces: IntArray) -> TriangleMesh:
-        """Without the vertices that are not in use."""
+        """A mesh of these faces, without the vertices that no face uses."""
         used = np.flatnonzero(np.bincount(faces.ravel()))
         place = np.full(len(vertices), -1, np.int64)
         place[used] = np.arange(len(used))
         return cls(vertices[used], place[faces])
 
     def reversed(self) -> TriangleMesh:
-        """With the faces' other side outside."""
+        """The same mesh with the orientation of all faces reversed."""
         return TriangleMesh(self.vertices, self.faces[:, ::-1])
 
 
 @dataclass(frozen=True)
 class IrrelevantRegion:
-    """Where nothing matters, of one or several surfaces: how far around points (k, 3) nothing does.
+    """The region where a surface need not be meshed, because other operands remove it.
 
-    cached_cells: the cells of lattices that are not proved to be there, each looked for once.
+    clearance: radii of balls about points (k, 3) that lie in the region.
+    cached_cells: per lattice, the cells not proved to lie in it.
     """
 
     clearance: Clearance
@@ -343,10 +349,11 @@ class IrrelevantRegion:
     )
 
     def relevant_cells(self, lattice: BccLattice, most: int) -> IntArray:
-        """(n, 3) indices of the cells that are not there, and of some around them.
+        """Indices (n, 3) of the cells that are not proved to lie in the region, and of a border of
+        cells around them.
 
         Raises:
-            MeshingError: there are more than `most` triangles would take.
+            MeshingError: there are more cells than `most` triangles would take.
         """
         key = (*lattice.lower.tolist(), *lattice.size.tolist(), *lattice.counts.tolist(), most)
         if key not in self.cached_cells:

@@ -49,11 +49,11 @@ class LevelSamples:
     quarter_period_radius: FloatArray
 
     def select(self, rows: Any) -> LevelSamples:
-        """Those at some points, by index or mask."""
+        """The samples at the points that `rows`, indices or a mask, select."""
         return LevelSamples(self.value[rows], self.gradient[rows], self.quarter_period_radius[rows])
 
     def replaced(self, rows: Any, others: LevelSamples) -> LevelSamples:
-        """With those at points `rows` replaced."""
+        """The samples, with those at points `rows` replaced by `others`."""
         value, gradient, reach = (
             self.value.copy(),
             self.gradient.copy(),
@@ -111,11 +111,11 @@ class LevelFunction:
 
     @property
     def period(self) -> float | None:
-        """Of an angle."""
+        """The period of an angle-valued field; None for others."""
         return self.field.period
 
     def relative_to_level(self, value: FloatArray) -> FloatArray:
-        """f - level, given f."""
+        """f - level, from values of f."""
         above = value - self.level
         if self.period is None:
             return above

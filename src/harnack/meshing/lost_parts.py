@@ -1,15 +1,15 @@
-"""Parts of a level set that are missing from its mesh by signs: walls and gaps thinner than a cell.
+"""Finds parts of a level set that are missing from its mesh by signs: walls and gaps thinner than a
+cell.
 
-Signs at the points of a lattice do not show a wall between two of them, nor a gap. What was made of
-the signs is near the level everywhere, which `points_off_level` looks at; here the way back is
-looked at, from points that are known to lie on the level to the mesh. Around a point of the level
-that is farther than d from the mesh the sign of the function changes within d, and that of the mesh
-does
-not: so there is a part of the solid, or of the space around it, which the mesh does not have.
+Signs at the points of a lattice do not show a wall between two of them, nor a gap. That the mesh is
+near the level everywhere is checked by `points_off_level`; here the converse is checked, from
+points that are known to lie on the level to the mesh. Around a point of the level that is farther
+than d from the mesh the sign of the function changes within d, and that of the mesh does not: so
+there is a part of the solid, or of the space around it, which the mesh does not have.
 
-Where points of the level are known: on the triangles of a mesh across which its winding number
-jumps over the level, beside the points of a cloud, and on the way out of blobs. That is a sample of
-about three thousand, spread evenly, and no proof.
+Points of the level are known on the triangles of a mesh across which its winding number jumps over
+the level, beside the points of a cloud, and along rays out of blobs. They are a sample of about
+three thousand, spread evenly, and no proof.
 """
 
 from __future__ import annotations
@@ -63,9 +63,9 @@ class PointsOnLevel:
 
     @classmethod
     def of(cls, function: SignFunction, tolerance: float) -> PointsOnLevel:
-        """Those that are known of a field; none of a field of which nothing is known.
+        """The known points on the level of a field; none for fields without such points.
 
-        tolerance: a length, that a cloud's points are looked at from.
+        tolerance: a length; the points of a cloud are looked at from this distance.
         """
         mesh = function.field.jump_mesh()
         if mesh is not None:
@@ -109,11 +109,11 @@ class PointsOnLevel:
         return cls(points[jumps], np.where(ahead > 0, 1.0, -1.0)[jumps, None] * normal[jumps])
 
     def some(self, rows: Any) -> PointsOnLevel:
-        """Some of them, by index or mask."""
+        """The points that `rows`, indices or a mask, select."""
         return PointsOnLevel(self.points[rows], self.normals[rows])
 
     def within(self, lower: FloatArray, upper: FloatArray, volume: Volume | None) -> PointsOnLevel:
-        """Those in a box and in a volume."""
+        """The points in a box and in a volume."""
         is_in = ((self.points > lower) & (self.points < upper)).all(axis=1)
         if volume is not None:
             is_in &= volume.contains_points(self.points)
@@ -154,7 +154,11 @@ class LostParts:
         tolerance: float,
         spacing: float,
     ) -> LostParts:
-        """Of a mesh of the level in cells of a spacing; known: where it should be."""
+        """The lost parts of a mesh of the level set.
+
+        known: points on the level, near which the mesh should be.
+        spacing: of the cells of the mesh.
+        """
         corner = surface.vertices[surface.faces]
         far = known.some(_are_farther(known.points, corner, tolerance))
         beyond = _are_farther(far.points, corner, max(tolerance, _CELLS * spacing))
@@ -179,7 +183,8 @@ class LostParts:
 
     @property
     def matter(self) -> bool:
-        """Whether there are more than what creases and corners leave at all meshes."""
+        """Whether there are more points off the mesh than creases and corners leave for all
+        meshes."""
         return self.beyond > 0 or self.far > _SHARE * self.looked_at
 
     @property

@@ -1,13 +1,12 @@
 """Triangles of a level set in tetrahedra, when its function may be an angle; and the tetrahedra.
 
-Between two points the function moves from one value to another along the edge: its *lift*. The
-edge crosses the level as often as the lift does, with the sign of the way up, n = 0 or +-1 if cells
-are small enough: of a real-valued function where the signs at the ends differ, of an angle where
-the lift, which may differ from the difference of the two wrapped values by whole periods, passes
-from one interval between levels to the next. In a tetrahedron the crossings on edges between
-corners off the level say on which side of the level each corner is, if they agree around every
-face; that is checked, and so is that no more than one level is between corners. A corner on the
-level, a vertex of the curve among them, is a vertex of the triangles as it is.
+The continuous change of the function along an edge is its *lift*. The signed number of level
+crossings is that of the lift: 0 or +-1 if cells are small enough. For a real-valued function it
+follows from the signs at the ends. For an angle, the lift may differ from the difference of the
+wrapped values by whole periods. The crossings of a tetrahedron's edges between corners off the
+level determine on which side of the level each corner lies, if they are consistent around every
+face; that is checked, and that at most one level passes between the corners. A corner on the level,
+such as a vertex of the curve, becomes a mesh vertex.
 
 Tetrahedra between points are Delaunay's, by Qhull (`delaunay`).
 """
@@ -49,9 +48,13 @@ _ROOT_ERROR, _FROM_ENDS = 1e-10, 1e-4
 
 @dataclass(frozen=True)
 class Tetrahedra:
-    """points: (n, 3). corners: (m, 4) indices of points.
-    ends: (k, 2) of all edges, the lower index first. edges: (m, 6) indices of edges, for the pairs
-    of corners (0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3).
+    """Tetrahedra and their edges.
+
+    points: (n, 3).
+    corners: (m, 4) indices of points.
+    ends: (k, 2) endpoints of all edges, the lower index first.
+    edges: (m, 6) indices of edges, for the pairs of corners (0, 1), (0, 2), (0, 3), (1, 2), (1, 3),
+        (2, 3).
     """
 
     points: FloatArray
@@ -61,7 +64,7 @@ class Tetrahedra:
 
     @classmethod
     def of(cls, points: FloatArray, corners: IntArray) -> Tetrahedra:
-        """With their edges numbered."""
+        """Tetrahedra with these corners; their edges are numbered."""
         edges = Edges.of(np.concatenate([corners[:, pair] for pair in _PAIRS]))
         return cls(points, corners, edges.vertices, edges.edge_of_pair.reshape(len(_PAIRS), -1).T)
 
@@ -128,9 +131,10 @@ def count_crossings(
 ) -> EdgeCrossings:
     """Count the crossings of every edge.
 
-    Wrapping. From p the function moves by less than a quarter of its period within `reach`; if the
-    reaches of both ends cover the edge, it moves by less than half a period along it, which is the
-    wrapped difference. Other edges are integrated (`Field.continuous_change`).
+    Wrapping. Within `LevelSamples.quarter_period_radius` of a point the function changes by less
+    than a quarter of its period. If these radii at both ends cover the edge, it changes by less
+    than half a period along it, so that the change is the wrapped difference. Along other edges
+    the change is integrated (`Field.continuous_change`).
 
     Raises:
         MeshingError: edges that are not covered, of a field that cannot be integrated.

@@ -1,9 +1,9 @@
-"""What is sound of a damaged mesh: triangles that can stay, and what is wrong with the others.
+"""Cleans a damaged mesh: finds the triangles that can stay, and the defects of the others.
 
-Triangles that are there twice, that have no area or pass through others are left out; those that
-are turned over against their neighbors are turned back. What stays is oriented and passes through
-nothing, and its holes are filled by `hole_filling`. Where that fails, the triangles around the hole
-are left out too, ring by ring.
+Duplicate, degenerate and intersecting triangles are removed; those turned over against their
+neighbors are flipped. The remaining triangles are oriented and intersect nothing, and their holes
+are filled by `hole_filling`. Where that fails, the triangles around the hole are removed too, ring
+by ring.
 """
 
 from __future__ import annotations
@@ -49,11 +49,12 @@ _NEAR = (0.01, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3)
 
 @dataclass(frozen=True)
 class CleanedMesh:
-    """A closed surface, in which what was sound is bit by bit as given and comes first.
+    """A closed mesh in which the valid triangles of the input come first, bit by bit.
 
-    kept: of the first faces, which of the given ones they are, in order. turned: which of these
-        run the other way round.
-    left_out: how many of the given triangles were, by reason. holes: how many were filled.
+    kept: for each of the first faces, the index of the input face that it is, in order.
+    turned: which of these are reversed.
+    left_out: how many of the input triangles were removed, by reason.
+    holes: how many were filled.
     """
 
     surface: TriangleMesh

@@ -135,7 +135,7 @@ def _holds(numbers: IntArray, wanted: IntArray) -> BoolArray:
 
 
 def least_angles(vertices: FloatArray, faces: IntArray) -> FloatArray:
-    """(m,) of triangles, in radians; 0 for one without an area."""
+    """(m,) the least angle of each triangle, in radians; 0 for a triangle without an area."""
     corner = vertices[faces]
     side = np.stack([corner[:, (k + 2) % 3] - corner[:, (k + 1) % 3] for k in range(3)], axis=1)
     square = np.einsum("ijk,ijk->ij", side, side)

@@ -46,8 +46,14 @@ _WORDS = re.compile(r"\{([^{}|]*)\|([^{}|]*)\}")
 
 @dataclass(frozen=True, eq=False)
 class PrintProblem:
-    """kind: its name, such as "open edges". count: how many there are. where: (k, 3) places of
-    some or all. message: all of it in a sentence. is_fatal: whether it is wrong, and no hint."""
+    """A problem of a mesh that is to be printed.
+
+    kind: its name, such as "open edges".
+    count: how many there are.
+    locations: (k, 3) where they are, of all or a part of them.
+    message: the problem in a sentence.
+    is_error: whether it is an error, and not a hint.
+    """
 
     kind: str
     count: int
@@ -58,8 +64,14 @@ class PrintProblem:
 
 @dataclass(frozen=True)
 class PrintCheck:
-    """problems: what was found, the worst first. size: (x, y, z). volume: None if the mesh is not
-    closed. triangles: how many there are. parts: that do not touch each other."""
+    """The result of checking a mesh that is to be printed.
+
+    problems: the worst first.
+    size: (x, y, z).
+    volume: None if the mesh is not closed.
+    triangles: how many there are.
+    parts: how many components there are that do not touch each other.
+    """
 
     problems: tuple[PrintProblem, ...]
     size: tuple[float, float, float]

@@ -1,4 +1,5 @@
-"""Finer meshes: edges cut where the surface bulges from them, vertices moved onto it, and smoothed.
+"""Refines meshes: edges are split where the surface is too far from them, vertices are moved onto
+the surface and smoothed.
 
 Vertices and edges of the boundary stay as they are.
 """
@@ -68,12 +69,12 @@ def refine(
     report: Callable[[str], None],
     where: Where = None,
 ) -> tuple[FloatArray, IntArray]:
-    """Cut edges at their middles, and move these onto the surface, until the middles of all edges
-    but those of the boundary, and the centers of all faces, are within `tolerance` of it; or until
-    that is seen not to succeed, which the caller has to check (`check_near_level`).
+    """Split edges at their midpoints, and move these onto the surface, until the midpoints of all
+    edges but those of the boundary, and the centers of all faces, are within `tolerance` of it; or
+    until that is seen not to succeed, which the caller has to check (`check_near_level`).
 
-    where: middles and centers count. What is cut beside these places is moved onto the surface as
-        well: else its edges, which end off the surface, would be cut again and again.
+    where: which midpoints and centers count. Edges that are split beside these are moved onto the
+        surface as well: else they would be split again and again, as they end off the surface.
 
     Raises:
         TriangleLimitError: it takes more triangles than the function allows.
@@ -221,19 +222,25 @@ def _level_along(
 def unrefined_midpoints(
     function: LevelFunction, vertices: FloatArray, faces: IntArray, tolerance: float
 ) -> FloatArray:
-    """Middles (k, 3) of the edges that `refine` would still cut."""
+    """Midpoints (k, 3) of the edges that `refine` would still split."""
     far = _RefinementMarks.of(function, vertices, faces, tolerance, None, None)
     return far.middle[far.marked]
 
 
 @dataclass(frozen=True)
 class _RefinementMarks:
-    """Edges and which of them are to be cut.
+    """The edges of a mesh, and which of them are to be split.
 
-    edges: (m, 3) of the faces. ends: (k, 2) vertices, middle: (k, 3), span: (k,) and marked: (k,)
-        of edges.
-    samples: at the middles; is_beyond: (k,) those that count and are beyond the tolerance.
-    is_off: (m,) faces of whose centers that holds. cuts_off: (m,) of these at a corner alone.
+    edges: (m, 3) of the faces.
+    ends: (k, 2) the endpoints of edges.
+    middle: (k, 3) their midpoints.
+    span: (k,) their lengths.
+    samples: at the midpoints.
+    is_beyond: (k,) midpoints that count and are beyond the tolerance.
+    is_off: (m,) faces whose centers count and are beyond the tolerance.
+    marked: (k,) edges to be split.
+    misses_corner: (m,) faces that are off although none of their edges is beyond the tolerance, as
+        they cut off a corner of a surface with creases.
     """
 
     edges: IntArray
@@ -256,7 +263,8 @@ class _RefinementMarks:
         walls: Walls,
         where: Where,
     ) -> _RefinementMarks:
-        """Those whose middle, or the center of a face beside them, is beyond the tolerance."""
+        """The marks of edges whose midpoint, or the center of an adjacent face, is beyond the
+        tolerance."""
         ends, edges, is_boundary = _edges(faces)
         if walls is not None:  # the boundary lies in them, and so do the middles of its edges
             is_boundary = np.zeros_like(is_boundary)
@@ -300,7 +308,10 @@ def _edges(faces: IntArray) -> tuple[IntArray, IntArray, BoolArray]:
 
 
 def split_faces(vertices: FloatArray, faces: IntArray, middle: IntArray) -> IntArray:
-    """Faces cut at the middles (m, 3) of their edges, -1 for those that are not cut."""
+    """Faces, split at the midpoints of their edges.
+
+    middle: (m, 3) vertices at the midpoints, -1 for edges that are not split.
+    """
     cut = middle >= 0
     number = cut.sum(axis=1)
     parts = [faces[number == 0]]

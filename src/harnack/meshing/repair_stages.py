@@ -1,15 +1,16 @@
-"""Repair of triangle meshes: a closed mesh of a damaged one, in which what was sound stays.
+"""Repairs triangle meshes: computes a closed mesh from a damaged one, and keeps its valid triangles
+where possible.
 
-It goes by stages: all triangles are kept, and holes get patches; or bodies that overlap are united;
-or the triangles that are sound are kept; or the surface on which the winding number is 1/2 is made
-anew.
+Stages are tried in turn, from the one that keeps most to the one that always gives a result: all
+triangles stay and holes are filled; bodies that overlap are united (`bodies`; for a surface that
+passes through itself, pieces of its faces, `joined_pieces`); only valid triangles stay
+(`mesh_cleaning`); corners of loose triangles are merged; everything is remeshed from signs, on the
+surface where the winding number is 1/2.
 
-Repair goes by stages, from what keeps most to what always comes: all triangles, bodies united
-(`bodies`; of a shell that passes through itself the pieces of faces, `joined_pieces`), sound
-triangles (`sound`), loose corners joined, all anew by signs. No result is believed for being
-closed: each is compared with the winding number of what was given (`intended_solid`). Patches bend
-least (`hole_filling`), and nothing is proved of them but that they cross nothing; those on which w
-= 1/2 (`harmonic_filling`) have a proof, and a dent where the surface was round.
+A result is not accepted for being closed: each is compared with the winding number of the input
+(`intended_solid`). Smooth hole fillings have minimal bending (`hole_filling`), and nothing is
+proved of them but that they intersect nothing; those on which w = 1/2 (`harmonic_filling`) have a
+proof, and a dent where the surface was round.
 """
 
 from __future__ import annotations
@@ -89,25 +90,24 @@ def repair(
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
 ) -> trimesh.Trimesh:
-    """A closed mesh of a damaged one: with patches over its holes, or made anew.
+    """Return a closed mesh for a damaged one: with its holes filled, or remeshed.
 
-    Corners that are apart by rounding are joined first, and what is inside out as a whole is turned
-    over: each closed part that does not lie in another, with all that lies in it. Then five stages
-    are tried in turn:
+    First, vertices that differ by rounding only are merged, and components that are inside out as a
+    whole are reversed: each closed component that lies in no other, with all that lies in it. Then
+    five stages are tried in turn:
 
-    - filled: all triangles stay, and holes get patches;
-    - boolean_union: a closed mesh that crosses itself, also along edges that lie on its faces, or
-    parts
-      that overlap or touch, are cut where they do, exactly, and what is inside is left out, as is
-      what it winds around clockwise: cavities stay where it winds around no point;
-    - cleaned: triangles that are there twice, have no area or pass through others are left out,
-    those
-      turned over against their neighbors are turned back, and holes get patches; where one cannot
-      be filled, the triangles around it are left out as well, ring by ring;
-    - welded: corners of loose triangles that lie near each other, as in a mesh full of cracks, are
-      moved to their mean, and the rest is done as before;
-    - remeshed: the surface on which the winding number w of the mesh is 1/2 is made by the signs of
-      w - 1/2 in cells (`meshing.sign_isosurface`), closed whatever the mesh is.
+    - filled: all triangles stay, and holes are filled;
+    - boolean_union: a closed mesh that intersects itself, also along edges that lie on its faces,
+      or components that overlap or touch, are cut exactly along the intersections; interior faces
+      are removed, and those that wind around a point clockwise: cavities stay where the mesh winds
+      around no point;
+    - cleaned: duplicate, degenerate and intersecting triangles are removed, those turned over
+      against their neighbors are flipped, and holes are filled; around a hole that cannot be
+      filled, triangles are removed ring by ring;
+    - welded: nearby corners of loose triangles, as in a mesh full of cracks, are merged at their
+      mean, and the mesh is then cleaned;
+    - remeshed: the surface on which the winding number w of the mesh is 1/2 is extracted from the
+      signs of w - 1/2 in cells (`meshing.sign_isosurface`); it is closed whatever the mesh is.
 
     Each result is compared with w at some thousand points, farther from both surfaces than two
     tolerances: where w is above 0.86 the inside has to be, and where it is below 0.14 the outside;
@@ -116,59 +116,60 @@ def repair(
     warning. That is sampled: what differs in less than a thousandth of the box may not be seen.
 
     mesh: anything with `vertices` (n, 3) and `faces` (m, 3).
-    keep: "all" does the first stage or raises an error, "valid" the second one, "none" the last;
-        None does the first that succeeds of all.
-    filling: "smooth" ones continue the surface around each hole, with its tangents, and bend least.
-        They are made hole by hole, and used where w is within 0.36 of 1/2 modulo 1 on them; the
-        rest is done by "harmonic" ones, on which w is 1/2 modulo 1: they join the rims of a gap
-        between two parts, and have a dent where the surface was round. Only of these is it proved
-        what they are.
-    largest: keep the body of the largest volume alone, with its cavities.
-    tolerance: how far harmonic patches may be from the surface w = 1/2, as a part of the size of
-        the box around all holes, and triangles made anew, as a part of the mesh's; sampled and not
-        proved.
+    keep: "all" does only the stage "filled", "valid" only "cleaned", and "none" only "remeshed",
+        or raises an error; None tries all five, up to the first that succeeds.
+    filling: "smooth" hole fillings continue the surface around each hole, with its tangents, and
+        bend least. They are computed hole by hole, and used where w is within 0.36 of 1/2 modulo 1
+        on them; other holes get "harmonic" fillings, on which w is 1/2 modulo 1: these join the
+        boundary loops of a gap between two components, and have a dent where the surface was
+        round. Only for harmonic fillings is it proved which surface they approximate.
+    largest: keep only the body of the largest volume, with its cavities.
+    tolerance: how far harmonic fillings may be from the surface w = 1/2, relative to the size of
+        the box around all holes, and remeshed triangles, relative to the size of the mesh; sampled
+        and not proved.
     cell_size: of cells before anything is refined, in the mesh's unit; None chooses.
     seed: of the small random moves that keep points in general position.
     progress: told what is being done.
 
     Returns:
         A closed trimesh.Trimesh: every edge has two faces, which agree. `metadata["harnack"]` has
-        stage: "filled", "boolean_union", "cleaned", "welded" or "remeshed"; why: what those before
-            failed with, or
-        None; kept: how many of the given triangles are there; parts: of each part, largest first, a
-        dictionary of its faces, volume and center; dropped: how many parts of these were left out
-        for `largest`; welded: how many corners were joined since they were apart by rounding;
-        differs: None, or a dictionary of what differs from what was given (share of the points on
-        the wrong side, some places, how many are missing and added, and volumes of both); and the
-        Euler characteristic.
+        stage: "filled", "boolean_union", "cleaned", "welded" or "remeshed"; why: the failures of
+        the stages before, or None; kept: how many of the input triangles are there; parts: for
+        each component, largest first, a dictionary of its faces, volume and center; dropped: how
+        many components were removed for `largest`; welded: how many corners were merged because
+        they differed by rounding only; differs: None, or a dictionary of the differences from the
+        input (share of the points on the wrong side, places of some, how many are missing and
+        added, and volumes of both); and the Euler characteristic.
 
-        Unless all was made anew there are also holes (loops of edges that were open), patches
-        (triangles added) and harmonic (how many of these are harmonic). Vertices and faces that
-        were given come first, bit by bit and in their order: all of them if all was kept and
-        nothing dropped, else those that are in use. Patches meet no other triangle but at the edges
-        and corners that they share, decided exactly.
+        After "filled", "cleaned" and "welded" there are also holes (how many loops of boundary
+        edges there were), patches (how many triangles were added) and harmonic (how many of these
+        are harmonic). After "filled" and "cleaned" the input's vertices and faces come first, bit
+        by bit and in their order: all of them if all were kept and nothing was dropped, else those
+        that are in use. Fillings meet other triangles only at shared edges and vertices, decided
+        exactly.
 
-        If all was kept: missing (how many patches are the triangles of holes of three edges),
-        refined (whether harmonic patches are within the tolerance: they stay as the cells cut them
-        if finer ones would pass through each other), spacing and evaluations of these. A closed
-        mesh gets nothing added; unless keep is "all", it is only returned if no triangles pass
-        through each other.
+        After "filled": missing (how many patches are single triangles that fill holes of three
+        edges), refined (whether harmonic fillings are within the tolerance: they stay as the cells
+        cut them if finer ones would intersect each other), spacing and evaluations of these.
+        Nothing is added to a closed mesh; unless keep is "all", it is only returned if it does not
+        intersect itself.
 
-        If it was united, kept is 0: triangles that were not cut lie where they were, but may be
-        divided otherwise.
+        After "boolean_union", kept is 0: triangles that were not cut lie where they were, but may
+        be divided otherwise.
 
-        If what was sound was kept: turned (how many triangles were turned over) and left_out, a
-        dictionary: how many were "flat" (without an area), "doubled", "crossing", "branching" (at
-        edges of more than two), "one-sided" (at edges where no two sides can be told), "around"
-        holes that could not be filled or "inside" the material of other parts. Vertices at one
-        place are joined. No triangles pass through each other, and no part is inside out.
+        After "cleaned": turned (how many triangles were flipped) and left_out, a dictionary of how
+        many were removed because they were "flat" (without an area), "doubled", "crossing",
+        "branching" (at edges of more than two), "one-sided" (at edges where the surface has no two
+        sides), "around" holes that could not be filled or "inside" the material of other
+        components. Vertices at the same position are merged. No triangles intersect, and no
+        component is inside out.
 
-        If corners were joined: the same, and joined (how many of the given triangles are there,
-        with moved corners) and moved (how far the farthest corner went, a length); kept is 0. A
-        warning says so where that is more than two tolerances.
+        After "welded": the same, and joined (how many of the input triangles are there, with moved
+        vertices) and moved (how far the farthest vertex was moved, a length); kept is 0. A warning
+        says so where that is more than two tolerances.
 
-        If all was made anew, no triangles pass through each other, and there is what `mesh` says of
-        meshes by signs, such as far and within; kept is 0.
+        After "remeshed", no triangles intersect, and there are the facts of `mesh` about meshes by
+        signs, such as far and within; kept is 0.
 
     Raises:
         MeshError: a ValueError, for a mesh that has no triangles, or numbers that are none; one

@@ -1,9 +1,9 @@
-"""Closed meshes of which a few triangles pass through each other, mended there alone.
+"""Repairs closed meshes of which a few triangles intersect each other, locally.
 
-Where solids are cut by each other corners are rounded, and where triangles in a plane are joined
-slivers without an area are left: such triangles pass through their neighbors by next to nothing.
-One edge near them, contracted or flipped, mends that mostly. Which one is tried, with exact signs,
-on the few triangles around.
+Where solids are cut by each other corners are rounded, and where triangles in a plane are merged
+slivers without an area are left: such triangles intersect their neighbors by about a rounding
+error. Contracting or flipping an edge near them repairs that mostly. Edges are tried in turn, with
+exact signs, on the few triangles around.
 """
 
 from __future__ import annotations

@@ -1,9 +1,11 @@
-"""Functions of which only the signs count: values at points, and where segments meet the level.
+"""Functions of which only the signs count: values at points, and crossings of the level on
+segments.
 
-What is real-valued has a sign at every point, whether or not it is continuous: winding numbers
-jump at triangles and are known up to an error, potentials of dipoles are infinite at points, and
-Newton's method is at a loss with both. Here a segment whose ends have different signs is halved, by
-values alone, and what is left of it is intersected with the sheets of the field, such as triangles.
+Every real-valued function has a sign at every point, whether or not it is continuous: winding
+numbers jump at triangles and are known up to an error, and potentials of dipoles are infinite at
+points. Newton's method fails for both. Here a segment whose ends have different signs is bisected,
+by values alone, and the last interval is intersected with the jump surfaces of the field, such as
+triangles.
 """
 
 from __future__ import annotations
@@ -39,7 +41,7 @@ if TYPE_CHECKING:
 
 __all__ = ["SignFunction", "cell_size_for_smoothing", "empty_surface_hint", "uses_sign_meshing"]
 
-# How often a segment is halved before it is intersected with sheets; and how often a smooth
+# How often a segment is halved before it is intersected with facets; and how often a smooth
 # function is evaluated along it, in turn where the secant meets the level and in the middle.
 _HALVINGS, _STEPS = 4, 8
 # Values that are so small, as a part of those at the ends, need no further steps.
@@ -64,8 +66,8 @@ def uses_sign_meshing(field: Field) -> bool:
 
 
 def cell_size_for_smoothing(field: Field, spacing: float, most: float, least: float) -> float:
-    """The size of cells: `cell_size`, or where the surface of a cloud with noise is likely to have
-    details that these do not show, smaller by factors between `least` and `most`."""
+    """The size of cells: `spacing`; or, where the surface of a cloud with noise is likely to have
+    details too small for these cells, smaller by factors between `least` and `most`."""
     if (
         not isinstance(field, DipolePotential)
         or not 0 < field.smoothing < _UNRESOLVED_SMOOTHING * spacing
@@ -75,7 +77,7 @@ def cell_size_for_smoothing(field: Field, spacing: float, most: float, least: fl
 
 
 def empty_surface_hint(field: Field) -> str:
-    """What is known of why there is no surface among cells, to be added to an error."""
+    """A likely reason why there is no surface among the cells, to be added to an error message."""
     if not isinstance(field, DipolePotential) or len(field.points) < 2:
         return ""
     alone = outlier_indices(field.points, build_point_tree(field.points))
@@ -93,7 +95,7 @@ class SignFunction(LevelFunction):
     """side (f - level), of a real-valued field, by its values at points.
 
     side: 1, or -1 for a function that is negative where f is above the level.
-    precision: of values. Crossings of sheets are found in double precision.
+    precision: of values. Crossings of facets are found in double precision.
     """
 
     side: float = dataclasses.field(default=1.0, kw_only=True)
@@ -133,8 +135,8 @@ class SignFunction(LevelFunction):
         return self.relative_to_level(self.field.value(points, precision=self.precision))
 
     def sample(self, points: FloatArray) -> LevelSamples:
-        """The function at points (n, 3). Of a field with sheets the gradient is given as 0, since
-        it does not say how far the level is."""
+        """The function at points (n, 3). For a field that jumps the gradient is given as 0, since
+        it does not tell how far the level is."""
         none = np.zeros(len(points))
         if self.field.has_jumps:
             return LevelSamples(self.values(points), np.zeros((len(points), 3)), none)
@@ -180,7 +182,7 @@ class SignFunction(LevelFunction):
         """Where segments between points (n, 3), at which the function is not positive and positive,
         meet the level: points (n, 3), and unit normals there towards where the function grows.
 
-        They lie on sheets where the function changes its sign by a jump, to rounding.
+        They lie on facets where the function changes its sign by a jump, to rounding.
         """
         if not len(low):
             return low.copy(), low.copy()

@@ -1,14 +1,14 @@
-"""Closed surfaces from signs: for fields that jump, are rough, or of which little is proved.
+"""Closed meshes from the signs of a function on a lattice, for fields that jump, are rough, or have
+few proved bounds.
 
-A function that has a sign at every point of a lattice has a surface: each tetrahedron whose corners
-differ is cut by one triangle or quadrilateral, whose corners lie within its edges. Triangles of two
-tetrahedra meet in common edges only, and every edge has two of them but for edges on the box. So
-the surface is closed, a manifold, and does not pass through itself, whatever the function is.
+A tetrahedron with corners of both signs is cut by one triangle or quadrilateral with vertices on
+its edges. Neighbors share these edges, so every mesh edge has two faces, except on the box: the
+mesh is a closed manifold without self-intersections, whatever the function.
 
-Its vertices are where edges of tetrahedra meet the level, with normals there. An edge between two
-of them whose normals turn is cut where the tangent planes meet, on the way there (Kobbelt et al.
-2001): along a crease triangles then end on it. Where that makes triangles turn over or pass through
-each other, these are made flat again. That nothing passes through itself then is checked, exactly.
+Where the normals at the ends of a mesh edge differ, the edge is split at the level's crossing of a
+segment toward the intersection of the tangent planes (Kobbelt et al. 2001), so that edges follow
+creases. Vertices whose faces then flip or intersect are moved back. Finally an exact test checks
+for self-intersections.
 """
 
 from __future__ import annotations
@@ -98,9 +98,13 @@ _MAX_GROWTH_ROUNDS = 20
 
 @dataclass(frozen=True)
 class SignIsosurface:
-    """A surface; of the points of the lattice how many there are, and at how many the error of the
-    function leaves the sign open; flat: how many triangles were made flat again; is_apart: whether
-    it was checked, exactly, that no triangles pass through each other."""
+    """A mesh extracted from signs.
+
+    points: number of lattice points.
+    undecided: at how many of them the error bound exceeds |f - level|, so that the sign is open.
+    unfitted: number of triangles moved back from creases.
+    is_intersection_free: whether the absence of self-intersections was checked exactly.
+    """
 
     surface: TriangleMesh
     points: int
@@ -120,12 +124,14 @@ def mesh_from_signs(
     closed: bool = False,
     volume: Volume | None = None,
 ) -> tuple[SignIsosurface, LostParts, dict[str, Any]]:
-    """`extract_from_signs` in cells of a box, parts of the level that it lost, and facts about it.
-    Where more than a few vertices and centers of triangles are beyond the tolerance, a length, or
-    lost parts may be found so, it is made once more of smaller cells; how many are at last, and
-    within what distance all are, is among the facts.
+    """Extract a mesh from signs in the cells of a box (`extract_from_signs`). Returns it with the
+    parts of the level set that it lost, and facts about it.
 
-    volume: only what is lost within it counts.
+    Where more than a few vertices and centers of triangles are beyond the tolerance, a length, or
+    where smaller cells may show lost parts, it is extracted again from smaller cells. The facts say
+    how many points are beyond the tolerance at last, and within what distance all of them are.
+
+    volume: only parts lost within it count.
 
     Raises:
         MeshingError: as `extract_from_signs`.
@@ -386,12 +392,16 @@ def _triangles(
 
 @dataclass(frozen=True)
 class _CreaseRefinement:
-    """Where edges and faces are cut.
+    """The places at which edges and faces are split to follow creases.
 
-    edges: (m, 3) of all faces. place: (k,) of edges, the index of the new vertex, or -1. ends:
-        (c, 2) of the edges that are cut, and share: (c,) where along them. cornered: (d, 3) faces
-        with a new vertex within, and their rows (d,).
-    points, normals, is_on_crease: the new vertices, those of edges first; bent: on a crease.
+    edges: (m, 3) of all faces.
+    vertex_of_edge: (k,) of edges, the index of the new vertex, or -1.
+    ends: (c, 2) of the edges that are split.
+    share: (c,) where along these edges, as a fraction.
+    corner_faces: (d, 3) faces with a new vertex within.
+    rows: (d,) the indices of these faces.
+    points, normals: of the new vertices, those of edges first.
+    is_on_crease: which new vertices are on a crease.
     """
 
     edges: IntArray
@@ -527,14 +537,14 @@ def _crease_corners(
 
 
 def _undo_until_valid(x: FloatArray, flat: FloatArray, faces: IntArray) -> tuple[FloatArray, int]:
-    """Vertices moved back to where they were made, within the triangles of the tetrahedra, of faces
-    that turn over or pass through others; and how many faces did. Faces none of whose vertices were
-    moved are not compared with each other.
+    """Move vertices back to their original positions in the tetrahedra until no face is flipped and
+    no two faces intersect. Returns vertices and the number of faces affected. Pairs of faces
+    without a moved vertex are not tested.
 
-    flat: (n, 3) these places.
+    flat: (n, 3) the original positions.
 
     Raises:
-        LocalizedMeshingError: triangles pass through each other still.
+        LocalizedMeshingError: triangles still intersect.
     """
     x = x.copy()
     total = 0

@@ -30,9 +30,10 @@ _OPPOSITE = -0.5
 
 @dataclass(frozen=True, eq=False)
 class WallThickness:
-    """What `wall_thickness` found.
+    """The thickness of a closed mesh at its faces, from `wall_thickness`.
 
-    vertices: (n, 3) and faces: (m, 3), of the mesh.
+    vertices: (n, 3).
+    faces: (m, 3).
     values: (m,) thickness at the centers of faces, a length; nan for faces without an area.
     """
 
@@ -49,13 +50,14 @@ class WallThickness:
         return float(np.nanmin(self.values))
 
     def thin_locations(self, less_than: float) -> FloatArray:
-        """Centers (k, 3) of the faces at which the part is thinner, the thinnest first."""
+        """Centers (k, 3) of the faces at which the wall is thinner than `less_than`, the thinnest
+        first."""
         rows = np.flatnonzero(self.is_thinner(less_than))
         rows = rows[np.argsort(self.values[rows])]
         return self.vertices[self.faces[rows]].mean(axis=1)
 
     def is_thinner(self, than: float) -> BoolArray:
-        """(m,) faces at which the part is thinner."""
+        """(m,) whether the wall is thinner than `than` at each face."""
         return np.asarray(np.nan_to_num(self.values, nan=np.inf) < than)
 
     def to_colored_mesh(self, low: float, high: float) -> trimesh.Trimesh:

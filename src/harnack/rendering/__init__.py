@@ -1,4 +1,5 @@
-"""Pictures: our surfaces in Mitsuba scenes, and a studio that makes a picture by itself."""
+"""Renders pictures: level sets in Mitsuba scenes, and in a studio that sets up lights, ground and
+camera by itself."""
 
 from __future__ import annotations
 

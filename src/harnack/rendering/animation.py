@@ -1,4 +1,4 @@
-"""Films: pictures one after the other, with one frame for all of them."""
+"""Animations: `render` for each frame, with a single framing for all of them."""
 
 from __future__ import annotations
 
@@ -45,7 +45,11 @@ Pixels = npt.NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class Animation:
-    """A film that was written. path: of its file. size: (width, height) of its pictures."""
+    """A written animation file.
+
+    path: of the file.
+    size: (width, height) of its pictures.
+    """
 
     path: Path
     size: tuple[int, int]

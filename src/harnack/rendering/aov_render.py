@@ -1,8 +1,8 @@
-"""Pictures of what the tracer did and found: normals, evaluations, status, depth, and values of
+"""Renders arbitrary output variables (AOVs): normals, evaluations, status, depth, and values of
 another function on the surface.
 
-The numbers are exact, not averaged: those of one ray through the middle of each pixel. So are the
-pictures, but that of values: where it has edges, the colors of several rays are averaged.
+The numbers are exact, not averaged: those of a single ray through the middle of each pixel. So are
+the pictures, except those of values: at edges, the colors of several rays are averaged.
 """
 
 from __future__ import annotations
@@ -78,10 +78,10 @@ class AovBuffers:
 
 @dataclass(frozen=True)
 class AovTask:
-    """A sensor in a world.
+    """The rendering of AOVs for a sensor in a scene, by ranges of pixels.
 
     placement: of the surfaces, in whose coordinates depths are given.
-    function: of the same coordinates, to be evaluated at hits; None for none.
+    function: of the same coordinates, to be evaluated at hits; None for no function.
     """
 
     mi: Any
@@ -101,7 +101,7 @@ class AovTask:
         function: Field | None = None,
         background: Color = _BACKGROUND,
     ) -> AovTask:
-        """Of a loaded scene."""
+        """The task for a loaded Mitsuba scene."""
         return cls(mi, HybridScene.of(mi, scene), sensor, placement, function, background)
 
     @property
@@ -124,8 +124,8 @@ class AovTask:
     ) -> AovBuffers:
         """The first hits of the rays through the middles of all pixels.
 
-        hands: call methods of a viewer like this one, in the place of this one's. advance: told
-        what part has been finished since the last call.
+        hands: executes the methods of a task like this one in place of this task.
+        advance: called with the fraction that has been finished since the last call.
         """
         hands = LocalRenderExecutor(self) if hands is None else hands
         width, height = self.size
@@ -144,8 +144,8 @@ class AovTask:
         return _map_arrays(by_rows, *parts)
 
     def render_samples(self, pixels: IntArray, offsets: FloatArray) -> AovBuffers:
-        """The first hits of rays through places (m, 2) in each of n pixels, counted by rows: arrays
-        (n, m)."""
+        """The first hits of rays through points (m, 2) in each of n pixels, which are counted by
+        rows: arrays (n, m)."""
         mi, count = self.mi, len(offsets)
         pixel = upload_indices(mi, np.repeat(pixels, count))
         table = np.tile(offsets, (len(pixels), 1)).T
@@ -299,10 +299,11 @@ def _with_lost(view: AovBuffers, picture: FloatArray) -> npt.NDArray[np.uint8]:
 
 @dataclass(frozen=True)
 class AovMode:
-    """What to take from a view as numbers, and how to draw it.
+    """How an AOV is read from the buffers as numbers, and drawn.
 
-    scale: of numbers that have one, which `picture` draws them by; None for others.
-    is_averaged: whether the picture, not the numbers, averages several rays where it has edges.
+    scale: the color scale of the numbers, by which `picture` draws them; None for AOVs without a
+        scale.
+    is_averaged: whether the picture, not the numbers, averages several rays at edges.
     """
 
     numbers: Callable[[AovBuffers], Any]
@@ -340,10 +341,11 @@ def aov_picture(
     spp: int,
     hands: RenderExecutor | None = None,
 ) -> npt.NDArray[np.uint8]:
-    """The pixels of what a viewer has seen.
+    """The picture (h, w, 3) of AOV buffers.
 
-    value_range: of the scale, in place of what is seen. bar: whether to put a color bar beside
-    it, or what to write over that. spp: rays of a pixel on an edge, of pictures that are averaged.
+    value_range: of the scale, in place of the range of the numbers that are seen.
+    bar: whether to put a color bar beside the picture, or its title.
+    spp: rays of a pixel at an edge, for pictures that are averaged.
     hands: as for `AovTask.look`.
     """
     one = AOV_MODES[show]

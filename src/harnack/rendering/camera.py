@@ -1,4 +1,4 @@
-"""A camera that frames what stands on the stage."""
+"""A camera that frames the surfaces on the stage."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ class Camera:
         has to be traced to find the frame.
     position: (x, y, z), where the camera stands, in the coordinates of the surfaces, in place of
         azimuth and elevation.
-    target: (x, y, z), what is in the middle of the picture, in the same coordinates; by default the
-        middle of what is framed.
+    target: (x, y, z), the point in the middle of the picture, in the same coordinates; by default
+        the middle of the framed box.
     distance: from the target, in the same unit; by default what frames the surface.
     """
 

@@ -1,7 +1,8 @@
-"""What a picture frames: which way is up, the box that holds a surface, and where the surface is.
+"""Computes the framing of a picture: which way is up, the box that holds a surface, and where in it
+the surface is visible.
 
 The box that a surface is proved to lie in can be many times larger than the surface. A picture
-should be filled by what is visible, so the surface is found by tracing it from all sides.
+should be filled by the visible part, so the surface is located by tracing it from all sides.
 """
 
 from __future__ import annotations

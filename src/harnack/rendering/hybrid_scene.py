@@ -1,7 +1,9 @@
-"""Mitsuba scenes with level sets in them: rays through both, and hits as surface interactions.
+"""Mitsuba scenes with level sets in them: rays are traced through both, and hits become surface
+interactions.
 
-Mitsuba's integrators cannot see our surfaces: those that ask for light that our path tracer finds
-are followed, scenes without our surfaces are left to them, all else is refused by name.
+Mitsuba's integrators cannot see level sets. Where a scene's integrator asks for light that
+harnack's path tracer computes, that path tracer is used; scenes without level sets are left to
+Mitsuba; all else is refused by name.
 """
 
 from __future__ import annotations
@@ -22,12 +24,12 @@ if TYPE_CHECKING:
 
 
 def surface_interaction(mi: Any, met: SurfaceHit, ray: Any, shape: Any) -> Any:
-    """The SurfaceInteraction3f of a ray with one of our surfaces, valid where `met.is_hit`.
+    """The SurfaceInteraction3f of a ray with a level set, valid where `met.is_hit`.
 
-    shape: ShapePtr of the carrier, whose BSDF is asked. Texture coordinates are x and y of the
-    position in the world: a level set has no parametrization of its own. The index of the primitive
-    is the number of the isoline that is drawn there, by which a BSDF chooses
-    (`mitsuba_proxy.isoline_bsdf`).
+    shape: ShapePtr of the proxy, whose BSDF is evaluated. Texture coordinates are x and y of the
+        position in the world: a level set has no parametrization of its own. The index of the
+        primitive is the number of the isoline that is drawn there, by which a BSDF chooses
+        (`mitsuba_proxy.isoline_bsdf`).
     """
     si = dr.zeros(mi.SurfaceInteraction3f)
     si.t = dr.select(met.is_hit, met.t, dr.inf)
@@ -72,7 +74,8 @@ def spawn_ray_to(mi: Any, si: Any, clearance: Real, target: Vec3) -> Any:
 
 @dataclass(frozen=True)
 class HybridScene:
-    """What rays are traced in: all of a scene's shapes, ours and Mitsuba's."""
+    """The scene that rays are traced in: all of its shapes, Mitsuba's and the level sets of
+    harnack."""
 
     mi: Any
     scene: Any
@@ -82,7 +85,7 @@ class HybridScene:
 
     @classmethod
     def of(cls, mi: Any, scene: Any, *, queued: bool = False) -> HybridScene:
-        """Finds the carriers in a scene.
+        """Find the proxies of level sets in a scene.
 
         queued: whether rays are traced without delay, from a queue, which is faster where they
             differ in length, and cannot be done while a kernel is being recorded.

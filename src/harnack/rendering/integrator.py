@@ -1,12 +1,13 @@
-"""A path tracer that sees Mitsuba's shapes and ours, and the sampler of its light paths.
+"""A path tracer that sees both Mitsuba's shapes and level sets, and the sampler of its light paths.
 
-Light paths go in waves, rays by a queue. A recorded loop over whole paths waits for the slowest ray
-of each packet, at each vertex: three quarters of the lanes were idle. Paths that have ended are
-left out between vertices, and a lane that has followed a ray fetches the next. Any walk can be
-queued (`surface_tracer`), as its state is a record; `trace` does so with many rays whose neighbors
-differ, and nobody with fields whose samples take less time than fetching a ray (`Field.is_cheap`).
-Nothing differs but the order of lanes. What is evaluated lies in memory of its own, so that kernels
-do not depend on how many paths are left.
+Light paths are traced in waves (vertex by vertex), and their rays from a queue. In a recorded loop
+over whole paths, each packet of lanes would wait for its slowest ray at each vertex: three quarters
+of the lanes were idle. Paths that have ended are left out between vertices, and a lane that has
+finished a ray fetches the next. Any ray march can be queued (`surface_tracer`), as its state is a
+record; `trace` does so with many rays whose neighbors differ. No rays are queued for fields whose
+samples take less time than fetching a ray (`Field.is_cheap`). Only the order of lanes changes.
+Intermediate results lie in memory of their own, so that kernels do not depend on how many paths are
+left.
 
 Samples are computed from their index, since paths change lanes.
 """
@@ -173,14 +174,14 @@ class _LightConnection:
 
 @dataclass
 class DenoisingFeatures:
-    """Features of what paths hit first, for denoising: albedo, in (0, 1), and unit normal. Both are
-    0 where paths hit nothing."""
+    """Features of the first hits of paths, for denoising: albedo, in (0, 1), and unit normal. Both
+    are 0 where paths hit nothing."""
 
     albedo: Any
     normal: Any
 
     def record(self, mi: Any, si: Any, numbers: Any, active: Mask) -> None:
-        """Stores those of interactions, at the numbers of their paths."""
+        """Store the features of interactions, at the numbers of their paths."""
         bsdf, straight = si.bsdf(), mi.SurfaceInteraction3f(si)
         straight.wi = mi.Vector3f(0, 0, dr.mulsign(mi.Float(1), si.wi.z))
         albedo = bsdf.eval_diffuse_reflectance(straight, active)
@@ -193,8 +194,13 @@ class DenoisingFeatures:
 
 @dataclass
 class PathResults:
-    """What paths have found: radiance, whether they hit a surface, whether a ray ran out of steps;
-    and features of what they hit first, if asked for."""
+    """Results of light paths.
+
+    light: radiance.
+    valid: whether they hit a surface.
+    lost: whether a ray ran out of steps.
+    features: of the first hits, if requested.
+    """
 
     light: Any
     valid: Mask
@@ -207,9 +213,9 @@ class PathTracer:
 
     max_depth: longest path in edges, -1 for no limit. rr_depth: where Russian roulette begins.
     hide_emitters: whether lights and environment are invisible to the camera.
-    clamp: the most that a path may bring of light that was spread by a rough surface before its
-        last scattering. A finite one takes some light away, and with it the white specks of
-        sharp reflections and caustics that paths find too rarely.
+    clamp: an upper limit of the contribution of a path whose light was scattered by a rough surface
+        before its last scattering. A finite limit removes light, and with it the white specks
+        ("fireflies") of sharp reflections and caustics that paths sample too rarely.
     """
 
     def __init__(
@@ -245,7 +251,7 @@ class PathTracer:
     def trace(
         self, scene: Any, sampler: SobolSampler, ray: Any, active: Mask, features: bool = False
     ) -> PathResults:
-        """What paths find that begin with camera rays, one for each of the sampler's lanes.
+        """Trace the paths that begin with these camera rays, one for each of the sampler's lanes.
 
         Paths go on vertex by vertex, all together, and those that have ended are left out: what
         each part of a vertex needs is evaluated for the paths that need it (`backend.loops`).

@@ -158,7 +158,7 @@ class Isolines:
         return period / count
 
     def prepare(self, backend: Backend, size: float) -> PreparedIsolines:
-        """Everything uploaded. size: diagonal of the surface's box, for the usual width."""
+        """The isolines on a backend. size: diagonal of the surface's box, for the default width."""
         width = _USUAL_WIDTH * size if self.width is None else self.width
         step, period = self._exact_interval(), self.function_field.period
         volume = padded_domain(self.function_field, size)
@@ -216,10 +216,11 @@ def parse_isolines(given: Any) -> tuple[Isolines, ...]:
 
 @dataclass(frozen=True)
 class PreparedIsolines:
-    """Isolines on a backend; all that a person changes is data.
+    """Isolines on a backend; all of their numbers are data, which kernels do not depend on.
 
-    volume: where the function is defined; None for all of space. spacing: of lines at its
-        multiples, or levels: a table for those at given ones.
+    volume: where the function is defined; None for all of space.
+    spacing: of lines at whole multiples of it.
+    levels: a table, for lines at single levels.
     """
 
     function: Field
@@ -273,7 +274,8 @@ class PreparedIsolines:
 def isoline_index_at(
     lines: tuple[PreparedIsolines, ...], p: Vec3, normal: Vec3, index: Any
 ) -> Index:
-    """The number of the line that points are on, counted from 1, the last of several; else 0.
+    """The number of the isoline that points are on, counted from 1, the last one where several
+    overlap; 0 for none.
 
     index: the type of the numbers.
     """

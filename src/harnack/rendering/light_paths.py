@@ -1,8 +1,8 @@
-"""Light on its way to a sensor: path-traced pixels, and rays through clear matter.
+"""Renders path-traced pixels, and traces rays through transparent solids.
 
-How long a picture will take is told before it is begun; noise can be taken out of it.
+The time that a picture will take is estimated before it is begun; noise can be removed from it.
 
-Going in and out of a solid alternates, so that absorption in glass needs only the last encounter.
+Entering and leaving a solid alternate, so that absorption in glass depends on the last hit only.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _FILTER_REACH = 2.0
 class PathRender:
     """Radiance of all pixels of a sensor.
 
-    image: linear sRGB and, last, the part that something covers (h, w, 4).
+    image: (h, w, 4) linear sRGB and, last, the fraction of the pixel that is covered.
     lost: how many paths ran out of steps.
     albedo, normal: means (h, w, 3) of what paths hit first, if asked for.
     """
@@ -55,9 +55,10 @@ class PathRender:
 
 @dataclass(frozen=True)
 class PathRenderTask:
-    """A sensor, and who follows light paths for it: what is done pixel by pixel.
+    """The path tracing of a picture for a sensor, by ranges of pixels.
 
-    features: whether to find albedos and normals too. paths_a_band: at once, at most.
+    features: whether to compute albedos and normals too.
+    paths_a_band: the largest number of paths traced at once.
     """
 
     mi: Any
@@ -109,8 +110,8 @@ def render_paths(
 ) -> PathRender:
     """Radiance of all pixels.
 
-    advance: told what part of the picture has been finished since the last call.
-    hands: call the method `render_range`, in the place of `exposing` itself.
+    advance: called with the fraction of the picture that has been finished since the last call.
+    hands: executes the method `render_range`, in place of `exposing` itself.
     """
     hands = LocalRenderExecutor(exposing) if hands is None else hands
     width, height = exposing.size
@@ -134,7 +135,8 @@ def trace_samples(
     mi: Any, scene: Any, sensor: Any, tracer: PathTracer, pixel: Any, sample: Any, seed: int,
     features: bool,
 ) -> tuple[PathResults, Any]:  # fmt: skip
-    """What paths through samples of pixels find, as the sensor weighs it, and its wavelengths."""
+    """Trace paths through samples of pixels. Returns their results, weighted by the sensor, and
+    their wavelengths."""
     width, height = (int(n) for n in sensor.film().crop_size())
     zero, own = dr.opaque(mi.UInt32, 0), dr.opaque(mi.UInt32, _mixed(seed))
     sampler = SobolSampler(mi, pixel, sample, own, zero)
@@ -201,7 +203,7 @@ class TimeEstimate:
 
     @property
     def paths_a_band(self) -> int:
-        """Paths that take as long as a progress bar may stand still."""
+        """The number of paths that take as long as a progress bar may stand still."""
         return round(min(max(_BAND / max(self.path, 1e-9), _FEWEST), MAX_PATHS_PER_BATCH))
 
     def __str__(self) -> str:
@@ -281,7 +283,7 @@ def denoise_image(found: PathRender) -> npt.NDArray[np.float32]:
     return np.concatenate([clean, found.image[..., 3:]], axis=-1)
 
 
-# Rays through clear matter.
+# Rays through transparent solids.
 
 # Boundaries that a ray goes through; the next one is opaque.
 _MAX_INTERFACES = 32
@@ -291,14 +293,15 @@ _DEFAULT_REFLECTANCE = 0.04
 
 @dataclass
 class RefractedHits:
-    """What rays see: the first thing that light does not pass through.
+    """The first opaque hits of rays through transparent solids.
 
-    ray: the last part of their way.
-    si, first: what it hits, as an interaction and as a `SurfaceHit`.
-    throughput: what is left of the light from there.
-    reflected_light: the light that boundaries on the way reflect to the eye.
-    path_length: the length of the way before the last part.
-    interface_count: how many boundaries they have met.
+    ray: the last segment of the path.
+    si, first: its hit, as an interaction and as a `SurfaceHit`.
+    throughput: the fraction of the light from there that reaches the eye.
+    reflected_light: the light that interfaces on the path reflect to the eye.
+    path_length: the length of the path before the last segment.
+    interface_count: how many interfaces the path has crossed.
+    active: rays that are still being traced.
     """
 
     ray: Any
@@ -312,14 +315,14 @@ class RefractedHits:
 
 
 class RefractionTracer:
-    """What shaded pictures show behind clear matter: rays go on through it, bent and tinted.
+    """Traces refracted rays through transparent solids for shaded pictures.
 
-    Of the two ways that light takes at a boundary only the one through it is followed, and the one
-    back where all of it is reflected; what else is reflected is the sky's light and a highlight. So
-    a picture has no noise, and no caustics.
+    At an interface only the transmitted ray is followed (the reflected one for total reflection);
+    the other contributes sky light and a highlight. So there is no noise, and there are no
+    caustics.
 
-    indices: of refraction, of each carrier that is clear.
-    hides_lights: whether shapes that shine are not seen.
+    indices: of refraction, of each proxy shape that is transparent.
+    hides_lights: whether shapes that emit light are not seen.
     """
 
     def __init__(
@@ -332,7 +335,7 @@ class RefractionTracer:
         self.indices = tuple((carrier, index) for carrier, index in found if index is not None)
 
     def trace(self, ray: Any) -> RefractedHits:
-        """What camera rays see."""
+        """The first opaque hits of camera rays, behind transparent solids."""
         mi, world = self.world.mi, self.world
         nothing = dr.zeros(mi.SurfaceInteraction3f, dr.width(ray.d))
         sight = RefractedHits(

@@ -1,6 +1,7 @@
-"""Mitsuba: imported with a usable variant, its scene files, and what clear matter does to light.
+"""Imports Mitsuba with a usable variant, loads its scene files, and computes refraction and
+absorption in transparent solids.
 
-Scene files in XML are checked before Mitsuba reads them, and its errors are told in words.
+Scene files in XML are checked before Mitsuba reads them, and its errors are reworded.
 """
 
 from __future__ import annotations
@@ -200,7 +201,7 @@ _SAME = 1e-6
 
 
 def transmittance_texture(mi: Any, tint: Any) -> Any:
-    """A texture of what is left of light after one unit of length; None where all of it is.
+    """A texture of the transmittance per unit of length; None where no light is absorbed.
 
     Raises:
         TypeError, ValueError: not three numbers in (0, 1].
@@ -220,8 +221,8 @@ def transmittance_texture(mi: Any, tint: Any) -> Any:
 
 
 def refractive_index(mi: Any, carrier: Any) -> Any:
-    """The index of refraction of a solid that light passes through, relative to what is around it,
-    as a kernel parameter; None for what is opaque, or no solid."""
+    """The index of refraction of a transparent solid, relative to its surroundings, as a kernel
+    parameter; None for opaque shapes, and for shapes that are no solids."""
     bsdf = carrier.bsdf()
     passes = (mi.BSDFFlags.DeltaTransmission, mi.BSDFFlags.GlossyTransmission)
     if carrier.surface.solid is None or not any(mi.has_flag(bsdf.flags(), one) for one in passes):
@@ -258,9 +259,9 @@ def transmittance(mi: Any, carriers: Any, start: Any, si: Any, d: Any) -> Any:
 
 
 def refract(normal: Any, d: Any, index: Any) -> tuple[Any, Any]:
-    """Where rays in unit directions d go through a boundary with an outward unit normal, and how
-    much of unpolarized light is reflected there (Fresnel). All of it is where it is 1: then the
-    direction is that of the mirror.
+    """Refract rays in unit directions d at an interface with an outward unit normal. Returns the
+    directions behind it, and the fraction of unpolarized light that is reflected (Fresnel). Where
+    that is 1 (total reflection), the direction is that of the mirror.
 
     index: of refraction, of the inside relative to the outside.
     """

@@ -17,12 +17,12 @@ scenes that are put together in Python.
 </shape>
 <integrator type="harnack_path"/>                  max_depth, rr_depth, hide_emitters, clamp
 
-Mitsuba's own integrators ask Mitsuba's shapes alone, for which a carrier is two points: they would
+Mitsuba's own integrators ask Mitsuba's shapes alone, for which a proxy is two points: they would
 draw nothing, and say nothing. No method of a shape is called while they render, so `mitsuba.render`
 looks first and warns. `harnack.render` follows paths itself where the integrator asks for the same
 light, leaves scenes without our surfaces to Mitsuba, and refuses the rest.
 
-Mitsuba surfaces are zero-area carrier meshes with a path integrator that meets both worlds; finding
+Mitsuba surfaces are zero-area proxy meshes with a path integrator that meets both worlds; finding
 a hit and describing it (`SurfaceInteraction`) are separate, since Mitsuba's next release lets
 Python define shapes.
 """
@@ -96,12 +96,13 @@ def warn_unsupported_integrator(scene: Any, integrator: Any) -> None:
 
 
 def equivalent_path_tracer(mi: Any, scene: Any) -> PathTracer | None:
-    """The path tracer that finds the light that the scene's integrator asks for; None for scenes
-    without surfaces of ours that Mitsuba has to draw itself.
+    """Return a path tracer equivalent to the scene's integrator; None where Mitsuba has to draw the
+    scene itself: its integrator follows no paths, and the scene has no surfaces of harnack, or the
+    integrator sees them.
 
     Raises:
-        ValueError: the scene holds surfaces of ours, and its integrator asks for what no path
-            tracer without media finds, such as light in a medium or channels of its own.
+        ValueError: the scene has surfaces of harnack, and its integrator asks for something that no
+            path tracer without media computes, such as light in a medium or channels of its own.
     """
     integrator = scene.integrator()
     if integrator is None:

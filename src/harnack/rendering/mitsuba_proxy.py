@@ -1,9 +1,9 @@
-"""Level sets in Mitsuba scenes: the meshes that carry them, and BSDFs with isolines.
+"""Represents level sets in Mitsuba scenes: proxy meshes that hold them, and BSDFs with isolines.
 
-Mitsuba 3.9 has no shapes written in Python, except meshes. So a level set travels in a *carrier*, a
+Mitsuba 3.9 has no shapes written in Python, except meshes. So a level set is held by a *proxy*, a
 mesh of two triangles that are each a point, at opposite corners of its bounding box: no ray hits
-them, but the scene's bounding box is right, and the mesh holds the BSDF. `world.HybridScene` finds
-the carriers in a scene and traces their level sets.
+them, but the scene's bounding box is right, and the mesh holds the BSDF. `hybrid_scene.HybridScene`
+finds the proxies in a scene and traces their level sets.
 
 On isolines the BSDF is another one, chosen by the number of the isoline (`isoline_bsdf`).
 """
@@ -55,7 +55,8 @@ def _lined_class(variant: str) -> Any:
     assert mi.variant() == variant
 
     class Lined(mi.BSDF):
-        """`world.surface_interaction` gives the isoline's number as the index of the primitive."""
+        """`hybrid_scene.surface_interaction` gives the isoline's number as the index of the
+        primitive."""
 
         def __init__(self, base: Any, paints: Sequence[Any]) -> None:
             mi.BSDF.__init__(self, mi.Properties())
@@ -135,7 +136,7 @@ def from_properties(
     isolines: to be drawn on the surface.
 
     Raises:
-        ValueError: as `shape`; or the properties hold an emitter or a medium.
+        ValueError: as `mitsuba_shape`; or the properties hold an emitter or a medium.
     """
     if tint is not None and surface.solid is None:
         raise ValueError(
@@ -223,5 +224,5 @@ def _bsdf_holder(mi: Any, bsdf: Any) -> Any:
 
 
 def is_proxy(shape: Any) -> bool:
-    """Whether a Mitsuba shape carries one of our surfaces."""
+    """Whether a Mitsuba shape is the proxy of a harnack surface."""
     return isinstance(getattr(shape, "placed", None), PlacedSurface)

@@ -1,4 +1,4 @@
-"""`render`: a field in, a picture out."""
+"""`render`: draws a picture of fields, surfaces or Mitsuba scenes."""
 
 from __future__ import annotations
 
@@ -141,7 +141,7 @@ def render(
     cut_material: what the faces of opaque solids on their `section` are made of.
     isolines: lines on the surfaces, of heights or of another function, where `show` is "path",
         "shaded" or "value": an `Isolines` or several.
-    thickness: draws surfaces as sheets so thick, in their own coordinates: the closed meshes that
+    thickness: draws surfaces as walls so thick, in their own coordinates: the closed meshes that
         `harnack.mesh` makes with this thickness, whose triangles are seen from close by.
     settings: of the surfaces, as `harnack.level_set` takes them: level, clip, section, solid, ...;
         those of a `Surface` are replaced. A `Solid` with a section is drawn as one, with faces

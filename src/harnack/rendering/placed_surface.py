@@ -104,7 +104,8 @@ class _IsolineIndex:
 class PlacedSurface:
     """A level set or solid on a backend, to be hit by rays of the world.
 
-    rotation_rows: of the rotation; all numbers are kernel parameters. lines: isolines drawn on it.
+    rotation_rows: of the rotation; all numbers are kernel parameters.
+    isolines: drawn on it.
     """
 
     prepared: SurfaceTracer
@@ -119,7 +120,8 @@ class PlacedSurface:
         cls, surface: Surface, placement: Placement, backend: Backend,
         isolines: Sequence[Isolines] = (), size: float = 1.0,
     ) -> PlacedSurface:  # fmt: skip
-        """Everything uploaded. size: diagonal of the surface's box, for the width of lines."""
+        """The surface on a backend. size: diagonal of the surface's box, for the default width of
+        isolines."""
 
         def vector(numbers: FloatArray) -> Vec3:
             return backend.Array3f(*(dr.opaque(backend.Float, float(x)) for x in numbers))
@@ -202,9 +204,13 @@ class PlacedSurface:
         t_max: Real,
         bounding_balls: tuple[Vec3, Real, Real] | None,
     ) -> Mask:
-        """Which cones around rays of the world it covers in part, before t_max or anything else.
+        """Which cones around rays of the world are partly covered by the surface, before t_max or
+        anything else.
 
-        radius: per unit of t. around: see `PixelCones`. The surface must be prepared for crossings.
+        radius: of the cones, per unit of t.
+        bounding_balls: see `PixelCones`.
+
+        The surface must be prepared for crossings.
         """
         o, d, t_max = self._local_ray(o, d, t_max)
         solid = None if self.solid is None else (self.solid.low, self.solid.high)

@@ -1,4 +1,4 @@
-"""What a picture is drawn from, which can be sent to other processes to have parts drawn there."""
+"""The job of a picture, which can be sent to other processes to have parts of it drawn there."""
 
 from __future__ import annotations
 
@@ -36,12 +36,15 @@ _RAYS_A_PATH = 3
 
 @dataclass(frozen=True)
 class RenderJob:
-    """All that decides what is in a picture.
+    """Everything that determines a picture.
 
-    what: fields or a Mitsuba scene, as `render` takes them. asked: how to draw them. settings: of
-        the surfaces. variant: of Mitsuba.
+    what: fields or a Mitsuba scene, as `render` takes them.
+    options: how to draw them.
+    settings: of the surfaces.
+    variant: of Mitsuba.
 
-    Methods that are named like those of a drawing draw a part and give plain arrays.
+    Methods named like those of a task (`AovTask`, `PathRenderTask`, `ShadedTask`) draw a part of
+    the picture and return plain arrays.
     """
 
     what: Any
@@ -141,17 +144,18 @@ class RenderJob:
 
 @dataclass(frozen=True)
 class ClusterRenderExecutor:
-    """Hands that are a crew's: they call methods of a job and give what its drawing would."""
+    """Executes tasks on a cluster: its workers call the methods of a `RenderJob`, with the results
+    that the task itself would return."""
 
     crew: Executor
     job: RenderJob
 
     def split_range(self, count: int, most: int) -> list[tuple[int, int]]:
-        """As suits the crew."""
+        """Ranges (start, stop) of a number that suits the workers."""
         return self.crew.split_range(count, most)
 
     def run_tasks(self, step: str, parts: Sequence[tuple[Any, ...]]) -> Iterator[Any]:
-        """In order, several at the same time."""
+        """Results of the tasks, in order; several run at the same time."""
         drawing = self.job.task
         for found in self.crew.run_tasks(self.job, step, parts):
             if isinstance(drawing, AovTask):

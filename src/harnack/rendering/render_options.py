@@ -286,8 +286,8 @@ def _setting(check: Check = _as_given, **marks: bool) -> Mapping[str, Any]:
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """The settings of `render`, checked: sizes and counts are integers, None means not set. Each
-    field holds its check; films read this table too."""
+    """The checked options of `render`: sizes and counts are integers, None means not set. The
+    metadata of each field holds its check; animations read this table too."""
 
     show: str = field(metadata=_setting(_ignoring_mode(check_show)))
     size: tuple[int, int] | None = field(metadata=_setting(_if_given(check_image_size)))

@@ -176,19 +176,19 @@ _FIRST_PASS_FRACTION = 0.6
 
 @dataclass
 class GBuffer:
-    """What rays hit first, or first behind clear matter.
+    """G-buffer: per pixel, the first opaque hit, seen through transparent solids.
 
-    position, normal, eye: the point, its unit normal towards the eye, and the direction to the eye.
-    width: of a pixel, there.
+    position, normal, eye: the point, its unit normal toward the eye, and the direction to the eye.
+    width: pixel size there.
     color: reflectance.
-    light: shone by an emitter or the environment and reflected by clear matter, or magenta for
-        lost.
-    transmittance: what clear matter leaves of the light from what is hit.
-    glossy: whether the material is glossy. met, lost: whether there is a hit; and whether the ray
-        ran out of steps.
-    covered: whether there is anything at all, and not the environment alone.
-    needs_refinement: whether to draw the pixel again, as the edge of an isoline may pass through
-        it, or a cone found that a surface covers a part of it.
+    light: emitted, from the environment, or reflected by transparent solids; magenta for rays out
+        of steps.
+    transmittance: of the transparent solids in front.
+    glossy: whether the material is glossy.
+    met, lost: whether there is a hit; whether the ray ran out of steps.
+    covered: whether anything but the environment is visible.
+    needs_refinement: whether the pixel is to be drawn again, as an isoline's edge may cross it, or
+        a cone found it partly covered.
     """
 
     position: Any
@@ -212,12 +212,12 @@ class GBuffer:
         return cls(*(dr.zeros(kind, count) for kind in kinds))
 
     def to_numpy(self) -> dict[str, npt.NDArray[Any]]:
-        """As arrays of NumPy, by name."""
+        """The arrays as NumPy arrays, by name."""
         return {name: to_numpy(value) for name, value in vars(self).items()}
 
     @classmethod
     def from_numbers(cls, mi: Any, numbers: Mapping[str, npt.NDArray[Any]]) -> GBuffer:
-        """From what `to_numpy` gave, here or in another process."""
+        """The G-buffer from the result of `to_numpy`, of this process or another."""
         empty = vars(cls.nothing(mi, 0))
         return cls(
             **{name: _of_numbers(mi, type(kind), numbers[name]) for name, kind in empty.items()}
@@ -233,16 +233,16 @@ def _of_numbers(mi: Any, kind: Any, numbers: npt.NDArray[Any]) -> Any:
 
 
 class ShadedTask:
-    """A sensor in a world, its light, and what of a shaded picture can be done pixel by pixel.
+    """The rendering of a shaded picture for a sensor and a light, by ranges of pixels.
 
-    spp: rays of a pixel on an edge, at least; 1 for one ray a pixel everywhere.
+    spp: rays of a pixel at an edge, at least; 1 for a single ray in every pixel.
     on_floor: whether the scene is a studio's, whose floor shows shadows.
-    cut_out: whether to leave out the light of what is behind everything.
+    cut_out: whether to leave out the light of the backdrop behind all objects.
     cones: whether cones find pixels to draw again, besides the edges in the picture.
 
     Raises:
-        ValueError: the Mitsuba variant is spectral, whose four wavelengths a ray are no color;
-            or cones are asked to find a field that jumps.
+        ValueError: the Mitsuba variant is spectral, whose four wavelengths a ray are no color; or
+            cones are requested for a field that jumps.
     """
 
     def __init__(
@@ -270,7 +270,8 @@ class ShadedTask:
         self.floor = FloorShadow.of(world, self.light) if on_floor else None
 
     def render_gbuffer(self, start: int, stop: int) -> GBuffer:
-        """What the rays through the middles of some pixels hit first; `order` counts pixels."""
+        """The first hits of the rays through the middles of a range of pixels; `order` counts
+        pixels."""
         mi = self.mi
         pixel = upload_indices(mi, self.order[start:stop])
         seen = self._look(pixel, mi.Vector2f(_MIDDLE))

@@ -32,35 +32,39 @@ _EDGE = 16
 
 
 def pixel_ranges(pixels: int, step: int) -> Iterator[tuple[int, int]]:
-    """(start, stop) of runs of at most `step` pixels: Ctrl-C works between them."""
+    """Ranges (start, stop) of at most `step` pixels that cover range(pixels).
+
+    Ctrl-C works between the ranges.
+    """
     for start in range(0, pixels, step):
         yield start, min(start + step, pixels)
 
 
 class RenderExecutor(Protocol):
-    """Those who do the parts of a picture."""
+    """Interface to what executes the tasks of a render: this process, or a Dask cluster."""
 
     def split_range(self, count: int, most: int) -> list[tuple[int, int]]:
-        """(start, stop) of runs of things that are counted from 0, at most `most` a run."""
+        """Ranges (start, stop) that cover range(count), each of at most `most` elements."""
         ...
 
     def run_tasks(self, step: str, parts: Sequence[tuple[Any, ...]]) -> Iterator[Any]:
-        """What a method, given by its name, returns for the arguments of each part, in order."""
+        """Results of the method named `step`, called with the arguments of each of `parts`, in
+        order."""
         ...
 
 
 @dataclass(frozen=True)
 class LocalRenderExecutor:
-    """This process, which calls the methods of an object."""
+    """Executes tasks in this process: calls the methods of the object `drawing`."""
 
     drawing: Any
 
     def split_range(self, count: int, most: int) -> list[tuple[int, int]]:
-        """As few runs as there may be."""
+        """The fewest ranges possible."""
         return list(pixel_ranges(count, most))
 
     def run_tasks(self, step: str, parts: Sequence[tuple[Any, ...]]) -> Iterator[Any]:
-        """One after the other."""
+        """Results of the tasks, which are run one after the other."""
         method = getattr(self.drawing, step)
         return (method(*part) for part in parts)
 
@@ -157,8 +161,9 @@ class StudioLight:
     """The light of shaded pictures: a formula, so that one ray a sample is all they need.
 
     A soft key light from the upper left of the camera, a hemisphere of light that is cooler above
-    than below, and a gloss on what is glossy. `shaded.ambient_visibility` says how much of the
-    hemisphere is hidden by what is near, `FloorShadow` where the studio's floor lies in shadow.
+    than below, and highlights on glossy materials. `shaded_render.ambient_visibility` computes how
+    much of the hemisphere is hidden by nearby surfaces, `FloorShadow` where the studio's floor
+    lies in shadow.
 
     key, up: unit vectors, as lists of three numbers, to the key light and to the brighter
     hemisphere.
@@ -252,7 +257,7 @@ _BLUR = (0.05, 0.2, 0.25, 0.25, 0.2, 0.05)
 
 
 class ShadowCaster(Protocol):
-    """What casts shadows, such as a `HybridScene`."""
+    """Interface to objects that cast shadows, such as a `HybridScene`."""
 
     @property
     def mi(self) -> Any: ...
@@ -264,15 +269,15 @@ class ShadowCaster(Protocol):
 
 @dataclass(frozen=True)
 class FloorShadow:
-    """The soft shadow on the studio's floor, traced on a coarse grid and blurred: what of the key
-    light and of the sky reaches the floor, a texture of two channels."""
+    """The soft shadow on the studio's floor, traced on a coarse grid and blurred: a texture of two
+    channels, the fractions of the key light and of the sky's light that reach the floor."""
 
     mi: Any
     texture: Any
 
     @classmethod
     def of(cls, world: ShadowCaster, light: StudioLight) -> FloorShadow:
-        """Traced in a studio."""
+        """The shadow of a studio scene, by tracing rays."""
         mi = world.mi
         cell = (np.arange(_CELLS) + 0.5) / _CELLS * 2 * _REACH - _REACH
         y, x = np.meshgrid(cell, cell, indexing="ij")

@@ -58,15 +58,15 @@ def _metal(name: str, roughness: float) -> Dictionary:
 
 @dataclass(frozen=True)
 class Material:
-    """What a surface is made of.
+    """The material of a surface.
 
     front: BSDF of the side of larger values (the normal's side); of a solid, its outside.
     back: of the other side of an open surface; None for the same as the front.
-    two_sided: whether open surfaces are to be seen from both sides. A BSDF that takes care of
-        that itself does not want it.
-    transparent: light passes through it, so that only a solid can be made of it.
-    tint: what it leaves of red, green and blue light that passes through one unit of length on the
-        stage, where half the diagonal of all that stands there is 1; None for all.
+    two_sided: whether open surfaces are to be seen from both sides. A BSDF that takes care of that
+        itself does not need it.
+    transparent: light passes through it, so that only a solid can have it.
+    tint: the fraction of red, green and blue light that is left after one unit of length on the
+        stage, where half the diagonal of the box of all objects is 1; None for all of the light.
     """
 
     front: Dictionary
@@ -191,7 +191,7 @@ _LIGHT = GroundBackdrop("light")
 
 @dataclass(frozen=True)
 class StudioObject:
-    """A surface on the stage.
+    """A surface on the stage, with its material.
 
     has_default_tolerance: whether to give it a tolerance that suits its size in place of its own.
     section_material: the material of the faces at which a section cuts a solid; None for that of
@@ -208,10 +208,13 @@ class StudioObject:
 
 @dataclass(frozen=True)
 class StudioScene:
-    """A scene dictionary, and what a picture of it needs besides.
+    """A studio scene.
 
-    placement: of the surfaces in it. backdrop: as given. azimuth: of the camera. has_ground:
-        whether the surfaces stand on a floor.
+    scene: the dictionary for Mitsuba.
+    placement: of the surfaces in it.
+    backdrop: as passed to `build_studio`.
+    azimuth: of the camera.
+    has_ground: whether the surfaces stand on a floor.
     """
 
     scene: dict[str, Any]
@@ -234,7 +237,8 @@ def build_studio(
 ) -> StudioScene:
     """Surfaces on the stage, seen in a picture of (width, height) pixels.
 
-    up: the direction of the surfaces' coordinates that is up on the stage, as `upright` takes it.
+    up: the direction of the surfaces' coordinates that is up on the stage, as `rotation_to_z_up`
+        takes it.
     bare: only surfaces and camera, without ground and lights.
     traced_light: whether the picture follows light paths, and so needs whole materials.
     """

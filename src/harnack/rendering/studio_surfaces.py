@@ -1,4 +1,4 @@
-"""From what `render` is given to surfaces on the stage of the studio."""
+"""Turns the arguments of `render` into surfaces on the stage of the studio."""
 
 from __future__ import annotations
 
@@ -214,7 +214,7 @@ def _surface(one: Field | Surface, settings: Mapping[str, Any], clear: bool) -> 
 
 
 def with_options(one: Field | Surface, settings: Mapping[str, Any]) -> Surface:
-    """A surface with settings of `level_set` in the place of its own."""
+    """The surface, with its own options replaced by `settings` of `level_set`."""
     if isinstance(one, Field):
         return level_set(one, **settings)
     if not settings:

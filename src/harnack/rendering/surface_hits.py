@@ -1,7 +1,7 @@
 """First hits of rays with level sets and closed solids: refined positions, oriented normals.
 
 Everything here is in the surface's own coordinates and knows no Mitsuba;
-`world.surface_interaction` turns a hit into what a BSDF takes.
+`hybrid_scene.surface_interaction` turns a hit into what a BSDF takes.
 """
 
 from __future__ import annotations
@@ -32,22 +32,20 @@ _GRAZING = 1e-3
 
 @dataclass
 class SurfaceHit:
-    """What rays hit first. Lanes that hit nothing have t = inf, and neither is_hit nor
-    is_out_of_steps.
+    """First hits of rays. Rays without a hit have is_hit = is_out_of_steps = False and t = inf.
 
-    t: ray parameter; of a lost ray, how far it is proved free.
+    t: ray parameter of the hit; of a ray out of steps, up to where it is proved free.
     is_hit: there is a surface at t.
     is_out_of_steps: the ray ran out of steps behind t.
-    position, normal: of the surface. The normal is unit and points to the side of larger values or,
-        of a solid, out of it.
-    ray_offset: how far off the surface the next ray has to start.
-    value: of the field, close to the surface or, of a sheet (where a field jumps), just before it;
-        undefined where nothing is hit.
-    evaluations: of the field.
-    is_on_section: the hit is on a face at which the section cuts a solid.
-    is_hole_filling: of a field with sheets, the hit is on none: the surface closes a hole between
-        them there.
-    isoline_index: the number of the isoline drawn there, counted from 1; 0 for none.
+    position, normal: of the surface. The normal is unit and points toward larger values or, of a
+        solid, outward.
+    ray_offset: how far off the surface the next ray must start.
+    value: of the field, close to the surface or just before a jump; undefined without a hit.
+    evaluations: number of evaluations of the field.
+    is_hole_filling: the field has jumps but the hit is on none; the surface closes a hole between
+        jump surfaces there.
+    is_on_section: the hit is on a face where the section cuts a solid.
+    isoline_index: of the isoline drawn there, from 1; 0 for none.
     """
 
     t: Real
@@ -75,7 +73,7 @@ def intersect_surface(
 
     A confirmed hit is at a root already, and its side is known.
 
-    A hit on a sheet is not moved; the normal points to the side of larger values.
+    A hit on a jump surface is not moved; the normal points to the side of larger values.
     """
     trace = prepared.first_hit(o, d, 0, t_max, active)
     if not prepared.uses_ray_queue:

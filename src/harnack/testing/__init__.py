@@ -1,7 +1,7 @@
-"""Tests of fields and bounds, for the library's own and for those that users write.
+"""Tests of fields and enclosures, for those of the library and for those that users write.
 
-`check_field(MyField())` samples every promise of a field, `check_enclosure(MyBound())` tries a
-bound on random functions of every kind, among them the extremal ones. Both raise
+`check_field(MyField())` samples every promise of a field; `check_enclosure(MyEnclosure)` tries an
+enclosure on random functions of every kind, among them the extremal ones. Both raise
 `BrokenPromiseError`.
 """
 

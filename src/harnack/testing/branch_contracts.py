@@ -1,4 +1,4 @@
-"""What is promised of the branches of a Riemann surface, sampled."""
+"""Contracts of the branches of a Riemann surface, tested by sampling."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ _SLACK = 1e-6
 
 
 def check_branch_points(field: RiemannSurface, size: float, rng: np.random.Generator) -> None:
-    """Test that |g - value| <= constant |z - at|^power within the radius of each branch point, for
-    the part of g that is drawn, up to its period: proofs of steps near it are made of that, and
-    rays that happen to come so near are few.
+    """Check that |g - value| <= constant |z - at|^power within the radius of each branch point, for
+    the part of g that is drawn, up to its period. Enclosures near a branch point are derived from
+    that, and few rays come so near by chance.
 
-    size: of the domain, as far as a radius may be infinite.
+    size: of the domain; it limits an infinite radius.
 
     Raises:
-        BrokenPromiseError: naming the branch point, and the place where it does not hold.
+        BrokenPromiseError: naming the branch point, and the point where the bound does not hold.
     """
     for point in field.branches.branch_points:
         if point.power is not None:

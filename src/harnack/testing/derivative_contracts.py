@@ -1,4 +1,5 @@
-"""Derivatives that a field gives, compared with differences of what they are derivatives of."""
+"""Contracts of derivatives: the derivatives that a field returns, compared with finite
+differences."""
 
 from __future__ import annotations
 
@@ -26,25 +27,26 @@ if TYPE_CHECKING:
 
 __all__ = ["check_derivatives"]
 
-# Nodes of central differences in units of h, and the weights over h of two derivatives of fourth
-# order: with spacing h, and with 2h. They differ by 15 times the error of the former, to its first
-# order, so this share of the difference allows for three times that error (Richardson).
+# Fourth-order central differences with spacing h and with 2h: nodes in units of h, weights in units
+# of 1/h. Their difference is 15 times the leading error of the finer one, so a fifth of it
+# (_RICHARDSON_SHARE) allows three times that error (Richardson extrapolation).
 _NODES = (-4.0, -2.0, -1.0, 1.0, 2.0, 4.0)
 _WEIGHTS = (0.0, 1 / 12, -8 / 12, 8 / 12, -1 / 12, 0.0)
 _WIDE_WEIGHTS = (1 / 24, -8 / 24, 0.0, 0.0, 8 / 24, -1 / 24)
 _RICHARDSON_SHARE = 0.2
-# Where no promise says over which length f is smooth, spacings of these shares of the points' own
-# size are tried.
+# Where no promise says over which length f is smooth, spacings of these fractions of `_scale`
+# are tried, too.
 _SPACING_FACTORS = (1.0, 0.1, 0.01, 1e-3, 1e-4)
-# Of a field with an error the differences must agree at this share of the points even without it:
-# between neighboring points an approximation mostly is a smooth function itself.
+# For a field with an error bound, the differences must agree at this fraction of the points even
+# without allowance for it: between neighboring points an approximation mostly is smooth itself.
 _MIN_SMOOTH_FRACTION = 0.5
-# Of a field with creases they must agree at this share.
+# For a field with creases they must agree at this fraction of the points.
 _MIN_FRACTION_OFF_CREASES = 0.9
 
 
 def check_derivatives(field: Field, points: FloatArray, look: FieldSamples) -> None:
-    """Gradient, Laplacian and Hessian at points (n, 3), where `look` has the field's values.
+    """Check gradient, Laplacian and Hessian at points (n, 3), where `look` has the samples of the
+    field.
 
     Differences are taken within the field's domain; points too close to its border for that are
     left out.
@@ -77,7 +79,8 @@ def check_derivatives(field: Field, points: FloatArray, look: FieldSamples) -> N
 def _spacing_within(
     field: Field, points: FloatArray, h: FloatArray
 ) -> tuple[FloatArray, BoolArray]:
-    """Spacings with all nodes in the domain, and at which points there are such."""
+    """Spacings such that all nodes lie in the domain, and at which points there is such a
+    spacing."""
     fits = np.ones(len(points), dtype=np.bool_)
     if field.domain is None:
         return h, fits
@@ -94,11 +97,12 @@ def _spacing_within(
 
 @dataclass(frozen=True)
 class _StencilSample:
-    """The field at points + node h along an axis, for a node of the differences.
+    """The samples of the field at points + node h along an axis, for a node of the differences.
 
-    h: (n,). weight: (n,) of the node, over h; wide: the same with twice the spacing. move: (n,) of
-    the value since the points, jumps and periods taken out. error: (n,) what errors at both ends
-    may have added to it, gradient_error likewise.
+    h: (n,) the spacing.
+    weight: (n,) of the node, divided by h; wide: the same with twice the spacing.
+    move: (n,) the difference of the value to that at the points, without jumps and periods.
+    error: (n,) a bound of the errors of both values in it, gradient_error likewise.
     """
 
     axis: int
@@ -150,7 +154,7 @@ def _without_truncation(
 def _pick_spacing(
     trials: list[list[_StencilSample]], choice: npt.NDArray[np.intp]
 ) -> list[_StencilSample]:
-    """Of several spacings the one chosen at each point."""
+    """The samples at the spacing that `choice` selects for each point."""
     if len(trials) == 1:
         return trials[0]
     rows = np.arange(len(choice))
@@ -170,7 +174,8 @@ def _spacing(points: FloatArray, look: FieldSamples) -> FloatArray:
 
 
 def _scale(points: FloatArray, look: FieldSamples) -> FloatArray:
-    """A length (n,) over which the field is smooth: the smallest radius that is promised."""
+    """A length (n,) over which the field is smooth: the smallest radius of its `HarmonicBall`
+    promises, at most the extent of the points."""
     size = float(np.ptp(points, axis=0).max()) or 1.0
     radii = [known.radius for known in look.promises if isinstance(known, HarmonicBall)]
     smooth = np.min([np.full(len(points), size), *radii], axis=0)
@@ -203,8 +208,8 @@ def _difference(nearby: list[_StencilSample]) -> tuple[FloatArray, FloatArray]:
 def _limits(
     field: Field, points: FloatArray, look: FieldSamples, nearby: list[_StencilSample]
 ) -> tuple[FloatArray, FloatArray]:
-    """How far differences of the value may be from the gradient (n,): what they leave out and
-    rounding, and besides what errors of value and gradient allow."""
+    """Two bounds (n,) of the difference between differences of the value and the gradient: their
+    truncation and rounding error, and the errors of value and gradient."""
     h = nearby[0].h
     allowance = look.gradient_error.copy()
     for neighbor in nearby:
@@ -276,8 +281,8 @@ def _check_laplacian(
 def _likeliest(
     tried: list[tuple[FloatArray, ...]],
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """At each point, of the two spacings at which differences tell most, the one at which they
-    agree better: how far off they are, the tolerance and the allowance, (n,) each.
+    """At each point, of the two spacings with the smallest bounds, the spacing at which they agree
+    better: the difference, the tolerance and the allowance, (n,) each.
 
     Differences across a crease may be close at one spacing by accident, and wrong.
     """

@@ -1,9 +1,10 @@
-"""`check_enclosure`: proofs tried on functions that keep a promise, with levels put where they go.
+"""`check_enclosure`: tests of enclosures on functions that keep a promise, with levels that they
+reach.
 
-A proof is right if no function that the promise allows meets a level within its step. The functions
-drawn here include the extremal ones of the proofs in `harnack.enclosures`, so a proof that is a
-thousandth too long is found out. A `PromiseCase` is a promise with the levels asked for, on which
-every proof can be tried.
+An enclosure is right if no function that the promise allows meets a level within its free length.
+The functions drawn here include the extremal ones of the proofs in `harnack.enclosures`, so that an
+enclosure whose lengths are a thousandth too long is detected. A `PromiseCase` is a promise with
+levels, on which every enclosure can be tried.
 """
 
 from __future__ import annotations
@@ -45,20 +46,20 @@ __all__ = [
 
 @dataclass(frozen=True)
 class PromiseCase:
-    """promise: what is known near p of a function with f(p) = 0. gap_below, gap_above: how far in
-    value the levels below and above are."""
+    """A promise about a function with f(p) = 0, and levels. gap_below, gap_above: the differences
+    in value to the levels below and above."""
 
     promise: Promise
     gap_below: Real
     gap_above: Real
 
     def map_numbers(self, change: Callable[[Any], Any]) -> PromiseCase:
-        """The case with all its numbers changed, of Python, NumPy or Dr.Jit."""
+        """The case with `change` applied to all its numbers, of Python, NumPy or Dr.Jit."""
         promise = self.promise.map_numbers(lambda number, _, __: change(number))
         return PromiseCase(promise, change(self.gap_below), change(self.gap_above))
 
     def enclosure(self, kind: type[Enclosure], slopes: SlopeRange) -> Enclosure | None:
-        """The enclosure that a proof makes of this; None if it makes none."""
+        """The enclosure of a class for this promise; None if the class does not apply."""
         promise: Any = self.promise
         # Without what `of` takes off for rounding, so that steps can be compared exactly.
         if isinstance(promise, HarmonicBall) and issubclass(kind, HarmonicBallEnclosure):
@@ -74,7 +75,7 @@ class PromiseCase:
         return kind.from_promise(promise, type(slopes.lower)(0), 0.0, slopes)
 
     def accepts(self, kind: type[Enclosure]) -> bool:
-        """Whether a proof applies to this."""
+        """Whether a class of enclosures applies to this promise."""
         lows = [low for low, _ in self.promise.interval_pairs]
         plain = {
             name: -1.0 if name in lows else 1.0
@@ -85,7 +86,7 @@ class PromiseCase:
         return case.enclosure(kind, SlopeRange(0.0, 0.0)) is not None
 
     def step(self, kind: type[Enclosure], slope: Real, error: Real = 0.0) -> Real:
-        """The step along a direction with a slope known up to an error."""
+        """The free length along a direction in which f has a slope, known up to an error."""
         enclosure = self.enclosure(kind, SlopeRange.around(slope, error))
         assert enclosure is not None
         return enclosure.free_length(LevelGaps(self.gap_below, self.gap_above))
@@ -109,10 +110,12 @@ _SAMPLES = 48
 
 @dataclass(frozen=True)
 class RandomFunctions:
-    """Functions along rays, (rows,), and cases at t = 0 whose promise they keep.
+    """Functions along rays, (rows,), and a case at t = 0 whose promise they keep.
 
-    movement: f(t) - f(0) for t (rows, m) with 0 <= t < reach, the distance of the promise.
-    slope: f'(0). The gaps of the cases are such that levels are met.
+    movement: f(t) - f(0) for t (rows, m) with 0 <= t < reach, the radius of the promise.
+    slope: f'(0).
+
+    The gaps of the case are such that levels are met.
     """
 
     name: str
@@ -129,16 +132,17 @@ def check_enclosure(
     rows: int = 400,
     precision: Precision = "double",
 ) -> None:
-    """Test a proof against random functions of every kind of promise that it applies to.
+    """Test a class of enclosures against random functions of every kind of promise that it applies
+    to.
 
-    rng: a generator or a seed. rows: how many functions of each kind.
+    rng: a generator or a seed. rows: the number of functions of each kind.
 
-    Checked: steps are numbers in [0, reach]; no level is met within a step; `covers` agrees with
-    `step`; no level is met within any length that is covered.
+    Checked: free lengths are numbers in [0, reach]; no level is met within a free length; `is_free`
+    agrees with `free_length`; no level is met within any length that `is_free` accepts.
 
     Raises:
         BrokenPromiseError: with the numbers of the first function that shows it.
-        ValueError: it applies to none of the promises there are.
+        ValueError: the class applies to no kind of promise that is drawn.
     """
     accepted = 0
     generator = np.random.default_rng(rng)

@@ -1,4 +1,5 @@
-"""`check_field` and `check_ray_samples`: what a field promises, and proves along paths, sampled."""
+"""`check_field` and `check_ray_samples`: tests, by sampling, of the promises of a field and of its
+enclosures along paths."""
 
 from __future__ import annotations
 
@@ -60,9 +61,9 @@ def check_ray_samples(
 ) -> None:
     """Test the enclosures that a field gives along random directions from points (n, 3).
 
-    For lengths from a thousandth of the extent of the points to twice of it, and gaps from far
-    below to far above what f moves by on the way, f must not pass a gap within the step proved for
-    it, but by `Sample.value_error` and the rounding of value and position.
+    Lengths range from a thousandth of the extent of the points to twice that extent, and gaps from
+    far below to far above the movement of f on the way. Within the free length proved for a gap, f
+    must not pass the gap by more than `Sample.value_error` and the rounding of value and position.
 
     Raises:
         BrokenPromiseError: naming the point, and where f is too large or too small.
@@ -106,10 +107,12 @@ def proved_free_lengths(
     precision: Precision = "double",
     forwards: bool = True,
 ) -> FloatArray:
-    """The steps (n,) that a field's enclosures prove from points (n, 3) along unit directions.
+    """The free lengths (n,) that a field's enclosures prove from points (n, 3) along unit
+    directions.
 
-    ahead: (n,) lengths that enclosures are asked for. gaps: (n, 2) in value, down and up. With
-    forwards=False those that look back from points on paths along `directions`.
+    ahead: (n,) the reach that is asked of the enclosures.
+    gaps: (n, 2) the differences in value to the levels below and above.
+    forwards: False for the enclosures that look back from points on paths along `directions`.
     """
     backend = choose_backend(precision)
     path = Ray(
@@ -203,7 +206,7 @@ def check_field(
 
 
 def _overrides_sample_ray(field: Field) -> bool:
-    """Whether the field proves more along a path than its promises say."""
+    """Whether the field has enclosures along a path besides those that follow from its promises."""
     return type(field).sample_ray is not Field.sample_ray and not field.has_jumps
 
 
@@ -245,8 +248,8 @@ def _check_numbers(field: Field, points: FloatArray, look: FieldSamples) -> None
 
 
 def _check_rounding(field: Field, points: FloatArray) -> None:
-    """In single precision the value is off by at most `error`, eight units in its last place, and
-    what the rounding of the point does."""
+    """Check that in single precision the value is off by at most `error`, eight units in its last
+    place, and the effect of rounding the point."""
     single = points.astype(np.float32).astype(np.float64)
     if field.domain is not None:
         single = single[field.domain.contains_points(single)]
@@ -299,9 +302,10 @@ def _check_promise(
     rng: np.random.Generator,
     directions: int,
 ) -> None:
-    """Walk from each point to the border of the promise, or across the points' size.
+    """Test a promise along random directions from each point, to the border of the promise or
+    across the extent of the points.
 
-    Promises of all space, such as harmonic balls, are tested outside the field's domain as well.
+    Promises of all space, such as harmonic balls, are tested outside of the field's domain as well.
     """
     name = type(known).__name__
     reach = np.minimum(known.radius, 2 * float(np.ptp(points, axis=0).max()) + 1e-300)

@@ -30,7 +30,7 @@ def kernel_difference(q: npt.ArrayLike, s: npt.ArrayLike, dimension: int) -> Flo
 
 
 def cap_mass(height: npt.ArrayLike, dimension: int) -> FloatArray:
-    """The share of the sphere in the cap s >= 1 - height, 0 <= height <= 2."""
+    """The fraction of the sphere in the cap s >= 1 - height, 0 <= height <= 2."""
     b = np.asarray(height, np.float64)
     if dimension == 3:
         return 0.5 * b
@@ -107,11 +107,11 @@ def _cap_closed(q: FloatArray, b: FloatArray, dimension: int) -> FloatArray:
 
 @dataclass(frozen=True)
 class AxialFunctions:
-    """Harmonic functions u on balls of R^n along an axis, one a row.
+    """Harmonic functions u on balls of R^n along an axis, a function for each row.
 
     measure: "points" for rings of point masses at latitudes `latitudes_or_heights`, "caps" for
         boundary values that are sums of indicators of caps of heights `latitudes_or_heights`.
-    latitudes_or_heights, weights: (rows, k). In kind "points" the weights are masses, >= 0.
+    latitudes_or_heights, weights: (rows, k). For "points" the weights are masses, >= 0.
     radius: (rows,) of the balls.
     """
 

@@ -1,4 +1,5 @@
-"""Fields sampled as NumPy arrays, the worst places of promises, and reports of broken ones."""
+"""Fields sampled as NumPy arrays, the search for violations of promises, and the errors that report
+them."""
 
 from __future__ import annotations
 
@@ -34,7 +35,8 @@ __all__ = [
 
 
 class BrokenPromiseError(AssertionError):
-    """A field or a bound promised something that is not true; the message says what and where."""
+    """A field or an enclosure promised something that is not true; the message says which promise,
+    and where."""
 
 
 def require(
@@ -44,10 +46,10 @@ def require(
     amount: FloatArray | None = None,
     there: FloatArray | None = None,
 ) -> None:
-    """Raise BrokenPromiseError for the worst of the points (n, 3) that are not good (n,).
+    """Raise BrokenPromiseError for the worst of the points (n, 3) at which `good` (n,) is false.
 
-    amount: (n,) how wrong.
-    there: (n, 3) where it shows, if not at the point.
+    amount: (n,) the size of the violation.
+    there: (n, 3) the points where it shows, if not at the points themselves.
     """
     broken: BoolArray = ~np.asarray(good, dtype=np.bool_)
     bad = np.flatnonzero(broken)
@@ -62,8 +64,9 @@ def require(
 
 
 def mutated_enclosure(kind: type[Enclosure], factor: float, *, covers: float | None = None) -> Any:
-    """A proof made wrong on purpose, as a test suite that accepts it is worth nothing: with every
-    step multiplied by `factor`, and every length that it covers by `covers` (None: by the same)."""
+    """A class of enclosures that is wrong on purpose, to test that the tests detect it: every free
+    length is multiplied by `factor`, and every length that `is_free` accepts by `covers` (None: by
+    the same factor)."""
     loose = factor if covers is None else covers
     base: Any = kind
 
@@ -83,7 +86,7 @@ def mutated_enclosure(kind: type[Enclosure], factor: float, *, covers: float | N
 
 
 def original_enclosure(kind: type[Enclosure]) -> type[Enclosure]:
-    """The proof that `mutated_enclosure` was given; any other as it is."""
+    """The class from which `mutated_enclosure` derived a class; any other class itself."""
     return getattr(kind, "original", kind)
 
 
@@ -92,7 +95,8 @@ def original_enclosure(kind: type[Enclosure]) -> type[Enclosure]:
 
 @dataclass(frozen=True)
 class FieldSamples:
-    """A field at n points: value (n,), gradient (n, 3), their errors and promises (n,) each."""
+    """Samples of a field at n points: values (n,), gradients (n, 3), their error bounds and the
+    promises, (n,) each."""
 
     value: FloatArray
     gradient: FloatArray
@@ -101,7 +105,7 @@ class FieldSamples:
     promises: tuple[Promise, ...]
 
     def subset(self, rows: BoolArray) -> FieldSamples:
-        """The same at some of the points."""
+        """The samples at the rows given by indices or by a mask."""
         return FieldSamples(
             self.value[rows],
             self.gradient[rows],
@@ -114,9 +118,9 @@ class FieldSamples:
 def sample_field(
     field: Field, points: FloatArray, precision: Precision = "double", *, closely: bool = False
 ) -> FieldSamples:
-    """The field at points (n, 3), all numbers of its promises as float64 arrays (n,).
+    """Sample the field at points (n, 3); all numbers of its promises are float64 arrays (n,).
 
-    closely: without truncation.
+    closely: whether to sample without truncation error.
     """
     n = len(points)
     sample = _sample(field, points, precision, closely)
@@ -138,10 +142,10 @@ def sample_field(
 
 @dataclass(frozen=True)
 class RayLift:
-    """The continuous lift of f at m points along each of n rays, all arrays (n, m).
+    """The continuous lift of f at m points along each of n rays; all arrays are (n, m).
 
-    moved: how far the lift has moved since the ray's first point.
-    jumped: by how much f has jumped besides, across sheets.
+    moved: the movement of the lift since the ray's first point.
+    jumped: the sum of the jumps of f since then, across jump surfaces.
     gradient_norm: |grad f| at the points.
     error: `Sample.value_error` at the points.
     """
@@ -155,11 +159,12 @@ class RayLift:
 def lift_along_rays(
     field: Field, start: FloatArray, direction: FloatArray, lengths: FloatArray
 ) -> RayLift:
-    """How far the continuous lift of f moves along rays: f(start + t direction) - f(start).
+    """The movement of the continuous lift of f along rays: f(start + t direction) - f(start).
 
-    start, direction: (n, 3), unit directions. lengths: t (n, m), each row rising from 0. A value
-    known modulo the period is continued to the one that the mean of the gradients at both ends of
-    an interval predicts; jumps across sheets are taken out.
+    start, direction: (n, 3), unit directions. lengths: t (n, m), each row ascending from 0.
+
+    A value that is known modulo the period is continued to the value that the mean of the gradients
+    at both ends of an interval predicts; jumps are taken out.
     """
     n, m = lengths.shape
     points = start[:, None] + lengths[..., None] * direction[:, None]
@@ -183,8 +188,8 @@ def lift_along_rays(
 def accumulated_jumps(
     field: Field, start: FloatArray, direction: FloatArray, lengths: FloatArray
 ) -> FloatArray:
-    """By how much f has jumped (n, m) since the first of the lengths (n, m) along rays, as
-    `next_jump` says."""
+    """The sum (n, m) of the jumps of f since the first of the lengths (n, m) along rays, as
+    `next_jump` reports them."""
     total = np.zeros_like(lengths)
     if not field.has_jumps:
         return total
@@ -259,8 +264,8 @@ _SPACING = 1e-3
 
 @dataclass(frozen=True)
 class _Candidates:
-    """Points p (n, 3) and places p + reach * w, |w| < 1, and how near the promise is to being
-    broken there, (n,): above one it is."""
+    """Pairs of points p (n, 3) and y = p + reach * w, |w| < 1, with their violation ratios (n,): a
+    promise is violated where the ratio is above 1."""
 
     p: FloatArray
     w: FloatArray
@@ -268,7 +273,8 @@ class _Candidates:
     violation_ratio: FloatArray
 
     def best_of(self, others: _Candidates) -> tuple[_Candidates, BoolArray]:
-        """Each of these n, or the best of its m others of n * m; and whether that is another."""
+        """For each of these n pairs, the best of itself and its m of the n * m `others`; and (n,)
+        whether that is another."""
         n = len(self.p)
         m = len(others.p) // n
         which = np.arange(n) * m + others.violation_ratio.reshape(n, m).argmax(axis=1)
@@ -285,19 +291,22 @@ class _Candidates:
 def search_violations(
     field: Field, points: FloatArray, look: FieldSamples, number: int, rng: np.random.Generator
 ) -> None:
-    """Search for places that break a promise, the one of that number in `Sample.all_promises`.
+    """Search for points that violate a promise, the one with index `number` in
+    `Sample.all_promises`.
 
-    A promise that is wrong by a few percent is broken only near what makes it: beside a singularity
-    that lies just inside the ball, or in the one direction in which a range is attained. Random
-    places miss that. So places climb: pairs of a point p and a place y that the promise made at p
-    speaks of move at random, farther as long as they succeed, to where the promise is closer to
-    being broken.
+    A promise that is wrong by a few percent is violated only in special places: beside a
+    singularity that lies just inside of the ball, or in the one direction in which a range is
+    attained. Random points miss these. So this is a random local search over pairs: a point p,
+    where the promise is made, and a point y in its ball, where it is tested. Both are moved at
+    random, and a move is kept if it raises the violation ratio. The step length grows after success
+    and shrinks after failure.
 
-    points: (n, 3), and `look` the field there. The climb begins at those with the smallest radius
-    and at others, towards the border along the gradient, against it, and in random directions.
+    points: (n, 3), and `look` the samples of the field there. The search starts from the points
+        with the smallest radius and from others chosen at random, with y towards the border of the
+        ball: along the gradient, against it, and in random directions.
 
     Raises:
-        BrokenPromiseError: naming the point and the place of the worst pair.
+        BrokenPromiseError: naming both points of the worst pair.
     """
     search = _ViolationSearch(field, number, 2 * float(np.ptp(points, axis=0).max()) + 1e-300)
     part = _PATH_COST_DIVISOR if search.needs_path else 1
@@ -344,10 +353,10 @@ def search_violations(
 
 @dataclass(frozen=True)
 class _ViolationSearch:
-    """The promise that pairs are to break.
+    """The search for pairs that violate a promise.
 
     promise_index: of the promise in `Sample.all_promises`.
-    longest: the length that stands for a radius without an end.
+    longest: the length that stands for an infinite radius.
     """
 
     field: Field
@@ -356,11 +365,13 @@ class _ViolationSearch:
 
     @property
     def needs_path(self) -> bool:
-        """Whether how f moves is known along a path only, jumps taken out."""
+        """Whether the movement of f between two points must be added up along a path, without its
+        jumps."""
         return self.field.period is not None or self.field.has_jumps
 
     def pairs(self, p: FloatArray, w: FloatArray, samples: int = _PATH_SAMPLES) -> _Candidates:
-        """The pairs of points (n, 3) and shares of their radii, cut to the ball."""
+        """The pairs of points p (n, 3) and vectors w (n, 3), fractions of the radius, which are
+        shortened to stay in the ball."""
         length = np.linalg.norm(w, axis=1, keepdims=True)
         w = w * np.minimum(1, _BORDER / np.maximum(length, 1e-300))
         ratio, reach = np.full(len(p), -np.inf), np.full(len(p), 1.0)
@@ -446,8 +457,8 @@ class _ViolationSearch:
 def _slope_ratio(
     known: HarmonicBall, there: FieldSamples, free: FloatArray, gap: FloatArray
 ) -> FloatArray:
-    """|grad f| at places of a ball, as a share of what a harmonic function allows there that is
-    `gap` away from the nearer end of its range.
+    """The ratio of |grad f|, at points of a ball, to the largest gradient of a harmonic function
+    whose value there is `gap` away from the nearer end of its range.
 
     Proof. At y, `free` from the border, f - lower is positive and harmonic on B(y, free), so that
     by Harnack's inequality |grad f(y)| <= n (f(y) - lower)/free; likewise upper - f. Where a

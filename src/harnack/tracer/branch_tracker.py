@@ -1,9 +1,9 @@
-"""Values that are known but for a whole number, continued along rays.
+"""Determines the branch of f along rays whose samples give f only modulo 1.
 
-A sample in cells of a boundary (`Sample.branch_unknown`) knows a winding number but for a whole
-number. The levels, repeated with period 1, are a ladder, and w lies between two of its rungs. Steps
-that are proved free of all rungs stay between them, and a sheet moves w by a whole number of rungs:
-so the number follows from the value at the last accepted point, and need be found only once.
+Such samples (`Sample.branch_unknown`) come from FMM cells of the boundary of a mesh, whose winding
+number is f. The periodic levels are the levels repeated with period 1. Steps that are proved free
+of the periodic levels keep f between the same two of them, and a jump adds an integer. The last
+accepted value therefore determines the branch at the next point.
 """
 
 from __future__ import annotations
@@ -20,15 +20,19 @@ if TYPE_CHECKING:
     from harnack.backend import Mask, Real
     from harnack.fields.samples import RaySample, Sample
 
-# How near a rung that is no level may be, in value, before the number is asked for.
+# A periodic level that is no true level is passed with known branch if it is nearer than this, in
+# value.
 _NEAR_LEVEL = 1 / 16
-# A change of f that leaves no doubt about the number, and errors that do not.
+# Changes of f and errors of f below these bounds determine the branch without doubt.
 _MAX_CHANGE, _MAX_ERROR = 0.25, 0.125
 
 
 @dataclass(frozen=True)
 class BranchTracker:
-    """levels: those that count."""
+    """Adds the branch to samples of f that are known only modulo 1.
+
+    levels: the true levels, at which rays hit.
+    """
 
     levels: Levels
 
@@ -39,18 +43,22 @@ class BranchTracker:
     def resolve(
         self, look: RaySample, before: Real, step: Real, total_error: Real
     ) -> tuple[RaySample, Mask]:
-        """The look with the number added where the value is known but for that; and where it is
-        known even if f is within its error of a rung.
+        """Add the branch to samples that lack it.
 
-        before: f at the last accepted point, behind the sheet if that is at one; where there is
-            none, 0, which only tells between which rungs f is. step: how far that is back.
-        total_error: of the value.
+        Also returns the lanes on which the branch is certain even if f is within its error of a
+        periodic level.
 
-        Proof. (1) If the look proves that f changes by less than a quarter on the way back, it is
-        the value nearest to the one before, as both are known up to less than an eighth: what is
-        known worse is not taken (`gaps`). (2) Else, if the point is proved, the way to it is free
-        of rungs, and f lies between the same two as before. A point that is not proved is not
-        accepted, whatever its value; nor is one within its error of a rung, but by (1).
+        before: f at the last accepted point, behind the facet if that point lies on a facet. 0 if
+            there is no such point: then it only tells between which periodic levels f lies.
+        step: the distance back to that point.
+        total_error: a bound of the error of the value.
+
+        Proof. (1) Let the sample prove that f changes by less than a quarter on the way back. Then
+        f is the candidate nearest to the value before, as the errors of both are below an eighth:
+        samples with larger errors are not accepted (`gaps`). (2) Else, if the trial point is
+        proved, the way to it is free of periodic levels, and f lies between the same two of them as
+        before. A point that is not proved is not accepted, whatever its value. A point at which f
+        is within its error of a periodic level is accepted only by (1).
         """
         sample, level = look.sample, self.levels.values[0]
         value, rung = sample.value - level, dr.floor(before - level)
@@ -68,14 +76,19 @@ class BranchTracker:
     def gaps(
         self, sample: Sample, is_modulo: Mask, is_sure: Mask, total_error: Real
     ) -> tuple[LevelGaps, Mask, Mask]:
-        """The gaps from f to the rungs on both sides, or where one that is no level is near, or f
-        is hardly known, to the next levels; where it is the latter; and where the sample must be
-        taken again with the number instead.
+        """The gaps to solve steps for, and two masks.
 
-        is_sure: where f is known even within its error of a rung.
+        Gaps: to the neighboring periodic levels; but to the neighboring true levels (`passes`)
+        where a periodic level that is no true level is near, or f is hardly known.
+        Masks: lanes of `passes` whose sample knows its branch; lanes to be sampled again with known
+        branch.
 
-        A ray passes such a rung by samples that know the number: a step from one of them may, and
-        the one after it must be of that kind too.
+        is_modulo: lanes whose sample gave f only modulo 1.
+        is_sure: lanes on which the branch is certain even if f is within its error of a periodic
+            level.
+
+        A ray passes a periodic level that is no true level by samples that know their branch: a
+        step from such a sample may cross that level, and the next sample must know its branch, too.
         """
         rungs, plain = self._periodic_levels.gaps(sample.value), self.levels.gaps(sample.value)
         near = fmax(2 * total_error, _NEAR_LEVEL)

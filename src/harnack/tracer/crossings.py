@@ -1,8 +1,7 @@
 """All crossings of rays with level sets: `trace(..., all_hits=k)`.
 
-`find_crossings` finds them one after the other while a kernel is recorded; `RayCrossings` is what
-users
-get: NumPy in, NumPy out; Dr.Jit stays Dr.Jit.
+`find_crossings` finds them one after the other while a kernel is recorded. `RayCrossings` is the
+result for users: NumPy arrays for NumPy rays, Dr.Jit arrays for Dr.Jit rays.
 """
 
 from __future__ import annotations
@@ -36,14 +35,13 @@ if TYPE_CHECKING:
 class CrossingArrays:
     """The first k crossings of n rays, as Dr.Jit arrays.
 
-    t: (n k) of crossing j of ray i at i k + j; inf where there are fewer.
-    gradient: (n k, 3) of f there, or the normal of the sheet; 0 where there is no crossing.
-    sheet: (n k) index of the sheet that was crossed, NO_FACET for none.
-    side: (n k) 1 where f rises through the level along the ray, -1 where it falls, 0 for none.
-    count: (n) how many there are, at most k.
-    end: (n) how far the ray was followed; inf if it was to its end.
-    evaluations, status: (n). HIT: k crossings, and what follows was not examined. MISS: there are
-        no others.
+    t: (n k) ray parameters, with crossing j of ray i at i k + j; inf if a ray has fewer crossings.
+    gradient: (n k, 3) of f at the crossing, or the normal of the facet; 0 for no crossing.
+    sheet: (n k) index of the facet that was crossed, NO_FACET for none.
+    side: (n k) 1 if f rises through the level along the ray, -1 if it falls, 0 for no crossing.
+    count: (n) number of crossings, at most k.
+    end: (n) ray parameter up to which the ray was followed; inf if it was followed to its end.
+    evaluations, status: (n) as in `RayCrossings`.
     """
 
     t: Real
@@ -60,8 +58,8 @@ class CrossingArrays:
 class _SearchState:
     """Where rays are, and how many crossings they have found.
 
-    march: the state of the march; None for a field with sheets.
-    sheets: for a field with sheets the state of `JumpTracer`, which includes that of the march.
+    march: the state of the march; None for a field with jumps.
+    sheets: for a field with jumps the state of `JumpTracer`, which includes that of the march.
     count: of the crossings.
     """
 
@@ -91,8 +89,8 @@ def find_crossings(
 ) -> CrossingArrays:
     """The first k crossings of rays o + t d, |d| = 1, for t_min <= t <= t_max.
 
-    `Hysteresis` says what is guaranteed, and why: between two crossings the ray is one march, in
-    which contacts may begin and end any number of times.
+    `Hysteresis` states the guarantees and proves them: between two crossings the ray is a single
+    march, in which contacts may begin and end any number of times.
     """
     backend = prepared.backend
     real, vector, count = backend.Float, backend.Array3f, backend.UInt32
@@ -163,23 +161,23 @@ class RayCrossings:
     As NumPy arrays, or as tensors if the rays were; if they were Dr.Jit arrays, as Dr.Jit arrays,
     in which (n, k) is flat: crossing j of ray i is at i k + j.
 
-    t: (n, k) ray parameter of the crossing, inf where a ray has fewer. It lies between two samples
-        with f on different sides of the level: where the cubic through their values and slopes
-        takes the level or, if there is a crease between them, where bisection finds it.
-    position: (n, k, 3) point at t, NaN where there is none.
-    normal: (n, k, 3) unit normal grad f/|grad f|, to the side of larger f; zero where there is
-        none.
-    primitive_index: (n, k) index of the sheet, such as a triangle, that was crossed; -1 where none
-        was.
-    side: (n, k) integers: 1 where f rises through the level along the ray, -1 where it falls
-        through it, 0 where there is no crossing.
-    count: (n,) how many crossings there are, at most k.
-    traced_to: (n,) how far the ray was followed: inf if to its end; else up to where the last
-        crossing was noticed, just behind it, or to where the ray ran out of steps.
-    status: (n,) a `RayStatus`, of the end of the ray. MISS: it is proved that there are no other
-        crossings. HIT: there are k, and what follows was not examined. OUT_OF_STEPS: what follows
-        `traced_to` is not known.
-    evaluations: (n,) how many times the field was evaluated.
+    t: (n, k) ray parameter of the crossing, inf if a ray has fewer crossings. It lies between two
+        samples with f on different sides of the level: at the root of the cubic through their
+        values and slopes, or of a bisection if there is a crease between them.
+    position: (n, k, 3) point at t, NaN for no crossing.
+    normal: (n, k, 3) unit normal grad f/|grad f|, to the side of larger f; zero for no crossing.
+    primitive_index: (n, k) index of the facet, such as a triangle, that was crossed; -1 if no facet
+        was crossed.
+    side: (n, k) integers: 1 if f rises through the level along the ray, -1 if it falls through it,
+        0 for no crossing.
+    count: (n,) number of crossings, at most k.
+    traced_to: (n,) ray parameter up to which the ray was followed: inf if it was followed to its
+        end; else the point just behind the last crossing at which that was noticed, or the point at
+        which the ray ran out of steps.
+    status: (n,) a `RayStatus`, of the end of the ray. MISS: the ray is proved to have no other
+        crossings. HIT: there are k crossings, and the rest of the ray was not examined.
+        OUT_OF_STEPS: the ray behind `traced_to` is not known.
+    evaluations: (n,) number of evaluations of the field.
     """
 
     t: Any
@@ -194,11 +192,11 @@ class RayCrossings:
 
 
 def check_all_hits(all_hits: Any, surface: Surface) -> int:
-    """How many crossings to look for.
+    """The number of crossings to return for each ray, validated.
 
     Raises:
         TypeError: not an integer.
-        ValueError: less than 1; or several levels of a field with sheets.
+        ValueError: less than 1; or several levels of a field with jumps.
     """
     try:
         k = operator.index(all_hits)

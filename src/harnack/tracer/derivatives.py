@@ -5,14 +5,14 @@ stopped. The hit, f(o + t d; theta) = level, defines t(theta), and
 
     dt = (dlevel - df|_t) / (grad f . d),
 
-which is what these functions attach to a detached t. A hit on a sheet of a field that jumps lies
-on a plane, n . (o + t d) = const, whatever the level: dt = -(n . (do + t dd))/(n . d).
+which these functions attach to a detached t. A hit on a facet of a field with jumps lies on a
+plane, n . (o + t d) = const, whatever the level: dt = -(n . (do + t dd))/(n . d).
 
-Derivatives are implicit: the trace runs without them and t is re-attached at the hit, by the
-gradient that the field states there: no derivative passes an evaluation, which may be a recorded
-loop. What would be dropped is refused where numbers come in (`validation`, `Field.__new__`) and
-where results go out. At ties of formulas, where ranges of gradients have all slopes beside, dual
-numbers a few roundings away choose one (`Formula.evaluate`).
+Derivatives are implicit: the trace runs without them, and the derivative of t is attached at the
+hit, by the gradient of the sample there. So no derivative passes through `evaluate`, which may run
+a recorded loop. Derivatives that would be lost are refused, both for arguments (`validation`,
+`Field.__new__`) and for results. At ties of formulas, where the gradient is a range, dual numbers a
+few roundings away choose a one-sided gradient (`Formula.evaluate`).
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ def needs_derivatives(prepared: SurfaceTracer, o: Vec3, d: Vec3) -> bool:
     """Whether rays, levels or the field's parameters have derivatives enabled.
 
     Raises:
-        NotImplementedError: parameters of a field with sheets have. They move the sheets, and
-            the derivative of that is not known here; zero would be wrong.
+        NotImplementedError: parameters of a field with jumps have derivatives enabled. They move
+            the facets, and the derivative of that is not known here; zero would be wrong.
     """
     field = prepared.field
     if not _PARAMETER_FREE.get(field, None, lambda: is_plain_data(vars(field))):
@@ -85,8 +85,10 @@ class _NoDerivative(dr.CustomOp):
 
 
 def refuse_derivative(prepared: SurfaceTracer, o: Vec3, d: Vec3, what: str, value: Any) -> Any:
-    """A result of a trace whose derivative is not known: asking for it is an error
-    (`_NoDerivative`), since zero would be wrong."""
+    """The same result of a trace, with an error (`_NoDerivative`) if its derivative is requested.
+
+    Its derivative is not known, and zero would be wrong.
+    """
     sources = [o, d, *prepared.levels.values, *prepared.field.parameters()]
     return dr.custom(_NoDerivative, value, what, sources)
 
@@ -96,8 +98,9 @@ def attach_derivatives(
 ) -> tuple[Real, Vec3]:
     """t, refined up to rounding, with its derivative attached, and the normal at that point.
 
-    normal: unit, as traced. Normals carry no derivative (they would need the Hessian). At hits
-    on sheets t is exact already, and does not depend on the level.
+    normal: the unit normal of the trace. Normals carry no derivative (it would need the Hessian).
+
+    At hits on facets t is already exact, and does not depend on the level.
     """
     t, hit, prepared = end.t, end.status == int(RayStatus.HIT), prepared.hit_surface(end)
     if prepared.field.has_jumps:

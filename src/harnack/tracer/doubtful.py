@@ -1,8 +1,9 @@
-"""How far the surface is from hits that rounding alone may have made.
+"""Distances of the surface from hits that may be due to rounding alone.
 
-Where grad f is 0 on the surface, as where sheets meet, f - level is a power u^m, and rounding hides
-it from afar: f may be 0, up to its error e, out to (e/c)^(1/m). There e/|grad f| is a length to
-first order alone, and m times too short. So the surface is looked for around such hits.
+Where grad f is 0 on the surface, as where two sheets of it meet, f - level behaves as a power c u^m
+of the distance u. Rounding hides the surface there from afar: f equals the level, up to its error
+e, as far as (e/c)^(1/m). The estimate e/|grad f| of the distance is then only of first order, and m
+times too short. So the surface is searched for around such hits.
 """
 
 from __future__ import annotations
@@ -31,10 +32,12 @@ _WAYS = 6
 
 @dataclass(frozen=True)
 class Doubtful:
-    """Hits to look around.
+    """Hits around which the surface is searched for.
 
-    position: of hits. normal: (3,) unit, along the gradient. size: of coordinates up to there.
-    distance: how far from there to begin.
+    position: (3,) of the hits.
+    normal: (3,) unit vector along the gradient.
+    size: a bound of the coordinates along the ray up to the hit.
+    distance: the distance from the hit at which the search begins.
     """
 
     position: Vec3
@@ -69,15 +72,16 @@ class _Looking:
 
 
 def seen_distance(backend: Backend, field: Field, levels: Levels, hits: Doubtful) -> Real:
-    """Within what distance of hits the surface was seen, at least `hits.distance`; infinite where
-    it was not seen within a sixteenth of the size of coordinates.
+    """A distance from each hit within which the surface was seen, at least `hits.distance`;
+    infinite if it was not seen within a sixteenth of the size of coordinates.
 
-    Proof. f is surely on one side of the level at one of the points looked at, and surely on the
-    other at another: by more than the bound of its error at each. All lie within this distance of
-    the hit, so f takes the level between them, or jumps past it at a sheet. Where f only touches
-    the level it is on one side, and no sign tells. There it turns back: its slope along the
-    gradient of the hit changes sign, and where it does, found by secants and bisection, f is the
-    level up to its error. No look in this precision can tell such a place from the surface.
+    Proof. At one sampled point f is certainly on one side of the level, and at another sampled
+    point certainly on the other side: by more than the bound of its error at each. All points lie
+    within this distance of the hit, so f takes the level between them, or jumps past it at a facet.
+    If f only touches the level, it stays on one side, and no sign tells. Then it turns back: its
+    slope along the gradient of the hit changes sign, and at the point of this change, which secants
+    and bisection give, f equals the level up to its error. No sample in this precision can tell
+    such a point from the surface.
     """
     at_hit = field.evaluate(hits.position)
     level = at_hit.value + levels.offset_to_nearest(at_hit.value)

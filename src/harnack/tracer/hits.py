@@ -1,6 +1,6 @@
-"""`trace`: rays and a field in, a list of hits out.
+"""The function `trace`, which gives the hits of rays with a surface, and its result `Hits`.
 
-NumPy in, NumPy out; Dr.Jit stays Dr.Jit, and tensors stay tensors.
+NumPy rays give NumPy arrays, Dr.Jit rays give Dr.Jit arrays, and tensors give tensors.
 """
 
 from __future__ import annotations
@@ -59,35 +59,36 @@ class Hits:
 
     is_hit: (n,) mask of rays that hit. Rays that ran out of steps have a finite t as well, so that
         `isfinite(t)` is no such mask.
-    t: (n,) ray parameter of the hit, inf for a miss; for a ray that ran out of steps, how far
-        it is proved free. A hit is within tolerance of the first root, mostly before it. One that
-        is confirmed is at a root: between two samples with f on different sides of the level, where
-        the cubic through their values and slopes takes the level or, if there is a crease between
-        them, where bisection finds it.
+    t: (n,) ray parameter of the hit, a length; inf for a miss; for a ray that ran out of steps, the
+        parameter up to which it is proved free. A hit is within the tolerance of the first root,
+        mostly before it. A confirmed hit is at a root, between two samples with f on different
+        sides of the level: at the root of the cubic through their values and slopes, or of a
+        bisection if there is a crease between them.
     position: (n, 3) point at t, NaN for a miss.
-    normal: (n, 3) unit normal grad f/|grad f|, or of the sheet that was hit, to its side of
-        larger f; zero where there is no hit.
+    normal: (n, 3) unit normal grad f/|grad f|, or of the facet that was hit, to the side of larger
+        f; zero for rays without a hit.
     value: (n,) f at the last accepted point; for an angle-valued field up to a multiple of its
-        period. Where a sheet was hit, f just before it.
-    evaluations: (n,) how many times the field was evaluated.
+        period. For hits on facets, f just before the facet.
+    evaluations: (n,) number of evaluations of the field.
     status: (n,) a `RayStatus`.
-    primitive_index: (n,) index of the sheet, such as a triangle, or of the part, such as a face of
-        a `PolygonMesh`, that was hit; -1 where none was: misses, hits of a smooth level set, and
-        all rays of fields that have neither.
+    primitive_index: (n,) index of the facet (such as a triangle) or of the patch (such as a face of
+        a `PolygonMesh`) that was hit; -1 for misses, for hits of a smooth level set, and for all
+        rays of fields that have neither facets nor patches.
     uncertainty: (n,) a length: at a hit of a smooth level set, |f - level| is proved to be at most
-        (tolerance + uncertainty) |grad f|. It is 0 unless rounding leaves f less certain than the
-        tolerance asks; 0 for all other rays. Where |grad f| may have no bound the surface is proved
-        to be within the tolerance, or within the rounding of the point (see `Tolerance`). Elsewhere
-        that is a length to first order: along lines and at points where grad f is 0 and f - level a
-        power u^m, as where m sheets meet, the surface may be m times as far (beside the edge of a
-        cusp, as of y^2 = x^3, farther: 0.002 for a tolerance of 1e-4, and 0.02 with x^5). Rounding
-        hides the surface there from afar. Where it adds more than half the tolerance, the
-        uncertainty is that of three sheets; where it adds seven tolerances or more, the surface was
-        seen within tolerance + uncertainty: f is surely on different sides of the level there, or
-        touches it up to its error. It is infinite where the surface was not seen within a sixteenth
-        of the size of coordinates. (What these looks evaluate is not in `evaluations`.) Along a ray
-        that grazes such a place t is early by more: the ray is proved free no farther. Use
-        `precision="double"`, or `confirm`.
+        (tolerance + uncertainty) |grad f|. It is 0 if the error of f is within the tolerance, and
+        for all other rays. Where |grad f| may be unbounded, the surface is proved to be within the
+        tolerance, or within the rounding of the point (see `HitTolerance`). Elsewhere, tolerance +
+        uncertainty bounds the distance to first order: along lines and at points where grad f is 0
+        and f - level behaves as a power u^m of the distance, as where m sheets of the surface meet,
+        the surface may be m times as far (beside the edge of a cusp, as of y^2 = x^3, farther:
+        0.002 for a tolerance of 1e-4, and 0.02 with x^5). Rounding hides the surface there from
+        afar. If rounding adds more than half the tolerance, the uncertainty is that of three
+        sheets. If it adds seven tolerances or more, the surface was seen within tolerance +
+        uncertainty: f is certainly on different sides of the level there, or touches it up to its
+        error. It is infinite if the surface was not seen within a sixteenth of the size of
+        coordinates. (The evaluations of this search are not in `evaluations`.) Along a ray that
+        grazes such a point, t may be too small by more than the uncertainty: the ray is not proved
+        free any farther. Use `precision="double"`, or `confirm`.
     """
 
     t: Any
@@ -172,56 +173,56 @@ def trace(
     all_hits: int | None = None,
     backend: Literal["webgpu"] | None = None,
 ) -> Hits | RayCrossings:
-    """First hits of rays with a level set of a field; no hit is ever missed.
+    """First hits of rays with a level set of a field. No hit is missed: every step is proved.
 
-    field: what to trace; or a `Surface`, which then holds all the settings.
-    origins, directions: (n, 3) array-likes or Dr.Jit tensors (one of them may be (1, 3)), or
-        Dr.Jit 3-vectors.
-        Directions need not be unit; t counts multiples of the *unit* direction, so it is a
-        length.
+    field: the field to trace; or a `Surface`, which then holds all the settings.
+    origins, directions: (n, 3) array-likes or Dr.Jit tensors (one of them may be (1, 3)), or Dr.Jit
+        3-vectors. Directions need not have length 1; t counts multiples of the *unit* direction, so
+        it is a length.
     level: level or levels; None for the field's default. May be a Dr.Jit number.
-    t_min, t_max: (n,) or a number. An infinite t_max ends in a proved miss wherever the
-        field knows how far its surface reaches.
-    tolerance: a length, or a `Tolerance`. In single precision not below about 1e-6 of the
+    t_min, t_max: (n,) or a number. With an infinite t_max, a ray that leaves the proved extent of
+        the surface is a proved miss.
+    tolerance: a length, or a `HitTolerance`. In single precision not below about 1e-6 of the
         size of the coordinates.
-    bound: which proofs to use: None for all that pay; "classic" for the published rule, "slope",
+    bound: the proofs to use: None for all that pay; "classic" for the published rule, "slope",
         "caps", "curvature", "lipschitz"; or classes of enclosures, such as
         `harnack.SphericalCapEnclosure`.
-    clip, section: volumes that the surface is cut by; what lies outside of one is not there.
-    largest: of the surface in the domain and the clip, only its largest component, as far as
-        components are separated by cells proved empty: 128 along the longest side, or so many. Rays
-        that start so far away that rounding is more than a part of a cell are out of steps.
-    precision: "single" or "double" for NumPy input; Dr.Jit input keeps its own.
+    clip, section: volumes with which the surface is intersected.
+    largest: trace only the largest component of the surface within domain and clip, as far as
+        components are separated by cells proved empty. True for 128 cells along the longest side of
+        the box, or their number. Rays that start so far away that rounding is more than a part of a
+        cell are out of steps.
+    precision: "single" or "double" for NumPy input; Dr.Jit input keeps its own precision.
 
-    confirm: a hit counts only where f really changes sign: a ray that comes within the tolerance
-        of a level and turns back does not hit it. The hit is then at a root. What is guaranteed is
-        that of `all_hits`.
-    all_hits: how many crossings of each ray to return, in order, as an `RayCrossings`. No crossing
-        is missed whose function swings farther than the tolerance to both sides of the level, and
-        none is counted twice; touching a level without passing to its other side is no crossing,
-        and neither is starting on it. Where levels are closer in value than four tolerances, a
-        quarter of their distance is the tolerance; rays run out of steps where that is below
-        rounding. Where it is not, the tolerance is at least eight times what rounding does to f, in
-        single precision about 1e-5 of the size of the coordinates: whatever swings less than that
-        to one side may be no crossing. `max_steps` is for all of the ray.
+    confirm: a hit counts only if f passes to the other side of the level: a ray that comes within
+        the tolerance of a level and turns back does not hit it. The hit is then at a root. The
+        guarantees are those of `all_hits`.
+    all_hits: the number of crossings of each ray to return, in order, as `RayCrossings`. If f goes
+        farther than the tolerance to both sides of the level, the crossing is not missed, and no
+        crossing is counted twice. Touching a level without passing to its other side is no
+        crossing, and neither is starting on it. If levels are closer in value than four tolerances,
+        a quarter of their distance is the tolerance; rays run out of steps if that is below
+        rounding. Otherwise the tolerance is at least eight times the rounding error of f, in single
+        precision about 1e-5 of the size of the coordinates: if f goes less far than that to one
+        side, the crossing may not count. `max_steps` is for the whole ray.
 
-    backend: "webgpu" traces NumPy rays in single precision on whatever GPU the system has, by the
-        package `wgpu` (`pip install harnack[webgpu]`): the kernel that Dr.Jit records, translated.
-        What is proved of rounding is proved for Dr.Jit's own backends alone; so up to 4,096 of the
-        rays are traced there too, at each call, and the device must agree.
+    backend: "webgpu" traces NumPy rays in single precision on any GPU of the system, by the package
+        `wgpu` (`pip install harnack[webgpu]`), with a translation of the kernel that Dr.Jit
+        records. Rounding is proved for Dr.Jit's own backends only; so at each call up to 4,096 of
+        the rays are traced there, too, and the device must agree.
 
-    With Dr.Jit rays, t and position carry derivatives with respect to whatever had them enabled:
-    rays, level, vertices of a `SolidAngle` (implicit differentiation at the hit). The other results
-    have none: in reverse mode, using theirs raises NotImplementedError; in forward mode they are
-    NaN. Fields made of other numbers with derivatives enabled are refused.
+    With Dr.Jit rays, t and position carry derivatives with respect to rays, level, and vertices of
+    a `SolidAngle`, if these have derivatives enabled (implicit differentiation at the hit). The
+    other results have no derivatives: in reverse mode, using theirs raises NotImplementedError; in
+    forward mode they are NaN. Fields of other numbers with derivatives enabled are refused.
 
-    On processors, 4,096 rays or more whose neighbors have little to do with each other are followed
-    by few lanes that share a queue, unless samples are cheap (`Field.is_cheap`): the same hits, bit
-    by bit, in about half the time.
+    On processors, if there are at least 4,096 rays and neighbors have little to do with each other,
+    rays are traced by few lanes that share a queue, unless samples are cheap (`Field.is_cheap`).
+    This gives the same hits, bit by bit, in about half the time.
 
     Raises ValueError or TypeError for shapes that do not match, NaN, directions of length zero,
     an empty or negative interval, or a level that no surface has. With a backend, RuntimeError if
-    there is no device, or one that disagrees; NotImplementedError for a field whose kernel is not
+    there is no device or the device disagrees; NotImplementedError for a field whose kernel is not
     translated.
     """
     if backend is not None:

@@ -36,15 +36,18 @@ _CELLS: FieldCache[OccupancyGrid] = FieldCache()
 def largest_component_cells(
     field: Field, levels: tuple[float, ...], volume: Volume | None, solid: _Ends | None, across: int
 ) -> OccupancyGrid:
-    """Cells that hold the component of a level set in a volume, or of a solid {low <= f <= high},
-    with the largest sum of projected areas along x, y and z, and all that is not separated from it
-    by cells proved empty (see `largest_connected_component`).
+    """Cells that contain the largest component of a level set in a volume, or of a solid {low <= f
+    <= high}: the component with the largest sum of projected areas along x, y and z.
 
-    A cell is left out if it, or each of its eight octants, is proved to have nothing of the level
-    set, as the ball around it is within the clearance of its center (or, where that is outside of
-    the field's domain, of a point at the domain's boundary), or nothing of the volume, as its
-    signed distance says. Of a solid, cells that hold no level but lie inside of it are kept too.
-    For the rest of the proof see `largest_connected_component`.
+    The cells also contain all components that are not separated from it by cells proved empty (see
+    `largest_connected_component`).
+
+    A cell is left out if it, or each of its eight octants, is proved to contain no point of the
+    level set or no point of the volume. The first holds if the ball around the cell is within the
+    clearance of its center (or, if the center is outside of the domain of the field, of a point at
+    the boundary of the domain), the second by the signed distance of the volume. For a solid, cells
+    inside of it are kept, too, although they contain no level. For the rest of the proof see
+    `largest_connected_component`.
 
     Raises:
         ValueError: the volume is not bounded; or most of the cells that could not be proved empty
@@ -187,10 +190,10 @@ def _inside_solid(field: Field, solid: _Ends) -> Callable[[FloatArray], BoolArra
 
 
 def validate_component_cells(largest: object) -> int:
-    """Cells across, 0 for all components.
+    """The number of cells along the longest side of the box, validated; 0 for all components.
 
     Raises:
-        TypeError: neither a truth value nor a whole number.
+        TypeError: neither a truth value nor an integer.
         ValueError: fewer cells than 8, or more than 512.
     """
     wrong = (

@@ -1,14 +1,14 @@
-"""When a point of a ray counts as a hit or as a crossing, and how a ray can end.
+"""The rules by which a point of a ray counts as a hit or as a crossing, and the ways in which a ray
+can end.
 
-- First hits: a ray ends where f is within the `HitTolerance` of a level, or at a sheet across which
-  f
-  jumps past a level (`test_jump`).
-- Crossings: a ray goes on behind the level. `Contact` is its state near the level that it reached,
-  `Hysteresis` the rule by which each crossing is counted once.
+- First hits: a ray ends where f is within the `HitTolerance` of a level, or at a facet across which
+  f jumps past a level (`test_jump`).
+- Crossings: a ray goes on behind the level. `Contact` is its state near the level that it reached;
+  `Hysteresis` is the rule by which each crossing is counted once.
 
-A level that was reached counts as lying the tolerance beyond until f has left the tolerance: all
-crossings of a ray and hits confirmed by a change of sign are one mechanism. Rays that must cross
-start a little outside the extent, which the surface may touch.
+A level that was reached counts as lying a tolerance beyond its place until f has left the
+tolerance. The same mechanism serves all crossings of a ray and hits that are confirmed by a change
+of sign. Rays that must cross start a little outside the extent, which the surface may touch.
 """
 
 from __future__ import annotations
@@ -34,38 +34,39 @@ if TYPE_CHECKING:
 
 
 class RayStatus(enum.IntEnum):
-    """How a ray ended."""
+    """The ways in which a ray ends."""
 
     MISS = 0
-    """It is proved that the ray meets no level between t_min and t_max."""
+    """The ray is proved to meet no level between t_min and t_max."""
     HIT = 1
     """The ray is proved free up to t, where the surface is within tolerance."""
     OUT_OF_STEPS = 2
-    """The ray is proved free up to t; what follows is not known. Raise max_steps."""
+    """The ray is proved free up to t, and the rest of it is not known. Raise max_steps."""
 
 
 @dataclass(frozen=True)
 class HitTolerance:
-    """When a point is close enough to a level to be a hit.
+    """How close to a level a point must be to count as a hit.
 
-    distance: |f - level| <= distance * |grad f|, a length to first order (paper, Sec. 3.1.2); see
-        below for where that is none.
+    distance: a length; a point is a hit if |f - level| <= distance * |grad f|. To first order this
+        is its distance from the surface (paper, Sec. 3.1.2); the exceptions are below.
     per_length: added to `distance` for each unit of t: half the angle of a pixel makes the
-        tolerance grow with its footprint.
-    value: also a hit where |f - level| <= value, whatever the gradient.
+        tolerance grow with the footprint of the pixel.
+    value: in units of f; a point is also a hit if |f - level| <= value, whatever the gradient.
 
-    Where |grad f| may have no bound, as beside a vertical tangent or a pole of a formula
-    (`Field.is_steep`), that is no length. There a point is a hit only if f is proved to take the
-    level within the tolerance, by its slope ahead or by its values beyond, or up to the rounding of
-    the point. At creases |grad f| jumps but has a bound: a crease that stays off the level counts
-    as a hit where it comes as near to it in value. So do spikes and steps that are narrower than
-    the tolerance, as those of tanh(1e6 x) - y and of 0.5 + exp(-(1e5 x)^2). Of fields that are no
-    formulas and have poles, such as clouds of dipoles, rays that pass a pole within the tolerance
-    count as hits of every level.
+    Where |grad f| may be unbounded, as beside a vertical tangent or a pole of a formula
+    (`Field.is_steep`), |f - level| / |grad f| is no distance. There a point is a hit only if f is
+    proved to take the level within the tolerance, by its slope ahead or by its values beyond, or up
+    to the rounding of the point. At creases |grad f| jumps but is bounded: a crease that stays off
+    the level counts as a hit where it comes as near to the level in value. So do spikes and steps
+    that are narrower than the tolerance, as those of tanh(1e6 x) - y and of
+    0.5 + exp(-(1e5 x)^2). For fields that are no formulas and have poles, such as clouds of
+    dipoles, rays that pass a pole within the tolerance count as hits of every level.
 
-    Where rounding leaves the distance to the level less certain than this, that uncertainty is
-    the tolerance: about 1e-6 of the coordinates' size in single precision, 1e-15 in double, and far
-    more where grad f is 0 on the surface, as where sheets meet (`Hits.uncertainty` says how much).
+    If rounding leaves the distance to the level uncertain by more than the tolerance, then this
+    uncertainty is the tolerance: about 1e-6 of the size of coordinates in single precision, 1e-15
+    in double precision, and far more where grad f is 0 on the surface, as where two sheets of it
+    meet (`Hits.uncertainty` tells how much).
     """
 
     distance: float = 1e-4
@@ -81,7 +82,8 @@ class HitTolerance:
             raise ValueError("tolerance must be positive: a level set is never met exactly")
 
     def prepare(self, backend: Backend) -> PreparedHitTolerance:
-        """As kernel parameters of a backend: another tolerance compiles no new kernel."""
+        """This tolerance as kernel parameters of a backend, so that another tolerance compiles no
+        new kernel."""
         numbers = (self.distance, self.per_length, self.value)
         return PreparedHitTolerance(*(dr.opaque(backend.Float, number) for number in numbers))
 
@@ -95,23 +97,23 @@ class PreparedHitTolerance:
     value: Real
 
     def value_tolerance(self, gradient_norm: Real, t: Real) -> Real:
-        """By how much f may differ from a level at a hit, where |grad f| = gradient_norm."""
+        """The largest |f - level| at a hit at ray parameter t, where |grad f| = gradient_norm."""
         return fmax(gradient_norm * dr.fma(t, self.per_length, self.distance), self.value)
 
 
 HIT_AT_JUMP = max(RayStatus) + 1
-"""Status of a ray that hit a sheet, until `JumpTracer` turns it into a plain HIT."""
+"""Status of a ray that hit a facet, until `JumpTracer` turns it into a plain HIT."""
 
 
 @dataclass(frozen=True)
 class JumpTest:
-    """Result of comparing a sample with the sheet at the end of its ray interval.
+    """Result of the comparison of a sample with the facet at the end of its ray interval.
 
-    has_crossing: the interval ends at a sheet.
-    at_crossing: the sample is accepted and lies at that sheet.
-    is_hit: also, a level lies between the values on both sides, up to the total error.
-    gaps: to the levels below and above, of the value behind the sheet if `at_crossing`.
-    normal: of the sheet.
+    has_crossing: whether the interval ends at a facet.
+    at_crossing: whether, further, the sample is accepted and lies at that facet.
+    is_hit: whether, further, a level lies between the values on both sides, up to the total error.
+    gaps: the gaps to the levels below and above; from the value behind the facet if `at_crossing`.
+    normal: (3,) unit normal of the facet.
     """
 
     has_crossing: Mask
@@ -121,7 +123,8 @@ class JumpTest:
     normal: Vec3
 
     def mark(self, status: Any, gradient: Vec3) -> tuple[Any, Vec3]:
-        """Status and gradient, replaced by those of the sheet where it was hit."""
+        """Status and gradient, replaced on rays that hit the facet by HIT_AT_JUMP and the facet's
+        normal."""
         marked = type(status)(dr.select(self.is_hit, HIT_AT_JUMP, status))
         return marked, dr.select(self.is_hit, self.normal, gradient)
 
@@ -129,18 +132,18 @@ class JumpTest:
 def test_jump(
     ahead: JumpCrossing, there: Mask, value: Real, total_error: Real, levels: Levels
 ) -> JumpTest:
-    """Compare the values on the two sides of a sheet with the levels.
+    """Compare the values on the two sides of a facet with the levels.
 
     ahead: the crossing at the end of the ray interval.
-    there: where samples are accepted and lie at that crossing.
+    there: lanes whose samples are accepted and lie at that crossing.
     value: f there, before the jump, known up to `total_error`.
 
-    The sheet is the surface if a level lies between the values on its two sides. They are known
-    up to `total_error`, and a level within that of either counts as between: such a sheet is the
-    surface or just fails to be, and its points are no farther than rounding from the level. To
-    decide the other way could lose a surface, for the march has proved that the level is not met
-    *before* the sheet, which rounding may contradict by as much. Sheets at the same t count as one,
-    with the sum of their jumps (`JumpTracer._merge_coincident`).
+    The facet belongs to the surface if a level lies between the values on its two sides. These are
+    known up to `total_error`, and a level within `total_error` of either value counts as between:
+    such a facet belongs to the surface or misses it by no more than rounding. To decide the other
+    way could lose a surface, for the march has proved that the level is not met *before* the facet,
+    which rounding may contradict by as much. Facets at the same t count as a single facet, with the
+    sum of their jumps (`JumpTracer._merge_coincident`).
     """
     has_crossing = ahead.facet != NO_FACET
     at_crossing = has_crossing & there
@@ -150,8 +153,8 @@ def test_jump(
     return JumpTest(has_crossing, at_crossing, is_hit, levels.gaps(behind), ahead.normal)
 
 
-# The band around a level is at least so many roundings of f, and at most this fraction of the
-# difference between two levels, so that there is no doubt which of them was reached.
+# The band around a level is at least this many roundings of f, and at most this fraction of the
+# difference between two levels, so that it is certain which level was reached.
 _MIN_BAND_ROUNDINGS = 8.0
 _MAX_BAND_OF_SPACING = 0.25
 # In contact, f may come as near to the next level as this fraction of that difference.
@@ -164,8 +167,8 @@ _CROSSED = 0.5
 CONTACT_AIM = 0.75
 # In contact, truncation is judged by this fraction of the tolerance.
 CONTACT_TOLERANCE = 0.5
-# In contact, a step must not lead to where the band is less than this fraction of what it was,
-# unless it is at most so many tolerances long.
+# In contact, a step must not lead to where the band is less than the first number times the band
+# before, unless the step is at most the second number times the tolerance long.
 _MIN_BAND_RATIO, _SHORT_STEP = 0.25, 4.0
 # Rounds of the search for the root of a cubic.
 _ROUNDS = 4
@@ -173,20 +176,19 @@ _ROUNDS = 4
 
 @dataclass(frozen=True)
 class Contact:
-    """What a ray knows of the level that it has reached last.
+    """The contact of a ray with the level that it reached last.
 
-    side: on which side of that level the ray is: 1 where f is larger, -1 where it is smaller; 0 as
-        long as no sample has been off the level at which the ray started. While there is no contact
-        only whether it is 0 has a meaning.
+    side: the side of that level on which the ray is: 1 if f is larger, -1 if f is smaller; 0 as
+        long as no sample has been off the level at which the ray started. Without contact, only
+        whether it is 0 has a meaning.
     is_touching: whether f is, or may still be, within the tolerance of that level.
-    root: where f took the level last, between two samples on different sides of it; where the
-        contact began if it began beyond the level.
-    gradient: of f at the root.
+    root: the ray parameter at which f last took the level, between two samples on different sides
+        of it; if the contact began beyond the level, the parameter at which it began.
+    gradient: (3,) of f at the root.
     tolerance_excess: by how much f at the root may be farther from the level than the tolerance
-        allows, where rounding leaves f less certain than that: the root lies between the two
-            samples.
-    before, after: the places of the two samples, or the root itself.
-    band: that of the last sample.
+        allows, because of rounding. The root lies between the two samples.
+    before, after: the ray parameters of the two samples, or the root itself.
+    band: the band of the last sample.
     """
 
     side: Real
@@ -200,7 +202,7 @@ class Contact:
 
     @classmethod
     def none(cls, backend: Backend) -> Contact:
-        """Before the first sample."""
+        """The contact of a ray before its first sample: none."""
         zero = backend.Float(0)
         return cls(zero, backend.Bool(False), zero, backend.Array3f(0), zero, zero, zero, zero)
 
@@ -209,12 +211,13 @@ class Contact:
 class AcceptedPoint:
     """A sample at an accepted point of a ray.
 
-    t, value, gradient, slope: there.
+    t, value, gradient, slope: ray parameter of the point; f, its gradient (3,) and its derivative
+        along the ray at the point.
     before: (t, value, slope, gradient) of the accepted point before it.
-    excess: by how much f at the two may be farther from a level than the tolerance allows, where
-        the error of f is more than that; 0 elsewhere.
-    total_error: of the value.
-    is_near: whether it would be a hit.
+    excess: by how much f at these two points may be farther from a level than the tolerance allows,
+        if the error of f is more than the tolerance; 0 otherwise.
+    total_error: a bound of the error of the value.
+    is_near: whether the point would be a hit.
     band: the tolerance in value (`Hysteresis.band`).
     is_end: whether the ray ends there.
     """
@@ -233,48 +236,51 @@ class AcceptedPoint:
 
 @dataclass(frozen=True)
 class Hysteresis:
-    """The rule by which contacts begin, count as crossings, and end.
+    """The rule by which contacts with a level begin, count as crossings, and end.
 
-    A first hit ends a ray where f is within the tolerance of a level. A ray that goes on has to get
-    off the surface with a proof, and rounding, or a ray that runs along the surface, must not make
-    several crossings of one. So a level that has been reached counts as lying a tolerance *beyond*,
-    until f has left the tolerance around it (hysteresis): there is always a gap to it, and steps
-    stay long.
+    A first hit ends a ray where f is within the tolerance of a level. A ray that goes on must leave
+    the surface with a proof, and a single crossing must not be counted several times because of
+    rounding or because the ray runs along the surface. So a level that has been reached counts as
+    lying a tolerance *beyond* its place, until f has left the tolerance around it (hysteresis).
+    Then there is always a gap to it, and steps stay long.
 
-    Let W be the largest of the tolerances in value (`band`) at the samples of a contact. What is
-    guaranteed:
+    Let W be the largest of the tolerances in value (`band`) at the samples of a contact. The
+    guarantees are:
 
     1. *Nothing is missed.* If f is farther than W from a level on one side at some point of the
        ray, and on the other side at a later one, there is a crossing between them. Proof: in
        contact on the side of larger values, the ray is proved free of `level - band`, the band
        being that of the last sample, as a ray is proved free of a level before contact
        (`March.advance`). So f > level - W as long as no crossing was noticed. Before the contact,
-       f was proved not to take the level at all. Beside a pole the band is as large as f is steep,
-       and may be larger than f gets anywhere behind it. So the band of a sample counts up to the
-       next sample only if the band there is not much smaller (`_MIN_BAND_RATIO`), or if both are at
-       most `_SHORT_STEP` tolerances apart (`may_reach`): a step that fails this is made shorter. So
-       is one to a sample of which nothing is known, as where an exponential overflows.
+       f was proved not to take the level at all. Beside a pole the band grows with the slope of f,
+       and may be larger than f anywhere behind it. So the band of a sample counts up to the next
+       sample only if the band there is not much smaller (`_MIN_BAND_RATIO`), or if both samples are
+       at most `_SHORT_STEP` tolerances apart (`may_reach`): a step that fails this test is made
+       shorter. So is a step to a sample without a finite error bound, as where an exponential
+       overflows.
     2. *Nothing is counted twice.* A crossing is noticed at a point where f is proved to be on the
-       other side of the level, `band/2` being more than its error; the next one only where it is
-       proved to be on the first side again. So crossings of a level alternate, and between two that
-       are noticed f takes the level. A ray that starts within the tolerance of a level is on
-       neither side until a sample is half the tolerance off it: leaving it is no crossing.
+       other side of the level, `band/2` being more than its error; the next crossing is noticed
+       only where f is proved to be on the first side again. So crossings of a level alternate, and
+       between two noticed crossings f takes the level. A ray that starts within the tolerance of a
+       level is on neither side until a sample is half the tolerance off it: leaving it is no
+       crossing.
     3. *Nothing sticks.* In contact, f is `band/2` or more away from the level beyond, up to its
        error, so the gap that steps are solved for is at least a fifth of the band.
 
-    The lift of an angle-valued f. Before contact, f lies between two neighboring levels of the
-    ladder, and in contact it is proved to stay nearer to the level reached than to all others: the
-    window is less than a period wide, and the value tells where in it f is. (Looking back from a
-    point takes the window there, and the two proved intervals share a point, so their lifts agree.)
+    The branch of an angle-valued f. Before contact, f lies between two neighboring periodic levels.
+    In contact, f is proved to stay nearer to the level reached than to all others. Both windows are
+    less than a period wide, so the value modulo the period tells where in the window f is. (An
+    enclosure behind a point takes the window at that point, and the two proved intervals share a
+    point, so their branches agree.)
 
-    levels: all of them.
-    spacing: the difference between the two closest, inf for one level.
-    is_free_before, is_free_after: whether the ray is proved free before the interval that is
-        marched, and behind it, by where the surface lies. Then f stays on the side of a level on
+    levels: all levels.
+    spacing: the difference between the two closest levels, inf for a single level.
+    is_free_before, is_free_after: whether the extent of the surface proves that the ray is free
+        before the interval that is marched, and behind it. Then f stays on the side of a level on
         which it is at that end of the interval, and there it need be off the level by no more than
         its error.
-    start, rounding: where the interval begins, and how far off a sheet rounding may have put a ray
-        that starts on it.
+    start: the ray parameter at which the interval begins.
+    rounding: the distance from a facet by which rounding may displace a ray that starts on it.
     """
 
     levels: Levels
@@ -292,7 +298,7 @@ class Hysteresis:
         start: Real,
         rounding: Real,
     ) -> Hysteresis:
-        """The rule for some levels. free: `is_free_before` and `is_free_after`."""
+        """The rule for these levels. free: `is_free_before` and `is_free_after`."""
         period = levels.period
         spacing: Real = dr.inf if period is None else period
         for k, one in enumerate(levels.values):
@@ -305,13 +311,13 @@ class Hysteresis:
         return cls(levels, spacing, *free, start, rounding)
 
     def contact_tolerance(self, within: Real) -> Real:
-        """How near in value a level must be for contact: `contact_tolerance`, which the tolerance
-        asks for, or less where levels are close together."""
+        """The level gap at which contact begins: `within`, the value tolerance of a hit, or less if
+        levels are close together."""
         return fmin(within, _MAX_BAND_OF_SPACING * self.spacing)
 
     def band(self, within: Real, rounding: Real) -> Real:
-        """The tolerance in value around a level: `contact_tolerance`, or more where rounding asks
-        for it."""
+        """The tolerance in value around a level: `within`, or more if f has a large rounding error,
+        but at most a fraction of the spacing of levels."""
         return fmin(
             fmax(within, _MIN_BAND_ROUNDINGS * rounding), _MAX_BAND_OF_SPACING * self.spacing
         )
@@ -319,23 +325,23 @@ class Hysteresis:
     def may_reach(self, now: Contact, band: Real, step: Real, tolerance: Real) -> Mask:
         """Whether the band of the last sample may count for a step to a point with this band.
 
-        tolerance: a length, at that point.
+        tolerance: the hit tolerance at that point, a length.
         """
         holds = now.band * _MIN_BAND_RATIO <= band
         return ~now.is_touching | holds | (step <= _SHORT_STEP * tolerance)
 
     def must_sample_end(self, now: Contact, end: Real) -> Mask:
-        """Whether a ray that is proved free to its end has to sample it: in contact it is proved
-        free of levels that lie a band beyond."""
+        """Whether a ray that is proved free up to its end must still sample the end: in contact it
+        is only proved free of a level that counts as lying a band beyond its place."""
         return now.is_touching & (self.is_free_after | (end < dr.inf))
 
     def gaps(
         self, contact: Contact, value: Real, gaps: LevelGaps, band: Real, part: float = 1.0
     ) -> LevelGaps:
-        """How far f may move, given the gaps to the true levels.
+        """The gaps to the levels as the hysteresis places them, from the gaps to the true levels.
 
-        In contact the level counts as lying `part` of the band beyond, and steps end within that
-        part of half the way to the next level.
+        In contact the level counts as lying the fraction `part` of the band beyond its place, and
+        steps end within the same fraction of half the way to the next level.
         """
         x, far = -self.levels.offset_to_nearest(value), part * _MAX_APPROACH * self.spacing
         band = part * band
@@ -388,10 +394,12 @@ class Hysteresis:
     def update_at_jump(
         self, now: Contact, active: Mask, seen: AcceptedPoint, ahead: JumpCrossing, d: Vec3
     ) -> tuple[Contact, Mask]:
-        """The contact behind the sheet `ahead`, and whether the jump of f there crosses the level.
+        """The contact behind the facet `ahead`, and whether the jump of f there crosses the level.
 
-        now: the contact at an accepted point just before the sheet. d: the direction of the ray.
-        A field with sheets has one level here. A ray that starts on a sheet is on neither side.
+        now: the contact at an accepted point just before the facet.
+        d: (3,) the direction of the ray.
+
+        A field with jumps has a single level here. A ray that starts on a facet is on neither side.
         """
         x = -self.levels.offset_to_nearest(seen.value)
         one = type(x)(1)
@@ -417,11 +425,14 @@ class Hysteresis:
         ), crosses
 
     def _side(self, now: Contact, seen: AcceptedPoint, x: Real) -> Real:
-        """From which side of the nearest level a ray comes that was not in contact with it.
+        """The side from which a ray comes to the nearest level if it was not in contact with it: 1
+        if f is larger there, -1 if it is smaller, 0 if the side is not known.
 
-        x: f less that level. The ray was proved free, so a real-valued f is on the side of the last
-        accepted value. If f is periodic that value may lie on both sides: there the present value
-        decides and, where it is the level up to its error, the slope.
+        x: f minus that level.
+
+        The ray was proved free, so a real-valued f is on the side of the last accepted value. If f
+        is periodic, that value may lie on either side of the level. Then the present value decides,
+        or the slope if the present value equals the level up to its error.
         """
         if self.levels.period is None:
             above = seen.before[1] > seen.value - x
@@ -434,7 +445,7 @@ class Hysteresis:
 
 @dataclass(frozen=True)
 class _Bisection:
-    """The state of bisection: f takes the level between before and behind."""
+    """The state of bisection: f takes the level between `before` and `behind`."""
 
     before: Real
     behind: Real
@@ -448,11 +459,14 @@ def refine_crossing(
     field: Field, levels: Levels, tolerance: PreparedHitTolerance, path: Ray, found: Contact,
     active: Mask,
 ) -> tuple[Real, Vec3, Any]:  # fmt: skip
-    """The root of a crossing, the gradient of f there, and how many evaluations of f that took.
+    """Refine a crossing by bisection.
 
-    Between two points with a crease between them f is no cubic. So f is evaluated at the root, and
-    where it is farther from the level than the tolerance and its rounding, the two points are
-    brought together by bisection: f stays on different sides of the level at both.
+    Returns the root, the gradient of f at the root, and the number of evaluations.
+
+    The cubic through the two points of the crossing is a bad approximation of f if a crease lies
+    between them. So f is evaluated at the root of the cubic. If it is farther from the level than
+    both the tolerance and the error of f, the bracket is narrowed by bisection, with f on different
+    sides of the level at its ends.
     """
     side = -found.side
     count = dr.uint32_array_t(type(found.root))
@@ -484,8 +498,8 @@ def refine_crossing(
 
 
 def cubic_root(start: Real, end: Real, slope: Real, end_slope: Real) -> Any:
-    """A root in [0, 1] of the cubic with these values at 0 and 1, of different signs, and these
-    slopes: Newton's method, and bisection where it leaves the bracket."""
+    """A root in [0, 1] of the cubic with these values, of different signs, and these slopes at 0
+    and 1, by Newton's method, with bisection if Newton's method leaves the bracket."""
     # start + slope u + b u^2 + c u^3
     b = 3 * (end - start) - 2 * slope - end_slope
     c = slope + end_slope - 2 * (end - start)

@@ -1,15 +1,17 @@
-"""The only marching loop: the first point of a ray on a level set, with every step proved.
+"""The marching loop, the only one of the tracer: it gives the first point of a ray on a level set,
+with a proof of every step.
 
-It knows neither fields nor proofs. It samples a field along the ray, and the enclosures that come
-with each sample say how far the ray is free.
+The loop depends neither on the kind of field nor on the kind of proof. It samples a field along the
+ray, and the enclosures of each sample tell how far the ray is free of levels.
 
-Trials are aimed. Over-relaxed steps end just short of where f is predicted to reach a level.
-Without this, half of the samples near the surface were rejected. Smooth fields are predicted by the
-cubic through the last two values and slopes, approximate ones by the slope.
+Trial steps are aimed: an over-relaxed step ends just short of the point at which f is predicted to
+reach a level. Without this, half of the samples near the surface were rejected. The prediction is
+the cubic through the last two values and slopes for smooth fields, and the slope for approximate
+fields.
 
-The state of the march is a record, which `loops` takes apart and puts together for Dr.Jit's loop.
-The march compares samples with a sheet; the walk from sheet to sheet (`walks`) calls the march, and
-not the other way round.
+The state of the march is a record, which `backend.loops` takes apart and puts together for Dr.Jit's
+loop. The march compares samples with the facet at the end of an interval; the tracer that goes from
+facet to facet (`walks.JumpTracer`) calls the march, and not the other way round.
 """
 
 from __future__ import annotations
@@ -45,49 +47,54 @@ if TYPE_CHECKING:
     from harnack.tracer.branch_tracker import BranchTracker
     from harnack.tree.empty_space import EmptySpaceGrid
 
-# A coarse sample is repeated at higher detail where a level is closer in value than this many times
-# its total error. The detail is chosen to make truncation this fraction of that distance, or of
-# what truncation may be, whichever is larger (`_refined_accuracy`).
+# A coarse sample is repeated with higher accuracy where a level is nearer in value than the first
+# number times the total error. The accuracy is chosen so that the truncation error becomes the
+# second number times the distance to that level, or the third number times the allowed truncation
+# error, whichever is larger (`_refined_accuracy`).
 _REFINE_BELOW, _TRUNCATION_OF_GAP, _TRUNCATION_OF_ALLOWED = 2.0, 0.25, 0.85
-# What truncation may be at a hit: this fraction of the tolerance, less this many times the
-# rounding; or this many times the rounding if that is larger.
+# The truncation error that is allowed at a hit: the first number times the tolerance, less the
+# second times the rounding error; or the third times the rounding error if that is larger.
 _TRUNCATION_OF_TOLERANCE, _LESS_ROUNDINGS, _TRUNCATION_OF_ROUNDING = 0.4, 0.55, 0.6
-# The next sample may be so coarse that its truncation is this fraction of the distance to a level.
+# The next sample may be so coarse that its truncation error is this fraction of the level gap.
 _COARSEN = 0.2
-# Trials stop short of where f is predicted to reach a level by this factor: by a parabola, or where
-# there is only a slope.
+# Trial steps are this fraction of the length at which f is predicted to reach a level: predicted by
+# a parabola, or by the slope alone.
 _TRIAL_AIM, _AIM_BY_SLOPE = 0.999, 0.99
-# How far from the surface rounding may leave a point that is a hit: see `March._is_near`.
+# The largest distance from the surface that rounding may leave uncertain at a hit: see
+# `March._is_near`.
 _LARGEST_UNCERTAINTY = 1 / 16
-# Rays without an end that get as far as this power of the largest number end as misses: squares of
+# Rays without an end become misses where t reaches this power of the largest number: squares of
 # larger numbers overflow.
 _MISS_EXPONENT = 0.47
-# The fraction of the gap to the cover of a cone by which the cone may widen in a step.
+# The fraction of the level gap that is reserved for the growth of a cone during a step.
 _WIDENING = 0.1
-# The detail of a repeated sample is larger by these factors at least and at most.
+# The accuracy scale of a repeated sample is larger by these factors at least and at most.
 _REFINEMENT_LIMITS = 1.25, 16.0
-# Truncation falls like this power of detail; beyond the largest detail there is none.
+# Truncation falls as this power of the accuracy scale; beyond the largest scale there is none.
 _TRUNCATION_ORDER, _MAX_ACCURACY = 3.2, 1e6
-# In contact, a step that leads to where the band is much smaller is tried again so much shorter.
+# In contact, a step that leads to where the band is much smaller is tried again with this fraction
+# of its length.
 _RETRY_FRACTION = 0.125
 
 
 @dataclass(frozen=True)
 class MarchState:
-    """Where rays are.
+    """The state of rays during the march.
 
-    proved_to: the ray is proved free up to here; the last accepted point.
-    proved_step: a length from there that is proved free too.
-    trial_step: from there to the next trial point.
-    enclosure_reach: how far enclosures are asked to reach next.
-    value, gradient: f at `proved_to`; the value is that behind the sheet if one was passed there.
-    tolerance_excess: by how much f there may be farther from a level than the tolerance allows.
-    evaluations: of f, so far.
-    accuracy_scale: of the next sample (`Field.at_detail`); None for fields without a choice of
-        detail (Dr.Jit records a loop twice if a state in it never changes).
-    status: a `RayStatus` once the ray has ended.
-    active: whether it goes on.
-    contact: what is known of the level reached last; None for rays that end where they reach one.
+    proved_to: ray parameter of the last accepted point; up to it the ray is proved free of levels.
+    proved_step: a length from there that is proved free, too.
+    trial_step: the length from there to the next trial point.
+    enclosure_reach: the length that the next enclosures should reach.
+    value, gradient: of f at `proved_to`; the value behind the facet if a facet was passed there.
+    tolerance_excess: by how much f at `proved_to` may be farther from a level than the tolerance
+        allows.
+    evaluations: the number of evaluations of f so far.
+    accuracy_scale: the accuracy scale of the next sample (`Field.at_accuracy`); None for fields
+        with a single accuracy (Dr.Jit records a loop twice if a state in it never changes).
+    status: the `RayStatus` of rays that have ended.
+    active: whether the ray goes on.
+    contact: the state of contact with the level that was reached last; None for rays that end where
+        they reach a level.
     """
 
     proved_to: Real
@@ -114,7 +121,11 @@ class MarchState:
         has_detail: bool,
         crosses: bool = False,
     ) -> MarchState:
-        """At the start of rays, before the first sample."""
+        """The state at the start of rays, before the first sample.
+
+        has_detail: whether the field has variable accuracy.
+        crosses: whether rays end where they have crossed a level, and not where they reach it.
+        """
         real, vector, count = backend.Float, backend.Array3f, backend.UInt32
         return cls(
             proved_to=real(start),
@@ -134,24 +145,28 @@ class MarchState:
 
 @dataclass(frozen=True)
 class _TrialSample:
-    """What is known of f at the trial points of rays.
+    """The sample at the trial point of each ray, and what follows from it.
 
-    t: of the points. at_end: whether the ray ends there. size: of coordinates there.
+    t: ray parameter of the trial point.
+    at_end: whether the ray (or the interval before the next facet) ends there.
+    coordinate_size: a bound of the absolute values of the coordinates there.
     unproved_length: the length before the point that no step has proved yet.
-    look: the field's answer there. gradient_norm: the length of its gradient.
-    gaps: from f to the levels on both sides; in contact, to where the hysteresis puts them.
-    total_error: what rounding and truncation may have done to f.
-    value_tolerance: how near in value a level makes a hit; in contact, a crossing.
-    band: in contact that of `Hysteresis.band`.
+    look: the sample of the field there, with its enclosures.
+    gradient_norm: the length of the gradient there.
+    gaps: from f to the levels on both sides; in contact, to the levels as the hysteresis places
+        them.
+    total_error: a bound of the rounding and truncation error of f.
+    value_tolerance: the largest level gap that makes a hit; in contact, a crossing.
+    band: in contact, the band of `Hysteresis.band`; else `value_tolerance`.
     is_near: whether a level is near enough for a hit.
-    accepts_unknown_side: whether a point may be accepted although it is not known on which side of
-        a level it lies.
-    excess: as that of `MarchState`.
+    accepts_unknown_side: whether the point may be accepted although it is not known on which side
+        of a level it lies.
+    excess: as `MarchState.tolerance_excess`.
     is_smooth: whether value and slope predict f.
-    passes_branch_level, needs_branch: see `BranchTracker.gaps`; None for fields that know their
-        values.
-    steep: what values prove there; None for fields whose slopes are bounded.
-    looks: evaluations of f beyond the points.
+    passes_branch_level, needs_branch: the masks of `BranchTracker.gaps`; None if the sample knows
+        its branch on all lanes.
+    steep: bounds that rest on values of f; None for fields whose slopes are bounded.
+    looks: the number of further evaluations of f, beyond the trial point.
     """
 
     t: Real
@@ -179,7 +194,9 @@ class _TrialSample:
         return self.look.sample.value
 
     def gaps_after_jump(self, behind: LevelGaps) -> LevelGaps:
-        """The gaps to rungs, which a sheet does not change; behind it where these are passed."""
+        """The level gaps behind a facet for a field with unknown branch. A jump does not change the
+        gaps to the periodic levels. Lanes of `passes_branch_level` have gaps to the true levels,
+        and take those behind the facet."""
         down = dr.select(self.passes_branch_level, behind.below, self.gaps.below)
         return replace(
             self.gaps,
@@ -190,18 +207,19 @@ class _TrialSample:
 
 @dataclass(frozen=True)
 class March:
-    """How to march: the levels to find, when to stop, and by how much to try longer steps.
+    """The parameters of the march: the levels, the hit tolerance and the lengths of trial steps.
 
-    overstep: trial steps are at most this many times as long as the proved ones.
-    hysteresis: for rays that end where they have crossed a level, and not where they reach one.
+    max_steps: the number of evaluations of f after which a ray is out of steps.
+    overstep: trial steps are at most this many times as long as the proved steps.
+    hysteresis: for rays that end where they have crossed a level, and not where they reach it.
     cone_radius: for cones that end where they come near a level (`pixel_cones`): their radius per
         unit of t.
-    occupied: for rays that end where they reach a level, cells outside of which there is no level,
-        not even behind a sheet.
-    ray_end: where these rays end.
-    only_component: whether there may be levels outside of these cells, which do not count.
-    branch_tracker: for fields whose coarse samples know f but for a whole number, how rays find it;
-        None for no such samples.
+    occupied: for rays that end where they reach a level: cells outside of which there is no level,
+        not even for a continuation of f behind a facet.
+    ray_end: the ray parameter at which these rays end.
+    only_component: whether levels may lie outside of the occupied cells; these do not count.
+    branch_tracker: determines the branch of samples that give f only modulo 1; None if all samples
+        know their branch.
     """
 
     backend: Backend
@@ -228,48 +246,46 @@ class March:
 
         Proof that no hit is missed: `proved_to` is a point up to which the ray is free, and
         `proved_step` a proved length from there. A trial point, `trial_step` from there, is
-        accepted only if that is no more than `proved_step`, or an enclosure at the trial point,
-        looking back, covers the difference; then all up to it is free. Otherwise the ray goes back
-        to proved_to + proved_step, which needs no such test. A ray ends as a miss when proved_to +
-        proved_step passes its end, as a hit only at an accepted point. A point is not accepted on a
-        sample that is too coarse (`_refined_accuracy`), but sampled again.
+        accepted only if `trial_step` is at most `proved_step`, or if an enclosure behind the trial
+        point covers the difference; then the ray is free up to the trial point. Otherwise the ray
+        goes back to proved_to + proved_step, which needs no such test. A ray ends as a miss when
+        proved_to + proved_step passes its end, and as a hit only at an accepted point. A point
+        whose sample is too coarse (`_refined_accuracy`) is not accepted but sampled again.
 
-        A hit is a point where f is within the tolerance of a level *after* the truncation error of
-        f is taken off; where rounding leaves f less certain than that, within twice what it leaves.
-        A trial point at which the level is nearer than the error of f may lie behind the root, by
-        less than the tolerance: it is a hit (`_refined_accuracy`), so nothing is passed there. If
-            it is no
-        hit, because the error is large, it is not accepted by looking back, and no step from it is
-        proved: on which side of the point the level lies is not known.
+        A hit is a point at which f is within the tolerance, less the truncation error, of a level;
+        or within twice the rounding error of f, if that is more. A trial point at which the level
+        is nearer than the error of f may lie behind the root, by less than the tolerance: it is a
+        hit (`_refined_accuracy`), so nothing is passed there. If it is no hit, because the error is
+        large, then it is not accepted by an enclosure behind it, and no step from it is proved: it
+        is not known on which side of the point the level lies.
 
-        In rounded arithmetic a surface could be missed between the enclosure that reaches ahead
-        from one point and the one that looks back from the next, so for both the levels are nearer
-        by the rounding of value and position together (`value_error_bound`).
+        In rounded arithmetic a surface could be missed between the enclosure ahead of a point and
+        the enclosure behind the next point. So for both, the level gaps are reduced by the rounding
+        of value and position together (`value_error_bound`).
 
-        With `hysteresis` a level that is reached is not the end: the ray goes on, towards levels
-        that lie where the hysteresis puts them, and ends as a hit where it has crossed one. It may
-        be made active again there, to go on to the next.
+        With `hysteresis` the ray does not end where it reaches a level. It goes on towards levels
+        as the hysteresis places them, and ends as a hit where it has crossed a level. There it may
+        be made active again, to go on to the next level.
 
-        With `cone_radius` the levels lie nearer by |grad f| times the radius of a cone, which grows
-        with
-        t: a tenth of the gap is set aside for that growth, and no step is longer than the cone
-            takes
-        to widen by so much, unless the level is never met and f leaves it faster than the cone
-        widens.
+        With `cone_radius`, a whole cone must stay clear of the levels: gaps shrink by |grad f|
+        times its radius, which grows with t. A tenth of a gap is reserved for the growth of the
+        cone, and no step is longer than the cone takes to grow by it, unless the level is never met
+        and f leaves it faster than the cone grows.
 
-        With `occupied` what follows a proved step is passed as well, as far as it lies in cells
-        that hold no level (`EmptySpaceGrid.empty_run` has the proof): a union of free intervals is
-        free.
+        With `occupied`, the ray after a proved step is passed, too, as far as it lies in cells that
+        contain no level (`EmptySpaceGrid.empty_run` has the proof): a union of free
+        intervals is free.
 
-        With `only_component` levels outside of `occupied` belong to other components of the
-        surface.
-        Proved steps end in occupied cells, and so do trials: one that would not is not made. So no
-        hit lies outside of them, and levels that are passed there do not count.
+        With `only_component`, levels outside of `occupied` belong to other components of the
+        surface. Proved steps end in occupied cells. A trial step that would end elsewhere is
+        replaced by the proved step. So no hit lies outside of the occupied cells, and levels that
+        are passed there do not count.
 
-        ahead: for a field with sheets, the crossing at `end`, on lanes where there is one. Those
-        lanes sample that point as well. Accepted there, they hit the sheet or have passed it: a
-        miss, with the step that the value behind the sheet allows from there. `value` is then that
-        behind the sheet; without `hysteresis` not where the sheet was hit.
+        ahead: for a field with jumps, the crossing at `end`, on lanes that have one. These lanes
+            sample the point of the crossing as well. If it is accepted, they hit the facet or have
+            passed it. A ray that has passed it ends as a miss, with the step that the value behind
+            the facet allows from there. `value` is then the value behind the facet; without
+            `hysteresis` not if the facet was hit.
         """
 
         def body(now: MarchState) -> MarchState:
@@ -444,12 +460,15 @@ class March:
         is_near: Mask,
         may_be: Mask,
     ) -> tuple[Mask, Any]:
-        """At which of the points that are near a level, by their slope or by what f may be within
-        the rounding of the point, f takes it within the tolerance or twice that rounding, and how
-        many evaluations of f that took.
+        """Whether f really takes the level near points that are near it in value, and the number of
+        evaluations that this test took.
 
-        It does if the enclosures prove it along the ray, or if f is seen on the other side of the
-        level or at it (`steep.beyond`). may_be: whether the level may be f up to rounding.
+        A point is near a level by its slope, or because f may equal the level within the rounding
+        of the point. The test asks whether f takes the level within the tolerance, or within twice
+        that rounding. It does if the enclosures prove it along the ray, or if a sample of f lies on
+        the other side of the level or at it (`steep.beyond`).
+
+        may_be: whether f may equal the level up to rounding.
         """
         sample, p = look.sample, path.point(t)
         tolerance = dr.fma(t, self.tolerance.per_length, self.tolerance.distance)
@@ -469,8 +488,8 @@ class March:
     def _apply_hysteresis(
         self, seen: _TrialSample, hysteresis: Hysteresis, contact: Contact
     ) -> _TrialSample:
-        """The same, with levels where the hysteresis puts them. The band takes all rounding of f
-        into account, or a ray would stick in a crease."""
+        """The same sample with gaps to the levels as the hysteresis places them. The band includes
+        all rounding of f, or a ray would stick in a crease."""
         band = hysteresis.band(
             seen.value_tolerance, seen.total_error - seen.look.sample.truncation_error
         )
@@ -489,8 +508,8 @@ class March:
     def _accept(
         self, field: Field, seen: _TrialSample, now: MarchState, ahead: JumpCrossing | None
     ) -> tuple[Mask, Real | None, Mask]:
-        """Whether all up to the trial point is proved free, by a sample that is not too coarse; the
-        detail of the next sample; and whether this one was too coarse."""
+        """Whether the ray is proved free up to the trial point, by a sample that is not too coarse;
+        the accuracy scale of the next sample; and whether this sample was too coarse."""
         accepted = now.trial_step <= now.proved_step
         if self.overstep > 1:
             knows_side = seen.accepts_unknown_side | (seen.gaps.nearest > seen.total_error)
@@ -531,7 +550,7 @@ class March:
         sheet: JumpTest | None,
     ) -> tuple[Contact, Mask, JumpTest | None, Real]:
         """The contact behind the trial point, whether rays have crossed the level, the comparison
-        with the sheet, and f behind it."""
+        with the facet, and f behind the facet."""
         value = seen.value
         before = now.proved_to, now.value, dr.dot(now.gradient, path.direction), now.gradient
         last = seen.at_end if sheet is None else seen.at_end & ~sheet.has_crossing
@@ -554,7 +573,7 @@ class March:
         return contact, hit, sheet, value
 
     def _proved_step(self, seen: _TrialSample, gaps: LevelGaps, contact: Contact | None) -> Real:
-        """How far from the trial point rays are proved free of levels that far away in value."""
+        """The length from the trial point that is proved free of levels with these gaps."""
         spent = _WIDENING * seen.gaps.nearest
         if self.cone_radius is not None:
             gaps = gaps.reduced_by(spent)
@@ -583,7 +602,8 @@ class March:
         forward: Real,
         trial: Real,
     ) -> tuple[Real, Real]:
-        """The proved and the trial step, made longer by cells without a level behind the proof."""
+        """The proved step and the trial step, extended over empty cells that follow the proved
+        step."""
         free_to = dr.select(accepted, seen.t + forward, self.ray_end)
         free_to = occupied.end_of_empty_run(path.origin, path.direction, free_to, self.ray_end)
         forward = fmax(forward, dr.select(free_to >= self.ray_end, dr.inf, free_to - seen.t))
@@ -602,8 +622,8 @@ class March:
         contact: Contact | None,
         hit: Mask,
     ) -> Real:
-        """How far ahead enclosures are asked to reach next."""
-        # After a step of zero, enclosures are asked to reach a third as far: bisection.
+        """The length that the next enclosures should reach."""
+        # After a step of zero, the next enclosures need reach only a third as far: bisection.
         candidate = fmin(now.enclosure_reach, end - seen.t)
         shorter = dr.select(dr.isfinite(candidate), candidate / 3, 1 + 16 * seen.coordinate_size)
         tried = dr.select(proved > 0, seen.look.reach_growth * proved, shorter)
@@ -621,7 +641,7 @@ class March:
         proved_step: Real,
         contact: Contact | None,
     ) -> Mask:
-        """Whether rays are proved free to their end."""
+        """Whether rays are proved free of levels up to their end."""
         farthest = float(dr.largest(self.backend.Float)) ** _MISS_EXPONENT
         proved_to = dr.select(accepted, seen.t, now.proved_to)
         free = proved_to + proved_step >= dr.select(end == dr.inf, farthest, end)
@@ -642,13 +662,14 @@ class March:
     ) -> Mask:
         """Whether a level is near enough in value for a hit; see `advance`.
 
-        within: how near the tolerance asks it to be. rounding: what it may have done to f.
+        within: the largest level gap that the tolerance allows.
+        rounding: a bound of the rounding error of f.
 
         A point is no hit if rounding leaves the distance to the surface uncertain by more than a
-        sixteenth of a size: that of the coordinates or, if larger, the radius on which f is known
-        to be smooth. Nor is it on a ray without an end if rounding alone makes it one and leaves t
-        uncertain by more than that size: far enough away, rounding would make a hit of every ray
-        that is parallel to the surface.
+        sixteenth of a size: the size of the coordinates or, if larger, the radius of the ball on
+        which f is proved to be smooth. On a ray without an end, a point is no hit either if it is
+        near a level only by rounding and rounding leaves t uncertain by more than that size: far
+        enough away, rounding would make a hit of every ray that is parallel to the surface.
         """
         sample = look.sample
         near = gap <= fmax(within - sample.truncation_error, 2 * rounding)
@@ -669,12 +690,14 @@ class March:
         path: Ray,
         is_smooth: bool,
     ) -> Real:
-        """The next trial step, where `forward` is proved: longer, but not past where f is predicted
-        to reach a level. The prediction need not be right: a trial must still be proved, looking
-        back.
+        """The next trial step, at least the proved step `forward`.
 
-        is_smooth: whether value and slope at the last accepted point help to predict f. Those of an
-        approximate field, whose truncation differs from point to point, do not.
+        It is longer by over-relaxation, but not past the point at which f is predicted to reach a
+        level. The prediction need not be right: a trial must still be proved by an enclosure behind
+        it.
+
+        is_smooth: whether value and slope at the last accepted point help to predict f. They do not
+            for an approximate field, whose truncation error differs from point to point.
         """
         slope = look.slope
         rate, gap = dr.abs(slope), dr.select(slope > 0, gaps.above, gaps.below)
@@ -687,8 +710,9 @@ class March:
         return fmin(self.overstep * forward, fmax(target, forward))
 
     def _second_derivative(self, look: RaySample, now: MarchState, path: Ray) -> Real:
-        """The second derivative here of the cubic with the values and slopes of f here and at the
-        last accepted point, a length h before; 0 where nothing was accepted before.
+        """The second derivative, at the trial point, of the cubic with the values and slopes of f
+        at the trial point and at the last accepted point, a length h before; 0 if no point was
+        accepted before.
 
         With D the difference quotient and s0, s the slopes: 2 (2s + s0 - 3D)/h (Hermite).
         """
@@ -701,13 +725,13 @@ class March:
         return dr.select(known, 2 * (2 * slope + before - 3 * rise / h) / h, 0)
 
     def _status(self, hit: Mask, free: Mask) -> Any:
-        """The status of a ray that goes no farther."""
+        """The status of a ray that ends here."""
         ended = dr.select(free, int(RayStatus.MISS), int(RayStatus.OUT_OF_STEPS))
         return self.backend.UInt32(dr.select(hit, int(RayStatus.HIT), ended))
 
     def _deciding_gap(self, value: Real, ahead: JumpCrossing | None, at_end: Mask | None) -> Real:
-        """The distance in value from f to the nearest level; where the sample lies at a sheet, the
-        smaller of those of f before and behind the sheet."""
+        """The gap from f to the nearest level; at a facet, the smaller of the gaps from f before
+        and behind the facet."""
         gap = self.levels.gaps(value).nearest
         if ahead is not None:
             behind = self.levels.gaps(value + ahead.jump).nearest
@@ -718,14 +742,18 @@ class March:
 def _refined_accuracy(
     detail: Real, gap: Real, total_error: Real, truncation: Real, within: Real
 ) -> tuple[Real, Mask]:
-    """The detail to sample a point at again, and whether the sample at this detail is too coarse.
+    """The accuracy scale for a repeated sample, and whether the sample of this scale is too coarse.
 
-    It is too coarse where its error shortens the step by much or decides about a hit, unless
-    truncation is a small part of `value_tolerance`, by which a hit may be off, or of rounding,
-    which more detail does not reduce. With the truncation that is allowed the march still arrives
-    at hits: its steps end where a level is as near as `total_error`, and 1.25 times that is less
-        than what makes
-    a hit, within - truncation or twice the rounding.
+    detail, total_error, truncation: the accuracy scale, total error and truncation error of the
+        sample.
+    gap: the gap from f to the nearest level.
+    within: the value tolerance of a hit.
+
+    A sample is too coarse if its error shortens the step by much or decides about a hit, unless its
+    truncation error is a small part of `within` or of the rounding error, which a higher accuracy
+    does not reduce. With the truncation error that is allowed, the march still arrives at hits: its
+    steps end where a level is as near as `total_error`, and 1.25 times that is less than the gap
+    that makes a hit (within - truncation, or twice the rounding).
     """
     rounding = total_error - truncation
     allowed = fmax(
@@ -739,8 +767,7 @@ def _refined_accuracy(
 
 
 def _next_accuracy(detail: Real, gap: Real, truncation: Real, coarsest: float) -> Real:
-    """The detail for the next sample, at most that of this one, given the truncation of this one
-    and
-    its gap to the next level: 0 for the coarsest, or at least 1."""
+    """The accuracy scale of the next sample: 0 (coarsest) or at least 1, and never above `detail`,
+    the scale of this sample. truncation, gap: of this sample."""
     wanted = detail * dr.power(truncation / (_COARSEN * gap), 1 / _TRUNCATION_ORDER)
     return dr.select(wanted > coarsest, fmin(fmax(wanted, 1), detail), 0)

@@ -1,4 +1,5 @@
-"""Pixel cones near a surface: which pixels it may cover in part, though their rays miss it.
+"""Pixel cones: tests whether a surface may cover a part of a pixel although the pixel's ray misses
+it.
 
 The cover of a surface is the surface moved outwards by the radius of the cone (Thomas et al. 1989;
 Hart 1996, Section 3). A cone whose ray enters the cover and leaves it again on the same side is
@@ -6,9 +7,9 @@ covered in part; one whose ray gets a radius behind the surface is covered compl
 to first order: the distance to a level is taken as |f - level| / |grad f|, which is right only
 close to a smooth surface.
 
-Cones find, rays measure: `antialias="cones"` asks of each pixel's cone whether a surface covers a
-part of it, and such pixels get all samples. Hart's coverage by a half plane (1996, Eq. 22), laid
-over what lies behind, was tried and left out: its error was as large as of 9 rays a pixel on
+Cones only select pixels: with `antialias="cones"`, pixels whose cone may be covered in part get all
+samples, and their rays give the color. Hart's coverage by a half plane (1996, Eq. 22), composited
+over the background, was tried and left out: its error was as large as that of 9 rays a pixel on
 letters, and two to four times as large where surfaces end, have creases or are thinner than the
 cone.
 """
@@ -67,10 +68,11 @@ class _CoverState:
 class PixelCones:
     """Cones around rays o + t d, |d| = 1, that may touch a level set.
 
-    radius: of a cone, per unit of t.
-    bounding_balls: (middle, depth, size): the center of two balls, one of the radius `depth` inside
-        the surface's extent and one of the radius `size` around it; None for an extent without end.
-    solid: (low, high) of a solid {low <= f <= high}; None for a surface with two sides.
+    radius: the radius of a cone per unit of t.
+    bounding_balls: (middle, depth, size): the common center of two balls, one of radius `depth`
+        inside the extent of the surface and one of radius `size` around the extent; None for an
+        unbounded extent.
+    solid: (low, high) for a solid {low <= f <= high}; None for a surface with two sides.
     """
 
     prepared: SurfaceTracer

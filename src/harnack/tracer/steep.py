@@ -1,13 +1,15 @@
 """Hits and steps where the slope of a field has no bound (`Field.is_steep`).
 
-|f - level| <= tolerance |grad f| is a length only if f does not bend within it. Beside a vertical
-tangent or a pole it may bend by any amount: at x = 1e-6 the slope of sqrt(|x|) + 0.5 is 500, and
-the level 0 would be 0.001 away, but it is nowhere. So what would be a hit there is looked at on
-the other side, and what steps slopes do not prove, ranges of values may (`arithmetic.values`).
+|f - level| / |grad f| estimates the distance to the level only if f does not bend within it. Beside
+a vertical tangent or a pole f may bend by any amount: at x = 1e-6 the slope of sqrt(|x|) + 0.5 is
+500, so the level 0 should be 0.001 away, but f never takes it. So before a point counts as a hit, f
+is sampled on the other side of the level; and steps that slopes do not prove may be proved by
+ranges of values (`arithmetic.values`).
 
-So it is where a formula is steep within the rounding of coordinates only, as max(-1, min(1, 1e9 y))
-is: its slope is 0 on both sides. A rounded point there has a level within its error, which ends all
-steps; the ray hits if f is seen on the other side, and is undecided if it is not.
+The same holds for a formula that is steep only within the rounding of coordinates, such as
+max(-1, min(1, 1e9 y)), whose slope is 0 on both sides. A rounded point there has a level within its
+error, which ends all steps. The ray hits if f is seen on the other side of the level, and is
+undecided otherwise.
 """
 
 from __future__ import annotations
@@ -54,7 +56,7 @@ def values_between(field: Field, p: Vec3, q: Vec3, slack: Real | None = None) ->
 
 
 def largest_change(field: Field, p: Vec3, value: Real, reach: Real) -> Real:
-    """By how much f may differ from its value at p within `reach` of it; infinite if not known.
+    """A bound of |f(y) - f(p)| for |y - p| <= `reach`; infinite if none is known.
 
     Beside a vertical tangent |grad f| times a length is more, and may be more than f changes
     anywhere: that of |x y|^(1/3) - z at x = 1e-10 is 1e5.
@@ -205,8 +207,8 @@ def beyond(
     may have put p behind the level, and from the nearest place half of `reach` along each axis.
     Ranges around p are no proof: they hold numbers that are no values of f, and so do those beside
     a jump: f is at the level up to rounding only where it is continuous on a box that is many times
-    as large as this rounding. Where the level is not
-    found nothing is proved: the ray goes on, and comes nearer if it meets the surface.
+    as large as this rounding. If the level is not found, nothing is proved: the ray goes on, and
+    comes nearer if it meets the surface.
     """
     epsilon = float(dr.epsilon(backend.Float))
     finest = 4 * epsilon * reach

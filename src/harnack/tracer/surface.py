@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 
 _T = TypeVar("_T")
 
-# Levels nearer than this to a whole number are traced by samples that know f itself: far away a
-# winding number comes as near to such a level as one likes.
+# Levels nearer than this to an integer are traced by samples that know their branch: far away a
+# winding number comes arbitrarily near to such a level.
 _INTEGER_MARGIN = 1e-3
 
 _FIRST_HITS_ONLY = (
@@ -43,28 +43,28 @@ _FIRST_HITS_ONLY = (
 
 @dataclass(frozen=True)
 class Surface:
-    """A surface: where a field takes one of some levels, and how to trace it.
+    """A surface, that is the points at which a field takes one of the levels, and how to trace it.
 
-    field: the function.
+    field: the function f.
     levels: one or more numbers, or Dr.Jit numbers; `level_set` fills in the field's default.
-    tolerance: see `Tolerance`.
-    max_steps: evaluations of the field that a ray may take.
+    tolerance: see `HitTolerance`.
+    max_steps: the number of evaluations of the field after which a ray is out of steps.
     bound: the proofs by which steps are made (`choose_enclosures`).
     clip: a volume to cut the surface with, besides the field's own domain.
-    section: another one, that cuts the surface open: the faces of a solid on it may have a material
-        of their own.
-    largest: 0 for all of the surface. Else only one component of what the domain and the clip leave
-        is there: the one with the largest sum of projected areas along x, y and z
-        (`largest_component_cells`). Components are told apart by so many cells along the longest
-        side of the box, True for 128; those that are not separated by cells proved empty count as
-        one.
-    confirm: whether a ray hits only where f really changes sign about the level: where it passes
-        to the other side, by at least half the tolerance. One that comes within the tolerance and
-        turns back (a graze) goes on.
-    solid: (low, high) makes it the closed solid {low <= f <= high} cut by its volume, whose
-        levels are the finite ends; only renderers use it.
-    overstep: steps are tried this many times as long as proved, and kept if the bound at the far
-        end, looking back, covers the rest (Keinert et al. 2014). 1 turns it off.
+    section: another volume, which cuts the surface open: the faces of a solid on it may have a
+        material of their own.
+    largest: 0 for the whole surface. Otherwise the number of cells along the longest side of the
+        box (True for 128), by which components are told apart; components that are not separated by
+        cells proved empty count as a single component. Then the surface is only the component, of
+        the part within domain and clip, with the largest sum of projected areas along x, y and z
+        (`largest_component_cells`).
+    confirm: whether a ray hits only where f passes to the other side of the level, by at least half
+        the tolerance. A ray that comes within the tolerance and turns back (a graze) goes on.
+    solid: (low, high) for the closed solid {low <= f <= high} cut by the volume, whose levels are
+        the finite ends; only renderers use it.
+    overstep: the over-relaxation factor in [1, 2). Trial steps are this many times as long as the
+        proved steps, and are kept if an enclosure behind the trial point covers the rest (Keinert
+        et al. 2014). 1 turns over-relaxation off.
     """
 
     field: Field
@@ -125,10 +125,12 @@ class Surface:
             raise ValueError(_FIRST_HITS_ONLY)
 
     def validate_crossings(self, setting: str) -> None:
-        """Raise ValueError for several levels of a field with sheets: a jump may cross more than
-        one of them at once; NotImplementedError for a field with parts.
+        """Raise an error if crossings of this surface cannot be traced.
 
-        setting: what asks for crossings.
+        ValueError for several levels of a field with jumps, as a jump may cross more than one level
+        at once; NotImplementedError for a field with patches.
+
+        setting: the name of the setting that needs crossings, for the message.
         """
         if self.field.has_patches:
             raise NotImplementedError(
@@ -148,22 +150,23 @@ class Surface:
 
     @property
     def clip_volume(self) -> Volume | None:
-        """The intersection of clip and section; None for neither."""
+        """The intersection of clip and section; None if there is neither."""
         return _intersection([self.clip, self.section])
 
     def with_call_cache(self, *, begins: bool = False) -> Surface:
-        """The same surface, which prepares its field, and asks for its extent and its cells, at
-        most once; copies made by `dataclasses.replace` share these results.
+        """This surface with a cache for a single call of the library, so that field, extent and
+        cells are prepared only once. Copies by `dataclasses.replace` share the cache.
 
-        begins: whether this is the first use in a call of the library, so that earlier results do
-            not hold: between two calls, users may have changed a field in place.
+        begins: start with an empty cache, as users may have changed the field in place since the
+            last call.
         """
         return (
             self if self._call_cache is not None and not begins else replace(self, _call_cache={})
         )
 
     def memoize(self, what: Any, make: Callable[[], _T]) -> _T:
-        """The result of `make()`, which is called once for this field, these levels and `what`."""
+        """The result of `make()`, cached for this field, these levels and the key `what`. Without a
+        cache (outside of a call of the library), `make` is called each time."""
         if self._call_cache is None:
             return make()
         key = what, id(self.field), self.level_values
@@ -176,21 +179,21 @@ class Surface:
 
     @property
     def extent(self) -> Volume | None:
-        """The volume in which the field proves its levels to lie; None where it knows of none."""
+        """The volume that is proved to contain the level sets; None if none is known."""
         return self.memoize("extent", lambda: self.field.extent(self.level_values))
 
     @property
     def volume(self) -> Volume | None:
-        """What rays are clipped to: the intersection of domain, proved extent, clip and section;
-        None for all of space."""
+        """The volume to which rays are clipped: the intersection of domain, proved extent, clip and
+        section; None for all of space."""
         return _intersection([self.field.domain, self.extent, self.clip, self.section])
 
     def for_rays(self, count: int) -> Surface:
-        """The same surface, to be traced by so many rays (`Field.for_ray_count`)."""
+        """The same surface, prepared for this many rays (`Field.for_ray_count`)."""
         return replace(self, field=self.field.for_ray_count(count))
 
     def evaluator(self, backend: Backend) -> Field:
-        """The field on a backend, one for uses with and one for uses without derivatives."""
+        """The field, prepared for a backend and cached, with and without derivatives apart."""
         is_followed = any(dr.grad_enabled(one) for one in self.field.parameters())
         what = "field", backend, is_followed
         return self.memoize(
@@ -205,7 +208,7 @@ class Surface:
         return Levels(levels, self.field.period)
 
     def _occupied(self) -> OccupancyGrid | None:
-        """The cells that can hold a level that counts; None where none are known."""
+        """The cells that may contain a level that counts; None if no cells are known."""
         if not self.largest:
             return self.memoize("cells", lambda: self.field.occupied_cells(self.level_values))
         whole = _intersection([self.field.domain, self.extent, self.clip])
@@ -216,10 +219,10 @@ class Surface:
     def prepare(
         self, backend: Backend, *, crosses: bool = False, many: bool = True
     ) -> SurfaceTracer:
-        """Everything uploaded to a backend, ready to be traced in a recorded kernel.
+        """The tracer of this surface, with all data on a backend, for use in a recorded kernel.
 
-        crosses: whether rays will look for crossings. many: whether there will be so many rays that
-            it pays to look for cells without the level first.
+        crosses: whether rays will look for crossings.
+        many: whether there will be so many rays that it pays to search for empty cells first.
         """
         if self.largest and crosses:
             raise ValueError(_FIRST_HITS_ONLY)
@@ -265,12 +268,13 @@ def level_set(
     section: Volume | None = None,
     largest: bool | int = False,
 ) -> Surface:
-    """A `Surface` from what users write: a level or several, a tolerance, a bound's name.
+    """A `Surface` from user arguments: a level or several levels, a tolerance, the name of a bound.
 
-    largest: True or a number of cells for the largest component alone, as in `Surface`.
+    level: None for the default level of the field.
+    largest: True or a number of cells for the largest component only, as in `Surface`.
 
     Raises ValueError for a level that is not a finite number or that the field cannot have, and
-    TypeError for what is no field.
+    TypeError if `field` is no field.
     """
     check_is_field(field)
     if solid is not None:

@@ -1,7 +1,7 @@
-"""A level set uploaded to a backend, and the ways in which its rays are advanced.
+"""A surface on a backend, and the ways to advance its rays.
 
-`SurfaceTracer` is what renderers and `trace` call: first hits, occlusion and clipping, most of
-it while a kernel is being recorded. `trace_queued` traces many rays by few lanes.
+Renderers and `trace` call `SurfaceTracer` for first hits, occlusion and clipping, mostly while a
+kernel is being recorded. `trace_queued` traces many rays with few lanes.
 """
 
 from __future__ import annotations
@@ -39,32 +39,32 @@ __all__ = ["RayTracer", "SmoothTracer", "TracerFactory", "trace_queued"]
 
 
 class RayTracer(Protocol):
-    """Advances rays, each call of `advance` by one item: a trial point, a sheet, or a part."""
+    """Advances rays; each call of `advance` by one item: a trial point, an interval, or a patch."""
 
     def begin(self, state: MarchState) -> Any:
         """Rays at their start."""
         ...
 
     def advance(self, walk: Any, /) -> Any:
-        """Rays one item further."""
+        """The rays after one more item."""
         ...
 
     def finish(self, walk: Any, /) -> tuple[MarchState, Any]:
-        """The state of rays, and the index of the sheet or part that each hit."""
+        """The state of rays, and the index of the facet or patch that each ray hit."""
         ...
 
     def run(self, state: MarchState) -> tuple[MarchState, Any]:
-        """What `finish` returns for rays followed to their end."""
+        """The result of `finish` for rays that were advanced to their end."""
         ...
 
 
-# From a path, its start and its end.
+# A function of rays, their start and their end.
 TracerFactory: TypeAlias = "Callable[[Ray, Real, Real], RayTracer]"
 
 
 @dataclass(frozen=True)
 class SmoothTracer:
-    """Rays through a field that has neither sheets nor parts."""
+    """Traces rays through a field without jumps and patches."""
 
     march: March
     field: Field
@@ -80,7 +80,7 @@ class SmoothTracer:
         return self.march.next_trial(self.field, self.path, self.end, walk)
 
     def finish(self, walk: MarchState) -> tuple[MarchState, Any]:
-        """The state of rays; none hit a sheet."""
+        """The state of rays; no ray hits a facet."""
         return walk, self.march.backend.UInt32(NO_FACET)
 
     def run(self, state: MarchState) -> tuple[MarchState, Any]:
@@ -90,7 +90,7 @@ class SmoothTracer:
 
 @dataclass(frozen=True)
 class _QueuedRay:
-    """A ray from start to end, and how far it has got: all the state of a lane."""
+    """The whole state of a lane: a ray from `start` to `end`, and the state of its tracer."""
 
     origin: Vec3
     direction: Vec3
@@ -110,15 +110,17 @@ def trace_queued(
     tracer_of: TracerFactory, path: Ray, start: Real, end: Real, state: MarchState,
     collect: Callable[[MarchState, Any], Ends],
 ) -> Ends:  # fmt: skip
-    """What is wanted of what `RayTracer.run` finds, evaluated, by few lanes: one that has followed
-    a ray to its end fetches the next.
+    """Trace many rays with few lanes: a lane that has finished a ray fetches the next.
 
-    collect: a record of some arrays of the end state and the index. Each is written by itself,
-        which takes a good part of the time of a step.
+    Returns `collect(state, index)` for each ray, evaluated. State and index are those that
+    `RayTracer.run` returns.
 
-    Rays differ in length, and a packet of a processor waits for its longest. Bounces of light paths
-    go in all directions: there the longest ray of a packet took three to six times as many samples
-    as the mean one (measured).
+    collect: gives a record of arrays of the end state and the index. Each array is written
+        separately, which takes a good part of the time of a step.
+
+    Rays differ in length, and a packet of a processor waits for its longest ray. Bounces of light
+    paths go in all directions: there the longest ray of a packet took three to six times as many
+    samples as the mean ray (measured).
     """
     proofs: EnclosureKinds = path.proofs
 
@@ -140,24 +142,27 @@ def trace_queued(
 _MARGIN_OF_SIZE = 1 / 64
 # or by this fraction of the length within the extent, for rays that leave it at small angles.
 _MARGIN_OF_LENGTH = 1 / 7
-# A ray that starts no farther than so many roundings from a sheet counts as starting on it.
+# A ray that starts within this many roundings of a facet counts as starting on it.
 _AT_JUMP_ROUNDINGS = 8.0
 
 
 @dataclass(frozen=True)
 class MarchResult:
-    """Ends of rays, as Dr.Jit arrays.
+    """The ends of rays, as Dr.Jit arrays.
 
-    t: up to where the ray is proved free of levels; inf for a miss.
-    value, gradient: f at t. Where a sheet was hit, f just before it, and the sheet's unit normal,
-        to the side of larger f.
+    t: ray parameter up to which the ray is proved free of levels; inf for a miss.
+    value, gradient: f and its gradient (3,) at t. If a facet was hit, f just before it, and the
+        facet's unit normal, to the side of larger f.
     tolerance_excess: by how much f at t may be farther from the level than the tolerance allows.
-    facet: index of the sheet (see `harnack.fields.capabilities`) that was hit, at t; NO_FACET
-        elsewhere.
-    side: where hits are confirmed, 1 where f rises through the level along the ray, -1 where it
-        falls through it; else None. Then t and gradient are those of the root, and `value` is f a
-        little behind it.
-    patch: of a field with parts, the index of the one that was hit, NO_PATCH elsewhere; else None.
+    evaluations: the number of evaluations of f.
+    status: a `RayStatus`.
+    facet: index of the facet (see `harnack.fields.capabilities`) that was hit, at t; NO_FACET for
+        other rays.
+    side: if hits are confirmed, 1 if f rises through the level along the ray, -1 if it falls
+        through it; else None. If hits are confirmed, t and gradient are those of the root, and
+        `value` is f a little behind it.
+    patch: for a union of patches, the index of the patch that was hit, NO_PATCH for other rays; for
+        other fields None.
     """
 
     t: Real
@@ -172,13 +177,14 @@ class MarchResult:
 
     @property
     def at_jump(self) -> Mask:
-        """Mask of the rays that hit a sheet."""
+        """Mask of the rays that hit a facet."""
         return self.facet != NO_FACET
 
 
 @dataclass(frozen=True)
 class _EndState:
-    """What `MarchResult` is made of: some of a `MarchState`, and the index of the sheet or part."""
+    """The data of a `MarchResult`: attributes of a `MarchState`, and the index of the facet or
+    patch."""
 
     proved_to: Real
     value: Real
@@ -198,33 +204,33 @@ class _EndState:
 
 @dataclass(frozen=True)
 class _EndStatus:
-    """How rays ended, alone."""
+    """The status with which rays ended, and nothing else."""
 
     status: Any
 
     @classmethod
     def of(cls, end: MarchState, sheet: Any) -> _EndStatus:
-        """That of an end state."""
+        """The status of an end state."""
         del sheet
         return cls(end.status)
 
 
 @dataclass(frozen=True)
 class SurfaceTracer:
-    """A level set on a backend. Its methods can be called while a kernel is being recorded.
+    """A surface on a backend. Its methods can be called while a kernel is being recorded.
 
     volume: a volume that contains the surface; None for all of space.
     region: where the field may be evaluated, for rays that look for crossings; it contains
         `volume`. None for all of space.
-    occupied: cells outside of which there is no level; None where none are known.
-    only_component: whether only the surface within `occupied` is traced: there may be levels
-        outside, which do not count.
-    section: the volume, one of those that `volume` is the intersection of, that cuts the surface
-        open; None for none.
-    uses_ray_queue: whether rays are traced at once, and where a sample is not cheap by few lanes
-        that share a queue. Then its methods cannot be called while a kernel is being recorded.
-    known_branch_volume: for a field whose coarse samples know f but for a whole number, the volume
-        outside of which that number is the one of f = 0; None for no such samples.
+    occupied: cells outside of which there is no level; None if no cells are known.
+    only_component: whether only the surface within `occupied` is traced; levels outside may exist
+        and do not count.
+    section: the volume that cuts the surface open, one of the volumes whose intersection is
+        `volume`; None if nothing cuts it open.
+    uses_ray_queue: whether rays are traced at once: if a sample is not cheap, by few lanes that
+        share a queue. Then the methods cannot be called while a kernel is being recorded.
+    known_branch_volume: outside of it f has the branch of f = 0. None if all samples know their
+        branch.
     """
 
     backend: Backend
@@ -248,14 +254,15 @@ class SurfaceTracer:
         return self.field.evaluate(p)
 
     def sample_with_branch(self, p: Vec3, value: Real) -> Sample:
-        """The field at p, where f is known to differ from a value by less than a half."""
+        """The sample at p, on the branch nearest to `value`. f must differ from `value` by less
+        than a half."""
         if self.known_branch_volume is None:
             return self.sample(p)
         sample = self.field.evaluate_modulo_one(p)
         return sample.shifted(dr.round(value - sample.value))
 
     def hit_surface(self, hit: MarchResult) -> SurfaceTracer:
-        """The level set that was hit: for a field with parts that of the part, else this one."""
+        """The surface that was hit: for a field with patches the patch, else this surface."""
         if hit.patch is None:
             return self
         part = dr.select(hit.patch == NO_PATCH, self.backend.UInt32(0), hit.patch)
@@ -268,7 +275,8 @@ class SurfaceTracer:
         return self.occupied.cell(p).empty_distance == 0
 
     def is_resolved(self, o: Vec3, end: Real) -> Mask:
-        """Whether rounding leaves no doubt, anywhere on rays up to `end`, if levels count there."""
+        """Whether, everywhere on rays up to `end`, it is known in spite of rounding whether levels
+        count there (see `only_component`)."""
         if self.occupied is None or not self.only_component:
             return self.backend.Bool(True)
         return self.occupied.is_resolved(o, end)
@@ -280,8 +288,8 @@ class SurfaceTracer:
         return self.volume.clip(o, d, t_min, t_max)
 
     def occluded(self, o: Vec3, d: Vec3, t_min: Real, t_max: Real, active: Mask = True) -> Mask:
-        """Whether the surface lies between t_min and t_max. Out of steps counts as occluded:
-        what is not proved free must not let light through."""
+        """Whether rays meet the surface between t_min and t_max. Rays that are out of steps count
+        as occluded: a ray that is not proved free must not let light through."""
         end = self._march(o, d, t_min, t_max, active, _EndStatus.of, any_hit=True)
         return end.status != int(RayStatus.MISS)
 
@@ -316,8 +324,8 @@ class SurfaceTracer:
     def refined_crossings(
         self, o: Vec3, d: Vec3, found: Contact, active: Mask
     ) -> tuple[Real, Vec3, Any]:
-        """Roots of crossings, the gradients there, and how many evaluations of f that took. Those
-        that were found are kept where f has no creases."""
+        """Roots of crossings, the gradients there, and the number of evaluations of f for them. The
+        roots of `found` are kept if f has jumps or no creases."""
         if self.field.has_jumps or not self.field.has_creases:
             return found.root, found.gradient, dr.zeros(self.backend.UInt32, dr.width(found.root))
         path = Ray(self.backend.Array3f(o), self.backend.Array3f(d), self.proofs)
@@ -326,9 +334,9 @@ class SurfaceTracer:
     def begin_march(
         self, o: Vec3, d: Vec3, t_min: Real, t_max: Real, active: Mask, *, crosses: bool
     ) -> tuple[March, Ray, Real, Real, MarchState]:
-        """The march, its path, where that starts and ends, and the state at the start.
+        """The march, its rays, their start and end (ray parameters), and the state at the start.
 
-        crosses: whether rays end where they have crossed a level, and not where they reach one.
+        crosses: whether rays end where they have crossed a level, and not where they reach it.
         """
         backend, real = self.backend, self.backend.Float
         path = Ray(backend.Array3f(o), backend.Array3f(d), self.proofs)
@@ -426,7 +434,7 @@ class SurfaceTracer:
         *,
         any_hit: bool = False,
     ) -> Ends:
-        """What is wanted of the end state of rays and the index of the sheet or part that each hit.
+        """A record of the end state of rays and the index of the facet or patch that each ray hit.
 
         any_hit: whether any hit will do if it is found with less work than the first.
         """

@@ -1,19 +1,21 @@
-"""Rays through fields with sheets or parts (see `harnack.fields.capabilities`), by the loop of
-`March`.
+"""Tracers for fields with jumps and for unions of patches (see `harnack.fields.capabilities`), by
+the loop of `March`.
 
-- `JumpTracer`: fields that jump. A ray goes from one crossing of a sheet to the next.
-- `PatchTracer`: surfaces made of many level sets, each in a box. A ray finds the first hit of all.
+- `JumpTracer`: for fields with jumps. A ray goes from one crossing of the jump surface to the next.
+- `PatchTracer`: for unions of patches, each in its own box. A ray gets the first hit of all
+  patches.
 
-Meshes jump, and the jumps are exact. A ray is cut into stretches at the triangles that it crosses;
-on each the winding number is an ordinary smooth field, and at each crossing the values on both
-sides are compared with the level. Triangles are crossed by our own query and not by Embree's:
-whether a ray passes an edge must be decided by the same bits for both its triangles *and* for the
-boundary sum, or w is wrong by one behind it; and it must work in double precision.
+The winding number of a mesh jumps at its triangles, and the jumps are exact. A ray is cut into
+intervals at the triangles that it crosses. On each interval the winding number w is an ordinary
+smooth field, and at each crossing the values on both sides are compared with the level. Crossings
+come from our own query and not from Embree's: whether a ray passes an edge must be decided by the
+same bits for both triangles of the edge *and* for the boundary sum, or w is wrong by 1 behind the
+edge; and the query must work in double precision.
 
-Parts are marched one by one. Many level sets, each of a function of its own, are no level set of
-one: a union of the faces of a polygon mesh would pay all faces at each step. Rays enter proved
-boxes in order, by a tree, and each lane marches a part of its own: a view of one table of edges
-(`RecordTable.view`), so that no kernel depends on the mesh.
+Patches are marched one after the other, as no single function has all of them as a level set, and a
+union of the faces of a polygon mesh would evaluate all faces at each step. A tree gives the proved
+boxes in the order in which a ray enters them. Each lane marches its own patch, which is a view of a
+single table of edges (`RecordTable.view`), so that no kernel depends on the mesh.
 """
 
 from __future__ import annotations
@@ -35,24 +37,24 @@ if TYPE_CHECKING:
     from harnack.fields.field import Field
     from harnack.fields.samples import Ray
 
-# Two sheets count as crossed at the same point if they are no farther apart than so many roundings
-# of coordinates, and the cosine of the angle between them is larger than the second number. The
-# sine of a ray's angle to a sheet counts as at least the third.
+# Two facets count as crossed at the same point if they are no farther apart than the first number
+# of roundings of coordinates, and the cosine of the angle between them is larger than the second
+# number. The sine of a ray's angle to a facet counts as at least the third number.
 _COINCIDENT_ROUNDINGS, _MIN_COSINE, _MIN_SINE = 2.0, 0.999, 1 / 64
-# Where that distance is more than this share of the ray, sheets that face each other at one point
-# may be the two sides of a wall.
+# If that distance is more than this fraction of the ray, facets that face each other at the same
+# point may be the two sides of a wall.
 _COARSE = 1e-4
 
 
 @dataclass(frozen=True)
 class JumpTraceState:
-    """State of rays through a field with sheets.
+    """The state of rays through a field with jumps.
 
-    offset: the field's offset (`Field.offset`).
-    behind: the crossing passed last.
+    offset: `Field.initial_offset` plus all jumps since the start.
+    behind: the jump crossing that was passed last.
     march: the state of the march.
-    reported_facet: for rays that look for crossings, index of the sheet to be named for the last
-        crossing.
+    reported_facet: for rays that look for crossings: index of the facet to report for the last
+        crossing; None for other rays.
     """
 
     offset: Real
@@ -67,11 +69,14 @@ class JumpTraceState:
 
 @dataclass(frozen=True)
 class _CoincidentJumps:
-    """Crossings at the same point of a ray.
+    """Jump crossings at the same point of a ray, up to rounding.
 
-    jump: the sum of their jumps. t, last: of the last of them.
-    up, down, normal_up, normal_down: the first sheet at which f jumps up, and down.
-    folded: whether a sheet parallel to the first jumps the other way.
+    jump: the sum of their jumps.
+    t, last: ray parameter and facet index of the last of them.
+    up, normal_up: index and normal of the first facet at which f jumps up; NO_FACET if none.
+    down, normal_down: index and normal of the first facet at which f jumps down; NO_FACET if none.
+    folded: whether f jumps the other way at a facet parallel to the first.
+    active: whether there may be more of them.
     """
 
     jump: Real
@@ -87,15 +92,15 @@ class _CoincidentJumps:
 
 @dataclass(frozen=True)
 class JumpTracer:
-    """Rays through a field with sheets, from `start` to `end`.
+    """Traces rays through a field with jumps, from `start` to `end`.
 
-    Between two crossings of sheets the field is continuous, and `March` proves that ray interval as
-    it proves any ray. What is added here is which interval comes next.
+    Between two jump crossings the field is continuous, and `March` proves that ray interval as it
+    proves any ray. This class adds the order of the intervals.
 
-    A smooth hit is a point within tolerance of a level of the function that continues the interval.
-    Its level set may end at a sheet, so within tolerance of where it does a ray may hit although
-    the
-    sheet cuts the level off: mostly near singular edges, where gradients grow without limit.
+    A smooth hit is a point within the tolerance of a level of the function that continues the
+    interval. The level set of f may end at a facet. Within the tolerance of this end, a ray may
+    hit the continued level set although the facet cuts it off: mostly near singular edges, where
+    gradients grow without limit.
     """
 
     march: March
@@ -109,16 +114,15 @@ class JumpTracer:
         return self.march.backend
 
     def run(self, state: MarchState) -> tuple[MarchState, Any]:
-        """The end state of rays, and the index of the sheet that each hit (NO_FACET: none).
+        """The end state of rays, and the index of the facet that each ray hit (NO_FACET: none).
 
         Proof that no hit is missed: crossings come in order, so the intervals cover the ray. On
-        each of them the field is the continuous one that `march` sees, up to and including its
-        last point, where the value behind the sheet is compared with that before it; from there
-        it goes on with the step that the value behind the sheet allows. So the part of the ray
-        up to `proved_to` is free of smooth levels, and every sheet on it was compared with the
-        level.
+        each interval `march` samples a continuous function, up to and including the last point,
+        where the values before and behind the facet are compared with the level. From there the ray
+        goes on with the step that the value behind the facet allows. So the part of the ray up to
+        `proved_to` is free of smooth levels, and every facet on it was compared with the level.
 
-        Rays begin just before `start`, so that a sheet at the very start is not skipped.
+        Rays begin just before `start`, so that a facet at the very start is not skipped.
         """
         return self.finish(loop_while_active(self.begin(state), self.advance, "harnack intervals"))
 
@@ -133,7 +137,7 @@ class JumpTracer:
         return JumpTraceState(offset, start, state, named)
 
     def finish(self, outer: JumpTraceState) -> tuple[MarchState, Any]:
-        """The state of rays, and the index of the sheet that each is on, NO_FACET for none."""
+        """The state of rays, and the index of the facet that each ray hit, NO_FACET for none."""
         count, end = self.backend.UInt32, outer.march
         on_sheet = end.status == HIT_AT_JUMP
         status = dr.select(on_sheet, count(int(RayStatus.HIT)), end.status)
@@ -170,7 +174,8 @@ class JumpTracer:
             return self._after_jump(outer, now, ahead, last, passed, active & stops)
         spent = passed & (now.evaluations >= self.march.max_steps)
         status = dr.select(spent, out, now.status)
-        # Of several sheets at a point, a hit names `ahead`; a ray that passes goes on from `last`.
+        # Of several facets at a point, a hit reports `ahead`; a ray that passes goes on from
+        # `last`.
         crossing = JumpCrossing(
             dr.select(passed, last.t, ahead.t),
             dr.select(passed, last.facet, ahead.facet),
@@ -192,8 +197,8 @@ class JumpTracer:
         passed: Mask,
         stopped: Mask,
     ) -> JumpTraceState:
-        """The state of rays that look for crossings. One that has crossed the level at a sheet has
-        passed that sheet; it may be made active again."""
+        """The state, after an interval, of rays that look for crossings. A ray that has crossed the
+        level at a facet has passed that facet; it may be made active again."""
         spent = passed & (now.evaluations >= self.march.max_steps)
         status = dr.select(spent, self.backend.UInt32(int(RayStatus.OUT_OF_STEPS)), now.status)
         through = passed | (stopped & (now.status == HIT_AT_JUMP))
@@ -213,18 +218,21 @@ class JumpTracer:
     def _merge_coincident(
         self, first: JumpCrossing, active: Mask
     ) -> tuple[JumpCrossing, JumpCrossing, Mask]:
-        """All crossings at the t of the first as one, the last of them, and where it is open if
-        they are at one point.
+        """Merge all jump crossings at the same t, up to rounding, into one with the sum of their
+        jumps.
 
-        A ray through an edge or a vertex crosses several sheets at once, in no particular order: f
+        Returns the merged crossing, the last of its crossings (from which the ray continues), and
+        the lanes on which it is uncertain whether the crossings are at the same point.
+
+        A ray through an edge or a vertex crosses several facets at once, in no particular order: f
         jumps there by the sum of their jumps, and there is no interval between them. The same holds
-        for sheets in one plane: those that follow each other more closely than coordinates are
-        rounded count as at the same t, for rounding decides their order. The sheet named is the
-        first one whose jump has the sign of the sum.
+        for facets in the same plane: facets that follow each other more closely than coordinates
+        are rounded count as at the same t, as rounding decides their order. The merged crossing has
+        the index and normal of the first facet whose jump has the sign of the sum.
 
-        Far from the origin of rays or coordinates, rounding may be as large as a wall is thick,
-        whose sides would cancel. So where rounding is no small part of the ray, parallel sheets
-        whose jumps cancel leave it open what is there.
+        Far from the origin of rays or of coordinates, rounding may be as large as the thickness of
+        a wall, whose two sides would cancel. So if rounding is no small part of the ray, parallel
+        facets whose jumps cancel make the crossing uncertain.
         """
         real, count = self.backend.Float, self.backend.UInt32
         size = max_norm(self.path.origin)
@@ -234,7 +242,7 @@ class JumpTracer:
 
         def body(now: _CoincidentJumps) -> _CoincidentJumps:
             one = self._next(JumpCrossing(now.t, now.last, 0.0, first.normal), furthest, now.active)
-            # Sheets at an angle to each other count as one only at exactly the same t.
+            # Facets at an angle to each other are merged only at exactly the same t.
             level = dr.abs(dr.dot(one.normal, first.normal)) > _MIN_COSINE
             found = now.active & (one.facet != NO_FACET) & ((one.t == first.t) | level)
             new_up = found & (one.jump > 0) & (now.up == NO_FACET)
@@ -290,14 +298,16 @@ class JumpTracer:
 
 @dataclass(frozen=True)
 class PatchTraceState:
-    """State of rays through a field with parts: the box entered last, and the nearest hit so far.
+    """The state of rays through a union of patches: the box entered last, and the nearest hit so
+    far.
 
-    enter, box: where the ray entered the last box, and its index.
-    t: of the nearest hit so far, or the end of the ray; of a ray out of steps, up to where it is
-        free.
+    enter, box: the ray parameter at which the ray entered the last box, and the index of the box.
+    t: ray parameter of the nearest hit so far, else the end of the ray; for a ray out of steps, the
+        parameter up to which it is proved free.
     value, gradient, excess, status: of the march that ended there.
-    part: that of the hit, NO_PATCH for none.
-    active: whether there may be more parts.
+    evaluations: the number of evaluations of all marches so far.
+    part: index of the patch that was hit, NO_PATCH for none.
+    active: whether there may be more patches.
     """
 
     enter: Real
@@ -314,12 +324,12 @@ class PatchTraceState:
 
 @dataclass(frozen=True)
 class PatchTracer:
-    """Rays through a field with parts, from `start` to `end`.
+    """Traces rays through a union of patches, from `start` to `end`.
 
-    Each part is marched as any field is. What is added here is which part comes next, and how far
-    the ray must be followed in it.
+    Each patch is marched as any field is. This class adds the order of the patches, and the
+    interval in which the ray must be followed in each.
 
-    any_hit: whether any hit will do, and not only the first.
+    any_hit: whether a ray may end at any hit, and not only at the first.
     """
 
     march: March
@@ -330,13 +340,13 @@ class PatchTracer:
     any_hit: bool = False
 
     def run(self, state: MarchState) -> tuple[MarchState, Any]:
-        """The end state of rays, and the index of the part that each hit (NO_PATCH: none).
+        """The end state of rays, and the index of the patch that each ray hit (NO_PATCH: none).
 
-        Proof that no hit is missed: a part's level set lies in its box, and boxes come in the order
-        in which the ray enters them, all that it meets. Each is marched from where the ray enters
-        it to where it leaves it, or to the first hit so far if that comes before; so up to a hit
-        the ray is free of every part whose box it entered before the hit, and all others come
-        behind. A ray that is out of steps in a part is proved free up to where it entered that box.
+        Proof that no hit is missed: a patch lies in its box, and all boxes that the ray meets come
+        in the order in which it enters them. Each patch is marched from the entry into its box to
+        the exit, or to the first hit so far if that comes before. So up to a hit the ray is free of
+        every patch whose box it entered before the hit, and all other patches lie behind the hit. A
+        ray that is out of steps in a patch is proved free up to its entry into that box.
         """
         walk = loop_while_active(self.begin(state), self.advance, "harnack parts")
         return self.finish(walk)
@@ -358,7 +368,7 @@ class PatchTracer:
         )
 
     def finish(self, walk: PatchTraceState) -> tuple[MarchState, Any]:
-        """The state of rays, and the index of the part that each hit, NO_PATCH for none."""
+        """The state of rays, and the index of the patch that each ray hit, NO_PATCH for none."""
         backend = self.march.backend
         before = MarchState.at(backend, self.start, self.end, walk.active, has_detail=False)
         end = dataclasses.replace(
@@ -374,7 +384,8 @@ class PatchTracer:
         return end, walk.part
 
     def advance(self, walk: PatchTraceState) -> PatchTraceState:
-        """Rays after one more part: the next whose box is entered before the first hit so far."""
+        """Rays after one more patch: the next patch whose box they enter before the first hit so
+        far."""
         backend, path = self.march.backend, self.path
         after = PatchEntry(walk.enter, walk.enter, walk.box)
         entry = self.field.next_patch(

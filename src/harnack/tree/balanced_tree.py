@@ -3,15 +3,15 @@
 - `BalancedTree`: which primitive lies in which leaf, from `build_balanced_tree`, in vectorized
   NumPy.
 - `PackedTree`: nodes and primitives as records on a backend, from `pack_tree`.
-- `traverse`: visits nodes depth first, into a subtree or past it; `for_each_primitive`: the
-  primitives of a leaf.
+- `traverse`: visits nodes depth first, and enters or skips each subtree; `for_each_primitive`:
+  visits the primitives of a leaf.
 
-What a node means, and when to go past it, is up to the caller.
+The meaning of a node, and the decision to skip it, are up to the caller.
 
 Trees are balanced and complete: a level is a reshape of arrays, sums over nodes are sums along an
-axis, and a walk needs one link a node and no stack. Nodes are records of eight-float packets,
-siblings side by side. Moved vertices keep the tree's shape: bounds are computed
-from where things are.
+axis, and a walk needs a link in each node and no stack. Nodes are records of eight-float packets,
+siblings side by side. If vertices move, the tree keeps its shape, and its bounds are computed from
+the new positions.
 """
 
 from __future__ import annotations
@@ -72,12 +72,13 @@ class BalancedTree:
         return sum(self.counts)
 
     def node_links(self) -> tuple[tuple[IntArray, ...], tuple[IntArray, ...], tuple[IntArray, ...]]:
-        """Number of each node, of its first child, and of the node that follows its subtree when
-        all are visited depth first (`node_count` for the last); each level by level, leaves first.
+        """The index of each node, of its first child, and of the node that follows its subtree when
+        all nodes are visited depth first (`node_count` for the last); each level by level, leaves
+        first.
 
-        Children of a node are numbered one after the other, then the children of the first of
-        them, and so on, so that siblings, of which mostly all are visited, lie side by side in
-        memory. The first child of a leaf is 0, the number of the root, which stands for none.
+        The children of a node are numbered consecutively, then the children of the first of them,
+        and so on, so that siblings, which are mostly visited together, lie side by side in memory.
+        The first child of a leaf is 0, the index of the root, which stands for none.
         """
         below = [0]  # nodes below one of each level
         for arity in self.arities:
@@ -185,12 +186,14 @@ _MAX_NODES = 2**24
 
 @dataclass(frozen=True)
 class PackedTree:
-    """Nodes with links, siblings side by side (`BalancedTree.node_links`); primitives leaf by leaf.
+    """A tree on a backend: nodes with links, siblings side by side (`BalancedTree.node_links`), and
+    primitives leaf by leaf.
 
-    node_heads: of each node six numbers of the caller's, the node that follows its subtree, and the
-        number of its leaf or, for an inner node, minus that of its first child.
-    node_payloads: the caller's other numbers of each node, kept apart because a walk reads many
-        heads in a row and few of these; None for none.
+    node_heads: for each node six numbers of the caller, the index of the node that follows its
+        subtree, and the index of its leaf or, for an inner node, minus the index of its first
+        child.
+    node_payloads: further numbers of the caller for each node, stored separately because a walk
+        reads many heads in a row and few payloads; None for none.
     primitives: `leaf_size` rows for each leaf.
     """
 
@@ -206,7 +209,7 @@ class PackedTree:
         return self.node_heads.read_record(i)
 
     def payload(self, i: Any, active: Mask) -> list[Real]:
-        """The other numbers of node i."""
+        """The further numbers of node i."""
         return [] if self.node_payloads is None else self.node_payloads.read_record(i, active)
 
     def primitive(self, leaf: Any, slot: Any, active: Mask) -> list[Real]:
@@ -217,8 +220,8 @@ class PackedTree:
 def pack_tree(
     backend: Backend, tree: BalancedTree, levels: Sequence[FloatArray], primitives: FloatArray
 ) -> PackedTree:
-    """A tree with the numbers of its nodes (k, 6 or more), level by level from the leaves, and of
-    its primitives in their slots (leaves, leaf_size, c).
+    """Pack a tree with the numbers of its nodes (k, 6 or more), level by level from the leaves, and
+    the numbers of its primitives in their slots (leaves, leaf_size, c).
 
     Raises:
         ValueError: more nodes than links in single precision can count.
@@ -251,11 +254,11 @@ LoopValues: TypeAlias = "tuple[Any, ...]"
 
 @dataclass(frozen=True)
 class VisitedNode:
-    """The node that a walk visits; each lane may be at a different one.
+    """The node that a walk visits; each lane may be at a different node.
 
-    index: number of the node.
-    head: the six numbers of the caller's that every visit reads.
-    leaf: number of its leaf, if it is one.
+    index: of the node.
+    head: the six numbers of the caller that every visit reads.
+    leaf: the index of its leaf, if it is a leaf.
     """
 
     tree: PackedTree
@@ -274,10 +277,10 @@ PrimitiveBody: TypeAlias = "Callable[[list[Real], Mask, LoopValues], LoopValues]
 
 
 def traverse(tree: PackedTree, visit: Visit, state: LoopValues, active: Mask = True) -> LoopValues:
-    """The state after visiting nodes from the root on.
+    """The state after visiting nodes depth first, from the root on.
 
-    visit: from a node and the state, whether to go into the node's children, and the new state.
-        Else the walk goes on behind the subtree.
+    visit: takes a node and the state. Returns whether to visit the node's children (else the walk
+        skips its subtree), and the new state.
 
     May be called while a loop is being recorded.
     """
@@ -301,10 +304,11 @@ def traverse(tree: PackedTree, visit: Visit, state: LoopValues, active: Mask = T
 def for_each_primitive(
     node: VisitedNode, active: Mask, body: PrimitiveBody, state: LoopValues
 ) -> LoopValues:
-    """The state after visiting the primitives of a leaf, where active; costs nothing elsewhere.
+    """The state after visiting the primitives of a leaf, on active lanes. It costs nothing where
+    all lanes of a packet are inactive.
 
-    Empty slots are visited as well: the caller of `pack_tree` has filled them with harmless
-        numbers.
+    Empty slots are visited as well: the caller of `pack_tree` has filled them with numbers without
+    effect.
     """
     tree = node.tree
     index = tree.backend.UInt32

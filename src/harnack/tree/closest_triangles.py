@@ -1,4 +1,4 @@
-"""Queries of trees: the boxes that a ray enters, in order, and the triangles nearest to a point."""
+"""Queries of trees: the boxes that a ray enters, in order, and the triangles closest to a point."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ _LEAF_SIZE = 4
 
 @dataclass(frozen=True)
 class BoxTree:
-    """Boxes with coordinates of at most about one, which may overlap."""
+    """A tree of boxes, which may overlap, with coordinates of at most about 1."""
 
     tree: PackedTree
 
@@ -61,16 +61,16 @@ class BoxTree:
     def next_box(
         self, o: Vec3, d: Vec3, after: tuple[Real, Any], start: Real, end: Real, active: Mask
     ) -> tuple[Real, Real, Any]:
-        """The first box behind `after` = (t, number) that rays o + t d, |d| = 1, enter by t <= end.
+        """Return the next box along each ray o + t d, |d| = 1, after `after` = (t, number).
 
-        Boxes are ordered by (t, number), where t is where a ray enters the box, at least `start`;
-        boxes that it has left by then are not entered. From after = (t, NO_BOX) with t < start on,
-        each comes up once. A box is a little wider than given, so that rounding lets no ray pass by
-        a box that it meets.
+        A box is entered at t = max(entry, start); boxes are ordered by (t, number). Boxes that a
+        ray has left before `start` are not entered. Starting with after = (t, NO_BOX), t < start,
+        repeated calls visit every box that the ray meets for start <= t <= end exactly once. Boxes
+        are padded a little, so that rounding never skips a box that the ray meets.
 
         Returns:
             The t where the ray enters, the t where it leaves, and the box's number (NO_BOX for
-            none).
+                none).
         """
         real, index = self.tree.backend.Float, self.tree.backend.UInt32
         t_after, n_after = real(after[0]), index(after[1])
@@ -100,7 +100,8 @@ class BoxTree:
         return near, far, number
 
     def _slab_test(self, o: Vec3, d: Vec3) -> Any:
-        """Where rays enter and leave a box, a little earlier and later to cover rounding.
+        """A function that computes where rays enter and leave a box, a little too early and too
+        late to cover rounding.
 
         Each plane of the box is moved outwards by 16 roundings of the size of coordinates, and t is
         widened by 8 roundings of itself: (x - o)/d has three roundings, of which that of x - o is
@@ -130,12 +131,13 @@ _ROUNDING = 16.0
 
 @dataclass(frozen=True)
 class ClosestTriangle:
-    """The nearest triangle to points x, of those that a query considers.
+    """The triangle nearest to points x, among the triangles that a query considers.
 
-    squared_distance: squared distance; inf where there is no triangle.
-    triangle: of the triangle; NO_TRIANGLE where there is none.
+    squared_distance: inf where there is no triangle.
+    triangle: the index of the triangle; NO_TRIANGLE where there is none.
     offset: (3,) from x to the nearest point of the triangle.
-    normal: (3,) of the triangle by the right-hand rule, of any length; zero without an area.
+    normal: (3,) of the triangle by the right-hand rule, of any length; zero for a triangle of zero
+        area.
     is_inner: whether the nearest point lies inside the triangle, not on its edges.
     """
 
@@ -172,18 +174,17 @@ def distance_lower_bound(rays: TriangleTree, x: Vec3) -> Real:
 
 
 def initial_squared_distance(rays: TriangleTree, x: Vec3) -> Real:
-    """The squared distance from x to a vertex of a triangle nearby, rounded up: walks that begin
-    with it skip most boxes."""
+    """The squared distance from x to a vertex of a triangle nearby, rounded up: an upper bound that
+    lets a walk skip most boxes from its start."""
     square, pad = squared_distance_in_nearby_leaf(rays.tree, x, 0), _pad(rays, x)
     return square + 2 * pad * (dr.sqrt(square) + pad)
 
 
 def squared_distance_in_nearby_leaf(tree: PackedTree, x: Vec3, column: int) -> Real:
-    """The least squared distance from x to the points of a leaf nearby.
+    """The smallest squared distance from x to the points of a leaf nearby: the leaf that is reached
+    from the root by always entering the child whose box has the nearest center.
 
-    The leaf is found from the root on by the child whose box has the nearest center.
-
-    column: where in a record the coordinates of its point begin.
+    column: the column of a record at which the coordinates of its point begin.
     """
     backend = tree.backend
     real, index, vector = backend.Float, backend.UInt32, backend.Array3f
@@ -229,10 +230,10 @@ def squared_distance_in_nearby_leaf(tree: PackedTree, x: Vec3, column: int) -> R
 def next_closest_triangle(
     rays: TriangleTree, x: Vec3, after: tuple[Real, Any], limit: Real, active: Mask
 ) -> ClosestTriangle:
-    """The first triangle behind `after` = (squared distance, number), nearer than `limit`.
+    """The next triangle after `after` = (squared distance, number) that is nearer than `limit`.
 
-    Triangles are ordered by (squared distance, number), so that each comes up once; from
-    (-1, NO_TRIANGLE) on, all do. limit: a squared distance.
+    Triangles are ordered by (squared distance, number). Starting with (-1, NO_TRIANGLE), repeated
+    calls visit each triangle once. limit: a squared distance.
     """
     backend = rays.tree.backend
     real, index, vector = backend.Float, backend.UInt32, backend.Array3f
@@ -294,26 +295,25 @@ def _distance_test(rays: TriangleTree, x: Vec3, pad: Real) -> Any:
 
 @dataclass(frozen=True)
 class ClosestPointOnTriangle:
-    """The nearest point of a record's triangle to x.
+    """The closest point to x of a record's triangle.
 
-    squared_distance: the squared distance.
+    squared_distance: from x.
     offset: (3,) from x to the point.
     is_inner: whether the point lies inside the triangle, not on its edges.
 
-    It is the nearest point of the plane where that lies in the triangle, else that of the edges.
-    That of the plane is found along the longest edge e, from a and of length L, and along the
-    altitude h on it, made orthogonal to e twice.
+    It is the closest point of the plane if that lies in the triangle, else the closest point of the
+    edges. The closest point of the plane is computed along the longest edge e, from a and of length
+    L, and along the altitude h on it, made orthogonal to e twice.
 
     Proof that the distance is off by only a few epsilons of l = L + |x - a|, however thin the
     triangle (a cross product's direction is off by epsilon L/|h|, which for a needle is an error of
-    any size): x - a less its part along e, done twice, is right up to
-    epsilon l and orthogonal to e up to epsilon^2 l, and so is h, whose direction within the plane
-    normal to e is off by d <= epsilon L/|h|. So the point a + alpha e + s h lies off the plane by
-    at most s|h| d <= epsilon L, and off the nearest point within it by k <= epsilon l + min(d H,
-    |h|), H the distance from the plane. That lengthens H by at most k^2/(2H), where k >= epsilon l
-    counts as min(d H, |h|)^2/(2H) <= d |h|/2 <= epsilon L/2, and by k <= 3 epsilon l for H <
-    epsilon l. If the same k puts the point on the wrong side of an edge, the edges' distance or
-    the plane's is off by as much.
+    any size): x - a less its part along e, done twice, is right up to epsilon l and orthogonal to e
+    up to epsilon^2 l, and so is h, whose direction within the plane normal to e is off by d <=
+    epsilon L/|h|. So the point a + alpha e + s h lies off the plane by at most s|h| d <= epsilon L,
+    and off the closest point within it by k <= epsilon l + min(d H, |h|), H the distance from the
+    plane. That lengthens H by at most k^2/(2H), where k >= epsilon l counts as min(d H, |h|)^2/(2H)
+    <= d |h|/2 <= epsilon L/2, and by k <= 3 epsilon l for H < epsilon l. If the same k puts the
+    point on the wrong side of an edge, the edges' distance or the plane's is off by as much.
     """
 
     squared_distance: Real
@@ -351,7 +351,7 @@ class ClosestPointOnTriangle:
 
 
 def _project_on_edge(v: Vec3, e: Vec3, inverse: Real) -> tuple[Real, Vec3]:
-    """share and rest of v = share e + rest, with the rest orthogonal to e, even if it is short;
+    """The coefficient t and the rest r of v = t e + r, with r orthogonal to e, even if e is short;
     inverse = 1/|e|^2."""
     vector = cast("Any", type(v))
     share = dr.dot(v, e) * inverse
@@ -383,8 +383,8 @@ def squared_distance_to_segment(a: Vec3, e: Vec3, inverse: Real) -> Real:
 
 
 def jump_sum_within(rays: TriangleTree, x: Vec3, distance: Real, active: Mask = True) -> Real:
-    """The sum of the sizes of the winding number's jumps across triangles within a distance of
-    x."""
+    """The sum of the absolute values of the jumps of the winding number across triangles within a
+    distance of x."""
     real, vector = rays.tree.backend.Float, rays.tree.backend.Array3f
     x, distance = vector(x), real(distance)
     reach, inside = distance * distance, _distance_test(rays, x, distance)

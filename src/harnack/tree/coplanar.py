@@ -1,7 +1,8 @@
-"""Triangles that lie in one plane and overlap, as where parts of a mesh touch; and their borders.
+"""Triangles that overlap in the same plane, as where parts of a mesh touch; and the borders of the
+overlaps.
 
-None of two such triangles passes through the other, so that no edge crosses a face; and yet the
-winding number beside one of them changes where the other ends.
+Neither of two such triangles passes through the other, so that no edge crosses a face; and yet the
+winding number beside one triangle changes where the other ends.
 """
 
 from __future__ import annotations
@@ -37,13 +38,13 @@ _MIXED = np.array(
 def borders_of_overlaps(
     rays: TriangleTree, vertices: FloatArray, faces: IntArray, *, at_every_edge: bool = False
 ) -> tuple[IntArray, FloatArray]:
-    """Which faces (k,) have parts covered by others in their plane, and knives (k, 3, 3): triangles
-    that meet that plane in one edge of the covered part's border.
+    """The faces (k,) with parts that other faces in their plane cover, and knives (k, 3, 3):
+    triangles that meet that plane in an edge of the covered part's border.
 
-    rays: the same faces, with coordinates of at most about one.
-
-    Within a part, where the others meet in edges that no further face has, as much covers the face
-    on both sides: such edges are left out, unless at_every_edge.
+    rays: a tree of the same faces, with coordinates of at most about 1.
+    at_every_edge: whether edges between the covering faces count as borders. If not, edges inside
+        of a covered part are left out where the covering faces meet in edges that no further face
+        has: the face is equally covered on both sides.
     """
     covered, covering = overlapping_faces(rays, vertices, faces)
     if not len(covered):

@@ -1,15 +1,16 @@
-"""Cells of a box that are proved empty or not: octrees, uniform grids, and components of cells.
+"""Cells of a box that are proved empty, and the others: octrees, uniform grids, and connected
+components of cells.
 
 - `RefinedCells`, from `refine_cells` and `nonempty_cells`: a box split where it is not proved
   empty.
-- `EmptySpaceGrid`: equal cubes on a backend, and how far a ray stays among the empty ones.
-- `OccupancyGrid`: such a grid of the cells that may hold a set of points, made by an octree.
+- `EmptySpaceGrid`: equal cubes on a backend, and the length for which a ray stays in empty cubes.
+- `OccupancyGrid`: such a grid of the cells that may contain a set of points, computed by an octree.
 - `largest_connected_component`: the largest group of cells that cells proved empty separate from
   the others.
 
-Components are groups of cells: cells that are not proved empty, joined by faces, edges and corners,
-and those of all groups but one count as empty for the march. A trial point that lies in one of them
-is not looked at, so that nothing else is hit.
+A component is a group of cells that are not proved empty, connected by faces, edges and corners. If
+a single group is chosen, the march treats the cells of all others as empty. A trial point in such a
+cell is not sampled, so that nothing else is hit.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ _OCTANTS = np.array(list(itertools.product((0.0, 1.0), repeat=3)))
 
 @dataclass(frozen=True)
 class BoxCells:
-    """Equal boxes: lower corners (n, 3), and the size (3,) of all."""
+    """Boxes of equal size: their lower corners (n, 3), and the size (3,) of each."""
 
     corners: FloatArray
     size: FloatArray
@@ -72,12 +73,12 @@ class BoxCells:
         return 0.5 * float(np.linalg.norm(self.size))
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
-        """The least and the largest coordinates (3,) of all boxes."""
+        """The lower and the upper corner (3,) of the box around all boxes."""
         return self.corners.min(axis=0), self.corners.max(axis=0) + self.size
 
     def bounding_kdop(self, slack: float) -> ConvexHull:
-        """A polytope around all boxes, `slack` thicker, whose normals are the 26 directions of a
-        cube's faces, edges and corners."""
+        """The polytope around all boxes, enlarged by `slack`, whose normals are the 26 directions
+        of a cube's faces, edges and corners (a k-DOP)."""
         return _kdop_of_boxes(self.centers, 0.5 * self.size + slack)
 
     def octants(self) -> BoxCells:
@@ -86,7 +87,7 @@ class BoxCells:
         return BoxCells((self.corners[:, None] + _OCTANTS * half).reshape(-1, 3), half)
 
     def subset(self, which: BoolArray) -> BoxCells:
-        """Those chosen by a mask (n,)."""
+        """The boxes where a mask (n,) is set."""
         return BoxCells(self.corners[which], self.size)
 
     def is_proved_empty(self, clearance: Clearance, margin: float = 0.0) -> BoolArray:
@@ -98,13 +99,14 @@ class BoxCells:
 
 
 def kdop_of_points(points: FloatArray, slack: float) -> ConvexHull:
-    """A polytope around points (n, 3), `slack` thicker, with the normals of
+    """The polytope around points (n, 3), enlarged by `slack`, with the normals of
     `BoxCells.bounding_kdop`."""
     return _kdop_of_boxes(points, np.full(3, slack))
 
 
 def merge_kdops(one: ConvexHull, other: ConvexHull) -> ConvexHull:
-    """The smallest polytope with the normals of `BoxCells.bounding_kdop` around two such."""
+    """The smallest polytope with the normals of `BoxCells.bounding_kdop` that contains two such
+    polytopes."""
     return ConvexHull(
         one.normals,
         np.maximum(one.offsets, other.offsets),
@@ -125,8 +127,9 @@ def _kdop_of_boxes(centers: FloatArray, half: FloatArray) -> ConvexHull:
 class RefinedCells:
     """Cells that fill a box.
 
-    occupied: those of the finest size, which may hold the set.
-    empty: those proved empty, coarsest first.
+    occupied: the cells of the finest size that are not proved empty: they may contain points of the
+        set.
+    empty: the cells that are proved empty, coarsest first.
     """
 
     occupied: BoxCells
@@ -140,10 +143,11 @@ def refine_cells(
     max_rounds: int,
     margin: float = 0.0,
 ) -> RefinedCells:
-    """Split `cells`, again and again, where they are not proved empty.
+    """Split `cells` repeatedly into octants where they are not proved empty.
 
-    max_cells_per_round: cells tested in one round; a round that would test more is not made.
-    max_rounds: rounds at most; each halves the edges.
+    max_cells_per_round: the largest number of cells tested in a round; refinement stops before a
+        round that would test more.
+    max_rounds: the largest number of rounds; each halves the edges.
     margin: as for `BoxCells.is_proved_empty`.
     """
     empty: list[BoxCells] = []
@@ -160,12 +164,16 @@ def refine_cells(
 def nonempty_cells(
     lower: FloatArray, upper: FloatArray, clearance: Clearance, most: int, finest: int
 ) -> BoxCells:
-    """The leaves of the octree of one box; none if all of it is proved empty."""
+    """The leaves of the octree of a box that are not proved empty; there are none if all of the box
+    is proved empty.
+
+    most: the largest number of cells tested in a round. finest: the largest number of rounds.
+    """
     root = BoxCells(np.array(lower)[None], np.array(upper) - np.array(lower))
     return refine_cells(root, clearance, most, finest).occupied
 
 
-# So much of the margin around an empty cell, in cells, is left to the rounding of positions.
+# The part of the margin around an empty cell, in cells, that covers the rounding of positions.
 _ROUNDING = 1 / 64
 
 
@@ -174,14 +182,13 @@ Layout = TypeVar("Layout", bound="GridData")
 
 @dataclass(frozen=True)
 class GridData:
-    """A grid of cells, in NumPy.
+    """A grid of cells, some of them proved empty; in NumPy.
 
-    origin: (3,) its lower corner, numbers of single precision.
+    origin: (3,) its lower corner, in numbers of single precision.
     cell_size: the side of a cell (`round_to_short_float`).
-    shape: cells along x, y and z.
-    empty_distance: (cells,), x fastest: 0 where a cell is not empty, else the distance to the
-        nearest that is not, in cells, in the largest of the three coordinates (chessboard
-        distance).
+    shape: the number of cells along x, y and z.
+    empty_distance: (cells,), x fastest: the chessboard distance, in cells, to the nearest occupied
+        cell; 0 for an occupied cell.
     """
 
     origin: FloatArray
@@ -192,11 +199,12 @@ class GridData:
 
 @dataclass(frozen=True)
 class EmptySpaceGrid:
-    """A grid on a backend, all numbers of it as kernel parameters.
+    """A grid of cells, some of them proved empty; on a backend, with all numbers as kernel
+    parameters.
 
-    Outside of the grid the same holds as in its nearest cell.
+    A point outside of the grid is treated like its nearest cell.
 
-    margin: in cells; an empty cell enlarged by so much on all sides is empty too.
+    margin: in cells; an empty cell enlarged by the margin on all sides is empty too.
     """
 
     backend: Backend
@@ -208,7 +216,8 @@ class EmptySpaceGrid:
 
     @staticmethod
     def upload_layout(backend: Backend, layout: GridData) -> tuple[Backend, Vec3, Real, Vec3, Any]:
-        """The first five attributes of a grid."""
+        """The attributes backend, origin, cell_size, shape and empty_distance of a grid,
+        uploaded."""
 
         def vector(numbers: Any) -> Vec3:
             return backend.Array3f(*(dr.opaque(backend.Float, float(one)) for one in numbers))
@@ -232,11 +241,11 @@ class EmptySpaceGrid:
     def empty_run(self, p: Vec3, d: Vec3, length: Real) -> Real:
         """A length s for which p + s d is proved to stay in empty cells; it may exceed `length`.
 
-        Proof. The cell of a point and all that are fewer than `empty_distance` cells away are
-        empty, and so is
-        the margin around each: together a cube, wider by the margin than these cells. A step leaves
-        the cells by at most `margin` less `_ROUNDING`, so that all of it is empty; the rest of the
-        margin is for the rounding of positions. Steps end where a cell is not empty.
+        Proof. All cells less than empty_distance cells from a point's cell are empty, and so are
+        the margins around them. Together they form a cube, larger than these cells by the margin. A
+        step leaves the cells by at most `margin` less `_ROUNDING`, so that it stays inside of the
+        cube; the rest of the margin is for the rounding of positions. Steps end where a cell is
+        occupied.
         """
 
         def state_of(s: Real) -> tuple[Real, Mask]:
@@ -260,15 +269,16 @@ class EmptySpaceGrid:
         return dr.while_loop((start, active), running, body, label="empty cells")[0]
 
     def is_resolved(self, o: Vec3, end: Real) -> Mask:
-        """Whether rounding leaves points of rays up to `end` in their cells or close to them."""
+        """Whether rounding moves points of rays from o up to `end` by less than `_ROUNDING` of a
+        cell. False if o is not finite."""
         rounding = 4 * self.backend.machine_epsilon * (max_norm(o) + end)
         return (rounding < _ROUNDING * self.cell_size) & dr.all(dr.isfinite(o))
 
     def end_of_empty_run(self, o: Vec3, d: Vec3, t: Real, end: Real) -> Real:
         """A t, at most `end`, up to which rays o + t d, |d| = 1, stay in empty cells from `t` on.
 
-        It is `t` itself where coordinates are so large that rounding might lead into another cell:
-        a point is off by at most four roundings of the largest number in it.
+        It is `t` itself where coordinates are so large that rounding might move a point into
+        another cell: a point is off by at most four roundings of its largest coordinate.
         """
         length = dr.select(self.is_resolved(o, end), end - t, 0)
         run = self.empty_run(dr.fma(type(o)(t), d, o), d, length)
@@ -277,11 +287,11 @@ class EmptySpaceGrid:
 
 @dataclass(frozen=True)
 class GridCell:
-    """The cells in which points lie.
+    """The cell of a grid in which a point lies, in each lane.
 
-    cell_coordinates: the coordinates of the points, in cells.
-    corner: the lower corner of the cell, in cells.
-    index: of the cell.
+    cell_coordinates: the point, in units of cells from the origin of the grid.
+    corner: the lower corner of its cell, in the same units.
+    index: of the cell in `EmptySpaceGrid.empty_distance`.
     """
 
     grid: EmptySpaceGrid
@@ -291,12 +301,13 @@ class GridCell:
 
     @property
     def empty_distance(self) -> Any:
-        """See `GridData`."""
+        """The chessboard distance, in cells, to the nearest occupied cell (`GridData`)."""
         return dr.gather(self.grid.backend.UInt32, self.grid.empty_distance, self.index)
 
     def exit_distance(self, d: Vec3, around: Real = 1.0) -> Real:
-        """How far the path with direction d stays among the cells fewer than `around` away, or in
-        the margin around them; infinite where the grid ends there."""
+        """The length for which the path with direction d stays among the cells less than `around`
+        cells away, or in the margin around them; infinite in a direction in which the grid ends
+        there."""
         length: Real = self.grid.backend.Float(dr.inf)
         beyond = self.grid.margin - _ROUNDING
         for k in range(3):
@@ -322,8 +333,8 @@ def distance_to_occupied(empty: BoolArray) -> IntArray:
 
 
 def round_to_short_float(size: float) -> float:
-    """A length near `cell_size`, off by at most one part in 4,096, that is a power of two times an
-    integer below 2^13, so that single precision holds its multiples exactly."""
+    """A length near `size`, off by at most one part in 4,096, that is a power of two times an
+    integer below 2^13, so that single precision represents its multiples exactly."""
     mantissa, exponent = math.frexp(size)
     return math.ldexp(round(mantissa * 4096), exponent - 12)
 
@@ -369,7 +380,7 @@ class OccupancyGrid(GridData):
 
     @classmethod
     def empty(cls) -> OccupancyGrid:
-        """A grid around the empty set: one cell, and all is empty."""
+        """The grid of the empty set: a single cell, which is empty."""
         return cls(np.zeros(3), 1.0, (1, 1, 1), distance_to_occupied(np.ones((1, 1, 1), np.bool_)))
 
     def occupied_centers(self) -> FloatArray:
@@ -379,7 +390,7 @@ class OccupancyGrid(GridData):
         return self.origin + self.cell_size * (places + 0.5)
 
     def refined(self, clearance: Clearance) -> OccupancyGrid:
-        """The same grid in which cells count as empty as well if their eight octants are proved
+        """The same grid, in which a cell also counts as empty if its eight octants are proved
         empty, with the same margin around the cell."""
         x, y, z = self.shape
         full = (self.empty_distance == 0).reshape(z, y, x)
@@ -400,28 +411,27 @@ _NEIGHBOR_STENCIL = np.ones((3, 3, 3), np.bool_)
 
 
 def largest_connected_component(cells: OccupancyGrid) -> OccupancyGrid:
-    """The grid in which only the cells of one connected group are not empty: that with the largest
-    projections, in all, along the three axes.
+    """The grid in which only the cells of a single connected group are occupied: the group with the
+    largest sum of its projections along the three axes.
 
-    A projection counts the rows of cells, along one axis, that have a cell of the group. The number
-    of cells would measure areas, or volumes, only if as many cells were left around each piece of a
-    surface: but more are left where its function vanishes to a higher order, and around the two
-    sides of a plate thinner than a cell no more than around one. Projections do not depend on that,
-    but for the cells at their outlines: there are several more where a function vanishes to a
-        higher
-    order, so that with coarse cells a smaller component may be chosen for it. Of equal groups the
-    first along z, y and x is chosen.
+    A projection counts the rows of cells, along an axis, that contain a cell of the group. The
+    number of cells would measure areas, or volumes, only if each piece of a surface was surrounded
+    by as many occupied cells: but there are more where its function vanishes to a higher order, and
+    around the two sides of a plate thinner than a cell no more than around a single side.
+    Projections do not depend on that, but for the cells at their outlines: there are several more
+    where a function vanishes to a higher order, so that with coarse cells a smaller component may
+    be chosen for it. Of equal groups the first along z, y and x is chosen.
 
-    Proof that no component of the set is cut in two. All of the set lies in cells that are not
-    empty, as closed cubes. A connected part of it cannot be covered by two unions of such cubes
-    that are closed and have no point in common; cubes have a point in common if they share at least
-    a corner, that is, if they are neighbors. So it lies in the cells of one group.
+    Proof that no component of the set is cut in two. All of the set lies in occupied cells, as
+    closed cubes. A connected part of it cannot be covered by two unions of such cubes that are
+    closed and have no point in common; cubes have a point in common if they share at least a
+    corner, that is, if they are neighbors. So it lies in the cells of a single group.
 
     Proof that rays may jump across the other groups, with the margin that
     `EmptySpaceGrid.empty_run` goes beyond the cells that it jumps across. A neighbor of a cell of
     another group belongs to that group or was empty before, and the margin is less than a cell, so
-    the margin holds nothing of this group; the margin of a cell that was empty before holds nothing
-    of the set at all.
+    the margin contains nothing of the chosen group; the margin of a cell that was empty before
+    contains nothing of the set at all.
     """
     x, y, z = cells.shape
     full = (cells.empty_distance == 0).reshape(z, y, x)

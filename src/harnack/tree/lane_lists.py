@@ -1,7 +1,7 @@
-"""Lists of nodes and primitives of a tree, one for each lane, made and visited in Dr.Jit.
+"""Lists of nodes and primitives of a tree, a list for each lane, built and traversed in Dr.Jit.
 
-- `LaneLists`: many lists of numbers, one after the other in memory.
-- `build_lists`: from a walk that counts entries and one that writes them.
+- `LaneLists`: many lists of integers, one list after the other in memory.
+- `build_lists`: builds lists by a walk that runs twice, to count entries and to write them.
 - `traverse_subtrees`: visits the subtrees of the listed nodes; `for_each_entry`: a loop over the
   entries.
 """
@@ -31,7 +31,8 @@ _TOO_LONG = "more than 2^31 entries of lists: cut the input in parts"
 
 @dataclass(frozen=True)
 class LaneLists:
-    """A list for each lane: where it begins in `entries`, how long it is, all entries."""
+    """A list for each lane. first: the index in `entries` at which it begins. count: its length.
+    entries: the entries of all lists."""
 
     first: Any
     count: Any
@@ -39,19 +40,20 @@ class LaneLists:
 
     @classmethod
     def of_root(cls, backend: Backend) -> LaneLists:
-        """One list, of the root of a tree."""
+        """A single list, whose only entry is the root of a tree."""
         index = backend.UInt32
         return cls(index(0), index(1), index(0))
 
     @classmethod
     def empty(cls, backend: Backend) -> LaneLists:
-        """One list, which is empty."""
+        """A single list, which is empty."""
         index = backend.UInt32
         return cls(index(0), index(0), index(0))
 
     @classmethod
     def concatenate(cls, backend: Backend, parts: list[LaneLists]) -> LaneLists:
-        """The lists of all lanes, part by part; each part begins with its first entry."""
+        """The lists of the lanes of all parts, part after part. In each part, the first list must
+        begin at entry 0 and the lists follow each other."""
         counts = np.concatenate([to_numpy(one.count) for one in parts])
         entries = [to_numpy(one.entries)[: int(to_numpy(one.count).sum())] for one in parts]
         first = np.cumsum(counts, dtype=np.int64) - counts
@@ -69,8 +71,8 @@ class LaneLists:
 
 
 def build_lists(backend: Backend, walk: Callable[[WriteEntry | None], Any]) -> LaneLists:
-    """Lists of what a walk finds. walk: gives the number of entries of each lane, and puts each of
-    them if it is given a `WriteEntry`."""
+    """Build lists from a walk. walk: returns the number of entries of each lane, and writes each
+    entry if it is called with a `WriteEntry` instead of None."""
     index = backend.UInt32
     count = walk(None)
     dr.eval(count)
@@ -89,7 +91,7 @@ def build_lists(backend: Backend, walk: Callable[[WriteEntry | None], Any]) -> L
 def traverse_subtrees(
     tree: PackedTree, lists: LaneLists, visit: Visit, state: LoopValues
 ) -> LoopValues:
-    """The state after a walk (`hierarchy.walk`) over the subtrees of the listed nodes."""
+    """The state after a walk (`balanced_tree.traverse`) over the subtrees of the listed nodes."""
     index = tree.backend.UInt32
 
     def body(place: Any, i: Any, end: Any, *state: Any) -> LoopValues:

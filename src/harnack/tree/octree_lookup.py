@@ -1,7 +1,7 @@
-"""The leaf of an octree in which a point lies, on a backend.
+"""Lookup of the octree leaf that contains a point, on a backend.
 
-The builder of an octree numbers its nodes level by level (`OctreeLookup.from_levels`); what a leaf
-holds is up to the caller, who keeps a record for each.
+The builder of an octree lists its nodes level by level (`OctreeLookup.from_levels`). The caller
+keeps a record for each leaf; its contents are up to the caller.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 
 __all__ = ["BALL_MARGIN", "MAX_DEPTH", "OCTANT_DIRECTIONS", "OctreeLookup", "encode_nodes"]
 
-# Cells of the finest level are 2^-DEEPEST as wide as the cube; those of a grid that is looked up at
-# once 2^-_TOP_DEPTH.
+# Cells of the finest level are 2^-MAX_DEPTH as wide as the cube, cells of the grid with which a
+# lookup begins 2^-_TOP_DEPTH.
 MAX_DEPTH, _TOP_DEPTH = 10, 5
 # What holds in the ball of a cell should hold in one larger by this factor, for rounding: it moves
 # a point by less than 2^-20 of the cube's side in single precision, and such balls of the finest
@@ -32,9 +32,13 @@ OCTANT_DIRECTIONS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 
 
 def encode_nodes(is_leaf: BoolArray, leaves: int, split: int) -> IntArray:
-    """The nodes of a level, for `OctreeLookup.from_levels`. leaves: the number of leaves of the
-    levels above.
-    split: of the nodes of the levels above, but the first, that are split."""
+    """Encode the nodes of a level for `OctreeLookup.from_levels`: an inner node by the index of its
+    first child, leaf k by -1 - k.
+
+    is_leaf: (nodes of the level,).
+    leaves: the number of leaves of the levels above.
+    split: the number of inner nodes of the levels above, including the root.
+    """
     number = np.empty(len(is_leaf), np.int64)
     number[is_leaf] = -1 - (leaves + np.arange(int(is_leaf.sum())))
     number[~is_leaf] = 8 * (split + np.arange(int((~is_leaf).sum())))
@@ -43,14 +47,14 @@ def encode_nodes(is_leaf: BoolArray, leaves: int, split: int) -> IntArray:
 
 @dataclass(frozen=True)
 class OctreeLookup:
-    """The octree of a cube on a backend.
+    """The octree of a cube, on a backend.
 
-    lower_corner: the lower corner of the cube. scale: 2^DEEPEST over its side.
-    top_grid: for each cube of a grid of 2^_TOP_DEPTH along each side, z fastest, the node that it
-        is, or that it is in: the number of the first of its eight children, z fastest; or for a
-            leaf -1 minus
-        its number.
-    encoded_nodes: likewise for each node but the first.
+    lower_corner: the lower corner of the cube.
+    cells_per_length: 2^MAX_DEPTH divided by its side.
+    top_grid: (8^_TOP_DEPTH,) the encoded octree node at depth _TOP_DEPTH that contains each cell of
+        a uniform grid, z fastest; a coarser leaf fills all of its cells.
+    encoded_nodes: all nodes except the root, encoded: the index of the first of eight consecutive
+        children (z fastest), or -1 - k for leaf k.
     """
 
     backend: Backend
@@ -63,8 +67,9 @@ class OctreeLookup:
     def from_levels(
         cls, backend: Backend, low: FloatArray, side: float, levels: list[IntArray]
     ) -> OctreeLookup:
-        """levels: nodes of each level, those of a level octant by octant of the ones above that are
-        split."""
+        """Upload an octree. low, side: the lower corner (3,) and the side of its cube. levels: the
+        encoded nodes of each level (`encode_nodes`), from the root on; the eight children of each
+        inner node follow each other, in the order of the inner nodes of the level above."""
         root, *below = levels
         nodes = np.concatenate([*below, np.zeros(8, np.int64)])  # room for any octant
         corner = backend.Array3f(*(dr.opaque(backend.Float, float(one)) for one in low))
@@ -76,11 +81,11 @@ class OctreeLookup:
 
     @staticmethod
     def memory_bytes(nodes: int) -> int:
-        """Bytes of so many nodes and of the grid on top."""
+        """The bytes that a lookup with this number of nodes takes, its grid included."""
         return 4 * (nodes + 8**_TOP_DEPTH)
 
     def find_leaf(self, x: Vec3) -> tuple[Any, Mask]:
-        """The number of the leaf in which x lies, and whether x lies in the cube."""
+        """The index of the leaf that contains x, and whether x lies in the cube."""
         index, integer = self.backend.UInt32, self.backend.Int32
         place = (x - self.lower_corner) * self.cells_per_length
         inside = dr.all((place >= 0) & (place < float(2**MAX_DEPTH)))

@@ -1,7 +1,9 @@
-"""Triangles cut where they pass through each other, and the jumps of the winding number at them.
+"""Triangles cut where they pass through each other, and the jumps of the winding number across
+them.
 
-A closed mesh that crosses itself bounds the points of a winding number above 1/2 by parts of its
-triangles: each triangle is inside or on the boundary as a whole once it is cut along the others.
+The set of points whose winding number is above 1/2, for a closed mesh that crosses itself, is
+bounded by parts of the mesh's triangles. If each triangle is cut along the others, every piece is
+inside of the set or on its boundary as a whole.
 """
 
 from __future__ import annotations
@@ -23,9 +25,9 @@ __all__ = [
     "windings_of_sides",
 ]
 
-# In units of the mesh's size. Nearer than that two places are the same.
+# In units of the mesh's size: points closer than this are the same.
 _COINCIDENT = 1e-12
-# Pieces thinner than that are left out: others that touch them stand for them.
+# Pieces thinner than this are left out: their neighbors stand for them.
 _MIN_THICKNESS = 1e-11
 _CENTROID = (1 / 3, 1 / 3, 1 / 3)
 
@@ -34,18 +36,19 @@ def split_intersecting_faces(
     rays: TriangleTree, vertices: FloatArray, faces: IntArray, *, covered_whole: bool = False
 ) -> tuple[FloatArray, IntArray]:
     """Triangles (k, 3, 3) that fill the faces (m, 3), none of which passes through another or is
-    covered by another in part; and (k,) which face each is of, and turns as.
+    covered by another in part; and (k,) the face that each is a piece of and has the orientation
+    of.
 
-    rays: the same faces, with coordinates of at most about one.
+    rays: a tree of the same faces, with coordinates of at most about 1.
     covered_whole: whether faces are also cut where others in their plane meet, so that each of
         these covers all of a piece or nothing.
 
-    Where two triangles meet in a segment, at either end of it an edge of one of them meets the
-    other. So all edges are followed as rays, and each of the two faces beside an edge is cut by
-    the plane of every triangle that the edge crosses, and these by the planes of the two: as far
-    as the cut would not pass the other triangle by. An edge that meets another edge, but for
-    rounding, meets all faces beside that. Faces in one plane are cut along the borders of
-    what covers them. A cut too many does no harm.
+    Where two triangles intersect in a segment, each end of the segment lies on an edge of either of
+    them. So every edge is traced as a ray. If it crosses a triangle T, the faces at the edge are
+    cut by the plane of T, and T by their planes, but only where the cut meets the other triangle.
+    An edge that meets another edge, up to rounding, counts as meeting all faces at that edge. Faces
+    in the same plane are cut along the borders of the faces that cover them. Superfluous cuts are
+    harmless.
     """
     corners = vertices[faces]
     cut, by = _crossing_faces(rays, vertices, faces)
@@ -67,7 +70,8 @@ def split_intersecting_faces(
 def separates_levels(
     rays: TriangleTree, pieces: FloatArray, levels: tuple[float, ...]
 ) -> BoolArray:
-    """(k,) whether the winding number passes a level from one side of a triangle to the other."""
+    """(k,) whether a level lies strictly between the winding numbers on the two sides of a
+    triangle."""
     low, high = winding_numbers_of_sides(rays, pieces)
     return np.any([(low < level) & (level < high) for level in levels], axis=0)
 
@@ -75,9 +79,9 @@ def separates_levels(
 def winding_numbers_of_sides(
     rays: TriangleTree, pieces: FloatArray, barycentric: tuple[float, float, float] = _CENTROID
 ) -> tuple[FloatArray, FloatArray]:
-    """(k,), (k,): the smaller and the larger of the winding numbers on both sides of triangles.
+    """(k,), (k,): the smaller and the larger of the winding numbers on the two sides of triangles.
 
-    barycentric: barycentric coordinates of the place; by default the center.
+    barycentric: the barycentric coordinates of the point of the triangle; by default its center.
     """
     front, back = windings_of_sides(rays, pieces, barycentric)
     return np.minimum(front, back), np.maximum(front, back)
@@ -86,11 +90,11 @@ def winding_numbers_of_sides(
 def windings_of_sides(
     rays: TriangleTree, pieces: FloatArray, shares: tuple[float, float, float] = _CENTROID
 ) -> tuple[FloatArray, FloatArray]:
-    """(k,), (k,): the winding numbers in front of triangles, whence they are seen to run
+    """(k,), (k,): the winding numbers in front of triangles, the side from which they run
     counter-clockwise, and behind them.
 
-    A ray along the normal of each counts the crossings ahead of a place in it, and those ahead of a
-    place just behind it: with that, triangles in the same place are passed all at once.
+    A ray along the normal of each counts the crossings ahead of a point of the triangle, and those
+    ahead of a point just behind it: so the triangles in the same place are passed all at once.
     """
     backend = rays.tree.backend
     a, b, c = np.moveaxis(pieces, 1, 0)
@@ -182,11 +186,11 @@ def _next_foreign_crossing(
 
 
 def _cut_up(pieces: FloatArray, rows: IntArray, knives: FloatArray) -> tuple[FloatArray, IntArray]:
-    """The parts of triangles (n, 3, 3) whose entries `rows` (k,) are cut by the planes of knives
-    (k, 3, 3); and the triangle that each is of.
+    """The pieces of triangles (n, 3, 3) whose entries `rows` (k,) are cut by the planes of knives
+    (k, 3, 3); and the triangle that each is a piece of.
 
-    In each round every piece is cut by one of those knives that meet it, in the middle of its list,
-    and its parts share the rest: so their number falls by about half.
+    In each round every piece is cut by a knife that meets it, the middle of its list, and its parts
+    share the remaining knives: so their number falls by about half.
     """
     done: list[FloatArray] = []
     owners: list[IntArray] = []

@@ -1,6 +1,6 @@
-"""Triangles as records of a tree, and the rays that cross them.
+"""Triangles as records of a tree, and their crossings with rays.
 
-A record (16 numbers) holds the corners in the order of their vertices' indices, so that an edge
+A record (16 numbers) contains the corners in the order of their vertices' indices, so that an edge
 shared by two triangles has the same two ends in the same order in both: every decision about the
 edge is the same for both, to the last bit, so that no ray slips through between them or crosses
 both.
@@ -34,9 +34,9 @@ if TYPE_CHECKING:
 
 # Columns of a record; 0 to 8 are the corners.
 PARITY_COLUMN, NUMBER_COLUMN, INVERSE_SQUARES_COLUMN = 9, 10, 11
-# A ray that is so many roundings of a coordinate from an edge counts as passing through the edge.
+# A ray within this number of roundings of a coordinate from an edge passes through the edge.
 _EDGE_ROUNDINGS = 4.0
-# A crossing so many roundings of a coordinate from the end of a line may be on either side of it.
+# A crossing within this number of roundings of a line's end may be on either side of the end.
 _UNCERTAIN_ROUNDINGS = 64.0
 # Triangles are numbered in floats; single precision holds no larger integers without gaps.
 MAX_TRIANGLES = 2**24
@@ -44,8 +44,8 @@ NO_TRIANGLE = 0xFFFFFFFF
 
 
 def triangle_records(vertices: FloatArray, faces: IntArray) -> FloatArray:
-    """(m, 14): corners ordered by index; +1, or -1 if that order reverses the face; the face's
-    number; 1/length^2 of the edges 01, 12 and 02."""
+    """(m, 14): the corners ordered by index; +1, or -1 if that order reverses the face; the index
+    of the face; 1/length^2 of the edges 01, 12 and 02."""
     order = np.argsort(faces, axis=1, kind="stable")
     corners = vertices[np.take_along_axis(faces, order, axis=1)]
     even = np.isin(order @ np.array([9, 3, 1]), (5, 15, 19))  # 012, 120, 201 in base three
@@ -86,12 +86,12 @@ def node_slabs(
     tree: BalancedTree, corners: FloatArray, boxes: list[FloatArray]
 ) -> list[FloatArray]:
     """Slabs (k, 6) of the nodes of all levels: a unit normal n, an offset, half a thickness and a
-    radius. With c the center of a node's box, the triangles' points are c + h n + r, r at right
-    angles to n, with |h - offset| <= thickness and |r| <= radius.
+    radius. With c the center of a node's box, the points of its triangles are c + h n + r, r
+    orthogonal to n, with |h - offset| <= thickness and |r| <= radius.
 
-    A patch of a smooth surface is much thinner than its box, which matters for points far away:
-    with boxes alone, a walk visits the whole cap of the surface whose bulge is less than a box is
-    wide.
+    A piece of a smooth surface is much thinner than its box, which matters for points far away:
+    with boxes alone, a walk visits the whole cap of the surface that bulges by less than the width
+    of a box.
     """
     points = tree.values_in_slots(corners, np.nan).reshape(len(tree.leaf_slots), -1, 3)
     edges = corners - corners[:, :1]
@@ -187,9 +187,9 @@ class TriangleTree:
     def of(
         cls, backend: Backend, tree: BalancedTree, records: FloatArray, *, slabs: bool = False
     ) -> TriangleTree:
-        """From the records of `triangle_records`.
+        """Build the tree from the records of `triangle_records`.
 
-        slabs: whether nodes have slabs besides boxes, for nearest points from far away.
+        slabs: whether nodes have slabs besides boxes, for closest points from far away.
         """
         corners = records[:, :9].reshape(-1, 3, 3)
         levels = node_boxes(tree, corners.min(axis=1), corners.max(axis=1))
@@ -206,15 +206,16 @@ class TriangleTree:
         active: Mask,
         reach: float = 0.0,
     ) -> tuple[Real, Any, Real, Vec3]:
-        """The first crossing behind `after` = (t, number) with t <= t_max, ordered by (t, number).
+        """The next crossing after `after` = (t, number) with t <= t_max, ordered by (t, number).
 
-        reach: if more than 0, triangles whose border is so near to the ray are passed as well, but
-            for those that are at one of its ends, t = 0 and t_max, with their border.
+        reach: if more than 0, triangles whose border is within this distance of the ray count as
+            crossed too, except triangles whose border is that close to an end of the ray, t = 0 or
+            t_max.
 
         Returns:
-            t (inf for none), the triangle's number (NO_TRIANGLE for none), the sign of the crossing
-            (1 where the triangle's normal by the right-hand rule points along the ray, -1 where it
-            points back, 0 for none), and that normal (unit).
+            t (inf for none), the triangle's index (NO_TRIANGLE for none), the sign of the crossing
+                (1 where the triangle's normal by the right-hand rule points along the ray, -1 where
+                it points back, 0 for none), and that normal (unit).
         """
         real, index, vector = (
             self.tree.backend.Float,
@@ -268,13 +269,13 @@ class TriangleTree:
     def signed_crossings_between(
         self, frame: RayFrame, end: Real, unit: Real, active: Mask
     ) -> tuple[Real, Mask]:
-        """The sum of the signs of all crossings with 0 < t < end, and where that is sure.
+        """The sum of the signs of all crossings with 0 < t < end, and where that sum is certain.
 
         unit: the rounding of a coordinate.
 
         A computed t belongs to a point of the triangle within a few units of the ray, so that it is
-        off by that over the cosine between ray and normal. Where this leaves it open whether t is
-        between the ends, nothing is sure.
+        off by that over the cosine between ray and normal. Where t may therefore lie on either side
+        of an end, the sum is not certain.
         """
         real, inside = self.tree.backend.Float, self._slab_test(frame)
 
@@ -299,9 +300,10 @@ class TriangleTree:
         return turns, sure
 
     def signed_crossings_vertical(self, x: Vec3, way: Real, active: Mask = True) -> Real:
-        """The sum of the signs of all crossings of rays from x up (way 1) or down (-1) the z axis.
+        """The sum of the signs of all crossings of rays from x upwards (way 1) or downwards (-1)
+        along the z axis.
 
-        For both the signs are those with respect to the upward direction. Testing boxes costs less
+        For both, the signs are those with respect to the upward direction. Testing boxes costs less
         than for other directions.
         """
         real = self.tree.backend.Float
@@ -418,12 +420,12 @@ def _crossing_depth(
     corners: (u, v, depth) of each, in the frame of the ray. sides: `edge_function` of the edges.
 
     The barycentric weight of a corner is an area divided by that of the triangle, which is all
-    rounding where the triangle is thin. So the weight w of the corner off the longest edge is cut
-    to what the ray's coordinate along that edge allows, and the coordinate s of the point on the
-    edge
-    is then chosen for w: the ray is at s + w s', with s' the coordinate of that corner, 0 <= s <=
-    1 - w, and coordinates along the longest edge are accurate. A wrong w moves the point across
-    that edge only, by no more than the rounding of an area over the edge's length.
+    rounding where the triangle is thin. So the weight w of the corner off the longest edge is
+    clamped to the range that the ray's coordinate along that edge allows, and the coordinate s of
+    the point on the edge is then chosen for w: the ray is at s + w s', with s' the coordinate of
+    that corner, 0 <= s <= 1 - w, and coordinates along the longest edge are accurate. A wrong w
+    moves the point across that edge only, by no more than the rounding of an area over the edge's
+    length.
 
     A ray that is as close as `close` to an edge or a vertex passes all triangles there at the depth
     of that edge or vertex, the same bits for all: their jumps of w are at exactly the same t.

@@ -1,14 +1,17 @@
-"""Surfaces live in a browser: one drawing module, in a file to send and in a view of Python's.
+"""Draws surfaces live in a browser, in a standalone page (`page`) and in a view served by Python
+(`view`), by the same JavaScript module.
 
-The kernel that Dr.Jit recorded draws in the browser. `live_scene` makes plain data of what `render`
-would draw: shaders, one buffer of words for each, a camera, rays with Dr.Jit's answers.
+The kernel that Dr.Jit recorded is run by the browser. `live_scene` turns the arguments of `render`
+into plain data: shaders, a buffer of words for each, a camera, and rays with Dr.Jit's answers.
 `drawing.js` and `passes.wgsl` draw it, the same for a page, a view and a notebook; `panel.js` is
-the window, `live_framing` the camera that sees all places of the sliders, `legend_data` what colors
-mean. Three links (`link.js`, `frames.js`) bring what changes: a socket to `server`, messages of
-`widget`, or frames in the page itself. Python answers questions in `session`, which trusts none of
-them, and sends words that differ from the first state, so that a slider compiles nothing anywhere.
-Where the browser's device is missing, slower than Python or not to be believed, `preview_renderer`
-draws.
+the user interface, `live_framing` the camera that frames the surfaces for all slider values,
+`legend_data` the meaning of the colors.
+
+Three channels (`link.js`, `frames.js`) bring changes: a socket to `server`, messages of `widget`,
+or state deltas stored in the page itself. Python answers requests in `session`, which trusts none
+of them, and sends the words that differ from the initial state, so that a slider compiles nothing
+anywhere. Where the browser's device is missing, slower than Python or fails its check,
+`preview_renderer` draws.
 """
 
 from __future__ import annotations

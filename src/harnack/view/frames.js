@@ -1,5 +1,5 @@
-// What has changed since the first state: Python's answers say it, and pages without Python behind
-// them hold it for each place of their sliders.
+// State deltas relative to the initial state: sent by Python, or stored in a standalone page for
+// each combination of slider values.
 // @ts-check
 
 import { words } from "./drawing.js";
@@ -9,7 +9,7 @@ import { words } from "./drawing.js";
  * @typedef {{surfaces: (Surface | Partial<Surface> & {at: string, to: string, check?: Check})[],
  *            curves?: number[][][]}} Change */
 
-/** The state after a change; see `difference` in harnack.view.live_scene. @param {State} first
+/** The state after a change; see `state_delta` in harnack.view.live_scene. @param {State} first
  *  @param {Change} change @returns {Promise<State>} */
 export async function changed(first, change) {
   const surfaces = await Promise.all(change.surfaces.map(async (given, k) => {

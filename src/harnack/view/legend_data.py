@@ -1,5 +1,5 @@
-"""What the colors of live pictures mean, for pictures that are colored by numbers: `show` other
-than "shaded". legend.js draws it beside the picture."""
+"""Legends of live pictures that are colored by numbers: `show` other than "shaded". legend.js draws
+them beside the picture."""
 
 from __future__ import annotations
 
@@ -28,17 +28,19 @@ NEAR_GRAY, FAR_GRAY, HIT_COLOR = 0.95, 0.12, (0.93, 0.93, 0.90)
 
 
 def evaluations_share(evaluations: Any) -> Any:
-    """Where numbers of evaluations are on their scale, which is logarithmic: 0 for none, 1 for
-    `EVALUATIONS_TOP`."""
+    """The position of numbers of evaluations on their scale, which is logarithmic: 0 for none, 1
+    for `EVALUATIONS_TOP`."""
     return np.log2(1.0 + np.asarray(evaluations)) / math.log2(1.0 + EVALUATIONS_TOP)
 
 
 def legends() -> dict[str, Any]:
-    """Of each picture by its name: a title, and either the colors of a scale, from its low end to
-    its high end in equal steps, or swatches, names and their colors.
+    """The legend of each kind of picture, by the name of the picture: a title, and either the
+    colors of a scale, from its low end to its high end in equal steps, or swatches, which are names
+    and their colors.
 
-    ticks: where numbers stand on a scale, from 0 to 1, and how they are written; None for the least
-        and the greatest number that is seen, which are lengths in the unit of the surfaces.
+    In a legend, "ticks" are the positions of numbers on the scale, from 0 to 1, and their labels;
+    None for the least and the greatest number that is seen, which are lengths in the unit of the
+    surfaces.
     """
     lost = ["out of steps", _css(OUT_OF_STEPS_COLOR)]
     ticks = [[float(evaluations_share(n)), str(n)] for n in _EVALUATIONS[:-1]] + [

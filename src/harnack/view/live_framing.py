@@ -1,4 +1,5 @@
-"""Where live surfaces stand, and a camera that sees them at all places of their sliders."""
+"""The placement of live surfaces on the stage, and a camera that sees them for all values of their
+sliders."""
 
 from __future__ import annotations
 
@@ -27,11 +28,11 @@ _DIRECTIONS = 200
 
 @dataclass(frozen=True)
 class Framing:
-    """Where surfaces stand on the stage, and the camera that sees them.
+    """The placement of surfaces on the stage, and the camera that sees them.
 
     camera: a camera that turns about a target, as camera.js takes it, in the stage's coordinates.
-    box: what stands on the ground, in the coordinates of the surfaces, where more is framed than is
-        seen at first; None otherwise.
+    box: the box that stands on the ground, in the coordinates of the surfaces, where more is framed
+        than is seen at first; None otherwise.
     """
 
     placement: Placement
@@ -40,11 +41,12 @@ class Framing:
 
     @classmethod
     def of(cls, camera: Camera, up: Any, points: FloatArray, *, is_whole: bool) -> Framing:
-        """Of points (n, 3) of the surfaces.
+        """The framing of points (n, 3) of the surfaces.
 
-        camera: as `render` takes it; its box is framed in place of the points. up: likewise.
-        is_whole: whether all that is to be framed is seen at first; otherwise it is the box of the
-            points that stands on the ground, as in all pictures of a film.
+        camera: as `render` takes it; its box is framed in place of the points.
+        up: as `render` takes it.
+        is_whole: whether all points to be framed are seen at first; otherwise the box of the points
+            stands on the ground, as in all pictures of an animation.
         """
         box = camera.box
         if box is not None:
@@ -56,13 +58,13 @@ class Framing:
         return cls(placement, _orbit(camera, placement, points), box)
 
     def with_box(self, camera: Camera) -> Camera:
-        """A camera of `render` that has the surfaces stand where they stand here."""
+        """A camera for `render` with which the surfaces stand at the same place as here."""
         return camera if camera.box is not None else replace(camera, box=self.box)
 
 
 def extreme_points(points: FloatArray) -> FloatArray:
-    """Those of points (n, 3) that are farthest in one of many directions, which say what a camera
-    has to frame."""
+    """The points, of n (n, 3), that are farthest in any of many directions: they determine the
+    framing of a camera."""
     if len(points) <= _DIRECTIONS:
         return points
     directions = np.random.default_rng(0).normal(size=(3, _DIRECTIONS))

@@ -92,12 +92,14 @@ tubes around the curves at which they end (None for no tubes)."""
 
 @dataclass(frozen=True)
 class ControlState:
-    """What the controls of a live scene say: its sliders, its edited curve, its cut and settings.
+    """The state of the controls of a live scene: its sliders, its edited curve, its cut and its
+    settings.
 
-    values: of all sliders. loops: vertices (n, 3) in the place of those of the field's curve.
+    values: of all sliders.
+    curves: vertices (n, 3) of each loop, in place of those of the field's curve.
     cut_volume: a volume that cuts all surfaces; a half-space opens them, as `section` of
         `level_set` does.
-    settings: some of `LIVE_OPTIONS`, in the place of those that the scene was opened with.
+    settings: a selection of `LIVE_OPTIONS`, in place of those that the scene was opened with.
     """
 
     values: Mapping[str, float]
@@ -108,11 +110,14 @@ class ControlState:
 
 @dataclass(frozen=True)
 class LiveScene:
-    """A live scene: what is drawn as a function of sliders, where it stands on the stage, and the
-    rays by which devices are checked.
+    """A live scene: its content as a function of sliders, its placement on the stage, and the rays
+    by which devices are checked.
 
-    points: (n, 3) of each surface, as it is seen at first. camera, up: as `render` takes them.
-    editable: whether the vertices of its curve can be moved. show: what is shown at first.
+    points: (n, 3) of each surface, as it is seen at first.
+    camera, up: as `render` takes them.
+    editable: whether the vertices of its curve can be moved.
+    show: the kind of picture shown at first.
+    origins: where fields come from, for scene files.
     """
 
     content: SlidingContent
@@ -129,14 +134,15 @@ class LiveScene:
     def of(
         cls, what: Any, given: Mapping[str, Any], *, edits: bool = False, origins: FieldSources = ()
     ) -> LiveScene:
-        """From what users give `page` and `view`.
+        """The live scene of the arguments of `page` or `view`.
 
-        edits: whether vertices of curves are to be moved, so that they must not decide what is
-            recorded. origins: where fields come from, to be said in scene files.
+        edits: whether vertices of curves are to be moved, so that the recorded kernel must not
+            depend on them.
+        origins: where fields come from, for scene files.
 
         Raises:
             TypeError, ValueError: as `render` does; also for a transparent material, a `show` that
-                is not in `LIVE_MODES`, and a backdrop that is not "light" or "dark".
+            is not in `LIVE_MODES`, and a backdrop that is not "light" or "dark".
         """
         still = [
             name for name in given if name in OPTION_NAMES and name not in (*STUDIO_OPTIONS, "show")
@@ -170,10 +176,10 @@ class LiveScene:
         )
 
     def framed(self, places: Iterable[Mapping[str, float]]) -> LiveScene:
-        """The same, framed such that nothing leaves the picture at these places of its sliders; a
-        box of the camera stays what is framed.
+        """The live scene, framed so that nothing leaves the picture for these slider values; a box
+        of the camera stays the framed box.
 
-        Places at which nothing can be drawn are left out: what is wrong there is said where they
+        Slider values for which nothing can be drawn are left out: the error is reported where they
         are drawn.
         """
         if not self.content.sliders or self.camera.box is not None:
@@ -328,9 +334,9 @@ class LiveScene:
         )
 
     def to_scene_text(self, controls: ControlState, **others: Any) -> tuple[str, list[str]]:
-        """It as the text of a scene file, and the names of the sliders that are not in it, because
-        their functions are Python's: what they make of it is. others: settings of `render` besides
-        those of what is drawn.
+        """The state as the text of a scene file, and the names of the sliders that are not in it,
+        because their functions are Python's: the file has the result of these functions. others:
+        settings of `render` besides those of the content.
 
         Raises:
             SceneFileError: a text cannot hold it.
@@ -372,8 +378,8 @@ class LiveScene:
 
 
 def live_options(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Those of a picture that pages and views take: without what only still pictures have, such as
-    a size, and with "shaded" in the place of a `show` that cannot follow a mouse."""
+    """The options of `render` that pages and views take: without those of still pictures only, such
+    as a size, and with "shaded" in place of a `show` that cannot be drawn interactively."""
     taken = {name: one for name, one in settings.items() if name not in STILL_OPTIONS}
     return {**taken, "show": taken["show"] if taken.get("show") in LIVE_MODES else "shaded"}
 
@@ -517,8 +523,8 @@ def _rays(points: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def surface_colors(one: StudioObject) -> list[JsonDict]:
-    """Linear sRGB of the sides of larger and of smaller values in shaded pictures, and whether they
-    are glossy: of each paint."""
+    """The colors of each paint in shaded pictures: linear sRGB of the sides of larger and of
+    smaller values, and whether they are glossy."""
     surface, mi = one.surface, register()
     is_solid = surface.solid is not None
     front, back, glossy = _reflectances(one.material.bsdf(solid=is_solid, traced_light=False))
@@ -558,8 +564,8 @@ def _reflectances(bsdf: Mapping[str, Any]) -> tuple[Any, Any, bool]:
 
 
 def encode_arrays(value: Any) -> Any:
-    """The same with arrays of 32-bit words as text, which `words` in drawing.js reads: base64 of
-    what gzip makes of them. The tables of meshes repeat themselves, and become a tenth."""
+    """Replace arrays of 32-bit words by text, which `words` in drawing.js reads: base64 of gzip
+    data. The tables of meshes are repetitive, and shrink to a tenth."""
     if isinstance(value, np.ndarray):
         return base64.b64encode(gzip.compress(value.tobytes(), _LEVEL, mtime=0)).decode()
     if isinstance(value, dict):
@@ -570,11 +576,11 @@ def encode_arrays(value: Any) -> Any:
 
 
 def state_delta(first: JsonDict, state: JsonDict, *, checks: bool = True) -> JsonDict:
-    """What a state changes of the first: words of the data of its surfaces, and whatever else
-    differs; or all of it where there are other kernels. `changed` in frames.js is the way back.
+    """Difference between a state and the initial one: changed data words per surface and all other
+    changed entries; or the whole state if its kernels differ. Inverse: `changed` in frames.js.
 
-    checks: whether rays with answers go along; with other kernels they always do, as no device has
-        been asked about these.
+    checks: whether check rays with their answers are included. With other kernels they always are,
+        as no device has checked these yet.
     """
     pairs = [*zip(first["surfaces"], state["surfaces"], strict=False)]
     alike = len(first["surfaces"]) == len(state["surfaces"]) and all(

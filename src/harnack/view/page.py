@@ -123,7 +123,7 @@ def check_title(title: Any) -> None:
 
 
 def still_png(live: LiveScene) -> str:
-    """A picture of what is drawn at first, as base64 of a PNG file."""
+    """A picture of the initial state, as base64 of a PNG file."""
     camera = Camera(**live.pose)
     still: Any = live.render_still(
         live.initial_controls, show=live.show, size=_STILL_SIZE, camera=camera
@@ -180,7 +180,7 @@ def _slider_state(live: LiveScene, values: Mapping[str, float]) -> JsonDict:
 
 @dataclass(frozen=True)
 class PageJob:
-    """What the states of a page are made of: as `page` was given it, and Mitsuba's variant."""
+    """The job of computing the states of a page: the arguments of `page`, and Mitsuba's variant."""
 
     what: Any
     settings: Mapping[str, Any]
@@ -188,34 +188,35 @@ class PageJob:
 
     @functools.cached_property
     def given(self) -> LiveScene:
-        """What moves."""
+        """The live scene of the arguments."""
         set_variant(self.variant)
         return LiveScene.of(self.what, dict(self.settings))
 
     @functools.cached_property
     def places(self) -> dict[str, list[float]]:
-        """The places of the sliders that the page holds."""
+        """The slider values that the page holds, by slider."""
         return _places(self.given)
 
     @functools.cached_property
     def live(self) -> LiveScene:
-        """What moves, framed over these places."""
+        """The live scene, framed for all slider values that the page holds."""
         return self.given.framed(_slider_combinations(_framing_values(self.places)))
 
     @functools.cached_property
     def digest(self) -> str:
-        """A number of the first state, from which the others are told by differences."""
+        """A digest of the initial state, to which the deltas of the other states are relative."""
         return hashlib.blake2b(
             json.dumps(encode_arrays(self.live.initial_state)).encode()
         ).hexdigest()
 
     def state(self, values: Mapping[str, float], digest: str) -> TaskResult:
-        """What a place of the sliders changes of the first state, as text in bytes.
+        """The delta of a state, for a combination of slider values, relative to the initial state;
+        as text in bytes.
 
-        digest: of the first state that is in the page.
+        digest: of the initial state that is in the page.
 
         Raises:
-            RuntimeError: the first state is another one here.
+            RuntimeError: the initial state of this process is another one.
         """
         if self.digest != digest:
             raise RuntimeError(

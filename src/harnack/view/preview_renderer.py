@@ -1,8 +1,8 @@
-"""Pictures of what is live by this machine's own processor, for visitors whose device is slower.
+"""Draws live scenes on this machine's own processor, for visitors whose device is slower.
 
-They are those of `show="shaded"` with one ray a pixel, of the same formulas. Mitsuba's scene is
-left out, which takes longer to be put together than a small picture to be traced; and no kernel is
-recorded anew for another camera, level, slider or curve of as many vertices.
+The pictures are those of `show="shaded"` with one ray a pixel, by the same formulas. They need no
+Mitsuba scene, which takes longer to be put together than a small picture to be traced; and no
+kernel is recorded anew for another camera, level, slider or curve of as many vertices.
 """
 
 from __future__ import annotations
@@ -41,8 +41,12 @@ _DARKER = 0.45
 
 @dataclass(frozen=True)
 class CameraAxes:
-    """A camera on the stage: where it is, unit vectors to the right, up and forwards (3,), and how
-    wide a pixel of a picture one unit away is."""
+    """A camera on the stage.
+
+    origin: (3,) its position.
+    right, up, forward: unit vectors (3,).
+    pixel: the width of a pixel at distance 1.
+    """
 
     origin: FloatArray
     right: FloatArray
@@ -53,10 +57,11 @@ class CameraAxes:
 
 @dataclass(frozen=True)
 class Preview:
-    """A picture.
+    """A preview picture.
 
-    pixels: (h, w, 4) of sRGB and 255. depths: the least and the greatest distance that is seen in a
-    picture of depths, on the stage; zeros in others.
+    pixels: (h, w, 4) of sRGB and 255.
+    depths: the least and the greatest distance that is seen in a picture of depths, on the stage;
+        zeros in other pictures.
     """
 
     pixels: Pixels
@@ -65,7 +70,7 @@ class Preview:
 
 @dataclass(frozen=True)
 class PreviewSurface:
-    """A surface on the stage, and its paints (`scene.surface_colors`)."""
+    """A surface on the stage, and its paints (`live_scene.surface_colors`)."""
 
     placed: PlacedSurface
     paints: Sequence[Mapping[str, Any]]
@@ -73,8 +78,8 @@ class PreviewSurface:
 
 @dataclass
 class PreviewRenderer:
-    """Draws surfaces where they stand. Keeps the shadow on the floor while things move, and what
-    the rays of the last picture met, so that only its light is computed again."""
+    """Draws surfaces at their places on the stage. While things move it keeps the shadow on the
+    floor, and the hits of the last picture, of which only the light is computed again."""
 
     floor: FloorShadow | None = None
     _hit_cache: tuple[Any, dict[str, Any]] | None = None

@@ -102,16 +102,16 @@ FieldSources = Sequence[tuple[Field, Plain]]
 
 
 class SceneFileError(ValueError):
-    """A text that is no scene file, or something that no scene file can hold."""
+    """A text is no scene file, or an object cannot be stored in a scene file."""
 
 
 @dataclass(frozen=True)
 class SceneFile:
-    """What a scene file holds.
+    """The contents of a scene file.
 
-    surfaces: as `harnack.render`, `page` and `view` take them. settings: of these functions, by
-    name. sliders: by the names of settings, for `page` and `view`; in `settings` is where they
-    start.
+    surfaces: as `harnack.render`, `page` and `view` take them.
+    settings: of these functions, by name.
+    sliders: by the names of settings, for `page` and `view`; their start values are in `settings`.
     """
 
     surfaces: tuple[Field | Surface, ...]
@@ -128,7 +128,7 @@ class SceneFile:
 
 
 def surface_options(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Of some settings those that `level_set` takes."""
+    """The settings that `level_set` takes, among all settings."""
     return {name: one for name, one in settings.items() if name in SURFACE_SETTINGS}
 
 

@@ -1,6 +1,6 @@
-"""Answers to the questions of a page about its live scene, whichever way they come.
+"""Answers the requests of a page about its live scene, by whichever channel they come.
 
-A question is {"kind": ..., ...}, plain numbers, lists and text from outside, none of it trusted.
+A request is {"kind": ..., ...}: plain numbers, lists and text from outside, none of it trusted.
 """
 
 from __future__ import annotations
@@ -64,11 +64,11 @@ def _ignore_progress(part: float) -> None:
 
 
 class RequestError(ValueError):
-    """A question that is malformed or asks for something impossible."""
+    """A request is malformed or asks for something impossible."""
 
 
 class Cancelled(Exception):
-    """Work was stopped, because nobody waits for its answer any more."""
+    """The computation was stopped, because its answer is no longer needed."""
 
 
 @dataclass

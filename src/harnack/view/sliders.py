@@ -1,4 +1,4 @@
-"""What is drawn as a function of numbers that a person moves."""
+"""Sliders: numbers that a person moves, and the content of a live view as a function of them."""
 
 from __future__ import annotations
 
@@ -32,13 +32,14 @@ _COMBINED = 3
 
 @dataclass(frozen=True)
 class Slider:
-    """A number between two ends that whoever looks at a page or a view moves.
+    """A number between two ends that is moved by a person who looks at a page or a view.
 
-    low, high: its ends. start: where it stands at first; by default in the middle, or on the whole
-        step before it. step: between neighboring places, counted from `low`; None for none.
+    low, high: its ends.
+    start: its value at first; by default the middle, or the step at or before the middle.
+    step: between neighboring values, counted from `low`; None for continuous sliders.
 
     Raises:
-        TypeError: no numbers.
+        TypeError: not numbers.
         ValueError: ends out of order, a start outside of them, or a step that is not positive.
     """
 
@@ -63,8 +64,8 @@ class Slider:
             raise ValueError(f"start must lie between {self.low} and {self.high}: {self.start}")
 
     def nearest(self, number: float) -> float:
-        """The place that is nearest to a number, and not above it between two steps; the number as
-        it is where only rounding lies between."""
+        """The value of the slider at or below a number, within its ends; the number as it is where
+        only rounding lies between, or where the slider has no step."""
         number = min(max(number, self.low), self.high)
         if self.step is None:
             return number
@@ -73,7 +74,7 @@ class Slider:
         return number if abs(number - place) <= 1e-9 * self.step else place
 
     def values(self, count: int) -> list[float]:
-        """All its places, or `count` places evenly spread where it has no step."""
+        """All values of the slider, or `count` values evenly spread where it has no step."""
         if self.step is None:
             return [self.low + (self.high - self.low) * k / (count - 1) for k in range(count)]
         steps = math.floor((self.high - self.low) / self.step + 1e-9)
@@ -82,11 +83,11 @@ class Slider:
 
 @dataclass(frozen=True)
 class SlidingContent:
-    """Fields and settings, of which some are functions of sliders.
+    """Content of a live view as a function of sliders.
 
-    content: what `hk.render` draws in its studio, or a function of sliders that gives it. settings:
-        of
-    `render` and `level_set`; functions likewise. sliders: by their names.
+    content: an argument that `hk.render` accepts, or a function of sliders that returns it.
+    settings: options of `render` and `level_set`, constant or functions of sliders.
+    sliders: by name.
     """
 
     content: Any
@@ -95,10 +96,12 @@ class SlidingContent:
 
     @classmethod
     def of(cls, what: Any, given: Mapping[str, Any]) -> SlidingContent:
-        """What users give: sliders stand in the place of numbers, or are arguments of functions.
+        """The content of the arguments of `view` or `page`: a slider is the value of an option that
+        is a number, or the argument of functions.
 
         Raises:
-            TypeError: a function of what is no slider, or a slider that nothing depends on.
+            TypeError: a function of something that is no slider, or a slider that nothing depends
+                on.
         """
         sliders = {name: one for name, one in given.items() if isinstance(one, Slider)}
         known = (*inspect.signature(level_set).parameters, *NUMERIC_RENDER_OPTIONS)
@@ -126,18 +129,18 @@ class SlidingContent:
 
     @property
     def starts(self) -> dict[str, float]:
-        """Where the sliders stand at first."""
+        """The start values of the sliders."""
         return {name: cast("float", one.start) for name, one in self.sliders.items()}
 
     @property
     def name(self) -> str:
-        """What is drawn at first, in words."""
+        """The name of the initial content, in words."""
         what, _ = self.at(self.starts)
         several: list[Any] = [*what] if isinstance(what, list | tuple) else [what]
         return ", ".join(repr(getattr(one, "field", one)) for one in several)
 
     def at(self, values: Mapping[str, float]) -> tuple[Any, dict[str, Any]]:
-        """What is drawn, and its settings, for values of all sliders."""
+        """The content and its settings, for values of all sliders."""
         settings = {name: self._at(name, one, values) for name, one in self.settings.items()}
         return self._at("", self.content, values), settings
 
@@ -157,16 +160,16 @@ class SlidingContent:
 
 
 class SliderValueError(ValueError):
-    """Something wrong with what is drawn at one place of the sliders, which the message names."""
+    """An error at a combination of slider values, which the message names."""
 
 
 @contextmanager
 def slider_values_in_errors(values: Mapping[str, float]) -> Generator[None]:
-    """Has errors within it say for which values of the sliders they were raised; without sliders
-    they stay what they are.
+    """Context manager whose errors name the slider values at which they were raised; without
+    sliders errors stay as they are.
 
     Raises:
-        SliderValueError: in their place.
+        SliderValueError: in place of the error.
     """
     try:
         yield

@@ -1,5 +1,5 @@
-"""Whether values of a scene file are of the types that a class or a function asks for, so that
-what is something else is refused when the file is read, and not when it is drawn."""
+"""Checks values of a scene file against the type annotations of the constructor they are passed to,
+so that errors appear on reading and not on drawing."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ _WORDS: dict[Any, str] = {
 
 
 class ValueTypeError(TypeError):
-    """An argument of another type than that which its name stands for."""
+    """An argument does not have the type of its annotation."""
 
 
 def check_types(function: Callable[..., Any], given: dict[str, Any]) -> None:
-    """Check arguments of a class or a function by its annotations. Lists are tuples in `given`, and
-    stand for arrays too, whose numbers the function itself checks.
+    """Check arguments of a class or a function against its annotations. Lists are tuples in
+    `given`, and may be the values of array arguments too, whose numbers the function itself checks.
 
     Raises:
-        ValueTypeError: the message names the argument, and what it must be.
+        ValueTypeError: the message names the argument, and the required type.
     """
     target = function.__init__ if isinstance(function, type) else function
     hints = typing.get_type_hints(target, localns=_NAMES)

@@ -1,4 +1,4 @@
-"""A view as a widget of a notebook, by anywidget."""
+"""The view as a notebook widget, by anywidget."""
 
 from __future__ import annotations
 

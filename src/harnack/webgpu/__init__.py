@@ -1,9 +1,10 @@
-"""Kernels that Dr.Jit recorded, on any GPU: translated, run, and compared with Dr.Jit.
+"""Kernels that Dr.Jit recorded, translated for any GPU behind WebGPU, run there, and compared with
+Dr.Jit.
 
-Other GPUs get the recorded kernel: the text that Dr.Jit writes for LLVM is what a lane does, loops
-and all, and is read back (`llvm_parser`) and written as WGSL (`wgsl`). Which pointer is which array
-is known by labels, which Dr.Jit prints (`recording`). No field is written twice, and none is
-trusted: a sample of each call's rays is compared with Dr.Jit's own answers (`device`).
+Dr.Jit prints a recorded kernel as a program for LLVM, loops included. That text is parsed
+(`llvm_parser`) and written as WGSL (`wgsl`). Labels, which Dr.Jit prints, tell which pointer is
+which array (`recording`). So no field is implemented twice; and the result is not trusted: a sample
+of the rays of each call is compared with Dr.Jit's own results (`device`).
 """
 
 from __future__ import annotations

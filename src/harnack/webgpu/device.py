@@ -49,14 +49,14 @@ class NoDeviceError(RuntimeError):
 
 @dataclass(frozen=True)
 class Device:
-    """A device, and how it names itself."""
+    """A WebGPU device, and the name by which it identifies itself."""
 
     handle: Any
     name: str
 
     @functools.lru_cache(maxsize=_SHADER_CACHE_SIZE)  # noqa: B019  # devices last as long as the process
     def compile(self, shader: Shader) -> CompiledShader:
-        """The shader, ready to run; compiled once."""
+        """The compiled shader; each shader is compiled once."""
         module = self.handle.create_shader_module(code=shader.code)
         pipeline = self.handle.create_compute_pipeline(
             layout="auto", compute={"module": module, "entry_point": "main"}
@@ -90,7 +90,7 @@ def find_device() -> Device:
 
 @dataclass(frozen=True)
 class CompiledShader:
-    """A shader on a device."""
+    """A shader, compiled for a device."""
 
     device: Device
     shader: Shader
@@ -99,9 +99,10 @@ class CompiledShader:
     def run(
         self, data: Mapping[str, Any], lanes: Mapping[str, Any], count: int
     ) -> dict[str, Words]:
-        """The bits of the results, (count,) each, by their labels.
+        """Run the shader on `count` lanes. Returns the bits of each result, (count,), by label.
 
-        data: the arrays of numbers and tables. lanes: (count,) each.
+        data: by label, the numbers and tables that the shader reads.
+        lanes: by label, arrays (count,).
         """
         made = pack_shader_data(self.shader, data)
         given = np.stack([as_words(lanes[label]) for label in self.shader.lanes])
@@ -150,7 +151,8 @@ class CompiledShader:
 
 
 def pack_shader_data(shader: Shader, data: Mapping[str, Any]) -> Words:
-    """The buffer of numbers and tables that a shader reads (`Shader`), for no lanes as yet."""
+    """The buffer of numbers and tables that a shader reads (`Shader`), with the number of lanes set
+    to 0."""
     tables = [as_words(data[label]) for label in shader.tables]
     numbers = [as_words(data[label])[:1] for label in shader.numbers]
     begin = 2 + len(tables) + len(numbers)
@@ -177,7 +179,7 @@ _CHECKED_LANES = 4096
 
 
 class DeviceMismatchError(RuntimeError):
-    """A device does not compute what Dr.Jit does."""
+    """The results of a device differ from Dr.Jit's."""
 
 
 def evaluate_on_device(
@@ -187,16 +189,16 @@ def evaluate_on_device(
     data: Any,
     find_mismatch: Callable[[IntArray, Arrays, Arrays], str],
 ) -> Arrays:
-    """What `compute(**lanes)` gives, as NumPy arrays by name, computed on a device.
+    """Evaluate `compute(**lanes)` on a device. Returns NumPy arrays by name.
 
-    compute, data: as `recording.record` takes them.
+    compute, data: as `record_kernel` takes them.
     lanes: Dr.Jit arrays of n entries each.
-    find_mismatch: a function of some lanes, Dr.Jit's answers there and the device's, which says
-        what is wrong with the latter; nothing if they agree.
+    find_mismatch: a function of a sample of the lanes, Dr.Jit's results there and the device's,
+        which describes an error of the latter; it returns nothing if they agree.
 
     Raises:
-        UntranslatableError: the kernel holds what is not known.
-        DeviceMismatchError: the answers differ.
+        UntranslatableError: the kernel contains an unknown operation.
+        DeviceMismatchError: the results differ.
     """
     count = max(dr.width(one) for one in lanes.values())
     # Two at least: a single lane would be a number.

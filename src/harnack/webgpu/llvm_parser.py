@@ -1,8 +1,9 @@
-"""A kernel that Dr.Jit recorded, read: straight-line operations on lanes, and loops that nest.
+"""A parser of kernels that Dr.Jit recorded: straight-line operations on lanes, and nested loops.
 
-Dr.Jit writes kernels for LLVM as one function over packets of lanes. What a lane does is the same
-in all of them, so the packets go, and with them the masks that only keep lanes of a packet apart.
-Only the part of LLVM's language that Dr.Jit writes is known; anything else is refused by name.
+Dr.Jit writes a kernel for LLVM as a function over packets of lanes. The program of every lane is
+the same, so the parser drops the packets, and with them the masks that only keep the lanes of a
+packet apart. It knows the part of LLVM's language that Dr.Jit writes; anything else is refused by
+name.
 """
 
 from __future__ import annotations
@@ -29,12 +30,12 @@ _KINDS: dict[str, Kind] = {"float": "f32", "i32": "u32", "i1": "bool", "i8": "u3
 
 
 class UntranslatableError(NotImplementedError):
-    """A kernel holds an operation that is not known here."""
+    """A kernel contains an operation that the translation does not know."""
 
 
 @dataclass(frozen=True)
 class Constant:
-    """A number of a kernel: its 32 bits."""
+    """A constant of a kernel, as its 32 bits."""
 
     kind: Kind
     bits: int
@@ -45,7 +46,7 @@ Operand: TypeAlias = "str | Constant"
 
 @dataclass(frozen=True)
 class Operation:
-    """result = name(operands), each a constant or the result of an operation before."""
+    """result = name(operands); each operand is a constant or the result of an earlier operation."""
 
     result: str
     kind: Kind
@@ -55,10 +56,11 @@ class Operation:
 
 @dataclass(frozen=True)
 class Load:
-    """result = an array's entry: that of the lane, the only one, or entry `index` * stride + offset
-    where `mask` holds, and else 0.
+    """result = an entry of an array.
 
-    source: "lane", "number" or "table". parameter: which array.
+    source: "lane": the entry of the lane. "number": the only entry. "table": entry index * stride +
+        offset where `mask` holds, else 0.
+    parameter: the index of the array among the parameters of the kernel.
     """
 
     result: str
@@ -73,7 +75,7 @@ class Load:
 
 @dataclass(frozen=True)
 class Store:
-    """The lane's entry of an array = value."""
+    """The lane's entry of the array `parameter` = value."""
 
     parameter: int
     kind: Kind
@@ -92,7 +94,7 @@ class LoopVariable:
 
 @dataclass
 class Loop:
-    """Iterations of `test` and `body` while `condition`, which `test` computes, holds."""
+    """A loop: `test` computes `condition`; while it holds, `body` runs and `test` again."""
 
     variables: list[LoopVariable] = field(default_factory=list[LoopVariable])
     test: list[Statement] = field(default_factory=list["Statement"])
@@ -105,17 +107,17 @@ Statement: TypeAlias = "Operation | Load | Store | Loop"
 
 @dataclass(frozen=True)
 class ComputeKernel:
-    """What a lane does.
+    """The program that each lane of a kernel runs.
 
-    labels: of parameters, as far as they are known: of those that lanes read at places which they
-        compute, the label of what was read.
+    labels: index of a kernel parameter -> label of its array, where a label is known. An array from
+        which lanes gather at computed indices has the label of the gathered value.
     """
 
     statements: list[Statement]
     labels: dict[int, str]
 
     def walk(self) -> Iterator[Statement]:
-        """All statements, also those of loops."""
+        """All statements, those in loops included."""
         waiting = list(self.statements)
         while waiting:
             one = waiting.pop()
@@ -125,10 +127,10 @@ class ComputeKernel:
 
 
 def parse(text: str) -> ComputeKernel:
-    """The kernel of a text in LLVM's language, as `drjit.kernel_history` gives it.
+    """Parse a kernel, as `drjit.kernel_history` gives it in LLVM's language.
 
     Raises:
-        UntranslatableError: it holds an operation that is not known.
+        UntranslatableError: it contains an unknown operation.
     """
     start = text.rfind("define void @drjit_")
     if start < 0:
@@ -142,7 +144,8 @@ def parse(text: str) -> ComputeKernel:
 
 @dataclass
 class _Address:
-    """Where lanes read: a parameter's array, at an index, in records of `stride` numbers."""
+    """The address of a load: the array of a parameter, at an index, in records of `stride`
+    numbers."""
 
     parameter: int
     index: Operand | None = None

@@ -1,8 +1,8 @@
-"""The kernel that Dr.Jit records for a computation, and which of its arrays is which.
+"""The kernel that Dr.Jit records for a computation, and which of its parameters is which array.
 
-A kernel tells its arrays apart by the places of their pointers. Names come with it as comments:
-`drjit.set_label` gives a variable one, and `JitFlag.PrintIR` has them written. An array that a
-kernel reads at places which lanes compute is named by what `drjit.gather` returns of it.
+A kernel distinguishes its arrays only by the positions of their pointers. Labels come with it as
+comments: `drjit.set_label` labels a variable, and `JitFlag.PrintIR` prints labels. An array that a
+kernel reads at computed indices is identified by the label of the result of `drjit.gather`.
 """
 
 from __future__ import annotations
@@ -32,8 +32,9 @@ _RECORDING_LOCK = threading.Lock()
 class RecordedKernel:
     """A kernel as a shader, and the arrays that it reads and writes, by their labels.
 
-    data: of numbers and tables. results: what Dr.Jit made of the lanes. constants: of results that
-    no lane computes.
+    data: the numbers and tables that it reads.
+    results: Dr.Jit's own results for the lanes.
+    constants: results that are constants, which no lane computes.
     """
 
     shader: Shader
@@ -45,15 +46,16 @@ class RecordedKernel:
 def record_kernel(
     compute: Callable[..., Mapping[str, Any]], lanes: Mapping[str, Any], data: Any
 ) -> RecordedKernel:
-    """What `compute(**lanes)` records, run on Dr.Jit's own backend for these lanes.
+    """Record the kernel of `compute(**lanes)`, which also runs on Dr.Jit's own backend for these
+    lanes.
 
-    compute: gives arrays by name, none of them evaluated, from one kernel.
-    lanes: arrays by name, of the same length, of two entries at least.
-    data: whatever else `compute` reads: all arrays in it are looked for.
+    compute: returns arrays by name, none of them evaluated, from a single kernel.
+    lanes: arrays by name, of the same length, with two entries at least.
+    data: an object that contains all other arrays which `compute` reads; it is searched for them.
 
     Raises:
-        UntranslatableError: the kernel holds what is not known.
-        RuntimeError: it is more than one kernel.
+        UntranslatableError: the kernel contains an unknown operation.
+        RuntimeError: the computation is more than one kernel.
     """
     with _RECORDING_LOCK:
         naming = _ArrayLabels()
@@ -99,7 +101,7 @@ def _evaluate_and_get_ir(arrays: list[Any]) -> str:
 
 @contextlib.contextmanager
 def _garbage_collection_paused() -> Generator[None]:
-    """While it lasts, no thread collects garbage.
+    """Context manager: within it, no thread collects garbage.
 
     To print a kernel, Dr.Jit waits for Python's lock while it holds its own. A thread that collects
     garbage holds Python's lock, and would wait for Dr.Jit's to free an array, for ever.
@@ -114,15 +116,18 @@ def _garbage_collection_paused() -> Generator[None]:
 
 
 class _ArrayLabels:
-    """Labels of arrays, in the order in which they are met, so that they are the same for data of
-    the same shape: they are a part of the kernel, which is compiled anew for others."""
+    """Labels arrays in the order in which they are met.
+
+    Labels are part of the text of a kernel. Data of the same structure get the same labels, so that
+    the kernel is neither translated nor compiled again.
+    """
 
     def __init__(self) -> None:
         self.labeled_arrays: dict[str, Any] = {}
         self._tables: dict[int, str] = {}
 
     def label_array(self, array: Any) -> None:
-        """Gives an evaluated array a name."""
+        """Give an evaluated array the next label; an array of another state is left as it is."""
         if array.state == dr.VarState.Evaluated:
             label = f"data {len(self.labeled_arrays)}"
             dr.set_label(array, label)
@@ -130,7 +135,8 @@ class _ArrayLabels:
 
     @contextlib.contextmanager
     def label_gathers(self) -> Generator[None]:
-        """While it lasts, what `drjit.gather` returns is named after the array it is from."""
+        """Context manager: within it, the result of `drjit.gather` is labeled after the array that
+        it was gathered from."""
         module = cast("Any", dr)
         original = module.gather
 

@@ -1,9 +1,9 @@
-"""WGSL, WebGPU's language, for what a lane of a recorded kernel does: one lane an invocation.
+"""Translation of recorded kernels to WGSL, WebGPU's language, an invocation for each lane.
 
 WGSL promises less than LLVM: division may be off by 2.5 units in the last place, `fma` may round
-twice, denormals may be zero, and a compiler may take infinities and NaN for impossible. So
-constants that are not finite come from a buffer, NaN and infinity are told by bits, and what a
-device makes of a shader is compared with Dr.Jit's answers (`harnack.webgpu.device`).
+twice, denormals may be zero, and a compiler may assume that infinities and NaN do not occur. So
+constants that are not finite are read from a buffer, NaN and infinity are recognized by their bits,
+and the results of a device are compared with Dr.Jit's (`harnack.webgpu.device`).
 """
 
 from __future__ import annotations
@@ -68,11 +68,12 @@ _NEGATED_COMPARISONS = {"gt": "le", "ge": "lt", "lt": "ge", "le": "gt"}
 
 @dataclass(frozen=True)
 class Shader:
-    """A kernel in WGSL, and what its buffers hold.
+    """A kernel in WGSL, and the layout of its buffers. All fields but the code are labels of
+    arrays, in order.
 
-    data: `count`, the number of lanes; 0; for each of `tables` where it begins; each of `numbers`;
-        then the tables. lanes: for each of `lanes` an entry a lane, one array after the other;
-        results likewise. All are labels of arrays, in order.
+    The buffer of data holds: the number of lanes; 0; the start of each of `tables`; each of
+    `numbers`; then the tables. The buffer of lanes holds for each of `lanes` an entry per lane,
+    array after array; the buffer of results likewise.
     """
 
     code: str
@@ -86,7 +87,7 @@ def to_shader(kernel: ComputeKernel) -> Shader:
     """The shader of a kernel.
 
     Raises:
-        UntranslatableError: an operation is not known, or nothing says what an array is.
+        UntranslatableError: an operation is unknown, or an array has no label.
     """
     return _WGSLWriter(kernel).shader()
 

@@ -108,10 +108,9 @@ class HypersphericalHarmonic(Field):
     vectors v (`BallRange.curvature` has the proof). Let S = 1 + |p|^2.
 
     - `TaylorRemainder`. A line runs on S^3 at speed 2/S, and its second derivative in t has the
-      length
-      4/S^1.5 (`SphereArcEnclosure` has the circle: it is sqrt(c^2 + t^2) 4/S^2). By the chain rule
-      |f''| <= M l (4 (l-1)/S^2 + 4/S^1.5) with the least S on the ball, and |grad f| <= 2 l A/S
-      (Bernstein on the great circle along the line).
+      length 4/S^1.5 (`SphereArcEnclosure` has the circle: it is sqrt(c^2 + t^2) 4/S^2). By the
+      chain rule |f''| <= M l (4 (l-1)/S^2 + 4/S^1.5) with the least S on the ball, and |grad f| <=
+      2 l A/S (Bernstein on the great circle along the line).
     - Where f vanishes to an order above 2, at y = 0 or for |m| > 2 on the circle y_1 = y_2 = 0,
       another `TaylorRemainder`, on a ball whose radius is a fraction of the distance to that zero.
       With bounds of S_jm, its gradient and its Hessian at such distances (`AxialBound`), and 2ab <=
@@ -119,9 +118,8 @@ class HypersphericalHarmonic(Field):
       ball: R <= 0.3 sqrt(S) leaves 1 + |q|^2 >= 0.49 S at q, so that on the sphere it is within the
       chord 2R/(0.7 S).
     - Along a ray: `SphereArcEnclosure`. On the circle of radius 1/c, in its angle, the first
-      derivative of the
-      point has length 1/c and the second too, so |f_aa| <= M l ((l-1)/c^2 + 1/c); and f is a
-      trigonometric polynomial of degree l of the angle, so |f_aa| <= l^2 A (Bernstein).
+      derivative of the point has length 1/c and the second too, so |f_aa| <= M l ((l-1)/c^2 + 1/c);
+      and f is a trigonometric polynomial of degree l of the angle, so |f_aa| <= l^2 A (Bernstein).
 
     Raises:
         ValueError: l, j or m outside these ranges.

@@ -189,8 +189,7 @@ class Lobes(Field):
 
     def _local_remainder(self, r: Real, y: Real, slope: Real) -> TaylorRemainder:
         """A bound of second derivatives on a small ball, on which Y and its slope may be far
-        smaller
-        than elsewhere: between lobes that come close to each other.
+        smaller than elsewhere: between lobes that come close to each other.
 
         Proof, for B(x, q r) with q <= 1/4, whose directions from the origin are within the angle
         1.05 q of u. With M and L as for Y itself, second derivatives along the sphere are at most

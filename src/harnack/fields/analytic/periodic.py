@@ -183,9 +183,9 @@ class EigenfunctionSum(Field):
         E t <= E^2/(2 h H) + h H t^2/2   (2 a b <= a^2 + b^2):
 
     the larger H and E^2/(2 h H) cover the error of Taylor's formula with a rounded gradient. On the
-    harmonic ball of radius R it is E R, of which `enclosures.ball.rounding` covers 16 u of the mean
-    4 (f - lower)/R in units of which the slope enters, f - lower being about H R^2/2 or more; only
-    the rest is added.
+    harmonic ball of radius R it is E R, of which `enclosures.free_radius.condition_rounding` covers
+    16 u of the mean 4 (f - lower)/R in units of which the slope enters, f - lower being about H
+    R^2/2 or more; only the rest is added.
 
     Raises:
         ValueError: terms that are not finite, or a sum that is constant.

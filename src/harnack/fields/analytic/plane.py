@@ -237,15 +237,15 @@ _LONGEST = 1e6
 
 
 class LevelCurves(Field):
-    """f(x, y, z) = Re g(x + i y), or Im: its level sets are walls over level curves of the plane.
+    """f(x, y, z) = Re g(x + i y), or Im g(x + i y), with an analytic function g. Its level sets are
+    walls over level curves of the plane.
 
-    function, exponent, argument, singular_points, second_bound, period: an analytic function with
-    one branch, up to a
-        period, as for `RiemannSurface`: {a_i: n_i} with whole n_i for a rational function, "log"
-        with argument={a_i: n_i} for charges n_i at a_i.
+    function, exponent, argument, singular_points, second_bound, period: an analytic function g with
+        a single branch, up to a period, as for `RiemannSurface`: {a_i: n_i} with integers n_i for a
+        rational function, "log" with argument={a_i: n_i} for charges n_i at a_i.
     part: "real" or "imag".
-    level: the one drawn when none is asked for.
-    domain: the volume it is drawn in; by default the box |x|, |y| <= 2, |z| <= 1/4.
+    level: the level that is drawn if the user names none.
+    domain: the volume in which f is drawn; by default the box |x|, |y| <= 2, |z| <= 1/4.
 
     Re g is harmonic in the plane: Harnack's inequality of dimension 2 holds in disks up to the
     nearest singular point, and as |g''| is bounded there (`Branches.second_derivative_bound`) f

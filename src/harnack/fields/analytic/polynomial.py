@@ -174,7 +174,7 @@ class HarmonicPromises:
         larger promise and by E^2/(2 h H) added to the error of the value. Without second
         derivatives the gradient is constant and right to a few u of itself, less than the tracer
         allows for the rounding of points (8 u |grad f| times their size). For a harmonic ball E R
-        is a few u of the range, of which `enclosures.ball.rounding` covers 16 u.
+        is a few u of the range, of which `enclosures.free_radius.condition_rounding` covers 16 u.
         """
         unit = float(dr.epsilon(type(r)))  # u, half the distance from 1 to the next number
         error = dr.fma(self.rounding.value(rho, r), unit, self._smallest(r))

@@ -42,7 +42,7 @@ _WIDENED = 1 + 1e-4
 
 @dataclass(frozen=True)
 class _BranchValue:
-    """One sheet at a point.
+    """A branch at a point.
 
     phi: h - u.
     x, y: the gradient of phi in the plane, that of -u.
@@ -63,17 +63,17 @@ class _BranchValue:
         return dr.fma(self.x, direction.x, dr.fma(self.y, direction.y, direction.z))
 
     def coincides_with(self, other: _BranchValue) -> Mask:
-        """Whether phi and its gradient are those of the other, as for a sheet and itself. On a line
-        of symmetry those of two sheets agree in all but y, and f has a crease."""
+        """Whether phi and its gradient equal those of the other branch, as for a branch and itself.
+        On a line of symmetry two branches agree in all but y, and f has a crease."""
         return (self.phi == other.phi) & (self.x == other.x) & (self.y == other.y)
 
 
 @dataclass(frozen=True)
 class _PointBranches:
-    """All sheets at a point.
+    """All branches at a point.
 
     z, h: the point: in the plane, and the height.
-    nearest: the sheet with the smallest |phi|.
+    nearest: the branch with the smallest |phi|.
     sign: f is sign times its phi.
     error: of all phi, by arithmetic.
     rounding: of the position of the point.
@@ -118,13 +118,13 @@ class RiemannSurface(Field):
 
     Proof. Along a ray the set of branches is continued as long as no singular point is met: so
     branch cuts and the numbering of branches do not matter. `NearestBranchEnclosure` takes the
-    minimum over all sheets of the step in which it could be reached, from their slopes and a bound
-    of |g''| on the segment of the plane below the ray, which all share
+    minimum over all branches of the step in which it could be reached, from their slopes and a
+    bound of |g''| on the segment of the plane below the ray, which all share
     (`Branches.second_derivative_bound`): |d^2 phi_j/ds^2| <= |g''| |w|^2, w the projection of the
-    ray's direction to the plane, for h is linear. So the nearest sheet may change between two
-    samples: from each of them, ahead or back, all sheets are proved to be out of reach. Near branch
-    points with a power > 0 all branches are near one value, and for a ray that passes at another
-    height `BranchPointEnclosure` proves the step.
+    ray's direction to the plane, for h is linear. So the nearest branch may change between two
+    samples: from each of them, ahead or back, all branches are proved to be out of reach. Near
+    branch points with a power > 0 all branches are near one value, and for a ray that passes at
+    another height `BranchPointEnclosure` proves the step.
 
     A point is a hit if f is within the tolerance times |grad f| of 0 and, near such a branch point,
     if the surface is not proved to be farther away: where the slope grows without bound, f/|grad f|
@@ -220,7 +220,7 @@ class RiemannSurface(Field):
         steepest: Real = 0.0
         for sheet in place.branches:
             steepest = fmax(sheet.steepness, steepest)
-        # The radius within which no other sheet can become the nearest: |phi_j| - |phi_i| > 0.
+        # The radius within which no other branch can become the nearest: |phi_j| - |phi_i| > 0.
         # Sheets that touch here have the same value and gradient, and stay within the same
         # parabola; but the nearest of two is not harmonic.
         same, touching = radius, 0 * radius
@@ -246,7 +246,7 @@ class RiemannSurface(Field):
         )
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        """The look with proofs from all sheets along the ray, instead of from promises."""
+        """The ray sample with proofs from all branches, instead of from promises."""
         p, d = path.point(t), path.direction
         if PiecewiseTaylorEnclosure not in path.proofs.kinds:
             return path.enclose(self.evaluate(p))
@@ -479,5 +479,6 @@ class RiemannSurface(Field):
 
     @staticmethod
     def _extra_rounding(sheet: _BranchValue, place: _PointBranches) -> Real:
-        """How much more the rounding of the point may change phi of a sheet than of the nearest."""
+        """How much more the rounding of the point may change phi of a branch than of the
+        nearest."""
         return fmax(sheet.steepness - place.nearest.steepness, 0) * place.rounding

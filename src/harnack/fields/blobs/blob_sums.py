@@ -9,10 +9,10 @@ then so are t, the distance h of the line from the center (as a length), and the
 x = s - t, within 8u(2 + |t|) where they matter: that is a displacement of the blob relative to the
 path, which also covers that |d| is 1 only up to 2u. A displacement by e changes f' by at most
 `KernelLipschitz.slope` times e, and f'' by `KernelLipschitz.bend` times e (its jumps at the end of
-the support are searched for within a margin), or by `Kernel.lipschitz_fraction` of that. A sum of n
-terms adds n u times the sum of their largest absolute values. Both are added to the ranges,
+the support are searched for within a margin), or by `BlobKernel.lipschitz_fraction` of that. A sum
+of n terms adds n u times the sum of their largest absolute values. Both are added to the ranges,
 outwards. The value at the point is right within 8u |dk/dq|, by the rounding of q, and (16 + n)u m,
-with m as in `Kernel.profile`.
+with m as in `BlobKernel.profile`.
 """
 
 from __future__ import annotations

@@ -78,7 +78,7 @@ class Blobs(Formula):
     weights: (n,), or None for 1; negative ones carve.
     kernel: "compact" (a polynomial of the sixth degree), "gaussian", or the soft objects "cubic"
         and "sextic"; or one with other parameters, such as `GaussianKernel(sharpness=2.0)`. Each
-        ends at `Kernel.support` times the radius.
+        ends at `BlobKernel.support` times the radius.
     groups: (n,) integers: f is then the largest of the sums of each group, so that groups meet in
         creases; None for one sum.
 

@@ -179,7 +179,7 @@ class GroupMaximumEnclosure(Enclosure):
         """Proof. See `GroupMaximumEnclosure`. For a group whose sum is lower by g, the level above
         is farther by g and the level below nearer by g; g is known up to the errors of both sums,
         the larger of which the tracer has subtracted from the gaps already
-        (`look.value_error_bound`)."""
+        (`samples.value_error_bound`)."""
         backend = self.blobs.records.backend
         real = backend.Float
 

@@ -1,20 +1,18 @@
-"""Winding numbers modulo 1, by cells of the boundary.
+"""Winding numbers modulo 1 from FMM cells.
 
-Modulo 1 the winding number of a mesh is the solid angle of its singular edges over 4 pi, which are
-closed curves. In cells (`curve_cells`) that costs about the same however many of them there are,
-and no ray has to be followed. What is left open is a whole number: between two sheets w does not
-pass a level, modulo 1, unless a ray meets it, so the march knows that number from one sample to the
-next (`tracer.branch_tracker`).
+Modulo 1, the winding number w of a mesh is 1/(4 pi) times the solid angle of its singular edges,
+the edges at which triangles do not cancel, which form closed curves. Cells (`curve_cells`) evaluate
+it at nearly the same cost for any number of edges, and without following a ray.
 
-Winding numbers have the cells of their boundary: modulo one w is the solid angle of the edges at
-which triangles do not cancel, so that a sample needs no ray and few edges. The whole number is the
-ray's business (`branch_tracker`): the levels, repeated with period one, are rungs; proved steps
-stay between two of them, sheets move w by whole rungs, and a ray that comes from outside of the
-field's extent begins where w is about 0. Those that begin inside know w from the middle of the
-cell, where it was computed once: on the line from there the near loops are lifted, the polynomial
-is continuous, and crossings are counted. Only where rounding leaves one of these open, and to pass
-a rung that is no level, do they take samples that know the number. It replaced a tree of chains of
-edges along rays, which had to open all chains that a ray passes through.
+`tracer.branch_tracker.BranchTracker` determines the integer along rays: proved steps stay between
+two periodic levels, and a jump adds an integer to w. A ray that comes from outside the extent of
+the field begins where w is about 0. A ray that begins inside gets w from the center of its cell,
+where w was computed once: along the line from the center, the solid angle of the near loops is
+followed continuously, the polynomial is continuous, and crossings of triangles are counted
+(`BoundaryCells.value_where_known`). Rays take samples that know their branch only if rounding
+leaves the result of these steps uncertain, and to pass a periodic level that is no true level.
+These cells replaced a tree of chains of edges along rays, which had to open all chains that a ray
+passes through.
 """
 
 from __future__ import annotations
@@ -48,25 +46,28 @@ if TYPE_CHECKING:
 __all__ = ["BoundaryCells"]
 
 _SHARE = 1 / (4 * math.pi)
-# The boundary of a broken mesh is many small loops, and its cells must be built soon: they have so
-# many times as many near edges as those of one curve, and split ones share what is beyond so many
-# radii.
+# The boundary of a broken mesh consists of many small loops, and its cells must be built fast. They
+# have the first number times as many near edges as the cells of a single curve, and split cells
+# share the edges beyond the second number of radii.
 _NEAR_FACTOR, _SHARED = 4.0, 3.5
-# Of the bytes, for all but w at the centers: a cell has at least 64 numbers besides.
+# The fraction of the bytes for all numbers but w at the centers: a cell has at least 64 others.
 _CELL_BYTES_FRACTION = 64 / 65
-# Roundings of a coordinate: of a point, and within which of an edge nothing is known.
+# In roundings of a coordinate: the error of a point, and the distance from an edge within which
+# samples promise nothing.
 _POINT_ROUNDINGS, _EDGE_ROUNDINGS = 8.0, 16.0
-# In roundings: points are that far off triangles where w is known from a cell's center, and so are
-# the centers. By how much w may then be off.
+# Points at which w follows from the center of a cell, and these centers, are at least this many
+# roundings away from triangles. The second number bounds the error of w there.
 _TRIANGLE_ROUNDINGS, _MAX_BRANCH_ERROR = 64.0, 0.125
 
 
 @dataclass(frozen=True)
 class BoundaryCells:
-    """Cells of the singular edges of a mesh on a backend, in its unit coordinates.
+    """FMM cells of the singular edges of a mesh, on a backend, in the unit coordinates of the mesh.
 
-    rays: the triangles. center_values: w at the center of each cell; NaN where a triangle is near,
-        and where it is not known up to an eighth.
+    cells: the cells of the closed curves that the singular edges form.
+    rays: the tree of the triangles.
+    center_values: w at the center of each cell; NaN if a triangle is near, or if the error of w is
+        not below an eighth.
     """
 
     cells: CurveCells
@@ -78,10 +79,10 @@ class BoundaryCells:
         cls, rays: TriangleTree, mesh: WindingMesh, low: FloatArray, high: FloatArray,
         most_bytes: int, value: Callable[[FloatArray], tuple[FloatArray, FloatArray]],
     ) -> BoundaryCells | None:  # fmt: skip
-        """Cells of a cube around the mesh and the box from low (3,) to high (3,), of at most so
-        many bytes; None where that is too little.
+        """Cells of a cube around the mesh and around the box from low (3,) to high (3,); None if
+        they would take more than `most_bytes`.
 
-        value: w at points (n, 3), and bounds of its error.
+        value: gives w (n,) at points (n, 3), and bounds (n,) of its error.
         """
         backend = rays.tree.backend
         trails = closed_trails(mesh.singular_edges)
@@ -117,23 +118,23 @@ class BoundaryCells:
 
     @property
     def size(self) -> int:
-        """Their bytes, with w at the centers."""
+        """The number of bytes of the cells, with w at their centers."""
         return self.cells.size + self.count * np.dtype(self.cells.backend.dtype).itemsize
 
     def value_where_known(self, x: Vec3, unit: Real, active: Mask) -> Real:
-        """w at x where active; NaN where it is not known.
+        """w at x on active lanes; NaN on other lanes, and where w does not follow from the cell.
 
-        unit: the rounding of a coordinate of x, and of those of the ray on which it lies.
+        unit: the rounding of a coordinate of x, and of the ray on which x lies.
 
         Proof. On the line from the cell's center c to x, w changes by that of the solid angle of
         the boundary over 4 pi, and where the line crosses a triangle along its normal, by -1
-        (`edge_lift`). So w is known at x with the errors of w(c) and of the cell; it is the number
-        nearest to that of those that are what the cell knows modulo 1, as all errors together are
-        below three eighths. On a triangle nothing is known, nor where `signed_crossings_between` or
-        `change_from_center` are not sure. Off all triangles it is the number of the side on which
-        the ray has x, too: the t of a crossing is the depth of a point of the triangle that is a
-        few roundings off the ray, and so is the true one. If x were between these two, a point of
-        the triangle would be as near to x.
+        (`edge_lift`). This gives an estimate of w(x) with the errors of w(c) and of the cell. Then
+        w(x) is the number nearest to the estimate among those that are congruent modulo 1 to the
+        value of the cell, as all errors together are below three eighths. The result is NaN on a
+        triangle, and where `signed_crossings_between` or `change_from_center` are not sure. Off all
+        triangles it is the number of the side on which the ray has x, too: the t of a crossing is
+        the depth of a point of the triangle that is a few roundings off the ray, and so is the true
+        one. If x were between these two, a point of the triangle would be as near to x.
         """
         backend, real = self.cells.backend, self.cells.backend.Float
         found, inside = self.cells.sums(x, active)
@@ -157,10 +158,12 @@ class BoundaryCells:
     def sample(
         self, x: Vec3, direction: Vec3 | None, unit: Real, active: Mask
     ) -> tuple[Sample, Mask]:
-        """w at x but for a whole number, with promises of its lift, those along a unit direction
-        among them if one is given; and the points for which they hold: those that are active, in a
-        cell and not at an edge. See `SolidAngle` for the promises.
+        """A sample of w modulo 1 at x, and the lanes on which it is valid: those that are active
+        and whose x lies in a cell and not at an edge.
 
+        The promises are about w continued smoothly, and are those of `SolidAngle`.
+
+        direction: (3,) a unit vector, along which `ray_promises` are given; None for none.
         unit: the rounding of a coordinate.
         """
         backend = self.cells.backend

@@ -1,14 +1,15 @@
-"""Whether a field has cells: as it was asked for, or where rays are so many that cells pay.
+"""The argument `cells` of fields that may have FMM cells, and the decision whether cells pay.
 
 Fields with cells (`dipole_cells`, `curve_cells`) take an argument `cells`: None for cells where
-they pay, True for cells in any case, False for none, or how many megabytes they may take.
+they pay, True for cells in any case, False for no cells, or the number of megabytes that they may
+take.
 
-A field is told how many rays there will be, by `trace` and by `render`, and by views that Python
-draws as the rays add up, and prepares more where that pays: cells of a cloud cost what some six
-rays a point cost without them. Solids pass it on to their parts.
+`trace`, `render`, and views that Python draws tell a field the number of rays
+(`Field.for_ray_count`), and the field prepares more if that pays: building the cells of a cloud
+costs as much as about six rays a point without cells. Solids pass the number on to their operands.
 
-Values at points use cells where these were asked for, whatever the number of points: were it chosen
-by that number, values of blocks would not be within the bounds of all points.
+Values at points use cells if the user requested cells, whatever the number of points. If that
+number decided, values of a block of points could lie outside of the bounds for all points.
 """
 
 from __future__ import annotations
@@ -51,11 +52,11 @@ class FieldWithCells(Field):
     """A field that may have cells. Subclasses set `cells` by `configure_cells`, and define
     `cells_pay_from`.
 
-    cells_for_values: whether cells are for values at points too: where they were asked for,
-        whatever the number of points, so that values and bounds of their errors are always of one
-        kind.
-    finer_cells: whether there are so many rays that smaller cells pay; true where cells were asked
-        for.
+    cells_for_values: whether values at points use the cells, too: if the user requested cells,
+        whatever the number of points, so that values and their error bounds always come from the
+        same method.
+    finer_cells: whether there are so many rays that smaller cells pay; true if the user requested
+        cells.
     """
 
     cells: bool | float | None
@@ -102,7 +103,8 @@ class FieldWithCells(Field):
         return 0.0
 
     def for_ray_count(self, count: int) -> Self:
-        """With cells, if none were asked for and none refused, from `cells_pay_from` on."""
+        """This field with cells if `count` is at least `cells_pay_from` and the user neither
+        requested nor refused cells."""
         if self.cells is not None or not self.cells_pay_from() <= count:
             return self
         finer = self.finer_cells_pay_from() <= count
@@ -112,7 +114,7 @@ class FieldWithCells(Field):
         return self._with_cells[finer]
 
     def max_bytes(self) -> int:
-        """How many bytes cells may take."""
+        """The number of bytes that cells may take."""
         return int(1e6 * (_MEGABYTES if self.cells is True else float(self.cells or 0)))
 
     def describe_cells(self, built: BuiltCells | None) -> dict[str, str]:

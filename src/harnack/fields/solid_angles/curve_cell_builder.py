@@ -1,10 +1,10 @@
-"""The cells of curves (`curve_cells`), made a level at a time.
+"""Builds FMM cells of curves (`curve_cells`), one octree level at a time.
 
-What is far from a cell and was near to the one around it is added to the polynomial of the latter,
-moved to the cell's center: so a cell costs what was near, and not the whole curve. Only for bounds
-of what is far, all edges are summed up at each center.
+A cell inherits the local expansion and the near list of its parent. Edges of that list that are far
+from the cell move into the expansion, so that a cell costs as much as the near list of its parent,
+and not as the whole curve. All edges are visited only for bounds of the far field.
 
-- `build_curve_cells`: the cells of a cube, of at most so many bytes.
+- `build_curve_cells`: the cells of a cube, with a limit of their bytes.
 """
 
 from __future__ import annotations
@@ -38,21 +38,22 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
 
 _PERIOD = 4 * math.pi
-# Edges within so many radii of a cell's ball from its center are near; for cells that are split so
-# many, as what they add counts in all cells in them.
+# Edges within this many radii of the cell's ball from its center are near: the first number for
+# leaves; the second for cells that are split, as their far edges count in all cells inside them.
 _NEAR, _SHARED = 3.0, 4.5
-# Cells are split that have more near edges than this many times the cube root of all, or where
-# about this part of the integral of |dp|/D^2, a bound of the gradient, is left out: by experiment.
+# Cells are split if they have more near edges than the first number times the cube root of the
+# number of all edges (but at least the second number), or if truncation exceeds about the third
+# number times the integral of |dp|/D^2, a bound of the gradient. Chosen by experiment.
 _MAX_NEAR_FACTOR, _MIN_NEAR, _MAX_TAIL_RATIO = 2.0, 6.0, 1e-5
-# Where memory is short, cells have twice as many near edges and leave out four times as much, up to
-# so many times.
+# If memory is short, cells get twice as many near edges and four times the truncation, in at most
+# this many attempts.
 _ATTEMPTS = 4
 # Corners and centers of all cells are multiples of this over 2^DEEPEST, in unit coordinates: single
 # precision holds them exactly.
 _GRID_STEP = 2.0**-8
 # Sums in single precision, as bounds; edges that are near up to this part count as far as well.
 _SLACK = 1e-3
-# The most records of near edges, whose numbers single precision holds.
+# The largest number of records of near edges, so that single precision holds their indices.
 _MOST_RECORDS = 2**24
 
 
@@ -60,17 +61,17 @@ def build_curve_cells(
     backend: Backend, loops: tuple[FloatArray, ...], low: FloatArray, high: FloatArray,
     most_bytes: int, near: float = 1.0, shared: float = _SHARED,
 ) -> CurveCells | None:  # fmt: skip
-    """Cells of a cube around the box from low (3,) to high (3,), of at most so many bytes; None
-    where they would take more even if they were larger and had more near edges.
+    """Cells of a cube around the box from low (3,) to high (3,), with at most `most_bytes` bytes;
+    None if they would take more even with larger cells and more near edges.
 
-    loops: (n, 3) each, of a size of about one.
-    near: cells may have so many times as many near edges as usual, and leave out as much more.
-    shared: of split cells, edges beyond so many radii of the ball count for all cells in them.
+    loops: closed curves (n, 3), of a size of about 1.
+    near: the factor by which cells may have more near edges, and more truncation, than usual.
+    shared: edges beyond this many radii of the ball of a split cell count for all cells inside it.
 
-    Proof. The cell of the cube begins with all loops as near runs and nothing else. Each cell keeps
-    those edges of the runs of the cell around it that are near, closed again; the cycle of what is
-    left over (`edge_runs.subtract_runs`) is far from its ball and goes to the polynomial. So near
-    loops and polynomial have in each cell the solid angle of the curve, modulo 4 pi.
+    Proof. The cell of the cube begins with all loops as its near runs and an expansion of 0. Each
+    cell keeps the near edges among the runs of its parent, closed again. The cycle of the remaining
+    edges (`edge_runs.subtract_runs`) is far from its ball and goes into the expansion. So in each
+    cell, near loops and expansion together have the solid angle of the curve, modulo 4 pi.
     """
     loops = tuple(loop.astype(backend.dtype).astype(np.float64) for loop in loops)
     middle = np.round(0.5 * (low + high) / _GRID_STEP) * _GRID_STEP
@@ -94,10 +95,14 @@ def build_curve_cells(
 
 @dataclass
 class _CurveCellBuilder:
-    """Cells while they are made. most_near, fine, shared: see `_MAX_NEAR_FACTOR` and `_SHARED`.
+    """Cells under construction.
 
-    nodes: of each level, for `OctreeLookup.from_levels`. tables, near: records of `CurveCells`.
-    leaves, near_record_count: the number of cells that are not split, and of records of near edges.
+    middle, half: center (3,) of the cube, and half of its side.
+    most_near, max_tail_ratio, parent_ratio: see `_MAX_NEAR_FACTOR` and `_SHARED`.
+    nodes: the nodes of each level, for `OctreeLookup.from_levels`.
+    tables, near: records of `CurveCells`.
+    leaves: the number of cells that are not split.
+    near_record_count: the number of records of near edges.
     """
 
     backend: Backend
@@ -115,7 +120,7 @@ class _CurveCellBuilder:
     near_record_count: int = 0
 
     def grow(self, most_bytes: int) -> bool:
-        """Make all cells, level by level; False as soon as they take too many bytes."""
+        """Build all cells, level by level; returns False as soon as they exceed `most_bytes`."""
         shifts = local_to_local_matrices(DEGREE, 0.5 / (math.sqrt(3) * BALL_MARGIN))
         centers, runs, far = (
             self.middle[None],

@@ -1,21 +1,22 @@
-"""Cells in which the solid angle of a curve is that of a few near edges and one polynomial.
+"""FMM cells of curves: in each cell, the solid angle of a curve is the sum over a few near edges
+and a local expansion, a harmonic polynomial, of all other edges.
 
-A cube around the curve is an octree of cells. In each cell that is not split, the edges within
-three radii of its ball from its center are in runs that one more vertex closes to loops
-(`edge_runs`), and the solid angle of all that is left is one harmonic polynomial
-(`edge_expansion`). So a sample costs what is near, whatever the number of edges.
-`curve_cell_builder` makes the cells.
+The cells are the leaves of an octree over a cube around the curve. The near edges of a cell are the
+edges within three radii of its ball from its center. So the cost of a sample depends on the near
+edges only, and not on the number of all edges. `curve_cell_builder` builds the cells.
 
-Near edges are in runs, each
-closed to a loop by one vertex beyond them (`edge_runs`), since an open run has no solid angle; what
-is left is a cycle far away, whose solid angle is single-valued in the cell, and one harmonic
-polynomial. Each far edge gives a harmonic function by itself, the part of Biot and Savart's field
-along the line to the center (`edge_expansion`), so that remainders are proved edge by edge and no
-fit aliases. A cell adds what was near to the cell around it and is far from its own ball. Closing
-edges count in values and not in promises, which are about the curve. Detail 1 is the cells', more
-is the sum over all edges: cells are so small that fewer than one sample in a hundred needs it, as
-one lane that sums up all edges holds up its packet. Extents of curves with cells have few planes:
-with 1,024 vertices, clipping at the hull took three times as long as the march.
+An open run of near edges has no solid angle, so each run is closed to a loop by a further vertex
+beyond its ends (`edge_runs`). The remaining edges then form a cycle far away, whose solid angle is
+single-valued in the cell. Each far edge by itself gives a harmonic function, the part of Biot and
+Savart's field along the line to the center (`edge_expansion`), so that remainders are proved edge
+by edge and no fit aliases. A cell adds, to the expansion of its parent, the edges that were near to
+the parent and are far from its own ball. Closing edges count in values and not in promises, which
+are about the curve.
+
+Accuracy scale 1 is that of the cells; above it all edges are summed. Cells are so small that fewer
+than one sample in a hundred needs that sum, because a lane that sums over all edges delays its
+packet. Extents of curves with cells have few planes: with 1,024 vertices, clipping at the hull took
+three times as long as the march.
 """
 
 from __future__ import annotations
@@ -54,16 +55,17 @@ _LINE_FRACTION = 0.5
 
 @dataclass(frozen=True)
 class CurveCellSums:
-    """Sums over all edges at x, in a cell.
+    """Sums over all edges at a point x in a cell.
 
-    sums: those of `edges.sum_over_edges`; integrals and the distance are bounds.
-    error, slope_error: bounds of what the polynomial leaves out of value and gradient.
+    sums: as `edges.sum_over_edges` gives them; the integrals and the distance are bounds.
+    error, slope_error: bounds of the truncation errors of value and gradient by the expansion.
     rounding: a bound of the rounding of the value, to which `edges.vertex_rounding` is to be added.
-    expansion_gradient: the gradient of the polynomial. cubes, free: of far edges, an upper bound of
-        the integral of |dp|/D^3, and a lower bound of the distance.
-    near_first, count: of the records of near edges.
-    cell, center: the number of the cell, and where it is. change: the value of the polynomial
-        less that at the center.
+    expansion_gradient: the gradient of the expansion.
+    far_i3: an upper bound of the integral of |dp|/D^3 over the far edges.
+    far_distance: a lower bound of the distance to the far edges.
+    near_first, count: index of the first record of near edges, and the number of these records.
+    cell, center: the index of the cell, and its center (3,).
+    expansion_change: the value of the expansion at x minus its value at the center.
     """
 
     sums: EdgeSums
@@ -155,10 +157,11 @@ class CurveCells:
     def change_from_center(
         self, found: CurveCellSums, frame: RayFrame, x: Vec3, unit: Real, active: Mask
     ) -> tuple[Real, Mask]:
-        """How much the solid angle, continued along the line from the cell's center, is larger at
-        x; and where that is known.
+        """The change of the solid angle from the cell's center to x, followed continuously along
+        the line, and the lanes on which the change is certain.
 
-        frame: of rays from the center to x. unit: the rounding of a coordinate.
+        frame: of the rays from the center to x.
+        unit: the rounding of a coordinate.
 
         Proof. What the far edges add is the polynomial in all of the ball. The near loops are
         closed, so that the lifted sum of their edges (`edge_lift`) is their solid angle; it has no
@@ -198,14 +201,14 @@ class CurveCells:
     def rates_along(
         self, found: CurveCellSums, line: RayLine, lengths: tuple[Real, ...], active: Mask
     ) -> tuple[Real, ...]:
-        """As `trail_sums.rates_along`, at the points of these sums.
+        """As `trail_sums.line_rates`, at the points of these sums.
 
         Proof. f changes along a line by the sum of what the fields of all edges add up to along it.
         For near edges that is bounded by `add_edge_rates`. The field H of all others at x is the
         gradient of the polynomial, up to `slope_error`, with the fields of closing edges, which are
         in the near loops. Along v it adds to f at x + sv at most |s||H . v| + s^2/2 K for |s| <= r,
-        with r half the distance d of far edges, and K the constant of `curve_queries.bends` for
-        q = 1/2, which is 3/2 (I3 + d I4), at most 3 I3.
+        with r half the distance d of far edges, and K the constant of
+        `curve_queries.remainder_promises` for q = 1/2, which is 3/2 (I3 + d I4), at most 3 I3.
         """
         vector, x = self.backend.Array3f, line.x
         count = dr.select(active, found.count, 0)

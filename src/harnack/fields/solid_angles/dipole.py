@@ -104,7 +104,7 @@ class DipoleTree:
 
     @property
     def coarsest_accuracy(self) -> float:
-        """The detail of coarse samples (`Field.coarsest_detail`)."""
+        """The accuracy scale of coarse samples (`Field.coarsest_accuracy`)."""
         return self.clusters.coarsest_accuracy if self.cells is None else 1.0
 
     def values(self, x: Vec3, derivatives: int, closer: Real) -> PointValues:
@@ -254,14 +254,13 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         it).
     cells: for many rays through many points: cells in which the near points count one by one and
         all others as one polynomial, so that an evaluation for tracing costs a tenth. None builds
-        them where they pay (`for_rays`), for pictures of small clouds and for path tracing; True
-        always, also for values and gradients at points, which pays from some 600 values a point
-        on; False never.
-        They take some 1 kB a point, or the megabytes that are given (True: 256) with larger and
-        slower cells; where these would be too large, none are built, and `describe` of a prepared
-        field says so. Building takes as long as tracing 100,000 to a million rays without cells,
-        for each precision, at the first trace, and several times the memory. All bounds are proved,
-        whatever is given.
+        them where they pay (`for_ray_count`), for pictures of small clouds and for path tracing;
+        True always, also for values and gradients at points, which pays from some 600 values a
+        point on; False never. They take some 1 kB a point, or the megabytes that are given (True:
+        256) with larger and slower cells; where these would be too large, none are built, and
+        `describe` of a prepared field says so. Building takes as long as tracing 100,000 to a
+        million rays without cells, for each precision, at the first trace, and several times the
+        memory. All bounds are proved, whatever is given.
 
     `with_points` gives the field of points that have moved.
 

@@ -1,23 +1,23 @@
-"""Cells in which a sum over dipoles or triangles is a few near ones and one polynomial.
+"""FMM cells of dipoles or triangles: in each cell, a sum over all of them is a direct sum over a
+near list plus a local expansion, a harmonic polynomial, of all others.
 
-A cube around these primitives is an octree of cells. In each cell that is not split, those within
-`_NEAR` times the radius of its ball from its center (`dipole_expansion`) are listed, and all the
-rest are one harmonic polynomial (`local_expansion`), so that a sample costs what is near, whatever
-their number.
+The cells are the leaves of an octree over a cube around these primitives. The near list of a cell
+has the primitives within `_NEAR` times the radius of the cell's ball from its center
+(`dipole_expansion`). So the cost of a sample depends on the near list only, and not on the number
+of all primitives.
 
-- `DipoleCells`: the cells on a backend. `build_cells` makes them, a level at a time, from the
-  moments of the tree; what cells share with others is gathered once, for their parent.
+- `DipoleCells`: the cells on a backend.
+- `build_cells`: builds the cells, one octree level at a time, from the moments of the tree.
 
-Clouds may have cells: an octree whose cells have a list of near dipoles (or triangles) and one
-harmonic polynomial of degree 6 for all others, made from the tree's moments. What cells share is
-gathered once, for their parent, in lists of nodes and dipoles that no cell above has taken
-(`dipole_expansion`, `lane_lists`); small leaves of the tree are taken apart into dipoles, as the
-moments of a node cost as much as seven of them. The remainder, bounded node by node, is the
-truncation of detail 1; finer details are the tree's. A promise is about f and not about the
-polynomial, so that steps lead from cell to cell. What a polynomial of degree p leaves out falls
-with the power p + 1 of the distance from the cell's center, which the bound follows: so dipoles
-within 2.5 radii of a cell are near and not within 3, with half as many cells and a third of the
-samples that the tree had to repeat.
+The expansion has degree 6 and is computed from the moments of the tree. Contributions that the
+children of a cell share are added once, in the cell, from lists of the nodes and dipoles that no
+ancestor has added (`dipole_expansion`, `lane_lists`). Small leaves of the tree are split into
+dipoles, as the moments of a node cost as much as seven dipoles. The remainder, bounded node by
+node, is the truncation error of accuracy scale 1; higher accuracy comes from the tree. A promise is
+about f and not about the expansion, so that steps lead from cell to cell. The remainder of an
+expansion of degree p falls with the power p + 1 of the distance from the cell's center, and so does
+its bound: therefore dipoles count as near within 2.5 radii of a cell and not within 3, which gives
+half as many cells, and a third of the samples that the tree had to repeat.
 """
 
 from __future__ import annotations

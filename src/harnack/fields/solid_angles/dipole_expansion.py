@@ -69,8 +69,8 @@ _ROUNDED_UP = 1 + 1e-9
 
 def source_tree(tree: BalancedTree, levels: list[NodeMoments], rows: FloatArray) -> PackedTree:
     """Nodes: center, `_NODE_RATIO` times the radius, radius, area | moments up to
-    `_MULTIPOLE_DEGREE`, (E, G) of `multipole.truncation`, and the sup norms of the moments. rows:
-    of primitives in slots, dipoles (`treecode.dipole_records`) or `triangle_sources`."""
+    `_MULTIPOLE_DEGREE`, (E, G) of `multipole.truncation_bounds`, and the sup norms of the moments.
+    rows: of primitives in slots, dipoles (`treecode.dipole_records`) or `triangle_sources`."""
     numbers: list[FloatArray] = []
     for level in levels:
         reach = _NODE_RATIO * level.radius
@@ -89,8 +89,8 @@ def _columns(level: NodeMoments, keys: Iterable[tuple[int, int, int]]) -> list[F
 
 def triangle_sources(corners: FloatArray) -> FloatArray:
     """(n, 30) records of triangles (n, 3, 3): centroid, area times normal, area, `TRIANGLE_RATIO`
-    times the radius | radius, (E, G) of `multipole.truncation`, the sup norms of the moments 1, 3
-    and 4, and the moments 3 and 4.
+    times the radius | radius, (E, G) of `multipole.truncation_bounds`, the sup norms of the moments
+    1, 3 and 4, and the moments 3 and 4.
 
     The second moment about the centroid is a mean of vectors from there, and so is 0. A triangle
     whose area is rounded to 0 is given one of 1e-30: records without an area are empty slots, and
@@ -111,7 +111,7 @@ def triangle_sources(corners: FloatArray) -> FloatArray:
 class DipoleExpansions:
     """Sums over far primitives of n balls.
 
-    coefficients: (n, COEFFICIENTS) of the local expansion (`local_expansion.parts`).
+    coefficients: (n, COEFFICIENTS) of the local expansion (`local_expansion.coefficient_keys`).
     error, slope: (n,) bounds of what it leaves out of value and gradient, anywhere in the ball.
     tail, tail_slope: (n,) of what it leaves out besides: at a distance a from the center at most
         q^(p+1) and q^p times these, with q = a/radius and p = `DEGREE`.
@@ -295,8 +295,8 @@ class _ClusterExpansion:
         """The numbers of `DipoleExpansions` of a cluster of dipoles with moments up to
         `_MULTIPOLE_DEGREE`.
 
-        left_out, slope_left_out: (E, G) of `multipole.truncation`, for points that are no nearer
-        than the ball. size: the cluster's radius. area: that of its dipoles.
+        left_out, slope_left_out: (E, G) of `multipole.truncation_bounds`, for points that are no
+        nearer than the ball. size: the cluster's radius. area: that of its dipoles.
         """
         distance = dr.rcp(self.inverse)
         near = dr.rcp(distance - radius)

@@ -55,8 +55,8 @@ _ROUNDED_UP = 1 + 1e-9
 class EdgeExpansions:
     """Sums over cycles of edges for n balls.
 
-    coefficients: (n, COEFFICIENTS) of the polynomial (`local_expansion.parts`); its value at the
-        center is known modulo 4 pi.
+    coefficients: (n, COEFFICIENTS) of the polynomial (`local_expansion.coefficient_keys`); its
+        value at the center is known modulo 4 pi.
     error, slope: (n,) bounds of what it leaves out of value and gradient, anywhere in the ball.
     """
 

@@ -73,9 +73,9 @@ class LiftedEdges:
 def edge_records(vertices: FloatArray, edges: IntArray) -> FloatArray:
     """(k, 8) for directed edges (k, 2): lower end, direction, higher end, 1/length^2.
 
-    The ends are ordered by vertex index, as those of triangles are (`tree.triangles`), so that
-    `side` gives the same bits here and there; direction is 1 if the edge runs from lower to
-    higher, -1 if it runs back.
+    The ends are ordered by vertex index, as those of triangles are (`tree.triangle_tree`), so that
+    `edge_function` gives the same bits here and there; direction is 1 if the edge runs from lower
+    to higher, -1 if it runs back.
     """
     low, high = vertices[edges.min(axis=1)], vertices[edges.max(axis=1)]
     direction = np.where(edges[:, 0] < edges[:, 1], 1.0, -1.0)
@@ -149,10 +149,10 @@ class LiftedEdge:
         length L, subtends more than a right angle. It is less than 4 pi in any case.
 
         Variation. Taylor's remainder after the linear term is at most 3/4 t^2 times the integral of
-        |dp|/(rho^3 (1-t/rho)) (`curve_queries.bends`). With a = L/2 and distance d an edge has
-        int rho^-3 <= 2a/(d^2 sqrt(d^2+a^2)) =: 2e, int rho^-4 <= 2e/d; and 1/(1-q) <= 1 + q/(1-b)
-        <= 1 + q rise/4 on [0, b] (`SourceSums.sample`). So an edge adds to the remainder what
-        s4 += e/2 and s5 += 3e/(8d) do. d is reduced by its rounding.
+        |dp|/(rho^3 (1-t/rho)) (`curve_queries.remainder_promises`). With a = L/2 and distance d an
+        edge has int rho^-3 <= 2a/(d^2 sqrt(d^2+a^2)) =: 2e, int rho^-4 <= 2e/d; and 1/(1-q) <= 1 +
+        q/(1-b) <= 1 + q rise/4 on [0, b] (`SourceSums.sample`). So an edge adds to the remainder
+        what s4 += e/2 and s5 += 3e/(8d) do. d is reduced by its rounding.
         """
         distance = fmax(dr.sqrt(self.edge.squared_distance) - 2 * unit, 0)
         first, e = edge_variation(distance * distance, self.edge.inverse_square_length)
@@ -301,8 +301,8 @@ def edge_factor(a: Vec3, b: Vec3, la: Real, lb: Real) -> tuple[Real, Real]:
 def _factor(a: tuple[Real, Real], b: tuple[Real, Real], sa: Real, sb: Real) -> tuple[Real, Real]:
     """F_e from the ends' coordinates across the direction, and s of each.
 
-    A ray exactly through an edge or a vertex is treated as by `tree.triangles.crossing`: as if it
-    passed at a v, and then a u, infinitely little below zero.
+    A ray exactly through an edge or a vertex is treated as by `tree.triangle_tree.signed_crossing`:
+    as if it passed at a v, and then a u, infinitely little below zero.
     """
     real, (au, av), (bu, bv) = cast("Any", type(sa)), a, b
     in_line = (au == 0) & (av == 0), (bu == 0) & (bv == 0)

@@ -171,8 +171,8 @@ class EdgeRuns:
         return EdgeRuns(self.cell, self.first, self.count, self.is_whole, apex)
 
     def closing_edges(self, apexes: int) -> tuple[CellEdges, CellEdges]:
-        """The edges from the ends of runs to apexes, and those from apexes to their beginnings;
-        apexes: the row of the first apex in the table of points."""
+        """The edges from the ends of runs to their apexes, and from the apexes to the beginnings of
+        the runs; apexes: the row of the first apex in the table of points."""
         rows = np.flatnonzero(~self.is_whole)
         first, last = self.first[rows], self.first[rows] + self.count[rows]
         cell = self.cell[rows]
@@ -191,12 +191,15 @@ def subtract_runs(
     after: EdgeRuns,
     vertices: int,
 ) -> CellEdges:
-    """What is left of the closed runs before if the closed runs after are taken out, in the order
-    of cells.
+    """The edges that remain when the closed runs `after` are subtracted from the closed runs
+    `before`, sorted by cell.
 
-    edges: of the runs before (`EdgeRuns.edges`). kept: for each of them, whether it is in a run
-        after.
-    The rows of points are the vertices, so many, the apexes before, and the apexes after.
+    edges: the edges of the runs `before` (`EdgeRuns.edges`).
+    kept: for each of these edges, whether it is in a run of `after`.
+    vertices: the number of vertices.
+
+    The edges refer to a table of points with the vertices first, then the apexes of `before`, then
+    the apexes of `after`.
     """
     left = np.flatnonzero(~kept)
     run, place = (one[left] for one in edges)
@@ -211,7 +214,7 @@ def subtract_runs(
 
 
 def _merged(groups: list[CellEdges]) -> CellEdges:
-    """All edges in the order of cells; those of each group are in that order."""
+    """The edges of all groups, sorted by cell; each group must be sorted by cell."""
     cells = 1 + max((int(one.cell[-1]) for one in groups if len(one.cell)), default=0)
     counts = [np.bincount(one.cell, minlength=cells) for one in groups]
     total = np.sum(counts, axis=0)

@@ -205,9 +205,9 @@ def tail_factors(degree: int, l: int) -> tuple[float, float]:
     Their gradient is at most (p+1)/rho times that, with (l+p+2)/(p+1) for c.
 
     Proof. The derivative of order j along a line is at most (l+j)!/l! B/D^(l+1+j) at c
-    (`multipole.truncation`), so that the term of degree j is at most C(l+j, j) q^j B/D^(l+1). From
-    j = p+1 on, each of these is at most c q times the one before. By Bernstein and Szego's
-    inequality a harmonic polynomial of degree j has a gradient of at most j/rho times its
+    (`multipole.truncation_bounds`), so that the term of degree j is at most C(l+j, j) q^j
+    B/D^(l+1). From j = p+1 on, each of these is at most c q times the one before. By Bernstein and
+    Szego's inequality a harmonic polynomial of degree j has a gradient of at most j/rho times its
     largest value on the sphere; and j C(l+j, j) grows by (l+j+1)/j at most.
     """
     return float(math.comb(l + degree + 1, degree + 1)), (l + degree + 2) / (degree + 2)

@@ -1,4 +1,4 @@
-"""What fields that are sums over oriented points are made of."""
+"""The data of fields that are sums over oriented points."""
 
 from __future__ import annotations
 

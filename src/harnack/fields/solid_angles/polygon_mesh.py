@@ -1,9 +1,9 @@
 """Meshes of polygons that need not be flat, each spanned by a level set of its solid angle.
 
-- `PolygonMesh`: the field, with a part for each face.
+- `PolygonMesh`: the field, with a patch for each face.
 - `FaceLoops`: the boundary curves of all faces on a backend; `FaceSolidAngle`: the solid angle of a
-  face, in each lane another.
-- `face_boxes`: boxes proved to hold the surface of each face.
+  face, which may be another face in each lane.
+- `face_boxes`: boxes that are proved to contain the surface of each face.
 """
 
 from __future__ import annotations
@@ -397,7 +397,7 @@ class PolygonMesh(PatchField["_MeshBuffers"]):
         return SolidAngle(self.faces.loops(index))
 
     def boxes(self, levels: tuple[float, ...] | None = None) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper corners (m, 3) of boxes proved to hold the surface of each face.
+        """Lower and upper corners (m, 3) of boxes proved to contain the surface of each face.
 
         levels: of the surfaces; None for the default.
         """

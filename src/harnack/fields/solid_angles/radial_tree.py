@@ -167,9 +167,11 @@ def cluster_source(
 
 @dataclass(frozen=True)
 class ClusteredDipoles:
-    """Dipoles (n, 8), the rows of `dipole_records`, in the leaves of a tree, with the moments of
-    its
-    levels: all that does not depend on the kernel."""
+    """A tree over dipoles with its moments: all data of the sum that do not depend on the kernel.
+
+    rows: the dipoles (n, 8), as `dipole_records` gives them, which are the leaves of the tree.
+    levels: the moments of the nodes of each level.
+    """
 
     rows: FloatArray
     tree: BalancedTree

@@ -215,11 +215,10 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
     u = 1 inside, 0 outside (Green's second identity). So w falls from 1 - u to -u at the surface
     and decays like exp(-distance/l) on both sides: far points have no effect, holes wider than a
     few l stay open, and deep inside w is near 0 again. The level that lies on the surface is the
-    mean of
-    the two limits: 1/2 for l much larger than the surface, 0 for l much smaller. `default_level` is
-    the mean of w over (some of) the points, each without its own term, weighted by area, as Kazhdan
-    et al. 2006 choose theirs. l should be longer than the distance between neighboring points: else
-    the level sets are those of single dipoles.
+    mean of the two limits: 1/2 for l much larger than the surface, 0 for l much smaller.
+    `default_level` is the mean of w over all points or a part of them, each without its own term,
+    weighted by area, as Kazhdan et al. 2006 choose theirs. l should be longer than the distance
+    between neighboring points: else the level sets are those of single dipoles.
 
     points, normals: (n, 3), normals of any length, to the outside.
     areas: (n,) that each point stands for; None estimates them.

@@ -96,7 +96,7 @@ class SmoothedSum:
 
     @property
     def coarsest_accuracy(self) -> float:
-        """The detail of coarse evaluations (`Field.coarsest_detail`): there are none."""
+        """The detail of coarse evaluations (`Field.coarsest_accuracy`): there are none."""
         return 1.0
 
     def values(self, x: Vec3, derivatives: int, closer: Real) -> PointValues:

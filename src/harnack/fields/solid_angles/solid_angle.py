@@ -95,9 +95,9 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
     anything is computed (`cancel_opposite_edges`): they do not contribute to f. If none is left, f
     is 0 everywhere, every ray a proved miss, and levels that are multiples of 4 pi are refused.
 
-    Promises. Second derivatives are bounded near every curve (`curve_queries.bends`), and steps
-    rest on that. The other proofs, chosen by `bound=`, need the range of the lift on a ball:
-    on wavy polygons and knots they take 1.4 to 2 times as many evaluations.
+    Promises. Second derivatives are bounded near every curve (`curve_queries.remainder_promises`),
+    and steps rest on that. The other proofs, chosen by `bound=`, need the range of the lift on a
+    ball: on wavy polygons and knots they take 1.4 to 2 times as many evaluations.
 
     lift_bound: how the lift is bounded on a ball. "auto" takes "planar" where its hypothesis is
     checked to hold, "convex" where that does, else "edges"; if loops are Dr.Jit arrays it takes
@@ -117,8 +117,8 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
     cells: for many rays and curves of many vertices: cells in which the near edges count one by one
     and all others as one polynomial, with a proved remainder, so that an evaluation for tracing
     costs about the same whatever the number of edges; where the remainder decides, all edges are
-    summed up. None builds them where they pay (`for_rays`), True always, False never. They take
-    some 2 to 10 MB, at most the megabytes that are given (True: 256); where these would be too
+    summed up. None builds them where they pay (`for_ray_count`), True always, False never. They
+    take some 2 to 10 MB, at most the megabytes that are given (True: 256); where these would be too
     small, none are built, and `describe` of a prepared field says so. Building takes as long as
     tracing some 200,000 to 600,000 camera rays without cells, for each precision, at the first
     trace. Circles have no cells, and cost what they cost. Values and derivatives at points are
@@ -299,7 +299,7 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         return self._sample(p, None)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        """The look with promises along the ray, which prove long steps where it runs along an
+        """The sample with promises along the ray, which prove long steps if the ray runs along an
         edge."""
         del ahead, back
         knows_lines = not self._all_cancel and self.lift_bound_option != "paper"
@@ -398,7 +398,7 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
         """Bounds of the effect of the rounding of positions, as for sums over boundary edges
-        (`sums.SLOPE_ROUNDINGS`), with distances reduced by their rounding. Infinite at the
+        (`source_sums.SLOPE_ROUNDINGS`), with distances reduced by their rounding. Infinite at the
         curve."""
         del sample
         on = self._data_for(p)
@@ -615,10 +615,10 @@ class _CurveData(UnitFrame):
 
 @dataclass(frozen=True)
 class CellErrors:
-    """Bounds of what cells leave out of the value and the gradient, and of the rounding of the
-    value.
+    """Bounds of the truncation errors of value and gradient in FMM cells, and of the rounding of
+    the value.
 
-    cell, in_cells: the sums in cells, and where these were taken.
+    cell, in_cells: the sums in cells, and the lanes on which they were used.
     """
 
     value: Real

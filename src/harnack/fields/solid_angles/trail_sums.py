@@ -170,7 +170,7 @@ _EDGES_PER_RECORD = 4
 # Points of a lane: as many as registers hold, by experiment.
 _POINTS_PER_LANE = 3
 # Signs of `side` are not trusted where it is closer to zero than this many rounding errors of its
-# products; its own are six at most, those of `tree.triangles.side` one.
+# products; its own are six at most, those of `tree.triangle_tree.edge_function` one.
 _SIDE_ROUNDINGS = 16
 # Beyond this distance, in sizes of the mesh, the products of lengths could leave float32.
 _FAR = 1024.0
@@ -223,15 +223,14 @@ class _AngleProduct:
         return cls(*factor, bits.sign(factor[1]))
 
     def times(self, bits: _FloatFormat, factor: Complex) -> _AngleProduct:
-        """The product with one factor more.
+        """The product with a further factor.
 
         The factor's argument, in [-pi, pi], takes theta at most one half plane forward, or one back
         if the sign bit of its imaginary part is set; and it does so exactly if the sign of y
         changes. That holds for the computed y as well: its sign differs from that of the exact
         value only if its two terms cancel, and then the exact theta is close to the very multiple
         of pi that the count says it has crossed (arguments of like signs and y x' < 0: about +-pi;
-        of
-        unlike signs: about 0). A term that underflows keeps its sign bit.
+        of unlike signs: about 0). A term that underflows keeps its sign bit.
         """
         x = dr.fma(self.x, factor[0], -(self.y * factor[1]))
         y = dr.fma(self.x, factor[1], self.y * factor[0])
@@ -260,15 +259,14 @@ class _AngleProduct:
 
 @dataclass(frozen=True)
 class TrailValues:
-    """Directed edges on a backend, as records of consecutive edges of closed trails.
+    """Directed edges on a backend, as records of consecutive edges of closed trails, for values of
+    the sum of `edge_lift` at many points.
 
-    For values of `edge_lift`'s sum at many points. The formula is the same, arranged so that little
-    is computed twice. The boundary of a chain of triangles enters every vertex as often as it
-    leaves
-    it, so that its edges make up closed trails: the part of a factor that belongs to a vertex is
-    computed once and not for each of its edges; a record of edges is fetched once for several
-    points; there are no divisions. Points at which rounding could have changed a sign are marked,
-    for `edge_lift` to compute again.
+    The formula is that of `edge_lift`, arranged so that little is computed twice. The boundary of a
+    chain of triangles enters every vertex as often as it leaves it, so that its edges form closed
+    trails. The part of a factor that belongs to a vertex is computed once and not for each of its
+    edges; a record of edges is fetched once for several points; there are no divisions. Points at
+    which rounding could have changed a sign are marked, so that `edge_lift` computes them again.
     """
 
     records: RecordTable

@@ -80,7 +80,7 @@ def traverse_clusters(
 
     closer: nodes are taken as a whole from so many times that distance on.
     add_cluster: from a cluster and the state, the state with the node added where it is far.
-    add_primitive: as for `tree.for_each`, for the leaves that are not far.
+    add_primitive: as for `tree.for_each_primitive`, for the leaves that are not far.
     height_square: added to the squares of all distances: in four dimensions, the square of the
         distance of the point from the space of the tree.
     """
@@ -214,24 +214,24 @@ ExtraState: TypeAlias = "tuple[Any, ...]"
 
 # Coarse evaluations take nodes as a whole beyond this many times their radius.
 _COARSE_RATIO = 2.5
-# Roundings of a far node's gradient itself.
+# The number of roundings by which the gradient of a far node itself may be wrong.
 _FAR_GRADIENT_ROUNDINGS = 64.0
 # The free distance, in units of coordinates, if no term bounds it.
 _NO_SOURCE_DISTANCE = 1e4
 
-# From a record, a mask, the sums, and a state of the caller's own: the latter two with the record's
-# primitive added where the mask holds.
+# A function of a record, a mask, the sums, and a further state of the caller. It returns sums and
+# state with the record's primitive added on the lanes of the mask.
 AddPrimitive: TypeAlias = (
     "Callable[[list[Real], Mask, SourceSums, ExtraState], tuple[SourceSums, ExtraState]]"
 )
 
 
 def node_records(level: NodeMoments, order: int, rough: float, error: FloatArray) -> FloatArray:
-    """Numbers of nodes that may be taken as a whole beyond `coarse_ratio` times their radius, as
-    `Treecode`
-    reads them: center, accepting distance, A and K of `remainder_constants`, 15 coefficients, and
-        the value
-    error E (k,)."""
+    """Node records as `Treecode` reads them.
+
+    Each has center, accepting distance (`rough` times the radius), remainder constants A and K
+    (`remainder_constants`), 15 coefficients, and the error bound E (k,) of the value.
+    """
     head = [rough * level.radius, *remainder_constants(level, rough)]
     parts = (level.center, *head, cartesian_coefficients(level.moments, order), error)
     return np.column_stack(parts)
@@ -239,16 +239,17 @@ def node_records(level: NodeMoments, order: int, rough: float, error: FloatArray
 
 @dataclass(frozen=True)
 class Treecode:
-    """Sums over a tree of nodes as `node_records` lays them out.
+    """Sums over sources by a tree, whose far nodes count as a single source, on a backend.
 
-    accuracy: at detail 1 nodes are taken as a whole beyond this many times their radius.
-    coarse_ratio: the same in a coarse evaluation.
-    order: of the multipoles.
-    coarse_error_ratio: the truncation of a coarse evaluation is at most this many times the stored
-        bound.
-    gradient_error_ratio, hessian_error_ratio: the truncation of the gradient is at most
-        `gradient_error_ratio` times that of the value over r, that of second derivatives
-        `hessian_error_ratio` times it over r^2.
+    tree: the nodes, with the records of `node_records`.
+    accuracy: at accuracy scale 1, nodes are far beyond this many times their radius.
+    coarse_ratio: the same number for coarse evaluations.
+    order: of the multipole moments.
+    coarse_error_ratio: the truncation error of a coarse evaluation is at most this many times the
+        stored bound.
+    gradient_error_ratio, hessian_error_ratio: at distance r, the truncation error of the gradient
+        is at most `gradient_error_ratio`/r times that of the value, and that of second derivatives
+        at most `hessian_error_ratio`/r^2 times that of the value.
     """
 
     backend: Backend
@@ -270,11 +271,13 @@ class Treecode:
         accuracy: float,
         order: int = 2,
     ) -> Treecode:
-        """Everything uploaded. primitives: records in their slots, as `tree.pack` takes them.
+        """Upload a tree with its moments and sources.
 
-        One E is stored for both kinds of evaluation: as large as that at detail 1 needs, and at
-        least what the coarse one needs divided by `coarse_error_ratio`, the median of the ratio of
-        both.
+        primitives: the records of the sources in their slots, as `tree.pack_tree` takes them.
+
+        Each node has a single E for both kinds of evaluation: at least the bound at accuracy scale
+        1, and at least the bound of the coarse evaluation divided by `coarse_error_ratio`, which is
+        the median of the ratio of the two bounds.
         """
         rough = min(accuracy, _COARSE_RATIO)
         close = [truncation_bounds(level, accuracy * level.radius, order) for level in levels]
@@ -297,7 +300,7 @@ class Treecode:
 
     @property
     def coarsest_accuracy(self) -> float:
-        """The detail of coarse evaluations (`Field.coarsest_detail`)."""
+        """The accuracy scale of coarse evaluations (`Field.coarsest_accuracy`)."""
         return self.coarse_ratio / self.accuracy
 
     def acceptance_ratio(self, detail: Real) -> Real:
@@ -310,7 +313,7 @@ class Treecode:
     ) -> tuple[SourceSums, ExtraState]:  # fmt: skip
         """All sums at points x, and the caller's own state.
 
-        detail: `Field.at_detail`; infinity adds up all terms one by one.
+        detail: the accuracy scale of `Field.at_accuracy`; infinity gives the direct sum.
         add: adds a primitive of a near leaf (`AddPrimitive`).
         derivatives: 0 for the value alone, 1 with the gradient, 2 with the Hessian.
         """

@@ -87,14 +87,14 @@ class ExactWinding:
     """Whether coarse samples cost less."""
 
     coarsest_detail: ClassVar[float] = 0.5
-    """`Field.coarsest_detail` of the boundary's cells: any number below 1 (`boundary_cells`)."""
+    """`Field.coarsest_accuracy` of the boundary's cells: any number below 1 (`boundary_cells`)."""
 
     def fast_values(self, x: Vec3) -> Real:
         """w at points, as by `values`, for a third of the work; not while a loop is being recorded.
 
-        Crossings are decided by `tree.triangles.crossing`. Wherever `TrailValues` is uncertain
-        about an edge, the sum over edges is computed again by `lifted_sums`, which decides by the
-        same bits.
+        Crossings are decided by `tree.triangle_tree.signed_crossing`. Wherever `TrailValues` is
+        uncertain about an edge, the sum over edges is computed again by `lifted_sums`, which
+        decides by the same bits.
         """
         # Rays lead away from the middle of the mesh, so that less of it lies ahead. For a mirrored
         # mesh the winding number changes its sign.

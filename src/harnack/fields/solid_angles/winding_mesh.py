@@ -146,7 +146,7 @@ class WindingMesh:
 
     @functools.cached_property
     def ray_records(self) -> FloatArray:
-        """(m, 14) records of the faces (`tree.triangles`), with the sign of crossings times the
+        """(m, 14) records of the faces (`tree.triangle_tree`), with the sign of crossings times the
         multiplicity."""
         records = triangle_records(self.unit_vertices, self.faces)
         records[:, PARITY_COLUMN] *= self.multiplicity

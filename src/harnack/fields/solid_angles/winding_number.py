@@ -1,10 +1,11 @@
-"""The generalized winding number of triangle meshes: holes, soups, overlaps, all repaired.
+"""The generalized winding number of triangle meshes, whose level set closes holes and repairs
+triangle soups and overlaps.
 
-`WindingNumber` is the field. `winding_extent` and `winding_cells` prove where its level sets can
-be: on its triangles, and on the surfaces that span its holes. Modulo 1 a winding number does not
-jump, and it takes a level only on the latter. Cells in which it is proved not to count as empty,
-whether or not there are triangles in them: there rays sample the winding number only where they
-cross triangles.
+`WindingNumber` is the field. `winding_extent` and `winding_cells` prove in which volume and cells
+its level sets lie: on its triangles, and on the surfaces that span its holes. Modulo 1 a winding
+number does not jump, and it takes a level only on the surfaces that span holes. Cells in which it
+is proved to take no level modulo 1 count as empty, whether or not they contain triangles: there
+rays sample the winding number only where they cross triangles.
 """
 
 from __future__ import annotations
@@ -84,13 +85,14 @@ class ModuloOneEvaluable(Protocol):
 
 
 class WindingModuloOne(Field):
-    """A winding number modulo 1: continuous off the singular edges, also across sheets.
+    """The winding number w of a mesh modulo 1, as a field: continuous off the singular edges, also
+    across the triangles.
 
-    winding: the field. The promises of its samples are about its lift, with all jumps taken out;
-        the lift and w differ by whole numbers. Coarse samples are used, which cost half as much: at
-        detail 1, 2 % fewer cells are full.
+    winding: the winding number. The promises of its samples are about w continued smoothly through
+        all triangles; that function and w differ by integers. Samples are coarse, which costs half
+        as much: at accuracy scale 1, only 2 % fewer cells are occupied.
 
-    Where w has a level off its triangles this field has it too, but not the other way round.
+    Where w takes a level off its triangles this field takes it, too, but not the other way round.
     """
 
     period: ClassVar[float | None] = 1.0
@@ -211,11 +213,11 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         near edges and one polynomial for all others, with a proved remainder (`boundary_cells`), so
         that a sample costs the same however many edges there are. In a soup, where triangles have
         hardly an edge in common, near triangles take the place of edges, with the tree as method
-        (`dipole_cells`). None builds them where they pay (`for_rays`), True always, False never; at
-        most the megabytes that are given (True: 256), and several times as much while they are
-        built. Those of soups, where they were asked for, give values and gradients at points too,
-        which pays from some 2,000 points a triangle on; all other values and derivatives at points
-        are those of `method`.
+        (`dipole_cells`). None builds them where they pay (`for_ray_count`), True always, False
+        never; at most the megabytes that are given (True: 256), and several times as much while
+        they are built. Those of soups, where they were asked for, give values and gradients at
+        points too, which pays from some 2,000 points a triangle on; all other values and
+        derivatives at points are those of `method`.
 
     A mesh that lies on its own spanning surface, such as a file that `mesh` wrote of a
     `SolidAngle`, or any that is flat, has the level right beside all of its triangles, where
@@ -295,7 +297,7 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
 
     @property
     def facet_faces(self) -> npt.NDArray[np.int64]:
-        """The face, as given, of each sheet."""
+        """The index of the face, in the user's order, to which each facet belongs."""
         return self.mesh.input_face
 
     def prepare(self, backend: Backend) -> Self:
@@ -417,7 +419,8 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         return self._occupied[levels]
 
     def evaluate(self, p: Vec3) -> Sample:
-        """w itself, jumps included, with promises of its lift."""
+        """w itself, jumps included, with promises about w continued smoothly through all
+        triangles."""
         on, frame = self._upward_rays(p)
         return _sample_at_start(on, frame, on.winding.crossings_ahead(frame, 0, True), 1.0)
 
@@ -425,8 +428,8 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         return WindingModuloOne(self)
 
     def evaluate_modulo_one(self, p: Vec3, detail: Real = 0.0) -> Sample:
-        """w less a whole number, which differs from point to point; by default the coarsest
-        sample."""
+        """A sample of w minus an integer that is not known and may differ from point to point; by
+        default the coarsest sample."""
         on, frame = self._upward_rays(p)
         detail = on.backend.Float(detail)
         if on.cells is None:

@@ -55,7 +55,7 @@ if TYPE_CHECKING:
     from harnack.fields.solid_angles.treecode import AddPrimitive
     from harnack.fields.solid_angles.winding_mesh import WindingMesh
 
-# The first of three columns of a record after those of `tree.triangles`: 1 where an edge is
+# The first of three columns of a record after those of `tree.triangle_tree`: 1 where an edge is
 # singular.
 SINGULAR = INVERSE_SQUARES_COLUMN + 3
 # The corners that edges join, and 1 or -1 for whether they run in the triangle's direction.
@@ -143,7 +143,7 @@ class TreeWinding:
 
     @property
     def coarsest_detail(self) -> float:
-        """`Field.coarsest_detail`."""
+        """`Field.coarsest_accuracy`."""
         return self.clusters.coarsest_accuracy if self.cells is None else 1.0
 
     def values(self, x: Vec3, derivatives: int, closer: Real) -> PointValues:
@@ -252,7 +252,7 @@ class TreeWinding:
         return found.sample(_SHARE, unit, self.rounding, along=known)
 
     def _rates(self, line: RayLine, where: Mask) -> Rates:
-        """The rates of `trail_sums.rates_along` for 4 pi w on a line."""
+        """The rates of `trail_sums.line_rates` for 4 pi w on a line."""
 
         def rates(lengths: tuple[Real, ...], active: Mask) -> tuple[Real, ...]:
             active = active & where

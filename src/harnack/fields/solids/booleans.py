@@ -116,7 +116,7 @@ class BooleanSolid(Solid):
         return self._for_rays(self.parts, count, make)
 
     def _of(self, parts: list[Field]) -> Solid:
-        """The same combination of other parts, which need not be solids."""
+        """The same combination of other operands, which need not be solids."""
         other = copy.copy(self)
         object.__setattr__(other, "parts", tuple(parts))
         return other
@@ -145,9 +145,8 @@ class BooleanSolid(Solid):
         return rows
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
-        """The largest errors of the parts that may be the extreme one. Infinite where rounding
-        leaves
-        it open which of two parts that is: derivatives jump there."""
+        """The largest derivative errors of the operands that may be the extreme one. Infinite where
+        rounding leaves open which one is, since derivatives jump there."""
         size = max_norm(p)
         sign = -1.0 if self.is_union else 1.0
         whole = value_error_bound(sample, safe_norm(sample.gradient), size)
@@ -165,7 +164,7 @@ class BooleanSolid(Solid):
         return dr.select(is_one, slopes, dr.inf), dr.select(is_one, bends, dr.inf)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        """The look made of the looks of all parts, by `MaximumEnclosure`."""
+        """The ray sample of the combination, from those of all operands, by `MaximumEnclosure`."""
         looks = [one.sample_ray(path, t, ahead, back) for one in self.parts]
         size = max_norm(path.origin) + t
         sample, below, extreme = self._combine_samples([one.sample for one in looks], size)
@@ -196,17 +195,17 @@ class BooleanSolid(Solid):
     def _combine_samples(
         self, samples: list[Sample], size: Real
     ) -> tuple[Sample, list[tuple[Real, Real]], Real]:
-        """The sample of the combination; for each part the least and the most that it is below the
-        greatest; and the greatest (for a union, the least) of the values.
+        """The sample of the combination; for each operand bounds (lower, upper) of the difference
+        by which it is below the greatest operand; and the greatest (for a union, the least) value.
 
         Proof of the errors. Let v_i be values with errors e_i (all rounding, `value_error_bound`),
         v = v_k the greatest. max f_i <= max(v_i + e_i) = v + max(e_i - (v - v_i)), and max f_i >=
         v_k - e_k. So max(e_i - (v - v_i)) is the error of the combination. As max f_i >= v_j - e_j
-        for every j,
-        a part that is known better may exclude most of that range: then the value is the middle of
-        the rest, for else a ray would hit, by the rounding of one part, a surface that lies inside
-        of another part. The tracer subtracts the error of the combination from its gaps; where that
-        of a part is larger, the difference is subtracted from how far the part is below.
+        for every j, an operand with a smaller error may exclude most of that range. Then the value
+        is the middle of the remaining range, for otherwise a ray would hit, by the rounding of an
+        operand, a surface that lies inside of another operand. The tracer subtracts the error of
+        the combination from its gaps. If the error of an operand is larger, the excess is
+        subtracted from the difference by which the operand is below.
         """
         sign = -1.0 if self.is_union else 1.0
         values = [sign * one.value for one in samples]
@@ -268,7 +267,7 @@ class BooleanSolid(Solid):
 
 
 def min_wavelength(parts: Iterable[Solid]) -> float | None:
-    """The least `Field.min_wavelength` of several."""
+    """The smallest `Field.min_wavelength` of several fields."""
     return min(
         (one.min_wavelength for one in parts if one.min_wavelength is not None), default=None
     )
@@ -326,7 +325,7 @@ class Complement(SolidOfField):
 
 
 def negated_look(look: RaySample) -> RaySample:
-    """The look at -f."""
+    """The ray sample of -f from that of f."""
     return RaySample(
         negated_sample(look.sample),
         tuple(NegatedEnclosure(one) for one in look.forward),
@@ -338,7 +337,7 @@ def negated_look(look: RaySample) -> RaySample:
 
 
 def negated_sample(sample: Sample) -> Sample:
-    """The sample of -f."""
+    """The sample of -f from that of f."""
     return sample.map_promises(
         lambda one: one.negated(),
         value=-sample.value,

@@ -1,4 +1,4 @@
-"""Solids twisted and tapered: maps that bend lines."""
+"""Twisted and tapered solids: images of solids under maps that bend lines."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ class Deformation(SpaceMap):
 
     @property
     def min_scale(self) -> float:
-        """The least factor by which lengths are multiplied, by which wavelengths shrink; 1 where it
-        depends on the point, as for a twist, which compresses waves the more the farther they are
-        from its axis."""
+        """The smallest factor by which the map multiplies lengths, and so wavelengths. 1 if it
+        depends on the point, as for a twist, which compresses waves more the farther they are from
+        its axis."""
         return 1.0
 
     @abc.abstractmethod
@@ -84,7 +84,7 @@ class DeformedSolid(FormulaSolid):
 
     @property
     def may_jump(self) -> bool:
-        """Whether the solid's formula may: maps are continuous."""
+        """Whether the solid's formula may jump: the map itself is continuous."""
         return tally_of(self.inner.formula).may_jump
 
     def promises(self, p: Vec3) -> tuple[Promise, ...]:
@@ -157,8 +157,8 @@ class Taper(Deformation):
     Proof of `preimage_lipschitz`. The derivative of the inverse acts on the radial and the axial
     direction as [[k, m], [0, 1]], k = 1/r, m = rho |r'|/r^2 at the distance rho from the axis, and
     on the third as k. Its largest singular value has sigma^2 = (S + sqrt(S^2 - 4 k^2))/2, S = k^2 +
-    m^2 + 1,
-    which grows with k and m: here their largest values. (Hart's equation 49 has min 1/r.)
+    m^2 + 1, which grows with k and m: here k and m have their largest values. (Hart's equation 49
+    has min 1/r.)
     """
 
     start: tuple[Any, Any]

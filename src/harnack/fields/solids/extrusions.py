@@ -50,7 +50,7 @@ class Extrusion(Solid):
     loops: the outline of the region: an array (n, 2) of the vertices of a closed loop, or several.
         A point is inside if an odd number of loops runs around it (the even-odd rule), so that
         loops in loops are holes, and islands in these, whichever way they run. Loops that cross or
-        touch are cut there. Stored as `harnack.geometry.make_outline.make_outline` returns them.
+        touch are cut there. Stored as `harnack.geometry.make_outline` returns them.
     height: along z.
     twist: by so many degrees the end is turned against the start, counter-clockwise as seen from
         above, about the z axis.

@@ -36,22 +36,22 @@ def solid(
     between: tuple[float, float] | None = None,
     around: tuple[float, float] | None = None,
 ) -> Solid:
-    """The solid of a closed mesh, or that where a field's values are below or above a level, or
-    between two.
+    """The solid of a closed mesh; or the solid of all points at which a field is below or above a
+    level, or between two levels.
 
     field: a field; or, with none of the levels, a trimesh.Trimesh, a pair (vertices (n, 3), faces
         (m, 3)), or the path of a surface file, of which the solid is a `MeshSolid`, the signed
         distance from the mesh.
     below, above: a level.
     between: (low, high).
-    around: (level, half_width): where the value is at most half_width from the level. It is the
-        one for angle-valued fields, such as a thickened surface that spans a knot.
+    around: (level, half_width): the points at which the value is at most half_width from the level.
+        This is the argument for angle-valued fields, as for a thickened surface that spans a knot.
 
         hk.solid(hk.Gyroid(1.0), between=(-0.3, 0.3)) & hk.Torus(0.8, 0.3)
         hk.solid("part.stl") - hk.Cylinder(2.0, 50.0)
 
     Raises:
-        ValueError: none, or several, of these given; bad numbers; a field that jumps across sheets,
+        ValueError: none, or several, of these given; bad numbers; a field with jumps,
             or an angle-valued one without `around`; a mesh that bounds no solid (`MeshError`).
     """
     given = [one for one in (below, above, between, around) if one is not None]
@@ -333,8 +333,8 @@ class BandSolid(SolidOfField):
         return x, y, z
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
-        """Those of the inner field; infinite where rounding leaves it open on which side of a fold
-        the point is: derivatives jump there."""
+        """The bounds of the inner field; infinite where rounding leaves open on which side of a
+        fold the point is, since derivatives jump there."""
         own = self.field.evaluate(p)
         slope, bend = self.field.derivative_errors(p, own)
         doubt = value_error_bound(own, safe_norm(own.gradient), max_norm(p))

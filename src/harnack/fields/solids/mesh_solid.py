@@ -1,6 +1,7 @@
 """Closed triangle meshes made solid: `MeshSolid`, the signed distance from their surface.
 
-`closed_surface_of` finds what of a mesh bounds the solid, and refuses meshes that bound none.
+`ClosedSurface.of` gives the faces of a mesh that bound the solid, and refuses meshes that bound
+none.
 
 Signs of meshes come from crossings: normals of edges and vertices, weighted by angles, say nothing
 beside triangles as thin as rounding; a ray whose edges are decided by the same bits on both sides
@@ -65,7 +66,7 @@ _LEAF_SIZE = 4
 # Of a signed distance the gradient is a unit vector wherever it exists.
 _STEEP = 0.99
 # How far rounding may move a distance, in epsilons of coordinates and of the mesh's size, by
-# `tree.nearest.distance_lower_bound`.
+# `tree.closest_triangles.distance_lower_bound`.
 _ROUNDING = 16.0
 # Coordinates in jets that are known only up to more roundings are ranges.
 _ROUNDED_BY = 256.0
@@ -123,18 +124,18 @@ class MeshSolid(Solid):
 
     |f| is the distance from the nearest triangle, by a tree; so its constant is 1. It is off by at
     most 16 epsilons of the size of the mesh and the distance from its center
-    (`tree.nearest.ClosestPointOnTriangle`).
+    (`tree.closest_triangles.ClosestPointOnTriangle`).
 
     Proof of the sign. It is that of the winding number, the sum of the signs of the crossings of a
-    ray along z (`tree.triangles.crossing`), and is right wherever the distance is more than its
-    error e, also for rays through edges and vertices and for triangles without area. Of each
-    triangle that the ray counts as crossed, a point lies within rounding of the ray at the depth
-    that is compared with 0. Let C be a cylinder of that radius around the line; the ball of radius
-    e about x has no point of the surface. So the part of a triangle in C, which is convex, lies
-    ahead of x or behind it as a whole, and its depth says which. Edges that meet C ahead of x are
-    edges of two triangles ahead, where the same bits decide on which side the ray passes, so that
-    they cancel; all other edges are passed at more than rounding. So the sum is that of a ray in
-    general position. Normals of edges and vertices, weighted by angles (Baerentzen and Aanaes
+    ray along z (`tree.triangle_tree.signed_crossing`), and is right wherever the distance is more
+    than its error e, also for rays through edges and vertices and for triangles without area. Of
+    each triangle that the ray counts as crossed, a point lies within rounding of the ray at the
+    depth that is compared with 0. Let C be a cylinder of that radius around the line; the ball of
+    radius e about x has no point of the surface. So the part of a triangle in C, which is convex,
+    lies ahead of x or behind it as a whole, and its depth says which. Edges that meet C ahead of x
+    are edges of two triangles ahead, where the same bits decide on which side the ray passes, so
+    that they cancel; all other edges are passed at more than rounding. So the sum is that of a ray
+    in general position. Normals of edges and vertices, weighted by angles (Baerentzen and Aanaes
     2005), would need no ray, but have no direction to trust beside triangles as thin as rounding.
 
     Where the nearest point is inside of a triangle, its normal says the same without a ray. Proof:
@@ -226,10 +227,10 @@ _SAMPLE_CACHE: ContextVar[dict[tuple[int, ...], tuple[Vec3, Sample]] | None] = C
 
 @contextmanager
 def share_samples() -> Generator[None]:
-    """Samples of a mesh at the same points are recorded once: parts of a solid that are made of the
-    same mesh, such as its shell and a lattice in it, look for the nearest triangle once.
+    """Within this context, a mesh is sampled only once at the same Dr.Jit points, so that a shell
+    and a lattice made from one mesh share one nearest-triangle search.
 
-    Not while loops are recorded, whose numbers are known within them alone.
+    Inactive while loops are recorded, as their values are defined inside the loop only.
     """
     token = _SAMPLE_CACHE.set({})
     try:

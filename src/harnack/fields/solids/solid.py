@@ -1,7 +1,7 @@
-"""What a solid is: the points where a function is not positive; and how solids are combined.
+"""Solids, the points at which a function is not positive, and their combinations.
 
-`Solid` is the base of all, `FormulaSolid` of those with a formula, `SolidOfField` of those made of
-another field, `SpaceMap` of maps of space.
+`Solid` is the base of all solids, `FormulaSolid` the base of solids with a formula, `SolidOfField`
+the base of solids of another field, and `SpaceMap` the base of maps of space.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def axis_index(axis: str) -> int:
 
 
 def not_a_solid(other: Any) -> str:
-    """For a message: what to do with something that is no solid."""
+    """Text for an error message: how to make a solid of an object that is no solid."""
     kind = type(other).__name__
     if isinstance(other, Field):
         return (
@@ -98,10 +98,10 @@ class Solid(Field):
 
     Solids are combined by operators, `a | b` (union), `a & b` (intersection), `a - b` (difference),
     `~a` (complement), and are moved and deformed by methods. Every step is proved from enclosures
-    of the parts, never from a distance, which f of a combination is not.
+    of the operands, never from a distance, as f of a combination is no distance.
 
     lipschitz: a proved bound of |grad f| everywhere, so that outside f/lipschitz is a lower bound
-        of the distance (Hart 1996, definition 3); None where none is known.
+        of the distance (Hart 1996, definition 3); None if none is known.
     """
 
     over_relaxation = 1.0
@@ -139,7 +139,7 @@ class Solid(Field):
 
     @abc.abstractmethod
     def map_operands(self, change: Callable[[Solid], Solid]) -> Solid:
-        """The same combination with each part changed, as a map of space maps each part."""
+        """The same combination with a change of each operand, such as a map of space."""
 
     # Combinations. Operands that are no solids are refused.
 
@@ -333,7 +333,7 @@ class SolidOfField(Solid):
         return self._for_rays([self.field], count, make)
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
-        """Those of the inner field, which has the same derivatives up to their sign."""
+        """The bounds of the inner field, which has the same derivatives up to their sign."""
         del sample
         return self.field.derivative_errors(p, self.field.evaluate(p))
 
