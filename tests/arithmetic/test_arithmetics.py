@@ -201,7 +201,7 @@ def test_parabolas_of_smooth_functions_have_their_slope_at_the_start() -> None:
         (a, _), (c, _) = made.bounds
         jet = FORMULAS[name](*Jet.along_ray(p, d, 0.0, dr.zeros(type(p.x)) + 1e-5))
         assert float(dr.max(dr.abs(c - a))[0]) < 1e-3
-        slope = jet.start.first_derivatives[0]
+        slope = jet.jet_at_start.first_derivatives[0]
         assert not np.any((a > slope.upper + 1e-12).numpy())
         assert not np.any((c < slope.lower - 1e-12).numpy())
 

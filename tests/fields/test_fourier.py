@@ -224,7 +224,7 @@ def test_displacements_are_those_of_the_surfaces() -> None:
     """A sphere whose radius grew by 0.01: the surfaces are that far apart."""
     wave = hk.FourierSeries.fit(lambda x: np.exp(-4 * (x**2).sum(axis=1)), CUBE, 10)
     level = math.exp(-4 * 0.5**2)
-    wave._resolve_source = lambda x: np.exp(-4 * (np.linalg.norm(x, axis=1) - 0.01) ** 2)
+    wave._source = lambda x: np.exp(-4 * (np.linalg.norm(x, axis=1) - 0.01) ** 2)
     found = wave.displacement(level)
     assert found.count > 1000
     assert found.mean == pytest.approx(0.01, rel=0.03)

@@ -163,7 +163,7 @@ def test_parts_in_parts_and_cavities() -> None:
         lambda one: one.twisted(1.0),
         lambda one: one.shell(0.1) - hk.Cylinder(0.2),
         lambda one: (one.offset(0.1) & hk.solid(hk.Gyroid(0.8), between=(-0.4, 0.4))).scaled(0.5),
-        lambda one: one.rotated(30.0, "x").moved((100.0, -50.0, 20.0)),
+        lambda one: one.rotated(30.0, "x").translated((100.0, -50.0, 20.0)),
     ],
 )
 def test_combinations_keep_their_promises(combine: Any) -> None:

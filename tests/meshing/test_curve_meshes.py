@@ -259,7 +259,7 @@ def test_wrapping_alone_would_be_noticed(monkeypatch: pytest.MonkeyPatch) -> Non
     assert mesh.metadata["harnack"]["euler_characteristic"] == 1
     marching = sys.modules["harnack.meshing.marching_tetrahedra"]
     monkeypatch.setattr(marching, "_integrate_change", lambda field, p, q, wrapped, period: wrapped)
-    with pytest.raises(hk.MeshingError, match="spacing"):
+    with pytest.raises(hk.MeshingError, match="cell_size"):
         hk.mesh(field, cell_size=spacing, tolerance=0.05)
 
 

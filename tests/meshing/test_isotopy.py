@@ -90,7 +90,7 @@ def test_wrong_values_and_wrong_topology_are_not_proved() -> None:
     found, points = first_mesh(field, 0.2, 0.07)
     assert found.proved > 0.995
     x, value = points.points, points.samples.value
-    inner = (np.abs(x).max(axis=1) < 0.4) & ~points.is_on & (np.abs(value) > 0.3)
+    inner = (np.abs(x).max(axis=1) < 0.4) & ~points.is_on_level & (np.abs(value) > 0.3)
     for row in np.flatnonzero(inner)[:3]:
 
         def turn(given: TetrahedronPoints, row: int = row) -> TetrahedronPoints:

@@ -401,7 +401,7 @@ CURVE = hk.SolidAngle(example_curves.wavy_polygon(12))
         (hk.Sphere(0.5), {"thickness": "thick"}, "must be a number"),
         (hk.Sphere(0.5), {"tolerance": math.nan}, "tolerance"),
         (hk.Sphere(0.5), {"tolerance": 1e-12}, "triangles"),
-        (hk.Sphere(0.5), {"spacing": 1e-7}, "cells"),
+        (hk.Sphere(0.5), {"cell_size": 1e-7}, "cells"),
         (hk.Gyroid(1.0), {"solid": (-1e-8, 1e-8), "clip": BOX}, "thick, and its sides"),
         (hk.Gyroid(1.0), {"solid": (-1e-3, 1e-3), "clip": BOX}, "thick, and its sides"),
         (hk.Gyroid(1.0), {"solid": (-0.3, 0.3), "clip": hk.Box((0, 0, 0), (1, 1, 0))}, "empty"),

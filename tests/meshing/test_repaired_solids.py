@@ -182,7 +182,7 @@ def test_halves_of_a_ball_along_a_zigzag() -> None:
     """Half of the ball was left out, after 40 seconds."""
     damaged = halves_along_a_zigzag()
     result = repaired(damaged)
-    assert "the result of sound is another solid" in result.metadata["harnack"]["why"]
+    assert "the result of cleaned is another solid" in result.metadata["harnack"]["why"]
     assert result.volume == pytest.approx(4.31, abs=0.03)
     check_is(result, winding_sum(damaged.triangles), damaged.bounds)
 

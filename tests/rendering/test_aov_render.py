@@ -293,7 +293,7 @@ def test_the_alpha_of_a_film_is_kept() -> None:
 @pytest.mark.parametrize("backdrop", ["light", "dark"])
 @pytest.mark.parametrize(
     ("show", "elevation"),
-    [("color", 4.0), ("color", -20.0), ("shaded", 4.0), ("shaded", 0.0), ("shaded", -20.0)],
+    [("path", 4.0), ("path", -20.0), ("shaded", 4.0), ("shaded", 0.0), ("shaded", -20.0)],
 )
 def test_there_is_no_edge_behind_the_surface(show: str, backdrop: str, elevation: float) -> None:
     camera = hk.Camera(elevation=elevation, zoom=0.4)
