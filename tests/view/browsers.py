@@ -52,7 +52,7 @@ class Page:
         self.tab = browser.new_page(viewport={"width": size[0], "height": size[1]})
         self.tab.set_default_timeout(PATIENCE)
         home = address.split("/?")[0].rstrip("/").rsplit("/", 1)[0]
-        self.tab.return_path("**/*", lambda route: self._allow(route, home))
+        self.tab.route("**/*", lambda route: self._allow(route, home))
         self.tab.on("console", lambda one: self._hear(one.type, one.text))
         self.tab.on("pageerror", lambda one: self._hear("error", str(one)))
         for name, function in (exposed or {}).items():
