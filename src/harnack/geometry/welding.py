@@ -17,7 +17,7 @@ from harnack.backend.validation import FloatArray, IntArray
 from harnack.geometry.boundary_edges import NetFaces, net_faces, singular_edges, weld_vertices
 from harnack.geometry.meshes import zero_area_faces
 
-__all__ = ["Welded", "rounding_of"]
+__all__ = ["Welded", "connected_groups", "pairs_within", "rounding_of"]
 
 # How many units in the last place of the largest coordinate rounding explains.
 _UNITS = 4
@@ -81,7 +81,7 @@ class Welded:
 def _joined_by_rounding(x: FloatArray, faces: IntArray, places: IntArray) -> IntArray:
     """(n,) the vertex that stands for each, of those at some places, all different."""
     stands = np.arange(len(x))
-    pairs = _near_pairs(x, places, rounding_of(x[faces]))
+    pairs = places[pairs_within(x[places], rounding_of(x[faces]))]
     distance = np.linalg.norm(x[pairs[:, 0]] - x[pairs[:, 1]], axis=1)
     corner = x[faces]
     shortest = np.full(len(x), np.inf)
@@ -90,7 +90,8 @@ def _joined_by_rounding(x: FloatArray, faces: IntArray, places: IntArray) -> Int
         np.minimum.at(shortest, faces[:, k], edges)
     pairs = pairs[distance <= _OF_EDGES * shortest[pairs].min(axis=1)]
     while len(pairs):
-        stands = _first_of_groups(pairs, len(x))
+        group = connected_groups(pairs, len(x))
+        stands = np.unique(group, return_index=True)[1][group]
         joined = stands[faces]
         changed = np.flatnonzero((joined != faces).any(axis=1))
         vanished = (joined == np.roll(joined, 1, axis=1)).any(axis=1)
@@ -104,22 +105,21 @@ def _joined_by_rounding(x: FloatArray, faces: IntArray, places: IntArray) -> Int
     return stands
 
 
-def _near_pairs(x: FloatArray, places: IntArray, distance: float) -> IntArray:
-    """(k, 2) pairs of places, by index, up to a distance apart."""
+def pairs_within(points: FloatArray, distance: float) -> IntArray:
+    """(k, 2) indices of the pairs of points (n, 3) that are at most a distance apart."""
     import scipy.spatial  # here: half a second that few need
 
     spatial = cast("Any", scipy.spatial)
-    pairs = spatial.cKDTree(x[places]).query_pairs(distance, output_type="ndarray")
-    return places[pairs.reshape(-1, 2)]
+    pairs = spatial.cKDTree(points).query_pairs(distance, output_type="ndarray")
+    return np.asarray(pairs, np.int64).reshape(-1, 2)
 
 
-def _first_of_groups(pairs: IntArray, count: int) -> IntArray:
-    """(n,) the first of those that pairs join with each of `count`."""
-    import scipy.sparse
+def connected_groups(pairs: IntArray, count: int) -> IntArray:
+    """(count,) the number of the group of each index, where pairs (k, 2) join indices to groups.
+    Groups are numbered in the order of their first indices."""
+    import scipy.sparse  # here: half a second that few need
     import scipy.sparse.csgraph as csgraph_module
 
     sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
     joined = sparse.coo_matrix((np.ones(len(pairs)), pairs.T), shape=(count, count))
-    group: IntArray = csgraph.connected_components(joined, directed=False)[1]
-    first = np.unique(group, return_index=True)[1]
-    return np.asarray(first[group], np.int64)
+    return np.asarray(csgraph.connected_components(joined, directed=False)[1], np.int64)

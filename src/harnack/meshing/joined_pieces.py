@@ -11,13 +11,14 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray, choose_backend
 from harnack.geometry.boundary_edges import singular_edges
 from harnack.geometry.meshes import without_zero_area_faces
+from harnack.geometry.welding import connected_groups, pairs_within
 from harnack.meshing.checks import MeshingError, touching_pairs
 from harnack.meshing.edges import Edges, IntArray, area_normals, half_edges, row_dots, row_norms
 from harnack.meshing.lattice_meshing import TriangleMesh
@@ -26,7 +27,7 @@ from harnack.tree.coplanar import overlapping_faces
 from harnack.tree.triangle_splitting import split_intersecting_faces, windings_of_sides
 from harnack.tree.triangle_tree import TriangleTree, triangle_records
 
-__all__ = ["boundary_of_solid", "near_groups", "neighbors", "passes_itself"]
+__all__ = ["boundary_of_solid", "neighbors", "passes_itself"]
 
 _LEAF_SIZE = 4
 # In units of the mesh's size. Pieces not as high as the first are not asked what is beside them.
@@ -76,7 +77,7 @@ def boundary_of_solid(vertices: FloatArray, faces: IntArray) -> TriangleMesh:
     looks_in = (cut.front > cut.back)[bounds]
     pieces = np.where(looks_in[:, None, None], pieces[:, ::-1], pieces)
     places = np.concatenate([cut.unit, pieces.reshape(-1, 3)])
-    group = near_groups(places, _SAME)
+    group = connected_groups(pairs_within(places, _SAME), len(places))
     first = np.unique(group, return_index=True)[1][group]  # corners of the mesh come first
     joined = first[len(x) :].reshape(-1, 3)
     joined = joined[(joined != np.roll(joined, 1, axis=1)).all(axis=1)]
@@ -156,20 +157,6 @@ def _rays(unit: FloatArray, faces: IntArray) -> TriangleTree:
 
 
 # Pieces joined.
-
-
-def near_groups(places: FloatArray, distance: float) -> IntArray:
-    """(n,) numbers of groups of points, each nearer to another of its group than a distance."""
-    import scipy.sparse  # here: half a second that few need
-    import scipy.sparse.csgraph as csgraph_module
-    import scipy.spatial
-
-    sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
-    searching: Any = scipy.spatial
-    one, other = searching.cKDTree(places).query_pairs(distance, output_type="ndarray").T
-    n = len(places)
-    near = sparse.coo_matrix((np.ones(len(one)), (one, other)), shape=(n, n))
-    return np.asarray(csgraph.connected_components(near, directed=False)[1], np.int64)
 
 
 def _cut_at_corners(x: FloatArray, faces: IntArray) -> IntArray:
@@ -279,16 +266,10 @@ def _wedges(ends: FloatArray, third: FloatArray, is_along: BoolArray) -> IntArra
 
 def _apart_at_contacts(x: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray]:
     """A closed surface with a corner of its own for each of the sheets that touch in one."""
-    import scipy.sparse  # here: half a second that few need
-    import scipy.sparse.csgraph as csgraph_module
-
-    sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
     m = len(faces)
-    one, other = neighbors(x, faces).T
+    edge, opposite = neighbors(x, faces).T
     # Corner k of face i is k m + i, and edge k runs from it to the next.
-    rows = np.concatenate([one, (one + m) % (3 * m)])
-    columns = np.concatenate([(other + m) % (3 * m), other])
-    joined = sparse.coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(3 * m, 3 * m))
-    fan = np.asarray(csgraph.connected_components(joined, directed=False)[1], np.int64)
+    start, end = (edge, (opposite + m) % (3 * m)), ((edge + m) % (3 * m), opposite)
+    fan = connected_groups(np.concatenate([start, end], axis=1).T, 3 * m)
     first = np.unique(fan, return_index=True)[1]
     return x[faces.T.ravel()[first]], fan.reshape(3, m).T

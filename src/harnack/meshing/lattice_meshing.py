@@ -13,11 +13,12 @@ import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray
+from harnack.geometry.welding import connected_groups, pairs_within
 from harnack.meshing.bcc_lattice import BccLattice, distinct_rows
 from harnack.meshing.checks import (
     MeshingError,
@@ -247,18 +248,10 @@ def _check_passes_level(function: LevelFunction, part: FloatArray, size: float) 
 
 def _longest_part(x: FloatArray, apart: float) -> FloatArray:
     """Of points (n, 3) those of the longest chain of which neighbors are no farther apart."""
-    import scipy.sparse  # here: half a second that few need
-    import scipy.sparse.csgraph as csgraph_module
-    import scipy.spatial
-
-    sparse, csgraph, searching = (
-        cast("Any", one) for one in (scipy.sparse, csgraph_module, scipy.spatial)
-    )
     if not len(x):
         return x
-    one, other = searching.cKDTree(x).query_pairs(apart, output_type="ndarray").T
-    joined = sparse.coo_matrix((np.ones(len(one)), (one, other)), shape=(len(x), len(x)))
-    count, part = csgraph.connected_components(joined, directed=False)
+    part = connected_groups(pairs_within(x, apart), len(x))
+    count = int(part.max()) + 1
     low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
     np.minimum.at(low, part, x)
     np.maximum.at(high, part, x)

@@ -18,6 +18,7 @@ from harnack.backend import BoolArray, FloatArray
 from harnack.fields.solid_angles.winding_number import WindingNumber
 from harnack.geometry.boundary_edges import weld_vertices
 from harnack.geometry.orientability import orientation_components
+from harnack.geometry.welding import connected_groups, pairs_within
 from harnack.meshing.checks import (
     MeshingError,
     check_manifold,
@@ -34,7 +35,7 @@ from harnack.meshing.edges import (
     row_norms,
 )
 from harnack.meshing.hole_filling import fill_holes, hole_loops
-from harnack.meshing.joined_pieces import near_groups, passes_itself
+from harnack.meshing.joined_pieces import passes_itself
 from harnack.meshing.lattice_meshing import TriangleMesh
 
 __all__ = ["CleanedMesh", "against_neighbors", "clean_and_fill", "weld_near_corners"]
@@ -110,7 +111,7 @@ def weld_near_corners(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray
     usual = float(np.median(row_norms((at - np.roll(at, 1, axis=1)).reshape(-1, 3))))
     found: list[tuple[int, FloatArray, IntArray, float]] = []
     for part in _NEAR:
-        group = near_groups(places, part * usual)
+        group = connected_groups(pairs_within(places, part * usual), len(places))
         count = np.bincount(group)[:, None]
         mean = np.stack([np.bincount(group, column) for column in places.T], axis=1) / count
         made = group[corners]
