@@ -470,10 +470,10 @@ def _with_seen_distances(prepared: SurfaceTracer, hits: Hits, doubt: _Doubt) -> 
         return hits
 
     def seen(rays: _Around) -> _Lengths:
-        one = field
+        sampled = field
         if field.has_patches:
-            one = field.patch(dr.reinterpret_array(backend.UInt32, rays.part))
-        return _Lengths(seen_distance(backend, one, prepared.levels, rays.around))
+            sampled = field.patch(dr.reinterpret_array(backend.UInt32, rays.part))
+        return _Lengths(seen_distance(backend, sampled, prepared.levels, rays.around))
 
     around = Doubtful(hits.position, hits.normal, doubt.size, doubt.distance)
     far = compute_on_active(
