@@ -160,6 +160,13 @@ def choose_backend(precision: Precision = "single") -> Backend:
     return _backend("llvm", precision)
 
 
+def precision_of_input(*arrays: Any) -> Precision:
+    """The precision in which to compute with array-likes: double if any of them is an array of
+    float64, else single (float32, integers, lists of Python numbers)."""
+    kinds = [getattr(array, "dtype", None) for array in arrays]
+    return "double" if any(kind == np.float64 for kind in kinds if kind is not None) else "single"
+
+
 def backend_of(array: Any) -> Backend:
     """The backend and precision of a Dr.Jit array or vector of floats, with or without AD.
 

@@ -32,6 +32,9 @@ def accepts_dask_arrays(*names: str) -> Callable[[Function], Function]:
 
     def decorate(function: Function) -> Function:
         signature = inspect.signature(function)
+        variadic = next(
+            (name for name, one in signature.parameters.items() if one.kind is one.VAR_KEYWORD), ""
+        )
 
         @functools.wraps(function)
         def general(*given: Any, **settings: Any) -> Any:
@@ -40,7 +43,7 @@ def accepts_dask_arrays(*names: str) -> Callable[[Function], Function]:
             arguments = signature.bind(*given, **settings).arguments
             # Methods take the place of `self` by position, and the rest by name.
             rest = arguments.pop(next(iter(signature.parameters)))
-            named = {**arguments.pop("settings", {}), **arguments}
+            named = {**arguments.pop(variadic, {}), **arguments}
             return _map_blocks(functools.partial(general, rest), names, named)
 
         return cast("Function", general)

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from harnack.enclosures import Levels
     from harnack.fields.field import Field, Sample
     from harnack.geometry import Volume
-    from harnack.tracer import Surface
+    from harnack.tracer import TracedSurface
 
 __all__ = ["CellClassifier", "ClipCurveDescent", "taylor_remainder"]
 
@@ -232,7 +232,7 @@ def multiplicity(step: Real, last: Real) -> Real:
 class CellClassifier:
     """Classifies the cells of a level set, in double precision."""
 
-    surface: Surface
+    surface: TracedSurface
 
     def __post_init__(self) -> None:
         self._backend = choose_backend("double")
@@ -434,5 +434,5 @@ class CellClassifier:
         return dr.while_loop(start, more, body, label="rays through cells")[0]
 
 
-def _domain(surface: Surface) -> Any:
+def _domain(surface: TracedSurface) -> Any:
     return surface.field.domain if surface.clip_volume is None else surface.volume

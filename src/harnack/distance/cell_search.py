@@ -18,7 +18,7 @@ from harnack.distance.tangent_plane import in_batches
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real, Vec3
-    from harnack.tracer import Surface
+    from harnack.tracer import TracedSurface
 
 __all__ = ["DescentMethods", "InitialGuess", "SearchResult", "StoppingRule", "search"]
 
@@ -130,7 +130,7 @@ class _Cube:
 
 
 def search(
-    surface: Surface, points: FloatArray, known: InitialGuess, descents: DescentMethods,
+    surface: TracedSurface, points: FloatArray, known: InitialGuess, descents: DescentMethods,
     tolerance: StoppingRule, progress: Callable[[str], None],
 ) -> SearchResult:  # fmt: skip
     """The nearest points of a level set to `points` (n, 3)."""
@@ -162,7 +162,7 @@ def search(
     return SearchResult(feet, lower)
 
 
-def _box(surface: Surface) -> tuple[FloatArray, FloatArray] | None:
+def _box(surface: TracedSurface) -> tuple[FloatArray, FloatArray] | None:
     volume = surface.volume
     if volume is None:
         return None
@@ -171,7 +171,7 @@ def _box(surface: Surface) -> tuple[FloatArray, FloatArray] | None:
 
 
 def _search_in_batches(
-    surface: Surface,
+    surface: TracedSurface,
     root: _Cube,
     points: FloatArray,
     known: InitialGuess,
@@ -210,7 +210,7 @@ def _search_in_batches(
     )
 
 
-def _max_cells(surface: Surface, points: int, is_proved: bool) -> int:
+def _max_cells(surface: TracedSurface, points: int, is_proved: bool) -> int:
     """How many cells there may be."""
     if surface.field.has_jumps:
         return _MOST_ON_SHEETS

@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from harnack.enclosures import Levels
     from harnack.fields.samples import Sample
     from harnack.geometry import Volume
-    from harnack.tracer import Surface
+    from harnack.tracer import TracedSurface
 
 __all__ = ["ClosestPoints", "find_closest"]
 
@@ -96,7 +96,7 @@ class ClosestPoints:
 
 
 def find_closest(
-    backend: Backend, surface: Surface, levels: Levels, points: Any,
+    backend: Backend, surface: TracedSurface, levels: Levels, points: Any,
     progress: Callable[[str], None], *, is_proved: bool = False,
 ) -> ClosestPoints:  # fmt: skip
     """The closest point of a surface to each of the points (n, 3).
@@ -114,7 +114,7 @@ def find_closest(
 
 
 def _find_sorted(
-    backend: Backend, surface: Surface, levels: Levels, points: FloatArray,
+    backend: Backend, surface: TracedSurface, levels: Levels, points: FloatArray,
     progress: Callable[[str], None], is_proved: bool,
 ) -> ClosestPoints:  # fmt: skip
     mesh = LevelTriangles.of(surface)
@@ -198,7 +198,9 @@ def _search_smooth_part(
     return SearchResult(feet, lower)
 
 
-def _with_singular_points(surface: Surface, points: FloatArray, feet: FloatArray) -> FloatArray:
+def _with_singular_points(
+    surface: TracedSurface, points: FloatArray, feet: FloatArray
+) -> FloatArray:
     """The feet (n, 3), or the nearest singular points where these are nearer: beside those the
     surface is a tiny loop that descents do not see."""
     singular = surface.field.singular_points
@@ -215,7 +217,7 @@ def _with_singular_points(surface: Surface, points: FloatArray, feet: FloatArray
 
 
 def _closest_on_mesh(
-    backend: Backend, surface: Surface, levels: Levels, mesh: LevelTriangles, points: Any
+    backend: Backend, surface: TracedSurface, levels: Levels, mesh: LevelTriangles, points: Any
 ) -> ClosestPoints:
     prepared, nearest = surface.evaluator(backend), mesh.upload(backend)
 
@@ -245,7 +247,7 @@ class _QueryEvaluator:
     query points."""
 
     backend: Backend
-    surface: Surface
+    surface: TracedSurface
     levels: Levels
 
     def __post_init__(self) -> None:
@@ -561,7 +563,7 @@ def _length(vectors: FloatArray) -> FloatArray:
     return np.hypot(np.hypot(x, y), z)
 
 
-def _size(surface: Surface, points: FloatArray) -> float:
+def _size(surface: TracedSurface, points: FloatArray) -> float:
     """The size of the surface, or of the points where it is unknown."""
     if surface.volume is not None:
         lower, upper = surface.volume.bounds()

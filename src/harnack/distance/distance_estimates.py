@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import drjit as dr
@@ -17,38 +18,50 @@ from harnack.distance.closest_point_search import ClosestPoints, find_closest
 from harnack.distance.tangent_plane import first_order_distance, in_batches, second_order_distance
 from harnack.enclosures import Levels
 from harnack.fields.clearance import level_distance_lower_bound
-from harnack.fields.field import Field, check_is_field
+from harnack.fields.field import Field
 from harnack.name_suggestions import did_you_mean, is_one_of
 from harnack.progress import teller
-from harnack.tracer import level_set
+from harnack.tracer import TracedSurface, TraceOptions
+from harnack.tracer.surface import intersection_of
+from harnack.tracer.trace_options import TRACE_OPTIONS, shows_keywords, surface_and_options
+from harnack.tracer.traced_surface import check_is_open
 
 if TYPE_CHECKING:
-    from harnack.backend import Backend, Precision, Real, Vec3
-    from harnack.tracer import Surface
+    from typing_extensions import Unpack
+
+    from harnack.backend import Backend, Real, Vec3
+    from harnack.tracer import Surface, TraceKeywords
 
 __all__ = ["DistanceBounds", "Method", "closest_points", "distance_bounds", "signed_distance"]
 
 Method = Literal["first_order", "second_order", "closest_point", "lower_bound"]
+_NOT_OF_DISTANCES = (
+    "side", "largest", *(name for name in TRACE_OPTIONS if name != "precision"),
+)  # fmt: skip
 # As close as rounding allows: the tracer raises it to that.
 _CLOSE = 1e-15
 
 
 @accepts_dask_arrays("points")
+@shows_keywords(*_NOT_OF_DISTANCES)
 @no_derivatives
 def signed_distance(
-    field: Field,
+    surface: Field | Surface,
     points: Any,
     *,
-    level: Any = None,
     method: Method = "closest_point",
-    precision: Precision = "double",
     progress: Callable[[str], None] | None = None,
+    options: TraceOptions | None = None,
+    **keywords: Unpack[TraceKeywords],
 ) -> FloatArray:
-    """Signed distances (n,) from points (n, 3) to a level set: positive where f > level.
+    """Signed distances (n,) from points (n, 3) to a surface: positive where f > level, so negative
+    inside of a `Solid`.
 
-    level: the level, by default the field's own; several mean the nearest one in value. Of an
-        angle-valued field every level stands for all that differ from it by periods, and the sign
-        is that of the one nearest in value.
+    surface: a field or a `Surface`, but for `side` and `largest`, which distances do not have; of
+        several levels the sign is that of the one nearest in value. Of an angle-valued field every
+        level stands for all that differ from it by periods. Clip and section cut the surface for
+        "closest_point"; a "lower_bound" holds for the whole surface, and so for what is left of
+        it; the other methods refuse them.
     method:
         "first_order": (f - level)/|grad f|. Off by O(d^2) at distance d; infinite where grad f = 0.
         "second_order": the same with the curvature of f along its gradient. Off by O(d^3); needs
@@ -64,9 +77,12 @@ def signed_distance(
             order too: the nearer the surface, the smaller the share that it falls short by.
         For a field that jumps across facets, "first_order" and "second_order" see the smooth part
         of the surface, and the nearest facet if that is nearer and the surface lies there.
-    precision: of the computation; "lower_bound" allows for rounding in both. The search of
-        "closest_point" is done in double precision in any case.
     progress: told what is being done.
+    options: a `TraceOptions`, of which distances have `precision` alone: None is double precision.
+        "lower_bound" allows for rounding in both precisions, and the search of "closest_point" is
+        done in double precision in any case. Closest points have no tolerance: they are exact up to
+        rounding.
+    keywords: those of `Surface` beside a bare field, and `precision` in place of `options`.
 
     Raises:
         TypeError, ValueError: points that are not an (n, 3) array of finite numbers, an unknown
@@ -78,12 +94,14 @@ def signed_distance(
         known = ", ".join(f'"{one}"' for one in get_args(Method))
         hint = did_you_mean(method, get_args(Method))
         raise ValueError(f"unknown method {method!r}; choose one of {known}{hint}")
+    traced, backend = _surface("signed_distance", surface, options, keywords)
+    field = traced.field
     if method == "closest_point":
-        found = _find("signed_distance", field, points, level, precision, progress)
-        return np.copysign(found.distance, found.signed_value)
-    backend = choose_backend(precision)
-    surface = _surface(field, level)
-    levels, prepared = surface.target_levels(backend), surface.evaluator(backend)
+        closest = _find("signed_distance", traced, backend, points, progress)
+        return np.copysign(closest.distance, closest.signed_value)
+    if traced.clip_volume is not None and method != "lower_bound":
+        raise TypeError(f'method="{method}" does not see clip and section: use "closest_point"')
+    levels, prepared = traced.target_levels(backend), traced.evaluator(backend)
     compute = _COMPUTE[method]
 
     def of_points(p: Vec3) -> tuple[Real | Vec3, ...]:
@@ -93,20 +111,21 @@ def signed_distance(
     if method == "lower_bound":
         _check_domain(field, x)
     if field.has_jumps and method != "lower_bound":
-        to_sheet = find_closest(backend, surface, levels, x, teller(None)).distance
+        to_sheet = find_closest(backend, traced, levels, x, teller(None)).distance
         result = np.copysign(np.fmin(to_sheet, np.abs(result)), result)
     return result
 
 
 @accepts_dask_arrays("points")
+@shows_keywords(*_NOT_OF_DISTANCES)
 @no_derivatives
 def closest_points(
-    field: Field,
+    surface: Field | Surface,
     points: Any,
     *,
-    level: Any = None,
-    precision: Precision = "double",
     progress: Callable[[str], None] | None = None,
+    options: TraceOptions | None = None,
+    **keywords: Unpack[TraceKeywords],
 ) -> FloatArray:
     """The closest points (n, 3) of a level set to `points` (n, 3), as far as a search finds them.
 
@@ -121,8 +140,9 @@ def closest_points(
     Raises:
         TypeError, ValueError: as `signed_distance`.
     """
-    found = _find("closest_points", field, points, level, precision, progress)
-    return found.closest
+    traced, backend = _surface("closest_points", surface, options, keywords)
+    closest = _find("closest_points", traced, backend, points, progress)
+    return closest.closest
 
 
 @dataclass(frozen=True)
@@ -141,14 +161,15 @@ class DistanceBounds:
 
 
 @accepts_dask_arrays("points")
+@shows_keywords(*_NOT_OF_DISTANCES)
 @no_derivatives
 def distance_bounds(
-    field: Field,
+    surface: Field | Surface,
     points: Any,
     *,
-    level: Any = None,
-    precision: Precision = "double",
     progress: Callable[[str], None] | None = None,
+    options: TraceOptions | None = None,
+    **keywords: Unpack[TraceKeywords],
 ) -> DistanceBounds:
     """Distances of points (n, 3) from a level set, with proved lower bounds.
 
@@ -166,30 +187,64 @@ def distance_bounds(
     Raises:
         TypeError, ValueError: as `signed_distance`.
     """
-    found = _find("distance_bounds", field, points, level, precision, progress, is_proved=True)
-    return DistanceBounds(found.closest, found.distance, found.lower)
+    traced, backend = _surface("distance_bounds", surface, options, keywords)
+    closest = _find("distance_bounds", traced, backend, points, progress, is_proved=True)
+    return DistanceBounds(closest.closest, closest.distance, closest.lower)
 
 
 def _find(
-    name: str, field: Field, points: Any, level: Any, precision: Precision,
-    progress: Callable[[str], None] | None, *, is_proved: bool = False,
-) -> ClosestPoints:  # fmt: skip
-    backend = choose_backend(precision)
-    surface = _surface(field, level)
+    name: str,
+    surface: TracedSurface,
+    backend: Backend,
+    points: Any,
+    progress: Callable[[str], None] | None,
+    *,
+    is_proved: bool = False,
+) -> ClosestPoints:
+    if surface.clip_volume is not None:
+        if surface.field.has_jumps:
+            raise NotImplementedError(
+                f"{name} takes no clip and no section of a {type(surface.field).__name__}, which "
+                "jumps: cut its mesh by the volume, and give the winding number of that"
+            )
+        # The search asks the field for its domain.
+        field = copy.copy(surface.field)
+        volume = intersection_of([field.domain, surface.clip_volume])
+        object.__setattr__(field, "domain", volume)  # also of frozen dataclasses
+        surface = replace(surface, field=field, clip=None, section=None)
     levels = surface.target_levels(backend)
-    found = find_closest(backend, surface, levels, points, teller(progress), is_proved=is_proved)
-    _warn(name, found)
-    return found
+    closest = find_closest(backend, surface, levels, points, teller(progress), is_proved=is_proved)
+    _warn(name, closest)
+    return closest
 
 
-def _surface(field: Field, level: Any) -> Surface:
-    check_is_field(field)
+def _surface(
+    verb: str,
+    surface: Field | Surface,
+    options: TraceOptions | None,
+    keywords: TraceKeywords,
+) -> tuple[TracedSurface, Backend]:
+    """The surface whose distances are asked for, and the backend to compute them on.
+
+    Raises:
+        TypeError, ValueError: as `surface_and_options`; an option that distances do not have.
+        NotImplementedError: a field with jumps whose distance is not known.
+    """
+    target, choices = surface_and_options(verb, surface, options, keywords)
+    choices.refuse_others(verb, "precision")
+    check_is_open(verb, target)
+    if target.largest:
+        raise TypeError(f"{verb} has no largest: mesh the component, and take the mesh's distance")
+    field = target.field
     if field.has_jumps and type(field).distance_to_jumps is Field.distance_to_jumps:
         raise NotImplementedError(
             f"{type(field).__name__} has jumps but does not say how far they are: define its "
             "method distance_to_jumps(p)"
         )
-    return level_set(field, level, tolerance=_CLOSE, overstep=1.0).with_call_cache()
+    closely = TraceOptions(tolerance=_CLOSE, over_relaxation=1.0)
+    return TracedSurface.of(target, closely).with_call_cache(), choose_backend(
+        choices.precision or "double"
+    )
 
 
 def _warn(name: str, found: ClosestPoints) -> None:

@@ -27,7 +27,7 @@ from harnack.tree.triangle_tree import NO_TRIANGLE, TriangleTree, triangle_recor
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Vec3
-    from harnack.tracer import Surface
+    from harnack.tracer import TracedSurface
 
 __all__ = ["LevelTriangles"]
 
@@ -51,7 +51,7 @@ class LevelTriangles:
     is_complete: bool
 
     @classmethod
-    def of(cls, surface: Surface) -> LevelTriangles | None:
+    def of(cls, surface: TracedSurface) -> LevelTriangles | None:
         """The triangles of a surface: the level set of the winding number of a mesh without a clip,
         or the boundary of a `MeshSolid`; None for other surfaces. For a mesh that is not closed,
         the triangles that are proved to belong to the surface as a whole; or all, if the surface
@@ -108,7 +108,7 @@ def _tree(
     return TriangleTree.of(backend, tree, triangle_records(vertices, faces), slabs=slabs)
 
 
-def _proved_on_level(surface: Surface, corners: FloatArray, size: float) -> BoolArray:
+def _proved_on_level(surface: TracedSurface, corners: FloatArray, size: float) -> BoolArray:
     """(k,) whether all of a triangle, which none passes through, belongs to a level.
 
     Proof. With its jumps, whole numbers, removed, f is smooth about the triangle's center, and

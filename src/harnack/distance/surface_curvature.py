@@ -14,20 +14,26 @@ from harnack.backend import BoolArray, FloatArray, choose_backend, to_numpy
 from harnack.backend.arrays import as_finite_vectors, upload_vectors
 from harnack.backend.elementary import fmax, fmin
 from harnack.backend.loops import loop_while_active
-from harnack.backend.validation import as_finite, as_positive, no_derivatives
+from harnack.backend.validation import as_positive, no_derivatives
 from harnack.distance.tangent_plane import SymmetricEigen2, TangentPlane, in_batches
 from harnack.fields.batched_fields import BatchedField
-from harnack.fields.field import check_is_field
-from harnack.geometry.volume import check_volume
 from harnack.name_suggestions import did_you_mean, is_one_of
+from harnack.tracer.trace_options import TRACE_OPTIONS, shows_keywords, surface_and_options
+from harnack.tracer.traced_surface import check_is_open
 
 if TYPE_CHECKING:
-    from harnack.backend import Backend, Mask, Precision, Real, Vec3
+    from typing_extensions import Unpack
+
+    from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.fields.field import Field
     from harnack.geometry import Volume
+    from harnack.tracer import Surface, TraceKeywords, TraceOptions
 
 __all__ = ["CurvatureSamples", "Family", "curvature", "curvature_lines"]
 
+_NOT_OF_CURVATURE = (
+    "side", "largest", *(name for name in TRACE_OPTIONS if name != "precision"),
+)  # fmt: skip
 # The error of a mean curvature that is good enough: this share of it, or of one over the size of
 # the surface where that is more.
 _ACCURACY = 1e-3
@@ -61,9 +67,21 @@ class CurvatureSamples:
     gaussian_error: FloatArray
 
 
+@shows_keywords(*_NOT_OF_CURVATURE, "level", "clip", "section")
 @no_derivatives
-def curvature(field: Field, points: Any, *, precision: Precision = "double") -> CurvatureSamples:
+def curvature(
+    surface: Field | Surface,
+    points: Any,
+    *,
+    options: TraceOptions | None = None,
+    **keywords: Unpack[TraceKeywords],
+) -> CurvatureSamples:
     """Mean and Gaussian curvature of the level sets of a field through points (n, 3).
+
+    surface: a field, or a `Surface` whose levels, clip and section say where it is drawn: the
+        curvature at a point is that of the level set through it, whatever its level.
+    options: a `TraceOptions`, of which curvatures have `precision` alone; None is double precision.
+    keywords: `precision`, in place of `options`.
 
     The derivative of n = grad f/|grad f| along a tangent u of the level set has the tangential
     part (A u)/|grad f|, A the Hessian; its component along n is zero, for |n| = 1. So with an
@@ -82,8 +100,11 @@ def curvature(field: Field, points: Any, *, precision: Precision = "double") -> 
         NotImplementedError: the field has no second derivatives.
         TypeError, ValueError: points that are not an (n, 3) array of finite numbers.
     """
-    check_is_field(field)
-    backend = choose_backend(precision)
+    for name in ("level", "clip", "section"):
+        if name in keywords:
+            raise TypeError(f"curvature has no {name}: it is that of the level set through a point")
+    target, backend = _field_and_backend("curvature", surface, options, keywords)
+    field = target.field
     if not isinstance(field, BatchedField):
         prepared = field.prepare(backend)
 
@@ -105,6 +126,22 @@ def curvature(field: Field, points: Any, *, precision: Precision = "double") -> 
         return found.curvatures()
 
     return _refine_accuracy(backend, field, by_tree, points, True)
+
+
+def _field_and_backend(
+    verb: str, surface: Field | Surface, options: TraceOptions | None, keywords: TraceKeywords
+) -> tuple[Surface, Backend]:
+    """The surface of a call, and the backend to compute on.
+
+    Raises:
+        TypeError, ValueError: as `surface_and_options`; an option that curvatures do not have.
+    """
+    target, choices = surface_and_options(verb, surface, options, keywords)
+    choices.refuse_others(verb, "precision")
+    check_is_open(verb, target)
+    if target.largest:
+        raise TypeError(f"{verb} has no largest: take points on the component, such as hits")
+    return target, choose_backend(choices.precision or "double")
 
 
 def _refine_accuracy(
@@ -245,17 +282,17 @@ _MIN_STEP_COSINE, _MAX_STEP_PER_RADIUS = math.cos(math.radians(40)), 0.5
 _MOST_STEPS = 100_000
 
 
+@shows_keywords(*_NOT_OF_CURVATURE)
 @no_derivatives
 def curvature_lines(
-    field: Field,
+    surface: Field | Surface,
     seeds: Any,
     *,
     step: float,
     length: float,
     family: Family = "maximum",
-    level: float | None = None,
-    clip: Volume | None = None,
-    precision: Precision = "double",
+    options: TraceOptions | None = None,
+    **keywords: Unpack[TraceKeywords],
 ) -> list[FloatArray]:
     """The lines of curvature of a level set through seeds (n, 3): n polylines (k, 3), with k >= 1.
 
@@ -263,12 +300,13 @@ def curvature_lines(
 
     A line that comes back to its seed ends there, and its first point is its last.
 
+    surface: a field, or a `Surface` of one level; lines end where its clip and section do, and a
+        seed outside of these gives an empty line, (0, 3).
     seeds: points near the surface, from which Newton's method leads to it.
     step: length of the steps, as a length of arc. length: how far to follow a line to either side.
     family: whether to follow the direction of the larger principal curvature or of the smaller; the
         sign of curvatures is that of `curvature`.
-    level: of the surface; by default the field's own.
-    clip: where lines end besides; a seed outside of it gives an empty line, (0, 3).
+    options, keywords: as in `curvature`; beside a bare field also `level`, `clip` and `section`.
 
     With n = grad f/|grad f| and the Hessian A, the principal directions are the eigenvectors of A
     restricted to the tangent plane (`curvature` says why). They are lines without an arrow: each
@@ -285,8 +323,10 @@ def curvature_lines(
         TypeError, ValueError: seeds that are not an (n, 3) array of finite numbers; a step or
             length that is not positive; an unknown family.
     """
-    check_is_field(field)
-    check_volume(clip, "clip")
+    target, backend = _field_and_backend("curvature_lines", surface, options, keywords)
+    field, levels = target.field, target.level_values
+    if len(levels) > 1:
+        raise ValueError(f"lines of curvature are of one level, not of {len(levels)}")
     if not is_one_of(family, get_args(Family)):
         known = ", ".join(f'"{one}"' for one in get_args(Family))
         hint = did_you_mean(family, get_args(Family))
@@ -298,15 +338,16 @@ def curvature_lines(
     start = as_finite_vectors(seeds, "seeds")
     if not len(start):
         return []
-    level = field.default_level if level is None else as_finite(level, "level")
-    backend = choose_backend(precision)
     # Data, so that another level, step or family compiles no other kernel.
     most = 1.0 if family == "maximum" else 0.0
-    at, h, share = (dr.opaque(backend.Float, one) for one in (level, step, most))
+    at, h, share = (dr.opaque(backend.Float, one) for one in (levels[0], step, most))
     guide = _CurvatureLineTracer(backend, field.prepare(backend), at, h, share)
     with dr.suspend_grad():
         both = guide.follow(start, count)
-    return [_join_halves(ahead, back, step, clip) for ahead, back in zip(*both, strict=True)]
+    return [
+        _join_halves(ahead, back, step, target.clip_volume)
+        for ahead, back in zip(*both, strict=True)
+    ]
 
 
 @dataclass(frozen=True)

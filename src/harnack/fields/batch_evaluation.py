@@ -11,7 +11,12 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.backend.arrays import as_finite_vectors, upload_integers, upload_vectors
+from harnack.backend.arrays import (
+    as_finite_vectors,
+    precision_of_input,
+    upload_integers,
+    upload_vectors,
+)
 from harnack.backend.validation import check_no_derivatives
 from harnack.cluster.dask_arrays import accepts_dask_arrays
 
@@ -30,10 +35,12 @@ _BITS = 5
 def evaluate_points(
     points: Any,
     kernel: Callable[[Backend, Vec3], tuple[Any, ...]],
-    precision: Precision,
+    precision: Precision | None,
 ) -> tuple[npt.NDArray[Any], ...]:
     """The arrays that `kernel` gives at points (n, 3), in the order of the points; for a single
     point (3,) without the first axis.
+
+    precision: None for double precision if the points are an array of float64, else single.
 
     The points are visited cell by cell along a Morton curve, so that neighboring lanes visit the
     same nodes of a tree, which halves the time.
@@ -41,7 +48,7 @@ def evaluate_points(
     Raises:
         TypeError, ValueError: points that are no (n, 3) array of finite numbers.
     """
-    backend = choose_backend(precision)
+    backend = choose_backend(precision or precision_of_input(points))
 
     def visit(x: Vec3) -> tuple[Any, ...]:
         order = morton_order(backend, x)
@@ -61,7 +68,7 @@ def accepts_numpy_points(hessian: Callable[[Any, Vec3], Any]) -> Callable[..., A
 
     @accepts_dask_arrays("p")
     @functools.wraps(hessian)
-    def general(self: Any, p: Any, *, precision: Precision = "single") -> Any:
+    def general(self: Any, p: Any, *, precision: Precision | None = None) -> Any:
         if dr.is_array_v(type(p)):
             check_no_derivatives(f"the Hessian of {type(self).__name__}", p, self.parameters())
             return hessian(self, p)

@@ -166,7 +166,7 @@ class BatchedField(Field):
 
     @accepts_dask_arrays("points")
     @accepts_tensors
-    def value(self, points: Any, *, precision: Precision = "single") -> Any:
+    def value(self, points: Any, *, precision: Precision | None = None) -> Any:
         if dr.is_array_v(type(points)):
             if dr.grad_enabled(points):
                 return self.differentiable_value(points)
@@ -175,7 +175,7 @@ class BatchedField(Field):
 
     @accepts_dask_arrays("points")
     @accepts_tensors
-    def gradient(self, points: Any, *, precision: Precision = "single") -> Any:
+    def gradient(self, points: Any, *, precision: Precision | None = None) -> Any:
         if dr.is_array_v(type(points)):
             if dr.grad_enabled(points):
                 return super().gradient(points)
@@ -183,14 +183,14 @@ class BatchedField(Field):
         return self._at(points, precision, 1, lambda at: (at.gradient,))[0]
 
     def value_and_gradient(
-        self, points: Any, *, precision: Precision = "single"
+        self, points: Any, *, precision: Precision | None = None
     ) -> tuple[FloatArray, FloatArray]:
         """Values (n,) and gradients (n, 3) together, at hardly more cost than gradients alone."""
         value, gradient = self._at(points, precision, 1, lambda at: (at.value, at.gradient))
         return value, gradient
 
     def rough_value_and_gradient(
-        self, points: Any, *, precision: Precision = "single"
+        self, points: Any, *, precision: Precision | None = None
     ) -> tuple[FloatArray, FloatArray]:
         """Values (n,) and gradients (n, 3) of a single pass over a tree. Errors of the gradients
         may be large: they are for estimates, and for points at which f is steep."""
@@ -210,7 +210,7 @@ class BatchedField(Field):
         return sample.gradient_error, self.values_at(p, 2).hessian_error
 
     @accepts_dask_arrays("points")
-    def error_bound(self, points: Any, *, precision: Precision = "single") -> FloatArray:
+    def error_bound(self, points: Any, *, precision: Precision | None = None) -> FloatArray:
         """Bounds (n,) of the error of `value` at points (n, 3).
 
         They include the proved truncation error and the rounding error of f. The rounding of the
@@ -219,14 +219,16 @@ class BatchedField(Field):
         return self._at(points, precision, 0, lambda at: (at.error,))[0]
 
     @accepts_dask_arrays("points")
-    def gradient_error_bound(self, points: Any, *, precision: Precision = "single") -> FloatArray:
+    def gradient_error_bound(
+        self, points: Any, *, precision: Precision | None = None
+    ) -> FloatArray:
         """Bounds (n,) of the error of `gradient`, as a length, at points (n, 3): see
         `error_bound`. For a sum over a tree the bound is about a hundred times the error itself:
         the accuracy of the sum is chosen by estimates (`sharpened`)."""
         return self._at(points, precision, 1, lambda at: (at.gradient_error,))[0]
 
     @accepts_dask_arrays("points")
-    def hessian_error_bound(self, points: Any, *, precision: Precision = "single") -> FloatArray:
+    def hessian_error_bound(self, points: Any, *, precision: Precision | None = None) -> FloatArray:
         """Bounds (n,) of the error of `hessian`, in the spectral norm, at points (n, 3): see
         `error_bound`."""
         return self._at(points, precision, 2, lambda at: (at.hessian_error,))[0]
@@ -234,7 +236,7 @@ class BatchedField(Field):
     def _at(
         self,
         points: Any,
-        precision: Precision,
+        precision: Precision | None,
         derivatives: int,
         wanted: Callable[[PointValues], tuple[Any, ...]],
     ) -> tuple[FloatArray, ...]:

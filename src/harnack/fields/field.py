@@ -281,13 +281,16 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
 
     @accepts_dask_arrays("points")
     @accepts_tensors
-    def value(self, points: Any, *, precision: Precision = "single") -> Any:
+    def value(self, points: Any, *, precision: Precision | None = None) -> Any:
         """The values (n,) of f at points (n, 3); a number for a single point (3,).
 
         A Dr.Jit 3-vector gives a Dr.Jit array, and a tensor (n, 3) gives a tensor (n,). Both have
         derivatives with respect to the points and the field's parameters where these have
         derivatives enabled. Values of an angle-valued field are determined up to a multiple of its
         period.
+
+        precision: "single" or "double"; None for that of the input, double for arrays of float64,
+            else single.
 
         Raises TypeError or ValueError for other shapes, NaN or infinity.
         """
@@ -300,7 +303,7 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
 
     @accepts_dask_arrays("points")
     @accepts_tensors
-    def gradient(self, points: Any, *, precision: Precision = "single") -> Any:
+    def gradient(self, points: Any, *, precision: Precision | None = None) -> Any:
         """The gradients (n, 3) of f at points (n, 3); (3,) for a single point (3,).
 
         A Dr.Jit 3-vector gives a Dr.Jit 3-vector, and a tensor (n, 3) gives a tensor (n, 3). Both
@@ -321,7 +324,7 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         return gradient + type(points)(*(dr.dot(row, moved) for row in rows))
 
     def _evaluate_points(
-        self, points: Any, precision: Precision, wanted: Callable[[Sample], Any]
+        self, points: Any, precision: Precision | None, wanted: Callable[[Sample], Any]
     ) -> npt.NDArray[Any]:
         def kernel(backend: Backend, x: Vec3) -> tuple[Any, ...]:
             return (wanted(self.prepare(backend).evaluate(x)),)

@@ -81,6 +81,8 @@ from harnack.meshing.tube_mesh import tube_manifold
 if TYPE_CHECKING:
     from manifold3d import Manifold
 
+    from harnack.meshing.mesh_tolerance import MeshTolerance
+
 __all__ = [
     "AngleMesher",
     "CsgMesher",
@@ -562,28 +564,13 @@ def solid_value_range(field: Field, solid: Any, level: float | None) -> tuple[fl
     """
     if solid is True:
         raise ValueError(
-            f"solid=True is for solids, and a {type(field).__name__} has two sides: give "
-            "solid=(low, high), the values inside, such as solid=(-math.inf, 0.0)"
+            f"a {type(field).__name__} has two sides: name the inside, by "
+            'side="below" or side="above"'
         )
     if level is not None:
         raise ValueError("give either level or solid: the ends of a solid are its levels")
-    low, high = two_numbers(solid)
-    if not low < high or not (math.isfinite(low) or math.isfinite(high)):
-        raise ValueError(f"solid must be (low, high) with low < high, one finite, not {solid}")
+    low, high = solid
     field.validate_levels(tuple(end for end in (low, high) if math.isfinite(end)))
-    return low, high
-
-
-def two_numbers(solid: Any) -> tuple[float, float]:
-    """(low, high), of whatever holds two numbers.
-
-    Raises:
-        TypeError: it does not.
-    """
-    try:
-        low, high = (float(one) for one in solid)
-    except (TypeError, ValueError):
-        raise TypeError(f"solid must be (low, high), two numbers, or True, not {solid!r}") from None
     return low, high
 
 
@@ -591,7 +578,7 @@ def mesh_solid(
     solid: Solid,
     level: float,
     volume: Volume | None,
-    tolerance: float,
+    tolerance: MeshTolerance,
     spacing: float | None,
     angle_mesher: Callable[[float, float], AngleMesher],
     most_faces: int,
@@ -600,7 +587,7 @@ def mesh_solid(
 ) -> SolidMeshResult:
     """The boundary of the points of a volume where a solid's function is at most `level`.
 
-    volume: None for all of space. tolerance: a part of the size. most_faces: of a level set.
+    volume: None for all of space. most_faces: of a level set.
     angle_mesher: given a tolerance and a spacing, both lengths, how to mesh level sets of angles.
     check: of the surface, of which no triangles pass through each other, given the size, that it is
         near the level last. Where it is not, in a few places, these are mended
@@ -614,7 +601,7 @@ def mesh_solid(
     lower, upper = _bounds(solid, level, volume)
     size = float((upper - lower).max())
     cells = size / _ACROSS if spacing is None else spacing
-    error = 0.5 * tolerance * size
+    error = 0.5 * tolerance.at(size)
     attempts = _MOST_ATTEMPTS if spacing is None else 1
     per_wave = CELLS_PER_WAVE if spacing is None else None
     uploads = EvaluatorCache()

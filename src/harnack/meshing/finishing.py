@@ -164,13 +164,9 @@ _CREASE = math.cos(math.radians(30))
 _SIMPLER, _MENDED = (0.4, 0.2, 0.1), 0.05
 
 
-def check_options(tolerance: Any, spacing: Any, thickness: Any, seed: Any, most: Any) -> None:
+def check_options(spacing: Any, thickness: Any, seed: Any, most: Any) -> None:
     """Raise ValueError or TypeError for numbers out of range."""
-    if not 0 < as_real(tolerance, "tolerance") < 0.5:
-        raise ValueError(
-            f"tolerance is a part of the size: it must lie in (0, 0.5), not {tolerance}"
-        )
-    for name, value in (("spacing", spacing), ("thickness", thickness)):
+    for name, value in (("cell_size", spacing), ("thickness", thickness)):
         if value is not None and not 0 < as_real(value, name) < math.inf:
             raise ValueError(f"{name} must be a positive length, not {value!r}")
     as_integer_in_range(seed, "seed", 0, 2**63 - 1)

@@ -44,6 +44,7 @@ from harnack.meshing.refinement import improve, refine, smooth, unrefined_midpoi
 
 if TYPE_CHECKING:
     from harnack.backend import FloatArray
+    from harnack.meshing.mesh_tolerance import MeshTolerance
 
 __all__ = [
     "HarmonicFilling",
@@ -76,7 +77,7 @@ class HoleFillingOptions:
     attempts: how many sizes of cells are tried.
     """
 
-    tolerance: float
+    tolerance: MeshTolerance
     spacing: float | None
     seed: int
     attempts: int
@@ -144,7 +145,7 @@ def _fill_all_holes(
     function = LevelFunction(SolidAngle([vertices[loop] for loop in loops]), _LEVEL)
     size = float(np.ptp(vertices[np.unique(edges)], axis=0).max())
     cell = size / _ACROSS if asked.spacing is None else float(asked.spacing)
-    report, tolerance = asked.report, asked.tolerance * size
+    report, tolerance = asked.report, asked.tolerance.within(size)
     finer: tuple[RefinementBalls, ...] = ()
     times_met, seed, before = 0, asked.seed, None
     for attempt in range(asked.attempts):

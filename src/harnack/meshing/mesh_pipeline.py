@@ -16,7 +16,6 @@ from harnack.fields.solid_angles.dipole import DipolePotential
 from harnack.fields.solid_angles.solid_angle import SolidAngle
 from harnack.fields.solid_angles.winding_number import WindingNumber
 from harnack.geometry import Box, Volume, VolumeIntersection
-from harnack.geometry.volume import check_volume
 from harnack.meshing.bcc_lattice import BccLattice
 from harnack.meshing.checks import (
     EmptySurfaceError,
@@ -35,7 +34,6 @@ from harnack.meshing.csg_meshing import (
     mesh_solid,
     solid_and_level,
     solid_value_range,
-    two_numbers,
 )
 from harnack.meshing.curve_spanning import mesh_spanning_curve
 from harnack.meshing.finishing import (
@@ -48,6 +46,7 @@ from harnack.meshing.finishing import (
 from harnack.meshing.lattice_meshing import TriangleMesh, mesh_open_surface
 from harnack.meshing.level_function import CELLS_PER_WAVE, MOST_FACES, LevelFunction
 from harnack.meshing.lost_parts import LostParts
+from harnack.meshing.mesh_tolerance import MeshTolerance
 from harnack.meshing.sign_function import (
     SignFunction,
     cell_size_for_smoothing,
@@ -61,16 +60,21 @@ from harnack.meshing.sign_isosurface import (
 )
 from harnack.progress import teller
 from harnack.tracer import Surface
+from harnack.tracer.trace_options import TRACE_OPTIONS, shows_keywords, surface_and_options
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     import trimesh
     from manifold3d import Manifold
+    from typing_extensions import Unpack
 
     from harnack.backend import FloatArray
+    from harnack.tracer import TraceKeywords, TraceOptions
 
 __all__ = ["mesh"]
+
+_NOT_OF_MESHES = tuple(name for name in TRACE_OPTIONS if name != "tolerance")
 
 # Cells across the level set, unless a spacing is given; curves have their own length besides.
 _ACROSS = 24
@@ -81,21 +85,18 @@ _MARGIN = 0.01
 _ROOM = 0.05
 
 
+@shows_keywords(*_NOT_OF_MESHES)
 def mesh(
-    field: Field | Surface,
-    level: float | None = None,
+    surface: Field | Surface,
     *,
-    tolerance: float = 1e-3,
     cell_size: float | None = None,
-    clip: Volume | None = None,
-    section: Volume | None = None,
-    solid: tuple[float, float] | bool | None = None,
     thickness: float | None = None,
     simplify: bool = False,
-    largest: bool = False,
-    seed: int = 0,
     max_triangles: int = MOST_FACES,
+    seed: int = 0,
     progress: Callable[[str], None] | None = None,
+    options: TraceOptions | None = None,
+    **keywords: Unpack[TraceKeywords],
 ) -> trimesh.Trimesh:
     """Triangles of a level set, or the closed surface of a solid.
 
@@ -113,32 +114,28 @@ def mesh(
     a mesh that is its own spanning surface (`WindingNumber`), such as a file of a `SolidAngle`'s,
     the triangles are kept as they are, whatever tolerance, spacing and seed are.
 
-    field: a `SolidAngle` of polygons, a real-valued field that is continuous, or one of those; or a
-        `Surface` of one level or a solid, whose level, clip, section, solid and largest are used
-        unless others are given here. Its tolerance and other settings of rays are not used.
-    level: None for the field's default.
-    tolerance: how far triangles may be from the surface, as a part of the size of the level set's
-        box (its longest side), sampled and not proved.
+    surface: a field or a `Surface`; of a `SolidAngle` of polygons, or a real-valued field that is
+        continuous, or one of those named above; of one level, but for side="between". Surfaces end
+        where clip, section or the field's domain cut them, and solids (`side`) are closed there. A
+        clip is needed where the level set has no extent. The points of a `Solid` are those with
+        f <= level, unless side="surface" asks for the level set alone, which is open where it is
+        cut. `largest` keeps one connected component alone: of a surface the one with the largest
+        area, of a closed mesh the one with the largest volume, whose cavities stay.
     cell_size: of cells before anything is refined, in the field's unit; None chooses a 24th of the
         longest side (by signs a 48th), and of waves (`Field.min_wavelength`) a fifth of theirs at
         the most. Sheets that are nearer to each other are told apart where that is noticed; else a
         MeshingError says so.
-    clip: a volume, needed where the level set has no extent. The surface ends at its boundary; a
-        solid is closed there. None for the field's domain.
-    section: another one, such as a `HalfSpace`, besides the clip or the domain.
-    solid: the closed surface of the points where low <= f <= high, given as (low, high); one of
-        them may be infinite, as in `level_set` and `render`. For an angle-valued field, those
-        between the two levels. None is True for a `Solid`, whose inside is f <= level; False for
-        its surface alone, open where it is cut.
     thickness: makes a closed part so thick, in the field's unit, of a surface: half on each side.
     simplify: leave out vertices that are not needed within the tolerance, of closed meshes: of the
         mesh that is made without it, whose middles of edges are within half of the tolerance.
-    largest: keep one connected part alone: of a surface that with the largest area, of a closed
-        mesh that with the largest volume, whose cavities stay.
     seed: of the small random moves that keep points in general position.
     max_triangles: of one level set, before anything is simplified; what would take more is not
         begun or given up, with a MeshingError. Cells are limited with them, to two millions.
     progress: told what is being done.
+    options: a `TraceOptions`, of which meshes have the tolerance alone: the largest distance of
+        triangles from the surface, sampled and not proved; None for 1e-3 of the longest side of the
+        level set's box.
+    keywords: those of `Surface` beside a bare field, and `tolerance` in place of `options`.
 
     All that is returned has been checked: every edge has two faces, or one at the boundary, no two
     triangles pass through each other, vertices and centers of triangles are within the tolerance of
@@ -180,51 +177,42 @@ def mesh(
 
     Raises:
         MeshingError: a ValueError, if it could not be done; the message says why.
-        TypeError: a field that has parts; a clip that is no volume.
-        ValueError: options out of range, or that contradict each other; a `Surface` of several
-            levels.
+        TypeError: a field that has patches; a clip that is no volume; an option of traces that
+            meshes do not have; keywords beside an object that holds them.
+        ValueError: options out of range, or that contradict each other; several levels.
     """
-    if isinstance(field, Surface):
-        level, solid = _level_and_solid(field, level, solid)
-        clip = field.clip if clip is None else clip
-        section = field.section if section is None else section
-        field, largest = field.field, largest or field.largest > 0
-    check_volume(clip, "clip")
-    check_volume(section, "section")
-    check_options(tolerance, cell_size, thickness, seed, max_triangles)
-    simplify, largest = flag(simplify, "simplify"), flag(largest, "largest")
+    target, choices = surface_and_options("mesh", surface, options, keywords)
+    choices.refuse_others("mesh", "tolerance")
+    accuracy = MeshTolerance.of(choices)
+    check_options(cell_size, thickness, seed, max_triangles)
+    simplify, largest = flag(simplify, "simplify"), target.largest > 0
     report = teller(progress)
-    if solid is not None and not isinstance(solid, bool):
-        solid = two_numbers(solid)
-    field = _checked(field)
-    if solid is None and isinstance(field, Solid) and thickness is None:
-        solid = True
-    if solid and thickness is not None:
-        raise ValueError("give either solid or thickness, not both: a solid has an inside already")
+    field, level, solid = _checked(target.field), *_level_and_solid(target, thickness)
     is_closed = bool(solid) or thickness is not None
     if simplify and not is_closed:
-        raise ValueError("simplify is for closed meshes: give solid or thickness as well")
-    volume = _volume(field, clip, section)
-    asked = _MeshOptions(volume, tolerance, cell_size, seed, max_triangles, report)
+        raise ValueError('simplify is for closed meshes: give side="below" or thickness as well')
+    volume = _volume(field, target.clip, target.section)
+    asked = _MeshOptions(volume, accuracy, cell_size, seed, max_triangles, report)
     if uses_sign_meshing(field):
         made = _mesh_from_signs(field, level, solid, thickness is not None, asked)
     elif solid:
         made = _mesh_solid(field, level, solid, asked)
     else:
         made = _mesh_level_set(field, level, asked)
-    surface, facts = made.surface, dict(made.facts)
+    triangles, facts = made.surface, dict(made.facts)
     if solid:
-        facts["solid"] = solid
+        facts["side"] = target.side or "below"
     else:
-        surface = largest_component(surface) if largest else surface
-        made.check_level(surface)
+        triangles = largest_component(triangles) if largest else triangles
+        made.check_level(triangles)
+    tolerance = accuracy.at(made.size)
     if thickness is not None:
         report("thickening")
-        normals = vertex_normals(made.function, surface)
-        surface, more = thicken(surface, normals, float(thickness), 0.5 * tolerance * made.size)
+        normals = vertex_normals(made.function, triangles)
+        triangles, more = thicken(triangles, normals, float(thickness), 0.5 * tolerance)
         facts |= more
     if largest and is_closed:
-        surface = largest_body(surface)
+        triangles = largest_body(triangles)
 
     def check(one: TriangleMesh) -> None:
         if solid:
@@ -233,13 +221,13 @@ def mesh(
 
     if not made.is_checked:
         report("checking")
-        check(surface)
-        check_no_self_intersection(surface.vertices, surface.faces)
+        check(triangles)
+        check_no_self_intersection(triangles.vertices, triangles.faces)
     if simplify:
         report("simplifying")
-        surface, more = simplify_mesh(surface, tolerance * made.size, check)
+        triangles, more = simplify_mesh(triangles, tolerance, check)
         facts |= more
-    return to_trimesh(surface, facts, is_closed)
+    return to_trimesh(triangles, facts, is_closed)
 
 
 @dataclass(frozen=True)
@@ -247,7 +235,7 @@ class _MeshOptions:
     """Arguments of `mesh`; volume: what the level set is cut by."""
 
     volume: Volume | None
-    tolerance: float
+    tolerance: MeshTolerance
     spacing: float | None
     seed: int
     most_faces: int
@@ -274,7 +262,7 @@ class _RawMesh:
 def _mesh_from_signs(
     field: Field,
     level: float | None,
-    solid: tuple[float, float] | bool | None,
+    solid: tuple[float, float] | bool,
     is_thick: bool,
     asked: _MeshOptions,
 ) -> _RawMesh:
@@ -308,7 +296,7 @@ def _mesh_from_signs(
                 function(one, side),
                 filled,
                 cells,
-                asked.tolerance * size,
+                asked.tolerance.at(size),
                 attempts,
                 asked.report,
                 closed=closed,
@@ -334,9 +322,9 @@ def _mesh_from_signs(
         if math.isfinite(ends[1]):
             whole = whole - to_manifold(signed(ends[1], -1.0, True))
         if field.has_jumps and len(levels) == 2:
-            _check_has_thickness(field, whole, ends, asked.tolerance * size)
+            _check_has_thickness(field, whole, ends, asked.tolerance.at(size))
         cut = volume or Box(tuple(box.lower.tolist()), tuple(box.upper.tolist()))
-        whole ^= volume_manifold(cut, box.lower, box.upper, 0.5 * asked.tolerance * size)
+        whole ^= volume_manifold(cut, box.lower, box.upper, 0.5 * asked.tolerance.at(size))
         made, is_apart = from_manifold(whole), False
     if not len(made.faces):
         raise MeshingError("the level set is empty: it lies outside of the clip")
@@ -345,7 +333,7 @@ def _mesh_from_signs(
     known = {"level": levels[0], **_merge_facts(facts)}
     if isinstance(field, DipolePotential):
         known["cloud"] = field.describe()
-    is_told = _check_sign_accuracy(field, known, asked.tolerance * size)
+    is_told = _check_sign_accuracy(field, known, asked.tolerance.at(size))
     _warn_of_lost(field, losses, is_told)
     return _RawMesh(made, size, known, function(levels[0], 1.0), _accept, is_apart)
 
@@ -353,7 +341,7 @@ def _mesh_from_signs(
 def _ends_by_signs(
     field: Field,
     level: float | None,
-    solid: tuple[float, float] | bool | None,
+    solid: tuple[float, float] | bool,
     is_thick: bool,
 ) -> tuple[float, float]:
     """The values between which the inside is; of a level set that is not closed those from its
@@ -390,7 +378,7 @@ def _cells_by_signs(field: Field, size: float, spacing: float | None) -> tuple[f
 def _faces_alone(
     field: WindingNumber,
     level: float,
-    solid: tuple[float, float] | bool | None,
+    solid: tuple[float, float] | bool,
     asked: _MeshOptions,
 ) -> _RawMesh:
     """The triangles of a mesh that is its own surface, as they are, but for what the volume cuts.
@@ -485,25 +473,30 @@ def _accept(surface: TriangleMesh) -> None:
 
 
 def _level_and_solid(
-    surface: Surface, level: float | None, solid: tuple[float, float] | bool | None
-) -> tuple[float | None, tuple[float, float] | bool | None]:
-    """The level and the solid to mesh: those that are given, else those of a `Surface`."""
-    if level is not None or not (solid is None or isinstance(solid, bool)):
-        return level, solid
-    if surface.solid is not None and solid is not False:
-        return None, surface.solid
+    surface: Surface, thickness: float | None
+) -> tuple[float | None, tuple[float, float] | bool]:
+    """The level, and the values (low, high) on the closed solid in its place: True for the points
+    of a `Solid`, False for the level set.
+
+    Raises:
+        ValueError: several levels; a solid that is to be thickened.
+    """
+    if thickness is not None and surface.solid_range is not None:
+        raise ValueError("give either side or thickness, not both: a solid has an inside already")
+    if surface.side == "between":
+        return None, surface.level_values  # pyright: ignore[reportReturnType]
     if len(surface.levels) > 1:
-        kind, numbers = (
-            type(surface.field).__name__,
-            ", ".join(f"{x:g}" for x in surface.level_values),
-        )
+        numbers = ", ".join(f"{level:g}" for level in surface.level_values)
         raise ValueError(
-            f"this Surface of a {kind} has {len(surface.levels)} levels ({numbers}) and a mesh is "
-            f"of one: give it beside, as in mesh(surface, level={surface.level_values[0]:g}), one "
-            "after "
-            "the other"
+            f"there are {len(surface.levels)} levels ({numbers}), and a mesh is of one: mesh one "
+            f"after the other, with level={surface.level_values[0]:g} and so on, or the solid "
+            'between two of them (side="between")'
         )
-    return surface.level_values[0], solid
+    level = surface.level_values[0]
+    if isinstance(surface.field, Solid) and surface.side in (None, "below"):
+        return level, thickness is None
+    solid = surface.solid_range
+    return (level, False) if solid is None else (None, solid)
 
 
 def _check_level(
@@ -571,7 +564,7 @@ def _mesh_solid(
         return mesh_angle
 
     def check_level(made: TriangleMesh, size: float) -> None:
-        _check_level(region, made, asked.tolerance * size, asked.volume)
+        _check_level(region, made, asked.tolerance.at(size), asked.volume)
 
     def check(made: TriangleMesh, size: float) -> None:
         check_manifold(made.faces, made.vertices)
@@ -607,7 +600,7 @@ def _mesh_level_set(field: Field, level: float | None, asked: _MeshOptions) -> _
     volume, report = asked.volume, asked.report
     box = _box(field, (level,), volume)
     size = float((box.upper - box.lower).max())
-    error = 0.5 * asked.tolerance * size
+    error = 0.5 * asked.tolerance.at(size)
     cells = size / _ACROSS if asked.spacing is None else float(asked.spacing)
     if asked.spacing is None and field.min_wavelength is not None:
         cells = min(cells, field.min_wavelength / CELLS_PER_WAVE)
@@ -624,7 +617,7 @@ def _mesh_level_set(field: Field, level: float | None, asked: _MeshOptions) -> _
             raise MeshingError("the level set is empty: it lies outside of the clip")
 
     def check_level(one: TriangleMesh) -> None:
-        _check_level(function, one, asked.tolerance * size, volume)
+        _check_level(function, one, asked.tolerance.at(size), volume)
 
     return _RawMesh(made, size, {"level": level, **facts}, function, check_level, False)
 

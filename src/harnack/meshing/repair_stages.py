@@ -16,7 +16,6 @@ proof, and a dent where the surface was round.
 from __future__ import annotations
 
 import dataclasses
-import math
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -54,8 +53,10 @@ from harnack.meshing.joined_pieces import passes_itself
 from harnack.meshing.lattice_meshing import TriangleMesh
 from harnack.meshing.mesh_cleaning import CleanedMesh, clean_and_fill, weld_near_corners
 from harnack.meshing.mesh_pipeline import mesh as mesh_of
+from harnack.meshing.mesh_tolerance import MeshTolerance
 from harnack.name_suggestions import is_one_of
 from harnack.progress import teller
+from harnack.tracer import TraceOptions
 
 if TYPE_CHECKING:
     import trimesh
@@ -85,10 +86,11 @@ def repair(
     keep: Keep | None = None,
     filling: Patches = "smooth",
     largest: bool = False,
-    tolerance: float = 1e-3,
     cell_size: float | None = None,
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
+    options: TraceOptions | None = None,
+    tolerance: float | None = None,
 ) -> trimesh.Trimesh:
     """Return a closed mesh for a damaged one: with its holes filled, or remeshed.
 
@@ -124,12 +126,13 @@ def repair(
         boundary loops of a gap between two components, and have a dent where the surface was
         round. Only for harmonic fillings is it proved which surface they approximate.
     largest: keep only the body of the largest volume, with its cavities.
-    tolerance: how far harmonic fillings may be from the surface w = 1/2, relative to the size of
-        the box around all holes, and remeshed triangles, relative to the size of the mesh; sampled
-        and not proved.
     cell_size: of cells before anything is refined, in the mesh's unit; None chooses.
     seed: of the small random moves that keep points in general position.
     progress: told what is being done.
+    options: a `TraceOptions`, of which repairs have the tolerance alone: the largest distance of
+        harmonic fillings and of remeshed triangles from the surface w = 1/2, a length, sampled and
+        not proved. None is 1e-3 of the longest side of the box of the mesh and, for fillings, of
+        the box around all holes. tolerance: the same, in place of `options`.
 
     Returns:
         A closed trimesh.Trimesh: every edge has two faces, which agree. `metadata["harnack"]` has
@@ -181,7 +184,13 @@ def repair(
             cells.
     """
     largest = flag(largest, "largest")
-    asked = _checked_settings(keep, filling, tolerance, cell_size, seed, teller(progress))
+    if options is None:
+        options = TraceOptions(tolerance=tolerance)
+    elif tolerance is not None:
+        raise TypeError("tolerance: give it in options, or without options")
+    options.refuse_others("repair", "tolerance")
+    accuracy = MeshTolerance.of(options)
+    asked = _checked_settings(keep, filling, accuracy, cell_size, seed, teller(progress))
     _check_is_mesh(mesh)
     _check_encloses(mesh)
     intended = IntendedSolid.of(mesh, as_it_is=keep == "all")
@@ -204,7 +213,7 @@ def repair(
             asked.report(f"{error}; so not all is kept")
             continue
         asked.report("comparing with what was given")
-        away = 2 * tolerance * intended.size + facts.get("moved", 0.0)
+        away = 2 * accuracy.at(intended.size) + facts.get("moved", 0.0)
         results.append(_Result(surface, facts, intended.difference(surface, away)))
         if results[-1].difference is None:
             break
@@ -212,7 +221,7 @@ def repair(
         asked.report(f"{reasons[-1]}; so another way")
     best = min(results, key=lambda result: result.badness)
     moved = best.facts.get("moved", 0.0)
-    if moved > 2 * tolerance * intended.size:
+    if moved > 2 * accuracy.at(intended.size):
         warnings.warn(
             f"faces that were apart were joined, which moved corners by up to {moved:.3g}: the "
             "repaired mesh may be off by as much",
@@ -229,7 +238,7 @@ class _RepairOptions:
 
     keep: Keep | None
     patches: Patches
-    tolerance: float
+    tolerance: MeshTolerance
     spacing: float | None
     seed: int
     report: Callable[[str], None]
@@ -238,7 +247,7 @@ class _RepairOptions:
 def _checked_settings(
     keep: Keep | None,
     patches: Patches,
-    tolerance: float,
+    tolerance: MeshTolerance,
     spacing: float | None,
     seed: int,
     report: Callable[[str], None],
@@ -246,8 +255,8 @@ def _checked_settings(
     if keep is not None and not is_one_of(keep, ("all", "valid", "none")):
         raise ValueError(f'keep is None, "all", "valid" or "none", not {keep!r}')
     if not is_one_of(patches, ("smooth", "harmonic")):
-        raise ValueError(f'patches are "smooth" or "harmonic", not {patches!r}')
-    check_options(tolerance, spacing, None, seed, 1)
+        raise ValueError(f'filling is "smooth" or "harmonic", not {patches!r}')
+    check_options(spacing, None, seed, 1)
     return _RepairOptions(keep, patches, tolerance, spacing, seed, report)
 
 
@@ -349,7 +358,7 @@ def _unite_bodies(
     if _is_fine(vertices, faces):
         raise MeshError("nothing of it passes through or lies in itself")
     facts = {"stage": "boolean_union", "kept": 0}
-    slivers = 0.5 * asked.tolerance * intended.size
+    slivers = 0.5 * asked.tolerance.at(intended.size)
     if len(intended.parts) > 1 and sum(map(len, intended.parts)) == len(faces):
         asked.report(f"uniting {len(intended.parts):,} parts")
         try:
@@ -411,7 +420,7 @@ def _by_signs(
     field: WindingNumber, spacing: float, asked: _RepairOptions, most: int = 2_000_000
 ) -> trimesh.Trimesh:
     return mesh_of(
-        field, solid=(0.5, math.inf), tolerance=asked.tolerance, cell_size=spacing,
+        field, level=0.5, side="above", tolerance=asked.tolerance.length, cell_size=spacing,
         max_triangles=most, progress=asked.report,
     )  # fmt: skip
 

@@ -56,7 +56,7 @@ def check_ray_samples(
     points: FloatArray,
     *,
     rng: np.random.Generator | int = 0,
-    bound: EnclosureChoice = None,
+    enclosures: EnclosureChoice = None,
     precision: Precision = "double",
 ) -> None:
     """Test the enclosures that a field gives along random directions from points (n, 3).
@@ -81,7 +81,7 @@ def check_ray_samples(
         gaps[without < 2, without[without < 2]] = np.inf
         steps = proved_free_lengths(
             field, points, directions if forwards else -directions, ahead, gaps,
-            bound=bound, precision=precision, forwards=forwards,
+            enclosures=enclosures, precision=precision, forwards=forwards,
         )  # fmt: skip
         lengths = np.minimum(steps, 2 * ahead)[:, None] * np.linspace(0, 1, _SAMPLES)
         path = lift_along_rays(field, points, directions, lengths)
@@ -103,7 +103,7 @@ def proved_free_lengths(
     ahead: FloatArray,
     gaps: FloatArray,
     *,
-    bound: EnclosureChoice = None,
+    enclosures: EnclosureChoice = None,
     precision: Precision = "double",
     forwards: bool = True,
 ) -> FloatArray:
@@ -116,13 +116,13 @@ def proved_free_lengths(
     """
     backend = choose_backend(precision)
     path = Ray(
-        to_vector3(backend, points), to_vector3(backend, directions), choose_enclosures(bound)
+        to_vector3(backend, points), to_vector3(backend, directions), choose_enclosures(enclosures)
     )
     length = backend.Float(np.ascontiguousarray(ahead))
     down, up = (backend.Float(np.ascontiguousarray(gaps[:, k])) for k in (0, 1))
     look = field.prepare(backend).sample_ray(path, backend.Float(0), length, length)
-    enclosures = look.forward if forwards else look.backward
-    steps = to_numpy(longest_free_length(enclosures, LevelGaps(down, up)) + 0 * down)
+    proofs = look.forward if forwards else look.backward
+    steps = to_numpy(longest_free_length(proofs, LevelGaps(down, up)) + 0 * down)
     return np.broadcast_to(steps, len(points)).astype(np.float64)
 
 

@@ -1,12 +1,14 @@
-"""First hits of rays with level sets, every step proved."""
+"""First hits and crossings of rays with level sets, every step proved."""
 
 from __future__ import annotations
 
-from harnack.tracer.crossings import RayCrossings
 from harnack.tracer.hits import Hits, trace
 from harnack.tracer.level_contact import HitTolerance, RayStatus
-from harnack.tracer.surface import Surface, level_set
+from harnack.tracer.ray_crossings import RayCrossings, crossings
+from harnack.tracer.surface import Side, Surface
 from harnack.tracer.surface_tracer import MarchResult, SurfaceTracer
+from harnack.tracer.trace_options import TraceKeywords, TraceOptions
+from harnack.tracer.traced_surface import TracedSurface, traced_surface
 
 __all__ = [
     "HitTolerance",
@@ -14,8 +16,13 @@ __all__ = [
     "MarchResult",
     "RayCrossings",
     "RayStatus",
+    "Side",
     "Surface",
     "SurfaceTracer",
-    "level_set",
+    "TraceKeywords",
+    "TraceOptions",
+    "TracedSurface",
+    "crossings",
     "trace",
+    "traced_surface",
 ]

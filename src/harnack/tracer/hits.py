@@ -7,38 +7,33 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal, cast, overload
+from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 import numpy as np
 
-from harnack.backend import backend_of, choose_backend, to_float, to_numpy, to_vector3
-from harnack.backend.arrays import as_kernel_parameters
-from harnack.backend.elementary import fmax, max_norm, safe_normalize
+from harnack.backend import to_numpy
+from harnack.backend.elementary import fmax, max_norm
 from harnack.backend.elementary import safe_norm as norm
 from harnack.backend.loops import compute_on_active
-from harnack.backend.tensors import array_to_tensor, is_tensor, tensor_to_array, tensor_to_vectors
+from harnack.backend.tensors import array_to_tensor, is_tensor
 from harnack.cluster.dask_arrays import accepts_dask_arrays
-from harnack.name_suggestions import is_one_of
-from harnack.tracer.crossings import (
-    RayCrossings,
-    check_all_hits,
-    crossings_to_numpy,
-    empty_crossings,
-    trace_crossings,
-)
 from harnack.tracer.derivatives import attach_derivatives, needs_derivatives, refuse_derivative
 from harnack.tracer.doubtful import Doubtful, seen_distance
 from harnack.tracer.level_contact import HitTolerance, RayStatus
-from harnack.tracer.surface import Surface, level_set
+from harnack.tracer.rays import RayBatch
+from harnack.tracer.trace_options import shows_keywords, surface_and_options
+from harnack.tracer.traced_surface import TracedSurface, check_is_open
 from harnack.webgpu import evaluate_on_device, find_device
 
 if TYPE_CHECKING:
-    from harnack.backend import Backend, FloatArray, IntArray, Mask, Precision, Real, Vec3
-    from harnack.enclosures import EnclosureChoice
+    from typing_extensions import Unpack
+
+    from harnack.backend import Backend, FloatArray, IntArray, Mask, Real, Vec3
     from harnack.fields.field import Field
-    from harnack.geometry import Volume
+    from harnack.tracer.surface import Surface
     from harnack.tracer.surface_tracer import MarchResult, SurfaceTracer
+    from harnack.tracer.trace_options import TraceKeywords, TraceOptions
     from harnack.webgpu import Arrays
 
 # From so many rays on it pays to look for empty cells first.
@@ -88,7 +83,7 @@ class Hits:
         error. It is infinite if the surface was not seen within a sixteenth of the size of
         coordinates. (The evaluations of this search are not in `evaluations`.) Along a ray that
         grazes such a point, t may be too small by more than the uncertainty: the ray is not proved
-        free any farther. Use `precision="double"`, or `confirm`.
+        free any farther. Use `precision="double"`, or `require_crossing`.
     """
 
     t: Any
@@ -106,252 +101,94 @@ class Hits:
         return self.status == int(RayStatus.HIT)
 
 
-@overload
-def trace(
-    field: Field | Surface,
-    origins: Any,
-    directions: Any,
-    *,
-    level: Any = None,
-    t_min: Any = 0.0,
-    t_max: Any = math.inf,
-    tolerance: float | HitTolerance = 1e-4,
-    max_steps: int = 2000,
-    bound: EnclosureChoice = None,
-    clip: Volume | None = None,
-    section: Volume | None = None,
-    largest: bool | int = False,
-    overstep: float | None = None,
-    precision: Precision | None = None,
-    confirm: bool = False,
-    all_hits: None = None,
-    backend: Literal["webgpu"] | None = None,
-) -> Hits: ...
-
-
-@overload
-def trace(
-    field: Field | Surface,
-    origins: Any,
-    directions: Any,
-    *,
-    level: Any = None,
-    t_min: Any = 0.0,
-    t_max: Any = math.inf,
-    tolerance: float | HitTolerance = 1e-4,
-    max_steps: int = 2000,
-    bound: EnclosureChoice = None,
-    clip: Volume | None = None,
-    section: Volume | None = None,
-    largest: bool | int = False,
-    overstep: float | None = None,
-    precision: Precision | None = None,
-    confirm: bool = False,
-    all_hits: int,
-    backend: None = None,
-) -> RayCrossings: ...
-
-
 @accepts_dask_arrays("origins", "directions", "t_min", "t_max")
+@shows_keywords()
 def trace(
-    field: Field | Surface,
+    surface: Field | Surface,
     origins: Any,
     directions: Any,
     *,
-    level: Any = None,
     t_min: Any = 0.0,
     t_max: Any = math.inf,
-    tolerance: float | HitTolerance = 1e-4,
-    max_steps: int = 2000,
-    bound: EnclosureChoice = None,
-    clip: Volume | None = None,
-    section: Volume | None = None,
-    largest: bool | int = False,
-    overstep: float | None = None,
-    precision: Precision | None = None,
-    confirm: bool = False,
-    all_hits: int | None = None,
-    backend: Literal["webgpu"] | None = None,
-) -> Hits | RayCrossings:
+    options: TraceOptions | None = None,
+    **keywords: Unpack[TraceKeywords],
+) -> Hits:
     """First hits of rays with a level set of a field. No hit is missed: every step is proved.
 
-    field: the field to trace; or a `Surface`, which then holds all the settings.
+    surface: a field, or a `Surface`: its levels, clip, section and largest component. `side` is
+        refused: the faces of a solid on its clip are no level set.
     origins, directions: (n, 3) array-likes or Dr.Jit tensors (one of them may be (1, 3)), or Dr.Jit
         3-vectors. Directions need not have length 1; t counts multiples of the *unit* direction, so
         it is a length.
-    level: level or levels; None for the field's default. May be a Dr.Jit number.
     t_min, t_max: (n,) or a number. With an infinite t_max, a ray that leaves the proved extent of
         the surface is a proved miss.
-    tolerance: a length, or a `HitTolerance`. In single precision not below about 1e-6 of the
-        size of the coordinates.
-    bound: the proofs to use: None for all that pay; "classic" for the published rule, "slope",
-        "caps", "curvature", "lipschitz"; or classes of enclosures, such as
-        `harnack.SphericalCapEnclosure`.
-    clip, section: volumes with which the surface is intersected.
-    largest: trace only the largest component of the surface within domain and clip, as far as
-        components are separated by cells proved empty. True for 128 cells along the longest side of
-        the box, or their number. Rays that start so far away that rounding is more than a part of a
-        cell are out of steps.
-    precision: "single" or "double" for NumPy input; Dr.Jit input keeps its own precision.
+    options: a `TraceOptions`.
+    keywords: those of `Surface` beside a bare field, and of `TraceOptions` in place of `options`:
+        `trace(field, o, d, level=2.0, tolerance=1e-6)`.
 
-    confirm: a hit counts only if f passes to the other side of the level: a ray that comes within
-        the tolerance of a level and turns back does not hit it. The hit is then at a root. The
-        guarantees are those of `all_hits`.
-    all_hits: the number of crossings of each ray to return, in order, as `RayCrossings`. If f goes
-        farther than the tolerance to both sides of the level, the crossing is not missed, and no
-        crossing is counted twice. Touching a level without passing to its other side is no
-        crossing, and neither is starting on it. If levels are closer in value than four tolerances,
-        a quarter of their distance is the tolerance; rays run out of steps if that is below
-        rounding. Otherwise the tolerance is at least eight times the rounding error of f, in single
-        precision about 1e-5 of the size of the coordinates: if f goes less far than that to one
-        side, the crossing may not count. `max_steps` is for the whole ray.
-
-    backend: "webgpu" traces NumPy rays in single precision on any GPU of the system, by the package
-        `wgpu` (`pip install harnack[webgpu]`), with a translation of the kernel that Dr.Jit
-        records. Rounding is proved for Dr.Jit's own backends only; so at each call up to 4,096 of
-        the rays are traced there, too, and the device must agree.
+    Arrays of float64 are traced in double precision and give such arrays, others in single
+    precision, unless `precision` says otherwise. Crossing rays behind their first hit are for
+    `crossings`.
 
     With Dr.Jit rays, t and position carry derivatives with respect to rays, level, and vertices of
     a `SolidAngle`, if these have derivatives enabled (implicit differentiation at the hit). The
     other results have no derivatives: in reverse mode, using theirs raises NotImplementedError; in
     forward mode they are NaN. Fields of other numbers with derivatives enabled are refused.
 
+    With `backend="webgpu"`, NumPy rays are traced in single precision by the package `wgpu`
+    (`pip install harnack[webgpu]`) with a translation of the kernel that Dr.Jit records. Rounding
+    is proved for Dr.Jit's own backends only; so at each call up to 4,096 of the rays are traced
+    there, too, and the device must agree.
+
     On processors, if there are at least 4,096 rays and neighbors have little to do with each other,
     rays are traced by few lanes that share a queue, unless samples are cheap (`Field.is_cheap`).
-    This gives the same hits, bit by bit, in about half the time.
+    This gives the same hits, bit by bit, in about half the time. Rays that start so far from a
+    `largest` component that rounding is more than a part of a cell are out of steps.
 
-    Raises ValueError or TypeError for shapes that do not match, NaN, directions of length zero,
-    an empty or negative interval, or a level that no surface has. With a backend, RuntimeError if
-    there is no device or the device disagrees; NotImplementedError for a field whose kernel is not
-    translated.
+    Raises:
+        TypeError, ValueError: shapes that do not match, NaN, directions of length zero, an empty or
+            negative interval, a level that no surface has; keywords beside an object that holds
+            them.
+        RuntimeError: with a backend, there is no device, or the device disagrees.
+        NotImplementedError: with a backend, a field whose kernel is not translated.
     """
-    if backend is not None:
-        _check_backend(backend, (origins, directions, t_min, t_max), precision, all_hits)
-    surface = (
-        field
-        if isinstance(field, Surface)
-        else level_set(
-            field, level, clip=clip, section=section, largest=largest,
-            tolerance=tolerance, max_steps=max_steps, bound=bound, overstep=overstep,
-            confirm=confirm,
-        )
-    )  # fmt: skip
-    k = None if all_hits is None else check_all_hits(all_hits, surface)
-    if any(is_tensor(a) for a in (origins, directions)):
-        return _trace_tensors(surface, origins, directions, t_min, t_max, precision, k)
-    given = [a for a in (origins, directions) if dr.is_array_v(type(a))]
-    if given and precision is not None:
-        raise ValueError("precision follows Dr.Jit rays; give it only with NumPy ones")
-    own = (
-        backend_of(given[0])
-        if given
-        else choose_backend("single" if precision is None else precision)
-    )
-    o, d, near, far = _rays(own, origins, directions, t_min, t_max)
-    n = max(dr.width(array) for array in (o, d, near, far))
-    if min(dr.width(array) for array in (o, d, near, far)) == 0:
-        n = 0
-    if k is not None:
-        all_of_them = empty_crossings(own)
-        if n > 0:
-            all_of_them = trace_crossings(
-                surface, own, o, d, near, far, k, differentiable=bool(given)
-            )
-        return all_of_them if given else crossings_to_numpy(all_of_them, n, k)
-    if n == 0:
-        return _no_hits(own, as_numpy=not given)
-    if backend is not None:
-        return _trace_on_device(surface, own, (o, d, near, far), n)
-    hits = _trace(surface, own, o, d, near, far, differentiable=bool(given))
-    return hits if given else _as_numpy(hits, max(dr.width(o), dr.width(d), dr.width(near)))
+    target, choices = surface_and_options("trace", surface, options, keywords)
+    check_is_open("trace", target)
+    traced = TracedSurface.of(target, choices)
+    if choices.backend is not None:
+        if any(is_tensor(a) or dr.is_array_v(type(a)) for a in (origins, directions, t_min, t_max)):
+            raise TypeError('backend="webgpu" takes rays as NumPy arrays: Dr.Jit\'s have a backend')
+        rays = RayBatch.of(origins, directions, t_min, t_max, "single")
+        return _trace_on_device(traced, rays) if rays.count else _no_hits(rays)
+    rays = RayBatch.of(origins, directions, t_min, t_max, choices.precision)
+    if rays.count == 0:
+        return _no_hits(rays)
+    hits = _trace(traced, rays)
+    if rays.is_numpy:
+        return _as_numpy(hits, rays.count)
+    return _as_tensors(hits) if rays.is_tensor else hits
 
 
-def _trace_tensors(
-    surface: Surface,
-    origins: Any,
-    directions: Any,
-    t_min: Any,
-    t_max: Any,
-    precision: Precision | None,
-    k: int | None,
-) -> Any:
-    """The result of `trace` for rays that are tensors, or some of which are: tensors of the shapes
-    of `Hits`, or of `RayCrossings` for k crossings a ray."""
-    rays = {"origins": origins, "directions": directions}
-    vectors = [tensor_to_vectors(a, name) if is_tensor(a) else a for name, a in rays.items()]
-    ends = {"t_min": t_min, "t_max": t_max}
-    near, far = (tensor_to_array(a, name) if is_tensor(a) else a for name, a in ends.items())
-    hits = trace(
-        surface, *vectors, t_min=near, t_max=far, precision=precision, all_hits=cast("int", k)
-    )
+def _as_tensors(hits: Hits) -> Hits:
     n = dr.width(hits.status)
-    if k is None:
-        return Hits(*(array_to_tensor(value, (n,)) for value in vars(hits).values()))
-    of_rays = {"count", "traced_to", "status", "evaluations"}
-    shapes = {name: (n,) if name in of_rays else (n, k) for name in vars(hits)}
-    return RayCrossings(
-        *(array_to_tensor(getattr(hits, name), shape) for name, shape in shapes.items())
-    )
+    return Hits(*(array_to_tensor(array, (n,)) for array in vars(hits).values()))
 
 
-def _rays(
-    backend: Backend, origins: Any, directions: Any, t_min: Any, t_max: Any
-) -> tuple[Vec3, Vec3, Real, Real]:
-    o = as_kernel_parameters(to_vector3(backend, origins, "origins"))
-    d = as_kernel_parameters(to_vector3(backend, directions, "directions"))
-    near, far = to_float(backend, t_min, "t_min"), to_float(backend, t_max, "t_max")
-    widths = {"origins": o, "directions": d, "t_min": near, "t_max": far}
-    lengths = {name: dr.width(array) for name, array in widths.items()}
-    n = max(lengths.values()) if min(lengths.values()) > 0 else 0
-    for name, length in lengths.items():
-        if length not in (1, n):
-            raise ValueError(f"{name} has {length} entries, the others have {n}; give 1 or {n}")
-    if not n:
-        return o, d, near, far
-    if not dr.is_array_v(type(directions)):
-        _check_numpy_rays(to_numpy(max_norm(d)), to_numpy(near), to_numpy(far))
-    return o, safe_normalize(d), near, far
-
-
-def _check_numpy_rays(largest: Any, near: Any, far: Any) -> None:
-    zero = np.flatnonzero(~(largest >= np.finfo(largest.dtype).smallest_normal))
-    if zero.size:
-        raise ValueError(
-            f"directions: entry {zero[0]} has length zero, or is shorter than the smallest number "
-            "that this precision holds; a ray needs a direction"
-        )
-    if (near < 0).any():
-        raise ValueError("t_min must be >= 0: rays run forwards")
-    empty = np.flatnonzero(~(near <= far))
-    if empty.size:
-        raise ValueError(f"t_max is smaller than t_min for ray {empty[0]}: swap them")
-
-
-def _trace(
-    surface: Surface,
-    backend: Backend,
-    o: Vec3,
-    d: Vec3,
-    near: Real,
-    far: Real,
-    *,
-    differentiable: bool,
-) -> Hits:
-    count = dr.width(o, d)
+def _trace(surface: TracedSurface, rays: RayBatch) -> Hits:
+    """The hits, as Dr.Jit arrays; with derivatives if the rays came as such."""
+    backend, o, d, count = rays.backend, rays.origin, rays.direction, rays.count
     prepared = surface.for_rays(count).prepare(backend, many=count >= _MIN_RAYS_FOR_CELLS)
     if not prepared.field.is_cheap and _are_scattered(backend, dr.detach(o), dr.detach(d)):
         prepared = replace(prepared, uses_ray_queue=True)
     with dr.suspend_grad():
-        origin, direction = dr.detach(o), dr.detach(d)
-        rays = origin, direction, dr.detach(near), dr.detach(far)
-        end, hits, doubt = _first_hits(prepared, *rays)
+        end, hits, doubt = _first_hits(prepared, *(dr.detach(array) for array in rays.arrays))
         if doubt is not None:
             hits = _with_seen_distances(prepared, hits, doubt)
-    if differentiable and needs_derivatives(prepared, o, d):
+    if not rays.is_numpy and needs_derivatives(prepared, o, d):
         t, normal = attach_derivatives(prepared, o, d, end, hits.normal)
         normal, value, uncertainty = (
-            refuse_derivative(prepared, o, d, name, one)
-            for name, one in (
+            refuse_derivative(prepared, o, d, name, array)
+            for name, array in (
                 ("normal", normal), ("value", hits.value), ("uncertainty", hits.uncertainty),
             )
         )  # fmt: skip
@@ -490,26 +327,12 @@ def _positions(o: Vec3, d: Vec3, t: Real) -> Vec3:
 # Tracing on other GPUs, by WebGPU.
 
 
-def _check_backend(
-    backend: str, rays: tuple[Any, ...], precision: Precision | None, all_hits: int | None
-) -> None:
-    if not is_one_of(backend, ("webgpu",)):
-        raise ValueError(
-            f'backend is "webgpu", or nothing for the one that Dr.Jit has, not {backend!r}'
-        )
-    if any(is_tensor(one) or dr.is_array_v(type(one)) for one in rays):
-        raise TypeError('backend="webgpu" takes rays as NumPy arrays: Dr.Jit\'s have a backend')
-    if precision not in (None, "single"):
-        raise ValueError('backend="webgpu" computes in single precision alone')
-    if all_hits is not None:
-        raise NotImplementedError('backend="webgpu" finds first hits alone: leave out all_hits')
-
-
-def _trace_on_device(surface: Surface, backend: Backend, rays: tuple[Any, ...], count: int) -> Hits:
-    prepared = surface.prepare(backend, many=count >= _MIN_RAYS_FOR_CELLS)
+def _trace_on_device(surface: TracedSurface, rays: RayBatch) -> Hits:
+    count = rays.count
+    prepared = surface.prepare(rays.backend, many=count >= _MIN_RAYS_FOR_CELLS)
     lanes = {
-        name: one + dr.zeros(type(one), count)
-        for name, one in zip(("o", "d", "near", "far"), rays, strict=True)
+        name: array + dr.zeros(type(array), count)
+        for name, array in zip(("o", "d", "near", "far"), rays.arrays, strict=True)
     }
     dr.eval(lanes)
 
@@ -518,9 +341,9 @@ def _trace_on_device(surface: Surface, backend: Backend, rays: tuple[Any, ...], 
 
     directions = to_numpy(lanes["d"])
 
-    def differences(rows: IntArray, expected: Arrays, found: Arrays) -> str:
-        given = Hits(**expected), Hits(**found)
-        return _compare_hits(*given, directions[rows], surface.tolerance)
+    def differences(rows: IntArray, expected: Arrays, computed: Arrays) -> str:
+        both = Hits(**expected), Hits(**computed)
+        return _compare_hits(*both, directions[rows], surface.hit_tolerance)
 
     found = evaluate_on_device(find_device(), compute, lanes, prepared, differences)
     return _as_numpy(Hits(**found), count)
@@ -579,12 +402,15 @@ def _compare_hits(
     return ""
 
 
-def _no_hits(backend: Backend, *, as_numpy: bool) -> Hits:
+def _no_hits(rays: RayBatch) -> Hits:
+    backend = rays.backend
     number, vector = dr.zeros(backend.Float, 0), dr.zeros(backend.Array3f, 0)
     count = dr.zeros(backend.UInt32, 0)
     sheet = dr.zeros(backend.Int32, 0)
     hits = Hits(number, vector, vector, number, count, count, sheet, number)
-    return _as_numpy(hits, 0) if as_numpy else hits
+    if rays.is_numpy:
+        return _as_numpy(hits, 0)
+    return _as_tensors(hits) if rays.is_tensor else hits
 
 
 def _as_numpy(hits: Hits, n: int) -> Hits:

@@ -210,7 +210,7 @@ class March:
     """The parameters of the march: the levels, the hit tolerance and the lengths of trial steps.
 
     max_steps: the number of evaluations of f after which a ray is out of steps.
-    overstep: trial steps are at most this many times as long as the proved steps.
+    over_relaxation: trial steps are at most this many times as long as the proved steps.
     hysteresis: for rays that end where they have crossed a level, and not where they reach it.
     cone_radius: for cones that end where they come near a level (`pixel_cones`): their radius per
         unit of t.
@@ -226,7 +226,7 @@ class March:
     levels: Levels
     tolerance: PreparedHitTolerance
     max_steps: Any
-    overstep: float
+    over_relaxation: float
     hysteresis: Hysteresis | None = None
     cone_radius: Real | None = None
     occupied: EmptySpaceGrid | None = None
@@ -511,7 +511,7 @@ class March:
         """Whether the ray is proved free up to the trial point, by a sample that is not too coarse;
         the accuracy scale of the next sample; and whether this sample was too coarse."""
         accepted = now.trial_step <= now.proved_step
-        if self.overstep > 1:
+        if self.over_relaxation > 1:
             knows_side = seen.accepts_unknown_side | (seen.gaps.nearest > seen.total_error)
             covered = any_is_free(
                 seen.look.backward, seen.gaps.reduced_by(seen.total_error), seen.unproved_length
@@ -707,7 +707,7 @@ class March:
             target = _TRIAL_AIM * dr.select(root >= 0, 2 * gap / (rate + dr.sqrt(root)), dr.inf)
         else:
             target = _AIM_BY_SLOPE * dr.select(rate > 0, gap / rate, dr.inf)
-        return fmin(self.overstep * forward, fmax(target, forward))
+        return fmin(self.over_relaxation * forward, fmax(target, forward))
 
     def _second_derivative(self, look: RaySample, now: MarchState, path: Ray) -> Real:
         """The second derivative, at the trial point, of the cubic with the values and slopes of f

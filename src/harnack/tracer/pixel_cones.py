@@ -101,7 +101,7 @@ class PixelCones:
         )  # fmt: skip
         within = _WITHIN_APPROXIMATE if prepared.field.has_variable_accuracy else _WITHIN
         tolerance = PreparedHitTolerance(real(0), within * self.radius, real(0))
-        settings = prepared.levels, tolerance, prepared.max_steps, prepared.overstep
+        settings = prepared.levels, tolerance, prepared.max_steps, prepared.over_relaxation
         march = March(backend, *settings, cone_radius=self.radius)
         now = march.advance(prepared.field, path, real(end), state)
         met = now.status == int(RayStatus.HIT)

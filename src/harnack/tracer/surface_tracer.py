@@ -240,7 +240,7 @@ class SurfaceTracer:
     proofs: EnclosureKinds
     tolerance: PreparedHitTolerance
     max_steps: Any
-    overstep: float
+    over_relaxation: float
     require_crossing: bool = False
     region: Volume | None = None
     occupied: EmptySpaceGrid | None = None
@@ -382,7 +382,7 @@ class SurfaceTracer:
             self.levels,
             self.tolerance,
             self.max_steps,
-            self.overstep,
+            self.over_relaxation,
             hysteresis,
             occupied=occupied,
             ray_end=end,

@@ -165,7 +165,7 @@ class JumpTracer:
             samples_end = self.march.hysteresis.must_sample_end(now.contact, stop)
             goes_on |= samples_end & (now.proved_to < stop)
         active = now.active & (stops | goes_on)
-        step = fmin(self.march.overstep * now.proved_step, stop - now.proved_to)
+        step = fmin(self.march.over_relaxation * now.proved_step, stop - now.proved_to)
         now = dataclasses.replace(now, trial_step=step, active=active)
         field = self.field.continuation(o, d, behind, ahead, outer.offset)
         now = self.march.advance(field, self.path, stop, now, ahead)

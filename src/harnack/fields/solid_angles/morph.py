@@ -95,7 +95,7 @@ class Morph(BatchedField):
         )
 
     def quadrature_displacement(
-        self, points: Any, *, precision: Precision = "single"
+        self, points: Any, *, precision: Precision | None = None
     ) -> FloatArray:
         """A bound (n,), to first order, of the distance of the surface through points (n, 3) from
         the surface of the integral over the triangles, in the unit of the meshes; 0 at the ends.

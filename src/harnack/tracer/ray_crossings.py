@@ -1,4 +1,5 @@
-"""All crossings of rays with level sets: `trace(..., all_hits=k)`.
+"""The function `crossings`, which gives the crossings of rays with a surface, and its result
+`RayCrossings`.
 
 `find_crossings` finds them one after the other while a kernel is recorded. `RayCrossings` is the
 result for users: NumPy arrays for NumPy rays, Dr.Jit arrays for Dr.Jit rays.
@@ -7,6 +8,7 @@ result for users: NumPy arrays for NumPy rays, Dr.Jit arrays for Dr.Jit rays.
 from __future__ import annotations
 
 import dataclasses
+import math
 import operator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -18,17 +20,26 @@ from harnack.backend import to_numpy
 from harnack.backend.arrays import gather_vectors
 from harnack.backend.elementary import safe_norm as norm
 from harnack.backend.loops import loop_while_active
+from harnack.backend.tensors import array_to_tensor
+from harnack.cluster.dask_arrays import accepts_dask_arrays
 from harnack.fields.capabilities import NO_FACET
 from harnack.tracer.derivatives import attach_derivatives, needs_derivatives, refuse_derivative
 from harnack.tracer.level_contact import Contact, RayStatus
+from harnack.tracer.rays import RayBatch
 from harnack.tracer.surface_tracer import MarchResult
+from harnack.tracer.trace_options import shows_keywords, surface_and_options
+from harnack.tracer.traced_surface import TracedSurface, check_is_open
 from harnack.tracer.walks import JumpTracer, JumpTraceState
 
 if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
     from harnack.backend import Backend, Mask, Real, Vec3
+    from harnack.fields.field import Field
     from harnack.tracer.march import MarchState
     from harnack.tracer.surface import Surface
     from harnack.tracer.surface_tracer import SurfaceTracer
+    from harnack.tracer.trace_options import TraceKeywords, TraceOptions
 
 
 @dataclass(frozen=True)
@@ -156,7 +167,7 @@ def find_crossings(
 
 @dataclass(frozen=True)
 class RayCrossings:
-    """The first k crossings of n rays with the level set, in order: `trace(..., all_hits=k)`.
+    """The first k crossings of n rays with the level set, in order.
 
     As NumPy arrays, or as tensors if the rays were; if they were Dr.Jit arrays, as Dr.Jit arrays,
     in which (n, k) is flat: crossing j of ray i is at i k + j.
@@ -191,43 +202,85 @@ class RayCrossings:
     evaluations: Any
 
 
-def check_all_hits(all_hits: Any, surface: Surface) -> int:
-    """The number of crossings to return for each ray, validated.
+@accepts_dask_arrays("origins", "directions", "t_min", "t_max")
+@shows_keywords("largest", "require_crossing", "backend")
+def crossings(
+    surface: Field | Surface,
+    origins: Any,
+    directions: Any,
+    *,
+    max_crossings: int,
+    t_min: Any = 0.0,
+    t_max: Any = math.inf,
+    options: TraceOptions | None = None,
+    **keywords: Unpack[TraceKeywords],
+) -> RayCrossings:
+    """The first crossings of rays with a level set of a field, in order.
+
+    If f goes farther than the tolerance to both sides of the level, the crossing is not missed, and
+    no crossing is counted twice. Touching a level without passing to its other side is no crossing,
+    and neither is starting on it. If levels are closer in value than four tolerances, a quarter of
+    their distance is the tolerance; rays run out of steps if that is below rounding. Otherwise the
+    tolerance is at least eight times the rounding error of f, in single precision about 1e-5 of the
+    size of the coordinates: if f goes less far than that to one side, the crossing may not count.
+
+    surface, origins, directions, t_min, t_max, options, keywords: as in `trace`, but for `side`,
+        `largest`, `require_crossing` and `backend`, which crossings do not have. `max_steps` is for
+        the whole ray.
+    max_crossings: the number of crossings of each ray to return, at least 1.
+
+    With Dr.Jit rays, t and position carry derivatives as those of `trace` do.
 
     Raises:
-        TypeError: not an integer.
-        ValueError: less than 1; or several levels of a field with jumps.
+        TypeError, ValueError: as `trace`; also for several levels of a field with jumps.
+        NotImplementedError: a field with patches.
     """
+    target, choices = surface_and_options("crossings", surface, options, keywords)
+    choices.refuse_others("crossings", "tolerance", "enclosures", "max_steps", "over_relaxation",
+                          "precision")  # fmt: skip
+    check_is_open("crossings", target)
+    traced = TracedSurface.of(target, choices)
+    k = _check_count(max_crossings)
+    traced.validate_crossings("crossings")
+    rays = RayBatch.of(origins, directions, t_min, t_max, choices.precision)
+    result = empty_crossings(rays.backend)
+    if rays.count:
+        result = trace_crossings(traced, rays, k, differentiable=not rays.is_numpy)
+    if rays.is_numpy:
+        return crossings_to_numpy(result, rays.count, k)
+    if not rays.is_tensor:
+        return result
+    n = dr.width(result.status)
+    of_rays = {"count", "traced_to", "status", "evaluations"}
+    return RayCrossings(
+        **{
+            name: array_to_tensor(array, (n,) if name in of_rays else (n, k))
+            for name, array in vars(result).items()
+        }
+    )
+
+
+def _check_count(max_crossings: Any) -> int:
     try:
-        k = operator.index(all_hits)
+        k = operator.index(max_crossings)
     except TypeError:
         raise TypeError(
-            "all_hits is how many crossings of a ray to look for, an integer such as 8, "
-            f"not {all_hits!r}"
+            "max_crossings is how many crossings of a ray to look for, an integer such as 8, "
+            f"not {max_crossings!r}"
         ) from None
-    if k < 1 or isinstance(all_hits, bool):
-        raise ValueError(f"all_hits must be at least 1, such as 8, not {all_hits}")
-    surface.validate_crossings("all_hits")
+    if k < 1 or isinstance(max_crossings, bool):
+        raise ValueError(f"max_crossings must be at least 1, such as 8, not {max_crossings}")
     return k
 
 
 def trace_crossings(
-    surface: Surface,
-    backend: Backend,
-    o: Vec3,
-    d: Vec3,
-    near: Real,
-    far: Real,
-    k: int,
-    *,
-    differentiable: bool,
+    surface: TracedSurface, rays: RayBatch, k: int, *, differentiable: bool
 ) -> RayCrossings:
     """The first k crossings as `RayCrossings` of Dr.Jit arrays."""
+    backend, o, d = rays.backend, rays.origin, rays.direction
     prepared = surface.prepare(backend, crosses=True)
     with dr.suspend_grad():
-        found = find_crossings(
-            prepared, dr.detach(o), dr.detach(d), dr.detach(near), dr.detach(far), k
-        )
+        found = find_crossings(prepared, *(dr.detach(array) for array in rays.arrays), k)
         is_found = dr.isfinite(found.t)
         length = norm(found.gradient)
         normal = dr.select(length > 0, found.gradient / length, 0)

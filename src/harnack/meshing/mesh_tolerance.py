@@ -1,0 +1,49 @@
+"""The tolerance of `mesh` and `repair`: how far triangles may be from a surface."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from harnack.tracer import TraceOptions
+
+__all__ = ["MeshTolerance"]
+
+
+@dataclass(frozen=True)
+class MeshTolerance:
+    """The largest distance of triangles from a surface: a length, or None for 1e-3 of the size
+    of the surface."""
+
+    length: float | None = None
+
+    @classmethod
+    def of(cls, options: TraceOptions) -> MeshTolerance:
+        """The tolerance of a call.
+
+        Raises:
+            TypeError: a `HitTolerance` that is more than a length.
+        """
+        hits = options.hit_tolerance
+        if hits is not None and (hits.per_length or hits.value):
+            raise TypeError("the tolerance of a mesh is a length, without per_length and value")
+        return cls(None if hits is None else hits.distance)
+
+    def at(self, size: float) -> float:
+        """The tolerance for a surface of this size, a length.
+
+        Raises:
+            ValueError: it is half of the size or more.
+        """
+        length = 1e-3 * size if self.length is None else self.length
+        if not length < 0.5 * size and self.length is not None:
+            raise ValueError(
+                f"tolerance={length:g} is a length, and half of the surface's size of {size:.3g} "
+                "or more: choose a smaller tolerance"
+            )
+        return length
+
+    def within(self, size: float) -> float:
+        """The tolerance for a part of a surface, which may be smaller than the tolerance."""
+        return self.at(size) if self.length is None else min(self.length, 0.4 * size)

@@ -1,0 +1,185 @@
+"""`TraceOptions`, how a surface is traced; and the rule by which verbs take keywords in place of
+`Surface` and `TraceOptions`.
+
+Keywords are shorthand for a bare field, and for no `options`. Beside an object that holds them they
+raise, since either could be meant; and an option that a verb cannot honor raises, by its name.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast
+
+from harnack.backend.validation import as_integer_in_range, flag
+from harnack.enclosures import EnclosureChoice, EnclosureKinds, choose_enclosures
+from harnack.name_suggestions import did_you_mean, is_one_of
+from harnack.tracer.level_contact import HitTolerance
+from harnack.tracer.surface import Surface, SurfaceKeywords, as_number
+
+if TYPE_CHECKING:
+    from harnack.backend import Precision
+
+_Function = TypeVar("_Function", bound=Callable[..., Any])
+
+
+class TraceKeywords(SurfaceKeywords, total=False):
+    """The keywords of `Surface` and of `TraceOptions`, which verbs take as shorthand."""
+
+    tolerance: float | HitTolerance | None
+    enclosures: EnclosureChoice
+    max_steps: int
+    over_relaxation: float | None
+    precision: Precision | None
+    backend: Literal["webgpu"] | None
+    require_crossing: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class TraceOptions:
+    """How a surface is traced, drawn, meshed or measured: the `options` of every verb.
+
+    tolerance: the largest distance of hits, of points of a picture or of triangles from the
+        surface, a length in the field's coordinates; or a `HitTolerance`. None follows the size of
+        the surface: 1e-4 of the longest side of its box (domain, proved extent, clip and section),
+        1e-3 of it for meshes, and 1e-4 where the surface has no bounds. In single precision it is
+        not below about 1e-6 of the size of coordinates. Closest points are exact up to rounding.
+    enclosures: the proofs by which steps are made: None for all that pay; a name, "classic" for
+        the published rule, "slope", "caps", "curvature", "lipschitz" and others; or classes of
+        enclosures (`harnack.enclosures.choose_enclosures`).
+    max_steps: the number of evaluations of the field after which a ray is out of steps.
+    over_relaxation: a factor in [1, 2). Trial steps are this many times as long as the proved
+        steps, and are kept if an enclosure behind the trial point covers the rest (Keinert et al.
+        2014). 1 turns it off; None is the field's own choice.
+    precision: "single" or "double". None follows the input: double precision for float64 arrays,
+        single for all others; Dr.Jit arrays have a precision of their own.
+    backend: "webgpu" traces on any GPU of the system by the package `wgpu`; None on what Dr.Jit
+        has, a CPU or an NVIDIA GPU.
+    require_crossing: whether a ray hits only where f passes to the other side of the level by at
+        least half the tolerance. A ray that comes within the tolerance and turns back (a graze)
+        goes on; a hit is at a root.
+
+    Raises:
+        TypeError, ValueError: a value of the wrong kind, or out of range, by its name.
+    """
+
+    tolerance: float | HitTolerance | None = None
+    enclosures: EnclosureChoice = None
+    max_steps: int = 2000
+    over_relaxation: float | None = None
+    precision: Precision | None = None
+    backend: Literal["webgpu"] | None = None
+    require_crossing: bool = False
+
+    def __post_init__(self) -> None:
+        _ = self.hit_tolerance, self.enclosure_kinds
+        count = as_integer_in_range(self.max_steps, "max_steps", 1, 2**31 - 1)
+        object.__setattr__(self, "max_steps", count)
+        flag(self.require_crossing, "require_crossing")
+        if self.over_relaxation is not None:
+            # A Python number: NumPy's would ask Dr.Jit for numbers.
+            factor = as_number(self.over_relaxation, "over_relaxation must be a number in [1, 2)")
+            if not 1 <= factor < 2:
+                raise ValueError(f"over_relaxation must lie in [1, 2), not {factor}")
+            object.__setattr__(self, "over_relaxation", factor)
+        if self.precision is not None and not is_one_of(self.precision, ("single", "double")):
+            raise ValueError(f'precision is "single" or "double", not {self.precision!r}')
+        if self.backend is not None and not is_one_of(self.backend, ("webgpu",)):
+            raise ValueError(
+                f'backend is "webgpu", or None for what Dr.Jit has, not {self.backend!r}'
+            )
+        if self.backend is not None and self.precision == "double":
+            raise ValueError('backend="webgpu" computes in single precision alone')
+
+    @property
+    def hit_tolerance(self) -> HitTolerance | None:
+        """The tolerance as a `HitTolerance`; None if it follows the size of the surface."""
+        if self.tolerance is None or isinstance(self.tolerance, HitTolerance):
+            return self.tolerance
+        return HitTolerance(as_number(self.tolerance, "tolerance must be a length or HitTolerance"))
+
+    @property
+    def enclosure_kinds(self) -> EnclosureKinds:
+        """The classes of enclosures that are chosen."""
+        return choose_enclosures(self.enclosures)
+
+    def replace(self, **changes: Any) -> TraceOptions:
+        """These options with other values."""
+        return replace(self, **changes)
+
+    def refuse_others(self, verb: str, *honored: str) -> None:
+        """Raise TypeError for an option other than those honored by a verb, if it is set."""
+        for option in fields(self):
+            if option.name not in honored and getattr(self, option.name) != option.default:
+                raise TypeError(
+                    f"{verb} has no {option.name}; of the options of traces it has "
+                    f"{', '.join(honored) or 'none'}"
+                )
+
+
+SURFACE_OPTIONS = tuple(SurfaceKeywords.__annotations__)
+"""The names of the keywords of `Surface`."""
+TRACE_OPTIONS = tuple(field.name for field in fields(TraceOptions))
+"""The names of the keywords of `TraceOptions`."""
+
+
+def surface_and_options(
+    verb: str, surface: Any, options: TraceOptions | None, keywords: Mapping[str, Any]
+) -> tuple[Surface, TraceOptions]:
+    """The surface and the options of a call of a verb, of which some may be given as keywords.
+
+    Raises:
+        TypeError: a keyword that there is not; a keyword of `Surface` beside a `Surface`, or of
+            `TraceOptions` beside `options`; `surface` is neither a field nor a `Surface`.
+        ValueError: as `Surface` and `TraceOptions` raise it.
+    """
+    known = (*SURFACE_OPTIONS, *TRACE_OPTIONS)
+    for name in keywords:
+        if name not in known:
+            raise TypeError(f"{verb} has no argument {name!r}{did_you_mean(name, known)}")
+    of_surface = {name: value for name, value in keywords.items() if name in SURFACE_OPTIONS}
+    of_trace = {name: value for name, value in keywords.items() if name in TRACE_OPTIONS}
+    if options is not None and not isinstance(cast("Any", options), TraceOptions):
+        raise TypeError(f"options must be harnack.TraceOptions(...), not {options!r:.60}")
+    if options is not None and of_trace:
+        raise TypeError(
+            f"{', '.join(of_trace)}: {verb} has options already; give all of them in options, such "
+            f"as options.replace({next(iter(of_trace))}=...), or none"
+        )
+    if isinstance(surface, Surface):
+        if of_surface:
+            raise TypeError(
+                f"{', '.join(of_surface)}: a Surface holds its own; give {verb} "
+                f"surface.replace({next(iter(of_surface))}=...)"
+            )
+    else:
+        surface = Surface(surface, **of_surface)
+    return surface, TraceOptions(**of_trace) if options is None else options
+
+
+def shows_keywords(*omitted: str) -> Callable[[_Function], _Function]:
+    """Return a decorator of a verb that takes `**keywords: Unpack[TraceKeywords]`: its signature
+    shows these keywords by name, with their defaults, but for those omitted."""
+    kinds: tuple[Callable[..., Any], ...] = (Surface, TraceOptions)
+    shorthand = {
+        name: parameter
+        for kind in kinds
+        for name, parameter in inspect.signature(kind).parameters.items()
+        if name in (*SURFACE_OPTIONS, *TRACE_OPTIONS) and name not in omitted
+    }
+
+    def decorate(verb: _Function) -> _Function:
+        signature = inspect.signature(verb)
+        parameters = [
+            parameter
+            for parameter in signature.parameters.values()
+            if parameter.kind is not parameter.VAR_KEYWORD
+        ]
+        parameters += [
+            parameter.replace(kind=parameter.KEYWORD_ONLY) for parameter in shorthand.values()
+        ]
+        cast("Any", verb).__signature__ = signature.replace(parameters=parameters)
+        return verb
+
+    return decorate

@@ -1,0 +1,279 @@
+"""`TracedSurface`: a `Surface` together with `TraceOptions`, and what one call prepares of them."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import drjit as dr
+import numpy as np
+
+from harnack.backend import to_float
+from harnack.backend.arrays import as_kernel_parameters
+from harnack.enclosures import EnclosureKinds, Levels, choose_enclosures
+from harnack.tracer.largest_component import largest_component_cells
+from harnack.tracer.level_contact import HitTolerance
+from harnack.tracer.surface import Surface, intersection_of, level_number, side_range
+from harnack.tracer.surface_tracer import SurfaceTracer
+from harnack.tracer.trace_options import TraceOptions, surface_and_options
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Real
+    from harnack.fields.field import Field
+    from harnack.geometry import Volume
+    from harnack.tracer.surface import Side
+    from harnack.tree.empty_space import OccupancyGrid
+
+_T = TypeVar("_T")
+
+# Levels nearer than this to an integer are traced by samples that know their branch: far away a
+# winding number comes arbitrarily near to such a level.
+_INTEGER_MARGIN = 1e-3
+# The default tolerance, as a part of the longest side of the box; and of surfaces without bounds.
+_RELATIVE_TOLERANCE, _UNBOUNDED_TOLERANCE = 1e-4, 1e-4
+
+_FIRST_HITS_ONLY = (
+    "largest=... works for first hits alone: it cannot be combined with crossings, "
+    'require_crossing or antialias="cones"'
+)
+
+
+@dataclass(frozen=True)
+class TracedSurface:
+    """A surface and how rays are traced to it, for one call of the library.
+
+    field, levels, clip, section, side, largest: as in `Surface`.
+    tolerance: None for one that follows the size of the surface (`hit_tolerance`).
+    max_steps, over_relaxation, require_crossing: as in `TraceOptions`.
+    enclosures: the classes of enclosures.
+    """
+
+    field: Field
+    levels: tuple[Real, ...] = ()
+    clip: Volume | None = None
+    section: Volume | None = None
+    side: Side | None = None
+    largest: int = 0
+    tolerance: HitTolerance | None = None
+    enclosures: EnclosureKinds = dataclasses.field(default_factory=choose_enclosures)
+    max_steps: int = 2000
+    over_relaxation: float = 1.4
+    require_crossing: bool = False
+    # Results of `memoize`; None outside of a call of the library.
+    _call_cache: dict[Any, Any] | None = dataclasses.field(
+        default=None, repr=False, compare=False, kw_only=True
+    )
+
+    def __post_init__(self) -> None:
+        if self.require_crossing:
+            self.validate_crossings("require_crossing")
+            if self.largest:
+                raise ValueError(_FIRST_HITS_ONLY)
+
+    @classmethod
+    def of(cls, surface: Surface, options: TraceOptions) -> TracedSurface:
+        """The surface with the options of a call.
+
+        Raises:
+            ValueError, NotImplementedError: options that this surface cannot have.
+        """
+        factor, default_factor = options.over_relaxation, surface.field.over_relaxation
+        return cls(
+            surface.field,
+            surface.levels,
+            **surface.keywords,
+            tolerance=options.hit_tolerance,
+            enclosures=options.enclosure_kinds,
+            max_steps=options.max_steps,
+            over_relaxation=default_factor if factor is None else factor,
+            require_crossing=options.require_crossing,
+        )
+
+    @property
+    def surface(self) -> Surface:
+        """The surface without the options."""
+        return Surface(
+            self.field, self.levels, clip=self.clip, section=self.section, side=self.side,
+            largest=self.largest,
+        )  # fmt: skip
+
+    def validate_crossings(self, option: str) -> None:
+        """Raise an error if crossings of this surface cannot be traced.
+
+        ValueError for several levels of a field with jumps, as a jump may cross more than one level
+        at once; NotImplementedError for a field with patches.
+
+        option: the name of the verb or option that needs crossings, for the message.
+        """
+        if self.field.has_patches:
+            raise NotImplementedError(
+                f"{option} takes one function, and this {type(self.field).__name__} has one for "
+                "each patch: trace a patch by itself, such as mesh.face(0) of a polygon mesh"
+            )
+        if self.field.has_jumps and len(self.levels) > 1:
+            raise ValueError(
+                f"{option} takes one level of a field with jumps, such as this "
+                f"{type(self.field).__name__}, not {len(self.levels)}: trace each level by itself"
+            )
+
+    @property
+    def level_values(self) -> tuple[float, ...]:
+        """The levels as Python numbers."""
+        return tuple(level_number(level) for level in self.levels)
+
+    @property
+    def clip_volume(self) -> Volume | None:
+        """The intersection of clip and section; None if there is neither."""
+        return intersection_of([self.clip, self.section])
+
+    @property
+    def solid_range(self) -> tuple[float, float] | None:
+        """The values (low, high) of f on the closed solid; None for the level set itself."""
+        return side_range(self.side, self.level_values)
+
+    def with_call_cache(self, *, begins: bool = False) -> TracedSurface:
+        """This surface with a cache for a single call of the library, so that field, extent and
+        cells are prepared only once. Copies by `dataclasses.replace` share the cache.
+
+        begins: start with an empty cache, as users may have changed the field in place since the
+            last call.
+        """
+        return (
+            self if self._call_cache is not None and not begins else replace(self, _call_cache={})
+        )
+
+    def memoize(self, key: Any, compute: Callable[[], _T]) -> _T:
+        """The result of `compute()`, cached for this field, these levels and the key. Without a
+        cache (outside of a call of the library), `compute` is called each time."""
+        if self._call_cache is None:
+            return compute()
+        full_key = key, id(self.field), self.level_values
+        if full_key not in self._call_cache:
+            # With a reference to the field, so that no other field gets its id.
+            self._call_cache[full_key] = compute(), self.field
+        return self._call_cache[full_key][0]
+
+    @property
+    def extent(self) -> Volume | None:
+        """The volume that is proved to contain the level sets; None if none is known."""
+        return self.memoize("extent", lambda: self.field.extent(self.level_values))
+
+    @property
+    def volume(self) -> Volume | None:
+        """The volume to which rays are clipped: the intersection of domain, proved extent, clip and
+        section; None for all of space."""
+        return intersection_of([self.field.domain, self.extent, self.clip, self.section])
+
+    @property
+    def hit_tolerance(self) -> HitTolerance:
+        """The tolerance of hits: the one that was set, or one that follows the size of the
+        volume."""
+        return default_tolerance(self.volume) if self.tolerance is None else self.tolerance
+
+    def for_rays(self, count: int) -> TracedSurface:
+        """The same surface, prepared for this many rays (`Field.for_ray_count`)."""
+        return replace(self, field=self.field.for_ray_count(count))
+
+    def evaluator(self, backend: Backend) -> Field:
+        """The field, prepared for a backend and cached, with and without derivatives apart."""
+        is_followed = any(dr.grad_enabled(parameter) for parameter in self.field.parameters())
+        key = "field", backend, is_followed
+        return self.memoize(key, lambda: self.field.with_levels(self.level_values).prepare(backend))
+
+    def target_levels(self, backend: Backend) -> Levels:
+        """The levels on a backend."""
+        levels = tuple(
+            as_kernel_parameters(to_float(backend, level, "level")) for level in self.levels
+        )
+        return Levels(levels, self.field.period)
+
+    def _occupied(self) -> OccupancyGrid | None:
+        """The cells that may contain a level that counts; None if no cells are known."""
+        if not self.largest:
+            return self.memoize("cells", lambda: self.field.occupied_cells(self.level_values))
+        whole = intersection_of([self.field.domain, self.extent, self.clip])
+        arguments = self.field, self.level_values, whole, self.solid_range, self.largest
+        key = "largest", self.clip, self.side, self.largest
+        return self.memoize(key, lambda: largest_component_cells(*arguments))
+
+    def prepare(
+        self, backend: Backend, *, crosses: bool = False, many: bool = True
+    ) -> SurfaceTracer:
+        """The tracer of this surface, with all data on a backend, for use in a recorded kernel.
+
+        crosses: whether rays will look for crossings.
+        many: whether there will be so many rays that it pays to search for empty cells first.
+        """
+        if self.largest and crosses:
+            raise ValueError(_FIRST_HITS_ONLY)
+        volume, region = self.volume, None
+        occupied = self._occupied() if self.largest or (many and not crosses) else None
+        if crosses or self.require_crossing:
+            region = intersection_of([self.field.domain, self.clip, self.section])
+        field, known_volume = self.evaluator(backend), None
+        if field.has_unknown_branch and all(
+            abs(math.remainder(level, 1)) > _INTEGER_MARGIN for level in self.level_values
+        ):
+            extent = self.field.extent(_with_reduced_levels(self.level_values))
+            known_volume = None if extent is None else extent.prepare(backend)
+        return SurfaceTracer(
+            backend,
+            field,
+            self.target_levels(backend),
+            None if volume is None else volume.prepare(backend),
+            self.enclosures,
+            self.hit_tolerance.prepare(backend),
+            dr.opaque(backend.UInt32, self.max_steps),
+            self.over_relaxation,
+            self.require_crossing,
+            None if region is None else region.prepare(backend),
+            None if occupied is None else occupied.upload(backend),
+            only_component=self.largest > 0,
+            section=None if self.section is None else self.section.prepare(backend),
+            known_branch_volume=known_volume,
+        )
+
+
+def traced_surface(
+    surface: Field | Surface | TracedSurface,
+    options: TraceOptions | None = None,
+    *,
+    verb: str = "a trace",
+    **keywords: Any,
+) -> TracedSurface:
+    """A surface with the options of a call of a verb, or with keywords in place of both.
+
+    Raises:
+        TypeError, ValueError: as `surface_and_options`, `Surface` and `TraceOptions` raise them.
+    """
+    if isinstance(surface, TracedSurface) and options is None and not keywords:
+        return surface
+    return TracedSurface.of(*surface_and_options(verb, surface, options, keywords))
+
+
+def check_is_open(verb: str, surface: Surface) -> None:
+    """Raise TypeError for the boundary of a closed solid, whose faces on the clip a verb does not
+    see."""
+    if surface.solid_range is not None:
+        raise TypeError(
+            f'{verb} takes level sets, not side="{surface.side}": faces of a solid on its clip are '
+            'no part of them; give surface.replace(side="surface"), or the solid as a field '
+            "(harnack.solid)"
+        )
+
+
+def default_tolerance(volume: Volume | None) -> HitTolerance:
+    """1e-4 of the longest side of the box of a volume; 1e-4 if it has no bounds."""
+    side = math.nan if volume is None else float(np.ptp(np.array(volume.bounds()), axis=0).max())
+    is_bounded = math.isfinite(side) and side > 0
+    return HitTolerance(_RELATIVE_TOLERANCE * side if is_bounded else _UNBOUNDED_TOLERANCE)
+
+
+def _with_reduced_levels(levels: tuple[float, ...]) -> tuple[float, ...]:
+    """The levels, and for those farther from 0 than a half also their remainders modulo 1, which
+    |f| reaches sooner."""
+    remainders = dict.fromkeys(math.remainder(level, 1) for level in levels if abs(level) > 0.5)
+    return levels + tuple(level for level in remainders if level not in levels)
