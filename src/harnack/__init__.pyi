@@ -103,7 +103,16 @@ from .meshing import (
     wall_thickness,
 )
 from .rendering import Camera, Isolines, animate, render
-from .tracer import Hits, HitTolerance, RayCrossings, RayStatus, Surface, level_set, trace
+from .tracer import (
+    Hits,
+    HitTolerance,
+    RayCrossings,
+    RayStatus,
+    Surface,
+    TraceOptions,
+    crossings,
+    trace,
+)
 from .view import LiveView, SceneFile, SceneFileError, Slider, page, read_scene, view, write_scene
 
 __all__ = [
@@ -188,6 +197,7 @@ __all__ = [
     "TaylorRemainder",
     "Thread",
     "Torus",
+    "TraceOptions",
     "Tube",
     "TubeNetwork",
     "VolumeIntersection",
@@ -208,6 +218,7 @@ __all__ = [
     "cos",
     "cosh",
     "cosine_factor",
+    "crossings",
     "curvature",
     "curvature_lines",
     "distance",
@@ -219,7 +230,6 @@ __all__ = [
     "files",
     "geometry",
     "intersection",
-    "level_set",
     "log",
     "maximum",
     "mesh",

@@ -23,14 +23,14 @@ from harnack.fields.analytic.polynomial import HarmonicPolynomial, SphericalHarm
 from harnack.fields.analytic.riemann_surface import RiemannSurface
 from harnack.fields.analytic.waves import WaveProduct, sine_factor
 from harnack.fields.solid_angles.solid_angle import SolidAngle
-from harnack.gallery.scene import PICTURE_TOLERANCE, Scene
+from harnack.gallery.scene import Scene
 from harnack.geometry import Ball, Box, HalfSpace, Volume, example_curves
 from harnack.rendering import Camera
-from harnack.tracer import Surface, level_set
+from harnack.tracer import Surface
 
 
 def _curve(loops: Any, level: Any = None, **settings: Any) -> list[Surface]:
-    return [level_set(SolidAngle(loops), level, tolerance=PICTURE_TOLERANCE, **settings)]
+    return [Surface(SolidAngle(loops), level, **settings)]
 
 
 def _levels() -> list[Surface]:
@@ -53,9 +53,16 @@ def _bent(loop: FloatArray) -> FloatArray:
     return np.column_stack([x, y, 0.25 * np.sin(2.2 * x) + 0.2 * np.cos(2.0 * y)])
 
 
-def _periodic(kind: Any, *, solid: tuple[float, float], box: bool = False) -> list[Surface]:
+def _periodic(kind: Any, half_wall: float, *, box: bool = False) -> list[Surface]:
+    """The wall between two levels, -half_wall and half_wall, of a periodic function."""
     domain = Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)) if box else Ball(radius=1.0)
-    return [level_set(kind(1.0, domain=domain), solid=solid, tolerance=PICTURE_TOLERANCE)]
+    return [Surface(kind(1.0, domain=domain), (-half_wall, half_wall), side="between")]
+
+
+def _golden_gyroid() -> list[Surface]:
+    """Half of space behind the gyroid, in a box."""
+    domain = Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
+    return [Surface(Gyroid(1.0, domain=domain), 0.0, side="below")]
 
 
 def _eigenfunctions() -> list[Surface]:
@@ -63,30 +70,24 @@ def _eigenfunctions() -> list[Surface]:
     terms = [
         WaveProduct(1.0, x=sine_factor(k), y=sine_factor(k), z=sine_factor(k)) for k in (6.0, 2.0)
     ]
-    side = math.pi / 2
-    domain = Box((-side, -side, -side), (side, side, side))
-    solid = (0.5, math.inf)
-    return [
-        level_set(EigenfunctionSum(terms, domain=domain), solid=solid, tolerance=PICTURE_TOLERANCE)
-    ]
+    end = math.pi / 2
+    domain = Box((-end, -end, -end), (end, end, end))
+    return [Surface(EigenfunctionSum(terms, domain=domain), 0.5, side="above")]
 
 
 def _harmonic(field: Field) -> list[Surface]:
-    return [level_set(field, tolerance=PICTURE_TOLERANCE)]
+    return [Surface(field)]
 
 
 def _on_the_sphere(field: HypersphericalHarmonic, level: float) -> list[Surface]:
     """Both levels of a function of S^3, whole: nothing is clipped."""
-    return [level_set(field, [-level, level], tolerance=PICTURE_TOLERANCE)]
+    return [Surface(field, [-level, level])]
 
 
 def _lobes() -> list[Surface]:
     """Those where the function is positive, and where it is negative."""
     lobes = Lobes(3, 2)
-    return [
-        level_set(part, solid=(-math.inf, 0.0), tolerance=PICTURE_TOLERANCE)
-        for part in (lobes.positive, lobes.negative)
-    ]
+    return [Surface(part, 0.0, side="below") for part in (lobes.positive, lobes.negative)]
 
 
 def _quartic() -> list[Surface]:
@@ -112,7 +113,7 @@ def _fitted_knot() -> list[Surface]:
     low, high = curve.min(axis=0) - 2.6 * width, curve.max(axis=0) + 2.6 * width
     box = low.tolist(), high.tolist()
     series = FourierSeries.fit(density, box, (16, 16, 9), samples=(48, 48, 28))
-    return [level_set(series, solid=(0.4, math.inf), tolerance=PICTURE_TOLERANCE)]
+    return [Surface(series, 0.4, side="above")]
 
 
 CURVES = (
@@ -209,27 +210,27 @@ SOLIDS = (
     Scene(
         "gyroid",
         "a gyroid wall in glass, cut to a ball",
-        lambda: _periodic(Gyroid, solid=(-0.35, 0.35)),
+        lambda: _periodic(Gyroid, 0.35),
         ("glass",),
         demo_spp=144,
     ),
     Scene(
         "gyroid-gold",
         "half of space behind the gyroid in gold, cut to a box",
-        lambda: _periodic(Gyroid, solid=(-math.inf, 0.0), box=True),
+        _golden_gyroid,
         ("gold",),
         demo_spp=64,
     ),
     Scene(
         "schwarz-p",
         "Schwarz's primitive surface as a wall, cut to a box",
-        lambda: _periodic(SchwarzP, solid=(-0.25, 0.25), box=True),
+        lambda: _periodic(SchwarzP, 0.25, box=True),
         ("porcelain",),
     ),
     Scene(
         "schwarz-d",
         "Schwarz's diamond surface as a wall, cut to a ball",
-        lambda: _periodic(SchwarzD, solid=(-0.15, 0.15)),
+        lambda: _periodic(SchwarzD, 0.15),
         ("copper",),
     ),
     Scene(
@@ -254,7 +255,7 @@ SOLIDS = (
 
 
 def _surface(function: Any, part: str = "imag", **settings: Any) -> list[Surface]:
-    return [level_set(RiemannSurface(function, part, **settings), tolerance=PICTURE_TOLERANCE)]
+    return [Surface(RiemannSurface(function, part, **settings))]
 
 
 def _elliptic(domain: Volume) -> list[Surface]:
@@ -266,13 +267,13 @@ def _lemniscates() -> list[Surface]:
     """Level curves of the potential of three line charges."""
     triangle = {complex(math.cos(a), math.sin(a)): 1 for a in (0.5 * math.pi, 3.7, 5.8)}
     field = LevelCurves("log", argument=triangle, domain=Box((-2.2, -2.2, -0.2), (2.2, 2.2, 0.2)))
-    return [level_set(field, [-1.2, -0.6, 0.0, 0.6, 1.2, 1.8], tolerance=PICTURE_TOLERANCE)]
+    return [Surface(field, [-1.2, -0.6, 0.0, 0.6, 1.2, 1.8])]
 
 
 def _field_lines() -> list[Surface]:
     """Field lines of a charge and its opposite: level curves of the conjugate function."""
     field = LevelCurves("log", "imag", argument={1: 1, -1: -1})
-    return [level_set(field, [k * math.pi / 6 for k in range(12)], tolerance=PICTURE_TOLERANCE)]
+    return [Surface(field, [k * math.pi / 6 for k in range(12)])]
 
 
 def _ripples() -> list[Surface]:
@@ -280,7 +281,7 @@ def _ripples() -> list[Surface]:
         lambda x, y: exp(-(x**2 + y**2) * 1.5) * sin(x * 5 + cos(y * 4)) * 0.6,
         domain=Box((-1.5, -1.5, -1.0), (1.5, 1.5, 1.0)),
     )
-    return [level_set(field, tolerance=PICTURE_TOLERANCE)]
+    return [Surface(field)]
 
 
 PLANE = (

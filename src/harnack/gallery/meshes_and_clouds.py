@@ -9,10 +9,10 @@ import numpy as np
 from harnack.backend import FloatArray
 from harnack.fields.solid_angles.dipole import DipolePotential
 from harnack.fields.solid_angles.winding_number import WindingNumber
-from harnack.gallery.scene import PICTURE_TOLERANCE, Scene
+from harnack.gallery.scene import Scene
 from harnack.geometry import example_curves, example_meshes
 from harnack.rendering import Camera
-from harnack.tracer import Surface, level_set
+from harnack.tracer import Surface
 
 # Evenly spread over any range: multiples of it, modulo 1.
 _GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
@@ -24,7 +24,7 @@ def _cut_mesh() -> list[Surface]:
     middles = vertices[faces].mean(axis=1)
     middles /= np.linalg.norm(middles, axis=1, keepdims=True)
     whole = (middles @ _spiral_directions(14).T < math.cos(0.27)).all(axis=1)
-    return [level_set(WindingNumber(vertices, faces[whole]), tolerance=PICTURE_TOLERANCE)]
+    return [Surface(WindingNumber(vertices, faces[whole]))]
 
 
 def _spiral_directions(n: int) -> FloatArray:
@@ -43,7 +43,7 @@ def _soup() -> list[Surface]:
     middle = corners.mean(axis=1, keepdims=True)
     loose = (middle + 0.86 * (corners - middle)).reshape(-1, 3)
     field = WindingNumber(loose, np.arange(len(loose)).reshape(-1, 3))
-    return [level_set(field, tolerance=PICTURE_TOLERANCE)]
+    return [Surface(field)]
 
 
 def _cloud() -> list[Surface]:
@@ -54,7 +54,7 @@ def _cloud() -> list[Surface]:
         points = points - 0.7 * (value / (gradient**2).sum(axis=1))[:, None] * gradient
     value, gradient = _tangle(points)
     found = (np.abs(value) < 1e-9) & (np.abs(points) < 2.6).all(axis=1)
-    return [level_set(DipolePotential(points[found], gradient[found]), tolerance=PICTURE_TOLERANCE)]
+    return [Surface(DipolePotential(points[found], gradient[found]))]
 
 
 def _tangle(points: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -76,11 +76,7 @@ def _knot_cloud() -> list[Surface]:
     u /= np.linalg.norm(u, axis=1, keepdims=True)
     normals = np.cos(turn) * u + np.sin(turn) * np.cross(along[at], u)
     radius = 0.055 * float(np.ptp(curve))
-    return [
-        level_set(
-            DipolePotential(curve[at] + radius * normals, normals), tolerance=PICTURE_TOLERANCE
-        )
-    ]
+    return [Surface(DipolePotential(curve[at] + radius * normals, normals))]
 
 
 MESHES = (

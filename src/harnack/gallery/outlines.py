@@ -9,9 +9,9 @@ import numpy as np
 from harnack.fields.solids.extrusions import Extrusion
 from harnack.fields.solids.thread import metric_thread
 from harnack.files import outline
-from harnack.gallery.scene import PICTURE_TOLERANCE, Scene
+from harnack.gallery.scene import Scene
 from harnack.rendering import Camera
-from harnack.tracer import HitTolerance, Surface, level_set
+from harnack.tracer import Surface, TraceOptions
 
 # harnack.outline.text("harnack", 1000, tolerance=4): x, y of each loop, so that the scene does
 # without matplotlib. Behind the letters a are their holes.
@@ -57,7 +57,7 @@ def _nameplate() -> list[Surface]:
     # A little way into the plate, so that no faces coincide.
     raised = Extrusion(letters, 0.25).translated((0.0, 0.0, 0.15))
     parts = (plate.translated((-1.8, 0.0, 0.0)), raised.translated((-1.8, 0.0, 0.0)))
-    return [level_set(one, tolerance=PICTURE_TOLERANCE) for one in parts]
+    return [Surface(one) for one in parts]
 
 
 def _bolt() -> list[Surface]:
@@ -66,7 +66,7 @@ def _bolt() -> list[Surface]:
     bolt = metric_thread("M8", 22.0) | Extrusion(hexagon, 5.3).translated((0.0, 0.0, -5.3))
     nut = Extrusion(hexagon, 6.5) - metric_thread("M8", 8.0, internal=True, clearance=0.05)
     lying = nut.rotated(20.0).translated((-8.0, -14.0, -5.3))
-    return [level_set(one, tolerance=HitTolerance(2e-3)) for one in (bolt, lying)]
+    return [Surface(one) for one in (bolt, lying)]
 
 
 OUTLINES = (
@@ -84,6 +84,7 @@ OUTLINES = (
         _bolt,
         ("copper", "copper"),
         Camera(azimuth=-65, elevation=24),
+        options=TraceOptions(tolerance=2e-3),
         demo_spp=25,
     ),
 )

@@ -7,12 +7,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from harnack.rendering import Camera, render
-from harnack.tracer import HitTolerance, Surface
+from harnack.tracer import Surface, TraceOptions
 
 SurfaceFactory = Callable[[], "list[Surface]"]
 
 # Fine enough that no pixel of a demo picture shows it, coarse enough for shadow rays to be quick.
-PICTURE_TOLERANCE = HitTolerance(2e-4)
+PICTURE_OPTIONS = TraceOptions(tolerance=2e-4)
 
 
 @dataclass(frozen=True)
@@ -21,6 +21,7 @@ class Scene:
 
     surfaces: a function that returns the surfaces.
     materials: a name for each of them (or a single name for all).
+    options: of the traces.
     demo_spp: samples a pixel in `make demo`, few, to keep that to a few minutes; 0 to leave the
         scene out of it.
     """
@@ -31,14 +32,18 @@ class Scene:
     materials: tuple[str, ...] = ("two-tone",)
     camera: Camera = field(default_factory=Camera)
     show: str = "path"
+    options: TraceOptions = PICTURE_OPTIONS
     demo_spp: int = 0
 
-    def render(self, path: Any = None, **settings: Any) -> Any:
-        """Render the picture by `harnack.rendering`; settings override the scene's own."""
+    def render(self, path: Any = None, **options: Any) -> Any:
+        """Render the picture by `harnack.rendering`; options of `render` override the scene's."""
         surfaces = self.surfaces()
-        return render(surfaces, path, **{**self.settings(len(surfaces)), **settings})
+        return render(surfaces, path, **{**self.settings(len(surfaces)), **options})
 
     def settings(self, count: int) -> dict[str, Any]:
         """The options of `render` by which `count` surfaces are drawn."""
         names = self.materials * count if len(self.materials) == 1 else self.materials
-        return {"material": list(names), "camera": self.camera, "show": self.show}
+        return {
+            "material": list(names), "camera": self.camera, "show": self.show,
+            "options": self.options,
+        }  # fmt: skip

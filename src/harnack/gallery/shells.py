@@ -13,14 +13,14 @@ from harnack.distance import Family, curvature_lines
 from harnack.fields.solid_angles.polygon_mesh import PolygonMesh
 from harnack.fields.solid_angles.solid_angle import SolidAngle
 from harnack.fields.solids.tube import Tube, TubeNetwork
-from harnack.gallery.scene import PICTURE_TOLERANCE, Scene
+from harnack.gallery.scene import Scene
 from harnack.geometry import Circle, HalfSpace, example_meshes
 from harnack.geometry.polygon_meshes import cluster_into_polygons
 from harnack.rendering import Camera
-from harnack.tracer import HitTolerance, Surface, level_set
+from harnack.tracer import Surface, TraceOptions
 
 # Edges of faces lie inside the picture: what is met within the tolerance of one has no normal.
-_CLOSE = HitTolerance(1e-5)
+_PATCH_OPTIONS = TraceOptions(tolerance=1e-5)
 
 
 def _exoskeleton() -> list[Surface]:
@@ -32,14 +32,14 @@ def _exoskeleton() -> list[Surface]:
     wavy = ring + across * (1 + 0.25 * np.cos(3 * turn))[:, None]
     mesh = PolygonMesh(*cluster_into_polygons(wavy, faces, 150, smoothing=12))
     tubes = TubeNetwork(mesh.vertices, mesh.edges, 0.011)
-    return [level_set(mesh, tolerance=_CLOSE), level_set(tubes, tolerance=_CLOSE)]
+    return [Surface(mesh), Surface(tubes)]
 
 
 def _patches() -> list[Surface]:
     """A bumpy sphere of 5,200 patches with some eleven corners each."""
     vertices, faces = example_meshes.bumpy_sphere(6)
     mesh = PolygonMesh(*cluster_into_polygons(vertices, faces, 5200))
-    return [level_set(mesh, tolerance=_CLOSE)]
+    return [Surface(mesh)]
 
 
 EXOSKELETONS = (
@@ -50,6 +50,7 @@ EXOSKELETONS = (
         ("eggshell", "gold"),
         Camera(elevation=42),
         show="shaded",
+        options=_PATCH_OPTIONS,
         demo_spp=9,
     ),
     Scene(
@@ -58,6 +59,7 @@ EXOSKELETONS = (
         _patches,
         ("porcelain",),
         show="shaded",
+        options=_PATCH_OPTIONS,
     ),
 )
 
@@ -195,8 +197,8 @@ def _grid_shell_surfaces(shell: GridShell) -> list[Surface]:
     ground = HalfSpace((0, 0, -1), 0.0)
     beams = Tube.from_polylines(shell.beams(field), shell.thickness)
     return [
-        level_set(field, shell.level, clip=ground, tolerance=PICTURE_TOLERANCE),
-        level_set(beams, solid=(-math.inf, 0.0), tolerance=PICTURE_TOLERANCE),
+        Surface(field, shell.level, clip=ground),
+        Surface(beams, 0.0, side="below"),
     ]
 
 

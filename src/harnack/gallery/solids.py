@@ -25,16 +25,16 @@ from harnack.fields.solids.julia import Julia
 from harnack.fields.solids.primitives import Sphere, Torus
 from harnack.fields.solids.tube import Tube
 from harnack.files import Atoms
-from harnack.gallery.scene import PICTURE_TOLERANCE, Scene
+from harnack.gallery.scene import Scene
 from harnack.geometry import example_curves
 from harnack.rendering import Camera
-from harnack.tracer import Surface, level_set
+from harnack.tracer import Surface
 
 _VAN_DER_WAALS = {"H": 1.2, "C": 1.7, "N": 1.55, "O": 1.52}
 
 
 def _solid(field: Field, level: float) -> list[Surface]:
-    return [level_set(field, solid=(level, math.inf), tolerance=PICTURE_TOLERANCE)]
+    return [Surface(field, level, side="above")]
 
 
 def _metaballs() -> list[Surface]:
@@ -66,7 +66,7 @@ def _through_points() -> list[Surface]:
             normal = math.cos(v) * way + math.sin(v) * np.array([0.0, 0.0, 1.0])
             points.append(way + 0.42 * normal)
             normals.append(normal)
-    return [level_set(HRBF(points, normals), solid=(-math.inf, 0.0), tolerance=PICTURE_TOLERANCE)]
+    return [Surface(HRBF(points, normals), 0.0, side="below")]
 
 
 def _helix() -> Atoms:
@@ -131,7 +131,7 @@ BLOBS = (
 
 
 def _drawn(*solids: Solid) -> list[Surface]:
-    return [level_set(one, tolerance=PICTURE_TOLERANCE) for one in solids]
+    return [Surface(one) for one in solids]
 
 
 def _carved() -> list[Surface]:
@@ -194,7 +194,7 @@ def _knot() -> list[Surface]:
 def _jelly() -> list[Surface]:
     rng = np.random.default_rng(8)
     blobs: Any = Blobs(rng.normal(size=(14, 3)) * 0.55, 0.55, kernel=CompactKernel(1.7))
-    return [level_set(blobs, solid=(1.0, math.inf), tolerance=PICTURE_TOLERANCE)]
+    return [Surface(blobs, 1.0, side="above")]
 
 
 SHAPES = (

@@ -357,25 +357,24 @@ class Box(Polytope):
 
 @dataclass(frozen=True)
 class HalfSpace(Polytope):
-    """Points with normal.x <= offset. The normal points out; its length is divided out."""
+    """The points x with n.x <= offset, where n is the unit vector along `normal`, which points out.
+
+    offset: the distance of the plane from the origin, negative if n points towards the origin.
+    """
 
     normal: Point
     offset: float
 
     def __post_init__(self) -> None:
         normal = np.array(as_point(self.normal, "the normal of a half-space"))
-        size = float(np.abs(normal).max())
-        if size == 0.0:
+        largest = float(np.abs(normal).max())
+        if largest == 0.0:
             raise ValueError("the normal of a half-space must not be zero")
-        normal /= size  # so that squares neither overflow nor vanish
-        length = float(np.linalg.norm(normal))
-        offset = as_real(self.offset, "the offset of a half-space") / size / length
+        normal /= largest  # so that squares neither overflow nor vanish
+        offset = as_real(self.offset, "the offset of a half-space")
         if not np.isfinite(offset):
-            raise ValueError(
-                f"the offset of a half-space must be finite, not {self.offset!r}, and so must its "
-                f"ratio to the length of the normal {self.normal!r}"
-            )
-        x, y, z = (float(v) for v in normal / length)
+            raise ValueError(f"the offset of a half-space must be finite, not {self.offset!r}")
+        x, y, z = (float(v) for v in normal / np.linalg.norm(normal))
         object.__setattr__(self, "normal", (x, y, z))
         object.__setattr__(self, "offset", offset)
 

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -26,18 +26,19 @@ from harnack.rendering.camera import Camera
 from harnack.rendering.framing import UnboundedSurfaceError, rotation_to_z_up, visible_points
 from harnack.rendering.mitsuba import mitsuba_backend, set_variant
 from harnack.rendering.mitsuba_plugins import register
+from harnack.rendering.option_table import BY_NAME, SHORTHAND, complete_options, shows_options
 from harnack.rendering.picture import render
-from harnack.rendering.render_options import (
-    APPEARANCE_OPTIONS,
-    check_camera,
-    check_image_size,
-    check_integer,
-)
+from harnack.rendering.render_job import DEFAULT_SIZE
+from harnack.rendering.render_options import check_camera, check_image_size, check_integer
 from harnack.rendering.studio_surfaces import drawn_surfaces
 
+if TYPE_CHECKING:
+    from harnack.tracer import TraceOptions
+
 FILM_FILES = (".gif", ".mp4")
-_SIZE = (320, 240)
-_MOST_FRAMES = 10_000
+_MAX_FRAMES = 10_000
+# What changes where surfaces are.
+_MOVING = frozenset((*SHORTHAND, "surfaces", "options", "boundary_radius", "thickness"))
 # The palette's last entry in a GIF, which stands for transparent.
 _CLEAR = 255
 Pixels = npt.NDArray[np.uint8]
@@ -66,74 +67,72 @@ class Animation:
         return f"<video {size} controls loop muted autoplay>{source}</video>"
 
 
+@shows_options("animate")
 def animate(
-    what: Any,
+    surfaces: Any,
     path: str | os.PathLike[str],
     *,
-    frames: int = 24,
-    fps: float = 24.0,
-    turn: float = 0.0,
-    camera: Any = None,
-    size: tuple[int, int] = _SIZE,
-    show: str = "shaded",
-    progress: bool = True,
-    client: Any = None,
-    checkpoint: str | os.PathLike[str] | None = None,
-    **settings: Any,
+    options: TraceOptions | None = None,
+    **keywords: Any,
 ) -> Animation:
     """Draw a film and write it to `path`; notebooks show what is returned.
 
-        hk.animate(field, "turntable.gif", turn=360)
+        hk.animate(field, "turntable.gif", orbit=360)
         hk.animate(lambda s: hk.Morph(a, b, gap=0.2, w=0.2 * s), "morph.mp4")
         hk.animate(field, "levels.gif", level=lambda s: 1 + 4 * s)
 
-    what: what `render` draws in its studio. It, the camera and settings may be functions of
-        s, which goes from 0 in the first picture to 1 in the last; with a `turn` of 360 degrees,
-        to just before 1, so that the film can be repeated.
+    surfaces: as `render` draws them in its studio. They, the camera and options that may change
+        from picture to picture may be functions of s, which goes from 0 in the first picture to 1
+        in the last; with an orbit of 360 degrees, to just before 1, so that the film can be
+        repeated.
     path: .gif (Pillow) or .mp4 (PyAV: `pip install harnack[film]`).
     frames: number of pictures. fps: pictures a second; those of a GIF last whole hundredths.
-    turn: degrees that the camera goes around during the film.
+    orbit: degrees that the camera goes around its target during the film.
     camera: as `render` takes it. What it does not say (target, distance, angle of view) is the same
-        for all pictures, and such that all is always in view. It goes around its target.
+        for all pictures, and such that everything is always in view.
     client, checkpoint: as `render` takes them; workers draw whole pictures, and a film with more of
         them, or at another speed, draws only those that the folder does not have.
-    settings: of `render`; `size` and `show` are the same for all pictures.
+    options, keywords: as `render` takes them, but for `chunks`; `show` is "shaded" by default.
 
     Raises what `render` raises; ValueError for no or too many frames, and for another file type;
     ModuleNotFoundError where Pillow or PyAV is missing. Nothing is written unless all is.
     """
     target = check_film_path(path)
-    count = check_integer("frames", frames)
-    if not 1 <= count <= _MOST_FRAMES:
-        raise ValueError(f"frames must be from 1 to {_MOST_FRAMES:,}, not {count}")
-    fps, turn = as_finite(fps, "fps"), as_finite(turn, "turn")
+    arguments = complete_options("animate", keywords)
+    count = check_integer("frames", arguments.pop("frames"))
+    if not 1 <= count <= _MAX_FRAMES:
+        raise ValueError(f"frames must be from 1 to {_MAX_FRAMES:,}, not {count}")
+    fps, orbit = (as_finite(arguments.pop(name), name) for name in ("fps", "orbit"))
     if not 0 < fps <= 240:
         raise ValueError(f"fps must be more than 0 and at most 240, not {fps}")
-    for name, value in (("size", size), ("show", show)):
-        if callable(value):
+    for name, value in arguments.items():
+        if callable(value) and not BY_NAME[name].varies and name not in ("client", "progress"):
             raise TypeError(
                 f"{name} is the same for all pictures of a film, and no function of s: give it as "
                 "render takes it"
             )
-    size = check_image_size(size)
+    progress, client, checkpoint = (
+        arguments.pop(name) for name in ("progress", "client", "checkpoint")
+    )
+    size = check_image_size(arguments.pop("size") or DEFAULT_SIZE)
     with write_atomically(target) as partial, _encoder(partial, size, fps) as add:
-        repeats = turn != 0 and turn % 360 == 0
+        repeats = orbit != 0 and orbit % 360 == 0
         steps = np.arange(count) / max(count if repeats else count - 1, 1)
-        given = {"what": what, "camera": camera, **settings}
+        changing = {"surfaces": surfaces, "options": options, **arguments}
         moments = [
-            {name: _value_at(value, s) for name, value in given.items()} for s in steps.tolist()
+            {name: _value_at(value, s) for name, value in changing.items()} for s in steps.tolist()
         ]
-        cameras = _cameras(moments, steps, turn, size)
-        frames_of = [
-            {**moment, "camera": one} for moment, one in zip(moments, cameras, strict=True)
+        cameras = _cameras(moments, steps, orbit, size)
+        frames = [
+            {**moment, "camera": camera} for moment, camera in zip(moments, cameras, strict=True)
         ]
-        job, parts = _job(frames_of, {"size": size, "show": show, "progress": False})
+        job, parts = _job(frames, {"size": size, "progress": False})
         with (
             progress_bar("film", progress) as advance,
             open_executor(client, checkpoint) as workers,
         ):
-            for found in workers.run_tasks(job, "frame", parts):
-                add(found["shown"])
+            for frame in workers.run_tasks(job, "frame", parts):
+                add(frame["shown"])
                 advance(1 / count)
     return Animation(target, size)
 
@@ -148,8 +147,8 @@ class _FilmJob:
     def frame(self, others: dict[str, Any]) -> TaskResult:
         """The pixels of one picture. others: its other arguments."""
         set_variant(self.variant)
-        given = {**self.arguments, **others}
-        return {"shown": render(given.pop("what"), **given).srgb}
+        arguments = {**self.arguments, **others}
+        return {"shown": render(arguments.pop("surfaces"), **arguments).srgb}
 
 
 def _job(
@@ -184,7 +183,7 @@ def _value_at(value: Any, s: float) -> Any:
 
 
 def _cameras(
-    moments: list[dict[str, Any]], steps: FloatArray, turn: float, size: tuple[int, int]
+    moments: list[dict[str, Any]], steps: FloatArray, orbit: float, size: tuple[int, int]
 ) -> list[Camera]:
     """The camera of each picture: all have one box, target, distance and angle of view, except
     where they set their own."""
@@ -199,7 +198,7 @@ def _cameras(
         points = np.array(np.meshgrid(*ends.T)).reshape(3, -1).T
     box, middle = Box(*map(_as_point, ends)), _as_point(ends.mean(axis=0))
     framed = [
-        _orbited(replace(one, box=box, target=one.target or middle), turn * s, way)
+        _orbited(replace(one, box=box, target=one.target or middle), orbit * s, way)
         for one, s, way in zip(cameras, steps.tolist(), stand, strict=True)
     ]
     free = [one.position is None and one.distance is None for one in framed]
@@ -219,11 +218,11 @@ def _cameras(
     ]  # fmt: skip
 
 
-def _orbited(camera: Camera, turn: float, stand: FloatArray) -> Camera:
+def _orbited(camera: Camera, orbit: float, stand: FloatArray) -> Camera:
     """The camera after it has gone around its target. stand: (3, 3), rotates up to z."""
     if camera.position is None:
-        return replace(camera, azimuth=camera.azimuth_elevation[0] + turn)
-    c, s = math.cos(math.radians(turn)), math.sin(math.radians(turn))
+        return replace(camera, azimuth=camera.azimuth_elevation[0] + orbit)
+    c, s = math.cos(math.radians(orbit)), math.sin(math.radians(orbit))
     around = stand.T @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ stand
     target = np.array(camera.target)
     place = target + around @ (np.array(camera.position) - target)
@@ -236,7 +235,7 @@ def _points(moments: list[dict[str, Any]], steps: FloatArray) -> FloatArray:
     seen: list[FloatArray] = []
     last: Any = None
     for moment, s in zip(moments, steps.tolist(), strict=True):
-        rest = {name: value for name, value in moment.items() if name not in APPEARANCE_OPTIONS}
+        rest = {name: value for name, value in moment.items() if name in _MOVING}
         if last is not None and all(rest[name] is last[name] for name in rest):
             continue  # the same surfaces
         last = rest

@@ -25,7 +25,7 @@ from harnack.tracer import HitTolerance
 
 if TYPE_CHECKING:
     from harnack.backend import Backend
-    from harnack.tracer import Surface
+    from harnack.tracer import TracedSurface
 
 # Rotations that turn the named axis to z. From y, the front of a glTF model (z) turns to -y,
 # which is where the studio's camera stands.
@@ -85,7 +85,7 @@ class NothingVisibleError(ValueError):
     """A surface of which no ray hits anything: there is nothing to frame."""
 
 
-def bounding_box(surface: Surface) -> FloatArray:
+def bounding_box(surface: TracedSurface) -> FloatArray:
     """Lower and upper corner (2, 3) of a box that holds the surface.
 
     Raises:
@@ -98,7 +98,7 @@ def bounding_box(surface: Surface) -> FloatArray:
     return ends
 
 
-def _unbounded(surface: Surface) -> UnboundedSurfaceError:
+def _unbounded(surface: TracedSurface) -> UnboundedSurfaceError:
     field = surface.field
     levels = surface.level_values
     shown = ", ".join(f"{level:g}" for level in levels)
@@ -129,7 +129,7 @@ _BLURRED, _NOTHING_LEFT = 5e3, 1e5
 _VISIBLE_POINTS_CACHE: FieldCache[FloatArray] = FieldCache()
 
 
-def visible_points(surface: Surface, backend: Backend) -> FloatArray:
+def visible_points(surface: TracedSurface, backend: Backend) -> FloatArray:
     """Points (n, 3) of the surface, as seen from the six sides of the box it lies in.
 
     They are cached for a field that is uploaded once, as long as the settings are the same: when
@@ -151,11 +151,13 @@ def visible_points(surface: Surface, backend: Backend) -> FloatArray:
     settings = (
         surface.level_values,
         surface.clip_volume,
-        surface.solid,
+        surface.solid_range,
         surface.largest,
         surface.max_steps,
     )
-    return _VISIBLE_POINTS_CACHE.get(prepared, (*settings, surface.bound, surface.overstep), found)
+    return _VISIBLE_POINTS_CACHE.get(
+        prepared, (*settings, surface.enclosures, surface.over_relaxation), found
+    )
 
 
 def check_drawable_size(ends: FloatArray) -> None:
@@ -184,7 +186,7 @@ def check_offset(points: FloatArray) -> None:
     warnings.warn(said.format("its edges are blurred"), stacklevel=4)
 
 
-def _find_visible_points(surface: Surface, backend: Backend, ends: FloatArray) -> FloatArray:
+def _find_visible_points(surface: TracedSurface, backend: Backend, ends: FloatArray) -> FloatArray:
     """Points found on a coarse grid, and on one around them."""
     lower, upper = ends
     points = _probe(surface, backend, lower, upper, _GRID)
@@ -212,7 +214,7 @@ def _point(corner: FloatArray) -> str:
 
 
 def _probe(
-    surface: Surface, backend: Backend, lower: FloatArray, upper: FloatArray, grid: int
+    surface: TracedSurface, backend: Backend, lower: FloatArray, upper: FloatArray, grid: int
 ) -> FloatArray:
     """First hits of parallel rays, grid x grid from each of the six sides of a box."""
     size = float(np.linalg.norm(upper - lower))

@@ -225,7 +225,9 @@ def refractive_index(mi: Any, carrier: Any) -> Any:
     parameter; None for opaque shapes, and for shapes that are no solids."""
     bsdf = carrier.bsdf()
     passes = (mi.BSDFFlags.DeltaTransmission, mi.BSDFFlags.GlossyTransmission)
-    if carrier.surface.solid is None or not any(mi.has_flag(bsdf.flags(), one) for one in passes):
+    if carrier.surface.solid_range is None or not any(
+        mi.has_flag(bsdf.flags(), one) for one in passes
+    ):
         return None
     named = mi.traverse(bsdf)
     for name, _ in named:

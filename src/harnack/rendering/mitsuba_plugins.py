@@ -36,6 +36,7 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, cast
 
+from harnack.fields import Field
 from harnack.fields.analytic.periodic import Gyroid, SchwarzD, SchwarzP
 from harnack.fields.analytic.polynomial import SphericalHarmonic
 from harnack.fields.solid_angles.solid_angle import SolidAngle
@@ -47,13 +48,15 @@ from harnack.rendering.integrator import INTEGRATOR, PLUGIN, PathTracer
 from harnack.rendering.isolines import Isolines, parse_isolines
 from harnack.rendering.mitsuba import load_dict, load_mitsuba
 from harnack.rendering.mitsuba_proxy import as_matrix, from_properties, is_proxy
-from harnack.tracer import Surface, level_set
+from harnack.tracer import Surface, TracedSurface, traced_surface
+from harnack.tracer.traced_surface import check_has_inside
 
 if TYPE_CHECKING:
     import numpy.typing as npt
+    from typing_extensions import Unpack
 
-    from harnack.fields import Field
     from harnack.geometry import Volume
+    from harnack.tracer import TraceKeywords, TraceOptions
 
 _MARK = "watched_by_harnack"
 # Integrators that follow paths, and those among them that see media.
@@ -172,7 +175,7 @@ def register() -> Any:
     return mi
 
 
-def register_surfaces(plugin: str, surface: Callable[[Any], Surface]) -> Any:
+def register_surfaces(plugin: str, surface: Callable[[Any], TracedSurface]) -> Any:
     """Make a shape known whose surfaces come from a function of `mitsuba.Properties`.
 
     The function reads what it understands; `to_world` and BSDF are taken care of.
@@ -186,19 +189,26 @@ def register_surfaces(plugin: str, surface: Callable[[Any], Surface]) -> Any:
     return mi
 
 
-def surface_from_properties(props: Any) -> Surface:
-    """The surface that the properties of a `harnack` shape describe.
+def surface_from_properties(props: Any) -> TracedSurface:
+    """The surface that the properties of a `harnack` shape describe. "low" and "high" are the ends
+    of the values on a closed solid, one of which may be missing.
 
     Raises:
         ValueError: they describe none, or contradict each other.
     """
-    settings: dict[str, Any] = {"clip": _clip(props)}
-    if "low" in props or "high" in props:
-        settings["solid"] = (props.get("low", -math.inf), props.get("high", math.inf))
-    for name in ("level", "tolerance", "max_steps", "confirm"):
+    keywords: dict[str, Any] = {"clip": _clip(props)}
+    ends = [props[name] for name in ("low", "high") if name in props]
+    if ends:
+        if "level" in props:
+            raise ValueError("give either level, or low and high of a solid")
+        keywords["level"] = ends
+        keywords["side"] = "between" if len(ends) == 2 else "above" if "low" in props else "below"
+    for name in ("level", "tolerance", "max_steps", "require_crossing"):
         if name in props:
-            settings[name] = props[name]
-    return level_set(_field(props), **settings)
+            keywords[name] = props[name]
+    surface = traced_surface(_field(props), verb="a shape", **keywords)
+    check_has_inside(surface)
+    return surface
 
 
 def _field(props: Any) -> Field:
@@ -239,14 +249,15 @@ def _point(value: Any) -> tuple[float, float, float]:
 
 
 def mitsuba_shape(
-    surface: Field | Surface,
+    surface: Field | Surface | TracedSurface,
     *,
     bsdf: Mapping[str, Any] | Any = None,
     to_world: npt.ArrayLike | Any = None,
     tint: Sequence[float] | None = None,
-    cut_bsdf: Mapping[str, Any] | Any = None,
+    section_bsdf: Mapping[str, Any] | Any = None,
     isolines: Isolines | Sequence[Isolines] | None = None,
-    **settings: Any,
+    options: TraceOptions | None = None,
+    **keywords: Unpack[TraceKeywords],
 ) -> Any:
     """A Mitsuba shape of a field's level set, for a scene dictionary or a scene.
 
@@ -262,43 +273,41 @@ def mitsuba_shape(
     to_world: matrix (4, 4) or Mitsuba transform of moves, turns and one scale for all axes.
     tint: of a solid of glass, what is left of red, green and blue light after one unit of length
         in it, in the world: (1, 1, 1) for clear (Beer and Lambert).
-    cut_bsdf: of the faces at which `section` cuts an opaque solid; by default that of the rest.
+    section_bsdf: of the faces at which `section` cuts an opaque solid; by default that of the rest.
     isolines: `harnack.Isolines` to draw on it, or several; later ones cover earlier ones.
-    settings: as `harnack.level_set` takes them: level, clip, tolerance, solid, ... Glass needs a
-        `solid`.
+    options, keywords: as `render` takes them: level, clip, tolerance, side, ... Glass needs a
+        `side`.
 
     Raises:
         ValueError: the surface has no bounds and no `clip`, or `to_world` is no similarity.
     """
     mi = register()
-    if isinstance(surface, Surface):
-        if settings:
-            raise ValueError(f"{', '.join(settings)}: a Surface holds its settings already")
-    else:
-        if "material" in settings:
+    if isinstance(surface, Surface | Field):
+        if "material" in keywords:
             raise TypeError(
-                "a shape takes bsdf=..., not material=...: that is an argument of harnack.render"
+                "a shape takes bsdf=..., not material=...: that is an option of harnack.render"
             )
-        surface = level_set(surface, **settings)
+        surface = traced_surface(surface, options, verb="a shape", **keywords)
+    check_has_inside(surface)
     surface = surface.with_call_cache()
     props = mi.Properties()
     props["bsdf"] = as_bsdf(mi, bsdf)
     if to_world is not None:
         props["to_world"] = mi.ScalarTransform4f(as_matrix(to_world))
-    of_cut = _section_bsdf(mi, surface, props["bsdf"], cut_bsdf)
+    of_cut = _section_bsdf(mi, surface, props["bsdf"], section_bsdf)
     return from_properties(mi, props, surface, tint, of_cut, parse_isolines(isolines))
 
 
-def _section_bsdf(mi: Any, surface: Surface, bsdf: Any, cut_bsdf: Any) -> Any:
+def _section_bsdf(mi: Any, surface: TracedSurface, bsdf: Any, section_bsdf: Any) -> Any:
     """The BSDF of the faces at which a section cuts a solid; None for that of the rest."""
-    if cut_bsdf is None:
+    if section_bsdf is None:
         return None
-    if surface.solid is None or surface.section is None:
+    if surface.solid_range is None or surface.section is None:
         raise ValueError(
-            "faces of a cut are those of a solid on its section: give solid=(low, high) and "
-            "section=harnack.HalfSpace(normal, offset) as well"
+            "section_bsdf is of the faces of a solid on its section: give a section, such as a "
+            'half-space, and side="below" or "above" as well'
         )
-    made = as_bsdf(mi, cut_bsdf)
+    made = as_bsdf(mi, section_bsdf)
     for one in (bsdf, made):
         if mi.has_flag(one.flags(), mi.BSDFFlags.Transmission):
             raise ValueError(

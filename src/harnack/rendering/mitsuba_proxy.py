@@ -28,7 +28,7 @@ from harnack.rendering.mitsuba import (
 )
 from harnack.rendering.placed_surface import PlacedSurface, Placement
 from harnack.rendering.scales import Color, linear_from_srgb
-from harnack.tracer import Surface
+from harnack.tracer import TracedSurface
 
 if TYPE_CHECKING:
     from harnack.backend import FloatArray, Mask
@@ -124,7 +124,7 @@ PLUGIN = "harnack"
 def from_properties(
     mi: Any,
     props: Any,
-    surface: Surface,
+    surface: TracedSurface,
     tint: Any = None,
     section_bsdf: Any = None,
     isolines: Sequence[Isolines] = (),
@@ -138,7 +138,7 @@ def from_properties(
     Raises:
         ValueError: as `mitsuba_shape`; or the properties hold an emitter or a medium.
     """
-    if tint is not None and surface.solid is None:
+    if tint is not None and surface.solid_range is None:
         raise ValueError(
             "tint needs a solid, which light goes through: give solid=(low, high), for instance "
             "solid=(-math.inf, level)"
@@ -147,7 +147,7 @@ def from_properties(
     if "to_world" in props:
         placement = Placement.of(as_matrix(props["to_world"]))
     for one in isolines:
-        if one.function_field is surface.field and surface.solid is None:
+        if one.function_field is surface.field and surface.solid_range is None:
             raise ValueError(
                 f"isolines of {surface.field!r} on its own level set: it is constant there. Draw "
                 "those of another function, or a solid, whose caps show them"
@@ -191,7 +191,7 @@ def _carrier_class(variant: str) -> Any:
         """A mesh that no ray hits, with the surface that it stands for."""
 
         def __init__(
-            self, props: Any, surface: Surface, placement: Placement, tint: Any, cut_bsdf: Any,
+            self, props: Any, surface: TracedSurface, placement: Placement, tint: Any, cut_bsdf: Any,
             isolines: Sequence[Isolines],
         ) -> None:  # fmt: skip
             ends = bounding_box(surface)

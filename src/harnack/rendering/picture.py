@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,9 +17,7 @@ from harnack.fields import Field
 from harnack.progress import Advance, progress_bar
 from harnack.rendering.aov_render import AOV_MODES, AovTask, aov_picture
 from harnack.rendering.backdrops import GroundBackdrop
-from harnack.rendering.camera import Camera
 from harnack.rendering.images import Picture, check_picture_path, tone_map, write_image
-from harnack.rendering.isolines import Isolines
 from harnack.rendering.light_paths import (
     MIN_REPORTED_SECONDS,
     PathRenderTask,
@@ -29,13 +27,16 @@ from harnack.rendering.light_paths import (
     render_paths,
 )
 from harnack.rendering.mitsuba_plugins import register
-from harnack.rendering.render_job import EDGE_SPP, ClusterRenderExecutor, RenderJob
-from harnack.rendering.render_options import (
+from harnack.rendering.option_table import (
     STUDIO_OPTIONS,
+    RenderKeywords,
     RenderOptions,
-    check_tiles,
-    refuse_studio_settings,
+    complete_options,
+    shorthand_among,
+    shows_options,
 )
+from harnack.rendering.render_job import EDGE_SPP, ClusterRenderExecutor, RenderJob
+from harnack.rendering.render_options import check_chunks, refuse_studio_options
 from harnack.rendering.shaded_render import ShadedTask, render_shaded
 from harnack.rendering.shading import (
     LocalRenderExecutor,
@@ -44,53 +45,40 @@ from harnack.rendering.shading import (
     studio_wall,
 )
 from harnack.rendering.stage import StudioScene
-from harnack.rendering.studio_surfaces import MaterialLike
-from harnack.tracer import Surface
+from harnack.tracer import Surface, TracedSurface
 
-ShowMode = Literal["path", "shaded", "normal", "evaluations", "status", "depth", "value"]
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+    from harnack.tracer import TraceOptions
+
 # Modes with ground and lights, and what they trace.
 _LIT = {"path": "light paths", "shaded": "rays"}
 _IN_AOV = (".R", ".G", ".B", ".A")
 Image = npt.NDArray[Any]
 
 
+@shows_options("render")
 def render(
-    what: Any,
+    surfaces: Any,
     path: str | os.PathLike[str] | None = None,
     *,
-    show: ShowMode | str = "path",
-    size: tuple[int, int] | None = None,
-    spp: int | None = None,
-    antialias: str | None = None,
-    material: MaterialLike | Sequence[MaterialLike] | None = None,
-    camera: Camera | tuple[float, float, float] | None = None,
-    backdrop: Any = None,
-    up: str | tuple[float, float, float] | None = None,
-    boundary: float | None = None,
-    boundary_material: MaterialLike | None = None,
-    cut_material: MaterialLike | None = None,
-    isolines: Isolines | Sequence[Isolines] | None = None,
-    thickness: float | None = None,
-    of: Any = None,
-    value_range: tuple[float, float] | None = None,
-    colorbar: bool | str = False,
-    max_depth: int | None = None,
-    seed: int = 0,
-    denoise: bool = False,
-    progress: bool | Advance = True,
-    client: Any = None,
-    checkpoint: str | os.PathLike[str] | None = None,
-    tiles: int | None = None,
-    **settings: Any,
+    options: TraceOptions | None = None,
+    **keywords: Unpack[RenderKeywords],
 ) -> Picture:
     """Draw fields or a Mitsuba scene, and write the picture to `path` if there is one.
 
-    what: a field, a `Surface` or a list of them, drawn in the studio; or a Mitsuba scene, its
+    surfaces: a field, a `Surface` or a list of them, drawn in the studio; or a Mitsuba scene, its
         dictionary, or the path of its XML file.
     path: .png (8-bit sRGB, tone mapped) or .exr (the numbers).
+    options: a `TraceOptions` for all surfaces, of which pictures do not have `precision` and
+        `backend`. Beside bare fields the keywords of `Surface` may be given (level, clip, section,
+        side, largest), and those of `TraceOptions` in place of `options`. A `Solid` with a section,
+        or of glass, is drawn with its inside. Without a tolerance, it is 1e-4 of half the diagonal
+        of what is drawn.
     show: "path" follows light paths; "shaded" lights first hits by a formula, in seconds and
         without noise; or what one ray a pixel found: "normal", "evaluations" (of the fields),
-        "status" and "depth", or "value", which colors the surface by the function `of`. Edges of
+        "status" and "depth", or "value", which colors the surface by the function `color_by`. Edges of
         pictures of values are antialiased, the numbers that are returned are not.
     size: (width, height) in pixels, by default (800, 600) or the scene's own.
     spp: samples a pixel of a color picture, by default 64 or the scene's own, and of the edges
@@ -100,11 +88,11 @@ def render(
         a cone around each pixel. Wires thinner than a pixel then stay lines. It evaluates fields
         about twice as often, goes by |f - level| / |grad f|, and takes no fields that jump, such as
         winding numbers of meshes.
-    of: the function of which show="value" shows values on the surface: a field, "x", "y", "z", or
+    color_by: the function of which show="value" shows values on the surface: a field, "x", "y", "z", or
         a function of three coordinates. All are those of the surface or, of a scene, of the world.
-    value_range: (low, high) of the colors of values, depths or evaluations, by default what is
+    color_range: (low, high) of the colors of values, depths or evaluations, by default what is
         seen; the same for all pictures of a series.
-    colorbar: True, or the title, for a bar with numbers to the right of these pictures. It widens
+    color_bar: True, or the title, for a bar with numbers to the right of these pictures. It widens
         the picture that is written and displayed, not the array that is returned. Needs Pillow,
         which `pip install harnack[film]` brings.
     max_depth: longest light path in edges, -1 for no limit; by default 12 or the scene's own.
@@ -121,8 +109,8 @@ def render(
         Needs `pip install harnack[cluster]`, here and there.
     checkpoint: a folder, in which parts that are done are kept, so that a picture that was stopped
         goes on from there. It is not emptied when the picture is done.
-    tiles: how many parts a picture is cut into, with a client or a checkpoint; by default as suits
-        the workers.
+    chunks: how many parts a picture is divided into, with a client or a checkpoint; by default as
+        suits the workers.
 
     In the studio only:
 
@@ -136,17 +124,13 @@ def render(
         alpha in PNG and EXR files and as a fourth number, by which the first three are multiplied.
     up: what is up, "x", "y", "z", "-x", ... or a direction in the surfaces' coordinates; by
         default z.
-    boundary: the radius, in the surfaces' coordinates, of a tube around the curves at which
+    boundary_radius: the radius, in the surfaces' coordinates, of a tube around the curves at which
         surfaces end (`Field.boundary_curves`). boundary_material: its material, by default "gold".
-    cut_material: what the faces of opaque solids on their `section` are made of.
+    section_material: what the faces of opaque solids on their `section` are made of.
     isolines: lines on the surfaces, of heights or of another function, where `show` is "path",
         "shaded" or "value": an `Isolines` or several.
     thickness: draws surfaces as walls so thick, in their own coordinates: the closed meshes that
         `harnack.mesh` makes with this thickness, whose triangles are seen from close by.
-    settings: of the surfaces, as `harnack.level_set` takes them: level, clip, section, solid, ...;
-        those of a `Surface` are replaced. A `Solid` with a section is drawn as one, with faces
-        where it is cut. Without a tolerance, a field gets one that suits its size.
-
     In shaded pictures, the side of larger values of an open surface in one color is darker, and
     what spans the gaps of a mesh is amber, or teal on warm colors.
 
@@ -165,24 +149,29 @@ def render(
     mode or material, settings that make no surface, a surface without bounds, or a picture that
     does not fit into memory; OSError where the picture cannot be written.
     """
-    arguments = locals()  # the settings by name
     target = None if path is None else check_picture_path(path)
-    asked = RenderOptions.from_arguments(arguments)
-    tiles = check_tiles(tiles, divided=client is not None or checkpoint is not None)
-    if asked.denoise:
+    arguments = complete_options("render", keywords)
+    client, checkpoint, progress = (arguments[k] for k in ("client", "checkpoint", "progress"))
+    picture_options = RenderOptions.of(arguments)
+    is_divided = client is not None or checkpoint is not None
+    chunks = check_chunks(arguments["chunks"], is_divided=is_divided)
+    if picture_options.denoise:
         load_denoiser()
-    if target is not None and asked.colorbar and target.suffix.lower() == ".exr":
+    if target is not None and picture_options.color_bar and target.suffix.lower() == ".exr":
         raise ValueError(f"{target}: EXR files hold the numbers; a color bar is drawn in .png")
-    if not _is_of_studio(what):
-        refuse_studio_settings({name: arguments[name] for name in STUDIO_OPTIONS} | settings)
-    job = RenderJob(what, replace(asked, progress=None), settings, register().variant())
-    drawing = job.task
-    if client is not None or checkpoint is not None:
-        _check_can_be_sent(what, drawing)
-    with open_executor(client, checkpoint, tiles) as workers:
-        own = workers.client is None and workers.checkpoint is None
-        hands = LocalRenderExecutor(drawing) if own else ClusterRenderExecutor(workers, job)
-        image, shown, names = _render_job(job, hands, of, progress, alone=client is None)
+    shorthand = shorthand_among(arguments)
+    if not _is_of_studio(surfaces):
+        of_studio = {name: arguments[name] for name in STUDIO_OPTIONS}
+        refuse_studio_options({**of_studio, **shorthand, "options": options})
+    job = RenderJob(surfaces, picture_options, options, shorthand, register().variant())
+    task = job.task
+    if is_divided:
+        _check_can_be_sent(surfaces, task)
+    with open_executor(client, checkpoint, chunks) as workers:
+        is_local = workers.client is None and workers.checkpoint is None
+        executor = LocalRenderExecutor(task) if is_local else ClusterRenderExecutor(workers, job)
+        title = arguments["color_by"]
+        image, shown, names = _render_job(job, executor, title, progress, alone=client is None)
     if target is not None:
         exact = target.suffix.lower() == ".exr"
         write_image(job.mi, target, image if exact else shown, names)
@@ -190,11 +179,11 @@ def render(
 
 
 def _render_job(
-    job: RenderJob, hands: RenderExecutor, of: Any, progress: bool | Advance, *, alone: bool
+    job: RenderJob, hands: RenderExecutor, color_by: Any, progress: bool | Advance, *, alone: bool
 ) -> tuple[Image, npt.NDArray[np.uint8], list[str] | None]:
     """The numbers of a picture, its pixels, and the names of its channels if it has its own.
 
-    of: as it was given, the title of a color bar. alone: whether this process draws everything.
+    color_by: as it was set, the title of a color bar. alone: whether this process draws everything.
     """
     mi, asked, drawing, sensor = job.mi, job.options, job.task, job.scene.sensors()[0]
     if drawing is None:
@@ -204,9 +193,9 @@ def _render_job(
             "rendering", progress and not isinstance(hands, LocalRenderExecutor)
         ) as advance:
             view = drawing.look(hands, advance)
-        bar = str(of) if asked.colorbar is True and isinstance(of, str) else asked.colorbar
+        bar = color_by if asked.color_bar is True and isinstance(color_by, str) else asked.color_bar
         samples = asked.spp or EDGE_SPP
-        shown = aov_picture(asked.show, drawing, view, asked.value_range, bar, samples, hands)
+        shown = aov_picture(asked.show, drawing, view, asked.color_range, bar, samples, hands)
         return AOV_MODES[asked.show].numbers(view), shown, None
     if isinstance(drawing, PathRenderTask) and alone and progress:
         drawing = _with_time_estimate(job, drawing, progress)
@@ -236,16 +225,16 @@ def _with_time_estimate(
     return replace(drawing, paths_a_band=pace.paths_a_band)
 
 
-def _is_of_studio(what: Any) -> bool:
-    return isinstance(what, Field | Surface | list | tuple)
+def _is_of_studio(surfaces: Any) -> bool:
+    return isinstance(surfaces, Field | Surface | TracedSurface | list | tuple)
 
 
-def _check_can_be_sent(what: Any, drawing: Any) -> None:
-    if drawing is None:
+def _check_can_be_sent(surfaces: Any, task: Any) -> None:
+    if task is None:
         raise ValueError(
             "client, checkpoint: Mitsuba draws this scene, by an integrator of its own"
         )
-    if not _is_of_studio(what) and not isinstance(what, Mapping):
+    if not _is_of_studio(surfaces) and not isinstance(surfaces, Mapping):
         raise TypeError(
             "client, checkpoint: a loaded scene cannot be sent, and the files of one may change or "
             "be elsewhere: give the scene as a dictionary"

@@ -19,7 +19,7 @@ from harnack.tracer.pixel_cones import PixelCones
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Index, Mask, Real, Vec3
-    from harnack.tracer import Surface, SurfaceTracer
+    from harnack.tracer import SurfaceTracer, TracedSurface
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ class PlacedSurface:
 
     @classmethod
     def of(
-        cls, surface: Surface, placement: Placement, backend: Backend,
+        cls, surface: TracedSurface, placement: Placement, backend: Backend,
         isolines: Sequence[Isolines] = (), size: float = 1.0,
     ) -> PlacedSurface:  # fmt: skip
         """The surface on a backend. size: diagonal of the surface's box, for the default width of
@@ -127,7 +127,7 @@ class PlacedSurface:
             return backend.Array3f(*(dr.opaque(backend.Float, float(x)) for x in numbers))
 
         prepared = surface.prepare(backend)
-        solid = None if surface.solid is None else CappedSolid.of(surface, prepared)
+        solid = None if surface.solid_range is None else CappedSolid.of(surface, prepared)
         rows = tuple(vector(row) for row in placement.rotation)
         scale = dr.opaque(backend.Float, placement.scale)
         lines = tuple(one.prepare(backend, size) for one in isolines)

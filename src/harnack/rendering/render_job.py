@@ -18,18 +18,19 @@ from harnack.rendering.backdrops import GradientBackdrop
 from harnack.rendering.light_paths import PathRenderTask
 from harnack.rendering.mitsuba import load_dict, load_scene_file, set_variant
 from harnack.rendering.mitsuba_plugins import equivalent_path_tracer, register
+from harnack.rendering.option_table import RenderOptions
 from harnack.rendering.placed_surface import Placement
-from harnack.rendering.render_options import RenderOptions, check_memory, check_spp
+from harnack.rendering.render_options import check_memory, check_spp
 from harnack.rendering.shaded_render import GBuffer, ShadedTask
 from harnack.rendering.stage import STUDIO_SPP, StudioScene, build_studio
 from harnack.rendering.studio_surfaces import studio_objects
-from harnack.tracer import Surface
+from harnack.tracer import Surface, TracedSurface, TraceOptions
 
 EDGE_SPP = 9
 # Light paths that a worker follows at a time: some hundred bytes each, of what may be a small
 # memory, and enough for all threads.
 _PATHS_A_BAND = 2**18
-_SIZE = (800, 600)
+DEFAULT_SIZE = (800, 600)
 # Rays of a path, shadow rays included, about.
 _RAYS_A_PATH = 3
 
@@ -38,18 +39,19 @@ _RAYS_A_PATH = 3
 class RenderJob:
     """Everything that determines a picture.
 
-    what: fields or a Mitsuba scene, as `render` takes them.
-    options: how to draw them.
-    settings: of the surfaces.
+    surfaces: fields or surfaces, or a Mitsuba scene, as `render` takes them.
+    options: of the picture. trace_options: of all surfaces.
+    shorthand: options of surfaces and traces that were set by keywords.
     variant: of Mitsuba.
 
     Methods named like those of a task (`AovTask`, `PathRenderTask`, `ShadedTask`) draw a part of
     the picture and return plain arrays.
     """
 
-    what: Any
+    surfaces: Any
     options: RenderOptions
-    settings: Mapping[str, Any]
+    trace_options: TraceOptions | None
+    shorthand: Mapping[str, Any]
     variant: str
 
     @property
@@ -61,14 +63,15 @@ class RenderJob:
     @functools.cached_property
     def stage(self) -> StudioScene | None:
         """The studio in which surfaces are drawn; None for a Mitsuba scene."""
-        if not isinstance(self.what, Field | Surface | list | tuple):
+        if not isinstance(self.surfaces, Field | Surface | TracedSurface | list | tuple):
             return None
-        asked, size = self.options, self.options.size or _SIZE
+        asked, size = self.options, self.options.size or DEFAULT_SIZE
         check_memory(asked.show, *size)
         on_stage = studio_objects(
-            self.what, asked.material, self.settings, boundary=asked.boundary,
-            boundary_material=asked.boundary_material, cut=asked.cut_material,
-            isolines=asked.isolines, thickness=asked.thickness,
+            self.surfaces, asked.material, self.trace_options, self.shorthand,
+            boundary_radius=asked.boundary_radius, boundary_material=asked.boundary_material,
+            section_material=asked.section_material, isolines=asked.isolines,
+            thickness=asked.thickness,
         )  # fmt: skip
         rays = size[0] * size[1]
         if asked.show not in (*AOV_MODES, "shaded"):
@@ -85,7 +88,7 @@ class RenderJob:
         """The Mitsuba scene that is drawn."""
         if self.stage is not None:
             return self.mi.load_dict(self.stage.scene, parallel=False)
-        scene = _loaded(self.mi, self.what, self.options.size)
+        scene = _loaded(self.mi, self.surfaces, self.options.size)
         check_memory(self.options.show, *map(int, scene.sensors()[0].film().crop_size()))
         return scene
 
@@ -97,7 +100,7 @@ class RenderJob:
         sensor = scene.sensors()[0]
         if asked.show in AOV_MODES:
             placement = Placement.identity() if stage is None else stage.placement
-            viewer = AovTask.of(mi, scene, sensor, placement, asked.of)
+            viewer = AovTask.of(mi, scene, sensor, placement, asked.color_by)
             if isinstance(asked.backdrop, GradientBackdrop):
                 viewer = replace(viewer, background=asked.backdrop.bottom)
             return viewer

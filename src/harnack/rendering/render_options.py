@@ -1,13 +1,11 @@
-"""The arguments of `render`, checked before anything is drawn."""
+"""Checks of the options of pictures, before anything is drawn."""
 
 from __future__ import annotations
 
-import inspect
 import math
 import operator
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -20,7 +18,6 @@ from harnack.rendering.backdrops import Backdrop, GradientBackdrop, GroundBackdr
 from harnack.rendering.camera import Camera
 from harnack.rendering.isolines import Isolines, as_field, parse_isolines
 from harnack.rendering.scales import require_pillow, typeface_for
-from harnack.tracer import level_set
 
 SHOW_MODES: tuple[str, ...] = ("path", "shaded", *AOV_MODES)
 # Pictures that may have isolines.
@@ -28,20 +25,9 @@ MODES_WITH_ISOLINES = ("path", "shaded", "value")
 ANTIALIASING = ("edges", "cones")
 MAX_SIDE = 32768
 MAX_SPP = 1_000_000
-_MOST_TILES = 1_000_000
+_MAX_CHUNKS = 1_000_000
 # The largest number that the path tracer's counters hold.
 _MAX_INTEGER = 2**31 - 1
-# Names of settings in other programs, and what they are called here.
-_OTHER_PROGRAMS_NAMES = {
-    "color": '"material"', "colour": '"material"', "bsdf": '"material"', "samples": '"spp"',
-    "resolution": '"size"', "width": '"size"', "height": '"size"',
-    "filename": '"path", the second argument', "output": '"path", the second argument',
-    "file": '"path", the second argument', "title": '"colorbar"', "domain": '"clip"',
-    **dict.fromkeys(
-        ("azimuth", "elevation", "fov", "zoom", "position", "target", "distance"),
-        "camera=harnack.Camera(...), which has it",
-    ),
-}  # fmt: skip
 # Peak memory in bytes per pixel, measured at 2048 x 2048 and 4096 x 4096, rounded up.
 _BYTES = {"path": 50, "shaded": 280, "value": 240}
 _BYTES_OF_VIEWS = 130
@@ -79,29 +65,29 @@ def check_isolines(isolines: Any, show: str) -> tuple[Isolines, ...]:
     return lines
 
 
-def check_color_by(of: Any, show: str) -> Field | None:
+def check_color_by(color_by: Any, show: str) -> Field | None:
     """The function whose values are shown; ValueError if it is missing, or given for another kind
     of picture."""
     if show != "value":
-        if of is not None:
-            raise ValueError(f'of=... needs a picture with show="value", not show="{show}"')
+        if color_by is not None:
+            raise ValueError(f'color_by needs a picture with show="value", not show="{show}"')
         return None
-    if of is None:
+    if color_by is None:
         raise ValueError(
             'show="value" needs the function whose values are shown on the surface, such as '
-            'of="z", another field, or a function of x, y and z'
+            'color_by="z", another field, or a function of x, y and z'
         )
-    return as_field(of)
+    return as_field(color_by, "color_by")
 
 
-def check_value_range(value_range: Any, show: str) -> tuple[float, float] | None:
+def check_color_range(color_range: Any, show: str) -> tuple[float, float] | None:
     """The ends of the color scale, or None; ValueError for pictures without such a scale."""
-    if value_range is None:
+    if color_range is None:
         return None
-    _check_scaled("value_range", show)
-    wrong = f"value_range must be (low, high), two finite numbers in order, not {value_range!r}"
+    _check_scaled("color_range", show)
+    wrong = f"color_range must be (low, high), two finite numbers in order, not {color_range!r}"
     try:
-        low, high = (float(end) for end in value_range)
+        low, high = (float(end) for end in color_range)
     except (TypeError, ValueError):
         raise TypeError(wrong) from None
     if not (low < high and math.isfinite(high - low)):
@@ -109,18 +95,18 @@ def check_value_range(value_range: Any, show: str) -> tuple[float, float] | None
     return low, high
 
 
-def check_colorbar(colorbar: Any, show: str) -> bool | str:
+def check_color_bar(color_bar: Any, show: str) -> bool | str:
     """Whether to draw a color bar, or its title; ValueError for pictures without a color scale."""
-    if not isinstance(colorbar, bool | str):
-        raise TypeError(f"colorbar must be True, False or the bar's title, not {colorbar!r}")
-    if colorbar:
-        _check_scaled("colorbar", show)
+    if not isinstance(color_bar, bool | str):
+        raise TypeError(f"color_bar must be True, False or the bar's title, not {color_bar!r}")
+    if color_bar:
+        _check_scaled("color_bar", show)
         require_pillow()
-    if isinstance(colorbar, str):
-        if not colorbar.isprintable():
-            raise ValueError(f"the title of a color bar is one line of letters, not {colorbar!r}")
-        typeface_for(colorbar, 10)
-    return colorbar
+    if isinstance(color_bar, str):
+        if not color_bar.isprintable():
+            raise ValueError(f"the title of a color bar is one line of letters, not {color_bar!r}")
+        typeface_for(color_bar, 10)
+    return color_bar
 
 
 def check_backdrop(backdrop: Any, show: str) -> Backdrop:
@@ -222,11 +208,14 @@ def check_integer(name: str, number: Any) -> int:
     return integer
 
 
-def check_tiles(tiles: Any, *, divided: bool) -> int | None:
-    """How many parts a task is cut into, or None; divided: whether it is cut at all."""
-    if tiles is not None and not divided:
-        raise ValueError("tiles: parts are drawn one by one with a client or a checkpoint only")
-    return None if tiles is None else as_integer_in_range(tiles, "tiles", 1, _MOST_TILES)
+def check_chunks(chunks: Any, *, is_divided: bool) -> int | None:
+    """The number of parts that a task is divided into, or None.
+
+    is_divided: whether it is divided at all.
+    """
+    if chunks is not None and not is_divided:
+        raise ValueError("chunks: parts are drawn one by one with a client or a checkpoint only")
+    return None if chunks is None else as_integer_in_range(chunks, "chunks", 1, _MAX_CHUNKS)
 
 
 def _index(number: Any) -> int:
@@ -255,106 +244,30 @@ def check_camera(camera: Any) -> Camera:
 Check = Callable[[Any, str], Any]
 
 
-def _ignoring_mode(check: Callable[[Any], Any]) -> Check:
+def ignoring_mode(check: Callable[[Any], Any]) -> Check:
     """A check that does not depend on what is shown."""
-    return lambda given, show: check(given)
+    return lambda value, show: check(value)
 
 
-def _if_given(check: Callable[[Any], Any]) -> Check:
-    """A check, of a setting that may be None."""
-    return lambda given, show: None if given is None else check(given)
+def if_set(check: Callable[[Any], Any]) -> Check:
+    """A check, of an option that may be None."""
+    return lambda value, show: None if value is None else check(value)
 
 
-def _as_given(given: Any, show: str) -> Any:
-    """No check: what uses the setting checks it."""
+def unchecked(value: Any, show: str) -> Any:
+    """No check: what uses the option checks it."""
     del show
-    return given
+    return value
 
 
-def _integer(name: str) -> Check:
-    return lambda given, show: check_integer(name, given)
+def as_integer(name: str) -> Check:
+    """The check of an integer."""
+    return lambda value, show: check_integer(name, value)
 
 
-def _setting(check: Check = _as_given, **marks: bool) -> Mapping[str, Any]:
-    """The metadata of a setting: its check, which gets the setting and `show`, and marks.
-
-    of_studio: it is for the studio alone; a Mitsuba scene does not take it.
-    surface_options: it changes where surfaces are.
-    """
-    return {"check": check, **marks}
-
-
-@dataclass(frozen=True)
-class RenderOptions:
-    """The checked options of `render`: sizes and counts are integers, None means not set. The
-    metadata of each field holds its check; animations read this table too."""
-
-    show: str = field(metadata=_setting(_ignoring_mode(check_show)))
-    size: tuple[int, int] | None = field(metadata=_setting(_if_given(check_image_size)))
-    spp: int | None = field(metadata=_setting(_if_given(check_spp)))
-    antialias: str | None = field(metadata=_setting(check_antialias))
-    material: Any = field(metadata=_setting(of_studio=True))
-    camera: Camera = field(metadata=_setting(_ignoring_mode(check_camera), of_studio=True))
-    backdrop: Backdrop = field(metadata=_setting(check_backdrop, of_studio=True))
-    up: Any = field(metadata=_setting(of_studio=True))
-    boundary: float | None = field(metadata=_setting(of_studio=True, surface_options=True))
-    boundary_material: Any = field(metadata=_setting(of_studio=True))
-    cut_material: Any = field(metadata=_setting(of_studio=True))
-    isolines: tuple[Isolines, ...] = field(metadata=_setting(check_isolines, of_studio=True))
-    thickness: float | None = field(metadata=_setting(of_studio=True, surface_options=True))
-    of: Field | None = field(metadata=_setting(check_color_by))
-    value_range: tuple[float, float] | None = field(metadata=_setting(check_value_range))
-    colorbar: bool | str = field(metadata=_setting(check_colorbar))
-    max_depth: int | None = field(metadata=_setting(check_max_depth))
-    seed: int = field(metadata=_setting(_integer("seed")))
-    denoise: bool = field(metadata=_setting(check_denoise))
-    progress: Any = field(metadata=_setting())
-
-    def __post_init__(self) -> None:
-        if self.antialias == "cones" and self.spp == 1:
-            raise ValueError(
-                'antialias="cones" finds pixels for more than one sample, and spp is 1: give '
-                "spp=9, or leave antialias out"
-            )
-
-    @classmethod
-    def from_arguments(cls, given: Mapping[str, Any]) -> RenderOptions:
-        """The settings, from the arguments of `render` by name.
-
-        Raises:
-            TypeError, ValueError: naming the setting that is wrong, and what it should be.
-        """
-        show: str = given["show"]
-        return cls(
-            **{one.name: one.metadata["check"](given[one.name], show) for one in fields(cls)}
-        )
-
-
-OPTION_NAMES = tuple(one.name for one in fields(RenderOptions))
-STUDIO_OPTIONS = tuple(one.name for one in fields(RenderOptions) if "of_studio" in one.metadata)
-# Those that do not change where surfaces are.
-APPEARANCE_OPTIONS = tuple(
-    one.name for one in fields(RenderOptions) if "surface_options" not in one.metadata
-)
-
-
-def check_settings(settings: Mapping[str, Any]) -> None:
-    """Raise TypeError for a setting that neither `render` nor `level_set` has."""
-    of_surface = [name for name in inspect.signature(level_set).parameters if name != "field"]
-    for name in settings:
-        if name not in of_surface:
-            ours = _OTHER_PROGRAMS_NAMES.get(name.lower())
-            hint = did_you_mean(name, (*OPTION_NAMES, *of_surface))
-            raise TypeError(
-                f"there is no setting {name!r}; there are {', '.join(OPTION_NAMES)} and, of "
-                "surfaces, "
-                f"{', '.join(of_surface)}{hint if ours is None else f'; did you mean {ours}?'}"
-            )
-
-
-def refuse_studio_settings(given: Mapping[str, Any]) -> None:
-    """Raise ValueError for settings of the studio, which a Mitsuba scene does not take."""
-    wrong = [name for name, value in given.items() if value is not None]
+def refuse_studio_options(options: Mapping[str, Any]) -> None:
+    """Raise ValueError for options of the studio, which a Mitsuba scene does not take."""
+    wrong = [name for name, value in options.items() if value is not None]
     if wrong:
         raise ValueError(f"{', '.join(wrong)}: a Mitsuba scene is drawn as it is")
 

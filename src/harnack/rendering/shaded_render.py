@@ -340,7 +340,7 @@ class ShadedTask:
         found = self.mi.Bool(False)
         for carrier in self.world.proxies:
             surface = carrier.surface
-            if surface.solid is None and not isinstance(surface.field, Solid):
+            if surface.solid_range is None and not isinstance(surface.field, Solid):
                 found |= si.shape == self.mi.ShapePtr(carrier)
         return found
 

@@ -28,7 +28,7 @@ from harnack.rendering.mitsuba import mitsuba_backend
 from harnack.rendering.mitsuba_plugins import mitsuba_shape
 from harnack.rendering.placed_surface import Placement
 from harnack.rendering.scales import NAMED_COLORS, Color, linear_from_srgb, parse_color
-from harnack.tracer import HitTolerance, Surface
+from harnack.tracer import HitTolerance, TracedSurface
 
 Dictionary = dict[str, Any]
 
@@ -97,8 +97,8 @@ class Material:
             return front
         if self.transparent:
             raise ValueError(
-                "light passes through this material, so what is made of it needs an inside: give "
-                "solid=(low, high), for instance solid=(-math.inf, level)"
+                "light passes through this material, so the surface needs an inside: give "
+                'side="below" or side="above"'
             )
         if not self.two_sided:
             return front
@@ -193,15 +193,14 @@ _LIGHT = GroundBackdrop("light")
 class StudioObject:
     """A surface on the stage, with its material.
 
-    has_default_tolerance: whether to give it a tolerance that suits its size in place of its own.
+    surface: without a tolerance, it gets one that suits the size of what is drawn.
     section_material: the material of the faces at which a section cuts a solid; None for that of
         the rest.
     isolines: drawn on it.
     """
 
-    surface: Surface
+    surface: TracedSurface
     material: Material
-    has_default_tolerance: bool = False
     section_material: Material | None = None
     isolines: tuple[Isolines, ...] = ()
 
@@ -260,17 +259,17 @@ def build_studio(
     }
     for k, one in enumerate(studio_objects):
         surface = one.surface
-        if one.has_default_tolerance:
+        if surface.tolerance is None:
             close = _PATCH_TOLERANCE if surface.field.has_patches else _TOLERANCE
             surface = replace(surface, tolerance=HitTolerance(close / placement.scale))
-        bsdf = one.material.bsdf(solid=surface.solid is not None, traced_light=traced_light)
+        bsdf = one.material.bsdf(solid=surface.solid_range is not None, traced_light=traced_light)
         cut = (
             None
             if one.section_material is None
             else one.section_material.bsdf(solid=True, traced_light=traced_light)
         )
         scene[f"surface{k}"] = mitsuba_shape(
-            surface, bsdf=bsdf, to_world=placement.matrix, tint=one.material.tint, cut_bsdf=cut,
+            surface, bsdf=bsdf, to_world=placement.matrix, tint=one.material.tint, section_bsdf=cut,
             isolines=one.isolines,
         )  # fmt: skip
     has_ground = False

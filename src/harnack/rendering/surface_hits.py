@@ -19,7 +19,7 @@ from harnack.fields.samples import Sample
 from harnack.tracer import RayStatus
 
 if TYPE_CHECKING:
-    from harnack.tracer import MarchResult, Surface, SurfaceTracer
+    from harnack.tracer import MarchResult, SurfaceTracer, TracedSurface
 
 # A hit is refined by at most this many tolerances: along a ray that only grazes the surface there
 # is no crossing to converge to.
@@ -245,12 +245,12 @@ class CappedSolid:
     high: Real
 
     @classmethod
-    def of(cls, surface: Surface, prepared: SurfaceTracer) -> CappedSolid:
-        """The solid that `surface.solid` describes."""
-        if surface.solid is None:
+    def of(cls, surface: TracedSurface, prepared: SurfaceTracer) -> CappedSolid:
+        """The solid that `surface.side` describes."""
+        if surface.solid_range is None:
             raise ValueError("this level set is not a solid: make it with solid=(low, high)")
         finite = iter(prepared.levels.values)
-        low, high = (next(finite) if math.isfinite(end) else end for end in surface.solid)
+        low, high = (next(finite) if math.isfinite(end) else end for end in surface.solid_range)
         return cls(prepared, low, high)
 
     def _contains(self, p: Vec3) -> Mask:

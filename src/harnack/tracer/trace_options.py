@@ -8,7 +8,7 @@ raise, since either could be meant; and an option that a verb cannot honor raise
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast
 
@@ -139,14 +139,7 @@ def surface_and_options(
         if name not in known:
             raise TypeError(f"{verb} has no argument {name!r}{did_you_mean(name, known)}")
     of_surface = {name: value for name, value in keywords.items() if name in SURFACE_OPTIONS}
-    of_trace = {name: value for name, value in keywords.items() if name in TRACE_OPTIONS}
-    if options is not None and not isinstance(cast("Any", options), TraceOptions):
-        raise TypeError(f"options must be harnack.TraceOptions(...), not {options!r:.60}")
-    if options is not None and of_trace:
-        raise TypeError(
-            f"{', '.join(of_trace)}: {verb} has options already; give all of them in options, such "
-            f"as options.replace({next(iter(of_trace))}=...), or none"
-        )
+    choices = trace_options_among(options, keywords)
     if isinstance(surface, Surface):
         if of_surface:
             raise TypeError(
@@ -155,31 +148,67 @@ def surface_and_options(
             )
     else:
         surface = Surface(surface, **of_surface)
-    return surface, TraceOptions(**of_trace) if options is None else options
+    return surface, choices
+
+
+def trace_options_among(options: Any, keywords: Mapping[str, Any]) -> TraceOptions:
+    """The `options` of a call, or those of traces among its keywords.
+
+    Raises:
+        TypeError: both are given; `options` is no `TraceOptions`.
+    """
+    of_trace = {name: value for name, value in keywords.items() if name in TRACE_OPTIONS}
+    if options is None:
+        return TraceOptions(**of_trace)
+    if not isinstance(options, TraceOptions):
+        raise TypeError(f"options must be harnack.TraceOptions(...), not {options!r:.60}")
+    if of_trace:
+        raise TypeError(
+            f"{', '.join(of_trace)}: there are options already; give all of them in options, such "
+            f"as options.replace({next(iter(of_trace))}=...), or none"
+        )
+    return options
+
+
+def shorthand_parameters() -> dict[str, inspect.Parameter]:
+    """The keywords of `Surface` and `TraceOptions`, by name, as parameters of a verb."""
+    kinds: tuple[Callable[..., Any], ...] = (Surface, TraceOptions)
+    return {
+        name: parameter.replace(kind=parameter.KEYWORD_ONLY)
+        for kind in kinds
+        for name, parameter in inspect.signature(kind).parameters.items()
+        if name in (*SURFACE_OPTIONS, *TRACE_OPTIONS)
+    }
 
 
 def shows_keywords(*omitted: str) -> Callable[[_Function], _Function]:
     """Return a decorator of a verb that takes `**keywords: Unpack[TraceKeywords]`: its signature
     shows these keywords by name, with their defaults, but for those omitted."""
-    kinds: tuple[Callable[..., Any], ...] = (Surface, TraceOptions)
-    shorthand = {
-        name: parameter
-        for kind in kinds
-        for name, parameter in inspect.signature(kind).parameters.items()
-        if name in (*SURFACE_OPTIONS, *TRACE_OPTIONS) and name not in omitted
-    }
+    shorthand = shorthand_parameters()
+    return shows_parameters(
+        [parameter for name, parameter in shorthand.items() if name not in omitted]
+    )
+
+
+def shows_parameters(
+    parameters: Sequence[inspect.Parameter], *, keeps_others: bool = False
+) -> Callable[[_Function], _Function]:
+    """Return a decorator of a function of `**keywords`: its signature shows these parameters by
+    name in place of the keywords.
+
+    keeps_others: whether there may be other keywords as well.
+    """
 
     def decorate(verb: _Function) -> _Function:
         signature = inspect.signature(verb)
-        parameters = [
-            parameter
-            for parameter in signature.parameters.values()
-            if parameter.kind is not parameter.VAR_KEYWORD
-        ]
-        parameters += [
-            parameter.replace(kind=parameter.KEYWORD_ONLY) for parameter in shorthand.values()
-        ]
-        cast("Any", verb).__signature__ = signature.replace(parameters=parameters)
+        own = list(signature.parameters.values())
+        others = [parameter for parameter in own if parameter.kind is parameter.VAR_KEYWORD]
+        own = [parameter for parameter in own if parameter not in others]
+        names = {parameter.name for parameter in own}
+        own += [parameter for parameter in parameters if parameter.name not in names]
+        cast("Any", verb).__signature__ = signature.replace(
+            parameters=[*own, *(others if keeps_others else [])]
+        )
         return verb
 
     return decorate

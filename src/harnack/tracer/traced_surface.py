@@ -265,6 +265,24 @@ def check_is_open(verb: str, surface: Surface) -> None:
         )
 
 
+def check_has_inside(surface: TracedSurface) -> None:
+    """Raise ValueError for the boundary of a solid of a field that rays cannot see as closed."""
+    field = surface.field
+    if surface.solid_range is None:
+        return
+    if field.period is not None:
+        raise ValueError("an angle-valued field has no inside: side needs a real-valued one")
+    if field.has_patches:
+        raise ValueError(
+            f"a {type(field).__name__} is many surfaces and no closed solid: draw it without side"
+        )
+    if field.has_jumps:
+        raise ValueError(
+            "a field that jumps has no closed solid: values on one side may end at a facet, with "
+            "no level there; draw its level set without side"
+        )
+
+
 def default_tolerance(volume: Volume | None) -> HitTolerance:
     """1e-4 of the longest side of the box of a volume; 1e-4 if it has no bounds."""
     side = math.nan if volume is None else float(np.ptp(np.array(volume.bounds()), axis=0).max())

@@ -8,7 +8,6 @@ from __future__ import annotations
 import base64
 import gzip
 import hashlib
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -28,16 +27,18 @@ from harnack.rendering.camera import Camera
 from harnack.rendering.framing import NothingVisibleError, bounding_box, visible_points
 from harnack.rendering.isolines import parse_isolines
 from harnack.rendering.mitsuba_plugins import register
+from harnack.rendering.option_table import names_of, refuse_unknown, shorthand_among
 from harnack.rendering.placed_surface import PlacedSurface
-from harnack.rendering.render_options import OPTION_NAMES, STUDIO_OPTIONS, check_camera
+from harnack.rendering.render_options import check_camera
 from harnack.rendering.scales import linear_from_srgb
 from harnack.rendering.shading import hole_filling_tint, reflectance, two_sided_color
 from harnack.rendering.stage import MATERIALS, Material, StudioObject
-from harnack.rendering.studio_surfaces import studio_objects
-from harnack.tracer import HitTolerance, RayStatus, Surface
+from harnack.rendering.studio_surfaces import studio_objects, with_visible_inside
+from harnack.tracer import HitTolerance, RayStatus, Surface, TracedSurface
+from harnack.tracer.trace_options import SURFACE_OPTIONS
 from harnack.view.legend_data import EVALUATIONS_TOP, legends
 from harnack.view.live_framing import Framing, extreme_points
-from harnack.view.scene_file import STILL_OPTIONS, FieldSources, surface_options, to_scene_text
+from harnack.view.scene_file import FieldSources, to_scene_text, with_flat_options
 from harnack.view.sliders import SliderValueError, SlidingContent, slider_values_in_errors
 from harnack.webgpu import as_words, labeled_leaves, pack_shader_data, record_kernel
 
@@ -77,16 +78,20 @@ _NO_OUTPUT = 99
 _MENDED, _CUT = 1, 2
 # `PAINTS` in drawing.js.
 _MOST_PAINTS = 2048
-_OF_STUDIO = ("boundary", "boundary_material", "thickness")
+_OF_STUDIO = ("boundary_radius", "boundary_material", "section_material", "thickness")
 # Of gzip: more takes longer, and gains little.
 _LEVEL = 5
 _STAGE_OPTIONS = ("camera", "backdrop", "up", "show")
+STILL_OPTIONS = (
+    "size", "spp", *names_of("render", "color", "quality", "run"),
+)  # fmt: skip
+"""Options that `render` has for still pictures alone."""
 LIVE_MODES = ("shaded", "normal", "depth", "evaluations", "status")
 """The values of `show` that pages and views have."""
 
 
-LIVE_OPTIONS = ("material", "boundary")
-"""Settings of `render` that can be changed in a view: what surfaces are made of, and the radius of
+LIVE_OPTIONS = ("material", "boundary_radius")
+"""Options that can be changed in a view: what surfaces are made of, and the radius of
 tubes around the curves at which they end (None for no tubes)."""
 
 
@@ -117,7 +122,7 @@ class LiveScene:
     camera, up: as `render` takes them.
     editable: whether the vertices of its curve can be moved.
     show: the kind of picture shown at first.
-    origins: where fields come from, for scene files.
+    sources: where fields come from, for scene files.
     """
 
     content: SlidingContent
@@ -128,31 +133,29 @@ class LiveScene:
     backdrop: str
     editable: bool
     show: str
-    origins: FieldSources = ()
+    sources: FieldSources = ()
 
     @classmethod
     def of(
-        cls, what: Any, given: Mapping[str, Any], *, edits: bool = False, origins: FieldSources = ()
+        cls, what: Any, given: Mapping[str, Any], *, edits: bool = False, sources: FieldSources = ()
     ) -> LiveScene:
         """The live scene of the arguments of `page` or `view`.
 
         edits: whether vertices of curves are to be moved, so that the recorded kernel must not
             depend on them.
-        origins: where fields come from, for scene files.
+        sources: where fields come from, for scene files.
 
         Raises:
             TypeError, ValueError: as `render` does; also for a transparent material, a `show` that
             is not in `LIVE_MODES`, and a backdrop that is not "light" or "dark".
         """
-        still = [
-            name for name in given if name in OPTION_NAMES and name not in (*STUDIO_OPTIONS, "show")
-        ]
+        still = [name for name in given if name in STILL_OPTIONS]
         if still:
             raise TypeError(
                 f"{', '.join(still)}: for still pictures only, as `harnack.render` draws them; "
-                "pages and views have no such setting"
+                "pages and views have no such option"
             )
-        given = dict(given)
+        given = with_flat_options(given)
         camera, backdrop, up, show = (given.pop(name, None) for name in _STAGE_OPTIONS)
         show = "shaded" if show is None else show
         if show not in LIVE_MODES:
@@ -172,7 +175,7 @@ class LiveScene:
         up, camera = "z" if up is None else up, check_camera(camera)
         framing = Framing.of(camera, up, np.concatenate(points), is_whole=True)
         return cls(
-            subject, points, camera, up, framing, ground.name, curve is not None, show, origins
+            subject, points, camera, up, framing, ground.name, curve is not None, show, sources
         )
 
     def framed(self, places: Iterable[Mapping[str, float]]) -> LiveScene:
@@ -227,7 +230,7 @@ class LiveScene:
             "editable": self.editable,
             "materials": [name for name, one in MATERIALS.items() if not one.transparent],
             "material": material if isinstance(material, str) else None,
-            "tube": None if (tube := settings.get("boundary")) is None else float(tube),
+            "tube": None if (tube := settings.get("boundary_radius")) is None else float(tube),
             "middle": middle.tolist(),
             "reach": float(np.linalg.norm(points - middle, axis=1).max()),
             "legends": legends(),
@@ -286,7 +289,7 @@ class LiveScene:
         """What is drawn, and its settings."""
         what, settings = self.content.at(controls.values)
         settings |= controls.settings
-        if "boundary" in controls.settings and settings["boundary"] is None:
+        if "boundary_radius" in controls.settings and settings["boundary_radius"] is None:
             settings.pop("boundary_material", None)
         return what, settings
 
@@ -297,7 +300,7 @@ class LiveScene:
         if (
             curve is not None
             and controls.curves is not None
-            and settings.get("boundary") is not None
+            and settings.get("boundary_radius") is not None
         ):
             # The tube around the curve is that of the moved one.
             drawn = _studio_objects(_with_loops(what, curve, controls.curves), settings)
@@ -323,7 +326,9 @@ class LiveScene:
     def render_still(self, controls: ControlState, **others: Any) -> Picture:
         """A still picture of a state by `render`. others: settings of `render`."""
         _, settings = self._at(controls)
-        own = {name: settings[name] for name in ("isolines", "cut_material") if name in settings}
+        own = {
+            name: settings[name] for name in ("isolines", "section_material") if name in settings
+        }
         drawn = self.surfaces_at(controls)
         if isinstance(others.get("camera"), Camera):
             others["camera"] = self.framing.with_box(others["camera"])
@@ -349,9 +354,9 @@ class LiveScene:
         if curve is not None:
             several = _with_loops(what, curve, controls.curves)
         if controls.cut_volume is not None:
-            own = surface_options(settings)
+            own = {name: one for name, one in settings.items() if name in SURFACE_OPTIONS}
             settings = {name: one for name, one in settings.items() if name not in own}
-            made = studio_objects(several, settings.get("material"), own)
+            made = studio_objects(several, settings.get("material"), None, own)
             several = [with_cut(one.surface, controls.cut_volume) for one in made]
         lost: list[str] = []
         for name, one in self.content.sliders.items():
@@ -361,11 +366,11 @@ class LiveScene:
                 settings[name] = replace(one, start=controls.values[name])
             else:
                 lost.append(name)
-        return to_scene_text(several, {**settings, **others}, self.origins), lost
+        return to_scene_text(several, {**settings, **others}, self.sources), lost
 
     def _fitted(self, one: StudioObject) -> StudioObject:
         """The same, with a tolerance that suits its size on the stage if it has none."""
-        if not one.has_default_tolerance:
+        if one.surface.tolerance is not None:
             return one
         tolerance = HitTolerance(_TOLERANCE / self.placement.scale)
         return replace(one, surface=replace(one.surface, tolerance=tolerance))
@@ -384,16 +389,13 @@ def live_options(settings: Mapping[str, Any]) -> dict[str, Any]:
     return {**taken, "show": taken["show"] if taken.get("show") in LIVE_MODES else "shaded"}
 
 
-def with_cut(surface: Surface, volume: Volume) -> Surface:
+def with_cut(surface: TracedSurface, volume: Volume) -> TracedSurface:
     """A surface cut by one more volume; by a half-space, it is opened to be looked into."""
     name = "section" if isinstance(volume, HalfSpace) else "clip"
     own = getattr(surface, name)
     both = volume if own is None else VolumeIntersection((own, volume))
     made = replace(surface, **cast("Any", {name: both})).with_call_cache(begins=True)
-    is_whole = isinstance(made.field, Solid) and made.solid is None and len(made.levels) == 1
-    if name == "clip" or not is_whole:
-        return made
-    return replace(made, solid=(-math.inf, made.level_values[0]))
+    return made if name == "clip" else with_visible_inside(made)
 
 
 def _with_loops(what: Any, curve: SolidAngle, loops: Any) -> list[Any]:
@@ -402,7 +404,7 @@ def _with_loops(what: Any, curve: SolidAngle, loops: Any) -> list[Any]:
 
     def edited(one: Any) -> Any:
         if isinstance(one, Surface) and one.field is curve:
-            return replace(one, field=moved)
+            return one.replace(field=moved)
         return moved if one is curve else one
 
     several: list[Any] = [*what] if isinstance(what, list | tuple) else [what]
@@ -413,15 +415,22 @@ def _objects_at(subject: SlidingContent, values: Mapping[str, float]) -> list[St
     return _studio_objects(*subject.at(values))
 
 
-def _studio_objects(what: Any, given: Mapping[str, Any]) -> list[StudioObject]:
-    settings = dict(given)
-    studio = {name: settings.pop(name) for name in _OF_STUDIO if name in settings}
-    material, cut = (settings.pop(name, None) for name in ("material", "cut_material"))
-    isolines = parse_isolines(settings.pop("isolines", None))
-    drawn = studio_objects(what, material, settings, cut=cut, isolines=isolines, **studio)
-    for one in drawn:
-        check_opaque(one.material)
+def _studio_objects(surfaces: Any, options: Mapping[str, Any]) -> list[StudioObject]:
+    studio = {name: options[name] for name in _OF_STUDIO if name in options}
+    isolines = parse_isolines(options.get("isolines"))
+    drawn = studio_objects(
+        surfaces, options.get("material"), None, _surface_and_trace(options), isolines=isolines,
+        **studio,
+    )  # fmt: skip
+    for element in drawn:
+        check_opaque(element.material)
     return drawn
+
+
+def _surface_and_trace(options: Mapping[str, Any]) -> dict[str, Any]:
+    """The options of surfaces and traces. Raises TypeError for one that live pictures have not."""
+    refuse_unknown("view", options)
+    return shorthand_among(options)
 
 
 def check_opaque(material: Material) -> None:
@@ -526,7 +535,7 @@ def surface_colors(one: StudioObject) -> list[JsonDict]:
     """The colors of each paint in shaded pictures: linear sRGB of the sides of larger and of
     smaller values, and whether they are glossy."""
     surface, mi = one.surface, register()
-    is_solid = surface.solid is not None
+    is_solid = surface.solid_range is not None
     front, back, glossy = _reflectances(one.material.bsdf(solid=is_solid, traced_light=False))
     inside = mi.Bool(not is_solid and not isinstance(surface.field, Solid))
     sides = two_sided_color(front, back, inside), back

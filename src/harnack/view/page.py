@@ -26,10 +26,12 @@ from harnack.progress import progress_bar
 from harnack.rendering.camera import Camera
 from harnack.rendering.mitsuba import set_variant
 from harnack.rendering.mitsuba_plugins import register
+from harnack.rendering.option_table import shows_options
 from harnack.view.live_scene import ControlState, LiveScene, encode_arrays, state_delta
 from harnack.view.sliders import slider_values_in_errors
 
 if TYPE_CHECKING:
+    from harnack.tracer import TraceOptions
     from harnack.view.live_scene import JsonDict
 
 __all__ = ["MODULES", "check_title", "document", "page", "resource", "script", "still_png"]
@@ -52,15 +54,13 @@ _CHANNEL_SCRIPTS = {
 }
 
 
+@shows_options("page")
 def page(
-    what: Any,
+    surfaces: Any,
     path: str | os.PathLike[str],
     *,
-    title: str = "",
-    progress: bool = True,
-    client: Any = None,
-    checkpoint: str | os.PathLike[str] | None = None,
-    **settings: Any,
+    options: TraceOptions | None = None,
+    **keywords: Any,
 ) -> None:
     """Write one HTML file in which surfaces turn under mouse, touch and keys.
 
@@ -75,15 +75,16 @@ def page(
     They are traced first, and if the visitor's device does not agree, nothing of what it says is
     drawn.
 
-    what: a field, a `Surface`, or a list of them, as `render` draws them in its studio; or a
+    surfaces: a field, a `Surface`, or a list of them, as `render` draws them in its studio; or a
         function of sliders that gives them.
-    path: ends in .html. title: of the page; by default what the field is.
-    settings: as `render` takes them in its studio: level, clip, tolerance, material, camera, up,
-        boundary, ..., and backdrop="light" or "dark". A `Slider` may stand in the place of a
-        number, and functions of sliders, by the names of their arguments, in the place of anything.
-        What is drawn at each place of a slider is in the file: of one without a step 33, of
-        two 17 each, and fewer where they would take more than 4 MB (9, of several 5 each, at
-        least). A page with sliders of more than 8 MB is written with a warning.
+    path: ends in .html. title: of the page; by default the field's own text.
+    options, keywords: as `render` takes them in its studio: level, clip, tolerance, material,
+        camera, up, boundary_radius, ..., and backdrop="light" or "dark"; those of still pictures
+        alone are refused. A `Slider` may stand in the place of a number, and functions of sliders,
+        by the names of their arguments, in the place of anything. What is drawn at each place of a
+        slider is in the file: of one without a step 33, of two 17 each, and fewer where they would
+        take more than 4 MB (9, of several 5 each, at least). A page with sliders of more than 8 MB
+        is written with a warning.
     client, checkpoint: as `render` takes them, for the places of sliders.
 
     Raises:
@@ -94,10 +95,13 @@ def page(
         TypeError: what is no field; an unknown setting; a slider that nothing depends on.
     """
     target = os.fspath(path)
+    settings = dict(keywords)
+    title, progress = settings.pop("title", ""), settings.pop("progress", True)
+    client, checkpoint = settings.pop("client", None), settings.pop("checkpoint", None)
     check_title(title)
     if not target.lower().endswith((".html", ".htm")):
         raise ValueError(f"{target}: a page is written as .html")
-    job = PageJob(what, settings, register().variant())
+    job = PageJob(surfaces, {**settings, "options": options}, register().variant())
     with progress_bar("page", progress) as advance:
         live = job.live
         scene = live.scene(title or live.content.name)
@@ -111,7 +115,7 @@ def page(
         warnings.warn(
             f"{target} has {len(text) / 1e6:.1f} MB, because it holds what is drawn at {count:,} "
             "places of the sliders: give them larger steps, as in "
-            "harnack.Slider(low, high, step=...)",
+            "harnack.Slider(low, high, step=0.5)",
             stacklevel=2,
         )
 
@@ -182,7 +186,7 @@ def _slider_state(live: LiveScene, values: Mapping[str, float]) -> JsonDict:
 class PageJob:
     """The job of computing the states of a page: the arguments of `page`, and Mitsuba's variant."""
 
-    what: Any
+    surfaces: Any
     settings: Mapping[str, Any]
     variant: str
 
@@ -190,7 +194,7 @@ class PageJob:
     def given(self) -> LiveScene:
         """The live scene of the arguments."""
         set_variant(self.variant)
-        return LiveScene.of(self.what, dict(self.settings))
+        return LiveScene.of(self.surfaces, dict(self.settings))
 
     @functools.cached_property
     def places(self) -> dict[str, list[float]]:

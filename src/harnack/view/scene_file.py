@@ -13,8 +13,10 @@ A field is one of {"curves": loops of points, "lift_bound": ..., "cells": true o
 {"formula": text, "parameters": numbers by name},
 {"scene": a name of the gallery, "number": which of its surfaces}, {"file": a surface file,
 "read_as": ..., "take_boundary": ..., "normals": ..., "smoothing": ..., "up": ...}, or the name of a
-class and its arguments, as {"Sphere": {"radius": 2}}. Beside it stand the settings of `level_set`,
-under "settings" those of `render`, by the names that they have in Python.
+class and its arguments, as {"Sphere": {"radius": 2}}. Beside it stand the keywords of `Surface`;
+{"scene": ..., "number": ...} in place of a field and its keywords is a surface of the gallery with
+its own. Under "settings" stand the options of `render` and of traces, by the names that they have
+in Python (`rendering.option_table`).
 """
 
 from __future__ import annotations
@@ -35,7 +37,6 @@ import numpy as np
 
 from harnack import geometry
 from harnack.backend.validation import as_positive, as_real
-from harnack.enclosures.selection import choose_enclosures
 from harnack.field_from_file import field_from_file
 from harnack.fields import Field, Solid, solids
 from harnack.fields.analytic.periodic import Gyroid, SchwarzD, SchwarzP
@@ -49,11 +50,16 @@ from harnack.geometry import Volume
 from harnack.name_suggestions import did_you_mean
 from harnack.rendering import Camera, Isolines
 from harnack.rendering.framing import rotation_to_z_up
-from harnack.rendering.render_options import OPTION_NAMES, STUDIO_OPTIONS, RenderOptions
+from harnack.rendering.option_table import BY_NAME, options_of
 from harnack.rendering.stage import parse_material
-from harnack.rendering.studio_surfaces import with_options
-from harnack.tracer import HitTolerance, Surface, level_set
-from harnack.view.sliders import NUMERIC_RENDER_OPTIONS, Slider
+from harnack.tracer import HitTolerance, Surface, TracedSurface, TraceOptions
+from harnack.tracer.trace_options import (
+    SURFACE_OPTIONS,
+    TRACE_OPTIONS,
+    surface_and_options,
+    trace_options_among,
+)
+from harnack.view.sliders import SLIDER_OPTIONS, Slider
 from harnack.view.type_checks import check_types
 
 __all__ = [
@@ -62,25 +68,16 @@ __all__ = [
     "SceneFileError",
     "parse_scene",
     "read_scene",
-    "surface_options",
     "to_scene_text",
+    "with_flat_options",
     "write_scene",
 ]
 
 VERSION = 1
 _MAX_BYTES = 64 * 2**20
 _ENDING = ".json"
-SURFACE_SETTINGS = (
-    "level", "solid", "clip", "section", "tolerance", "max_steps", "bound", "overstep", "confirm",
-    "largest",
-)  # fmt: skip
-"""Names of the settings that `level_set` takes."""
-_SLIDER_OPTIONS = (*SURFACE_SETTINGS, *NUMERIC_RENDER_OPTIONS)
-_UNWRITTEN = ("of", "value_range", "colorbar", "progress")
-_OF_PICTURE = tuple(name for name in OPTION_NAMES if name not in _UNWRITTEN)
-_KNOWN = (*SURFACE_SETTINGS, *_OF_PICTURE)
-STILL_OPTIONS = tuple(name for name in _OF_PICTURE if name not in (*STUDIO_OPTIONS, "show"))
-"""Names of the settings that `render` takes for still pictures alone."""
+_SURFACE_KEYS = ("field", *SURFACE_OPTIONS)
+_KNOWN = tuple(option.name for option in options_of("render") if option.in_files)
 # Fields that say all of themselves by their arguments, besides solids.
 _EXTRA_FIELD_TYPES: tuple[type[Field], ...] = (
     Gyroid, SchwarzD, SchwarzP, SphericalHarmonic,
@@ -110,8 +107,8 @@ class SceneFile:
     """The contents of a scene file.
 
     surfaces: as `harnack.render`, `page` and `view` take them.
-    settings: of these functions, by name.
-    sliders: by the names of settings, for `page` and `view`; their start values are in `settings`.
+    settings: options of these functions, by name.
+    sliders: by the names of options, for `page` and `view`; their start values are in `settings`.
     """
 
     surfaces: tuple[Field | Surface, ...]
@@ -121,15 +118,17 @@ class SceneFile:
 
     @property
     def surfaces_with_options(self) -> tuple[Surface, ...]:
-        """The surfaces with the settings of the scene that are theirs (level, clip, ...), for
+        """The surfaces with the options of the scene that are theirs (level, clip, ...), for
         `harnack.trace` and whatever else takes a `Surface`."""
-        own = surface_options(self.settings)
-        return tuple(with_options(one, own) for one in self.surfaces)
+        shorthand = {k: value for k, value in self.settings.items() if k in SURFACE_OPTIONS}
+        return tuple(
+            surface_and_options("a scene", surface, None, shorthand)[0] for surface in self.surfaces
+        )
 
-
-def surface_options(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings that `level_set` takes, among all settings."""
-    return {name: one for name, one in settings.items() if name in SURFACE_SETTINGS}
+    @property
+    def trace_options(self) -> TraceOptions:
+        """The options of traces among those of the scene."""
+        return TraceOptions(**{k: v for k, v in self.settings.items() if k in TRACE_OPTIONS})
 
 
 def read_scene(path: str | os.PathLike[str]) -> SceneFile:
@@ -166,17 +165,19 @@ def _resolve_file(folder: Path, name: str) -> Path:
 
 def write_scene(
     path: str | os.PathLike[str],
-    what: Any,
+    surfaces: Any,
     *,
-    origins: FieldSources = (),
+    sources: FieldSources = (),
     **settings: Any,
 ) -> None:
     """Write what is drawn, and how, into a scene file.
 
         hk.write_scene("mine.json", hk.SolidAngle(curve), level=2.0, material="gold")
 
-    what, settings: as `harnack.render` and `page` take them, with a `Slider` for `level` if wanted.
-    path: ends in .json. origins: fields that come from files or from the gallery, and where from.
+    path: ends in .json.
+    surfaces, settings: as `harnack.render` and `page` take them, `options` included, with a
+        `Slider` for options that are numbers.
+    sources: fields that come from files or from the gallery, and where from.
 
     Raises:
         SceneFileError (a ValueError): something that a text cannot hold, such as a Python function
@@ -185,7 +186,7 @@ def write_scene(
     target = os.fspath(path)
     if not target.lower().endswith(_ENDING):
         raise SceneFileError(f"{target}: a scene is written as {_ENDING}")
-    text = to_scene_text(what, settings, origins)
+    text = to_scene_text(surfaces, settings, sources)
     with write_atomically(target) as partial:
         partial.write_text(text, encoding="utf-8")
 
@@ -193,36 +194,58 @@ def write_scene(
 # Writing.
 
 
-def to_scene_text(what: Any, settings: Mapping[str, Any], origins: FieldSources = ()) -> str:
+def to_scene_text(surfaces: Any, settings: Mapping[str, Any], sources: FieldSources = ()) -> str:
     """A scene as text.
 
     Raises:
         SceneFileError: as `write_scene`.
     """
-    several: list[Any] = [*what] if isinstance(what, list | tuple) else [what]
-    if not several:
+    listed: list[Any] = [*surfaces] if isinstance(surfaces, list | tuple) else [surfaces]
+    if not listed:
         raise SceneFileError("there is nothing to write: give at least one field")
-    made: Plain = {"harnack": VERSION, "surfaces": [_surface_text(one, origins) for one in several]}
-    sliders = {name: one for name, one in settings.items() if isinstance(one, Slider)}
-    for name in sliders:
-        if name not in _SLIDER_OPTIONS:
-            raise SceneFileError(f"a slider of {name} cannot be written: only settings of surfaces")
-    written = {
-        name: _setting_text(name, one, origins)
-        for name, one in settings.items()
-        if one is not None and name not in sliders
+    scene: Plain = {
+        "harnack": VERSION,
+        "surfaces": [_surface_text(surface, sources) for surface in listed],
     }
-    starts = {name: one.start for name, one in sliders.items()}
-    given = {name: one for name, one in settings.items() if one is not None}
-    _check_values(SceneFile(tuple(several), {**given, **starts}))
-    if written:
-        made["settings"] = written
+    settings = with_flat_options(settings)
+    sliders = {name: value for name, value in settings.items() if isinstance(value, Slider)}
+    for name in sliders:
+        if name not in SLIDER_OPTIONS:
+            raise SceneFileError(f"a slider of {name} cannot be written: it is no number")
+    texts = {
+        name: _setting_text(name, value, sources)
+        for name, value in settings.items()
+        if value is not None and name not in sliders
+    }
+    starts = {name: slider.start for name, slider in sliders.items()}
+    values = {name: value for name, value in settings.items() if value is not None}
+    _check_values(SceneFile(tuple(listed), {**values, **starts}))
+    if texts:
+        scene["settings"] = texts
     if sliders:
-        made["sliders"] = {
-            name: {key: one for key, one in dataclasses.asdict(slider).items() if one is not None}
+        scene["sliders"] = {
+            name: {k: v for k, v in dataclasses.asdict(slider).items() if v is not None}
             for name, slider in sliders.items()
         }
-    return _json(made) + "\n"
+    return _json(scene) + "\n"
+
+
+def with_flat_options(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Options by name, where `options`, a `TraceOptions`, is replaced by what it sets.
+
+    Raises:
+        TypeError: an option of traces beside `options`.
+    """
+    flat = dict(settings)
+    options = flat.pop("options", None)
+    if options is None:
+        return flat
+    trace_options_among(options, flat)
+    for option in dataclasses.fields(TraceOptions):
+        value = getattr(options, option.name)
+        if value != option.default:
+            flat[option.name] = value
+    return flat
 
 
 def _json(made: Any, depth: int = 0) -> str:
@@ -241,29 +264,24 @@ def _json(made: Any, depth: int = 0) -> str:
     return f"{first}\n" + ",\n".join(entries) + "\n" + "  " * depth + last
 
 
-def _surface_text(one: Any, origins: FieldSources) -> Plain:
-    if isinstance(one, Field):
-        return {"field": _field_text(one, origins)}
-    if not isinstance(one, Surface):
-        raise SceneFileError(f"what is written are fields and level sets, not {one!r:.60}")
-    made: Plain = {"field": _field_text(one.field, origins)}
-    usual = level_set(one.field)
-    made["tolerance"] = _setting_text("tolerance", one.tolerance, origins)
-    if one.solid is not None:
-        made["solid"] = _setting_text("solid", one.solid, origins)
-    elif one.levels:
-        numbers = [float(number) for number in one.level_values]
-        made["level"] = numbers[0] if len(numbers) == 1 else numbers
-    if one.bound != choose_enclosures(None):
-        raise SceneFileError("a Surface with proofs chosen by name: give bound= as a setting")
-    for name in ("clip", "section", "max_steps", "overstep", "confirm", "largest"):
-        if getattr(one, name) != getattr(usual, name):
-            made[name] = _setting_text(name, getattr(one, name), origins)
-    return made
+def _surface_text(surface: Any, sources: FieldSources) -> Plain:
+    if isinstance(surface, Field):
+        return {"field": _field_text(surface, sources)}
+    if isinstance(surface, TracedSurface):
+        surface = surface.surface
+    if not isinstance(surface, Surface):
+        raise SceneFileError(f"what is written are fields and surfaces, not {surface!r:.60}")
+    text: Plain = {"field": _field_text(surface.field, sources)}
+    levels = [float(level) for level in surface.level_values]
+    text["level"] = levels[0] if len(levels) == 1 else levels
+    for name, value in surface.keywords.items():
+        if value:
+            text[name] = _setting_text(name, value, sources)
+    return text
 
 
-def _field_text(one: Field, origins: FieldSources) -> Plain:
-    for known, origin in origins:
+def _field_text(one: Field, sources: FieldSources) -> Plain:
+    for known, origin in sources:
         if one is known:
             return origin
     if isinstance(one, Expression) and isinstance(one.function, TextFormula):
@@ -349,13 +367,14 @@ def _number(value: float) -> Any:
     return value if math.isfinite(value) else ("inf" if value > 0 else "-inf")
 
 
-def _setting_text(name: str, value: Any, origins: FieldSources) -> Any:
+def _setting_text(name: str, value: Any, sources: FieldSources) -> Any:
     _check_name(name, _KNOWN, "setting")
     if isinstance(value, HitTolerance):
-        usual = HitTolerance(value.distance)
-        if value != usual:
+        if value != HitTolerance(value.distance):
             raise SceneFileError("tolerance: only a length can be written")
         return value.distance
+    if name == "enclosures" and not isinstance(value, str):
+        raise SceneFileError("enclosures: only those chosen by name can be written")
     if isinstance(value, Camera):
         every = {one.name: getattr(value, one.name) for one in dataclasses.fields(value)}
         usual = {one.name: one.default for one in dataclasses.fields(value)}
@@ -368,7 +387,7 @@ def _setting_text(name: str, value: Any, origins: FieldSources) -> Any:
             key: _to_json_value(one) for key in names if (one := getattr(value, key)) is not None
         }
     if name == "isolines" and isinstance(value, Sequence):
-        return [_setting_text(name, one, origins) for one in cast("Sequence[Any]", value)]
+        return [_setting_text(name, one, sources) for one in cast("Sequence[Any]", value)]
     try:
         return _to_json_value(value)
     except SceneFileError as wrong:
@@ -407,41 +426,42 @@ def _scene_of(given: Any, find: Callable[[str], Path] | None) -> SceneFile:
     listed = whole.get("surfaces")
     if not isinstance(listed, list) or not listed:
         raise SceneFileError("surfaces must be a list of one surface at least")
-    origins: list[tuple[Field, Plain]] = []
+    sources: list[tuple[Field, Plain]] = []
     surfaces = tuple(
-        _surface_of(one, f"surfaces[{k}]", find, origins)
+        _surface_of(one, f"surfaces[{k}]", find, sources)
         for k, one in enumerate(cast("list[Any]", listed))
     )
     settings = _settings_of(_object(whole.get("settings", {}), "settings"), _KNOWN)
     sliders = _object(whole.get("sliders", {}), "sliders")
     made: dict[str, Slider] = {}
     for name, one in sliders.items():
-        _check_name(name, _SLIDER_OPTIONS, "slider")
+        _check_name(name, SLIDER_OPTIONS, "slider")
         made[name] = _construct(Slider, one, f"sliders: {name}")
         settings[name] = made[name].start
-    scene = SceneFile(surfaces, settings, made, tuple(origins))
+    scene = SceneFile(surfaces, settings, made, tuple(sources))
     _check_values(scene)
     return scene
 
 
 def _check_values(scene: SceneFile) -> None:
-    """Raise SceneFileError for values that `render` or `level_set` would refuse later."""
+    """Raise SceneFileError for values that `render` or `Surface` would refuse later."""
     settings = scene.settings
     show = settings.get("show", "shaded")
     try:
-        _ = scene.surfaces_with_options
-        for one in dataclasses.fields(RenderOptions):
-            if one.name in settings:
-                one.metadata["check"](settings[one.name], show)
-        for name in NUMERIC_RENDER_OPTIONS:
-            if settings.get(name) is not None:
-                as_positive(settings[name], name)
+        _ = scene.surfaces_with_options, scene.trace_options
+        for name, value in settings.items():
+            if name in BY_NAME:
+                BY_NAME[name].check(value, show)
+            if name in ("boundary_radius", "thickness"):
+                as_positive(value, name)
         if settings.get("up") is not None:
             rotation_to_z_up(settings["up"])
-        for name in ("material", "boundary_material", "cut_material"):
-            given: Any = settings.get(name, [])
-            for each in cast("list[Any]", given) if isinstance(given, list) else [given]:
-                parse_material(each)
+        for name in ("material", "boundary_material", "section_material"):
+            materials: Any = settings.get(name, [])
+            for material in (
+                cast("list[Any]", materials) if isinstance(materials, list) else [materials]
+            ):
+                parse_material(material)
     except _CONSTRUCTION_ERRORS as wrong:
         raise SceneFileError(f"settings: {wrong}") from None
 
@@ -471,57 +491,60 @@ def _check_name(name: str, known: Sequence[str], what: str) -> None:
 
 
 def _surface_of(
-    given: Any, where: str, find: Callable[[str], Path] | None, origins: list[tuple[Field, Plain]]
+    entry: Any, where: str, find: Callable[[str], Path] | None, sources: list[tuple[Field, Plain]]
 ) -> Field | Surface:
-    own = dict(_object(given, where))
-    if "field" not in own:
-        raise SceneFileError(f"{where} has no field")
-    about = own.pop("field")
+    about = dict(_object(entry, where))
     try:
-        one = _origin_of(about, where, find)
-        if one is not None:
-            origins.append((one.field if isinstance(one, Surface) else one, about))
+        if "scene" in about:
+            surface = _gallery_surface(about)
+            sources.append((surface.field, about))
+            return surface
+        if "field" not in about:
+            raise SceneFileError(f"{where} has no field")
+        for name in about:
+            _check_name(name, _SURFACE_KEYS, "keyword of a surface")
+        text = about.pop("field")
+        field = _source_of(text, where, find)
+        if field is not None:
+            sources.append((field, text))
         else:
-            one = _field_of(about, f"{where}: field", find)
-        settings = _settings_of(own, SURFACE_SETTINGS)
-        return with_options(one, settings) if settings else one
+            field = _field_of(text, f"{where}: field", find)
+        keywords = _settings_of(about, SURFACE_OPTIONS)
+        return Surface(field, **keywords) if keywords else field
     except SceneFileError:
         raise
     except (*_CONSTRUCTION_ERRORS, OSError) as wrong:
         raise SceneFileError(f"{where}: {wrong}") from None
 
 
-def _origin_of(
-    given: Any, where: str, find: Callable[[str], Path] | None
-) -> Field | Surface | None:
-    """A surface of the gallery or of a file; None for another."""
-    about = _object(given, f"{where}: field")
+def _gallery_surface(about: Plain) -> Surface:
+    for name in about:
+        _check_name(name, ("scene", "number"), "part of a surface of the gallery")
+    scene, number = about["scene"], about.get("number", 0)
+    if not isinstance(scene, str) or scene not in SCENES:
+        raise SceneFileError(f"no scene is named {scene!r:.60}{did_you_mean(str(scene), SCENES)}")
+    surfaces = SCENES[scene].surfaces()
+    if type(number) is not int or not 0 <= number < len(surfaces):
+        raise SceneFileError(f"{scene} has {len(surfaces)} surfaces, and no number {number!r:.60}")
+    return surfaces[number]
+
+
+def _source_of(text: Any, where: str, find: Callable[[str], Path] | None) -> Field | None:
+    """The field of a surface of the gallery, or of a file; None for another."""
+    about = _object(text, f"{where}: field")
     if "scene" in about:
-        for name in about:
-            _check_name(name, ("scene", "number"), "part of a field")
-        scene, number = about["scene"], about.get("number", 0)
-        if not isinstance(scene, str) or scene not in SCENES:
-            raise SceneFileError(
-                f"no scene is named {scene!r:.60}{did_you_mean(str(scene), SCENES)}"
-            )
-        surfaces = SCENES[scene].surfaces()
-        if type(number) is not int or not 0 <= number < len(surfaces):
-            raise SceneFileError(
-                f"{scene} has {len(surfaces)} surfaces, and no number {number!r:.60}"
-            )
-        return surfaces[number]
+        return _gallery_surface(about).field
     if "file" not in about:
         return None
     for name in about:
         _check_name(name, ("file", *_FILE_OPTIONS), "part of a field")
-    options = {key: one for key, one in about.items() if key != "file"}
+    options = {key: value for key, value in about.items() if key != "file"}
     check_types(field_from_file, options)
     if not isinstance(about["file"], str):
         raise SceneFileError(f"{where}: file must be a text, not {about['file']!r:.60}")
     if find is None:
         raise SceneFileError("a scene that is opened in a browser must not name files")
-    opened = field_from_file(find(about["file"]), **cast("Any", options))
-    return opened.field
+    return field_from_file(find(about["file"]), **cast("Any", options)).field
 
 
 def _field_of(given: Any, where: str, find: Callable[[str], Path] | None) -> Field:

@@ -14,6 +14,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, cast
 
 from harnack.backend.validation import as_integer_in_range
+from harnack.rendering.option_table import shows_options
 from harnack.view.live_scene import LiveScene
 from harnack.view.page import check_title, document, still_png
 from harnack.view.scene_file import FieldSources
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 
     from aiohttp import web
 
+    from harnack.tracer import TraceOptions
     from harnack.view.live_scene import JsonDict
     from harnack.view.widget import Widget
 
@@ -75,17 +77,19 @@ class LiveView:
         return f'<iframe src="{self.address}" style="width:100%;height:480px;border:0"></iframe>'
 
 
+@shows_options("view")
 def view(
-    what: Any,
+    surfaces: Any,
     *,
     title: str = "",
     host: str = "127.0.0.1",
     port: int = 0,
-    opens: bool = True,
-    waits: bool | None = None,
-    origins: FieldSources = (),
+    open_browser: bool = True,
+    block: bool | None = None,
+    sources: FieldSources = (),
     height: int = 480,
-    **settings: Any,
+    options: TraceOptions | None = None,
+    **keywords: Any,
 ) -> LiveView | Widget:
     """Show surfaces live in the browser: turned, moved by sliders, their curves dragged.
 
@@ -98,18 +102,18 @@ def view(
     is compiled.
 
     In a notebook that has anywidget (`pip install harnack[notebook]`) it is a live widget, whose
-    `camera`, `sliders`, `points` and `show` are attributes with events. `port` or `opens=False`
-    asks for the server there too.
+    `camera`, `sliders`, `points` and `show` are attributes with events. `port` or
+    `open_browser=False` asks for the server there too.
 
-    what, title, settings: as `page` takes them. The points of the curve of a `SolidAngle` can be
-        moved, inserted (double click), removed (Delete) and smoothed, with undo and redo.
+    surfaces, title, options, keywords: as `page` takes them. The points of the curve of a
+        `SolidAngle` can be moved, inserted (double click), removed (Delete) and smoothed, with undo
+        and redo.
     host: the address to serve at; anything but this machine's own is open to the network, so that
         the address of the page then has a token, without which nothing is answered.
-    port: 0 for a free one. height: of a widget, in pixels. opens: whether to open a browser.
-    waits: whether to return only when Ctrl-C is pressed; by default where Python is not used
+    port: 0 for a free one. height: of a widget, in pixels. open_browser: whether to open a browser.
+    block: whether to return only when Ctrl-C is pressed; by default where Python is not used
         interactively.
-
-    origins: fields that come from files or the gallery, and where from, for scene files that are
+    sources: fields that come from files or the gallery, and where from, for scene files that are
         saved in the view; as `SceneFile` has them.
 
     Raises what `page` raises; ModuleNotFoundError without aiohttp (`pip install harnack[view]`);
@@ -120,10 +124,11 @@ def view(
     check_title(title)
     if not isinstance(cast("Any", host), str):
         raise TypeError(f'host must be an address, such as "127.0.0.1", not {host!r:.60}')
-    live = LiveScene.of(what, settings, edits=True, origins=origins)
+    settings = {**keywords, "options": options}
+    live = LiveScene.of(surfaces, settings, edits=True, sources=sources)
     live = live.framed(extreme_slider_values(live.content.sliders))
     title = title or live.content.name
-    if opens and port == 0 and host == _LOCAL[0] and waits is None and in_notebook():
+    if open_browser and port == 0 and host == _LOCAL[0] and block is None and in_notebook():
         try:
             from harnack.view.widget import Widget
         except ImportError:
@@ -140,11 +145,11 @@ def view(
     print(f"{scene['title']}: {made.address}", file=sys.stderr)
     if token:
         print("open to the network: whoever has this address can use it", file=sys.stderr)
-    if opens:
+    if open_browser:
         webbrowser.open(made.address)
-    if waits is None:
-        waits = not (hasattr(sys, "ps1") or "ipykernel" in sys.modules)
-    if waits:
+    if block is None:
+        block = not (hasattr(sys, "ps1") or "ipykernel" in sys.modules)
+    if block:
         made.wait()
     return made
 

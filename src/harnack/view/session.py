@@ -350,7 +350,7 @@ class Session:
             raise RequestError("text must be that of a scene file")
         saved = parse_scene(text)
         settings = {**live_options(saved.settings), **saved.sliders}
-        live = LiveScene.of([*saved.surfaces], settings, edits=True, origins=saved.sources)
+        live = LiveScene.of([*saved.surfaces], settings, edits=True, sources=saved.sources)
         self.live = live.framed(extreme_slider_values(live.content.sliders))
         self._painter, self._painted = PreviewRenderer(), None
         return self.live.scene(self.live.content.name)
@@ -422,7 +422,7 @@ def _settings(given: Any) -> dict[str, Any]:
             except ValueError as wrong:
                 raise RequestError(str(wrong)) from None
         elif value is not None and not (_is_number(value) and value > 0):
-            raise RequestError(f"boundary must be a positive number or null, not {value!r:.60}")
+            raise RequestError(f"{name} must be a positive number or null, not {value!r:.60}")
     return settings
 
 

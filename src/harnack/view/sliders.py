@@ -13,10 +13,10 @@ from typing import Any, cast
 from harnack.backend.validation import as_finite
 from harnack.fields import Field
 from harnack.name_suggestions import did_you_mean
-from harnack.tracer import Surface, level_set
+from harnack.tracer import Surface
 
 __all__ = [
-    "NUMERIC_RENDER_OPTIONS",
+    "SLIDER_OPTIONS",
     "Slider",
     "SliderValueError",
     "SlidingContent",
@@ -24,8 +24,10 @@ __all__ = [
     "slider_values_in_errors",
 ]
 
-NUMERIC_RENDER_OPTIONS = ("boundary", "thickness")
-"""Settings of `render` that are numbers of surfaces, besides those of `level_set`."""
+SLIDER_OPTIONS = (
+    "level", "tolerance", "max_steps", "over_relaxation", "boundary_radius", "thickness",
+)  # fmt: skip
+"""Options that are numbers, so that a slider may be their value."""
 # Sliders of which all combinations of ends are few.
 _COMBINED = 3
 
@@ -86,7 +88,7 @@ class SlidingContent:
     """Content of a live view as a function of sliders.
 
     content: an argument that `hk.render` accepts, or a function of sliders that returns it.
-    settings: options of `render` and `level_set`, constant or functions of sliders.
+    settings: options of `view`, constant or functions of sliders.
     sliders: by name.
     """
 
@@ -104,9 +106,8 @@ class SlidingContent:
                 on.
         """
         sliders = {name: one for name, one in given.items() if isinstance(one, Slider)}
-        known = (*inspect.signature(level_set).parameters, *NUMERIC_RENDER_OPTIONS)
         settings = {name: one for name, one in given.items() if name not in sliders}
-        settings |= {name: sliders[name] for name in sliders if name in known}
+        settings |= {name: sliders[name] for name in sliders if name in SLIDER_OPTIONS}
         asked: set[str] = set(settings) & set(sliders)
         for name, one in {"the first argument": what, **settings}.items():
             if _is_function(one):
@@ -122,8 +123,9 @@ class SlidingContent:
         for name in sliders:
             if name not in asked:
                 raise TypeError(
-                    f"nothing depends on the slider {name!r}: it is no number of surfaces, and no "
-                    f"function has an argument of that name{did_you_mean(name, known)}"
+                    f"nothing depends on the slider {name!r}: it is no option that is a number, "
+                    "and no function has an argument of that name"
+                    f"{did_you_mean(name, SLIDER_OPTIONS)}"
                 )
         return cls(what, settings, sliders)
 

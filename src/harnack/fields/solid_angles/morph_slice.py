@@ -335,7 +335,9 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
         weight = sum(float(one.rows[:, 6].sum()) for one in self._dipoles)
         return values.with_far_field_errors(x, 64, weight).rescaled(on.size)
 
-    def quadrature_displacement(self, points: Any, precision: Precision | None = None) -> FloatArray:
+    def quadrature_displacement(
+        self, points: Any, precision: Precision | None = None
+    ) -> FloatArray:
         """As `Morph.quadrature_displacement`.
 
         Let a point at distance D stand for a part of the mesh with moment m. Its error is at most

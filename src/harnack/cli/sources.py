@@ -1,0 +1,316 @@
+"""What the SOURCE of a command is: a scene of the gallery, a file or a formula, with the options of
+the command line, as arguments of the verbs."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, cast
+
+from rich.console import Console
+
+from harnack.cli.arguments import CAMERA_OPTIONS
+from harnack.cli.messages import printable, python_to_cli_terms
+from harnack.field_from_file import field_from_file
+from harnack.fields import Field
+from harnack.fields.expressions import expression, looks_like_formula
+from harnack.files.geometry_files import GEOMETRY_SUFFIXES
+from harnack.gallery import SCENES, Scene
+from harnack.name_suggestions import did_you_mean
+from harnack.rendering import Camera
+from harnack.rendering.option_table import STUDIO_OPTIONS, options_of
+from harnack.tracer import Surface, TraceOptions
+from harnack.tracer.trace_options import SURFACE_OPTIONS, TRACE_OPTIONS
+from harnack.view import SceneFile, read_scene
+from harnack.view.live_scene import live_options
+from harnack.view.scene_file import FieldSources
+
+_SUFFIXES = (*GEOMETRY_SUFFIXES, ".xml", ".json")
+
+Content = tuple[Any, dict[str, Any], FieldSources]
+"""Surfaces, the options of a verb, and where the fields come from."""
+
+
+def options_set(verb: str, arguments: Any) -> dict[str, Any]:
+    """The options of a verb that are set on the command line, by their names in Python."""
+    values = {option.name: getattr(arguments, option.name, None) for option in options_of(verb)}
+    chosen = {name: value for name, value in values.items() if value is not None}
+    style = {
+        name: value
+        for name in ("width", "color")
+        if (value := getattr(arguments, f"isolines_{name}", None)) is not None
+    }
+    if style and "isolines" not in chosen:
+        raise ValueError(f"--isolines-{next(iter(style))} without isolines: give --isolines too")
+    if style:
+        chosen["isolines"] = replace(chosen["isolines"], **style)
+    return chosen
+
+
+def source_path(arguments: Any) -> Path:
+    """The file of the source, or the name of a scene; of a formula, a name for its output.
+
+    Raises:
+        ValueError: it is none of these.
+    """
+    name = arguments.source
+    if is_formula(name):
+        return Path("formula")
+    if arguments.parameters:
+        raise ValueError(f"--parameter {arguments.parameters[0][0]}: only formulas have names")
+    if name not in SCENES and Path(name).suffix.lower() not in _SUFFIXES:
+        raise ValueError(
+            f"{name!r} is no scene: give a name from `harnack gallery --list`, a surface file "
+            f"({', '.join(GEOMETRY_SUFFIXES)}), a scene file (.json), a Mitsuba scene (.xml) or a "
+            f'formula such as "x^2 + y^2 + z^2 = 1"{did_you_mean(name, SCENES)}'
+        )
+    return Path(name)
+
+
+def is_formula(name: str) -> bool:
+    """Whether a source is a formula."""
+    is_file = Path(name).suffix.lower() in _SUFFIXES
+    return name not in SCENES and not is_file and looks_like_formula(name)
+
+
+def is_mitsuba_scene(arguments: Any, path: Path) -> bool:
+    """Whether a source is the file of a Mitsuba scene."""
+    return arguments.source not in SCENES and path.suffix.lower() == ".xml"
+
+
+def load_mitsuba_scene(arguments: Any) -> tuple[str, dict[str, Any]]:
+    """A scene that has everything of its own, and the options of its picture."""
+    _refuse_file_options(arguments)
+    chosen = options_set("render", arguments)
+    of_scene = (*SURFACE_OPTIONS, *TRACE_OPTIONS, *STUDIO_OPTIONS)
+    wrong = [f"--{name.replace('_', '-')}" for name in chosen if name in of_scene]
+    wrong += [f"--{name}" for name in _camera_options(arguments)]
+    if wrong:
+        raise ValueError(f"{', '.join(wrong)}: a Mitsuba scene sets this in its own file")
+    return arguments.source, chosen
+
+
+def load_content(
+    verb: str, arguments: Any, path: Path, moved: Mapping[str, float] | None = None
+) -> Content:
+    """The surfaces of a source, with the options of a command.
+
+    moved: parameters of a formula besides those of the arguments.
+    """
+    chosen = options_set(verb, arguments)
+    if arguments.source in SCENES:
+        _refuse_file_options(arguments)
+        return _of_scene(SCENES[arguments.source], arguments, chosen)
+    if is_formula(arguments.source):
+        _refuse_file_options(arguments)
+        camera = _camera(arguments, Camera())
+        return formula_field(arguments, moved), {**camera, **chosen}, ()
+    if path.suffix.lower() == ".json":
+        _refuse_file_options(arguments)
+        return _of_scene_file(read_scene(path), arguments, chosen)
+    return _of_file(path, arguments, chosen)
+
+
+def load_live_content(verb: str, arguments: Any, path: Path) -> Content:
+    """The content of a page or a view, and its options, of which sliders may be values."""
+    if is_mitsuba_scene(arguments, path):
+        raise ValueError("a page needs a scene, a surface file or a formula, no Mitsuba scene")
+    sliders = dict(arguments.slider)
+    if path.suffix.lower() == ".json" and arguments.source not in SCENES:
+        sliders = {**read_scene(path).sliders, **sliders}
+    known = [option.name for option in options_of(verb)]
+    of_formula = [name for name in sliders if name not in known]
+    for name in sliders:
+        value = getattr(arguments, name, None) if name in known else None
+        if value is not None:
+            sliders[name] = replace(sliders[name], start=value)
+    if of_formula and not is_formula(arguments.source):
+        raise ValueError(
+            f"--slider {of_formula[0]}: there are sliders of options that are numbers, such as "
+            "level, and of names in formulas"
+        )
+    starts = {name: cast("float", sliders[name].start) for name in of_formula}
+    surfaces, settings, sources = load_content(verb, arguments, path, starts)
+    show = getattr(arguments, "show", None)
+    settings = live_options(settings) | ({} if show is None else {"show": show})
+    if any(name in SURFACE_OPTIONS for name in sliders):
+        surfaces, settings = _unpacked(surfaces, settings)
+    settings = _with_flat_options(settings, sliders) | sliders
+    if not of_formula:
+        return surfaces, settings, sources
+    formula, fixed = arguments.source, dict(arguments.parameters)
+
+    def field(**values: float) -> Field:
+        return expression(formula, parameters={**fixed, **values})
+
+    kind = inspect.Parameter.KEYWORD_ONLY
+    cast("Any", field).__signature__ = inspect.Signature(
+        [inspect.Parameter(name, kind) for name in of_formula]
+    )
+    return field, settings, sources
+
+
+def load_single_surface(arguments: Any, path: Path) -> Field | Surface:
+    """The one surface of a source, for a mesh; with the options of surfaces that are set."""
+    chosen = {k: v for k, v in options_set("mesh", arguments).items() if k in SURFACE_OPTIONS}
+    if is_formula(arguments.source) or arguments.source in SCENES:
+        _refuse_file_options(arguments)
+        if arguments.up is not None:
+            raise ValueError(f"--up is for surface files ({', '.join(GEOMETRY_SUFFIXES)}) only")
+    surfaces: Sequence[Field | Surface]
+    if is_formula(arguments.source):
+        surfaces = [formula_field(arguments)]
+    elif arguments.source in SCENES:
+        surfaces = SCENES[arguments.source].surfaces()
+    elif path.suffix.lower() == ".json":
+        surfaces = read_scene(path).surfaces_with_options
+    else:
+        opened = field_from_file(path, **_file_options(arguments))
+        print_line(f"{path}: {python_to_cli_terms(opened.summary)}")
+        if arguments.smoothing == "auto":
+            print_line(_described(opened.field))
+        surfaces = [opened.field]
+    if len(surfaces) != 1:
+        raise ValueError(
+            f"scene {path} has {len(surfaces)} surfaces, and a mesh can be made of one only"
+        )
+    return _replaced(surfaces[0], chosen)
+
+
+def formula_field(arguments: Any, moved: Mapping[str, float] | None = None) -> Field:
+    """The field of a source that is a formula."""
+    return expression(arguments.source, parameters={**dict(arguments.parameters), **(moved or {})})
+
+
+def print_line(line: str) -> None:
+    """Print a line about what was read or done; names in it stand as they are."""
+    Console(highlight=False, soft_wrap=True, markup=False, emoji=False).print(printable(line))
+
+
+def _of_scene(scene: Scene, arguments: Any, chosen: dict[str, Any]) -> Content:
+    surfaces = scene.surfaces()
+    of_surface, rest = _split(chosen, SURFACE_OPTIONS)
+    single = [name for name in ("level", "side") if name in of_surface]
+    if single and len(surfaces) != 1:
+        raise ValueError(f"scene {scene.name} has several surfaces; --{single[0]} does not apply")
+    sources = [
+        (surface.field, {"scene": scene.name, "number": number})
+        for number, surface in enumerate(surfaces)
+    ]
+    of_trace, rest = _split(rest, TRACE_OPTIONS)
+    settings = {**scene.settings(len(surfaces)), **rest}
+    settings["options"] = scene.options.replace(**of_trace)
+    settings |= _camera(arguments, scene.camera)
+    return [_replaced(surface, of_surface) for surface in surfaces], settings, sources
+
+
+def _of_scene_file(scene: SceneFile, arguments: Any, chosen: dict[str, Any]) -> Content:
+    settings = dict(scene.settings)
+    settings |= _camera(arguments, settings.get("camera") or Camera())
+    if "level" in chosen and len(scene.surfaces) != 1:
+        raise ValueError("a scene of several surfaces has their levels; --level does not apply")
+    of_surface, rest = _split(chosen, SURFACE_OPTIONS)
+    surfaces = [
+        _replaced(surface, of_surface) if isinstance(surface, Surface) else surface
+        for surface in scene.surfaces
+    ]
+    if not all(isinstance(surface, Surface) for surface in surfaces):
+        settings |= of_surface
+    return surfaces, {**settings, **rest}, scene.sources
+
+
+def _of_file(path: Path, arguments: Any, chosen: dict[str, Any]) -> Content:
+    chosen = {name: value for name, value in chosen.items() if name != "up"}
+    opened = field_from_file(path, **_file_options(arguments))
+    print_line(f"{path}: {python_to_cli_terms(opened.summary)}")
+    print_line(_described(opened.field))
+    if getattr(arguments, "show", None) is None and opened.show != "path":
+        chosen["show"] = opened.show
+        print_line(f"drawn {opened.show}; --show path follows light paths, in minutes")
+    source = {"file": str(path.resolve())}
+    source |= {name: value for name, value in _file_options(arguments).items() if value}
+    settings = {"material": opened.material, **_camera(arguments, Camera()), **chosen}
+    return opened.field, settings, [(opened.field, source)]
+
+
+def _file_options(arguments: Any) -> dict[str, Any]:
+    names = ("read_as", "take_boundary", "normals", "smoothing", "up")
+    return {name: getattr(arguments, name) for name in names}
+
+
+def _refuse_file_options(arguments: Any) -> None:
+    for name in ("read_as", "take_boundary", "normals", "smoothing"):
+        if getattr(arguments, name):
+            raise ValueError(
+                f"--{name.replace('_', '-')} is for surface files "
+                f"({', '.join(GEOMETRY_SUFFIXES)}) only"
+            )
+
+
+def _split(values: Mapping[str, Any], names: Sequence[str]) -> tuple[dict[str, Any], ...]:
+    """The values of these names, and the others."""
+    inside = {name: value for name, value in values.items() if name in names}
+    return inside, {name: value for name, value in values.items() if name not in names}
+
+
+def _replaced(surface: Field | Surface, keywords: Mapping[str, Any]) -> Field | Surface:
+    """A surface with other keywords. A level in place of a solid's is that of the level set."""
+    if not keywords:
+        return surface
+    if isinstance(surface, Field):
+        return Surface(surface, **keywords)
+    changes = dict(keywords)
+    if "level" in changes and "side" not in changes and surface.side == "between":
+        changes["side"] = None
+    return surface.replace(**changes)
+
+
+def _unpacked(surfaces: Any, settings: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
+    """A single surface as its field, and its keywords beside the other options: a slider can then
+    be the value of a keyword."""
+    listed: list[Any] = [*surfaces] if isinstance(surfaces, list | tuple) else [surfaces]
+    if not any(isinstance(surface, Surface) for surface in listed):
+        return surfaces, settings
+    if len(listed) != 1:
+        raise ValueError("a scene of several surfaces has their levels; sliders do not apply")
+    (surface,) = listed
+    if surface.side == "between":
+        raise ValueError("this scene is a solid between two levels; a slider does not apply")
+    own = {name: value for name, value in surface.keywords.items() if value}
+    return surface.field, {"level": surface.level_values[0], **own, **settings}
+
+
+def _with_flat_options(settings: dict[str, Any], sliders: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings without `options` if a slider is the value of an option of traces."""
+    options = settings.get("options")
+    if not isinstance(options, TraceOptions) or not any(name in TRACE_OPTIONS for name in sliders):
+        return settings
+    flat = {name: value for name, value in settings.items() if name != "options"}
+    return {**{name: getattr(options, name) for name in ("tolerance", "max_steps")}, **flat}
+
+
+def _camera_options(arguments: Any) -> dict[str, Any]:
+    values = {name: getattr(arguments, name, None) for name in CAMERA_OPTIONS}
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def _camera(arguments: Any, camera: Camera) -> dict[str, Any]:
+    """The camera, changed by the options that are set; empty if none is."""
+    chosen = _camera_options(arguments)
+    if not chosen:
+        return {}
+    if "position" in chosen:  # in place of where the camera stands by its angles
+        camera = replace(camera, azimuth=None, elevation=None, distance=None)
+    elif {"azimuth", "elevation", "distance"} & set(chosen):
+        camera = replace(camera, position=None)
+    return {"camera": replace(camera, **chosen)}
+
+
+def _described(field: Field) -> str:
+    facts = ", ".join(
+        f"{key}: {f'{value:.6g}' if isinstance(value, float) else value}"
+        for key, value in field.describe().items()
+    )
+    return f"{type(field).__name__}: {facts}"

@@ -1,0 +1,377 @@
+"""The table of all options of all verbs: `OPTIONS`.
+
+From it come the checks of calls in Python and their signatures, the options of the command line,
+what scene files hold, what films and sliders may change, and the table of the documentation. An
+option is a row here, a check in `render_options`, and what uses it.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
+
+from harnack.name_suggestions import did_you_mean
+from harnack.rendering import option_text as text
+from harnack.rendering import render_options as checks
+from harnack.tracer.trace_options import (
+    SURFACE_OPTIONS,
+    TRACE_OPTIONS,
+    TraceKeywords,
+    TraceOptions,
+    shorthand_parameters,
+    shows_parameters,
+)
+
+if TYPE_CHECKING:
+    import os
+
+    from harnack.fields import Field
+    from harnack.progress import Advance
+    from harnack.rendering.backdrops import Backdrop
+    from harnack.rendering.camera import Camera
+    from harnack.rendering.isolines import Isolines
+    from harnack.rendering.studio_surfaces import MaterialLike
+
+_Function = TypeVar("_Function", bound=Callable[..., Any])
+
+PICTURES = frozenset(("render", "animate"))
+LIVE = frozenset(("view", "page"))
+DRAWN = PICTURES | LIVE
+DISTANCES = frozenset(("signed_distance", "closest_points", "distance_bounds"))
+CURVATURES = frozenset(("curvature", "curvature_lines"))
+RAYS = frozenset(("trace", "crossings"))
+VERBS = RAYS | DRAWN | DISTANCES | CURVATURES | {"mesh", "repair"}
+"""The functions that take options."""
+
+_PLACED = RAYS | DRAWN | DISTANCES | {"mesh", "curvature_lines"}
+
+Parse = Callable[[str], Any]
+
+
+@dataclass(frozen=True)
+class Option:
+    """An option of verbs.
+
+    name: the keyword in Python and the name in scene files; on the command line "--name", with
+        hyphens.
+    group: the kind of thing that it says: surface, trace, image, style, color, quality, run, film,
+        live, server, mesh or repair.
+    verbs: those that honor it; all others refuse it by name.
+    help: what it is, in a sentence without a period, and its default in brackets.
+    value: what a value is on the command line, such as "LENGTH" or "WxH"; "" for an option that
+        takes none.
+    parse: the value of a text of the command line; None for an option that it does not have, or
+        makes of several others.
+    check: of a value and of `show`, for a picture; it returns the value in its final form.
+    default: the value if it is not set; default_of: other defaults, by verb.
+    varies: whether films and sliders may change it.
+    in_files: whether scene files hold it.
+    """
+
+    name: str
+    group: str
+    verbs: frozenset[str]
+    help: str
+    value: str = ""
+    parse: Parse | None = None
+    check: checks.Check = checks.unchecked
+    default: Any = None
+    default_of: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    varies: bool = False
+    in_files: bool = True
+
+    @property
+    def flag(self) -> str:
+        """Its name on the command line."""
+        return f"--{self.name.replace('_', '-')}"
+
+    def default_in(self, verb: str) -> Any:
+        """The value that a verb has if it is not set."""
+        return self.default_of.get(verb, self.default)
+
+
+def _of_trace(name: str) -> Any:
+    return TraceOptions.__dataclass_fields__[name].default
+
+
+OPTIONS: tuple[Option, ...] = (
+    Option("level", "surface", _PLACED, "level to draw, or several with commas; pi is understood: "
+           "2pi, pi/2 (the field's own: 1/2 for meshes, 2pi for curves)", "LEVEL",
+           text.parse_levels, varies=True),
+    Option("clip", "surface", _PLACED, "volume that cuts the surface: ball:X,Y,Z,RADIUS, or "
+           "box:X,Y,Z,X,Y,Z between two corners", "VOLUME", text.parse_clip, varies=True),
+    Option("section", "surface", _PLACED, "plane that opens the surface: leave out what lies beyond "
+           "it, on the side that the vector X,Y,Z points to, at a distance from the origin (0)",
+           "X,Y,Z[,DISTANCE]", text.parse_section, varies=True),
+    Option("side", "surface", DRAWN | {"mesh"}, "surface, or the closed solid where the function "
+           "is below or above the level, or between two levels", "{surface,below,above,between}",
+           text.parse_choice("surface", "below", "above", "between")),
+    Option("largest", "surface", DRAWN | {"trace", "mesh", "repair"},
+           "only the largest connected component", default=False),
+    Option("tolerance", "trace", RAYS | DRAWN | {"mesh", "repair"}, "largest distance of hits or "
+           "triangles from the surface (1e-4 of its size, 1e-3 for meshes)", "LENGTH",
+           text.parse_positive, varies=True),
+    Option("enclosures", "trace", RAYS | DRAWN, "proof by which steps are made (the longest of all "
+           "that apply)", "NAME", text.parse_enclosures),
+    Option("max_steps", "trace", RAYS | DRAWN, "evaluations after which a ray is out of steps "
+           "(2000)", "N", text.parse_count, default=_of_trace("max_steps"), varies=True),
+    Option("over_relaxation", "trace", RAYS | DRAWN, "factor from 1 to 2 by which trial steps are "
+           "longer than proved ones (the field's own)", "FACTOR", text.parse_positive, varies=True),
+    Option("precision", "trace", RAYS | DISTANCES | CURVATURES, "arithmetic (that of the input)",
+           "{single,double}", text.parse_choice("single", "double"), in_files=False),
+    Option("backend", "trace", frozenset(("trace",)), "webgpu for any GPU of the system",
+           "{webgpu}", text.parse_choice("webgpu"), in_files=False),
+    Option("require_crossing", "trace", DRAWN | {"trace"}, "a ray hits only where the field passes "
+           "to the other side of the level, not where it comes near and turns back",
+           default=False),
+    Option("show", "image", DRAWN, "picture: path follows light paths, shaded lights first hits by "
+           "a formula, without noise; or what a ray found", "{" + ",".join(checks.SHOW_MODES) + "}",
+           text.parse_choice(*checks.SHOW_MODES), checks.ignoring_mode(checks.check_show),
+           "path", dict.fromkeys(("animate", "view", "page"), "shaded")),
+    Option("camera", "image", DRAWN, "camera, or the point where it stands",
+           check=checks.ignoring_mode(checks.check_camera), varies=True),
+    Option("size", "image", PICTURES, "width and height in pixels (800x600)", "WxH",
+           text.parse_size, checks.if_set(checks.check_image_size)),
+    Option("spp", "image", PICTURES, "samples per pixel (64; 9 at edges of shaded pictures)", "N",
+           text.parse_count, checks.if_set(checks.check_spp)),
+    Option("material", "style", DRAWN, "material of the surface, by name, or a color by name or "
+           "#rrggbb (two-tone)", "NAME", text.parse_material_name, varies=True),
+    Option("section_material", "style", DRAWN, "material of the faces of a solid on its section "
+           "(that of the rest)", "NAME", text.parse_material_name, varies=True),
+    Option("boundary_radius", "style", DRAWN, "radius of a tube around the curve at which the "
+           "surface ends (no tube)", "LENGTH", text.parse_positive, varies=True),
+    Option("boundary_material", "style", DRAWN, "material of this tube (gold)", "NAME",
+           text.parse_material_name, varies=True),
+    Option("isolines", "style", DRAWN, "lines where a coordinate or a formula is a multiple of an "
+           "interval, as z:0.1, x*y:1", "FORMULA:INTERVAL", text.parse_isolines_text,
+           checks.check_isolines, varies=True),
+    Option("thickness", "style", DRAWN | {"mesh"}, "thickness of a closed wall in place of the "
+           "surface, half on each side", "LENGTH", text.parse_positive, varies=True),
+    Option("backdrop", "style", DRAWN, "light, dark, transparent, a color such as white or "
+           "#334455, two from bottom to top such as white,steelblue, or an image (light)",
+           "BACKDROP", text.parse_backdrop_text, checks.check_backdrop, varies=True),
+    Option("up", "style", DRAWN, "axis that points up (z; of files .glb, .gltf and surfaces in "
+           ".obj y)", "AXIS", text.parse_axis),
+    Option("color_by", "color", PICTURES, "coordinate or formula of x, y and z whose values "
+           "show=value shows", "FORMULA", text.parse_formula, checks.check_color_by, varies=True),
+    Option("color_range", "color", PICTURES, "ends of the colors of values, depths or evaluations "
+           "(what is seen)", "LOW:HIGH", text.parse_range, checks.check_color_range),
+    Option("color_bar", "color", PICTURES, "bar with numbers beside such a picture, or its title",
+           "[TITLE]", str, checks.check_color_bar, default=False),
+    Option("antialias", "quality", PICTURES, "pixels of a shaded picture that get all samples: "
+           "edges in the picture, or also what cones around pixels meet (edges)",
+           "{" + ",".join(checks.ANTIALIASING) + "}", text.parse_choice(*checks.ANTIALIASING),
+           checks.check_antialias),
+    Option("max_depth", "quality", PICTURES, "longest light path in edges, -1 for no limit (12)",
+           "N", int, checks.check_max_depth),
+    Option("denoise", "quality", PICTURES, "take the noise out of a picture of light paths (needs "
+           "pip install 'harnack[denoise]')", check=checks.check_denoise, default=False),
+    Option("seed", "quality", PICTURES | {"mesh", "repair"}, "another seed, other noise, or other "
+           "small random moves of meshes (0)", "N", text.parse_seed,
+           checks.as_integer("seed"), 0),
+    Option("client", "run", PICTURES | {"page"}, "workers of a Dask cluster that do the work, by "
+           "its scheduler's address, such as tcp://10.0.0.1:8786 (needs pip install "
+           "'harnack[cluster]')", "ADDRESS", str, in_files=False),
+    Option("checkpoint", "run", PICTURES | {"page"}, "folder that keeps finished parts, and from "
+           "which a stopped task goes on", "FOLDER", str, in_files=False),
+    Option("chunks", "run", frozenset(("render",)), "number of parts that a picture is divided "
+           "into (as suits the workers)", "N", text.parse_count, in_files=False),
+    Option("progress", "run", PICTURES | DISTANCES | {"page", "mesh", "repair"}, "whether to show "
+           "how far the work is", default=True,
+           default_of=dict.fromkeys((*DISTANCES, "mesh", "repair")), in_files=False),
+    Option("frames", "film", frozenset(("animate",)), "number of pictures", "N", text.parse_count,
+           default=24, in_files=False),
+    Option("fps", "film", frozenset(("animate",)), "pictures a second (24)", "N",
+           text.parse_positive, default=24.0, in_files=False),
+    Option("orbit", "film", frozenset(("animate",)), "degrees that the camera goes around the "
+           "surface", "DEGREES", text.parse_number, default=0.0, in_files=False),
+    Option("title", "live", LIVE, "title of the page", "TEXT", str, default="", in_files=False),
+    Option("host", "server", frozenset(("view",)), "address to serve at; any but this machine's "
+           "own is open to the network, and the page's address then has a token (127.0.0.1)",
+           "ADDRESS", str, default="127.0.0.1", in_files=False),
+    Option("port", "server", frozenset(("view",)), "port to serve at, 0 for a free one (0)", "N",
+           text.parse_port, default=0, in_files=False),
+    Option("open_browser", "server", frozenset(("view",)), "whether to open a browser",
+           default=True, in_files=False),
+    Option("block", "server", frozenset(("view",)), "whether to return only after Ctrl-C",
+           in_files=False),
+    Option("height", "server", frozenset(("view",)), "height of a widget in pixels", default=480,
+           in_files=False),
+    Option("sources", "server", frozenset(("view",)), "where fields come from, for scene files "
+           "that are saved", default=(), in_files=False),
+    Option("cell_size", "mesh", frozenset(("mesh", "repair")), "size of cells before anything is "
+           "refined", "LENGTH", text.parse_positive, in_files=False),
+    Option("simplify", "mesh", frozenset(("mesh",)), "fewer triangles of closed meshes, as exact",
+           default=False, in_files=False),
+    Option("max_triangles", "mesh", frozenset(("mesh",)), "triangles beyond which a mesh is given "
+           "up, before anything is simplified (2,000,000)", "N", text.parse_count, in_files=False),
+    Option("keep", "repair", frozenset(("repair",)), "all: fail if the triangles cannot all be "
+           "kept; valid: keep those that are valid; none: make all anew (the first that can be "
+           "done)", "{all,valid,none}", text.parse_choice("all", "valid", "none"), in_files=False),
+    Option("filling", "repair", frozenset(("repair",)), "smooth: continue the surface around "
+           "holes; harmonic: where the winding number is 1/2 (smooth, and harmonic where those do "
+           "not fit)", "{smooth,harmonic}", text.parse_choice("smooth", "harmonic"),
+           default="smooth", in_files=False),
+)  # fmt: skip
+"""All options, in the order of their groups."""
+
+BY_NAME: Mapping[str, Option] = {option.name: option for option in OPTIONS}
+
+# Names in other programs, and what is called so here.
+_OTHER_PROGRAMS_NAMES = {
+    "color": '"material"', "colour": '"material"', "bsdf": '"material"', "samples": '"spp"',
+    "resolution": '"size"', "width": '"size"', "height": '"size"', "bound": '"enclosures"',
+    "filename": '"path", the second argument', "output": '"path", the second argument',
+    "file": '"path", the second argument', "domain": '"clip"', "solid": '"side"',
+    **dict.fromkeys(
+        ("azimuth", "elevation", "fov", "zoom", "position", "target", "distance"),
+        "camera=harnack.Camera(...), which has it",
+    ),
+}  # fmt: skip
+
+
+class RenderKeywords(TraceKeywords, total=False):
+    """The keywords of `render`, for type checkers: the rows of `OPTIONS` for pictures."""
+
+    show: ShowMode | str
+    camera: Camera | tuple[float, float, float] | None
+    size: tuple[int, int] | None
+    spp: int | None
+    material: Any
+    section_material: MaterialLike | None
+    boundary_radius: float | None
+    boundary_material: MaterialLike | None
+    isolines: Isolines | Any
+    thickness: float | None
+    backdrop: Any
+    up: str | tuple[float, float, float] | None
+    color_by: Any
+    color_range: tuple[float, float] | None
+    color_bar: bool | str
+    antialias: str | None
+    max_depth: int | None
+    denoise: bool
+    seed: int
+    client: Any
+    checkpoint: str | os.PathLike[str] | None
+    chunks: int | None
+    progress: bool | Advance
+
+
+ShowMode = Literal["path", "shaded", "normal", "evaluations", "status", "depth", "value"]
+
+
+def options_of(verb: str) -> tuple[Option, ...]:
+    """The options that a verb honors."""
+    return tuple(option for option in OPTIONS if verb in option.verbs)
+
+
+def names_of(verb: str, *groups: str) -> tuple[str, ...]:
+    """The names of the options that a verb honors, of these groups."""
+    return tuple(option.name for option in options_of(verb) if option.group in groups)
+
+
+def complete_options(verb: str, keywords: Mapping[str, Any]) -> dict[str, Any]:
+    """All options of a verb but those of surfaces and traces, set or by default; and of these only
+    those that are set.
+
+    Raises:
+        TypeError: there is no such option, or the verb does not honor it.
+    """
+    refuse_unknown(verb, keywords)
+    unset = {
+        option.name: option.default_in(verb)
+        for option in options_of(verb)
+        if option.name not in SHORTHAND
+    }
+    return {**unset, **keywords}
+
+
+def refuse_unknown(verb: str, keywords: Mapping[str, Any]) -> None:
+    """Raise TypeError for a keyword that is no option of a verb."""
+    for name in keywords:
+        option = BY_NAME.get(name)
+        if option is not None and verb not in option.verbs:
+            others = ", ".join(sorted(option.verbs))
+            raise TypeError(f"{verb} has no {name}: that is an option of {others}")
+        if option is None:
+            known = [option.name for option in options_of(verb)]
+            other_name = _OTHER_PROGRAMS_NAMES.get(name.lower())
+            hint = f"; did you mean {other_name}?" if other_name else did_you_mean(name, known)
+            raise TypeError(f"{verb} has no option {name!r}{hint}; it has {', '.join(known)}")
+
+
+def shows_options(verb: str) -> Callable[[_Function], _Function]:
+    """Return a decorator of a verb that takes keywords: its signature shows its options by name,
+    with their defaults. Films and live views may have others, which their functions take."""
+    shorthand, annotations = shorthand_parameters(), RenderKeywords.__annotations__
+    kind = inspect.Parameter.KEYWORD_ONLY
+    parameters = [
+        shorthand[option.name]
+        if option.name in shorthand
+        else inspect.Parameter(
+            option.name,
+            kind,
+            default=option.default_in(verb),
+            annotation=getattr(annotations.get(option.name), "__forward_arg__", "Any"),
+        )
+        for option in options_of(verb)
+    ]
+    return shows_parameters(parameters, keeps_others=verb in LIVE)
+
+
+STUDIO_OPTIONS = ("camera", *names_of("render", "style"))
+"""The options of pictures that a Mitsuba scene, which has all of its own, does not take."""
+SHORTHAND = frozenset((*SURFACE_OPTIONS, *TRACE_OPTIONS))
+"""The names of the options of `Surface` and `TraceOptions`."""
+
+
+def shorthand_among(options: Mapping[str, Any]) -> dict[str, Any]:
+    """The options of `Surface` and `TraceOptions` among these."""
+    return {name: value for name, value in options.items() if name in SHORTHAND}
+
+
+@dataclass(frozen=True)
+class RenderOptions:
+    """The options of a picture in their final form, but for those of surfaces, traces and of who
+    does the work: sizes and counts are integers, None is not set."""
+
+    show: str
+    size: tuple[int, int] | None
+    spp: int | None
+    antialias: str | None
+    material: Any
+    camera: Camera
+    backdrop: Backdrop
+    up: Any
+    boundary_radius: float | None
+    boundary_material: Any
+    section_material: Any
+    isolines: tuple[Isolines, ...]
+    thickness: float | None
+    color_by: Field | None
+    color_range: tuple[float, float] | None
+    color_bar: bool | str
+    max_depth: int | None
+    seed: int
+    denoise: bool
+
+    def __post_init__(self) -> None:
+        if self.antialias == "cones" and self.spp == 1:
+            raise ValueError(
+                'antialias="cones" looks for pixels for more than one sample, and spp is 1: give '
+                "spp=9, or leave antialias out"
+            )
+
+    @classmethod
+    def of(cls, options: Mapping[str, Any]) -> RenderOptions:
+        """The options, from values by name.
+
+        Raises:
+            TypeError, ValueError: naming the option that is wrong, and what it should be.
+        """
+        show: str = options["show"]
+        names = [column.name for column in fields(cls)]
+        return cls(**{name: BY_NAME[name].check(options[name], show) for name in names})

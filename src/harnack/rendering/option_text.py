@@ -1,0 +1,213 @@
+"""Values of options as people write them on a command line: text to values.
+
+Each function raises ValueError with a sentence that says how to write it.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from typing import Any
+
+from harnack.enclosures.selection import ENCLOSURE_NAMES
+from harnack.fields.expressions import TextFormula
+from harnack.geometry import Ball, Box, HalfSpace, Volume
+from harnack.name_suggestions import did_you_mean
+from harnack.rendering.backdrops import IMAGE_FILES, parse_backdrop
+from harnack.rendering.isolines import Isolines
+from harnack.rendering.scales import parse_color
+from harnack.rendering.stage import parse_material
+
+# Of what was typed, this much is repeated in messages.
+_SHOWN = 60
+_AXES = ("x", "y", "z", "-x", "-y", "-z")
+
+
+def quoted(text: str) -> str:
+    """The beginning of what was typed, in quotes."""
+    return repr(text if len(text) <= _SHOWN else text[:_SHOWN] + "...")
+
+
+def parse_choice(*names: str) -> Callable[[str], str]:
+    """A parser of one of several names."""
+
+    def choice(text: str) -> str:
+        if text not in names:
+            raise ValueError(
+                f"{quoted(text)} is none of {', '.join(names)}{did_you_mean(text, names)}"
+            )
+        return text
+
+    return choice
+
+
+parse_enclosures = parse_choice(*ENCLOSURE_NAMES)
+parse_axis = parse_choice(*_AXES)
+
+
+def parse_number(text: str) -> float:
+    """A finite number."""
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise ValueError(f"{quoted(text)} must be a finite number")
+    return number
+
+
+def parse_positive(text: str) -> float:
+    """A positive number."""
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not 0 < number < math.inf:
+        raise ValueError(f"{quoted(text)} must be a positive number")
+    return number
+
+
+def parse_count(text: str) -> int:
+    """A number of things, at least 1."""
+    number = int(text) if re.fullmatch(r"[0-9]{1,9}", text) else 0
+    if number < 1:
+        raise ValueError(f"{quoted(text)} must be a whole number, at least 1")
+    return number
+
+
+def parse_seed(text: str) -> int:
+    """An integer."""
+    if not re.fullmatch(r"[+-]?[0-9]{1,18}", text):
+        raise ValueError(f"{quoted(text)} must be an integer of at most 18 digits")
+    return int(text)
+
+
+def parse_port(text: str) -> int:
+    """A port of this machine."""
+    if not re.fullmatch(r"[0-9]{1,5}", text) or int(text) > 65535:
+        raise ValueError(f"{quoted(text)} must be a number from 0 to 65535")
+    return int(text)
+
+
+def parse_level(text: str) -> float:
+    """A finite number, or a multiple of pi such as "2pi", "1.5*pi", "-pi/2"."""
+    match = re.fullmatch(
+        r"([+-]?[\d.]*(?:e[+-]?\d+)?)\s*\*?\s*(pi)?\s*(?:/\s*([\d.]+))?", text.strip()
+    )
+    try:
+        if not match:
+            raise ValueError
+        factor, has_pi, divisor = match.groups()
+        if factor in ("", "+", "-"):
+            if not has_pi:
+                raise ValueError
+            factor += "1"
+        level = float(factor) * (math.pi if has_pi else 1.0) / float(divisor or 1.0)
+        if not math.isfinite(level):
+            raise ValueError
+        return level
+    except (ValueError, ZeroDivisionError):
+        raise ValueError(f"{quoted(text)} is no level; write 0.5, 2pi or pi/3") from None
+
+
+def parse_levels(text: str) -> float | list[float]:
+    """A level, or several with commas."""
+    levels = [parse_level(part) for part in text.split(",")]
+    return levels if len(levels) > 1 else levels[0]
+
+
+def parse_range(text: str) -> tuple[float, float]:
+    """ "-0.3:0.3" as (-0.3, 0.3)."""
+    low, colon, high = text.partition(":")
+    if not colon:
+        raise ValueError(f"{quoted(text)}: write two values as -0.3:0.3")
+    ends = parse_level(low), parse_level(high)
+    if not ends[0] < ends[1]:
+        raise ValueError(f"{quoted(text)}: the first value must be the lower one")
+    return ends
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """ "800x600" as (800, 600)."""
+    match = re.fullmatch(r"([0-9]{1,9})[xX]([0-9]{1,9})", text)
+    if not match:
+        raise ValueError(f"{quoted(text)} is no size; write it as 800x600")
+    return int(match[1]), int(match[2])
+
+
+def parse_numbers(text: str, count: int) -> tuple[float, ...]:
+    """Finite numbers with commas."""
+    try:
+        numbers = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        numbers = ()
+    if len(numbers) != count or not all(map(math.isfinite, numbers)):
+        raise ValueError(f"{quoted(text)} must be {count} numbers with commas")
+    return numbers
+
+
+def parse_point(text: str) -> tuple[float, ...]:
+    """ "1,0,2" as (1, 0, 2)."""
+    return parse_numbers(text, 3)
+
+
+def parse_clip(text: str) -> Volume:
+    """ "ball:0,0,0,1" or "box:-1,-1,-1,1,1,1" as a volume."""
+    kind, colon, rest = text.partition(":")
+    if not colon or kind not in ("ball", "box"):
+        raise ValueError(
+            f"{quoted(text)} is no volume; write ball:X,Y,Z,RADIUS, such as ball:0,0,0,1, or "
+            "box:X,Y,Z,X,Y,Z, such as box:-1,-1,-1,1,1,1"
+        )
+    if kind == "ball":
+        x, y, z, radius = parse_numbers(rest, 4)
+        return Ball((x, y, z), radius)
+    x0, y0, z0, x1, y1, z1 = parse_numbers(rest, 6)
+    return Box((x0, y0, z0), (x1, y1, z1))
+
+
+def parse_section(text: str) -> HalfSpace:
+    """ "0,0,1" or "0,0,1,0.2" as the half-space behind a plane, at a distance from the origin."""
+    plane = parse_numbers(text, 4 if text.count(",") == 3 else 3)
+    x, y, z = plane[:3]
+    if not any((x, y, z)):
+        raise ValueError(f"{quoted(text)}: the vector must not be zero")
+    return HalfSpace((x, y, z), plane[3] if len(plane) == 4 else 0.0)
+
+
+def parse_formula(text: str) -> str:
+    """A formula of x, y and z, as it is written."""
+    TextFormula.parse(text)
+    return text
+
+
+def parse_isolines_text(text: str) -> Isolines:
+    """ "z:0.1" as isolines of z at multiples of 0.1."""
+    formula, colon, interval = text.rpartition(":")
+    if not colon:
+        raise ValueError(
+            f"{quoted(text)}: write a coordinate or a formula, and an interval, as z:0.1"
+        )
+    return Isolines(parse_formula(formula), interval=parse_positive(interval))
+
+
+def parse_material_name(text: str) -> str:
+    """The name of a material, or a color."""
+    parse_material(text)
+    return text
+
+
+def parse_color_name(text: str) -> str:
+    """A color by its name or as #rrggbb."""
+    parse_color(text, "a color")
+    return text
+
+
+def parse_backdrop_text(text: str) -> Any:
+    """A name, colors with a comma, or an image's file, as `render` takes it."""
+    parts = [part.strip() for part in text.split(",")]
+    is_file = text.lower().endswith(IMAGE_FILES)
+    backdrop: Any = text if is_file or len(parts) != 2 else tuple(parts)
+    parse_backdrop(backdrop)
+    return backdrop
