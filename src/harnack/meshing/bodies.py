@@ -75,8 +75,8 @@ def _is_closed(faces: IntArray) -> bool:
     """Whether every edge is run as often one way as the other."""
     pairs = half_edges(faces)
     count = int(pairs.max()) + 1
-    forth, back = (np.sort(pairs @ way) for way in ((count, 1), (1, count)))
-    return bool((forth == back).all())
+    forward_keys, backward_keys = (np.sort(pairs @ weights) for weights in ((count, 1), (1, count)))
+    return bool((forward_keys == backward_keys).all())
 
 
 def volume_of(x: FloatArray, faces: IntArray) -> float:
@@ -100,7 +100,7 @@ def nested(x: FloatArray, parts: list[IntArray]) -> list[list[int]]:
         sample = parts[i][:: max(1, len(parts[i]) // _PLACES)]
         normals = _unit_normals(x[sample])
         points = x[sample].mean(axis=1) - math.copysign(within, volumes[i]) * normals
-        around = [
+        containers = [
             j
             for j, (lower, upper) in enumerate(boxes)
             if j != i
@@ -109,7 +109,7 @@ def nested(x: FloatArray, parts: list[IntArray]) -> list[list[int]]:
             and sizes[j] > (1 + _WITHIN) * sizes[i]
             and all(abs(winding_around(corners[j], point)) > 0.5 for point in points)
         ]
-        holders.append(sorted(around, key=lambda j: sizes[j]))
+        holders.append(sorted(containers, key=lambda j: sizes[j]))
     return holders
 
 
@@ -203,7 +203,7 @@ def _united(shells: list[TriangleMesh], within: float) -> TriangleMesh:
         shared = [levels[k] ^ part for k in range(len(levels) - 1)]
         levels = [levels[0] + part, *(a + b for a, b in zip(levels[1:], shared, strict=True))]
     for part in clockwise:
-        levels = [above + (level - part) for level, above in itertools.pairwise(levels)]
+        levels = [next_level + (level - part) for level, next_level in itertools.pairwise(levels)]
     surface = apart_of(levels[0], within)
     check_manifold(surface.faces, surface.vertices)
     return surface

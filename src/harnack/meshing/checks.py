@@ -81,8 +81,8 @@ def orient3d(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> Sign
     rows = together[:, :3] - together[:, 3:]
     (ax, ay, az), (bx, by, bz), (cx, cy, cz) = (rows[:, k].T for k in range(3))
     terms = [(bx * cy, cx * by, az), (cx * ay, ax * cy, bz), (ax * by, bx * ay, cz)]
-    value = sum((one - other) * height for one, other, height in terms)
-    size = sum((np.abs(one) + np.abs(other)) * np.abs(height) for one, other, height in terms)
+    value = sum((plus - minus) * height for plus, minus, height in terms)
+    size = sum((np.abs(plus) + np.abs(minus)) * np.abs(height) for plus, minus, height in terms)
     # A difference of doubles is 0 where they are equal, and only there.
     flat = (rows == 0).all(axis=1).any(axis=1)
     return _signs_with_fallback(
@@ -123,10 +123,10 @@ def _signs_with_fallback(
 def _integers(points: FloatArray) -> Any:
     """Points times a power of two, as Python's integers."""
     mantissa, exponent = np.frexp(points)
-    whole = np.ldexp(mantissa, 53).astype(np.int64).astype(object)
+    mantissas = np.ldexp(mantissa, 53).astype(np.int64).astype(object)
     used = mantissa != 0
-    least = int(exponent[used].min()) if used.any() else 0
-    return whole * 2 ** np.where(used, exponent - least, 0).astype(object)
+    min_exponent = int(exponent[used].min()) if used.any() else 0
+    return mantissas * 2 ** np.where(used, exponent - min_exponent, 0).astype(object)
 
 
 def _orient3d_exact(points: Any) -> Any:
@@ -176,18 +176,18 @@ def intersecting_faces(
 
     among: (m,) mask; pairs of which neither is chosen are not looked at.
     """
-    found: list[IntArray] = []
+    crossing_faces: list[IntArray] = []
     for pairs, heights in _pairs_in_doubt(vertices, faces, among):
-        one, other = faces[pairs[:, 0]], faces[pairs[:, 1]]
+        first, second = faces[pairs[:, 0]], faces[pairs[:, 1]]
         meet = np.zeros(len(pairs), np.bool_)
         rows = np.flatnonzero((heights[0] == 0).all(axis=1) & (heights[1] == 0).all(axis=1))
-        meet[rows] = _overlap(vertices[one[rows]], vertices[other[rows]])
+        meet[rows] = _overlap(vertices[first[rows]], vertices[second[rows]])
         both = np.all([(h.min(axis=1) < 0) & (h.max(axis=1) > 0) for h in heights], axis=0)
         rows = np.flatnonzero(both)
-        meet[rows] = _edge_pierces(vertices, one[rows], other[rows], heights[0][rows])
-        meet[rows] |= _edge_pierces(vertices, other[rows], one[rows], heights[1][rows])
-        found.append(pairs[meet].ravel())
-    return np.unique(np.concatenate([*found, np.zeros(0, np.int64)]))
+        meet[rows] = _edge_pierces(vertices, first[rows], second[rows], heights[0][rows])
+        meet[rows] |= _edge_pierces(vertices, second[rows], first[rows], heights[1][rows])
+        crossing_faces.append(pairs[meet].ravel())
+    return np.unique(np.concatenate([*crossing_faces, np.zeros(0, np.int64)]))
 
 
 def touching_pairs(vertices: FloatArray, faces: IntArray) -> tuple[IntArray, FloatArray]:
@@ -203,16 +203,16 @@ def touching_pairs(vertices: FloatArray, faces: IntArray) -> tuple[IntArray, Flo
     an edge at the corner, and in the other's plane.
     """
     batches: list[IntArray] = []
-    places: list[FloatArray] = []
+    contacts: list[FloatArray] = []
 
     def add(pairs: IntArray, on: BoolArray, p: FloatArray, q: FloatArray) -> None:
         batches.append(pairs[on])
-        places.append(0.5 * (p + q)[on])
+        contacts.append(0.5 * (p + q)[on])
 
     for pairs, heights in _pairs_in_doubt(vertices, faces, None):
         same = faces[pairs[:, 0], :, None] == faces[pairs[:, 1]][:, None]
         shared = same.sum(axis=(1, 2))
-        for way, ((plane, of), height) in enumerate(
+        for order, ((plane, of), height) in enumerate(
             zip((pairs.T, pairs.T[::-1]), heights, strict=True)
         ):
             # A corner is an edge from itself to itself.
@@ -220,16 +220,16 @@ def touching_pairs(vertices: FloatArray, faces: IntArray) -> tuple[IntArray, Flo
                 rows = np.flatnonzero((shared == 0) & (height[:, i] == 0) & (height[:, j] == 0))
                 p, q = (vertices[faces[of[rows], k]] for k in (i, j))
                 add(pairs[rows], _is_on(vertices[faces[plane[rows]]], p, q), p, q)
-            is_common = same.any(axis=1 + way)  # of the corners of `of`
+            is_common = same.any(axis=1 + order)  # of the corners of `of`
             for i in range(3):
                 rows = np.flatnonzero((shared == 1) & ~is_common[:, i] & (height[:, i] == 0))
-                apex = same.any(axis=2 - way)[rows].argmax(axis=1)[:, None]
+                apex = same.any(axis=2 - order)[rows].argmax(axis=1)[:, None]
                 turned = np.take_along_axis(faces[plane[rows]], (apex + np.arange(3)) % 3, axis=1)
                 p = vertices[faces[of[rows], i]]
                 add(pairs[rows], _is_between(vertices[turned], p), p, p)
     both = np.concatenate([*batches, np.zeros((0, 2), np.int64)])
     _, first = np.unique(both, axis=0, return_index=True)
-    return both[first], np.concatenate([*places, np.zeros((0, 3))])[first]
+    return both[first], np.concatenate([*contacts, np.zeros((0, 3))])[first]
 
 
 def _pairs_in_doubt(
@@ -237,8 +237,8 @@ def _pairs_in_doubt(
 ) -> Generator[tuple[IntArray, tuple[SignArray, SignArray]]]:
     """Pairs (k, 2) of faces that are not proved apart, some at a time, and the `_heights` of the
     second over the first and of the first over the second."""
-    many = len(faces) if among is None else int(among.sum())
-    by_kernel = many > _MIN_FACES_FOR_KERNEL
+    face_count = len(faces) if among is None else int(among.sum())
+    by_kernel = face_count > _MIN_FACES_FOR_KERNEL
     near = near_pairs(vertices, faces, among) if by_kernel else _near_pairs(vertices[faces], among)
     for start in range(0, len(near), _PAIRS_AT_ONCE):
         pairs = near[start : start + _PAIRS_AT_ONCE]
@@ -267,31 +267,31 @@ def _near_pairs(corner: FloatArray, among: BoolArray | None) -> IntArray:
     center = 0.5 * (lower + upper)
     radius = 0.5 * row_norms(upper - lower)
     octave = np.floor(np.log2(np.maximum(radius, 1e-300)))
-    groups = [np.flatnonzero(near & (octave == one)) for one in np.unique(octave[near])]
+    groups = [np.flatnonzero(near & (octave == first)) for first in np.unique(octave[near])]
     trees = [searching.cKDTree(center[rows]) for rows in groups]
-    found: list[IntArray] = []
+    batches: list[IntArray] = []
 
-    def add(one: IntArray, other: IntArray) -> None:
-        keep = (lower[one] <= upper[other]).all(axis=1)
-        keep &= (lower[other] <= upper[one]).all(axis=1)
-        found.append(np.column_stack([one[keep], other[keep]]))
+    def add(first: IntArray, second: IntArray) -> None:
+        keep = (lower[first] <= upper[second]).all(axis=1)
+        keep &= (lower[second] <= upper[first]).all(axis=1)
+        batches.append(np.column_stack([first[keep], second[keep]]))
 
     for i, j in itertools.product(range(len(groups)), repeat=2):
         reach = float(radius[groups[i]].max() + radius[groups[j]].max())
-        first = groups[i][chosen[groups[i]]]
-        if i == j and len(first) == len(groups[i]) <= _MOST_AT_ONCE:
+        queries = groups[i][chosen[groups[i]]]
+        if i == j and len(queries) == len(groups[i]) <= _MOST_AT_ONCE:
             table = trees[i].query_pairs(reach, output_type="ndarray")
             add(*groups[i][table.T])
             continue
         step = max(1, _PAIRS_AT_ONCE // 64)
-        for start in range(0, len(first), step):
-            rows = first[start : start + step]
-            some = searching.cKDTree(center[rows])
-            table = some.sparse_distance_matrix(trees[j], reach, output_type="ndarray")
-            one, other = rows[table["i"]], groups[j][table["j"]]
-            once = (one < other) | ~chosen[other]  # two that are chosen meet once
-            add(one[once], other[once])
-    return np.concatenate(found).astype(np.int64)
+        for start in range(0, len(queries), step):
+            rows = queries[start : start + step]
+            query_tree = searching.cKDTree(center[rows])
+            table = query_tree.sparse_distance_matrix(trees[j], reach, output_type="ndarray")
+            first, second = rows[table["i"]], groups[j][table["j"]]
+            once = (first < second) | ~chosen[second]  # two that are chosen meet once
+            add(first[once], second[once])
+    return np.concatenate(batches).astype(np.int64)
 
 
 def _are_separated(vertices: FloatArray, faces: IntArray, pairs: IntArray) -> BoolArray:
@@ -307,17 +307,17 @@ def _are_separated(vertices: FloatArray, faces: IntArray, pairs: IntArray) -> Bo
         a = vertices[plane[:, 0]]
         u, v = vertices[plane[:, 1]] - a, vertices[plane[:, 2]] - a
         normal = np.cross(u, v)
-        most = ROUNDING * (row_norms(u) * row_norms(v))
+        error_scale = ROUNDING * (row_norms(u) * row_norms(v))
         above, below = np.ones(len(rows), np.bool_), np.ones(len(rows), np.bool_)
         for k in range(3):
-            way = vertices[of[:, k]] - a
-            height, error = row_dots(normal, way), most * row_norms(way) + _UNDERFLOW
+            offset = vertices[of[:, k]] - a
+            height, error = row_dots(normal, offset), error_scale * row_norms(offset) + _UNDERFLOW
             shared = (of[:, k, None] == plane).any(axis=1)
             above &= shared | (height > error)
             below &= shared | (height < -error)
         # A face that shares all its corners is the same one.
-        several = (of[:, :, None] != plane[:, None]).all(axis=2).any(axis=1)
-        apart[rows] = (above | below) & several
+        is_other = (of[:, :, None] != plane[:, None]).all(axis=2).any(axis=1)
+        apart[rows] = (above | below) & is_other
     return apart
 
 
@@ -337,29 +337,29 @@ def _edge_pierces(
     """(k,) whether an edge of faces `of` (k, 3) passes through faces `through`, of whose planes the
     corners are on the sides `heights`: the line of the edge passes all three edges on one side, or
     touches them."""
-    found = np.zeros(len(of), np.bool_)
+    pierces = np.zeros(len(of), np.bool_)
     for i, j in _EDGES:
-        rows = np.flatnonzero((heights[:, i] * heights[:, j] < 0) & ~found)
+        rows = np.flatnonzero((heights[:, i] * heights[:, j] < 0) & ~pierces)
         p, q = vertices[of[rows, i]], vertices[of[rows, j]]
         x = [vertices[through[rows, k]] for k in range(3)]
-        around = np.stack([orient3d(p, q, x[k], x[m]) for k, m in _EDGES])
-        found[rows] = (around >= 0).all(axis=0) | (around <= 0).all(axis=0)
-    return found
+        orientations = np.stack([orient3d(p, q, x[k], x[m]) for k, m in _EDGES])
+        pierces[rows] = (orientations >= 0).all(axis=0) | (orientations <= 0).all(axis=0)
+    return pierces
 
 
-def _overlap(one: FloatArray, other: FloatArray) -> BoolArray:
+def _overlap(first: FloatArray, second: FloatArray) -> BoolArray:
     """(k,) whether triangles (k, 3, 3) in one plane have an area in common; seen along the axis in
     which they are thinnest."""
-    normal = np.abs(area_normals(one))
+    normal = np.abs(area_normals(first))
     axes = np.array([[1, 2], [2, 0], [0, 1]])[normal.argmax(axis=1)]
-    flat = [np.take_along_axis(t, axes[:, None].repeat(3, axis=1), axis=2) for t in (one, other)]
-    found = np.ones(len(one), np.bool_)
+    flat = [np.take_along_axis(t, axes[:, None].repeat(3, axis=1), axis=2) for t in (first, second)]
+    overlaps = np.ones(len(first), np.bool_)
     for a, b in (flat, flat[::-1]):
-        turn = orient2d(a[:, 0], a[:, 1], a[:, 2])
+        sign = orient2d(a[:, 0], a[:, 1], a[:, 2])
         for i, j in _EDGES:
-            side = [turn * orient2d(a[:, i], a[:, j], b[:, k]) for k in range(3)]
-            found &= (np.stack(side) > 0).any(axis=0)
-    return found
+            side = [sign * orient2d(a[:, i], a[:, j], b[:, k]) for k in range(3)]
+            overlaps &= (np.stack(side) > 0).any(axis=0)
+    return overlaps
 
 
 def _is_on(triangle: FloatArray, p: FloatArray, q: FloatArray) -> BoolArray:
@@ -369,10 +369,10 @@ def _is_on(triangle: FloatArray, p: FloatArray, q: FloatArray) -> BoolArray:
     axes = np.array([[1, 2], [2, 0], [0, 1]])[normal.argmax(axis=1)]
     a = np.take_along_axis(triangle, axes[:, None].repeat(3, axis=1), axis=2)
     p, q = (np.take_along_axis(corner, axes, axis=1) for corner in (p, q))
-    turn = orient2d(a[:, 0], a[:, 1], a[:, 2])
-    is_on = turn != 0
+    sign = orient2d(a[:, 0], a[:, 1], a[:, 2])
+    is_on = sign != 0
     for i, j in _EDGES:
-        side = [turn * orient2d(a[:, i], a[:, j], corner) for corner in (p, q)]
+        side = [sign * orient2d(a[:, i], a[:, j], corner) for corner in (p, q)]
         is_on &= (np.stack(side) >= 0).any(axis=0)
     side = np.stack([orient2d(p, q, a[:, k]) for k in range(3)])
     return is_on & ~((side > 0).all(axis=0) | (side < 0).all(axis=0))
@@ -385,9 +385,9 @@ def _is_between(triangle: FloatArray, p: FloatArray) -> BoolArray:
     axes = np.array([[1, 2], [2, 0], [0, 1]])[normal.argmax(axis=1)]
     a = np.take_along_axis(triangle, axes[:, None].repeat(3, axis=1), axis=2)
     p = np.take_along_axis(p, axes, axis=1)
-    turn = orient2d(a[:, 0], a[:, 1], a[:, 2])
-    left = turn * orient2d(a[:, 0], a[:, 1], p)
-    return (turn != 0) & (left >= 0) & (turn * orient2d(a[:, 2], a[:, 0], p) >= 0)
+    sign = orient2d(a[:, 0], a[:, 1], a[:, 2])
+    first_side = sign * orient2d(a[:, 0], a[:, 1], p)
+    return (sign != 0) & (first_side >= 0) & (sign * orient2d(a[:, 2], a[:, 0], p) >= 0)
 
 
 # Checks of whole meshes.
@@ -491,12 +491,12 @@ def check_manifold(faces: IntArray, vertices: FloatArray | None = None) -> None:
             "itself, or cells are too large for it; choose a smaller `cell_size`, or another level",
             np.unique(pairs[uses[index] > 2]),
         )
-    ways = np.bincount(index, np.where(pairs[:, 0] < pairs[:, 1], 1, -1), minlength=len(uses))
-    if ((uses == 2) & (ways != 0)).any():
+    net = np.bincount(index, np.where(pairs[:, 0] < pairs[:, 1], 1, -1), minlength=len(uses))
+    if ((uses == 2) & (net != 0)).any():
         fail(
             "neighboring faces of the mesh do not agree on its two sides: cells are too large for "
             "this level set; choose a smaller `cell_size`",
-            np.unique(pairs[((uses == 2) & (ways != 0))[index]]),
+            np.unique(pairs[((uses == 2) & (net != 0))[index]]),
         )
     if _vertex_fans(faces, edges)[0] > np.count_nonzero(np.bincount(faces.ravel())):
         fail(
@@ -517,11 +517,11 @@ def check_no_self_intersection(vertices: FloatArray, faces: IntArray) -> None:
         raise MeshingError("vertices of the mesh are no numbers: choose another level or `clip`")
     crossing = intersecting_faces(vertices, faces)
     if len(crossing):
-        places = vertices[faces[crossing]].mean(axis=1)
+        centers = vertices[faces[crossing]].mean(axis=1)
         raise SelfIntersectionError(
             f"{len(crossing):,} of {len(faces):,} triangles pass through each other, such as near "
-            f"{point_text(places[0])}: choose a smaller `cell_size` or a larger `tolerance`",
-            places,
+            f"{point_text(centers[0])}: choose a smaller `cell_size` or a larger `tolerance`",
+            centers,
             crossing,
         )
 
@@ -568,13 +568,13 @@ def check_near_level(
     Raises:
         OffLevelError: with the points that are not.
     """
-    far, count = points_off_level(function, vertices, faces, tolerance, volume)
-    if len(far):
+    off_level, count = points_off_level(function, vertices, faces, tolerance, volume)
+    if len(off_level):
         raise OffLevelError(
-            f"{len(far):,} of {count:,} vertices and centers of triangles are farther than "
-            f"the tolerance, {tolerance:.3g}, from the level, such as {point_text(far[0])}: "
+            f"{len(off_level):,} of {count:,} vertices and centers of triangles are farther than "
+            f"the tolerance, {tolerance:.3g}, from the level, such as {point_text(off_level[0])}: "
             "choose a smaller `cell_size` or a larger `tolerance`",
-            far,
+            off_level,
         )
 
 
@@ -598,32 +598,32 @@ def points_off_level(
     for k in range(3):
         np.add.at(mean, faces[:, k], normal)
     points = np.concatenate([vertices[is_checked], corner[large].mean(axis=1)])
-    ways = np.concatenate([mean[is_checked], normal[large]])
-    ways /= np.maximum(row_norms(ways), 1e-300)[:, None]
-    far = np.flatnonzero(~(function.sample(points).distance <= tolerance))
+    directions = np.concatenate([mean[is_checked], normal[large]])
+    directions /= np.maximum(row_norms(directions), 1e-300)[:, None]
+    rows = np.flatnonzero(~(function.sample(points).distance <= tolerance))
     # Nearer ones as well: behind a cap there may be little of a solid.
-    for share, line in itertools.product((1.0, 0.25, 0.0625), (None, *_askew_lines())):
-        if not len(far):
+    for fraction, line in itertools.product((1.0, 0.25, 0.0625), (None, *_askew_lines())):
+        if not len(rows):
             break
-        step = share * tolerance * (ways[far] if line is None else line)
-        one, other = (_is_positive(function, points[far] + s * step, volume) for s in (1, -1))
-        far = far[one == other]
-    return points[far], len(points)
+        step = fraction * tolerance * (directions[rows] if line is None else line)
+        ahead, behind = (_is_positive(function, points[rows] + s * step, volume) for s in (1, -1))
+        rows = rows[ahead == behind]
+    return points[rows], len(points)
 
 
 def _askew_lines() -> FloatArray:
     """(13, 3) unit vectors along the axes and both kinds of diagonals of a cube, turned so that
     none of them is near to a plane of coordinates or to one of their diagonals."""
-    ways = np.array(list(itertools.product((-1.0, 0.0, 1.0), repeat=3)))[14:]
+    directions = np.array(list(itertools.product((-1.0, 0.0, 1.0), repeat=3)))[14:]
     frame: FloatArray = np.linalg.qr([[7, 7, -3], [3, -16, -7], [19, 7, -13]])[0]
-    return (ways / row_norms(ways)[:, None]) @ frame
+    return (directions / row_norms(directions)[:, None]) @ frame
 
 
 def _is_positive(
     function: LevelFunction, points: FloatArray, volume: Volume | None
 ) -> npt.NDArray[np.bool_]:
-    above = ~(function.sample(points).value <= 0)
-    return above if volume is None else above | ~volume.contains_points(points)
+    is_positive = ~(function.sample(points).value <= 0)
+    return is_positive if volume is None else is_positive | ~volume.contains_points(points)
 
 
 def point_text(x: FloatArray) -> str:
@@ -636,13 +636,13 @@ def nonmanifold_vertices(faces: IntArray) -> IntArray:
     two faces, and those that have more than one fan of faces."""
     pairs, count = half_edges(faces), int(faces.max(initial=-1)) + 1
     edges = Edges.of(pairs)
-    many = np.unique(pairs[edges.multiplicity[edges.edge_of_pair] > 2])
+    overused = np.unique(pairs[edges.multiplicity[edges.edge_of_pair] > 2])
     _, fan = _vertex_fans(faces, edges)
     # Each fan once, at its vertex.
     vertex = np.empty(int(fan.max(initial=-1)) + 1, np.int64)
     vertex[fan] = faces.ravel()
     fans = np.bincount(vertex, minlength=count)
-    return np.union1d(many, np.flatnonzero(fans > 1))
+    return np.union1d(overused, np.flatnonzero(fans > 1))
 
 
 def _vertex_fans(faces: IntArray, edges: Edges) -> tuple[int, IntArray]:
@@ -657,9 +657,9 @@ def _vertex_fans(faces: IntArray, edges: Edges) -> tuple[int, IntArray]:
     # Corners at both ends of the edge k of a face, in the order of `half_edges`.
     first = np.concatenate([corner[:, 0], corner[:, 1], corner[:, 2]])
     second = np.concatenate([corner[:, 1], corner[:, 2], corner[:, 0]])
-    one, other = edges.paired_half_edges().T  # run in opposite directions
-    rows = np.concatenate([first[one], second[one]])
-    columns = np.concatenate([second[other], first[other]])
+    forward, backward = edges.paired_half_edges().T  # run in opposite directions
+    rows = np.concatenate([first[forward], second[forward]])
+    columns = np.concatenate([second[backward], first[backward]])
     joined = sparse.coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(3 * m, 3 * m))
     number, fan = csgraph.connected_components(joined, directed=False)
     return int(number), np.asarray(fan, np.int64)

@@ -60,14 +60,14 @@ def largest_body(surface: TriangleMesh) -> TriangleMesh:
     outer = np.flatnonzero(shells.volumes > 0)
     outer = outer[np.argsort(shells.volumes[outer])]
     for cavity in np.flatnonzero(shells.volumes <= 0):
-        holds = (one for one in outer if shells.winding_number(one, cavity) > 0.5)
-        if (found := next(holds, None)) is None:
+        holds = (shell for shell in outer if shells.winding_number(shell, cavity) > 0.5)
+        if (holder := next(holds, None)) is None:
             raise MeshingError("a part of the mesh is inside out: choose a smaller `cell_size`")
-        owner[cavity] = found
-        bodies[found] += shells.volumes[cavity]
-    kept = outer[bodies[outer].argmax()] if len(outer) else -1
+        owner[cavity] = holder
+        bodies[holder] += shells.volumes[cavity]
+    largest = outer[bodies[outer].argmax()] if len(outer) else -1
     return TriangleMesh.without_unused_vertices(
-        surface.vertices, surface.faces[owner[shells.component_of_face] == kept]
+        surface.vertices, surface.faces[owner[shells.component_of_face] == largest]
     )
 
 
@@ -91,20 +91,20 @@ def drop_degenerate_components(surface: TriangleMesh) -> TriangleMesh:
     is_film = 2 * volume <= 3 * _DEGENERATE_THICKNESS * float(np.abs(x).max()) * area
     if not is_film.any():
         return surface
-    kept = faces[~is_film[part]]
-    return TriangleMesh.without_unused_vertices(x, kept) if len(kept) else TriangleMesh(x[:0], kept)
+    rest = faces[~is_film[part]]
+    return TriangleMesh.without_unused_vertices(x, rest) if len(rest) else TriangleMesh(x[:0], rest)
 
 
 def component_facts(surface: TriangleMesh) -> list[dict[str, Any]]:
     """A dictionary for each connected component of a closed surface, largest first: faces, the
     number of its faces; volume, which is negative for a cavity; center, of its bounding box."""
-    shells, found = Shells.of(surface), list[dict[str, Any]]()
+    shells, facts = Shells.of(surface), list[dict[str, Any]]()
     counts = np.bincount(shells.component_of_face)
     for k in np.argsort(-np.abs(shells.volumes), kind="stable"):
         center = 0.5 * (shells.lower[k] + shells.upper[k])
         volume = float(shells.volumes[k])
-        found.append({"faces": int(counts[k]), "volume": volume, "center": center.tolist()})
-    return found
+        facts.append({"faces": int(counts[k]), "volume": volume, "center": center.tolist()})
+    return facts
 
 
 def faces_to_flip(surface: TriangleMesh) -> npt.NDArray[np.bool_]:
@@ -155,10 +155,10 @@ class Shells:
         depth = np.zeros(len(self.volumes), np.int64)
         for k in range(len(depth)) if len(depth) > 1 else ():
             point = self.corners[np.argmax(self.component_of_face == k)].mean(axis=0)
-            around = ((self.lower < point) & (point < self.upper)).all(axis=1)
-            around[k] = False
-            near = np.flatnonzero(around)
-            depth[k] = round(sum(self.winding_number(j, k) for j in near))
+            in_box = ((self.lower < point) & (point < self.upper)).all(axis=1)
+            in_box[k] = False
+            candidates = np.flatnonzero(in_box)
+            depth[k] = round(sum(self.winding_number(j, k) for j in candidates))
         return depth
 
     def bound(self) -> npt.NDArray[np.bool_]:
@@ -224,8 +224,8 @@ def clip_to_volume(surface: TriangleMesh, volume: Volume) -> TriangleMesh:
         MeshingError: another kind of volume.
     """
     if isinstance(volume, VolumeIntersection):
-        for one in volume.volumes:
-            surface = clip_to_volume(surface, one)
+        for operand in volume.volumes:
+            surface = clip_to_volume(surface, operand)
         return surface
     if isinstance(volume, Ball):
         return _cut(surface, _ClipBoundary(np.array(volume.center), np.zeros(3), volume.radius))
@@ -259,16 +259,16 @@ def _snap_to_boundary(surface: TriangleMesh, side: _ClipBoundary) -> tuple[Float
         np.add.at(mean, faces[:, k], normal)
     mean /= np.maximum(np.linalg.norm(mean, axis=1), 1e-300)[:, None]
     h = side.heights(x)
-    there = x
+    moved = x
     for _ in range(4):
-        slope = side.slopes(there)
+        slope = side.slopes(moved)
         along = slope - (slope * mean).sum(axis=1)[:, None] * mean
         square = np.maximum((along * along).sum(axis=1), 1e-3)
-        there = there - (side.heights(there) / square)[:, None] * along
-    near = np.linalg.norm(there - x, axis=1) < _SNAPPED * shortest
-    near &= np.abs(side.heights(there)) <= 1e-9 * shortest
+        moved = moved - (side.heights(moved) / square)[:, None] * along
+    near = np.linalg.norm(moved - x, axis=1) < _SNAPPED * shortest
+    near &= np.abs(side.heights(moved)) <= 1e-9 * shortest
     near[np.unique(boundary_edges(faces))] = False
-    return np.where(near[:, None], there, x), np.where(near, 0.0, h)
+    return np.where(near[:, None], moved, x), np.where(near, 0.0, h)
 
 
 def _cut(surface: TriangleMesh, side: _ClipBoundary) -> TriangleMesh:
@@ -287,8 +287,8 @@ def _cut(surface: TriangleMesh, side: _ClipBoundary) -> TriangleMesh:
     crossing = pairs[h[pairs[:, 0]] * h[pairs[:, 1]] < 0]
     keys = np.unique(edge_keys(crossing, len(vertices)))
     a, b = keys // len(vertices), keys % len(vertices)
-    share = (h[a] / (h[a] - h[b]))[:, None]
-    points = vertices[a] + share * (vertices[b] - vertices[a])
+    fraction = (h[a] / (h[a] - h[b]))[:, None]
+    points = vertices[a] + fraction * (vertices[b] - vertices[a])
     if side.radius is not None:
         points = _on_sphere(vertices[a], vertices[b], side.center, side.radius)
     first = len(vertices)
@@ -303,14 +303,14 @@ def _cut(surface: TriangleMesh, side: _ClipBoundary) -> TriangleMesh:
     number = out[mixed].sum(axis=1)
     for k in range(3):
         order = [k, (k + 1) % 3, (k + 2) % 3]
-        one = rows[(number == 1) & out[mixed][:, k]][:, order]  # a is outside
-        x, y = at(one[:, 1], one[:, 0]), at(one[:, 2], one[:, 0])
-        parts += [np.stack([one[:, 1], one[:, 2], x], axis=1), np.stack([one[:, 2], y, x], axis=1)]
-        two = rows[(number == 2) & ~out[mixed][:, k]][:, order]  # a is inside
-        parts.append(np.stack([two[:, 0], at(two[:, 0], two[:, 1]), at(two[:, 0], two[:, 2])], 1))
-    made = np.concatenate(parts)
-    whole = (made != np.roll(made, 1, axis=1)).all(axis=1)
-    return TriangleMesh.without_unused_vertices(np.concatenate([vertices, points]), made[whole])
+        tri = rows[(number == 1) & out[mixed][:, k]][:, order]  # a is outside
+        x, y = at(tri[:, 1], tri[:, 0]), at(tri[:, 2], tri[:, 0])
+        parts += [np.stack([tri[:, 1], tri[:, 2], x], axis=1), np.stack([tri[:, 2], y, x], axis=1)]
+        tip = rows[(number == 2) & ~out[mixed][:, k]][:, order]  # a is inside
+        parts.append(np.stack([tip[:, 0], at(tip[:, 0], tip[:, 1]), at(tip[:, 0], tip[:, 2])], 1))
+    new = np.concatenate(parts)
+    proper = (new != np.roll(new, 1, axis=1)).all(axis=1)
+    return TriangleMesh.without_unused_vertices(np.concatenate([vertices, points]), new[proper])
 
 
 def _on_sphere(a: FloatArray, b: FloatArray, center: FloatArray, radius: float) -> FloatArray:
@@ -320,5 +320,5 @@ def _on_sphere(a: FloatArray, b: FloatArray, center: FloatArray, radius: float) 
     o, d = start - center, end - start
     dd, od = (d * d).sum(axis=1), (o * d).sum(axis=1)
     room = np.maximum(radius**2 - (o * o).sum(axis=1), 0)
-    share = room / (od + np.sqrt(od * od + dd * room))
-    return start + share[:, None] * d
+    fraction = room / (od + np.sqrt(od * od + dd * room))
+    return start + fraction[:, None] * d

@@ -168,8 +168,8 @@ class CsgMesher:
             apart = factor_common_operands(solid, level) if solid.is_union else None
             if apart is not None:
                 return self.mesh_sublevel(apart, 0.0)
-            kept = drop_cancelled_operands(flatten_csg(solid), level)
-            return Manifold() if kept is None else self._joined(kept, level)
+            reduced = drop_cancelled_operands(flatten_csg(solid), level)
+            return Manifold() if reduced is None else self._joined(reduced, level)
         if isinstance(solid, Complement):  # -f <= c where f >= -c
             return self._whole_box() - self.mesh_sublevel(solid.field, -level)
         if isinstance(solid, OffsetSolid):
@@ -211,29 +211,29 @@ class CsgMesher:
                 [self._part(solid, k, level) for k in numbers], OpType.Add
             )
         cut = [k for k in numbers if isinstance(solid.parts[k], Complement)]
-        kept = [self._part(solid, k, level) for k in numbers if k not in cut]
-        whole = Manifold.batch_boolean(kept, OpType.Intersect) if kept else self._whole_box()
+        parts = [self._part(solid, k, level) for k in numbers if k not in cut]
+        common = Manifold.batch_boolean(parts, OpType.Intersect) if parts else self._whole_box()
         away = [self._part(solid, k, level) for k in cut]
-        return Manifold.batch_boolean([whole, *away], OpType.Subtract)
+        return Manifold.batch_boolean([common, *away], OpType.Subtract)
 
     def _part(self, solid: BooleanSolid, number: int, level: float) -> Manifold:
         """One part of a union or an intersection, made where the others of an intersection may
         leave something of it (`IntersectedOperands`); of a complement in an intersection what is
         cut away."""
-        kept, part = self.intersected_with, solid.parts[number]
+        previous, part = self.intersected_with, solid.parts[number]
         if not solid.is_union:
-            beside = [one for one in solid.parts if one is not part]
+            beside = [operand for operand in solid.parts if operand is not part]
             if isinstance(part, Complement):
                 self.intersected_with = tuple(
-                    (one, level) for one in beside if _has_no_complement(one)
+                    (operand, level) for operand in beside if _has_no_complement(operand)
                 )
                 part, level = part.field, -level
             else:
-                self.intersected_with = (*kept, *((one, level) for one in beside))
+                self.intersected_with = (*previous, *((operand, level) for operand in beside))
         try:
             return self.mesh_sublevel(part, level)
         finally:
-            self.intersected_with = kept
+            self.intersected_with = previous
 
     def _closed(self, function: LevelFunction, lattice: BccLattice) -> TriangleMesh:
         """A level set in a box: where the other parts may leave something, if cells are many. Of
@@ -263,18 +263,18 @@ class CsgMesher:
             and self.irrelevant_region_cache[0] is self.intersected_with
         ):
             return self.irrelevant_region_cache[1]
-        functions = [self.function(one, level) for one, level in self.intersected_with]
+        functions = [self.function(solid, level) for solid, level in self.intersected_with]
 
         def clearance(points: FloatArray) -> FloatArray:
-            found = np.zeros(len(points))
-            for one in functions:
-                outside = np.flatnonzero(one.values(points) > 0)
-                found[outside] = np.maximum(found[outside], one.clearance(points[outside]))
-            return found
+            lengths = np.zeros(len(points))
+            for solid in functions:
+                outside = np.flatnonzero(solid.values(points) > 0)
+                lengths[outside] = np.maximum(lengths[outside], solid.clearance(points[outside]))
+            return lengths
 
-        made = IrrelevantRegion(clearance)
-        self.irrelevant_region_cache = self.intersected_with, made
-        return made
+        region = IrrelevantRegion(clearance)
+        self.irrelevant_region_cache = self.intersected_with, region
+        return region
 
     def mesh_smooth_level(self, field: Field, level: float) -> tuple[TriangleMesh, bool]:
         """The boundary of {f <= level} as one level set, and whether it is all of it: if not, it is
@@ -296,10 +296,10 @@ class CsgMesher:
         function = self.function(_underlying_field(field), level)
         self.report(f"level {level:g} of {type(field).__name__} in cells of {spacing:.3g}")
         lattice = BccLattice.covering_box(lower, upper, spacing, layers=2)
-        made = self._closed(function, lattice)
+        surface = self._closed(function, lattice)
         self.evaluations += function.evaluations
         self.levels += 1
-        return made, is_whole
+        return surface, is_whole
 
     def function(self, field: Field, level: float) -> LevelFunction:
         """f - level, continued beyond the field's domain."""
@@ -359,11 +359,11 @@ class CsgMesher:
         count = sum(map(len, field.loops))
         if not np.array_equal(inner.vertices[:count], outer.vertices[:count]):
             raise MeshingError("the two sides of the solid do not end at the same curve")
-        place = np.arange(len(inner.vertices)) - count + len(outer.vertices)
-        place[:count] = np.arange(count)
+        index = np.arange(len(inner.vertices)) - count + len(outer.vertices)
+        index[:count] = np.arange(count)
         vertices = np.concatenate([outer.vertices, inner.vertices[count:]])
         self.levels += 2
-        return TriangleMesh(vertices, np.concatenate([outer.faces, place[inner.faces][:, ::-1]]))
+        return TriangleMesh(vertices, np.concatenate([outer.faces, index[inner.faces][:, ::-1]]))
 
     def _offset(self, solid: MeshSolid, level: float) -> Manifold:
         """The points within a distance of a mesh, or deeper inside than that.
@@ -383,31 +383,31 @@ class CsgMesher:
         function = dataclasses.replace(self.function(solid, level), secant_steps=_SECANTS)
         self.report(f"level {level:g} of a mesh in cells of {cells:.3g}")
         lattice = BccLattice.covering_box(lower - cells, upper + cells, cells, layers=2)
-        made = mesh_closed_surface(function, lattice, self.tolerance, self.report, as_cut=True)
-        whole = to_manifold(made)
+        surface = mesh_closed_surface(function, lattice, self.tolerance, self.report, as_cut=True)
+        manifold = to_manifold(surface)
         self.levels += 1
-        for share in _JOINED_WITHIN:
-            joined = from_manifold(without_short_edges(whole, share * self.tolerance))
+        for fraction in _JOINED_WITHIN:
+            joined = from_manifold(without_short_edges(manifold, fraction * self.tolerance))
             joined = split_faces_off_level(function, joined, _FAR_OFF * self.tolerance, _TIMES_CUT)
             try:
-                made = resolve_self_intersections(joined, _MENDED_WITHIN * self.tolerance)
+                surface = resolve_self_intersections(joined, _MENDED_WITHIN * self.tolerance)
             except SelfIntersectionError:
                 continue
             break
         self.evaluations += function.evaluations
-        return to_manifold(made)
+        return to_manifold(surface)
 
     def _image(self, solid: TransformedSolid, level: float) -> Manifold:
         """Of a solid under an affine map: the image of its mesh."""
         matrix, offset = np.array(solid.map.matrix), np.array(solid.map.translation_vector)
         ends = np.stack([self.lower, self.upper])
         corners = np.stack(np.meshgrid(*ends.T, indexing="ij"), axis=-1).reshape(-1, 3)
-        own = (corners - offset) @ solid.map.inverse.T
+        local_corners = (corners - offset) @ solid.map.inverse.T
         scale = float(np.linalg.norm(matrix, 2))
         local = dataclasses.replace(
             self,
-            lower=own.min(axis=0),
-            upper=own.max(axis=0),
+            lower=local_corners.min(axis=0),
+            upper=local_corners.max(axis=0),
             tolerance=self.tolerance / scale,
             spacing=self.spacing / scale,
             evaluations=0,
@@ -415,17 +415,17 @@ class CsgMesher:
             smallest_cell=math.inf,
             intersected_with=(),
         )
-        made = local.mesh_sublevel(solid.field, level / solid.map.value_factor)
+        manifold = local.mesh_sublevel(solid.field, level / solid.map.value_factor)
         self.evaluations += local.evaluations
         self.levels += local.levels
         self.smallest_cell = min(self.smallest_cell, local.smallest_cell * scale)
-        return made.transform(np.column_stack([matrix, offset]))
+        return manifold.transform(np.column_stack([matrix, offset]))
 
 
 def _has_no_complement(solid: Solid) -> bool:
     """Whether there is no complement within a solid, as it is meshed."""
     if isinstance(solid, BooleanSolid):
-        return all(_has_no_complement(one) for one in solid.parts)
+        return all(_has_no_complement(operand) for operand in solid.parts)
     if isinstance(solid, TransformedSolid | OffsetSolid):
         return _has_no_complement(solid.field)
     return not isinstance(solid, Complement | BandSolid)
@@ -450,15 +450,15 @@ def _hull(field: Field, level: float) -> Volume | None:
     """A volume that holds {f <= level}, if it has bounds. A domain does not count: what ends there
     is cut by it."""
     if isinstance(field, Solid):
-        found = field.sublevel_extent(level)
+        extent = field.sublevel_extent(level)
     else:
-        found = bounded_side_extent(field, (level,), lambda value: value <= level)
-    if found is None or found == field.domain:
+        extent = bounded_side_extent(field, (level,), lambda value: value <= level)
+    if extent is None or extent == field.domain:
         return None
-    if isinstance(field, SublevelSolid) and found == field.field.domain:
+    if isinstance(field, SublevelSolid) and extent == field.field.domain:
         return None
-    low, high = found.bounds()
-    return found if np.isfinite(low).all() and np.isfinite(high).all() else None
+    low, high = extent.bounds()
+    return extent if np.isfinite(low).all() and np.isfinite(high).all() else None
 
 
 def _underlying_field(field: Field) -> Field:
@@ -581,7 +581,7 @@ def two_numbers(solid: Any) -> tuple[float, float]:
         TypeError: it does not.
     """
     try:
-        low, high = (float(one) for one in solid)
+        low, high = (float(number) for number in solid)
     except (TypeError, ValueError):
         raise TypeError(f"solid must be (low, high), two numbers, or True, not {solid!r}") from None
     return low, high
@@ -626,9 +626,9 @@ def mesh_solid(
             most_faces, report, uploads=uploads,
         )  # fmt: skip
         try:
-            made = _apart(_assemble(mesher, solid, level, volume), error)
+            surface = _apart(_assemble(mesher, solid, level, volume), error)
             report("checking")
-            made = _checked(mesher, solid, level, made, size, check)
+            surface = _checked(mesher, solid, level, surface, size, check)
             break
         except TriangleLimitError as large:
             if first is None:
@@ -645,7 +645,7 @@ def mesh_solid(
                 error *= 0.5
             report(f"{wrong}; so cells of {cells:.3g}")
     return SolidMeshResult(
-        made, min(cells, mesher.smallest_cell), mesher.evaluations, mesher.levels, size
+        surface, min(cells, mesher.smallest_cell), mesher.evaluations, mesher.levels, size
     )
 
 
@@ -653,7 +653,7 @@ def _checked(
     mesher: CsgMesher,
     solid: Solid,
     level: float,
-    made: TriangleMesh,
+    surface: TriangleMesh,
     size: float,
     check: Callable[[TriangleMesh, float], None],
 ) -> TriangleMesh:
@@ -663,17 +663,17 @@ def _checked(
         MeshingError: it fails the check.
     """
     try:
-        check(made, size)
+        check(surface, size)
     except OffLevelError as far:
         mended = project_outliers(
-            mesher.function(solid, level), made, far.locations, 2 * mesher.tolerance,
-            lambda one: check(one, size),
+            mesher.function(solid, level), surface, far.locations, 2 * mesher.tolerance,
+            lambda candidate: check(candidate, size),
         )  # fmt: skip
         if mended is None:
             raise
         check_manifold(mended.faces, mended.vertices)  # all of it: `check` saw what is new
         return mended
-    return made
+    return surface
 
 
 def apart_of(whole: Manifold, tolerance: float) -> TriangleMesh:
@@ -694,12 +694,12 @@ def _apart(parts: TriangleMesh | _Assembly, tolerance: float) -> TriangleMesh:
             fewer triangles cross where less is left out.
     """
     raised: SelfIntersectionError | None = None
-    for share in _SLIVERS_WITHIN if isinstance(parts, _Assembly) else (0.0,):
-        one = parts.without_slivers(share * tolerance) if isinstance(parts, _Assembly) else parts
-        if not len(one.faces):
+    for factor in _SLIVERS_WITHIN if isinstance(parts, _Assembly) else (0.0,):
+        mesh = parts.without_slivers(factor * tolerance) if isinstance(parts, _Assembly) else parts
+        if not len(mesh.faces):
             raise MeshingError("the solid is empty: no point of the box is inside")
         try:
-            return resolve_self_intersections(one, _MENDED_WITHIN * tolerance)
+            return resolve_self_intersections(mesh, _MENDED_WITHIN * tolerance)
         except SelfIntersectionError as error:
             if not is_retry_promising(error, raised):
                 raise
@@ -729,15 +729,15 @@ def _assemble(
     if volume is None and is_single_level_set(solid):
         return mesher.mesh_smooth_level(solid, level)[0]
     lower, upper = mesher.lower, mesher.upper
-    whole = mesher.mesh_sublevel(solid, level)
+    manifold = mesher.mesh_sublevel(solid, level)
     mesher.report("putting the parts together")
     if volume is None:
         volume = Box(_point(lower), _point(upper))
-        ends = np.array(whole.bounding_box(), np.float64)
+        ends = np.array(manifold.bounding_box(), np.float64)
         if (ends[:3] > lower).all() and (ends[3:] < upper).all():
-            return _Assembly(whole, volume)
+            return _Assembly(manifold, volume)
     cut = volume_manifold(volume, lower, upper, mesher.tolerance)
-    return _Assembly(whole ^ cut, volume)
+    return _Assembly(manifold ^ cut, volume)
 
 
 def _bounds(solid: Solid, level: float, volume: Volume | None) -> tuple[FloatArray, FloatArray]:

@@ -78,17 +78,17 @@ def restore_curve_edges(
     chains: list[list[int]] = []
     for start in range(kept):
         chain = [start]
-        while (place := successor.get(chain[-1])) is not None:
-            chain.append(place)
-            if place < kept:
+        while (vertex := successor.get(chain[-1])) is not None:
+            chain.append(vertex)
+            if vertex < kept:
                 break
         if len(chain) > 2:
             chains.append(chain)
-    inner = np.array([place for chain in chains for place in chain[1:-1]], np.int64)
+    inner = np.array([vertex for chain in chains for vertex in chain[1:-1]], np.int64)
     if not len(inner):
         return vertices, faces
-    owner = np.repeat(np.arange(len(chains)), [len(one) - 2 for one in chains])
-    ends = np.array([(one[0], one[-1]) for one in chains], np.int64)
+    owner = np.repeat(np.arange(len(chains)), [len(path) - 2 for path in chains])
+    ends = np.array([(path[0], path[-1]) for path in chains], np.int64)
     vertices = vertices.copy()
     vertices[inner] = _push_inward(function, vertices, faces, inner, owner, ends, height)
     gaps = [face for chain in chains for face in _filling(chain)]
@@ -107,28 +107,28 @@ def _push_inward(
     """Points (k, 3) `inner` of the edges owner (k,) with these ends (m, 2), moved off the edges and
     onto the surface. The heights over an edge are one parabola, so that its filling lies below the
     chain."""
-    here = vertices[inner]
+    points = vertices[inner]
     a, along = vertices[ends[:, 0]], vertices[ends[:, 1]] - vertices[ends[:, 0]]
     length = np.linalg.norm(along, axis=1)
     along, a = (along / length[:, None])[owner], a[owner]
-    share = ((here - a) * along).sum(axis=1) / length[owner]
+    fraction = ((points - a) * along).sum(axis=1) / length[owner]
     inward, shortest = np.zeros_like(vertices), np.full(len(vertices), np.inf)
     for k in range(3):
-        place, one, other = (faces[:, (k + j) % 3] for j in range(3))
-        np.add.at(inward, place, vertices[one] + vertices[other] - 2 * vertices[place])
-        for end in (one, other):
-            span = np.linalg.norm(vertices[end] - vertices[place], axis=1)
-            np.minimum.at(shortest, place, span)
-    most = np.full(len(ends), height)
-    np.minimum.at(most, owner, _SHALLOW * shortest[inner])
-    far = 4 * share * (1 - share) * most[owner]
-    way = _across(inward[inner], along)
-    start = here + far[:, None] * way
-    there = newton_to_level(function, start, function.sample(start), 0.3 * far, None)
+        corner, second, third = (faces[:, (k + j) % 3] for j in range(3))
+        np.add.at(inward, corner, vertices[second] + vertices[third] - 2 * vertices[corner])
+        for end in (second, third):
+            span = np.linalg.norm(vertices[end] - vertices[corner], axis=1)
+            np.minimum.at(shortest, corner, span)
+    max_height = np.full(len(ends), height)
+    np.minimum.at(max_height, owner, _SHALLOW * shortest[inner])
+    lift = 4 * fraction * (1 - fraction) * max_height[owner]
+    direction = _across(inward[inner], along)
+    start = points + lift[:, None] * direction
+    projected = newton_to_level(function, start, function.sample(start), 0.3 * lift, None)
     # Points keep their place along the edge and their distance from it: they are turned about it.
-    turned = _across(there - here, along)
-    good = (turned * way).sum(axis=1) > 0.3
-    return here + far[:, None] * np.where(good[:, None], turned, way)
+    turned = _across(projected - points, along)
+    is_close = (turned * direction).sum(axis=1) > 0.3
+    return points + lift[:, None] * np.where(is_close[:, None], turned, direction)
 
 
 def _across(vectors: FloatArray, along: FloatArray) -> FloatArray:
@@ -236,20 +236,20 @@ def mesh_spanning_curve(
         vertices, faces = refine(function, vertices, faces, tolerance, walls, report)
         vertices, faces = improve(function, vertices, faces, tolerance, walls, report)
         turned = misoriented_faces(function, vertices, faces)
-        kept = sum(map(len, _loops(function)))
+        curve_count = sum(map(len, _loops(function)))
         vertices, faces = restore_curve_edges(
-            function, vertices, faces, kept, len(first.curve.points), tolerance
+            function, vertices, faces, curve_count, len(first.curve.points), tolerance
         )
         check_manifold(faces)
         crossing = intersecting_faces(vertices, faces)
         if not len(crossing) and (best is None or len(turned) < best.turned):
             best = dataclasses.replace(first, vertices=vertices, faces=faces, turned=len(turned))
-        bad = np.union1d(crossing, turned)
-        if not len(bad):
+        failing = np.union1d(crossing, turned)
+        if not len(failing):
             break
         if attempt < _MOST_ATTEMPTS - 1:
-            report(f"{len(bad)} triangles fail: smaller cells there")
-            finer = (*finer, RefinementBalls(vertices[faces[bad]].mean(axis=1), spacing))
+            report(f"{len(failing)} triangles fail: smaller cells there")
+            finer = (*finer, RefinementBalls(vertices[faces[failing]].mean(axis=1), spacing))
     if best is None:
         raise MeshingError(
             f"{len(crossing)} triangles pass through others, in cells as small as "
@@ -294,8 +294,8 @@ def _in_cells(
     """
     function, walls = task.function, task.walls
     curve = BoundaryCurve.of(_loops(function), _LONGEST * spacing)
-    for k, places in enumerate(finer):  # balls on long edges leave no room for points
-        curve = curve.split_near(places, spacing * 0.5**k)
+    for k, balls in enumerate(finer):  # balls on long edges leave no room for points
+        curve = curve.split_near(balls, spacing * 0.5**k)
     margin = 0.5 * spacing if walls is None else 0.0
     root = box_cells(task.lower - margin, task.upper + margin, spacing, exact=walls is not None)
     curve, points, tets = _tetrahedralize(task, root, curve, finer)
@@ -337,13 +337,13 @@ def _check_boundary(
     edges = boundary_edges(faces)
     count = max(int(faces.max()) + 1, len(curve.points))
     if walls is not None:  # where the surface ends as well
-        slack = 1e-9 * (walls[1] - walls[0])
+        margin = 1e-9 * (walls[1] - walls[0])
         near = np.minimum(np.abs(vertices - walls[0]), np.abs(vertices - walls[1]))
-        on = np.asarray((near <= slack).any(axis=1))
+        on = np.asarray((near <= margin).any(axis=1))
         edges = edges[~on[edges].all(axis=1)]
-    wrong = np.setxor1d(edge_keys(edges, count), edge_keys(curve.edges, count))
-    if len(wrong):
-        ends = np.stack(np.divmod(wrong, count), axis=1)
+    unmatched = np.setxor1d(edge_keys(edges, count), edge_keys(curve.edges, count))
+    if len(unmatched):
+        ends = np.stack(np.divmod(unmatched, count), axis=1)
         raise LocalizedMeshingError(
             "the mesh does not end at the curve: cells are too large for it; choose a smaller "
             "`cell_size`",

@@ -78,20 +78,20 @@ class BoundaryCurve:
         """A curve of closed loops, their vertices first and in their order; edges longer than
         `longest` are divided into equal parts."""
         points = [*loops]
-        more: list[FloatArray] = []
+        inner_points: list[FloatArray] = []
         edges: list[tuple[int, int]] = []
         first, last = 0, sum(map(len, loops))
         for loop in loops:
             for k, (a, b) in enumerate(zip(loop, np.roll(loop, -1, axis=0), strict=True)):
                 parts = max(1, math.ceil(float(np.linalg.norm(b - a)) / longest))
                 inner = a + (np.arange(1, parts)[:, None] / parts) * (b - a)
-                more.append(inner)
+                inner_points.append(inner)
                 ends = [first + k, *range(last, last + parts - 1), first + (k + 1) % len(loop)]
                 edges += itertools.pairwise(ends)
                 last += parts - 1
             first += len(loop)
         pairs = np.array(edges, np.int64).reshape(-1, 2)
-        return cls(np.concatenate([*points, *more, np.zeros((0, 3))]), pairs)
+        return cls(np.concatenate([*points, *inner_points, np.zeros((0, 3))]), pairs)
 
     def split(self, which: BoolArray) -> BoundaryCurve:
         """The curve with the midpoints of the edges that the mask `which` (k,) selects as
@@ -183,7 +183,7 @@ def sample_delaunay_points(
     n = len(boundary.points)
     zeros = LevelSamples(np.zeros(n), np.zeros((n, 3)), np.zeros(n))
     together = [
-        np.concatenate([getattr(one, name) for one in (zeros, samples)])
+        np.concatenate([getattr(batch, name) for batch in (zeros, samples)])
         for name in ("value", "gradient", "quarter_period_radius")
     ]
     return TetrahedronPoints(
@@ -198,14 +198,14 @@ def _finer_cells(
 ) -> list[BoxCells]:
     """Cells that leaves are split into, smallest first; those proved empty are left out."""
     pool = [leaves]
-    for places in finer:
+    for balls in finer:
         split: list[BoxCells] = []
         for cells in pool:
-            halves = cells.subset(places.meet(cells.centers, cells.half_diagonal)).octants()
+            halves = cells.subset(balls.meet(cells.centers, cells.half_diagonal)).octants()
             split.append(halves.subset(~halves.is_proved_empty(function.clearance)))
         pool += split
-    found = [cells for cells in pool[1:] if len(cells.corners)]
-    return sorted(found, key=lambda cells: float(cells.size.max()))
+    nonempty = [cells for cells in pool[1:] if len(cells.corners)]
+    return sorted(nonempty, key=lambda cells: float(cells.size.max()))
 
 
 def _corners_and_centers(
@@ -216,10 +216,10 @@ def _corners_and_centers(
     leaves = [*finer, tree.occupied]
     points = [cells.centers for cells in leaves]
     sizes = [np.full(len(cells.corners), float(cells.size.max())) for cells in leaves]
-    for some in [*leaves, *reversed(tree.empty)]:
-        corners = (some.corners[:, None] + _CORNERS * some.size).reshape(-1, 3)
+    for layer in [*leaves, *reversed(tree.empty)]:
+        corners = (layer.corners[:, None] + _CORNERS * layer.size).reshape(-1, 3)
         points.append(corners)
-        sizes.append(np.full(len(corners), float(some.size.max())))
+        sizes.append(np.full(len(corners), float(layer.size.max())))
     x, size = np.concatenate(points), np.concatenate(sizes)
     order = np.argsort(size, kind="stable")
     x, size = x[order], size[order]
@@ -244,14 +244,14 @@ def _is_far(points: FloatArray, free: FloatArray, boundary: BoundaryCurve) -> Bo
     is_far = np.ones(len(points), np.bool_)
     # Curves may have edges of any lengths: those of one size at a time.
     octave = np.floor(np.log2(half))
-    for one in np.unique(octave):
-        rows = np.flatnonzero(octave == one)
-        few = min(8, len(rows))
-        found: IntArray = searching.cKDTree(middle[rows]).query(points, k=few)[1]
-        index = rows[found.reshape(len(points), few)]
+    for exponent in np.unique(octave):
+        rows = np.flatnonzero(octave == exponent)
+        neighbor_count = min(8, len(rows))
+        nearest: IntArray = searching.cKDTree(middle[rows]).query(points, k=neighbor_count)[1]
+        index = rows[nearest.reshape(len(points), neighbor_count)]
         e, w = (b - a)[index], points[:, None] - a[index]
-        share = np.clip((w * e).sum(axis=2) / (e * e).sum(axis=2), 0, 1)
-        gap = np.linalg.norm(w - share[..., None] * e, axis=2)
+        fraction = np.clip((w * e).sum(axis=2) / (e * e).sum(axis=2), 0, 1)
+        gap = np.linalg.norm(w - fraction[..., None] * e, axis=2)
         away = np.linalg.norm(points[:, None] - middle[index], axis=2)
         near = np.minimum(near, gap.min(axis=1))
         is_far &= (away > 1.1 * half[index]).all(axis=1)
@@ -260,8 +260,8 @@ def _is_far(points: FloatArray, free: FloatArray, boundary: BoundaryCurve) -> Bo
 
 def _off_walls(points: FloatArray, walls: tuple[FloatArray, FloatArray]) -> FloatArray:
     """(n, 3): 0 in directions in which a point on a face of the box would leave it, else 1."""
-    slack = 1e-9 * (walls[1] - walls[0])
-    on = (np.abs(points - walls[0]) <= slack) | (np.abs(points - walls[1]) <= slack)
+    margin = 1e-9 * (walls[1] - walls[0])
+    on = (np.abs(points - walls[0]) <= margin) | (np.abs(points - walls[1]) <= margin)
     return np.where(on, 0.0, 1.0)
 
 
@@ -277,15 +277,15 @@ def _snapped(
     """Points, with those near the level moved onto it, their samples, and which are on it."""
     near = np.flatnonzero(samples.distance < _SNAPPED * size)
     moved = newton_to_level(function, points[near], samples.select(near), 0.25 * size[near], walls)
-    there = function.sample(moved)
+    new_samples = function.sample(moved)
     apart = row_norms(moved - points[near])
-    steep = row_norms(there.gradient)
-    good = np.abs(there.value) < 1e-9 * np.maximum(steep * size[near], 1e-300)
-    good &= (apart < 1.5 * _SNAPPED * size[near]) & _is_far(moved, free[near], boundary)
-    rows = near[good]
+    steep = row_norms(new_samples.gradient)
+    converged = np.abs(new_samples.value) < 1e-9 * np.maximum(steep * size[near], 1e-300)
+    converged &= (apart < 1.5 * _SNAPPED * size[near]) & _is_far(moved, free[near], boundary)
+    rows = near[converged]
     points, is_on = points.copy(), np.zeros(len(points), np.bool_)
-    points[rows], is_on[rows] = moved[good], True
-    return points, samples.replaced(rows, there.select(good)), is_on
+    points[rows], is_on[rows] = moved[converged], True
+    return points, samples.replaced(rows, new_samples.select(converged)), is_on
 
 
 def newton_to_level(
@@ -302,16 +302,16 @@ def newton_to_level(
     finite step, as beside a pole."""
     x, rows = points.copy(), np.arange(len(points))
     for k in range(steps):
-        here = x[rows]
-        g = samples.gradient if walls is None else samples.gradient * _off_walls(here, walls)
+        current = x[rows]
+        g = samples.gradient if walls is None else samples.gradient * _off_walls(current, walls)
         square = row_dots(g, g)
         with np.errstate(invalid="ignore", over="ignore"):
             move = -(samples.value / np.maximum(square, 1e-300))[:, None] * g
             length = row_norms(move)
         lost = ~np.isfinite(length)
         move[lost], length[lost] = 0.0, 0.0
-        there = here + move * np.minimum(1, longest[rows] / np.maximum(length, 1e-300))[:, None]
-        x[rows] = there if walls is None else np.clip(there, *walls)
+        moved = current + move * np.minimum(1, longest[rows] / np.maximum(length, 1e-300))[:, None]
+        x[rows] = moved if walls is None else np.clip(moved, *walls)
         rows = rows[length > _CONVERGED * longest[rows]]
         if k == steps - 1 or not len(rows):
             break

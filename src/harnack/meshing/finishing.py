@@ -112,20 +112,20 @@ def _reason_beyond_reach(
     flat = area_normals(surface.vertices[surface.faces])
     areas = np.linalg.norm(flat, axis=1)
     tree = searching.cKDTree(surface.vertices)
-    own = np.arange(len(surface.vertices))
-    few = min(16, len(own))
-    neighbors = sorted_unique(edge_keys(half_edges(surface.faces), len(own)))
+    vertex_ids = np.arange(len(surface.vertices))
+    neighbor_count = min(16, len(vertex_ids))
+    neighbors = sorted_unique(edge_keys(half_edges(surface.faces), len(vertex_ids)))
     for sign in (1, -1):
         side = surface.vertices + sign * half * normals
         turned = (area_normals(side[surface.faces]) * flat).sum(axis=1) <= 0
         if areas[turned].sum() > _TURNED * areas.sum():  # less are slivers
             return f"{turned.sum()} triangles turn over: the surface bends more than 1/{half:.3g}"
         # Nearer than the vertex that a point was moved from are at most its neighbors.
-        away, other = tree.query(side, k=few)
-        pairs = np.stack([np.broadcast_to(own[:, None], other.shape), other], axis=-1)
+        away, nearest = tree.query(side, k=neighbor_count)
+        pairs = np.stack([np.broadcast_to(vertex_ids[:, None], nearest.shape), nearest], axis=-1)
         near = (away < _NEAR * half) & (pairs[..., 0] != pairs[..., 1])
-        found = sorted_unique(edge_keys(pairs[near], len(own)))
-        count = int((~np.isin(found, neighbors)).sum())
+        near_keys = sorted_unique(edge_keys(pairs[near], len(vertex_ids)))
+        count = int((~np.isin(near_keys, neighbors)).sum())
         if count:
             return f"{count} points of a side are nearer to another place than to their own"
     return None
@@ -190,10 +190,10 @@ def vertex_normals(function: LevelFunction, surface: TriangleMesh) -> FloatArray
     steep: FloatArray = np.linalg.norm(slope, axis=1)
     slope = slope / np.maximum(steep, 1e-300)[:, None]
     # Beside the curve slopes turn within a triangle.
-    good = np.isfinite(steep) & (steep > 0) & ((slope * mean).sum(axis=1) > 0.7)
+    is_reliable = np.isfinite(steep) & (steep > 0) & ((slope * mean).sum(axis=1) > 0.7)
     if function.period is not None:
-        good[np.unique(boundary_edges(surface.faces))] = False
-    chosen: FloatArray = np.where(good[:, None], slope, mean)
+        is_reliable[np.unique(boundary_edges(surface.faces))] = False
+    chosen: FloatArray = np.where(is_reliable[:, None], slope, mean)
     return chosen
 
 
@@ -233,20 +233,20 @@ def to_trimesh(surface: TriangleMesh, facts: dict[str, Any], is_closed: bool) ->
     """
     from harnack.meshing.closed_mesh import ClosedMesh
 
-    made = ClosedMesh(surface.vertices, surface.faces, process=False, validate=False)
+    mesh = ClosedMesh(surface.vertices, surface.faces, process=False, validate=False)
     pairs = half_edges(surface.faces)
     edges = Edges.of(pairs)
     boundary = pairs[edges.multiplicity[edges.edge_of_pair] == 1]
     if is_closed:
-        volume = float(made.volume)
+        volume = float(mesh.volume)
         if len(boundary) or not volume > 0:
             raise MeshingError(
                 "the part did not close, or is inside out: choose a smaller `cell_size`"
             )
         facts = {**facts, "volume": volume}
-    elif not len(boundary) and made.volume < 0:  # f is larger inside
-        made.invert()
-    made.metadata["harnack"] = {
+    elif not len(boundary) and mesh.volume < 0:  # f is larger inside
+        mesh.invert()
+    mesh.metadata["harnack"] = {
         "proved": 0,
         "integrated": 0,
         **facts,
@@ -254,7 +254,7 @@ def to_trimesh(surface: TriangleMesh, facts: dict[str, Any], is_closed: bool) ->
         "boundary": boundary,
         "creases": _creases(surface, edges),
     }
-    return made
+    return mesh
 
 
 def _creases(surface: TriangleMesh, edges: Edges) -> int:

@@ -72,26 +72,26 @@ class Difference:
     @property
     def badness(self) -> float:
         """A number to compare surfaces by: the one with less of it is nearer to the input."""
-        off = 0.0
+        volume_error = 0.0
         if self.volumes is not None:
             new, intended = self.volumes
-            off = abs(new - intended) / abs(intended)
-        return self.share + off
+            volume_error = abs(new - intended) / abs(intended)
+        return self.share + volume_error
 
     def __str__(self) -> str:
         words = [
-            f"{count:,} {what}"
-            for count, what in ((self.missing, "inside of it"), (self.added, "outside"))
+            f"{count:,} {side}"
+            for count, side in ((self.missing, "inside of it"), (self.added, "outside"))
             if count
         ]
-        told = f"{self.share:.2%} of the points compared" if self.share else "none of the points"
+        text = f"{self.share:.2%} of the points compared" if self.share else "none of the points"
         if words:
             x, y, z = self.places[0]
-            told += f" ({' and '.join(words)}, such as near ({x:.4g}, {y:.4g}, {z:.4g}))"
-        told += " lie on the other side"
+            text += f" ({' and '.join(words)}, such as near ({x:.4g}, {y:.4g}, {z:.4g}))"
+        text += " lie on the other side"
         if self.volumes is not None:
-            told += ", and volumes are {:.4g} and {:.4g}".format(*self.volumes)
-        return told
+            text += ", and volumes are {:.4g} and {:.4g}".format(*self.volumes)
+        return text
 
 
 @dataclass(frozen=True)
@@ -128,20 +128,20 @@ class IntendedSolid:
             np.asarray(mesh.vertices), np.asarray(mesh.faces), allow_zero_area=True
         )
         welded = Welded.of(x, faces)
-        known, raw = welded.index[faces], faces
+        joined, raw = welded.index[faces], faces
         if welded.rounded:
-            faces = known
-        rows = np.flatnonzero((known != np.roll(known, 1, axis=1)).all(axis=1))
+            faces = joined
+        rows = np.flatnonzero((joined != np.roll(joined, 1, axis=1)).all(axis=1))
         if not len(welded.net.faces):  # every face is there with its reverse
-            rows = rows[np.unique(np.sort(known[rows], axis=1), axis=0, return_index=True)[1]]
-        known, is_turned = known[rows], np.zeros(len(faces), np.bool_)
+            rows = rows[np.unique(np.sort(joined[rows], axis=1), axis=0, return_index=True)[1]]
+        joined, is_turned = joined[rows], np.zeros(len(faces), np.bool_)
         if as_it_is or not len(rows):
-            return cls(x, faces, is_turned, known, [], welded.rounded)
-        disagrees = against_neighbors(x, known)
-        agreeing = _turned(known, disagrees)
+            return cls(x, faces, is_turned, joined, [], welded.rounded)
+        disagrees = against_neighbors(x, joined)
+        agreeing = _turned(joined, disagrees)
         raw = _turned(raw[rows], disagrees)
-        way = 1 if volume_of(x, agreeing) >= 0 else -1  # most has its material inside
-        parts = closed_parts(x, raw[:, ::way], agreeing[:, ::way])
+        step = 1 if volume_of(x, agreeing) >= 0 else -1  # most has its material inside
+        parts = closed_parts(x, raw[:, ::step], agreeing[:, ::step])
         turned = _inside_out(x, agreeing, parts)
         oriented = _turned(agreeing, turned)
         if turned.any() and not turned.all():
@@ -202,10 +202,10 @@ class IntendedSolid:
         away = _NEAREST * self.size * normals
         beside = self.winding(np.concatenate([points + away, points - away]))
         nothing = (beside.reshape(2, -1) < 0.5).all(axis=0)
-        share = float(nothing.mean())
-        if share > _OPEN:
+        fraction = float(nothing.mean())
+        if fraction > _OPEN:
             raise MeshError(
-                f"the mesh is an open sheet: {share:.0%} of its area have nothing inside, on "
+                f"the mesh is an open sheet: {fraction:.0%} of its area have nothing inside, on "
                 "neither side, so that most of it would be lost; give it a thickness first, in the "
                 "program that made it"
             )
@@ -223,16 +223,16 @@ class IntendedSolid:
         )
         field = _winding_number(surface.vertices, surface.faces)
         both = np.concatenate([self.vertices[self.oriented], corner])
-        missing, added, far = _on_other_side(points, w, field, both, away)
-        beside, around = self.beside
-        lost, filled, beside_far = _on_other_side(beside, around, field, corner, away)
-        far = np.concatenate([far, beside_far])
+        missing, added, distant = _on_other_side(points, w, field, both, away)
+        beside, windings = self.beside
+        lost, filled, beside_far = _on_other_side(beside, windings, field, corner, away)
+        distant = np.concatenate([distant, beside_far])
         volumes = self._volumes(surface, away)
-        if not len(far) and volumes is None:
+        if not len(distant) and volumes is None:
             return None
         missing, added = missing + lost, added + filled
-        share = (missing + added) / (len(points) + len(beside))
-        return Difference(share, far[:_LISTED], missing, added, volumes)
+        fraction = (missing + added) / (len(points) + len(beside))
+        return Difference(fraction, distant[:_LISTED], missing, added, volumes)
 
     def _volumes(self, surface: TriangleMesh, away: float) -> tuple[float, float] | None:
         """Volumes of the surface and the mesh if they differ, of a closed one that winds around no
@@ -265,10 +265,10 @@ def _on_other_side(
     missing, added = ~inside & (w > 0.5 + _CLEARLY), inside & (w < 0.5 - _CLEARLY)
     rows = np.flatnonzero(missing | added)
     rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), _LOOKED_AT)).astype(int)]
-    far = rows[[distance_from_triangles(points[k], corner) > away for k in rows]]
-    if not len(far):
+    distant = rows[[distance_from_triangles(points[k], corner) > away for k in rows]]
+    if not len(distant):
         return 0, 0, np.zeros((0, 3))
-    return int(missing.sum()), int(added.sum()), points[far]
+    return int(missing.sum()), int(added.sum()), points[distant]
 
 
 def _winding_number(x: FloatArray, faces: IntArray) -> WindingNumber | None:
@@ -324,31 +324,31 @@ def _inside_out(x: FloatArray, faces: IntArray, parts: list[IntArray]) -> BoolAr
     turned, is_rest = np.zeros(len(faces), np.bool_), np.ones(len(faces), np.bool_)
     for rows in parts:
         is_rest[rows] = False
-    rest = faces[is_rest]
+    open_faces = faces[is_rest]
     closed = [faces[rows] for rows in parts]
     volumes = [volume_of(x, part) for part in closed]
-    holds_rest = [_lies_in(x, rest, part) for part in closed]
+    holds_rest = [_lies_in(x, open_faces, part) for part in closed]
     is_with_rest = is_rest.copy()
-    for k, around in enumerate(nested(x, closed)):
-        outermost = around[-1] if around else k
-        if not any(holds_rest) and _lies_in(x, closed[outermost], rest):
+    for k, containers in enumerate(nested(x, closed)):
+        outermost = containers[-1] if containers else k
+        if not any(holds_rest) and _lies_in(x, closed[outermost], open_faces):
             is_with_rest[parts[k]] = True
         else:
             turned[parts[k]] = volumes[outermost] < 0
     if any(holds_rest):
         sizes = np.where(holds_rest, np.abs(volumes), 0)
         turned[is_rest] = volumes[int(sizes.argmax())] < 0
-    elif len(rest) and _winds_clockwise(x, rest):
+    elif len(open_faces) and _winds_clockwise(x, open_faces):
         turned |= is_with_rest
     return turned
 
 
-def _lies_in(x: FloatArray, part: IntArray, around: IntArray) -> bool:
+def _lies_in(x: FloatArray, part: IntArray, container: IntArray) -> bool:
     """Whether faces wind around all of some places of others."""
-    if not len(part) or not len(around):
+    if not len(part) or not len(container):
         return False
-    places = x[part[:: max(1, len(part) // _PLACES)]].mean(axis=1)
-    return bool((np.abs(_values(_winding_number(x, around), places)) > 0.5).all())
+    centers = x[part[:: max(1, len(part) // _PLACES)]].mean(axis=1)
+    return bool((np.abs(_values(_winding_number(x, container), centers)) > 0.5).all())
 
 
 def _winds_clockwise(x: FloatArray, faces: IntArray) -> bool:

@@ -109,9 +109,9 @@ def isotopy_of(
     corners = points.points[tetrahedra]
     if not _has_bounds(function, corners[is_cut]):
         return IsotopyCoverage(0.0, 0.0, int(is_cut.sum()), tetrahedra[is_cut])
-    rest = np.flatnonzero(~is_cut)
+    uncut = np.flatnonzero(~is_cut)
     holds = is_cut.copy()
-    holds[rest[~_proved_empty(function, corners[rest])]] = True
+    holds[uncut[~_proved_empty(function, corners[uncut])]] = True
     index, corners = tetrahedra[holds], corners[holds]
     values = points.samples.value[index]
     values[points.is_on_level[index]] = 0.0
@@ -120,11 +120,11 @@ def isotopy_of(
     proved = np.bincount(slopes.owner, minlength=len(index)) > 0
     proved &= ~beside
     rows = np.flatnonzero(proved[slopes.owner])
-    good = _proved_regular(
+    is_regular = _proved_regular(
         function, corners[slopes.owner[rows]], values[slopes.owner[rows], 0],
         slopes.slope[rows], np.ones(3),
     )  # fmt: skip
-    proved[slopes.owner[rows[~good]]] = False
+    proved[slopes.owner[rows[~is_regular]]] = False
     on_walls = np.ones(len(index), np.bool_)
     if walls is not None:
         on_walls = _regular_on_walls(function, corners, values, slopes, proved, walls)
@@ -140,9 +140,9 @@ def isotopy_of(
 def _has_bounds(function: LevelFunction, corners: FloatArray) -> bool:
     """Whether changes of the gradient are bounded on any of tetrahedra (n, 4, 3); without, all that
     is cut stays unproved, and no other needs to be examined."""
-    some = corners[:: max(1, len(corners) // _FEW)]
-    center, radius = _balls(some)
-    return not len(some) or bool((function.gradient_bounds(center, radius)[1] < _UNKNOWN).any())
+    sampled = corners[:: max(1, len(corners) // _FEW)]
+    center, radius = _balls(sampled)
+    return not len(sampled) or bool((function.gradient_bounds(center, radius)[1] < _UNKNOWN).any())
 
 
 def _share(proved: BoolArray) -> float:
@@ -182,16 +182,16 @@ def _slopes_on(
     owners, slopes = [rows], [slope]
     rows = np.flatnonzero(sound & flat)
     count = int(index.max(initial=0)) + 1
-    known = _triple_keys(faces[(faces < count).all(axis=1)], count)
-    others = np.array([np.delete(np.arange(4), k) for k in range(4)])
-    there = np.stack(
-        [np.isin(_triple_keys(index[rows][:, some], count), known) for some in others], axis=1
+    keys = _triple_keys(faces[(faces < count).all(axis=1)], count)
+    triples = np.array([np.delete(np.arange(4), k) for k in range(4)])
+    in_mesh = np.stack(
+        [np.isin(_triple_keys(index[rows][:, triple], count), keys) for triple in triples], axis=1
     )
     sign = np.sign(function.values(corners[rows].mean(axis=1)))
-    pair = there.sum(axis=1) == 2
-    for k, some in enumerate(others):
-        chosen = np.flatnonzero(pair & there[:, k])
-        a, b, c = (corners[rows[chosen], one] for one in some)
+    pair = in_mesh.sum(axis=1) == 2
+    for k, triple in enumerate(triples):
+        chosen = np.flatnonzero(pair & in_mesh[:, k])
+        a, b, c = (corners[rows[chosen], corner] for corner in triple)
         normal = np.cross(b - a, c - a)
         inward = ((corners[rows[chosen], k] - a) * normal).sum(axis=1)
         owners.append(rows[chosen])
@@ -218,32 +218,32 @@ def _proved_by_stars(
     n is found as a perceptron does: beginning with the sum of all unit gradients of F around a
     corner, those with which the product is not positive are added again, a few times.
     """
-    wanted = np.unique(index[rows])
-    place = np.full(int(index.max(initial=0)) + 1, -1, np.int64)
-    place[wanted] = np.arange(len(wanted))
+    vertices = np.unique(index[rows])
+    number = np.full(int(index.max(initial=0)) + 1, -1, np.int64)
+    number[vertices] = np.arange(len(vertices))
     # Pairs of a corner and a tetrahedron around it; then of a corner and a gradient there.
-    tet, corner = np.nonzero(place[index] >= 0)
-    star = place[index[tet, corner]]
-    entry, column = np.nonzero(place[index[slopes.owner]] >= 0)
-    vertex = place[index[slopes.owner[entry], column]]
-    unit = slopes.slope[entry]
-    unit = unit / np.maximum(np.linalg.norm(unit, axis=1), 1e-300)[:, None]
-    n = np.zeros((len(wanted), 3))
-    np.add.at(n, vertex, unit)
+    tet, corner = np.nonzero(number[index] >= 0)
+    star = number[index[tet, corner]]
+    entry, column = np.nonzero(number[index[slopes.owner]] >= 0)
+    vertex = number[index[slopes.owner[entry], column]]
+    units = slopes.slope[entry]
+    units = units / np.maximum(np.linalg.norm(units, axis=1), 1e-300)[:, None]
+    n = np.zeros((len(vertices), 3))
+    np.add.at(n, vertex, units)
     for _ in range(_TRIALS):
-        short = (n[vertex] * unit).sum(axis=1) <= 0
+        short = (n[vertex] * units).sum(axis=1) <= 0
         if not short.any():
             break
-        np.add.at(n, vertex[short], unit[short])
-    good = np.ones(len(wanted), np.bool_)
-    good[vertex[(n[vertex] * unit).sum(axis=1) <= 1e-9]] = False
+        np.add.at(n, vertex[short], units[short])
+    is_proved = np.ones(len(vertices), np.bool_)
+    is_proved[vertex[(n[vertex] * units).sum(axis=1) <= 1e-9]] = False
     has_slope = np.bincount(slopes.owner, minlength=len(index)) > 0
-    good[star[~has_slope[tet]]] = False
-    tried = np.flatnonzero(good[star])
+    is_proved[star[~has_slope[tet]]] = False
+    tried = np.flatnonzero(is_proved[star])
     start = np.zeros(len(tried))
     fine = _proved_regular(function, corners[tet[tried]], start, n[star[tried]], np.ones(3))
-    good[star[tried[~fine]]] = False
-    return np.asarray(good[place[index[rows]]].all(axis=1), np.bool_)
+    is_proved[star[tried[~fine]]] = False
+    return np.asarray(is_proved[number[index[rows]]].all(axis=1), np.bool_)
 
 
 def _proved_empty(function: LevelFunction, corners: FloatArray) -> BoolArray:
@@ -252,9 +252,9 @@ def _proved_empty(function: LevelFunction, corners: FloatArray) -> BoolArray:
     owner, pieces = np.arange(len(corners)), corners
     for _ in range(_HALVINGS + 1):
         center, radius = _balls(pieces)
-        bad = function.clearance(center) <= radius * (1 + 1e-9)
-        owner = np.concatenate([owner[bad], owner[bad]])
-        pieces = _halved(pieces[bad])
+        undecided = function.clearance(center) <= radius * (1 + 1e-9)
+        owner = np.concatenate([owner[undecided], owner[undecided]])
+        pieces = _halved(pieces[undecided])
         if not len(pieces):
             break
     free = np.ones(len(corners), np.bool_)
@@ -291,19 +291,19 @@ def _proved_regular(
         steep = np.linalg.norm(samples.gradient, axis=1)
         moved = (steep + change) * radius
         rise = (samples.gradient * along).sum(axis=1)
-        good = rise > change * np.linalg.norm(along, axis=1) * (1 + 1e-9)
+        is_regular = rise > change * np.linalg.norm(along, axis=1) * (1 + 1e-9)
         within = np.abs(samples.value) + moved < half_period
         linear = start[owner, None] + ((pieces - first[owner, None]) * slope[owner, None]).sum(2)
         sign = np.sign(samples.value)
-        good |= (np.abs(samples.value) > moved) & (linear * sign[:, None] > 0).all(axis=1)
+        is_regular |= (np.abs(samples.value) > moved) & (linear * sign[:, None] > 0).all(axis=1)
         if halving == 0:
             proved &= within
-        bad = ~good & proved[owner]
+        undecided = ~is_regular & proved[owner]
         if halving == _HALVINGS or pieces.shape[1] == 1:
-            proved[owner[bad]] = False
+            proved[owner[undecided]] = False
             break
-        owner = np.concatenate([owner[bad], owner[bad]])
-        pieces = _halved(pieces[bad])
+        owner = np.concatenate([owner[undecided], owner[undecided]])
+        pieces = _halved(pieces[undecided])
     return proved
 
 
@@ -314,9 +314,9 @@ def _halved(pieces: FloatArray) -> FloatArray:
     i, j = np.array(pairs)[np.argmax(span, axis=0)].T if len(pieces) else (np.zeros(0, int),) * 2
     rows = np.arange(len(pieces))
     middle = 0.5 * (pieces[rows, i] + pieces[rows, j])
-    one, other = pieces.copy(), pieces.copy()
-    one[rows, j], other[rows, i] = middle, middle
-    return np.concatenate([one, other])
+    first, second = pieces.copy(), pieces.copy()
+    first[rows, j], second[rows, i] = middle, middle
+    return np.concatenate([first, second])
 
 
 def _regular_on_walls(
@@ -329,16 +329,16 @@ def _regular_on_walls(
 ) -> BoolArray:
     """(n,) whether (b) is proved for projections, on what lies in walls of tetrahedra `rows` (n,);
     True for others without a corner there."""
-    slack = 1e-9 * (walls[1] - walls[0])
-    on = np.stack([np.abs(corners - wall) <= slack for wall in walls], axis=-1)  # (n, 4, 3, 2)
+    margin = 1e-9 * (walls[1] - walls[0])
+    on = np.stack([np.abs(corners - wall) <= margin for wall in walls], axis=-1)  # (n, 4, 3, 2)
     proved = rows | ~on.any(axis=(1, 2, 3))
     planes = list(itertools.product(range(3), range(2)))
     for count in (1, 2):  # in corners of the box no point moves, and there is nothing to ask
-        for some in itertools.combinations(planes, count):
-            axes = [axis for axis, _ in some]
+        for chosen in itertools.combinations(planes, count):
+            axes = [axis for axis, _ in chosen]
             if len(set(axes)) < count:
                 continue
-            inside = np.all([on[:, :, axis, side] for axis, side in some], axis=0)
+            inside = np.all([on[:, :, axis, side] for axis, side in chosen], axis=0)
             free = np.ones(3)
             free[axes] = 0.0
             number = inside.sum(axis=1)
@@ -350,8 +350,8 @@ def _regular_on_walls(
                 which = np.argsort(~inside[owner], axis=1, kind="stable")[:, :k]
                 part = np.take_along_axis(corners[owner], which[..., None], axis=1)
                 start = np.take_along_axis(values[owner], which[:, :1], axis=1)[:, 0]
-                good = _proved_regular(function, part, start, slopes.slope[entry], free)
-                proved[owner[~good]] = False
+                is_regular = _proved_regular(function, part, start, slopes.slope[entry], free)
+                proved[owner[~is_regular]] = False
     return proved
 
 
@@ -361,7 +361,7 @@ def _distances(points: FloatArray, boundary: BoundaryCurve) -> FloatArray:
 
     searching: Any = scipy.spatial
     a, b = (boundary.points[boundary.edges[:, k]] for k in (0, 1))
-    share = np.linspace(0, 1, 9)[:, None, None]
-    on: FloatArray = (a + share * (b - a)).reshape(-1, 3)
-    found: FloatArray = searching.cKDTree(on).query(points)[0]
-    return found
+    fraction = np.linspace(0, 1, 9)[:, None, None]
+    on: FloatArray = (a + fraction * (b - a)).reshape(-1, 3)
+    distances: FloatArray = searching.cKDTree(on).query(points)[0]
+    return distances

@@ -67,8 +67,8 @@ def boundary_of_solid(vertices: FloatArray, faces: IntArray) -> TriangleMesh:
     Raises:
         MeshingError: there are no such points, or pieces do not fit together.
     """
-    x, whole = without_zero_area_faces(vertices, faces)
-    cut = _Cut.of(x, whole, np.arange(len(whole)), closed=faces)
+    x, proper_faces = without_zero_area_faces(vertices, faces)
+    cut = _Cut.of(x, proper_faces, np.arange(len(proper_faces)), closed=faces)
     bounds = (np.minimum(cut.front, cut.back) < 0.5) & (np.maximum(cut.front, cut.back) > 0.5)
     bounds &= ~cut.is_there_before()
     if not bounds.any():
@@ -76,13 +76,13 @@ def boundary_of_solid(vertices: FloatArray, faces: IntArray) -> TriangleMesh:
     pieces = cut.pieces[bounds]
     looks_in = (cut.front > cut.back)[bounds]
     pieces = np.where(looks_in[:, None, None], pieces[:, ::-1], pieces)
-    places = np.concatenate([cut.unit, pieces.reshape(-1, 3)])
-    group = connected_groups(pairs_within(places, _SAME), len(places))
+    points = np.concatenate([cut.unit, pieces.reshape(-1, 3)])
+    group = connected_groups(pairs_within(points, _SAME), len(points))
     first = np.unique(group, return_index=True)[1][group]  # corners of the mesh come first
     joined = first[len(x) :].reshape(-1, 3)
     joined = joined[(joined != np.roll(joined, 1, axis=1)).all(axis=1)]
-    joined = _cut_at_corners(places, joined)
-    moved = np.concatenate([x, cut.center + cut.size * places[len(x) :]])
+    joined = _cut_at_corners(points, joined)
+    moved = np.concatenate([x, cut.center + cut.size * points[len(x) :]])
     return TriangleMesh.without_unused_vertices(*_apart_at_contacts(moved, joined))
 
 
@@ -116,16 +116,16 @@ class _Cut:
         low, high = corner.min(axis=(0, 1)), corner.max(axis=(0, 1))
         size = float(2.0 ** np.ceil(np.log2(0.5 * float((high - low).max()))))
         center = 0.5 * (low + high)
-        unit = (vertices - center) / size
-        rays = _rays(unit, faces[rows])
-        pieces, owner = split_intersecting_faces(rays, unit, faces[rows], covered_whole=True)
-        around = _rays(unit, faces if closed is None else closed)
-        front, back = windings_of_sides(around, pieces)
+        scaled = (vertices - center) / size
+        rays = _rays(scaled, faces[rows])
+        pieces, owner = split_intersecting_faces(rays, scaled, faces[rows], covered_whole=True)
+        closed_rays = _rays(scaled, faces if closed is None else closed)
+        front, back = windings_of_sides(closed_rays, pieces)
         edges = pieces - np.roll(pieces, 1, axis=1)
         longest = np.linalg.norm(edges, axis=2).max(axis=1)
         is_thick = np.linalg.norm(area_normals(pieces), axis=1) > _THIN * longest
         return cls(
-            rays, unit, faces[rows], center, size, pieces, rows[owner], front, back, is_thick
+            rays, scaled, faces[rows], center, size, pieces, rows[owner], front, back, is_thick
         )
 
     def is_there_before(self) -> BoolArray:
@@ -151,9 +151,9 @@ class _Cut:
         return is_there
 
 
-def _rays(unit: FloatArray, faces: IntArray) -> TriangleTree:
-    tree = build_balanced_tree(unit[faces].mean(axis=1), leaf_size=_LEAF_SIZE)
-    return TriangleTree.of(choose_backend("double"), tree, triangle_records(unit, faces))
+def _rays(scaled: FloatArray, faces: IntArray) -> TriangleTree:
+    tree = build_balanced_tree(scaled[faces].mean(axis=1), leaf_size=_LEAF_SIZE)
+    return TriangleTree.of(choose_backend("double"), tree, triangle_records(scaled, faces))
 
 
 # Pieces joined.
@@ -202,17 +202,17 @@ def _corners_on(x: FloatArray, edges: IntArray) -> tuple[IntArray, BoolArray]:
     p, q = x[edges[:, 0]], x[edges[:, 1]]
     half = 0.5 * row_norms(q - p)
     near = searching.cKDTree(x[corners]).query_ball_point(0.5 * (p + q), half)
-    count = np.array([len(some) for some in near])
+    count = np.array([len(group) for group in near])
     row = np.repeat(np.arange(len(edges)), count)
     corner = corners[np.fromiter(itertools.chain.from_iterable(near), np.int64, int(count.sum()))]
-    way = (q - p)[row] / np.maximum(2 * half[row], 1e-300)[:, None]
+    direction = (q - p)[row] / np.maximum(2 * half[row], 1e-300)[:, None]
     to = x[corner] - p[row]
-    along = row_dots(to, way)
-    is_on = row_norms(to - along[:, None] * way) <= _SAME
+    along = row_dots(to, direction)
+    is_on = row_norms(to - along[:, None] * direction) <= _SAME
     is_on &= (corner != edges[row, 0]) & (corner != edges[row, 1])
     is_on &= (along > 0) & (along < 2 * half[row])
-    row, corner, off = row[is_on], corner[is_on], np.abs(along - half[row])[is_on]
-    order = np.lexsort((off, row))
+    row, corner, offset = row[is_on], corner[is_on], np.abs(along - half[row])[is_on]
+    order = np.lexsort((offset, row))
     row, first = np.unique(row[order], return_index=True)
     middle, is_cut = np.zeros(len(edges), np.int64), np.zeros(len(edges), np.bool_)
     middle[row], is_cut[row] = corner[order][first], True
@@ -244,13 +244,13 @@ def _wedges(ends: FloatArray, third: FloatArray, is_along: BoolArray) -> IntArra
     the edge backwards, since its positive side looks back, and ends at the next one that runs it
     forwards. Of faces in one direction those at which material ends come first.
     """
-    way = ends[1] - ends[0]
+    direction = ends[1] - ends[0]
     away = third - ends[0]
-    away -= np.outer(away @ way / (way @ way), way)
+    away -= np.outer(away @ direction / (direction @ direction), direction)
     across: Any = away[0] / max(float(np.linalg.norm(away[0])), 1e-300)
-    upright: Any = np.cross(way / float(np.linalg.norm(way)), across)
-    turn: FloatArray = np.arctan2(away @ upright, away @ across) / (2 * np.pi)
-    steps: IntArray = np.round(turn / _SAME_TURN).astype(np.int64) % round(1 / _SAME_TURN)
+    upright: Any = np.cross(direction / float(np.linalg.norm(direction)), across)
+    turns: FloatArray = np.arctan2(away @ upright, away @ across) / (2 * np.pi)
+    steps: IntArray = np.round(turns / _SAME_TURN).astype(np.int64) % round(1 / _SAME_TURN)
     begun, wedges = list[int](), list[tuple[int, int]]()
     is_taken = np.zeros(len(third), np.bool_)
     for k in 2 * np.lexsort((~is_along, steps)).tolist():  # twice around

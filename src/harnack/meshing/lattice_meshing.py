@@ -140,20 +140,20 @@ def check_no_missed_parts(
     start = points[rows]
     step = np.full(len(rows), 0.5 * size)
     x = newton_to_level(function, start, samples.select(rows), step, None)
-    left = function.sample(x)
-    found = left.distance < _ON * size
-    slow = ~found & (left.distance < _SLOW * samples.distance[rows])
+    end_samples = function.sample(x)
+    on_level = end_samples.distance < _ON * size
+    slow = ~on_level & (end_samples.distance < _SLOW * samples.distance[rows])
     if slow.any():
-        x[slow] = to_multiple_roots(function, x[slow], left.select(slow), step[slow])
-        found[slow] = function.sample(x[slow]).distance < _ON * size
-    found &= row_norms(x - start) < _MAX_SEED_MOVE * size
+        x[slow] = to_multiple_roots(function, x[slow], end_samples.select(slow), step[slow])
+        on_level[slow] = function.sample(x[slow]).distance < _ON * size
+    on_level &= row_norms(x - start) < _MAX_SEED_MOVE * size
     deep = _MIN_WALL_DISTANCE * size
-    found &= ((x >= box[0] + deep) & (x <= box[1] - deep)).all(axis=1)
-    x = x[found]
+    on_level &= ((x >= box[0] + deep) & (x <= box[1] - deep)).all(axis=1)
+    x = x[on_level]
     vertices, faces = surface
     if len(faces) and len(x):
-        around = np.concatenate([vertices[np.unique(faces)], vertices[faces].mean(axis=1)])
-        x = x[searching.cKDTree(around).query(x)[0] > _MIN_MESH_DISTANCE * size]
+        mesh_points = np.concatenate([vertices[np.unique(faces)], vertices[faces].mean(axis=1)])
+        x = x[searching.cKDTree(mesh_points).query(x)[0] > _MIN_MESH_DISTANCE * size]
     if elsewhere is not None and len(x):
         x = x[elsewhere(x) <= 0]
     part = _longest_part(x, _CLUSTER_DISTANCE * size)
@@ -177,29 +177,29 @@ def _thickness(function: LevelFunction, x: FloatArray, size: float) -> FloatArra
     """(k,) how far points (k, 3) on the level are from where the sign changes again along the
     slope, up to `size`: 0 where it does not change at the point itself, inf where not again."""
     slope = function.sample(x).gradient
-    way = slope / np.maximum(row_norms(slope), 1e-300)[:, None]
-    far = size * 2.0 ** np.arange(round(math.log2(_LEAST)), 1)
+    direction = slope / np.maximum(row_norms(slope), 1e-300)[:, None]
+    distances = size * 2.0 ** np.arange(round(math.log2(_LEAST)), 1)
     sides: list[BoolArray] = []
-    least = np.full(len(x), np.inf)
+    thickness = np.full(len(x), np.inf)
     for sign in (1.0, -1.0):
-        there = x[:, None] + sign * far[:, None] * way[:, None]
-        is_above = function.values(there.reshape(-1, 3)).reshape(len(x), len(far)) > 0
+        probes = x[:, None] + sign * distances[:, None] * direction[:, None]
+        is_above = function.values(probes.reshape(-1, 3)).reshape(len(x), len(distances)) > 0
         changed = is_above != is_above[:, :1]
-        first = far[changed.argmax(axis=1)]
-        least = np.minimum(least, np.where(changed.any(axis=1), first, np.inf))
+        first = distances[changed.argmax(axis=1)]
+        thickness = np.minimum(thickness, np.where(changed.any(axis=1), first, np.inf))
         sides.append(is_above[:, 0])
-    return np.where(sides[0] == sides[1], 0.0, least)
+    return np.where(sides[0] == sides[1], 0.0, thickness)
 
 
 def _check_off_level_around(function: LevelFunction, part: FloatArray, reach: float) -> None:
     """Raise if the function is its level, up to rounding, at most of some points (n, 3) and on all
     sides of them: such as max(x, 0), of which no cells are small enough."""
-    some = part[:: -(-len(part) // _MOST_PROBES)]
-    ways = reach * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
-    around = (some[:, None] + ways).reshape(-1, 3)
-    is_flat = function.is_on_level(around).reshape(len(some), -1).all(axis=1)
+    probes = part[:: -(-len(part) // _MOST_PROBES)]
+    offsets = reach * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
+    near_points = (probes[:, None] + offsets).reshape(-1, 3)
+    is_flat = function.is_on_level(near_points).reshape(len(probes), -1).all(axis=1)
     if is_flat.mean() > 0.5:
-        a, b, c = some[is_flat][0]
+        a, b, c = probes[is_flat][0]
         raise UnrefinableError(
             f"{type(function.field).__name__} is {function.level:g}, up to rounding, at and around "
             f"points such as ({a:.4g}, {b:.4g}, {c:.4g}): its level there is a volume and no "
@@ -220,10 +220,10 @@ def _check_passes_level(function: LevelFunction, part: FloatArray, size: float) 
         -1, 3, 3
     )
     steepest = beside[np.arange(len(x)), (beside**2).sum(axis=2).argmax(axis=1)]
-    way = steepest / np.maximum(row_norms(steepest), 1e-300)[:, None]
+    direction = steepest / np.maximum(row_norms(steepest), 1e-300)[:, None]
 
     def along(s: FloatArray) -> FloatArray:
-        return function.values(x + s[:, None] * way)
+        return function.values(x + s[:, None] * direction)
 
     low, high = np.full(len(x), -half), np.full(len(x), half)
     side = np.sign(along(low))
@@ -271,10 +271,10 @@ def check_estimated_triangles(
         MeshingError: the function has no slope between the vertices.
         TriangleLimitError: with the estimate, and a tolerance that would do.
     """
-    some = faces[:: max(1, len(faces) // 20_000)]
-    if not len(some):
+    sampled = faces[:: max(1, len(faces) // 20_000)]
+    if not len(sampled):
         return
-    corner = vertices[some]
+    corner = vertices[sampled]
     at = function.sample(0.5 * (corner + np.roll(corner, 1, axis=1)).reshape(-1, 3))
     is_flat = (at.value != 0) & ~at.gradient.any(axis=1)
     if is_flat.any():
@@ -286,11 +286,11 @@ def check_estimated_triangles(
     middle = at.distance
     ratio = middle.reshape(-1, 3).max(axis=1) / tolerance
     expected = float(np.maximum(1.0, ratio).mean()) * len(faces)
-    most = function.most_faces
-    if expected > most:
-        enough = expected / most
+    limit = function.most_faces
+    if expected > limit:
+        enough = expected / limit
         raise TriangleLimitError(
-            f"the tolerance takes about {expected:.1e} triangles, and max_triangles is {most:,}: "
+            f"the tolerance takes about {expected:.1e} triangles, and max_triangles is {limit:,}: "
             f"choose a `tolerance` {enough:.2g} times as large, or a larger max_triangles"
         )
 
@@ -319,9 +319,9 @@ class TriangleMesh:
     def without_unused_vertices(cls, vertices: FloatArray, faces: IntArray) -> TriangleMesh:
         """A mesh of these faces, without the vertices that no face uses."""
         used = np.flatnonzero(np.bincount(faces.ravel()))
-        place = np.full(len(vertices), -1, np.int64)
-        place[used] = np.arange(len(used))
-        return cls(vertices[used], place[faces])
+        index = np.full(len(vertices), -1, np.int64)
+        index[used] = np.arange(len(used))
+        return cls(vertices[used], index[faces])
 
     def reversed(self) -> TriangleMesh:
         """The same mesh with the orientation of all faces reversed."""
@@ -418,12 +418,12 @@ def mesh_closed_surface(
     Raises:
         MeshingError: too many cells.
     """
-    most, does_matter = function.most_faces, None
+    limit, does_matter = function.most_faces, None
     if elsewhere is None:
-        cells = lattice.nonempty_cells(function.clearance, most)
+        cells = lattice.nonempty_cells(function.clearance, limit)
     else:
         cells, does_matter = lattice.relevant_cells(
-            function.clearance, elsewhere.relevant_cells(lattice, most), function.values, most
+            function.clearance, elsewhere.relevant_cells(lattice, limit), function.values, limit
         )
     outer = lattice.outer_cells()
     if does_matter is not None:
@@ -472,22 +472,22 @@ def split_faces_off_level(
     """Faces whose center is farther than that from the level, as across a crease, cut into three at
     a point on it; so are the new ones, a few times. All edges stay."""
     vertices, faces = surface.vertices, surface.faces
-    asked = np.arange(len(faces))
+    pending = np.arange(len(faces))
     for _ in range(times):
-        corner = vertices[faces[asked]]
+        corner = vertices[faces[pending]]
         center = corner.mean(axis=1)
         samples = function.sample(center)
-        far = np.flatnonzero(samples.distance > farthest)
-        if not len(far):
+        off_level = np.flatnonzero(samples.distance > farthest)
+        if not len(off_level):
             break
-        span = 0.5 * row_norms(corner[far, 1] - corner[far, 0])
-        moved = newton_to_level(function, center[far], samples.select(far), span, None)
-        rows, inner = asked[far], len(vertices) + np.arange(len(far))
+        span = 0.5 * row_norms(corner[off_level, 1] - corner[off_level, 0])
+        moved = newton_to_level(function, center[off_level], samples.select(off_level), span, None)
+        rows, inner = pending[off_level], len(vertices) + np.arange(len(off_level))
         a, b, c = faces[rows].T
         vertices = np.concatenate([vertices, moved])
         fans = [np.stack([*ends, inner], axis=1) for ends in ((a, b), (b, c), (c, a))]
         faces = np.concatenate([np.delete(faces, rows, axis=0), *fans])
-        asked = np.arange(len(faces) - 3 * len(rows), len(faces))
+        pending = np.arange(len(faces) - 3 * len(rows), len(faces))
     return TriangleMesh(vertices, faces)
 
 
@@ -497,8 +497,8 @@ def _are_negative(function: LevelFunction, lattice: BccLattice, cells: IntArray)
     shape = lattice.counts // _BLOCK + 1
     x, y, z = (cells // _BLOCK).T
     keys, index, _, _ = unique_with_inverse((x * shape[1] + y) * shape[2] + z)
-    rest, z = np.divmod(keys, shape[2])
-    blocks = np.stack([*np.divmod(rest, shape[1]), z], axis=1)
+    xy, z = np.divmod(keys, shape[2])
+    blocks = np.stack([*np.divmod(xy, shape[1]), z], axis=1)
     centers = lattice.points(_BLOCK * (2 * blocks + 1))
     half_diagonal = 0.5 * _BLOCK * float(np.linalg.norm(lattice.size))
     is_sure = function.clearance(centers) > half_diagonal * (1 + 1e-9)
@@ -541,12 +541,12 @@ def _inside(
     deep = None if does_matter is None else lattice.interior_cells(does_matter)
 
     def counts(points: FloatArray) -> BoolArray:
-        found = np.ones(len(points), np.bool_)
+        is_inside = np.ones(len(points), np.bool_)
         for x, low, high in zip(points.T, lower, upper, strict=True):
-            found &= (x >= low) & (x <= high)
+            is_inside &= (x >= low) & (x <= high)
         if deep is not None:
-            found &= deep[tuple(lattice.cell_indices(points).T)]
-        return found
+            is_inside &= deep[tuple(lattice.cell_indices(points).T)]
+        return is_inside
 
     return counts
 
@@ -558,9 +558,9 @@ def _wall_faces(
     on = is_wall[corners]
     rows = np.flatnonzero(on.sum(axis=1) == 3)
     order = np.argsort(on[rows], axis=1, kind="stable")  # the fourth corner first
-    apex, *rest = np.take_along_axis(corners[rows], order, axis=1).T
+    apex, *base = np.take_along_axis(corners[rows], order, axis=1).T
     below = samples.value[apex] <= 0
-    face, apex = np.stack(rest, axis=1)[below], apex[below]
+    face, apex = np.stack(base, axis=1)[below], apex[below]
     a, b, c = (points[face[:, k]] for k in range(3))
     inward = (np.cross(b - a, c - a) * (points[apex] - a)).sum(axis=1) > 0
     face[inward] = face[inward][:, ::-1]
@@ -576,12 +576,12 @@ def _sample_lattice(
     samples = LevelSamples(np.full(count, 10 * OUTSIDE_VALUE), np.ones((count, 3)), np.zeros(count))
     points = points[~is_beyond]
     samples = samples.replaced(~is_beyond, function.sample(points))
-    bad = ~np.isfinite(samples.value[~is_beyond])
-    if bad.any():
-        x, y, z = points[bad][0]
+    fails = ~np.isfinite(samples.value[~is_beyond])
+    if fails.any():
+        x, y, z = points[fails][0]
         nearer = ", or a smaller `cell_size`: it is asked for three cells around other parts"
         raise UnrefinableError(
-            f"{type(function.field).__name__} has no finite value at {bad.sum():,} points, such "
+            f"{type(function.field).__name__} has no finite value at {fails.sum():,} points, such "
             f"as ({x:.4g}, {y:.4g}, {z:.4g}): choose a `clip` where it has"
             + (nearer if is_beyond.any() else "")
         )
@@ -613,12 +613,12 @@ def _check_off_level_at_most_points(
     no cells are proved empty, however small they are."""
     if len(points) <= _MOST_FLAT * 2 * math.prod(lattice.counts.tolist()):
         return
-    some = points[:: -(-len(points) // _MOST_PROBES)]
-    share = float(function.is_on_level(some).mean())
-    if share > _MOST_FLAT:
+    probes = points[:: -(-len(points) // _MOST_PROBES)]
+    fraction = float(function.is_on_level(probes).mean())
+    if fraction > _MOST_FLAT:
         raise UnrefinableError(
             f"{type(function.field).__name__} is {function.level:g}, up to rounding, at "
-            f"{share:.0%} of the points looked at: its level there is a volume and no surface; "
+            f"{fraction:.0%} of the points looked at: its level there is a volume and no surface; "
             "choose another level"
         )
 
@@ -665,41 +665,44 @@ def _march(
     at_rest, original = points, samples
     points, samples, is_on = _snap_points(function, points, samples, is_fixed, lattice, walls)
     is_on |= is_wall
-    wrong, is_asked = np.zeros(0, np.int64), np.ones(len(points), np.bool_)
-    rows = found = np.flatnonzero(_may_be_cut(samples.value, is_on, corners))
+    touching, is_affected = np.zeros(0, np.int64), np.ones(len(points), np.bool_)
+    rows = cut_rows = np.flatnonzero(_may_be_cut(samples.value, is_on, corners))
     for _ in range(_MOST_ROUNDS):
-        some, tets = TetrahedronPoints(points, is_on, samples), Tetrahedra.of(points, corners[rows])
-        crossings = count_crossings(function, some, tets)
+        sampled, tets = (
+            TetrahedronPoints(points, is_on, samples),
+            Tetrahedra.of(points, corners[rows]),
+        )
+        crossings = count_crossings(function, sampled, tets)
         # Where vertices lie on edges does not matter for what touches.
-        _, faces = extract_triangles(function, some, tets, crossings, _middles)
-        wrong = nonmanifold_vertices(faces)
-        wrong = wrong[wrong < len(points)]
-        wrong = wrong[(is_asked & ~is_wall)[wrong]]
-        if not len(wrong):
+        _, faces = extract_triangles(function, sampled, tets, crossings, _middles)
+        touching = nonmanifold_vertices(faces)
+        touching = touching[touching < len(points)]
+        touching = touching[(is_affected & ~is_wall)[touching]]
+        if not len(touching):
             break
         points, is_on = points.copy(), is_on.copy()
-        points[wrong], is_on[wrong] = at_rest[wrong], False
-        samples = samples.replaced(wrong, original.select(wrong))
+        points[touching], is_on[touching] = at_rest[touching], False
+        samples = samples.replaced(touching, original.select(touching))
         # Only points beside these may touch anew: with all of their tetrahedra.
-        near, is_asked = np.zeros(len(points), np.bool_), np.zeros(len(points), np.bool_)
-        near[wrong] = True
-        is_asked[corners[_have_any(near, corners)]] = True
-        asked = np.flatnonzero(_have_any(is_asked, corners))
-        rows = asked[_may_be_cut(samples.value, is_on, corners[asked])]
-        found = np.concatenate([found, rows])
+        near, is_affected = np.zeros(len(points), np.bool_), np.zeros(len(points), np.bool_)
+        near[touching] = True
+        is_affected[corners[_have_any(near, corners)]] = True
+        affected = np.flatnonzero(_have_any(is_affected, corners))
+        rows = affected[_may_be_cut(samples.value, is_on, corners[affected])]
+        cut_rows = np.concatenate([cut_rows, rows])
     else:
         raise MeshingError(
-            f"sheets of the level set touch at {len(wrong)} places: choose a smaller `cell_size`"
+            f"sheets of the level set touch at {len(touching)} places: choose a smaller `cell_size`"
         )
     # Others have the same points as before.
-    rows = sorted_unique(found)
+    rows = sorted_unique(cut_rows)
     rows = rows[_may_be_cut(samples.value, is_on, corners[rows])]
-    some, tets = TetrahedronPoints(points, is_on, samples), Tetrahedra.of(points, corners[rows])
-    crossings = count_crossings(function, some, tets)
-    vertices, faces = extract_triangles(function, some, tets, crossings)
+    sampled, tets = TetrahedronPoints(points, is_on, samples), Tetrahedra.of(points, corners[rows])
+    crossings = count_crossings(function, sampled, tets)
+    vertices, faces = extract_triangles(function, sampled, tets, crossings)
     crossed: BoolArray = np.asarray((crossings.count[tets.edges] != 0).any(axis=1))
     ends = tets.ends[np.flatnonzero(crossings.count)]
-    return _InitialMesh(vertices, faces, some, rows, crossed, ends)
+    return _InitialMesh(vertices, faces, sampled, rows, crossed, ends)
 
 
 def _middles(low: FloatArray, high: FloatArray) -> FloatArray:
@@ -719,24 +722,24 @@ def _snap_points(
     near = np.flatnonzero((samples.distance < _SNAPPED * size) & ~is_fixed)
     longest = np.full(len(near), 0.5 * _SNAPPED * size)
     moved = newton_to_level(function, points[near], samples.select(near), longest, walls, steps=4)
-    there = function.sample(moved)
+    new_samples = function.sample(moved)
     apart = row_norms(moved - points[near])
-    steep = row_norms(there.gradient)
-    good = np.abs(there.value) < 1e-9 * np.maximum(steep * size, 1e-300)
-    good &= apart < 1.2 * _SNAPPED * size
-    rows = near[good]
+    steep = row_norms(new_samples.gradient)
+    converged = np.abs(new_samples.value) < 1e-9 * np.maximum(steep * size, 1e-300)
+    converged &= apart < 1.2 * _SNAPPED * size
+    rows = near[converged]
     # A value of exactly 0 counts as on the level where it is, so that others have a sign.
     points, is_on = points.copy(), (samples.value == 0) & ~is_fixed
-    points[rows], is_on[rows] = moved[good], True
-    return points, samples.replaced(rows, there.select(good)), is_on
+    points[rows], is_on[rows] = moved[converged], True
+    return points, samples.replaced(rows, new_samples.select(converged)), is_on
 
 
 def _have_any(chosen: BoolArray, corners: IntArray) -> BoolArray:
     """(m,) which tetrahedra (m, 4) have some of the chosen points."""
-    found = np.zeros(len(corners), np.bool_)
+    has_chosen = np.zeros(len(corners), np.bool_)
     for column in corners.T:  # four times as fast as chosen[corners].any(axis=1)
-        found |= chosen[column]
-    return found
+        has_chosen |= chosen[column]
+    return has_chosen
 
 
 # Of a point above the level, below it, and on it: sums of four tell how many there are of each.

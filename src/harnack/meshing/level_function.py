@@ -116,10 +116,10 @@ class LevelFunction:
 
     def relative_to_level(self, value: FloatArray) -> FloatArray:
         """f - level, from values of f."""
-        above = value - self.level
+        difference = value - self.level
         if self.period is None:
-            return above
-        return above - self.period * np.round(above / self.period)
+            return difference
+        return difference - self.period * np.round(difference / self.period)
 
     def sample(self, points: FloatArray) -> LevelSamples:
         """The function at points (n, 3)."""

@@ -76,14 +76,14 @@ class PointsOnLevel:
         if isinstance(field, OrientedPoints | HRBF):
             rows = _spread(len(field.points), _BY_AREA)
             smoothed = field.smoothing if isinstance(field, DipolePotential) else 0.0
-            way = max(tolerance, _SMOOTHED * smoothed) * field.normals[rows]
-            way /= np.maximum(row_norms(field.normals[rows]), 1e-300)[:, None]
-            low, high = field.points[rows] - way, field.points[rows] + way
+            offset = max(tolerance, _SMOOTHED * smoothed) * field.normals[rows]
+            offset /= np.maximum(row_norms(field.normals[rows]), 1e-300)[:, None]
+            low, high = field.points[rows] - offset, field.points[rows] + offset
         elif isinstance(field, Blobs):
             rows = _spread(len(field.centers), _BY_AREA)
-            way = np.random.default_rng(0).normal(size=(len(rows), 3))
-            way *= ((field.radii * field.kernel.support)[rows] / row_norms(way))[:, None]
-            low, high = field.centers[rows], field.centers[rows] + way
+            offset = np.random.default_rng(0).normal(size=(len(rows), 3))
+            offset *= ((field.radii * field.kernel.support)[rows] / row_norms(offset))[:, None]
+            low, high = field.centers[rows], field.centers[rows] + offset
         is_low, is_high = function.values(low) > 0, function.values(high) > 0
         low, high = np.where(is_low[:, None], high, low), np.where(is_low[:, None], low, high)
         return cls(*function.crossings(low[is_low != is_high], high[is_low != is_high]))
@@ -160,15 +160,15 @@ class LostParts:
         spacing: of the cells of the mesh.
         """
         corner = surface.vertices[surface.faces]
-        far = known.some(_are_farther(known.points, corner, tolerance))
-        beyond = _are_farther(far.points, corner, max(tolerance, _CELLS * spacing))
-        within = _bound_of_distances(far.points, corner) if len(far.points) else tolerance
-        shown = far.some(_spread(len(far.points), _LOOKED_AT))
+        distant = known.some(_are_farther(known.points, corner, tolerance))
+        beyond = _are_farther(distant.points, corner, max(tolerance, _CELLS * spacing))
+        within = _bound_of_distances(distant.points, corner) if len(distant.points) else tolerance
+        shown = distant.some(_spread(len(distant.points), _LOOKED_AT))
         thickness, is_inside = _thicknesses(function, shown, spacing)
         is_thin = np.isfinite(thickness)
         thickness = thickness[is_thin]
         return cls(
-            len(far.points),
+            len(distant.points),
             len(known.points),
             tolerance,
             int(beyond.sum()),
@@ -204,14 +204,14 @@ class LostParts:
         )
         shown = [f"{words}, as near {point_text(x[0])}" for x, words in thin if len(x)]
         within = f" (all within {self.within:.3g})" if math.isfinite(self.within) else ""
-        told = (
+        text = (
             f"{self.far:,} of {self.looked_at:,} points of the level are farther than "
             f"{self.tolerance:.3g} from the mesh{within}, which has cells of {self.spacing:.3g}: "
             f"{' and '.join(shown)}"
         )
         if shown:
-            return f"{told}; they are about {self.thickness:.2g} thick"
-        return f"{told}such as {point_text(self.others[0])}"
+            return f"{text}; they are about {self.thickness:.2g} thick"
+        return f"{text}such as {point_text(self.others[0])}"
 
 
 def _advice(field: Field) -> str:
@@ -227,31 +227,31 @@ def _advice(field: Field) -> str:
 def _by_area(area: FloatArray) -> IntArray:
     """Rows, each as often as its part of the area asks for."""
     ends: FloatArray = np.cumsum(area)
-    places: FloatArray = (np.arange(_BY_AREA) + 0.5) / _BY_AREA * ends[-1]
-    return np.searchsorted(ends, places)
+    targets: FloatArray = (np.arange(_BY_AREA) + 0.5) / _BY_AREA * ends[-1]
+    return np.searchsorted(ends, targets)
 
 
-def _spread(count: int, most: int) -> IntArray:
+def _spread(count: int, max_count: int) -> IntArray:
     """All of some rows, or no more than `most`, evenly spread."""
-    return np.linspace(0, count - 1, min(count, most)).astype(np.int64)
+    return np.linspace(0, count - 1, min(count, max_count)).astype(np.int64)
 
 
 def _thicknesses(
-    function: SignFunction, known: PointsOnLevel, spacing: float
+    function: SignFunction, points: PointsOnLevel, spacing: float
 ) -> tuple[FloatArray, BoolArray]:
     """How far points of the level (k, 3) are, along the normal on either side, from where the sign
     changes again, up to about a cell, the smaller of both; and whether that is inside. Of clouds
     that is not known."""
     if isinstance(function.field, OrientedPoints):  # each point is in a bubble of its own
-        nowhere = np.full(len(known.points), np.inf)
+        nowhere = np.full(len(points.points), np.inf)
         return nowhere, nowhere > 0
-    far = spacing * _THICKNESSES
+    distances = spacing * _THICKNESSES
     sides: list[FloatArray] = []
     for sign in (1.0, -1.0):
-        places = known.points[:, None] + sign * far[:, None] * known.normals[:, None]
-        is_positive = function.values(places.reshape(-1, 3)).reshape(-1, len(far)) > 0
+        probes = points.points[:, None] + sign * distances[:, None] * points.normals[:, None]
+        is_positive = function.values(probes.reshape(-1, 3)).reshape(-1, len(distances)) > 0
         changed = is_positive != (sign > 0)
-        sides.append(np.where(changed.any(axis=1), far[changed.argmax(axis=1)], np.inf))
+        sides.append(np.where(changed.any(axis=1), distances[changed.argmax(axis=1)], np.inf))
     above, below = sides
     # The function is positive inside, or where its side is -1 outside.
     return np.minimum(above, below), (above < below) == (function.side > 0)
@@ -264,8 +264,8 @@ def _bound_of_distances(points: FloatArray, corner: FloatArray) -> float:
     searching: Any = scipy.spatial
     if not len(corner):
         return math.inf
-    places = np.concatenate([corner.reshape(-1, 3), corner.mean(axis=1)])
-    tree = searching.cKDTree(places, compact_nodes=False, balanced_tree=False)
+    mesh_points = np.concatenate([corner.reshape(-1, 3), corner.mean(axis=1)])
+    tree = searching.cKDTree(mesh_points, compact_nodes=False, balanced_tree=False)
     return float(tree.query(points)[0].max())
 
 
@@ -285,12 +285,12 @@ def _are_farther(points: FloatArray, corner: FloatArray, distance: float) -> Boo
     reach = np.stack([row_norms(corner[:, k] - center) for k in range(3)]).max(axis=0)
     octave = np.ceil(np.log2(np.maximum(reach, distance))).astype(np.int64)
     for k in np.unique(octave).tolist():
-        left, rows = np.flatnonzero(is_far), np.flatnonzero(octave == k)
+        remaining, rows = np.flatnonzero(is_far), np.flatnonzero(octave == k)
         tree = searching.cKDTree(center[rows], compact_nodes=False, balanced_tree=False)
-        near = tree.query_ball_point(points[left], 2.0**k + distance)
-        counts = np.array([len(one) for one in near], np.int64)
+        near = tree.query_ball_point(points[remaining], 2.0**k + distance)
+        counts = np.array([len(indices) for indices in near], np.int64)
         if not counts.sum():
             continue
-        place, of = np.repeat(left, counts), rows[np.concatenate(near).astype(np.int64)]
-        is_far[place[distances_from_triangles(points[place], corner[of]) <= distance]] = False
+        query, of = np.repeat(remaining, counts), rows[np.concatenate(near).astype(np.int64)]
+        is_far[query[distances_from_triangles(points[query], corner[of]) <= distance]] = False
     return is_far

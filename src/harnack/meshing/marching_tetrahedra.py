@@ -94,11 +94,11 @@ def delaunay(points: FloatArray) -> Tetrahedra:
 
     qhull: Any = scipy.spatial
     middle, size = points.mean(axis=0), float(np.ptp(points, axis=0).max())
-    turn = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
-    around = np.array(list(itertools.product((-1.0, 1.0), repeat=3))) @ turn
+    rotation = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
+    far_corners = np.array(list(itertools.product((-1.0, 1.0), repeat=3))) @ rotation
     n = len(points)
     # About the middle, so that Qhull does not round far from the origin.
-    together = np.concatenate([points - middle, 20 * size * around])
+    together = np.concatenate([points - middle, 20 * size * far_corners])
     try:
         corners: IntArray = qhull.Delaunay(together).simplices.astype(np.int64)
     except qhull.QhullError as error:
@@ -141,23 +141,23 @@ def count_crossings(
     """
     a, b = tets.ends.T
     value = points.samples.value
-    off = ~points.is_on_level[a] & ~points.is_on_level[b]
-    change = np.where(off, value[b] - value[a], 0.0)
+    is_off = ~points.is_on_level[a] & ~points.is_on_level[b]
+    change = np.where(is_off, value[b] - value[a], 0.0)
     if function.period is None:
-        count = np.where(off, (value[b] > 0).astype(np.int64) - (value[a] > 0), 0)
-        return EdgeCrossings(count, change, int(off.sum()), 0)
+        count = np.where(is_off, (value[b] > 0).astype(np.int64) - (value[a] > 0), 0)
+        return EdgeCrossings(count, change, int(is_off.sum()), 0)
     period = function.period
     change -= period * np.round(change / period)
     span = row_norms(points.points[a] - points.points[b])
     reach = points.samples.quarter_period_radius
-    unsure = np.flatnonzero(off & (reach[a] + reach[b] < span * (1 + 1e-9)))
+    unsure = np.flatnonzero(is_off & (reach[a] + reach[b] < span * (1 + 1e-9)))
     if len(unsure):
         p, q = points.points[a[unsure]], points.points[b[unsure]]
         change[unsure] = _integrate_change(function.field, p, q, change[unsure], period)
     # Values between levels lie in (0, period).
     level = np.remainder(value, period)
-    count = np.where(off, np.round((level[a] + change - level[b]) / period), 0).astype(np.int64)
-    return EdgeCrossings(count, change, int(off.sum()) - len(unsure), len(unsure))
+    count = np.where(is_off, np.round((level[a] + change - level[b]) / period), 0).astype(np.int64)
+    return EdgeCrossings(count, change, int(is_off.sum()) - len(unsure), len(unsure))
 
 
 def _integrate_change(
@@ -202,16 +202,16 @@ def extract_triangles(
     """
     side = _sides(points, tets, crossings)
     on = points.is_on_level[tets.corners]
-    least = np.where(on, np.iinfo(np.int64).max, side).min(axis=1)
-    most = np.where(on, np.iinfo(np.int64).min, side).max(axis=1)
-    double = (most - least > 1) & ~on.all(axis=1)
+    lowest = np.where(on, np.iinfo(np.int64).max, side).min(axis=1)
+    highest = np.where(on, np.iinfo(np.int64).min, side).max(axis=1)
+    double = (highest - lowest > 1) & ~on.all(axis=1)
     if double.any():
         raise LocalizedMeshingError(
             "two sheets of the level set pass between corners of one tetrahedron: choose a smaller "
             "`cell_size`",
             _mean(points.points, tets.corners[double]),
         )
-    cut = np.flatnonzero(~on.all(axis=1) & (most > least))
+    cut = np.flatnonzero(~on.all(axis=1) & (highest > lowest))
     edges = np.flatnonzero(crossings.count)
     if roots_of is None:
         roots = _roots(function, points, tets, crossings, edges)
@@ -219,11 +219,11 @@ def extract_triangles(
         upwards = (crossings.count[edges] > 0)[:, None]
         ends = np.where(upwards, tets.ends[edges], tets.ends[edges, ::-1])
         roots = roots_of(points.points[ends[:, 0]], points.points[ends[:, 1]])
-    place = np.full(len(tets.ends), -1, np.int64)
-    place[edges] = len(points.points) + np.arange(len(edges))
+    vertex_of_edge = np.full(len(tets.ends), -1, np.int64)
+    vertex_of_edge[edges] = len(points.points) + np.arange(len(edges))
     vertices = np.concatenate([points.points, roots])
     parts: list[tuple[IntArray, FloatArray]] = []
-    above = (side > least[:, None]) & ~on
+    above = (side > lowest[:, None]) & ~on
     pattern = (above[cut] * [1, 2, 4, 8]).sum(axis=1) + 16 * (on[cut] * [1, 2, 4, 8]).sum(axis=1)
     for code in np.unique(pattern):
         rows = cut[pattern == code]
@@ -234,7 +234,7 @@ def extract_triangles(
         rise = _mean(points.points, corner[:, up]) - _mean(points.points, corner[:, down])
 
         def at(i: int, j: int, rows: IntArray = rows) -> IntArray:
-            return place[tets.edge_between(i, j, rows)[0]]
+            return vertex_of_edge[tets.edge_between(i, j, rows)[0]]
 
         on_level = [corner[:, k] for k in level]
         crossed = [at(i, j) for i in up for j in down]
@@ -268,8 +268,8 @@ def _mean(points: FloatArray, index: IntArray) -> FloatArray:
 def _halves(vertices: FloatArray, ring: list[IntArray]) -> tuple[IntArray, IntArray]:
     """A quadrilateral cut along its shorter diagonal."""
     a, b, c, d = ring
-    one, other = (row_norms(vertices[x] - vertices[y]) for x, y in ((a, c), (b, d)))
-    longer = (one > other)[:, None]
+    ac, bd = (row_norms(vertices[x] - vertices[y]) for x, y in ((a, c), (b, d)))
+    longer = (ac > bd)[:, None]
     first = np.where(longer, np.stack([a, b, d], axis=1), np.stack([a, b, c], axis=1))
     second = np.where(longer, np.stack([b, c, d], axis=1), np.stack([a, c, d], axis=1))
     return first, second
@@ -284,21 +284,21 @@ def _sides(points: TetrahedronPoints, tets: Tetrahedra, crossings: EdgeCrossings
     side = np.zeros(on.shape, np.int64)
 
     def between(i: int, j: int, rows: IntArray) -> IntArray:
-        edge, way = tets.edge_between(i, j, rows)
-        return way * crossings.count[edge]
+        edge, sign = tets.edge_between(i, j, rows)
+        return sign * crossings.count[edge]
 
     for i, j in itertools.permutations(range(4), 2):
-        some = rows[(first == i) & ~on[:, j]]
-        side[some, j] = between(i, j, some)
-    wrong = np.zeros(len(rows), np.bool_)
+        chosen = rows[(first == i) & ~on[:, j]]
+        side[chosen, j] = between(i, j, chosen)
+    disagrees = np.zeros(len(rows), np.bool_)
     for i, j in _PAIRS:
-        some = rows[~on[:, i] & ~on[:, j]]
-        wrong[some] |= side[some, j] - side[some, i] != between(i, j, some)
-    if wrong.any():
+        chosen = rows[~on[:, i] & ~on[:, j]]
+        disagrees[chosen] |= side[chosen, j] - side[chosen, i] != between(i, j, chosen)
+    if disagrees.any():
         raise LocalizedMeshingError(
             "crossings of the level set do not agree around a triangle: the curve passes "
             "through it; choose a smaller `cell_size`",
-            _mean(points.points, tets.corners[wrong]),
+            _mean(points.points, tets.corners[disagrees]),
         )
     return side
 
@@ -312,7 +312,7 @@ def _roots(
 ) -> FloatArray:
     """Where some edges meet the level (r, 3), by Chandrupatla's method along the edge."""
     a, b = tets.ends[edges].T
-    p, way = points.points[a], points.points[b] - points.points[a]
+    p, direction = points.points[a], points.points[b] - points.points[a]
     value, change = points.samples.value[a], crossings.change[edges]
     if function.period is not None:
         # Count from the level that is crossed: below it at one end, above it at the other.
@@ -324,23 +324,23 @@ def _roots(
             np.stack(of[0:3], axis=-1), np.stack(of[3:6], axis=-1), of[6], of[7]
         )  # fmt: skip
         flat = (origin + t[..., None] * along).reshape(-1, 3)
-        found = function.values(flat).reshape(t.shape)
+        sampled = function.values(flat).reshape(t.shape)
         if function.period is None:
-            return found
-        return found + function.period * np.rint((start + 0.5 * rise - found) / function.period)
+            return sampled
+        return sampled + function.period * np.rint((start + 0.5 * rise - sampled) / function.period)
 
     if function.secant_steps:
-        return p + _illinois(function, p, way, value, value + change)[:, None] * way
-    known = np.flatnonzero(np.maximum(np.abs(value), np.abs(value + change)) < OUTSIDE_VALUE)
-    share = np.full(len(a), 0.5)
-    share[known] = _chandrupatla(
-        function, p[known], way[known], value[known], change[known], lifted
+        return p + _illinois(function, p, direction, value, value + change)[:, None] * direction
+    finite = np.flatnonzero(np.maximum(np.abs(value), np.abs(value + change)) < OUTSIDE_VALUE)
+    fraction = np.full(len(a), 0.5)
+    fraction[finite] = _chandrupatla(
+        function, p[finite], direction[finite], value[finite], change[finite], lifted
     )
-    return p + share[:, None] * way
+    return p + fraction[:, None] * direction
 
 
 def _illinois(
-    function: LevelFunction, p: FloatArray, way: FloatArray, low: FloatArray, high: FloatArray
+    function: LevelFunction, p: FloatArray, direction: FloatArray, low: FloatArray, high: FloatArray
 ) -> FloatArray:
     """(r,) places along edges by a few secants, given the values at both ends; the end that stays
     counts half from the second time on (the Illinois method)."""
@@ -348,23 +348,23 @@ def _illinois(
     up = high > low
     low, high = np.where(up, low, -low), np.where(up, high, -high)
     stayed = np.zeros(len(p), np.int64)
-    share = low / (low - high)
+    fraction = low / (low - high)
     for _ in range(function.secant_steps):
-        value = function.values(p + share[:, None] * way)
+        value = function.values(p + fraction[:, None] * direction)
         value = np.where(up, value, -value)
-        above = value > 0
-        stayed = np.where(above, np.maximum(stayed, 0) + 1, np.minimum(stayed, 0) - 1)
-        low = np.where(above, np.where(stayed > 1, 0.5 * low, low), value)
-        high = np.where(above, value, np.where(stayed < -1, 0.5 * high, high))
-        first, last = np.where(above, first, share), np.where(above, share, last)
-        share = first + (last - first) * low / np.minimum(low - high, -1e-300)
-    return np.clip(share, _FROM_ENDS, 1 - _FROM_ENDS)
+        is_positive = value > 0
+        stayed = np.where(is_positive, np.maximum(stayed, 0) + 1, np.minimum(stayed, 0) - 1)
+        low = np.where(is_positive, np.where(stayed > 1, 0.5 * low, low), value)
+        high = np.where(is_positive, value, np.where(stayed < -1, 0.5 * high, high))
+        first, last = np.where(is_positive, first, fraction), np.where(is_positive, fraction, last)
+        fraction = first + (last - first) * low / np.minimum(low - high, -1e-300)
+    return np.clip(fraction, _FROM_ENDS, 1 - _FROM_ENDS)
 
 
 def _chandrupatla(
     function: LevelFunction,
     p: FloatArray,
-    way: FloatArray,
+    direction: FloatArray,
     value: FloatArray,
     change: FloatArray,
     lifted: Callable[..., FloatArray],
@@ -373,7 +373,7 @@ def _chandrupatla(
     import scipy.optimize.elementwise as elementwise  # here: half a second that few need
 
     search = cast("Any", elementwise).find_root
-    arguments = (*p.T, *way.T, value, change)
+    arguments = (*p.T, *direction.T, value, change)
     result = search(
         lifted, (np.zeros(len(p)), np.ones(len(p))), args=arguments,
         tolerances={"xatol": _ROOT_ERROR, "fatol": 0.0, "xrtol": 0.0, "frtol": 0.0},
@@ -404,25 +404,25 @@ def _faces_on_the_level(
     table = np.concatenate(triples)
     table = table[np.lexsort(table[:, 2::-1].T)]
     twice = np.flatnonzero((table[1:, :3] == table[:-1, :3]).all(axis=1))
-    one, other, face = table[twice], table[twice + 1], table[twice, :3]
+    first, second, face = table[twice], table[twice + 1], table[twice, :3]
     if not len(face):
         return np.zeros((0, 3), np.int64), np.zeros((0, 3))
     middle = _mean(points.points, face)
     (before, low), (behind, high) = (
-        _side_sample(function, points, tets, row) for row in (one, other)
+        _side_sample(function, points, tets, row) for row in (first, second)
     )
     if function.period is None:
         count = (high > 0).astype(np.int64) - (low > 0)
     else:
         period = function.period
-        there = function.values(middle)
+        value = function.values(middle)
         change = sum(
             sign
-            * _integrate_change(function.field, side, middle, _wrap(there - start, period), period)
+            * _integrate_change(function.field, side, middle, _wrap(value - start, period), period)
             for sign, side, start in ((1, before, low), (-1, behind, high))
         )
-        rest = np.remainder(low, period) + change - np.remainder(high, period)
-        count = np.round(rest / period).astype(np.int64)
+        difference = np.remainder(low, period) + change - np.remainder(high, period)
+        count = np.round(difference / period).astype(np.int64)
     rise = (behind - before) * np.sign(count)[:, None]
     return face[count != 0], rise[count != 0]
 
@@ -437,8 +437,8 @@ def _side_sample(
     """Points (n, 3) on one side of faces, and the function there."""
     corners = tets.corners[rows[:, 3]]
     apex = corners[np.arange(len(rows)), rows[:, 4]]
-    place, value = points.points[apex], points.samples.value[apex]
+    side_points, value = points.points[apex], points.samples.value[apex]
     is_on = np.flatnonzero(points.is_on_level[apex])
-    place[is_on] = points.points[corners[is_on]].mean(axis=1)
-    value[is_on] = function.values(place[is_on])
-    return place, value
+    side_points[is_on] = points.points[corners[is_on]].mean(axis=1)
+    value[is_on] = function.values(side_points[is_on])
+    return side_points, value

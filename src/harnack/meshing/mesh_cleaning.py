@@ -75,7 +75,7 @@ def clean_and_fill(
     """
     report("looking for triangles that are sound")
     state = _WorkingMesh.of(vertices, faces)
-    holes, why, most = 0, "", _MOST_LEFT_OUT * len(state.faces)
+    holes, why, min_faces = 0, "", _MOST_LEFT_OUT * len(state.faces)
     for ring in range(_MOST_RINGS):
         state = state.without_nonmanifold_edges()
         if not len(state.faces):
@@ -85,13 +85,13 @@ def clean_and_fill(
             raise MeshingError(f"{len(edges):,} edges of {len(state.faces):,} triangles are open")
         loops = hole_loops(state.vertices, state.faces, edges)
         report(f"{len(loops):,} holes" + f", {ring} rings wider in places" * (ring > 0))
-        state, left, why = state.filled(loops)
-        holes += len(loops) - len(left)
-        bad = np.concatenate([nonmanifold_vertices(state.faces), *left])
-        if not len(bad):
+        state, unfilled, why = state.filled(loops)
+        holes += len(loops) - len(unfilled)
+        failing = np.concatenate([nonmanifold_vertices(state.faces), *unfilled])
+        if not len(failing):
             return state.result(holes)
-        state = state.without_ring(bad)
-        if (state.source_face >= 0).sum() < most:
+        state = state.without_ring(failing)
+        if (state.source_face >= 0).sum() < min_faces:
             raise MeshingError(f"half of the triangles would be left out: {why}")
     raise MeshingError(f"holes cannot be filled, even {_MOST_RINGS} rings wider: {why}")
 
@@ -103,29 +103,29 @@ def weld_near_corners(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray
     Raises:
         MeshingError: triangles are not loose, or most edges stay open.
     """
-    places, index = np.unique(vertices[faces].reshape(-1, 3), axis=0, return_inverse=True)
+    points, index = np.unique(vertices[faces].reshape(-1, 3), axis=0, return_inverse=True)
     corners = np.asarray(index, np.int64).reshape(-1, 3)
     if len(boundary_edges(corners)) <= _MOST_OPEN * len(faces):
         raise MeshingError("its triangles are not loose")
-    at = places[corners]
+    at = points[corners]
     usual = float(np.median(row_norms((at - np.roll(at, 1, axis=1)).reshape(-1, 3))))
-    found: list[tuple[int, FloatArray, IntArray, float]] = []
+    candidates: list[tuple[int, FloatArray, IntArray, float]] = []
     for part in _NEAR:
-        group = connected_groups(pairs_within(places, part * usual), len(places))
+        group = connected_groups(pairs_within(points, part * usual), len(points))
         count = np.bincount(group)[:, None]
-        mean = np.stack([np.bincount(group, column) for column in places.T], axis=1) / count
-        made = group[corners]
-        whole = made[(made != np.roll(made, 1, axis=1)).all(axis=1)]
-        missing = 3 * (len(faces) - len(whole))  # what has lost an edge counts as if all were open
-        moved = float(row_norms(mean[group] - places).max())
-        found.append((len(boundary_edges(whole)) + missing, mean, whole, moved))
-    count, mean, whole, moved = min(found, key=lambda one: one[0])
+        mean = np.stack([np.bincount(group, column) for column in points.T], axis=1) / count
+        welded = group[corners]
+        proper = welded[(welded != np.roll(welded, 1, axis=1)).all(axis=1)]
+        missing = 3 * (len(faces) - len(proper))  # what has lost an edge counts as if all were open
+        moved = float(row_norms(mean[group] - points).max())
+        candidates.append((len(boundary_edges(proper)) + missing, mean, proper, moved))
+    count, mean, proper, moved = min(candidates, key=lambda candidate: candidate[0])
     if count > _MOST_OPEN * len(faces):
         raise MeshingError(
             f"triangles are loose, and {count:,} edges of {len(faces):,} stay open if near corners "
             "are joined"
         )
-    return mean, whole, moved
+    return mean, proper, moved
 
 
 @dataclass(frozen=True)
@@ -170,15 +170,15 @@ class _WorkingMesh:
         is not possible."""
         state = self.without_fins()
         edges = Edges.of(half_edges(state.faces))
-        many = np.asarray((edges.multiplicity > 2)[edges.edge_of_pair].reshape(3, -1).any(axis=0))
-        state = state.keep_faces(~many, "branching")
+        excess = np.asarray((edges.multiplicity > 2)[edges.edge_of_pair].reshape(3, -1).any(axis=0))
+        state = state.keep_faces(~excess, "branching")
         turned = against_neighbors(state.vertices, state.faces)
         oriented = np.where(turned[:, None], state.faces[:, ::-1], state.faces)
         pairs = half_edges(oriented)
         edges = Edges.of(pairs)
-        way = np.where(pairs[:, 0] < pairs[:, 1], 1, -1)
-        sum_of = np.bincount(edges.edge_of_pair, way, minlength=len(edges.multiplicity))
-        bad = (
+        sign = np.where(pairs[:, 0] < pairs[:, 1], 1, -1)
+        sum_of = np.bincount(edges.edge_of_pair, sign, minlength=len(edges.multiplicity))
+        one_sided = (
             ((edges.multiplicity == 2) & (sum_of != 0))[edges.edge_of_pair]
             .reshape(3, -1)
             .any(axis=0)
@@ -186,7 +186,7 @@ class _WorkingMesh:
         state = _WorkingMesh(
             state.vertices, oriented, state.source_face, state.is_turned ^ turned, state.counts
         )
-        return state.keep_faces(~np.asarray(bad), "one-sided")
+        return state.keep_faces(~np.asarray(one_sided), "one-sided")
 
     def without_fins(self) -> _WorkingMesh:
         """Without sheets that hang on a surface: of the pieces between edges of more than two faces
@@ -215,18 +215,18 @@ class _WorkingMesh:
         if not loops:
             return self, [], ""
         field = WindingNumber(self.vertices, self.faces)
-        made = fill_holes(
+        filling = fill_holes(
             self.vertices, self.faces, loops, lambda p: field.value(p, precision="double")
         )
-        count = len(made.faces)
+        count = len(filling.faces)
         state = _WorkingMesh(
-            np.concatenate([self.vertices, made.vertices]),
-            np.concatenate([self.faces, made.faces]),
+            np.concatenate([self.vertices, filling.vertices]),
+            np.concatenate([self.faces, filling.faces]),
             np.concatenate([self.source_face, np.full(count, -1)]),
             np.concatenate([self.is_turned, np.zeros(count, np.bool_)]),
             self.counts,
         )
-        return state, made.unfilled_loops, made.reason
+        return state, filling.unfilled_loops, filling.reason
 
     def without_ring(self, places: IntArray) -> _WorkingMesh:
         """Without the faces at some vertices."""
@@ -242,25 +242,25 @@ class _WorkingMesh:
         """
         last = len(self.vertices) + len(self.source_face)  # behind all that were given
         order = np.argsort(np.where(self.source_face < 0, last, self.source_face), kind="stable")
-        faces, kept = self.faces[order], self.source_face[order]
+        faces, source = self.faces[order], self.source_face[order]
         check_manifold(faces)
         inwards = faces_to_flip(TriangleMesh(self.vertices, faces))
         faces = np.where(inwards[:, None], faces[:, ::-1], faces)
-        whole = TriangleMesh(self.vertices, faces)
-        shells = Shells.of(whole)
-        if passes_itself(whole, shells.component_of_face):
+        mesh = TriangleMesh(self.vertices, faces)
+        shells = Shells.of(mesh)
+        if passes_itself(mesh, shells.component_of_face):
             raise MeshingError("it passes through itself along edges that lie on faces")
         bounds = shells.bound()
-        lost = int((kept[~bounds] >= 0).sum())
-        faces, kept, is_turned = (
+        lost = int((source[~bounds] >= 0).sum())
+        faces, source, is_turned = (
             faces[bounds],
-            kept[bounds],
+            source[bounds],
             (self.is_turned[order] ^ inwards)[bounds],
         )
-        turned = kept[is_turned & (kept >= 0)]
+        turned = source[is_turned & (source >= 0)]
         surface = TriangleMesh.without_unused_vertices(self.vertices, faces)
         counts = self.counts | {"inside": lost}
-        return CleanedMesh(surface, kept[kept >= 0], turned, counts, holes)
+        return CleanedMesh(surface, source[source >= 0], turned, counts, holes)
 
 
 def _pieces(edges: Edges, count: int) -> IntArray:
@@ -270,8 +270,8 @@ def _pieces(edges: Edges, count: int) -> IntArray:
     import scipy.sparse.csgraph as csgraph_module
 
     sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
-    one, other = edges.paired_half_edges().T % count
-    joined = sparse.coo_matrix((np.ones(len(one)), (one, other)), shape=(count, count))
+    first, second = edges.paired_half_edges().T % count
+    joined = sparse.coo_matrix((np.ones(len(first)), (first, second)), shape=(count, count))
     return np.asarray(csgraph.connected_components(joined, directed=False)[1], np.int64)
 
 

@@ -74,15 +74,15 @@ def _project_and_split(
     function: LevelFunction,
     surface: TriangleMesh,
     is_new: BoolArray,
-    places: FloatArray,
+    points: FloatArray,
     tolerance: float,
 ) -> tuple[tuple[FloatArray, IntArray], BoolArray] | None:
     """Vertices and faces with what is at some places moved onto the level, or cut; and which faces
     are new (m,), those that were included. None if something is elsewhere, or too far from it."""
     vertices, faces = surface.vertices, surface.faces
-    corners = _rows_at(places, vertices)
-    centers = _rows_at(places, vertices[faces].mean(axis=1))
-    if len(corners) + len(centers) < len(places):
+    corners = _rows_at(points, vertices)
+    centers = _rows_at(points, vertices[faces].mean(axis=1))
+    if len(corners) + len(centers) < len(points):
         return None
     pairs = half_edges(faces[centers])
     middle = vertices[pairs].mean(axis=1)
@@ -91,16 +91,16 @@ def _project_and_split(
     keys = sorted_unique(edge_keys(pairs, count))
     ends = np.stack(np.divmod(keys, count), axis=1)
     # Edges of all faces at these ends: which of them is cut.
-    place = np.full(faces.shape, -1, np.int64)
+    midpoint = np.full(faces.shape, -1, np.int64)
     rows = np.flatnonzero(np.isin(faces, ends).any(axis=1))
-    found = np.searchsorted(keys, own := edge_keys(half_edges(faces[rows]), count))
-    found = np.minimum(found, max(len(keys) - 1, 0))
+    position = np.searchsorted(keys, face_keys := edge_keys(half_edges(faces[rows]), count))
+    position = np.minimum(position, max(len(keys) - 1, 0))
     if len(keys):
-        is_cut = keys[found] == own
-        place[rows] = np.where(is_cut, count + found, -1).reshape(3, -1).T
-    whole = np.setdiff1d(centers, np.flatnonzero((place >= 0).any(axis=1)))
+        is_cut = keys[position] == face_keys
+        midpoint[rows] = np.where(is_cut, count + position, -1).reshape(3, -1).T
+    uncut = np.setdiff1d(centers, np.flatnonzero((midpoint >= 0).any(axis=1)))
     start = np.concatenate(
-        [vertices[corners], vertices[ends].mean(axis=1), vertices[faces[whole]].mean(axis=1)]
+        [vertices[corners], vertices[ends].mean(axis=1), vertices[faces[uncut]].mean(axis=1)]
     )
     moved = newton_to_level(
         function, start, function.sample(start), np.full(len(start), tolerance), None
@@ -109,18 +109,18 @@ def _project_and_split(
         return None
     vertices = np.concatenate([vertices, moved[len(corners) :]])
     vertices[corners] = moved[: len(corners)]
-    is_split = (place >= 0).any(axis=1)
-    split = split_faces(vertices, faces[is_split], place[is_split])
-    inner = count + len(ends) + np.arange(len(whole))
-    a, b, c = faces[whole].T
+    is_split = (midpoint >= 0).any(axis=1)
+    split = split_faces(vertices, faces[is_split], midpoint[is_split])
+    inner = count + len(ends) + np.arange(len(uncut))
+    a, b, c = faces[uncut].T
     new = [split, *(np.stack([*two, inner], axis=1) for two in ((a, b), (b, c), (c, a)))]
-    gone = np.union1d(np.flatnonzero(is_split), whole)
-    kept = np.delete(faces, gone, axis=0)
+    removed = np.union1d(np.flatnonzero(is_split), uncut)
+    remaining = np.delete(faces, removed, axis=0)
     is_moved = np.zeros(len(vertices), np.bool_)
     is_moved[corners] = True
-    is_new = np.delete(is_new, gone) | is_moved[kept].any(axis=1)
-    faces = np.concatenate([kept, *new])
-    is_new = np.concatenate([is_new, np.ones(len(faces) - len(kept), np.bool_)])
+    is_new = np.delete(is_new, removed) | is_moved[remaining].any(axis=1)
+    faces = np.concatenate([remaining, *new])
+    is_new = np.concatenate([is_new, np.ones(len(faces) - len(remaining), np.bool_)])
     return (vertices, faces), is_new
 
 
@@ -133,12 +133,12 @@ def _check_new_faces(
     """The surface if its new faces (m,) pass through no others; mended there if need be, and then
     checked as a whole; None if that does not help."""
     vertices, faces = surface.vertices, surface.faces
-    around = _in_boxes_of(vertices[faces], np.flatnonzero(is_new))
-    crossing = around[intersecting_faces(vertices, faces[around])]
+    nearby = _in_boxes_of(vertices[faces], np.flatnonzero(is_new))
+    crossing = nearby[intersecting_faces(vertices, faces[nearby])]
     if not len(crossing):
         return surface
-    mended, left = resolve_local_intersections(surface, crossing, _MENDED_WITHIN * tolerance)
-    if left:
+    mended, remaining = resolve_local_intersections(surface, crossing, _MENDED_WITHIN * tolerance)
+    if remaining:
         return None
     try:
         check(mended)
@@ -147,17 +147,17 @@ def _check_new_faces(
     return mended
 
 
-def _in_boxes_of(corner: FloatArray, some: IntArray) -> IntArray:
+def _in_boxes_of(corner: FloatArray, rows: IntArray) -> IntArray:
     """Triangles (m, 3, 3), by index, whose box meets that of one of some."""
     lower, upper = corner.min(axis=1), corner.max(axis=1)
-    found = np.zeros(len(corner), np.bool_)
-    for row in some.tolist():
-        found |= (lower <= upper[row]).all(axis=1) & (upper >= lower[row]).all(axis=1)
-    return np.flatnonzero(found)
+    meets = np.zeros(len(corner), np.bool_)
+    for row in rows.tolist():
+        meets |= (lower <= upper[row]).all(axis=1) & (upper >= lower[row]).all(axis=1)
+    return np.flatnonzero(meets)
 
 
-def _rows_at(places: FloatArray, points: FloatArray) -> IntArray:
+def _rows_at(targets: FloatArray, points: FloatArray) -> IntArray:
     """Points, by index, that are one of some places."""
-    rows = np.flatnonzero(np.isin(points[:, 0], places[:, 0]))
-    same = (points[rows, None] == places).all(axis=2).any(axis=1)
+    rows = np.flatnonzero(np.isin(points[:, 0], targets[:, 0]))
+    same = (points[rows, None] == targets).all(axis=2).any(axis=1)
     return rows[same]

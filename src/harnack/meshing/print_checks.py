@@ -94,13 +94,13 @@ class PrintCheck:
             "parts": self.parts,
             "problems": [
                 {
-                    "kind": one.kind,
-                    "count": one.count,
-                    "fatal": one.is_error,
-                    "message": one.message,
-                    "where": one.locations[:most_places].tolist(),
+                    "kind": problem.kind,
+                    "count": problem.count,
+                    "fatal": problem.is_error,
+                    "message": problem.message,
+                    "where": problem.locations[:most_places].tolist(),
                 }
-                for one in self.problems
+                for problem in self.problems
             ],
         }
 
@@ -135,31 +135,35 @@ def check_print(
     if build_volume is not None and np.shape(build_volume) != (3,):
         raise ValueError(f"build_volume must be (x, y, z), three lengths, not {build_volume!r}")
     sides = (
-        None if build_volume is None else [as_positive(one, "build_volume") for one in build_volume]
+        None
+        if build_volume is None
+        else [as_positive(entry, "build_volume") for entry in build_volume]
     )
     x, faces, rounded = _mesh_of(part)
-    found = _topology(x, faces)
-    is_closed = not _is_wrong(found)
+    problems = _topology(x, faces)
+    is_closed = not _is_wrong(problems)
     shells = Shells.of(TriangleMesh(x, faces))
     crossings, touching = _contacts(x, faces, shells, is_closed)
     is_clear = is_closed and not crossings.count
-    found += [*_component_problems(shells, is_closed, is_clear), crossings, touching]
+    problems += [*_component_problems(shells, is_closed, is_clear), crossings, touching]
     if min_thickness is not None:
-        found += [
-            _thin_walls(x, faces, min_thickness, not _is_wrong(found)),
+        problems += [
+            _thin_walls(x, faces, min_thickness, not _is_wrong(problems)),
             _coarse(x, faces, min_thickness),
         ]
     low, high = x[faces].min(axis=(0, 1)), x[faces].max(axis=(0, 1))
     size = cast("tuple[float, float, float]", tuple((high - low).tolist()))
-    found += _of_size(size, sides)
-    found.append(rounded)
-    kept = sorted((one for one in found if one.count), key=lambda one: not one.is_error)
+    problems += _of_size(size, sides)
+    problems.append(rounded)
+    reported = sorted(
+        (entry for entry in problems if entry.count), key=lambda entry: not entry.is_error
+    )
     volume = float(shells.volumes.sum()) if is_closed else None
-    return PrintCheck(tuple(kept), size, volume, len(faces), len(shells.volumes))
+    return PrintCheck(tuple(reported), size, volume, len(faces), len(shells.volumes))
 
 
 def _is_wrong(problems: Sequence[PrintProblem]) -> bool:
-    return any(one.is_error and one.count for one in problems)
+    return any(problem.is_error and problem.count for problem in problems)
 
 
 def _mesh_of(part: Any) -> tuple[FloatArray, IntArray, PrintProblem]:
@@ -177,13 +181,13 @@ def _mesh_of(part: Any) -> tuple[FloatArray, IntArray, PrintProblem]:
     else:
         pair = (part.vertices, part.faces) if hasattr(part, "faces") else part
         try:
-            vertices, given = pair
+            vertices, raw_faces = pair
         except (TypeError, ValueError):
             raise TypeError(
                 "a mesh is a trimesh.Trimesh, a pair (vertices, faces), or the path of a file, not "
                 f"of type {type(part).__name__}"
             ) from None
-        x, faces = validate_mesh(vertices, given, allow_zero_area=True)
+        x, faces = validate_mesh(vertices, raw_faces, allow_zero_area=True)
         rounded = 0
     welded = Welded.of(x, faces)
     count = rounded + welded.rounded
@@ -204,18 +208,18 @@ def _topology(x: FloatArray, faces: IntArray) -> list[PrintProblem]:
     """Edges, sides, duplicates and faces without an area."""
     flat = zero_area_faces(x, faces)
     vanished = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
-    kept = faces[~vanished]
-    pairs = half_edges(kept)
+    used = faces[~vanished]
+    pairs = half_edges(used)
     edges = Edges.of(pairs)
     middle = x[edges.vertices].mean(axis=1)
-    ways = np.bincount(
+    net = np.bincount(
         edges.edge_of_pair,
         np.where(pairs[:, 0] < pairs[:, 1], 1, -1),
         minlength=len(edges.multiplicity),
     )
-    _, first, uses = np.unique(np.sort(kept, axis=1), axis=0, return_index=True, return_counts=True)
-    touching = nonmanifold_vertices(kept)
-    many = np.unique(edges.vertices[edges.multiplicity > 2])
+    _, first, uses = np.unique(np.sort(used, axis=1), axis=0, return_index=True, return_counts=True)
+    touching = nonmanifold_vertices(used)
+    overused = np.unique(edges.vertices[edges.multiplicity > 2])
     return [
         _problem(
             "open edges", middle[edges.multiplicity == 1], "{} {edge has|edges have} one face alone"
@@ -227,17 +231,17 @@ def _topology(x: FloatArray, faces: IntArray) -> list[PrintProblem]:
         ),
         _problem(
             "sides that disagree",
-            middle[(edges.multiplicity == 2) & (ways != 0)],
+            middle[(edges.multiplicity == 2) & (net != 0)],
             "at {} {edge|edges} neighboring faces do not agree on what is inside",
         ),
         _problem(
             "duplicate faces",
-            x[kept[first[uses > 1]]].mean(axis=1),
+            x[used[first[uses > 1]]].mean(axis=1),
             "{} {face is|faces are} there twice",
         ),
         _problem(
             "touching vertices",
-            x[np.setdiff1d(touching, many)],
+            x[np.setdiff1d(touching, overused)],
             "at {} {vertex|vertices} parts touch in a point",
         ),
         _problem(
@@ -310,14 +314,14 @@ def _contacts(
     )
     rows = np.delete(rows, crossing)
     rows = rows[~is_flat[rows]]
-    pairs, places = touching_pairs(x, faces[rows])
+    pairs, contacts = touching_pairs(x, faces[rows])
     first, second = rows[pairs.T]
     is_contact = is_plain[first] | (
         shells.component_of_face[first] != shells.component_of_face[second]
     )
     touching = _problem(
         "touching faces",
-        np.unique(places[is_contact], axis=0),
+        np.unique(contacts[is_contact], axis=0),
         "at {} {place|places} a corner or an edge lies on a face that it is not part of: let parts "
         "overlap, or move them apart",
     )
@@ -329,40 +333,40 @@ def _thin_walls(x: FloatArray, faces: IntArray, wall: float, is_solid: bool) -> 
         # Another name than that of walls that were found thin.
         why = "how thick walls are is not known before the rest is mended"
         return PrintProblem("walls not measured", 1, np.zeros((0, 3)), why)
-    found = wall_thickness(MeshSolid(x, faces))
-    places = found.thin_locations(wall - _ROUNDING * float(np.ptp(x, axis=0).max()))
-    least = f"; the thinnest is {found.thinnest:.3g}"
-    text = f"at {{}} {{triangle|triangles}} the part is thinner than {wall:g}{least}"
-    return _problem("thin walls", places, text)
+    thickness = wall_thickness(MeshSolid(x, faces))
+    locations = thickness.thin_locations(wall - _ROUNDING * float(np.ptp(x, axis=0).max()))
+    suffix = f"; the thinnest is {thickness.thinnest:.3g}"
+    text = f"at {{}} {{triangle|triangles}} the part is thinner than {wall:g}{suffix}"
+    return _problem("thin walls", locations, text)
 
 
 def _coarse(x: FloatArray, faces: IntArray, wall: float) -> PrintProblem:
     """Faces beside whose centers thin places may be that nobody looked at."""
     corner = x[faces]
     longest = np.stack([row_norms(corner[:, k] - corner[:, k - 1]) for k in range(3)]).max(axis=0)
-    places = corner[longest > _COARSE * wall].mean(axis=1)
+    centers = corner[longest > _COARSE * wall].mean(axis=1)
     text = f"{{}} {{triangle is|triangles are}} longer than {_COARSE:g} walls, and thickness is "
     text += "measured at centers"
-    return _problem("walls measured coarsely", places, text, is_fatal=False)
+    return _problem("walls measured coarsely", centers, text, is_fatal=False)
 
 
 def _of_size(size: tuple[float, float, float], bed: list[float] | None) -> list[PrintProblem]:
     longest, nowhere = max(size), np.zeros((0, 3))
-    text = " x ".join(f"{one:.4g}" for one in size)
-    found: list[PrintProblem] = []
+    text = " x ".join(f"{length:.4g}" for length in size)
+    problems: list[PrintProblem] = []
     if longest < _SMALLEST or longest > _LARGEST:
         why = f"it is {text} mm, if files are in millimeters"
         if longest < _SMALLEST:
             why += f"; in meters {longest * 1000:.4g}, in inches {longest * _INCH:.4g} mm long"
-        found.append(PrintProblem("unit", 1, nowhere, why, is_error=False))
+        problems.append(PrintProblem("unit", 1, nowhere, why, is_error=False))
     elif longest < 10 * _SMALLEST:
         why = f"it is {text} mm; if that is meant in inches, scale it by 25.4"
-        found.append(PrintProblem("unit", 1, nowhere, why, is_error=False))
+        problems.append(PrintProblem("unit", 1, nowhere, why, is_error=False))
     if bed is not None:
         x, y, z = size
         a, b, c = (side * (1 + _ROUNDING) for side in bed)
         fits = z <= c and ((x <= a and y <= b) or (y <= a and x <= b))
         if not fits:
-            space = " x ".join(f"{one:g}" for one in bed)
-            found.append(PrintProblem("bed", 1, nowhere, f"{text} does not fit on {space}"))
-    return found
+            space = " x ".join(f"{length:g}" for length in bed)
+            problems.append(PrintProblem("bed", 1, nowhere, f"{text} does not fit on {space}"))
+    return problems

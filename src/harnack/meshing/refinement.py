@@ -79,36 +79,36 @@ def refine(
     Raises:
         TriangleLimitError: it takes more triangles than the function allows.
     """
-    least, before = math.inf, 0
+    smallest_count, before = math.inf, 0
     for round_number in range(_MOST_ROUNDS):
         report(f"refining, round {round_number + 1}: {len(faces):,} triangles")
-        far = _RefinementMarks.of(function, vertices, faces, tolerance, walls, where)
-        marked = far.marked
-        count = int(marked.sum()) + int(far.misses_corner.sum())
+        marks = _RefinementMarks.of(function, vertices, faces, tolerance, walls, where)
+        marked = marks.marked
+        count = int(marked.sum()) + int(marks.misses_corner.sum())
         if not count:
             break
-        if count > _DIVERGENCE_FACTOR * least:
+        if count > _DIVERGENCE_FACTOR * smallest_count:
             break
-        least = min(least, count) if count < before else least
+        smallest_count = min(smallest_count, count) if count < before else smallest_count
         before = count
         # Every edge that is cut makes one more triangle on each side, and so does every center.
         check_triangle_limit(len(faces) + 2 * count, function.most_faces)
-        samples, reach = far.samples.select(marked), 0.5 * far.span[marked]
-        moved = newton_to_level(function, far.middle[marked], samples, reach, walls)
+        samples, reach = marks.samples.select(marked), 0.5 * marks.span[marked]
+        moved = newton_to_level(function, marks.middle[marked], samples, reach, walls)
         if function.field.has_creases:
-            moved = _project_to_creases(function, vertices, far.ends[marked], moved, walls)
-        place = np.full(len(marked), -1, np.int64)
-        place[marked] = len(vertices) + np.arange(int(marked.sum()))
+            moved = _project_to_creases(function, vertices, marks.ends[marked], moved, walls)
+        new_vertex = np.full(len(marked), -1, np.int64)
+        new_vertex[marked] = len(vertices) + np.arange(int(marked.sum()))
         vertices = np.concatenate([vertices, moved])
-        cut_off = far.misses_corner & ~marked[far.edges].any(axis=1)
+        cut_off = marks.misses_corner & ~marked[marks.edges].any(axis=1)
         inner = len(vertices) + np.arange(np.count_nonzero(cut_off))
         vertices = np.concatenate(
             [vertices, _crease_corners(function, vertices, faces[cut_off], walls)]
         )
         a, b, c = faces[cut_off].T
         fans = [np.stack([*ends, inner], axis=1) for ends in ((a, b), (b, c), (c, a))]
-        whole = split_faces(vertices, faces[~cut_off], place[far.edges[~cut_off]])
-        faces = np.concatenate([whole, *fans])
+        split = split_faces(vertices, faces[~cut_off], new_vertex[marks.edges[~cut_off]])
+        faces = np.concatenate([split, *fans])
     if function.field.has_variable_accuracy:
         vertices = _converge_vertices(function, vertices, faces, tolerance, walls)
     return vertices, faces
@@ -127,13 +127,13 @@ def _converge_vertices(
     if not len(rows):
         return vertices
     longest = np.full(len(rows), 0.5 * tolerance)
-    there = newton_to_level(
+    moved = newton_to_level(
         function, vertices[rows], samples.select(rows), longest, walls, steps=20
     )
-    good = np.abs(function.sample(there).value) < np.abs(samples.value[rows])
-    good &= row_norms(there - vertices[rows]) < tolerance
+    is_closer = np.abs(function.sample(moved).value) < np.abs(samples.value[rows])
+    is_closer &= row_norms(moved - vertices[rows]) < tolerance
     vertices = vertices.copy()
-    vertices[rows[good]] = there[good]
+    vertices[rows[is_closer]] = moved[is_closer]
     return vertices
 
 
@@ -150,28 +150,28 @@ def _project_to_creases(
     degrees or more, and nearly all of it between the moved middle and one of the ends; on a smooth
     surface about half of it.
     """
-    used, place = np.unique(ends, return_inverse=True)
+    used, index = np.unique(ends, return_inverse=True)
     slope = function.sample(vertices[used]).gradient
-    at_ends = (slope / np.maximum(row_norms(slope), 1e-300)[:, None])[place.reshape(-1, 2)]
-    here = function.sample(moved).gradient
-    here = here / np.maximum(row_norms(here), 1e-300)[:, None]
-    one, other = at_ends[:, 0], at_ends[:, 1]
-    cosine = row_dots(one, other)
-    turn = np.arccos(np.clip(np.minimum(row_dots(one, here), row_dots(other, here)), -1, 1))
-    whole = np.arccos(np.clip(cosine, -1, 1))
-    rows = np.flatnonzero((whole > _BENT) & (turn > _AT_ONCE * whole) & (1 - cosine**2 > 0.01))
+    at_ends = (slope / np.maximum(row_norms(slope), 1e-300)[:, None])[index.reshape(-1, 2)]
+    n = function.sample(moved).gradient
+    n = n / np.maximum(row_norms(n), 1e-300)[:, None]
+    n_a, n_b = at_ends[:, 0], at_ends[:, 1]
+    cosine = row_dots(n_a, n_b)
+    angle = np.arccos(np.clip(np.minimum(row_dots(n_a, n), row_dots(n_b, n)), -1, 1))
+    total = np.arccos(np.clip(cosine, -1, 1))
+    rows = np.flatnonzero((total > _BENT) & (angle > _AT_ONCE * total) & (1 - cosine**2 > 0.01))
     if not len(rows):
         return moved
-    one, other, cosine = one[rows], other[rows], cosine[rows]
+    n_a, n_b, cosine = n_a[rows], n_b[rows], cosine[rows]
     a, b = (vertices[ends[rows, k]] for k in (0, 1))
     middle, span = 0.5 * (a + b), row_norms(b - a)
-    high, low = row_dots(one, a - middle), row_dots(other, b - middle)
-    share = np.stack([high - cosine * low, low - cosine * high]) / (1 - cosine**2)
-    way = share[0][:, None] * one + share[1][:, None] * other
-    there, good = _level_along(function, middle, way, _BESIDE * span, walls)
-    good &= np.minimum(row_norms(there - a), row_norms(there - b)) > _FROM_ENDS * span
+    high, low = row_dots(n_a, a - middle), row_dots(n_b, b - middle)
+    weights = np.stack([high - cosine * low, low - cosine * high]) / (1 - cosine**2)
+    direction = weights[0][:, None] * n_a + weights[1][:, None] * n_b
+    projected, passed = _level_along(function, middle, direction, _BESIDE * span, walls)
+    passed &= np.minimum(row_norms(projected - a), row_norms(projected - b)) > _FROM_ENDS * span
     moved = moved.copy()
-    moved[rows[good]] = there[good]
+    moved[rows[passed]] = projected[passed]
     return moved
 
 
@@ -189,42 +189,42 @@ def _crease_corners(
     rows = np.flatnonzero(np.abs(np.linalg.det(normal)) > _INDEPENDENT)
     away = (normal * (corner - center[:, None])).sum(axis=2)
     solve: Any = np.linalg.solve
-    way: FloatArray = solve(normal[rows], away[rows][:, :, None])[:, :, 0]
-    there, good = _level_along(function, center[rows], way, _BESIDE * span[rows], walls)
-    moved[rows[good]] = there[good]
+    direction: FloatArray = solve(normal[rows], away[rows][:, :, None])[:, :, 0]
+    crossing, passed = _level_along(function, center[rows], direction, _BESIDE * span[rows], walls)
+    moved[rows[passed]] = crossing[passed]
     return moved
 
 
 def _level_along(
-    function: LevelFunction, start: FloatArray, way: FloatArray, most: FloatArray, walls: Walls
+    function: LevelFunction, start: FloatArray, along: FloatArray, limit: FloatArray, walls: Walls
 ) -> tuple[FloatArray, BoolArray]:
     """Points on the level from `start` (k, 3) along `way`, a little beyond its end at most and no
     farther than `most`; and whether the level is passed there."""
-    way = way * np.minimum(1, most / np.maximum(row_norms(way), 1e-300))[:, None]
+    along = along * np.minimum(1, limit / np.maximum(row_norms(along), 1e-300))[:, None]
     low, high = np.zeros(len(start)), np.full(len(start), _BEYOND)
-    good = np.ones(len(start), np.bool_)
+    passed = np.ones(len(start), np.bool_)
     parts = np.linspace(0, 1, _SAMPLES)
     for _ in range(2):
         t = low[:, None] + (high - low)[:, None] * parts
-        x = start[:, None] + t[:, :, None] * way[:, None]
+        x = start[:, None] + t[:, :, None] * along[:, None]
         x = x if walls is None else np.clip(x, *walls)
         is_above = (function.sample(x.reshape(-1, 3)).value > 0).reshape(t.shape)
         passes = is_above[:, 1:] != is_above[:, :-1]
-        good &= passes.any(axis=1)
+        passed &= passes.any(axis=1)
         first = passes.argmax(axis=1)[:, None]
         low, high = (np.take_along_axis(t, first + k, axis=1)[:, 0] for k in (0, 1))
-    there = start + low[:, None] * way
-    there = there if walls is None else np.clip(there, *walls)
-    longest = 4 * (high - low) * row_norms(way)
-    return newton_to_level(function, there, function.sample(there), longest, walls), good
+    crossing = start + low[:, None] * along
+    crossing = crossing if walls is None else np.clip(crossing, *walls)
+    longest = 4 * (high - low) * row_norms(along)
+    return newton_to_level(function, crossing, function.sample(crossing), longest, walls), passed
 
 
 def unrefined_midpoints(
     function: LevelFunction, vertices: FloatArray, faces: IntArray, tolerance: float
 ) -> FloatArray:
     """Midpoints (k, 3) of the edges that `refine` would still split."""
-    far = _RefinementMarks.of(function, vertices, faces, tolerance, None, None)
-    return far.middle[far.marked]
+    marks = _RefinementMarks.of(function, vertices, faces, tolerance, None, None)
+    return marks.middle[marks.marked]
 
 
 @dataclass(frozen=True)
@@ -278,16 +278,16 @@ class _RefinementMarks:
             is_beyond &= where(middle)
             is_off &= where(center)
         marked = is_beyond.copy()
-        off = is_off & (span[edges].max(axis=1) > _SHORTEST * tolerance)
+        must_split = is_off & (span[edges].max(axis=1) > _SHORTEST * tolerance)
         cuts_off = np.zeros(len(faces), np.bool_)
-        lone = np.flatnonzero(off & ~marked[edges].any(axis=1))
+        lone = np.flatnonzero(must_split & ~marked[edges].any(axis=1))
         if function.field.has_creases:
             cuts_off[lone] = _turns(function, vertices[faces[lone]])
-        off &= ~cuts_off
+        must_split &= ~cuts_off
         # Of a face that is off, the longest edge that may be cut.
         free = np.where(is_boundary[edges], 0.0, span[edges])
         worst = edges[np.arange(len(faces)), free.argmax(axis=1)]
-        marked[worst[off]] = True
+        marked[worst[must_split]] = True
         marked &= ~is_boundary & (span > _SHORTEST * tolerance)
         return cls(edges, ends, middle, span, samples, is_beyond, is_off, marked, cuts_off)
 
@@ -315,17 +315,17 @@ def split_faces(vertices: FloatArray, faces: IntArray, middle: IntArray) -> IntA
     cut = middle >= 0
     number = cut.sum(axis=1)
     parts = [faces[number == 0]]
-    three = number == 3
-    (a, b, c), (x, y, z) = faces[three].T, middle[three].T
+    all_cut = number == 3
+    (a, b, c), (x, y, z) = faces[all_cut].T, middle[all_cut].T
     parts += [np.stack(t, axis=1) for t in ((a, x, z), (x, b, y), (z, y, c), (x, y, z))]
     for k in range(3):
         order = [k, (k + 1) % 3, (k + 2) % 3]
-        one = (number == 1) & cut[:, k]
-        (a, b, c), x = faces[one][:, order].T, middle[one, k]
+        single = (number == 1) & cut[:, k]
+        (a, b, c), x = faces[single][:, order].T, middle[single, k]
         parts += [np.stack(t, axis=1) for t in ((a, x, c), (x, b, c))]
-        two = (number == 2) & ~cut[:, k]
+        pair = (number == 2) & ~cut[:, k]
         # The edge from a to b is whole; y and z are the middles of the others.
-        (a, b, c), y, z = faces[two][:, order].T, middle[two, order[1]], middle[two, order[2]]
+        (a, b, c), y, z = faces[pair][:, order].T, middle[pair, order[1]], middle[pair, order[2]]
         first = row_norms(vertices[a] - vertices[y])
         second = row_norms(vertices[b] - vertices[z])
         shorter = (first < second)[:, None]
@@ -377,21 +377,21 @@ def smooth(
     size = float(np.ptp(vertices[free], axis=0).max(initial=0.0)) if len(rows) else 0.0
     for _ in range(rounds):
         sums = np.zeros_like(vertices)
-        for one, other in ((0, 1), (1, 0)):
+        for i, j in ((0, 1), (1, 0)):
             for axis in range(3):
                 sums[:, axis] += np.bincount(
-                    ends[:, one], vertices[ends[:, other], axis], minlength=len(vertices)
+                    ends[:, i], vertices[ends[:, j], axis], minlength=len(vertices)
                 )
         aim = 0.5 * (vertices + sums / count[:, None])
         start = function.sample(aim[rows])
         # No farther than neighbors are: beside the curve gradients turn.
         span = row_norms(aim[rows] - vertices[rows]) + 1e-300
-        there = vertices.copy()
-        there[rows] = newton_to_level(function, aim[rows], start, 2 * span, walls)
-        after = function.sample(there[rows])
-        worse = after.distance > 1e-7 * size + 1e-12 * row_norms(there[rows])
-        there[rows[worse]] = vertices[rows[worse]]
-        vertices = _undo_flipped(vertices, there, faces)
+        moved = vertices.copy()
+        moved[rows] = newton_to_level(function, aim[rows], start, 2 * span, walls)
+        after = function.sample(moved[rows])
+        worse = after.distance > 1e-7 * size + 1e-12 * row_norms(moved[rows])
+        moved[rows[worse]] = vertices[rows[worse]]
+        vertices = _undo_flipped(vertices, moved, faces)
     return vertices
 
 
@@ -410,18 +410,18 @@ def smooth_within_tolerance(
     after = smooth(function, vertices, faces, walls)
     rows = np.arange(len(faces))
     for _ in range(8):
-        far = _RefinementMarks.of(function, after, faces[rows], tolerance, walls, where)
-        off = np.zeros(len(faces), np.bool_)
-        off[rows] = far.is_beyond[far.edges].any(axis=1) | far.is_off
-        back = np.zeros(len(vertices), np.bool_)
+        marks = _RefinementMarks.of(function, after, faces[rows], tolerance, walls, where)
+        is_off = np.zeros(len(faces), np.bool_)
+        is_off[rows] = marks.is_beyond[marks.edges].any(axis=1) | marks.is_off
+        is_reverted = np.zeros(len(vertices), np.bool_)
         for _ in range(2):  # with neighbors, so that this ends soon
-            back[faces[off]] = True
-            off = back[faces].any(axis=1)
-        back &= (after != vertices).any(axis=1)
-        if not back.any():
+            is_reverted[faces[is_off]] = True
+            is_off = is_reverted[faces].any(axis=1)
+        is_reverted &= (after != vertices).any(axis=1)
+        if not is_reverted.any():
             return after
-        after = np.where(back[:, None], vertices, after)
-        rows = np.flatnonzero(back[faces].any(axis=1))  # others are as they were
+        after = np.where(is_reverted[:, None], vertices, after)
+        rows = np.flatnonzero(is_reverted[faces].any(axis=1))  # others are as they were
     return vertices
 
 
@@ -436,6 +436,6 @@ def _undo_flipped(before: FloatArray, after: FloatArray, faces: IntArray) -> Flo
         if not turned.any():
             return after
         after = after.copy()
-        back = np.unique(faces[turned])
-        after[back] = before[back]
+        reverted = np.unique(faces[turned])
+        after[reverted] = before[reverted]
     return before

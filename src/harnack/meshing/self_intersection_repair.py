@@ -54,8 +54,8 @@ def resolve_self_intersections(surface: TriangleMesh, length: float) -> Triangle
     try:
         check_no_self_intersection(surface.vertices, surface.faces)
     except SelfIntersectionError as error:
-        mended, left = resolve_local_intersections(surface, error.faces, length)
-        if left:
+        mended, crossing_count = resolve_local_intersections(surface, error.faces, length)
+        if crossing_count:
             raise
         return mended
     return surface
@@ -73,19 +73,19 @@ def resolve_local_intersections(
     if not 0 < len(crossing) <= _MOST or length <= 0:
         return surface, len(crossing)
     vertices, faces = surface.vertices, surface.faces
-    is_gone, made, left = np.zeros(len(faces), np.bool_), [faces[:0]], 0
+    is_gone, pieces, crossing_count = np.zeros(len(faces), np.bool_), [faces[:0]], 0
     for rows, movable in _regions(vertices, faces, crossing):
         is_gone[rows] = True
         if len(rows) > _MOST_AROUND:
-            made.append(faces[rows])
-            left += int(np.isin(crossing, rows).sum())
+            pieces.append(faces[rows])
+            crossing_count += int(np.isin(crossing, rows).sum())
             continue
         patch, count = _reduce_crossings(_Neighborhood.of(vertices, faces[rows], movable), length)
-        made.append(patch)
-        left += count
+        pieces.append(patch)
+        crossing_count += count
     return TriangleMesh.without_unused_vertices(
-        vertices, np.concatenate([faces[~is_gone], *made])
-    ), left
+        vertices, np.concatenate([faces[~is_gone], *pieces])
+    ), crossing_count
 
 
 def _regions(
@@ -104,28 +104,28 @@ def _regions(
     corner = vertices[faces]
     lower, upper = corner.min(axis=1), corner.max(axis=1)
     near = _touching(faces, faces[crossing])
-    around = _touching(faces, faces[near])
-    pairs = half_edges(faces[around])
+    second_ring = _touching(faces, faces[near])
+    pairs = half_edges(faces[second_ring])
     joined = sparse.coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(vertices),) * 2)
     part = csgraph.connected_components(joined, directed=False)[1]
     boxes: list[IntArray] = []
-    for one in np.unique(part[faces[around, 0]]):
-        rows = around[part[faces[around, 0]] == one]
+    for label in np.unique(part[faces[second_ring, 0]]):
+        rows = second_ring[part[faces[second_ring, 0]] == label]
         low, high = lower[rows].min(axis=0), upper[rows].max(axis=0)
-        found = np.flatnonzero((lower <= high).all(axis=1) & (upper >= low).all(axis=1))
+        members = np.flatnonzero((lower <= high).all(axis=1) & (upper >= low).all(axis=1))
         for k in reversed(range(len(boxes))):
-            if len(np.intersect1d(found, boxes[k])):
-                found = np.union1d(found, boxes.pop(k))
-        boxes.append(found)
+            if len(np.intersect1d(members, boxes[k])):
+                members = np.union1d(members, boxes.pop(k))
+        boxes.append(members)
     for rows in boxes:
         yield rows, np.unique(faces[near[np.isin(near, rows)]])
 
 
-def _touching(faces: IntArray, some: IntArray) -> IntArray:
+def _touching(faces: IntArray, targets: IntArray) -> IntArray:
     """Faces, by index, with a corner of some."""
-    is_asked = np.zeros(int(faces.max()) + 1, np.bool_)
-    is_asked[some] = True
-    return np.flatnonzero(is_asked[faces].any(axis=1))
+    is_corner = np.zeros(int(faces.max()) + 1, np.bool_)
+    is_corner[targets] = True
+    return np.flatnonzero(is_corner[faces].any(axis=1))
 
 
 @dataclass(frozen=True)
@@ -141,8 +141,8 @@ class _Neighborhood:
     @classmethod
     def of(cls, vertices: FloatArray, faces: IntArray, movable: IntArray) -> _Neighborhood:
         """names: of the vertices, in the mesh."""
-        names, place = np.unique(faces, return_inverse=True)
-        return cls(vertices[names], place.reshape(-1, 3), np.isin(names, movable), names)
+        names, index = np.unique(faces, return_inverse=True)
+        return cls(vertices[names], index.reshape(-1, 3), np.isin(names, movable), names)
 
     def crossing(self) -> IntArray:
         """Faces, by index, that pass through others."""
@@ -168,19 +168,19 @@ class _Neighborhood:
             return None
         if len(self.neighbors(a) & self.neighbors(b)) != 2:
             return None
-        gone = self.around(a)
-        new = np.where(self.faces[gone] == a, b, self.faces[gone])
-        return gone, new[(new != np.roll(new, 1, axis=1)).all(axis=1)]
+        removed = self.around(a)
+        new = np.where(self.faces[removed] == a, b, self.faces[removed])
+        return removed, new[(new != np.roll(new, 1, axis=1)).all(axis=1)]
 
     def flip_edge(self, a: int, b: int) -> tuple[IntArray, IntArray] | None:
         """Faces that go and that come if the edge between a and b joins the corners opposite to it
         instead; None if there is such an edge."""
         if not (self.is_movable[a] and self.is_movable[b]):
             return None
-        gone = np.intersect1d(self.around(a), self.around(b))
-        if len(gone) != 2:
+        removed = np.intersect1d(self.around(a), self.around(b))
+        if len(removed) != 2:
             return None
-        first, second = (self.faces[row].tolist() for row in gone)
+        first, second = (self.faces[row].tolist() for row in removed)
         if first[(first.index(a) + 1) % 3] != b:
             first, second = second, first
         (c,), (d,) = set(first) - {a, b}, set(second) - {a, b}
@@ -188,36 +188,36 @@ class _Neighborhood:
             return None
         if not (self.is_movable[c] or self.is_movable[d]):
             return None
-        return gone, np.array([[a, d, c], [d, b, c]])
+        return removed, np.array([[a, d, c], [d, b, c]])
 
 
 def _reduce_crossings(patch: _Neighborhood, length: float) -> tuple[IntArray, int]:
     """Faces of a patch, by vertices of the mesh, in which fewer cross; and how many still do."""
-    bad = patch.crossing()
+    crossing = patch.crossing()
     for _ in range(_MOST_CHANGES):
-        better = _best_change(patch, bad, length) if len(bad) else None
+        better = _best_change(patch, crossing, length) if len(crossing) else None
         if better is None:
             break
-        patch, bad = better
-    return patch.mesh_vertices[patch.faces], len(bad)
+        patch, crossing = better
+    return patch.mesh_vertices[patch.faces], len(crossing)
 
 
 def _best_change(
-    patch: _Neighborhood, bad: IntArray, length: float
+    patch: _Neighborhood, crossing: IntArray, length: float
 ) -> tuple[_Neighborhood, IntArray] | None:
     """The patch after one change, after which fewer faces cross, and these; None if none is known.
 
     Those are tried first that move the surface least: of edges of faces that cross, then of all
     edges at their corners.
     """
-    for rows in (bad, _touching(patch.faces, patch.faces[bad])):
-        for _, gone, new in sorted(_changes(patch, rows, length), key=lambda one: one[0])[
+    for rows in (crossing, _touching(patch.faces, patch.faces[crossing])):
+        for _, removed, new in sorted(_changes(patch, rows, length), key=lambda change: change[0])[
             :_MOST_TRIED
         ]:
-            made = patch.with_faces(gone, new)
-            crossing = made.crossing()
-            if len(crossing) < len(bad):
-                return made, crossing
+            changed = patch.with_faces(removed, new)
+            still_crossing = changed.crossing()
+            if len(still_crossing) < len(crossing):
+                return changed, still_crossing
     return None
 
 
@@ -229,10 +229,10 @@ def _changes(
     count = len(patch.vertices)
     keys = sorted_unique(edge_keys(half_edges(patch.faces[rows]), count))
     for a, b in np.stack(np.divmod(keys, count), axis=1).tolist():
-        for one, other in ((a, b), (b, a)):
-            change = patch.collapse_edge(one, other)
+        for source, target in ((a, b), (b, a)):
+            change = patch.collapse_edge(source, target)
             if change is not None and _keeps_orientation(patch, *change, length):
-                moved = distance_from_triangles(patch.vertices[one], patch.vertices[change[1]])
+                moved = distance_from_triangles(patch.vertices[source], patch.vertices[change[1]])
                 if moved <= length:
                     yield moved, *change
         change = patch.flip_edge(a, b)
@@ -243,21 +243,21 @@ def _changes(
                 yield moved, *change
 
 
-def _keeps_orientation(patch: _Neighborhood, gone: IntArray, new: IntArray, length: float) -> bool:
+def _keeps_orientation(patch: _Neighborhood, rows: IntArray, new: IntArray, length: float) -> bool:
     """Whether no new face, but for slivers, looks backwards from where the old ones look in the
     mean, and the volume between new and old ones is no more than if these moved by a length: a
     vertex on the new faces says nothing of old ones that are folded, as at a thin spike."""
-    corner, replaced = patch.vertices[patch.faces[gone]], patch.vertices[new]
-    old, made = area_normals(corner), area_normals(replaced)
+    corner, replaced = patch.vertices[patch.faces[rows]], patch.vertices[new]
+    old, after = area_normals(corner), area_normals(replaced)
     mean = old.sum(axis=0)
-    most = float(row_norms(old).sum())
+    total = float(row_norms(old).sum())
     origin = corner[0, 0]
     between = (
-        row_dots(replaced[:, 0] - origin, made).sum() - row_dots(corner[:, 0] - origin, old).sum()
+        row_dots(replaced[:, 0] - origin, after).sum() - row_dots(corner[:, 0] - origin, old).sum()
     )
-    if abs(float(between)) / 6 > length * most / 2:
+    if abs(float(between)) / 6 > length * total / 2:
         return False
-    return bool(((made @ mean > 0) | (row_norms(made) <= _NOTHING * most)).all())
+    return bool(((after @ mean > 0) | (row_norms(after) <= _NOTHING * total)).all())
 
 
 def _between(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> float:

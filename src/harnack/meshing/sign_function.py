@@ -122,8 +122,8 @@ class SignFunction(LevelFunction):
         """
         if isinstance(field, DipolePotential):
             _check_encloses(field, level)
-        far = float(np.abs(box).max())
-        is_near = far * 2.0**-24 * _STEPS_IN_CELL < spacing
+        max_abs = float(np.abs(box).max())
+        is_near = max_abs * 2.0**-24 * _STEPS_IN_CELL < spacing
         precision: Precision = "single" if is_near else "double"
         return cls(field, level, side=side, precision=precision, most_faces=most_faces)
 
@@ -175,8 +175,8 @@ class SignFunction(LevelFunction):
         self.evaluations += len(points)
         if not self._clearances:
             self._clearances = _clearances(self.field, self.level, self.precision)
-        found = [one(points) for one in self._clearances]
-        return np.min(found, axis=0)
+        distances = [bound(points) for bound in self._clearances]
+        return np.min(distances, axis=0)
 
     def crossings(self, low: FloatArray, high: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Where segments between points (n, 3), at which the function is not positive and positive,
@@ -186,24 +186,24 @@ class SignFunction(LevelFunction):
         """
         if not len(low):
             return low.copy(), low.copy()
-        way = high - low
+        direction = high - low
         t = np.zeros(len(low))
         normal, is_on_sheet = np.zeros_like(low), np.zeros(len(low), np.bool_)
         if self.field.has_jumps:
-            first, last = self._bisect(low, way)
-            t, normal, is_on_sheet = self._on_sheets(low, way, first, last)
+            first, last = self._bisect(low, direction)
+            t, normal, is_on_sheet = self._on_sheets(low, direction, first, last)
             rows = np.flatnonzero(~is_on_sheet)
-            t[rows] = self._roots(low[rows], way[rows], first[rows], last[rows], 2)
+            t[rows] = self._roots(low[rows], direction[rows], first[rows], last[rows], 2)
         else:
-            t = self._roots(low, way, t, t + 1, _STEPS)
-        x = low + t[:, None] * way
+            t = self._roots(low, direction, t, t + 1, _STEPS)
+        x = low + t[:, None] * direction
         smooth = np.flatnonzero(~is_on_sheet)
-        normal[smooth] = self._slopes(x[smooth], way[smooth])
-        down = is_on_sheet & (row_dots(normal, way) < 0)
+        normal[smooth] = self._slopes(x[smooth], direction[smooth])
+        down = is_on_sheet & (row_dots(normal, direction) < 0)
         normal[down] *= -1
         return x, normal / np.maximum(row_norms(normal), 1e-300)[:, None]
 
-    def _slopes(self, x: FloatArray, way: FloatArray) -> FloatArray:
+    def _slopes(self, x: FloatArray, direction: FloatArray) -> FloatArray:
         """(n, 3) gradients at points; where there is none, the way that leads up."""
         if not len(x):
             return x
@@ -214,20 +214,20 @@ class SignFunction(LevelFunction):
             slopes = self.field.gradient(x, precision=self.precision)
         slope = self.side * np.asarray(slopes, np.float64)
         flat = ~np.isfinite(slope).all(axis=1) | ~slope.any(axis=1)
-        slope[flat] = way[flat]
+        slope[flat] = direction[flat]
         return slope
 
-    def _bisect(self, start: FloatArray, way: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _bisect(self, start: FloatArray, direction: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Ends (n,) of parts of segments, in which the function changes its sign as well."""
         first, last = np.zeros(len(start)), np.ones(len(start))
         for _ in range(_HALVINGS):
             t = 0.5 * (first + last)
-            above = self.values(start + t[:, None] * way) > 0
-            first, last = np.where(above, first, t), np.where(above, t, last)
+            is_positive = self.values(start + t[:, None] * direction) > 0
+            first, last = np.where(is_positive, first, t), np.where(is_positive, t, last)
         return first, last
 
     def _roots(
-        self, start: FloatArray, way: FloatArray, first: FloatArray, last: FloatArray, steps: int
+        self, start: FloatArray, along: FloatArray, first: FloatArray, last: FloatArray, steps: int
     ) -> FloatArray:
         """(n,) where the function is 0 between two places of a segment: by turns the secant and the
         middle are tried, so that what is left is at most half as long with every second step; until
@@ -235,40 +235,40 @@ class SignFunction(LevelFunction):
         if not len(start):
             return first
         first, last = first.copy(), last.copy()
-        low, high = (self.values(start + t[:, None] * way) for t in (first, last))
+        low, high = (self.values(start + t[:, None] * along) for t in (first, last))
         enough = _NEAR_ROOT * np.minimum(np.abs(low), np.abs(high))
         rows = np.arange(len(start))
         for k in range(steps):
             ends = first[rows], last[rows]
             t = 0.5 * (ends[0] + ends[1]) if k % 2 else _secant(*ends, low[rows], high[rows])
-            value = self.values(start[rows] + t[:, None] * way[rows])
-            above = value > 0
-            first[rows], last[rows] = np.where(above, ends[0], t), np.where(above, t, ends[1])
-            low[rows] = np.where(above, low[rows], value)
-            high[rows] = np.where(above, value, high[rows])
+            value = self.values(start[rows] + t[:, None] * along[rows])
+            is_up = value > 0
+            first[rows], last[rows] = np.where(is_up, ends[0], t), np.where(is_up, t, ends[1])
+            low[rows] = np.where(is_up, low[rows], value)
+            high[rows] = np.where(is_up, value, high[rows])
             rows = rows[~(np.abs(value) <= enough[rows])]
             if not len(rows):
                 break
         return _secant(first, last, low, high)
 
     def _on_sheets(
-        self, start: FloatArray, way: FloatArray, first: FloatArray, last: FloatArray
+        self, start: FloatArray, direction: FloatArray, first: FloatArray, last: FloatArray
     ) -> tuple[FloatArray, FloatArray, BoolArray]:
         """Where segments first cross a sheet between two places of them (n,), the sheet's normals
         (n, 3), and whether there is one."""
         backend = choose_backend("double")
         field = self.field.prepare(backend)
-        length = row_norms(way)
-        ray = way / np.maximum(length, 1e-300)[:, None]
+        length = row_norms(direction)
+        ray = direction / np.maximum(length, 1e-300)[:, None]
         room = _BEYOND * (last - first)
-        origin = start + (first - room)[:, None] * way
+        origin = start + (first - room)[:, None] * direction
         reach = (last - first + 2 * room) * length
 
         def crossed(o: Vec3, d: Vec3, limit: Vec3) -> tuple[Real, Vec3]:
             none = backend.Array3f(0)
             after = JumpCrossing(backend.Float(0), backend.UInt32(NO_FACET), backend.Float(0), none)
-            found = field.next_jump(o, d, after, limit.x, backend.Bool(True))
-            return found.t, found.normal
+            crossing = field.next_jump(o, d, after, limit.x, backend.Bool(True))
+            return crossing.t, crossing.normal
 
         t, normal = map_batches(backend, crossed, origin, ray, np.column_stack([reach] * 3))
         is_crossed = np.isfinite(t) & (t <= reach)
@@ -303,9 +303,9 @@ def _secant(first: FloatArray, last: FloatArray, low: FloatArray, high: FloatArr
     """Where lines through two values of different signs meet 0; in the middle where values are no
     numbers."""
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        share = low / (low - high)
-    share = np.where(np.isfinite(share), np.clip(share, 0.0, 1.0), 0.5)
-    return first + share * (last - first)
+        fraction = low / (low - high)
+    fraction = np.where(np.isfinite(fraction), np.clip(fraction, 0.0, 1.0), 0.5)
+    return first + fraction * (last - first)
 
 
 def _clearances(

@@ -65,12 +65,12 @@ class WallThickness:
         PLY and GLB files hold them."""
         import trimesh  # here: half a second that few need
 
-        share = np.clip((self.values - low) / max(high - low, 1e-300), 0.0, 1.0)
-        share = np.nan_to_num(share, nan=1.0)
+        fraction = np.clip((self.values - low) / max(high - low, 1e-300), 0.0, 1.0)
+        fraction = np.nan_to_num(fraction, nan=1.0)
         stops = np.array([[200, 30, 30], [240, 200, 60], [190, 190, 190]], np.float64)
-        colors = np.full((len(share), 4), 255, np.uint8)
+        colors = np.full((len(fraction), 4), 255, np.uint8)
         for k in range(3):
-            colors[:, k] = np.rint(np.interp(share, (0.0, 0.5, 1.0), stops[:, k]))
+            colors[:, k] = np.rint(np.interp(fraction, (0.0, 0.5, 1.0), stops[:, k]))
         return trimesh.Trimesh(
             self.vertices, self.faces, face_colors=colors, process=False, validate=False
         )

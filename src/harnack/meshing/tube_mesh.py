@@ -54,7 +54,7 @@ def tube_manifold(tube: Tube, level: float, tolerance: float) -> Manifold:
     if radius <= 0:
         return Manifold()
     step = math.sqrt(3 * tolerance / radius)
-    around = max(_LEAST_AROUND, math.ceil(2 * math.pi / step))
+    segments = max(_LEAST_AROUND, math.ceil(2 * math.pi / step))
     waiting = [
         _simpler(polyline, _LEFT_OUT * tolerance) for polyline in np.split(tube.points, tube.starts)
     ]
@@ -62,14 +62,14 @@ def tube_manifold(tube: Tube, level: float, tolerance: float) -> Manifold:
     vertices = 0
     while waiting:
         # Rings of a half ball at both ends, and one at least at each vertex between.
-        least = around * sum(len(polyline) + around // 2 for polyline in waiting)
-        if vertices + least > _MOST_VERTICES:
+        minimum = segments * sum(len(polyline) + segments // 2 for polyline in waiting)
+        if vertices + minimum > _MOST_VERTICES:
             raise MeshingError(
-                f"a tube within {tolerance:.3g} has more than {2 * (vertices + least):,} faces: "
+                f"a tube within {tolerance:.3g} has more than {2 * (vertices + minimum):,} faces: "
                 "choose a larger `tolerance`"
             )
         points = waiting.pop()
-        swept = _Sweep(radius, around, points).surface()
+        swept = _Sweep(radius, segments, points).surface()
         if swept is not None and (len(points) == 2 or _is_apart(swept)):
             parts.append(to_manifold(swept))
             vertices += len(swept.vertices)
@@ -95,11 +95,11 @@ def _simpler(points: FloatArray, length: float) -> FloatArray:
         first, last = waiting.pop()
         side, away = points[last] - points[first], points[first + 1 : last] - points[first]
         square = float(side @ side)
-        share = (away @ side / square if square > 0 else np.zeros(len(away))).clip(0, 1)
-        off = row_norms(away - share[:, None] * side)
-        if not len(off) or (square > 0 and off.max() <= length):
+        fraction = (away @ side / square if square > 0 else np.zeros(len(away))).clip(0, 1)
+        distance = row_norms(away - fraction[:, None] * side)
+        if not len(distance) or (square > 0 and distance.max() <= length):
             continue
-        middle = first + 1 + int(off.argmax())
+        middle = first + 1 + int(distance.argmax())
         is_kept[middle] = True
         waiting += [(first, middle), (middle, last)]
     return points[is_kept]
@@ -117,14 +117,14 @@ class _Sweep:
         """Rings of points one after the other; None where a line along an edge would end before it
         begins."""
         points, sides = self.points, np.diff(self.points, axis=0)
-        ways = sides / np.abs(sides).max(axis=1)[:, None]  # squares of small ones underflow
-        ways /= row_norms(ways)[:, None]
-        is_closed = len(ways) > 2 and bool((points[0] == points[-1]).all())
-        swung = self._transported(ways, is_closed=is_closed)
+        edges = sides / np.abs(sides).max(axis=1)[:, None]  # squares of small ones underflow
+        edges /= row_norms(edges)[:, None]
+        is_closed = len(edges) > 2 and bool((points[0] == points[-1]).all())
+        swung = self._transported(edges, is_closed=is_closed)
         if swung is None:
             return None
         frames, shift = swung
-        turns = itertools.pairwise([*ways, ways[0]] if is_closed else ways)
+        turns = itertools.pairwise([*edges, edges[0]] if is_closed else edges)
         corners = [
             self._corner(point, turn, self._directions(end))
             for point, turn, (_, end) in zip(points[1:], turns, frames, strict=False)
@@ -132,10 +132,10 @@ class _Sweep:
         if is_closed:
             starts, ends = [np.roll(corners[-1], shift, axis=1), *corners[:-1]], corners
         else:
-            starts = [self._end(points[0], ways[0], frames[0][0], -1), *corners]
-            ends = [*corners, self._end(points[-1], ways[-1], frames[-1][1], 1)]
-        for way, start, end in zip(ways, starts, ends, strict=True):
-            if len(ways) > 1 and not ((end[0] - start[-1]) @ way > 0).all():
+            starts = [self._end(points[0], edges[0], frames[0][0], -1), *corners]
+            ends = [*corners, self._end(points[-1], edges[-1], frames[-1][1], 1)]
+        for edge, start, end in zip(edges, starts, ends, strict=True):
+            if len(edges) > 1 and not ((end[0] - start[-1]) @ edge > 0).all():
                 return None
         rings = starts if is_closed else [*starts, ends[-1]]
         return self._joined(np.concatenate(rings), shift if is_closed else None)
@@ -157,21 +157,21 @@ class _Sweep:
             return (point + self.radius * directions)[None]
         across = across / sine
         angle = math.atan2(sine, cosine)
-        share = directions @ across
+        component = directions @ across
         step = 2 * math.pi / self.around
         count = math.ceil(angle / step)
         angles = np.array([0.5 * angle]) if count <= 1 else np.linspace(0.0, angle, count + 1)
-        turned = directions + share[:, None] * (
+        turned = directions + component[:, None] * (
             (np.cos(angles)[:, None, None] - 1) * across - np.sin(angles)[:, None, None] * before
         )
-        inner = directions - (share * math.tan(0.5 * angle))[:, None] * before
-        return point + self.radius * np.where((share > 0)[:, None], inner, turned)
+        inner = directions - (component * math.tan(0.5 * angle))[:, None] * before
+        return point + self.radius * np.where((component > 0)[:, None], inner, turned)
 
-    def _end(self, point: FloatArray, way: FloatArray, frame: FloatArray, sign: int) -> FloatArray:
+    def _end(self, point: FloatArray, axis: FloatArray, frame: FloatArray, sign: int) -> FloatArray:
         """Rings from the pole of a half ball to its rim, or the other way at the last point."""
         count = math.ceil(0.25 * self.around)
         angle = 0.5 * math.pi * np.arange(count + 1)[:, None, None] / count
-        rings = np.cos(angle) * self._directions(frame) + sign * np.sin(angle) * way
+        rings = np.cos(angle) * self._directions(frame) + sign * np.sin(angle) * axis
         return point + self.radius * (rings if sign > 0 else rings[::-1])
 
     def _joined(self, rings: FloatArray, shift: int | None) -> TriangleMesh:
@@ -181,30 +181,30 @@ class _Sweep:
         count, n = len(rings), self.around
         row, column = np.mgrid[: count - 1 if shift is None else count, :n].reshape(2, -1)
         moved = np.where(row == count - 1, shift or 0, 0)
-        above = (row + 1) % count * n
+        next_row = (row + 1) % count * n
         a, b = row * n + column, row * n + (column + 1) % n
-        c, d = above + (column + moved + 1) % n, above + (column + moved) % n
-        place: IntArray = np.arange(count * n, dtype=np.int64).reshape((count, n))
+        c, d = next_row + (column + moved + 1) % n, next_row + (column + moved) % n
+        vertex: IntArray = np.arange(count * n, dtype=np.int64).reshape((count, n))
         for k in range(1, count):
             same = (rings[k] == rings[k - 1]).all(axis=1)
-            place[k, same] = place[k - 1, same]
+            vertex[k, same] = vertex[k - 1, same]
         if shift is None:
-            place[[0, -1]] = place[[0, -1], :1]
+            vertex[[0, -1]] = vertex[[0, -1], :1]
         corners = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
-        faces: IntArray = place.ravel()[corners]
+        faces: IntArray = vertex.ravel()[corners]
         is_triangle = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
         return TriangleMesh.without_unused_vertices(rings.reshape(-1, 3), faces[is_triangle])
 
     def _transported(
-        self, ways: FloatArray, *, is_closed: bool
+        self, edges: FloatArray, *, is_closed: bool
     ) -> tuple[list[tuple[FloatArray, FloatArray]], int] | None:
         """Two unit vectors (2, 3) across each edge, at its start and its end, turned as the edges
         turn; of a closed polyline also a little about them, so that numbers around agree at the
         last and the first but for a shift. None where an edge leads back along the one before."""
-        first = np.cross(ways[0], np.eye(3)[np.abs(ways[0]).argmin()])
+        first = np.cross(edges[0], np.eye(3)[np.abs(edges[0]).argmin()])
         first /= np.linalg.norm(first)
         across = [first]
-        for before, after in itertools.pairwise([*ways, ways[0]] if is_closed else ways):
+        for before, after in itertools.pairwise([*edges, edges[0]] if is_closed else edges):
             cosine = float(before @ after)
             if cosine <= -1 + _BACK:
                 return None
@@ -213,15 +213,15 @@ class _Sweep:
             turned = cosine * u + np.cross(axis, u) + axis * (axis @ u) / (1 + cosine)
             turned -= (turned @ after) * after
             across.append(turned / np.linalg.norm(turned))
-        shift, turn = 0, 0.0
+        shift, twist = 0, 0.0
         if is_closed:
-            off = math.atan2(across[-1] @ np.cross(ways[0], first), across[-1] @ first)
+            mismatch = math.atan2(across[-1] @ np.cross(edges[0], first), across[-1] @ first)
             step = 2 * math.pi / self.around
-            shift = round(off / step)
-            turn = (off - shift * step) / len(ways)
-        frames = [np.stack([u, np.cross(way, u)]) for u, way in zip(across, ways, strict=False)]
+            shift = round(mismatch / step)
+            twist = (mismatch - shift * step) / len(edges)
+        frames = [np.stack([u, np.cross(edge, u)]) for u, edge in zip(across, edges, strict=False)]
         return [
-            (_spun(f, -turn * k), _spun(f, -turn * (k + 1))) for k, f in enumerate(frames)
+            (_spun(f, -twist * k), _spun(f, -twist * (k + 1))) for k, f in enumerate(frames)
         ], shift
 
 
