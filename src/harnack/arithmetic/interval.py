@@ -153,12 +153,12 @@ class Interval:
         if self.lower is self.upper and other.lower is other.upper:
             ends = (ends[0],)
         low = high = ends[0]
-        for one in ends[1:]:
-            low, high = _minimum(low, one), _maximum(high, one)
+        for product in ends[1:]:
+            low, high = _minimum(low, product), _maximum(high, product)
         # 0 times infinity is NaN: the smallest of the other ends may then be wrong.
-        known = _none_is_nan(ends)
-        if known is not None:
-            low, high = dr.select(known, low, -dr.inf), dr.select(known, high, dr.inf)
+        is_valid = _none_is_nan(ends)
+        if is_valid is not None:
+            low, high = dr.select(is_valid, low, -dr.inf), dr.select(is_valid, high, dr.inf)
         return Interval(_round_down(_pad_underflow(low, -1)), _round_up(_pad_underflow(high, 1)))
 
     def _times(self, constant: Interval) -> Interval:
@@ -169,8 +169,8 @@ class Interval:
         if a == b == -1.0:
             return -self
         if a < 0.0 < b:
-            most = _pad_underflow(self.max_abs * max(-a, b), 1)
-            return self._rounded_outward(-most, most, constant)
+            bound = _pad_underflow(self.max_abs * max(-a, b), 1)
+            return self._rounded_outward(-bound, bound, constant)
         if b <= 0.0:
             return -self._times(Interval(-b, -a, constant.is_single))
         if a == b <= 1.0 and np.frexp(a)[0] == 0.5:  # a power of two: exact, but for underflow
@@ -297,6 +297,6 @@ def _absolute(x: Real) -> Real:
 
 def _none_is_nan(numbers: tuple[Real, ...]) -> Mask | None:
     total = numbers[0]
-    for one in numbers[1:]:
-        total = total + one
+    for number in numbers[1:]:
+        total = total + number
     return total == total

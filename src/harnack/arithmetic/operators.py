@@ -215,11 +215,11 @@ class FormulaNumber(abc.ABC):
                 a, b = inputs
                 left, right = _OPERATORS[name]
                 is_left = isinstance(a, FormulaNumber)
-                made = getattr(a, left)(b) if is_left else getattr(b, right)(a)
-                if made is NotImplemented:
+                result = getattr(a, left)(b) if is_left else getattr(b, right)(a)
+                if result is NotImplemented:
                     other = type(b if is_left else a).__name__
                     raise TypeError(f"expected a number, not an object of type {other}")
-                return made
+                return result
         raise TypeError(
             f"numpy.{name} has no proved ranges: write formulas with + - * / **, abs, and "
             f"harnack.{_NAMES}"
@@ -231,8 +231,8 @@ class FormulaNumber(abc.ABC):
             "and its like"
         )
 
-    def _undecided(self, *others: Any) -> Any:
-        del others
+    def _undecided(self, *operands: Any) -> Any:
+        del operands
         raise TypeError(
             "a formula cannot decide by its coordinates: use harnack.maximum and harnack.minimum"
         )

@@ -52,9 +52,9 @@ class Values(FormulaNumber):
         """The coordinates on the smallest box around two points, `slack` larger on all sides."""
         no = p.x != p.x
         no = no & ~no
-        around = ZERO if slack is None else Interval(-slack, slack)
+        padding = ZERO if slack is None else Interval(-slack, slack)
         x, y, z = (
-            cls(Interval.point(p[k]).hull(Interval.point(q[k])) + around, no, no, no)
+            cls(Interval.point(p[k]).hull(Interval.point(q[k])) + padding, no, no, no)
             for k in range(3)
         )
         return x, y, z
@@ -108,9 +108,9 @@ class Values(FormulaNumber):
         x, y = self.value, other.value
         gaps = self.gaps | other.gaps
         either = _unless(self.nowhere, x, y).hull(_unless(other.nowhere, y, x))
-        least = dr.select(gaps, either.lower, x.intersect(y).lower)
+        low = dr.select(gaps, either.lower, x.intersect(y).lower)
         return Values(
-            Interval(least, either.upper),
+            Interval(low, either.upper),
             self.nowhere & other.nowhere,
             self.jumps | other.jumps | gaps | _is_lost(x) | _is_lost(y),
             gaps,
@@ -138,8 +138,8 @@ def _is_lost(x: Interval, large: float = _LARGE) -> Mask:
     lost = ~(dr.isfinite(x.lower) & dr.isfinite(x.upper))
     if large == 0.0:
         return lost
-    most = float(dr.largest(cast("Any", type(x.lower)))) ** large
-    return lost & ~((x.lower > most) | (x.upper < -most))
+    limit = float(dr.largest(cast("Any", type(x.lower)))) ** large
+    return lost & ~((x.lower > limit) | (x.upper < -limit))
 
 
 def _unless(condition: Mask, x: Interval, y: Interval) -> Interval:

@@ -86,10 +86,10 @@ class BalancedTree:
         number, after = [np.zeros(1, np.int64)], [np.array([self.node_count], np.int64)]
         first = [np.ones(1, np.int64)]
         for level, arity in reversed(list(enumerate(self.arities))):
-            place = np.arange(arity)
-            child = first[0][:, None] + place
-            following = np.where(place < arity - 1, child + 1, after[0][:, None])
-            start = first[0][:, None] + arity + place * below[level]
+            position = np.arange(arity)
+            child = first[0][:, None] + position
+            following = np.where(position < arity - 1, child + 1, after[0][:, None])
+            start = first[0][:, None] + arity + position * below[level]
             number.insert(0, child.reshape(-1))
             after.insert(0, following.reshape(-1))
             first.insert(0, start.reshape(-1))
@@ -118,17 +118,17 @@ def build_balanced_tree(points: FloatArray, *, leaf_size: int = 8, arity: int = 
     rows = np.arange(len(points), dtype=np.int64)[None]
     x = np.array(points.T, dtype=np.float64, order="C")[:, None]
     depth = max(0, math.ceil(math.log2(len(points) / leaf_size)))
-    left = depth
-    while left and rows.shape[1] > _POINTS_IN_CACHE:
+    remaining = depth
+    while remaining and rows.shape[1] > _POINTS_IN_CACHE:
         rows, x = _split(rows, x)
-        left -= 1
+        remaining -= 1
     at_once = max(1, _POINTS_IN_CACHE // rows.shape[1])
     leaves: list[IntArray] = []
     for start in range(0, len(rows), at_once):
-        some, places = rows[start : start + at_once], x[:, start : start + at_once]
-        for _ in range(left):
-            some, places = _split(some, places)
-        leaves.append(some)
+        batch, coordinates = rows[start : start + at_once], x[:, start : start + at_once]
+        for _ in range(remaining):
+            batch, coordinates = _split(batch, coordinates)
+        leaves.append(batch)
     slots = np.concatenate(leaves)
     if arity == 2:
         return BalancedTree(slots, (2,) * depth)
@@ -153,7 +153,7 @@ def _split(rows: IntArray, x: FloatArray) -> tuple[IntArray, FloatArray]:
         order[short, -1], order[short, middle] = order[short, middle], width - 1
     order += np.arange(0, rows.size, width, dtype=np.int64)[:, None]
     return _halves(rows, order, half, NO_PRIMITIVE), np.stack(
-        [_halves(one, order, half, np.nan) for one in x]
+        [_halves(coordinate, order, half, np.nan) for coordinate in x]
     )
 
 
@@ -294,11 +294,11 @@ def traverse(tree: PackedTree, visit: Visit, state: LoopValues, active: Mask = T
         i = dr.select(descend & ~is_leaf, number, index(head[6]))
         return i, *state
 
-    def more(i: Any, *_: Any) -> Mask:
+    def is_running(i: Any, *_: Any) -> Mask:
         return i < tree.node_count
 
     start = dr.select(mask(active), index(0), tree.node_count)
-    return dr.while_loop((start, *state), more, body, label="walk")[1:]
+    return dr.while_loop((start, *state), is_running, body, label="walk")[1:]
 
 
 def for_each_primitive(
@@ -313,10 +313,10 @@ def for_each_primitive(
     tree = node.tree
     index = tree.backend.UInt32
 
-    def more(slot: Any, *_: Any) -> Mask:
+    def is_running(slot: Any, *_: Any) -> Mask:
         return active & (slot < tree.leaf_size)
 
     def step(slot: Any, *state: Any) -> LoopValues:
         return slot + 1, *body(tree.primitive(node.leaf, slot, active), active, state)
 
-    return dr.while_loop((index(0), *state), more, step, label="leaf")[1:]
+    return dr.while_loop((index(0), *state), is_running, step, label="leaf")[1:]

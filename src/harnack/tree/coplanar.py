@@ -49,13 +49,13 @@ def borders_of_overlaps(
     covered, covering = overlapping_faces(rays, vertices, faces)
     if not len(covered):
         return covered, np.zeros((0, 3, 3))
-    edges, way = _edges(faces[covering])
+    edges, sign = _edges(faces[covering])
     key, number = np.unique(edges, axis=0, return_inverse=True)
     number = number.reshape(-1)
     pairs = np.repeat(covered, 3) * len(key) + number
     lines, line, count = np.unique(pairs, return_inverse=True, return_counts=True)
     net = np.zeros(len(lines), np.int64)
-    np.add.at(net, line.reshape(-1), way)
+    np.add.at(net, line.reshape(-1), sign)
     face, edge = np.divmod(lines, len(key))
     ends, faces_at = np.unique(_edges(faces)[0], axis=0, return_counts=True)
     width = len(vertices)
@@ -99,12 +99,12 @@ def _candidates(corners: FloatArray, normal: FloatArray, height: FloatArray) -> 
     clear = np.abs(normal) - 0.3
     first = np.take_along_axis(normal, (clear > 0).argmax(axis=1)[:, None], axis=1)
     normal = np.where(first < 0, -normal, normal)
-    place = np.column_stack([normal, np.einsum("ni,ni->n", normal, corners[:, 0])]) / _CELL
-    cell = np.floor(place)
-    within = place - cell
+    position = np.column_stack([normal, np.einsum("ni,ni->n", normal, corners[:, 0])]) / _CELL
+    cell = np.floor(position)
+    within = position - cell
     to_wall = np.minimum(within, 1 - within).min(axis=1) * _CELL
-    slack = 4 * (_SAME + _ROUNDED) / np.where(height > 0, height, 1e-300)
-    is_sure = (to_wall > slack) & (np.abs(clear).min(axis=1) > slack)
+    tolerance = 4 * (_SAME + _ROUNDED) / np.where(height > 0, height, 1e-300)
+    is_sure = (to_wall > tolerance) & (np.abs(clear).min(axis=1) > tolerance)
     # Cells that share a number are taken for one.
     number = (cell.astype(np.int64).astype(np.uint64) * _MIXED).sum(axis=1)
     _, group, count = np.unique(number, return_inverse=True, return_counts=True)
@@ -126,8 +126,8 @@ def overlapping_faces(
     batches: list[IntArray] = []
     while len(rows):
         ends = tuple(to_vector3(backend, corner) for corner in np.moveaxis(corners[rows], 1, 0))
-        own = upload_integers(backend, rows)
-        partners = _next_in_plane(rays, ends, own, sizes, backend.Float(after))
+        ids = upload_integers(backend, rows)
+        partners = _next_in_plane(rays, ends, ids, sizes, backend.Float(after))
         number = to_numpy(partners).astype(np.int64)
         hit = number != NO_TRIANGLE
         rows, after = rows[hit], number[hit].astype(np.float64)
@@ -140,14 +140,14 @@ def overlapping_faces(
 
 
 def _next_in_plane(
-    rays: TriangleTree, corners: tuple[Vec3, ...], own: Any, sizes: Real, after: Real
+    rays: TriangleTree, corners: tuple[Vec3, ...], face: Any, sizes: Real, after: Real
 ) -> Any:
     """The first face with a number above `after` that overlaps the face `own`, one in each lane, in
     its plane, and is no smaller. sizes: of all faces; of two alike the latter counts as larger."""
     backend = rays.tree.backend
     real, index, vector = backend.Float, backend.UInt32, backend.Array3f
     a, b, c = corners
-    size = dr.gather(real, sizes, own)
+    size = dr.gather(real, sizes, face)
     low, high = fmin(fmin(a, b), c) - _SAME, fmax(fmax(a, b), c) + _SAME
 
     def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
@@ -159,10 +159,10 @@ def _next_in_plane(
         number = index(fmax(row[NUMBER_COLUMN], real(0)))
         theirs = corners_of(row, vector)
         their_size = dr.gather(real, sizes, number, active)
-        larger = (their_size > size) | ((their_size == size) & (number > own))
-        taken = active & (row[NUMBER_COLUMN] > after) & (number < state[0]) & larger
-        taken &= _in_plane(corners, theirs) & _overlap(corners, theirs)
-        return (dr.select(taken, number, state[0]),)
+        larger = (their_size > size) | ((their_size == size) & (number > face))
+        chosen = active & (row[NUMBER_COLUMN] > after) & (number < state[0]) & larger
+        chosen &= _in_plane(corners, theirs) & _overlap(corners, theirs)
+        return (dr.select(chosen, number, state[0]),)
 
     return traverse(rays.tree, visit, (index(NO_TRIANGLE),))[0]
 
