@@ -1,4 +1,4 @@
-"""Tetrahedra that fill cells of a box without a Delaunay triangulation: a body-centered lattice.
+"""A body-centered lattice: tetrahedra that fill cells of a box without a Delaunay triangulation.
 
 Its points are the corners and the centers of equal cells, and where a cell lies on the box, the
 centers of its faces there. Two centers on both sides of a face make four tetrahedra with the four
@@ -7,10 +7,10 @@ ones. So the tetrahedra fill the box, and those at the faces of some cells conta
 cubes their dihedral angles are 60 and 90 degrees (Labelle and Shewchuk 2007).
 
 Cells that are proved empty need none. Proof. Let the level set meet chosen cells only, and let a
-tetrahedron at a face of a chosen cell have its other apex in a cell that is not: that cell holds no
-level, so its center and the corners of the face, which it has too, are on one side. Of the faces of
-the tetrahedron only those with the chosen cell's center and a corner of another side are crossed,
-and the tetrahedron behind such a face belongs to a face of the chosen cell as well.
+tetrahedron at a face of a chosen cell have its other apex in a cell that is not chosen: that cell
+holds no level, so its center and the corners of the face, which it has too, are on one side. Of the
+faces of the tetrahedron only those with the chosen cell's center and a corner of another side are
+crossed, and the tetrahedron behind such a face belongs to a face of the chosen cell as well.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from harnack.tree.empty_space import BoxCells, Clearance, refine_cells
 
 __all__ = ["BccLattice", "distinct_rows"]
 
-# More cells than that are refused: about five million triangles.
+# The largest number of cells, which make about five million triangles; more are refused.
 MOST_CELLS = 2_000_000
-# The points of a lattice that has fewer are found by a table.
+# Points of a lattice that has fewer than this are looked up in a table.
 _MOST_LISTED = 20_000_000
-# Cells of the first round of the octree.
+# The largest number of cells in the first round of the octree.
 _MOST_ROOTS = 200_000
 
 
@@ -88,10 +88,10 @@ class BccLattice:
     def nonempty_cells(self, clearance: Clearance, most_faces: int) -> IntArray:
         """(n, 3) indices of the cells that are not proved empty, by octrees over blocks of them.
 
-        most_faces: triangles that may be made; a cell makes about three.
+        most_faces: the largest number of triangles; a cell makes about three.
 
         Raises:
-            MeshingError: there are too many.
+            MeshingError: there are too many cells.
         """
         # A surface across the box passes through at least this many cells.
         max_cells = min(MOST_CELLS, most_faces)
@@ -147,8 +147,8 @@ class BccLattice:
         return matter[chosen], does
 
     def interior_cells(self, cells: BoolArray) -> BoolArray:
-        """Mask (counts) of the given cells of which all neighbors in the lattice are given cells,
-        too."""
+        """A mask, of the shape `counts`, of the cells in `cells` all of whose neighbors in the
+        lattice are in `cells` as well."""
         padded = np.pad(cells, 1, constant_values=True)
         inner = cells.copy()
         for shift in itertools.product((0, 1, 2), repeat=3):
@@ -161,18 +161,18 @@ class BccLattice:
         return np.clip(index, 0, self.counts - 1)
 
     def touches_cells(self, coordinates: IntArray, cells: BoolArray) -> BoolArray:
-        """(n,) whether points, given by lattice coordinates, are corners or centers of the given
-        cells (counts)."""
+        """(n,) whether points, given by lattice coordinates, are corners or centers of cells in the
+        mask `cells`, of the shape `counts`."""
         padded = np.pad(cells, 1)
         touches = np.zeros(len(coordinates), np.bool_)
         for offset in itertools.product((-1, 0), repeat=3):
-            # Of an odd coordinate both are the same cell.
+            # For an odd coordinate both offsets lead to the same cell.
             index = (coordinates + offset) // 2 + 1
             touches |= padded[tuple(index.T)]
         return touches
 
     def outer_cells(self) -> IntArray:
-        """(n, 3) indices of the cells at the box."""
+        """(n, 3) indices of the cells at the faces of the box."""
         layers: list[IntArray] = []
         for axis in range(3):
             ends = self.counts.copy()
@@ -184,10 +184,10 @@ class BccLattice:
         return distinct_rows(np.concatenate(layers))
 
     def tetrahedra(self, cells: IntArray) -> tuple[IntArray, IntArray]:
-        """Tetrahedra at all faces of cells (k, 3): their points (n, 3) by coordinates, and for each
-        the indices of four of them (m, 4)."""
+        """The tetrahedra at all faces of cells (k, 3): the lattice coordinates (n, 3) of their
+        points, and (m, 4) the indices of the four corners of each."""
         shape = 2 * self.counts + 1
-        keys_by_axis: list[list[IntArray]] = []  # of each face its centers, and its corners in turn
+        keys_by_axis: list[list[IntArray]] = []  # of each face: centers, then corners in turn
         for axis in range(3):
             lower = 2 * cells
             lower[:, axis] += 2
@@ -223,7 +223,7 @@ def distinct_rows(rows: IntArray) -> IntArray:
 
 
 def triangle_limit_error(cells: float, most: int) -> TriangleLimitError:
-    """The error about too many cells."""
+    """The error for too many cells."""
     return TriangleLimitError(
         f"about {cells:.1e} cells hold the surface, which makes some {3 * cells:.0e} triangles; "
         f"at most {most:,} cells are made (max_triangles, and never more than {MOST_CELLS:,}): "

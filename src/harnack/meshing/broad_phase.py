@@ -1,5 +1,5 @@
-"""Broad phase of the intersection test: the pairs of triangles that may meet. All others are proved
-apart, in floating point.
+"""The broad phase of the intersection test: the pairs of triangles that may meet. All other pairs
+are proved apart, in floating point.
 
 Each triangle walks a tree of boxes, and the pairs whose boxes overlap are listed: about eight for
 each triangle. They are then tested side by side, since tests within the walk would wait for each
@@ -41,13 +41,15 @@ __all__ = ["ROUNDING", "near_pairs"]
 # Columns of a record behind the box: the face's number, and whether it is chosen.
 _NUMBER, _CHOSEN = 6, 7
 _LEAF_SIZE = 8
-# Triangles that walk the tree at once, and pairs that there is room for then, at the least.
+# The number of triangles that walk the tree at once, and the smallest number of pairs that there is
+# room for.
 _ROWS_AT_ONCE, _PAIRS_AT_ONCE = 1 << 17, 1 << 22
-# Rounding of a product of three vectors and of two, of differences of coordinates, over the product
-# of their lengths: at most seven roundings of up to six terms, which are 1.16 times that product
-# together, and four of three terms, which are as much as it. So that is a third of what is allowed.
+# A bound of the rounding of a product of three vectors, or of two, whose components are differences
+# of coordinates, relative to the product of their lengths: at most seven roundings of up to six
+# terms, whose sum is at most 1.16 times that product, and four of three terms, whose sum is at most
+# that product. The rounding is a third of this bound.
 ROUNDING = 16 * 2.0**-52
-# What underflow may add, for coordinates of order one.
+# A bound of the error by underflow, for coordinates of order one.
 _UNDERFLOW = 1e-290
 
 
@@ -56,14 +58,14 @@ def near_pairs(vertices: FloatArray, faces: IntArray, among: BoolArray | None) -
     each once; all others are proved not to (`_are_apart`).
 
     vertices: (n, 3), finite.
-    among: (m,) mask; pairs of which neither is chosen are left out.
+    among: (m,) mask of chosen faces; pairs without a chosen face are left out.
     """
     chosen = np.ones(len(faces), np.bool_) if among is None else among
     batches = [np.zeros((0, 2), np.int64)]
     if not chosen.any():
         return batches[0]
     largest = float(np.abs(vertices).max(initial=0.0))
-    # A power of two, so that nothing is rounded.
+    # Scaled by a power of two, so that nothing is rounded.
     scaled = np.ldexp(vertices, -int(np.frexp(largest)[1])) if largest else vertices
     boxes, pairs = _FaceBoxTree.of(scaled[faces], chosen), _PairTests.of(scaled, faces)
     rows = boxes.order[chosen[boxes.order]]
@@ -81,7 +83,8 @@ def near_pairs(vertices: FloatArray, faces: IntArray, among: BoolArray | None) -
 
 @dataclass(frozen=True)
 class _FaceBoxTree:
-    """Boxes of faces in a tree. records: (m, 8); order: their indices leaf by leaf."""
+    """The boxes of faces in a tree. records: (m, 8), a row for each box; order: the indices of the
+    faces, leaf by leaf."""
 
     tree: PackedTree
     records: FloatArray
@@ -101,8 +104,8 @@ class _FaceBoxTree:
         return cls(pack_tree(choose_backend("double"), hierarchy, levels, placed), records, order)
 
     def overlapping(self, rows: IntArray, room: int) -> tuple[Any, Any] | None:
-        """Pairs of some faces, and of others, whose boxes overlap, in no order; None if there are
-        more than `room`."""
+        """The pairs of a face in `rows` and any face whose boxes overlap, as two lists, in no
+        order; None if there are more than `room`."""
         backend = self.tree.backend
         real, vector, integer = backend.Float, backend.Array3f, backend.UInt32
         columns = [real(np.ascontiguousarray(column)) for column in self.records[rows].T]
@@ -119,7 +122,7 @@ class _FaceBoxTree:
 
         def put(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
             with_number = row[_NUMBER]
-            # Two that are chosen meet once.
+            # Two chosen faces are listed once.
             once = (with_number > own_number) | ((row[_CHOSEN] == 0) & (with_number >= 0))
             met = active & once & overlap(row)
             slot = dr.scatter_inc(number, integer(0), met)
@@ -139,7 +142,8 @@ class _FaceBoxTree:
 
 @dataclass(frozen=True)
 class _PairTests:
-    """Tests of pairs of faces. points: of vertices. corners: of the faces, three columns."""
+    """Tests of pairs of faces. points: the records of the vertices. corners: the three columns of
+    the faces."""
 
     points: RecordTable
     corners: tuple[Any, Any, Any]
@@ -151,7 +155,7 @@ class _PairTests:
         return cls(RecordTable.upload(backend, vertices), (a, b, c))
 
     def unseparated(self, one: Any, other: Any) -> IntArray:
-        """Those pairs (k, 2) that are not proved apart, in order."""
+        """(k, 2) the pairs that are not proved apart, in order."""
         backend = self.points.backend
         names = [[dr.gather(backend.UInt32, k, i) for k in self.corners] for i in (one, other)]
         triangles = [
@@ -171,8 +175,9 @@ def _are_apart(a: Corners, b: Corners, shared: list[list[Mask]]) -> Mask:
 
     shared: whether corner i of a is corner k of b.
 
-    - *A plane*: all corners of one that are not shared lie strictly on one side of the other's
-      plane (`_sides`). Points of the one on that plane then are combinations of shared corners.
+    - *A plane*: all corners of one triangle that are not shared lie strictly on one side of the
+      other's plane (`_sides`). Points of the first triangle on that plane are then combinations of
+      shared corners.
     - *Edges*, where at most one corner is shared: triangles in different planes meet in a segment
       on the line of both planes, whose ends lie on edges that pass through the other triangle.
       None does: each edge without a shared corner has its ends strictly on one side of the other's
@@ -207,8 +212,8 @@ def _are_apart(a: Corners, b: Corners, shared: list[list[Mask]]) -> Mask:
 
 
 def _sides(plane: Corners, of: Corners) -> list[tuple[Mask, Mask]]:
-    """Of each corner of a triangle, whether it is strictly above another's plane, and strictly
-    below it; neither where rounding leaves it open."""
+    """For each corner of the triangle `of`, whether it is strictly above the plane of the triangle
+    `plane`, and whether strictly below it; neither where rounding leaves it undecided."""
     u, v = plane[1] - plane[0], plane[2] - plane[0]
     normal = dr.cross(u, v)
     error_scale = ROUNDING * dr.norm(u) * dr.norm(v)
@@ -250,9 +255,9 @@ def _edge_may_pierce(
 
 
 def _shared_corners_first(of: Corners, shared: list[Mask], count: Real) -> Corners:
-    """The corners in another order: what is shared first."""
+    """The corners in another order: shared corners first."""
     once = count < 1.5
-    # One that is shared comes first; of two, the one that is not shared comes last.
+    # A single shared corner comes first; with two, the corner that is not shared comes last.
     from_second = dr.select(once, shared[1], ~shared[0])
     from_third = dr.select(once, shared[2], ~shared[1])
     none = count < 0.5

@@ -1,14 +1,14 @@
-"""What a mesh of a level set has to satisfy, whatever made it, with exact predicates.
+"""Checks that every mesh of a level set has to pass, with exact predicates.
 
 The predicates are signs of determinants: on which side of a plane, or of a line in a plane, points
-lie. Determinants are computed in floating point, with a bound of what rounding may have done to
-them (Shewchuk, Adaptive Precision Floating-Point Arithmetic and Fast Robust Geometric Predicates,
-1997). Where that leaves the sign open it is found in integers: all coordinates are integers times
-one power of two.
+lie. Determinants are computed in floating point, with a bound of their rounding error (Shewchuk,
+Adaptive Precision Floating-Point Arithmetic and Fast Robust Geometric Predicates, 1997). Where that
+leaves the sign undecided, it is computed in integers: all coordinates are integers times one power
+of two.
 
 Every mesh that `mesh` returns has passed checks: vertices and middles of triangles by samples of
 the field, faces that pass through each other by exact predicates, the number of triangles by a
-limit. The largest body is found by signed volumes and by which body holds which (`clipping`). Files
+limit. The largest body is chosen by signed volumes and by the nesting of shells (`clipping`). Files
 hold single precision, to which vertices are snapped before the last check.
 """
 
@@ -70,7 +70,7 @@ SignArray = npt.NDArray[np.int8]
 _UNIT = 2.0**-53
 # Shewchuk's bounds of the rounding of both determinants, over the sum of their terms' magnitudes.
 _ORIENT3D_ERROR, _ORIENT2D_ERROR = (7 + 56 * _UNIT) * _UNIT, (3 + 16 * _UNIT) * _UNIT
-# What underflow may add, for coordinates of order one.
+# A bound of the error by underflow, for coordinates of order one.
 _UNDERFLOW = 1e-290
 
 
@@ -110,8 +110,8 @@ def _scaled(points: FloatArray) -> FloatArray:
 def _signs_with_fallback(
     value: FloatArray, error: FloatArray, zero: BoolArray, points: FloatArray, exact: Any
 ) -> SignArray:
-    """Signs of values known up to errors, or to be 0; where that is not enough, by `exact` of the
-    points."""
+    """The signs of values that are known up to errors, or known to be 0; where errors leave a sign
+    undecided, `exact` computes it from the points."""
     signs: SignArray = np.sign(value).astype(np.int8)
     signs[zero] = 0
     open_rows = np.flatnonzero(~zero & (np.abs(value) <= error + _UNDERFLOW))
@@ -145,9 +145,9 @@ def _orient2d_exact(points: Any) -> Any:
 
 _EDGES = ((0, 1), (1, 2), (2, 0))
 _PAIRS_AT_ONCE = 1 << 18
-# Of more triangles than this a kernel finds the pairs, which takes 0.05 s to record.
+# For more triangles than this a kernel lists the pairs, which takes 0.05 s to record.
 _MIN_FACES_FOR_KERNEL = 5_000
-# So many triangles of a size are compared with each other at once.
+# The largest number of triangles of a size that are compared with each other at once.
 _MOST_AT_ONCE = 1 << 19
 
 
@@ -163,18 +163,18 @@ def misoriented_faces(function: LevelFunction, vertices: FloatArray, faces: IntA
 def intersecting_faces(
     vertices: FloatArray, faces: IntArray, among: BoolArray | None = None
 ) -> IntArray:
-    """Indices of faces (m, 3) that meet others in more than what they share, decided exactly: that
-    an edge of another face passes through, or that lie on others in their plane, and of those
-    others.
+    """Indices of faces (m, 3) that meet other faces in more than shared corners and edges, decided
+    exactly: faces that an edge of another face passes through, faces that lie on another face in
+    their plane, and the other faces of such pairs.
 
     Two triangles in different planes meet beyond their common corners if and only if an edge of one
     passes through the other, with its ends on both sides of that one's plane, or ends on it:
-    corners that lie on other triangles are not looked for, since edges beyond them would pass
+    corners that lie on other triangles are not searched for, since edges beyond them would pass
     through. Two triangles in one plane overlap unless the line of an edge has them on its two sides
     (separating axes), whatever they share: faces that are there twice, or folded back onto their
     neighbors, do. Pairs are looked for among those whose boxes overlap.
 
-    among: (m,) mask; pairs of which neither is chosen are not looked at.
+    among: (m,) mask of chosen faces; pairs without a chosen face are not tested.
     """
     crossing_faces: list[IntArray] = []
     for pairs, heights in _pairs_in_doubt(vertices, faces, among):
@@ -191,16 +191,16 @@ def intersecting_faces(
 
 
 def touching_pairs(vertices: FloatArray, faces: IntArray) -> tuple[IntArray, FloatArray]:
-    """Pairs (k, 2) of faces (m, 3) of which one has a corner or an edge on the other, beyond a
-    corner that they share, decided exactly; and (k, 3) a corner that is on the other, or the middle
-    of an edge.
+    """Pairs (k, 2) of faces (m, 3) that touch, decided exactly: one has a corner or an edge on the
+    other, beyond a corner that they share. Also (k, 3) the corner on the other face, or the middle
+    of the edge.
 
-    Of a face that lies on another as a whole its edges do. Where edges meet between their ends, and
-    lie in neither face's plane, `intersecting_faces` has the pair. So it has those that share two
-    corners, which have no more in common unless they overlap in one plane. Of two that share one
-    corner the planes meet in a line through it, or are one: each has a segment from it on that
-    line, and where these lie along each other an edge passes through a face, or the shorter one is
-    an edge at the corner, and in the other's plane.
+    If all of a face lies on another, so do its edges. Where edges meet between their ends, and lie
+    in neither face's plane, `intersecting_faces` has the pair. It also has the pairs that share two
+    corners, which have no more in common unless they overlap in one plane. If two faces share one
+    corner, their planes meet in a line through it, or are equal: each face has a segment from the
+    corner on that line, and where these lie along each other an edge passes through a face, or the
+    shorter one is an edge at the corner, and in the other's plane.
     """
     batches: list[IntArray] = []
     contacts: list[FloatArray] = []
@@ -235,8 +235,8 @@ def touching_pairs(vertices: FloatArray, faces: IntArray) -> tuple[IntArray, Flo
 def _pairs_in_doubt(
     vertices: FloatArray, faces: IntArray, among: BoolArray | None
 ) -> Generator[tuple[IntArray, tuple[SignArray, SignArray]]]:
-    """Pairs (k, 2) of faces that are not proved apart, some at a time, and the `_heights` of the
-    second over the first and of the first over the second."""
+    """Pairs (k, 2) of faces that are not proved apart, in batches, and the `_heights` of the second
+    over the first and of the first over the second."""
     face_count = len(faces) if among is None else int(among.sum())
     by_kernel = face_count > _MIN_FACES_FOR_KERNEL
     near = near_pairs(vertices, faces, among) if by_kernel else _near_pairs(vertices[faces], among)
@@ -249,11 +249,11 @@ def _pairs_in_doubt(
 
 
 def _near_pairs(corner: FloatArray, among: BoolArray | None) -> IntArray:
-    """Pairs (k, 2) of triangles (m, 3, 3) whose boxes overlap, each once; given a mask, only those
-    with one of the chosen triangles.
+    """Pairs (k, 2) of triangles (m, 3, 3) whose boxes overlap, each once; given a mask, only pairs
+    with a chosen triangle.
 
-    Triangles of one size (up to 2) at a time, with those no larger: of a large triangle and many
-    small ones only what is near is looked at.
+    Triangles of one size (up to a factor of 2) are compared at a time, with triangles that are no
+    larger: so a large triangle is compared only with the small triangles near it.
     """
     import scipy.spatial  # here: half a second that few need
 
@@ -289,14 +289,15 @@ def _near_pairs(corner: FloatArray, among: BoolArray | None) -> IntArray:
             query_tree = searching.cKDTree(center[rows])
             table = query_tree.sparse_distance_matrix(trees[j], reach, output_type="ndarray")
             first, second = rows[table["i"]], groups[j][table["j"]]
-            once = (first < second) | ~chosen[second]  # two that are chosen meet once
+            once = (first < second) | ~chosen[second]  # two chosen triangles are listed once
             add(first[once], second[once])
     return np.concatenate(batches).astype(np.int64)
 
 
 def _are_separated(vertices: FloatArray, faces: IntArray, pairs: IntArray) -> BoolArray:
-    """(k,) whether two faces are proved to share nothing but common vertices: the plane of one has
-    all other vertices of the other strictly on one side. False where rounding leaves it undecided.
+    """(k,) whether two faces are proved to share nothing but common vertices: the plane of one face
+    has all vertices of the other that are not common strictly on one side. False where rounding
+    leaves it undecided.
 
     See `broad_phase.ROUNDING` for the error of heights.
     """
@@ -315,14 +316,15 @@ def _are_separated(vertices: FloatArray, faces: IntArray, pairs: IntArray) -> Bo
             shared = (of[:, k, None] == plane).any(axis=1)
             above &= shared | (height > error)
             below &= shared | (height < -error)
-        # A face that shares all its corners is the same one.
+        # A face that shares all its corners is the same face.
         is_other = (of[:, :, None] != plane[:, None]).all(axis=2).any(axis=1)
         apart[rows] = (above | below) & is_other
     return apart
 
 
 def _heights(vertices: FloatArray, plane: IntArray, of: IntArray) -> SignArray:
-    """(k, 3) on which sides of the planes of faces (k, 3) the corners of others lie; 0 on them."""
+    """(k, 3) the signs that tell on which sides of the planes of faces (k, 3) the corners of other
+    faces lie; 0 on a plane."""
     a, b, c = (vertices[plane[:, i]] for i in range(3))
     signs = np.zeros((len(of), 3), np.int8)
     for i in range(3):
@@ -334,9 +336,9 @@ def _heights(vertices: FloatArray, plane: IntArray, of: IntArray) -> SignArray:
 def _edge_pierces(
     vertices: FloatArray, through: IntArray, of: IntArray, heights: SignArray
 ) -> BoolArray:
-    """(k,) whether an edge of faces `of` (k, 3) passes through faces `through`, of whose planes the
-    corners are on the sides `heights`: the line of the edge passes all three edges on one side, or
-    touches them."""
+    """(k,) whether an edge of the faces `of` (k, 3) passes through the faces `through`: its line
+    passes all three edges on one side, or touches them. heights: the sides of the planes of
+    `through` that the corners of `of` are on."""
     pierces = np.zeros(len(of), np.bool_)
     for i, j in _EDGES:
         rows = np.flatnonzero((heights[:, i] * heights[:, j] < 0) & ~pierces)
@@ -348,8 +350,8 @@ def _edge_pierces(
 
 
 def _overlap(first: FloatArray, second: FloatArray) -> BoolArray:
-    """(k,) whether triangles (k, 3, 3) in one plane have an area in common; seen along the axis in
-    which they are thinnest."""
+    """(k,) whether triangles (k, 3, 3) in one plane have an area in common; they are projected
+    along the axis in which they are thinnest."""
     normal = np.abs(area_normals(first))
     axes = np.array([[1, 2], [2, 0], [0, 1]])[normal.argmax(axis=1)]
     flat = [np.take_along_axis(t, axes[:, None].repeat(3, axis=1), axis=2) for t in (first, second)]
@@ -379,8 +381,8 @@ def _is_on(triangle: FloatArray, p: FloatArray, q: FloatArray) -> BoolArray:
 
 
 def _is_between(triangle: FloatArray, p: FloatArray) -> BoolArray:
-    """(k,) whether the ways from the first corners of triangles (k, 3, 3) to points in their planes
-    run between those to the two other corners, or along one of them."""
+    """(k,) whether the directions from the first corners of triangles (k, 3, 3) to points in their
+    planes lie between the directions to the two other corners, or along one of them."""
     normal = np.abs(area_normals(triangle))
     axes = np.array([[1, 2], [2, 0], [0, 1]])[normal.argmax(axis=1)]
     a = np.take_along_axis(triangle, axes[:, None].repeat(3, axis=1), axis=2)
@@ -419,7 +421,7 @@ class OffLevelError(LocalizedMeshingError):
 
 
 class SelfIntersectionError(LocalizedMeshingError):
-    """Triangles that pass through each other, by index; places: their centers."""
+    """Triangles pass through each other. faces: their indices. places: their centers."""
 
     def __init__(self, message: str, places: FloatArray, faces: IntArray) -> None:
         super().__init__(message, places)
@@ -438,7 +440,8 @@ class TriangleLimitError(UnrefinableError):
     """The mesh would have more triangles than allowed, and was not begun."""
 
 
-# So many places may be wrong in smaller cells, or this part of those before.
+# The largest number of failures for which smaller cells are tried again, and the largest ratio to
+# the number of failures before.
 _MAX_FAILURES_FOR_RETRY, _REQUIRED_FAILURE_REDUCTION = 20, 0.5
 
 
@@ -461,7 +464,8 @@ def is_retry_promising(
 
 
 def euler_characteristic(faces: IntArray, edges: Edges | None = None) -> int:
-    """Vertices in use, less edges, and faces. edges: those of `half_edges`, if known."""
+    """The Euler characteristic: the number of used vertices, minus that of edges, plus that of
+    faces. edges: of `half_edges`, if they are known."""
     vertices = int(np.count_nonzero(np.bincount(faces.ravel())))
     edges = edges or Edges.of(half_edges(faces))
     return vertices - len(edges.vertices) + len(faces)
@@ -471,10 +475,10 @@ def check_manifold(faces: IntArray, vertices: FloatArray | None = None) -> None:
     """Raise unless every edge has one or two faces, which run it in opposite directions, and the
     faces around every vertex are joined by edges.
 
-    vertices: (n, 3), to say where not.
+    vertices: (n, 3), for the locations of failures.
 
     Raises:
-        MeshingError: otherwise; a LocalizedMeshingError, given vertices.
+        MeshingError: the mesh is no manifold; a LocalizedMeshingError if vertices are given.
     """
 
     def fail(message: str, where: IntArray) -> Never:
@@ -511,7 +515,8 @@ def check_no_self_intersection(vertices: FloatArray, faces: IntArray) -> None:
     decided exactly.
 
     Raises:
-        MeshingError: so; a SelfIntersectionError with these faces.
+        MeshingError: a vertex is not finite; a SelfIntersectionError, with the faces, if faces
+            meet.
     """
     if not np.isfinite(vertices).all():
         raise MeshingError("vertices of the mesh are no numbers: choose another level or `clip`")
@@ -555,18 +560,18 @@ def check_near_level(
     """Raise unless vertices and centers of faces are within `tolerance` of the level, by samples of
     the function.
 
-    A point is within it if the gradient says so, |f|/|grad f| <= tolerance; or if f changes its
-    sign between two points at that distance from it or nearer, along the normal of the face or
-    one of 13 other lines, for then a continuous f has its level between them. These lines are
-    askew, since many parts have faces in planes of coordinates, where rounding decides the sign;
-    and every cone of 28 degrees about its axis has one of their directions in it, as the corner of
-    a cube has (35 degrees). A solid is cut at the volume's boundary: to be outside of the volume
-    counts as a positive sign. Boundary vertices of an angle's level set are on its curve, where it
-    has no value, and are left out; and triangles smaller than half of the tolerance are as near as
-    their corners.
+    A point counts as within the tolerance if the gradient says so, |f|/|grad f| <= tolerance; or if
+    f changes its sign between two points at that distance from it or nearer, along the normal of
+    the face or one of 13 other lines, for then a continuous f has its level between them. These
+    lines are askew, since many parts have faces in planes of coordinates, where rounding decides
+    the sign; and every cone of 28 degrees about its axis has one of their directions in it, as the
+    corner of a cube has (35 degrees). A solid is cut at the volume's boundary: to be outside of the
+    volume counts as a positive sign. Boundary vertices of an angle's level set are on its curve,
+    where it has no value, and are left out; and triangles smaller than half of the tolerance are as
+    near as their corners.
 
     Raises:
-        OffLevelError: with the points that are not.
+        OffLevelError: points are farther from the level; they are its locations.
     """
     off_level, count = points_off_level(function, vertices, faces, tolerance, volume)
     if len(off_level):
@@ -585,8 +590,8 @@ def points_off_level(
     tolerance: float,
     volume: Volume | None,
 ) -> tuple[FloatArray, int]:
-    """Those vertices and centers of faces (k, 3) that are not within `tolerance` of the level, as
-    `check_near_level` decides it; and how many were looked at."""
+    """The vertices and centers of faces (k, 3) that are not within `tolerance` of the level, as
+    `check_near_level` decides it; and the number of points that were tested."""
     corner = vertices[faces]
     normal = area_normals(corner)
     longest = np.stack([row_norms(corner[:, k] - corner[:, k - 1]) for k in range(3)]).max(axis=0)
@@ -601,7 +606,7 @@ def points_off_level(
     directions = np.concatenate([mean[is_checked], normal[large]])
     directions /= np.maximum(row_norms(directions), 1e-300)[:, None]
     rows = np.flatnonzero(~(function.sample(points).distance <= tolerance))
-    # Nearer ones as well: behind a cap there may be little of a solid.
+    # Nearer points are tried as well: behind a cap there may be little of a solid.
     for fraction, line in itertools.product((1.0, 0.25, 0.0625), (None, *_askew_lines())):
         if not len(rows):
             break
@@ -632,8 +637,8 @@ def point_text(x: FloatArray) -> str:
 
 
 def nonmanifold_vertices(faces: IntArray) -> IntArray:
-    """Vertices, by index, at which faces (m, 3) are not a manifold: those of edges with more than
-    two faces, and those that have more than one fan of faces."""
+    """Vertices, by index, at which faces (m, 3) are not a manifold: the ends of edges with more
+    than two faces, and vertices with more than one fan of faces."""
     pairs, count = half_edges(faces), int(faces.max(initial=-1)) + 1
     edges = Edges.of(pairs)
     overused = np.unique(pairs[edges.multiplicity[edges.edge_of_pair] > 2])
@@ -646,8 +651,8 @@ def nonmanifold_vertices(faces: IntArray) -> IntArray:
 
 
 def _vertex_fans(faces: IntArray, edges: Edges) -> tuple[int, IntArray]:
-    """How many fans of faces, joined by edges, all vertices have together, and of each corner of
-    the faces (3m,) the fan that it belongs to. edges: those of `half_edges`."""
+    """The number of fans of faces, joined by edges, that all vertices have together, and (3m,) the
+    fan that each corner of a face belongs to. edges: of `half_edges`."""
     import scipy.sparse  # here: half a second that few need
     import scipy.sparse.csgraph as csgraph_module
 

@@ -43,14 +43,15 @@ __all__ = [
 ]
 
 _MOST_SEGMENTS = 2000
-# Parts of a union have its area up to this part of it. Else, and where triangles of it cross, they
-# are grown, by this part of the size; at sharp corners by no more than some times that.
+# The areas of a union and of its parts may differ by the first, relative to the area. Otherwise,
+# and where triangles of the union cross, parts are grown, by the second, relative to the size; at
+# sharp corners by at most that over the third.
 _SAME_AREA, _GROWN, _LEAST_SLANT = 1e-6, 1e-9, 0.1
 _MOST_CELLS = 1_000_000
 
 
 def to_manifold(surface: TriangleMesh) -> Manifold:
-    """A closed mesh whose faces are seen counter-clockwise from outside.
+    """The solid of a closed mesh, whose faces run counter-clockwise seen from outside.
 
     Raises:
         MeshingError: it is not closed.
@@ -70,12 +71,12 @@ def to_manifold(surface: TriangleMesh) -> Manifold:
 
 
 def mesh_manifold(solid: MeshSolid) -> Manifold | None:
-    """The mesh of a `MeshSolid`, itself: of one that crosses itself the union of its parts, or None
-    where a part crosses itself, or is a cavity.
+    """The mesh of a `MeshSolid`; if it crosses itself the union of its parts, or None where a part
+    crosses itself or is a cavity.
 
     Parts in contact up to rounding would be left with gaps as thin as that, which have an area, or
     pass through each other: if the union has more than the boundary of the solid, or triangles of
-    it cross, parts are grown by next to nothing first.
+    it cross, parts are grown by a tiny length first.
 
     Raises:
         MeshingError: more than two faces meet at an edge.
@@ -83,7 +84,7 @@ def mesh_manifold(solid: MeshSolid) -> Manifold | None:
     from manifold3d import Error, Manifold, Mesh64, OpType
 
     surface = solid.surface
-    # Copies, which can be written to; vertices are as they were given, bit by bit.
+    # Copies, which can be written to; vertices are the input's, bit by bit.
     body = Manifold(Mesh64(np.array(solid.vertices), np.array(surface.faces, np.uint64)))
     if body.status() != Error.NoError:
         raise MeshingError(
@@ -125,9 +126,9 @@ def grown(surface: TriangleMesh, length: float) -> TriangleMesh:
 
 
 def without_short_edges(solid: Manifold, length: float) -> Manifold:
-    """A solid with short edges and slivers left out that move its surface by up to a length; or as
-    it is, if its volume changed by more than that explains: where slivers are as thin as rounding,
-    manifold3d has been seen to lose a part."""
+    """A solid without short edges and slivers, whose removal moves its surface by up to a length;
+    or the solid itself, if its volume would change by more than that explains: where slivers are as
+    thin as rounding, manifold3d has been seen to lose a part."""
     simpler = solid.simplify(length)
     max_change = 2 * length * solid.surface_area()
     return simpler if abs(simpler.volume() - solid.volume()) <= max_change else solid
@@ -154,11 +155,11 @@ def extruded_manifold(
 ) -> Manifold:
     """The outline over 0 <= z <= height, its end turned by `twist` degrees and scaled by `taper`.
 
-    Without a twist the faces are flat, and as they are. Else the vertices lie on the surface, and
-    faces within `tolerance` of it. Proof: a triangle of edges of L at most, mapped, is within
-    M L^2/6 of the mapped triangle, where M bounds second derivatives of the map along lines (it
-    lies within L/sqrt(3) of a point). For turning by a and scaling by k within a unit of length,
-    at distances up to R from the axis, with q = max(1, taper), M = q (a + a^2 R) + k (1 + 2 a R).
+    Without a twist the faces are flat, and exact. Otherwise the vertices lie on the surface, and
+    faces within `tolerance` of it. Proof: a triangle of edges of L at most, mapped, is within M
+    L^2/6 of the mapped triangle, where M bounds second derivatives of the map along lines (it lies
+    within L/sqrt(3) of a point). For turning by a and scaling by k within a unit of length, at
+    distances up to R from the axis, with q = max(1, taper), M = q (a + a^2 R) + k (1 + 2 a R).
 
     Raises:
         MeshingError: so fine that it has millions of faces.
@@ -208,7 +209,8 @@ def revolved_manifold(outline: Outline, tolerance: float) -> Manifold:
 
 
 def _section(outline: Outline) -> tuple[CrossSection, float]:
-    """An outline, times a scale for which it is not rounded (`scale_for_clipper`)."""
+    """The cross-section of an outline, times a scale for which it is not rounded
+    (`scale_for_clipper`), and that scale."""
     from manifold3d import CrossSection
 
     loops, scale = scale_for_clipper(outline)
@@ -273,7 +275,7 @@ _LARGEST = 2.0**36
 _MOST_COARSE = 1e4
 # Where the snapped mesh does not pass its checks, it is simplified within these numbers of steps.
 _SIMPLIFY_STEPS = (4, 32)
-# And mended, where triangles cross, within this number.
+# Where triangles cross, it is mended within this number of steps.
 _REPAIR_STEPS = 32
 
 
@@ -343,8 +345,8 @@ def _grid_spacing(x: FloatArray) -> float:
 
 
 def _quantize(mesh: trimesh.Trimesh, step: float) -> trimesh.Trimesh:
-    """The mesh with vertices on the grid; where that does not pass its checks, mended there or
-    simplified."""
+    """The mesh with vertices on the grid; if that does not pass its checks, mended where it fails,
+    or simplified."""
     original = TriangleMesh(np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64))
     x, faces, is_kept = _merge_on_grid(original, step)
     is_plain = not cast("Any", mesh.visual).defined
@@ -370,7 +372,8 @@ def _quantize(mesh: trimesh.Trimesh, step: float) -> trimesh.Trimesh:
 
 
 def _simplify_until_valid(original: TriangleMesh, step: float) -> TriangleMesh | None:
-    """Without slivers, simplified by manifold3d; None if that does not help either."""
+    """The mesh on the grid without slivers, simplified by manifold3d; None if that does not help
+    either."""
     for steps in _SIMPLIFY_STEPS:
         simpler = from_manifold(without_short_edges(to_manifold(original), steps * step))
         x, faces, is_kept = _merge_on_grid(simpler, step)
@@ -385,11 +388,11 @@ def _simplify_until_valid(original: TriangleMesh, step: float) -> TriangleMesh |
 
 
 def _merge_on_grid(surface: TriangleMesh, step: float) -> tuple[FloatArray, IntArray, BoolArray]:
-    """Vertices on the grid, faces between the first of those that are one point, and which faces
-    are left."""
+    """The vertices on the grid; the faces, between the first of the vertices at each point; and
+    which faces still have three corners."""
     grid = np.round(surface.vertices / step)
     x = grid * step
-    # Points that are one, by their coordinates one after the other.
+    # Vertices at the same point, by their coordinates one after the other.
     group = np.zeros(len(x), np.int64)
     for column in (grid - grid.min(axis=0)).astype(np.int64).T:
         _, group, _, _ = unique_with_inverse(group * (int(column.max()) + 1) + column)
@@ -402,8 +405,9 @@ def _merge_on_grid(surface: TriangleMesh, step: float) -> tuple[FloatArray, IntA
 def _resolve_after_rounding(
     rounded: TriangleMesh, original: TriangleMesh, length: float
 ) -> TriangleMesh | None:
-    """A surface mended where triangles cross, moved by no more than a length; None if none do, or
-    if that does not help and those that were given, such as of a mesh that was repaired, do too.
+    """The rounded surface mended where triangles cross, moved by no more than a length; None if
+    none cross, or if mending does not help and triangles of the original cross too, as those of a
+    repaired mesh may.
 
     Raises:
         LocalizedMeshingError: it is not closed, or triangles cross.
