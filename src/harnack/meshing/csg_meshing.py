@@ -92,14 +92,17 @@ __all__ = [
     "solid_value_range",
 ]
 
-# Cells of offsets of meshes, in tolerances; and how many secants find roots on their edges.
+# The size of cells for offsets of meshes, in tolerances; and the number of secant steps for roots
+# on their edges.
 _CELLS_OF_OFFSET, _SECANTS = 6.0, 2
-# Where other parts leave nothing is looked for at once in lattices of more cells than this.
+# In lattices of more cells than this, the region where other operands leave nothing is computed at
+# once.
 _MANY_CELLS = 100_000
-# How far joining their triangles may move them, in tolerances: the first that does no harm; and how
-# far mending may, which is tried with the least.
+# How far merging of coplanar triangles may move surfaces of offsets, in tolerances, the first value
+# that does no harm; and how far mending may move them, which is done after merging.
 _JOINED_WITHIN, _MENDED_WITHIN = (0.5, 0.25, 0.1), 0.5
-# Triangles of them are cut in three where their centers are farther off, in tolerances; so often.
+# Triangles of offsets are cut in three where their centers are farther off the level, in
+# tolerances; and how often.
 _FAR_OFF, _TIMES_CUT = 1.8, 2
 
 # Meshes the level set of an angle, which ends at its curve: field, level -> vertices and faces.
@@ -126,17 +129,18 @@ class CsgMesher:
     """Meshes solids in a box from `lower` to `upper`, (3,) each.
 
     tolerance: a length, at the midpoints of edges and the centers of faces.
-    spacing: of cells, at most.
-    per_wave: cells along a wave (`Field.min_wavelength`) at the least; None for no such limit.
+    spacing: the largest size of cells.
+    per_wave: the smallest number of cells along a wave (`Field.min_wavelength`); None for no such
+        limit.
     mesh_angle: meshes level sets of angles, which end at a curve.
-    most_faces: of each level set.
-    evaluations: of fields so far, in points.
+    most_faces: the largest number of triangles of each level set.
+    evaluations: the number of evaluations of fields so far, in points.
     levels: number of level sets meshed so far.
-    smallest_cell: the smallest spacing of these.
-    uploads: of the fields that were meshed so far.
+    smallest_cell: the smallest spacing of these level sets.
+    uploads: the prepared fields that were meshed so far.
     intersected_with: solids that everything meshed next is intersected with (see
         `IntersectedOperands`).
-    irrelevant_region_cache: the operands and the region of the last call that asked where other
+    irrelevant_region_cache: the operands and the region of the last call that computed where other
         operands leave nothing.
     """
 
@@ -156,8 +160,8 @@ class CsgMesher:
     irrelevant_region_cache: tuple[IntersectedOperands, IrrelevantRegion] | None = None
 
     def mesh_sublevel(self, solid: Solid, level: float) -> Manifold:
-        """The points of the box where a solid's function is at most `level`; what there is outside
-        of the box has no meaning.
+        """The points of the box where a solid's function is at most `level`; the result outside of
+        the box has no meaning.
 
         Raises:
             MeshingError: a part cannot be meshed.
@@ -202,7 +206,7 @@ class CsgMesher:
         return to_manifold(self.mesh_smooth_level(solid, level)[0])
 
     def _joined(self, solid: BooleanSolid, level: float) -> Manifold:
-        """A union; or an intersection, from which complements are cut away."""
+        """The mesh of a union, or of an intersection, from which complements are cut away."""
         from manifold3d import Manifold, OpType
 
         numbers = range(len(solid.parts))
@@ -217,9 +221,9 @@ class CsgMesher:
         return Manifold.batch_boolean([common, *away], OpType.Subtract)
 
     def _part(self, solid: BooleanSolid, number: int, level: float) -> Manifold:
-        """One part of a union or an intersection, made where the others of an intersection may
-        leave something of it (`IntersectedOperands`); of a complement in an intersection what is
-        cut away."""
+        """The mesh of one operand of a union or an intersection: in an intersection only where the
+        other operands may leave something of it (`IntersectedOperands`). For a complement in an
+        intersection, the solid that is cut away."""
         previous, part = self.intersected_with, solid.parts[number]
         if not solid.is_union:
             beside = [operand for operand in solid.parts if operand is not part]
@@ -236,10 +240,10 @@ class CsgMesher:
             self.intersected_with = previous
 
     def _closed(self, function: LevelFunction, lattice: BccLattice) -> TriangleMesh:
-        """A level set in a box: where the other parts may leave something, if cells are many. Of
-        few all are made, so that what is there twice is the same bit by bit; unless that goes
-        wrong, as it may where nothing is left: a function of the angle about an axis jumps there,
-        and others have no value beyond some surface."""
+        """A level set in a box. If there are many cells, only those where the other operands may
+        leave something are meshed. If there are few, all are meshed, so that copies of a surface
+        are the same bit by bit; unless that fails, as it may where nothing is left: a function of
+        the angle about an axis jumps there, and other functions have no value beyond a surface."""
         elsewhere: IrrelevantRegion | None = None
         if math.prod(lattice.counts.tolist()) < _MANY_CELLS:
             try:
@@ -254,8 +258,8 @@ class CsgMesher:
         )
 
     def _elsewhere(self) -> IrrelevantRegion | None:
-        """How far around points the other parts leave nothing, by proof; None if there are none.
-        The two sides of a wall have the same."""
+        """The region where the other operands are proved to leave nothing; None if there are no
+        other operands. The two sides of a wall have the same region."""
         if not self.intersected_with:
             return None
         if (
@@ -277,8 +281,8 @@ class CsgMesher:
         return region
 
     def mesh_smooth_level(self, field: Field, level: float) -> tuple[TriangleMesh, bool]:
-        """The boundary of {f <= level} as one level set, and whether it is all of it: if not, it is
-        closed outside of the box in a way that has no meaning."""
+        """The boundary of {f <= level} as one level set, and whether it is the whole boundary: if
+        not, it is closed outside of the box in a way that has no meaning."""
         hull = _hull(field, level)
         lower, upper = self.lower, self.upper
         is_whole = False
@@ -312,7 +316,7 @@ class CsgMesher:
         return box_manifold(self.lower - pad, self.upper + pad)
 
     def _wall(self, wall: BandSolid, level: float) -> Manifold:
-        """Where a field is within half_width + level of the wall's level."""
+        """The mesh of the points where a field is within half_width + level of the wall's level."""
         from manifold3d import Manifold
 
         half = wall.half_width + level
@@ -342,7 +346,7 @@ class CsgMesher:
         points = lattice.points(2 * np.argwhere(np.ones(lattice.counts)) + 1)
         middle = 0.5 * (low + high)
         samples = self.function(field, middle).sample(points)
-        # Where the wall may be near.
+        # Cells where the wall may be near.
         near = samples.distance <= np.median(samples.distance)
         steep = float(np.median(np.linalg.norm(samples.gradient[near], axis=1)))
         self.evaluations += len(points)
@@ -354,7 +358,8 @@ class CsgMesher:
             )
 
     def _between_angle_levels(self, field: SolidAngle, low: float, high: float) -> TriangleMesh:
-        """Between two levels of an angle: both end at the same vertices, those of the curve."""
+        """The surface around the points between two levels of an angle: both levels end at the same
+        vertices, those of the curve."""
         inner, outer = self.mesh_angle(field, low), self.mesh_angle(field, high)
         count = sum(map(len, field.loops))
         if not np.array_equal(inner.vertices[:count], outer.vertices[:count]):
@@ -366,14 +371,14 @@ class CsgMesher:
         return TriangleMesh(vertices, np.concatenate([outer.faces, index[inner.faces][:, ::-1]]))
 
     def _offset(self, solid: MeshSolid, level: float) -> Manifold:
-        """The points within a distance of a mesh, or deeper inside than that.
+        """The points within a distance of a mesh, or deeper inside than that distance.
 
         Offsets of meshes have creases wherever the mesh has, too many for cells to be refined
-        beside them. So cells are small at once, and of f, a distance, roots are linear along their
-        edges but at creases. Then triangles that are nearly in a plane are joined, those that lie
-        across a crease are cut, and those that pass through each other are mended. Parts thinner
-        than a cell, such as the tip of a knife edge, may be left out: points of them are less than
-        a cell from the level.
+        beside them. So cells are small at once; and since f is a distance, it is linear along their
+        edges except at creases. Then triangles that are nearly in a plane are merged, triangles
+        across a crease are cut, and triangles that pass through each other are mended. Parts
+        thinner than a cell, such as the tip of a knife edge, may be left out: points of them are
+        less than a cell from the level.
         """
         lower, upper = (np.array(end) for end in _finite_hull(solid, level))
         if not (lower < upper).all():
@@ -398,7 +403,7 @@ class CsgMesher:
         return to_manifold(surface)
 
     def _image(self, solid: TransformedSolid, level: float) -> Manifold:
-        """Of a solid under an affine map: the image of its mesh."""
+        """The image of a solid's mesh under an affine map."""
         matrix, offset = np.array(solid.map.matrix), np.array(solid.map.translation_vector)
         ends = np.stack([self.lower, self.upper])
         corners = np.stack(np.meshgrid(*ends.T, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -423,7 +428,7 @@ class CsgMesher:
 
 
 def _has_no_complement(solid: Solid) -> bool:
-    """Whether there is no complement within a solid, as it is meshed."""
+    """Whether a solid has no complement among its operands, as it is meshed."""
     if isinstance(solid, BooleanSolid):
         return all(_has_no_complement(operand) for operand in solid.parts)
     if isinstance(solid, TransformedSolid | OffsetSolid):
@@ -447,8 +452,8 @@ def _finite_hull(solid: MeshSolid, level: float) -> tuple[FloatArray, FloatArray
 
 
 def _hull(field: Field, level: float) -> Volume | None:
-    """A volume that holds {f <= level}, if it has bounds. A domain does not count: what ends there
-    is cut by it."""
+    """A volume that holds {f <= level}, if it has bounds. A domain does not count: a surface that
+    ends there is cut by it."""
     if isinstance(field, Solid):
         extent = field.sublevel_extent(level)
     else:
@@ -462,7 +467,7 @@ def _hull(field: Field, level: float) -> Volume | None:
 
 
 def _underlying_field(field: Field) -> Field:
-    """The field itself, of a region of a field."""
+    """The field of a sublevel solid; any other field itself."""
     return field.field if isinstance(field, SublevelSolid) else field
 
 
@@ -507,13 +512,13 @@ class _DomainExtendedFunction(LevelFunction):
 
 # Cells across a solid, unless a spacing is given.
 _ACROSS = 24
-# How many sizes of cells are tried, and what each is of the one before.
+# How many sizes of cells are tried, and the ratio of each size to the one before.
 _MOST_ATTEMPTS = 3
 _SMALLER = 0.6
-# Where parts were cut by each other, slivers may pass through their neighbors by rounding: what may
-# be moved to leave them out, in tolerances, in the order in which it is tried.
+# Where operands were cut by each other, slivers may pass through their neighbors by rounding: how
+# far the surface may be moved to remove them, in tolerances, in the order of the attempts.
 _SLIVERS_WITHIN = (1e-3, 1e-4, 0.0)
-# Room around what has an extent, as a part of its size.
+# The margin around an extent, relative to its size.
 _MARGIN = 0.01
 
 
@@ -535,11 +540,11 @@ class SolidMeshResult:
 
 
 def solid_and_level(field: Field, solid: Any, level: float | None) -> tuple[Solid, float]:
-    """The solid that is asked for by `solid`, (low, high) or True, and its level.
+    """The solid that the argument `solid` describes, (low, high) or True, and its level.
 
     Raises:
-        ValueError: it is none; levels that no solid has.
-        TypeError: neither.
+        ValueError: it describes no solid, or levels that no solid has.
+        TypeError: it is neither.
     """
     if solid is True and isinstance(field, Solid):
         level = field.default_level if level is None else as_finite(level, "level")
@@ -555,7 +560,7 @@ def solid_and_level(field: Field, solid: Any, level: float | None) -> tuple[Soli
 
 
 def solid_value_range(field: Field, solid: Any, level: float | None) -> tuple[float, float]:
-    """The values (low, high) between which a solid is, given as such.
+    """The values (low, high) between which a solid lies, from the argument that describes it.
 
     Raises:
         ValueError, TypeError: as `solid_and_level`.
@@ -575,7 +580,7 @@ def solid_value_range(field: Field, solid: Any, level: float | None) -> tuple[fl
 
 
 def two_numbers(solid: Any) -> tuple[float, float]:
-    """(low, high), of whatever holds two numbers.
+    """The pair (low, high) of any object that holds two numbers.
 
     Raises:
         TypeError: it does not.
@@ -600,13 +605,16 @@ def mesh_solid(
 ) -> SolidMeshResult:
     """The boundary of the points of a volume where a solid's function is at most `level`.
 
-    volume: None for all of space. tolerance: a part of the size. most_faces: of a level set.
-    angle_mesher: given a tolerance and a spacing, both lengths, how to mesh level sets of angles.
-    check: of the surface, of which no triangles pass through each other, given the size, that it is
-        near the level last. Where it is not, in a few places, these are mended
-        (`project_outliers`); where another check fails in known places, or that is not enough,
-        smaller cells are tried,
-        and half the tolerance: beside a thin part triangles within it may be anywhere.
+    volume: None for all of space.
+    tolerance: relative to the size.
+    angle_mesher: makes, for a tolerance and a spacing, both lengths, a function that meshes level
+        sets of angles.
+    most_faces: the largest number of triangles of a level set.
+    check: checks a surface, none of whose triangles pass through each other, of a size; last, that
+        it is near the level. Where it is not, in a few places, these are mended
+        (`project_outliers`); where another check fails in known places, or mending is not enough,
+        smaller cells are tried, and half the tolerance: beside a thin part triangles within the
+        tolerance may be anywhere.
 
     Raises:
         MeshingError: it has no bounds; it is empty; a part cannot be meshed.
@@ -633,7 +641,7 @@ def mesh_solid(
         except TriangleLimitError as large:
             if first is None:
                 raise
-            raise first from large  # what smaller cells were for is what went wrong
+            raise first from large  # the first error is the cause
         except (MissedPartsError, LocalizedMeshingError) as wrong:
             attempts, first = attempts - 1, first or wrong
             if not attempts or not is_retry_promising(wrong, before, _SMALLER**attempts):
@@ -657,7 +665,7 @@ def _checked(
     size: float,
     check: Callable[[TriangleMesh, float], None],
 ) -> TriangleMesh:
-    """The surface, checked; brought nearer to the level in a few places, if need be.
+    """The checked surface, moved nearer to the level in a few places if necessary.
 
     Raises:
         MeshingError: it fails the check.
@@ -671,13 +679,13 @@ def _checked(
         )  # fmt: skip
         if mended is None:
             raise
-        check_manifold(mended.faces, mended.vertices)  # all of it: `check` saw what is new
+        check_manifold(mended.faces, mended.vertices)  # the whole mesh: `check` saw new faces only
         return mended
     return surface
 
 
 def apart_of(whole: Manifold, tolerance: float) -> TriangleMesh:
-    """The surface of parts put together, of which no triangles pass through each other.
+    """The surface of the assembled parts, none of whose triangles pass through each other.
 
     Raises:
         MeshingError: it is empty, or triangles cross.
@@ -686,12 +694,12 @@ def apart_of(whole: Manifold, tolerance: float) -> TriangleMesh:
 
 
 def _apart(parts: TriangleMesh | _Assembly, tolerance: float) -> TriangleMesh:
-    """The surface, of which no triangles pass through each other; of parts put together mended, or
-    without slivers.
+    """The surface, none of whose triangles pass through each other; for assembled parts it is
+    mended, or without slivers.
 
     Raises:
-        MeshingError: it is empty; a SelfIntersectionError where that does not help, or hardly any
-            fewer triangles cross where less is left out.
+        MeshingError: it is empty; a SelfIntersectionError if mending does not help, or if hardly
+            any fewer triangles cross when fewer slivers are removed.
     """
     raised: SelfIntersectionError | None = None
     for factor in _SLIVERS_WITHIN if isinstance(parts, _Assembly) else (0.0,):
@@ -709,14 +717,14 @@ def _apart(parts: TriangleMesh | _Assembly, tolerance: float) -> TriangleMesh:
 
 @dataclass(frozen=True)
 class _Assembly:
-    """Parts put together, in a volume or in all of space."""
+    """Assembled parts, in a volume or in all of space."""
 
     whole: Manifold
     volume: Volume | None = None
 
     def without_slivers(self, length: float) -> TriangleMesh:
-        """The surface, short edges and slivers left out within a length, and bodies that are
-        nothing but rounding."""
+        """The surface without short edges and slivers, whose removal moves it by up to a length,
+        and without bodies that are only rounding error."""
         simpler = without_short_edges(self.whole, length) if length > 0 else self.whole
         surface = drop_degenerate_components(from_manifold(simpler))
         return surface if self.volume is None else _on_box(surface, self.volume)
@@ -772,7 +780,7 @@ def _point(x: FloatArray) -> tuple[float, float, float]:
 
 
 def _on_box(surface: TriangleMesh, volume: Volume) -> TriangleMesh:
-    """Vertices within rounding of a box's faces, put there."""
+    """The surface, with vertices within rounding of a box's faces put onto them."""
     boxes = volume.volumes if isinstance(volume, VolumeIntersection) else (volume,)
     vertices = surface.vertices
     for box in boxes:

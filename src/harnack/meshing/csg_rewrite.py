@@ -72,7 +72,7 @@ def drop_cancelled_operands(solid: BooleanSolid, level: float) -> BooleanSolid |
 
 
 def _factors(solid: Solid, level: float) -> list[SolidAtLevel]:
-    """Those whose intersection is where a solid is at most a level."""
+    """Solids and levels whose intersection is the set where a solid is at most a level."""
     if isinstance(solid, BooleanSolid) and not solid.is_union:
         return [factor for part in solid.parts for factor in _factors(part, level)]
     if isinstance(solid, OffsetSolid):
@@ -97,7 +97,7 @@ def _image(solid: Solid, of: TransformedSolid, level: float) -> SolidAtLevel:
 
 
 def _key(solid: Solid, level: float) -> Hashable:
-    """Equal of the same points, of the same field."""
+    """A key that is equal for equal sets of points of the same field."""
     if isinstance(solid, Complement):
         return "complement", _key(solid.field, -level)
     if isinstance(solid, OffsetSolid):
@@ -109,7 +109,7 @@ def _key(solid: Solid, level: float) -> Hashable:
 
 
 def _placed(solid: Solid, level: float) -> Solid:
-    """With the level 0."""
+    """The solid as a solid of level 0."""
     if level == 0:
         return solid
     if isinstance(solid, Complement):
@@ -123,8 +123,8 @@ def _intersection(factors: Iterable[SolidAtLevel]) -> Solid:
 
 
 def _union(parts: Sequence[Solid]) -> Solid:
-    """If there are complements, that of an intersection: what is cut away need not be made of all
-    of space."""
+    """The union of solids. If there are complements, it is the complement of an intersection, so
+    that no solid has to be cut away from all of space."""
     if any(isinstance(operand, Complement) for operand in parts):
         return Complement(BooleanSolid(tuple(~operand for operand in parts), is_union=False))
     return BooleanSolid(tuple(parts), is_union=True)

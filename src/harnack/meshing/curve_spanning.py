@@ -1,7 +1,7 @@
 """Triangles of an angle's level set that end at its curve, in Delaunay's tetrahedra.
 
-Where a check fails in known places, cells are made smaller there alone and all is done again. Where
-that does not help, or the places are not known, cells are made smaller everywhere.
+Where a check fails in known places, cells are made smaller there alone and the mesh is computed
+again. Where that does not help, or the places are not known, cells are made smaller everywhere.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ from harnack.tree.empty_space import BoxCells
 
 __all__ = ["SpanningMesh", "mesh_spanning_curve", "restore_curve_edges"]
 
-# How far points are moved, at most, as a part of the edges of triangles beside them.
+# The largest move of a point, relative to the edges of triangles beside it.
 _SHALLOW = 0.1
 
 
@@ -65,11 +65,11 @@ def restore_curve_edges(
     Long edges of a curve are subdivided so that cells near them need not be as large. The extra
     points are moved off the edge into the surface, by at most the tolerance, and the gap is filled:
     the mesh then ends at the given curve. The filling triangles are thin, unavoidably: the surface
-    twists about the edge, and a triangle along all of it is within the tolerance only if it is
-    about that low.
+    twists about the edge, and a triangle along all of it is within the tolerance only if its height
+    is about the tolerance.
 
-    kept, cut: vertices before `kept` are those of the curve, those from there to `cut` are the
-        extra points on its edges.
+    kept, cut: vertices before `kept` are those of the curve; from there to `cut` they are the extra
+        points on its edges.
     height: how far the extra points are moved, at most.
     """
     if cut == kept:
@@ -104,9 +104,9 @@ def _push_inward(
     ends: IntArray,
     height: float,
 ) -> FloatArray:
-    """Points (k, 3) `inner` of the edges owner (k,) with these ends (m, 2), moved off the edges and
-    onto the surface. The heights over an edge are one parabola, so that its filling lies below the
-    chain."""
+    """(n, 3) the vertices, with the points `inner` (k,) moved off their edges and onto the surface.
+    owner: (k,) the edge of each point; ends: (m, 2) the ends of the edges. The heights over an edge
+    are one parabola, so that its filling lies below the chain."""
     points = vertices[inner]
     a, along = vertices[ends[:, 0]], vertices[ends[:, 1]] - vertices[ends[:, 0]]
     length = np.linalg.norm(along, axis=1)
@@ -125,14 +125,14 @@ def _push_inward(
     direction = _across(inward[inner], along)
     start = points + lift[:, None] * direction
     projected = newton_to_level(function, start, function.sample(start), 0.3 * lift, None)
-    # Points keep their place along the edge and their distance from it: they are turned about it.
+    # Points keep their position along the edge and their distance from it: they turn about it.
     turned = _across(projected - points, along)
     is_close = (turned * direction).sum(axis=1) > 0.3
     return points + lift[:, None] * np.where(is_close[:, None], turned, direction)
 
 
 def _across(vectors: FloatArray, along: FloatArray) -> FloatArray:
-    """The unit vectors (k, 3) of parts of vectors at right angles to unit vectors."""
+    """The unit vectors (k, 3) of the components of vectors at right angles to unit vectors."""
     part = vectors - (vectors * along).sum(axis=1)[:, None] * along
     return part / np.maximum(np.linalg.norm(part, axis=1), 1e-300)[:, None]
 
@@ -151,15 +151,16 @@ def _filling(chain: list[int]) -> list[tuple[int, int, int]]:
 
 # The whole surface.
 
-# How often all is done again because finished triangles fail.
+# How often the mesh is computed again because finished triangles fail.
 _MOST_ATTEMPTS = 4
-# How often cells are made smaller where the first triangles fail, before that is done everywhere.
+# How often cells are made smaller where the first triangles fail, before they are made smaller
+# everywhere.
 _MOST_LOCAL = 4
 # Edges of a curve that are longer than this many cells are cut.
 _LONGEST = 2.5
 # How often edges of a curve that are too near to others are halved.
 _MOST_CUTS = 4
-# The size of smaller cells everywhere, as a part of that before.
+# The ratio of the size of smaller cells everywhere to the size before.
 _SMALLER = 0.6
 
 
@@ -189,10 +190,10 @@ class SpanningMesh:
 
 @dataclass(frozen=True)
 class _SpanningInput:
-    """What is to be filled, with what.
+    """The function and the box in which its level set is meshed.
 
     lower, upper: (3,) the box.
-    walls: the same, where the surface may end there, or None.
+    walls: the same box, if the surface may end at its faces, or None.
     """
 
     function: LevelFunction
@@ -213,14 +214,15 @@ def mesh_spanning_curve(
     tolerance: float,
     report: Callable[[str], None],
 ) -> SpanningMesh:
-    """Triangles within the tolerance, none of which pass through others; where some do, or are
-    turned over, cells are made smaller and all is done again.
+    """The mesh of an angle's level set within the tolerance, none of whose triangles pass through
+    each other; where triangles do, or are turned over, cells are made smaller and the mesh is
+    computed again.
 
     attempts: how many spacings are tried, each smaller than the one before. box: to be filled.
         has_walls: whether the surface may end at the box's faces. tolerance: a length.
 
     Raises:
-        MeshingError: it could not be done.
+        MeshingError: no mesh passes the checks.
     """
     task = _SpanningInput(function, *box, box if has_walls else None, seed, report)
     walls = task.walls
@@ -266,8 +268,8 @@ def _loops(function: LevelFunction) -> tuple[FloatArray, ...]:
 def _first_surface(
     task: _SpanningInput, spacing: float, attempts: int, finer: tuple[RefinementBalls, ...]
 ) -> SpanningMesh:
-    """Triangles in cells of that spacing, smaller where they have to be; or where that fails, in
-    smaller ones everywhere."""
+    """The mesh in cells of that spacing, smaller where necessary; or where that fails, in smaller
+    cells everywhere."""
     task.report(f"cells of {spacing:.3g}")
     local = finer
     try:
@@ -287,7 +289,7 @@ def _first_surface(
 def _in_cells(
     task: _SpanningInput, spacing: float, finer: tuple[RefinementBalls, ...]
 ) -> SpanningMesh:
-    """Triangles in cells of that spacing, split in some places, with what is proved of them.
+    """The mesh in cells of that spacing, split in the balls `finer`, and its proved isotopy.
 
     Raises:
         MeshingError: checks that fail, or edges of the curve that are in no tetrahedron.
@@ -317,7 +319,8 @@ def _tetrahedralize(
     curve: BoundaryCurve,
     finer: tuple[RefinementBalls, ...],
 ) -> tuple[BoundaryCurve, TetrahedronPoints, Tetrahedra]:
-    """Tetrahedra that have all edges of the curve, which is cut where others are too near."""
+    """Tetrahedra that have all edges of the curve, whose edges are cut where others are too
+    near."""
     for _ in range(_MOST_CUTS):
         points = sample_delaunay_points(task.function, root, curve, task.walls, task.seed, finer)
         tets = delaunay(points.points)
@@ -336,7 +339,7 @@ def _check_boundary(
 ) -> None:
     edges = boundary_edges(faces)
     count = max(int(faces.max()) + 1, len(curve.points))
-    if walls is not None:  # where the surface ends as well
+    if walls is not None:  # the surface ends there as well
         margin = 1e-9 * (walls[1] - walls[0])
         near = np.minimum(np.abs(vertices - walls[0]), np.abs(vertices - walls[1]))
         on = np.asarray((near <= margin).any(axis=1))

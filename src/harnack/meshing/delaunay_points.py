@@ -1,5 +1,5 @@
-"""Chooses the points of a Delaunay triangulation around a level set: those of an octree around it,
-and the boundary curve it ends on.
+"""The points of a Delaunay triangulation around a level set: those of an octree around it, and the
+boundary curve it ends on.
 
 Vertices of the curve are points as they are. Other points keep so far from it that no point lies in
 the ball with an edge of the curve as diameter, so that every edge of the curve is an edge of the
@@ -29,14 +29,15 @@ __all__ = [
     "sample_delaunay_points",
 ]
 
-# All in parts of the size of a cell, by experiment.
+# All relative to the size of a cell, by experiment.
 _JITTER = 1e-3  # no five points on a sphere
 _SNAPPED = 0.3  # points this near to the level are moved onto it
 _MIN_CURVE_DISTANCE = 0.45  # no other points are so near to the curve
 _MOST_CELLS = 4_000_000
-# A step of Newton's method that is shorter is the last: a part of the longest one.
+# A step of Newton's method that is shorter than this, relative to the longest step, is the last.
 _CONVERGED = 1e-9
-# How often the way to a multiple root is continued as a geometric series, and the rates of that.
+# How often steps to a multiple root are continued as a geometric series, and the range of its
+# rates.
 _SERIES, _RATES = 4, (0.4, 0.97)
 _CORNERS = np.array(list(itertools.product((0.0, 1.0), repeat=3)))
 
@@ -46,7 +47,7 @@ class RefinementBalls:
     """Balls in which cells are subdivided once more.
 
     points: (n, 3) their centers.
-    radius: of all of them.
+    radius: of all balls.
     """
 
     points: FloatArray
@@ -163,8 +164,8 @@ def sample_delaunay_points(
 ) -> TetrahedronPoints:
     """Points for the tetrahedra: see the module's docstring.
 
-    walls: a box whose faces points on them do not leave. finer: where leaves of the octree are
-    split again, once for each of the entries that they meet.
+    walls: a box; points on its faces stay on them. finer: where leaves of the octree are split
+        again, once for each entry that they meet.
 
     Raises MemoryError for more than four million cells.
     """
@@ -196,7 +197,7 @@ def sample_delaunay_points(
 def _finer_cells(
     function: LevelFunction, leaves: BoxCells, finer: tuple[RefinementBalls, ...]
 ) -> list[BoxCells]:
-    """Cells that leaves are split into, smallest first; those proved empty are left out."""
+    """The cells that leaves are split into, smallest first, without cells that are proved empty."""
     pool = [leaves]
     for balls in finer:
         split: list[BoxCells] = []
@@ -211,8 +212,8 @@ def _finer_cells(
 def _corners_and_centers(
     tree: RefinedCells, finer: list[BoxCells]
 ) -> tuple[FloatArray, FloatArray]:
-    """Points (n, 3), each once: corners of all cells, and centers of leaves and of `finer` ones;
-    and the size (n,) of the smallest cell at each."""
+    """Points (n, 3), each once: corners of all cells, and centers of leaves and of cells in
+    `finer`; and the size (n,) of the smallest cell at each."""
     leaves = [*finer, tree.occupied]
     points = [cells.centers for cells in leaves]
     sizes = [np.full(len(cells.corners), float(cells.size.max())) for cells in leaves]
@@ -225,14 +226,14 @@ def _corners_and_centers(
     x, size = x[order], size[order]
     steps: FloatArray = (x - x.min(axis=0)) / (0.25 * leaves[0].size)
     keys = np.rint(steps).astype(np.int64)
-    # Of points at one place the first, which is that of the smallest cell.
+    # Of equal points the first, which is that of the smallest cell.
     first: IntArray = np.sort(np.unique(keys, axis=0, return_index=True)[1])
     return x[first], size[first]
 
 
 def _is_far(points: FloatArray, free: FloatArray, boundary: BoundaryCurve) -> BoolArray:
-    """Whether points are farther from the curve than `free` (n,), and out of the balls on its edges
-    as diameters."""
+    """(n,) whether points are farther from the curve than `free` (n,), and outside of the balls
+    with its edges as diameters."""
     if not len(boundary.edges):
         return np.ones(len(points), np.bool_)
     import scipy.spatial  # here: half a second that few need
@@ -242,7 +243,7 @@ def _is_far(points: FloatArray, free: FloatArray, boundary: BoundaryCurve) -> Bo
     middle, half = 0.5 * (a + b), 0.5 * row_norms(b - a)
     near = np.full(len(points), np.inf)
     is_far = np.ones(len(points), np.bool_)
-    # Curves may have edges of any lengths: those of one size at a time.
+    # Curves may have edges of any lengths: edges of one size are examined at a time.
     octave = np.floor(np.log2(half))
     for exponent in np.unique(octave):
         rows = np.flatnonzero(octave == exponent)
@@ -274,7 +275,8 @@ def _snapped(
     boundary: BoundaryCurve,
     walls: tuple[FloatArray, FloatArray] | None,
 ) -> tuple[FloatArray, LevelSamples, BoolArray]:
-    """Points, with those near the level moved onto it, their samples, and which are on it."""
+    """The points, with points near the level moved onto it; their samples; and which are on the
+    level."""
     near = np.flatnonzero(samples.distance < _SNAPPED * size)
     moved = newton_to_level(function, points[near], samples.select(near), 0.25 * size[near], walls)
     new_samples = function.sample(moved)
@@ -297,9 +299,9 @@ def newton_to_level(
     steps: int = 5,
 ) -> FloatArray:
     """Points (n, 3) after steps of Newton's method along the gradient towards the level, each no
-    longer than `longest` (n,). On walls they stay on them. Points are left alone after a step that
-    was so short that the next one, of its square, would be lost in rounding; and where there is no
-    finite step, as beside a pole."""
+    longer than `longest` (n,). Points on walls stay on them. Points are no longer moved after a
+    step so short that the next step, of the order of its square, would be lost in rounding; and
+    where there is no finite step, as beside a pole."""
     x, rows = points.copy(), np.arange(len(points))
     for k in range(steps):
         current = x[rows]
@@ -322,8 +324,9 @@ def newton_to_level(
 def to_multiple_roots(
     function: LevelFunction, points: FloatArray, samples: LevelSamples, longest: FloatArray
 ) -> FloatArray:
-    """Points (n, 3) after steps towards the level as long as it takes where f - level is a power
-    u^m, to which Newton's shrink by 1 - 1/m only: to where a geometric series of two ends."""
+    """Points (n, 3) after steps towards the level where f - level is a power u^m, for which
+    Newton's steps shrink only by 1 - 1/m: each step goes to the limit of the geometric series of
+    two of Newton's steps."""
     x = points
     for k in range(_SERIES):
         first = newton_to_level(

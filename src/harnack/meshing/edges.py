@@ -66,7 +66,7 @@ def distances_from_triangles(points: FloatArray, corner: FloatArray) -> FloatArr
         distance = np.minimum(distance, row_norms(points - foot))
     normal = area_normals(corner)
     size = row_norms(normal)
-    is_within = size > 0  # what has no area has edges alone
+    is_within = size > 0  # a triangle without an area has edges alone
     size = np.maximum(size, 1e-300)
     height = row_dots(points - corner[:, 0], normal) / size
     foot = points - (height / size)[:, None] * normal
@@ -137,7 +137,7 @@ def unique_with_inverse(keys: IntArray) -> tuple[IntArray, IntArray, IntArray, I
     if int(keys.max(initial=0)) >> (62 - bits):
         order = np.argsort(keys, kind="stable")
         ordered = keys[order]
-    else:  # numbers and places in one word, since sorting is far faster than `argsort`
+    else:  # keys and indices in one word, since sorting is far faster than `argsort`
         both = np.sort((keys << bits) | np.arange(len(keys)))
         order, ordered = both & ((1 << bits) - 1), both >> bits
     is_first = np.ones(len(keys), np.bool_)

@@ -54,12 +54,12 @@ __all__ = [
 ]
 
 _LEVEL = 2 * math.pi
-# Cells across the holes at first.
+# The initial number of cells across the holes.
 _ACROSS = 24
-# How often edges of holes that are too near to others are halved for the tetrahedra; but not to
-# more pieces than that, and so many for each edge: as many are cut where edges lie on each other.
+# How often edges of holes that are too near to others are halved for the tetrahedra; and the
+# largest number of pieces, in all and for each edge: so many arise where edges lie on each other.
 _MOST_CUTS, _MOST_PIECES, _MOST_PER_EDGE = 12, 20_000, 64
-# How often patches that meet the mesh are made again, of smaller cells.
+# How often patches that meet the mesh are computed again, with smaller cells.
 _MOST_MET = 1
 # How far w may be from 1/2, modulo 1, at vertices of patches.
 _NEAR = 1e-6
@@ -69,9 +69,9 @@ _NEAR = 1e-6
 class HoleFillingOptions:
     """Options of harmonic hole fillings.
 
-    tolerance: how far they may be from the surface, relative to the size of the box around all
+    tolerance: how far fillings may be from the surface, relative to the size of the box around all
         holes.
-    spacing: of cells at first, or None.
+    spacing: the initial size of cells, or None.
     seed: of random moves.
     attempts: how many sizes of cells are tried.
     """
@@ -109,7 +109,7 @@ def harmonic_patches(
     fillings of the other holes.
 
     Raises:
-        MeshingError: they could not be computed, or intersect the mesh or each other.
+        MeshingError: fillings could not be computed, or intersect the mesh or each other.
     """
     try:
         return _fill_all_holes(vertices, faces, edges, asked)
@@ -133,7 +133,7 @@ def harmonic_patches(
 def _fill_all_holes(
     vertices: FloatArray, faces: IntArray, edges: IntArray, options: HoleFillingOptions
 ) -> HarmonicFilling:
-    """Patches that end at open edges; cells are made smaller where checks fail.
+    """The patches that end at open edges; cells are made smaller where checks fail.
 
     Raises:
         MeshingError: as `harmonic_filling`.
@@ -183,7 +183,7 @@ class _MeshIntersectionError(LocalizedMeshingError):
 
 
 def checked_boundary_edges(faces: IntArray) -> IntArray:
-    """(k, 2): edges of one face, in its direction.
+    """(k, 2) the edges with one face, in its direction.
 
     Raises:
         MeshError: an edge of more than two faces, or of two that have it in the same direction.
@@ -249,7 +249,7 @@ def _patches(
 ) -> HarmonicFilling:
     """The level set, ending at the edges (k, 2) of the mesh.
 
-    last: whether patches that cannot be refined will do.
+    last: whether this is the last attempt, in which patches that cannot be refined are accepted.
 
     Raises:
         MeshingError: as `mesh`; or Delaunay's tetrahedra lack an edge.
@@ -328,7 +328,7 @@ def _finished(
         finer, split = (x if mode == "refining alone" else smooth(function, x, faces, None)), faces
         finer, split = refine(function, finer, split, 0.5 * tolerance, None, report)
         far = unrefined_midpoints(function, finer, split, 0.5 * tolerance)
-        if len(far):  # the patch takes another way than the surface, or connects two of its sheets
+        if len(far):  # the patch departs from the surface, or connects two of its sheets
             raise LocalizedMeshingError(
                 f"{len(far):,} triangles of patches do not come near the surface, however they are "
                 "cut: subdivide the mesh there, or choose a smaller `cell_size`",
@@ -346,13 +346,14 @@ def _finished(
 
 
 def _new_singular(before: IntArray, after: IntArray) -> IntArray:
-    """Vertices at which faces are not a manifold any more; holes may touch in others."""
+    """The vertices at which faces are no longer a manifold; holes may touch in other vertices."""
     return np.setdiff1d(nonmanifold_vertices(after), nonmanifold_vertices(before))
 
 
 def _collapse_midpoint(x: FloatArray, faces: IntArray, middle: int, ends: list[int]) -> IntArray:
-    """The faces with a vertex in the middle of a boundary edge moved to one of its ends: that with
-    which fewer faces meet or, if they are as many, the faces around it are turned less.
+    """The faces after a vertex in the middle of a boundary edge was moved to one of the edge's
+    ends: the end for which fewer faces intersect or, if the numbers are equal, for which the faces
+    around it are turned less.
 
     Raises:
         MeshingError: both ends would join more than the two faces at the edge.
@@ -381,14 +382,14 @@ def _collapse_midpoint(x: FloatArray, faces: IntArray, middle: int, ends: list[i
 
 
 def _normals(corners: FloatArray) -> FloatArray:
-    """Unit normals of triangles (m, 3, 3), 0 of those without an area."""
+    """Unit normals of triangles (m, 3, 3), 0 for triangles without an area."""
     normal = area_normals(corners)
     return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
 
 
 def _check_boundary(x: FloatArray, faces: IntArray, boundary: BoundaryCurve) -> None:
-    """Raise unless patches end at the boundary, and run each of its edges as the mesh does: they
-    are reversed afterwards."""
+    """Raise unless patches end at the boundary, and run each of its edges in the direction of the
+    mesh: patches are reversed afterwards."""
     directed = {(int(a), int(b)) for a, b in half_edges(faces)}
     rim = {(a, b) for a, b in directed if (b, a) not in directed}
     unmatched = rim ^ {(int(a), int(b)) for a, b in boundary.edges}
@@ -406,10 +407,10 @@ def _check(
     patches: HarmonicFilling,
     report: Callable[[str], None],
 ) -> None:
-    """Raise unless the mesh with its patches is what `repair` promises.
+    """Raise unless the mesh with its patches fulfills what `repair` promises.
 
     Raises:
-        MeshingError: it is not.
+        MeshingError: it does not.
     """
     report("checking the patches")
     x = np.concatenate([vertices, patches.vertices])

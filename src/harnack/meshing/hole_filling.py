@@ -39,22 +39,24 @@ __all__ = ["HoleFilling", "fill_holes", "hole_loops"]
 
 # Loops of more edges are not filled: the time grows with the cube of their number.
 _MOST_IN_LOOP = 600
-# Up to so many edges angles count, beyond it areas alone; up to so many they always do.
+# The largest number of edges of a loop for which angles count, beyond which areas alone do; and the
+# number up to which angles always count.
 _MOST_BY_ANGLES, _ALWAYS_BY_ANGLES = 150, 10
 # Largest angles count as the same if their cosines differ by less than this.
 _SAME_TURN = 1e-9
-# Edges are cut that are longer than this many times what is usual around the hole; so often.
+# Edges are split that are longer than this multiple of the usual length around the hole; and the
+# number of rounds.
 _LONG, _ROUNDS = 1.4, 10
 _MOST_CUT = 200_000
-# Edges of two triangles are flipped if the cotangents of the angles opposite have a sum below this.
+# Edges are flipped if the cotangents of the two opposite angles have a sum below this.
 _MAX_FLIP_COTANGENT_SUM = -1e-3
 _MOST_FLIPS = 12
-# Cotangents are kept between these, so that every matrix is definite.
+# Cotangents are clamped to this range, so that every matrix is definite.
 _LEAST_COTANGENT, _MOST_COTANGENT = 0.02, 20.0
-# What is tried in turn: whether loops are triangulated by angles, and how often the patch is made
-# to bend little, by the cotangents of what it was before.
+# The strategies in the order of the attempts: whether loops are triangulated by angles, and how
+# often the patch is faired, by the cotangents of the patch before.
 _STRATEGIES = ((True, 6), (False, 2), (True, 0), (False, 0))
-# On a patch the winding number of what is there may differ from 1/2 modulo 1 by so much.
+# The largest deviation of the mesh's winding number from 1/2 modulo 1 on a patch.
 _MAX_WINDING_DEVIATION = 0.36
 
 Winding = Callable[[FloatArray], FloatArray]
@@ -105,7 +107,7 @@ def fill_holes(
 
 
 def _used(x: FloatArray, faces: IntArray, input_count: int) -> tuple[FloatArray, IntArray]:
-    """Vertices and faces without those vertices that no face has, but for the given ones."""
+    """The vertices and faces, without new vertices that no face uses."""
     used = np.zeros(len(x), np.bool_)
     used[:input_count] = True
     used[faces] = True
@@ -120,7 +122,7 @@ def _failures(
     input_count: int,
     winding: Winding,
 ) -> dict[int, str]:
-    """By loop, what is wrong with its patch. new: faces of patches, and owner: of which loop."""
+    """The reasons why patches fail, by loop. new: the faces of patches; owner: the loop of each."""
     reasons: dict[int, str] = {}
     if not len(new):
         return reasons
@@ -144,7 +146,8 @@ def _failures(
 
 
 def hole_loops(vertices: FloatArray, faces: IntArray, edges: IntArray) -> list[IntArray]:
-    """The loops of open edges (k, 2), which run as their faces do, each without a vertex twice.
+    """The loops of open edges (k, 2), in the direction of their faces, each without a repeated
+    vertex.
 
     Where several holes meet at a vertex, a loop goes on with the edge that bounds the same gap
     between faces, as seen along the normal there.
@@ -184,7 +187,7 @@ def hole_loops(vertices: FloatArray, faces: IntArray, edges: IntArray) -> list[I
 def _match_loop_edges(
     x: FloatArray, v: int, normal: FloatArray, starts: list[int], ends: list[int]
 ) -> list[int]:
-    """For each edge that comes from a start to v, the end to which its loop goes on: the next one
+    """For each edge from a start to v, the end to which its loop goes on: the next end
     counter-clockwise, since faces are to the left of their edges and holes to the right."""
     axis = np.eye(3)[np.abs(normal).argmin()]
     unit_normal = normal / max(float(np.linalg.norm(normal)), 1e-300)
@@ -214,8 +217,8 @@ def _patches(
     by_angles: bool,
     fairings: int,
 ) -> tuple[FloatArray, IntArray, IntArray, dict[int, str]]:
-    """All vertices with those of patches behind; faces of patches; of which loop each is; and loops
-    without a patch, with the reason."""
+    """All vertices, those of patches last; the faces of patches; the loop of each face; and the
+    reasons why loops have no patch, by loop."""
     third = _opposite_corners(faces, np.unique(np.concatenate(loops)), len(vertices))
     used_edges = {(min(edge), max(edge)) for edge in third}
     fixed_edges = np.array(sorted(used_edges), np.int64).reshape(-1, 2)
@@ -257,7 +260,7 @@ def _opposite_corners(faces: IntArray, rims: IntArray, count: int) -> dict[tuple
 
 
 def _forbidden_diagonals(polygon: IntArray, used_edges: set[tuple[int, int]]) -> BoolArray:
-    """(n, n) which diagonals of a polygon are edges already."""
+    """(n, n) which diagonals of a polygon are already edges."""
     n = len(polygon)
     barred = np.zeros((n, n), np.bool_)
     position = {v: k for k, v in enumerate(polygon.tolist())}
@@ -270,7 +273,7 @@ def _forbidden_diagonals(polygon: IntArray, used_edges: set[tuple[int, int]]) ->
 
 
 def _pairs(polygon: IntArray, used_edges: set[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Those pairs of a polygon's vertices that are edges already."""
+    """The pairs of a polygon's vertices that are already edges."""
     ordered = sorted(polygon.tolist())
     return [(a, b) for i, a in enumerate(ordered) for b in ordered[i + 1 :] if (a, b) in used_edges]
 
@@ -281,8 +284,8 @@ def _min_area_triangulation(
     third: dict[tuple[int, int], int],
     used_edges: set[tuple[int, int]],
 ) -> IntArray | None:
-    """Triangles (n - 2, 3) of least area between the corners of a polygon; None if edges that are
-    there already leave none."""
+    """The triangulation (n - 2, 3) of a polygon with the smallest area; None if existing edges
+    exclude every triangulation."""
     n, corner = len(polygon), x[polygon]
     if n == 3:
         return polygon[None]
@@ -305,8 +308,8 @@ def _min_area_triangulation(
 
 
 def _triangles_of_plan(middle: IntArray, n: int) -> IntArray:
-    """The triangles of a plan: middle[i, k] is the third corner of that at the diagonal from i to
-    k, on the side of the corners between them."""
+    """The triangles of a plan: middle[i, k] is the third corner of the triangle at the diagonal
+    from i to k, on the side of the corners between them."""
     triangles, todo = list[tuple[int, int, int]](), [(0, n - 1)]
     while todo:
         i, k = todo.pop()
@@ -323,13 +326,13 @@ def _min_dihedral_triangulation(
     third: dict[tuple[int, int], int],
     used_edges: set[tuple[int, int]],
 ) -> IntArray | None:
-    """Triangles of a polygon whose largest angle with neighbors, those around the polygon among
-    them, is least; of the same angles those of least area (Liepa 2003)."""
+    """The triangulation of a polygon whose largest angle between neighbors, including those around
+    the polygon, is smallest; of equal angles the one with the smallest area (Liepa 2003)."""
     n, corner = len(polygon), x[polygon]
     if n == 3:
         return polygon[None]
     barred = _forbidden_diagonals(polygon, used_edges)
-    beside = np.zeros((n, n, 3))  # 0: there is none, or not yet
+    beside = np.zeros((n, n, 3))  # 0: no neighbor, or not yet
     for k in range(n):
         a, b = int(polygon[k]), int(polygon[(k + 1) % n])
         if (b, a) in third:
@@ -363,7 +366,7 @@ def _min_dihedral_triangulation(
 
 
 def _unit(vectors: FloatArray) -> FloatArray:
-    """(..., 3) of length 1, or 0."""
+    """(..., 3) vectors scaled to length 1; 0 stays 0."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-300)
 
 
@@ -373,10 +376,10 @@ def _unit(vectors: FloatArray) -> FloatArray:
 def _refine(
     vertices: FloatArray, faces: IntArray, new: IntArray, fixed_edges: IntArray
 ) -> tuple[FloatArray, IntArray]:
-    """Patches of triangles about as large as those around them, with the least area; all vertices
-    (n, 4), new ones behind those given, and with each the usual length of edges there.
+    """All vertices (n, 4), new vertices last, each with the usual length of edges there; and
+    patches of triangles about as large as those around them, with the smallest area.
 
-    taken: (t, 2) edges that are there already.
+    fixed_edges: (t, 2) the existing edges.
     """
     input_count = len(vertices)
     x = np.column_stack([vertices, _mean_edge_lengths(vertices, faces, np.unique(new))])
@@ -390,7 +393,7 @@ def _refine(
 
 
 def _split_long_edges(x: FloatArray, new: IntArray) -> tuple[FloatArray, IntArray]:
-    """Vertices (n, 4) and triangles with edges cut in the middle that are too long."""
+    """Vertices (n, 4) and triangles, with edges that are too long cut in the middle."""
     edges = Edges.of(half_edges(new))
     ends = x[edges.vertices]
     long = row_norms(ends[:, 0, :3] - ends[:, 1, :3]) > _LONG * ends[:, :, 3].mean(axis=1)
@@ -404,7 +407,7 @@ def _split_long_edges(x: FloatArray, new: IntArray) -> tuple[FloatArray, IntArra
 
 
 def _mean_edge_lengths(x: FloatArray, faces: IntArray, rims: IntArray) -> FloatArray:
-    """(n,) the mean length of a vertex's edges; 0 but at some vertices."""
+    """(n,) the mean length of a vertex's edges, at the vertices `rims`; 0 at others."""
     is_rim = np.zeros(len(x), np.bool_)
     is_rim[rims] = True
     edges = Edges.of(half_edges(faces[is_rim[faces].any(axis=1)])).vertices
@@ -417,14 +420,15 @@ def _mean_edge_lengths(x: FloatArray, faces: IntArray, rims: IntArray) -> FloatA
 
 
 def _relaxed(x: FloatArray, new: IntArray, input_count: int) -> FloatArray:
-    """Rows of new vertices, in the middle of their neighbors' rows."""
+    """(n, 4) the vertices, with the rows of new vertices in the middle of their neighbors' rows."""
     ends = Edges.of(half_edges(new)).vertices
     weights = _graph_laplacian(ends, np.ones(len(ends)), len(x))
     return _solve_least_squares(weights[input_count:], x, input_count)
 
 
 def _solve_least_squares(rows: Any, x: FloatArray, input_count: int) -> FloatArray:
-    """Rows from `given` on such that a linear map of all is nearest to 0."""
+    """All rows, with those from `input_count` on chosen so that a linear map of all is nearest to
+    0."""
     import scipy.sparse.linalg as linalg  # here: half a second that few need
 
     solver = cast("Any", linalg)
@@ -453,7 +457,7 @@ def _graph_laplacian(ends: IntArray, weight: FloatArray, count: int) -> Any:
 
 
 def _fair(x: FloatArray, faces: IntArray, new: IntArray, input_count: int) -> FloatArray:
-    """New vertices where the patches bend least, together with the faces around them."""
+    """The vertices, with new vertices where the patches and the faces around them bend least."""
     is_rim = np.zeros(len(x), np.bool_)
     is_rim[new] = True
     triangles = np.concatenate([faces[is_rim[faces].any(axis=1)], new])
@@ -462,14 +466,14 @@ def _fair(x: FloatArray, faces: IntArray, new: IntArray, input_count: int) -> Fl
     weight = np.zeros(len(edges.vertices))
     area = np.zeros(len(x))
     double = np.maximum(row_norms(area_normals(x[triangles])), 1e-300)
-    for k in range(3):  # the edge from corner k to the next is opposite to the one after
+    for k in range(3):  # the edge from corner k to k + 1 is opposite to corner k + 2
         u, w = (corner[:, j] - corner[:, k - 1] for j in (k, (k + 1) % 3))
         cotangent = np.clip(row_dots(u, w) / double, -_MOST_COTANGENT, _MOST_COTANGENT)
         m = len(triangles)
         np.add.at(weight, edges.edge_of_pair[k * m : (k + 1) * m], 0.5 * cotangent)
         np.add.at(area, triangles[:, k], double / 6)
     weight = np.maximum(weight, _LEAST_COTANGENT)
-    # Beside holes that stay open only new vertices count.
+    # Beside holes that remain open only new vertices count.
     is_rim[edges.vertices[edges.multiplicity != 2]] = False
     rows = np.flatnonzero(is_rim & (area > 0))
     laplacian = _graph_laplacian(edges.vertices, weight, len(x))[rows]
@@ -479,7 +483,7 @@ def _fair(x: FloatArray, faces: IntArray, new: IntArray, input_count: int) -> Fl
 
 def _flipped(x: FloatArray, new: IntArray, fixed_edges: IntArray) -> IntArray:
     """Triangles with edges flipped so that angles opposite to them are small (Delaunay's
-    criterion), where the new edge is none already and nothing turns over."""
+    criterion), where the new edge does not exist yet and no triangle turns over."""
     new = new.copy()
     fixed_keys = edge_keys(fixed_edges, len(x))
     for _ in range(_MOST_FLIPS):
@@ -512,13 +516,13 @@ def _flipped(x: FloatArray, new: IntArray, fixed_edges: IntArray) -> IntArray:
 
 
 def _cotangents(a: FloatArray, b: FloatArray, apex: FloatArray) -> FloatArray:
-    """(k,) of the angles at `apex` between points."""
+    """(k,) the cotangents of the angles at `apex` between points a and b."""
     u, w = a - apex, b - apex
     return row_dots(u, w) / np.maximum(row_norms(np.cross(u, w)), 1e-300)
 
 
 def _loop_of_faces(new: IntArray, loops: list[IntArray], count: int) -> IntArray:
-    """(p,) of which loop each face of patches is: those joined by edges to a face at the loop."""
+    """(p,) the loop of each face of patches: faces are joined by edges to a face at their loop."""
     import scipy.sparse  # here: half a second that few need
     import scipy.sparse.csgraph as csgraph_module
 
