@@ -32,23 +32,27 @@ from harnack.meshing.mesh_cleaning import against_neighbors
 
 __all__ = ["Difference", "IntendedSolid"]
 
-# Points at which winding numbers are compared: in the box around the mesh, and near each surface.
+# The number of points at which winding numbers are compared: in the box around the mesh, and near
+# each surface.
 _IN_BOX, _NEAR = 2000, 1000
-# Those near a surface are so far from it, as parts of the size; and the box is wider by that part.
+# The smallest and the largest distance of the points near a surface from it, and the margin of the
+# box, relative to the size.
 _NEAREST, _FARTHEST, _MARGIN = 2e-3, 0.1, 0.05
-# The winding number is clearly above or below 1/2 if it is by more than smooth patches need.
+# The winding number is clearly above or below 1/2 if it differs by more than smooth patches need.
 _CLEARLY = 0.36
-# Volumes of closed meshes that bound their solid once may differ by this part.
+# The largest relative difference of volumes of closed meshes that bound their solid once.
 _VOLUME = 0.01
-# A mesh winds counter-clockwise if cones to its middle hold that part of their volumes added up.
+# A mesh winds counter-clockwise if the signed volumes of cones to its middle sum to this fraction
+# of the sum of their magnitudes.
 _PLAINLY = 0.5
-# Points next to faces are so far from these, as a part of the size.
+# The distance of points next to faces from these, relative to the size.
 _BESIDE = 1e-6
-# How many points that differ are looked at again, and listed.
+# The number of differing points that are tested again, and the number that are listed.
 _LOOKED_AT, _LISTED = 40, 10
-# So many places of each closed part are looked at, to see where it lies and what became of it.
+# The number of points of each closed part that are tested for where the part lies and what became
+# of it.
 _PLACES = 16
-# A mesh is an open sheet if this part of its area, or more, has nothing inside.
+# A mesh is an open sheet if at least this fraction of its area has nothing inside.
 _OPEN = 0.4
 
 
@@ -57,8 +61,8 @@ class Difference:
     """How a surface differs from the input of the repair.
 
     share: the fraction of the compared points that are on the wrong side.
-    places: (k, 3), a selection of these.
-    missing: how many of them should be inside, and are not; added: the reverse.
+    places: (k, 3), a selection of these points.
+    missing: the number of points that should be inside, and are not; added: the reverse.
     volumes: of the surface and of the closed mesh that bounds its solid once; None if they are
         equal, or if the mesh does not bound its solid once.
     """
@@ -71,7 +75,8 @@ class Difference:
 
     @property
     def badness(self) -> float:
-        """A number to compare surfaces by: the one with less of it is nearer to the input."""
+        """A number to compare surfaces by: the surface with the smaller number is nearer to the
+        input."""
         volume_error = 0.0
         if self.volumes is not None:
             new, intended = self.volumes
@@ -99,9 +104,9 @@ class IntendedSolid:
     """A mesh whose corners are joined and that is not inside out.
 
     vertices: (n, 3). faces: (m, 3); is_turned: (m,) which of them were turned over.
-    oriented: (k, 3) faces that agree with their neighbors where that is possible. parts: of these
-        the closed ones, which may touch, cross or lie in each other (`closed_parts`).
-    rounded: how many corners were joined with others, apart by rounding.
+    oriented: (k, 3) faces that agree with their neighbors where that is possible. parts: the closed
+        parts of these faces, which may touch, cross or lie in each other (`closed_parts`).
+    rounded: the number of corners that were joined with others, apart by rounding.
     """
 
     vertices: FloatArray
@@ -113,11 +118,12 @@ class IntendedSolid:
 
     @classmethod
     def of(cls, mesh: Any, *, as_it_is: bool = False) -> IntendedSolid:
-        """Of anything with vertices and faces, which may have no area.
+        """The solid of any object with vertices and faces, which may have no area.
 
         Corners apart by rounding are joined. Then each closed part that is inside out is turned
-        over, with all that lies in it; and what is not closed and lies in none, with all that lies
-        in it, if it winds around more points clockwise than counter-clockwise.
+        over, with all that lies in it. So are the faces that are not closed and lie in no closed
+        part, with all that lies in them, if they wind around more points clockwise than
+        counter-clockwise.
 
         as_it_is: turn nothing over.
 
@@ -132,7 +138,7 @@ class IntendedSolid:
         if welded.rounded:
             faces = joined
         rows = np.flatnonzero((joined != np.roll(joined, 1, axis=1)).all(axis=1))
-        if not len(welded.net.faces):  # every face is there with its reverse
+        if not len(welded.net.faces):  # every face has its reverse
             rows = rows[np.unique(np.sort(joined[rows], axis=1), axis=0, return_index=True)[1]]
         joined, is_turned = joined[rows], np.zeros(len(faces), np.bool_)
         if as_it_is or not len(rows):
@@ -140,13 +146,13 @@ class IntendedSolid:
         disagrees = against_neighbors(x, joined)
         agreeing = _turned(joined, disagrees)
         raw = _turned(raw[rows], disagrees)
-        step = 1 if volume_of(x, agreeing) >= 0 else -1  # most has its material inside
+        step = 1 if volume_of(x, agreeing) >= 0 else -1  # most faces have their material inside
         parts = closed_parts(x, raw[:, ::step], agreeing[:, ::step])
         turned = _inside_out(x, agreeing, parts)
         oriented = _turned(agreeing, turned)
         if turned.any() and not turned.all():
             parts = closed_parts(x, _turned(raw, turned), oriented)
-        if not disagrees.any():  # else it is no part as a whole that is turned
+        if not disagrees.any():  # otherwise no part is turned as a whole
             is_turned[rows] = turned
         return cls(x, _turned(faces, is_turned), is_turned, oriented, parts, welded.rounded)
 
@@ -192,9 +198,8 @@ class IntendedSolid:
 
     def check_encloses(self) -> None:
         """Raise if so much of the area has nothing inside, on neither side, that it is no solid.
-
         Raises:
-            MeshError: so.
+            MeshError: it is no solid.
         """
         rng = np.random.default_rng(0)
         corner = self.vertices[self.oriented]
@@ -211,8 +216,9 @@ class IntendedSolid:
             )
 
     def difference(self, surface: TriangleMesh, away: float) -> Difference | None:
-        """How a closed surface differs from what was given, at points farther than `away` from
-        both, and next to closed parts and farther than that from the surface; None if it does not.
+        """The difference of a closed surface from the input, at points farther than `away` from
+        both, and next to closed parts and farther than that from the surface; None if there is
+        none.
         """
         points, w = self.samples
         corner = surface.vertices[surface.faces]
@@ -235,8 +241,8 @@ class IntendedSolid:
         return Difference(fraction, distant[:_LISTED], missing, added, volumes)
 
     def _volumes(self, surface: TriangleMesh, away: float) -> tuple[float, float] | None:
-        """Volumes of the surface and the mesh if they differ, of a closed one that winds around no
-        point twice or clockwise."""
+        """The volumes of the surface and the mesh if they differ, for a closed mesh that winds
+        around no point twice or clockwise."""
         _, w = self.samples
         if self.field is None or len(self.field.mesh.singular_edges):
             return None
@@ -258,9 +264,10 @@ def _on_other_side(
     corner: FloatArray,
     away: float,
 ) -> tuple[int, int, FloatArray]:
-    """How many points with winding numbers w clearly above 1/2 are not inside of what was made; how
-    many clearly below are; and those of them that are farther than `away` from triangles (m, 3, 3),
-    of some that are looked at. If these are none, there are none."""
+    """The number of points with winding numbers w clearly above 1/2 that are outside of the result;
+    the number of points clearly below that are inside; and, of a selection of both, the points that
+    are farther than `away` from triangles (m, 3, 3). If there are no such points, both numbers are
+    0."""
     inside = _values(field, points) > 0.5
     missing, added = ~inside & (w > 0.5 + _CLEARLY), inside & (w < 0.5 - _CLEARLY)
     rows = np.flatnonzero(missing | added)
@@ -285,7 +292,7 @@ def _values(field: WindingNumber | None, points: FloatArray) -> FloatArray:
 
 
 def _turned(faces: IntArray, which: BoolArray) -> IntArray:
-    """Faces (m, 3), some of them (m,) turned over."""
+    """Faces (m, 3), with those of the mask `which` (m,) turned over."""
     return np.where(which[:, None], faces[:, ::-1], faces)
 
 
@@ -316,10 +323,11 @@ def _near(corner: FloatArray, size: float, rng: np.random.Generator) -> FloatArr
 
 
 def _inside_out(x: FloatArray, faces: IntArray, parts: list[IntArray]) -> BoolArray:
-    """(m,) which faces to turn over for what was given not to be inside out. parts: closed ones.
+    """(m,) which faces to turn over for the input not to be inside out. parts: the closed parts.
 
-    A part is turned with the outermost one that it lies in. So is what is not closed; where that
-    lies in no part it is turned by itself, and parts that lie in it with it.
+    A part is turned with the outermost part that it lies in. So are the faces that are not closed;
+    where these lie in no part they are turned by themselves, together with the parts that lie in
+    them.
     """
     turned, is_rest = np.zeros(len(faces), np.bool_), np.ones(len(faces), np.bool_)
     for rows in parts:
@@ -344,7 +352,7 @@ def _inside_out(x: FloatArray, faces: IntArray, parts: list[IntArray]) -> BoolAr
 
 
 def _lies_in(x: FloatArray, part: IntArray, container: IntArray) -> bool:
-    """Whether faces wind around all of some places of others."""
+    """Whether the faces `container` wind around points of the faces `part`: all of a selection."""
     if not len(part) or not len(container):
         return False
     centers = x[part[:: max(1, len(part) // _PLACES)]].mean(axis=1)

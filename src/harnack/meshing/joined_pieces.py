@@ -1,5 +1,5 @@
-"""Computes the boundary of the solid of a closed mesh that intersects itself: its faces are cut
-along each other, and those pieces that bound the solid are joined.
+"""The boundary of the solid of a closed mesh that intersects itself: its faces are cut along each
+other, and the pieces that bound the solid are joined.
 
 The winding numbers on both sides of each piece tell whether the piece bounds the points around
 which the mesh winds at least once. Where two faces meet, the pieces of each have vertices that
@@ -30,9 +30,11 @@ from harnack.tree.triangle_tree import TriangleTree, triangle_records
 __all__ = ["boundary_of_solid", "neighbors", "passes_itself"]
 
 _LEAF_SIZE = 4
-# In units of the mesh's size. Pieces not as high as the first are not asked what is beside them.
+# Relative to the mesh's size: pieces thinner than the first are not tested for winding numbers
+# beside them; corners nearer than the second are joined.
 _THIN, _SAME = 1e-9, 1e-11
-# Faces around an edge have one direction if they are turned by less, in full turns.
+# Faces around an edge have the same direction if the angle between them, in full turns, is less
+# than this.
 _SAME_TURN = 1e-9
 # How often edges are halved at corners on them.
 _MOST_HALVINGS = 200
@@ -42,12 +44,12 @@ def passes_itself(surface: TriangleMesh, number: IntArray) -> bool:
     """Whether a closed surface none of whose triangles pass through others does so along edges that
     lie on faces, where nothing passes through a triangle.
 
-    number: (m,) of the connected part that each face belongs to.
+    number: (m,) the number of the connected component that each face belongs to.
 
     Proof. Where one sheet passes through another, each is cut in two, with winding numbers on both
-    sides of one part that are larger by one than those of the other. So the numbers beside pieces
-    of faces that touch others are not the same all over a connected part. Where no sheet passes
-    through it they are: they change at no other place.
+    sides of one part that are larger by one than those of the other. So the winding numbers beside
+    pieces of faces that touch others are not the same all over a connected component. Where no
+    sheet passes through it they are: they change at no other place.
     """
     pairs, _ = touching_pairs(surface.vertices, surface.faces)
     if not len(pairs):
@@ -60,7 +62,7 @@ def passes_itself(surface: TriangleMesh, number: IntArray) -> bool:
 
 def boundary_of_solid(vertices: FloatArray, faces: IntArray) -> TriangleMesh:
     """The boundary of the points around which a closed mesh winds at least once; it may wind around
-    others clockwise. Where it touches itself it has corners of its own for each sheet.
+    others clockwise. Where the boundary touches itself each sheet has corners of its own.
 
     Corners of the mesh are as they were, bit by bit.
 
@@ -89,10 +91,11 @@ def boundary_of_solid(vertices: FloatArray, faces: IntArray) -> TriangleMesh:
 @dataclass(frozen=True)
 class _Cut:
     """Pieces (k, 3, 3) of some faces of a mesh, cut along each other, in coordinates of at most
-    about one: center + size times them are the real ones.
+    about one: center + size times these are the original coordinates.
 
-    unit: (n, 3) vertices. faces: those that were cut; owner: (k,) which of the mesh each piece is
-    of. front, back: (k,) winding numbers on its sides. is_thick: (k,) whether these are known.
+    unit: (n, 3) vertices. faces: the faces that were cut; owner: (k,) the face of the mesh that
+        each piece is of. front, back: (k,) winding numbers on its sides. is_thick: (k,) whether
+        these are known.
     """
 
     rays: TriangleTree
@@ -110,8 +113,8 @@ class _Cut:
     def of(
         cls, vertices: FloatArray, faces: IntArray, rows: IntArray, closed: IntArray | None = None
     ) -> _Cut:
-        """Of the faces `rows`. closed: all faces, with those that have no area, if there are
-        such."""
+        """The pieces of the faces `rows`. closed: all faces, with those without an area, if there
+        are such faces."""
         corner = vertices[faces]
         low, high = corner.min(axis=(0, 1)), corner.max(axis=(0, 1))
         size = float(2.0 ** np.ceil(np.log2(0.5 * float((high - low).max()))))
@@ -129,8 +132,8 @@ class _Cut:
         )
 
     def is_there_before(self) -> BoolArray:
-        """(k,) which pieces lie on a face in front of their own, in one plane, if all were cut: of
-        several in one place one is enough."""
+        """(k,) which pieces lie on a face that precedes their own, in one plane, if all faces were
+        cut: of several pieces in one place a single one is enough."""
         is_there = np.zeros(len(self.pieces), np.bool_)
         covered, covering = overlapping_faces(self.rays, self.unit, self.faces)
         covered, covering = covered[covering < covered], covering[covering < covered]
@@ -160,8 +163,9 @@ def _rays(scaled: FloatArray, faces: IntArray) -> TriangleTree:
 
 
 def _cut_at_corners(x: FloatArray, faces: IntArray) -> IntArray:
-    """Faces, cut until every edge is run as often one way as the other: those at edges where that
-    is not so at a corner of such edges that lies on them, of several the one next to the middle.
+    """Faces, cut until every edge is run as often in one direction as in the other. Edges for which
+    that fails are cut at a corner of such edges that lies on them, of several the corner nearest to
+    the middle.
 
     Raises:
         MeshingError: they do not fit together.
@@ -193,8 +197,8 @@ def _cut_at_corners(x: FloatArray, faces: IntArray) -> IntArray:
 
 
 def _corners_on(x: FloatArray, edges: IntArray) -> tuple[IntArray, BoolArray]:
-    """For each of some edges (k, 2) that of their ends which lies on it, nearest to its middle; and
-    whether there is one."""
+    """For each of edges (k, 2) the end of another edge that lies on it, nearest to its middle; and
+    whether there is such an end."""
     import scipy.spatial  # here: half a second that few need
 
     searching: Any = scipy.spatial
@@ -220,8 +224,8 @@ def _corners_on(x: FloatArray, edges: IntArray) -> tuple[IntArray, BoolArray]:
 
 
 def neighbors(x: FloatArray, faces: IntArray) -> IntArray:
-    """(k, 2) pairs of `half_edges` of faces at which two belong together: at edges of two, and
-    at those of more that have the material between them."""
+    """(k, 2) pairs of `half_edges` at which two faces belong together: the two at an edge of two
+    faces, and at an edge of more faces those that have the material between them."""
     pairs, m = half_edges(faces), len(faces)
     edges = Edges.of(pairs)
     beside = [edges.paired_half_edges()]
@@ -242,7 +246,7 @@ def _wedges(ends: FloatArray, third: FloatArray, is_along: BoolArray) -> IntArra
 
     Seen against the edge's direction, counter-clockwise, material begins behind a face that runs
     the edge backwards, since its positive side looks back, and ends at the next one that runs it
-    forwards. Of faces in one direction those at which material ends come first.
+    forwards. Of faces in the same direction, faces at which material ends come first.
     """
     direction = ends[1] - ends[0]
     away = third - ends[0]
@@ -265,7 +269,7 @@ def _wedges(ends: FloatArray, third: FloatArray, is_along: BoolArray) -> IntArra
 
 
 def _apart_at_contacts(x: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray]:
-    """A closed surface with a corner of its own for each of the sheets that touch in one."""
+    """A closed surface in which each sheet has corners of its own where sheets touch."""
     m = len(faces)
     edge, opposite = neighbors(x, faces).T
     # Corner k of face i is k m + i, and edge k runs from it to the next.

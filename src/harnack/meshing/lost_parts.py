@@ -1,5 +1,4 @@
-"""Finds parts of a level set that are missing from its mesh by signs: walls and gaps thinner than a
-cell.
+"""Parts of a level set that are missing from its mesh by signs: walls and gaps thinner than a cell.
 
 Signs at the points of a lattice do not show a wall between two of them, nor a gap. That the mesh is
 near the level everywhere is checked by `points_off_level`; here the converse is checked, from
@@ -37,19 +36,23 @@ if TYPE_CHECKING:
 
 __all__ = ["LostParts", "PointsOnLevel"]
 
-# So many points are spread over triangles by area, and so many lie in the middles of others.
+# The number of points that are spread over triangles by area, and the number of triangles with a
+# point in their middle.
 _BY_AREA, _MIDDLES = 2000, 1000
-# Points beside triangles are so far from these, as a part of the size, or if that is more of the
-# coordinates; and w on both sides is by so much off the level at least, else rounding decides.
+# The distance of points beside triangles from these, relative to the size, or if that is more,
+# relative to the coordinates; and the smallest difference of w on both sides from the level, below
+# which rounding would decide.
 _BESIDE, _ROUNDED, _CLEARLY = 1e-9, 64 * 2.0**-53, 0.02
-# So many smoothing lengths the level may be from the points of a cloud.
+# The largest distance of the level from the points of a cloud, in smoothing lengths.
 _SMOOTHED = 2.0
-# Parts are lost if more than this share of the points are beyond the tolerance from the mesh, as
-# many as may be of the mesh's own points from the level; or if one is farther than so many cells.
+# Parts are lost if more than this fraction of the points are beyond the tolerance from the mesh,
+# the fraction that is allowed for the mesh's points off the level; or if a point is farther than
+# this number of cells.
 _SHARE, _CELLS = 0.01, 0.5
-# How thick a part is at so many places, as parts of a cell.
+# The number of points at which the thickness of a part is measured; and the thicknesses that are
+# tried, in cells.
 _LOOKED_AT, _THICKNESSES = 40, 2.0 ** np.arange(-10, 0.5, 0.25)
-# Thinner parts than this many cells are lost nearly everywhere.
+# Parts thinner than this, in cells, are lost nearly everywhere.
 _THIN = 0.25
 
 
@@ -65,7 +68,7 @@ class PointsOnLevel:
     def of(cls, function: SignFunction, tolerance: float) -> PointsOnLevel:
         """The known points on the level of a field; none for fields without such points.
 
-        tolerance: a length; the points of a cloud are looked at from this distance.
+        tolerance: a length; the distance from the points of a cloud at which its sign is evaluated.
         """
         mesh = function.field.jump_mesh()
         if mesh is not None:
@@ -90,7 +93,7 @@ class PointsOnLevel:
 
     @classmethod
     def _on_triangles(cls, function: SignFunction, corner: FloatArray) -> PointsOnLevel:
-        """On triangles (m, 3, 3) across which the function changes its sign."""
+        """Points on triangles (m, 3, 3) across which the function changes its sign."""
         normal = area_normals(corner)
         area = row_norms(normal)
         rows = np.concatenate([_by_area(area), _spread(len(corner), _MIDDLES)])
@@ -124,12 +127,13 @@ class PointsOnLevel:
 class LostParts:
     """Points of the level that are farther from a mesh than they should be.
 
-    far: how many are farther than the tolerance, of `looked_at`; beyond: how many of them are
-        farther than half a cell; within: a distance within which all are, by corners and centers
-        of triangles; inf if there are none.
-    missing, filled: (k, 3), of those that are far some that lie on parts which are missing, and
-        some in gaps which are filled; others: those of which neither is known.
-    thickness: of such parts and gaps, the median; inf if they are wider than cells, or not known.
+    far: the number of points farther than the tolerance, of `looked_at`; beyond: the number of
+        these that are farther than half a cell; within: a distance within which all points are, by
+        corners and centers of triangles; inf if there are none.
+    missing, filled: (k, 3), selections of the far points: on parts that are missing, and in gaps
+        that are filled; others: points for which neither is known.
+    thickness: the median thickness of such parts and gaps; inf if they are wider than cells, or not
+        known.
     spacing: of cells. advice: what to do.
     """
 
@@ -183,18 +187,19 @@ class LostParts:
 
     @property
     def matter(self) -> bool:
-        """Whether there are more points off the mesh than creases and corners leave for all
-        meshes."""
+        """Whether there are more points off the mesh than creases and corners cause for any
+        mesh."""
         return self.beyond > 0 or self.far > _SHARE * self.looked_at
 
     @property
     def show_thin_parts(self) -> bool:
-        """Whether they are on parts or in gaps that are thinner than cells, or beyond half a cell,
-        so that more is wrong than how coarse the mesh is."""
+        """Whether points are on parts or in gaps that are thinner than cells, or beyond half a
+        cell, so that the coarseness of the mesh is not the only cause."""
         return self.beyond + len(self.missing) + len(self.filled) > 0
 
     def are_mended_by(self, smaller: float) -> bool:
-        """Whether cells smaller by a factor may show them: not if most are far thinner."""
+        """Whether cells smaller by a factor may show the lost parts: not if most are far
+        thinner."""
         return self.thickness >= _THIN * smaller * self.spacing
 
     def __str__(self) -> str:
@@ -215,7 +220,7 @@ class LostParts:
 
 
 def _advice(field: Field) -> str:
-    """What helps where cells miss parts."""
+    """The remedy where cells miss parts, in words."""
     advice = "choose a smaller `cell_size`"
     if isinstance(field, WindingNumber):
         advice += "; `harnack.repair` keeps thin parts where their triangles are sound"
@@ -225,24 +230,24 @@ def _advice(field: Field) -> str:
 
 
 def _by_area(area: FloatArray) -> IntArray:
-    """Rows, each as often as its part of the area asks for."""
+    """Row indices, each repeated in proportion to its area."""
     ends: FloatArray = np.cumsum(area)
     targets: FloatArray = (np.arange(_BY_AREA) + 0.5) / _BY_AREA * ends[-1]
     return np.searchsorted(ends, targets)
 
 
 def _spread(count: int, max_count: int) -> IntArray:
-    """All of some rows, or no more than `most`, evenly spread."""
+    """The indices of all rows, or of `max_count` rows, evenly spread."""
     return np.linspace(0, count - 1, min(count, max_count)).astype(np.int64)
 
 
 def _thicknesses(
     function: SignFunction, points: PointsOnLevel, spacing: float
 ) -> tuple[FloatArray, BoolArray]:
-    """How far points of the level (k, 3) are, along the normal on either side, from where the sign
-    changes again, up to about a cell, the smaller of both; and whether that is inside. Of clouds
-    that is not known."""
-    if isinstance(function.field, OrientedPoints):  # each point is in a bubble of its own
+    """The distances from points of the level (k, 3), along the normal on either side, to the next
+    change of sign, up to about a cell, the smaller of both; and whether that side is inside. For
+    clouds they are not known."""
+    if isinstance(function.field, OrientedPoints):  # each point is in its own bubble
         nowhere = np.full(len(points.points), np.inf)
         return nowhere, nowhere > 0
     distances = spacing * _THICKNESSES
@@ -272,8 +277,8 @@ def _bound_of_distances(points: FloatArray, corner: FloatArray) -> float:
 def _are_farther(points: FloatArray, corner: FloatArray, distance: float) -> BoolArray:
     """(n,) whether points (n, 3) are farther than a distance from all triangles (m, 3, 3).
 
-    A triangle within the distance has its center within that and its reach. Triangles are taken
-    together whose reach differs by less than a factor of 2.
+    A triangle within the distance has its center within the sum of the distance and the triangle's
+    radius. Triangles whose radii differ by less than a factor of 2 are examined together.
     """
     import scipy.spatial  # here: half a second that few need
 

@@ -1,4 +1,4 @@
-"""Triangles of a level set in tetrahedra, when its function may be an angle; and the tetrahedra.
+"""Triangles of a level set in tetrahedra, for functions that may be angles; and the tetrahedra.
 
 The continuous change of the function along an edge is its *lift*. The signed number of level
 crossings is that of the lift: 0 or +-1 if cells are small enough. For a real-valued function it
@@ -39,10 +39,11 @@ __all__ = [
 ]
 
 _PAIRS = tuple(itertools.combinations(range(4), 2))
-# Values this large are none: where the other end has one, the edge is crossed in its middle.
+# Values this large mark points outside: where the other end has a value, the edge is crossed in its
+# middle.
 OUTSIDE_VALUE = 1e299
-# Of places where edges meet the level, as a part of the edge; and what secants leave at its ends,
-# so that triangles have an area.
+# The error of roots on edges, relative to the edge; and the distance of roots by secants from its
+# ends, so that triangles have an area.
 _ROOT_ERROR, _FROM_ENDS = 1e-10, 1e-4
 
 
@@ -81,14 +82,14 @@ class Tetrahedra:
 
 
 def delaunay(points: FloatArray) -> Tetrahedra:
-    """The Delaunay tetrahedra of points (n, 3) in general position, but that many may lie on the
+    """The Delaunay tetrahedra of points (n, 3) in general position, except that many may lie on the
     faces of a box.
 
     Eight points far away are added and left out again with their tetrahedra: Qhull takes long over
     a hull that is flat.
 
     Raises:
-        MeshingError: points are too near to each other, for their distance.
+        MeshingError: points are too near to each other, relative to their extent.
     """
     import scipy.spatial  # here: half a second that few need
 
@@ -97,7 +98,8 @@ def delaunay(points: FloatArray) -> Tetrahedra:
     rotation = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
     far_corners = np.array(list(itertools.product((-1.0, 1.0), repeat=3))) @ rotation
     n = len(points)
-    # About the middle, so that Qhull does not round far from the origin.
+    # Relative to the middle, so that Qhull's rounding does not grow with the distance from the
+    # origin.
     together = np.concatenate([points - middle, 20 * size * far_corners])
     try:
         corners: IntArray = qhull.Delaunay(together).simplices.astype(np.int64)
@@ -114,10 +116,10 @@ def delaunay(points: FloatArray) -> Tetrahedra:
 class EdgeCrossings:
     """Crossings of all edges of tetrahedra, between points off the level.
 
-    count: (k,) how often an edge crosses the level, upwards less downwards.
-    change: (k,) of the function along it.
-    proved: how many changes are proved to be the difference of wrapped values.
-    integrated_count: how many were integrated along the edge.
+    count: (k,) the number of upward minus that of downward crossings of the level along each edge.
+    change: (k,) the change of the function along each edge.
+    proved: the number of changes that are proved to be the difference of wrapped values.
+    integrated_count: the number of changes that were integrated along the edge.
     """
 
     count: IntArray
@@ -163,8 +165,8 @@ def count_crossings(
 def _integrate_change(
     field: Field, p: FloatArray, q: FloatArray, wrapped: FloatArray, period: float
 ) -> FloatArray:
-    """The change of f from p to q (n, 3): what the field says, as it differs from the wrapped one
-    by whole periods."""
+    """The change of f from p to q (n, 3), as the field integrates it, which differs from the
+    wrapped change by whole periods."""
     exact = field.continuous_change(p, q)
     if exact is None:
         raise MeshingError(
@@ -192,10 +194,11 @@ def extract_triangles(
     roots_of: EdgeRootFinder | None = None,
 ) -> tuple[FloatArray, IntArray]:
     """Vertices (n, 3) and faces (m, 3), counter-clockwise as seen from where the function is
-    greater. The first vertices are `points`, whether they are in use or not; then comes one for
-    each edge that is crossed, in their order.
+    greater. The first vertices are `points`, whether they are in use or not; they are followed by a
+    vertex for each edge that is crossed, in their order.
 
-    roots_of: where edges meet the level of a real-valued function; None for a search along them.
+    roots_of: computes where edges meet the level of a real-valued function; None for a search along
+        them.
 
     Raises:
         MeshingError: crossings that do not agree around a face, or two levels between corners.
@@ -238,7 +241,7 @@ def extract_triangles(
 
         on_level = [corner[:, k] for k in level]
         crossed = [at(i, j) for i in up for j in down]
-        if len(crossed) == 4:  # two and two
+        if len(crossed) == 4:  # two corners on each side
             ring = [at(up[0], down[0]), at(up[0], down[1]), at(up[1], down[1]), at(up[1], down[0])]
             for face in _halves(vertices, ring):
                 parts.append((face, rise))
@@ -246,8 +249,9 @@ def extract_triangles(
             parts.append((np.stack([*on_level, *crossed], axis=1), rise))
     parts.append(_faces_on_the_level(function, points, tets))
     faces, rise = (np.concatenate(column) for column in zip(*parts, strict=True))
-    # As with vertices in the middles of edges: of a plane through any points of these all corners
-    # above are on one side, and roots at an end, as where f jumps, leave triangles without an area.
+    # The orientation is tested with vertices in the middles of edges: any plane through points of
+    # the edges has all corners above on one side, and roots at an end, as where f jumps, leave
+    # triangles without an area.
     middles = _mean(points.points, tets.ends[edges])
     turned = row_dots(area_normals(np.concatenate([points.points, middles])[faces]), rise) < 0
     faces[turned] = faces[turned][:, ::-1]
@@ -266,7 +270,7 @@ def _mean(points: FloatArray, index: IntArray) -> FloatArray:
 
 
 def _halves(vertices: FloatArray, ring: list[IntArray]) -> tuple[IntArray, IntArray]:
-    """A quadrilateral cut along its shorter diagonal."""
+    """The two triangles of a quadrilateral cut along its shorter diagonal."""
     a, b, c, d = ring
     ac, bd = (row_norms(vertices[x] - vertices[y]) for x, y in ((a, c), (b, d)))
     longer = (ac > bd)[:, None]
@@ -276,8 +280,8 @@ def _halves(vertices: FloatArray, ring: list[IntArray]) -> tuple[IntArray, IntAr
 
 
 def _sides(points: TetrahedronPoints, tets: Tetrahedra, crossings: EdgeCrossings) -> IntArray:
-    """(m, 4): how many levels lie between the first corner that is off the level, and each other
-    one."""
+    """(m, 4) the number of levels between the first corner that is off the level and each other
+    corner."""
     on = points.is_on_level[tets.corners]
     rows = np.arange(len(on))
     first = np.argmin(on, axis=1)
@@ -310,7 +314,7 @@ def _roots(
     crossings: EdgeCrossings,
     edges: IntArray,
 ) -> FloatArray:
-    """Where some edges meet the level (r, 3), by Chandrupatla's method along the edge."""
+    """(r, 3) the points where `edges` meet the level, by Chandrupatla's method along the edge."""
     a, b = tets.ends[edges].T
     p, direction = points.points[a], points.points[b] - points.points[a]
     value, change = points.samples.value[a], crossings.change[edges]
@@ -342,8 +346,9 @@ def _roots(
 def _illinois(
     function: LevelFunction, p: FloatArray, direction: FloatArray, low: FloatArray, high: FloatArray
 ) -> FloatArray:
-    """(r,) places along edges by a few secants, given the values at both ends; the end that stays
-    counts half from the second time on (the Illinois method)."""
+    """(r,) the fractions along edges where they meet the level, by a few secants from the values at
+    both ends; the value at an end that stays is halved from the second time on (the Illinois
+    method)."""
     first, last = np.zeros(len(p)), np.ones(len(p))
     up = high > low
     low, high = np.where(up, low, -low), np.where(up, high, -high)
@@ -369,7 +374,7 @@ def _chandrupatla(
     change: FloatArray,
     lifted: Callable[..., FloatArray],
 ) -> FloatArray:
-    """(r,) places along edges by Chandrupatla's method."""
+    """(r,) the fractions along edges where they meet the level, by Chandrupatla's method."""
     import scipy.optimize.elementwise as elementwise  # here: half a second that few need
 
     search = cast("Any", elementwise).find_root
@@ -390,10 +395,11 @@ def _chandrupatla(
 def _faces_on_the_level(
     function: LevelFunction, points: TetrahedronPoints, tets: Tetrahedra
 ) -> tuple[IntArray, FloatArray]:
-    """Faces of tetrahedra with all corners on the level that have another side of it behind than
-    before them, and the way up through each.
+    """Faces of tetrahedra that have all corners on the level and different sides of the level
+    before and behind them; and the upward direction through each.
 
-    A side is that of the fourth corner, or if it is on the level too, of the center.
+    The side of a tetrahedron is that of its fourth corner or, if this is on the level too, of its
+    center.
     """
     on = points.is_on_level[tets.corners]
     triples: list[IntArray] = []
@@ -434,7 +440,7 @@ def _wrap(change: FloatArray, period: float) -> FloatArray:
 def _side_sample(
     function: LevelFunction, points: TetrahedronPoints, tets: Tetrahedra, rows: IntArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Points (n, 3) on one side of faces, and the function there."""
+    """Points (n, 3) on one side of faces, and the values of the function at them."""
     corners = tets.corners[rows[:, 3]]
     apex = corners[np.arange(len(rows)), rows[:, 4]]
     side_points, value = points.points[apex], points.samples.value[apex]

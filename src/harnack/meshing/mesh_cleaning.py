@@ -1,4 +1,4 @@
-"""Cleans a damaged mesh: finds the triangles that can stay, and the defects of the others.
+"""The cleaning of a damaged mesh: the triangles that can stay, and the defects of the others.
 
 Duplicate, degenerate and intersecting triangles are removed; those turned over against their
 neighbors are flipped. The remaining triangles are oriented and intersect nothing, and their holes
@@ -40,11 +40,13 @@ from harnack.meshing.lattice_meshing import TriangleMesh
 
 __all__ = ["CleanedMesh", "against_neighbors", "clean_and_fill", "weld_near_corners"]
 
-# How often the rings around holes are left out; and what part of all triangles may be.
+# The largest number of rings around holes that are removed; and the largest fraction of all
+# triangles that may be.
 _MOST_RINGS, _MOST_LEFT_OUT = 6, 0.5
-# More open edges than this part of the triangles are those of loose triangles.
+# If the ratio of open edges to triangles is larger than this, the triangles are loose.
 _MOST_OPEN = 0.5
-# Corners of loose triangles are joined that are nearer than one of these parts of the usual edge.
+# Corners of loose triangles that are nearer than one of these distances, relative to the usual
+# edge, are joined.
 _NEAR = (0.01, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3)
 
 
@@ -53,9 +55,9 @@ class CleanedMesh:
     """A closed mesh in which the valid triangles of the input come first, bit by bit.
 
     kept: for each of the first faces, the index of the input face that it is, in order.
-    turned: which of these are reversed.
-    left_out: how many of the input triangles were removed, by reason.
-    holes: how many were filled.
+    turned: which of these faces are reversed.
+    left_out: the number of input triangles that were removed, by reason.
+    holes: the number of filled holes.
     """
 
     surface: TriangleMesh
@@ -68,10 +70,10 @@ class CleanedMesh:
 def clean_and_fill(
     vertices: FloatArray, faces: IntArray, report: Callable[[str], None]
 ) -> CleanedMesh:
-    """The sound triangles of a mesh, with patches in place of all others and over holes.
+    """The valid triangles of a mesh, with patches in place of all others and over holes.
 
     Raises:
-        MeshingError: half of the triangles would go, or all, or most of them are loose.
+        MeshingError: half of the triangles, or all, would be removed, or most of them are loose.
     """
     report("looking for triangles that are sound")
     state = _WorkingMesh.of(vertices, faces)
@@ -97,8 +99,8 @@ def clean_and_fill(
 
 
 def weld_near_corners(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray, float]:
-    """Loose triangles with near corners moved to their mean, of several distances that which leaves
-    the fewest edges open; faces; and how far the farthest corner went.
+    """The vertices of loose triangles, with near corners moved to their mean: of several distances
+    the one that leaves the fewest edges open; the faces; and the largest move of a corner.
 
     Raises:
         MeshingError: triangles are not loose, or most edges stay open.
@@ -116,7 +118,7 @@ def weld_near_corners(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray
         mean = np.stack([np.bincount(group, column) for column in points.T], axis=1) / count
         welded = group[corners]
         proper = welded[(welded != np.roll(welded, 1, axis=1)).all(axis=1)]
-        missing = 3 * (len(faces) - len(proper))  # what has lost an edge counts as if all were open
+        missing = 3 * (len(faces) - len(proper))  # a lost triangle counts as three open edges
         moved = float(row_norms(mean[group] - points).max())
         candidates.append((len(boundary_edges(proper)) + missing, mean, proper, moved))
     count, mean, proper, moved = min(candidates, key=lambda candidate: candidate[0])
@@ -130,8 +132,9 @@ def weld_near_corners(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray
 
 @dataclass(frozen=True)
 class _WorkingMesh:
-    """Vertices, those given first; faces; of each face which of the given ones it is, or -1, and
-    whether it runs the other way. counts: of the given ones that were left out, by reason."""
+    """Vertices, those of the input first; faces; for each face the index of the input face that it
+    is, or -1, and whether it is reversed. counts: the number of input faces that were removed, by
+    reason."""
 
     vertices: FloatArray
     faces: IntArray
@@ -141,7 +144,7 @@ class _WorkingMesh:
 
     @classmethod
     def of(cls, vertices: FloatArray, faces: IntArray) -> _WorkingMesh:
-        """What passes through nothing, oriented."""
+        """The faces that intersect no others, oriented."""
         joined = weld_vertices(vertices)[faces]
         every = np.arange(len(faces))
         corner = vertices[joined]
@@ -158,7 +161,8 @@ class _WorkingMesh:
         return cls(vertices, joined[rows], rows, np.zeros(len(rows), np.bool_), counts)
 
     def keep_faces(self, rows: BoolArray, reason: str) -> _WorkingMesh:
-        """Without some faces, of which those given are counted."""
+        """The mesh with only the faces `rows`; input faces that are removed are counted under
+        `reason`."""
         lost = int((~rows & (self.source_face >= 0)).sum())
         counts = self.counts | {reason: self.counts[reason] + lost}
         return _WorkingMesh(
@@ -166,8 +170,8 @@ class _WorkingMesh:
         )
 
     def without_nonmanifold_edges(self) -> _WorkingMesh:
-        """Without faces at edges of more than two; and oriented, without those at edges where that
-        is not possible."""
+        """The mesh without faces at edges of more than two faces; and oriented, without the faces
+        at edges where that is not possible."""
         state = self.without_fins()
         edges = Edges.of(half_edges(state.faces))
         excess = np.asarray((edges.multiplicity > 2)[edges.edge_of_pair].reshape(3, -1).any(axis=0))
@@ -189,9 +193,9 @@ class _WorkingMesh:
         return state.keep_faces(~np.asarray(one_sided), "one-sided")
 
     def without_fins(self) -> _WorkingMesh:
-        """Without sheets that hang on a surface: of the pieces between edges of more than two faces
-        those that end in the open, the smallest first, as long as there are such edges. The largest
-        piece stays."""
+        """The mesh without sheets that hang on a surface: of the pieces between edges of more than
+        two faces, pieces with open ends are removed, the smallest first, as long as there are such
+        edges. The largest piece stays."""
         state = self
         while True:
             edges = Edges.of(half_edges(state.faces))
@@ -211,7 +215,8 @@ class _WorkingMesh:
             state = state.keep_faces(piece != fins[area[fins].argmin()], "branching")
 
     def filled(self, loops: list[IntArray]) -> tuple[_WorkingMesh, list[IntArray], str]:
-        """With patches where they pass the checks; the loops left, and why they are."""
+        """The mesh with patches that pass the checks; the loops that are not filled, and the
+        reason."""
         if not loops:
             return self, [], ""
         field = WindingNumber(self.vertices, self.faces)
@@ -229,18 +234,18 @@ class _WorkingMesh:
         return state, filling.unfilled_loops, filling.reason
 
     def without_ring(self, places: IntArray) -> _WorkingMesh:
-        """Without the faces at some vertices."""
+        """The mesh without the faces at the vertices `places`."""
         is_bad = np.zeros(len(self.vertices), np.bool_)
         is_bad[places] = True
         return self.keep_faces(~np.asarray(is_bad[self.faces].any(axis=1)), "around")
 
     def result(self, holes: int) -> CleanedMesh:
-        """The surface, with what was given first.
+        """The cleaned surface, input faces first.
 
         Raises:
             MeshingError: parts pass through each other.
         """
-        last = len(self.vertices) + len(self.source_face)  # behind all that were given
+        last = len(self.vertices) + len(self.source_face)  # after all input faces
         order = np.argsort(np.where(self.source_face < 0, last, self.source_face), kind="stable")
         faces, source = self.faces[order], self.source_face[order]
         check_manifold(faces)
@@ -264,8 +269,8 @@ class _WorkingMesh:
 
 
 def _pieces(edges: Edges, count: int) -> IntArray:
-    """(m,) which of the pieces that edges of two faces hold together each of `count` faces belongs
-    to. edges: those of `half_edges`."""
+    """(m,) the piece that each of `count` faces belongs to, where edges of two faces join faces to
+    pieces. edges: of `half_edges`."""
     import scipy.sparse  # here: half a second that few need
     import scipy.sparse.csgraph as csgraph_module
 
@@ -276,8 +281,9 @@ def _pieces(edges: Edges, count: int) -> IntArray:
 
 
 def against_neighbors(x: FloatArray, faces: IntArray) -> BoolArray:
-    """(m,) which faces are to be turned over for all that share an edge of two to agree: of each
-    part those with the smaller area. Parts of one side only are left as they are."""
+    """(m,) which faces are to be turned over so that all faces that share an edge of two faces
+    agree: in each connected part those of the orientation with the smaller area. Parts with only
+    one side are left as they are."""
     m, part = len(faces), orientation_components(faces)
     corner = x[faces]
     area = row_norms(area_normals(corner))

@@ -1,16 +1,16 @@
 """Better triangles: edges flipped, slivers contracted, vertices moved along the surface.
 
 Flips. Two triangles (a, b, c) and (b, a, d) become (c, d, b) and (d, c, a) where that makes the
-smaller of their least angles larger, where the new edge is as near to the surface as is asked for,
-and where the new triangles face the way the surface does.
+smaller of their least angles larger, where the new edge is within the tolerance of the surface, and
+where the new triangles face the way the surface does.
 
 Contractions. The ends of a sliver's shortest edge are merged: see `collapse_slivers`.
 
 Moves. Means of neighbors, to which `smoothed` moves vertices, make thin triangles where lengths of
-edges change quickly, as beside long boundary edges that cannot be cut. Here some places are tried
-for each vertex of a thin triangle, and it moves to the best of them if the least angle of all
-triangles around it grows. No two neighbors move at once, so that what was measured is what is made:
-the least angle around a moved vertex never falls.
+edges change quickly, as beside long boundary edges that cannot be cut. Here several positions are
+tried for each vertex of a thin triangle, and it moves to the best of them if the least angle of all
+triangles around it grows. No two neighbors move at once, so that the measured angles are those of
+the new mesh: the least angle around a moved vertex never falls.
 """
 
 from __future__ import annotations
@@ -35,14 +35,15 @@ from harnack.meshing.level_function import LevelFunction
 
 __all__ = ["collapse_slivers", "flip_edges", "least_angles", "relax_vertices"]
 
-# By how much a least angle has to grow: its cosine in flips, in radians in moves; and the least
-# cosine between normals of a triangle before and after, and between it and the gradient.
+# The smallest growth of a least angle: of its cosine in flips, in radians in moves; and the
+# smallest cosine between normals of a triangle before and after, and between its normal and the
+# gradient.
 _GAIN = 0.01
 _FACING = 0.5
 _MOST_ROUNDS_OF_FLIPS = 12
 # Triangles with a smaller angle, in radians, are slivers: 4 degrees.
 _SLIVER = 0.07
-# The least cosine between normals of the triangles around a contracted edge and the gradient.
+# The smallest cosine between normals of the triangles around a contracted edge and the gradient.
 _MIN_COLLAPSE_COSINE = 0.3
 
 
@@ -52,11 +53,11 @@ def flip_edges(
     faces: IntArray,
     tolerance: float,
 ) -> IntArray:
-    """Faces after rounds of flips, each of which improves the two triangles it touches; of several
-    flips of one triangle the best is made.
+    """Faces after rounds of flips, each of which improves the two triangles at its edge; of several
+    flips of one triangle only the best is done.
 
     tolerance: how far the middles of new edges, and the centers of new triangles, may be from the
-        surface, by the slope there.
+        surface, estimated by the slope there.
     """
     refused = np.zeros(0, np.int64)
     boundary = edge_keys(boundary_edges(faces), len(vertices))
@@ -101,7 +102,7 @@ def _quadrilaterals(faces: IntArray) -> tuple[IntArray, IntArray]:
 def _independent_flips(
     rows: IntArray, gain: FloatArray, pairs: IntArray, key: IntArray, count: int
 ) -> IntArray:
-    """Those candidates that are the best of both their faces, and the only ones of their edge."""
+    """The candidates that are the best of both their faces, and the only ones of their edge."""
     rows = rows[np.argsort(-gain[rows], kind="stable")]
     rank = np.arange(len(rows))
     first = np.full(count, len(rows))
@@ -129,7 +130,7 @@ def _flips_stay_near(
 
 
 def _holds(numbers: IntArray, keys: IntArray) -> BoolArray:
-    """(k,) whether ascending numbers (n,) hold those wanted (k,)."""
+    """(k,) whether the keys (k,) are among ascending numbers (n,)."""
     at = np.searchsorted(numbers, keys)
     return numbers[np.minimum(at, len(numbers) - 1)] == keys if len(numbers) else at < 0
 
@@ -153,9 +154,9 @@ def collapse_slivers(
     fixed: BoolArray,
     tolerance: float,
 ) -> IntArray:
-    """Faces without those slivers of which an end of the shortest edge can be moved to the other.
+    """Faces without slivers whose shortest edge can be contracted to one of its ends.
 
-    An edge (u, v) can be contracted to u without a change of topology if u and v have just the two
+    An edge (u, v) can be contracted to u without a change of topology if u and v have only the two
     neighbors in common that are the third corners of its faces (the link condition), and v is not
     `fixed` (n,), as boundary vertices are. It is contracted if no new triangle is a sliver, all
     face the way that the surface does, and their centers are within `tolerance` of it.
@@ -186,7 +187,7 @@ def collapse_slivers(
 
 
 def _can_contract(faces: IntArray, target: int, source: int) -> bool:
-    """The link condition, of an edge with two faces."""
+    """Whether an edge with two faces satisfies the link condition."""
     target_faces, source_faces = (faces[(faces == v).any(axis=1)] for v in (target, source))
     common = np.setdiff1d(np.intersect1d(target_faces, source_faces), [target, source])
     beside = source_faces[(source_faces == target).any(axis=1)]
@@ -209,7 +210,7 @@ Walls = tuple[FloatArray, FloatArray] | None
 # Triangles with a smaller angle are thin, in radians: 30 degrees.
 _THIN = 0.52
 _MOST_ROUNDS_OF_MOVES = 6
-# Parts of the way to each aim that are tried.
+# The fractions of the displacement to each aim that are tried.
 _PARTS = (1.0, 0.5)
 
 
@@ -220,8 +221,8 @@ def relax_vertices(
     tolerance: float,
     walls: Walls,
 ) -> FloatArray:
-    """Vertices (n, 3), moved where that makes the least angles of triangles larger; those of the
-    boundary stay.
+    """Vertices (n, 3), moved where that makes the least angles of triangles larger; boundary
+    vertices stay.
 
     tolerance: how far the centers of triangles around moved vertices may be from the surface.
     """
@@ -247,8 +248,8 @@ def relax_vertices(
 
 @dataclass(frozen=True)
 class _VertexStars:
-    """Faces around some vertices: centers (k,), and pairs of one of these, owner (p,), and a face,
-    face (p,), with the corners of that face, corners (p, 3), the center first."""
+    """Faces around vertices: the vertices, centers (k,), and pairs of a vertex, owner (p,), and a
+    face, face (p,), with the corners of that face, corners (p, 3), the center first."""
 
     centers: IntArray
     owner: IntArray
@@ -286,12 +287,12 @@ def _best_places(
     stars: _VertexStars,
     walls: Walls,
 ) -> tuple[FloatArray, FloatArray]:
-    """Where each vertex is best (k, 3), and the least angle around it there (k,)."""
+    """The best positions (k, 3) of vertices, and the least angle around each vertex there (k,)."""
     center, a, b = (vertices[stars.corners[:, k]] for k in range(3))
     normal = np.cross(a - center, b - center)
     normal /= np.maximum(row_norms(normal), 1e-300)[:, None]
     middle = 0.5 * (a + b)
-    # Where the triangle over the opposite edge has equal sides.
+    # The position at which the triangle over the opposite edge has equal sides.
     apex = middle + np.sqrt(0.75) * np.cross(normal, b - a)
     start = vertices[stars.centers]
     aims = [stars.mean(apex), stars.mean(middle), 0.5 * (stars.mean(apex) + stars.mean(middle))]
@@ -306,7 +307,8 @@ def _best_places(
             angle = _least_at(x, stars, a, b, normal)
             better = angle > best_angle
             best[better], best_angle[better] = x[better], angle[better]
-    # Onto the surface only the best of them, which changes little: the aims are beside it.
+    # Only the best position is moved onto the surface, which changes it little: the aims are near
+    # it.
     span = row_norms(best - start) + 1e-300
     best = newton_to_level(function, best, function.sample(best), 2 * span, walls, steps=4)
     return best, _least_at(best, stars, a, b, normal)
@@ -331,7 +333,7 @@ def _least_at(
 def _independent_moves(
     rows: IntArray, gain: FloatArray, stars: _VertexStars, faces: IntArray, count: int
 ) -> IntArray:
-    """Those vertices that gain more than all their neighbors do."""
+    """The vertices that gain more than all their neighbors."""
     rank = np.full(count, len(rows))
     ordered = rows[np.argsort(-gain[rows], kind="stable")]
     rank[stars.centers[ordered]] = np.arange(len(rows))
@@ -349,7 +351,7 @@ def _moves_stay_near(
     rows: IntArray,
     tolerance: float,
 ) -> BoolArray:
-    """(k,) whether some vertices, where they would be, are on the surface, and the triangles
+    """(k,) whether the vertices `rows`, at their targets, are on the surface, and the triangles
     around them near it, facing the way it does."""
     moved = np.zeros(len(stars.centers), np.bool_)
     moved[rows] = True

@@ -1,9 +1,9 @@
-"""Closed meshes of which a few vertices or faces are too far from the level, mended there alone.
+"""The local repair of closed meshes a few of whose vertices or faces are too far from the level.
 
-Offsets of meshes have creases everywhere. Where another part cuts a triangle that lies across one,
-the pieces have centers and corners of their own, of which one in a hundred thousand may be farther
-from the level than the triangle's center. Edges across the crease are cut on it there, and what is
-new is checked with what is around it.
+Offsets of meshes have creases everywhere. Where another part cuts a triangle that lies across a
+crease, the pieces have centers and corners of their own, of which one in a hundred thousand may be
+farther from the level than the triangle's center. There edges across the crease are cut on it, and
+the new faces are checked with those around them.
 """
 
 from __future__ import annotations
@@ -23,11 +23,12 @@ from harnack.meshing.self_intersection_repair import resolve_local_intersections
 
 __all__ = ["project_outliers"]
 
-# More places than this are no exceptions; and how often faces may be cut, one after the other.
+# The largest number of locations that is mended; and how often faces may be cut, one after the
+# other.
 _MOST, _TIMES = 100, 4
-# Edges of such faces are cut if their middle is farther off than that, in tolerances.
+# Edges of such faces are cut if their middle is farther off the level than this, in tolerances.
 _FAR = 0.5
-# How far mending may move what is cut, in tolerances.
+# How far mending of intersections may move cut faces, in tolerances.
 _MENDED_WITHIN = 0.25
 
 
@@ -38,15 +39,15 @@ def project_outliers(
     tolerance: float,
     check: Callable[[TriangleMesh], None],
 ) -> TriangleMesh | None:
-    """The surface with vertices that are far from the level moved onto it, and faces with such a
-    center cut at the middles of their edges that are far, or at their own, moved onto it; None if
+    """The surface with vertices that are far from the level moved onto it, and faces with a far
+    center cut at the far middles of their edges, or at the center, moved onto the level; None if
     that cannot be done.
 
-    surface: of which no triangles pass through each other, and all but some are near the level.
-    places: (k, 3) these vertices, and centers of faces. tolerance: nothing is moved farther than
-        twice that.
-    check: raises a MeshingError of a surface that is not near the level. It is given what has
-        changed; that this passes through no other triangle is decided exactly.
+    surface: none of its triangles pass through each other, and nearly all are near the level.
+    places: (k, 3) the far vertices, and centers of faces. tolerance: a length; no point is moved
+        farther than twice that.
+    check: raises a MeshingError for a surface that is not near the level. It is called with the
+        changed faces; whether these pass through other triangles is decided exactly.
     """
     if len(places) > _MOST:
         return None
@@ -77,8 +78,9 @@ def _project_and_split(
     points: FloatArray,
     tolerance: float,
 ) -> tuple[tuple[FloatArray, IntArray], BoolArray] | None:
-    """Vertices and faces with what is at some places moved onto the level, or cut; and which faces
-    are new (m,), those that were included. None if something is elsewhere, or too far from it."""
+    """Vertices and faces with the vertices at `points` moved onto the level and the faces with a
+    center at `points` cut; and (m,) which faces are new, including those of `is_new`. None if a
+    point is neither a vertex nor a center, or too far from the level."""
     vertices, faces = surface.vertices, surface.faces
     corners = _rows_at(points, vertices)
     centers = _rows_at(points, vertices[faces].mean(axis=1))
@@ -90,7 +92,7 @@ def _project_and_split(
     count = len(vertices)
     keys = sorted_unique(edge_keys(pairs, count))
     ends = np.stack(np.divmod(keys, count), axis=1)
-    # Edges of all faces at these ends: which of them is cut.
+    # Which edges are cut, of all faces at these ends.
     midpoint = np.full(faces.shape, -1, np.int64)
     rows = np.flatnonzero(np.isin(faces, ends).any(axis=1))
     position = np.searchsorted(keys, face_keys := edge_keys(half_edges(faces[rows]), count))
@@ -130,7 +132,7 @@ def _check_new_faces(
     tolerance: float,
     check: Callable[[TriangleMesh], None],
 ) -> TriangleMesh | None:
-    """The surface if its new faces (m,) pass through no others; mended there if need be, and then
+    """The surface if its new faces (m,) pass through no others; otherwise mended there, and then
     checked as a whole; None if that does not help."""
     vertices, faces = surface.vertices, surface.faces
     nearby = _in_boxes_of(vertices[faces], np.flatnonzero(is_new))
@@ -148,7 +150,7 @@ def _check_new_faces(
 
 
 def _in_boxes_of(corner: FloatArray, rows: IntArray) -> IntArray:
-    """Triangles (m, 3, 3), by index, whose box meets that of one of some."""
+    """The indices of triangles (m, 3, 3) whose box meets that of a triangle in `rows`."""
     lower, upper = corner.min(axis=1), corner.max(axis=1)
     meets = np.zeros(len(corner), np.bool_)
     for row in rows.tolist():
@@ -157,7 +159,7 @@ def _in_boxes_of(corner: FloatArray, rows: IntArray) -> IntArray:
 
 
 def _rows_at(targets: FloatArray, points: FloatArray) -> IntArray:
-    """Points, by index, that are one of some places."""
+    """The indices of points that are equal to a target."""
     rows = np.flatnonzero(np.isin(points[:, 0], targets[:, 0]))
     same = (points[rows, None] == targets).all(axis=2).any(axis=1)
     return rows[same]

@@ -1,4 +1,4 @@
-"""What a slicer would complain of in a mesh, and where."""
+"""Checks of a mesh for problems that a slicer would report, and where they are."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ from harnack.meshing.thickness import wall_thickness
 
 __all__ = ["PrintCheck", "PrintProblem", "check_print"]
 
-# A part is tiny if it is no longer than this part of the whole.
+# A part is tiny if it is no longer than this, relative to the whole.
 _TINY = 0.01
 # Sizes in millimeters beyond which another unit is likely.
 _SMALLEST, _LARGEST = 1.0, 2000.0
 _INCH = 25.4
-# A part of exactly the least thickness, or the bed's size, may be off by so much of its size: files
-# hold single precision, and thickness is measured to it.
+# The relative error of a part of exactly the least thickness, or the bed's size: files hold single
+# precision, and thickness is measured to that.
 _ROUNDING = 1e-6
-# Faces longer than so many walls may hide thin places beside their centers.
+# Faces longer than this, in least thicknesses, may hide thin places beside their centers.
 _COARSE = 5.0
-# Words for one and for several, in messages.
+# The words for one and for several, in the texts of messages.
 _WORDS = re.compile(r"\{([^{}|]*)\|([^{}|]*)\}")
 
 
@@ -49,8 +49,8 @@ class PrintProblem:
     """A problem of a mesh that is to be printed.
 
     kind: its name, such as "open edges".
-    count: how many there are.
-    locations: (k, 3) where they are, of all or a part of them.
+    count: the number of its occurrences.
+    locations: (k, 3) of all occurrences, or of a part of them.
     message: the problem in a sentence.
     is_error: whether it is an error, and not a hint.
     """
@@ -69,8 +69,8 @@ class PrintCheck:
     problems: the worst first.
     size: (x, y, z).
     volume: None if the mesh is not closed.
-    triangles: how many there are.
-    parts: how many components there are that do not touch each other.
+    triangles: the number of triangles. parts: the number of components that do not touch each
+        other.
     """
 
     problems: tuple[PrintProblem, ...]
@@ -81,11 +81,11 @@ class PrintCheck:
 
     @property
     def is_printable(self) -> bool:
-        """Whether nothing is wrong; hints may be left."""
+        """Whether there is no error; there may be hints."""
         return not _is_wrong(self.problems)
 
     def as_dict(self, most_places: int = 10) -> dict[str, Any]:
-        """Of plain numbers and texts, as JSON holds them."""
+        """The result as a dictionary of plain numbers and texts, as JSON holds them."""
         return {
             "fine": self.is_printable,
             "size": list(self.size),
@@ -110,25 +110,24 @@ def check_print(
 ) -> PrintCheck:
     """What a slicer would complain of in a mesh, and where.
 
-    Wrong are: open edges, edges of more than two faces, neighbors that do not agree on their two
+    Errors are: open edges, edges of more than two faces, neighbors that do not agree on their two
     sides, parts that are inside out or in the material of others, vertices where sheets touch,
-    corners and edges that lie on other faces, triangles that pass through each other or lie on
-    each other (decided exactly), faces that are there twice; walls thinner than asked; what does
+    corners and edges that lie on other faces, triangles that pass through each other or lie on each
+    other (decided exactly), duplicate faces; walls thinner than `min_thickness`; a size that does
     not fit on the bed. Hints are: corners apart from others by rounding, which count as one, faces
     without an area, several parts, tiny ones, cavities without a way out (for powder and resin),
     and a size that looks like inches or meters, and, of walls, faces so large that a thin place
     beside their centers may be missed.
 
     part: a trimesh.Trimesh, (vertices, faces), or the name of a file. Vertices at the same place
-        are one.
-    min_thickness: the least thickness that is fine, a length (see `thickness`); None to leave it
-        out.
+        count as one.
+    min_thickness: the least allowed thickness, a length (see `thickness`); None to leave it out.
     build_volume: (x, y, z), the size that fits, turned by right angles about z; None to leave it
         out.
 
     Raises:
-        MeshError: no mesh. FileFormatError: a file that cannot be read. ValueError: a wall or a bed
-            that is no length.
+        MeshError: no mesh. FileFormatError: a file that cannot be read. ValueError: a thickness or
+            a bed that is no length.
     """
     if min_thickness is not None:
         min_thickness = as_positive(min_thickness, "min_thickness")
@@ -167,8 +166,8 @@ def _is_wrong(problems: Sequence[PrintProblem]) -> bool:
 
 
 def _mesh_of(part: Any) -> tuple[FloatArray, IntArray, PrintProblem]:
-    """Vertices, and faces between those at one place or apart by rounding, with those of zero area;
-    and how many were apart."""
+    """Vertices; faces, between the vertices at one place or apart by rounding, including faces of
+    zero area; and a hint with the number of corners that were apart."""
     if isinstance(part, str | os.PathLike):
         read = read_geometry(cast("Any", part), "winding")
         if not isinstance(read, LoadedMesh):
@@ -197,7 +196,8 @@ def _mesh_of(part: Any) -> tuple[FloatArray, IntArray, PrintProblem]:
 
 
 def _problem(kind: str, where: FloatArray, text: str, *, is_fatal: bool = True) -> PrintProblem:
-    """text: with {} for the number, and the words for one and for several as {one|several}."""
+    """A problem with its message. text: with {} for the number, and the words for one and for
+    several as {one|several}."""
     count = len(where)
     near = "" if not count else f", {'' if count == 1 else 'such as '}at {point_text(where[0])}"
     text = _WORDS.sub(lambda pair: pair[1 if count == 1 else 2], text)
@@ -205,7 +205,7 @@ def _problem(kind: str, where: FloatArray, text: str, *, is_fatal: bool = True) 
 
 
 def _topology(x: FloatArray, faces: IntArray) -> list[PrintProblem]:
-    """Edges, sides, duplicates and faces without an area."""
+    """The problems of edges, sides, duplicates and faces without an area."""
     flat = zero_area_faces(x, faces)
     vanished = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
     used = faces[~vanished]
@@ -254,8 +254,9 @@ def _topology(x: FloatArray, faces: IntArray) -> list[PrintProblem]:
 
 
 def _component_problems(shells: Shells, is_closed: bool, is_clear: bool) -> list[PrintProblem]:
-    """Inside out, inside others, cavities, loose and tiny parts. is_clear: closed, and no faces
-    pass through each other, so that a part is inside another as a whole or not at all."""
+    """The problems of components: inside out, inside others, cavities, loose and tiny parts.
+    is_clear: whether the mesh is closed and no faces pass through each other, so that a part is
+    inside another as a whole or not at all."""
     volumes, none = shells.volumes, np.zeros(len(shells.volumes), np.bool_)
     middle = 0.5 * (shells.lower + shells.upper)
     length = (shells.upper - shells.lower).max(axis=1)
@@ -294,16 +295,17 @@ def _component_problems(shells: Shells, is_closed: bool, is_clear: bool) -> list
 def _contacts(
     x: FloatArray, faces: IntArray, shells: Shells, is_closed: bool
 ) -> tuple[PrintProblem, PrintProblem]:
-    """Faces that pass through or lie on others, and those that only touch others.
+    """The problems of faces that pass through or lie on others, and of faces that only touch
+    others.
 
-    Faces without an area close gaps between corners and edges that lie on each other: where a part
-    has some, it is not said to touch itself.
+    Faces without an area close gaps between corners and edges that lie on each other: for a part
+    with such faces, contacts with itself are not reported.
     """
     is_flat = np.zeros(len(faces), np.bool_)
     is_flat[zero_area_faces(x, faces)] = True
     is_plain = np.isin(shells.component_of_face, shells.component_of_face[is_flat], invert=True)
     rows = np.flatnonzero((faces != np.roll(faces, 1, axis=1)).all(axis=1))
-    # Duplicates have been counted.
+    # Duplicates are reported separately.
     rows = rows[np.unique(np.sort(faces[rows], axis=1), axis=0, return_index=True)[1]]
     crossing = intersecting_faces(x, faces[rows])
     advice = "; hk.mesh(hk.solid(part)) makes one of parts that overlap" if is_closed else ""
@@ -330,7 +332,7 @@ def _contacts(
 
 def _thin_walls(x: FloatArray, faces: IntArray, wall: float, is_solid: bool) -> PrintProblem:
     if not is_solid:
-        # Another name than that of walls that were found thin.
+        # The name differs from that of walls that were measured to be thin.
         why = "how thick walls are is not known before the rest is mended"
         return PrintProblem("walls not measured", 1, np.zeros((0, 3)), why)
     thickness = wall_thickness(MeshSolid(x, faces))
@@ -341,7 +343,7 @@ def _thin_walls(x: FloatArray, faces: IntArray, wall: float, is_solid: bool) -> 
 
 
 def _coarse(x: FloatArray, faces: IntArray, wall: float) -> PrintProblem:
-    """Faces beside whose centers thin places may be that nobody looked at."""
+    """The problem of faces so large that thin places beside their centers may be missed."""
     corner = x[faces]
     longest = np.stack([row_norms(corner[:, k] - corner[:, k - 1]) for k in range(3)]).max(axis=0)
     centers = corner[longest > _COARSE * wall].mean(axis=1)

@@ -1,9 +1,9 @@
-"""Repairs closed meshes of which a few triangles intersect each other, locally.
+"""The local repair of closed meshes a few of whose triangles intersect each other.
 
 Where solids are cut by each other corners are rounded, and where triangles in a plane are merged
-slivers without an area are left: such triangles intersect their neighbors by about a rounding
-error. Contracting or flipping an edge near them repairs that mostly. Edges are tried in turn, with
-exact signs, on the few triangles around.
+slivers without an area remain: such triangles intersect their neighbors by about a rounding error.
+    Contracting or flipping an edge near them repairs most of these. Edges are tried in turn, with
+    exact signs, on the few triangles around.
 """
 
 from __future__ import annotations
@@ -35,11 +35,12 @@ from harnack.meshing.lattice_meshing import TriangleMesh
 
 __all__ = ["resolve_local_intersections", "resolve_self_intersections"]
 
-# More crossing triangles than this, or in a larger neighborhood, are no slivers.
+# If there are more crossing triangles than this, or if their neighborhood is larger, they are no
+# slivers.
 _MOST, _MOST_AROUND = 400, 5_000
-# How many changes are made in one place, and how many are tried for each.
+# The largest number of changes in one place, and the number of attempts for each.
 _MOST_CHANGES, _MOST_TRIED = 40, 80
-# New triangles of this part of the area that they are to cover may look backwards.
+# New triangles with less than this fraction of the area that they cover may face backwards.
 _NOTHING = 1e-4
 
 
@@ -48,8 +49,7 @@ def resolve_self_intersections(surface: TriangleMesh, length: float) -> Triangle
     (`resolve_local_intersections`), so that none do.
 
     Raises:
-        MeshingError: vertices that are not finite; a SelfIntersectionError where that is not
-            enough.
+        MeshingError: vertices are not finite; a SelfIntersectionError if triangles still cross.
     """
     try:
         check_no_self_intersection(surface.vertices, surface.faces)
@@ -64,11 +64,12 @@ def resolve_self_intersections(surface: TriangleMesh, length: float) -> Triangle
 def resolve_local_intersections(
     surface: TriangleMesh, crossing: IntArray, length: float
 ) -> tuple[TriangleMesh, int]:
-    """A closed surface with edges contracted and flipped where triangles cross; and how many
-    triangles cross still.
+    """A closed surface with edges contracted and flipped where triangles cross; and the number of
+    triangles that still cross.
 
-    crossing: all faces that do (`intersecting_faces`).
-    length: how far the surface may be moved by one change; vertices stay where they are, or go.
+    crossing: all faces that cross others (`intersecting_faces`).
+    length: how far the surface may be moved by one change; vertices stay where they are, or are
+        removed.
     """
     if not 0 < len(crossing) <= _MOST or length <= 0:
         return surface, len(crossing)
@@ -91,11 +92,11 @@ def resolve_local_intersections(
 def _regions(
     vertices: FloatArray, faces: IntArray, crossing: IntArray
 ) -> Iterator[tuple[IntArray, IntArray]]:
-    """Faces, by index, of separate neighborhoods, and the vertices that may go in each.
+    """The faces, by index, of separate neighborhoods, and the vertices of each that may be removed.
 
     A neighborhood is all faces whose boxes meet that of the faces around the faces around crossing
-    ones. Vertices of the latter may go: the new faces then lie within that box, so that they cross
-    no others.
+    faces. Vertices of faces next to crossing faces may be removed: the new faces then lie within
+    that box, so that they cross no others.
     """
     import scipy.sparse  # here: half a second that few need
     import scipy.sparse.csgraph as csgraph_module
@@ -122,7 +123,7 @@ def _regions(
 
 
 def _touching(faces: IntArray, targets: IntArray) -> IntArray:
-    """Faces, by index, with a corner of some."""
+    """The indices of faces that have a corner in common with `targets`."""
     is_corner = np.zeros(int(faces.max()) + 1, np.bool_)
     is_corner[targets] = True
     return np.flatnonzero(is_corner[faces].any(axis=1))
@@ -130,8 +131,8 @@ def _touching(faces: IntArray, targets: IntArray) -> IntArray:
 
 @dataclass(frozen=True)
 class _Neighborhood:
-    """Faces (m, 3) of a neighborhood, between vertices (n, 3) of the mesh; is_movable: (n,) those
-    of which all faces are here."""
+    """Faces (m, 3) of a neighborhood, between vertices (n, 3) of the mesh; is_movable: (n,) the
+    vertices all of whose faces are in the neighborhood."""
 
     vertices: FloatArray
     faces: IntArray
@@ -140,7 +141,7 @@ class _Neighborhood:
 
     @classmethod
     def of(cls, vertices: FloatArray, faces: IntArray, movable: IntArray) -> _Neighborhood:
-        """names: of the vertices, in the mesh."""
+        """The neighborhood of these faces, whose vertices `movable` may be removed."""
         names, index = np.unique(faces, return_inverse=True)
         return cls(vertices[names], index.reshape(-1, 3), np.isin(names, movable), names)
 
@@ -153,17 +154,18 @@ class _Neighborhood:
         return np.flatnonzero((self.faces == vertex).any(axis=1))
 
     def neighbors(self, vertex: int) -> set[int]:
-        """Vertices that edges join a vertex with."""
+        """The vertices that edges join to a vertex."""
         return set(self.faces[self.around(vertex)].ravel().tolist()) - {vertex}
 
     def with_faces(self, gone: IntArray, new: IntArray) -> _Neighborhood:
-        """With faces, by index, replaced."""
+        """The neighborhood with the faces `gone`, by index, replaced by `new`."""
         return dataclasses.replace(
             self, faces=np.concatenate([np.delete(self.faces, gone, axis=0), new])
         )
 
     def collapse_edge(self, a: int, b: int) -> tuple[IntArray, IntArray] | None:
-        """Faces that go and that come if a is moved to b; None where sheets would touch."""
+        """The faces that are removed, by index, and those that replace them if a is moved to b;
+        None if sheets would touch."""
         if not (self.is_movable[a] and self.is_movable[b]):
             return None
         if len(self.neighbors(a) & self.neighbors(b)) != 2:
@@ -173,8 +175,9 @@ class _Neighborhood:
         return removed, new[(new != np.roll(new, 1, axis=1)).all(axis=1)]
 
     def flip_edge(self, a: int, b: int) -> tuple[IntArray, IntArray] | None:
-        """Faces that go and that come if the edge between a and b joins the corners opposite to it
-        instead; None if there is such an edge."""
+        """The faces that are removed, by index, and those that replace them if the edge between a
+        and b is flipped to join the corners opposite to it; None if there already is such an
+        edge."""
         if not (self.is_movable[a] and self.is_movable[b]):
             return None
         removed = np.intersect1d(self.around(a), self.around(b))
@@ -192,7 +195,8 @@ class _Neighborhood:
 
 
 def _reduce_crossings(patch: _Neighborhood, length: float) -> tuple[IntArray, int]:
-    """Faces of a patch, by vertices of the mesh, in which fewer cross; and how many still do."""
+    """The faces of a patch, by vertices of the mesh, after changes that let fewer cross; and the
+    number that still cross."""
     crossing = patch.crossing()
     for _ in range(_MOST_CHANGES):
         better = _best_change(patch, crossing, length) if len(crossing) else None
@@ -205,9 +209,10 @@ def _reduce_crossings(patch: _Neighborhood, length: float) -> tuple[IntArray, in
 def _best_change(
     patch: _Neighborhood, crossing: IntArray, length: float
 ) -> tuple[_Neighborhood, IntArray] | None:
-    """The patch after one change, after which fewer faces cross, and these; None if none is known.
+    """The patch after one change that lets fewer faces cross, and these faces; None if no change
+    does.
 
-    Those are tried first that move the surface least: of edges of faces that cross, then of all
+    Changes that move the surface least are tried first: of edges of faces that cross, then of all
     edges at their corners.
     """
     for rows in (crossing, _touching(patch.faces, patch.faces[crossing])):
@@ -224,8 +229,8 @@ def _best_change(
 def _changes(
     patch: _Neighborhood, rows: IntArray, length: float
 ) -> Iterator[tuple[float, IntArray, IntArray]]:
-    """Changes of the edges of some faces: how far they move the surface, and the faces that go and
-    that come."""
+    """Changes of the edges of the faces `rows`: how far they move the surface, the faces that are
+    removed, and those that replace them."""
     count = len(patch.vertices)
     keys = sorted_unique(edge_keys(half_edges(patch.faces[rows]), count))
     for a, b in np.stack(np.divmod(keys, count), axis=1).tolist():
@@ -244,9 +249,10 @@ def _changes(
 
 
 def _keeps_orientation(patch: _Neighborhood, rows: IntArray, new: IntArray, length: float) -> bool:
-    """Whether no new face, but for slivers, looks backwards from where the old ones look in the
-    mean, and the volume between new and old ones is no more than if these moved by a length: a
-    vertex on the new faces says nothing of old ones that are folded, as at a thin spike."""
+    """Whether no new face, except slivers, faces backwards relative to the mean normal of the old
+    faces, and the volume between new and old faces is no more than if the old ones moved by a
+    length: a vertex on the new faces tells nothing about old faces that are folded, as at a thin
+    spike."""
     corner, replaced = patch.vertices[patch.faces[rows]], patch.vertices[new]
     old, after = area_normals(corner), area_normals(replaced)
     mean = old.sum(axis=0)
@@ -261,7 +267,7 @@ def _keeps_orientation(patch: _Neighborhood, rows: IntArray, new: IntArray, leng
 
 
 def _between(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> float:
-    """How far the lines through a and b and through c and d are from each other."""
+    """The distance between the line through a and b and the line through c and d."""
     across = np.cross(b - a, d - c)
     size = float(np.linalg.norm(across))
     return abs(float(across @ (c - a))) / size if size > 0 else np.inf
