@@ -1,8 +1,9 @@
 """Revised affine arithmetic along a path: a line and a constant bound of the error.
 
 A function of 0 <= s <= h is c + l e + r, with e = 2s/h - 1 and |r| <= error. Sums are exact;
-products and functions put what is not linear in s into the error. Unlike `ParabolaBounds` it is not
-exact at s = 0, so the march tries shorter lengths where it proves nothing.
+products and functions put the terms that are not linear in s into the error. Unlike
+`ParabolaBounds` it is not exact at s = 0, so the march tries shorter lengths where it proves
+nothing.
 
 Source: Vu, Sam-Haroud and Faltings 2009; Fryazinov, Pasko and Comninos 2010.
 """
@@ -78,8 +79,8 @@ class AffineForm(FormulaNumber):
         )
 
     def product(self, other: Any) -> AffineForm:
-        """Proof. Of (c + l e + r)(d + m e + q), e^2 lies in [0, 1], so l m e^2 within l m/2 of
-        l m/2; everything else that is not linear in e is an error."""
+        """The product of two functions. Proof. Of (c + l e + r)(d + m e + q), e^2 lies in [0, 1],
+        so l m e^2 within l m/2 of l m/2; everything else that is not linear in e is an error."""
         c, l, r = self.center, self.slope, self.error  # noqa: E741
         d, m, q = other.center, other.slope, other.error
         both = 0.5 * l * m
@@ -188,7 +189,7 @@ def _entries(x: AffineForm) -> tuple[Real, Real, Real]:
 def _smaller_error(
     first: tuple[Real, Real, Real], second: tuple[Real, Real, Real]
 ) -> tuple[Real, Real, Real]:
-    """The one with the smaller error; if one is not finite, the other."""
+    """The line and error with the smaller error; if one of them is not finite, the other."""
     first_finite = dr.isfinite(first[0]) & dr.isfinite(first[1]) & dr.isfinite(first[2])
     second_finite = dr.isfinite(second[0]) & dr.isfinite(second[1]) & dr.isfinite(second[2])
     use_first = first_finite & ((first[2] <= second[2]) | ~second_finite)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 __all__ = ["angle_range", "approximate_direction", "atan2"]
 
-# Units in the last place that Dr.Jit's atan2 is off by at most; measured: 3.3.
+# A bound of the error of Dr.Jit's atan2, in units in the last place; measured: 3.3.
 _MAX_ULP_ERROR = 8.0
 # A number of double precision above pi.
 _PI = math.nextafter(math.pi, 4.0)

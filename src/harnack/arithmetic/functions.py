@@ -25,9 +25,9 @@ DerivativeRanges: TypeAlias = "tuple[Interval, Interval, Interval]"
 
 # The domain of roots, powers that are no integers, and logarithms.
 _POSITIVE = (0.0, math.inf)
-# No function here overflows sooner than at this part of the largest number: LLVM's exp does at 0.7.
+# No function here overflows below this fraction of the largest number: LLVM's exp does at 0.7.
 _OVERFLOWS = 1 / 16
-# Units in the last place that exp, log and their like are off by at most, on every backend.
+# A bound of the error of exp, log and the like on every backend, in units in the last place.
 _MAX_ULP_ERROR = 8.0
 
 
@@ -54,7 +54,7 @@ class ElementaryFunction:
     has_pole: bool = False
 
     def __reduce__(self) -> str:
-        # There is one of each name, in this module.
+        # There is one function of each name, in this module.
         return "absolute" if self.name == "abs" else self.name
 
     def __call__(self, x: Any) -> Any:
@@ -120,7 +120,7 @@ def _exponential_range(f: Callable[[Any], Any], x: Interval) -> Interval:
 
 def _log(x: Interval) -> DerivativeRanges:
     inverse = x.reciprocal()
-    # Near 1 a logarithm is off by four units of 1 on CUDA.
+    # Near 1 the error of a logarithm is four units of 1 on CUDA.
     value = _increasing_range(dr.log, x).widened(0.0, 4 * machine_epsilon(x.lower))
     return _unbounded_where_undefined(x.lower > 0, (value, inverse, -inverse.square()))
 
@@ -174,10 +174,10 @@ def _sine_and_cosine(x: Interval) -> tuple[Interval, Interval]:
 
     Proof. Both are monotone between the multiples of pi/2 at which they are 1 or -1: the range is
     given by the ends, and by such points inside. Whether such a point is inside is tested for an
-    interval widened by the rounding of the test; a point that is counted wrongly is that near to an
-    end. Beyond `max_sincos_argument` sines are not known: on pieces the range is [-1, 1] there; at
-    a point it is all numbers, as the value at a point is taken half way between the ends, and 0
-    would look like a value.
+    interval widened by the rounding of the test; a point that is counted wrongly is within that
+    rounding of an end. Beyond `max_sincos_argument` sines are not known: on pieces the range is
+    [-1, 1] there; at a point it is all numbers, as the value at a point is taken half way between
+    the ends, and 0 would look like a value.
     """
     epsilon, max_argument = machine_epsilon(x.lower), max_sincos_argument(type(x.lower))
     s0, c0 = sincos(x.lower)
@@ -234,7 +234,8 @@ def _tan(x: Interval) -> DerivativeRanges:
 
 
 def _hyperbolic_tangent(x: Real) -> Real:
-    """tanh; Dr.Jit's own is accurate to only 11 bits on CUDA. From 20 on it is 1 up to rounding."""
+    """The range of tanh, since Dr.Jit's is accurate to only 11 bits on CUDA. From 20 on it is 1 up
+    to rounding."""
     x = clamp(x, -20.0, 20.0)
     return dr.sinh(x) / dr.cosh(x)
 
@@ -307,7 +308,7 @@ def integer_power(x: Interval, n: int) -> Interval:
         low, high = x.lower, x.upper
     a = _power_by_squaring(low, n)
     b = a if low is high else _power_by_squaring(high, n)
-    # Every product is off by at most half a unit.
+    # The error of every product is at most half a unit.
     result = Interval(a, b).widened(n * machine_epsilon(x.lower), n * _smallest_normal(x))
     return Interval(fmax(result.lower, 0), result.upper) if n % 2 == 0 else result
 
@@ -323,7 +324,7 @@ def _power_by_squaring(x: Real, n: int) -> Real:
 
 
 def power(n: float) -> ElementaryFunction:
-    """x -> x^n; for x >= 0 if n is no integer."""
+    """The function x -> x^n; for x >= 0 if n is no integer."""
     if float(n).is_integer():
         k = int(n)
         if k < 0:
@@ -381,7 +382,8 @@ def _numpy_power(n: float) -> Callable[[Any], Any]:
 
 
 def _real_power(x: Interval, n: float) -> Interval:
-    """The range of x^n for x >= 0 and any n: exp2(n log2 x), so off by n log2(x) units and a few.
+    """The range of x^n for x >= 0 and any n: exp2(n log2 x), with an error of n log2(x) units and a
+    few.
 
     An x below the smallest normal number may stand for any number from 0 to that.
     """
@@ -428,8 +430,8 @@ absolute = ElementaryFunction("abs", _abs, dr.abs, np.abs)
 
 @dataclass(frozen=True)
 class ClippedPower(ElementaryFunction):
-    """x -> max(x, 0)^n, n >= 1: convex, and n - 1 times continuously differentiable. A kernel of
-    blobs with compact support.
+    """The function x -> max(x, 0)^n, n >= 1: convex, and n - 1 times continuously differentiable. A
+    kernel of blobs with compact support.
 
     Written as maximum(x, 0)**n its second derivative would have no bound, since that of the maximum
     has none. An arithmetic may use that it is 0 for x <= 0.

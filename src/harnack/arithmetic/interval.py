@@ -68,7 +68,7 @@ class Interval:
 
     @property
     def is_zero(self) -> bool:
-        """Whether it is [0, 0] in Python numbers, which is known while a kernel is being
+        """Whether the interval is [0, 0] in Python numbers, which is known while a kernel is being
         recorded."""
         return self.is_literal and self.lower == 0.0 == self.upper
 
@@ -197,7 +197,7 @@ class Interval:
                 return Interval(-math.inf, math.inf, self.is_single)
             return self._rounded_outward(1 / self.upper, 1 / self.lower)
         has_zero = ~((self.lower > 0) | (self.upper < 0))
-        # Quotients are off by two units on CUDA.
+        # The error of quotients is two units on CUDA.
         low = _round_down(_pad_underflow(1 / self.upper, -1), 4.0)
         high = _round_up(_pad_underflow(1 / self.lower, 1), 4.0)
         return Interval(dr.select(has_zero, -dr.inf, low), dr.select(has_zero, dr.inf, high))
@@ -276,14 +276,14 @@ def _maximum(a: Real, b: Real) -> Real:
 
 
 def _maximum_or_nan(a: Real, b: Real) -> Real:
-    """The larger; NaN where either is."""
+    """The larger number; NaN where either is NaN."""
     if isinstance(a, float) and isinstance(b, float):
         return math.nan if a != a or b != b else max(a, b)
     return dr.select((a > b) | dr.isnan(a), a, b)
 
 
 def _minimum_ignoring_nan(a: Real, b: Real) -> Real:
-    """The smaller; a where b is NaN, and b where a is."""
+    """The smaller number; a where b is NaN, and b where a is."""
     return dr.select((a <= b) | dr.isnan(b), a, b)
 
 

@@ -33,7 +33,7 @@ class Jet(FormulaNumber):
     the length along a path, or n = 3 at a point.
 
     Interval arithmetic of value, first and second derivatives at once (Moore 1966; the Taylor forms
-    of Aydinlilar and Zanni 2023, section 6.1, are made of it).
+    of Aydinlilar and Zanni 2023, section 6.1, consist of it).
 
     value: the range of the function.
     first_derivatives: (n,) the ranges of the partial derivatives.
@@ -239,9 +239,9 @@ class Jet(FormulaNumber):
     def pointwise_maximum(self, other: Jet) -> Jet:
         """The larger of two functions at each point.
 
-        Proof. If one is larger everywhere, it is the maximum. Else each derivative is that of one
-        of the two, except where they cross: there the first derivative jumps up, so that the second
-        derivative has no upper bound.
+        Proof. If one function is larger everywhere, it is the maximum. Otherwise each derivative is
+        that of one of the two, except where they cross: there the first derivative jumps up, so
+        that the second derivative has no upper bound.
         """
         x, y = self.value_on_backend(), other.value_on_backend(self.backend_number())
         is_x, is_y = x.lower > y.upper, y.lower > x.upper
@@ -319,7 +319,7 @@ class Jet(FormulaNumber):
         )
 
     def select(self, condition: Mask, other: Jet) -> Jet:
-        """This one on lanes where the condition holds, the other on all others."""
+        """This jet on lanes where the condition holds, the other on all others."""
         kind = self.backend_number()
 
         def chosen(u: Interval, v: Interval) -> Interval:

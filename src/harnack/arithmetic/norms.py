@@ -70,7 +70,7 @@ def norm(*values: Any, p: float = 2.0) -> Any:
     lines: the range of w_ij is narrowed from the start of the piece.
 
     Raises:
-        TypeError: no numbers given.
+        TypeError: there are no numbers.
         ValueError: p is below 1, for which this is no norm and has no bounded derivative.
     """
     if not values:
@@ -88,7 +88,7 @@ def norm(*values: Any, p: float = 2.0) -> Any:
         powers = [
             term.apply(power(p)) if isinstance(term, FormulaNumber) else term**p for term in sizes
         ]
-        # First one whose operators accept numbers of the other kinds.
+        # A number whose operators accept numbers of the other kinds comes first.
         powers.sort(key=lambda term: not isinstance(term, FormulaNumber))
         total = functools.reduce(lambda a, b: a + b, powers)
         return total.norm_of_powers(p)
@@ -196,7 +196,7 @@ def _norm_of_magnitudes(sizes: list[Any], p: float) -> Interval:
 
 
 def _signed_power(x: Interval, q: float) -> Interval:
-    """sign(x) |x|^q, q > 0, which rises."""
+    """The range of sign(x) |x|^q, q > 0, which increases."""
 
     def of(v: Any) -> Interval:
         size = power(q).ranges(Interval.point(dr.abs(v)))[0]
@@ -209,14 +209,15 @@ def _signed_power(x: Interval, q: float) -> Interval:
 
 
 def _reciprocal_norm(length: Interval) -> Interval:
-    """1/N for N >= 0; infinite above where N may be 0."""
+    """The range of 1/N for N >= 0; its upper end is infinite where N may be 0."""
     over = reciprocal.ranges(length)[0]
     from_upper = Interval.point(length.upper).reciprocal()
     return Interval(fmax(from_upper.lower, 0), over.upper)
 
 
 def _clip_magnitude(x: Interval, limit: Interval) -> Interval:
-    """x cut to the numbers that are no larger in size than `most`."""
+    """The interval x clipped to numbers whose absolute value is at most the upper end of
+    `limit`."""
     bound = limit.upper
     return Interval(fmax(x.lower, -bound), fmin(x.upper, bound))
 

@@ -230,7 +230,8 @@ class ParabolaBounds(FormulaNumber):
         )
 
     def _bound_coefficients(self) -> list[tuple[Real, Real, Real, Real]]:
-        """The two bounds as (a, b, 0, 0); of a polynomial one, (a, b, radius of a, radius of b)."""
+        """The two bounds as (a, b, 0, 0); for a polynomial a single bound, (a, b, radius of a,
+        radius of b)."""
         if self.polynomial_degree is None:
             return [(*self.lower, 0.0, 0.0), (*self.upper, 0.0, 0.0)]
         a, ra = _midpoint_and_half_width(self.lower[0], self.upper[0])
@@ -245,7 +246,7 @@ class ParabolaBounds(FormulaNumber):
         Chords. With x = f(s) - f(0) between x- and x+, phi(f(0) + x) - phi(f(0)) = m x, where m is
         the slope of a chord from f(0). It lies in the range of phi' and, for convex phi, between
         the slopes of the chords to x- and to x+. For an upper bound of a convex phi the two chords
-        themselves are enough, and for a lower one the tangent at f(0), as phi lies above it; for
+        themselves are enough, and for a lower bound the tangent at f(0), as phi lies above it; for
         concave phi the two are exchanged. So f's two parabolas times the ends of the range of m
         bound phi, and one parabola bounds several (`_common_upper_bound`).
 
@@ -428,8 +429,8 @@ class ParabolaBounds(FormulaNumber):
     def _extend_parabolas(
         self, start: Real, length: Real, is_cut: Any, tail: Real
     ) -> tuple[Quadratic, Quadratic]:
-        """Bounds, on all of [0, length], of a function that is this one on an interval that begins
-        at `start`, and constant elsewhere."""
+        """Bounds, on all of [0, length], of a function that equals this function on an interval
+        that begins at `start`, and is constant elsewhere."""
         bounds: list[Quadratic] = []
         for sign, (a, b) in ((-1, self.lower), (1, self.upper)):
             at_start = a - 2 * b * start
@@ -444,7 +445,7 @@ class ParabolaBounds(FormulaNumber):
     def _extend_lines(
         self, start: Real, end: Real, length: Real, value: Interval, is_cut: Any, tail: Real
     ) -> tuple[Quadratic, Quadratic]:
-        """The same with straight bounds.
+        """As `_extend_parabolas`, with straight bounds.
 
         Proof. Before `start` f is 0 and so is its value there: a line from 0 at 0 to the bound at
         `end` lies above. Behind `end` f is 0: a slope of at least -value/s is above -value for all
@@ -517,7 +518,7 @@ def _integral(at_start: Real, at_end: Real, length: Real) -> Quadratic:
 def _common_upper_bound(
     parabolas: list[Quadratic], length: Real, offsets: tuple[Real, ...] = ()
 ) -> Quadratic:
-    """A parabola through 0 above several, each with an offset <= 0, on [0, length].
+    """A parabola through 0 above several parabolas, each with an offset <= 0, on [0, length].
 
     Proof. On [0, h] c + a s + b s^2 is a mean, with weights >= 0, of the control values c,
     c + a h/2, c + a h + b h^2 (Bernstein 1912): larger control values make a larger parabola.
@@ -544,7 +545,8 @@ def _common_lower_bound(parabolas: list[Quadratic], length: Real) -> Quadratic:
 
 
 def _tighter(first: Quadratic, second: Quadratic, length: Real, sign: int) -> Quadratic:
-    """The tighter of two bounds on one side, compared at one point; if one is NaN, the other."""
+    """The tighter of two bounds on one side, compared at one point; if one bound is NaN, the
+    other."""
     r = _COMPARED_AT * length
     first_value, second_value = (sign * r * (a + b * r) for a, b in (first, second))
     return _where((first_value <= second_value) | ~dr.isfinite(second_value), first, second)
@@ -585,7 +587,7 @@ def _where(mask: Any, first: Quadratic, second: Quadratic) -> Quadratic:
 
 
 def _midpoint_and_half_width(low: Real, high: Real) -> tuple[Real, Real]:
-    """The middle of two numbers and how far both are from it."""
+    """The middle of two numbers and the distance of both from it."""
     if low is high or (_is_zero(low) and _is_zero(high)):
         return low, 0.0
     middle = 0.5 * low + 0.5 * high
@@ -597,7 +599,8 @@ def _midpoint_and_radius(x: Interval) -> tuple[Real, Real]:
 
 
 def _radius(x: Interval) -> Real:
-    """How far numbers of an interval are from its middle, the rounding of the middle included."""
+    """The largest distance of numbers of an interval from its middle, including the rounding of the
+    middle."""
     if x.lower is x.upper or x.is_zero:
         return 0.0
     radius = x.radius
@@ -632,7 +635,7 @@ def _rounding_bound(size: Real) -> Real:
 
 
 def _maximum_or_inf(*numbers: Real) -> Real:
-    """The largest; infinite if one is NaN."""
+    """The largest number; infinite if one is NaN."""
     largest, total = numbers[0], numbers[0]
     for number in numbers[1:]:
         largest, total = fmax(largest, number), total + number

@@ -61,7 +61,7 @@ def closed_parts(x: FloatArray, raw: IntArray, joined: IntArray) -> list[IntArra
 
 def _pieces(x: FloatArray, faces: IntArray) -> list[IntArray]:
     """The groups of faces, by index, that belong together at edges."""
-    import scipy.sparse  # here: half a second that few need
+    import scipy.sparse  # imported here: it takes half a second
     import scipy.sparse.csgraph as csgraph_module
 
     sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)

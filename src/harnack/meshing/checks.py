@@ -255,7 +255,7 @@ def _near_pairs(corner: FloatArray, among: BoolArray | None) -> IntArray:
     Triangles of one size (up to a factor of 2) are compared at a time, with triangles that are no
     larger: so a large triangle is compared only with the small triangles near it.
     """
-    import scipy.spatial  # here: half a second that few need
+    import scipy.spatial  # imported here: it takes half a second
 
     searching: Any = scipy.spatial
     lower, upper = corner.min(axis=1), corner.max(axis=1)
@@ -653,7 +653,7 @@ def nonmanifold_vertices(faces: IntArray) -> IntArray:
 def _vertex_fans(faces: IntArray, edges: Edges) -> tuple[int, IntArray]:
     """The number of fans of faces, joined by edges, that all vertices have together, and (3m,) the
     fan that each corner of a face belongs to. edges: of `half_edges`."""
-    import scipy.sparse  # here: half a second that few need
+    import scipy.sparse  # imported here: it takes half a second
     import scipy.sparse.csgraph as csgraph_module
 
     sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)

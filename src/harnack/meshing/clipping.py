@@ -172,7 +172,7 @@ class Shells:
 
 def _component_of_faces(surface: TriangleMesh) -> IntArray:
     """(m,) the number of the connected component of each face."""
-    import scipy.sparse  # here: half a second that few need
+    import scipy.sparse  # imported here: it takes half a second
     import scipy.sparse.csgraph as csgraph_module
 
     sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)

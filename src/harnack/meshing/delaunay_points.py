@@ -57,7 +57,7 @@ class RefinementBalls:
         """(k,) whether balls about points (k, 3) meet any of these balls."""
         if not len(centers):
             return np.zeros(0, np.bool_)
-        import scipy.spatial  # here: half a second that few need
+        import scipy.spatial  # imported here: it takes half a second
 
         searching: Any = scipy.spatial
         apart: FloatArray = searching.cKDTree(self.points).query(centers)[0]
@@ -236,7 +236,7 @@ def _is_far(points: FloatArray, free: FloatArray, boundary: BoundaryCurve) -> Bo
     with its edges as diameters."""
     if not len(boundary.edges):
         return np.ones(len(points), np.bool_)
-    import scipy.spatial  # here: half a second that few need
+    import scipy.spatial  # imported here: it takes half a second
 
     searching: Any = scipy.spatial
     a, b = (boundary.points[boundary.edges[:, k]] for k in (0, 1))

@@ -107,7 +107,7 @@ def _reason_beyond_reach(
 ) -> str | None:
     """The reason why half of the thickness exceeds the surface's reach; None if nothing shows
     that."""
-    import scipy.spatial  # here: half a second that few need
+    import scipy.spatial  # imported here: it takes half a second
 
     searching: Any = scipy.spatial
     half = 0.5 * thickness

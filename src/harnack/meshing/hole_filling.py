@@ -429,7 +429,7 @@ def _relaxed(x: FloatArray, new: IntArray, input_count: int) -> FloatArray:
 def _solve_least_squares(rows: Any, x: FloatArray, input_count: int) -> FloatArray:
     """All rows, with those from `input_count` on chosen so that a linear map of all is nearest to
     0."""
-    import scipy.sparse.linalg as linalg  # here: half a second that few need
+    import scipy.sparse.linalg as linalg  # imported here: it takes half a second
 
     solver = cast("Any", linalg)
     inner, fixed = rows[:, input_count:], rows[:, :input_count]
@@ -441,7 +441,7 @@ def _solve_least_squares(rows: Any, x: FloatArray, input_count: int) -> FloatArr
 
 def _graph_laplacian(ends: IntArray, weight: FloatArray, count: int) -> Any:
     """The Laplacian of a graph with these edges (k, 2), as a sparse matrix."""
-    import scipy.sparse  # here: half a second that few need
+    import scipy.sparse  # imported here: it takes half a second
 
     sparse = cast("Any", scipy.sparse)
     a, b = ends.T
@@ -523,7 +523,7 @@ def _cotangents(a: FloatArray, b: FloatArray, apex: FloatArray) -> FloatArray:
 
 def _loop_of_faces(new: IntArray, loops: list[IntArray], count: int) -> IntArray:
     """(p,) the loop of each face of patches: faces are joined by edges to a face at their loop."""
-    import scipy.sparse  # here: half a second that few need
+    import scipy.sparse  # imported here: it takes half a second
     import scipy.sparse.csgraph as csgraph_module
 
     sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)

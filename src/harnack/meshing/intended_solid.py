@@ -198,6 +198,7 @@ class IntendedSolid:
 
     def check_encloses(self) -> None:
         """Raise if so much of the area has nothing inside, on neither side, that it is no solid.
+
         Raises:
             MeshError: it is no solid.
         """

@@ -218,7 +218,7 @@ def _proved_by_stars(
     """(k,) whether (c) is proved for tetrahedra `rows` (k,).
 
     n is computed as by a perceptron: starting with the sum of all unit gradients of F around a
-        corner, gradients whose product with n is not positive are added again, a few times.
+    corner, gradients whose product with n is not positive are added again, a few times.
     """
     vertices = np.unique(index[rows])
     number = np.full(int(index.max(initial=0)) + 1, -1, np.int64)
@@ -361,7 +361,7 @@ def _regular_on_walls(
 def _distances(points: FloatArray, boundary: BoundaryCurve) -> FloatArray:
     """(n,) the distances of points from the curve, too large by at most half of its longest
     edge."""
-    import scipy.spatial  # here: half a second that few need
+    import scipy.spatial  # imported here: it takes half a second
 
     searching: Any = scipy.spatial
     a, b = (boundary.points[boundary.edges[:, k]] for k in (0, 1))

@@ -199,7 +199,7 @@ def _cut_at_corners(x: FloatArray, faces: IntArray) -> IntArray:
 def _corners_on(x: FloatArray, edges: IntArray) -> tuple[IntArray, BoolArray]:
     """For each of edges (k, 2) the end of another edge that lies on it, nearest to its middle; and
     whether there is such an end."""
-    import scipy.spatial  # here: half a second that few need
+    import scipy.spatial  # imported here: it takes half a second
 
     searching: Any = scipy.spatial
     corners = np.unique(edges)

@@ -137,7 +137,7 @@ def check_no_missed_parts(
         MissedPartsError: parts are missed; with points of the longest. UnrefinableError: the
             function equals its level in a volume, or touches it along a surface.
     """
-    import scipy.spatial  # here: half a second that few need
+    import scipy.spatial  # imported here: it takes half a second
 
     searching: Any = scipy.spatial
     rows = np.flatnonzero(~is_beside & (samples.distance < _MAX_SEED_DISTANCE * size))

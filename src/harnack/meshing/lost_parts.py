@@ -264,7 +264,7 @@ def _thicknesses(
 
 def _bound_of_distances(points: FloatArray, corner: FloatArray) -> float:
     """A distance within which points (n, 3) are from triangles (m, 3, 3); inf without any."""
-    import scipy.spatial  # here: half a second that few need
+    import scipy.spatial  # imported here: it takes half a second
 
     searching: Any = scipy.spatial
     if not len(corner):
@@ -280,7 +280,7 @@ def _are_farther(points: FloatArray, corner: FloatArray, distance: float) -> Boo
     A triangle within the distance has its center within the sum of the distance and the triangle's
     radius. Triangles whose radii differ by less than a factor of 2 are examined together.
     """
-    import scipy.spatial  # here: half a second that few need
+    import scipy.spatial  # imported here: it takes half a second
 
     searching: Any = scipy.spatial
     is_far = np.ones(len(points), np.bool_)

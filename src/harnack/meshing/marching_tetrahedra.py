@@ -91,7 +91,7 @@ def delaunay(points: FloatArray) -> Tetrahedra:
     Raises:
         MeshingError: points are too near to each other, relative to their extent.
     """
-    import scipy.spatial  # here: half a second that few need
+    import scipy.spatial  # imported here: it takes half a second
 
     qhull: Any = scipy.spatial
     middle, size = points.mean(axis=0), float(np.ptp(points, axis=0).max())
@@ -375,7 +375,7 @@ def _chandrupatla(
     lifted: Callable[..., FloatArray],
 ) -> FloatArray:
     """(r,) the fractions along edges where they meet the level, by Chandrupatla's method."""
-    import scipy.optimize.elementwise as elementwise  # here: half a second that few need
+    import scipy.optimize.elementwise as elementwise  # imported here: it takes half a second
 
     search = cast("Any", elementwise).find_root
     arguments = (*p.T, *direction.T, value, change)

@@ -271,7 +271,7 @@ class _WorkingMesh:
 def _pieces(edges: Edges, count: int) -> IntArray:
     """(m,) the piece that each of `count` faces belongs to, where edges of two faces join faces to
     pieces. edges: of `half_edges`."""
-    import scipy.sparse  # here: half a second that few need
+    import scipy.sparse  # imported here: it takes half a second
     import scipy.sparse.csgraph as csgraph_module
 
     sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)

@@ -2,8 +2,8 @@
 
 Where solids are cut by each other corners are rounded, and where triangles in a plane are merged
 slivers without an area remain: such triangles intersect their neighbors by about a rounding error.
-    Contracting or flipping an edge near them repairs most of these. Edges are tried in turn, with
-    exact signs, on the few triangles around.
+Contracting or flipping an edge near them repairs most of these. Edges are tried in turn, with exact
+signs, on the few triangles around.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ def _regions(
     faces. Vertices of faces next to crossing faces may be removed: the new faces then lie within
     that box, so that they cross no others.
     """
-    import scipy.sparse  # here: half a second that few need
+    import scipy.sparse  # imported here: it takes half a second
     import scipy.sparse.csgraph as csgraph_module
 
     sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)

@@ -60,38 +60,44 @@ __all__ = [
     "mesh_from_signs",
 ]
 
-# Vertices keep this part of an edge from its ends, so that all triangles have an area.
+# The smallest distance of vertices from the ends of edges, relative to the edge, so that all
+# triangles have an area.
 _EDGE_END_MARGIN = 1e-4
-# How often edges are cut; and how often triangles that pass through others are made flat again.
+# The number of rounds in which edges are cut; and how often vertices of triangles that pass through
+# others are moved back.
 _ROUNDS, _MOST_REPAIRS = 2, 12
-# A round that would cut more than this part of the edges that the last one cut, or of the faces, is
-# not made: the surface is rough at every scale.
+# A round that would cut more than this fraction of the edges that the last round cut, or of the
+# faces, is omitted: the surface is rough at every scale.
 _MAX_CUT_FRACTION = 0.5
 # Neighbors lie on each other if the cosine between their normals is less than this.
 _FOLDED = -0.99999
-# Slivers and flat places are left out within this part of the tolerance, and this one of a cell.
+# Slivers and flat places are simplified within the first, relative to the tolerance, and the
+# second, relative to a cell.
 _SIMPLIFY_TOLERANCE, _SIMPLIFY_CELL_FRACTION = 0.5, 0.05
-# Edges shorter than this, in tolerances, stay whole.
+# Edges shorter than this, in tolerances, are not cut.
 _SHORTEST = 4.0
-# An edge is cut no nearer to its ends than this part of it.
+# An edge is cut no nearer to its ends than this, relative to its length.
 _FROM_CORNERS = 0.1
-# Across a crease normals turn by at least this angle, and by this part of it between two points.
+# Across a crease normals turn by at least this angle, and by this fraction of it between two
+# points.
 _MIN_CREASE_ANGLE, _CREASE_ANGLE_SHARE = math.radians(2), 0.75
-# The level is looked for from before the middle of an edge to behind the place where tangent planes
-# meet, in parts of that way; which counts up to so many lengths of the edge.
+# The level is searched for from before the middle of an edge to behind the place where tangent
+# planes meet, relative to the displacement between these; which is clamped to the third, in lengths
+# of the edge.
 _BEFORE, _BEHIND, _BESIDE = 0.3, 1.3, 1.0
-# Tangent planes whose normals are nearly the same meet anywhere; three of them meet in a point if
-# the determinant of their normals is larger than the last.
+# Tangent planes with nearly equal normals meet anywhere; three of them meet in a point if the
+# determinant of their normals is larger than the second.
 _PARALLEL, _INDEPENDENT = 1e-4, 0.1
-# So large a part of vertices and centers may be beyond the tolerance before cells are made smaller.
+# The largest fraction of vertices and centers that may be beyond the tolerance before cells are
+# made smaller; and the ratio of smaller cells to the cells before.
 MAX_OFF_LEVEL_FRACTION, CELL_REFINEMENT_FACTOR = 0.01, 0.6
-# What is farther from the level than this many cells is nowhere near.
+# The largest distance from the level, in cells, that is measured.
 _MAX_DISTANCE_CELLS = 4.0
-# At the corners and centers of so many triangles distances are measured.
+# The largest number of triangles at whose corners and centers distances are measured.
 _MOST_MEASURED = 20_000
-# What has more triangles is not made again.
+# Meshes with more triangles are not computed again.
 _MOST_REMADE = 100_000
-# Points at which the function is no number are moved by this part of a cell.
+# How far points at which the function is no number are moved, relative to a cell.
 _SINGULAR_POINT_SHIFT = 1e-3
 _MAX_GROWTH_ROUNDS = 20
 
@@ -101,7 +107,8 @@ class SignIsosurface:
     """A mesh extracted from signs.
 
     points: number of lattice points.
-    undecided: at how many of them the error bound exceeds |f - level|, so that the sign is open.
+    undecided: the number of lattice points where the error bound exceeds |f - level|, so that the
+        sign is undecided.
     unfitted: number of triangles moved back from creases.
     is_intersection_free: whether the absence of self-intersections was checked exactly.
     """
@@ -128,8 +135,9 @@ def mesh_from_signs(
     parts of the level set that it lost, and facts about it.
 
     Where more than a few vertices and centers of triangles are beyond the tolerance, a length, or
-    where smaller cells may show lost parts, it is extracted again from smaller cells. The facts say
-    how many points are beyond the tolerance at last, and within what distance all of them are.
+    where smaller cells may show lost parts, it is extracted again from smaller cells. The facts
+    contain the number of points that are finally beyond the tolerance, and a distance within which
+    all of them are.
 
     volume: only parts lost within it count.
 
@@ -187,10 +195,10 @@ def _distances(
     lattice: BccLattice,
     closed: bool,
 ) -> tuple[int, int, float]:
-    """How many vertices and centers of faces are farther from the level than the tolerance, of how
-    many, and the distance within which all of these are, up to a factor of 2. Of large meshes every
-    second face is looked at, or every third and so on. What is closed at the box is to be cut away
-    there, and left out."""
+    """The number of vertices and centers of faces that are farther from the level than the
+    tolerance, the number of all, and a distance within which all of them are, up to a factor of 2.
+    Of large meshes every second face is tested, or every third and so on. Faces that close the mesh
+    at the box are to be cut away, and left out."""
     x, faces = surface.vertices, surface.faces
     if closed:
         lower, upper = lattice.lower + 2 * lattice.size, lattice.upper - 2 * lattice.size
@@ -220,10 +228,11 @@ def extract_from_signs(
 
     tolerance: how far edges may be from the surface, by the normals at their ends, before they are
         cut.
-    closed: beyond the box the function counts as positive; else the surface ends on the box.
+    closed: whether the function counts as positive beyond the box; otherwise the surface ends on
+        the box.
 
     Raises:
-        MeshingError: there is none, too many cells, or values that are no numbers.
+        MeshingError: there is no surface, there are too many cells, or values are no numbers.
     """
     first = _march(function, lattice, closed, report)
     x, faces, normals, is_apart = _collapse_slivers(
@@ -260,8 +269,8 @@ def extract_from_signs(
 
 @dataclass(frozen=True)
 class _RawIsosurface:
-    """Vertices (n, 3) on the level, normals there, and faces (m, 3); the points of the lattice, and
-    how many of these are undecided."""
+    """Vertices (n, 3) on the level, normals there, and faces (m, 3); the number of points of the
+    lattice, and the number of these that are undecided."""
 
     vertices: FloatArray
     normals: FloatArray
@@ -275,9 +284,9 @@ def _march(
 ) -> _RawIsosurface:
     """The triangles of all tetrahedra whose corners differ.
 
-    Cells are left out that are proved empty. Where values are known up to an error, or proofs rest
-    on rounding, signs may differ at the corner of such a cell, and the surface would end there:
-    then its neighbors are looked at as well, until it does not.
+    Cells that are proved empty are left out. Where values are known up to an error, or proofs
+    depend on rounding, signs may differ at the corner of such a cell, and the surface would end
+    there: then its neighbors are added, until the surface does not end.
     """
     cells = lattice.nonempty_cells(function.clearance, function.most_faces)
     if closed:
@@ -331,11 +340,11 @@ def _march(
 def _collapse_slivers(
     marched: _RawIsosurface, tolerance: float
 ) -> tuple[FloatArray, IntArray, FloatArray, bool]:
-    """Vertices, faces and normals with short edges contracted, and vertices left out where faces
-    around them lie in a plane, within a tolerance (manifold3d); all as they were if the surface is
-    open, or triangles then pass through each other. And whether that was checked and none do: they
-    do not as the tetrahedra cut them, but for rounding."""
-    import scipy.spatial  # here: half a second that few need
+    """Vertices, faces and normals, with short edges contracted, and without vertices whose faces
+    lie in a plane, within a tolerance (manifold3d); unchanged if the surface is open, or if
+    triangles would pass through each other. And whether the absence of intersections was checked:
+    triangles as the tetrahedra cut them do not intersect, up to rounding."""
+    import scipy.spatial  # imported here: it takes half a second
 
     searching: Any = scipy.spatial
     x, faces = marched.vertices, marched.faces
@@ -351,7 +360,8 @@ def _collapse_slivers(
 
 
 def _finite_values(function: SignFunction, points: FloatArray, size: FloatArray) -> FloatArray:
-    """The function at points, or a little beside them where it is no number, as at a dipole."""
+    """The values of the function at points, or a little beside them where they are no numbers, as
+    at a dipole."""
     value = function.values(points)
     for k in (1, 2):
         fails = np.flatnonzero(~np.isfinite(value))
@@ -396,8 +406,8 @@ class _CreaseRefinement:
 
     edges: (m, 3) of all faces.
     vertex_of_edge: (k,) of edges, the index of the new vertex, or -1.
-    ends: (c, 2) of the edges that are split.
-    share: (c,) where along these edges, as a fraction.
+    ends: (c, 2) the ends of the edges that are split.
+    share: (c,) the fraction along each of these edges where it is split.
     corner_faces: (d, 3) faces with a new vertex within.
     rows: (d,) the indices of these faces.
     points, normals: of the new vertices, those of edges first.
@@ -424,8 +434,9 @@ class _CreaseRefinement:
         faces: IntArray,
         tolerance: float,
     ) -> _CreaseRefinement:
-        """Edges that are farther from the surface than the tolerance, by where the tangent planes
-        of their ends meet; those on a crease have two, and stay."""
+        """The splits of edges that are farther from the surface than the tolerance, judged by where
+        the tangent planes of their ends meet; edges on a crease, whose ends have two tangent
+        planes, stay."""
         every = Edges.of(half_edges(faces))
         edges = every.edge_of_pair.reshape(3, -1).T
         rows = np.flatnonzero((every.multiplicity == 2) & ~bent[every.vertices].any(axis=1))
@@ -478,16 +489,16 @@ class _CreaseRefinement:
 def _toward_tangent_planes(
     a: FloatArray, b: FloatArray, n_a: FloatArray, n_b: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Where edges from a to b (k, 3) come nearest to the line in which the planes through their
-    ends with normals `one` and `other` meet: a part of the edge (k,), and the way from there to the
-    line (k, 3); also the square of the sine between the normals.
+    """The points where edges from a to b (k, 3) come nearest to the line in which the planes
+    through their ends with normals `n_a` and `n_b` meet: the fraction (k,) of the edge, and the
+    displacement (k, 3) from there to the line; also the square of the sine between the normals.
 
-    Edges of a plane triangulation pass over such a line in order, and so do these places.
+    Edges of a plane triangulation pass over such a line in order, and so do these points.
     """
     edge, line = b - a, np.cross(n_a, n_b)
     cosine, turned = row_dots(n_a, n_b), row_dots(line, line)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        # A point of the line, from a: p.one = 0 and p.other = edge.other.
+        # A point of the line, relative to a: p.n_a = 0 and p.n_b = edge.n_b.
         height = row_dots(edge, n_b) / turned
         point = height[:, None] * (n_b - cosine[:, None] * n_a)
         along = line / np.sqrt(turned)[:, None]
@@ -503,8 +514,8 @@ def _toward_tangent_planes(
 def _level_along(
     function: SignFunction, start: FloatArray, along: FloatArray, limit: FloatArray
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Points of the level from a little before `start` (k, 3) to a little behind start + way, no
-    farther than `most`; normals there; and whether the function has different signs at both
+    """Points of the level between a little before `start` (k, 3) and a little behind start + along,
+    no farther than `limit`; normals there; and whether the function has different signs at both
     ends."""
     along = along * np.minimum(1, limit / np.maximum(row_norms(along), 1e-300))[:, None]
     near, end = start - _BEFORE * along, start + _BEHIND * along
@@ -521,8 +532,8 @@ def _level_along(
 def _crease_corners(
     function: SignFunction, x: FloatArray, normals: FloatArray, faces: IntArray, rows: IntArray
 ) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Points where the tangent planes at the corners of some faces meet, on the level; normals; and
-    the faces, by index, that have one."""
+    """Points on the level where the tangent planes at the corners of the faces `rows` meet;
+    normals; and the faces, by index, that have such a point."""
     corner, normal = x[faces[rows]], normals[faces[rows]]
     det: Any = np.linalg.det
     chosen = np.flatnonzero(np.abs(det(normal)) > _INDEPENDENT)
@@ -567,7 +578,7 @@ def _undo_until_valid(x: FloatArray, flat: FloatArray, faces: IntArray) -> tuple
         near = np.zeros(len(x), np.bool_)
         near[faces[failing]] = True
         among = np.asarray(near[faces].any(axis=1))
-        if not (x[near] != flat[near]).any():  # so that it ends: with their neighbors
+        if not (x[near] != flat[near]).any():  # together with neighbors, so that the loop ends
             near[faces[among]] = True
             among = np.asarray(near[faces].any(axis=1))
         x[near] = flat[near]
@@ -577,7 +588,8 @@ def _undo_until_valid(x: FloatArray, flat: FloatArray, faces: IntArray) -> tuple
 
 
 def _folded_faces(x: FloatArray, faces: IntArray, among: BoolArray) -> IntArray:
-    """Faces, by index, that lie on a neighbor but for rounding, of which one is chosen."""
+    """The indices of faces that lie on a neighbor up to rounding, where either of both is
+    chosen."""
     normal = area_normals(x[faces])
     normal /= np.maximum(row_norms(normal), 1e-300)[:, None]
     pairs = Edges.of(half_edges(faces)).paired_half_edges() % len(faces)

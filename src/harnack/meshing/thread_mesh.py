@@ -22,15 +22,15 @@ _MOST_VERTICES = 4_000_000
 
 
 def thread_manifold(thread: Thread, lower: float, upper: float, tolerance: float) -> Manifold:
-    """A thread for lower <= z <= upper; what is beyond has no meaning.
+    """A thread for lower <= z <= upper; the mesh beyond that range has no meaning.
 
-    Vertices lie on the surface, so that the edges of the profile are edges of the mesh. With n of
-    them around, faces are within 2 r (pi/n)^2 of the surface: their corners differ by 2 pi/n in
+    Vertices lie on the surface, so that the edges of the profile are edges of the mesh. With n
+    vertices around, faces are within 2 r (pi/n)^2 of the surface: their corners differ by 2 pi/n in
     angle at most, so that a chord has a sagitta of r (pi/n)^2/2, and a diagonal of a face that is
     turned by 2 pi/n departs from it by less than three times that.
 
     Raises:
-        MeshingError: so fine that it has millions of faces.
+        MeshingError: the mesh would have millions of faces.
     """
     profile = np.array(thread.profile)
     radius = float(profile[:, 1].max())
@@ -66,8 +66,9 @@ def thread_manifold(thread: Thread, lower: float, upper: float, tolerance: float
 def _vertices(
     height: FloatArray, radii: FloatArray, segments: int, lead: float, shift: int
 ) -> FloatArray:
-    """Points of each helical line at each angle; and those at angle 0 of the lines that a turn
-    leads to from the last ones. turn: how many lines farther a line arrives after a turn."""
+    """Points of each helical line at each angle; and the points at angle 0 of the lines that the
+    last lines lead to after a turn. shift: the number of lines by which a line advances in a
+    turn."""
     angle = 2 * math.pi * np.arange(segments) / segments
     continued = height[-shift:] + lead, radii[-shift:]
     z = height[:, None] + lead * angle / (2 * math.pi)
@@ -77,7 +78,8 @@ def _vertices(
 
 
 def _index(line: IntArray, step: IntArray, lines: int, segments: int, shift: int) -> IntArray:
-    """The vertex of a line at an angle; after a turn it is that of another line at angle 0."""
+    """The index of the vertex of a line at an angle; after a turn it is that of another line at
+    angle 0."""
     line, step = np.where(step == segments, line + shift, line), np.where(step == segments, 0, step)
     return np.where(line < lines, line * segments + step, lines * segments + line - lines)
 

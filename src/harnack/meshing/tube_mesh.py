@@ -1,4 +1,5 @@
-"""The closed mesh of a tube: rings of points swept along its polylines, in pieces put together."""
+"""The closed mesh of a tube: rings of points swept along its polylines, in pieces that are
+united."""
 
 from __future__ import annotations
 
@@ -22,9 +23,9 @@ if TYPE_CHECKING:
 __all__ = ["tube_manifold"]
 
 _MOST_VERTICES = 4_000_000
-# Of the tolerance, by which polylines may be off.
+# The largest error of polylines, relative to the tolerance.
 _LEFT_OUT = 0.25
-# Points around, of wires far thinner than the tolerance too.
+# The smallest number of points around, also for wires far thinner than the tolerance.
 _LEAST_AROUND = 8
 # An edge leads back where the cosine of its turn is less than this above -1.
 _BACK = 1e-9
@@ -34,10 +35,10 @@ def tube_manifold(tube: Tube, level: float, tolerance: float) -> Manifold:
     """The points within radius + level of a tube's polylines; vertices lie on the surface, and
     faces within `tolerance` of it.
 
-    Vertices of a polyline within a quarter of the tolerance of a shorter one are left out. Each is
-    swept as a whole. Where its mesh would pass through itself, as at corners too sharp for the
-    radius or where the tube comes back to itself, it is cut in two at a vertex, where both parts
-    end with a ball: the tube is the union of theirs.
+    Vertices of a polyline within a quarter of the tolerance of a shorter polyline are left out.
+    Each polyline is swept as a whole. Where its mesh would pass through itself, as at corners too
+    sharp for the radius or where the tube returns to itself, the polyline is cut in two at a
+    vertex, where both parts end with a ball: the tube is the union of both parts' tubes.
 
     Proof of the tolerance, with the angle a = 2 pi/n between points around. Distances from two
     polylines differ by no more than these do. Faces between lines along an edge have chords of
@@ -46,7 +47,7 @@ def tube_manifold(tube: Tube, level: float, tolerance: float) -> Manifold:
     of angle a at most. The sum is at most r a^2/4, three quarters of the tolerance.
 
     Raises:
-        MeshingError: so fine that it has millions of faces.
+        MeshingError: the mesh would have millions of faces.
     """
     from manifold3d import Manifold, OpType
 
@@ -61,7 +62,7 @@ def tube_manifold(tube: Tube, level: float, tolerance: float) -> Manifold:
     parts: list[Manifold] = []
     vertices = 0
     while waiting:
-        # Rings of a half ball at both ends, and one at least at each vertex between.
+        # Rings of a half ball at both ends, and at least one ring at each vertex between.
         minimum = segments * sum(len(polyline) + segments // 2 for polyline in waiting)
         if vertices + minimum > _MOST_VERTICES:
             raise MeshingError(
@@ -85,9 +86,10 @@ def _is_apart(surface: TriangleMesh) -> bool:
 
 
 def _simpler(points: FloatArray, length: float) -> FloatArray:
-    """A polyline (n, 3) with the vertices left out that are within a length of the edges in their
-    place (Douglas and Peucker 1973). Proof that all of these edges are as near to the polyline: the
-    nearest points on an edge of what it stands for go from one of its ends to the other."""
+    """A polyline (n, 3) without vertices that are within a length of the edges that replace them
+    (Douglas and Peucker 1973). Proof that all of these edges are as near to the polyline: the
+    points on an edge that are nearest to the replaced part of the polyline go from one of the
+    edge's ends to the other."""
     is_kept = np.zeros(len(points), np.bool_)
     is_kept[[0, -1]] = True
     waiting = [(0, len(points) - 1)]
@@ -114,8 +116,8 @@ class _Sweep:
     points: FloatArray
 
     def surface(self) -> TriangleMesh | None:
-        """Rings of points one after the other; None where a line along an edge would end before it
-        begins."""
+        """The surface of rings of points one after the other; None where a line along an edge would
+        end before it begins."""
         points, sides = self.points, np.diff(self.points, axis=0)
         edges = sides / np.abs(sides).max(axis=1)[:, None]  # squares of small ones underflow
         edges /= row_norms(edges)[:, None]
@@ -141,7 +143,7 @@ class _Sweep:
         return self._joined(np.concatenate(rings), shift if is_closed else None)
 
     def _directions(self, frame: FloatArray) -> FloatArray:
-        """(around, 3) of the unit vectors in a plane."""
+        """(around, 3) unit vectors in the plane of a frame, at equal angles."""
         angle = 2 * math.pi * np.arange(self.around) / self.around
         return np.cos(angle)[:, None] * frame[0] + np.sin(angle)[:, None] * frame[1]
 
@@ -168,16 +170,17 @@ class _Sweep:
         return point + self.radius * np.where((component > 0)[:, None], inner, turned)
 
     def _end(self, point: FloatArray, axis: FloatArray, frame: FloatArray, sign: int) -> FloatArray:
-        """Rings from the pole of a half ball to its rim, or the other way at the last point."""
+        """Rings from the pole of a half ball to its rim, or in the reverse order at the last
+        point."""
         count = math.ceil(0.25 * self.around)
         angle = 0.5 * math.pi * np.arange(count + 1)[:, None, None] / count
         rings = np.cos(angle) * self._directions(frame) + sign * np.sin(angle) * axis
         return point + self.radius * (rings if sign > 0 else rings[::-1])
 
     def _joined(self, rings: FloatArray, shift: int | None) -> TriangleMesh:
-        """Faces between neighbors of rings (k, around, 3), those of points that are the same left
-        out. shift: by which the numbers around grow from the last to the first; None for poles
-        there."""
+        """The mesh of faces between neighbors of rings (k, around, 3), without faces with equal
+        corners. shift: the amount by which the indices around grow from the last ring to the first;
+        None if the ends are poles."""
         count, n = len(rings), self.around
         row, column = np.mgrid[: count - 1 if shift is None else count, :n].reshape(2, -1)
         moved = np.where(row == count - 1, shift or 0, 0)
@@ -199,8 +202,9 @@ class _Sweep:
         self, edges: FloatArray, *, is_closed: bool
     ) -> tuple[list[tuple[FloatArray, FloatArray]], int] | None:
         """Two unit vectors (2, 3) across each edge, at its start and its end, turned as the edges
-        turn; of a closed polyline also a little about them, so that numbers around agree at the
-        last and the first but for a shift. None where an edge leads back along the one before."""
+        turn; for a closed polyline they also turn a little about the edges, so that the indices
+        around agree at the last and the first edge up to a shift. None where an edge leads back
+        along the edge before."""
         first = np.cross(edges[0], np.eye(3)[np.abs(edges[0]).argmin()])
         first /= np.linalg.norm(first)
         across = [first]
@@ -226,6 +230,6 @@ class _Sweep:
 
 
 def _spun(frame: FloatArray, angle: float) -> FloatArray:
-    """Turned in its plane."""
+    """The frame, turned by an angle in its plane."""
     c, s = math.cos(angle), math.sin(angle)
     return np.stack([c * frame[0] + s * frame[1], c * frame[1] - s * frame[0]])

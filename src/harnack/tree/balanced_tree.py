@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real
 
 NO_PRIMITIVE = -1
-# So many points and their indices fit into the cache.
+# The number of points that fit into the cache, with their indices.
 _POINTS_IN_CACHE = 1 << 17
 # Rows up to this length are reduced faster by a loop over columns than by NumPy's reductions.
 _LONG_ROW = 48
@@ -47,7 +47,8 @@ class BalancedTree:
 
     leaf_slots: (leaves, leaf_size) index of the primitive in each slot, NO_PRIMITIVE for an empty
         one (the last of a leaf, if any).
-    arities: children of every inner node, level by level from the leaves' parents to the root.
+    arities: the number of children of every inner node, level by level from the leaves' parents to
+        the root.
     """
 
     leaf_slots: IntArray
@@ -55,12 +56,12 @@ class BalancedTree:
 
     @property
     def leaf_size(self) -> int:
-        """Slots of a leaf."""
+        """The number of slots of a leaf."""
         return self.leaf_slots.shape[1]
 
     @property
     def counts(self) -> tuple[int, ...]:
-        """Nodes of each level, from the leaves to the root."""
+        """The number of nodes of each level, from the leaves to the root."""
         counts = [len(self.leaf_slots)]
         for arity in self.arities:
             counts.append(counts[-1] // arity)
@@ -68,7 +69,7 @@ class BalancedTree:
 
     @property
     def node_count(self) -> int:
-        """Nodes of all levels."""
+        """The number of nodes of all levels."""
         return sum(self.counts)
 
     def node_links(self) -> tuple[tuple[IntArray, ...], tuple[IntArray, ...], tuple[IntArray, ...]]:
@@ -80,7 +81,7 @@ class BalancedTree:
         and so on, so that siblings, which are mostly visited together, lie side by side in memory.
         The first child of a leaf is 0, the index of the root, which stands for none.
         """
-        below = [0]  # nodes below one of each level
+        below = [0]  # the number of nodes below a node, for each level
         for arity in self.arities:
             below.append(arity * (1 + below[-1]))
         number, after = [np.zeros(1, np.int64)], [np.array([self.node_count], np.int64)]
@@ -139,8 +140,8 @@ def _split(rows: IntArray, x: FloatArray) -> tuple[IntArray, FloatArray]:
     """The points of nodes, a row each, halved: indices (k, w) and positions x (3, k, w) become
     (2k, ceil(w/2)) and (3, 2k, ceil(w/2)).
 
-    The last of a row may be empty: NO_PRIMITIVE, at NaN, which sorts behind all numbers. If each
-    row holds w or w - 1 points, each of the new ones holds ceil(w/2) or one less.
+    The last slot of a row may be empty: NO_PRIMITIVE, at NaN, which sorts behind all numbers. If
+    each row holds w or w - 1 points, each new row holds ceil(w/2) points or one less.
     """
     count, width = rows.shape
     half, middle = (width + 1) // 2, width // 2
@@ -193,7 +194,7 @@ class PackedTree:
         subtree, and the index of its leaf or, for an inner node, minus the index of its first
         child.
     node_payloads: further numbers of the caller for each node, stored separately because a walk
-        reads many heads in a row and few payloads; None for none.
+        reads many heads in a row and few payloads; None if there are none.
     primitives: `leaf_size` rows for each leaf.
     """
 

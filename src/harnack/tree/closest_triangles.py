@@ -38,7 +38,7 @@ __all__ = ["MAX_BOXES", "NO_BOX", "BoxTree"]
 # Boxes are numbered in floats; single precision holds no larger integers without gaps.
 MAX_BOXES = 2**24
 NO_BOX = 0xFFFFFFFF
-# Column of a record behind its box.
+# The column of a record behind its box.
 _NUMBER = 6
 _LEAF_SIZE = 4
 
@@ -101,7 +101,7 @@ class BoxTree:
 
     def _slab_test(self, o: Vec3, d: Vec3) -> Any:
         """A function that computes where rays enter and leave a box, a little too early and too
-        late to cover rounding.
+        late, which covers rounding.
 
         Each plane of the box is moved outwards by 16 roundings of the size of coordinates, and t is
         widened by 8 roundings of itself: (x - o)/d has three roundings, of which that of x - o is
@@ -197,7 +197,8 @@ def squared_distance_in_nearby_leaf(tree: PackedTree, x: Vec3, column: int) -> R
         nearer, following = square < best, index(head[6])
         best = dr.select(nearer, square, best)
         is_leaf, number = head[7] >= 0, index(dr.abs(head[7]))
-        # Of the nearest sibling so far: its leaf if it is one, or its first child and their end.
+        # For the nearest sibling so far: its leaf if it is a leaf, or its first child and the end
+        # of its children.
         nearest_leaf = dr.select(nearer, dr.select(is_leaf, number, NO_TRIANGLE), nearest_leaf)
         first = dr.select(nearer, number, first)
         after = dr.select(nearer, following, after)
@@ -301,19 +302,20 @@ class ClosestPointOnTriangle:
     offset: (3,) from x to the point.
     is_inner: whether the point lies inside the triangle, not on its edges.
 
-    It is the closest point of the plane if that lies in the triangle, else the closest point of the
-    edges. The closest point of the plane is computed along the longest edge e, from a and of length
-    L, and along the altitude h on it, made orthogonal to e twice.
+    It is the closest point of the plane if that lies in the triangle, otherwise the closest point
+    of the edges. The closest point of the plane is computed along the longest edge e, from a and of
+    length L, and along the altitude h on it, made orthogonal to e twice.
 
     Proof that the distance is off by only a few epsilons of l = L + |x - a|, however thin the
     triangle (a cross product's direction is off by epsilon L/|h|, which for a needle is an error of
-    any size): x - a less its part along e, done twice, is right up to epsilon l and orthogonal to e
-    up to epsilon^2 l, and so is h, whose direction within the plane normal to e is off by d <=
-    epsilon L/|h|. So the point a + alpha e + s h lies off the plane by at most s|h| d <= epsilon L,
-    and off the closest point within it by k <= epsilon l + min(d H, |h|), H the distance from the
-    plane. That lengthens H by at most k^2/(2H), where k >= epsilon l counts as min(d H, |h|)^2/(2H)
-    <= d |h|/2 <= epsilon L/2, and by k <= 3 epsilon l for H < epsilon l. If the same k puts the
-    point on the wrong side of an edge, the edges' distance or the plane's is off by as much.
+    any size): x - a minus its component along e, removed twice, is right up to epsilon l and
+    orthogonal to e up to epsilon^2 l, and so is h, whose direction within the plane normal to e is
+    off by d <= epsilon L/|h|. So the point a + alpha e + s h lies off the plane by at most s|h| d
+    <= epsilon L, and off the closest point within it by k <= epsilon l + min(d H, |h|), H the
+    distance from the plane. That lengthens H by at most k^2/(2H), where k >= epsilon l counts as
+    min(d H, |h|)^2/(2H) <= d |h|/2 <= epsilon L/2, and by k <= 3 epsilon l for H < epsilon l. If
+    the same k puts the point on the wrong side of an edge, the edges' distance or the plane's is
+    off by as much.
     """
 
     squared_distance: Real
@@ -336,7 +338,7 @@ class ClosestPointOnTriangle:
         by_qr = ~by_pr & (squares[1] > squares[0])
 
         def chosen(of_pq: Any, of_qr: Any, of_pr: Any) -> Any:
-            """The one that belongs to the longest of the edges pq, qr and pr."""
+            """The argument that belongs to the longest of the edges pq, qr and pr."""
             return dr.select(by_pr, of_pr, dr.select(by_qr, of_qr, of_pq))
 
         a, e, inverse = chosen(p, q, p), chosen(pq, qr, pr), chosen(first, second, third)
@@ -361,13 +363,13 @@ def _project_on_edge(v: Vec3, e: Vec3, inverse: Real) -> tuple[Real, Vec3]:
 
 
 def _closest_on_segment(a: Vec3, e: Vec3, inverse: Real) -> Vec3:
-    """The nearest point to the origin of the segment from a to a + e."""
+    """The point of the segment from a to a + e that is nearest to the origin."""
     real, vector = cast("Any", type(inverse)), cast("Any", type(a))
     return dr.fma(vector(clamp(-dr.dot(a, e) * inverse, real(0), real(1))), e, a)
 
 
 def _shortest_vector(*vectors: Vec3) -> tuple[Real, Vec3]:
-    """The smallest of them, its squared length first."""
+    """The shortest of vectors, its squared length first."""
     best, *rest = vectors
     square = dr.squared_norm(best)
     for vector in rest:
@@ -377,8 +379,8 @@ def _shortest_vector(*vectors: Vec3) -> tuple[Real, Vec3]:
 
 
 def squared_distance_to_segment(a: Vec3, e: Vec3, inverse: Real) -> Real:
-    """From the origin to the segment from a to a + e; inverse: 1/|e|^2, any finite number if e =
-    0."""
+    """The squared distance from the origin to the segment from a to a + e; inverse: 1/|e|^2, any
+    finite number if e = 0."""
     return dr.squared_norm(_closest_on_segment(a, e, inverse))
 
 

@@ -64,7 +64,7 @@ class BoxCells:
 
     @property
     def centers(self) -> FloatArray:
-        """(n, 3)."""
+        """(n, 3) the centers of the boxes."""
         return self.corners + 0.5 * self.size
 
     @property
@@ -243,7 +243,7 @@ class EmptySpaceGrid:
 
         Proof. All cells less than empty_distance cells from a point's cell are empty, and so are
         the margins around them. Together they form a cube, larger than these cells by the margin. A
-        step leaves the cells by at most `margin` less `_ROUNDING`, so that it stays inside of the
+        step leaves the cells by at most `margin` minus `_ROUNDING`, so that it stays inside of the
         cube; the rest of the margin is for the rounding of positions. Steps end where a cell is
         occupied.
         """
@@ -323,10 +323,10 @@ class GridCell:
 
 
 def distance_to_occupied(empty: BoolArray) -> IntArray:
-    """`GridData.empty_distance` of cells (nz, ny, nx)."""
+    """`GridData.empty_distance` from the mask of empty cells (nz, ny, nx)."""
     if empty.all():
         return np.full(empty.size, max(empty.shape), np.int64)
-    from scipy import ndimage  # here: a third of a second that few need
+    from scipy import ndimage  # imported here: it takes a third of a second
 
     chessboard: Any = cast("Any", ndimage).distance_transform_cdt  # its default metric
     return np.asarray(chessboard(empty), dtype=np.int64).ravel()
@@ -418,9 +418,9 @@ def largest_connected_component(cells: OccupancyGrid) -> OccupancyGrid:
     number of cells would measure areas, or volumes, only if each piece of a surface was surrounded
     by as many occupied cells: but there are more where its function vanishes to a higher order, and
     around the two sides of a plate thinner than a cell no more than around a single side.
-    Projections do not depend on that, but for the cells at their outlines: there are several more
-    where a function vanishes to a higher order, so that with coarse cells a smaller component may
-    be chosen for it. Of equal groups the first along z, y and x is chosen.
+    Projections do not depend on that, except for the cells at their outlines: there are several
+    more where a function vanishes to a higher order, so that with coarse cells a smaller component
+    may be chosen for it. Of equal groups the first along z, y and x is chosen.
 
     Proof that no component of the set is cut in two. All of the set lies in occupied cells, as
     closed cubes. A connected part of it cannot be covered by two unions of such cubes that are
@@ -437,7 +437,7 @@ def largest_connected_component(cells: OccupancyGrid) -> OccupancyGrid:
     full = (cells.empty_distance == 0).reshape(z, y, x)
     if not full.any():
         return cells
-    from scipy import ndimage  # here: a third of a second that few need
+    from scipy import ndimage  # imported here: it takes a third of a second
 
     groups, count = cast("Any", ndimage).label(full, _NEIGHBOR_STENCIL)
     group, indices = groups[full], np.argwhere(full)

@@ -23,9 +23,9 @@ __all__ = ["BALL_MARGIN", "MAX_DEPTH", "OCTANT_DIRECTIONS", "OctreeLookup", "enc
 # Cells of the finest level are 2^-MAX_DEPTH as wide as the cube, cells of the grid with which a
 # lookup begins 2^-_TOP_DEPTH.
 MAX_DEPTH, _TOP_DEPTH = 10, 5
-# What holds in the ball of a cell should hold in one larger by this factor, for rounding: it moves
-# a point by less than 2^-20 of the cube's side in single precision, and such balls of the finest
-# cells reach 2^-19 of it beyond these.
+# Statements about the ball of a cell should hold in a ball larger by this factor, for rounding: it
+# moves a point by less than 2^-20 of the cube's side in single precision, and such balls of the
+# finest cells reach 2^-19 of it beyond these.
 BALL_MARGIN = 1.004
 # From the center of a cube to those of its octants, in quarters of its side; z fastest.
 OCTANT_DIRECTIONS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))

@@ -36,8 +36,8 @@ def split_intersecting_faces(
     rays: TriangleTree, vertices: FloatArray, faces: IntArray, *, covered_whole: bool = False
 ) -> tuple[FloatArray, IntArray]:
     """Triangles (k, 3, 3) that fill the faces (m, 3), none of which passes through another or is
-    covered by another in part; and (k,) the face that each is a piece of and has the orientation
-    of.
+    partly covered by another; and (k,) the face that each is a piece of, with the orientation of
+    the face.
 
     rays: a tree of the same faces, with coordinates of at most about 1.
     covered_whole: whether faces are also cut where others in their plane meet, so that each of
@@ -93,8 +93,9 @@ def windings_of_sides(
     """(k,), (k,): the winding numbers in front of triangles, the side from which they run
     counter-clockwise, and behind them.
 
-    A ray along the normal of each counts the crossings ahead of a point of the triangle, and those
-    ahead of a point just behind it: so the triangles in the same place are passed all at once.
+    A ray along the normal of each triangle counts the crossings ahead of a point of the triangle,
+    and the crossings ahead of a point just behind it: so coincident triangles are passed all at
+    once.
     """
     backend = rays.tree.backend
     a, b, c = np.moveaxis(pieces, 1, 0)
@@ -113,7 +114,7 @@ def windings_of_sides(
 def _crossing_faces(
     rays: TriangleTree, vertices: FloatArray, faces: IntArray
 ) -> tuple[IntArray, IntArray]:
-    """Pairs of faces (k,), (k,) that pass through one another, each both ways round."""
+    """Pairs of faces (k,), (k,) that pass through one another, each in both orders."""
     ends = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     edges, edge = np.unique(ends, axis=0, return_inverse=True)
     edge = edge.reshape(-1)
@@ -129,7 +130,7 @@ def _crossing_faces(
 
 
 def _ranks_in_groups(count: IntArray) -> IntArray:
-    """0, 1, .. for each of the counts in turn."""
+    """The concatenation of 0, 1, .., n - 1 for the counts n in turn."""
     first = np.cumsum(count) - count
     return cast("IntArray", np.arange(int(count.sum())) - np.repeat(first, count))
 
@@ -137,8 +138,8 @@ def _ranks_in_groups(count: IntArray) -> IntArray:
 def _crossings_of_edges(
     rays: TriangleTree, vertices: FloatArray, faces: IntArray, edges: IntArray
 ) -> tuple[IntArray, IntArray]:
-    """Which edges (m, 2) cross which faces that have neither end, or meet their borders: indices of
-    both."""
+    """The indices of edges (m, 2) and of faces without their ends that they cross, or whose borders
+    they meet."""
     backend = rays.tree.backend
     corner = [upload_integers(backend, ids) for ids in faces.T]
     span = vertices[edges[:, 1]] - vertices[edges[:, 0]]
@@ -167,8 +168,8 @@ def _next_foreign_crossing(
     rays: TriangleTree, corner: list[Any], frame: RayFrame, ends: tuple[Any, Any], end: Any,
     after: tuple[Any, Any],
 ) -> tuple[Any, Any]:  # fmt: skip
-    """The first crossing of rays behind another one with a face that has neither of two vertices;
-    corner: those of the faces."""
+    """The first crossing of rays after the crossing `after` with a face that has neither of two
+    vertices; corner: the corners of the faces."""
     index = rays.tree.backend.UInt32
 
     def body(t: Any, n: Any, active: Any) -> tuple[Any, ...]:
@@ -190,7 +191,7 @@ def _cut_up(pieces: FloatArray, rows: IntArray, knives: FloatArray) -> tuple[Flo
     (k, 3, 3); and the triangle that each is a piece of.
 
     In each round every piece is cut by a knife that meets it, the middle of its list, and its parts
-    share the remaining knives: so their number falls by about half.
+    share the remaining knives: so the number of knives falls by about half.
     """
     done: list[FloatArray] = []
     owners: list[IntArray] = []
@@ -220,9 +221,10 @@ def _cut_up(pieces: FloatArray, rows: IntArray, knives: FloatArray) -> tuple[Flo
 
 
 def _parts(pieces: FloatArray, height: FloatArray) -> FloatArray:
-    """Triangles (3 k, 3, 3) that triangles fall into at a plane above which their corners have
-    heights (k, 3): one on one side and two on the other."""
-    # The corner that is alone on its side comes first; one in the plane goes with another.
+    """The triangles (3 k, 3, 3) into which a plane cuts triangles whose corners have heights (k, 3)
+    above it: one on one side and two on the other."""
+    # The corner that is alone on its side comes first; a corner in the plane belongs to the side of
+    # another corner.
     side = np.where(height > 0, 1, -1)
     side = np.where((height == 0), np.where(side.sum(axis=1) > 0, 1, -1)[:, None], side)
     minority = np.where(side.sum(axis=1) > 0, -1, 1)
@@ -236,7 +238,7 @@ def _parts(pieces: FloatArray, height: FloatArray) -> FloatArray:
 
 
 def _heights(pieces: FloatArray, knives: FloatArray) -> FloatArray:
-    """(k, 3) of corners of triangles above the planes of others."""
+    """(k, 3) the heights of corners of triangles above the planes of knives."""
     a, b, c = np.moveaxis(knives, 1, 0)
     normal = np.cross(b - a, c - a)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
@@ -255,7 +257,7 @@ def _cut_meets_triangle(pieces: FloatArray, height: FloatArray, knives: FloatArr
         ends.append(pieces[:, i] + fraction[:, None] * (pieces[:, j] - pieces[:, i]))
     low, high = np.zeros(len(pieces)), np.ones(len(pieces))
     points = np.stack(ends, axis=1)
-    # The two ends: of three places at most two differ.
+    # The two ends: at most two of the three points differ.
     start = np.where(np.isnan(points[:, 0]), points[:, 1], points[:, 0])
     apart = np.nan_to_num(np.linalg.norm(points - start[:, None], axis=2), nan=-1.0)
     end = points[np.arange(len(points)), apart.argmax(axis=1)]

@@ -29,7 +29,7 @@ from harnack.tree.balanced_tree import (
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
 
-    # A point across a ray (u, v) and along it.
+    # The coordinates of a point: (u, v) across a ray, and the depth along it.
     RayCoordinates: TypeAlias = tuple[Real, Real, Real]
 
 # Columns of a record; 0 to 8 are the corners.
@@ -161,7 +161,7 @@ class VerticalRayFrame:
 
 
 def _flush_tiny(u: Real) -> Real:
-    """A coordinate across a ray, with 0 for one so small that a product of two could underflow.
+    """A coordinate across a ray; 0 if it is so small that a product of two could underflow.
 
     Such a coordinate is far smaller than the rounding error of a vertex.
     """
@@ -273,9 +273,9 @@ class TriangleTree:
 
         unit: the rounding of a coordinate.
 
-        A computed t belongs to a point of the triangle within a few units of the ray, so that it is
-        off by that over the cosine between ray and normal. Where t may therefore lie on either side
-        of an end, the sum is not certain.
+        A computed t belongs to a point of the triangle within a few units of the ray, so that its
+        error is that distance over the cosine between ray and normal. Where t may therefore lie on
+        either side of an end, the sum is not certain.
         """
         real, inside = self.tree.backend.Float, self._slab_test(frame)
 
@@ -395,8 +395,8 @@ def signed_crossing(row: list[Real], frame: RayFrame | VerticalRayFrame) -> tupl
 
 
 def _is_beside(row: list[Real], frame: RayFrame, reach: float) -> Mask:
-    """Whether the line of a ray is as near as `reach` to the border of a record's triangle. (What
-    `signed_crossing` computes as well is computed once.)"""
+    """Whether the line of a ray is as near as `reach` to the border of a record's triangle. (Terms
+    that `signed_crossing` computes as well are computed once.)"""
     p, q, r = corners_of(row, type(frame.o))
     a, b, c = frame.transverse(p), frame.transverse(q), frame.transverse(r)
     near: Mask = False
@@ -419,8 +419,8 @@ def _crossing_depth(
 
     corners: (u, v, depth) of each, in the frame of the ray. sides: `edge_function` of the edges.
 
-    The barycentric weight of a corner is an area divided by that of the triangle, which is all
-    rounding where the triangle is thin. So the weight w of the corner off the longest edge is
+    The barycentric weight of a corner is an area divided by that of the triangle, which is only
+    rounding error where the triangle is thin. So the weight w of the corner off the longest edge is
     clamped to the range that the ray's coordinate along that edge allows, and the coordinate s of
     the point on the edge is then chosen for w: the ray is at s + w s', with s' the coordinate of
     that corner, 0 <= s <= 1 - w, and coordinates along the longest edge are accurate. A wrong w
