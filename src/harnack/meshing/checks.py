@@ -172,7 +172,7 @@ def intersecting_faces(
     corners that lie on other triangles are not searched for, since edges beyond them would pass
     through. Two triangles in one plane overlap unless the line of an edge has them on its two sides
     (separating axes), whatever they share: faces that are there twice, or folded back onto their
-    neighbors, do. Pairs are looked for among those whose boxes overlap.
+    neighbors, do. Only pairs whose boxes overlap are tested.
 
     among: (m,) mask of chosen faces; pairs without a chosen face are not tested.
     """
@@ -452,7 +452,7 @@ def is_retry_promising(
     failed. It is not if the number of failures hardly decreased since the previous attempt: along a
     pole, or where jump surfaces cross, cells of every size fail.
 
-    smallest: the smallest cell allowed, relative to those that failed now.
+    smallest: the smallest cell allowed, relative to the cells that failed now.
     """
     if not now.may_be_fixed_by(smallest):
         return False

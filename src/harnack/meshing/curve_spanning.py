@@ -218,8 +218,9 @@ def mesh_spanning_curve(
     each other; where triangles do, or are turned over, cells are made smaller and the mesh is
     computed again.
 
-    attempts: how many spacings are tried, each smaller than the one before. box: to be filled.
-        has_walls: whether the surface may end at the box's faces. tolerance: a length.
+    attempts: the number of spacings that are tried, each smaller than the spacing before.
+    box: the box that cells fill. has_walls: whether the surface may end at its faces.
+    tolerance: a length.
 
     Raises:
         MeshingError: no mesh passes the checks.

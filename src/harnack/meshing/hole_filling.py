@@ -10,7 +10,7 @@ it continues the surface around it, tangents included. Laplacians are those of t
 repeated, with long edges split, this converges to surfaces whose mean curvature is harmonic, such
 as spheres and cylinders.
 
-Nothing is proved of such fillings. Those that pass the checks of `fill_holes` are returned.
+Nothing is proved about such fillings. Fillings that pass the checks of `fill_holes` are returned.
 """
 
 from __future__ import annotations

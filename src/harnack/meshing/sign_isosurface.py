@@ -158,16 +158,16 @@ def mesh_from_signs(
                 raise
             raise EmptySurfaceError(f"the mesh is empty: {lost}; {lost.advice}") from error
         report("measuring distances to the level")
-        far, count, within = _distances(function, mesh.surface, tolerance, lattice, closed)
+        far_count, count, within = _distances(function, mesh.surface, tolerance, lattice, closed)
         report("looking for parts that were lost")
         lost = LostParts.of(function, level_points, mesh.surface, tolerance, spacing)
         attempts -= 1
-        may_help = far > MAX_OFF_LEVEL_FRACTION * count or (
+        may_help = far_count > MAX_OFF_LEVEL_FRACTION * count or (
             lost.matter and lost.are_mended_by(CELL_REFINEMENT_FACTOR)
         )
         if attempts <= 0 or not may_help or len(mesh.surface.faces) > _MOST_REMADE:
             break
-        report(f"{far:,} of {count:,} vertices and centers are beyond the tolerance")
+        report(f"{far_count:,} of {count:,} vertices and centers are beyond the tolerance")
         if lost.matter:
             report(str(lost))
         spacing *= CELL_REFINEMENT_FACTOR
@@ -179,7 +179,7 @@ def mesh_from_signs(
         "isotopy_far": 0.0,
         "undecided": mesh.undecided,
         "flat": mesh.unfitted,
-        "far": far,
+        "far": far_count,
         "looked_at": count,
         "within": within,
         "lost": lost.far,
@@ -445,9 +445,11 @@ class _CreaseRefinement:
         a, b = x[ends[:, 0]], x[ends[:, 1]]
         t, along, turned = _toward_tangent_planes(a, b, one, other)
         long = row_norms(b - a)
-        far = (turned > _PARALLEL) & (row_norms(along) > tolerance) & (long > _SHORTEST * tolerance)
-        rows, along, t = rows[far], along[far], t[far]
-        foot, span = a[far] + t[:, None] * (b - a)[far], long[far]
+        is_far = (
+            (turned > _PARALLEL) & (row_norms(along) > tolerance) & (long > _SHORTEST * tolerance)
+        )
+        rows, along, t = rows[is_far], along[is_far], t[is_far]
+        foot, span = a[is_far] + t[:, None] * (b - a)[is_far], long[is_far]
         points, normal, passed = _level_along(function, foot, along, _BESIDE * span)
         rows, points, normal, t = rows[passed], points[passed], normal[passed], t[passed]
         ends = every.vertices[rows]
