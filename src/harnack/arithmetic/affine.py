@@ -1,8 +1,9 @@
 """Revised affine arithmetic along a path: a line and a constant bound of the error.
 
 A function of 0 <= s <= h is c + l e + r, with e = 2s/h - 1 and |r| <= error. Sums are exact;
-products and functions put what is not linear in s into the error. Unlike `ParabolaBounds` it is not
-exact at s = 0, so the march tries shorter lengths where it proves nothing.
+products and functions put the terms that are not linear in s into the error. Unlike
+`ParabolaBounds` it is not exact at s = 0, so the march tries shorter lengths where it proves
+nothing.
 
 Source: Vu, Sam-Haroud and Faltings 2009; Fryazinov, Pasko and Comninos 2010.
 """
@@ -56,8 +57,8 @@ class AffineForm(FormulaNumber):
     def range(self) -> Interval:
         """The range of the function."""
         room = dr.abs(self.slope) + self.error
-        slack = _rounding_bound(dr.abs(self.center) + room)
-        return Interval(self.center - room - slack, self.center + room + slack)
+        rounding = _rounding_bound(dr.abs(self.center) + room)
+        return Interval(self.center - room - rounding, self.center + room + rounding)
 
     def constant(self, x: float | Real) -> AffineForm:
         kind = cast("Any", type(self.center))
@@ -78,8 +79,8 @@ class AffineForm(FormulaNumber):
         )
 
     def product(self, other: Any) -> AffineForm:
-        """Proof. Of (c + l e + r)(d + m e + q), e^2 lies in [0, 1], so l m e^2 within l m/2 of
-        l m/2; everything else that is not linear in e is an error."""
+        """The product of two functions. Proof. Of (c + l e + r)(d + m e + q), e^2 lies in [0, 1],
+        so l m e^2 within l m/2 of l m/2; everything else that is not linear in e is an error."""
         c, l, r = self.center, self.slope, self.error  # noqa: E741
         d, m, q = other.center, other.slope, other.error
         both = 0.5 * l * m
@@ -98,8 +99,8 @@ class AffineForm(FormulaNumber):
         x = self.range
         value, slopes, curvature = function.ranges(x)
         width = x.upper - x.lower
-        unit = machine_epsilon(width)
-        ends = [function.ranges(Interval(one, one))[0] for one in (x.lower, x.upper)]
+        epsilon = machine_epsilon(width)
+        ends = [function.ranges(Interval(end, end))[0] for end in (x.lower, x.upper)]
         rise = dr.select(width > 0, (ends[1].midpoint - ends[0].midpoint) / width, 0)
         rise = dr.select(dr.isfinite(rise), rise, 0)
         eighth = 0.125 * width * width
@@ -111,44 +112,44 @@ class AffineForm(FormulaNumber):
             0.5 * (over - under) + ends[0].radius + ends[1].radius + _rounding_bound(size),
         )
         middle = 0.5 * x.lower + 0.5 * x.upper
-        there = function.ranges(Interval(middle, middle))[0]
+        middle_value = function.ranges(Interval(middle, middle))[0]
         mean = (
-            there.midpoint,
+            middle_value.midpoint,
             slopes.midpoint,
-            (slopes.radius * width * 0.5 + there.radius) * (1 + 8 * unit)
-            + _rounding_bound(dr.abs(there.midpoint) + dr.abs(slopes.midpoint) * width),
+            (slopes.radius * width * 0.5 + middle_value.radius) * (1 + 8 * epsilon)
+            + _rounding_bound(dr.abs(middle_value.midpoint) + dr.abs(slopes.midpoint) * width),
         )
         flat = (value.midpoint, 0 * width, value.radius + _rounding_bound(dr.abs(value.midpoint)))
         best = _smaller_error(_smaller_error(chord, mean), flat)
         center, rate, error = best
         moved = rate * (self.center - middle)
-        slack = _rounding_bound(
+        rounding = _rounding_bound(
             dr.abs(center) + dr.abs(rate) * (dr.abs(self.center) + dr.abs(self.slope) + self.error)
         )
         return AffineForm(
-            center + moved, rate * self.slope, error + dr.abs(rate) * self.error + slack
+            center + moved, rate * self.slope, error + dr.abs(rate) * self.error + rounding
         )
 
     def pointwise_maximum(self, other: Any) -> AffineForm:
         """max(f, g) = g + max(f - g, 0); f or g itself where it is proved to be the larger."""
         difference = self.sum(-other)
         x = difference.range
-        one, two = x.lower >= 0, x.upper <= 0
+        self_larger, other_larger = x.lower >= 0, x.upper <= 0
         # max(t, 0) on [x, y], x < 0 < y: its chord has slope y/(y - x) and lies above by at most
         # -x y/(y - x), at 0.
         rate = x.upper / (x.upper - x.lower)
-        above = -x.lower * rate
-        center = rate * (difference.center - x.lower) - 0.5 * above
+        excess = -x.lower * rate
+        center = rate * (difference.center - x.lower) - 0.5 * excess
         size = dr.abs(rate) * (dr.abs(difference.center) + dr.abs(x.lower) + dr.abs(x.upper))
         part = AffineForm(
             center,
             rate * difference.slope,
-            rate * difference.error + 0.5 * above + _rounding_bound(size),
+            rate * difference.error + 0.5 * excess + _rounding_bound(size),
         )
         both = other.sum(part)
         return AffineForm(
             *(
-                dr.select(one, u, dr.select(two, v, w))
+                dr.select(self_larger, u, dr.select(other_larger, v, w))
                 for u, v, w in zip(_entries(self), _entries(other), _entries(both), strict=True)
             )
         )
@@ -165,19 +166,19 @@ class AffineForm(FormulaNumber):
         """
         a, b = approximate_direction(x.center, self.center)
         ahead, aside = x * a + self * b, self * a - x * b
-        seen = aside.product(ahead.apply(reciprocal)).apply(atan)
+        offset = aside.product(ahead.apply(reciprocal)).apply(atan)
         turned, _ = angle_range(Interval.point(b), Interval.point(a))
-        known = ~meets_branch_cut(self.range, x.range) & (ahead.range.lower > 0)
-        center = seen.center + turned.midpoint
+        is_valid = ~meets_branch_cut(self.range, x.range) & (ahead.range.lower > 0)
+        center = offset.center + turned.midpoint
         error = (
-            seen.error + turned.radius + _rounding_bound(dr.abs(center) + dr.abs(turned.midpoint))
+            offset.error + turned.radius + _rounding_bound(dr.abs(center) + dr.abs(turned.midpoint))
         )
-        known &= dr.isfinite(center) & dr.isfinite(seen.slope) & dr.isfinite(error)
-        whole = math.pi * (1 + 1e-6)
+        is_valid &= dr.isfinite(center) & dr.isfinite(offset.slope) & dr.isfinite(error)
+        half_turn = math.pi * (1 + 1e-6)
         return AffineForm(
-            dr.select(known, center, 0),
-            dr.select(known, seen.slope, 0),
-            dr.select(known, error, whole),
+            dr.select(is_valid, center, 0),
+            dr.select(is_valid, offset.slope, 0),
+            dr.select(is_valid, error, half_turn),
         )
 
 
@@ -186,13 +187,13 @@ def _entries(x: AffineForm) -> tuple[Real, Real, Real]:
 
 
 def _smaller_error(
-    one: tuple[Real, Real, Real], two: tuple[Real, Real, Real]
+    first: tuple[Real, Real, Real], second: tuple[Real, Real, Real]
 ) -> tuple[Real, Real, Real]:
-    """The one with the smaller error; if one is not finite, the other."""
-    known = dr.isfinite(one[0]) & dr.isfinite(one[1]) & dr.isfinite(one[2])
-    other = dr.isfinite(two[0]) & dr.isfinite(two[1]) & dr.isfinite(two[2])
-    first = known & ((one[2] <= two[2]) | ~other)
-    x, y, z = (dr.select(first, u, v) for u, v in zip(one, two, strict=True))
+    """The line and error with the smaller error; if one of them is not finite, the other."""
+    first_finite = dr.isfinite(first[0]) & dr.isfinite(first[1]) & dr.isfinite(first[2])
+    second_finite = dr.isfinite(second[0]) & dr.isfinite(second[1]) & dr.isfinite(second[2])
+    use_first = first_finite & ((first[2] <= second[2]) | ~second_finite)
+    x, y, z = (dr.select(use_first, u, v) for u, v in zip(first, second, strict=True))
     return x, y, z
 
 

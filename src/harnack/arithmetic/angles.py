@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 __all__ = ["angle_range", "approximate_direction", "atan2"]
 
-# Units in the last place that Dr.Jit's atan2 is off by at most; measured: 3.3.
+# A bound of the error of Dr.Jit's atan2, in units in the last place; measured: 3.3.
 _MAX_ULP_ERROR = 8.0
 # A number of double precision above pi.
 _PI = math.nextafter(math.pi, 4.0)
@@ -39,7 +39,7 @@ def atan2(y: Any, x: Any) -> Any:
         return y.atan2(x)
     if isinstance(x, FormulaNumber):
         return x.coerce(y).atan2(x)
-    if any(dr.is_array_v(cast("Any", type(one))) for one in (y, x)):
+    if any(dr.is_array_v(cast("Any", type(number))) for number in (y, x)):
         return dr.atan2(y, x)
     return np.arctan2(y, x)
 
@@ -63,7 +63,7 @@ def angle_range(y: Interval, x: Interval) -> tuple[Interval, Mask]:
     """
     met = meets_branch_cut(y, x)
     is_point = x.lower is x.upper and y.lower is y.upper
-    whole = Interval.enclosing(_PI, type(x.lower)).upper
+    pi = Interval.enclosing(_PI, type(x.lower)).upper
     if is_point:
         angle = dr.atan2(y.lower, x.lower)
         angle = dr.select((y.lower == 0) & (x.lower < 0), math.pi, angle)
@@ -73,9 +73,9 @@ def angle_range(y: Interval, x: Interval) -> tuple[Interval, Mask]:
         y, x = _nan_to_infinite(y), _nan_to_infinite(x)
         low, high = _widened(-_largest_angle(Interval(-y.upper, -y.lower), x), _largest_angle(y, x))
         unknown = met
-    low, high = (dr.select(one == one, one, sign * dr.inf) for one, sign in ((low, -1), (high, 1)))
-    low, high = dr.maximum(low, -whole), dr.minimum(high, whole)
-    return Interval(dr.select(unknown, -whole, low), dr.select(unknown, whole, high)), met
+    low, high = (dr.select(end == end, end, sign * dr.inf) for end, sign in ((low, -1), (high, 1)))
+    low, high = dr.maximum(low, -pi), dr.minimum(high, pi)
+    return Interval(dr.select(unknown, -pi, low), dr.select(unknown, pi, high)), met
 
 
 def _largest_angle(y: Interval, x: Interval) -> Real:
@@ -108,8 +108,8 @@ def approximate_direction(x: Real, y: Real) -> tuple[Real, Real]:
     """A vector about along (x, y), of a length between 1/2 and 2; (1, 0) if (x, y) has no
     direction."""
     size = dr.maximum(dr.abs(x), dr.abs(y))
-    known = (size > 0) & dr.isfinite(size)
-    scale = dr.select(known, 1 / size, 0)
+    is_valid = (size > 0) & dr.isfinite(size)
+    scale = dr.select(is_valid, 1 / size, 0)
     a, b = x * scale, y * scale
     over = dr.rsqrt(dr.maximum(a * a + b * b, 1))
-    return dr.select(known, a * over, 1), dr.select(known, b * over, 0)
+    return dr.select(is_valid, a * over, 1), dr.select(is_valid, b * over, 0)

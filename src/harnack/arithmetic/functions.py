@@ -25,9 +25,9 @@ DerivativeRanges: TypeAlias = "tuple[Interval, Interval, Interval]"
 
 # The domain of roots, powers that are no integers, and logarithms.
 _POSITIVE = (0.0, math.inf)
-# No function here overflows sooner than at this part of the largest number: LLVM's exp does at 0.7.
+# No function here overflows below this fraction of the largest number: LLVM's exp does at 0.7.
 _OVERFLOWS = 1 / 16
-# Units in the last place that exp, log and their like are off by at most, on every backend.
+# A bound of the error of exp, log and the like on every backend, in units in the last place.
 _MAX_ULP_ERROR = 8.0
 
 
@@ -54,7 +54,7 @@ class ElementaryFunction:
     has_pole: bool = False
 
     def __reduce__(self) -> str:
-        # There is one of each name, in this module.
+        # There is one function of each name, in this module.
         return "absolute" if self.name == "abs" else self.name
 
     def __call__(self, x: Any) -> Any:
@@ -86,13 +86,13 @@ def _two(x: Interval) -> Interval:
 def _unbounded_where_undefined(defined: Mask, ranges: DerivativeRanges) -> DerivativeRanges:
     """The ranges; on lanes where the function is not defined, the ranges of its derivatives are all
     numbers."""
-    value, *rest = ranges
+    value, *derivatives = ranges
     slope, second = (
         Interval(
-            typed_select(defined, one.lower, -dr.inf, value.lower),
-            typed_select(defined, one.upper, dr.inf, value.lower),
+            typed_select(defined, derivative.lower, -dr.inf, value.lower),
+            typed_select(defined, derivative.upper, dr.inf, value.lower),
         )
-        for one in rest
+        for derivative in derivatives
     )
     return value, slope, second
 
@@ -111,18 +111,18 @@ def _exponential_range(f: Callable[[Any], Any], x: Interval) -> Interval:
 
     def end(v: Real, sign: int) -> Real:
         result = f(v)
-        off = machine_epsilon(v) * (_MAX_ULP_ERROR + dr.abs(v))
-        moved = dr.fma(dr.abs(result), sign * off, result) + sign * _smallest_normal(x)
+        error = machine_epsilon(v) * (_MAX_ULP_ERROR + dr.abs(v))
+        moved = dr.fma(dr.abs(result), sign * error, result) + sign * _smallest_normal(x)
         return typed_select(sign * result == -dr.inf, -sign * large, moved, v)
 
     return Interval(end(x.lower, -1), end(x.upper, 1))
 
 
 def _log(x: Interval) -> DerivativeRanges:
-    one = x.reciprocal()
-    # Near 1 a logarithm is off by four units of 1 on CUDA.
+    inverse = x.reciprocal()
+    # Near 1 the error of a logarithm is four units of 1 on CUDA.
     value = _increasing_range(dr.log, x).widened(0.0, 4 * machine_epsilon(x.lower))
-    return _unbounded_where_undefined(x.lower > 0, (value, one, -one.square()))
+    return _unbounded_where_undefined(x.lower > 0, (value, inverse, -inverse.square()))
 
 
 def _sqrt(x: Interval) -> DerivativeRanges:
@@ -152,10 +152,10 @@ def _positive_reciprocal(x: Interval) -> Interval:
 
 
 def _reciprocal(x: Interval) -> DerivativeRanges:
-    one = x.reciprocal()
-    slope = -one.square()
+    inverse = x.reciprocal()
+    slope = -inverse.square()
     return _unbounded_where_undefined(
-        (x.lower > 0) | (x.upper < 0), (one, slope, _two(-slope * one))
+        (x.lower > 0) | (x.upper < 0), (inverse, slope, _two(-slope * inverse))
     )
 
 
@@ -174,35 +174,35 @@ def _sine_and_cosine(x: Interval) -> tuple[Interval, Interval]:
 
     Proof. Both are monotone between the multiples of pi/2 at which they are 1 or -1: the range is
     given by the ends, and by such points inside. Whether such a point is inside is tested for an
-    interval widened by the rounding of the test; a point that is counted wrongly is that near to an
-    end. Beyond `max_sincos_argument` sines are not known: on pieces the range is [-1, 1] there; at
-    a point it is all numbers, as the value at a point is taken half way between the ends, and 0
-    would look like a value.
+    interval widened by the rounding of the test; a point that is counted wrongly is within that
+    rounding of an end. Beyond `max_sincos_argument` sines are not known: on pieces the range is
+    [-1, 1] there; at a point it is all numbers, as the value at a point is taken half way between
+    the ends, and 0 would look like a value.
     """
-    unit, most = machine_epsilon(x.lower), max_sincos_argument(type(x.lower))
+    epsilon, max_argument = machine_epsilon(x.lower), max_sincos_argument(type(x.lower))
     s0, c0 = sincos(x.lower)
     if x.lower is x.upper:
-        known = dr.abs(x.lower) <= most
+        is_valid = dr.abs(x.lower) <= max_argument
 
-        def at_point(one: Real) -> Interval:
-            plain = Interval(one, one).widened(4 * unit, 4 * unit)
-            low = dr.select(known, fmax(plain.lower, -1), -dr.inf)
-            return Interval(low, dr.select(known, fmin(plain.upper, 1), dr.inf))
+        def at_point(value: Real) -> Interval:
+            plain = Interval(value, value).widened(4 * epsilon, 4 * epsilon)
+            low = dr.select(is_valid, fmax(plain.lower, -1), -dr.inf)
+            return Interval(low, dr.select(is_valid, fmin(plain.upper, 1), dr.inf))
 
         return at_point(s0), at_point(c0)
     s1, c1 = sincos(x.upper)
-    turn = 1 / (2 * math.pi)
-    slack = 8 * unit * (fmax(dr.abs(x.lower), dr.abs(x.upper)) + 1) * turn
-    low, high = x.lower * turn - slack, x.upper * turn + slack
-    wide = ~(fmax(dr.abs(x.lower), dr.abs(x.upper)) <= most) | ~(high - low < 1)
+    scale = 1 / (2 * math.pi)
+    rounding = 8 * epsilon * (fmax(dr.abs(x.lower), dr.abs(x.upper)) + 1) * scale
+    low, high = x.lower * scale - rounding, x.upper * scale + rounding
+    wide = ~(fmax(dr.abs(x.lower), dr.abs(x.upper)) <= max_argument) | ~(high - low < 1)
 
     def passes(phase: float) -> Mask:
         return dr.floor(high - phase) > dr.floor(low - phase)
 
     def over(a: Real, b: Real, top: float, bottom: float) -> Interval:
-        plain = Interval(fmin(a, b), fmax(a, b)).widened(4 * unit, 4 * unit)
-        least = dr.select(passes(bottom), -1, plain.lower)
-        return _clip_to_unit(Interval(least, dr.select(passes(top), 1, plain.upper)), wide)
+        plain = Interval(fmin(a, b), fmax(a, b)).widened(4 * epsilon, 4 * epsilon)
+        lowest = dr.select(passes(bottom), -1, plain.lower)
+        return _clip_to_unit(Interval(lowest, dr.select(passes(top), 1, plain.upper)), wide)
 
     return over(s0, s1, 0.25, 0.75), over(c0, c1, 0.0, 0.5)
 
@@ -219,8 +219,8 @@ def _tan(x: Interval) -> DerivativeRanges:
     t = s * c.reciprocal()
     # Monotone where the cosine has no zero: the ends are the range.
     ends = [
-        one * two.reciprocal()
-        for one, two in (
+        sine * cosine.reciprocal()
+        for sine, cosine in (
             _sine_and_cosine(Interval(x.lower, x.lower)),
             _sine_and_cosine(Interval(x.upper, x.upper)),
         )
@@ -234,7 +234,8 @@ def _tan(x: Interval) -> DerivativeRanges:
 
 
 def _hyperbolic_tangent(x: Real) -> Real:
-    """tanh; Dr.Jit's own is accurate to only 11 bits on CUDA. From 20 on it is 1 up to rounding."""
+    """The range of tanh, since Dr.Jit's is accurate to only 11 bits on CUDA. From 20 on it is 1 up
+    to rounding."""
     x = clamp(x, -20.0, 20.0)
     return dr.sinh(x) / dr.cosh(x)
 
@@ -250,9 +251,9 @@ def _tanh(x: Interval) -> DerivativeRanges:
 
 def _atan(x: Interval) -> DerivativeRanges:
     slope = (ONE + x.square()).reciprocal()
-    most = 3 * math.sqrt(3) / 8 * (1 + 1e-6)  # of |2x/(1+x^2)^2|, at x = 1/sqrt(3)
+    max_second = 3 * math.sqrt(3) / 8 * (1 + 1e-6)  # of |2x/(1+x^2)^2|, at x = 1/sqrt(3)
     second = -_two(x * slope.square())
-    second = Interval(fmax(second.lower, -most), fmin(second.upper, most))
+    second = Interval(fmax(second.lower, -max_second), fmin(second.upper, max_second))
     return _increasing_range(dr.atan, x), slope, second
 
 
@@ -307,7 +308,7 @@ def integer_power(x: Interval, n: int) -> Interval:
         low, high = x.lower, x.upper
     a = _power_by_squaring(low, n)
     b = a if low is high else _power_by_squaring(high, n)
-    # Every product is off by at most half a unit.
+    # The error of every product is at most half a unit.
     result = Interval(a, b).widened(n * machine_epsilon(x.lower), n * _smallest_normal(x))
     return Interval(fmax(result.lower, 0), result.upper) if n % 2 == 0 else result
 
@@ -323,17 +324,17 @@ def _power_by_squaring(x: Real, n: int) -> Real:
 
 
 def power(n: float) -> ElementaryFunction:
-    """x -> x^n; for x >= 0 if n is no integer."""
+    """The function x -> x^n; for x >= 0 if n is no integer."""
     if float(n).is_integer():
         k = int(n)
         if k < 0:
 
             def inverse(x: Interval) -> DerivativeRanges:
-                one = x.reciprocal()
-                slope = Interval.enclosing(k, type(x.lower)) * integer_power(one, 1 - k)
-                second = Interval.enclosing(k * (k - 1), type(x.lower)) * integer_power(one, 2 - k)
+                inv = x.reciprocal()
+                slope = Interval.enclosing(k, type(x.lower)) * integer_power(inv, 1 - k)
+                second = Interval.enclosing(k * (k - 1), type(x.lower)) * integer_power(inv, 2 - k)
                 defined = (x.lower > 0) | (x.upper < 0)
-                return _unbounded_where_undefined(defined, (integer_power(one, -k), slope, second))
+                return _unbounded_where_undefined(defined, (integer_power(inv, -k), slope, second))
 
             def plain(x: Any) -> Any:
                 return 1 / _power_by_squaring(x, -k)
@@ -342,7 +343,7 @@ def power(n: float) -> ElementaryFunction:
                 f"power {k}", inverse, plain, _numpy_power(k), is_steep=True, has_pole=True
             )
 
-        def whole(x: Interval) -> DerivativeRanges:
+        def ranges(x: Interval) -> DerivativeRanges:
             like = cast("Any", type(x.lower))
             slope, second = Interval.enclosing(k, like), Interval.enclosing(k * (k - 1), like)
             return (
@@ -354,7 +355,7 @@ def power(n: float) -> ElementaryFunction:
         def of_numbers(x: Any) -> Any:
             return 0 * x + 1 if k == 0 else _power_by_squaring(x, k)
 
-        return ElementaryFunction(f"power {k}", whole, of_numbers, _numpy_power(k))
+        return ElementaryFunction(f"power {k}", ranges, of_numbers, _numpy_power(k))
 
     def real(x: Interval) -> DerivativeRanges:
         like = cast("Any", type(x.lower))
@@ -381,29 +382,30 @@ def _numpy_power(n: float) -> Callable[[Any], Any]:
 
 
 def _real_power(x: Interval, n: float) -> Interval:
-    """The range of x^n for x >= 0 and any n: exp2(n log2 x), so off by n log2(x) units and a few.
+    """The range of x^n for x >= 0 and any n: exp2(n log2 x), with an error of n log2(x) units and a
+    few.
 
     An x below the smallest normal number may stand for any number from 0 to that.
     """
-    least = fmax(x.lower, 0)
-    most = (
+    lower = fmax(x.lower, 0)
+    upper = (
         fmax(_smallest_normal(x), x.upper)
         if x.upper is not x.lower
-        else fmax(_smallest_normal(x), least)
+        else fmax(_smallest_normal(x), lower)
     )
 
     def end(v: Real, sign: int) -> Real:
         result = dr.power(v, n)
-        off = machine_epsilon(v) * (_MAX_ULP_ERROR + abs(n) * (4 + 2 * dr.abs(dr.log2(v))))
-        return result + sign * (off * result + _smallest_normal(x))
+        error = machine_epsilon(v) * (_MAX_ULP_ERROR + abs(n) * (4 + 2 * dr.abs(dr.log2(v))))
+        return result + sign * (error * result + _smallest_normal(x))
 
-    at_least = fmax(least, _smallest_normal(x))
+    at_least = fmax(lower, _smallest_normal(x))
     if n > 0:
         return Interval(
-            dr.select(least >= _smallest_normal(x), fmax(end(at_least, -1), 0), 0), end(most, 1)
+            dr.select(lower >= _smallest_normal(x), fmax(end(at_least, -1), 0), 0), end(upper, 1)
         )
-    high = dr.select(least >= _smallest_normal(x), end(at_least, 1), dr.inf)
-    return Interval(fmax(end(most, -1), 0), high)
+    high = dr.select(lower >= _smallest_normal(x), end(at_least, 1), dr.inf)
+    return Interval(fmax(end(upper, -1), 0), high)
 
 
 exp = ElementaryFunction("exp", _exp, dr.exp, np.exp)
@@ -428,8 +430,8 @@ absolute = ElementaryFunction("abs", _abs, dr.abs, np.abs)
 
 @dataclass(frozen=True)
 class ClippedPower(ElementaryFunction):
-    """x -> max(x, 0)^n, n >= 1: convex, and n - 1 times continuously differentiable. A kernel of
-    blobs with compact support.
+    """The function x -> max(x, 0)^n, n >= 1: convex, and n - 1 times continuously differentiable. A
+    kernel of blobs with compact support.
 
     Written as maximum(x, 0)**n its second derivative would have no bound, since that of the maximum
     has none. An arithmetic may use that it is 0 for x <= 0.

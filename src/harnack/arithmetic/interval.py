@@ -68,7 +68,7 @@ class Interval:
 
     @property
     def is_zero(self) -> bool:
-        """Whether it is [0, 0] in Python numbers, which is known while a kernel is being
+        """Whether the interval is [0, 0] in Python numbers, which is known while a kernel is being
         recorded."""
         return self.is_literal and self.lower == 0.0 == self.upper
 
@@ -153,12 +153,12 @@ class Interval:
         if self.lower is self.upper and other.lower is other.upper:
             ends = (ends[0],)
         low = high = ends[0]
-        for one in ends[1:]:
-            low, high = _minimum(low, one), _maximum(high, one)
+        for product in ends[1:]:
+            low, high = _minimum(low, product), _maximum(high, product)
         # 0 times infinity is NaN: the smallest of the other ends may then be wrong.
-        known = _none_is_nan(ends)
-        if known is not None:
-            low, high = dr.select(known, low, -dr.inf), dr.select(known, high, dr.inf)
+        is_valid = _none_is_nan(ends)
+        if is_valid is not None:
+            low, high = dr.select(is_valid, low, -dr.inf), dr.select(is_valid, high, dr.inf)
         return Interval(_round_down(_pad_underflow(low, -1)), _round_up(_pad_underflow(high, 1)))
 
     def _times(self, constant: Interval) -> Interval:
@@ -169,8 +169,8 @@ class Interval:
         if a == b == -1.0:
             return -self
         if a < 0.0 < b:
-            most = _pad_underflow(self.max_abs * max(-a, b), 1)
-            return self._rounded_outward(-most, most, constant)
+            bound = _pad_underflow(self.max_abs * max(-a, b), 1)
+            return self._rounded_outward(-bound, bound, constant)
         if b <= 0.0:
             return -self._times(Interval(-b, -a, constant.is_single))
         if a == b <= 1.0 and np.frexp(a)[0] == 0.5:  # a power of two: exact, but for underflow
@@ -197,7 +197,7 @@ class Interval:
                 return Interval(-math.inf, math.inf, self.is_single)
             return self._rounded_outward(1 / self.upper, 1 / self.lower)
         has_zero = ~((self.lower > 0) | (self.upper < 0))
-        # Quotients are off by two units on CUDA.
+        # The error of quotients is two units on CUDA.
         low = _round_down(_pad_underflow(1 / self.upper, -1), 4.0)
         high = _round_up(_pad_underflow(1 / self.lower, 1), 4.0)
         return Interval(dr.select(has_zero, -dr.inf, low), dr.select(has_zero, dr.inf, high))
@@ -276,14 +276,14 @@ def _maximum(a: Real, b: Real) -> Real:
 
 
 def _maximum_or_nan(a: Real, b: Real) -> Real:
-    """The larger; NaN where either is."""
+    """The larger number; NaN where either is NaN."""
     if isinstance(a, float) and isinstance(b, float):
         return math.nan if a != a or b != b else max(a, b)
     return dr.select((a > b) | dr.isnan(a), a, b)
 
 
 def _minimum_ignoring_nan(a: Real, b: Real) -> Real:
-    """The smaller; a where b is NaN, and b where a is."""
+    """The smaller number; a where b is NaN, and b where a is."""
     return dr.select((a <= b) | dr.isnan(b), a, b)
 
 
@@ -297,6 +297,6 @@ def _absolute(x: Real) -> Real:
 
 def _none_is_nan(numbers: tuple[Real, ...]) -> Mask | None:
     total = numbers[0]
-    for one in numbers[1:]:
-        total = total + one
+    for number in numbers[1:]:
+        total = total + number
     return total == total

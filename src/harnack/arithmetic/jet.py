@@ -33,7 +33,7 @@ class Jet(FormulaNumber):
     the length along a path, or n = 3 at a point.
 
     Interval arithmetic of value, first and second derivatives at once (Moore 1966; the Taylor forms
-    of Aydinlilar and Zanni 2023, section 6.1, are made of it).
+    of Aydinlilar and Zanni 2023, section 6.1, consist of it).
 
     value: the range of the function.
     first_derivatives: (n,) the ranges of the partial derivatives.
@@ -71,7 +71,7 @@ class Jet(FormulaNumber):
         """The coordinates as functions of themselves, on boxes around the balls B(p, radius)."""
         x, y, z = cls.at_point(p)
         ends = Interval(-radius, radius)
-        x, y, z = (dataclasses.replace(one, value=one.value + ends) for one in (x, y, z))
+        x, y, z = (dataclasses.replace(jet, value=jet.value + ends) for jet in (x, y, z))
         return x, y, z
 
     @classmethod
@@ -96,10 +96,10 @@ class Jet(FormulaNumber):
             base = Interval.point(x)
             if is_rounded:
                 base = base.widened(machine_epsilon(x))
-            here = _moved(base, rate, start)
+            at_start = _moved(base, rate, start)
             first, second = (rate,), (ZERO,)
-            anchor = Jet(here, first, second, piece_length=0 * x) if anchored else None
-            return Jet(here.hull(_moved(base, rate, end)), first, second, anchor, end - start)
+            anchor = Jet(at_start, first, second, piece_length=0 * x) if anchored else None
+            return Jet(at_start.hull(_moved(base, rate, end)), first, second, anchor, end - start)
 
         x, y, z = (coordinate(p[k], direction[k]) for k in range(3))
         return x, y, z
@@ -149,8 +149,8 @@ class Jet(FormulaNumber):
         return dataclasses.replace(
             self,
             value=-self.value,
-            first_derivatives=tuple(-one for one in self.first_derivatives),
-            second_derivatives=tuple(-one for one in self.second_derivatives),
+            first_derivatives=tuple(-derivative for derivative in self.first_derivatives),
+            second_derivatives=tuple(-derivative for derivative in self.second_derivatives),
             jet_at_start=None if self.jet_at_start is None else -self.jet_at_start,
             roots=(),
         )
@@ -219,7 +219,7 @@ class Jet(FormulaNumber):
             return norm(*self.roots)
         x = self.value_on_backend()
         value, slope, curvature = function.ranges(x)
-        first = tuple(slope * one for one in self.first_derivatives)
+        first = tuple(slope * derivative for derivative in self.first_derivatives)
         second = tuple(
             curvature
             * (
@@ -239,12 +239,12 @@ class Jet(FormulaNumber):
     def pointwise_maximum(self, other: Jet) -> Jet:
         """The larger of two functions at each point.
 
-        Proof. If one is larger everywhere, it is the maximum. Else each derivative is that of one
-        of the two, except where they cross: there the first derivative jumps up, so that the second
-        derivative has no upper bound.
+        Proof. If one function is larger everywhere, it is the maximum. Otherwise each derivative is
+        that of one of the two, except where they cross: there the first derivative jumps up, so
+        that the second derivative has no upper bound.
         """
         x, y = self.value_on_backend(), other.value_on_backend(self.backend_number())
-        left, right = x.lower > y.upper, y.lower > x.upper
+        is_x, is_y = x.lower > y.upper, y.lower > x.upper
 
         def chosen(u: Interval, v: Interval, *, kink: bool) -> Interval:
             if u.is_literal and v.is_literal and u == v and not kink:
@@ -253,9 +253,9 @@ class Jet(FormulaNumber):
             high = dr.inf if kink else both.upper
             return Interval(
                 typed_select(
-                    left, u.lower, typed_select(right, v.lower, both.lower, x.lower), x.lower
+                    is_x, u.lower, typed_select(is_y, v.lower, both.lower, x.lower), x.lower
                 ),
-                typed_select(left, u.upper, typed_select(right, v.upper, high, x.lower), x.lower),
+                typed_select(is_x, u.upper, typed_select(is_y, v.upper, high, x.lower), x.lower),
             )
 
         pairs = self.hessian_indices()
@@ -291,28 +291,26 @@ class Jet(FormulaNumber):
         value, met = angle_range(v, u)
         over = sqrt.ranges(u.square() + v.square())[0]
         over = Interval(0 * over.lower, dr.inf).intersect(reciprocal.ranges(over)[0])
-        c, s = (one * over for one in (u, v))
-        c, s = (Interval(fmax(one.lower, -1), fmin(one.upper, 1)) for one in (c, s))
+        c, s = (bound * over for bound in (u, v))
+        c, s = (Interval(fmax(bound.lower, -1), fmin(bound.upper, 1)) for bound in (c, s))
         count = range(len(self.first_derivatives))
-        turn = [wronskian_range(x, self, u, v, i) * over * over for i in count]
-        growth = [
-            (c * x.first_derivatives[i] + s * self.first_derivatives[i]) * over for i in count
-        ]
+        theta = [wronskian_range(x, self, u, v, i) * over * over for i in count]
+        rho = [(c * x.first_derivatives[i] + s * self.first_derivatives[i]) * over for i in count]
         second = [
             (c * self.second_derivatives[k] - s * x.second_derivatives[k]) * over
-            - (turn[i] * growth[j] + turn[j] * growth[i])
+            - (theta[i] * rho[j] + theta[j] * rho[i])
             for k, (i, j) in enumerate(self.hessian_indices())
         ]
 
-        def off_cut(one: Interval) -> Interval:
+        def off_cut(bound: Interval) -> Interval:
             return Interval(
-                typed_select(met, -dr.inf, one.lower, like),
-                typed_select(met, dr.inf, one.upper, like),
+                typed_select(met, -dr.inf, bound.lower, like),
+                typed_select(met, dr.inf, bound.upper, like),
             )
 
-        first = tuple(off_cut(one) for one in turn)
+        first = tuple(off_cut(bound) for bound in theta)
         jet = Jet(
-            value, first, tuple(off_cut(one) for one in second), piece_length=self.piece_length
+            value, first, tuple(off_cut(bound) for bound in second), piece_length=self.piece_length
         )
         if self.jet_at_start is None or x.jet_at_start is None:
             return jet
@@ -321,7 +319,7 @@ class Jet(FormulaNumber):
         )
 
     def select(self, condition: Mask, other: Jet) -> Jet:
-        """This one on lanes where the condition holds, the other on all others."""
+        """This jet on lanes where the condition holds, the other on all others."""
         kind = self.backend_number()
 
         def chosen(u: Interval, v: Interval) -> Interval:
@@ -387,15 +385,15 @@ def wronskian_range(x: Jet, y: Jet, u: Interval, v: Interval, i: int) -> Interva
     Its derivative x y_ii - y x_ii is 0 along straight lines: the range of w is narrowed from the
     start of the piece.
     """
-    found = u * y.first_derivatives[i] - v * x.first_derivatives[i]
+    w = u * y.first_derivatives[i] - v * x.first_derivatives[i]
     if x.jet_at_start is None or y.jet_at_start is None:
-        return found
+        return w
     at_start = (
         x.jet_at_start.value * y.jet_at_start.first_derivatives[i]
         - y.jet_at_start.value * x.jet_at_start.first_derivatives[i]
     )
     rate = u * y.second_derivatives[i] - v * x.second_derivatives[i]
-    return found.intersect(at_start + range_times_length(rate, x.piece_length))
+    return w.intersect(at_start + range_times_length(rate, x.piece_length))
 
 
 def range_times_length(slope: Interval, width: Real) -> Interval:

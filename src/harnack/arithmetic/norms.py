@@ -37,14 +37,14 @@ def minimum(*values: Any) -> Any:
 def _reduce_extremum(name: str, values: tuple[Any, ...]) -> Any:
     if len(values) < 2:
         raise TypeError(f"{name} compares two numbers or more, and {len(values)} was given")
-    if any(isinstance(one, FormulaNumber) for one in values):
+    if any(isinstance(value, FormulaNumber) for value in values):
         # Jets and their like first: their methods accept numbers of the other kinds.
-        ordered = sorted(values, key=lambda one: not isinstance(one, FormulaNumber))
+        ordered = sorted(values, key=lambda value: not isinstance(value, FormulaNumber))
         return functools.reduce(lambda a, b: getattr(a, name)(b), ordered)
     of_arrays, of_others = _EXTREMUM_FUNCTIONS[name]
 
     def plain(a: Any, b: Any) -> Any:
-        is_array = any(dr.is_array_v(cast("Any", type(one))) for one in (a, b))
+        is_array = any(dr.is_array_v(cast("Any", type(value))) for value in (a, b))
         return of_arrays(a, b) if is_array else of_others(a, b)
 
     return functools.reduce(plain, values)
@@ -70,7 +70,7 @@ def norm(*values: Any, p: float = 2.0) -> Any:
     lines: the range of w_ij is narrowed from the start of the piece.
 
     Raises:
-        TypeError: no numbers given.
+        TypeError: there are no numbers.
         ValueError: p is below 1, for which this is no norm and has no bounded derivative.
     """
     if not values:
@@ -78,42 +78,42 @@ def norm(*values: Any, p: float = 2.0) -> Any:
     if not p >= 1.0:
         raise ValueError(f"the p of a norm must be at least 1, not {p!r}")
     if len(values) == 1 or math.isinf(p):
-        sizes = [absolute(one) for one in values]
+        sizes = [absolute(term) for term in values]
         return sizes[0] if len(sizes) == 1 else maximum(*sizes)
     if p == 1.0:
-        return functools.reduce(lambda a, b: a + b, [absolute(one) for one in values])
-    jets = [one for one in values if isinstance(one, Jet)]
-    if not jets and any(isinstance(one, FormulaNumber) for one in values):
-        sizes = [one if p == 2.0 else absolute(one) for one in values]
+        return functools.reduce(lambda a, b: a + b, [absolute(term) for term in values])
+    jets = [term for term in values if isinstance(term, Jet)]
+    if not jets and any(isinstance(term, FormulaNumber) for term in values):
+        sizes = [term if p == 2.0 else absolute(term) for term in values]
         powers = [
-            one.apply(power(p)) if isinstance(one, FormulaNumber) else one**p for one in sizes
+            term.apply(power(p)) if isinstance(term, FormulaNumber) else term**p for term in sizes
         ]
-        # First one whose operators accept numbers of the other kinds.
-        powers.sort(key=lambda one: not isinstance(one, FormulaNumber))
+        # A number whose operators accept numbers of the other kinds comes first.
+        powers.sort(key=lambda term: not isinstance(term, FormulaNumber))
         total = functools.reduce(lambda a, b: a + b, powers)
         return total.norm_of_powers(p)
     if not jets:
         return _plain_norm(values, p)
-    given = [one if isinstance(one, Jet) else jets[0].coerce(one) for one in values]
-    return _norm(given, p)
+    operands = [term if isinstance(term, Jet) else jets[0].coerce(term) for term in values]
+    return _norm(operands, p)
 
 
 def _plain_norm(values: tuple[Any, ...], p: float) -> Any:
     """The norm of arrays and numbers, in a form whose derivative at 0 is finite."""
-    if not any(dr.is_array_v(cast("Any", type(one))) for one in values):
-        sizes = np.array(np.broadcast_arrays(*(np.abs(one) for one in values)))
-        most = sizes.max(axis=0)
-        scale = np.where(most > 0, most, 1.0)
-        return scale * np.sum((sizes / scale) ** p, axis=0) ** (1 / p) * (most > 0)
+    if not any(dr.is_array_v(cast("Any", type(value))) for value in values):
+        sizes = np.array(np.broadcast_arrays(*(np.abs(value) for value in values)))
+        largest = sizes.max(axis=0)
+        scale = np.where(largest > 0, largest, 1.0)
+        return scale * np.sum((sizes / scale) ** p, axis=0) ** (1 / p) * (largest > 0)
     if p == 2.0:
-        total = functools.reduce(lambda a, b: a + b, [one * one for one in values])
+        total = functools.reduce(lambda a, b: a + b, [value * value for value in values])
         positive = total > 0
         return dr.select(positive, dr.sqrt(dr.select(positive, total, 1)), 0)
-    most = functools.reduce(lambda a, b: fmax(a, b), [dr.abs(one) for one in values])
-    positive = most > 0
-    scale = dr.select(positive, dr.detach(most), 1)
-    parts = [dr.abs(one) / scale for one in values]
-    total = functools.reduce(lambda a, b: a + b, [_plain_power(one, p) for one in parts])
+    largest = functools.reduce(lambda a, b: fmax(a, b), [dr.abs(value) for value in values])
+    positive = largest > 0
+    scale = dr.select(positive, dr.detach(largest), 1)
+    parts = [dr.abs(value) / scale for value in values]
+    total = functools.reduce(lambda a, b: a + b, [_plain_power(value, p) for value in parts])
     return dr.select(positive, scale * dr.power(dr.select(positive, total, 1), 1 / p), 0)
 
 
@@ -122,39 +122,39 @@ def _plain_power(x: Any, p: float) -> Any:
 
 
 def _norm(xs: list[Jet], p: float) -> Jet:
-    like = next((one.value.lower for one in xs if not one.value.is_literal), None)
+    like = next((f.value.lower for f in xs if not f.value.is_literal), None)
     like = xs[0].backend_number() if like is None else like
-    values = [as_backend_interval(one.value, like) for one in xs]
+    values = [as_backend_interval(f.value, like) for f in xs]
     length = _norm_range(values, p)
     over = _reciprocal_norm(length)
-    unit = [_clip_magnitude(one * over, ONE) for one in values]
-    pulls = unit if p == 2.0 else [_signed_power(one, p - 1) for one in unit]
+    ratios = [_clip_magnitude(f * over, ONE) for f in values]
+    pulls = ratios if p == 2.0 else [_signed_power(f, p - 1) for f in ratios]
     count = range(len(xs))
     first = tuple(
         _clip_magnitude(
             _total([pulls[k] * xs[k].first_derivatives[i] for k in count]),
-            _norm_range([as_backend_interval(one.first_derivatives[i], like) for one in xs], p),
+            _norm_range([as_backend_interval(f.first_derivatives[i], like) for f in xs], p),
         )
         for i in range(len(xs[0].first_derivatives))
     )
     second: list[Interval] = []
     for k, (i, j) in enumerate(xs[0].hessian_indices()):
         if p == 2.0:
-            bent = _wronskian_term(xs, values, over, i, j)
+            convex = _wronskian_term(xs, values, over, i, j)
         else:
-            bent = -(first[i] * first[j])
-            for one, u in zip(xs, unit, strict=True):
+            convex = -(first[i] * first[j])
+            for f, u in zip(xs, ratios, strict=True):
                 by = power(p - 2).ranges(Interval(u.min_abs, u.max_abs))[0]
-                bent = bent + by * _product(one.first_derivatives[i], one.first_derivatives[j])
-            bent = bent * over * Interval.enclosing(p - 1, type(like))
+                convex = convex + by * _product(f.first_derivatives[i], f.first_derivatives[j])
+            convex = convex * over * Interval.enclosing(p - 1, type(like))
         if i == j:
-            bent = Interval(fmax(bent.lower, 0), bent.upper)
+            convex = Interval(fmax(convex.lower, 0), convex.upper)
         second.append(
-            bent + _total([u * x.second_derivatives[k] for u, x in zip(pulls, xs, strict=True)])
+            convex + _total([u * x.second_derivatives[k] for u, x in zip(pulls, xs, strict=True)])
         )
     jet = Jet(length, first, tuple(second), piece_length=xs[0].piece_length)
-    starts = [one.jet_at_start for one in xs]
-    if any(one is None for one in starts):
+    starts = [f.jet_at_start for f in xs]
+    if any(f is None for f in starts):
         return jet
     return jet.narrowed_from_start(_norm(cast("list[Jet]", starts), p), xs[0].piece_length)
 
@@ -173,30 +173,30 @@ def _wronskian_term(
 
 def _norm_range(values: list[Interval], p: float) -> Interval:
     """The range of the norm of independent numbers."""
-    smallest, largest = [one.min_abs for one in values], [one.max_abs for one in values]
+    smallest, largest = [value.min_abs for value in values], [value.max_abs for value in values]
     low = _norm_of_magnitudes(smallest, p).lower
-    most = functools.reduce(fmax, smallest)  # rounding and underflow cannot make it shorter
-    return Interval(fmax(low, most), _norm_of_magnitudes(largest, p).upper)
+    floor = functools.reduce(fmax, smallest)  # rounding and underflow cannot make it shorter
+    return Interval(fmax(low, floor), _norm_of_magnitudes(largest, p).upper)
 
 
 def _norm_of_magnitudes(sizes: list[Any], p: float) -> Interval:
     """The norm of numbers >= 0."""
     if p == 2.0:
-        return sqrt.ranges(_total([Interval.point(one).square() for one in sizes]))[0]
-    most = functools.reduce(lambda a, b: dr.select((a > b) | dr.isnan(a), a, b), sizes)
-    tiny = float(dr.smallest(cast("Any", type(most))))
+        return sqrt.ranges(_total([Interval.point(size).square() for size in sizes]))[0]
+    largest = functools.reduce(lambda a, b: dr.select((a > b) | dr.isnan(a), a, b), sizes)
+    tiny = float(dr.smallest(cast("Any", type(largest))))
     # Divided by the largest, so that no power overflows.
-    over = Interval.point(fmax(tiny, most)).reciprocal()
+    over = Interval.point(fmax(tiny, largest)).reciprocal()
     root, raised = power(1 / p).ranges, power(p).ranges
-    parts = [raised(Interval.point(one) * over)[0] for one in sizes]
-    total = root(_total(parts))[0] * Interval.point(most)
+    parts = [raised(Interval.point(size) * over)[0] for size in sizes]
+    total = root(_total(parts))[0] * Interval.point(largest)
     return Interval(
-        dr.select(most > tiny, total.lower, 0), fmax(total.upper, 0) + len(sizes) * tiny
+        dr.select(largest > tiny, total.lower, 0), fmax(total.upper, 0) + len(sizes) * tiny
     )
 
 
 def _signed_power(x: Interval, q: float) -> Interval:
-    """sign(x) |x|^q, q > 0, which rises."""
+    """The range of sign(x) |x|^q, q > 0, which increases."""
 
     def of(v: Any) -> Interval:
         size = power(q).ranges(Interval.point(dr.abs(v)))[0]
@@ -209,15 +209,16 @@ def _signed_power(x: Interval, q: float) -> Interval:
 
 
 def _reciprocal_norm(length: Interval) -> Interval:
-    """1/N for N >= 0; infinite above where N may be 0."""
+    """The range of 1/N for N >= 0; its upper end is infinite where N may be 0."""
     over = reciprocal.ranges(length)[0]
-    least = Interval.point(length.upper).reciprocal()
-    return Interval(fmax(least.lower, 0), over.upper)
+    from_upper = Interval.point(length.upper).reciprocal()
+    return Interval(fmax(from_upper.lower, 0), over.upper)
 
 
-def _clip_magnitude(x: Interval, most: Interval) -> Interval:
-    """x cut to the numbers that are no larger in size than `most`."""
-    bound = most.upper
+def _clip_magnitude(x: Interval, limit: Interval) -> Interval:
+    """The interval x clipped to numbers whose absolute value is at most the upper end of
+    `limit`."""
+    bound = limit.upper
     return Interval(fmax(x.lower, -bound), fmin(x.upper, bound))
 
 
@@ -255,16 +256,16 @@ def blend_union(a: Any, b: Any, radius: Any, power: float = 2.0) -> Any:
     gradients are equal. Where they are orthogonal and p >= 2, it is 1. With two radii, as Hart has
     it, the function is not continuous at g = 0, and there is no constant at all.
     """
-    g_a, g_b = (maximum(1.0 - one / radius, 0.0) for one in (a, b))
+    g_a, g_b = (maximum(1.0 - operand / radius, 0.0) for operand in (a, b))
     near = (1.0 - norm(g_a, g_b, p=power)) * radius
-    least = minimum(a, b)
-    both = near + maximum(least - radius, 0.0)
-    if not isinstance(least, Jet) or not isinstance(both, Jet):
+    smaller = minimum(a, b)
+    both = near + maximum(smaller - radius, 0.0)
+    if not isinstance(smaller, Jet) or not isinstance(both, Jet):
         return both
     # Where only one of the two forms applies, the kinks of the other do not matter.
-    far = least - radius
-    both = near.select(far.value.upper < 0, both)
-    return least.select(far.value.lower > 0, both)
+    excess = smaller - radius
+    both = near.select(excess.value.upper < 0, both)
+    return smaller.select(excess.value.lower > 0, both)
 
 
 def blend_intersection(a: Any, b: Any, radius: Any, power: float = 2.0) -> Any:
@@ -280,15 +281,15 @@ def orthogonal_intersection(*sides: Any) -> Any:
     is the norm of the positive ones (Pythagoras); inside, the nearest side decides. Where a single
     side is positive the norm is that side, the largest.
     """
-    most = maximum(*sides)
-    outside = norm(*(maximum(one, 0.0) for one in sides))
-    both = outside + minimum(most, 0.0)
+    largest = maximum(*sides)
+    outside = norm(*(maximum(side, 0.0) for side in sides))
+    both = outside + minimum(largest, 0.0)
     if not isinstance(both, Jet):
         return both
-    both = outside.select(most.value.lower > 0, both)
+    both = outside.select(largest.value.lower > 0, both)
     # Where no two sides can be positive, as on a face, the distance is the largest of them: the
     # kinks of the norm at 0 and of the minimum do not matter.
-    highs = [one.value.upper if isinstance(one, Jet) else one for one in sides]
+    highs = [side.value.upper if isinstance(side, Jet) else side for side in sides]
     second = functools.reduce(fmax, [fmin(a, b) for a, b in itertools.combinations(highs, 2)])
-    known = dr.isfinite(functools.reduce(lambda a, b: a + b, highs))
-    return most.select((second < 0) & known, both)
+    is_finite = dr.isfinite(functools.reduce(lambda a, b: a + b, highs))
+    return largest.select((second < 0) & is_finite, both)

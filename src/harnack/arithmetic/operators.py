@@ -215,11 +215,11 @@ class FormulaNumber(abc.ABC):
                 a, b = inputs
                 left, right = _OPERATORS[name]
                 is_left = isinstance(a, FormulaNumber)
-                made = getattr(a, left)(b) if is_left else getattr(b, right)(a)
-                if made is NotImplemented:
+                result = getattr(a, left)(b) if is_left else getattr(b, right)(a)
+                if result is NotImplemented:
                     other = type(b if is_left else a).__name__
                     raise TypeError(f"expected a number, not an object of type {other}")
-                return made
+                return result
         raise TypeError(
             f"numpy.{name} has no proved ranges: write formulas with + - * / **, abs, and "
             f"harnack.{_NAMES}"
@@ -231,8 +231,8 @@ class FormulaNumber(abc.ABC):
             "and its like"
         )
 
-    def _undecided(self, *others: Any) -> Any:
-        del others
+    def _undecided(self, *operands: Any) -> Any:
+        del operands
         raise TypeError(
             "a formula cannot decide by its coordinates: use harnack.maximum and harnack.minimum"
         )
@@ -262,8 +262,8 @@ def exponent_of(n: Any) -> float:
 
 # Operations of Dr.Jit, measured for one piece of a path with its sample and slopes.
 _SUM, _PRODUCT, _FUNCTION = 60, 220, 300
-# What is so steep may turn within the rounding of coordinates that are no larger than this: 1/4096
-# is what 16 roundings of single precision are there.
+# Functions this steep may turn within the rounding of coordinates that are no larger than this:
+# 1/4096 is 16 roundings of single precision there.
 _ABRUPT, _FAR = 4096.0, 128.0
 # Sizes and slopes are not counted beyond this number, whose square does not overflow.
 _MOST = 1e100
@@ -271,15 +271,15 @@ _MOST = 1e100
 
 @dataclass(eq=False)
 class Tally:
-    """What numbers of a formula have been through.
+    """A summary of the operations on the numbers of a formula.
 
-    operations: how many operations of Dr.Jit their ranges take, about.
+    operations: about how many operations of Dr.Jit their ranges take.
     may_jump: whether a function was used that is not continuous everywhere.
     is_steep: whether the slope may have no bound in a bounded box, as where roots, powers below 1,
         quotients or logarithms are used.
     steepest: the largest slope, where coordinates are at most 1, of a number that was bent: by a
         maximum, an absolute value, or a function that is no power.
-    finest: the smallest constant but 0, at most 1: what is bent may turn within so much.
+    finest: the smallest nonzero constant, at most 1: a bent number may turn within that.
     farthest: the largest constant that was added.
     """
 
@@ -294,7 +294,7 @@ class Tally:
         """Whether f may change within the rounding of coordinates by far more than its slopes on
         both sides say, as max(-1, min(1, 1e9 y)) does: flat, steep, and flat again.
 
-        finest: by how much what is bent has to change to turn, at least.
+        finest: the smallest change within which a bent number may turn.
 
         An estimate from the numbers of the formula, and no proof: sums and products of coordinates
         alone do not get flat again; a function of 1e9 y does, such as tanh, and so does a maximum
@@ -311,8 +311,8 @@ class OperationCounter(FormulaNumber):
     is_square: whether it is a sum of squares. The root of one has no vertical tangent: with
         f = sqrt(u^2 + v^2), |grad f| <= |grad u| + |grad v|.
     size, rate: bounds of it and of its slope where coordinates are at most 1, and functions that
-        have a pole or grow faster than a power are taken to be about 1 and no steeper than what
-        they are of (`Tally.turns_within`). A constant that is an array counts as 1.
+        have a pole or grow faster than a power count as about 1 and no steeper than their argument
+        (`Tally.turns_within`). A constant that is an array counts as 1.
     """
 
     tally: Tally
@@ -380,7 +380,7 @@ class OperationCounter(FormulaNumber):
         return self._bent(_FUNCTION, self, size, self.rate / (p * size ** (p - 1)))
 
     def _note(self, function: ElementaryFunction) -> None:
-        """Note what a function of this number may do."""
+        """Record in the tally whether a function of this number may jump or be steep."""
         if not self.is_constant:
             is_norm = function is sqrt and self.is_square
             self.tally.may_jump |= function.has_pole
@@ -389,7 +389,8 @@ class OperationCounter(FormulaNumber):
     def _bent(
         self, operations: int, other: OperationCounter, size: float, rate: float
     ) -> OperationCounter:
-        """A number made of this and another one by what may be flat on both sides of a place."""
+        """The result of this and another number by an operation that may be flat on both sides of a
+        place."""
         if not (self.is_constant and other.is_constant):
             self.tally.steepest = max(self.tally.steepest, self.rate, other.rate)
         return self._after(operations, other, size, rate)
@@ -403,7 +404,7 @@ class OperationCounter(FormulaNumber):
         *,
         is_square: bool = False,
     ) -> OperationCounter:
-        """A number made of this and another one by so many operations."""
+        """The result of this and another number, after `operations` operations."""
         self.tally.operations += operations
         is_constant = self.is_constant and other.is_constant
         rate = 0.0 if is_constant else min(rate, _MOST)
@@ -416,9 +417,9 @@ def _power(x: float, n: float) -> float:
 
 
 def tally_of(formula: Callable[[Any, Any, Any], Any]) -> Tally:
-    """What a formula of three coordinates takes. One that does not accept numbers of this kind has
-    no operations and may jump; it accepts only ranges of derivatives, as those of the library's own
-    shapes do, which are bounded."""
+    """The tally of a formula of three coordinates. A formula that does not accept numbers of this
+    kind has no operations and may jump; it accepts only ranges of derivatives, as the formulas of
+    the library's shapes do, which are bounded."""
     tally = Tally()
     x, y, z = (
         OperationCounter(tally) for _ in range(3)

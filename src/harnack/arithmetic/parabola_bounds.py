@@ -91,11 +91,11 @@ class ParabolaBounds(FormulaNumber):
     def _made(
         self, value: Interval, lower: Quadratic, upper: Quadratic, polynomial: int | None = None
     ) -> ParabolaBounds:
-        made = ParabolaBounds(value, lower, upper, self.piece_length, self.bound_degree, polynomial)
+        new = ParabolaBounds(value, lower, upper, self.piece_length, self.bound_degree, polynomial)
         if polynomial is None and self.bound_degree == 1:
-            lower, upper = made.bounds
-            return dataclasses.replace(made, lower=lower, upper=upper)
-        return made
+            lower, upper = new.bounds
+            return dataclasses.replace(new, lower=lower, upper=upper)
+        return new
 
     def __neg__(self) -> ParabolaBounds:
         (a, b), (c, d) = self.lower, self.upper
@@ -148,20 +148,20 @@ class ParabolaBounds(FormulaNumber):
         if factor.is_zero:
             return self._made(value, (0.0, 0.0), (0.0, 0.0), 0)
         low, high = self.lower, self.upper
-        moved = [(middle * one[0], middle * one[1]) for one in (low, high)]
+        moved = [(middle * bound[0], middle * bound[1]) for bound in (low, high)]
         falls = middle < 0
         lower = tuple(dr.select(falls, v, u) for u, v in zip(*moved, strict=True))
         upper = tuple(dr.select(falls, u, v) for u, v in zip(*moved, strict=True))
         sizes = [fmax(dr.abs(u), dr.abs(v)) for u, v in zip(low, high, strict=True)]
-        slack = [
+        rounding = [
             0.0 if _is_zero(low[k]) and _is_zero(high[k])
             else radius * sizes[k] + _rounding_bound(dr.abs(middle) * sizes[k])
             for k in range(2)
         ]  # fmt: skip
         return self._made(
             value,
-            (lower[0] - slack[0], lower[1] - slack[1]),
-            (upper[0] + slack[0], upper[1] + slack[1]),
+            (lower[0] - rounding[0], lower[1] - rounding[1]),
+            (upper[0] + rounding[0], upper[1] + rounding[1]),
             self.polynomial_degree,
         )
 
@@ -171,11 +171,11 @@ class ParabolaBounds(FormulaNumber):
         c, rc = _midpoint_and_half_width(other.lower[0], other.upper[0])
         v, rv, w, rw = *_midpoint_and_radius(self.value), *_midpoint_and_radius(other.value)
         linear = v * c + w * a
-        slack = _rounding_bound(dr.abs(v * c) + dr.abs(w * a))
-        slack += rv * dr.abs(c) + rw * dr.abs(a) + (dr.abs(v) + rv) * rc + (dr.abs(w) + rw) * ra
-        bent = a * c
-        loose = _rounding_bound(dr.abs(bent)) + dr.abs(a) * rc + dr.abs(c) * ra + ra * rc
-        return (linear - slack, bent - loose), (linear + slack, bent + loose)
+        error_1 = _rounding_bound(dr.abs(v * c) + dr.abs(w * a))
+        error_1 += rv * dr.abs(c) + rw * dr.abs(a) + (dr.abs(v) + rv) * rc + (dr.abs(w) + rw) * ra
+        quadratic = a * c
+        error_2 = _rounding_bound(dr.abs(quadratic)) + dr.abs(a) * rc + dr.abs(c) * ra + ra * rc
+        return (linear - error_1, quadratic - error_2), (linear + error_1, quadratic + error_2)
 
     def _straight_product(self, other: ParabolaBounds) -> tuple[Quadratic, Quadratic]:
         h = self.piece_length
@@ -184,11 +184,11 @@ class ParabolaBounds(FormulaNumber):
         highs: list[Real] = []
         for a, _ in self.bounds:
             for c, _ in other.bounds:
-                linear, bent = v * c + w * a, a * c * h
-                slack = _rounding_bound(dr.abs(v * c) + dr.abs(w * a) + dr.abs(bent))
-                slack += rv * dr.abs(c) + rw * dr.abs(a)
-                lows += [linear - slack, linear + bent - slack]
-                highs += [linear + slack, linear + bent + slack]
+                linear, quadratic = v * c + w * a, a * c * h
+                rounding = _rounding_bound(dr.abs(v * c) + dr.abs(w * a) + dr.abs(quadratic))
+                rounding += rv * dr.abs(c) + rw * dr.abs(a)
+                lows += [linear - rounding, linear + quadratic - rounding]
+                highs += [linear + rounding, linear + quadratic + rounding]
         return (_minimum_or_inf(*lows), 0.0), (_maximum_or_inf(*highs), 0.0)
 
     def _curved_product(self, other: ParabolaBounds) -> tuple[Quadratic, Quadratic]:
@@ -209,9 +209,9 @@ class ParabolaBounds(FormulaNumber):
                 (3 * ah * dh, 3 * bh * ch),
                 (4 * bh * dh,),
             )
-            c0, c1, c2, c3 = (sum(one[1:], one[0]) for one in terms)
+            c0, c1, c2, c3 = (sum(term[1:], term[0]) for term in terms)
             size = sum(
-                ((k + 1) * dr.abs(one) for k, group in enumerate(terms) for one in group), 0 * h
+                ((k + 1) * dr.abs(term) for k, group in enumerate(terms) for term in group), 0 * h
             )
             # The uncertainty of the values, and the difference of the bounds of a polynomial.
             size_f = dr.abs(ah) + 2 * dr.abs(bh)
@@ -220,17 +220,18 @@ class ParabolaBounds(FormulaNumber):
             off_f, off_g = ra * h + 2 * rb * h * h, rc * h + 2 * rd * h * h
             loose += off_f * (dr.abs(w) + rw + size_g + off_g)
             loose += off_g * (dr.abs(v) + rv + size_f)
-            slack = _rounding_bound(size) + loose
+            rounding = _rounding_bound(size) + loose
             l0, l1, u0, u1 = _lines_bounding_cubic(c0, c1, c2, c3)
-            lows += [l0 - slack, l1 - slack]
-            highs += [u0 + slack, u1 + slack]
+            lows += [l0 - rounding, l1 - rounding]
+            highs += [u0 + rounding, u1 + rounding]
         return (
             _integral(_minimum_or_inf(*lows[::2]), _minimum_or_inf(*lows[1::2]), h),
             _integral(_maximum_or_inf(*highs[::2]), _maximum_or_inf(*highs[1::2]), h),
         )
 
     def _bound_coefficients(self) -> list[tuple[Real, Real, Real, Real]]:
-        """The two bounds as (a, b, 0, 0); of a polynomial one, (a, b, radius of a, radius of b)."""
+        """The two bounds as (a, b, 0, 0); for a polynomial a single bound, (a, b, radius of a,
+        radius of b)."""
         if self.polynomial_degree is None:
             return [(*self.lower, 0.0, 0.0), (*self.upper, 0.0, 0.0)]
         a, ra = _midpoint_and_half_width(self.lower[0], self.upper[0])
@@ -245,7 +246,7 @@ class ParabolaBounds(FormulaNumber):
         Chords. With x = f(s) - f(0) between x- and x+, phi(f(0) + x) - phi(f(0)) = m x, where m is
         the slope of a chord from f(0). It lies in the range of phi' and, for convex phi, between
         the slopes of the chords to x- and to x+. For an upper bound of a convex phi the two chords
-        themselves are enough, and for a lower one the tangent at f(0), as phi lies above it; for
+        themselves are enough, and for a lower bound the tangent at f(0), as phi lies above it; for
         concave phi the two are exchanged. So f's two parabolas times the ends of the range of m
         bound phi, and one parabola bounds several (`_common_upper_bound`).
 
@@ -269,7 +270,7 @@ class ParabolaBounds(FormulaNumber):
             ((function.ranges(start.shifted(x))[0] - value) * Interval.point(x).reciprocal())
             for x in (fall, rise)
         ]
-        first, last = (one.intersect(slopes) for one in chords)
+        first, last = (bound.intersect(slopes) for bound in chords)
         convex, concave = curvature.lower >= 0, curvature.upper <= 0
 
         # For convex phi, x > 0 needs the upper chord and x < 0 the lower one.
@@ -282,10 +283,10 @@ class ParabolaBounds(FormulaNumber):
             dr.select(convex, slope.upper, dr.select(concave, first.upper, slopes.upper)),
         )
         above = _common_upper_bound(
-            [_times(m, one) for m in upper_slopes for one in (lower, upper)], h
+            [_times(m, bound) for m in upper_slopes for bound in (lower, upper)], h
         )
         below = _common_lower_bound(
-            [_times(m, one) for m in lower_slopes for one in (lower, upper)], h
+            [_times(m, bound) for m in lower_slopes for bound in (lower, upper)], h
         )
         by_taylor = self._taylor(slope, curvature)
         if self.bound_degree == 1:
@@ -299,12 +300,12 @@ class ParabolaBounds(FormulaNumber):
 
     def _taylor(self, slope: Interval, curvature: Interval) -> tuple[Quadratic, Quadratic]:
         moved = self._scaled(slope)
-        (least, _), (most, _) = _lines_bounding_parabolas(self.lower, self.upper, self.piece_length)
+        (low, _), (high, _) = _lines_bounding_parabolas(self.lower, self.upper, self.piece_length)
         half = Interval(0.5 * curvature.lower, 0.5 * curvature.upper)
-        bend = half * Interval(least, most).square()
+        remainder = half * Interval(low, high).square()
         return (
-            _added(moved.lower, (0.0, bend.lower), -1),
-            _added(moved.upper, (0.0, bend.upper), 1),
+            _added(moved.lower, (0.0, remainder.lower), -1),
+            _added(moved.upper, (0.0, remainder.upper), 1),
         )
 
     def pointwise_maximum(self, other: Any) -> ParabolaBounds:
@@ -345,17 +346,17 @@ class ParabolaBounds(FormulaNumber):
         latter is an arc tangent. Elsewhere nothing is known beyond the start.
         """
         h = self.piece_length
-        v, u = (_dynamic(one.value, h) for one in (self, x))
+        v, u = (_dynamic(bounds.value, h) for bounds in (self, x))
         value, _ = angle_range(v, u)
         a, b = approximate_direction(u.midpoint, v.midpoint)
         ahead, aside = x * a + self * b, self * a - x * b
-        seen = aside.product(ahead.apply(reciprocal)).apply(atan)
-        known = ~meets_branch_cut(self._range(), x._range()) & (ahead._range().lower > 0)
+        relative = aside.product(ahead.apply(reciprocal)).apply(atan)
+        is_valid = ~meets_branch_cut(self._range(), x._range()) & (ahead._range().lower > 0)
         zero = 0 * h
         return self._made(
             value,
-            _where(known, seen.lower, (zero - dr.inf, zero)),
-            _where(known, seen.upper, (zero + dr.inf, zero)),
+            _where(is_valid, relative.lower, (zero - dr.inf, zero)),
+            _where(is_valid, relative.upper, (zero + dr.inf, zero)),
         )
 
     def _range(self) -> Interval:
@@ -384,15 +385,15 @@ class ParabolaBounds(FormulaNumber):
         )
         v, rv = _midpoint_and_radius(self.value)
         size = dr.abs(v) + dr.abs(a) * h + dr.abs(b) * h * h
-        off = _rounding_bound(size) + rv + ra * h + rb * h * h
+        value_error = _rounding_bound(size) + rv + ra * h + rb * h * h
         # The roots of v + a s + b s^2, b < 0, without cancellation.
         square = a * a - 4 * b * v
         root = dr.sqrt(fmax(square, 0))
         q = -0.5 * (a + dr.select(a >= 0, root, -root))
-        one, two = q / b, v / q
-        one = dr.select(dr.isfinite(one), one, 0)
-        two = dr.select(dr.isfinite(two), two, 0)
-        start, end = clamp(fmin(one, two), 0, h), clamp(fmax(one, two), 0, h)
+        root_1, root_2 = q / b, v / q
+        root_1 = dr.select(dr.isfinite(root_1), root_1, 0)
+        root_2 = dr.select(dr.isfinite(root_2), root_2, 0)
+        start, end = clamp(fmin(root_1, root_2), 0, h), clamp(fmax(root_1, root_2), 0, h)
         empty = (square <= 0) | (end <= start)
         start, end = dr.select(empty, 0, start), dr.select(empty, h, end)
 
@@ -400,7 +401,7 @@ class ParabolaBounds(FormulaNumber):
         inner = fmax(v + start * (a + b * start), 0)
         turned = a + 2 * b * start
         on_it = ParabolaBounds(
-            Interval(fmax(inner - off, 0), inner + off),
+            Interval(fmax(inner - value_error, 0), inner + value_error),
             (turned - _rounding_bound(dr.abs(a) + 2 * dr.abs(b) * h) - ra - 2 * rb * h, b - rb),
             (turned + _rounding_bound(dr.abs(a) + 2 * dr.abs(b) * h) + ra + 2 * rb * h, b + rb),
             end - start,
@@ -408,7 +409,7 @@ class ParabolaBounds(FormulaNumber):
             2,
         )._power_by_squaring(n)
         value, _, _ = function.ranges(_dynamic(self.value, h))
-        tail = n * (2 * off) ** (n - 1) * (dr.abs(a) + ra + 2 * (dr.abs(b) + rb) * h)
+        tail = n * (2 * value_error) ** (n - 1) * (dr.abs(a) + ra + 2 * (dr.abs(b) + rb) * h)
         is_cut = (start > 0) | (end < h)
         if self.bound_degree == 1:
             lower, upper = on_it._extend_lines(start, end, h, value, is_cut, tail)
@@ -428,23 +429,23 @@ class ParabolaBounds(FormulaNumber):
     def _extend_parabolas(
         self, start: Real, length: Real, is_cut: Any, tail: Real
     ) -> tuple[Quadratic, Quadratic]:
-        """Bounds, on all of [0, length], of a function that is this one on an interval that begins
-        at `start`, and constant elsewhere."""
-        made: list[Quadratic] = []
+        """Bounds, on all of [0, length], of a function that equals this function on an interval
+        that begins at `start`, and is constant elsewhere."""
+        bounds: list[Quadratic] = []
         for sign, (a, b) in ((-1, self.lower), (1, self.upper)):
             at_start = a - 2 * b * start
             at_end = a + 2 * b * (length - start)
-            slack = _rounding_bound(dr.abs(a) + 2 * dr.abs(b) * length) + tail
-            ends = [one + sign * slack for one in (at_start, at_end)]
+            rounding = _rounding_bound(dr.abs(a) + 2 * dr.abs(b) * length) + tail
+            ends = [end + sign * rounding for end in (at_start, at_end)]
             extreme = _maximum_or_inf if sign > 0 else _minimum_or_inf
-            ends = [dr.select(is_cut, extreme(one, 0 * one), one) * length for one in ends]
-            made.append(_integral(ends[0], ends[1], length))
-        return made[0], made[1]
+            ends = [dr.select(is_cut, extreme(end, 0 * end), end) * length for end in ends]
+            bounds.append(_integral(ends[0], ends[1], length))
+        return bounds[0], bounds[1]
 
     def _extend_lines(
         self, start: Real, end: Real, length: Real, value: Interval, is_cut: Any, tail: Real
     ) -> tuple[Quadratic, Quadratic]:
-        """The same with straight bounds.
+        """As `_extend_parabolas`, with straight bounds.
 
         Proof. Before `start` f is 0 and so is its value there: a line from 0 at 0 to the bound at
         `end` lies above. Behind `end` f is 0: a slope of at least -value/s is above -value for all
@@ -459,8 +460,8 @@ class ParabolaBounds(FormulaNumber):
         low = dr.select(before, _minimum_or_inf(low, 0 * low) * part, low)
         high = dr.select(end < length, _maximum_or_inf(high, behind), high)
         low = dr.select(end < length, _minimum_or_inf(low, -(value.upper / end) * (1 + 1e-6)), low)
-        slack = dr.select(is_cut, tail, 0)
-        return (low - slack, 0.0), (high + slack, 0.0)
+        margin = dr.select(is_cut, tail, 0)
+        return (low - margin, 0.0), (high + margin, 0.0)
 
 
 def _lines_bounding_cubic(c0: Real, c1: Real, c2: Real, c3: Real) -> tuple[Real, Real, Real, Real]:
@@ -470,26 +471,26 @@ def _lines_bounding_cubic(c0: Real, c1: Real, c2: Real, c3: Real) -> tuple[Real,
     chord and the tangent at the end nearer to 0. The line through the larger values of two lines at
     0 and 1 is above both. A second derivative whose sign is mistaken is as small as its rounding.
     """
-    turn = -c2 / (3 * c3)
-    two = (turn > 0) & (turn < 1)
-    turn = dr.select(two, turn, 1)
+    t = -c2 / (3 * c3)
+    two = (t > 0) & (t < 1)
+    t = dr.select(two, t, 1)
 
-    chord = c1 + turn * (c2 + turn * c3)
-    convex = c2 + 1.5 * c3 * turn >= 0
+    chord = c1 + t * (c2 + t * c3)
+    convex = c2 + 1.5 * c3 * t >= 0
     u0 = l0 = c0
     u1 = c0 + dr.select(convex, chord, c1)
     l1 = c0 + dr.select(convex, c1, chord)
 
-    there = c0 + turn * (c1 + turn * (c2 + turn * c3))
-    tangent = c1 + turn * (2 * c2 + 3 * c3 * turn)
-    chord = c1 + c2 * (1 + turn) + c3 * (1 + turn * (1 + turn))
-    convex = c2 + 1.5 * c3 * (1 + turn) >= 0
+    value = c0 + t * (c1 + t * (c2 + t * c3))
+    tangent = c1 + t * (2 * c2 + 3 * c3 * t)
+    chord = c1 + c2 * (1 + t) + c3 * (1 + t * (1 + t))
+    convex = c2 + 1.5 * c3 * (1 + t) >= 0
     steep = dr.select(convex, chord, tangent)
     flat = dr.select(convex, tangent, chord)
-    u0 = dr.select(two, fmax(u0, there - steep * turn), u0)
-    u1 = dr.select(two, fmax(u1, there + steep * (1 - turn)), u1)
-    l0 = dr.select(two, fmin(l0, there - flat * turn), l0)
-    l1 = dr.select(two, fmin(l1, there + flat * (1 - turn)), l1)
+    u0 = dr.select(two, fmax(u0, value - steep * t), u0)
+    u1 = dr.select(two, fmax(u1, value + steep * (1 - t)), u1)
+    l0 = dr.select(two, fmin(l0, value - flat * t), l0)
+    l1 = dr.select(two, fmin(l1, value + flat * (1 - t)), l1)
     return l0, l1, u0, u1
 
 
@@ -508,16 +509,16 @@ def _lines_bounding_parabolas(
 
 def _integral(at_start: Real, at_end: Real, length: Real) -> Quadratic:
     """The parabola through 0 whose derivative, times h, has these values at 0 and at h."""
-    there = length > 0
-    a = dr.select(there, at_start / length, 0)
-    b = dr.select(there, (at_end - at_start) / (2 * length * length), 0)
+    nonempty = length > 0
+    a = dr.select(nonempty, at_start / length, 0)
+    b = dr.select(nonempty, (at_end - at_start) / (2 * length * length), 0)
     return a, b
 
 
 def _common_upper_bound(
-    several: list[Quadratic], length: Real, offsets: tuple[Real, ...] = ()
+    parabolas: list[Quadratic], length: Real, offsets: tuple[Real, ...] = ()
 ) -> Quadratic:
-    """A parabola through 0 above several, each with an offset <= 0, on [0, length].
+    """A parabola through 0 above several parabolas, each with an offset <= 0, on [0, length].
 
     Proof. On [0, h] c + a s + b s^2 is a mean, with weights >= 0, of the control values c,
     c + a h/2, c + a h + b h^2 (Bernstein 1912): larger control values make a larger parabola.
@@ -525,29 +526,30 @@ def _common_upper_bound(
     h = length
     middles: list[Real] = []
     lasts: list[Real] = []
-    for k, (a, b) in enumerate(several):
+    for k, (a, b) in enumerate(parabolas):
         offset = offsets[k] if offsets else 0.0
         first, second = a * h, b * h * h
-        slack = _rounding_bound(dr.abs(offset) + dr.abs(first) + dr.abs(second) + 0 * h)
-        middles.append(offset + 0.5 * first + slack)
-        lasts.append(offset + (first + second) + slack)
+        rounding = _rounding_bound(dr.abs(offset) + dr.abs(first) + dr.abs(second) + 0 * h)
+        middles.append(offset + 0.5 * first + rounding)
+        lasts.append(offset + (first + second) + rounding)
     middle, last = _maximum_or_inf(*middles), _maximum_or_inf(*lasts)
-    slack = _rounding_bound(dr.abs(middle) + dr.abs(last))
-    there = h > 0
-    a = dr.select(there, 2 * middle / h, 0)
-    b = dr.select(there, (last - 2 * middle + slack) / (h * h), 0)
+    rounding = _rounding_bound(dr.abs(middle) + dr.abs(last))
+    nonempty = h > 0
+    a = dr.select(nonempty, 2 * middle / h, 0)
+    b = dr.select(nonempty, (last - 2 * middle + rounding) / (h * h), 0)
     return a + _rounding_bound(dr.abs(a)), b
 
 
-def _common_lower_bound(several: list[Quadratic], length: Real) -> Quadratic:
-    return _negative(_common_upper_bound([_negative(one) for one in several], length))
+def _common_lower_bound(parabolas: list[Quadratic], length: Real) -> Quadratic:
+    return _negative(_common_upper_bound([_negative(parabola) for parabola in parabolas], length))
 
 
 def _tighter(first: Quadratic, second: Quadratic, length: Real, sign: int) -> Quadratic:
-    """The tighter of two bounds on one side, compared at one point; if one is NaN, the other."""
+    """The tighter of two bounds on one side, compared at one point; if one bound is NaN, the
+    other."""
     r = _COMPARED_AT * length
-    one, two = (sign * r * (a + b * r) for a, b in (first, second))
-    return _where((one <= two) | ~dr.isfinite(two), first, second)
+    first_value, second_value = (sign * r * (a + b * r) for a, b in (first, second))
+    return _where((first_value <= second_value) | ~dr.isfinite(second_value), first, second)
 
 
 def _maximum_on_piece(q: Quadratic, length: Real) -> Real:
@@ -563,13 +565,13 @@ def _maximum_on_piece(q: Quadratic, length: Real) -> Real:
     return _maximum_or_inf(0 * length, last, vertex)
 
 
-def _added(one: Quadratic, two: Quadratic, sign: int) -> Quadratic:
+def _added(first: Quadratic, second: Quadratic, sign: int) -> Quadratic:
     def plus(x: Real, y: Real) -> Real:
         if _is_zero(y):
             return x
         return y if _is_zero(x) else _shift_by_rounding(x + y, sign, 0.0)
 
-    return plus(one[0], two[0]), plus(one[1], two[1])
+    return plus(first[0], second[0]), plus(first[1], second[1])
 
 
 def _times(m: Real, q: Quadratic) -> Quadratic:
@@ -580,12 +582,12 @@ def _negative(q: Quadratic) -> Quadratic:
     return -q[0], -q[1]
 
 
-def _where(mask: Any, one: Quadratic, two: Quadratic) -> Quadratic:
-    return dr.select(mask, one[0], two[0]), dr.select(mask, one[1], two[1])
+def _where(mask: Any, first: Quadratic, second: Quadratic) -> Quadratic:
+    return dr.select(mask, first[0], second[0]), dr.select(mask, first[1], second[1])
 
 
 def _midpoint_and_half_width(low: Real, high: Real) -> tuple[Real, Real]:
-    """The middle of two numbers and how far both are from it."""
+    """The middle of two numbers and the distance of both from it."""
     if low is high or (_is_zero(low) and _is_zero(high)):
         return low, 0.0
     middle = 0.5 * low + 0.5 * high
@@ -597,7 +599,8 @@ def _midpoint_and_radius(x: Interval) -> tuple[Real, Real]:
 
 
 def _radius(x: Interval) -> Real:
-    """How far numbers of an interval are from its middle, the rounding of the middle included."""
+    """The largest distance of numbers of an interval from its middle, including the rounding of the
+    middle."""
     if x.lower is x.upper or x.is_zero:
         return 0.0
     radius = x.radius
@@ -632,12 +635,12 @@ def _rounding_bound(size: Real) -> Real:
 
 
 def _maximum_or_inf(*numbers: Real) -> Real:
-    """The largest; infinite if one is NaN."""
+    """The largest number; infinite if one is NaN."""
     largest, total = numbers[0], numbers[0]
-    for one in numbers[1:]:
-        largest, total = fmax(largest, one), total + one
+    for number in numbers[1:]:
+        largest, total = fmax(largest, number), total + number
     return dr.select(total == total, largest, dr.inf)
 
 
 def _minimum_or_inf(*numbers: Real) -> Real:
-    return -_maximum_or_inf(*(-one for one in numbers))
+    return -_maximum_or_inf(*(-number for number in numbers))

@@ -26,7 +26,8 @@ if TYPE_CHECKING:
     from harnack.backend import Mask, Real, Vec3
 
 
-# Ranges beyond this power of the largest number are of what overflows, whatever their other end.
+# Ranges beyond this power of the largest number belong to numbers that overflow, whatever their
+# other end.
 _LARGE = 0.5
 
 
@@ -52,9 +53,9 @@ class Values(FormulaNumber):
         """The coordinates on the smallest box around two points, `slack` larger on all sides."""
         no = p.x != p.x
         no = no & ~no
-        around = ZERO if slack is None else Interval(-slack, slack)
+        padding = ZERO if slack is None else Interval(-slack, slack)
         x, y, z = (
-            cls(Interval.point(p[k]).hull(Interval.point(q[k])) + around, no, no, no)
+            cls(Interval.point(p[k]).hull(Interval.point(q[k])) + padding, no, no, no)
             for k in range(3)
         )
         return x, y, z
@@ -94,23 +95,23 @@ class Values(FormulaNumber):
             nowhere, gaps = nowhere | (x.upper < low), gaps | ~(x.lower >= low)
         if high < math.inf:
             nowhere, gaps = nowhere | (x.lower > high), gaps | ~(x.upper <= high)
-        # A pole in the box has all numbers for its range.
+        # The range of a box with a pole is all numbers.
         pole = _is_lost(value, 0.0 if function.has_pole else _LARGE)
         return Values(value, nowhere, self.jumps | _is_lost(x) | pole, gaps)
 
     def checked(self) -> Values:
-        """The same; it may jump where numbers that overflowed left no range."""
+        """The same range; it may jump where numbers that overflowed left no range."""
         return replace(self, jumps=self.jumps | _is_lost(self.value))
 
     def pointwise_maximum(self, other: Values) -> Values:
-        """The larger of two. Where only one of them has a value, it may count as that one or have
-        none: the range holds both, and may jump."""
+        """The larger of two functions. Where only one of them has a value, the result may count as
+        that value or have none: the range holds both, and may jump."""
         x, y = self.value, other.value
         gaps = self.gaps | other.gaps
         either = _unless(self.nowhere, x, y).hull(_unless(other.nowhere, y, x))
-        least = dr.select(gaps, either.lower, x.intersect(y).lower)
+        low = dr.select(gaps, either.lower, x.intersect(y).lower)
         return Values(
-            Interval(least, either.upper),
+            Interval(low, either.upper),
             self.nowhere & other.nowhere,
             self.jumps | other.jumps | gaps | _is_lost(x) | _is_lost(y),
             gaps,
@@ -123,7 +124,7 @@ class Values(FormulaNumber):
         return Values(value, angle.nowhere, jumps, angle.gaps)
 
     def _with(self, value: Interval, other: Values) -> Values:
-        """A range made of those of two functions."""
+        """The range of a function of this and another function."""
         return Values(
             value,
             self.nowhere | other.nowhere,
@@ -138,10 +139,10 @@ def _is_lost(x: Interval, large: float = _LARGE) -> Mask:
     lost = ~(dr.isfinite(x.lower) & dr.isfinite(x.upper))
     if large == 0.0:
         return lost
-    most = float(dr.largest(cast("Any", type(x.lower)))) ** large
-    return lost & ~((x.lower > most) | (x.upper < -most))
+    limit = float(dr.largest(cast("Any", type(x.lower)))) ** large
+    return lost & ~((x.lower > limit) | (x.upper < -limit))
 
 
 def _unless(condition: Mask, x: Interval, y: Interval) -> Interval:
-    """x, or y where the condition holds."""
+    """The interval x, or y where the condition holds."""
     return Interval(dr.select(condition, y.lower, x.lower), dr.select(condition, y.upper, x.upper))

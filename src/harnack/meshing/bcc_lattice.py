@@ -1,4 +1,4 @@
-"""Tetrahedra that fill cells of a box without a Delaunay triangulation: a body-centered lattice.
+"""A body-centered lattice: tetrahedra that fill cells of a box without a Delaunay triangulation.
 
 Its points are the corners and the centers of equal cells, and where a cell lies on the box, the
 centers of its faces there. Two centers on both sides of a face make four tetrahedra with the four
@@ -7,10 +7,10 @@ ones. So the tetrahedra fill the box, and those at the faces of some cells conta
 cubes their dihedral angles are 60 and 90 degrees (Labelle and Shewchuk 2007).
 
 Cells that are proved empty need none. Proof. Let the level set meet chosen cells only, and let a
-tetrahedron at a face of a chosen cell have its other apex in a cell that is not: that cell holds no
-level, so its center and the corners of the face, which it has too, are on one side. Of the faces of
-the tetrahedron only those with the chosen cell's center and a corner of another side are crossed,
-and the tetrahedron behind such a face belongs to a face of the chosen cell as well.
+tetrahedron at a face of a chosen cell have its other apex in a cell that is not chosen: that cell
+holds no level, so its center and the corners of the face, which it has too, are on one side. Of the
+faces of the tetrahedron only those with the chosen cell's center and a corner of another side are
+crossed, and the tetrahedron behind such a face belongs to a face of the chosen cell as well.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from harnack.tree.empty_space import BoxCells, Clearance, refine_cells
 
 __all__ = ["BccLattice", "distinct_rows"]
 
-# More cells than that are refused: about five million triangles.
+# The largest number of cells, which make about five million triangles; more are refused.
 MOST_CELLS = 2_000_000
-# The points of a lattice that has fewer are found by a table.
+# Points of a lattice that has fewer than this are looked up in a table.
 _MOST_LISTED = 20_000_000
-# Cells of the first round of the octree.
+# The largest number of cells in the first round of the octree.
 _MOST_ROOTS = 200_000
 
 
@@ -88,15 +88,15 @@ class BccLattice:
     def nonempty_cells(self, clearance: Clearance, most_faces: int) -> IntArray:
         """(n, 3) indices of the cells that are not proved empty, by octrees over blocks of them.
 
-        most_faces: triangles that may be made; a cell makes about three.
+        most_faces: the largest number of triangles; a cell makes about three.
 
         Raises:
-            MeshingError: there are too many.
+            MeshingError: there are too many cells.
         """
         # A surface across the box passes through at least this many cells.
-        most = min(MOST_CELLS, most_faces)
-        if (least := float(np.prod(np.sort(self.counts)[:2].astype(float)))) > most:
-            raise triangle_limit_error(least, most)
+        max_cells = min(MOST_CELLS, most_faces)
+        if (min_cells := float(np.prod(np.sort(self.counts)[:2].astype(float)))) > max_cells:
+            raise triangle_limit_error(min_cells, max_cells)
         halvings = 0
         while halvings < 3 and (self.counts >= 2 ** (halvings + 2)).all():
             halvings += 1
@@ -108,13 +108,13 @@ class BccLattice:
         edges = self.size * 2**halvings
         root = BoxCells(self.lower + grid.reshape(-1, 3) * edges, edges)
         root = root.subset(~root.is_proved_empty(clearance))
-        leaves = refine_cells(root, clearance, 8 * most, halvings).occupied
+        leaves = refine_cells(root, clearance, 8 * max_cells, halvings).occupied
         if not len(leaves.corners):
             return np.zeros((0, 3), np.int64)
         rounds = round(math.log2(edges[0] / leaves.size[0]))
         expected = len(leaves.corners) * 4 ** (halvings - rounds)
-        if expected > most or rounds < halvings:
-            raise triangle_limit_error(expected, most)
+        if expected > max_cells or rounds < halvings:
+            raise triangle_limit_error(expected, max_cells)
         index = np.rint((leaves.corners - self.lower) / self.size).astype(np.int64)
         return index[(index < self.counts).all(axis=1)]
 
@@ -147,12 +147,12 @@ class BccLattice:
         return matter[chosen], does
 
     def interior_cells(self, cells: BoolArray) -> BoolArray:
-        """Mask (counts) of the given cells of which all neighbors in the lattice are given cells,
-        too."""
-        around = np.pad(cells, 1, constant_values=True)
+        """A mask, of the shape `counts`, of the cells in `cells` all of whose neighbors in the
+        lattice are in `cells` as well."""
+        padded = np.pad(cells, 1, constant_values=True)
         inner = cells.copy()
         for shift in itertools.product((0, 1, 2), repeat=3):
-            inner &= around[tuple(slice(i, i + n) for i, n in zip(shift, cells.shape, strict=True))]
+            inner &= padded[tuple(slice(i, i + n) for i, n in zip(shift, cells.shape, strict=True))]
         return inner
 
     def cell_indices(self, points: FloatArray) -> IntArray:
@@ -161,59 +161,59 @@ class BccLattice:
         return np.clip(index, 0, self.counts - 1)
 
     def touches_cells(self, coordinates: IntArray, cells: BoolArray) -> BoolArray:
-        """(n,) whether points, given by lattice coordinates, are corners or centers of the given
-        cells (counts)."""
+        """(n,) whether points, given by lattice coordinates, are corners or centers of cells in the
+        mask `cells`, of the shape `counts`."""
         padded = np.pad(cells, 1)
-        found = np.zeros(len(coordinates), np.bool_)
-        for ways in itertools.product((-1, 0), repeat=3):
-            # Of an odd coordinate both are the same cell.
-            index = (coordinates + ways) // 2 + 1
-            found |= padded[tuple(index.T)]
-        return found
+        touches = np.zeros(len(coordinates), np.bool_)
+        for offset in itertools.product((-1, 0), repeat=3):
+            # For an odd coordinate both offsets lead to the same cell.
+            index = (coordinates + offset) // 2 + 1
+            touches |= padded[tuple(index.T)]
+        return touches
 
     def outer_cells(self) -> IntArray:
-        """(n, 3) indices of the cells at the box."""
-        found: list[IntArray] = []
+        """(n, 3) indices of the cells at the faces of the box."""
+        layers: list[IntArray] = []
         for axis in range(3):
             ends = self.counts.copy()
             ends[axis] = 1
             layer: IntArray = np.indices(tuple(ends.tolist())).reshape(3, -1).T.copy()
-            found.append(layer.copy())
+            layers.append(layer.copy())
             layer[:, axis] = self.counts[axis] - 1
-            found.append(layer)
-        return distinct_rows(np.concatenate(found))
+            layers.append(layer)
+        return distinct_rows(np.concatenate(layers))
 
     def tetrahedra(self, cells: IntArray) -> tuple[IntArray, IntArray]:
-        """Tetrahedra at all faces of cells (k, 3): their points (n, 3) by coordinates, and for each
-        the indices of four of them (m, 4)."""
+        """The tetrahedra at all faces of cells (k, 3): the lattice coordinates (n, 3) of their
+        points, and (m, 4) the indices of the four corners of each."""
         shape = 2 * self.counts + 1
-        found: list[list[IntArray]] = []  # of each face both centers, and its corners in turn
+        keys_by_axis: list[list[IntArray]] = []  # of each face: centers, then corners in turn
         for axis in range(3):
             lower = 2 * cells
             lower[:, axis] += 2
             face = np.concatenate([2 * cells, lower])
             face = _key_rows(sorted_unique(_keys(face, shape)), shape)
-            others = [k for k in range(3) if k != axis]
-            six: list[IntArray] = []
-            for way in (-1, 1):
+            plane_axes = [k for k in range(3) if k != axis]
+            face_keys: list[IntArray] = []
+            for side in (-1, 1):
                 center = face + 1
-                center[:, axis] = np.clip(face[:, axis] + way, 0, shape[axis] - 1)
-                six.append(_keys(center, shape))
+                center[:, axis] = np.clip(face[:, axis] + side, 0, shape[axis] - 1)
+                face_keys.append(_keys(center, shape))
             for i, j in ((0, 0), (2, 0), (2, 2), (0, 2)):
                 corner = face.copy()
-                corner[:, others] += [i, j]
-                six.append(_keys(corner, shape))
-            found.append(six)
-        keys = [np.concatenate(column) for column in zip(*found, strict=True)]
+                corner[:, plane_axes] += [i, j]
+                face_keys.append(_keys(corner, shape))
+            keys_by_axis.append(face_keys)
+        keys = [np.concatenate(column) for column in zip(*keys_by_axis, strict=True)]
         used = sorted_unique(np.concatenate(keys))
         if math.prod(shape.tolist()) < _MOST_LISTED:
-            place = np.zeros(math.prod(shape.tolist()), np.int64)
-            place[used] = np.arange(len(used))
-            one, other, *ring = (place[column] for column in keys)
+            index = np.zeros(math.prod(shape.tolist()), np.int64)
+            index[used] = np.arange(len(used))
+            first, second, *ring = (index[column] for column in keys)
         else:
-            one, other, *ring = (np.searchsorted(used, column) for column in keys)
-        fours = [np.stack([one, other, ring[k - 1], ring[k]], axis=1) for k in range(4)]
-        return _key_rows(used, shape), np.concatenate(fours)
+            first, second, *ring = (np.searchsorted(used, column) for column in keys)
+        corners = [np.stack([first, second, ring[k - 1], ring[k]], axis=1) for k in range(4)]
+        return _key_rows(used, shape), np.concatenate(corners)
 
 
 def distinct_rows(rows: IntArray) -> IntArray:
@@ -223,7 +223,7 @@ def distinct_rows(rows: IntArray) -> IntArray:
 
 
 def triangle_limit_error(cells: float, most: int) -> TriangleLimitError:
-    """The error about too many cells."""
+    """The error for too many cells."""
     return TriangleLimitError(
         f"about {cells:.1e} cells hold the surface, which makes some {3 * cells:.0e} triangles; "
         f"at most {most:,} cells are made (max_triangles, and never more than {MOST_CELLS:,}): "
@@ -236,5 +236,5 @@ def _keys(coordinates: IntArray, shape: IntArray) -> IntArray:
 
 
 def _key_rows(keys: IntArray, shape: IntArray) -> IntArray:
-    rest, z = np.divmod(keys, shape[2])
-    return np.stack([*np.divmod(rest, shape[1]), z], axis=1)
+    xy, z = np.divmod(keys, shape[2])
+    return np.stack([*np.divmod(xy, shape[1]), z], axis=1)

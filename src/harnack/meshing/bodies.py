@@ -1,4 +1,4 @@
-"""Closed components of meshes: finds them, which of them lie in which, and the solid that they
+"""Closed components of meshes: which faces form them, how they are nested, and the solid that they
 bound."""
 
 from __future__ import annotations
@@ -24,15 +24,17 @@ if TYPE_CHECKING:
 
 __all__ = ["closed_parts", "mended_by_cuts", "nested", "united_parts", "volume_of"]
 
-# Closed parts have so many faces; of more parts than that none are told from the rest.
+# The smallest number of faces of a closed part; and the largest number of parts that are told from
+# the rest.
 _LEAST_FACES, _MOST_PARTS = 4, 200
-# Places of a part that have to lie in another one for the part to do.
+# The number of points of a part that are tested for lying in another part.
 _PLACES = 16
-# These are so far within it, as a part of its size.
+# How far within the part these points are, relative to its size.
 _WITHIN = 1e-6
-# Parts of the size: faces that are nearer lie on each other, and are moved into each other by that.
+# Relative to the size: faces that are nearer than the first lie on each other, and are moved into
+# each other by the second.
 _ON, _INTO = 1e-12, 1e-8
-# Parts whose union crosses itself are grown by this part of the size.
+# How far parts whose union crosses itself are grown, relative to the size.
 _GROWN = 1e-9
 
 
@@ -42,8 +44,8 @@ def closed_parts(x: FloatArray, raw: IntArray, joined: IntArray) -> list[IntArra
 
     raw: (m, 3) faces as in the input: components that touch are told apart if they have vertices of
         their own.
-    joined: (m, 3) the same faces, with one vertex for all at the same position. In these, faces at
-        an edge of two belong together, and at an edge of more those with the material between them.
+    joined: (m, 3) the same faces, with one vertex for all at the same position. Here the two faces
+        at an edge belong together; at an edge of more faces, those with the material between them.
     """
     parts: list[IntArray] = []
     is_left = np.ones(len(raw), np.bool_)
@@ -58,8 +60,8 @@ def closed_parts(x: FloatArray, raw: IntArray, joined: IntArray) -> list[IntArra
 
 
 def _pieces(x: FloatArray, faces: IntArray) -> list[IntArray]:
-    """Faces, by index, that belong together at edges."""
-    import scipy.sparse  # here: half a second that few need
+    """The groups of faces, by index, that belong together at edges."""
+    import scipy.sparse  # imported here: it takes half a second
     import scipy.sparse.csgraph as csgraph_module
 
     sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
@@ -72,11 +74,11 @@ def _pieces(x: FloatArray, faces: IntArray) -> list[IntArray]:
 
 
 def _is_closed(faces: IntArray) -> bool:
-    """Whether every edge is run as often one way as the other."""
+    """Whether every edge is run as often in one direction as in the other."""
     pairs = half_edges(faces)
     count = int(pairs.max()) + 1
-    forth, back = (np.sort(pairs @ way) for way in ((count, 1), (1, count)))
-    return bool((forth == back).all())
+    forward_keys, backward_keys = (np.sort(pairs @ weights) for weights in ((count, 1), (1, count)))
+    return bool((forward_keys == backward_keys).all())
 
 
 def volume_of(x: FloatArray, faces: IntArray) -> float:
@@ -84,12 +86,13 @@ def volume_of(x: FloatArray, faces: IntArray) -> float:
     corner = x[faces] - x[faces].mean(axis=(0, 1))
     return (
         float(row_dots(corner[:, 0], area_normals(corner)).sum()) / 6
-    )  # the same as of its corners
+    )  # the same as the size of its corners
 
 
 def nested(x: FloatArray, parts: list[IntArray]) -> list[list[int]]:
-    """For each closed component, faces (k, 3), the indices of the components that it lies in as a
-    whole, the smallest first. Components may touch: each is tested at points a little within it."""
+    """For each closed component, given by its faces (k, 3), the indices of the components that
+    contain all of it, the smallest first. Components may touch: each is tested at points a little
+    within it."""
     corners = [x[part] for part in parts]
     boxes = [(corner.min(axis=(0, 1)), corner.max(axis=(0, 1))) for corner in corners]
     volumes = [volume_of(x, part) for part in parts]
@@ -100,7 +103,7 @@ def nested(x: FloatArray, parts: list[IntArray]) -> list[list[int]]:
         sample = parts[i][:: max(1, len(parts[i]) // _PLACES)]
         normals = _unit_normals(x[sample])
         points = x[sample].mean(axis=1) - math.copysign(within, volumes[i]) * normals
-        around = [
+        containers = [
             j
             for j, (lower, upper) in enumerate(boxes)
             if j != i
@@ -109,7 +112,7 @@ def nested(x: FloatArray, parts: list[IntArray]) -> list[list[int]]:
             and sizes[j] > (1 + _WITHIN) * sizes[i]
             and all(abs(winding_around(corners[j], point)) > 0.5 for point in points)
         ]
-        holders.append(sorted(around, key=lambda j: sizes[j]))
+        holders.append(sorted(containers, key=lambda j: sizes[j]))
     return holders
 
 
@@ -117,7 +120,7 @@ def mended_by_cuts(x: FloatArray, faces: IntArray, within: float) -> TriangleMes
     """The boundary of the points around which a closed mesh winds at least once, by pieces of its
     faces (`boundary_of_solid`).
 
-    within: a length by which slivers that are made where faces cross may be moved.
+    within: a length, by which slivers that arise where faces cross may be moved.
 
     Raises:
         MeshingError: nothing is left, or pieces do not fit together.
@@ -160,9 +163,9 @@ def united_parts(
 
 
 def _overlapping(shells: list[TriangleMesh]) -> list[TriangleMesh]:
-    """Parts whose faces that lie on those of an earlier one, but for rounding, are moved into it by
-    next to nothing: where they are in one plane, but not to the last bit, gaps without a width
-    would be left."""
+    """The parts, with faces that lie on those of an earlier part, up to rounding, moved into that
+    part by a tiny length: where the two are in one plane, but not to the last bit, gaps without a
+    width would be left."""
     corners = [shell.vertices[shell.faces] for shell in shells]
     size = float(np.ptp(np.concatenate(corners), axis=(0, 1)).max())
     planes = [_unit_normals(corner) for corner in corners]
@@ -193,7 +196,7 @@ def _unit_normals(corner: FloatArray) -> FloatArray:
 
 
 def _united(shells: list[TriangleMesh], within: float) -> TriangleMesh:
-    """As `united_parts`, of parts that do not lie on each other but for rounding."""
+    """As `united_parts`, for parts whose faces do not lie on each other up to rounding."""
     from manifold3d import Manifold
 
     bodies = [_manifold_of_part(shell) for shell in shells]
@@ -203,14 +206,15 @@ def _united(shells: list[TriangleMesh], within: float) -> TriangleMesh:
         shared = [levels[k] ^ part for k in range(len(levels) - 1)]
         levels = [levels[0] + part, *(a + b for a, b in zip(levels[1:], shared, strict=True))]
     for part in clockwise:
-        levels = [above + (level - part) for level, above in itertools.pairwise(levels)]
+        levels = [next_level + (level - part) for level, next_level in itertools.pairwise(levels)]
     surface = apart_of(levels[0], within)
     check_manifold(surface.faces, surface.vertices)
     return surface
 
 
 def _manifold_of_part(shell: TriangleMesh) -> tuple[Manifold, bool]:
-    """What a closed part bounds, and whether it winds counter-clockwise around that."""
+    """The body that a closed part bounds, and whether the part winds counter-clockwise around
+    it."""
     is_body = volume_of(shell.vertices, shell.faces) > 0
     if len(crossing := intersecting_faces(shell.vertices, shell.faces)):
         raise MeshError(f"{len(crossing):,} triangles of a part pass through others of it")

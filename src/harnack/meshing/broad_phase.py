@@ -1,5 +1,5 @@
-"""Broad phase of the intersection test: the pairs of triangles that may meet. All others are proved
-apart, in floating point.
+"""The broad phase of the intersection test: the pairs of triangles that may meet. All other pairs
+are proved apart, in floating point.
 
 Each triangle walks a tree of boxes, and the pairs whose boxes overlap are listed: about eight for
 each triangle. They are then tested side by side, since tests within the walk would wait for each
@@ -41,13 +41,15 @@ __all__ = ["ROUNDING", "near_pairs"]
 # Columns of a record behind the box: the face's number, and whether it is chosen.
 _NUMBER, _CHOSEN = 6, 7
 _LEAF_SIZE = 8
-# Triangles that walk the tree at once, and pairs that there is room for then, at the least.
+# The number of triangles that walk the tree at once, and the smallest number of pairs that there is
+# room for.
 _ROWS_AT_ONCE, _PAIRS_AT_ONCE = 1 << 17, 1 << 22
-# Rounding of a product of three vectors and of two, of differences of coordinates, over the product
-# of their lengths: at most seven roundings of up to six terms, which are 1.16 times that product
-# together, and four of three terms, which are as much as it. So that is a third of what is allowed.
+# A bound of the rounding of a product of three vectors, or of two, whose components are differences
+# of coordinates, relative to the product of their lengths: at most seven roundings of up to six
+# terms, whose sum is at most 1.16 times that product, and four of three terms, whose sum is at most
+# that product. The rounding is a third of this bound.
 ROUNDING = 16 * 2.0**-52
-# What underflow may add, for coordinates of order one.
+# A bound of the error by underflow, for coordinates of order one.
 _UNDERFLOW = 1e-290
 
 
@@ -56,32 +58,33 @@ def near_pairs(vertices: FloatArray, faces: IntArray, among: BoolArray | None) -
     each once; all others are proved not to (`_are_apart`).
 
     vertices: (n, 3), finite.
-    among: (m,) mask; pairs of which neither is chosen are left out.
+    among: (m,) mask of chosen faces; pairs without a chosen face are left out.
     """
     chosen = np.ones(len(faces), np.bool_) if among is None else among
-    found = [np.zeros((0, 2), np.int64)]
+    batches = [np.zeros((0, 2), np.int64)]
     if not chosen.any():
-        return found[0]
+        return batches[0]
     largest = float(np.abs(vertices).max(initial=0.0))
-    # A power of two, so that nothing is rounded.
-    unit = np.ldexp(vertices, -int(np.frexp(largest)[1])) if largest else vertices
-    boxes, pairs = _FaceBoxTree.of(unit[faces], chosen), _PairTests.of(unit, faces)
+    # Scaled by a power of two, so that nothing is rounded.
+    scaled = np.ldexp(vertices, -int(np.frexp(largest)[1])) if largest else vertices
+    boxes, pairs = _FaceBoxTree.of(scaled[faces], chosen), _PairTests.of(scaled, faces)
     rows = boxes.order[chosen[boxes.order]]
     room = max(_PAIRS_AT_ONCE, len(faces))
-    left = [rows[start : start + _ROWS_AT_ONCE] for start in range(0, len(rows), _ROWS_AT_ONCE)]
-    while left:
-        some = left.pop()
-        listed = boxes.overlapping(some, room)
+    pending = [rows[start : start + _ROWS_AT_ONCE] for start in range(0, len(rows), _ROWS_AT_ONCE)]
+    while pending:
+        batch = pending.pop()
+        listed = boxes.overlapping(batch, room)
         if listed is None:  # a single triangle always has room
-            left += np.array_split(some, 2)
+            pending += np.array_split(batch, 2)
             continue
-        found.append(pairs.unseparated(*listed))
-    return np.concatenate(found)
+        batches.append(pairs.unseparated(*listed))
+    return np.concatenate(batches)
 
 
 @dataclass(frozen=True)
 class _FaceBoxTree:
-    """Boxes of faces in a tree. records: (m, 8); order: their indices leaf by leaf."""
+    """The boxes of faces in a tree. records: (m, 8), a row for each box; order: the indices of the
+    faces, leaf by leaf."""
 
     tree: PackedTree
     records: FloatArray
@@ -101,14 +104,14 @@ class _FaceBoxTree:
         return cls(pack_tree(choose_backend("double"), hierarchy, levels, placed), records, order)
 
     def overlapping(self, rows: IntArray, room: int) -> tuple[Any, Any] | None:
-        """Pairs of some faces, and of others, whose boxes overlap, in no order; None if there are
-        more than `room`."""
+        """The pairs of a face in `rows` and any face whose boxes overlap, as two lists, in no
+        order; None if there are more than `room`."""
         backend = self.tree.backend
-        real, vector, whole = backend.Float, backend.Array3f, backend.UInt32
-        columns = [real(np.ascontiguousarray(one)) for one in self.records[rows].T]
-        low, high, own = vector(*columns[:3]), vector(*columns[3:6]), columns[_NUMBER]
-        number, most = dr.zeros(whole, 1), dr.opaque(whole, room)
-        one, other = dr.zeros(whole, room), dr.zeros(whole, room)
+        real, vector, integer = backend.Float, backend.Array3f, backend.UInt32
+        columns = [real(np.ascontiguousarray(column)) for column in self.records[rows].T]
+        low, high, own_number = vector(*columns[:3]), vector(*columns[3:6]), columns[_NUMBER]
+        number, max_count = dr.zeros(integer, 1), dr.opaque(integer, room)
+        column, partners = dr.zeros(integer, room), dr.zeros(integer, room)
 
         def overlap(row: Any) -> Mask:
             return dr.all((vector(*row[:3]) <= high) & (vector(*row[3:6]) >= low))
@@ -119,27 +122,28 @@ class _FaceBoxTree:
 
         def put(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
             with_number = row[_NUMBER]
-            # Two that are chosen meet once.
-            once = (with_number > own) | ((row[_CHOSEN] == 0) & (with_number >= 0))
+            # Two chosen faces are listed once.
+            once = (with_number > own_number) | ((row[_CHOSEN] == 0) & (with_number >= 0))
             met = active & once & overlap(row)
-            place = dr.scatter_inc(number, whole(0), met)
-            has_room = met & (place < most)
-            dr.scatter(one, whole(own), place, has_room)
-            dr.scatter(other, whole(with_number), place, has_room)
+            slot = dr.scatter_inc(number, integer(0), met)
+            has_room = met & (slot < max_count)
+            dr.scatter(column, integer(own_number), slot, has_room)
+            dr.scatter(partners, integer(with_number), slot, has_room)
             return state
 
         traverse(self.tree, visit, (real(0),))
-        dr.eval(number, one, other)
+        dr.eval(number, column, partners)
         count = int(to_numpy(number)[0])
         if count > room:
             return None
-        listed = dr.arange(whole, count)
-        return dr.gather(whole, one, listed), dr.gather(whole, other, listed)
+        listed = dr.arange(integer, count)
+        return dr.gather(integer, column, listed), dr.gather(integer, partners, listed)
 
 
 @dataclass(frozen=True)
 class _PairTests:
-    """Tests of pairs of faces. points: of vertices. corners: of the faces, three columns."""
+    """Tests of pairs of faces. points: the records of the vertices. corners: the three columns of
+    the faces."""
 
     points: RecordTable
     corners: tuple[Any, Any, Any]
@@ -147,11 +151,11 @@ class _PairTests:
     @classmethod
     def of(cls, vertices: FloatArray, faces: IntArray) -> _PairTests:
         backend = choose_backend("double")
-        a, b, c = (backend.UInt32(np.ascontiguousarray(one, np.uint32)) for one in faces.T)
+        a, b, c = (backend.UInt32(np.ascontiguousarray(column, np.uint32)) for column in faces.T)
         return cls(RecordTable.upload(backend, vertices), (a, b, c))
 
     def unseparated(self, one: Any, other: Any) -> IntArray:
-        """Those pairs (k, 2) that are not proved apart, in order."""
+        """(k, 2) the pairs that are not proved apart, in order."""
         backend = self.points.backend
         names = [[dr.gather(backend.UInt32, k, i) for k in self.corners] for i in (one, other)]
         triangles = [
@@ -162,8 +166,8 @@ class _PairTests:
         a, b = cast("tuple[Corners, Corners]", triangles)
         rows = dr.compress(~_are_apart(a, b, shared))
         pairs = [to_numpy(dr.gather(backend.UInt32, i, rows)) for i in (one, other)]
-        found = np.stack(pairs, axis=1).astype(np.int64)
-        return found[np.lexsort(found.T[::-1])]
+        unsorted = np.stack(pairs, axis=1).astype(np.int64)
+        return unsorted[np.lexsort(unsorted.T[::-1])]
 
 
 def _are_apart(a: Corners, b: Corners, shared: list[list[Mask]]) -> Mask:
@@ -171,8 +175,9 @@ def _are_apart(a: Corners, b: Corners, shared: list[list[Mask]]) -> Mask:
 
     shared: whether corner i of a is corner k of b.
 
-    - *A plane*: all corners of one that are not shared lie strictly on one side of the other's
-      plane (`_sides`). Points of the one on that plane then are combinations of shared corners.
+    - *A plane*: all corners of one triangle that are not shared lie strictly on one side of the
+      other's plane (`_sides`). Points of the first triangle on that plane are then combinations of
+      shared corners.
     - *Edges*, where at most one corner is shared: triangles in different planes meet in a segment
       on the line of both planes, whose ends lie on edges that pass through the other triangle.
       None does: each edge without a shared corner has its ends strictly on one side of the other's
@@ -183,19 +188,19 @@ def _are_apart(a: Corners, b: Corners, shared: list[list[Mask]]) -> Mask:
     in_a = [shared[i][0] | shared[i][1] | shared[i][2] for i in range(3)]
     in_b = [shared[0][k] | shared[1][k] | shared[2][k] for k in range(3)]
     real = cast("Any", type(a[0].x))
-    count: Real = sum((dr.select(one, real(1), real(0)) for one in in_a), real(0))
+    count: Real = sum((dr.select(first, real(1), real(0)) for first in in_a), real(0))
     of_b, of_a = _sides(a, b), _sides(b, a)
     by_plane = _on_one_side(of_b, in_b) | _on_one_side(of_a, in_a)
     by_plane &= count < 2.5
 
     def by_edges_or_line(*numbers: Any) -> Mask:
-        one, other = cast("tuple[Corners, Corners]", (numbers[:3], numbers[3:6]))
-        in_one, in_other, common = list(numbers[6:9]), list(numbers[9:12]), numbers[12]
-        passes = _edge_may_pierce(one, other, _sides(one, other), in_other)
-        passes |= _edge_may_pierce(other, one, _sides(other, one), in_one)
+        first, second = cast("tuple[Corners, Corners]", (numbers[:3], numbers[3:6]))
+        in_first, in_second, common = list(numbers[6:9]), list(numbers[9:12]), numbers[12]
+        passes = _edge_may_pierce(first, second, _sides(first, second), in_second)
+        passes |= _edge_may_pierce(second, first, _sides(second, first), in_first)
         turned = (
-            _shared_corners_first(one, in_one, common),
-            _shared_corners_first(other, in_other, common),
+            _shared_corners_first(first, in_first, common),
+            _shared_corners_first(second, in_second, common),
         )
         return ((common < 1.5) & ~passes) | _beside(*turned, common)
 
@@ -207,17 +212,17 @@ def _are_apart(a: Corners, b: Corners, shared: list[list[Mask]]) -> Mask:
 
 
 def _sides(plane: Corners, of: Corners) -> list[tuple[Mask, Mask]]:
-    """Of each corner of a triangle, whether it is strictly above another's plane, and strictly
-    below it; neither where rounding leaves it open."""
+    """For each corner of the triangle `of`, whether it is strictly above the plane of the triangle
+    `plane`, and whether strictly below it; neither where rounding leaves it undecided."""
     u, v = plane[1] - plane[0], plane[2] - plane[0]
     normal = dr.cross(u, v)
-    most = ROUNDING * dr.norm(u) * dr.norm(v)
-    found: list[tuple[Mask, Mask]] = []
+    error_scale = ROUNDING * dr.norm(u) * dr.norm(v)
+    sides: list[tuple[Mask, Mask]] = []
     for corner in of:
-        way = corner - plane[0]
-        height, error = dr.dot(normal, way), most * dr.norm(way) + _UNDERFLOW
-        found.append((height > error, height < -error))
-    return found
+        offset = corner - plane[0]
+        height, error = dr.dot(normal, offset), error_scale * dr.norm(offset) + _UNDERFLOW
+        sides.append((height > error, height < -error))
+    return sides
 
 
 def _on_one_side(sides: list[tuple[Mask, Mask]], shared: list[Mask]) -> Mask:
@@ -234,25 +239,25 @@ def _edge_may_pierce(
     """Whether an edge of a triangle without shared corners may pass through another: unless both
     ends are strictly on one side of its plane, or the line of the edge has two edges of it on
     different sides of itself."""
-    found = False
+    pierces = False
     for i, j in ((0, 1), (1, 2), (2, 0)):
         stays = (sides[i][0] & sides[j][0]) | (sides[i][1] & sides[j][1]) | shared[i] | shared[j]
-        way = of[j] - of[i]
+        direction = of[j] - of[i]
         to = [corner - of[i] for corner in through]
-        length, lengths = dr.norm(way), [dr.norm(one) for one in to]
+        length, lengths = dr.norm(direction), [dr.norm(offset) for offset in to]
         left, right = False, False
         for k, m in ((0, 1), (1, 2), (2, 0)):
-            value = dr.dot(way, dr.cross(to[k], to[m]))
+            value = dr.dot(direction, dr.cross(to[k], to[m]))
             error = ROUNDING * length * lengths[k] * lengths[m] + _UNDERFLOW
             left, right = left | (value > error), right | (value < -error)
-        found = found | ~(stays | (left & right))
-    return found
+        pierces = pierces | ~(stays | (left & right))
+    return pierces
 
 
 def _shared_corners_first(of: Corners, shared: list[Mask], count: Real) -> Corners:
-    """The corners in another order: what is shared first."""
+    """The corners in another order: shared corners first."""
     once = count < 1.5
-    # One that is shared comes first; of two, the one that is not shared comes last.
+    # A single shared corner comes first; with two, the corner that is not shared comes last.
     from_second = dr.select(once, shared[1], ~shared[0])
     from_third = dr.select(once, shared[2], ~shared[1])
     none = count < 0.5
@@ -279,38 +284,38 @@ def _beside(a: Corners, b: Corners, count: Real) -> Mask:
     """
     none, once = count < 0.5, (count > 0.5) & (count < 1.5)
     twice = (count > 1.5) & (count < 2.5)
-    found = False
-    for one, other in ((a, b), (b, a)):
+    is_beside = False
+    for first, second in ((a, b), (b, a)):
         for i, j, k in ((0, 1, 2), (0, 2, 1), (1, 2, 0)):
-            origin = one[i]
-            e, x = one[j] - origin, one[k] - origin
+            origin = first[i]
+            e, x = first[j] - origin, first[k] - origin
             m = dr.fma(e, dr.dot(x, e) / dr.squared_norm(e), -x)
             size, length = dr.norm(m), dr.norm(e)
-            off = 1.01 * (dr.abs(dr.dot(m, e)) + ROUNDING * size * length) / length
-            slack = ROUNDING * size + off
+            dot_error = 1.01 * (dr.abs(dr.dot(m, e)) + ROUNDING * size * length) / length
+            rounding = ROUNDING * size + dot_error
 
-            def past(to: Vec3, m: Vec3 = m, slack: Real = slack) -> tuple[Mask, Mask]:
-                value, error = dr.dot(m, to), slack * dr.norm(to) + _UNDERFLOW
+            def past(to: Vec3, m: Vec3 = m, rounding: Real = rounding) -> tuple[Mask, Mask]:
+                value, error = dr.dot(m, to), rounding * dr.norm(to) + _UNDERFLOW
                 return value > error, value < -error
 
             behind = past(x)[1]
-            beyond = [past(corner - origin)[0] for corner in other]
+            beyond = [past(corner - origin)[0] for corner in second]
             if i == 0:
-                found = found | (once & behind & beyond[1] & beyond[2])
+                is_beside = is_beside | (once & behind & beyond[1] & beyond[2])
             if (i, j) == (0, 1):
-                found = found | (twice & behind & beyond[2])
+                is_beside = is_beside | (twice & behind & beyond[2])
             # Without a shared corner the edge itself is behind as well: m'.e = 0.
-            found = found | (none & behind & beyond[0] & beyond[1] & beyond[2])
-    return found | (once & _opposite(a, b))
+            is_beside = is_beside | (none & behind & beyond[0] & beyond[1] & beyond[2])
+    return is_beside | (once & _opposite(a, b))
 
 
 def _opposite(a: Corners, b: Corners) -> Mask:
     """Whether a plane through the first corner, which is that of both, has the others of a and
     those of b on different sides, at right angles to the difference of their mean directions."""
-    ways = [one[k] - one[0] for one, k in itertools.product((a, b), (1, 2))]
-    mean = [dr.normalize(ways[k]) + dr.normalize(ways[k + 1]) for k in (0, 2)]
+    edges = [one[k] - one[0] for one, k in itertools.product((a, b), (1, 2))]
+    mean = [dr.normalize(edges[k]) + dr.normalize(edges[k + 1]) for k in (0, 2)]
     m = dr.normalize(mean[1]) - dr.normalize(mean[0])
-    slack = ROUNDING * dr.norm(m)
-    values = [(dr.dot(m, way), slack * dr.norm(way) + _UNDERFLOW) for way in ways]
+    rounding = ROUNDING * dr.norm(m)
+    values = [(dr.dot(m, edge), rounding * dr.norm(edge) + _UNDERFLOW) for edge in edges]
     (p, one), (q, two), (r, three), (s, four) = values
     return (p < -one) & (q < -two) & (r > three) & (s > four)

@@ -1,14 +1,14 @@
-"""What a mesh of a level set has to satisfy, whatever made it, with exact predicates.
+"""Checks that every mesh of a level set has to pass, with exact predicates.
 
 The predicates are signs of determinants: on which side of a plane, or of a line in a plane, points
-lie. Determinants are computed in floating point, with a bound of what rounding may have done to
-them (Shewchuk, Adaptive Precision Floating-Point Arithmetic and Fast Robust Geometric Predicates,
-1997). Where that leaves the sign open it is found in integers: all coordinates are integers times
-one power of two.
+lie. Determinants are computed in floating point, with a bound of their rounding error (Shewchuk,
+Adaptive Precision Floating-Point Arithmetic and Fast Robust Geometric Predicates, 1997). Where that
+leaves the sign undecided, it is computed in integers: all coordinates are integers times one power
+of two.
 
 Every mesh that `mesh` returns has passed checks: vertices and middles of triangles by samples of
 the field, faces that pass through each other by exact predicates, the number of triangles by a
-limit. The largest body is found by signed volumes and by which body holds which (`clipping`). Files
+limit. The largest body is chosen by signed volumes and by the nesting of shells (`clipping`). Files
 hold single precision, to which vertices are snapped before the last check.
 """
 
@@ -70,7 +70,7 @@ SignArray = npt.NDArray[np.int8]
 _UNIT = 2.0**-53
 # Shewchuk's bounds of the rounding of both determinants, over the sum of their terms' magnitudes.
 _ORIENT3D_ERROR, _ORIENT2D_ERROR = (7 + 56 * _UNIT) * _UNIT, (3 + 16 * _UNIT) * _UNIT
-# What underflow may add, for coordinates of order one.
+# A bound of the error by underflow, for coordinates of order one.
 _UNDERFLOW = 1e-290
 
 
@@ -81,8 +81,8 @@ def orient3d(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> Sign
     rows = together[:, :3] - together[:, 3:]
     (ax, ay, az), (bx, by, bz), (cx, cy, cz) = (rows[:, k].T for k in range(3))
     terms = [(bx * cy, cx * by, az), (cx * ay, ax * cy, bz), (ax * by, bx * ay, cz)]
-    value = sum((one - other) * height for one, other, height in terms)
-    size = sum((np.abs(one) + np.abs(other)) * np.abs(height) for one, other, height in terms)
+    value = sum((plus - minus) * height for plus, minus, height in terms)
+    size = sum((np.abs(plus) + np.abs(minus)) * np.abs(height) for plus, minus, height in terms)
     # A difference of doubles is 0 where they are equal, and only there.
     flat = (rows == 0).all(axis=1).any(axis=1)
     return _signs_with_fallback(
@@ -110,8 +110,8 @@ def _scaled(points: FloatArray) -> FloatArray:
 def _signs_with_fallback(
     value: FloatArray, error: FloatArray, zero: BoolArray, points: FloatArray, exact: Any
 ) -> SignArray:
-    """Signs of values known up to errors, or to be 0; where that is not enough, by `exact` of the
-    points."""
+    """The signs of values that are known up to errors, or known to be 0; where errors leave a sign
+    undecided, `exact` computes it from the points."""
     signs: SignArray = np.sign(value).astype(np.int8)
     signs[zero] = 0
     open_rows = np.flatnonzero(~zero & (np.abs(value) <= error + _UNDERFLOW))
@@ -123,10 +123,10 @@ def _signs_with_fallback(
 def _integers(points: FloatArray) -> Any:
     """Points times a power of two, as Python's integers."""
     mantissa, exponent = np.frexp(points)
-    whole = np.ldexp(mantissa, 53).astype(np.int64).astype(object)
+    mantissas = np.ldexp(mantissa, 53).astype(np.int64).astype(object)
     used = mantissa != 0
-    least = int(exponent[used].min()) if used.any() else 0
-    return whole * 2 ** np.where(used, exponent - least, 0).astype(object)
+    min_exponent = int(exponent[used].min()) if used.any() else 0
+    return mantissas * 2 ** np.where(used, exponent - min_exponent, 0).astype(object)
 
 
 def _orient3d_exact(points: Any) -> Any:
@@ -145,9 +145,9 @@ def _orient2d_exact(points: Any) -> Any:
 
 _EDGES = ((0, 1), (1, 2), (2, 0))
 _PAIRS_AT_ONCE = 1 << 18
-# Of more triangles than this a kernel finds the pairs, which takes 0.05 s to record.
+# For more triangles than this a kernel lists the pairs, which takes 0.05 s to record.
 _MIN_FACES_FOR_KERNEL = 5_000
-# So many triangles of a size are compared with each other at once.
+# The largest number of triangles of a size that are compared with each other at once.
 _MOST_AT_ONCE = 1 << 19
 
 
@@ -163,56 +163,56 @@ def misoriented_faces(function: LevelFunction, vertices: FloatArray, faces: IntA
 def intersecting_faces(
     vertices: FloatArray, faces: IntArray, among: BoolArray | None = None
 ) -> IntArray:
-    """Indices of faces (m, 3) that meet others in more than what they share, decided exactly: that
-    an edge of another face passes through, or that lie on others in their plane, and of those
-    others.
+    """Indices of faces (m, 3) that meet other faces in more than shared corners and edges, decided
+    exactly: faces that an edge of another face passes through, faces that lie on another face in
+    their plane, and the other faces of such pairs.
 
     Two triangles in different planes meet beyond their common corners if and only if an edge of one
     passes through the other, with its ends on both sides of that one's plane, or ends on it:
-    corners that lie on other triangles are not looked for, since edges beyond them would pass
+    corners that lie on other triangles are not searched for, since edges beyond them would pass
     through. Two triangles in one plane overlap unless the line of an edge has them on its two sides
     (separating axes), whatever they share: faces that are there twice, or folded back onto their
-    neighbors, do. Pairs are looked for among those whose boxes overlap.
+    neighbors, do. Only pairs whose boxes overlap are tested.
 
-    among: (m,) mask; pairs of which neither is chosen are not looked at.
+    among: (m,) mask of chosen faces; pairs without a chosen face are not tested.
     """
-    found: list[IntArray] = []
+    crossing_faces: list[IntArray] = []
     for pairs, heights in _pairs_in_doubt(vertices, faces, among):
-        one, other = faces[pairs[:, 0]], faces[pairs[:, 1]]
+        first, second = faces[pairs[:, 0]], faces[pairs[:, 1]]
         meet = np.zeros(len(pairs), np.bool_)
         rows = np.flatnonzero((heights[0] == 0).all(axis=1) & (heights[1] == 0).all(axis=1))
-        meet[rows] = _overlap(vertices[one[rows]], vertices[other[rows]])
+        meet[rows] = _overlap(vertices[first[rows]], vertices[second[rows]])
         both = np.all([(h.min(axis=1) < 0) & (h.max(axis=1) > 0) for h in heights], axis=0)
         rows = np.flatnonzero(both)
-        meet[rows] = _edge_pierces(vertices, one[rows], other[rows], heights[0][rows])
-        meet[rows] |= _edge_pierces(vertices, other[rows], one[rows], heights[1][rows])
-        found.append(pairs[meet].ravel())
-    return np.unique(np.concatenate([*found, np.zeros(0, np.int64)]))
+        meet[rows] = _edge_pierces(vertices, first[rows], second[rows], heights[0][rows])
+        meet[rows] |= _edge_pierces(vertices, second[rows], first[rows], heights[1][rows])
+        crossing_faces.append(pairs[meet].ravel())
+    return np.unique(np.concatenate([*crossing_faces, np.zeros(0, np.int64)]))
 
 
 def touching_pairs(vertices: FloatArray, faces: IntArray) -> tuple[IntArray, FloatArray]:
-    """Pairs (k, 2) of faces (m, 3) of which one has a corner or an edge on the other, beyond a
-    corner that they share, decided exactly; and (k, 3) a corner that is on the other, or the middle
-    of an edge.
+    """Pairs (k, 2) of faces (m, 3) that touch, decided exactly: one has a corner or an edge on the
+    other, beyond a corner that they share. Also (k, 3) the corner on the other face, or the middle
+    of the edge.
 
-    Of a face that lies on another as a whole its edges do. Where edges meet between their ends, and
-    lie in neither face's plane, `intersecting_faces` has the pair. So it has those that share two
-    corners, which have no more in common unless they overlap in one plane. Of two that share one
-    corner the planes meet in a line through it, or are one: each has a segment from it on that
-    line, and where these lie along each other an edge passes through a face, or the shorter one is
-    an edge at the corner, and in the other's plane.
+    If all of a face lies on another, so do its edges. Where edges meet between their ends, and lie
+    in neither face's plane, `intersecting_faces` has the pair. It also has the pairs that share two
+    corners, which have no more in common unless they overlap in one plane. If two faces share one
+    corner, their planes meet in a line through it, or are equal: each face has a segment from the
+    corner on that line, and where these lie along each other an edge passes through a face, or the
+    shorter one is an edge at the corner, and in the other's plane.
     """
     batches: list[IntArray] = []
-    places: list[FloatArray] = []
+    contacts: list[FloatArray] = []
 
     def add(pairs: IntArray, on: BoolArray, p: FloatArray, q: FloatArray) -> None:
         batches.append(pairs[on])
-        places.append(0.5 * (p + q)[on])
+        contacts.append(0.5 * (p + q)[on])
 
     for pairs, heights in _pairs_in_doubt(vertices, faces, None):
         same = faces[pairs[:, 0], :, None] == faces[pairs[:, 1]][:, None]
         shared = same.sum(axis=(1, 2))
-        for way, ((plane, of), height) in enumerate(
+        for order, ((plane, of), height) in enumerate(
             zip((pairs.T, pairs.T[::-1]), heights, strict=True)
         ):
             # A corner is an edge from itself to itself.
@@ -220,25 +220,25 @@ def touching_pairs(vertices: FloatArray, faces: IntArray) -> tuple[IntArray, Flo
                 rows = np.flatnonzero((shared == 0) & (height[:, i] == 0) & (height[:, j] == 0))
                 p, q = (vertices[faces[of[rows], k]] for k in (i, j))
                 add(pairs[rows], _is_on(vertices[faces[plane[rows]]], p, q), p, q)
-            is_common = same.any(axis=1 + way)  # of the corners of `of`
+            is_common = same.any(axis=1 + order)  # of the corners of `of`
             for i in range(3):
                 rows = np.flatnonzero((shared == 1) & ~is_common[:, i] & (height[:, i] == 0))
-                apex = same.any(axis=2 - way)[rows].argmax(axis=1)[:, None]
+                apex = same.any(axis=2 - order)[rows].argmax(axis=1)[:, None]
                 turned = np.take_along_axis(faces[plane[rows]], (apex + np.arange(3)) % 3, axis=1)
                 p = vertices[faces[of[rows], i]]
                 add(pairs[rows], _is_between(vertices[turned], p), p, p)
     both = np.concatenate([*batches, np.zeros((0, 2), np.int64)])
     _, first = np.unique(both, axis=0, return_index=True)
-    return both[first], np.concatenate([*places, np.zeros((0, 3))])[first]
+    return both[first], np.concatenate([*contacts, np.zeros((0, 3))])[first]
 
 
 def _pairs_in_doubt(
     vertices: FloatArray, faces: IntArray, among: BoolArray | None
 ) -> Generator[tuple[IntArray, tuple[SignArray, SignArray]]]:
-    """Pairs (k, 2) of faces that are not proved apart, some at a time, and the `_heights` of the
-    second over the first and of the first over the second."""
-    many = len(faces) if among is None else int(among.sum())
-    by_kernel = many > _MIN_FACES_FOR_KERNEL
+    """Pairs (k, 2) of faces that are not proved apart, in batches, and the `_heights` of the second
+    over the first and of the first over the second."""
+    face_count = len(faces) if among is None else int(among.sum())
+    by_kernel = face_count > _MIN_FACES_FOR_KERNEL
     near = near_pairs(vertices, faces, among) if by_kernel else _near_pairs(vertices[faces], among)
     for start in range(0, len(near), _PAIRS_AT_ONCE):
         pairs = near[start : start + _PAIRS_AT_ONCE]
@@ -249,13 +249,13 @@ def _pairs_in_doubt(
 
 
 def _near_pairs(corner: FloatArray, among: BoolArray | None) -> IntArray:
-    """Pairs (k, 2) of triangles (m, 3, 3) whose boxes overlap, each once; given a mask, only those
-    with one of the chosen triangles.
+    """Pairs (k, 2) of triangles (m, 3, 3) whose boxes overlap, each once; given a mask, only pairs
+    with a chosen triangle.
 
-    Triangles of one size (up to 2) at a time, with those no larger: of a large triangle and many
-    small ones only what is near is looked at.
+    Triangles of one size (up to a factor of 2) are compared at a time, with triangles that are no
+    larger: so a large triangle is compared only with the small triangles near it.
     """
-    import scipy.spatial  # here: half a second that few need
+    import scipy.spatial  # imported here: it takes half a second
 
     searching: Any = scipy.spatial
     lower, upper = corner.min(axis=1), corner.max(axis=1)
@@ -267,36 +267,37 @@ def _near_pairs(corner: FloatArray, among: BoolArray | None) -> IntArray:
     center = 0.5 * (lower + upper)
     radius = 0.5 * row_norms(upper - lower)
     octave = np.floor(np.log2(np.maximum(radius, 1e-300)))
-    groups = [np.flatnonzero(near & (octave == one)) for one in np.unique(octave[near])]
+    groups = [np.flatnonzero(near & (octave == first)) for first in np.unique(octave[near])]
     trees = [searching.cKDTree(center[rows]) for rows in groups]
-    found: list[IntArray] = []
+    batches: list[IntArray] = []
 
-    def add(one: IntArray, other: IntArray) -> None:
-        keep = (lower[one] <= upper[other]).all(axis=1)
-        keep &= (lower[other] <= upper[one]).all(axis=1)
-        found.append(np.column_stack([one[keep], other[keep]]))
+    def add(first: IntArray, second: IntArray) -> None:
+        keep = (lower[first] <= upper[second]).all(axis=1)
+        keep &= (lower[second] <= upper[first]).all(axis=1)
+        batches.append(np.column_stack([first[keep], second[keep]]))
 
     for i, j in itertools.product(range(len(groups)), repeat=2):
         reach = float(radius[groups[i]].max() + radius[groups[j]].max())
-        first = groups[i][chosen[groups[i]]]
-        if i == j and len(first) == len(groups[i]) <= _MOST_AT_ONCE:
+        queries = groups[i][chosen[groups[i]]]
+        if i == j and len(queries) == len(groups[i]) <= _MOST_AT_ONCE:
             table = trees[i].query_pairs(reach, output_type="ndarray")
             add(*groups[i][table.T])
             continue
         step = max(1, _PAIRS_AT_ONCE // 64)
-        for start in range(0, len(first), step):
-            rows = first[start : start + step]
-            some = searching.cKDTree(center[rows])
-            table = some.sparse_distance_matrix(trees[j], reach, output_type="ndarray")
-            one, other = rows[table["i"]], groups[j][table["j"]]
-            once = (one < other) | ~chosen[other]  # two that are chosen meet once
-            add(one[once], other[once])
-    return np.concatenate(found).astype(np.int64)
+        for start in range(0, len(queries), step):
+            rows = queries[start : start + step]
+            query_tree = searching.cKDTree(center[rows])
+            table = query_tree.sparse_distance_matrix(trees[j], reach, output_type="ndarray")
+            first, second = rows[table["i"]], groups[j][table["j"]]
+            once = (first < second) | ~chosen[second]  # two chosen triangles are listed once
+            add(first[once], second[once])
+    return np.concatenate(batches).astype(np.int64)
 
 
 def _are_separated(vertices: FloatArray, faces: IntArray, pairs: IntArray) -> BoolArray:
-    """(k,) whether two faces are proved to share nothing but common vertices: the plane of one has
-    all other vertices of the other strictly on one side. False where rounding leaves it undecided.
+    """(k,) whether two faces are proved to share nothing but common vertices: the plane of one face
+    has all vertices of the other that are not common strictly on one side. False where rounding
+    leaves it undecided.
 
     See `broad_phase.ROUNDING` for the error of heights.
     """
@@ -307,22 +308,23 @@ def _are_separated(vertices: FloatArray, faces: IntArray, pairs: IntArray) -> Bo
         a = vertices[plane[:, 0]]
         u, v = vertices[plane[:, 1]] - a, vertices[plane[:, 2]] - a
         normal = np.cross(u, v)
-        most = ROUNDING * (row_norms(u) * row_norms(v))
+        error_scale = ROUNDING * (row_norms(u) * row_norms(v))
         above, below = np.ones(len(rows), np.bool_), np.ones(len(rows), np.bool_)
         for k in range(3):
-            way = vertices[of[:, k]] - a
-            height, error = row_dots(normal, way), most * row_norms(way) + _UNDERFLOW
+            offset = vertices[of[:, k]] - a
+            height, error = row_dots(normal, offset), error_scale * row_norms(offset) + _UNDERFLOW
             shared = (of[:, k, None] == plane).any(axis=1)
             above &= shared | (height > error)
             below &= shared | (height < -error)
-        # A face that shares all its corners is the same one.
-        several = (of[:, :, None] != plane[:, None]).all(axis=2).any(axis=1)
-        apart[rows] = (above | below) & several
+        # A face that shares all its corners is the same face.
+        is_other = (of[:, :, None] != plane[:, None]).all(axis=2).any(axis=1)
+        apart[rows] = (above | below) & is_other
     return apart
 
 
 def _heights(vertices: FloatArray, plane: IntArray, of: IntArray) -> SignArray:
-    """(k, 3) on which sides of the planes of faces (k, 3) the corners of others lie; 0 on them."""
+    """(k, 3) the signs that tell on which sides of the planes of faces (k, 3) the corners of other
+    faces lie; 0 on a plane."""
     a, b, c = (vertices[plane[:, i]] for i in range(3))
     signs = np.zeros((len(of), 3), np.int8)
     for i in range(3):
@@ -334,32 +336,32 @@ def _heights(vertices: FloatArray, plane: IntArray, of: IntArray) -> SignArray:
 def _edge_pierces(
     vertices: FloatArray, through: IntArray, of: IntArray, heights: SignArray
 ) -> BoolArray:
-    """(k,) whether an edge of faces `of` (k, 3) passes through faces `through`, of whose planes the
-    corners are on the sides `heights`: the line of the edge passes all three edges on one side, or
-    touches them."""
-    found = np.zeros(len(of), np.bool_)
+    """(k,) whether an edge of the faces `of` (k, 3) passes through the faces `through`: its line
+    passes all three edges on one side, or touches them. heights: the sides of the planes of
+    `through` that the corners of `of` are on."""
+    pierces = np.zeros(len(of), np.bool_)
     for i, j in _EDGES:
-        rows = np.flatnonzero((heights[:, i] * heights[:, j] < 0) & ~found)
+        rows = np.flatnonzero((heights[:, i] * heights[:, j] < 0) & ~pierces)
         p, q = vertices[of[rows, i]], vertices[of[rows, j]]
         x = [vertices[through[rows, k]] for k in range(3)]
-        around = np.stack([orient3d(p, q, x[k], x[m]) for k, m in _EDGES])
-        found[rows] = (around >= 0).all(axis=0) | (around <= 0).all(axis=0)
-    return found
+        orientations = np.stack([orient3d(p, q, x[k], x[m]) for k, m in _EDGES])
+        pierces[rows] = (orientations >= 0).all(axis=0) | (orientations <= 0).all(axis=0)
+    return pierces
 
 
-def _overlap(one: FloatArray, other: FloatArray) -> BoolArray:
-    """(k,) whether triangles (k, 3, 3) in one plane have an area in common; seen along the axis in
-    which they are thinnest."""
-    normal = np.abs(area_normals(one))
+def _overlap(first: FloatArray, second: FloatArray) -> BoolArray:
+    """(k,) whether triangles (k, 3, 3) in one plane have an area in common; they are projected
+    along the axis in which they are thinnest."""
+    normal = np.abs(area_normals(first))
     axes = np.array([[1, 2], [2, 0], [0, 1]])[normal.argmax(axis=1)]
-    flat = [np.take_along_axis(t, axes[:, None].repeat(3, axis=1), axis=2) for t in (one, other)]
-    found = np.ones(len(one), np.bool_)
+    flat = [np.take_along_axis(t, axes[:, None].repeat(3, axis=1), axis=2) for t in (first, second)]
+    overlaps = np.ones(len(first), np.bool_)
     for a, b in (flat, flat[::-1]):
-        turn = orient2d(a[:, 0], a[:, 1], a[:, 2])
+        sign = orient2d(a[:, 0], a[:, 1], a[:, 2])
         for i, j in _EDGES:
-            side = [turn * orient2d(a[:, i], a[:, j], b[:, k]) for k in range(3)]
-            found &= (np.stack(side) > 0).any(axis=0)
-    return found
+            side = [sign * orient2d(a[:, i], a[:, j], b[:, k]) for k in range(3)]
+            overlaps &= (np.stack(side) > 0).any(axis=0)
+    return overlaps
 
 
 def _is_on(triangle: FloatArray, p: FloatArray, q: FloatArray) -> BoolArray:
@@ -369,25 +371,25 @@ def _is_on(triangle: FloatArray, p: FloatArray, q: FloatArray) -> BoolArray:
     axes = np.array([[1, 2], [2, 0], [0, 1]])[normal.argmax(axis=1)]
     a = np.take_along_axis(triangle, axes[:, None].repeat(3, axis=1), axis=2)
     p, q = (np.take_along_axis(corner, axes, axis=1) for corner in (p, q))
-    turn = orient2d(a[:, 0], a[:, 1], a[:, 2])
-    is_on = turn != 0
+    sign = orient2d(a[:, 0], a[:, 1], a[:, 2])
+    is_on = sign != 0
     for i, j in _EDGES:
-        side = [turn * orient2d(a[:, i], a[:, j], corner) for corner in (p, q)]
+        side = [sign * orient2d(a[:, i], a[:, j], corner) for corner in (p, q)]
         is_on &= (np.stack(side) >= 0).any(axis=0)
     side = np.stack([orient2d(p, q, a[:, k]) for k in range(3)])
     return is_on & ~((side > 0).all(axis=0) | (side < 0).all(axis=0))
 
 
 def _is_between(triangle: FloatArray, p: FloatArray) -> BoolArray:
-    """(k,) whether the ways from the first corners of triangles (k, 3, 3) to points in their planes
-    run between those to the two other corners, or along one of them."""
+    """(k,) whether the directions from the first corners of triangles (k, 3, 3) to points in their
+    planes lie between the directions to the two other corners, or along one of them."""
     normal = np.abs(area_normals(triangle))
     axes = np.array([[1, 2], [2, 0], [0, 1]])[normal.argmax(axis=1)]
     a = np.take_along_axis(triangle, axes[:, None].repeat(3, axis=1), axis=2)
     p = np.take_along_axis(p, axes, axis=1)
-    turn = orient2d(a[:, 0], a[:, 1], a[:, 2])
-    left = turn * orient2d(a[:, 0], a[:, 1], p)
-    return (turn != 0) & (left >= 0) & (turn * orient2d(a[:, 2], a[:, 0], p) >= 0)
+    sign = orient2d(a[:, 0], a[:, 1], a[:, 2])
+    first_side = sign * orient2d(a[:, 0], a[:, 1], p)
+    return (sign != 0) & (first_side >= 0) & (sign * orient2d(a[:, 2], a[:, 0], p) >= 0)
 
 
 # Checks of whole meshes.
@@ -419,7 +421,7 @@ class OffLevelError(LocalizedMeshingError):
 
 
 class SelfIntersectionError(LocalizedMeshingError):
-    """Triangles that pass through each other, by index; places: their centers."""
+    """Triangles pass through each other. faces: their indices. places: their centers."""
 
     def __init__(self, message: str, places: FloatArray, faces: IntArray) -> None:
         super().__init__(message, places)
@@ -438,7 +440,8 @@ class TriangleLimitError(UnrefinableError):
     """The mesh would have more triangles than allowed, and was not begun."""
 
 
-# So many places may be wrong in smaller cells, or this part of those before.
+# The largest number of failures for which smaller cells are tried again, and the largest ratio to
+# the number of failures before.
 _MAX_FAILURES_FOR_RETRY, _REQUIRED_FAILURE_REDUCTION = 20, 0.5
 
 
@@ -449,7 +452,7 @@ def is_retry_promising(
     failed. It is not if the number of failures hardly decreased since the previous attempt: along a
     pole, or where jump surfaces cross, cells of every size fail.
 
-    smallest: the smallest cell allowed, relative to those that failed now.
+    smallest: the smallest cell allowed, relative to the cells that failed now.
     """
     if not now.may_be_fixed_by(smallest):
         return False
@@ -461,7 +464,8 @@ def is_retry_promising(
 
 
 def euler_characteristic(faces: IntArray, edges: Edges | None = None) -> int:
-    """Vertices in use, less edges, and faces. edges: those of `half_edges`, if known."""
+    """The Euler characteristic: the number of used vertices, minus that of edges, plus that of
+    faces. edges: of `half_edges`, if they are known."""
     vertices = int(np.count_nonzero(np.bincount(faces.ravel())))
     edges = edges or Edges.of(half_edges(faces))
     return vertices - len(edges.vertices) + len(faces)
@@ -471,10 +475,10 @@ def check_manifold(faces: IntArray, vertices: FloatArray | None = None) -> None:
     """Raise unless every edge has one or two faces, which run it in opposite directions, and the
     faces around every vertex are joined by edges.
 
-    vertices: (n, 3), to say where not.
+    vertices: (n, 3), for the locations of failures.
 
     Raises:
-        MeshingError: otherwise; a LocalizedMeshingError, given vertices.
+        MeshingError: the mesh is no manifold; a LocalizedMeshingError if vertices are given.
     """
 
     def fail(message: str, where: IntArray) -> Never:
@@ -491,12 +495,12 @@ def check_manifold(faces: IntArray, vertices: FloatArray | None = None) -> None:
             "itself, or cells are too large for it; choose a smaller `cell_size`, or another level",
             np.unique(pairs[uses[index] > 2]),
         )
-    ways = np.bincount(index, np.where(pairs[:, 0] < pairs[:, 1], 1, -1), minlength=len(uses))
-    if ((uses == 2) & (ways != 0)).any():
+    net = np.bincount(index, np.where(pairs[:, 0] < pairs[:, 1], 1, -1), minlength=len(uses))
+    if ((uses == 2) & (net != 0)).any():
         fail(
             "neighboring faces of the mesh do not agree on its two sides: cells are too large for "
             "this level set; choose a smaller `cell_size`",
-            np.unique(pairs[((uses == 2) & (ways != 0))[index]]),
+            np.unique(pairs[((uses == 2) & (net != 0))[index]]),
         )
     if _vertex_fans(faces, edges)[0] > np.count_nonzero(np.bincount(faces.ravel())):
         fail(
@@ -511,17 +515,18 @@ def check_no_self_intersection(vertices: FloatArray, faces: IntArray) -> None:
     decided exactly.
 
     Raises:
-        MeshingError: so; a SelfIntersectionError with these faces.
+        MeshingError: a vertex is not finite; a SelfIntersectionError, with the faces, if faces
+            meet.
     """
     if not np.isfinite(vertices).all():
         raise MeshingError("vertices of the mesh are no numbers: choose another level or `clip`")
     crossing = intersecting_faces(vertices, faces)
     if len(crossing):
-        places = vertices[faces[crossing]].mean(axis=1)
+        centers = vertices[faces[crossing]].mean(axis=1)
         raise SelfIntersectionError(
             f"{len(crossing):,} of {len(faces):,} triangles pass through each other, such as near "
-            f"{point_text(places[0])}: choose a smaller `cell_size` or a larger `tolerance`",
-            places,
+            f"{point_text(centers[0])}: choose a smaller `cell_size` or a larger `tolerance`",
+            centers,
             crossing,
         )
 
@@ -555,26 +560,26 @@ def check_near_level(
     """Raise unless vertices and centers of faces are within `tolerance` of the level, by samples of
     the function.
 
-    A point is within it if the gradient says so, |f|/|grad f| <= tolerance; or if f changes its
-    sign between two points at that distance from it or nearer, along the normal of the face or
-    one of 13 other lines, for then a continuous f has its level between them. These lines are
-    askew, since many parts have faces in planes of coordinates, where rounding decides the sign;
-    and every cone of 28 degrees about its axis has one of their directions in it, as the corner of
-    a cube has (35 degrees). A solid is cut at the volume's boundary: to be outside of the volume
-    counts as a positive sign. Boundary vertices of an angle's level set are on its curve, where it
-    has no value, and are left out; and triangles smaller than half of the tolerance are as near as
-    their corners.
+    A point counts as within the tolerance if the gradient says so, |f|/|grad f| <= tolerance; or if
+    f changes its sign between two points at that distance from it or nearer, along the normal of
+    the face or one of 13 other lines, for then a continuous f has its level between them. These
+    lines are askew, since many parts have faces in planes of coordinates, where rounding decides
+    the sign; and every cone of 28 degrees about its axis has one of their directions in it, as the
+    corner of a cube has (35 degrees). A solid is cut at the volume's boundary: to be outside of the
+    volume counts as a positive sign. Boundary vertices of an angle's level set are on its curve,
+    where it has no value, and are left out; and triangles smaller than half of the tolerance are as
+    near as their corners.
 
     Raises:
-        OffLevelError: with the points that are not.
+        OffLevelError: points are farther from the level; they are its locations.
     """
-    far, count = points_off_level(function, vertices, faces, tolerance, volume)
-    if len(far):
+    off_level, count = points_off_level(function, vertices, faces, tolerance, volume)
+    if len(off_level):
         raise OffLevelError(
-            f"{len(far):,} of {count:,} vertices and centers of triangles are farther than "
-            f"the tolerance, {tolerance:.3g}, from the level, such as {point_text(far[0])}: "
+            f"{len(off_level):,} of {count:,} vertices and centers of triangles are farther than "
+            f"the tolerance, {tolerance:.3g}, from the level, such as {point_text(off_level[0])}: "
             "choose a smaller `cell_size` or a larger `tolerance`",
-            far,
+            off_level,
         )
 
 
@@ -585,8 +590,8 @@ def points_off_level(
     tolerance: float,
     volume: Volume | None,
 ) -> tuple[FloatArray, int]:
-    """Those vertices and centers of faces (k, 3) that are not within `tolerance` of the level, as
-    `check_near_level` decides it; and how many were looked at."""
+    """The vertices and centers of faces (k, 3) that are not within `tolerance` of the level, as
+    `check_near_level` decides it; and the number of points that were tested."""
     corner = vertices[faces]
     normal = area_normals(corner)
     longest = np.stack([row_norms(corner[:, k] - corner[:, k - 1]) for k in range(3)]).max(axis=0)
@@ -598,32 +603,32 @@ def points_off_level(
     for k in range(3):
         np.add.at(mean, faces[:, k], normal)
     points = np.concatenate([vertices[is_checked], corner[large].mean(axis=1)])
-    ways = np.concatenate([mean[is_checked], normal[large]])
-    ways /= np.maximum(row_norms(ways), 1e-300)[:, None]
-    far = np.flatnonzero(~(function.sample(points).distance <= tolerance))
-    # Nearer ones as well: behind a cap there may be little of a solid.
-    for share, line in itertools.product((1.0, 0.25, 0.0625), (None, *_askew_lines())):
-        if not len(far):
+    directions = np.concatenate([mean[is_checked], normal[large]])
+    directions /= np.maximum(row_norms(directions), 1e-300)[:, None]
+    rows = np.flatnonzero(~(function.sample(points).distance <= tolerance))
+    # Nearer points are tried as well: behind a cap there may be little of a solid.
+    for fraction, line in itertools.product((1.0, 0.25, 0.0625), (None, *_askew_lines())):
+        if not len(rows):
             break
-        step = share * tolerance * (ways[far] if line is None else line)
-        one, other = (_is_positive(function, points[far] + s * step, volume) for s in (1, -1))
-        far = far[one == other]
-    return points[far], len(points)
+        step = fraction * tolerance * (directions[rows] if line is None else line)
+        ahead, behind = (_is_positive(function, points[rows] + s * step, volume) for s in (1, -1))
+        rows = rows[ahead == behind]
+    return points[rows], len(points)
 
 
 def _askew_lines() -> FloatArray:
     """(13, 3) unit vectors along the axes and both kinds of diagonals of a cube, turned so that
     none of them is near to a plane of coordinates or to one of their diagonals."""
-    ways = np.array(list(itertools.product((-1.0, 0.0, 1.0), repeat=3)))[14:]
+    directions = np.array(list(itertools.product((-1.0, 0.0, 1.0), repeat=3)))[14:]
     frame: FloatArray = np.linalg.qr([[7, 7, -3], [3, -16, -7], [19, 7, -13]])[0]
-    return (ways / row_norms(ways)[:, None]) @ frame
+    return (directions / row_norms(directions)[:, None]) @ frame
 
 
 def _is_positive(
     function: LevelFunction, points: FloatArray, volume: Volume | None
 ) -> npt.NDArray[np.bool_]:
-    above = ~(function.sample(points).value <= 0)
-    return above if volume is None else above | ~volume.contains_points(points)
+    is_positive = ~(function.sample(points).value <= 0)
+    return is_positive if volume is None else is_positive | ~volume.contains_points(points)
 
 
 def point_text(x: FloatArray) -> str:
@@ -632,23 +637,23 @@ def point_text(x: FloatArray) -> str:
 
 
 def nonmanifold_vertices(faces: IntArray) -> IntArray:
-    """Vertices, by index, at which faces (m, 3) are not a manifold: those of edges with more than
-    two faces, and those that have more than one fan of faces."""
+    """Vertices, by index, at which faces (m, 3) are not a manifold: the ends of edges with more
+    than two faces, and vertices with more than one fan of faces."""
     pairs, count = half_edges(faces), int(faces.max(initial=-1)) + 1
     edges = Edges.of(pairs)
-    many = np.unique(pairs[edges.multiplicity[edges.edge_of_pair] > 2])
+    overused = np.unique(pairs[edges.multiplicity[edges.edge_of_pair] > 2])
     _, fan = _vertex_fans(faces, edges)
     # Each fan once, at its vertex.
     vertex = np.empty(int(fan.max(initial=-1)) + 1, np.int64)
     vertex[fan] = faces.ravel()
     fans = np.bincount(vertex, minlength=count)
-    return np.union1d(many, np.flatnonzero(fans > 1))
+    return np.union1d(overused, np.flatnonzero(fans > 1))
 
 
 def _vertex_fans(faces: IntArray, edges: Edges) -> tuple[int, IntArray]:
-    """How many fans of faces, joined by edges, all vertices have together, and of each corner of
-    the faces (3m,) the fan that it belongs to. edges: those of `half_edges`."""
-    import scipy.sparse  # here: half a second that few need
+    """The number of fans of faces, joined by edges, that all vertices have together, and (3m,) the
+    fan that each corner of a face belongs to. edges: of `half_edges`."""
+    import scipy.sparse  # imported here: it takes half a second
     import scipy.sparse.csgraph as csgraph_module
 
     sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
@@ -657,9 +662,9 @@ def _vertex_fans(faces: IntArray, edges: Edges) -> tuple[int, IntArray]:
     # Corners at both ends of the edge k of a face, in the order of `half_edges`.
     first = np.concatenate([corner[:, 0], corner[:, 1], corner[:, 2]])
     second = np.concatenate([corner[:, 1], corner[:, 2], corner[:, 0]])
-    one, other = edges.paired_half_edges().T  # run in opposite directions
-    rows = np.concatenate([first[one], second[one]])
-    columns = np.concatenate([second[other], first[other]])
+    forward, backward = edges.paired_half_edges().T  # run in opposite directions
+    rows = np.concatenate([first[forward], second[forward]])
+    columns = np.concatenate([second[backward], first[backward]])
     joined = sparse.coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(3 * m, 3 * m))
     number, fan = csgraph.connected_components(joined, directed=False)
     return int(number), np.asarray(fan, np.int64)

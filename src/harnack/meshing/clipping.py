@@ -28,12 +28,12 @@ __all__ = [
     "winding_around",
 ]
 
-# Parts no thicker than this part of their coordinates are made of rounding.
+# Components no thicker than this, relative to their coordinates, are rounding error.
 _DEGENERATE_THICKNESS = 1e-11
 
 
 def largest_component(surface: TriangleMesh) -> TriangleMesh:
-    """The connected part with the largest area."""
+    """The connected component with the largest area."""
     part = _component_of_faces(surface)
     areas = np.bincount(part, np.linalg.norm(area_normals(surface.vertices[surface.faces]), axis=1))
     return TriangleMesh.without_unused_vertices(
@@ -42,14 +42,14 @@ def largest_component(surface: TriangleMesh) -> TriangleMesh:
 
 
 def largest_body(surface: TriangleMesh) -> TriangleMesh:
-    """Of a closed surface the body with the largest volume: an outer shell and the shells of its
+    """The body with the largest volume of a closed surface: an outer shell and the shells of its
     cavities, which are turned inwards, so that their volume is negative.
 
     Proof. Shells are closed, connected and do not meet. Let the surface bound a set. A shell that
     is turned inwards has the set around it, and that part of the set has an outer shell. Of the
-    shells that hold the cavity, this is the innermost and smallest one: another one in between
+    shells that hold the cavity, this is the innermost and smallest one: another shell in between
     would be outside of the part, with nothing of the set between both. Whether a shell holds a
-    point is told by its winding number there, which is whole.
+    point is told by its winding number there, which is an integer.
 
     Raises:
         MeshingError: a cavity that lies in no shell.
@@ -60,14 +60,14 @@ def largest_body(surface: TriangleMesh) -> TriangleMesh:
     outer = np.flatnonzero(shells.volumes > 0)
     outer = outer[np.argsort(shells.volumes[outer])]
     for cavity in np.flatnonzero(shells.volumes <= 0):
-        holds = (one for one in outer if shells.winding_number(one, cavity) > 0.5)
-        if (found := next(holds, None)) is None:
+        holds = (shell for shell in outer if shells.winding_number(shell, cavity) > 0.5)
+        if (holder := next(holds, None)) is None:
             raise MeshingError("a part of the mesh is inside out: choose a smaller `cell_size`")
-        owner[cavity] = found
-        bodies[found] += shells.volumes[cavity]
-    kept = outer[bodies[outer].argmax()] if len(outer) else -1
+        owner[cavity] = holder
+        bodies[holder] += shells.volumes[cavity]
+    largest = outer[bodies[outer].argmax()] if len(outer) else -1
     return TriangleMesh.without_unused_vertices(
-        surface.vertices, surface.faces[owner[shells.component_of_face] == kept]
+        surface.vertices, surface.faces[owner[shells.component_of_face] == largest]
     )
 
 
@@ -91,25 +91,25 @@ def drop_degenerate_components(surface: TriangleMesh) -> TriangleMesh:
     is_film = 2 * volume <= 3 * _DEGENERATE_THICKNESS * float(np.abs(x).max()) * area
     if not is_film.any():
         return surface
-    kept = faces[~is_film[part]]
-    return TriangleMesh.without_unused_vertices(x, kept) if len(kept) else TriangleMesh(x[:0], kept)
+    rest = faces[~is_film[part]]
+    return TriangleMesh.without_unused_vertices(x, rest) if len(rest) else TriangleMesh(x[:0], rest)
 
 
 def component_facts(surface: TriangleMesh) -> list[dict[str, Any]]:
     """A dictionary for each connected component of a closed surface, largest first: faces, the
     number of its faces; volume, which is negative for a cavity; center, of its bounding box."""
-    shells, found = Shells.of(surface), list[dict[str, Any]]()
+    shells, facts = Shells.of(surface), list[dict[str, Any]]()
     counts = np.bincount(shells.component_of_face)
     for k in np.argsort(-np.abs(shells.volumes), kind="stable"):
         center = 0.5 * (shells.lower[k] + shells.upper[k])
         volume = float(shells.volumes[k])
-        found.append({"faces": int(counts[k]), "volume": volume, "center": center.tolist()})
-    return found
+        facts.append({"faces": int(counts[k]), "volume": volume, "center": center.tolist()})
+    return facts
 
 
 def faces_to_flip(surface: TriangleMesh) -> npt.NDArray[np.bool_]:
-    """(m,) which faces of a closed surface to turn over for no part to be inside out: those of
-    parts of negative volume that lie in no other, and so are no cavities."""
+    """(m,) which faces of a closed surface to turn over so that no component is inside out: those
+    of components of negative volume that lie in no other component, and so are no cavities."""
     shells = Shells.of(surface)
     inwards = (shells.volumes < 0) & (shells.nesting_depths() == 0)
     return inwards[shells.component_of_face]
@@ -150,28 +150,29 @@ class Shells:
         return winding_around(self.corners[self.component_of_face == around], point)
 
     def nesting_depths(self) -> IntArray:
-        """(k,) how often all other parts wind around each, at a point of it: more than 0 where it
-        is in their material, if no two meet."""
+        """(k,) how often all other components wind around each component, at a point of it: more
+        than 0 where it is in their material, if no two meet."""
         depth = np.zeros(len(self.volumes), np.int64)
         for k in range(len(depth)) if len(depth) > 1 else ():
             point = self.corners[np.argmax(self.component_of_face == k)].mean(axis=0)
-            around = ((self.lower < point) & (point < self.upper)).all(axis=1)
-            around[k] = False
-            near = np.flatnonzero(around)
-            depth[k] = round(sum(self.winding_number(j, k) for j in near))
+            in_box = ((self.lower < point) & (point < self.upper)).all(axis=1)
+            in_box[k] = False
+            candidates = np.flatnonzero(in_box)
+            depth[k] = round(sum(self.winding_number(j, k) for j in candidates))
         return depth
 
     def bound(self) -> npt.NDArray[np.bool_]:
-        """(m,) which faces bound the points that all parts together wind around at least once, if
-        no two meet: across a part the number changes by one, from that outside of it, so that those
-        that do turn outwards with nothing around, or inwards with one."""
+        """(m,) which faces bound the points that all components together wind around at least once,
+        if no two meet: across a component the winding number changes by one from its value outside,
+        so that these components are turned outwards and have a winding number of 0 around them, or
+        inwards and have a winding number of 1."""
         does = self.nesting_depths() == np.where(self.volumes > 0, 0, 1)
         return does[self.component_of_face]
 
 
 def _component_of_faces(surface: TriangleMesh) -> IntArray:
-    """(m,) of each face the number of its connected part."""
-    import scipy.sparse  # here: half a second that few need
+    """(m,) the number of the connected component of each face."""
+    import scipy.sparse  # imported here: it takes half a second
     import scipy.sparse.csgraph as csgraph_module
 
     sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
@@ -182,15 +183,15 @@ def _component_of_faces(surface: TriangleMesh) -> IntArray:
 
 
 def winding_around(corner: FloatArray, point: FloatArray) -> float:
-    """The winding number around a point of triangles (m, 3, 3)."""
+    """The winding number of triangles (m, 3, 3) around a point."""
     return float(solid_angles(corner, point).sum()) / (4 * math.pi)
 
 
 # Surfaces cut by volumes.
 
-# Vertices this near to a boundary, as a part of the size, count as on it.
+# Vertices this near to a boundary, relative to the size, count as on it.
 _NEAR = 1e-9
-# Vertices this near, as a part of the shortest edge there, are moved onto it: else slivers remain.
+# Vertices this near, relative to their shortest edge, are moved onto it: otherwise slivers remain.
 _SNAPPED = 0.25
 
 
@@ -203,7 +204,7 @@ class _ClipBoundary:
     radius: float | None
 
     def heights(self, x: FloatArray) -> FloatArray:
-        """(n,) distances of points (n, 3) from it, negative inside."""
+        """(n,) signed distances of points (n, 3) from the boundary, negative inside."""
         if self.radius is None:
             return (x - self.center) @ self.normal
         return np.linalg.norm(x - self.center, axis=1) - self.radius
@@ -217,15 +218,15 @@ class _ClipBoundary:
 
 
 def clip_to_volume(surface: TriangleMesh, volume: Volume) -> TriangleMesh:
-    """The part of a surface in a volume. Its new ends lie on planes exactly, and between points of
-    spheres; vertices that are kept stay in their order and come first.
+    """The part of a surface in a volume. Its new boundary lies on planes exactly, and on chords of
+    spheres; vertices inside keep their order and come first.
 
     Raises:
         MeshingError: another kind of volume.
     """
     if isinstance(volume, VolumeIntersection):
-        for one in volume.volumes:
-            surface = clip_to_volume(surface, one)
+        for operand in volume.volumes:
+            surface = clip_to_volume(surface, operand)
         return surface
     if isinstance(volume, Ball):
         return _cut(surface, _ClipBoundary(np.array(volume.center), np.zeros(3), volume.radius))
@@ -239,7 +240,7 @@ def clip_to_volume(surface: TriangleMesh, volume: Volume) -> TriangleMesh:
 
 
 def _onto(vertices: FloatArray, box: Box) -> FloatArray:
-    """Vertices within rounding of a box's faces, put there."""
+    """The vertices, with those within rounding of a box's faces put onto them."""
     for end in box.bounds():
         near = np.abs(vertices - end) <= _NEAR * (1 + np.abs(end))
         vertices = np.where(near, end, vertices)
@@ -247,8 +248,9 @@ def _onto(vertices: FloatArray, box: Box) -> FloatArray:
 
 
 def _snap_to_boundary(surface: TriangleMesh, side: _ClipBoundary) -> tuple[FloatArray, FloatArray]:
-    """Vertices, and their heights. Those near the side are moved onto it within the surface's
-    tangent plane, except those of the surface's boundary and those that would have to go far."""
+    """The vertices, and their heights. Vertices near the side are moved onto it within the
+    surface's tangent plane, except those of the surface's boundary and those that would have to
+    move far."""
     x, faces = surface.vertices, surface.faces
     corner = x[faces]
     edges = np.linalg.norm(corner - np.roll(corner, 1, axis=1), axis=2).min(axis=1)
@@ -259,42 +261,43 @@ def _snap_to_boundary(surface: TriangleMesh, side: _ClipBoundary) -> tuple[Float
         np.add.at(mean, faces[:, k], normal)
     mean /= np.maximum(np.linalg.norm(mean, axis=1), 1e-300)[:, None]
     h = side.heights(x)
-    there = x
+    moved = x
     for _ in range(4):
-        slope = side.slopes(there)
+        slope = side.slopes(moved)
         along = slope - (slope * mean).sum(axis=1)[:, None] * mean
         square = np.maximum((along * along).sum(axis=1), 1e-3)
-        there = there - (side.heights(there) / square)[:, None] * along
-    near = np.linalg.norm(there - x, axis=1) < _SNAPPED * shortest
-    near &= np.abs(side.heights(there)) <= 1e-9 * shortest
+        moved = moved - (side.heights(moved) / square)[:, None] * along
+    near = np.linalg.norm(moved - x, axis=1) < _SNAPPED * shortest
+    near &= np.abs(side.heights(moved)) <= 1e-9 * shortest
     near[np.unique(boundary_edges(faces))] = False
-    return np.where(near[:, None], there, x), np.where(near, 0.0, h)
+    return np.where(near[:, None], moved, x), np.where(near, 0.0, h)
 
 
 def _cut(surface: TriangleMesh, side: _ClipBoundary) -> TriangleMesh:
-    """The part where heights are not positive. Heights are linear along edges, or those above a
-    sphere."""
+    """The part of the surface where heights are not positive. Heights are linear along edges,
+    except above a sphere."""
     faces = surface.faces
     if not len(faces):
         return surface
     vertices, h = _snap_to_boundary(surface, side)
     h = np.where(np.abs(h) <= _NEAR * float(np.ptp(vertices, axis=0).max()), 0.0, h)
     out = (h > 0)[faces]
-    # What lies on the boundary with no corner inside is left out.
+    # Faces on the boundary with no corner inside are left out.
     keep = (h < 0)[faces].any(axis=1)
     mixed = keep & out.any(axis=1)
     pairs = np.concatenate([faces[mixed][:, [k, (k + 1) % 3]] for k in range(3)])
     crossing = pairs[h[pairs[:, 0]] * h[pairs[:, 1]] < 0]
     keys = np.unique(edge_keys(crossing, len(vertices)))
     a, b = keys // len(vertices), keys % len(vertices)
-    share = (h[a] / (h[a] - h[b]))[:, None]
-    points = vertices[a] + share * (vertices[b] - vertices[a])
+    fraction = (h[a] / (h[a] - h[b]))[:, None]
+    points = vertices[a] + fraction * (vertices[b] - vertices[a])
     if side.radius is not None:
         points = _on_sphere(vertices[a], vertices[b], side.center, side.radius)
     first = len(vertices)
 
     def at(i: IntArray, j: IntArray) -> IntArray:
-        """The end of edges between vertices inside and outside; a vertex on the boundary itself."""
+        """The vertex where edges from i to j meet the boundary; i itself if it lies on the
+        boundary."""
         index = np.searchsorted(keys, edge_keys(np.column_stack([i, j]), len(vertices)))
         return np.where(h[i] == 0, i, first + index)
 
@@ -303,22 +306,23 @@ def _cut(surface: TriangleMesh, side: _ClipBoundary) -> TriangleMesh:
     number = out[mixed].sum(axis=1)
     for k in range(3):
         order = [k, (k + 1) % 3, (k + 2) % 3]
-        one = rows[(number == 1) & out[mixed][:, k]][:, order]  # a is outside
-        x, y = at(one[:, 1], one[:, 0]), at(one[:, 2], one[:, 0])
-        parts += [np.stack([one[:, 1], one[:, 2], x], axis=1), np.stack([one[:, 2], y, x], axis=1)]
-        two = rows[(number == 2) & ~out[mixed][:, k]][:, order]  # a is inside
-        parts.append(np.stack([two[:, 0], at(two[:, 0], two[:, 1]), at(two[:, 0], two[:, 2])], 1))
-    made = np.concatenate(parts)
-    whole = (made != np.roll(made, 1, axis=1)).all(axis=1)
-    return TriangleMesh.without_unused_vertices(np.concatenate([vertices, points]), made[whole])
+        tri = rows[(number == 1) & out[mixed][:, k]][:, order]  # a is outside
+        x, y = at(tri[:, 1], tri[:, 0]), at(tri[:, 2], tri[:, 0])
+        parts += [np.stack([tri[:, 1], tri[:, 2], x], axis=1), np.stack([tri[:, 2], y, x], axis=1)]
+        tip = rows[(number == 2) & ~out[mixed][:, k]][:, order]  # a is inside
+        parts.append(np.stack([tip[:, 0], at(tip[:, 0], tip[:, 1]), at(tip[:, 0], tip[:, 2])], 1))
+    new = np.concatenate(parts)
+    proper = (new != np.roll(new, 1, axis=1)).all(axis=1)
+    return TriangleMesh.without_unused_vertices(np.concatenate([vertices, points]), new[proper])
 
 
 def _on_sphere(a: FloatArray, b: FloatArray, center: FloatArray, radius: float) -> FloatArray:
-    """Where segments from a to b (n, 3), one inside and one outside, pass through the sphere."""
+    """The points where segments from a to b (n, 3), of which one end is inside, pass through the
+    sphere."""
     inside = np.linalg.norm(a - center, axis=1) < np.linalg.norm(b - center, axis=1)
     start, end = np.where(inside[:, None], a, b), np.where(inside[:, None], b, a)
     o, d = start - center, end - start
     dd, od = (d * d).sum(axis=1), (o * d).sum(axis=1)
     room = np.maximum(radius**2 - (o * o).sum(axis=1), 0)
-    share = room / (od + np.sqrt(od * od + dd * room))
-    return start + share[:, None] * d
+    fraction = room / (od + np.sqrt(od * od + dd * room))
+    return start + fraction[:, None] * d

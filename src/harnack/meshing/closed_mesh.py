@@ -43,14 +43,15 @@ __all__ = [
 ]
 
 _MOST_SEGMENTS = 2000
-# Parts of a union have its area up to this part of it. Else, and where triangles of it cross, they
-# are grown, by this part of the size; at sharp corners by no more than some times that.
+# The areas of a union and of its parts may differ by the first, relative to the area. Otherwise,
+# and where triangles of the union cross, parts are grown, by the second, relative to the size; at
+# sharp corners by at most that over the third.
 _SAME_AREA, _GROWN, _LEAST_SLANT = 1e-6, 1e-9, 0.1
 _MOST_CELLS = 1_000_000
 
 
 def to_manifold(surface: TriangleMesh) -> Manifold:
-    """A closed mesh whose faces are seen counter-clockwise from outside.
+    """The solid of a closed mesh, whose faces run counter-clockwise seen from outside.
 
     Raises:
         MeshingError: it is not closed.
@@ -60,22 +61,22 @@ def to_manifold(surface: TriangleMesh) -> Manifold:
     if not len(surface.faces):
         return Manifold()
     vertices = np.ascontiguousarray(surface.vertices, np.float64)
-    made = Manifold(Mesh64(vertices, np.ascontiguousarray(surface.faces, np.uint64)))
-    if made.status() != Error.NoError:
+    body = Manifold(Mesh64(vertices, np.ascontiguousarray(surface.faces, np.uint64)))
+    if body.status() != Error.NoError:
         raise MeshingError(
-            f"a surface of the solid is not closed ({made.status().name}): cells are too large for "
+            f"a surface of the solid is not closed ({body.status().name}): cells are too large for "
             "it; choose a smaller `cell_size`"
         )
-    return made
+    return body
 
 
 def mesh_manifold(solid: MeshSolid) -> Manifold | None:
-    """The mesh of a `MeshSolid`, itself: of one that crosses itself the union of its parts, or None
-    where a part crosses itself, or is a cavity.
+    """The mesh of a `MeshSolid`; if it crosses itself the union of its parts, or None where a part
+    crosses itself or is a cavity.
 
     Parts in contact up to rounding would be left with gaps as thin as that, which have an area, or
     pass through each other: if the union has more than the boundary of the solid, or triangles of
-    it cross, parts are grown by next to nothing first.
+    it cross, parts are grown by a tiny length first.
 
     Raises:
         MeshingError: more than two faces meet at an edge.
@@ -83,16 +84,16 @@ def mesh_manifold(solid: MeshSolid) -> Manifold | None:
     from manifold3d import Error, Manifold, Mesh64, OpType
 
     surface = solid.surface
-    # Copies, which can be written to; vertices are as they were given, bit by bit.
-    whole = Manifold(Mesh64(np.array(solid.vertices), np.array(surface.faces, np.uint64)))
-    if whole.status() != Error.NoError:
+    # Copies, which can be written to; vertices are the input's, bit by bit.
+    body = Manifold(Mesh64(np.array(solid.vertices), np.array(surface.faces, np.uint64)))
+    if body.status() != Error.NoError:
         raise MeshingError(
-            f"the faces of the mesh do not meet two by two at its edges ({whole.status().name}): "
+            f"the faces of the mesh do not meet two by two at its edges ({body.status().name}): "
             "join its parts by trimesh.boolean.union, or move them apart"
         )
     if surface.boundary_triangles is None:
-        return whole
-    parts = whole.decompose()
+        return body
+    parts = body.decompose()
     for part in parts:
         boundary = from_manifold(part)
         if part.volume() <= 0 or len(intersecting_faces(boundary.vertices, boundary.faces)):
@@ -117,20 +118,20 @@ def grown(surface: TriangleMesh, length: float) -> TriangleMesh:
     Components that touch, up to rounding, then overlap."""
     x, faces = surface.vertices, surface.faces
     mesh = trimesh.Trimesh(x, faces, process=False)
-    way = np.array(mesh.vertex_normals)
-    slant = np.ones(len(way))
+    normals = np.array(mesh.vertex_normals)
+    slant = np.ones(len(normals))
     for k in range(3):
-        np.minimum.at(slant, faces[:, k], row_dots(way[faces[:, k]], mesh.face_normals))
-    return TriangleMesh(x + way * (length / np.maximum(slant, _LEAST_SLANT))[:, None], faces)
+        np.minimum.at(slant, faces[:, k], row_dots(normals[faces[:, k]], mesh.face_normals))
+    return TriangleMesh(x + normals * (length / np.maximum(slant, _LEAST_SLANT))[:, None], faces)
 
 
 def without_short_edges(solid: Manifold, length: float) -> Manifold:
-    """A solid with short edges and slivers left out that move its surface by up to a length; or as
-    it is, if its volume changed by more than that explains: where slivers are as thin as rounding,
-    manifold3d has been seen to lose a part."""
+    """A solid without short edges and slivers, whose removal moves its surface by up to a length;
+    or the solid itself, if its volume would change by more than that explains: where slivers are as
+    thin as rounding, manifold3d has been seen to lose a part."""
     simpler = solid.simplify(length)
-    most = 2 * length * solid.surface_area()
-    return simpler if abs(simpler.volume() - solid.volume()) <= most else solid
+    max_change = 2 * length * solid.surface_area()
+    return simpler if abs(simpler.volume() - solid.volume()) <= max_change else solid
 
 
 def from_manifold(manifold: Manifold) -> TriangleMesh:
@@ -154,24 +155,24 @@ def extruded_manifold(
 ) -> Manifold:
     """The outline over 0 <= z <= height, its end turned by `twist` degrees and scaled by `taper`.
 
-    Without a twist the faces are flat, and as they are. Else the vertices lie on the surface, and
-    faces within `tolerance` of it. Proof: a triangle of edges of L at most, mapped, is within
-    M L^2/6 of the mapped triangle, where M bounds second derivatives of the map along lines (it
-    lies within L/sqrt(3) of a point). For turning by a and scaling by k within a unit of length,
-    at distances up to R from the axis, with q = max(1, taper), M = q (a + a^2 R) + k (1 + 2 a R).
+    Without a twist the faces are flat, and exact. Otherwise the vertices lie on the surface, and
+    faces within `tolerance` of it. Proof: a triangle of edges of L at most, mapped, is within M
+    L^2/6 of the mapped triangle, where M bounds second derivatives of the map along lines (it lies
+    within L/sqrt(3) of a point). For turning by a and scaling by k within a unit of length, at
+    distances up to R from the axis, with q = max(1, taper), M = q (a + a^2 R) + k (1 + 2 a R).
 
     Raises:
         MeshingError: so fine that it has millions of faces.
     """
     section, scale = _section(outline)
-    back = (1 / scale, 1 / scale, 1 / scale)
+    inverse_scale = (1 / scale, 1 / scale, 1 / scale)
     if twist == 0:
-        return section.extrude(height * scale, 0, 0.0, (taper, taper)).scale(back)
+        return section.extrude(height * scale, 0, 0.0, (taper, taper)).scale(inverse_scale)
     rate, growth = math.radians(twist) / height, (taper - 1.0) / height
-    radius = max(float(np.linalg.norm(one, axis=1).max()) for one in outline)
-    turn, most = abs(rate), max(1.0, taper)
-    bend = most * (turn + turn**2 * radius) + abs(growth) * (1 + 2 * turn * radius)
-    length = math.sqrt(6 * tolerance / bend)
+    radius = max(float(np.linalg.norm(loop, axis=1).max()) for loop in outline)
+    turn, q = abs(rate), max(1.0, taper)
+    bound = q * (turn + turn**2 * radius) + abs(growth) * (1 + 2 * turn * radius)
+    length = math.sqrt(6 * tolerance / bound)
     straight = section.extrude(height * scale)
     count = straight.surface_area() / (scale * length) ** 2
     if count > _MOST_CELLS:
@@ -182,11 +183,11 @@ def extruded_manifold(
 
     def mapped(points: FloatArray) -> FloatArray:
         z = points[:, 2] / scale
-        share, c, s = 1 + growth * z, np.cos(rate * z), np.sin(rate * z)
-        x, y = share * points[:, 0], share * points[:, 1]
+        factor, c, s = 1 + growth * z, np.cos(rate * z), np.sin(rate * z)
+        x, y = factor * points[:, 0], factor * points[:, 1]
         return np.column_stack([c * x - s * y, s * x + c * y, points[:, 2]])
 
-    return straight.refine_to_length(length * scale).warp_batch(mapped).scale(back)
+    return straight.refine_to_length(length * scale).warp_batch(mapped).scale(inverse_scale)
 
 
 def revolved_manifold(outline: Outline, tolerance: float) -> Manifold:
@@ -196,7 +197,7 @@ def revolved_manifold(outline: Outline, tolerance: float) -> Manifold:
     Raises:
         MeshingError: so fine that it has millions of faces.
     """
-    radius = max(float(one[:, 0].max()) for one in outline)
+    radius = max(float(loop[:, 0].max()) for loop in outline)
     segments = 4 * math.ceil(0.25 * math.pi * math.sqrt(radius / (2 * tolerance)))
     if segments > _MOST_SEGMENTS:
         raise MeshingError(
@@ -208,7 +209,8 @@ def revolved_manifold(outline: Outline, tolerance: float) -> Manifold:
 
 
 def _section(outline: Outline) -> tuple[CrossSection, float]:
-    """An outline, times a scale for which it is not rounded (`scale_for_clipper`)."""
+    """The cross-section of an outline, times a scale for which it is not rounded
+    (`scale_for_clipper`), and that scale."""
     from manifold3d import CrossSection
 
     loops, scale = scale_for_clipper(outline)
@@ -226,11 +228,11 @@ def volume_manifold(
     """
     from manifold3d import Manifold
 
-    around = box_manifold(lower, upper)
+    manifold = box_manifold(lower, upper)
     if isinstance(volume, VolumeIntersection):
-        for one in volume.volumes:
-            around ^= volume_manifold(one, lower, upper, tolerance)
-        return around
+        for operand in volume.volumes:
+            manifold ^= volume_manifold(operand, lower, upper, tolerance)
+        return manifold
     if isinstance(volume, Box):
         low, high = (np.array(end, np.float64) for end in volume.bounds())
         low, high = np.maximum(low, lower), np.minimum(high, upper)
@@ -238,10 +240,10 @@ def volume_manifold(
     if isinstance(volume, HalfSpace | ConvexHull):
         for row in volume.planes():
             x, y, z, h = (float(v) for v in row)
-            around = around.trim_by_plane((-x, -y, -z), -h)
-        return around
+            manifold = manifold.trim_by_plane((-x, -y, -z), -h)
+        return manifold
     if isinstance(volume, Ball):
-        return around ^ _ball(volume, tolerance)
+        return manifold ^ _ball(volume, tolerance)
     raise MeshingError(f"a {type(volume).__name__} cannot cut a mesh: give a box or a ball")
 
 
@@ -273,7 +275,7 @@ _LARGEST = 2.0**36
 _MOST_COARSE = 1e4
 # Where the snapped mesh does not pass its checks, it is simplified within these numbers of steps.
 _SIMPLIFY_STEPS = (4, 32)
-# And mended, where triangles cross, within this number.
+# Where triangles cross, it is mended within this number of steps.
 _REPAIR_STEPS = 32
 
 
@@ -294,14 +296,14 @@ class ClosedMesh(trimesh.Trimesh):
     @classmethod
     def of(cls, mesh: trimesh.Trimesh) -> ClosedMesh:
         """A copy of any mesh."""
-        made = trimesh.Trimesh.copy(mesh)
-        made.__class__ = cls
-        return cast("ClosedMesh", made)
+        copied = trimesh.Trimesh.copy(mesh)
+        copied.__class__ = cls
+        return cast("ClosedMesh", copied)
 
     def copy(self, *args: Any, **options: Any) -> trimesh.Trimesh:
-        made = super().copy(*args, **options)
-        made.__class__ = type(self)
-        return made
+        copied = super().copy(*args, **options)
+        copied.__class__ = type(self)
+        return copied
 
     def export(self, file_obj: Any = None, file_type: str | None = None, **options: Any) -> Any:
         """Write the mesh as trimesh.Trimesh.export does. Metadata is not written: its arrays fit in
@@ -343,17 +345,17 @@ def _grid_spacing(x: FloatArray) -> float:
 
 
 def _quantize(mesh: trimesh.Trimesh, step: float) -> trimesh.Trimesh:
-    """The mesh with vertices on the grid; where that does not pass its checks, mended there or
-    simplified."""
-    given = TriangleMesh(np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64))
-    x, faces, kept = _merge_on_grid(given, step)
+    """The mesh with vertices on the grid; if that does not pass its checks, mended where it fails,
+    or simplified."""
+    original = TriangleMesh(np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64))
+    x, faces, is_kept = _merge_on_grid(original, step)
     is_plain = not cast("Any", mesh.visual).defined
     try:
         mended = _resolve_after_rounding(
-            TriangleMesh(x, faces[kept]), given, _REPAIR_STEPS * step if is_plain else 0.0
+            TriangleMesh(x, faces[is_kept]), original, _REPAIR_STEPS * step if is_plain else 0.0
         )
     except LocalizedMeshingError as error:
-        mended = _simplify_until_valid(given, step) if is_plain else None
+        mended = _simplify_until_valid(original, step) if is_plain else None
         if mended is None:
             x, y, z = error.locations[0]
             raise MeshingError(
@@ -364,58 +366,60 @@ def _quantize(mesh: trimesh.Trimesh, step: float) -> trimesh.Trimesh:
     if mended is not None:
         return trimesh.Trimesh(mended.vertices, mended.faces, process=False, validate=False)
     mesh.vertices, mesh.faces = x, faces
-    mesh.update_faces(kept)
+    mesh.update_faces(is_kept)
     mesh.remove_unreferenced_vertices()
     return mesh
 
 
-def _simplify_until_valid(given: TriangleMesh, step: float) -> TriangleMesh | None:
-    """Without slivers, simplified by manifold3d; None if that does not help either."""
+def _simplify_until_valid(original: TriangleMesh, step: float) -> TriangleMesh | None:
+    """The mesh on the grid without slivers, simplified by manifold3d; None if that does not help
+    either."""
     for steps in _SIMPLIFY_STEPS:
-        simpler = from_manifold(without_short_edges(to_manifold(given), steps * step))
-        x, faces, kept = _merge_on_grid(simpler, step)
-        if not kept.any():
+        simpler = from_manifold(without_short_edges(to_manifold(original), steps * step))
+        x, faces, is_kept = _merge_on_grid(simpler, step)
+        if not is_kept.any():
             return None
-        made = TriangleMesh.without_unused_vertices(x, faces[kept])
+        rounded = TriangleMesh.without_unused_vertices(x, faces[is_kept])
         try:
-            return _resolve_after_rounding(made, given, _REPAIR_STEPS * step) or made
+            return _resolve_after_rounding(rounded, original, _REPAIR_STEPS * step) or rounded
         except LocalizedMeshingError:
             continue
     return None
 
 
 def _merge_on_grid(surface: TriangleMesh, step: float) -> tuple[FloatArray, IntArray, BoolArray]:
-    """Vertices on the grid, faces between the first of those that are one point, and which faces
-    are left."""
+    """The vertices on the grid; the faces, between the first of the vertices at each point; and
+    which faces still have three corners."""
     grid = np.round(surface.vertices / step)
     x = grid * step
-    # Points that are one, by their coordinates one after the other.
-    place = np.zeros(len(x), np.int64)
-    for one in (grid - grid.min(axis=0)).astype(np.int64).T:
-        _, place, _, _ = unique_with_inverse(place * (int(one.max()) + 1) + one)
+    # Vertices at the same point, by their coordinates one after the other.
+    group = np.zeros(len(x), np.int64)
+    for column in (grid - grid.min(axis=0)).astype(np.int64).T:
+        _, group, _, _ = unique_with_inverse(group * (int(column.max()) + 1) + column)
     first = np.empty(len(x), np.int64)
-    first[place[::-1]] = np.arange(len(x))[::-1]
-    faces = first[place][surface.faces]
+    first[group[::-1]] = np.arange(len(x))[::-1]
+    faces = first[group][surface.faces]
     return x, faces, (faces != np.roll(faces, 1, axis=1)).all(axis=1)
 
 
 def _resolve_after_rounding(
-    made: TriangleMesh, given: TriangleMesh, length: float
+    rounded: TriangleMesh, original: TriangleMesh, length: float
 ) -> TriangleMesh | None:
-    """A surface mended where triangles cross, moved by no more than a length; None if none do, or
-    if that does not help and those that were given, such as of a mesh that was repaired, do too.
+    """The rounded surface mended where triangles cross, moved by no more than a length; None if
+    none cross, or if mending does not help and triangles of the original cross too, as those of a
+    repaired mesh may.
 
     Raises:
         LocalizedMeshingError: it is not closed, or triangles cross.
     """
-    check_manifold(made.faces, made.vertices)
+    check_manifold(rounded.faces, rounded.vertices)
     try:
-        apart = resolve_self_intersections(made, length)
+        apart = resolve_self_intersections(rounded, length)
     except SelfIntersectionError:
-        if not len(intersecting_faces(given.vertices, given.faces)):
+        if not len(intersecting_faces(original.vertices, original.faces)):
             raise
         return None
-    if apart is made:
+    if apart is rounded:
         return None
     check_manifold(apart.faces, apart.vertices)
     return apart

@@ -94,14 +94,17 @@ __all__ = [
     "solid_value_range",
 ]
 
-# Cells of offsets of meshes, in tolerances; and how many secants find roots on their edges.
+# The size of cells for offsets of meshes, in tolerances; and the number of secant steps for roots
+# on their edges.
 _CELLS_OF_OFFSET, _SECANTS = 6.0, 2
-# Where other parts leave nothing is looked for at once in lattices of more cells than this.
+# In lattices of more cells than this, the region where other operands leave nothing is computed at
+# once.
 _MANY_CELLS = 100_000
-# How far joining their triangles may move them, in tolerances: the first that does no harm; and how
-# far mending may, which is tried with the least.
+# How far merging of coplanar triangles may move surfaces of offsets, in tolerances, the first value
+# that does no harm; and how far mending may move them, which is done after merging.
 _JOINED_WITHIN, _MENDED_WITHIN = (0.5, 0.25, 0.1), 0.5
-# Triangles of them are cut in three where their centers are farther off, in tolerances; so often.
+# Triangles of offsets are cut in three where their centers are farther off the level, in
+# tolerances; and how often.
 _FAR_OFF, _TIMES_CUT = 1.8, 2
 
 # Meshes the level set of an angle, which ends at its curve: field, level -> vertices and faces.
@@ -128,17 +131,18 @@ class CsgMesher:
     """Meshes solids in a box from `lower` to `upper`, (3,) each.
 
     tolerance: a length, at the midpoints of edges and the centers of faces.
-    spacing: of cells, at most.
-    per_wave: cells along a wave (`Field.min_wavelength`) at the least; None for no such limit.
+    spacing: the largest size of cells.
+    per_wave: the smallest number of cells along a wave (`Field.min_wavelength`); None for no such
+        limit.
     mesh_angle: meshes level sets of angles, which end at a curve.
-    most_faces: of each level set.
-    evaluations: of fields so far, in points.
+    most_faces: the largest number of triangles of each level set.
+    evaluations: the number of evaluations of fields so far, in points.
     levels: number of level sets meshed so far.
-    smallest_cell: the smallest spacing of these.
-    uploads: of the fields that were meshed so far.
+    smallest_cell: the smallest spacing of these level sets.
+    uploads: the prepared fields that were meshed so far.
     intersected_with: solids that everything meshed next is intersected with (see
         `IntersectedOperands`).
-    irrelevant_region_cache: the operands and the region of the last call that asked where other
+    irrelevant_region_cache: the operands and the region of the last call that computed where other
         operands leave nothing.
     """
 
@@ -158,8 +162,8 @@ class CsgMesher:
     irrelevant_region_cache: tuple[IntersectedOperands, IrrelevantRegion] | None = None
 
     def mesh_sublevel(self, solid: Solid, level: float) -> Manifold:
-        """The points of the box where a solid's function is at most `level`; what there is outside
-        of the box has no meaning.
+        """The points of the box where a solid's function is at most `level`; the result outside of
+        the box has no meaning.
 
         Raises:
             MeshingError: a part cannot be meshed.
@@ -170,8 +174,8 @@ class CsgMesher:
             apart = factor_common_operands(solid, level) if solid.is_union else None
             if apart is not None:
                 return self.mesh_sublevel(apart, 0.0)
-            kept = drop_cancelled_operands(flatten_csg(solid), level)
-            return Manifold() if kept is None else self._joined(kept, level)
+            reduced = drop_cancelled_operands(flatten_csg(solid), level)
+            return Manifold() if reduced is None else self._joined(reduced, level)
         if isinstance(solid, Complement):  # -f <= c where f >= -c
             return self._whole_box() - self.mesh_sublevel(solid.field, -level)
         if isinstance(solid, OffsetSolid):
@@ -204,7 +208,7 @@ class CsgMesher:
         return to_manifold(self.mesh_smooth_level(solid, level)[0])
 
     def _joined(self, solid: BooleanSolid, level: float) -> Manifold:
-        """A union; or an intersection, from which complements are cut away."""
+        """The mesh of a union, or of an intersection, from which complements are cut away."""
         from manifold3d import Manifold, OpType
 
         numbers = range(len(solid.parts))
@@ -213,35 +217,35 @@ class CsgMesher:
                 [self._part(solid, k, level) for k in numbers], OpType.Add
             )
         cut = [k for k in numbers if isinstance(solid.parts[k], Complement)]
-        kept = [self._part(solid, k, level) for k in numbers if k not in cut]
-        whole = Manifold.batch_boolean(kept, OpType.Intersect) if kept else self._whole_box()
+        parts = [self._part(solid, k, level) for k in numbers if k not in cut]
+        common = Manifold.batch_boolean(parts, OpType.Intersect) if parts else self._whole_box()
         away = [self._part(solid, k, level) for k in cut]
-        return Manifold.batch_boolean([whole, *away], OpType.Subtract)
+        return Manifold.batch_boolean([common, *away], OpType.Subtract)
 
     def _part(self, solid: BooleanSolid, number: int, level: float) -> Manifold:
-        """One part of a union or an intersection, made where the others of an intersection may
-        leave something of it (`IntersectedOperands`); of a complement in an intersection what is
-        cut away."""
-        kept, part = self.intersected_with, solid.parts[number]
+        """The mesh of one operand of a union or an intersection: in an intersection only where the
+        other operands may leave something of it (`IntersectedOperands`). For a complement in an
+        intersection, the solid that is cut away."""
+        previous, part = self.intersected_with, solid.parts[number]
         if not solid.is_union:
-            beside = [one for one in solid.parts if one is not part]
+            beside = [operand for operand in solid.parts if operand is not part]
             if isinstance(part, Complement):
                 self.intersected_with = tuple(
-                    (one, level) for one in beside if _has_no_complement(one)
+                    (operand, level) for operand in beside if _has_no_complement(operand)
                 )
                 part, level = part.field, -level
             else:
-                self.intersected_with = (*kept, *((one, level) for one in beside))
+                self.intersected_with = (*previous, *((operand, level) for operand in beside))
         try:
             return self.mesh_sublevel(part, level)
         finally:
-            self.intersected_with = kept
+            self.intersected_with = previous
 
     def _closed(self, function: LevelFunction, lattice: BccLattice) -> TriangleMesh:
-        """A level set in a box: where the other parts may leave something, if cells are many. Of
-        few all are made, so that what is there twice is the same bit by bit; unless that goes
-        wrong, as it may where nothing is left: a function of the angle about an axis jumps there,
-        and others have no value beyond some surface."""
+        """A level set in a box. If there are many cells, only those where the other operands may
+        leave something are meshed. If there are few, all are meshed, so that copies of a surface
+        are the same bit by bit; unless that fails, as it may where nothing is left: a function of
+        the angle about an axis jumps there, and other functions have no value beyond a surface."""
         elsewhere: IrrelevantRegion | None = None
         if math.prod(lattice.counts.tolist()) < _MANY_CELLS:
             try:
@@ -256,8 +260,8 @@ class CsgMesher:
         )
 
     def _elsewhere(self) -> IrrelevantRegion | None:
-        """How far around points the other parts leave nothing, by proof; None if there are none.
-        The two sides of a wall have the same."""
+        """The region where the other operands are proved to leave nothing; None if there are no
+        other operands. The two sides of a wall have the same region."""
         if not self.intersected_with:
             return None
         if (
@@ -265,22 +269,22 @@ class CsgMesher:
             and self.irrelevant_region_cache[0] is self.intersected_with
         ):
             return self.irrelevant_region_cache[1]
-        functions = [self.function(one, level) for one, level in self.intersected_with]
+        functions = [self.function(solid, level) for solid, level in self.intersected_with]
 
         def clearance(points: FloatArray) -> FloatArray:
-            found = np.zeros(len(points))
-            for one in functions:
-                outside = np.flatnonzero(one.values(points) > 0)
-                found[outside] = np.maximum(found[outside], one.clearance(points[outside]))
-            return found
+            lengths = np.zeros(len(points))
+            for solid in functions:
+                outside = np.flatnonzero(solid.values(points) > 0)
+                lengths[outside] = np.maximum(lengths[outside], solid.clearance(points[outside]))
+            return lengths
 
-        made = IrrelevantRegion(clearance)
-        self.irrelevant_region_cache = self.intersected_with, made
-        return made
+        region = IrrelevantRegion(clearance)
+        self.irrelevant_region_cache = self.intersected_with, region
+        return region
 
     def mesh_smooth_level(self, field: Field, level: float) -> tuple[TriangleMesh, bool]:
-        """The boundary of {f <= level} as one level set, and whether it is all of it: if not, it is
-        closed outside of the box in a way that has no meaning."""
+        """The boundary of {f <= level} as one level set, and whether it is the whole boundary: if
+        not, it is closed outside of the box in a way that has no meaning."""
         hull = _hull(field, level)
         lower, upper = self.lower, self.upper
         is_whole = False
@@ -298,10 +302,10 @@ class CsgMesher:
         function = self.function(_underlying_field(field), level)
         self.report(f"level {level:g} of {type(field).__name__} in cells of {spacing:.3g}")
         lattice = BccLattice.covering_box(lower, upper, spacing, layers=2)
-        made = self._closed(function, lattice)
+        surface = self._closed(function, lattice)
         self.evaluations += function.evaluations
         self.levels += 1
-        return made, is_whole
+        return surface, is_whole
 
     def function(self, field: Field, level: float) -> LevelFunction:
         """f - level, continued beyond the field's domain."""
@@ -314,7 +318,7 @@ class CsgMesher:
         return box_manifold(self.lower - pad, self.upper + pad)
 
     def _wall(self, wall: BandSolid, level: float) -> Manifold:
-        """Where a field is within half_width + level of the wall's level."""
+        """The mesh of the points where a field is within half_width + level of the wall's level."""
         from manifold3d import Manifold
 
         half = wall.half_width + level
@@ -344,7 +348,7 @@ class CsgMesher:
         points = lattice.points(2 * np.argwhere(np.ones(lattice.counts)) + 1)
         middle = 0.5 * (low + high)
         samples = self.function(field, middle).sample(points)
-        # Where the wall may be near.
+        # Cells where the wall may be near.
         near = samples.distance <= np.median(samples.distance)
         steep = float(np.median(np.linalg.norm(samples.gradient[near], axis=1)))
         self.evaluations += len(points)
@@ -356,26 +360,27 @@ class CsgMesher:
             )
 
     def _between_angle_levels(self, field: SolidAngle, low: float, high: float) -> TriangleMesh:
-        """Between two levels of an angle: both end at the same vertices, those of the curve."""
+        """The surface around the points between two levels of an angle: both levels end at the same
+        vertices, those of the curve."""
         inner, outer = self.mesh_angle(field, low), self.mesh_angle(field, high)
         count = sum(map(len, field.loops))
         if not np.array_equal(inner.vertices[:count], outer.vertices[:count]):
             raise MeshingError("the two sides of the solid do not end at the same curve")
-        place = np.arange(len(inner.vertices)) - count + len(outer.vertices)
-        place[:count] = np.arange(count)
+        index = np.arange(len(inner.vertices)) - count + len(outer.vertices)
+        index[:count] = np.arange(count)
         vertices = np.concatenate([outer.vertices, inner.vertices[count:]])
         self.levels += 2
-        return TriangleMesh(vertices, np.concatenate([outer.faces, place[inner.faces][:, ::-1]]))
+        return TriangleMesh(vertices, np.concatenate([outer.faces, index[inner.faces][:, ::-1]]))
 
     def _offset(self, solid: MeshSolid, level: float) -> Manifold:
-        """The points within a distance of a mesh, or deeper inside than that.
+        """The points within a distance of a mesh, or deeper inside than that distance.
 
         Offsets of meshes have creases wherever the mesh has, too many for cells to be refined
-        beside them. So cells are small at once, and of f, a distance, roots are linear along their
-        edges but at creases. Then triangles that are nearly in a plane are joined, those that lie
-        across a crease are cut, and those that pass through each other are mended. Parts thinner
-        than a cell, such as the tip of a knife edge, may be left out: points of them are less than
-        a cell from the level.
+        beside them. So cells are small at once; and since f is a distance, it is linear along their
+        edges except at creases. Then triangles that are nearly in a plane are merged, triangles
+        across a crease are cut, and triangles that pass through each other are mended. Parts
+        thinner than a cell, such as the tip of a knife edge, may be left out: points of them are
+        less than a cell from the level.
         """
         lower, upper = (np.array(end) for end in _finite_hull(solid, level))
         if not (lower < upper).all():
@@ -385,31 +390,31 @@ class CsgMesher:
         function = dataclasses.replace(self.function(solid, level), secant_steps=_SECANTS)
         self.report(f"level {level:g} of a mesh in cells of {cells:.3g}")
         lattice = BccLattice.covering_box(lower - cells, upper + cells, cells, layers=2)
-        made = mesh_closed_surface(function, lattice, self.tolerance, self.report, as_cut=True)
-        whole = to_manifold(made)
+        surface = mesh_closed_surface(function, lattice, self.tolerance, self.report, as_cut=True)
+        manifold = to_manifold(surface)
         self.levels += 1
-        for share in _JOINED_WITHIN:
-            joined = from_manifold(without_short_edges(whole, share * self.tolerance))
+        for fraction in _JOINED_WITHIN:
+            joined = from_manifold(without_short_edges(manifold, fraction * self.tolerance))
             joined = split_faces_off_level(function, joined, _FAR_OFF * self.tolerance, _TIMES_CUT)
             try:
-                made = resolve_self_intersections(joined, _MENDED_WITHIN * self.tolerance)
+                surface = resolve_self_intersections(joined, _MENDED_WITHIN * self.tolerance)
             except SelfIntersectionError:
                 continue
             break
         self.evaluations += function.evaluations
-        return to_manifold(made)
+        return to_manifold(surface)
 
     def _image(self, solid: TransformedSolid, level: float) -> Manifold:
-        """Of a solid under an affine map: the image of its mesh."""
+        """The image of a solid's mesh under an affine map."""
         matrix, offset = np.array(solid.map.matrix), np.array(solid.map.translation_vector)
         ends = np.stack([self.lower, self.upper])
         corners = np.stack(np.meshgrid(*ends.T, indexing="ij"), axis=-1).reshape(-1, 3)
-        own = (corners - offset) @ solid.map.inverse.T
+        local_corners = (corners - offset) @ solid.map.inverse.T
         scale = float(np.linalg.norm(matrix, 2))
         local = dataclasses.replace(
             self,
-            lower=own.min(axis=0),
-            upper=own.max(axis=0),
+            lower=local_corners.min(axis=0),
+            upper=local_corners.max(axis=0),
             tolerance=self.tolerance / scale,
             spacing=self.spacing / scale,
             evaluations=0,
@@ -417,17 +422,17 @@ class CsgMesher:
             smallest_cell=math.inf,
             intersected_with=(),
         )
-        made = local.mesh_sublevel(solid.field, level / solid.map.value_factor)
+        manifold = local.mesh_sublevel(solid.field, level / solid.map.value_factor)
         self.evaluations += local.evaluations
         self.levels += local.levels
         self.smallest_cell = min(self.smallest_cell, local.smallest_cell * scale)
-        return made.transform(np.column_stack([matrix, offset]))
+        return manifold.transform(np.column_stack([matrix, offset]))
 
 
 def _has_no_complement(solid: Solid) -> bool:
-    """Whether there is no complement within a solid, as it is meshed."""
+    """Whether a solid has no complement among its operands, as it is meshed."""
     if isinstance(solid, BooleanSolid):
-        return all(_has_no_complement(one) for one in solid.parts)
+        return all(_has_no_complement(operand) for operand in solid.parts)
     if isinstance(solid, TransformedSolid | OffsetSolid):
         return _has_no_complement(solid.field)
     return not isinstance(solid, Complement | BandSolid)
@@ -449,22 +454,22 @@ def _finite_hull(solid: MeshSolid, level: float) -> tuple[FloatArray, FloatArray
 
 
 def _hull(field: Field, level: float) -> Volume | None:
-    """A volume that holds {f <= level}, if it has bounds. A domain does not count: what ends there
-    is cut by it."""
+    """A volume that holds {f <= level}, if it has bounds. A domain does not count: a surface that
+    ends there is cut by it."""
     if isinstance(field, Solid):
-        found = field.sublevel_extent(level)
+        extent = field.sublevel_extent(level)
     else:
-        found = bounded_side_extent(field, (level,), lambda value: value <= level)
-    if found is None or found == field.domain:
+        extent = bounded_side_extent(field, (level,), lambda value: value <= level)
+    if extent is None or extent == field.domain:
         return None
-    if isinstance(field, SublevelSolid) and found == field.field.domain:
+    if isinstance(field, SublevelSolid) and extent == field.field.domain:
         return None
-    low, high = found.bounds()
-    return found if np.isfinite(low).all() and np.isfinite(high).all() else None
+    low, high = extent.bounds()
+    return extent if np.isfinite(low).all() and np.isfinite(high).all() else None
 
 
 def _underlying_field(field: Field) -> Field:
-    """The field itself, of a region of a field."""
+    """The field of a sublevel solid; any other field itself."""
     return field.field if isinstance(field, SublevelSolid) else field
 
 
@@ -509,13 +514,13 @@ class _DomainExtendedFunction(LevelFunction):
 
 # Cells across a solid, unless a spacing is given.
 _ACROSS = 24
-# How many sizes of cells are tried, and what each is of the one before.
+# How many sizes of cells are tried, and the ratio of each size to the one before.
 _MOST_ATTEMPTS = 3
 _SMALLER = 0.6
-# Where parts were cut by each other, slivers may pass through their neighbors by rounding: what may
-# be moved to leave them out, in tolerances, in the order in which it is tried.
+# Where operands were cut by each other, slivers may pass through their neighbors by rounding: how
+# far the surface may be moved to remove them, in tolerances, in the order of the attempts.
 _SLIVERS_WITHIN = (1e-3, 1e-4, 0.0)
-# Room around what has an extent, as a part of its size.
+# The margin around an extent, relative to its size.
 _MARGIN = 0.01
 
 
@@ -537,11 +542,11 @@ class SolidMeshResult:
 
 
 def solid_and_level(field: Field, solid: Any, level: float | None) -> tuple[Solid, float]:
-    """The solid that is asked for by `solid`, (low, high) or True, and its level.
+    """The solid that the argument `solid` describes, (low, high) or True, and its level.
 
     Raises:
-        ValueError: it is none; levels that no solid has.
-        TypeError: neither.
+        ValueError: it describes no solid, or levels that no solid has.
+        TypeError: it is neither.
     """
     if solid is True and isinstance(field, Solid):
         level = field.default_level if level is None else as_finite(level, "level")
@@ -557,7 +562,7 @@ def solid_and_level(field: Field, solid: Any, level: float | None) -> tuple[Soli
 
 
 def solid_value_range(field: Field, solid: Any, level: float | None) -> tuple[float, float]:
-    """The values (low, high) between which a solid is, given as such.
+    """The values (low, high) between which a solid lies, from the argument that describes it.
 
     Raises:
         ValueError, TypeError: as `solid_and_level`.
@@ -587,13 +592,15 @@ def mesh_solid(
 ) -> SolidMeshResult:
     """The boundary of the points of a volume where a solid's function is at most `level`.
 
-    volume: None for all of space. most_faces: of a level set.
-    angle_mesher: given a tolerance and a spacing, both lengths, how to mesh level sets of angles.
-    check: of the surface, of which no triangles pass through each other, given the size, that it is
-        near the level last. Where it is not, in a few places, these are mended
-        (`project_outliers`); where another check fails in known places, or that is not enough,
-        smaller cells are tried,
-        and half the tolerance: beside a thin part triangles within it may be anywhere.
+    volume: None for all of space.
+    angle_mesher: makes, for a tolerance and a spacing, both lengths, a function that meshes level
+        sets of angles.
+    most_faces: the largest number of triangles of a level set.
+    check: checks a surface, none of whose triangles pass through each other, of a size; last, that
+        it is near the level. Where it is not, in a few places, these are mended
+        (`project_outliers`); where another check fails in known places, or mending is not enough,
+        smaller cells are tried, and half the tolerance: beside a thin part triangles within the
+        tolerance may be anywhere.
 
     Raises:
         MeshingError: it has no bounds; it is empty; a part cannot be meshed.
@@ -613,14 +620,14 @@ def mesh_solid(
             most_faces, report, uploads=uploads,
         )  # fmt: skip
         try:
-            made = _apart(_assemble(mesher, solid, level, volume), error)
+            surface = _apart(_assemble(mesher, solid, level, volume), error)
             report("checking")
-            made = _checked(mesher, solid, level, made, size, check)
+            surface = _checked(mesher, solid, level, surface, size, check)
             break
         except TriangleLimitError as large:
             if first is None:
                 raise
-            raise first from large  # what smaller cells were for is what went wrong
+            raise first from large  # the first error is the cause
         except (MissedPartsError, LocalizedMeshingError) as wrong:
             attempts, first = attempts - 1, first or wrong
             if not attempts or not is_retry_promising(wrong, before, _SMALLER**attempts):
@@ -632,7 +639,7 @@ def mesh_solid(
                 error *= 0.5
             report(f"{wrong}; so cells of {cells:.3g}")
     return SolidMeshResult(
-        made, min(cells, mesher.smallest_cell), mesher.evaluations, mesher.levels, size
+        surface, min(cells, mesher.smallest_cell), mesher.evaluations, mesher.levels, size
     )
 
 
@@ -640,31 +647,31 @@ def _checked(
     mesher: CsgMesher,
     solid: Solid,
     level: float,
-    made: TriangleMesh,
+    surface: TriangleMesh,
     size: float,
     check: Callable[[TriangleMesh, float], None],
 ) -> TriangleMesh:
-    """The surface, checked; brought nearer to the level in a few places, if need be.
+    """The checked surface, moved nearer to the level in a few places if necessary.
 
     Raises:
         MeshingError: it fails the check.
     """
     try:
-        check(made, size)
+        check(surface, size)
     except OffLevelError as far:
         mended = project_outliers(
-            mesher.function(solid, level), made, far.locations, 2 * mesher.tolerance,
-            lambda one: check(one, size),
+            mesher.function(solid, level), surface, far.locations, 2 * mesher.tolerance,
+            lambda candidate: check(candidate, size),
         )  # fmt: skip
         if mended is None:
             raise
-        check_manifold(mended.faces, mended.vertices)  # all of it: `check` saw what is new
+        check_manifold(mended.faces, mended.vertices)  # the whole mesh: `check` saw new faces only
         return mended
-    return made
+    return surface
 
 
 def apart_of(whole: Manifold, tolerance: float) -> TriangleMesh:
-    """The surface of parts put together, of which no triangles pass through each other.
+    """The surface of the assembled parts, none of whose triangles pass through each other.
 
     Raises:
         MeshingError: it is empty, or triangles cross.
@@ -673,20 +680,20 @@ def apart_of(whole: Manifold, tolerance: float) -> TriangleMesh:
 
 
 def _apart(parts: TriangleMesh | _Assembly, tolerance: float) -> TriangleMesh:
-    """The surface, of which no triangles pass through each other; of parts put together mended, or
-    without slivers.
+    """The surface, none of whose triangles pass through each other; for assembled parts it is
+    mended, or without slivers.
 
     Raises:
-        MeshingError: it is empty; a SelfIntersectionError where that does not help, or hardly any
-            fewer triangles cross where less is left out.
+        MeshingError: it is empty; a SelfIntersectionError if mending does not help, or if hardly
+            any fewer triangles cross when fewer slivers are removed.
     """
     raised: SelfIntersectionError | None = None
-    for share in _SLIVERS_WITHIN if isinstance(parts, _Assembly) else (0.0,):
-        one = parts.without_slivers(share * tolerance) if isinstance(parts, _Assembly) else parts
-        if not len(one.faces):
+    for factor in _SLIVERS_WITHIN if isinstance(parts, _Assembly) else (0.0,):
+        mesh = parts.without_slivers(factor * tolerance) if isinstance(parts, _Assembly) else parts
+        if not len(mesh.faces):
             raise MeshingError("the solid is empty: no point of the box is inside")
         try:
-            return resolve_self_intersections(one, _MENDED_WITHIN * tolerance)
+            return resolve_self_intersections(mesh, _MENDED_WITHIN * tolerance)
         except SelfIntersectionError as error:
             if not is_retry_promising(error, raised):
                 raise
@@ -696,14 +703,14 @@ def _apart(parts: TriangleMesh | _Assembly, tolerance: float) -> TriangleMesh:
 
 @dataclass(frozen=True)
 class _Assembly:
-    """Parts put together, in a volume or in all of space."""
+    """Assembled parts, in a volume or in all of space."""
 
     whole: Manifold
     volume: Volume | None = None
 
     def without_slivers(self, length: float) -> TriangleMesh:
-        """The surface, short edges and slivers left out within a length, and bodies that are
-        nothing but rounding."""
+        """The surface without short edges and slivers, whose removal moves it by up to a length,
+        and without bodies that are only rounding error."""
         simpler = without_short_edges(self.whole, length) if length > 0 else self.whole
         surface = drop_degenerate_components(from_manifold(simpler))
         return surface if self.volume is None else _on_box(surface, self.volume)
@@ -716,15 +723,15 @@ def _assemble(
     if volume is None and is_single_level_set(solid):
         return mesher.mesh_smooth_level(solid, level)[0]
     lower, upper = mesher.lower, mesher.upper
-    whole = mesher.mesh_sublevel(solid, level)
+    manifold = mesher.mesh_sublevel(solid, level)
     mesher.report("putting the parts together")
     if volume is None:
         volume = Box(_point(lower), _point(upper))
-        ends = np.array(whole.bounding_box(), np.float64)
+        ends = np.array(manifold.bounding_box(), np.float64)
         if (ends[:3] > lower).all() and (ends[3:] < upper).all():
-            return _Assembly(whole, volume)
+            return _Assembly(manifold, volume)
     cut = volume_manifold(volume, lower, upper, mesher.tolerance)
-    return _Assembly(whole ^ cut, volume)
+    return _Assembly(manifold ^ cut, volume)
 
 
 def _bounds(solid: Solid, level: float, volume: Volume | None) -> tuple[FloatArray, FloatArray]:
@@ -759,7 +766,7 @@ def _point(x: FloatArray) -> tuple[float, float, float]:
 
 
 def _on_box(surface: TriangleMesh, volume: Volume) -> TriangleMesh:
-    """Vertices within rounding of a box's faces, put there."""
+    """The surface, with vertices within rounding of a box's faces put onto them."""
     boxes = volume.volumes if isinstance(volume, VolumeIntersection) else (volume,)
     vertices = surface.vertices
     for box in boxes:

@@ -25,30 +25,30 @@ SolidAtLevel: TypeAlias = tuple[Solid, float]
 def factor_common_operands(union: BooleanSolid, level: float) -> Solid | None:
     """Rewrite the solid {union <= level} as {another solid <= 0} with common operands factored out:
     (A & B) | (A & C) as A & (B | C). None if no two operands have anything in common."""
-    terms = [{_key(*one): one for one in _factors(part, level)} for part in union.parts]
-    most, times = Counter(key for term in terms for key in term).most_common(1)[0]
+    terms = [{_key(*factor): factor for factor in _factors(part, level)} for part in union.parts]
+    common_key, times = Counter(key for term in terms for key in term).most_common(1)[0]
     if times < 2:
         return None
-    sharing = [term for term in terms if most in term]
-    others = [_intersection(term.values()) for term in terms if most not in term]
+    sharing = [term for term in terms if common_key in term]
+    other_terms = [_intersection(term.values()) for term in terms if common_key not in term]
     shared = {key for key in sharing[0] if all(key in term for term in sharing)}
-    common = [_placed(*one) for key, one in sharing[0].items() if key in shared]
-    rests = [[one for key, one in term.items() if key not in shared] for term in sharing]
-    if all(rests):
-        common.append(_union([_intersection(rest) for rest in rests]))
-    made = BooleanSolid(tuple(common), is_union=False)
-    return _union([made, *others]) if others else made
+    common = [_placed(*factor) for key, factor in sharing[0].items() if key in shared]
+    remainders = [[factor for key, factor in term.items() if key not in shared] for term in sharing]
+    if all(remainders):
+        common.append(_union([_intersection(remainder) for remainder in remainders]))
+    intersection = BooleanSolid(tuple(common), is_union=False)
+    return _union([intersection, *other_terms]) if other_terms else intersection
 
 
 def flatten_csg(solid: BooleanSolid) -> BooleanSolid:
     """Flatten nested operations of the same kind, unions in a union or intersections in an
     intersection: everything that is cut away from an operand is then cut away at once."""
     parts: list[Solid] = []
-    for one in solid.parts:
-        if isinstance(one, BooleanSolid) and one.is_union == solid.is_union:
-            parts += flatten_csg(one).parts
+    for operand in solid.parts:
+        if isinstance(operand, BooleanSolid) and operand.is_union == solid.is_union:
+            parts += flatten_csg(operand).parts
         else:
-            parts.append(one)
+            parts.append(operand)
     return BooleanSolid(tuple(parts), solid.is_union)
 
 
@@ -58,30 +58,30 @@ def drop_cancelled_operands(solid: BooleanSolid, level: float) -> BooleanSolid |
     it is."""
     if solid.is_union:
         return solid
-    cut = {_key(one.field, -level) for one in solid.parts if isinstance(one, Complement)}
+    cut = {_key(term.field, -level) for term in solid.parts if isinstance(term, Complement)}
     parts: list[Solid] = []
-    for one in solid.parts:
-        if isinstance(one, BooleanSolid) and one.is_union:
-            kept = [part for part in flatten_csg(one).parts if _key(part, level) not in cut]
-            if not kept:
+    for term in solid.parts:
+        if isinstance(term, BooleanSolid) and term.is_union:
+            rest = [part for part in flatten_csg(term).parts if _key(part, level) not in cut]
+            if not rest:
                 return None
-            if len(kept) < len(flatten_csg(one).parts):
-                one = kept[0] if len(kept) == 1 else BooleanSolid(tuple(kept), is_union=True)
-        parts.append(one)
+            if len(rest) < len(flatten_csg(term).parts):
+                term = rest[0] if len(rest) == 1 else BooleanSolid(tuple(rest), is_union=True)
+        parts.append(term)
     return BooleanSolid(tuple(parts), is_union=False)
 
 
 def _factors(solid: Solid, level: float) -> list[SolidAtLevel]:
-    """Those whose intersection is where a solid is at most a level."""
+    """Solids and levels whose intersection is the set where a solid is at most a level."""
     if isinstance(solid, BooleanSolid) and not solid.is_union:
-        return [one for part in solid.parts for one in _factors(part, level)]
+        return [factor for part in solid.parts for factor in _factors(part, level)]
     if isinstance(solid, OffsetSolid):
         return _factors(solid.field, level + solid.distance)
     if isinstance(solid, SublevelSolid) and isinstance(solid.field, Solid):
         return _factors(solid.field, level)
     if isinstance(solid, TransformedSolid):
-        factor = solid.map.value_factor
-        return [_image(one, solid, at) for one, at in _factors(solid.field, level / factor)]
+        scale = solid.map.value_factor
+        return [_image(factor, solid, at) for factor, at in _factors(solid.field, level / scale)]
     if isinstance(solid, BandSolid) and isinstance(solid.field, Solid):
         half = solid.half_width + level
         if half > 0:
@@ -97,19 +97,19 @@ def _image(solid: Solid, of: TransformedSolid, level: float) -> SolidAtLevel:
 
 
 def _key(solid: Solid, level: float) -> Hashable:
-    """Equal of the same points, of the same field."""
+    """A key that is equal for equal sets of points of the same field."""
     if isinstance(solid, Complement):
         return "complement", _key(solid.field, -level)
     if isinstance(solid, OffsetSolid):
         return _key(solid.field, level + solid.distance)
     if isinstance(solid, TransformedSolid):
-        own = _key(solid.field, level / solid.map.value_factor)
-        return own, solid.map.matrix, solid.map.translation_vector
+        field_key = _key(solid.field, level / solid.map.value_factor)
+        return field_key, solid.map.matrix, solid.map.translation_vector
     return id(solid), level
 
 
 def _placed(solid: Solid, level: float) -> Solid:
-    """With the level 0."""
+    """The solid as a solid of level 0."""
     if level == 0:
         return solid
     if isinstance(solid, Complement):
@@ -123,8 +123,8 @@ def _intersection(factors: Iterable[SolidAtLevel]) -> Solid:
 
 
 def _union(parts: Sequence[Solid]) -> Solid:
-    """If there are complements, that of an intersection: what is cut away need not be made of all
-    of space."""
-    if any(isinstance(one, Complement) for one in parts):
-        return Complement(BooleanSolid(tuple(~one for one in parts), is_union=False))
+    """The union of solids. If there are complements, it is the complement of an intersection, so
+    that no solid has to be cut away from all of space."""
+    if any(isinstance(operand, Complement) for operand in parts):
+        return Complement(BooleanSolid(tuple(~operand for operand in parts), is_union=False))
     return BooleanSolid(tuple(parts), is_union=True)

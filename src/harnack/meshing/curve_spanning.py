@@ -1,7 +1,7 @@
 """Triangles of an angle's level set that end at its curve, in Delaunay's tetrahedra.
 
-Where a check fails in known places, cells are made smaller there alone and all is done again. Where
-that does not help, or the places are not known, cells are made smaller everywhere.
+Where a check fails in known places, cells are made smaller there alone and the mesh is computed
+again. Where that does not help, or the places are not known, cells are made smaller everywhere.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ from harnack.tree.empty_space import BoxCells
 
 __all__ = ["SpanningMesh", "mesh_spanning_curve", "restore_curve_edges"]
 
-# How far points are moved, at most, as a part of the edges of triangles beside them.
+# The largest move of a point, relative to the edges of triangles beside it.
 _SHALLOW = 0.1
 
 
@@ -65,11 +65,11 @@ def restore_curve_edges(
     Long edges of a curve are subdivided so that cells near them need not be as large. The extra
     points are moved off the edge into the surface, by at most the tolerance, and the gap is filled:
     the mesh then ends at the given curve. The filling triangles are thin, unavoidably: the surface
-    twists about the edge, and a triangle along all of it is within the tolerance only if it is
-    about that low.
+    twists about the edge, and a triangle along all of it is within the tolerance only if its height
+    is about the tolerance.
 
-    kept, cut: vertices before `kept` are those of the curve, those from there to `cut` are the
-        extra points on its edges.
+    kept, cut: vertices before `kept` are those of the curve; from there to `cut` they are the extra
+        points on its edges.
     height: how far the extra points are moved, at most.
     """
     if cut == kept:
@@ -78,17 +78,17 @@ def restore_curve_edges(
     chains: list[list[int]] = []
     for start in range(kept):
         chain = [start]
-        while (place := successor.get(chain[-1])) is not None:
-            chain.append(place)
-            if place < kept:
+        while (vertex := successor.get(chain[-1])) is not None:
+            chain.append(vertex)
+            if vertex < kept:
                 break
         if len(chain) > 2:
             chains.append(chain)
-    inner = np.array([place for chain in chains for place in chain[1:-1]], np.int64)
+    inner = np.array([vertex for chain in chains for vertex in chain[1:-1]], np.int64)
     if not len(inner):
         return vertices, faces
-    owner = np.repeat(np.arange(len(chains)), [len(one) - 2 for one in chains])
-    ends = np.array([(one[0], one[-1]) for one in chains], np.int64)
+    owner = np.repeat(np.arange(len(chains)), [len(path) - 2 for path in chains])
+    ends = np.array([(path[0], path[-1]) for path in chains], np.int64)
     vertices = vertices.copy()
     vertices[inner] = _push_inward(function, vertices, faces, inner, owner, ends, height)
     gaps = [face for chain in chains for face in _filling(chain)]
@@ -104,35 +104,35 @@ def _push_inward(
     ends: IntArray,
     height: float,
 ) -> FloatArray:
-    """Points (k, 3) `inner` of the edges owner (k,) with these ends (m, 2), moved off the edges and
-    onto the surface. The heights over an edge are one parabola, so that its filling lies below the
-    chain."""
-    here = vertices[inner]
+    """(n, 3) the vertices, with the points `inner` (k,) moved off their edges and onto the surface.
+    owner: (k,) the edge of each point; ends: (m, 2) the ends of the edges. The heights over an edge
+    are one parabola, so that its filling lies below the chain."""
+    points = vertices[inner]
     a, along = vertices[ends[:, 0]], vertices[ends[:, 1]] - vertices[ends[:, 0]]
     length = np.linalg.norm(along, axis=1)
     along, a = (along / length[:, None])[owner], a[owner]
-    share = ((here - a) * along).sum(axis=1) / length[owner]
+    fraction = ((points - a) * along).sum(axis=1) / length[owner]
     inward, shortest = np.zeros_like(vertices), np.full(len(vertices), np.inf)
     for k in range(3):
-        place, one, other = (faces[:, (k + j) % 3] for j in range(3))
-        np.add.at(inward, place, vertices[one] + vertices[other] - 2 * vertices[place])
-        for end in (one, other):
-            span = np.linalg.norm(vertices[end] - vertices[place], axis=1)
-            np.minimum.at(shortest, place, span)
-    most = np.full(len(ends), height)
-    np.minimum.at(most, owner, _SHALLOW * shortest[inner])
-    far = 4 * share * (1 - share) * most[owner]
-    way = _across(inward[inner], along)
-    start = here + far[:, None] * way
-    there = newton_to_level(function, start, function.sample(start), 0.3 * far, None)
-    # Points keep their place along the edge and their distance from it: they are turned about it.
-    turned = _across(there - here, along)
-    good = (turned * way).sum(axis=1) > 0.3
-    return here + far[:, None] * np.where(good[:, None], turned, way)
+        corner, second, third = (faces[:, (k + j) % 3] for j in range(3))
+        np.add.at(inward, corner, vertices[second] + vertices[third] - 2 * vertices[corner])
+        for end in (second, third):
+            span = np.linalg.norm(vertices[end] - vertices[corner], axis=1)
+            np.minimum.at(shortest, corner, span)
+    max_height = np.full(len(ends), height)
+    np.minimum.at(max_height, owner, _SHALLOW * shortest[inner])
+    lift = 4 * fraction * (1 - fraction) * max_height[owner]
+    direction = _across(inward[inner], along)
+    start = points + lift[:, None] * direction
+    projected = newton_to_level(function, start, function.sample(start), 0.3 * lift, None)
+    # Points keep their position along the edge and their distance from it: they turn about it.
+    turned = _across(projected - points, along)
+    is_close = (turned * direction).sum(axis=1) > 0.3
+    return points + lift[:, None] * np.where(is_close[:, None], turned, direction)
 
 
 def _across(vectors: FloatArray, along: FloatArray) -> FloatArray:
-    """The unit vectors (k, 3) of parts of vectors at right angles to unit vectors."""
+    """The unit vectors (k, 3) of the components of vectors at right angles to unit vectors."""
     part = vectors - (vectors * along).sum(axis=1)[:, None] * along
     return part / np.maximum(np.linalg.norm(part, axis=1), 1e-300)[:, None]
 
@@ -151,15 +151,16 @@ def _filling(chain: list[int]) -> list[tuple[int, int, int]]:
 
 # The whole surface.
 
-# How often all is done again because finished triangles fail.
+# How often the mesh is computed again because finished triangles fail.
 _MOST_ATTEMPTS = 4
-# How often cells are made smaller where the first triangles fail, before that is done everywhere.
+# How often cells are made smaller where the first triangles fail, before they are made smaller
+# everywhere.
 _MOST_LOCAL = 4
 # Edges of a curve that are longer than this many cells are cut.
 _LONGEST = 2.5
 # How often edges of a curve that are too near to others are halved.
 _MOST_CUTS = 4
-# The size of smaller cells everywhere, as a part of that before.
+# The ratio of the size of smaller cells everywhere to the size before.
 _SMALLER = 0.6
 
 
@@ -189,10 +190,10 @@ class SpanningMesh:
 
 @dataclass(frozen=True)
 class _SpanningInput:
-    """What is to be filled, with what.
+    """The function and the box in which its level set is meshed.
 
     lower, upper: (3,) the box.
-    walls: the same, where the surface may end there, or None.
+    walls: the same box, if the surface may end at its faces, or None.
     """
 
     function: LevelFunction
@@ -213,14 +214,16 @@ def mesh_spanning_curve(
     tolerance: float,
     report: Callable[[str], None],
 ) -> SpanningMesh:
-    """Triangles within the tolerance, none of which pass through others; where some do, or are
-    turned over, cells are made smaller and all is done again.
+    """The mesh of an angle's level set within the tolerance, none of whose triangles pass through
+    each other; where triangles do, or are turned over, cells are made smaller and the mesh is
+    computed again.
 
-    attempts: how many spacings are tried, each smaller than the one before. box: to be filled.
-        has_walls: whether the surface may end at the box's faces. tolerance: a length.
+    attempts: the number of spacings that are tried, each smaller than the spacing before.
+    box: the box that cells fill. has_walls: whether the surface may end at its faces.
+    tolerance: a length.
 
     Raises:
-        MeshingError: it could not be done.
+        MeshingError: no mesh passes the checks.
     """
     task = _SpanningInput(function, *box, box if has_walls else None, seed, report)
     walls = task.walls
@@ -236,20 +239,20 @@ def mesh_spanning_curve(
         vertices, faces = refine(function, vertices, faces, tolerance, walls, report)
         vertices, faces = improve(function, vertices, faces, tolerance, walls, report)
         turned = misoriented_faces(function, vertices, faces)
-        kept = sum(map(len, _loops(function)))
+        curve_count = sum(map(len, _loops(function)))
         vertices, faces = restore_curve_edges(
-            function, vertices, faces, kept, len(first.curve.points), tolerance
+            function, vertices, faces, curve_count, len(first.curve.points), tolerance
         )
         check_manifold(faces)
         crossing = intersecting_faces(vertices, faces)
         if not len(crossing) and (best is None or len(turned) < best.turned):
             best = dataclasses.replace(first, vertices=vertices, faces=faces, turned=len(turned))
-        bad = np.union1d(crossing, turned)
-        if not len(bad):
+        failing = np.union1d(crossing, turned)
+        if not len(failing):
             break
         if attempt < _MOST_ATTEMPTS - 1:
-            report(f"{len(bad)} triangles fail: smaller cells there")
-            finer = (*finer, RefinementBalls(vertices[faces[bad]].mean(axis=1), spacing))
+            report(f"{len(failing)} triangles fail: smaller cells there")
+            finer = (*finer, RefinementBalls(vertices[faces[failing]].mean(axis=1), spacing))
     if best is None:
         raise MeshingError(
             f"{len(crossing)} triangles pass through others, in cells as small as "
@@ -266,8 +269,8 @@ def _loops(function: LevelFunction) -> tuple[FloatArray, ...]:
 def _first_surface(
     task: _SpanningInput, spacing: float, attempts: int, finer: tuple[RefinementBalls, ...]
 ) -> SpanningMesh:
-    """Triangles in cells of that spacing, smaller where they have to be; or where that fails, in
-    smaller ones everywhere."""
+    """The mesh in cells of that spacing, smaller where necessary; or where that fails, in smaller
+    cells everywhere."""
     task.report(f"cells of {spacing:.3g}")
     local = finer
     try:
@@ -287,15 +290,15 @@ def _first_surface(
 def _in_cells(
     task: _SpanningInput, spacing: float, finer: tuple[RefinementBalls, ...]
 ) -> SpanningMesh:
-    """Triangles in cells of that spacing, split in some places, with what is proved of them.
+    """The mesh in cells of that spacing, split in the balls `finer`, and its proved isotopy.
 
     Raises:
         MeshingError: checks that fail, or edges of the curve that are in no tetrahedron.
     """
     function, walls = task.function, task.walls
     curve = BoundaryCurve.of(_loops(function), _LONGEST * spacing)
-    for k, places in enumerate(finer):  # balls on long edges leave no room for points
-        curve = curve.split_near(places, spacing * 0.5**k)
+    for k, balls in enumerate(finer):  # balls on long edges leave no room for points
+        curve = curve.split_near(balls, spacing * 0.5**k)
     margin = 0.5 * spacing if walls is None else 0.0
     root = box_cells(task.lower - margin, task.upper + margin, spacing, exact=walls is not None)
     curve, points, tets = _tetrahedralize(task, root, curve, finer)
@@ -317,7 +320,8 @@ def _tetrahedralize(
     curve: BoundaryCurve,
     finer: tuple[RefinementBalls, ...],
 ) -> tuple[BoundaryCurve, TetrahedronPoints, Tetrahedra]:
-    """Tetrahedra that have all edges of the curve, which is cut where others are too near."""
+    """Tetrahedra that have all edges of the curve, whose edges are cut where others are too
+    near."""
     for _ in range(_MOST_CUTS):
         points = sample_delaunay_points(task.function, root, curve, task.walls, task.seed, finer)
         tets = delaunay(points.points)
@@ -336,14 +340,14 @@ def _check_boundary(
 ) -> None:
     edges = boundary_edges(faces)
     count = max(int(faces.max()) + 1, len(curve.points))
-    if walls is not None:  # where the surface ends as well
-        slack = 1e-9 * (walls[1] - walls[0])
+    if walls is not None:  # the surface ends there as well
+        margin = 1e-9 * (walls[1] - walls[0])
         near = np.minimum(np.abs(vertices - walls[0]), np.abs(vertices - walls[1]))
-        on = np.asarray((near <= slack).any(axis=1))
+        on = np.asarray((near <= margin).any(axis=1))
         edges = edges[~on[edges].all(axis=1)]
-    wrong = np.setxor1d(edge_keys(edges, count), edge_keys(curve.edges, count))
-    if len(wrong):
-        ends = np.stack(np.divmod(wrong, count), axis=1)
+    unmatched = np.setxor1d(edge_keys(edges, count), edge_keys(curve.edges, count))
+    if len(unmatched):
+        ends = np.stack(np.divmod(unmatched, count), axis=1)
         raise LocalizedMeshingError(
             "the mesh does not end at the curve: cells are too large for it; choose a smaller "
             "`cell_size`",

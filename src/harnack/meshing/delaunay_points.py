@@ -1,5 +1,5 @@
-"""Chooses the points of a Delaunay triangulation around a level set: those of an octree around it,
-and the boundary curve it ends on.
+"""The points of a Delaunay triangulation around a level set: those of an octree around it, and the
+boundary curve it ends on.
 
 Vertices of the curve are points as they are. Other points keep so far from it that no point lies in
 the ball with an edge of the curve as diameter, so that every edge of the curve is an edge of the
@@ -29,14 +29,15 @@ __all__ = [
     "sample_delaunay_points",
 ]
 
-# All in parts of the size of a cell, by experiment.
+# All relative to the size of a cell, by experiment.
 _JITTER = 1e-3  # no five points on a sphere
 _SNAPPED = 0.3  # points this near to the level are moved onto it
 _MIN_CURVE_DISTANCE = 0.45  # no other points are so near to the curve
 _MOST_CELLS = 4_000_000
-# A step of Newton's method that is shorter is the last: a part of the longest one.
+# A step of Newton's method that is shorter than this, relative to the longest step, is the last.
 _CONVERGED = 1e-9
-# How often the way to a multiple root is continued as a geometric series, and the rates of that.
+# How often steps to a multiple root are continued as a geometric series, and the range of its
+# rates.
 _SERIES, _RATES = 4, (0.4, 0.97)
 _CORNERS = np.array(list(itertools.product((0.0, 1.0), repeat=3)))
 
@@ -46,7 +47,7 @@ class RefinementBalls:
     """Balls in which cells are subdivided once more.
 
     points: (n, 3) their centers.
-    radius: of all of them.
+    radius: of all balls.
     """
 
     points: FloatArray
@@ -56,7 +57,7 @@ class RefinementBalls:
         """(k,) whether balls about points (k, 3) meet any of these balls."""
         if not len(centers):
             return np.zeros(0, np.bool_)
-        import scipy.spatial  # here: half a second that few need
+        import scipy.spatial  # imported here: it takes half a second
 
         searching: Any = scipy.spatial
         apart: FloatArray = searching.cKDTree(self.points).query(centers)[0]
@@ -78,20 +79,20 @@ class BoundaryCurve:
         """A curve of closed loops, their vertices first and in their order; edges longer than
         `longest` are divided into equal parts."""
         points = [*loops]
-        more: list[FloatArray] = []
+        inner_points: list[FloatArray] = []
         edges: list[tuple[int, int]] = []
         first, last = 0, sum(map(len, loops))
         for loop in loops:
             for k, (a, b) in enumerate(zip(loop, np.roll(loop, -1, axis=0), strict=True)):
                 parts = max(1, math.ceil(float(np.linalg.norm(b - a)) / longest))
                 inner = a + (np.arange(1, parts)[:, None] / parts) * (b - a)
-                more.append(inner)
+                inner_points.append(inner)
                 ends = [first + k, *range(last, last + parts - 1), first + (k + 1) % len(loop)]
                 edges += itertools.pairwise(ends)
                 last += parts - 1
             first += len(loop)
         pairs = np.array(edges, np.int64).reshape(-1, 2)
-        return cls(np.concatenate([*points, *more, np.zeros((0, 3))]), pairs)
+        return cls(np.concatenate([*points, *inner_points, np.zeros((0, 3))]), pairs)
 
     def split(self, which: BoolArray) -> BoundaryCurve:
         """The curve with the midpoints of the edges that the mask `which` (k,) selects as
@@ -163,8 +164,8 @@ def sample_delaunay_points(
 ) -> TetrahedronPoints:
     """Points for the tetrahedra: see the module's docstring.
 
-    walls: a box whose faces points on them do not leave. finer: where leaves of the octree are
-    split again, once for each of the entries that they meet.
+    walls: a box; points on its faces stay on them. finer: where leaves of the octree are split
+        again, once for each entry that they meet.
 
     Raises MemoryError for more than four million cells.
     """
@@ -183,7 +184,7 @@ def sample_delaunay_points(
     n = len(boundary.points)
     zeros = LevelSamples(np.zeros(n), np.zeros((n, 3)), np.zeros(n))
     together = [
-        np.concatenate([getattr(one, name) for one in (zeros, samples)])
+        np.concatenate([getattr(batch, name) for batch in (zeros, samples)])
         for name in ("value", "gradient", "quarter_period_radius")
     ]
     return TetrahedronPoints(
@@ -196,62 +197,62 @@ def sample_delaunay_points(
 def _finer_cells(
     function: LevelFunction, leaves: BoxCells, finer: tuple[RefinementBalls, ...]
 ) -> list[BoxCells]:
-    """Cells that leaves are split into, smallest first; those proved empty are left out."""
+    """The cells that leaves are split into, smallest first, without cells that are proved empty."""
     pool = [leaves]
-    for places in finer:
+    for balls in finer:
         split: list[BoxCells] = []
         for cells in pool:
-            halves = cells.subset(places.meet(cells.centers, cells.half_diagonal)).octants()
+            halves = cells.subset(balls.meet(cells.centers, cells.half_diagonal)).octants()
             split.append(halves.subset(~halves.is_proved_empty(function.clearance)))
         pool += split
-    found = [cells for cells in pool[1:] if len(cells.corners)]
-    return sorted(found, key=lambda cells: float(cells.size.max()))
+    nonempty = [cells for cells in pool[1:] if len(cells.corners)]
+    return sorted(nonempty, key=lambda cells: float(cells.size.max()))
 
 
 def _corners_and_centers(
     tree: RefinedCells, finer: list[BoxCells]
 ) -> tuple[FloatArray, FloatArray]:
-    """Points (n, 3), each once: corners of all cells, and centers of leaves and of `finer` ones;
-    and the size (n,) of the smallest cell at each."""
+    """Points (n, 3), each once: corners of all cells, and centers of leaves and of cells in
+    `finer`; and the size (n,) of the smallest cell at each."""
     leaves = [*finer, tree.occupied]
     points = [cells.centers for cells in leaves]
     sizes = [np.full(len(cells.corners), float(cells.size.max())) for cells in leaves]
-    for some in [*leaves, *reversed(tree.empty)]:
-        corners = (some.corners[:, None] + _CORNERS * some.size).reshape(-1, 3)
+    for layer in [*leaves, *reversed(tree.empty)]:
+        corners = (layer.corners[:, None] + _CORNERS * layer.size).reshape(-1, 3)
         points.append(corners)
-        sizes.append(np.full(len(corners), float(some.size.max())))
+        sizes.append(np.full(len(corners), float(layer.size.max())))
     x, size = np.concatenate(points), np.concatenate(sizes)
     order = np.argsort(size, kind="stable")
     x, size = x[order], size[order]
     steps: FloatArray = (x - x.min(axis=0)) / (0.25 * leaves[0].size)
     keys = np.rint(steps).astype(np.int64)
-    # Of points at one place the first, which is that of the smallest cell.
+    # Of equal points the first, which is that of the smallest cell.
     first: IntArray = np.sort(np.unique(keys, axis=0, return_index=True)[1])
     return x[first], size[first]
 
 
 def _is_far(points: FloatArray, free: FloatArray, boundary: BoundaryCurve) -> BoolArray:
-    """Whether points are farther from the curve than `free` (n,), and out of the balls on its edges
-    as diameters."""
+    """(n,) whether points are farther from the curve than `free` (n,), and outside of the balls
+    with its edges as diameters."""
     if not len(boundary.edges):
         return np.ones(len(points), np.bool_)
-    import scipy.spatial  # here: half a second that few need
+    import scipy.spatial  # imported here: it takes half a second
 
     searching: Any = scipy.spatial
     a, b = (boundary.points[boundary.edges[:, k]] for k in (0, 1))
     middle, half = 0.5 * (a + b), 0.5 * row_norms(b - a)
     near = np.full(len(points), np.inf)
     is_far = np.ones(len(points), np.bool_)
-    # Curves may have edges of any lengths: those of one size at a time.
+    # Curves may have edges of any lengths: edges of one size are examined at a time.
     octave = np.floor(np.log2(half))
-    for one in np.unique(octave):
-        rows = np.flatnonzero(octave == one)
-        few = min(8, len(rows))
-        found: IntArray = searching.cKDTree(middle[rows]).query(points, k=few)[1]
-        index = rows[found.reshape(len(points), few)]
+    for exponent in np.unique(octave):
+        rows = np.flatnonzero(octave == exponent)
+        neighbor_count = min(8, len(rows))
+        nearest: IntArray = searching.cKDTree(middle[rows]).query(points, k=neighbor_count)[1]
+        index = rows[nearest.reshape(len(points), neighbor_count)]
         e, w = (b - a)[index], points[:, None] - a[index]
-        share = np.clip((w * e).sum(axis=2) / (e * e).sum(axis=2), 0, 1)
-        gap = np.linalg.norm(w - share[..., None] * e, axis=2)
+        fraction = np.clip((w * e).sum(axis=2) / (e * e).sum(axis=2), 0, 1)
+        gap = np.linalg.norm(w - fraction[..., None] * e, axis=2)
         away = np.linalg.norm(points[:, None] - middle[index], axis=2)
         near = np.minimum(near, gap.min(axis=1))
         is_far &= (away > 1.1 * half[index]).all(axis=1)
@@ -260,8 +261,8 @@ def _is_far(points: FloatArray, free: FloatArray, boundary: BoundaryCurve) -> Bo
 
 def _off_walls(points: FloatArray, walls: tuple[FloatArray, FloatArray]) -> FloatArray:
     """(n, 3): 0 in directions in which a point on a face of the box would leave it, else 1."""
-    slack = 1e-9 * (walls[1] - walls[0])
-    on = (np.abs(points - walls[0]) <= slack) | (np.abs(points - walls[1]) <= slack)
+    margin = 1e-9 * (walls[1] - walls[0])
+    on = (np.abs(points - walls[0]) <= margin) | (np.abs(points - walls[1]) <= margin)
     return np.where(on, 0.0, 1.0)
 
 
@@ -274,18 +275,19 @@ def _snapped(
     boundary: BoundaryCurve,
     walls: tuple[FloatArray, FloatArray] | None,
 ) -> tuple[FloatArray, LevelSamples, BoolArray]:
-    """Points, with those near the level moved onto it, their samples, and which are on it."""
+    """The points, with points near the level moved onto it; their samples; and which are on the
+    level."""
     near = np.flatnonzero(samples.distance < _SNAPPED * size)
     moved = newton_to_level(function, points[near], samples.select(near), 0.25 * size[near], walls)
-    there = function.sample(moved)
+    new_samples = function.sample(moved)
     apart = row_norms(moved - points[near])
-    steep = row_norms(there.gradient)
-    good = np.abs(there.value) < 1e-9 * np.maximum(steep * size[near], 1e-300)
-    good &= (apart < 1.5 * _SNAPPED * size[near]) & _is_far(moved, free[near], boundary)
-    rows = near[good]
+    steep = row_norms(new_samples.gradient)
+    converged = np.abs(new_samples.value) < 1e-9 * np.maximum(steep * size[near], 1e-300)
+    converged &= (apart < 1.5 * _SNAPPED * size[near]) & _is_far(moved, free[near], boundary)
+    rows = near[converged]
     points, is_on = points.copy(), np.zeros(len(points), np.bool_)
-    points[rows], is_on[rows] = moved[good], True
-    return points, samples.replaced(rows, there.select(good)), is_on
+    points[rows], is_on[rows] = moved[converged], True
+    return points, samples.replaced(rows, new_samples.select(converged)), is_on
 
 
 def newton_to_level(
@@ -297,21 +299,21 @@ def newton_to_level(
     steps: int = 5,
 ) -> FloatArray:
     """Points (n, 3) after steps of Newton's method along the gradient towards the level, each no
-    longer than `longest` (n,). On walls they stay on them. Points are left alone after a step that
-    was so short that the next one, of its square, would be lost in rounding; and where there is no
-    finite step, as beside a pole."""
+    longer than `longest` (n,). Points on walls stay on them. Points are no longer moved after a
+    step so short that the next step, of the order of its square, would be lost in rounding; and
+    where there is no finite step, as beside a pole."""
     x, rows = points.copy(), np.arange(len(points))
     for k in range(steps):
-        here = x[rows]
-        g = samples.gradient if walls is None else samples.gradient * _off_walls(here, walls)
+        current = x[rows]
+        g = samples.gradient if walls is None else samples.gradient * _off_walls(current, walls)
         square = row_dots(g, g)
         with np.errstate(invalid="ignore", over="ignore"):
             move = -(samples.value / np.maximum(square, 1e-300))[:, None] * g
             length = row_norms(move)
         lost = ~np.isfinite(length)
         move[lost], length[lost] = 0.0, 0.0
-        there = here + move * np.minimum(1, longest[rows] / np.maximum(length, 1e-300))[:, None]
-        x[rows] = there if walls is None else np.clip(there, *walls)
+        moved = current + move * np.minimum(1, longest[rows] / np.maximum(length, 1e-300))[:, None]
+        x[rows] = moved if walls is None else np.clip(moved, *walls)
         rows = rows[length > _CONVERGED * longest[rows]]
         if k == steps - 1 or not len(rows):
             break
@@ -322,8 +324,9 @@ def newton_to_level(
 def to_multiple_roots(
     function: LevelFunction, points: FloatArray, samples: LevelSamples, longest: FloatArray
 ) -> FloatArray:
-    """Points (n, 3) after steps towards the level as long as it takes where f - level is a power
-    u^m, to which Newton's shrink by 1 - 1/m only: to where a geometric series of two ends."""
+    """Points (n, 3) after steps towards the level where f - level is a power u^m, for which
+    Newton's steps shrink only by 1 - 1/m: each step goes to the limit of the geometric series of
+    two of Newton's steps."""
     x = points
     for k in range(_SERIES):
         first = newton_to_level(

@@ -58,22 +58,22 @@ def distances_from_triangles(points: FloatArray, corner: FloatArray) -> FloatArr
     """(k,) the distance (at most) of each of k points (k, 3), or of a single point (3,), from the
     triangle of the same index (k, 3, 3): from its plane where the projection of the point is within
     the triangle, and from its edges."""
-    least = np.full(len(corner), np.inf)
+    distance = np.full(len(corner), np.inf)
     for k in range(3):
-        start, way = corner[:, k], corner[:, k - 1] - corner[:, k]
-        share = row_dots(points - start, way) / np.maximum(row_dots(way, way), 1e-300)
-        foot = start + np.clip(share, 0, 1)[:, None] * way
-        least = np.minimum(least, row_norms(points - foot))
+        start, edge = corner[:, k], corner[:, k - 1] - corner[:, k]
+        fraction = row_dots(points - start, edge) / np.maximum(row_dots(edge, edge), 1e-300)
+        foot = start + np.clip(fraction, 0, 1)[:, None] * edge
+        distance = np.minimum(distance, row_norms(points - foot))
     normal = area_normals(corner)
     size = row_norms(normal)
-    is_within = size > 0  # what has no area has edges alone
+    is_within = size > 0  # a triangle without an area has edges alone
     size = np.maximum(size, 1e-300)
     height = row_dots(points - corner[:, 0], normal) / size
     foot = points - (height / size)[:, None] * normal
     for k in range(3):
         side = np.cross(corner[:, (k + 1) % 3] - corner[:, k], foot - corner[:, k])
         is_within &= row_dots(side, normal) >= 0
-    return np.where(is_within, np.minimum(least, np.abs(height)), least)
+    return np.where(is_within, np.minimum(distance, np.abs(height)), distance)
 
 
 @dataclass(frozen=True)
@@ -107,8 +107,8 @@ class Edges:
 
 def edge_keys(pairs: IntArray, count: int) -> IntArray:
     """(k,) a key for each pair (k, 2) of `count` points, the same in either order."""
-    one, other = pairs.T
-    return np.minimum(one, other) * count + np.maximum(one, other)
+    first, second = pairs.T
+    return np.minimum(first, second) * count + np.maximum(first, second)
 
 
 def half_edges(faces: IntArray) -> IntArray:
@@ -137,7 +137,7 @@ def unique_with_inverse(keys: IntArray) -> tuple[IntArray, IntArray, IntArray, I
     if int(keys.max(initial=0)) >> (62 - bits):
         order = np.argsort(keys, kind="stable")
         ordered = keys[order]
-    else:  # numbers and places in one word, since sorting is far faster than `argsort`
+    else:  # keys and indices in one word, since sorting is far faster than `argsort`
         both = np.sort((keys << bits) | np.arange(len(keys)))
         order, ordered = both & ((1 << bits) - 1), both >> bits
     is_first = np.ones(len(keys), np.bool_)

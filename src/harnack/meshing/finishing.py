@@ -33,18 +33,19 @@ if TYPE_CHECKING:
 
 __all__ = ["check_options", "simplify_mesh", "thicken", "to_trimesh", "vertex_normals"]
 
-# This part of the area may turn over where the two sides are made: slivers.
+# The fraction of the area that may turn over on the two sides: slivers.
 _TURNED = 1e-2
-# Hulls are made of at most this many triangles.
+# The largest number of triangles whose hulls are computed.
 _MOST_HULLS = 20_000
-# Half the thickness is beyond the reach if a side comes nearer to the surface than this part of it.
+# Half the thickness is beyond the reach if a side comes nearer to the surface than this fraction of
+# it.
 _NEAR = 0.98
 
 
 def thicken(
     surface: TriangleMesh, normals: FloatArray, thickness: float, tolerance: float
 ) -> tuple[TriangleMesh, dict[str, Any]]:
-    """A closed part of a given thickness around a surface, and how it was made: `thickened_by` is
+    """A closed part of a given thickness around a surface, and facts about it: `thickened_by` is
     "offset" or "hulls of balls".
 
     Where the surface's reach is larger than half of the thickness t (no point that near has two
@@ -55,8 +56,8 @@ def thicken(
     other, the part is the union of the convex hulls of three balls around the corners of each
     triangle: all points within t/2, with a round boundary.
 
-    normals: (n, 3), of unit length, on the side that faces are seen counter-clockwise from.
-    tolerance: of the balls' polyhedra, and of the triangles given, a length.
+    normals: (n, 3), of unit length, on the side from which faces run counter-clockwise.
+    tolerance: of the balls' polyhedra, and of the surface's triangles, a length.
 
     Raises:
         MeshingError: the part is far thicker than triangles are large, of which there are too many.
@@ -76,7 +77,7 @@ def thicken(
 
 
 def _offset(surface: TriangleMesh, normals: FloatArray, thickness: float) -> TriangleMesh:
-    """Both sides, and walls along the boundary."""
+    """The closed surface of both sides and of walls along the boundary."""
     n = len(surface.vertices)
     move = 0.5 * thickness * normals / _normal_cosines(surface, normals)[:, None]
     a, b = boundary_edges(surface.faces).T
@@ -104,28 +105,29 @@ def _normal_cosines(surface: TriangleMesh, normals: FloatArray) -> FloatArray:
 def _reason_beyond_reach(
     surface: TriangleMesh, normals: FloatArray, thickness: float
 ) -> str | None:
-    """Why half of the thickness is more than the surface's reach; None if nothing shows that."""
-    import scipy.spatial  # here: half a second that few need
+    """The reason why half of the thickness exceeds the surface's reach; None if nothing shows
+    that."""
+    import scipy.spatial  # imported here: it takes half a second
 
     searching: Any = scipy.spatial
     half = 0.5 * thickness
     flat = area_normals(surface.vertices[surface.faces])
     areas = np.linalg.norm(flat, axis=1)
     tree = searching.cKDTree(surface.vertices)
-    own = np.arange(len(surface.vertices))
-    few = min(16, len(own))
-    neighbors = sorted_unique(edge_keys(half_edges(surface.faces), len(own)))
+    vertex_ids = np.arange(len(surface.vertices))
+    neighbor_count = min(16, len(vertex_ids))
+    neighbors = sorted_unique(edge_keys(half_edges(surface.faces), len(vertex_ids)))
     for sign in (1, -1):
         side = surface.vertices + sign * half * normals
         turned = (area_normals(side[surface.faces]) * flat).sum(axis=1) <= 0
-        if areas[turned].sum() > _TURNED * areas.sum():  # less are slivers
+        if areas[turned].sum() > _TURNED * areas.sum():  # a smaller area is slivers
             return f"{turned.sum()} triangles turn over: the surface bends more than 1/{half:.3g}"
-        # Nearer than the vertex that a point was moved from are at most its neighbors.
-        away, other = tree.query(side, k=few)
-        pairs = np.stack([np.broadcast_to(own[:, None], other.shape), other], axis=-1)
+        # At most the neighbors of the vertex that a point was moved from are nearer to the point.
+        away, nearest = tree.query(side, k=neighbor_count)
+        pairs = np.stack([np.broadcast_to(vertex_ids[:, None], nearest.shape), nearest], axis=-1)
         near = (away < _NEAR * half) & (pairs[..., 0] != pairs[..., 1])
-        found = sorted_unique(edge_keys(pairs[near], len(own)))
-        count = int((~np.isin(found, neighbors)).sum())
+        near_keys = sorted_unique(edge_keys(pairs[near], len(vertex_ids)))
+        count = int((~np.isin(near_keys, neighbors)).sum())
         if count:
             return f"{count} points of a side are nearer to another place than to their own"
     return None
@@ -134,7 +136,7 @@ def _reason_beyond_reach(
 def _hulls(surface: TriangleMesh, radius: float, tolerance: float, why: str) -> TriangleMesh:
     """The union of the hulls of three balls around the corners of each triangle.
 
-    Balls are polyhedra with corners on the sphere, so that the part is inside of what it should be,
+    Balls are polyhedra with corners on the sphere, so that the part lies inside of the exact one,
     by at most `tolerance` or a tenth of the radius.
     """
     from manifold3d import Manifold, OpType
@@ -160,7 +162,8 @@ def _hulls(surface: TriangleMesh, radius: float, tolerance: float, why: str) -> 
 
 # The cosine of the angle between normals from which on an edge is a crease.
 _CREASE = math.cos(math.radians(30))
-# What simplification may move a surface by, and mending it then, as parts of the tolerance.
+# How far simplification may move a surface, and how far mending may then, relative to the
+# tolerance.
 _SIMPLER, _MENDED = (0.4, 0.2, 0.1), 0.05
 
 
@@ -186,10 +189,10 @@ def vertex_normals(function: LevelFunction, surface: TriangleMesh) -> FloatArray
     steep: FloatArray = np.linalg.norm(slope, axis=1)
     slope = slope / np.maximum(steep, 1e-300)[:, None]
     # Beside the curve slopes turn within a triangle.
-    good = np.isfinite(steep) & (steep > 0) & ((slope * mean).sum(axis=1) > 0.7)
+    is_reliable = np.isfinite(steep) & (steep > 0) & ((slope * mean).sum(axis=1) > 0.7)
     if function.period is not None:
-        good[np.unique(boundary_edges(surface.faces))] = False
-    chosen: FloatArray = np.where(good[:, None], slope, mean)
+        is_reliable[np.unique(boundary_edges(surface.faces))] = False
+    chosen: FloatArray = np.where(is_reliable[:, None], slope, mean)
     return chosen
 
 
@@ -198,12 +201,13 @@ def simplify_mesh(
 ) -> tuple[TriangleMesh, dict[str, Any]]:
     """A closed surface with fewer triangles, or as it is where that cannot be.
 
-    manifold3d's simplification: vertices are a part of those before. It moves the surface by less
-    than a part of the tolerance, half of which is for all else. Where triangles then pass through
-    each other they are mended; what cannot be, or does not pass the check, is done with a smaller
-    part.
+    The method is manifold3d's simplification, which keeps some of the vertices. It moves the
+    surface by less than a fraction of the tolerance, half of which is for all other errors. Where
+    triangles then pass through each other they are mended; where that fails, or the check does, a
+    smaller fraction is tried.
 
-    check: of a surface of which no triangles pass through each other.
+
+    check: checks a surface none of whose triangles pass through each other.
     """
     facts = {"triangles_before_simplification": len(surface.faces)}
     solid = to_manifold(surface)
@@ -229,20 +233,20 @@ def to_trimesh(surface: TriangleMesh, facts: dict[str, Any], is_closed: bool) ->
     """
     from harnack.meshing.closed_mesh import ClosedMesh
 
-    made = ClosedMesh(surface.vertices, surface.faces, process=False, validate=False)
+    mesh = ClosedMesh(surface.vertices, surface.faces, process=False, validate=False)
     pairs = half_edges(surface.faces)
     edges = Edges.of(pairs)
     boundary = pairs[edges.multiplicity[edges.edge_of_pair] == 1]
     if is_closed:
-        volume = float(made.volume)
+        volume = float(mesh.volume)
         if len(boundary) or not volume > 0:
             raise MeshingError(
                 "the part did not close, or is inside out: choose a smaller `cell_size`"
             )
         facts = {**facts, "volume": volume}
-    elif not len(boundary) and made.volume < 0:  # f is larger inside
-        made.invert()
-    made.metadata["harnack"] = {
+    elif not len(boundary) and mesh.volume < 0:  # f is larger inside
+        mesh.invert()
+    mesh.metadata["harnack"] = {
         "proved": 0,
         "integrated": 0,
         **facts,
@@ -250,7 +254,7 @@ def to_trimesh(surface: TriangleMesh, facts: dict[str, Any], is_closed: bool) ->
         "boundary": boundary,
         "creases": _creases(surface, edges),
     }
-    return made
+    return mesh
 
 
 def _creases(surface: TriangleMesh, edges: Edges) -> int:

@@ -55,12 +55,12 @@ __all__ = [
 ]
 
 _LEVEL = 2 * math.pi
-# Cells across the holes at first.
+# The initial number of cells across the holes.
 _ACROSS = 24
-# How often edges of holes that are too near to others are halved for the tetrahedra; but not to
-# more pieces than that, and so many for each edge: as many are cut where edges lie on each other.
+# How often edges of holes that are too near to others are halved for the tetrahedra; and the
+# largest number of pieces, in all and for each edge: so many arise where edges lie on each other.
 _MOST_CUTS, _MOST_PIECES, _MOST_PER_EDGE = 12, 20_000, 64
-# How often patches that meet the mesh are made again, of smaller cells.
+# How often patches that meet the mesh are computed again, with smaller cells.
 _MOST_MET = 1
 # How far w may be from 1/2, modulo 1, at vertices of patches.
 _NEAR = 1e-6
@@ -70,9 +70,9 @@ _NEAR = 1e-6
 class HoleFillingOptions:
     """Options of harmonic hole fillings.
 
-    tolerance: how far they may be from the surface, relative to the size of the box around all
+    tolerance: how far fillings may be from the surface, relative to the size of the box around all
         holes.
-    spacing: of cells at first, or None.
+    spacing: the initial size of cells, or None.
     seed: of random moves.
     attempts: how many sizes of cells are tried.
     """
@@ -110,7 +110,7 @@ def harmonic_patches(
     fillings of the other holes.
 
     Raises:
-        MeshingError: they could not be computed, or intersect the mesh or each other.
+        MeshingError: fillings could not be computed, or intersect the mesh or each other.
     """
     try:
         return _fill_all_holes(vertices, faces, edges, asked)
@@ -122,19 +122,19 @@ def harmonic_patches(
     asked.report(f"once more, with triangles in {len(missing):,} holes of three edges")
     together = np.concatenate([faces, missing])
     try:
-        rest = _fill_all_holes(vertices, together, checked_boundary_edges(together), asked)
+        filling = _fill_all_holes(vertices, together, checked_boundary_edges(together), asked)
     except MeshingError as error:
         raise MeshingError(
             f"{first}; and with triangles in {len(missing):,} holes of three edges: {error}"
         ) from error
-    both = np.concatenate([missing, rest.faces])
-    return dataclasses.replace(rest, faces=both, triangle_fill_count=len(missing))
+    both = np.concatenate([missing, filling.faces])
+    return dataclasses.replace(filling, faces=both, triangle_fill_count=len(missing))
 
 
 def _fill_all_holes(
-    vertices: FloatArray, faces: IntArray, edges: IntArray, asked: HoleFillingOptions
+    vertices: FloatArray, faces: IntArray, edges: IntArray, options: HoleFillingOptions
 ) -> HarmonicFilling:
-    """Patches that end at open edges; cells are made smaller where checks fail.
+    """The patches that end at open edges; cells are made smaller where checks fail.
 
     Raises:
         MeshingError: as `harmonic_filling`.
@@ -144,12 +144,12 @@ def _fill_all_holes(
     loops = singular_loops(edges, np.ones(len(edges), np.int64))
     function = LevelFunction(SolidAngle([vertices[loop] for loop in loops]), _LEVEL)
     size = float(np.ptp(vertices[np.unique(edges)], axis=0).max())
-    cell = size / _ACROSS if asked.spacing is None else float(asked.spacing)
-    report, tolerance = asked.report, asked.tolerance.within(size)
+    cell = size / _ACROSS if options.spacing is None else float(options.spacing)
+    report, tolerance = options.report, options.tolerance.within(size)
     finer: tuple[RefinementBalls, ...] = ()
-    times_met, seed, before = 0, asked.seed, None
-    for attempt in range(asked.attempts):
-        last = attempt == asked.attempts - 1
+    times_met, seed, before = 0, options.seed, None
+    for attempt in range(options.attempts):
+        last = attempt == options.attempts - 1
         report(f"cells of {cell:.3g}" + ", smaller in places" * bool(finer))
         try:
             patches = _patches(
@@ -160,10 +160,10 @@ def _fill_all_holes(
             times_met += isinstance(error, _MeshIntersectionError)
             is_hopeless, before = not is_retry_promising(error, before), error
             if last or is_hopeless or times_met > _MOST_MET:
-                place = ", ".join(f"{c:.4g}" for c in error.locations[0])
+                location = ", ".join(f"{c:.4g}" for c in error.locations[0])
                 raise MeshingError(
                     f"{error} (cells were {cell:.3g} wide, and smaller in {len(error.locations)} "
-                    f"places, such as near ({place}))"
+                    f"places, such as near ({location}))"
                 ) from None
             report(f"{error} ({len(error.locations)} places)")
             finer = (*finer, RefinementBalls(error.locations, 2 * cell * 0.5 ** len(finer)))
@@ -184,7 +184,7 @@ class _MeshIntersectionError(LocalizedMeshingError):
 
 
 def checked_boundary_edges(faces: IntArray) -> IntArray:
-    """(k, 2): edges of one face, in its direction.
+    """(k, 2) the edges with one face, in its direction.
 
     Raises:
         MeshError: an edge of more than two faces, or of two that have it in the same direction.
@@ -192,11 +192,11 @@ def checked_boundary_edges(faces: IntArray) -> IntArray:
     pairs = half_edges(faces)
     edges = Edges.of(pairs)
     index, uses = edges.edge_of_pair, edges.multiplicity
-    several = np.flatnonzero(uses > 2)
-    if len(several):
-        a, b = edges.vertices[several[0]].tolist()
+    overused = np.flatnonzero(uses > 2)
+    if len(overused):
+        a, b = edges.vertices[overused[0]].tolist()
         raise MeshError(
-            f"{len(several):,} edges have more than two faces, the first of them between vertices "
+            f"{len(overused):,} edges have more than two faces, the first of them between vertices "
             f"{a} and {b}: such a mesh has no two sides there, and where all faces are kept none "
             "are left out"
         )
@@ -219,22 +219,22 @@ def triangle_fills(vertices: FloatArray, faces: IntArray, edges: IntArray) -> In
     leads: dict[int, set[int]] = defaultdict(set)
     for a, b in edges.tolist():
         leads[a].add(b)
-    there = {tuple(sorted(face)) for face in faces.tolist()}
-    found: list[tuple[int, int, int]] = []
+    existing = {tuple(sorted(face)) for face in faces.tolist()}
+    fills: list[tuple[int, int, int]] = []
     for a, b in edges.tolist():
         for c in leads[b]:
-            if a in leads[c] and tuple(sorted((a, b, c))) not in there and b in leads[a]:
-                found.append((a, c, b))
-                for one, other in ((a, b), (b, c), (c, a)):
-                    leads[one].discard(other)
+            if a in leads[c] and tuple(sorted((a, b, c))) not in existing and b in leads[a]:
+                fills.append((a, c, b))
+                for start, end in ((a, b), (b, c), (c, a)):
+                    leads[start].discard(end)
                 break
-    made = np.array(found, np.int64).reshape(-1, 3)
-    corners = vertices[made]
-    made = made[np.linalg.norm(_normals(corners), axis=1) > 0]
-    together = np.concatenate([faces, made])
-    is_made = np.arange(len(together)) >= len(faces)
-    met = np.setdiff1d(intersecting_faces(vertices, together, is_made), np.arange(len(faces)))
-    return np.delete(made, met - len(faces), axis=0)
+    triangles = np.array(fills, np.int64).reshape(-1, 3)
+    corners = vertices[triangles]
+    triangles = triangles[np.linalg.norm(_normals(corners), axis=1) > 0]
+    together = np.concatenate([faces, triangles])
+    is_new = np.arange(len(together)) >= len(faces)
+    met = np.setdiff1d(intersecting_faces(vertices, together, is_new), np.arange(len(faces)))
+    return np.delete(triangles, met - len(faces), axis=0)
 
 
 def _patches(
@@ -250,13 +250,13 @@ def _patches(
 ) -> HarmonicFilling:
     """The level set, ending at the edges (k, 2) of the mesh.
 
-    last: whether patches that cannot be refined will do.
+    last: whether this is the last attempt, in which patches that cannot be refined are accepted.
 
     Raises:
         MeshingError: as `mesh`; or Delaunay's tetrahedra lack an edge.
     """
-    rim, place = np.unique(edges, return_inverse=True)
-    boundary = BoundaryCurve(vertices[rim], place.reshape(-1, 2))
+    rim, rim_edges = np.unique(edges, return_inverse=True)
+    boundary = BoundaryCurve(vertices[rim], rim_edges.reshape(-1, 2))
     hull: Any = function.field.extent((_LEVEL,))
     lower, upper = (np.array(end, np.float64) for end in hull.bounds())
     root = box_cells(lower - 0.5 * spacing, upper + 0.5 * spacing, spacing, exact=False)
@@ -302,8 +302,8 @@ def _patches(
         is_fine = False
     # Faces of level sets are seen from where w is greater, those of meshes from outside.
     faces = faces[:, ::-1]
-    kept = np.unique(faces)
-    inner = kept[kept >= len(rim)]
+    used = np.unique(faces)
+    inner = used[used >= len(rim)]
     index = np.full(len(x), -1, np.int64)
     index[: len(rim)] = rim
     index[inner] = len(vertices) + np.arange(len(inner))
@@ -323,81 +323,82 @@ def _finished(
     Raises:
         MeshingError: all do, as small triangles turn over each other beside sharp corners of holes.
     """
-    bad = x[:0]
-    for way in ("improving", "smoothing", "refining alone"):
-        report(way)
-        finer, split = (x if way == "refining alone" else smooth(function, x, faces, None)), faces
+    failed = x[:0]
+    for mode in ("improving", "smoothing", "refining alone"):
+        report(mode)
+        finer, split = (x if mode == "refining alone" else smooth(function, x, faces, None)), faces
         finer, split = refine(function, finer, split, 0.5 * tolerance, None, report)
         far = unrefined_midpoints(function, finer, split, 0.5 * tolerance)
-        if len(far):  # the patch takes another way than the surface, or connects two of its sheets
+        if len(far):  # the patch departs from the surface, or connects two of its sheets
             raise LocalizedMeshingError(
                 f"{len(far):,} triangles of patches do not come near the surface, however they are "
                 "cut: subdivide the mesh there, or choose a smaller `cell_size`",
                 far,
             )
-        if way == "improving":
+        if mode == "improving":
             finer, split = improve(function, finer, split, 0.5 * tolerance, None, report)
-        elif way == "smoothing":
+        elif mode == "smoothing":
             finer = smooth(function, finer, split, None)
         met = finer[split[intersecting_faces(finer, split)]].mean(axis=1)
-        bad = np.concatenate([met, finer[_new_singular(faces, split)]])
-        if not len(bad):
+        failed = np.concatenate([met, finer[_new_singular(faces, split)]])
+        if not len(failed):
             return finer, split
-    raise LocalizedMeshingError("the patches meet each other: choose a smaller `cell_size`", bad)
+    raise LocalizedMeshingError("the patches meet each other: choose a smaller `cell_size`", failed)
 
 
 def _new_singular(before: IntArray, after: IntArray) -> IntArray:
-    """Vertices at which faces are not a manifold any more; holes may touch in others."""
+    """The vertices at which faces are no longer a manifold; holes may touch in other vertices."""
     return np.setdiff1d(nonmanifold_vertices(after), nonmanifold_vertices(before))
 
 
 def _collapse_midpoint(x: FloatArray, faces: IntArray, middle: int, ends: list[int]) -> IntArray:
-    """The faces with a vertex in the middle of a boundary edge moved to one of its ends: that with
-    which fewer faces meet or, if they are as many, the faces around it are turned less.
+    """The faces after a vertex in the middle of a boundary edge was moved to one of the edge's
+    ends: the end for which fewer faces intersect or, if the numbers are equal, for which the faces
+    around it are turned less.
 
     Raises:
         MeshingError: both ends would join more than the two faces at the edge.
     """
-    around = (faces == middle).any(axis=1)
-    star, rest = faces[around], faces[~around]
-    found: list[tuple[int, float, IntArray]] = []
+    in_star = (faces == middle).any(axis=1)
+    star, rest = faces[in_star], faces[~in_star]
+    candidates: list[tuple[int, float, IntArray]] = []
     for end in ends:
         joined = (faces == end).any(axis=1)
         if len(np.intersect1d(star, faces[joined])) != 3:  # these two, and the face's third corner
             continue
         moved = np.where(star == middle, end, star)
-        kept = ~(star == end).any(axis=1)
-        one, other = _normals(x[star[kept]]), _normals(x[moved[kept]])
+        is_kept = ~(star == end).any(axis=1)
+        one, other = _normals(x[star[is_kept]]), _normals(x[moved[is_kept]])
         turned = float((one * other).sum(axis=1).min(initial=1.0))
-        made = np.concatenate([rest, moved[kept]])
-        is_moved = np.arange(len(made)) >= len(rest)
-        found.append((len(intersecting_faces(x, made, is_moved)), -turned, made))
-    if not found:
+        new_faces = np.concatenate([rest, moved[is_kept]])
+        is_moved = np.arange(len(new_faces)) >= len(rest)
+        candidates.append((len(intersecting_faces(x, new_faces, is_moved)), -turned, new_faces))
+    if not candidates:
         raise LocalizedMeshingError(
             "boundary edges of the mesh are too near to others for patches that end at them: "
             "subdivide the mesh there, or choose a smaller `cell_size`",
             x[[middle]],
         )
-    return min(found, key=lambda one: one[:2])[2]
+    return min(candidates, key=lambda one: one[:2])[2]
 
 
 def _normals(corners: FloatArray) -> FloatArray:
-    """Unit normals of triangles (m, 3, 3), 0 of those without an area."""
+    """Unit normals of triangles (m, 3, 3), 0 for triangles without an area."""
     normal = area_normals(corners)
     return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
 
 
 def _check_boundary(x: FloatArray, faces: IntArray, boundary: BoundaryCurve) -> None:
-    """Raise unless patches end at the boundary, and run each of its edges as the mesh does: they
-    are reversed afterwards."""
+    """Raise unless patches end at the boundary, and run each of its edges in the direction of the
+    mesh: patches are reversed afterwards."""
     directed = {(int(a), int(b)) for a, b in half_edges(faces)}
     rim = {(a, b) for a, b in directed if (b, a) not in directed}
-    wrong = rim ^ {(int(a), int(b)) for a, b in boundary.edges}
-    if wrong:
+    unmatched = rim ^ {(int(a), int(b)) for a, b in boundary.edges}
+    if unmatched:
         raise LocalizedMeshingError(
             "the patches do not end at the edges of the holes: cells are too large for them; "
             "choose a smaller `cell_size`",
-            x[np.array(sorted(wrong))].mean(axis=1),
+            x[np.array(sorted(unmatched))].mean(axis=1),
         )
 
 
@@ -407,10 +408,10 @@ def _check(
     patches: HarmonicFilling,
     report: Callable[[str], None],
 ) -> None:
-    """Raise unless the mesh with its patches is what `repair` promises.
+    """Raise unless the mesh with its patches fulfills what `repair` promises.
 
     Raises:
-        MeshingError: it is not.
+        MeshingError: it does not.
     """
     report("checking the patches")
     x = np.concatenate([vertices, patches.vertices])
@@ -421,25 +422,25 @@ def _check(
         raise LocalizedMeshingError(str(error), x[nonmanifold_vertices(together)]) from None
     added = patches.vertices
     w = WindingNumber(vertices, faces).value(added, precision="double")
-    off = np.abs(w - np.floor(w) - 0.5)
-    if not (off <= _NEAR).all():
+    gap = np.abs(w - np.floor(w) - 0.5)
+    if not (gap <= _NEAR).all():
         raise LocalizedMeshingError(
-            f"the winding number is off 1/2 by {off.max():.2g} at a vertex of the patches: choose "
+            f"the winding number is off 1/2 by {gap.max():.2g} at a vertex of the patches: choose "
             "a smaller `cell_size`",
-            added[off > _NEAR],
+            added[gap > _NEAR],
         )
     is_patch = np.arange(len(together)) >= len(faces)
     met = intersecting_faces(x, together, is_patch)
     if not len(met):
         return
-    places = x[together[met[is_patch[met]]]].mean(axis=1)
+    centers = x[together[met[is_patch[met]]]].mean(axis=1)
     if is_patch[met].all():
         raise LocalizedMeshingError(
-            "the patches meet each other: choose a smaller `cell_size`", places
+            "the patches meet each other: choose a smaller `cell_size`", centers
         )
     raise _MeshIntersectionError(
         f"the patches meet {int((~is_patch[met]).sum()):,} triangles of the mesh, where the "
         "winding number jumps: the hole cannot be closed by its 1/2 level alone; remove the "
         "triangles that stand in it, or draw the mesh with WindingNumber, which needs no repair",
-        places,
+        centers,
     )

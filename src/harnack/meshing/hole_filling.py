@@ -10,7 +10,7 @@ it continues the surface around it, tangents included. Laplacians are those of t
 repeated, with long edges split, this converges to surfaces whose mean curvature is harmonic, such
 as spheres and cylinders.
 
-Nothing is proved of such fillings. Those that pass the checks of `fill_holes` are returned.
+Nothing is proved about such fillings. Fillings that pass the checks of `fill_holes` are returned.
 """
 
 from __future__ import annotations
@@ -39,22 +39,24 @@ __all__ = ["HoleFilling", "fill_holes", "hole_loops"]
 
 # Loops of more edges are not filled: the time grows with the cube of their number.
 _MOST_IN_LOOP = 600
-# Up to so many edges angles count, beyond it areas alone; up to so many they always do.
+# The largest number of edges of a loop for which angles count, beyond which areas alone do; and the
+# number up to which angles always count.
 _MOST_BY_ANGLES, _ALWAYS_BY_ANGLES = 150, 10
 # Largest angles count as the same if their cosines differ by less than this.
 _SAME_TURN = 1e-9
-# Edges are cut that are longer than this many times what is usual around the hole; so often.
+# Edges are split that are longer than this multiple of the usual length around the hole; and the
+# number of rounds.
 _LONG, _ROUNDS = 1.4, 10
 _MOST_CUT = 200_000
-# Edges of two triangles are flipped if the cotangents of the angles opposite have a sum below this.
+# Edges are flipped if the cotangents of the two opposite angles have a sum below this.
 _MAX_FLIP_COTANGENT_SUM = -1e-3
 _MOST_FLIPS = 12
-# Cotangents are kept between these, so that every matrix is definite.
+# Cotangents are clamped to this range, so that every matrix is definite.
 _LEAST_COTANGENT, _MOST_COTANGENT = 0.02, 20.0
-# What is tried in turn: whether loops are triangulated by angles, and how often the patch is made
-# to bend little, by the cotangents of what it was before.
+# The strategies in the order of the attempts: whether loops are triangulated by angles, and how
+# often the patch is faired, by the cotangents of the patch before.
 _STRATEGIES = ((True, 6), (False, 2), (True, 0), (False, 0))
-# On a patch the winding number of what is there may differ from 1/2 modulo 1 by so much.
+# The largest deviation of the mesh's winding number from 1/2 modulo 1 on a patch.
 _MAX_WINDING_DEVIATION = 0.36
 
 Winding = Callable[[FloatArray], FloatArray]
@@ -89,25 +91,25 @@ def fill_holes(
     winding: the winding number of the mesh at points.
     """
     x, together = vertices, faces
-    left: list[IntArray] = loops
+    pending: list[IntArray] = loops
     reasons = dict[int, str]()
     for by_angles, fairings in _STRATEGIES:
-        if not left:
+        if not pending:
             break
-        made, new, owner, reasons = _patches(x, together, left, by_angles, fairings)
-        reasons |= _failures(made, together, new, owner, len(x), winding)
-        good = ~np.isin(owner, list(reasons))
-        x, together = _used(made, np.concatenate([together, new[good]]), len(x))
-        left = [left[k] for k in sorted(reasons)]
+        patched, new, owner, reasons = _patches(x, together, pending, by_angles, fairings)
+        reasons |= _failures(patched, together, new, owner, len(x), winding)
+        is_accepted = ~np.isin(owner, list(reasons))
+        x, together = _used(patched, np.concatenate([together, new[is_accepted]]), len(x))
+        pending = [pending[k] for k in sorted(reasons)]
     counts = Counter(reasons.values())
-    why = ", ".join(f"{count:,} {what}" for what, count in counts.items())
-    return HoleFilling(x[len(vertices) :], together[len(faces) :], left, why)
+    why = ", ".join(f"{count:,} {reason}" for reason, count in counts.items())
+    return HoleFilling(x[len(vertices) :], together[len(faces) :], pending, why)
 
 
-def _used(x: FloatArray, faces: IntArray, given: int) -> tuple[FloatArray, IntArray]:
-    """Vertices and faces without those vertices that no face has, but for the given ones."""
+def _used(x: FloatArray, faces: IntArray, input_count: int) -> tuple[FloatArray, IntArray]:
+    """The vertices and faces, without new vertices that no face uses."""
     used = np.zeros(len(x), np.bool_)
-    used[:given] = True
+    used[:input_count] = True
     used[faces] = True
     return x[used], (np.cumsum(used) - 1)[faces]
 
@@ -117,34 +119,35 @@ def _failures(
     faces: IntArray,
     new: IntArray,
     owner: IntArray,
-    given: int,
+    input_count: int,
     winding: Winding,
 ) -> dict[int, str]:
-    """By loop, what is wrong with its patch. new: faces of patches, and owner: of which loop."""
-    found: dict[int, str] = {}
+    """The reasons why patches fail, by loop. new: the faces of patches; owner: the loop of each."""
+    reasons: dict[int, str] = {}
     if not len(new):
-        return found
+        return reasons
     loop_of = np.zeros(len(x), np.int64)
     loop_of[new] = owner[:, None]
-    loops = np.concatenate([owner, loop_of[given:]])
-    w = winding(np.concatenate([x[new].mean(axis=1), x[given:]]))
-    far = ~(np.abs(w - np.floor(w) - 0.5) <= _MAX_WINDING_DEVIATION)
-    found |= dict.fromkeys(loops[far].tolist(), "not where the winding number is near 1/2")
+    loops = np.concatenate([owner, loop_of[input_count:]])
+    w = winding(np.concatenate([x[new].mean(axis=1), x[input_count:]]))
+    is_off = ~(np.abs(w - np.floor(w) - 0.5) <= _MAX_WINDING_DEVIATION)
+    reasons |= dict.fromkeys(loops[is_off].tolist(), "not where the winding number is near 1/2")
     together = np.concatenate([faces, new])
     is_new = np.arange(len(together)) >= len(faces)
     met = intersecting_faces(x, together, is_new)
-    found |= dict.fromkeys(
+    reasons |= dict.fromkeys(
         owner[met[is_new[met]] - len(faces)].tolist(), "passing through other triangles"
     )
     flat = row_norms(area_normals(x[new])) == 0
-    return found | dict.fromkeys(owner[flat].tolist(), "with triangles without an area")
+    return reasons | dict.fromkeys(owner[flat].tolist(), "with triangles without an area")
 
 
 # Loops.
 
 
 def hole_loops(vertices: FloatArray, faces: IntArray, edges: IntArray) -> list[IntArray]:
-    """The loops of open edges (k, 2), which run as their faces do, each without a vertex twice.
+    """The loops of open edges (k, 2), in the direction of their faces, each without a repeated
+    vertex.
 
     Where several holes meet at a vertex, a loop goes on with the edge that bounds the same gap
     between faces, as seen along the normal there.
@@ -166,17 +169,17 @@ def hole_loops(vertices: FloatArray, faces: IntArray, edges: IntArray) -> list[I
     loops: list[IntArray] = []
     while following:
         (a, b), _ = next(iter(following.items()))
-        path, place = [a], {a: 0}
+        path, position = [a], {a: 0}
         while (a, b) in following:
             a, b = b, following.pop((a, b))
-            if a in place:  # a loop is complete; what led to it goes on
-                first = place[a]
+            if a in position:  # a loop is complete; what led to it goes on
+                first = position[a]
                 loops.append(np.array(path[first:]))
-                for one in path[first + 1 :]:
-                    del place[one]
+                for vertex in path[first + 1 :]:
+                    del position[vertex]
                 del path[first + 1 :]
             else:
-                place[a] = len(path)
+                position[a] = len(path)
                 path.append(a)
     return loops
 
@@ -184,24 +187,24 @@ def hole_loops(vertices: FloatArray, faces: IntArray, edges: IntArray) -> list[I
 def _match_loop_edges(
     x: FloatArray, v: int, normal: FloatArray, starts: list[int], ends: list[int]
 ) -> list[int]:
-    """For each edge that comes from a start to v, the end to which its loop goes on: the next one
+    """For each edge from a start to v, the end to which its loop goes on: the next end
     counter-clockwise, since faces are to the left of their edges and holes to the right."""
     axis = np.eye(3)[np.abs(normal).argmin()]
-    unit = normal / max(float(np.linalg.norm(normal)), 1e-300)
-    one = np.cross(unit, axis)
-    other = np.cross(unit, one)
+    unit_normal = normal / max(float(np.linalg.norm(normal)), 1e-300)
+    u = np.cross(unit_normal, axis)
+    w = np.cross(unit_normal, u)
 
     def angle(k: int) -> float:
-        way = x[k] - x[v]
-        return float(np.arctan2(way @ other, way @ one))
+        direction = x[k] - x[v]
+        return float(np.arctan2(direction @ w, direction @ u))
 
-    free, found = {c: angle(c) for c in ends}, list[int]()
+    free, matches = {c: angle(c) for c in ends}, list[int]()
     for a in starts:
         from_here = angle(a)
         nearest = min(free, key=lambda c: (free[c] - from_here) % (2 * np.pi))
         del free[nearest]
-        found.append(nearest)
-    return found
+        matches.append(nearest)
+    return matches
 
 
 # Triangulations of loops.
@@ -214,34 +217,34 @@ def _patches(
     by_angles: bool,
     fairings: int,
 ) -> tuple[FloatArray, IntArray, IntArray, dict[int, str]]:
-    """All vertices with those of patches behind; faces of patches; of which loop each is; and loops
-    without a patch, with the reason."""
+    """All vertices, those of patches last; the faces of patches; the loop of each face; and the
+    reasons why loops have no patch, by loop."""
     third = _opposite_corners(faces, np.unique(np.concatenate(loops)), len(vertices))
-    taken = {(min(edge), max(edge)) for edge in third}
-    there = np.array(sorted(taken), np.int64).reshape(-1, 2)
-    found, failed = list[IntArray](), dict[int, str]()
+    used_edges = {(min(edge), max(edge)) for edge in third}
+    fixed_edges = np.array(sorted(used_edges), np.int64).reshape(-1, 2)
+    patches, failed = list[IntArray](), dict[int, str]()
     for k, loop in enumerate(loops):
         if len(loop) > _MOST_IN_LOOP:
             failed[k] = f"of more than {_MOST_IN_LOOP} edges"
             continue
         polygon = loop[::-1].copy()
-        most = _MOST_BY_ANGLES if by_angles else _ALWAYS_BY_ANGLES
-        plan = _min_dihedral_triangulation if len(polygon) <= most else _min_area_triangulation
-        made = plan(vertices, polygon, third, taken)
-        if made is None:
+        limit = _MOST_BY_ANGLES if by_angles else _ALWAYS_BY_ANGLES
+        plan = _min_dihedral_triangulation if len(polygon) <= limit else _min_area_triangulation
+        triangles = plan(vertices, polygon, third, used_edges)
+        if triangles is None:
             failed[k] = "between edges that are joined already"
             continue
-        taken |= {(min(e), max(e)) for e in half_edges(made).tolist()}
-        found.append(made)
-    if not found:
+        used_edges |= {(min(e), max(e)) for e in half_edges(triangles).tolist()}
+        patches.append(triangles)
+    if not patches:
         return vertices, faces[:0], np.zeros(0, np.int64), failed
-    sized, new = _refine(vertices, faces, np.concatenate(found), there)
-    for left in range(fairings if len(sized) > len(vertices) else 0, 0, -1):
+    sized, new = _refine(vertices, faces, np.concatenate(patches), fixed_edges)
+    for rounds_left in range(fairings if len(sized) > len(vertices) else 0, 0, -1):
         sized[:, :3] = _fair(sized[:, :3], faces, new, len(vertices))
-        new = _flipped(sized[:, :3], new, there)
-        if left > 2:
+        new = _flipped(sized[:, :3], new, fixed_edges)
+        if rounds_left > 2:
             sized, new = _split_long_edges(sized, new)
-            new = _flipped(sized[:, :3], new, there)
+            new = _flipped(sized[:, :3], new, fixed_edges)
     return sized[:, :3], new, _loop_of_faces(new, loops, len(sized)), failed
 
 
@@ -256,37 +259,37 @@ def _opposite_corners(faces: IntArray, rims: IntArray, count: int) -> dict[tuple
     return {(a, b): c for (a, b), c in zip(ends, third, strict=True)}
 
 
-def _forbidden_diagonals(polygon: IntArray, taken: set[tuple[int, int]]) -> BoolArray:
-    """(n, n) which diagonals of a polygon are edges already."""
+def _forbidden_diagonals(polygon: IntArray, used_edges: set[tuple[int, int]]) -> BoolArray:
+    """(n, n) which diagonals of a polygon are already edges."""
     n = len(polygon)
     barred = np.zeros((n, n), np.bool_)
-    place = {v: k for k, v in enumerate(polygon.tolist())}
-    for a, b in taken if n * n > len(taken) else _pairs(polygon, taken):
-        if a in place and b in place:
-            barred[place[a], place[b]] = barred[place[b], place[a]] = True
+    position = {v: k for k, v in enumerate(polygon.tolist())}
+    for a, b in used_edges if n * n > len(used_edges) else _pairs(polygon, used_edges):
+        if a in position and b in position:
+            barred[position[a], position[b]] = barred[position[b], position[a]] = True
     k = np.arange(n)
     barred[k, (k + 1) % n] = barred[(k + 1) % n, k] = False
     return barred
 
 
-def _pairs(polygon: IntArray, taken: set[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Those pairs of a polygon's vertices that are edges already."""
+def _pairs(polygon: IntArray, used_edges: set[tuple[int, int]]) -> list[tuple[int, int]]:
+    """The pairs of a polygon's vertices that are already edges."""
     ordered = sorted(polygon.tolist())
-    return [(a, b) for i, a in enumerate(ordered) for b in ordered[i + 1 :] if (a, b) in taken]
+    return [(a, b) for i, a in enumerate(ordered) for b in ordered[i + 1 :] if (a, b) in used_edges]
 
 
 def _min_area_triangulation(
     x: FloatArray,
     polygon: IntArray,
     third: dict[tuple[int, int], int],
-    taken: set[tuple[int, int]],
+    used_edges: set[tuple[int, int]],
 ) -> IntArray | None:
-    """Triangles (n - 2, 3) of least area between the corners of a polygon; None if edges that are
-    there already leave none."""
+    """The triangulation (n - 2, 3) of a polygon with the smallest area; None if existing edges
+    exclude every triangulation."""
     n, corner = len(polygon), x[polygon]
     if n == 3:
         return polygon[None]
-    cost = np.where(_forbidden_diagonals(polygon, taken), np.inf, 0.0)
+    cost = np.where(_forbidden_diagonals(polygon, used_edges), np.inf, 0.0)
     middle = np.zeros((n, n), np.int64)
     for d in range(2, n):
         i = np.arange(n - d)[:, None]
@@ -305,31 +308,31 @@ def _min_area_triangulation(
 
 
 def _triangles_of_plan(middle: IntArray, n: int) -> IntArray:
-    """The triangles of a plan: middle[i, k] is the third corner of that at the diagonal from i to
-    k, on the side of the corners between them."""
-    found, todo = list[tuple[int, int, int]](), [(0, n - 1)]
+    """The triangles of a plan: middle[i, k] is the third corner of the triangle at the diagonal
+    from i to k, on the side of the corners between them."""
+    triangles, todo = list[tuple[int, int, int]](), [(0, n - 1)]
     while todo:
         i, k = todo.pop()
         if k - i > 1:
             m = int(middle[i, k])
-            found.append((i, m, k))
+            triangles.append((i, m, k))
             todo += [(i, m), (m, k)]
-    return np.array(found, np.int64)
+    return np.array(triangles, np.int64)
 
 
 def _min_dihedral_triangulation(
     x: FloatArray,
     polygon: IntArray,
     third: dict[tuple[int, int], int],
-    taken: set[tuple[int, int]],
+    used_edges: set[tuple[int, int]],
 ) -> IntArray | None:
-    """Triangles of a polygon whose largest angle with neighbors, those around the polygon among
-    them, is least; of the same angles those of least area (Liepa 2003)."""
+    """The triangulation of a polygon whose largest angle between neighbors, including those around
+    the polygon, is smallest; of equal angles the one with the smallest area (Liepa 2003)."""
     n, corner = len(polygon), x[polygon]
     if n == 3:
         return polygon[None]
-    barred = _forbidden_diagonals(polygon, taken)
-    beside = np.zeros((n, n, 3))  # 0: there is none, or not yet
+    barred = _forbidden_diagonals(polygon, used_edges)
+    beside = np.zeros((n, n, 3))  # 0: no neighbor, or not yet
     for k in range(n):
         a, b = int(polygon[k]), int(polygon[(k + 1) % n])
         if (b, a) in third:
@@ -341,29 +344,29 @@ def _min_dihedral_triangulation(
         i = np.arange(n - d)[:, None]
         m, k = i + np.arange(1, d), i + d
         cross = np.cross(corner[m] - corner[i], corner[k] - corner[i])
-        own = _unit(cross)
+        normals = _unit(cross)
         sides = [beside[i, m], beside[m, k]]
         if d == n - 1:
-            sides.append(np.broadcast_to(beside[k, i], own.shape))
-        turns = [-np.einsum("imk,imk->im", own, side) for side in sides]
+            sides.append(np.broadcast_to(beside[k, i], normals.shape))
+        turns = [-np.einsum("imk,imk->im", normals, side) for side in sides]
         turns = [np.where(side.any(axis=2), t, -1.0) for side, t in zip(sides, turns, strict=True)]
         worst = np.maximum.reduce([*turns, turn[i, m], turn[m, k]])
         size = area[i, m] + area[m, k] + np.sqrt((cross**2).sum(axis=2))
-        least = worst.min(axis=1, keepdims=True)
-        best = np.where(worst <= least + _SAME_TURN, size, np.inf).argmin(axis=1)
+        smallest = worst.min(axis=1, keepdims=True)
+        best = np.where(worst <= smallest + _SAME_TURN, size, np.inf).argmin(axis=1)
         rows = np.arange(n - d)
         bar = barred[rows, rows + d] if d < n - 1 else np.zeros(1, np.bool_)
         turn[rows, rows + d] = np.where(bar, np.inf, worst[rows, best])
         area[rows, rows + d] = size[rows, best]
         middle[rows, rows + d] = m[rows, best]
-        beside[rows, rows + d] = own[rows, best]
+        beside[rows, rows + d] = normals[rows, best]
     if not np.isfinite(turn[0, n - 1]):
         return None
     return polygon[_triangles_of_plan(middle, n)]
 
 
 def _unit(vectors: FloatArray) -> FloatArray:
-    """(..., 3) of length 1, or 0."""
+    """(..., 3) vectors scaled to length 1; 0 stays 0."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-300)
 
 
@@ -371,73 +374,74 @@ def _unit(vectors: FloatArray) -> FloatArray:
 
 
 def _refine(
-    vertices: FloatArray, faces: IntArray, new: IntArray, taken: IntArray
+    vertices: FloatArray, faces: IntArray, new: IntArray, fixed_edges: IntArray
 ) -> tuple[FloatArray, IntArray]:
-    """Patches of triangles about as large as those around them, with the least area; all vertices
-    (n, 4), new ones behind those given, and with each the usual length of edges there.
+    """All vertices (n, 4), new vertices last, each with the usual length of edges there; and
+    patches of triangles about as large as those around them, with the smallest area.
 
-    taken: (t, 2) edges that are there already.
+    fixed_edges: (t, 2) the existing edges.
     """
-    given = len(vertices)
+    input_count = len(vertices)
     x = np.column_stack([vertices, _mean_edge_lengths(vertices, faces, np.unique(new))])
     for _ in range(_ROUNDS):
-        new, count = _flipped(x[:, :3], new, taken), len(x)
+        new, count = _flipped(x[:, :3], new, fixed_edges), len(x)
         x, new = _split_long_edges(x, new)
         if len(x) == count:
             break
-        x = _relaxed(x, new, given)
-    return x, _flipped(x[:, :3], new, taken)
+        x = _relaxed(x, new, input_count)
+    return x, _flipped(x[:, :3], new, fixed_edges)
 
 
 def _split_long_edges(x: FloatArray, new: IntArray) -> tuple[FloatArray, IntArray]:
-    """Vertices (n, 4) and triangles with edges cut in the middle that are too long."""
+    """Vertices (n, 4) and triangles, with edges that are too long cut in the middle."""
     edges = Edges.of(half_edges(new))
     ends = x[edges.vertices]
     long = row_norms(ends[:, 0, :3] - ends[:, 1, :3]) > _LONG * ends[:, :, 3].mean(axis=1)
     rows = np.flatnonzero(long & (edges.multiplicity == 2))
     if not len(rows) or len(new) > _MOST_CUT:
         return x, new
-    place = np.full(len(edges.vertices), -1, np.int64)
-    place[rows] = len(x) + np.arange(len(rows))
+    midpoint = np.full(len(edges.vertices), -1, np.int64)
+    midpoint[rows] = len(x) + np.arange(len(rows))
     x = np.concatenate([x, ends[rows].mean(axis=1)])
-    return x, split_faces(x[:, :3], new, place[edges.edge_of_pair].reshape(3, -1).T)
+    return x, split_faces(x[:, :3], new, midpoint[edges.edge_of_pair].reshape(3, -1).T)
 
 
 def _mean_edge_lengths(x: FloatArray, faces: IntArray, rims: IntArray) -> FloatArray:
-    """(n,) the mean length of a vertex's edges; 0 but at some vertices."""
+    """(n,) the mean length of a vertex's edges, at the vertices `rims`; 0 at others."""
     is_rim = np.zeros(len(x), np.bool_)
     is_rim[rims] = True
     edges = Edges.of(half_edges(faces[is_rim[faces].any(axis=1)])).vertices
     long = row_norms(x[edges[:, 0]] - x[edges[:, 1]])
     total, count = (
-        np.bincount(edges.ravel(), np.repeat(one, 2), minlength=len(x))
-        for one in (long, np.ones(len(long)))
+        np.bincount(edges.ravel(), np.repeat(weights, 2), minlength=len(x))
+        for weights in (long, np.ones(len(long)))
     )
     return np.where(is_rim, total / np.maximum(count, 1), 0.0)
 
 
-def _relaxed(x: FloatArray, new: IntArray, given: int) -> FloatArray:
-    """Rows of new vertices, in the middle of their neighbors' rows."""
+def _relaxed(x: FloatArray, new: IntArray, input_count: int) -> FloatArray:
+    """(n, 4) the vertices, with the rows of new vertices in the middle of their neighbors' rows."""
     ends = Edges.of(half_edges(new)).vertices
     weights = _graph_laplacian(ends, np.ones(len(ends)), len(x))
-    return _solve_least_squares(weights[given:], x, given)
+    return _solve_least_squares(weights[input_count:], x, input_count)
 
 
-def _solve_least_squares(rows: Any, x: FloatArray, given: int) -> FloatArray:
-    """Rows from `given` on such that a linear map of all is nearest to 0."""
-    import scipy.sparse.linalg as linalg  # here: half a second that few need
+def _solve_least_squares(rows: Any, x: FloatArray, input_count: int) -> FloatArray:
+    """All rows, with those from `input_count` on chosen so that a linear map of all is nearest to
+    0."""
+    import scipy.sparse.linalg as linalg  # imported here: it takes half a second
 
     solver = cast("Any", linalg)
-    inner, fixed = rows[:, given:], rows[:, :given]
+    inner, fixed = rows[:, input_count:], rows[:, :input_count]
     after = x.copy()
-    right = inner.T @ (fixed @ x[:given])
-    after[given:] = -solver.splu((inner.T @ inner).tocsc()).solve(np.asarray(right))
+    right = inner.T @ (fixed @ x[:input_count])
+    after[input_count:] = -solver.splu((inner.T @ inner).tocsc()).solve(np.asarray(right))
     return after
 
 
 def _graph_laplacian(ends: IntArray, weight: FloatArray, count: int) -> Any:
     """The Laplacian of a graph with these edges (k, 2), as a sparse matrix."""
-    import scipy.sparse  # here: half a second that few need
+    import scipy.sparse  # imported here: it takes half a second
 
     sparse = cast("Any", scipy.sparse)
     a, b = ends.T
@@ -452,36 +456,36 @@ def _graph_laplacian(ends: IntArray, weight: FloatArray, count: int) -> Any:
     ).tocsr()
 
 
-def _fair(x: FloatArray, faces: IntArray, new: IntArray, given: int) -> FloatArray:
-    """New vertices where the patches bend least, together with the faces around them."""
+def _fair(x: FloatArray, faces: IntArray, new: IntArray, input_count: int) -> FloatArray:
+    """The vertices, with new vertices where the patches and the faces around them bend least."""
     is_rim = np.zeros(len(x), np.bool_)
     is_rim[new] = True
-    around = np.concatenate([faces[is_rim[faces].any(axis=1)], new])
-    edges = Edges.of(half_edges(around))
-    corner = x[around]
+    triangles = np.concatenate([faces[is_rim[faces].any(axis=1)], new])
+    edges = Edges.of(half_edges(triangles))
+    corner = x[triangles]
     weight = np.zeros(len(edges.vertices))
     area = np.zeros(len(x))
-    double = np.maximum(row_norms(area_normals(x[around])), 1e-300)
-    for k in range(3):  # the edge from corner k to the next is opposite to the one after
-        one, other = (corner[:, j] - corner[:, k - 1] for j in (k, (k + 1) % 3))
-        cotangent = np.clip(row_dots(one, other) / double, -_MOST_COTANGENT, _MOST_COTANGENT)
-        m = len(around)
+    double = np.maximum(row_norms(area_normals(x[triangles])), 1e-300)
+    for k in range(3):  # the edge from corner k to k + 1 is opposite to corner k + 2
+        u, w = (corner[:, j] - corner[:, k - 1] for j in (k, (k + 1) % 3))
+        cotangent = np.clip(row_dots(u, w) / double, -_MOST_COTANGENT, _MOST_COTANGENT)
+        m = len(triangles)
         np.add.at(weight, edges.edge_of_pair[k * m : (k + 1) * m], 0.5 * cotangent)
-        np.add.at(area, around[:, k], double / 6)
+        np.add.at(area, triangles[:, k], double / 6)
     weight = np.maximum(weight, _LEAST_COTANGENT)
-    # Beside holes that stay open only new vertices count.
+    # Beside holes that remain open only new vertices count.
     is_rim[edges.vertices[edges.multiplicity != 2]] = False
     rows = np.flatnonzero(is_rim & (area > 0))
     laplacian = _graph_laplacian(edges.vertices, weight, len(x))[rows]
     scale = 1 / np.sqrt(np.maximum(area[rows], 1e-300))
-    return _solve_least_squares(laplacian.multiply(scale[:, None]).tocsr(), x, given)
+    return _solve_least_squares(laplacian.multiply(scale[:, None]).tocsr(), x, input_count)
 
 
-def _flipped(x: FloatArray, new: IntArray, taken: IntArray) -> IntArray:
+def _flipped(x: FloatArray, new: IntArray, fixed_edges: IntArray) -> IntArray:
     """Triangles with edges flipped so that angles opposite to them are small (Delaunay's
-    criterion), where the new edge is none already and nothing turns over."""
+    criterion), where the new edge does not exist yet and no triangle turns over."""
     new = new.copy()
-    there = edge_keys(taken, len(x))
+    fixed_keys = edge_keys(fixed_edges, len(x))
     for _ in range(_MOST_FLIPS):
         edges = Edges.of(half_edges(new))
         half = edges.paired_half_edges()
@@ -490,18 +494,18 @@ def _flipped(x: FloatArray, new: IntArray, taken: IntArray) -> IntArray:
         a, b, c, d = new[f, k], new[f, (k + 1) % 3], new[f, (k + 2) % 3], new[g, (j + 2) % 3]
         key = edge_keys(np.column_stack([c, d]), len(x))
         gain = _cotangents(x[a], x[b], x[c]) + _cotangents(x[a], x[b], x[d])
-        good = (gain < _MAX_FLIP_COTANGENT_SUM) & (c != d)
-        good &= ~np.isin(key, there) & ~np.isin(key, edge_keys(edges.vertices, len(x)))
+        is_flippable = (gain < _MAX_FLIP_COTANGENT_SUM) & (c != d)
+        is_flippable &= ~np.isin(key, fixed_keys) & ~np.isin(key, edge_keys(edges.vertices, len(x)))
         before = area_normals(x[new])
         mean = before[f] + before[g]
         for triangle in ((a, d, c), (d, b, c)):
-            good &= row_dots(area_normals(x[np.column_stack(triangle)]), mean) > 0
-        rows = np.flatnonzero(good)
+            is_flippable &= row_dots(area_normals(x[np.column_stack(triangle)]), mean) > 0
+        rows = np.flatnonzero(is_flippable)
         rows = rows[np.argsort(gain[rows])]
         rows = rows[np.sort(np.unique(key[rows], return_index=True)[1])]
         best = np.full(len(new), len(rows))
-        for one in (f, g):
-            np.minimum.at(best, one[rows], np.arange(len(rows)))
+        for side in (f, g):
+            np.minimum.at(best, side[rows], np.arange(len(rows)))
         rank = np.arange(len(rows))
         rows = rows[(best[f[rows]] == rank) & (best[g[rows]] == rank)]
         if not len(rows):
@@ -512,27 +516,27 @@ def _flipped(x: FloatArray, new: IntArray, taken: IntArray) -> IntArray:
 
 
 def _cotangents(a: FloatArray, b: FloatArray, apex: FloatArray) -> FloatArray:
-    """(k,) of the angles at `apex` between points."""
-    one, other = a - apex, b - apex
-    return row_dots(one, other) / np.maximum(row_norms(np.cross(one, other)), 1e-300)
+    """(k,) the cotangents of the angles at `apex` between points a and b."""
+    u, w = a - apex, b - apex
+    return row_dots(u, w) / np.maximum(row_norms(np.cross(u, w)), 1e-300)
 
 
 def _loop_of_faces(new: IntArray, loops: list[IntArray], count: int) -> IntArray:
-    """(p,) of which loop each face of patches is: those joined by edges to a face at the loop."""
-    import scipy.sparse  # here: half a second that few need
+    """(p,) the loop of each face of patches: faces are joined by edges to a face at their loop."""
+    import scipy.sparse  # imported here: it takes half a second
     import scipy.sparse.csgraph as csgraph_module
 
     sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
     edges = Edges.of(half_edges(new))
-    one, other = edges.paired_half_edges().T % len(new)
-    joined = sparse.coo_matrix((np.ones(len(one)), (one, other)), shape=(len(new), len(new)))
+    first, second = edges.paired_half_edges().T % len(new)
+    joined = sparse.coo_matrix((np.ones(len(first)), (first, second)), shape=(len(new), len(new)))
     part = np.asarray(csgraph.connected_components(joined, directed=False)[1])
     loop_at = np.full(int(part.max()) + 1, -1, np.int64)
     keys = edge_keys(edges.vertices, count)
     face_at = np.empty(len(keys), np.int64)
     face_at[edges.edge_of_pair] = np.arange(3 * len(new)) % len(new)
     firsts = edge_keys(np.array([loop[:2] for loop in loops]), count)
-    places = np.minimum(np.searchsorted(keys, firsts), len(keys) - 1)
-    found = np.flatnonzero(keys[places] == firsts)
-    loop_at[part[face_at[places[found]]]] = found
+    positions = np.minimum(np.searchsorted(keys, firsts), len(keys) - 1)
+    matched = np.flatnonzero(keys[positions] == firsts)
+    loop_at[part[face_at[positions[matched]]]] = matched
     return loop_at[part]

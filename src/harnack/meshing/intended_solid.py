@@ -32,23 +32,27 @@ from harnack.meshing.mesh_cleaning import against_neighbors
 
 __all__ = ["Difference", "IntendedSolid"]
 
-# Points at which winding numbers are compared: in the box around the mesh, and near each surface.
+# The number of points at which winding numbers are compared: in the box around the mesh, and near
+# each surface.
 _IN_BOX, _NEAR = 2000, 1000
-# Those near a surface are so far from it, as parts of the size; and the box is wider by that part.
+# The smallest and the largest distance of the points near a surface from it, and the margin of the
+# box, relative to the size.
 _NEAREST, _FARTHEST, _MARGIN = 2e-3, 0.1, 0.05
-# The winding number is clearly above or below 1/2 if it is by more than smooth patches need.
+# The winding number is clearly above or below 1/2 if it differs by more than smooth patches need.
 _CLEARLY = 0.36
-# Volumes of closed meshes that bound their solid once may differ by this part.
+# The largest relative difference of volumes of closed meshes that bound their solid once.
 _VOLUME = 0.01
-# A mesh winds counter-clockwise if cones to its middle hold that part of their volumes added up.
+# A mesh winds counter-clockwise if the signed volumes of cones to its middle sum to this fraction
+# of the sum of their magnitudes.
 _PLAINLY = 0.5
-# Points next to faces are so far from these, as a part of the size.
+# The distance of points next to faces from these, relative to the size.
 _BESIDE = 1e-6
-# How many points that differ are looked at again, and listed.
+# The number of differing points that are tested again, and the number that are listed.
 _LOOKED_AT, _LISTED = 40, 10
-# So many places of each closed part are looked at, to see where it lies and what became of it.
+# The number of points of each closed part that are tested for where the part lies and what became
+# of it.
 _PLACES = 16
-# A mesh is an open sheet if this part of its area, or more, has nothing inside.
+# A mesh is an open sheet if at least this fraction of its area has nothing inside.
 _OPEN = 0.4
 
 
@@ -57,8 +61,8 @@ class Difference:
     """How a surface differs from the input of the repair.
 
     share: the fraction of the compared points that are on the wrong side.
-    places: (k, 3), a selection of these.
-    missing: how many of them should be inside, and are not; added: the reverse.
+    places: (k, 3), a selection of these points.
+    missing: the number of points that should be inside, and are not; added: the reverse.
     volumes: of the surface and of the closed mesh that bounds its solid once; None if they are
         equal, or if the mesh does not bound its solid once.
     """
@@ -71,27 +75,28 @@ class Difference:
 
     @property
     def badness(self) -> float:
-        """A number to compare surfaces by: the one with less of it is nearer to the input."""
-        off = 0.0
+        """A number to compare surfaces by: the surface with the smaller number is nearer to the
+        input."""
+        volume_error = 0.0
         if self.volumes is not None:
             new, intended = self.volumes
-            off = abs(new - intended) / abs(intended)
-        return self.share + off
+            volume_error = abs(new - intended) / abs(intended)
+        return self.share + volume_error
 
     def __str__(self) -> str:
         words = [
-            f"{count:,} {what}"
-            for count, what in ((self.missing, "inside of it"), (self.added, "outside"))
+            f"{count:,} {side}"
+            for count, side in ((self.missing, "inside of it"), (self.added, "outside"))
             if count
         ]
-        told = f"{self.share:.2%} of the points compared" if self.share else "none of the points"
+        text = f"{self.share:.2%} of the points compared" if self.share else "none of the points"
         if words:
             x, y, z = self.places[0]
-            told += f" ({' and '.join(words)}, such as near ({x:.4g}, {y:.4g}, {z:.4g}))"
-        told += " lie on the other side"
+            text += f" ({' and '.join(words)}, such as near ({x:.4g}, {y:.4g}, {z:.4g}))"
+        text += " lie on the other side"
         if self.volumes is not None:
-            told += ", and volumes are {:.4g} and {:.4g}".format(*self.volumes)
-        return told
+            text += ", and volumes are {:.4g} and {:.4g}".format(*self.volumes)
+        return text
 
 
 @dataclass(frozen=True)
@@ -99,9 +104,9 @@ class IntendedSolid:
     """A mesh whose corners are joined and that is not inside out.
 
     vertices: (n, 3). faces: (m, 3); is_turned: (m,) which of them were turned over.
-    oriented: (k, 3) faces that agree with their neighbors where that is possible. parts: of these
-        the closed ones, which may touch, cross or lie in each other (`closed_parts`).
-    rounded: how many corners were joined with others, apart by rounding.
+    oriented: (k, 3) faces that agree with their neighbors where that is possible. parts: the closed
+        parts of these faces, which may touch, cross or lie in each other (`closed_parts`).
+    rounded: the number of corners that were joined with others, apart by rounding.
     """
 
     vertices: FloatArray
@@ -113,11 +118,12 @@ class IntendedSolid:
 
     @classmethod
     def of(cls, mesh: Any, *, as_it_is: bool = False) -> IntendedSolid:
-        """Of anything with vertices and faces, which may have no area.
+        """The solid of any object with vertices and faces, which may have no area.
 
         Corners apart by rounding are joined. Then each closed part that is inside out is turned
-        over, with all that lies in it; and what is not closed and lies in none, with all that lies
-        in it, if it winds around more points clockwise than counter-clockwise.
+        over, with all that lies in it. So are the faces that are not closed and lie in no closed
+        part, with all that lies in them, if they wind around more points clockwise than
+        counter-clockwise.
 
         as_it_is: turn nothing over.
 
@@ -128,25 +134,25 @@ class IntendedSolid:
             np.asarray(mesh.vertices), np.asarray(mesh.faces), allow_zero_area=True
         )
         welded = Welded.of(x, faces)
-        known, raw = welded.index[faces], faces
+        joined, raw = welded.index[faces], faces
         if welded.rounded:
-            faces = known
-        rows = np.flatnonzero((known != np.roll(known, 1, axis=1)).all(axis=1))
-        if not len(welded.net.faces):  # every face is there with its reverse
-            rows = rows[np.unique(np.sort(known[rows], axis=1), axis=0, return_index=True)[1]]
-        known, is_turned = known[rows], np.zeros(len(faces), np.bool_)
+            faces = joined
+        rows = np.flatnonzero((joined != np.roll(joined, 1, axis=1)).all(axis=1))
+        if not len(welded.net.faces):  # every face has its reverse
+            rows = rows[np.unique(np.sort(joined[rows], axis=1), axis=0, return_index=True)[1]]
+        joined, is_turned = joined[rows], np.zeros(len(faces), np.bool_)
         if as_it_is or not len(rows):
-            return cls(x, faces, is_turned, known, [], welded.rounded)
-        disagrees = against_neighbors(x, known)
-        agreeing = _turned(known, disagrees)
+            return cls(x, faces, is_turned, joined, [], welded.rounded)
+        disagrees = against_neighbors(x, joined)
+        agreeing = _turned(joined, disagrees)
         raw = _turned(raw[rows], disagrees)
-        way = 1 if volume_of(x, agreeing) >= 0 else -1  # most has its material inside
-        parts = closed_parts(x, raw[:, ::way], agreeing[:, ::way])
+        step = 1 if volume_of(x, agreeing) >= 0 else -1  # most faces have their material inside
+        parts = closed_parts(x, raw[:, ::step], agreeing[:, ::step])
         turned = _inside_out(x, agreeing, parts)
         oriented = _turned(agreeing, turned)
         if turned.any() and not turned.all():
             parts = closed_parts(x, _turned(raw, turned), oriented)
-        if not disagrees.any():  # else it is no part as a whole that is turned
+        if not disagrees.any():  # otherwise no part is turned as a whole
             is_turned[rows] = turned
         return cls(x, _turned(faces, is_turned), is_turned, oriented, parts, welded.rounded)
 
@@ -194,7 +200,7 @@ class IntendedSolid:
         """Raise if so much of the area has nothing inside, on neither side, that it is no solid.
 
         Raises:
-            MeshError: so.
+            MeshError: it is no solid.
         """
         rng = np.random.default_rng(0)
         corner = self.vertices[self.oriented]
@@ -202,17 +208,18 @@ class IntendedSolid:
         away = _NEAREST * self.size * normals
         beside = self.winding(np.concatenate([points + away, points - away]))
         nothing = (beside.reshape(2, -1) < 0.5).all(axis=0)
-        share = float(nothing.mean())
-        if share > _OPEN:
+        fraction = float(nothing.mean())
+        if fraction > _OPEN:
             raise MeshError(
-                f"the mesh is an open sheet: {share:.0%} of its area have nothing inside, on "
+                f"the mesh is an open sheet: {fraction:.0%} of its area have nothing inside, on "
                 "neither side, so that most of it would be lost; give it a thickness first, in the "
                 "program that made it"
             )
 
     def difference(self, surface: TriangleMesh, away: float) -> Difference | None:
-        """How a closed surface differs from what was given, at points farther than `away` from
-        both, and next to closed parts and farther than that from the surface; None if it does not.
+        """The difference of a closed surface from the input, at points farther than `away` from
+        both, and next to closed parts and farther than that from the surface; None if there is
+        none.
         """
         points, w = self.samples
         corner = surface.vertices[surface.faces]
@@ -223,20 +230,20 @@ class IntendedSolid:
         )
         field = _winding_number(surface.vertices, surface.faces)
         both = np.concatenate([self.vertices[self.oriented], corner])
-        missing, added, far = _on_other_side(points, w, field, both, away)
-        beside, around = self.beside
-        lost, filled, beside_far = _on_other_side(beside, around, field, corner, away)
-        far = np.concatenate([far, beside_far])
+        missing, added, distant = _on_other_side(points, w, field, both, away)
+        beside, windings = self.beside
+        lost, filled, beside_far = _on_other_side(beside, windings, field, corner, away)
+        distant = np.concatenate([distant, beside_far])
         volumes = self._volumes(surface, away)
-        if not len(far) and volumes is None:
+        if not len(distant) and volumes is None:
             return None
         missing, added = missing + lost, added + filled
-        share = (missing + added) / (len(points) + len(beside))
-        return Difference(share, far[:_LISTED], missing, added, volumes)
+        fraction = (missing + added) / (len(points) + len(beside))
+        return Difference(fraction, distant[:_LISTED], missing, added, volumes)
 
     def _volumes(self, surface: TriangleMesh, away: float) -> tuple[float, float] | None:
-        """Volumes of the surface and the mesh if they differ, of a closed one that winds around no
-        point twice or clockwise."""
+        """The volumes of the surface and the mesh if they differ, for a closed mesh that winds
+        around no point twice or clockwise."""
         _, w = self.samples
         if self.field is None or len(self.field.mesh.singular_edges):
             return None
@@ -258,17 +265,18 @@ def _on_other_side(
     corner: FloatArray,
     away: float,
 ) -> tuple[int, int, FloatArray]:
-    """How many points with winding numbers w clearly above 1/2 are not inside of what was made; how
-    many clearly below are; and those of them that are farther than `away` from triangles (m, 3, 3),
-    of some that are looked at. If these are none, there are none."""
+    """The number of points with winding numbers w clearly above 1/2 that are outside of the result;
+    the number of points clearly below that are inside; and, of a selection of both, the points that
+    are farther than `away` from triangles (m, 3, 3). If there are no such points, both numbers are
+    0."""
     inside = _values(field, points) > 0.5
     missing, added = ~inside & (w > 0.5 + _CLEARLY), inside & (w < 0.5 - _CLEARLY)
     rows = np.flatnonzero(missing | added)
     rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), _LOOKED_AT)).astype(int)]
-    far = rows[[distance_from_triangles(points[k], corner) > away for k in rows]]
-    if not len(far):
+    distant = rows[[distance_from_triangles(points[k], corner) > away for k in rows]]
+    if not len(distant):
         return 0, 0, np.zeros((0, 3))
-    return int(missing.sum()), int(added.sum()), points[far]
+    return int(missing.sum()), int(added.sum()), points[distant]
 
 
 def _winding_number(x: FloatArray, faces: IntArray) -> WindingNumber | None:
@@ -285,7 +293,7 @@ def _values(field: WindingNumber | None, points: FloatArray) -> FloatArray:
 
 
 def _turned(faces: IntArray, which: BoolArray) -> IntArray:
-    """Faces (m, 3), some of them (m,) turned over."""
+    """Faces (m, 3), with those of the mask `which` (m,) turned over."""
     return np.where(which[:, None], faces[:, ::-1], faces)
 
 
@@ -316,39 +324,40 @@ def _near(corner: FloatArray, size: float, rng: np.random.Generator) -> FloatArr
 
 
 def _inside_out(x: FloatArray, faces: IntArray, parts: list[IntArray]) -> BoolArray:
-    """(m,) which faces to turn over for what was given not to be inside out. parts: closed ones.
+    """(m,) which faces to turn over for the input not to be inside out. parts: the closed parts.
 
-    A part is turned with the outermost one that it lies in. So is what is not closed; where that
-    lies in no part it is turned by itself, and parts that lie in it with it.
+    A part is turned with the outermost part that it lies in. So are the faces that are not closed;
+    where these lie in no part they are turned by themselves, together with the parts that lie in
+    them.
     """
     turned, is_rest = np.zeros(len(faces), np.bool_), np.ones(len(faces), np.bool_)
     for rows in parts:
         is_rest[rows] = False
-    rest = faces[is_rest]
+    open_faces = faces[is_rest]
     closed = [faces[rows] for rows in parts]
     volumes = [volume_of(x, part) for part in closed]
-    holds_rest = [_lies_in(x, rest, part) for part in closed]
+    holds_rest = [_lies_in(x, open_faces, part) for part in closed]
     is_with_rest = is_rest.copy()
-    for k, around in enumerate(nested(x, closed)):
-        outermost = around[-1] if around else k
-        if not any(holds_rest) and _lies_in(x, closed[outermost], rest):
+    for k, containers in enumerate(nested(x, closed)):
+        outermost = containers[-1] if containers else k
+        if not any(holds_rest) and _lies_in(x, closed[outermost], open_faces):
             is_with_rest[parts[k]] = True
         else:
             turned[parts[k]] = volumes[outermost] < 0
     if any(holds_rest):
         sizes = np.where(holds_rest, np.abs(volumes), 0)
         turned[is_rest] = volumes[int(sizes.argmax())] < 0
-    elif len(rest) and _winds_clockwise(x, rest):
+    elif len(open_faces) and _winds_clockwise(x, open_faces):
         turned |= is_with_rest
     return turned
 
 
-def _lies_in(x: FloatArray, part: IntArray, around: IntArray) -> bool:
-    """Whether faces wind around all of some places of others."""
-    if not len(part) or not len(around):
+def _lies_in(x: FloatArray, part: IntArray, container: IntArray) -> bool:
+    """Whether the faces `container` wind around points of the faces `part`: all of a selection."""
+    if not len(part) or not len(container):
         return False
-    places = x[part[:: max(1, len(part) // _PLACES)]].mean(axis=1)
-    return bool((np.abs(_values(_winding_number(x, around), places)) > 0.5).all())
+    centers = x[part[:: max(1, len(part) // _PLACES)]].mean(axis=1)
+    return bool((np.abs(_values(_winding_number(x, container), centers)) > 0.5).all())
 
 
 def _winds_clockwise(x: FloatArray, faces: IntArray) -> bool:

@@ -1,5 +1,5 @@
-"""Computes the boundary of the solid of a closed mesh that intersects itself: its faces are cut
-along each other, and those pieces that bound the solid are joined.
+"""The boundary of the solid of a closed mesh that intersects itself: its faces are cut along each
+other, and the pieces that bound the solid are joined.
 
 The winding numbers on both sides of each piece tell whether the piece bounds the points around
 which the mesh winds at least once. Where two faces meet, the pieces of each have vertices that
@@ -30,9 +30,11 @@ from harnack.tree.triangle_tree import TriangleTree, triangle_records
 __all__ = ["boundary_of_solid", "neighbors", "passes_itself"]
 
 _LEAF_SIZE = 4
-# In units of the mesh's size. Pieces not as high as the first are not asked what is beside them.
+# Relative to the mesh's size: pieces thinner than the first are not tested for winding numbers
+# beside them; corners nearer than the second are joined.
 _THIN, _SAME = 1e-9, 1e-11
-# Faces around an edge have one direction if they are turned by less, in full turns.
+# Faces around an edge have the same direction if the angle between them, in full turns, is less
+# than this.
 _SAME_TURN = 1e-9
 # How often edges are halved at corners on them.
 _MOST_HALVINGS = 200
@@ -42,12 +44,12 @@ def passes_itself(surface: TriangleMesh, number: IntArray) -> bool:
     """Whether a closed surface none of whose triangles pass through others does so along edges that
     lie on faces, where nothing passes through a triangle.
 
-    number: (m,) of the connected part that each face belongs to.
+    number: (m,) the number of the connected component that each face belongs to.
 
     Proof. Where one sheet passes through another, each is cut in two, with winding numbers on both
-    sides of one part that are larger by one than those of the other. So the numbers beside pieces
-    of faces that touch others are not the same all over a connected part. Where no sheet passes
-    through it they are: they change at no other place.
+    sides of one part that are larger by one than those of the other. So the winding numbers beside
+    pieces of faces that touch others are not the same all over a connected component. Where no
+    sheet passes through it they are: they change at no other place.
     """
     pairs, _ = touching_pairs(surface.vertices, surface.faces)
     if not len(pairs):
@@ -60,15 +62,15 @@ def passes_itself(surface: TriangleMesh, number: IntArray) -> bool:
 
 def boundary_of_solid(vertices: FloatArray, faces: IntArray) -> TriangleMesh:
     """The boundary of the points around which a closed mesh winds at least once; it may wind around
-    others clockwise. Where it touches itself it has corners of its own for each sheet.
+    others clockwise. Where the boundary touches itself each sheet has corners of its own.
 
     Corners of the mesh are as they were, bit by bit.
 
     Raises:
         MeshingError: there are no such points, or pieces do not fit together.
     """
-    x, whole = without_zero_area_faces(vertices, faces)
-    cut = _Cut.of(x, whole, np.arange(len(whole)), closed=faces)
+    x, proper_faces = without_zero_area_faces(vertices, faces)
+    cut = _Cut.of(x, proper_faces, np.arange(len(proper_faces)), closed=faces)
     bounds = (np.minimum(cut.front, cut.back) < 0.5) & (np.maximum(cut.front, cut.back) > 0.5)
     bounds &= ~cut.is_there_before()
     if not bounds.any():
@@ -76,23 +78,24 @@ def boundary_of_solid(vertices: FloatArray, faces: IntArray) -> TriangleMesh:
     pieces = cut.pieces[bounds]
     looks_in = (cut.front > cut.back)[bounds]
     pieces = np.where(looks_in[:, None, None], pieces[:, ::-1], pieces)
-    places = np.concatenate([cut.unit, pieces.reshape(-1, 3)])
-    group = connected_groups(pairs_within(places, _SAME), len(places))
+    points = np.concatenate([cut.unit, pieces.reshape(-1, 3)])
+    group = connected_groups(pairs_within(points, _SAME), len(points))
     first = np.unique(group, return_index=True)[1][group]  # corners of the mesh come first
     joined = first[len(x) :].reshape(-1, 3)
     joined = joined[(joined != np.roll(joined, 1, axis=1)).all(axis=1)]
-    joined = _cut_at_corners(places, joined)
-    moved = np.concatenate([x, cut.center + cut.size * places[len(x) :]])
+    joined = _cut_at_corners(points, joined)
+    moved = np.concatenate([x, cut.center + cut.size * points[len(x) :]])
     return TriangleMesh.without_unused_vertices(*_apart_at_contacts(moved, joined))
 
 
 @dataclass(frozen=True)
 class _Cut:
     """Pieces (k, 3, 3) of some faces of a mesh, cut along each other, in coordinates of at most
-    about one: center + size times them are the real ones.
+    about one: center + size times these are the original coordinates.
 
-    unit: (n, 3) vertices. faces: those that were cut; owner: (k,) which of the mesh each piece is
-    of. front, back: (k,) winding numbers on its sides. is_thick: (k,) whether these are known.
+    unit: (n, 3) vertices. faces: the faces that were cut; owner: (k,) the face of the mesh that
+        each piece is of. front, back: (k,) winding numbers on its sides. is_thick: (k,) whether
+        these are known.
     """
 
     rays: TriangleTree
@@ -110,27 +113,27 @@ class _Cut:
     def of(
         cls, vertices: FloatArray, faces: IntArray, rows: IntArray, closed: IntArray | None = None
     ) -> _Cut:
-        """Of the faces `rows`. closed: all faces, with those that have no area, if there are
-        such."""
+        """The pieces of the faces `rows`. closed: all faces, with those without an area, if there
+        are such faces."""
         corner = vertices[faces]
         low, high = corner.min(axis=(0, 1)), corner.max(axis=(0, 1))
         size = float(2.0 ** np.ceil(np.log2(0.5 * float((high - low).max()))))
         center = 0.5 * (low + high)
-        unit = (vertices - center) / size
-        rays = _rays(unit, faces[rows])
-        pieces, owner = split_intersecting_faces(rays, unit, faces[rows], covered_whole=True)
-        around = _rays(unit, faces if closed is None else closed)
-        front, back = windings_of_sides(around, pieces)
+        scaled = (vertices - center) / size
+        rays = _rays(scaled, faces[rows])
+        pieces, owner = split_intersecting_faces(rays, scaled, faces[rows], covered_whole=True)
+        closed_rays = _rays(scaled, faces if closed is None else closed)
+        front, back = windings_of_sides(closed_rays, pieces)
         edges = pieces - np.roll(pieces, 1, axis=1)
         longest = np.linalg.norm(edges, axis=2).max(axis=1)
         is_thick = np.linalg.norm(area_normals(pieces), axis=1) > _THIN * longest
         return cls(
-            rays, unit, faces[rows], center, size, pieces, rows[owner], front, back, is_thick
+            rays, scaled, faces[rows], center, size, pieces, rows[owner], front, back, is_thick
         )
 
     def is_there_before(self) -> BoolArray:
-        """(k,) which pieces lie on a face in front of their own, in one plane, if all were cut: of
-        several in one place one is enough."""
+        """(k,) which pieces lie on a face that precedes their own, in one plane, if all faces were
+        cut: of several pieces in one place a single one is enough."""
         is_there = np.zeros(len(self.pieces), np.bool_)
         covered, covering = overlapping_faces(self.rays, self.unit, self.faces)
         covered, covering = covered[covering < covered], covering[covering < covered]
@@ -151,17 +154,18 @@ class _Cut:
         return is_there
 
 
-def _rays(unit: FloatArray, faces: IntArray) -> TriangleTree:
-    tree = build_balanced_tree(unit[faces].mean(axis=1), leaf_size=_LEAF_SIZE)
-    return TriangleTree.of(choose_backend("double"), tree, triangle_records(unit, faces))
+def _rays(scaled: FloatArray, faces: IntArray) -> TriangleTree:
+    tree = build_balanced_tree(scaled[faces].mean(axis=1), leaf_size=_LEAF_SIZE)
+    return TriangleTree.of(choose_backend("double"), tree, triangle_records(scaled, faces))
 
 
 # Pieces joined.
 
 
 def _cut_at_corners(x: FloatArray, faces: IntArray) -> IntArray:
-    """Faces, cut until every edge is run as often one way as the other: those at edges where that
-    is not so at a corner of such edges that lies on them, of several the one next to the middle.
+    """Faces, cut until every edge is run as often in one direction as in the other. Edges for which
+    that fails are cut at a corner of such edges that lies on them, of several the corner nearest to
+    the middle.
 
     Raises:
         MeshingError: they do not fit together.
@@ -193,26 +197,26 @@ def _cut_at_corners(x: FloatArray, faces: IntArray) -> IntArray:
 
 
 def _corners_on(x: FloatArray, edges: IntArray) -> tuple[IntArray, BoolArray]:
-    """For each of some edges (k, 2) that of their ends which lies on it, nearest to its middle; and
-    whether there is one."""
-    import scipy.spatial  # here: half a second that few need
+    """For each of edges (k, 2) the end of another edge that lies on it, nearest to its middle; and
+    whether there is such an end."""
+    import scipy.spatial  # imported here: it takes half a second
 
     searching: Any = scipy.spatial
     corners = np.unique(edges)
     p, q = x[edges[:, 0]], x[edges[:, 1]]
     half = 0.5 * row_norms(q - p)
     near = searching.cKDTree(x[corners]).query_ball_point(0.5 * (p + q), half)
-    count = np.array([len(some) for some in near])
+    count = np.array([len(group) for group in near])
     row = np.repeat(np.arange(len(edges)), count)
     corner = corners[np.fromiter(itertools.chain.from_iterable(near), np.int64, int(count.sum()))]
-    way = (q - p)[row] / np.maximum(2 * half[row], 1e-300)[:, None]
+    direction = (q - p)[row] / np.maximum(2 * half[row], 1e-300)[:, None]
     to = x[corner] - p[row]
-    along = row_dots(to, way)
-    is_on = row_norms(to - along[:, None] * way) <= _SAME
+    along = row_dots(to, direction)
+    is_on = row_norms(to - along[:, None] * direction) <= _SAME
     is_on &= (corner != edges[row, 0]) & (corner != edges[row, 1])
     is_on &= (along > 0) & (along < 2 * half[row])
-    row, corner, off = row[is_on], corner[is_on], np.abs(along - half[row])[is_on]
-    order = np.lexsort((off, row))
+    row, corner, offset = row[is_on], corner[is_on], np.abs(along - half[row])[is_on]
+    order = np.lexsort((offset, row))
     row, first = np.unique(row[order], return_index=True)
     middle, is_cut = np.zeros(len(edges), np.int64), np.zeros(len(edges), np.bool_)
     middle[row], is_cut[row] = corner[order][first], True
@@ -220,8 +224,8 @@ def _corners_on(x: FloatArray, edges: IntArray) -> tuple[IntArray, BoolArray]:
 
 
 def neighbors(x: FloatArray, faces: IntArray) -> IntArray:
-    """(k, 2) pairs of `half_edges` of faces at which two belong together: at edges of two, and
-    at those of more that have the material between them."""
+    """(k, 2) pairs of `half_edges` at which two faces belong together: the two at an edge of two
+    faces, and at an edge of more faces those that have the material between them."""
     pairs, m = half_edges(faces), len(faces)
     edges = Edges.of(pairs)
     beside = [edges.paired_half_edges()]
@@ -242,15 +246,15 @@ def _wedges(ends: FloatArray, third: FloatArray, is_along: BoolArray) -> IntArra
 
     Seen against the edge's direction, counter-clockwise, material begins behind a face that runs
     the edge backwards, since its positive side looks back, and ends at the next one that runs it
-    forwards. Of faces in one direction those at which material ends come first.
+    forwards. Of faces in the same direction, faces at which material ends come first.
     """
-    way = ends[1] - ends[0]
+    direction = ends[1] - ends[0]
     away = third - ends[0]
-    away -= np.outer(away @ way / (way @ way), way)
+    away -= np.outer(away @ direction / (direction @ direction), direction)
     across: Any = away[0] / max(float(np.linalg.norm(away[0])), 1e-300)
-    upright: Any = np.cross(way / float(np.linalg.norm(way)), across)
-    turn: FloatArray = np.arctan2(away @ upright, away @ across) / (2 * np.pi)
-    steps: IntArray = np.round(turn / _SAME_TURN).astype(np.int64) % round(1 / _SAME_TURN)
+    upright: Any = np.cross(direction / float(np.linalg.norm(direction)), across)
+    turns: FloatArray = np.arctan2(away @ upright, away @ across) / (2 * np.pi)
+    steps: IntArray = np.round(turns / _SAME_TURN).astype(np.int64) % round(1 / _SAME_TURN)
     begun, wedges = list[int](), list[tuple[int, int]]()
     is_taken = np.zeros(len(third), np.bool_)
     for k in 2 * np.lexsort((~is_along, steps)).tolist():  # twice around
@@ -265,7 +269,7 @@ def _wedges(ends: FloatArray, third: FloatArray, is_along: BoolArray) -> IntArra
 
 
 def _apart_at_contacts(x: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray]:
-    """A closed surface with a corner of its own for each of the sheets that touch in one."""
+    """A closed surface in which each sheet has corners of its own where sheets touch."""
     m = len(faces)
     edge, opposite = neighbors(x, faces).T
     # Corner k of face i is k m + i, and edge k runs from it to the next.

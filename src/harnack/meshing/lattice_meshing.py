@@ -1,9 +1,9 @@
 """Triangles of a real-valued level set in the tetrahedra of a lattice, and checks of them.
 
-Points of the lattice near the level set are moved onto it and become vertices, which makes most
-slivers go (Labelle and Shewchuk 2007). Where parts of the surface then touch in a vertex or an
-edge, points are put back until they do not. With none moved the surface is a manifold: every
-tetrahedron is cut by one triangle or quadrilateral, and signs at its corners alone say how.
+Points of the lattice near the level set are moved onto it and become vertices, which removes most
+slivers (Labelle and Shewchuk 2007). Where parts of the surface then touch in a vertex or an edge,
+points are moved back until they do not. With none moved the surface is a manifold: every
+tetrahedron is cut by one triangle or quadrilateral, which the signs at its corners determine.
 """
 
 from __future__ import annotations
@@ -57,36 +57,41 @@ __all__ = [
     "split_faces_off_level",
 ]
 
-# Lengths in cells, for points of missed parts: how near the level seems to a lattice point; how far
-# the point may be moved to it; how far a point that is found has to be from all triangles, by their
-# corners and centers, which are less than half a cell from all that is on them; and from the faces
-# of the box, beyond which there may be more.
+# Distances in cells, for points of missed parts: the largest estimated distance of the level from a
+# lattice point; the largest move of the point onto it; the smallest distance of the moved point
+# from all triangles, by their corners and centers, which are less than half a cell from all points
+# on them; and its smallest distance from the faces of the box, beyond which the surface may
+# continue.
 _MAX_SEED_DISTANCE, _MAX_SEED_MOVE, _MIN_MESH_DISTANCE, _MIN_WALL_DISTANCE = 1.0, 1.5, 0.75, 0.5
-# Points nearer than the first belong together; parts at least as long as the second are missed.
+# In cells: points nearer than the first belong together; parts at least as long as the second count
+# as missed.
 _CLUSTER_DISTANCE, _MIN_MISSED_LENGTH = 1.0, 2.0
 # Parts thinner than this many cells are missed nearly everywhere; and the thinnest measured.
 _THIN, _LEAST = 0.25, 2.0**-7
 # How near to the level, in cells, a point has to come by Newton's method.
 _ON = 1e-3
-# Newton's method may be on the way to a multiple root where it came nearer by that much.
+# Newton's method may converge to a multiple root where the distance fell by at least this factor.
 _SLOW = 0.7
-# Where the function touches its level: how many points are tried; how far beside them, in cells,
-# the function is looked at; golden sections; and how near it comes, as a part of what it is there.
+# The test for a function that touches its level: the number of points; how far beside them, in
+# cells, the function is evaluated; the number of golden sections and their ratio; and how near the
+# function comes to the level, relative to its values beside the point.
 _MOST_TRIED, _BESIDE, _SECTIONS, _GOLDEN, _TOUCHES = 60, 0.01, 40, 0.6180339887498949, 1e-8
-# So large a part of vertices may be farther from the level than that many cells: where signs change
-# by a jump.
+# The largest fraction of vertices that may be farther from the level than the second, in cells:
+# where signs change by a jump.
 _MOST_JUMPS, _FAR = 0.04, 0.1
-# A function that is its level at a larger part of so many points has no surface there.
+# A function that equals its level at a larger fraction of this number of points has no surface
+# there.
 _MOST_FLAT, _MOST_PROBES = 0.75, 2000
-# How far around a point, in cells, the function has to be its level for that to be a volume.
+# How far around a point, in cells, the function has to equal its level for the level set to be a
+# volume.
 _FLAT_AROUND = 0.25
 
 
 class MissedPartsError(MeshingError):
     """A level set of which some parts lie between the points of a lattice.
 
-    places: (k, 3) of the longest one, on the level; thickness: (k,) of the part there, a multiple
-        of `_LEAST` cells: 0 where it is thinner, inf where it is thicker than a cell.
+    places: (k, 3) points of the longest part, on the level; thickness: (k,) of the part there, a
+        multiple of `_LEAST` cells: 0 where it is thinner, inf where it is thicker than a cell.
     size: of cells.
     """
 
@@ -97,9 +102,9 @@ class MissedPartsError(MeshingError):
         self.places, self.thickness, self.size = places, thickness, size
 
     def may_be_fixed_by(self, smaller: float) -> bool:
-        """Whether such cells may help: not if they would miss a part as well that is two of these
-        cells long and far thinner than a cell, as beside a cusp or the tip of a cone, which no size
-        of cells resolves."""
+        """Whether cells `smaller` times as large may help: not if they would also miss a part that
+        is two of these cells long and far thinner than a cell, as beside a cusp or the tip of a
+        cone, which no size of cells resolves."""
         thin = self.places[self.thickness < _THIN * smaller * self.size]
         part = _longest_part(thin, _CLUSTER_DISTANCE * self.size)
         reach = float(np.ptp(part, axis=0).max()) if len(part) else 0.0
@@ -119,19 +124,20 @@ def check_no_missed_parts(
     """Raise if the level set has parts, two cells long or longer, away from its triangles: thin
     walls, knife edges, islands.
 
-    Signs at the points of a lattice do not show a wall between two of them. Its sides are found
-    from there by Newton's method: where that ends, on the level, should be near triangles. So many
-    points are a dense sample, and no proof. Islands smaller than a cell may be missed.
+    Signs at the points of a lattice do not show a wall between two of them. Newton's method,
+    started at these points, finds its sides: the end point, on the level, should be near triangles.
+    These points are a dense sample, and no proof. Islands smaller than a cell may be missed.
 
-    samples: at points (n, 3) of the lattice. is_beside: (n,) those of tetrahedra that are cut.
-    surface: vertices and faces. size: of a cell. box: where the level set counts; elsewhere: and
-        how far around points it does not.
+    samples: at points (n, 3) of the lattice. is_beside: (n,) which points are corners of cut
+        tetrahedra.
+    surface: vertices and faces. size: of a cell. box: where the level set counts; elsewhere: the
+        radius around points within which it does not count.
 
     Raises:
-        MissedPartsError: with one of the places. UnrefinableError: the function is its level in a
-            volume, or touches it along a surface.
+        MissedPartsError: parts are missed; with points of the longest. UnrefinableError: the
+            function equals its level in a volume, or touches it along a surface.
     """
-    import scipy.spatial  # here: half a second that few need
+    import scipy.spatial  # imported here: it takes half a second
 
     searching: Any = scipy.spatial
     rows = np.flatnonzero(~is_beside & (samples.distance < _MAX_SEED_DISTANCE * size))
@@ -140,20 +146,20 @@ def check_no_missed_parts(
     start = points[rows]
     step = np.full(len(rows), 0.5 * size)
     x = newton_to_level(function, start, samples.select(rows), step, None)
-    left = function.sample(x)
-    found = left.distance < _ON * size
-    slow = ~found & (left.distance < _SLOW * samples.distance[rows])
+    end_samples = function.sample(x)
+    on_level = end_samples.distance < _ON * size
+    slow = ~on_level & (end_samples.distance < _SLOW * samples.distance[rows])
     if slow.any():
-        x[slow] = to_multiple_roots(function, x[slow], left.select(slow), step[slow])
-        found[slow] = function.sample(x[slow]).distance < _ON * size
-    found &= row_norms(x - start) < _MAX_SEED_MOVE * size
+        x[slow] = to_multiple_roots(function, x[slow], end_samples.select(slow), step[slow])
+        on_level[slow] = function.sample(x[slow]).distance < _ON * size
+    on_level &= row_norms(x - start) < _MAX_SEED_MOVE * size
     deep = _MIN_WALL_DISTANCE * size
-    found &= ((x >= box[0] + deep) & (x <= box[1] - deep)).all(axis=1)
-    x = x[found]
+    on_level &= ((x >= box[0] + deep) & (x <= box[1] - deep)).all(axis=1)
+    x = x[on_level]
     vertices, faces = surface
     if len(faces) and len(x):
-        around = np.concatenate([vertices[np.unique(faces)], vertices[faces].mean(axis=1)])
-        x = x[searching.cKDTree(around).query(x)[0] > _MIN_MESH_DISTANCE * size]
+        mesh_points = np.concatenate([vertices[np.unique(faces)], vertices[faces].mean(axis=1)])
+        x = x[searching.cKDTree(mesh_points).query(x)[0] > _MIN_MESH_DISTANCE * size]
     if elsewhere is not None and len(x):
         x = x[elsewhere(x) <= 0]
     part = _longest_part(x, _CLUSTER_DISTANCE * size)
@@ -174,32 +180,33 @@ def check_no_missed_parts(
 
 
 def _thickness(function: LevelFunction, x: FloatArray, size: float) -> FloatArray:
-    """(k,) how far points (k, 3) on the level are from where the sign changes again along the
-    slope, up to `size`: 0 where it does not change at the point itself, inf where not again."""
+    """(k,) the distance from points (k, 3) on the level to the next change of sign along the slope,
+    up to `size`: 0 where the sign does not change at the point itself, inf where it does not change
+    again."""
     slope = function.sample(x).gradient
-    way = slope / np.maximum(row_norms(slope), 1e-300)[:, None]
-    far = size * 2.0 ** np.arange(round(math.log2(_LEAST)), 1)
+    direction = slope / np.maximum(row_norms(slope), 1e-300)[:, None]
+    distances = size * 2.0 ** np.arange(round(math.log2(_LEAST)), 1)
     sides: list[BoolArray] = []
-    least = np.full(len(x), np.inf)
+    thickness = np.full(len(x), np.inf)
     for sign in (1.0, -1.0):
-        there = x[:, None] + sign * far[:, None] * way[:, None]
-        is_above = function.values(there.reshape(-1, 3)).reshape(len(x), len(far)) > 0
+        probes = x[:, None] + sign * distances[:, None] * direction[:, None]
+        is_above = function.values(probes.reshape(-1, 3)).reshape(len(x), len(distances)) > 0
         changed = is_above != is_above[:, :1]
-        first = far[changed.argmax(axis=1)]
-        least = np.minimum(least, np.where(changed.any(axis=1), first, np.inf))
+        first = distances[changed.argmax(axis=1)]
+        thickness = np.minimum(thickness, np.where(changed.any(axis=1), first, np.inf))
         sides.append(is_above[:, 0])
-    return np.where(sides[0] == sides[1], 0.0, least)
+    return np.where(sides[0] == sides[1], 0.0, thickness)
 
 
 def _check_off_level_around(function: LevelFunction, part: FloatArray, reach: float) -> None:
-    """Raise if the function is its level, up to rounding, at most of some points (n, 3) and on all
-    sides of them: such as max(x, 0), of which no cells are small enough."""
-    some = part[:: -(-len(part) // _MOST_PROBES)]
-    ways = reach * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
-    around = (some[:, None] + ways).reshape(-1, 3)
-    is_flat = function.is_on_level(around).reshape(len(some), -1).all(axis=1)
+    """Raise if the function equals its level, up to rounding, at most of the points (n, 3) and on
+    all sides of them: such as max(x, 0), for which no cells are small enough."""
+    probes = part[:: -(-len(part) // _MOST_PROBES)]
+    offsets = reach * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
+    near_points = (probes[:, None] + offsets).reshape(-1, 3)
+    is_flat = function.is_on_level(near_points).reshape(len(probes), -1).all(axis=1)
     if is_flat.mean() > 0.5:
-        a, b, c = some[is_flat][0]
+        a, b, c = probes[is_flat][0]
         raise UnrefinableError(
             f"{type(function.field).__name__} is {function.level:g}, up to rounding, at and around "
             f"points such as ({a:.4g}, {b:.4g}, {c:.4g}): its level there is a volume and no "
@@ -208,11 +215,11 @@ def _check_off_level_around(function: LevelFunction, part: FloatArray, reach: fl
 
 
 def _check_passes_level(function: LevelFunction, part: FloatArray, size: float) -> None:
-    """Raise if the function touches its level at most of some points (n, 3) near it, and does not
-    pass it, as a square does, whose sign no cells show.
+    """Raise if the function touches its level at most of the points (n, 3) near it, and does not
+    pass it, as a square, whose sign no cells show.
 
     Across such a point, on a line along the slope beside it, the function is on one side of the
-    level, and where it comes nearest, by golden sections, it is as near as rounding lets it.
+    level, and where it comes nearest, by golden sections, it is as near as rounding allows.
     """
     x = part[:: -(-len(part) // _MOST_TRIED)]
     half = _BESIDE * size
@@ -220,10 +227,10 @@ def _check_passes_level(function: LevelFunction, part: FloatArray, size: float) 
         -1, 3, 3
     )
     steepest = beside[np.arange(len(x)), (beside**2).sum(axis=2).argmax(axis=1)]
-    way = steepest / np.maximum(row_norms(steepest), 1e-300)[:, None]
+    direction = steepest / np.maximum(row_norms(steepest), 1e-300)[:, None]
 
     def along(s: FloatArray) -> FloatArray:
-        return function.values(x + s[:, None] * way)
+        return function.values(x + s[:, None] * direction)
 
     low, high = np.full(len(x), -half), np.full(len(x), half)
     side = np.sign(along(low))
@@ -247,7 +254,8 @@ def _check_passes_level(function: LevelFunction, part: FloatArray, size: float) 
 
 
 def _longest_part(x: FloatArray, apart: float) -> FloatArray:
-    """Of points (n, 3) those of the longest chain of which neighbors are no farther apart."""
+    """The points (n, 3) that form the longest chain whose neighbors are no farther apart than
+    `apart`."""
     if not len(x):
         return x
     part = connected_groups(pairs_within(x, apart), len(x))
@@ -261,20 +269,21 @@ def _longest_part(x: FloatArray, apart: float) -> FloatArray:
 def check_estimated_triangles(
     function: LevelFunction, vertices: FloatArray, faces: IntArray, tolerance: float
 ) -> None:
-    """Raise if refinement would make more triangles of these than the function allows: an estimate,
-    before they are made.
+    """Raise if refinement of these triangles is estimated to make more triangles than the function
+    allows.
 
-    How far the middle of a triangle is from the surface falls with its area: one that is k times
-    the tolerance away takes about k others. One triangle in several is examined.
+    The distance of the middle of a triangle from the surface falls with its area: a triangle that
+    is k times the tolerance away is refined to about k triangles. A selection of triangles is
+    examined.
 
     Raises:
         MeshingError: the function has no slope between the vertices.
-        TriangleLimitError: with the estimate, and a tolerance that would do.
+        TriangleLimitError: the estimate exceeds the limit; with a tolerance that would suffice.
     """
-    some = faces[:: max(1, len(faces) // 20_000)]
-    if not len(some):
+    sampled = faces[:: max(1, len(faces) // 20_000)]
+    if not len(sampled):
         return
-    corner = vertices[some]
+    corner = vertices[sampled]
     at = function.sample(0.5 * (corner + np.roll(corner, 1, axis=1)).reshape(-1, 3))
     is_flat = (at.value != 0) & ~at.gradient.any(axis=1)
     if is_flat.any():
@@ -286,20 +295,20 @@ def check_estimated_triangles(
     middle = at.distance
     ratio = middle.reshape(-1, 3).max(axis=1) / tolerance
     expected = float(np.maximum(1.0, ratio).mean()) * len(faces)
-    most = function.most_faces
-    if expected > most:
-        enough = expected / most
+    limit = function.most_faces
+    if expected > limit:
+        enough = expected / limit
         raise TriangleLimitError(
-            f"the tolerance takes about {expected:.1e} triangles, and max_triangles is {most:,}: "
+            f"the tolerance takes about {expected:.1e} triangles, and max_triangles is {limit:,}: "
             f"choose a `tolerance` {enough:.2g} times as large, or a larger max_triangles"
         )
 
 
-# Points this near to the level, in parts of the length of a cell, are moved onto it.
+# Points this near to the level, relative to the length of a cell, are moved onto it.
 _SNAPPED = 0.25
-# So many cells around what matters are made as if they did.
+# The width, in cells, of the border around relevant cells that is meshed as well.
 _BORDER = 2.0
-# So many cells along an edge of a block.
+# The number of cells along an edge of a block.
 _BLOCK = 8
 _MOST_ROUNDS = 20
 
@@ -319,9 +328,9 @@ class TriangleMesh:
     def without_unused_vertices(cls, vertices: FloatArray, faces: IntArray) -> TriangleMesh:
         """A mesh of these faces, without the vertices that no face uses."""
         used = np.flatnonzero(np.bincount(faces.ravel()))
-        place = np.full(len(vertices), -1, np.int64)
-        place[used] = np.arange(len(used))
-        return cls(vertices[used], place[faces])
+        index = np.full(len(vertices), -1, np.int64)
+        index[used] = np.arange(len(used))
+        return cls(vertices[used], index[faces])
 
     def reversed(self) -> TriangleMesh:
         """The same mesh with the orientation of all faces reversed."""
@@ -333,7 +342,7 @@ class IrrelevantRegion:
     """The region where a surface need not be meshed, because other operands remove it.
 
     clearance: radii of balls about points (k, 3) that lie in the region.
-    cached_cells: per lattice, the cells not proved to lie in it.
+    cached_cells: for each lattice, the cells that are not proved to lie in the region.
     """
 
     clearance: Clearance
@@ -346,7 +355,7 @@ class IrrelevantRegion:
         cells around them.
 
         Raises:
-            MeshingError: there are more cells than `most` triangles would take.
+            MeshingError: there are more cells than `most` triangles take.
         """
         key = (*lattice.lower.tolist(), *lattice.size.tolist(), *lattice.counts.tolist(), most)
         if key not in self.cached_cells:
@@ -360,14 +369,14 @@ class IrrelevantRegion:
 def mesh_open_surface(
     function: LevelFunction, lattice: BccLattice, tolerance: float, report: Callable[[str], None]
 ) -> tuple[TriangleMesh, IsotopyCoverage]:
-    """The level set in the box of a lattice, which ends on the box's faces; and what is proved of
-    it, before it is refined.
+    """The mesh of the level set in the box of a lattice, which ends on the box's faces; and its
+    proved isotopy, before it is refined.
 
     tolerance: of the middles of edges and faces, a length.
 
     Raises:
-        MeshingError: no cell is cut, or there are too many; a UnrefinableError where the function
-            is not finite, or its level is a volume.
+        MeshingError: no cell is cut, or there are too many; an UnrefinableError where the function
+            is not finite, or its level set is a volume.
     """
     walls = lattice.lower, lattice.upper
     cells = lattice.nonempty_cells(function.clearance, function.most_faces)
@@ -404,26 +413,26 @@ def mesh_closed_surface(
 ) -> TriangleMesh:
     """The boundary of the points of a lattice's box where the function is negative.
 
-    On the box it is made of the faces of the cells whose centers are negative, as if the points of
+    On the box it consists of the faces of the cells whose centers are negative, as if the points of
     the lattice there were on the level. Triangles in the two outermost layers of cells are coarse
     and may touch in vertices: they are to be cut away. There are no faces if the function is
     nowhere negative.
 
-    as_cut: leave the triangles as the cells cut them, which never pass through each other, and
-        leave out what lies between points of the lattice: for functions with creases everywhere, as
-        distances from meshes have, and cells of about the tolerance.
-    elsewhere: where nothing matters: there, but for a few cells at the border, the function counts
-        as positive, and the surface is closed by coarse triangles.
+    as_cut: whether to leave the triangles as the cells cut them, which never pass through each
+        other, and to leave out parts between points of the lattice: for functions with creases
+        everywhere, as distances from meshes, and cells of about the tolerance.
+    elsewhere: the region where the surface does not matter: except for a few cells at its border,
+        the function counts as positive there, and the surface is closed by coarse triangles.
 
     Raises:
         MeshingError: too many cells.
     """
-    most, does_matter = function.most_faces, None
+    limit, does_matter = function.most_faces, None
     if elsewhere is None:
-        cells = lattice.nonempty_cells(function.clearance, most)
+        cells = lattice.nonempty_cells(function.clearance, limit)
     else:
         cells, does_matter = lattice.relevant_cells(
-            function.clearance, elsewhere.relevant_cells(lattice, most), function.values, most
+            function.clearance, elsewhere.relevant_cells(lattice, limit), function.values, limit
         )
     outer = lattice.outer_cells()
     if does_matter is not None:
@@ -450,7 +459,7 @@ def mesh_closed_surface(
         function, points, samples, corners, first, faces, lattice, inner,
         None if elsewhere is None else elsewhere.clearance,
     )  # fmt: skip
-    # What ends at the outermost cells is moved and cut, its ends are not.
+    # Triangles that end at the outermost cells are moved and cut, their ends are not.
     if len(rest):
         _check_is_continuous(function, vertices, rest, lattice)
         check_estimated_triangles(function, vertices, rest, tolerance)
@@ -469,36 +478,37 @@ def mesh_closed_surface(
 def split_faces_off_level(
     function: LevelFunction, surface: TriangleMesh, farthest: float, times: int
 ) -> TriangleMesh:
-    """Faces whose center is farther than that from the level, as across a crease, cut into three at
-    a point on it; so are the new ones, a few times. All edges stay."""
+    """The mesh in which faces whose center is farther than `farthest` from the level, as across a
+    crease, are cut into three at a point on the level; so are the new faces, `times` times. All
+    edges stay."""
     vertices, faces = surface.vertices, surface.faces
-    asked = np.arange(len(faces))
+    pending = np.arange(len(faces))
     for _ in range(times):
-        corner = vertices[faces[asked]]
+        corner = vertices[faces[pending]]
         center = corner.mean(axis=1)
         samples = function.sample(center)
-        far = np.flatnonzero(samples.distance > farthest)
-        if not len(far):
+        off_level = np.flatnonzero(samples.distance > farthest)
+        if not len(off_level):
             break
-        span = 0.5 * row_norms(corner[far, 1] - corner[far, 0])
-        moved = newton_to_level(function, center[far], samples.select(far), span, None)
-        rows, inner = asked[far], len(vertices) + np.arange(len(far))
+        span = 0.5 * row_norms(corner[off_level, 1] - corner[off_level, 0])
+        moved = newton_to_level(function, center[off_level], samples.select(off_level), span, None)
+        rows, inner = pending[off_level], len(vertices) + np.arange(len(off_level))
         a, b, c = faces[rows].T
         vertices = np.concatenate([vertices, moved])
         fans = [np.stack([*ends, inner], axis=1) for ends in ((a, b), (b, c), (c, a))]
         faces = np.concatenate([np.delete(faces, rows, axis=0), *fans])
-        asked = np.arange(len(faces) - 3 * len(rows), len(faces))
+        pending = np.arange(len(faces) - 3 * len(rows), len(faces))
     return TriangleMesh(vertices, faces)
 
 
 def _are_negative(function: LevelFunction, lattice: BccLattice, cells: IntArray) -> BoolArray:
-    """(k,) whether the centers of cells (k, 3) are negative: as those of blocks of cells, where it
-    is proved that the level is not in the block."""
+    """(k,) whether the function is negative at the centers of cells (k, 3): as at the center of the
+    block of cells, where the level is proved not to be in the block."""
     shape = lattice.counts // _BLOCK + 1
     x, y, z = (cells // _BLOCK).T
     keys, index, _, _ = unique_with_inverse((x * shape[1] + y) * shape[2] + z)
-    rest, z = np.divmod(keys, shape[2])
-    blocks = np.stack([*np.divmod(rest, shape[1]), z], axis=1)
+    xy, z = np.divmod(keys, shape[2])
+    blocks = np.stack([*np.divmod(xy, shape[1]), z], axis=1)
     centers = lattice.points(_BLOCK * (2 * blocks + 1))
     half_diagonal = 0.5 * _BLOCK * float(np.linalg.norm(lattice.size))
     is_sure = function.clearance(centers) > half_diagonal * (1 + 1e-9)
@@ -531,22 +541,23 @@ def _check_nothing_missed(
 def _inside(
     lattice: BccLattice, does_matter: BoolArray | None
 ) -> Callable[[FloatArray], BoolArray]:
-    """Which points are farther than one and a half cells from the box, and neither in nor beside
-    cells that do not matter (counts).
+    """A function that tells which points are farther than one and a half cells from the box's
+    faces, and neither in nor beside irrelevant cells. does_matter: (counts) the mask of relevant
+    cells.
 
-    Triangles that end in the outermost cells would be cut again and again: the edge they end with
-    stays as it is, and their centers are no deeper than that.
+    Triangles that end in the outermost cells would be cut again and again: the edge that they end
+    with stays as it is, and their centers are no deeper than that.
     """
     lower, upper = lattice.lower + 1.5 * lattice.size, lattice.upper - 1.5 * lattice.size
     deep = None if does_matter is None else lattice.interior_cells(does_matter)
 
     def counts(points: FloatArray) -> BoolArray:
-        found = np.ones(len(points), np.bool_)
+        is_inside = np.ones(len(points), np.bool_)
         for x, low, high in zip(points.T, lower, upper, strict=True):
-            found &= (x >= low) & (x <= high)
+            is_inside &= (x >= low) & (x <= high)
         if deep is not None:
-            found &= deep[tuple(lattice.cell_indices(points).T)]
-        return found
+            is_inside &= deep[tuple(lattice.cell_indices(points).T)]
+        return is_inside
 
     return counts
 
@@ -558,9 +569,9 @@ def _wall_faces(
     on = is_wall[corners]
     rows = np.flatnonzero(on.sum(axis=1) == 3)
     order = np.argsort(on[rows], axis=1, kind="stable")  # the fourth corner first
-    apex, *rest = np.take_along_axis(corners[rows], order, axis=1).T
+    apex, *base = np.take_along_axis(corners[rows], order, axis=1).T
     below = samples.value[apex] <= 0
-    face, apex = np.stack(rest, axis=1)[below], apex[below]
+    face, apex = np.stack(base, axis=1)[below], apex[below]
     a, b, c = (points[face[:, k]] for k in range(3))
     inward = (np.cross(b - a, c - a) * (points[apex] - a)).sum(axis=1) > 0
     face[inward] = face[inward][:, ::-1]
@@ -570,18 +581,19 @@ def _wall_faces(
 def _sample_lattice(
     function: LevelFunction, points: FloatArray, lattice: BccLattice, is_beyond: BoolArray
 ) -> LevelSamples:
-    """The function at points of a lattice, far on the positive side at those beyond what matters;
-    raises UnrefinableError where it is not finite, or is its level nearly everywhere."""
+    """The function at points of a lattice, with a large positive value at irrelevant points
+    `is_beyond`; raises UnrefinableError where it is not finite, or equals its level nearly
+    everywhere."""
     count = len(points)
     samples = LevelSamples(np.full(count, 10 * OUTSIDE_VALUE), np.ones((count, 3)), np.zeros(count))
     points = points[~is_beyond]
     samples = samples.replaced(~is_beyond, function.sample(points))
-    bad = ~np.isfinite(samples.value[~is_beyond])
-    if bad.any():
-        x, y, z = points[bad][0]
+    fails = ~np.isfinite(samples.value[~is_beyond])
+    if fails.any():
+        x, y, z = points[fails][0]
         nearer = ", or a smaller `cell_size`: it is asked for three cells around other parts"
         raise UnrefinableError(
-            f"{type(function.field).__name__} has no finite value at {bad.sum():,} points, such "
+            f"{type(function.field).__name__} has no finite value at {fails.sum():,} points, such "
             f"as ({x:.4g}, {y:.4g}, {z:.4g}): choose a `clip` where it has"
             + (nearer if is_beyond.any() else "")
         )
@@ -592,8 +604,8 @@ def _sample_lattice(
 def _check_is_continuous(
     function: LevelFunction, vertices: FloatArray, faces: IntArray, lattice: BccLattice
 ) -> None:
-    """Raise if at many vertices the sign of the function changes and the level is not near: it
-    jumps there, and refinement would never come to an end."""
+    """Raise if at many vertices the sign of the function changes and the level is not near: the
+    function jumps there, and refinement would never end."""
     x = vertices[np.unique(faces)]
     is_far = function.sample(x).distance > _FAR * float(lattice.size.max())
     if is_far.sum() > _MOST_JUMPS * len(x):
@@ -609,23 +621,23 @@ def _check_is_continuous(
 def _check_off_level_at_most_points(
     function: LevelFunction, points: FloatArray, lattice: BccLattice
 ) -> None:
-    """Raise if the function is its level nearly everywhere, up to rounding: such as x - x, of which
-    no cells are proved empty, however small they are."""
+    """Raise if the function equals its level nearly everywhere, up to rounding: such as x - x, for
+    which no cells are proved empty, however small they are."""
     if len(points) <= _MOST_FLAT * 2 * math.prod(lattice.counts.tolist()):
         return
-    some = points[:: -(-len(points) // _MOST_PROBES)]
-    share = float(function.is_on_level(some).mean())
-    if share > _MOST_FLAT:
+    probes = points[:: -(-len(points) // _MOST_PROBES)]
+    fraction = float(function.is_on_level(probes).mean())
+    if fraction > _MOST_FLAT:
         raise UnrefinableError(
             f"{type(function.field).__name__} is {function.level:g}, up to rounding, at "
-            f"{share:.0%} of the points looked at: its level there is a volume and no surface; "
+            f"{fraction:.0%} of the points looked at: its level there is a volume and no surface; "
             "choose another level"
         )
 
 
 @dataclass(frozen=True)
 class _InitialMesh:
-    """Vertices and faces before they are refined, and the points of the tetrahedra, those near the
+    """Vertices and faces before refinement, and the points of the tetrahedra, with points near the
     level moved onto it; rows: (k,) the tetrahedra that the level may pass through between points,
     and crossed: (k,) whether it does; ends: (j, 2) points at the ends of the edges on which the
     other vertices lie."""
@@ -638,7 +650,7 @@ class _InitialMesh:
     ends: IntArray
 
     def is_cut(self, corners: IntArray) -> BoolArray:
-        """(m,) which of all tetrahedra, by their corners (m, 4), hold points of the faces."""
+        """(m,) which of all tetrahedra, given by their corners (m, 4), hold points of the faces."""
         cut = _have_any(self.points.is_on_level, corners)
         cut[self.rows] |= self.crossed
         return cut
@@ -660,46 +672,50 @@ def _march(
 ) -> _InitialMesh:
     """Vertices and faces of a manifold, with points near the level moved onto it.
 
-    is_fixed: (n,) points that are not moved. is_wall: (n,) those that count as on the level.
+    is_fixed: (n,) which points are not moved. is_wall: (n,) which points count as on the level.
     """
     at_rest, original = points, samples
     points, samples, is_on = _snap_points(function, points, samples, is_fixed, lattice, walls)
     is_on |= is_wall
-    wrong, is_asked = np.zeros(0, np.int64), np.ones(len(points), np.bool_)
-    rows = found = np.flatnonzero(_may_be_cut(samples.value, is_on, corners))
+    touching, is_affected = np.zeros(0, np.int64), np.ones(len(points), np.bool_)
+    rows = cut_rows = np.flatnonzero(_may_be_cut(samples.value, is_on, corners))
     for _ in range(_MOST_ROUNDS):
-        some, tets = TetrahedronPoints(points, is_on, samples), Tetrahedra.of(points, corners[rows])
-        crossings = count_crossings(function, some, tets)
-        # Where vertices lie on edges does not matter for what touches.
-        _, faces = extract_triangles(function, some, tets, crossings, _middles)
-        wrong = nonmanifold_vertices(faces)
-        wrong = wrong[wrong < len(points)]
-        wrong = wrong[(is_asked & ~is_wall)[wrong]]
-        if not len(wrong):
+        sampled, tets = (
+            TetrahedronPoints(points, is_on, samples),
+            Tetrahedra.of(points, corners[rows]),
+        )
+        crossings = count_crossings(function, sampled, tets)
+        # The positions of vertices on edges do not matter for whether parts touch.
+        _, faces = extract_triangles(function, sampled, tets, crossings, _middles)
+        touching = nonmanifold_vertices(faces)
+        touching = touching[touching < len(points)]
+        touching = touching[(is_affected & ~is_wall)[touching]]
+        if not len(touching):
             break
         points, is_on = points.copy(), is_on.copy()
-        points[wrong], is_on[wrong] = at_rest[wrong], False
-        samples = samples.replaced(wrong, original.select(wrong))
-        # Only points beside these may touch anew: with all of their tetrahedra.
-        near, is_asked = np.zeros(len(points), np.bool_), np.zeros(len(points), np.bool_)
-        near[wrong] = True
-        is_asked[corners[_have_any(near, corners)]] = True
-        asked = np.flatnonzero(_have_any(is_asked, corners))
-        rows = asked[_may_be_cut(samples.value, is_on, corners[asked])]
-        found = np.concatenate([found, rows])
+        points[touching], is_on[touching] = at_rest[touching], False
+        samples = samples.replaced(touching, original.select(touching))
+        # Parts may touch anew only at points beside these: they are examined with all of their
+        # tetrahedra.
+        near, is_affected = np.zeros(len(points), np.bool_), np.zeros(len(points), np.bool_)
+        near[touching] = True
+        is_affected[corners[_have_any(near, corners)]] = True
+        affected = np.flatnonzero(_have_any(is_affected, corners))
+        rows = affected[_may_be_cut(samples.value, is_on, corners[affected])]
+        cut_rows = np.concatenate([cut_rows, rows])
     else:
         raise MeshingError(
-            f"sheets of the level set touch at {len(wrong)} places: choose a smaller `cell_size`"
+            f"sheets of the level set touch at {len(touching)} places: choose a smaller `cell_size`"
         )
-    # Others have the same points as before.
-    rows = sorted_unique(found)
+    # Other tetrahedra have the same points as before.
+    rows = sorted_unique(cut_rows)
     rows = rows[_may_be_cut(samples.value, is_on, corners[rows])]
-    some, tets = TetrahedronPoints(points, is_on, samples), Tetrahedra.of(points, corners[rows])
-    crossings = count_crossings(function, some, tets)
-    vertices, faces = extract_triangles(function, some, tets, crossings)
+    sampled, tets = TetrahedronPoints(points, is_on, samples), Tetrahedra.of(points, corners[rows])
+    crossings = count_crossings(function, sampled, tets)
+    vertices, faces = extract_triangles(function, sampled, tets, crossings)
     crossed: BoolArray = np.asarray((crossings.count[tets.edges] != 0).any(axis=1))
     ends = tets.ends[np.flatnonzero(crossings.count)]
-    return _InitialMesh(vertices, faces, some, rows, crossed, ends)
+    return _InitialMesh(vertices, faces, sampled, rows, crossed, ends)
 
 
 def _middles(low: FloatArray, high: FloatArray) -> FloatArray:
@@ -714,32 +730,35 @@ def _snap_points(
     lattice: BccLattice,
     walls: tuple[FloatArray, FloatArray] | None,
 ) -> tuple[FloatArray, LevelSamples, BoolArray]:
-    """Points, those near the level moved onto it; their samples; and which are on it."""
+    """The points, with points near the level moved onto it; their samples; and which are on the
+    level."""
     size = float(lattice.size.min())
     near = np.flatnonzero((samples.distance < _SNAPPED * size) & ~is_fixed)
     longest = np.full(len(near), 0.5 * _SNAPPED * size)
     moved = newton_to_level(function, points[near], samples.select(near), longest, walls, steps=4)
-    there = function.sample(moved)
+    new_samples = function.sample(moved)
     apart = row_norms(moved - points[near])
-    steep = row_norms(there.gradient)
-    good = np.abs(there.value) < 1e-9 * np.maximum(steep * size, 1e-300)
-    good &= apart < 1.2 * _SNAPPED * size
-    rows = near[good]
-    # A value of exactly 0 counts as on the level where it is, so that others have a sign.
+    steep = row_norms(new_samples.gradient)
+    converged = np.abs(new_samples.value) < 1e-9 * np.maximum(steep * size, 1e-300)
+    converged &= apart < 1.2 * _SNAPPED * size
+    rows = near[converged]
+    # A point with a value of exactly 0 counts as on the level unmoved, so that all other points
+    # have a sign.
     points, is_on = points.copy(), (samples.value == 0) & ~is_fixed
-    points[rows], is_on[rows] = moved[good], True
-    return points, samples.replaced(rows, there.select(good)), is_on
+    points[rows], is_on[rows] = moved[converged], True
+    return points, samples.replaced(rows, new_samples.select(converged)), is_on
 
 
 def _have_any(chosen: BoolArray, corners: IntArray) -> BoolArray:
-    """(m,) which tetrahedra (m, 4) have some of the chosen points."""
-    found = np.zeros(len(corners), np.bool_)
+    """(m,) which tetrahedra (m, 4) have a chosen point."""
+    has_chosen = np.zeros(len(corners), np.bool_)
     for column in corners.T:  # four times as fast as chosen[corners].any(axis=1)
-        found |= chosen[column]
-    return found
+        has_chosen |= chosen[column]
+    return has_chosen
 
 
-# Of a point above the level, below it, and on it: sums of four tell how many there are of each.
+# Codes of a point above the level, below it, and on it: a sum of four codes tells how many points
+# there are of each kind.
 _ABOVE, _BELOW, _ON_LEVEL = 1, 5, 25
 
 

@@ -1,4 +1,4 @@
-"""The function to be meshed, at many points at a time, and what is proved about it around them."""
+"""The function to be meshed, at many points at a time, and its proved bounds around them."""
 
 from __future__ import annotations
 
@@ -38,10 +38,10 @@ _PROOFS = choose_enclosures("curvature")
 class LevelSamples:
     """The function at points.
 
-    value: (n,) f - level; of an angle the nearest to 0, in [-period/2, period/2].
+    value: (n,) f - level; for an angle the value nearest to 0, in [-period/2, period/2].
     gradient: (n, 3).
-    quarter_period_radius: (n,) as far as f is proved to move by less than a quarter of its period;
-        0 without one.
+    quarter_period_radius: (n,) a radius within which f is proved to change by less than a quarter
+        of its period; 0 without a period.
     """
 
     value: FloatArray
@@ -68,7 +68,7 @@ class LevelSamples:
 
     @property
     def distance(self) -> FloatArray:
-        """(n,) to the level, by the slope: |f - level|/|gradient|."""
+        """(n,) the distance to the level, estimated by the slope: |f - level|/|gradient|."""
         steep = row_norms(self.gradient)
         return np.abs(self.value) / np.maximum(steep, 1e-300)
 
@@ -80,7 +80,7 @@ class EvaluatorCache:
         self._made: dict[int, tuple[Field, Field]] = {}
 
     def of(self, field: Field) -> Field:
-        if id(field) not in self._made:  # it is kept, so that no other has its id
+        if id(field) not in self._made:  # it is stored, so that no other field has its id
             self._made[id(field)] = field, field.prepare(choose_backend("double"))
         return self._made[id(field)][1]
 
@@ -89,10 +89,10 @@ class EvaluatorCache:
 class LevelFunction:
     """f - level, in double precision.
 
-    most_faces: no more triangles may be made of it.
-    evaluations: of f so far, in points. uploads: of fields, which functions share.
-    secant_steps: how many find where an edge of a cell meets the level, of functions that are
-        nearly linear along edges, as distances are; 0 for a search.
+    most_faces: the largest number of triangles of its mesh.
+    evaluations: of f so far, in points. uploads: the prepared fields, which functions share.
+    secant_steps: the number of secant steps for the roots on edges of cells, for functions that are
+        nearly linear along edges, such as distances; 0 for a search.
     """
 
     field: Field
@@ -116,10 +116,10 @@ class LevelFunction:
 
     def relative_to_level(self, value: FloatArray) -> FloatArray:
         """f - level, from values of f."""
-        above = value - self.level
+        difference = value - self.level
         if self.period is None:
-            return above
-        return above - self.period * np.round(above / self.period)
+            return difference
+        return difference - self.period * np.round(difference / self.period)
 
     def sample(self, points: FloatArray) -> LevelSamples:
         """The function at points (n, 3)."""
@@ -136,7 +136,8 @@ class LevelFunction:
         return self.relative_to_level(self._in_batches(points, value)[0])
 
     def is_on_level(self, points: FloatArray) -> BoolArray:
-        """(n,) where f is the level up to its error: rounding, and what a sum leaves out."""
+        """(n,) where f equals the level up to its error: rounding error, and truncation error of a
+        sum."""
 
         def both(p: Vec3) -> tuple[Real, Real]:
             with without_alternatives():
@@ -149,9 +150,9 @@ class LevelFunction:
     def gradient_bounds(
         self, points: FloatArray, radius: FloatArray
     ) -> tuple[LevelSamples, FloatArray]:
-        """The function at points (n, 3), its reach left out, and by how much at most its gradient
-        changes within `radius` (n,) of each, rounding included: see
-        `Field.gradient_change_bound`."""
+        """The samples of the function at points (n, 3), without `quarter_period_radius`, and a
+        bound of the change of its gradient within `radius` (n,) of each point, rounding included:
+        see `Field.gradient_change_bound`."""
 
         def compute(p: Vec3, r: Vec3) -> tuple[Real, Vec3, Real]:
             sample = self._prepared.evaluate(p)
@@ -165,7 +166,7 @@ class LevelFunction:
         return LevelSamples(self.relative_to_level(value), gradient, np.zeros(len(points))), change
 
     def clearance(self, points: FloatArray) -> FloatArray:
-        """(n,) no point of the level set is nearer: see `level_distance_lower_bound`."""
+        """(n,) a lower bound of the distance to the level set: see `level_distance_lower_bound`."""
 
         def bound(p: Vec3) -> tuple[Real]:
             sample = self._prepared.evaluate(p)
@@ -187,7 +188,7 @@ class LevelFunction:
         enclosures = _PROOFS.from_promises(
             sample.promises, sample.alternative_promises, sample.value, sample.value_error, slopes
         )
-        # A quarter above and a quarter below, less what rounding does.
+        # A quarter above and a quarter below, minus the rounding error.
         quarter = self._backend.Float(0.2499 * self.period) - 2 * sample.value_error
         return (
             sample.value,

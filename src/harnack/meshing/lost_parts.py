@@ -1,5 +1,4 @@
-"""Finds parts of a level set that are missing from its mesh by signs: walls and gaps thinner than a
-cell.
+"""Parts of a level set that are missing from its mesh by signs: walls and gaps thinner than a cell.
 
 Signs at the points of a lattice do not show a wall between two of them, nor a gap. That the mesh is
 near the level everywhere is checked by `points_off_level`; here the converse is checked, from
@@ -37,19 +36,23 @@ if TYPE_CHECKING:
 
 __all__ = ["LostParts", "PointsOnLevel"]
 
-# So many points are spread over triangles by area, and so many lie in the middles of others.
+# The number of points that are spread over triangles by area, and the number of triangles with a
+# point in their middle.
 _BY_AREA, _MIDDLES = 2000, 1000
-# Points beside triangles are so far from these, as a part of the size, or if that is more of the
-# coordinates; and w on both sides is by so much off the level at least, else rounding decides.
+# The distance of points beside triangles from these, relative to the size, or if that is more,
+# relative to the coordinates; and the smallest difference of w on both sides from the level, below
+# which rounding would decide.
 _BESIDE, _ROUNDED, _CLEARLY = 1e-9, 64 * 2.0**-53, 0.02
-# So many smoothing lengths the level may be from the points of a cloud.
+# The largest distance of the level from the points of a cloud, in smoothing lengths.
 _SMOOTHED = 2.0
-# Parts are lost if more than this share of the points are beyond the tolerance from the mesh, as
-# many as may be of the mesh's own points from the level; or if one is farther than so many cells.
+# Parts are lost if more than this fraction of the points are beyond the tolerance from the mesh,
+# the fraction that is allowed for the mesh's points off the level; or if a point is farther than
+# this number of cells.
 _SHARE, _CELLS = 0.01, 0.5
-# How thick a part is at so many places, as parts of a cell.
+# The number of points at which the thickness of a part is measured; and the thicknesses that are
+# tried, in cells.
 _LOOKED_AT, _THICKNESSES = 40, 2.0 ** np.arange(-10, 0.5, 0.25)
-# Thinner parts than this many cells are lost nearly everywhere.
+# Parts thinner than this, in cells, are lost nearly everywhere.
 _THIN = 0.25
 
 
@@ -65,7 +68,7 @@ class PointsOnLevel:
     def of(cls, function: SignFunction, tolerance: float) -> PointsOnLevel:
         """The known points on the level of a field; none for fields without such points.
 
-        tolerance: a length; the points of a cloud are looked at from this distance.
+        tolerance: a length; the distance from the points of a cloud at which its sign is evaluated.
         """
         mesh = function.field.jump_mesh()
         if mesh is not None:
@@ -76,21 +79,21 @@ class PointsOnLevel:
         if isinstance(field, OrientedPoints | HRBF):
             rows = _spread(len(field.points), _BY_AREA)
             smoothed = field.smoothing if isinstance(field, DipolePotential) else 0.0
-            way = max(tolerance, _SMOOTHED * smoothed) * field.normals[rows]
-            way /= np.maximum(row_norms(field.normals[rows]), 1e-300)[:, None]
-            low, high = field.points[rows] - way, field.points[rows] + way
+            offset = max(tolerance, _SMOOTHED * smoothed) * field.normals[rows]
+            offset /= np.maximum(row_norms(field.normals[rows]), 1e-300)[:, None]
+            low, high = field.points[rows] - offset, field.points[rows] + offset
         elif isinstance(field, Blobs):
             rows = _spread(len(field.centers), _BY_AREA)
-            way = np.random.default_rng(0).normal(size=(len(rows), 3))
-            way *= ((field.radii * field.kernel.support)[rows] / row_norms(way))[:, None]
-            low, high = field.centers[rows], field.centers[rows] + way
+            offset = np.random.default_rng(0).normal(size=(len(rows), 3))
+            offset *= ((field.radii * field.kernel.support)[rows] / row_norms(offset))[:, None]
+            low, high = field.centers[rows], field.centers[rows] + offset
         is_low, is_high = function.values(low) > 0, function.values(high) > 0
         low, high = np.where(is_low[:, None], high, low), np.where(is_low[:, None], low, high)
         return cls(*function.crossings(low[is_low != is_high], high[is_low != is_high]))
 
     @classmethod
     def _on_triangles(cls, function: SignFunction, corner: FloatArray) -> PointsOnLevel:
-        """On triangles (m, 3, 3) across which the function changes its sign."""
+        """Points on triangles (m, 3, 3) across which the function changes its sign."""
         normal = area_normals(corner)
         area = row_norms(normal)
         rows = np.concatenate([_by_area(area), _spread(len(corner), _MIDDLES)])
@@ -124,12 +127,13 @@ class PointsOnLevel:
 class LostParts:
     """Points of the level that are farther from a mesh than they should be.
 
-    far: how many are farther than the tolerance, of `looked_at`; beyond: how many of them are
-        farther than half a cell; within: a distance within which all are, by corners and centers
-        of triangles; inf if there are none.
-    missing, filled: (k, 3), of those that are far some that lie on parts which are missing, and
-        some in gaps which are filled; others: those of which neither is known.
-    thickness: of such parts and gaps, the median; inf if they are wider than cells, or not known.
+    far: the number of points farther than the tolerance, of `looked_at`; beyond: the number of
+        these that are farther than half a cell; within: a distance within which all points are, by
+        corners and centers of triangles; inf if there are none.
+    missing, filled: (k, 3), selections of the far points: on parts that are missing, and in gaps
+        that are filled; others: points for which neither is known.
+    thickness: the median thickness of such parts and gaps; inf if they are wider than cells, or not
+        known.
     spacing: of cells. advice: what to do.
     """
 
@@ -160,15 +164,15 @@ class LostParts:
         spacing: of the cells of the mesh.
         """
         corner = surface.vertices[surface.faces]
-        far = known.some(_are_farther(known.points, corner, tolerance))
-        beyond = _are_farther(far.points, corner, max(tolerance, _CELLS * spacing))
-        within = _bound_of_distances(far.points, corner) if len(far.points) else tolerance
-        shown = far.some(_spread(len(far.points), _LOOKED_AT))
+        distant = known.some(_are_farther(known.points, corner, tolerance))
+        beyond = _are_farther(distant.points, corner, max(tolerance, _CELLS * spacing))
+        within = _bound_of_distances(distant.points, corner) if len(distant.points) else tolerance
+        shown = distant.some(_spread(len(distant.points), _LOOKED_AT))
         thickness, is_inside = _thicknesses(function, shown, spacing)
         is_thin = np.isfinite(thickness)
         thickness = thickness[is_thin]
         return cls(
-            len(far.points),
+            len(distant.points),
             len(known.points),
             tolerance,
             int(beyond.sum()),
@@ -183,18 +187,19 @@ class LostParts:
 
     @property
     def matter(self) -> bool:
-        """Whether there are more points off the mesh than creases and corners leave for all
-        meshes."""
+        """Whether there are more points off the mesh than creases and corners cause for any
+        mesh."""
         return self.beyond > 0 or self.far > _SHARE * self.looked_at
 
     @property
     def show_thin_parts(self) -> bool:
-        """Whether they are on parts or in gaps that are thinner than cells, or beyond half a cell,
-        so that more is wrong than how coarse the mesh is."""
+        """Whether points are on parts or in gaps that are thinner than cells, or beyond half a
+        cell, so that the coarseness of the mesh is not the only cause."""
         return self.beyond + len(self.missing) + len(self.filled) > 0
 
     def are_mended_by(self, smaller: float) -> bool:
-        """Whether cells smaller by a factor may show them: not if most are far thinner."""
+        """Whether cells smaller by a factor may show the lost parts: not if most are far
+        thinner."""
         return self.thickness >= _THIN * smaller * self.spacing
 
     def __str__(self) -> str:
@@ -204,18 +209,18 @@ class LostParts:
         )
         shown = [f"{words}, as near {point_text(x[0])}" for x, words in thin if len(x)]
         within = f" (all within {self.within:.3g})" if math.isfinite(self.within) else ""
-        told = (
+        text = (
             f"{self.far:,} of {self.looked_at:,} points of the level are farther than "
             f"{self.tolerance:.3g} from the mesh{within}, which has cells of {self.spacing:.3g}: "
             f"{' and '.join(shown)}"
         )
         if shown:
-            return f"{told}; they are about {self.thickness:.2g} thick"
-        return f"{told}such as {point_text(self.others[0])}"
+            return f"{text}; they are about {self.thickness:.2g} thick"
+        return f"{text}such as {point_text(self.others[0])}"
 
 
 def _advice(field: Field) -> str:
-    """What helps where cells miss parts."""
+    """The remedy where cells miss parts, in words."""
     advice = "choose a smaller `cell_size`"
     if isinstance(field, WindingNumber):
         advice += "; `harnack.repair` keeps thin parts where their triangles are sound"
@@ -225,33 +230,33 @@ def _advice(field: Field) -> str:
 
 
 def _by_area(area: FloatArray) -> IntArray:
-    """Rows, each as often as its part of the area asks for."""
+    """Row indices, each repeated in proportion to its area."""
     ends: FloatArray = np.cumsum(area)
-    places: FloatArray = (np.arange(_BY_AREA) + 0.5) / _BY_AREA * ends[-1]
-    return np.searchsorted(ends, places)
+    targets: FloatArray = (np.arange(_BY_AREA) + 0.5) / _BY_AREA * ends[-1]
+    return np.searchsorted(ends, targets)
 
 
-def _spread(count: int, most: int) -> IntArray:
-    """All of some rows, or no more than `most`, evenly spread."""
-    return np.linspace(0, count - 1, min(count, most)).astype(np.int64)
+def _spread(count: int, max_count: int) -> IntArray:
+    """The indices of all rows, or of `max_count` rows, evenly spread."""
+    return np.linspace(0, count - 1, min(count, max_count)).astype(np.int64)
 
 
 def _thicknesses(
-    function: SignFunction, known: PointsOnLevel, spacing: float
+    function: SignFunction, points: PointsOnLevel, spacing: float
 ) -> tuple[FloatArray, BoolArray]:
-    """How far points of the level (k, 3) are, along the normal on either side, from where the sign
-    changes again, up to about a cell, the smaller of both; and whether that is inside. Of clouds
-    that is not known."""
-    if isinstance(function.field, OrientedPoints):  # each point is in a bubble of its own
-        nowhere = np.full(len(known.points), np.inf)
+    """The distances from points of the level (k, 3), along the normal on either side, to the next
+    change of sign, up to about a cell, the smaller of both; and whether that side is inside. For
+    clouds they are not known."""
+    if isinstance(function.field, OrientedPoints):  # each point is in its own bubble
+        nowhere = np.full(len(points.points), np.inf)
         return nowhere, nowhere > 0
-    far = spacing * _THICKNESSES
+    distances = spacing * _THICKNESSES
     sides: list[FloatArray] = []
     for sign in (1.0, -1.0):
-        places = known.points[:, None] + sign * far[:, None] * known.normals[:, None]
-        is_positive = function.values(places.reshape(-1, 3)).reshape(-1, len(far)) > 0
+        probes = points.points[:, None] + sign * distances[:, None] * points.normals[:, None]
+        is_positive = function.values(probes.reshape(-1, 3)).reshape(-1, len(distances)) > 0
         changed = is_positive != (sign > 0)
-        sides.append(np.where(changed.any(axis=1), far[changed.argmax(axis=1)], np.inf))
+        sides.append(np.where(changed.any(axis=1), distances[changed.argmax(axis=1)], np.inf))
     above, below = sides
     # The function is positive inside, or where its side is -1 outside.
     return np.minimum(above, below), (above < below) == (function.side > 0)
@@ -259,23 +264,23 @@ def _thicknesses(
 
 def _bound_of_distances(points: FloatArray, corner: FloatArray) -> float:
     """A distance within which points (n, 3) are from triangles (m, 3, 3); inf without any."""
-    import scipy.spatial  # here: half a second that few need
+    import scipy.spatial  # imported here: it takes half a second
 
     searching: Any = scipy.spatial
     if not len(corner):
         return math.inf
-    places = np.concatenate([corner.reshape(-1, 3), corner.mean(axis=1)])
-    tree = searching.cKDTree(places, compact_nodes=False, balanced_tree=False)
+    mesh_points = np.concatenate([corner.reshape(-1, 3), corner.mean(axis=1)])
+    tree = searching.cKDTree(mesh_points, compact_nodes=False, balanced_tree=False)
     return float(tree.query(points)[0].max())
 
 
 def _are_farther(points: FloatArray, corner: FloatArray, distance: float) -> BoolArray:
     """(n,) whether points (n, 3) are farther than a distance from all triangles (m, 3, 3).
 
-    A triangle within the distance has its center within that and its reach. Triangles are taken
-    together whose reach differs by less than a factor of 2.
+    A triangle within the distance has its center within the sum of the distance and the triangle's
+    radius. Triangles whose radii differ by less than a factor of 2 are examined together.
     """
-    import scipy.spatial  # here: half a second that few need
+    import scipy.spatial  # imported here: it takes half a second
 
     searching: Any = scipy.spatial
     is_far = np.ones(len(points), np.bool_)
@@ -285,12 +290,12 @@ def _are_farther(points: FloatArray, corner: FloatArray, distance: float) -> Boo
     reach = np.stack([row_norms(corner[:, k] - center) for k in range(3)]).max(axis=0)
     octave = np.ceil(np.log2(np.maximum(reach, distance))).astype(np.int64)
     for k in np.unique(octave).tolist():
-        left, rows = np.flatnonzero(is_far), np.flatnonzero(octave == k)
+        remaining, rows = np.flatnonzero(is_far), np.flatnonzero(octave == k)
         tree = searching.cKDTree(center[rows], compact_nodes=False, balanced_tree=False)
-        near = tree.query_ball_point(points[left], 2.0**k + distance)
-        counts = np.array([len(one) for one in near], np.int64)
+        near = tree.query_ball_point(points[remaining], 2.0**k + distance)
+        counts = np.array([len(indices) for indices in near], np.int64)
         if not counts.sum():
             continue
-        place, of = np.repeat(left, counts), rows[np.concatenate(near).astype(np.int64)]
-        is_far[place[distances_from_triangles(points[place], corner[of]) <= distance]] = False
+        query, of = np.repeat(remaining, counts), rows[np.concatenate(near).astype(np.int64)]
+        is_far[query[distances_from_triangles(points[query], corner[of]) <= distance]] = False
     return is_far

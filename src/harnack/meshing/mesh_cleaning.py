@@ -1,4 +1,4 @@
-"""Cleans a damaged mesh: finds the triangles that can stay, and the defects of the others.
+"""The cleaning of a damaged mesh: the triangles that can stay, and the defects of the others.
 
 Duplicate, degenerate and intersecting triangles are removed; those turned over against their
 neighbors are flipped. The remaining triangles are oriented and intersect nothing, and their holes
@@ -40,11 +40,13 @@ from harnack.meshing.lattice_meshing import TriangleMesh
 
 __all__ = ["CleanedMesh", "against_neighbors", "clean_and_fill", "weld_near_corners"]
 
-# How often the rings around holes are left out; and what part of all triangles may be.
+# The largest number of rings around holes that are removed; and the largest fraction of all
+# triangles that may be.
 _MOST_RINGS, _MOST_LEFT_OUT = 6, 0.5
-# More open edges than this part of the triangles are those of loose triangles.
+# If the ratio of open edges to triangles is larger than this, the triangles are loose.
 _MOST_OPEN = 0.5
-# Corners of loose triangles are joined that are nearer than one of these parts of the usual edge.
+# Corners of loose triangles that are nearer than one of these distances, relative to the usual
+# edge, are joined.
 _NEAR = (0.01, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3)
 
 
@@ -53,9 +55,9 @@ class CleanedMesh:
     """A closed mesh in which the valid triangles of the input come first, bit by bit.
 
     kept: for each of the first faces, the index of the input face that it is, in order.
-    turned: which of these are reversed.
-    left_out: how many of the input triangles were removed, by reason.
-    holes: how many were filled.
+    turned: which of these faces are reversed.
+    left_out: the number of input triangles that were removed, by reason.
+    holes: the number of filled holes.
     """
 
     surface: TriangleMesh
@@ -68,14 +70,14 @@ class CleanedMesh:
 def clean_and_fill(
     vertices: FloatArray, faces: IntArray, report: Callable[[str], None]
 ) -> CleanedMesh:
-    """The sound triangles of a mesh, with patches in place of all others and over holes.
+    """The valid triangles of a mesh, with patches in place of all others and over holes.
 
     Raises:
-        MeshingError: half of the triangles would go, or all, or most of them are loose.
+        MeshingError: half of the triangles, or all, would be removed, or most of them are loose.
     """
     report("looking for triangles that are sound")
     state = _WorkingMesh.of(vertices, faces)
-    holes, why, most = 0, "", _MOST_LEFT_OUT * len(state.faces)
+    holes, why, min_faces = 0, "", _MOST_LEFT_OUT * len(state.faces)
     for ring in range(_MOST_RINGS):
         state = state.without_nonmanifold_edges()
         if not len(state.faces):
@@ -85,53 +87,54 @@ def clean_and_fill(
             raise MeshingError(f"{len(edges):,} edges of {len(state.faces):,} triangles are open")
         loops = hole_loops(state.vertices, state.faces, edges)
         report(f"{len(loops):,} holes" + f", {ring} rings wider in places" * (ring > 0))
-        state, left, why = state.filled(loops)
-        holes += len(loops) - len(left)
-        bad = np.concatenate([nonmanifold_vertices(state.faces), *left])
-        if not len(bad):
+        state, unfilled, why = state.filled(loops)
+        holes += len(loops) - len(unfilled)
+        failing = np.concatenate([nonmanifold_vertices(state.faces), *unfilled])
+        if not len(failing):
             return state.result(holes)
-        state = state.without_ring(bad)
-        if (state.source_face >= 0).sum() < most:
+        state = state.without_ring(failing)
+        if (state.source_face >= 0).sum() < min_faces:
             raise MeshingError(f"half of the triangles would be left out: {why}")
     raise MeshingError(f"holes cannot be filled, even {_MOST_RINGS} rings wider: {why}")
 
 
 def weld_near_corners(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray, float]:
-    """Loose triangles with near corners moved to their mean, of several distances that which leaves
-    the fewest edges open; faces; and how far the farthest corner went.
+    """The vertices of loose triangles, with near corners moved to their mean: of several distances
+    the one that leaves the fewest edges open; the faces; and the largest move of a corner.
 
     Raises:
         MeshingError: triangles are not loose, or most edges stay open.
     """
-    places, index = np.unique(vertices[faces].reshape(-1, 3), axis=0, return_inverse=True)
+    points, index = np.unique(vertices[faces].reshape(-1, 3), axis=0, return_inverse=True)
     corners = np.asarray(index, np.int64).reshape(-1, 3)
     if len(boundary_edges(corners)) <= _MOST_OPEN * len(faces):
         raise MeshingError("its triangles are not loose")
-    at = places[corners]
+    at = points[corners]
     usual = float(np.median(row_norms((at - np.roll(at, 1, axis=1)).reshape(-1, 3))))
-    found: list[tuple[int, FloatArray, IntArray, float]] = []
+    candidates: list[tuple[int, FloatArray, IntArray, float]] = []
     for part in _NEAR:
-        group = connected_groups(pairs_within(places, part * usual), len(places))
+        group = connected_groups(pairs_within(points, part * usual), len(points))
         count = np.bincount(group)[:, None]
-        mean = np.stack([np.bincount(group, column) for column in places.T], axis=1) / count
-        made = group[corners]
-        whole = made[(made != np.roll(made, 1, axis=1)).all(axis=1)]
-        missing = 3 * (len(faces) - len(whole))  # what has lost an edge counts as if all were open
-        moved = float(row_norms(mean[group] - places).max())
-        found.append((len(boundary_edges(whole)) + missing, mean, whole, moved))
-    count, mean, whole, moved = min(found, key=lambda one: one[0])
+        mean = np.stack([np.bincount(group, column) for column in points.T], axis=1) / count
+        welded = group[corners]
+        proper = welded[(welded != np.roll(welded, 1, axis=1)).all(axis=1)]
+        missing = 3 * (len(faces) - len(proper))  # a lost triangle counts as three open edges
+        moved = float(row_norms(mean[group] - points).max())
+        candidates.append((len(boundary_edges(proper)) + missing, mean, proper, moved))
+    count, mean, proper, moved = min(candidates, key=lambda candidate: candidate[0])
     if count > _MOST_OPEN * len(faces):
         raise MeshingError(
             f"triangles are loose, and {count:,} edges of {len(faces):,} stay open if near corners "
             "are joined"
         )
-    return mean, whole, moved
+    return mean, proper, moved
 
 
 @dataclass(frozen=True)
 class _WorkingMesh:
-    """Vertices, those given first; faces; of each face which of the given ones it is, or -1, and
-    whether it runs the other way. counts: of the given ones that were left out, by reason."""
+    """Vertices, those of the input first; faces; for each face the index of the input face that it
+    is, or -1, and whether it is reversed. counts: the number of input faces that were removed, by
+    reason."""
 
     vertices: FloatArray
     faces: IntArray
@@ -141,7 +144,7 @@ class _WorkingMesh:
 
     @classmethod
     def of(cls, vertices: FloatArray, faces: IntArray) -> _WorkingMesh:
-        """What passes through nothing, oriented."""
+        """The faces that intersect no others, oriented."""
         joined = weld_vertices(vertices)[faces]
         every = np.arange(len(faces))
         corner = vertices[joined]
@@ -158,7 +161,8 @@ class _WorkingMesh:
         return cls(vertices, joined[rows], rows, np.zeros(len(rows), np.bool_), counts)
 
     def keep_faces(self, rows: BoolArray, reason: str) -> _WorkingMesh:
-        """Without some faces, of which those given are counted."""
+        """The mesh with only the faces `rows`; input faces that are removed are counted under
+        `reason`."""
         lost = int((~rows & (self.source_face >= 0)).sum())
         counts = self.counts | {reason: self.counts[reason] + lost}
         return _WorkingMesh(
@@ -166,19 +170,19 @@ class _WorkingMesh:
         )
 
     def without_nonmanifold_edges(self) -> _WorkingMesh:
-        """Without faces at edges of more than two; and oriented, without those at edges where that
-        is not possible."""
+        """The mesh without faces at edges of more than two faces; and oriented, without the faces
+        at edges where that is not possible."""
         state = self.without_fins()
         edges = Edges.of(half_edges(state.faces))
-        many = np.asarray((edges.multiplicity > 2)[edges.edge_of_pair].reshape(3, -1).any(axis=0))
-        state = state.keep_faces(~many, "branching")
+        excess = np.asarray((edges.multiplicity > 2)[edges.edge_of_pair].reshape(3, -1).any(axis=0))
+        state = state.keep_faces(~excess, "branching")
         turned = against_neighbors(state.vertices, state.faces)
         oriented = np.where(turned[:, None], state.faces[:, ::-1], state.faces)
         pairs = half_edges(oriented)
         edges = Edges.of(pairs)
-        way = np.where(pairs[:, 0] < pairs[:, 1], 1, -1)
-        sum_of = np.bincount(edges.edge_of_pair, way, minlength=len(edges.multiplicity))
-        bad = (
+        sign = np.where(pairs[:, 0] < pairs[:, 1], 1, -1)
+        sum_of = np.bincount(edges.edge_of_pair, sign, minlength=len(edges.multiplicity))
+        one_sided = (
             ((edges.multiplicity == 2) & (sum_of != 0))[edges.edge_of_pair]
             .reshape(3, -1)
             .any(axis=0)
@@ -186,12 +190,12 @@ class _WorkingMesh:
         state = _WorkingMesh(
             state.vertices, oriented, state.source_face, state.is_turned ^ turned, state.counts
         )
-        return state.keep_faces(~np.asarray(bad), "one-sided")
+        return state.keep_faces(~np.asarray(one_sided), "one-sided")
 
     def without_fins(self) -> _WorkingMesh:
-        """Without sheets that hang on a surface: of the pieces between edges of more than two faces
-        those that end in the open, the smallest first, as long as there are such edges. The largest
-        piece stays."""
+        """The mesh without sheets that hang on a surface: of the pieces between edges of more than
+        two faces, pieces with open ends are removed, the smallest first, as long as there are such
+        edges. The largest piece stays."""
         state = self
         while True:
             edges = Edges.of(half_edges(state.faces))
@@ -211,73 +215,75 @@ class _WorkingMesh:
             state = state.keep_faces(piece != fins[area[fins].argmin()], "branching")
 
     def filled(self, loops: list[IntArray]) -> tuple[_WorkingMesh, list[IntArray], str]:
-        """With patches where they pass the checks; the loops left, and why they are."""
+        """The mesh with patches that pass the checks; the loops that are not filled, and the
+        reason."""
         if not loops:
             return self, [], ""
         field = WindingNumber(self.vertices, self.faces)
-        made = fill_holes(
+        filling = fill_holes(
             self.vertices, self.faces, loops, lambda p: field.value(p, precision="double")
         )
-        count = len(made.faces)
+        count = len(filling.faces)
         state = _WorkingMesh(
-            np.concatenate([self.vertices, made.vertices]),
-            np.concatenate([self.faces, made.faces]),
+            np.concatenate([self.vertices, filling.vertices]),
+            np.concatenate([self.faces, filling.faces]),
             np.concatenate([self.source_face, np.full(count, -1)]),
             np.concatenate([self.is_turned, np.zeros(count, np.bool_)]),
             self.counts,
         )
-        return state, made.unfilled_loops, made.reason
+        return state, filling.unfilled_loops, filling.reason
 
     def without_ring(self, places: IntArray) -> _WorkingMesh:
-        """Without the faces at some vertices."""
+        """The mesh without the faces at the vertices `places`."""
         is_bad = np.zeros(len(self.vertices), np.bool_)
         is_bad[places] = True
         return self.keep_faces(~np.asarray(is_bad[self.faces].any(axis=1)), "around")
 
     def result(self, holes: int) -> CleanedMesh:
-        """The surface, with what was given first.
+        """The cleaned surface, input faces first.
 
         Raises:
             MeshingError: parts pass through each other.
         """
-        last = len(self.vertices) + len(self.source_face)  # behind all that were given
+        last = len(self.vertices) + len(self.source_face)  # after all input faces
         order = np.argsort(np.where(self.source_face < 0, last, self.source_face), kind="stable")
-        faces, kept = self.faces[order], self.source_face[order]
+        faces, source = self.faces[order], self.source_face[order]
         check_manifold(faces)
         inwards = faces_to_flip(TriangleMesh(self.vertices, faces))
         faces = np.where(inwards[:, None], faces[:, ::-1], faces)
-        whole = TriangleMesh(self.vertices, faces)
-        shells = Shells.of(whole)
-        if passes_itself(whole, shells.component_of_face):
+        mesh = TriangleMesh(self.vertices, faces)
+        shells = Shells.of(mesh)
+        if passes_itself(mesh, shells.component_of_face):
             raise MeshingError("it passes through itself along edges that lie on faces")
         bounds = shells.bound()
-        lost = int((kept[~bounds] >= 0).sum())
-        faces, kept, is_turned = (
+        lost = int((source[~bounds] >= 0).sum())
+        faces, source, is_turned = (
             faces[bounds],
-            kept[bounds],
+            source[bounds],
             (self.is_turned[order] ^ inwards)[bounds],
         )
-        turned = kept[is_turned & (kept >= 0)]
+        turned = source[is_turned & (source >= 0)]
         surface = TriangleMesh.without_unused_vertices(self.vertices, faces)
         counts = self.counts | {"inside": lost}
-        return CleanedMesh(surface, kept[kept >= 0], turned, counts, holes)
+        return CleanedMesh(surface, source[source >= 0], turned, counts, holes)
 
 
 def _pieces(edges: Edges, count: int) -> IntArray:
-    """(m,) which of the pieces that edges of two faces hold together each of `count` faces belongs
-    to. edges: those of `half_edges`."""
-    import scipy.sparse  # here: half a second that few need
+    """(m,) the piece that each of `count` faces belongs to, where edges of two faces join faces to
+    pieces. edges: of `half_edges`."""
+    import scipy.sparse  # imported here: it takes half a second
     import scipy.sparse.csgraph as csgraph_module
 
     sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
-    one, other = edges.paired_half_edges().T % count
-    joined = sparse.coo_matrix((np.ones(len(one)), (one, other)), shape=(count, count))
+    first, second = edges.paired_half_edges().T % count
+    joined = sparse.coo_matrix((np.ones(len(first)), (first, second)), shape=(count, count))
     return np.asarray(csgraph.connected_components(joined, directed=False)[1], np.int64)
 
 
 def against_neighbors(x: FloatArray, faces: IntArray) -> BoolArray:
-    """(m,) which faces are to be turned over for all that share an edge of two to agree: of each
-    part those with the smaller area. Parts of one side only are left as they are."""
+    """(m,) which faces are to be turned over so that all faces that share an edge of two faces
+    agree: in each connected part those of the orientation with the smaller area. Parts with only
+    one side are left as they are."""
     m, part = len(faces), orientation_components(faces)
     corner = x[faces]
     area = row_norms(area_normals(corner))

@@ -1,16 +1,16 @@
 """Better triangles: edges flipped, slivers contracted, vertices moved along the surface.
 
 Flips. Two triangles (a, b, c) and (b, a, d) become (c, d, b) and (d, c, a) where that makes the
-smaller of their least angles larger, where the new edge is as near to the surface as is asked for,
-and where the new triangles face the way the surface does.
+smaller of their least angles larger, where the new edge is within the tolerance of the surface, and
+where the new triangles face the way the surface does.
 
 Contractions. The ends of a sliver's shortest edge are merged: see `collapse_slivers`.
 
 Moves. Means of neighbors, to which `smoothed` moves vertices, make thin triangles where lengths of
-edges change quickly, as beside long boundary edges that cannot be cut. Here some places are tried
-for each vertex of a thin triangle, and it moves to the best of them if the least angle of all
-triangles around it grows. No two neighbors move at once, so that what was measured is what is made:
-the least angle around a moved vertex never falls.
+edges change quickly, as beside long boundary edges that cannot be cut. Here several positions are
+tried for each vertex of a thin triangle, and it moves to the best of them if the least angle of all
+triangles around it grows. No two neighbors move at once, so that the measured angles are those of
+the new mesh: the least angle around a moved vertex never falls.
 """
 
 from __future__ import annotations
@@ -35,14 +35,15 @@ from harnack.meshing.level_function import LevelFunction
 
 __all__ = ["collapse_slivers", "flip_edges", "least_angles", "relax_vertices"]
 
-# By how much a least angle has to grow: its cosine in flips, in radians in moves; and the least
-# cosine between normals of a triangle before and after, and between it and the gradient.
+# The smallest growth of a least angle: of its cosine in flips, in radians in moves; and the
+# smallest cosine between normals of a triangle before and after, and between its normal and the
+# gradient.
 _GAIN = 0.01
 _FACING = 0.5
 _MOST_ROUNDS_OF_FLIPS = 12
 # Triangles with a smaller angle, in radians, are slivers: 4 degrees.
 _SLIVER = 0.07
-# The least cosine between normals of the triangles around a contracted edge and the gradient.
+# The smallest cosine between normals of the triangles around a contracted edge and the gradient.
 _MIN_COLLAPSE_COSINE = 0.3
 
 
@@ -52,11 +53,11 @@ def flip_edges(
     faces: IntArray,
     tolerance: float,
 ) -> IntArray:
-    """Faces after rounds of flips, each of which improves the two triangles it touches; of several
-    flips of one triangle the best is made.
+    """Faces after rounds of flips, each of which improves the two triangles at its edge; of several
+    flips of one triangle only the best is done.
 
     tolerance: how far the middles of new edges, and the centers of new triangles, may be from the
-        surface, by the slope there.
+        surface, estimated by the slope there.
     """
     refused = np.zeros(0, np.int64)
     boundary = edge_keys(boundary_edges(faces), len(vertices))
@@ -69,11 +70,11 @@ def flip_edges(
         gain = np.cos(before) - np.cos(after)
         count = len(vertices)
         key = edge_keys(quads[:, 2:], count)
-        good = gain > _GAIN
-        good[good] = ~np.isin(key[good], refused)
-        taken = sorted_unique(edge_keys(quads[:, :2], count))
-        good[good] = ~_holds(taken, key[good]) & ~np.isin(key[good], boundary)
-        rows = _independent_flips(np.flatnonzero(good), gain, pairs, key, len(faces))
+        useful = gain > _GAIN
+        useful[useful] = ~np.isin(key[useful], refused)
+        used_keys = sorted_unique(edge_keys(quads[:, :2], count))
+        useful[useful] = ~_holds(used_keys, key[useful]) & ~np.isin(key[useful], boundary)
+        rows = _independent_flips(np.flatnonzero(useful), gain, pairs, key, len(faces))
         if not len(rows):
             break
         allowed = _flips_stay_near(function, vertices, new[rows], tolerance)
@@ -91,17 +92,17 @@ def _quadrilaterals(faces: IntArray) -> tuple[IntArray, IntArray]:
     keys = edge_keys(edges, count)
     order = np.argsort(keys, kind="stable")
     same = np.flatnonzero(keys[order[1:]] == keys[order[:-1]])
-    one, other = order[same], order[same + 1]
+    first, second = order[same], order[same + 1]
     m = len(faces)
     third = np.concatenate([faces[:, 2], faces[:, 0], faces[:, 1]])
-    quads = np.column_stack([edges[one], third[one], third[other]])
-    return np.column_stack([one % m, other % m]), quads
+    quads = np.column_stack([edges[first], third[first], third[second]])
+    return np.column_stack([first % m, second % m]), quads
 
 
 def _independent_flips(
     rows: IntArray, gain: FloatArray, pairs: IntArray, key: IntArray, count: int
 ) -> IntArray:
-    """Those candidates that are the best of both their faces, and the only ones of their edge."""
+    """The candidates that are the best of both their faces, and the only ones of their edge."""
     rows = rows[np.argsort(-gain[rows], kind="stable")]
     rank = np.arange(len(rows))
     first = np.full(count, len(rows))
@@ -119,8 +120,8 @@ def _flips_stay_near(
     corner = vertices[new]  # (k, 2, 3, 3)
     normal = np.cross(corner[:, :, 1] - corner[:, :, 0], corner[:, :, 2] - corner[:, :, 0])
     middle = corner[:, 0, :2].mean(axis=1)
-    places = np.concatenate([middle, *corner.mean(axis=2).transpose(1, 0, 2)])
-    samples = function.sample(places)
+    points = np.concatenate([middle, *corner.mean(axis=2).transpose(1, 0, 2)])
+    samples = function.sample(points)
     near = (samples.distance <= tolerance).reshape(3, -1).all(axis=0)
     slope = samples.gradient.reshape(3, -1, 3)[1:].transpose(1, 0, 2)
     size = np.linalg.norm(normal, axis=2) * np.linalg.norm(slope, axis=2)
@@ -128,10 +129,10 @@ def _flips_stay_near(
     return near & facing
 
 
-def _holds(numbers: IntArray, wanted: IntArray) -> BoolArray:
-    """(k,) whether ascending numbers (n,) hold those wanted (k,)."""
-    place = np.searchsorted(numbers, wanted)
-    return numbers[np.minimum(place, len(numbers) - 1)] == wanted if len(numbers) else place < 0
+def _holds(numbers: IntArray, keys: IntArray) -> BoolArray:
+    """(k,) whether the keys (k,) are among ascending numbers (n,)."""
+    at = np.searchsorted(numbers, keys)
+    return numbers[np.minimum(at, len(numbers) - 1)] == keys if len(numbers) else at < 0
 
 
 def least_angles(vertices: FloatArray, faces: IntArray) -> FloatArray:
@@ -142,8 +143,8 @@ def least_angles(vertices: FloatArray, faces: IntArray) -> FloatArray:
     twice_area = row_norms(np.cross(side[:, 0], side[:, 1]))
     # The least angle is opposite the shortest side: tan = 2 area/(b . c).
     shortest = square.argmin(axis=1)
-    rest = 0.5 * (square.sum(axis=1) - 2 * square[np.arange(len(faces)), shortest])
-    return np.arctan2(twice_area, rest)
+    dot = 0.5 * (square.sum(axis=1) - 2 * square[np.arange(len(faces)), shortest])
+    return np.arctan2(twice_area, dot)
 
 
 def collapse_slivers(
@@ -153,44 +154,44 @@ def collapse_slivers(
     fixed: BoolArray,
     tolerance: float,
 ) -> IntArray:
-    """Faces without those slivers of which an end of the shortest edge can be moved to the other.
+    """Faces without slivers whose shortest edge can be contracted to one of its ends.
 
-    An edge (u, v) can be contracted to u without a change of topology if u and v have just the two
+    An edge (u, v) can be contracted to u without a change of topology if u and v have only the two
     neighbors in common that are the third corners of its faces (the link condition), and v is not
     `fixed` (n,), as boundary vertices are. It is contracted if no new triangle is a sliver, all
     face the way that the surface does, and their centers are within `tolerance` of it.
     """
     slivers = np.flatnonzero(least_angles(vertices, faces) < _SLIVER)
-    gone = np.zeros(len(faces), np.bool_)
+    is_removed = np.zeros(len(faces), np.bool_)
     faces = faces.copy()
     for row in slivers:
-        if gone[row]:
+        if is_removed[row]:
             continue
         corner = vertices[faces[row]]
         sides = row_norms(np.roll(corner, -1, axis=0) - corner)
         k = int(sides.argmin())
         ends = int(faces[row, k]), int(faces[row, (k + 1) % 3])
-        for kept, lost in (ends, ends[::-1]):
-            if fixed[lost]:
+        for target, source in (ends, ends[::-1]):
+            if fixed[source]:
                 continue
-            around = np.flatnonzero((faces == lost).any(axis=1) & ~gone)
-            beside = (faces[around] == kept).any(axis=1)
-            if not _can_contract(faces[~gone], kept, lost):
+            star = np.flatnonzero((faces == source).any(axis=1) & ~is_removed)
+            beside = (faces[star] == target).any(axis=1)
+            if not _can_contract(faces[~is_removed], target, source):
                 continue
-            new = np.where(faces[around[~beside]] == lost, kept, faces[around[~beside]])
+            new = np.where(faces[star[~beside]] == source, target, faces[star[~beside]])
             if _is_good(function, vertices, new, tolerance):
-                faces[around[~beside]] = new
-                gone[around[beside]] = True
+                faces[star[~beside]] = new
+                is_removed[star[beside]] = True
                 break
-    return faces[~gone]
+    return faces[~is_removed]
 
 
-def _can_contract(faces: IntArray, kept: int, lost: int) -> bool:
-    """The link condition, of an edge with two faces."""
-    near, far = (faces[(faces == v).any(axis=1)] for v in (kept, lost))
-    common = np.setdiff1d(np.intersect1d(near, far), [kept, lost])
-    beside = far[(far == kept).any(axis=1)]
-    return len(beside) == 2 and np.array_equal(common, np.setdiff1d(beside, [kept, lost]))
+def _can_contract(faces: IntArray, target: int, source: int) -> bool:
+    """Whether an edge with two faces satisfies the link condition."""
+    target_faces, source_faces = (faces[(faces == v).any(axis=1)] for v in (target, source))
+    common = np.setdiff1d(np.intersect1d(target_faces, source_faces), [target, source])
+    beside = source_faces[(source_faces == target).any(axis=1)]
+    return len(beside) == 2 and np.array_equal(common, np.setdiff1d(beside, [target, source]))
 
 
 def _is_good(
@@ -209,7 +210,7 @@ Walls = tuple[FloatArray, FloatArray] | None
 # Triangles with a smaller angle are thin, in radians: 30 degrees.
 _THIN = 0.52
 _MOST_ROUNDS_OF_MOVES = 6
-# Parts of the way to each aim that are tried.
+# The fractions of the displacement to each aim that are tried.
 _PARTS = (1.0, 0.5)
 
 
@@ -220,8 +221,8 @@ def relax_vertices(
     tolerance: float,
     walls: Walls,
 ) -> FloatArray:
-    """Vertices (n, 3), moved where that makes the least angles of triangles larger; those of the
-    boundary stay.
+    """Vertices (n, 3), moved where that makes the least angles of triangles larger; boundary
+    vertices stay.
 
     tolerance: how far the centers of triangles around moved vertices may be from the surface.
     """
@@ -235,20 +236,20 @@ def relax_vertices(
         if not len(stars.centers):
             break
         before = stars.least(angles[stars.face])
-        there, after = _best_places(function, vertices, faces, stars, walls)
+        moved, after = _best_places(function, vertices, faces, stars, walls)
         gain = after - before
         rows = _independent_moves(np.flatnonzero(gain > _GAIN), gain, stars, faces, len(vertices))
-        rows = rows[_moves_stay_near(function, vertices, faces, stars, there, rows, tolerance)]
+        rows = rows[_moves_stay_near(function, vertices, faces, stars, moved, rows, tolerance)]
         if not len(rows):
             break
-        vertices[stars.centers[rows]] = there[rows]
+        vertices[stars.centers[rows]] = moved[rows]
     return vertices
 
 
 @dataclass(frozen=True)
 class _VertexStars:
-    """Faces around some vertices: centers (k,), and pairs of one of these, owner (p,), and a face,
-    face (p,), with the corners of that face, corners (p, 3), the center first."""
+    """Faces around vertices: the vertices, centers (k,), and pairs of a vertex, owner (p,), and a
+    face, face (p,), with the corners of that face, corners (p, 3), the center first."""
 
     centers: IntArray
     owner: IntArray
@@ -257,17 +258,17 @@ class _VertexStars:
 
     @classmethod
     def of(cls, faces: IntArray, centers: IntArray, count: int) -> _VertexStars:
-        place = np.full(count, -1, np.int64)
-        place[centers] = np.arange(len(centers))
-        face, column = np.nonzero(place[faces] >= 0)
+        index = np.full(count, -1, np.int64)
+        index[centers] = np.arange(len(centers))
+        face, column = np.nonzero(index[faces] >= 0)
         corners = np.stack([faces[face, (column + k) % 3] for k in range(3)], axis=1)
-        return cls(centers, place[corners[:, 0]], face, corners)
+        return cls(centers, index[corners[:, 0]], face, corners)
 
     def least(self, of_pairs: FloatArray) -> FloatArray:
         """(k,) the least of numbers (p,) around each vertex."""
-        found = np.full(len(self.centers), np.inf)
-        np.minimum.at(found, self.owner, of_pairs)
-        return found
+        smallest = np.full(len(self.centers), np.inf)
+        np.minimum.at(smallest, self.owner, of_pairs)
+        return smallest
 
     def mean(self, of_pairs: FloatArray) -> FloatArray:
         """(k, 3) means of vectors (p, 3) around each vertex."""
@@ -286,12 +287,12 @@ def _best_places(
     stars: _VertexStars,
     walls: Walls,
 ) -> tuple[FloatArray, FloatArray]:
-    """Where each vertex is best (k, 3), and the least angle around it there (k,)."""
-    here, a, b = (vertices[stars.corners[:, k]] for k in range(3))
-    normal = np.cross(a - here, b - here)
+    """The best positions (k, 3) of vertices, and the least angle around each vertex there (k,)."""
+    center, a, b = (vertices[stars.corners[:, k]] for k in range(3))
+    normal = np.cross(a - center, b - center)
     normal /= np.maximum(row_norms(normal), 1e-300)[:, None]
     middle = 0.5 * (a + b)
-    # Where the triangle over the opposite edge has equal sides.
+    # The position at which the triangle over the opposite edge has equal sides.
     apex = middle + np.sqrt(0.75) * np.cross(normal, b - a)
     start = vertices[stars.centers]
     aims = [stars.mean(apex), stars.mean(middle), 0.5 * (stars.mean(apex) + stars.mean(middle))]
@@ -299,14 +300,15 @@ def _best_places(
     thinnest = angles <= stars.least(angles)[stars.owner]
     aims.append(start.copy())
     aims[-1][stars.owner[thinnest]] = apex[thinnest]
-    best, found = start.copy(), np.full(len(start), -np.inf)
+    best, best_angle = start.copy(), np.full(len(start), -np.inf)
     for aim in aims:
         for part in _PARTS:
             x = start + part * (aim - start)
-            least = _least_at(x, stars, a, b, normal)
-            better = least > found
-            best[better], found[better] = x[better], least[better]
-    # Onto the surface only the best of them, which changes little: the aims are beside it.
+            angle = _least_at(x, stars, a, b, normal)
+            better = angle > best_angle
+            best[better], best_angle[better] = x[better], angle[better]
+    # Only the best position is moved onto the surface, which changes it little: the aims are near
+    # it.
     span = row_norms(best - start) + 1e-300
     best = newton_to_level(function, best, function.sample(best), 2 * span, walls, steps=4)
     return best, _least_at(best, stars, a, b, normal)
@@ -331,7 +333,7 @@ def _least_at(
 def _independent_moves(
     rows: IntArray, gain: FloatArray, stars: _VertexStars, faces: IntArray, count: int
 ) -> IntArray:
-    """Those vertices that gain more than all their neighbors do."""
+    """The vertices that gain more than all their neighbors."""
     rank = np.full(count, len(rows))
     ordered = rows[np.argsort(-gain[rows], kind="stable")]
     rank[stars.centers[ordered]] = np.arange(len(rows))
@@ -345,24 +347,24 @@ def _moves_stay_near(
     vertices: FloatArray,
     faces: IntArray,
     stars: _VertexStars,
-    there: FloatArray,
+    targets: FloatArray,
     rows: IntArray,
     tolerance: float,
 ) -> BoolArray:
-    """(k,) whether some vertices, where they would be, are on the surface, and the triangles
+    """(k,) whether the vertices `rows`, at their targets, are on the surface, and the triangles
     around them near it, facing the way it does."""
     moved = np.zeros(len(stars.centers), np.bool_)
     moved[rows] = True
     pairs = np.flatnonzero(moved[stars.owner])
     corner = vertices[stars.corners[pairs]]
-    corner[:, 0] = there[stars.owner[pairs]]
+    corner[:, 0] = targets[stars.owner[pairs]]
     samples = function.sample(corner.mean(axis=1))
     normal = area_normals(corner)
     size = row_norms(normal) * row_norms(samples.gradient)
-    good = row_dots(normal, samples.gradient) > _FACING * size
-    good &= samples.distance <= tolerance
-    off = np.zeros(len(stars.centers), np.int64)
-    np.add.at(off, stars.owner[pairs[~good]], 1)
-    length = row_norms(there[rows] - vertices[stars.centers[rows]])
-    on = function.sample(there[rows]).distance <= 1e-7 * np.maximum(length, 0.1 * tolerance)
-    return on & (off[rows] == 0)
+    is_near = row_dots(normal, samples.gradient) > _FACING * size
+    is_near &= samples.distance <= tolerance
+    failures = np.zeros(len(stars.centers), np.int64)
+    np.add.at(failures, stars.owner[pairs[~is_near]], 1)
+    length = row_norms(targets[rows] - vertices[stars.centers[rows]])
+    on = function.sample(targets[rows]).distance <= 1e-7 * np.maximum(length, 0.1 * tolerance)
+    return on & (failures[rows] == 0)

@@ -1,9 +1,9 @@
-"""Closed meshes of which a few vertices or faces are too far from the level, mended there alone.
+"""The local repair of closed meshes a few of whose vertices or faces are too far from the level.
 
-Offsets of meshes have creases everywhere. Where another part cuts a triangle that lies across one,
-the pieces have centers and corners of their own, of which one in a hundred thousand may be farther
-from the level than the triangle's center. Edges across the crease are cut on it there, and what is
-new is checked with what is around it.
+Offsets of meshes have creases everywhere. Where another part cuts a triangle that lies across a
+crease, the pieces have centers and corners of their own, of which one in a hundred thousand may be
+farther from the level than the triangle's center. There edges across the crease are cut on it, and
+the new faces are checked with those around them.
 """
 
 from __future__ import annotations
@@ -23,11 +23,12 @@ from harnack.meshing.self_intersection_repair import resolve_local_intersections
 
 __all__ = ["project_outliers"]
 
-# More places than this are no exceptions; and how often faces may be cut, one after the other.
+# The largest number of locations that is mended; and how often faces may be cut, one after the
+# other.
 _MOST, _TIMES = 100, 4
-# Edges of such faces are cut if their middle is farther off than that, in tolerances.
+# Edges of such faces are cut if their middle is farther off the level than this, in tolerances.
 _FAR = 0.5
-# How far mending may move what is cut, in tolerances.
+# How far mending of intersections may move cut faces, in tolerances.
 _MENDED_WITHIN = 0.25
 
 
@@ -38,15 +39,15 @@ def project_outliers(
     tolerance: float,
     check: Callable[[TriangleMesh], None],
 ) -> TriangleMesh | None:
-    """The surface with vertices that are far from the level moved onto it, and faces with such a
-    center cut at the middles of their edges that are far, or at their own, moved onto it; None if
+    """The surface with vertices that are far from the level moved onto it, and faces with a far
+    center cut at the far middles of their edges, or at the center, moved onto the level; None if
     that cannot be done.
 
-    surface: of which no triangles pass through each other, and all but some are near the level.
-    places: (k, 3) these vertices, and centers of faces. tolerance: nothing is moved farther than
-        twice that.
-    check: raises a MeshingError of a surface that is not near the level. It is given what has
-        changed; that this passes through no other triangle is decided exactly.
+    surface: none of its triangles pass through each other, and nearly all are near the level.
+    places: (k, 3) the far vertices, and centers of faces. tolerance: a length; no point is moved
+        farther than twice that.
+    check: raises a MeshingError for a surface that is not near the level. It is called with the
+        changed faces; whether these pass through other triangles is decided exactly.
     """
     if len(places) > _MOST:
         return None
@@ -74,15 +75,16 @@ def _project_and_split(
     function: LevelFunction,
     surface: TriangleMesh,
     is_new: BoolArray,
-    places: FloatArray,
+    points: FloatArray,
     tolerance: float,
 ) -> tuple[tuple[FloatArray, IntArray], BoolArray] | None:
-    """Vertices and faces with what is at some places moved onto the level, or cut; and which faces
-    are new (m,), those that were included. None if something is elsewhere, or too far from it."""
+    """Vertices and faces with the vertices at `points` moved onto the level and the faces with a
+    center at `points` cut; and (m,) which faces are new, including those of `is_new`. None if a
+    point is neither a vertex nor a center, or too far from the level."""
     vertices, faces = surface.vertices, surface.faces
-    corners = _rows_at(places, vertices)
-    centers = _rows_at(places, vertices[faces].mean(axis=1))
-    if len(corners) + len(centers) < len(places):
+    corners = _rows_at(points, vertices)
+    centers = _rows_at(points, vertices[faces].mean(axis=1))
+    if len(corners) + len(centers) < len(points):
         return None
     pairs = half_edges(faces[centers])
     middle = vertices[pairs].mean(axis=1)
@@ -90,17 +92,17 @@ def _project_and_split(
     count = len(vertices)
     keys = sorted_unique(edge_keys(pairs, count))
     ends = np.stack(np.divmod(keys, count), axis=1)
-    # Edges of all faces at these ends: which of them is cut.
-    place = np.full(faces.shape, -1, np.int64)
+    # Which edges are cut, of all faces at these ends.
+    midpoint = np.full(faces.shape, -1, np.int64)
     rows = np.flatnonzero(np.isin(faces, ends).any(axis=1))
-    found = np.searchsorted(keys, own := edge_keys(half_edges(faces[rows]), count))
-    found = np.minimum(found, max(len(keys) - 1, 0))
+    position = np.searchsorted(keys, face_keys := edge_keys(half_edges(faces[rows]), count))
+    position = np.minimum(position, max(len(keys) - 1, 0))
     if len(keys):
-        is_cut = keys[found] == own
-        place[rows] = np.where(is_cut, count + found, -1).reshape(3, -1).T
-    whole = np.setdiff1d(centers, np.flatnonzero((place >= 0).any(axis=1)))
+        is_cut = keys[position] == face_keys
+        midpoint[rows] = np.where(is_cut, count + position, -1).reshape(3, -1).T
+    uncut = np.setdiff1d(centers, np.flatnonzero((midpoint >= 0).any(axis=1)))
     start = np.concatenate(
-        [vertices[corners], vertices[ends].mean(axis=1), vertices[faces[whole]].mean(axis=1)]
+        [vertices[corners], vertices[ends].mean(axis=1), vertices[faces[uncut]].mean(axis=1)]
     )
     moved = newton_to_level(
         function, start, function.sample(start), np.full(len(start), tolerance), None
@@ -109,18 +111,18 @@ def _project_and_split(
         return None
     vertices = np.concatenate([vertices, moved[len(corners) :]])
     vertices[corners] = moved[: len(corners)]
-    is_split = (place >= 0).any(axis=1)
-    split = split_faces(vertices, faces[is_split], place[is_split])
-    inner = count + len(ends) + np.arange(len(whole))
-    a, b, c = faces[whole].T
+    is_split = (midpoint >= 0).any(axis=1)
+    split = split_faces(vertices, faces[is_split], midpoint[is_split])
+    inner = count + len(ends) + np.arange(len(uncut))
+    a, b, c = faces[uncut].T
     new = [split, *(np.stack([*two, inner], axis=1) for two in ((a, b), (b, c), (c, a)))]
-    gone = np.union1d(np.flatnonzero(is_split), whole)
-    kept = np.delete(faces, gone, axis=0)
+    removed = np.union1d(np.flatnonzero(is_split), uncut)
+    remaining = np.delete(faces, removed, axis=0)
     is_moved = np.zeros(len(vertices), np.bool_)
     is_moved[corners] = True
-    is_new = np.delete(is_new, gone) | is_moved[kept].any(axis=1)
-    faces = np.concatenate([kept, *new])
-    is_new = np.concatenate([is_new, np.ones(len(faces) - len(kept), np.bool_)])
+    is_new = np.delete(is_new, removed) | is_moved[remaining].any(axis=1)
+    faces = np.concatenate([remaining, *new])
+    is_new = np.concatenate([is_new, np.ones(len(faces) - len(remaining), np.bool_)])
     return (vertices, faces), is_new
 
 
@@ -130,15 +132,15 @@ def _check_new_faces(
     tolerance: float,
     check: Callable[[TriangleMesh], None],
 ) -> TriangleMesh | None:
-    """The surface if its new faces (m,) pass through no others; mended there if need be, and then
+    """The surface if its new faces (m,) pass through no others; otherwise mended there, and then
     checked as a whole; None if that does not help."""
     vertices, faces = surface.vertices, surface.faces
-    around = _in_boxes_of(vertices[faces], np.flatnonzero(is_new))
-    crossing = around[intersecting_faces(vertices, faces[around])]
+    nearby = _in_boxes_of(vertices[faces], np.flatnonzero(is_new))
+    crossing = nearby[intersecting_faces(vertices, faces[nearby])]
     if not len(crossing):
         return surface
-    mended, left = resolve_local_intersections(surface, crossing, _MENDED_WITHIN * tolerance)
-    if left:
+    mended, remaining = resolve_local_intersections(surface, crossing, _MENDED_WITHIN * tolerance)
+    if remaining:
         return None
     try:
         check(mended)
@@ -147,17 +149,17 @@ def _check_new_faces(
     return mended
 
 
-def _in_boxes_of(corner: FloatArray, some: IntArray) -> IntArray:
-    """Triangles (m, 3, 3), by index, whose box meets that of one of some."""
+def _in_boxes_of(corner: FloatArray, rows: IntArray) -> IntArray:
+    """The indices of triangles (m, 3, 3) whose box meets that of a triangle in `rows`."""
     lower, upper = corner.min(axis=1), corner.max(axis=1)
-    found = np.zeros(len(corner), np.bool_)
-    for row in some.tolist():
-        found |= (lower <= upper[row]).all(axis=1) & (upper >= lower[row]).all(axis=1)
-    return np.flatnonzero(found)
+    meets = np.zeros(len(corner), np.bool_)
+    for row in rows.tolist():
+        meets |= (lower <= upper[row]).all(axis=1) & (upper >= lower[row]).all(axis=1)
+    return np.flatnonzero(meets)
 
 
-def _rows_at(places: FloatArray, points: FloatArray) -> IntArray:
-    """Points, by index, that are one of some places."""
-    rows = np.flatnonzero(np.isin(points[:, 0], places[:, 0]))
-    same = (points[rows, None] == places).all(axis=2).any(axis=1)
+def _rows_at(targets: FloatArray, points: FloatArray) -> IntArray:
+    """The indices of points that are equal to a target."""
+    rows = np.flatnonzero(np.isin(points[:, 0], targets[:, 0]))
+    same = (points[rows, None] == targets).all(axis=2).any(axis=1)
     return rows[same]

@@ -1,4 +1,4 @@
-"""What a slicer would complain of in a mesh, and where."""
+"""Checks of a mesh for problems that a slicer would report, and where they are."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ from harnack.meshing.thickness import wall_thickness
 
 __all__ = ["PrintCheck", "PrintProblem", "check_print"]
 
-# A part is tiny if it is no longer than this part of the whole.
+# A part is tiny if it is no longer than this, relative to the whole.
 _TINY = 0.01
 # Sizes in millimeters beyond which another unit is likely.
 _SMALLEST, _LARGEST = 1.0, 2000.0
 _INCH = 25.4
-# A part of exactly the least thickness, or the bed's size, may be off by so much of its size: files
-# hold single precision, and thickness is measured to it.
+# The relative error of a part of exactly the least thickness, or the bed's size: files hold single
+# precision, and thickness is measured to that.
 _ROUNDING = 1e-6
-# Faces longer than so many walls may hide thin places beside their centers.
+# Faces longer than this, in least thicknesses, may hide thin places beside their centers.
 _COARSE = 5.0
-# Words for one and for several, in messages.
+# The words for one and for several, in the texts of messages.
 _WORDS = re.compile(r"\{([^{}|]*)\|([^{}|]*)\}")
 
 
@@ -49,8 +49,8 @@ class PrintProblem:
     """A problem of a mesh that is to be printed.
 
     kind: its name, such as "open edges".
-    count: how many there are.
-    locations: (k, 3) where they are, of all or a part of them.
+    count: the number of its occurrences.
+    locations: (k, 3) of all occurrences, or of a part of them.
     message: the problem in a sentence.
     is_error: whether it is an error, and not a hint.
     """
@@ -69,8 +69,8 @@ class PrintCheck:
     problems: the worst first.
     size: (x, y, z).
     volume: None if the mesh is not closed.
-    triangles: how many there are.
-    parts: how many components there are that do not touch each other.
+    triangles: the number of triangles. parts: the number of components that do not touch each
+        other.
     """
 
     problems: tuple[PrintProblem, ...]
@@ -81,11 +81,11 @@ class PrintCheck:
 
     @property
     def is_printable(self) -> bool:
-        """Whether nothing is wrong; hints may be left."""
+        """Whether there is no error; there may be hints."""
         return not _is_wrong(self.problems)
 
     def as_dict(self, most_places: int = 10) -> dict[str, Any]:
-        """Of plain numbers and texts, as JSON holds them."""
+        """The result as a dictionary of plain numbers and texts, as JSON holds them."""
         return {
             "fine": self.is_printable,
             "size": list(self.size),
@@ -94,13 +94,13 @@ class PrintCheck:
             "parts": self.parts,
             "problems": [
                 {
-                    "kind": one.kind,
-                    "count": one.count,
-                    "fatal": one.is_error,
-                    "message": one.message,
-                    "where": one.locations[:most_places].tolist(),
+                    "kind": problem.kind,
+                    "count": problem.count,
+                    "fatal": problem.is_error,
+                    "message": problem.message,
+                    "where": problem.locations[:most_places].tolist(),
                 }
-                for one in self.problems
+                for problem in self.problems
             ],
         }
 
@@ -110,61 +110,64 @@ def check_print(
 ) -> PrintCheck:
     """What a slicer would complain of in a mesh, and where.
 
-    Wrong are: open edges, edges of more than two faces, neighbors that do not agree on their two
+    Errors are: open edges, edges of more than two faces, neighbors that do not agree on their two
     sides, parts that are inside out or in the material of others, vertices where sheets touch,
-    corners and edges that lie on other faces, triangles that pass through each other or lie on
-    each other (decided exactly), faces that are there twice; walls thinner than asked; what does
+    corners and edges that lie on other faces, triangles that pass through each other or lie on each
+    other (decided exactly), duplicate faces; walls thinner than `min_thickness`; a size that does
     not fit on the bed. Hints are: corners apart from others by rounding, which count as one, faces
     without an area, several parts, tiny ones, cavities without a way out (for powder and resin),
     and a size that looks like inches or meters, and, of walls, faces so large that a thin place
     beside their centers may be missed.
 
     part: a trimesh.Trimesh, (vertices, faces), or the name of a file. Vertices at the same place
-        are one.
-    min_thickness: the least thickness that is fine, a length (see `thickness`); None to leave it
-        out.
+        count as one.
+    min_thickness: the least allowed thickness, a length (see `thickness`); None to leave it out.
     build_volume: (x, y, z), the size that fits, turned by right angles about z; None to leave it
         out.
 
     Raises:
-        MeshError: no mesh. FileFormatError: a file that cannot be read. ValueError: a wall or a bed
-            that is no length.
+        MeshError: no mesh. FileFormatError: a file that cannot be read. ValueError: a thickness or
+            a bed that is no length.
     """
     if min_thickness is not None:
         min_thickness = as_positive(min_thickness, "min_thickness")
     if build_volume is not None and np.shape(build_volume) != (3,):
         raise ValueError(f"build_volume must be (x, y, z), three lengths, not {build_volume!r}")
     sides = (
-        None if build_volume is None else [as_positive(one, "build_volume") for one in build_volume]
+        None
+        if build_volume is None
+        else [as_positive(entry, "build_volume") for entry in build_volume]
     )
     x, faces, rounded = _mesh_of(part)
-    found = _topology(x, faces)
-    is_closed = not _is_wrong(found)
+    problems = _topology(x, faces)
+    is_closed = not _is_wrong(problems)
     shells = Shells.of(TriangleMesh(x, faces))
     crossings, touching = _contacts(x, faces, shells, is_closed)
     is_clear = is_closed and not crossings.count
-    found += [*_component_problems(shells, is_closed, is_clear), crossings, touching]
+    problems += [*_component_problems(shells, is_closed, is_clear), crossings, touching]
     if min_thickness is not None:
-        found += [
-            _thin_walls(x, faces, min_thickness, not _is_wrong(found)),
+        problems += [
+            _thin_walls(x, faces, min_thickness, not _is_wrong(problems)),
             _coarse(x, faces, min_thickness),
         ]
     low, high = x[faces].min(axis=(0, 1)), x[faces].max(axis=(0, 1))
     size = cast("tuple[float, float, float]", tuple((high - low).tolist()))
-    found += _of_size(size, sides)
-    found.append(rounded)
-    kept = sorted((one for one in found if one.count), key=lambda one: not one.is_error)
+    problems += _of_size(size, sides)
+    problems.append(rounded)
+    reported = sorted(
+        (entry for entry in problems if entry.count), key=lambda entry: not entry.is_error
+    )
     volume = float(shells.volumes.sum()) if is_closed else None
-    return PrintCheck(tuple(kept), size, volume, len(faces), len(shells.volumes))
+    return PrintCheck(tuple(reported), size, volume, len(faces), len(shells.volumes))
 
 
 def _is_wrong(problems: Sequence[PrintProblem]) -> bool:
-    return any(one.is_error and one.count for one in problems)
+    return any(problem.is_error and problem.count for problem in problems)
 
 
 def _mesh_of(part: Any) -> tuple[FloatArray, IntArray, PrintProblem]:
-    """Vertices, and faces between those at one place or apart by rounding, with those of zero area;
-    and how many were apart."""
+    """Vertices; faces, between the vertices at one place or apart by rounding, including faces of
+    zero area; and a hint with the number of corners that were apart."""
     if isinstance(part, str | os.PathLike):
         read = read_geometry(cast("Any", part), "winding")
         if not isinstance(read, LoadedMesh):
@@ -177,13 +180,13 @@ def _mesh_of(part: Any) -> tuple[FloatArray, IntArray, PrintProblem]:
     else:
         pair = (part.vertices, part.faces) if hasattr(part, "faces") else part
         try:
-            vertices, given = pair
+            vertices, raw_faces = pair
         except (TypeError, ValueError):
             raise TypeError(
                 "a mesh is a trimesh.Trimesh, a pair (vertices, faces), or the path of a file, not "
                 f"of type {type(part).__name__}"
             ) from None
-        x, faces = validate_mesh(vertices, given, allow_zero_area=True)
+        x, faces = validate_mesh(vertices, raw_faces, allow_zero_area=True)
         rounded = 0
     welded = Welded.of(x, faces)
     count = rounded + welded.rounded
@@ -193,7 +196,8 @@ def _mesh_of(part: Any) -> tuple[FloatArray, IntArray, PrintProblem]:
 
 
 def _problem(kind: str, where: FloatArray, text: str, *, is_fatal: bool = True) -> PrintProblem:
-    """text: with {} for the number, and the words for one and for several as {one|several}."""
+    """A problem with its message. text: with {} for the number, and the words for one and for
+    several as {one|several}."""
     count = len(where)
     near = "" if not count else f", {'' if count == 1 else 'such as '}at {point_text(where[0])}"
     text = _WORDS.sub(lambda pair: pair[1 if count == 1 else 2], text)
@@ -201,21 +205,21 @@ def _problem(kind: str, where: FloatArray, text: str, *, is_fatal: bool = True) 
 
 
 def _topology(x: FloatArray, faces: IntArray) -> list[PrintProblem]:
-    """Edges, sides, duplicates and faces without an area."""
+    """The problems of edges, sides, duplicates and faces without an area."""
     flat = zero_area_faces(x, faces)
     vanished = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
-    kept = faces[~vanished]
-    pairs = half_edges(kept)
+    used = faces[~vanished]
+    pairs = half_edges(used)
     edges = Edges.of(pairs)
     middle = x[edges.vertices].mean(axis=1)
-    ways = np.bincount(
+    net = np.bincount(
         edges.edge_of_pair,
         np.where(pairs[:, 0] < pairs[:, 1], 1, -1),
         minlength=len(edges.multiplicity),
     )
-    _, first, uses = np.unique(np.sort(kept, axis=1), axis=0, return_index=True, return_counts=True)
-    touching = nonmanifold_vertices(kept)
-    many = np.unique(edges.vertices[edges.multiplicity > 2])
+    _, first, uses = np.unique(np.sort(used, axis=1), axis=0, return_index=True, return_counts=True)
+    touching = nonmanifold_vertices(used)
+    overused = np.unique(edges.vertices[edges.multiplicity > 2])
     return [
         _problem(
             "open edges", middle[edges.multiplicity == 1], "{} {edge has|edges have} one face alone"
@@ -227,17 +231,17 @@ def _topology(x: FloatArray, faces: IntArray) -> list[PrintProblem]:
         ),
         _problem(
             "sides that disagree",
-            middle[(edges.multiplicity == 2) & (ways != 0)],
+            middle[(edges.multiplicity == 2) & (net != 0)],
             "at {} {edge|edges} neighboring faces do not agree on what is inside",
         ),
         _problem(
             "duplicate faces",
-            x[kept[first[uses > 1]]].mean(axis=1),
+            x[used[first[uses > 1]]].mean(axis=1),
             "{} {face is|faces are} there twice",
         ),
         _problem(
             "touching vertices",
-            x[np.setdiff1d(touching, many)],
+            x[np.setdiff1d(touching, overused)],
             "at {} {vertex|vertices} parts touch in a point",
         ),
         _problem(
@@ -250,8 +254,9 @@ def _topology(x: FloatArray, faces: IntArray) -> list[PrintProblem]:
 
 
 def _component_problems(shells: Shells, is_closed: bool, is_clear: bool) -> list[PrintProblem]:
-    """Inside out, inside others, cavities, loose and tiny parts. is_clear: closed, and no faces
-    pass through each other, so that a part is inside another as a whole or not at all."""
+    """The problems of components: inside out, inside others, cavities, loose and tiny parts.
+    is_clear: whether the mesh is closed and no faces pass through each other, so that a part is
+    inside another as a whole or not at all."""
     volumes, none = shells.volumes, np.zeros(len(shells.volumes), np.bool_)
     middle = 0.5 * (shells.lower + shells.upper)
     length = (shells.upper - shells.lower).max(axis=1)
@@ -290,16 +295,17 @@ def _component_problems(shells: Shells, is_closed: bool, is_clear: bool) -> list
 def _contacts(
     x: FloatArray, faces: IntArray, shells: Shells, is_closed: bool
 ) -> tuple[PrintProblem, PrintProblem]:
-    """Faces that pass through or lie on others, and those that only touch others.
+    """The problems of faces that pass through or lie on others, and of faces that only touch
+    others.
 
-    Faces without an area close gaps between corners and edges that lie on each other: where a part
-    has some, it is not said to touch itself.
+    Faces without an area close gaps between corners and edges that lie on each other: for a part
+    with such faces, contacts with itself are not reported.
     """
     is_flat = np.zeros(len(faces), np.bool_)
     is_flat[zero_area_faces(x, faces)] = True
     is_plain = np.isin(shells.component_of_face, shells.component_of_face[is_flat], invert=True)
     rows = np.flatnonzero((faces != np.roll(faces, 1, axis=1)).all(axis=1))
-    # Duplicates have been counted.
+    # Duplicates are reported separately.
     rows = rows[np.unique(np.sort(faces[rows], axis=1), axis=0, return_index=True)[1]]
     crossing = intersecting_faces(x, faces[rows])
     advice = "; hk.mesh(hk.solid(part)) makes one of parts that overlap" if is_closed else ""
@@ -310,14 +316,14 @@ def _contacts(
     )
     rows = np.delete(rows, crossing)
     rows = rows[~is_flat[rows]]
-    pairs, places = touching_pairs(x, faces[rows])
+    pairs, contacts = touching_pairs(x, faces[rows])
     first, second = rows[pairs.T]
     is_contact = is_plain[first] | (
         shells.component_of_face[first] != shells.component_of_face[second]
     )
     touching = _problem(
         "touching faces",
-        np.unique(places[is_contact], axis=0),
+        np.unique(contacts[is_contact], axis=0),
         "at {} {place|places} a corner or an edge lies on a face that it is not part of: let parts "
         "overlap, or move them apart",
     )
@@ -326,43 +332,43 @@ def _contacts(
 
 def _thin_walls(x: FloatArray, faces: IntArray, wall: float, is_solid: bool) -> PrintProblem:
     if not is_solid:
-        # Another name than that of walls that were found thin.
+        # The name differs from that of walls that were measured to be thin.
         why = "how thick walls are is not known before the rest is mended"
         return PrintProblem("walls not measured", 1, np.zeros((0, 3)), why)
-    found = wall_thickness(MeshSolid(x, faces))
-    places = found.thin_locations(wall - _ROUNDING * float(np.ptp(x, axis=0).max()))
-    least = f"; the thinnest is {found.thinnest:.3g}"
-    text = f"at {{}} {{triangle|triangles}} the part is thinner than {wall:g}{least}"
-    return _problem("thin walls", places, text)
+    thickness = wall_thickness(MeshSolid(x, faces))
+    locations = thickness.thin_locations(wall - _ROUNDING * float(np.ptp(x, axis=0).max()))
+    suffix = f"; the thinnest is {thickness.thinnest:.3g}"
+    text = f"at {{}} {{triangle|triangles}} the part is thinner than {wall:g}{suffix}"
+    return _problem("thin walls", locations, text)
 
 
 def _coarse(x: FloatArray, faces: IntArray, wall: float) -> PrintProblem:
-    """Faces beside whose centers thin places may be that nobody looked at."""
+    """The problem of faces so large that thin places beside their centers may be missed."""
     corner = x[faces]
     longest = np.stack([row_norms(corner[:, k] - corner[:, k - 1]) for k in range(3)]).max(axis=0)
-    places = corner[longest > _COARSE * wall].mean(axis=1)
+    centers = corner[longest > _COARSE * wall].mean(axis=1)
     text = f"{{}} {{triangle is|triangles are}} longer than {_COARSE:g} walls, and thickness is "
     text += "measured at centers"
-    return _problem("walls measured coarsely", places, text, is_fatal=False)
+    return _problem("walls measured coarsely", centers, text, is_fatal=False)
 
 
 def _of_size(size: tuple[float, float, float], bed: list[float] | None) -> list[PrintProblem]:
     longest, nowhere = max(size), np.zeros((0, 3))
-    text = " x ".join(f"{one:.4g}" for one in size)
-    found: list[PrintProblem] = []
+    text = " x ".join(f"{length:.4g}" for length in size)
+    problems: list[PrintProblem] = []
     if longest < _SMALLEST or longest > _LARGEST:
         why = f"it is {text} mm, if files are in millimeters"
         if longest < _SMALLEST:
             why += f"; in meters {longest * 1000:.4g}, in inches {longest * _INCH:.4g} mm long"
-        found.append(PrintProblem("unit", 1, nowhere, why, is_error=False))
+        problems.append(PrintProblem("unit", 1, nowhere, why, is_error=False))
     elif longest < 10 * _SMALLEST:
         why = f"it is {text} mm; if that is meant in inches, scale it by 25.4"
-        found.append(PrintProblem("unit", 1, nowhere, why, is_error=False))
+        problems.append(PrintProblem("unit", 1, nowhere, why, is_error=False))
     if bed is not None:
         x, y, z = size
         a, b, c = (side * (1 + _ROUNDING) for side in bed)
         fits = z <= c and ((x <= a and y <= b) or (y <= a and x <= b))
         if not fits:
-            space = " x ".join(f"{one:g}" for one in bed)
-            found.append(PrintProblem("bed", 1, nowhere, f"{text} does not fit on {space}"))
-    return found
+            space = " x ".join(f"{length:g}" for length in bed)
+            problems.append(PrintProblem("bed", 1, nowhere, f"{text} does not fit on {space}"))
+    return problems

@@ -1,5 +1,5 @@
-"""Refines meshes: edges are split where the surface is too far from them, vertices are moved onto
-the surface and smoothed.
+"""The refinement of meshes: edges are split where the surface is too far from them, vertices are
+moved onto the surface and smoothed.
 
 Vertices and edges of the boundary stay as they are.
 """
@@ -38,25 +38,27 @@ __all__ = [
 ]
 
 Walls = tuple[FloatArray, FloatArray] | None
-# Which points (k, 3) count; None for all.
+# A function that tells which points (k, 3) count; None for all.
 Where = Callable[[FloatArray], BoolArray] | None
-# Across a crease normals turn by at least this angle, and by this part of it between two points.
+# Across a crease normals turn by at least this angle, and by this fraction of it between two
+# points.
 _BENT, _AT_ONCE = math.radians(20), 0.75
-# A vertex this near, in parts of the tolerance, counts as on the surface.
+# A vertex this near, relative to the tolerance, counts as on the surface.
 _ON = 1e-5
-# A crease may be this far from the middle of an edge, in parts of the edge.
+# The largest distance of a crease from the middle of an edge, relative to the edge.
 _BESIDE = 1.5
-# It is not looked for nearer to the ends than this, and by this many samples, twice.
+# A crease is not searched for nearer to the ends than this; and the number of samples of the
+# search, which is done twice.
 _FROM_ENDS, _SAMPLES = 0.05, 33
-# The level is looked for up to this part of the way to where tangent planes meet; and three planes
-# meet in a point if the determinant of their normals is larger.
+# The level is searched for up to this multiple of the displacement to where tangent planes meet;
+# and three planes meet in a point if the determinant of their normals is larger than the second.
 _BEYOND, _INDEPENDENT = 1.25, 0.1
-# Edges shorter than this part of the tolerance are never cut.
+# Edges shorter than this, relative to the tolerance, are never cut.
 _SHORTEST = 0.5
 _MOST_ROUNDS = 12
-# The number of edges and centers to be cut grows at first, and then falls. If it grows to this many
-# times the least before, refinement will not end: the surface bends within any triangle, as around
-# each dipole of a cloud.
+# The number of edges and centers to be cut grows at first, and then falls. If it grows to this
+# multiple of its smallest value before, refinement will not end: the surface bends within any
+# triangle, as around each dipole of a cloud.
 _DIVERGENCE_FACTOR = 3
 
 
@@ -71,44 +73,44 @@ def refine(
 ) -> tuple[FloatArray, IntArray]:
     """Split edges at their midpoints, and move these onto the surface, until the midpoints of all
     edges but those of the boundary, and the centers of all faces, are within `tolerance` of it; or
-    until that is seen not to succeed, which the caller has to check (`check_near_level`).
+    until refinement is found to diverge, which the caller has to check (`check_near_level`).
 
     where: which midpoints and centers count. Edges that are split beside these are moved onto the
-        surface as well: else they would be split again and again, as they end off the surface.
+        surface as well: otherwise they would be split again and again, as they end off the surface.
 
     Raises:
         TriangleLimitError: it takes more triangles than the function allows.
     """
-    least, before = math.inf, 0
+    smallest_count, before = math.inf, 0
     for round_number in range(_MOST_ROUNDS):
         report(f"refining, round {round_number + 1}: {len(faces):,} triangles")
-        far = _RefinementMarks.of(function, vertices, faces, tolerance, walls, where)
-        marked = far.marked
-        count = int(marked.sum()) + int(far.misses_corner.sum())
+        marks = _RefinementMarks.of(function, vertices, faces, tolerance, walls, where)
+        marked = marks.marked
+        count = int(marked.sum()) + int(marks.misses_corner.sum())
         if not count:
             break
-        if count > _DIVERGENCE_FACTOR * least:
+        if count > _DIVERGENCE_FACTOR * smallest_count:
             break
-        least = min(least, count) if count < before else least
+        smallest_count = min(smallest_count, count) if count < before else smallest_count
         before = count
-        # Every edge that is cut makes one more triangle on each side, and so does every center.
+        # Every edge that is cut adds one triangle on each side, and so does every center.
         check_triangle_limit(len(faces) + 2 * count, function.most_faces)
-        samples, reach = far.samples.select(marked), 0.5 * far.span[marked]
-        moved = newton_to_level(function, far.middle[marked], samples, reach, walls)
+        samples, reach = marks.samples.select(marked), 0.5 * marks.span[marked]
+        moved = newton_to_level(function, marks.middle[marked], samples, reach, walls)
         if function.field.has_creases:
-            moved = _project_to_creases(function, vertices, far.ends[marked], moved, walls)
-        place = np.full(len(marked), -1, np.int64)
-        place[marked] = len(vertices) + np.arange(int(marked.sum()))
+            moved = _project_to_creases(function, vertices, marks.ends[marked], moved, walls)
+        new_vertex = np.full(len(marked), -1, np.int64)
+        new_vertex[marked] = len(vertices) + np.arange(int(marked.sum()))
         vertices = np.concatenate([vertices, moved])
-        cut_off = far.misses_corner & ~marked[far.edges].any(axis=1)
+        cut_off = marks.misses_corner & ~marked[marks.edges].any(axis=1)
         inner = len(vertices) + np.arange(np.count_nonzero(cut_off))
         vertices = np.concatenate(
             [vertices, _crease_corners(function, vertices, faces[cut_off], walls)]
         )
         a, b, c = faces[cut_off].T
         fans = [np.stack([*ends, inner], axis=1) for ends in ((a, b), (b, c), (c, a))]
-        whole = split_faces(vertices, faces[~cut_off], place[far.edges[~cut_off]])
-        faces = np.concatenate([whole, *fans])
+        split = split_faces(vertices, faces[~cut_off], new_vertex[marks.edges[~cut_off]])
+        faces = np.concatenate([split, *fans])
     if function.field.has_variable_accuracy:
         vertices = _converge_vertices(function, vertices, faces, tolerance, walls)
     return vertices, faces
@@ -117,7 +119,7 @@ def refine(
 def _converge_vertices(
     function: LevelFunction, vertices: FloatArray, faces: IntArray, tolerance: float, walls: Walls
 ) -> FloatArray:
-    """With more steps for vertices that Newton's method has not yet brought onto the surface, as
+    """The vertices after more of Newton's steps for those that are not yet on the surface, as
     beside the dipoles of a cloud, where slopes change within a step."""
     samples = function.sample(vertices)
     is_off = samples.distance > _ON * tolerance
@@ -127,58 +129,58 @@ def _converge_vertices(
     if not len(rows):
         return vertices
     longest = np.full(len(rows), 0.5 * tolerance)
-    there = newton_to_level(
+    moved = newton_to_level(
         function, vertices[rows], samples.select(rows), longest, walls, steps=20
     )
-    good = np.abs(function.sample(there).value) < np.abs(samples.value[rows])
-    good &= row_norms(there - vertices[rows]) < tolerance
+    is_closer = np.abs(function.sample(moved).value) < np.abs(samples.value[rows])
+    is_closer &= row_norms(moved - vertices[rows]) < tolerance
     vertices = vertices.copy()
-    vertices[rows[good]] = there[good]
+    vertices[rows[is_closer]] = moved[is_closer]
     return vertices
 
 
 def _project_to_creases(
     function: LevelFunction, vertices: FloatArray, ends: IntArray, moved: FloatArray, walls: Walls
 ) -> FloatArray:
-    """Middles (k, 3) of edges, given by their vertices (k, 2), that were moved onto the surface;
-    where edges cut off a sharp crease, onto that instead.
+    """The middles (k, 3) of edges, given by their vertices (k, 2), after they were moved onto the
+    surface; where edges cut off a sharp crease, moved onto the crease instead.
 
     Newton's method leads to one of the two sides of a crease, and an edge along the normal of that
-    side back to its end: cut there again and again, it stays as long as it is. The point nearest to
-    the middle in the tangent planes of both ends is on the crease, as far as its sides are flat
-    (Kobbelt et al. 2001); the level is taken on the way there. There is one if normals turn by 20
-    degrees or more, and nearly all of it between the moved middle and one of the ends; on a smooth
-    surface about half of it.
+    side leads back to its end: cut there again and again, its length stays the same. The point
+    nearest to the middle in the tangent planes of both ends is on the crease, as far as its sides
+    are flat (Kobbelt et al. 2001); the point is where the segment to it passes the level. There is
+    a crease if normals turn by 20 degrees or more, and by nearly all of that angle between the
+    moved middle and one of the ends; on a smooth surface they turn by about half of it there.
     """
-    used, place = np.unique(ends, return_inverse=True)
+    used, index = np.unique(ends, return_inverse=True)
     slope = function.sample(vertices[used]).gradient
-    at_ends = (slope / np.maximum(row_norms(slope), 1e-300)[:, None])[place.reshape(-1, 2)]
-    here = function.sample(moved).gradient
-    here = here / np.maximum(row_norms(here), 1e-300)[:, None]
-    one, other = at_ends[:, 0], at_ends[:, 1]
-    cosine = row_dots(one, other)
-    turn = np.arccos(np.clip(np.minimum(row_dots(one, here), row_dots(other, here)), -1, 1))
-    whole = np.arccos(np.clip(cosine, -1, 1))
-    rows = np.flatnonzero((whole > _BENT) & (turn > _AT_ONCE * whole) & (1 - cosine**2 > 0.01))
+    at_ends = (slope / np.maximum(row_norms(slope), 1e-300)[:, None])[index.reshape(-1, 2)]
+    n = function.sample(moved).gradient
+    n = n / np.maximum(row_norms(n), 1e-300)[:, None]
+    n_a, n_b = at_ends[:, 0], at_ends[:, 1]
+    cosine = row_dots(n_a, n_b)
+    angle = np.arccos(np.clip(np.minimum(row_dots(n_a, n), row_dots(n_b, n)), -1, 1))
+    total = np.arccos(np.clip(cosine, -1, 1))
+    rows = np.flatnonzero((total > _BENT) & (angle > _AT_ONCE * total) & (1 - cosine**2 > 0.01))
     if not len(rows):
         return moved
-    one, other, cosine = one[rows], other[rows], cosine[rows]
+    n_a, n_b, cosine = n_a[rows], n_b[rows], cosine[rows]
     a, b = (vertices[ends[rows, k]] for k in (0, 1))
     middle, span = 0.5 * (a + b), row_norms(b - a)
-    high, low = row_dots(one, a - middle), row_dots(other, b - middle)
-    share = np.stack([high - cosine * low, low - cosine * high]) / (1 - cosine**2)
-    way = share[0][:, None] * one + share[1][:, None] * other
-    there, good = _level_along(function, middle, way, _BESIDE * span, walls)
-    good &= np.minimum(row_norms(there - a), row_norms(there - b)) > _FROM_ENDS * span
+    high, low = row_dots(n_a, a - middle), row_dots(n_b, b - middle)
+    weights = np.stack([high - cosine * low, low - cosine * high]) / (1 - cosine**2)
+    direction = weights[0][:, None] * n_a + weights[1][:, None] * n_b
+    projected, passed = _level_along(function, middle, direction, _BESIDE * span, walls)
+    passed &= np.minimum(row_norms(projected - a), row_norms(projected - b)) > _FROM_ENDS * span
     moved = moved.copy()
-    moved[rows[good]] = there[good]
+    moved[rows[passed]] = projected[passed]
     return moved
 
 
 def _crease_corners(
     function: LevelFunction, vertices: FloatArray, faces: IntArray, walls: Walls
 ) -> FloatArray:
-    """A point on the surface within each of some faces (k, 3) that cut off a corner: where the
+    """A point on the surface within each of the faces (k, 3), which cut off a corner: where the
     tangent planes of its vertices meet, or near the center."""
     corner = vertices[faces]
     center = corner.mean(axis=1)
@@ -189,42 +191,42 @@ def _crease_corners(
     rows = np.flatnonzero(np.abs(np.linalg.det(normal)) > _INDEPENDENT)
     away = (normal * (corner - center[:, None])).sum(axis=2)
     solve: Any = np.linalg.solve
-    way: FloatArray = solve(normal[rows], away[rows][:, :, None])[:, :, 0]
-    there, good = _level_along(function, center[rows], way, _BESIDE * span[rows], walls)
-    moved[rows[good]] = there[good]
+    direction: FloatArray = solve(normal[rows], away[rows][:, :, None])[:, :, 0]
+    crossing, passed = _level_along(function, center[rows], direction, _BESIDE * span[rows], walls)
+    moved[rows[passed]] = crossing[passed]
     return moved
 
 
 def _level_along(
-    function: LevelFunction, start: FloatArray, way: FloatArray, most: FloatArray, walls: Walls
+    function: LevelFunction, start: FloatArray, along: FloatArray, limit: FloatArray, walls: Walls
 ) -> tuple[FloatArray, BoolArray]:
-    """Points on the level from `start` (k, 3) along `way`, a little beyond its end at most and no
-    farther than `most`; and whether the level is passed there."""
-    way = way * np.minimum(1, most / np.maximum(row_norms(way), 1e-300))[:, None]
+    """Points on the level from `start` (k, 3) along the displacements `along`, at most a little
+    beyond their ends and no farther than `limit`; and whether the level is passed there."""
+    along = along * np.minimum(1, limit / np.maximum(row_norms(along), 1e-300))[:, None]
     low, high = np.zeros(len(start)), np.full(len(start), _BEYOND)
-    good = np.ones(len(start), np.bool_)
+    passed = np.ones(len(start), np.bool_)
     parts = np.linspace(0, 1, _SAMPLES)
     for _ in range(2):
         t = low[:, None] + (high - low)[:, None] * parts
-        x = start[:, None] + t[:, :, None] * way[:, None]
+        x = start[:, None] + t[:, :, None] * along[:, None]
         x = x if walls is None else np.clip(x, *walls)
         is_above = (function.sample(x.reshape(-1, 3)).value > 0).reshape(t.shape)
         passes = is_above[:, 1:] != is_above[:, :-1]
-        good &= passes.any(axis=1)
+        passed &= passes.any(axis=1)
         first = passes.argmax(axis=1)[:, None]
         low, high = (np.take_along_axis(t, first + k, axis=1)[:, 0] for k in (0, 1))
-    there = start + low[:, None] * way
-    there = there if walls is None else np.clip(there, *walls)
-    longest = 4 * (high - low) * row_norms(way)
-    return newton_to_level(function, there, function.sample(there), longest, walls), good
+    crossing = start + low[:, None] * along
+    crossing = crossing if walls is None else np.clip(crossing, *walls)
+    longest = 4 * (high - low) * row_norms(along)
+    return newton_to_level(function, crossing, function.sample(crossing), longest, walls), passed
 
 
 def unrefined_midpoints(
     function: LevelFunction, vertices: FloatArray, faces: IntArray, tolerance: float
 ) -> FloatArray:
     """Midpoints (k, 3) of the edges that `refine` would still split."""
-    far = _RefinementMarks.of(function, vertices, faces, tolerance, None, None)
-    return far.middle[far.marked]
+    marks = _RefinementMarks.of(function, vertices, faces, tolerance, None, None)
+    return marks.middle[marks.marked]
 
 
 @dataclass(frozen=True)
@@ -266,7 +268,7 @@ class _RefinementMarks:
         """The marks of edges whose midpoint, or the center of an adjacent face, is beyond the
         tolerance."""
         ends, edges, is_boundary = _edges(faces)
-        if walls is not None:  # the boundary lies in them, and so do the middles of its edges
+        if walls is not None:  # the boundary lies in the walls, and so do the middles of its edges
             is_boundary = np.zeros_like(is_boundary)
         middle = 0.5 * (vertices[ends[:, 0]] + vertices[ends[:, 1]])
         span = row_norms(vertices[ends[:, 0]] - vertices[ends[:, 1]])
@@ -278,22 +280,22 @@ class _RefinementMarks:
             is_beyond &= where(middle)
             is_off &= where(center)
         marked = is_beyond.copy()
-        off = is_off & (span[edges].max(axis=1) > _SHORTEST * tolerance)
+        must_split = is_off & (span[edges].max(axis=1) > _SHORTEST * tolerance)
         cuts_off = np.zeros(len(faces), np.bool_)
-        lone = np.flatnonzero(off & ~marked[edges].any(axis=1))
+        lone = np.flatnonzero(must_split & ~marked[edges].any(axis=1))
         if function.field.has_creases:
             cuts_off[lone] = _turns(function, vertices[faces[lone]])
-        off &= ~cuts_off
-        # Of a face that is off, the longest edge that may be cut.
+        must_split &= ~cuts_off
+        # For a face that is off the surface, the longest edge that may be cut.
         free = np.where(is_boundary[edges], 0.0, span[edges])
         worst = edges[np.arange(len(faces)), free.argmax(axis=1)]
-        marked[worst[off]] = True
+        marked[worst[must_split]] = True
         marked &= ~is_boundary & (span > _SHORTEST * tolerance)
         return cls(edges, ends, middle, span, samples, is_beyond, is_off, marked, cuts_off)
 
 
 def _turns(function: LevelFunction, corner: FloatArray) -> BoolArray:
-    """Whether normals at the corners (k, 3, 3) of faces turn as across a crease."""
+    """(k,) whether normals at the corners (k, 3, 3) of faces turn as across a crease."""
     slope = function.sample(corner.reshape(-1, 3)).gradient
     normal = (slope / np.maximum(row_norms(slope), 1e-300)[:, None]).reshape(-1, 3, 3)
     between = [row_dots(normal[:, k], normal[:, k - 1]) for k in range(3)]
@@ -301,8 +303,8 @@ def _turns(function: LevelFunction, corner: FloatArray) -> BoolArray:
 
 
 def _edges(faces: IntArray) -> tuple[IntArray, IntArray, BoolArray]:
-    """All edges (k, 2), those of each face (m, 3) (that of corners 0 and 1 first), and whether they
-    belong to one face only."""
+    """All edges (k, 2), the indices of the edges of each face (m, 3) (that of corners 0 and 1
+    first), and whether each edge belongs to one face only."""
     edges = Edges.of(half_edges(faces))
     return edges.vertices, edges.edge_of_pair.reshape(3, -1).T, edges.multiplicity == 1
 
@@ -315,17 +317,17 @@ def split_faces(vertices: FloatArray, faces: IntArray, middle: IntArray) -> IntA
     cut = middle >= 0
     number = cut.sum(axis=1)
     parts = [faces[number == 0]]
-    three = number == 3
-    (a, b, c), (x, y, z) = faces[three].T, middle[three].T
+    all_cut = number == 3
+    (a, b, c), (x, y, z) = faces[all_cut].T, middle[all_cut].T
     parts += [np.stack(t, axis=1) for t in ((a, x, z), (x, b, y), (z, y, c), (x, y, z))]
     for k in range(3):
         order = [k, (k + 1) % 3, (k + 2) % 3]
-        one = (number == 1) & cut[:, k]
-        (a, b, c), x = faces[one][:, order].T, middle[one, k]
+        single = (number == 1) & cut[:, k]
+        (a, b, c), x = faces[single][:, order].T, middle[single, k]
         parts += [np.stack(t, axis=1) for t in ((a, x, c), (x, b, c))]
-        two = (number == 2) & ~cut[:, k]
-        # The edge from a to b is whole; y and z are the middles of the others.
-        (a, b, c), y, z = faces[two][:, order].T, middle[two, order[1]], middle[two, order[2]]
+        pair = (number == 2) & ~cut[:, k]
+        # The edge from a to b is not cut; y and z are the middles of the other edges.
+        (a, b, c), y, z = faces[pair][:, order].T, middle[pair, order[1]], middle[pair, order[2]]
         first = row_norms(vertices[a] - vertices[y])
         second = row_norms(vertices[b] - vertices[z])
         shorter = (first < second)[:, None]
@@ -343,8 +345,9 @@ def improve(
     walls: Walls,
     report: Callable[[str], None],
 ) -> tuple[FloatArray, IntArray]:
-    """Better angles: edges are flipped and vertices smoothed in turn, slivers are contracted; then
-    edges are cut again where triangles are no longer within `tolerance`."""
+    """Vertices and faces with better angles: edges are flipped and vertices smoothed in turn,
+    slivers are contracted; then edges are cut again where triangles are no longer within
+    `tolerance`."""
     for _ in range(2):
         faces = flip_edges(function, vertices, faces, tolerance)
         vertices = smooth(function, vertices, faces, walls, rounds=2)
@@ -366,7 +369,7 @@ def smooth(
     rounds: int = 3,
 ) -> FloatArray:
     """Vertices moved towards the mean of their neighbors and back onto the surface, a few times;
-    those of the boundary stay. Moves that turn a face by much are taken back."""
+    boundary vertices stay. Moves that turn a face by much are reverted."""
     ends, _, _ = _edges(faces)
     boundary = np.unique(boundary_edges(faces))
     free = np.zeros(len(vertices), np.bool_)
@@ -377,21 +380,21 @@ def smooth(
     size = float(np.ptp(vertices[free], axis=0).max(initial=0.0)) if len(rows) else 0.0
     for _ in range(rounds):
         sums = np.zeros_like(vertices)
-        for one, other in ((0, 1), (1, 0)):
+        for i, j in ((0, 1), (1, 0)):
             for axis in range(3):
                 sums[:, axis] += np.bincount(
-                    ends[:, one], vertices[ends[:, other], axis], minlength=len(vertices)
+                    ends[:, i], vertices[ends[:, j], axis], minlength=len(vertices)
                 )
         aim = 0.5 * (vertices + sums / count[:, None])
         start = function.sample(aim[rows])
-        # No farther than neighbors are: beside the curve gradients turn.
+        # No farther than the neighbors: beside the curve gradients turn.
         span = row_norms(aim[rows] - vertices[rows]) + 1e-300
-        there = vertices.copy()
-        there[rows] = newton_to_level(function, aim[rows], start, 2 * span, walls)
-        after = function.sample(there[rows])
-        worse = after.distance > 1e-7 * size + 1e-12 * row_norms(there[rows])
-        there[rows[worse]] = vertices[rows[worse]]
-        vertices = _undo_flipped(vertices, there, faces)
+        moved = vertices.copy()
+        moved[rows] = newton_to_level(function, aim[rows], start, 2 * span, walls)
+        after = function.sample(moved[rows])
+        worse = after.distance > 1e-7 * size + 1e-12 * row_norms(moved[rows])
+        moved[rows[worse]] = vertices[rows[worse]]
+        vertices = _undo_flipped(vertices, moved, faces)
     return vertices
 
 
@@ -403,30 +406,31 @@ def smooth_within_tolerance(
     tolerance: float,
     where: Where = None,
 ) -> FloatArray:
-    """As `smooth`, but for vertices of faces whose middles of edges or center would get farther
-    from the surface than `tolerance` by that, as beside a crease.
+    """As `smooth`, except that vertices stay if smoothing would move a center or a middle of an
+    edge of their faces farther from the surface than `tolerance`, as beside a crease.
 
-    where: middles and centers count."""
+    where: which middles and centers count."""
     after = smooth(function, vertices, faces, walls)
     rows = np.arange(len(faces))
     for _ in range(8):
-        far = _RefinementMarks.of(function, after, faces[rows], tolerance, walls, where)
-        off = np.zeros(len(faces), np.bool_)
-        off[rows] = far.is_beyond[far.edges].any(axis=1) | far.is_off
-        back = np.zeros(len(vertices), np.bool_)
-        for _ in range(2):  # with neighbors, so that this ends soon
-            back[faces[off]] = True
-            off = back[faces].any(axis=1)
-        back &= (after != vertices).any(axis=1)
-        if not back.any():
+        marks = _RefinementMarks.of(function, after, faces[rows], tolerance, walls, where)
+        is_off = np.zeros(len(faces), np.bool_)
+        is_off[rows] = marks.is_beyond[marks.edges].any(axis=1) | marks.is_off
+        is_reverted = np.zeros(len(vertices), np.bool_)
+        for _ in range(2):  # together with neighbors, so that the loop ends soon
+            is_reverted[faces[is_off]] = True
+            is_off = is_reverted[faces].any(axis=1)
+        is_reverted &= (after != vertices).any(axis=1)
+        if not is_reverted.any():
             return after
-        after = np.where(back[:, None], vertices, after)
-        rows = np.flatnonzero(back[faces].any(axis=1))  # others are as they were
+        after = np.where(is_reverted[:, None], vertices, after)
+        rows = np.flatnonzero(is_reverted[faces].any(axis=1))  # other faces have not changed
     return vertices
 
 
 def _undo_flipped(before: FloatArray, after: FloatArray, faces: IntArray) -> FloatArray:
-    """`after`, but for vertices of faces that have turned over, which stay as before."""
+    """The vertices `after`, except those of faces that turned over, which are reverted to
+    `before`."""
     for _ in range(8):
         corner = after[faces]
         normal = area_normals(corner)
@@ -436,6 +440,6 @@ def _undo_flipped(before: FloatArray, after: FloatArray, faces: IntArray) -> Flo
         if not turned.any():
             return after
         after = after.copy()
-        back = np.unique(faces[turned])
-        after[back] = before[back]
+        reverted = np.unique(faces[turned])
+        after[reverted] = before[reverted]
     return before

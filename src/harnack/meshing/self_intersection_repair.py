@@ -1,9 +1,9 @@
-"""Repairs closed meshes of which a few triangles intersect each other, locally.
+"""The local repair of closed meshes a few of whose triangles intersect each other.
 
 Where solids are cut by each other corners are rounded, and where triangles in a plane are merged
-slivers without an area are left: such triangles intersect their neighbors by about a rounding
-error. Contracting or flipping an edge near them repairs that mostly. Edges are tried in turn, with
-exact signs, on the few triangles around.
+slivers without an area remain: such triangles intersect their neighbors by about a rounding error.
+Contracting or flipping an edge near them repairs most of these. Edges are tried in turn, with exact
+signs, on the few triangles around.
 """
 
 from __future__ import annotations
@@ -35,11 +35,12 @@ from harnack.meshing.lattice_meshing import TriangleMesh
 
 __all__ = ["resolve_local_intersections", "resolve_self_intersections"]
 
-# More crossing triangles than this, or in a larger neighborhood, are no slivers.
+# If there are more crossing triangles than this, or if their neighborhood is larger, they are no
+# slivers.
 _MOST, _MOST_AROUND = 400, 5_000
-# How many changes are made in one place, and how many are tried for each.
+# The largest number of changes in one place, and the number of attempts for each.
 _MOST_CHANGES, _MOST_TRIED = 40, 80
-# New triangles of this part of the area that they are to cover may look backwards.
+# New triangles with less than this fraction of the area that they cover may face backwards.
 _NOTHING = 1e-4
 
 
@@ -48,14 +49,13 @@ def resolve_self_intersections(surface: TriangleMesh, length: float) -> Triangle
     (`resolve_local_intersections`), so that none do.
 
     Raises:
-        MeshingError: vertices that are not finite; a SelfIntersectionError where that is not
-            enough.
+        MeshingError: vertices are not finite; a SelfIntersectionError if triangles still cross.
     """
     try:
         check_no_self_intersection(surface.vertices, surface.faces)
     except SelfIntersectionError as error:
-        mended, left = resolve_local_intersections(surface, error.faces, length)
-        if left:
+        mended, crossing_count = resolve_local_intersections(surface, error.faces, length)
+        if crossing_count:
             raise
         return mended
     return surface
@@ -64,74 +64,75 @@ def resolve_self_intersections(surface: TriangleMesh, length: float) -> Triangle
 def resolve_local_intersections(
     surface: TriangleMesh, crossing: IntArray, length: float
 ) -> tuple[TriangleMesh, int]:
-    """A closed surface with edges contracted and flipped where triangles cross; and how many
-    triangles cross still.
+    """A closed surface with edges contracted and flipped where triangles cross; and the number of
+    triangles that still cross.
 
-    crossing: all faces that do (`intersecting_faces`).
-    length: how far the surface may be moved by one change; vertices stay where they are, or go.
+    crossing: all faces that cross others (`intersecting_faces`).
+    length: how far the surface may be moved by one change; vertices stay where they are, or are
+        removed.
     """
     if not 0 < len(crossing) <= _MOST or length <= 0:
         return surface, len(crossing)
     vertices, faces = surface.vertices, surface.faces
-    is_gone, made, left = np.zeros(len(faces), np.bool_), [faces[:0]], 0
+    is_gone, pieces, crossing_count = np.zeros(len(faces), np.bool_), [faces[:0]], 0
     for rows, movable in _regions(vertices, faces, crossing):
         is_gone[rows] = True
         if len(rows) > _MOST_AROUND:
-            made.append(faces[rows])
-            left += int(np.isin(crossing, rows).sum())
+            pieces.append(faces[rows])
+            crossing_count += int(np.isin(crossing, rows).sum())
             continue
         patch, count = _reduce_crossings(_Neighborhood.of(vertices, faces[rows], movable), length)
-        made.append(patch)
-        left += count
+        pieces.append(patch)
+        crossing_count += count
     return TriangleMesh.without_unused_vertices(
-        vertices, np.concatenate([faces[~is_gone], *made])
-    ), left
+        vertices, np.concatenate([faces[~is_gone], *pieces])
+    ), crossing_count
 
 
 def _regions(
     vertices: FloatArray, faces: IntArray, crossing: IntArray
 ) -> Iterator[tuple[IntArray, IntArray]]:
-    """Faces, by index, of separate neighborhoods, and the vertices that may go in each.
+    """The faces, by index, of separate neighborhoods, and the vertices of each that may be removed.
 
     A neighborhood is all faces whose boxes meet that of the faces around the faces around crossing
-    ones. Vertices of the latter may go: the new faces then lie within that box, so that they cross
-    no others.
+    faces. Vertices of faces next to crossing faces may be removed: the new faces then lie within
+    that box, so that they cross no others.
     """
-    import scipy.sparse  # here: half a second that few need
+    import scipy.sparse  # imported here: it takes half a second
     import scipy.sparse.csgraph as csgraph_module
 
     sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
     corner = vertices[faces]
     lower, upper = corner.min(axis=1), corner.max(axis=1)
     near = _touching(faces, faces[crossing])
-    around = _touching(faces, faces[near])
-    pairs = half_edges(faces[around])
+    second_ring = _touching(faces, faces[near])
+    pairs = half_edges(faces[second_ring])
     joined = sparse.coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(vertices),) * 2)
     part = csgraph.connected_components(joined, directed=False)[1]
     boxes: list[IntArray] = []
-    for one in np.unique(part[faces[around, 0]]):
-        rows = around[part[faces[around, 0]] == one]
+    for label in np.unique(part[faces[second_ring, 0]]):
+        rows = second_ring[part[faces[second_ring, 0]] == label]
         low, high = lower[rows].min(axis=0), upper[rows].max(axis=0)
-        found = np.flatnonzero((lower <= high).all(axis=1) & (upper >= low).all(axis=1))
+        members = np.flatnonzero((lower <= high).all(axis=1) & (upper >= low).all(axis=1))
         for k in reversed(range(len(boxes))):
-            if len(np.intersect1d(found, boxes[k])):
-                found = np.union1d(found, boxes.pop(k))
-        boxes.append(found)
+            if len(np.intersect1d(members, boxes[k])):
+                members = np.union1d(members, boxes.pop(k))
+        boxes.append(members)
     for rows in boxes:
         yield rows, np.unique(faces[near[np.isin(near, rows)]])
 
 
-def _touching(faces: IntArray, some: IntArray) -> IntArray:
-    """Faces, by index, with a corner of some."""
-    is_asked = np.zeros(int(faces.max()) + 1, np.bool_)
-    is_asked[some] = True
-    return np.flatnonzero(is_asked[faces].any(axis=1))
+def _touching(faces: IntArray, targets: IntArray) -> IntArray:
+    """The indices of faces that have a corner in common with `targets`."""
+    is_corner = np.zeros(int(faces.max()) + 1, np.bool_)
+    is_corner[targets] = True
+    return np.flatnonzero(is_corner[faces].any(axis=1))
 
 
 @dataclass(frozen=True)
 class _Neighborhood:
-    """Faces (m, 3) of a neighborhood, between vertices (n, 3) of the mesh; is_movable: (n,) those
-    of which all faces are here."""
+    """Faces (m, 3) of a neighborhood, between vertices (n, 3) of the mesh; is_movable: (n,) the
+    vertices all of whose faces are in the neighborhood."""
 
     vertices: FloatArray
     faces: IntArray
@@ -140,9 +141,9 @@ class _Neighborhood:
 
     @classmethod
     def of(cls, vertices: FloatArray, faces: IntArray, movable: IntArray) -> _Neighborhood:
-        """names: of the vertices, in the mesh."""
-        names, place = np.unique(faces, return_inverse=True)
-        return cls(vertices[names], place.reshape(-1, 3), np.isin(names, movable), names)
+        """The neighborhood of these faces, whose vertices `movable` may be removed."""
+        names, index = np.unique(faces, return_inverse=True)
+        return cls(vertices[names], index.reshape(-1, 3), np.isin(names, movable), names)
 
     def crossing(self) -> IntArray:
         """Faces, by index, that pass through others."""
@@ -153,34 +154,36 @@ class _Neighborhood:
         return np.flatnonzero((self.faces == vertex).any(axis=1))
 
     def neighbors(self, vertex: int) -> set[int]:
-        """Vertices that edges join a vertex with."""
+        """The vertices that edges join to a vertex."""
         return set(self.faces[self.around(vertex)].ravel().tolist()) - {vertex}
 
     def with_faces(self, gone: IntArray, new: IntArray) -> _Neighborhood:
-        """With faces, by index, replaced."""
+        """The neighborhood with the faces `gone`, by index, replaced by `new`."""
         return dataclasses.replace(
             self, faces=np.concatenate([np.delete(self.faces, gone, axis=0), new])
         )
 
     def collapse_edge(self, a: int, b: int) -> tuple[IntArray, IntArray] | None:
-        """Faces that go and that come if a is moved to b; None where sheets would touch."""
+        """The faces that are removed, by index, and those that replace them if a is moved to b;
+        None if sheets would touch."""
         if not (self.is_movable[a] and self.is_movable[b]):
             return None
         if len(self.neighbors(a) & self.neighbors(b)) != 2:
             return None
-        gone = self.around(a)
-        new = np.where(self.faces[gone] == a, b, self.faces[gone])
-        return gone, new[(new != np.roll(new, 1, axis=1)).all(axis=1)]
+        removed = self.around(a)
+        new = np.where(self.faces[removed] == a, b, self.faces[removed])
+        return removed, new[(new != np.roll(new, 1, axis=1)).all(axis=1)]
 
     def flip_edge(self, a: int, b: int) -> tuple[IntArray, IntArray] | None:
-        """Faces that go and that come if the edge between a and b joins the corners opposite to it
-        instead; None if there is such an edge."""
+        """The faces that are removed, by index, and those that replace them if the edge between a
+        and b is flipped to join the corners opposite to it; None if there already is such an
+        edge."""
         if not (self.is_movable[a] and self.is_movable[b]):
             return None
-        gone = np.intersect1d(self.around(a), self.around(b))
-        if len(gone) != 2:
+        removed = np.intersect1d(self.around(a), self.around(b))
+        if len(removed) != 2:
             return None
-        first, second = (self.faces[row].tolist() for row in gone)
+        first, second = (self.faces[row].tolist() for row in removed)
         if first[(first.index(a) + 1) % 3] != b:
             first, second = second, first
         (c,), (d,) = set(first) - {a, b}, set(second) - {a, b}
@@ -188,51 +191,53 @@ class _Neighborhood:
             return None
         if not (self.is_movable[c] or self.is_movable[d]):
             return None
-        return gone, np.array([[a, d, c], [d, b, c]])
+        return removed, np.array([[a, d, c], [d, b, c]])
 
 
 def _reduce_crossings(patch: _Neighborhood, length: float) -> tuple[IntArray, int]:
-    """Faces of a patch, by vertices of the mesh, in which fewer cross; and how many still do."""
-    bad = patch.crossing()
+    """The faces of a patch, by vertices of the mesh, after changes that let fewer cross; and the
+    number that still cross."""
+    crossing = patch.crossing()
     for _ in range(_MOST_CHANGES):
-        better = _best_change(patch, bad, length) if len(bad) else None
+        better = _best_change(patch, crossing, length) if len(crossing) else None
         if better is None:
             break
-        patch, bad = better
-    return patch.mesh_vertices[patch.faces], len(bad)
+        patch, crossing = better
+    return patch.mesh_vertices[patch.faces], len(crossing)
 
 
 def _best_change(
-    patch: _Neighborhood, bad: IntArray, length: float
+    patch: _Neighborhood, crossing: IntArray, length: float
 ) -> tuple[_Neighborhood, IntArray] | None:
-    """The patch after one change, after which fewer faces cross, and these; None if none is known.
+    """The patch after one change that lets fewer faces cross, and these faces; None if no change
+    does.
 
-    Those are tried first that move the surface least: of edges of faces that cross, then of all
+    Changes that move the surface least are tried first: of edges of faces that cross, then of all
     edges at their corners.
     """
-    for rows in (bad, _touching(patch.faces, patch.faces[bad])):
-        for _, gone, new in sorted(_changes(patch, rows, length), key=lambda one: one[0])[
+    for rows in (crossing, _touching(patch.faces, patch.faces[crossing])):
+        for _, removed, new in sorted(_changes(patch, rows, length), key=lambda change: change[0])[
             :_MOST_TRIED
         ]:
-            made = patch.with_faces(gone, new)
-            crossing = made.crossing()
-            if len(crossing) < len(bad):
-                return made, crossing
+            changed = patch.with_faces(removed, new)
+            still_crossing = changed.crossing()
+            if len(still_crossing) < len(crossing):
+                return changed, still_crossing
     return None
 
 
 def _changes(
     patch: _Neighborhood, rows: IntArray, length: float
 ) -> Iterator[tuple[float, IntArray, IntArray]]:
-    """Changes of the edges of some faces: how far they move the surface, and the faces that go and
-    that come."""
+    """Changes of the edges of the faces `rows`: how far they move the surface, the faces that are
+    removed, and those that replace them."""
     count = len(patch.vertices)
     keys = sorted_unique(edge_keys(half_edges(patch.faces[rows]), count))
     for a, b in np.stack(np.divmod(keys, count), axis=1).tolist():
-        for one, other in ((a, b), (b, a)):
-            change = patch.collapse_edge(one, other)
+        for source, target in ((a, b), (b, a)):
+            change = patch.collapse_edge(source, target)
             if change is not None and _keeps_orientation(patch, *change, length):
-                moved = distance_from_triangles(patch.vertices[one], patch.vertices[change[1]])
+                moved = distance_from_triangles(patch.vertices[source], patch.vertices[change[1]])
                 if moved <= length:
                     yield moved, *change
         change = patch.flip_edge(a, b)
@@ -243,25 +248,26 @@ def _changes(
                 yield moved, *change
 
 
-def _keeps_orientation(patch: _Neighborhood, gone: IntArray, new: IntArray, length: float) -> bool:
-    """Whether no new face, but for slivers, looks backwards from where the old ones look in the
-    mean, and the volume between new and old ones is no more than if these moved by a length: a
-    vertex on the new faces says nothing of old ones that are folded, as at a thin spike."""
-    corner, replaced = patch.vertices[patch.faces[gone]], patch.vertices[new]
-    old, made = area_normals(corner), area_normals(replaced)
+def _keeps_orientation(patch: _Neighborhood, rows: IntArray, new: IntArray, length: float) -> bool:
+    """Whether no new face, except slivers, faces backwards relative to the mean normal of the old
+    faces, and the volume between new and old faces is no more than if the old ones moved by a
+    length: a vertex on the new faces tells nothing about old faces that are folded, as at a thin
+    spike."""
+    corner, replaced = patch.vertices[patch.faces[rows]], patch.vertices[new]
+    old, after = area_normals(corner), area_normals(replaced)
     mean = old.sum(axis=0)
-    most = float(row_norms(old).sum())
+    total = float(row_norms(old).sum())
     origin = corner[0, 0]
     between = (
-        row_dots(replaced[:, 0] - origin, made).sum() - row_dots(corner[:, 0] - origin, old).sum()
+        row_dots(replaced[:, 0] - origin, after).sum() - row_dots(corner[:, 0] - origin, old).sum()
     )
-    if abs(float(between)) / 6 > length * most / 2:
+    if abs(float(between)) / 6 > length * total / 2:
         return False
-    return bool(((made @ mean > 0) | (row_norms(made) <= _NOTHING * most)).all())
+    return bool(((after @ mean > 0) | (row_norms(after) <= _NOTHING * total)).all())
 
 
 def _between(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> float:
-    """How far the lines through a and b and through c and d are from each other."""
+    """The distance between the line through a and b and the line through c and d."""
     across = np.cross(b - a, d - c)
     size = float(np.linalg.norm(across))
     return abs(float(across @ (c - a))) / size if size > 0 else np.inf

@@ -1,4 +1,4 @@
-"""Functions of which only the signs count: values at points, and crossings of the level on
+"""Functions that are meshed by their signs: values at points, and crossings of the level on
 segments.
 
 Every real-valued function has a sign at every point, whether or not it is continuous: winding
@@ -42,20 +42,21 @@ if TYPE_CHECKING:
 __all__ = ["SignFunction", "cell_size_for_smoothing", "empty_surface_hint", "uses_sign_meshing"]
 
 # How often a segment is halved before it is intersected with facets; and how often a smooth
-# function is evaluated along it, in turn where the secant meets the level and in the middle.
+# function is evaluated along it, alternately where the secant meets the level and in the middle.
 _HALVINGS, _STEPS = 4, 8
-# Values that are so small, as a part of those at the ends, need no further steps.
+# Values smaller than this, relative to those at the ends, need no further steps.
 _NEAR_ROOT = 1e-3
-# A part of what is left of a segment that is looked at beyond both of its ends.
+# How far a segment is extended beyond both of its ends, relative to its remaining length.
 _BEYOND = 1e-6
-# Single precision is used where it tells this many points apart along a cell.
+# Single precision is used where it distinguishes this many points along a cell.
 _STEPS_IN_CELL = 1000
-# Surfaces smoothed over a smaller part of a cell than this have details that it does not show: of
-# five meshes, cells up to 2.8 smoothing lengths were enough, and those above 3.9 were not. Cells of
-# so many smoothing lengths show them, but for noise: by experiment cells of 7 lose thin edges, and
-# those below 4 show bubbles around single points.
+# Surfaces with a smoothing length below this, relative to a cell, have details that the cell does
+# not show: of five meshes, cells up to 2.8 smoothing lengths were enough, and cells above 3.9 were
+# not. Cells of the second number of smoothing lengths show the details, but not the noise: by
+# experiment cells of 7 lose thin edges, and cells below 4 show bubbles around single points.
 _UNRESOLVED_SMOOTHING, _RESOLVED_SMOOTHING_LENGTHS = 0.3, 4.8
-# Points of a cloud at which its value is looked at, and the part of the level that it must have.
+# The largest number of points of a cloud at which its value is tested, and the fraction of the
+# level that it must reach.
 _MOST_PROBES, _LEAST_PART = 2000, 0.1
 
 
@@ -95,7 +96,7 @@ class SignFunction(LevelFunction):
     """side (f - level), of a real-valued field, by its values at points.
 
     side: 1, or -1 for a function that is negative where f is above the level.
-    precision: of values. Crossings of facets are found in double precision.
+    precision: of values. Crossings of facets are computed in double precision.
     """
 
     side: float = dataclasses.field(default=1.0, kw_only=True)
@@ -115,15 +116,16 @@ class SignFunction(LevelFunction):
         side: float = 1.0,
         most_faces: int,
     ) -> SignFunction:
-        """In single precision where that tells points of a cell in the box apart.
+        """The function of a field, in single precision where that distinguishes points of a cell in
+        the box.
 
         Raises:
-            MeshingError: a cloud whose normals do not face outwards, or that encloses nothing.
+            MeshingError: a cloud has normals that do not face outwards, or encloses nothing.
         """
         if isinstance(field, DipolePotential):
             _check_encloses(field, level)
-        far = float(np.abs(box).max())
-        is_near = far * 2.0**-24 * _STEPS_IN_CELL < spacing
+        max_abs = float(np.abs(box).max())
+        is_near = max_abs * 2.0**-24 * _STEPS_IN_CELL < spacing
         precision: Precision = "single" if is_near else "double"
         return cls(field, level, side=side, precision=precision, most_faces=most_faces)
 
@@ -135,8 +137,8 @@ class SignFunction(LevelFunction):
         return self.relative_to_level(self.field.value(points, precision=self.precision))
 
     def sample(self, points: FloatArray) -> LevelSamples:
-        """The function at points (n, 3). For a field that jumps the gradient is given as 0, since
-        it does not tell how far the level is."""
+        """The samples of the function at points (n, 3). For a field that jumps the gradient is set
+        to 0, since it does not tell the distance to the level."""
         none = np.zeros(len(points))
         if self.field.has_jumps:
             return LevelSamples(self.values(points), np.zeros((len(points), 3)), none)
@@ -157,8 +159,8 @@ class SignFunction(LevelFunction):
         )
 
     def count_undecided(self, points: FloatArray, value: FloatArray) -> int:
-        """At how many of some points, with the function's values, its error leaves the sign
-        open."""
+        """The number of points, given with the function's values, at which its error leaves the
+        sign undecided."""
         if not isinstance(self.field, BatchedField):
             return 0
         scale = float(np.median(np.abs(value))) if len(value) else 0.0
@@ -169,42 +171,44 @@ class SignFunction(LevelFunction):
         return int((np.abs(value[near]) <= error).sum())
 
     def clearance(self, points: FloatArray) -> FloatArray:
-        """(n,) no point of the level set is nearer: see `level_distance_lower_bound`. Of a winding
-        number modulo 1, which has no jumps and needs coarse samples alone, and from its
-        triangles."""
+        """(n,) a lower bound of the distance to the level set: see `level_distance_lower_bound`.
+        For a winding number it is that of the winding number modulo 1, which has no jumps and needs
+        coarse samples alone, and the distance from its triangles."""
         self.evaluations += len(points)
         if not self._clearances:
             self._clearances = _clearances(self.field, self.level, self.precision)
-        found = [one(points) for one in self._clearances]
-        return np.min(found, axis=0)
+        distances = [bound(points) for bound in self._clearances]
+        return np.min(distances, axis=0)
 
     def crossings(self, low: FloatArray, high: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Where segments between points (n, 3), at which the function is not positive and positive,
-        meet the level: points (n, 3), and unit normals there towards where the function grows.
+        """The points (n, 3) where segments between points (n, 3), at which the function is not
+        positive and positive, meet the level, and unit normals there towards where the function
+        grows.
 
         They lie on facets where the function changes its sign by a jump, to rounding.
         """
         if not len(low):
             return low.copy(), low.copy()
-        way = high - low
+        direction = high - low
         t = np.zeros(len(low))
         normal, is_on_sheet = np.zeros_like(low), np.zeros(len(low), np.bool_)
         if self.field.has_jumps:
-            first, last = self._bisect(low, way)
-            t, normal, is_on_sheet = self._on_sheets(low, way, first, last)
+            first, last = self._bisect(low, direction)
+            t, normal, is_on_sheet = self._on_sheets(low, direction, first, last)
             rows = np.flatnonzero(~is_on_sheet)
-            t[rows] = self._roots(low[rows], way[rows], first[rows], last[rows], 2)
+            t[rows] = self._roots(low[rows], direction[rows], first[rows], last[rows], 2)
         else:
-            t = self._roots(low, way, t, t + 1, _STEPS)
-        x = low + t[:, None] * way
+            t = self._roots(low, direction, t, t + 1, _STEPS)
+        x = low + t[:, None] * direction
         smooth = np.flatnonzero(~is_on_sheet)
-        normal[smooth] = self._slopes(x[smooth], way[smooth])
-        down = is_on_sheet & (row_dots(normal, way) < 0)
+        normal[smooth] = self._slopes(x[smooth], direction[smooth])
+        down = is_on_sheet & (row_dots(normal, direction) < 0)
         normal[down] *= -1
         return x, normal / np.maximum(row_norms(normal), 1e-300)[:, None]
 
-    def _slopes(self, x: FloatArray, way: FloatArray) -> FloatArray:
-        """(n, 3) gradients at points; where there is none, the way that leads up."""
+    def _slopes(self, x: FloatArray, direction: FloatArray) -> FloatArray:
+        """(n, 3) gradients at points; where there is none, the direction of the segment, which
+        leads upwards."""
         if not len(x):
             return x
         self.evaluations += len(x)
@@ -214,61 +218,63 @@ class SignFunction(LevelFunction):
             slopes = self.field.gradient(x, precision=self.precision)
         slope = self.side * np.asarray(slopes, np.float64)
         flat = ~np.isfinite(slope).all(axis=1) | ~slope.any(axis=1)
-        slope[flat] = way[flat]
+        slope[flat] = direction[flat]
         return slope
 
-    def _bisect(self, start: FloatArray, way: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Ends (n,) of parts of segments, in which the function changes its sign as well."""
+    def _bisect(self, start: FloatArray, direction: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The ends (n,) of shorter parts of the segments, on which the function changes its sign as
+        well."""
         first, last = np.zeros(len(start)), np.ones(len(start))
         for _ in range(_HALVINGS):
             t = 0.5 * (first + last)
-            above = self.values(start + t[:, None] * way) > 0
-            first, last = np.where(above, first, t), np.where(above, t, last)
+            is_positive = self.values(start + t[:, None] * direction) > 0
+            first, last = np.where(is_positive, first, t), np.where(is_positive, t, last)
         return first, last
 
     def _roots(
-        self, start: FloatArray, way: FloatArray, first: FloatArray, last: FloatArray, steps: int
+        self, start: FloatArray, along: FloatArray, first: FloatArray, last: FloatArray, steps: int
     ) -> FloatArray:
-        """(n,) where the function is 0 between two places of a segment: by turns the secant and the
-        middle are tried, so that what is left is at most half as long with every second step; until
-        values are small beside those at the ends, so that one more secant is as good as exact."""
+        """(n,) the fractions of segments, between `first` and `last`, where the function is 0: the
+        secant and the middle are tried in turn, so that every second step at least halves the
+        interval; until values are small relative to those at the ends, so that one more secant is
+        as good as exact."""
         if not len(start):
             return first
         first, last = first.copy(), last.copy()
-        low, high = (self.values(start + t[:, None] * way) for t in (first, last))
+        low, high = (self.values(start + t[:, None] * along) for t in (first, last))
         enough = _NEAR_ROOT * np.minimum(np.abs(low), np.abs(high))
         rows = np.arange(len(start))
         for k in range(steps):
             ends = first[rows], last[rows]
             t = 0.5 * (ends[0] + ends[1]) if k % 2 else _secant(*ends, low[rows], high[rows])
-            value = self.values(start[rows] + t[:, None] * way[rows])
-            above = value > 0
-            first[rows], last[rows] = np.where(above, ends[0], t), np.where(above, t, ends[1])
-            low[rows] = np.where(above, low[rows], value)
-            high[rows] = np.where(above, value, high[rows])
+            value = self.values(start[rows] + t[:, None] * along[rows])
+            is_up = value > 0
+            first[rows], last[rows] = np.where(is_up, ends[0], t), np.where(is_up, t, ends[1])
+            low[rows] = np.where(is_up, low[rows], value)
+            high[rows] = np.where(is_up, value, high[rows])
             rows = rows[~(np.abs(value) <= enough[rows])]
             if not len(rows):
                 break
         return _secant(first, last, low, high)
 
     def _on_sheets(
-        self, start: FloatArray, way: FloatArray, first: FloatArray, last: FloatArray
+        self, start: FloatArray, direction: FloatArray, first: FloatArray, last: FloatArray
     ) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Where segments first cross a sheet between two places of them (n,), the sheet's normals
-        (n, 3), and whether there is one."""
+        """The fractions (n,) at which segments, between `first` and `last`, first cross a jump
+        surface, its normals (n, 3), and whether there is such a crossing."""
         backend = choose_backend("double")
         field = self.field.prepare(backend)
-        length = row_norms(way)
-        ray = way / np.maximum(length, 1e-300)[:, None]
+        length = row_norms(direction)
+        ray = direction / np.maximum(length, 1e-300)[:, None]
         room = _BEYOND * (last - first)
-        origin = start + (first - room)[:, None] * way
+        origin = start + (first - room)[:, None] * direction
         reach = (last - first + 2 * room) * length
 
         def crossed(o: Vec3, d: Vec3, limit: Vec3) -> tuple[Real, Vec3]:
             none = backend.Array3f(0)
             after = JumpCrossing(backend.Float(0), backend.UInt32(NO_FACET), backend.Float(0), none)
-            found = field.next_jump(o, d, after, limit.x, backend.Bool(True))
-            return found.t, found.normal
+            crossing = field.next_jump(o, d, after, limit.x, backend.Bool(True))
+            return crossing.t, crossing.normal
 
         t, normal = map_batches(backend, crossed, origin, ray, np.column_stack([reach] * 3))
         is_crossed = np.isfinite(t) & (t <= reach)
@@ -279,9 +285,9 @@ class SignFunction(LevelFunction):
 
 def _check_encloses(field: DipolePotential, level: float) -> None:
     """Raise unless the points lie about where f is half the level of a closed surface: without its
-    own term f is 2 pi at a point of one, and -2 pi where its normals face inwards.
+    own term f is 2 pi at a point of such a surface, and -2 pi where its normals face inwards.
 
-    Where areas are given, points need not stand for a surface.
+    If areas are given, points need not represent a surface.
     """
     if field.smoothing or not field.is_estimated[1] or not level > 0:
         return
@@ -300,18 +306,19 @@ def _check_encloses(field: DipolePotential, level: float) -> None:
 
 
 def _secant(first: FloatArray, last: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
-    """Where lines through two values of different signs meet 0; in the middle where values are no
-    numbers."""
+    """The points where lines through two values of different signs meet 0; the middle where values
+    are no numbers."""
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        share = low / (low - high)
-    share = np.where(np.isfinite(share), np.clip(share, 0.0, 1.0), 0.5)
-    return first + share * (last - first)
+        fraction = low / (low - high)
+    fraction = np.where(np.isfinite(fraction), np.clip(fraction, 0.0, 1.0), 0.5)
+    return first + fraction * (last - first)
 
 
 def _clearances(
     field: Field, level: float, precision: Precision
 ) -> list[Callable[[FloatArray], FloatArray]]:
-    """Functions from points (n, 3) to lengths (n,); the least of them is proved."""
+    """Functions from points (n, 3) to lengths (n,), the smallest of which is a proved lower bound
+    of the distance to the level set."""
     backend = choose_backend(precision)
 
     def bound(smooth: Field) -> Callable[[FloatArray], FloatArray]:

@@ -60,38 +60,44 @@ __all__ = [
     "mesh_from_signs",
 ]
 
-# Vertices keep this part of an edge from its ends, so that all triangles have an area.
+# The smallest distance of vertices from the ends of edges, relative to the edge, so that all
+# triangles have an area.
 _EDGE_END_MARGIN = 1e-4
-# How often edges are cut; and how often triangles that pass through others are made flat again.
+# The number of rounds in which edges are cut; and how often vertices of triangles that pass through
+# others are moved back.
 _ROUNDS, _MOST_REPAIRS = 2, 12
-# A round that would cut more than this part of the edges that the last one cut, or of the faces, is
-# not made: the surface is rough at every scale.
+# A round that would cut more than this fraction of the edges that the last round cut, or of the
+# faces, is omitted: the surface is rough at every scale.
 _MAX_CUT_FRACTION = 0.5
 # Neighbors lie on each other if the cosine between their normals is less than this.
 _FOLDED = -0.99999
-# Slivers and flat places are left out within this part of the tolerance, and this one of a cell.
+# Slivers and flat places are simplified within the first, relative to the tolerance, and the
+# second, relative to a cell.
 _SIMPLIFY_TOLERANCE, _SIMPLIFY_CELL_FRACTION = 0.5, 0.05
-# Edges shorter than this, in tolerances, stay whole.
+# Edges shorter than this, in tolerances, are not cut.
 _SHORTEST = 4.0
-# An edge is cut no nearer to its ends than this part of it.
+# An edge is cut no nearer to its ends than this, relative to its length.
 _FROM_CORNERS = 0.1
-# Across a crease normals turn by at least this angle, and by this part of it between two points.
+# Across a crease normals turn by at least this angle, and by this fraction of it between two
+# points.
 _MIN_CREASE_ANGLE, _CREASE_ANGLE_SHARE = math.radians(2), 0.75
-# The level is looked for from before the middle of an edge to behind the place where tangent planes
-# meet, in parts of that way; which counts up to so many lengths of the edge.
+# The level is searched for from before the middle of an edge to behind the place where tangent
+# planes meet, relative to the displacement between these; which is clamped to the third, in lengths
+# of the edge.
 _BEFORE, _BEHIND, _BESIDE = 0.3, 1.3, 1.0
-# Tangent planes whose normals are nearly the same meet anywhere; three of them meet in a point if
-# the determinant of their normals is larger than the last.
+# Tangent planes with nearly equal normals meet anywhere; three of them meet in a point if the
+# determinant of their normals is larger than the second.
 _PARALLEL, _INDEPENDENT = 1e-4, 0.1
-# So large a part of vertices and centers may be beyond the tolerance before cells are made smaller.
+# The largest fraction of vertices and centers that may be beyond the tolerance before cells are
+# made smaller; and the ratio of smaller cells to the cells before.
 MAX_OFF_LEVEL_FRACTION, CELL_REFINEMENT_FACTOR = 0.01, 0.6
-# What is farther from the level than this many cells is nowhere near.
+# The largest distance from the level, in cells, that is measured.
 _MAX_DISTANCE_CELLS = 4.0
-# At the corners and centers of so many triangles distances are measured.
+# The largest number of triangles at whose corners and centers distances are measured.
 _MOST_MEASURED = 20_000
-# What has more triangles is not made again.
+# Meshes with more triangles are not computed again.
 _MOST_REMADE = 100_000
-# Points at which the function is no number are moved by this part of a cell.
+# How far points at which the function is no number are moved, relative to a cell.
 _SINGULAR_POINT_SHIFT = 1e-3
 _MAX_GROWTH_ROUNDS = 20
 
@@ -101,7 +107,8 @@ class SignIsosurface:
     """A mesh extracted from signs.
 
     points: number of lattice points.
-    undecided: at how many of them the error bound exceeds |f - level|, so that the sign is open.
+    undecided: the number of lattice points where the error bound exceeds |f - level|, so that the
+        sign is undecided.
     unfitted: number of triangles moved back from creases.
     is_intersection_free: whether the absence of self-intersections was checked exactly.
     """
@@ -128,38 +135,39 @@ def mesh_from_signs(
     parts of the level set that it lost, and facts about it.
 
     Where more than a few vertices and centers of triangles are beyond the tolerance, a length, or
-    where smaller cells may show lost parts, it is extracted again from smaller cells. The facts say
-    how many points are beyond the tolerance at last, and within what distance all of them are.
+    where smaller cells may show lost parts, it is extracted again from smaller cells. The facts
+    contain the number of points that are finally beyond the tolerance, and a distance within which
+    all of them are.
 
     volume: only parts lost within it count.
 
     Raises:
         MeshingError: as `extract_from_signs`.
     """
-    known = PointsOnLevel.of(function, tolerance).within(*box, volume)
+    level_points = PointsOnLevel.of(function, tolerance).within(*box, volume)
     while True:
         report(f"cells of {spacing:.3g}")
         layers = 2 if closed else 0
         lattice = BccLattice.covering_box(*box, spacing, layers=layers)
         try:
-            made = extract_from_signs(function, lattice, 0.8 * tolerance, report, closed=closed)
+            mesh = extract_from_signs(function, lattice, 0.8 * tolerance, report, closed=closed)
         except EmptySurfaceError as error:
             nothing = TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
-            lost = LostParts.of(function, known, nothing, tolerance, spacing)
+            lost = LostParts.of(function, level_points, nothing, tolerance, spacing)
             if not lost.far:
                 raise
             raise EmptySurfaceError(f"the mesh is empty: {lost}; {lost.advice}") from error
         report("measuring distances to the level")
-        far, count, within = _distances(function, made.surface, tolerance, lattice, closed)
+        far_count, count, within = _distances(function, mesh.surface, tolerance, lattice, closed)
         report("looking for parts that were lost")
-        lost = LostParts.of(function, known, made.surface, tolerance, spacing)
+        lost = LostParts.of(function, level_points, mesh.surface, tolerance, spacing)
         attempts -= 1
-        may_help = far > MAX_OFF_LEVEL_FRACTION * count or (
+        may_help = far_count > MAX_OFF_LEVEL_FRACTION * count or (
             lost.matter and lost.are_mended_by(CELL_REFINEMENT_FACTOR)
         )
-        if attempts <= 0 or not may_help or len(made.surface.faces) > _MOST_REMADE:
+        if attempts <= 0 or not may_help or len(mesh.surface.faces) > _MOST_REMADE:
             break
-        report(f"{far:,} of {count:,} vertices and centers are beyond the tolerance")
+        report(f"{far_count:,} of {count:,} vertices and centers are beyond the tolerance")
         if lost.matter:
             report(str(lost))
         spacing *= CELL_REFINEMENT_FACTOR
@@ -169,15 +177,15 @@ def mesh_from_signs(
         "evaluations": function.evaluations,
         "isotopy": 0.0,
         "isotopy_far": 0.0,
-        "undecided": made.undecided,
-        "flat": made.unfitted,
-        "far": far,
+        "undecided": mesh.undecided,
+        "flat": mesh.unfitted,
+        "far": far_count,
         "looked_at": count,
         "within": within,
         "lost": lost.far,
         "sought": lost.looked_at,
     }
-    return made, lost, facts
+    return mesh, lost, facts
 
 
 def _distances(
@@ -187,10 +195,10 @@ def _distances(
     lattice: BccLattice,
     closed: bool,
 ) -> tuple[int, int, float]:
-    """How many vertices and centers of faces are farther from the level than the tolerance, of how
-    many, and the distance within which all of these are, up to a factor of 2. Of large meshes every
-    second face is looked at, or every third and so on. What is closed at the box is to be cut away
-    there, and left out."""
+    """The number of vertices and centers of faces that are farther from the level than the
+    tolerance, the number of all, and a distance within which all of them are, up to a factor of 2.
+    Of large meshes every second face is tested, or every third and so on. Faces that close the mesh
+    at the box are to be cut away, and left out."""
     x, faces = surface.vertices, surface.faces
     if closed:
         lower, upper = lattice.lower + 2 * lattice.size, lattice.upper - 2 * lattice.size
@@ -199,13 +207,13 @@ def _distances(
         x, faces[:: -(-len(faces) // _MOST_MEASURED) or 1]
     )
     x, faces = surface.vertices, surface.faces
-    far, count = points_off_level(function, x, faces, tolerance, None)
-    within, left = tolerance, far
-    while len(left) and within < _MAX_DISTANCE_CELLS * float(lattice.size.max()):
+    off_level, count = points_off_level(function, x, faces, tolerance, None)
+    within, farther = tolerance, off_level
+    while len(farther) and within < _MAX_DISTANCE_CELLS * float(lattice.size.max()):
         within *= 2
         alone = np.zeros((0, 3), np.int64)
-        left, _ = points_off_level(function, left, alone, within, None)
-    return len(far), count, within if not len(left) else math.inf
+        farther, _ = points_off_level(function, farther, alone, within, None)
+    return len(off_level), count, within if not len(farther) else math.inf
 
 
 def extract_from_signs(
@@ -220,10 +228,11 @@ def extract_from_signs(
 
     tolerance: how far edges may be from the surface, by the normals at their ends, before they are
         cut.
-    closed: beyond the box the function counts as positive; else the surface ends on the box.
+    closed: whether the function counts as positive beyond the box; otherwise the surface ends on
+        the box.
 
     Raises:
-        MeshingError: there is none, too many cells, or values that are no numbers.
+        MeshingError: there is no surface, there are too many cells, or values are no numbers.
     """
     first = _march(function, lattice, closed, report)
     x, faces, normals, is_apart = _collapse_slivers(
@@ -233,22 +242,22 @@ def extract_from_signs(
     report(f"{len(first.faces):,} triangles, {len(faces):,} without slivers")
     check_triangle_limit(len(faces), function.most_faces)
     flat = x
-    bent = np.zeros(len(x), np.bool_)
+    on_crease = np.zeros(len(x), np.bool_)
     before = len(faces)
     for round_number in range(_ROUNDS):
         report(f"refining, round {round_number + 1}: {len(faces):,} triangles")
-        cut = _CreaseRefinement.of(function, x, normals, bent, faces, tolerance)
+        cut = _CreaseRefinement.of(function, x, normals, on_crease, faces, tolerance)
         if not len(cut.points) or len(cut.points) > _MAX_CUT_FRACTION * before:
             break
         before = len(cut.points)
         check_triangle_limit(len(faces) + 2 * len(cut.points), function.most_faces)
-        one, other = (flat[cut.ends[:, k]] for k in (0, 1))
-        feet = one + cut.share[:, None] * (other - one)
-        around = feet[cut.vertex_of_edge[cut.edges[cut.rows]] - len(x)]
-        flat = np.concatenate([flat, feet, around.mean(axis=1)])
+        start, end = (flat[cut.ends[:, k]] for k in (0, 1))
+        feet = start + cut.share[:, None] * (end - start)
+        corner_feet = feet[cut.vertex_of_edge[cut.edges[cut.rows]] - len(x)]
+        flat = np.concatenate([flat, feet, corner_feet.mean(axis=1)])
         x, faces = cut.applied(x, faces)
         normals = np.concatenate([normals, cut.normals])
-        bent = np.concatenate([bent, cut.is_on_crease])
+        on_crease = np.concatenate([on_crease, cut.is_on_crease])
     report("looking for triangles that pass through each other")
     try:
         x, count = _undo_until_valid(x, flat, faces)
@@ -260,8 +269,8 @@ def extract_from_signs(
 
 @dataclass(frozen=True)
 class _RawIsosurface:
-    """Vertices (n, 3) on the level, normals there, and faces (m, 3); the points of the lattice, and
-    how many of these are undecided."""
+    """Vertices (n, 3) on the level, normals there, and faces (m, 3); the number of points of the
+    lattice, and the number of these that are undecided."""
 
     vertices: FloatArray
     normals: FloatArray
@@ -275,16 +284,16 @@ def _march(
 ) -> _RawIsosurface:
     """The triangles of all tetrahedra whose corners differ.
 
-    Cells are left out that are proved empty. Where values are known up to an error, or proofs rest
-    on rounding, signs may differ at the corner of such a cell, and the surface would end there:
-    then its neighbors are looked at as well, until it does not.
+    Cells that are proved empty are left out. Where values are known up to an error, or proofs
+    depend on rounding, signs may differ at the corner of such a cell, and the surface would end
+    there: then its neighbors are added, until the surface does not end.
     """
     cells = lattice.nonempty_cells(function.clearance, function.most_faces)
     if closed:
         outer = lattice.outer_cells()
         outer = outer[function.values(lattice.points(2 * outer + 1)) <= 0]
         cells = distinct_rows(np.concatenate([cells, outer]))
-    places = np.zeros((0, 3))
+    open_middles = np.zeros((0, 3))
     for _ in range(_MAX_GROWTH_ROUNDS):
         if not len(cells):
             raise EmptySurfaceError("the level set is empty: no cell of the box holds the level")
@@ -300,69 +309,70 @@ def _march(
         def roots(low: FloatArray, high: FloatArray, normals: Any = normals) -> FloatArray:
             x, normal = function.crossings(low, high)
             normals.append(normal)
-            way = high - low
-            square = row_dots(way, way)
-            t = np.clip(row_dots(x - low, way) / square, _EDGE_END_MARGIN, 1 - _EDGE_END_MARGIN)
-            return low + t[:, None] * way
+            edge = high - low
+            square = row_dots(edge, edge)
+            t = np.clip(row_dots(x - low, edge) / square, _EDGE_END_MARGIN, 1 - _EDGE_END_MARGIN)
+            return low + t[:, None] * edge
 
         x, faces = _triangles(function, points, value, corners, roots)
         if not len(faces):
             raise EmptySurfaceError("the level set is empty: no cell of the box holds the level")
         ends = boundary_edges(faces)
         middle = x[ends].mean(axis=1)
-        slack = 1e-9 * lattice.size
-        inner = (middle > lattice.lower + slack) & (middle < lattice.upper - slack)
-        places = middle[inner.all(axis=1)]
-        if not len(places):
+        margin = 1e-9 * lattice.size
+        inner = (middle > lattice.lower + margin) & (middle < lattice.upper - margin)
+        open_middles = middle[inner.all(axis=1)]
+        if not len(open_middles):
             return _RawIsosurface(
                 x, normals[0], faces, len(points), function.count_undecided(points, value)
             )
-        index = np.floor((places - lattice.lower) / lattice.size).astype(np.int64)
-        around = np.array(list(itertools.product((-1, 0, 1), repeat=3)))
-        more = np.clip((index[:, None] + around).reshape(-1, 3), 0, lattice.counts - 1)
-        cells = distinct_rows(np.concatenate([cells, more]))
+        index = np.floor((open_middles - lattice.lower) / lattice.size).astype(np.int64)
+        offsets = np.array(list(itertools.product((-1, 0, 1), repeat=3)))
+        neighbors = np.clip((index[:, None] + offsets).reshape(-1, 3), 0, lattice.counts - 1)
+        cells = distinct_rows(np.concatenate([cells, neighbors]))
     raise LocalizedMeshingError(
         "signs differ at the corners of ever more cells that are proved empty: values of "
         f"{type(function.field).__name__} are not what it promises; choose a smaller `cell_size`",
-        places,
+        open_middles,
     )
 
 
 def _collapse_slivers(
     marched: _RawIsosurface, tolerance: float
 ) -> tuple[FloatArray, IntArray, FloatArray, bool]:
-    """Vertices, faces and normals with short edges contracted, and vertices left out where faces
-    around them lie in a plane, within a tolerance (manifold3d); all as they were if the surface is
-    open, or triangles then pass through each other. And whether that was checked and none do: they
-    do not as the tetrahedra cut them, but for rounding."""
-    import scipy.spatial  # here: half a second that few need
+    """Vertices, faces and normals, with short edges contracted, and without vertices whose faces
+    lie in a plane, within a tolerance (manifold3d); unchanged if the surface is open, or if
+    triangles would pass through each other. And whether the absence of intersections was checked:
+    triangles as the tetrahedra cut them do not intersect, up to rounding."""
+    import scipy.spatial  # imported here: it takes half a second
 
     searching: Any = scipy.spatial
     x, faces = marched.vertices, marched.faces
     if len(boundary_edges(faces)):
         return x, faces, marched.normals, False
     simpler = from_manifold(without_short_edges(to_manifold(TriangleMesh(x, faces)), tolerance))
-    away, place = searching.cKDTree(x).query(simpler.vertices)
+    away, nearest = searching.cKDTree(x).query(simpler.vertices)
     if not len(simpler.faces) or away.any():
         return x, faces, marched.normals, False
     if len(intersecting_faces(simpler.vertices, simpler.faces)):
         return x, faces, marched.normals, False
-    return simpler.vertices, simpler.faces, marched.normals[place], True
+    return simpler.vertices, simpler.faces, marched.normals[nearest], True
 
 
 def _finite_values(function: SignFunction, points: FloatArray, size: FloatArray) -> FloatArray:
-    """The function at points, or a little beside them where it is no number, as at a dipole."""
+    """The values of the function at points, or a little beside them where they are no numbers, as
+    at a dipole."""
     value = function.values(points)
     for k in (1, 2):
-        bad = np.flatnonzero(~np.isfinite(value))
-        if not len(bad):
+        fails = np.flatnonzero(~np.isfinite(value))
+        if not len(fails):
             return value
-        value[bad] = function.values(points[bad] + k * _SINGULAR_POINT_SHIFT * size)
-    bad = ~np.isfinite(value)
-    if bad.any():
-        x, y, z = points[bad][0]
+        value[fails] = function.values(points[fails] + k * _SINGULAR_POINT_SHIFT * size)
+    fails = ~np.isfinite(value)
+    if fails.any():
+        x, y, z = points[fails][0]
         raise MeshingError(
-            f"{type(function.field).__name__} has no finite value at {bad.sum():,} points, such "
+            f"{type(function.field).__name__} has no finite value at {fails.sum():,} points, such "
             f"as ({x:.4g}, {y:.4g}, {z:.4g}): choose a `clip` where it has"
         )
     return value
@@ -383,9 +393,9 @@ def _triangles(
         return points[:0], np.zeros((0, 3), np.int64)
     # A value of 0 counts as below; no point is on the level.
     nowhere = np.zeros(len(points), np.bool_)
-    some = TetrahedronPoints(points, nowhere, LevelSamples(value, np.zeros_like(points), value))
+    sampled = TetrahedronPoints(points, nowhere, LevelSamples(value, np.zeros_like(points), value))
     vertices, faces = extract_triangles(
-        function, some, tets, count_crossings(function, some, tets), roots
+        function, sampled, tets, count_crossings(function, sampled, tets), roots
     )
     return vertices[len(points) :], faces - len(points)
 
@@ -396,8 +406,8 @@ class _CreaseRefinement:
 
     edges: (m, 3) of all faces.
     vertex_of_edge: (k,) of edges, the index of the new vertex, or -1.
-    ends: (c, 2) of the edges that are split.
-    share: (c,) where along these edges, as a fraction.
+    ends: (c, 2) the ends of the edges that are split.
+    share: (c,) the fraction along each of these edges where it is split.
     corner_faces: (d, 3) faces with a new vertex within.
     rows: (d,) the indices of these faces.
     points, normals: of the new vertices, those of edges first.
@@ -424,38 +434,41 @@ class _CreaseRefinement:
         faces: IntArray,
         tolerance: float,
     ) -> _CreaseRefinement:
-        """Edges that are farther from the surface than the tolerance, by where the tangent planes
-        of their ends meet; those on a crease have two, and stay."""
+        """The splits of edges that are farther from the surface than the tolerance, judged by where
+        the tangent planes of their ends meet; edges on a crease, whose ends have two tangent
+        planes, stay."""
         every = Edges.of(half_edges(faces))
         edges = every.edge_of_pair.reshape(3, -1).T
         rows = np.flatnonzero((every.multiplicity == 2) & ~bent[every.vertices].any(axis=1))
         ends = every.vertices[rows]
         one, other = normals[ends[:, 0]], normals[ends[:, 1]]
         a, b = x[ends[:, 0]], x[ends[:, 1]]
-        share, way, turned = _toward_tangent_planes(a, b, one, other)
+        t, along, turned = _toward_tangent_planes(a, b, one, other)
         long = row_norms(b - a)
-        far = (turned > _PARALLEL) & (row_norms(way) > tolerance) & (long > _SHORTEST * tolerance)
-        rows, way, share = rows[far], way[far], share[far]
-        foot, span = a[far] + share[:, None] * (b - a)[far], long[far]
-        there, normal, good = _level_along(function, foot, way, _BESIDE * span)
-        rows, there, normal, share = rows[good], there[good], normal[good], share[good]
+        is_far = (
+            (turned > _PARALLEL) & (row_norms(along) > tolerance) & (long > _SHORTEST * tolerance)
+        )
+        rows, along, t = rows[is_far], along[is_far], t[is_far]
+        foot, span = a[is_far] + t[:, None] * (b - a)[is_far], long[is_far]
+        points, normal, passed = _level_along(function, foot, along, _BESIDE * span)
+        rows, points, normal, t = rows[passed], points[passed], normal[passed], t[passed]
         ends = every.vertices[rows]
-        place = np.full(len(every.vertices), -1, np.int64)
-        place[rows] = len(x) + np.arange(len(rows))
-        whole, turn = (
+        vertex = np.full(len(every.vertices), -1, np.int64)
+        vertex[rows] = len(x) + np.arange(len(rows))
+        total, angle = (
             np.arccos(np.clip(one, -1, 1))
             for one in (
                 row_dots(normals[ends[:, 0]], normals[ends[:, 1]]),
                 np.minimum(*(row_dots(normals[ends[:, k]], normal) for k in (0, 1))),
             )
         )
-        on_crease = (whole > _MIN_CREASE_ANGLE) & (turn > _CREASE_ANGLE_SHARE * whole)
+        on_crease = (total > _MIN_CREASE_ANGLE) & (angle > _CREASE_ANGLE_SHARE * total)
         is_bent = np.concatenate([bent, on_crease])
-        new = place[edges]
+        new = vertex[edges]
         corner = np.flatnonzero((new >= 0).all(axis=1) & is_bent[np.maximum(new, 0)].all(axis=1))
         inner, inner_normal, corner = _crease_corners(function, x, normals, faces, corner)
         return cls(
-            edges, place, ends, share, faces[corner], corner, np.concatenate([there, inner]),
+            edges, vertex, ends, t, faces[corner], corner, np.concatenate([points, inner]),
             np.concatenate([normal, inner_normal]),
             np.concatenate([on_crease, np.ones(len(inner), np.bool_)]),
         )  # fmt: skip
@@ -464,76 +477,76 @@ class _CreaseRefinement:
         """The finer mesh."""
         vertices = np.concatenate([x, self.points])
         middle = self.vertex_of_edge[self.edges]
-        rest = np.ones(len(faces), np.bool_)
-        rest[self.rows] = False
-        made = [split_faces(vertices, faces[rest], middle[rest])]
+        is_other = np.ones(len(faces), np.bool_)
+        is_other[self.rows] = False
+        parts = [split_faces(vertices, faces[is_other], middle[is_other])]
         a, b, c = self.corner_faces.T
         u, v, w = middle[self.rows].T  # on the edges ab, bc and ca
         inner = len(vertices) - len(self.rows) + np.arange(len(self.rows))
-        made += [np.stack(t, axis=1) for t in ((a, u, w), (u, b, v), (w, v, c))]
-        made += [np.stack([*t, inner], axis=1) for t in ((u, v), (v, w), (w, u))]
-        return vertices, np.concatenate(made)
+        parts += [np.stack(t, axis=1) for t in ((a, u, w), (u, b, v), (w, v, c))]
+        parts += [np.stack([*t, inner], axis=1) for t in ((u, v), (v, w), (w, u))]
+        return vertices, np.concatenate(parts)
 
 
 def _toward_tangent_planes(
-    a: FloatArray, b: FloatArray, one: FloatArray, other: FloatArray
+    a: FloatArray, b: FloatArray, n_a: FloatArray, n_b: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Where edges from a to b (k, 3) come nearest to the line in which the planes through their
-    ends with normals `one` and `other` meet: a part of the edge (k,), and the way from there to the
-    line (k, 3); also the square of the sine between the normals.
+    """The points where edges from a to b (k, 3) come nearest to the line in which the planes
+    through their ends with normals `n_a` and `n_b` meet: the fraction (k,) of the edge, and the
+    displacement (k, 3) from there to the line; also the square of the sine between the normals.
 
-    Edges of a plane triangulation pass over such a line in order, and so do these places.
+    Edges of a plane triangulation pass over such a line in order, and so do these points.
     """
-    edge, line = b - a, np.cross(one, other)
-    cosine, turned = row_dots(one, other), row_dots(line, line)
+    edge, line = b - a, np.cross(n_a, n_b)
+    cosine, turned = row_dots(n_a, n_b), row_dots(line, line)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        # A point of the line, from a: p.one = 0 and p.other = edge.other.
-        height = row_dots(edge, other) / turned
-        point = height[:, None] * (other - cosine[:, None] * one)
+        # A point of the line, relative to a: p.n_a = 0 and p.n_b = edge.n_b.
+        height = row_dots(edge, n_b) / turned
+        point = height[:, None] * (n_b - cosine[:, None] * n_a)
         along = line / np.sqrt(turned)[:, None]
         across = edge - row_dots(edge, along)[:, None] * along
-        share = row_dots(point, across) / row_dots(across, across)
-        share = np.clip(share, _FROM_CORNERS, 1 - _FROM_CORNERS)
-        foot = share[:, None] * edge
-        way = point + row_dots(foot - point, along)[:, None] * along - foot
-    good = np.isfinite(share) & np.isfinite(way).all(axis=1)
-    return np.where(good, share, 0.5), np.where(good[:, None], way, 0.0), turned
+        fraction = row_dots(point, across) / row_dots(across, across)
+        fraction = np.clip(fraction, _FROM_CORNERS, 1 - _FROM_CORNERS)
+        foot = fraction[:, None] * edge
+        direction = point + row_dots(foot - point, along)[:, None] * along - foot
+    is_finite = np.isfinite(fraction) & np.isfinite(direction).all(axis=1)
+    return np.where(is_finite, fraction, 0.5), np.where(is_finite[:, None], direction, 0.0), turned
 
 
 def _level_along(
-    function: SignFunction, start: FloatArray, way: FloatArray, most: FloatArray
+    function: SignFunction, start: FloatArray, along: FloatArray, limit: FloatArray
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Points of the level from a little before `start` (k, 3) to a little behind start + way, no
-    farther than `most`; normals there; and whether the function has different signs at both
+    """Points of the level between a little before `start` (k, 3) and a little behind start + along,
+    no farther than `limit`; normals there; and whether the function has different signs at both
     ends."""
-    way = way * np.minimum(1, most / np.maximum(row_norms(way), 1e-300))[:, None]
-    near, far = start - _BEFORE * way, start + _BEHIND * way
-    above = function.values(near) > 0
-    good = above != (function.values(far) > 0)
-    rows = np.flatnonzero(good)
-    upwards = ~above[rows, None]
-    low, high = np.where(upwards, near[rows], far[rows]), np.where(upwards, far[rows], near[rows])
-    there, normal = start.copy(), np.zeros_like(start)
-    there[rows], normal[rows] = function.crossings(low, high)
-    return there, normal, good
+    along = along * np.minimum(1, limit / np.maximum(row_norms(along), 1e-300))[:, None]
+    near, end = start - _BEFORE * along, start + _BEHIND * along
+    is_positive = function.values(near) > 0
+    changes_sign = is_positive != (function.values(end) > 0)
+    rows = np.flatnonzero(changes_sign)
+    upwards = ~is_positive[rows, None]
+    low, high = np.where(upwards, near[rows], end[rows]), np.where(upwards, end[rows], near[rows])
+    points, normal = start.copy(), np.zeros_like(start)
+    points[rows], normal[rows] = function.crossings(low, high)
+    return points, normal, changes_sign
 
 
 def _crease_corners(
     function: SignFunction, x: FloatArray, normals: FloatArray, faces: IntArray, rows: IntArray
 ) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Points where the tangent planes at the corners of some faces meet, on the level; normals; and
-    the faces, by index, that have one."""
+    """Points on the level where the tangent planes at the corners of the faces `rows` meet;
+    normals; and the faces, by index, that have such a point."""
     corner, normal = x[faces[rows]], normals[faces[rows]]
     det: Any = np.linalg.det
-    some = np.flatnonzero(np.abs(det(normal)) > _INDEPENDENT)
-    rows, corner, normal = rows[some], corner[some], normal[some]
+    chosen = np.flatnonzero(np.abs(det(normal)) > _INDEPENDENT)
+    rows, corner, normal = rows[chosen], corner[chosen], normal[chosen]
     center = corner.mean(axis=1)
     span = np.stack([row_norms(corner[:, k] - corner[:, k - 1]) for k in range(3)]).max(axis=0)
     away = np.einsum("kij,kij->ki", normal, corner - center[:, None])
     solve: Any = np.linalg.solve
-    way: FloatArray = solve(normal, away[:, :, None])[:, :, 0]
-    there, normal, good = _level_along(function, center, way, _BESIDE * span)
-    return there[good], normal[good], rows[good]
+    direction: FloatArray = solve(normal, away[:, :, None])[:, :, 0]
+    points, normal, passed = _level_along(function, center, direction, _BESIDE * span)
+    return points[passed], normal[passed], rows[passed]
 
 
 def _undo_until_valid(x: FloatArray, flat: FloatArray, faces: IntArray) -> tuple[FloatArray, int]:
@@ -558,29 +571,30 @@ def _undo_until_valid(x: FloatArray, flat: FloatArray, faces: IntArray) -> tuple
         x[faces[turned]] = flat[faces[turned]]
         total += int(turned.sum())
     among: BoolArray = np.asarray((x != flat).any(axis=1)[faces].any(axis=1))
-    bad = faces[:0, 0]
+    failing = faces[:0, 0]
     for _ in range(_MOST_REPAIRS):
-        bad = np.union1d(intersecting_faces(x, faces, among), _folded_faces(x, faces, among))
-        if not len(bad):
+        failing = np.union1d(intersecting_faces(x, faces, among), _folded_faces(x, faces, among))
+        if not len(failing):
             return x, total
-        total += len(bad)
+        total += len(failing)
         near = np.zeros(len(x), np.bool_)
-        near[faces[bad]] = True
+        near[faces[failing]] = True
         among = np.asarray(near[faces].any(axis=1))
-        if not (x[near] != flat[near]).any():  # so that it ends: with their neighbors
+        if not (x[near] != flat[near]).any():  # together with neighbors, so that the loop ends
             near[faces[among]] = True
             among = np.asarray(near[faces].any(axis=1))
         x[near] = flat[near]
     raise LocalizedMeshingError(
-        f"{len(bad):,} triangles pass through each other still", x[faces[bad]].mean(axis=1)
+        f"{len(failing):,} triangles pass through each other still", x[faces[failing]].mean(axis=1)
     )
 
 
 def _folded_faces(x: FloatArray, faces: IntArray, among: BoolArray) -> IntArray:
-    """Faces, by index, that lie on a neighbor but for rounding, of which one is chosen."""
+    """The indices of faces that lie on a neighbor up to rounding, where either of both is
+    chosen."""
     normal = area_normals(x[faces])
     normal /= np.maximum(row_norms(normal), 1e-300)[:, None]
     pairs = Edges.of(half_edges(faces)).paired_half_edges() % len(faces)
-    one, other = pairs.T
-    on_other = (row_dots(normal[one], normal[other]) < _FOLDED) & (among[one] | among[other])
+    first, second = pairs.T
+    on_other = (row_dots(normal[first], normal[second]) < _FOLDED) & (among[first] | among[second])
     return np.unique(pairs[on_other])

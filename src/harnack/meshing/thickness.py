@@ -1,4 +1,4 @@
-"""Thickness of closed meshes: how much material is behind each face."""
+"""The thickness of closed meshes: the extent of the material behind each face."""
 
 from __future__ import annotations
 
@@ -19,11 +19,12 @@ if TYPE_CHECKING:
 
 __all__ = ["WallThickness", "wall_thickness"]
 
-# Rays start this far below a face, in parts of the mesh's size.
+# Rays start this far below a face, relative to the mesh's size.
 _BELOW = 1e-6
-# Balls shrink so often at most, and no more once they are this near to what they touch.
+# The largest number of times that balls shrink; and the distance from the surface at which they
+# count as touching it.
 _MOST_ROUNDS, _TOUCHING = 30, 1e-6
-# Two places are opposite if the cosine between their normals is below this: walls beside an edge of
+# Two points are opposite if the cosine between their normals is below this: walls beside an edge of
 # a part, at up to 120 degrees, are no thin places.
 _OPPOSITE = -0.5
 
@@ -63,21 +64,21 @@ class WallThickness:
     def to_colored_mesh(self, low: float, high: float) -> trimesh.Trimesh:
         """The mesh with colors of faces: red up to `low`, through yellow, to gray from `high` on.
         PLY and GLB files hold them."""
-        import trimesh  # here: half a second that few need
+        import trimesh  # imported here: it takes half a second
 
-        share = np.clip((self.values - low) / max(high - low, 1e-300), 0.0, 1.0)
-        share = np.nan_to_num(share, nan=1.0)
+        fraction = np.clip((self.values - low) / max(high - low, 1e-300), 0.0, 1.0)
+        fraction = np.nan_to_num(fraction, nan=1.0)
         stops = np.array([[200, 30, 30], [240, 200, 60], [190, 190, 190]], np.float64)
-        colors = np.full((len(share), 4), 255, np.uint8)
+        colors = np.full((len(fraction), 4), 255, np.uint8)
         for k in range(3):
-            colors[:, k] = np.rint(np.interp(share, (0.0, 0.5, 1.0), stops[:, k]))
+            colors[:, k] = np.rint(np.interp(fraction, (0.0, 0.5, 1.0), stops[:, k]))
         return trimesh.Trimesh(
             self.vertices, self.faces, face_colors=colors, process=False, validate=False
         )
 
 
 def wall_thickness(part: Any, **options: Any) -> WallThickness:
-    """How thick a part is behind each of its faces.
+    """The thickness of a part behind each of its faces.
 
     At the center of a face a ray goes into the part, along the normal, and ends at the other side:
     at a distance t. Then the ball that touches the center, t wide, shrinks until it holds no place
@@ -89,7 +90,7 @@ def wall_thickness(part: Any, **options: Any) -> WallThickness:
     not thin by that: there the ball shrinks no further, so that the value is an upper bound.
 
     Error: rays and nearest points are exact on the triangles, in double precision, to 1e-6 of the
-    mesh's size. Between centers nothing is looked at; make large faces smaller for that
+    mesh's size. Between centers nothing is measured; make large faces smaller for that
     (`mesh.subdivide_to_size`).
 
     part: a closed mesh (a trimesh.Trimesh, (vertices, faces), or a file's name), or a solid, of
@@ -127,7 +128,7 @@ def _medial_diameters(solid: MeshSolid, start: FloatArray, normal: FloatArray) -
     )  # fmt: skip
     t = np.asarray(hits.t, np.float64) + below
     width = np.where(np.isfinite(t), t, 2 * size)
-    # Where that is beyond the other side already, the part is no thicker than what was skipped.
+    # Where that is already beyond the other side, the part is no thicker than the skipped length.
     width[~_is_within(solid, start - 2 * below * normal)] = 2 * below
     moving = np.arange(len(width))
     for _ in range(_MOST_ROUNDS):
@@ -136,7 +137,7 @@ def _medial_diameters(solid: MeshSolid, start: FloatArray, normal: FloatArray) -
         p, n, r = start[moving], normal[moving], 0.5 * width[moving]
         center = p - r[:, None] * n
         distance, foot, towards = _nearest(solid, center)
-        # The ball is free, or touches what does not face the center.
+        # The ball is empty, or touches points that do not face the center.
         inside = distance < r * (1 - _TOUCHING)
         shrinks = inside & (row_dots(towards, n) < _OPPOSITE)
         away = p - foot

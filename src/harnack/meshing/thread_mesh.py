@@ -22,41 +22,41 @@ _MOST_VERTICES = 4_000_000
 
 
 def thread_manifold(thread: Thread, lower: float, upper: float, tolerance: float) -> Manifold:
-    """A thread for lower <= z <= upper; what is beyond has no meaning.
+    """A thread for lower <= z <= upper; the mesh beyond that range has no meaning.
 
-    Vertices lie on the surface, so that the edges of the profile are edges of the mesh. With n of
-    them around, faces are within 2 r (pi/n)^2 of the surface: their corners differ by 2 pi/n in
+    Vertices lie on the surface, so that the edges of the profile are edges of the mesh. With n
+    vertices around, faces are within 2 r (pi/n)^2 of the surface: their corners differ by 2 pi/n in
     angle at most, so that a chord has a sagitta of r (pi/n)^2/2, and a diagonal of a face that is
     turned by 2 pi/n departs from it by less than three times that.
 
     Raises:
-        MeshingError: so fine that it has millions of faces.
+        MeshingError: the mesh would have millions of faces.
     """
     profile = np.array(thread.profile)
     radius = float(profile[:, 1].max())
-    around = max(16, math.ceil(math.pi * math.sqrt(2 * radius / tolerance)))
+    segments = max(16, math.ceil(math.pi * math.sqrt(2 * radius / tolerance)))
     lead = thread.starts * thread.pitch
     # Below and above the profile fades within a lead to a cylinder, which is closed there.
     first = math.floor((lower - 3 * lead) / thread.pitch)
     periods = math.ceil((upper + 3 * lead) / thread.pitch) - first
     lines = periods * len(profile)
-    if lines * around > _MOST_VERTICES:
+    if lines * segments > _MOST_VERTICES:
         raise MeshingError(
-            f"a thread within {tolerance:.3g} has {2 * lines * around:,} faces: choose a larger "
+            f"a thread within {tolerance:.3g} has {2 * lines * segments:,} faces: choose a larger "
             "`tolerance`"
         )
     shift = thread.pitch * (first + np.arange(periods))
     height: FloatArray = (profile[:, 0] + shift[:, None]).astype(np.float64).ravel()
     radii = np.tile(profile[:, 1], periods)
-    vertices = _vertices(height, radii, around, lead, thread.starts * len(profile))
-    least = float(profile[:, 1].min())
-    share = np.minimum(
+    vertices = _vertices(height, radii, segments, lead, thread.starts * len(profile))
+    min_radius = float(profile[:, 1].min())
+    fraction = np.minimum(
         (vertices[:, 2] - lower) / lead + 2, (upper - vertices[:, 2]) / lead + 2
     ).clip(0, 1)
     size = np.linalg.norm(vertices[:, :2], axis=1)
-    vertices[:, :2] *= ((least + share * (size - least)) / size)[:, None]
-    faces = _faces(lines, around, thread.starts * len(profile))
-    vertices = np.concatenate([vertices, _middles(vertices, lines, around)])
+    vertices[:, :2] *= ((min_radius + fraction * (size - min_radius)) / size)[:, None]
+    faces = _faces(lines, segments, thread.starts * len(profile))
+    vertices = np.concatenate([vertices, _middles(vertices, lines, segments)])
     if thread.left_handed:
         vertices[:, 1] *= -1
         faces = faces[:, ::-1]
@@ -64,47 +64,49 @@ def thread_manifold(thread: Thread, lower: float, upper: float, tolerance: float
 
 
 def _vertices(
-    height: FloatArray, radii: FloatArray, around: int, lead: float, turn: int
+    height: FloatArray, radii: FloatArray, segments: int, lead: float, shift: int
 ) -> FloatArray:
-    """Points of each helical line at each angle; and those at angle 0 of the lines that a turn
-    leads to from the last ones. turn: how many lines farther a line arrives after a turn."""
-    angle = 2 * math.pi * np.arange(around) / around
-    more = height[-turn:] + lead, radii[-turn:]
+    """Points of each helical line at each angle; and the points at angle 0 of the lines that the
+    last lines lead to after a turn. shift: the number of lines by which a line advances in a
+    turn."""
+    angle = 2 * math.pi * np.arange(segments) / segments
+    continued = height[-shift:] + lead, radii[-shift:]
     z = height[:, None] + lead * angle / (2 * math.pi)
     x, y = radii[:, None] * np.cos(angle), radii[:, None] * np.sin(angle)
-    last = np.column_stack([more[1], 0 * more[1], more[0]])
+    last = np.column_stack([continued[1], 0 * continued[1], continued[0]])
     return np.concatenate([np.stack([x, y, z], axis=-1).reshape(-1, 3), last])
 
 
-def _index(line: IntArray, step: IntArray, lines: int, around: int, turn: int) -> IntArray:
-    """The vertex of a line at an angle; after a turn it is that of another line at angle 0."""
-    line, step = np.where(step == around, line + turn, line), np.where(step == around, 0, step)
-    return np.where(line < lines, line * around + step, lines * around + line - lines)
+def _index(line: IntArray, step: IntArray, lines: int, segments: int, shift: int) -> IntArray:
+    """The index of the vertex of a line at an angle; after a turn it is that of another line at
+    angle 0."""
+    line, step = np.where(step == segments, line + shift, line), np.where(step == segments, 0, step)
+    return np.where(line < lines, line * segments + step, lines * segments + line - lines)
 
 
-def _faces(lines: int, around: int, turn: int) -> IntArray:
+def _faces(lines: int, segments: int, shift: int) -> IntArray:
     """Two triangles between neighbors of a line, and fans from the axis that close both ends."""
-    line, step = (one.ravel() for one in np.mgrid[: lines - 1, :around])
+    line, step = (grid.ravel() for grid in np.mgrid[: lines - 1, :segments])
 
     def at(i: IntArray, j: IntArray) -> IntArray:
-        return _index(i, j, lines, around, turn)
+        return _index(i, j, lines, segments, shift)
 
     a, b, c, d = at(line, step), at(line, step + 1), at(line + 1, step + 1), at(line + 1, step)
     sides = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
-    steps, jump = np.arange(around + 1), np.arange(turn + 1)[::-1]
-    middle = lines * around + turn
+    steps, jump = np.arange(segments + 1), np.arange(shift + 1)[::-1]
+    middle = lines * segments + shift
     ends: list[IntArray] = []
     for first, apex, sign in ((0, middle, -1), (lines - 1, middle + 1, 1)):
-        along = at(np.full(around + 1, first), steps)
-        back = at(first + jump, np.zeros(turn + 1, np.int64))
-        loop = np.concatenate([along, back[1:]])
+        along = at(np.full(segments + 1, first), steps)
+        backward = at(first + jump, np.zeros(shift + 1, np.int64))
+        loop = np.concatenate([along, backward[1:]])
         fan = np.column_stack([loop[:-1], loop[1:], np.full(len(loop) - 1, apex)])
         ends.append(fan[:, ::sign])
     return np.concatenate([sides, *ends])
 
 
-def _middles(vertices: FloatArray, lines: int, around: int) -> FloatArray:
+def _middles(vertices: FloatArray, lines: int, segments: int) -> FloatArray:
     """Points of the axis at the middle heights of the ends."""
-    low = vertices[:around, 2].mean()
-    high = vertices[(lines - 1) * around : lines * around, 2].mean()
+    low = vertices[:segments, 2].mean()
+    high = vertices[(lines - 1) * segments : lines * segments, 2].mean()
     return np.array([[0.0, 0.0, low], [0.0, 0.0, high]])

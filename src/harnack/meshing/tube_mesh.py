@@ -1,4 +1,5 @@
-"""The closed mesh of a tube: rings of points swept along its polylines, in pieces put together."""
+"""The closed mesh of a tube: rings of points swept along its polylines, in pieces that are
+united."""
 
 from __future__ import annotations
 
@@ -22,9 +23,9 @@ if TYPE_CHECKING:
 __all__ = ["tube_manifold"]
 
 _MOST_VERTICES = 4_000_000
-# Of the tolerance, by which polylines may be off.
+# The largest error of polylines, relative to the tolerance.
 _LEFT_OUT = 0.25
-# Points around, of wires far thinner than the tolerance too.
+# The smallest number of points around, also for wires far thinner than the tolerance.
 _LEAST_AROUND = 8
 # An edge leads back where the cosine of its turn is less than this above -1.
 _BACK = 1e-9
@@ -34,10 +35,10 @@ def tube_manifold(tube: Tube, level: float, tolerance: float) -> Manifold:
     """The points within radius + level of a tube's polylines; vertices lie on the surface, and
     faces within `tolerance` of it.
 
-    Vertices of a polyline within a quarter of the tolerance of a shorter one are left out. Each is
-    swept as a whole. Where its mesh would pass through itself, as at corners too sharp for the
-    radius or where the tube comes back to itself, it is cut in two at a vertex, where both parts
-    end with a ball: the tube is the union of theirs.
+    Vertices of a polyline within a quarter of the tolerance of a shorter polyline are left out.
+    Each polyline is swept as a whole. Where its mesh would pass through itself, as at corners too
+    sharp for the radius or where the tube returns to itself, the polyline is cut in two at a
+    vertex, where both parts end with a ball: the tube is the union of both parts' tubes.
 
     Proof of the tolerance, with the angle a = 2 pi/n between points around. Distances from two
     polylines differ by no more than these do. Faces between lines along an edge have chords of
@@ -46,7 +47,7 @@ def tube_manifold(tube: Tube, level: float, tolerance: float) -> Manifold:
     of angle a at most. The sum is at most r a^2/4, three quarters of the tolerance.
 
     Raises:
-        MeshingError: so fine that it has millions of faces.
+        MeshingError: the mesh would have millions of faces.
     """
     from manifold3d import Manifold, OpType
 
@@ -54,22 +55,22 @@ def tube_manifold(tube: Tube, level: float, tolerance: float) -> Manifold:
     if radius <= 0:
         return Manifold()
     step = math.sqrt(3 * tolerance / radius)
-    around = max(_LEAST_AROUND, math.ceil(2 * math.pi / step))
+    segments = max(_LEAST_AROUND, math.ceil(2 * math.pi / step))
     waiting = [
         _simpler(polyline, _LEFT_OUT * tolerance) for polyline in np.split(tube.points, tube.starts)
     ]
     parts: list[Manifold] = []
     vertices = 0
     while waiting:
-        # Rings of a half ball at both ends, and one at least at each vertex between.
-        least = around * sum(len(polyline) + around // 2 for polyline in waiting)
-        if vertices + least > _MOST_VERTICES:
+        # Rings of a half ball at both ends, and at least one ring at each vertex between.
+        minimum = segments * sum(len(polyline) + segments // 2 for polyline in waiting)
+        if vertices + minimum > _MOST_VERTICES:
             raise MeshingError(
-                f"a tube within {tolerance:.3g} has more than {2 * (vertices + least):,} faces: "
+                f"a tube within {tolerance:.3g} has more than {2 * (vertices + minimum):,} faces: "
                 "choose a larger `tolerance`"
             )
         points = waiting.pop()
-        swept = _Sweep(radius, around, points).surface()
+        swept = _Sweep(radius, segments, points).surface()
         if swept is not None and (len(points) == 2 or _is_apart(swept)):
             parts.append(to_manifold(swept))
             vertices += len(swept.vertices)
@@ -85,9 +86,10 @@ def _is_apart(surface: TriangleMesh) -> bool:
 
 
 def _simpler(points: FloatArray, length: float) -> FloatArray:
-    """A polyline (n, 3) with the vertices left out that are within a length of the edges in their
-    place (Douglas and Peucker 1973). Proof that all of these edges are as near to the polyline: the
-    nearest points on an edge of what it stands for go from one of its ends to the other."""
+    """A polyline (n, 3) without vertices that are within a length of the edges that replace them
+    (Douglas and Peucker 1973). Proof that all of these edges are as near to the polyline: the
+    points on an edge that are nearest to the replaced part of the polyline go from one of the
+    edge's ends to the other."""
     is_kept = np.zeros(len(points), np.bool_)
     is_kept[[0, -1]] = True
     waiting = [(0, len(points) - 1)]
@@ -95,11 +97,11 @@ def _simpler(points: FloatArray, length: float) -> FloatArray:
         first, last = waiting.pop()
         side, away = points[last] - points[first], points[first + 1 : last] - points[first]
         square = float(side @ side)
-        share = (away @ side / square if square > 0 else np.zeros(len(away))).clip(0, 1)
-        off = row_norms(away - share[:, None] * side)
-        if not len(off) or (square > 0 and off.max() <= length):
+        fraction = (away @ side / square if square > 0 else np.zeros(len(away))).clip(0, 1)
+        distance = row_norms(away - fraction[:, None] * side)
+        if not len(distance) or (square > 0 and distance.max() <= length):
             continue
-        middle = first + 1 + int(off.argmax())
+        middle = first + 1 + int(distance.argmax())
         is_kept[middle] = True
         waiting += [(first, middle), (middle, last)]
     return points[is_kept]
@@ -114,17 +116,17 @@ class _Sweep:
     points: FloatArray
 
     def surface(self) -> TriangleMesh | None:
-        """Rings of points one after the other; None where a line along an edge would end before it
-        begins."""
+        """The surface of rings of points one after the other; None where a line along an edge would
+        end before it begins."""
         points, sides = self.points, np.diff(self.points, axis=0)
-        ways = sides / np.abs(sides).max(axis=1)[:, None]  # squares of small ones underflow
-        ways /= row_norms(ways)[:, None]
-        is_closed = len(ways) > 2 and bool((points[0] == points[-1]).all())
-        swung = self._transported(ways, is_closed=is_closed)
+        edges = sides / np.abs(sides).max(axis=1)[:, None]  # squares of small ones underflow
+        edges /= row_norms(edges)[:, None]
+        is_closed = len(edges) > 2 and bool((points[0] == points[-1]).all())
+        swung = self._transported(edges, is_closed=is_closed)
         if swung is None:
             return None
         frames, shift = swung
-        turns = itertools.pairwise([*ways, ways[0]] if is_closed else ways)
+        turns = itertools.pairwise([*edges, edges[0]] if is_closed else edges)
         corners = [
             self._corner(point, turn, self._directions(end))
             for point, turn, (_, end) in zip(points[1:], turns, frames, strict=False)
@@ -132,16 +134,16 @@ class _Sweep:
         if is_closed:
             starts, ends = [np.roll(corners[-1], shift, axis=1), *corners[:-1]], corners
         else:
-            starts = [self._end(points[0], ways[0], frames[0][0], -1), *corners]
-            ends = [*corners, self._end(points[-1], ways[-1], frames[-1][1], 1)]
-        for way, start, end in zip(ways, starts, ends, strict=True):
-            if len(ways) > 1 and not ((end[0] - start[-1]) @ way > 0).all():
+            starts = [self._end(points[0], edges[0], frames[0][0], -1), *corners]
+            ends = [*corners, self._end(points[-1], edges[-1], frames[-1][1], 1)]
+        for edge, start, end in zip(edges, starts, ends, strict=True):
+            if len(edges) > 1 and not ((end[0] - start[-1]) @ edge > 0).all():
                 return None
         rings = starts if is_closed else [*starts, ends[-1]]
         return self._joined(np.concatenate(rings), shift if is_closed else None)
 
     def _directions(self, frame: FloatArray) -> FloatArray:
-        """(around, 3) of the unit vectors in a plane."""
+        """(around, 3) unit vectors in the plane of a frame, at equal angles."""
         angle = 2 * math.pi * np.arange(self.around) / self.around
         return np.cos(angle)[:, None] * frame[0] + np.sin(angle)[:, None] * frame[1]
 
@@ -157,54 +159,56 @@ class _Sweep:
             return (point + self.radius * directions)[None]
         across = across / sine
         angle = math.atan2(sine, cosine)
-        share = directions @ across
+        component = directions @ across
         step = 2 * math.pi / self.around
         count = math.ceil(angle / step)
         angles = np.array([0.5 * angle]) if count <= 1 else np.linspace(0.0, angle, count + 1)
-        turned = directions + share[:, None] * (
+        turned = directions + component[:, None] * (
             (np.cos(angles)[:, None, None] - 1) * across - np.sin(angles)[:, None, None] * before
         )
-        inner = directions - (share * math.tan(0.5 * angle))[:, None] * before
-        return point + self.radius * np.where((share > 0)[:, None], inner, turned)
+        inner = directions - (component * math.tan(0.5 * angle))[:, None] * before
+        return point + self.radius * np.where((component > 0)[:, None], inner, turned)
 
-    def _end(self, point: FloatArray, way: FloatArray, frame: FloatArray, sign: int) -> FloatArray:
-        """Rings from the pole of a half ball to its rim, or the other way at the last point."""
+    def _end(self, point: FloatArray, axis: FloatArray, frame: FloatArray, sign: int) -> FloatArray:
+        """Rings from the pole of a half ball to its rim, or in the reverse order at the last
+        point."""
         count = math.ceil(0.25 * self.around)
         angle = 0.5 * math.pi * np.arange(count + 1)[:, None, None] / count
-        rings = np.cos(angle) * self._directions(frame) + sign * np.sin(angle) * way
+        rings = np.cos(angle) * self._directions(frame) + sign * np.sin(angle) * axis
         return point + self.radius * (rings if sign > 0 else rings[::-1])
 
     def _joined(self, rings: FloatArray, shift: int | None) -> TriangleMesh:
-        """Faces between neighbors of rings (k, around, 3), those of points that are the same left
-        out. shift: by which the numbers around grow from the last to the first; None for poles
-        there."""
+        """The mesh of faces between neighbors of rings (k, around, 3), without faces with equal
+        corners. shift: the amount by which the indices around grow from the last ring to the first;
+        None if the ends are poles."""
         count, n = len(rings), self.around
         row, column = np.mgrid[: count - 1 if shift is None else count, :n].reshape(2, -1)
         moved = np.where(row == count - 1, shift or 0, 0)
-        above = (row + 1) % count * n
+        next_row = (row + 1) % count * n
         a, b = row * n + column, row * n + (column + 1) % n
-        c, d = above + (column + moved + 1) % n, above + (column + moved) % n
-        place: IntArray = np.arange(count * n, dtype=np.int64).reshape((count, n))
+        c, d = next_row + (column + moved + 1) % n, next_row + (column + moved) % n
+        vertex: IntArray = np.arange(count * n, dtype=np.int64).reshape((count, n))
         for k in range(1, count):
             same = (rings[k] == rings[k - 1]).all(axis=1)
-            place[k, same] = place[k - 1, same]
+            vertex[k, same] = vertex[k - 1, same]
         if shift is None:
-            place[[0, -1]] = place[[0, -1], :1]
+            vertex[[0, -1]] = vertex[[0, -1], :1]
         corners = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
-        faces: IntArray = place.ravel()[corners]
+        faces: IntArray = vertex.ravel()[corners]
         is_triangle = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
         return TriangleMesh.without_unused_vertices(rings.reshape(-1, 3), faces[is_triangle])
 
     def _transported(
-        self, ways: FloatArray, *, is_closed: bool
+        self, edges: FloatArray, *, is_closed: bool
     ) -> tuple[list[tuple[FloatArray, FloatArray]], int] | None:
         """Two unit vectors (2, 3) across each edge, at its start and its end, turned as the edges
-        turn; of a closed polyline also a little about them, so that numbers around agree at the
-        last and the first but for a shift. None where an edge leads back along the one before."""
-        first = np.cross(ways[0], np.eye(3)[np.abs(ways[0]).argmin()])
+        turn; for a closed polyline they also turn a little about the edges, so that the indices
+        around agree at the last and the first edge up to a shift. None where an edge leads back
+        along the edge before."""
+        first = np.cross(edges[0], np.eye(3)[np.abs(edges[0]).argmin()])
         first /= np.linalg.norm(first)
         across = [first]
-        for before, after in itertools.pairwise([*ways, ways[0]] if is_closed else ways):
+        for before, after in itertools.pairwise([*edges, edges[0]] if is_closed else edges):
             cosine = float(before @ after)
             if cosine <= -1 + _BACK:
                 return None
@@ -213,19 +217,19 @@ class _Sweep:
             turned = cosine * u + np.cross(axis, u) + axis * (axis @ u) / (1 + cosine)
             turned -= (turned @ after) * after
             across.append(turned / np.linalg.norm(turned))
-        shift, turn = 0, 0.0
+        shift, twist = 0, 0.0
         if is_closed:
-            off = math.atan2(across[-1] @ np.cross(ways[0], first), across[-1] @ first)
+            mismatch = math.atan2(across[-1] @ np.cross(edges[0], first), across[-1] @ first)
             step = 2 * math.pi / self.around
-            shift = round(off / step)
-            turn = (off - shift * step) / len(ways)
-        frames = [np.stack([u, np.cross(way, u)]) for u, way in zip(across, ways, strict=False)]
+            shift = round(mismatch / step)
+            twist = (mismatch - shift * step) / len(edges)
+        frames = [np.stack([u, np.cross(edge, u)]) for u, edge in zip(across, edges, strict=False)]
         return [
-            (_spun(f, -turn * k), _spun(f, -turn * (k + 1))) for k, f in enumerate(frames)
+            (_spun(f, -twist * k), _spun(f, -twist * (k + 1))) for k, f in enumerate(frames)
         ], shift
 
 
 def _spun(frame: FloatArray, angle: float) -> FloatArray:
-    """Turned in its plane."""
+    """The frame, turned by an angle in its plane."""
     c, s = math.cos(angle), math.sin(angle)
     return np.stack([c * frame[0] + s * frame[1], c * frame[1] - s * frame[0]])

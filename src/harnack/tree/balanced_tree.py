@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real
 
 NO_PRIMITIVE = -1
-# So many points and their indices fit into the cache.
+# The number of points that fit into the cache, with their indices.
 _POINTS_IN_CACHE = 1 << 17
 # Rows up to this length are reduced faster by a loop over columns than by NumPy's reductions.
 _LONG_ROW = 48
@@ -47,7 +47,8 @@ class BalancedTree:
 
     leaf_slots: (leaves, leaf_size) index of the primitive in each slot, NO_PRIMITIVE for an empty
         one (the last of a leaf, if any).
-    arities: children of every inner node, level by level from the leaves' parents to the root.
+    arities: the number of children of every inner node, level by level from the leaves' parents to
+        the root.
     """
 
     leaf_slots: IntArray
@@ -55,12 +56,12 @@ class BalancedTree:
 
     @property
     def leaf_size(self) -> int:
-        """Slots of a leaf."""
+        """The number of slots of a leaf."""
         return self.leaf_slots.shape[1]
 
     @property
     def counts(self) -> tuple[int, ...]:
-        """Nodes of each level, from the leaves to the root."""
+        """The number of nodes of each level, from the leaves to the root."""
         counts = [len(self.leaf_slots)]
         for arity in self.arities:
             counts.append(counts[-1] // arity)
@@ -68,7 +69,7 @@ class BalancedTree:
 
     @property
     def node_count(self) -> int:
-        """Nodes of all levels."""
+        """The number of nodes of all levels."""
         return sum(self.counts)
 
     def node_links(self) -> tuple[tuple[IntArray, ...], tuple[IntArray, ...], tuple[IntArray, ...]]:
@@ -80,16 +81,16 @@ class BalancedTree:
         and so on, so that siblings, which are mostly visited together, lie side by side in memory.
         The first child of a leaf is 0, the index of the root, which stands for none.
         """
-        below = [0]  # nodes below one of each level
+        below = [0]  # the number of nodes below a node, for each level
         for arity in self.arities:
             below.append(arity * (1 + below[-1]))
         number, after = [np.zeros(1, np.int64)], [np.array([self.node_count], np.int64)]
         first = [np.ones(1, np.int64)]
         for level, arity in reversed(list(enumerate(self.arities))):
-            place = np.arange(arity)
-            child = first[0][:, None] + place
-            following = np.where(place < arity - 1, child + 1, after[0][:, None])
-            start = first[0][:, None] + arity + place * below[level]
+            position = np.arange(arity)
+            child = first[0][:, None] + position
+            following = np.where(position < arity - 1, child + 1, after[0][:, None])
+            start = first[0][:, None] + arity + position * below[level]
             number.insert(0, child.reshape(-1))
             after.insert(0, following.reshape(-1))
             first.insert(0, start.reshape(-1))
@@ -118,17 +119,17 @@ def build_balanced_tree(points: FloatArray, *, leaf_size: int = 8, arity: int = 
     rows = np.arange(len(points), dtype=np.int64)[None]
     x = np.array(points.T, dtype=np.float64, order="C")[:, None]
     depth = max(0, math.ceil(math.log2(len(points) / leaf_size)))
-    left = depth
-    while left and rows.shape[1] > _POINTS_IN_CACHE:
+    remaining = depth
+    while remaining and rows.shape[1] > _POINTS_IN_CACHE:
         rows, x = _split(rows, x)
-        left -= 1
+        remaining -= 1
     at_once = max(1, _POINTS_IN_CACHE // rows.shape[1])
     leaves: list[IntArray] = []
     for start in range(0, len(rows), at_once):
-        some, places = rows[start : start + at_once], x[:, start : start + at_once]
-        for _ in range(left):
-            some, places = _split(some, places)
-        leaves.append(some)
+        batch, coordinates = rows[start : start + at_once], x[:, start : start + at_once]
+        for _ in range(remaining):
+            batch, coordinates = _split(batch, coordinates)
+        leaves.append(batch)
     slots = np.concatenate(leaves)
     if arity == 2:
         return BalancedTree(slots, (2,) * depth)
@@ -139,8 +140,8 @@ def _split(rows: IntArray, x: FloatArray) -> tuple[IntArray, FloatArray]:
     """The points of nodes, a row each, halved: indices (k, w) and positions x (3, k, w) become
     (2k, ceil(w/2)) and (3, 2k, ceil(w/2)).
 
-    The last of a row may be empty: NO_PRIMITIVE, at NaN, which sorts behind all numbers. If each
-    row holds w or w - 1 points, each of the new ones holds ceil(w/2) or one less.
+    The last slot of a row may be empty: NO_PRIMITIVE, at NaN, which sorts behind all numbers. If
+    each row holds w or w - 1 points, each new row holds ceil(w/2) points or one less.
     """
     count, width = rows.shape
     half, middle = (width + 1) // 2, width // 2
@@ -153,7 +154,7 @@ def _split(rows: IntArray, x: FloatArray) -> tuple[IntArray, FloatArray]:
         order[short, -1], order[short, middle] = order[short, middle], width - 1
     order += np.arange(0, rows.size, width, dtype=np.int64)[:, None]
     return _halves(rows, order, half, NO_PRIMITIVE), np.stack(
-        [_halves(one, order, half, np.nan) for one in x]
+        [_halves(coordinate, order, half, np.nan) for coordinate in x]
     )
 
 
@@ -193,7 +194,7 @@ class PackedTree:
         subtree, and the index of its leaf or, for an inner node, minus the index of its first
         child.
     node_payloads: further numbers of the caller for each node, stored separately because a walk
-        reads many heads in a row and few payloads; None for none.
+        reads many heads in a row and few payloads; None if there are none.
     primitives: `leaf_size` rows for each leaf.
     """
 
@@ -294,11 +295,11 @@ def traverse(tree: PackedTree, visit: Visit, state: LoopValues, active: Mask = T
         i = dr.select(descend & ~is_leaf, number, index(head[6]))
         return i, *state
 
-    def more(i: Any, *_: Any) -> Mask:
+    def is_running(i: Any, *_: Any) -> Mask:
         return i < tree.node_count
 
     start = dr.select(mask(active), index(0), tree.node_count)
-    return dr.while_loop((start, *state), more, body, label="walk")[1:]
+    return dr.while_loop((start, *state), is_running, body, label="walk")[1:]
 
 
 def for_each_primitive(
@@ -313,10 +314,10 @@ def for_each_primitive(
     tree = node.tree
     index = tree.backend.UInt32
 
-    def more(slot: Any, *_: Any) -> Mask:
+    def is_running(slot: Any, *_: Any) -> Mask:
         return active & (slot < tree.leaf_size)
 
     def step(slot: Any, *state: Any) -> LoopValues:
         return slot + 1, *body(tree.primitive(node.leaf, slot, active), active, state)
 
-    return dr.while_loop((index(0), *state), more, step, label="leaf")[1:]
+    return dr.while_loop((index(0), *state), is_running, step, label="leaf")[1:]

@@ -38,7 +38,7 @@ __all__ = ["MAX_BOXES", "NO_BOX", "BoxTree"]
 # Boxes are numbered in floats; single precision holds no larger integers without gaps.
 MAX_BOXES = 2**24
 NO_BOX = 0xFFFFFFFF
-# Column of a record behind its box.
+# The column of a record behind its box.
 _NUMBER = 6
 _LEAF_SIZE = 4
 
@@ -88,11 +88,11 @@ class BoxTree:
             later = (t > t_after) | ((t == t_after) & (n > n_after))
             first = (t < best) | ((t == best) & (n < number))
             entered = (near <= far) & (far >= start) & (t <= end) & (row[_NUMBER] >= 0)
-            taken = active & entered & later & first
+            chosen = active & entered & later & first
             return (
-                dr.select(taken, t, best),
-                dr.select(taken, far, leave),
-                dr.select(taken, n, number),
+                dr.select(chosen, t, best),
+                dr.select(chosen, far, leave),
+                dr.select(chosen, n, number),
             )
 
         begun = (real(dr.inf), real(dr.inf), index(NO_BOX))
@@ -101,7 +101,7 @@ class BoxTree:
 
     def _slab_test(self, o: Vec3, d: Vec3) -> Any:
         """A function that computes where rays enter and leave a box, a little too early and too
-        late to cover rounding.
+        late, which covers rounding.
 
         Each plane of the box is moved outwards by 16 roundings of the size of coordinates, and t is
         widened by 8 roundings of itself: (x - o)/d has three roundings, of which that of x - o is
@@ -119,8 +119,8 @@ class BoxTree:
             a, b = (low - o) * inverse, (high - o) * inverse
             near = fmax(fmax(fmin(a.x, b.x), fmin(a.y, b.y)), fmin(a.z, b.z))
             far = fmin(fmin(fmax(a.x, b.x), fmax(a.y, b.y)), fmax(a.z, b.z))
-            slack = 8 * backend.machine_epsilon
-            return near - slack * dr.abs(near), far + slack * dr.abs(far)
+            rounding = 8 * backend.machine_epsilon
+            return near - rounding * dr.abs(near), far + rounding * dr.abs(far)
 
         return span
 
@@ -190,41 +190,42 @@ def squared_distance_in_nearby_leaf(tree: PackedTree, x: Vec3, column: int) -> R
     real, index, vector = backend.Float, backend.UInt32, backend.Array3f
     x = vector(x)
 
-    def body(i: Any, end: Any, best: Real, first: Any, after: Any, found: Any) -> LoopValues:
+    def body(i: Any, end: Any, best: Real, first: Any, after: Any, nearest_leaf: Any) -> LoopValues:
         head = tree.head(i)
         middle = 0.5 * (vector(*head[:3]) + vector(*head[3:6]))
         square = dr.squared_norm(middle - x)
         nearer, following = square < best, index(head[6])
         best = dr.select(nearer, square, best)
         is_leaf, number = head[7] >= 0, index(dr.abs(head[7]))
-        # Of the nearest sibling so far: its leaf if it is one, or its first child and their end.
-        found = dr.select(nearer, dr.select(is_leaf, number, NO_TRIANGLE), found)
+        # For the nearest sibling so far: its leaf if it is a leaf, or its first child and the end
+        # of its children.
+        nearest_leaf = dr.select(nearer, dr.select(is_leaf, number, NO_TRIANGLE), nearest_leaf)
         first = dr.select(nearer, number, first)
         after = dr.select(nearer, following, after)
         is_last = following == end
-        down = is_last & (found == NO_TRIANGLE)
+        down = is_last & (nearest_leaf == NO_TRIANGLE)
         i = dr.select(down, first, following)
         end, best = dr.select(down, after, end), dr.select(down, dr.inf, best)
-        return i, end, best, first, after, found
+        return i, end, best, first, after, nearest_leaf
 
-    def more(i: Any, end: Any, *state: Any) -> Mask:
+    def is_running(i: Any, end: Any, *state: Any) -> Mask:
         return i != end
 
     start = (
         index(0), index(tree.node_count), real(dr.inf), index(0), index(0), index(NO_TRIANGLE),
     )  # fmt: skip
-    leaf = dr.while_loop(start, more, body, label="to a leaf")[5]
+    leaf = dr.while_loop(start, is_running, body, label="to a leaf")[5]
 
     def add(slot: Any, square: Real) -> LoopValues:
         row = tree.primitive(leaf, slot, backend.Bool(True))
         point = vector(*row[column : column + 3])
         return slot + 1, fmin(square, dr.squared_norm(point - x))
 
-    def left(slot: Any, square: Real) -> Mask:
+    def has_slots(slot: Any, square: Real) -> Mask:
         del square
         return slot < tree.leaf_size
 
-    return dr.while_loop((index(0), real(dr.inf)), left, add, label="points of a leaf")[1]
+    return dr.while_loop((index(0), real(dr.inf)), has_slots, add, label="points of a leaf")[1]
 
 
 def next_closest_triangle(
@@ -251,19 +252,19 @@ def next_closest_triangle(
         square, n = point.squared_distance, index(fmax(row[NUMBER_COLUMN], real(0)))
         later = (square > square_after) | ((square == square_after) & (n > number_after))
         first = (square < best) | ((square == best) & (n < number))
-        taken = active & later & first & (row[NUMBER_COLUMN] >= 0)
+        chosen = active & later & first & (row[NUMBER_COLUMN] >= 0)
         return (
-            dr.select(taken, square, best),
-            dr.select(taken, n, number),
-            dr.select(taken, point.offset, offset),
-            dr.select(taken, normal_of(row, vector), normal),
-            dr.select(taken, point.is_inner, is_inner),
+            dr.select(chosen, square, best),
+            dr.select(chosen, n, number),
+            dr.select(chosen, point.offset, offset),
+            dr.select(chosen, normal_of(row, vector), normal),
+            dr.select(chosen, point.is_inner, is_inner),
         )
 
     start = (limit, index(NO_TRIANGLE), vector(0), vector(0), backend.Bool(False))
     square, number, offset, normal, is_inner = traverse(rays.tree, visit, start, active)
-    found = number != NO_TRIANGLE
-    return ClosestTriangle(dr.select(found, square, dr.inf), number, offset, normal, is_inner)
+    exists = number != NO_TRIANGLE
+    return ClosestTriangle(dr.select(exists, square, dr.inf), number, offset, normal, is_inner)
 
 
 def _pad(rays: TriangleTree, x: Vec3) -> Real:
@@ -286,9 +287,9 @@ def _distance_test(rays: TriangleTree, x: Vec3, pad: Real) -> Any:
         from_center = x - 0.5 * (low + high)
         height = dr.dot(from_center, n)
         across = dr.norm(dr.fma(vector(-height), n, from_center))
-        off = fmax(dr.abs(height - offset) - (thickness + pad), 0)
+        excess = fmax(dr.abs(height - offset) - (thickness + pad), 0)
         beside = fmax(across - (radius + pad), 0)
-        return close & (dr.fma(off, off, beside * beside) <= square)
+        return close & (dr.fma(excess, excess, beside * beside) <= square)
 
     return within
 
@@ -301,19 +302,20 @@ class ClosestPointOnTriangle:
     offset: (3,) from x to the point.
     is_inner: whether the point lies inside the triangle, not on its edges.
 
-    It is the closest point of the plane if that lies in the triangle, else the closest point of the
-    edges. The closest point of the plane is computed along the longest edge e, from a and of length
-    L, and along the altitude h on it, made orthogonal to e twice.
+    It is the closest point of the plane if that lies in the triangle, otherwise the closest point
+    of the edges. The closest point of the plane is computed along the longest edge e, from a and of
+    length L, and along the altitude h on it, made orthogonal to e twice.
 
     Proof that the distance is off by only a few epsilons of l = L + |x - a|, however thin the
     triangle (a cross product's direction is off by epsilon L/|h|, which for a needle is an error of
-    any size): x - a less its part along e, done twice, is right up to epsilon l and orthogonal to e
-    up to epsilon^2 l, and so is h, whose direction within the plane normal to e is off by d <=
-    epsilon L/|h|. So the point a + alpha e + s h lies off the plane by at most s|h| d <= epsilon L,
-    and off the closest point within it by k <= epsilon l + min(d H, |h|), H the distance from the
-    plane. That lengthens H by at most k^2/(2H), where k >= epsilon l counts as min(d H, |h|)^2/(2H)
-    <= d |h|/2 <= epsilon L/2, and by k <= 3 epsilon l for H < epsilon l. If the same k puts the
-    point on the wrong side of an edge, the edges' distance or the plane's is off by as much.
+    any size): x - a minus its component along e, removed twice, is right up to epsilon l and
+    orthogonal to e up to epsilon^2 l, and so is h, whose direction within the plane normal to e is
+    off by d <= epsilon L/|h|. So the point a + alpha e + s h lies off the plane by at most s|h| d
+    <= epsilon L, and off the closest point within it by k <= epsilon l + min(d H, |h|), H the
+    distance from the plane. That lengthens H by at most k^2/(2H), where k >= epsilon l counts as
+    min(d H, |h|)^2/(2H) <= d |h|/2 <= epsilon L/2, and by k <= 3 epsilon l for H < epsilon l. If
+    the same k puts the point on the wrong side of an edge, the edges' distance or the plane's is
+    off by as much.
     """
 
     squared_distance: Real
@@ -335,9 +337,9 @@ class ClosestPointOnTriangle:
         by_pr = (squares[2] > squares[0]) & (squares[2] >= squares[1])
         by_qr = ~by_pr & (squares[1] > squares[0])
 
-        def chosen(one: Any, two: Any, three: Any) -> Any:
-            """The one that belongs to the longest of the edges pq, qr and pr."""
-            return dr.select(by_pr, three, dr.select(by_qr, two, one))
+        def chosen(of_pq: Any, of_qr: Any, of_pr: Any) -> Any:
+            """The argument that belongs to the longest of the edges pq, qr and pr."""
+            return dr.select(by_pr, of_pr, dr.select(by_qr, of_qr, of_pq))
 
         a, e, inverse = chosen(p, q, p), chosen(pq, qr, pr), chosen(first, second, third)
         alpha, away = _project_on_edge(-a, e, inverse)
@@ -354,31 +356,31 @@ def _project_on_edge(v: Vec3, e: Vec3, inverse: Real) -> tuple[Real, Vec3]:
     """The coefficient t and the rest r of v = t e + r, with r orthogonal to e, even if e is short;
     inverse = 1/|e|^2."""
     vector = cast("Any", type(v))
-    share = dr.dot(v, e) * inverse
-    rest = dr.fma(vector(-share), e, v)
-    more = dr.dot(rest, e) * inverse
-    return share + more, dr.fma(vector(-more), e, rest)
+    t = dr.dot(v, e) * inverse
+    rest = dr.fma(vector(-t), e, v)
+    correction = dr.dot(rest, e) * inverse
+    return t + correction, dr.fma(vector(-correction), e, rest)
 
 
 def _closest_on_segment(a: Vec3, e: Vec3, inverse: Real) -> Vec3:
-    """The nearest point to the origin of the segment from a to a + e."""
+    """The point of the segment from a to a + e that is nearest to the origin."""
     real, vector = cast("Any", type(inverse)), cast("Any", type(a))
     return dr.fma(vector(clamp(-dr.dot(a, e) * inverse, real(0), real(1))), e, a)
 
 
 def _shortest_vector(*vectors: Vec3) -> tuple[Real, Vec3]:
-    """The smallest of them, its squared length first."""
-    best, *others = vectors
+    """The shortest of vectors, its squared length first."""
+    best, *rest = vectors
     square = dr.squared_norm(best)
-    for other in others:
-        one = dr.squared_norm(other)
-        best, square = dr.select(one < square, other, best), fmin(one, square)
+    for vector in rest:
+        other_square = dr.squared_norm(vector)
+        best, square = dr.select(other_square < square, vector, best), fmin(other_square, square)
     return square, best
 
 
 def squared_distance_to_segment(a: Vec3, e: Vec3, inverse: Real) -> Real:
-    """From the origin to the segment from a to a + e; inverse: 1/|e|^2, any finite number if e =
-    0."""
+    """The squared distance from the origin to the segment from a to a + e; inverse: 1/|e|^2, any
+    finite number if e = 0."""
     return dr.squared_norm(_closest_on_segment(a, e, inverse))
 
 

@@ -23,13 +23,14 @@ if TYPE_CHECKING:
 
 __all__ = ["borders_of_overlaps", "overlapping_faces"]
 
-# In units of the mesh's size: triangles so near to a plane lie in it, and overlap by more.
+# In units of the mesh's size: triangles this near to a plane lie in it, and overlap by more than
+# this.
 _SAME = 1e-12
-# Planes are told apart in cells of this size, of their normals and distances from the origin.
+# The size of the cells, of normals and distances from the origin, in which planes are told apart.
 _CELL = 1e-6
-# Rounding of a normal, as a length at the corner of a triangle of size one.
+# The rounding of a normal, as a length at the corner of a triangle of size one.
 _ROUNDED = 1e-15
-# Odd numbers, by which coordinates of cells are mixed into one.
+# Odd numbers, with which coordinates of cells are hashed to one number.
 _MIXED = np.array(
     [0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9, 0xD6E8FEB86659FD93], np.uint64
 )
@@ -49,13 +50,13 @@ def borders_of_overlaps(
     covered, covering = overlapping_faces(rays, vertices, faces)
     if not len(covered):
         return covered, np.zeros((0, 3, 3))
-    edges, way = _edges(faces[covering])
+    edges, sign = _edges(faces[covering])
     key, number = np.unique(edges, axis=0, return_inverse=True)
     number = number.reshape(-1)
     pairs = np.repeat(covered, 3) * len(key) + number
     lines, line, count = np.unique(pairs, return_inverse=True, return_counts=True)
     net = np.zeros(len(lines), np.int64)
-    np.add.at(net, line.reshape(-1), way)
+    np.add.at(net, line.reshape(-1), sign)
     face, edge = np.divmod(lines, len(key))
     ends, faces_at = np.unique(_edges(faces)[0], axis=0, return_counts=True)
     width = len(vertices)
@@ -70,14 +71,15 @@ def borders_of_overlaps(
 
 
 def _edges(faces: IntArray) -> tuple[IntArray, IntArray]:
-    """Edges (3 m, 2) of faces, the lower index first, and 1 or -1 for whether that turns them."""
+    """Edges (3 m, 2) of faces, the lower index first, and -1 for those that this order reverses,
+    else 1."""
     ends = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
     return np.sort(ends, axis=1), np.where(ends[:, 0] < ends[:, 1], 1, -1)
 
 
 def _normals(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Unit normals (m, 3) of triangles, 0 for those without one, and heights (m,) over their
-    longest edges."""
+    """Unit normals (m, 3) of triangles, 0 for triangles without a normal, and heights (m,) over
+    their longest edges."""
     u, v = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     normal = np.cross(u, v)
     area = np.sqrt(np.einsum("ni,ni->n", normal, normal))
@@ -90,22 +92,22 @@ def _normals(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _candidates(corners: FloatArray, normal: FloatArray, height: FloatArray) -> IntArray:
     """Triangles (k,) in whose plane others may lie.
 
-    A plane is a point of R^4: its normal, the first coordinate of which that is clear of 0 is
-    positive, and its distance from the origin. For two triangles in one plane these points differ
-    by rounding and by what moves corners by `_SAME`, over the smaller of their heights. So of those
-    that are alone in their cell of R^4 only those as near to its walls may have others in their
-    plane; the lower triangle of a pair is always among those that are returned.
+    A plane is a point of R^4: its normal, whose first coordinate that is clear of 0 is positive,
+    and its distance from the origin. For two triangles in one plane these points differ by rounding
+    and by a move of corners by `_SAME`, over the smaller of their heights. So of triangles that are
+    alone in their cell of R^4 only those as near to its walls may have others in their plane; the
+    lower triangle of a pair is always among the returned triangles.
     """
     clear = np.abs(normal) - 0.3
     first = np.take_along_axis(normal, (clear > 0).argmax(axis=1)[:, None], axis=1)
     normal = np.where(first < 0, -normal, normal)
-    place = np.column_stack([normal, np.einsum("ni,ni->n", normal, corners[:, 0])]) / _CELL
-    cell = np.floor(place)
-    within = place - cell
+    position = np.column_stack([normal, np.einsum("ni,ni->n", normal, corners[:, 0])]) / _CELL
+    cell = np.floor(position)
+    within = position - cell
     to_wall = np.minimum(within, 1 - within).min(axis=1) * _CELL
-    slack = 4 * (_SAME + _ROUNDED) / np.where(height > 0, height, 1e-300)
-    is_sure = (to_wall > slack) & (np.abs(clear).min(axis=1) > slack)
-    # Cells that share a number are taken for one.
+    tolerance = 4 * (_SAME + _ROUNDED) / np.where(height > 0, height, 1e-300)
+    is_sure = (to_wall > tolerance) & (np.abs(clear).min(axis=1) > tolerance)
+    # Cells with the same number count as one cell.
     number = (cell.astype(np.int64).astype(np.uint64) * _MIXED).sum(axis=1)
     _, group, count = np.unique(number, return_inverse=True, return_counts=True)
     return np.flatnonzero((count[group] > 1) | ~is_sure)
@@ -114,9 +116,10 @@ def _candidates(corners: FloatArray, normal: FloatArray, height: FloatArray) -> 
 def overlapping_faces(
     rays: TriangleTree, vertices: FloatArray, faces: IntArray
 ) -> tuple[IntArray, IntArray]:
-    """Pairs of faces (k,), (k,) that overlap in a plane, each both ways round.
+    """Pairs of faces (k,), (k,) that overlap in a plane, each in both orders.
 
-    Each looks for others that are not lower than itself, of which it meets few.
+    For each face, the overlapping faces that are not lower than itself are searched for; there are
+    few.
     """
     backend = rays.tree.backend
     corners = vertices[faces]
@@ -126,8 +129,8 @@ def overlapping_faces(
     batches: list[IntArray] = []
     while len(rows):
         ends = tuple(to_vector3(backend, corner) for corner in np.moveaxis(corners[rows], 1, 0))
-        own = upload_integers(backend, rows)
-        partners = _next_in_plane(rays, ends, own, sizes, backend.Float(after))
+        ids = upload_integers(backend, rows)
+        partners = _next_in_plane(rays, ends, ids, sizes, backend.Float(after))
         number = to_numpy(partners).astype(np.int64)
         hit = number != NO_TRIANGLE
         rows, after = rows[hit], number[hit].astype(np.float64)
@@ -140,14 +143,14 @@ def overlapping_faces(
 
 
 def _next_in_plane(
-    rays: TriangleTree, corners: tuple[Vec3, ...], own: Any, sizes: Real, after: Real
+    rays: TriangleTree, corners: tuple[Vec3, ...], face: Any, sizes: Real, after: Real
 ) -> Any:
-    """The first face with a number above `after` that overlaps the face `own`, one in each lane, in
-    its plane, and is no smaller. sizes: of all faces; of two alike the latter counts as larger."""
+    """The first face with a number above `after` that overlaps `face`, a face in each lane, in its
+    plane, and is no smaller. sizes: of all faces; of two equal faces the later counts as larger."""
     backend = rays.tree.backend
     real, index, vector = backend.Float, backend.UInt32, backend.Array3f
     a, b, c = corners
-    size = dr.gather(real, sizes, own)
+    size = dr.gather(real, sizes, face)
     low, high = fmin(fmin(a, b), c) - _SAME, fmax(fmax(a, b), c) + _SAME
 
     def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
@@ -159,16 +162,16 @@ def _next_in_plane(
         number = index(fmax(row[NUMBER_COLUMN], real(0)))
         theirs = corners_of(row, vector)
         their_size = dr.gather(real, sizes, number, active)
-        larger = (their_size > size) | ((their_size == size) & (number > own))
-        taken = active & (row[NUMBER_COLUMN] > after) & (number < state[0]) & larger
-        taken &= _in_plane(corners, theirs) & _overlap(corners, theirs)
-        return (dr.select(taken, number, state[0]),)
+        larger = (their_size > size) | ((their_size == size) & (number > face))
+        chosen = active & (row[NUMBER_COLUMN] > after) & (number < state[0]) & larger
+        chosen &= _in_plane(corners, theirs) & _overlap(corners, theirs)
+        return (dr.select(chosen, number, state[0]),)
 
     return traverse(rays.tree, visit, (index(NO_TRIANGLE),))[0]
 
 
 def _unit(vector: Vec3) -> Vec3:
-    """A vector of length 1; 0 for none."""
+    """A vector scaled to length 1; 0 stays 0."""
     length = dr.norm(vector)
     return dr.select(length > 0, vector / dr.select(length > 0, length, 1), 0)
 
@@ -180,7 +183,7 @@ def _normal(corners: tuple[Vec3, ...]) -> Vec3:
 
 def _in_plane(ours: tuple[Vec3, ...], theirs: tuple[Vec3, ...]) -> Mask:
     """Whether one of two triangles has all corners in the plane of the other. (The normal of a thin
-    one may be all rounding.)"""
+    triangle may be only rounding.)"""
 
     def lies_in(corners: tuple[Vec3, ...], plane: tuple[Vec3, ...]) -> Mask:
         normal = _normal(plane)

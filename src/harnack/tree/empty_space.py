@@ -64,7 +64,7 @@ class BoxCells:
 
     @property
     def centers(self) -> FloatArray:
-        """(n, 3)."""
+        """(n, 3) the centers of the boxes."""
         return self.corners + 0.5 * self.size
 
     @property
@@ -220,7 +220,7 @@ class EmptySpaceGrid:
         uploaded."""
 
         def vector(numbers: Any) -> Vec3:
-            return backend.Array3f(*(dr.opaque(backend.Float, float(one)) for one in numbers))
+            return backend.Array3f(*(dr.opaque(backend.Float, float(number)) for number in numbers))
 
         return (
             backend,
@@ -232,18 +232,18 @@ class EmptySpaceGrid:
 
     def cell(self, p: Vec3) -> GridCell:
         """The cell in which p lies, or the nearest one."""
-        place = (p - self.origin) / self.cell_size
-        corner = type(p)(*(clamp(dr.floor(place[k]), 0, self.shape[k] - 1) for k in range(3)))
+        position = (p - self.origin) / self.cell_size
+        corner = type(p)(*(clamp(dr.floor(position[k]), 0, self.shape[k] - 1) for k in range(3)))
         x, y, z = (self.backend.UInt32(corner[k]) for k in range(3))
         row, layer = self.backend.UInt32(self.shape.x), self.backend.UInt32(self.shape.y)
-        return GridCell(self, place, corner, x + row * (y + layer * z))
+        return GridCell(self, position, corner, x + row * (y + layer * z))
 
     def empty_run(self, p: Vec3, d: Vec3, length: Real) -> Real:
         """A length s for which p + s d is proved to stay in empty cells; it may exceed `length`.
 
         Proof. All cells less than empty_distance cells from a point's cell are empty, and so are
         the margins around them. Together they form a cube, larger than these cells by the margin. A
-        step leaves the cells by at most `margin` less `_ROUNDING`, so that it stays inside of the
+        step leaves the cells by at most `margin` minus `_ROUNDING`, so that it stays inside of the
         cube; the rest of the margin is for the rounding of positions. Steps end where a cell is
         occupied.
         """
@@ -323,10 +323,10 @@ class GridCell:
 
 
 def distance_to_occupied(empty: BoolArray) -> IntArray:
-    """`GridData.empty_distance` of cells (nz, ny, nx)."""
+    """`GridData.empty_distance` from the mask of empty cells (nz, ny, nx)."""
     if empty.all():
         return np.full(empty.size, max(empty.shape), np.int64)
-    from scipy import ndimage  # here: a third of a second that few need
+    from scipy import ndimage  # imported here: it takes a third of a second
 
     chessboard: Any = cast("Any", ndimage).distance_transform_cdt  # its default metric
     return np.asarray(chessboard(empty), dtype=np.int64).ravel()
@@ -368,8 +368,8 @@ class OccupancyGrid(GridData):
         origin = origin.astype(np.float64)
         side = cell * 2**_ROUNDS
         nx, ny, nz = (int(count) for count in np.ceil((upper + room - origin) / side))
-        places = np.indices((nx, ny, nz)).reshape(3, -1).T
-        roots = BoxCells(origin + side * places, np.full(3, side))
+        indices = np.indices((nx, ny, nz)).reshape(3, -1).T
+        roots = BoxCells(origin + side * indices, np.full(3, side))
         roots = roots.subset(~roots.is_proved_empty(clearance, _MARGIN))
         cells = refine_cells(roots, clearance, np.iinfo(np.int64).max, _ROUNDS, _MARGIN).occupied
         nx, ny, nz = (count << _ROUNDS for count in (nx, ny, nz))
@@ -386,17 +386,17 @@ class OccupancyGrid(GridData):
     def occupied_centers(self) -> FloatArray:
         """The centers (n, 3) of the cells that are not empty."""
         x, y, z = self.shape
-        places = np.argwhere((self.empty_distance == 0).reshape(z, y, x))[:, ::-1]
-        return self.origin + self.cell_size * (places + 0.5)
+        indices = np.argwhere((self.empty_distance == 0).reshape(z, y, x))[:, ::-1]
+        return self.origin + self.cell_size * (indices + 0.5)
 
     def refined(self, clearance: Clearance) -> OccupancyGrid:
         """The same grid, in which a cell also counts as empty if its eight octants are proved
         empty, with the same margin around the cell."""
         x, y, z = self.shape
         full = (self.empty_distance == 0).reshape(z, y, x)
-        places = np.argwhere(full)[:, ::-1]
+        indices = np.argwhere(full)[:, ::-1]
         halves = BoxCells(
-            self.origin + self.cell_size * places, np.full(3, self.cell_size)
+            self.origin + self.cell_size * indices, np.full(3, self.cell_size)
         ).octants()
         full[full] = ~halves.is_proved_empty(clearance, 2 * _MARGIN).reshape(-1, 8).all(axis=1)
         return replace(self, empty_distance=distance_to_occupied(~full))
@@ -418,9 +418,9 @@ def largest_connected_component(cells: OccupancyGrid) -> OccupancyGrid:
     number of cells would measure areas, or volumes, only if each piece of a surface was surrounded
     by as many occupied cells: but there are more where its function vanishes to a higher order, and
     around the two sides of a plate thinner than a cell no more than around a single side.
-    Projections do not depend on that, but for the cells at their outlines: there are several more
-    where a function vanishes to a higher order, so that with coarse cells a smaller component may
-    be chosen for it. Of equal groups the first along z, y and x is chosen.
+    Projections do not depend on that, except for the cells at their outlines: there are several
+    more where a function vanishes to a higher order, so that with coarse cells a smaller component
+    may be chosen for it. Of equal groups the first along z, y and x is chosen.
 
     Proof that no component of the set is cut in two. All of the set lies in occupied cells, as
     closed cubes. A connected part of it cannot be covered by two unions of such cubes that are
@@ -437,17 +437,17 @@ def largest_connected_component(cells: OccupancyGrid) -> OccupancyGrid:
     full = (cells.empty_distance == 0).reshape(z, y, x)
     if not full.any():
         return cells
-    from scipy import ndimage  # here: a third of a second that few need
+    from scipy import ndimage  # imported here: it takes a third of a second
 
     groups, count = cast("Any", ndimage).label(full, _NEIGHBOR_STENCIL)
-    group, places = groups[full], np.argwhere(full)
-    sizes = sum(_projection_sizes(group, np.delete(places, axis, 1), count) for axis in range(3))
-    wanted = groups == 1 + int(np.argmax(sizes))
-    return replace(cells, empty_distance=distance_to_occupied(~wanted))
+    group, indices = groups[full], np.argwhere(full)
+    sizes = sum(_projection_sizes(group, np.delete(indices, axis, 1), count) for axis in range(3))
+    chosen = groups == 1 + int(np.argmax(sizes))
+    return replace(cells, empty_distance=distance_to_occupied(~chosen))
 
 
-def _projection_sizes(group: IntArray, places: IntArray, count: int) -> IntArray:
+def _projection_sizes(group: IntArray, positions: IntArray, count: int) -> IntArray:
     """(count,) the number of different places (n, 2) of each group from 1 to count."""
-    width = 1 + places.max(axis=0)
-    index = (group * width[0] + places[:, 0]) * width[1] + places[:, 1]
+    width = 1 + positions.max(axis=0)
+    index = (group * width[0] + positions[:, 0]) * width[1] + positions[:, 1]
     return np.bincount(np.unique(index) // (width[0] * width[1]), minlength=count + 1)[1:]

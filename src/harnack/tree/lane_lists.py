@@ -54,19 +54,19 @@ class LaneLists:
     def concatenate(cls, backend: Backend, parts: list[LaneLists]) -> LaneLists:
         """The lists of the lanes of all parts, part after part. In each part, the first list must
         begin at entry 0 and the lists follow each other."""
-        counts = np.concatenate([to_numpy(one.count) for one in parts])
-        entries = [to_numpy(one.entries)[: int(to_numpy(one.count).sum())] for one in parts]
+        counts = np.concatenate([to_numpy(part.count) for part in parts])
+        entries = [to_numpy(part.entries)[: int(to_numpy(part.count).sum())] for part in parts]
         first = np.cumsum(counts, dtype=np.int64) - counts
         if first[-1] + counts[-1] >= 2**31:
             raise ValueError(_TOO_LONG)
         arrays = first, counts, np.append(np.concatenate(entries), 0)
-        return cls(*(upload_integers(backend, one) for one in arrays))
+        return cls(*(upload_integers(backend, part) for part in arrays))
 
     def subset(self, backend: Backend, lanes: IntArray) -> LaneLists:
         """The lists of these lanes; a lane may occur several times."""
         index = backend.UInt32
-        place = upload_integers(backend, lanes)
-        first, count = (dr.gather(index, one, place) for one in (self.first, self.count))
+        uploaded = upload_integers(backend, lanes)
+        first, count = (dr.gather(index, numbers, uploaded) for numbers in (self.first, self.count))
         return LaneLists(first, count, self.entries)
 
 
@@ -81,8 +81,8 @@ def build_lists(backend: Backend, walk: Callable[[WriteEntry | None], Any]) -> L
         raise ValueError(_TOO_LONG)
     first, entries = upload_integers(backend, start[:-1]), dr.zeros(index, max(1, int(start[-1])))
 
-    def put(place: Any, entry: Any, active: Mask) -> None:
-        dr.scatter(entries, index(entry), first + place, active)
+    def put(position: Any, entry: Any, active: Mask) -> None:
+        dr.scatter(entries, index(entry), first + position, active)
 
     dr.eval(walk(put), entries)
     return LaneLists(first, count, entries)
@@ -94,22 +94,22 @@ def traverse_subtrees(
     """The state after a walk (`balanced_tree.traverse`) over the subtrees of the listed nodes."""
     index = tree.backend.UInt32
 
-    def body(place: Any, i: Any, end: Any, *state: Any) -> LoopValues:
+    def body(k: Any, i: Any, end: Any, *state: Any) -> LoopValues:
         begins = i == end
-        entry = dr.gather(index, lists.entries, lists.first + place, begins & (place < lists.count))
+        entry = dr.gather(index, lists.entries, lists.first + k, begins & (k < lists.count))
         i = dr.select(begins, entry, i)
         head = tree.head(i)
         after, is_leaf, number = index(head[6]), head[7] >= 0, index(dr.abs(head[7]))
         end = dr.select(begins, after, end)
         descend, state = visit(VisitedNode(tree, i, tuple(head[:6]), number, is_leaf), state)
         i = dr.select(descend & ~is_leaf, number, after)
-        return place + dr.select(i == end, index(1), index(0)), i, end, *state
+        return k + dr.select(i == end, index(1), index(0)), i, end, *state
 
-    def more(place: Any, *_: Any) -> Mask:
-        return place < lists.count
+    def is_running(k: Any, *_: Any) -> Mask:
+        return k < lists.count
 
     start = (index(0), index(0), index(0), *state)
-    return dr.while_loop(start, more, body, label="subtrees")[3:]
+    return dr.while_loop(start, is_running, body, label="subtrees")[3:]
 
 
 def for_each_entry(
@@ -121,12 +121,12 @@ def for_each_entry(
     """The state after `body` of each entry of the lists, where active."""
     index = backend.UInt32
 
-    def step(place: Any, *state: Any) -> LoopValues:
-        active = place < lists.count
-        entry = dr.gather(index, lists.entries, lists.first + place, active)
-        return place + 1, *body(entry, active, state)
+    def step(k: Any, *state: Any) -> LoopValues:
+        active = k < lists.count
+        entry = dr.gather(index, lists.entries, lists.first + k, active)
+        return k + 1, *body(entry, active, state)
 
-    def more(place: Any, *_: Any) -> Mask:
-        return place < lists.count
+    def is_running(k: Any, *_: Any) -> Mask:
+        return k < lists.count
 
-    return dr.while_loop((index(0), *state), more, step, label="entries")[1:]
+    return dr.while_loop((index(0), *state), is_running, step, label="entries")[1:]

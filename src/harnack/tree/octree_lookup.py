@@ -23,9 +23,9 @@ __all__ = ["BALL_MARGIN", "MAX_DEPTH", "OCTANT_DIRECTIONS", "OctreeLookup", "enc
 # Cells of the finest level are 2^-MAX_DEPTH as wide as the cube, cells of the grid with which a
 # lookup begins 2^-_TOP_DEPTH.
 MAX_DEPTH, _TOP_DEPTH = 10, 5
-# What holds in the ball of a cell should hold in one larger by this factor, for rounding: it moves
-# a point by less than 2^-20 of the cube's side in single precision, and such balls of the finest
-# cells reach 2^-19 of it beyond these.
+# Statements about the ball of a cell should hold in a ball larger by this factor, for rounding: it
+# moves a point by less than 2^-20 of the cube's side in single precision, and such balls of the
+# finest cells reach 2^-19 of it beyond these.
 BALL_MARGIN = 1.004
 # From the center of a cube to those of its octants, in quarters of its side; z fastest.
 OCTANT_DIRECTIONS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
@@ -72,7 +72,7 @@ class OctreeLookup:
         inner node follow each other, in the order of the inner nodes of the level above."""
         root, *below = levels
         nodes = np.concatenate([*below, np.zeros(8, np.int64)])  # room for any octant
-        corner = backend.Array3f(*(dr.opaque(backend.Float, float(one)) for one in low))
+        corner = backend.Array3f(*(dr.opaque(backend.Float, float(number)) for number in low))
         return cls(
             backend, corner, dr.opaque(backend.Float, 2**MAX_DEPTH / side),
             backend.Int32(_build_top_grid(int(root[0]), nodes).astype(np.int32)),
@@ -87,13 +87,13 @@ class OctreeLookup:
     def find_leaf(self, x: Vec3) -> tuple[Any, Mask]:
         """The index of the leaf that contains x, and whether x lies in the cube."""
         index, integer = self.backend.UInt32, self.backend.Int32
-        place = (x - self.lower_corner) * self.cells_per_length
-        inside = dr.all((place >= 0) & (place < float(2**MAX_DEPTH)))
-        ix, iy, iz = (index(dr.select(inside, place[k], 0)) for k in range(3))
+        position = (x - self.lower_corner) * self.cells_per_length
+        inside = dr.all((position >= 0) & (position < float(2**MAX_DEPTH)))
+        ix, iy, iz = (index(dr.select(inside, position[k], 0)) for k in range(3))
         down = MAX_DEPTH - _TOP_DEPTH
         first = (((ix >> down) << _TOP_DEPTH | (iy >> down)) << _TOP_DEPTH) | (iz >> down)
 
-        def more(node: Any, *_: Any) -> Mask:
+        def is_inner(node: Any, *_: Any) -> Mask:
             return node >= 0
 
         def step(node: Any, bit: Any) -> tuple[Any, Any]:
@@ -101,7 +101,7 @@ class OctreeLookup:
             return dr.gather(integer, self.encoded_nodes, index(node) + octant), bit - 1
 
         node = dr.gather(integer, self.top_grid, first)
-        node, _ = dr.while_loop((node, index(down - 1) + 0 * ix), more, step, label="cell")
+        node, _ = dr.while_loop((node, index(down - 1) + 0 * ix), is_inner, step, label="cell")
         return index(-1 - node), inside
 
 

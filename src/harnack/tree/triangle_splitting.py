@@ -36,8 +36,8 @@ def split_intersecting_faces(
     rays: TriangleTree, vertices: FloatArray, faces: IntArray, *, covered_whole: bool = False
 ) -> tuple[FloatArray, IntArray]:
     """Triangles (k, 3, 3) that fill the faces (m, 3), none of which passes through another or is
-    covered by another in part; and (k,) the face that each is a piece of and has the orientation
-    of.
+    partly covered by another; and (k,) the face that each is a piece of, with the orientation of
+    the face.
 
     rays: a tree of the same faces, with coordinates of at most about 1.
     covered_whole: whether faces are also cut where others in their plane meet, so that each of
@@ -56,15 +56,15 @@ def split_intersecting_faces(
     if not len(cut) + len(covered):
         return corners, np.arange(len(faces))
     cut, knives = np.concatenate([cut, covered]), np.concatenate([corners[by], borders])
-    whole = np.ones(len(faces), np.bool_)
-    whole[cut] = False
-    number = np.cumsum(~whole) - 1
-    pieces, owner = _cut_up(corners[~whole], number[cut], knives)
+    uncut = np.ones(len(faces), np.bool_)
+    uncut[cut] = False
+    number = np.cumsum(~uncut) - 1
+    pieces, owner = _cut_up(corners[~uncut], number[cut], knives)
     edges = pieces - np.roll(pieces, 1, axis=1)
     longest = np.linalg.norm(edges, axis=2).max(axis=1)
     thick = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) > _MIN_THICKNESS * longest
-    owner = np.concatenate([np.flatnonzero(whole), np.flatnonzero(~whole)[owner[thick]]])
-    return np.concatenate([corners[whole], pieces[thick]]), owner
+    owner = np.concatenate([np.flatnonzero(uncut), np.flatnonzero(~uncut)[owner[thick]]])
+    return np.concatenate([corners[uncut], pieces[thick]]), owner
 
 
 def separates_levels(
@@ -93,16 +93,17 @@ def windings_of_sides(
     """(k,), (k,): the winding numbers in front of triangles, the side from which they run
     counter-clockwise, and behind them.
 
-    A ray along the normal of each counts the crossings ahead of a point of the triangle, and those
-    ahead of a point just behind it: so the triangles in the same place are passed all at once.
+    A ray along the normal of each triangle counts the crossings ahead of a point of the triangle,
+    and the crossings ahead of a point just behind it: so coincident triangles are passed all at
+    once.
     """
     backend = rays.tree.backend
     a, b, c = np.moveaxis(pieces, 1, 0)
     normal = np.cross(b - a, c - a)
     length = np.linalg.norm(normal, axis=1, keepdims=True)
     normal = np.where(length > 0, normal / np.where(length > 0, length, 1), [0.0, 0.0, 1.0])
-    place = shares[0] * a + shares[1] * b + shares[2] * c
-    frame = RayFrame.along(backend, to_vector3(backend, place), to_vector3(backend, normal))
+    points = shares[0] * a + shares[1] * b + shares[2] * c
+    frame = RayFrame.along(backend, to_vector3(backend, points), to_vector3(backend, normal))
     front, back = (
         to_numpy(rays.signed_crossings_ahead(frame, backend.Float(dr.opaque(backend.Float, t))))
         for t in (_COINCIDENT, -_COINCIDENT)
@@ -113,7 +114,7 @@ def windings_of_sides(
 def _crossing_faces(
     rays: TriangleTree, vertices: FloatArray, faces: IntArray
 ) -> tuple[IntArray, IntArray]:
-    """Pairs of faces (k,), (k,) that pass through one another, each both ways round."""
+    """Pairs of faces (k,), (k,) that pass through one another, each in both orders."""
     ends = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     edges, edge = np.unique(ends, axis=0, return_inverse=True)
     edge = edge.reshape(-1)
@@ -122,14 +123,14 @@ def _crossing_faces(
     crossed, crossing = _crossings_of_edges(rays, vertices, faces, edges)
     count = first[crossed + 1] - first[crossed]
     rows = np.repeat(first[crossed], count) + _ranks_in_groups(count)
-    one, other = beside[rows], np.repeat(crossing, count)
-    pairs = np.concatenate([np.column_stack([one, other]), np.column_stack([other, one])])
+    passing, passed = beside[rows], np.repeat(crossing, count)
+    pairs = np.concatenate([np.column_stack([passing, passed]), np.column_stack([passed, passing])])
     pairs = np.unique(pairs[pairs[:, 0] != pairs[:, 1]], axis=0)
     return pairs[:, 0], pairs[:, 1]
 
 
 def _ranks_in_groups(count: IntArray) -> IntArray:
-    """0, 1, .. for each of the counts in turn."""
+    """The concatenation of 0, 1, .., n - 1 for the counts n in turn."""
     first = np.cumsum(count) - count
     return cast("IntArray", np.arange(int(count.sum())) - np.repeat(first, count))
 
@@ -137,21 +138,21 @@ def _ranks_in_groups(count: IntArray) -> IntArray:
 def _crossings_of_edges(
     rays: TriangleTree, vertices: FloatArray, faces: IntArray, edges: IntArray
 ) -> tuple[IntArray, IntArray]:
-    """Which edges (m, 2) cross which faces that have neither end, or meet their borders: indices of
-    both."""
+    """The indices of edges (m, 2) and of faces without their ends that they cross, or whose borders
+    they meet."""
     backend = rays.tree.backend
-    corner = [upload_integers(backend, one) for one in faces.T]
-    way = vertices[edges[:, 1]] - vertices[edges[:, 0]]
-    length = np.linalg.norm(way, axis=1)
+    corner = [upload_integers(backend, ids) for ids in faces.T]
+    span = vertices[edges[:, 1]] - vertices[edges[:, 0]]
+    length = np.linalg.norm(span, axis=1)
     rows = np.flatnonzero(length > 0)
     after_t, after_n = np.full(len(edges), -_COINCIDENT), np.full(len(edges), NO_TRIANGLE, np.int64)
-    found: list[tuple[IntArray, IntArray]] = []
+    batches: list[tuple[IntArray, IntArray]] = []
     while len(rows):
         o = to_vector3(backend, vertices[edges[rows, 0]])
-        d = to_vector3(backend, way[rows] / length[rows, None])
+        d = to_vector3(backend, span[rows] / length[rows, None])
         frame = RayFrame.along(backend, o, d)
         end = backend.Float(length[rows] + _COINCIDENT)
-        p, q = (upload_integers(backend, one) for one in edges[rows].T)
+        p, q = (upload_integers(backend, ids) for ids in edges[rows].T)
 
         after = backend.Float(after_t[rows]), upload_integers(backend, after_n[rows])
         t, n = _next_foreign_crossing(rays, corner, frame, (p, q), end, after)
@@ -159,30 +160,30 @@ def _crossings_of_edges(
         hit = number != NO_TRIANGLE
         after_t[rows], after_n[rows] = to_numpy(t), number
         rows, number = rows[hit], number[hit]
-        found.append((rows, number))
-    return np.concatenate([one for one, _ in found]), np.concatenate([one for _, one in found])
+        batches.append((rows, number))
+    return np.concatenate([ids for ids, _ in batches]), np.concatenate([ids for _, ids in batches])
 
 
 def _next_foreign_crossing(
     rays: TriangleTree, corner: list[Any], frame: RayFrame, ends: tuple[Any, Any], end: Any,
     after: tuple[Any, Any],
 ) -> tuple[Any, Any]:  # fmt: skip
-    """The first crossing of rays behind another one with a face that has neither of two vertices;
-    corner: those of the faces."""
+    """The first crossing of rays after the crossing `after` with a face that has neither of two
+    vertices; corner: the corners of the faces."""
     index = rays.tree.backend.UInt32
 
     def body(t: Any, n: Any, active: Any) -> tuple[Any, ...]:
         t, n, _, _ = rays.next_crossing(frame, (t, n), end, active, _COINCIDENT)
-        known = active & (n != NO_TRIANGLE)
-        ours = [dr.gather(index, one, n, known) for one in corner]
-        return t, n, known & dr.any([(one == ends[0]) | (one == ends[1]) for one in ours])
+        hit = active & (n != NO_TRIANGLE)
+        corners = [dr.gather(index, vertex, n, hit) for vertex in corner]
+        return t, n, hit & dr.any([(vertex == ends[0]) | (vertex == ends[1]) for vertex in corners])
 
-    def more(t: Any, n: Any, active: Any) -> Any:
+    def is_running(t: Any, n: Any, active: Any) -> Any:
         del t, n
         return active
 
     start = (*after, rays.tree.backend.Bool(True))
-    return dr.while_loop(start, more, body, label="crossings of edges")[:2]
+    return dr.while_loop(start, is_running, body, label="crossings of edges")[:2]
 
 
 def _cut_up(pieces: FloatArray, rows: IntArray, knives: FloatArray) -> tuple[FloatArray, IntArray]:
@@ -190,11 +191,11 @@ def _cut_up(pieces: FloatArray, rows: IntArray, knives: FloatArray) -> tuple[Flo
     (k, 3, 3); and the triangle that each is a piece of.
 
     In each round every piece is cut by a knife that meets it, the middle of its list, and its parts
-    share the remaining knives: so their number falls by about half.
+    share the remaining knives: so the number of knives falls by about half.
     """
     done: list[FloatArray] = []
     owners: list[IntArray] = []
-    by, whole = np.arange(len(knives)), np.arange(len(pieces))
+    by, source = np.arange(len(knives)), np.arange(len(pieces))
     while True:
         height = _heights(pieces[rows], knives[by])
         height[np.abs(height) < _COINCIDENT] = 0
@@ -204,39 +205,40 @@ def _cut_up(pieces: FloatArray, rows: IntArray, knives: FloatArray) -> tuple[Flo
         is_cut = np.zeros(len(pieces), np.bool_)
         is_cut[rows] = True
         done.append(pieces[~is_cut])
-        owners.append(whole[~is_cut])
+        owners.append(source[~is_cut])
         if not len(rows):
             return np.concatenate(done), np.concatenate(owners)
         order = np.argsort(rows, kind="stable")
         rows, by, height = rows[order], by[order], height[order]
         owner, first, count = np.unique(rows, return_index=True, return_counts=True)
         middle = first + count // 2
-        left = np.ones(len(rows), np.bool_)
-        left[middle] = False
-        pieces, whole = _parts(pieces[owner], height[middle]), np.tile(whole[owner], 3)
-        rest = np.searchsorted(owner, rows[left])
-        rows = (rest[:, None] + len(owner) * np.arange(3)).ravel()
-        by = np.repeat(by[left], 3)
+        remaining = np.ones(len(rows), np.bool_)
+        remaining[middle] = False
+        pieces, source = _parts(pieces[owner], height[middle]), np.tile(source[owner], 3)
+        targets = np.searchsorted(owner, rows[remaining])
+        rows = (targets[:, None] + len(owner) * np.arange(3)).ravel()
+        by = np.repeat(by[remaining], 3)
 
 
 def _parts(pieces: FloatArray, height: FloatArray) -> FloatArray:
-    """Triangles (3 k, 3, 3) that triangles fall into at a plane above which their corners have
-    heights (k, 3): one on one side and two on the other."""
-    # The corner that is alone on its side comes first; one in the plane goes with another.
+    """The triangles (3 k, 3, 3) into which a plane cuts triangles whose corners have heights (k, 3)
+    above it: one on one side and two on the other."""
+    # The corner that is alone on its side comes first; a corner in the plane belongs to the side of
+    # another corner.
     side = np.where(height > 0, 1, -1)
     side = np.where((height == 0), np.where(side.sum(axis=1) > 0, 1, -1)[:, None], side)
     minority = np.where(side.sum(axis=1) > 0, -1, 1)
     alone = (side == minority[:, None]).argmax(axis=1)
-    turn = (alone[:, None] + np.arange(3)) % 3
-    a, b, c = np.moveaxis(np.take_along_axis(pieces, turn[:, :, None], axis=1), 1, 0)
-    h = np.take_along_axis(height, turn, axis=1)
+    order = (alone[:, None] + np.arange(3)) % 3
+    a, b, c = np.moveaxis(np.take_along_axis(pieces, order[:, :, None], axis=1), 1, 0)
+    h = np.take_along_axis(height, order, axis=1)
     p = a + (h[:, 0] / (h[:, 0] - h[:, 1]))[:, None] * (b - a)
     q = a + (h[:, 0] / (h[:, 0] - h[:, 2]))[:, None] * (c - a)
     return np.concatenate([np.stack(part, axis=1) for part in ((a, p, q), (p, b, c), (p, c, q))])
 
 
 def _heights(pieces: FloatArray, knives: FloatArray) -> FloatArray:
-    """(k, 3) of corners of triangles above the planes of others."""
+    """(k, 3) the heights of corners of triangles above the planes of knives."""
     a, b, c = np.moveaxis(knives, 1, 0)
     normal = np.cross(b - a, c - a)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
@@ -251,21 +253,21 @@ def _cut_meets_triangle(pieces: FloatArray, height: FloatArray, knives: FloatArr
     for i, j in ((0, 1), (1, 2), (2, 0)):
         hi, hj = height[:, i], height[:, j]
         crosses = (hi * hj < 0) | ((hi == 0) ^ (hj == 0))
-        share = np.where(crosses, hi / np.where(crosses, hi - hj, 1), np.nan)
-        ends.append(pieces[:, i] + share[:, None] * (pieces[:, j] - pieces[:, i]))
+        fraction = np.where(crosses, hi / np.where(crosses, hi - hj, 1), np.nan)
+        ends.append(pieces[:, i] + fraction[:, None] * (pieces[:, j] - pieces[:, i]))
     low, high = np.zeros(len(pieces)), np.ones(len(pieces))
     points = np.stack(ends, axis=1)
-    # The two ends: of three places at most two differ.
+    # The two ends: at most two of the three points differ.
     start = np.where(np.isnan(points[:, 0]), points[:, 1], points[:, 0])
     apart = np.nan_to_num(np.linalg.norm(points - start[:, None], axis=2), nan=-1.0)
     end = points[np.arange(len(points)), apart.argmax(axis=1)]
     for p, q in ((a, b), (b, c), (c, a)):
         inward = np.cross(normal, q - p)
         inward /= np.maximum(np.linalg.norm(inward, axis=1, keepdims=True), 1e-300)
-        one, other = (np.einsum("nk,nk->n", x - p, inward) + 1e-9 for x in (start, end))
-        rate = other - one
-        root = -one / np.where(rate == 0, 1, rate)
+        at_start, at_end = (np.einsum("nk,nk->n", x - p, inward) + 1e-9 for x in (start, end))
+        rate = at_end - at_start
+        root = -at_start / np.where(rate == 0, 1, rate)
         low = np.where(rate > 0, np.maximum(low, root), low)
         high = np.where(rate < 0, np.minimum(high, root), high)
-        high = np.where((rate == 0) & (one < 0), -1.0, high)
+        high = np.where((rate == 0) & (at_start < 0), -1.0, high)
     return low <= high

@@ -29,7 +29,7 @@ from harnack.tree.balanced_tree import (
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
 
-    # A point across a ray (u, v) and along it.
+    # The coordinates of a point: (u, v) across a ray, and the depth along it.
     RayCoordinates: TypeAlias = tuple[Real, Real, Real]
 
 # Columns of a record; 0 to 8 are the corners.
@@ -161,7 +161,7 @@ class VerticalRayFrame:
 
 
 def _flush_tiny(u: Real) -> Real:
-    """A coordinate across a ray, with 0 for one so small that a product of two could underflow.
+    """A coordinate across a ray; 0 if it is so small that a product of two could underflow.
 
     Such a coordinate is far smaller than the rounding error of a vertex.
     """
@@ -231,26 +231,26 @@ class TriangleTree:
             return open_, for_each_primitive(node, open_ & node.is_leaf, nearer, state)
 
         def nearer(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
-            best, number, turn, normal = state
-            t, here = signed_crossing(row, frame)
+            best, number, sign, normal = state
+            t, new_sign = signed_crossing(row, frame)
             n = index(fmax(row[NUMBER_COLUMN], real(0)))
             later = (t > t_after) | ((t == t_after) & (n > n_after) & (n_after != NO_TRIANGLE))
             first = (t < best) | ((t == best) & (n < number))
-            passed = here != 0
+            passed = new_sign != 0
             if reach > 0:
                 within = (t > 2 * reach) & (t < t_max - 2 * reach)
                 passed |= within & _is_beside(row, frame, reach)
-            taken = active & passed & later & first & (t <= t_max)
+            chosen = active & passed & later & first & (t <= t_max)
             return (
-                dr.select(taken, t, best),
-                dr.select(taken, n, number),
-                dr.select(taken, here, turn),
-                dr.select(taken, normal_of(row, vector), normal),
+                dr.select(chosen, t, best),
+                dr.select(chosen, n, number),
+                dr.select(chosen, new_sign, sign),
+                dr.select(chosen, normal_of(row, vector), normal),
             )
 
         start = (real(dr.inf), index(NO_TRIANGLE), real(0), vector(0))
-        best, number, turn, normal = traverse(self.tree, visit, start, active)
-        return best, number, turn, normal * dr.rsqrt(fmax(dr.squared_norm(normal), real(1e-37)))
+        best, number, sign, normal = traverse(self.tree, visit, start, active)
+        return best, number, sign, normal * dr.rsqrt(fmax(dr.squared_norm(normal), real(1e-37)))
 
     def signed_crossings_ahead(self, frame: RayFrame, t_min: Real, active: Mask = True) -> Real:
         """The sum of the signs of all crossings with t > t_min."""
@@ -261,8 +261,8 @@ class TriangleTree:
             return open_, for_each_primitive(node, open_ & node.is_leaf, add, state)
 
         def add(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
-            t, turn = signed_crossing(row, frame)
-            return (state[0] + dr.select(active & (t > t_min), turn, 0),)
+            t, sign = signed_crossing(row, frame)
+            return (state[0] + dr.select(active & (t > t_min), sign, 0),)
 
         return traverse(self.tree, visit, (real(0),), active)[0]
 
@@ -273,9 +273,9 @@ class TriangleTree:
 
         unit: the rounding of a coordinate.
 
-        A computed t belongs to a point of the triangle within a few units of the ray, so that it is
-        off by that over the cosine between ray and normal. Where t may therefore lie on either side
-        of an end, the sum is not certain.
+        A computed t belongs to a point of the triangle within a few units of the ray, so that its
+        error is that distance over the cosine between ray and normal. Where t may therefore lie on
+        either side of an end, the sum is not certain.
         """
         real, inside = self.tree.backend.Float, self._slab_test(frame)
 
@@ -284,20 +284,20 @@ class TriangleTree:
             return open_, for_each_primitive(node, open_ & node.is_leaf, add, state)
 
         def add(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
-            turns, sure = state
-            t, turn = signed_crossing(row, frame)
+            total, sure = state
+            t, sign = signed_crossing(row, frame)
             normal = normal_of(row, self.tree.backend.Array3f)
-            steep, off = (
+            steep, error = (
                 dr.abs(dr.dot(normal, frame.d)),
                 _UNCERTAIN_ROUNDINGS * unit * dr.norm(normal),
             )
-            clear = (dr.abs(t) * steep > off) & (dr.abs(t - end) * steep > off)
+            clear = (dr.abs(t) * steep > error) & (dr.abs(t - end) * steep > error)
             between = active & (t > 0) & (t < end)
-            return turns + dr.select(between, turn, 0), sure & (clear | (turn == 0) | ~active)
+            return total + dr.select(between, sign, 0), sure & (clear | (sign == 0) | ~active)
 
         start = real(0), self.tree.backend.Bool(active)
-        turns, sure = traverse(self.tree, visit, start, active)
-        return turns, sure
+        total, sure = traverse(self.tree, visit, start, active)
+        return total, sure
 
     def signed_crossings_vertical(self, x: Vec3, way: Real, active: Mask = True) -> Real:
         """The sum of the signs of all crossings of rays from x upwards (way 1) or downwards (-1)
@@ -320,8 +320,8 @@ class TriangleTree:
             return open_, for_each_primitive(node, open_ & node.is_leaf, add, state)
 
         def add(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
-            t, turn = signed_crossing(row, VerticalRayFrame(x))
-            return (state[0] + dr.select(active & (way * t > 0), turn, 0),)
+            t, sign = signed_crossing(row, VerticalRayFrame(x))
+            return (state[0] + dr.select(active & (way * t > 0), sign, 0),)
 
         return traverse(self.tree, visit, (real(0),), active)[0]
 
@@ -343,8 +343,8 @@ class TriangleTree:
             a, b = (low - o) * inverse, (high - o) * inverse
             near = fmax(fmax(fmin(a.x, b.x), fmin(a.y, b.y)), fmin(a.z, b.z))
             far = fmin(fmin(fmax(a.x, b.x), fmax(a.y, b.y)), fmax(a.z, b.z))
-            slack = 8 * backend.machine_epsilon * dr.abs(far) + pad
-            return (near <= far + slack) & (far + slack >= t_min) & (near - slack <= t_max)
+            margin = 8 * backend.machine_epsilon * dr.abs(far) + pad
+            return (near <= far + margin) & (far + margin >= t_min) & (near - margin <= t_max)
 
         return inside
 
@@ -386,25 +386,25 @@ def signed_crossing(row: list[Real], frame: RayFrame | VerticalRayFrame) -> tupl
             from_up & ~to_up & (left < 0), one, 0
         )
 
-    turn = row[PARITY_COLUMN] * (
+    sign = row[PARITY_COLUMN] * (
         upwards(up_a, up_b, ab) + upwards(up_b, up_c, bc) - upwards(up_a, up_c, ac)
     )
     a, b, c = (*a, frame.depth(p)), (*b, frame.depth(q)), (*c, frame.depth(r))
     close = _EDGE_ROUNDINGS * float(dr.epsilon(frame.o)) * (1 + dr.max(dr.abs(frame.o)))
-    return _crossing_depth((a, b, c), (ab, bc, ac), close), turn
+    return _crossing_depth((a, b, c), (ab, bc, ac), close), sign
 
 
 def _is_beside(row: list[Real], frame: RayFrame, reach: float) -> Mask:
-    """Whether the line of a ray is as near as `reach` to the border of a record's triangle. (What
-    `signed_crossing` computes as well is computed once.)"""
+    """Whether the line of a ray is as near as `reach` to the border of a record's triangle. (Terms
+    that `signed_crossing` computes as well are computed once.)"""
     p, q, r = corners_of(row, type(frame.o))
     a, b, c = frame.transverse(p), frame.transverse(q), frame.transverse(r)
     near: Mask = False
     zero = type(a[0])(0)
-    for one, other in ((a, b), (b, c), (a, c)):
-        left, square = edge_function(one, other), _square((*one, zero), (*other, zero))
-        share = -dr.fma(one[0], other[0] - one[0], one[1] * (other[1] - one[1])) / square
-        near |= (left * left <= reach * reach * square) & (share > 0) & (share < 1)
+    for start, end in ((a, b), (b, c), (a, c)):
+        area, square = edge_function(start, end), _square((*start, zero), (*end, zero))
+        t = -dr.fma(start[0], end[0] - start[0], start[1] * (end[1] - start[1])) / square
+        near |= (area * area <= reach * reach * square) & (t > 0) & (t < 1)
     for u, v in (a, b, c):
         near |= dr.fma(u, u, v * v) <= reach * reach
     return near
@@ -419,8 +419,8 @@ def _crossing_depth(
 
     corners: (u, v, depth) of each, in the frame of the ray. sides: `edge_function` of the edges.
 
-    The barycentric weight of a corner is an area divided by that of the triangle, which is all
-    rounding where the triangle is thin. So the weight w of the corner off the longest edge is
+    The barycentric weight of a corner is an area divided by that of the triangle, which is only
+    rounding error where the triangle is thin. So the weight w of the corner off the longest edge is
     clamped to the range that the ray's coordinate along that edge allows, and the coordinate s of
     the point on the edge is then chosen for w: the ray is at s + w s', with s' the coordinate of
     that corner, 0 <= s <= 1 - w, and coordinates along the longest edge are accurate. A wrong w
@@ -439,25 +439,25 @@ def _crossing_depth(
         return dr.select(is_first, first, dr.select(is_last, last, second))
 
     start, end, apex = (
-        tuple(of_longest(*some) for some in zip(*choice, strict=True))
+        tuple(of_longest(*numbers) for numbers in zip(*choice, strict=True))
         for choice in ((a, b, a), (b, c, c), (c, a, b))
     )
     e = end[0] - start[0], end[1] - start[1]
     share = dr.rcp(of_longest(*squares))
-    here = -dr.fma(start[0], e[0], start[1] * e[1]) * share
+    along = -dr.fma(start[0], e[0], start[1] * e[1]) * share
     aside = dr.fma(apex[0] - start[0], e[0], (apex[1] - start[1]) * e[1]) * share
     zero = type(ab)(0)
-    here, aside = clamp(here, zero, 1), clamp(aside, zero, 1)
-    most = fmin((1 - here) / (1 - aside), fmin(here / aside, type(ab)(1)))
-    w = clamp(of_longest(ab, bc, -ac) / (bc - ac + ab), zero, most)
-    s = clamp(dr.fma(-w, aside, here), zero, 1 - w)
+    along, aside = clamp(along, zero, 1), clamp(aside, zero, 1)
+    max_w = fmin((1 - along) / (1 - aside), fmin(along / aside, type(ab)(1)))
+    w = clamp(of_longest(ab, bc, -ac) / (bc - ac + ab), zero, max_w)
+    s = clamp(dr.fma(-w, aside, along), zero, 1 - w)
     t = dr.fma(s, end[2] - start[2], dr.fma(w, apex[2] - start[2], start[2]))
     near = close * close
-    for (one, other), side_, square in zip(
+    for (tail, head), side_, square in zip(
         ((a, b), (b, c), (a, c)), (ab, bc, ac), squares, strict=True
     ):
-        share = -dr.fma(one[0], other[0] - one[0], one[1] * (other[1] - one[1])) / square
-        at = dr.fma(clamp(share, zero, 1), other[2] - one[2], one[2])
+        share = -dr.fma(tail[0], head[0] - tail[0], tail[1] * (head[1] - tail[1])) / square
+        at = dr.fma(clamp(share, zero, 1), head[2] - tail[2], tail[2])
         beside = (side_ * side_ <= near * square) & (share > 0) & (share < 1)
         t = dr.select(beside, at, t)
     for u, v, depth in corners:
