@@ -241,10 +241,7 @@ class Extrusion(Solid):
             p = cast("Any", type(p))(*taper.preimage(p.x, p.y, p.z))
         if twist is not None:
             turn, reach = twist.preimage_lipschitz(p)
-            constant, radius = (
-                constant * turn,
-                fmin(radius, reach / constant * (1 - 1e-5)),
-            )
+            constant, radius = (constant * turn, fmin(radius, reach / constant * (1 - 1e-5)))
         return constant, radius
 
 
@@ -301,10 +298,7 @@ class ExtrusionEnclosure(Enclosure):
         )
         down = fmax(gaps.below, self._fall(gaps.below - below))
         aside = gaps.below - beside
-        down = fmax(
-            dr.select(aside > 0, self.side.free_length(LevelGaps(aside, inf)), 0),
-            down,
-        )
+        down = fmax(dr.select(aside > 0, self.side.free_length(LevelGaps(aside, inf)), 0), down)
         inside = self.value + gaps.above + self.error <= 0  # also for unrounded numbers
         error = 2 * self.error
         up = fmin(

@@ -298,11 +298,7 @@ class _MeshData(UnitFrame):
         corners = self.corners.read_record(closest.triangle, closest.triangle != NO_TRIANGLE)
         offsets = [vector(*corners[k : k + 3]) - (x + closest.offset) for k in (0, 3, 6)]
         rounding = _ROUNDING * self.backend.machine_epsilon * (1 + dr.max(dr.abs(x)))
-        at_vertex, along, least = (
-            self.backend.Bool(False),
-            vector(0),
-            self.backend.Float(dr.inf),
-        )
+        at_vertex, along, least = (self.backend.Bool(False), vector(0), self.backend.Float(dr.inf))
         for a, b in ((0, 1), (1, 2), (2, 0)):
             edge = offsets[b] - offsets[a]
             length = dr.norm(edge)

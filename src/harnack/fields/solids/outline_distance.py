@@ -101,12 +101,7 @@ class OutlineEdges:
         start, end = (array.astype(backend.dtype).astype(np.float64) for array in (start, end))
         square = ((end - start) ** 2).sum(axis=1)
         keep = square > 0
-        start, end, square, loop = (
-            start[keep],
-            end[keep],
-            square[keep],
-            loop[keep],
-        )
+        start, end, square, loop = (start[keep], end[keep], square[keep], loop[keep])
         rows = np.column_stack([start, end, 1.0 / square])
         chains = None
         if len(rows) >= _MANY:
