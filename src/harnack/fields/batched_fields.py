@@ -118,16 +118,16 @@ class PointValues:
     def rescaled(self, size: Real) -> PointValues:
         """The values of x -> f(x / size) at `size` times the points. Where a number has overflowed
         its error is infinite."""
-        gradient, hessian, share = self.gradient, self.hessian, 1 / size
+        gradient, hessian, inverse = self.gradient, self.hessian, 1 / size
         gradient_error, hessian_error = self.gradient_error, self.hessian_error
         if gradient is not None:
-            gradient = gradient * share
-            known = dr.isfinite(gradient.x) & dr.isfinite(gradient.y) & dr.isfinite(gradient.z)
-            gradient_error = dr.select(known, gradient_error * share, dr.inf)
+            gradient = gradient * inverse
+            is_finite = dr.isfinite(gradient.x) & dr.isfinite(gradient.y) & dr.isfinite(gradient.z)
+            gradient_error = dr.select(is_finite, gradient_error * inverse, dr.inf)
         if hessian is not None:
-            hessian = type(hessian)(*(share * share * one for one in hessian.components()))
-            known = dr.isfinite(sum(hessian.components()))
-            hessian_error = dr.select(known, hessian_error * (share * share), dr.inf)
+            hessian = type(hessian)(*(inverse * inverse * entry for entry in hessian.components()))
+            is_finite = dr.isfinite(sum(hessian.components()))
+            hessian_error = dr.select(is_finite, hessian_error * (inverse * inverse), dr.inf)
         error = dr.select(dr.isfinite(self.value), self.error, dr.inf)
         return PointValues(self.value, error, gradient, hessian, gradient_error, hessian_error)
 
@@ -236,12 +236,15 @@ class BatchedField(Field):
         points: Any,
         precision: Precision,
         derivatives: int,
-        wanted: Callable[[PointValues], tuple[Any, ...]],
+        choose: Callable[[PointValues], tuple[Any, ...]],
     ) -> tuple[FloatArray, ...]:
+        """The arrays that `choose` takes from the values at points, with this number of
+        derivatives."""
+
         def kernel(backend: Backend, x: Vec3) -> tuple[Any, ...]:
             del backend
             sharp = derivatives == 1
-            return wanted(self.sharp_values_at(x) if sharp else self.values_at(x, derivatives))
+            return choose(self.sharp_values_at(x) if sharp else self.values_at(x, derivatives))
 
         return evaluate_points(points, kernel, precision)
 
@@ -355,12 +358,12 @@ def cached_prepare(prepare: Prepare) -> Prepare:
     Fields with parameters are uploaded at each call: a parameter may change in place, and its
     derivatives belong to a single trace.
     """
-    kept: defaultdict[Backend, FieldCache[Field]] = defaultdict(FieldCache)
+    caches: defaultdict[Backend, FieldCache[Field]] = defaultdict(FieldCache)
 
     @functools.wraps(prepare)
-    def once(self: Field, backend: Backend) -> Field:
+    def cached(self: Field, backend: Backend) -> Field:
         if self.parameters():
             return prepare(self, backend)
-        return kept[backend].get(self, None, lambda: prepare(self, backend))
+        return caches[backend].get(self, None, lambda: prepare(self, backend))
 
-    return cast("Prepare", once)
+    return cast("Prepare", cached)

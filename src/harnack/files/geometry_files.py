@@ -333,13 +333,16 @@ def _interpret_faces(
 
 
 def _polygons(contents: FileGeometry) -> LoadedPolygons:
+    """The polygons of a file with three corners or more, each to be spanned by a surface."""
     sizes = contents.faces.sizes
-    end, wide = np.cumsum(sizes), np.flatnonzero(sizes >= 3)
-    kept = [contents.faces.corners[end[k] - sizes[k] : end[k]] for k in wide]
-    few, many = min(map(len, kept)), max(map(len, kept))
-    corners = f"{few}" if few == many else f"{few} to {many}"
-    said = f"{len(kept):,} polygons of {corners} corners, each spanned by a surface, as asked"
-    return LoadedPolygons(contents.vertices, kept, said)
+    ends, indices = np.cumsum(sizes), np.flatnonzero(sizes >= 3)
+    polygons = [contents.faces.corners[ends[k] - sizes[k] : ends[k]] for k in indices]
+    min_corners, max_corners = min(map(len, polygons)), max(map(len, polygons))
+    corners = f"{min_corners}" if min_corners == max_corners else f"{min_corners} to {max_corners}"
+    summary = (
+        f"{len(polygons):,} polygons of {corners} corners, each spanned by a surface, as asked"
+    )
+    return LoadedPolygons(contents.vertices, polygons, summary)
 
 
 def _looks_like_curves(contents: FileGeometry) -> bool:
@@ -359,65 +362,79 @@ def _looks_like_curves(contents: FileGeometry) -> bool:
 
 
 def _mesh(contents: FileGeometry) -> LoadedMesh:
-    found = triangulate(contents.vertices, contents.faces.corners, contents.faces.sizes)
-    vertices, faces = without_zero_area_faces(contents.vertices, found)
-    flat = found[zero_area_faces(vertices, found)]
+    """The triangle mesh of a file's faces, with a summary of what was read.
+
+    Raises:
+        MeshError: the faces cancel each other.
+    """
+    triangles = triangulate(contents.vertices, contents.faces.corners, contents.faces.sizes)
+    vertices, faces = without_zero_area_faces(contents.vertices, triangles)
+    zero_area = triangles[zero_area_faces(vertices, triangles)]
     welded = Welded.of(vertices, faces)
     net, edges = welded.net, welded.edges
     if not len(net.faces):
         raise MeshError(f"its {len(faces):,} faces cancel each other: there is no surface")
     count = f"{len(faces):,} triangles"
     if len(edges) == 0:
-        said = f"{count} without singular edges: a closed mesh"
-        middle = vertices.mean(axis=0)
-        if np.linalg.det(vertices[faces] - middle).sum() < 0.0:
-            said += ", whose faces look inward (the winding number inside is negative)"
+        summary = f"{count} without singular edges: a closed mesh"
+        center = vertices.mean(axis=0)
+        if np.linalg.det(vertices[faces] - center).sum() < 0.0:
+            summary += ", whose faces look inward (the winding number inside is negative)"
     elif len(edges) >= len(faces):
-        said = f"{count}, {len(edges):,} singular edges: a triangle soup"
+        summary = f"{count}, {len(edges):,} singular edges: a triangle soup"
     else:
-        said = f"{count}, {len(edges):,} singular edges: a mesh with holes or faces turned round"
+        summary = f"{count}, {len(edges):,} singular edges: a mesh with holes or faces turned round"
     if welded.rounded:
         vertices = vertices[welded.index]
-        said += f"; {welded.rounded:,} corners joined with others that were apart by rounding"
-    if len(found) > len(faces):
-        said += f"; {len(found) - len(faces):,} of zero area left out"
+        summary += f"; {welded.rounded:,} corners joined with others that were apart by rounding"
+    if len(triangles) > len(faces):
+        summary += f"; {len(triangles) - len(faces):,} of zero area left out"
     if len(faces) > len(net.faces):
-        said += f"; {len(faces) - len(net.faces):,} are added to or canceled by others"
+        summary += f"; {len(faces) - len(net.faces):,} are added to or canceled by others"
     if len(contents.polylines):
-        said += "; polylines not used"
-    return LoadedMesh(vertices, faces, said, flat, welded.rounded)
+        summary += "; polylines not used"
+    return LoadedMesh(vertices, faces, summary, zero_area, welded.rounded)
 
 
 def _mesh_to_cloud(mesh: LoadedMesh) -> LoadedCloud:
+    """The triangles of a mesh as a cloud of points, with their normals and areas."""
     corners = mesh.vertices[mesh.faces]
     normal = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(normal, axis=1)
-    said = f"{len(area):,} triangles, each taken as a point with its normal and area, as asked"
-    return LoadedCloud(corners.mean(axis=1), normal / area[:, None], area, said)
+    summary = f"{len(area):,} triangles, each taken as a point with its normal and area, as asked"
+    return LoadedCloud(corners.mean(axis=1), normal / area[:, None], area, summary)
 
 
 def _mesh_to_boundary(path: Path, mesh: LoadedMesh) -> LoadedCurves:
+    """The boundary of a mesh's faces as loops.
+
+    Raises:
+        FileFormatError: the faces have no boundary, or it is not a valid curve.
+    """
     edges, weights = singular_edges(weld_vertices(mesh.vertices)[mesh.faces])
     if not len(edges):
         raise FileLocation(path).error(
             'its faces form a closed surface, which has no boundary: it cannot be taken as "loops"'
         )
     try:
-        joined = singular_loops(edges, weights)
-        loops = validate_loops([mesh.vertices[loop] for loop in joined])
+        closed = singular_loops(edges, weights)
+        loops = validate_loops([mesh.vertices[loop] for loop in closed])
     except CurveError as error:
         raise FileLocation(path).error(str(error)) from error
     noun = "loop" if len(loops) == 1 else "loops"
-    said = f"{len(loops):,} {noun} of {sum(weights):,} edges: the boundary of the faces, as asked"
-    return LoadedCurves(loops, said)
+    summary = (
+        f"{len(loops):,} {noun} of {sum(weights):,} edges: the boundary of the faces, as asked"
+    )
+    return LoadedCurves(loops, summary)
 
 
 def _cloud(contents: FileGeometry) -> LoadedCloud:
+    """The point cloud of a file without faces."""
     points = as_cloud_points(contents.vertices)
     count = f"{len(points):,} points"
     if contents.normals is None:
-        said = f"{count} without faces, and no normals read: a point cloud"
-        return LoadedCloud(points, None, None, said)
+        summary = f"{count} without faces, and no normals read: a point cloud"
+        return LoadedCloud(points, None, None, summary)
     normals = as_unit_normals(contents.normals, len(points))
     return LoadedCloud(points, normals, None, f"{count} with normals, no faces: a point cloud")
 

@@ -198,8 +198,8 @@ def net_faces(faces: IntArray) -> NetFaces:
     descents = (a > b).astype(np.int64) + (b > c) + (c > a)
     sign = np.where(descents == 1, 1, -1)
     if not len(proper):
-        none = np.zeros(0, dtype=np.int64)
-        return NetFaces(none.reshape(0, 3), none, none)
+        empty = np.zeros(0, dtype=np.int64)
+        return NetFaces(empty.reshape(0, 3), empty, empty)
     order, starts = _group_equal_rows(corners.view(np.uint64))
     net = np.add.reduceat(sign[order], starts)
     group_sign = np.repeat(np.sign(net), _lengths(starts, len(order)))
@@ -237,19 +237,19 @@ def net_edges(
     """
     if not len(begin):
         return np.zeros((0, 2), dtype=np.int64), np.zeros(0, dtype=np.int64)
-    low, high = np.minimum(begin, end), np.maximum(begin, end)
+    lower, upper = np.minimum(begin, end), np.maximum(begin, end)
     signed = np.where(begin < end, 1, -1) * np.asarray(weight, dtype=np.int64)
-    count = int(high.max()) + 1
-    keys = low * count + high  # below 2^63: there are at most 10^8 vertices
+    count = int(upper.max()) + 1
+    keys = lower * count + upper  # below 2^63: there are at most 10^8 vertices
     order = np.argsort(keys, kind="stable")
     keys = keys[order]
     starts = np.flatnonzero(np.append(True, keys[1:] != keys[:-1]))
     net = np.add.reduceat(signed[order], starts)
     keys = keys[starts]
-    low, high = keys // count, keys % count
-    singular = (net != 0) & (low != high)
-    low, high, net = low[singular], high[singular], net[singular]
-    begin, end = np.where(net > 0, low, high), np.where(net > 0, high, low)
+    lower, upper = keys // count, keys % count
+    remains = (net != 0) & (lower != upper)
+    lower, upper, net = lower[remains], upper[remains], net[remains]
+    begin, end = np.where(net > 0, lower, upper), np.where(net > 0, upper, lower)
     return np.column_stack([begin, end]), np.abs(net)
 
 

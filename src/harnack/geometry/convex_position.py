@@ -139,20 +139,21 @@ def _widest_gap_direction(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def is_simple(x: FloatArray) -> bool:
-    """Whether edges without a common vertex are MIN_SEPARATION apart, and none folds back."""
+    """Whether edges without a common vertex are MIN_SEPARATION apart, and no edge folds back on its
+    neighbor."""
     count = len(x)
     ends = np.roll(x, -1, axis=0)
     direction = (ends - x) / _edge_lengths(x)[:, None]
     turned = direction + np.roll(direction, -1, axis=0)
     if not np.linalg.norm(turned, axis=1).min() >= MIN_ANGLE:
         return False
-    low, high = np.minimum(x, ends) - MIN_SEPARATION, np.maximum(x, ends)
-    near = np.triu(np.ones((count, count), dtype=np.bool_), k=2)
-    near[0, count - 1] = False
+    lower, upper = np.minimum(x, ends) - MIN_SEPARATION, np.maximum(x, ends)
+    is_near = np.triu(np.ones((count, count), dtype=np.bool_), k=2)
+    is_near[0, count - 1] = False
     for axis in range(3):
-        near &= low[:, None, axis] <= high[None, :, axis]
-        near &= low[None, :, axis] <= high[:, None, axis]
-    first, second = np.nonzero(near)
+        is_near &= lower[:, None, axis] <= upper[None, :, axis]
+        is_near &= lower[None, :, axis] <= upper[:, None, axis]
+    first, second = np.nonzero(is_near)
     for begin in range(0, len(first), 100_000):
         i, j = first[begin : begin + 100_000], second[begin : begin + 100_000]
         clearance = segment_distance_lower_bound(x[i], ends[i], x[j], ends[j])
@@ -312,23 +313,24 @@ def _facet_normals(x: FloatArray) -> FloatArray | None:
 def _order_by_spread(normals: FloatArray) -> FloatArray:
     """The same normals in another order, the first ones far from each other: most rays that miss
     the hull are recognized by a few planes."""
-    order, left = [0], np.full(len(normals), np.inf)
+    order, min_distances = [0], np.full(len(normals), np.inf)
     for _ in range(min(len(normals), _LEADING_PLANES) - 1):
-        left = np.minimum(left, 1.0 - normals @ normals[order[-1]])
-        order.append(int(np.argmax(left)))
-    rest = np.setdiff1d(np.arange(len(normals)), order)
-    return normals[np.concatenate([order, rest]).astype(np.intp)]
+        min_distances = np.minimum(min_distances, 1.0 - normals @ normals[order[-1]])
+        order.append(int(np.argmax(min_distances)))
+    remaining = np.setdiff1d(np.arange(len(normals)), order)
+    return normals[np.concatenate([order, remaining]).astype(np.intp)]
 
 
 def _distinct_normals(normals: FloatArray) -> FloatArray:
-    """One of each group of nearly equal normals, at most MAX_PLANES, and the six axes if cut."""
+    """A normal of each group of nearly equal normals, at most MAX_PLANES groups; with the six axes
+    if the groups are coarser than 9 digits."""
     digits = 9
     while True:
         _, first = np.unique(np.round(normals, digits), axis=0, return_index=True)
         if len(first) <= MAX_PLANES:
             break
         digits -= 1
-    kept = normals[np.sort(first)]
+    distinct = normals[np.sort(first)]
     if digits < 9:
-        kept = np.concatenate([np.eye(3), -np.eye(3), kept])
-    return kept / np.linalg.norm(kept, axis=1, keepdims=True)
+        distinct = np.concatenate([np.eye(3), -np.eye(3), distinct])
+    return distinct / np.linalg.norm(distinct, axis=1, keepdims=True)

@@ -87,7 +87,8 @@ def triangulate(vertices: FloatArray, corners: IntArray, sizes: IntArray) -> Int
 
     vertices: (n, 3).
     corners: the vertex indices of all polygons, one polygon after the other.
-    sizes: (m,) the number of corners of each; polygons with fewer than three give no triangles.
+    sizes: (m,) the number of corners of each polygon; polygons with fewer than three yield no
+        triangles.
 
     A polygon need not be exactly planar: it is judged by its projection along its mean normal. If
     the fans around its first two corners are not valid triangulations, because the polygon is not
@@ -96,37 +97,41 @@ def triangulate(vertices: FloatArray, corners: IntArray, sizes: IntArray) -> Int
     number these still add up to the polygon.
 
     Raises:
-        MeshError: so many non-convex polygons with so many corners that it would take long.
+        MeshError: the triangulation would take too long, because of the number of non-convex
+            polygons and of their corners.
     """
     if (sizes == 3).all():
         return corners.reshape(-1, 3)
     begins = np.cumsum(sizes) - sizes
-    found = [np.zeros((0, 3), dtype=np.int64)]
+    triangles = [np.zeros((0, 3), dtype=np.int64)]
     owners = [np.zeros(0, dtype=np.int64)]
     work = 0
     for part in _group_by_size(sizes):
         k = int(sizes[part[0]])
         polygons = corners[begins[part][:, None] + np.arange(k)]
-        bent = np.zeros(len(part), dtype=bool)
+        is_concave = np.zeros(len(part), dtype=bool)
         if k > 3:
-            bent = _fan_is_invalid(vertices, polygons)
-            # The fan around the second corner is that around the first of the polygon turned on.
-            polygons[bent] = np.roll(polygons[bent], -1, axis=1)
+            is_concave = _fan_is_invalid(vertices, polygons)
+            # The fan around the second corner is the fan around the first corner of the rotated
+            # polygon.
+            polygons[is_concave] = np.roll(polygons[is_concave], -1, axis=1)
             # A quadrilateral can be cut in no other way.
-            bent[bent] = k > 4 and _fan_is_invalid(vertices, polygons[bent])
-        work += int(bent.sum()) * (k * k + _WORK_A_POLYGON)
+            is_concave[is_concave] = k > 4 and _fan_is_invalid(vertices, polygons[is_concave])
+        work += int(is_concave.sum()) * (k * k + _WORK_A_POLYGON)
         if work > _MAX_EAR_WORK:
             raise MeshError(
-                f"{bent.sum():,} polygons with dents and {k:,} corners each take too long to "
+                f"{is_concave.sum():,} polygons with dents and {k:,} corners each take too long to "
                 "triangulate: let the program that made the file triangulate them"
             )
-        found.append(_fans(polygons[~bent]))
-        owners.append(np.repeat(part[~bent], k - 2))
-        projections = _projections(vertices, polygons[bent])
-        for owner, polygon, projection in zip(part[bent], polygons[bent], projections, strict=True):
-            found.append(_clip_ears(polygon, projection))
-            owners.append(np.full(len(found[-1]), owner))
-    return np.concatenate(found)[np.argsort(np.concatenate(owners), kind="stable")]
+        triangles.append(_fans(polygons[~is_concave]))
+        owners.append(np.repeat(part[~is_concave], k - 2))
+        projections = _projections(vertices, polygons[is_concave])
+        for owner, polygon, projection in zip(
+            part[is_concave], polygons[is_concave], projections, strict=True
+        ):
+            triangles.append(_clip_ears(polygon, projection))
+            owners.append(np.full(len(triangles[-1]), owner))
+    return np.concatenate(triangles)[np.argsort(np.concatenate(owners), kind="stable")]
 
 
 def _group_by_size(sizes: IntArray) -> list[IntArray]:
