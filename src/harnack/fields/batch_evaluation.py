@@ -1,4 +1,5 @@
-"""Runs Dr.Jit kernels at many NumPy points, in batches; the results are NumPy arrays."""
+"""Runs Dr.Jit kernels at large numbers of NumPy points, in batches; the results are NumPy
+arrays."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Fields that can be evaluated at many points at once, and caches that live as long as a field.
+"""Fields that can be evaluated at large numbers of points at once, and caches that live as long as
+a field.
 
 - `BatchedField`: values, derivatives and error bounds at NumPy points, as NumPy arrays.
 - `FieldCache`, `cached_prepare`: caches for results that are computed or uploaded once per field.
@@ -96,8 +97,8 @@ class PointValues:
     def with_far_field_errors(self, x: Vec3, terms: int, weight: float) -> PointValues:
         """The same values with error bounds that hold at points far away too.
 
-        x: the points, in coordinates in which the field's data have a size of about one. terms: how
-        many terms were summed up. weight: of all dipoles together.
+        x: the points, in coordinates in which the field's data have a size of about 1. terms: the
+            number of terms summed up. weight: of all dipoles together.
 
         Two errors matter only far away. A term of a derivative is a product of a factor that falls
         like |x|^-5 and one that grows like |x|^2, and the first may underflow. And where dipoles
@@ -133,7 +134,8 @@ class PointValues:
 
 
 class BatchedField(Field):
-    """A field that gives values, derivatives and error bounds at many points at once.
+    """A field that evaluates values, derivatives and error bounds at large numbers of points at
+    once.
 
     Subclasses define `values_at`.
     """
@@ -281,8 +283,8 @@ def sharpened(at: Callable[[Vec3, Real], PointValues], x: Vec3) -> PointValues:
     """Value and gradient at points x by a sum over a tree, the gradient with an error of about 1 %
     of its length.
 
-    at: gives values and gradients at points, with clusters taken as a whole beyond this multiple of
-        the usual distance.
+    at: evaluates values and gradients at points, with clusters expanded beyond this multiple of the
+        usual distance.
 
     Far terms may nearly cancel, as the triangles of a mesh with small holes do. Then the gradient
     is far smaller than the truncation error of its clusters. Bounds of the truncation error add up

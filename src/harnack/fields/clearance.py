@@ -93,7 +93,8 @@ def tight_extent(
 
 
 def _outside(held: ConvexHull, clearance: Clearance) -> Clearance:
-    """The clearance from what lies outside a polytope: inside, the distance to its faces."""
+    """The clearance from the outside of a polytope: for points inside, the distance to its
+    faces."""
 
     def beyond(points: FloatArray) -> FloatArray:
         depth = (held.offsets - points @ held.normals.T).min(axis=1)
@@ -108,7 +109,7 @@ def _outside(held: ConvexHull, clearance: Clearance) -> Clearance:
 def occupied_cells(
     field: Field, levels: tuple[float, ...], extent: Volume, cells_across: int
 ) -> OccupancyGrid:
-    """A grid over an extent, with about so many cells along its longest side."""
+    """A grid over an extent, with about this number of cells along its longest side."""
     return OccupancyGrid.from_clearance(
         *extent.bounds(), clearance_function(field, levels, "single"), cells_across
     )
@@ -255,5 +256,5 @@ def frame_parameters(
 
 
 def coordinate_rounding(x: Vec3) -> Real:
-    """The rounding of a coordinate of x, or of a vertex of size about one."""
+    """The rounding of a coordinate of x, or of a vertex of size about 1."""
     return float(dr.epsilon(x)) * (1 + dr.max(dr.abs(x)))

@@ -36,7 +36,7 @@ _FUNCTIONS: Mapping[str, Callable[..., Any]] = MappingProxyType(
         "min": lambda *several: functools.reduce(arithmetic.minimum, several),
     }
 )  # fmt: skip
-# Functions with several arguments: the least and the largest number of them.
+# Functions of more than one argument: the least and the largest number of arguments.
 _ARGUMENT_COUNTS = {"max": (2, 99), "min": (2, 99), "norm": (2, 3), "atan2": (2, 2)}
 _OPERATORS: Mapping[type[ast.operator], Callable[[Any, Any], Any]] = MappingProxyType(
     {
@@ -53,7 +53,7 @@ _MAX_LENGTH, _MAX_DEPTH = 4000, 200
 
 @dataclass(frozen=True)
 class TextFormula:
-    """f(x, y, z) given as a text, called like any function of three coordinates.
+    """A formula f(x, y, z) as a text. It is called like any function of three coordinates.
 
     text: with + - * / ^ (or **), brackets, numbers, x, y, z, pi, e and the functions above. An
         equation "left = right" means left - right. It is parsed to a tree and never run as Python,
@@ -120,7 +120,8 @@ class TextFormula:
 
 
 def looks_like_formula(text: str) -> bool:
-    """Whether a text looks like a formula: an equation, or with powers, products or functions."""
+    """Whether a text looks like a formula: it is an equation, or has powers, products or
+    functions."""
     return any(sign in text for sign in ("=", "^", "*", "("))
 
 
@@ -236,7 +237,8 @@ def _evaluate_node(node: ast.expr, names: Mapping[str, Any]) -> Any:
 
 
 def _power(base: Any, exponent: Any) -> Any:
-    """base^exponent, with whole exponents as integers: negative numbers have such powers too."""
+    """base^exponent, where exponents without a fraction are integers: negative numbers have such
+    powers too."""
     if isinstance(exponent, float) and exponent.is_integer():
         exponent = int(exponent) if abs(exponent) < 2**31 else exponent
     if isinstance(base, float) and isinstance(exponent, int | float):
@@ -249,11 +251,12 @@ def _power(base: Any, exponent: Any) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Expression(Formula):
-    """f(x, y, z) given as a Python function, written with plain operators and `harnack.sin` etc.
+    """A field f(x, y, z) that is a Python function, written with plain operators and `harnack.sin`
+    etc.
 
     function: called with three coordinates while a kernel is being recorded; numbers in it are
         literals of that kernel.
-    domain: the volume it is drawn in; None for all of space.
+    domain: the volume in which f is drawn; None for all of space.
     """
 
     function: Callable[[Any, Any, Any], Any]
@@ -323,7 +326,7 @@ def expression(
 
 
 def _check_arguments(function: Callable[..., Any]) -> None:
-    """Raise TypeError for what does not take three coordinates."""
+    """Raise TypeError for a function that does not take three coordinates."""
     try:
         signature = inspect.signature(function)
     except (TypeError, ValueError):  # of what is not written in Python nothing may be known

@@ -353,7 +353,7 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         return sample.gradient_error, math.inf
 
     def describe(self) -> dict[str, Any]:
-        """Names and values of choices that the field made by itself, for users who want to know
+        """Names and values of the choices that the field made by itself, for users who need
         them."""
         return {}
 
@@ -371,7 +371,7 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
 
 
 class EvaluateOnly(Field):
-    """A field that is given by its `evaluate` alone, such as the result of `Field.at_accuracy`."""
+    """A field that has only its `evaluate`, such as the result of `Field.at_accuracy`."""
 
     def __init__(self, evaluate: Callable[[Vec3], Sample]) -> None:
         self._evaluate = evaluate

@@ -1,11 +1,11 @@
-"""Fields that are given by a formula of the coordinates: everything else follows from it.
+"""Fields defined by a formula of the coordinates, from which everything else follows.
 
-A formula is evaluated in two ways. Given jets of the coordinates at a point, it returns value and
-gradient with bounds of their rounding; given jets along a piece of a path, it returns ranges of its
+A formula is evaluated in two ways. For jets of the coordinates at a point it returns value and
+gradient with bounds of their rounding. For jets along a piece of a path it returns ranges of its
 derivatives there, from which steps are proved.
 
 A formula's kernel is counted before it is compiled: LLVM's time grows faster than the number of
-operations, so that a warning comes before minutes of silence, and says what to do.
+operations, so that a warning comes before minutes of silence, with a remedy.
 """
 
 from __future__ import annotations
@@ -96,21 +96,23 @@ class Formula(Field):
 
     @property
     def tally(self) -> Tally:
-        """What the formula is made of; of a prepared one, while its numbers were known."""
+        """The operations of the formula, counted; for a prepared formula, counted before it was
+        prepared, while its numbers were known."""
         return tally_of(self.formula) if self._prepared_tally is None else self._prepared_tally
 
     @property
     def is_steep(self) -> bool:
-        """Whether the formula uses what may have a vertical tangent or a pole, or is as steep as
-        one for the rounding of coordinates."""
+        """Whether the formula uses an operation that may have a vertical tangent or a pole, or that
+        is as steep as a pole for the rounding of coordinates."""
         return self.tally.is_steep or self.is_abrupt
 
     @property
     def is_abrupt(self) -> bool:
-        """Whether f may change within the rounding of coordinates by far more than its slopes say.
+        """Whether f may change within the rounding of coordinates by far more than its slopes
+        allow.
 
-        Where a Lipschitz constant is stated, as the library's shapes do, which are about distances,
-        small numbers in a formula are lengths, and only large ones make it abrupt.
+        Where a Lipschitz constant is stated, as for the library's shapes, whose values are about
+        distances, small numbers in a formula are lengths, and only large numbers make it abrupt.
         """
         return self.tally.turns_within(1.0 if self.lipschitz is not None else self.tally.finest)
 
@@ -193,7 +195,7 @@ class Formula(Field):
         return tuple(promises)
 
     def promises(self, p: Vec3) -> tuple[Promise, ...]:
-        """Promises that hold in every direction from p: the Lipschitz constant, if one is known."""
+        """Promises that hold in every direction from p: the Lipschitz constant, if it is known."""
         return () if self.lipschitz is None else (Lipschitz(0 * p.x + self.lipschitz),)
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
@@ -291,7 +293,7 @@ class Formula(Field):
 
 
 def probe_jets() -> tuple[Jet, Jet, Jet]:
-    """Coordinates of some point, to try a formula on when it is made."""
+    """Jets of the coordinates of an arbitrary point, with which a new formula is tested."""
     return Jet.at_point(choose_backend("double").Array3f(0.1, 0.2, 0.3))
 
 
@@ -334,10 +336,10 @@ def is_jet(x: Any, name: str) -> bool:
 
 
 def as_jet(value: Any, like: Jet, name: str) -> Jet:
-    """What a formula returned, as a jet; a constant is one too.
+    """The result of a formula as a jet; a constant becomes a constant jet.
 
     Raises:
-        TypeError: it returned anything else.
+        TypeError: the result is neither a jet nor a constant.
     """
     if isinstance(value, Jet):
         return value
@@ -353,8 +355,8 @@ def as_jet(value: Any, like: Jet, name: str) -> Jet:
 class FormulaOnRay:
     """A formula along the path p + s d.
 
-    before: how far before p its first piece begins. If that is not 0.0, its pieces are of all paths
-        that lead through p up to rounding.
+    before: the distance before p at which its first piece begins. If that is not 0.0, its pieces
+        cover all paths that lead through p up to rounding.
     """
 
     field: Formula
@@ -406,8 +408,8 @@ class FormulaOnRay:
 
 
 def with_device_numbers(field: Any, backend: Backend) -> Any:
-    """A copy of a dataclass whose numbers, and those of fields in it, are kernel parameters of the
-    backend."""
+    """A copy of a dataclass whose numbers, and the numbers of fields in it, are kernel parameters
+    of the backend."""
     other = copy.copy(field)
     for entry in dataclasses.fields(cast("Any", field)) if dataclasses.is_dataclass(field) else ():
         value = getattr(field, entry.name)

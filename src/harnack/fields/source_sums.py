@@ -72,7 +72,7 @@ def dipole_rounding(area: Real, inverse: Real, unit: Real) -> Real:
 
 @dataclass(frozen=True)
 class SourceTerm:
-    """The term of one dipole, edge or far node in the sums of f and of its derivatives.
+    """The term of a dipole, edge or far node in the sums of f and of its derivatives.
 
     Derivatives that were not requested are None. The value of an edge is None, too: its angle is
     added later.
@@ -158,15 +158,15 @@ class SourceSums:
         return 0 if self.gradient is None else 1 if self.hessian is None else 2
 
     def add_term(self, terms: SourceTerm, active: Mask) -> SourceSums:
-        """The sums with terms added where active; what they do not have is 0.
+        """The sums with terms added on active lanes; derivatives that the terms lack count as 0.
 
-        Rounding of the value. Errors of n additions add up like n, if they are all of one sign, as
-        where small terms are lost in a large sum. But what s = fl(a + b) loses is a number of the
-        same precision, and found exactly (Knuth's TwoSum; Higham 2002, Section 4.3): with c = s - a
-        it is (a - (s - c)) + (b - c). It is at most u |s|, u half the distance from 1 to the next
-        number. These numbers are summed in turn, and that sum is off by at most n u times the sum
-        of their absolute values, hence by n u^2 times the sum of all |s|. Up to n = 2^20 terms n u
-        is at most 1/16, and twice that covers the rounding of the bound itself.
+        Rounding of the value. Errors of n additions add up like n, if they all have the same sign,
+        as where small terms are lost in a large sum. But the error of s = fl(a + b) is a number of
+        the same precision, and is computed exactly (Knuth's TwoSum; Higham 2002, Section 4.3): with
+        c = s - a it is (a - (s - c)) + (b - c). It is at most u |s|, u half the distance from 1 to
+        the next number. These numbers are summed in turn, and the error of that sum is at most n u
+        times the sum of their absolute values, hence by n u^2 times the sum of all |s|. Up to n =
+        2^20 terms n u is at most 1/16, and twice that covers the rounding of the bound itself.
         """
         gradient, hessian = self.gradient, self.hessian
         if gradient is not None and terms.gradient is not None:

@@ -68,13 +68,13 @@ _LOOP_READERS: dict[str, Callable[[Path, bytes], FileGeometry]] = {
 def read_loops(path: str | os.PathLike[str], *, boundary: bool = False) -> list[FloatArray]:
     """The closed curves in an .obj, .ply or .loops file, as arrays (n, 3).
 
-    .obj: every `f` face is a loop, every `l` polyline that ends at its first vertex is one, and
-    all other `l` polylines are joined end to end. .ply: every face is a loop, edges are joined;
-    a file with vertices only is one loop in their order. .loops: one loop a line, x y z
-    repeated. Where edges are joined, equal positions count as one vertex.
+    .obj: every `f` face is a loop, every `l` polyline that ends at its first vertex is a loop, and
+    all other `l` polylines are joined end to end. .ply: every face is a loop, edges are joined; a
+    file with vertices only is one loop in their order. .loops: a loop on each line, x y z repeated.
+    Where edges are joined, equal positions count as the same vertex.
 
-    boundary: not the faces, but the boundary of the surface they form: the edges that do not
-    cancel between neighboring faces, equal positions counted as one vertex.
+    boundary: not the faces, but the boundary of the surface they form: the edges that do not cancel
+        between neighboring faces, where equal positions count as the same vertex.
 
     Raises:
         FileFormatError: unreadable, malformed or hostile; open polylines; a loop that
@@ -186,7 +186,7 @@ class LoadedMesh:
     summary: the contents of the file, and why they are read as a mesh.
     zero_area_faces: (k, 3) faces of zero area, left out of `faces`; they may close gaps without a
         width.
-    rounded: how many corners were joined with others from which rounding separated them.
+    rounded: the number of corners that were joined with others from which rounding separated them.
     """
 
     vertices: FloatArray
@@ -239,11 +239,11 @@ def read_geometry(path: str | os.PathLike[str], read_as: ReadAs | None = None) -
     """Read the surface, cloud, curves, blobs or molecule in a file: .obj, .ply, .stl, .off, .glb,
     .gltf, .3mf, .xyz, .loops, .blobs; molecules .pdb, .ent, .cif, .mmcif.
 
-    Faces make a mesh, except polygons of an .obj or .ply file of which some have more than four
-    corners and none share an edge: these are curves, as are polylines without faces. Points alone
-    make a cloud, with normals from nx ny nz (.ply), from as many `vn` as `v` (.obj) or from columns
-    4 to 6 (.xyz). Polygons are triangulated, the nodes of a scene are transformed to their
-    positions, and faces of zero area are left out.
+    Faces make a mesh, except polygons of an .obj or .ply file if a polygon has more than four
+    corners and no two share an edge: these are curves, as are polylines without faces. Points alone
+    make a cloud, with normals from nx ny nz (.ply), from the same number of `vn` as of `v` (.obj)
+    or from columns 4 to 6 (.xyz). Polygons are triangulated, the nodes of a scene are transformed
+    to their positions, and faces of zero area are left out.
 
     read_as: "winding": the faces, as a mesh. "dipole": the points; of a mesh the centers of its
         triangles, with their normals and areas. "loops": the result of `read_loops`; of a mesh its
@@ -299,7 +299,7 @@ def _read(path: Path, kind: str, read_as: ReadAs | None) -> LoadedGeometry:
 def _check_convertible(
     path: Path, read_as: ReadAs | None, possible: tuple[str, ...], held: str
 ) -> None:
-    """Raise unless `read_as` can be made of what the file holds."""
+    """Raise an error unless the contents of the file can be read as `read_as`."""
     needs = {
         "winding": "faces", "dipole": "points or faces", "loops": "polylines or faces",
         "polygons": "faces",
@@ -346,7 +346,7 @@ def _polygons(contents: FileGeometry) -> LoadedPolygons:
 
 
 def _looks_like_curves(contents: FileGeometry) -> bool:
-    """Whether some polygon has more than four corners, and no two share an edge."""
+    """Whether a polygon has more than four corners, and no two polygons share an edge."""
     faces = contents.faces
     if faces.sizes.max() <= 4:
         return False

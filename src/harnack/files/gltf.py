@@ -35,7 +35,7 @@ _UNSUPPORTED_EXTENSIONS = (
     "EXT_mesh_gpu_instancing", "KHR_mesh_quantization", "KHR_node_visibility",
     "EXT_meshopt_compression", "KHR_meshopt_compression",
 )  # fmt: skip
-# How triangles may be listed: one by one, or in strips.
+# The modes in which triangles may be listed: one by one, or in strips.
 _TRIANGLES, _FAN = (4, 5), 6
 # Extensions under which vertices and indices are stored as always.
 _IGNORED_EXTENSIONS = ("KHR_materials", "KHR_texture", "KHR_lights", "EXT_texture", "KHR_xmp")
@@ -162,7 +162,7 @@ def _check_no_animation(place: FileLocation, header: dict[str, Any]) -> None:
 
 
 def _corner_counts(place: FileLocation, header: dict[str, Any], accessors: list[Any]) -> list[int]:
-    """How many corners each mesh draws."""
+    """The number of corners that each mesh draws."""
     drawn: list[int] = []
     for mesh in header.get("meshes", []):
         total = 0
@@ -216,7 +216,7 @@ def _contents(place: FileLocation, scene: Any) -> FileGeometry:
         geometry = scene.geometry[name]
         placed = _placed(place, np.asarray(geometry.vertices), np.asarray(world_from_node))
         if not hasattr(geometry, "faces"):
-            # Lines have entities; what is left are points.
+            # Lines have entities; the other geometries are points.
             points += [] if hasattr(geometry, "entities") else [placed]
             continue
         corners = np.asarray(geometry.faces, dtype=np.int64)

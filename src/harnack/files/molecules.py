@@ -35,14 +35,14 @@ class Atoms:
 
 
 def read_molecule(path: str | os.PathLike[str]) -> Atoms:
-    """Read the atoms of a molecule (.pdb, .ent, .cif, .mmcif): those of the first model, without
-    alternatives, water and hydrogen.
+    """Read the atoms of a molecule (.pdb, .ent, .cif, .mmcif): the atoms of the first model,
+    without alternatives, water and hydrogen.
 
     Alternatives are atoms that the file marks as such (altLoc in .pdb, label_alt_id in .cif): of
-    each atom the first counts, and of several residues in the same place the first. Atoms without
-    the mark all count, whatever their names. Radii are gemmi's van der Waals radii of the elements
-    (C 1.7, N 1.55, O 1.52, S 1.8, H 1.2). `summary` tells what was left out: atoms of other models,
-    alternatives, unknown elements, and the text after the line END.
+    each atom the first alternative counts, and of residues at the same position the first. Atoms
+    without the mark all count, whatever their names. Radii are gemmi's van der Waals radii of the
+    elements (C 1.7, N 1.55, O 1.52, S 1.8, H 1.2). `summary` lists the parts left out: atoms of
+    other models, alternatives, unknown elements, and the text after the line END.
 
     Raises:
         FileFormatError: unreadable, malformed, another format, no atoms in it.

@@ -170,7 +170,8 @@ def _drop_degenerate_loops(loops: list[FloatArray]) -> list[FloatArray]:
 # SVG.
 
 _MAX_SVG_BYTES, _MAX_SVG_ELEMENTS, _MAX_SVG_DEPTH = 32 * 2**20, 200_000, 200
-# What does not show, with all that is in it; and what shows in ways that are not read.
+# Elements that are not visible, with all elements in them; and elements that are visible in ways
+# that are not read.
 _HIDDEN = (
     "defs", "symbol", "clipPath", "mask", "marker", "pattern", "linearGradient", "radialGradient",
     "filter", "metadata", "title", "desc", "script", "namedview", "style",

@@ -179,7 +179,7 @@ class ElementTable:
 
     def list_column(self, name: str) -> tuple[npt.NDArray[Any], IntArray]:
         """A column of lists: the numbers of all lists, one list after the other, and the length of
-        each."""
+        each list."""
         column = self._column(name)
         if column.list_lengths is None:
             raise self._is_other_kind()
@@ -279,7 +279,7 @@ def _columns(
         if lengths.dtype.kind == "f":
             k = int(np.argmax(lengths != np.rint(lengths)))
             raise places[k].error(f"the length of a list is no integer, but {lengths[k]}")
-        # What is impossible ends behind everything.
+        # Impossible lists end beyond the end of the file.
         sizes = np.where(lengths < 0, values.size + 1, lengths).astype(np.int64)
         sizes = np.minimum(sizes, values.size + 1)
         added += values.width(p.length_code)
@@ -374,7 +374,7 @@ def _too_short(path: Path, section: PlyElement) -> FileFormatError:
 
 
 def _header(path: Path, data: bytes) -> PlyHeader:
-    """What the header of a .ply file declares.
+    """The elements and properties that the header of a .ply file declares.
 
     Raises:
         FileFormatError: it is malformed, or not the header of a .ply file.

@@ -36,14 +36,14 @@ from harnack.geometry.boundary_edges import weld_vertices
 
 
 def read_xyz(path: Path, data: bytes) -> FileGeometry:
-    """Read an .xyz file, a point a line: positions from columns 1 to 3, and normals from columns 4
-    to 6 if there are six columns or more.
+    """Read an .xyz file, with a point on each line: positions from columns 1 to 3, and normals from
+    columns 4 to 6 if there are six columns or more.
 
     Further columns are ignored. `#` begins a comment.
 
     Raises:
         FileFormatError: lines with different numbers of columns or fewer than three, words, numbers
-            that are not finite; columns 4 to 6 that are no normals (lengths far from 1).
+            that are not finite; columns 4 to 6 that are not normals (lengths far from 1).
     """
     lines = split_content_lines(path, data)
     if not len(lines):
@@ -374,7 +374,7 @@ _KEYWORDS = (b"solid", b"facet", b"outer", b"vertex", b"endloop", b"endfacet", b
 
 
 def read_stl(path: Path, data: bytes) -> FileGeometry:
-    """The triangles of an .stl file, corners at the same position made one vertex.
+    """The triangles of an .stl file, where corners at the same position become the same vertex.
 
     Raises:
         FileFormatError: truncated, malformed, a coordinate that is not finite, no triangles.

@@ -34,7 +34,7 @@ _Number = TypeVar("_Number", int, float)
 
 @dataclass(frozen=True, eq=False)
 class TextLines:
-    """Lines of a text file, such as all that say something, and where they stand."""
+    """Lines of a text file, such as all lines with content, and their locations."""
 
     text: list[bytes]
     locations: FileLocations
@@ -81,10 +81,10 @@ def split_content_lines(
 
 
 def parse_finite(word: bytes, place: FileLocation) -> float:
-    """A finite number.
+    """The finite number that a word is.
 
     Raises:
-        FileFormatError: it is not one.
+        FileFormatError: the word is not a finite number.
     """
     try:
         value = float(b"" if b"_" in word else word)  # Python reads 1_0 as 10
@@ -99,7 +99,7 @@ def parse_vertex_index(word: bytes, place: FileLocation) -> int:
     """An integer that can be the index of a vertex.
 
     Raises:
-        FileFormatError: it is not one.
+        FileFormatError: the word is not such an integer.
     """
     try:
         value = int(b"" if b"_" in word else word)
@@ -183,7 +183,7 @@ def read_integers(lines: TextLines) -> tuple[IntArray, IntArray]:
 def _parse_with_numpy(lines: TextLines, columns: Sequence[int] | None = None) -> FloatArray | None:
     """A table of numbers by NumPy, or None where it does not succeed.
 
-    columns: which to read. None: all, if there are as many in each line.
+    columns: the columns to read. None: all columns, if each line has the same number of them.
     """
     if not len(lines) or b"_" in b"\n".join(lines.text):
         return None
@@ -199,7 +199,7 @@ def _parse_with_numpy(lines: TextLines, columns: Sequence[int] | None = None) ->
 
 
 def _equal(table: FloatArray) -> IntArray:
-    """How many numbers each row of a table has."""
+    """The number of numbers of each row of a table."""
     return np.full(len(table), table.shape[1], dtype=np.int64)
 
 

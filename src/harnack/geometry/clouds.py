@@ -257,9 +257,9 @@ _NEIGHBOR_COUNTS, _MAX_FLATNESS, _PROBES, _MIN_SUBSET, _FLATNESS_GAIN = (
     1000,
     0.9,
 )
-# How many of the nearest points that have a normal vote on the sign of a point's normal.
+# The number of the nearest points with a normal that vote on the sign of a point's normal.
 _VOTING_NEIGHBORS = 8
-# Where to look for extreme points: towards the faces, edges and corners of a cube.
+# The directions of extreme points: towards the faces, edges and corners of a cube.
 _DIRECTIONS = np.array([d for d in itertools.product((-1.0, 0.0, 1.0), repeat=3) if any(d)])
 
 

@@ -37,23 +37,23 @@ MIN_ANGLE = 1e-6  # so do edges that fold back at a smaller angle (radians)
 def is_convex_position(loops: tuple[FloatArray, ...]) -> bool:
     """Whether it is proved that the theorems apply to these (validated) loops.
 
-    True means: one loop; no edge is shorter than 1e-9 (all lengths relative to the curve's
-    size: one that short may be nothing but rounding, and has no direction to be trusted); edges
-    that share no vertex are at least 1e-9 apart, none folds back; and either all vertices lie
-    within 1e-12 of one plane (then P is on the boundary of its flat hull, a degenerate convex
-    set), or every edge has a plane through it that no vertex exceeds by more than 1e-12. False
-    means: no proof found, as for more than 2048 vertices; it says nothing about the curve.
+    True means: one loop; no edge is shorter than 1e-9 (all lengths relative to the curve's size; an
+    edge that short may be nothing but rounding, and has no reliable direction); edges that share no
+    vertex are at least 1e-9 apart, and no edge folds back; and either all vertices lie within 1e-12
+    of a common plane (then P is on the boundary of its flat hull, a degenerate convex set), or
+    every edge has a plane through it that no vertex exceeds by more than 1e-12. False means that
+    there is no proof, as for more than 2048 vertices; it implies nothing about the curve.
 
-    Stability. Where no vertex exceeds the plane of an edge, that edge lies on the boundary of
-    the hull H, and nothing is left to say. Otherwise let each point move along the normal of its
+    Stability. Where no vertex exceeds the plane of an edge, that edge lies on the boundary of the
+    hull H, and nothing remains to be proved. Otherwise let each point move along the normal of its
     edge until it leaves H: by at most delta = 1e-12. At a vertex the edges' normals n and n' may
-    send it to two places; both lie in the wedge { a n + b n', a, b >= 0 } at the vertex, where
-    n.x <= delta and n'.x <= delta leave |x| <= 2 delta / (1 + n.n'), and n.n' >= -0.9 is
-    required, so a path of that size on the boundary joins them. It cannot meet another edge
-    (1e-9 away); crossings with its neighbor, near the common vertex, are cut off as loops of
-    area below 1e-15. So the theorems hold for a curve within w = 2e-11 of P, and the two
-    solid angles differ by at most 2 w / r for each edge at distance r: at r = 1e-4 that is less
-    than the rounding of the solid angle itself in single precision.
+    send it to two positions; both lie in the wedge { a n + b n', a, b >= 0 } at the vertex, where
+    n.x <= delta and n'.x <= delta leave |x| <= 2 delta / (1 + n.n'), and n.n' >= -0.9 is required,
+    so a path of that size on the boundary joins them. It cannot meet another edge (1e-9 away);
+    crossings with its neighbor, near the common vertex, are cut off as loops of area below 1e-15.
+    So the theorems hold for a curve within w = 2e-11 of P, and the two solid angles differ by at
+    most 2 w / r for each edge at distance r: at r = 1e-4 that is less than the rounding of the
+    solid angle itself in single precision.
     """
     if len(loops) != 1 or not 3 <= len(loops[0]) <= MAX_EXAMINED_VERTICES:
         return False
@@ -98,9 +98,10 @@ def _supporting_planes(
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
     """For the edges from vertices `part`: a plane that contains the edge and supports all of x.
 
-    Projected along the edge, the vertices have to leave an angle of at least pi free; the
-    normal (k, 3) points to the middle of the largest free angle. Also by how far the vertices
-    exceed the plane (k,), and whether all but the edge's ends stay below it beyond rounding.
+    Projected along the edge, the vertices have to leave an angle of at least pi free; the normal
+    (k, 3) points to the middle of the largest free angle. Also returned are the distance by which
+    the vertices exceed the plane (k,), and whether all but the edge's ends stay below it beyond
+    rounding.
     """
     count = len(x)
     start = x[part]

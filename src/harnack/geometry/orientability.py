@@ -47,8 +47,8 @@ def orientation_components(faces: IntArray) -> IntArray:
 
 def _edges(faces: IntArray) -> tuple[IntArray, IntArray, IntArray]:
     """Edges (3m, 2) in the direction in which faces run them, the first edges of all faces first;
-    the index (3m,) of each as an undirected edge; and for each undirected edge how many faces run
-    it."""
+    the index (3m,) of each as an undirected edge; and for each undirected edge the number of faces
+    that run it."""
     pairs = np.concatenate([faces[:, [k, (k + 1) % 3]] for k in range(3)]).astype(np.int64)
     keys = pairs.min(axis=1) * (int(pairs.max(initial=0)) + 1) + pairs.max(axis=1)
     _, index, uses = np.unique(keys, return_inverse=True, return_counts=True)

@@ -197,7 +197,7 @@ def _checked_vertices(vertices: Any) -> FloatArray:
 
 
 def _flatten_faces(faces: Any) -> tuple[IntArray, IntArray, IntArray]:
-    """Corners of all loops, the size of each, and the face of each."""
+    """The corners of all loops, and the size and the face of each loop."""
     if not _is_list(faces):
         raise MeshError(f"the faces must be a list of lists of vertex indices, not {faces!r}")
     if len(faces) == 0:
@@ -318,7 +318,7 @@ def _check_not_collinear(mesh: PolygonFaces) -> None:
         )
 
 
-# How much normals count beside places, in units of the mesh.
+# The weight of normals relative to positions, in units of the mesh.
 _NORMAL_WEIGHT = 0.25
 
 
@@ -371,7 +371,7 @@ def _edges(loop: list[int]) -> list[tuple[int, int]]:
 
 
 def _smoothed(points: FloatArray, edges: IntArray, times: int) -> FloatArray:
-    """The points, with those of exactly two edges (e, 2) smoothed along the polygon, `times`
+    """The points, where points of exactly two edges (e, 2) are smoothed along the polygon, `times`
     times."""
     both = np.concatenate([edges, edges[:, ::-1]])
     inner = np.bincount(both[:, 0], minlength=len(points)) == 2

@@ -25,20 +25,20 @@ __all__ = ["cancel_opposite_edges", "remaining_edges", "triangulate"]
 def cancel_opposite_edges(loops: Loops) -> Loops:
     """Remove pairs of opposite edges from closed loops; the solid angle stays the same modulo 4 pi.
 
-    Seen from a point, an edge contributes minus what the reversed edge contributes, so both drop
+    Seen from a point, the contribution of an edge is minus that of the reversed edge, so both drop
     out of the sum. If they were kept, they would leave rounding errors, and would count in
     distances and in tests of convexity as a curve that is not there.
 
     Vertices at exactly the same position are the same. If edges run both ways between two vertices,
-    the surplus of one direction is left, as often as it counts. If no edges cancel, the loops are
-    returned as they are; if all cancel, no loop is returned. Edges are compared as wholes: of two
+    the surplus of a direction is left, with its multiplicity. If no edges cancel, the loops are
+    returned as they are; if all cancel, no loop is returned. Only entire edges are compared: of two
     edges that overlap in part and run opposite ways, both stay.
 
-    Proof that the rest is closed: in loops as many edges begin at a vertex as end there, and this
-    stays true when an edge and its reverse are removed. The gradient of the solid angle is the sum
-    of the edges' fields, which cancel (Biot and Savart), and the integral along closed paths is
-    still a multiple of 4 pi, so that values change by a constant at most; far away both vanish,
-    modulo 4 pi.
+    Proof that the remaining loops are closed: in loops the same number of edges begins and ends at
+    a vertex, and this stays true when an edge and its reverse are removed. The gradient of the
+    solid angle is the sum of the edges' fields, which cancel (Biot and Savart), and the integral
+    along closed paths is still a multiple of 4 pi, so that values change by a constant at most; far
+    away both vanish, modulo 4 pi.
     """
     points = np.concatenate(loops)
     begin, end = _welded(loops, points)
@@ -71,13 +71,13 @@ def _welded(loops: Loops, points: FloatArray) -> tuple[IntArray, IntArray]:
 
 # Triangles of polygons.
 
-# Corners squared, and this constant more a polygon, summed over those of which ears are cut: some
-# ten seconds of work at worst.
+# The square of the number of corners plus a constant, summed over the polygons of which ears are
+# cut: about ten seconds of work at worst.
 _MAX_EAR_WORK = 1_000_000_000
 _WORK_A_POLYGON = 1000
 # Twice the area of a triangle, in a polygon of size about 1, up to which it counts as flat.
 _FLAT = 1e-12
-# How much an edge with corners in its middle is bent: depth over the square of its length.
+# The curvature of an edge with corners in its middle: depth over the square of its length.
 _INWARD = 1e-6
 _CHUNK = 2_000_000
 
@@ -135,7 +135,8 @@ def triangulate(vertices: FloatArray, corners: IntArray, sizes: IntArray) -> Int
 
 
 def _group_by_size(sizes: IntArray) -> list[IntArray]:
-    """Numbers of polygons with equally many corners, three or more, not too many at a time."""
+    """The indices of polygons with the same number of corners, three or more, in groups of limited
+    size."""
     order = np.argsort(sizes, kind="stable")
     order = order[sizes[order] >= 3]
     distinct, first = np.unique(sizes[order], return_index=True)

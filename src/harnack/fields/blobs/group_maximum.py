@@ -1,4 +1,4 @@
-"""The largest of several sums of blobs, one for each group: groups do not flow together but meet in
+"""The largest of the sums of blobs of several groups: groups do not flow together but meet in
 creases.
 
 A group is 0 where none of its blobs is near.

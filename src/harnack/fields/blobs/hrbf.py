@@ -1,4 +1,4 @@
-"""Hermite radial basis functions: a smooth surface through points with given normals."""
+"""Hermite radial basis functions: a smooth surface through points, normal to prescribed vectors."""
 
 from __future__ import annotations
 

@@ -174,17 +174,17 @@ class BooleanSolid(Solid):
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
         """The ray sample of the combination, from those of all operands, by `MaximumEnclosure`."""
-        looks = [part.sample_ray(path, t, ahead, back) for part in self.parts]
+        looks = [operand.sample_ray(path, t, ahead, back) for operand in self.parts]
         size = max_norm(path.origin) + t
-        sample, below, extreme = self._combine_samples([part.sample for part in looks], size)
+        sample, below, extreme = self._combine_samples([operand.sample for operand in looks], size)
         slope, slope_error = looks[-1].slope, looks[-1].slope_error_bound
         for look in looks[:-1]:
             is_chosen = look.sample.value == extreme
             slope = dr.select(is_chosen, look.slope, slope)
             slope_error = dr.select(is_chosen, look.slope_error_bound, slope_error)
-        front = self._enclosures([part.forward for part in looks], below)
-        behind = self._enclosures([part.backward for part in looks], below)
-        growth = max(part.reach_growth for part in looks)
+        front = self._enclosures([operand.forward for operand in looks], below)
+        behind = self._enclosures([operand.backward for operand in looks], below)
+        growth = max(operand.reach_growth for operand in looks)
         return RaySample(sample, front, behind, slope, growth, slope_error)
 
     def _enclosures(
@@ -281,7 +281,7 @@ class BooleanSolid(Solid):
 
 
 def min_wavelength(parts: Iterable[Solid]) -> float | None:
-    """The smallest `Field.min_wavelength` of several fields."""
+    """The smallest `Field.min_wavelength` of any of the fields; None if no field has it."""
     return min(
         (part.min_wavelength for part in parts if part.min_wavelength is not None), default=None
     )

@@ -63,10 +63,9 @@ class Extrusion(Solid):
 
     Else f is this function at the preimage of p, which has the same z. Along a path it changes no
     faster than the preimage moves, whose speed is bounded by ranges. Proof of the promise in all
-    directions: on a ball about p the inverse of the taper has the constant c within R, the inverse
-        of the twist, which acts on what the first returns, the constant b within S (proofs:
-        `Taper`, `Twist`); so both together have b c within min(R, S/c), and f, of constant 1, has
-        it too.
+    directions. On a ball about p the inverse of the taper has the constant c within R, the inverse
+    of the twist, which acts on what the first returns, the constant b within S (proofs: `Taper`,
+    `Twist`); so both together have b c within min(R, S/c), and f, of constant 1, has it too.
 
     Raises:
         ValueError: loops that enclose no area; a height or a taper that is not positive.

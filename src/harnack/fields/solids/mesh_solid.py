@@ -1,4 +1,5 @@
-"""Closed triangle meshes made solid: `MeshSolid`, the signed distance from their surface.
+"""Solids bounded by closed triangle meshes: `MeshSolid`, whose function is the signed distance from
+the mesh.
 
 `ClosedSurface.of` returns the faces of a mesh that bound the solid, and refuses meshes that bound
 none.
@@ -151,7 +152,7 @@ class MeshSolid(Solid):
     Raises:
         MeshError: a mesh that is not closed, whose faces do not agree on its two sides, that is
             inside out somewhere, or whose faces lie on each other up to rounding and not exactly;
-            the message says what to do.
+            the message states a remedy.
     """
 
     vertices: Any
@@ -232,7 +233,7 @@ _SAMPLE_CACHE: ContextVar[dict[tuple[int, ...], tuple[Vec3, Sample]] | None] = C
 @contextmanager
 def share_samples() -> Generator[None]:
     """Within this context, a mesh is sampled only once at the same Dr.Jit points, so that a shell
-    and a lattice made from one mesh share one nearest-triangle search.
+    and a lattice of the same mesh share a nearest-triangle search.
 
     Inactive while loops are recorded, as their values are defined inside the loop only.
     """
@@ -465,7 +466,8 @@ class ClosedSurface:
     """The boundary of the solid that a mesh bounds, in unit coordinates, of at most about 1: a
     point u stands for center + size * u.
 
-    vertices: (n, 3). faces: (m, 3), closed, no two alike. weights: (m,) how often each face counts.
+    vertices: (n, 3). faces: (m, 3), closed, no two alike. weights: (m,) the multiplicity of each
+        face.
     boundary_triangles: (k, 3, 3) corners of the triangles that bound the points of a winding number
         above 1/2; None if these are just the faces.
     box: the lowest and the highest coordinates of that boundary. area: of that boundary, not in

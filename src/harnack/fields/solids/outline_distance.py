@@ -1,7 +1,7 @@
 """The signed distance from an outline in the plane, and its bounds along a line of the plane.
 
-Edges are read in a loop. Where there are many, chains of consecutive edges are skipped by their
-boxes, so that an outline of 1,000 edges costs about as much as one of 100 (`OutlineEdges`).
+Edges are read in a loop. If their number is large, chains of consecutive edges are skipped by their
+boxes, so that an outline of 1,000 edges costs about as much as an outline of 100 (`OutlineEdges`).
 """
 
 from __future__ import annotations

@@ -190,7 +190,7 @@ class Solid(Field):
 
         with 5 half the height, or let one of the solids end a radius below the other's face.
 
-        radius: how far the fillet reaches along both surfaces, where f is a distance.
+        radius: the distance that the fillet reaches along both surfaces, where f is a distance.
         power: the exponent of the superellipse that the fillet is a part of: 2 for a circle, larger
             for a sharper corner (Hart 1996, appendix D.3, corrected).
 

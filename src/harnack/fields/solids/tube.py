@@ -123,8 +123,9 @@ class Tube(Solid):
         """The tube around a chain of cubic Bezier curves, each of which ends where the next starts.
 
         controls: (3 n + 1, 3) control points of n curves; two curves meet at every third point.
-        tolerance: how far the surface may be from the exact one, in units of length; by default a
-            thousandth of the radius. The number of segments grows like its square root.
+        tolerance: the largest distance between the surface and the exact surface, in units of
+            length; by default a thousandth of the radius. The number of segments grows like its
+            square root.
 
         Proof: `harnack.geometry.beziers.flatten_bezier`.
 
@@ -161,8 +162,8 @@ class Tube(Solid):
         radius: of the helix that is the middle of the wire. pitch: the rise along the axis in each
             turn.
         wire: the radius of the wire. left_handed: whether the helix turns clockwise as it rises.
-        tolerance: how far the surface may be from the exact one, in units of length; by default a
-            thousandth of the radius of the wire.
+        tolerance: the largest distance between the surface and the exact surface, in units of
+            length; by default a thousandth of the radius of the wire.
 
         Proof. A chord between two angles h apart is within h^2/8 max |c''| of the helix c, which is
         parametrized by the angle, and |c''| is the radius.
@@ -443,8 +444,9 @@ class TubeNetwork(PatchField["_TubeBuffers"]):
 
     Each segment is a patch, a tube with rounded ends (`harnack.fields.capabilities`). A ray
     evaluates only the patches whose boxes it enters, so that thousands of segments cost little more
-    than one, and `Hits.primitive_index` is the index of the segment. A level is added to the radius
-    of all tubes. For a single polyline, and for combinations with other solids, there is `Tube`.
+    than a single segment, and `Hits.primitive_index` is the index of the segment. A level is added
+    to the radius of all tubes. For a single polyline, and for combinations with other solids, there
+    is `Tube`.
 
     Raises ValueError for arrays of other shapes, numbers that are not finite, an index that is out
     of range, a segment without a length, or a radius that is not positive.
