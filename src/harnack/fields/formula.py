@@ -244,16 +244,14 @@ class Formula(Field):
         if not enclosures:
             return path.enclose(sample)
         if self.may_jump and not all(
-            isinstance(enclosure, PiecewiseTaylorEnclosure) for enclosure in enclosures
+            isinstance(entry, PiecewiseTaylorEnclosure) for entry in enclosures
         ):
             ahead = dr.select(function.is_continuous(ahead), ahead, 0)
             enclosures = path.proofs.from_restriction(function, slopes, ahead)
-        growth = max(enclosure.reach_growth for enclosure in enclosures)
+        growth = max(entry.reach_growth for entry in enclosures)
         if self.is_convex and ConvexityEnclosure in path.proofs.kinds:
             enclosures = (*enclosures, ConvexityEnclosure(slopes))
-        min_norm = safe_norm(
-            type(p)(*(0 * p.x + enclosure.min_abs for enclosure in jet.first_derivatives))
-        )
+        min_norm = safe_norm(type(p)(*(0 * p.x + entry.min_abs for entry in jet.first_derivatives)))
         return RaySample(sample, enclosures, (), slope, growth, slope_error, min_norm)
 
     def _slope(self, p: Vec3, direction: Vec3, *, is_rounded: bool = False) -> tuple[Real, Real]:

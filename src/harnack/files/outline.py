@@ -392,21 +392,21 @@ def _loops(segments: list[Any], matrix: FloatArray, tolerance: float) -> list[Fl
     """The closed loops of consecutive segments, under a transform."""
     loops: list[list[FloatArray]] = []
     last: complex | None = None
-    for segment in segments:
-        if last is None or segment.start != last:
-            loops.append([_transform_points(matrix, [segment.start])])
-        last = segment.end
-        kind = type(segment).__name__
+    for piece in segments:
+        if last is None or piece.start != last:
+            loops.append([_transform_points(matrix, [piece.start])])
+        last = piece.end
+        kind = type(piece).__name__
         if kind == "Arc":
-            loops[-1].append(_arc(segment, matrix, tolerance))
+            loops[-1].append(_arc(piece, matrix, tolerance))
             continue
-        controls = _transform_points(matrix, [*segment.bpoints()])
+        controls = _transform_points(matrix, [*piece.bpoints()])
         if not np.isfinite(controls).all():
             raise ValueError("a number in it is not finite")
         loops[-1].append(
             flatten_bezier(controls, tolerance)[0] if len(controls) > 2 else controls[1:]
         )
-    return _drop_degenerate_loops([np.concatenate(segment) for segment in loops])
+    return _drop_degenerate_loops([np.concatenate(piece) for piece in loops])
 
 
 def _arc(arc: Any, matrix: FloatArray, tolerance: float) -> FloatArray:

@@ -147,12 +147,12 @@ class HRBF(Formula):
         """f of jets of the coordinates, or of Dr.Jit numbers."""
         if not is_jet(x, type(self).__name__):
             return self.differentiable_value(backend_of(x).Array3f(x, y, z))
-        numbers = (end for jet in (x, y, z) for axis in (jet.value, *jet.first_derivatives)
-                   for end in (axis.lower, axis.upper) if dr.is_array_v(type(end)))  # fmt: skip
+        numbers = (end for jet in (x, y, z) for entry in (jet.value, *jet.first_derivatives)
+                   for end in (entry.lower, entry.upper) if dr.is_array_v(type(end)))  # fmt: skip
         backend, records = self._prepared_for(backend_of(next(numbers)))
 
         def term(row: list[Real]) -> Jet:
-            u, v, w = ((axis - row[k]) - row[3 + k] for k, axis in enumerate((x, y, z)))
+            u, v, w = ((entry - row[k]) - row[3 + k] for k, entry in enumerate((x, y, z)))
             r = (u**2 + v**2 + w**2).apply(sqrt)
             return r**3 * row[6] + r * (u * row[7] + v * row[8] + w * row[9])
 

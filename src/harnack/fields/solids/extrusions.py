@@ -132,16 +132,18 @@ class Extrusion(Solid):
             return solid._joined(p, side, cast("Any", type(p))(*side.gradient, 0))
         x, y, _ = solid._local(*Jet.at_point(p))
         zero = 0 * p.x
-        u, v = (zero + jet.value.midpoint for jet in (x, y))
+        u, v = (zero + component.value.midpoint for component in (x, y))
         side = solid._outline.sample(u, v)
         spread = zero + x.value.radius + y.value.radius
         slopes = [
             Interval.point(side.gradient[0]) * a + Interval.point(side.gradient[1]) * b
             for a, b in zip(x.first_derivatives, y.first_derivatives, strict=True)
         ]
-        gradient = cast("Any", type(p))(*(zero + jet.midpoint for jet in slopes))
+        gradient = cast("Any", type(p))(*(zero + component.midpoint for component in slopes))
         stretch, radius = solid._stretch(p)
-        error = sum((jet.radius for jet in slopes), zero) + side.gradient_error * stretch
+        error = (
+            sum((component.radius for component in slopes), zero) + side.gradient_error * stretch
+        )
         moved = OutlineSample(side.value, side.gradient, side.error + 2 * spread, error)
         return solid._joined(p, moved, gradient, Lipschitz(stretch, radius))
 

@@ -227,12 +227,12 @@ class FractalNoise(FormulaSolid):
         scale, amplitude = data["frequency"], data["amplitude"]
         octaves: list[tuple[Any, list[Any], list[Any]]] = []
         for octave in range(self.octaves):
-            position = [component * scale for component in q]
-            floors = [dr.floor(dr.detach(component)) for component in position]
+            position = [entry * scale for entry in q]
+            floors = [dr.floor(dr.detach(entry)) for entry in position]
             t = [a - b for a, b in zip(position, floors, strict=True)]
             integer = dr.int32_array_t(cast("Any", type(q[0])))
             natural = dr.uint32_array_t(cast("Any", type(q[0])))
-            base = [natural(integer(component)) for component in floors]
+            base = [natural(integer(entry)) for entry in floors]
             seed = data["_seed"] + octave
             vectors: list[Any] = []
             for corner in CORNERS:
@@ -243,19 +243,19 @@ class FractalNoise(FormulaSolid):
             octaves.append(
                 (
                     amplitude * value,
-                    [slope * component for component in gradient],
-                    [slope * scale * component for component in hessian],
+                    [slope * entry for entry in gradient],
+                    [slope * scale * entry for entry in hessian],
                 )
             )
             amplitude, scale = amplitude * data["_falls"], 2 * scale
         if each:
             return octaves
         total = octaves[0]
-        for component in octaves[1:]:
+        for entry in octaves[1:]:
             total = (
-                total[0] + component[0],
-                [a + b for a, b in zip(total[1], component[1], strict=True)],
-                [a + b for a, b in zip(total[2], component[2], strict=True)],
+                total[0] + entry[0],
+                [a + b for a, b in zip(total[1], entry[1], strict=True)],
+                [a + b for a, b in zip(total[2], entry[2], strict=True)],
             )
         return [total]
 

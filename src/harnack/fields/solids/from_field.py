@@ -191,11 +191,11 @@ def field_jet(field: Field, x: Jet, y: Jet, z: Jet) -> Jet:
         TypeError: the field promises no bound of its second derivatives.
     """
     coordinates = (x, y, z)
-    starts = [jet if jet.jet_at_start is None else jet.jet_at_start for jet in coordinates]
-    q = _vector(*(0 * x.piece_length + jet.value.midpoint for jet in starts))
+    starts = [entry if entry.jet_at_start is None else entry.jet_at_start for entry in coordinates]
+    q = _vector(*(0 * x.piece_length + entry.value.midpoint for entry in starts))
     sample = field.evaluate(q)
     bound, radius = _second_derivatives(field, sample)
-    offset = safe_norm(type(q)(*(0 * x.piece_length + jet.value.radius for jet in starts)))
+    offset = safe_norm(type(q)(*(0 * x.piece_length + entry.value.radius for entry in starts)))
     rows = _second_derivatives_at(field, q) if len(x.second_derivatives) == _ALL_PAIRS else None
     second_error = 2 * bound
     if rows is not None:
@@ -209,21 +209,25 @@ def field_jet(field: Field, x: Jet, y: Jet, z: Jet) -> Jet:
     ) -> tuple[tuple[Interval, ...], tuple[Interval, ...]]:
         limit = dr.select(distance <= radius, bound, dr.inf)
         spread = limit * distance * (1 + 1e-5) + sample.gradient_error
-        slopes = [Interval(jet - spread, jet + spread) for jet in sample.gradient]
+        slopes = [Interval(entry - spread, entry + spread) for entry in sample.gradient]
         first = tuple(
-            _interval_sum(g * jet.first_derivatives[i] for g, jet in zip(slopes, jets, strict=True))
+            _interval_sum(
+                g * entry.first_derivatives[i] for g, entry in zip(slopes, jets, strict=True)
+            )
             for i in range(len(x.first_derivatives))
         )
         speeds = [
             safe_norm(
-                type(q)(*(0 * x.piece_length + jet.first_derivatives[i].max_abs for jet in jets))
+                type(q)(
+                    *(0 * x.piece_length + entry.first_derivatives[i].max_abs for entry in jets)
+                )
             )
             for i in range(len(x.first_derivatives))
         ]
         second: list[Interval] = []
         for k, (i, j) in enumerate(_pairs(len(x.first_derivatives), len(x.second_derivatives))):
             rate = _interval_sum(
-                g * jet.second_derivatives[k] for g, jet in zip(slopes, jets, strict=True)
+                g * entry.second_derivatives[k] for g, entry in zip(slopes, jets, strict=True)
             )
             if rows is None:
                 margin = limit * speeds[i] * speeds[j] * (1 + 1e-5)
@@ -250,8 +254,8 @@ def field_jet(field: Field, x: Jet, y: Jet, z: Jet) -> Jet:
     if x.jet_at_start is None:
         return start
     offsets = (
-        fmax(dr.abs(jet.value.upper - m), dr.abs(jet.value.lower - m))
-        for jet, m in zip(coordinates, q, strict=True)
+        fmax(dr.abs(entry.value.upper - m), dr.abs(entry.value.lower - m))
+        for entry, m in zip(coordinates, q, strict=True)
     )
     first, second = derivatives(list(coordinates), safe_norm(type(q)(*offsets)) * (1 + 1e-5))
     span = Interval(0 * x.piece_length, 0 * value.lower + x.piece_length)

@@ -141,10 +141,10 @@ class OutlineEdges:
         start = zero + dr.inf, zero, zero, zero, zero, zero, zero > 1, zero > 1
         state = (*start, *(zero + dr.inf for _ in knots))
         if self.chains is None:
-            sums = self.edges.for_each(query.with_edge, state, "outline")
+            final = self.edges.for_each(query.with_edge, state, "outline")
         else:
-            sums = self._by_chains(self.chains, query, state)
-        distance, error, away_x, away_y, normal_x, normal_y, on_edge, inside, *bounds = sums
+            final = self._by_chains(self.chains, query, state)
+        distance, error, away_x, away_y, normal_x, normal_y, on_edge, inside, *bounds = final
         error = error + epsilon * (size + distance)
         sign = dr.select(inside, real(-1), real(1))
         # Across an edge the direction is that of its normal, also where the distance is rounding.

@@ -220,7 +220,7 @@ class TransformedSolid(SolidOfField):
         rows = self.field.hessian(type(p)(*numbers.local(p.x, p.y, p.z)))
         columns = [numbers.pull_back(row) for row in rows]  # H M^-1
         product = [numbers.pull_back(type(p)(*(columns[j][k] for j in range(3)))) for k in range(3)]
-        x, y, z = (row_ * numbers.factor for row_ in product)
+        x, y, z = (vector * numbers.factor for vector in product)
         return x, y, z
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:

@@ -107,14 +107,14 @@ class Tube(Solid):
             TypeError: arrays that are not of numbers.
         """
         arrays: list[FloatArray] = []
-        for k, line in enumerate(polylines):
-            array = as_real_array(line, f"polyline {k} of a tube")
+        for k, entry in enumerate(polylines):
+            array = as_real_array(entry, f"polyline {k} of a tube")
             check_vectors(array, f"polyline {k} of a tube")
             arrays.append(np.array(array, dtype=np.float64))
         if not arrays:
             raise ValueError("a tube needs a polyline, and there are none")
         ends = np.cumsum([len(part) for part in arrays])[:-1]
-        return cls(np.concatenate(arrays), radius, starts=tuple(int(line) for line in ends))
+        return cls(np.concatenate(arrays), radius, starts=tuple(int(entry) for entry in ends))
 
     @classmethod
     def bezier(
@@ -273,17 +273,17 @@ class Tube(Solid):
         start = (zero + dr.inf, zero, zero, zero, zero, *(zero + dr.inf for _ in knots))
         groups: RecordTable | None = cast("Any", self)._groups
         if groups is None:
-            sums = records.for_each(body, start, "tube")
+            final = records.for_each(body, start, "tube")
         else:
-            sums = _visit_by_groups(p, direction, knots, records, groups, body, start)
-        distance, error = sums[0], sums[4]
-        away = vector(*sums[1:4])
+            final = _visit_by_groups(p, direction, knots, records, groups, body, start)
+        distance, error = final[0], final[4]
+        away = vector(*final[1:4])
         gradient = dr.select(distance > 0, away / distance, vector(0))
         value = distance - self._parameter("_radius")
         error = error + 4 * epsilon * (distance + self._parameter("_radius"))
         gradient_error = dr.select(distance > 0, fmin(4 * error / distance, 2), 2)
         sample = Sample(value, gradient, (Lipschitz(zero + 1),), error, gradient_error)
-        return sample, distance, tuple(bound - distance - error for bound in sums[5:])
+        return sample, distance, tuple(bound - distance - error for bound in final[5:])
 
     def _parameter(self, name: str) -> Any:
         return getattr(self, name)
@@ -331,13 +331,13 @@ def _visit_by_groups(
         away = p - vector(*ball[:3])
         distance = dr.norm(away)
         is_near = distance - ball[3] <= limit
-        sums = list(state)
+        updated = list(state)
         if direction is not None:
             rounding = 8 * epsilon * (dr.norm(p) + distance + ball[3])
             slope = dr.dot(away, direction) / distance - 2 * rounding / distance
             start = dr.select(is_near, dr.inf, distance - ball[3] - rounding)
-            sums[5:] = min_with_tangent(
-                sums[5:], knots, start, slope, 4 * epsilon * distance, epsilon
+            updated[5:] = min_with_tangent(
+                updated[5:], knots, start, slope, 4 * epsilon * distance, epsilon
             )
 
         def each(j: Any, *inner: Any) -> tuple[Any, ...]:
@@ -347,7 +347,7 @@ def _visit_by_groups(
             return j < last
 
         last = dr.select(is_near, type(i)(_GROUP), type(i)(0))
-        visited = dr.while_loop((type(i)(0), *sums), has_more, each, label="tube")
+        visited = dr.while_loop((type(i)(0), *updated), has_more, each, label="tube")
         return i + 1, *visited[1:]
 
     def has_groups(i: Any, *_: Any) -> Any:
